@@ -9,12 +9,15 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
 from typing import Any
 
 import pytest
+import torch.distributed as dist
 
+import clod_adapter
 from clod_adapter.config import AdaptConfig
 from clod_adapter.progress import Progress
 from clod_adapter.training.objective import Objective
@@ -104,6 +107,43 @@ class Server:
     def run(self, folder: Path, *words: object) -> tuple[int, str]:
         """Exit code and output."""
         return self.wait(self.start(folder, *words)), log_of(folder)
+
+
+@dataclass
+class Launched:
+    """Processes started as torchrun starts them."""
+
+    server: Server
+    folder: Path
+    pids: list[int]
+    store: Any  # has to exist as long as the processes
+
+    def log(self, rank: int) -> str:
+        return log_of(self.folder, rank)
+
+    def wait(self) -> list[int]:
+        return [self.server.wait(pid) for pid in self.pids]
+
+    def report(self) -> dict[str, Any]:
+        assert [name for name in names(self.folder) if name != STATE] == OUTPUTS, self.log(0)
+        assert clod_adapter.load(self.folder / "dial.ply").gaussians.sigma_d is not None
+        clod_adapter.load_adapter(self.folder / "dial.safetensors")
+        return json.loads((self.folder / "dial.json").read_text())
+
+
+def launch(server: Server, folder: Path, *words: object, size: int = 2, before: Any = None, wait: Any = "") -> Launched:
+    """Starts ``size`` processes; ``before`` is code that one of them runs first; returns once file ``wait`` exists."""
+    folder.mkdir(exist_ok=True)
+    store = dist.TCPStore("localhost", 0, is_master=True, wait_for_workers=False)
+    pids = []
+    for rank in range(size):
+        told = {
+            "RANK": rank, "WORLD_SIZE": size, "LOCAL_RANK": rank, "LOCAL_WORLD_SIZE": size, "MASTER_ADDR": "localhost",
+            "MASTER_PORT": store.port, "TORCHELASTIC_USE_AGENT_STORE": True, "TORCHELASTIC_RESTART_COUNT": 0,
+        }  # fmt: skip
+        pids.append(server.start(folder, *words, rank=rank, before=(before or {}).get(rank, ""), **told))
+    wait_for(folder / wait)
+    return Launched(server, folder, pids, store)
 
 
 def names(folder: Path) -> list[str]:

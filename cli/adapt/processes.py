@@ -87,6 +87,8 @@ def together(make_job: Callable[[], TrainingJob], display: ProgressDisplay) -> I
     display.console.say(_describe(launch, job.config, job.device))
     number = _store().add(JOBS, 1)
     try:
+        if any(_store().check([_reason(rank)]) for rank in range(1, launch.size)):  # it would wait for ten minutes
+            raise ProcessLost("a process of the group has ended")
         with _threads(launch), joined(_of_job(number), launch.rank, launch.size) as group:
             group.broadcast(job)
             del job
@@ -102,7 +104,7 @@ def take_part() -> None:
     launch, store, stop = launched(), _store(), GracefulStop(aborts=False)
     with stop.listening(), _threads(launch):
         for number in count(1):
-            if not _is_called(store, number, stop):
+            if not _is_called(store, number, stop, launch.rank):
                 return
             try:
                 _train(number, launch, stop)
@@ -162,12 +164,15 @@ def _giving_reasons(rank: int) -> Iterator[None]:
         raise
 
 
-def _is_called(store: Store, number: int, stop: GracefulStop) -> bool:
+def _is_called(store: Store, number: int, stop: GracefulStop, rank: int) -> bool:
     """Waits for work. Polls, because a wait of the store's own would delay signals."""
     try:
         while store.add(JOBS, 0) < number:
-            if store.check([OVER]) or stop.requests:
+            if store.check([OVER]):
                 return False
+            if stop.requests:
+                store.set(_reason(rank), f"process {rank}: ended by a signal")
+                return store.add(JOBS, 0) >= number  # the first one may have called before it could know
             time.sleep(POLL_EVERY)
     except RuntimeError:  # the store has ended, and the first process with it
         return False

@@ -8,13 +8,11 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-import torch.distributed as dist
 
 import clod_adapter
 from clod_adapter.cli.commands.settings import make_config
@@ -23,47 +21,10 @@ from clod_adapter.cli.shared.launch import Launch, launched
 from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.training.state_file import load_state
-from runs import OUTPUTS, STATE, Server, accepted, log_of, names, wait_for
+from runs import STATE, Launched, Server, accepted, launch
 
 TINY = ("--max-sv", 4, "--out", "dial.ply", "--batch", 2, "--iters", 12)
 LONG = (*TINY[:-1], 4000)  # does not end by itself
-
-
-@dataclass
-class Launched:
-    """Processes started as torchrun starts them."""
-
-    server: Server
-    folder: Path
-    pids: list[int]
-    store: Any  # has to exist as long as the processes
-
-    def log(self, rank: int) -> str:
-        return log_of(self.folder, rank)
-
-    def wait(self) -> list[int]:
-        return [self.server.wait(pid) for pid in self.pids]
-
-    def report(self) -> dict[str, Any]:
-        assert [name for name in names(self.folder) if name != STATE] == OUTPUTS, self.log(0)
-        assert clod_adapter.load(self.folder / "dial.ply").gaussians.sigma_d is not None
-        clod_adapter.load_adapter(self.folder / "dial.safetensors")
-        return json.loads((self.folder / "dial.json").read_text())
-
-
-def launch(server: Server, folder: Path, *words: object, size: int = 2, before: Any = None, wait: Any = "") -> Launched:
-    """Starts ``size`` processes; ``before`` is code that one of them runs first; returns once file ``wait`` exists."""
-    folder.mkdir(exist_ok=True)
-    store = dist.TCPStore("localhost", 0, is_master=True, wait_for_workers=False)
-    pids = []
-    for rank in range(size):
-        told = {
-            "RANK": rank, "WORLD_SIZE": size, "LOCAL_RANK": rank, "LOCAL_WORLD_SIZE": size, "MASTER_ADDR": "localhost",
-            "MASTER_PORT": store.port, "TORCHELASTIC_USE_AGENT_STORE": True, "TORCHELASTIC_RESTART_COUNT": 0,
-        }  # fmt: skip
-        pids.append(server.start(folder, *words, rank=rank, before=(before or {}).get(rank, ""), **told))
-    wait_for(folder / wait)
-    return Launched(server, folder, pids, store)
 
 
 @pytest.fixture(scope="module")
@@ -239,6 +200,14 @@ def test_process_lost_before_the_first_step(server: Server, words: list[Any], tm
     assert log.count("error:") == 1 and f"; {why}; this was before the first step, so start again\n" in log
 
 
+def test_signal_to_another_process_before_the_first_step(server: Server, words: list[Any], tmp_path: Path) -> None:
+    """The first one does not wait for it."""
+    pressed = "processes.time.sleep = lambda seconds: signal.raise_signal(signal.SIGTERM)"  # while it waits for work
+    run = launch(server, tmp_path / "run", *words, *TINY, before={1: pressed})
+    assert run.wait() == [2, 0] and list(run.folder.iterdir()) == [], run.log(0)
+    assert "process 1: ended by a signal; this was before the first step, so start again\n" in run.log(0)
+
+
 def test_killed_first_process(server: Server, words: list[Any], alone: Path, tmp_path: Path) -> None:
     """Any number of processes can resume its last state; the others wait for the launcher's signal."""
     slowly = "from clod_adapter.training.trainer import Trainer; real = Trainer.step\n"
@@ -253,9 +222,10 @@ def test_killed_first_process(server: Server, words: list[Any], alone: Path, tmp
     assert_close(run.folder, alone)
 
 
-def test_interrupt_stops_all_after_the_same_step(server: Server, words: list[Any], tmp_path: Path) -> None:
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
+def test_interrupt_stops_all_after_the_same_step(server: Server, words: list[Any], tmp_path: Path, number: int) -> None:
     run = launch(server, tmp_path / "run", *words, *LONG, wait=STATE)
-    os.kill(run.pids[1], signal.SIGINT)  # either process
+    os.kill(run.pids[1], number)  # either process
     assert run.wait() == [0, 0], run.log(0)
     report = run.report()
     assert report["interrupted"] and load_state(run.folder / STATE)[0].steps == report["steps"], run.log(0)
