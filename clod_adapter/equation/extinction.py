@@ -25,7 +25,8 @@ def extinction_scale(opacity_logits: Tensor, sigma_d: Tensor, d: Tensor, config:
     1 the Gaussian is kept at no dial value. ``a/tau`` where d = 0 (or d^2 / v is negligible); 0 where sigma <= 0,
     eps = 0 and d > 0. No gradient.
 
-    Accuracy: relative error within ``(6 + |log a|) * finfo.eps`` where ``a`` is a normal number.
+    Accuracy: relative error within ``(6 + |log a|) * finfo.eps`` where ``a`` is a normal number. Logarithms that are
+    off by a unit in the last place, as on some processors, add ``|log tau|``.
 
     Raises:
         ClodError: the shapes differ.

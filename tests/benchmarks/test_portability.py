@@ -9,7 +9,7 @@ import portability
 import pytest
 
 TESTS = """
-import locale, os, signal, tempfile
+import locale, math, os, signal, tempfile
 import pytest
 
 def test_ignored():
@@ -24,6 +24,13 @@ def test_spaced():
 def test_ascii():
     assert locale.getencoding() in ("ANSI_X3.4-1968", "US-ASCII", "646")
 
+def test_moved():
+    assert hasattr(math.exp, "__wrapped__")
+
+def test_lacking():
+    with pytest.raises(ModuleNotFoundError):
+        import pycolmap
+
 def test_skipped():
     pytest.skip("always")
 
@@ -36,7 +43,7 @@ def test_error(broken):
 """
 
 
-HOLD = {"ignored", "blocked", "spaced", "ascii"}
+HOLD = {"ignored", "blocked", "spaced", "ascii", "moved", "lacking"}
 
 
 def run_made(folder: Path, condition: str) -> dict[str, Any]:
@@ -56,14 +63,19 @@ def already(tmp_path_factory: pytest.TempPathFactory) -> set[str]:
 
 @pytest.mark.parametrize(
     ("condition", "holds"),
-    [("ignored_sigint", {"ignored"}), ("blocked_signals+folders", {"blocked", "spaced"}), ("c_locale", {"ascii"})],
+    [
+        ("ignored_sigint", {"ignored"}),
+        ("blocked_signals+folders", {"blocked", "spaced"}),
+        ("c_locale", {"ascii"}),
+        ("libm_0+no_pycolmap", {"moved", "lacking"}),
+    ],
 )
 def test_a_condition_and_its_counts(tmp_path: Path, already: set[str], condition: str, holds: set[str]) -> None:
     if condition == "c_locale" and not str(tmp_path).isascii():
         pytest.skip("pytest itself fails in that locale where its folders have other letters")
     found = run_made(tmp_path, condition)
     holds = holds | already
-    assert [found[key] for key in ("passed", "failed", "skipped")] == [len(holds), 5 - len(holds), 1], found
+    assert [found[key] for key in ("passed", "failed", "skipped")] == [len(holds), 7 - len(holds), 1], found
     assert failed(found) == (HOLD | {"error"}) - holds
 
 

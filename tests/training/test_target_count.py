@@ -139,7 +139,7 @@ def test_soft_count_gradient_matches_mpmath(dtype: torch.dtype, temperature: flo
         z = (mpmath.mpf(log) - threshold) / temperature
         q, other = 1 / (1 + mpmath.exp(-z)), 1 / (1 + mpmath.exp(z))
         want = q * other / (temperature * len(logs))
-        allowed = 6 + float(abs(threshold) / (2 * temperature) + 1.5 * abs(z))
+        allowed = 6 + 1.5 * float(abs(threshold) / temperature + abs(z))  # a logarithm may be off by a unit
         assert abs(g - want) <= allowed * eps * want + torch.finfo(dtype).tiny
         assert abs(b - want * max(-2 * log, 1)) <= (allowed + 2) * eps * b + torch.finfo(dtype).tiny
 
