@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-import time
 import tracemalloc
 import warnings
 from pathlib import Path
@@ -41,11 +40,10 @@ def test_false_row_counts_allocate_nothing(tmp_path: Path, form: str, count: int
     path.write_bytes(header(form, count) + b"0 " * 30)
     read_head(path)  # so that nothing is imported while it is measured
     tracemalloc.start()
-    began = time.perf_counter()
     try:
         with pytest.raises(ClodError, match=rf"in.ply: is truncated.*claims {count} of vertex.*the file has"):
             load(path)
-        assert tracemalloc.get_traced_memory()[1] < 3 << 20 and time.perf_counter() - began < 1
+        assert tracemalloc.get_traced_memory()[1] < 3 << 20
     finally:
         tracemalloc.stop()
 
@@ -61,10 +59,8 @@ def test_false_counts_of_other_elements_are_refused(tmp_path: Path, form: str, o
     body = "".join("0 " * 17 + "\n").encode() if form == "ascii" else bytes(17 * 4)
     for before, after in ((f"element a {1 << 40}\n{other}", ""), ("", f"element a {1 << 40}\n{other}")):
         (tmp_path / "in.ply").write_bytes(header(form, 1, before, after) + body)
-        began = time.perf_counter()
-        with pytest.raises(ClodError):
+        with pytest.raises(ClodError):  # before the test's time limit, in which no loop counts that far
             load(tmp_path / "in.ply")
-        assert time.perf_counter() - began < 1
 
 
 @pytest.mark.parametrize("order", ["<", ">", "ascii"])
