@@ -102,7 +102,8 @@ def test_units_multiply_the_rates_of_rows(kind: type[RowAdam], n: int = 40) -> N
         for optimizer in optimizers:
             optimizer.step(given, torch.arange(n) % 3 > 0, {"means": 0.1, "sh0": 0.1})
     assert torch.equal(one["sh0"], other["sh0"])
-    torch.testing.assert_close(other["means"], units[:, None] * one["means"], rtol=1e-5, atol=0)
+    # Steps of 0.1 up and down may cancel.
+    torch.testing.assert_close(other["means"] / units[:, None], one["means"], rtol=1e-5, atol=1e-7)
 
 
 @pytest.mark.parametrize("kind", [RowAdam, PlainRowAdam])
