@@ -30,7 +30,7 @@ class Gaussians:
 
     Attributes:
         means: ``[N, 3]`` centres, world units.
-        quats: ``[N, 4]`` rotations, wxyz, of any length but 0.
+        quats: ``[N, 4]`` rotations, wxyz, of any length from 1e-15 to 1e15; others are not drawn.
         log_scales: ``[N, 3]`` logarithms of the standard deviations along the axes, world units.
         opacity_logits: ``[N]``; the opacity is their sigmoid. +inf means fully opaque.
         sh0: ``[N, 1, 3]`` degree-0 spherical harmonics.

@@ -43,7 +43,7 @@ def model(degree: int = 3, count: int = 40, *, growth: bool = True) -> Gaussians
     logits = g.opacity_logits.clone()
     logits[0] = torch.inf
     quats = g.quats.clone()
-    quats[1:4] *= torch.tensor([1e-30, 1e30, 3.0])[:, None]
+    quats[1:4] *= torch.tensor([1e-14, 1e14, 3.0])[:, None]
     growth_d = torch.linspace(-1, 3, count).where(torch.arange(count) % 5 != 2, 0) if growth else None
     return g.replace(opacity_logits=logits, quats=quats, sigma_d=sigma, growth_d=growth_d, attenuation=ATTENUATION)
 

@@ -7,6 +7,7 @@ from numba import float32
 import clod_adapter._kernels as limits
 
 ALPHA_MIN, ALPHA_MAX, T_MIN = (float32(v) for v in (limits.ALPHA_MIN, limits.ALPHA_MAX, limits.T_MIN))
+QUAT_MIN2, QUAT_MAX2 = float32(limits.QUAT_MIN**2), float32(limits.QUAT_MAX**2)
 LOG2E, LOG2_255, TWO_LN2 = float32(1.4426950408889634), float32(7.994353436858858), float32(1.3862943611198906)
 HALF, ZERO, ONE, TWO = float32(0.5), float32(0), float32(1), float32(2)
 HUGE = float32(3e38)  # larger values are dropped as not finite

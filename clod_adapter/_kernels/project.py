@@ -47,6 +47,8 @@ from clod_adapter._kernels.conventions import (
     QC,
     QINV,
     QUAT,
+    QUAT_MAX2,
+    QUAT_MIN2,
     RAWDET,
     REACH,
     RECORD,
@@ -89,7 +91,8 @@ def covariance(cam, w):  # type: ignore[no-untyped-def]
         w[POINT + d] = cam[row] * w[MEAN] + cam[row + 1] * w[MEAN + 1] + cam[row + 2] * w[MEAN + 2] + cam[row + 3]
     norm2 = w[STORED] * w[STORED] + w[STORED + 1] * w[STORED + 1]
     norm2 = norm2 + w[STORED + 2] * w[STORED + 2] + w[STORED + 3] * w[STORED + 3]
-    valid = both(ge(w[POINT + 2], splat(cam[NEAR])), gt(norm2, splat(ZERO)))
+    valid = both(ge(norm2, splat(QUAT_MIN2)), ge(splat(QUAT_MAX2), norm2))
+    valid = both(ge(w[POINT + 2], splat(cam[NEAR])), valid)
     w[QINV] = ONE / vsqrt(norm2)
     for d in range(4):
         w[QUAT + d] = w[STORED + d] * w[QINV]

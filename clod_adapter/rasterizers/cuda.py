@@ -28,7 +28,7 @@ from torch.autograd.function import once_differentiable
 from clod_adapter.cameras import Camera
 from clod_adapter.config import CLASSIC, ScreenFilter
 from clod_adapter.errors import ClodError
-from clod_adapter.rasterizers.protocol import ALPHA_MIN, require_float32
+from clod_adapter.rasterizers.protocol import drawable, require_float32
 
 TILE = 16
 OLDEST, INSTALL = (1, 4, 0), "pip install gsplat==1.5.3"
@@ -91,7 +91,7 @@ def rasterize(
 
 def compact(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor) -> tuple[Tensor, list[Tensor]]:
     """The numbers of the rows that are drawn, and the geometry and opacity of these alone."""
-    rows = (opacities.detach() >= ALPHA_MIN).nonzero()[:, 0]
+    rows = drawable(quats, opacities).nonzero()[:, 0]
     return rows, [_Rows.apply(rows, x) for x in (means, quats, scales, opacities)]
 
 

@@ -7,12 +7,12 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from clod_adapter._kernels import ALPHA_MAX, ALPHA_MIN, T_MIN
+from clod_adapter._kernels import ALPHA_MAX, ALPHA_MIN, QUAT_MAX, QUAT_MIN, T_MIN
 from clod_adapter.cameras import Camera
 from clod_adapter.config import CLASSIC, ScreenFilter
 from clod_adapter.errors import ClodError
 
-__all__ = ["ALPHA_MAX", "ALPHA_MIN", "T_MIN", "Rasterizer", "require_float32", "wait_for"]
+__all__ = ["ALPHA_MAX", "ALPHA_MIN", "T_MIN", "Rasterizer", "drawable", "require_float32", "wait_for"]
 
 
 class Rasterizer(Protocol):
@@ -20,7 +20,7 @@ class Rasterizer(Protocol):
 
     Args:
         means: ``[N, 3]`` world units.
-        quats: ``[N, 4]`` wxyz, any length but zero.
+        quats: ``[N, 4]`` wxyz, any length from QUAT_MIN to QUAT_MAX.
         scales: ``[N, 3]`` standard deviations, world units.
         opacities: ``[N]`` in [0, 1]; rows below 1/255 are skipped before any other work.
         sh0: ``[N, 1, 3]``; shN: ``[N, K-1, 3]``.
@@ -38,6 +38,12 @@ class Rasterizer(Protocol):
         self, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh0: Tensor, shN: Tensor,
         camera: Camera, background: Tensor, screen_filter: ScreenFilter = CLASSIC,
     ) -> tuple[Tensor, Tensor]: ...  # fmt: skip
+
+
+def drawable(quats: Tensor, opacities: Tensor) -> Tensor:
+    """``[N]`` bool, the rows that are not too faint, and whose rotation has a usable length."""
+    length = quats.detach().norm(dim=1)
+    return (opacities.detach() >= ALPHA_MIN) & (length >= QUAT_MIN) & (length <= QUAT_MAX)
 
 
 def require_float32(backend: str, **tensors: Tensor) -> None:

@@ -13,7 +13,7 @@ from torch import Tensor
 from clod_adapter.cameras import Camera
 from clod_adapter.config import CLASSIC, ScreenFilter
 from clod_adapter.gaussians import SH_C0
-from clod_adapter.rasterizers.protocol import ALPHA_MAX, ALPHA_MIN, T_MIN
+from clod_adapter.rasterizers.protocol import ALPHA_MAX, ALPHA_MIN, T_MIN, drawable
 
 
 def rasterize(
@@ -23,7 +23,7 @@ def rasterize(
     """See ``clod_adapter.rasterizers.Rasterizer``."""
     viewmat, K = camera.viewmat.to(means), camera.K.to(means)
     points = means @ viewmat[:3, :3].T + viewmat[:3, 3]
-    rows = ((points[:, 2] >= camera.near) & (opacities >= ALPHA_MIN) & (quats.norm(dim=1) > 0)).nonzero()[:, 0]
+    rows = ((points[:, 2] >= camera.near) & drawable(quats, opacities)).nonzero()[:, 0]
     rows = rows[points[rows, 2].argsort(stable=True)]
     centres, projected = project(points[rows], quats[rows], scales[rows], viewmat, K, camera)
     covariance, opacities = blurred(projected, opacities[rows], screen_filter)

@@ -159,12 +159,13 @@ def test_mask_gaussian_layout(tmp_path: Path) -> None:
 
 
 def test_unusable_rows_are_dropped_and_counted(tmp_path: Path) -> None:
-    vertex = make(12, [*needed(1), "nx", "sigma_d", "growth_d"], types={"y": "f8", "opacity": "f8"})
+    vertex = make(13, [*needed(1), "nx", "sigma_d", "growth_d"], types={"y": "f8", "opacity": "f8"})
     vertex["x"][0] = np.nan
     vertex["f_rest_8"][1] = np.inf
     vertex["opacity"][[2, 3, 4, 9]] = np.nan, -np.inf, np.inf, 1e300  # the last is +inf as a float32
     vertex["scale_1"][5] = -np.inf
     rotated(vertex[6:7], 0)
+    rotated(vertex[12:], 1e-25)
     vertex["sigma_d"][7] = np.nan
     vertex["nx"][8] = np.nan  # not used, so no reason to drop
     vertex["y"][10] = 1e300
@@ -173,8 +174,8 @@ def test_unusable_rows_are_dropped_and_counted(tmp_path: Path) -> None:
     np.testing.assert_array_equal(checkpoint.gaussians.means[:, 1], vertex["y"][[4, 8, 9]].astype("f4"))
     assert checkpoint.gaussians.opacities[0] == 1
     assert checkpoint.notes[:3] == (
-        "8 of 12 Gaussians dropped: a value is not finite",
-        "1 of 12 Gaussians dropped: rotation is zero",
+        "8 of 13 Gaussians dropped: a value is not finite",
+        "2 of 13 Gaussians dropped: rotation is zero or not of a usable length",
         "2 Gaussians have opacity = +inf and are taken as fully opaque",
     )
     save(tmp_path / "out.ply", checkpoint.gaussians, checkpoint)

@@ -176,7 +176,7 @@ def assert_rows_are_skipped(
     assert_same(found, want, **rasterize.rounding)
 
 
-@pytest.mark.parametrize("case", ["below 1/255", "zero quaternion", "compensated to below 1/255"])
+@pytest.mark.parametrize("case", ["below 1/255", "zero quaternion", "short quaternion", "compensated to below 1/255"])
 @pytest.mark.usefixtures("one_or_two_threads")
 def test_invisible_rows_are_skipped(rasterize: Backend, case: str) -> None:
     some = scene(300, 1, 3, size=0.1)
@@ -184,8 +184,8 @@ def test_invisible_rows_are_skipped(rasterize: Backend, case: str) -> None:
     if case == "below 1/255":
         below = math.nextafter(1 / 255, 0) - 1e-9
         some["opacities"] = torch.where(gone, torch.linspace(0, below, 300), some["opacities"].clamp(min=0.004))
-    elif case == "zero quaternion":
-        some["quats"][gone] = 0
+    elif case.endswith("quaternion"):
+        some["quats"][gone] *= 0 if case.startswith("zero") else 1e-16
     else:
         some["scales"][gone] *= 1e-3  # a thousandth of a pixel: the compensation is 1e-5 and less
     assert_rows_are_skipped(rasterize, some, gone, FILTERS["on" if case.startswith("compensated") else "off"])

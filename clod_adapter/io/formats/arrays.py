@@ -13,6 +13,7 @@ from clod_adapter.config import CLASSIC
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import SH_C0, Gaussians
 from clod_adapter.io.atomic import check_target
+from clod_adapter.io.ply.rows import UNROTATED, rotated
 from clod_adapter.io.settings import Metadata
 from clod_adapter.io.sniff import refuse_irregular
 
@@ -30,7 +31,7 @@ def arrays_of(path: Path, gaussians: Gaussians) -> dict[str, np.ndarray]:
     """The float32 arrays of ``Gaussians.tensors``, checked for writing.
 
     Raises:
-        ClodError: there are none, a value is not finite (opacity = +inf aside), a rotation is zero, or the target
+        ClodError: there are none, a value is not finite (opacity = +inf aside), a rotation is unusable, or the target
             cannot be written.
     """
     check_target(path)
@@ -44,8 +45,8 @@ def arrays_of(path: Path, gaussians: Gaussians) -> dict[str, np.ndarray]:
         finite = np.isfinite(array) | (array == np.inf) if name == "opacity_logits" else np.isfinite(array)
         if not finite.all():
             raise ClodError(f"{path}: {name} holds a value that is not finite; drop such rows first, as load does")
-    if not arrays["quats"].any(1).all():
-        raise ClodError(f"{path}: a rotation is zero; drop such rows first, as load does")
+    if not rotated(arrays["quats"]).all():
+        raise ClodError(f"{path}: a rotation is {UNROTATED}; drop such rows first, as load does")
     return arrays
 
 
@@ -82,9 +83,8 @@ def half_turn(arrays: Mapping[str, np.ndarray], axis: str) -> dict[str, np.ndarr
 
 
 def normalized(quats: np.ndarray) -> np.ndarray:
-    """``[N, 4]`` float32 quaternions of unit length; none is zero, however short."""
+    """``[N, 4]`` float32 quaternions of unit length; none is zero."""
     wide = quats.astype(np.float64)
-    wide /= np.abs(wide).max(1, keepdims=True)
     return (wide / np.linalg.norm(wide, axis=1, keepdims=True)).astype(np.float32)
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from plyfile import PlyData
 
+from clod_adapter._kernels import QUAT_MAX, QUAT_MIN
 from clod_adapter.io.ply.body import check_length, read_elements
 from clod_adapter.io.ply.columns import MASKS, SIGMA, column_map, dial_columns, read_table, sh_degree_of
 from clod_adapter.io.ply.constants import constant_settings, read_constants
@@ -18,6 +19,7 @@ from clod_adapter.io.ply.packed import NOTE, check_packed, is_packed, packed_ele
 from clod_adapter.io.settings import Metadata, read_metadata
 from clod_adapter.origin import Origin, relative
 
+UNROTATED = "zero or not of a usable length"
 ROWS = 4096  # in a block, which stays in the processor's cache
 
 
@@ -157,8 +159,15 @@ def usable_rows(attributes: Mapping[str, np.ndarray], dropped: Counter[str]) -> 
     for rule, reason in (
         (exists, "MaskGaussian existence probability below 0.5"),
         (finite, "a value is not finite"),
-        ((attributes["quats"] != 0).any(1), "rotation is zero"),
+        (rotated(attributes["quats"]), f"rotation is {UNROTATED}"),
     ):
         dropped[reason] += int((keep & ~rule).sum())
         keep &= rule
     return keep
+
+
+def rotated(quats: np.ndarray) -> np.ndarray:
+    """``[N]`` bool, whether the quaternions ``[N, 4]`` float32 have a length that rasterizers can divide by."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        length = np.sqrt(np.square(quats).sum(1))
+    return (length >= QUAT_MIN) & (length <= QUAT_MAX)

@@ -30,7 +30,9 @@ function removals(masked, invalid, count) {
   return invalid ? [...notes, `${invalid} of ${count} Gaussians cannot be drawn and were removed`] : notes;
 }
 
-/** Removes the rows that cannot be drawn: with a non-finite value, or a zero quaternion (io/ply/rows.py). */
+const SHORTEST = 1e-15, LONGEST = 1e15; // quaternion (clod_adapter/_kernels)
+
+/** Removes the rows that cannot be drawn: with a non-finite value, or a quaternion too short or long (io/ply/rows.py). */
 export function removeInvalid(gaussians) {
   const { count, means, quats, logScales, opacityLogits, sh0, shN, coefficients, exists } = gaussians;
   const finite = (array, size, i) => {
@@ -44,9 +46,11 @@ export function removeInvalid(gaussians) {
       masked++;
       continue;
     }
-    const rotated = quats[4 * i] || quats[4 * i + 1] || quats[4 * i + 2] || quats[4 * i + 3];
+    let square = 0;
+    for (let k = 4 * i; k < 4 * i + 4; k++) square += quats[k] * quats[k];
+    const rotated = square >= SHORTEST ** 2 && square <= LONGEST ** 2;
     const opaque = Number.isFinite(opacityLogits[i]) || opacityLogits[i] === Infinity;
-    if (rotated && opaque && !(exists && Number.isNaN(exists[i])) && finite(means, 3, i) && finite(quats, 4, i) && finite(logScales, 3, i) && finite(sh0, 3, i)
+    if (rotated && opaque && !(exists && Number.isNaN(exists[i])) && finite(means, 3, i) && finite(logScales, 3, i) && finite(sh0, 3, i)
       && finite(shN, 3 * coefficients, i) && dial.every((name) => Number.isFinite(gaussians[name][i]))) keep.push(i);
   }
   if (!keep.length) throw new Error("no Gaussian in it can be drawn: values are not finite or rotations are 0; export it again");
