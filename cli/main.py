@@ -35,7 +35,7 @@ from .shared.interrupts import interrupt_as_stopped, signals_as_interrupt
 from .shared.launch import launched, silence_but_first
 from .shared.outputs import claimed
 from .shared.shortages import check_addresses, shortage
-from .shared.streams import forget_stdout, print_anywhere
+from .shared.streams import check_printed, unbreakable_streams
 
 PROG = "clod-adapt"
 INTERRUPTED = 130  # exit code
@@ -54,14 +54,14 @@ def main(argv: list[str] | None = None) -> int:
 
     A report may have its own exit_code. An unexpected error prints its traceback and returns 1.
     """
-    print_anywhere()
     words = sys.argv[1:] if argv is None else argv
-    try:
-        with silence_but_first():
-            return _main(words)
-    except Exception:
-        traceback.print_exc()
-        return refuse(f"this is a bug in {PROG} {package_version()}, not in the input: {REPORT}", 1, words)
+    with unbreakable_streams():
+        try:
+            with silence_but_first():
+                return _main(words)
+        except Exception:
+            traceback.print_exc()
+            return refuse(f"this is a bug in {PROG} {package_version()}, not in the input: {REPORT}", 1, words)
 
 
 def refuse(why: str, code: int, words: list[str]) -> int:
@@ -73,10 +73,7 @@ def refuse(why: str, code: int, words: list[str]) -> int:
         line = folded(line, sys.stderr)
     print(line, file=sys.stderr)
     if "--json" in words:
-        try:
-            print(json.dumps({"error": as_text(why), "code": code}), flush=True)
-        except BrokenPipeError:
-            forget_stdout()
+        print(json.dumps({"error": as_text(why), "code": code}))
     return code
 
 
@@ -87,15 +84,11 @@ def _main(words: list[str]) -> int:
             if not name:
                 check_command(words)
             args = build_parser(name).parse_args(words[1:] if name else words)
-            code = run_here(COMMANDS.get(name, ADAPT), args)
-            sys.stdout.flush()
+            return run_here(COMMANDS.get(name, ADAPT), args)
     except ClodError as error:
         return refuse(" ".join(str(error).splitlines()), 2, words)
     except Stopped:
         return refuse("interrupted", INTERRUPTED, words)
-    except BrokenPipeError:
-        forget_stdout()
-        return 1
     except (MemoryError, RuntimeError, ImportError, OSError) as error:
         if (line := shortage(error)) is not None:
             return refuse(line, 2, words)
@@ -103,7 +96,6 @@ def _main(words: list[str]) -> int:
             raise
         name = f"{error.filename}: " if error.filename is not None else ""
         return refuse(f"{name}{error.strerror or error}; check the path and its permissions", 2, words)
-    return code
 
 
 def check_command(words: list[str]) -> None:
@@ -130,9 +122,14 @@ def run_here(command: Command, args: argparse.Namespace) -> int:
 
 
 def run(command: Command, args: argparse.Namespace) -> int:
-    """Runs a command, prints its report with --json, and returns the report's exit code, or 0."""
+    """Runs a command, prints its report with --json, and returns the report's exit code, or 0.
+
+    Without files and --json the result is what was printed.
+    """
     from .shared.report import jsonable
 
+    if args.json:
+        check_printed()
     command.check(args)
     with claimed(command.outputs(args)):
         module = import_command(command, args)
@@ -141,6 +138,8 @@ def run(command: Command, args: argparse.Namespace) -> int:
             report = module.run(args)
     if args.json and report is not None:
         print(json.dumps(jsonable(report), allow_nan=False))
+    if args.json or "outputs" not in (report or {"outputs": ()}):
+        check_printed()
     return int((report or {}).get("exit_code", 0))
 
 

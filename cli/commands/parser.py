@@ -8,6 +8,7 @@ from typing import Any, NoReturn
 from clod_adapter.errors import ClodError
 
 from ..shared.manual import manual
+from ..shared.streams import check_printed
 from .command import Command
 
 
@@ -22,6 +23,11 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         raise ClodError(f"{message} (see {self.prog} --help)")
+
+    def exit(self, status: int = 0, message: str | None = None) -> NoReturn:
+        """After --help and --version."""
+        check_printed()
+        super().exit(status, message)
 
     def format_help(self) -> str:
         page = manual()

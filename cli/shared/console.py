@@ -31,9 +31,8 @@ class Console:
 
     def say(self, text: str) -> None:
         if not self.quiet:
-            with _unbreakable():
-                tqdm.write(folded(text, sys.stderr), file=sys.stderr)  # print would overwrite a bar on this line
-                sys.stderr.flush()
+            tqdm.write(folded(text, sys.stderr), file=sys.stderr)  # print would overwrite a bar on this line
+            sys.stderr.flush()
 
     def note(self, text: str) -> None:
         """Writes a note on input or output, or a warning if it begins so."""
@@ -47,14 +46,12 @@ class Console:
         """
         shown, printed = None, time.perf_counter()
         if not self.quiet and sys.stderr.isatty():
-            with _unbreakable():
-                shown = tqdm(bar_format="{desc}", desc=text, file=sys.stderr, leave=False, dynamic_ncols=True)
+            shown = tqdm(bar_format="{desc}", desc=text, file=sys.stderr, leave=False, dynamic_ncols=True)
 
         def show(more: str) -> None:
             nonlocal printed
             if shown is not None:
-                with _unbreakable():
-                    shown.set_description_str(more)
+                shown.set_description_str(more)
             elif time.perf_counter() - printed >= LINE_EVERY:
                 printed = time.perf_counter()
                 self.say(more)
@@ -63,8 +60,7 @@ class Console:
             yield show
         finally:
             if shown is not None:
-                with _unbreakable():
-                    shown.close()
+                shown.close()
 
     @contextmanager
     def meter(self, label: str) -> Iterator[Meter]:
@@ -105,9 +101,8 @@ class Meter:
         """Shows the ``share`` that is done, in [0, 1], followed by ``text``."""
         now, text = time.perf_counter(), clipped(text, TEXT)
         if self.bar is not None:
-            with _unbreakable():
-                self.bar.set_postfix_str(text, refresh=False)
-                self.bar.update(min(share, 1.0) - self.bar.n)
+            self.bar.set_postfix_str(text, refresh=False)
+            self.bar.update(min(share, 1.0) - self.bar.n)
         elif now - self.printed >= LINE_EVERY:
             self.printed = now
             left = (now - self.began) * (1 - share) / max(share - self.initial, 1e-9)
@@ -122,8 +117,7 @@ class Meter:
 
     def close(self) -> None:
         if self.bar is not None:
-            with _unbreakable():
-                self.bar.close()
+            self.bar.close()
             self.bar = None
 
 
@@ -181,12 +175,3 @@ def duration(seconds: float) -> str:
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"
-
-
-@contextmanager
-def _unbreakable() -> Iterator[None]:
-    """If the reader of stderr has ended, the work continues without output."""
-    try:
-        yield
-    except BrokenPipeError:
-        sys.stderr = open(os.devnull, "w")  # noqa: SIM115

@@ -1,4 +1,4 @@
-"""Text for stdout and stderr that cannot be written, or not as it is."""
+"""stdout and stderr that may be closed, on a full device, or pipes whose reader has ended: the work goes on."""
 
 from __future__ import annotations
 
@@ -6,41 +6,64 @@ import errno
 import io
 import os
 import sys
-from typing import TYPE_CHECKING, TextIO
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, TextIO
 
-if TYPE_CHECKING:
-    from _typeshed import ReadableBuffer
-
-
-def print_anywhere() -> None:
-    """Makes stdout and stderr escape characters that their encoding lacks, as in names of files.
-
-    A terminal that is closed meanwhile drops the text, so that the work continues.
-    """
-    sys.stdout, sys.stderr = _lasting(sys.stdout), _lasting(sys.stderr)
+from clod_adapter.errors import ClodError
 
 
-def forget_stdout() -> None:
-    """After the reader of a pipe has ended; without this Python reports it again when it flushes at exit."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+class Stream:
+    """A text stream that raises no OSError: it keeps the first one as ``error`` and discards what follows."""
 
+    def __init__(self, stream: TextIO | None) -> None:
+        self.error: OSError | None = None
+        if stream is None:  # Python's, where the shell closed it
+            stream, self.error = open(os.devnull, "w"), OSError(errno.EBADF, "it is closed")  # noqa: SIM115
+        elif isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # characters that its encoding lacks, as in names of files
+        self._stream = stream
 
-def _lasting(stream: TextIO) -> TextIO:
-    if not isinstance(stream, io.TextIOWrapper):
-        return stream
-    stream.reconfigure(errors="backslashreplace")
-    raw = getattr(stream.buffer, "raw", stream.buffer)  # the second one below python -u
-    if type(raw) is not io.FileIO or not raw.isatty():  # Windows has another class for its console
-        return stream
-    terminal = io.BufferedWriter(_Terminal(os.dup(raw.fileno()), "w"))
-    return io.TextIOWrapper(terminal, stream.encoding, stream.errors, line_buffering=True)
+    def write(self, text: str) -> int:
+        return self._try(lambda: self._stream.write(text)) or 0
 
+    def flush(self) -> None:
+        self._try(self._stream.flush)
 
-class _Terminal(io.FileIO):
-    def write(self, data: ReadableBuffer, /) -> int:
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def _try(self, call: Callable[[], int | None]) -> int | None:
         try:
-            return super().write(data)
+            return call()
         except OSError as error:
-            if error.errno != errno.EIO:
-                raise
-            return memoryview(data).nbytes
+            self.error = error
+            with open(os.devnull, "w") as nowhere:  # Python flushes what is left again when it exits
+                os.dup2(nowhere.fileno(), self._stream.fileno())
+            return None
+
+
+@contextmanager
+def unbreakable_streams() -> Iterator[None]:
+    """Within the block sys.stdout and sys.stderr are Streams."""
+    for number in range(3):  # a file that is opened later must not get the number of a closed stream
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)
+    before = sys.stdout, sys.stderr
+    out, err = streams = Stream(sys.stdout), Stream(sys.stderr)
+    sys.stdout, sys.stderr = streams  # type: ignore[assignment]
+    try:
+        yield
+    finally:
+        out.flush()
+        err.flush()
+        sys.stdout, sys.stderr = before
+
+
+def check_printed() -> None:
+    """Refuses a stdout that did not take all that was printed."""
+    sys.stdout.flush()
+    if error := getattr(sys.stdout, "error", None):  # not of a redirected one
+        raise ClodError(f"stdout cannot be written ({error.strerror or error}), so the result is lost; open it")

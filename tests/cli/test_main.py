@@ -44,13 +44,6 @@ def test_torch_is_imported_with_idle_threads_and_the_collector_on() -> None:
     assert done.stdout.split()[0] == "PASSIVE"
 
 
-def test_closed_pipe(spawn: Any, capture: Any, tmp_path: Path) -> None:
-    process = spawn("eval", capture.ply, "--images", capture.scene, cwd=tmp_path)
-    process.stdout.close()
-    assert "Traceback" not in process.stderr.read()
-    assert process.wait(timeout=60) == 1
-
-
 def test_ctrl_c_within_compiled_code(clod: Any, capture: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """Numba's dispatcher raises a SystemError from it; other SystemErrors are bugs."""
     for cause, code, last in ((KeyboardInterrupt(), 130, "clod-adapt: interrupted"), (None, 1, "please report it")):
@@ -101,10 +94,3 @@ def test_a_misspelt_command_is_suggested(clod: Any, tmp_path: Path, word: str, c
     assert done.code == 2 and f"{word}: no such file or command; did you mean clod-adapt {command}?\n" in done.err
     (tmp_path / word).touch()
     assert "did you mean" not in clod(word).err  # a file
-
-
-def test_a_pipe_that_is_closed_before_the_error(spawn: Any, tmp_path: Path) -> None:
-    process = spawn("inspect", "missing.ply", "--json", cwd=tmp_path)
-    process.stdout.close()
-    assert "Traceback" not in (said := process.stderr.read()) and "missing.ply" in said
-    assert process.wait(timeout=60) == 2
