@@ -39,6 +39,7 @@ from .shared.streams import check_printed, unbreakable_streams
 
 PROG = "clod-adapt"
 INTERRUPTED = 130  # exit code
+LONGEST = 10_000  # characters of an error; a word of the command line may have more
 NEAR = 0.75  # similarity of a misspelt command: two neighbouring letters exchanged in "view" have it
 REPORT = "please report it, with the lines above, as an issue of this program's repository"
 
@@ -66,6 +67,7 @@ def main(argv: list[str] | None = None) -> int:
 
 def refuse(why: str, code: int, words: list[str]) -> int:
     """Prints why a command failed, with --json also as the one object on stdout; returns the exit code."""
+    why = why if len(why) <= LONGEST else f"{why[:LONGEST]} ..."
     line = f"{PROG}: {why}" if code == INTERRUPTED else f"{PROG}: error: {why}"
     if sys.stderr.isatty():
         from .shared.console import folded

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import re
 import sys
 from io import BufferedReader
 from pathlib import Path
@@ -61,6 +62,16 @@ def refuse_irregular(path: Path, remedy: str = "give the name of a file") -> Non
     """
     if path.exists() and not path.is_file():
         raise ClodError(f"{path}: cannot be read (it is not a regular file); {remedy}")
+
+
+def refuse_long_numbers(path: Path, text: bytes) -> None:
+    """Refuses a number of a thousand digits, of which parsers make copies.
+
+    Raises:
+        ClodError: ``text``, of ``path``, has one.
+    """
+    if re.search(rb"\d{1000}", text):
+        raise ClodError(f"{path}: is damaged (a number of more than 1,000 digits); copy or export it again")
 
 
 def read_start(path: Path, size: int = 64) -> bytes:

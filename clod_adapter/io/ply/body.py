@@ -10,7 +10,7 @@ import io
 import itertools
 import os
 import warnings
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -130,7 +130,8 @@ def _least_bytes(element: PlyElement, text: bool) -> int:
 
 def _read_text(path: Path, file: io.BufferedReader, head: Head, wanted: Collection[str]) -> dict[str, np.ndarray]:
     found = dict[str, np.ndarray]()
-    lines = io.TextIOWrapper(file, "ascii")
+    text = io.TextIOWrapper(file, "ascii")
+    lines = _lines(text)
     with warnings.catch_warnings(action="ignore"), np.errstate(over="ignore"):  # of blank lines, or none at all
         for element, count in zip(head.ply, head.counts, strict=True):
             if element.name in wanted:
@@ -142,8 +143,16 @@ def _read_text(path: Path, file: io.BufferedReader, head: Head, wanted: Collecti
             else:
                 for _ in itertools.islice(lines, count):
                     pass
-    lines.detach()
+    text.detach()
     return found
+
+
+def _lines(text: io.TextIOWrapper) -> Iterator[str]:
+    """The lines, none too long: a number of any length would be copied several times."""
+    while line := text.readline(_PIECE):
+        if len(line) == _PIECE:
+            raise ValueError(f"a row of more than {_PIECE:,} characters")
+        yield line
 
 
 def _read_binary(path: Path, file: io.BufferedReader, head: Head, wanted: Collection[str]) -> dict[str, np.ndarray]:

@@ -100,6 +100,9 @@ def write_model(
 
 def _posed_image(model: Path, image: pycolmap.Image) -> PosedImage:
     assert image.camera is not None  # a Reconstruction gives every image its camera
-    viewmat = np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]])
+    pose = image.cam_from_world()
+    viewmat = np.vstack([pose.matrix(), [0, 0, 0, 1]])
+    if hasattr(pose, "rotation") and not np.linalg.norm(pose.rotation.quat) > 0.5:
+        viewmat[:3, :3] = np.nan  # pycolmap takes a quaternion of no length for no rotation; colmap_plain gives NaN
     # A copy, as the image's own is part of the whole reconstruction and keeps it in memory.
     return check_posed(PosedImage(image.name, viewmat, copy(image.camera)), model)

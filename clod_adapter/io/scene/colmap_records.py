@@ -7,7 +7,7 @@ from pathlib import Path
 
 from clod_adapter.errors import ClodError
 from clod_adapter.io.scene.colmap_library import pycolmap
-from clod_adapter.io.sniff import refuse_irregular
+from clod_adapter.io.sniff import refuse_irregular, refuse_long_numbers
 
 
 def check_records(model: Path) -> None:
@@ -18,14 +18,11 @@ def check_records(model: Path) -> None:
     """
     for name, after in _RECORDS.items():
         path = model / name
-        for other in (path, path.with_suffix(".txt")):
-            refuse_irregular(other, "copy the model again")
-        if not path.is_file():
+        text = path.with_suffix(".txt")
+        if data := _content(text):
+            refuse_long_numbers(text, data)
+        if not (data := _content(path)) and not path.exists():
             continue
-        try:
-            data = path.read_bytes()
-        except OSError as error:
-            raise ClodError(f"{path}: cannot be read ({error.strerror or error}); check the path") from error
         try:
             at = 8
             for _ in range(struct.unpack_from("<Q", data)[0]):
@@ -34,6 +31,15 @@ def check_records(model: Path) -> None:
             at = len(data) + 1
         if at > len(data):
             raise ClodError(f"{path}: is truncated or damaged; copy or export the model again")
+
+
+def _content(path: Path) -> bytes:
+    """The file's bytes; none where there is no file."""
+    refuse_irregular(path, "copy the model again")
+    try:
+        return path.read_bytes() if path.is_file() else b""
+    except OSError as error:
+        raise ClodError(f"{path}: cannot be read ({error.strerror or error}); check the path") from error
 
 
 def _count(data: bytes, at: int) -> int:

@@ -18,6 +18,7 @@ from clod_adapter.io.scene.colmap_library import pycolmap
 from clod_adapter.io.scene.folder import name_parts
 from clod_adapter.io.scene.images import image_size
 from clod_adapter.io.scene.posed import PosedImage, check_posed
+from clod_adapter.io.sniff import refuse_long_numbers
 
 DATAPARSER = "dataparser_transforms.json"  # nerfstudio's: the frame it trained in
 MAX_BYTES = 256 * 2**20  # a hundred thousand frames have a tenth of that
@@ -84,7 +85,9 @@ def read_json(path: Path) -> Any:
     try:
         if path.stat().st_size > MAX_BYTES:
             raise ClodError(f"{path}: is larger than {MAX_BYTES >> 20} MB, so it is no list of cameras; check the path")
-        return json.loads(path.read_bytes())
+        text = path.read_bytes()
+        refuse_long_numbers(path, text)
+        return json.loads(text)
     except OSError as error:
         raise ClodError(f"{path}: cannot be read ({error.strerror or error}); check the path") from error
     except (ValueError, RecursionError) as error:

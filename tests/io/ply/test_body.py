@@ -167,3 +167,15 @@ def test_malformed_files_are_refused(tmp_path: Path, content: bytes, message: st
     (tmp_path / "in.ply").write_bytes(content)
     with pytest.raises(ClodError, match=message):
         load(tmp_path / "in.ply")
+
+
+def test_a_row_of_any_length_is_not_copied(tmp_path: Path) -> None:
+    path = tmp_path / "in.ply"
+    path.write_bytes(header("ascii", 1) + b"0 " * 16 + b"1" * (1 << 23))
+    tracemalloc.start()
+    try:
+        with pytest.raises(ClodError, match="in.ply: damaged or truncated .a row of more than"):
+            load(path)
+        assert tracemalloc.get_traced_memory()[1] < 1 << 23
+    finally:
+        tracemalloc.stop()

@@ -134,6 +134,21 @@ def test_empty_and_damaged_models_are_refused(tmp_path: Path) -> None:
     (tmp_path / "sparse" / "0" / "images.txt").write_text("1 nonsense\n\n")
     with pytest.raises(ClodError, match="COLMAP cannot read this model"):
         load_scene(tmp_path)
+    (tmp_path / "sparse" / "0" / "cameras.txt").write_text(f"1 PINHOLE 40 30 {'1' * 10_000} 33 20 15\n")
+    with pytest.raises(ClodError, match="cameras.txt: .*a number of more than 1,000 digits"):
+        load_scene(tmp_path)
+
+
+@pytest.mark.usefixtures("library")
+def test_a_quaternion_of_zeros_is_refused(tmp_path: Path) -> None:
+    """COLMAP reads it as no rotation."""
+    write_scene(tmp_path, 2)
+    for name, at in (("images.bin", 12), ("frames.bin", 16)):
+        if (path := tmp_path / "sparse" / "0" / name).exists():
+            data = path.read_bytes()
+            path.write_bytes(data[:at] + bytes(32) + data[at + 32 :])
+    with pytest.raises(ClodError, match=r"sparse/0: image '.*png' has a camera or pose that is not usable"):
+        load_scene(tmp_path)
 
 
 @pytest.mark.parametrize(

@@ -193,7 +193,8 @@ def test_invalid_frame_is_named(tmp_path: Path, change: dict[str, Any], message:
     ("content", "message"),
     [
         *((content, "no JSON or damaged") for content in (
-            b"", b'{"frames": [', b"\xff\xfe\x00", b"[" * 100_000, b'{"frames": ' + b"9" * 10_000 + b"}")),
+            b"", b'{"frames": [', b"\xff\xfe\x00", b"[" * 100_000)),
+        (b'{"frames": ' + b"9" * 10_000 + b"}", "a number of more than 1,000 digits"),
         *((content, "no list of frames") for content in (b"[]", b"3", b'{"frames": []}', b'{"frames": {}}')),
         (b'{"frames": [3]}', "frame 0 has no file_path"), (b"{", "is larger than 256 MB"),
     ],
