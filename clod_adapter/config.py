@@ -204,7 +204,7 @@ class AdaptConfig:
             require(not isinstance(value, float) or math.isfinite(value), name, value, "finite")
         require(self.max_sv >= 1, "max_sv", self.max_sv, "at least 1")
         require(self.iters is None or self.iters >= 0, "iters", self.iters, "at least 0")
-        require(self.batch >= 1, "batch", self.batch, "at least 1")
+        require(1 <= self.batch <= 4096, "batch", self.batch, "between 1 and 4096")
         require(0 <= self.seed < 2**63, "seed", self.seed, "at least 0 and below 2^63")
         require(self.time_budget is None or self.time_budget > 0, "time_budget", self.time_budget, "positive seconds")
         require(0.5 < self.share <= 1, "start_share", self.start_share, "above 0.5 and at most 1")

@@ -67,7 +67,7 @@ class ProcessGroup:
 
     def sum(self, own: GradientSum) -> GradientSum:
         """The sum over all processes; overwrites the gradients given."""
-        loss = torch.tensor([float(own.loss)], dtype=torch.float64)
+        loss = torch.tensor([float(own.loss), own.views], dtype=torch.float64)
         self._meet(loss)
         gradients = {name: gradient.contiguous() for name, gradient in own.gradients.items()}
         kept = own.kept.to(torch.uint8)
@@ -80,7 +80,7 @@ class ProcessGroup:
                 work.wait()
             if kept.is_cuda:
                 torch.cuda.synchronize()  # NCCL's own wait returns at once
-        return GradientSum(gradients, kept.bool(), loss[0])
+        return GradientSum(gradients, kept.bool(), loss[0], int(loss[1]))
 
     def once(self, compute: Callable[[Listener], T], progress: Listener | None = None) -> T:
         """What ``compute`` returns in the first process, which alone calls it; in the others with tensors on the CPU.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -171,7 +172,7 @@ def _train(trainer: Trainer, progress: Listener | None) -> Adapted:
                     share, going = group.agree(share, going)
                 if share >= 1 or not going:
                     break
-                _step(trainer, share, progress)
+                _step(trainer, share, progress, began + (trainer.config.time_budget or math.inf))
                 trainer.seconds = time.perf_counter() - began
                 interrupt.begin()  # from here on there is a result
                 going = _tell(trainer, progress) and not interrupt.received
@@ -194,10 +195,10 @@ def _train(trainer: Trainer, progress: Listener | None) -> Adapted:
     return replace(adapted, interrupted=adapted.interrupted or interrupt.received, signalled=interrupt.received)
 
 
-def _step(trainer: Trainer, share: float, progress: Listener | None) -> None:
+def _step(trainer: Trainer, share: float, progress: Listener | None, until: float) -> None:
     """One step; an error of it that nothing handles is told to the listener first, so that it can save the state."""
     try:
-        trainer.step(share)
+        trainer.step(share, until)
     except (ProcessLost, LossNotFinite):
         raise
     except Exception as error:

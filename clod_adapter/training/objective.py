@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import reduce
 from typing import Any
 
 import torch
@@ -57,15 +57,17 @@ class GradientSum:
         gradients: by name of the trained parameter, of its first ``trained`` rows.
         kept: ``[trained]`` bool, the rows that at least one rendering kept.
         loss: 0-d float64, photometric loss of each view, summed.
+        views: their number.
     """
 
     gradients: dict[str, Tensor]
     kept: Tensor
     loss: Tensor
+    views: int = 1
 
     def __add__(self, other: GradientSum) -> GradientSum:
         gradients = {name: mine + other.gradients[name] for name, mine in self.gradients.items()}
-        return GradientSum(gradients, self.kept | other.kept, self.loss + other.loss)
+        return GradientSum(gradients, self.kept | other.kept, self.loss + other.loss, self.views + other.views)
 
 
 @dataclass(frozen=True)
@@ -120,9 +122,16 @@ class Objective:
         sigma = sigma_d.detach().float().clamp(*SIGMA_RANGE)
         return sigma if self.config.parameter == "linear" else sigma.log()
 
-    def gradient_sum(self, parameters: dict[str, Tensor], samples: Sequence[Sample]) -> GradientSum:
-        """The gradients summed over the samples."""
-        return reduce(GradientSum.__add__, (self._of_view(parameters, sample) for sample in samples))
+    def gradient_sum(
+        self, parameters: dict[str, Tensor], samples: Sequence[Sample], until: float = math.inf
+    ) -> GradientSum:
+        """The gradients summed over the samples: the first, and those begun before ``until`` (``perf_counter``)."""
+        found = self._of_view(parameters, samples[0])
+        for sample in samples[1:]:
+            if time.perf_counter() >= until:
+                break
+            found += self._of_view(parameters, sample)
+        return found
 
     def _of_view(self, parameters: dict[str, Tensor], sample: Sample) -> GradientSum:
         """Renders one view at its dial value, and differentiates the weighted loss."""

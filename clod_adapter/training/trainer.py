@@ -87,8 +87,11 @@ class Trainer:
         self.gate = Gate(self, watched, bool(set(map(id, watched)) & set(map(id, views)))) if watched else None
 
     @torch_on_one_thread()
-    def step(self, share_done: float) -> None:
+    def step(self, share_done: float, until: float = math.inf) -> None:
         """Samples views and dial values, sums the gradients of their losses, and updates the parameters once.
+
+        Args:
+            until: as for ``Objective.gradient_sum``: the step has fewer views if the time is over.
 
         Raises:
             LossNotFinite, or any error of the rasterizer: nothing has changed.
@@ -102,11 +105,12 @@ class Trainer:
         numbers = range(self.done * self.config.batch, (self.done + 1) * self.config.batch)
         samples = [self.sampler.draw(number, share_done) for number in numbers]
         try:  # if it fails, the next step samples the same views again
-            found = self.objective.gradient_sum(self.parameters, self.group.share(samples) if self.group else samples)
+            own = self.group.share(samples) if self.group else samples
+            found = self.objective.gradient_sum(self.parameters, own, until)
             found = self.group.sum(found) if self.group else found
             self._updating = True
             self._update(found, share_done)
-            loss = float(found.loss) / self.config.batch  # the host waits for a GPU, as else only gsplat does
+            loss = float(found.loss) / found.views  # the host waits for a GPU, as else only gsplat does
             if not math.isfinite(loss):
                 self._updating = False
                 names = ", ".join(view.camera.name or "a view without a name" for view, *_ in samples)

@@ -219,6 +219,8 @@ def test_time_budget_ends_training(captured: Pair) -> None:
     assert adapt(*captured, config_of(iters=3, time_budget=60.0)).steps == 3
     result = adapt(*captured, config, None, replace(states[3], seconds=0.28))
     assert 3 < result.steps < 10_000 and 0.3 <= result.seconds < 5
+    result = adapt(*captured, config_of(batch=4096, time_budget=0.3))  # within the first step
+    assert result.steps == 1 and 0.3 <= result.seconds < 3 and result.gaussians.sigma_d.isfinite().all()
 
 
 def test_a_listener_that_stops_returns_the_result_so_far(captured: Pair) -> None:
