@@ -34,7 +34,7 @@ from .commands.view import VIEW
 from .shared.interrupts import interrupt_as_stopped, signals_as_interrupt
 from .shared.launch import launched, silence_but_first
 from .shared.outputs import claimed
-from .shared.shortages import check_addresses, shortage
+from .shared.shortages import check_surroundings, shortage
 from .shared.streams import check_printed, unbreakable_streams
 
 PROG = "clod-adapt"
@@ -130,6 +130,7 @@ def run(command: Command, args: argparse.Namespace) -> int:
     """
     from .shared.report import jsonable
 
+    check_surroundings()
     if args.json:
         check_printed()
     command.check(args)
@@ -149,7 +150,6 @@ def import_command(command: Command, args: argparse.Namespace) -> Any:
     """The command's module; importing it, with torch, takes a second or two."""
     from .shared.console import Console
 
-    check_addresses()
     name = f"{__package__}.{command.module}"
     if name in sys.modules:
         return sys.modules[name]

@@ -21,6 +21,15 @@ class Parser(argparse.ArgumentParser):
 
     general: Any
 
+    def parse_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Refuses empty values too: Path takes one for the current folder, and ``or`` for none."""
+        found = super().parse_args(args, namespace)
+        for action in self._actions:
+            value = getattr(found, action.dest, None)
+            if "" in (value if isinstance(value, list) else [value]):
+                self.error(f"argument {'/'.join(action.option_strings) or action.metavar}: is empty")
+        return found
+
     def error(self, message: str) -> NoReturn:
         raise ClodError(f"{message} (see {self.prog} --help)")
 

@@ -1,8 +1,9 @@
-"""Recognizes the errors of the libraries for exhausted memory or threads."""
+"""Surroundings in which the libraries cannot work, and their errors for exhausted memory or threads."""
 
 from __future__ import annotations
 
 import errno
+import os
 import sys
 
 from clod_adapter.blocks.memory import in_words
@@ -17,11 +18,18 @@ MESSAGES = (
 LLVM = "libllvmlite"  # reported as not found where it could not be mapped
 
 
-def check_addresses() -> None:
-    """Refuses a limit of the address space (``ulimit -v``) that is too small for the libraries.
+def check_surroundings() -> None:
+    """Refuses what makes libraries abort the process, or raise an error of their own.
 
-    Some of them abort the process without a message where they cannot map their memory.
+    That is a current folder that was deleted, and a limit of the address space (``ulimit -v``) that is too small.
+    Variables of what is not used here, numba's threads and matplotlib's windows, are removed.
     """
+    for name in ("NUMBA_NUM_THREADS", "MPLBACKEND"):
+        os.environ.pop(name, None)
+    try:
+        os.getcwd()
+    except FileNotFoundError as error:
+        raise ClodError("the current folder was deleted; change to another one") from error
     limit = address_limit()
     if limit is not None and limit < ADDRESSES:
         raise ClodError(
