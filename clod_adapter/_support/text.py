@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import os
+from typing import Any
 
 
 def as_text(name: str) -> str:
@@ -26,3 +28,8 @@ def file_name(text: str) -> str:
 def first_line(error: BaseException) -> str:
     """The first line of an error's message that is not blank."""
     return next((line.strip() for line in str(error).splitlines() if line.strip()), "no message")
+
+
+def script_json(value: Any) -> str:
+    """JSON without <, so that no text in it can end an HTML script element, or begin a comment in it."""
+    return json.dumps(value, allow_nan=False, ensure_ascii=False).replace("<", "\\u003c")

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import base64
 import io
-import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
@@ -18,7 +17,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from clod_adapter._support.text import as_text
+from clod_adapter._support.text import as_text, script_json
 from clod_adapter.io.atomic import atomic_path
 
 WIDEST = 1000  # pixels; wider pictures are scaled down
@@ -47,8 +46,6 @@ def write_page(path: str | Path, title: str, kicker: str, body: Iterable[str], d
     """
     source = files("clod_adapter.report")
     style, script = ((source / name).read_text(encoding="utf-8") for name in ("style.css", "dial.js"))
-    # "</" would end the script element.
-    rows = json.dumps(data, allow_nan=False, ensure_ascii=False).replace("</", "<\\/")
     page = f"""<!doctype html>
 <html lang="en">
 <head>
@@ -63,7 +60,7 @@ def write_page(path: str | Path, title: str, kicker: str, body: Iterable[str], d
 <main>
 {"".join(body)}
 </main>
-<script type="application/json" id="data">{rows}</script>
+<script type="application/json" id="data">{script_json(data)}</script>
 <script type="module">
 {script}</script>
 </body>

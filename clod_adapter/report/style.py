@@ -29,6 +29,7 @@ STYLE: dict[Any, Any] = {
     "xtick.color": QUIET,
     "ytick.color": QUIET,
     "font.size": 9,
+    "text.parse_math": False,  # names of files may have a $
     "svg.fonttype": "none",  # keeps text as text in a page
 }
 

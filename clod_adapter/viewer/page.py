@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import base64
 import hashlib
-import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+from clod_adapter._support.text import script_json
 from clod_adapter.cameras import Camera
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.checkpoint import Checkpoint
@@ -113,11 +113,6 @@ def _document(config: Mapping[str, Any], data: Iterable[bytes], meta: str) -> It
         yield before.encode()
         yield from pieces
     yield rest.encode()
-
-
-def script_json(value: Any) -> str:
-    """JSON without <, so that no text in it can end the script element."""
-    return json.dumps(value, allow_nan=False, ensure_ascii=False).replace("<", "\\u003c")
 
 
 def _elements(data: Mapping[str, Iterable[bytes]]) -> Iterator[bytes]:

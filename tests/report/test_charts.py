@@ -18,7 +18,7 @@ from clod_adapter.report.series import Series
 from clod_adapter.report.style import new_figure, shades
 
 DIAL = Series("dial", [{"virtual_scale": s, "psnr": 30 - s, "frame_ms": 20 / s} for s in (1.0, 2.0, 4.0)], dial=True)
-BASE = Series("base & co", [{"virtual_scale": 1.0, "psnr": 29.5, "frame_ms": 25.0}])
+BASE = Series(r"base & $\co$", [{"virtual_scale": 1.0, "psnr": 29.5, "frame_ms": 25.0}])
 CURVES = [{"label": "s = 1", "points": [{"seconds": 2.0**k, "psnr": 20.0 + k} for k in range(6)]}]
 
 
@@ -68,7 +68,7 @@ def test_svg_has_the_pages_colours_and_fonts() -> None:
     assert root.get("viewBox") and root.get("width") is None and root.get("aria-label") == "a chart"
     assert {"var(--ink)", "var(--quiet)", "var(--series-1)", "var(--series-2)"} <= set(re.findall(r"var\([^)]*\)", svg))
     assert not re.findall(r"#(?!000000|ffffff)[0-9a-f]{6}", svg) and "DejaVu" not in svg
-    assert "base &amp; co" in svg
+    assert "base &amp; $\\co$" in svg
     for count in (1, 2, 5):  # from light to dark
         sums = [sum(bytes.fromhex(colour[1:])) for colour in shades(count)]
         assert len(sums) == count and sums == sorted(sums, reverse=True) and len(set(sums)) == count
