@@ -134,7 +134,7 @@ def render(
 
 def _behind(gaussians: Gaussians, background: Tensor | None) -> Tensor:
     if background is None:
-        return torch.zeros(3, device=gaussians.means.device)
+        return torch.zeros(3, dtype=torch.float32, device=gaussians.means.device)
     if background.shape != (3,):
         raise ClodError(f"background is {tuple(background.shape)} and must be (3,)")
     return background

@@ -125,7 +125,7 @@ def divide(
             f"the checkpoint's dial has the normaliser {initial.attenuation.normalizer}, whose distances depend on all "
             "Gaussians in view: it cannot be trained in blocks; adapt it whole"
         )
-    block, seen = split(initial.means, count), torch.empty(len(views), count)
+    block, seen = split(initial.means, count), torch.empty(len(views), count, dtype=torch.float32)
     for k, view in enumerate(views):
         shown = coverage(initial, initial.opacities, reduced(view.camera)).double()
         seen[k] = (shown.new_zeros(count).index_add_(0, block.long(), shown) / shown.sum().clamp(min=1e-9)).float()

@@ -113,7 +113,7 @@ def camera_of(viewpoint: Viewpoint, width: int, height: int, name: str = "") -> 
     viewmat[:3, :3] = torch.stack([torch.linalg.cross(look, up), -up, look])
     viewmat[:3, 3] = -viewmat[:3, :3] @ torch.tensor([v.x, v.y, v.z], dtype=torch.float64)
     focal = 0.5 * height / math.tan(0.5 * v.fov)
-    K = torch.tensor([[focal, 0, 0.5 * width], [0, focal, 0.5 * height], [0, 0, 1.0]])
+    K = torch.tensor([[focal, 0, 0.5 * width], [0, focal, 0.5 * height], [0, 0, 1.0]], dtype=torch.float32)
     return Camera(viewmat.float(), K, width, height, name)
 
 

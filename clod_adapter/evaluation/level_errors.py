@@ -78,7 +78,7 @@ def _toward(target: np.ndarray, viewpoint: Viewpoint) -> Camera:
     viewmat, focal = np.eye(4), WIDTH / 2 / np.tan(np.radians(FIELD) / 2)
     viewmat[:3, :3] = right, np.cross(forward, right), forward
     viewmat[:3, 3] = -viewmat[:3, :3] @ place
-    K = torch.tensor([[focal, 0, WIDTH / 2], [0, focal, HEIGHT / 2], [0, 0, 1]])
+    K = torch.tensor([[focal, 0, WIDTH / 2], [0, focal, HEIGHT / 2], [0, 0, 1]], dtype=torch.float32)
     return Camera(torch.from_numpy(viewmat).float(), K.float(), WIDTH, HEIGHT)
 
 

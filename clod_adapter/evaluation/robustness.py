@@ -128,7 +128,7 @@ def distribution(gaussians: Gaussians) -> dict[str, Any]:
 
 
 def _histogram(values: Tensor, edges: Sequence[float]) -> dict[str, list[float]]:
-    inner = torch.tensor(edges[1:-1])
+    inner = torch.tensor(edges[1:-1], dtype=torch.float32)
     counts = torch.bincount(torch.bucketize(values.detach().cpu().float(), inner, right=True), minlength=len(edges) - 1)
     return {"edges": list(edges), "shares": (counts / max(len(values), 1)).tolist()}
 

@@ -210,7 +210,7 @@ def sigma_from_importance(
         share: of all Gaussians, kept at s = 1; in (0.5, 1].
     """
     rank, order = torch.empty_like(distances), importance.argsort(descending=True, stable=True)
-    rank[order] = (torch.arange(len(rank), device=rank.device) + 0.5) / len(rank)
+    rank[order] = (torch.arange(len(rank), dtype=rank.dtype, device=rank.device) + 0.5) / len(rank)
     power = (1 / rank + (rank**-2 - 4 * (1 / share - 1)).clamp(min=0).sqrt()) / 2
     extinction = torch.where(rank <= share, power ** (1 / exponent), share / rank)
     return sigma_for_extinction(gaussians.opacity_logits, distances, extinction, config)

@@ -99,4 +99,4 @@ def _intrinsics(settings: Any) -> Tensor:
     """``[3, 3]`` in pixels, with the principal point in the middle of the image."""
     width, height = settings.image_width, settings.image_height
     fx, fy = width / (2 * settings.tanfovx), height / (2 * settings.tanfovy)
-    return torch.tensor([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1]])
+    return torch.tensor([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1]], dtype=torch.float32)

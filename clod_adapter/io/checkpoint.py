@@ -100,6 +100,7 @@ class Checkpoint:
         return Hook(own.sigma_d, own.attenuation, virtual_scale, own.growth_d)
 
 
+@torch.inference_mode(False)  # training takes no inference tensors
 def load(path: str | Path, *, activated: Activated | None = None, origin: Origin | None = None) -> Checkpoint:
     """Reads a checkpoint of plain Gaussians; the suffix decides the format (``file_formats.FORMATS``).
 

@@ -31,12 +31,12 @@ def view_of(camera: Any) -> View:
     """
     pose = camera.camera_to_worlds.reshape(-1, 3, 4)[0].detach().cpu().float()
     rotation = pose[:, :3] * pose.new_tensor([1.0, -1.0, -1.0])
-    viewmat = torch.eye(4)
+    viewmat = torch.eye(4, dtype=torch.float32)
     viewmat[:3, :3], viewmat[:3, 3] = rotation.T, -rotation.T @ pose[:, 3]
     fx, fy, cx, cy, width, height = (
         float(getattr(camera, name).flatten()[0]) for name in ("fx", "fy", "cx", "cy", "width", "height")
     )
-    K = torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    K = torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]], dtype=torch.float32)
     found = Camera(viewmat, K, int(width), int(height))
     return StoredView(found, lambda: torch.zeros(found.height, found.width, 3, dtype=torch.uint8))
 

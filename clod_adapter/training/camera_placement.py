@@ -51,6 +51,8 @@ class Candidate:
     score: float
 
 
+@torch.inference_mode(False)
+@torch.enable_grad()
 def place_cameras(
     gaussians: Gaussians,
     *,
@@ -163,8 +165,8 @@ def _towards(
     ends = interest.double().cumsum(0).cpu()  # cameras are placed on the CPU
     drawn = torch.searchsorted(ends, torch.rand(count, generator=generator, dtype=torch.float64) * ends[-1])
     targets = means[drawn.clamp(max=len(means) - 1).to(means.device)].cpu()
-    sides = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=1)
-    away = reach * 2 ** (2 * torch.rand(count, 1, generator=generator) - 1)
+    sides = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator, dtype=torch.float32), dim=1)
+    away = reach * 2 ** (2 * torch.rand(count, 1, generator=generator, dtype=torch.float32) - 1)
     return [_looking(eye, target, zoom) for eye, target in zip(targets + away * sides, targets, strict=True)]
 
 
@@ -172,7 +174,7 @@ def _beside(
     candidates: list[Candidate], count: int, reach: float, zoom: float, generator: torch.Generator
 ) -> list[Camera]:
     """Cameras with random offsets of position and direction from the candidates, each in turn."""
-    steps = STEP * torch.randn(count, 2, 3, generator=generator)
+    steps = STEP * torch.randn(count, 2, 3, generator=generator, dtype=torch.float32)
     cameras = []
     for k in range(count):
         camera = candidates[k % len(candidates)].camera
@@ -202,19 +204,19 @@ def _spread(candidates: list[Candidate], count: int, reach: float) -> list[Candi
 def _looking(eye: Tensor, target: Tensor, zoom: float) -> Camera:
     """A camera for scoring. The up direction is unknown; COLMAP's y axis usually points down."""
     forward = torch.nn.functional.normalize(target - eye, dim=0)
-    down = torch.tensor([0.0, 1.0, 0.0]) if abs(float(forward[1])) < 0.99 else torch.tensor([0.0, 0.0, 1.0])
+    down = torch.tensor([0.0, 1.0, 0.0] if abs(float(forward[1])) < 0.99 else [0.0, 0.0, 1.0], dtype=torch.float32)
     right = torch.nn.functional.normalize(torch.linalg.cross(down, forward), dim=0)
-    viewmat = torch.eye(4)
+    viewmat = torch.eye(4, dtype=torch.float32)
     viewmat[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward])
     viewmat[:3, 3] = -viewmat[:3, :3] @ eye
     width, height = LOOK
-    K = torch.tensor([[zoom * width, 0, width / 2], [0, zoom * width, height / 2], [0, 0, 1.0]])
+    K = torch.tensor([[zoom * width, 0, width / 2], [0, zoom * width, height / 2], [0, 0, 1.0]], dtype=torch.float32)
     return Camera(viewmat, K, width, height, near=near_plane(float((target - eye).norm())))
 
 
 def _resized(camera: Camera, width: int, height: int, number: int) -> Camera:
     focal = float(camera.K[0, 0]) / camera.width * width
-    K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
+    K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]], dtype=torch.float32)
     return Camera(camera.viewmat, K, width, height, f"placed_{number:03}", camera.near)
 
 

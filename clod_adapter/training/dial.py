@@ -201,6 +201,8 @@ class Dial(nn.Module):
             self.growth_d.clamp_(*GROWTH_RANGE)
 
 
+@torch.inference_mode(False)
+@torch.enable_grad()
 def attach(
     splats: Splats, scene: Scene | Sequence[View] | Sequence[Camera], config: AdaptConfig | None = None,
     progress: Listener | Literal[False] | None = None, **settings: Any,

@@ -144,7 +144,7 @@ class ProcessGroup:
         """Waits for all processes and reduces a few numbers, on the CPU: gloo reports a lost process at once."""
         began = time.perf_counter()
         with _losses():
-            dist.all_reduce(torch.zeros(1) if said is None else said, getattr(dist.ReduceOp, how))
+            dist.all_reduce(torch.zeros(1, dtype=torch.float32) if said is None else said, getattr(dist.ReduceOp, how))
         self.waiting += time.perf_counter() - began
 
     @contextmanager

@@ -28,6 +28,8 @@ from clod_adapter.training.trainer import Trainer
 __all__ = ["Adapted", "Progress", "TrainingState", "adapt"]
 
 
+@torch.inference_mode(False)
+@torch.enable_grad()
 def adapt(
     base: Gaussians,
     scene: Scene,

@@ -191,7 +191,7 @@ class Objective:
             **attributes, sigma_d=sigma, attenuation=self.attenuation, growth_d=growth_d, screen_filter=screen_filter
         )
         kept = cpu.kept(shown, camera, s)[: self.trained]
-        return cpu.draw(shown, camera, s, torch.zeros(3), trained=self.trained)[0], kept, None
+        return cpu.draw(shown, camera, s, torch.zeros(3, dtype=torch.float32), trained=self.trained)[0], kept, None
 
     def _rendered_plain(
         self, leaves: dict[str, Tensor], camera: Camera, s: float, screen_filter: ScreenFilter

@@ -34,7 +34,7 @@ class RowAdam:
         units: dict[str, Tensor] | None = None,
     ):  # fmt: skip
         self.parameters = parameters
-        one = torch.ones(1)
+        one = torch.ones(1, dtype=torch.float32)
         self._units = {name: (units or {}).get(name, one.to(p.device)) for name, p in parameters.items()}
         self.beta1, self.beta2, self.epsilon = beta1, beta2, epsilon
         self._moments = {name: (_zeros(p), _zeros(p)) for name, p in parameters.items()}

@@ -29,6 +29,8 @@ VIEWS = 8  # evenly spread training views on which that is measured
 REQUESTED = "as requested, not measured"
 
 
+@torch.inference_mode(False)
+@torch.enable_grad()
 def make_plan(
     base: Gaussians,
     scene: Scene,

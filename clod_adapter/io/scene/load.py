@@ -32,6 +32,7 @@ MOST_AT_ONCE = 8  # photographs of full size in memory
 ROOM = Room(1 << 28)  # their pixels in memory, of 4 bytes each while they are decoded
 
 
+@torch.inference_mode(False)  # training takes no inference tensors
 def load_scene(
     folder: str | Path,
     *,
