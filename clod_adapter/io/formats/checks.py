@@ -26,7 +26,7 @@ def check_model(path: Path) -> None:
         refuse(path, start, f"is not a {suffix} file by its first bytes; copy or export it again")
     if suffix == ".spz" and start.startswith(NEW_SPZ):
         check_converted(path, " of version 4")
-    if suffix == ".splat" and path.stat().st_size % 32:
-        raise ClodError(f"{path}: is not a .splat file, whose rows have 32 bytes; copy or export it again")
+    if suffix == ".splat" and (path.stat().st_size % 32 or start.startswith(b"ply")):  # else any bytes are one
+        refuse(path, start, "is not a .splat file, whose rows have 32 bytes; copy or export it again")
     if suffix == ".safetensors" and '"clod-adapter"' in read_tensor_header(path)[1].get(KEY, ""):
         raise ClodError(f"{path}: is an adapter, not a model; clod-adapt apply BASE.ply {path.name} -o OUT.ply")

@@ -3,10 +3,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 
 from clod_adapter.adapter import detach
+from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import SH_C0
+from clod_adapter.io.checkpoint import load
 from clod_adapter.io.file_formats import write
 from clod_adapter.io.formats.splat import load_splat
 from formats import ORIGIN, model, rows_by_place, turned
@@ -44,3 +47,11 @@ def test_losses(tmp_path: Path) -> None:
     rows = rows_by_place(again.means.numpy(), g.means.numpy())
     weights = (g.scales.prod(1) * g.opacities)[rows]
     assert (weights[1:] <= weights[:-1] * (1 + 1e-5)).all()
+
+
+def test_a_ply_is_not_read_as_rows(tmp_path: Path) -> None:
+    write(tmp_path / "a.ply", detach(model(0)))
+    data = (tmp_path / "a.ply").read_bytes()
+    (tmp_path / "a.splat").write_bytes(data + bytes(-len(data) % 32))
+    with pytest.raises(ClodError, match="a.splat: is a PLY file; call it .ply"):
+        load(tmp_path / "a.splat")
