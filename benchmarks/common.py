@@ -6,6 +6,7 @@ import argparse
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -67,8 +68,10 @@ def photographs(scene: str) -> clod.Scene:
 
 
 def commit() -> str:
-    """The commit of the package that is measured, with a + where it or the benchmarks differ from it."""
+    """The commit of the package that is measured, with a + where it or the benchmarks differ; empty without git."""
     checkout = Path(clod.__file__).parents[1]
+    if not shutil.which("git") or not (checkout / ".git").exists():
+        return ""
 
     def git(*words: str) -> str:
         return subprocess.run(["git", *words], cwd=checkout, capture_output=True, text=True, check=True).stdout.strip()
