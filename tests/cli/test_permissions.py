@@ -25,7 +25,7 @@ NO_ROOT = "" if os.geteuid() else "import ctypes; assert ctypes.CDLL(None).unsha
         ("out", 0o555, "out/dial.ply: folder out is not writable; choose another or change its permissions"),
         ("out", 0, "out/dial.ply: folder out is not writable; choose another or change its permissions"),
         ("out/dial.ply", 0o444, "dial.ply: is write-protected; choose another output, or chmod u+w"),
-        (f"out/{STATE}", 0, f"{STATE}: cannot be read (Permission denied); check the path"),
+        (f"out/{STATE}", 0, f"{STATE}: is write-protected; choose another output, or chmod u+w"),
     ],
 )
 def test_files_without_permission(
