@@ -3,7 +3,7 @@
 #   make demo    install and run the demo
 #   make test    install, then lint, format check, types, tests
 #   make docs    install what the documentation needs, and build it as a site in build/docs
-#   make peers   install what some tests compare with and otherwise skip: Node 22 and splat-transform, by npm, 400 MB
+#   make peers   install what some tests compare with and otherwise skip: Node 22, splat-transform, Spark, PlayCanvas; by npm, 400 MB
 #   make clean   remove .venv and everything that was built or cached; what the demo made, in demo/, stays
 #
 # PYTHON    the interpreter that .venv is made from.
@@ -42,8 +42,9 @@ $(VENV)/.installed-%: pyproject.toml constraints.txt | $(BIN)/pip
 	$(BIN)/python -m pip install $(PIP_ARGS) -c constraints.txt -e ".[$*]"
 	touch $@
 
-$(PEERS)/.installed: | $(BIN)/pip
-	npm install --no-fund --no-audit --prefix $(PEERS) node@22.23.3 @playcanvas/splat-transform@3.7.0
+$(PEERS)/.installed: Makefile | $(BIN)/pip
+	npm install --no-fund --no-audit --prefix $(PEERS) node@22.23.3 @playcanvas/splat-transform@3.7.0 \
+	    @sparkjsdev/spark@2.2.0 three@0.180.0 playcanvas@2.23.0
 	touch $@
 
 # pip and not python: it comes last, so a venv that was interrupted is made again.

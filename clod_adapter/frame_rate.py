@@ -15,7 +15,7 @@ The law needs no model of the renderer. A single slow frame has no influence; a 
 in motion follows the newest 3. Where t = a + b s^-p, p from 0.2 to 1.5, and the load changes by 2, 4 or 1/3, t is
 within 10 % of T at most 15 frames later, or 4 frames after steps of 10 % can reach it; it ends within 3 % of T. With a
 noise of 20 % per frame the dial rests in most frames and changes by 0.6 % a frame on average. The viewer has the same
-law in JavaScript (clod_adapter/viewer/web/src/frame_rate.js).
+law in JavaScript (viewers/frame_rate.js).
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ from clod_adapter.frame_rate import excess, next_dial
 from clod_adapter.viewer.page import write_viewer_page
 from shown import Shown, serve, take
 
-LAW = Path(clod_adapter.__file__).parent / "viewer" / "web" / "src" / "frame_rate.js"
+LAW = Path(__file__).parents[2] / "viewers" / "frame_rate.js"
 BUDGET = 0.8 * 1000 / 60  # ms of a frame at 60 fps
 
 # window.trace: dial value and milliseconds of each frame timed; a query ends at once, or never if window.stuck.

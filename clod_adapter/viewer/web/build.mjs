@@ -3,7 +3,8 @@ import { createHash } from "node:crypto";
 import { readFileSync, readdirSync, writeFileSync } from "node:fs";
 import { build } from "esbuild";
 
-const here = new URL(".", import.meta.url), out = new URL("../static/", here);
+const SHARED = ["equation.js", "frame_rate.js", "settings.js", "shaders.js", "timer.js"]; // with the drop-ins
+const here = new URL(".", import.meta.url), dropIns = new URL("../../../viewers/", here), out = new URL("../static/", here);
 const shared = { bundle: true, minify: true, format: "iife", target: "es2022", write: false, loader: { ".glsl": "text", ".wgsl": "text" } };
 
 /** `worker:./x.js` is the text of x.js with what it imports, for a Worker out of a Blob. */
@@ -25,7 +26,10 @@ writeFileSync(new URL("viewer.css", out), css.outputFiles[0].text);
 writeFileSync(new URL("page.html", out), readFileSync(new URL("src/page.html", here)));
 
 const shaders = ["glsl", "wgsl"].map((kind) => `../../integrations/shaders/attenuation.${kind}`);
-const sources = [...shaders, "build.mjs", "package-lock.json", "package.json"];
+const texts = ["glsl", "wgsl"].map((kind, k) => `export const ${kind} = \`${readFileSync(new URL(shaders[k], here))}\`;\n`);
+const origin = "// Made by clod_adapter/viewer/web/build.mjs from clod_adapter/integrations/shaders/.\n";
+writeFileSync(new URL("shaders.js", dropIns), origin + texts.join(""));
+const sources = [...shaders, ...SHARED.map((name) => `../../../viewers/${name}`), "build.mjs", "package-lock.json", "package.json"];
 sources.push(...readdirSync(new URL("src", here), { recursive: true }).filter((name) => /\.\w+$/.test(name)).map((name) => `src/${name}`));
 const lines = sources.sort().map((name) => `${createHash("sha256").update(readFileSync(new URL(name, here))).digest("hex")}  ${name}`);
 writeFileSync(new URL("SOURCES.sha256", out), `${lines.join("\n")}\n`);

@@ -1,5 +1,5 @@
 // A splat on the GPU, and what culls and sorts its Gaussians: WebGPU, or else a worker.
-import { extinctions, prepare } from "./equation.js";
+import { extinctions, prepare } from "../../../../viewers/equation.js";
 import { WIDTH, dataTexture, heightOf, maxTexels } from "./gpu.js";
 import { half } from "./half.js";
 import { SH_TEXELS } from "./shaders.js";

@@ -1,9 +1,9 @@
 // Draws models. A first pass projects each Gaussian to one texel; a second one draws a quad each, farthest first, into a
 // half-float image, so that blending hundreds of layers does not round to 8 bits.
 import { WIDTH, bindTextures, framebuffer, heightOf, program, quads, texture } from "./gpu.js";
-import { growthDistance } from "./equation.js";
+import { growthDistance } from "../../../../viewers/equation.js";
 import { copyVertex, copyFragment, projectFragment, splatFragment, splatVertex } from "./shaders.js";
-import { createTimer } from "./timer.js";
+import { createTimer } from "../../../../viewers/timer.js";
 
 export function createRenderer(canvas) {
   const gl = canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false, powerPreference: "high-performance" });

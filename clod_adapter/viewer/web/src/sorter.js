@@ -1,7 +1,7 @@
 // Culls and sorts the Gaussians of a model by WebGPU: what the worker does (worker.js), in float32. The rows are read back,
 // since WebGL draws them.
 import attenuationSource from "../../../integrations/shaders/attenuation.wgsl";
-import { growthDistance } from "./equation.js";
+import { growthDistance } from "../../../../viewers/equation.js";
 import { frustumOf } from "./frustum.js";
 import { WIDTH, heightOf } from "./gpu.js";
 import source from "./sorter.wgsl";

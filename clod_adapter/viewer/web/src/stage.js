@@ -1,6 +1,6 @@
 // The displayed state: one model at one dial value, or two images divided by a wipe. A frame is drawn only after a
 // change, and while a held frame rate settles.
-import { createHold } from "./frame_rate.js";
+import { createHold } from "../../../../viewers/frame_rate.js";
 
 const MIN_RESOLUTION = 0.5; // of the canvas's pixels per side, during motion on a slow device
 const SLOW = 50, FAST = 25; // ms per frame, above and below which the resolution during motion falls and rises

@@ -1,6 +1,6 @@
 // The worker of a model: culls the Gaussians for each camera and dial value, and sorts the kept ones by depth. Those that are
 // culled or outside the picture are neither sorted nor drawn.
-import { dialForCount, extinctionScales, growthDistance, growthFactor, normalizingDistance, prepare } from "./equation.js";
+import { dialForCount, extinctionScales, growthDistance, growthFactor, normalizingDistance, prepare } from "../../../../viewers/equation.js";
 import { frustumOf } from "./frustum.js";
 
 let means, scales, growthD, blur, attenuation, prepared, keys, scratchKeys, scratchRows;

@@ -3,7 +3,7 @@ import { isCompressed, readCompressed } from "./compressed.js";
 import { removeInvalid } from "./gaussians.js";
 import { readGlb } from "./glb.js";
 import { readHeader, readPly } from "./ply.js";
-import { readCalibration, readScreenFilter, readSettings } from "./settings.js";
+import { readCalibration, readScreenFilter, readSettings } from "../../../../../viewers/settings.js";
 import { readSog } from "./sog.js";
 import { readSplat } from "./splat.js";
 import { readSpz } from "./spz.js";

@@ -3,8 +3,9 @@
 const PATIENCE = 1000; // ms until the result of a query
 const FAILURES = 5; // of queries that the GPU could not time, after which it is not asked again
 
-export function createTimer(gl) {
-  let query = gl.getExtension("EXT_disjoint_timer_query_webgl2"), failures = 0;
+/** Of a WebGL 2 context, or without one of a WebGPU device. */
+export function createTimer(gl, device) {
+  let query = gl?.getExtension("EXT_disjoint_timer_query_webgl2"), failures = 0;
 
   /** Resolves after the first check that returns true. */
   const until = (check) => new Promise((resolve) => {
@@ -50,8 +51,16 @@ export function createTimer(gl) {
     return performance.now() - start;
   }
 
+  /** WebGPU's queue tells when it is empty. */
+  async function byQueue(draw) {
+    const start = performance.now();
+    draw();
+    await device.queue.onSubmittedWorkDone();
+    return performance.now() - start;
+  }
+
   return {
     /** Calls `draw()`; resolves with the milliseconds of its work. `exact` is for control, else for display. */
-    measure: (draw, exact) => (!exact ? byFence : query ? byQuery : byPixel)(draw),
+    measure: (draw, exact) => (!gl ? byQueue : !exact ? byFence : query ? byQuery : byPixel)(draw),
   };
 }

@@ -1,0 +1,73 @@
+// The dial in PlayCanvas, and so in SuperSplat's engine: a work buffer modifier with the library's GLSL or WGSL.
+import { PIXELFORMAT_RG32F, Vec3, WORKBUFFER_UPDATE_ONCE } from "playcanvas";
+import { Dial, checked, constants, texels } from "./dial.js";
+import { readSettings } from "./settings.js";
+import { glsl, wgsl } from "./shaders.js";
+import { createTimer } from "./timer.js";
+
+/** Attaches the dial of an adapted PLY to an entity with its gsplat; distances are from `camera`, an entity. */
+export function attach(app, entity, camera) {
+  const { gsplat } = entity, { resource } = gsplat, file = fileOf(resource.gsplatData);
+  resource.format.addExtraStreams([{ name: "clod", format: PIXELFORMAT_RG32F }]);
+  const texture = resource.getTexture("clod");
+  texture.lock().set(texels(file, 2 * texture.width * texture.height));
+  texture.unlock();
+  gsplat.setWorkBufferModifier(modifier(file));
+  const world = () => camera.getPosition(), place = new Vec3();
+  const eye = () => {
+    entity.getWorldTransform().clone().invert().transformPoint(world(), place);
+    return [place.x, place.y, place.z];
+  };
+  let scale = 1, last = "";
+  const update = () => {
+    const { x, y, z } = world(), transform = entity.getWorldTransform(), state = `${scale} ${x} ${y} ${z} ${transform.data}`;
+    if (state === last) return; // what the work buffer has is right
+    last = state;
+    gsplat.setParameter("uClodEye", [x, y, z]);
+    gsplat.setParameter("uClodScale", [scale, 1 / transform.getScale().x]);
+    gsplat.workBufferUpdate = WORKBUFFER_UPDATE_ONCE;
+  };
+  app.on("prerender", update);
+  const dial = new Dial(file, { eye, show: (value) => (scale = value), timer: createTimer(app.graphicsDevice.gl, app.graphicsDevice.wgpu) });
+  const render = app.render.bind(app);
+  app.render = () => void dial.frame(render);
+  return dial;
+}
+
+function fileOf(data) {
+  const column = (name) => data.getProp(name), [x, y, z] = ["x", "y", "z"].map(column), count = data.numSplats;
+  const means = new Float32Array(3 * count);
+  for (let i = 0; i < count; i++) means.set([x[i], y[i], z[i]], 3 * i);
+  const settings = readSettings(data.comments ?? []);
+  return checked({ count, means, opacityLogits: column("opacity"), sigma: column("sigma_d"), growth: column("growth_d"), settings });
+}
+
+/** The modifier for `gsplat.setWorkBufferModifier`. */
+export function modifier(file) {
+  const { distance, eps, tau, soft, reach } = constants(file);
+  return {
+    glsl: `${glsl}
+      uniform vec3 uClodEye;
+      uniform vec2 uClodScale;
+      float clodDistance(vec3 center) { return length(center - uClodEye) * uClodScale.y / ${distance}; }
+      void modifySplatCenter(inout vec3 center) {}
+      void modifySplatRotationScale(vec3 original, vec3 center, inout vec4 rotation, inout vec3 scale) {
+        scale *= clodScale(loadClod().g, clodDistance(center), uClodScale.x, ${reach});
+      }
+      void modifySplatColor(vec3 center, inout vec4 color) {
+        color.a = clodOpacity(color.a, loadClod().r, clodDistance(center), uClodScale.x, ${eps}, ${tau}, ${soft});
+      }`,
+    wgsl: `${wgsl}
+      uniform uClodEye: vec3f;
+      uniform uClodScale: vec2f;
+      fn clodDistance(center: vec3f) -> f32 { return length(center - uniform.uClodEye) * uniform.uClodScale.y / ${distance}; }
+      fn modifySplatCenter(center: ptr<function, vec3f>) {}
+      fn modifySplatRotationScale(original: vec3f, center: vec3f, rotation: ptr<function, vec4f>, scale: ptr<function, vec3f>) {
+        *scale = *scale * clodScale(loadClod().g, clodDistance(center), uniform.uClodScale.x, ${reach});
+      }
+      fn modifySplatColor(center: vec3f, color: ptr<function, vec4f>) {
+        (*color).a = clodOpacity((*color).a, loadClod().r, clodDistance(center), uniform.uClodScale.x, ${eps}, ${tau}, ${soft});
+      }`,
+  };
+}
+

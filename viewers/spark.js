@@ -1,0 +1,50 @@
+// The dial in Spark (three.js): mesh.objectModifiers, with the library's GLSL.
+import { dyno } from "@sparkjsdev/spark";
+import { DataTexture, FloatType, RGFormat } from "three";
+import { Dial, constants, readDial, texels } from "./dial.js";
+import { glsl } from "./shaders.js";
+import { createTimer } from "./timer.js";
+
+const WIDTH = 2048; // of the texture
+
+/** Attaches the dial of an adapted PLY or SPZ, whose `bytes` the SplatMesh was made from (without `lod`). */
+export async function attach(mesh, bytes, renderer) {
+  const [file] = await Promise.all([readDial(bytes), mesh.initialized]);
+  if (mesh.splats.getNumSplats() !== file.count) throw new Error(`the mesh has not the ${file.count} splats of the file; load it without lod`);
+  const height = Math.ceil(file.count / WIDTH);
+  const texture = new DataTexture(texels(file, 2 * WIDTH * height), WIDTH, height, RGFormat, FloatType);
+  texture.needsUpdate = true;
+  const columns = new dyno.DynoSampler2D({ key: "clodColumns", value: texture }), s = dyno.dynoFloat(1, "clodScale");
+  const eye = mesh.context.viewToObject.translate;
+  mesh.enableViewToObject = true;
+  mesh.objectModifiers = [
+    ...(mesh.objectModifiers ?? []),
+    dyno.dynoBlock({ gsplat: dyno.Gsplat }, { gsplat: dyno.Gsplat }, ({ gsplat }) => attenuated(file).apply({ gsplat, columns, s, eye })),
+  ];
+  mesh.updateGenerator();
+  const show = (value) => {
+    s.value = value;
+    mesh.updateVersion();
+  };
+  const place = () => eye.value.toArray();
+  return new Dial(file, { eye: place, show, timer: createTimer(renderer.getContext()) });
+}
+
+function attenuated(file) {
+  const { distance, eps, tau, soft, reach } = constants(file);
+  return new dyno.Dyno({
+    inTypes: { gsplat: dyno.Gsplat, columns: "sampler2D", s: "float", eye: "vec3" },
+    outTypes: { gsplat: dyno.Gsplat },
+    globals: () => [dyno.defineGsplat, glsl],
+    statements: ({ inputs, outputs }) => dyno.unindentLines(`
+      ${outputs.gsplat} = ${inputs.gsplat};
+      if (isGsplatActive(${outputs.gsplat}.flags)) {
+        vec2 column = texelFetch(${inputs.columns}, ivec2(${outputs.gsplat}.index % ${WIDTH}, ${outputs.gsplat}.index / ${WIDTH}), 0).rg;
+        float d = length(${outputs.gsplat}.center - ${inputs.eye}) / ${distance};
+        ${outputs.gsplat}.rgba.a = clodOpacity(${outputs.gsplat}.rgba.a, column.r, d, ${inputs.s}, ${eps}, ${tau}, ${soft});
+        ${outputs.gsplat}.scales *= clodScale(column.g, d, ${inputs.s}, ${reach});
+        if (${outputs.gsplat}.rgba.a == 0.0) ${outputs.gsplat}.flags = 0u;
+      }
+    `),
+  });
+}

@@ -1,0 +1,31 @@
+/** What an adapted file says: [count, 3] means, columns [count], and the settings of the equation. */
+export interface DialFile {
+  count: number;
+  means: Float32Array;
+  opacityLogits: Float32Array;
+  sigma: Float32Array;
+  growth: Float32Array;
+  settings: Record<string, number | string>;
+}
+
+/** Reads an adapted PLY (binary) or SPZ (versions 2 and 3). */
+export function readDial(bytes: ArrayBuffer | Uint8Array): Promise<DialFile>;
+
+export interface Dial {
+  readonly file: DialFile;
+  /** The dial value: 0 shows everything, 1 is full quality; trained up to `file.settings.max_sv`. */
+  readonly s: number;
+  /** The number of Gaussians that the dial keeps for the camera. */
+  readonly kept: number;
+  /** Turns the dial to a value, or to the smallest one from 1 on that keeps at most so many Gaussians from here. */
+  set(value: number | { keep: number }): void;
+  /** Turns the dial with the time of frames, until `set` is called. */
+  hold(fps: number): void;
+  /** Calls `draw()` at once, and measures it while a frame rate is held; in Spark wrap your render call in it. */
+  frame(draw: () => void): Promise<void>;
+}
+
+/** From clod-adapter/spark: `mesh` was made from `bytes`, without `lod`. */
+export function attach(mesh: object, bytes: ArrayBuffer | Uint8Array, renderer: object): Promise<Dial>;
+/** From clod-adapter/playcanvas: `entity` has a gsplat with an adapted PLY; distances are from `camera`. */
+export function attach(app: object, entity: object, camera: object): Dial;
