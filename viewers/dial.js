@@ -53,8 +53,9 @@ function ofSpz(bytes) {
   while (at + 8 <= bytes.length && view.getUint32(at, true) !== SPZ_RECORD) at += 8 + view.getUint32(at + 4, true);
   if (at + 12 > bytes.length) throw new Error("this .spz has no dial; export it with clod-adapt");
   const first = at + 12 + view.getUint32(at + 8, true), about = JSON.parse(new TextDecoder().decode(bytes.subarray(at + 12, first)));
-  const columns = about.columns.map((_, k) => Float32Array.from({ length: count }, (_, i) => half(view.getUint16(first + 2 * (count * k + i), true))));
-  const named = Object.fromEntries(about.columns.map((name, k) => [name, columns[k]]));
+  const names = about.columns ?? ["sigma_d"];
+  const columns = names.map((_, k) => Float32Array.from({ length: count }, (_, i) => half(view.getUint16(first + 2 * (count * k + i), true))));
+  const named = Object.fromEntries(names.map((name, k) => [name, columns[k]]));
   return checked({ count, means, opacityLogits, sigma: named.sigma_d, growth: named.growth_d, settings: about.attenuation });
 }
 

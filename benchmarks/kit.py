@@ -1,0 +1,67 @@
+"""Makes viewers/kit: an adapted file of 2,000 Gaussians, its cameras, and reference pictures at dial values.
+
+    clod-adapt demo
+    python benchmarks/kit.py
+
+The Gaussians are a random part of the demo's, enlarged to cover the same area. Values and pictures are those of
+``clod_adapter.render``; a test compares them.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+
+import clod_adapter as clod
+from common import ROOT, arguments
+
+import torch
+from PIL import Image
+
+KIT = ROOT / "viewers" / "kit"
+COUNT, SHARE = 2000, 0.25  # Gaussians; of their full enlargement
+DIALS = (0.0, 1.0, 3.0, 5.0)
+VIEWS, WIDTH = (1, 3), 192
+
+
+def main() -> None:
+    parser = arguments(__doc__)
+    parser.add_argument("--demo", default="demo", help="the folder that the demo has written")
+    folder = parser.parse_args().demo
+    model, scene = clod.load(f"{folder}/gallery.ply"), clod.load_scene(f"{folder}/capture")
+    order = torch.randperm(len(model.gaussians), generator=torch.Generator().manual_seed(0))
+    few = model.gaussians[order[:COUNT].sort().values]
+    few = few.replace(log_scales=few.log_scales + SHARE * math.log(len(model.gaussians) / COUNT) / 2)
+    KIT.mkdir(exist_ok=True)
+    for suffix in ("ply", "spz", "glb"):
+        clod.save(KIT / f"kit.{suffix}", few)
+    cameras = [resized(scene.test[k].camera) for k in VIEWS]
+    about = {"background": [0, 0, 0], "dials": DIALS, "cameras": list(described(few, cameras))}
+    (KIT / "cameras.json").write_text(json.dumps(about, indent=1) + "\n")
+
+
+def resized(camera: clod.Camera) -> clod.Camera:
+    """Of WIDTH pixels, with square pixels and the principal point in the middle, as viewers have them."""
+    height = round(camera.height * WIDTH / camera.width)
+    focal = float(camera.K[0, 0]) * WIDTH / camera.width
+    K = torch.tensor([[focal, 0, WIDTH / 2], [0, focal, height / 2], [0, 0, 1]])
+    return clod.Camera(camera.viewmat, K, WIDTH, height)
+
+
+def described(gaussians: clod.Gaussians, cameras: list[clod.Camera]) -> Iterator[dict[str, object]]:
+    for k, camera in enumerate(cameras):
+        frames = []
+        for s in DIALS:
+            shown = clod.render(gaussians, camera, s)
+            name = f"camera{k}_s{s:g}.png"
+            Image.fromarray((shown.image.clamp(0, 1) * 255).round().byte().numpy()).save(KIT / name, optimize=True)
+            frames.append({"s": s, "kept": int(shown.kept.sum()), "picture": name})
+        yield {
+            "world_to_camera": camera.viewmat.tolist(), "focal": float(camera.K[0, 0]),
+            "width": camera.width, "height": camera.height, "frames": frames,
+        }  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()
