@@ -69,7 +69,6 @@ def bake(
     baked = {"opacity_logits": _logits_drawn(shown, gaussians.opacity_logits)}
     if gaussians.growth_d is not None:
         growth = (dialled if camera else dial(gaussians, distances, virtual_scale**GROWN)).growth
-        assert growth is not None
         baked["log_scales"] = gaussians.log_scales + growth.log()[:, None]
     return detach(gaussians.replace(**baked)).select(dialled.keep)
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from clod_adapter._support.arrays import float_tensor
-from clod_adapter.config import CLASSIC, SH_COUNTS, AttenuationConfig, ScreenFilter
+from clod_adapter.config import CLASSIC, SH_COUNTS, AttenuationConfig, ScreenFilter, require
 from clod_adapter.errors import ClodError
 
 SH_C0 = 0.28209479177387814
@@ -21,12 +21,13 @@ OPAQUE = 20.0
 """A logit whose opacity is 1 in float32; written instead of +inf, which some readers refuse."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Gaussians:
     """N Gaussians with the parameters that checkpoints store, and, once adapted, their distance decay.
 
     Fields may be given as numpy arrays, which become float32 tensors. ``gaussians[:100]``, ``gaussians[mask]`` and
-    ``gaussians[indices]`` are the Gaussians of these rows.
+    ``gaussians[indices]`` are the Gaussians of these rows. ``a == b`` is whether all fields are equal, bit for bit but
+    for the sign of 0.
 
     Attributes:
         means: ``[N, 3]`` centres, world units.
@@ -42,7 +43,7 @@ class Gaussians:
         screen_filter: the filter for rendering, that of training.
 
     Raises:
-        ClodError: a tensor has the wrong shape, or one of sigma_d and attenuation is missing.
+        ClodError: a tensor has the wrong shape or holds integers, or one of sigma_d and attenuation is missing.
     """
 
     means: Tensor
@@ -60,6 +61,8 @@ class Gaussians:
         for field in dataclasses.fields(self):
             if isinstance(value := getattr(self, field.name), np.ndarray):
                 object.__setattr__(self, field.name, float_tensor(value))
+        for name, value in self.tensors().items():
+            require(value.is_floating_point(), f"Gaussians.{name}", value.dtype, "floating point: .float()")
         n = self.means.shape[0]
         expected = {"means": (n, 3), "quats": (n, 4), "log_scales": (n, 3), "opacity_logits": (n,), "sh0": (n, 1, 3)}
         expected |= {name: (n,) for name in ("sigma_d", "growth_d") if getattr(self, name) is not None}
@@ -78,6 +81,14 @@ class Gaussians:
 
     def __len__(self) -> int:
         return self.means.shape[0]
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Gaussians):
+            return NotImplemented
+        pairs = ((getattr(self, field.name), getattr(other, field.name)) for field in dataclasses.fields(self))
+        return all(_same(a, b) for a, b in pairs)
+
+    __hash__ = None  # type: ignore[assignment]
 
     def __getitem__(self, rows: slice | Tensor | np.ndarray | Sequence[int]) -> Gaussians:
         """The Gaussians at ``rows``: a slice, a boolean mask ``[N]``, or indices ``[M]``.
@@ -159,3 +170,9 @@ class Gaussians:
     def cpu(self) -> Gaussians:
         """A copy in main memory."""
         return self.to("cpu")
+
+
+def _same(a: object, b: object) -> bool:
+    if isinstance(a, Tensor) and isinstance(b, Tensor):
+        return a.device == b.device and a.dtype == b.dtype and torch.equal(a, b)
+    return a == b

@@ -1,7 +1,7 @@
 """The dial as a function for any renderer: it takes the opacities and returns those to rasterize.
 
 hook = clod_adapter.load("model.ply").hook(virtual_scale=3)
-opacities, keep, growth = hook(means, opacities, viewmat, K, width, height, growth=True)
+opacities, keep, growth = hook(means, opacities, viewmat, K, width, height)
 scales = scales * growth[:, None]
 
 ``Hook.hold`` moves the dial so that frames take a given time.
@@ -13,7 +13,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, TypeVar, overload
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -22,7 +22,7 @@ from torch import Tensor
 from clod_adapter._support.arrays import float_tensor, tensor_of
 from clod_adapter.cameras import NEAR, Camera
 from clod_adapter.config import AttenuationConfig, require
-from clod_adapter.equation.attenuation import Attenuated, attenuate, check_dial
+from clod_adapter.equation.attenuation import Attenuated, attenuate, check_dial, warn_of_no_dial
 from clod_adapter.errors import ClodError
 from clod_adapter.frame_rate import DEAD_BAND, FRAMES, NEWEST, Frame, excess, next_dial
 
@@ -54,24 +54,15 @@ class Hook:
                 object.__setattr__(self, name, float_tensor(column))
         check_dial(self.virtual_scale)
 
-    @overload
     def __call__(
         self, means: Array, opacities: Array, viewmat: Any, K: Any = None, width: int = 1, height: int = 1,
-        near: float = NEAR, *, growth: Literal[False] = False,
-    ) -> tuple[Array, Array]: ...  # fmt: skip
-    @overload
-    def __call__(
-        self, means: Array, opacities: Array, viewmat: Any, K: Any = None, width: int = 1, height: int = 1,
-        near: float = NEAR, *, growth: Literal[True],
-    ) -> tuple[Array, Array, Array]: ...  # fmt: skip
-    def __call__(
-        self, means: Array, opacities: Array, viewmat: Any, K: Any = None, width: int = 1, height: int = 1,
-        near: float = NEAR, *, growth: bool = False,
-    ) -> tuple[Array, ...]:  # fmt: skip
-        """The opacities to draw with, 0 for culled Gaussians, and ``[N]`` bool, kept ones (CLoD-GS Eq. 2, its mask).
+        near: float = NEAR,
+    ) -> tuple[Array, Array, Array]:  # fmt: skip
+        """The opacities to draw with, the kept rows, and the factors of the scales.
 
-        With ``growth`` a third array follows, ``[N]`` factors of the scales (``growth.growth_factors``), in float32 or,
-        if an input is float64, in float64; ones where the hook has no ``growth_d``.
+        Opacities are 0 for culled Gaussians; ``[N]`` bool are the kept ones (CLoD-GS Eq. 2, its mask). The factors are
+        ``[N]`` (``growth.growth_factors``), in float32 or, if an input is float64, in float64; ones where the hook has
+        no ``growth_d``.
 
         numpy in, numpy out; torch in, torch out, on the means' device, differentiable in ``opacities``, ``sigma_d`` and
         ``growth_d``. Distances are constants: no gradient reaches ``means`` and ``viewmat``. The camera's arguments may
@@ -85,17 +76,16 @@ class Hook:
                 normalisers ``max`` and ``quantile``; ``scene`` needs none of them.
 
         Raises:
-            ClodError: the shapes do not fit the hook or each other, or a normaliser that needs K has none.
+            ClodError: the shapes do not fit the hook or each other, means or opacities are integers, or a normaliser
+                that needs K has none.
         """
         if K is None and self.attenuation.normalizer != "scene":
             raise ClodError(f"normalizer {self.attenuation.normalizer} needs K, width and height in the hook's call")
         camera = Camera(_matrix(viewmat), _matrix(np.eye(3) if K is None else K), width, height, near=near)
         shown = tensor_of(opacities)
         result = self.attenuate(tensor_of(means), shown, camera)
-        found = [result.drawn.reshape(shown.shape).to(shown.dtype), result.keep]
-        if growth:
-            found.append(torch.ones_like(result.opacities) if result.growth is None else result.growth)
-        return tuple(found if isinstance(means, Tensor) else (each.detach().numpy() for each in found))
+        found: Any = result.drawn.reshape(shown.shape).to(shown.dtype), result.keep, result.growth
+        return found if isinstance(means, Tensor) else tuple(each.detach().numpy() for each in found)
 
     def attenuate(self, means: Tensor, opacities: Tensor, camera: Camera) -> Attenuated:
         """The same for a ``Camera``, with everything that ``attenuation.attenuate`` returns."""
@@ -105,6 +95,7 @@ class Hook:
                 f"the dial is for {n} Gaussians, but means is {tuple(means.shape)} and opacities "
                 f"{tuple(opacities.shape)}; pass the rows of the file that it was loaded from"
             )
+        require(means.is_floating_point(), "means", means.dtype, "floating point: .float()")
         sigma_d = self.sigma_d.to(means.device)
         growth_d = None if self.growth_d is None else self.growth_d.to(means.device)
         return attenuate(
@@ -117,6 +108,25 @@ class Hook:
         return Hold(self, milliseconds)
 
 
+def dropped_in(
+    sigma_d: Tensor | None, virtual_scale: float, attenuation: AttenuationConfig | None, growth_d: Tensor | None
+) -> AttenuationConfig | None:
+    """The settings of a drop-in's call; None without a ``sigma_d``, and a warning if ``virtual_scale`` is above 1.
+
+    Raises:
+        ClodError: the dial is negative or not finite, or ``growth_d`` lacks ``sigma_d`` or ``attenuation``.
+    """
+    if growth_d is not None and (sigma_d is None or attenuation is None):
+        raise ClodError(
+            "growth_d needs sigma_d and attenuation, which says where growth begins; pass Gaussians.attenuation of the "
+            "file, or AttenuationConfig() for 1 world unit"
+        )
+    if sigma_d is None:
+        warn_of_no_dial(virtual_scale, "pass sigma_d, growth_d and attenuation of the file", 4)
+        return None
+    return attenuation or AttenuationConfig()
+
+
 @dataclass
 class Hold:
     """A hook whose dial value holds the time of a frame, in any renderer, by the law of ``frame_rate``.
@@ -124,7 +134,7 @@ class Hold:
         hold = hook.hold(milliseconds=16.7)
         for viewmat in path:
             with hold.frame() as hook:
-                drawn, keep, growth = hook(means, opacities, viewmat, K, width, height, growth=True)
+                drawn, keep, growth = hook(means, opacities, viewmat, K, width, height)
                 ...  # rasterize
 
     The drop-ins for gsplat and Inria's rasterizer take ``virtual_scale=hook.virtual_scale`` inside the block.

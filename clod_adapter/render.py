@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -12,7 +11,7 @@ from torch import Tensor
 
 from clod_adapter._support.arrays import float_tensor
 from clod_adapter.cameras import Camera
-from clod_adapter.equation.attenuation import Attenuated, attenuate, check_dial
+from clod_adapter.equation.attenuation import Attenuated, attenuate, check_dial, warn_of_no_dial
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.rasterizers import Rasterizer, for_device
@@ -115,9 +114,8 @@ def render(
         ClodError: the dial is negative or not finite.
     """
     check_dial(virtual_scale)
-    if virtual_scale > 1 and gaussians.sigma_d is None:
-        much = f"virtual_scale is {virtual_scale:g}, but the Gaussians have no sigma_d: all are drawn as they are"
-        warnings.warn(f"{much}; give the result of clod_adapter.adapt", stacklevel=2)
+    if gaussians.sigma_d is None:
+        warn_of_no_dial(virtual_scale, "give the result of clod_adapter.adapt")
     behind = None if background is None else float_tensor(background)
     if rasterizer is None and _drawn_at_once(gaussians, behind):
         from clod_adapter.rasterizers import cpu

@@ -28,7 +28,7 @@ def main(model: str) -> None:
 
     for virtual_scale in (1, 2, 3, 5):
         hook = checkpoint.hook(virtual_scale)
-        drawn, keep = hook(means, opacities, viewmat, K, WIDTH, HEIGHT)
+        drawn, keep, _ = hook(means, opacities, viewmat, K, WIDTH, HEIGHT)  # growth: pixels have no scales
         picture = dots(means[keep] @ viewmat[:3, :3].T + viewmat[:3, 3], drawn[keep], colors[keep], K)
         name = f"{Path(model).stem}_dots_sv{virtual_scale}.png"
         Image.fromarray((picture * 255).round().astype(np.uint8)).save(name)

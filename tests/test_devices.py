@@ -254,7 +254,7 @@ def test_a_dial_of_ones_own_loop(setup: Setup) -> None:
         groups = dialled.param_groups(splats=True)
         assert len(groups) == 8 and all(each["params"][0].device == model.means.device for each in groups)
         view, s = setup.scene.train[0], dialled.sample()
-        shown = render(dialled.differentiable(), view.camera, 2.0).image
+        shown = render(dialled.gaussians(), view.camera, 2.0).image
         loss = dialled.loss(2.0, photometric_loss(shown, view.image.to(model.means.device)))
         loss.backward()
         found = [each["params"][0].grad.cpu() for each in groups if each["name"] in ("log_sigma", "opacity_logits")]

@@ -89,7 +89,7 @@ def baked(**given: Any) -> Callable[[Gaussians], list[Tensor]]:
 def hook(model: Gaussians) -> list[Tensor]:
     assert model.attenuation is not None and model.sigma_d is not None
     view, dialled = CAMERAS[0], Hook(model.sigma_d, model.attenuation, DIAL, model.growth_d)
-    return list(dialled(model.means, model.opacities, view.viewmat, growth=True))
+    return list(dialled(model.means, model.opacities, view.viewmat))
 
 
 def copy_with(name: str, installed: ModuleType, needs: str) -> Any:

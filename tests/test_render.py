@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 
 import numpy as np
 import pytest
@@ -141,15 +140,6 @@ def test_rendering_no_gaussians() -> None:
     for some in (none, with_dial(none), with_dial(none, attenuation=AttenuationConfig(normalizer="max"))):
         rendering = render(some, camera(), 2.0)
         assert rendering.kept.shape == (0,) and (rendering.image == 0).all() and (rendering.alpha == 0).all()
-
-
-def test_a_dial_value_without_a_dial_is_warned_of() -> None:
-    with pytest.warns(UserWarning, match="virtual_scale is 3, but the Gaussians have no sigma_d"):
-        render(gaussians(5, 0, 0), camera(), 3)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        render(gaussians(5, 0, 0), camera())
-        render(adapted(), camera(), 3)
 
 
 def test_a_background_of_numpy() -> None:

@@ -8,6 +8,7 @@ from glob import escape
 from pathlib import Path
 
 from clod_adapter.errors import ClodError
+from clod_adapter.io.file_formats import check_suffix
 
 
 @dataclass(frozen=True)
@@ -42,6 +43,7 @@ class AdaptFiles:
 def check_ply_name(path: Path, option: str) -> None:
     if path.suffix.lower() != ".ply":
         raise ClodError(f"{path}: {option} names the PLY to write, so it must end in .ply")
+    check_suffix(path)  # .compressed.ply
 
 
 def labels(paths: Sequence[str]) -> list[str]:

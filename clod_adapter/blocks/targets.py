@@ -57,7 +57,7 @@ def context_rows(
             opacities, growth = dialled.drawn, dialled.growth
             if not after:
                 opacities = torch.where(own, opacities, scene.opacities)
-                growth = growth if growth is None else torch.where(own, growth, 1)
+                growth = torch.where(own, growth, 1)
             covered = coverage(scene, opacities, view.camera, growth)
             drawn |= covered > _least_covered(covered)
         tell(progress, Phase.CONTEXT, k + 1, len(views))

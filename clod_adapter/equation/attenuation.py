@@ -33,6 +33,7 @@ are within ``4 + 3 u`` of them, ``u = (d s)^2 / (2 v)``.
 from __future__ import annotations
 
 import math
+import warnings
 from functools import reduce
 from typing import Any, NamedTuple, TypeVar
 
@@ -55,7 +56,7 @@ FAINTEST = 2.0**-126
 """The smallest normal float32: at s = 0 only what is fainter is culled, which no rasterizer draws."""
 
 Scale = TypeVar("Scale", float, Tensor)
-Fields = tuple[Tensor, Tensor, Tensor, Tensor, Tensor | None]
+Fields = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
 
 
 class Attenuated(NamedTuple):
@@ -66,14 +67,14 @@ class Attenuated(NamedTuple):
         log_opacities: ``[N]`` log a'', in [-inf, 0]; meaningful where a'' underflows.
         keep: ``[N]`` bool, ``log a'' > log(tau s)``.
         drawn: ``[N]`` the rasterizer's input, in [0, 1]: a'' after the cut, above 0 exactly for kept Gaussians.
-        growth: ``[N]`` factor of the scales (``growth.growth_factors``); None without a ``growth_d``.
+        growth: ``[N]`` factor of the scales (``growth.growth_factors``); ones without a ``growth_d``.
     """
 
     opacities: Tensor
     log_opacities: Tensor
     keep: Tensor
     drawn: Tensor
-    growth: Tensor | None = None
+    growth: Tensor
 
 
 def attenuate(
@@ -108,7 +109,8 @@ def attenuate(
     if sigma_d is None or config is None:
         shown = opacities if activated else opacities.sigmoid()
         keep = torch.ones_like(shown, dtype=torch.bool)
-        return Attenuated(shown, opacities.log() if activated else F.logsigmoid(opacities), keep, shown)
+        logs = opacities.log() if activated else F.logsigmoid(opacities)
+        return Attenuated(shown, logs, keep, shown, torch.ones_like(shown))
     numbers = float(virtual_scale), log_threshold(config.tau, virtual_scale)
     named = {"opacities" if activated else "opacity_logits": opacities, "sigma_d": sigma_d}
     more: Any = {"eps": config.eps, "cut": config.cut}
@@ -201,8 +203,8 @@ def _from_opacities(
     return *drawn, _growth(growth_d, d, virtual_scale, reach)
 
 
-def _growth(growth_d: Tensor | None, d: Tensor, virtual_scale: Number, reach: float) -> Tensor | None:
-    return None if growth_d is None else growth_factors(growth_d, d, virtual_scale, reach)
+def _growth(growth_d: Tensor | None, d: Tensor, virtual_scale: Number, reach: float) -> Tensor:
+    return torch.ones_like(d) if growth_d is None else growth_factors(growth_d, d, virtual_scale, reach)
 
 
 def _cut(
@@ -220,11 +222,20 @@ def check_dial(virtual_scale: float) -> None:
     require(0 <= virtual_scale < math.inf, "virtual_scale", virtual_scale, "at least 0 and finite")
 
 
+def warn_of_no_dial(virtual_scale: float, remedy: str, stacklevel: int = 3) -> None:
+    """Checks the dial value, and above 1 warns the caller's caller that it has no effect, as there is no sigma_d."""
+    check_dial(virtual_scale)
+    if virtual_scale > 1:
+        much = f"virtual_scale is {virtual_scale:g}, but there is no sigma_d: all Gaussians are drawn as they are"
+        warnings.warn(f"{much}; {remedy}", stacklevel=stacklevel)
+
+
 def conform(**tensors: Tensor) -> list[Tensor]:
     """The tensors in their common dtype, at least float32; raises ClodError unless they are tensors of one [N]."""
     for name, tensor in tensors.items():
         if not isinstance(tensor, Tensor):
             raise ClodError(f"{name} is no tensor but {type(tensor).__name__}; pass torch.as_tensor of it")
+        require(tensor.is_floating_point(), name, tensor.dtype, "floating point: .float()")
     shapes = {name: tuple(t.shape) for name, t in tensors.items()}
     if len(set(shapes.values())) != 1 or any(len(shape) != 1 for shape in shapes.values()):
         raise ClodError("expected one shape [N], got " + ", ".join(f"{name} {shape}" for name, shape in shapes.items()))

@@ -25,6 +25,7 @@ from typing import Any, Literal, TypeVar
 from torch import Tensor
 
 from clod_adapter.config import AttenuationConfig
+from clod_adapter.hook import dropped_in
 from clod_adapter.integrations.gsplat_cameras import render
 
 try:
@@ -56,12 +57,13 @@ def _of_gsplat(typed: Typed) -> Typed:
         **kwargs: Any,
     ) -> Any:
         function = getattr(gsplat, name)
-        if sigma_d is None:
+        settings = dropped_in(sigma_d, virtual_scale, attenuation, growth_d)
+        if settings is None:
             return function(*args, **kwargs)
         bound = inspect.signature(function).bind(*args, **kwargs)
         bound.apply_defaults()
         given = bound.arguments | bound.arguments.pop("kwargs", {}) | {"sigma_d": sigma_d, "growth_d": growth_d}
-        return render(function, given, virtual_scale, attenuation or AttenuationConfig(), hide)
+        return render(function, given, virtual_scale, settings, hide)
 
     dialled.__signature__ = _signature(getattr(gsplat, name), typed)  # type: ignore[attr-defined]
     return dialled  # type: ignore[return-value]
@@ -112,12 +114,13 @@ def rasterization(
     pinhole camera with these ``Ks``; ``scene``, the default, needs none.
 
     Args:
-        sigma_d: ``[..., N]`` like ``opacities``; None calls gsplat's function unchanged.
+        sigma_d: ``[..., N]`` like ``opacities``; None calls gsplat's function unchanged, with a warning if
+            ``virtual_scale`` is above 1.
         virtual_scale: the dial s >= 0.
         attenuation: settings of the equation, ``Gaussians.attenuation`` of the file; by default
             ``AttenuationConfig()``, with distances in world units.
         growth_d: ``[..., N]`` exponents of the growth of the scales, which begins at ``reference_distance`` of the
-            attenuation or, where that is 0, at 1 world unit; None for no growth.
+            attenuation, which is needed then, or, where that is 0, at 1 world unit; None for no growth.
 
     The others are those of the installed gsplat, by position or by name, with its defaults.
 
@@ -125,7 +128,8 @@ def rasterization(
         ``render_colors [..., C, H, W, X]``, ``render_alphas [..., C, H, W, 1]`` and ``meta``.
 
     Raises:
-        ClodError: the dial is negative, sigma_d or growth_d differs from opacities in shape, ``distributed`` is set,
+        ClodError: the dial is negative, growth_d comes without attenuation, a tensor holds integers, sigma_d or
+            growth_d differs from opacities in shape, ``distributed`` is set,
             with which the cameras of all processes share one opacity, or several cameras come with a tensor that none
             of the known versions has.
         TypeError: an argument is missing, or the installed gsplat does not have it.

@@ -69,7 +69,7 @@ def _one_camera(
     opacities, means = given["opacities"], given["means"]
     shown = hook.attenuate(means.reshape(-1, 3), opacities.flatten(), camera)
     arguments["opacities"] = shown.drawn.to(opacities).reshape(opacities.shape)
-    if shown.growth is not None:
+    if growth_d is not None:
         name, growth = ("scales", shown.growth) if given.get("covars") is None else ("covars", shown.growth.square())
         old = given[name]
         arguments[name] = old * growth.to(old).reshape(opacities.shape + (1,) * (old.dim() - opacities.dim()))

@@ -23,7 +23,7 @@ from torch import Tensor
 from clod_adapter.cameras import NEAR
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
-from clod_adapter.hook import Hook
+from clod_adapter.hook import Hook, dropped_in
 
 try:
     import diff_gaussian_rasterization as installed
@@ -62,30 +62,31 @@ class GaussianRasterizer(installed.GaussianRasterizer):  # type: ignore[misc]
 
         Args:
             means3D, means2D, opacities, args, kwargs: those of the fork, by position or by name.
-            sigma_d: ``[N]``; None calls the fork's function unchanged.
+            sigma_d: ``[N]``; None calls the fork's function unchanged, with a warning if ``virtual_scale`` is above 1.
             virtual_scale: the dial s >= 0.
             attenuation: settings of the equation, ``Gaussians.attenuation`` of the file; by default
                 ``AttenuationConfig()``, with distances in world units.
             growth_d: ``[N]`` exponents of the growth of the scales, which begins at ``reference_distance`` of the
-                attenuation or, where that is 0, at 1 world unit; None for no growth.
+                attenuation, which is needed then, or, where that is 0, at 1 world unit; None for no growth.
 
         Raises:
-            ClodError: the dial is negative, the shapes do not match, or the settings have ``prefiltered``, with which
+            ClodError: the dial is negative, growth_d comes without attenuation, a tensor holds integers, the shapes do
+                not match, or the settings have ``prefiltered``, with which
                 the rasterizer aborts at the first Gaussian out of view.
         """
-        if sigma_d is None:
+        config = dropped_in(sigma_d, virtual_scale, attenuation, growth_d)
+        if config is None or sigma_d is None:
             return super().forward(means3D, means2D, opacities, *args, **kwargs)
         settings = self.raster_settings
         if settings.prefiltered:
             raise ClodError(
                 "raster_settings.prefiltered is True, but culled Gaussians are out of view; set it to False"
             )
-        hook = Hook(sigma_d, attenuation or AttenuationConfig(), virtual_scale, growth_d)
+        hook = Hook(sigma_d, config, virtual_scale, growth_d)
         viewmat = settings.viewmatrix.T  # Inria's matrices multiply from the right
         drawn, keep, growth = hook(
-            means3D, opacities, viewmat, _intrinsics(settings), settings.image_width, settings.image_height,
-            growth=True,
-        )  # fmt: skip
+            means3D, opacities, viewmat, _intrinsics(settings), settings.image_width, settings.image_height
+        )
         hidden = settings.campos - NEAR * settings.viewmatrix[:3, 2]  # opposite to the viewing direction
         means3D = torch.where(keep[:, None], means3D, hidden.to(means3D))
         bound = inspect.signature(super().forward).bind(means3D, means2D, drawn, *args, **kwargs)

@@ -22,7 +22,7 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.hook import Hook
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.content import read_content
-from clod_adapter.io.file_formats import PLY, check_written, format_of, write
+from clod_adapter.io.file_formats import PLY, check_suffix, check_written, format_of, write
 from clod_adapter.io.ply.columns import SIGMA, column_map, in_shape, rows_of
 from clod_adapter.io.ply.constants import dial_constants, filter_constants
 from clod_adapter.io.ply.header import PREFIX, write_comments
@@ -151,7 +151,7 @@ def save(
     version: str | None = None,
     calibration: Calibration | None = None,
 ) -> None:
-    """Writes ``gaussians`` in the format of the path's suffix; a PLY if that is none of ``file_formats.FORMATS``.
+    """Writes ``gaussians`` in the format of the path's suffix (``file_formats.WRITABLE``).
 
     A PLY is an extended file: the base's columns, then ``sigma_d`` and ``growth_d``. Without a base the columns are
     those of Inria's layout. What another format loses is a warning.
@@ -167,11 +167,12 @@ def save(
         calibration: of these Gaussians, for the header. The base's is not passed on, which is of the base.
 
     Raises:
-        ClodError: there are no Gaussians, they do not match the base, a new value is not finite, the target is the
-            base itself, cannot be written, or not be read again; or, for another format than PLY, as
-            ``file_formats.write``.
+        ClodError: another suffix or none, there are no Gaussians, they do not match the base, a new value is not
+            finite, the target is the base itself, cannot be written, or not be read again; or, for another format than
+            PLY, as ``file_formats.write``.
     """
     path = Path(path)
+    check_suffix(path)
     if len(gaussians) == 0:
         raise ClodError(f"{path}: there are no Gaussians to write, and no reader takes a file without any")
     base = base or blank(len(gaussians), gaussians.sh_degree)

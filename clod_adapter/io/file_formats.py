@@ -113,6 +113,19 @@ def file_has_dial(path: Path) -> bool:
     return bool(opened) and _call(opened, path)
 
 
+def check_suffix(path: Path) -> None:
+    """Refuses a name whose suffix is none of WRITABLE.
+
+    Raises:
+        ClodError: it is not.
+    """
+    if path.name.lower().endswith((".sog", ".compressed.ply")):
+        raise ClodError(f"{path}: is written by clod-adapt export alone: save a .ply, then clod-adapt export it")
+    if path.suffix.lower() not in WRITABLE:
+        found = path.suffix or "no suffix"
+        raise ClodError(f"{path}: {found} is no format to write; choose one of {', '.join(WRITABLE)}")
+
+
 def check_written(path: Path) -> None:
     """Refuses a file just written, under its temporary name, that the reader of its format would refuse: ``open``.
 
@@ -162,9 +175,8 @@ def write(
         ClodError: an unknown suffix, sigma_d for a format that does not carry it, no Gaussians, a value that is not
             finite (opacity = +inf aside), a missing package, or the file cannot be written or not be read again.
     """
+    check_suffix(Path(path))
     suffix = Path(path).suffix.lower()
-    if suffix not in WRITABLE:
-        raise ClodError(f"{path}: {suffix or 'no suffix'} is no format to write; choose one of {', '.join(WRITABLE)}")
     if gaussians.sigma_d is not None and not FORMATS[suffix].carries_sigma:
         raise ClodError(f"{path}: {Path(path).suffix} has no room for a dial; choose a dial value to bake")
     from clod_adapter.equation.units import in_world_units  # here: the table needs no torch

@@ -53,11 +53,11 @@ def shown(parameters: Mapping[str, Tensor], dial: Dial, camera: Camera, virtual_
     keep = found.keep[:, None]
     logits = torch.logit(found.drawn[:, None].where(keep, 0.5), eps=NEARLY)
     behind = (camera.position - camera.viewmat[2, :3]).to(means)
-    changed = {
+    return {
         "means": torch.where(keep, means, behind),
         "opacities": logits.where(keep, -torch.inf).to(opacities),
+        "scales": scales + found.growth.log().to(scales)[:, None],
     }
-    return changed if found.growth is None else changed | {"scales": scales + found.growth.log().to(scales)[:, None]}
 
 
 def new_dial(
@@ -113,7 +113,7 @@ def write_ply(path: str, columns: Mapping[str, np.ndarray[Any, Any]], dial: Dial
     """
     gaussians = dial.gaussians().cpu().replace(screen_filter=screen_filter)
     exported = np.stack([columns[name].ravel() for name in ("x", "y", "z", "opacity")], 1).astype(np.float32)
-    values = torch.cat([gaussians.means, gaussians.opacity_logits[:, None]], 1).numpy()
+    values = torch.cat([gaussians.means, gaussians.opacity_logits[:, None]], 1).detach().numpy()
     own = enumerate(row.tobytes() for row in values)
     rows = [next((i for i, mine in own if mine == each.tobytes()), -1) for each in exported]
     if -1 in rows:

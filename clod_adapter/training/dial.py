@@ -32,7 +32,6 @@ from clod_adapter.config import AdaptConfig
 from clod_adapter.equation.attenuation import Attenuated, attenuate
 from clod_adapter.equation.distances import typical_distance
 from clod_adapter.equation.growth import GROWTH_RANGE
-from clod_adapter.equation.units import in_world_units
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.importance import MOST_VIEWS, for_training, initialize, usable_views
@@ -130,10 +129,10 @@ class Dial(nn.Module):
     def forward(self, camera: Camera, virtual_scale: float) -> Attenuated:
         """The opacities ``drawn [N]`` and the factor ``growth [N]`` of the scales, for one camera and dial value.
 
-        Differentiable in the splats' opacities and the dial's parameters. ``growth`` is None without growth.
+        Differentiable in the splats' opacities and the dial's parameters. ``growth`` is 1 without growth.
         ``integrations.gsplat.rasterization`` takes ``sigma_d``, ``growth_d`` and ``attenuation`` instead.
         """
-        return dialled_by(self.differentiable(), camera, virtual_scale)
+        return dialled_by(self.gaussians(), camera, virtual_scale)
 
     def loss(self, virtual_scale: float, rendering_loss: Tensor) -> Tensor:
         """0-d, the objective of one rendering at s: ``w_s rendering_loss`` and the target-count term.
@@ -158,7 +157,7 @@ class Dial(nn.Module):
         """
         if virtual_scale < 1:
             return self.log_sigma.new_zeros(())
-        logits, sigma = self.differentiable().opacity_logits.detach(), self.sigma_d.detach()
+        logits, sigma = self.gaussians().opacity_logits.detach(), self.sigma_d.detach()
         loss = torch.as_tensor(rendering_loss).detach().double()
         target = target_share(virtual_scale, len(logits), self.config)
         dialled = attenuate(logits, sigma, self.typical, virtual_scale, self.attenuation)
@@ -171,8 +170,10 @@ class Dial(nn.Module):
         """The share of the splats that the target-count curve keeps at s, in (0, 1]; 1 below s = 1."""
         return target_share(virtual_scale, len(self.log_sigma), self.config).share
 
-    def differentiable(self) -> Gaussians:
-        """The splats with this dial, for ``render`` and other rasterizers: gradients reach both.
+    def gaussians(self) -> Gaussians:
+        """The splats with this dial, for ``render`` in the loop and ``save`` after it: gradients reach both.
+
+        It has the splats' own tensors.
 
         Raises:
             ClodError: their number has changed.
@@ -185,13 +186,6 @@ class Dial(nn.Module):
                 "densification and pruning"
             )
         return current.replace(sigma_d=self.sigma_d, attenuation=self.attenuation, growth_d=self.growth_d)
-
-    @torch.no_grad()
-    def gaussians(self) -> Gaussians:
-        """The result so far, in world units, as ``save`` and ``evaluate`` take it; it shares the splats' memory."""
-        self._clamp()
-        found = self.differentiable()
-        return in_world_units(found.replace(**{name: value.detach() for name, value in found.tensors().items()}))
 
     @torch.no_grad()
     def _clamp(self) -> None:

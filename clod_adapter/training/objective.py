@@ -208,7 +208,7 @@ class Objective:
         if self.part.full_context:
             context = leaves["opacity_logits"].detach()[self.trained :]
             drawn = torch.cat([drawn, attenuate(context, None, distances[self.trained :], s, None).drawn])
-            growth = None if growth is None else torch.cat([growth, torch.ones_like(context)])
+            growth = torch.cat([growth, torch.ones_like(context)])
         # Culled rows have opacity 0: the rasterizer skips them, and they get no gradient.
         term = None
         if self.config.count_term == "paper" and self.config.reg_weight > 0 and s >= 1:

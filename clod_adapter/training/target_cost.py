@@ -127,8 +127,7 @@ class TargetCost:
 
     def _blocks(self, dialled: Attenuated, log_scales: Tensor) -> Tensor:
         size = (2 / 3) * (log_scales.sum(1) - self.log_scales)
-        growth = 1.0 if dialled.growth is None else dialled.growth.square()
-        return self.blocks * growth * size.exp() * (_reach(dialled.drawn) / self.reach)
+        return self.blocks * dialled.growth.square() * size.exp() * (_reach(dialled.drawn) / self.reach)
 
     def gradients(
         self, parameters: dict[str, Tensor], typical: Tensor, s: float, loss: Number, attenuation: AttenuationConfig,

@@ -62,7 +62,7 @@ def through_hook(checkpoint: Checkpoint, monkeypatch: pytest.MonkeyPatch) -> Ten
     """numpy, then a renderer that knows nothing of the dial."""
     g = checkpoint.gaussians
     arrays = (tensor.numpy() for tensor in (g.means, g.opacities, VIEW.viewmat))
-    opacities, keep, growth = map(torch.from_numpy, checkpoint.hook(DIAL)(*arrays, growth=True))
+    opacities, keep, growth = map(torch.from_numpy, checkpoint.hook(DIAL)(*arrays))
     assert torch.equal(opacities > 0, keep)
     scales = g.scales * growth[:, None]
     return reference.rasterize(g.means, g.quats, scales, opacities, g.sh0, g.shN, VIEW, torch.zeros(3))[0]

@@ -121,9 +121,9 @@ def dialled(
         d = normalized_distances(given["means"], Camera(viewmat, K, WIDTH, HEIGHT), config)
         shown = attenuate(given["opacities"].logit(), sigma_d, d, dial, config, growth_d=growth_d)
         found.append({"opacities": shown.drawn})
-        if shown.growth is not None and "covars" in given:
+        if "covars" in given:
             found[-1]["covars"] = given["covars"] * shown.growth[:, None, None] ** 2
-        elif shown.growth is not None:
+        else:
             found[-1]["scales"] = given["scales"] * shown.growth[:, None]
     return found
 
@@ -351,7 +351,7 @@ def test_bad_arguments_are_refused(tools: Tools) -> None:
     with pytest.raises(ClodError, match=r"sigma_d is \(39,\) and opacities \(40,\)"):
         tools.ours(**given, **views, sigma_d=given["opacities"][1:])
     with pytest.raises(ClodError, match=r"growth_d is \(39,\) and opacities \(40,\)"):
-        tools.ours(**given, **views, sigma_d=given["opacities"], growth_d=given["opacities"][1:])
+        tools.ours(**given, **views, sigma_d=given["opacities"], growth_d=given["opacities"][1:], attenuation=SOFT)
     with pytest.raises(ClodError, match="virtual_scale is -0.5"):
         tools.ours(**given, **views, sigma_d=given["opacities"], virtual_scale=-0.5)
     with pytest.raises(TypeError, match="missing a required argument: 'viewmats'"):

@@ -181,7 +181,7 @@ def test_bad_arguments_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ClodError, match=r"the dial is for 149 Gaussians, but means is \(150, 3\)"):
         ours(inria_forks.settings_of(kind, VIEW))(**given, sigma_d=reach()[1:])
     with pytest.raises(ClodError, match=r"sigma_d \(150,\), growth_d \(149,\)"):
-        ours(inria_forks.settings_of(kind, VIEW))(**given, sigma_d=reach(), growth_d=reach()[1:])
+        ours(inria_forks.settings_of(kind, VIEW))(**given, sigma_d=reach(), growth_d=reach()[1:], attenuation=config())
     with pytest.raises(ClodError, match="virtual_scale is -1"):
         ours(inria_forks.settings_of(kind, VIEW))(**given, sigma_d=reach(), virtual_scale=-1)
     with pytest.raises(ImportError, match="pip install .*graphdeco-inria/diff-gaussian-rasterization"):

@@ -14,6 +14,7 @@ import scenes
 from clod_adapter import load
 from clod_adapter.cameras import Camera
 from clod_adapter.config import FILTERS, AdaptConfig
+from clod_adapter.equation.units import in_world_units
 from clod_adapter.errors import ClodError
 from clod_adapter.nerfstudio.splatfacto import chosen, new_dial, shown, state_of, view_of, write_ply
 from clod_adapter.render import render
@@ -135,15 +136,16 @@ def test_the_dial_value_of_the_commands(monkeypatch: pytest.MonkeyPatch) -> None
 
 def test_rows_that_nerfstudio_drops_have_no_dial_in_the_file(dial: Dial, tmp_path: Any) -> None:
     """Columns as ns-export has them: some ``[M]``, some ``[M, 1]``, with rows missing."""
-    own = dial.gaussians()
+    with torch.no_grad():
+        own = in_world_units(dial.gaussians())
     keep = torch.arange(N) % 3 != 1
-    columns: dict[str, Any] = {name: own.means[keep, i].numpy() for i, name in enumerate("xyz")}
-    columns["opacity"] = own.opacity_logits[keep, None].numpy()
+    columns: dict[str, Any] = {name: own.means[keep, i].detach().numpy() for i, name in enumerate("xyz")}
+    columns["opacity"] = own.opacity_logits[keep, None].detach().numpy()
     path = tmp_path / "splat.ply"
     write_ply(str(path), columns, dial, FILTERS["on"])
     found = load(path).gaussians
     assert found.attenuation == own.attenuation and found.screen_filter == FILTERS["on"]
     for name, value in found.tensors().items():
-        torch.testing.assert_close(value, own.tensors()[name][keep], rtol=1e-6, atol=0)
+        torch.testing.assert_close(value, own.tensors()[name][keep].detach(), rtol=1e-6, atol=0)
     with pytest.raises(ClodError, match="exports other rows than those of the dial"):
         write_ply(str(path), {name: np.flip(value, 0) for name, value in columns.items()}, dial, FILTERS["on"])

@@ -73,7 +73,7 @@ def test_hook_code_of_the_page_runs(adapted: clod_adapter.Gaussians) -> None:
     Path("adapted.ply").rename("model.ply")
     exec(block(".hook("), names | {"clod_adapter": clod_adapter, "K": torch.eye(3), "width": 2, "height": 2}, names)
     hook = Hook(adapted.sigma_d, adapted.attenuation, 3.0, adapted.growth_d)
-    want = hook(adapted.means, adapted.opacities, torch.eye(4), growth=True)
+    want = hook(adapted.means, adapted.opacities, torch.eye(4))
     assert torch.equal(names["opacities"], want[0]) and torch.equal(names["keep"], want[1])
     assert torch.equal(names["scales"], adapted.scales * want[2][:, None]) and want[2].max() > 1.1
 

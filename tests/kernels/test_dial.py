@@ -44,7 +44,7 @@ def wanted(model: Gaussians, view: Camera, s: float) -> tuple[Tensor, Tensor]:
     """The records by the equation in float64, and the rows where rounding may decide."""
     exact = model.replace(**{name: x.double() for name, x in model.tensors().items()})
     found = dial(exact, view, s)
-    scales = exact.scales if found.growth is None else exact.scales * found.growth[:, None]
+    scales = exact.scales * found.growth[:, None]
     tensors = (model.means, model.quats, scales.float(), found.drawn.float(), model.sh0, model.shN)
     close = (found.drawn - 1 / 255).abs() < 1e-6
     if model.attenuation is not None:
@@ -125,7 +125,7 @@ def test_other_types_take_the_other_way() -> None:
     half = model.replace(sigma_d=model.sigma_d.half())
     apart = render(half, VIEW, 2.0, rasterizer=cpu.rasterize)
     assert torch.equal(render(half, VIEW, 2.0).image, apart.image)
-    with pytest.raises(ClodError, match="float32 only, and opacities is"):
+    with pytest.raises(ClodError, match="float32 only, and scales is"):
         render(model.replace(sigma_d=model.sigma_d.double()), VIEW, 2.0)
 
 

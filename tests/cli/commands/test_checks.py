@@ -97,6 +97,7 @@ def bad(tmp_path: Path, capture: Any) -> dict[str, Path]:
         ("PLY --images SCENE --with quats --without sh0 quats", "--with and --without both name quats"),
         ("PLY --images SCENE --out nowhere/dial.ply", "nowhere/dial.ply: folder nowhere does not exist; create"),
         ("PLY --images SCENE --out dial.splat", "dial.splat: .*must end in .ply"),
+        ("PLY --images SCENE --out a.compressed.ply", "a.compressed.ply: is written by clod-adapt export alone"),
         ("PLY --images SCENE --out folder.ply", "folder.ply: is a folder"),
         ("mine.ply --images SCENE --out mine.ply", "mine.ply: is an input file.*choose another"),
         ("eval missing.ply --images SCENE", "missing.ply: .*check the path"),
