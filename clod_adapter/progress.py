@@ -7,15 +7,17 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from enum import StrEnum
+from enum import Enum
 from typing import TYPE_CHECKING, Any, Literal
 
 if TYPE_CHECKING:  # the command reports an interrupt without importing torch
     from clod_adapter.gaussians import Gaussians
 
 
-class Phase(StrEnum):
+class Phase(str, Enum):
     """The part of a computation that is under way; its value is the label that is displayed."""
+
+    __str__ = str.__str__
 
     PHOTOGRAPHS = "photographs"
     CAMERAS = "placing cameras"

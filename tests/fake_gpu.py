@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_leaves, tree_map
+from torch.utils._pytree import tree_flatten, tree_map
 
 MOVES = ("aten._to_copy.default", "aten.copy_.default")  # what may see tensors of both
 # Operations whose result, or its size, the host reads.
@@ -50,7 +50,7 @@ class Walled(Tensor):
 
 
 def _run(function: Any, args: Any, kwargs: dict[str, Any]) -> Any:
-    tensors = [x for x in tree_leaves((args, kwargs)) if isinstance(x, Tensor)]
+    tensors = [x for x in tree_flatten((args, kwargs))[0] if isinstance(x, Tensor)]
     walled = [x for x in tensors if isinstance(x, Walled)]
     outside = [x for x in tensors if not isinstance(x, Walled) and x.dim()]
     if walled and outside and str(function) not in MOVES:

@@ -164,6 +164,45 @@ def test_import_is_light_and_names_are_lazy(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
 
 
+def test_hook_and_drop_ins_need_torch_and_numpy_alone() -> None:
+    """So that they work in a training's environment, after pip install --no-deps."""
+    code = f"""
+import sys, types
+import numpy, torch
+
+class Installed:
+    def find_spec(self, name, path=None, target=None):
+        top = name.partition(".")[0]
+        if top not in sys.stdlib_module_names and top != "{PACKAGE}" and top not in sys.modules:
+            raise ModuleNotFoundError(name)
+
+sys.path.insert(0, {str(ROOT / "tests")!r})
+import gsplat_versions
+sys.meta_path.insert(0, Installed())
+inria = types.ModuleType("diff_gaussian_rasterization")
+inria.GaussianRasterizationSettings, inria.GaussianRasterizer = tuple, torch.nn.Module
+sys.modules |= {{"gsplat": gsplat_versions.module("1.4.0", lambda *given: given), inria.__name__: inria}}
+import {PACKAGE} as clod
+import {PACKAGE}.integrations.inria
+from {PACKAGE}.integrations.gsplat import rasterization
+
+means, ones, eye = torch.rand(5, 3), torch.ones(5), torch.eye(4)
+model = clod.from_gsplat({{"means": means, "quats": torch.rand(5, 4), "scales": means, "opacities": ones,
+                          "sh0": torch.rand(5, 1, 3)}})
+model = clod.with_dial(model, ones, growth_d=ones)
+drawn, keep, growth = clod.Hook(model.sigma_d, model.attenuation, 2, model.growth_d)(means, ones, eye)
+_, _, given = rasterization(means, model.quats, means, ones, means, eye[None], eye[None, :3, :3], 4, 4, virtual_scale=2,
+                            sigma_d=ones, growth_d=ones, attenuation=model.attenuation)
+assert torch.equal(given["opacities"], drawn) and torch.equal(given["scales"], means * growth[:, None])
+try:
+    clod.load("model.ply")
+except ModuleNotFoundError as error:
+    assert "plyfile" in str(error)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
 def test_every_package_is_installed() -> None:
     listed = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["setuptools"]["packages"]
     folders = {f"{PACKAGE}.{module_of(path)}".rstrip(".") for path in SOURCES if path.name == "__init__.py"}

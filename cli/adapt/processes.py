@@ -22,7 +22,7 @@ from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.progress import Stopped
-from clod_adapter.training.distributed import PATIENCE, ProcessGroup, ProcessLost, joined
+from clod_adapter.training.distributed import PATIENCE, ProcessGroup, ProcessLost, joined, require_distributed
 from clod_adapter.training.loop import adapt
 from clod_adapter.training.objective import TrainableSubset
 from clod_adapter.training.plan import Plan
@@ -182,10 +182,7 @@ def _is_called(store: Store, number: int, stop: GracefulStop, rank: int) -> bool
 @lru_cache(maxsize=1)
 def _store() -> Store:
     """The launcher's key-value store."""
-    if not torch.distributed.is_available():
-        raise ClodError(
-            "this build of torch has no torch.distributed, so only one process can train: leave out torchrun"
-        )
+    require_distributed()
     from torch.distributed.rendezvous import rendezvous
 
     try:

@@ -71,8 +71,8 @@ class GaussianRasterizer(installed.GaussianRasterizer):  # type: ignore[misc]
 
         Raises:
             ClodError: the dial is negative, growth_d comes without attenuation, a tensor holds integers, the shapes do
-                not match, or the settings have ``prefiltered``, with which
-                the rasterizer aborts at the first Gaussian out of view.
+                not match, or the settings have ``prefiltered``, with which the rasterizer aborts at the first Gaussian
+                out of view.
         """
         config = dropped_in(sigma_d, virtual_scale, attenuation, growth_d)
         if config is None or sigma_d is None:

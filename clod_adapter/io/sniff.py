@@ -99,7 +99,10 @@ def handle_name(file: BufferedReader) -> str:
 def file_sha256(file: BufferedReader) -> str:
     """SHA-256 of an open file, hex."""
     file.seek(0)
-    return hashlib.file_digest(file, "sha256").hexdigest()
+    digest = hashlib.sha256()
+    while block := file.read(1 << 20):
+        digest.update(block)
+    return digest.hexdigest()
 
 
 def refuse_known(path: Path, start: bytes) -> None:

@@ -28,11 +28,13 @@ OWN = "_model.dial."
 EXPORTER = "nerfstudio.scripts.exporter"
 
 # Learning rates in nerfstudio's checkpoints are numpy's numbers, which torch 2.6 and newer refuse to read, in
-# nerfstudio's own commands too. These names run no code.
-SCALAR: Any = np.float64(0).__reduce__()[0]
-torch.serialization.add_safe_globals([
-    (SCALAR, "numpy._core.multiarray.scalar"), (SCALAR, "numpy.core.multiarray.scalar"), np.dtype, type(np.dtype("f8")),
-])  # fmt: skip
+# nerfstudio's own commands too. These names run no code. Older versions of torch cannot be told of them.
+if torch.__version__ >= "2.6":
+    SCALAR: Any = np.float64(0).__reduce__()[0]
+    torch.serialization.add_safe_globals([
+        (SCALAR, "numpy._core.multiarray.scalar"), (SCALAR, "numpy.core.multiarray.scalar"),
+        np.dtype, type(np.dtype("f8")),
+    ])  # fmt: skip
 
 
 class ClodPipeline(VanillaPipeline):  # type: ignore[misc]
@@ -90,6 +92,8 @@ class ClodTrainer(Trainer):  # type: ignore[misc]
 
     def _load_checkpoint(self) -> None:
         """Of splatfacto: its Gaussians, for a new dial from step 0. Of this method: everything, from the next step."""
+        if torch.__version__ < "2.6":
+            raise ClodError(f"clod-splatfacto needs torch 2.6 or newer to read checkpoints, not {torch.__version__}")
         state = torch.load(self._checkpoint(), map_location="cpu", weights_only=True)
         resumed = any(name.startswith(OWN) for name in state["pipeline"])
         self._start_step = state["step"] + 1 if resumed else 0

@@ -34,6 +34,7 @@ T = TypeVar("T")
 
 # A process that does not answer for so long counts as lost. The first one may be evaluating or saving meanwhile.
 PATIENCE = timedelta(minutes=10)
+OLDEST = "2.9"  # torch
 
 
 class ProcessLost(ClodError):
@@ -155,9 +156,32 @@ class ProcessGroup:
         self.exchanging += time.perf_counter() - began
 
 
+def require_distributed() -> None:
+    """Refuses a torch that cannot train in several processes.
+
+    Raises:
+        ClodError: it is built without ``torch.distributed``, or hangs in the exchange, as 2.4 and 2.6 do with three.
+    """
+    if not dist.is_available():
+        raise ClodError(
+            "this build of torch has no torch.distributed, so only one process can train: leave out torchrun"
+        )
+    if torch.__version__ < OLDEST:
+        raise ClodError(
+            f"several processes need torch {OLDEST} or newer, and this is {torch.__version__}: "
+            "leave out torchrun, or pip install --upgrade torch"
+        )
+
+
 @contextmanager
 def joined(store: Store, rank: int, size: int) -> Iterator[ProcessGroup]:
-    """The group of the processes that enter with the same ``store``: gloo on CPUs, NCCL on GPUs."""
+    """The group of the processes that enter with the same ``store``: gloo on CPUs, NCCL on GPUs.
+
+    Raises:
+        ClodError: as ``require_distributed``, of several processes.
+    """
+    if size > 1:
+        require_distributed()
     nccl = torch.cuda.is_available() and dist.is_nccl_available()
     with _losses(), _silent_stdout():
         dist.init_process_group(

@@ -123,8 +123,8 @@ def test_a_failure_to_compile_warns_once_and_falls_back(
     assert len([w for w in seen if "torch.compile" in str(w.message)]) == 1
     assert all(torch.equal(a, b) for a, b in zip(found, want, strict=True))
     fused = Fused(lambda x: x)  # running out of memory is not a failure to compile
-    monkeypatch.setattr(fused, "_compiled", lambda *_: fail(torch.OutOfMemoryError("full")))
-    with pytest.raises(torch.OutOfMemoryError):
+    monkeypatch.setattr(fused, "_compiled", lambda *_: fail(torch.cuda.OutOfMemoryError("full")))
+    with pytest.raises(torch.cuda.OutOfMemoryError):
         fused.compiled(torch.zeros(1))
     assert not fused._failed
 

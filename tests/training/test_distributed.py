@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 import torch
 import torch.distributed as dist
+from torch.torch_version import TorchVersion
 
 from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
@@ -102,8 +103,17 @@ def test_a_lost_process_is_distinguished_from_other_errors() -> None:
         distributed._losses(),
     ):
         raise RuntimeError("[/a/b/pair.cc:547] Connection closed by peer [127.0.0.1]:1. This may be caused by\nmore")
-    with pytest.raises(torch.OutOfMemoryError), distributed._losses():
-        raise torch.OutOfMemoryError("CUDA out of memory")
+    with pytest.raises(torch.cuda.OutOfMemoryError), distributed._losses():
+        raise torch.cuda.OutOfMemoryError("CUDA out of memory")
+
+
+def test_several_processes_need_a_torch_that_does_not_hang(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch, "__version__", TorchVersion("2.6.0+cu124"))
+    with (
+        joined(dist.HashStore(), 0, 1),
+        pytest.raises(ClodError, match=r"need torch 2.9 or newer, and this is 2.6.0\+"),
+    ):
+        joined(dist.HashStore(), 0, 2).__enter__()
 
 
 def test_connecting_prints_nothing(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:

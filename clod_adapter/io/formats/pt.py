@@ -48,7 +48,8 @@ def check_pt(path: Path) -> None:
             whole = stored and sum(entry.file_size for entry in entries) <= path.stat().st_size
             if not whole or len(pickles) != 1 or pickles[0].file_size > _PICKLE_LIMIT:
                 raise ClodError(f"{path}: is a zip archive that torch.save does not write; export a PLY instead")
-            with warnings.catch_warnings(action="ignore"):  # of odd escapes in it
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # of odd escapes in it
                 _check_pickle(path, archive.read(pickles[0]))
     except (OSError, ValueError) as error:
         raise ClodError(f"{path}: cannot be read ({getattr(error, 'strerror', error)}); check the path") from error
@@ -110,7 +111,8 @@ def _load(path: Path, digest: bool) -> tuple[Any, str]:
     check_pt(path)
     try:
         # Mapped, so that what else a checkpoint holds (optimisers, networks) is not read.
-        with warnings.catch_warnings(action="ignore"), open(path, "rb") as file:
+        with warnings.catch_warnings(), open(path, "rb") as file:
+            warnings.simplefilter("ignore")
             found = torch.load(handle_name(file), map_location="cpu", weights_only=True, mmap=True)
             return found, file_sha256(file) if digest else ""
     except pickle.UnpicklingError as error:

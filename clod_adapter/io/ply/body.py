@@ -132,7 +132,8 @@ def _read_text(path: Path, file: io.BufferedReader, head: Head, wanted: Collecti
     found = dict[str, np.ndarray]()
     text = io.TextIOWrapper(file, "ascii")
     lines = _lines(text)
-    with warnings.catch_warnings(action="ignore"), np.errstate(over="ignore"):  # of blank lines, or none at all
+    with warnings.catch_warnings(), np.errstate(over="ignore"):
+        warnings.simplefilter("ignore")  # of blank lines, or none at all
         for element, count in zip(head.ply, head.counts, strict=True):
             if element.name in wanted:
                 part = itertools.islice(lines, count) if len(wanted) > len(found) + 1 else lines
