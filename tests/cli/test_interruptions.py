@@ -121,7 +121,9 @@ def test_kills_at_random_moments(server: Server, words: list[Any], capture: Any,
 
 
 def kill(server: Server, run: Launched, draw: random.Random, seconds: float, saved: bool) -> bool:
-    """Sends a signal to some processes, as torchrun also SIGTERM to the others; False if one had ended before.
+    """Sends a signal to some processes; False if one had ended before.
+
+    If only some end, torchrun sends SIGTERM to the others, and SIGKILL after 30 s.
 
     Args:
         seconds: within which it is sent; within an eighth of them after a state or block was saved.
@@ -142,10 +144,11 @@ def kill(server: Server, run: Launched, draw: random.Random, seconds: float, sav
         os.kill(pid, number)
     until = time.monotonic() + 30
     while not all(server.ask(ended=pid) for pid in run.pids):
-        if number == signal.SIGKILL and ended():
-            others = [pid for pid in run.pids if pid not in victims and not server.ask(ended=pid)]
-            for pid in others:
-                os.kill(pid, signal.SIGTERM if time.monotonic() < until else signal.SIGKILL)
+        late = time.monotonic() > until
+        if (late or number == signal.SIGKILL) and ended():
+            for pid in (pid for pid in run.pids if late or pid not in victims):
+                if not server.ask(ended=pid):
+                    os.kill(pid, signal.SIGKILL if late else signal.SIGTERM)
         time.sleep(0.2)
     return True
 
