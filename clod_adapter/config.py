@@ -20,6 +20,8 @@ COUNT_TERMS = ("law", "paper")
 GROWTHS = ("on", "off")
 TARGETS = ("count", "cost")
 STEPS, STEPS_PER_VIEW = 900, 8.5  # of training, by default, with one view a step
+# Gaussians that viewers draw at most on a device, by their makers; docs/formats.md has the sources.
+DEVICES = {"quest3": 500_000, "phone": 1_000_000, "laptop": 2_000_000, "desktop": 4_000_000}
 SH_COUNTS = {0: 1, 1: 4, 2: 9, 3: 16, 4: 25}  # spherical harmonics of each degree
 
 

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import importlib.util
-import json
 import sys
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import replace
 from types import ModuleType
 from typing import Any
 
@@ -251,8 +250,5 @@ def test_everything_grows_by_one_function(name: str, monkeypatch: pytest.MonkeyP
 def test_the_viewer_takes_the_settings_of_the_file() -> None:
     """Its shaders have an equation of their own, checked against golden values; the settings are the file's."""
     model = model_of(TAU)
-    payload = Payload("model.ply", model)
-    assert payload.describe()["attenuation"] == asdict(model.attenuation)  # type: ignore[arg-type]
     raised = Payload("model.ply", model.replace(attenuation=replace(model.attenuation, tau=RAISED)))  # type: ignore[type-var]
-    assert json.dumps(raised.describe()["attenuation"]["tau"]).encode() in raised.header
-    assert raised.header != payload.header
+    assert f"tau {RAISED}\n".encode() in raised.header and raised.header != Payload("model.ply", model).header

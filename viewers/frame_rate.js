@@ -30,8 +30,8 @@ export function nextDial(frames, milliseconds, maxSv) {
   return Math.min(Math.max(dial * Math.exp(step), 1), maxSv);
 }
 
-/** Follows frames of an animation that is drawn after changes only, at `fps` frames per second. */
-export function createHold(fps) {
+/** Follows frames of an animation that is drawn after changes only, at `fps` frames per second, with dial values from `least` on. */
+export function createHold(fps, least = 1) {
   const milliseconds = (WORK * 1000) / fps;
   let frames = [], left = REST;
   const excessAt = (dial) => (frames.length < NEWEST ? 0 : excess(frames, milliseconds) - EXPONENT * Math.log(dial / frames.at(-1)[0]));
@@ -44,7 +44,7 @@ export function createHold(fps) {
     /** Takes a frame's time; returns the dial value of the next frame. A value below 1 stays while it is fast enough. */
     took(dial, took, maxSv) {
       frames = [...frames, [Math.max(dial, 1), took]].slice(-FRAMES);
-      const held = nextDial(frames, milliseconds, maxSv), next = held > 1 ? held : Math.min(dial, 1);
+      const held = Math.max(nextDial(frames, milliseconds, maxSv), least), next = held > 1 ? held : Math.min(dial, 1);
       left -= next === dial ? UNCHANGED : 1;
       return next;
     },

@@ -60,8 +60,8 @@ def export_options(parser: ArgumentParser) -> None:
         help="sort the Gaussians by the dial value at which they are culled, latest first, for prefix rendering",
     )  # fmt: skip
     output.add_argument(
-        "--pack", action="store_true",
-        help="pack the splat in an .html page by splat-transform: a fifth of the size, with rounded values",
+        "--exact", action="store_true",
+        help="store float32 values in an .html page, in place of rounded ones: eight times the size",
     )  # fmt: skip
     add_device(output, "measure for --fps and --psnr-drop with --images")
 
@@ -81,7 +81,7 @@ def check_export(args: Namespace) -> None:
         raise ClodError(f"{args.model}: has no sigma_d to order its Gaussians by; adapt it first")
     if folder_option(args) is None:
         check_format(args, bakes, dial)
-    if args.lod_meta or args.pack or (not args.tiles and suffix_of(Path(args.out)) in PACKED):
+    if args.lod_meta or (not args.tiles and suffix_of(Path(args.out)) in PACKED):
         SplatTransform.find()
 
 
@@ -114,8 +114,8 @@ def check_together(args: Namespace, bakes: bool) -> None:
     page = Path(args.out).suffix.lower() == PAGE
     if page and (args.levels or args.camera is not None or args.order):
         raise ClodError(f"a {PAGE} page contains the whole dial; remove --levels, --camera and --order")
-    if args.pack and not page:
-        raise ClodError(f"--pack is for {PAGE} pages; .sog and .compressed.ply are packed by themselves: remove it")
+    if args.exact and not page:
+        raise ClodError(f"--exact is for {PAGE} pages; another format has its own precision: remove it")
     if args.camera is not None and not bakes:
         raise ClodError("--camera needs a dial value to bake; give one, as in --sv 2")
     if args.images is not None and not (bakes or args.order or page):
@@ -205,9 +205,9 @@ other tools:
   SIBR reads a baked .ply of SH degree 1 to 3, and takes the degree from
   sh_degree in cfg_args next to the file.
   .html is the page of "clod-adapt view" in one file; --sv or a budget sets its
-  initial dial value. With --pack its splat is rounded as in .sog; the loss is
-  measured and printed.
-  .sog, .compressed.ply, --pack and --lod-meta need splat-transform 3.7 with
+  initial dial value. Its splat is rounded as in .spz; the PSNR against MODEL is
+  measured and printed. With --exact it is float32.
+  .sog, .compressed.ply and --lod-meta need splat-transform 3.7 with
   Node 22, on the PATH or in CLOD_SPLAT_TRANSFORM; "clod-adapt doctor" prints
   how to install it. Without a GPU, 100,000 Gaussians take minutes for .sog.
 

@@ -77,7 +77,7 @@ def prepare_export(
     gaussians = model.gaussians
     if args.order:
         gaussians = gaussians.select(order_by_extinction(gaussians, target.cameras))
-    return Export(model, gaussians, target, cameras, bool(args.order), args.pack, console), notes
+    return Export(model, gaussians, target, cameras, bool(args.order), args.exact, console), notes
 
 
 def dial_values(

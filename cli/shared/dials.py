@@ -5,6 +5,8 @@ from __future__ import annotations
 from argparse import Namespace
 from typing import TYPE_CHECKING, Any
 
+from clod_adapter.config import DEVICES
+
 if TYPE_CHECKING:
     from argparse import _ActionsContainer
 
@@ -14,8 +16,6 @@ OPTIONS: tuple[tuple[str, str, type, str], ...] = (
     ("fps", "F", float, "the dial value that renders F frames per second, by frame times {times}"),
     ("psnr_drop", "DB", float, "the dial value that loses DB decibels against s = 1, {decibels}"),
 )  # fmt: skip
-# Gaussians that viewers draw at most on a device, by their makers; docs/formats.md has the sources.
-DEVICES = {"quest3": 500_000, "phone": 1_000_000, "laptop": 2_000_000, "desktop": 4_000_000}
 BUDGETS = """\
 budgets, each solved for a dial value:
   --keep       exact; s = 1 keeps fewer Gaussians than the file has

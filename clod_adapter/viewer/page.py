@@ -8,28 +8,37 @@ from __future__ import annotations
 
 import base64
 import hashlib
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import cache
 from importlib.resources import files
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
+import torch
+from PIL import Image
+
 from clod_adapter._support.text import script_json
 from clod_adapter.cameras import Camera
+from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.checkpoint import Checkpoint
-from clod_adapter.io.formats.splat_transform import SplatTransform
+from clod_adapter.render import render
 from clod_adapter.viewer.payload import Payload, page_config
-from clod_adapter.viewer.sog import PackedSplat, pack_sog
 
 PAGE, STYLE, SCRIPT = "page.html", "viewer.css", "viewer.js"
 MAX_CHARACTERS = 1 << 26  # per script element; browsers limit strings to about 5e8
-PLACEHOLDERS = ("<!--CLOD-STYLE-->", "<!--CLOD-CONFIG-->", "<!--CLOD-DATA-->", "<!--CLOD-SCRIPT-->")  # in this order
+POSTER_SIDE, POSTER_BYTES = 512, 40_000  # of the picture shown while the page loads: pixels, bytes before base64
+# In this order.
+PLACEHOLDERS = (
+    "<!--CLOD-STYLE-->", "<!--CLOD-POSTER-->", "<!--CLOD-CONFIG-->", "<!--CLOD-DATA-->", "<!--CLOD-SCRIPT-->",
+)  # fmt: skip
 
 
 def served_page(config: Mapping[str, Any]) -> bytes:
     """The page that fetches its splats from its server."""
-    return b"".join(_document(config, (), ""))
+    return b"".join(_document(config, (), "", ""))
 
 
 def write_viewer_page(
@@ -39,9 +48,8 @@ def write_viewer_page(
     base: Checkpoint | None = None,
     cameras: Sequence[Camera] = (),
     virtual_scale: float | None = None,
-    tool: SplatTransform | None = None,
-    progress: Callable[[float], None] | None = None,
-) -> PackedSplat | None:
+    exact: bool = False,
+) -> tuple[Gaussians, tuple[str, ...]]:
     """Writes the page as one file that includes the splats, for opening without a server or network.
 
     The same arguments give the same bytes; what is installed has no influence.
@@ -50,44 +58,54 @@ def write_viewer_page(
         model: with or without a dial.
         base: shown for comparison; relative to the same origin.
         cameras: selectable viewpoints, in the frame of the Gaussians (relative to the origin); by default the stored
-            ones.
+            ones. A picture from the first one is shown while the page loads.
         virtual_scale: the initial dial value, >= 0; None for 1 with photographs, else 0 (everything), and then what
-            the device holds.
-        tool: packs the splats to a fifth of their size, with rounded values (``pack_sog``, which calls
-            ``progress``); None stores them unpacked.
+            suits the device.
+        exact: includes the splats as float32, not as SPZ, which has an eighth of the size.
 
     Returns:
-        The packed model; None without ``tool``.
+        The model's Gaussians as the page shows them, and a line for each loss.
 
     Raises:
-        ClodError: the file cannot be written, or packing fails.
+        ClodError: the file cannot be written, or SPZ cannot store the splat.
     """
-    entries, data, packs = list[dict[str, Any]](), dict[str, Iterable[bytes]](), list[PackedSplat | None]()
-    for element, checkpoint in (("clod-model", model), ("clod-base", base)):
-        if checkpoint is not None:
-            payload = Payload.of(checkpoint)
-            packed = pack_sog(payload, tool, Path(path).absolute().parent, progress) if tool else None
-            entry, added = _embed(element, payload, packed)
-            entries.append(entry)
-            packs.append(packed)
-            data |= added
     shown, placed = cameras or model.cameras, model.placed and not cameras
-    config = page_config(entries[0], entries[1] if base else None, shown, virtual_scale, placed=placed)
-    meta = f'<meta http-equiv="Content-Security-Policy" content="{policy()}">\n'
-    with atomic_path(path) as temporary, open(temporary, "wb") as file:
-        file.writelines(_document(config, _elements(data), meta))
-    return packs[0]
+    with atomic_path(path) as temporary:
+        checkpoints = {"clod-model": model} | ({"clod-base": base} if base else {})
+        payloads = {element: Payload.of(each) for element, each in checkpoints.items()}
+        entries = [{"name": payload.name, "element": element} for element, payload in payloads.items()]
+        if exact:
+            data: dict[str, Iterable[bytes]] = {element: payload.blocks() for element, payload in payloads.items()}
+            found, notes = payloads["clod-model"].gaussians, tuple[str, ...]()
+        else:
+            packed = {element: payload.packed(f"{temporary}.spz") for element, payload in payloads.items()}
+            data = {element: (spz,) for element, (spz, *_) in packed.items()}
+            _, found, notes = packed["clod-model"]
+        config = page_config(entries[0], entries[1] if base else None, shown, virtual_scale, placed=placed)
+        opening = virtual_scale if virtual_scale is not None else 0.0 if placed else 1.0
+        poster = _poster(found, shown[0], opening) if shown else ""
+        meta = f'<meta http-equiv="Content-Security-Policy" content="{policy()}">\n'
+        with open(temporary, "wb") as file:
+            file.writelines(_document(config, _elements(data), meta, poster))
+    return found, notes
 
 
-def _embed(
-    element: str, payload: Payload, packed: PackedSplat | None
-) -> tuple[dict[str, Any], dict[str, Iterable[bytes]]]:
-    """A splat's entry in the configuration, and its bytes in the page by the id of their element."""
-    if packed is None:
-        return payload.describe(element=element), {element: payload.blocks()}
-    columns = {name: {"element": f"{element}-{name}", "gzip": True} for name in packed.columns}
-    entry = payload.describe(element=element, format="sog", columns=columns)
-    return entry, {element: (packed.sog,), **{f"{element}-{name}": (data,) for name, data in packed.columns.items()}}
+def _poster(gaussians: Gaussians, camera: Camera, virtual_scale: float) -> str:
+    """An element with the view of a camera as a JPEG, for the time until the page has drawn its own."""
+    scale = min(POSTER_SIDE / max(camera.width, camera.height), 1.0)
+    width, height = (max(round(scale * side), 1) for side in (camera.width, camera.height))
+    K = camera.K * torch.tensor([[width / camera.width], [height / camera.height], [1.0]])
+    small = replace(camera, K=K, width=width, height=height)
+    dial = 1.0 if gaussians.sigma_d is None else virtual_scale
+    image = Image.fromarray(render(gaussians, small, dial).pixels.cpu().numpy())
+    for quality in (80, 60, 40, 20, 5):
+        buffer = BytesIO()
+        image.save(buffer, "JPEG", quality=quality)
+        if buffer.tell() <= POSTER_BYTES:
+            break
+    return (
+        f'<img id="poster" alt="" src="data:image/jpeg;base64,{base64.b64encode(buffer.getvalue()).decode("ascii")}">'
+    )
 
 
 def policy(connect: str = "") -> str:
@@ -99,14 +117,15 @@ def policy(connect: str = "") -> str:
     )
 
 
-def _document(config: Mapping[str, Any], data: Iterable[bytes], meta: str) -> Iterator[bytes]:
-    """The page in pieces, because data may be large; ``meta`` is added to its head."""
+def _document(config: Mapping[str, Any], data: Iterable[bytes], meta: str, poster: str) -> Iterator[bytes]:
+    """The page in pieces, because data may be large; ``meta`` is added to its head, ``poster`` above its canvas."""
     rest = _static_file(PAGE)
     content: dict[str, Iterable[bytes]] = {
         PLACEHOLDERS[0]: (f"{meta}<style>{_static_file(STYLE)}</style>".encode(),),
-        PLACEHOLDERS[1]: (f'<script type="application/json" id="clod-config">{script_json(config)}</script>'.encode(),),
-        PLACEHOLDERS[2]: data,
-        PLACEHOLDERS[3]: (f'<script type="module">{_static_file(SCRIPT)}</script>'.encode(),),
+        PLACEHOLDERS[1]: (poster.encode(),),
+        PLACEHOLDERS[2]: (f'<script type="application/json" id="clod-config">{script_json(config)}</script>'.encode(),),
+        PLACEHOLDERS[3]: data,
+        PLACEHOLDERS[4]: (f'<script type="module">{_static_file(SCRIPT)}</script>'.encode(),),
     }
     for placeholder, pieces in content.items():
         before, _, rest = rest.partition(placeholder)

@@ -6,8 +6,9 @@ The layout does not depend on the file (ascii, big-endian, doubles, masks, .pt).
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,10 +20,13 @@ from clod_adapter._support.text import as_text
 from clod_adapter._support.version import package_version
 from clod_adapter.calibration import Calibration
 from clod_adapter.cameras import Camera
+from clod_adapter.config import DEVICES
 from clod_adapter.gaussians import OPAQUE, Gaussians
-from clod_adapter.io.checkpoint import Checkpoint
+from clod_adapter.io.checkpoint import Checkpoint, load
+from clod_adapter.io.file_formats import write
 from clod_adapter.io.ply.columns import column_map, dial_columns, inria_dtype
 from clod_adapter.io.ply.header import write_comments
+from clod_adapter.origin import NOWHERE, Origin
 
 BLOCK_ROWS = 1 << 14
 
@@ -35,15 +39,18 @@ class Payload:
         name: the file name without its folder.
         gaussians: without SH degrees that are 0; means are relative to the checkpoint's origin.
         calibration: the file's calibration table, if any.
+        origin: the checkpoint's.
     """
 
     name: str
     gaussians: Gaussians
     calibration: Calibration | None = None
+    origin: Origin = NOWHERE
 
     @classmethod
     def of(cls, checkpoint: Checkpoint) -> Payload:
-        return cls(as_text(checkpoint.path.name), checkpoint.gaussians.without_empty_bands(), checkpoint.calibration)
+        gaussians = checkpoint.gaussians.without_empty_bands()
+        return cls(as_text(checkpoint.path.name), gaussians, checkpoint.calibration, checkpoint.origin)
 
     @cached_property
     def header(self) -> bytes:
@@ -70,16 +77,25 @@ class Payload:
         for start in range(0, len(self.gaussians), BLOCK_ROWS):
             yield _values(self.gaussians, slice(start, start + BLOCK_ROWS)).astype("<f4", copy=False).tobytes()
 
-    def describe(self, **location: Any) -> dict[str, Any]:
-        """The splat's entry in the page's configuration; ``location`` overrides where the data are."""
-        attenuation = self.gaussians.attenuation
-        return {
-            "name": self.name, "href": None, "element": None, "format": "ply", "columns": {},
-            "size": self.size, "count": len(self.gaussians), "max_sv": attenuation.max_sv if attenuation else 1.0,
-            "attenuation": asdict(attenuation) if attenuation else None,
-            "screen_filter": asdict(self.gaussians.screen_filter),
-            "no_dial": None if attenuation else no_dial(self.name), "calibration": _calibration_rows(self.calibration),
-        } | location  # fmt: skip
+    def packed(self, file: str | Path) -> tuple[bytes, Gaussians, tuple[str, ...]]:
+        """The splat as SPZ, of which rows that are near one another take a tenth less.
+
+        Args:
+            file: a temporary name.
+
+        Returns:
+            The bytes, the Gaussians in them, and a line for each loss.
+
+        Raises:
+            ClodError: as ``file_formats.write``.
+        """
+        rows = _along_curve(self.gaussians.means)
+        try:
+            notes = write(file, self.gaussians.select(rows), origin=self.origin, calibration=self.calibration)
+            found = load(file, origin=self.origin).gaussians.to(self.gaussians.means.device)
+            return Path(file).read_bytes(), found, notes
+        finally:
+            Path(file).unlink(missing_ok=True)
 
 
 def page_config(
@@ -93,23 +109,19 @@ def page_config(
     """The page's configuration.
 
     Args:
-        model, base: from ``Payload.describe``.
+        model, base: their ``name``, and where the data are: ``href`` and ``size`` on the server, or ``element`` in the
+            page.
         cameras: selectable viewpoints, in this order, in the frame of the Gaussians.
         virtual_scale: the initial dial value, >= 0; None for 1 with photographs, else 0 (everything), and then what
-            the device holds.
-        others: further models to switch to, from ``Payload.describe``.
+            suits the device.
+        others: further models to switch to.
         placed: the cameras are not photographs'; the page levels them by the scene's up axis.
     """
     return {
         "version": package_version(), "title": model["name"], "model": model, "base": base,
         "others": list(others), "cameras": [_camera(camera) | {"placed": placed} for camera in cameras],
-        "virtual_scale": virtual_scale,
+        "devices": DEVICES, "virtual_scale": virtual_scale,
     }  # fmt: skip
-
-
-def no_dial(name: str) -> str:
-    """The message for a file without a dial: the reason, and the command that adds one."""
-    return f"{name} has no sigma_d, so it has no dial; add one: clod-adapt {name} --images SCENE"
 
 
 def dial_of(gaussians: Gaussians) -> dict[str, Tensor]:
@@ -130,9 +142,13 @@ def _values(gaussians: Gaussians, rows: slice) -> np.ndarray:
     return torch.cat(parts, 1).detach().float().cpu().numpy()
 
 
-def _calibration_rows(calibration: Calibration | None) -> list[dict[str, float]]:
-    rows = calibration.rows if calibration else ()
-    return [{"virtual_scale": row.virtual_scale, "count": row.kept, "psnr": row.psnr} for row in rows]
+def _along_curve(means: Tensor) -> Tensor:
+    """The rows in Morton order, of cells that divide all but the outermost 1 % on each side by 1024."""
+    points = means.detach().double().cpu().numpy()
+    low, high = np.quantile(points, (0.01, 0.99), axis=0)
+    cells = (1023 * (points - low) / np.maximum(high - low, 1e-300)).clip(0, 1023).astype(np.int64)
+    code = sum(((cells[:, k] >> bit) & 1) << (3 * bit + k) for bit in range(10) for k in range(3))
+    return torch.from_numpy(np.argsort(code, kind="stable")).to(means.device)
 
 
 def _camera(camera: Camera) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +12,12 @@ import torch
 
 import clod_adapter
 import scenes
+from clod_adapter.calibration import Calibration, CalibrationRow
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.render import dial
+from clod_adapter.render import dial, render
 from clod_adapter.viewer import page, payload
 from clod_adapter.viewer.page import write_viewer_page
-from shown import COUNTS, SIZE, Shown, serve, take
+from shown import COUNTS, SIZE, Shown, assert_same, serve, take
 
 
 def test_a_file_without_sigma_d_has_no_dial(show: Any, save: Any, plain: Gaussians) -> None:
@@ -126,7 +128,9 @@ def test_one_file_needs_no_network(
     monkeypatch.setattr(payload, "BLOCK_ROWS", 100)
     path = save(gaussians)
     served, model = show(path, "--sv", 2), clod_adapter.load(path)
-    write_viewer_page(tmp_path / "page.html", model, base=model, cameras=scenes.ring(2, 320, 240), virtual_scale=2.0)
+    write_viewer_page(
+        tmp_path / "page.html", model, base=model, cameras=scenes.ring(2, 320, 240), virtual_scale=2.0, exact=True
+    )
     assert (tmp_path / "page.html").read_text(encoding="utf-8").count('id="clod-model"') > 2
     with chromium.new_context(viewport=SIZE, offline=True) as context:
         alone = Shown(context.new_page()).ready((tmp_path / "page.html").as_uri())
@@ -136,6 +140,35 @@ def test_one_file_needs_no_network(
         alone.run("clod.setWipe(0.5, 'base')")
         assert alone.errors == []
         assert [url for url in alone.asked if not url.startswith(("file:", "blob:", "data:"))] == []
+
+
+def test_a_page_shows_its_spz(chromium: Any, save: Any, artefacts: Path) -> None:
+    """What Python reads of it, with growth, in units that float16 does not hold; the picture to wait for goes away."""
+    size, model = 1000.0, scenes.dialled(1000, 3, 4, scene_distance=1.0, reference_distance=3.0)
+    grown = model.replace(growth_d=torch.linspace(-0.5, 1, 1000))
+    far = grown.replace(
+        means=size * grown.means, log_scales=grown.log_scales + float(np.log(size)), sigma_d=size * grown.sigma_d,
+        attenuation=replace(grown.attenuation, reference_distance=3 * size, eps=size**2 * grown.attenuation.eps),
+    )  # fmt: skip
+    row = CalibrationRow(1.0, 900.0, 31.5, 0.9, 4.0)
+    for name, gaussians, unit in (("near", grown, 1.0), ("far", far, size)):
+        path = save(gaussians, f"{name}.ply")
+        calibrated = replace(clod_adapter.load(path), calibration=Calibration((row,), 1000, 2, 8, 6, "a machine"))
+        camera = scenes.camera(320, 240)
+        viewmat = camera.viewmat.clone()
+        viewmat[:3, 3] *= unit
+        seen = replace(camera, viewmat=viewmat)
+        read, _ = write_viewer_page(path.with_suffix(".html"), calibrated, cameras=[seen], virtual_scale=1.0)
+        with chromium.new_context(viewport=SIZE, offline=True) as context:
+            shown = Shown(context.new_page())
+            shown.page.goto(path.with_suffix(".html").as_uri(), wait_until="commit")
+            shown.run("clod.ready")
+            assert shown.page.query_selector("#poster") is None and shown.page.is_visible("#dial")
+            assert shown.text("#quality") == "31.5 dB" and shown.errors == []
+            shown.camera(seen)
+            for s in (1.0, 3.0):
+                shown.run("clod.setDial(given)", s)
+                assert_same(shown, render(read, seen, s), artefacts / f"{name}_{s:g}.png")
 
 
 def test_the_panel_fits_the_window(show: Any, model: Path, save: Any, plain: Gaussians, artefacts: Path) -> None:

@@ -217,6 +217,25 @@ def test_a_file_opens_with_everything_and_moves_to_what_the_device_holds(
         each.page.close()
 
 
+def test_a_file_opens_with_the_count_of_its_device(chromium: Any, model: Path, tmp_path: Path) -> None:
+    """However fast it is; a slow one has fewer. Of a device with room for all nothing is said."""
+    path = tmp_path / "page.html"
+    write_viewer_page(path, clod_adapter.load(model))
+    text = path.read_text(encoding="utf-8")
+    assert '"devices": {"quest3": 500000, "phone": 1000000,' in text
+    path.write_text(text.replace('"quest3": 500000, "phone": 1000000', '"quest3": 50, "phone": 100'), encoding="utf-8")
+    devices = {"phone": {"has_touch": True, "is_mobile": True}, "quest3": {"user_agent": "OculusBrowser/40"}}
+    for device, count in {"phone": 100, "quest3": 50, "desktop": 400}.items():
+        with chromium.new_context(**devices.get(device, {})) as context:
+            shown = opened(context, path.as_uri(), QUERIES.replace("load: 1", "load: 0.1"))
+            assert shown.counts()["kept"] == count and shown.errors == [], device
+            note = f"Opened at {shown.text('#dial-value')}, with {count} Gaussians for such devices"
+            assert shown.text("#target-note") == ("" if device == "desktop" else note)
+            if device == "phone":
+                slow = opened(context, path.as_uri(), QUERIES.replace("load: 1", "load: 5"))
+                assert dial_of(slow) > dial_of(shown) and "Moved to s" in slow.text("#target-note")
+
+
 def test_notes_on_a_dropped_file_stay_when_the_dial_has_settled(tabs: Any, model: Path, tmp_path: Path) -> None:
     """Followed by what became of the dial: kept, moved, or not moved on a device that is too slow."""
     write_viewer_page(tmp_path / "page.html", clod_adapter.load(model))

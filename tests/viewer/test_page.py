@@ -4,14 +4,20 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import io
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
+from PIL import Image
 
 import clod_adapter
 import scenes
+from clod_adapter.render import render
 from clod_adapter.viewer import page, payload
 from clod_adapter.viewer.payload import Payload, page_config
 
@@ -62,27 +68,41 @@ def test_colours_are_those_of_the_report() -> None:
 
 
 def test_a_name_cannot_end_its_element() -> None:
-    entry = Payload(NASTY, scenes.gaussians(3, 0, 0)).describe(href="/files/model")
-    text = page.served_page(page_config(entry, None, [], 1.0)).decode()
+    text = page.served_page(page_config({"name": NASTY}, None, [], 1.0)).decode()
     assert json.loads(element(text, "clod-config"))["model"]["name"] == NASTY
     assert "<script>alert" not in text
 
 
-def test_one_file_contains_everything(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("exact", [True, False])
+def test_one_file_contains_everything(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, exact: bool) -> None:
+    """Splats as PLY or SPZ, a picture of the first camera, and a policy that allows no connection."""
     monkeypatch.setattr(payload, "BLOCK_ROWS", 7)  # blocks that base64 would pad
     clod_adapter.save(tmp_path / "model.ply", clod_adapter.with_dial(scenes.gaussians(50, 1, 0)))
-    saved, cameras = clod_adapter.load(tmp_path / "model.ply"), scenes.ring(2, 20, 10)
-    page.write_viewer_page(tmp_path / "page.html", saved, base=saved, cameras=cameras, virtual_scale=2.0)
-    text = (tmp_path / "page.html").read_text(encoding="utf-8")
+    saved, cameras = clod_adapter.load(tmp_path / "model.ply"), scenes.ring(2, 1000, 500)
+    out = tmp_path / "out" / "page.html"
+    out.parent.mkdir()
+    shown, losses = page.write_viewer_page(out, saved, base=saved, cameras=cameras, virtual_scale=2.0, exact=exact)
+    assert [each.name for each in out.parent.iterdir()] == ["page.html"] and bool(losses) != exact
+    text = out.read_text(encoding="utf-8")
     config = json.loads(element(text, "clod-config"))
     for entry, name in ((config["model"], "clod-model"), (config["base"], "clod-base")):
-        assert (entry["element"], entry["href"]) == (name, None)
+        assert entry == {"name": "model.ply", "element": name}
         data = base64.b64decode(element(text, name), validate=True)
-        assert data == b"".join(Payload.of(saved).blocks())
+        if exact:
+            assert data == b"".join(Payload.of(saved).blocks())
+        else:
+            (tmp_path / "held.spz").write_bytes(data)
+            assert torch.equal(clod_adapter.load(tmp_path / "held.spz").gaussians.means, shown.means)
     assert len(config["cameras"]) == 2 and config["virtual_scale"] == 2.0
     policy = re.search('<meta http-equiv="Content-Security-Policy" content="([^"]*)">', text)
-    assert policy and "default-src 'none'" in policy[1] and "'self'" not in policy[1]
+    assert policy and "default-src 'none'" in policy[1] and "'self'" not in policy[1] and "unsafe" not in policy[1]
     assert str(tmp_path) not in text
-    page.write_viewer_page(tmp_path / "alone.html", saved)
+    (poster,) = re.findall('<img id="poster" alt="" src="data:image/jpeg;base64,([^"]*)">', text)
+    assert len(poster) < 60_000
+    picture = np.asarray(Image.open(io.BytesIO(base64.b64decode(poster))), dtype=float)
+    wanted = render(shown, replace(cameras[0], K=cameras[0].K * 0.512, width=512, height=256), 2.0).pixels.numpy()
+    assert picture.shape == wanted.shape and np.abs(picture - wanted).mean() < 3
+    page.write_viewer_page(tmp_path / "alone.html", saved, exact=exact)
     text = (tmp_path / "alone.html").read_text(encoding="utf-8")
     assert json.loads(element(text, "clod-config"))["base"] is None and "clod-base" not in text
+    assert '<img id="poster"' not in text  # no viewpoint is stored

@@ -14,7 +14,8 @@ from plyfile import PlyData
 import clod_adapter
 import scenes
 from clod_adapter.calibration import Calibration, CalibrationRow
-from clod_adapter.config import FILTERS, AttenuationConfig
+from clod_adapter.config import FILTERS
+from clod_adapter.equation.units import with_distance
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.viewer.payload import BLOCK_ROWS, Payload, page_config
 
@@ -72,25 +73,30 @@ def test_empty_sh_degrees_and_dropped_rows_are_left_out(capture: Any, tmp_path: 
     capture.write(tmp_path / "a.ply", gaussians.replace(means=means, sigma_d=None, attenuation=None))
     checkpoint = dataclasses.replace(clod_adapter.load(tmp_path / "a.ply"), path=Path("b\udcff.ply"))
     payload = Payload.of(checkpoint)
-    assert b"f_rest" not in payload.header and len(payload.gaussians) == payload.describe()["count"] == 39
+    assert b"f_rest" not in payload.header and len(payload.gaussians) == 39
     assert payload.name == "b\\xff.ply"
 
 
-def test_description() -> None:
-    """Numbers of a camera keep all digits of float32."""
+def test_spz_has_the_same_settings_and_leaves_no_file(tmp_path: Path) -> None:
+    """In world units that float16 would not hold, and relative to the origin. Its rows are in another order."""
     rows = (CalibrationRow(1.0, 30.5, 29.25, 0.9, 4.0), CalibrationRow(3.0, 9.0, 28.0, 0.8, 2.0))
-    payload = Payload("a b.ply", dialled(), Calibration(rows, 40, 2, 8, 6, "a machine"))
-    entry = payload.describe(href="/files/model")
-    assert (entry["name"], entry["href"], entry["element"], entry["format"]) == ("a b.ply", "/files/model", None, "ply")
-    assert (entry["count"], entry["max_sv"], entry["no_dial"], entry["columns"]) == (40, 5.0, None, {})
-    assert entry["attenuation"] == dataclasses.asdict(AttenuationConfig(tau=0.02, cut="soft"))
-    assert entry["calibration"][1] == {"virtual_scale": 3.0, "count": 9.0, "psnr": 28.0}
-    plain = Payload("p.ply", scenes.gaussians(5, 0, 0)).describe()
-    assert plain["attenuation"] is None and plain["max_sv"] == 1.0 and plain["calibration"] == []
-    assert plain["screen_filter"] == {"variance": 0.3, "compensate": False}
-    assert plain["no_dial"].startswith("p.ply has no sigma_d") and "clod-adapt p.ply" in plain["no_dial"]
+    model = with_distance(dialled(degree=4), 1000.0)
+    payload = Payload("a.ply", model, Calibration(rows, 40, 2, 8, 6, "a machine"), (5e5, 4e6, 0.0))
+    data, found, losses = payload.packed(tmp_path / "temporary.spz")
+    assert list(tmp_path.iterdir()) == [] and any("above degree 3 are dropped" in line for line in losses)
+    (tmp_path / "a.spz").write_bytes(data)
+    read = clod_adapter.load(tmp_path / "a.spz", origin=payload.origin)
+    assert read.calibration == payload.calibration and read.gaussians.screen_filter == FILTERS["mip"]
+    rows_of = (model.means[:, None] - found.means).norm(dim=2).argmin(1)
+    assert sorted(rows_of.tolist()) == list(range(40))
+    wanted = with_distance(model, 1.0)
+    assert torch.allclose(found.sigma_d[rows_of], wanted.sigma_d, rtol=1e-3)
+    assert torch.allclose(found.means[rows_of], model.means, atol=1e-4)
+
+
+def test_cameras_keep_all_digits_of_float32() -> None:
     camera = scenes.ring(3, 20, 10)[1]
-    config = json.loads(json.dumps(page_config(entry, None, [camera], 2.5)))
+    config = json.loads(json.dumps(page_config({"name": "a b.ply"}, None, [camera], 2.5)))
     shown = config["cameras"][0]
     assert (shown["name"], shown["width"], shown["height"], config["virtual_scale"]) == ("view_1.png", 20, 10, 2.5)
     assert torch.equal(torch.tensor(shown["viewmat"]), camera.viewmat)

@@ -49,7 +49,7 @@ export function createFiles(elements, viewer, config, { show, replace, update, s
       ui.showName(name, null);
       ui.showMessage(null);
       await stage.whenDrawn();
-      settle();
+      await settle();
     } catch (error) {
       const message = `${name}: ${error.message}`;
       if (!signal.aborted) ui.showMessage(message);

@@ -6,6 +6,7 @@ import { canRecord } from "./media.js";
 import { createMenu } from "./menu.js";
 import { createModel } from "./model.js";
 import { createMotion } from "./motion.js";
+import { createOpening } from "./opening.js";
 import { readConfig } from "./payload.js";
 import { createPlayback } from "./playback.js";
 import { createRenderer } from "./renderer.js";
@@ -17,8 +18,6 @@ import { createViews } from "./views.js";
 import { createWipe } from "./wipe.js";
 import { xrModes } from "./xr.js";
 
-const OPENING = 30; // frames per second, for which the dial is moved when a file has been opened
-const HOPELESS = Math.log(2); // excess at the largest dial value, above which it is not moved
 const STEEP = 0.7; // sine of a placed camera's angle to the horizon
 
 const elements = elementsOf(document), config = readConfig();
@@ -49,7 +48,7 @@ async function start() {
   stage.listeners.frame = viewer.ui.updateFrame;
   stage.listeners.held = (outOfReach, excess) => {
     viewer.ui.update();
-    if (viewer.opening !== null) return excess > HOPELESS && keepAll(); // a note on the file stays
+    if (viewer.opening !== null) return opening.held(excess); // a note on the file stays
     viewer.ui.showNote(outOfReach ? `s = ${stage.model.max_sv}, the largest trained value, is too slow for this frame rate` : "");
   };
   stage.listeners.error = (error) => viewer.ui.showMessage(error.message);
@@ -63,27 +62,9 @@ async function start() {
     window.addEventListener("hashchange", () => actions.applyLink(location.hash));
   });
   await stage.whenDrawn();
-  settle();
+  elements.poster?.remove();
+  await opening.settle();
 }
-
-/** Moves the dial from where a file was opened to what the device holds, and says so. A touch of the dial ends it. */
-async function settle() {
-  const { stage, opening } = viewer, { model, state } = stage;
-  if (opening === null || !model?.attenuation) return;
-  stage.setHold(OPENING);
-  await stage.whenDrawn();
-  if (viewer.opening === null || stage.model !== model) return;
-  actions.setHold(null);
-  noteAfterOpening(state.dial === opening ? "" : `Moved to s = ${state.dial.toFixed(2)} for ${OPENING} fps on this device`);
-}
-
-function keepAll() {
-  actions.setDial(viewer.opening);
-  noteAfterOpening(`Dial not moved: under ${OPENING / 2} fps at any value`);
-}
-
-/** Shows the notes on the file again, which the end of the hold has removed, and what became of the dial. */
-const noteAfterOpening = (moved) => viewer.ui.showNote([viewer.notes, moved].filter(Boolean).join("; "));
 
 const upload = ({ gaussians, metadata }) => createModel(viewer.renderer.gl, gaussians, metadata, viewer.device);
 
@@ -104,6 +85,7 @@ function show(model, base, cameras, dial) {
   actions.reset();
   stage.state.dial = clampDial(dial ?? (cameras.some(({ placed }) => !placed) ? 1 : 0)); // s = 1 is fitted to photographs
   viewer.opening = dial === null ? stage.state.dial : null;
+  if (dial === null && opening.isOverBudget()) stage.state.dial = uploaded.max_sv; // for a first picture soon
   update();
 }
 
@@ -188,7 +170,8 @@ const actions = {
   fullScreen: () => (document.fullscreenElement ? document.exitFullscreen() : document.documentElement.requestFullscreen?.()),
 };
 
-const files = createFiles(elements, viewer, config, { show, replace, update, settle, clampDial, reset: () => actions.reset() });
+const opening = createOpening(viewer, actions, config.devices);
+const files = createFiles(elements, viewer, config, { show, replace, update, clampDial, settle: () => opening.settle(), reset: () => actions.reset() });
 const ready = start().catch((error) => {
   elements.busy.hidden = true;
   elements.panel.hidden = !viewer.ui; // without it, no control works

@@ -1,7 +1,5 @@
 // The page's configuration, and the splats that it names: in the page or on its server.
-import { DIAL } from "./formats/gaussians.js";
 import { readFile } from "./formats/index.js";
-import { inflate } from "./formats/zip.js";
 
 const PARTS = [0.05, 0.1, 0.2, 0.4, 0.8, 1]; // of a file: ends of its requests, at which the rows so far are shown
 const LEAST = 1 << 16, MOST = 2 ** 30; // bytes of a request; of 2 GB and more, Chromium gives a script none
@@ -11,43 +9,22 @@ const PAUSE = 1000; // ms between two of the pictures before the whole
 /** The page's configuration; a page without one starts empty, as a viewer for dropped files. */
 export function readConfig() {
   const element = document.getElementById("clod-config");
-  return { title: "", model: null, base: null, others: [], cameras: [], virtual_scale: null, ...(element ? JSON.parse(element.textContent) : {}) };
+  return { title: "", model: null, base: null, others: [], cameras: [], virtual_scale: null, devices: {}, ...(element ? JSON.parse(element.textContent) : {}) };
 }
 
 /** {gaussians, metadata} of the configuration's `model` or `base`; calls `onProgress(fraction)` during the transfer and,
  *  where it is slow, `onPart(read)` with the first rows. `signal` aborts it. */
 export async function fetchModel(entry, { signal, onProgress, onPart }) {
-  const readPart = async (bytes) => onPart(described(entry, await readFile(bytes, entry.name, true)));
-  const transfer = { signal, onProgress, onPart: onPart && readPart };
-  const read = await readFile(await bytesOf(entry, transfer), entry.name), { gaussians } = read;
-  for (const [name, place] of Object.entries(entry.columns)) {
-    const values = gaussians[DIAL[name]] = new Float32Array(await bytesOf(place));
-    if (values.length !== gaussians.count) {
-      throw new Error(`it has ${gaussians.count} Gaussians and ${values.length} values of ${name}; export the page again`);
-    }
-  }
-  return described(entry, read);
-}
-
-/** The Gaussians of an entry, with what it says of them. */
-function described(entry, { gaussians, metadata }) {
-  const attenuation = gaussians.sigmaD ? entry.attenuation ?? null : null;
-  return {
-    gaussians,
-    metadata: {
-      ...metadata, name: entry.name, attenuation, screen_filter: entry.screen_filter, max_sv: entry.max_sv ?? metadata.max_sv,
-      no_dial: attenuation ? null : entry.no_dial ?? metadata.no_dial, calibration: entry.calibration ?? [],
-    },
-  };
+  const readPart = async (bytes) => onPart(await readFile(bytes, entry.name, true));
+  return readFile(await bytesOf(entry, { signal, onProgress, onPart: onPart && readPart }), entry.name);
 }
 
 /** Bytes from the same origin (`href`), or from base64 in the elements with the id `element`, which are then removed. */
-async function bytesOf({ href, size, element, gzip }, transfer) {
+async function bytesOf({ href, size, element }, transfer) {
   if (href) return download(href, size, transfer);
   const elements = [...document.querySelectorAll(`[id="${element}"]`)];
   if (!elements.length) throw new Error("the page does not contain its data; export the page again");
-  const data = new Blob(elements.map(takeBytes));
-  return gzip ? (await inflate(data, "gzip")).buffer : data.arrayBuffer();
+  return new Blob(elements.map(takeBytes)).arrayBuffer();
 }
 
 /** In parts, where `onPart` shows them: it is called with the bytes so far. */

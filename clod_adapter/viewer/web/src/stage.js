@@ -151,9 +151,9 @@ export function createStage(renderer, canvas, camera) {
       [main, second] = [makeSide(), makeSide()]; // the old ones may wait for a worker that has ended
       change();
     },
-    /** Holds so many frames per second by the dial, at full resolution; null ends that. */
-    setHold(fps) {
-      hold = fps ? createHold(fps) : null;
+    /** Holds so many frames per second by the dial, from the value `least` on, at full resolution; null ends that. */
+    setHold(fps, least) {
+      hold = fps ? createHold(fps, least) : null;
       if (fps) resolution = 1;
       change();
     },

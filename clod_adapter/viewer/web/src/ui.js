@@ -167,7 +167,7 @@ export function createUi(elements, stage, actions) {
     /** Shows progress in the canvas, at its top where there is a picture; null hides it. */
     showProgress(text) {
       elements.busy.hidden = !text;
-      elements.busy.classList.toggle("tag", Boolean(stage.model));
+      elements.busy.classList.toggle("tag", Boolean(stage.model || elements.poster));
       elements.busy.textContent = text ?? "";
     },
   };

@@ -25,6 +25,14 @@ export function smallestThree(largest, three) {
   return [...three.slice(0, largest), rest, ...three.slice(largest)];
 }
 
+/** The dial's settings, screen-space filter and calibration in our description of a file that is not a PLY; none in others. */
+export function described(values, count) {
+  if (!values) return {};
+  const { attenuation, screen_filter: screenFilter = { variance: 0.3, compensate: false }, calibration } = values;
+  const rows = calibration?.total === count ? calibration.rows.map(({ virtual_scale, kept, psnr }) => ({ virtual_scale, count: kept, psnr })) : [];
+  return { ...(attenuation ? { settings: attenuation } : {}), screenFilter, calibration: rows };
+}
+
 function removals(masked, invalid, count) {
   const notes = masked ? [`${masked} of ${count} Gaussians are masked out by MaskGaussian and were removed`] : [];
   return invalid ? [...notes, `${invalid} of ${count} Gaussians cannot be drawn and were removed`] : notes;

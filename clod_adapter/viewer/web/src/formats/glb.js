@@ -1,5 +1,5 @@
 // glTF binary files with KHR_gaussian_splatting, and _SIGMA_D and _GROWTH_D where there is a dial (io/formats/glb_reader.py).
-import { DIAL, allocate } from "./gaussians.js";
+import { DIAL, allocate, described } from "./gaussians.js";
 
 const EXTENSION = "KHR_gaussian_splatting", JSON_CHUNK = 0x4e4f534a, BINARY_CHUNK = 0x004e4942;
 const KINDS = { 5120: ["Int8", 1, 127], 5121: ["Uint8", 1, 255], 5122: ["Int16", 2, 32767], 5123: ["Uint16", 2, 65535], 5126: ["Float32", 4, 1] };
@@ -30,14 +30,6 @@ export function readGlb(bytes) {
     read(attribute, gaussians[DIAL[name]], 1, 0);
   }
   return { ...gaussians, up: upOf(gltf), ...described(gltf.asset?.extras?.clod_adapter, count) };
-}
-
-/** The dial's settings, screen-space filter and calibration in our description of the file; none in others. */
-function described(values, count) {
-  if (!values) return {};
-  const { attenuation, screen_filter: screenFilter = { variance: 0.3, compensate: false }, calibration } = values;
-  const rows = calibration?.total === count ? calibration.rows.map(({ virtual_scale, kept, psnr }) => ({ virtual_scale, count: kept, psnr })) : [];
-  return { ...(attenuation ? { settings: attenuation } : {}), screenFilter, calibration: rows };
 }
 
 function chunks(bytes) {

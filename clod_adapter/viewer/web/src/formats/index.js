@@ -11,8 +11,8 @@ import { inflate } from "./zip.js";
 
 const noDial = (name) => `${name} has no sigma_d, so it has no dial; add one: clod-adapt ${name} --images SCENE`;
 
-/** {gaussians, metadata} of a file, an ArrayBuffer or bytes, with the metadata that the page's configuration has for a
- *  served one. `prefix`: these are the first bytes of a PLY; the Gaussians are those of its complete rows. */
+/** {gaussians, metadata} of a file, an ArrayBuffer or bytes. `prefix`: these are the first bytes of a PLY; the Gaussians
+ *  are those of its complete rows. */
 export async function readFile(data, name, prefix = false) {
   const bytes = data instanceof Uint8Array ? data : new Uint8Array(data);
   const gaussians = removeInvalid(await readGaussians(bytes, name, prefix).catch(rethrow));

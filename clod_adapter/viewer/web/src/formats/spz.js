@@ -1,6 +1,6 @@
 // Niantic's .spz, versions 2 and 3: gzip of one block per attribute and then vendor records, of which ours has the
 // dial's columns (io/formats/spz.py). Axes are not converted: converters keep those of the PLY.
-import { DIAL, allocate, logit, smallestThree } from "./gaussians.js";
+import { DIAL, allocate, described, logit, smallestThree } from "./gaussians.js";
 
 const MAGIC = 0x5053474e, HEADER = 16;
 const COLOR = 0.15; // colours are stored as 0.15 f_dc + 0.5
@@ -41,14 +41,13 @@ function readRecord(gaussians, bytes, view, at) {
     if (type !== RECORD || at > bytes.length) continue;
     const end = start + view.getUint32(start - 4, true);
     const metadata = JSON.parse(new TextDecoder().decode(bytes.subarray(start, end)));
-    if (metadata.screen_filter) gaussians.screenFilter = metadata.screen_filter;
-    const { columns = ["sigma_d"] } = metadata, { count } = gaussians;
-    if (at - end !== 2 * count * columns.length || !metadata.attenuation) continue;
+    const { columns = ["sigma_d"] } = metadata, { count } = gaussians, found = { ...gaussians, ...described(metadata, count) };
+    if (at - end !== 2 * count * columns.length || !metadata.attenuation) return found;
     columns.forEach((name, k) => {
       const first = end + 2 * count * k, value = (_, i) => floatOfHalf(view.getUint16(first + 2 * i, true));
-      gaussians[DIAL[name]] = Float32Array.from({ length: count }, value);
+      found[DIAL[name]] = Float32Array.from({ length: count }, value);
     });
-    return { ...gaussians, settings: metadata.attenuation };
+    return found;
   }
   return gaussians;
 }
