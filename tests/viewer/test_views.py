@@ -224,7 +224,7 @@ def test_pictures_and_videos_are_saved(shown: Shown) -> None:
 
 
 def test_removed_gaussians_are_shown_in_orange(shown: Shown, save: Any, artefacts: Path) -> None:
-    """In their place by depth and at full opacity; the count is that of the kept ones."""
+    """In their place by depth and at full opacity, among the others in grey; the count is that of the kept ones."""
     model, camera = scenes.dialled(1500, 0, 7), scenes.camera(320, 240)
     take(shown, save(model))
     shown.camera(camera)
@@ -234,9 +234,9 @@ def test_removed_gaussians_are_shown_in_orange(shown: Shown, save: Any, artefact
     drawn = dial(model, camera, 3.0)
     colours = 0.5 + C0 * model.sh0[:, 0].numpy()
     light = np.clip(np.maximum(colours, 0) @ [0.2126, 0.7152, 0.0722], 0, 1)
-    orange = torch.tensor((ORANGE * (0.4 + 0.6 * light)[:, None] - 0.5) / C0, dtype=torch.float32)
+    coloured = np.where(drawn.keep[:, None], 0.3 * light[:, None], ORANGE)
     wanted = model.replace(
-        sigma_d=None, attenuation=None, sh0=torch.where(drawn.keep[:, None, None], model.sh0, orange[:, None]),
+        sigma_d=None, attenuation=None, sh0=torch.tensor((coloured - 0.5) / C0, dtype=torch.float32)[:, None],
         opacity_logits=torch.where(drawn.keep, drawn.opacities.logit(), model.opacity_logits),
     )  # fmt: skip
     assert 0.1 < drawn.keep.float().mean() < 0.9

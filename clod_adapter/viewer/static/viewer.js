@@ -51,7 +51,7 @@ uniform mat3 view;           // world to camera, OpenCV axes
 uniform vec3 eye;
 uniform vec4 pinhole;        // fx, fy, cx, cy
 uniform vec3 size;           // width, height, near
-uniform bool attenuated, soft, marks;   // marks: culled Gaussians are drawn too, in MARK
+uniform bool attenuated, soft, marks;   // marks: culled Gaussians are drawn in MARK, the others in dark grey
 uniform float depth_unit;    // where it is not 0, colours are replaced by depth / (depth + depth_unit)
 uniform float dial, distance_unit, reach, eps, tau;
 uniform float blur;          // px^2 that the screen-space filter adds to covariances
@@ -109,7 +109,7 @@ void main() {
   if (any(lessThan(centre + extent, vec2(0.0))) || any(greaterThan(centre - extent, size.xy))) return;
   vec3 rgb = tint.rgb;
   ${t?"rgb += shColor(row, normalize(ray));":""}
-  if (marked) rgb = ${Mo} * (0.4 + 0.6 * clamp(dot(rgb, vec3(0.2126, 0.7152, 0.0722)), 0.0, 1.0));
+  if (marks && attenuated) rgb = marked ? ${Mo} : vec3(0.3 * clamp(dot(rgb, vec3(0.2126, 0.7152, 0.0722)), 0.0, 1.0));
   if (depth_unit > 0.0) rgb = vec3(point.z / (point.z + depth_unit));
   float far = length(abs(centre - 0.5 * size.xy) + 0.5 * size.xy);   // to the farthest corner: no quad need be longer
   footprint = floatBitsToUint(vec4(centre, min(radius * sqrt(major), far) * normalize(direction)));
