@@ -167,8 +167,8 @@ def test_the_dial_by_hand_ends_it(simulated: Shown, model: Path) -> None:
         assert shown.page.is_checked("#hold")
         shown.page.evaluate(f"(target) => {{ {end} }}", shown.page.query_selector("#target"))
         shown.until("!document.getElementById('hold').checked")
-        dial = dial_of(shown)
-        assert turned(shown, 3) == [] and dial_of(shown) == dial, end
+        dial = shown.text("#dial-value")
+        assert turned(shown, 3) == [] and shown.text("#dial-value") == dial, end
     shown.page.evaluate("document.getElementById('hold').click()")
     take(shown, model)
     assert not shown.page.is_checked("#hold") and shown.errors == []

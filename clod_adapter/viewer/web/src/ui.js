@@ -46,6 +46,7 @@ export function createUi(elements, stage, actions) {
       model?.no_dial ?? "",
     ].filter(Boolean).join(" ");
     setSlider(elements.dial, elements.dialValue, hasDial ? state.dial : null);
+    if (hasDial && !state.equation) elements.dialValue.textContent = "off";
     elements.equation.checked = state.equation && hasDial;
     elements.hold.checked = stage.holds;
     elements.compare.value = mode;
