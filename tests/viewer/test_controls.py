@@ -149,7 +149,7 @@ def test_cameras_of_the_scene(show: Any, model: Path, tmp_path: Path) -> None:
     assert np.array_equal(shown.picture(), views[1])
     shown.page.mouse.move(500, 60)
     shown.page.mouse.wheel(0, 200)
-    shown.until("document.getElementById('camera').selectedIndex === -1")
+    shown.until("document.getElementById('camera').value === 'free view'")
 
 
 RING = "getComputedStyle(document.getElementById('canvas')).outlineStyle !== 'none'"

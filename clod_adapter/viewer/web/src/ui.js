@@ -157,13 +157,15 @@ export function createUi(elements, stage, actions) {
       elements.title.hidden = listed && number !== null;
       elements.files.selectedIndex = number ?? -1;
     },
-    /** Lists the cameras by name. */
+    /** Lists the cameras by name, and last what is shown for a view of none, which cannot be chosen. */
     listCameras(cameras) {
+      const free = new Option("free view");
+      free.hidden = free.disabled = true;
       elements.cameraRow.hidden = !cameras.length;
-      elements.camera.replaceChildren(...cameras.map(({ name }) => new Option(name)));
+      elements.camera.replaceChildren(...cameras.map(({ name }) => new Option(name)), free);
     },
     /** Selects the camera of the present view in the list; null for none. */
-    selectCamera(number) { elements.camera.selectedIndex = number ?? -1; },
+    selectCamera(number) { elements.camera.selectedIndex = number ?? elements.camera.length - 1; },
     showNote(text) { elements.targetNote.textContent = text; },
     /** Shows progress in the canvas, at its top where there is a picture; null hides it. */
     showProgress(text) {
