@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -160,11 +161,15 @@ def test_a_page_shows_its_spz(chromium: Any, save: Any, artefacts: Path) -> None
         seen = replace(camera, viewmat=viewmat)
         read, _ = write_viewer_page(path.with_suffix(".html"), calibrated, cameras=[seen], virtual_scale=1.0)
         with chromium.new_context(viewport=SIZE, offline=True) as context:
-            shown = Shown(context.new_page())
-            shown.page.goto(path.with_suffix(".html").as_uri(), wait_until="commit")
-            shown.run("clod.ready")
+            shown = Shown(context.new_page()).ready(path.with_suffix(".html").as_uri())
             assert shown.page.query_selector("#poster") is None and shown.page.is_visible("#dial")
             assert shown.text("#quality") == "31.5 dB" and shown.errors == []
+            shown.page.keyboard.press("l")
+            here = shown.page.evaluate("location.hash")
+            eye = ",".join(str(unit * value) for value in (40, 0, -40))
+            for view, quality in ((re.sub("eye=[^&]*", f"eye={eye}", here), ""), (here, "31.5 dB")):
+                shown.page.evaluate("hash => { location.hash = hash }", view)
+                shown.until(f"document.getElementById('quality').textContent === '{quality}'")
             shown.camera(seen)
             for s in (1.0, 3.0):
                 shown.run("clod.setDial(given)", s)

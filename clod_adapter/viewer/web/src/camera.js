@@ -3,12 +3,13 @@ import { add, cross, dot, row, rotated, unit } from "./vector.js";
 
 const DEFAULT_FOV = (50 * Math.PI) / 180; // without a configured camera
 const NEAR = 0.01; // depth of the near plane, world units, as in clod_adapter/cameras.py
+const BESIDE = 0.5, ALIKE = 0.7; // of isNear: of the distance; cosine
 const MAX_PITCH = 0.995; // of |forward . up|: orbiting stops before it looks straight up or down
 
 export function createCamera() {
   const camera = {
     rotation: [1, 0, 0, 0, 1, 0, 0, 0, 1], // rows: right, down, forward, in world axes
-    eye: [0, 0, 0], up: [0, -1, 0], distance: 1, // distance: from the eye to the pivot, the point ahead that orbiting rotates about
+    eye: [0, 0, 0], up: [0, -1, 0], distance: 1, reach: 1, // distance: from the eye to the pivot, the point ahead that orbiting rotates about
     near: NEAR,
     fov: DEFAULT_FOV, aspect: 1, // of the picture that the canvas shows in full: across its shorter side, radians; width over height
     panel: [0, 0], // shares of the canvas that the panel covers from the left and from the bottom, with what is beside it
@@ -25,8 +26,7 @@ export function createCamera() {
     /** Takes pose and intrinsics of a camera of the configuration; one that was placed is levelled. */
     set({ viewmat, K, width, height, near, placed = false }) {
       camera.rotation = [0, 1, 2].flatMap((k) => viewmat[k].slice(0, 3));
-      const t = [0, 1, 2].map((k) => viewmat[k][3]);
-      camera.eye = [0, 1, 2].map((k) => -dot([0, 1, 2].map((j) => viewmat[j][k]), t));
+      camera.eye = axisOf(viewmat).eye;
       camera.near = near > 0 ? near : NEAR;
       camera.intrinsics = { fx: K[0][0], fy: K[1][1], cx: K[0][2], cy: K[1][2], width, height };
       const [side, f] = width < height ? [width, K[0][0]] : [height, K[1][1]];
@@ -95,6 +95,14 @@ export function createCamera() {
       camera.distance = distance;
     },
 
+    /** Whether one of the cameras is near and looks the same way, by the distance to the pivot when they were fitted. */
+    isNear(cameras) {
+      return cameras.some(({ viewmat }) => {
+        const { eye, forward } = axisOf(viewmat);
+        return Math.hypot(...add(camera.eye, eye, -1)) < BESIDE * camera.reach && dot(forward, row(camera.rotation, 2)) > ALIKE;
+      });
+    },
+
     /** Shows the first of `cameras`, with the pivot where they look; without cameras, all Gaussians of the extent. */
     fit(extent, cameras, up) {
       const { centre, radius } = extent;
@@ -102,6 +110,7 @@ export function createCamera() {
       if (cameras.length) {
         camera.set(cameras[0]);
         camera.distance = focusDistance(cameras) ?? Math.max(dot(row(camera.rotation, 2), add(centre, camera.eye, -1)), 0.1 * radius);
+        camera.reach = camera.distance;
         return;
       }
       camera.near = Math.min(NEAR, 1e-3 * radius);
@@ -131,13 +140,15 @@ function lookingDown(up) {
   return unit(add(unit(add(axis, up, -dot(axis, up))), up, -0.5));
 }
 
+/** The optical axis of a camera of the configuration: {eye, forward}. */
+function axisOf(viewmat) {
+  const r = viewmat.map((line) => line.slice(0, 3)), t = [0, 1, 2].map((k) => viewmat[k][3]);
+  return { forward: r[2], eye: [0, 1, 2].map((k) => -(r[0][k] * t[0] + r[1][k] * t[1] + r[2][k] * t[2])) };
+}
+
 /** Depth in the first camera of the point nearest to all axes (least squares); null where there is none in front of it. */
 function focusDistance(cameras) {
-  const normal = new Float64Array(9), target = [0, 0, 0];
-  const poses = cameras.map(({ viewmat }) => {
-    const r = viewmat.map((line) => line.slice(0, 3)), t = [0, 1, 2].map((k) => viewmat[k][3]);
-    return { forward: r[2], eye: [0, 1, 2].map((k) => -(r[0][k] * t[0] + r[1][k] * t[1] + r[2][k] * t[2])) };
-  });
+  const normal = new Float64Array(9), target = [0, 0, 0], poses = cameras.map(({ viewmat }) => axisOf(viewmat));
   for (const { forward, eye } of poses) {
     for (let i = 0; i < 3; i++) for (let j = 0; j < 3; j++) {
       const value = (i === j ? 1 : 0) - forward[i] * forward[j];

@@ -68,7 +68,7 @@ export function createUi(elements, stage, actions) {
     const { model } = stage, { total, kept } = stage.counts(), other = stage.otherCounts();
     elements.counts.textContent = total ? `${integer(kept)} of ${integer(total)} kept (${percent(kept, total)})` : "";
     elements.frame.textContent = stage.frameMs === null ? "" : `${stage.frameMs.toFixed(stage.frameMs < 10 ? 1 : 0)} ms per frame`;
-    const psnr = model?.attenuation && state.equation ? interpolatePsnr(model.calibration, state.dial) : null;
+    const psnr = model?.attenuation && state.equation && actions.isCalibrated() ? interpolatePsnr(model.calibration, state.dial) : null;
     elements.quality.textContent = psnr === null ? "" : `${psnr.toFixed(1)} dB`;
     if (!other) return;
     const left = !model.attenuation ? model.name : state.equation ? formatDial(state.dial) : "dial off";

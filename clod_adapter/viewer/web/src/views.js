@@ -16,6 +16,8 @@ export function createViews(elements, viewer, { update, showFile, clampDial }) {
       viewer.ui.selectCamera(0);
       update();
     },
+    /** Whether the calibration tells of such a view: it is of the cameras', if there are any to compare with. */
+    isCalibrated: () => !viewer.cameras.length || viewer.camera.isNear(viewer.cameras),
     nextCamera(step) {
       const { length } = viewer.cameras;
       if (length) views.goTo((viewer.cameraNumber + step + length) % length);
