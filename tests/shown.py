@@ -29,8 +29,14 @@ TALL = {"width": 640, "height": 600}  # the whole panel is shown
 WITHIN = 45.0  # dB between the page and our renderer
 COUNTS = 1e-3  # of the count
 SECONDS = 10  # until waiting ends
-# A script that hides from a page that Chromium's WebGPU is software, on which the page does not sort.
-REAL_GPU = "Object.defineProperty(GPUAdapterInfo.prototype, 'isFallbackAdapter', { get: () => false });"
+# A script that hides from a page that Chromium's WebGL and WebGPU are software, on which the page does not sort.
+REAL_GPU = """
+    Object.defineProperty(GPUAdapterInfo.prototype, "isFallbackAdapter", { get: () => false });
+    const { getParameter: named } = WebGL2RenderingContext.prototype;
+    WebGL2RenderingContext.prototype.getParameter = function (name) {
+        return name === 0x9246 ? "a GPU" : named.call(this, name); // UNMASKED_RENDERER_WEBGL
+    };
+"""
 
 
 @dataclass

@@ -51,6 +51,15 @@ class Tabs(NamedTuple):
             each.camera(camera)
 
 
+def test_in_software_no_adapter_is_asked_for(tab: Any, model: Path) -> None:
+    """Chromium logs a warning where it has none."""
+    tab.add_init_script(
+        "Object.defineProperty(navigator, 'gpu', { value: { requestAdapter() { window.asked = true } } })"
+    )
+    with serve(model) as url:
+        assert Shown(tab).ready(url).errors == [] and tab.evaluate("window.asked") is None
+
+
 @pytest.fixture(scope="module")
 def both(tabs: Any, model: Path) -> Iterator[Tabs]:
     with serve(model) as url:

@@ -22,12 +22,12 @@ const STEEP = 0.7; // sine of a placed camera's angle to the horizon
 
 const elements = elementsOf(document), config = readConfig();
 const viewer = { cameraNumber: 0, cameras: config.cameras, up: "", recording: null, file: 0, opening: null, notes: "" }; // opening: the dial value that a file was opened at, null once that is settled; notes: on a dropped file
-viewer.device = sortingDevice();
 viewer.files = config.model ? [config.model, ...config.others] : [];
 
 async function start() {
   const renderer = createRenderer(elements.canvas), camera = createCamera();
   const stage = createStage(renderer, elements.canvas, camera);
+  viewer.device = sortingDevice(renderer.gl);
   const moved = () => {
     stage.change({ moving: true });
     viewer.ui.showNote(""); // it was of another view

@@ -11,10 +11,14 @@ const KEPT = 4 * PASSES + 4, TALLY_BYTES = 96; // words before the count of kept
 const BINDINGS = { cull: [0, 1, 2, 3], histogram: [3, 4, 5, 9], scan: [3, 4, 9], scatter: [3, 4, 5, 6, 7, 8, 9] }; // of the kernels
 const MAX_GROUPS = 65535; // of one dispatch, on every device
 
+const SOFTWARE = /SwiftShader|llvmpipe|softpipe|Basic Render/; // names of WebGL's renderers
+
 /** {gpu, pipelines}: a device and its kernels; null where the browser has no WebGPU, or only in software, where the worker
- *  is faster. */
-export async function sortingDevice() {
+ *  is faster. Where WebGL is drawn in software it is not asked, since Chromium then logs that it has no adapter. */
+export async function sortingDevice(gl) {
   try {
+    const { UNMASKED_RENDERER_WEBGL: unmasked } = gl.getExtension("WEBGL_debug_renderer_info") ?? {};
+    if (SOFTWARE.test(gl.getParameter(unmasked ?? gl.RENDERER))) return null;
     const adapter = await navigator.gpu?.requestAdapter({ powerPreference: "high-performance" });
     if (!adapter || adapter.info.isFallbackAdapter) return null;
     const { maxBufferSize, maxStorageBufferBindingSize } = adapter.limits;
