@@ -32,7 +32,7 @@ def test_keys_move_the_dial(shown: Shown) -> None:
     assert shown.text("#dial-value") == "all" and shown.counts()["kept"] == 400 > full
     shown.page.keyboard.press("e")
     assert shown.counts()["kept"] == 400 and not shown.page.is_checked("#equation")
-    assert shown.text("#dial-value") == "off" and shown.page.text_content("label:has(#equation)") == " Apply the dial"
+    assert shown.text("#dial-value") == "off" and shown.page.text_content("label:has(#equation)") == " Apply dial"
     shown.page.keyboard.press("e")
     assert shown.text("#dial-value") == "all"
 
