@@ -2,7 +2,8 @@
 import { isCompressed, readCompressed } from "./compressed.js";
 import { removeInvalid } from "./gaussians.js";
 import { readGlb } from "./glb.js";
-import { readHeader, readPly } from "./ply.js";
+import { readHeader } from "../../../../../viewers/ply.js";
+import { readPly } from "./ply.js";
 import { readCalibration, readScreenFilter, readSettings } from "../../../../../viewers/settings.js";
 import { readSog } from "./sog.js";
 import { readSplat } from "./splat.js";

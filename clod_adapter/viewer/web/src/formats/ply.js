@@ -1,45 +1,10 @@
-// PLY: the header, and plain Gaussians with columns of any order and type, ascii or binary (io/ply).
+// PLY: plain Gaussians with columns of any order and type, ascii or binary (io/ply).
+import { binaryColumns, constantsOf } from "../../../../../viewers/ply.js";
 import { DIAL, allocate } from "./gaussians.js";
 
-const TYPES = {
-  char: ["Int8", 1], int8: ["Int8", 1], uchar: ["Uint8", 1], uint8: ["Uint8", 1], short: ["Int16", 2], int16: ["Int16", 2],
-  ushort: ["Uint16", 2], uint16: ["Uint16", 2], int: ["Int32", 4], int32: ["Int32", 4], uint: ["Uint32", 4],
-  uint32: ["Uint32", 4], float: ["Float32", 4], float32: ["Float32", 4], double: ["Float64", 8], float64: ["Float64", 8],
-};
 const UNSUPPORTED = [
   [/^f_(offset|anchor_feat)_\d+$/, "this is a Scaffold-GS or Octree-GS file, which stores anchors, not Gaussians; export Gaussians from that program"],
 ];
-const HEADER_LIMIT = 1 << 20;
-
-/** The header: {elements: [{name, count, properties: [{name, type, size, offset}], size}], format, comments, length}.
- *  `prefix`: `bytes` are the first ones of a file, whose count is that of its complete rows. */
-export function readHeader(bytes, prefix = false) {
-  const text = new TextDecoder("latin1").decode(bytes.subarray(0, HEADER_LIMIT));
-  const end = /[\r\n]end_header(\r\n|\n|\r)/.exec(text);
-  if (!end) throw new Error("the PLY header has no end_header line, so the file is truncated; copy or export it again");
-  const header = { elements: [], comments: [], format: "", length: end.index + end[0].length };
-  for (const line of text.slice(0, end.index).split(/\r\n|\n|\r/).slice(1)) {
-    const words = line.trim().split(/\s+/), last = header.elements.at(-1);
-    if (words[0] === "comment") header.comments.push(line.replace(/^\s*comment ?/, ""));
-    else if (words[0] === "format") header.format = words[1];
-    else if (words[0] === "element" && /^\d+$/.test(words[2])) {
-      header.elements.push({ name: words[1], count: Number(words[2]), properties: [], size: 0 });
-    } else if (words[0] === "property" && last && words[1] === "list") {
-      last.properties.push({ name: words.at(-1), type: "list" });
-      last.size = NaN;
-    } else if (words[0] === "property" && last && TYPES[words[1]]) {
-      const [type, size] = TYPES[words[1]];
-      last.properties.push({ name: words[2], type, size, offset: last.size });
-      last.size += size;
-    } else if (words[0] !== "obj_info" && line.trim()) {
-      throw new Error(`the PLY header is damaged ("${line.slice(0, 40)}"); export the file again`);
-    }
-  }
-  const [first] = header.elements;
-  if (prefix) first.count = Math.min(first.count, Math.floor((bytes.length - header.length) / first.size));
-  return header;
-}
-
 /** Gaussians with or without a dial. */
 export function readPly(bytes, header) {
   const vertex = header.elements.find((element) => element.name === "vertex");
@@ -101,19 +66,6 @@ function fuseFilter(gaussians, read) {
   };
 }
 
-/** The value of each clod_* column, which is the same in all rows (io/ply/constants.py). */
-function constantsOf({ properties }, columns) {
-  const found = {};
-  for (const { name } of properties.filter((property) => property.name.startsWith("clod_"))) {
-    columns(name, (i, value) => {
-      const rounded = Math.fround(value);
-      if (i && rounded !== found[name]) throw new Error(`property ${name} must have the same value in all rows; export the file again`);
-      found[name] = rounded;
-    });
-  }
-  return found;
-}
-
 function degreeOf({ properties }) {
   const names = new Set(properties.map((property) => property.name));
   for (const [pattern, what] of UNSUPPORTED) if ([...names].some((name) => pattern.test(name))) throw new Error(what);
@@ -128,25 +80,6 @@ function degreeOf({ properties }) {
     if (!names.has(name)) throw new Error(`property ${name} is missing; export the file again in Inria's 3DGS layout`);
   }
   return degree;
-}
-
-function binaryColumns(bytes, header, vertex) {
-  let start = header.length;
-  for (const element of header.elements) {
-    if (element === vertex) break;
-    start += element.count * element.size;
-  }
-  if (Number.isNaN(start + vertex.size)) throw new Error("it has a list property, which splats do not have; export the file again");
-  const size = start + vertex.count * vertex.size;
-  if (bytes.length < size) {
-    throw new Error(`it is truncated: its header describes ${size} bytes and it has ${bytes.length}; copy or export it again`);
-  }
-  const little = header.format === "binary_little_endian", view = new DataView(bytes.buffer, bytes.byteOffset + start);
-  return (name, each) => {
-    const { type, offset } = vertex.properties.find((property) => property.name === name);
-    const get = DataView.prototype[`get${type}`];
-    for (let i = 0, at = offset; i < vertex.count; i++, at += vertex.size) each(i, get.call(view, at, little));
-  };
 }
 
 function asciiColumns(bytes, header, vertex) {
