@@ -55,7 +55,7 @@ def described(gaussians: clod.Gaussians, cameras: list[clod.Camera]) -> Iterator
         for s in DIALS:
             shown = clod.render(gaussians, camera, s)
             name = f"camera{k}_s{s:g}.png"
-            Image.fromarray((shown.image.clamp(0, 1) * 255).round().byte().numpy()).save(KIT / name, optimize=True)
+            Image.fromarray(shown.pixels.numpy()).save(KIT / name, optimize=True)
             frames.append({"s": s, "kept": int(shown.kept.sum()), "picture": name})
         yield {
             "world_to_camera": camera.viewmat.tolist(), "focal": float(camera.K[0, 0]),

@@ -1,5 +1,5 @@
 // The dial of an adapted file, without a viewer: what the file says, and what turns it.
-import { dialForCount, extinctionScales, growthDistance, prepare } from "./equation.js";
+import { countAt, dialForCount, extinctionScales, growthDistance, prepare } from "./equation.js";
 import { createHold } from "./frame_rate.js";
 import { binaryColumns, constantsOf, readHeader } from "./ply.js";
 import { readSettings } from "./settings.js";
@@ -78,8 +78,7 @@ export class Dial {
 
   /** The number of Gaussians that the dial keeps for the camera. */
   get kept() {
-    const scales = this.#extinctions();
-    return this.s === 0 ? scales.length : scales.findLastIndex((scale) => scale > this.s) + 1;
+    return this.s === 0 ? this.file.count : countAt(this.#extinctions(), this.s);
   }
 
   /** Follows the time of frames from now on, so that `fps` are drawn each second. */

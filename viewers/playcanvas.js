@@ -1,6 +1,7 @@
 // The dial in PlayCanvas, and so in SuperSplat's engine: a work buffer modifier with the library's GLSL or WGSL.
 import { PIXELFORMAT_RG32F, Vec3, WORKBUFFER_UPDATE_ONCE } from "playcanvas";
 import { Dial, checked, constants, texels } from "./dial.js";
+import { constantsOf } from "./ply.js";
 import { readSettings } from "./settings.js";
 import { glsl, wgsl } from "./shaders.js";
 import { createTimer } from "./timer.js";
@@ -38,7 +39,8 @@ function fileOf(data) {
   const column = (name) => data.getProp(name), [x, y, z] = ["x", "y", "z"].map(column), count = data.numSplats;
   const means = new Float32Array(3 * count);
   for (let i = 0; i < count; i++) means.set([x[i], y[i], z[i]], 3 * i);
-  const settings = readSettings(data.comments ?? []);
+  const columns = (name, each) => column(name).forEach((value, i) => each(i, value));
+  const settings = readSettings(data.comments ?? [], constantsOf(data.getElement("vertex"), columns));
   return checked({ count, means, opacityLogits: column("opacity"), sigma: column("sigma_d"), growth: column("growth_d"), settings });
 }
 
