@@ -1,0 +1,87 @@
+"""Puts deliberate faults into a copy of the code, one at a time, and records which test catches each.
+
+    python benchmarks/faults.py --record            # all of faults/*.toml; where the whole suite runs, minutes each
+    python benchmarks/faults.py io kernels/sign     # one file of them, one fault
+
+A fault is one replaced text in one file: ``name``, ``file``, ``before`` (occurs once), ``after``, and ``tests``, the
+paths that run first. Where these pass, the whole suite runs. The exit code is 1 where a fault was not caught, and where
+a ``before`` does not occur once.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+import tomllib
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from common import ROOT, SHARED, append, arguments
+
+FILE = "faults.jsonl"
+LISTS = ROOT / "benchmarks" / "faults"
+LEFT_OUT = shutil.ignore_patterns(".venv", ".git", "*.egg-info", "demo", "build", "node_modules", "*_cache")
+
+
+def faults(words: Sequence[str]) -> Iterator[tuple[str, dict[str, Any]]]:
+    """The faults named, all without words: ``ROOM/NAME`` and the entry."""
+    for path in sorted(LISTS.glob("*.toml")):
+        for entry in tomllib.loads(path.read_text(encoding="utf-8"))["fault"]:
+            name = f"{path.stem}/{entry['name']}"
+            if not words or path.stem in words or name in words:
+                yield name, entry
+
+
+def first_failure(copy: Path, tests: Sequence[str]) -> str:
+    """The first test that fails in the copy; empty where all pass. A run that fails without a test is one too."""
+    words = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "--numprocesses=0", *tests]
+    environment = os.environ | {"PYTHONPATH": str(copy), "CLOD_SHARED_DATA": str(SHARED)}
+    done = subprocess.run(words, cwd=copy, env=environment, capture_output=True, text=True, check=False)
+    if done.returncode == 0:
+        return ""
+    lines = (done.stdout + done.stderr).splitlines()
+    return next((line.split()[1] for line in lines if line.startswith(("FAILED", "ERROR "))), "".join(lines[-1:]))
+
+
+def run(copy: Path, entry: dict[str, Any]) -> str:
+    """What catches the fault, as by ``first_failure``."""
+    path = copy / entry["file"]
+    text = path.read_text(encoding="utf-8")
+    if text.count(entry["before"]) != 1:
+        raise SystemExit(
+            f"{entry['file']}: 'before' of {entry['name']} occurs {text.count(entry['before'])} times, not 1"
+        )
+    path.write_text(text.replace(entry["before"], entry["after"]), encoding="utf-8")
+    try:
+        return first_failure(copy, entry["tests"]) or first_failure(copy, ["tests"])
+    finally:
+        path.write_text(text, encoding="utf-8")
+
+
+def main() -> None:
+    parser = arguments(__doc__, record=FILE)
+    parser.add_argument("faults", nargs="*", help="ROOM or ROOM/NAME; default: all")
+    args = parser.parse_args()
+    missed = 0
+    with tempfile.TemporaryDirectory() as folder:
+        copy = Path(folder) / ROOT.name
+        shutil.copytree(ROOT, copy, ignore=LEFT_OUT, symlinks=True)
+        (copy / "clod_adapter" / "cli").symlink_to(copy / "cli")  # else the installed one is imported
+        for name, entry in faults(args.faults):
+            began = time.perf_counter()
+            by = run(copy, entry)
+            missed += not by
+            print(f"{name:40} {by or 'NOT CAUGHT'}", flush=True)
+            if args.record:
+                seconds = round(time.perf_counter() - began, 1)
+                append(FILE, {"benchmark": "faults", "fault": name, "caught_by": by, "seconds": seconds})
+    sys.exit(bool(missed))
+
+
+if __name__ == "__main__":
+    main()
