@@ -18,7 +18,6 @@ PARAMETERS = ("log", "linear")
 SAMPLINGS = ("log", "uniform")
 COUNT_TERMS = ("law", "paper")
 GROWTHS = ("on", "off")
-TARGETS = ("count", "cost")
 STEPS, STEPS_PER_VIEW = 900, 8.5  # of training, by default, with one view a step
 # Gaussians that viewers draw at most on a device, by their makers; docs/formats.md has the sources.
 DEVICES = {"quest3": 500_000, "phone": 1_000_000, "laptop": 2_000_000, "desktop": 4_000_000}
@@ -172,12 +171,7 @@ class AdaptConfig:
         0.9,
         "share of the run, at first, in which steps beyond s = 1 have photographs of half the size (not small ones)",
     )
-    target: str = option(
-        "count", "what the dial reduces: count (of Gaussians, the paper's) or cost (the work of rendering them)"
-    )
-    exponent: float = option(
-        1.5, "target-count curve: the target share of Gaussians at s is s^-exponent (of cost: s^-1)"
-    )
+    exponent: float = option(1.5, "target-count curve: the target share of Gaussians at s is s^-exponent")
     count_term: str = option(
         "law", "count loss: law (both directions, through sigma_d alone) or paper (the paper's L_reg)"
     )
@@ -216,13 +210,9 @@ class AdaptConfig:
             "sampling": SAMPLINGS,
             "count_term": COUNT_TERMS,
             "growth": GROWTHS,
-            "target": TARGETS,
         }
         for name, allowed in choices.items():
             require(getattr(self, name) in allowed, name, getattr(self, name), f"one of {', '.join(allowed)}")
-        following = self.count_term == "law" and self.parameter == "log"
-        need = "count, as cost needs count_term law and parameter log (not the paper's form)"
-        require(self.target == "count" or following, "target", self.target, need)
         require(0 <= self.full_share <= 1, "full_share", self.full_share, "between 0 and 1")
         require(0 <= self.full_final <= 1, "full_final", self.full_final, "between 0 and 1")
         require(0 <= self.coarse <= 1, "coarse", self.coarse, "between 0 and 1")

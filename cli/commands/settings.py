@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 OPTIONS: dict[str, Any] = {
     "max_sv": ("S", float), "iters": ("N", int), "batch": ("N", int), "time_budget": ("SEC", float),
-    "seed": ("N", int), "target": ("count|cost", str), "growth": ("on|off", str),
+    "seed": ("N", int), "growth": ("on|off", str),
 }  # fmt: skip
 # Defaults that depend on another option or on the scene.
 DEFAULTS = {

@@ -10,7 +10,7 @@ from numba.core.caching import NullCache
 from numba.core.event import Event, Listener, install_listener
 
 from clod_adapter.cameras import Camera, Scene, View
-from clod_adapter.config import CLASSIC, TARGETS, AdaptConfig, ScreenFilter
+from clod_adapter.config import CLASSIC, AdaptConfig, ScreenFilter
 from clod_adapter.evaluation.evaluate import evaluate
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.progress import Stopped
@@ -41,11 +41,9 @@ def prepare_kernels(
     with announced_compiling(console, SHARES), one_thread():
         evaluate(one, [view], [1.0])
         if training:
-            for target in TARGETS:
-                settings = AdaptConfig(iters=1, full_share=1.0, target=target)
-                adapted = adapt(one, Scene((view,), ()), settings, progress=False)
-                if adapted.interrupted:
-                    raise Stopped("stopped while the kernels were compiled")
+            adapted = adapt(one, Scene((view,), ()), AdaptConfig(iters=1, full_share=1.0), progress=False)
+            if adapted.interrupted:
+                raise Stopped("stopped while the kernels were compiled")
 
 
 @contextmanager

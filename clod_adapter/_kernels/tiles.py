@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import float32, uint64
+from numba import float32
 
 from clod_adapter._kernels.compiling import kernel, part
 from clod_adapter._kernels.conventions import (
@@ -161,16 +161,3 @@ def fill_tiles(worker, workers, records, order, across, histogram, totals, slots
                 entry_slots[at] = slot
                 slot += 1
         slots[2 * p + 1] = slot
-
-
-@kernel
-def tally(entries, masks, words, tiles, blocks):  # type: ignore[no-untyped-def]
-    """Adds up for each record the tiles that list it, and their blocks that blended it."""
-    for entry in range(len(entries)):
-        p = entries[entry]
-        tiles[p] += 1
-        for word in range(words):
-            bits = masks[entry * words + word]
-            while bits != uint64(0):
-                bits &= bits - uint64(1)
-                blocks[p] += 1

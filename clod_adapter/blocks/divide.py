@@ -140,8 +140,3 @@ def check_divisible(config: AdaptConfig) -> None:
             "the paper's form cannot be trained in blocks: its count and its distances are of all Gaussians at once; "
             "leave out --form paper, or --memory"
         )
-    if config.target == "cost":
-        raise ClodError(
-            "the target cost cannot be trained in blocks: what a Gaussian costs depends on all that is in front of it; "
-            "leave out --target cost, or --memory"
-        )

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from clod_adapter._kernels import blocks, conventions, dial, dial_gradient, project, project_gradient, threads, tiles
+from clod_adapter._kernels import conventions, dial, dial_gradient, project, project_gradient, threads
 from clod_adapter._kernels.memory import recycled
 from clod_adapter.cameras import Camera
 from clod_adapter.config import CLASSIC, ScreenFilter
@@ -138,25 +138,6 @@ def kept(gaussians: Gaussians, camera: Camera, virtual_scale: float) -> Tensor:
     given = camera_vector(camera, gaussians.screen_filter), _dial_vector(gaussians, camera, virtual_scale)
     threads.run(dial.mark_kept, workers_for(len(found)), means, logits, sigma_d, *given, found)
     return torch.from_numpy(found).view(torch.bool)
-
-
-@torch.no_grad()
-def work(gaussians: Gaussians, camera: Camera, virtual_scale: float = 1.0) -> tuple[Tensor, Tensor]:
-    """``[N]`` float32, what drawing each Gaussian takes: the tiles that list it, and the 4x4 blocks that blend it.
-
-    A block whose pixels are all opaque already blends no more, so work depends on what is in front.
-    """
-    frame = _prepare_dialled(gaussians, camera, virtual_scale)
-    frame.blend(np.zeros(3, np.float32))
-    n, counted = len(gaussians), np.zeros((2, len(gaussians)), np.float32)
-    tiles.tally(frame.entries, frame.masks, blocks.WORDS, *counted)
-    found = np.zeros_like(counted)
-    for worker, count in enumerate(frame.counts.tolist()):
-        first = n * worker // len(frame.counts)
-        packed = slice(first, first + count)
-        found[:, frame.packed_ids[packed]] = counted[:, packed]
-    give(frame.buffers)
-    return torch.from_numpy(found[0]), torch.from_numpy(found[1])
 
 
 def _dial_vector(gaussians: Gaussians, camera: Camera, virtual_scale: float) -> np.ndarray:

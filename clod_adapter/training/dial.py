@@ -211,13 +211,12 @@ def attach(
         settings: fields of ``AdaptConfig`` that replace those of ``config``.
 
     Raises:
-        ClodError: as ``adapt``; or the config has the paper's count term, its linear parameter, or the target cost.
+        ClodError: as ``adapt``; or the config has the paper's count term or its linear parameter.
     """
     config = replace(config or AdaptConfig(), **settings)
-    if config.count_term != "law" or config.parameter != "log" or config.target != "count":
+    if config.count_term != "law" or config.parameter != "log":
         raise ClodError(
-            "attach has the count term law, the parameter log and the target count; for others, as AdaptConfig.paper, "
-            "call adapt"
+            "attach has the count term law and the parameter log; for others, as AdaptConfig.paper, call adapt"
         )
     given = scene.train if isinstance(scene, Scene) else scene
     views = tuple(each if isinstance(each, View) else _without_photograph(each) for each in given)

@@ -49,7 +49,7 @@ def adapt(
     - weight_slope s / max_sv)^2``. In the first steps, a share ``coarse`` of all, photographs have half their size
     beyond s = 1, unless that is below 128 pixels a side.
     ``target_count.count_gradient`` moves sigma_d so that the share of Gaussians kept at their typical distances follows
-    the target-count curve; with the target ``cost``, ``target_cost.TargetCost`` does so for the cost of rendering.
+    the target-count curve.
     The result is the mean of the parameters over the last ``average`` of the steps, so learning rates can stay large
     to the end. A base that has a sigma_d is continued from. Training divides sigma_d by the reference distance; the
     result has it in world units.

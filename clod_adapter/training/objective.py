@@ -19,7 +19,6 @@ from clod_adapter.equation.distances import normalized_distances
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.losses import photometric_loss
 from clod_adapter.render import splat
-from clod_adapter.training.target_cost import TargetCost
 from clod_adapter.training.target_count import TargetShare, count_gradient_at, paper_count, target_share
 from clod_adapter.training.view_sampler import Sample
 
@@ -80,7 +79,6 @@ class Objective:
         typical: ``[trained]`` normalised distances that Gaussians are counted at; no view's own, whose counts differ
             from the mean's: gradients that correct such differences cancel out, and only add noise.
         screen_filter: the filter that images are rendered with.
-        cost: the cost term, in place of the count term; None for the latter.
     """
 
     config: AdaptConfig
@@ -89,7 +87,6 @@ class Objective:
     part: TrainableSubset
     typical: Tensor
     screen_filter: ScreenFilter = CLASSIC
-    cost: TargetCost | None = None
 
     @property
     def trained(self) -> int:
@@ -150,8 +147,7 @@ class Objective:
             counts.append((counted, plain))
         if config.has_target_count:
             for at, weighted in counts:
-                for name, gradient in self._target_gradients(parameters, at, weighted).items():
-                    gradients[name] = gradients[name] + gradient
+                gradients[self.decay] = gradients[self.decay] + self._count_gradient(parameters, at, weighted)
         return GradientSum(gradients, kept, plain)
 
     def image(self, parameters: dict[str, Tensor], camera: Camera, s: float, halved: bool) -> Tensor:
@@ -215,21 +211,17 @@ class Objective:
             term = paper_count(dialled, s, self.attenuation.tau, self.config, self.part.total)
         return splat(shown, drawn, camera, growth=growth)[0], dialled.keep[: self.trained], term
 
-    def _target_gradients(self, parameters: dict[str, Tensor], s: float, loss: Tensor) -> dict[str, Tensor]:
-        """``[trained]`` the gradients of the count term or the cost term at one dial value, by parameter."""
-        rows = {name: parameters[name][: self.trained].detach() for name in (*self.stepped, "log_scales")}
-        if self.cost is not None:
-            found = self.cost.gradients(rows, self.typical, s, loss, self.attenuation, self.config)
-            return {name: gradient for name, gradient in found.items() if name in self.stepped}
-        decay, logits = rows[self.decay], rows["opacity_logits"]
-        with torch.no_grad():
-            if self.part.target is not None:
-                target = self.part.target(s)
-            else:
-                target = target_share(s, self.trained, self.config, self.part.total)
-            sigma = self.sigma(decay)
-            counted = count_gradient_at(self.typical, logits, sigma, s, self.attenuation, loss, self.config, target)
-        return {self.decay: counted if self.config.parameter == "log" else counted / decay}
+    @torch.no_grad()
+    def _count_gradient(self, parameters: dict[str, Tensor], s: float, loss: Tensor) -> Tensor:
+        """``[trained]`` the count term's gradient of the decay parameter at one dial value."""
+        decay, logits = (parameters[name][: self.trained].detach() for name in (self.decay, "opacity_logits"))
+        if self.part.target is not None:
+            target = self.part.target(s)
+        else:
+            target = target_share(s, self.trained, self.config, self.part.total)
+        sigma = self.sigma(decay)
+        counted = count_gradient_at(self.typical, logits, sigma, s, self.attenuation, loss, self.config, target)
+        return counted if self.config.parameter == "log" else counted / decay
 
 
 def loss_weight(virtual_scale: float, config: AdaptConfig) -> float:

@@ -71,7 +71,7 @@ class TrainingState:
             kind, _, attribute = name.partition(".")
             if kind == "steps":  # an index in compiled code, which does not check it
                 sound = (values >= 0) & (values <= self.steps)
-            elif kind in ("second", "cost"):
+            elif kind == "second":
                 sound = values >= 0  # and not NaN
             elif kind == "gate":
                 sound = values.isfinite() & (values >= values.new_tensor([-math.inf, 0, 0, -math.inf]))

@@ -24,7 +24,6 @@ from clod_adapter.training.gate import Gate
 from clod_adapter.training.objective import GradientSum, Objective, TrainableSubset
 from clod_adapter.training.optimizer import RowAdam, add_to_mean
 from clod_adapter.training.state import TrainingState
-from clod_adapter.training.target_cost import TargetCost
 from clod_adapter.training.view_sampler import ViewSampler
 
 # Adam's decay rates per view. A batch takes their powers and multiplies learning rates by its square root, so that
@@ -56,12 +55,7 @@ class Trainer:
         tuned = [n for n in ATTRIBUTES if n != "opacity_logits" and rates[n] > 0 and getattr(start, n).numel()]
         cameras = subset.cameras or [view.camera for view in spread(views, MOST_VIEWS)]
         typical = typical_distance(start.means, cameras, start.attenuation)[: subset.trained]
-        cost = None
-        if config.target == "cost" and config.has_target_count:
-            if subset.trained < len(start):
-                raise ClodError("the target cost needs all Gaussians trained: leave out the subset, or target cost")
-            cost = TargetCost(start, cameras, config)
-        self.objective = Objective(config, start.attenuation, tuple(tuned), subset, typical, start.screen_filter, cost)
+        self.objective = Objective(config, start.attenuation, tuple(tuned), subset, typical, start.screen_filter)
         self.decay, self.stepped = self.objective.decay, self.objective.stepped
         self.decay_range = self.objective.decay_range
         self.rates = rates | {self.decay: config.lr_sigma * math.sqrt(config.batch)}
@@ -98,9 +92,6 @@ class Trainer:
         """
         if self.gate:
             self.gate.check(share_done)
-        cost = self.objective.cost
-        if cost is not None and cost.due(share_done):
-            cost.measure(self._assembled(self.parameters), self.objective.typical, share_done)
         before = self.sampler.state()
         numbers = range(self.done * self.config.batch, (self.done + 1) * self.config.batch)
         samples = [self.sampler.draw(number, share_done) for number in numbers]
@@ -223,7 +214,7 @@ class Trainer:
             found |= {f"good.{name}": value for name, value in self.gate.good.items()} | {
                 "gate.checks": self.gate.numbers
             }
-        return found if self.objective.cost is None else found | {"cost.measured": self.objective.cost.measured}
+        return found
 
 
 def learning_rates(config: AdaptConfig) -> dict[str, float]:
