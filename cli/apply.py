@@ -2,22 +2,43 @@
 
 from __future__ import annotations
 
-import argparse
+from argparse import ArgumentParser, Namespace
 from pathlib import Path
 from typing import Any
 
 from clod_adapter._support.version import package_version
-from clod_adapter.adapter import dial_tensors
 from clod_adapter.errors import ClodError
-from clod_adapter.io.adapter_file import load_adapter
-from clod_adapter.io.checkpoint import save, trimmed
 
+from .shared.command import Command
 from .shared.console import Console, put
-from .shared.files import size
-from .shared.inputs import read_checkpoint
+from .shared.files import check_ply_name, size
+from .shared.options import add_activated, check_checkpoint
+from .shared.outputs import Outputs
 
 
-def run(args: argparse.Namespace) -> dict[str, Any]:
+def add_arguments(parser: ArgumentParser) -> None:
+    given = parser.add_argument_group("input")
+    given.add_argument("base", metavar="BASE.ply", help="the checkpoint that was adapted")
+    given.add_argument("adapter", metavar="ADAPTER.safetensors", help="the adapter that clod-adapt wrote")
+    add_activated(given)
+    output = parser.add_argument_group("output")
+    output.add_argument("-o", "--out", metavar="OUT.ply", required=True, help="output file; replaced if it exists")
+
+
+def check(args: Namespace) -> None:
+    check_ply_name(Path(args.out), "--out")
+    if not Path(args.adapter).is_file():
+        raise ClodError(f"{args.adapter}: No such file; give the .safetensors that clod-adapt wrote")
+    check_checkpoint(args.base)
+
+
+def run(args: Namespace) -> dict[str, Any]:
+    from clod_adapter.adapter import dial_tensors
+    from clod_adapter.io.adapter_file import load_adapter
+    from clod_adapter.io.checkpoint import save, trimmed
+
+    from .shared.inputs import read_checkpoint
+
     console, adapter = Console(args.quiet), load_adapter(args.adapter)
     for note in adapter.notes:
         console.note(f"{args.adapter}: {note}")
@@ -35,3 +56,21 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
         "base_count": adapter.base_count, "changed": sorted(adapter.updates), "notes": [*adapter.notes, *base.notes],
         "outputs": {"ply": args.out},
     }  # fmt: skip
+
+
+COMMAND = Command(
+    summary="Rebuild the adapted PLY from checkpoint and adapter.",
+    description="Rebuild the adapted PLY from the checkpoint and the small adapter file.",
+    usage="BASE.ply ADAPTER.safetensors -o OUT.ply [--json]",
+    epilog="""\
+OUT.ply equals the file that clod-adapt wrote, bit for bit. BASE.ply must be the
+checkpoint that was adapted: the adapter stores its SHA-256.
+
+example:
+  clod-adapt apply garden.ply garden_clod.safetensors -o again.ply
+""",
+    add_arguments=add_arguments,
+    check=check,
+    run=run,
+    outputs=lambda args: Outputs([Path(args.out)], inputs=[args.base, args.adapter]),
+)

@@ -23,7 +23,6 @@ from clod_adapter.render import render
 from .adapt import run as adapt
 from .commands.adapt import ADAPT
 from .commands.demo import picture_files
-from .commands.parser import make_parser
 from .shared.console import Console, duration, put
 from .shared.files import AdaptFiles
 from .shared.kernels import prepare_kernels
@@ -63,7 +62,7 @@ def adapt_arguments(args: argparse.Namespace, base: Path, capture: Path, model: 
     words = [f"--images={capture}", f"--max-sv={MAX_SV:g}", f"--out={model}"]
     words += [f"--{name}" for name in ("quiet", "json") if getattr(args, name)]
     words += ["--resume"] if AdaptFiles.of(str(base), str(model)).state.exists() else []
-    return make_parser(ADAPT, "clod-adapt").parse_args([*words, "--", str(base)])
+    return ADAPT.parser("clod-adapt").parse_args([*words, "--", str(base)])
 
 
 def print_next(folder: Path, pictures: dict[str, Path], watch: Stopwatch) -> None:

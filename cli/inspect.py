@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
-import argparse
+from argparse import ArgumentParser, Namespace
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from clod_adapter._support.version import package_version
-from clod_adapter.calibration import Calibration
-from clod_adapter.inspection.report import Inspection, inspect
-from clod_adapter.inspection.splat import Splat
-from clod_adapter.inspection.statistics import Spread
+from clod_adapter.io.file_formats import check_readable
 from clod_adapter.io.settings import WARNING
 
+from .shared.command import Command
 from .shared.console import duration, put
 from .shared.files import size
+
+if TYPE_CHECKING:
+    from clod_adapter.calibration import Calibration
+    from clod_adapter.inspection.report import Inspection
+    from clod_adapter.inspection.splat import Splat
+    from clod_adapter.inspection.statistics import Spread
 
 WIDTH = 13  # of the labels
 MOST_ROWS = 8  # of a calibration, including the first and last
@@ -23,7 +27,21 @@ MOST_LINES = 6  # under one label
 LONGEST = 100  # characters of a comment
 
 
-def run(args: argparse.Namespace) -> dict[str, Any]:
+def add_arguments(parser: ArgumentParser) -> None:
+    given = parser.add_argument_group("input")
+    given.add_argument("file", metavar="FILE", help="a splat, an adapter, or the state of an interrupted run")
+    parser.set_defaults(quiet=True)
+
+
+def check(args: Namespace) -> None:
+    path = Path(args.file)
+    if path.suffix.lower() != ".safetensors":  # an adapter or a state is no splat
+        check_readable(path)
+
+
+def run(args: Namespace) -> dict[str, Any]:
+    from clod_adapter.inspection.report import inspect
+
     found = inspect(args.file)
     put("\n".join(lines_of(found)), hang=WIDTH)
     return {"command": "inspect", "version": package_version(), **found.as_dict()}
@@ -98,6 +116,9 @@ def calibration_lines(calibration: Calibration | None) -> list[str]:
 
 def tensor_lines(about: dict[str, Any]) -> list[str]:
     """The lines of an adapter or a training state."""
+    from clod_adapter.calibration import Calibration
+    from clod_adapter.inspection.statistics import Spread
+
     lines = [_line("Gaussians", f"{about['count']:,}")]
     if about["kind"] == "state":
         after = f"{about['steps']} steps in {duration(about['seconds'])}, loss {about['loss']:.4g}"
@@ -138,3 +159,36 @@ def _block(name: str, says: Iterable[str]) -> list[str]:
 
 def _line(name: str, says: str) -> str:
     return f"{name:<{WIDTH}}{''.join(c if c.isprintable() else ' ' for c in says)}"
+
+
+COMMAND = Command(
+    summary="Print what a file is and what it contains.",
+    description="""\
+Print what a file is, which program wrote it, what it contains, and what
+adapting it would exclude. Reads only.
+""",
+    usage="FILE [--json]",
+    epilog="""\
+FILE can be a PLY (also compressed), gsplat's .pt, an adapter or the state of an
+interrupted run (.safetensors), any format of clod-adapt export, and, with
+splat-transform installed, .sog or .ksplat.
+
+  looks like   a guess from comments and the order of properties
+  says         comments in the file, for example of a baked one
+  needle       a Gaussian more than 10 times as long as its second axis
+  tau          culling threshold of the opacity at s = 1: the file's own, or the
+               one that adapting would use
+
+--json also has all properties and numbers.
+
+exit codes: 0 read; 2 damaged or of another kind, one line on stderr
+
+examples:
+  clod-adapt inspect garden.ply
+  clod-adapt inspect garden_clod.safetensors --json
+""",
+    add_arguments=add_arguments,
+    check=check,
+    run=run,
+    needs_torch=False,
+)

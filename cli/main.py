@@ -12,25 +12,21 @@ import traceback
 from contextlib import nullcontext, redirect_stdout
 from difflib import get_close_matches
 from importlib import import_module
-from typing import Any
 
 from clod_adapter._support.text import as_text
 from clod_adapter._support.version import package_version
 from clod_adapter.errors import ClodError
 from clod_adapter.progress import Stopped
 
+from . import apply, doctor, inspect
 from .commands.adapt import ADAPT
-from .commands.apply import APPLY
-from .commands.command import Command
 from .commands.demo import DEMO
-from .commands.doctor import DOCTOR
 from .commands.evaluate import EVALUATE
 from .commands.export import EXPORT
-from .commands.inspect import INSPECT
-from .commands.parser import Parser, make_parser
 from .commands.render import RENDER
 from .commands.robustness import ROBUSTNESS
 from .commands.view import VIEW
+from .shared.command import Command, Parser
 from .shared.interrupts import interrupt_as_stopped, signals_as_interrupt
 from .shared.launch import launched, silence_but_first
 from .shared.outputs import claimed
@@ -40,13 +36,14 @@ from .shared.streams import check_printed, unbreakable_streams
 PROG = "clod-adapt"
 INTERRUPTED = 130  # exit code
 LONGEST = 10_000  # characters of an error; a word of the command line may have more
+LIBRARY = ("torch", "numba", "clod_adapter.io.scene.load", "clod_adapter.training.loop")  # what most commands import
 NEAR = 0.75  # similarity of a misspelt command: two neighbouring letters exchanged in "view" have it
 REPORT = "please report it, with the lines above, as an issue of this program's repository"
 
 # Adapting is the main command and has no name.
 COMMANDS: dict[str, Command] = {
-    "view": VIEW, "inspect": INSPECT, "eval": EVALUATE, "render": RENDER, "export": EXPORT, "apply": APPLY,
-    "robustness": ROBUSTNESS, "demo": DEMO, "doctor": DOCTOR,
+    "view": VIEW, "inspect": inspect.COMMAND, "eval": EVALUATE, "render": RENDER, "export": EXPORT,
+    "apply": apply.COMMAND, "robustness": ROBUSTNESS, "demo": DEMO, "doctor": doctor.COMMAND,
 }  # fmt: skip
 
 
@@ -135,10 +132,11 @@ def run(command: Command, args: argparse.Namespace) -> int:
         check_printed()
     command.check(args)
     with claimed(command.outputs(args)):
-        module = import_command(command, args)
+        if command.needs_torch:
+            import_library(args.quiet)
         aside = io.StringIO() if args.quiet else sys.stderr
         with redirect_stdout(aside) if args.json else nullcontext(), signals_as_interrupt():
-            report = module.run(args)
+            report = command.run(args)
     if args.json and report is not None:
         print(json.dumps(jsonable(report), allow_nan=False))
     if args.json or "outputs" not in (report or {"outputs": ()}):
@@ -146,17 +144,17 @@ def run(command: Command, args: argparse.Namespace) -> int:
     return int((report or {}).get("exit_code", 0))
 
 
-def import_command(command: Command, args: argparse.Namespace) -> Any:
-    """The command's module; importing it, with torch, takes a second or two."""
+def import_library(quiet: bool) -> None:
+    """Imports LIBRARY, which takes a second or two."""
     from .shared.console import Console
 
-    name = f"{__package__}.{command.module}"
-    if name in sys.modules:
-        return sys.modules[name]
+    if all(name in sys.modules for name in LIBRARY):
+        return
     gc.disable()  # a tenth of the time, with nothing to collect
     try:
-        with Console(args.quiet).status("starting ..."):
-            return import_module(name)
+        with Console(quiet).status("starting ..."):
+            for name in LIBRARY:
+                import_module(name)
     finally:
         gc.freeze()  # later collections, one of them at exit, skip what was imported
         gc.enable()
@@ -165,7 +163,7 @@ def import_command(command: Command, args: argparse.Namespace) -> Any:
 def build_parser(name: str) -> Parser:
     """The parser of a command; of the main command for an empty name."""
     command = COMMANDS.get(name, ADAPT)
-    parser = make_parser(command, f"{PROG} {name}".strip())
+    parser = command.parser(f"{PROG} {name}".strip())
     if not name:
         others = "\n".join(f"  {PROG} {word:<10} {other.summary}" for word, other in COMMANDS.items())
         parser.epilog = f"other commands, each with its own --help:\n{others}\n\n{command.epilog}"

@@ -19,16 +19,15 @@ from clod_adapter.viewer.page import policy, served_page
 from clod_adapter.viewer.payload import Payload, page_config
 from clod_adapter.viewer.server import Response, Server
 
-from .commands.checks import check_stored_cameras
 from .commands.view import view_files
 from .shared.alignment import read_cameras
 from .shared.antialiasing import with_filter, with_filter_of
 from .shared.browsers import open_browser
 from .shared.budgets import solve_dials
 from .shared.console import Console
-from .shared.dials import initial_dial
 from .shared.inputs import read_checkpoint
 from .shared.interrupts import interrupt_as_stopped
+from .shared.options import check_stored_cameras, initial_dial
 from .shared.report import jsonable
 
 MODEL, BASE = "/files/model", "/files/base"

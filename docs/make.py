@@ -12,9 +12,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import clod_adapter  # noqa: F401  (before torch)
-from clod_adapter.cli.commands.adapt import ADAPT
-from clod_adapter.cli.commands.command import Command
-from clod_adapter.cli.main import COMMANDS, PROG, build_parser
+from clod_adapter.cli.main import ADAPT, COMMANDS, PROG, build_parser
+from clod_adapter.cli.shared.command import Command
 from clod_adapter.config import AdaptConfig, AttenuationConfig, field_descriptions
 
 HERE = Path(__file__).resolve().parent

@@ -8,12 +8,19 @@ from typing import TYPE_CHECKING
 from clod_adapter.blocks.memory import parse_size
 from clod_adapter.errors import ClodError
 
+from ..shared.command import Command, run_of
 from ..shared.files import AdaptFiles, check_ply_name
 from ..shared.launch import launched
+from ..shared.options import (
+    add_activated,
+    add_antialiasing,
+    add_device,
+    add_misaligned_ok,
+    check_checkpoint,
+    check_scene,
+    page_files,
+)
 from ..shared.outputs import Outputs
-from .checks import check_checkpoint, check_scene, page_files
-from .command import Command
-from .options import add_activated, add_antialiasing, add_device, add_misaligned_ok
 from .settings import add_settings, make_config
 
 if TYPE_CHECKING:
@@ -108,7 +115,6 @@ def check_memory(args: Namespace) -> None:
 
 
 ADAPT = Command(
-    module="adapt.run",
     summary="Give a trained 3D Gaussian splat a quality dial.",
     description="""\
 Give a trained 3D Gaussian splat a quality dial: one file for every budget.
@@ -188,5 +194,6 @@ examples:
 """,
     add_arguments=adapt_options,
     check=check_adapt,
+    run=run_of("adapt.run"),
     outputs=adapt_outputs,
 )

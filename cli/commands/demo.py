@@ -7,9 +7,9 @@ from pathlib import Path
 
 from clod_adapter.report.style import check_matplotlib
 
+from ..shared.command import Command, run_of
 from ..shared.files import AdaptFiles
 from ..shared.outputs import Outputs
-from .command import Command
 
 
 def demo_options(parser: ArgumentParser) -> None:
@@ -28,7 +28,6 @@ def picture_files(folder: Path) -> dict[str, Path]:
 
 
 DEMO = Command(
-    module="demo",
     summary="Run everything on a built-in scene; nothing to download.",
     description="""\
 Run all steps on a scene that comes with the package.
@@ -48,5 +47,6 @@ outputs in DIR:
 """,
     add_arguments=demo_options,
     check=lambda args: check_matplotlib(),  # before a minute is spent
+    run=run_of("demo"),
     outputs=demo_outputs,
 )

@@ -7,12 +7,22 @@ from pathlib import Path
 
 from clod_adapter.errors import ClodError
 
-from ..shared.dials import BUDGETS, add_dial_options
+from ..shared.command import Command, run_of
 from ..shared.files import labels
+from ..shared.options import (
+    BUDGETS,
+    add_activated,
+    add_antialiasing,
+    add_device,
+    add_dial_options,
+    add_images,
+    check_checkpoint,
+    check_dials,
+    check_scene,
+    model_has_dial,
+    page_files,
+)
 from ..shared.outputs import Outputs
-from .checks import check_checkpoint, check_dials, check_scene, model_has_dial, page_files
-from .command import Command
-from .options import add_activated, add_antialiasing, add_device, add_images
 
 
 def evaluate_options(parser: ArgumentParser) -> None:
@@ -63,7 +73,6 @@ def evaluate_outputs(args: Namespace) -> Outputs:
 
 
 EVALUATE = Command(
-    module="evaluate",
     summary="Measure quality, count and time at some dial values.",
     description="Measure quality, Gaussians kept and frame time at several dial values.",
     usage="MODEL.ply --images DIR [--sv S [S ...]] [options]",
@@ -100,5 +109,6 @@ examples:
 """,
     add_arguments=evaluate_options,
     check=check_evaluate,
+    run=run_of("evaluate"),
     outputs=evaluate_outputs,
 )

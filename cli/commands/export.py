@@ -10,12 +10,20 @@ from pathlib import Path
 from clod_adapter.errors import ClodError
 from clod_adapter.io.formats.splat_transform import SplatTransform
 
-from ..shared.dials import add_dial_options, given_budget
+from ..shared.command import Command, run_of
+from ..shared.options import (
+    add_activated,
+    add_antialiasing,
+    add_device,
+    add_dial_options,
+    check_checkpoint,
+    check_dials,
+    check_scene,
+    given_budget,
+    model_has_dial,
+)
 from ..shared.outputs import Outputs
-from .checks import check_checkpoint, check_dials, check_scene, model_has_dial
-from .command import Command
 from .export_formats import FORMATS, LOD_META, PACKED, PAGE, TILESET, format_table, level_paths, suffix_of, suffixes
-from .options import add_activated, add_antialiasing, add_device
 
 DIGITS = 6  # significant digits of a level, all of them in its file's name
 
@@ -158,7 +166,6 @@ def check_format(args: Namespace, bakes: bool, dial: bool) -> None:
 
 
 EXPORT = Command(
-    module="export.run",
     summary="Write a file for other tools: another format, or plain.",
     description="""\
 Write a model for other tools: in another format, with its dial if the format
@@ -224,5 +231,6 @@ examples:
 """,
     add_arguments=export_options,
     check=check_export,
+    run=run_of("export.run"),
     outputs=export_outputs,
 )

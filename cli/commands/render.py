@@ -8,11 +8,18 @@ from pathlib import Path
 from clod_adapter.errors import ClodError
 from clod_adapter.io.scene.folder import find_cameras, photograph_folders
 
-from ..shared.dials import add_dial_options
+from ..shared.command import Command, run_of
+from ..shared.options import (
+    add_activated,
+    add_antialiasing,
+    add_device,
+    add_dial_options,
+    add_images,
+    check_checkpoint,
+    check_dials,
+    check_scene,
+)
 from ..shared.outputs import Outputs
-from .checks import check_checkpoint, check_dials, check_scene
-from .command import Command
-from .options import add_activated, add_antialiasing, add_device, add_images
 
 
 def render_options(parser: ArgumentParser) -> None:
@@ -57,7 +64,6 @@ def render_outputs(args: Namespace) -> Outputs:
 
 
 RENDER = Command(
-    module="render",
     summary="Render a scene's cameras at some dial values to PNG.",
     description="""\
 Render the cameras of a scene's photographs at some dial values to PNG files.
@@ -78,5 +84,6 @@ examples:
 """,
     add_arguments=render_options,
     check=check_render,
+    run=run_of("render"),
     outputs=render_outputs,
 )

@@ -7,11 +7,18 @@ from pathlib import Path
 
 from clod_adapter.report.style import check_matplotlib
 
+from ..shared.command import Command, run_of
 from ..shared.files import labels
+from ..shared.options import (
+    add_activated,
+    add_antialiasing,
+    add_device,
+    add_images,
+    add_misaligned_ok,
+    check_checkpoint,
+    check_scene,
+)
 from ..shared.outputs import Outputs
-from .checks import check_checkpoint, check_scene
-from .command import Command
-from .options import add_activated, add_antialiasing, add_device, add_images, add_misaligned_ok
 from .settings import add_settings, make_configs
 
 
@@ -67,7 +74,6 @@ def cell_name(label: str, max_sv: float | None) -> str:
 
 
 ROBUSTNESS = Command(
-    module="robustness",
     summary="Adapt checkpoints at several ranges, and plot them.",
     description="""\
 Run the robustness experiment of CLoD-GS: checkpoints adapted at several ranges.
@@ -95,5 +101,6 @@ example:
 """,
     add_arguments=robustness_options,
     check=check_robustness,
+    run=run_of("robustness"),
     outputs=robustness_outputs,
 )

@@ -13,10 +13,17 @@ from clod_adapter.errors import ClodError
 from clod_adapter.io.file_formats import FORMATS
 from clod_adapter.io.ply.header import VIEWPOINT
 
-from ..shared.dials import add_device_preset
-from .checks import check_checkpoint, check_scene, check_stored_cameras, may_store, model_has_dial
-from .command import Command
-from .options import add_activated, add_antialiasing
+from ..shared.command import Command, run_of
+from ..shared.options import (
+    add_activated,
+    add_antialiasing,
+    add_device_preset,
+    check_checkpoint,
+    check_scene,
+    check_stored_cameras,
+    may_store,
+    model_has_dial,
+)
 
 
 def view_options(parser: ArgumentParser) -> None:
@@ -88,7 +95,6 @@ def check_view(args: Namespace) -> None:
 
 
 VIEW = Command(
-    module="view",
     summary="Look at a file in the browser, and turn its dial.",
     description="""\
 Show a file in the browser, with its dial and a free camera.
@@ -128,4 +134,5 @@ examples:
 """,
     add_arguments=view_options,
     check=check_view,
+    run=run_of("view"),
 )

@@ -22,10 +22,10 @@ from ..shared.antialiasing import with_filter
 from ..shared.budgets import solve_dials
 from ..shared.console import Console, put
 from ..shared.devices import on_device, pick_device
-from ..shared.dials import given_budget, initial_dial
 from ..shared.files import size
 from ..shared.inputs import read_checkpoint
 from ..shared.measure import choose_dials
+from ..shared.options import given_budget, initial_dial
 from ..shared.report import Stopwatch
 from .baking import Photographs, Target, find_target, measure_drop
 from .files import Export

@@ -19,8 +19,8 @@ from clod_adapter.io.checkpoint import Checkpoint
 from clod_adapter.origin import Origin
 
 from .console import Console
-from .dials import given_budget
 from .kernels import prepare_kernels
+from .options import given_budget
 from .report import machine_name
 
 BLOCK = 8  # pixels

@@ -29,14 +29,13 @@ def test_torch_is_imported_with_idle_threads_and_the_collector_on() -> None:
     """The command sets OpenMP's wait policy before torch reads it."""
     code = (
         "import sys, gc, os\n"
-        "from argparse import Namespace\n"
         "class Spy:\n"
         "    def find_spec(self, name, *rest):\n"
         "        if name == 'torch': print(os.environ.get('OMP_WAIT_POLICY'))\n"
         "sys.meta_path.insert(0, Spy())\n"
-        "from clod_adapter.cli.main import APPLY, import_command\n"
-        "module = import_command(APPLY, Namespace(quiet=True))\n"
-        "assert module is import_command(APPLY, Namespace(quiet=True)) and 'torch' in sys.modules\n"
+        "from clod_adapter.cli.main import import_library\n"
+        "import_library(quiet=True)\n"
+        "assert 'torch' in sys.modules\n"
         "assert gc.isenabled() and gc.get_freeze_count() > 1000\n"
     )
     environment = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
@@ -94,3 +93,13 @@ def test_a_misspelt_command_is_suggested(clod: Any, tmp_path: Path, word: str, c
     assert done.code == 2 and f"{word}: no such file or command; did you mean clod-adapt {command}?\n" in done.err
     (tmp_path / word).touch()
     assert "did you mean" not in clod(word).err  # a file
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="Linux has this device")
+@pytest.mark.parametrize("words", ["inspect PLY", "inspect PLY --json", "--help"])
+def test_results_that_cannot_be_printed_are_an_error(capture: Any, words: str) -> None:
+    command = [sys.executable, "-m", "clod_adapter", *words.replace("PLY", str(capture.ply)).split()]
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    said = "clod-adapt: error: stdout cannot be written (No space left on device), so the result is lost; open it\n"
+    assert (done.returncode, done.stderr) == (2, said)

@@ -9,9 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from clod_adapter.cli.commands.parser import make_parser
 from clod_adapter.cli.main import ADAPT
-from clod_adapter.cli.shared import manual
+from clod_adapter.cli.shared import command
 from fences import ROOT
 
 SOURCES = [
@@ -34,7 +33,7 @@ def test_no_line_installs_clod_adapter_from_the_index() -> None:
 
 def test_the_pages_are_installed_with_the_package() -> None:
     ((folder, patterns),) = PROJECT["tool"]["setuptools"]["data-files"].items()
-    assert Path(folder).parts[-2:] == manual.INSTALLED[:2] and patterns == ["docs/*.md"]
+    assert Path(folder).parts[-2:] == ("doc", "clod-adapter") and patterns == ["docs/*.md"]
     assert all(url.startswith("https://") for url in PROJECT["project"]["urls"].values())
 
 
@@ -49,9 +48,9 @@ def test_help_names_the_installed_page(tmp_path: Path, monkeypatch: pytest.Monke
         def locate(self) -> Path:
             return page
 
-    assert manual.manual() == ROOT / "docs" / "index.md"  # of the checkout
-    monkeypatch.setattr(manual, "__file__", str(tmp_path / "lib" / "cli" / "shared" / "manual.py"))
+    assert command.manual() == ROOT / "docs" / "index.md"  # of the checkout
+    monkeypatch.setattr(command, "__file__", str(tmp_path / "lib" / "cli" / "shared" / "command.py"))
     monkeypatch.setattr(metadata, "files", lambda name: [File()])
-    assert make_parser(ADAPT, "clod-adapt").format_help().endswith(f"\nmanual: {page}\n")
+    assert ADAPT.parser("clod-adapt").format_help().endswith(f"\nmanual: {page}\n")
     monkeypatch.setattr(metadata, "files", lambda name: None)
-    assert "manual:" not in make_parser(ADAPT, "clod-adapt").format_help()
+    assert "manual:" not in ADAPT.parser("clod-adapt").format_help()

@@ -1,0 +1,171 @@
+"""``clod-adapt doctor``: what renders and shows on this machine, and how to fix what does not."""
+
+from __future__ import annotations
+
+import io
+import warnings
+from argparse import Namespace
+from collections.abc import Callable
+from contextlib import redirect_stdout
+from typing import TYPE_CHECKING, Any
+
+from clod_adapter._support.text import first_line
+from clod_adapter._support.version import package_version
+
+from .shared.browsers import find_browser
+from .shared.command import Command
+from .shared.console import WIDTH, Console, put
+
+if TYPE_CHECKING:
+    import torch
+
+TORCH = "pip install --force-reinstall torch (https://pytorch.org has the command for a GPU)"
+REINSTALL = "pip install --force-reinstall numba; if that does not help, report it with clod-adapt doctor --json"
+NO_BROWSER = "clod-adapt view --no-browser --port 8000, and ssh -L 8000:127.0.0.1:8000 HOST where there is a browser"
+TOLERANCE = 2e-4  # RMS of colours in [0, 1]: rounding, and a pixel or two on the other side of a threshold
+RENDERERS = ("cpu", "gsplat")
+
+
+class CheckFailed(Exception):
+    """Something does not work; with the reason, and the command to type or what to do."""
+
+    def __init__(self, found: str, fix: str) -> None:
+        super().__init__(found)
+        self.found, self.fix = found, fix
+
+
+def check_torch() -> str:
+    try:
+        import torch
+    except Exception as error:  # OSError too, where a library that it links to is missing
+        raise CheckFailed(f"cannot be imported ({first_line(error)})", TORCH) from error
+    built = f"built for CUDA {torch.version.cuda}" if torch.version.cuda else "a CPU build"
+    return f"{torch.__version__}, {built}, {torch.get_num_threads()} threads"
+
+
+def check_cpu() -> str:
+    import torch
+
+    return rendered(torch.device("cpu"), REINSTALL)
+
+
+def check_gsplat() -> str:
+    """gsplat on the GPU; may compile its kernels for minutes, once."""
+    import torch
+
+    from .shared.devices import no_gpu
+
+    if reason := no_gpu():
+        found, _, fix = reason.partition(": ")
+        raise CheckFailed(found, fix or "install NVIDIA's driver, and a torch for its CUDA from https://pytorch.org")
+    said = rendered(torch.device("cuda"), "pip install --force-reinstall gsplat==1.5.3")
+    return f"{torch.cuda.get_device_name()}; {said}"
+
+
+def check_browser() -> str:
+    """Finds a browser without opening it."""
+    found = find_browser()
+    if found is None:
+        raise CheckFailed("none found that opens a window", NO_BROWSER)
+    return str(getattr(found, "name", "") or type(found).__name__)
+
+
+CHECKS: dict[str, Callable[[], str]] = {
+    "torch": check_torch, "cpu": check_cpu, "gsplat": check_gsplat, "browser": check_browser,
+}  # fmt: skip
+
+
+def rendered(device: torch.device, fix: str) -> str:
+    """Renders sixty Gaussians and compares the image with the reference rasterizer's.
+
+    Raises:
+        CheckFailed: the root mean square difference exceeds TOLERANCE, or is no number.
+    """
+    import torch
+
+    from clod_adapter.cameras import Camera
+    from clod_adapter.rasterizers import for_device, reference
+
+    random = torch.Generator().manual_seed(7)
+
+    def normal(*shape: int) -> torch.Tensor:
+        return torch.randn(*shape, generator=random)
+
+    scene: dict[str, Any] = {
+        "means": normal(60, 3).clamp(-1.5, 1.5), "quats": normal(60, 4), "scales": (0.5 * normal(60, 3) - 2).exp(),
+        "opacities": (1.5 * normal(60)).sigmoid().clamp(max=0.95), "sh0": normal(60, 1, 3),
+        "shN": 0.1 * normal(60, 3, 3), "background": torch.zeros(3),
+    }  # fmt: skip
+    viewmat = torch.eye(4)
+    viewmat[2, 3] = 4.0
+    camera = Camera(viewmat, torch.tensor([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]]), 64, 48)
+    want, _ = reference.rasterize(**scene, camera=camera)
+    image, _ = for_device(device)(**{name: value.to(device) for name, value in scene.items()}, camera=camera)
+    error = float((image.detach().cpu() - want).square().mean().sqrt())
+    if not error <= TOLERANCE:
+        raise CheckFailed(f"renders another image than the reference (RMS {error:.2g})", fix)
+    return f"renders the reference image (RMS {error:.0e})"
+
+
+def outcome(name: str, check: Callable[[], str]) -> dict[str, Any]:
+    """Name, whether it works, what was found, and a fix. Any error is a result: the code belongs to other projects."""
+    try:
+        with warnings.catch_warnings(), redirect_stdout(io.StringIO()):  # gsplat prints, torch warns
+            warnings.simplefilter("ignore")
+            return {"name": name, "ok": True, "found": check(), "fix": ""}
+    except CheckFailed as failed:
+        return {"name": name, "ok": False, "found": failed.found, "fix": failed.fix}
+    except Exception as error:
+        if isinstance(error.__cause__, KeyboardInterrupt):  # within the dispatching of a compiled function
+            raise
+        return {"name": name, "ok": False, "found": f"{type(error).__name__}: {first_line(error)}", "fix": ""}
+
+
+def line_of(found: dict[str, Any]) -> str:
+    """``name  ok/off  found  -> fix``; a long line has the fix below it."""
+    line = f"{found['name']:<9}{'ok' if found['ok'] else 'off':<5}{found['found']}"
+    if not found["fix"]:
+        return line
+    beside = f"{line}  -> {found['fix']}"
+    return beside if len(beside) <= WIDTH else f"{line}\n    -> {found['fix']}"
+
+
+def run(args: Namespace) -> dict[str, Any]:
+    """Runs all checks; the report's exit code is 1 where nothing renders."""
+    with Console(args.quiet).status("checking ..."):
+        findings = [outcome(name, check) for name, check in CHECKS.items()]
+    draws = [found["name"] for found in findings if found["ok"] and found["name"] in RENDERERS]
+    put("\n".join(line_of(found) for found in findings))
+    failed = "no rendering backend works: fix torch first, then the CPU backend"
+    put(f"rendering and training backends: {', '.join(draws)}" if draws else failed)
+    return {
+        "command": "doctor", "version": package_version(), "draws": draws, "exit_code": 0 if draws else 1,
+        "findings": findings,
+    }  # fmt: skip
+
+
+COMMAND = Command(
+    summary="Check what renders here, and say how to fix it.",
+    description="""\
+Check which backends work on this machine. For each that does not, print the
+reason and what fixes it.
+""",
+    usage="[--json] [--quiet]",
+    epilog="""\
+Each line has a name, ok or off, the result, and after -> the fix.
+
+  torch          version, build and threads
+  cpu, gsplat    rendering on the CPU and on an NVIDIA GPU; ok means that the
+                 image of a test scene is the reference's
+  browser        for clod-adapt view; found, not opened
+
+Nothing is installed or downloaded. The first run compiles the CPU's kernels,
+and on a GPU gsplat's, which can take minutes.
+
+exit codes: 0 cpu or gsplat works; 1 neither does
+""",
+    add_arguments=lambda parser: None,
+    check=lambda args: None,
+    run=run,
+    needs_torch=False,  # it reports a torch that is missing
+)
