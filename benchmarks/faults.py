@@ -4,8 +4,8 @@
     python benchmarks/faults.py io kernels/sign     # one file of them, one fault
 
 A fault is one replaced text in one file: ``name``, ``file``, ``before`` (occurs once), ``after``, and ``tests``, the
-paths that run. With ``--whole`` the whole suite runs where these pass, minutes each. The exit code is 1 where a fault was
-not caught, and where a ``before`` does not occur once.
+paths that run. With ``--whole`` the whole suite runs where these pass, minutes each. The exit code is 1 where a fault
+was not caught, and where a ``before`` does not occur once.
 """
 
 from __future__ import annotations
