@@ -1,10 +1,7 @@
-"""A synthetic city of any number of Gaussians: streets, houses, trees, cars, fields and a sky.
+"""A synthetic town of any number of Gaussians: a plain with houses on a grid, under a sky.
 
-It replaces captures that are too large for a repository. More Gaussians make a larger city at the same density of about
-5 per square metre of surface. Thin Gaussians cover the surfaces, a fifth of them as a coarser layer; colours vary from
-one Gaussian to the next, and all SH degrees are used.
-
-World axes: x right, y DOWN, z into the picture, in metres; the ground is y = 0.
+It replaces captures that are too large for a repository. More Gaussians make a larger town of the same density, about
+five for each square metre of surface. World axes: x right, y DOWN, z into the picture, in metres; the ground is y = 0.
 """
 
 from __future__ import annotations
@@ -14,8 +11,7 @@ from pathlib import Path
 from typing import Literal
 
 import clod_adapter as clod
-from city_points import FIELD, cover, facing, higher_degrees, shade, surround
-from city_surfaces import PITCH, blocks, build, extent, joined
+from clod_adapter.config import SH_COUNTS
 from clod_adapter.gaussians import SH_C0, Gaussians
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.scene.colmap import write_model
@@ -25,97 +21,99 @@ import torch
 from PIL import Image
 
 Where = Literal["near", "far", "mixed"]
-FAR = (1500, 0.02, 30_000)  # Gaussians of fields and sky: at least, of all, at most
+PITCH, HOUSE, AREA, DENSITY = 24.0, 12.0, 1050.0, 5.0  # metres; square metres of surface of a lot; Gaussians on each
+SKY = 0.03  # share of the Gaussians
 PERTURBED = {"means": 0.02, "log_scales": 0.15, "opacity_logits": 0.5, "sh0": 0.12}  # of a checkpoint, off the truth
-BLUR = 0.1  # of a checkpoint: its Gaussians are larger than the truth by this, in logarithms
+
+
+def lots(count: int) -> int:
+    """Houses along a side of the town."""
+    return max(math.ceil(math.sqrt(count / (DENSITY * AREA))), 1)
 
 
 def city(count: int, *, seed: int = 0, sh_degree: int = 3) -> Gaussians:
-    """``count`` Gaussians of a city, at least 1000, with SH of degree 0 to 4; the same ones for the same arguments."""
+    """``count`` Gaussians, at least 1000; the same ones for the same arguments."""
     if count < 1000:
-        raise SystemExit(f"a city needs at least 1000 Gaussians, not {count}")
-    random = np.random.default_rng(seed)
-    far = surrounding(count)
-    points = joined([cover(build(count, random), count - far, random), surround(far, count, random)])
-    noise = random.standard_normal((count, 3), np.float32)
-    low = points.kind >= FIELD
-    flat = np.where(low, np.float32(0.7), np.float32(0.5)) * points.spacing
-    flat[: count - far : 5] *= 2.2  # the coarser layer
-    log_scales = np.log(np.stack([flat, flat, 0.08 * flat], axis=1)) + 0.15 * noise
-    logits = np.where(low, 3.0, 2.6 + 1.2 * noise[:, 0])
-    shaded = shade(points, random)
-    return Gaussians(
-        means=torch.from_numpy(points.position),
-        quats=torch.from_numpy(facing(points.normal, random)),
-        log_scales=torch.from_numpy(log_scales.astype(np.float32)),
-        opacity_logits=torch.from_numpy(logits.astype(np.float32)),
-        sh0=torch.from_numpy((shaded - 0.5) / np.float32(SH_C0))[:, None],
-        shN=torch.from_numpy(higher_degrees(points, shaded, sh_degree, random)),
+        raise SystemExit(f"a town needs at least 1000 Gaussians, not {count}")
+    random, far, size = np.random.default_rng(seed), round(SKY * count), lots(count) * PITCH
+    points, normals, colours = surfaces(count - far, random)
+    up = random.normal(size=(far, 3))
+    up /= np.linalg.norm(up, axis=1, keepdims=True)
+    points, normals = np.concatenate([points, 3 * size * up]), np.concatenate([normals, up])
+    colours = np.concatenate([colours, np.array([0.5, 0.6, 0.65]) - 0.25 * up[:, 1:2] * [0.4, 0.7, 1]])
+    spacing = np.sqrt(lots(count) ** 2 * AREA / (count - far))
+    flat = np.full(count, 0.7 * spacing)
+    flat[count - far :] = 1.3 * math.sqrt(4 * math.pi * (3 * size) ** 2 / far)
+    noise = random.standard_normal((count, 3))
+    log_scales = np.log(np.stack([flat, flat, 0.08 * flat], 1)) + 0.15 * noise
+    higher = random.normal(scale=0.03, size=(count, SH_COUNTS[sh_degree] - 1, 3))
+    logits = np.where(np.arange(count) < count - far, 2.6 + 1.2 * noise[:, 0], 3.0)
+    means, quats, log_scales, logits, sh0, shN = (
+        torch.from_numpy(np.ascontiguousarray(each, np.float32))
+        for each in (points, facing(normals), log_scales, logits, ((colours - 0.5) / SH_C0)[:, None], higher)
     )
+    return Gaussians(means, quats, log_scales, logits, sh0, shN)
 
 
-def surrounding(count: int) -> int:
-    """Gaussians of fields and sky in a city of ``count``; they are its last ones."""
-    least, share, most = FAR
-    return min(max(round(share * count), min(least, count // 5)), most)
+def surfaces(count: int, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points, normals and colours on the plain and on the houses' walls and roofs."""
+    side = lots(count)
+    lot, kind, along = random.integers(0, side**2, count), random.random(count), random.uniform(-0.5, 0.5, (count, 2))
+    height, hue = random.uniform(6, 14, side**2)[lot], random.uniform(0.35, 0.85, (side**2, 3))[lot]
+    centre = PITCH * (np.stack([lot % side, lot // side], 1) - (side - 1) / 2)
+    ground, roof = kind < 0.5, kind > 0.86
+    turned = (4 * (kind - 0.5) / 0.36).astype(int).clip(0, 3)  # which of the four walls
+    outward = np.stack([np.cos(turned * np.pi / 2), np.sin(turned * np.pi / 2)], 1).round()
+    wall = HOUSE * (outward / 2 + along[:, :1] * outward[:, ::-1])
+    level = np.where((ground | roof)[:, None], np.where(ground, PITCH, HOUSE)[:, None] * along, wall)
+    depth = np.where(ground, 0, np.where(roof, height, (along[:, 1] + 0.5) * height))
+    points = np.stack([centre[:, 0] + level[:, 0], -depth, centre[:, 1] + level[:, 1]], 1)
+    upward = (ground | roof)[:, None]
+    normals = np.where(upward, [0.0, -1, 0], np.stack([outward[:, 0], 0 * depth, outward[:, 1]], 1))
+    pattern = 0.08 * np.sin(points @ np.array([[1.1, 0.3, 2.0], [2.3, 1.7, 0.4], [0.6, 2.9, 1.5]]))
+    base = np.where(ground[:, None], [0.42, 0.44, 0.4], np.where(roof[:, None], 0.7 * hue, hue))
+    return points, normals, (base + pattern + 0.03 * random.normal(size=(count, 3))).clip(0.02, 0.98)
+
+
+def facing(normals: np.ndarray) -> np.ndarray:
+    """Quaternions that turn z to the normals."""
+    z = np.where(normals[:, 2:] < -0.999, [0.0, 1, 0, 0], 0)
+    quats = np.stack([1 + normals[:, 2], -normals[:, 1], normals[:, 0], 0 * normals[:, 0]], 1)
+    quats = np.where(normals[:, 2:] < -0.999, z, quats)
+    return quats / np.linalg.norm(quats, axis=1, keepdims=True)
 
 
 def city_cameras(
     n: int, width: int, height: int, *, where: Where = "mixed", count: int, seed: int = 0
 ) -> list[clod.Camera]:
-    """``n`` cameras in a city of ``count`` Gaussians, named ``view_0000.png`` on.
-
-    Args:
-        where: "near": in the streets, at eye height and a little above; "far": from the air, looking down on the city
-            at about 40 degrees, from all sides; "mixed": the two in turn.
-    """
-    random = np.random.default_rng(seed + 1)
-    cameras = []
+    """``n`` cameras, named ``view_0000.png`` on: "near" in the streets, "far" in the air, or the two in turn."""
+    random, size, cameras = np.random.default_rng(seed + 1), lots(count) * PITCH, []
     for k in range(n):
-        close = where == "near" or (where == "mixed" and k % 2 == 0)
-        eye, target = (in_street if close else in_air)(count, random)
+        if where == "near" or (where == "mixed" and k % 2 == 0):
+            street = PITCH * (random.integers(0, lots(count) + 1) - lots(count) / 2)
+            eye = np.array([street, -random.uniform(1.7, 4.5), random.uniform(-0.45, 0.45) * size])
+            turn = math.radians(random.uniform(-25, 25))
+            target = eye + 20 * np.array([math.sin(turn), -0.1, -math.copysign(math.cos(turn), eye[2])])
+        else:
+            turn, pitch = random.uniform(0, 2 * np.pi), math.radians(random.uniform(28, 50))
+            target = np.array([*random.uniform(-0.2, 0.2, 2) * size, 0])[[0, 2, 1]]
+            away = random.uniform(0.6, 1.1) * max(size, 30)
+            eye = target + away * np.array([
+                math.cos(pitch) * math.cos(turn), -math.sin(pitch), math.cos(pitch) * math.sin(turn)
+            ])  # fmt: skip
         cameras.append(look_at(eye, target, width, height, f"view_{k:04d}.png"))
     return cameras
 
 
-def in_street(count: int, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Eye and target of a camera on a street, looking along it more than across."""
-    n, axis = blocks(count), int(random.integers(2))
-    street = random.integers(0, n + 1) if n < 3 else random.integers(1, n)
-    eye, ahead = np.zeros(2), np.zeros(2)
-    eye[axis] = street * PITCH[axis] - n * PITCH[axis] / 2 + random.uniform(-2, 2)
-    eye[1 - axis] = random.uniform(-0.45, 0.45) * n * PITCH[1 - axis]
-    ahead[1 - axis] = -np.sign(eye[1 - axis])
-    turn = math.radians(random.uniform(-25, 25))
-    ahead = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]]) @ ahead
-    up = random.uniform(1.7, 4.5)
-    target = np.array([eye[0] + 20 * ahead[0], -up - random.uniform(0, 5), eye[1] + 20 * ahead[1]])
-    return np.array([eye[0], -up, eye[1]]), target
-
-
-def in_air(count: int, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Eye and target of a camera above, a share of the city's size away."""
-    size, turn = extent(count), random.uniform(0, 2 * np.pi)
-    aim = random.uniform(-0.2, 0.2, 2) * size
-    away, pitch = random.uniform(0.55, 1.1) * float(size.max()), math.radians(random.uniform(28, 50))
-    level = away * math.cos(pitch)
-    eye = np.array([
-        aim[0] + level * math.cos(turn), -max(away * math.sin(pitch), 30.0), aim[1] + level * math.sin(turn)
-    ])  # fmt: skip
-    return eye, np.array([aim[0], -5.0, aim[1]])
-
-
-def look_at(
-    eye: np.ndarray, target: np.ndarray, width: int, height: int, name: str, field: float = 65.0
-) -> clod.Camera:
-    """An upright camera that has ``target`` in the middle of its image; ``field`` of view across the width, degrees."""
+def look_at(eye: np.ndarray, target: np.ndarray, width: int, height: int, name: str) -> clod.Camera:
+    """An upright camera with ``target`` in the middle of its image, and 65 degrees across it."""
     forward = (target - eye) / np.linalg.norm(target - eye)
     right = np.cross([0.0, 1.0, 0.0], forward)
     right /= np.linalg.norm(right)
     viewmat = np.eye(4)
     viewmat[:3, :3] = np.stack([right, np.cross(forward, right), forward])
     viewmat[:3, 3] = -viewmat[:3, :3] @ eye
-    focal = width / 2 / math.tan(math.radians(field) / 2)
+    focal = width / 2 / math.tan(math.radians(65) / 2)
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
     return clod.Camera(torch.from_numpy(viewmat).float(), torch.from_numpy(K).float(), width, height, name)
 
@@ -128,23 +126,19 @@ def perturb(truth: Gaussians, seed: int = 0) -> Gaussians:
         values = getattr(truth, name)
         noise = torch.randn(values.shape, generator=generator).mul_(by)
         values += noise * size / 0.15 if name == "means" else noise
-    truth.log_scales.add_(BLUR)
+    truth.log_scales.add_(0.1)
     return truth
 
 
-def write_city(folder: str | Path, count: int, images: int, width: int, height: int, *, where: Where = "mixed") -> None:
-    """Writes a perturbed checkpoint ``folder/city.ply`` and photographs of the truth as a COLMAP scene.
-
-    The folder does not exist or is empty; it appears when everything in it is complete.
-    """
-    truth = city(count)
-    cameras = city_cameras(images, width, height, where=where, count=count)
+def write_city(folder: str | Path, count: int, images: int, width: int, height: int) -> None:
+    """Writes a perturbed checkpoint ``folder/city.ply`` and photographs of the truth as a COLMAP scene, whole."""
+    truth, cameras = city(count), city_cameras(images, width, height, count=count)
     with atomic_path(folder) as part:
         (part / "images").mkdir(parents=True)
         for camera in cameras:
             with torch.no_grad():
                 Image.fromarray(clod.render(truth, camera).pixels.numpy()).save(part / "images" / camera.name)
-        some = np.linspace(0, count - surrounding(count), 2000, endpoint=False).astype(np.int64)
-        colors = ((0.5 + SH_C0 * truth.sh0[some, 0].numpy()).clip(0, 1) * 255).astype(np.uint8)
-        write_model(part, cameras, [camera.name for camera in cameras], truth.means[some].numpy(), colors)
+        some = np.linspace(0, count * (1 - SKY), 2000, endpoint=False).astype(np.int64)
+        colours = ((0.5 + SH_C0 * truth.sh0[some, 0].numpy()).clip(0, 1) * 255).astype(np.uint8)
+        write_model(part, cameras, [camera.name for camera in cameras], truth.means[some].numpy(), colours)
         clod.save(part / "city.ply", perturb(truth))

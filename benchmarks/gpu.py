@@ -28,8 +28,6 @@ from typing import Any
 
 import clod_adapter as clod
 from city import city, city_cameras, perturb
-from clod_adapter.equation.attenuation import attenuate
-from clod_adapter.equation.distances import normalized_distances
 from clod_adapter.metrics import psnr
 from clod_adapter.rasterizers import cuda, wait_for
 from clod_adapter.render import dial, splat
@@ -176,11 +174,8 @@ def frames(model: clod.Gaussians, views: list[clod.View], where: str, s: float, 
         "what": "frames", "where": where, "virtual_scale": s, "kept": fmean(int(p.kept.sum()) for p in shown), "ms": ms,
         "faster": {name: ms[name] / ms["ours"] for name in plain},
         "dial_share": (ms["dial"] + ms["compact"]) / ms["ours"],
-        "dial_share_of_plain": {name: (ms["dial"] + ms["compact"]) / ms[name] for name in plain},
         "psnr_full": fmean(psnr(p.image, f) for p, f in zip(shown, pixels, strict=True)),
         "psnr_truth": fmean(psnr(p.image, view.image) for p, view in zip(shown, views, strict=True)),
-        "plain_psnr_truth": fmean(psnr(f, view.image) for f, view in zip(full, views, strict=True)),
-        "one_pass_differs": one_pass_differs(model, views[0].camera, s),
     }  # fmt: skip
 
 
@@ -214,18 +209,6 @@ def compaction(model: clod.Gaussians, s: float) -> Callable[[clod.Camera], Any]:
         return cuda.compact(model.means, model.quats, scales, drawn[camera.name])
 
     return run
-
-
-def one_pass_differs(model: clod.Gaussians, camera: clod.Camera, s: float) -> dict[str, float]:
-    """Compiled formula and plain one: the largest difference of drawn opacities, and Gaussians that only one keeps."""
-    assert model.sigma_d is not None and model.attenuation is not None
-    fused = attenuate(model.opacity_logits, model.sigma_d, (model.means, camera), s, model.attenuation)
-    on_cpu = model.to("cpu")
-    assert on_cpu.sigma_d is not None
-    d = normalized_distances(on_cpu.means, camera, model.attenuation)
-    plain = attenuate(on_cpu.opacity_logits, on_cpu.sigma_d, d, s, model.attenuation)
-    apart = (fused.drawn.cpu() - plain.drawn).abs()
-    return {"drawn": float(apart.max()), "kept_by_one": int((fused.keep.cpu() != plain.keep).sum())}
 
 
 def synthetic(size: Size, device: torch.device) -> tuple[clod.Gaussians, clod.Scene]:

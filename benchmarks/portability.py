@@ -21,17 +21,14 @@ exit code is 1 where a test failed or a condition could not be had. The conditio
 from __future__ import annotations
 
 import os
-import re
 import subprocess
 import sys
 import sysconfig
 import tempfile
 import time
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import reduce
-from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 from typing import Any
 
@@ -131,16 +128,6 @@ def last_line(text: str) -> str:
     return next((line for line in reversed(text.splitlines()) if line.strip()), "no output")
 
 
-def packages() -> dict[str, str]:
-    """Installed versions of the dependencies in pyproject.toml, without extras."""
-    needed = [line for line in requires("clod-adapter") or [] if "extra ==" not in line]
-    found = {}
-    for name in (name for line in needed for name in re.findall(r"^[\w.-]+", line)):
-        with suppress(PackageNotFoundError):  # pycolmap is not needed everywhere
-            found[name] = version(name)
-    return found
-
-
 def main() -> None:
     parser = arguments(__doc__, record=FILE)
     parser.add_argument("conditions", nargs="*", help="default: each of them; a+b is both at once")
@@ -156,9 +143,8 @@ def main() -> None:
         print(f"{name:16} {found['passed']:7} {found['failed']:7} {found['skipped']:7} {found['seconds']:8}")
         print("\n".join(f"    {line}" for line in found["failures"]), end="\n" * bool(found["failures"]), flush=True)
         if args.record:
-            load = round(os.getloadavg()[0], 2)
             about = {"benchmark": "portability", "condition": name, "tests": args.tests or ["tests"]}
-            append(FILE, {**about, "load": load, "packages": packages(), **found})
+            append(FILE, {**about, **found})
     sys.exit(failed)
 
 

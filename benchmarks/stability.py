@@ -1,11 +1,11 @@
-"""Numerical stability: the equation against 50 digits, stiffness, extreme scenes, popping. For docs/stability.md.
+"""Numerical stability: the equation against 50 digits, stiffness, extreme scenes, popping. For docs/performance.md.
 
     python benchmarks/stability.py                   # everything, then the tables and the pictures
     python benchmarks/stability.py --only scenes     # one part; the rows of the others stay
     python benchmarks/stability.py --page            # the tables and the pictures again, from the stored rows
 
 Rows go to ``results/stability.jsonl``, where they replace those of the parts that were run. The tables of
-docs/stability.md are printed, its pictures are written.
+docs/performance.md are printed, its pictures are written.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ import json
 import time
 
 import stability_equation
-import stability_plots
 import stability_popping
 import stability_scenes
 import stability_stiffness
@@ -26,7 +25,6 @@ PARTS = {
     "equation": stability_equation, "stiffness": stability_stiffness, "scenes": stability_scenes,
     "popping": stability_popping,
 }  # fmt: skip
-PLOTS = {"stiffness": stability_plots.stiffness, "popping": stability_plots.popping}
 
 
 def main() -> None:
@@ -46,8 +44,8 @@ def main() -> None:
         if own := rows[part]:
             head = f"## {part}: commit {own[0]['commit']}, {own[0]['part_seconds']} s"
             print(f"{head}\n\n{PARTS[part].tables(own)}\n", flush=True)
-            if part in PLOTS:
-                PLOTS[part](own, IMAGES / f"stability_{part}.png")
+            if hasattr(PARTS[part], "picture"):
+                PARTS[part].picture(own, IMAGES / f"stability_{part}.png")
 
 
 if __name__ == "__main__":

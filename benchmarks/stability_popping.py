@@ -10,7 +10,7 @@ for the footprint f of a Gaussian on a pixel, ``exp(-q/2)`` times the compensati
 
 ``h`` is the change of ``log s``, or of the logarithm of the distance. With ``n`` the largest number of Gaussians on one
 pixel and ``W`` the largest sum of their footprints, no pixel changes by more than ``255 (W L + 2/e n G) h + n`` levels:
-rasterizers drop an alpha < 1/255. docs/stability.md derives it.
+rasterizers drop an alpha < 1/255. each Gaussian changes by at most that, and a pixel is their sum.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from itertools import pairwise, product
+from pathlib import Path
 from typing import Any
 
 import clod_adapter as clod
@@ -27,6 +28,7 @@ from clod_adapter.equation.extinction import sigma_for_extinction
 from clod_adapter.evaluation.popping import dial_popping, path, path_popping
 from clod_adapter.gaussians import SH_C0, Gaussians
 from clod_adapter.render import dial, splat
+from clod_adapter.report.style import BLUE, GREEN, INK, ORANGE, label_log, new_figure, save_figure, tidy
 from common import table
 
 import torch
@@ -151,3 +153,32 @@ def tables(rows: list[dict[str, Any]]) -> str:
     held = all(row["pixel"] <= row["bound"] + 0.05 for row in rows if "bound" in row)
     found = table(["normalizer", "threshold", *(f"{name}: 1/{steps}" for name, steps in ends)], lines)
     return f"{found}\n\nThe bound {'holds' if held else 'IS BROKEN'}."
+
+
+def picture(rows: list[dict[str, Any]], path: Path) -> None:
+    """Log-log, a panel a sweep: a colour a normalizer, dashes for the hard threshold; without growth."""
+    rows, colours = [row for row in rows if not row["growth"]], {"scene": BLUE, "quantile": GREEN, "max": ORANGE}
+    with new_figure((10.4, 3.9), layout="constrained") as figure:
+        panels = figure.subplots(1, len(SWEEPS), sharey=True)
+        for axes, (sweep, title) in zip(panels, SWEEPS.items(), strict=True):
+            for normalizer, cut in dict.fromkeys((row["normalizer"], row["cut"]) for row in rows):
+                own = [r for r in rows if (r["normalizer"], r["cut"], r["sweep"]) == (normalizer, cut, sweep)]
+                default = (normalizer, cut) == DEFAULT
+                axes.plot(
+                    [1 / r["steps"] for r in own], [max(r["pixel"], 0.2) for r in own], color=colours[normalizer],
+                    linestyle="-" if cut == "soft" else "--", linewidth=1.4 + default,
+                    label=f"{normalizer}, {cut}{' (default)' if default else ''}",
+                )  # fmt: skip
+            limits = [r for r in rows if r["sweep"] == sweep and r.get("bound", 0) > 0]
+            axes.plot([1 / r["steps"] for r in limits], [r["bound"] for r in limits], color=INK, linewidth=1.2,
+                      linestyle=":", label="bound of the default")  # fmt: skip
+            axes.set_title(title, loc="left", fontsize=9.5)
+            axes.set(xscale="log", yscale="log", ylim=(0.15, 500))
+            axes.set_xticks([1 / steps for steps in STEPS], [f"1/{steps}" for steps in STEPS])
+            axes.set_xticks([], minor=True)
+            label_log(axes.yaxis, "{:g}", subs=(1,))
+            tidy(axes)
+        panels[0].set_ylabel("largest change of a pixel in a step (of 255)")
+        panels[1].set_xlabel("length of a step, share of the sweep")
+        figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", frameon=False, ncols=4)
+        save_figure(figure, path)

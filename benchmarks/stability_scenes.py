@@ -1,20 +1,200 @@
 """Extreme scenes, each adapted for 200 steps and rendered over its dial: all finite, and no loss of quality.
 
-The cases are those of ``extreme_scenes.py``. A case holds when every picture over the dial is finite and the
-full-quality end is at most 0.3 dB below the checkpoint itself on the same held-out views.
+A case is the capture ``ci_banana`` with one extreme change to the checkpoint, the cameras, the photographs or the
+settings. It holds when every picture over the dial is finite and the full-quality end is at most 0.3 dB below the
+checkpoint itself on the same held-out views.
 """
 
 from __future__ import annotations
 
+import dataclasses
+import math
+import tempfile
 import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import clod_adapter as clod
+from clod_adapter.cameras import Scene, View, in_its_unit
+from clod_adapter.gaussians import SH_C0
+from clod_adapter.io.scene.colmap import write_model
 from clod_adapter.training.pseudo_views import add_pseudo_views
-from common import checkpoint, photographs, table
-from extreme_scenes import CAPTURE, CASES, Case
+from common import capture, checkpoint, photographs, table
 
+import numpy as np
+import pycolmap
+import torch
+from PIL import Image
+from plyfile import PlyData, PlyElement
+
+CAPTURE = "ci_banana"
 STEPS, ALLOWED = 200, 0.3  # dB
+
+
+@dataclass(frozen=True)
+class Case:
+    """A base, its scene, and settings besides the number of steps."""
+
+    base: clod.Gaussians
+    scene: Scene
+    settings: dict[str, Any] = field(default_factory=dict)
+
+
+Change = Callable[[clod.Gaussians, Scene], Case]
+
+
+def similar(base: clod.Gaussians, scene: Scene, scale: float) -> Case:
+    """The same scene in other units."""
+
+    def resized(view: View) -> View:
+        viewmat = view.camera.viewmat.clone()
+        viewmat[:3, 3] = -viewmat[:3, :3] @ (view.camera.position * scale)
+        return View(dataclasses.replace(view.camera, viewmat=viewmat), view.image)
+
+    larger = base.replace(means=base.means * scale, log_scales=base.log_scales + math.log(scale))
+    return Case(larger, in_its_unit(of_views(scene, resized)))
+
+
+def one_view(base: clod.Gaussians, scene: Scene, scale: float) -> Case:
+    """A single training image, in other units: one camera does not define the size of a scene."""
+    case = similar(base, scene, scale)
+    return dataclasses.replace(case, scene=Scene(case.scene.train[:1], case.scene.test))
+
+
+def floater(base: clod.Gaussians, scene: Scene) -> Case:
+    means, scales = base.means.clone(), base.log_scales.clone()
+    ahead = scene.train[0].camera
+    means[0] = ahead.position + 1e6 * size_of(base) * ahead.viewmat[2, :3]
+    scales[0] = math.log(1e4 * size_of(base))
+    return Case(base.replace(means=means, log_scales=scales), scene)
+
+
+def only_one(base: clod.Gaussians, scene: Scene) -> Case:
+    one = base.select(torch.tensor([0]))
+    mean = torch.stack([view.image.float().mean((0, 1)) for view in scene.train]).mean(0) / 255
+    return Case(
+        one.replace(
+            means=base.means.median(0).values[None], log_scales=torch.full((1, 3), math.log(size_of(base) / 2)),
+            opacity_logits=torch.full((1,), 2.0), sh0=((mean - 0.5) / SH_C0)[None, None], shN=torch.zeros(1, 0, 3),
+        ),
+        scene,
+    )  # fmt: skip
+
+
+def behind(base: clod.Gaussians, scene: Scene) -> Case:
+    """A third of the training cameras look away from the scene; their photographs are black."""
+
+    def away(view: View) -> View:
+        back = torch.diag(torch.tensor([-1.0, 1, -1]))
+        turned = view.camera.viewmat.clone()
+        turned[:3, :3] = back @ turned[:3, :3]
+        out = view.camera.position - 100 * size_of(base) * view.camera.viewmat[2, :3]
+        turned[:3, 3] = -turned[:3, :3] @ out
+        return View(dataclasses.replace(view.camera, viewmat=turned), torch.zeros_like(view.image))
+
+    train = tuple(away(view) if k % 3 == 0 else view for k, view in enumerate(scene.train))
+    return Case(base, dataclasses.replace(scene, train=train))
+
+
+def inside(base: clod.Gaussians, scene: Scene) -> Case:
+    """A Gaussian around a training camera, one around a held-out one, and one with its centre in the lens."""
+    means, scales, logits = base.means.clone(), base.log_scales.clone(), base.opacity_logits.clone()
+    for row, view in enumerate((scene.train[0], scene.test[0])):
+        means[row], scales[row], logits[row] = view.camera.position, math.log(0.1 * size_of(base)), -1.0
+    return Case(base.replace(means=means, log_scales=scales, opacity_logits=logits), scene)
+
+
+def opacity(base: clod.Gaussians, scene: Scene, value: float) -> Case:
+    return Case(base.replace(opacity_logits=torch.full_like(base.opacity_logits, math.log(value / (1 - value)))), scene)
+
+
+def flat(base: clod.Gaussians, scene: Scene, axes: int) -> Case:
+    """The smallest ``axes`` axes a millionth of the largest: 1 for discs, 2 for needles."""
+    order = base.log_scales.argsort(1)[:, :axes]
+    shrunk = base.log_scales.amax(1, keepdim=True) - math.log(1e6)
+    return Case(base.replace(log_scales=base.log_scales.scatter(1, order, shrunk.expand(-1, axes))), scene)
+
+
+def black(base: clod.Gaussians, scene: Scene) -> Case:
+    return Case(base, of_views(scene, lambda view: View(view.camera, torch.zeros_like(view.image))))
+
+
+def georeferenced(base: clod.Gaussians, scene: Scene, kind: str) -> Case:
+    """Coordinates a million units off, as file of ``kind`` f4 or f8 and COLMAP model; read back by our readers."""
+    offset = np.array([437_000.0, 4_481_000.0, 1_000_000.0])
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        model = pycolmap.Reconstruction(str(capture(CAPTURE) / "sparse" / "0"))
+        model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(), offset))
+        (folder / "sparse" / "0").mkdir(parents=True)
+        model.write_binary(str(folder / "sparse" / "0"))
+        (folder / "images").symlink_to((capture(CAPTURE) / "images").resolve())
+        clod.save(folder / "plain.ply", base)
+        rows = PlyData.read(str(folder / "plain.ply"))["vertex"].data
+        shifted = rows.astype([(n, kind if n in ("x", "y", "z") else rows.dtype[n]) for n in rows.dtype.names])
+        for axis, by in zip("xyz", offset, strict=True):
+            shifted[axis] = rows[axis].astype("f8") + by
+        PlyData([PlyElement.describe(shifted, "vertex")]).write(str(folder / "utm.ply"))
+        checkpoint = clod.load(folder / "utm.ply")
+        return Case(checkpoint.gaussians, clod.load_scene(folder, origin=checkpoint.origin))
+
+
+def with_alpha(base: clod.Gaussians, scene: Scene) -> Case:
+    """Photographs cut out along a soft circle, as PNG with alpha, read back by our reader."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        (folder / "images").mkdir()
+        views = sorted((*scene.train, *scene.test), key=lambda view: view.camera.name)
+        for view in views:
+            y, x = np.mgrid[-1 : 1 : view.camera.height * 1j, -1 : 1 : view.camera.width * 1j]
+            alpha = np.clip(4 * (1 - np.hypot(x, y)), 0, 1) * 255
+            rgba = np.dstack([view.image.numpy(), alpha.astype(np.uint8)])
+            Image.fromarray(rgba).save(folder / "images" / f"{view.camera.name}.png")
+        cameras = [view.camera for view in views]
+        write_model(folder, cameras, [f"{camera.name}.png" for camera in cameras])
+        return Case(base, clod.load_scene(folder))
+
+
+def of_views(scene: Scene, change: Callable[[View], View]) -> Scene:
+    return Scene(tuple(map(change, scene.train)), tuple(map(change, scene.test)))
+
+
+def size_of(base: clod.Gaussians) -> float:
+    """Of the bulk of the scene, in world units."""
+    low, high = (base.means.quantile(q, 0) for q in (0.1, 0.9))
+    return float((high - low).norm())
+
+
+CASES: dict[str, Change] = {
+    "as it is": Case,
+    "offset by 1e6, stored as double": partial(georeferenced, kind="f8"),
+    "offset by 1e6, stored as float": partial(georeferenced, kind="f4"),
+    "scaled by 1e-4": partial(similar, scale=1e-4),
+    "scaled by 1e4": partial(similar, scale=1e4),
+    "one floater at 1e6 times the size": floater,
+    "one Gaussian in all": only_one,
+    "all Gaussians in one place": lambda base, scene: Case(
+        base.replace(means=base.means.median(0).values.repeat(len(base), 1)), scene
+    ),
+    "all behind a third of the cameras": behind,
+    "cameras inside Gaussians": inside,
+    "opacities all 0.99": partial(opacity, value=0.99),
+    "opacities all 0.01": partial(opacity, value=0.01),
+    "discs, axes 1e6 : 1": partial(flat, axes=1),
+    "needles, axes 1e6 : 1": partial(flat, axes=2),
+    "a single training image": partial(one_view, scale=1.0),
+    "a single training image, scaled by 1e-4": partial(one_view, scale=1e-4),
+    "a single training image, scaled by 1e4": partial(one_view, scale=1e4),
+    "black images": black,
+    "images with alpha": with_alpha,
+    "two cameras at one place": lambda base, scene: Case(base, Scene((*scene.train, scene.train[0]), scene.test)),
+    "max_sv 1": partial(Case, settings={"max_sv": 1.0}),
+    "max_sv 100, tau 0.004": partial(Case, settings={"max_sv": 100.0, "tau": 0.004}),
+    "max_sv 100, tau 0.004, 1,500 steps": partial(Case, settings={"max_sv": 100.0, "tau": 0.004, "iters": 1500}),
+}
 
 
 def measure() -> list[dict[str, Any]]:

@@ -1,40 +1,43 @@
-"""Stiffness: optimisers, parameters and step sizes on values of sigma_d that span eight decades.
+"""Stiffness: optimizers, parameters and learning rates on values of sigma_d that span eight decades.
 
-The slope of the equation goes as 1/sigma. All measurements use the package's equation, target-count curve, schedule and
-mean of the last steps:
+The slope of the equation goes as 1/sigma_d. Gaussians at distances over eight decades have a known sigma_d that meets
+the target-count curve; training starts up to four decades off and minimises the mean square difference of the drawn
+opacities from the right ones, and the count term, with the package's schedule and mean of the last steps. Every
+optimizer gets the same gradients.
 
-- ``equation``: Gaussians at distances over eight decades with known sigma_d that meets the target count. The loss is
-  the mean square difference of the drawn opacities from the right ones. Starts are off by up to four decades each way.
-  Every optimizer gets the same gradient, of the loss and of the count term.
-- ``stuck`` and ``training``: the same through the training step itself (``stability_stuck.py``).
+``stuck``: a quarter each begins at 0, ten thousand times too small, as much too large, and at SIGMA_MAX. A Gaussian is
+stuck if no dial value gives it a gradient, before and after 100 steps.
 """
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from itertools import product
+from pathlib import Path
 from typing import Any
 
+import clod_adapter as clod
 from clod_adapter._kernels.threads import torch_on_one_thread
-from clod_adapter.equation.attenuation import Attenuated, attenuate
-from clod_adapter.equation.distances import normalized_distances
-from clod_adapter.report.style import BLUE, GREEN, ORANGE, PURPLE, QUIET
+from clod_adapter.equation.attenuation import SIGMA_MAX, Attenuated, attenuate
+from clod_adapter.initialization.importance import sigma_from_importance
+from clod_adapter.report.style import BLUE, GREEN, ORANGE, PURPLE, QUIET, label_log, new_figure, save_figure, tidy
 from clod_adapter.training.objective import SIGMA_RANGE
 from clod_adapter.training.optimizer import RowAdam
 from clod_adapter.training.target_count import count_gradient
 from common import table
-from stability_stuck import CONFIG, DIALS, STUCK_STEPS, TRAINING_STEPS, scene, stuck_rows, training_rows
 
 import numpy as np
 import torch
 from torch import Tensor
 
+CONFIG = clod.AdaptConfig(growth="off")
+DIALS = tuple(CONFIG.max_sv ** (k / 11) for k in range(12))
 RATES = tuple(10 ** (k / 2) for k in range(-8, 1))  # 1e-4 to 1 in half decades
 WRONG = 4.0  # decades, each way
-STEPS, LENGTHS = 600, (30, 100, 300, 1000)
+STEPS, LENGTHS, STUCK_STEPS = 600, (30, 100, 300, 1000), 100
 CONVERGED = 0.25  # of the start's error
 Stepper = Callable[[list[Tensor], list[float]], None]
 
@@ -73,26 +76,6 @@ OPTIMIZERS: dict[str, tuple[Callable[[list[Tensor]], Stepper], str]] = {
 }
 
 
-def measure() -> list[dict[str, Any]]:
-    task, rows = problem(), []
-    for optimizer, parameter in product(OPTIMIZERS, ("log", "linear")):
-        own = {"part": "stiffness", "what": "equation", "optimizer": optimizer, "parameter": parameter}
-        fit(task, optimizer, parameter, (1e-4,), 2)  # compiled, and imported by torch, before the clock starts
-        errors = [task.error(sigma) for sigma in fit(task, optimizer, parameter, RATES, STEPS)[0]]
-        rows += [own | {"rate": rate, "steps": STEPS, "error": e} for rate, e in zip(RATES, errors, strict=True)]
-        best = RATES[int(np.nanargmin(errors))]
-        for steps in LENGTHS:
-            (sigma,), seconds = fit(task, optimizer, parameter, (best,), steps)
-            rows.append(own | {"rate": best, "steps": steps, "error": task.error(sigma), "seconds": seconds})
-    rows.append({"part": "stiffness", "what": "start", "error": task.error(task.start)})
-    near = problem(1.0)
-    for parameter in ("log", "linear"):  # for the default alone: how wide where the start is only a decade wrong
-        errors = [near.error(sigma) for sigma in fit(near, "RowAdam", parameter, RATES, STEPS)[0]]
-        good = [rate for rate, e in zip(RATES, errors, strict=True) if e <= CONVERGED * near.error(near.start)]
-        rows.append({"part": "stiffness", "what": "near", "parameter": parameter, "steps": STEPS, "rates": good})
-    return rows + stuck_rows() + training_rows()
-
-
 @dataclass(frozen=True)
 class Problem:
     """What the equation is to be fitted to: all ``[N]``, but ``wanted [dial values, N]``, the right ones as drawn."""
@@ -103,47 +86,45 @@ class Problem:
     start: Tensor
     wanted: Tensor
 
-    def drawn(self, sigma: Tensor) -> Tensor:
-        return _drawn(self.logits, sigma, self.distances)
-
     def error(self, sigma: Tensor) -> float:
         """Root mean square over Gaussians and dial values of the opacity they are drawn with, less the right one."""
-        return float((self.drawn(sigma) - self.wanted).square().mean().sqrt())
+        return float((drawn(self.logits, sigma, self.distances) - self.wanted).square().mean().sqrt())
 
 
-def _drawn(logits: Tensor, sigma: Tensor, distances: Tensor) -> Tensor:
+def drawn(logits: Tensor, sigma: Tensor, distances: Tensor) -> Tensor:
     settings = CONFIG.attenuation(1.0)
     return torch.stack([attenuate(logits, sigma, distances, s, settings).drawn for s in DIALS])
 
 
-def problem(wrong: float = WRONG) -> Problem:
-    """The scene's equation; the start is wrong by up to ``wrong`` decades each way, log-uniform."""
-    some, camera = scene()
-    distances, right = normalized_distances(some.means, camera, some.attenuation), some.sigma_d
-    off = torch.empty(len(right)).uniform_(-wrong, wrong, generator=torch.Generator().manual_seed(1))
-    return Problem(
-        some.opacity_logits, distances, right, right * 10**off, _drawn(some.opacity_logits, right, distances)
-    )
+def problem(n: int = 192) -> Problem:
+    """Distances d' from 1e-3 to 1e5, log-uniform; the start is wrong by up to WRONG decades each way."""
+    draw = torch.Generator().manual_seed(0)
+    distances = 10 ** torch.empty(n).uniform_(-3, 5, generator=draw)
+    logits = torch.empty(n).uniform_(0.3, 0.99, generator=draw).logit()
+    flat, rank = torch.zeros(n, 3), torch.rand(4 * n, generator=draw)[3 * n :]
+    some = clod.Gaussians(flat, torch.ones(n, 4), flat, logits, torch.zeros(n, 1, 3), torch.zeros(n, 0, 3))
+    right = sigma_from_importance(
+        some, rank, distances, CONFIG.attenuation(1.0), share=CONFIG.share,
+        exponent=CONFIG.exponent,
+    ).clamp(max=1e6)  # fmt: skip
+    off = torch.empty(n).uniform_(-WRONG, WRONG, generator=torch.Generator().manual_seed(1))
+    return Problem(logits, distances, right, right * 10**off, drawn(logits, right, distances))
 
 
 @torch_on_one_thread()
 def fit(
-    task: Problem, optimizer: str, parameter: str, rates: tuple[float, ...], steps: int
+    task: Problem, optimizer: str, log: bool, rates: Sequence[float], steps: int, count: bool = True
 ) -> tuple[list[Tensor], float]:
-    """sigma_d after training as ``trainer.Trainer`` does it, at dial value 1 and another one a step; and seconds.
-
-    One run a step size, all of them at once; they know nothing of each other.
-    """
-    log, n = parameter == "log", len(task.start)
+    """sigma_d after training, at dial value 1 and another one a step; and seconds. One run a rate, all at once."""
     limits = tuple(map(math.log, SIGMA_RANGE)) if log else SIGMA_RANGE
     x = task.start.clamp(*SIGMA_RANGE)
     runs = [(x.log() if log else x).clone() for _ in rates]
-    step, means, random = OPTIMIZERS[optimizer][0](runs), torch.zeros(len(rates), n), np.random.default_rng(0)
+    step, means, random = OPTIMIZERS[optimizer][0](runs), torch.zeros(len(rates), len(x)), np.random.default_rng(0)
     began, averaged = time.perf_counter(), 0
     for k in range(steps):
         fall = CONFIG.lr_final ** (k / steps)
-        gradients = _gradients(task, torch.stack(runs), log, int(random.integers(1, len(DIALS))))
-        step(list(gradients), [rate * fall for rate in rates])
+        found = gradients(task, torch.stack(runs), log, (0, int(random.integers(1, len(DIALS)))), count)
+        step(list(found), [rate * fall for rate in rates])
         for x in runs:
             x.clamp_(*limits)
         if k >= (1 - CONFIG.average) * steps:
@@ -152,23 +133,54 @@ def fit(
     return list(means.exp() if log else means), time.perf_counter() - began
 
 
-def _gradients(task: Problem, x: Tensor, log: bool, other: int) -> Tensor:
-    """``[runs, N]``: gradient by ``x`` of the loss at dial value 1 and another one, and of the count term."""
+def gradients(task: Problem, x: Tensor, log: bool, dials: Sequence[int], count: bool = True) -> Tensor:
+    """``[runs, N]``: gradient by ``x`` of the loss at these dial values and, with ``count``, of the count term."""
     settings, n, total, pull = CONFIG.attenuation(1.0), len(task.start), torch.zeros(()), torch.zeros_like(x)
     leaf = x.requires_grad_()
     sigma = (leaf.exp() if log else leaf).flatten()
     logits, distances = task.logits.repeat(len(x)), task.distances.repeat(len(x))
-    for k in (0, other):
+    for k in dials:
         s = DIALS[k]
         dialled = attenuate(logits, sigma, distances, s, settings)
         losses = (dialled.drawn.view(-1, n) - task.wanted[k]).square().mean(1)
         weight = (1 - CONFIG.weight_slope * s / CONFIG.max_sv) ** 2
         total = total + weight * losses.sum()
-        for run, loss in enumerate((weight * losses.detach()).tolist()):
+        for run, loss in enumerate((weight * losses.detach()).tolist() if count else []):
             own = Attenuated(*(value[run * n : (run + 1) * n] for value in dialled))
             pull[run] += count_gradient(own, task.logits, s, settings.tau, loss, CONFIG)
     (gradient,) = torch.autograd.grad(total, leaf)
     return gradient + (pull if log else pull / x.detach())
+
+
+def stuck(task: Problem, sigma: Tensor, log: bool, count: bool) -> int:
+    """Gaussians that are drawn wrongly somewhere, and get no gradient at any dial value."""
+    x = sigma.clamp(min=SIGMA_RANGE[0]).log() if log else sigma
+    moved = sum(gradients(task, x[None].clone(), log, (k,), count)[0].abs() for k in range(len(DIALS)))
+    wrong = (drawn(task.logits, sigma, task.distances) - task.wanted).abs().amax(0) > 0.01
+    return int((wrong & (torch.as_tensor(moved) == 0)).sum())
+
+
+def measure() -> list[dict[str, Any]]:
+    task, rows = problem(), []
+    for optimizer, log in product(OPTIMIZERS, (True, False)):
+        own = {"part": "stiffness", "what": "equation", "optimizer": optimizer, "parameter": "log" if log else "linear"}
+        fit(task, optimizer, log, (1e-4,), 2)  # compiled, and imported by torch, before the clock starts
+        errors = [task.error(sigma) for sigma in fit(task, optimizer, log, RATES, STEPS)[0]]
+        rows += [own | {"rate": rate, "steps": STEPS, "error": e} for rate, e in zip(RATES, errors, strict=True)]
+        best = RATES[int(np.nanargmin(errors))]
+        for steps in LENGTHS:
+            (sigma,), seconds = fit(task, optimizer, log, (best,), steps)
+            rows.append(own | {"rate": best, "steps": steps, "error": task.error(sigma), "seconds": seconds})
+    rows.append({"part": "stiffness", "what": "start", "error": task.error(task.start)})
+    n = torch.arange(len(task.right))
+    ends = torch.stack([task.right * 0, task.right / 1e4, task.right * 1e4, torch.full_like(task.right, SIGMA_MAX)])
+    bad = replace(task, start=ends[n % 4, n])
+    for log, count in ((False, False), (True, False), (True, True)):
+        name = f"{'log' if log else 'linear'} sigma_d{', count term (default)' if count else ''}"
+        (after,), _ = fit(bad, "RowAdam", log, (CONFIG.lr_sigma,), STUCK_STEPS, count)
+        counts = [stuck(bad, sigma, log, count) for sigma in (bad.start, after)]
+        rows.append({"part": "stiffness", "what": "stuck", "method": name, "of": len(n), "counts": counts})
+    return rows
 
 
 def curves(rows: list[dict[str, Any]], timed: bool) -> dict[tuple[str, str], list[dict[str, Any]]]:
@@ -181,27 +193,42 @@ def curves(rows: list[dict[str, Any]], timed: bool) -> dict[tuple[str, str], lis
 
 
 def tables(rows: list[dict[str, Any]]) -> str:
-    """Error and step sizes that converge; Gaussians that cannot come back; the objective before and after."""
+    """Error and learning rates that converge; Gaussians that are stuck."""
     (start,) = (row["error"] for row in rows if row["what"] == "start")
-    enough, timed, lines = CONVERGED * start, curves(rows, True), []
+    timed, lines = curves(rows, True), []
     for key, own in curves(rows, False).items():
         best = min(own, key=lambda row: row["error"])
-        good = [row["rate"] for row in own if row["error"] <= enough]
-        first = next((f"{row['seconds']:.2f}" for row in timed[key] if row["error"] <= enough), "")
-        lines.append([*key, f"{best['error']:.3f}", f"{best['rate']:.2g}", _span(good), first])
-    stuck = [[row["method"], f"{row['start']} of {row['of']}", row["end"]] for row in rows if row["what"] == "stuck"]
-    near = [f"{row['parameter']} sigma_d {_span(row['rates'])}" for row in rows if row["what"] == "near"]
-    ends = [
-        f"{row['from']} start: {row['before']:.3f} to {row['after']:.3f}" for row in rows if row["what"] == "training"
-    ]
+        good = [f"{row['rate']:.2g}" for row in own if row["error"] <= CONVERGED * start]
+        first = next((f"{row['seconds']:.2f}" for row in timed[key] if row["error"] <= CONVERGED * start), "")
+        span = " to ".join(dict.fromkeys((good[0], good[-1]))) if good else "none"
+        lines.append([*key, f"{best['error']:.3f}", f"{best['rate']:.2g}", span, first])
     heads = ["optimizer", "sigma_d", "best error", "at", "learning rates that converge", "seconds to it"]
+    left = [[row["method"], *(f"{k} of {row['of']}" for k in row["counts"])] for row in rows if row["what"] == "stuck"]
     return "\n\n".join([
         table(heads, lines), f"RMS error at the start: {start:.2f}",
-        f"learning rates that converge from initial values at most one decade wrong: {'; '.join(near)}",
-        table(["cannot come back", "at the start", f"after {STUCK_STEPS} steps"], stuck),
-        f"objective, {TRAINING_STEPS} steps: {'; '.join(ends)}",
+        table(["Gaussians without a gradient", "at the start", f"after {STUCK_STEPS} steps"], left),
     ])  # fmt: skip
 
 
-def _span(rates: list[float]) -> str:
-    return "none" if not rates else f"{rates[0]:.2g}" if len(rates) == 1 else f"{rates[0]:.2g} to {rates[-1]:.2g}"
+def picture(rows: list[dict[str, Any]], path: Path) -> None:
+    """Error by learning rate on the left, by seconds at the best one on the right; dots for linear sigma_d."""
+    with new_figure((10.4, 4.6), layout="constrained") as figure:
+        panels = figure.subplots(1, 2, sharey=True)
+        for axes, timed, along in zip(panels, (False, True), ("rate", "seconds"), strict=True):
+            for (optimizer, parameter), own in curves(rows, timed).items():
+                ours = (optimizer, parameter) == ("RowAdam", "log")
+                axes.plot(
+                    [row[along] for row in own], [row["error"] for row in own], color=OPTIMIZERS[optimizer][1],
+                    linestyle="-" if parameter == "log" else ":", linewidth=2.6 if ours else 1.3,
+                    label=optimizer + (" (default)" if ours else "") if parameter == "log" else None,
+                )  # fmt: skip
+            axes.set(xscale="log", yscale="log")
+            tidy(axes)
+            label_log(axes.xaxis, "{:g}", subs=(1,))
+        label_log(panels[0].yaxis, "{:g}")
+        panels[0].axvline(CONFIG.lr_sigma, color=BLUE, linewidth=0.8)
+        panels[0].set(ylabel="RMS error of the opacity that is drawn", xlabel=f"learning rate, {STEPS} steps")
+        panels[1].set_xlabel("seconds of training at the best learning rate")
+        panels[0].plot([], [], color=QUIET, linestyle=":", label="linear sigma_d")
+        figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", frameon=False, ncols=4)
+        save_figure(figure, path)

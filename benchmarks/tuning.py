@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import math
 import os
 import sys
 import tempfile
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import clod_adapter as clod
@@ -25,6 +23,7 @@ import numpy as np
 import torch
 from plyfile import PlyData, PlyElement
 from torch import Tensor
+from tqdm import tqdm
 
 TIMEOUT = 3600.0  # seconds of a merging
 # 3DGS's rates of training; means times the cameras' extent.
@@ -37,54 +36,41 @@ class Tuning:
 
     iters: int  # steps, over which the learning rates fall exponentially to ``final`` of RATES
     seed: int = 0  # of the order of the views, and of the prefixes' lengths
-    rates: dict[str, float] = field(default_factory=lambda: dict(RATES))
     final: float = 0.05
-    draw: str | None = None  # "log": a prefix's share of all is log-uniform in [shortest, 1]; None: no prefixes
+    prefixes: bool = False  # a prefix's share of all is log-uniform in [shortest, 1]
     shortest: float = 0.01
 
 
-@dataclass(frozen=True)
-class Tuned:
-    gaussians: clod.Gaussians
-    steps: int
-    seconds: float
+def tune(start: clod.Gaussians, views: tuple[clod.View, ...], config: Tuning) -> tuple[clod.Gaussians, float]:
+    """Minimises 0.8 L1 + 0.2 (1 - SSIM), a view a step, with Adam over all attributes; the result, and seconds.
 
-
-def tune(
-    start: clod.Gaussians, views: tuple[clod.View, ...], config: Tuning, progress: Callable[[float, str], None]
-) -> Tuned:
-    """Minimises 0.8 L1 + 0.2 (1 - SSIM), a view a step, with Adam over all attributes of all Gaussians.
-
-    With ``draw`` each step's loss is that of all Gaussians plus that of a random prefix of them, after Matryoshka
+    With ``prefixes`` each step's loss is that of all Gaussians plus that of a random prefix of them, after Matryoshka
     Gaussian Splatting (arXiv 2603.19234): two renders a step, no weights. ``start`` is then in the order of importance.
     Drawn with the screen-space filter of ``start``.
     """
     start = detach(start)
     own = {"dtype": torch.float32, "copy": True, "memory_format": torch.contiguous_format}
     parameters = {name: getattr(start, name).detach().to(**own) for name in ATTRIBUTES}
-    rates = config.rates | {"means": config.rates["means"] * camera_extent([view.camera for view in views])}
-    tuned = [name for name in ATTRIBUTES if rates[name] > 0 and parameters[name].numel()]
+    rates = RATES | {"means": RATES["means"] * camera_extent([view.camera for view in views])}
+    tuned = [name for name in ATTRIBUTES if parameters[name].numel()]
     optimizer, random = RowAdam({name: parameters[name] for name in tuned}), np.random.default_rng(config.seed)
-    everyone, order = torch.ones(len(start), dtype=torch.bool), []
+    everyone, order = torch.ones(len(start), dtype=torch.bool), list[int]()
     # Compiled before the clock starts.
-    _gradients(start, parameters, tuned, views[0], len(start) if config.draw else None)
-    began, steps, mean = time.perf_counter(), 0, math.nan
-    while steps < config.iters:
-        share = steps / config.iters
+    _gradients(start, parameters, tuned, views[0], len(start) if config.prefixes else None)
+    began = time.perf_counter()
+    for step in tqdm(range(config.iters), leave=False):
         order = order or random.permutation(len(views)).tolist()
-        prefix = max(round(config.shortest ** random.random() * len(start)), 1) if config.draw else None
-        loss, gradients = _gradients(start, parameters, tuned, views[order.pop()], prefix)
-        optimizer.step(gradients, everyone, {name: rate * config.final**share for name, rate in rates.items()})
-        mean = loss if math.isnan(mean) else 0.98 * mean + 0.02 * loss
-        steps += 1
-        progress(steps / config.iters, f"step {steps}, loss {mean:.4f}")
-    return Tuned(start.replace(**parameters), steps, time.perf_counter() - began)
+        prefix = max(round(config.shortest ** random.random() * len(start)), 1) if config.prefixes else None
+        gradients = _gradients(start, parameters, tuned, views[order.pop()], prefix)
+        share = config.final ** (step / config.iters)
+        optimizer.step(gradients, everyone, {name: rate * share for name, rate in rates.items()})
+    return start.replace(**parameters), time.perf_counter() - began
 
 
 @torch_on_one_thread()
 def _gradients(
     start: clod.Gaussians, parameters: dict[str, Tensor], tuned: list[str], view: clod.View, prefix: int | None
-) -> tuple[float, dict[str, Tensor]]:
+) -> dict[str, Tensor]:
     leaves = {name: value.detach().requires_grad_(name in tuned) for name, value in parameters.items()}
     gaussians = start.replace(**leaves)
     loss = photometric_loss(splat(gaussians, gaussians.opacities, view.camera)[0], view.image)
@@ -94,7 +80,7 @@ def _gradients(
         image, _ = splat(gaussians, torch.where(inside, gaussians.opacities, 0), view.camera)
         loss = loss + photometric_loss(image, view.image)
     found = torch.autograd.grad(loss, [leaves[name] for name in tuned])
-    return float(loss.detach()), dict(zip(tuned, found, strict=True))
+    return dict(zip(tuned, found, strict=True))
 
 
 def find_tool() -> SplatTransform:

@@ -47,9 +47,9 @@ class Workload:
         return Workload(name, **{**old, **fields}, camera=self.camera, weights=self.weights)
 
 
-def make(name: str) -> Workload:
-    """W1 or W2; the draws come in a fixed order, which the numbers depend on."""
-    count, width, height, seed = SIZES[name]
+def make(name: str, size: tuple[int, int, int, int] | None = None) -> Workload:
+    """W1, W2 or one of another size; the draws come in a fixed order, which the numbers depend on."""
+    count, width, height, seed = size or SIZES[name]
     draw = np.random.default_rng(seed)
     rotation, translation, focal = _pose(width)
     points = _surface_points(draw, count)

@@ -41,7 +41,7 @@ def bake(
 
     For ``cameras`` each Gaussian has one distance (``distances.typical_distance``). The Gaussians kept there at s are
     kept, with the opacities drawn at ``s^FADED``: fading Gaussians before they are culled prevents popping, which a
-    plain file does not have (benchmarks/bake.py). As they cover more then, the scales are those of ``s^GROWN``.
+    plain file does not have. As they cover more then, the scales are those of ``s^GROWN``.
 
     Where the dial has no effect the logits are unchanged, except +inf, which becomes ``OPAQUE``.
 

@@ -35,7 +35,7 @@ FLAT = 2 / 255
 # large one of which only some cameras were given.
 FEWEST_IN_VIEW = 0.01
 # Misplaced files measured at most 0.39, those off by a pixel or two at least 0.43 (the search finds these), matching
-# ones at least 0.91, or 0.67 with half of the Gaussians removed (benchmarks/alignment.py).
+# ones at least 0.91, or 0.67 with half of the Gaussians removed.
 CORRELATED = 0.5
 CLEAR = 3.0  # dB by which another explanation must be better
 DOUBTFUL = 6.0  # dB above the mean colours, below which the frame may be wrong; matching files had 8 to 18

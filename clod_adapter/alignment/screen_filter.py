@@ -22,7 +22,7 @@ from clod_adapter.losses import unit
 from clod_adapter.render import render
 
 MOST_VIEWS = 8
-# A wrong filter measured at least 0.48 dB worse than that of training (benchmarks/antialias.py).
+# A wrong filter measured at least 0.48 dB worse than that of training.
 CLEAR = 0.2  # dB, mean over the views
 MOST = 0.75  # share of the views in which the chosen filter must be better
 

@@ -1,4 +1,4 @@
-"""Tables, and processes that are timed from outside."""
+"""Tables, processes that are timed from outside, and the exponents of their times."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import sys
 
 import common
 import pytest
+import scaling
 
 
 def test_a_table_is_markdown() -> None:
@@ -19,9 +20,10 @@ def test_a_process_is_timed_by_its_messages() -> None:
     assert (run.out, run.lines) == ("done\n", ["half"])
     assert 0 < run.moments["half"] <= run.seconds - 0.3  # a busy machine reads the message up to a second late
     assert run.peak_bytes >= max(size for _, size, _ in run.memory) > 0
-
-
-def test_another_exit_code_ends_the_benchmark() -> None:
     with pytest.raises(SystemExit, match="exit code 3"):
         common.Process([sys.executable, "-c", "raise SystemExit(3)"])
-    assert common.Process([sys.executable, "-c", "raise SystemExit(3)"], code=3).out == ""
+
+
+@pytest.mark.parametrize("power", [0.5, 1.0, 2.0])
+def test_an_exponent_is_that_of_the_power(power: float) -> None:
+    assert scaling.exponent([(n, 3 * n**power) for n in scaling.SIZES]) == pytest.approx(power)

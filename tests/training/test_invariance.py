@@ -105,7 +105,7 @@ def test_unit_direction_and_place(
 
 
 def assert_same(found: list[tuple[float, float]], wanted: list[tuple[float, float]]) -> None:
-    """Within the noise of roundings, which is larger in a scene as small as this (benchmarks/invariance.py)."""
+    """Within the noise of roundings, which is larger in a scene as small as this."""
     for (psnr, kept), (other, share) in zip(found, wanted, strict=True):
         assert psnr == pytest.approx(other, abs=0.5) and kept == pytest.approx(share, abs=0.02), (found, wanted)
 
