@@ -14,7 +14,6 @@ exit code is 1 where a test failed or a condition could not be had. The conditio
 - ``ignored_sigint``, ``blocked_signals``: as a script's background job, and below a program that blocks signals;
 - ``c_locale``: ASCII as the encoding of files and of the terminal, and a day's time zone away from Greenwich;
 - ``folders``: temporary files, home and kernel cache in folders with spaces and other letters in their names;
-- ``no_pycolmap``: as on Linux on arm64, for which pycolmap has no wheel;
 - ``checkout``: the last commit as a clone in such a folder, with an environment of its own (pip installs it).
 """
 
@@ -70,7 +69,6 @@ CONDITIONS = {
     "folders": Condition(
         {"TMPDIR": "{work}/tmp", "HOME": "{work}/home", "XDG_CACHE_HOME": "", "NUMBA_CACHE_DIR": "{work}/cache"}
     ),
-    "no_pycolmap": Condition({"PYTHONPATH": "{work}/absent"}),
     "checkout": Condition(),
 }
 
@@ -86,9 +84,8 @@ def run(name: str, tests: Sequence[str], parallel: Sequence[str] = PARALLEL) -> 
     condition = reduce(Condition.__add__, (CONDITIONS[each] for each in names))
     with tempfile.TemporaryDirectory() as outer:
         work = Path(outer) / SPACED
-        for folder in ("tmp", "home", "cache", "absent"):
+        for folder in ("tmp", "home", "cache"):
             (work / folder).mkdir(parents=True)
-        (work / "absent" / "pycolmap.py").write_text("raise ModuleNotFoundError('no pycolmap', name='pycolmap')\n")
         root, python = clone(work) if "checkout" in names else (ROOT, Path(sys.executable))
         report = Path(outer) / "report.xml"
         words = [*condition.prefix, str(python), "-m", "pytest", *parallel, f"--junitxml={report}", *tests]

@@ -8,14 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
+import pycolmap
 import torch
 from hypothesis import strategies as st
 from PIL import Image
 
 from clod_adapter.cameras import Camera
 from clod_adapter.io.scene.colmap import write_model
-from clod_adapter.io.scene.colmap_library import pycolmap
 from formats import damaged
 
 SIZE = {"width": 160, "height": 120}
@@ -86,8 +85,6 @@ def write_frames(folder: Path, frames: list[Any], file: str = "transforms.json",
 
 
 def as_text(folder: Path) -> None:
-    """Skips the test where there is no pycolmap, which alone writes text."""
-    pytest.importorskip("pycolmap")
     model = folder / "sparse" / "0"
     reconstruction = pycolmap.Reconstruction(str(model))
     for file in model.iterdir():
@@ -96,7 +93,7 @@ def as_text(folder: Path) -> None:
 
 
 def model_of(folder: Path, kind: str, params: list[float], name: str = "a.png", cameras: int = 1, **size: int) -> None:
-    """Writes a model of one image with pycolmap or its stand-in."""
+    """Writes a model of one image with pycolmap."""
     size = size or {"width": 40, "height": 30}
     reconstruction = pycolmap.Reconstruction()
     for i in range(1, cameras + 1):

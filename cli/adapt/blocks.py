@@ -17,7 +17,7 @@ from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.robustness import scene_fingerprint
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.importance import usable_views
-from clod_adapter.io.scene.image_cache import ImageCache
+from clod_adapter.io.scene.load import ImageCache
 from clod_adapter.progress import Phase, Stopped
 from clod_adapter.rasterizers.frame import release_memory
 from clod_adapter.training.plan import Plan

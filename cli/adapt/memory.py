@@ -16,7 +16,7 @@ from clod_adapter.blocks.memory import IMAGES, MemoryEstimate, MemoryPlan, in_wo
 from clod_adapter.cameras import Scene, StoredView
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.checkpoint import Checkpoint
-from clod_adapter.io.scene.image_cache import ImageCache
+from clod_adapter.io.scene.load import ImageCache
 
 from ..shared.console import Console
 

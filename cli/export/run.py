@@ -15,7 +15,7 @@ from clod_adapter.io.atomic import atomic_path, atomic_paths
 from clod_adapter.io.checkpoint import Checkpoint
 from clod_adapter.io.ply.columns import MASKS, dial_columns, inria_dtype
 from clod_adapter.io.ply.constants import PREFIX
-from clod_adapter.io.scene.poses import load_cameras
+from clod_adapter.io.scene.load import load_cameras
 
 from ..commands.export_formats import LOD_META, PAGE, TILESET, level_paths, suffix_of
 from ..shared.antialiasing import with_filter

@@ -15,8 +15,7 @@ from clod_adapter.cameras import Camera, Scene, View
 from clod_adapter.errors import ClodError
 from clod_adapter.io.checkpoint import Checkpoint
 from clod_adapter.io.scene.colmap import load_points
-from clod_adapter.io.scene.load import load_scene
-from clod_adapter.io.scene.poses import load_cameras
+from clod_adapter.io.scene.load import load_cameras, load_scene
 from clod_adapter.origin import Origin
 
 from .console import Console

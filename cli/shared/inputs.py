@@ -10,8 +10,7 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.checkpoint import Checkpoint, load
 from clod_adapter.io.ply.columns import dial_columns
 from clod_adapter.io.ply.values import Activated
-from clod_adapter.io.scene.image_cache import ImageCache
-from clod_adapter.io.scene.load import load_scene
+from clod_adapter.io.scene.load import ImageCache, load_scene
 from clod_adapter.origin import Origin
 from clod_adapter.progress import Phase
 from clod_adapter.training.camera_placement import place_cameras

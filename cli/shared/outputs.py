@@ -14,7 +14,7 @@ from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import check_target, remove_leftovers
 from clod_adapter.io.file_formats import read_model
 from clod_adapter.io.lock import output_lock
-from clod_adapter.io.scene.files import scene_files
+from clod_adapter.io.scene.folder import scene_files
 
 # Found at the beginning of the files that clod-adapt writes: in PLY comments, metadata, pages, reports and tables. An
 # .spz is compressed; .splat, .sog and .compressed.ply have no such text.

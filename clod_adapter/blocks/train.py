@@ -33,7 +33,7 @@ from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.importance import MOST_VIEWS
-from clod_adapter.io.scene.image_cache import ImageCache
+from clod_adapter.io.scene.load import ImageCache
 from clod_adapter.progress import Listener, Phase, tell
 from clod_adapter.training.loop import adapt
 from clod_adapter.training.objective import TrainableSubset

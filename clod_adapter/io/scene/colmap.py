@@ -1,9 +1,11 @@
-"""COLMAP models: their posed images and points, and writing one."""
+"""COLMAP models: posed images and points, read and written; damaged ones are refused before COLMAP reads them."""
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Sequence
 from copy import copy
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,11 +14,80 @@ import torch
 from clod_adapter.cameras import Camera
 from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import atomic_path
-from clod_adapter.io.scene.colmap_library import pycolmap
-from clod_adapter.io.scene.colmap_records import check_records
 from clod_adapter.io.scene.folder import find_cameras, name_parts
-from clod_adapter.io.scene.posed import PosedImage, check_posed
+from clod_adapter.io.sniff import refuse_irregular, refuse_long_numbers
 from clod_adapter.origin import NOWHERE
+
+try:
+    import pycolmap
+except ModuleNotFoundError as error:
+    raise ClodError(
+        "cameras and photographs are read with pycolmap, which is not installed: pip install pycolmap; on arm64 Linux "
+        "conda install -c conda-forge pycolmap"
+    ) from error
+
+TEST_EVERY = 8  # one view in this many is held out
+HUGE = 1e9  # world units and pixels; larger values are damage, and may not fit float32
+
+
+@dataclass(frozen=True)
+class PosedImage:
+    """A photograph's name, pose and camera.
+
+    Attributes:
+        name: its path in the folder of photographs, parts joined by /.
+        viewmat: ``[4, 4]`` float64, world to camera, OpenCV axes.
+        camera: any of COLMAP's perspective models; pixel centres lie at +0.5.
+        held_out: whether the scene marks it for testing; None where the scene marks none.
+    """
+
+    name: str
+    viewmat: np.ndarray
+    camera: pycolmap.Camera
+    held_out: bool | None = None
+
+    @property
+    def is_pinhole(self) -> bool:
+        """Whether it has no distortion, or only coefficients of 0."""
+        return self.camera.is_perspective_pinhole() and self.camera.is_undistorted()
+
+    def relative_to(self, origin: Sequence[float]) -> PosedImage:
+        """In a world with its origin at ``origin [3]``; in float64, as float32 lacks digits far from 0."""
+        viewmat = self.viewmat.copy()
+        viewmat[:3, 3] += viewmat[:3, :3] @ np.asarray(origin, np.float64)
+        return replace(self, viewmat=viewmat)
+
+
+def held_out(images: Sequence[PosedImage], test_every: int) -> set[str]:
+    """Names of the test images: those that the scene marks, else the 0th and every ``test_every``-th.
+
+    A single image is for training.
+    """
+    if any(image.held_out is not None for image in images):
+        return {image.name for image in images if image.held_out}
+    return {image.name for image in images[::test_every]} if len(images) > 1 else set()
+
+
+def check_posed(image: PosedImage, source: Path) -> PosedImage:
+    """The image as it is.
+
+    Raises:
+        ClodError: its camera or pose is not finite, too large, or cannot be undistorted to a pinhole.
+    """
+    camera = image.camera
+    if not camera.is_perspective_pinhole() and not camera.is_perspective_fisheye():
+        raise ClodError(
+            f"{source}: image {image.name!r} has camera model {camera.model_name}, no perspective camera; cut "
+            "perspective views from it first"
+        )
+    focals = [camera.focal_length_x, camera.focal_length_y]
+    numbers = np.concatenate([image.viewmat.ravel(), camera.params])
+    sized = 0 < camera.width < HUGE and 0 < camera.height < HUGE
+    if not sized or not (np.abs(numbers) < HUGE).all() or min(focals) <= 0:  # a comparison with NaN is false
+        raise ClodError(
+            f"{source}: image {image.name!r} has a camera or pose that is not usable; copy or export it again"
+        )
+    return image
 
 
 def read_colmap(model: Path) -> tuple[list[PosedImage], list[str]]:
@@ -103,6 +174,69 @@ def _posed_image(model: Path, image: pycolmap.Image) -> PosedImage:
     pose = image.cam_from_world()
     viewmat = np.vstack([pose.matrix(), [0, 0, 0, 1]])
     if hasattr(pose, "rotation") and not np.linalg.norm(pose.rotation.quat) > 0.5:
-        viewmat[:3, :3] = np.nan  # pycolmap takes a quaternion of no length for no rotation; colmap_plain gives NaN
+        viewmat[:3, :3] = np.nan  # pycolmap takes a quaternion of no length for no rotation
     # A copy, as the image's own is part of the whole reconstruction and keeps it in memory.
     return check_posed(PosedImage(image.name, viewmat, copy(image.camera)), model)
+
+
+def check_records(model: Path) -> None:
+    """Walks the binary records, as COLMAP reads past the end of a cut file until memory runs out.
+
+    Raises:
+        ClodError: a file cannot be read or does not hold the number of records that it states.
+    """
+    for name, after in _RECORDS.items():
+        path = model / name
+        text = path.with_suffix(".txt")
+        if data := _content(text):
+            refuse_long_numbers(text, data)
+        if not (data := _content(path)) and not path.exists():
+            continue
+        try:
+            at = 8
+            for _ in range(struct.unpack_from("<Q", data)[0]):
+                at = after(data, at)
+        except (struct.error, ValueError, OverflowError):
+            at = len(data) + 1
+        if at > len(data):
+            raise ClodError(f"{path}: is truncated or damaged; copy or export the model again")
+
+
+def _content(path: Path) -> bytes:
+    """The file's bytes; none where there is no file."""
+    refuse_irregular(path, "copy the model again")
+    try:
+        return path.read_bytes() if path.is_file() else b""
+    except OSError as error:
+        raise ClodError(f"{path}: cannot be read ({error.strerror or error}); check the path") from error
+
+
+def _count(data: bytes, at: int) -> int:
+    return struct.unpack_from("<Q", data, at)[0]
+
+
+def _camera_end(data: bytes, at: int) -> int:
+    model = pycolmap.CameraModelId(struct.unpack_from("<i", data, at + 4)[0])
+    parameters = pycolmap.Camera.create_from_model_id(1, model, 1.0, 1, 1).params  # ValueError: no such model
+    return at + 24 + 8 * len(parameters)  # id, model, width, height, parameters
+
+
+def _rig_end(data: bytes, at: int) -> int:
+    sensors = struct.unpack_from("<I", data, at + 4)[0]
+    at += 16 if sensors else 8  # id, count, the reference sensor
+    for _ in range(sensors - 1):
+        at += 65 if struct.unpack_from("<?", data, at + 8)[0] else 9  # sensor, whether it has a pose, the pose
+    return at
+
+
+# Where the record that starts at a position ends, by file.
+_RECORDS = {
+    "cameras.bin": _camera_end,
+    "rigs.bin": _rig_end,
+    # id, rotation, translation, camera id, name, keypoints
+    "images.bin": lambda data, at: (end := data.index(b"\0", at + 64) + 1) + 8 + 24 * _count(data, end),
+    # id, position, colour, error, track
+    "points3D.bin": lambda data, at: at + 51 + 8 * _count(data, at + 43),
+    # id, rig id, rotation, translation, members (the count has 32 bits here)
+    "frames.bin": lambda data, at: at + 68 + 16 * struct.unpack_from("<I", data, at + 64)[0],
+}

@@ -1,21 +1,29 @@
-"""Where a scene has its cameras and photographs, and where undistorted ones are cached.
+"""Where a scene has its cameras, its photographs and every other file that reading it may open.
 
 Needs neither pycolmap nor torch, so that a wrong folder is refused before they are imported.
 """
 
 from __future__ import annotations
 
+import json
 import os
-import sys
+import struct
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from os.path import isfile
 from pathlib import Path, PureWindowsPath
+from typing import Any
 
 from clod_adapter._support.text import as_text, file_name
 from clod_adapter.errors import ClodError
+from clod_adapter.io.sniff import refuse_long_numbers
 
 TRANSFORMS = ("transforms_train.json", "transforms.json")
+DATAPARSER = "dataparser_transforms.json"  # nerfstudio's: the frame it trained in
+DESCRIPTIONS = (*TRANSFORMS, "transforms_test.json", "transforms_val.json", DATAPARSER)
+PATHS = ("file_path", "mask_path", "depth_file_path")  # of a frame
+ENDINGS = ("", ".png", ".jpg", ".jpeg")  # that the path of a frame may omit
+MAX_BYTES = 256 * 2**20  # a hundred thousand frames have a tenth of that
 SMALLER = ("images_2", "images_4", "images_8")  # copies at a part of the size, as Mip-NeRF 360 and Inria's code have
 RAW = "input"  # Inria's name for the photographs before they are undistorted into images
 MISSING = 0.5  # the share of photographs that may be missing
@@ -122,18 +130,81 @@ def name_parts(name: str, cameras: Path) -> tuple[str, ...]:
     return path.parts
 
 
-def user_caches() -> Path:
-    """``$XDG_CACHE_HOME``, or where the platform has its users' caches; it need not be there.
+def scene_files(folder: Path) -> Iterator[Path]:
+    """The files of the model or the transforms, photographs, masks and depths; some may not exist.
+
+    A damaged file gives no names; its reader refuses it.
 
     Raises:
-        ClodError: there is neither that nor a home folder.
+        ClodError: the folder has no cameras.
     """
-    if chosen := os.environ.get("XDG_CACHE_HOME"):
-        return Path(chosen)
+    cameras = find_cameras(folder)
+    homes = dict.fromkeys((folder, cameras if cameras.is_dir() else cameras.parent))
+    for home in homes:
+        yield from (home / name for name in DESCRIPTIONS)
+    if cameras.is_dir():
+        yield from (path for path in cameras.iterdir() if path.suffix in (".bin", ".txt"))
+        names = [*_names_in_binary(cameras / "images.bin"), *_names_in_text(cameras / "images.txt")]
+    else:
+        names = [name for each in DESCRIPTIONS for name in _names_in_json(cameras.with_name(each))]
+    for root in photograph_folders(folder, cameras):
+        yield from (root.joinpath(*Path(name).parts) for name in names)
+
+
+def _names_in_binary(path: Path) -> Iterator[str]:
     try:
-        home = Path.home()
-    except RuntimeError as error:
-        raise ClodError("no home folder to keep undistorted photographs in; set XDG_CACHE_HOME to a folder") from error
-    if sys.platform == "win32":
-        return Path(os.environ.get("LOCALAPPDATA", home / "AppData" / "Local"))
-    return home / "Library" / "Caches" if sys.platform == "darwin" else home / ".cache"
+        data, at = path.read_bytes(), 8
+        for _ in range(struct.unpack_from("<Q", data)[0]):
+            end = data.index(b"\0", at + 64)  # after id, rotation, translation and camera
+            yield os.fsdecode(data[at + 64 : end].replace(b"\\", b"/"))
+            at = end + 9 + 24 * struct.unpack_from("<Q", data, end + 1)[0]
+    except (OSError, ValueError, struct.error):
+        return
+
+
+def _names_in_text(path: Path) -> Iterator[str]:
+    try:
+        lines = path.read_bytes().splitlines()
+    except OSError:
+        return
+    for line in lines:  # of two lines an image the second has points, and at most names what is not there
+        if not line.startswith(b"#") and len(words := line.split(None, 9)) == 10:
+            yield os.fsdecode(words[9].strip().replace(b"\\", b"/"))
+
+
+def _names_in_json(path: Path) -> Iterator[str]:
+    try:
+        content: Any = read_json(path)
+    except ClodError:
+        return
+    frames = content.get("frames") if isinstance(content, dict) else None
+    for frame in frames if isinstance(frames, list) else ():
+        for key in PATHS if isinstance(frame, dict) else ():
+            if isinstance(frame.get(key), str) and (name := _on_disk(frame[key])):
+                yield from (name + ending for ending in ENDINGS)
+
+
+def _on_disk(name: str) -> str:
+    """The name as the file system encodes it; empty for an impossible one."""
+    try:
+        return file_name(name.replace("\\", "/")) if "\0" not in name else ""
+    except UnicodeEncodeError:
+        return ""
+
+
+def read_json(path: Path) -> Any:
+    """What a JSON file holds.
+
+    Raises:
+        ClodError: it cannot be read, is damaged, or larger than MAX_BYTES.
+    """
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise ClodError(f"{path}: is larger than {MAX_BYTES >> 20} MB, so it is no list of cameras; check the path")
+        text = path.read_bytes()
+        refuse_long_numbers(path, text)
+        return json.loads(text)
+    except OSError as error:
+        raise ClodError(f"{path}: cannot be read ({error.strerror or error}); check the path") from error
+    except (ValueError, RecursionError) as error:
+        raise ClodError(f"{path}: is no JSON or damaged ({error}); export it again") from error

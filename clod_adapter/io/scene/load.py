@@ -1,9 +1,10 @@
-"""Reads posed photographs from a COLMAP model or a transforms file."""
+"""Reads posed photographs, or their cameras alone, from a COLMAP model or a transforms file."""
 
 from __future__ import annotations
 
+import threading
 import warnings
-from collections import Counter
+from collections import Counter, OrderedDict
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from copy import copy
@@ -13,23 +14,63 @@ from pathlib import Path
 import numpy as np
 import torch
 from PIL import Image
+from torch import Tensor
 
 from clod_adapter._kernels.memory import release
 from clod_adapter._support.workers import in_order
-from clod_adapter.cameras import Camera, Scene, View, in_its_unit, spread
+from clod_adapter.cameras import Camera, Scene, StoredView, View, in_its_unit, spread, with_near_planes
 from clod_adapter.errors import ClodError
-from clod_adapter.io.scene.colmap import read_colmap
-from clod_adapter.io.scene.dataparser import trained_frame
+from clod_adapter.io.scene.colmap import HUGE, TEST_EVERY, PosedImage, held_out, read_colmap
 from clod_adapter.io.scene.folder import find_cameras, find_photographs
-from clod_adapter.io.scene.image_cache import ImageCache
 from clod_adapter.io.scene.images import LARGE, Note, Photograph, Room, image_size, read_image
-from clod_adapter.io.scene.posed import HUGE, TEST_EVERY, PosedImage, held_out
-from clod_adapter.io.scene.transforms import read_transforms
+from clod_adapter.io.scene.transforms import read_transforms, trained_frame
+from clod_adapter.io.scene.undistort import cache_folder, kept, undistort
 from clod_adapter.origin import NOWHERE
 from clod_adapter.progress import Listener, Phase, tell
 
 MOST_AT_ONCE = 8  # photographs of full size in memory
 ROOM = Room(1 << 28)  # their pixels in memory, of 4 bytes each while they are decoded
+
+
+class ImageCache:
+    """Pixels of photographs, least recently used dropped first, of at most ``limit`` bytes in total.
+
+    A single photograph larger than ``limit`` is not kept.
+
+    Attributes:
+        limit: bytes; held: bytes in memory now.
+        reads: how often a photograph was read again.
+    """
+
+    def __init__(self, limit: int) -> None:
+        self.limit, self.held, self.reads = limit, 0, 0
+        self._images: OrderedDict[int, Tensor] = OrderedDict()
+        self._lock, self._count = threading.Lock(), 0
+
+    def store(self, view: View, read: Callable[[], Tensor]) -> View:
+        """The view without its pixels, which are kept while there is room and else come from ``read``."""
+        with self._lock:
+            key, self._count = self._count, self._count + 1
+        self._keep(key, view.image)
+        return StoredView(view.camera, lambda: self._look(key, read))
+
+    def _look(self, key: int, read: Callable[[], Tensor]) -> Tensor:
+        with self._lock:
+            if (image := self._images.get(key)) is not None:
+                self._images.move_to_end(key)
+                return image
+            self.reads += 1
+        image = read()
+        self._keep(key, image)
+        return image
+
+    def _keep(self, key: int, image: Tensor) -> None:
+        with self._lock:
+            if key not in self._images and image.nbytes <= self.limit:
+                self._images[key] = image
+                self.held += image.nbytes
+            while self.held > self.limit:
+                self.held -= self._images.popitem(last=False)[1].nbytes
 
 
 @torch.inference_mode(False)  # training takes no inference tensors
@@ -99,6 +140,44 @@ def load_scene(
     return in_its_unit(Scene(train, test, (*notes, *_summary(done, len(views))), spared))
 
 
+def load_cameras(
+    folder: str | Path, origin: Sequence[float] = NOWHERE, *, training: bool = False
+) -> tuple[list[Camera], list[str]]:
+    """The cameras that ``scene.load_scene`` would give photographs to, sorted by name, and notes.
+
+    A distorted one is the pinhole of the same focal length and centre, not that of its undistorted photograph. Of a
+    transforms.json without sizes, cameras whose photograph is missing too are left out.
+
+    Args:
+        folder: the scene's, usually the one with ``sparse/0/`` or ``transforms.json``.
+        origin: ``[3]`` what the world is to be relative to, in its units: ``Checkpoint.origin``.
+        training: excludes those that ``load_scene`` holds out.
+
+    Raises:
+        ClodError: there are no cameras, or none is usable.
+    """
+    folder = Path(folder)
+    source = find_cameras(folder)
+    images, notes = (read_transforms if source.is_file() else read_colmap)(source)
+    if frame := trained_frame(folder, source):
+        images, notes = frame.bring(images, source), [*notes, frame.note]
+    testing = held_out(images, TEST_EVERY) if training else set()
+    cameras = []
+    for image in images:
+        pinhole = image.camera
+        if min(pinhole.width, pinhole.height) > 1:
+            viewmat = torch.from_numpy(image.relative_to(origin).viewmat).float()
+            K = torch.from_numpy(pinhole.calibration_matrix()).float()
+            cameras.append(Camera(viewmat, K, pinhole.width, pinhole.height, image.name))
+    if unsized := len(images) - len(cameras):
+        notes.append(f"{unsized} of {len(images)} cameras left out: neither {source.name} nor a photograph has a size")
+    if not cameras:
+        raise ClodError(
+            f"{source}: has no size of a photograph, and no photograph is there; put them beside it, or w and h into it"
+        )
+    return [camera for camera in with_near_planes(cameras) if camera.name not in testing], notes
+
+
 def _load(
     present: Sequence[tuple[PosedImage, Path]],
     folder: Path,
@@ -109,8 +188,6 @@ def _load(
     """The views of the images, their sizes in the files, and notes. Each worker holds one of full size at a time."""
     cache = None
     if not all(image.is_pinhole for image, _ in present):
-        from clod_adapter.io.scene.undistort import cache_folder
-
         cache = cache_folder(folder)
     views, sizes, notes = list[View](), list[tuple[int, int]](), list[Note]()
     workers = min(MOST_AT_ONCE, max(2, torch.get_num_threads()))
@@ -162,8 +239,6 @@ def _load_view(
     if cache is None or image.is_pinhole:
         pixels, K, source, notes = _photograph(image, path, max_width)
     else:
-        from clod_adapter.io.scene.undistort import kept
-
         pixels, K, source, notes = kept(cache, image, path, max_width, lambda: _photograph(image, path, max_width))
         lens = f"from {image.camera.model_name} into {cache}"
         notes = [*notes, ("undistorted {}, which may be deleted; the sources are untouched", lens)]
@@ -191,8 +266,6 @@ def _worked_on(image: PosedImage, path: Path, max_width: int) -> Photograph:
         # With pixel centres at +0.5, in COLMAP as here, the principal point scales like the focal length.
         camera.rescale(*pixels.size)
     if not image.is_pinhole:
-        from clod_adapter.io.scene.undistort import undistort
-
         pixels, camera = undistort(path, pixels, camera)
     width, height = pixels.size
     if width > max_width:

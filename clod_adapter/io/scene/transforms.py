@@ -2,26 +2,23 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections import ChainMap
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from os.path import isfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pycolmap
 
 from clod_adapter._support.text import file_name
 from clod_adapter.errors import ClodError
-from clod_adapter.io.scene.colmap_library import pycolmap
-from clod_adapter.io.scene.folder import name_parts
+from clod_adapter.io.scene.colmap import HUGE, PosedImage, check_posed
+from clod_adapter.io.scene.folder import DATAPARSER, ENDINGS, name_parts, read_json
 from clod_adapter.io.scene.images import image_size
-from clod_adapter.io.scene.posed import PosedImage, check_posed
-from clod_adapter.io.sniff import refuse_long_numbers
 
-DATAPARSER = "dataparser_transforms.json"  # nerfstudio's: the frame it trained in
-MAX_BYTES = 256 * 2**20  # a hundred thousand frames have a tenth of that
 FISHEYE = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 PERSPECTIVE = ("", "SIMPLE_PINHOLE", "PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 
@@ -76,28 +73,10 @@ def _frames(path: Path, held_out: bool | None) -> tuple[list[PosedImage], list[s
     return images, notes
 
 
-def read_json(path: Path) -> Any:
-    """What a JSON file holds.
-
-    Raises:
-        ClodError: it cannot be read, is damaged, or larger than MAX_BYTES.
-    """
-    try:
-        if path.stat().st_size > MAX_BYTES:
-            raise ClodError(f"{path}: is larger than {MAX_BYTES >> 20} MB, so it is no list of cameras; check the path")
-        text = path.read_bytes()
-        refuse_long_numbers(path, text)
-        return json.loads(text)
-    except OSError as error:
-        raise ClodError(f"{path}: cannot be read ({error.strerror or error}); check the path") from error
-    except (ValueError, RecursionError) as error:
-        raise ClodError(f"{path}: is no JSON or damaged ({error}); export it again") from error
-
-
 def _name(path: Path, file_path: str) -> str:
     name = "/".join(name_parts(file_path, path))
-    endings = ("", ".png", ".jpg", ".jpeg")  # isfile, as it is False for what can be no path
-    return next((name + ending for ending in endings if isfile(path.parent / file_name(name + ending))), name)
+    # isfile, as it is False for what can be no path
+    return next((name + ending for ending in ENDINGS if isfile(path.parent / file_name(name + ending))), name)
 
 
 def read_pose(where: object, values: Mapping[str, Any], key: str) -> np.ndarray:
@@ -162,3 +141,86 @@ def _camera(where: str, photograph: Path, values: Mapping[str, Any]) -> pycolmap
 def _focal(pixels: int, angle: float) -> float:
     """The focal length with which this many pixels see this angle; 0 where it is no angle."""
     return pixels / (2 * math.tan(angle / 2)) if 0 < angle < math.pi else 0.0
+
+
+@dataclass(frozen=True)
+class TrainedFrame:
+    """The frame that nerfstudio trained in: ``dataparser_transforms.json``, which ns-train writes.
+
+    nerfstudio rotates, moves and scales its cameras, trains in that frame and exports its splats in it. With
+    ``transform`` the file's 3x4 matrix ``[R | t]`` and ``scale`` its number, a point ``x`` of the world that the data
+    came in (COLMAP's, where ``ns-process-data`` or the colmap dataparser turned it first) is in that frame
+
+        x_trained = scale (R x + t)
+
+    and a camera ``[R_c | t_c]`` becomes ``[R_c R^T | scale (t_c - R_c R^T t)]``. Cameras are brought into the splat's
+    frame, not the splat into theirs, which is exact for the harmonics too.
+
+    Source: nerfstudio 1.1, ``base_dataparser.save_dataparser_transform`` and ``nerfstudio_dataparser``, which
+    multiplies ``transform`` by the ``applied_transform`` of a transforms.json, and ``scale`` by its ``applied_scale``.
+
+    Attributes:
+        rotation: ``[3, 3]`` float64, proper.
+        offset: ``[3]`` world units before scaling.
+        scale: positive.
+        note: for the scene's notes.
+    """
+
+    rotation: np.ndarray
+    offset: np.ndarray
+    scale: float
+    note: str
+
+    def bring(self, images: Sequence[PosedImage], source: Path) -> list[PosedImage]:
+        """The images with their cameras in that frame.
+
+        Raises:
+            ClodError: a pose is not usable there.
+        """
+        brought = []
+        for image in images:
+            viewmat = np.eye(4)
+            viewmat[:3, :3] = image.viewmat[:3, :3] @ self.rotation.T
+            viewmat[:3, 3] = self.scale * (image.viewmat[:3, 3] - viewmat[:3, :3] @ self.offset)
+            brought.append(check_posed(replace(image, viewmat=viewmat), source))
+        return brought
+
+
+def trained_frame(folder: Path, cameras: Path) -> TrainedFrame | None:
+    """The frame that ``folder/dataparser_transforms.json`` gives the cameras of a scene; None where there is none.
+
+    Args:
+        cameras: what ``find_cameras`` found: a model's folder, or a transforms file, whose ``applied_transform`` and
+            ``applied_scale`` are taken out again, as its poses have them already.
+
+    Raises:
+        ClodError: the file is damaged, or holds no rotation, translation and scale.
+    """
+    path = folder / DATAPARSER
+    if not path.is_file():
+        return None
+    values = _object(path)
+    pose, scale = read_pose(path, values, "transform"), _number(path, values.get("scale", 1.0), "scale")
+    if cameras.is_file():
+        applied = _object(cameras)
+        if applied.get("applied_transform") is not None:
+            pose = pose @ np.linalg.inv(read_pose(cameras, applied, "applied_transform"))
+        if applied.get("applied_scale") is not None:
+            scale /= _number(cameras, applied["applied_scale"], "applied_scale")
+    left, _, right = np.linalg.svd(pose[:3, :3])
+    note = f"the cameras are brought into the frame of {DATAPARSER}: the splat must be what nerfstudio exported"
+    return TrainedFrame(left @ right, pose[:3, 3], scale, note)
+
+
+def _object(path: Path) -> dict[str, Any]:
+    content = read_json(path)
+    if not isinstance(content, dict):
+        raise ClodError(f"{path}: is no JSON object; copy it again from beside the config.yml of ns-train")
+    return content
+
+
+def _number(path: Path, value: Any, key: str) -> float:
+    usable = isinstance(value, int | float) and not isinstance(value, bool) and 1 / HUGE < value < HUGE
+    if not usable:
+        raise ClodError(f"{path}: {key} is {value!r:.40}, it must be a positive number; copy or export it again")
+    return float(value)

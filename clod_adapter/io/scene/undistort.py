@@ -5,20 +5,20 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import sys
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 import PIL
+import pycolmap
 from PIL import Image, PngImagePlugin
 
 from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import atomic_path
-from clod_adapter.io.scene.colmap_library import pycolmap
-from clod_adapter.io.scene.folder import user_caches
+from clod_adapter.io.scene.colmap import PosedImage
 from clod_adapter.io.scene.images import Photograph
-from clod_adapter.io.scene.posed import PosedImage
 
 _KEY = "clod-adapter"  # of the text in a cached PNG
 
@@ -41,6 +41,23 @@ def undistort(path: Path, pixels: Image.Image, camera: pycolmap.Camera) -> tuple
         reason = str(error).splitlines()[0]
         raise ClodError(f"{path}: COLMAP cannot undistort it ({reason}); check its camera's parameters") from error
     return Image.fromarray(bitmap.to_array()), pinhole
+
+
+def user_caches() -> Path:
+    """``$XDG_CACHE_HOME``, or where the platform has its users' caches; it need not be there.
+
+    Raises:
+        ClodError: there is neither that nor a home folder.
+    """
+    if chosen := os.environ.get("XDG_CACHE_HOME"):
+        return Path(chosen)
+    try:
+        home = Path.home()
+    except RuntimeError as error:
+        raise ClodError("no home folder to keep undistorted photographs in; set XDG_CACHE_HOME to a folder") from error
+    if sys.platform == "win32":
+        return Path(os.environ.get("LOCALAPPDATA", home / "AppData" / "Local"))
+    return home / "Library" / "Caches" if sys.platform == "darwin" else home / ".cache"
 
 
 def cache_folder(scene: Path) -> Path:

@@ -1,0 +1,550 @@
+"""Scenes as ``load_scene`` gives them: COLMAP models, photographs that are missing or distorted, what is held out."""
+
+from __future__ import annotations
+
+import json
+import os
+import pickle
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+import scenes
+from clod_adapter._support.text import file_name
+from clod_adapter.cameras import Camera, Scene, StoredView, View, camera_extent
+from clod_adapter.errors import ClodError
+from clod_adapter.io.scene.colmap import load_points, read_colmap, write_model
+from clod_adapter.io.scene.folder import name_parts, scene_files
+from clod_adapter.io.scene.load import ImageCache, load_cameras, load_scene
+from clod_adapter.progress import Stopped
+from photographs import (
+    LENSES,
+    SIZE,
+    as_text,
+    camera,
+    damage,
+    model_of,
+    pixels,
+    pose,
+    psnr_of,
+    seen,
+    write_images,
+    write_scene,
+)
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+def model(folder: Path, form: str, names: tuple[str, ...] = ("a.png", "sub/b.png")) -> Path:
+    """Images of one camera, and points that they see."""
+    reconstruction = pycolmap.Reconstruction()
+    lens = pycolmap.Camera(model="PINHOLE", params=[9, 9, 4, 3], camera_id=1, width=8, height=6)
+    reconstruction.add_camera_with_trivial_rig(lens)
+    for number, name in enumerate(names, start=1):
+        keypoints = [pycolmap.Point2D(np.array([k, number], float)) for k in range(2)]
+        image = pycolmap.Image(name=name, camera_id=1, image_id=number, points2D=keypoints)
+        reconstruction.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
+    for k in range(2):
+        track = pycolmap.Track([pycolmap.TrackElement(number, k) for number in range(1, len(names) + 1)])
+        reconstruction.add_point3D(np.array([k, 1, 5], float), track, np.zeros(3, np.uint8))
+    target = folder / "sparse" / "0"
+    target.mkdir(parents=True, exist_ok=True)
+    getattr(reconstruction, f"write_{form}")(str(target))
+    return target
+
+
+@pytest.mark.parametrize("form", ["binary", "text", "before rigs"])
+def test_scene_round_trips(tmp_path: Path, form: str) -> None:
+    cameras, names = write_scene(tmp_path)
+    if form == "text":
+        as_text(tmp_path)
+    if form == "before rigs":
+        for name in ("rigs.bin", "frames.bin"):
+            (tmp_path / "sparse" / "0" / name).unlink()
+    progress: list[tuple[int, int]] = []
+    loaded = load_scene(str(tmp_path), progress=lambda now: progress.append((now.done, now.total)))
+    assert loaded.notes == () and progress == [(k + 1, 10) for k in range(10)]
+    assert dict(loaded.left_out) == {
+        "undistortion": "all 10 cameras are pinholes", "scaling": "all 10 photographs are used at full resolution",
+    }  # fmt: skip
+    order = sorted(range(10), key=lambda i: names[i])
+    assert [view.camera.name for view in loaded.test] == [names[order[0]], names[order[8]]]
+    assert [view.camera.name for view in loaded.train] == [names[i] for i in order if i not in (order[0], order[8])]
+    for view in (*loaded.train, *loaded.test):
+        i = names.index(view.camera.name)
+        torch.testing.assert_close(view.camera.viewmat, cameras[i].viewmat, atol=1e-6, rtol=0)
+        torch.testing.assert_close(view.camera.K, cameras[i].K, atol=0, rtol=0)
+        assert view.camera.viewmat.dtype == view.camera.K.dtype == torch.float32
+        np.testing.assert_array_equal(view.image, pixels(i))
+
+
+def test_train_and_test_split(tmp_path: Path) -> None:
+    for count in (10, 1, 2):
+        (tmp_path / str(count)).mkdir()
+        names = write_scene(tmp_path / str(count), count)[1]
+    for count, every, train in ((10, 3, 6), (10, 8, 8), (1, 8, 1)):
+        loaded = load_scene(tmp_path / str(count), test_every=every)
+        assert (len(loaded.train), len(loaded.test)) == (train, count - train)
+    (tmp_path / "2" / "images" / max(names)).unlink()
+    for folder, every, message in (("1", 1, "test_every is 1"), ("2", 8, "no photograph to train on")):
+        with pytest.raises(ClodError, match=message):
+            load_scene(tmp_path / folder, test_every=every)
+    with pytest.raises(Stopped):
+        load_scene(tmp_path / "10", progress=lambda now: False)
+
+
+def test_model_and_images_are_found_in_other_folders(tmp_path: Path) -> None:
+    write_scene(tmp_path, 2)
+    folder = tmp_path / "sparse" / "0"
+    assert len(load_scene(folder).train) == 1  # images beside the model's parent
+    for file in folder.iterdir():
+        file.rename(tmp_path / "sparse" / file.name)
+    folder.rmdir()
+    assert len(load_scene(tmp_path).train) == 1
+    assert len(load_scene(tmp_path / "images").train) == 1  # the images' own folder
+    (tmp_path / "images" / "sub").rename(tmp_path / "sub")  # images beside sparse/
+    assert len(load_scene(tmp_path).train) == 1
+    with pytest.raises(ClodError, match="no COLMAP model"):
+        load_scene(tmp_path / "images" / "deeper")
+
+
+def test_written_model_is_read_by_pycolmap(tmp_path: Path) -> None:
+    xyz, rgb = np.arange(12.0).reshape(4, 3), np.arange(12, dtype=np.uint8).reshape(4, 3)
+    cameras, names = [camera(0), camera(1), camera(2, focal=50.0)], ["a b.png", "c.png", "ü.png"]
+    write_model(tmp_path, cameras, names, xyz, rgb)
+    found = pycolmap.Reconstruction(str(tmp_path / "sparse" / "0"))
+    assert len(found.cameras) == 2 and {c.model_name for c in found.cameras.values()} == {"PINHOLE"}
+    images = sorted(found.images.values(), key=lambda image: image.name)
+    assert [image.name for image in images] == names
+    for image, wanted in zip(images, cameras, strict=True):
+        np.testing.assert_allclose(image.cam_from_world().matrix(), wanted.viewmat[:3], atol=1e-6)
+    points = [found.points3D[i] for i in sorted(found.points3D)]
+    np.testing.assert_array_equal([point.xyz for point in points], xyz)
+    np.testing.assert_array_equal([point.color for point in points], rgb)
+    assert sorted(load_points(tmp_path).tolist()) == xyz.tolist()
+    for folder, names, message in (
+        (tmp_path, ["a.png"], "not empty"),
+        (tmp_path, ["a.png", "a.png"], "as many different names"),
+        (tmp_path / "no", ["a.png"], "does not exist"),
+    ):
+        with pytest.raises(ClodError, match=message):
+            write_model(folder, cameras[: len(names)], names)
+    (tmp_path / "none").mkdir()
+    write_model(tmp_path / "none", [], [])
+    with pytest.raises(ClodError, match="no registered image"):
+        load_scene(tmp_path / "none")
+
+
+def test_poses_of_a_rig_are_composed(tmp_path: Path) -> None:
+    reconstruction = pycolmap.Reconstruction()
+    for i in (1, 2):
+        size = {"width": 40, "height": 30}
+        reconstruction.add_camera(pycolmap.Camera(model="PINHOLE", params=[33, 33, 20, 15], camera_id=i, **size))
+    rig = pycolmap.Rig(rig_id=1)
+    sensors = [pycolmap.sensor_t(type=pycolmap.SensorType.CAMERA, id=i) for i in (1, 2)]
+    rig.add_ref_sensor(sensors[0])
+    rig.add_sensor(sensors[1], pycolmap.Rigid3d(pose(1)[:3].double().numpy()))
+    reconstruction.add_rig(rig)
+    frame = pycolmap.Frame(rig_id=1, frame_id=1)
+    for i in (0, 1):
+        frame.add_data_id(pycolmap.data_t(sensor_id=sensors[i], id=i + 1))
+    frame.rig_from_world = pycolmap.Rigid3d(pose(2)[:3].double().numpy())
+    reconstruction.add_frame(frame)
+    for i in (1, 2):
+        image = pycolmap.Image(name=f"{i}.png", camera_id=i, image_id=i)
+        image.frame_id = 1
+        reconstruction.add_image(image)
+        Image.fromarray(pixels(i)).save(tmp_path / f"{i}.png")
+    reconstruction.register_frame(1)
+    (tmp_path / "sparse").mkdir()
+    reconstruction.write_binary(str(tmp_path / "sparse"))
+    loaded = load_scene(tmp_path)
+    torch.testing.assert_close(loaded.test[0].camera.viewmat, pose(2), atol=1e-5, rtol=0)
+    torch.testing.assert_close(loaded.train[0].camera.viewmat, pose(1) @ pose(2), atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("file", ["cameras", "images", "points3D", "rigs", "frames"])
+def test_records_beyond_the_file_are_refused(tmp_path: Path, file: str) -> None:
+    """Handed to COLMAP as it is, a cut points3D.bin makes it allocate until memory runs out."""
+    path = model(tmp_path, "binary") / f"{file}.bin"
+    data = path.read_bytes()
+    counts = [count.to_bytes(8, "little") + data[8:] for count in (1 << 31, (1 << 64) - 1)]
+    for content in (*counts, b"", data[: len(data) // 2], data[:-1]):
+        path.write_bytes(content)
+        with pytest.raises(ClodError, match=f"{file}.bin: is truncated or damaged"):
+            load_scene(tmp_path)
+
+
+@settings(deadline=None, max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.data(), st.sampled_from(["binary", "text"]))
+def test_damage_raises_only_clod_error(tmp_path: Path, data: st.DataObject, form: str) -> None:
+    damaged = tmp_path / "damaged"
+    shutil.rmtree(damaged, ignore_errors=True)
+    shutil.copytree(model(tmp_path / form, form), damaged)
+    damage(data, sorted(damaged.iterdir()))
+    try:
+        read_colmap(damaged)
+    except ClodError as error:
+        assert str(damaged) in str(error)
+
+
+def write(path: Path, content: bytes) -> None:
+    path.write_bytes(content)
+
+
+@pytest.mark.parametrize(
+    ("form", "change", "message"),
+    [
+        ("text", lambda at: write(at / "images.txt", b"1 nonsense\n\n"), "COLMAP cannot read this model"),
+        ("text", lambda at: write(at / "cameras.txt", b"1 PINHOLE 40 30 %b 33 20 15\n" % (b"1" * 10_000)),
+         "cameras.txt: .*a number of more than 1,000 digits"),
+        ("text", lambda at: write(at / "images.txt", (at / "images.txt").read_bytes().replace(b"sub/b.png", b"a.png")),
+         "has image a.png more than once"),
+        ("text", lambda at: os.mkfifo(at / "rigs.bin"), "rigs.bin: .*not a regular file"),
+        # COLMAP reads a quaternion of zeros as no rotation
+        ("binary", lambda at: [write(at / name, (data := (at / name).read_bytes())[:k] + bytes(32) + data[k + 32 :])
+                               for name, k in (("images.bin", 12), ("frames.bin", 16))],
+         "image 'a.png' has a camera or pose that is not usable"),
+    ],
+)  # fmt: skip
+def test_unusable_models_are_refused(tmp_path: Path, form: str, change: Callable[[Path], Any], message: str) -> None:
+    change(model(tmp_path, form))
+    with pytest.raises(ClodError, match=message):
+        load_scene(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("a" * 300 + ".png", "is no file's name"), ("a/" * 2500 + "b.png", "is no file's name"),
+        ("\u00e9" * 130, "is no file's name"), ("a\x00b.png", "is no file's name"), ("a\nb.png", "is no file's name"),
+        ("\x1b[2J.png", "is no file's name"), ("a\x9b2J.png", "is no file's name"), ("\ud800.png", "is not UTF-8"),
+        ("", "leaves the images folder"), ("../a.png", "leaves the images folder"),
+        ("sub/../../a.png", "leaves the images folder"), ("/etc/a.png", "leaves the images folder"),
+        ("..\\a.png", "leaves the images folder"), ("C:\\a.png", "leaves the images folder"),
+    ],
+)  # fmt: skip
+def test_invalid_image_names_are_refused(name: str, message: str) -> None:
+    with pytest.raises(ClodError, match=f"transforms.json: image name .*{message}") as caught:
+        name_parts(name, Path("transforms.json"))
+    assert str(caught.value).isprintable()
+
+
+@pytest.mark.skipif(sys.getfilesystemencoding() != "utf-8", reason="files have ASCII names here")
+def test_unusual_names_and_linked_folders_are_read(tmp_path: Path) -> None:
+    names = ("$HOME.png", "a.b/c d.png", "sub\\of windows.png", "~/a.png", "äö ü/日本 (1).png")
+    model(tmp_path / "scene", "binary", names)
+    write_images(tmp_path / "elsewhere", [name.replace("\\", "/") for name in names], width=8, height=6)
+    (tmp_path / "scene" / "images").symlink_to(tmp_path / "elsewhere", target_is_directory=True)
+    scene = load_scene(tmp_path / "scene")
+    assert [view.camera.name for view in (*scene.test, *scene.train)] == list(names)
+
+
+@pytest.mark.parametrize(
+    ("name", "train", "test", "size"), [("ci_banana", 12, 2, (332, 221)), ("plush_half", 84, 13, (494, 370))]
+)
+def test_real_scenes_load(
+    shared_data: Callable[[str], Path], name: str, train: int, test: int, size: tuple[int, int]
+) -> None:
+    loaded = load_scene(shared_data(name))
+    assert (len(loaded.train), len(loaded.test), loaded.notes) == (train, test, ())
+    first = loaded.test[0].camera
+    assert (first.width, first.height) == size and first.name < loaded.train[0].camera.name
+    assert first.K[0, 2] == size[0] / 2
+    torch.testing.assert_close(first.viewmat[:3, :3] @ first.viewmat[:3, :3].T, torch.eye(3), atol=1e-5, rtol=0)
+
+
+def test_without_pycolmap_the_error_says_where_it_is() -> None:
+    code = "import sys; sys.modules['pycolmap'] = None\nimport clod_adapter as clod\nclod.load_scene('.')"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert "ClodError" in done.stderr and "conda install -c conda-forge pycolmap" in done.stderr.splitlines()[-1]
+
+
+def test_missing_images_are_noted_or_refused(tmp_path: Path) -> None:
+    """The held-out images stay the same; more than half missing is an error."""
+    names = sorted(write_scene(tmp_path, 18)[1])
+    for name in names[2:11]:
+        (tmp_path / "images" / name).unlink()
+    loaded = load_scene(tmp_path)
+    missing = "9 of 18 photographs are missing and left out (sub/003.png, sub/004.png, sub/005.png, ...)"
+    assert loaded.notes == (missing,)
+    assert [view.camera.name for view in loaded.test] == [names[0], names[16]]  # the 8th is missing, the rest stay
+    assert [view.camera.name for view in loaded.train] == [names[1], *names[11:16], names[17]]
+    (tmp_path / "images" / names[0]).unlink()
+    text = r"10 of 18 images of the model are missing \(sub/001.png, sub/003.png, sub/004.png, \.\.\.\), more than half"
+    with pytest.raises(ClodError, match=text):
+        load_scene(tmp_path)
+
+
+def test_smaller_copies_replace_missing_images(tmp_path: Path) -> None:
+    write_scene(tmp_path, 3)
+    (tmp_path / "images").rename(tmp_path / "images_2")
+    (tmp_path / "input" / "sub").mkdir(parents=True)
+    for file in (tmp_path / "images_2" / "sub").iterdir():
+        with Image.open(file) as image:
+            image.resize((20, 15)).save(file)
+            image.save(tmp_path / "input" / "sub" / file.name)
+    loaded = load_scene(tmp_path)
+    assert loaded.notes == (
+        "the photographs are those in images_2, as there are more than in images",
+        "3 of 3 images are 20x15 where the model has 40x30: intrinsics scaled",
+    )
+    torch.testing.assert_close(loaded.test[0].camera.K[:2] * 2, camera(2, focal=30.0).K[:2])
+    for file in (tmp_path / "images_2" / "sub").iterdir():
+        file.unlink()
+    with pytest.raises(ClodError, match="images: 3 of 3 images of the model"):  # the raw ones are of other cameras
+        load_scene(tmp_path)
+
+
+def test_wide_images_are_scaled_with_their_intrinsics(tmp_path: Path) -> None:
+    write_scene(tmp_path, 3)
+    loaded = load_scene(tmp_path, max_width=15)
+    assert loaded.notes == ("3 of 3 images scaled from 40x30 to 15x11 (Pillow bicubic, as in Inria's code)",)
+    view = loaded.train[0]
+    assert tuple(view.image.shape) == (11, 15, 3) and view.camera.name == "sub/002.png"
+    scale = torch.tensor([[15 / 40], [11 / 30], [1.0]])
+    torch.testing.assert_close(view.camera.K, camera(1, focal=31.0).K * scale)  # names count down
+    expected = Image.fromarray(pixels(1)).resize((15, 11), Image.Resampling.BICUBIC)
+    np.testing.assert_array_equal(view.image, np.asarray(expected))
+    assert load_scene(tmp_path, max_width=40).notes == ()
+
+
+def capture_of(folder: Path, kind: str, params: list[float]) -> Path:
+    """A scene of one photograph, of ``seen``, by this lens."""
+    model_of(folder, kind, params, **SIZE)
+    (folder / "images").mkdir()
+    Image.fromarray(seen(pycolmap.Camera(model=kind, params=params, **SIZE))).save(folder / "images" / "a.png")
+    return folder
+
+
+def ideal(view: View, across: float = 0.0, down: float = 0.0) -> np.ndarray:
+    """What the pinhole camera of the view would have seen, or one whose axis is these pixels beside."""
+    K = view.camera.K.double().numpy()
+    params = [K[0, 0], K[1, 1], K[0, 2] + across, K[1, 2] + down]
+    size = {"width": view.camera.width, "height": view.camera.height}
+    return seen(pycolmap.Camera(model="PINHOLE", params=params, **size))
+
+
+@pytest.mark.parametrize("kind", LENSES)
+def test_undistorted_image_is_that_of_the_pinhole_camera(tmp_path: Path, cache: Path, kind: str) -> None:
+    scene = capture_of(tmp_path / "scene", kind, LENSES[kind])
+    sources = {path: path.read_bytes() for path in scene.rglob("*") if path.is_file()}
+    loaded = load_scene(scene)
+    view = loaded.train[0]
+    right = psnr_of(view.image.numpy(), ideal(view))
+    shifted = [psnr_of(view.image.numpy(), ideal(view, *by)) for by in ((0.1, 0), (-0.1, 0), (0, 0.1), (0, -0.1))]
+    assert right > 45 and right > max(shifted), (right, shifted)
+    assert "undistortion" not in dict(loaded.left_out)
+    folder = next((cache / "clod-adapter" / "undistorted").iterdir())
+    into = f"from {kind} into {folder}, which may be deleted; the sources are untouched"
+    assert loaded.notes == (f"1 of 1 images undistorted {into}",)
+    assert {path: path.read_bytes() for path in scene.rglob("*") if path.is_file()} == sources
+
+
+@pytest.mark.parametrize(
+    ("kind", "params", "fy"), [("OPENCV", [140, 142, 82, 58, 0, 0, 0, 0], 142), ("SIMPLE_PINHOLE", [140, 82, 58], 140)]
+)
+def test_lens_without_distortion_is_a_pinhole(
+    tmp_path: Path, cache: Path, kind: str, params: list[float], fy: float
+) -> None:
+    scene = capture_of(tmp_path / "scene", kind, params)
+    loaded = load_scene(scene)
+    with Image.open(scene / "images" / "a.png") as image:
+        np.testing.assert_array_equal(loaded.train[0].image, np.asarray(image))
+    assert loaded.train[0].camera.K.tolist() == [[140, 0, 82], [0, fy, 58], [0, 0, 1]]
+    assert loaded.notes == () and not cache.exists()
+
+
+def same(one: Scene, other: Scene) -> bool:
+    a, b = one.train[0], other.train[0]
+    return a.image.equal(b.image) and a.camera.K.equal(b.camera.K) and one.notes == other.notes
+
+
+def test_cached_images_are_reused(tmp_path: Path, cache: Path) -> None:
+    """While the photograph, its camera and the width are the same; a damaged one is made again."""
+    scene = capture_of(tmp_path / "scene", "OPENCV", LENSES["OPENCV"])
+    first = load_scene(scene, max_width=100)
+    (file,) = cache.rglob("*.png")
+    with Image.open(file) as kept:
+        about, changed = kept.info["clod-adapter"], Image.new("RGB", kept.size, (1, 2, 3))
+    from PIL.PngImagePlugin import PngInfo
+
+    info = PngInfo()
+    info.add_text("clod-adapter", about)
+    changed.save(file, pnginfo=info)
+    assert load_scene(scene, max_width=100).train[0].image.unique().tolist() == [1, 2, 3]  # the cached one is read
+    file.write_bytes(file.read_bytes()[:-50])
+    assert same(load_scene(scene, max_width=100), first) and len(list(cache.rglob("*.png"))) == 1
+    load_scene(scene, max_width=90)
+    os.utime(scene / "images" / "a.png", ns=(1, 1))
+    load_scene(scene, max_width=100)
+    assert len(list(cache.rglob("*.png"))) == 3
+    model_of(tmp_path / "other", "OPENCV", [*LENSES["OPENCV"][:4], 0.01, 0, 0, 0], **SIZE)  # calibrated again
+    shutil.copytree(tmp_path / "other" / "sparse", scene / "sparse", dirs_exist_ok=True)
+    assert not same(load_scene(scene, max_width=100), first)
+
+
+def test_cache_folder_must_be_writable(tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = capture_of(tmp_path / "scene", "OPENCV", LENSES["OPENCV"])
+    cache.write_text("a file, so that no folder can be made")
+    with pytest.raises(ClodError, match="undistorted photographs cannot be kept there .*set XDG_CACHE_HOME"):
+        load_scene(scene)
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    load_scene(scene)
+    assert len(list((tmp_path / "home").rglob("clod-adapter/undistorted/scene-*/*.png"))) == 1
+
+
+@pytest.mark.parametrize(
+    ("kind", "params", "message"),
+    [
+        ("EQUIRECTANGULAR", [160, 120], "EQUIRECTANGULAR, no perspective camera"),
+        ("OPENCV", [140, 140, 80, 60, float("nan"), 0, 0, 0], "not usable"),
+        ("OPENCV", [140, 140, 80, 60, 1e300, 0, 0, 0], "not usable"),
+        ("SIMPLE_RADIAL", [-140, 80, 60, 0.1], "not usable"),
+        ("PINHOLE", [140, 140, float("inf"), 60], "not usable"),
+        ("PINHOLE", [0, 140, 80, 60], "not usable"),
+        *(("OPENCV", [140, 140, 80, 60, k, 0, 0, 0], "") for k in (-5.0, 1e8, -1e8)),
+    ],
+)
+def test_bad_lenses_are_refused(tmp_path: Path, kind: str, params: list[float], message: str) -> None:
+    model_of(tmp_path, kind, params, **SIZE)
+    Image.new("RGB", (160, 120)).save(tmp_path / "a.png")
+    if message:
+        with pytest.raises(ClodError, match=f"image 'a.png' has .*{message}"):
+            load_scene(tmp_path)
+        return
+    assert load_scene(tmp_path).train[0].camera.width <= 320  # the lens folds
+
+
+@pytest.mark.parametrize("origin", [(0.0, 0.0, 0.0), (10.0, -20.0, 30.0)])
+def test_cameras_equal_those_of_load_scene(capture: Any, origin: tuple[float, float, float]) -> None:
+    scene = load_scene(capture.scene, origin=origin)
+    views = sorted([*scene.train, *scene.test], key=lambda view: view.camera.name)
+    cameras, notes = load_cameras(capture.scene, origin)
+    assert notes == [] and [camera.name for camera in cameras] == [view.camera.name for view in views]
+    for found, view in zip(cameras, views, strict=True):
+        assert torch.equal(found.viewmat, view.camera.viewmat) and torch.equal(found.K, view.camera.K)
+        assert (found.width, found.height, found.near) == (view.camera.width, view.camera.height, view.camera.near)
+    training = [found.name for found in load_cameras(capture.scene, training=True)[0]]
+    assert training == [view.camera.name for view in scene.train] and len(training) == 8
+
+
+def test_near_plane_follows_the_unit_of_length(tmp_path: Path) -> None:
+    unit = torch.tensor([[1e-3], [1e-3], [1e-3], [1.0]])
+    cameras = [
+        replace(c, viewmat=torch.cat([c.viewmat[:, :3], c.viewmat[:, 3:] * unit], 1)) for c in scenes.ring(4, 20, 10)
+    ]
+    write_model(tmp_path, cameras, [each.name for each in cameras])  # and no photographs, which cameras do not need
+    assert {each.near for each in load_cameras(tmp_path)[0]} == {0.01 * camera_extent(cameras)}
+
+
+def there(folder: Path) -> set[str]:
+    return {str(path.relative_to(folder)) for path in scene_files(folder) if path.is_file()}
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_files_of_a_colmap_scene(tmp_path: Path, text: bool) -> None:
+    """All that no output may overwrite, and nothing else."""
+    write_scene(tmp_path, 3)
+    if text:
+        as_text(tmp_path)
+    (tmp_path / "images" / "another.png").write_bytes(b"not of the scene")
+    (tmp_path / "images_2" / "sub").mkdir(parents=True)
+    (tmp_path / "images_2" / "sub" / "001.png").write_bytes(b"a smaller one")
+    (tmp_path / "dataparser_transforms.json").write_text("{}")
+    files = {str(path.relative_to(tmp_path)) for path in (tmp_path / "sparse" / "0").iterdir()}
+    photographs = {f"images/sub/{k:03}.png" for k in (1, 2, 3)} | {"images_2/sub/001.png"}
+    assert len(files) >= 3 and there(tmp_path) == files | photographs | {"dataparser_transforms.json"}
+    images = tmp_path / "sparse" / "0" / ("images.txt" if text else "images.bin")
+    images.write_bytes(images.read_bytes()[:-9])  # a damaged one is still the scene's
+    assert os.path.relpath(images, tmp_path) in there(tmp_path)
+
+
+def test_files_of_transforms_scenes(tmp_path: Path) -> None:
+    train = {"frames": [{"file_path": "./train/r_0", "mask_path": "masks/0.png"}, {"file_path": "train\\ü.jpg"}, 7]}
+    test = {"frames": [{"file_path": "test/r_0.png", "depth_file_path": "depth/0.tif"}, {"file_path": "a\0\ud800"}]}
+    (tmp_path / "transforms_train.json").write_text(json.dumps(train))
+    (tmp_path / "transforms_test.json").write_text(json.dumps(test))
+    (tmp_path / "transforms.json").write_text("no JSON")
+    names = ["train/r_0.png", "train/ü.jpg", "masks/0.png", "test/r_0.png", "depth/0.tif"]
+    names = [file_name(name) for name in names]
+    for name in [*names, "train/r_1.png"]:
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(b"")
+    assert there(tmp_path) == {*names, "transforms.json", "transforms_train.json", "transforms_test.json"}
+
+
+ONE = 64 * 48 * 3
+
+
+def numbered(count: int, cache: ImageCache) -> tuple[list[View], list[int]]:
+    """Views whose pixels are their number, and how often each was read."""
+    reads = [0] * count
+
+    def read(k: int) -> torch.Tensor:
+        reads[k] += 1
+        return torch.full((48, 64, 3), k, dtype=torch.uint8)
+
+    def made(k: int) -> View:
+        view = View(Camera(torch.eye(4), torch.eye(3), 64, 48, f"{k}"), torch.full((48, 64, 3), k, dtype=torch.uint8))
+        return cache.store(view, lambda: read(k))
+
+    return [made(k) for k in range(count)], reads
+
+
+@pytest.mark.parametrize("room", [0, 1, 3, 10])
+def test_cache_stays_within_its_limit(room: int) -> None:
+    cache = ImageCache(room * ONE + ONE // 2)
+    views, _ = numbered(8, cache)
+    for k in [*range(8), 3, 3, 0, 7, 7, 2]:
+        assert int(views[k].image.unique()) == k
+        assert cache.held <= cache.limit and cache.held == min(room, 8) * ONE
+    with ThreadPoolExecutor(8) as pool:
+        looked = list(pool.map(lambda k: int(views[k % 5].image.unique()), range(400)))
+    assert looked == [k % 5 for k in range(400)] and cache.held <= cache.limit
+
+
+def test_most_recently_used_images_are_kept() -> None:
+    cache = ImageCache(2 * ONE)
+    views, reads = numbered(3, cache)  # 1 and 2 are kept
+    for k in (1, 2, 1, 2):
+        assert views[k].image is views[k].image
+    assert reads == [0, 0, 0] and cache.reads == 0
+    _ = views[0].image, views[2].image, views[1].image  # 0 takes the place of 1
+    assert reads == [1, 1, 0] and cache.reads == 2
+    again = pickle.loads(pickle.dumps(views[1]))
+    assert type(again) is View and again.camera.name == "1" and torch.equal(again.image, views[1].image)
+
+
+def test_cached_scene_equals_the_scene(capture: Any, tmp_path: Path) -> None:
+    shutil.copytree(capture.scene, tmp_path / "scene")
+    whole, cache = load_scene(capture.scene), ImageCache(2 * ONE)
+    stored = load_scene(tmp_path / "scene", cache=cache)
+    assert stored.notes == whole.notes
+    for one, other in zip((*whole.train, *whole.test), (*stored.train, *stored.test), strict=True):
+        assert isinstance(other, StoredView) and one.camera.name == other.camera.name
+        moved = other.at(replace(other.camera, near=0.5))
+        assert torch.equal(moved.image, one.image) and moved.camera.near == 0.5
+    assert cache.held <= 2 * ONE and cache.reads > 0
+    for path in (tmp_path / "scene" / "images").iterdir():
+        Image.new("RGB", (32, 24)).save(path)
+    with pytest.raises(ClodError, match=r"view '001.png': image must be uint8 of shape \(48, 64, 3\)"):
+        _ = stored.train[0].image
