@@ -10,12 +10,11 @@ from torch import Tensor
 from clod_adapter.adapter import detach
 from clod_adapter.calibration import Viewpoint
 from clod_adapter.cameras import Camera
-from clod_adapter.equation.attenuation import Attenuated
+from clod_adapter.equation.attenuation import Attenuated, dial
 from clod_adapter.equation.distances import typical_distance
 from clod_adapter.equation.extinction import extinction_scale
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import OPAQUE, Gaussians
-from clod_adapter.render import dial
 
 # Exponents of the dial value that opacities and scales are baked at for several cameras. Measured on held-out
 # photographs: FADED of 0, 0.5, 0.75 and 1, and with that FADED, GROWN of 0, 0.5, 0.75, 0.85, 0.9, 1 and 1.25. At equal

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from clod_adapter.cameras import Camera
 from clod_adapter.config import CLASSIC, ScreenFilter
-from clod_adapter.rasterizers import Rasterizer, reference
+from clod_adapter.rasterizers import Splat, reference
 
 IMAGE, GRADIENT, ON_A_CUT = 2e-5, 5e-4, 0.02
 BACKGROUND = torch.tensor([0.2, 0.5, 0.7])
@@ -41,7 +41,7 @@ def weights(camera: Camera, seed: int = 0) -> tuple[Tensor, Tensor]:
 
 
 def differentiate(
-    rasterize: Rasterizer, scene: Parameters, camera: Camera, v: tuple[Tensor, Tensor],
+    rasterize: Splat, scene: Parameters, camera: Camera, v: tuple[Tensor, Tensor],
     background: Tensor = BACKGROUND, screen_filter: ScreenFilter = CLASSIC,
 ) -> Result:  # fmt: skip
     """Forward and backward, in the scene's float type."""
@@ -77,7 +77,7 @@ def on_a_cut(scene: Parameters, camera: Camera, nudge: float, screen_filter: Scr
 
 
 def assert_agrees(
-    rasterize: Rasterizer, scene: Parameters, camera: Camera, *, image: float = IMAGE, gradient: float = GRADIENT,
+    rasterize: Splat, scene: Parameters, camera: Camera, *, image: float = IMAGE, gradient: float = GRADIENT,
     cut: float = ON_A_CUT, nudge: float = 1e-4, rows: Tensor | None = None, screen_filter: ScreenFilter = CLASSIC,
 ) -> None:  # fmt: skip
     """Asserts agreement; with ``rows``, of the scene with the reference's picture of those rows alone.

@@ -24,14 +24,14 @@ from clod_adapter.blocks.targets import target_image
 from clod_adapter.blocks.train import adapt_block, merge
 from clod_adapter.cameras import Camera, Scene
 from clod_adapter.config import AdaptConfig
+from clod_adapter.equation.attenuation import dial
 from clod_adapter.evaluation.baselines import matching_dial, mean_kept, rankings
 from clod_adapter.evaluation.budget import dial_for, frame_times
 from clod_adapter.evaluation.popping import dial_popping, path_popping
 from clod_adapter.initialization.importance import for_training, initialize, usable_views
 from clod_adapter.losses import photometric_loss
 from clod_adapter.metrics import psnr_ssim
-from clod_adapter.rasterizers import cpu, cuda
-from clod_adapter.render import dial
+from clod_adapter.rasterizers import BACKENDS, Rasterizer, cuda
 from clod_adapter.training.camera_placement import place_cameras
 from clod_adapter.training.loop import adapt
 from clod_adapter.training.optimizer import RowAdam
@@ -64,12 +64,11 @@ def setup(monkeypatch: pytest.MonkeyPatch) -> Iterator[Setup]:
     pytest.importorskip("gsplat", reason="pip install gsplat==1.5.3")
     base, scene = capture(50, 4, 20, 14)
     own = initialize(base, scene.train, CONFIG)
-    module = importlib.import_module("clod_adapter.render")
     if torch.cuda.is_available():
         yield Setup(torch.device("cuda", 0), own, own.to("cuda"), scene)
         return
     gsplat_in_torch.install(monkeypatch)
-    monkeypatch.setattr(module, "for_device", lambda d: cpu.rasterize if d.type == "cpu" else cuda.rasterize)
+    monkeypatch.setitem(BACKENDS, "gpu", lambda: Rasterizer(cuda.rasterize))
     with fake_gpu() as device:
         yield Setup(device, own, own.to(device), scene)
 

@@ -12,10 +12,10 @@ import torch
 
 import clod_adapter
 from clod_adapter.config import AttenuationConfig
+from clod_adapter.equation.attenuation import dial
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.hook import Hold, Hook
-from clod_adapter.render import dial
 from scenes import camera, gaussians
 
 N = 200

@@ -29,6 +29,7 @@ from clod_adapter.evaluation.popping import dial_popping, path_popping
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.hook import Hook
 from clod_adapter.initialization.importance import initialize, sigma_from_importance
+from clod_adapter.rasterizers import BACKENDS, Rasterizer, cpu
 from clod_adapter.render import render
 from clod_adapter.training.objective import Objective, TrainableSubset
 from clod_adapter.training.view_sampler import Sample
@@ -199,9 +200,10 @@ WITHOUT_GROWTH = (
 )  # fmt: skip
 
 
-# The CPU's kernels have an equation of their own, which tests/kernels compares with this one. The threshold is this
-# one's there too.
-COMPILED = ("render", "evaluate", "popping", "objective", "objective of a block")
+@pytest.fixture
+def composed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The default ``draw``, which the CPU's kernels override. tests/kernels compares the two."""
+    monkeypatch.setitem(BACKENDS, "cpu", lambda: Rasterizer(cpu.rasterize))
 
 
 def same(these: list[Any], those: list[Any]) -> bool:
@@ -221,22 +223,24 @@ def test_everything_follows_the_culling_threshold(name: str, monkeypatch: pytest
     assert 10 * TAU == RAISED and same(consumer(model_of(TAU)), wanted)
 
 
-@pytest.mark.parametrize("name", [name for name in CONSUMERS if name not in (*CLOSED_FORMS, *COMPILED)])
-def test_everything_passes_through_the_cut(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A cut that keeps only what is nearly opaque changes whatever renders, counts or bakes."""
+@pytest.mark.usefixtures("composed")
+@pytest.mark.parametrize("name", [name for name in CONSUMERS if name not in CLOSED_FORMS])
+def test_everything_passes_through_one_function(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A result of ``attenuate`` without what is faint changes whatever renders, counts or bakes."""
     consumer = CONSUMERS[name]
-    before, cut = consumer(model_of(TAU)), attenuation._cut
+    before, result = consumer(model_of(TAU)), attenuation.Attenuated
 
-    def strict(opacities: Tensor, log_opacities: Tensor, threshold: Any, kind: str) -> Any:
+    def strict(opacities: Tensor, log_opacities: Tensor, keep: Tensor, drawn: Tensor, growth: Tensor) -> Any:
         faint = opacities < 0.15
-        shown = opacities.masked_fill(faint, 0)
-        return cut(shown, log_opacities.masked_fill(faint, -torch.inf), threshold, kind)
+        logs = log_opacities.masked_fill(faint, -torch.inf)
+        return result(opacities.masked_fill(faint, 0), logs, keep & ~faint, drawn.masked_fill(faint, 0), growth)
 
-    monkeypatch.setattr(attenuation, "_cut", strict)
+    monkeypatch.setattr(attenuation, "Attenuated", strict)
     assert not same(consumer(model_of(TAU)), before)
 
 
-@pytest.mark.parametrize("name", [name for name in CONSUMERS if name not in COMPILED])
+@pytest.mark.usefixtures("composed")
+@pytest.mark.parametrize("name", CONSUMERS)
 def test_everything_grows_by_one_function(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Other factors change whatever draws, and nothing that counts or culls."""
     consumer = CONSUMERS[name]

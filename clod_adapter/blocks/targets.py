@@ -15,12 +15,13 @@ from clod_adapter.adapter import detach
 from clod_adapter.blocks.divide import Division
 from clod_adapter.cameras import Camera, View, spread
 from clod_adapter.config import AdaptConfig
+from clod_adapter.equation.attenuation import dial
 from clod_adapter.equation.distances import normalized_distances, typical_distance
 from clod_adapter.gaussians import SH_C0, Gaussians
 from clod_adapter.initialization.coverage import coverage
 from clod_adapter.losses import unit
 from clod_adapter.progress import Listener, Phase, tell
-from clod_adapter.render import dial, splat
+from clod_adapter.render import splat
 from clod_adapter.training.target_count import TargetShare, target_curve
 
 LEFT_OUT = 1e-3  # of an image, the share that the Gaussians left out of a block's context may cover

@@ -20,10 +20,10 @@ and falls to 0 at the culling threshold. The same Gaussians are kept, and the im
 per unit of ``log s`` or ``log d`` the drawn opacity changes by at most 4.3, namely by ``2 x (1.5 - 4 log x)`` with
 ``x = min(1.5 tau s, e^(-5/8))`` or, where that is less, by 2/e.
 
-Tensors are ``[N]``, one entry per Gaussian, on one device. ``opacity_logits`` may be +-inf, ``sigma_d`` and the
-distances are finite, distances are >= 0; in float64, which has no wider type to square them in, neither they nor d s
-exceed 1e150. Half-precision inputs are computed in float32, and so are their results; otherwise the result has the
-inputs' common dtype.
+Tensors are ``[N]``, one entry per Gaussian, on one device. ``opacity_logits`` may be +-inf. Where ``sigma_d`` is +inf
+there is no dial and no cut: the Gaussian is kept and drawn with a. Distances are finite and >= 0; in float64, which has
+no wider type to square them in, neither they nor a finite ``sigma_d`` nor d s exceed 1e150. Half-precision inputs are
+computed in float32, and so are their results; otherwise the result has the inputs' common dtype.
 
 Accuracy, measured against mpmath (benchmarks/stability_equation.py), in relative errors: log a'' and its gradients are
 within ``4 finfo.eps``, and so are, from float32, a'' and its gradients where a'' is a normal number; from float64 these
@@ -48,6 +48,7 @@ from clod_adapter.equation.autograd import Attenuate, Fade
 from clod_adapter.equation.distances import euclidean, normalized_distances, normalizing_distance
 from clod_adapter.equation.growth import growth_distance, growth_factors
 from clod_adapter.errors import ClodError
+from clod_adapter.gaussians import Gaussians
 
 SIGMA_MAX = 1e9
 """Stands for an infinite sigma_d. The factor is exactly 1 for d s < 2e5 in float32, d s < 10 in float64."""
@@ -56,7 +57,6 @@ FAINTEST = 2.0**-126
 """The smallest normal float32: at s = 0 only what is fainter is culled, which no rasterizer draws."""
 
 Scale = TypeVar("Scale", float, Tensor)
-Fields = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
 
 
 class Attenuated(NamedTuple):
@@ -111,23 +111,35 @@ def attenuate(
         keep = torch.ones_like(shown, dtype=torch.bool)
         logs = opacities.log() if activated else F.logsigmoid(opacities)
         return Attenuated(shown, logs, keep, shown, torch.ones_like(shown))
-    numbers = float(virtual_scale), log_threshold(config.tau, virtual_scale)
     named = {"opacities" if activated else "opacity_logits": opacities, "sigma_d": sigma_d}
-    more: Any = {"eps": config.eps, "cut": config.cut}
+    more: Any = {"activated": activated, "eps": config.eps, "cut": config.cut}
     if growth_d is not None:
         more["growth_d"] = conform(sigma_d=sigma_d, growth_d=growth_d)[1]
         more["reach"] = growth_distance(config)
-    if not isinstance(seen_from, tuple):
-        d = seen_from
-    elif activated or not _from_centres.compiles(seen_from[0]):
-        d = normalized_distances(*seen_from, config)
+    if isinstance(seen_from, tuple) and _dialled.compiles(seen_from[0]) and not activated:
+        where, more["position"], more["unit"] = _centres(*seen_from, config)
+        rows = conform(**named, x=where[:, 0])[:2]
     else:
-        means, position, unit = _centres(*seen_from, config)
-        rows = conform(**named, x=means[:, 0])[:2]
-        return Attenuated(*_from_centres(means, position, unit, *rows, *numbers, **more))
-    form = _from_opacities if activated else _from_logits
-    rows = conform(**named, d=d)
-    return Attenuated(*form(*rows[:2], rows[2].detach(), *numbers, **more))
+        d = normalized_distances(*seen_from, config) if isinstance(seen_from, tuple) else seen_from
+        *rows, where = conform(**named, d=d)
+    numbers = float(virtual_scale), log_threshold(config.tau, virtual_scale)
+    return Attenuated(*_dialled(*rows, where.detach(), *numbers, **more))
+
+
+def dial(gaussians: Gaussians, seen_from: Camera | Tensor, virtual_scale: float) -> Attenuated:
+    """``attenuate`` of a container of Gaussians: their opacities and growth at one dial value.
+
+    Args:
+        seen_from: the camera, or ``[N]`` distances d where they are known.
+
+    Raises:
+        ClodError: the dial is negative or not finite.
+    """
+    where = seen_from if isinstance(seen_from, Tensor) else (gaussians.means, seen_from)
+    return attenuate(
+        gaussians.opacity_logits, gaussians.sigma_d, where, virtual_scale, gaussians.attenuation,
+        growth_d=gaussians.growth_d,
+    )  # fmt: skip
 
 
 def log_attenuation(sigma_d: Tensor, d: Tensor, virtual_scale: float, eps: float) -> Tensor:
@@ -172,49 +184,29 @@ def _centres(means: Tensor, camera: Camera, config: AttenuationConfig) -> tuple[
 
 
 @Fused
-def _from_logits(
-    logits: Tensor, sigma: Tensor, d: Tensor, virtual_scale: Number, threshold: Number, *, eps: float, cut: str,
-    growth_d: Tensor | None = None, reach: float = 1.0,
-) -> Fields:  # fmt: skip
-    opacities, log_opacities = Attenuate.apply(logits, sigma, d, virtual_scale, eps)
-    return *_cut(opacities, log_opacities, threshold, cut), _growth(growth_d, d, virtual_scale, reach)
-
-
-@Fused
-def _from_centres(
-    means: Tensor, position: Tensor, unit: Number, logits: Tensor, sigma: Tensor, virtual_scale: Number,
-    threshold: Number, *, eps: float, cut: str, growth_d: Tensor | None = None, reach: float = 1.0,
-) -> Fields:  # fmt: skip
-    d = euclidean(means, position).div_(unit)
-    opacities, log_opacities = Attenuate.apply(logits, sigma, d, virtual_scale, eps)
-    return *_cut(opacities, log_opacities, threshold, cut), _growth(growth_d, d, virtual_scale, reach)
-
-
-@Fused
-def _from_opacities(
-    opacities: Tensor, sigma: Tensor, d: Tensor, virtual_scale: Number, threshold: Number, *, eps: float, cut: str,
-    growth_d: Tensor | None = None, reach: float = 1.0,
-) -> Fields:  # fmt: skip
-    opaque = torch.full_like(opacities, math.inf)
-    factor, log_factor = Attenuate.apply(opaque, sigma, d, virtual_scale, eps)
-    nothing = opacities <= 0
-    logs = opacities.masked_fill(nothing, 1).log().masked_fill(nothing, -math.inf)  # no slope, rather than 1 / 0
-    drawn = _cut(opacities * factor, logs + log_factor, threshold, cut)
-    return *drawn, _growth(growth_d, d, virtual_scale, reach)
-
-
-def _growth(growth_d: Tensor | None, d: Tensor, virtual_scale: Number, reach: float) -> Tensor:
-    return torch.ones_like(d) if growth_d is None else growth_factors(growth_d, d, virtual_scale, reach)
-
-
-def _cut(
-    opacities: Tensor, log_opacities: Tensor, threshold: Number, cut: str
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """The opacities of ``Attenuated`` from a'' and log a''."""
-    keep = log_opacities.detach() > threshold
-    # The hard cut's product is five times as fast as where.
-    drawn = opacities * keep.to(opacities) if cut == "hard" else Fade.apply(opacities, log_opacities, threshold)
-    return opacities, log_opacities, keep, drawn
+def _dialled(
+    opacities: Tensor, sigma: Tensor, where: Tensor, virtual_scale: Number, threshold: Number, *, activated: bool,
+    eps: float, cut: str, position: Tensor | None = None, unit: Number = 1.0, growth_d: Tensor | None = None,
+    reach: float = 1.0,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
+    """The fields of ``Attenuated``; ``where`` are distances, or with a ``position`` the centres."""
+    d = where if position is None else euclidean(where, position).div_(unit)
+    if activated:
+        opaque = torch.full_like(opacities, math.inf)
+        factor, log_factor = Attenuate.apply(opaque, sigma, d, virtual_scale, eps)
+        nothing = opacities <= 0
+        logs = opacities.masked_fill(nothing, 1).log().masked_fill(nothing, -math.inf)  # no slope, rather than 1 / 0
+        opacities, log_opacities = opacities * factor, logs + log_factor
+    else:
+        opacities, log_opacities = Attenuate.apply(opacities, sigma, d, virtual_scale, eps)
+    undialled = sigma.detach() == math.inf
+    keep = (log_opacities.detach() > threshold) | undialled
+    if cut == "hard":
+        drawn = opacities * keep.to(opacities)  # five times as fast as where
+    else:
+        drawn = torch.where(undialled, opacities, Fade.apply(opacities, log_opacities, threshold))
+    growth = torch.ones_like(d) if growth_d is None else growth_factors(growth_d, d, virtual_scale, reach)
+    return opacities, log_opacities, keep, drawn, growth
 
 
 def check_dial(virtual_scale: float) -> None:

@@ -9,12 +9,12 @@ import torch
 from torch import Tensor
 
 from clod_adapter.cameras import Camera, View, spread
+from clod_adapter.equation.attenuation import dial
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.budget import dial_for
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.importance import MOST_VIEWS, removal_error
 from clod_adapter.progress import Listener
-from clod_adapter.render import dial
 
 
 @torch.no_grad()

@@ -27,13 +27,13 @@ from torch import Tensor
 from clod_adapter.calibration import Calibration, Viewpoint, crossing
 from clod_adapter.cameras import Camera
 from clod_adapter.config import AttenuationConfig, require
+from clod_adapter.equation.attenuation import dial
 from clod_adapter.equation.distances import typical_distance
 from clod_adapter.equation.extinction import extinction_scale
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.frame_times import time_frames
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.progress import Listener
-from clod_adapter.render import dial
 
 TIMED_DIALS = 6
 

@@ -30,7 +30,7 @@ from clod_adapter.evaluation.level_errors import VIEWS
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.formats.tileset import ALLOWED
 from clod_adapter.progress import Listener, Phase, tell
-from clod_adapter.render import splat
+from clod_adapter.render import render
 
 
 @torch.no_grad()
@@ -47,7 +47,7 @@ def geometric_errors(
     picked = np.linspace(0, len(cameras) - 1, min(VIEWS, len(cameras))).round().astype(int)
     found = np.zeros((len(picked), len(levels)))
     for done, view in enumerate(cameras[k] for k in picked):
-        images = [splat(level, level.opacities, view)[0].clamp(0, 1) for level in levels]
+        images = [render(level, view).image.clamp(0, 1) for level in levels]
         slope = max(_slope(images[0]), 1e-6)
         length = median_distance(levels[0].means, view) / float(view.K[0, 0])
         found[done] = [length / slope * float((image - images[0]).square().mean().sqrt()) for image in images]

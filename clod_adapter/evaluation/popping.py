@@ -36,7 +36,8 @@ from clod_adapter.config import require
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.progress import Listener, Phase, tell
-from clod_adapter.render import dial, render, splat
+from clod_adapter.rasterizers import for_device
+from clod_adapter.render import render
 
 
 @dataclass(frozen=True)
@@ -131,11 +132,10 @@ def path_popping(
         ClodError: fewer than two cameras or two steps, or the dial is negative or not finite.
     """
     gaussians, shown = gaussians.without_empty_bands(), path(cameras, steps)
-
-    dialled = lru_cache(maxsize=3)(lambda j: dial(gaussians, shown[j], virtual_scale))
+    rasterizer = for_device(gaussians.means.device)
 
     def picture(k: int, j: int) -> Tensor:
-        return splat(gaussians, dialled(j).drawn, shown[k], growth=dialled(j).growth)[0]
+        return rasterizer.draw(gaussians, shown[k], virtual_scale, seen_from=shown[j])[0]
 
     return sweep(picture, [k / steps for k in range(steps + 1)], progress)
 

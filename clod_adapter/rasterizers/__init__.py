@@ -1,28 +1,40 @@
-"""Rasterizers behind one protocol. They take final opacities; ``sigma_d`` is applied before."""
+"""Rasterizers behind one protocol, by which a dial value becomes a picture."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import torch
 
 from clod_adapter.errors import ClodError
-from clod_adapter.rasterizers.protocol import ALPHA_MAX, Rasterizer, wait_for
+from clod_adapter.rasterizers.protocol import ALPHA_MAX, Rasterizer, Splat, wait_for
 
-__all__ = ["ALPHA_MAX", "Rasterizer", "for_device", "wait_for"]
+__all__ = ["ALPHA_MAX", "BACKENDS", "Rasterizer", "Splat", "for_device", "wait_for"]
+
+
+def _cpu() -> Rasterizer:
+    from clod_adapter.rasterizers import cpu
+
+    return cpu.RASTERIZER
+
+
+def _cuda() -> Rasterizer:
+    from clod_adapter.rasterizers import cuda
+
+    cuda.require_gsplat()
+    return Rasterizer(cuda.rasterize)
+
+
+BACKENDS: dict[str, Callable[[], Rasterizer]] = {"cpu": _cpu, "cuda": _cuda}
+"""By the type of a device, a function that returns its rasterizer; another backend is another entry."""
 
 
 def for_device(device: torch.device) -> Rasterizer:
-    """The fastest rasterizer for tensors on ``device``, imported on first use.
+    """The rasterizer for tensors on ``device``, imported on first use.
 
     Raises:
         ClodError: there is none for that kind of device, or gsplat is not installed or does not work.
     """
-    if device.type == "cpu":
-        from clod_adapter.rasterizers import cpu
-
-        return cpu.rasterize
-    if device.type == "cuda":
-        from clod_adapter.rasterizers import cuda
-
-        cuda.require_gsplat()
-        return cuda.rasterize
-    raise ClodError(f"no rasterizer for device {device}: move the Gaussians to the CPU with .to('cpu')")
+    if device.type not in BACKENDS:
+        raise ClodError(f"no rasterizer for device {device}: move the Gaussians to the CPU with .to('cpu')")
+    return BACKENDS[device.type]()

@@ -14,10 +14,11 @@ from clod_adapter._kernels import conventions, dial, dial_gradient, project, pro
 from clod_adapter._kernels.memory import recycled
 from clod_adapter.cameras import Camera
 from clod_adapter.config import CLASSIC, ScreenFilter
+from clod_adapter.equation.attenuation import check_dial
 from clod_adapter.equation.distances import camera_unit
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.rasterizers.frame import Frame, camera_vector, dial_vector, give, prepare, workers_for
-from clod_adapter.rasterizers.protocol import require_float32
+from clod_adapter.rasterizers.protocol import Rasterizer, behind, require_float32
 
 
 def _arrays(tensors: Any) -> list[np.ndarray]:
@@ -103,19 +104,36 @@ def _of_background(needed: bool, alpha: Tensor, v_image: Tensor) -> Tensor | Non
     return ((1 - alpha)[..., None] * v_image).sum((0, 1)) if needed else None
 
 
-def draw(
-    gaussians: Gaussians, camera: Camera, virtual_scale: float, background: Tensor, trained: int | None = None
-) -> tuple[Tensor, Tensor]:
-    """Image and alpha at one dial value, as ``attenuate`` and ``rasterize`` give them, differentiable.
+class _Compiled(Rasterizer):
+    """The dial is the first part of the projection, and the last of its gradient: what it culls is not touched again,
+    and nothing is copied. Tensors that are not float32 take the composed way."""
 
-    The dial is the first part of the projection, and the last of its gradient: what it culls is not touched again,
-    and nothing is copied. All tensors are float32. A row whose sigma_d is infinite has no dial and no cut. Gradients
-    are those of the first ``trained`` rows, and 0 for the others.
-    """
-    return _Drawn.apply(  # type: ignore[no-any-return, no-untyped-call]
-        *_stored(gaussians), background, camera, gaussians.screen_filter, gaussians.sh_degree,
-        _dial_vector(gaussians, camera, virtual_scale), len(gaussians) if trained is None else trained,
-    )  # fmt: skip
+    def draw(
+        self, gaussians: Gaussians, camera: Camera, virtual_scale: float = 1.0, *,
+        background: Tensor | np.ndarray | None = None, seen_from: Camera | None = None, trained: int | None = None,
+    ) -> tuple[Tensor, Tensor]:  # fmt: skip
+        black = behind(gaussians, background)
+        if seen_from is not None or not _all_float32(*gaussians.tensors().values(), black):
+            return super().draw(gaussians, camera, virtual_scale, background=black, seen_from=seen_from)
+        check_dial(virtual_scale)
+        return _Drawn.apply(  # type: ignore[no-any-return, no-untyped-call]
+            *_stored(gaussians), black, camera, gaussians.screen_filter, gaussians.sh_degree,
+            _dial_vector(gaussians, camera, virtual_scale), len(gaussians) if trained is None else trained,
+        )  # fmt: skip
+
+    @torch.no_grad()
+    def kept(self, gaussians: Gaussians, camera: Camera, virtual_scale: float) -> Tensor:
+        if gaussians.sigma_d is None or not _all_float32(*gaussians.tensors().values()):
+            return super().kept(gaussians, camera, virtual_scale)
+        found = np.empty(len(gaussians), np.uint8)
+        means, _, _, logits, sigma_d, *_ = _arrays(_stored(gaussians))
+        given = camera_vector(camera, gaussians.screen_filter), _dial_vector(gaussians, camera, virtual_scale)
+        threads.run(dial.mark_kept, workers_for(len(found)), means, logits, sigma_d, *given, found)
+        return torch.from_numpy(found).view(torch.bool)
+
+
+def _all_float32(*tensors: Tensor) -> bool:
+    return all(x.device.type == "cpu" and x.dtype == torch.float32 for x in tensors)
 
 
 def _stored(g: Gaussians) -> tuple[Tensor, ...]:
@@ -130,16 +148,6 @@ def _prepare_dialled(g: Gaussians, camera: Camera, virtual_scale: float) -> Fram
     return prepare(dial.project_dialled, _arrays(_stored(g)), g.sh_degree, camera, g.screen_filter, dialling)
 
 
-@torch.no_grad()
-def kept(gaussians: Gaussians, camera: Camera, virtual_scale: float) -> Tensor:
-    """``[N]`` bool, the Gaussians that ``draw`` keeps at this dial value, in the image or not. They have a dial."""
-    found = np.empty(len(gaussians), np.uint8)
-    means, _, _, logits, sigma_d, *_ = _arrays(_stored(gaussians))
-    given = camera_vector(camera, gaussians.screen_filter), _dial_vector(gaussians, camera, virtual_scale)
-    threads.run(dial.mark_kept, workers_for(len(found)), means, logits, sigma_d, *given, found)
-    return torch.from_numpy(found).view(torch.bool)
-
-
 def _dial_vector(gaussians: Gaussians, camera: Camera, virtual_scale: float) -> np.ndarray:
     config = gaussians.attenuation
     if config is None:
@@ -151,7 +159,7 @@ def rasterize(
     means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh0: Tensor, shN: Tensor, camera: Camera,
     background: Tensor, screen_filter: ScreenFilter = CLASSIC,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """See ``clod_adapter.rasterizers.Rasterizer``.
+    """See ``clod_adapter.rasterizers.Splat``.
 
     Raises:
         ClodError: a tensor is not float32.
@@ -163,3 +171,6 @@ def rasterize(
     return _Splat.apply(  # type: ignore[no-any-return, no-untyped-call]
         means, quats, scales, opacities, sh0, shN, background, camera, screen_filter, degree
     )
+
+
+RASTERIZER = _Compiled(rasterize)

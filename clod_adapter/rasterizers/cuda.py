@@ -68,7 +68,7 @@ def rasterize(
     means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh0: Tensor, shN: Tensor, camera: Camera,
     background: Tensor, screen_filter: ScreenFilter = CLASSIC,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """See ``clod_adapter.rasterizers.Rasterizer``.
+    """See ``clod_adapter.rasterizers.Splat``.
 
     Raises:
         ClodError: a tensor is not float32.

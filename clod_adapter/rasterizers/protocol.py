@@ -1,21 +1,26 @@
-"""The interface of every rasterizer, and their common checks."""
+"""The interface of every rasterizer, by which a dial value becomes a picture, and their common checks."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Protocol
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from clod_adapter._kernels import ALPHA_MAX, ALPHA_MIN, QUAT_MAX, QUAT_MIN, T_MIN
+from clod_adapter._support.arrays import float_tensor
 from clod_adapter.cameras import Camera
 from clod_adapter.config import CLASSIC, ScreenFilter
+from clod_adapter.equation.attenuation import dial
 from clod_adapter.errors import ClodError
+from clod_adapter.gaussians import Gaussians
 
-__all__ = ["ALPHA_MAX", "ALPHA_MIN", "T_MIN", "Rasterizer", "drawable", "require_float32", "wait_for"]
+__all__ = ["ALPHA_MAX", "ALPHA_MIN", "T_MIN", "Rasterizer", "Splat", "drawable", "require_float32", "wait_for"]
 
 
-class Rasterizer(Protocol):
+class Splat(Protocol):
     """Splats activated Gaussians into one camera.
 
     Args:
@@ -38,6 +43,55 @@ class Rasterizer(Protocol):
         self, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh0: Tensor, shN: Tensor,
         camera: Camera, background: Tensor, screen_filter: ScreenFilter = CLASSIC,
     ) -> tuple[Tensor, Tensor]: ...  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Rasterizer:
+    """What makes a picture of Gaussians at a dial value. Whatever renders, trains or measures pictures calls ``draw``.
+
+    The dial is composed with ``splat``. A subclass may have kernels with the dial in them instead, which then give the
+    same to rounding.
+
+    Attributes:
+        splat: draws activated Gaussians, without a dial.
+    """
+
+    splat: Splat
+
+    def draw(
+        self, gaussians: Gaussians, camera: Camera, virtual_scale: float = 1.0, *,
+        background: Tensor | np.ndarray | None = None, seen_from: Camera | None = None, trained: int | None = None,
+    ) -> tuple[Tensor, Tensor]:  # fmt: skip
+        """Image ``[H, W, 3]`` and alpha ``[H, W]`` at one dial value, differentiable in every tensor.
+
+        Args:
+            gaussians: without a ``sigma_d`` all are drawn as stored, at any dial value.
+            background: ``[3]``; black by default.
+            seen_from: the camera of the dial's distances, where it is not ``camera``.
+            trained: how many rows, the first ones, need gradients; those of others may be 0.
+
+        Raises:
+            ClodError: the dial is negative or not finite, or the background has the wrong shape.
+        """
+        dialled, g = dial(gaussians, seen_from or camera, virtual_scale), gaussians
+        return self.splat(
+            g.means, g.quats, g.scales * dialled.growth[:, None], dialled.drawn, g.sh0, g.shN, camera,
+            behind(gaussians, background), g.screen_filter,
+        )  # fmt: skip
+
+    def kept(self, gaussians: Gaussians, camera: Camera, virtual_scale: float) -> Tensor:
+        """``[N]`` bool, the Gaussians that ``draw`` does not cull at this dial value, in the image or not."""
+        return dial(gaussians, camera, virtual_scale).keep
+
+
+def behind(gaussians: Gaussians, background: Tensor | np.ndarray | None = None) -> Tensor:
+    """The background ``[3]`` as a tensor; black where None is given."""
+    if background is None:
+        return torch.zeros(3, dtype=torch.float32, device=gaussians.means.device)
+    found = float_tensor(background)
+    if found.shape != (3,):  # a kernel would read past its end
+        raise ClodError(f"background is {tuple(found.shape)} and must be (3,)")
+    return found
 
 
 def drawable(quats: Tensor, opacities: Tensor) -> Tensor:

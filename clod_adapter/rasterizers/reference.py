@@ -20,7 +20,7 @@ def rasterize(
     means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh0: Tensor, shN: Tensor, camera: Camera,
     background: Tensor, screen_filter: ScreenFilter = CLASSIC,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """See ``clod_adapter.rasterizers.Rasterizer``."""
+    """See ``clod_adapter.rasterizers.Splat``."""
     viewmat, K = camera.viewmat.to(means), camera.K.to(means)
     points = means @ viewmat[:3, :3].T + viewmat[:3, 3]
     rows = ((points[:, 2] >= camera.near) & drawable(quats, opacities)).nonzero()[:, 0]

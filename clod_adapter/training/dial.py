@@ -30,6 +30,7 @@ from torch import Tensor, nn
 from clod_adapter.cameras import Camera, Scene, StoredView, View, spread
 from clod_adapter.config import AdaptConfig
 from clod_adapter.equation.attenuation import Attenuated, attenuate
+from clod_adapter.equation.attenuation import dial as dialled_by
 from clod_adapter.equation.distances import typical_distance
 from clod_adapter.equation.growth import GROWTH_RANGE
 from clod_adapter.errors import ClodError
@@ -37,7 +38,6 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.importance import MOST_VIEWS, for_training, initialize, usable_views
 from clod_adapter.integrations.splats import NAMES, from_gsplat
 from clod_adapter.progress import Listener, shown
-from clod_adapter.render import dial as dialled_by
 from clod_adapter.training.loop import require_trainable
 from clod_adapter.training.objective import SIGMA_RANGE, loss_weight
 from clod_adapter.training.target_count import count_gradient, target_share

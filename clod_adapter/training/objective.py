@@ -14,18 +14,15 @@ from torch import Tensor
 from clod_adapter.adapter import ATTRIBUTES
 from clod_adapter.cameras import Camera
 from clod_adapter.config import CLASSIC, AdaptConfig, AttenuationConfig, ScreenFilter
-from clod_adapter.equation.attenuation import SIGMA_MAX, attenuate
-from clod_adapter.equation.distances import normalized_distances
+from clod_adapter.equation.attenuation import SIGMA_MAX, Attenuated, dial
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.losses import photometric_loss
-from clod_adapter.render import splat
+from clod_adapter.rasterizers import for_device
 from clod_adapter.training.target_count import TargetShare, count_gradient_at, paper_count, target_share
 from clod_adapter.training.view_sampler import Sample
 
 # Sigma stays where the equation still resolves it; below, a Gaussian would be culled for good.
 SIGMA_RANGE = (1e-4, SIGMA_MAX)
-
-Rendered = tuple[Tensor, Tensor, Tensor | None]
 
 
 @dataclass(frozen=True)
@@ -134,7 +131,9 @@ class Objective:
         """Renders one view at its dial value, and differentiates the weighted loss."""
         (view, s, counted, halved), config, first = sample, self.config, slice(self.trained)
         leaves = {name: parameters[name].detach().requires_grad_(name in self.stepped) for name in parameters}
-        image, kept, term = self._rendered(leaves, view.camera, s, halved)
+        shown = self._shown(leaves, halved)
+        kept = for_device(shown.means.device).kept(shown, view.camera, s)[first]
+        image, term = self._draw(shown, view.camera, s), self._paper_count(shown, view.camera, s)
         loss = photometric_loss(image, view.image, config.ssim_weight)
         plain, weight = loss.detach().double(), loss_weight(s, config)
         total = weight * (loss if term is None else loss + term)
@@ -152,64 +151,39 @@ class Objective:
 
     def image(self, parameters: dict[str, Tensor], camera: Camera, s: float, halved: bool) -> Tensor:
         """The image ``[H, W, 3]`` of the parameters; ``halved`` if the camera is for images of half the size."""
-        return self._rendered(parameters, camera, s, halved)[0]
+        return self._draw(self._shown(parameters, halved), camera, s)
 
     def undialled(self, parameters: dict[str, Tensor], camera: Camera, halved: bool) -> Tensor:
         """``image`` without a dial: of untrained parameters it is the base's."""
         attributes: Any = {name: parameters[name] for name in ATTRIBUTES}
-        shown = Gaussians(**attributes, screen_filter=self._filter(halved))
-        return splat(shown, shown.opacities, camera)[0]
+        return self._draw(Gaussians(**attributes, screen_filter=self._filter(halved)), camera, 1.0)
 
     def _filter(self, halved: bool) -> ScreenFilter:
         return self.screen_filter.halved() if halved else self.screen_filter
 
-    def _rendered(self, leaves: dict[str, Tensor], camera: Camera, s: float, halved: bool) -> Rendered:
-        """The image, the trained rows that are kept, and the paper's count term."""
-        rendered = self._rendered_by_kernels if self._compiled(leaves["opacity_logits"]) else self._rendered_plain
-        return rendered(leaves, camera, s, self._filter(halved))
+    def _draw(self, shown: Gaussians, camera: Camera, s: float) -> Tensor:
+        return for_device(shown.means.device).draw(shown, camera, s, trained=self.trained)[0]
 
-    def _compiled(self, like: Tensor) -> bool:
-        """Whether the rasterizer of the CPU applies the dial itself: the paper's term needs the opacities."""
-        return like.device.type == "cpu" and like.dtype == torch.float32 and self.config.count_term != "paper"
-
-    def _rendered_by_kernels(
-        self, leaves: dict[str, Tensor], camera: Camera, s: float, screen_filter: ScreenFilter
-    ) -> Rendered:
-        """``_rendered`` with the dial in the kernels."""
-        from clod_adapter.rasterizers import cpu
-
+    def _shown(self, leaves: dict[str, Tensor], halved: bool) -> Gaussians:
+        """The Gaussians of the parameters, the context without a dial where that is asked for."""
         sigma, growth_d = self.sigma(leaves[self.decay]), leaves.get("growth_d")
         if self.part.full_context:
             sigma = _ending_in(math.inf, sigma, self.trained)
             growth_d = None if growth_d is None else _ending_in(0.0, growth_d, self.trained)
         attributes: Any = {name: leaves[name] for name in ATTRIBUTES}
-        shown = Gaussians(
-            **attributes, sigma_d=sigma, attenuation=self.attenuation, growth_d=growth_d, screen_filter=screen_filter
-        )
-        kept = cpu.kept(shown, camera, s)[: self.trained]
-        return cpu.draw(shown, camera, s, torch.zeros(3, dtype=torch.float32), trained=self.trained)[0], kept, None
+        return Gaussians(
+            **attributes, sigma_d=sigma, attenuation=self.attenuation, growth_d=growth_d,
+            screen_filter=self._filter(halved),
+        )  # fmt: skip
 
-    def _rendered_plain(
-        self, leaves: dict[str, Tensor], camera: Camera, s: float, screen_filter: ScreenFilter
-    ) -> Rendered:
-        """``_rendered`` in plain torch."""
+    def _paper_count(self, shown: Gaussians, camera: Camera, s: float) -> Tensor | None:
+        """The paper's count term, where it is asked for."""
+        if self.config.count_term != "paper" or self.config.reg_weight <= 0 or s < 1:
+            return None
         rows = slice(self.trained) if self.part.full_context else slice(None)
-        attributes: Any = {name: leaves[name] for name in ATTRIBUTES}
-        shown = Gaussians(**attributes, screen_filter=screen_filter)
-        distances = normalized_distances(leaves["means"].detach(), camera, self.attenuation)
-        logits, sigma = leaves["opacity_logits"][rows], self.sigma(leaves[self.decay][rows])
-        growth_d = leaves["growth_d"][rows] if "growth_d" in leaves else None
-        dialled = attenuate(logits, sigma, distances[rows], s, self.attenuation, growth_d=growth_d)
-        drawn, growth = dialled.drawn, dialled.growth
-        if self.part.full_context:
-            context = leaves["opacity_logits"].detach()[self.trained :]
-            drawn = torch.cat([drawn, attenuate(context, None, distances[self.trained :], s, None).drawn])
-            growth = torch.cat([growth, torch.ones_like(context)])
-        # Culled rows have opacity 0: the rasterizer skips them, and they get no gradient.
-        term = None
-        if self.config.count_term == "paper" and self.config.reg_weight > 0 and s >= 1:
-            term = paper_count(dialled, s, self.attenuation.tau, self.config, self.part.total)
-        return splat(shown, drawn, camera, growth=growth)[0], dialled.keep[: self.trained], term
+        dialled = dial(shown, camera, s)
+        counted = Attenuated(*(field[rows] for field in dialled))
+        return paper_count(counted, s, self.attenuation.tau, self.config, self.part.total)
 
     @torch.no_grad()
     def _count_gradient(self, parameters: dict[str, Tensor], s: float, loss: Tensor) -> Tensor:

@@ -29,8 +29,7 @@ DIALS = (1.0, 2.5, 6.0)
 def everything_compiles(monkeypatch: pytest.MonkeyPatch) -> None:
     """Compiles on the CPU too, for any number of rows, and anew in each test."""
     monkeypatch.setattr(Fused, "compiles", lambda self, first: not self._failed)
-    for name in ("_from_logits", "_from_centres", "_from_opacities"):
-        monkeypatch.setattr(attenuation, name, Fused(getattr(attenuation, name).plain))
+    monkeypatch.setattr(attenuation, "_dialled", Fused(attenuation._dialled.plain))
     monkeypatch.setattr(optimizer, "_adam", Fused(optimizer._adam.plain))
 
 
@@ -82,7 +81,7 @@ def test_one_traced_graph_gives_the_same_results(
     torch._dynamo.utils.counters.clear()
     found = results(inputs(), camera(), SOFT, "seen")
     assert torch._dynamo.utils.counters["stats"]["unique_graphs"] == 1  # of three dial values
-    assert not attenuation._from_centres._failed and attenuation._from_centres._compiled is not None
+    assert not attenuation._dialled._failed and attenuation._dialled._compiled is not None
     assert_same(found, want)
     assert donates() == before
 
@@ -98,8 +97,7 @@ def test_compiled_results_are_the_same_to_rounding(request: pytest.FixtureReques
     want = results(given, camera(), SOFT, form)
     request.getfixturevalue("everything_compiles")
     assert_same(results(given, camera(), SOFT, form), want)
-    used = {"seen": "_from_centres", "logits": "_from_logits", "opacities": "_from_opacities"}[form]
-    assert not getattr(attenuation, used)._failed and getattr(attenuation, used)._compiled is not None
+    assert not attenuation._dialled._failed and attenuation._dialled._compiled is not None
 
 
 def assert_same(found: list[Tensor], want: list[Tensor]) -> None:

@@ -15,12 +15,12 @@ from torch import Tensor
 from clod_adapter.adapter import with_dial
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.equation.attenuation import Attenuated, attenuate
+from clod_adapter.equation.attenuation import dial as at_dial
 from clod_adapter.equation.distances import normalized_distances
 from clod_adapter.equation.growth import GROWTH_RANGE, LOG_GROWTH_MAX, growth_distance, growth_factors
 from clod_adapter.equation.units import in_world_units, with_distance
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.render import dial as at_dial
 from exact import DISTANCES, DTYPES, SCALES, ZERO, assert_close, config, dial, grid, quick, reference_growth
 from scenes import camera, gaussians
 

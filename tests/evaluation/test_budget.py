@@ -15,10 +15,10 @@ from clod_adapter.adapter import with_dial
 from clod_adapter.calibration import Calibration, CalibrationRow
 from clod_adapter.cameras import Camera
 from clod_adapter.config import AttenuationConfig
+from clod_adapter.equation.attenuation import dial
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.budget import dial_for, frame_times
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.render import dial
 from scenes import gaussians, ring
 
 MAX_SV = 6.0

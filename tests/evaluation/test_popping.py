@@ -11,12 +11,13 @@ import torch
 from clod_adapter.adapter import with_dial
 from clod_adapter.cameras import Camera
 from clod_adapter.config import FILTERS, AdaptConfig, AttenuationConfig
+from clod_adapter.equation.attenuation import dial
 from clod_adapter.equation.distances import normalized_distances
 from clod_adapter.equation.extinction import sigma_for_extinction
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.popping import dial_popping, path, path_popping, sweep
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.render import dial, render
+from clod_adapter.render import render
 from scenes import gaussians, ring
 
 

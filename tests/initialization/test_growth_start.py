@@ -10,6 +10,7 @@ from torch import Tensor
 
 from clod_adapter.adapter import with_dial
 from clod_adapter.config import AdaptConfig, AttenuationConfig
+from clod_adapter.equation.attenuation import dial
 from clod_adapter.equation.extinction import sigma_for_extinction
 from clod_adapter.equation.growth import growth_factors
 from clod_adapter.gaussians import Gaussians
@@ -17,7 +18,6 @@ from clod_adapter.initialization import growth_start, importance
 from clod_adapter.initialization.growth_start import MOST, SHARE, initial_growth
 from clod_adapter.initialization.importance import for_training, has_dial, initialize, scene_distance
 from clod_adapter.initialization.pruning_order import PruningOrder, pruning_order
-from clod_adapter.render import dial
 from scenes import gaussians, photograph, ring
 
 MAX_SV = 5.0

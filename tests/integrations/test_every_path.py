@@ -18,7 +18,7 @@ import scenes
 from backends import fresh_copy
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.checkpoint import Checkpoint
-from clod_adapter.rasterizers import cpu, reference
+from clod_adapter.rasterizers import Rasterizer, cpu, reference
 from clod_adapter.render import render
 from shown import SIZE, Shown, assert_same, serve
 
@@ -29,7 +29,7 @@ Draw = Callable[[Checkpoint, pytest.MonkeyPatch], Tensor]
 
 
 def through_cpu(checkpoint: Checkpoint, monkeypatch: pytest.MonkeyPatch) -> Tensor:
-    return render(checkpoint.gaussians, VIEW, DIAL, rasterizer=cpu.rasterize).image
+    return render(checkpoint.gaussians, VIEW, DIAL, rasterizer=Rasterizer(cpu.rasterize)).image
 
 
 def through_gsplat(checkpoint: Checkpoint, monkeypatch: pytest.MonkeyPatch) -> Tensor:
@@ -94,7 +94,7 @@ def adapted() -> Gaussians:
 
 
 def wanted(gaussians: Gaussians) -> Tensor:
-    return render(gaussians, VIEW, DIAL, rasterizer=reference.rasterize).image
+    return render(gaussians, VIEW, DIAL, rasterizer=Rasterizer(reference.rasterize)).image
 
 
 @pytest.mark.parametrize("draw", PATHS)

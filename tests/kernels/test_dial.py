@@ -17,12 +17,12 @@ from clod_adapter._kernels import project
 from clod_adapter._kernels.conventions import LOG, QA, QC, RECORD, RED
 from clod_adapter.cameras import Camera
 from clod_adapter.config import ScreenFilter
-from clod_adapter.equation.attenuation import SIGMA_MAX, log_threshold
+from clod_adapter.equation.attenuation import SIGMA_MAX, dial, log_threshold
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.rasterizers import cpu
+from clod_adapter.rasterizers import Rasterizer, cpu
 from clod_adapter.rasterizers.frame import give, prepare
-from clod_adapter.render import dial, render
+from clod_adapter.render import render
 from scenes import camera, dialled, gaussians
 
 VIEW = camera(45, 37)
@@ -98,7 +98,7 @@ def test_extreme_values(cut: str, s: float) -> None:
         model.means[::7] = VIEW.position
         finite = rows[:, 0].isfinite() & (rows[:, 2].abs() < 1e3)  # those for which the equation is defined
         assert_follows_the_equation(model.replace(growth_d=rows[:, 2]).select(finite), s)
-        image = cpu.draw(model.replace(growth_d=rows[:, 2]), VIEW, s, torch.zeros(3))[0]
+        image = cpu.RASTERIZER.draw(model.replace(growth_d=rows[:, 2]), VIEW, s)[0]
         assert image.isfinite().all()
 
 
@@ -112,7 +112,7 @@ def test_images_and_kept_rows() -> None:
     model = dialled(400, 2, 5).replace(growth_d=torch.full((400,), 0.5))
     behind = torch.tensor([0.2, 0.4, 0.6])
     at_once = render(model, VIEW, 2.0, background=behind)
-    apart = render(model, VIEW, 2.0, background=behind, rasterizer=cpu.rasterize)
+    apart = render(model, VIEW, 2.0, background=behind, rasterizer=Rasterizer(cpu.rasterize))
     torch.testing.assert_close(at_once.image, apart.image, rtol=0, atol=5e-3)  # an alpha of 1/255 more or less
     assert (at_once.image - apart.image).abs().mean() < 1e-5
     torch.testing.assert_close(at_once.alpha, apart.alpha, rtol=0, atol=5e-3)
@@ -123,7 +123,7 @@ def test_other_types_take_the_other_way() -> None:
     model = dialled(50, 0, 1)
     assert model.sigma_d is not None
     half = model.replace(sigma_d=model.sigma_d.half())
-    apart = render(half, VIEW, 2.0, rasterizer=cpu.rasterize)
+    apart = render(half, VIEW, 2.0, rasterizer=Rasterizer(cpu.rasterize))
     assert torch.equal(render(half, VIEW, 2.0).image, apart.image)
     with pytest.raises(ClodError, match="float32 only, and scales is"):
         render(model.replace(sigma_d=model.sigma_d.double()), VIEW, 2.0)
@@ -131,4 +131,4 @@ def test_other_types_take_the_other_way() -> None:
 
 def test_a_growth_that_is_not_finite_is_not_drawn() -> None:
     model = dialled(50, 0, 1).replace(growth_d=torch.full((50,), math.nan))
-    assert cpu.draw(model, VIEW, 2.0, torch.zeros(3))[1].sum() == 0
+    assert cpu.RASTERIZER.draw(model, VIEW, 2.0)[1].sum() == 0

@@ -13,10 +13,10 @@ from torch import Tensor
 
 from backends import torch_threads
 from clod_adapter.config import ScreenFilter
-from clod_adapter.equation.attenuation import SIGMA_MAX
+from clod_adapter.equation.attenuation import SIGMA_MAX, dial
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.rasterizers import Rasterizer, cpu
-from clod_adapter.render import dial, render
+from clod_adapter.render import render
 from scenes import camera, dialled, gaussians
 
 VIEW = camera(45, 37)
@@ -36,7 +36,7 @@ def gradients(model: Gaussians, s: float, rasterizer: Rasterizer | None, *frozen
 
 
 def assert_same(model: Gaussians, s: float, *frozen: str) -> dict[str, Tensor]:
-    at_once, apart = gradients(model, s, None, *frozen), gradients(model, s, cpu.rasterize, *frozen)
+    at_once, apart = gradients(model, s, None, *frozen), gradients(model, s, Rasterizer(cpu.rasterize), *frozen)
     for name, want in apart.items():
         largest = max(float(want.abs().max()), 1e-6) if want.numel() else 1.0
         torch.testing.assert_close(
@@ -106,7 +106,7 @@ def test_a_row_with_infinite_sigma_has_no_dial() -> None:
     for name, value in want.items():
         torch.testing.assert_close(found[name], value)
     assert not found["sigma_d"].any() and bool(want["opacity_logits"].any())
-    assert bool(cpu.kept(fixed, VIEW, 40.0).all())
+    assert bool(cpu.RASTERIZER.kept(fixed, VIEW, 40.0).all())
 
 
 @pytest.mark.parametrize("workers", [1, 3])
@@ -115,6 +115,6 @@ def test_kept_rows(workers: int) -> None:
         model = dialled(n, 0, n)
         for s in (1.0, 3.0):
             with torch_threads(workers):
-                got, want = cpu.kept(model, VIEW, s), dial(model, VIEW, s).keep
+                got, want = cpu.RASTERIZER.kept(model, VIEW, s), dial(model, VIEW, s).keep
             assert got.dtype == torch.bool and int((got != want).sum()) <= 1
     assert 0 < int(got.sum()) < 300

@@ -13,7 +13,7 @@ import torch
 from backends import Backend
 from clod_adapter.cameras import Camera
 from clod_adapter.config import FILTERS, ScreenFilter
-from clod_adapter.rasterizers import Rasterizer
+from clod_adapter.rasterizers import Splat
 from oracle import BACKGROUND, IMAGE, ON_A_CUT, assert_agrees, differentiate, weights
 from scenes import camera, in_front, scene
 
@@ -22,7 +22,7 @@ SIZES = [(61, 45), (33, 70), (97, 31), (64, 64), (5, 7)]
 
 
 @pytest.mark.parametrize("degree", range(5))
-def test_random_scenes(rasterize: Rasterizer, degree: int) -> None:
+def test_random_scenes(rasterize: Splat, degree: int) -> None:
     seed, (width, height) = degree % 2, SIZES[degree]
     size = (0.05, 0.1, 0.3)[degree % 3]
     view = camera(width, height, off_centre=(0.52, 0.47) if seed else (0.31, 0.72))
@@ -37,7 +37,7 @@ def test_random_scenes(rasterize: Rasterizer, degree: int) -> None:
     ],
     ids=lambda view: " ".join(map(str, view.values())),
 )  # fmt: skip
-def test_cameras(rasterize: Rasterizer, view: dict[str, Any]) -> None:
+def test_cameras(rasterize: Splat, view: dict[str, Any]) -> None:
     """Image sizes; narrow and wide lenses; the principal point outside the image.
 
     With the wide lens, centres are far outside the image, where the Jacobian's ray is clamped.
@@ -48,7 +48,7 @@ def test_cameras(rasterize: Rasterizer, view: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize("near", [1e-6, 0.01, 3.0])
-def test_near_the_camera_plane(rasterize: Rasterizer, near: float) -> None:
+def test_near_the_camera_plane(rasterize: Splat, near: float) -> None:
     """Centres just before, on and just beyond the near plane; those before it are not drawn."""
     view, unit = camera(40, 30), near / 0.01
     some = scene(60, 2, 3)
@@ -65,21 +65,21 @@ def test_near_the_camera_plane(rasterize: Rasterizer, near: float) -> None:
 
 
 @pytest.mark.parametrize("opacity", [0.0, 1 / 255 * 0.999, 0.9995, 1.0])
-def test_opacity_of_a_few(rasterize: Rasterizer, opacity: float) -> None:
+def test_opacity_of_a_few(rasterize: Splat, opacity: float) -> None:
     some = scene(120, 1, 1, size=0.15)
     some["opacities"][::3] = opacity
     assert_agrees(rasterize, some, camera(), rows=some["opacities"] >= 1 / 255)
 
 
 @pytest.mark.parametrize("saturated", [False, True])
-def test_opaque_layers(rasterize: Rasterizer, saturated: bool) -> None:
+def test_opaque_layers(rasterize: Splat, saturated: bool) -> None:
     """Gaussians behind the end of a pixel are not drawn; at opacity 1 alpha is clamped and has no gradient."""
     some = scene(300 if saturated else 1500, 1, 0, size=1.0 if saturated else 0.3)
     some["opacities"] = torch.ones(300) if saturated else 0.9 + 0.1 * some["opacities"]
     assert_agrees(rasterize, some, camera(26, 19), cut=0.05 if saturated else ON_A_CUT)
 
 
-def test_alpha_is_clamped(rasterize: Rasterizer) -> None:
+def test_alpha_is_clamped(rasterize: Splat) -> None:
     """One opaque Gaussian, so wide that every pixel is at the clamp."""
     view = camera(19, 13)
     one = {
@@ -103,7 +103,7 @@ def test_alpha_is_clamped(rasterize: Rasterizer) -> None:
     [((1.0, 1e-6, 1e-6), 0), ((0.3, 3e-7, 3e-7), 1), ((0.3, 0.3, 3e-7), 2)],
     ids=["needle", "short", "disc"],
 )
-def test_axis_ratio_of_a_million(rasterize: Rasterizer, scales: tuple[float, float, float], seed: int) -> None:
+def test_axis_ratio_of_a_million(rasterize: Splat, scales: tuple[float, float, float], seed: int) -> None:
     """Bounds of a needle are wider: its exponent is a small difference of terms of up to ``61^2 / (2 x 0.3) = 6,200``.
 
     Each is rounded by ``2^-24`` of itself in float32, in all by about 1e-3. Processors round differently: 40 seeds
@@ -116,7 +116,7 @@ def test_axis_ratio_of_a_million(rasterize: Rasterizer, scales: tuple[float, flo
 
 
 @pytest.mark.parametrize(("axes", "length"), [(1, 1e-8), (3, 0.0), (1, 1e2), (3, 1e3), (1, 1e4)])
-def test_extreme_scales(rasterize: Rasterizer, axes: int, length: float) -> None:
+def test_extreme_scales(rasterize: Splat, axes: int, length: float) -> None:
     """With quaternions of any length."""
     if axes == 1 and length >= 100 and getattr(rasterize, "looser", 1.0) > 1:
         pytest.skip("gsplat takes the determinant in float32, where that of such a needle cancels")
@@ -128,7 +128,7 @@ def test_extreme_scales(rasterize: Rasterizer, axes: int, length: float) -> None
 
 
 @pytest.mark.parametrize("distance", [1e3, 1e6])
-def test_far_away(rasterize: Rasterizer, distance: float) -> None:
+def test_far_away(rasterize: Splat, distance: float) -> None:
     """Sub-pixel Gaussians at great distance, each as wide as the blur."""
     view = camera(40, 30)
     some = scene(60, 1, 9)
@@ -159,7 +159,7 @@ def test_thousands_in_one_tile(rasterize: Backend) -> None:
     ],
     ids=str,
 )  # fmt: skip
-def test_screen_filters(rasterize: Rasterizer, scales: Any, screen_filter: ScreenFilter) -> None:
+def test_screen_filters(rasterize: Splat, scales: Any, screen_filter: ScreenFilter) -> None:
     """Sizes from a tenth of a pixel to several pixels, where the compensation is strong, medium and weak.
 
     A needle has no area and is not drawn; the compensation of a disc seen from its edge is steep.
@@ -173,7 +173,7 @@ def test_screen_filters(rasterize: Rasterizer, scales: Any, screen_filter: Scree
 
 
 @pytest.mark.parametrize("far", [1e4, 1e8])
-def test_an_ellipse_beyond_the_range_of_integers(rasterize: Rasterizer, far: float) -> None:
+def test_an_ellipse_beyond_the_range_of_integers(rasterize: Splat, far: float) -> None:
     """The centre is up to 1e12 pixels away, the long axis crosses the image; all pixels are finite and in range."""
     view = Camera(torch.eye(4), torch.tensor([[100.0, 0, 64], [0, 100.0, 64], [0, 0, 1]]), 128, 128)
     some = scene(20, 0, 0)

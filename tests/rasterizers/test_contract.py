@@ -36,11 +36,11 @@ def result_of(leaves: Parameters, image: Tensor, alpha: Tensor) -> Result:
 
 
 def test_for_device(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert for_device(torch.device("cpu")) is cpu.rasterize
+    assert for_device(torch.device("cpu")) is cpu.RASTERIZER
     with pytest.raises(ClodError, match="no rasterizer for device meta"):
         for_device(torch.device("meta"))
     monkeypatch.setattr(cuda, "unusable", lambda: None)
-    assert for_device(torch.device("cuda:1")) is cuda.rasterize
+    assert for_device(torch.device("cuda:1")).splat is cuda.rasterize
     monkeypatch.setattr(cuda, "unusable", lambda: "gsplat is not there: pip install gsplat==1.5.3")
     with pytest.raises(ClodError, match=r"no rasterizer for the GPU: .*pip install gsplat==1.5.3; or use the CPU"):
         for_device(torch.device("cuda"))

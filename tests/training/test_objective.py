@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import pytest
@@ -11,16 +10,15 @@ import torch
 from torch import Tensor
 
 from clod_adapter.adapter import with_dial
-from clod_adapter.cameras import Scene
+from clod_adapter.cameras import Camera, Scene
 from clod_adapter.config import FILTERS
 from clod_adapter.equation.growth import GROWTH_RANGE
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.initialization import importance
 from clod_adapter.initialization.importance import initialize
 from clod_adapter.losses import photometric_loss
 from clod_adapter.progress import Progress
-from clod_adapter.rasterizers import cpu, reference
-from clod_adapter.render import render, splat
+from clod_adapter.rasterizers import BACKENDS, Rasterizer, cpu, reference
+from clod_adapter.render import render
 from clod_adapter.training import objective
 from clod_adapter.training.gate import Gate
 from clod_adapter.training.loop import TrainingState, adapt
@@ -41,11 +39,17 @@ def test_screen_filter_is_used_and_empty_harmonics_are_skipped(
     mip = FILTERS["mip"]
     base = captured[0].replace(shN=torch.zeros_like(captured[0].shN), screen_filter=mip)
     seen, shown = set(), set()
-    for module, name in ((cpu, "draw"), (importance, "splat")):
-        real = getattr(module, name)
-        monkeypatch.setattr(
-            module, name, lambda g, *a, to=real, **k: seen.add((g.shN.shape[1], g.screen_filter)) or to(g, *a, **k)
-        )
+
+    class Watched(type(cpu.RASTERIZER)):  # type: ignore[misc]
+        def draw(self, g: Gaussians, *given: Any, **more: Any) -> Any:
+            seen.add((g.shN.shape[1], g.screen_filter))
+            return super().draw(g, *given, **more)
+
+    def watched(*given: Any) -> Any:
+        seen.add((given[5].shape[1], given[8]))
+        return cpu.rasterize(*given)
+
+    monkeypatch.setitem(BACKENDS, "cpu", lambda: Watched(watched))
 
     def look(now: Progress) -> None:
         if now.gaussians:
@@ -140,7 +144,7 @@ def test_compiled_steps_have_the_gradients_of_plain_ones(
     run.parameters["growth_d"] = torch.linspace(-0.5, 1, len(base))
     sample = Sample(scene.train[0], dial, 3.0)
     compiled = run.objective.gradient_sum(run.parameters, [sample])
-    monkeypatch.setattr(run.objective.__class__, "_compiled", lambda *_: False)
+    monkeypatch.setitem(BACKENDS, "cpu", lambda: Rasterizer(cpu.rasterize))
     plain = run.objective.gradient_sum(run.parameters, [sample])
     assert float(compiled.loss) == pytest.approx(float(plain.loss), rel=1e-3)
     assert int((compiled.kept != plain.kept).sum()) <= 1
@@ -151,7 +155,7 @@ def test_compiled_steps_have_the_gradients_of_plain_ones(
 @pytest.mark.parametrize("context", [0, 5], ids=["all rows", "rows of a block"])
 def test_gradient_of_growth_equals_finite_differences(monkeypatch: pytest.MonkeyPatch, context: int) -> None:
     """In float64, at a dial value of its own; the context of a block does not grow."""
-    monkeypatch.setattr(objective, "splat", partial(splat, rasterizer=reference.rasterize))
+    monkeypatch.setitem(BACKENDS, "cpu", lambda: Rasterizer(reference.rasterize))
     count, config = 12, config_of(start="identity", max_sv=4.0)
     some = gaussians(count, 1, 0, size=0.3)
     begun = initialize(some, views := photograph(some, ring(2, 16, 12)), config)
@@ -180,8 +184,14 @@ def test_trained_growth_stays_in_its_range(captured: Pair) -> None:
 
 def test_steps_use_the_sampled_views_and_dial_values(captured: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
     taken: list[Any] = []
-    draw, count = cpu.draw, objective.count_gradient_at
-    monkeypatch.setattr(cpu, "draw", lambda *a, **k: taken.append(a[2]) or draw(*a, **k))
+    count = objective.count_gradient_at
+
+    class Watched(type(cpu.RASTERIZER)):  # type: ignore[misc]
+        def draw(self, g: Gaussians, view: Camera, s: float, **more: Any) -> Any:
+            taken.extend([s] if g.sigma_d is not None else [])
+            return super().draw(g, view, s, **more)
+
+    monkeypatch.setitem(BACKENDS, "cpu", lambda: Watched(cpu.rasterize))
     monkeypatch.setattr(objective, "count_gradient_at", lambda *a: taken.append(a[3]) or count(*a))
     monkeypatch.setattr(objective, "photometric_loss", lambda *a: taken.append(id(a[1])) or photometric_loss(*a))
     config = config_of(iters=14, max_sv=4.0)

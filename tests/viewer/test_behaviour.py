@@ -14,8 +14,9 @@ import torch
 import clod_adapter
 import scenes
 from clod_adapter.calibration import Calibration, CalibrationRow
+from clod_adapter.equation.attenuation import dial
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.render import dial, render
+from clod_adapter.render import render
 from clod_adapter.viewer import page, payload
 from clod_adapter.viewer.page import write_viewer_page
 from shown import COUNTS, SIZE, Shown, assert_same, serve, take

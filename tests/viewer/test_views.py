@@ -17,10 +17,11 @@ import clod_adapter
 import scenes
 from clod_adapter.calibration import Calibration, CalibrationRow
 from clod_adapter.cameras import Camera
+from clod_adapter.equation.attenuation import dial
 from clod_adapter.equation.distances import viewpoint_of
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.scene.colmap import write_model
-from clod_adapter.render import dial, render
+from clod_adapter.render import render
 from clod_adapter.viewer.page import write_viewer_page
 from shown import REAL_GPU, SIZE, TALL, Shown, assert_alike, serve, sorts_on_gpu, take
 
