@@ -100,7 +100,8 @@ def rendered(device: torch.device, fix: str) -> str:
     viewmat[2, 3] = 4.0
     camera = Camera(viewmat, torch.tensor([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]]), 64, 48)
     want, _ = reference.rasterize(**scene, camera=camera)
-    image, _ = for_device(device)(**{name: value.to(device) for name, value in scene.items()}, camera=camera)
+    splat = for_device(device).splat
+    image, _ = splat(**{name: value.to(device) for name, value in scene.items()}, camera=camera)
     error = float((image.detach().cpu() - want).square().mean().sqrt())
     if not error <= TOLERANCE:
         raise CheckFailed(f"renders another image than the reference (RMS {error:.2g})", fix)

@@ -50,7 +50,7 @@ def test_a_wrong_image_is_reported(clod: Any, monkeypatch: pytest.MonkeyPatch, c
         image, alpha = reference.rasterize(**given)
         return {"roll": image.roll(1, 1), "nan": image * torch.nan, "transpose": image.transpose(0, 1)}[change], alpha
 
-    monkeypatch.setattr(rasterizers, "for_device", lambda device: rasterize)
+    monkeypatch.setitem(rasterizers.BACKENDS, "cpu", lambda: rasterizers.Rasterizer(rasterize))
     code, found = findings(clod)
     assert code == 1 and not found["cpu"]["ok"] and found["torch"]["ok"]
     assert change == "transpose" or found["cpu"]["found"].startswith("renders another image than the reference")
