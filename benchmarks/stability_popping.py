@@ -23,11 +23,11 @@ from typing import Any
 
 import clod_adapter as clod
 from clod_adapter.config import CUTS, NORMALIZERS, AttenuationConfig
+from clod_adapter.equation.attenuation import dial
 from clod_adapter.equation.distances import normalized_distances
 from clod_adapter.equation.extinction import sigma_for_extinction
 from clod_adapter.evaluation.popping import dial_popping, path, path_popping
 from clod_adapter.gaussians import SH_C0, Gaussians
-from clod_adapter.equation.attenuation import dial
 from clod_adapter.render import splat
 from clod_adapter.report.style import BLUE, GREEN, INK, ORANGE, label_log, new_figure, save_figure, tidy
 from common import table
