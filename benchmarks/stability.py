@@ -17,7 +17,7 @@ import stability_equation
 import stability_popping
 import stability_scenes
 import stability_stiffness
-from clod_adapter.cli.shared.report import jsonable
+from clod_adapter.cli.shared.outputs import jsonable
 from common import RESULTS, ROOT, about, arguments, stored
 
 FILE, IMAGES = "stability.jsonl", ROOT / "docs" / "images"

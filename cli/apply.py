@@ -9,11 +9,9 @@ from typing import Any
 from clod_adapter._support.version import package_version
 from clod_adapter.errors import ClodError
 
-from .shared.command import Command
+from .shared.command import Command, add_activated, check_checkpoint
 from .shared.console import Console, put
-from .shared.files import check_ply_name, size
-from .shared.options import add_activated, check_checkpoint
-from .shared.outputs import Outputs
+from .shared.outputs import Outputs, check_ply_name, size
 
 
 def add_arguments(parser: ArgumentParser) -> None:

@@ -18,9 +18,9 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.progress import Stopped
 
 from .shared.console import Console
-from .shared.files import labels
-from .shared.interrupts import GracefulStop
-from .shared.report import popping_table, rows_table
+from .shared.measure import popping_table, rows_table
+from .shared.outputs import labels
+from .shared.process import GracefulStop
 
 CLOSE = 0.01  # relative difference up to which two counts are equal
 POPPING_VIEWS = 2  # held-out views in which the dial is turned

@@ -24,10 +24,9 @@ from .adapt import run as adapt
 from .commands.adapt import ADAPT
 from .commands.demo import picture_files
 from .shared.console import Console, duration, put
-from .shared.files import AdaptFiles
-from .shared.kernels import prepare_kernels
-from .shared.outputs import claimed
-from .shared.report import Stopwatch
+from .shared.inputs import prepare_kernels
+from .shared.measure import Stopwatch
+from .shared.outputs import AdaptFiles, claimed
 
 MAX_SV = 5.0
 DIALS = (1.0, 2.0, 3.0, 5.0)

@@ -53,7 +53,7 @@ def check_gsplat() -> str:
     """gsplat on the GPU; may compile its kernels for minutes, once."""
     import torch
 
-    from .shared.devices import no_gpu
+    from .shared.inputs import no_gpu
 
     if reason := no_gpu():
         found, _, fix = reason.partition(": ")

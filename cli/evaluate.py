@@ -16,14 +16,10 @@ from clod_adapter.progress import Stopped
 
 from .comparisons import Comparisons, compare
 from .shared.alignment import align
-from .shared.antialiasing import with_filter
-from .shared.budgets import solve_dials
 from .shared.console import Console, put
-from .shared.kernels import prepare_kernels
-from .shared.measure import choose_dials, measure, with_frame_times
-from .shared.models import read_model_and_scene
+from .shared.inputs import prepare_kernels, read_model_and_scene, with_filter
+from .shared.measure import Stopwatch, choose_dials, machine, measure, solve_dials, table, with_frame_times
 from .shared.pages import write_eval_page
-from .shared.report import Stopwatch, machine, table
 
 
 def run(args: argparse.Namespace) -> dict[str, Any]:

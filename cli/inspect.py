@@ -13,7 +13,7 @@ from clod_adapter.io.settings import WARNING
 
 from .shared.command import Command
 from .shared.console import duration, put
-from .shared.files import size
+from .shared.outputs import size
 
 if TYPE_CHECKING:
     from clod_adapter.calibration import Calibration

@@ -27,11 +27,17 @@ from .commands.render import RENDER
 from .commands.robustness import ROBUSTNESS
 from .commands.view import VIEW
 from .shared.command import Command, Parser
-from .shared.interrupts import interrupt_as_stopped, signals_as_interrupt
-from .shared.launch import launched, silence_but_first
 from .shared.outputs import claimed
-from .shared.shortages import check_surroundings, shortage
-from .shared.streams import check_printed, unbreakable_streams
+from .shared.process import (
+    check_printed,
+    check_surroundings,
+    interrupt_as_stopped,
+    launched,
+    shortage,
+    signals_as_interrupt,
+    silence_but_first,
+    unbreakable_streams,
+)
 
 PROG = "clod-adapt"
 INTERRUPTED = 130  # exit code
@@ -125,7 +131,7 @@ def run(command: Command, args: argparse.Namespace) -> int:
 
     Without files and --json the result is what was printed.
     """
-    from .shared.report import jsonable
+    from .shared.outputs import jsonable
 
     check_surroundings()
     if args.json:

@@ -22,16 +22,11 @@ from clod_adapter.metrics import psnr
 from clod_adapter.render import render
 
 from .shared.alignment import align
-from .shared.antialiasing import with_filter
-from .shared.budgets import solve_dials
 from .shared.console import Console, put
-from .shared.interrupts import GracefulStop
-from .shared.kernels import prepare_kernels
-from .shared.measure import choose_dials
-from .shared.models import read_model_and_scene
+from .shared.inputs import pick_views, prepare_kernels, read_model_and_scene, with_filter
+from .shared.measure import Stopwatch, choose_dials, solve_dials
 from .shared.outputs import Outputs, check_outputs, make_folder
-from .shared.report import Stopwatch
-from .shared.views import pick_views
+from .shared.process import GracefulStop
 
 
 @dataclass(frozen=True)

@@ -23,14 +23,11 @@ from .commands.robustness import result_files
 from .commands.settings import make_configs
 from .robustness_cells import Cell, cells_of
 from .shared.alignment import align
-from .shared.antialiasing import with_filter
 from .shared.console import Console, Meter, clipped, duration, put
-from .shared.devices import on_device, pick_device
-from .shared.files import labels
-from .shared.inputs import read_checkpoint, read_scene
-from .shared.interrupts import GracefulStop
-from .shared.kernels import prepare_kernels
-from .shared.report import Stopwatch, machine, report_dials, write_report
+from .shared.inputs import on_device, pick_device, prepare_kernels, read_checkpoint, read_scene, with_filter
+from .shared.measure import Stopwatch, machine, report_dials
+from .shared.outputs import labels, write_report
+from .shared.process import GracefulStop
 
 COLUMNS = (
     "checkpoint", "max_sv", "within_range", "virtual_scale", "psnr", "ssim", "kept", "kept_share", "in_view", "frame_ms"

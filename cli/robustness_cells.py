@@ -15,7 +15,8 @@ from clod_adapter.io.adapter_file import save_adapter
 from clod_adapter.io.checkpoint import Checkpoint
 
 from .commands.robustness import cell_name
-from .shared.report import machine, write_report
+from .shared.measure import machine
+from .shared.outputs import write_report
 
 
 @dataclass(frozen=True)

@@ -21,14 +21,13 @@ from clod_adapter.viewer.server import Response, Server
 
 from .commands.view import view_files
 from .shared.alignment import read_cameras
-from .shared.antialiasing import with_filter, with_filter_of
 from .shared.browsers import open_browser
-from .shared.budgets import solve_dials
+from .shared.command import check_stored_cameras, initial_dial
 from .shared.console import Console
-from .shared.inputs import read_checkpoint
-from .shared.interrupts import interrupt_as_stopped
-from .shared.options import check_stored_cameras, initial_dial
-from .shared.report import jsonable
+from .shared.inputs import read_checkpoint, with_filter, with_filter_of
+from .shared.measure import solve_dials
+from .shared.outputs import jsonable
+from .shared.process import interrupt_as_stopped
 
 MODEL, BASE = "/files/model", "/files/base"
 

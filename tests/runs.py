@@ -35,7 +35,7 @@ from clod_adapter.cli import main
 from clod_adapter.cli.adapt import processes, saver
 from clod_adapter.cli.adapt import run as adapt
 from clod_adapter.cli.shared.console import Console
-from clod_adapter.cli.shared.kernels import prepare_kernels
+from clod_adapter.cli.shared.inputs import prepare_kernels
 from clod_adapter.training import pseudo_views
 pseudo_views.MANY = 8  # as in conftest
 prepare_kernels(Console(quiet=True))

@@ -10,8 +10,8 @@ from clod_adapter.blocks.train import merge
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 
-from ..shared.files import size
-from ..shared.report import machine
+from ..shared.measure import machine
+from ..shared.outputs import size
 from .blocks import Blocks, Divided, Pass
 from .inputs import Inputs
 from .plan import complete

@@ -16,7 +16,7 @@ from clod_adapter.progress import Phase, Progress
 from clod_adapter.render import render
 
 from ..shared.console import Console, Meter
-from ..shared.interrupts import GracefulStop
+from ..shared.process import GracefulStop
 
 CHECK_EVERY = 10.0  # seconds between measurements on held-out views, at least
 CHECK_COST = 0.03  # largest share of the time that they may take

@@ -14,10 +14,16 @@ from clod_adapter.io.checkpoint import Checkpoint
 from clod_adapter.progress import Stopped
 
 from ..shared.alignment import align
-from ..shared.antialiasing import with_filter
-from ..shared.devices import on_device, pick_device
-from ..shared.inputs import place_scene, read_checkpoint, read_scene, with_pseudo_views
-from ..shared.kernels import prepare_kernels
+from ..shared.inputs import (
+    on_device,
+    pick_device,
+    place_scene,
+    prepare_kernels,
+    read_checkpoint,
+    read_scene,
+    with_filter,
+    with_pseudo_views,
+)
 from ..shared.measure import measure
 from .memory import image_cache, plan_memory, rows_on_disk, without_rows
 from .setup import Setup

@@ -29,8 +29,7 @@ from clod_adapter.training.plan import Plan
 from clod_adapter.training.pseudo_views import teachers_to
 from clod_adapter.training.state import Adapted, TrainingState
 
-from ..shared.interrupts import GracefulStop
-from ..shared.launch import Launch, launched
+from ..shared.process import GracefulStop, Launch, launched
 from .display import ProgressDisplay
 
 BACKENDS = {"cpu": "gloo", "cuda": "nccl"}  # of torch.distributed, by device

@@ -16,12 +16,11 @@ from clod_adapter.io.adapter_file import save_adapter
 from clod_adapter.io.atomic import atomic_paths
 from clod_adapter.io.checkpoint import Checkpoint, save
 
-from ..shared.budgets import calibrate
 from ..shared.console import command_line, duration, put
-from ..shared.files import AdaptFiles, size
-from ..shared.interrupts import GracefulStop
+from ..shared.measure import Stopwatch, calibrate, machine, table
+from ..shared.outputs import AdaptFiles, size, write_report
 from ..shared.pages import AdaptPage
-from ..shared.report import Stopwatch, machine, table, write_report
+from ..shared.process import GracefulStop
 from .inputs import Inputs
 from .processes import describe_processes
 from .result import Measurements, Result, measure_result

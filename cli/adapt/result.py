@@ -11,9 +11,8 @@ from clod_adapter.io.checkpoint import Checkpoint, trimmed
 from clod_adapter.training.plan import Plan
 from clod_adapter.training.state import Adapted
 
-from ..shared.interrupts import GracefulStop, listen_no_more
-from ..shared.measure import measure, with_frame_times
-from ..shared.report import report_dials
+from ..shared.measure import measure, report_dials, with_frame_times
+from ..shared.process import GracefulStop, listen_no_more
 from .inputs import Inputs
 from .processes import explain, hurried
 from .setup import Setup

@@ -16,7 +16,7 @@ from clod_adapter.training.state import StateRefused
 from clod_adapter.training.state_file import save_state
 
 from ..shared.console import Console
-from ..shared.interrupts import GracefulStop
+from ..shared.process import GracefulStop
 from .resume import Resumed, RunKey
 
 SAVE_EVERY = 5.0  # seconds between saves, at least

@@ -10,10 +10,9 @@ from clod_adapter.io.adapter_file import check_config
 
 from ..commands.settings import make_config
 from ..shared.console import Console
-from ..shared.files import AdaptFiles
-from ..shared.interrupts import GracefulStop
-from ..shared.launch import launched
-from ..shared.report import Stopwatch
+from ..shared.measure import Stopwatch
+from ..shared.outputs import AdaptFiles
+from ..shared.process import GracefulStop, launched
 from .resume import Resumed, find_state
 
 

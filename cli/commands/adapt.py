@@ -8,10 +8,8 @@ from typing import TYPE_CHECKING
 from clod_adapter.blocks.memory import parse_size
 from clod_adapter.errors import ClodError
 
-from ..shared.command import Command, run_of
-from ..shared.files import AdaptFiles, check_ply_name
-from ..shared.launch import launched
-from ..shared.options import (
+from ..shared.command import (
+    Command,
     add_activated,
     add_antialiasing,
     add_device,
@@ -19,8 +17,10 @@ from ..shared.options import (
     check_checkpoint,
     check_scene,
     page_files,
+    run_of,
 )
-from ..shared.outputs import Outputs
+from ..shared.outputs import AdaptFiles, Outputs, check_ply_name
+from ..shared.process import launched
 from .settings import add_settings, make_config
 
 if TYPE_CHECKING:

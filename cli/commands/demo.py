@@ -8,8 +8,7 @@ from pathlib import Path
 from clod_adapter.report.style import check_matplotlib
 
 from ..shared.command import Command, run_of
-from ..shared.files import AdaptFiles
-from ..shared.outputs import Outputs
+from ..shared.outputs import AdaptFiles, Outputs
 
 
 def demo_options(parser: ArgumentParser) -> None:

@@ -7,10 +7,9 @@ from pathlib import Path
 
 from clod_adapter.errors import ClodError
 
-from ..shared.command import Command, run_of
-from ..shared.files import labels
-from ..shared.options import (
+from ..shared.command import (
     BUDGETS,
+    Command,
     add_activated,
     add_antialiasing,
     add_device,
@@ -21,8 +20,9 @@ from ..shared.options import (
     check_scene,
     model_has_dial,
     page_files,
+    run_of,
 )
-from ..shared.outputs import Outputs
+from ..shared.outputs import Outputs, labels
 
 
 def evaluate_options(parser: ArgumentParser) -> None:

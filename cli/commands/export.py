@@ -10,8 +10,8 @@ from pathlib import Path
 from clod_adapter.errors import ClodError
 from clod_adapter.io.formats.splat_transform import SplatTransform
 
-from ..shared.command import Command, run_of
-from ..shared.options import (
+from ..shared.command import (
+    Command,
     add_activated,
     add_antialiasing,
     add_device,
@@ -21,6 +21,7 @@ from ..shared.options import (
     check_scene,
     given_budget,
     model_has_dial,
+    run_of,
 )
 from ..shared.outputs import Outputs
 from .export_formats import FORMATS, LOD_META, PACKED, PAGE, TILESET, format_table, level_paths, suffix_of, suffixes

@@ -8,8 +8,8 @@ from pathlib import Path
 from clod_adapter.errors import ClodError
 from clod_adapter.io.scene.folder import find_cameras, photograph_folders
 
-from ..shared.command import Command, run_of
-from ..shared.options import (
+from ..shared.command import (
+    Command,
     add_activated,
     add_antialiasing,
     add_device,
@@ -18,6 +18,7 @@ from ..shared.options import (
     check_checkpoint,
     check_dials,
     check_scene,
+    run_of,
 )
 from ..shared.outputs import Outputs
 

@@ -7,9 +7,8 @@ from pathlib import Path
 
 from clod_adapter.report.style import check_matplotlib
 
-from ..shared.command import Command, run_of
-from ..shared.files import labels
-from ..shared.options import (
+from ..shared.command import (
+    Command,
     add_activated,
     add_antialiasing,
     add_device,
@@ -17,8 +16,9 @@ from ..shared.options import (
     add_misaligned_ok,
     check_checkpoint,
     check_scene,
+    run_of,
 )
-from ..shared.outputs import Outputs
+from ..shared.outputs import Outputs, labels
 from .settings import add_settings, make_configs
 
 

@@ -13,8 +13,8 @@ from clod_adapter.errors import ClodError
 from clod_adapter.io.file_formats import FORMATS
 from clod_adapter.io.ply.header import VIEWPOINT
 
-from ..shared.command import Command, run_of
-from ..shared.options import (
+from ..shared.command import (
+    Command,
     add_activated,
     add_antialiasing,
     add_device_preset,
@@ -23,6 +23,7 @@ from ..shared.options import (
     check_stored_cameras,
     may_store,
     model_has_dial,
+    run_of,
 )
 
 

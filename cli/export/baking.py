@@ -17,10 +17,8 @@ from clod_adapter.training.camera_placement import place_cameras
 
 from ..shared.alignment import align, read_cameras
 from ..shared.console import Console
-from ..shared.inputs import read_scene
-from ..shared.kernels import prepare_kernels
+from ..shared.inputs import named, prepare_kernels, read_scene
 from ..shared.measure import measure
-from ..shared.views import named
 
 PLACED = 16  # cameras placed where none are known
 DIAL_RATIO = 1.01  # of two dial values, at which the search for a PSNR ends

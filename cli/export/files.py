@@ -23,7 +23,7 @@ from clod_adapter.viewer.page import write_viewer_page
 
 from ..commands.export_formats import LOD_META, PACKED, PAGE, suffix_of
 from ..shared.console import Console, duration
-from ..shared.kernels import prepare_kernels
+from ..shared.inputs import prepare_kernels
 from .baking import Target
 from .packing import packing_bar, page_psnr
 

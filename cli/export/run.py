@@ -18,15 +18,11 @@ from clod_adapter.io.ply.constants import PREFIX
 from clod_adapter.io.scene.load import load_cameras
 
 from ..commands.export_formats import LOD_META, PAGE, TILESET, level_paths, suffix_of
-from ..shared.antialiasing import with_filter
-from ..shared.budgets import solve_dials
+from ..shared.command import given_budget, initial_dial
 from ..shared.console import Console, put
-from ..shared.devices import on_device, pick_device
-from ..shared.files import size
-from ..shared.inputs import read_checkpoint
-from ..shared.measure import choose_dials
-from ..shared.options import given_budget, initial_dial
-from ..shared.report import Stopwatch
+from ..shared.inputs import on_device, pick_device, read_checkpoint, with_filter
+from ..shared.measure import Stopwatch, choose_dials, solve_dials
+from ..shared.outputs import size
 from .baking import Photographs, Target, find_target, measure_drop
 from .files import Export
 

@@ -19,7 +19,7 @@ from clod_adapter.io.scene.load import load_cameras, load_scene
 from clod_adapter.origin import Origin
 
 from .console import Console
-from .kernels import prepare_kernels
+from .inputs import prepare_kernels
 
 OTHER_COLOURS = (
     "warning: {ply} matches the photographs in {images}, but some differ more from it than from their own mean "

@@ -1,23 +1,37 @@
-"""Reading checkpoints and scenes, with messages on their contents."""
+"""Checkpoints, scenes and devices of a command, with messages on them, and the kernels compiled for them."""
 
 from __future__ import annotations
 
-from pathlib import Path
+import argparse
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path, PureWindowsPath
 
-from clod_adapter.cameras import Scene
-from clod_adapter.config import CLASSIC, AdaptConfig
+import torch
+from numba.core.caching import NullCache
+from numba.core.event import Event, Listener, install_listener
+
+from clod_adapter._support.text import first_line
+from clod_adapter.alignment.screen_filter import FilterComparison, compare_filters
+from clod_adapter.cameras import Camera, Scene, View
+from clod_adapter.config import CLASSIC, FILTERS, AdaptConfig, ScreenFilter
+from clod_adapter.errors import ClodError
+from clod_adapter.evaluation.evaluate import evaluate
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.checkpoint import Checkpoint, load
 from clod_adapter.io.ply.columns import dial_columns
 from clod_adapter.io.ply.values import Activated
 from clod_adapter.io.scene.load import ImageCache, load_scene
 from clod_adapter.origin import Origin
-from clod_adapter.progress import Phase
+from clod_adapter.progress import Phase, Stopped
+from clod_adapter.rasterizers.cuda import unusable
 from clod_adapter.training.camera_placement import place_cameras
+from clod_adapter.training.loop import adapt
 from clod_adapter.training.pseudo_views import LIGHTEST, STEPS_PER_PLACED, add_pseudo_views, render_pseudo_views
 
-from .console import Console
-from .files import size
+from .console import Console, Meter
+from .outputs import size
 
 
 def read_checkpoint(
@@ -69,3 +83,219 @@ def place_scene(gaussians: Gaussians, config: AdaptConfig, console: Console) -> 
     for note in scene.notes:
         console.say(note)
     return scene, config.lighter(LIGHTEST).for_views(len(scene.train), STEPS_PER_PLACED)
+
+
+def read_model_and_scene(
+    args: argparse.Namespace, console: Console, others: Sequence[str] = ()
+) -> tuple[Checkpoint, dict[str, Checkpoint], Scene, torch.device]:
+    """The model of ``args``, other files by path, the scene, and the device that the Gaussians are on.
+
+    All coordinates are relative to the model's origin.
+    """
+    device = pick_device(args.device, console)
+    model = read_checkpoint(args.model, console, args.activated)
+    read = {path: read_checkpoint(path, console, args.activated, model.origin) for path in others}
+    scene = read_scene(args.images, console, model.origin)
+    return on_device(model, device), {path: on_device(each, device) for path, each in read.items()}, scene, device
+
+
+def pick_device(name: str, console: Console) -> torch.device:
+    """The device of ``--device``; prints why a GPU is not used.
+
+    Raises:
+        ClodError: cuda was asked for and does not work; the message says what to install.
+    """
+    if name == "cpu" or (name == "auto" and not torch.cuda.is_available()):
+        return torch.device("cpu")
+    reason = no_gpu()
+    if reason is None:
+        device = torch.device("cuda", torch.cuda.current_device())
+        console.say(f"on {torch.cuda.get_device_name(device)}")
+        return device
+    if name == "cuda":
+        raise ClodError(f"--device cuda: {reason}; or use --device cpu")
+    console.say(f"on the CPU, although there is a GPU: {reason}")
+    return torch.device("cpu")
+
+
+def no_gpu() -> str | None:
+    """Why no GPU backend works, None if one does. The first call may compile gsplat for minutes."""
+    if torch.cuda.is_available():
+        return _fails() or unusable()
+    if torch.version.cuda is None:
+        return f"torch {torch.__version__} is built without CUDA: install torch from https://pytorch.org for your CUDA"
+    return "torch finds no NVIDIA GPU; check with nvidia-smi that there is one and that its driver is new enough"
+
+
+def _fails() -> str | None:
+    """Why torch cannot compute on the GPU that it finds: not supported by this torch, or in use."""
+    try:
+        torch.ones(1, device="cuda").add_(1).item()
+    except (RuntimeError, AssertionError) as error:
+        return f"torch cannot compute on it ({first_line(error)}); clod-adapt doctor prints a fix"
+    return None
+
+
+def on_device(checkpoint: Checkpoint, device: torch.device) -> Checkpoint:
+    """The checkpoint with its Gaussians on the device. Photographs stay in main memory and are copied one at a time."""
+    return replace(checkpoint, gaussians=checkpoint.gaussians.to(device))
+
+
+WORDS = {"off": "without antialiasing", "on": "with antialiasing", "mip": "with Mip-Splatting's antialiasing"}
+
+
+def with_filter(
+    checkpoint: Checkpoint, args: argparse.Namespace, console: Console, views: Sequence[View] = ()
+) -> Checkpoint:
+    """The checkpoint with the filter to render it with, and a note, also printed, where the file has another or none.
+
+    The filter is that of ``--antialiasing``. With ``auto`` it is the file's; if the file has none, the one whose
+    renders of ``views`` are clearly closest to the photographs, or without views the default.
+    """
+    gaussians = checkpoint.gaussians
+    if args.antialiasing != "auto":
+        given = FILTERS[args.antialiasing]
+        if given == gaussians.screen_filter or not checkpoint.filter_known:
+            return replace(checkpoint, gaussians=gaussians.replace(screen_filter=given))
+        stored = gaussians.screen_filter.description
+        note = f"{checkpoint.path}: rendered {WORDS[args.antialiasing]} (--antialiasing); the file has {stored}"
+        return _noted(checkpoint, given, note, console)
+    if checkpoint.filter_known or not views:
+        return checkpoint
+    with console.status("comparing screen-space filters with the photographs ..."):
+        found = compare_filters(gaussians, views, gaussians.screen_filter.name or "off")
+    if found.chosen == found.expected:
+        return checkpoint
+    return _noted(checkpoint, found.screen_filter, _measured_note(checkpoint, found), console)
+
+
+def with_filter_of(base: Checkpoint, model: Checkpoint, args: argparse.Namespace) -> Checkpoint:
+    """The base of a model, with the model's filter if its own file has none."""
+    if args.antialiasing != "auto" or base.filter_known or not model.filter_known:
+        return base
+    return replace(base, gaussians=base.gaussians.replace(screen_filter=model.gaussians.screen_filter))
+
+
+def _measured_note(checkpoint: Checkpoint, found: FilterComparison) -> str:
+    chosen, expected = (f"{found.psnr[name]:.2f} dB {WORDS[name]}" for name in (found.chosen, found.expected))
+    return (
+        f"{checkpoint.path}: by the photographs it was trained {WORDS[found.chosen]}: {chosen}, {expected}; "
+        f"rendered so (--antialiasing {found.expected} overrides it)"
+    )
+
+
+def _noted(checkpoint: Checkpoint, screen_filter: ScreenFilter, note: str, console: Console) -> Checkpoint:
+    console.say(note)
+    gaussians = checkpoint.gaussians.replace(screen_filter=screen_filter)
+    return replace(checkpoint, gaussians=gaussians, notes=(*checkpoint.notes, note))
+
+
+def pick_views(scene: Scene, wanted: Sequence[str]) -> list[View]:
+    """The held-out views, all views, or those named, in the scene's order."""
+    views = sorted([*scene.train, *scene.test], key=lambda view: view.camera.name)
+    if list(wanted) == ["all"]:
+        return views
+    if list(wanted) == ["held-out"]:
+        return list(scene.test or scene.train)  # a single photograph is not held out
+    cameras = [view.camera for view in views]
+    chosen = {camera.name for name in wanted for camera in named(cameras, name, "--views")}
+    return [view for view in views if view.camera.name in chosen]
+
+
+def named(cameras: Sequence[Camera], name: str, option: str) -> list[Camera]:
+    """The cameras whose photograph has this name; if none has, without its suffix, its folder, or both.
+
+    Raises:
+        ClodError: no photograph has this name.
+    """
+    whole = [camera for camera in cameras if camera.name == name]
+    if found := whole or [camera for camera in cameras if name in _shorter(camera.name)]:
+        return found
+    some = ", ".join(camera.name for camera in cameras[:3])
+    raise ClodError(f"{option}: no photograph is named {name!r}; names are like {some}")
+
+
+def _shorter(name: str) -> tuple[str, ...]:
+    path = PureWindowsPath(name)
+    return str(Path(name).with_suffix("")), path.name, path.stem
+
+
+CPU = torch.device("cpu")
+OTHER = ""
+# Share of each kernel in the time to compile all of them; used only for the progress shown.
+SHARES = {"project_dialled": 0.23, "project_gradient": 0.16, "adam_rows": 0.12, OTHER: 0.03}
+
+
+def prepare_kernels(
+    console: Console, device: torch.device = CPU, *, training: bool = True, screen_filter: ScreenFilter = CLASSIC
+) -> None:
+    """Evaluates, and with ``training`` adapts, a scene of one Gaussian, so that all kernels are compiled.
+
+    Training with a filter that compensates opacities needs another kernel.
+    """
+    one = Gaussians(
+        torch.zeros(1, 3), torch.ones(1, 4), torch.zeros(1, 3), torch.zeros(1), torch.zeros(1, 1, 3),
+        torch.zeros(1, 3, 3), screen_filter=screen_filter,
+    ).to(device)  # fmt: skip
+    viewmat, K = torch.eye(4), torch.eye(3)
+    viewmat[2, 3] = 2.0
+    view = View(Camera(viewmat, K, 4, 4), torch.zeros(4, 4, 3, dtype=torch.uint8))
+    with announced_compiling(console, SHARES), one_thread():
+        evaluate(one, [view], [1.0])
+        if training:
+            adapted = adapt(one, Scene((view,), ()), AdaptConfig(iters=1, full_share=1.0), progress=False)
+            if adapted.interrupted:
+                raise Stopped("stopped while the kernels were compiled")
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Limits torch to one thread; after a Ctrl-C in one, each of several threads would compile on its own."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+@contextmanager
+def announced_compiling(console: Console, shares: Mapping[str, float]) -> Iterator[None]:
+    """Prints a line when something is compiled within the block, and the progress.
+
+    Args:
+        shares: of the compile time, by kernel and for ``OTHER`` ones.
+    """
+    listener = _Compiling(console, shares)
+    try:
+        with install_listener("numba:compile", listener):
+            yield
+    finally:
+        listener.close()
+
+
+class _Compiling(Listener):  # type: ignore[misc]
+    """Follows compilations; functions that a kernel calls are compiled within its own."""
+
+    def __init__(self, console: Console, shares: Mapping[str, float]) -> None:
+        self.console, self.shares = console, shares
+        self.meter: Meter | None = None
+        self.depth, self.done = 0, 0.0
+
+    def on_start(self, event: Event) -> None:
+        self.depth += 1
+        if not self.meter:
+            cached = not isinstance(event.data["dispatcher"]._cache, NullCache)
+            nowhere = "on every run, as no cache folder is writable: set NUMBA_CACHE_DIR"
+            self.console.say(f"compiling kernels ({'first run only, well under a minute' if cached else nowhere}) ...")
+            self.meter = Meter(self.console, "compiling", slow=True)
+
+    def on_end(self, event: Event) -> None:
+        self.depth -= 1
+        if self.depth == 0 and self.meter:
+            self.done += self.shares.get(event.data["dispatcher"].py_func.__name__, self.shares[OTHER])
+            self.meter.update(self.done)
+
+    def close(self) -> None:
+        if self.meter:
+            self.meter.close()

@@ -1,21 +1,147 @@
-"""Measuring dial values with progress; Ctrl-C ends it between frames."""
+"""Dial values: solved from budgets, measured with progress, and shown in tables."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import os
+import platform
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from clod_adapter.evaluation.evaluate import Row
+    from clod_adapter.evaluation.popping import Popping
+
+import argparse
+from collections.abc import Mapping
 from dataclasses import replace
 
-from clod_adapter.cameras import View
+from torch import Tensor
+from torch.nn.functional import avg_pool2d
+
+from clod_adapter.calibration import Calibration, Viewpoint
+from clod_adapter.cameras import Camera, Scene, View, spread
 from clod_adapter.config import AttenuationConfig
+from clod_adapter.equation.distances import viewpoint_of
+from clod_adapter.errors import ClodError
+from clod_adapter.evaluation.budget import dial_for, dial_for_times, frame_times
 from clod_adapter.evaluation.evaluate import Row, evaluate
 from clod_adapter.evaluation.frame_times import time_frames
 from clod_adapter.evaluation.perceptual import Metric
 from clod_adapter.gaussians import Gaussians
+from clod_adapter.io.checkpoint import Checkpoint
+from clod_adapter.origin import Origin
 from clod_adapter.progress import Phase, Progress, Stopped
 
+from .command import given_budget
 from .console import Console
-from .interrupts import GracefulStop
-from .launch import launched
+from .inputs import prepare_kernels
+from .process import GracefulStop, launched
+
+# Round values, each about 1.4 times the last, or more between 1 and 5; max_sv < 1/tau = 50.
+REPORT_DIALS = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0, 10.0, 14.0, 20.0, 28.0, 40.0)
+
+
+class Stopwatch:
+    """Named wall times, for the report."""
+
+    def __init__(self) -> None:
+        self.began = time.perf_counter()
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def time(self, name: str) -> Iterator[None]:
+        """Adds the time of the block to ``name``."""
+        began = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - began
+
+    def report(self) -> dict[str, float]:
+        return {name: round(value, 3) for name, value in {**self.seconds, "total": self.total()}.items()}
+
+    def total(self) -> float:
+        return time.perf_counter() - self.began
+
+
+def machine() -> dict[str, Any]:
+    """The hardware and software that times were measured on."""
+    import numba
+    import torch
+
+    gpu = {"gpu": torch.cuda.get_device_name()} if torch.cuda.is_available() else {}
+    return {
+        **gpu,
+        "cpu": _cpu_name(),
+        "cores": os.cpu_count(),
+        "threads": torch.get_num_threads(),
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+        "numba": numba.__version__,
+    }
+
+
+def machine_name(device: str = "cpu") -> str:
+    """The machine in one line: the hardware that determines frame times on that type of device."""
+    about = machine()
+    if device == "cuda":
+        return about["gpu"]
+    return f"{about['cpu']}, {about['threads']} threads"
+
+
+def _cpu_name() -> str:
+    try:
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    except OSError:
+        pass
+    return platform.processor() or platform.machine()
+
+
+def report_dials(max_sv: float) -> list[float]:
+    """The dial values of a report, in about even steps of their logarithm; the last one is ``max_sv``."""
+    return [s for s in REPORT_DIALS if s < max_sv] + [max_sv]
+
+
+def table(rows: Sequence[Row], base_rows: Sequence[Row] = (), plain_rows: Sequence[Row] = ()) -> str:
+    """A table: the base first, then the dial values, then the rows without the dial."""
+    marked = [("base", row) for row in base_rows] + [(f"{row.virtual_scale:.5g}", row) for row in rows]
+    return rows_table(marked + [("plain", row) for row in plain_rows])
+
+
+def rows_table(marked: Sequence[tuple[str, Row]]) -> str:
+    """A table of labelled rows; LPIPS and FLIP if they were measured."""
+    width = max(6, *(len(label) for label, _ in marked))
+    more = [name for name in ("lpips", "flip") if any(getattr(row, name) is not None for _, row in marked)]
+    heads = "".join(f"  {name.upper():>6}" for name in more)
+    lines = [f"{'dial':>{width}}  PSNR dB    SSIM{heads}        kept            in view  frame ms"]
+    for label, row in marked:
+        extra = "".join(f"  {getattr(row, name):6.4f}" for name in more)
+        kept = f"{row.kept:10,.0f}  {row.kept_share:6.1%}  {row.in_view:9,.0f}  {row.frame_ms:8.1f}"
+        lines.append(f"{label:>{width}}  {row.psnr:7.2f}  {row.ssim:.4f}{extra}  {kept}")
+    return "\n".join(lines)
+
+
+def popping_table(results: Sequence[tuple[str, Popping]]) -> str:
+    """A table of popping measurements, with an explanation; what moves is above its numbers."""
+    lines = [
+        "popping: change of the image per step, in levels of 255 (RMS over the image,",
+        "largest change of a pixel). Halving the step halves the largest change of a",
+        "fade (0.5), but not that of a jump (1.0):",
+        "  steps     mean  largest     at  / mean  halved   pixel  halved",
+    ]
+    for moved, p in results:
+        lines.append(moved)
+        lines.append(
+            f"  {p.steps:5}  {p.mean:7.4f}  {p.largest:7.4f}  {p.at:5.2f}  {p.ratio:6.1f}"
+            f"  {p.persistence:6.2f}  {p.pixel:6.1f}  {p.pixel_persistence:6.2f}"
+        )
+    return "\n".join(lines)
+
 
 DIALS = (1.0, 2.0, 3.0, 5.0)
 
@@ -89,3 +215,98 @@ def with_frame_times(
         taken = dict(zip(scales, found, strict=True))
         each[:] = [replace(row, frame_ms=taken[row.virtual_scale]) for row in each]
     return rows, times.notes, False
+
+
+BLOCK = 8  # pixels
+VIEWPOINTS = 16  # most training cameras stored in a calibration: all 84 baked 0.006 dB better
+
+
+def solve_dials(
+    args: argparse.Namespace,
+    model: Checkpoint,
+    cameras: Sequence[Camera | Viewpoint],
+    console: Console,
+    *,
+    baked: bool = False,
+) -> tuple[list[float] | None, list[str]]:
+    """The dial values of --sv or of a budget, None without either; and notes on the solution.
+
+    Args:
+        cameras: those that the command renders, or bakes for. Where none of them has an image size, as those stored in
+            a file, frame times are those of the calibration.
+        baked: whether a count is of the file baked for the cameras, and not the mean over them.
+    """
+    budget = given_budget(args)
+    if budget is None:
+        return args.sv, []
+    name, option, values = budget
+    whole = [camera for camera in cameras if isinstance(camera, Camera)]
+    times, notes = timed_here(model, whole, console) if name == "fps" and whole else (None, [])
+    calibration, machine = None if times else _calibration_for(name, option, model), ""
+    if name == "psnr_drop" and calibration is not None and calibration.against == "checkpoint":
+        notes.append("--psnr-drop uses a calibration made without photographs, against renders of the checkpoint")
+    if name == "fps" and calibration is not None:
+        machine = f" (frame times of {calibration.machine} at {calibration.width}x{calibration.height})"
+    dials = []
+    for value in values:
+        asked = f"{option} {value}" if isinstance(value, int) else f"{option} {value:g}"
+        try:
+            if times:
+                solved = dial_for_times(times, value)
+            else:
+                budgets = {name: value}
+                solved = dial_for(model.gaussians, **budgets, cameras=cameras, calibration=calibration, baked=baked)
+        except ClodError as error:
+            raise ClodError(f"{asked}: {error}{machine}") from error
+        dials.append(solved.virtual_scale)
+        note = solved.note and f" ({solved.note})"
+        notes.append(f"{asked}: s = {solved.virtual_scale:.5g}{note}{machine}")
+    return dials, notes
+
+
+def _calibration_for(name: str, option: str, model: Checkpoint) -> Calibration | None:
+    """The stored calibration, which every budget but a count needs."""
+    if model.calibration is None and name != "keep":
+        why = next((note for note in model.notes if "calibration" in note), "there is no calibration in the header")
+        raise ClodError(f"{model.path}: {option}: {why}; adapt it again, or give --sv or --keep")
+    return model.calibration
+
+
+def timed_here(
+    model: Checkpoint, cameras: Sequence[Camera], console: Console
+) -> tuple[list[tuple[float, float]], list[str]]:
+    """``budget.frame_times`` with a progress bar, and notes on the result."""
+    prepare_kernels(console, model.gaussians.means.device, training=False)
+    with console.meter("timing") as meter:
+        times, notes = frame_times(model.gaussians, cameras, progress=meter)
+    (first, slow), (last, fast) = times[0], times[-1]
+    return times, [f"frames timed here: {slow:.1f} ms at s = {first:g}, {fast:.1f} ms at s = {last:g}", *notes]
+
+
+def _interest(view: View) -> float:
+    """Contrast times detail times sharpness: a camera behind a wall sees contrasts, but no sharp ones.
+
+    The standard deviation of its image, the mean difference of neighbouring pixels, and that over the mean difference
+    of neighbouring blocks of BLOCK pixels.
+    """
+    image = view.image.float().mean(2)
+    detail, coarse = (_change(pixels) for pixels in (image, avg_pool2d(image[None], min(BLOCK, *image.shape))[0]))
+    return float(image.std()) * detail**2 / max(coarse, 1e-6)
+
+
+def _change(image: Tensor) -> float:
+    return sum(float(image.diff(dim=dim).abs().mean()) for dim in (0, 1) if image.shape[dim] > 1)
+
+
+def calibrate(rows: Sequence[Row], measured: Gaussians, scene: Scene, against: str, origin: Origin) -> Calibration:
+    """The calibration of rows measured on this machine; a ClodError if a PSNR is infinite."""
+    assert measured.attenuation is not None
+    camera, machine = scene.test[0].camera, machine_name(measured.means.device.type)
+    stored = list(spread(scene.train, VIEWPOINTS))
+    if against != "photographs":  # of placed cameras some look at little; viewers open at the first
+        stored.sort(key=_interest, reverse=True)
+    viewpoints = [viewpoint_of(each.camera, measured.means, measured.attenuation).moved(origin) for each in stored]
+    return Calibration.of(
+        rows, total=len(measured), views=len(scene.test), size=(camera.width, camera.height), machine=machine,
+        against=against, viewpoints=viewpoints,
+    )  # fmt: skip

@@ -1,20 +1,102 @@
-"""The files that a command writes: compared with existing files and with inputs, and locked, before it begins."""
+"""Output files: their names; compared with existing files and inputs, and locked, before a command begins; reports."""
 
 from __future__ import annotations
 
+import json
+import math
 import os
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
+from glob import escape
 from itertools import chain
 from pathlib import Path
+from typing import Any
 
+from clod_adapter._support.text import as_text
 from clod_adapter.errors import ClodError
-from clod_adapter.io.atomic import check_target, remove_leftovers
-from clod_adapter.io.file_formats import read_model
+from clod_adapter.io.atomic import atomic_path, check_target, remove_leftovers
+from clod_adapter.io.file_formats import check_suffix, read_model
 from clod_adapter.io.lock import output_lock
 from clod_adapter.io.scene.folder import scene_files
+
+
+@dataclass(frozen=True)
+class AdaptFiles:
+    """The three output files of adapting."""
+
+    ply: Path
+    adapter: Path
+    report: Path
+
+    @classmethod
+    def of(cls, checkpoint: str, out: str | None) -> AdaptFiles:
+        """From ``out``; by default the checkpoint's name with _clod, in the current folder."""
+        ply = Path(out or f"{Path(checkpoint).stem}_clod.ply")
+        return cls(ply, ply.with_suffix(".safetensors"), ply.with_suffix(".json"))
+
+    @property
+    def state(self) -> Path:
+        """The state for ``--resume``; exists only until the run is finished."""
+        return self.ply.with_suffix(".resume.safetensors")
+
+    def blocks(self) -> list[Path]:
+        """Existing files of an unfinished run in blocks (``adapt.block_files``)."""
+        stem = escape(self.ply.stem)
+        names = (f"{stem}.start.safetensors", f"{stem}.block*.pass*.safetensors")
+        return [path for name in names for path in self.ply.parent.glob(name)]
+
+    def names(self) -> dict[str, str]:
+        return {name: str(path) for name, path in vars(self).items()}
+
+
+def check_ply_name(path: Path, option: str) -> None:
+    if path.suffix.lower() != ".ply":
+        raise ClodError(f"{path}: {option} names the PLY to write, so it must end in .ply")
+    check_suffix(path)  # .compressed.ply
+
+
+def labels(paths: Sequence[str]) -> list[str]:
+    """A distinct label per file: its stem, with the folder's name where two stems are equal.
+
+    Raises:
+        ClodError: a file is given twice, or two labels are equal.
+    """
+    resolved = [Path(path).resolve() for path in paths]
+    if len(set(resolved)) < len(resolved):
+        raise ClodError(f"{next(p for k, p in enumerate(paths) if resolved[k] in resolved[:k])}: is given twice")
+    stems = [path.stem for path in resolved]
+    names = [f"{p.parent.name}_{p.stem}" if stems.count(p.stem) > 1 else p.stem for p in resolved]
+    for k, name in enumerate(names):
+        if name in names[:k]:
+            raise ClodError(f"{paths[k]}: has the same name as {paths[names.index(name)]}; rename one of them")
+    return names
+
+
+def size(of: Path | int) -> str:
+    """The size of a file, or a number of bytes, as text: ``4 kB``, ``12.3 MB``."""
+    count = of if isinstance(of, int) else of.stat().st_size
+    return f"{count / 1e6:.1f} MB" if count >= 1e6 else f"{max(count / 1e3, 1):.0f} kB"
+
+
+def jsonable(value: Any) -> Any:
+    """``value`` with numbers that JSON cannot represent (an infinite PSNR) as null, and file names as text."""
+    if isinstance(value, dict):
+        return {jsonable(key): jsonable(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [jsonable(entry) for entry in value]
+    if isinstance(value, str):
+        return as_text(value)
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def write_report(path: Path, report: dict[str, Any]) -> None:
+    """Writes the report as an indented JSON file."""
+    with atomic_path(path) as temporary:
+        text = json.dumps(jsonable(report), indent=2, allow_nan=False, ensure_ascii=False)
+        temporary.write_text(text + "\n", encoding="utf-8")
+
 
 # Found at the beginning of the files that clod-adapt writes: in PLY comments, metadata, pages, reports and tables. An
 # .spz is compressed; .splat, .sog and .compressed.ply have no such text.

@@ -21,8 +21,8 @@ from clod_adapter.report.page import Picture
 from clod_adapter.report.tradeoff_page import own_teacher, write_tradeoff_report
 
 from .console import Console
-from .interrupts import interrupt_as_stopped
-from .report import jsonable
+from .outputs import jsonable
+from .process import interrupt_as_stopped
 
 FRAMES = 13  # positions of the page's slider
 SNAPSHOTS = tuple(2.0**-k for k in range(6, 0, -1))  # shares of the training at which the result so far is copied

@@ -13,7 +13,7 @@ import pytest
 
 from clod_adapter.cli.main import main
 from clod_adapter.cli.shared.console import Meter
-from clod_adapter.cli.shared.report import popping_table, rows_table
+from clod_adapter.cli.shared.measure import popping_table, rows_table
 from clod_adapter.evaluation.evaluate import Row
 from clod_adapter.evaluation.popping import Popping
 

@@ -19,7 +19,7 @@ def test_oserror_is_one_line(clod: Any, capture: Any, monkeypatch: pytest.Monkey
     def full(*_: Any) -> None:
         raise OSError(28, "No space left on device", "some/file")
 
-    monkeypatch.setattr("clod_adapter.cli.shared.models.read_scene", full)
+    monkeypatch.setattr("clod_adapter.cli.shared.inputs.read_scene", full)
     done = clod("eval", capture.ply, "--images", capture.scene)
     assert (done.code, done.out) == (2, ""), done
     assert done.err.splitlines()[-1].startswith("clod-adapt: error: some/file: No space left on device; check")
@@ -50,7 +50,7 @@ def test_ctrl_c_within_compiled_code(clod: Any, capture: Any, monkeypatch: pytes
         def read(*_: object, cause: BaseException | None = cause) -> None:
             raise SystemError("returned a result with an exception set") from cause
 
-        monkeypatch.setattr("clod_adapter.cli.shared.models.read_checkpoint", read)
+        monkeypatch.setattr("clod_adapter.cli.shared.inputs.read_checkpoint", read)
         done = clod("eval", capture.ply, "--images", capture.scene)
         assert done.code == code and last in done.err.splitlines()[-1], done
 
@@ -58,7 +58,7 @@ def test_ctrl_c_within_compiled_code(clod: Any, capture: Any, monkeypatch: pytes
 def test_unexpected_error_prints_a_traceback_and_where_to_report_it(
     clod: Any, capture: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("clod_adapter.cli.shared.models.read_checkpoint", fail)
+    monkeypatch.setattr("clod_adapter.cli.shared.inputs.read_checkpoint", fail)
     done = clod("eval", capture.ply, "--images", capture.scene, "--json", "--quiet")
     lines = done.err.splitlines()
     assert done.code == 1 and lines[0] == "Traceback (most recent call last):", done
@@ -80,7 +80,7 @@ def test_errors_are_one_json_object(clod: Any, capture: Any, monkeypatch: pytest
         def read(*_: object, error: BaseException = error) -> None:
             raise error
 
-        monkeypatch.setattr("clod_adapter.cli.shared.models.read_scene", read)
+        monkeypatch.setattr("clod_adapter.cli.shared.inputs.read_scene", read)
         done = clod(*words)
         found = json.loads(done.out)
         assert done.code == found["code"] == code and found["error"].startswith(said), done

@@ -17,7 +17,7 @@ from plyfile import PlyData, PlyElement
 import scenes
 from clod_adapter.adapter import detach, extract, with_dial
 from clod_adapter.cli.inspect import lines_of
-from clod_adapter.cli.shared.report import jsonable
+from clod_adapter.cli.shared.outputs import jsonable
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.inspection.report import Inspection, inspect

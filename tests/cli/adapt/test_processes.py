@@ -17,7 +17,7 @@ import torch
 import clod_adapter
 from clod_adapter.cli.commands.settings import make_config
 from clod_adapter.cli.main import build_parser
-from clod_adapter.cli.shared.launch import Launch, launched
+from clod_adapter.cli.shared.process import Launch, launched
 from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.training.state_file import load_state

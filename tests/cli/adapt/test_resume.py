@@ -29,7 +29,7 @@ from clod_adapter.cli.adapt.resume import Resumed, RunKey, find_state, identify
 from clod_adapter.cli.adapt.saver import Saver
 from clod_adapter.cli.shared import inputs
 from clod_adapter.cli.shared.console import Console
-from clod_adapter.cli.shared.interrupts import GracefulStop
+from clod_adapter.cli.shared.process import GracefulStop
 from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians

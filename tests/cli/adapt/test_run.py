@@ -22,7 +22,7 @@ from clod_adapter.cli.adapt import inputs, result, setup
 from clod_adapter.cli.adapt import report as reporting
 from clod_adapter.cli.main import main
 from clod_adapter.cli.shared import measure
-from clod_adapter.cli.shared.report import machine_name, report_dials
+from clod_adapter.cli.shared.measure import machine_name, report_dials
 from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.io.scene.colmap import write_model

@@ -20,7 +20,7 @@ from plyfile import PlyData, PlyElement
 import clod_adapter
 from clod_adapter.calibration import Calibration, CalibrationRow, Viewpoint
 from clod_adapter.cli.commands.export_formats import FORMATS, PACKED, level_paths, suffix_of
-from clod_adapter.cli.shared import budgets
+from clod_adapter.cli.shared import measure as budgets
 from clod_adapter.errors import ClodError
 from clod_adapter.io.checkpoint import load, save
 from clod_adapter.io.file_formats import FORMATS as FILE_FORMATS

@@ -13,8 +13,8 @@ import pytest
 import clod_adapter
 from clod_adapter.cli import view
 from clod_adapter.cli.main import build_parser
-from clod_adapter.cli.shared import budgets
-from clod_adapter.cli.shared.options import DEVICES
+from clod_adapter.cli.shared import measure as budgets
+from clod_adapter.cli.shared.command import DEVICES
 from clod_adapter.io.checkpoint import load, save
 from runs import notes_of
 

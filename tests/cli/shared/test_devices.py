@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from clod_adapter.cli.main import main
-from clod_adapter.cli.shared import devices
+from clod_adapter.cli.shared import inputs as devices
 from clod_adapter.cli.shared.console import Console
-from clod_adapter.cli.shared.devices import pick_device
+from clod_adapter.cli.shared.inputs import pick_device
 from clod_adapter.errors import ClodError
 
 

@@ -14,7 +14,7 @@ from numba.core.dispatcher import Dispatcher
 import clod_adapter
 from clod_adapter import _kernels
 from clod_adapter.cli.shared.console import Console
-from clod_adapter.cli.shared.kernels import OTHER, SHARES, announced_compiling, prepare_kernels
+from clod_adapter.cli.shared.inputs import OTHER, SHARES, announced_compiling, prepare_kernels
 
 
 def kernels() -> dict[str, Dispatcher]:
@@ -51,7 +51,7 @@ def test_compiling_is_announced_once(kept: bool, capsys: pytest.CaptureFixture[s
     monkeypatch.setattr("clod_adapter.cli.shared.console.LINE_EVERY", 0)
     inner = numba.njit(lambda x: x + 1)
     function = numba.njit(lambda x: inner(x))
-    monkeypatch.setattr("clod_adapter.cli.shared.kernels.NullCache", () if kept else object)
+    monkeypatch.setattr("clod_adapter.cli.shared.inputs.NullCache", () if kept else object)
     with announced_compiling(Console(), {OTHER: 0.25}):
         function(1)
         function(1.0)

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from clod_adapter.cli import inspect as inspect_command
-from clod_adapter.cli.shared.shortages import shortage
+from clod_adapter.cli.shared.process import shortage
 from clod_adapter.errors import ClodError
 from clod_adapter.io.scene import images
 from clod_adapter.io.scene.images import read_image
@@ -45,9 +44,9 @@ def test_address_space_too_small_for_the_libraries(capture: Any, tmp_path: Path)
 def test_limit_reached_during_the_work(capture: Any) -> None:
     """torch's allocator raises a RuntimeError."""
     code = (
-        "import torch\nfrom clod_adapter.cli import inspect\n"
-        "def run(args): limit(); torch.zeros(1 << 32)\n"
-        "inspect.run = run\nsys.exit(main())"
+        "import torch\nfrom clod_adapter.inspection import report\n"
+        "def inspect(path): limit(); torch.zeros(1 << 32)\n"
+        "report.inspect = inspect\nsys.exit(main())"
     )
     done = limited(8_000_000, code, "inspect", capture.ply)
     assert (done.returncode, done.stdout) == (2, "")
@@ -71,7 +70,7 @@ def test_errors_of_a_shortage(clod: Any, capture: Any, monkeypatch: pytest.Monke
     def run(_: object) -> None:
         raise error
 
-    monkeypatch.setattr(inspect_command, "run", run)
+    monkeypatch.setattr("clod_adapter.inspection.report.inspect", run)
     done = clod("inspect", capture.ply)
     assert done.code == 2 and done.err.startswith("clod-adapt: error: not enough memory ("), done
     assert done.err.endswith("); free some memory\n")

@@ -1,0 +1,258 @@
+"""The process: its streams, signals and limits, and its place among those of torchrun."""
+
+from __future__ import annotations
+
+import errno
+import io
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from dataclasses import dataclass
+from types import FrameType
+from typing import Any, TextIO
+
+from clod_adapter.blocks.memory import in_words
+from clod_adapter.errors import ClodError
+from clod_adapter.progress import Listener, Progress, Stopped
+from clod_adapter.training.interrupts import ENDING, PRESSED
+
+
+class Stream:
+    """A text stream that raises no OSError: it keeps the first one as ``error`` and discards what follows."""
+
+    def __init__(self, stream: TextIO | None) -> None:
+        self.error: OSError | None = None
+        if stream is None:  # Python's, where the shell closed it
+            stream, self.error = open(os.devnull, "w"), OSError(errno.EBADF, "it is closed")  # noqa: SIM115
+        elif isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # characters that its encoding lacks, as in names of files
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        return self._try(lambda: self._stream.write(text)) or 0
+
+    def flush(self) -> None:
+        self._try(self._stream.flush)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def _try(self, call: Callable[[], int | None]) -> int | None:
+        try:
+            return call()
+        except OSError as error:
+            self.error = error
+            with open(os.devnull, "w") as nowhere:  # Python flushes what is left again when it exits
+                os.dup2(nowhere.fileno(), self._stream.fileno())
+            return None
+
+
+@contextmanager
+def unbreakable_streams() -> Iterator[None]:
+    """Within the block sys.stdout and sys.stderr are Streams."""
+    for number in range(3):  # a file that is opened later must not get the number of a closed stream
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)
+    before = sys.stdout, sys.stderr
+    out, err = streams = Stream(sys.stdout), Stream(sys.stderr)
+    sys.stdout, sys.stderr = streams  # type: ignore[assignment]
+    try:
+        yield
+    finally:
+        out.flush()
+        err.flush()
+        sys.stdout, sys.stderr = before
+
+
+def check_printed() -> None:
+    """Refuses a stdout that did not take all that was printed."""
+    sys.stdout.flush()
+    if error := getattr(sys.stdout, "error", None):  # not of a redirected one
+        raise ClodError(f"stdout cannot be written ({error.strerror or error}), so the result is lost; open it")
+
+
+class GracefulStop:
+    """Counts signals. The first one requests a stop after the step under way.
+
+    The second Ctrl-C or SIGTERM raises KeyboardInterrupt. The other signals are repeated, and do not.
+
+    Args:
+        aborts: whether the second one does. Launchers repeat all signals, so their processes do not abort.
+        presses: of Ctrl-C or SIGTERM before.
+    """
+
+    def __init__(self, aborts: bool = True, presses: int = 0) -> None:
+        self.requests, self.aborts, self.presses = 0, aborts, presses
+
+    @property
+    def aborted(self) -> bool:
+        """Whether the user does not want anything to be written."""
+        return self.aborts and self.presses > 1
+
+    def heeding(self, display: Listener | None = None) -> Listener:
+        """The listener that calls ``display`` and stops once a signal has arrived."""
+
+        def listen(now: Progress) -> bool:
+            return (display is None or display(now) is not False) and self.requests == 0
+
+        return listen
+
+    @contextmanager
+    def listening(self) -> Iterator[None]:
+        with _handled_by(self._request):
+            yield
+
+    def _request(self, number: int, frame: FrameType | None) -> None:
+        self.requests += 1
+        self.presses += number in PRESSED
+        if self.aborted and number in PRESSED:
+            raise KeyboardInterrupt
+
+
+@contextmanager
+def interrupt_as_stopped() -> Iterator[None]:
+    """Within the block Ctrl-C raises Stopped. From the dispatcher of a compiled function it comes as a SystemError."""
+    try:
+        yield
+    except KeyboardInterrupt as error:
+        raise Stopped("interrupted") from error
+    except SystemError as error:
+        if not isinstance(error.__cause__, KeyboardInterrupt):
+            raise
+        raise Stopped("interrupted") from error
+
+
+@contextmanager
+def signals_as_interrupt() -> Iterator[None]:
+    """Within the block all raise KeyboardInterrupt. Enter it after importing pycolmap, which sets a handler."""
+    with _handled_by(signal.default_int_handler):
+        yield
+
+
+def listen_no_more() -> None:
+    """Ignores all until the process ends, also after the blocks above."""
+    for number in ENDING:
+        signal.signal(number, signal.SIG_IGN)
+
+
+@contextmanager
+def _handled_by(handler: Callable[[int, FrameType | None], Any]) -> Iterator[None]:
+    if threading.current_thread() is not threading.main_thread():  # Python allows handlers only there
+        yield
+        return
+    heard = [n for n in ENDING if n == signal.SIGTERM or signal.getsignal(n) is not signal.SIG_IGN]
+    before = {number: signal.signal(number, handler) for number in heard}
+    try:
+        yield
+    finally:
+        for number, earlier in before.items():
+            if signal.getsignal(number) is handler:  # not after listen_no_more
+                signal.signal(number, earlier)
+
+
+ADDRESSES = 1_800_000_000  # bytes of address space that the libraries and the smallest run need
+# In RuntimeErrors (torch's allocators, Python's threads) and ImportErrors (the loader's).
+MESSAGES = (
+    "can't allocate memory", "not enough memory", "out of memory", "std::bad_alloc", "can't start new thread",
+    "failed to map segment", "cannot allocate memory",
+)  # fmt: skip
+LLVM = "libllvmlite"  # reported as not found where it could not be mapped
+
+
+def check_surroundings() -> None:
+    """Refuses what makes libraries abort the process, or raise an error of their own.
+
+    That is a current folder that was deleted, and a limit of the address space (``ulimit -v``) that is too small.
+    Variables of what is not used here, numba's threads and matplotlib's windows, are removed.
+    """
+    for name in ("NUMBA_NUM_THREADS", "MPLBACKEND"):
+        os.environ.pop(name, None)
+    try:
+        os.getcwd()
+    except FileNotFoundError as error:
+        raise ClodError("the current folder was deleted; change to another one") from error
+    limit = address_limit()
+    if limit is not None and limit < ADDRESSES:
+        raise ClodError(
+            f"the address space is limited to {in_words(limit)} (ulimit -v), but torch and LLVM need "
+            f"{in_words(ADDRESSES)}; raise the limit"
+        )
+
+
+def address_limit() -> int | None:
+    """The limit in bytes; None without one."""
+    if sys.platform == "win32":
+        return None
+    import resource
+
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    return None if limit == resource.RLIM_INFINITY else limit
+
+
+def shortage(error: BaseException) -> str | None:
+    """The shortage and its remedy in one line; None for another error."""
+    text = (str(error) or "allocating").splitlines()[0]
+    if isinstance(error, OSError):
+        short = error.errno == errno.ENOMEM or (LLVM in text and address_limit() is not None)
+    else:
+        short = isinstance(error, MemoryError) or any(message in str(error).lower() for message in MESSAGES)
+    if not short:
+        return None
+    limit = address_limit()
+    more = "free some memory"
+    if limit is not None:
+        more = f"raise the limit of {in_words(limit)} on the address space (ulimit -v)"
+    return f"not enough memory ({text[:200]}); {more}"
+
+
+NEEDED = ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")
+
+
+@dataclass(frozen=True)
+class Launch:
+    """The place of this process in its group.
+
+    Attributes:
+        rank, size: index of this process, from 0, and number of processes.
+        local_rank, local_size: the same among the processes on this machine.
+    """
+
+    rank: int = 0
+    size: int = 1
+    local_rank: int = 0
+    local_size: int = 1
+
+
+def launched() -> Launch:
+    """Reads the environment variables; a single process without them.
+
+    Raises:
+        ClodError: their values are inconsistent.
+    """
+    if not all(name in os.environ for name in NEEDED):
+        return Launch()
+    names = ("RANK", "WORLD_SIZE", "LOCAL_RANK", "LOCAL_WORLD_SIZE")
+    found = {name: os.environ[name] for name in names if name in os.environ}
+    try:
+        launch = Launch(*(int(found.get(name, default)) for name, default in zip(names, (0, 1, 0, 1), strict=True)))
+    except ValueError:
+        launch = Launch(-1)
+    if not 0 <= launch.rank < launch.size or not 0 <= launch.local_rank < launch.local_size:
+        shown = ", ".join(f"{name}={value}" for name, value in found.items())
+        raise ClodError(f"inconsistent environment variables: {shown}; start the processes with torchrun")
+    return launch
+
+
+@contextmanager
+def silence_but_first() -> Iterator[None]:
+    """Within the block, only the first of several processes prints; an exception that leaves it is not silenced."""
+    if os.environ.get("RANK", "0") == "0" or not all(name in os.environ for name in NEEDED):
+        yield
+        return
+    with open(os.devnull, "w") as nowhere, redirect_stdout(nowhere), redirect_stderr(nowhere):
+        yield
