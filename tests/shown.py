@@ -6,7 +6,6 @@ import base64
 import io
 import json
 import threading
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -29,14 +28,6 @@ TALL = {"width": 640, "height": 600}  # the whole panel is shown
 WITHIN = 45.0  # dB between the page and our renderer
 COUNTS = 1e-3  # of the count
 SECONDS = 10  # until waiting ends
-# A script that hides from a page that Chromium's WebGL and WebGPU are software, on which the page does not sort.
-REAL_GPU = """
-    Object.defineProperty(GPUAdapterInfo.prototype, "isFallbackAdapter", { get: () => false });
-    const { getParameter: named } = WebGL2RenderingContext.prototype;
-    WebGL2RenderingContext.prototype.getParameter = function (name) {
-        return name === 0x9246 ? "a GPU" : named.call(this, name); // UNMASKED_RENDERER_WEBGL
-    };
-"""
 
 
 @dataclass
@@ -103,21 +94,17 @@ def assert_same(shown: Shown, wanted: Rendering, keep: Path) -> None:
     assert abs(counts["kept"] - kept) <= COUNTS * kept and counts["total"] == len(wanted.kept)
 
 
-def drop(shown: Shown, name: str, data: bytes, *, wait: int = 0, fails: bool = False) -> None:
-    """Drops a file on the page that can be read after ``wait`` milliseconds, or never."""
-    script = """([name, data, wait, fails]) => {
-        const all = new DataTransfer();
-        all.items.add(new File([Uint8Array.from(atob(data), (letter) => letter.charCodeAt(0))], name));
-        const event = new DragEvent("drop", { dataTransfer: all, bubbles: true, cancelable: true });
-        if (wait || fails) {
-            const file = all.files[0], read = file.arrayBuffer.bind(file);
-            const later = new Promise((resolve) => setTimeout(resolve, wait));
-            file.arrayBuffer = () => later.then(() => fails ? Promise.reject(new DOMException("")) : read());
-            Object.defineProperty(event, "dataTransfer", { value: { files: [file] } });
-        }
+def drop(shown: Shown, name: str, data: bytes, *, wait: int = 0) -> None:
+    """Drops a file on the page that can be read after ``wait`` milliseconds; a name without a suffix never can be."""
+    script = """([name, data, wait]) => {
+        const file = new File([Uint8Array.from(atob(data), (letter) => letter.charCodeAt(0))], name);
+        const read = file.arrayBuffer.bind(file), later = new Promise((resolve) => setTimeout(resolve, wait));
+        file.arrayBuffer = () => later.then(() => name.includes(".") ? read() : Promise.reject(new DOMException("")));
+        const event = new DragEvent("drop", { bubbles: true, cancelable: true });
+        Object.defineProperty(event, "dataTransfer", { value: { files: [file] } });
         document.body.dispatchEvent(event);
     }"""
-    shown.page.evaluate(script, [name, base64.b64encode(data).decode(), wait, fails])
+    shown.page.evaluate(script, [name, base64.b64encode(data).decode(), wait])
 
 
 def message(shown: Shown, name: str) -> str:
@@ -141,16 +128,6 @@ def take(shown: Shown, path: Path) -> None:
     """Shows another file in the tab, by the page's own function, and waits until it is drawn."""
     script = "clod.load(Uint8Array.from(atob(given[1]), (letter) => letter.charCodeAt(0)).buffer, given[0])"
     shown.run(script, [path.name, base64.b64encode(path.read_bytes()).decode()])
-
-
-def sorts_on_gpu(shown: Shown, seconds: float = SECONDS) -> bool:
-    """Waits until WebGPU sorts the model of the page; False if it never does."""
-    until = time.monotonic() + seconds
-    while not shown.run("clod.order()")["onGpu"]:
-        if time.monotonic() > until:
-            return False
-        shown.page.wait_for_timeout(50)
-    return True
 
 
 @contextmanager

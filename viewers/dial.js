@@ -3,16 +3,12 @@ import { countAt, dialForCount, extinctionScales, growthDistance, prepare } from
 import { createHold } from "./frame_rate.js";
 import { binaryColumns, constantsOf, readHeader } from "./ply.js";
 import { readSettings } from "./settings.js";
-import { layoutOf, readPositions, readRecord } from "./spz.js";
+import { inflate, layoutOf, readPositions, readRecord } from "./spz.js";
 
 /** Reads the dial of an adapted PLY or SPZ (bytes): {count, means, opacityLogits, sigma, growth, settings}. */
 export async function readDial(bytes) {
   const data = new Uint8Array(bytes.buffer ?? bytes, bytes.byteOffset ?? 0, bytes.byteLength);
-  if (data[0] === 0x1f && data[1] === 0x8b) {
-    const stream = new Blob([data]).stream().pipeThrough(new DecompressionStream("gzip"));
-    return ofSpz(new Uint8Array(await new Response(stream).arrayBuffer()));
-  }
-  return ofPly(data);
+  return data[0] === 0x1f && data[1] === 0x8b ? ofSpz(await inflate(data)) : ofPly(data);
 }
 
 function ofPly(bytes) {
@@ -61,12 +57,12 @@ export function constants({ settings }) {
 }
 
 /** Turns the dial of a model in a viewer. `eye()`: the camera in the file's coordinates; `show(s)`: draws with s;
- *  `timer.measure(draw, true)`: milliseconds of a frame's work. */
+ *  `time(draw)`: milliseconds of a frame's work, or a promise of these. */
 export class Dial {
   #hold = null;
 
-  constructor(file, { eye, show, timer }) {
-    Object.assign(this, { file, eye, show, timer, s: 1 });
+  constructor(file, { eye, show, time }) {
+    Object.assign(this, { file, eye, show, time, s: 1 });
     show(1);
   }
 
@@ -91,9 +87,9 @@ export class Dial {
     const hold = this.#hold;
     if (!hold || hold.busy) return draw();
     hold.busy = true;
-    const milliseconds = await this.timer.measure(draw, true);
+    const milliseconds = await this.time(draw);
     hold.busy = false;
-    if (hold === this.#hold && milliseconds !== null) this.#turn(hold.took(this.s, milliseconds, this.file.settings.max_sv));
+    if (hold === this.#hold) this.#turn(hold.took(this.s, milliseconds, this.file.settings.max_sv));
   }
 
   #turn(s) {

@@ -4,7 +4,7 @@ import { Dial, checked, constants, texels } from "./dial.js";
 import { constantsOf } from "./ply.js";
 import { readSettings } from "./settings.js";
 import { glsl, wgsl } from "./shaders.js";
-import { createTimer } from "./timer.js";
+import { timed, timedByQueue } from "./timer.js";
 
 /** Attaches the dial of an adapted PLY to an entity with its gsplat; distances are from `camera`, an entity. */
 export function attach(app, entity, camera) {
@@ -29,7 +29,8 @@ export function attach(app, entity, camera) {
     gsplat.workBufferUpdate = WORKBUFFER_UPDATE_ONCE;
   };
   app.on("prerender", update);
-  const dial = new Dial(file, { eye, show: (value) => (scale = value), timer: createTimer(app.graphicsDevice.gl, app.graphicsDevice.wgpu) });
+  const { gl, wgpu } = app.graphicsDevice, time = (draw) => (gl ? timed(gl, draw) : timedByQueue(wgpu, draw));
+  const dial = new Dial(file, { eye, show: (value) => (scale = value), time });
   const render = app.render.bind(app);
   app.render = () => void dial.frame(render);
   return dial;

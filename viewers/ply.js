@@ -6,10 +6,8 @@ const TYPES = {
 };
 const HEADER_LIMIT = 1 << 20;
 
-
-/** The header: {elements: [{name, count, properties: [{name, type, size, offset}], size}], format, comments, length}.
- *  `prefix`: `bytes` are the first ones of a file, whose count is that of its complete rows. */
-export function readHeader(bytes, prefix = false) {
+/** The header: {elements: [{name, count, properties: [{name, type, size, offset}], size}], format, comments, length}. */
+export function readHeader(bytes) {
   const text = new TextDecoder("latin1").decode(bytes.subarray(0, HEADER_LIMIT));
   const end = /[\r\n]end_header(\r\n|\n|\r)/.exec(text);
   if (!end) throw new Error("the PLY header has no end_header line, so the file is truncated; copy or export it again");
@@ -31,8 +29,6 @@ export function readHeader(bytes, prefix = false) {
       throw new Error(`the PLY header is damaged ("${line.slice(0, 40)}"); export the file again`);
     }
   }
-  const [first] = header.elements;
-  if (prefix) first.count = Math.min(first.count, Math.floor((bytes.length - header.length) / first.size));
   return header;
 }
 

@@ -26,28 +26,17 @@ export function readSettings(comments, constants = {}) {
 
 function ofColumns({ clod_tau, clod_eps, clod_hard_cut, clod_quantile, clod_max, clod_reference_distance }) {
   const found = {};
-  if (clod_tau !== undefined) found.tau = shortest(clod_tau);
-  if (clod_eps !== undefined) found.eps = shortest(clod_eps);
+  if (clod_tau !== undefined) found.tau = clod_tau;
+  if (clod_eps !== undefined) found.eps = clod_eps;
   if (clod_hard_cut) found.cut = "hard";
-  if (clod_quantile !== undefined) Object.assign(found, { normalizer: "quantile", quantile: shortest(clod_quantile) });
+  if (clod_quantile !== undefined) Object.assign(found, { normalizer: "quantile", quantile: clod_quantile });
   if (clod_max) found.normalizer = "max";
-  if (clod_reference_distance !== undefined) found.reference_distance = shortest(clod_reference_distance);
+  if (clod_reference_distance !== undefined) found.reference_distance = clod_reference_distance;
   return found;
 }
 
-/** The shortest decimal that rounds to `value` in float32; if it has more than six digits and 1/n rounds to it too, 1/n. */
-function shortest(value) {
-  for (let digits = 1; digits <= 9; digits++) {
-    const decimal = Number(value.toPrecision(digits));
-    if (Math.fround(decimal) !== value) continue;
-    const fraction = 1 / Math.round(1 / decimal);
-    return digits > 6 && Math.fround(fraction) === value ? fraction : decimal;
-  }
-  return value;
-}
-
 /** The screen-space filter from comments, ours or another program's, or from columns; as in io/screen_filter.py. */
-export function readScreenFilter({ comments, constants: { clod_screen_variance, clod_compensate } = {}, impliedFilter }, hasDial) {
+export function readScreenFilter({ comments, constants: { clod_screen_variance, clod_compensate } = {} }, hasDial) {
   const written = entries(comments).findLast(([name]) => name === "screen_filter")?.[1];
   if (written) {
     const [, variance, compensate] = /^(\S+) (True|False)$/.exec(written) ?? [];
@@ -55,23 +44,19 @@ export function readScreenFilter({ comments, constants: { clod_screen_variance, 
     return { variance: Number(variance), compensate: compensate === "True" };
   }
   if (clod_screen_variance !== undefined || clod_compensate) {
-    return { variance: clod_screen_variance === undefined ? 0.3 : shortest(clod_screen_variance), compensate: Boolean(clod_compensate) };
+    return { variance: clod_screen_variance ?? 0.3, compensate: Boolean(clod_compensate) };
   }
   // A dial was trained with the default filter, unless the file names another.
-  if (impliedFilter && !hasDial) return impliedFilter;
   const compensate = !hasDial && comments.some((comment) => /^\s*(splatrendermode:\s*mip|antialiased 1)\s*$/i.test(comment));
   return { variance: compensate && comments.includes("Exported from Brush") ? 0.1 : 0.3, compensate };
 }
 
-/** Rows {virtual_scale, count, psnr}; none without a table, or if the number of Gaussians is not the table's. */
+/** Rows {virtual_scale, psnr}; none without a table, or if the number of Gaussians is not the table's. */
 export function readCalibration(comments, total) {
-  const found = entries(comments);
-  const extent = found.find(([name]) => name === "calibrated_with");
+  const found = entries(comments), extent = found.find(([name]) => name === "calibrated_with");
   if (!extent || Number(extent[1].split(" ")[0]) !== total) return [];
-  return found
-    .filter(([name]) => name === "calibrated")
-    .map(([, value]) => value.split(/\s+/).map(Number))
-    .map(([virtual_scale, count, psnr]) => ({ virtual_scale, count, psnr }));
+  const rows = found.filter(([name]) => name === "calibrated").map(([, value]) => value.split(/\s+/).map(Number));
+  return rows.map(([virtual_scale, , psnr]) => ({ virtual_scale, psnr }));
 }
 
 function entries(comments) {

@@ -3,7 +3,7 @@ import { dyno } from "@sparkjsdev/spark";
 import { DataTexture, FloatType, RGFormat } from "three";
 import { Dial, constants, readDial, texels } from "./dial.js";
 import { glsl } from "./shaders.js";
-import { createTimer } from "./timer.js";
+import { timed } from "./timer.js";
 
 const WIDTH = 2048; // of the texture
 
@@ -27,7 +27,7 @@ export async function attach(mesh, bytes, renderer) {
     mesh.updateVersion();
   };
   const place = () => eye.value.toArray();
-  return new Dial(file, { eye: place, show, timer: createTimer(renderer.getContext()) });
+  return new Dial(file, { eye: place, show, time: (draw) => timed(renderer.getContext(), draw) });
 }
 
 function attenuated(file) {

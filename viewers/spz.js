@@ -4,6 +4,11 @@
 const MAGIC = 0x5053474e, HEADER = 16;
 const EXTENDED = 2, RECORD = 0x434c0001; // flag: vendor records; type of our record
 
+export async function inflate(bytes) {
+  const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
+  return new Uint8Array(await new Response(stream).arrayBuffer());
+}
+
 /** {view, version, count, degree, starts}: the offsets of positions, opacities, colours, scales, rotations, harmonics,
  *  and of what follows these arrays. */
 export function layoutOf(bytes) {

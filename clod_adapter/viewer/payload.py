@@ -20,7 +20,6 @@ from clod_adapter._support.text import as_text
 from clod_adapter._support.version import package_version
 from clod_adapter.calibration import Calibration
 from clod_adapter.cameras import Camera
-from clod_adapter.config import DEVICES
 from clod_adapter.gaussians import OPAQUE, Gaussians
 from clod_adapter.io.checkpoint import Checkpoint, load
 from clod_adapter.io.file_formats import write
@@ -120,7 +119,7 @@ def page_config(
     return {
         "version": package_version(), "title": model["name"], "model": model, "base": base,
         "others": list(others), "cameras": [_camera(camera) | {"placed": placed} for camera in cameras],
-        "devices": DEVICES, "virtual_scale": virtual_scale,
+        "virtual_scale": virtual_scale,
     }  # fmt: skip
 
 

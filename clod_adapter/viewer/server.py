@@ -22,7 +22,6 @@ from clod_adapter.errors import ClodError
 
 HOST = "127.0.0.1"
 LOOPBACK = re.compile(r"(127\.0\.0\.1|localhost)(:\d{1,5})?", re.ASCII)
-RANGE = re.compile(r"bytes=(\d{1,18})-(\d{1,18})", re.ASCII)  # of a request for a part of a response
 IDLE_TIMEOUT = 30  # of a connection between responses, seconds
 
 
@@ -134,22 +133,14 @@ class _Handler(BaseHTTPRequestHandler):
         if response is None:
             self.send_error(HTTPStatus.NOT_FOUND)
             return
-        first, last = part_of(self.headers.get("Range", ""), response.size)
-        whole = last - first + 1 == response.size
-        self.send_response(HTTPStatus.OK if whole else HTTPStatus.PARTIAL_CONTENT)
+        self.send_response(HTTPStatus.OK)
         self.send_header("Content-Type", response.media_type)
-        self.send_header("Content-Length", str(last - first + 1))
-        if not whole:
-            self.send_header("Content-Range", f"bytes {first}-{last}/{response.size}")
+        self.send_header("Content-Length", str(response.size))
         self.send_header("Content-Security-Policy", f"{response.policy}; frame-ancestors 'none'")
         self.end_headers()
         self.connection.settimeout(None)  # a page that is busy with a file's first rows takes no bytes
-        at = 0
         for block in response.blocks() if body else ():
-            self.wfile.write(block[max(first - at, 0) : max(last + 1 - at, 0)])
-            at += len(block)
-            if at > last:
-                break
+            self.wfile.write(block)
         self.connection.settimeout(self.timeout)
 
     def end_headers(self) -> None:
@@ -163,13 +154,6 @@ class _Handler(BaseHTTPRequestHandler):
 
     def log_message(self, format: str, *args: Any) -> None:
         """Requests are not logged."""
-
-
-def part_of(range_: str, size: int) -> tuple[int, int]:
-    """The first and the last byte that a Range header asks for; those of the whole where it asks for no such part."""
-    asked = RANGE.fullmatch(range_.strip())
-    first, last = (int(asked[1]), min(int(asked[2]), size - 1)) if asked else (0, size - 1)
-    return (first, last) if first <= last else (0, size - 1)
 
 
 def names_loopback(hosts: list[str]) -> bool:

@@ -34,32 +34,31 @@ def tabs(chromium: Any) -> Iterator[Any]:
 
 
 @pytest.fixture
-def tab(tabs: Any) -> Iterator[Any]:
-    """A blank tab of the size SIZE, closed after the test."""
-    page = tabs.new_page()
-    page.set_viewport_size(SIZE)
-    yield page
-    page.close()
-
-
-@pytest.fixture
 def show(tabs: Any) -> Iterator[Callable[..., Shown]]:
     """Opens a tab with the files of a ``clod-adapt view`` command line; an error in its console fails the test."""
     with ExitStack() as stack:
         opened: list[tuple[Shown, str]] = []
 
-        def start(*words: object, address: str = "", viewport: Any = SIZE, context: Any = tabs) -> Shown:
-            url = stack.enter_context(serve(*words))
+        def start(
+            *words: object,
+            url: str = "",
+            address: str = "",
+            viewport: Any = SIZE,
+            context: Any = tabs,
+            script: str = "",
+        ) -> Shown:
+            url = url or stack.enter_context(serve(*words))
             shown = Shown(context.new_page())
             stack.callback(shown.page.close)
             shown.page.set_viewport_size(viewport)
+            shown.page.add_init_script(script)
             opened.append((shown, url))
             return shown.ready(url + address)
 
         yield start
         for shown, url in opened:
             assert shown.errors == []
-            foreign = [each for each in shown.asked if not each.startswith((url, "data:", f"blob:{url}"))]
+            foreign = [each for each in shown.asked if not each.startswith((url, "data:", "blob:"))]
             assert foreign == []
 
 

@@ -1,4 +1,4 @@
-"""The text of the page: its parts, sources, colours and security policy."""
+"""The page's text, the page as one file, and its messages."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import json
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,92 +18,169 @@ from PIL import Image
 
 import clod_adapter
 import scenes
+from clod_adapter.calibration import Calibration, CalibrationRow
+from clod_adapter.equation.attenuation import dial
+from clod_adapter.gaussians import Gaussians
 from clod_adapter.render import render
 from clod_adapter.viewer import page, payload
-from clod_adapter.viewer.payload import Payload, page_config
+from clod_adapter.viewer.payload import page_config
+from shown import SIZE, Shown, assert_same, serve
 
-PACKAGE = Path(clod_adapter.__file__).parent
-NASTY = "a</script><!--<script>alert(1)</script>&amp;'\".ply"
-
-
-def element(text: str, name: str) -> str:
-    """The content of the script element with this id."""
-    (found,) = re.findall(rf'<script type="[a-z/-]+" id="{name}">(.*?)</script>', text, re.DOTALL)
-    return str(found)
+VIEWER = Path(clod_adapter.__file__).parent / "viewer"
+NAME = "<img src=x onerror=clod=1><script>clod=1<!script>&amp;'\".ply"
 
 
-def test_parts_are_in_their_places_and_built_from_these_sources() -> None:
+def test_parts_are_built_from_these_sources() -> None:
     """After a change of the sources: npm ci && npm run build, in clod_adapter/viewer/web."""
-    for place in page.PLACEHOLDERS:
-        assert page._static_file(page.PAGE).count(place) == 1
-    where = [page._static_file(page.PAGE).index(place) for place in page.PLACEHOLDERS]
-    assert where == sorted(where)
-    for name in (page.PAGE, page.STYLE, page.SCRIPT):
-        assert not re.search(r"""(?:src|href)=["']?https?:|@import|url\(["']?https?:""", page._static_file(name)), name
-    assert not re.search("</script|<!--", page._static_file(page.SCRIPT)) and "</style" not in page._static_file(
-        page.STYLE
-    )
-    web = PACKAGE / "viewer" / "web"
+    texts = {name: (VIEWER / "static" / name).read_text() for name in ("page.html", "viewer.css", "viewer.js")}
+    for name, text in texts.items():
+        assert not re.search(r"""(?:src|href)=["']?https?:|@import|url\(["']?https?:""", text), name
+    assert not re.search("</script|<!--", texts["viewer.js"]) and "</style" not in texts["viewer.css"]
+    web = VIEWER / "web"
     if not web.is_dir():
         pytest.skip("only a checkout contains the sources of the page")
-    lines = (PACKAGE / "viewer" / "static" / "SOURCES.sha256").read_text(encoding="utf-8").splitlines()
+    lines = (VIEWER / "static" / "SOURCES.sha256").read_text(encoding="utf-8").splitlines()
     listed = {(web / name).resolve(): digest for digest, name in (line.split("  ") for line in lines)}
     assert {path for path in (web / "src").rglob("*.*") if path.is_file()} <= set(listed)
     for path, digest in listed.items():
         assert hashlib.sha256(path.read_bytes()).hexdigest() == digest, f"{path} has changed since: build again"
 
 
-def colours(path: Path) -> list[dict[str, str]]:
-    """The colours by name of a style, minified or not: light and dark."""
-    style = re.sub(r"#fff(?=[;}])", "#ffffff", re.sub(r"\s", "", path.read_text(encoding="utf-8")))
-    blocks = re.findall(r":root\{(.*?)\}", style)
-    assert len(blocks) == 2
-    return [dict(re.findall(r"--([\w-]+):(#\w+)", block)) for block in blocks]
-
-
 def test_colours_are_those_of_the_report() -> None:
-    styles = (PACKAGE / "viewer" / "static" / "viewer.css", PACKAGE / "report" / "style.css")
-    for ours, theirs in zip(*map(colours, styles), strict=True):
-        assert {"paper", "card", "ink", "quiet", "line", "accent"} == set(ours)
-        assert ours.items() <= theirs.items()
+    styles = []
+    for path in (VIEWER / "static" / "viewer.css", VIEWER.parent / "report" / "style.css"):
+        style = re.sub(r"#fff(?=[;}])", "#ffffff", re.sub(r"\s", "", path.read_text(encoding="utf-8")))
+        styles.append([dict(re.findall(r"--([\w-]+):(#\w+)", block)) for block in re.findall(r":root\{(.*?)\}", style)])
+    for ours, theirs in zip(*styles, strict=True):
+        assert {"paper", "card", "ink", "quiet", "line", "accent"} == set(ours) and ours.items() <= theirs.items()
 
 
-def test_a_name_cannot_end_its_element() -> None:
-    text = page.served_page(page_config({"name": NASTY}, None, [], 1.0)).decode()
-    assert json.loads(element(text, "clod-config"))["model"]["name"] == NASTY
-    assert "<script>alert" not in text
-
-
-@pytest.mark.parametrize("exact", [True, False])
-def test_one_file_contains_everything(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, exact: bool) -> None:
-    """Splats as PLY or SPZ, a picture of the first camera, and a policy that allows no connection."""
-    monkeypatch.setattr(payload, "BLOCK_ROWS", 7)  # blocks that base64 would pad
+def test_the_text_of_one_file(tmp_path: Path) -> None:
+    """A picture of the first camera, a policy that allows no connection, and no names of folders."""
     clod_adapter.save(tmp_path / "model.ply", clod_adapter.with_dial(scenes.gaussians(50, 1, 0)))
     saved, cameras = clod_adapter.load(tmp_path / "model.ply"), scenes.ring(2, 1000, 500)
     out = tmp_path / "out" / "page.html"
     out.parent.mkdir()
-    shown, losses = page.write_viewer_page(out, saved, base=saved, cameras=cameras, virtual_scale=2.0, exact=exact)
-    assert [each.name for each in out.parent.iterdir()] == ["page.html"] and bool(losses) != exact
+    shown, losses = page.write_viewer_page(out, saved, base=saved, cameras=cameras, virtual_scale=2.0)
+    assert [each.name for each in out.parent.iterdir()] == ["page.html"] and losses
     text = out.read_text(encoding="utf-8")
-    config = json.loads(element(text, "clod-config"))
-    for entry, name in ((config["model"], "clod-model"), (config["base"], "clod-base")):
-        assert entry == {"name": "model.ply", "element": name}
-        data = base64.b64decode(element(text, name), validate=True)
-        if exact:
-            assert data == b"".join(Payload.of(saved).blocks())
-        else:
-            (tmp_path / "held.spz").write_bytes(data)
-            assert torch.equal(clod_adapter.load(tmp_path / "held.spz").gaussians.means, shown.means)
-    assert len(config["cameras"]) == 2 and config["virtual_scale"] == 2.0
     policy = re.search('<meta http-equiv="Content-Security-Policy" content="([^"]*)">', text)
     assert policy and "default-src 'none'" in policy[1] and "'self'" not in policy[1] and "unsafe" not in policy[1]
     assert str(tmp_path) not in text
     (poster,) = re.findall('<img id="poster" alt="" src="data:image/jpeg;base64,([^"]*)">', text)
-    assert len(poster) < 60_000
     picture = np.asarray(Image.open(io.BytesIO(base64.b64decode(poster))), dtype=float)
     wanted = render(shown, replace(cameras[0], K=cameras[0].K * 0.512, width=512, height=256), 2.0).pixels.numpy()
-    assert picture.shape == wanted.shape and np.abs(picture - wanted).mean() < 3
-    page.write_viewer_page(tmp_path / "alone.html", saved, exact=exact)
+    assert len(poster) < 60_000 and picture.shape == wanted.shape and np.abs(picture - wanted).mean() < 3
+    page.write_viewer_page(tmp_path / "alone.html", saved)
     text = (tmp_path / "alone.html").read_text(encoding="utf-8")
-    assert json.loads(element(text, "clod-config"))["base"] is None and "clod-base" not in text
-    assert '<img id="poster"' not in text  # no viewpoint is stored
+    assert "clod-base" not in text and '<img id="poster"' not in text  # no viewpoint is stored
+
+
+def test_one_exact_file_needs_no_network(
+    chromium: Any, shown: Shown, model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Large data are divided among several elements, because browsers limit the size of a text."""
+    monkeypatch.setattr(page, "MAX_CHARACTERS", 20_000)
+    monkeypatch.setattr(payload, "BLOCK_ROWS", 100)
+    loaded = clod_adapter.load(model)
+    out = tmp_path / "page.html"
+    page.write_viewer_page(out, loaded, base=loaded, cameras=scenes.ring(2, 320, 240), virtual_scale=2.0, exact=True)
+    assert out.read_text(encoding="utf-8").count('id="clod-model"') > 2
+    shown.run("clod.setDial(2)")
+    with chromium.new_context(viewport=SIZE, offline=True) as context:
+        alone = Shown(context.new_page()).ready(out.as_uri())
+        assert alone.page.query_selector("#poster") is None
+        for each in (shown, alone):
+            each.camera(scenes.camera(320, 240))
+        assert np.array_equal(shown.picture(), alone.picture()) and shown.counts() == alone.counts()
+        alone.run("clod.setWipe(0.5, 'base')")
+        assert alone.text("#wipe-right") == "base · 400" and alone.errors == []
+        assert [url for url in alone.asked if not url.startswith(("file:", "blob:", "data:"))] == []
+
+
+def test_a_page_shows_its_spz(show: Any, save: Any, artefacts: Path) -> None:
+    """What Python reads of it, with growth, in units that float16 does not hold; its dB near its cameras only."""
+    size, model = 1000.0, scenes.dialled(1000, 3, 4, scene_distance=1.0, reference_distance=3.0)
+    far = model.replace(
+        means=size * model.means, log_scales=model.log_scales + float(np.log(size)), sigma_d=size * model.sigma_d,
+        growth_d=torch.linspace(-0.5, 1, 1000),
+        attenuation=replace(model.attenuation, reference_distance=3 * size, eps=size**2 * model.attenuation.eps),
+    )  # fmt: skip
+    path, row = save(far), CalibrationRow(1.0, 900.0, 31.5, 0.9, 4.0)
+    calibrated = replace(clod_adapter.load(path), calibration=Calibration((row,), 1000, 2, 8, 6, "a machine"))
+    camera = scenes.camera(320, 240)
+    viewmat = camera.viewmat.clone()
+    viewmat[:3, 3] *= size
+    seen, out = replace(camera, viewmat=viewmat), path.with_suffix(".html")
+    read, _ = page.write_viewer_page(out, calibrated, cameras=[seen], virtual_scale=1.0)
+    shown = show(url=out.as_uri())
+    assert shown.text("#quality") == "31.5 dB"
+    shown.page.keyboard.press("l")
+    here = shown.page.evaluate("location.hash")
+    away = re.sub("eye=[^&]*", f"eye={40 * size},0,{-40 * size}", here)
+    for view, quality in ((away, ""), (here, "31.5 dB")):
+        shown.page.evaluate("hash => { location.hash = hash }", view)
+        shown.until(f"document.getElementById('quality').textContent === '{quality}'")
+    shown.camera(seen)
+    for s in (1.0, 3.0):
+        shown.run("clod.setDial(given)", s)
+        assert_same(shown, render(read, seen, s), artefacts / f"spz_{s:g}.png")
+
+
+def test_a_file_without_sigma_d_has_no_dial(show: Any, save: Any, plain: Gaussians) -> None:
+    """The page shows the reason, and the file's name as text; a name does not end its element."""
+    config = page.served_page(page_config({"name": f"</script>{NAME}"}, None, [], 1.0)).decode()
+    assert json.loads(re.findall('id="clod-config">(.*?)</script>', config)[0])["title"] == f"</script>{NAME}"
+    shown = show(save(plain, NAME))
+    assert shown.text("#title") == NAME and shown.page.title() == NAME and shown.page.query_selector("img") is None
+    assert all(shown.page.is_disabled(f"#{name}") for name in ("dial", "target", "equation", "hold", "rate"))
+    assert f"{NAME} has no sigma_d" in shown.text("#no-dial") and f"clod-adapt {NAME}" in shown.text("#no-dial")
+    for key in "]re":
+        shown.page.keyboard.press(key)
+    assert shown.counts()["kept"] == 400 and shown.picture().max() > 50 and not shown.page.is_checked("#hold")
+    shown.page.evaluate("location.hash = '#wipe=0.5&other=3&dial=3'")  # a link with a comparison, which needs a dial
+    shown.until("document.getElementById('compare').value === 'off'")
+
+
+def test_a_page_that_cannot_show_its_model_says_why(tabs: Any, model: Path) -> None:
+    """Keys have no effect then; without WebGL there is no panel either."""
+    cases = (
+        ("truncated", ""),
+        ("WebGL2", "HTMLCanvasElement.prototype.getContext = () => null"),
+    )
+    for error, script in cases:
+        with serve(model) as url:
+            tab = tabs.new_page()
+            tab.route("**/files/model", lambda route: route.fulfill(body=b"ply\nformat"))
+            tab.add_init_script(script)
+            shown = Shown(tab)
+            tab.goto(url)
+            tab.wait_for_selector("#message:not([hidden])")
+            assert error in shown.text("#message") and tab.is_hidden("#panel") == bool(script)
+            assert error in tab.evaluate("clod.ready.then(() => '', (error) => error.message)")
+            if not script:
+                assert "model.ply" in shown.text("#message")
+                for key in "0lvncpe[w+":
+                    tab.keyboard.press(key)
+            assert shown.errors == []
+            tab.close()
+
+
+def test_of_a_model_beyond_the_device_limit_the_dial_leaves_out_some(show: Any, save: Any) -> None:
+    small = """const real = WebGL2RenderingContext.prototype.getParameter;
+        WebGL2RenderingContext.prototype.getParameter = function (name) {
+            return name === this.MAX_TEXTURE_SIZE ? 2 : real.call(this, name);
+        };"""
+    # The first 600 stay longer than the others, at any distance.
+    large = scenes.dialled(1100, 3, 5).replace(sigma_d=torch.where(torch.arange(1100) < 600, 1e3, 1e-3))
+    files = [save(large), save(large.replace(sigma_d=None, attenuation=None), "plain.ply")]
+    shown, camera = show(*files, script=small), scenes.camera(320, 240)
+    shown.camera(camera)
+    shown.run("clod.setDial(3)")
+    kept = int(dial(large, camera, 3.0).keep.sum())
+    assert 100 < kept < 600 and abs(shown.counts()["kept"] - kept) <= 1
+    for name in ("model.ply", "plain.ply"):
+        shown.until(f"document.title === '{name}'")
+        assert shown.counts()["total"] == 682
+        assert "418 of 1,100 Gaussians do not fit on this graphics device" in shown.text("#no-dial")
+        shown.page.keyboard.press("2")

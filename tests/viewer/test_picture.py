@@ -10,114 +10,109 @@ import numpy as np
 import pytest
 import torch
 
+import clod_adapter
 import scenes
 from clod_adapter.cameras import Camera
 from clod_adapter.config import FILTERS, ScreenFilter
+from clod_adapter.gaussians import Gaussians
+from clod_adapter.io.file_formats import write
 from clod_adapter.render import render
-from clod_adapter.viewer.payload import Payload
 from shown import Shown, assert_alike, assert_same, take
 
+VIEW, WIDE = scenes.camera(320, 240), ScreenFilter(variance=2.0)
 
-@pytest.mark.parametrize("degree", [0, 3])
-def test_at_dial_values_and_without_the_equation(shown: Shown, save: Any, artefacts: Path, degree: int) -> None:
-    gaussians, camera = scenes.dialled(1500, degree, 7), scenes.camera(320, 240)
-    take(shown, save(gaussians))
+
+def finer(model: Gaussians, by: float, **changes: Any) -> Gaussians:
+    return model.replace(log_scales=model.log_scales - by, **changes)
+
+
+def grown(count: int, degree: int, power: float, by: float, **settings: Any) -> Gaussians:
+    """With growth of both signs; some Gaussians have their centre outside the picture and grow into it."""
+    model = scenes.dialled(count, degree, 7, **settings)
+    return finer(model, by, growth_d=torch.linspace(-1, power, count))
+
+
+# Model, dial values and camera; each differs from the others in what is named.
+CASES: dict[str, tuple[Gaussians, tuple[float, ...], Camera]] = {
+    "degree 3": (scenes.dialled(1500, 3, 7), (1.0, 3.0), VIEW),
+    "no dial": (scenes.dialled(1500, 3, 7).replace(sigma_d=None, attenuation=None), (1.0,), VIEW),
+    "hard, view's unit, compensated": (
+        finer(scenes.dialled(1500, 1, 7, cut="hard", normalizer="max"), 2, screen_filter=FILTERS["on"]), (2.0,), VIEW
+    ),
+    "eps, wide blur": (
+        finer(scenes.dialled(1500, 1, 7, tau=0.05, eps=0.5, scene_distance=2.0), 2, screen_filter=WIDE),
+        (2.0,), VIEW,
+    ),
+    "growth": (
+        grown(1500, 0, 1.5, 1, max_sv=10.0, reference_distance=4.5), (1.0, 3.0, 8.0), scenes.camera(320, 240, fov=40)
+    ),
+    # By factors up to 1e8: quads of that size would be drawn inexactly; they end at the picture's farthest corner.
+    "far beyond the picture": (grown(300, 0, 5, 0, max_sv=40.0, reference_distance=2.0), (20.0,), VIEW),
+    "narrow": (finer(scenes.dialled(1500, 0, 7), 0.5), (1.0,), scenes.camera(64, 48, fov=10)),
+    "portrait": (scenes.dialled(1500, 0, 7), (1.0,), scenes.camera(180, 240, fov=100)),
+    "off centre": (scenes.dialled(1500, 0, 7), (1.0,), scenes.camera(320, 240, off_centre=(0.1, 0.9))),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_picture_and_the_count(shown: Shown, save: Any, artefacts: Path, name: str) -> None:
+    model, dials, camera = CASES[name]
+    take(shown, save(model))
     shown.camera(camera)
-    for s in (1.0, 3.0):
+    for s in dials:
         shown.run("clod.setDial(given)", s)
-        assert_same(shown, render(gaussians, camera, s), artefacts / f"degree{degree}_s{s:g}.png")
+        wanted = render(model, camera, s if model.attenuation else 1.0)
+        assert_same(shown, wanted, artefacts / f"{name}_{s:g}.png")
+        if name in ("growth", "eps, wide blur"):  # the measure tells them from models without it
+            other = model.replace(growth_d=None, screen_filter=FILTERS["off"])
+            with pytest.raises(AssertionError):
+                assert_alike(shown.picture(), render(other, camera, s).pixels.numpy(), artefacts / "other.png")
     shown.run("clod.setEquation(false)")
-    plain = gaussians.replace(sigma_d=None, attenuation=None)
-    assert_same(shown, render(plain, camera), artefacts / f"degree{degree}_off.png")
+    bare = model.replace(sigma_d=None, growth_d=None, attenuation=None)
+    assert_same(shown, render(bare, camera), artefacts / f"{name}_off.png")
 
 
-@pytest.mark.parametrize(
-    ("settings", "screen_filter"),
-    [
-        ({"cut": "hard", "normalizer": "max"}, FILTERS["on"]),
-        ({"tau": 1 / 255, "normalizer": "quantile", "quantile": 0.7}, FILTERS["mip"]),
-        ({"tau": 0.05, "eps": 0.5, "scene_distance": 2.0}, ScreenFilter(variance=2.0)),
-    ],
-    ids=["hard, on", "quantile, mip", "eps, blur"],
-)
-def test_settings_and_screen_filters(
-    show: Any, save: Any, artefacts: Path, settings: dict[str, Any], screen_filter: ScreenFilter
-) -> None:
-    """With Gaussians of at most a pixel, for which filters differ: the classic filter gives a different picture."""
-    classic = scenes.dialled(1500, 1, 7, **settings)
-    classic = classic.replace(log_scales=classic.log_scales - 2.0)
-    gaussians, camera = classic.replace(screen_filter=screen_filter), scenes.camera(320, 240)
-    shown = show(save(gaussians), "--sv", 2)
-    shown.camera(camera)
-    wanted = render(gaussians, camera, 2.0)
-    assert 0.05 < wanted.kept.float().mean() < 0.95
-    assert_same(shown, wanted, artefacts / f"filter_{screen_filter.variance}.png")
-    with pytest.raises(AssertionError):
-        assert_alike(shown.picture(), render(classic, camera, 2.0).pixels.numpy(), artefacts / "classic.png")
-
-
-@pytest.mark.parametrize(
-    ("degree", "settings"), [(0, {}), (3, {"normalizer": "quantile", "quantile": 0.3})], ids=["scene", "quantile"]
-)
-def test_growth(shown: Shown, artefacts: Path, tmp_path: Path, degree: int, settings: dict[str, Any]) -> None:
-    """Exponents of both signs. Some Gaussians have their centre outside the picture and grow into it."""
-    plain = scenes.dialled(1500, degree, 7, max_sv=10.0, reference_distance=4.5, **settings)
-    camera = scenes.camera(320, 240, fov=40)
-    plain = plain.replace(log_scales=plain.log_scales - 1.0)
-    model = plain.replace(growth_d=torch.linspace(-1, 1.5, 1500))
-    (tmp_path / "grown.ply").write_bytes(b"".join(Payload("grown.ply", model).blocks()))
-    take(shown, tmp_path / "grown.ply")
-    shown.camera(camera)
-    for s in (1.0, 3.0, 8.0):
-        shown.run("clod.setDial(given)", s)
-        assert_same(shown, render(model, camera, s), artefacts / f"growth{degree}_s{s:g}.png")
-        with pytest.raises(AssertionError):
-            assert_same(shown, render(plain, camera, s), artefacts / "not_grown.png")
-    shown.run("clod.setEquation(false)")
-    assert_same(shown, render(plain.replace(sigma_d=None, attenuation=None), camera), artefacts / "growth_off.png")
-
-
-def test_gaussians_that_grow_far_beyond_the_picture(shown: Shown, artefacts: Path, tmp_path: Path) -> None:
-    """By factors up to 1e8. Quads of that size would be drawn inexactly; they end at the picture's farthest corner."""
-    model = scenes.dialled(1500, 0, 7, max_sv=40.0, reference_distance=2.0)
-    model, camera = model.replace(growth_d=torch.linspace(-1, 5, 1500)), scenes.camera(320, 240)
-    (tmp_path / "grown.ply").write_bytes(b"".join(Payload("grown.ply", model).blocks()))
-    take(shown, tmp_path / "grown.ply")
-    shown.camera(camera)
-    shown.run("clod.setDial(given)", 20.0)
-    assert_same(shown, render(model, camera, 20.0), artefacts / "far_beyond.png")
-
-
-def test_through_cameras_of_other_shapes(shown: Shown, save: Any, artefacts: Path) -> None:
-    """Portrait format, the principal point in a corner, and a small unit of length with a nearer near plane."""
-    gaussians = scenes.dialled(1500, 0, 7)
-    take(shown, save(gaussians))
-    for k, camera in enumerate([scenes.camera(180, 240, fov=100), scenes.camera(320, 240, off_centre=(0.1, 0.9))]):
-        shown.camera(camera)
-        assert_same(shown, render(gaussians, camera), artefacts / f"shape{k}.png")
-    size = 1e-3
-    small = gaussians.replace(
-        means=size * gaussians.means, log_scales=gaussians.log_scales + float(np.log(size)),
-        attenuation=replace(gaussians.attenuation, scene_distance=3 * size),
+def test_a_small_unit_of_length(shown: Shown, save: Any, artefacts: Path) -> None:
+    """With a nearer near plane."""
+    size, model = 1e-3, CASES["portrait"][0]
+    small = model.replace(
+        means=size * model.means, log_scales=model.log_scales + float(np.log(size)),
+        attenuation=replace(model.attenuation, scene_distance=3 * size),
     )  # fmt: skip
-    viewmat = scenes.camera().viewmat.clone()
+    viewmat = VIEW.viewmat.clone()
     viewmat[:3, 3] *= size
-    near = Camera(viewmat, scenes.camera(320, 240).K, 320, 240, near=0.01 * size)
-    take(shown, save(small, "small.ply"))
+    near = replace(VIEW, viewmat=viewmat, near=0.01 * size)
+    take(shown, save(small))
     shown.camera(near)
     assert_same(shown, render(small, near), artefacts / "small.png")
 
 
 def test_wipe_shows_both_sides(show: Any, save: Any, artefacts: Path) -> None:
-    gaussians, camera = scenes.dialled(1500, 0, 7), scenes.camera(320, 240)
+    gaussians = scenes.dialled(1500, 0, 7)
     plain = gaussians.replace(sigma_d=None, attenuation=None, sh0=-gaussians.sh0)
     shown = show(save(gaussians), "--base", save(plain, "base.ply"), "--sv", 3)
-    shown.camera(camera)
-    sides = {"base": render(plain, camera), 1.5: render(gaussians, camera, 1.5)}
+    shown.camera(VIEW)
+    sides = {"base": render(plain, VIEW), 1.5: render(gaussians, VIEW, 1.5)}
     for other, right in sides.items():
         shown.run("clod.setWipe(0.4, given)", other)
-        left = render(gaussians, camera, 3.0).pixels.numpy()
+        left = render(gaussians, VIEW, 3.0).pixels.numpy()
         both = np.concatenate([left[:, :128], right.pixels.numpy()[:, 128:]], axis=1)
         assert_alike(shown.picture(), both, artefacts / f"wipe_{other}.png")
     shown.run("clod.setWipe(null)")
-    assert_same(shown, render(gaussians, camera, 3.0), artefacts / "wipe_off.png")
+    assert_same(shown, render(gaussians, VIEW, 3.0), artefacts / "wipe_off.png")
+
+
+def test_python_converts_every_format(show: Any, artefacts: Path, tmp_path: Path) -> None:
+    """The page shows what ``load`` reads; each file holds the same model, and is switched to from the one before."""
+    model = grown(1500, 1, 1, 1, max_sv=6.0, reference_distance=1.5)
+    files = [tmp_path / name for name in ("a.ply", "b.spz", "c.glb", "d.safetensors", "e.pt", "f.splat")]
+    for path in files:
+        baked = clod_adapter.bake(model, 1.0, cameras=[VIEW]) if path.suffix == ".splat" else model
+        write(path, baked)
+    shown = show(*files, "--sv", 3)
+    for number, path in enumerate(files, 1):
+        shown.page.keyboard.press(str(number))
+        shown.until(f"document.title === '{path.name}'")
+        shown.camera(VIEW)
+        found = clod_adapter.load(path).gaussians
+        assert_same(shown, render(found, VIEW, 3.0 if found.attenuation else 1.0), artefacts / f"{path.name}.png")

@@ -5,7 +5,7 @@ import { build } from "esbuild";
 
 const SHARED = ["equation.js", "frame_rate.js", "ply.js", "settings.js", "shaders.js", "spz.js", "timer.js"]; // with the drop-ins
 const here = new URL(".", import.meta.url), dropIns = new URL("../../../viewers/", here), out = new URL("../static/", here);
-const shared = { bundle: true, minify: true, format: "iife", target: "es2022", write: false, loader: { ".glsl": "text", ".wgsl": "text" } };
+const shared = { bundle: true, minify: true, format: "iife", target: "es2022", write: false, loader: { ".glsl": "text" } };
 
 /** `worker:./x.js` is the text of x.js with what it imports, for a Worker out of a Blob. */
 const worker = {

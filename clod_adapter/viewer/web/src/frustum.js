@@ -1,4 +1,4 @@
-// Which Gaussians are outside the picture: neither sorted nor drawn. Used by the worker and, in float32, by sorter.wgsl.
+// Which Gaussians are outside the picture: neither sorted nor drawn.
 
 const MARGIN = 0.25; // of the picture on each side: Gaussians that a moving camera shows before the next order
 const RADIUS = 3.34; // standard deviations to alpha 1/255, and more than in shaders.js

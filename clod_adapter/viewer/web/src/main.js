@@ -3,21 +3,17 @@ import { createCamera } from "./camera.js";
 import { createControls } from "./controls.js";
 import { createFiles } from "./files.js";
 import { canRecord } from "./media.js";
-import { createMenu } from "./menu.js";
 import { createModel } from "./model.js";
 import { createMotion } from "./motion.js";
-import { createOpening } from "./opening.js";
 import { readConfig } from "./payload.js";
 import { createPlayback } from "./playback.js";
 import { createRenderer } from "./renderer.js";
-import { sortingDevice } from "./sorter.js";
 import { createStage } from "./stage.js";
 import { createUi, elementsOf } from "./ui.js";
 import { dot } from "./vector.js";
 import { createViews } from "./views.js";
-import { createWipe } from "./wipe.js";
-import { xrModes } from "./xr.js";
 
+const OPENING = 30, HOPELESS = Math.log(2); // frames per second that the dial is moved for; excess at its largest value, above which it is not moved
 const STEEP = 0.7; // sine of a placed camera's angle to the horizon
 
 const elements = elementsOf(document), config = readConfig();
@@ -25,48 +21,58 @@ const viewer = { cameraNumber: 0, cameras: config.cameras, up: "", recording: nu
 viewer.files = config.model ? [config.model, ...config.others] : [];
 
 async function start() {
-  const renderer = createRenderer(elements.canvas), camera = createCamera();
-  const stage = createStage(renderer, elements.canvas, camera);
-  viewer.device = sortingDevice(renderer.gl);
+  const renderer = createRenderer(elements.canvas), camera = createCamera(), stage = createStage(renderer, elements.canvas, camera);
   const moved = () => {
     stage.change({ moving: true });
     viewer.ui.showNote(""); // it was of another view
   };
   Object.assign(actions, files, createViews(elements, viewer, { update, clampDial, showFile: files.showFile }));
-  Object.assign(actions, createPlayback(elements, viewer, { update, clampDial }));
+  Object.assign(actions, createPlayback(elements, viewer, update));
   const controls = createControls(elements.canvas, camera, () => {
     viewer.motion.stop();
     viewer.ui.selectCamera(null);
     moved();
   }, actions.focus);
-  const motion = createMotion(camera, moved, () => viewer.menu.update());
-  const wipe = createWipe(elements, stage);
-  Object.assign(viewer, { renderer, camera, stage, controls, motion, wipe });
-  viewer.ui = createUi(elements, stage, actions);
-  viewer.menu = createMenu(elements, viewer, actions, canRecord());
-  xrModes().then(viewer.menu.showModes);
+  Object.assign(viewer, { renderer, camera, stage, controls, motion: createMotion(camera, moved, () => viewer.ui.update()) });
+  viewer.ui = createUi(elements, viewer, actions, canRecord());
   stage.listeners.frame = viewer.ui.updateFrame;
   stage.listeners.held = (outOfReach, excess) => {
     viewer.ui.update();
-    if (viewer.opening !== null) return opening.held(excess); // a note on the file stays
-    viewer.ui.showNote(outOfReach ? `s = ${stage.model.max_sv}, the largest trained value, is too slow for this frame rate` : "");
+    const slow = outOfReach && `s = ${stage.model.max_sv}, the largest trained value, is too slow for this frame rate`;
+    if (viewer.opening === null) viewer.ui.showNote(slow || "");
+    else if (excess > HOPELESS) endOpening(viewer.opening, `Dial not moved: under ${OPENING / 2} fps at any value`);
   };
   stage.listeners.error = (error) => viewer.ui.showMessage(error.message);
   new ResizeObserver(actions.layOut).observe(elements.canvas);
   elements.canvas.addEventListener("webglcontextlost", () => viewer.ui.showMessage("The graphics device was lost; reload the page."));
-  viewer.ui.showName(config.title || "clod-adapter", 0, viewer.files.map(({ name }) => name));
+  viewer.ui.showName(config.title || "clod-adapt", 0, viewer.files.map(({ name }) => name));
   viewer.ui.update();
   if (!config.model) return viewer.ui.showProgress("Drop a splat here, or open one");
-  await files.open(async () => {
-    await actions.applyLink(location.hash);
+  await files.open(() => {
     window.addEventListener("hashchange", () => actions.applyLink(location.hash));
+    return actions.applyLink(location.hash);
   });
-  await stage.whenDrawn();
   elements.poster?.remove();
-  await opening.settle();
+  await settle();
 }
 
-const upload = ({ gaussians, metadata }) => createModel(viewer.renderer.gl, gaussians, metadata, viewer.device);
+/** Moves the dial from where a file was opened until the device holds a frame rate. A touch of the dial ends it. */
+async function settle() {
+  const { stage } = viewer, { model } = stage;
+  if (!model?.attenuation || viewer.opening === null) return;
+  stage.setHold(OPENING);
+  await stage.whenDrawn();
+  const { dial } = stage.state;
+  if (viewer.opening !== null && stage.model === model) endOpening(dial, dial !== viewer.opening && `Moved to s = ${dial.toFixed(2)} for ${OPENING} fps on this device`);
+}
+
+/** Ends the hold at a dial value, and shows the notes on the file and what became of the dial. */
+function endOpening(dial, note) {
+  actions.setDial(dial);
+  viewer.ui.showNote([viewer.notes, note].filter(Boolean).join("; "));
+}
+
+const upload = ({ gaussians, metadata }) => createModel(viewer.renderer.gl, gaussians, metadata);
 
 /** Shows another scene, and starts anew. `dial`: null for s = 1 with photographs, else everything, then what the
  *  device holds. */
@@ -85,7 +91,6 @@ function show(model, base, cameras, dial) {
   actions.reset();
   stage.state.dial = clampDial(dial ?? (cameras.some(({ placed }) => !placed) ? 1 : 0)); // s = 1 is fitted to photographs
   viewer.opening = dial === null ? stage.state.dial : null;
-  if (dial === null && opening.isOverBudget()) stage.state.dial = uploaded.max_sv; // for a first picture soon
   update();
 }
 
@@ -100,8 +105,6 @@ function update() {
   viewer.stage.change();
   viewer.ui.update();
   viewer.ui.updateFrame();
-  viewer.menu.update();
-  viewer.wipe.update();
 }
 
 /** The last other dial value if it differs from the present one, else the end of the dial that is farther from it. */
@@ -170,8 +173,7 @@ const actions = {
   fullScreen: () => (document.fullscreenElement ? document.exitFullscreen() : document.documentElement.requestFullscreen?.()),
 };
 
-const opening = createOpening(viewer, actions, config.devices);
-const files = createFiles(elements, viewer, config, { show, replace, update, clampDial, settle: () => opening.settle(), reset: () => actions.reset() });
+const files = createFiles(elements, viewer, config, { show, replace, update, clampDial, settle });
 const ready = start().catch((error) => {
   elements.busy.hidden = true;
   elements.panel.hidden = !viewer.ui; // without it, no control works
@@ -182,7 +184,7 @@ const ready = start().catch((error) => {
 ready.catch(() => {}); // shown on the page; awaiting `ready` throws it too
 
 window.clod = {
-  ready, load: files.load,
+  ready, load: (buffer, name) => files.load(new Blob([buffer]), name),
   setDial: actions.setDial, setEquation: actions.setEquation, setHold: actions.setHold, setWipe: actions.setWipe,
   setCamera(camera) {
     viewer.camera.set(camera);
@@ -190,7 +192,6 @@ window.clod = {
   },
   whenDrawn: () => viewer.stage.whenDrawn(),
   counts: () => viewer.stage.counts(),
-  order: (frustum) => viewer.stage.order(frustum),
   async capture() {
     viewer.stage.endMotion();
     await viewer.stage.whenDrawn();

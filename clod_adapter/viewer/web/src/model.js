@@ -1,9 +1,9 @@
-// A splat on the GPU, and what culls and sorts its Gaussians: WebGPU, or else a worker.
+// A splat on the GPU, and the worker that culls and sorts its Gaussians.
 import { extinctions, prepare } from "../../../../viewers/equation.js";
 import { WIDTH, dataTexture, heightOf, maxTexels } from "./gpu.js";
 import { half } from "./half.js";
 import { SH_TEXELS } from "./shaders.js";
-import { createSorter, largestScales } from "./sorter.js";
+import { select } from "./read.js";
 import { upOfGaussians } from "./up.js";
 import { add } from "./vector.js";
 import workerSource from "worker:./worker.js";
@@ -12,40 +12,28 @@ const SH_C0 = 0.28209479177387814;
 const RECORD_TEXELS = 4;
 const VISIBLE = 3.4; // standard deviations to alpha 1/255
 
-/** `metadata`: name, attenuation or null, screen_filter, no_dial, max_sv, calibration. `gaussians`: from a reader in formats/.
- *  `device`: promise of sorter.js. */
-export function createModel(gl, all, metadata, device) {
+/** `metadata`: name, attenuation or null, screen_filter, no_dial, max_sv, calibration. `all`: the Gaussians, from read.js. */
+export function createModel(gl, all, metadata) {
   const gaussians = fitted(all, roomFor(gl, all.degree), metadata.attenuation), leftOut = all.count - gaussians.count;
   const { count, degree, means, opacityLogits } = gaussians, { records, sh } = upload(gl, gaussians);
   const attenuation = gaussians.sigmaD ? metadata.attenuation : null, extent = extentOf(gaussians), worker = startWorker();
-  const scales = largestScales(gaussians), sorting = createSorter(device, gaussians, scales, { ...metadata, attenuation }).catch(() => null);
-  let sorter = null;
-  sorting.then((made) => { sorter = made; });
-  const { sigmaD, growthD } = attenuation ? gaussians : {}, blur = metadata.screen_filter.variance;
+  const { logScales: s, sigmaD = null, growthD = null } = gaussians, blur = metadata.screen_filter.variance;
+  const scales = Float32Array.from({ length: count }, (_, i) => Math.exp(Math.max(s[3 * i], s[3 * i + 1], s[3 * i + 2])));
   worker.request("model", { means, opacityLogits, scales, sigmaD, growthD, attenuation, blur }, [means.buffer, scales.buffer]);
   const spare = []; // buffers for orders, which are transferred to the worker and back
 
-  async function orderByWorker(state) {
-    const buffer = spare.pop() ?? new ArrayBuffer(4 * WIDTH * heightOf(count));
-    const result = await worker.request("order", { ...state, rows: buffer }, [buffer]);
-    return { ...result, rows: new Uint32Array(result.rows), done: () => spare.push(result.rows) };
-  }
-
   return {
     ...metadata, attenuation, count, leftOut, degree, records, sh, extent,
-    get sortsOnGpu() { return sorter !== null; },
-    /** Requests the rows to draw, and calls `use({rows, drawn, kept, distance})`; `rows` is valid until it returns. A lost
-     *  device is replaced by the worker. */
+    /** Requests the rows to draw, and calls `use({rows, drawn, kept, distance})`; `rows` is valid until it returns. */
     async order(state, use) {
-      const byGpu = sorter && (await sorter.order(state).catch(() => { sorter = null; }));
-      const result = byGpu ?? (await orderByWorker(state));
-      use(result);
-      result.done();
+      const buffer = spare.pop() ?? new ArrayBuffer(4 * WIDTH * heightOf(count));
+      const result = await worker.request("order", { ...state, rows: buffer }, [buffer]);
+      use({ ...result, rows: new Uint32Array(result.rows) });
+      spare.push(result.rows);
     },
     dialFor: (view, target) => worker.request("dialFor", { view, target, maxSv: metadata.max_sv }),
     destroy() {
       worker.stop();
-      sorting.then((made) => made?.destroy());
       gl.deleteTexture(records);
       gl.deleteTexture(sh);
     },
@@ -73,15 +61,7 @@ function fitted(gaussians, most, attenuation) {
   const least = score.slice().sort()[count - most - 1], rows = new Uint32Array(most);
   let size = 0;
   for (let i = 0; i < count; i++) if (score[i] > least) rows[size++] = i;
-  const taken = Object.entries(gaussians).map(([name, values]) => [name, ArrayBuffer.isView(values) ? select(values, rows.subarray(0, size), values.length / count) : values]);
-  return { ...Object.fromEntries(taken), count: size };
-}
-
-/** These rows of a table. */
-function select(values, rows, width) {
-  const found = new values.constructor(width * rows.length);
-  for (let i = 0; i < rows.length; i++) for (let k = 0; k < width; k++) found[width * i + k] = values[width * rows[i] + k];
-  return found;
+  return select(gaussians, rows.subarray(0, size));
 }
 
 /** A separate function, so that no closure of the model keeps the values in memory after the upload. */

@@ -1,21 +1,20 @@
-// What plays: the path through the photographs, the turntable, recordings of them, and headsets.
+// What plays: the path through the photographs, the turntable, and recordings of them.
 import { createCamera } from "./camera.js";
 import { download, record } from "./media.js";
-import { startXr } from "./xr.js";
 
 /** `viewer`: camera, cameras, stage, motion, recording (main.js); `update()` shows a changed state. */
-export function createPlayback(elements, viewer, { update, clampDial }) {
+export function createPlayback(elements, viewer, update) {
   const fileName = (suffix) => `${viewer.stage.model.name.replace(/\.[^.]*$/, "")}_s${viewer.stage.state.dial.toFixed(2)}.${suffix}`;
 
   function playOnce(ended) {
-    const { cameras, motion, camera, ui, menu } = viewer;
+    const { cameras, motion, camera, ui } = viewer;
     const select = (number) => {
       viewer.cameraNumber = number;
       ui.selectCamera(number);
     };
     if (cameras.length < 2) motion.turntable(1, ended);
     else motion.path(posesOf(cameras, camera), select, ended);
-    menu.update();
+    ui.update();
   }
 
   const playback = {
@@ -28,7 +27,7 @@ export function createPlayback(elements, viewer, { update, clampDial }) {
       if (viewer.motion.running) return viewer.motion.stop();
       viewer.ui.selectCamera(null);
       viewer.motion.turntable(Infinity);
-      viewer.menu.update();
+      viewer.ui.update();
     },
     async savePicture() {
       const { stage, motion } = viewer;
@@ -51,15 +50,6 @@ export function createPlayback(elements, viewer, { update, clampDial }) {
       viewer.recording = record(elements.canvas);
       playOnce(() => viewer.recording && playback.record());
       update();
-    },
-    async enter(mode) {
-      try {
-        viewer.motion.stop();
-        const { state } = viewer.stage, turnDial = (factor) => { state.dial = clampDial(Math.max(state.dial, 0.1) * factor); };
-        await startXr(mode, { ...viewer, turnDial }, update);
-      } catch (error) {
-        viewer.ui.showMessage(`the headset does not start (${error.message})`);
-      }
     },
   };
   return playback;

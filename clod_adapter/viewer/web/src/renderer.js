@@ -3,7 +3,7 @@
 import { WIDTH, bindTextures, framebuffer, heightOf, program, quads, texture } from "./gpu.js";
 import { growthDistance } from "../../../../viewers/equation.js";
 import { copyVertex, copyFragment, projectFragment, splatFragment, splatVertex } from "./shaders.js";
-import { createTimer } from "../../../../viewers/timer.js";
+import { timed } from "../../../../viewers/timer.js";
 
 export function createRenderer(canvas) {
   const gl = canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false, powerPreference: "high-performance" });
@@ -69,6 +69,12 @@ export function createRenderer(canvas) {
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
+  function clear() {
+    gl.bindFramebuffer(gl.FRAMEBUFFER, image.target);
+    gl.clearColor(0, 0, 0, 0);
+    gl.clear(gl.COLOR_BUFFER_BIT);
+  }
+
   function blend(side, view) {
     gl.bindFramebuffer(gl.FRAMEBUFFER, image.target);
     gl.viewport(0, 0, width, height);
@@ -88,7 +94,7 @@ export function createRenderer(canvas) {
   }
 
   return {
-    gl, measure: createTimer(gl).measure,
+    gl,
     /** Uploads the order of a side: its first `drawn` rows, rounded up to a multiple of WIDTH. */
     upload(side, rows, drawn) {
       const lines = heightOf(side.model.count);
@@ -104,9 +110,7 @@ export function createRenderer(canvas) {
     /** The depth at a pixel, the mean over the Gaussians there by their share of the picture; null where there is none. */
     depthAt(side, view, x, y, depthUnit) {
       resize(view);
-      gl.bindFramebuffer(gl.FRAMEBUFFER, image.target);
-      gl.clearColor(0, 0, 0, 0);
-      gl.clear(gl.COLOR_BUFFER_BIT);
+      clear();
       project(side, view, depthUnit);
       blend(side, view);
       const pixel = halfFloat ? new Float32Array(4) : new Uint8Array(4);
@@ -114,27 +118,21 @@ export function createRenderer(canvas) {
       const share = pixel[0] / pixel[3];
       return pixel[3] > (halfFloat ? 0.1 : 25) && share < 1 ? (share * depthUnit) / (1 - share) : null;
     },
-    /** Draws each side in its range [from, to] of the image's width, in [0, 1], and shows the image in the canvas, or in
-     *  `target`, {framebuffer, transparent} of a headset, `at` [x, y]. */
-    draw(sides, view, target = null, at = [0, 0]) {
+    /** Draws each side in its range [from, to] of the image's width, in [0, 1]; returns the milliseconds that it took. */
+    draw: (sides, view) => timed(gl, () => {
       resize(view);
-      if (!target && (canvas.width !== width || canvas.height !== height)) [canvas.width, canvas.height] = [width, height];
-      gl.bindFramebuffer(gl.FRAMEBUFFER, image.target);
-      gl.clearColor(0, 0, 0, 0);
-      gl.clear(gl.COLOR_BUFFER_BIT);
-      for (const side of sides) {
-        if (!side.drawn) continue;
+      if (canvas.width !== width || canvas.height !== height) [canvas.width, canvas.height] = [width, height];
+      clear();
+      for (const side of sides.filter(({ drawn }) => drawn)) {
         project(side, view);
         blend(side, view);
       }
-      gl.bindFramebuffer(gl.FRAMEBUFFER, target?.framebuffer ?? null);
-      gl.viewport(...at, width, height);
+      gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+      gl.viewport(0, 0, width, height);
       gl.useProgram(copy.handle);
-      gl.uniform2i(copy.uniforms.offset, ...at);
-      gl.uniform1i(copy.uniforms.transparent, target?.transparent ?? false);
       bindTextures(gl, copy.uniforms, { image: image.texture });
       gl.bindVertexArray(empty);
       gl.drawArrays(gl.TRIANGLES, 0, 3);
-    },
+    }),
   };
 }

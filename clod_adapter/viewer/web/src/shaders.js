@@ -154,10 +154,5 @@ void main() { gl_Position = vec4(vec2(gl_VertexID & 1, gl_VertexID >> 1) * 4.0 -
 export const copyFragment = `#version 300 es
 precision highp float;
 uniform highp sampler2D image;
-uniform ivec2 offset;
-uniform bool transparent;
 out vec4 result;
-void main() {
-  vec4 pixel = texelFetch(image, ivec2(gl_FragCoord.xy) - offset, 0);
-  result = vec4(pixel.rgb, transparent ? pixel.a : 1.0);
-}`;
+void main() { result = vec4(texelFetch(image, ivec2(gl_FragCoord.xy), 0).rgb, 1.0); }`;

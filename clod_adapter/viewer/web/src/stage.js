@@ -3,7 +3,7 @@
 import { createHold } from "../../../../viewers/frame_rate.js";
 
 const MIN_RESOLUTION = 0.5; // of the canvas's pixels per side, during motion on a slow device
-const SLOW = 50, FAST = 25; // ms per frame, above and below which the resolution during motion falls and rises
+const SLOW = 50, FAST = 25; // ms of a frame, above and below which the resolution during motion falls and rises
 const IDLE = 180; // ms without motion, until a frame at full resolution
 
 export function createStage(renderer, canvas, camera) {
@@ -11,7 +11,7 @@ export function createStage(renderer, canvas, camera) {
   const listeners = { frame: () => {}, held: () => {}, error: () => {} };
   let main = makeSide(), second = makeSide(), model = null, base = null;
   let version = 0, drawnVersion = -1, resolution = 1, lastMotion = -Infinity, idleTimer = 0, frame = 0, frameMs = null;
-  let timing = false, warmedUp = false, newOrder = false, skipped = false, hold = null, eyes = null;
+  let newOrder = false, hold = null, warm = false; // warm: a frame has been drawn; the first one includes the compilation of the shaders
   const callbacks = []; // of whenDrawn
 
   function makeSide() {
@@ -55,24 +55,21 @@ export function createStage(renderer, canvas, camera) {
 
   async function draw() {
     frame = 0;
-    if (eyes || !model || renderer.gl.isContextLost()) return;
+    if (!model || renderer.gl.isContextLost()) return;
     const current = version, view = camera.view(...size()), shown = sides();
     for (const each of shown) requestOrder(each, view, current);
     if (shown.some(({ side, model: of }) => side.sortedVersion < 0 || side.model !== of)) return; // never sorted yet
-    skipped = timing && frameMs > SLOW; // one frame at a time: on a slow device, queued frames would show past views
-    if (skipped) return;
     // Without motion, only the frame with the current order is drawn; during motion, an earlier order is used until then.
     const complete = shown.every(({ side }) => side.sortedVersion === current);
     if (!complete && !newOrder && performance.now() - lastMotion > IDLE) return;
     newOrder = false;
     shown.forEach(prepare);
-    const render = () => renderer.draw(shown.map(({ side }) => side), view);
-    if (timing) render();
-    else measure(render);
-    if (complete) {
-      drawnVersion = current;
-      if (isDrawn()) for (const resolve of callbacks.splice(0)) resolve();
-    }
+    const ms = renderer.draw(shown.map(({ side }) => side), view);
+    if (complete) drawnVersion = current;
+    if (warm) took(ms);
+    else schedule();
+    warm = true;
+    if (isDrawn()) for (const resolve of callbacks.splice(0)) resolve();
     listeners.frame();
   }
 
@@ -83,52 +80,26 @@ export function createStage(renderer, canvas, camera) {
     side.to = length === 1 || k === 1 ? 1 : state.wipe;
   }
 
-  async function measure(render) {
-    const { dial } = state, holding = hold;
-    timing = true;
-    try {
-      finish(await renderer.measure(render, holding !== null), dial, holding);
-    } catch (error) {
-      listeners.error(error);
-    }
-    timing = false;
-    if (skipped) schedule();
-  }
-
-  /** Takes the milliseconds of the last frame, null if unknown, with the dial value and the hold that it was drawn with. */
-  function finish(ms, dial, holding) {
-    if (!warmedUp || ms === null) { // the first frame includes the compilation of the shaders
-      warmedUp = true;
-      return schedule();
-    }
+  /** Takes the milliseconds of a frame: for the resolution in motion, or the held frame rate, whose next frame has
+   *  another dial value until it has settled. */
+  function took(ms) {
     frameMs = ms;
-    if (!hold) adjustResolution(ms);
-    else if (hold === holding) follow(ms, dial);
-    else schedule(); // the first frame to follow
-    listeners.frame();
-  }
-
-  function adjustResolution(ms) {
-    if (ms > SLOW) resolution = Math.max(resolution * 0.8, MIN_RESOLUTION);
-    else if (ms < FAST) resolution = Math.min(resolution * 1.1, 1);
-  }
-
-  /** Moves the dial, and draws another frame for measuring until it has settled. */
-  function follow(ms, dial) {
-    if (hold.settled) return;
-    const next = hold.took(dial, ms, model.max_sv);
-    if (next !== dial) version++;
-    state.dial = next;
-    schedule();
+    if (!hold && ms > SLOW) resolution = Math.max(resolution * 0.8, MIN_RESOLUTION);
+    else if (!hold && ms < FAST) resolution = Math.min(resolution * 1.1, 1);
+    if (!hold || hold.settled) return;
+    const { dial } = state;
+    state.dial = hold.took(dial, ms, model.max_sv);
+    if (state.dial !== dial) version++;
+    if (!isDrawn()) schedule();
     listeners.held(hold.outOfReach(model.max_sv), hold.excessAt(model.max_sv));
   }
 
-  /** Requests the order for the current state, one at a time for each side. A headset shows more than the view. */
+  /** Requests the order for the current state, one at a time for each side. */
   async function requestOrder({ side, model: of, dial, equation }, view, current) {
     if (side.busy || (side.sortedVersion === current && side.model === of)) return;
     side.busy = true;
     try {
-      await of.order({ view, dial, equation, marks: state.marks, frustum: !eyes }, ({ rows, drawn: count, kept, distance }) => {
+      await of.order({ view, dial, equation, marks: state.marks }, ({ rows, drawn: count, kept, distance }) => {
         if (of.destroyed) return;
         if (side.model !== of) renderer.release(side);
         Object.assign(side, { model: of, sortedVersion: current, kept, distance });
@@ -151,9 +122,9 @@ export function createStage(renderer, canvas, camera) {
       [main, second] = [makeSide(), makeSide()]; // the old ones may wait for a worker that has ended
       change();
     },
-    /** Holds so many frames per second by the dial, from the value `least` on, at full resolution; null ends that. */
-    setHold(fps, least) {
-      hold = fps ? createHold(fps, least) : null;
+    /** Holds so many frames per second by the dial, at full resolution; null ends that. */
+    setHold(fps) {
+      hold = fps ? createHold(fps) : null;
       if (fps) resolution = 1;
       change();
     },
@@ -164,16 +135,6 @@ export function createStage(renderer, canvas, camera) {
     view: () => camera.view(...size()),
     counts: () => ({ total: model?.count ?? 0, kept: main.kept, drawn: main.drawn }),
     otherCounts: () => (state.wipe === null ? null : { total: second.model?.count ?? 0, kept: second.kept }),
-    /** Culls and sorts the left side for the current state, for tests and benchmarks: {ms, onGpu, kept, rows}. `frustum`:
-     *  without the Gaussians outside the picture. */
-    async order(frustum = true) {
-      const [{ model: of, dial, equation }] = sides(), start = performance.now();
-      let found = null;
-      await of.order({ view: camera.view(...size()), dial, equation, marks: state.marks, frustum }, ({ rows, drawn: count, kept }) => {
-        found = { ms: performance.now() - start, onGpu: of.sortsOnGpu, kept, rows: [...rows.subarray(0, count)] };
-      });
-      return found;
-    },
     /** Resolves once the current state is drawn, and a held frame rate has settled. */
     whenDrawn: () => (isDrawn() || !model ? Promise.resolve() : new Promise((resolve) => { callbacks.push(resolve); schedule(); })),
     /** The point under a position of the canvas, in shares of its size; null where nothing is. */
@@ -185,21 +146,6 @@ export function createStage(renderer, canvas, camera) {
       if (depth === null) return null;
       const across = [(column + 0.5 - view.cx) / view.fx, (line + 0.5 - view.cy) / view.fy, 1];
       return [0, 1, 2].map((k) => view.eye[k] + depth * (across[0] * r[k] + across[1] * r[3 + k] + r[6 + k]));
-    },
-    /** Draws the model for the eyes of a headset, [{view, at}], culled and sorted for the view `head`, in place of the
-     *  canvas until `endEyes`. */
-    drawEyes(head, views, target) {
-      eyes = views;
-      version++;
-      const shown = { side: main, model, dial: state.dial, equation: state.equation };
-      requestOrder(shown, head, version);
-      if (main.sortedVersion < 0 || main.model !== model) return;
-      prepare(shown, 0, [shown]);
-      for (const { view, at } of views) renderer.draw([main], view, target, at);
-    },
-    endEyes() {
-      eyes = null;
-      change();
     },
     /** Ends the lower resolution during motion at once. */
     endMotion() {

@@ -14,13 +14,12 @@ const jobs = {
     return [{}, []];
   },
 
-  /** Writes the rows to draw, farthest first, into the buffer `rows`, which is transferred in both directions. `frustum`:
-   *  without the Gaussians outside the picture. */
-  order({ view, dial, equation, marks, frustum, rows }) {
+  /** Writes the rows to draw, farthest first, into the buffer `rows`, which is transferred in both directions. */
+  order({ view, dial, equation, marks, rows }) {
     const on = equation && attenuation !== null;
     const distance = on ? normalizingDistance(means, view, attenuation) : 1;
     const order = new Uint32Array(rows);
-    const [kept, drawn] = cullAndSort(order, view, on ? { dial, distance } : null, marks, frustum ? insideOf(view, on && dial / distance) : () => true);
+    const [kept, drawn] = cullAndSort(order, view, on ? { dial, distance } : null, marks, insideOf(view, on && dial / distance));
     return [{ rows, kept, drawn, distance }, [rows]];
   },
 
