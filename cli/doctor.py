@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 from clod_adapter._support.text import first_line
 from clod_adapter._support.version import package_version
 
-from .shared.browsers import find_browser
 from .shared.command import Command
 from .shared.console import WIDTH, Console, put
+from .view import find_browser
 
 if TYPE_CHECKING:
     import torch

@@ -1,76 +1,339 @@
-"""``clod-adapt eval``: quality, count and time at several dial values, on the held-out photographs."""
+"""``clod-adapt eval``: quality, count and time at some dial values, on the held-out photographs; and comparisons."""
 
 from __future__ import annotations
 
-import argparse
-from dataclasses import asdict
-from typing import Any
+from argparse import ArgumentParser, Namespace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from clod_adapter._support.version import package_version
-from clod_adapter.cameras import Scene
 from clod_adapter.errors import ClodError
-from clod_adapter.evaluation.perceptual import available_metrics
-from clod_adapter.gaussians import Gaussians
-from clod_adapter.io.checkpoint import Checkpoint
-from clod_adapter.progress import Stopped
+from clod_adapter.progress import Listener, Stopped
 
-from .comparisons import Comparisons, compare
-from .shared.alignment import align
+from .shared.command import (
+    BUDGETS,
+    Command,
+    add_activated,
+    add_antialiasing,
+    add_device,
+    add_dial_options,
+    add_images,
+    check_checkpoint,
+    check_dials,
+    check_scene,
+    model_has_dial,
+    page_files,
+)  # fmt: skip
 from .shared.console import Console, put
-from .shared.inputs import prepare_kernels, read_model_and_scene, with_filter
-from .shared.measure import Stopwatch, choose_dials, machine, measure, solve_dials, table, with_frame_times
-from .shared.pages import write_eval_page
+from .shared.outputs import Outputs, labels
+from .shared.process import GracefulStop
+
+if TYPE_CHECKING:
+    from clod_adapter.cameras import Scene, View
+    from clod_adapter.evaluation.evaluate import Row
+    from clod_adapter.evaluation.popping import Popping
+    from clod_adapter.gaussians import Gaussians
+    from clod_adapter.io.checkpoint import Checkpoint
+
+CLOSE = 0.01  # relative difference up to which two counts are equal
+POPPING_VIEWS = 2  # held-out views in which the dial is turned
+PATH_CAMERAS = 5  # neighbours by name, which are usually photographed one after the other
 
 
-def run(args: argparse.Namespace) -> dict[str, Any]:
+def add_arguments(parser: ArgumentParser) -> None:
+    given = parser.add_argument_group("input")
+    given.add_argument("model", metavar="MODEL.ply", help="an adapted file, or a plain one as a baseline")
+    add_images(given)
+    add_activated(given)
+    add_antialiasing(given)
+    dial = parser.add_argument_group("dial values, one of")
+    default = "dial values from 1 (full quality) (default: 1 2 3 5 below the largest trained, and that)"
+    add_dial_options(dial, default, "(mean over the held-out views)", several=True)
+    measuring = parser.add_argument_group("measuring")
+    measuring.add_argument(
+        "--base", metavar="BASE.ply", help="also measure the checkpoint, pruned to the count of each row"
+    )
+    measuring.add_argument(
+        "--against", metavar="FILE.ply", nargs="+", default=[],
+        help="also measure other files, each beside MODEL.ply at the same number of Gaussians",
+    )  # fmt: skip
+    measuring.add_argument(
+        "--popping", action="store_true", help="also measure how evenly the image changes with the dial and the camera"
+    )
+    add_device(measuring, "render")
+    output = parser.add_argument_group("output")
+    output.add_argument("--report", metavar="OUT.html", help="also write a self-contained page, and its charts")
+
+
+def check(args: Namespace) -> None:
+    check_dials(args, args.model)
+    labels(args.against)
+    for path in (args.model, *args.against):
+        check_checkpoint(path)
+    if args.base:
+        check_checkpoint(args.base)
+        if model_has_dial(args.base):
+            raise ClodError(
+                f"{args.base}: has a dial (sigma_d); give --base the checkpoint that was adapted, or use --against"
+            )
+    check_scene(args.images)
+
+
+def outputs(args: Namespace) -> Outputs:
+    if not args.report:
+        return Outputs()
+    page, *charts = page_files(Path(args.report), ["rendering"])
+    inputs = [args.model, *args.against, *([args.base] if args.base else [])]
+    return Outputs([page], charts, inputs=inputs, scene=args.images)
+
+
+def run(args: Namespace) -> dict[str, Any]:
+    from .shared.measure import (
+        Stopwatch,
+        choose_dials,
+        machine,
+        measure,
+        solve_dials,
+        table,
+        with_frame_times,
+    )  # fmt: skip
+    from .shared.pages import write_eval_page
+
     console, watch = Console(args.quiet), Stopwatch()
-    model, others, scene = prepare_inputs(args, console, watch)
-    attenuation = model.gaussians.attenuation
+    with watch.time("load"):
+        model, others, scene = read_inputs(args, console)
+    gaussians, base = model.gaussians, others[args.base] if args.base else None
     given, notes = solve_dials(args, model, [view.camera for view in scene.test], console)
-    dials, beyond = choose_dials(given, attenuation)
-    metrics, missing = available_metrics()
-    notes += [*beyond, *missing]
+    dials, beyond = choose_dials(given, gaussians.attenuation)
+    notes += beyond
     for note in notes:
         console.say(note)
     with watch.time("evaluate"):
-        rows, interrupted = measure(model.gaussians, scene.test, dials, console, metrics=metrics)
+        rows, interrupted = measure(gaussians, scene.test, dials, console)
         if interrupted and not rows:
             raise Stopped("stopped before the first row")
         if not interrupted:
-            (rows,), rough, interrupted = with_frame_times([(model.gaussians, rows)], scene.test, console)
+            (rows,), rough, interrupted = with_frame_times([(gaussians, rows)], scene.test, console)
             notes += rough
     put(table(rows))
-    base = others[args.base] if args.base else None
-    against, comparisons = {path: others[path] for path in args.against}, Comparisons()
+    comparisons, against = Comparisons(gaussians, scene, console), {path: others[path] for path in args.against}
     if not interrupted:
         with watch.time("comparisons"):
-            comparisons = compare(model.gaussians, rows, base, against, scene, metrics, console, args.popping)
-        interrupted = comparisons.interrupted
+            interrupted = not comparisons.measure(rows, base, against, args.popping)
     put(comparisons.text(), end="")
     report: dict[str, Any] = {
         "command": "eval", "version": package_version(), "model": args.model, "scene": args.images,
-        "base_count": len(model.gaussians), "sh_degree": model.gaussians.sh_degree, "views": len(scene.test),
+        "base_count": len(gaussians), "sh_degree": gaussians.sh_degree, "views": len(scene.test),
         "rows": [row.as_dict() for row in rows], "base": args.base, **comparisons.report(),
-        "interrupted": interrupted, "attenuation": asdict(attenuation) if attenuation else None,
+        "interrupted": interrupted, "attenuation": asdict(gaussians.attenuation) if gaussians.attenuation else None,
         "notes": [*model.notes, *scene.notes, *notes, *comparisons.notes], "machine": machine(),
-        "device": str(model.gaussians.means.device), "seconds": watch.report(),
+        "device": str(gaussians.means.device), "seconds": watch.report(),
     }  # fmt: skip
-    return report | write_eval_page(args, report, model.gaussians, base, scene, console)
+    return report | write_eval_page(args, report, gaussians, base, scene, console)
 
 
-def prepare_inputs(
-    args: argparse.Namespace, console: Console, watch: Stopwatch
-) -> tuple[Checkpoint, dict[str, Gaussians], Scene]:
+def read_inputs(args: Namespace, console: Console) -> tuple[Checkpoint, dict[str, Gaussians], Scene]:
     """The model, the files of --base and --against by path, and the scene; all with their screen-space filters."""
-    with watch.time("load"):
-        paths = [*([args.base] if args.base else []), *args.against]
-        model, others, scene, device = read_model_and_scene(args, console, paths)
+    from .shared.alignment import align
+    from .shared.inputs import prepare_kernels, read_model_and_scene, with_filter
+
+    paths = [*([args.base] if args.base else []), *args.against]
+    model, others, scene, device = read_model_and_scene(args, console, paths)
     if not scene.test:
         raise ClodError(f"{args.images}: there are no held-out photographs to evaluate on; give at least two")
-    with watch.time("kernels"):
-        prepare_kernels(console, device, training=bool(args.base))
+    prepare_kernels(console, device, training=bool(args.base))
     scene, _ = align(model, scene, args.images, console, required=False)
     model = with_filter(model, args, console, scene.test)
     if model.gaussians.sigma_d is None:
         console.say(f"{args.model} has no sigma_d, so every dial value renders all of it")
     return model, {p: with_filter(each, args, console, scene.test).gaussians for p, each in others.items()}, scene
+
+
+@dataclass
+class Comparisons:
+    """Comparisons of a model; those that are finished.
+
+    Attributes:
+        base_row: the unadapted base with all its Gaussians.
+        ranked: (row of the model, ranking, the base pruned by that ranking to the same count).
+        against: (file, its row, row of the model at the dial value with the same count).
+        popping: (what moves, how the image changes).
+    """
+
+    model: Gaussians
+    scene: Scene
+    console: Console
+    stop: GracefulStop = field(default_factory=GracefulStop)
+    base_row: Row | None = None
+    ranked: list[tuple[Row, str, Row]] = field(default_factory=list)
+    against: list[tuple[str, Row, Row]] = field(default_factory=list)
+    popping: list[tuple[str, Popping]] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+    def measure(
+        self, rows: Sequence[Row], base: Gaussians | None, others: Mapping[str, Gaussians], popping: bool
+    ) -> bool:
+        """Measures those asked for; False if Ctrl-C ended them early.
+
+        The base is pruned to the counts of ``rows``; other files with a dial are measured at their dial values.
+        """
+        with self.stop.listening():
+            try:
+                if base is not None:
+                    self.prune(base, rows)
+                if others:
+                    self.match(others, rows)
+                if popping:
+                    self.pop(max(row.virtual_scale for row in rows))
+            except Stopped:
+                return False
+        return True
+
+    def prune(self, base: Gaussians, rows: Sequence[Row]) -> None:
+        from clod_adapter.evaluation.baselines import rankings
+
+        with self.console.meter("removal error") as meter:
+            orders = rankings(base, self.scene.train, self.stop.heeding(meter))
+        jobs = [(row, by, order) for row in rows for by, order in orders.items()]
+        with self.console.meter("base") as meter:
+            self.base_row = self._row(base, 1.0, meter.part(0, len(jobs) + 1, "all"))
+            for i, (ours, by, order) in enumerate(jobs, 1):
+                row = self._row(base.select(order[: round(ours.kept)]), 1.0, meter.part(i, len(jobs) + 1, by))
+                self.ranked.append((ours, by, replace(row, kept_share=row.kept / len(base))))  # of the whole base
+
+    def match(self, others: Mapping[str, Gaussians], rows: Sequence[Row]) -> None:
+        from clod_adapter.evaluation.baselines import matching_dial, mean_kept
+
+        cameras = [view.camera for view in self.scene.test]
+        dials = [row.virtual_scale for row in rows]
+        jobs = [(path, g, s) for path, g in others.items() for s in (dials if g.sigma_d is not None else [1.0])]
+        with self.console.meter("compare") as meter:
+            for i, (path, other, s) in enumerate(jobs):
+                count = mean_kept(other, cameras, s)
+                same = matching_dial(self.model, cameras, count)
+                if abs((kept := mean_kept(self.model, cameras, same)) - count) > CLOSE * count:
+                    more = f"{'at most' if kept < count else 'at least'} {kept:,.0f}"
+                    self._note(f"{path} keeps {count:,.0f} Gaussians; the model is compared with {more}")
+                listener = meter.part(i, len(jobs), path)
+                theirs = self._row(other, s, listener)
+                self.against.append((path, theirs, self._row(self.model, same, listener)))
+
+    def pop(self, max_sv: float) -> None:
+        from clod_adapter.evaluation.popping import dial_popping, path_popping
+
+        if self.model.sigma_d is None or max_sv <= 1:
+            self._note("popping is not measured: there is no dial, or only s = 1 was requested")
+            return
+        test, walk = self.scene.test, neighbours([*self.scene.train, *self.scene.test])
+        views = [test[(2 * k + 1) * len(test) // (2 * POPPING_VIEWS)] for k in range(min(POPPING_VIEWS, len(test)))]
+        jobs: list[tuple[str, Any]] = [
+            (f"dial, {v.camera.name}", partial(dial_popping, self.model, v.camera, max_sv)) for v in views
+        ]
+        if len(walk) > 1:
+            path = partial(path_popping, self.model, [view.camera for view in walk], max_sv)
+            jobs.append((f"camera, {walk[0].camera.name} to {walk[-1].camera.name}, s = {max_sv:g}", path))
+        with self.console.meter("popping") as meter:
+            for i, (moved, sweep) in enumerate(jobs):
+                found = sweep(progress=self.stop.heeding(meter.part(i, len(jobs), moved)))
+                self.popping.append((moved, found))
+
+    def _row(self, gaussians: Gaussians, virtual_scale: float, listener: Listener) -> Row:
+        from clod_adapter.evaluation.evaluate import evaluate
+
+        rows = evaluate(gaussians, self.scene.test, [virtual_scale], progress=self.stop.heeding(listener))
+        if not rows:
+            raise Stopped("stopped within a comparison")
+        return rows[0]
+
+    def _note(self, text: str) -> None:
+        self.console.say(text)
+        self.notes.append(text)
+
+    def report(self) -> dict[str, Any]:
+        """For --json."""
+        paths = list(dict.fromkeys(path for path, *_ in self.against))
+        names = dict(zip(paths, labels(paths), strict=True))
+        return {
+            "base_row": self.base_row.as_dict() if self.base_row else None,
+            "ranked": [
+                {"virtual_scale": ours.virtual_scale, "by": by, "row": row.as_dict()} for ours, by, row in self.ranked
+            ],
+            "against": [
+                {"model": path, "label": names[path], "theirs": theirs.as_dict(), "ours": ours.as_dict()}
+                for path, theirs, ours in self.against
+            ],
+            "popping": [{"moved": moved, **result.as_dict()} for moved, result in self.popping],
+        }
+
+    def text(self) -> str:
+        """For the console; empty without comparisons."""
+        from .shared.measure import popping_table, rows_table
+
+        parts = []
+        if self.base_row:
+            marked = [("base", self.base_row)]
+            for ours, by, row in self.ranked:
+                label = f"s={ours.virtual_scale:g}"
+                marked += [(label, ours)] if (label, ours) not in marked else []
+                marked.append((by, row))
+            title = "the unadapted base, pruned to the same counts by two rankings:"
+            parts.append(f"{title}\n{rows_table(marked)}")
+        if self.against:
+            parts.append("other files, each row followed by the dial value with the same count:")
+        for path in dict.fromkeys(path for path, *_ in self.against):
+            pairs = [pair for other, *pair in self.against if other == path]
+            marked = [m for their, our in pairs for m in (("theirs", their), (f"s={our.virtual_scale:.4g}", our))]
+            parts[-1] += f"\n{path}\n{rows_table(marked)}"
+        if self.popping:
+            parts.append(popping_table(self.popping))
+        return "".join(f"\n{part}\n" for part in parts)
+
+
+def neighbours(views: Sequence[View]) -> list[View]:
+    """PATH_CAMERAS from the middle of the capture, in the order of their names."""
+    ordered = sorted(views, key=lambda view: view.camera.name)
+    first = max((len(ordered) - PATH_CAMERAS) // 2, 0)
+    return ordered[first : first + PATH_CAMERAS]
+
+
+COMMAND = Command(
+    summary="Measure quality, count and time at some dial values.",
+    description="Measure quality, Gaussians kept and frame time at several dial values.",
+    usage="MODEL.ply --images DIR [--sv S [S ...]] [options]",
+    epilog=f"""\
+{BUDGETS}
+columns, over the held-out photographs (every 8th by name):
+  PSNR, SSIM  means against the photographs
+  kept        Gaussians kept, and their share of all
+  in view     of these, the ones with their centre in the image
+  frame ms    median time to render an image
+
+--base adds two rows per dial value: the base without tuning, reduced to as many
+Gaussians by opacity, and by removal error (the error in the training views when
+one Gaussian is removed). --against measures a file with a dial at every dial
+value, and MODEL.ply at as many Gaussians, or at s = 1.
+
+--popping turns the dial from 1 to the largest S in 200 equal ratios at two
+held-out cameras, and moves through five cameras in 200 steps at that S, where
+only the dial's changes count. Printed are the RMS change per step (of 255), the
+ratio of largest to mean (1 even, 200 a single jump), and the share of the
+largest left when the step is halved (0.5 a fade, 1.0 a jump).
+
+Ctrl-C skips unfinished dial values (exit code 0, "interrupted": true; 130 if
+none is finished).
+
+examples:
+  clod-adapt eval garden_clod.ply --images garden
+  clod-adapt eval garden_clod.ply --images garden --sv 1 4 --json > eval.json
+  clod-adapt eval garden_clod.ply --images garden --base garden.ply --popping
+  clod-adapt eval garden_clod.ply --images garden --against merged.ply cut.ply
+  clod-adapt eval garden_clod.ply --images garden --keep 500000 200000
+""",
+    add_arguments=add_arguments,
+    check=check,
+    run=run,
+    outputs=outputs,
+)

@@ -18,14 +18,11 @@ from clod_adapter._support.version import package_version
 from clod_adapter.errors import ClodError
 from clod_adapter.progress import Stopped
 
-from . import apply, doctor, inspect
+from . import apply, doctor, evaluate, inspect, render, view
 from .commands.adapt import ADAPT
 from .commands.demo import DEMO
-from .commands.evaluate import EVALUATE
 from .commands.export import EXPORT
-from .commands.render import RENDER
 from .commands.robustness import ROBUSTNESS
-from .commands.view import VIEW
 from .shared.command import Command, Parser
 from .shared.outputs import claimed
 from .shared.process import (
@@ -48,8 +45,8 @@ REPORT = "please report it, with the lines above, as an issue of this program's 
 
 # Adapting is the main command and has no name.
 COMMANDS: dict[str, Command] = {
-    "view": VIEW, "inspect": inspect.COMMAND, "eval": EVALUATE, "render": RENDER, "export": EXPORT,
-    "apply": apply.COMMAND, "robustness": ROBUSTNESS, "demo": DEMO, "doctor": doctor.COMMAND,
+    "view": view.COMMAND, "inspect": inspect.COMMAND, "eval": evaluate.COMMAND, "render": render.COMMAND,
+    "export": EXPORT, "apply": apply.COMMAND, "robustness": ROBUSTNESS, "demo": DEMO, "doctor": doctor.COMMAND,
 }  # fmt: skip
 
 

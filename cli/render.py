@@ -2,44 +2,87 @@
 
 from __future__ import annotations
 
-import argparse
+from argparse import ArgumentParser, Namespace
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PureWindowsPath
 from statistics import fmean
-from typing import Any
-
-import torch
-from PIL import Image, PngImagePlugin
-from torch import Tensor
+from typing import TYPE_CHECKING, Any
 
 from clod_adapter._support.text import file_name
 from clod_adapter._support.version import package_version
-from clod_adapter.cameras import View
-from clod_adapter.gaussians import Gaussians
+from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import atomic_path
-from clod_adapter.metrics import psnr
-from clod_adapter.render import render
+from clod_adapter.io.scene.folder import find_cameras, photograph_folders
 
-from .shared.alignment import align
+from .shared.command import (
+    Command,
+    add_activated,
+    add_antialiasing,
+    add_device,
+    add_dial_options,
+    add_images,
+    check_checkpoint,
+    check_dials,
+    check_scene,
+)  # fmt: skip
 from .shared.console import Console, put
-from .shared.inputs import pick_views, prepare_kernels, read_model_and_scene, with_filter
-from .shared.measure import Stopwatch, choose_dials, solve_dials
 from .shared.outputs import Outputs, check_outputs, make_folder
 from .shared.process import GracefulStop
 
+if TYPE_CHECKING:
+    from torch import Tensor
 
-@dataclass(frozen=True)
-class Written:
-    """An image file of a view; per dial value the Gaussians kept, and PSNR (dB) against the photograph."""
-
-    view: str
-    file: str
-    kept: list[int]
-    psnr: list[float]
+    from clod_adapter.cameras import View
+    from clod_adapter.gaussians import Gaussians
 
 
-def run(args: argparse.Namespace) -> dict[str, Any]:
+def add_arguments(parser: ArgumentParser) -> None:
+    given = parser.add_argument_group("input")
+    given.add_argument("model", metavar="MODEL.ply", help="an adapted file, or a plain one")
+    add_images(given)
+    given.add_argument(
+        "--views", metavar="NAME", nargs="+", default=["held-out"],
+        help="photographs whose cameras to render: names, all, or held-out (default)",
+    )  # fmt: skip
+    add_activated(given)
+    add_antialiasing(given)
+    dial = parser.add_argument_group("dial values, one of")
+    add_dial_options(dial, "dial values (default: 1)", "(mean over the images)", several=True)
+    output = parser.add_argument_group("output")
+    output.add_argument("-o", "--out", metavar="FOLDER", required=True, help="output folder; made if missing")
+    output.add_argument("--beside", action="store_true", help="put the photograph left of the renders")
+    add_device(output, "render")
+
+
+def check(args: Namespace) -> None:
+    check_dials(args, args.model)
+    check_checkpoint(args.model)
+    check_scene(args.images)
+    check_folder(Path(args.out), Path(args.images))
+
+
+def check_folder(out: Path, scene: Path) -> None:
+    """Refuses an output folder in which images could replace photographs of the scene."""
+    cameras = find_cameras(scene)
+    places = [folder.resolve() for folder in (scene, cameras.parent, cameras.parent.parent)]
+    folders = photograph_folders(scene, cameras)
+    if cameras.is_dir():  # folders next to a model's images/ are free; a transforms.json may name any file below it
+        folders.remove(scene)
+    if out.resolve() in places or any(out.resolve().is_relative_to(folder.resolve()) for folder in folders):
+        raise ClodError(f"{out}: the scene's own photographs may be there; choose another --out")
+
+
+def outputs(args: Namespace) -> Outputs:
+    """The folder; the names of the images in it are those of photographs, which are read later."""
+    return Outputs(folders=[Path(args.out)], inputs=[args.model], scene=args.images)
+
+
+def run(args: Namespace) -> dict[str, Any]:
+    from .shared.alignment import align
+    from .shared.inputs import pick_views, prepare_kernels, read_model_and_scene, with_filter
+    from .shared.measure import Stopwatch, choose_dials, solve_dials
+
     console, watch, out = Console(args.quiet), Stopwatch(), Path(args.out)
     model, _, scene, device = read_model_and_scene(args, console)
     prepare_kernels(console, device, training=False)
@@ -66,6 +109,16 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     }  # fmt: skip
 
 
+@dataclass(frozen=True)
+class Written:
+    """An image file of a view; per dial value the Gaussians kept, and PSNR (dB) against the photograph."""
+
+    view: str
+    file: str
+    kept: list[int]
+    psnr: list[float]
+
+
 def image_names(views: Sequence[View]) -> list[Path]:
     """The PNG's name for each view: that of its photograph, with its suffix only where names would collide."""
     paths = [Path(file_name(str(Path(*PureWindowsPath(view.camera.name).parts)))) for view in views]
@@ -85,14 +138,19 @@ def write_all(images: Iterator[Written], total: int, console: Console) -> tuple[
     return written, len(written) < total
 
 
-@torch.no_grad()
 def write_images(
     gaussians: Gaussians, views: Sequence[View], dials: Sequence[float], out: Path, beside: bool
 ) -> Iterator[Written]:
     """Writes an image per view: the dial values from left to right, after the photograph with ``beside``."""
+    import torch
+
+    from clod_adapter.metrics import psnr
+    from clod_adapter.render import render
+
     for view, name in zip(views, image_names(views), strict=True):
         plain = gaussians.sigma_d is None
-        shown = [render(gaussians, view.camera, 1.0 if plain else dial) for dial in dials]
+        with torch.no_grad():
+            shown = [render(gaussians, view.camera, 1.0 if plain else dial) for dial in dials]
         panels = [rendering.pixels.cpu() for rendering in shown]
         write_png(out / name, torch.cat([view.image, *panels] if beside else panels, dim=1))
         kept = [int(rendering.kept.sum()) for rendering in shown]
@@ -102,6 +160,8 @@ def write_images(
 
 def write_png(path: Path, pixels: Tensor) -> None:
     """Writes ``[H, W, 3]`` uint8 pixels; makes the folder if it is missing."""
+    from PIL import Image, PngImagePlugin
+
     make_folder(path.parent)
     with atomic_path(path) as temporary:
         about = PngImagePlugin.PngInfo()
@@ -116,3 +176,29 @@ def summary(pictures: Sequence[Written], dials: Sequence[float], total: int, out
         error = fmean(picture.psnr[k] for picture in pictures)
         lines.append(f"  s = {dial:.5g}: {kept:,.0f} of {total:,} Gaussians, {error:.2f} dB, means over the images")
     return "\n".join(lines)
+
+
+COMMAND = Command(
+    summary="Render a scene's cameras at some dial values to PNG.",
+    description="""\
+Render the cameras of a scene's photographs at some dial values to PNG files.
+
+Each image has the name of its photograph and shows all dial values side by
+side, in the order given.
+""",
+    usage="MODEL.ply --images DIR -o FOLDER [options]",
+    epilog="""\
+"clod-adapt eval --help" explains the budgets --keep, --fps and --psnr-drop.
+Ctrl-C finishes the image under way (exit code 0, "interrupted": true); a second
+one aborts.
+
+examples:
+  clod-adapt render garden_clod.ply --images garden -o out --sv 3
+  clod-adapt render garden_clod.ply --images garden -o out --sv 1 2 5 --beside
+  clod-adapt render garden_clod.ply --images garden -o out --views a.jpg --sv 2
+""",
+    add_arguments=add_arguments,
+    check=check,
+    run=run,
+    outputs=outputs,
+)

@@ -2,38 +2,125 @@
 
 from __future__ import annotations
 
-import argparse
 import json
+import math
+import os
+import re
+import subprocess
 import sys
+import webbrowser
+from argparse import ArgumentParser, Namespace
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from clod_adapter._support.text import as_text
 from clod_adapter._support.version import package_version
-from clod_adapter.cameras import Camera
-from clod_adapter.io.checkpoint import Checkpoint
+from clod_adapter.errors import ClodError
+from clod_adapter.io.file_formats import FORMATS
+from clod_adapter.io.ply.header import VIEWPOINT
 from clod_adapter.progress import Stopped
-from clod_adapter.viewer.page import policy, served_page
-from clod_adapter.viewer.payload import Payload, page_config
-from clod_adapter.viewer.server import Response, Server
 
-from .commands.view import view_files
-from .shared.alignment import read_cameras
-from .shared.browsers import open_browser
-from .shared.command import check_stored_cameras, initial_dial
+from .shared.command import (
+    Command,
+    add_activated,
+    add_antialiasing,
+    add_device_preset,
+    check_checkpoint,
+    check_scene,
+    check_stored_cameras,
+    initial_dial,
+    may_store,
+    model_has_dial,
+)  # fmt: skip
 from .shared.console import Console
-from .shared.inputs import read_checkpoint, with_filter, with_filter_of
-from .shared.measure import solve_dials
 from .shared.outputs import jsonable
 from .shared.process import interrupt_as_stopped
 
+if TYPE_CHECKING:
+    from clod_adapter.cameras import Camera
+    from clod_adapter.io.checkpoint import Checkpoint
+    from clod_adapter.viewer.payload import Payload
+    from clod_adapter.viewer.server import Response
+
 MODEL, BASE = "/files/model", "/files/base"
+IN_TERMINAL = ("lynx", "w3m", "links", "links2", "elinks", "www-browser")  # they would take over the terminal
 
 
-def run(args: argparse.Namespace) -> None:
+def add_arguments(parser: ArgumentParser) -> None:
+    given = parser.add_argument_group("input")
+    given.add_argument(
+        "models", metavar="MODEL.ply", nargs="+",
+        help="an adapted file, or a plain one, which has no dial; several, or a folder of them, to switch between",
+    )  # fmt: skip
+    given.add_argument("--base", metavar="BASE.ply", help="the checkpoint, or another file, to compare with")
+    given.add_argument("--images", metavar="DIR", help="scene folder, for its cameras only")
+    add_activated(given)
+    add_antialiasing(given, photographs=False)
+    page = parser.add_argument_group("page")
+    initial: Any = page.add_mutually_exclusive_group()
+    initial.add_argument(
+        "--sv", metavar="S", type=float,
+        help="initial dial value (default: 1 with photographs, else everything; then what the browser draws at 30 fps)",
+    )  # fmt: skip
+    add_device_preset(initial)
+    page.add_argument("--port", metavar="P", type=int, default=0, help="port of the server (default: a free one)")
+    page.add_argument("--no-browser", action="store_true", help="print the address only")
+
+
+def view_files(given: Sequence[str]) -> list[str]:
+    """The files to show: those given, and of a folder the checkpoints in it, by name, numbers by their value.
+
+    Raises:
+        ClodError: a folder has none.
+    """
+    return [file for path in given for file in (_files_in(Path(path)) if Path(path).is_dir() else [path])]
+
+
+def _files_in(folder: Path) -> list[str]:
+    def natural(path: Path) -> list[tuple[int, str]]:
+        return [(int(part), "") if part.isdigit() else (0, part) for part in re.split(r"(\d+)", path.name)]
+
+    found = sorted(
+        (path for path in folder.iterdir() if path.suffix.lower() in FORMATS and path.is_file()), key=natural
+    )
+    splats = [str(path) for path in found if _is_checkpoint(path)]
+    if not splats:
+        raise ClodError(f"{folder}: has no splat in it; give the file, or the folder that has it")
+    return splats
+
+
+def _is_checkpoint(path: Path) -> bool:
+    """Whether it is one by its first bytes; point clouds and meshes are .ply files too."""
+    try:
+        check_checkpoint(str(path))
+    except ClodError:
+        return False
+    return True
+
+
+def check(args: Namespace) -> None:
+    if not 0 <= args.port < 1 << 16:
+        raise ClodError(f"--port is {args.port}, it must be between 1 and 65535, or 0 for a free one")
+    if args.sv is not None and not 0 <= args.sv < math.inf:
+        raise ClodError(f"--sv is {args.sv:g}, it must be at least 0 (1 is full quality, 0 everything)")
+    files = view_files(args.models)
+    for path in (*files, *([args.base] if args.base else [])):
+        check_checkpoint(path)
+    if args.device_preset and not model_has_dial(files[0]):
+        raise ClodError(f"{files[0]}: has no sigma_d, which --device-preset needs; adapt it first")
+    if args.images is not None:
+        check_scene(args.images)
+    elif args.device_preset:
+        check_stored_cameras(files[0], may_store(files[0], VIEWPOINT))
+
+
+def run(args: Namespace) -> None:
     """Prints the address, or with --json the report, and serves the page until it is interrupted."""
+    from clod_adapter.viewer.server import Server
+
     console = Console(args.quiet)
     answers, report = make_page(args, console)
     with Server(answers, args.port) as server:
@@ -49,8 +136,16 @@ def run(args: argparse.Namespace) -> None:
         console.say("ended")
 
 
-def make_page(args: argparse.Namespace, console: Console) -> tuple[dict[str, Response], dict[str, Any]]:
+def make_page(args: Namespace, console: Console) -> tuple[dict[str, Response], dict[str, Any]]:
     """The answers of the server by path, and the report."""
+    from clod_adapter.viewer.page import policy, served_page
+    from clod_adapter.viewer.payload import Payload, page_config
+    from clod_adapter.viewer.server import Response
+
+    from .shared.alignment import read_cameras
+    from .shared.inputs import read_checkpoint, with_filter, with_filter_of
+    from .shared.measure import solve_dials
+
     files, base = view_files(args.models), None
     model = with_filter(read_checkpoint(files[0], console, args.activated), args, console)
     if args.device_preset and args.images is None:
@@ -61,7 +156,7 @@ def make_page(args: argparse.Namespace, console: Console) -> tuple[dict[str, Res
     if args.base:
         base = with_filter(read_checkpoint(args.base, console, args.activated, model.origin), args, console)
         base = with_filter_of(base, model, args)
-    cameras, notes = read_cameras(model, args.images, console) if args.images else (list[Camera](), list[str]())
+    cameras, notes = read_cameras(model, args.images, console) if args.images else ([], [])
     attenuation = model.gaussians.attenuation
     solved, asked = solve_dials(args, model, cameras or model.viewpoints, console)
     opening = solved[0] if args.device_preset and solved else args.sv
@@ -88,8 +183,82 @@ def make_page(args: argparse.Namespace, console: Console) -> tuple[dict[str, Res
 
 def payloads_of(models: list[Checkpoint]) -> dict[str, Payload]:
     """The models by path; of two files with the same name, the names have their folders."""
+    from clod_adapter.viewer.payload import Payload
+
     payloads = [Payload.of(model) for model in models]
     if len({payload.name for payload in payloads}) < len(payloads):
         names = [as_text("/".join(Path(model.path).absolute().parts[-2:])) for model in models]
         payloads = [replace(payload, name=name) for payload, name in zip(payloads, names, strict=True)]
     return {f"/files/{number}" if number else MODEL: payload for number, payload in enumerate(payloads)}
+
+
+def find_browser() -> webbrowser.BaseBrowser | None:
+    """The default browser; None if there is none, or only one that runs in the terminal."""
+    try:
+        browser = webbrowser.get()
+    except webbrowser.Error:
+        return None
+    if type(browser) is not webbrowser.GenericBrowser:
+        return browser
+    return None if "BROWSER" not in os.environ or browser.basename in IN_TERMINAL else browser
+
+
+def open_browser(url: str) -> bool:
+    """Opens ``url`` in a browser window; False if there is no such browser."""
+    browser = find_browser()
+    if browser is None:
+        return False
+    if type(browser) is not webbrowser.GenericBrowser:
+        return browser.open(url)
+    # A program of the user's, or of an editor that shows the page in its own window. Its open() would wait for it.
+    command = [browser.name, *(word.replace("%s", url) for word in browser.args)]
+    nowhere = subprocess.DEVNULL
+    try:
+        subprocess.Popen(command, stdin=nowhere, stdout=nowhere, stderr=nowhere, start_new_session=True)
+    except OSError:
+        return False
+    return True
+
+
+COMMAND = Command(
+    summary="Look at a file in the browser, and turn its dial.",
+    description="""\
+Show a file in the browser, with its dial and a free camera.
+
+Serves a page on 127.0.0.1, prints the address, opens it in the browser, and
+runs until Ctrl-C.
+""",
+    usage="MODEL.ply ... [--base BASE.ply] [--images DIR] [options]",
+    epilog="""\
+The page opens at s = 1 with photographs, else with everything shown, then at
+the dial value at which the browser draws 30 frames per second; --sv sets one
+that stays. It shows the Gaussians kept and the frame time, switches the
+attenuation on and off, and compares two dial values, or MODEL.ply and BASE.ply,
+on the two sides of a line. Drop another file on the page to open it; --sv
+holds for it too, within its trained range. The address holds the view. With
+--images the page can jump between the scene's cameras. Several files, such as
+levels or variants, and a folder of files open with a list to switch between
+them; the view and the dial value stay.
+
+Other machines cannot reach the page, and it loads nothing from the network. To
+see it from another machine, forward the port (-t passes Ctrl-C on):
+  ssh -t -L 8000:127.0.0.1:8000 HOST \\
+      clod-adapt view MODEL.ply --no-browser --port 8000
+"clod-adapt export MODEL.ply -o page.html" writes the page to a file.
+--device-preset opens it at the dial value whose count suits a device, by the
+cameras of --images or those stored in MODEL.ply.
+
+--json prints its object at the start: {"url": ..., ...}.
+
+exit codes: 0 ended by Ctrl-C or a signal; 2 bad input, or the port is in use
+
+examples:
+  clod-adapt view garden_clod.ply
+  clod-adapt view garden_clod.ply --base garden.ply --images garden --sv 3
+  clod-adapt view garden_clod.ply --device-preset phone
+  clod-adapt view levels/
+""",
+    add_arguments=add_arguments,
+    check=check,
+    run=run,
+)

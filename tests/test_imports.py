@@ -38,9 +38,9 @@ ORDER: list[set[str]] = [
     {""},  # the package itself, whose __init__ re-exports from the rows above
     {"cli.shared"},
     {"cli.commands"},
-    {"cli.comparisons", "cli.robustness_cells"},
+    {"cli.robustness_cells", "cli.view"},
     {"cli.adapt", "cli.apply", "cli.doctor", "cli.evaluate", "cli.export", "cli.inspect", "cli.render",
-     "cli.robustness", "cli.view"},
+     "cli.robustness"},
     {"cli.demo"},  # runs adapt
     {"cli.main"},
     {"__main__"},

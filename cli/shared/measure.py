@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from clod_adapter.evaluation.popping import Popping
 
 import argparse
-from collections.abc import Mapping
 from dataclasses import replace
 
 from torch import Tensor
@@ -29,7 +28,6 @@ from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.budget import dial_for, dial_for_times, frame_times
 from clod_adapter.evaluation.evaluate import Row, evaluate
 from clod_adapter.evaluation.frame_times import time_frames
-from clod_adapter.evaluation.perceptual import Metric
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.checkpoint import Checkpoint
 from clod_adapter.origin import Origin
@@ -114,15 +112,12 @@ def table(rows: Sequence[Row], base_rows: Sequence[Row] = (), plain_rows: Sequen
 
 
 def rows_table(marked: Sequence[tuple[str, Row]]) -> str:
-    """A table of labelled rows; LPIPS and FLIP if they were measured."""
+    """A table of labelled rows."""
     width = max(6, *(len(label) for label, _ in marked))
-    more = [name for name in ("lpips", "flip") if any(getattr(row, name) is not None for _, row in marked)]
-    heads = "".join(f"  {name.upper():>6}" for name in more)
-    lines = [f"{'dial':>{width}}  PSNR dB    SSIM{heads}        kept            in view  frame ms"]
+    lines = [f"{'dial':>{width}}  PSNR dB    SSIM        kept            in view  frame ms"]
     for label, row in marked:
-        extra = "".join(f"  {getattr(row, name):6.4f}" for name in more)
         kept = f"{row.kept:10,.0f}  {row.kept_share:6.1%}  {row.in_view:9,.0f}  {row.frame_ms:8.1f}"
-        lines.append(f"{label:>{width}}  {row.psnr:7.2f}  {row.ssim:.4f}{extra}  {kept}")
+        lines.append(f"{label:>{width}}  {row.psnr:7.2f}  {row.ssim:.4f}  {kept}")
     return "\n".join(lines)
 
 
@@ -162,7 +157,6 @@ def measure(
     virtual_scales: Sequence[float],
     console: Console,
     label: str = "measure",
-    metrics: Mapping[str, Metric] | None = None,
     stop: GracefulStop | None = None,
 ) -> tuple[list[Row], bool]:
     """The rows of the dial values, none without views, and whether Ctrl-C ended the measurement early.
@@ -179,7 +173,7 @@ def measure(
             meter.update(now.share, f"s={virtual_scales[(now.done - 1) // len(views)]:g}")
             return stop.requests == 0
 
-        rows = evaluate(gaussians, views, virtual_scales, metrics=metrics, progress=show)
+        rows = evaluate(gaussians, views, virtual_scales, progress=show)
     return rows, stop.requests > 0
 
 

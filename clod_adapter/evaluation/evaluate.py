@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 
@@ -15,7 +15,6 @@ from clod_adapter.cameras import View
 from clod_adapter.equation.attenuation import check_dial
 from clod_adapter.equation.distances import in_frustum
 from clod_adapter.errors import ClodError
-from clod_adapter.evaluation.perceptual import Metric
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.metrics import psnr_ssim
 from clod_adapter.progress import Listener, Phase, Progress
@@ -35,7 +34,6 @@ class Row:
         kept: Gaussians the dial leaves in, of all; kept_share: that divided by all.
         in_view: kept Gaussians that also take part in the picture (their centre is in the image).
         frame_ms: median time of a frame, milliseconds; one frame a view, so compare with ``frame_times.time_frames``.
-        lpips, flip: where they were asked for (``perceptual.available_metrics``), else None.
     """
 
     virtual_scale: float
@@ -45,12 +43,9 @@ class Row:
     kept_share: float
     in_view: float
     frame_ms: float
-    lpips: float | None = None
-    flip: float | None = None
 
     def as_dict(self) -> dict[str, float]:
-        """By name, without what was not measured."""
-        return {name: value for name, value in asdict(self).items() if value is not None}
+        return asdict(self)
 
 
 @torch.no_grad()
@@ -59,7 +54,6 @@ def evaluate(
     views: Sequence[View] | View,
     virtual_scales: Sequence[float] | float,
     *,
-    metrics: Mapping[str, Metric] | None = None,
     progress: Listener | None = None,
 ) -> list[Row]:
     """Renders ``views`` at each dial value and compares with the photographs.
@@ -67,7 +61,6 @@ def evaluate(
     Args:
         gaussians: adapted or not; without ``sigma_d`` every dial value shows the base.
         views: one or several; virtual_scales: one dial value or several.
-        metrics: more to measure, from ``perceptual.available_metrics``: any of ``lpips`` and ``flip``.
         progress: called in ``Phase.EVALUATION`` after each view of each dial value. If it returns False, the rows of
             the dial values that are complete are returned.
 
@@ -88,12 +81,9 @@ def evaluate(
     rows = list[Row]()
     for i, virtual_scale in enumerate(virtual_scales):
         results, times = [], []
-        more: dict[str, list[float]] = {name: [] for name in metrics or {}}
         for j, (view, rendering, seconds, scores) in enumerate(_compared(gaussians, views, dials[i])):
             times.append(seconds * 1e3)
             results.append((*scores, *_counts(gaussians, view, rendering)))
-            for name, metric in (metrics or {}).items():
-                more[name].append(metric(rendering.image, view.image))
             done = Progress(Phase.EVALUATION, i * len(views) + j + 1, len(virtual_scales) * len(views))
             stopped = progress is not None and progress(done) is False
             if stopped and j + 1 < len(views):
@@ -101,8 +91,7 @@ def evaluate(
         psnr, ssim, kept, in_view = (statistics.fmean(column) for column in zip(*results, strict=True))
         share = kept / max(len(gaussians), 1)
         frame_ms = statistics.median(times)
-        perceived = {name: statistics.fmean(values) for name, values in more.items()}
-        rows.append(Row(float(virtual_scale), psnr, ssim, kept, share, in_view, frame_ms, **perceived))
+        rows.append(Row(float(virtual_scale), psnr, ssim, kept, share, in_view, frame_ms))
         if stopped:
             break
     return rows

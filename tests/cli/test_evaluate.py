@@ -12,7 +12,7 @@ import pytest
 import torch
 
 import clod_adapter
-from clod_adapter.cli import comparisons
+from clod_adapter.evaluation import evaluate as module
 from runs import notes_of, pressing
 
 ROW = {"virtual_scale", "psnr", "ssim", "kept", "kept_share", "in_view", "frame_ms"}
@@ -25,7 +25,7 @@ def test_eval_prints_one_object(clod: Any, capture: Any, dialled: Path) -> None:
     assert (report["model"], report["scene"], report["base_count"]) == (str(dialled), str(capture.scene), 300)
     assert [row["virtual_scale"] for row in report["rows"]] == [1, 2.5]
     for row in report["rows"]:
-        assert set(row) - {"lpips", "flip"} == ROW and row["in_view"] <= row["kept"]
+        assert set(row) == ROW and row["in_view"] <= row["kept"]
         assert row["kept_share"] == row["kept"] / 300 and row["frame_ms"] > 0
         assert 0 < row["psnr"] < 100 and 0 < row["ssim"] <= 1
     assert "PSNR dB" in done.err and "PSNR dB" not in done.out
@@ -125,22 +125,10 @@ def test_popping(clod: Any, capture: Any, dialled: Path) -> None:
 def test_interrupt_keeps_finished_comparisons(
     clod: Any, capture: Any, dialled: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(comparisons, "evaluate", pressing(comparisons.evaluate, signal.SIGINT, at=3))
+    monkeypatch.setattr(module, "evaluate", pressing(module.evaluate, signal.SIGINT, at=3))
     words = ("eval", dialled, "--images", capture.scene, "--sv", 1, 2, "--base", capture.ply, "--popping", "--json")
     done = clod(*words)
     report = json.loads(done.out)
     assert done.code == 0 and report["interrupted"] is True and len(report["rows"]) == 2
     assert report["base_row"] and [entry["by"] for entry in report["ranked"]] == ["opacity"]
     assert report["popping"] == []
-
-
-def test_optional_metrics_are_columns(clod: Any, capture: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Means over the views, in the rows and in the table."""
-    found = {"flip": lambda image, target: float(image.mean())}
-    monkeypatch.setattr("clod_adapter.cli.evaluate.available_metrics", lambda: (found, ["without LPIPS (why)"]))
-    done = clod("eval", capture.ply, "--images", capture.scene, "--sv", 1, "--json")
-    report = json.loads(done.out)
-    assert report["notes"] == ["without LPIPS (why)"] and "without LPIPS (why)" in done.err
-    assert 0 < report["rows"][0]["flip"] < 1 and "lpips" not in report["rows"][0]
-    table = done.err[done.err.index("  dial") :].splitlines()
-    assert "FLIP" in table[0] and "LPIPS" not in table[0] and f"{report['rows'][0]['flip']:.4f}" in table[1]

@@ -94,9 +94,9 @@ def test_progress_plan_and_tables_fit_in_a_pipe(capsys: pytest.CaptureFixture[st
 
 
 def test_tables_fit_with_every_column() -> None:
-    row = Row(28.5, 100.0, 0.98765, 12_345_678, 1.0, 1_234_567, 12345.6, 0.12345, 0.12345)
+    row = Row(28.5, 100.0, 0.98765, 12_345_678, 1.0, 1_234_567, 12345.6)
     table = rows_table([("s=28.5", row), ("base", row)])
-    assert {len(line) for line in table.splitlines()} == {80}
+    assert len({len(line) for line in table.splitlines()}) == 1 and len(table.splitlines()[0]) <= 80
     popping = Popping(200, 12.3456, 123.4567, 12.34, 123.4, 0.5, 123.4, 12.3, 0.5, ())
     shown = popping_table([("camera, a_photograph_of_a_long_name.png to another.png, s = 7", popping)])
     assert max(map(len, shown.splitlines())) <= 80

@@ -16,7 +16,6 @@ import pytest
 
 import clod_adapter
 from clod_adapter.cli import view
-from clod_adapter.cli.commands import view as view_command
 from clod_adapter.cli.main import build_parser, main
 from clod_adapter.errors import ClodError
 
@@ -124,7 +123,7 @@ def test_a_folder_and_several_files(capture: Any, dialled: Path, tmp_path: Path)
     (tmp_path / "more" / "lod2.ply").write_bytes(capture.ply.read_bytes())
     words = ["view", str(tmp_path), str(tmp_path / "more" / "lod2.ply")]
     args = build_parser("view").parse_args(words[1:])
-    view_command.VIEW.check(args)
+    view.COMMAND.check(args)
     answers, report = view.make_page(args, view.Console(True))
     (config,) = re.findall(r'id="clod-config">(.*?)</script>', b"".join(answers["/"].blocks()).decode(), re.DOTALL)
     config = json.loads(config)
@@ -138,4 +137,4 @@ def test_a_folder_and_several_files(capture: Any, dialled: Path, tmp_path: Path)
     assert report["model"].endswith("lod2.ply") and len(report["files"]) == 3
     (tmp_path / "empty").mkdir()
     with pytest.raises(ClodError, match="empty: has no splat in it"):
-        view_command.VIEW.check(build_parser("view").parse_args([str(tmp_path / "empty")]))
+        view.COMMAND.check(build_parser("view").parse_args([str(tmp_path / "empty")]))

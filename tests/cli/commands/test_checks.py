@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 import clod_adapter
-from clod_adapter.cli.commands.render import check_folder
+from clod_adapter.cli.render import check_folder
 from clod_adapter.cli.shared.command import check_scene
 from clod_adapter.errors import ClodError
 from photographs import model_of
