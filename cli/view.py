@@ -40,7 +40,6 @@ from .shared.outputs import jsonable
 from .shared.process import interrupt_as_stopped
 
 if TYPE_CHECKING:
-    from clod_adapter.cameras import Camera
     from clod_adapter.io.checkpoint import Checkpoint
     from clod_adapter.viewer.payload import Payload
     from clod_adapter.viewer.server import Response
