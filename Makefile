@@ -1,4 +1,4 @@
-# Needs python3 (3.11 or newer, with venv) and make; everything else is installed into .venv.
+# Needs python3 (3.10 or newer, with venv; 3.11 for the tests) and make; everything else is installed into .venv.
 #
 #   make demo    install and run the demo
 #   make test    install, then lint, format check, types, tests
@@ -28,6 +28,7 @@ test: $(VENV)/.installed-dev
 	PATH="$(CURDIR)/$(PEERS)/node_modules/.bin:$$PATH" $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist worksteal
 
 docs: $(VENV)/.installed-docs
+	$(BIN)/python docs/make.py
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 	@echo "open build/docs/index.html"
 

@@ -1,15 +1,14 @@
-"""The pictures of the dial, the viewer and a report for README and docs, of the demo's scene.
+"""The pictures of the dial and the viewer for README and docs, of the demo's scene.
 
 clod-adapt demo                  # makes demo/base.ply, demo/gallery.ply and demo/capture
-python benchmarks/pictures.py    # dial.webp, viewer.webp, viewer_menu.webp and report.webp in docs/images
+python benchmarks/pictures.py    # dial.webp and viewer.webp in docs/images
 
-The dial's picture has numbers of the view shown, measured then. The others are of a headless Chromium.
+The dial's picture has numbers of the view shown, measured then. The other is of a headless Chromium.
 """
 
 from __future__ import annotations
 
 import io
-import subprocess
 import sys
 import tempfile
 from pathlib import Path
@@ -20,7 +19,7 @@ from clod_adapter.cli.demo import CROP, VIEW, measured
 from clod_adapter.demo.pictures import dial_strip
 from clod_adapter.evaluation.baselines import matching_dial
 from clod_adapter.io.atomic import atomic_path
-from common import COMMAND, ROOT, arguments
+from common import ROOT, arguments
 
 from PIL import Image
 
@@ -29,8 +28,7 @@ import browser  # noqa: E402
 from shown import Shown, serve  # noqa: E402
 
 IMAGES = ROOT / "docs" / "images"
-SIZE, TALL = {"width": 1280, "height": 800}, {"width": 1100, "height": 1300}
-PHONE, GAP = {"width": 390, "height": 800}, 20
+SIZE = {"width": 1280, "height": 800}
 LARGEST = 300_000  # bytes
 DIAL = 5.0
 SHARE = 0.2  # of the Gaussians, beside all
@@ -43,8 +41,7 @@ def main() -> None:
     folder = Path(parser.parse_args().demo)
     keep(IMAGES / "dial.webp", dial(folder))
     with browser.launch() as chromium:
-        for name, picture in (("viewer", viewer), ("viewer_menu", menu), ("report", report)):
-            keep(IMAGES / f"{name}.webp", picture(chromium, folder))
+        keep(IMAGES / "viewer.webp", viewer(chromium, folder))
 
 
 def dial(folder: Path) -> bytes:
@@ -72,40 +69,6 @@ def viewer(chromium: Any, folder: Path) -> bytes:
         shown.page.wait_for_timeout(250)  # longer than the page draws fewer pixels after a movement
         shown.run("clod.whenDrawn()")
         return bytes(shown.page.screenshot(timeout=120_000))
-
-
-def menu(chromium: Any, folder: Path) -> bytes:
-    """The open menu with the removed Gaussians in orange: on a desktop in light, on a phone in dark."""
-    sheet = Image.new("RGB", (SIZE["width"] + GAP + PHONE["width"], SIZE["height"]), "white")
-    words = [folder / "gallery.ply", "--images", folder / "capture", "--sv", 2]
-    with serve(*words) as url:
-        for left, size, scheme in ((0, SIZE, "light"), (SIZE["width"] + GAP, PHONE, "dark")):
-            touch = size is PHONE
-            options = {"viewport": size, "color_scheme": scheme, "has_touch": touch, "is_mobile": touch}
-            with chromium.new_context(**options) as context:
-                shown = Shown(context.new_page()).ready(url)
-                shown.page.keyboard.press("k")
-                if touch:
-                    shown.page.tap("#fold")
-                shown.page.click("#menu-open")
-                shown.page.evaluate("document.getElementById('frame').style.visibility = 'hidden'")
-                shown.run("clod.whenDrawn()")
-                sheet.paste(Image.open(io.BytesIO(shown.page.screenshot(timeout=120_000))), (left, 0))
-    file = io.BytesIO()
-    sheet.save(file, "PNG")
-    return file.getvalue()
-
-
-def report(chromium: Any, folder: Path) -> bytes:
-    """The top of an evaluation's page in light."""
-    with tempfile.TemporaryDirectory() as made, chromium.new_context(viewport=TALL, color_scheme="light") as context:
-        out = Path(made) / "gallery.html"
-        words = ["eval", "gallery.ply", "--images", "capture", "--base", "base.ply", "--report", str(out), "--quiet"]
-        command = [*COMMAND, *words]
-        subprocess.run(command, check=True, stdout=subprocess.DEVNULL, cwd=folder)  # names without a folder on the page
-        page = context.new_page()
-        page.goto(out.as_uri())
-        return bytes(page.screenshot())
 
 
 def keep(path: Path, picture: bytes) -> None:
