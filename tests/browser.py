@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, NoReturn
 
@@ -23,6 +23,45 @@ SOFTWARE = (
     "--enable-unsafe-webgpu", "--use-webgpu-adapter=swiftshader", "--enable-features=Vulkan",  # WebGPU
     "--disable-background-networking",
 )  # fmt: skip
+
+# Runs WGSL statements on each row of a table, in place: `rows[at]` is the row's first number. One invocation a row.
+COMPUTE = """async ([source, statements, table]) => {
+  const adapter = await navigator.gpu?.requestAdapter();
+  if (!adapter) return null;
+  const device = await adapter.requestDevice(), rows = new Float32Array(table.flat()), width = table[0].length;
+  const module = device.createShaderModule({ code: `${source}
+    @group(0) @binding(0) var<storage, read_write> rows: array<f32>;
+    @compute @workgroup_size(1) fn main(@builtin(global_invocation_id) id: vec3u) {
+      let at = ${width} * id.x;
+      ${statements}
+    }` });
+  const faults = (await module.getCompilationInfo()).messages;
+  if (faults.length) throw new Error(faults.map((fault) => fault.message).join("; "));
+  const { STORAGE, COPY_SRC, COPY_DST, MAP_READ } = GPUBufferUsage, size = rows.byteLength;
+  const buffer = device.createBuffer({ size, usage: STORAGE | COPY_DST | COPY_SRC });
+  const copy = device.createBuffer({ size, usage: MAP_READ | COPY_DST });
+  device.queue.writeBuffer(buffer, 0, rows);
+  const pipeline = device.createComputePipeline({ layout: "auto", compute: { module, entryPoint: "main" } });
+  const encoder = device.createCommandEncoder(), pass = encoder.beginComputePass();
+  const entries = [{ binding: 0, resource: { buffer } }];
+  pass.setPipeline(pipeline);
+  pass.setBindGroup(0, device.createBindGroup({ layout: pipeline.getBindGroupLayout(0), entries }));
+  pass.dispatchWorkgroups(table.length);
+  pass.end();
+  encoder.copyBufferToBuffer(buffer, 0, copy, 0, size);
+  device.queue.submit([encoder.finish()]);
+  await copy.mapAsync(GPUMapMode.READ);
+  const found = Array.from(new Float32Array(copy.getMappedRange()));
+  return table.map((_, k) => found.slice(width * k, width * (k + 1)));
+}"""
+
+
+def compute(page: Any, source: str, statements: str, table: Sequence[Sequence[float]]) -> Any:
+    """The table after ``statements``; the page is from a secure place, such as loopback. Skips without WebGPU."""
+    found = page.evaluate(COMPUTE, [source, statements, table])
+    if found is None:
+        missing("this Chromium has no WebGPU adapter")
+    return found
 
 
 def find() -> str:

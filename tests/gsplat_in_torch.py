@@ -1,4 +1,4 @@
-"""gsplat's own ``rasterization`` and ``rasterization_2dgs`` without CUDA: its Python, with torch for its kernels.
+"""gsplat's own ``rasterization`` without CUDA: its Python, with torch for its kernels.
 
 Slow: for a few dozen Gaussians on a few tiles. It follows the kernels of the installed version, 1.4.0 or 1.5.3: where
 the projection has opacities, rows below 1/255 are dropped in it and narrow by their opacity; packed rows, tiles and
@@ -10,7 +10,6 @@ from __future__ import annotations
 import inspect
 import itertools
 import math
-from types import ModuleType
 from typing import Any
 
 import pytest
@@ -32,29 +31,15 @@ def install(monkeypatch: pytest.MonkeyPatch) -> None:
     by_opacity = "opacities" in inspect.signature(gsplat.fully_fused_projection).parameters
     replaced: dict[str, Any] = {
         "fully_fused_projection": fully_fused_projection if by_opacity else projection_without_opacities,
-        "fully_fused_projection_2dgs": projection_2dgs,
         "isect_tiles": isect_tiles,
         "isect_offset_encode": _torch_impl._isect_offset_encode,
         "rasterize_to_pixels": rasterize_to_pixels,
-        "rasterize_to_pixels_2dgs": pixels_2dgs,
         "spherical_harmonics": spherical_harmonics,
     }
     for name, function in replaced.items():
         monkeypatch.setattr(function, "__signature__", inspect.signature(getattr(gsplat, name)), raising=False)
         for module in (rendering, gsplat):
             monkeypatch.setattr(module, name, function)
-    monkeypatch.setattr(rendering, "torch", _OnCpu("torch"))
-
-
-class _OnCpu(ModuleType):
-    """torch, with the one device that gsplat's ``rasterization_2dgs`` has written into it left out."""
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(torch, name)
-
-    @staticmethod
-    def zeros_like(like: Tensor, device: Any = None, **options: Any) -> Tensor:
-        return torch.zeros_like(like, **options)
 
 
 def fully_fused_projection(
@@ -151,52 +136,6 @@ def rasterize_to_pixels(
     if backgrounds is not None:
         drawn = drawn + (1 - alphas) * backgrounds.reshape(len(canvas), 1, 1, -1)
     return drawn.unflatten(0, images), alphas.unflatten(0, images)
-
-
-def projection_2dgs(
-    means: Tensor, quats: Tensor, scales: Tensor, viewmats: Tensor, Ks: Tensor, width: int, height: int, eps2d: float,
-    near_plane: float, far_plane: float, radius_clip: float, packed: bool, sparse_grad: bool,
-) -> tuple[Tensor, ...]:  # fmt: skip
-    """Opacities play no part, as in the kernel."""
-    from gsplat.cuda import _torch_impl_2dgs
-
-    assert not packed, "rows of 2DGS are not packed here"
-    quats = quats / quats.norm(dim=-1, keepdim=True)
-    found = _torch_impl_2dgs._fully_fused_projection_2dgs(
-        means, quats, scales, viewmats, Ks, width, height, near_plane, far_plane
-    )
-    return found  # type: ignore[no-any-return]
-
-
-def pixels_2dgs(
-    means2d: Tensor, ray_transforms: Tensor, colors: Tensor, opacities: Tensor, normals: Tensor, densify: Tensor,
-    width: int, height: int, tile_size: int, isect_offsets: Tensor, flatten_ids: Tensor, *, backgrounds: Tensor | None,
-    packed: bool, absgrad: bool, distloss: bool,
-) -> tuple[Tensor, ...]:  # fmt: skip
-    """Every Gaussian with a tile, in order of the first: exact where Gaussians do not overlap differently by tile."""
-    images, n = means2d.shape[:-2], means2d.shape[-2]
-    centres = (means2d + densify).reshape(-1, n, 2)
-    if absgrad:
-        means2d.register_hook(lambda gradient: setattr(means2d, "absgrad", gradient.abs()))
-    y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
-    values = torch.cat([colors.expand(*images, n, -1), normals], -1).reshape(len(centres), n, -1)
-    drawn = []
-    for image, transforms in enumerate(ray_transforms.reshape(-1, n, 3, 3)):
-        ids = flatten_ids[flatten_ids // n == image].long().unique() - image * n
-        ids = ids[transforms[ids, 2, 2].argsort()]  # by depth
-        rays, shown = transforms[ids], opacities.reshape(-1, n)[image, ids]
-        across = torch.cross(
-            rays[:, 2] * x[..., None, None] - rays[:, 0], rays[:, 2] * y[..., None, None] - rays[:, 1], dim=-1
-        )
-        local = (across[..., :2] / across[..., 2:]).square().sum(-1)
-        flat = 2 * ((x[..., None] - centres[image, ids, 0]) ** 2 + (y[..., None] - centres[image, ids, 1]) ** 2)
-        weights = _weights(shown * torch.exp(-0.5 * torch.minimum(local, flat)))
-        drawn.append(torch.cat([weights @ values[image, ids], weights.sum(-1, keepdim=True)], -1))
-    canvas = torch.stack(drawn).unflatten(0, images)
-    image, normal, alphas = canvas[..., :-4], canvas[..., -4:-1], canvas[..., -1:]
-    if backgrounds is not None:
-        image = image + (1 - alphas) * backgrounds[..., None, None, :]
-    return image, alphas, normal, 0 * alphas, 0.5 * alphas
 
 
 def _blend(table: list[Tensor], x: Tensor, y: Tensor) -> Tensor:

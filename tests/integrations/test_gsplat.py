@@ -16,7 +16,6 @@ from torch import Tensor
 
 import gsplat_in_torch
 import gsplat_versions
-from backends import fresh_copy
 from clod_adapter.cameras import Camera
 from clod_adapter.config import FILTERS, AttenuationConfig
 from clod_adapter.equation.attenuation import attenuate
@@ -29,7 +28,6 @@ from scenes import camera, ring, scene
 N, WIDTH, HEIGHT = 40, 40, 28
 SOFT = AttenuationConfig(tau=0.02, cut="soft", scene_distance=4.0, max_sv=5.0)
 WHOLE = AttenuationConfig(tau=0.02, max_sv=5.0)  # does not change an opacity above tau without decay
-OURS = ["*", "sigma_d=None", "virtual_scale=1.0", "attenuation=None", "growth_d=None"]
 
 
 class Tools(SimpleNamespace):
@@ -78,22 +76,6 @@ def test_stored_signature_is_the_installed_one(tools: Tools, name: str) -> None:
     version = {"1.5.1": "1.5.0"}.get(gsplat.__version__, gsplat.__version__)
     stored = re.sub(r"=([A-Z]\w+)\.(\w+)", r"=<\1.\2:4>", gsplat_versions.signatures()[version][name])
     assert ", ".join(names(getattr(gsplat, name))) == stored.replace("**kwargs", "kwargs")
-
-
-def test_arguments_are_passed_to_a_stand_in(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without gsplat the error has the install command; a stand-in receives all arguments."""
-    with pytest.raises(ImportError, match="pip install gsplat==1.5.3"):
-        fresh_copy(monkeypatch, "gsplat", "gsplat", None)
-    stand_in = gsplat_versions.module("1.5.3", draw=lambda name, version, given: given)
-    wrapper = fresh_copy(monkeypatch, "gsplat", "gsplat", stand_in)
-    assert names(wrapper.rasterization) == [*names(stand_in.rasterization), *OURS]
-    given, views = arguments(N, 1)
-    plain = wrapper.rasterization(*given.values(), *views.values(), 0.3, packed=False)
-    assert (plain["near_plane"], plain["packed"], plain["tile_size"]) == (0.3, False, 16)
-    passed = wrapper.rasterization(*given.values(), *views.values(), sigma_d=torch.full((N,), 1e9), attenuation=SOFT)
-    same(passed.pop("opacities"), dialled(given, views, torch.full((N,), 1e9), 1.0, SOFT)[0]["opacities"])
-    want = stand_in.rasterization(*given.values(), *views.values())
-    assert all(passed[name] is want[name] for name in passed)
 
 
 def arguments(n: int, cameras: int, batch: tuple[int, ...] = (), **dtype: Any) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -246,57 +228,6 @@ def test_attenuated_results_match_gsplat_per_camera(
         want = torch.cat([getattr(point, kind) for point in points[1:]])
         assert getattr(points[0], kind).shape == points[0].shape
         torch.testing.assert_close(getattr(points[0], kind), want, rtol=1e-3, atol=1e-4)
-
-
-def test_colours_and_backgrounds_per_camera(tools: Tools) -> None:
-    require_batches()
-    given, views = arguments(N, 2, (2,), device=tools.device)
-    given["colors"] = torch.rand(2, 2, N, 5, generator=torch.Generator().manual_seed(0)).to(tools.device)
-    options = {"packed": False, "backgrounds": torch.rand(2, 2, 5).to(tools.device)}
-    wide = torch.full_like(given["opacities"], 1e9)
-    dial = {"sigma_d": wide, "growth_d": 0 * wide, "attenuation": AttenuationConfig(tau=1e-6)}
-    same(tools.ours(**given, **views, **options, **dial)[0], tools.theirs(**given, **views, **options)[0])
-
-
-@pytest.mark.parametrize(("cameras", "growing"), [(1, True), (3, False), (3, True)])
-def test_2dgs_matches_gsplats_per_camera(tools: Tools, cameras: int, growing: bool) -> None:
-    """All seven results and the gradients of the dial; culled rows are out of view; densification has its grad."""
-    import gsplat
-
-    from clod_adapter.integrations import gsplat as wrapper
-
-    given, views = arguments(N, cameras, device=tools.device)
-    given["colors"] = torch.rand(cameras, N, 3, generator=torch.Generator().manual_seed(3)).to(tools.device)
-    given["scales"][::2] *= 0.05  # narrower than a pixel: only these depend on gradient_2dgs
-    sigma_d = reach(N, device=tools.device).requires_grad_()
-    growth_d = (2 * reach(N, device=tools.device) - 1).requires_grad_() if growing else None
-    options = {"render_mode": "RGB+ED", "packed": False}
-    dial = {"sigma_d": sigma_d, "growth_d": growth_d, "attenuation": SOFT, "virtual_scale": 2.0}
-    ours = wrapper.rasterization_2dgs(**given, **views, **options, **dial)
-    turned = dialled(given, views, sigma_d, 2.0, SOFT, growth_d)
-    theirs = []
-    for c, drawn in enumerate(turned):
-        single = {name: views[name][c : c + 1] for name in ("viewmats", "Ks")}
-        colors = {"colors": given["colors"][c : c + 1]}
-        theirs.append(gsplat.rasterization_2dgs(**given | drawn | colors, **views | single, **options))
-    for number in range(6):
-        parts = [part[number] for part in theirs]
-        want = torch.stack(parts) if parts[0].dim() == 3 and cameras > 1 else torch.cat(parts)
-        torch.testing.assert_close(ours[number], want, rtol=1e-3, atol=1e-3 if number == 3 else 1e-4)
-    culled = torch.stack([drawn["opacities"] == 0 for drawn in turned])
-    assert 0 < int(culled.sum()) < culled.numel() and not ours[6]["radii"][culled].any()
-
-    inputs = [sigma_d] if growth_d is None else [sigma_d, growth_d]
-    weights = torch.rand(ours[0].shape, generator=torch.Generator().manual_seed(1)).to(tools.device)
-    first = torch.autograd.grad((ours[0] * weights).sum(), inputs, retain_graph=True)
-    loss = sum((part[0] * w).sum() for part, w in zip(theirs, weights, strict=True))
-    for mine, want in zip(first, torch.autograd.grad(loss, inputs, retain_graph=True), strict=True):
-        torch.testing.assert_close(mine, want, rtol=1e-3, atol=1e-4)
-    (ours[0] * weights).sum().backward()
-    loss.backward()
-    want = torch.cat([part[6]["gradient_2dgs"].grad for part in theirs])
-    assert float(want.abs().max()) > 0
-    torch.testing.assert_close(ours[6]["gradient_2dgs"].grad, want, rtol=1e-3, atol=1e-4)
 
 
 @pytest.mark.parametrize("packed", [True, False], ids=["packed", "unpacked"])

@@ -1,4 +1,4 @@
-"""The wrapper against the fork with the kept rows alone: stand-ins for five forks, and the installed one on CUDA."""
+"""The wrapper against the fork with the kept rows alone: stand-ins for five forks."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def wrapper(monkeypatch: pytest.MonkeyPatch, installed: ModuleType | None) -> Mo
     return fresh_copy(monkeypatch, "inria", "diff_gaussian_rasterization", installed)
 
 
-def arguments(*further: str, device: str = "cpu") -> dict[str, Any]:
+def arguments(*further: str) -> dict[str, Any]:
     """A fork's arguments by name, which require gradients; half of the Gaussians are behind the camera."""
     s = scene(N, 1, 0, size=0.2)
     values = {
@@ -37,8 +37,8 @@ def arguments(*further: str, device: str = "cpu") -> dict[str, Any]:
         "shs": torch.cat([s["sh0"], s["shN"]], 1), "scales": s["scales"],
         "rotations": torch.nn.functional.normalize(s["quats"]),
     }  # fmt: skip
-    made = {name: value.to(device).requires_grad_() for name, value in values.items()}
-    return made | {name: torch.ones(N, 2, device=device) for name in further}
+    made = {name: value.requires_grad_() for name, value in values.items()}
+    return made | {name: torch.ones(N, 2) for name in further}
 
 
 def config(**changes: Any) -> AttenuationConfig:
@@ -75,6 +75,7 @@ def test_kept_rows_are_drawn_as_by_the_fork(name: str, grows: bool, monkeypatch:
     ours = wrapper(monkeypatch, fork).GaussianRasterizer(raster_settings)
     dial = {"sigma_d": sigma_d, "growth_d": growth_d, "virtual_scale": DIAL, "attenuation": settings}
     got = ours(**given, **dial)
+    assert torch.equal(ours(*map(given.get, inria_forks.FORKS[name].call.split()), **dial)[0], got[0])
     for result, mine, theirs in zip(results, got, want, strict=True):
         if result in ("radii", "touched"):  # of all rows, 0 for culled ones
             assert torch.equal(mine[keep], theirs) and len(mine) == N and not mine[~keep].any()
@@ -137,17 +138,6 @@ def test_culled_rows_are_invisible_to_a_fork_that_culls_at_zero(monkeypatch: pyt
         assert not rasterizer(**given, sigma_d=sigma_d, virtual_scale=DIAL, attenuation=config())[1].any()
 
 
-@pytest.mark.parametrize("name", inria_forks.FORKS)
-def test_positional_arguments(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    fork = inria_forks.module(name)
-    settings = inria_forks.settings_of(fork.GaussianRasterizationSettings, VIEW)
-    ours, g = wrapper(monkeypatch, fork).GaussianRasterizer(settings), arguments(*inria_forks.FORKS[name].further)
-    for growth_d in (None, reach()):
-        more = {"sigma_d": reach(), "growth_d": growth_d, "virtual_scale": DIAL, "attenuation": config()}
-        by_position = ours(*map(g.get, inria_forks.FORKS[name].call.split()), **more)
-        assert torch.equal(by_position[0], ours(**g, **more)[0])
-
-
 def test_covariances_grow_by_the_square(monkeypatch: pytest.MonkeyPatch) -> None:
     """``cov3D_precomp`` instead of scales and rotations, by name and by position."""
     fork, given, passed = inria_forks.module("inria 2023"), arguments(), []
@@ -186,34 +176,3 @@ def test_bad_arguments_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
         ours(inria_forks.settings_of(kind, VIEW))(**given, sigma_d=reach(), virtual_scale=-1)
     with pytest.raises(ImportError, match="pip install .*graphdeco-inria/diff-gaussian-rasterization"):
         wrapper(monkeypatch, None)
-
-
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
-def test_the_installed_fork() -> None:
-    """On CUDA, called as by Inria's renderer."""
-    fork = pytest.importorskip("diff_gaussian_rasterization")
-    from clod_adapter.integrations.inria import GaussianRasterizer
-
-    fields = {"projmatrix": _full_projection().cuda(), "antialiasing": False}
-    raster_settings = inria_forks.settings_of(fork.GaussianRasterizationSettings, VIEW, **fields)
-    raster_settings = raster_settings._replace(
-        **{name: getattr(raster_settings, name).cuda() for name in ("bg", "viewmatrix", "campos")}
-    )
-    given, sigma_d = arguments(device="cuda"), reach()
-    result = faded({name: value.cpu() for name, value in given.items()}, sigma_d, config())
-    keep = result.keep.cuda()
-    rows = {name: value[keep] for name, value in given.items()} | {"opacities": result.drawn.cuda()[keep, None]}
-    want = fork.GaussianRasterizer(raster_settings)(**rows)
-    got = GaussianRasterizer(raster_settings)(**given, sigma_d=sigma_d.cuda(), virtual_scale=DIAL, attenuation=config())
-    torch.testing.assert_close(got[0], want[0], rtol=1e-4, atol=1e-4)
-    found, expected = (torch.autograd.grad(result[0].sum(), sigma_d)[0] for result in (got, want))
-    torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-3)
-
-
-def _full_projection() -> Tensor:
-    """Inria's projmatrix: world to clip space, multiplied from the right."""
-    near, far = 0.01, 100.0
-    clip = torch.zeros(4, 4)
-    clip[0, 0], clip[1, 1] = 2 * VIEW.K[0, 0] / VIEW.width, 2 * VIEW.K[1, 1] / VIEW.height
-    clip[2, 2], clip[2, 3], clip[3, 2] = far / (far - near), -far * near / (far - near), 1.0
-    return (clip @ VIEW.viewmat).T
