@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future, wait
 from contextlib import contextmanager
-from functools import partial
 from typing import Any
 
 import torch
 
-from clod_adapter._support.workers import Job, some
+from clod_adapter._support.workers import shared, submit
 
 _lock = threading.Lock()
 _alone, _before = 0, 0  # contexts open now, and torch's threads before the first
@@ -50,18 +50,17 @@ def run(kernel: Callable[..., Any], workers: int, *arguments: Any) -> None:
     """Calls ``kernel(worker, workers, *arguments)`` for each worker and waits for all of them.
 
     Raises:
-        MemoryError: a thread cannot be started, or ended early.
+        MemoryError: a thread cannot be started.
     """
     if workers == 1:
         kernel(0, 1, *arguments)
         return
-    others: list[Job] = []
+    others = list[Future[None]]()
     try:
-        for worker, thread in enumerate(some(workers - 1), start=1):
-            others.append(thread.submit(partial(kernel, worker, workers, *arguments)))
+        for worker in range(1, workers):
+            others.append(submit(shared(), kernel, worker, workers, *arguments))
         kernel(0, workers, *arguments)
     finally:
-        for other in others:
-            other.wait()  # also when interrupted: no thread may write into arrays that are returned
+        wait(others)  # also when interrupted: no thread may write into arrays that are returned
     for other in others:
         other.result()
