@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from numba import float32, uint64
 
+from clod_adapter._kernels import conventions as c
 from clod_adapter._kernels.bits import lowest
 from clod_adapter._kernels.blocks import (
     ACROSS,
@@ -26,24 +27,6 @@ from clod_adapter._kernels.blocks import (
     start_tile,
 )
 from clod_adapter._kernels.compiling import kernel, part
-from clod_adapter._kernels.conventions import (
-    AHEAD,
-    ALPHA_MAX,
-    ALPHA_MIN,
-    BLUE,
-    GREEN,
-    LOG,
-    MX,
-    MY,
-    PAIR,
-    QA,
-    QB,
-    QC,
-    RECORD,
-    RED,
-    T_MIN,
-    TILE,
-)
 from clod_adapter._kernels.elementary import exp2, vabs
 from clod_adapter._kernels.pixels import load_colors, load_plane, store_colors, store_plane
 from clod_adapter._kernels.pointers import fetch_add, pointer, prefetch, scratch
@@ -54,16 +37,16 @@ from clod_adapter._kernels.simd import anywhere, both, but_not, f32x16, fma, ge,
 @part
 def spread(records, r):  # type: ignore[no-untyped-def]
     """Exponent ``-QA, -QB, -QC, LOG`` and colour of the record at ``r``, the same in every lane."""
-    qa, qb, qc = splat(-records[r + QA]), splat(-records[r + QB]), splat(-records[r + QC])
-    red, green, blue = splat(records[r + RED]), splat(records[r + GREEN]), splat(records[r + BLUE])
-    return qa, qb, qc, splat(records[r + LOG]), red, green, blue
+    qa, qb, qc = splat(-records[r + c.QA]), splat(-records[r + c.QB]), splat(-records[r + c.QC])
+    red, green, blue = splat(records[r + c.RED]), splat(records[r + c.GREEN]), splat(records[r + c.BLUE])
+    return qa, qb, qc, splat(records[r + c.LOG]), red, green, blue
 
 
 @part
 def offsets_from(records, r, ox, oy):  # type: ignore[no-untyped-def]
     """From the centre of the record at ``r`` to the pixels of the tile's first block, along x and along y."""
-    base_x = load(LANE_X, 0) + splat(float32(ox) - records[r + MX])
-    return base_x, load(LANE_Y, 0) + splat(float32(oy) - records[r + MY])
+    base_x = load(LANE_X, 0) + splat(float32(ox) - records[r + c.MX])
+    return base_x, load(LANE_Y, 0) + splat(float32(oy) - records[r + c.MY])
 
 
 @kernel
@@ -79,13 +62,13 @@ def blend(  # type: ignore[no-untyped-def]
     count, tiles, records, entries = len(tiles), pointer(tiles), pointer(records), pointer(entries)
     offsets, background, image, alpha = pointer(offsets), pointer(background), pointer(image), pointer(alpha)
     state, live, masks = pointer(room[worker]), scratch(uint64, WORDS), pointer(masks)
-    zero, threshold, most, least = splat(float32(0)), splat(ALPHA_MIN), splat(ALPHA_MAX), splat(T_MIN)
+    zero, threshold, most, least = splat(float32(0)), splat(c.ALPHA_MIN), splat(c.ALPHA_MAX), splat(c.T_MIN)
     while True:
         turn = fetch_add(cursor, 1)
         if turn >= count:
             break
         tile = tiles[turn]
-        ox, oy = (tile % across) * TILE, (tile // across) * TILE
+        ox, oy = (tile % across) * c.TILE, (tile // across) * c.TILE
         for k in range(FORWARD_STATE):
             state[k] = float32(0)
         start_tile(ox, oy, width, height, state, 64, live)
@@ -94,8 +77,8 @@ def blend(  # type: ignore[no-untyped-def]
                 for k in range(entry * WORDS, offsets[tile + 1] * WORDS):
                     masks[k] = uint64(0)
                 break
-            r = entries[entry] * RECORD
-            prefetch(records, entries[min(entry + AHEAD, offsets[tile + 1] - 1)] * RECORD)
+            r = entries[entry] * c.RECORD
+            prefetch(records, entries[min(entry + c.AHEAD, offsets[tile + 1] - 1)] * c.RECORD)
             qa, qb, qc, log, red, green, blue = spread(records, r)
             base_x, base_y = offsets_from(records, r, ox, oy)
             find_blocks(records, r, ox, oy, masks, entry * WORDS)
@@ -159,17 +142,17 @@ def write_tile(ox, oy, width, height, state, background, image, alpha):  # type:
 @part
 def read_tile(ox, oy, width, height, image, alpha, v_image, v_alpha, state):  # type: ignore[no-untyped-def]
     """Loads for each pixel the remainder of v . C behind the current Gaussian, and v of the three channels."""
-    c, v = scratch(f32x16, 3), scratch(f32x16, 3)
+    color, v = scratch(f32x16, 3), scratch(f32x16, 3)
     for block in range(BLOCKS):
         x, y, at = ox + BLOCK * (block % ACROSS), oy + BLOCK * (block // ACROSS), block * 80
         if x >= width or y >= height:
             continue
         pixel = y * width + x
         if x + BLOCK <= width and y + BLOCK <= height:
-            load_colors(image, 3 * pixel, 3 * width, c)
+            load_colors(image, 3 * pixel, 3 * width, color)
             load_colors(v_image, 3 * pixel, 3 * width, v)
             rest = load_plane(v_alpha, pixel, width) * (load_plane(alpha, pixel, width) - splat(float32(1)))
-            store(state, at + 16, fma(v[0], c[0], fma(v[1], c[1], fma(v[2], c[2], rest))))
+            store(state, at + 16, fma(v[0], color[0], fma(v[1], color[1], fma(v[2], color[2], rest))))
             for channel in range(3):
                 store(state, at + 32 + 16 * channel, v[channel])
         else:
@@ -200,14 +183,14 @@ def blend_gradient(  # type: ignore[no-untyped-def]
     image, alpha, v_image, v_alpha = pointer(image), pointer(alpha), pointer(v_image), pointer(v_alpha)
     state, live, masks = pointer(room[worker]), scratch(uint64, WORDS), pointer(masks)
     zero, one = splat(float32(0)), splat(float32(1))
-    threshold, most, least = splat(ALPHA_MIN), splat(ALPHA_MAX), splat(T_MIN)
+    threshold, most, least = splat(c.ALPHA_MIN), splat(c.ALPHA_MAX), splat(c.T_MIN)
     while True:
         turn = fetch_add(cursor, 1)
         if turn >= count:
             break
         tile = tiles[turn]
-        ox, oy = (tile % across) * TILE, (tile // across) * TILE
-        if ox + TILE > width or oy + TILE > height:
+        ox, oy = (tile % across) * c.TILE, (tile // across) * c.TILE
+        if ox + c.TILE > width or oy + c.TILE > height:
             for k in range(BACKWARD_STATE):  # pixels outside have weight 0, but 0 times NaN is NaN
                 state[k] = float32(0)
         start_tile(ox, oy, width, height, state, 80, live)
@@ -215,11 +198,11 @@ def blend_gradient(  # type: ignore[no-untyped-def]
         for entry in range(offsets[tile], offsets[tile + 1]):
             slot = entry_slots[entry]
             if none_set(masks, entry * WORDS):
-                for k in range(PAIR):
-                    pair_sums[slot * PAIR + k] = float32(0)
+                for k in range(c.PAIR):
+                    pair_sums[slot * c.PAIR + k] = float32(0)
                 continue
-            r = entries[entry] * RECORD
-            prefetch(records, entries[min(entry + AHEAD, offsets[tile + 1] - 1)] * RECORD)
+            r = entries[entry] * c.RECORD
+            prefetch(records, entries[min(entry + c.AHEAD, offsets[tile + 1] - 1)] * c.RECORD)
             qa, qb, qc, log, red, green, blue = spread(records, r)
             base_x, base_y = offsets_from(records, r, ox, oy)
             s_r = s_g = s_b = s_0 = s_x = s_y = s_xx = s_xy = s_yy = zero
@@ -252,4 +235,4 @@ def blend_gradient(  # type: ignore[no-untyped-def]
                         s_x, s_y = s_x + sx, s_y + sy
                         s_xx, s_xy, s_yy = fma(sx, dx, s_xx), fma(sx, dy, s_xy), fma(sy, dy, s_yy)
                     store(state, at, select(keep, after, select(done, zero - t, t)))
-            store_sums(pair_sums, slot * PAIR, s_r, s_g, s_b, s_0, s_x, s_y, s_xx, s_xy, s_yy)
+            store_sums(pair_sums, slot * c.PAIR, s_r, s_g, s_b, s_0, s_x, s_y, s_xx, s_xy, s_yy)

@@ -44,3 +44,8 @@ SLACK = float32(0.01)
 PAIR = 9
 # Records are prefetched this many entries ahead.
 AHEAD = 4
+
+# Gradients of sixteen Gaussians as vectors: sums over pixels (9), P (6), rotation matrix (9), then what is stored:
+# scales (3), quaternion (4), mean (3), SH degree 0 (3).
+SUMS, V_P, V_ROT, V_SCALE, V_QUAT, V_MEAN, V_SH0 = 0, 9, 15, 24, 27, 31, 34
+GRADIENTS = 37 + 16

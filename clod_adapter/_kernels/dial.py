@@ -10,31 +10,11 @@ from __future__ import annotations
 
 from numba import float32, int64, uint64
 
-from clod_adapter._kernels.bits import bits_of, lowest
-from clod_adapter._kernels.colors import color
+from clod_adapter._kernels import conventions as c
+from clod_adapter._kernels.bits import bits_of
 from clod_adapter._kernels.compiling import kernel, part
-from clod_adapter._kernels.conventions import (
-    EYE,
-    GROWTH_RATE,
-    HALF,
-    HALF_EPS,
-    HUGE,
-    LOG2E,
-    LOG_THRESHOLD,
-    MEAN,
-    NEAR,
-    ONE,
-    RATE,
-    SCALE,
-    SOFT,
-    THRESHOLD,
-    TWO,
-    WORKSPACE,
-    ZERO,
-)
 from clod_adapter._kernels.elementary import exp2, log2, vsqrt
 from clod_adapter._kernels.pointers import pointer, scratch
-from clod_adapter._kernels.project import add_records, load_stored
 from clod_adapter._kernels.rows import load_rows, load_triples
 from clod_adapter._kernels.simd import both, f32x16, ge, gt, load, select, splat, vmax, vmin
 
@@ -45,24 +25,32 @@ NEARLY = float32(0.99)  # of the near plane: the projection decides exactly
 
 
 @part
+def settings_of(dial):  # type: ignore[no-untyped-def]
+    """The address of a dial's settings, or None."""
+    if dial is None:
+        return None
+    return pointer(dial)
+
+
+@part
 def distance(x, y, z, cam):  # type: ignore[no-untyped-def]
     """From the camera's centre, world units."""
-    dx, dy, dz = x - cam[EYE], y - cam[EYE + 1], z - cam[EYE + 2]
+    dx, dy, dz = x - cam[c.EYE], y - cam[c.EYE + 1], z - cam[c.EYE + 2]
     return vsqrt(dx * dx + dy * dy + dz * dz)
 
 
 @part
 def exponent(d, sigma, dial):  # type: ignore[no-untyped-def]
     """``u = (d s)^2 / (2 v)``; 0 where d is 0."""
-    sigma = vmax(sigma, splat(ZERO))
-    ratio = d * dial[RATE] / vsqrt(sigma * sigma + dial[HALF_EPS])
-    return select(gt(d, splat(ZERO)), HALF * ratio * ratio, splat(ZERO))
+    sigma = vmax(sigma, splat(c.ZERO))
+    ratio = d * dial[c.RATE] / vsqrt(sigma * sigma + dial[c.HALF_EPS])
+    return select(gt(d, splat(c.ZERO)), c.HALF * ratio * ratio, splat(c.ZERO))
 
 
 @part
 def reciprocal_opacity(logit):  # type: ignore[no-untyped-def]
     """``1 / sigmoid(logit)``."""
-    return ONE + exp2(vmin(-logit * LOG2E, splat(FARTHEST_EXPONENT)))
+    return c.ONE + exp2(vmin(-logit * c.LOG2E, splat(FARTHEST_EXPONENT)))
 
 
 @part
@@ -70,18 +58,24 @@ def survives(w, logit, decay, cam, dial):  # type: ignore[no-untyped-def]
     """Which of sixteen rows with centres ``w[:3]`` the dial keeps."""
     u = exponent(distance(w[0], w[1], w[2], cam), decay, dial)
     log_opacity = -(LN2 * log2(reciprocal_opacity(logit))) - u
-    return gt(select(gt(splat(HUGE), decay), log_opacity, splat(ZERO)), splat(dial[LOG_THRESHOLD]))
+    return gt(select(gt(splat(c.HUGE), decay), log_opacity, splat(c.ZERO)), splat(dial[c.LOG_THRESHOLD]))
 
 
 @part
-def kept(at, many, means, logits, sigma, cam, dial, dialled):  # type: ignore[no-untyped-def]
-    """The bits of those of ``many`` rows from ``at`` on that are in front of the camera and not culled."""
-    w = scratch(f32x16, 3)
-    load_triples(means, 3 * at, w)
-    depth = cam[8] * w[0] + cam[9] * w[1] + cam[10] * w[2] + cam[11]
-    shown = ge(depth, splat(NEARLY * cam[NEAR]))
-    if dialled:
-        shown = both(shown, survives(w, load(logits, at), load(sigma, at), cam, dial))
+def kept(at, many, means, opacities, sigma, cam, dial, dialled):  # type: ignore[no-untyped-def]
+    """The bits of those of ``many`` rows from ``at`` on that are in front of the camera and not culled.
+
+    Without a ``dial``, opacities are activated, and those of the rows are 1/255 at least.
+    """
+    if dial is None:
+        shown = both(ge(load(opacities, at), splat(c.ALPHA_MIN)), gt(splat(c.HUGE), load(opacities, at)))
+    else:
+        w = scratch(f32x16, 3)
+        load_triples(means, 3 * at, w)
+        depth = cam[8] * w[0] + cam[9] * w[1] + cam[10] * w[2] + cam[11]
+        shown = ge(depth, splat(NEARLY * cam[c.NEAR]))
+        if dialled:
+            shown = both(shown, survives(w, load(opacities, at), load(sigma, at), cam, dial))
     return bits_of(shown) & ((uint64(1) << uint64(many)) - uint64(1))
 
 
@@ -103,77 +97,33 @@ def mark_kept(worker, workers, means, logits, sigma, cam, dial, out):  # type: i
 
 
 @part
-def drawn(rows, logits, sigma, growth, cam, dial, dialled, grows, w):  # type: ignore[no-untyped-def]
-    """The drawn opacities of sixteen rows, whose centres and logarithms of scales ``w`` holds; makes these scales."""
+def drawn(rows, opacities, sigma, growth, cam, dial, dialled, grows, w):  # type: ignore[no-untyped-def]
+    """The drawn opacities of sixteen rows, whose centres and logarithms of scales ``w`` holds; makes these scales.
+
+    Without a ``dial``, opacities and scales are activated.
+    """
     values = scratch(float32, 48)
     for lane in range(16):
-        values[lane] = logits[rows[lane]]
-    opacity = ONE / reciprocal_opacity(load(values, 0))
-    size = splat(ZERO)
+        values[lane] = opacities[rows[lane]]
+    if dial is None:
+        return load(values, 0)
+    opacity = c.ONE / reciprocal_opacity(load(values, 0))
+    size = splat(c.ZERO)
     if dialled:
         for lane in range(16):
             values[16 + lane] = sigma[rows[lane]]
-        d = distance(w[MEAN], w[MEAN + 1], w[MEAN + 2], cam)
+        d = distance(w[c.MEAN], w[c.MEAN + 1], w[c.MEAN + 2], cam)
         decay = load(values, 16)
-        opacity = opacity * exp2(-(LOG2E * exponent(d, decay, dial)))
-        if dial[SOFT] > ZERO:
-            fade = TWO * (opacity / splat(dial[THRESHOLD])) - TWO
-            fade = select(gt(splat(HUGE), decay), vmin(vmax(fade, splat(ZERO)), splat(ONE)), splat(ONE))
+        opacity = opacity * exp2(-(c.LOG2E * exponent(d, decay, dial)))
+        if dial[c.SOFT] > c.ZERO:
+            fade = c.TWO * (opacity / splat(dial[c.THRESHOLD])) - c.TWO
+            fade = select(gt(splat(c.HUGE), decay), vmin(vmax(fade, splat(c.ZERO)), splat(c.ONE)), splat(c.ONE))
             opacity = opacity * fade
         if grows:
             for lane in range(16):
                 values[32 + lane] = growth[rows[lane]]
-            size = load(values, 32) * log2(vmax(d * dial[GROWTH_RATE], splat(ONE)))
+            size = load(values, 32) * log2(vmax(d * dial[c.GROWTH_RATE], splat(c.ONE)))
             size = vmin(splat(LOG2_GROWTH_MAX), vmax(splat(-LOG2_GROWTH_MAX), size))  # NaN stays, and is not drawn
-    for k in range(SCALE, SCALE + 3):
-        w[k] = exp2(vmin(w[k] * LOG2E + size, splat(FARTHEST_EXPONENT)))
+    for k in range(c.SCALE, c.SCALE + 3):
+        w[k] = exp2(vmin(w[k] * c.LOG2E + size, splat(FARTHEST_EXPONENT)))
     return opacity
-
-
-@kernel
-def project_dialled(  # type: ignore[no-untyped-def]
-    worker, workers, means, quats, log_scales, logits, sigma, growth, sh0, shN, degree, cam, dial, records, depths, ids,
-    counts,
-):  # fmt: skip
-    """``project.project`` of Gaussians as they are stored, at one dial value.
-
-    ``sigma`` and ``growth`` may be empty: then there is no dial, or no growth.
-    """
-    n, spare, dialled, grows = len(logits), len(logits) + worker, len(sigma) > 0, len(growth) > 0
-    first, last = n * worker // workers, n * (worker + 1) // workers
-    means, quats, log_scales, logits = pointer(means), pointer(quats), pointer(log_scales), pointer(logits)
-    sigma, growth, sh0, shN = pointer(sigma), pointer(growth), pointer(sh0), pointer(shN)
-    cam, dial, records, depths, ids = pointer(cam), pointer(dial), pointer(records), pointer(depths), pointer(ids)
-    w, rows, queue = scratch(f32x16, WORKSPACE), scratch(int64, 16), scratch(int64, 32)
-    last_means, last_logits, last_sigma = scratch(float32, 48), scratch(float32, 16), scratch(float32, 16)
-    i = packed = first
-    queued = 0
-    while i < last or queued > 0:
-        while i < last and queued < 16:
-            if i + 16 <= n:
-                bits = kept(i, min(last - i, 16), means, logits, sigma, cam, dial, dialled)
-            else:  # from a copy: no vector may reach beyond an array
-                for k in range(n - i):
-                    last_logits[k] = logits[i + k]
-                    if dialled:
-                        last_sigma[k] = sigma[i + k]
-                    for axis in range(3):
-                        last_means[3 * k + axis] = means[3 * (i + k) + axis]
-                bits = kept(0, last - i, last_means, last_logits, last_sigma, cam, dial, dialled)
-            while bits != uint64(0):
-                queue[queued] = i + lowest(bits)
-                queued += 1
-                bits &= bits - uint64(1)
-            i += 16
-        filled = min(queued, 16)
-        if filled == 0:
-            break
-        for lane in range(16):
-            rows[lane] = queue[min(lane, filled - 1)]
-        for k in range(16):
-            queue[k] = queue[16 + k]
-        queued -= filled
-        load_stored(means, quats, log_scales, rows, w)
-        opacity = drawn(rows, logits, sigma, growth, cam, dial, dialled, grows, w)
-        packed = add_records(rows, filled, packed, spare, means, opacity, cam, w, records, depths, ids)
-    counts[worker] = color(first, packed - first, means, sh0, shN, degree, cam, records, depths, ids)

@@ -4,73 +4,45 @@ from __future__ import annotations
 
 from numba import float32, int64
 
+from clod_adapter._kernels import conventions as c
 from clod_adapter._kernels.colors import load_sh, view_direction
 from clod_adapter._kernels.compiling import kernel, part
-from clod_adapter._kernels.conventions import (
-    BLUR,
-    COV,
-    COVDET,
-    FX,
-    FY,
-    HIGH_X,
-    HIGH_Y,
-    LOW_X,
-    LOW_Y,
-    MEAN,
-    ONE,
-    PAIR,
-    PMAT,
-    POINT,
-    QINV,
-    QUAT,
-    RAWDET,
-    RECORD,
-    RED,
-    ROT,
-    SCALE,
-    TWO,
-    UMAT,
-    WORKSPACE,
-    ZERO,
-)
+from clod_adapter._kernels.conventions import GRADIENTS, WORKSPACE
+from clod_adapter._kernels.dial import drawn, settings_of
+from clod_adapter._kernels.dial_gradient import dial_gradient
 from clod_adapter._kernels.pointers import pointer, scratch
 from clod_adapter._kernels.project import covariance, load_stored
 from clod_adapter._kernels.rows import load_rows, store_rows
 from clod_adapter._kernels.sh import C0, sh_basis, sh_basis_gradient
 from clod_adapter._kernels.simd import eq, f32x16, gt, load, select, splat, store, vmax, vmin
 
-# Gradients of sixteen Gaussians as vectors: sums over pixels (9), P (6), rotation matrix (9), then what is stored:
-# scales (3), quaternion (4), mean (3), SH degree 0 (3).
-SUMS, V_P, V_ROT, V_SCALE, V_QUAT, V_MEAN, V_SH0 = 0, 9, 15, 24, 27, 31, 34
-GRADIENTS = 37 + 16
-
 
 @part
 def covariance_gradient(w, g, cam, compensated):  # type: ignore[no-untyped-def]
     """Gradients of scales, rotation matrix and mean from the sums over pixels."""
-    idet = ONE / w[COVDET]
-    a, b, c = w[COV + 2] * idet, -(w[COV + 1] * idet), w[COV] * idet
-    # dL/dP = K M (K P) with the conic K = [[a, b], [b, c]] and the second moments M of the sums. K P comes from
+    idet = c.ONE / w[c.COVDET]
+    a, b, e = w[c.COV + 2] * idet, -(w[c.COV + 1] * idet), w[c.COV] * idet
+    # dL/dP = K M (K P) with the conic K = [[a, b], [b, e]] and the second moments M of the sums. K P comes from
     # K = adj(P P^T + blur) / det term by term: for a needle, K times the long column of P would cancel.
     for k in range(3):
-        p0, p1 = w[PMAT + k], w[PMAT + 3 + k]
-        t0, t1 = cam[BLUR] * p0, cam[BLUR] * p1
+        p0, p1 = w[c.PMAT + k], w[c.PMAT + 3 + k]
+        t0, t1 = cam[c.BLUR] * p0, cam[c.BLUR] * p1
         for j in range(3):
             if j != k:  # else it is 0, except for the rounding of a fused product
-                cross = p0 * w[PMAT + 3 + j] - w[PMAT + j] * p1
-                t0 += w[PMAT + 3 + j] * cross
-                t1 -= w[PMAT + j] * cross
+                cross = p0 * w[c.PMAT + 3 + j] - w[c.PMAT + j] * p1
+                t0 += w[c.PMAT + 3 + j] * cross
+                t1 -= w[c.PMAT + j] * cross
         t0, t1 = t0 * idet, t1 * idet
-        m0, m1 = g[SUMS + 6] * t0 + g[SUMS + 7] * t1, g[SUMS + 7] * t0 + g[SUMS + 8] * t1
-        g[V_P + k], g[V_P + 3 + k] = a * m0 + b * m1, b * m0 + c * m1
+        m0, m1 = g[c.SUMS + 6] * t0 + g[c.SUMS + 7] * t1, g[c.SUMS + 7] * t0 + g[c.SUMS + 8] * t1
+        g[c.V_P + k], g[c.V_P + 3 + k] = a * m0 + b * m1, b * m0 + e * m1
         if compensated is not None:
             compensation_gradient(w, g, k, t0, t1)
-        g[V_SCALE + k] = splat(ZERO)
+        g[c.V_SCALE + k] = splat(c.ZERO)
         for d in range(3):
-            v = w[UMAT + d] * g[V_P + k] + w[UMAT + 3 + d] * g[V_P + 3 + k]
-            g[V_SCALE + k] = g[V_SCALE + k] + v * w[ROT + 3 * d + k]
-            g[V_ROT + 3 * d + k] = v * w[SCALE + k]
-    v_x, v_y = a * g[SUMS + 4] + b * g[SUMS + 5], b * g[SUMS + 4] + c * g[SUMS + 5]
+            v = w[c.UMAT + d] * g[c.V_P + k] + w[c.UMAT + 3 + d] * g[c.V_P + 3 + k]
+            g[c.V_SCALE + k] = g[c.V_SCALE + k] + v * w[c.ROT + 3 * d + k]
+            g[c.V_ROT + 3 * d + k] = v * w[c.SCALE + k]
+    v_x, v_y = a * g[c.SUMS + 4] + b * g[c.SUMS + 5], b * g[c.SUMS + 4] + e * g[c.SUMS + 5]
     point_gradient(w, g, v_x, v_y, cam)
 
 
@@ -80,53 +52,53 @@ def compensation_gradient(w, g, k, t0, t1):  # type: ignore[no-untyped-def]
 
     ``t0, t1`` is the column of K P. The gradient with respect to log c equals that with respect to log opacity.
     """
-    p0, p1, u0, u1, inverse = w[PMAT + k], w[PMAT + 3 + k], splat(ZERO), splat(ZERO), ONE / w[RAWDET]
+    p0, p1, u0, u1, inverse = w[c.PMAT + k], w[c.PMAT + 3 + k], splat(c.ZERO), splat(c.ZERO), c.ONE / w[c.RAWDET]
     for j in range(3):
         if j != k:
-            cross = p0 * w[PMAT + 3 + j] - w[PMAT + j] * p1
-            u0, u1 = u0 + w[PMAT + 3 + j] * cross, u1 - w[PMAT + j] * cross
-    g[V_P + k] = g[V_P + k] + g[SUMS + 3] * (u0 * inverse - t0)
-    g[V_P + 3 + k] = g[V_P + 3 + k] + g[SUMS + 3] * (u1 * inverse - t1)
+            cross = p0 * w[c.PMAT + 3 + j] - w[c.PMAT + j] * p1
+            u0, u1 = u0 + w[c.PMAT + 3 + j] * cross, u1 - w[c.PMAT + j] * cross
+    g[c.V_P + k] = g[c.V_P + k] + g[c.SUMS + 3] * (u0 * inverse - t0)
+    g[c.V_P + 3 + k] = g[c.V_P + 3 + k] + g[c.SUMS + 3] * (u1 * inverse - t1)
 
 
 @part
 def point_gradient(w, g, v_x, v_y, cam):  # type: ignore[no-untyped-def]
     """Adds the gradients through the projected centre and through the Jacobian to that of the mean."""
-    x, y, iz = w[POINT], w[POINT + 1], ONE / w[POINT + 2]
+    x, y, iz = w[c.POINT], w[c.POINT + 1], c.ONE / w[c.POINT + 2]
     rx, ry = x * iz, y * iz
-    clamped_x = vmin(vmax(rx, splat(cam[LOW_X])), splat(cam[HIGH_X]))
-    clamped_y = vmin(vmax(ry, splat(cam[LOW_Y])), splat(cam[HIGH_Y]))
-    j00 = j02 = j11 = j12 = splat(ZERO)
+    clamped_x = vmin(vmax(rx, splat(cam[c.LOW_X])), splat(cam[c.HIGH_X]))
+    clamped_y = vmin(vmax(ry, splat(cam[c.LOW_Y])), splat(cam[c.HIGH_Y]))
+    j00 = j02 = j11 = j12 = splat(c.ZERO)
     for d in range(3):
-        u0 = u1 = splat(ZERO)
+        u0 = u1 = splat(c.ZERO)
         for k in range(3):
-            q = w[ROT + 3 * d + k] * w[SCALE + k]
-            u0, u1 = u0 + g[V_P + k] * q, u1 + g[V_P + 3 + k] * q
+            q = w[c.ROT + 3 * d + k] * w[c.SCALE + k]
+            u0, u1 = u0 + g[c.V_P + k] * q, u1 + g[c.V_P + 3 + k] * q
         j00, j02 = j00 + u0 * cam[d], j02 + u0 * cam[8 + d]
         j11, j12 = j11 + u1 * cam[4 + d], j12 + u1 * cam[8 + d]
-    fx, fy = cam[FX] * iz, cam[FY] * iz
+    fx, fy = cam[c.FX] * iz, cam[c.FY] * iz
     # The projected centre, then the factor 1/z of all four entries of the Jacobian.
     v_z = -(fx * rx * v_x + fy * ry * v_y) - iz * (fx * (j00 - clamped_x * j02) + fy * (j11 - clamped_y * j12))
-    v_rx = select(eq(clamped_x, rx), -(fx * j02 * iz), splat(ZERO))
-    v_ry = select(eq(clamped_y, ry), -(fy * j12 * iz), splat(ZERO))
+    v_rx = select(eq(clamped_x, rx), -(fx * j02 * iz), splat(c.ZERO))
+    v_ry = select(eq(clamped_y, ry), -(fy * j12 * iz), splat(c.ZERO))
     v_x, v_y, v_z = fx * v_x + v_rx, fy * v_y + v_ry, v_z - v_rx * rx - v_ry * ry
     for d in range(3):
-        g[V_MEAN + d] = g[V_MEAN + d] + (cam[d] * v_x + cam[4 + d] * v_y + cam[8 + d] * v_z)
+        g[c.V_MEAN + d] = g[c.V_MEAN + d] + (cam[d] * v_x + cam[4 + d] * v_y + cam[8 + d] * v_z)
 
 
 @part
 def quat_gradient(w, g):  # type: ignore[no-untyped-def]
     """Gradient of the stored quaternion from that of the rotation matrix."""
-    q0, q1, q2, q3, r = w[QUAT], w[QUAT + 1], w[QUAT + 2], w[QUAT + 3], V_ROT
+    q0, q1, q2, q3, r = w[c.QUAT], w[c.QUAT + 1], w[c.QUAT + 2], w[c.QUAT + 3], c.V_ROT
     x, y, z = g[r + 7] - g[r + 5], g[r + 2] - g[r + 6], g[r + 3] - g[r + 1]
     xy, xz, yz = g[r + 3] + g[r + 1], g[r + 6] + g[r + 2], g[r + 7] + g[r + 5]
-    v0 = TWO * (q1 * x + q2 * y + q3 * z)
-    v1 = TWO * (q2 * xy + q3 * xz + q0 * x - TWO * q1 * (g[r + 4] + g[r + 8]))
-    v2 = TWO * (q1 * xy + q3 * yz + q0 * y - TWO * q2 * (g[r] + g[r + 8]))
-    v3 = TWO * (q1 * xz + q2 * yz + q0 * z - TWO * q3 * (g[r] + g[r + 4]))
+    v0 = c.TWO * (q1 * x + q2 * y + q3 * z)
+    v1 = c.TWO * (q2 * xy + q3 * xz + q0 * x - c.TWO * q1 * (g[r + 4] + g[r + 8]))
+    v2 = c.TWO * (q1 * xy + q3 * yz + q0 * y - c.TWO * q2 * (g[r] + g[r + 8]))
+    v3 = c.TWO * (q1 * xz + q2 * yz + q0 * z - c.TWO * q3 * (g[r] + g[r + 4]))
     along = v0 * q0 + v1 * q1 + v2 * q2 + v3 * q3
-    g[V_QUAT], g[V_QUAT + 1] = (v0 - along * q0) * w[QINV], (v1 - along * q1) * w[QINV]
-    g[V_QUAT + 2], g[V_QUAT + 3] = (v2 - along * q2) * w[QINV], (v3 - along * q3) * w[QINV]
+    g[c.V_QUAT], g[c.V_QUAT + 1] = (v0 - along * q0) * w[c.QINV], (v1 - along * q1) * w[c.QINV]
+    g[c.V_QUAT + 2], g[c.V_QUAT + 3] = (v2 - along * q2) * w[c.QINV], (v3 - along * q3) * w[c.QINV]
 
 
 @part
@@ -135,7 +107,7 @@ def color_gradient(w, g, shN, rows, degree, cam, sh, basis, tuned, v_shN):  # ty
     inverse = view_direction(w, cam, sh)
     x, y, z = sh[0], sh[1], sh[2]
     sh_basis(degree, x, y, z, basis)
-    red, green, blue = g[SUMS], g[SUMS + 1], g[SUMS + 2]
+    red, green, blue = g[c.SUMS], g[c.SUMS + 1], g[c.SUMS + 2]
     terms = (degree + 1) * (degree + 1) - 1
     load_sh(shN, rows, terms, sh)
     for k in range(terms):
@@ -147,15 +119,15 @@ def color_gradient(w, g, shN, rows, degree, cam, sh, basis, tuned, v_shN):  # ty
             store_rows(v_shN, rows, 3 * terms, first, min(3 * terms - first, 16), sh, first)
     gx, gy, gz = sh_basis_gradient(degree, x, y, z, basis)
     along = gx * x + gy * y + gz * z
-    g[V_MEAN], g[V_MEAN + 1] = (gx - along * x) * inverse, (gy - along * y) * inverse
-    g[V_MEAN + 2] = (gz - along * z) * inverse
+    g[c.V_MEAN], g[c.V_MEAN + 1] = (gx - along * x) * inverse, (gy - along * y) * inverse
+    g[c.V_MEAN + 2] = (gz - along * z) * inverse
 
 
 @part
 def clear(values, first, last):  # type: ignore[no-untyped-def]
     """Sets the elements from ``first`` up to ``last`` to 0."""
     for k in range(first, last):
-        values[k] = ZERO
+        values[k] = c.ZERO
 
 
 @part
@@ -171,29 +143,59 @@ def no_gradient(first, last, shaped, colored, terms, v_means, v_quats, v_scales,
     clear(v_shN, 3 * terms * first, 3 * terms * last)
 
 
+@part
+def add_slots(pair_sums, slots, records, packed, lanes, sums, g):  # type: ignore[no-untyped-def]
+    """Sums the slots of sixteen packed Gaussians into ``g[SUMS]`` and into the rows of ``sums [16, 16]``."""
+    for lane in range(16):
+        total = splat(c.ZERO)
+        for slot in range(slots[2 * packed[lane]], slots[2 * packed[lane] + 1]):
+            total = total + load(pair_sums, slot * c.PAIR)
+        store(sums, 16 * lane, total)
+    load_rows(records, packed, c.RECORD, c.RED, 3, g, c.SUMS + c.PAIR)
+    red, green, blue = g[c.SUMS + c.PAIR], g[c.SUMS + c.PAIR + 1], g[c.SUMS + c.PAIR + 2]
+    load_rows(sums, lanes, 16, 0, c.PAIR, g, c.SUMS)
+    # A colour clamped at 0 has no gradient.
+    g[c.SUMS] = select(gt(red, splat(c.ZERO)), g[c.SUMS], splat(c.ZERO))
+    g[c.SUMS + 1] = select(gt(green, splat(c.ZERO)), g[c.SUMS + 1], splat(c.ZERO))
+    g[c.SUMS + 2] = select(gt(blue, splat(c.ZERO)), g[c.SUMS + 2], splat(c.ZERO))
+
+
 @kernel
 def project_gradient(  # type: ignore[no-untyped-def]
-    worker, workers, means, quats, scales, opacities, shN, degree, cam, records, packed_ids, counts, slots,
-    pair_sums, compensated, v_means, v_quats, v_scales, v_opacities, v_sh0, v_shN,
+    worker, workers, means, quats, scales, opacities, sigma, growth, shN, degree, cam, dial, records, packed_ids,
+    counts, slots, pair_sums, compensated, trained, v_means, v_quats, v_scales, v_opacities, v_sigma, v_growth, v_sh0,
+    v_shN,
 ):  # fmt: skip
-    """Sums the slots of each visible Gaussian and computes the gradients of its parameters, in row order.
+    """Sums the slots of each visible Gaussian and computes the gradients of what ``project`` takes, in row order.
 
-    ``compensated`` is True if the camera's filter compensates opacities, else None, a separate type for which numba
-    compiles the kernel without compensation. Empty ``v_means``, ``v_quats`` and ``v_scales`` skip these gradients, an
-    empty ``v_sh0`` or ``v_shN`` its own.
+    They are 0 from the row ``trained`` on. ``compensated`` is True if the camera's filter compensates opacities, else
+    None, a separate type for which numba compiles the kernel without compensation. Empty ``v_means``, ``v_quats`` and
+    ``v_scales`` skip these gradients, an empty ``v_sh0`` or ``v_shN`` its own.
     """
     w, g = scratch(f32x16, WORKSPACE), scratch(f32x16, GRADIENTS)
     sh, basis = scratch(f32x16, 80), scratch(f32x16, 25)
     rows, packed, lanes, sums = scratch(int64, 16), scratch(int64, 16), scratch(int64, 16), scratch(float32, 256)
     shaped, colored, tuned = len(v_means) > 0, len(v_sh0) > 0, len(v_shN) > 0
-    terms = (degree + 1) * (degree + 1) - 1 if tuned else 0
+    dialled, grows, terms = len(sigma) > 0, len(growth) > 0, (degree + 1) * (degree + 1) - 1 if tuned else 0
     first, last = len(opacities) * worker // workers, len(opacities) * (worker + 1) // workers
     end = first + counts[worker]
     means, quats, scales, opacities = pointer(means), pointer(quats), pointer(scales), pointer(opacities)
-    shN, cam, records, packed_ids = pointer(shN), pointer(cam), pointer(records), pointer(packed_ids)
-    slots, pair_sums = pointer(slots), pointer(pair_sums)
-    v_means, v_quats, v_scales = pointer(v_means), pointer(v_quats), pointer(v_scales)
-    v_opacities, v_sh0, v_shN = pointer(v_opacities), pointer(v_sh0), pointer(v_shN)
+    sigma, growth, shN, cam = pointer(sigma), pointer(growth), pointer(shN), pointer(cam)
+    settings = settings_of(dial)
+    records, packed_ids, slots, pair_sums = pointer(records), pointer(packed_ids), pointer(slots), pointer(pair_sums)
+    v_means, v_quats, v_scales, v_opacities = (
+        pointer(v_means),
+        pointer(v_quats),
+        pointer(v_scales),
+        pointer(v_opacities),
+    )
+    v_sigma, v_growth, v_sh0, v_shN = pointer(v_sigma), pointer(v_growth), pointer(v_sh0), pointer(v_shN)
+    while end > first and packed_ids[end - 1] >= trained:
+        end -= 1
+    if dialled:
+        clear(v_sigma, first, last)
+    if grows:
+        clear(v_growth, first, last)
     done = first
     for start in range(first, end, 16):
         for lane in range(16):
@@ -203,38 +205,22 @@ def project_gradient(  # type: ignore[no-untyped-def]
                 no_gradient(done, row, shaped, colored, terms, v_means, v_quats, v_scales, v_opacities, v_sh0, v_shN)
             done = max(done, row + 1)
         add_slots(pair_sums, slots, records, packed, lanes, sums, g)
-        for lane in range(16):
-            v_opacities[rows[lane]] = sums[16 * lane + 3] / opacities[rows[lane]]
+        load_stored(means, quats, scales, rows, w)
+        drawn(rows, opacities, sigma, growth, cam, settings, dialled, grows, w)
         if shaped or tuned:
-            load_rows(means, rows, 3, 0, 3, w, MEAN)
             color_gradient(w, g, shN, rows, degree, cam, sh, basis, tuned, v_shN)
         if shaped:
-            load_stored(means, quats, scales, rows, w)
             covariance(cam, w)
             covariance_gradient(w, g, cam, compensated)
             quat_gradient(w, g)
-            store_rows(v_means, rows, 3, 0, 3, g, V_MEAN)
-            store_rows(v_quats, rows, 4, 0, 4, g, V_QUAT)
-            store_rows(v_scales, rows, 3, 0, 3, g, V_SCALE)
+            store_rows(v_means, rows, 3, 0, 3, g, c.V_MEAN)
+            store_rows(v_quats, rows, 4, 0, 4, g, c.V_QUAT)
+        given = opacities, sigma, growth, v_opacities, v_sigma, v_growth
+        dial_gradient(rows, given, cam, settings, dialled, grows, shaped, w, g)
+        if shaped:
+            store_rows(v_scales, rows, 3, 0, 3, g, c.V_SCALE)
         if colored:
             for k in range(3):
-                g[V_SH0 + k] = C0 * g[SUMS + k]
-            store_rows(v_sh0, rows, 3, 0, 3, g, V_SH0)
+                g[c.V_SH0 + k] = C0 * g[c.SUMS + k]
+            store_rows(v_sh0, rows, 3, 0, 3, g, c.V_SH0)
     no_gradient(done, last, shaped, colored, terms, v_means, v_quats, v_scales, v_opacities, v_sh0, v_shN)
-
-
-@part
-def add_slots(pair_sums, slots, records, packed, lanes, sums, g):  # type: ignore[no-untyped-def]
-    """Sums the slots of sixteen packed Gaussians into ``g[SUMS]`` and into the rows of ``sums [16, 16]``."""
-    for lane in range(16):
-        total = splat(ZERO)
-        for slot in range(slots[2 * packed[lane]], slots[2 * packed[lane] + 1]):
-            total = total + load(pair_sums, slot * PAIR)
-        store(sums, 16 * lane, total)
-    load_rows(records, packed, RECORD, RED, 3, g, SUMS + PAIR)
-    red, green, blue = g[SUMS + PAIR], g[SUMS + PAIR + 1], g[SUMS + PAIR + 2]
-    load_rows(sums, lanes, 16, 0, PAIR, g, SUMS)
-    # A colour clamped at 0 has no gradient.
-    g[SUMS] = select(gt(red, splat(ZERO)), g[SUMS], splat(ZERO))
-    g[SUMS + 1] = select(gt(green, splat(ZERO)), g[SUMS + 1], splat(ZERO))
-    g[SUMS + 2] = select(gt(blue, splat(ZERO)), g[SUMS + 2], splat(ZERO))

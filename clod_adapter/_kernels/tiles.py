@@ -7,27 +7,8 @@ import math
 import numpy as np
 from numba import float32
 
+from clod_adapter._kernels import conventions as c
 from clod_adapter._kernels.compiling import kernel, part
-from clod_adapter._kernels.conventions import (
-    AHEAD,
-    DET,
-    HALF,
-    MX,
-    MY,
-    ONE,
-    QA,
-    QB,
-    QC,
-    REACH,
-    RECORD,
-    RX,
-    SLACK,
-    TILE,
-    X0,
-    X1,
-    Y0,
-    Y1,
-)
 from clod_adapter._kernels.pointers import pointer, prefetch
 
 
@@ -44,19 +25,19 @@ def extent(records, r, first, last):  # type: ignore[no-untyped-def]
     The ellipse is where alpha reaches 1/255. Between two rows it is widest at its own leftmost and
     rightmost points where those lie between them, else on the nearer row.
     """
-    my, rx, b = records[r + MY], records[r + RX], records[r + QB]
-    top, bottom = float32(first) + HALF - my, float32(last) + HALF - my
-    tip = -b / (records[r + QC] * float32(2)) * rx
+    my, rx, b = records[r + c.MY], records[r + c.RX], records[r + c.QB]
+    top, bottom = float32(first) + c.HALF - my, float32(last) + c.HALF - my
+    tip = -b / (records[r + c.QC] * float32(2)) * rx
     right, left = min(max(tip, top), bottom), min(max(-tip, top), bottom)
-    half = HALF / records[r + QA]
-    det = records[r + DET]  # 4 QA QC - QB^2, from the covariance, where it does not cancel
-    reach = float32(4) * records[r + QA] * records[r + REACH]
+    half = c.HALF / records[r + c.QA]
+    det = records[r + c.DET]  # 4 QA QC - QB^2, from the covariance, where it does not cancel
+    reach = float32(4) * records[r + c.QA] * records[r + c.REACH]
     x1 = rx if right == tip else (-b * right + math.sqrt(max(float32(0), reach - det * right * right))) * half
     x0 = -rx if left == -tip else (-b * left - math.sqrt(max(float32(0), reach - det * left * left))) * half
-    mx = records[r + MX]
+    mx = records[r + c.MX]
     return (
-        within(np.ceil(mx + x0 - HALF - SLACK), records[r + X0], records[r + X0], records[r + X1] + ONE),
-        within(np.floor(mx + x1 - HALF + SLACK), records[r + X1], records[r + X0] - ONE, records[r + X1]),
+        within(np.ceil(mx + x0 - c.HALF - c.SLACK), records[r + c.X0], records[r + c.X0], records[r + c.X1] + c.ONE),
+        within(np.floor(mx + x1 - c.HALF + c.SLACK), records[r + c.X1], records[r + c.X0] - c.ONE, records[r + c.X1]),
     )
 
 
@@ -95,11 +76,11 @@ def depth_order(depths, counts, keys, order, keys_other, order_other):  # type: 
 @part
 def tiles_across(records, r, ty, y0, y1):  # type: ignore[no-untyped-def]
     """First and last column of tiles that the record at ``r`` touches in the tile row ``ty``; none: last < first."""
-    x0, x1 = np.int32(records[r + X0]), np.int32(records[r + X1])
-    if y0 // TILE == y1 // TILE and x0 // TILE == x1 // TILE:
-        return x0 // TILE, x1 // TILE
-    x0, x1 = extent(records, r, max(ty * TILE, y0), min(ty * TILE + TILE - 1, y1))
-    return (x0 // TILE, x1 // TILE) if x1 >= x0 else (np.int32(0), np.int32(-1))
+    x0, x1 = np.int32(records[r + c.X0]), np.int32(records[r + c.X1])
+    if y0 // c.TILE == y1 // c.TILE and x0 // c.TILE == x1 // c.TILE:
+        return x0 // c.TILE, x1 // c.TILE
+    x0, x1 = extent(records, r, max(ty * c.TILE, y0), min(ty * c.TILE + c.TILE - 1, y1))
+    return (x0 // c.TILE, x1 // c.TILE) if x1 >= x0 else (np.int32(0), np.int32(-1))
 
 
 @kernel
@@ -110,10 +91,10 @@ def count_tiles(worker, workers, records, order, across, histogram, totals):  # 
     tally, records, order = pointer(histogram[worker]), pointer(records), pointer(order)
     total = 0
     for j in range(first, last):
-        prefetch(records, order[min(j + AHEAD, last - 1)] * RECORD)
-        r = order[j] * RECORD
-        y0, y1 = np.int32(records[r + Y0]), np.int32(records[r + Y1])
-        for ty in range(y0 // TILE, y1 // TILE + 1):
+        prefetch(records, order[min(j + c.AHEAD, last - 1)] * c.RECORD)
+        r = order[j] * c.RECORD
+        y0, y1 = np.int32(records[r + c.Y0]), np.int32(records[r + c.Y1])
+        for ty in range(y0 // c.TILE, y1 // c.TILE + 1):
             low, high = tiles_across(records, r, ty, y0, y1)
             for tx in range(low, high + 1):
                 tally[ty * across + tx] += 1
@@ -147,12 +128,12 @@ def fill_tiles(worker, workers, records, order, across, histogram, totals, slots
     entries, entry_slots = pointer(entries), pointer(entry_slots)
     slot = totals[worker]
     for j in range(first, last):
-        prefetch(records, order[min(j + AHEAD, last - 1)] * RECORD)
+        prefetch(records, order[min(j + c.AHEAD, last - 1)] * c.RECORD)
         p = order[j]
-        r = p * RECORD
-        y0, y1 = np.int32(records[r + Y0]), np.int32(records[r + Y1])
+        r = p * c.RECORD
+        y0, y1 = np.int32(records[r + c.Y0]), np.int32(records[r + c.Y1])
         slots[2 * p] = slot
-        for ty in range(y0 // TILE, y1 // TILE + 1):
+        for ty in range(y0 // c.TILE, y1 // c.TILE + 1):
             low, high = tiles_across(records, r, ty, y0, y1)
             for tx in range(low, high + 1):
                 at = cursor[ty * across + tx]

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from clod_adapter._kernels import blend, blocks, conventions, threads, tiles
 from clod_adapter._kernels.memory import aligned, recycled, release
+from clod_adapter._kernels.project import project
 from clod_adapter.cameras import Camera
 from clod_adapter.config import CLASSIC, AttenuationConfig, ScreenFilter
 from clod_adapter.equation.attenuation import FAINTEST, culling_threshold, log_threshold
@@ -136,16 +137,14 @@ def workers_for(rows: int) -> int:
     return threads.worker_count() if rows >= FEW else 1
 
 
-def _sorted(
-    buffers: Buffers, kernel: Any, n: int, inputs: tuple[Any, ...]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def _sorted(buffers: Buffers, n: int, inputs: tuple[Any, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Runs a projection. Packed records of the visible of n Gaussians, their row numbers, the count of each worker, and
     the depth order."""
     workers = workers_for(n)
     records = buffers.get("records", ((n + workers) * conventions.RECORD,), np.float32)
     depths, packed_ids = buffers.get("depths", (n,), np.float32), buffers.get("packed_ids", (n,), np.int32)
     counts = np.zeros(workers, np.int64)
-    threads.run(kernel, workers, *inputs, records, depths, packed_ids, counts)
+    threads.run(project, workers, *inputs, records, depths, packed_ids, counts)
     visible = int(counts.sum())
     keys, order = buffers.get("keys", (visible,), np.uint32), buffers.get("order", (visible,), np.int32)
     other = buffers.get("keys2", (visible,), np.uint32), buffers.get("order2", (visible,), np.int32)
@@ -153,11 +152,11 @@ def _sorted(
 
 
 def prepare(
-    kernel: Any, arrays: list[np.ndarray], degree: int, camera: Camera, screen_filter: ScreenFilter, *more: np.ndarray
+    arrays: list[np.ndarray], degree: int, camera: Camera, screen_filter: ScreenFilter, dial: np.ndarray | None
 ) -> Frame:
-    """Projection, depth order and tile lists. The kernel takes ``arrays``, the SH degree, the camera and ``more``."""
+    """Projection, depth order and tile lists of ``arrays``, which are as the kernel ``project`` takes them."""
     buffers, cam, n = take(), camera_vector(camera, screen_filter), len(arrays[0])
-    records, packed_ids, counts, order = _sorted(buffers, kernel, n, (*arrays, degree, cam, *more))
+    records, packed_ids, counts, order = _sorted(buffers, n, (*arrays, degree, cam, dial))
     across, down = -(-camera.width // conventions.TILE), -(-camera.height // conventions.TILE)
     listing = workers_for(len(order))
     histogram, totals = np.empty((listing, across * down), np.int64), np.empty(listing, np.int64)

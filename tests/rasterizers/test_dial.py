@@ -1,0 +1,152 @@
+"""The CPU's kernels have the dial in them: they draw, keep and differentiate what the default ``draw`` composes."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from backends import torch_threads
+from clod_adapter.config import ScreenFilter
+from clod_adapter.equation.attenuation import SIGMA_MAX, dial
+from clod_adapter.gaussians import Gaussians
+from clod_adapter.rasterizers import Rasterizer, cpu, for_device
+from scenes import camera, dialled, gaussians
+
+VIEW = camera(45, 37)
+KERNELS, COMPOSED = for_device(torch.device("cpu")), Rasterizer(cpu.rasterize)
+SHAPE, COLOUR = ("means", "quats", "log_scales", "growth_d"), ("sh0", "shN")
+Found = tuple[Tensor, Tensor, dict[str, Tensor]]
+
+
+def results(rasterizer: Rasterizer, model: Gaussians, s: float, *frozen: str) -> Found:
+    """Image and alpha, and the gradients of a random weighting of them, by attribute."""
+    random = torch.Generator().manual_seed(3)
+    leaves = {name: x.clone().requires_grad_(name not in frozen) for name, x in model.tensors().items()}
+    leaves["background"] = torch.tensor([0.2, 0.4, 0.6]).requires_grad_()
+    drawn = {name: x for name, x in leaves.items() if name != "background"}
+    image, alpha = rasterizer.draw(model.replace(**drawn), VIEW, s, background=leaves["background"])
+    weighed = sum((x * torch.rand(x.shape, generator=random)).sum() for x in (image, alpha))
+    asked = {name: x for name, x in leaves.items() if x.requires_grad}
+    slopes = torch.autograd.grad(weighed, list(asked.values()))  # type: ignore[arg-type]
+    return image.detach(), alpha.detach(), dict(zip(asked, slopes, strict=True))
+
+
+def away_from_thresholds(model: Gaussians, s: float) -> Gaussians:
+    """Without rows that rounding may cull, or draw with less than 1/255."""
+    found = dial(model, VIEW, s)
+    sure = (found.drawn - 1 / 255).abs() > 1e-5
+    if model.attenuation is not None:
+        sure &= ~((found.log_opacities - math.log(model.attenuation.tau * s)).abs() <= 1e-4)
+    return model.select(sure)
+
+
+def assert_same(model: Gaussians, s: float, *frozen: str) -> dict[str, Tensor]:
+    model = away_from_thresholds(model, s)
+    *pictures, slopes = results(KERNELS, model, s, *frozen)
+    *wanted, want = results(COMPOSED, model, s, *frozen)
+    for found, expected in zip(pictures, wanted, strict=True):
+        torch.testing.assert_close(found, expected, rtol=0, atol=5e-3)  # an alpha of 1/255 more or less
+        assert float((found - expected).abs().mean()) < 1e-5
+    for name, expected in want.items():
+        atol = 1e-4 * (max(float(expected.abs().max()), 1e-6) if expected.numel() else 1.0)
+        torch.testing.assert_close(slopes[name], expected, rtol=1e-3, atol=atol, msg=lambda m, n=name: f"{n}: {m}")
+    kept = [each.kept(model, VIEW, s) for each in (KERNELS, COMPOSED)]
+    assert torch.equal(*kept) and kept[0].dtype == torch.bool
+    return slopes
+
+
+@pytest.mark.parametrize("n", [0, 1, 15, 16, 17, 33, 200])
+@pytest.mark.parametrize("workers", [1, 3])
+def test_counts_around_sixteen(n: int, workers: int) -> None:
+    with torch_threads(workers):
+        slopes = assert_same(dialled(n, 2, n).replace(growth_d=torch.linspace(-1, 2, n)), 2.0)
+    assert n < 33 or all(bool(slope.any()) for slope in slopes.values())
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    s=st.sampled_from([1.0, 1.7, 6.0, 40.0]), cut=st.sampled_from(["soft", "hard"]), eps=st.sampled_from([0.0, 1e-8]),
+    tau=st.sampled_from([1e-6, 1 / 255, 0.02]), grows=st.booleans(), seed=st.integers(0, 99),
+    normalizer=st.sampled_from(["scene", "max"]), reference=st.sampled_from([0.0, 2.0]), mip=st.booleans(),
+)  # fmt: skip
+def test_any_settings(grows: bool, s: float, seed: int, reference: float, mip: bool, **given: Any) -> None:
+    model = dialled(90, 0, seed, reference_distance=reference, max_sv=45.0, **given)
+    model = model.replace(screen_filter=ScreenFilter(compensate=mip))
+    if grows:
+        model = model.replace(growth_d=torch.linspace(-1, 1.5, 90).roll(seed))
+    assert_same(model, s)
+
+
+@pytest.mark.parametrize("frozen", [SHAPE, COLOUR, (*SHAPE, *COLOUR), ("sigma_d", "opacity_logits"), SHAPE[:3]])
+def test_frozen_attributes(frozen: tuple[str, ...]) -> None:
+    assert_same(dialled(120, 1, 4).replace(growth_d=torch.full((120,), 0.5)), 2.0, *frozen)
+
+
+def test_without_a_dial() -> None:
+    assert_same(gaussians(100, 2, 0), 3.0)
+    assert_same(gaussians(100, 0, 0).replace(screen_filter=ScreenFilter(compensate=True)), 1.0)
+
+
+@pytest.mark.parametrize("cut", ["soft", "hard"])
+@pytest.mark.parametrize("eps", [0.0, 1e-8])
+def test_extreme_values(cut: str, eps: float) -> None:
+    """Sigma, opacities and growth at their limits, and a Gaussian in the camera's centre."""
+    sigmas = [0.0, -1.0, 1e-30, 1e-4, 1.0, SIGMA_MAX, 1e30, math.inf]
+    logits, growths = [-math.inf, -200.0, -4.0, 0.0, 3.0, 90.0, math.inf], [-1e30, -5.0, 0.0, 1.0, 30.0, 1e30]
+    rows = torch.cartesian_prod(*(torch.tensor(x) for x in (sigmas, logits, growths)))
+    for s in (1.0, 5.0):
+        model = dialled(len(rows), 0, 3, cut=cut, eps=eps).replace(sigma_d=rows[:, 0], opacity_logits=rows[:, 1])
+        model.means[::7] = VIEW.position
+        model = model.replace(growth_d=rows[:, 2])
+        for x in KERNELS.draw(model, VIEW, s):
+            assert x.isfinite().all()
+        usual = (rows[:, 2].abs() < 10) & (rows[:, 1] > -100) & (torch.arange(len(rows)) % 7 > 0)
+        some = away_from_thresholds(model.select(usual), s)
+        kept = [each.kept(some, VIEW, s) for each in (KERNELS, COMPOSED)]
+        assert torch.equal(*kept) and 0 < int(kept[0].sum()) < len(kept[0])
+        image, alpha, slopes = results(KERNELS, model.select(usual), s)
+        assert all(x.isfinite().all() for x in (image, alpha, *slopes.values()))
+
+
+@pytest.mark.parametrize("rasterizer", [KERNELS, COMPOSED], ids=["kernels", "composed"])
+def test_a_row_with_infinite_sigma_has_no_dial(rasterizer: Rasterizer) -> None:
+    """It is drawn as without a dial, however far the dial is turned, and its opacity has that gradient."""
+    model = gaussians(60, 0, 1)
+    for cut in ("soft", "hard"):
+        fixed = dialled(60, 0, 1, max_sv=45.0, cut=cut)
+        fixed = fixed.replace(sigma_d=torch.full((60,), math.inf), growth_d=torch.zeros(60))
+        image, alpha, slopes = results(rasterizer, fixed, 40.0)
+        wanted, want_alpha, want = results(rasterizer, model, 1.0)
+        assert torch.equal(image, wanted) and torch.equal(alpha, want_alpha)
+        for name, value in want.items():
+            torch.testing.assert_close(slopes[name], value)
+        assert not slopes["sigma_d"].any() and bool(want["opacity_logits"].any())
+        assert bool(rasterizer.kept(fixed, VIEW, 40.0).all())
+
+
+def test_other_types_and_other_cameras_take_the_composed_way() -> None:
+    model, other = dialled(50, 0, 1), camera(45, 37, fov=70)
+    assert model.sigma_d is not None
+    half = model.replace(sigma_d=model.sigma_d.half())
+    for some, seen_from in ((half, None), (model, other)):
+        found = [each.draw(some, VIEW, 2.0, seen_from=seen_from)[0] for each in (KERNELS, COMPOSED)]
+        assert torch.equal(*found)
+
+
+def test_gradients_beyond_the_trained_rows_are_0() -> None:
+    model = away_from_thresholds(dialled(90, 1, 2).replace(growth_d=torch.full((90,), 0.5)), 2.0)
+    want, leaves = results(KERNELS, model, 2.0)[2], {k: x.clone().requires_grad_() for k, x in model.tensors().items()}
+    image, _ = KERNELS.draw(model.replace(**leaves), VIEW, 2.0, trained=40)
+    for name, slope in zip(leaves, torch.autograd.grad(image.sum(), list(leaves.values())), strict=True):
+        assert not slope[40:].any() and bool(slope[:40].any()) == bool(want[name][:40].any()), name
+
+
+def test_a_growth_that_is_not_finite_is_not_drawn() -> None:
+    model = dialled(50, 0, 1).replace(growth_d=torch.full((50,), math.nan))
+    assert KERNELS.draw(model, VIEW, 2.0)[1].sum() == 0
