@@ -223,7 +223,7 @@ def _shorter(name: str) -> tuple[str, ...]:
 CPU = torch.device("cpu")
 OTHER = ""
 # Share of each kernel in the time to compile all of them; used only for the progress shown.
-SHARES = {"project_dialled": 0.23, "project_gradient": 0.16, "adam_rows": 0.12, OTHER: 0.03}
+SHARES = {"project": 0.23, "project_gradient": 0.16, "adam_rows": 0.12, OTHER: 0.03}
 
 
 def prepare_kernels(
