@@ -21,8 +21,8 @@ from clod_adapter.progress import Stopped
 from . import apply, doctor, evaluate, inspect, render, view
 from .commands.adapt import ADAPT
 from .commands.demo import DEMO
-from .commands.export import EXPORT
 from .commands.robustness import ROBUSTNESS
+from .export.command import COMMAND as EXPORT
 from .shared.command import Command, Parser
 from .shared.outputs import claimed
 from .shared.process import (

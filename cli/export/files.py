@@ -1,31 +1,77 @@
-"""Writes the files of an export, and reads them back."""
+"""The cameras that ``clod-adapt export`` bakes for, and the files that it writes."""
 
 from __future__ import annotations
 
+from argparse import Namespace
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from clod_adapter.bake import bake
+from clod_adapter.calibration import Viewpoint
 from clod_adapter.cameras import Camera
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.geometric_error import geometric_errors
 from clod_adapter.evaluation.level_errors import level_errors, looking
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.atomic import atomic_path
-from clod_adapter.io.checkpoint import Checkpoint, load
+from clod_adapter.io.checkpoint import Checkpoint
 from clod_adapter.io.file_formats import write
 from clod_adapter.io.formats.lod_meta import cutting_options, read_leaves, write_errors
 from clod_adapter.io.formats.splat_transform import SplatTransform, time_limit
 from clod_adapter.io.formats.tileset import write_tileset
-from clod_adapter.origin import NOWHERE
+from clod_adapter.training.camera_placement import place_cameras
 from clod_adapter.viewer.page import write_viewer_page
 
-from ..commands.export_formats import LOD_META, PACKED, PAGE, suffix_of
+from ..shared.alignment import read_cameras
 from ..shared.console import Console, duration
-from ..shared.inputs import prepare_kernels
-from .baking import Target
-from .packing import packing_bar, page_psnr
+from ..shared.inputs import named, prepare_kernels
+from .formats import LOD_META, PACKED, PAGE
+
+PLACED = 16  # cameras placed where none are known
+
+
+@dataclass(frozen=True)
+class Target:
+    """The cameras that a dial value is baked for.
+
+    Attributes:
+        camera: the one of ``--camera``, for which the result is exact; else None.
+        cameras: that one, or all that the file is baked for; empty for a model without a dial.
+        about: a description in printable ASCII.
+    """
+
+    camera: Camera | None
+    cameras: Sequence[Camera | Viewpoint]
+    about: str
+
+
+def find_target(args: Namespace, model: Checkpoint, console: Console) -> tuple[Target, list[str]]:
+    """The cameras of --camera, --images or the model's file, else placed ones; and notes on them."""
+    if args.camera is not None:
+        cameras, notes = read_cameras(model, args.images, console)
+        found = named(cameras, args.camera, "--camera")
+        if len(found) > 1:
+            both = f"{found[0].name} and {found[1].name}"
+            raise ClodError(f"--camera: {args.camera!r} matches {both}; give the full name")
+        return Target(found[0], found, "one camera"), notes
+    if args.images is not None:
+        cameras, notes = read_cameras(model, args.images, console, training=True)
+        return Target(None, cameras, f"{len(cameras)} training cameras"), notes
+    if model.viewpoints:
+        return Target(None, model.viewpoints, f"{len(model.viewpoints)} training cameras"), []
+    return _placed(model, console)
+
+
+def _placed(model: Checkpoint, console: Console) -> tuple[Target, list[str]]:
+    try:
+        with console.meter("placing cameras") as meter:
+            cameras = place_cameras(model.gaussians, views=PLACED, progress=meter)
+    except ClodError as error:
+        raise ClodError(f"{model.path}: no cameras stored to bake for, and {error}; give --images") from error
+    note = f"{model.path} stores no cameras: baked for {len(cameras)} placed ones; --images gives a better result"
+    return Target(None, cameras, f"{len(cameras)} placed cameras"), [note]
 
 
 @dataclass(frozen=True)
@@ -38,8 +84,7 @@ class Export:
         target: the cameras to bake for.
         cameras: of the scene, for the views of a page.
         ordered: whether the rows are sorted by extinction.
-        exact: whether a page has float32 values.
-        console: for splat-transform's progress.
+        console: for progress.
     """
 
     model: Checkpoint
@@ -47,7 +92,6 @@ class Export:
     target: Target
     cameras: list[Camera]
     ordered: bool
-    exact: bool
     console: Console
 
     def content(self, virtual_scale: float | None) -> tuple[Gaussians, tuple[str, ...]]:
@@ -67,7 +111,9 @@ class Export:
     def write(self, path: Path, suffix: str, virtual_scale: float | None) -> tuple[int, tuple[str, ...]]:
         """Writes a file; its number of Gaussians, and notes on losses of the format."""
         if suffix == PAGE:
-            return len(self.gaussians), self._write_page(path, virtual_scale)
+            prepare_kernels(self.console, self.gaussians.means.device, training=False)  # for its picture
+            _, losses = write_viewer_page(path, self.model, cameras=self.cameras, virtual_scale=virtual_scale)
+            return len(self.gaussians), losses
         gaussians, about = self.content(virtual_scale)
         if suffix in PACKED:
             return len(gaussians), self._pack(path, suffix, gaussians, about)
@@ -77,22 +123,7 @@ class Export:
             notes += ("x, y and z are doubles, which SIBR and some other readers misread",)
         return len(gaussians), notes
 
-    def candidate(self, out: Path, virtual_scale: float) -> Gaussians:
-        """The Gaussians in the file of a dial value, as read back; without the rounding of splat-transform."""
-        suffix = suffix_of(out)
-        if suffix in PACKED:
-            return self.content(virtual_scale)[0]
-        with TemporaryDirectory(dir=out.parent, prefix=".tmp-") as folder:
-            path = Path(folder) / f"candidate{suffix}"
-            self.write(path, suffix, virtual_scale)
-            return self.read_back(path, suffix)
-
-    def read_back(self, path: Path, suffix: str) -> Gaussians:
-        """The Gaussians of a written file, on the model's device and relative to its origin."""
-        origin = NOWHERE if suffix in (".splat", *PACKED) else self.model.origin
-        return load(path, origin=origin).gaussians.to(self.gaussians.means.device)
-
-    def write_levels(self, folder: Path, levels: list[float]) -> tuple[list[int], tuple[str, ...]]:
+    def write_levels(self, folder: Path, levels: list[float]) -> tuple[list[int], list[str]]:
         """Writes a streaming set to ``folder``; the number of Gaussians per level, and notes."""
         folder.mkdir()
         contents = [self.content(level) for level in levels]
@@ -104,9 +135,9 @@ class Export:
                 write(source, gaussians, about)
                 words += [source, "-l", str(k)]
             notes = self._transform(words, folder / LOD_META, sum(counts))
-        return counts, notes + self._add_errors(folder / LOD_META, [gaussians for gaussians, _ in contents])
+        return counts, [*notes, *self._add_errors(folder / LOD_META, [gaussians for gaussians, _ in contents])]
 
-    def write_tiles(self, folder: Path, levels: list[float]) -> tuple[list[int], tuple[str, ...]]:
+    def write_tiles(self, folder: Path, levels: list[float]) -> tuple[list[int], list[str]]:
         """Writes a 3D Tiles set to ``folder``; the number of Gaussians per level, and notes."""
         folder.mkdir()
         contents = [self.content(level)[0] for level in levels]
@@ -114,7 +145,7 @@ class Export:
         with self.console.meter("errors of levels") as meter:
             errors = geometric_errors(contents, looking(self.target.cameras, contents[-1]), progress=meter)
         notes = write_tileset(folder, contents, errors.tolist(), origin=self.model.origin)
-        return [len(each) for each in contents], notes
+        return [len(each) for each in contents], [*notes]
 
     def _add_errors(self, index: Path, levels: list[Gaussians]) -> tuple[str, ...]:
         """Adds the leaves' errors at each level to a streaming set; a note if its leaves are unknown."""
@@ -128,25 +159,9 @@ class Export:
         write_errors(index, meta, leaves, errors.tolist())
         return ()
 
-    def _write_page(self, path: Path, virtual_scale: float | None) -> tuple[str, ...]:
-        """Writes the page; notes on its losses."""
-        prepare_kernels(self.console, self.gaussians.means.device, training=False)
-        shown, losses = write_viewer_page(
-            path, self.model, cameras=self.cameras, virtual_scale=virtual_scale, exact=self.exact
-        )
-        if self.exact:
-            return ()
-        cameras = self.cameras or self.model.cameras
-        found, views = page_psnr(shown, self.gaussians, cameras, self.console)
-        note = f"renders of the page have a PSNR of {found:.1f} dB against the exact file ({views} views, s = 1)"
-        return (*losses, f"{note}; --exact keeps all digits")
-
     def _pack(self, path: Path, suffix: str, gaussians: Gaussians, about: tuple[str, ...]) -> tuple[str, ...]:
         with TemporaryDirectory(dir=path.parent, prefix=".tmp-") as folder:
-            source, packed = (
-                Path(folder) / "plain.ply",
-                Path(folder) / f"packed{suffix}",
-            )  # the tool tells formats by their suffix
+            source, packed = Path(folder) / "plain.ply", Path(folder) / f"packed{suffix}"  # the suffix is the format
             write(source, gaussians, about)
             notes = self._transform([source], packed, len(gaussians))
             with atomic_path(path) as temporary:
@@ -155,8 +170,10 @@ class Export:
 
     def _transform(self, words: list[str | Path], out: Path, count: int) -> tuple[str, ...]:
         tool = SplatTransform.find()
-        with packing_bar(self.console, count) as tick:
-            seconds = tool.run(*words, out, timeout=time_limit(count), progress=tick)
+        text = f"splat-transform packs {count:,} Gaussians"
+        with self.console.status(f"{text} ...") as show:
+            limit = time_limit(count)
+            seconds = tool.run(*words, out, timeout=limit, progress=lambda s: show(f"{text}, {duration(s)} so far"))
         self.console.say(f"splat-transform {tool.version} took {duration(seconds)}")
         notes = ["splat-transform rounds values and sorts the Gaussians"]
         if any(self.model.origin):

@@ -127,6 +127,8 @@ def bad(tmp_path: Path, capture: Any) -> dict[str, Path]:
         ("export DIALLED -o nowhere/x.glb", "nowhere/x.glb: folder nowhere does not exist"),
         ("export DIALLED -o x.ply --fps 60", "dialled.ply: has no calibration .* --fps needs"),
         ("export DIALLED -o x.ply --sv=-0.5", "--sv has -0.5, it must be"),
+        ("export DIALLED -o . --lod-meta --levels 1,2", ".: is the current folder; --out must name a new one"),
+        ("export DIALLED -o x --lod-meta --levels 1,2 --order extinction", "--lod-meta sorts the Gaussians itself"),
         ("export DIALLED -o x.ply --sv 2 --levels 1,2", "--levels gives the dial values; give no other"),
         ("export DIALLED -o page.html --levels 1,2", "remove --levels, --camera and --order"),
         ("export DIALLED -o page.html --order extinction", "remove --levels, --camera and --order"),

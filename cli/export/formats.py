@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from clod_adapter.errors import ClodError
-from clod_adapter.io.file_formats import WRITABLE
 
 LOD_META = "lod-meta.json"
 TILESET = "tileset.json"
 PAGE = ".html"
+STORE_FILTER = (".spz", ".safetensors", PAGE)  # formats in which every reader finds the screen-space filter
 
 
 @dataclass(frozen=True)
@@ -43,21 +43,16 @@ FORMATS = {
     ".splat": ExportFormat(("8 bits, SH degree 0",), ordered=False, sigma=False),
     **PACKED,
     PAGE: ExportFormat(
-        ("the viewer with the splat, in one file;", "as .spz, or with --exact as float32"),
+        ("the viewer with the splat, in one file, as .spz",),
         ordered=False,
     ),
 }
 
 
-def suffixes() -> list[str]:
-    """The suffixes that can be written."""
-    return [suffix for suffix in FORMATS if suffix in WRITABLE or suffix in PACKED or suffix == PAGE]
-
-
 def format_table() -> str:
     """The table of formats for --help."""
     lines = []
-    for suffix in suffixes():
+    for suffix in FORMATS:
         first, *more = FORMATS[suffix].about
         lines.append(f"  {suffix:<17}{'kept' if FORMATS[suffix].sigma else '-':<6}{first}")
         lines += [f"{'':25}{line}" for line in more]
@@ -70,9 +65,9 @@ def suffix_of(out: Path) -> str:
     Raises:
         ClodError: it has none.
     """
-    found = [suffix for suffix in suffixes() if out.name.lower().endswith(suffix) and len(out.name) > len(suffix)]
+    found = [suffix for suffix in FORMATS if out.name.lower().endswith(suffix) and len(out.name) > len(suffix)]
     if not found:
-        raise ClodError(f"{out}: --out must end in one of {', '.join(suffixes())}, which is the format")
+        raise ClodError(f"{out}: --out must end in one of {', '.join(FORMATS)}, which is the format")
     return max(found, key=len)  # .compressed.ply ends in .ply
 
 

@@ -1,8 +1,10 @@
-"""``clod-adapt export``: baked files, levels, streaming sets, orders and other formats."""
+"""``clod-adapt export``: formats, baked files, levels, streaming sets, orders and pages."""
 
 from __future__ import annotations
 
+import base64
 import json
+import re
 import shlex
 import shutil
 import struct
@@ -19,15 +21,15 @@ from plyfile import PlyData, PlyElement
 
 import clod_adapter
 from clod_adapter.calibration import Calibration, CalibrationRow, Viewpoint
-from clod_adapter.cli.commands.export_formats import FORMATS, PACKED, level_paths, suffix_of
-from clod_adapter.cli.shared import measure as budgets
 from clod_adapter.errors import ClodError
 from clod_adapter.io.checkpoint import load, save
-from clod_adapter.io.file_formats import FORMATS as FILE_FORMATS
-from clod_adapter.io.file_formats import WRITABLE, read_model
-from clod_adapter.io.formats.splat_transform import INSTALL
+from clod_adapter.io.formats.splat_transform import INSTALL, SplatTransform
 from clod_adapter.io.ply.header import write_comments
+from scenes import gaussians as random_gaussians
 
+FLIP = torch.tensor([1.0, -1, -1, 1])  # the axes of OpenGL's cameras
+KEEP_DIAL = (".ply", ".glb", ".spz", ".safetensors", ".pt")
+PACKED = (".sog", ".compressed.ply")  # by splat-transform
 TOOL = """
 import json, pathlib, sys
 words = sys.argv[1:]
@@ -56,8 +58,6 @@ def tool(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPat
 @pytest.fixture
 def real_tool() -> None:
     """Skips if splat-transform is not installed."""
-    from clod_adapter.io.formats.splat_transform import SplatTransform
-
     try:
         SplatTransform.find()
     except ClodError as error:
@@ -82,24 +82,33 @@ def same(a: Any, b: Any) -> bool:
     return left.keys() == right.keys() and all(torch.equal(left[name], right[name]) for name in left)
 
 
-def test_baking(clod: Any, dialled: Path, tmp_path: Path) -> None:
+def exported(clod: Any, *words: object) -> Any:
+    """The report."""
+    done = clod("export", *words, "--json")
+    assert done.code == 0, done
+    return json.loads(done.out)
+
+
+def test_baking(clod: Any, capture: Any, dialled: Path, tmp_path: Path) -> None:
     done = clod("export", dialled, "--sv", 2, "-o", "plain.ply", "--json")
-    report = json.loads(done.out)
-    plain, want = load(tmp_path / "plain.ply"), baked(dialled, 2.0)
-    assert done.code == 0 and "lossy" in done.err and "baked for 8 training cameras" in done.err
-    assert f"{len(load('plain.ply').gaussians)} of 300 Gaussians, s = 2\n" in done.err
-    (output,) = report["outputs"]
-    assert output["count"] == len(plain.gaussians) == len(want) < report["base_count"] == 300
-    assert output | {"count": 0} == {
-        "file": "plain.ply", "virtual_scale": 2, "count": 0, "bytes": (tmp_path / "plain.ply").stat().st_size,
+    (output,), want, plain = json.loads(done.out)["outputs"], baked(dialled, 2.0), load("plain.ply")
+    assert done.code == 0 and "baked for 8 training cameras; lossy" in done.err and json.loads(done.out)["notes"] == []
+    assert output == {
+        "file": "plain.ply", "virtual_scale": 2, "count": len(want), "bytes": (tmp_path / "plain.ply").stat().st_size,
     }  # fmt: skip
-    assert same(plain.gaussians, want) and report["notes"] == []
+    assert f"{len(want)} of 300 Gaussians, s = 2\n" in done.err and len(want) < 300
     names = list(plain.vertex.dtype.names or ())
-    assert names[:6] == ["x", "y", "z", "nx", "ny", "nz"] and "sigma_d" not in names
-    assert any(comment == "baked at s = 2 by clod-adapter for 8 training cameras" for comment in plain.comments)
+    assert same(plain.gaussians, want) and names[:6] == ["x", "y", "z", "nx", "ny", "nz"] and "sigma_d" not in names
+    assert "baked at s = 2 by clod-adapter for 8 training cameras" in plain.comments
+    report = exported(clod, dialled, "--sv", 2, "--images", capture.scene, "-o", "x.ply")
+    cameras = [view.camera for view in clod_adapter.load_scene(capture.scene).train]
+    want = clod_adapter.bake(load(dialled).gaussians, 2.0, cameras=cameras)
+    assert report["cameras"] == 8 and torch.equal(load("x.ply").gaussians.means, want.means)
+    torch.testing.assert_close(load("x.ply").gaussians.opacity_logits, want.opacity_logits)
 
 
-def test_baking_for_a_camera(clod: Any, capture: Any, dialled: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_baking_for_a_camera(clod: Any, capture: Any, dialled: Path) -> None:
+    """The image at that camera is the dial's."""
     there = ("--camera", "003", "--images", capture.scene)
     camera = next(v.camera for v in clod_adapter.load_scene(capture.scene).train if v.camera.name == "003.png")
     gaussians = load(dialled).gaussians
@@ -114,33 +123,48 @@ def test_baking_for_a_camera(clod: Any, capture: Any, dialled: Path, monkeypatch
     torch.testing.assert_close(shown.image, want.image, atol=2e-5, rtol=0)
     assert "exact at the camera of 003.png only" in done.err
     assert any("for the camera at (" in comment for comment in plain.comments)
-    seen = []
-
-    def times(_: Any, cameras: Any, progress: Any) -> tuple[list[tuple[float, float]], list[str]]:
-        seen.extend(cameras)
-        return [(1.0, 8.0), (2.0, 4.0), (4.0, 2.0)], []
-
-    monkeypatch.setattr(budgets, "frame_times", times)
-    report = json.loads(clod("export", dialled, "--fps", 250, *there, "-o", "fast.ply", "--json").out)
-    assert report["outputs"][0]["virtual_scale"] == 2 and [each.name for each in seen] == ["003.png"]
+    fast = exported(clod, dialled, "--fps", 1, *there, "-o", "fast.ply")  # timed here, at that camera
+    assert fast["outputs"][0]["virtual_scale"] == 1 and any("frames timed here" in note for note in fast["notes"])
 
 
-def test_camera_that_matches_two_photographs(clod: Any, capture: Any, dialled: Path, monkeypatch: Any) -> None:
-    from clod_adapter.cli.shared import alignment
+def without_viewpoints(path: Path, out: Path) -> Path:
+    head, end, body = path.read_bytes().partition(b"end_header\n")
+    lines = [line for line in head.splitlines(keepends=True) if not line.startswith(b"comment clod_adapter viewpoint")]
+    out.write_bytes(b"".join(lines) + end + body)
+    return out
 
-    (first, second, *rest), notes = alignment.load_cameras(capture.scene)
-    twins = [replace(first, name="a.jpg"), replace(second, name="a.png")]
-    monkeypatch.setattr(alignment, "load_cameras", lambda *_, **__: ([*twins, *rest], notes))
-    words = ("export", dialled, "--sv", 2, "--images", capture.scene, "-o", "x.ply", "--camera")
-    done = clod(*words, "a")
-    assert done.code == 2 and "--camera: 'a' matches a.jpg and a.png; give the full name" in done.err
-    assert clod(*words, "a.png").code == 0
-    twins = [replace(first, name="images/a.jpg"), replace(second, name="a.jpg")]
-    assert clod(*words, "a.jpg").code == 0
-    assert clod(*words, "images/a").code == 0
-    twins = [replace(first, name="images/b.jpg")]  # as a transforms.json has them
-    assert clod(*words, "b.jpg").code == 0 and clod(*words, "b").code == 0
-    assert clod(*words, "c").code == 2
+
+def test_baking_without_cameras_places_some(clod: Any, dialled: Path, tmp_path: Path) -> None:
+    old = without_viewpoints(dialled, tmp_path / "old.ply")
+    report = exported(clod, old, "--sv", 2, "-o", "x.ply")
+    assert report["notes"] == [f"{old} stores no cameras: baked for 16 placed ones; --images gives a better result"]
+    model = load(old)
+    want = clod_adapter.bake(model.gaussians, 2.0, cameras=clod_adapter.place_cameras(model.gaussians, views=16))
+    assert model.viewpoints == () and torch.equal(load("x.ply").gaussians.means, want.means)
+    assert "baked at s = 2 by clod-adapter for 16 placed cameras" in load("x.ply").comments
+    faint = model.gaussians.replace(opacity_logits=model.gaussians.opacity_logits - 20)
+    clod_adapter.save("faint.ply", faint)
+    done = clod("export", "faint.ply", "--sv", 2, "-o", "y.ply")
+    assert done.code == 2 and not Path("y.ply").exists()
+    assert re.search("error: faint.ply: no cameras stored to bake for, and no .*; give --images$", done.err), done
+
+
+def test_names_of_cameras(clod: Any, capture: Any, dialled: Path, tmp_path: Path) -> None:
+    """With or without suffix and folder; two photographs of one name need the whole one."""
+    train = clod_adapter.load_scene(capture.scene).train
+    names = ["a.jpg", "a.png", "images/b.jpg", "b.jpg"]
+    frames = [
+        {"file_path": name, "transform_matrix": (torch.linalg.inv(view.camera.viewmat) * FLIP).tolist()}
+        for name, view in zip(names, train, strict=False)
+    ]
+    (tmp_path / "scene").mkdir()
+    content = {"fl_x": 60, "w": 64, "h": 48, "frames": frames}
+    (tmp_path / "scene" / "transforms.json").write_text(json.dumps(content))
+    codes = {"a": 2, "a.png": 0, "b.jpg": 0, "images/b": 0, "c": 2}
+    for name, code in codes.items():
+        done = clod("export", dialled, "--sv", 2, "--images", "scene", "-o", "x.ply", "--camera", name)
+        assert done.code == code, done
+        assert name != "a" or "--camera: 'a' matches a.jpg and a.png; give the full name" in done.err
 
 
 def test_levels(clod: Any, dialled: Path, tmp_path: Path) -> None:
@@ -166,51 +190,34 @@ def test_3dtiles(clod: Any, dialled: Path, tmp_path: Path) -> None:
     assert sorted(files(tmp_path / "tiles")) == ["0_0.glb", "0_1.glb", "root.glb", "tileset.json"]
 
 
-@pytest.mark.parametrize("failure", [KeyboardInterrupt(), OSError(28, "No space left on device")])
-def test_levels_appear_together_or_not_at_all(
-    clod: Any, dialled: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failure: BaseException
-) -> None:
-    from clod_adapter.cli.export import files as export_files
-
+def test_levels_appear_together_or_not_at_all(clod: Any, dialled: Path, tmp_path: Path) -> None:
+    """Neither a file of an earlier run nor the others change where the last cannot be written."""
     earlier = b"of an earlier run of clod-adapter"
     (tmp_path / "x_s1.ply").write_bytes(earlier)
-    real, calls = export_files.write, []
-
-    def write(*args: Any, **options: Any) -> Any:
-        calls.append(args)
-        if len(calls) == 3:
-            raise failure
-        return real(*args, **options)
-
-    monkeypatch.setattr(export_files, "write", write)
-    done = clod("export", dialled, "--levels", "1,2,4", "-o", "x.ply")
-    assert done.code == (130 if isinstance(failure, KeyboardInterrupt) else 2) and "Traceback" not in done.err
+    resource = pytest.importorskip("resource")
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (len(dialled.read_bytes()) // 2, hard))
+    try:
+        done = clod("export", dialled, "--levels", "1,4", "-o", "x.ply")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert done.code == 2 and "Traceback" not in done.err, done
     assert files(tmp_path) == ["x_s1.ply"] and (tmp_path / "x_s1.ply").read_bytes() == earlier
 
 
-def test_level_names() -> None:
-    paths = level_paths(Path("a/b.c.compressed.ply"), [1.0, 2.25])
-    assert paths == [Path("a/b.c_s1.compressed.ply"), Path("a/b.c_s2.25.compressed.ply")]
-    assert suffix_of(Path("B.PLY")) == ".ply" and level_paths(Path("B.PLY"), [3.0]) == [Path("B_s3.PLY")]
-    assert suffix_of(Path("b.Compressed.Ply")) == ".compressed.ply"
-
-
-@pytest.mark.parametrize("suffix", WRITABLE)
+@pytest.mark.parametrize("suffix", [*KEEP_DIAL, ".splat"])
 def test_formats_keep_the_dial_if_they_can(clod: Any, dialled: Path, suffix: str) -> None:
-    assert suffix not in PACKED and FORMATS[suffix].sigma == FILE_FORMATS[suffix].carries_sigma
-    words = () if FORMATS[suffix].sigma else ("--sv", 1)
-    done = clod("export", dialled, "-o", f"x{suffix}", *words, "--json")
+    model, kept = load(dialled), suffix in KEEP_DIAL
+    done = clod("export", dialled, "-o", f"x{suffix}", *(() if kept else ("--sv", 1)), "--json")
     (output,) = json.loads(done.out)["outputs"]
-    assert done.code == 0 and output["bytes"] == Path(f"x{suffix}").stat().st_size
-    assert output["virtual_scale"] == (None if FORMATS[suffix].sigma else 1)
-    assert ("lossy" in done.err) != FORMATS[suffix].sigma
-    if FORMATS[suffix].sigma:
-        assert output["count"] == 300
-    if suffix in (".ply", ".safetensors"):
-        model, again = load(dialled), (load if suffix == ".ply" else read_model)(f"x{suffix}")
-        assert same(again.gaussians, model.gaussians) and again.gaussians.attenuation == model.gaussians.attenuation
+    assert done.code == 0 and output["bytes"] == Path(f"x{suffix}").stat().st_size and ("lossy" in done.err) != kept
+    assert output["virtual_scale"] == (None if kept else 1) and (output["count"] == 300 or not kept)
+    again = load(f"x{suffix}").gaussians
+    assert (again.sigma_d is not None) == (again.growth_d is not None) == kept
+    if suffix in (".ply", ".safetensors", ".pt"):
+        assert same(again, model.gaussians) and (suffix == ".pt" or again.attenuation == model.gaussians.attenuation)
     if suffix == ".ply":
-        assert again.calibration == model.calibration and again.notes == ()
+        assert load("x.ply").calibration == model.calibration and load("x.ply").notes == ()
     plain = clod("export", dialled, "-o", f"y{suffix}", "--sv", 2, "--quiet", "--json")
     assert plain.code == 0 and plain.err == ""
     assert json.loads(plain.out)["outputs"][0]["count"] == len(baked(dialled, 2.0))
@@ -293,11 +300,9 @@ def test_order_by_extinction_for_cameras_of_the_scene(clod: Any, capture: Any, d
 
 def saved(path: Path, degree: int, *, growth: bool = True) -> Any:
     """A model of that SH degree with a dial at ``path``."""
-    from scenes import gaussians
-
     sigma = torch.linspace(0.9, 9, 50)
     model = clod_adapter.with_dial(
-        gaussians(50, degree, 4), sigma, clod_adapter.AttenuationConfig(reference_distance=3.0)
+        random_gaussians(50, degree, 4), sigma, clod_adapter.AttenuationConfig(reference_distance=3.0)
     )
     model = model.replace(growth_d=torch.linspace(-1, 3, 50) if growth else None)
     places = (Viewpoint(0.0, 0.0, -4.0, 1.0), Viewpoint(1.0, 0.0, 4.0, 1.0))
@@ -384,21 +389,9 @@ def test_streaming_set(clod: Any, dialled: Path, tmp_path: Path, tool: Any) -> N
     assert done.code == 2 and "out: is a folder that is not empty" in done.err
 
 
-def test_refusals_before_any_work(clod: Any, dialled: Path, tmp_path: Path, tool: Any, monkeypatch: Any) -> None:
-    """An unusable name or order of a streaming set, and packing without splat-transform."""
-    monkeypatch.setattr("clod_adapter.cli.main.import_command", None)
-    lod = ("--levels", "1,2", "--lod-meta", "-o")
-    tool()
-    refused = {
-        (*lod, "."): ".: is the current folder; --out must name a new one",
-        (*lod, "out", "--order", "extinction"): "--lod-meta sorts the Gaussians itself; remove --order",
-    }
-    for words, said in refused.items():
-        done = clod("export", dialled, *words)
-        assert done.code == 2 and done.err.splitlines() == [f"clod-adapt: error: {said}"], done
-    monkeypatch.delenv("CLOD_SPLAT_TRANSFORM")
+def test_packing_needs_the_tool(clod: Any, dialled: Path, tmp_path: Path, monkeypatch: Any) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
-    for words in (("--sv", 2, "-o", "x.sog"), (*lod, "out")):
+    for words in (("--sv", 2, "-o", "x.sog"), ("--levels", "1,2", "--lod-meta", "-o", "out")):
         done = clod("export", dialled, *words)
         assert done.code == 2 and len(done.err.splitlines()) == 1, done
         assert "splat-transform is not installed" in done.err and INSTALL in done.err
@@ -423,13 +416,8 @@ def test_failure_of_the_tool_leaves_no_file(
     assert done.code == 2 and done.err.splitlines()[-1].endswith(said) and files(tmp_path) == [], done
 
 
-def test_ctrl_c_ends_the_tool_too(clod: Any, dialled: Path, tmp_path: Path, tool: Any, monkeypatch: Any) -> None:
-    tool("import time; time.sleep(60)")
-
-    def press(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("clod_adapter.cli.export.packing.Meter.update", press)
+def test_ctrl_c_ends_the_tool_too(clod: Any, dialled: Path, tmp_path: Path, tool: Any) -> None:
+    tool("import os, signal, time; os.kill(os.getppid(), signal.SIGINT); time.sleep(60)")
     done = clod("export", dialled, "--levels", "1,2", "--lod-meta", "-o", "out")
     assert done.code == 130 and files(tmp_path) == []
 
@@ -448,3 +436,25 @@ def test_the_real_tool(clod: Any, dialled: Path, tmp_path: Path) -> None:
     assert b"packed_position" in data and f"element vertex {counts[1]}\n".encode() in data
     assert (tmp_path / "x.sog").read_bytes().startswith(b"PK")
     assert files(tmp_path / "out") != [] and not [name for name in files(tmp_path) if "tmp" in name]
+
+
+@pytest.mark.parametrize("sv", [None, 2, 9])
+def test_page_holds_the_splat_and_its_dial(
+    clod: Any, dialled: Path, tmp_path: Path, capture: Any, monkeypatch: Any, sv: int | None
+) -> None:
+    monkeypatch.setenv("CLOD_SPLAT_TRANSFORM", "there-is-none")  # it is not needed
+    scene = ["--images", capture.scene] if sv == 2 else []
+    done = clod("export", dialled, "-o", "page.html", *(["--sv", sv] if sv else []), *scene, "--json")
+    assert done.code == 0, done
+    report, text = json.loads(done.out), (tmp_path / "page.html").read_text(encoding="utf-8")
+    (output,), config = report["outputs"], json.loads(re.findall('id="clod-config">(.*?)</script>', text)[0])
+    assert config["model"]["name"] == dialled.name and config["virtual_scale"] == (min(sv, 4) if sv else None)
+    assert any("dial ends at s = 4" in note for note in report["notes"]) == (sv == 9)
+    assert ("Gaussians, initial dial value s = " in done.err) == bool(sv) and " of " not in done.err.splitlines()[-1]
+    names = [camera["name"] for camera in config["cameras"]]
+    assert (names == sorted(path.name for path in (capture.scene / "images").iterdir())) == (sv == 2)
+    (tmp_path / "held.spz").write_bytes(base64.b64decode(re.findall('id="clod-model">(.*?)</script>', text)[0]))
+    held = clod_adapter.load(tmp_path / "held.spz")
+    assert len(held.gaussians) == output["count"] == 300 and output["bytes"] == (tmp_path / "page.html").stat().st_size
+    assert held.gaussians.sigma_d is not None and held.calibration is not None
+    assert [path.name for path in tmp_path.glob(".tmp-*")] == []
