@@ -24,8 +24,9 @@ from clod_adapter._kernels.threads import torch_on_one_thread
 from clod_adapter.equation.attenuation import SIGMA_MAX, Attenuated, attenuate
 from clod_adapter.initialization.importance import sigma_from_importance
 from clod_adapter.report.style import BLUE, GREEN, ORANGE, PURPLE, QUIET, label_log, new_figure, save_figure, tidy
-from clod_adapter.training.objective import SIGMA_RANGE
+from clod_adapter.training.dial import SIGMA_RANGE, Dial
 from clod_adapter.training.optimizer import RowAdam
+from clod_adapter.training.schedule import OURS
 from clod_adapter.training.target_count import count_gradient
 from common import table
 
@@ -122,12 +123,12 @@ def fit(
     step, means, random = OPTIMIZERS[optimizer][0](runs), torch.zeros(len(rates), len(x)), np.random.default_rng(0)
     began, averaged = time.perf_counter(), 0
     for k in range(steps):
-        fall = CONFIG.lr_final ** (k / steps)
+        fall = OURS.lr_final ** (k / steps)
         found = gradients(task, torch.stack(runs), log, (0, int(random.integers(1, len(DIALS)))), count)
         step(list(found), [rate * fall for rate in rates])
         for x in runs:
             x.clamp_(*limits)
-        if k >= (1 - CONFIG.average) * steps:
+        if k >= (1 - OURS.average) * steps:
             averaged += 1
             means.lerp_(torch.stack(runs), 1 / averaged)
     return list(means.exp() if log else means), time.perf_counter() - began
@@ -143,7 +144,7 @@ def gradients(task: Problem, x: Tensor, log: bool, dials: Sequence[int], count: 
         s = DIALS[k]
         dialled = attenuate(logits, sigma, distances, s, settings)
         losses = (dialled.drawn.view(-1, n) - task.wanted[k]).square().mean(1)
-        weight = (1 - CONFIG.weight_slope * s / CONFIG.max_sv) ** 2
+        weight = (1 - Dial.weight_slope * s / CONFIG.max_sv) ** 2
         total = total + weight * losses.sum()
         for run, loss in enumerate((weight * losses.detach()).tolist() if count else []):
             own = Attenuated(*(value[run * n : (run + 1) * n] for value in dialled))

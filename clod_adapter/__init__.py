@@ -39,9 +39,8 @@ if TYPE_CHECKING:
     from clod_adapter.progress import Phase, Progress, Stopped
     from clod_adapter.render import Rendering, render
     from clod_adapter.training.camera_placement import place_cameras
-    from clod_adapter.training.dial import Dial, attach
+    from clod_adapter.training.dial import Dial, TrainableSubset, attach
     from clod_adapter.training.loop import Adapted, adapt
-    from clod_adapter.training.objective import TrainableSubset
     from clod_adapter.training.plan import Decision, Override, Plan
     from clod_adapter.training.planner import make_plan
     from clod_adapter.training.pseudo_views import render_pseudo_views
@@ -62,14 +61,13 @@ on_first_use(__name__, {
     "io.adapter_file": ("load_adapter", "save_adapter"),
     "io.scene.load": ("load_scene",),
     "io.checkpoint": ("Checkpoint", "load", "save"),
-    "training.objective": ("TrainableSubset",),
     "training.camera_placement": ("place_cameras",),
     "training.pseudo_views": ("render_pseudo_views",),
     "training.plan": ("Decision", "Override", "Plan"),
     "training.planner": ("make_plan",),
     "progress": ("Phase", "Progress", "Stopped"),
     "render": ("Rendering", "render"),
-    "training.dial": ("Dial", "attach"),
+    "training.dial": ("Dial", "TrainableSubset", "attach"),
     "training.loop": ("Adapted", "adapt"),
 })  # fmt: skip
 

@@ -13,10 +13,7 @@ from clod_adapter.errors import ClodError
 
 NORMALIZERS = ("max", "quantile", "scene")
 CUTS = ("hard", "soft")
-STARTS = ("importance", "error", "constant", "identity")
-PARAMETERS = ("log", "linear")
-SAMPLINGS = ("log", "uniform")
-COUNT_TERMS = ("law", "paper")
+FORMS = ("ours", "paper")
 GROWTHS = ("on", "off")
 STEPS, STEPS_PER_VIEW = 900, 8.5  # of training, by default, with one view a step
 # Gaussians that viewers draw at most on a device, by their makers; docs/formats.md has the sources.
@@ -141,6 +138,7 @@ class AdaptConfig:
         ClodError: a field is out of range.
     """
 
+    form: str = option("ours", "training as measured here (ours) or as published (paper); AdaptConfig.paper sets it")
     max_sv: float = option(5.0, "largest dial value to train for")
     iters: int | None = option(
         None, f"training steps (default: {STEPS}, or {STEPS_PER_VIEW:g} for each training view if that is more)"
@@ -151,35 +149,11 @@ class AdaptConfig:
     )
     seed: int = option(0, "seed of the view order, the dial values and the importance estimate")
     tau: float = option(0.02, "culling threshold on opacity at s = 1; lowered automatically for faint checkpoints")
-    cut: str = option("soft", "culling threshold: hard (opacity drops to 0 at tau s, the paper's) or soft (fades to 0)")
-    eps: float = option(1e-8, "the paper's epsilon, added to 2 sigma_d^2")
-    normalizer: str = option("scene", "divisor D of distances: scene, quantile or max (the paper's)")
-    quantile: float = option(0.95, "quantile of the distances in the frustum that is D (normalizer quantile)")
-    start: str = option(
-        "importance",
-        "initialization of sigma_d: importance (by rank of importance; replaceable neighbours are culled earlier), "
-        "error (by rank of removal error), constant (1) or identity (no fading)",
-    )
     start_share: float | None = option(
         None, "share of Gaussians to keep at s = 1 (default: as the plan measures; 0.62 without a plan)"
     )
-    parameter: str = option("log", "trained parameter: log (of sigma_d) or linear (sigma_d itself, the paper's)")
-    sampling: str = option("log", "dial value of a step: log-uniform (log) or uniform (the paper's)")
-    full_share: float = option(0.5, "share of steps at s = 1 instead, at first; a quarter of these at s = 0")
-    full_final: float = option(0.4, "full_share at the end, as a share of that at first")
-    coarse: float = option(
-        0.9,
-        "share of the run, at first, in which steps beyond s = 1 have photographs of half the size (not small ones)",
-    )
     exponent: float = option(1.5, "target-count curve: the target share of Gaussians at s is s^-exponent")
-    count_term: str = option(
-        "law", "count loss: law (both directions, through sigma_d alone) or paper (the paper's L_reg)"
-    )
     reg_weight: float = option(0.75, "weight of the count loss (the paper's lambda_reg)")
-    weight_slope: float = option(
-        0.25, "k of the loss weight w_s = (1 - k s/max_sv)^2; the paper has 0.5, 0 gives equal weights"
-    )
-    temperature: float = option(0.15, "width of the sigmoid of the straight-through count, in log opacity")
     ssim_weight: float = option(0.2, "weight w of 1 - SSIM; L1 has 1 - w")
     lr_sigma: float = option(0.1, "learning rate of log sigma_d: its largest relative change per step")
     growth: str = option(
@@ -192,8 +166,6 @@ class AdaptConfig:
     lr_opacities: float = option(0.1, "learning rate of opacity_logits")
     lr_sh0: float = option(4e-3, "learning rate of sh0")
     lr_shN: float = option(0.0, "learning rate of shN; 0 keeps SH degrees above 0 fixed, which costs 0.01 dB")
-    lr_final: float = option(0.1, "final learning rates as a share of the initial ones (exponential decay)")
-    average: float = option(0.2, "share of the steps, at the end, whose parameters are averaged for the result")
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -204,25 +176,11 @@ class AdaptConfig:
         require(0 <= self.seed < 2**63, "seed", self.seed, "at least 0 and below 2^63")
         require(self.time_budget is None or self.time_budget > 0, "time_budget", self.time_budget, "positive seconds")
         require(0.5 < self.share <= 1, "start_share", self.start_share, "above 0.5 and at most 1")
-        choices = {
-            "start": STARTS,
-            "parameter": PARAMETERS,
-            "sampling": SAMPLINGS,
-            "count_term": COUNT_TERMS,
-            "growth": GROWTHS,
-        }
-        for name, allowed in choices.items():
+        for name, allowed in {"form": FORMS, "growth": GROWTHS}.items():
             require(getattr(self, name) in allowed, name, getattr(self, name), f"one of {', '.join(allowed)}")
-        require(0 <= self.full_share <= 1, "full_share", self.full_share, "between 0 and 1")
-        require(0 <= self.full_final <= 1, "full_final", self.full_final, "between 0 and 1")
-        require(0 <= self.coarse <= 1, "coarse", self.coarse, "between 0 and 1")
         require(0 < self.exponent < math.inf, "exponent", self.exponent, "positive and finite")
         require(0 <= self.reg_weight < math.inf, "reg_weight", self.reg_weight, "at least 0 and finite")
-        require(0 <= self.weight_slope <= 1, "weight_slope", self.weight_slope, "between 0 and 1")
-        require(self.temperature > 0, "temperature", self.temperature, "positive")
         require(0 <= self.ssim_weight <= 1, "ssim_weight", self.ssim_weight, "between 0 and 1")
-        require(0 < self.lr_final <= 1, "lr_final", self.lr_final, "above 0 and at most 1")
-        require(0 <= self.average <= 1, "average", self.average, "between 0 and 1")
         for name in ("sigma", "growth", "means", "quats", "scales", "opacities", "sh0", "shN"):
             rate = getattr(self, f"lr_{name}")  # larger ones overflow float32 in the end
             require(0 <= rate <= 1e6, f"lr_{name}", rate, "between 0 and 1e6")
@@ -230,20 +188,14 @@ class AdaptConfig:
 
     @classmethod
     def paper(cls, **changes: Any) -> AdaptConfig:
-        """The settings of the paper where it gives them, the defaults elsewhere; then ``changes``.
+        """The paper's form with its settings where it gives them, and the defaults elsewhere; then ``changes``.
 
-        CLoD-GS section 3.3: one s ~ U(1, max_sv) per step, w_s with k = 0.5, its L_reg with lambda 1, distances divided
-        by the largest in the frustum, a hard threshold, sigma_d itself trained at 1e-2. Not in the paper, chosen here:
-        tau 1/255 (the limit of rasterizers), sigma_d initialized to 1, a straight-through count with a sigmoid 0.5
-        wide, half the default learning rates decaying to a twentieth, no average of parameters.
+        The form itself is ``training/paper.py``. CLoD-GS section 3.3: lambda 1, sigma_d itself trained at 1e-2. Not in
+        the paper, chosen here: tau 1/255 (the limit of rasterizers), half the default learning rates.
         """
         own: dict[str, Any] = {
-            "iters": 1600,
-            "tau": 1 / 255, "cut": "hard", "normalizer": "max", "start": "constant", "parameter": "linear",
-            "sampling": "uniform", "full_share": 0.0, "coarse": 0.0, "count_term": "paper", "reg_weight": 1.0,
-            "weight_slope": 0.5, "lr_sigma": 1e-2,
-            "growth": "off", "temperature": 0.5, "average": 0.0, "lr_final": 0.05, "lr_means": 0.03, "lr_quats": 8e-4,
-            "lr_scales": 8e-3, "lr_opacities": 5e-2, "lr_sh0": 2e-3,
+            "form": "paper", "iters": 1600, "tau": 1 / 255, "reg_weight": 1.0, "growth": "off", "lr_sigma": 1e-2,
+            "lr_means": 0.03, "lr_quats": 8e-4, "lr_scales": 8e-3, "lr_opacities": 5e-2, "lr_sh0": 2e-3,
         }  # fmt: skip
         return cls(**{**own, **changes})
 
@@ -263,22 +215,6 @@ class AdaptConfig:
             return self
         return replace(self, iters=max(round(max(STEPS, each * views) / self.batch), 1))
 
-    def beyond(self, factor: float, tau: float | None = None) -> float:
-        """A dial value beyond max_sv: ``factor`` times as large, at most halfway to 1/tau, where all are culled.
-
-        Training goes on there, so that quality and counts do not break off at max_sv. The paper's ends at max_sv.
-
-        Args:
-            tau: that of the file, where it is not the config's.
-        """
-        halfway = (self.max_sv + 1 / (tau or self.tau)) / 2
-        return max(min(factor * self.max_sv, halfway), self.max_sv) if self.has_target_count else self.max_sv
-
-    @property
-    def has_target_count(self) -> bool:
-        """Whether the target-count curve is part of the objective; with a single dial value it is not."""
-        return self.count_term == "law" and self.max_sv > 1
-
     def lighter(self, share: float) -> AdaptConfig:
         """A copy with the learning rates of all attributes but sigma_d multiplied by ``share``."""
         names = ("lr_means", "lr_quats", "lr_scales", "lr_opacities", "lr_sh0", "lr_shN")
@@ -286,10 +222,7 @@ class AdaptConfig:
 
     def attenuation(self, scene_distance: float) -> AttenuationConfig:
         """Settings of the equation in training; files have them in world units (``units.in_world_units``)."""
-        return AttenuationConfig(
-            tau=self.tau, cut=self.cut, eps=self.eps, normalizer=self.normalizer, quantile=self.quantile,
-            scene_distance=scene_distance, max_sv=self.max_sv,
-        )  # fmt: skip
+        return AttenuationConfig(tau=self.tau, scene_distance=scene_distance, max_sv=self.max_sv)
 
 
 def field_descriptions(config: Any) -> dict[str, str]:

@@ -20,8 +20,8 @@ import torch.distributed as dist
 import clod_adapter
 from clod_adapter.config import AdaptConfig
 from clod_adapter.progress import Progress
-from clod_adapter.training.objective import Objective
 from clod_adapter.training.state import TrainingState
+from clod_adapter.training.trainer import Trainer
 
 OUTPUTS = ["dial.json", "dial.ply", "dial.safetensors"]
 STATE = "dial.resume.safetensors"
@@ -187,19 +187,19 @@ def change_step(patch: pytest.MonkeyPatch, at: int, change: Callable[[Any], Any]
 
     Such a run prepares the kernels.
     """
-    real, steps = Objective.gradient_sum, count(1)
+    real, steps = Trainer.gradient_sum, count(1)
 
-    def changed(self: Objective, *given: Any) -> Any:
+    def changed(self: Trainer, *given: Any) -> Any:
         found = real(self, *given)
         return change(found) if self.config.iters > 1 and next(steps) == at else found
 
-    patch.setattr(Objective, "gradient_sum", changed)
+    patch.setattr(Trainer, "gradient_sum", changed)
 
 
 def config_of(**changes: Any) -> AdaptConfig:
     """Fixed settings, so that the tests do not depend on the defaults."""
     settings = {
-        "start_share": 0.6, "full_share": 0.5, "lr_sigma": 1e-2, "lr_growth": 1e-2, "lr_means": 3e-5, "lr_quats": 4e-4,
+        "start_share": 0.6, "lr_sigma": 1e-2, "lr_growth": 1e-2, "lr_means": 3e-5, "lr_quats": 4e-4,
         "lr_scales": 2e-3, "lr_opacities": 1e-2, "lr_sh0": 1e-3, "lr_shN": 5e-5,
     }  # fmt: skip
     return AdaptConfig(**(settings | changes))

@@ -14,14 +14,13 @@ import torch
 from torch import Tensor
 
 import inria_forks
-from clod_adapter.adapter import ATTRIBUTES, detach, with_dial
+from clod_adapter.adapter import detach, with_dial
 from clod_adapter.bake import bake, order_by_extinction
 from clod_adapter.blocks.divide import divide
 from clod_adapter.blocks.targets import block_target, context_rows
 from clod_adapter.cameras import View
 from clod_adapter.config import AdaptConfig, AttenuationConfig
 from clod_adapter.equation import attenuation, growth
-from clod_adapter.equation.distances import typical_distance
 from clod_adapter.equation.extinction import extinction_scale, sigma_for_extinction
 from clod_adapter.evaluation.budget import dial_for
 from clod_adapter.evaluation.evaluate import evaluate
@@ -31,8 +30,9 @@ from clod_adapter.hook import Hook
 from clod_adapter.initialization.importance import initialize, sigma_from_importance
 from clod_adapter.rasterizers import BACKENDS, Rasterizer, cpu
 from clod_adapter.render import render
-from clod_adapter.training.objective import Objective, TrainableSubset
-from clod_adapter.training.view_sampler import Sample
+from clod_adapter.training.dial import TrainableSubset
+from clod_adapter.training.schedule import Sample
+from clod_adapter.training.trainer import Trainer
 from clod_adapter.viewer.payload import Payload
 from scenes import gaussians, photograph, ring
 
@@ -63,13 +63,9 @@ def evaluation(model: Gaussians) -> list[Any]:
 
 def objective(config: AdaptConfig, trained: int = N, **part: Any) -> Callable[[Gaussians], list[Any]]:
     def gradients(model: Gaussians) -> list[Any]:
-        assert model.attenuation is not None and model.sigma_d is not None
-        typical = typical_distance(model.means, CAMERAS, model.attenuation)[:trained]
-        asked = Objective(config, model.attenuation, ("means", "sh0"), TrainableSubset(trained, **part), typical)
-        names = ("growth_d",) if config.growth == "on" else ()
-        parameters = {name: getattr(model, name) for name in (*ATTRIBUTES, *names)}
-        parameters[asked.decay] = asked.parameter(model.sigma_d)
-        found = asked.gradient_sum(parameters, [Sample(views_of(model)[0], DIAL)])
+        begun = model.replace(growth_d=None) if config.growth == "off" else model
+        run = Trainer(begun, views_of(model), config, TrainableSubset(trained, **part))
+        found = run.gradient_sum([Sample(views_of(model)[0], DIAL, 3.0)])
         return [found.loss, found.kept, *found.gradients.values()]
 
     return gradients

@@ -22,9 +22,9 @@ from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.progress import Stopped
+from clod_adapter.training.dial import TrainableSubset
 from clod_adapter.training.distributed import PATIENCE, ProcessGroup, ProcessLost, joined, require_distributed
 from clod_adapter.training.loop import adapt
-from clod_adapter.training.objective import TrainableSubset
 from clod_adapter.training.plan import Plan
 from clod_adapter.training.pseudo_views import teachers_to
 from clod_adapter.training.state import Adapted, TrainingState

@@ -244,7 +244,7 @@ def prepare_kernels(
     with announced_compiling(console, SHARES), one_thread():
         evaluate(one, [view], [1.0])
         if training:
-            adapted = adapt(one, Scene((view,), ()), AdaptConfig(iters=1, full_share=1.0), progress=False)
+            adapted = adapt(one, Scene((view,), ()), AdaptConfig(iters=1), progress=False)
             if adapted.interrupted:
                 raise Stopped("stopped while the kernels were compiled")
 

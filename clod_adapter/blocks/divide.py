@@ -135,7 +135,7 @@ def divide(
 
 def check_divisible(config: AdaptConfig) -> None:
     """Raises ClodError for settings that need the whole scene at once."""
-    if config.count_term == "paper" or config.normalizer != "scene":
+    if config.form == "paper":
         raise ClodError(
             "the paper's form cannot be trained in blocks: its count and its distances are of all Gaussians at once; "
             "leave out --form paper, or --memory"

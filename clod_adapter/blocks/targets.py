@@ -133,23 +133,23 @@ def target_image(gaussians: Gaussians, own: int, view: View) -> Tensor:
 
 
 def block_config(division: Division, block: int, config: AdaptConfig, *, first: bool) -> AdaptConfig:
-    """The settings of one block in one pass: its steps, learning rates, share of a time budget, and own seed."""
-    steps = division.steps(block, config)
+    """The settings of one block in one pass: its steps, share of a time budget, and own seed."""
+    steps, light = _steps(division, block, config)
     every = sum(division.steps(other, config) for other in range(division.count))
-    light = round(SECOND * steps) if division.passes > 1 else 0
     own = steps - light if first else light
     seed = (config.seed + 1 + block + (0 if first else division.count)) % 2**63
     budget = config.time_budget and config.time_budget * own / max(every, 1) or None
-    # Learning rates and the share of s = 1 fall as in an undivided run: from 1 to middle to the final value.
-    middle = config.lr_final ** (1 - light / max(steps, 1))
-    fewer = 1 - (1 - config.full_final) * (1 - light / max(steps, 1))
-    last = replace(
-        config.lighter(middle), full_share=fewer * config.full_share, full_final=config.full_final / max(fewer, 1e-9),
-        lr_sigma=middle * config.lr_sigma, lr_growth=middle * config.lr_growth,
-        lr_final=config.lr_final / middle, average=min(config.average * steps / max(light, 1), 1.0),
-    )  # fmt: skip
-    settings = replace(config, lr_final=middle, full_final=fewer) if first else last
-    # The second pass takes up where the first one ends.
-    begun = 0.0 if first else 1 - light / max(steps, 1)
-    coarse = min(max(config.coarse - begun, 0.0) * steps / max(own, 1), 1.0)
-    return replace(settings, iters=own, time_budget=budget, seed=seed, coarse=coarse)
+    return replace(config, iters=own, time_budget=budget, seed=seed)
+
+
+def block_span(division: Division, block: int, config: AdaptConfig, *, first: bool) -> tuple[float, float]:
+    """``TrainableSubset.span`` of one pass: the second takes up the schedule where the first one ends."""
+    steps, light = _steps(division, block, config)
+    between = 1 - light / max(steps, 1)
+    return (0.0, between) if first else (between, 1.0)
+
+
+def _steps(division: Division, block: int, config: AdaptConfig) -> tuple[int, int]:
+    """The steps of a block in both passes, and in the second one."""
+    steps = division.steps(block, config)
+    return steps, round(SECOND * steps) if division.passes > 1 else 0

@@ -27,7 +27,7 @@ import torch
 from torch import Tensor
 
 from clod_adapter.blocks.divide import Division
-from clod_adapter.blocks.targets import block_config, block_target, context_rows, target_image
+from clod_adapter.blocks.targets import block_config, block_span, block_target, context_rows, target_image
 from clod_adapter.cameras import Scene, View, spread
 from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
@@ -35,8 +35,8 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.importance import MOST_VIEWS
 from clod_adapter.io.scene.load import ImageCache
 from clod_adapter.progress import Listener, Phase, tell
+from clod_adapter.training.dial import TrainableSubset
 from clod_adapter.training.loop import adapt
-from clod_adapter.training.objective import TrainableSubset
 from clod_adapter.training.state import Adapted, TrainingState
 
 
@@ -97,7 +97,8 @@ def adapt_block(
         own = _with_target_images(gaussians, len(rows), own, cache, progress)
     cameras = [view.camera for view in spread(views, MOST_VIEWS)]
     target = block_target(division, block, cameras, config, first=after is None)
-    part = TrainableSubset(len(rows), after is None, target=target, cameras=cameras)
+    span = block_span(division, block, config, first=after is None)
+    part = TrainableSubset(len(rows), after is None, target=target, cameras=cameras, span=span)
     settings = block_config(division, block, config, first=after is None)
     adapted = adapt(gaussians, Scene(tuple(own), ()), settings, progress, resume, subset=part)
     return _learned(division, rows, adapted)

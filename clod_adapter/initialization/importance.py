@@ -58,23 +58,18 @@ def initialize(
         return in_world_units(with_growth(base.replace(attenuation=own), config, base.growth_d))
     views = spread(views, MOST_VIEWS)
     attenuation = config.attenuation(scene_distance(base, views))
-    if config.start in ("constant", "identity"):
-        value = 1.0 if config.start == "constant" else WIDEST * config.max_sv
-        constant = torch.full_like(base.means[:, 0], value)
-        return in_world_units(with_growth(base.replace(sigma_d=constant, attenuation=attenuation), config))
     if error is None:
         error = removal_error(base, views, seed=config.seed, progress=progress)
     attenuation = dataclasses.replace(attenuation, tau=fitting_tau(base.opacities, error, config))
-    pruned = pruning_order(base, error.sqrt() * base.opacities, progress) if config.start == "importance" else None
+    pruned = pruning_order(base, error.sqrt() * base.opacities, progress)
     distances = typical_distance(base.means, [view.camera for view in views], attenuation)
     sigma = sigma_from_importance(
-        base, error if pruned is None else pruned.position, distances, attenuation, share=config.share,
-        exponent=config.exponent,
-    )  # fmt: skip
+        base, pruned.position, distances, attenuation, share=config.share, exponent=config.exponent
+    )
     sigma = sigma.minimum(WIDEST * config.max_sv * distances)
     initial = base.replace(sigma_d=sigma, attenuation=attenuation)
     # Training that begins with this growth ends 0.1 to 0.2 dB lower than from 0 (docs/method.md).
-    fitted = initial_growth(initial, pruned.substitute, distances) if pruned and config.iters == 0 else None
+    fitted = initial_growth(initial, pruned.substitute, distances) if config.iters == 0 else None
     return in_world_units(with_growth(initial, config, fitted))
 
 

@@ -23,6 +23,7 @@ from clod_adapter.config import AdaptConfig, ScreenFilter
 from clod_adapter.errors import ClodError
 from clod_adapter.nerfstudio.model import ClodSplatfactoModelConfig
 from clod_adapter.nerfstudio.splatfacto import state_of, view_of, write_ply
+from clod_adapter.training.schedule import OURS
 
 OWN = "_model.dial."
 EXPORTER = "nerfstudio.scripts.exporter"
@@ -80,7 +81,7 @@ class ClodTrainer(Trainer):  # type: ignore[misc]
         if dial is None:  # before the checkpoint is loaded
             return Optimizers({}, {})
         rates = {group["name"]: group["lr"] for group in dial.param_groups(splats=True) if group["lr"] > 0}
-        steps, final = self.config.max_num_iterations, AdaptConfig().lr_final
+        steps, final = self.config.max_num_iterations, OURS.lr_final
         own = {
             name: {
                 "optimizer": AdamOptimizerConfig(lr=rate, eps=1e-15),

@@ -11,8 +11,8 @@
         optimizer.zero_grad()
     clod_adapter.save("dial.ply", dial.gaussians())
 
-Initialization, dial values and objective are those of ``training.loop.adapt``, whose own step is faster on a CPU: it
-computes the count term's gradient in compiled passes, steps the kept rows alone, and averages the last steps.
+Initialization, dial values and objective are those of ``training.loop.adapt``, which drives a dial too. Its own step is
+faster on a CPU: it steps the kept rows alone, and averages the last steps.
 
 The splats are trained already, and their number is fixed: densify and prune before.
 """
@@ -20,33 +20,55 @@ The splats are trained already, and their number is fixed: densify and prune bef
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Literal
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import torch
 from torch import Tensor, nn
 
 from clod_adapter.cameras import Camera, Scene, StoredView, View, spread
 from clod_adapter.config import AdaptConfig
-from clod_adapter.equation.attenuation import Attenuated, attenuate
+from clod_adapter.equation.attenuation import SIGMA_MAX, Attenuated, attenuate
 from clod_adapter.equation.attenuation import dial as dialled_by
 from clod_adapter.equation.distances import typical_distance
 from clod_adapter.equation.growth import GROWTH_RANGE
 from clod_adapter.errors import ClodError
+from clod_adapter.finite import require_finite
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.importance import MOST_VIEWS, for_training, initialize, usable_views
 from clod_adapter.integrations.splats import NAMES, from_gsplat
 from clod_adapter.progress import Listener, shown
-from clod_adapter.training.loop import require_trainable
-from clod_adapter.training.objective import SIGMA_RANGE, loss_weight
-from clod_adapter.training.target_count import count_gradient, target_share
-from clod_adapter.training.trainer import learning_rates, own_sizes
-from clod_adapter.training.view_sampler import ViewSampler
+from clod_adapter.training.schedule import OURS, Schedule, ViewSampler
+from clod_adapter.training.target_count import TargetShare, count_gradient_at, target_share
 
 ATTRIBUTE_OF = {**NAMES, "features_dc": "sh0", "features_rest": "shN"}
+# Sigma stays where the equation still resolves it; below, a Gaussian would be culled for good.
+SIGMA_RANGE = (1e-4, SIGMA_MAX)
 
 Splats = Gaussians | Mapping[str, Tensor]
+
+
+@dataclass(frozen=True)
+class TrainableSubset:
+    """The trained Gaussians, where these are not the whole scene.
+
+    Attributes:
+        trained: number of trained rows, the first ones; the others are the context: drawn, but not trained.
+        full_context: draw the context without a dial, instead of at the dial value of the trained rows.
+        total: number of Gaussians that the target-count curve is a share of, where that is more than ``trained``
+            (``target_count.target_share``).
+        target: returns the count term's target at a dial value, in place of the target-count curve's.
+        cameras: the whole scene's, which typical distances are from. By default those of the views.
+        span: the shares of a whole training's schedule at which this training begins and ends.
+    """
+
+    trained: int
+    full_context: bool = False
+    total: int | None = None
+    target: Callable[[float], TargetShare] | None = None
+    cameras: Sequence[Camera] | None = None
+    span: tuple[float, float] = (0.0, 1.0)
 
 
 class Dial(nn.Module):
@@ -60,71 +82,108 @@ class Dial(nn.Module):
         growth_d: ``[N]`` parameter, or None if the config has no growth.
         attenuation: settings of both; distances are in units of the reference distance.
         config: settings of the training.
-        typical: ``[N]`` normalised distances at which Gaussians are counted.
+        typical: ``[N]`` normalised distances at which Gaussians are counted; no view's own, whose counts differ from
+            the mean's: gradients that correct such differences cancel out, and only add noise.
+
+    Of every dial of this form:
+
+    Attributes:
+        decay, limits: name of the parameter that sigma_d is trained through, and its lowest and highest value.
+        everywhere: names of parameters, besides it, whose culled rows have gradients too.
+        schedule: of the training.
+        weight_slope: k of ``weight``.
+        measured: whether a plan measures what a scene needs, and views watch s = 1.
     """
 
+    decay: ClassVar[str] = "log_sigma"
+    limits: ClassVar[tuple[float, float]] = (math.log(SIGMA_RANGE[0]), math.log(SIGMA_RANGE[1]))
+    everywhere: ClassVar[frozenset[str]] = frozenset()
+    schedule: ClassVar[Schedule] = OURS
+    weight_slope: ClassVar[float] = 0.25
+    measured: ClassVar[bool] = True
+
     typical: Tensor
+    log_sigma: Tensor
     growth_d: Tensor | None
     if TYPE_CHECKING:  # a module's call is untyped
 
         def __call__(self, camera: Camera, virtual_scale: float) -> Attenuated: ...
 
-    def __init__(self, splats: Splats, start: Gaussians, views: Sequence[View], config: AdaptConfig) -> None:
+    def __init__(
+        self, splats: Splats, start: Gaussians, views: Sequence[View], config: AdaptConfig,
+        subset: TrainableSubset | None = None,
+    ) -> None:  # fmt: skip
         super().__init__()
         assert start.sigma_d is not None and start.attenuation is not None
         self._given = (splats,)  # a ParameterDict that is an attribute would be a part of the module
-        config = config.for_views(len(views))
-        self.attenuation, self.config = start.attenuation, config
-        self.log_sigma = nn.Parameter(start.sigma_d.detach().float().clamp(*SIGMA_RANGE).log())
+        self.part = subset or TrainableSubset(len(start))
+        self.attenuation, self.config = start.attenuation, config.for_views(len(views))
+        self.register_parameter(self.decay, nn.Parameter(self.parameter_of(start.sigma_d)))
         growth_d = (
             None if start.growth_d is None else nn.Parameter(start.growth_d.detach().float().clamp(*GROWTH_RANGE))
         )
         self.register_parameter("growth_d", growth_d)
-        cameras = [view.camera for view in spread(views, MOST_VIEWS)]
-        self.register_buffer("typical", typical_distance(start.means, cameras, start.attenuation), persistent=False)
-        self._rates = learning_rates(config)
-        self._rates["means"] *= float(own_sizes(start.log_scales).median())  # an optimizer has one rate for all rows
-        self._sampler, self._sampled = ViewSampler((), config, start.attenuation.tau), 0
+        cameras = self.part.cameras or [view.camera for view in spread(views, MOST_VIEWS)]
+        typical = typical_distance(start.means, cameras, start.attenuation)[: self.part.trained]
+        self.register_buffer("typical", typical, persistent=False)
+        self._own_size = float(own_sizes(start.log_scales).median())
+        self.sampler, self._sampled = ViewSampler((), config, start.attenuation.tau, self.schedule), 0
+
+    @classmethod
+    def initial(
+        cls, base: Gaussians, views: Sequence[View], config: AdaptConfig, progress: Listener | None = None,
+        error: Tensor | None = None,
+    ) -> Gaussians:  # fmt: skip
+        """The Gaussians with the dial that training begins with, as ``importance.initialize``."""
+        return initialize(base, views, config, progress, error)
+
+    @staticmethod
+    def sigma_of(parameter: Tensor) -> Tensor:
+        """``[N]`` sigma_d from the parameter ``decay``, differentiable."""
+        return parameter.exp()
+
+    @staticmethod
+    def parameter_of(sigma_d: Tensor) -> Tensor:
+        """The inverse of ``sigma_of``, clamped to the trained range."""
+        return sigma_d.detach().float().clamp(*SIGMA_RANGE).log()
 
     def __repr__(self) -> str:
-        return f"Dial({len(self.log_sigma):,} Gaussians, s from 1 to {self.config.max_sv:g}, {self.log_sigma.device})"
+        return f"Dial({len(self.typical):,} Gaussians, s from 1 to {self.config.max_sv:g}, {self.typical.device})"
 
     @property
     def sigma_d(self) -> Tensor:
         """``[N]`` for ``attenuation``, differentiable."""
-        return self.log_sigma.exp()
+        return self.sigma_of(getattr(self, self.decay))
 
     def param_groups(self, splats: bool = False) -> list[dict[str, Any]]:
         """Groups for an optimizer, with the learning rates of ``config`` and the ``name`` of each.
 
-        ``adapt`` decays all rates exponentially to ``config.lr_final`` of them over its steps.
+        ``adapt`` decays all rates exponentially to ``schedule.lr_final`` of them over its steps.
 
         Args:
             splats: also those of the caller's parameters that require a gradient. Not where the loop has optimizers
                 for them.
         """
-        root = self.config.batch**0.5
-        rates = {"log_sigma": root * self.config.lr_sigma, "growth_d": root * self.config.lr_growth}
+        rates = learning_rates(self.config, self.decay)
+        rates["means"] *= self._own_size  # an optimizer has one rate for all rows
         found = [{"params": [value], "lr": rates[name], "name": name} for name, value in self.named_parameters()]
         if splats:
             (given,) = self._given
             for name, value in (given.tensors() if isinstance(given, Gaussians) else given).items():
-                rate = self._rates.get(ATTRIBUTE_OF.get(name, name))
+                rate = rates.get(ATTRIBUTE_OF.get(name, name))
                 if rate is not None and getattr(value, "requires_grad", False):
                     found.append({"params": [value], "lr": rate, "name": name})
         return found
 
     def sample(self) -> float:
-        """The next dial value: s = 1 in ``full_share`` of the steps, a quarter of these s = 0, else (log-)uniform.
-
-        The share falls over ``config.steps`` calls.
+        """The next dial value, by ``schedule`` over ``config.steps`` calls.
 
         Called once a step, it also keeps the parameters in the range in which the equation has a gradient. Dial values
         are evenly spread, not random: take the views in random order, or some meet the same dial values each round.
         """
-        self._clamp()
+        self.clamp()
         self._sampled += 1
-        return self._sampler.dial(self._sampled - 1, min((self._sampled - 1) / max(self.config.steps, 1), 1.0))
+        return self.sampler.dial(self._sampled - 1, min((self._sampled - 1) / max(self.config.steps, 1), 1.0))
 
     def forward(self, camera: Camera, virtual_scale: float) -> Attenuated:
         """The opacities ``drawn [N]`` and the factor ``growth [N]`` of the scales, for one camera and dial value.
@@ -137,17 +196,35 @@ class Dial(nn.Module):
     def loss(self, virtual_scale: float, rendering_loss: Tensor) -> Tensor:
         """0-d, the objective of one rendering at s: ``w_s rendering_loss`` and the target-count term.
 
-        ``w_s = (1 - weight_slope s / max_sv)^2``. Gaussians are counted at s, if it is 1 or more, and at a random dial
-        value up to 1.5 times ``max_sv``.
+        ``w_s`` is ``weight``. Gaussians are counted at s, if it is 1 or more, and at a random dial value up to 1.5
+        times ``max_sv``.
 
         Args:
             rendering_loss: 0-d, of an image rendered at s.
         """
-        weighted = loss_weight(virtual_scale, self.config) * rendering_loss
-        counted = self._sampler.counted()
+        found = self.weight(virtual_scale) * rendering_loss
+        for at, loss in self.counts(virtual_scale, self.sampler.counted(), rendering_loss):
+            found = found + self.count_loss(at, loss)
+        return found
+
+    def weight(self, virtual_scale: float) -> float:
+        """``w_s = max(0, 1 - k s / max_sv)^2``, the weight of the loss at the dial value s."""
+        return max(1 - self.weight_slope * virtual_scale / self.config.max_sv, 0.0) ** 2
+
+    def counts(self, virtual_scale: float, counted: float | None, loss: Tensor) -> list[tuple[float, Tensor]]:
+        """The dial values at which Gaussians are counted, and the losses that weigh the count term there.
+
+        None below s = 1, where all are to be kept. The weight at ``counted`` is 1: with half of w_s, counts at the far
+        end were 1.25 times the target, at a gain of 0.05 to 0.1 dB at equal counts.
+        """
         if counted is None:
-            return weighted
-        return weighted + self.count_loss(virtual_scale, weighted) + self.count_loss(counted, rendering_loss)
+            return []
+        here = [(virtual_scale, self.weight(virtual_scale) * loss)] if virtual_scale >= 1 else []
+        return [*here, (counted, loss)]
+
+    def objective(self, loss: Tensor, shown: Gaussians, camera: Camera, virtual_scale: float) -> Tensor:
+        """0-d, for ``adapt``: what it differentiates, of the photometric loss of a rendering of ``shown``."""
+        return self.weight(virtual_scale) * loss
 
     def count_loss(self, virtual_scale: float, rendering_loss: Tensor) -> Tensor:
         """0-d, the target-count term ``L reg_weight (eta / target - 1)^2`` alone; eta is the share kept.
@@ -159,16 +236,35 @@ class Dial(nn.Module):
             return self.log_sigma.new_zeros(())
         logits, sigma = self.gaussians().opacity_logits.detach(), self.sigma_d.detach()
         loss = torch.as_tensor(rendering_loss).detach().double()
-        target = target_share(virtual_scale, len(logits), self.config)
+        gradient = self.count_gradient(logits, self.log_sigma.detach(), virtual_scale, loss)
         dialled = attenuate(logits, sigma, self.typical, virtual_scale, self.attenuation)
-        gradient = count_gradient(dialled, logits, virtual_scale, self.attenuation.tau, loss, self.config, target)
         eta = dialled.keep.sum() / len(logits)
-        value = loss * self.config.reg_weight * (eta / target.share - 1) ** 2
+        value = loss * self.config.reg_weight * (eta / self.target_share(virtual_scale) - 1) ** 2
         return value.to(sigma) + ((self.log_sigma - self.log_sigma.detach()) * gradient).sum()
+
+    @torch.no_grad()
+    def count_gradient(self, logits: Tensor, parameter: Tensor, virtual_scale: float, loss: Tensor) -> Tensor:
+        """``[trained]`` the count term's gradient of ``log_sigma`` at one dial value, by ``count_gradient_at``.
+
+        Args:
+            logits, parameter: of the trained rows.
+        """
+        sigma, target = self.sigma_of(parameter), self._target(virtual_scale)
+        return count_gradient_at(
+            self.typical, logits, sigma, virtual_scale, self.attenuation, loss, self.config, target
+        )
+
+    def _target(self, virtual_scale: float) -> TargetShare:
+        part = self.part
+        return (
+            part.target(virtual_scale)
+            if part.target
+            else target_share(virtual_scale, part.trained, self.config, part.total)
+        )
 
     def target_share(self, virtual_scale: float) -> float:
         """The share of the splats that the target-count curve keeps at s, in (0, 1]; 1 below s = 1."""
-        return target_share(virtual_scale, len(self.log_sigma), self.config).share
+        return self._target(virtual_scale).share
 
     def gaussians(self) -> Gaussians:
         """The splats with this dial, for ``render`` in the loop and ``save`` after it: gradients reach both.
@@ -180,17 +276,18 @@ class Dial(nn.Module):
         """
         (given,) = self._given
         current = given if isinstance(given, Gaussians) else from_gsplat(given)
-        if len(current) != len(self.log_sigma):
+        count = len(getattr(self, self.decay))
+        if len(current) != count:
             raise ClodError(
-                f"there are {len(current)} splats now, but the dial is for {len(self.log_sigma)}; attach it after "
+                f"there are {len(current)} splats now, but the dial is for {count}; attach it after "
                 "densification and pruning"
             )
         return current.replace(sigma_d=self.sigma_d, attenuation=self.attenuation, growth_d=self.growth_d)
 
     @torch.no_grad()
-    def _clamp(self) -> None:
-        low, high = map(math.log, SIGMA_RANGE)
-        self.log_sigma.clamp_(low, high)
+    def clamp(self) -> None:
+        """Keeps the parameters in their ranges."""
+        getattr(self, self.decay).clamp_(*self.limits)
         if self.growth_d is not None:
             self.growth_d.clamp_(*GROWTH_RANGE)
 
@@ -211,13 +308,11 @@ def attach(
         settings: fields of ``AdaptConfig`` that replace those of ``config``.
 
     Raises:
-        ClodError: as ``adapt``; or the config has the paper's count term or its linear parameter.
+        ClodError: as ``adapt``; or the config has the paper's form.
     """
     config = replace(config or AdaptConfig(), **settings)
-    if config.count_term != "law" or config.parameter != "log":
-        raise ClodError(
-            "attach has the count term law and the parameter log; for others, as AdaptConfig.paper, call adapt"
-        )
+    if config.form != "ours":
+        raise ClodError(f"attach has no form {config.form}: call adapt, or leave the form out")
     given = scene.train if isinstance(scene, Scene) else scene
     views = tuple(each if isinstance(each, View) else _without_photograph(each) for each in given)
     base = splats if isinstance(splats, Gaussians) else from_gsplat(splats)
@@ -227,6 +322,36 @@ def attach(
     with shown(progress) as listener:
         start = for_training(initialize(base, views, config, listener), views, config)
     return Dial(splats, start, views, config)
+
+
+def require_trainable(base: Gaussians, scene: Scene, config: AdaptConfig, processes: int = 1) -> None:
+    """Raises ClodError if there is nothing to train, or on nothing, or a value is not finite."""
+    if not scene.train:
+        raise ClodError("the scene has no training views: give at least one photograph that is not held out")
+    if len(base) == 0:
+        raise ClodError("the checkpoint has no Gaussians, so there is nothing to adapt")
+    if config.batch < processes:
+        raise ClodError(f"batch is {config.batch}, it must be at least {processes}, a view for each of the processes")
+    require_finite(base, "the checkpoint", "leave out such rows")
+
+
+def learning_rates(config: AdaptConfig, decay: str) -> dict[str, float]:
+    """By parameter, for a batch; that of means is in units of ``own_sizes``."""
+    rates = {
+        "means": config.lr_means, "quats": config.lr_quats, "log_scales": config.lr_scales,
+        "opacity_logits": config.lr_opacities, "sh0": config.lr_sh0, "shN": config.lr_shN,
+        decay: config.lr_sigma, "growth_d": config.lr_growth,
+    }  # fmt: skip
+    return {name: rate * math.sqrt(config.batch) for name, rate in rates.items()}
+
+
+@torch.no_grad()
+def own_sizes(log_scales: Tensor) -> Tensor:
+    """``[N]`` the unit of each Gaussian's position steps, world units: the geometric mean of its scales.
+
+    A length of the scene, 3DGS's unit, is a hundred times the size of most Gaussians in a scene of millions.
+    """
+    return log_scales.detach().float().mean(1).exp()
 
 
 def _without_photograph(camera: Camera) -> View:

@@ -25,7 +25,7 @@ from torch import Tensor
 
 from clod_adapter.errors import ClodError
 from clod_adapter.progress import Listener, Phase, Progress, Stopped
-from clod_adapter.training.objective import GradientSum
+from clod_adapter.training.optimizer import GradientSum
 
 if TYPE_CHECKING:
     from torch.distributed.distributed_c10d import Store

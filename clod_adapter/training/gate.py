@@ -11,10 +11,9 @@ import torch
 from torch import Tensor
 
 from clod_adapter.adapter import ATTRIBUTES
-from clod_adapter.cameras import View
+from clod_adapter.cameras import Camera, View
 from clod_adapter.losses import psnr
 from clod_adapter.training.distributed import ProcessGroup
-from clod_adapter.training.objective import Objective
 from clod_adapter.training.pseudo_views import PseudoView
 from clod_adapter.training.state import Watched
 
@@ -64,9 +63,12 @@ def squared_error(image: Tensor, view: View) -> float:
 class Run(Protocol):
     """What the gate needs of ``trainer.Trainer``."""
 
-    objective: Objective
     group: ProcessGroup | None
     parameters: dict[str, Tensor]
+
+    def image(self, parameters: dict[str, Tensor], camera: Camera, s: float, halved: bool) -> Tensor: ...
+
+    def undialled(self, camera: Camera, halved: bool) -> Tensor: ...
 
     def trained(self) -> dict[str, Tensor]: ...
 
@@ -144,10 +146,10 @@ class Gate:
     @torch.no_grad()
     def _error(self, view: View, parameters: dict[str, Tensor] | None) -> float:
         """Of s = 1 of the parameters, or of the base without a dial."""
-        small, objective = view.camera.halvable, self.trainer.objective
+        small = view.camera.halvable
         view = view.halved() if small else view
         if parameters is None:
-            image = objective.undialled(self.trainer.parameters, view.camera, small)
+            image = self.trainer.undialled(view.camera, small)
         else:
-            image = objective.image(parameters, view.camera, 1.0, small)
+            image = self.trainer.image(parameters, view.camera, 1.0, small)
         return squared_error(image, view)

@@ -14,14 +14,15 @@ from clod_adapter.cameras import Scene, View
 from clod_adapter.config import AdaptConfig
 from clod_adapter.equation.units import in_world_units, with_distance
 from clod_adapter.errors import ClodError
-from clod_adapter.finite import LossNotFinite, largest_colour, require_finite
+from clod_adapter.finite import LossNotFinite, largest_colour
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.initialization.importance import for_training, initialize, usable_views, with_growth
+from clod_adapter.initialization.importance import for_training, usable_views, with_growth
 from clod_adapter.progress import Listener, Phase, Progress, shown
+from clod_adapter.training.dial import TrainableSubset, require_trainable
 from clod_adapter.training.distributed import ProcessGroup, ProcessLost
 from clod_adapter.training.gate import split_views
 from clod_adapter.training.interrupts import DeferredInterrupt
-from clod_adapter.training.objective import TrainableSubset
+from clod_adapter.training.paper import form_of
 from clod_adapter.training.state import Adapted, StateRefused, TrainingState
 from clod_adapter.training.trainer import Trainer
 
@@ -43,19 +44,17 @@ def adapt(
 ) -> Adapted:
     """Learns sigma_d for ``base`` on the training views of ``scene``, and tunes the other attributes lightly.
 
-    Each step samples ``batch`` views (1 by default) and follows the sum of their gradients. Each view is rendered at
-    one dial value, s = 1 in ``full_share`` of the steps at first, a quarter of these s = 0, and else log-uniform from 1
-    to 1.25 max_sv, to minimise ``w_s L_render(s)``, where L_render is ``losses.photometric_loss`` and ``w_s = max(0, 1
-    - weight_slope s / max_sv)^2``. In the first steps, a share ``coarse`` of all, photographs have half their size
-    beyond s = 1, unless that is below 128 pixels a side.
-    ``target_count.count_gradient`` moves sigma_d so that the share of Gaussians kept at their typical distances follows
-    the target-count curve.
-    The result is the mean of the parameters over the last ``average`` of the steps, so learning rates can stay large
+    A ``dial.Dial`` gives the objective, for which each step samples ``batch`` views (1 by default) and follows the sum
+    of their gradients. Each view is rendered at one dial value, by ``schedule.Schedule``: s = 1 in half of the steps at
+    first, s = 0 in a quarter of these, and else log-uniform from 1 to 1.25 max_sv, to minimise ``w_s L_render(s)``,
+    where L_render is ``losses.photometric_loss`` and ``w_s`` is ``Dial.weight``. In most of the training, photographs
+    have half their size beyond s = 1, unless that is below 128 pixels a side. ``target_count.count_gradient`` moves
+    sigma_d so that the share of Gaussians kept at their typical distances follows the target-count curve.
+    The result is the mean of the parameters over the last fifth of the steps, so learning rates can stay large
     to the end. A base that has a sigma_d is continued from. Training divides sigma_d by the reference distance; the
     result has it in world units.
 
-    ``AdaptConfig.paper`` gives CLoD-GS's own objective instead (section 3.3): one s a step and
-    ``w_s (L_render + reg_weight L_reg)`` with ``L_reg = (s - 1)^2 relu(eta - s^-exponent)^2``, eta the share kept.
+    ``AdaptConfig.paper`` gives CLoD-GS's own training instead (``paper.PaperDial``).
 
     Training ends early, and returns the result so far with ``Adapted.interrupted``, in these cases. After the
     last one ``progress`` is called once more, with ``Progress.error``.
@@ -86,7 +85,7 @@ def adapt(
         Stopped: ``progress`` returned False before training.
     """
     config = replace(config or AdaptConfig(), **settings).for_views(len(scene.train))
-    require_trainable(base, scene, config, group)
+    require_trainable(base, scene, config, group.size if group else 1)
     with shown(False if progress is None and group and group.rank else progress) as listener:
         return _adapt(base, scene, config, listener, resume, subset, group)
 
@@ -126,18 +125,7 @@ def training_views(
         ClodError: no view is usable.
     """
     usable = usable_views(base, views)
-    return (usable, ()) if config.count_term == "paper" else split_views(usable)
-
-
-def require_trainable(base: Gaussians, scene: Scene, config: AdaptConfig, group: ProcessGroup | None = None) -> None:
-    """Raises ClodError if there is nothing to train, or on nothing, or a value is not finite."""
-    if not scene.train:
-        raise ClodError("the scene has no training views: give at least one photograph that is not held out")
-    if len(base) == 0:
-        raise ClodError("the checkpoint has no Gaussians, so there is nothing to adapt")
-    if group and config.batch < group.size:
-        raise ClodError(f"batch is {config.batch}, it must be at least {group.size}, a view for each of the processes")
-    require_finite(base, "the checkpoint", "leave out such rows")
+    return split_views(usable) if form_of(config).measured else (usable, ())
 
 
 def _initialized(
@@ -147,7 +135,7 @@ def _initialized(
     """The Gaussians with the initial dial; of a group, the first process computes it."""
 
     def initial(listener: Listener | None) -> dict[str, Any]:
-        begun = for_training(initialize(lean, views, config, listener), views, config)
+        begun = for_training(form_of(config).initial(lean, views, config, listener), views, config)
         return {name: getattr(begun, name) for name in ("sigma_d", "growth_d", "attenuation")}
 
     found = group.once(initial, progress) if group else initial(progress)

@@ -1,8 +1,9 @@
-"""Adam that steps only some rows (Gaussians) at a time."""
+"""Gradients of a step, and Adam that steps only some rows (Gaussians) at a time."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,27 @@ import torch
 from torch import Tensor
 
 from clod_adapter._support.fusing import Fused, Number
+
+
+@dataclass
+class GradientSum:
+    """Gradients of the objective, summed over views.
+
+    Attributes:
+        gradients: by name of the trained parameter, of its first ``trained`` rows.
+        kept: ``[trained]`` bool, the rows that at least one rendering kept.
+        loss: 0-d float64, photometric loss of each view, summed.
+        views: their number.
+    """
+
+    gradients: dict[str, Tensor]
+    kept: Tensor
+    loss: Tensor
+    views: int = 1
+
+    def __add__(self, other: GradientSum) -> GradientSum:
+        gradients = {name: mine + other.gradients[name] for name, mine in self.gradients.items()}
+        return GradientSum(gradients, self.kept | other.kept, self.loss + other.loss, self.views + other.views)
 
 
 class RowAdam:

@@ -14,9 +14,9 @@ from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.progress import Listener, within
 from clod_adapter.training.ablation import largest_change
+from clod_adapter.training.dial import TrainableSubset
 from clod_adapter.training.distributed import ProcessGroup
 from clod_adapter.training.loop import Adapted, adapt
-from clod_adapter.training.objective import TrainableSubset
 from clod_adapter.training.state import TrainingState
 
 RATES = {

@@ -14,10 +14,12 @@ from torch import Tensor
 from clod_adapter.cameras import Scene, View, spread
 from clod_adapter.config import AdaptConfig
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.initialization.importance import MOST_VIEWS, has_dial, initialize, removal_error
+from clod_adapter.initialization.importance import MOST_VIEWS, has_dial, removal_error
 from clod_adapter.progress import Listener, Phase, tell, within
 from clod_adapter.training.ablation import needed_share, seen, sh_degree_losses
-from clod_adapter.training.loop import require_trainable, training_views
+from clod_adapter.training.dial import require_trainable
+from clod_adapter.training.loop import training_views
+from clod_adapter.training.paper import form_of
 from clod_adapter.training.plan import NOT_NEEDED, RATES, Decision, Override, Plan
 from clod_adapter.training.pseudo_views import PseudoView
 
@@ -92,7 +94,7 @@ class _Planner:
         kept = self._unseen(errors)
         config = self._share(few, errors)
         with self._time("start"):
-            initial = initialize(few, self.views, config, self.progress, error=errors and errors.error)
+            initial = form_of(config).initial(few, self.views, config, self.progress, errors and errors.error)
         config = self._freeze(config)
         for item, reason in self.scene.left_out:
             self._decide(item, NOT_NEEDED, reason)
@@ -164,8 +166,8 @@ class _Planner:
             return ""
         if has_dial(self.base):
             return "not measured: its dial shows other Gaussians at other dial values"
-        if self.config.start in ("constant", "identity"):
-            return f"not measured: with a {self.config.start} initialization none is culled at any dial value"
+        if not form_of(self.config).measured:
+            return "not measured: in the paper's form every Gaussian begins with the same sigma_d"
         return ""
 
     def _share(self, few: Gaussians, errors: _Errors | None) -> AdaptConfig:

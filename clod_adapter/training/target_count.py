@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
-from torch.autograd import Function
-from torch.autograd.function import once_differentiable
 
 from clod_adapter._support.fusing import Number
 from clod_adapter.config import AdaptConfig, AttenuationConfig
 from clod_adapter.equation.attenuation import Attenuated, attenuate, conform, log_threshold
 
+TEMPERATURE = 0.15  # width of the sigmoid of the soft count, in log opacity
 # Lower bound of the sigmoid's slope, which is at most 1/4, for culled Gaussians while too few are kept. Some widths
 # below the culling threshold it is exactly 0, and so is the image's gradient: no step would bring such a sigma back.
 LIFT = 1e-3
@@ -75,7 +74,9 @@ def count_gradient(
     target = target or target_share(virtual_scale, len(opacity_logits), config)
     eta = dialled.keep.sum().double() / len(opacity_logits)  # a tensor: a float would wait for a GPU
     penalty = _penalty(eta, target, loss, config)
-    return lifted_slope(dialled, opacity_logits, virtual_scale, tau, config.temperature, penalty < 0).mul_(penalty)
+    slope = count_slope(opacity_logits, dialled.log_opacities.detach(), virtual_scale, tau, TEMPERATURE)
+    least = (torch.as_tensor(penalty < 0) & ~dialled.keep) * (LIFT / (TEMPERATURE * len(slope)))
+    return slope.clamp_(min=least).mul_(penalty)
 
 
 def count_gradient_at(
@@ -98,7 +99,7 @@ def count_gradient_at(
     penalty = float(_penalty(float(counts.sum()) / n, target, loss, config))
     lift = LIFT if penalty < 0 else 0.0
     threads.run(
-        count.count_slope, workers, *arrays, dial, config.temperature, lift, penalty / (config.temperature * n),
+        count.count_slope, workers, *arrays, dial, TEMPERATURE, lift, penalty / (TEMPERATURE * n),
         out.numpy(),
     )  # fmt: skip
     return out
@@ -109,29 +110,6 @@ def _penalty(eta: Number, target: TargetShare, loss: Number, config: AdaptConfig
     return 2 * loss * config.reg_weight * (eta / target.share - 1) * target.weight
 
 
-def lifted_slope(
-    dialled: Attenuated, opacity_logits: Tensor, virtual_scale: float, tau: float, temperature: float,
-    lift: bool | Tensor,
-) -> Tensor:  # fmt: skip
-    """``[N]`` ``count_slope``; with ``lift`` (0-d) at least ``LIFT / (temperature N)`` for culled Gaussians."""
-    slope = count_slope(opacity_logits, dialled.log_opacities.detach(), virtual_scale, tau, temperature)
-    return slope.clamp_(min=(lift & ~dialled.keep) * (LIFT / (temperature * len(slope))))
-
-
-def paper_count(
-    dialled: Attenuated, virtual_scale: float, tau: float, config: AdaptConfig, total: int | None = None
-) -> Tensor:
-    """0-d, the paper's ``lambda L_reg = lambda (s - 1)^2 relu(eta - s^-p)^2`` (section 3.3); eta is ``soft_count``.
-
-    Args:
-        total: number of Gaussians that eta is a share of, as in ``target_share``.
-    """
-    count = soft_count(dialled.log_opacities, virtual_scale, tau, config.temperature)
-    count = count * (len(dialled.log_opacities) / (total or len(dialled.log_opacities)))
-    excess = (count - virtual_scale**-config.exponent).clamp(min=0)
-    return config.reg_weight * (virtual_scale - 1) ** 2 * excess**2
-
-
 @torch.no_grad()
 def count_slope(
     opacity_logits: Tensor, log_opacities: Tensor, virtual_scale: float, tau: float, temperature: float
@@ -139,7 +117,7 @@ def count_slope(
     """``[N]`` the softened derivative of the share kept by each Gaussian's ``log sigma_d``.
 
     ``q (1 - q) / (temperature N) max(2 u, 1)`` with ``q = sigmoid((log a'' - log(tau s)) / temperature)`` and
-    ``u = log a - log a''``: the slope of ``soft_count`` by ``log sigma_d``, except that its factor ``2 u`` is
+    ``u = log a - log a''``: the slope of a soft count by ``log sigma_d``, except that its factor ``2 u`` is
     at least 1: Gaussians that are not attenuated yet have u = 0 and would never be. 0 at log a'' = -inf.
 
     Args:
@@ -151,41 +129,12 @@ def count_slope(
     """
     opacity_logits, log_opacities = conform(opacity_logits=opacity_logits, log_opacities=log_opacities)
     factor = (F.logsigmoid(opacity_logits) - log_opacities).mul_(2).clamp_(min=1)
-    slope = _slope_of_sigmoid(log_opacities, log_threshold(tau, virtual_scale), temperature)
+    slope = slope_of_sigmoid(log_opacities, log_threshold(tau, virtual_scale), temperature)
     # Where log a'' is -inf the slope is 0 and the factor inf.
     return slope.mul_(factor).nan_to_num_(0.0, 0.0)
 
 
-def soft_count(log_opacities: Tensor, virtual_scale: float, tau: float, temperature: float) -> Tensor:
-    """0-d, the share of Gaussians kept, in [0, 1]: exact in the forward pass, soft in the backward pass.
-
-    Forward: mean of ``log a'' > log(tau s)``; 0 for no Gaussians. Backward, straight through: the gradient
-    of the mean of ``sigmoid((log a'' - log(tau s)) / temperature)``, which is 0 at log a'' = -inf.
-
-    Args:
-        log_opacities: ``[N]`` from ``attenuate``, in [-inf, 0].
-        temperature: > 0, in units of log opacity; the larger, the farther from the threshold it acts.
-    """
-    (log_opacities,) = conform(log_opacities=log_opacities)
-    return _SoftCount.apply(log_opacities, log_threshold(tau, virtual_scale), temperature)
-
-
-class _SoftCount(Function):
-    """``soft_count`` above a log threshold."""
-
-    @staticmethod
-    def forward(ctx: Any, log_opacities: Tensor, threshold: float, temperature: float) -> Tensor:
-        ctx.save_for_backward(log_opacities)
-        ctx.settings = threshold, temperature
-        return (log_opacities > threshold).sum() / log_opacities.new_full((), max(len(log_opacities), 1))
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
-        return _slope_of_sigmoid(ctx.saved_tensors[0], *ctx.settings).mul_(grad), None, None
-
-
-def _slope_of_sigmoid(log_opacities: Tensor, threshold: float, temperature: float) -> Tensor:
+def slope_of_sigmoid(log_opacities: Tensor, threshold: float, temperature: float) -> Tensor:
     """``[N]`` the slope of the mean of ``sigmoid(z)``, ``z = (log a'' - threshold) / temperature``, by log a''.
 
     ``sigmoid(z) sigmoid(-z) / (temperature N)``, as 1 - sigmoid(z) would cancel. The temperature is clamped

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import time
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -10,21 +12,21 @@ from torch import Tensor
 
 from clod_adapter._kernels.threads import torch_on_one_thread
 from clod_adapter.adapter import ATTRIBUTES
-from clod_adapter.cameras import View, spread
+from clod_adapter.cameras import Camera, View
 from clod_adapter.config import AdaptConfig
-from clod_adapter.equation.distances import typical_distance
-from clod_adapter.equation.growth import GROWTH_RANGE
 from clod_adapter.equation.units import in_world_units
 from clod_adapter.errors import ClodError
 from clod_adapter.finite import LossNotFinite, require_finite, spoilt_rows
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.initialization.importance import MOST_VIEWS
+from clod_adapter.losses import photometric_loss
+from clod_adapter.rasterizers import for_device
+from clod_adapter.training.dial import TrainableSubset, learning_rates, own_sizes
 from clod_adapter.training.distributed import ProcessGroup
 from clod_adapter.training.gate import Gate
-from clod_adapter.training.objective import GradientSum, Objective, TrainableSubset
-from clod_adapter.training.optimizer import RowAdam, add_to_mean
+from clod_adapter.training.optimizer import GradientSum, RowAdam, add_to_mean
+from clod_adapter.training.paper import form_of
+from clod_adapter.training.schedule import Sample
 from clod_adapter.training.state import TrainingState
-from clod_adapter.training.view_sampler import ViewSampler
 
 # Adam's decay rates per view. A batch takes their powers and multiplies learning rates by its square root, so that
 # each view has the same effect (Zhao et al., "On Scaling Up 3D Gaussian Splatting Training", ICLR 2025).
@@ -35,7 +37,8 @@ class Trainer:
     """Holds everything that training steps change. The start has a growth_d if the config has growth.
 
     Attributes:
-        parameters: tensors by name; the first ``objective.trained`` rows of those in ``stepped`` are trained.
+        dial: what is trained, with the splats' parameters; count: the number of trained rows, the first ones.
+        parameters: tensors by name, those of the dial too; ``stepped``: names of those that are trained.
         mean: of the trained parameters over the last ``average`` of the steps; averaged: how many steps it has.
         loss: running mean of the photometric loss, NaN before the first step.
         done: steps; seconds: spent in them; start_seconds: spent before the first.
@@ -47,36 +50,31 @@ class Trainer:
         self, start: Gaussians, views: tuple[View, ...], config: AdaptConfig, subset: TrainableSubset | None = None,
         group: ProcessGroup | None = None, watched: tuple[View, ...] = (),
     ) -> None:  # fmt: skip
-        subset = subset or TrainableSubset(len(start))
-        assert start.sigma_d is not None and start.attenuation is not None
-        self.config, self.group, self.sampler = config, group, ViewSampler(views, config, start.attenuation.tau)
-        rates = learning_rates(config)
+        form = form_of(config)
+        self.rates = learning_rates(config, form.decay)
         # A frozen attribute requests no gradient from the rasterizer.
-        tuned = [n for n in ATTRIBUTES if n != "opacity_logits" and rates[n] > 0 and getattr(start, n).numel()]
-        cameras = subset.cameras or [view.camera for view in spread(views, MOST_VIEWS)]
-        typical = typical_distance(start.means, cameras, start.attenuation)[: subset.trained]
-        self.objective = Objective(config, start.attenuation, tuple(tuned), subset, typical, start.screen_filter)
-        self.decay, self.stepped = self.objective.decay, self.objective.stepped
-        self.decay_range = self.objective.decay_range
-        self.rates = rates | {self.decay: config.lr_sigma * math.sqrt(config.batch)}
-        self.rates["growth_d"] = config.lr_growth * math.sqrt(config.batch)
-        own = {"dtype": torch.float32, "memory_format": torch.contiguous_format}
-        self.parameters = {
-            name: getattr(start, name).detach().to(**own, copy=name in self.stepped) for name in ATTRIBUTES
+        tuned = [n for n in ATTRIBUTES if n != "opacity_logits" and self.rates[n] > 0 and getattr(start, n).numel()]
+        own: dict[str, Any] = {"dtype": torch.float32, "memory_format": torch.contiguous_format}
+        attributes: Any = {
+            name: getattr(start, name).detach().to(**own, copy=name in (*tuned, "opacity_logits"))
+            for name in ATTRIBUTES
         }
-        self.parameters[self.decay] = self.objective.parameter(start.sigma_d)
-        if config.growth == "on":
-            assert start.growth_d is not None
-            self.parameters["growth_d"] = start.growth_d.detach().float().clamp(*GROWTH_RANGE)
-        self.unit = own_sizes(start.log_scales[: subset.trained])
-        # The paper's count term has a gradient for opacities too, also of culled Gaussians.
-        everywhere = {self.decay} | ({"opacity_logits"} if config.count_term == "paper" else set())
+        splats = Gaussians(**attributes, screen_filter=start.screen_filter)
+        self.dial = form(splats, start, views, config, subset)
+        dials = {name: value.detach() for name, value in self.dial.named_parameters()}
+        self.parameters, self.stepped = attributes | dials, (*tuned, "opacity_logits", *dials)
+        self.config, self.group, self.count = config, group, self.dial.part.trained
+        self.sampler, self.screen_filter = self.dial.sampler, start.screen_filter
+        self.sampler.views = views
+        self.unit = own_sizes(start.log_scales[: self.count])
+        # Of culled Gaussians too the count term has a gradient.
+        everywhere = {self.dial.decay, *self.dial.everywhere}
         self.optimizers = [self._optimizer(set(self.stepped) - everywhere), self._optimizer(everywhere)]
         self.empty_sh: Tensor | None = None  # the whole shN of a base whose empty degrees were removed
         self.done, self.seconds, self.start_seconds, self.loss = 0, 0.0, 0.0, math.nan
         self.mean: dict[str, Tensor] = {}
         self.averaged = 0
-        self.held = torch.zeros(subset.trained, dtype=torch.bool, device=start.means.device)
+        self.held = torch.zeros(self.count, dtype=torch.bool, device=start.means.device)
         self._updating = False
         self.gate = Gate(self, watched, bool(set(map(id, watched)) & set(map(id, views)))) if watched else None
 
@@ -85,22 +83,23 @@ class Trainer:
         """Samples views and dial values, sums the gradients of their losses, and updates the parameters once.
 
         Args:
-            until: as for ``Objective.gradient_sum``: the step has fewer views if the time is over.
+            until: as for ``gradient_sum``: the step has fewer views if the time is over.
 
         Raises:
             LossNotFinite, or any error of the rasterizer: nothing has changed.
         """
         if self.gate:
             self.gate.check(share_done)
-        before = self.sampler.state()
+        before, (begin, end) = self.sampler.state(), self.dial.part.span
+        whole = begin + share_done * (end - begin)
         numbers = range(self.done * self.config.batch, (self.done + 1) * self.config.batch)
-        samples = [self.sampler.draw(number, share_done) for number in numbers]
+        samples = [self.sampler.draw(number, whole) for number in numbers]
         try:  # if it fails, the next step samples the same views again
             own = self.group.share(samples) if self.group else samples
-            found = self.objective.gradient_sum(self.parameters, own, until)
+            found = self.gradient_sum(own, until)
             found = self.group.sum(found) if self.group else found
             self._updating = True
-            self._update(found, share_done)
+            self._update(found, whole)
             loss = float(found.loss) / found.views  # the host waits for a GPU, as else only gsplat does
             if not math.isfinite(loss):
                 self._updating = False
@@ -110,25 +109,71 @@ class Trainer:
             self.sampler.restore(*before)
             raise
         self.loss = loss if math.isnan(self.loss) else 0.98 * self.loss + 0.02 * loss
-        if share_done >= 1 - self.config.average:  # the optimizer continues from the parameters, not from the mean
+        if whole >= end - self.dial.schedule.average:  # the optimizer continues from the parameters, not from the mean
             self.averaged += 1
             add_to_mean(self.mean, self.trained(), self.averaged)
         self.done += 1
         self._updating = False
+
+    def gradient_sum(self, samples: Sequence[Sample], until: float = math.inf) -> GradientSum:
+        """The gradients summed over the samples: the first, and those begun before ``until`` (``perf_counter``)."""
+        found = self._of_view(samples[0])
+        for sample in samples[1:]:
+            if time.perf_counter() >= until:
+                break
+            found += self._of_view(sample)
+        return found
+
+    def _of_view(self, sample: Sample) -> GradientSum:
+        """Renders one view at its dial value, and differentiates the objective."""
+        (view, s, counted, halved), first = sample, slice(self.count)
+        leaves = {name: value.detach().requires_grad_(name in self.stepped) for name, value in self.parameters.items()}
+        shown = self._shown(leaves, halved)
+        kept = for_device(shown.means.device).kept(shown, view.camera, s)[first]
+        image = self._draw(shown, view.camera, s)
+        loss = photometric_loss(image, view.image, self.config.ssim_weight)
+        total = self.dial.objective(loss, shown, view.camera, s)
+        found = torch.autograd.grad(total, [leaves[name] for name in self.stepped])
+        gradients = {name: gradient[first] for name, gradient in zip(self.stepped, found, strict=True)}
+        plain, decay = loss.detach().double(), self.dial.decay
+        logits, parameter = (self.parameters[name][first] for name in ("opacity_logits", decay))
+        for at, weighted in self.dial.counts(s, counted, plain):
+            gradients[decay] = gradients[decay] + self.dial.count_gradient(logits, parameter, at, weighted)
+        return GradientSum(gradients, kept, plain)
+
+    def image(self, parameters: dict[str, Tensor], camera: Camera, s: float, halved: bool) -> Tensor:
+        """The image ``[H, W, 3]`` of the parameters; ``halved`` if the camera is for images of half the size."""
+        return self._draw(self._shown(parameters, halved), camera, s)
+
+    def undialled(self, camera: Camera, halved: bool) -> Tensor:
+        """``image`` of the present parameters without a dial: before the first step it is the base's."""
+        shown = self._shown(self.parameters, halved)
+        return self._draw(shown.replace(sigma_d=None, growth_d=None, attenuation=None), camera, 1.0)
+
+    def _shown(self, parameters: dict[str, Tensor], halved: bool = False) -> Gaussians:
+        """Gaussians of these parameters, as they are drawn."""
+        found = self._assembled(parameters)
+        found = found.replace(screen_filter=self.screen_filter.halved()) if halved else found
+        if not self.dial.part.full_context:
+            return found
+        assert found.sigma_d is not None
+        growth_d = None if found.growth_d is None else _ending_in(0.0, found.growth_d, self.count)
+        return found.replace(sigma_d=_ending_in(math.inf, found.sigma_d, self.count), growth_d=growth_d)
+
+    def _draw(self, shown: Gaussians, camera: Camera, s: float) -> Tensor:
+        return for_device(shown.means.device).draw(shown, camera, s, trained=self.count)[0]
 
     def _update(self, found: GradientSum, share_done: float) -> None:
         """Moves the rows whose gradients are finite; none if the loss is not, without asking which."""
         learned, rows = torch.as_tensor(found.loss).isfinite(), spoilt_rows(found.gradients)
         self.held |= learned & rows
         finite = rows.logical_not_().logical_and_(learned)
-        rates = {name: rate * self.config.lr_final**share_done for name, rate in self.rates.items()}
+        rates = {name: rate * self.dial.schedule.lr_final**share_done for name, rate in self.rates.items()}
         rates = self.gate.weaken(rates) if self.gate else rates
         for optimizer, rows in zip(self.optimizers, (found.kept.logical_and_(finite), finite), strict=True):
             if optimizer:
                 optimizer.step(found.gradients, rows, rates)
-        self.parameters[self.decay].clamp_(*self.decay_range)
-        if self.config.growth == "on":
-            self.parameters["growth_d"].clamp_(*GROWTH_RANGE)
+        self.dial.clamp()
 
     def state(self) -> TrainingState:
         """Everything that later steps depend on; its tensors are the trainer's own.
@@ -140,7 +185,7 @@ class Trainer:
             raise ClodError(f"step {self.done + 1} failed while it updated the parameters, so they cannot be saved")
         random, order = self.sampler.state()
         return TrainingState(
-            tensors=self._changing(), attenuation=self.objective.attenuation, random=random, order=order,
+            tensors=self._changing(), attenuation=self.dial.attenuation, random=random, order=order,
             loss=self.loss, averaged=self.averaged, steps=self.done, seconds=self.seconds,
             start_seconds=self.start_seconds,
         )  # fmt: skip
@@ -169,22 +214,21 @@ class Trainer:
 
     def averages(self) -> dict[str, Tensor]:
         """The mean parameters, of all rows; none before there is a mean."""
-        rest = slice(self.objective.trained, None)
+        rest = slice(self.count, None)
         whole = all(len(self.parameters[name][rest]) == 0 for name in self.mean)
         return self.mean if whole else {n: torch.cat([m, self.parameters[n][rest]]) for n, m in self.mean.items()}
 
     def _assembled(self, parameters: dict[str, Tensor]) -> Gaussians:
         """Gaussians of these parameters."""
         values: Any = {name: parameters[name] for name in ATTRIBUTES}
-        dial: Any = {
-            "sigma_d": self.objective.sigma(parameters[self.decay]), "attenuation": self.objective.attenuation,
-            "growth_d": parameters.get("growth_d"),
-        }  # fmt: skip
-        return Gaussians(**values, **dial, screen_filter=self.objective.screen_filter)
+        return Gaussians(
+            **values, sigma_d=self.dial.sigma_of(parameters[self.dial.decay]), attenuation=self.dial.attenuation,
+            growth_d=parameters.get("growth_d"), screen_filter=self.screen_filter,
+        )  # fmt: skip
 
     def trained(self) -> dict[str, Tensor]:
         """Views of the rows of the parameters that steps change."""
-        return {name: self.parameters[name][: self.objective.trained] for name in self.stepped}
+        return {name: self.parameters[name][: self.count] for name in self.stepped}
 
     def return_to(self, trained: dict[str, Tensor]) -> None:
         """Continues from these values of the trained rows, without moments and mean."""
@@ -217,19 +261,6 @@ class Trainer:
         return found
 
 
-def learning_rates(config: AdaptConfig) -> dict[str, float]:
-    """By attribute, for a batch; that of means is in units of ``own_sizes``."""
-    rates = {
-        "means": config.lr_means, "quats": config.lr_quats, "log_scales": config.lr_scales,
-        "opacity_logits": config.lr_opacities, "sh0": config.lr_sh0, "shN": config.lr_shN,
-    }  # fmt: skip
-    return {name: rate * math.sqrt(config.batch) for name, rate in rates.items()}
-
-
-@torch.no_grad()
-def own_sizes(log_scales: Tensor) -> Tensor:
-    """``[N]`` the unit of each Gaussian's position steps, world units: the geometric mean of its scales.
-
-    A length of the scene, 3DGS's unit, is a hundred times the size of most Gaussians in a scene of millions.
-    """
-    return log_scales.detach().float().mean(1).exp()
+def _ending_in(value: float, tensor: Tensor, trained: int) -> Tensor:
+    """``[N]`` with this value in the rows from ``trained`` on."""
+    return torch.cat([tensor[:trained], torch.full_like(tensor[trained:], value)])

@@ -15,7 +15,7 @@ from torch import Tensor
 from clod_adapter.equation.attenuation import SIGMA_MAX, attenuate, log_attenuation
 from clod_adapter.equation.extinction import extinction_scale, sigma_for_extinction
 from clod_adapter.errors import ClodError
-from clod_adapter.training.target_count import soft_count
+from clod_adapter.training.paper import soft_count
 from exact import (
     DISTANCES,
     DTYPES,

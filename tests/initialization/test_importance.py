@@ -120,22 +120,15 @@ def test_kept_shares_follow_the_target_curve(share: float, exponent: float, n: i
     assert empty.shape == (0,)
 
 
-def test_initialization_culls_in_the_configured_order() -> None:
-    """By removal error alone, the most important is culled last; with neighbours it may be culled earlier."""
+def test_initialization_culls_in_the_pruning_order() -> None:
+    """In which one that a neighbour replaces goes earlier than by its removal error alone."""
     some = gaussians(200, 0, 0)
     views = photograph(some, ring(3, 20, 16))
-    error = removal_error(some, views, seed=0)
-    by_error, by_default = (
-        importance.initialize(some, views, AdaptConfig(start=name)) for name in ("error", "importance")
-    )
-
-    def culling_order(dialled: Gaussians) -> Tensor:
-        d = typical_distance(some.means, [view.camera for view in views], dialled.attenuation)
-        return extinction_scale(dialled.opacity_logits, dialled.sigma_d, d, dialled.attenuation).argsort()
-
-    assert torch.equal(culling_order(by_error)[100:180], error.argsort(stable=True)[100:180])
+    error, dialled = removal_error(some, views, seed=0), importance.initialize(some, views, AdaptConfig())
+    d = typical_distance(some.means, [view.camera for view in views], dialled.attenuation)
+    found = extinction_scale(dialled.opacity_logits, dialled.sigma_d, d, dialled.attenuation).argsort()
     order = pruning_order(some, error.sqrt() * some.opacities).position
-    assert torch.equal(culling_order(by_default)[100:180], order.argsort()[100:180])
+    assert torch.equal(found[100:180], order.argsort()[100:180])
     assert not torch.equal(order.argsort()[100:180], error.argsort(stable=True)[100:180])
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import math
 from typing import Any
 
 import numpy as np
@@ -18,10 +17,9 @@ from clod_adapter.equation.attenuation import attenuate
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.losses import photometric_loss
-from clod_adapter.training.dial import Dial, attach
-from clod_adapter.training.objective import SIGMA_RANGE, Objective, TrainableSubset
-from clod_adapter.training.target_count import count_gradient_at, target_share
-from clod_adapter.training.view_sampler import COUNTED, RENDERED, Sample
+from clod_adapter.training.dial import SIGMA_RANGE, Dial, TrainableSubset, attach
+from clod_adapter.training.schedule import OURS, Sample
+from clod_adapter.training.trainer import Trainer
 
 Pair = tuple[Gaussians, Scene]
 MAX_SV = 5.0
@@ -48,7 +46,7 @@ def test_a_loop_learns(captured: Pair) -> None:
     splats, steps = trainable(base), 60
     dial = attach(splats, scene)
     optimizer = torch.optim.Adam(dial.param_groups(splats=True), eps=1e-15)
-    schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, dial.config.lr_final ** (1 / steps))
+    schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, OURS.lr_final ** (1 / steps))
     before = clod.evaluate(dial.gaussians(), scene.train, [1, MAX_SV])
     for step in range(steps):
         s = dial.sample()
@@ -61,42 +59,49 @@ def test_a_loop_learns(captured: Pair) -> None:
     assert after[0].kept_share == pytest.approx(0.62, abs=0.06) and 0.06 < after[1].kept_share < 0.2
 
 
-@pytest.mark.parametrize("s", [1.0, 2.7, 6.0])
-def test_the_count_term_has_the_gradient_of_training(captured: Pair, s: float) -> None:
-    base, scene = captured
-    dial = attach(base, scene)
-    with torch.no_grad():
-        dial.log_sigma += torch.linspace(-1, 1, len(base))
-    loss, config = torch.tensor(0.3, requires_grad=True), dial.config
-    term = dial.count_loss(s, loss)
-    found, none = torch.autograd.grad(term, [dial.log_sigma, loss], allow_unused=True)
-    given = dial.typical, base.opacity_logits, dial.sigma_d.detach()
-    target = target_share(s, len(base), config)
-    wanted = count_gradient_at(*given, s, dial.attenuation, loss.detach().double(), config, target)
-    assert none is None and wanted.abs().max() > 0
-    torch.testing.assert_close(found, wanted, rtol=1e-4, atol=1e-9)
-    share = attenuate(given[1], given[2], given[0], s, dial.attenuation).keep.double().mean()
-    assert term.item() == pytest.approx(0.3 * config.reg_weight * float(share / target.share - 1) ** 2, rel=1e-5)
-
-
-def test_the_loss_is_the_objective_of_adapt(captured: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_objective_is_that_of_adapt(captured: Pair) -> None:
     """All gradients, of the splats too, at one view and dial value."""
     base, scene = captured
     splats, s = trainable(base), 2.3
     dial = attach(splats, scene, seed=3)
-    counted = (COUNTED * MAX_SV) ** np.random.default_rng(3).random(2)[1]  # the first is of the dial values
+    counted = (OURS.counted * MAX_SV) ** np.random.default_rng(3).random(2)[1]  # the first is of the dial values
     dial.loss(s, loss_of(dial, scene, s)).backward()
-    tuned = ("means", "quats", "log_scales", "sh0")
-    objective = Objective(dial.config, dial.attenuation, tuned, TrainableSubset(len(base)), dial.typical)
-    parameters = {name: getattr(base, name) for name in (*tuned, "opacity_logits", "shN")}
-    parameters |= {"log_sigma": dial.log_sigma.detach(), "growth_d": dial.growth_d.detach()}
-    wanted = objective.gradient_sum(parameters, [Sample(scene.train[0], s, counted)]).gradients
+    run = Trainer(dial.gaussians(), scene.train, AdaptConfig(lr_shN=1e-3))
     names = {"log_scales": "scales", "opacity_logits": "opacities"}
-    for name, gradient in wanted.items():
+    for name, gradient in run.gradient_sum([Sample(scene.train[0], s, counted)]).gradients.items():
         own: Any = getattr(dial, name, None)
         found = (splats[names.get(name, name)] if own is None else own).grad
         assert gradient.abs().max() > 0, name
         torch.testing.assert_close(found, gradient, rtol=1e-3, atol=1e-5 * float(gradient.abs().max()), msg=name)
+    term = dial.count_loss(s, torch.tensor(0.3))
+    kept = attenuate(base.opacity_logits, dial.sigma_d, dial.typical, s, dial.attenuation).keep.float().mean()
+    wanted = 0.3 * dial.config.reg_weight * (kept.item() / dial.target_share(s) - 1) ** 2
+    assert term.item() == pytest.approx(wanted, rel=1e-3)
+    assert dial.count_loss(0.5, torch.tensor(0.3)) == 0 and dial.target_share(0.5) == 1
+
+
+@pytest.mark.parametrize("part", [{}, {"full_context": True}, {"total": 900}], ids=str)
+@pytest.mark.parametrize("form", [AdaptConfig, AdaptConfig.paper], ids=["ours", "paper"])
+def test_gradients_are_slopes_of_the_loss(captured: Pair, part: dict[str, Any], form: Any) -> None:
+    """Of what is trained, in a step of its own along the gradient; and the context is drawn."""
+    base, scene = captured
+    config = form(max_sv=4.0, reg_weight=0.0)
+    begun = clod.with_dial(base, torch.linspace(0.3, 3, len(base)), AdaptConfig().attenuation(4.0))
+    begun = begun.replace(growth_d=torch.linspace(-0.5, 1, len(base)))
+    run = Trainer(begun, scene.train, config, TrainableSubset(len(base) - 20, **part))
+    sample = Sample(scene.train[0], 2.0)
+    found = run.gradient_sum([sample])
+    for name, gradient in found.gradients.items():
+        own = run.trained()[name]
+        assert len(gradient) == len(base) - 20 and gradient.abs().max() > 0, name
+        step = 1e-3 * gradient / gradient.norm() * own.norm().clamp(max=10)
+        losses = []
+        for sign in (1, -1):
+            own += sign * step
+            losses.append(run.gradient_sum([sample]).loss)
+            own -= sign * step
+        slope = run.dial.weight(2.0) * float(losses[0] - losses[1]) / 2
+        assert slope == pytest.approx(float((gradient * step).sum()), rel=0.1, abs=1e-7), name
 
 
 @pytest.mark.filterwarnings("error")  # of numbers read from tensors in a graph: the initialization needs none
@@ -133,18 +138,6 @@ def test_learning_rates_are_those_of_the_settings(captured: Pair) -> None:
     assert rates["sh0"] == 2 and rates["shN"] == 0 and rates["opacities"] == 2 * config.lr_opacities
     assert rates["log_sigma"] == 2 * config.lr_sigma and rates["growth_d"] == 2 * config.lr_growth
     assert len(attach(base, scene).param_groups(splats=True)) == 2  # none of the Gaussians' tensors has a gradient
-
-
-@pytest.mark.parametrize("sampling", ["log", "uniform"])
-def test_dial_values_follow_the_settings(captured: Pair, sampling: str) -> None:
-    dial = attach(*captured, max_sv=4, full_share=0.3, full_final=1.0, sampling=sampling)
-    drawn = np.array([dial.sample() for _ in range(1000)])
-    others = np.sort(drawn[drawn > 1])
-    end = RENDERED * 4
-    assert (drawn == 1).sum() == pytest.approx(225, abs=5) and (drawn == 0).sum() == pytest.approx(75, abs=5)
-    assert others[-1] <= end
-    share = np.log(others) / math.log(end) if sampling == "log" else (others - 1) / (end - 1)
-    assert np.abs(share - np.linspace(0, 1, len(share))).max() < 0.02
 
 
 def test_parameters_stay_in_range(captured: Pair) -> None:

@@ -19,7 +19,7 @@ from clod_adapter.progress import Listener, Phase, Progress, Stopped, tell
 from clod_adapter.training import distributed
 from clod_adapter.training.distributed import ProcessGroup, ProcessLost, joined
 from clod_adapter.training.loop import adapt
-from clod_adapter.training.objective import GradientSum
+from clod_adapter.training.optimizer import GradientSum
 from scenes import assert_equal, capture
 
 

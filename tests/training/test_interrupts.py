@@ -22,8 +22,8 @@ from runs import pressing
 from scenes import assert_equal, capture
 
 Undisturbed = tuple[dict[int, Gaussians], float]
-ITERS, ROUNDS = 60, 8
-CONFIG = AdaptConfig(iters=ITERS, max_sv=3.0, average=0.5)
+ITERS, ROUNDS = 40, 4
+CONFIG = AdaptConfig(iters=ITERS, max_sv=3.0)
 SCENE = capture(60, views=4, width=16, height=12)
 
 
@@ -75,13 +75,12 @@ def test_interrupted_results_are_of_a_whole_step(undisturbed: Undisturbed) -> No
     assert early > ROUNDS / 2
 
 
-@pytest.mark.parametrize("where", ["spoilt_rows", "add_to_mean"])
 def test_an_interrupt_within_the_update_completes_the_step(
-    undisturbed: Undisturbed, monkeypatch: pytest.MonkeyPatch, where: str
+    undisturbed: Undisturbed, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Before and after the parameters change; the step is completed, and its state resumes to the same bits."""
+    """The step is completed, and its state resumes to the same bits."""
     states: list[Any] = []
-    monkeypatch.setattr(trainer, where, pressing(getattr(trainer, where), signal.SIGINT, at=5))
+    monkeypatch.setattr(trainer, "spoilt_rows", pressing(trainer.spoilt_rows, signal.SIGINT, at=5))
     found = adapt(*SCENE, CONFIG, lambda now: states.append(now.state) if now.state else None)
     assert found.interrupted and found.signalled
     assert_equal(found.gaussians, undisturbed[0][found.steps])

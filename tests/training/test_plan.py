@@ -1,92 +1,223 @@
-"""Training with a plan equals training without one, except for the parts left out."""
+"""The plan: its measurements on scenes with known results, its decisions, and training with it."""
 
 from __future__ import annotations
 
+import json
+import math
 from dataclasses import replace
 from typing import Any
 
 import pytest
 import torch
 
-from clod_adapter.adapter import ATTRIBUTES, DIAL
+from clod_adapter.adapter import ATTRIBUTES, DIAL, with_dial
 from clod_adapter.cameras import Scene
 from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.initialization.importance import initialize
-from clod_adapter.progress import Progress
+from clod_adapter.initialization.importance import initialize, removal_error
+from clod_adapter.progress import Phase, Progress, Stopped
 from clod_adapter.render import render
+from clod_adapter.training.ablation import largest_change, needed_share, seen, sh_degree_losses
 from clod_adapter.training.loop import adapt
-from clod_adapter.training.plan import NAMES, Override
+from clod_adapter.training.plan import NAMES, NOT_NEEDED, RATES, Decision, Override, Plan
 from clod_adapter.training.planner import make_plan
-from scenes import assert_equal, with_unseen
+from scenes import assert_equal, gaussians, photograph, ring, with_unseen
 
-CONFIG = AdaptConfig(iters=40, max_sv=4.0, start_share=0.62)
-ALL = frozenset(NAMES)
+Pair = tuple[Gaussians, Scene]
+CONFIG = AdaptConfig(iters=20, max_sv=4.0, start_share=0.62)
+ALL, LIMIT = frozenset(NAMES), 0.02
 
 
-def test_training_is_the_same_if_nothing_is_left_out(visible: tuple[Gaussians, Scene]) -> None:
+def verdicts(plan: Plan) -> dict[str, str]:
+    return {decision.what: decision.verdict for decision in plan.decisions}
+
+
+def with_bands(base: Gaussians, *sizes: float) -> Gaussians:
+    """``base`` with harmonics of degree 3, each degree of the given size."""
+    random = torch.Generator().manual_seed(5)
+    bands = [size * torch.randn(len(base), 2 * d + 1, 3, generator=random) for d, size in enumerate(sizes, 1)]
+    return base.replace(shN=torch.cat(bands, 1))
+
+
+def test_sh_degree_losses_separate_used_from_unused_degrees() -> None:
+    truth, cameras = with_bands(gaussians(200, 0, 3), 0.3, 1e-4, 1e-5), ring(4, 48, 36)
+    views = photograph(truth, cameras)
+    found = list(sh_degree_losses(truth, views, LIMIT))
+    assert [degree for degree, _ in found] == [3, 2, 1]
+    assert found[0][1] < LIMIT and found[1][1] < LIMIT and found[2][1] > 1
+    # From where one matters on, nothing below it is looked at; a view that gains makes up for none that loses.
+    strong = with_bands(truth, 0.3, 1e-4, 0.3)
+    mixed = (*photograph(strong, cameras[:2]), *photograph(strong.without_bands(2), cameras[2:]))
+    for photographs in (photograph(strong, cameras), views, mixed):
+        ((degree, loss),) = sh_degree_losses(strong, photographs, LIMIT)
+        assert degree == 3 and loss > 1
+    assert list(sh_degree_losses(with_bands(truth, 0, 0, 0), views, LIMIT)) == [(3, 0.0), (2, 0.0), (1, 0.0)]
+
+
+def hidden() -> tuple[Gaussians, Scene, torch.Tensor]:
+    """An opaque shell with Gaussians inside, some outside every image, some too faint, and others around it.
+
+    Also ``[N]`` bool: the Gaussians whose removal alone changes an image.
+    """
+    base = gaussians(70, 1, 2, size=0.1)
+    means, logs, logits = base.means, base.log_scales, base.opacity_logits
+    around = 2 * math.pi * torch.arange(24) / 24
+    means[:24] = torch.stack([around.sin(), torch.zeros(24), around.cos()], 1)
+    logs[:24], logits[:24] = math.log(0.8), 9.0
+    means[24:32], logs[24:32] = 0.05 * means[24:32], math.log(0.02)
+    means[32:40] += torch.tensor([0.0, 80.0, 0.0])
+    logits[40:46] = -8.0
+    views, matters = photograph(base, ring(6, 40, 30)), torch.zeros(70, dtype=torch.bool)
+    for camera in (view.camera for view in views):
+        image = render(base, camera).image
+        for row in range(70):
+            matters[row] |= not torch.equal(image, render(base.select(torch.arange(70) != row), camera).image)
+    return base, Scene(views, ()), matters
+
+
+def test_seen_gaussians_change_a_pixel_when_removed() -> None:
+    """Whichever views the error is from."""
+    base, scene, matters = hidden()
+    for first in (6, 2):
+        error = removal_error(base, scene.train[:first])
+        found = seen(base, scene.train[first:], error, 0)
+        assert found.tolist() == matters.tolist() and not found[24:46].any() and found[:24].all()
+    change, lost = largest_change(base, base.select(found), scene.train)
+    assert change < 1e-6 and abs(lost) < 1e-6  # all of them at once, too
+    less = base.select(torch.arange(70) % 2 == 0)
+    change, lost = largest_change(base, less, scene.train[:1])
+    images = [render(g, scene.train[0].camera).image.clamp(0, 1) for g in (base, less)]
+    assert change == float((images[0] - images[1]).abs().max()) > 0.1 and lost > 1
+    # One opaque all over: its alpha is clamped in every pixel and has no derivative, and the image is all its own.
+    base.means[0], base.log_scales[0], base.opacity_logits[0] = 0.0, math.log(100.0), math.inf
+    views = photograph(base, ring(3, 40, 30))
+    error = removal_error(base, views)
+    assert error[0] == 0 and seen(base, views, error, seed=0)[0]
+
+
+def test_needed_share_is_that_of_the_visible_gaussians() -> None:
+    """A quarter is too faint to matter; the others are all needed, also against the base's own renderings."""
+    truth = gaussians(200, 2, 0)
+    base = truth.replace(opacity_logits=torch.where(torch.arange(200) < 50, -9.0, 2.0))
+    views = photograph(base, ring(4, 48, 36))
+    error = removal_error(base, views)
+    share, loss = needed_share(base, views, error, LIMIT)
+    assert 0.6 < share <= 0.76 and 0 <= loss < LIMIT and needed_share(base, views, error, 3.0)[0] < share
+    invisible = base.replace(opacity_logits=torch.full((200,), -9.0))
+    assert needed_share(invisible, views, error, LIMIT)[0] == 0.51
+
+
+def test_sh_degrees_are_kept_or_left_out(visible: Pair) -> None:
     base, scene = visible
     plan = make_plan(base, scene, CONFIG)
+    assert verdicts(plan) == {"SH degree 1": "kept", "unseen Gaussians": "kept"} and plan.sh_degree == 1
+    faint = base.replace(shN=1e-5 * base.shN)
+    plan = make_plan(faint, scene, CONFIG)
+    assert verdicts(plan)["SH degree 1"] == "left out" and plan.sh_degree == 0
+    lean = plan.adapt(scene).gaussians
+    assert lean.sh_degree == 0 and torch.equal(plan.whole(faint, lean).shN, faint.shN)
+    assert plan.trims(faint) and plan.trimming_effect(faint, scene).number == pytest.approx(0, abs=0.02)
+    empty = make_plan(base.replace(shN=torch.zeros(len(base), 15, 3)), scene, CONFIG, Override(keep=ALL - {"bands"}))
+    assert empty.decisions[0].what == "SH degree 1 to 3" and empty.decisions[0].number == 0 and empty.sh_degree == 0
+    for override in (Override(keep=ALL), Override(leave_out=frozenset({"bands"}))):
+        plan = make_plan(base.without_bands(0), scene, CONFIG, override)
+        assert plan.decisions[0] == Decision("SH degrees", NOT_NEEDED, None, "", "there are none")
+
+
+def test_share_at_full_quality_is_measured(visible: Pair) -> None:
+    base, scene = visible
+    plan = make_plan(base, scene, replace(CONFIG, start_share=None))
+    (decision,) = (one for one in plan.decisions if "at s = 1" in one.what)
+    share = plan.config.start_share
+    assert share is not None and decision.what == f"{share:.0%} of the Gaussians at s = 1" and decision.number < 0.03
+    first = render(plan.start, scene.train[0].camera, 1.0).kept.float().mean()
+    assert abs(float(first) - share) < 0.15
+    for fixed in (CONFIG, replace(CONFIG, start_share=None, max_sv=1.0)):
+        assert make_plan(base, scene, fixed).config.start_share == fixed.start_share
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_each_decision_can_be_overridden(visible: Pair, name: str) -> None:
+    """The plan lists an attribute only if it is frozen."""
+    base, scene = with_unseen(visible[0])[0], visible[1]
+    gone = make_plan(base, scene, CONFIG, Override(ALL - {name}, frozenset({name})))
+    expected = {"bands": (0, False), "unseen": (1, True)}.get(name, (1, False))
+    assert (gone.sh_degree, gone.kept is not None) == expected
+    assert gone.config == (replace(CONFIG, **{RATES[name]: 0.0}) if name in RATES else CONFIG)
+    (verdict,) = {decision.verdict for decision in gone.decisions if decision.name == name}
+    assert verdict == ("frozen" if name in RATES else "left out")
+    assert {d.name for d in gone.decisions} == {"bands", "unseen", name}
+    assert all(decision.why.startswith("as requested") for decision in gone.decisions if decision.name != "unseen")
+
+
+def test_impossible_overrides_are_refused() -> None:
+    with pytest.raises(ClodError, match=r"'colour' is not part of a plan; the names are bands, unseen, means"):
+        Override(keep=frozenset({"colour"}))
+    with pytest.raises(ClodError, match="'quats' is both kept and left out"):
+        Override(frozenset({"quats", "bands"}), frozenset({"quats"}))
+
+
+def test_unseen_gaussians_are_kept_where_another_dial_value_may_show_them(visible: Pair) -> None:
+    """Of a base with a dial, in the paper's form, and of a checkpoint that is invisible altogether."""
+    base, scene = with_unseen(visible[0])[0], visible[1]
+    asked, forced = Override(keep=ALL - {"unseen"}), Override(ALL - {"unseen"}, frozenset({"unseen"}))
+    paper, adapted = AdaptConfig.paper(iters=40, max_sv=4.0), initialize(base, scene.train, CONFIG)
+    for some, config in ((adapted, CONFIG), (base, paper)):
+        plan = make_plan(some, scene, config, asked)
+        assert plan.kept is None and plan.decisions[1].name == "unseen" and "not measured" in plan.decisions[1].why
+        assert make_plan(some, scene, config, forced).kept is not None
+    assert make_plan(with_dial(base), scene, CONFIG, asked).kept is not None
+    faint = base.replace(opacity_logits=torch.full_like(base.opacity_logits, -9.0))
+    assert make_plan(faint, scene, CONFIG).kept is None
+
+
+@pytest.mark.parametrize("phase", [Phase.SH_DEGREES, Phase.IMPORTANCE, Phase.PRUNING_ORDER])
+def test_a_listener_stops_the_plan(visible: Pair, phase: Phase) -> None:
+    with pytest.raises(Stopped):
+        make_plan(*visible, CONFIG, progress=lambda now: now.phase != phase)
+
+
+def test_training_is_the_same_if_nothing_is_left_out(visible: Pair) -> None:
+    base, scene = visible
+    read = replace(scene, left_out=(("undistortion", "the cameras are pinholes"),))
+    plan = make_plan(base, read, CONFIG)
+    assert plan.decisions[-1] == Decision("undistortion", NOT_NEEDED, None, "", "the cameras are pinholes")
     assert plan.kept is None and plan.config == CONFIG and not plan.trims(base)
     planned = plan.adapt(scene).gaussians
     assert_equal(plan.whole(base, planned), adapt(plan.start, scene, CONFIG).gaussians)
-    assert_equal(plan.adapt(scene).gaussians, planned)  # a plan can be used again
 
 
-def test_a_resumed_plan_gives_the_same_bits(visible: tuple[Gaussians, Scene]) -> None:
-    """A plan that is made again resumes to the same bits, with unseen Gaussians and frozen attributes."""
-    base, scene = with_unseen(visible[0])[0], visible[1]
+def test_a_resumed_plan_gives_the_same_bits(visible: Pair) -> None:
+    """A plan that is made again is the same, and resumes to the same bits: what is left out or frozen is unchanged."""
+    (base, before), scene = with_unseen(visible[0]), visible[1]
     states: list[Any] = []
 
     def stop(now: Progress) -> bool:
-        if now.done == 25 and now.state is not None:
+        if now.done == 12 and now.state is not None:
             states.append(now.state())
-        return now.done < 25
+        return now.done < 12
 
     plans = [make_plan(base, scene, CONFIG, Override(leave_out=frozenset({"means", "scales"}))) for _ in range(2)]
+    assert plans[0].decisions == plans[1].decisions and plans[0].kept is not None
+    assert json.loads(json.dumps(plans[0].as_dict()))["decisions"][1]["number"] >= 40
     plans[0].adapt(scene, stop)
-    assert "parameter.quats" in states[0].tensors and "parameter.means" not in states[0].tensors
     steps: list[int] = []
-    found = plans[1].whole(base, plans[1].adapt(scene, lambda now: steps.append(now.done), states[0]).gaussians)
-    assert steps == list(range(26, 41))
+    lean = plans[1].adapt(scene, lambda now: steps.append(now.done), states[0]).gaussians
+    found, kept = plans[1].whole(base, lean), plans[0].kept
+    assert steps == list(range(13, 21)) and not kept[~before].any()
     assert_equal(found, plans[0].whole(base, plans[0].adapt(scene).gaussians))
-    assert torch.equal(found.means, base.means) and torch.equal(found.log_scales, base.log_scales)
-    assert not torch.equal(found.quats, base.quats)
+    for name in (*ATTRIBUTES, *DIAL):
+        others = plans[0].start if name in DIAL else base
+        assert torch.equal(getattr(found, name)[~kept], getattr(others, name)[~kept]), name
+        assert torch.equal(getattr(found, name)[kept], getattr(lean, name)), name
+    assert torch.equal(found.means, base.means) and not torch.equal(found.quats, base.quats)
 
 
-def test_unseen_gaussians_are_unchanged(visible: tuple[Gaussians, Scene]) -> None:
-    base, before = with_unseen(visible[0])
-    scene = visible[1]
-    plan = make_plan(base, scene, CONFIG)
-    assert plan.kept is not None and not plan.kept[~before].any()
-    lean = plan.adapt(scene).gaussians
-    assert len(lean) == int(plan.kept.sum())
-    whole, initial = plan.whole(base, lean), plan.start
-    for name in ATTRIBUTES:
-        assert torch.equal(getattr(whole, name)[~plan.kept], getattr(base, name)[~plan.kept]), name
-        assert torch.equal(getattr(whole, name)[plan.kept], getattr(lean, name)), name
-    for name in DIAL:
-        assert torch.equal(getattr(whole, name)[~plan.kept], getattr(initial, name)[~plan.kept]), name
-        assert torch.equal(getattr(whole, name)[plan.kept], getattr(lean, name)), name
-    assert not torch.equal(lean.means, base.means[plan.kept])  # seen ones are trained
-
-
-def test_growth_of_the_base_is_dropped_without_growth(visible: tuple[Gaussians, Scene]) -> None:
-    """Also of Gaussians that are left out, and if it is trained from an earlier result."""
-    base, scene = with_unseen(visible[0])[0], visible[1]
-    plan = make_plan(base.replace(shN=0 * base.shN), scene, replace(CONFIG, iters=2, growth="off"))
-    assert plan.kept is not None and plan.sh_degree == 0
-    assert plan.whole(base, plan.adapt(scene).gaussians).growth_d is None
-    grown = initialize(base, scene.train, CONFIG)
-    plan = make_plan(grown, scene, replace(CONFIG, iters=2, growth="off"), Override(leave_out=frozenset({"bands"})))
-    assert plan.trims(grown) and plan.whole(grown, plan.adapt(scene).gaussians).growth_d is None
-
-
-def test_target_counts_are_shares_of_all_gaussians(visible: tuple[Gaussians, Scene]) -> None:
+def test_target_counts_are_shares_of_all_gaussians(visible: Pair) -> None:
     """With a third of the file unseen, a dial value keeps as many Gaussians as if all were trained."""
     base, scene = with_unseen(visible[0], 150)[0], visible[1]
-    config = replace(CONFIG, iters=80)
+    config = replace(CONFIG, iters=60)
     plan = make_plan(base, scene, config, Override(keep=ALL - {"unseen"}))
     left_out = plan.whole(base, plan.adapt(scene).gaussians)
     trained = adapt(base, scene, config).gaussians
@@ -95,26 +226,14 @@ def test_target_counts_are_shares_of_all_gaussians(visible: tuple[Gaussians, Sce
         assert kept[0] == pytest.approx(kept[1], rel=0.15)
 
 
-def test_tuned_sh_degrees_return_to_their_place(visible: tuple[Gaussians, Scene]) -> None:
-    base, scene = visible
-    base = base.replace(shN=torch.cat([base.shN, 1e-6 * torch.ones(len(base), 5, 3)], 1))
-    plan = make_plan(base, scene, replace(CONFIG, lr_shN=1e-2))
-    assert plan.sh_degree == 1
-    whole = plan.whole(base, plan.adapt(scene).gaussians)
-    assert torch.equal(whole.shN[:, 3:], base.shN[:, 3:]) and not torch.equal(whole.shN[:, :3], base.shN[:, :3])
-
-
-def test_sh_degrees_that_are_left_out_are_unchanged(visible: tuple[Gaussians, Scene]) -> None:
-    base, scene = visible
-    faint = base.replace(shN=1e-5 * base.shN)
-    plan = make_plan(faint, scene, CONFIG)
-    lean = plan.adapt(scene).gaussians
-    assert lean.sh_degree == 0 and torch.equal(plan.whole(faint, lean).shN, faint.shN)
-    assert plan.trims(faint) and plan.trimming_effect(faint, scene).number == pytest.approx(0, abs=0.02)
-
-
-def test_bad_overrides() -> None:
-    with pytest.raises(ClodError, match=r"'colour' is not part of a plan; the names are bands, unseen, means"):
-        Override(keep=frozenset({"colour"}))
-    with pytest.raises(ClodError, match="'quats' is both kept and left out"):
-        Override(frozenset({"quats", "bands"}), frozenset({"quats"}))
+def test_what_is_left_out_returns_to_its_place(visible: Pair) -> None:
+    """Tuned SH degrees among those that are not; and no growth where there is to be none."""
+    (base, _), scene = with_unseen(visible[0]), visible[1]
+    more = base.replace(shN=torch.cat([base.shN, 1e-6 * torch.ones(len(base), 5, 3)], 1))
+    plan = make_plan(more, scene, replace(CONFIG, lr_shN=1e-2, iters=3))
+    whole = plan.whole(more, plan.adapt(scene).gaussians)
+    assert plan.sh_degree == 1 and torch.equal(whole.shN[:, 3:], more.shN[:, 3:])
+    assert not torch.equal(whole.shN[:, :3], more.shN[:, :3])
+    grown = initialize(base, scene.train, CONFIG)
+    plan = make_plan(grown, scene, replace(CONFIG, iters=2, growth="off"), Override(leave_out=frozenset({"bands"})))
+    assert plan.trims(grown) and plan.whole(grown, plan.adapt(scene).gaussians).growth_d is None

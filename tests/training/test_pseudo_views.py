@@ -28,7 +28,7 @@ from clod_adapter.training.pseudo_views import (
     shown,
     teachers_to,
 )
-from clod_adapter.training.view_sampler import ViewSampler
+from clod_adapter.training.schedule import ViewSampler
 
 
 @pytest.mark.parametrize("with_dial", [False, True])

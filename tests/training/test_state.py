@@ -16,8 +16,8 @@ from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.importance import initialize
 from clod_adapter.progress import Phase, Progress
+from clod_adapter.training.dial import TrainableSubset
 from clod_adapter.training.loop import TrainingState, adapt
-from clod_adapter.training.objective import TrainableSubset
 from runs import config_of, states_of
 from scenes import assert_equal
 
@@ -28,15 +28,15 @@ RATES = ("means", "quats", "scales", "opacities", "sh0", "shN")
 RESUMED = {
     "ours": {},
     "paper": vars(AdaptConfig.paper(iters=12, max_sv=4.0)),
-    "linear": {"parameter": "linear", "lr_shN": 0.0, "growth": "off"},
-    "mean of all": {"average": 1.0, "max_sv": 1.0},
-    "sigma_d alone": {f"lr_{name}": 0.0 for name in RATES} | {"average": 0.0},
+    "without growth": {"lr_shN": 0.0, "growth": "off"},
+    "one dial value": {"max_sv": 1.0},
+    "sigma_d alone": {f"lr_{name}": 0.0 for name in RATES},
 }
 
 
 @pytest.mark.parametrize(
     ("form", "kind"),
-    [("ours", "fresh"), ("paper", "with a dial"), ("linear", "empty"), ("mean of all", "with a dial"),
+    [("ours", "fresh"), ("paper", "with a dial"), ("without growth", "empty"), ("one dial value", "with a dial"),
      ("sigma_d alone", "fresh")],
 )  # fmt: skip
 def test_a_resumed_run_ends_with_the_same_bits(captured: Pair, form: str, kind: str) -> None:
@@ -82,10 +82,10 @@ def test_untrained_rows_keep_their_units_when_resumed(captured: Pair, distance: 
 
 def test_a_state_holds_trained_parameters_only(captured: Pair) -> None:
     base, states = captured[0], dict[int, TrainingState]()
-    still = {"lr_shN": 0.0, "lr_means": 0.0, "average": 0.5}
-    adapt(*captured, config_of(iters=4, **still), states_of({1, 3}, states))
+    still = {"lr_shN": 0.0, "lr_means": 0.0}
+    adapt(*captured, config_of(iters=10, **still), states_of({1, 10}, states))
     changing = {"quats", "log_scales", "opacity_logits", "sh0", "log_sigma", "growth_d"}
-    for step, kinds in ((1, {"parameter", "first", "second", "steps"}), (3, {"mean"})):
+    for step, kinds in ((1, {"parameter", "first", "second", "steps"}), (10, {"mean"})):
         assert {name.split(".")[1] for name in states[step].tensors} == changing | {"kept", "all", "checks"}
         assert kinds <= {name.split(".")[0] for name in states[step].tensors}
     assert "mean.quats" not in states[1].tensors and len(states[1].tensors["first.sh0"]) == len(base)
@@ -100,7 +100,7 @@ def test_a_state_of_another_run_is_refused(captured: Pair) -> None:
     for other in (
         (few, scene, config),
         (base, fewer, config),
-        (base, scene, config_of(iters=2, parameter="linear")),
+        (base, scene, replace(config, form="paper")),
         (base, scene, config_of(iters=2, growth="off")),
     ):
         with pytest.raises(ClodError, match="of other Gaussians, views or settings"):

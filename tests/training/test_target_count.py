@@ -14,11 +14,11 @@ from torch import Tensor
 from clod_adapter.config import AdaptConfig, AttenuationConfig
 from clod_adapter.equation.attenuation import attenuate
 from clod_adapter.training.optimizer import RowAdam
+from clod_adapter.training.paper import paper_count, soft_count
 from clod_adapter.training.target_count import (
+    TEMPERATURE,
     count_gradient,
     count_slope,
-    paper_count,
-    soft_count,
     target_curve,
     target_share,
 )
@@ -56,7 +56,7 @@ def test_count_gradient_penalises_excess_and_deficit() -> None:
     many, few = log_sigma + 3, log_sigma - 2
     for s in (1.5, 6.0):
         dialled = attenuate(logits, log_sigma.exp(), d, s, ATTENUATION)
-        slope = count_slope(logits, dialled.log_opacities, s, ATTENUATION.tau, CONFIG.temperature)
+        slope = count_slope(logits, dialled.log_opacities, s, ATTENUATION.tau, TEMPERATURE)
         share = target_curve(s, CONFIG.share, CONFIG.exponent)
         excess = float(dialled.keep.float().mean()) / share - 1
         want = 0.1 * 2 * CONFIG.reg_weight * excess / share * slope
@@ -160,10 +160,10 @@ def test_count_gradients_of_extreme_opacities_are_finite(dtype: torch.dtype) -> 
     assert torch.equal(count_slope(logits, logs.detach(), s, tau, 0.15), wide)
 
 
-@pytest.mark.parametrize(("form", "s"), [("law", 1.0), ("law", 3.0), ("paper", 3.0)])
+@pytest.mark.parametrize(("form", "s"), [("ours", 1.0), ("ours", 3.0), ("paper", 3.0)])
 def test_shares_count_gaussians_that_are_left_out(form: str, s: float) -> None:
     """Gaussians left out because they are never drawn count as culled."""
-    config = AdaptConfig(count_term=form)
+    config = AdaptConfig(form=form)
     random = torch.Generator().manual_seed(1)
     logits = torch.cat([torch.randn(40, generator=random), torch.full((25,), -40.0)])
     found = []

@@ -66,17 +66,19 @@ def test_two_give_the_result_of_one(server: Server, words: list[Any], alone: Pat
 def test_the_first_process_initializes(server: Server, words: list[Any], tmp_path: Path) -> None:
     """The second one computes nothing, and is told the progress of the first; so is it told an error."""
     start = "import clod_adapter.training.loop as t; from clod_adapter.progress import Phase, Progress\n"
+    start += "ours = t.form_of(t.AdaptConfig())\n"
     steps = start + (
-        "real = t.initialize\n"
-        "def initialize(base, views, config, progress):\n"
-        "    if progress is None: return real(base, views, config)  # to compile the kernels\n"
-        "    for done in (1, 2): assert progress(Progress(Phase.IMPORTANCE, done, 2))\n"
-        "    return real(base, views, config)\n"
-        "t.initialize = initialize"
+        "class Form(ours):\n"
+        "    @classmethod\n"
+        "    def initial(cls, base, views, config, progress):\n"
+        "        for done in (1, 2) if progress else (): assert progress(Progress(Phase.IMPORTANCE, done, 2))\n"
+        "        return ours.initial(base, views, config)\n"
+        "t.form_of = lambda config: Form"
     )
     heard = start + (
         "def nothing(*_): raise ZeroDivisionError('computed')\n"
-        "t.initialize, real, told = nothing, processes.adapt, open('../told', 'w')\n"
+        "t.form_of = lambda config: type('Form', (ours,), {'initial': nothing})\n"
+        "real, told = processes.adapt, open('../told', 'w')\n"
         "def adapt(base, scene, config, progress, *rest, **more):\n"
         "    def listen(now):\n"
         "        if now.phase != Phase.TRAINING: print(now.phase, now.done, now.total, file=told, flush=True)\n"
@@ -87,7 +89,7 @@ def test_the_first_process_initializes(server: Server, words: list[Any], tmp_pat
     run = launch(server, tmp_path / "run", *words, *TINY, before={0: steps, 1: heard})
     assert run.wait() == [0, 0] and run.report()["steps"] == 12, run.log(0) + run.log(1)
     assert (tmp_path / "told").read_text() == "importance 1 2\nimportance 2 2\n"
-    failing = steps.replace("    return real(base, views, config)\nt.", "    raise t.ClodError('no start here')\nt.")
+    failing = steps.replace("return ours", "if progress: raise t.ClodError('no start here')\n        return ours")
     run = launch(server, tmp_path / "failing", *words, *TINY, before={0: failing, 1: heard})
     assert run.wait() == [2, 2] and run.log(1) == "" and run.log(0).count("error: no start here\n") == 1, run.log(0)
 
@@ -103,12 +105,12 @@ def test_three_with_uneven_shares(server: Server, words: list[Any], tmp_path: Pa
 def test_non_finite_loss_ends_both(server: Server, words: list[Any], tmp_path: Path) -> None:
     """After the same step; the result so far is written and measured."""
     spoil = (
-        "from dataclasses import replace; from clod_adapter.training.objective import Objective\n"
-        "pull, steps = Objective.gradient_sum, []\n"
+        "from dataclasses import replace; from clod_adapter.training.trainer import Trainer\n"
+        "pull, steps = Trainer.gradient_sum, []\n"
         "def spoilt(self, *given):\n"
         "    steps.append(1)\n"
         "    return replace(pull(self, *given), loss=float('nan') if len(steps) == 4 else 0.1)\n"
-        "Objective.gradient_sum = spoilt"
+        "Trainer.gradient_sum = spoilt"
     )
     run = launch(server, tmp_path / "run", *words, *TINY, before={1: spoil})
     assert run.wait() == [1, 0], run.log(0) + run.log(1)
@@ -166,12 +168,12 @@ def test_process_lost_within_a_step_loses_no_step(
 ) -> None:
     """The first one prints the error of the second; a resumed run gives the result of an uninterrupted one."""
     fail = (
-        "from clod_adapter.training.objective import Objective; real, calls = Objective.gradient_sum, []\n"
+        "from clod_adapter.training.trainer import Trainer; real, calls = Trainer.gradient_sum, []\n"
         "def pull(*arguments):\n"
         "    calls.append(1)\n"
         "    if len(calls) == 5: raise MemoryError('no room for this view')\n"
         "    return real(*arguments)\n"
-        "Objective.gradient_sum = pull"
+        "Trainer.gradient_sum = pull"
     )
     run = launch(server, tmp_path / "run", *words, *TINY, before={1: fail})
     assert run.wait() == [0, 2], run.log(0)

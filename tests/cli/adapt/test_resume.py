@@ -40,7 +40,7 @@ from runs import OUTPUTS, STATE, names
 from scenes import capture as small_capture
 from scenes import stripped
 
-CONFIG = AdaptConfig(iters=3, max_sv=3.0, average=0.7)
+CONFIG = AdaptConfig(iters=3, max_sv=3.0)
 QUIET = Console(quiet=True)
 REQUESTED = {"keep_in": ["means"], "leave_out": []}
 

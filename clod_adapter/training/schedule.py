@@ -1,7 +1,8 @@
-"""Sampling of the training views and of the dial values that they are rendered at."""
+"""The schedule of a training: which view a step renders, at which dial value and size, and how far it moves."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,9 +13,44 @@ from clod_adapter.errors import ClodError
 from clod_adapter.training.pseudo_views import PseudoView
 from clod_adapter.training.state import OTHER_RUN
 
-RENDERED, COUNTED = 1.25, 1.5  # times max_sv: the largest dial values of steps, and of counts
 UNATTENUATED = 0.25  # of the steps at s = 1: at s = 0 instead, where every Gaussian is as it is stored
 GOLDEN = (5**0.5 - 1) / 2
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """What changes over a training; docs/method.md has the measurements. Shares of a training are in [0, 1].
+
+    Attributes:
+        full: share of the steps at s = 1 at first, a quarter of these at s = 0; it falls linearly to ``full_final`` of
+            itself: s = 1 is learned before the far end of the dial.
+        coarse: share of the training, at first, in which steps beyond s = 1 have photographs of half the size (not
+            small ones).
+        lr_final: final learning rates as a share of the first ones, between which they decay exponentially.
+        average: share of the steps, at the end, whose parameters are averaged for the result.
+        rendered, counted: times max_sv, the largest dial values of steps, and of counts.
+    """
+
+    full: float = 0.5
+    full_final: float = 0.4
+    coarse: float = 0.9
+    lr_final: float = 0.1
+    average: float = 0.2
+    rendered: float = 1.25
+    counted: float = 1.5
+
+    def dial(self, place: float, share_done: float, end: float) -> float:
+        """The dial value at ``place`` in [0, 1): 0, 1, or log-uniform from 1 to ``end``.
+
+        Steps at s = 0 train what cameras nearer than the photographs see, and viewers that do not know the dial.
+        """
+        full = self.full * (1 - (1 - self.full_final) * share_done)
+        if place < full:
+            return 0.0 if place < UNATTENUATED * full else 1.0
+        return end ** ((place - full) / (1 - full))
+
+
+OURS = Schedule()
 
 
 class Sample(NamedTuple):
@@ -23,7 +59,7 @@ class Sample(NamedTuple):
     Attributes:
         view: camera and photograph.
         dial: the dial value that it is rendered at.
-        counted: a dial value that Gaussians are only counted at; None if there is no target-count curve.
+        counted: a dial value that Gaussians are only counted at; None with a single dial value.
         halved: whether the view has half its size.
     """
 
@@ -44,8 +80,10 @@ class ViewSampler:
         offset: of the sequence of dial values.
     """
 
-    def __init__(self, views: tuple[View, ...], config: AdaptConfig, tau: float | None = None) -> None:
-        self.views, self.config, self.tau = views, config, tau
+    def __init__(
+        self, views: tuple[View, ...], config: AdaptConfig, tau: float | None = None, schedule: Schedule = OURS
+    ) -> None:
+        self.views, self.max_sv, self.tau, self.schedule = views, config.max_sv, tau or config.tau, schedule
         self.random = np.random.default_rng(config.seed)
         self.order: list[int] = []
         self.offset = self.random.random()
@@ -59,38 +97,37 @@ class ViewSampler:
         """
         if not self.order:
             self.order = self.random.permutation(len(self.views)).tolist()
-        view, config = self.views[self.order.pop()], self.config
+        view = self.views[self.order.pop()]
         if isinstance(view, PseudoView):
             view = view.moved(self.random)
         dial = self.dial(number, share_done)
-        halved = dial > 1 and share_done < config.coarse and view.camera.halvable
+        halved = dial > 1 and share_done < self.schedule.coarse and view.camera.halvable
         view = view.halved() if halved else view
         return Sample(view, dial, self.counted(), halved)
 
     def counted(self) -> float | None:
-        """A log-uniform dial value that Gaussians are only counted at; None if there is no target-count curve."""
-        if not self.config.has_target_count:
+        """A log-uniform dial value that Gaussians are only counted at; None with a single dial value."""
+        if self.max_sv == 1 or self.schedule.counted == 0:
             return None
-        return self.config.beyond(COUNTED, self.tau) ** self.random.random()
+        return self.beyond(self.schedule.counted) ** self.random.random()
 
     def dial(self, number: int, share_done: float) -> float:
-        """The dial value of a step: with the probability ``full_share`` 1 or 0, else (log-)uniform from 1 on.
-
-        The probability falls linearly to ``full_final`` of itself: s = 1 is learned before the far end of the dial.
-        Steps at s = 0 train what cameras nearer than the photographs see, and viewers that do not know the dial. With
-        max_sv 1 there is one dial value.
+        """The dial value of a step, by ``Schedule.dial``; with max_sv 1 there is one.
 
         Multiples of the golden ratio modulo 1 are spread more evenly than random numbers, in every stretch of a run:
         0.05 dB at s = 5 on plush_half.
         """
-        place, config = (self.offset + number * GOLDEN) % 1, self.config
-        full = config.full_share * (1 - (1 - config.full_final) * share_done)
-        if config.max_sv == 1:
+        if self.max_sv == 1:
             return 1.0
-        if place < full:
-            return 0.0 if place < UNATTENUATED * full else 1.0
-        place, end = (place - full) / (1 - full), config.beyond(RENDERED, self.tau)
-        return 1 + (end - 1) * place if config.sampling == "uniform" else end**place
+        place = (self.offset + number * GOLDEN) % 1
+        return self.schedule.dial(place, share_done, self.beyond(self.schedule.rendered))
+
+    def beyond(self, factor: float) -> float:
+        """A dial value beyond max_sv: ``factor`` times as large, at most halfway to 1/tau, where all are culled.
+
+        Training goes on there, so that quality and counts do not break off at max_sv.
+        """
+        return max(min(factor * self.max_sv, (self.max_sv + 1 / self.tau) / 2), self.max_sv)
 
     def state(self) -> tuple[dict[str, Any], tuple[int, ...]]:
         """Everything that later samples depend on: the generator's state, and the order."""

@@ -1,0 +1,133 @@
+"""CLoD-GS's own training (section 3.3), behind the methods of this project's: initialization, dial values, objective.
+
+Those of its settings that are fields are in ``AdaptConfig.paper``. Not in the paper, chosen here: sigma_d initialized
+to 1, a straight-through count with a sigmoid SOFTNESS wide, learning rates that decay to a twentieth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd import Function
+from torch.autograd.function import once_differentiable
+
+from clod_adapter.cameras import Camera, View, spread
+from clod_adapter.config import AdaptConfig
+from clod_adapter.equation.attenuation import Attenuated, conform, dial, log_threshold
+from clod_adapter.equation.units import in_world_units
+from clod_adapter.gaussians import Gaussians
+from clod_adapter.initialization.importance import MOST_VIEWS, has_dial, scene_distance, with_growth
+from clod_adapter.progress import Listener
+from clod_adapter.training.dial import SIGMA_RANGE, Dial
+from clod_adapter.training.schedule import Schedule
+from clod_adapter.training.target_count import slope_of_sigmoid
+
+SOFTNESS = 0.5  # of the sigmoid of the straight-through count, in log opacity
+
+
+class PaperSchedule(Schedule):
+    """One s ~ U(1, max_sv) a step, of whole photographs; no average of parameters."""
+
+    def __init__(self) -> None:
+        super().__init__(full=0.0, coarse=0.0, lr_final=0.05, average=0.0, rendered=1.0, counted=0.0)
+
+    def dial(self, place: float, share_done: float, end: float) -> float:
+        """Uniform from 1 to ``end``."""
+        return 1 + (end - 1) * place
+
+
+class PaperDial(Dial):
+    """The paper's form: sigma_d itself is trained, and the count term reaches it and the opacities in each view.
+
+    The objective is ``w_s (L_render + lambda L_reg)`` with ``w_s = (1 - 0.5 s / max_sv)^2``, and
+    ``L_reg = (s - 1)^2 relu(eta - s^-p)^2``, eta the share kept.
+    """
+
+    decay = "sigma"
+    limits = SIGMA_RANGE
+    everywhere = frozenset({"opacity_logits"})
+    schedule = PaperSchedule()
+    weight_slope = 0.5
+    measured = False
+
+    @classmethod
+    def initial(
+        cls, base: Gaussians, views: Sequence[View], config: AdaptConfig, progress: Listener | None = None,
+        error: Tensor | None = None,
+    ) -> Gaussians:  # fmt: skip
+        """sigma_d = 1 in units of the largest distance in the frustum, a hard threshold; a dial it has is kept."""
+        if has_dial(base):
+            return super().initial(base, views, config)
+        distance = scene_distance(base, spread(views, MOST_VIEWS))
+        attenuation = replace(config.attenuation(distance), cut="hard", normalizer="max")
+        initial = base.replace(sigma_d=torch.ones_like(base.opacity_logits), attenuation=attenuation)
+        return in_world_units(with_growth(initial, config))
+
+    @staticmethod
+    def sigma_of(parameter: Tensor) -> Tensor:
+        return parameter
+
+    @staticmethod
+    def parameter_of(sigma_d: Tensor) -> Tensor:
+        return sigma_d.detach().float().clamp(*SIGMA_RANGE)
+
+    def counts(self, virtual_scale: float, counted: float | None, loss: Tensor) -> list[tuple[float, Tensor]]:
+        return []
+
+    def objective(self, loss: Tensor, shown: Gaussians, camera: Camera, virtual_scale: float) -> Tensor:
+        if self.config.reg_weight > 0 and virtual_scale >= 1:
+            dialled = dial(shown, camera, virtual_scale)
+            loss = loss + paper_count(dialled, virtual_scale, self.attenuation.tau, self.config, self.part.total)
+        return self.weight(virtual_scale) * loss
+
+
+def form_of(config: AdaptConfig) -> type[Dial]:
+    """The dial of a form of training."""
+    return PaperDial if config.form == "paper" else Dial
+
+
+def paper_count(
+    dialled: Attenuated, virtual_scale: float, tau: float, config: AdaptConfig, total: int | None = None
+) -> Tensor:
+    """0-d, the paper's ``lambda L_reg = lambda (s - 1)^2 relu(eta - s^-p)^2``; eta is ``soft_count``.
+
+    Args:
+        total: number of Gaussians that eta is a share of, as in ``target_count.target_share``.
+    """
+    count = soft_count(dialled.log_opacities, virtual_scale, tau, SOFTNESS)
+    count = count * (len(dialled.log_opacities) / (total or len(dialled.log_opacities)))
+    excess = (count - virtual_scale**-config.exponent).clamp(min=0)
+    return config.reg_weight * (virtual_scale - 1) ** 2 * excess**2
+
+
+def soft_count(log_opacities: Tensor, virtual_scale: float, tau: float, temperature: float) -> Tensor:
+    """0-d, the share of Gaussians kept, in [0, 1]: exact in the forward pass, soft in the backward pass.
+
+    Forward: mean of ``log a'' > log(tau s)``; 0 for no Gaussians. Backward, straight through: the gradient
+    of the mean of ``sigmoid((log a'' - log(tau s)) / temperature)``, which is 0 at log a'' = -inf.
+
+    Args:
+        log_opacities: ``[N]`` from ``attenuate``, in [-inf, 0].
+        temperature: > 0, in units of log opacity; the larger, the farther from the threshold it acts.
+    """
+    (log_opacities,) = conform(log_opacities=log_opacities)
+    return _SoftCount.apply(log_opacities, log_threshold(tau, virtual_scale), temperature)
+
+
+class _SoftCount(Function):
+    """``soft_count`` above a log threshold."""
+
+    @staticmethod
+    def forward(ctx: Any, log_opacities: Tensor, threshold: float, temperature: float) -> Tensor:
+        ctx.save_for_backward(log_opacities)
+        ctx.settings = threshold, temperature
+        return (log_opacities > threshold).sum() / log_opacities.new_full((), max(len(log_opacities), 1))
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
+        return slope_of_sigmoid(ctx.saved_tensors[0], *ctx.settings).mul_(grad), None, None
