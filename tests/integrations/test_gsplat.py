@@ -68,14 +68,14 @@ def names(function: Callable[..., Any]) -> list[str]:
     return found
 
 
-@pytest.mark.parametrize("name", gsplat_versions.FUNCTIONS)
-def test_stored_signature_is_the_installed_one(tools: Tools, name: str) -> None:
+def test_the_stored_signatures_are_the_installed_ones(tools: Tools) -> None:
     """What the stand-ins of the versions are made of."""
     import gsplat
 
-    version = {"1.5.1": "1.5.0"}.get(gsplat.__version__, gsplat.__version__)
-    stored = re.sub(r"=([A-Z]\w+)\.(\w+)", r"=<\1.\2:4>", gsplat_versions.signatures()[version][name])
-    assert ", ".join(names(getattr(gsplat, name))) == stored.replace("**kwargs", "kwargs")
+    stored = gsplat_versions.signatures()[{"1.5.1": "1.5.0"}.get(gsplat.__version__, gsplat.__version__)]
+    for name in gsplat_versions.FUNCTIONS:
+        written = re.sub(r"=([A-Z]\w+)\.(\w+)", r"=<\1.\2:4>", stored[name]).replace("**kwargs", "kwargs")
+        assert ", ".join(names(getattr(gsplat, name))) == written
 
 
 def arguments(n: int, cameras: int, batch: tuple[int, ...] = (), **dtype: Any) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -124,8 +124,7 @@ def same(ours: Any, theirs: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    ("cameras", "batch", "packed"),
-    [(1, (), False), (3, (), True), (3, (), False), (1, (2,), True), (3, (2,), True), (3, (2,), False)],
+    ("cameras", "batch", "packed"), [(1, (), False), (3, (), True), (3, (2,), True), (3, (2,), False)]
 )
 def test_without_attenuation_results_are_gsplats(
     tools: Tools, cameras: int, batch: tuple[int, ...], packed: bool
@@ -145,7 +144,7 @@ def test_without_attenuation_results_are_gsplats(
         same(mine, want)
 
 
-@pytest.mark.parametrize("name", FILTERS)
+@pytest.mark.parametrize("name", ["on", "mip"])
 def test_images_match_render_with_each_screen_filter(tools: Tools, name: str) -> None:
     """Image, alpha and the gradient of sigma_d; gsplat's own arguments choose the filter."""
     given, views = arguments(N, 1)
@@ -166,14 +165,13 @@ def test_images_match_render_with_each_screen_filter(tools: Tools, name: str) ->
     want, found = (torch.autograd.grad(picture.sum(), s, retain_graph=True)[0].cpu() for picture, s in pairs)
     assert float((found - want).norm()) < 0.01 * float(want.norm())
     usual = render(model.replace(screen_filter=FILTERS["off"]), camera(WIDTH, HEIGHT), 2.0).image
-    assert name == "off" or float((own.image - usual).detach().abs().max()) > 0.02
+    assert float((own.image - usual).detach().abs().max()) > 0.02
 
 
 @pytest.mark.parametrize(
     ("cameras", "packed", "cut", "growing"),
-    [(1, True, "hard", ""), (1, False, "soft", "scales"), (3, True, "soft", "scales"), (3, False, "hard", ""),
-     (3, False, "hard", "covars")],
-)  # fmt: skip
+    [(1, True, "hard", ""), (3, True, "soft", "scales"), (3, False, "hard", "covars")],
+)
 def test_attenuated_results_match_gsplat_per_camera(
     tools: Tools, cameras: int, packed: bool, cut: str, growing: str
 ) -> None:

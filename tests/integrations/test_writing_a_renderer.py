@@ -16,7 +16,6 @@ from PIL import Image
 
 import clod_adapter
 import gsplat_in_torch
-from clod_adapter import integrations
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.equation.attenuation import attenuate
 from clod_adapter.equation.growth import growth_factors
@@ -59,35 +58,26 @@ def block(word: str) -> str:
     return str(found)
 
 
-def test_golden_loop_of_the_page_runs() -> None:
+def test_the_code_of_the_page_runs(adapted: clod_adapter.Gaussians, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The golden loop, which refuses functions that are off; the hook; and a held frame time, with 20 ms a frame."""
     own = {"my_opacity": my_opacity, "my_scale": my_scale}
     exec(block("golden"), dict(own))
     for name, function in own.items():
         with pytest.raises(AssertionError):
             exec(block("golden"), own | {name: lambda *row, function=function: function(*row) * 1.001})
-
-
-def test_hook_code_of_the_page_runs(adapted: clod_adapter.Gaussians) -> None:
     names: dict[str, Any] = {"means": adapted.means, "opacities": adapted.opacities, "viewmat": torch.eye(4)}
-    names["scales"] = adapted.scales
+    names |= {"scales": adapted.scales, "K": torch.eye(3), "width": 2, "height": 2, "clod_adapter": clod_adapter}
     Path("adapted.ply").rename("model.ply")
-    exec(block(".hook("), names | {"clod_adapter": clod_adapter, "K": torch.eye(3), "width": 2, "height": 2}, names)
+    exec(block(".hook("), names, names)
     hook = Hook(adapted.sigma_d, adapted.attenuation, 3.0, adapted.growth_d)
     want = hook(adapted.means, adapted.opacities, torch.eye(4))
     assert torch.equal(names["opacities"], want[0]) and torch.equal(names["keep"], want[1])
     assert torch.equal(names["scales"], adapted.scales * want[2][:, None]) and want[2].max() > 1.1
-
-
-def test_hold_code_of_the_page_runs(adapted: clod_adapter.Gaussians, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With 20 ms a frame."""
     monkeypatch.setattr("clod_adapter.hook.time.perf_counter", iter(0.02 * k for k in range(99)).__next__)
-    names: dict[str, Any] = {"hook": Hook(adapted.sigma_d, adapted.attenuation, 3.0, adapted.growth_d)}
-    names |= {"means": adapted.means, "a": adapted.opacities, "path": [torch.eye(4)] * 4}
-    exec(block(".hold("), names | {"K": torch.eye(3), "width": 2, "height": 2}, names)
-    dial = names["hook"].virtual_scale
-    assert dial == pytest.approx(3.3) and names["hold"].hook.virtual_scale == pytest.approx(3.63)
-    want = Hook(adapted.sigma_d, adapted.attenuation, dial)(adapted.means, adapted.opacities, torch.eye(4))
-    assert torch.equal(names["opacities"], want[0]) and torch.equal(names["keep"], want[1])
+    names |= {"hook": hook, "a": adapted.opacities, "path": [torch.eye(4)] * 4}
+    exec(block(".hold("), names, names)
+    assert names["hook"].virtual_scale == pytest.approx(3.3)
+    assert names["hold"].hook.virtual_scale == pytest.approx(3.63)
 
 
 def test_defaults_of_the_page_match_the_reader() -> None:
@@ -98,15 +88,11 @@ def test_defaults_of_the_page_match_the_reader() -> None:
         assert value == default if isinstance(default, str) else eval(value) == pytest.approx(default)
 
 
-def example(name: str, *words: object, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "argv", [name, *map(str, words)])
-    runpy.run_path(str(ROOT / "examples" / name), run_name="__main__")
-
-
 def test_the_hook_example(
     adapted: clod_adapter.Gaussians, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    example("04_hook.py", "adapted.ply", monkeypatch=monkeypatch)
+    monkeypatch.setattr(sys, "argv", ["04_hook.py", "adapted.ply"])
+    runpy.run_path(str(ROOT / "examples" / "04_hook.py"), run_name="__main__")
     counts = [int(row.split(": ")[1].split()[0]) for row in capsys.readouterr().out.splitlines()]
     assert counts == sorted(counts, reverse=True) and counts[0] > counts[-1] > 0
     pictures = [np.asarray(Image.open(f"adapted_dots_sv{dial}.png")) for dial in DIALS]
@@ -129,23 +115,3 @@ def test_the_gsplat_example(
     for dial in DIALS:
         own = clod_adapter.render(adapted, camera, dial).pixels.numpy().astype(float)
         assert np.abs(np.asarray(Image.open(f"adapted_gsplat_sv{dial}.png")) - own).mean() < 0.1
-
-
-def test_misuse_of_the_examples_is_explained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capture: Any) -> None:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    for name, words, error in (
-        ("03_gsplat.py", [], "python examples/03_gsplat.py"),
-        ("03_gsplat.py", ["missing.ply", "scene"], "error: gsplat draws on CUDA devices only"),
-        ("04_hook.py", [], "python examples/04_hook.py"),
-        ("04_hook.py", ["missing.ply"], "error: missing.ply: .*check the path"),
-        ("04_hook.py", [capture.ply], "it has no sigma_d, so there is no dial"),
-    ):
-        with pytest.raises(SystemExit, match=error):
-            example(name, *words, monkeypatch=monkeypatch)
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    monkeypatch.setitem(sys.modules, "gsplat", None)
-    monkeypatch.delitem(sys.modules, "clod_adapter.integrations.gsplat", raising=False)
-    monkeypatch.delattr(integrations, "gsplat", raising=False)
-    with pytest.raises(SystemExit, match="error: gsplat cannot be imported; .*pip install gsplat==1.5.3"):
-        example("03_gsplat.py", "missing.ply", "scene", monkeypatch=monkeypatch)
