@@ -1,39 +1,13 @@
 // The dial of an adapted file, without a viewer: what the file says, and what turns it.
 import { countAt, dialForCount, extinctionScales, growthDistance, prepare } from "./equation.js";
 import { createHold } from "./frame_rate.js";
-import { binaryColumns, constantsOf, readHeader } from "./ply.js";
-import { readSettings } from "./settings.js";
-import { inflate, layoutOf, readPositions, readRecord } from "./spz.js";
+import { readGaussians } from "./read.js";
 
 /** Reads the dial of an adapted PLY or SPZ (bytes): {count, means, opacityLogits, sigma, growth, settings}. */
 export async function readDial(bytes) {
   const data = new Uint8Array(bytes.buffer ?? bytes, bytes.byteOffset ?? 0, bytes.byteLength);
-  return data[0] === 0x1f && data[1] === 0x8b ? ofSpz(await inflate(data)) : ofPly(data);
-}
-
-function ofPly(bytes) {
-  const header = bytes.length > 3 && String.fromCharCode(...bytes.subarray(0, 3)) === "ply" ? readHeader(bytes) : null;
-  if (header?.format !== "binary_little_endian") throw new Error("no binary PLY or SPZ; open what clod-adapt wrote");
-  const vertex = header.elements.find(({ name }) => name === "vertex"), { count } = vertex;
-  const columns = binaryColumns(bytes, header, vertex);
-  const column = (name, out = new Float32Array(count), stride = 1, at = 0) => {
-    if (!vertex.properties.some((property) => property.name === name)) return null;
-    columns(name, (i, value) => { out[stride * i + at] = value; });
-    return out;
-  };
-  const means = new Float32Array(3 * count);
-  ["x", "y", "z"].forEach((name, k) => column(name, means, 3, k));
-  const settings = readSettings(header.comments, constantsOf(vertex, columns));
-  return checked({ count, means, opacityLogits: column("opacity"), sigma: column("sigma_d"), growth: column("growth_d"), settings });
-}
-
-function ofSpz(bytes) {
-  const layout = layoutOf(bytes), { count, starts } = layout, record = readRecord(bytes, layout);
-  if (!record?.columns.sigma_d) throw new Error("this .spz has no dial; export it with clod-adapt");
-  const means = new Float32Array(3 * count), { sigma_d: sigma, growth_d: growth } = record.columns;
-  readPositions(bytes, layout, means);
-  const opacityLogits = Float32Array.from({ length: count }, (_, i) => Math.log(bytes[starts[1] + i] / (255 - bytes[starts[1] + i])));
-  return checked({ count, means, opacityLogits, sigma, growth, settings: record.metadata.attenuation });
+  const { count, means, opacityLogits, sigmaD: sigma, growthD: growth, settings } = await readGaussians(data);
+  return checked({ count, means, opacityLogits, sigma, growth, settings });
 }
 
 /** `dial` if a viewer can show it: it has sigma_d, and distances whose unit does not depend on the view. */

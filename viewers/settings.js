@@ -36,7 +36,7 @@ function ofColumns({ clod_tau, clod_eps, clod_hard_cut, clod_quantile, clod_max,
 }
 
 /** The screen-space filter from comments, ours or another program's, or from columns; as in io/screen_filter.py. */
-export function readScreenFilter({ comments, constants: { clod_screen_variance, clod_compensate } = {} }, hasDial) {
+export function readScreenFilter(comments, { clod_screen_variance, clod_compensate }, hasDial) {
   const written = entries(comments).findLast(([name]) => name === "screen_filter")?.[1];
   if (written) {
     const [, variance, compensate] = /^(\S+) (True|False)$/.exec(written) ?? [];

@@ -1,58 +1,83 @@
-// Niantic's .spz, versions 2 and 3, unzipped: where its arrays are, its positions, and our vendor record, which has the
-// dial's columns (io/formats/spz.py).
+// Niantic's .spz, versions 2 and 3, and our vendor record, which has the dial's columns (io/formats/spz.py). Axes are not
+// converted: converters keep those of the PLY.
 
 const MAGIC = 0x5053474e, HEADER = 16;
-const EXTENDED = 2, RECORD = 0x434c0001; // flag: vendor records; type of our record
+const ANTIALIASED = 1, EXTENDED = 2, RECORD = 0x434c0001; // flags: compensated opacities, vendor records; type of our record
+const COLOR = 0.15; // colours are 0.15 f_dc + 0.5
 
-export async function inflate(bytes) {
+async function inflate(bytes) {
   const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
   return new Uint8Array(await new Response(stream).arrayBuffer());
 }
 
-/** {view, version, count, degree, starts}: the offsets of positions, opacities, colours, scales, rotations, harmonics,
- *  and of what follows these arrays. */
-export function layoutOf(bytes) {
-  const view = new DataView(bytes.buffer, bytes.byteOffset);
-  if (bytes.length < HEADER || view.getUint32(0, true) !== MAGIC) throw new Error("it is gzip data but not .spz; open a .spz of version 2 or 3");
-  const version = view.getUint32(4, true), count = view.getUint32(8, true), degree = bytes[12];
-  if (version < 2 || version > 3 || degree > 3) throw new Error(`it is .spz of version ${version} and SH degree ${degree}; export it as version 2 or 3 with degree 3 at most`);
-  const sizes = [9, 1, 3, 3, version === 3 ? 4 : 3, 3 * ((degree + 1) ** 2 - 1)], starts = [HEADER];
+/** The Gaussians of a file, as in read.js. */
+export async function readSpz(file) {
+  const bytes = await inflate(file), view = new DataView(bytes.buffer);
+  if (bytes.length < HEADER || view.getUint32(0, true) !== MAGIC) throw new Error("it is gzip data but not .spz");
+  const version = view.getUint32(4, true), count = view.getUint32(8, true), degree = bytes[12], shSize = 3 * ((degree + 1) ** 2 - 1);
+  if (version < 2 || version > 3 || degree > 3) throw new Error(`it is .spz of version ${version} and SH degree ${degree}, not of 2 or 3 and 3 at most`);
+  const sizes = [9, 1, 3, 3, version === 3 ? 4 : 3, shSize], starts = [HEADER];
   sizes.forEach((size) => starts.push(starts.at(-1) + size * count));
-  if (bytes.length < starts[6]) throw new Error("it is truncated; copy or export it again");
-  return { view, version, count, degree, starts };
+  const [means, alphas, colours, scales, rotations, harmonics, end] = starts, unit = 2 ** -bytes[13];
+  if (bytes.length < end) throw new Error("it is truncated; copy or export it again");
+  const read = (stride, value) => {
+    const values = new Float32Array(stride * count);
+    for (let k = 0; k < values.length; k++) values[k] = value(k);
+    return values;
+  };
+  const quats = new Float32Array(4 * count);
+  for (let i = 0; i < count; i++) quats.set(version === 3 ? quatOfBits(view.getUint32(rotations + 4 * i, true)) : quatOfBytes(bytes, rotations + 3 * i), 4 * i);
+  const { metadata: { attenuation = null, screen_filter: screenFilter, calibration } = {}, columns } = recordOf(bytes, view, count, end);
+  return {
+    count, degree, quats, sigmaD: columns.sigma_d ?? null, growthD: columns.growth_d ?? null, settings: attenuation,
+    means: read(3, (k) => {
+      const at = means + 3 * k, raw = bytes[at] | (bytes[at + 1] << 8) | (bytes[at + 2] << 16);
+      return ((raw << 8) >> 8) * unit; // 24-bit fixed point
+    }),
+    opacityLogits: read(1, (k) => Math.min(Math.max(Math.log(bytes[alphas + k] / (255 - bytes[alphas + k])), -40), 40)),
+    sh0: read(3, (k) => (bytes[colours + k] / 255 - 0.5) / COLOR), logScales: read(3, (k) => bytes[scales + k] / 16 - 10),
+    shN: read(shSize, (k) => (bytes[harmonics + k] - 128) / 128),
+    screenFilter: screenFilter ?? { variance: 0.3, compensate: (bytes[14] & ANTIALIASED) > 0 },
+    calibration: calibration?.total === count ? calibration.rows : [],
+  };
 }
 
-/** Writes the positions, 24-bit fixed point, to `means`. */
-export function readPositions(bytes, { count, starts: [first] }, means) {
-  const unit = 2 ** -bytes[13];
-  for (let k = 0; k < 3 * count; k++) {
-    const at = first + 3 * k, raw = bytes[at] | (bytes[at + 1] << 8) | (bytes[at + 2] << 16);
-    means[k] = ((raw << 8) >> 8) * unit;
+/** Our record: {metadata, columns}, a Float32Array for each name; both empty without a record, and columns without a dial. */
+function recordOf(bytes, view, count, first) {
+  for (let at = bytes[14] & EXTENDED ? first : bytes.length; at + 8 <= bytes.length;) {
+    const type = view.getUint32(at, true), start = at + 12, last = at + 8 + view.getUint32(at + 4, true);
+    at = last;
+    if (type !== RECORD || last > bytes.length) continue;
+    const end = start + view.getUint32(start - 4, true), metadata = JSON.parse(new TextDecoder().decode(bytes.subarray(start, end)));
+    const { columns: names = ["sigma_d"] } = metadata, column = (k) => {
+      const from = end + 2 * count * k;
+      return Float32Array.from({ length: count }, (_, i) => floatOfHalf(view.getUint16(from + 2 * i, true)));
+    };
+    const dialled = last - end === 2 * count * names.length && metadata.attenuation;
+    return { metadata, columns: dialled ? Object.fromEntries(names.map((name, k) => [name, column(k)])) : {} };
   }
-}
-
-/** Our record: {metadata, columns}, a Float32Array for each name; no columns if it has no dial; null without a record. */
-export function readRecord(bytes, { view, count, starts }) {
-  let at = bytes[14] & EXTENDED ? starts[6] : bytes.length;
-  while (at + 8 <= bytes.length) {
-    const type = view.getUint32(at, true), length = view.getUint32(at + 4, true), start = at + 12;
-    at += 8 + length;
-    if (type !== RECORD || at > bytes.length) continue;
-    const end = start + view.getUint32(start - 4, true);
-    const metadata = JSON.parse(new TextDecoder().decode(bytes.subarray(start, end)));
-    const { columns: names = ["sigma_d"] } = metadata, columns = {};
-    if (at - end !== 2 * count * names.length || !metadata.attenuation) return { metadata, columns };
-    names.forEach((name, k) => {
-      const first = end + 2 * count * k, value = (_, i) => floatOfHalf(view.getUint16(first + 2 * i, true));
-      columns[name] = Float32Array.from({ length: count }, value);
-    });
-    return { metadata, columns };
-  }
-  return null;
+  return { columns: {} };
 }
 
 /** The value of a finite float16. */
 function floatOfHalf(bits) {
   const exponent = (bits >> 10) & 31, fraction = (bits & 1023) / 1024;
   return (bits & 0x8000 ? -1 : 1) * (exponent ? 2 ** (exponent - 15) * (1 + fraction) : 2 ** -14 * fraction);
+}
+
+/** x, y and z in bytes; w >= 0. */
+function quatOfBytes(bytes, at) {
+  const [x, y, z] = [0, 1, 2].map((k) => bytes[at + k] / 127.5 - 1);
+  return [Math.sqrt(Math.max(0, 1 - x * x - y * y - z * z)), x, y, z];
+}
+
+/** Two bits for the index of the largest of x, y, z, w; a sign and nine bits for each of the others. */
+function quatOfBits(bits) {
+  const three = [20, 10, 0].map((shift) => {
+    const value = bits >>> shift, size = ((value & 511) / 511) * Math.SQRT1_2;
+    return (value >>> 9) & 1 ? -size : size;
+  });
+  const largest = Math.sqrt(Math.max(0, 1 - three.reduce((sum, value) => sum + value * value, 0)));
+  const at = bits >>> 30, [x, y, z, w] = [...three.slice(0, at), largest, ...three.slice(at)];
+  return [w, x, y, z];
 }

@@ -63,7 +63,7 @@ def test_other_files_are_errors_and_the_picture_stays(shown: Shown, model: Path,
     write(tmp_path / "a.glb", clod_adapter.load(model).gaussians)
     write(tmp_path / "a.splat", clod_adapter.bake(clod_adapter.load(model).gaussians, 1.0, cameras=cameras))
     header, _, _ = data.partition(b"end_header")
-    python = "clod-adapt view {} opens it"
+    python = "clod-adapt view {} opens every format"
     refused = (
         ("a.glb", (tmp_path / "a.glb").read_bytes(), python),
         ("a.splat", (tmp_path / "a.splat").read_bytes(), python),
@@ -73,7 +73,7 @@ def test_other_files_are_errors_and_the_picture_stays(shown: Shown, model: Path,
         ("mesh.ply", b"ply\nformat binary_little_endian 1.0\nelement vertex 0\nend_header\n", "x is missing"),
         ("cut.ply", data[:-100], "truncated"),
         ("head.ply", data[:300], "truncated"),
-        ("words.ply", b"good morning", "reads .ply and .spz"),
+        ("words.ply", b"good morning", "neither .ply nor .spz"),
         ("empty.ply", b"", "empty"),
         ("cut.spz", gzip.compress(bytes(100), mtime=0)[:-9], "damaged or too large"),
         ("zeros.spz", gzip.compress(bytes(100), mtime=0), "not .spz"),

@@ -3,7 +3,7 @@ import { createHash } from "node:crypto";
 import { readFileSync, readdirSync, writeFileSync } from "node:fs";
 import { build } from "esbuild";
 
-const SHARED = ["equation.js", "frame_rate.js", "ply.js", "settings.js", "shaders.js", "spz.js", "timer.js"]; // with the drop-ins
+const SHARED = ["equation.js", "frame_rate.js", "ply.js", "read.js", "settings.js", "shaders.js", "spz.js", "timer.js"]; // with the drop-ins
 const here = new URL(".", import.meta.url), dropIns = new URL("../../../viewers/", here), out = new URL("../static/", here);
 const shared = { bundle: true, minify: true, format: "iife", target: "es2022", write: false, loader: { ".glsl": "text" } };
 

@@ -35,10 +35,9 @@ export function createFiles(elements, viewer, config, { show, replace, update, s
 
   /** Opens a file, a Blob. */
   async function load(blob, name) {
-    const read = () => readFile(blob, name).catch((error) => { throw new Error(`${name}: ${error.message}`); });
-    await open(name, read, (found) => {
+    await open(name, () => readFile(blob, name), (found) => {
       show(found, null, [], config.virtual_scale); // within the range of this file
-      viewer.notes = found.metadata.notes.join("; ");
+      viewer.notes = found.metadata.notes;
       viewer.ui.showNote(viewer.notes);
       viewer.file = null;
       viewer.ui.showName(name, null);

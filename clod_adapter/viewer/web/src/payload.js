@@ -8,13 +8,7 @@ export function readConfig() {
 }
 
 /** {gaussians, metadata} of an entry of the configuration; calls `onProgress(share)` during the transfer. */
-export async function fetchModel({ name, href, element }, onProgress) {
-  try {
-    return await readFile(await (href ? download(href, onProgress) : included(element)), name);
-  } catch (error) {
-    throw new Error(`${name}: ${error.message}`);
-  }
-}
+export const fetchModel = async ({ name, href, element }, onProgress) => readFile(href ? await download(href, onProgress) : included(element), name);
 
 /** The bytes that the elements with this id have in base64; removes these elements, for their memory. */
 function included(id) {
