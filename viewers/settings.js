@@ -24,14 +24,12 @@ export function readSettings(comments, constants = {}) {
   return { ...DEFAULTS, ...(written.length ? FORMER : {}), ...stored };
 }
 
-function ofColumns({ clod_tau, clod_eps, clod_hard_cut, clod_quantile, clod_max, clod_reference_distance }) {
+/** Of the columns, whose names have the prefix clod_. */
+function ofColumns(constants) {
   const found = {};
-  if (clod_tau !== undefined) found.tau = clod_tau;
-  if (clod_eps !== undefined) found.eps = clod_eps;
-  if (clod_hard_cut) found.cut = "hard";
-  if (clod_quantile !== undefined) Object.assign(found, { normalizer: "quantile", quantile: clod_quantile });
-  if (clod_max) found.normalizer = "max";
-  if (clod_reference_distance !== undefined) found.reference_distance = clod_reference_distance;
+  for (const name of ["tau", "eps", "quantile", "reference_distance"]) if (`clod_${name}` in constants) found[name] = constants[`clod_${name}`];
+  if (constants.clod_hard_cut) found.cut = "hard";
+  if (constants.clod_max || "quantile" in found) found.normalizer = constants.clod_max ? "max" : "quantile";
   return found;
 }
 

@@ -8,7 +8,7 @@ import { timed } from "../../../../viewers/timer.js";
 export function createRenderer(canvas) {
   const gl = canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false, powerPreference: "high-performance" });
   if (!gl) throw new Error("this browser has no WebGL2; try a current Chrome, Edge, Firefox or Safari");
-  const halfFloat = gl.getExtension("EXT_color_buffer_float") ?? gl.getExtension("EXT_color_buffer_half_float");
+  gl.getExtension("EXT_color_buffer_float") ?? gl.getExtension("EXT_color_buffer_half_float"); // without these, framebuffer() throws
   const projectors = new Map(), splat = program(gl, splatVertex, splatFragment), copy = program(gl, copyVertex, copyFragment);
   const quadArray = quads(gl), empty = gl.createVertexArray();
   const projected = { textures: [], target: null, height: 0 }, image = { texture: null, target: null };
@@ -19,9 +19,7 @@ export function createRenderer(canvas) {
     ({ width, height } = view);
     gl.deleteTexture(image.texture);
     gl.deleteFramebuffer(image.target);
-    image.texture = halfFloat
-      ? texture(gl, gl.RGBA16F, width, height, gl.RGBA, gl.HALF_FLOAT)
-      : texture(gl, gl.RGBA8, width, height, gl.RGBA, gl.UNSIGNED_BYTE);
+    image.texture = texture(gl, gl.RGBA16F, width, height, gl.RGBA, gl.HALF_FLOAT);
     image.target = framebuffer(gl, [image.texture]);
   }
 
@@ -113,10 +111,10 @@ export function createRenderer(canvas) {
       clear();
       project(side, view, depthUnit);
       blend(side, view);
-      const pixel = halfFloat ? new Float32Array(4) : new Uint8Array(4);
-      gl.readPixels(x, height - 1 - y, 1, 1, gl.RGBA, halfFloat ? gl.FLOAT : gl.UNSIGNED_BYTE, pixel);
+      const pixel = new Float32Array(4);
+      gl.readPixels(x, height - 1 - y, 1, 1, gl.RGBA, gl.FLOAT, pixel);
       const share = pixel[0] / pixel[3];
-      return pixel[3] > (halfFloat ? 0.1 : 25) && share < 1 ? (share * depthUnit) / (1 - share) : null;
+      return pixel[3] > 0.1 && share < 1 ? (share * depthUnit) / (1 - share) : null;
     },
     /** Draws each side in its range [from, to] of the image's width, in [0, 1]; returns the milliseconds that it took. */
     draw: (sides, view) => timed(gl, () => {

@@ -63,13 +63,13 @@ export function createViews(elements, viewer, { update, showFile, clampDial }) {
     },
     /** Shows the view of a link, by its fragment. */
     async applyLink(hash) {
-      const { file, eye, rotation, fov, aspect, up, distance, dial, equation, wipe, other } = readLink(hash);
+      const { file, eye, forward, down, fov, aspect, up, distance, dial, equation, wipe, other } = readLink(hash);
       const { camera, stage } = viewer;
       if (viewer.file !== null && file !== viewer.file) await showFile(file);
       viewer.motion.stop();
-      if (up && Math.hypot(...up) > 0) [viewer.up, camera.up] = [String(up), unit(up)];
-      if (eye && rotation) {
-        Object.assign(camera, { eye, rotation, intrinsics: null, aspect });
+      if (up) [viewer.up, camera.up] = [String(up), unit(up)];
+      if (eye && forward) {
+        camera.pose = { ...camera.pose, eye, forward, down, aspect };
         viewer.ui.selectCamera(null);
       }
       camera.fov = fov ?? camera.fov;
