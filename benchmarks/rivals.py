@@ -19,8 +19,7 @@ from dataclasses import asdict
 from typing import Any
 
 import clod_adapter as clod
-from clod_adapter.initialization.coverage import coverage
-from clod_adapter.initialization.importance import removal_error
+from clod_adapter.initialization.importance import coverage, removal_error
 from common import Row, append, arguments, checkpoint, falling, head, photographs, stored, table
 from tuning import MERGINGS, Tuning, find_tool, merge, tune
 

@@ -113,30 +113,22 @@ def median(rows: Tensor) -> Tensor:
     return rows.quantile(0.5, dim=0)
 
 
+POSES = (
+    ("OpenGL poses", False, True,
+     "the cameras look along -z with y up (OpenGL), where COLMAP's look along z with y down: negate the y and z axes "
+     "of their poses"),
+    ("inverted poses", True, False,
+     "the poses are camera to world, where COLMAP's are world to camera: invert them"),
+    ("inverted OpenGL poses", True, True,
+     "the poses are camera to world in OpenGL's axes, where COLMAP's are world to camera: negate their y and z axes "
+     "and invert them"),
+)  # fmt: skip
+
+
 def _poses() -> Iterator[Frame]:
     """Wrong conventions of the individual poses."""
     here = torch.eye(3, dtype=torch.float64), 1.0, torch.zeros(3, dtype=torch.float64)
-    yield Frame(
-        "OpenGL poses",
-        "the cameras look along -z with y up (OpenGL), where COLMAP's look along z with y down: negate the y and z "
-        "axes of their poses",
-        *here,
-        opengl=True,
-    )
-    yield Frame(
-        "inverted poses",
-        "the poses are camera to world, where COLMAP's are world to camera: invert them",
-        *here,
-        inverted=True,
-    )
-    yield Frame(
-        "inverted OpenGL poses",
-        "the poses are camera to world in OpenGL's axes, where COLMAP's are world to camera: negate their y and z axes "
-        "and invert them",
-        *here,
-        inverted=True,
-        opengl=True,
-    )
+    yield from (Frame(name, text, *here, inverted, opengl) for name, inverted, opengl, text in POSES)
 
 
 def _axes(viewmats: Tensor) -> Iterator[Frame]:

@@ -14,7 +14,7 @@ from clod_adapter.cameras import View
 from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.initialization.coverage import coverage, reduced
+from clod_adapter.initialization.importance import coverage, reduced
 from clod_adapter.progress import Listener, Phase, tell
 
 UNSEEN = 0.005  # of a block's coverage over all views, the share that the views it is not trained on may have

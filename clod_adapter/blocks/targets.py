@@ -18,7 +18,7 @@ from clod_adapter.config import AdaptConfig
 from clod_adapter.equation.attenuation import dial
 from clod_adapter.equation.distances import normalized_distances, typical_distance
 from clod_adapter.gaussians import SH_C0, Gaussians
-from clod_adapter.initialization.coverage import coverage
+from clod_adapter.initialization.importance import coverage
 from clod_adapter.losses import unit
 from clod_adapter.progress import Listener, Phase, tell
 from clod_adapter.render import splat

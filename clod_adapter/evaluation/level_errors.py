@@ -37,8 +37,7 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.formats.lod_meta import Leaf
 from clod_adapter.progress import Listener, Phase, tell
 from clod_adapter.render import splat
-from clod_adapter.training.camera_placement import FIELD, HEIGHT
-from clod_adapter.training.camera_score import WIDTH
+from clod_adapter.training.camera_placement import FIELD, HEIGHT, WIDTH
 
 VIEWS = 16  # cameras that errors are measured from
 FLOOR = 0.01  # share of the errors by counts

@@ -5,11 +5,12 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from clod_adapter.cameras import View, spread
+from clod_adapter.cameras import Camera, View, spread
 from clod_adapter.config import AdaptConfig, AttenuationConfig
 from clod_adapter.equation.attenuation import SIGMA_MAX
 from clod_adapter.equation.distances import median_distance, typical_distance
@@ -17,9 +18,8 @@ from clod_adapter.equation.extinction import sigma_for_extinction
 from clod_adapter.equation.units import in_world_units, known_distance, with_distance
 from clod_adapter.errors import ClodError
 from clod_adapter.finite import bad_rows, largest_colour
-from clod_adapter.gaussians import Gaussians
-from clod_adapter.initialization.growth_start import initial_growth
-from clod_adapter.initialization.pruning_order import pruning_order
+from clod_adapter.gaussians import SH_C0, Gaussians
+from clod_adapter.initialization.pruning_order import initial_growth, pruning_order
 from clod_adapter.progress import Listener, Phase, tell
 from clod_adapter.render import splat
 
@@ -32,6 +32,7 @@ MOST_VIEWS = 64
 # at most this share of the removal error at s = 1.
 FAINT_SHARE = 0.05
 TAU_MIN = 1e-6
+SMALLER = 4  # downscaling of ``reduced``
 NEAREST = 0.05  # share of the views that may be nearer than where growth begins
 FADING = 1.5  # times the culling threshold: below, the soft cut reduces the opacity (attenuation)
 
@@ -209,3 +210,25 @@ def sigma_from_importance(
     power = (1 / rank + (rank**-2 - 4 * (1 / share - 1)).clamp(min=0).sqrt()) / 2
     extinction = torch.where(rank <= share, power ** (1 / exponent), share / rank)
     return sigma_for_extinction(gaussians.opacity_logits, distances, extinction, config)
+
+
+def coverage(gaussians: Gaussians, opacities: Tensor, camera: Camera, growth: Tensor | None = None) -> Tensor:
+    """``[N]`` pixels that each Gaussian covers: the sum over the image of its transmittance times its alpha.
+
+    This is the gradient of the image by the Gaussians' colours.
+
+    Args:
+        growth: ``[N]`` factor of the scales; None for 1.
+    """
+    grey = gaussians.sh0.new_zeros(gaussians.sh0.shape).requires_grad_()
+    plain = gaussians.replace(sh0=grey, shN=gaussians.shN[:, :0])
+    image, _ = splat(plain, opacities, camera, growth=growth)
+    (gradient,) = torch.autograd.grad(image[..., 0].sum(), grey)
+    return gradient[:, 0, 0] / SH_C0
+
+
+def reduced(camera: Camera) -> Camera:
+    """The same view with a SMALLER-th of the width and height, where shares of an image are as good."""
+    width, height = (max(size // SMALLER, 1) for size in (camera.width, camera.height))
+    shrink = camera.K.new_tensor([[width / camera.width], [height / camera.height], [1.0]])
+    return replace(camera, K=camera.K * shrink, width=width, height=height)

@@ -8,8 +8,12 @@ A checkpoint is accurate only where its photographs looked. Two properties of th
   in the directions from which a Gaussian was photographed and weak in others.
 
 Candidate cameras look at random Gaussians, preferably small opaque ones, from random directions. Each is scored by two
-small renderings (``camera_score``), and as many again are tried near the best. Of the good ones, cameras far from each
-other are chosen. The method needs no up direction, scene type or unit.
+small renderings (``score``), and as many again are tried near the best. Of the good ones, cameras far from each other
+are chosen. The method needs no up direction, scene type or unit.
+
+The time of a rendering follows the number of Gaussians, and hundreds of cameras are scored. Beyond SAMPLE of them a
+sample is rendered. With the probability p of a Gaussian as in ``sample``, its scales are multiplied by ``p^-1/2``, so
+that its projected area times its probability is what it was: surfaces are covered as before, and walls stay opaque.
 """
 
 from __future__ import annotations
@@ -25,14 +29,14 @@ from clod_adapter.adapter import detach
 from clod_adapter.cameras import Camera, near_plane
 from clod_adapter.config import require
 from clod_adapter.errors import ClodError
-from clod_adapter.gaussians import Gaussians
-from clod_adapter.initialization.coverage import coverage
+from clod_adapter.gaussians import SH_C0, Gaussians
+from clod_adapter.initialization.importance import coverage
 from clod_adapter.progress import Listener, Phase, tell
-from clod_adapter.training.camera_score import WIDTH, largest_scale, sample, score
+from clod_adapter.render import splat
 
 VIEWS, MOST = 96, 384  # cameras of a round, and of all rounds
 SHOWN, COVERED = 0.99, 0.5  # share of the Gaussians to show, each with that many pixels
-HEIGHT = 368
+WIDTH, HEIGHT = 496, 368  # of the images; sizes in pixels refer to the width
 FIELD = 55.0  # horizontal, degrees: between a phone's 65 and the 35 of a portrait lens
 TRIES = 3  # candidates for each view, first anywhere, then as many near the best of those
 BEST = 0.2  # share of the first candidates that are good; later ones must score as high
@@ -41,6 +45,8 @@ LOOK = (80, 60)  # size of the renderings that a candidate is scored by
 SMALL, SMALL_PIXELS = 0.1, 2.0  # a tenth of the Gaussians is at most this many pixels large in the nearest cameras
 FAR = 4.0  # cameras stand at most this many times as far away as the scene is large
 VISIBLE = 0.05  # Gaussians of lower opacity are ignored
+SAMPLE = 200_000  # Gaussians that are rendered, about
+ROUNDS = 30  # of the search for the probabilities, whose sum is then SAMPLE to a thousandth
 
 
 @dataclass(frozen=True)
@@ -227,3 +233,51 @@ def _zoom(field: float) -> float:
 
 def _quantile(values: Tensor, share: float) -> float:
     return float(values.kthvalue(max(round(share * len(values)), 1)).values)
+
+
+def sample(gaussians: Gaussians, rows: Tensor, seed: int) -> tuple[Gaussians, Tensor | None]:
+    """About SAMPLE of the Gaussians at ``rows [n]``, and the factors of their scales; all, and None, if n <= SAMPLE.
+
+    A Gaussian is drawn with probability ``p_i = min(1, c l_i)``, l its largest scale and c such that the sum is
+    SAMPLE: large ones, of which few cover much, stay as they are.
+    """
+    if len(rows) <= SAMPLE:
+        return gaussians.select(rows).without_empty_bands(), None
+    size = largest_scale(gaussians)[rows].double().nan_to_num(0.0, 0.0)  # infinite ones are not drawn
+    share = size * (SAMPLE / size.sum())
+    for _ in range(ROUNDS):
+        share = (share * (SAMPLE / share.sum())).clamp_(max=1)
+    random = torch.rand(len(rows), generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    drawn = random.to(share.device) < share
+    return gaussians.select(rows[drawn]).without_empty_bands(), share[drawn].rsqrt().to(gaussians.means)
+
+
+def score(gaussians: Gaussians, growth: Tensor | None, camera: Camera) -> float:
+    """How likely a photograph was taken from here; -inf if the rendering is empty.
+
+    ``log h - 0.5 p - 2 e`` with h the mean magnitude of the higher SH degrees' colour, p the mean log size in pixels
+    (both weighted by alpha), e the share of pixels that are not covered.
+
+    Args:
+        growth: of ``sample``. p is of the sizes without it.
+    """
+    higher = torch.zeros_like(gaussians.sh0)  # the colour is then 0.5 + that of the higher degrees
+    bands, alpha = splat(gaussians.replace(sh0=higher), gaussians.opacities, camera, growth=growth)
+    covered = float(alpha.sum())
+    if covered < 0.1 * alpha.numel():
+        return -math.inf
+    row = camera.viewmat[2].to(gaussians.means)
+    depths = gaussians.means @ row[:3] + row[3]
+    pixels = largest_scale(gaussians) * WIDTH / camera.width * camera.K[0, 0] / depths.clamp(min=1e-6)
+    shade = (pixels.clamp(1e-3, 1e4).log() + 7)[:, None, None].expand(-1, 1, 3)  # positive, as colours are
+    plain = gaussians.replace(sh0=(shade - 0.5) / SH_C0, shN=gaussians.shN[:, :0])
+    sizes, _ = splat(plain, gaussians.opacities, camera, growth=growth)
+    size = float(sizes[..., 0].sum()) / covered - 7
+    empty = float((alpha < 0.9).float().mean())
+    strength = float((bands - 0.5 * alpha[..., None]).abs().mean(2).sum()) / covered if gaussians.sh_degree else 1.0
+    return math.log(strength + 1e-4) - 0.5 * size - 2 * empty
+
+
+def largest_scale(gaussians: Gaussians) -> Tensor:
+    """``[N]`` the largest standard deviation, world units."""
+    return gaussians.scales.amax(1)

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from statistics import fmean
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from clod_adapter.adapter import trim, with_dial
-from clod_adapter.cameras import Scene
+from clod_adapter.cameras import Scene, View
 from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.progress import Listener, within
-from clod_adapter.training.ablation import largest_change
+from clod_adapter.losses import psnr
+from clod_adapter.progress import Listener, Phase, tell, within
+from clod_adapter.render import render
 from clod_adapter.training.dial import TrainableSubset
 from clod_adapter.training.distributed import ProcessGroup
 from clod_adapter.training.loop import Adapted, adapt
@@ -150,3 +154,22 @@ class Plan:
         seconds = {name: round(value, 3) for name, value in self.seconds.items()}
         decisions = [asdict(decision) | {"measured": decision.measured} for decision in self.decisions]
         return {"decisions": decisions, "seconds": seconds}
+
+
+@torch.no_grad()
+def largest_change(
+    base: Gaussians, less: Gaussians, views: Sequence[View], progress: Listener | None = None
+) -> tuple[float, float]:
+    """The largest difference of a channel between renderings of the two, in [0, 1], and the mean loss of PSNR in dB."""
+    largest, lost = 0.0, []
+    for done, view in enumerate(views, 1):
+        with_all, without = (render(each, view.camera).image.clamp(0, 1) for each in (base, less))
+        largest = max(largest, float((with_all - without).abs().max()))
+        lost.append(psnr_change(psnr(with_all, view.image), psnr(without, view.image)))
+        tell(progress, Phase.TRIMMING, done, len(views))
+    return largest, fmean(lost) if lost else 0.0
+
+
+def psnr_change(this: float, that: float) -> float:
+    """dB between two PSNR; 0 where both are infinite."""
+    return 0.0 if this == that else this - that

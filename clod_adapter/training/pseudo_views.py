@@ -19,11 +19,10 @@ from clod_adapter.config import AdaptConfig
 from clod_adapter.equation.distances import median_distance
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.initialization.coverage import SMALLER, coverage, reduced
+from clod_adapter.initialization.importance import SMALLER, coverage, reduced
 from clod_adapter.progress import Listener, Phase, tell
 from clod_adapter.render import render
-from clod_adapter.training.camera_placement import place_cameras
-from clod_adapter.training.camera_score import SAMPLE
+from clod_adapter.training.camera_placement import SAMPLE, place_cameras
 
 # Photographs are enough if there are MANY, or if TIMES of them show each part of at least SHOWN of the scene, as far as
 # CHECKED placed cameras see it. Otherwise ADDED pseudo views are added: up to half of them at the cameras of the

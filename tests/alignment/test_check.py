@@ -5,15 +5,13 @@ from __future__ import annotations
 import itertools
 import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
 from torch import Tensor
 
-import clod_adapter
 import scenes
 from clod_adapter.alignment import check
 from clod_adapter.alignment.check import FLAT, check_alignment
@@ -22,7 +20,6 @@ from clod_adapter.alignment.search import guess_frame, scene_in
 from clod_adapter.cameras import Scene, View
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.io.scene.colmap import load_points
 from clod_adapter.render import render
 
 EYE = torch.eye(3, dtype=torch.float64)
@@ -73,24 +70,6 @@ def test_measures_match_their_definitions(pair: tuple[Gaussians, list[View]]) ->
     assert found.correlation == pytest.approx(float(torch.nn.functional.cosine_similarity(*both, dim=0)), abs=1e-4)
 
 
-def test_an_underfitted_checkpoint_fits(pair: tuple[Gaussians, list[View]]) -> None:
-    base, views = pair
-    poor = base.select(torch.arange(len(base)) % 5 > 0)
-    poor = poor.replace(sh0=poor.sh0 * 0.7, shN=poor.shN[:, :0], log_scales=poor.log_scales + 0.15)
-    found = check_alignment(poor, views)
-    assert found.fits and found.margin < 6
-    assert guess_frame(poor, views, found) is None
-
-
-def test_views_outside_the_scene_do_not_prevent_a_fit(pair: tuple[Gaussians, list[View]]) -> None:
-    """Three of eight cameras look away, at a bright scene, so the pooled error alone would reject the file."""
-    base, views = pair
-    away = torch.diag(torch.tensor([-1.0, 1, -1, 1]))
-    bright = [View(view.camera, 255 - view.image // 4) for view in views[:3]]
-    found = check_alignment(base, [*(posed(view, away @ view.camera.viewmat) for view in bright), *views[3:]])
-    assert found.margin < 0 and found.explained == 5 / 8 and found.fits
-
-
 @pytest.mark.parametrize("noise", [0, 3])
 def test_flat_photographs_decide_nothing(pair: tuple[Gaussians, list[View]], noise: int) -> None:
     base, views = pair
@@ -102,19 +81,6 @@ def test_flat_photographs_decide_nothing(pair: tuple[Gaussians, list[View]], noi
     assert guess_frame(base, flat, found) is None
     assert check_alignment(base, [*flat[:6], *views[6:]]).margin > 6  # two that are not decide
     assert not check_alignment(base.replace(means=base.means + 1000), flat).fits
-
-
-@pytest.mark.parametrize("count", [1, 2])
-def test_few_views_and_one_gaussian(pair: tuple[Gaussians, list[View]], count: int) -> None:
-    base, views = pair
-    assert check_alignment(base, views[:count]).fits
-    truth = scenes.gaussians(1, 0, 3, size=0.4).replace(means=torch.zeros(1, 3), opacity_logits=torch.full((1,), 3.0))
-    seen = scenes.photograph(truth, scenes.ring(count, 40, 30))
-    found = check_alignment(truth, seen)
-    assert found.fits and found.in_view == 1
-    stray = truth.replace(means=torch.full((1, 3), 50.0))
-    lost = check_alignment(stray, seen)
-    assert not lost.fits and guess_frame(stray, seen, lost) is None or count == 2
 
 
 def test_an_empty_render_does_not_fit(pair: tuple[Gaussians, list[View]], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -232,26 +198,3 @@ def test_frames_of_trainers(pair: tuple[Gaussians, list[View]]) -> None:
         assert spread.diag().tolist() == sorted(spread.diag().tolist(), reverse=True)
     around = torch.stack([camera.viewmat for camera in scenes.ring(6, 40, 30)])
     assert focus_of(around).abs().max() < 1e-5 and torch.isfinite(focus_of(around[:1])).all()
-
-
-def test_one_far_camera_does_not_decide_what_most_cameras_look_at() -> None:
-    """It looks past the scene by 30 units; least squares moved the point by 6 units."""
-    around = torch.stack([camera.viewmat for camera in scenes.ring(8, 40, 30)])
-    past = scenes.ring(1, 40, 30, radius=120.0)[0].viewmat.clone()
-    past[0, 3] += 30
-    assert focus_of(torch.cat([around, past[None]]), 20).norm() < 0.1
-
-
-def test_real_files_fit_in_their_frame_alone(shared_data: Callable[[str], Path]) -> None:
-    files = [shared_data(f"{name}/pretrained.ply") for name in ("ci_banana", "plush_half")]
-    base, plush = (clod_adapter.load(path).gaussians for path in files)
-    views = everything(clod_adapter.load_scene(shared_data("ci_banana")))
-    found = check_alignment(base, views)
-    assert found.fits and found.margin > 6
-    elsewhere = in_world(views, 1.0, FLIP, NONE)
-    found = check_alignment(base, elsewhere)
-    guess = guess_frame(base, elsewhere, found, load_points(shared_data("ci_banana")))
-    assert not found.fits and guess is not None and "x, -y, -z" in guess.frame.description and guess.psnr > 26
-    views = everything(clod_adapter.load_scene(shared_data("plush_half")))
-    found = check_alignment(plush, views)
-    assert found.fits and found.margin > 6 and not check_alignment(base, views).fits

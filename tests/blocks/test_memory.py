@@ -27,13 +27,6 @@ def test_sizes() -> None:
             parse_size(text)
 
 
-def test_plan_uses_as_few_blocks_as_possible() -> None:
-    plan = plan_for_limit(CITY, 8 * 10**9)
-    assert plan.blocks == 1 and plan.peak <= 8 * 10**9 and plan.cache == CITY.images
-    counts = [plan_for_limit(CITY, limit).blocks for limit in range(least(CITY), 5 * 10**9, 10**8)]
-    assert counts == sorted(counts, reverse=True) and counts[0] > 2 and counts[-1] == 1
-
-
 @settings(max_examples=40, deadline=None)
 @given(st.integers(1, 10**7), st.sampled_from([56, 236]), st.integers(0, 10**10), st.integers(1, 10**7))
 def test_least_memory_is_the_smallest_that_suffices(count: int, attributes: int, images: int, pixels: int) -> None:
@@ -54,12 +47,3 @@ def test_too_little_memory_names_the_least() -> None:
     for count in (CITY.count, 90_000_000, 91_234_567, 1_000_000_000):
         needs = replace(CITY, count=count)
         assert plan_for_limit(needs, parse_size(in_words(least(needs)).replace(" ", ""))).blocks > 1
-
-
-def test_images_without_files_stay_in_memory() -> None:
-    """They are in memory in every phase but the first, in addition to a block's own images."""
-    plan = plan_for_limit(CITY, 8 * 10**9)
-    made = plan_for_limit(replace(CITY, images=0, pictures=CITY.images), 8 * 10**9)
-    assert (made.cache, made.start, made.train) == (0, plan.start, plan.train)
-    tight = least(CITY)
-    assert plan_for_limit(replace(CITY, images=0, pictures=CITY.images), tight + 10**8).cache > 0

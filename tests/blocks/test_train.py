@@ -224,22 +224,6 @@ def test_growth_is_drawn_in_the_context(divided: Division, captured: tuple[Gauss
     assert torch.equal(*(context_rows(replace(divided, initial=each), 0, views) for each in grown))
 
 
-@pytest.mark.parametrize("drawn", [True, False])
-def test_a_block_without_views_is_unchanged(captured: tuple[Gaussians, Scene], drawn: bool) -> None:
-    """The block is behind the only camera, which sees other blocks or nothing."""
-    base, scene = captured
-    view = scene.train[0]
-    ahead, right = view.camera.viewmat[2, :3], view.camera.viewmat[0, :3]
-    means = base.means * 0.001 + view.camera.position + 3 * ahead + (0 if drawn else 30) * right
-    means[:100] -= 50 * ahead
-    division = divide(initialize(base.replace(means=means), [view], CONFIG), [view], CONFIG, 3)
-    behind = int(division.block[0])
-    assert division.views(behind) == [] and division.steps(behind, CONFIG) == 0
-    part, outcome = adapt_block(division, [view], CONFIG, behind)
-    assert (part.steps, outcome.steps, list(part.values)) == (0, 0, ["sigma_d"])
-    assert torch.equal(part.values["sigma_d"], division.initial.sigma_d[division.rows(behind)])
-
-
 def test_settings_that_need_all_gaussians_are_refused(captured: tuple[Gaussians, Scene]) -> None:
     base, scene = captured
     begun = initialize(base, scene.train, CONFIG)

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import torch
 
-from clod_adapter.initialization.coverage import SMALLER, coverage, reduced
+from clod_adapter.initialization.importance import SMALLER, coverage, reduced
 from clod_adapter.render import render
 from scenes import capture
 

@@ -11,20 +11,18 @@ from torch import Tensor
 from clod_adapter.cameras import View
 from clod_adapter.config import AdaptConfig, AttenuationConfig
 from clod_adapter.equation.attenuation import attenuate
-from clod_adapter.equation.distances import normalized_distances, typical_distance
+from clod_adapter.equation.distances import typical_distance
 from clod_adapter.equation.extinction import extinction_scale
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization import importance
 from clod_adapter.initialization.importance import (
     fitting_tau,
-    initialize,
     removal_error,
     sigma_from_importance,
     usable_views,
 )
 from clod_adapter.initialization.pruning_order import pruning_order
-from clod_adapter.progress import Phase
 from clod_adapter.render import splat
 from scenes import gaussians, photograph, ring
 
@@ -83,22 +81,6 @@ def test_removal_error_is_the_mean_over_views() -> None:
         usable_views(few, [blind])
 
 
-def test_initialization_renders_some_of_many_views(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The views are evenly spaced from first to last; all of them are used where there are few."""
-    some, looked, counts = gaussians(50, 0, 0), [], []
-    views = photograph(some, ring(7, 12, 10))
-    monkeypatch.setattr(importance, "splat", lambda g, o, c: looked.append(c.name) or splat(g, o, c))
-    for most, expected in [(3, [0, 2, 4]), (7, range(7)), (64, range(7))]:
-        looked.clear()
-        counts.clear()
-        monkeypatch.setattr(importance, "MOST_VIEWS", most)
-        importance.initialize(some, views, AdaptConfig(), lambda now: counts.append((now.phase, now.done, now.total)))
-        assert looked == [views[k].camera.name for k in expected]
-        assert counts[: len(looked)] == [(Phase.IMPORTANCE, k + 1, len(looked)) for k in range(len(looked))]
-        assert {phase for phase, *_ in counts[len(looked) :]} == {Phase.PRUNING_ORDER}
-        assert counts[-1] == (Phase.PRUNING_ORDER, 50, 50)
-
-
 @pytest.mark.parametrize(("share", "exponent"), [(0.51, 1.5), (0.6, 1.0), (0.8, 2.5), (1.0, 1.5)])
 def test_kept_shares_follow_the_target_curve(share: float, exponent: float, n: int = 1000) -> None:
     """At the distances of the initialization, ``1 / (s^p + (1/share - 1) s^-p)``, to one Gaussian."""
@@ -146,12 +128,3 @@ def test_tau_is_lowered_for_faint_checkpoints_only() -> None:
     assert fitting_tau(torch.zeros(10), torch.ones(10), config) > 0
     for opacities in (mixed, faint, torch.zeros(1000)):  # never raised, however low it was asked for
         assert fitting_tau(opacities, error, AdaptConfig(tau=1e-8)) == 1e-8
-
-
-def test_a_faint_checkpoint_keeps_its_gaussians() -> None:
-    base = gaussians(200, 0, 0, size=0.3).replace(opacity_logits=torch.full((200,), -4.6))
-    views = photograph(base, ring(3, 24, 18))
-    dialled = initialize(base, views, AdaptConfig())
-    assert dialled.attenuation is not None and dialled.sigma_d is not None and dialled.attenuation.tau < 0.01 / 5
-    d = normalized_distances(base.means, views[0].camera, dialled.attenuation)
-    assert attenuate(base.opacity_logits, dialled.sigma_d, d, 1.0, dialled.attenuation).keep.float().mean() > 0.5

@@ -123,14 +123,6 @@ def test_trainers_tensors_are_used_as_they_are(captured: Pair, form: str) -> Non
     torch.testing.assert_close(dial.gaussians().sh0, base.sh0 + 1)
 
 
-def test_higher_degrees_may_be_missing(captured: Pair) -> None:
-    base, scene = captured
-    flat = base.without_bands(0)
-    named = clod.to_gsplat(flat)
-    del named["shN"]
-    assert torch.equal(attach(named, scene).log_sigma, attach(flat, scene).log_sigma)
-
-
 def test_learning_rates_are_those_of_the_settings(captured: Pair) -> None:
     base, scene = captured
     config = AdaptConfig(batch=4, lr_sh0=1.0)
@@ -158,11 +150,6 @@ def test_the_result_is_saved_in_world_units(captured: Pair, tmp_path: Any) -> No
     again, camera = clod.load(tmp_path / "dial.ply").gaussians, scene.test[0].camera
     assert again.attenuation.scene_distance == 1 and again.attenuation.max_sv == MAX_SV
     assert torch.equal(clod.render(again, camera, 3).kept, dial(camera, 3).keep)
-
-
-def test_one_dial_value_has_no_count_term(captured: Pair) -> None:
-    dial = attach(*captured, max_sv=1)
-    assert float(dial.loss(1.0, torch.tensor(0.5))) == pytest.approx(0.5 * 0.75**2)
 
 
 def test_what_does_not_fit_is_refused(captured: Pair) -> None:

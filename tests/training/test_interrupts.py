@@ -120,16 +120,3 @@ def test_other_handlers_and_threads_are_not_affected() -> None:
     thread.start()
     thread.join()
     assert found[0].steps == 2
-
-
-def test_an_error_of_the_listener_is_not_reported_to_it() -> None:
-    seen = []
-
-    def listen(now: Progress) -> None:
-        if now.phase == Phase.TRAINING and now.done == 2:
-            seen.append(now.error)
-            raise ZeroDivisionError("of the listener")
-
-    with pytest.raises(ZeroDivisionError, match="of the listener"):
-        adapt(*SCENE, CONFIG, listen)
-    assert seen == [None]

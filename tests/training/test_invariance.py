@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
-from statistics import fmean
 
 import pytest
 import torch
@@ -20,7 +19,7 @@ from clod_adapter.training.pseudo_views import reaches
 from scenes import gaussians, photograph, ring
 
 Pair = tuple[Gaussians, Scene]
-CONFIG, SEEDS = AdaptConfig(max_sv=4, iters=300, lr_shN=0), (0, 1, 2)
+CONFIG = AdaptConfig(max_sv=4, iters=200, lr_shN=0)
 TURN = torch.linalg.qr(torch.tensor([[0.3, 0.9, -0.2], [0.5, -0.4, 0.7], [0.8, 0.1, 0.6]], dtype=torch.float64))[0]
 TURN = TURN * TURN.det()
 
@@ -45,14 +44,11 @@ def taken(truth: Gaussians) -> Scene:
     return Scene(tuple(v for k, v in enumerate(seen) if k % 4), seen[::4])
 
 
-def results(base: Gaussians, scene: Scene, seeds: Sequence[int] = (0,)) -> list[tuple[float, float]]:
-    """PSNR and share kept on the held-out views, at s = 1, 2 and 4; means over the seeds."""
-    found = []
-    for seed in seeds:
-        plan = make_plan(base, scene, replace(CONFIG, seed=seed))
-        rows = evaluate(plan.whole(base, plan.adapt(scene).gaussians), scene.test, (1.0, 2.0, 4.0))
-        found.append([(row.psnr, row.kept_share) for row in rows])
-    return [(fmean(p for p, _ in each), fmean(k for _, k in each)) for each in zip(*found, strict=True)]
+def results(base: Gaussians, scene: Scene) -> list[tuple[float, float]]:
+    """PSNR and share kept on the held-out views, at s = 1, 2 and 4."""
+    plan = make_plan(base, scene, CONFIG)
+    rows = evaluate(plan.whole(base, plan.adapt(scene).gaussians), scene.test, (1.0, 2.0, 4.0))
+    return [(row.psnr, row.kept_share) for row in rows]
 
 
 @pytest.fixture(scope="module")
@@ -110,52 +106,7 @@ def assert_same(found: list[tuple[float, float]], wanted: list[tuple[float, floa
         assert psnr == pytest.approx(other, abs=0.5) and kept == pytest.approx(share, abs=0.02), (found, wanted)
 
 
-def test_a_far_camera(pair: Pair) -> None:
-    """30 times farther away than the others. It changes the order of the views, as another seed does."""
-    base, scene = pair
-    far = photograph(base, ring(1, 48, 36, radius=120.0))
-    found = results(base, Scene((*scene.train, *far), scene.test), SEEDS)
-    assert_same(found, results(*pair, SEEDS))
-
-
-def test_a_far_shell() -> None:
-    """Gaussians around the scene, 100 times as far away: photographs show them between the others."""
-    both = surrounded(gaussians(600, 0, 0, size=0.15))
-    scene = taken(both)
-    (before,) = evaluate(perturbed(both), scene.test, [1.0])
-    assert results(perturbed(both), scene, SEEDS)[0][0] > before.psnr
-
-
-def surrounded(base: Gaussians) -> Gaussians:
-    random = torch.Generator().manual_seed(1)
-    sides = torch.nn.functional.normalize(torch.randn(200, 3, generator=random), dim=1)
-    shell = base.select(torch.arange(200)).replace(
-        means=400 * sides, log_scales=torch.full((200, 3), math.log(40.0)), opacity_logits=torch.full((200,), 2.0)
-    )
-    return base.replace(**{n: torch.cat([t, shell.tensors()[n]]) for n, t in base.tensors().items()})
-
-
-def test_split_gaussians(pair: Pair) -> None:
-    """Each in eight of a smaller size, with about the same integral: s = 1 is not below its base."""
-    base, scene = pair
-    small = split(base)
-    (before,) = evaluate(small, scene.test, [1.0])
-    assert results(small, scene)[0][0] > before.psnr
-
-
-def split(base: Gaussians) -> Gaussians:
-    corners = torch.tensor([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * 0.5
-    turns = rotations(base.quats.double()).float()
-    offsets = torch.einsum("nij,kj->nki", turns * base.scales[:, None, :], corners.float())
-    rows = torch.arange(len(base)).repeat_interleave(8)
-    return base.select(rows).replace(
-        means=(base.means[:, None] + offsets).reshape(-1, 3),
-        log_scales=base.log_scales[rows] + 0.5 * math.log(0.75),
-        opacity_logits=torch.special.logit(1 - (1 - base.opacities[rows].clamp(max=0.999)) ** (1 / 6)),
-    )
-
-
-@pytest.mark.parametrize("change", ["larger", "far camera", "split", "shell"])
+@pytest.mark.parametrize("change", ["larger", "far camera"])
 def test_lengths_of_the_scene(pair: Pair, change: str) -> None:
     """Where growth begins, offsets of pseudo views, and typical distances: to a few per cent."""
     base, scene = pair
@@ -164,13 +115,14 @@ def test_lengths_of_the_scene(pair: Pair, change: str) -> None:
         scale = 1000.0
         own, larger = placed(base, scene, scale, torch.eye(3).double(), 0.0)
         views = larger.train
-    elif change == "far camera":
-        views = (*views, *photograph(base, ring(1, 48, 36, radius=120.0)))
     else:
-        own = split(base) if change == "split" else surrounded(base)
+        views = (*views, *photograph(base, ring(1, 48, 36, radius=120.0)))
     cameras, usual = ([view.camera for view in some] for some in (views, scene.train))
     assert scene_distance(own, views) == pytest.approx(scale * scene_distance(base, scene.train), rel=0.05)
     assert reaches(own, cameras)[: len(usual)] == pytest.approx([scale * r for r in reaches(base, usual)], rel=0.1)
-    means, middle = own.means[:: 8 if change == "split" else 1][: len(base)], AttenuationConfig(scene_distance=scale)
-    found, wanted = typical_distance(means, cameras, middle), typical_distance(base.means, usual, AttenuationConfig())
+    middle = AttenuationConfig(scene_distance=scale)
+    found, wanted = (
+        typical_distance(own.means, cameras, middle),
+        typical_distance(base.means, usual, AttenuationConfig()),
+    )
     assert found.median() == pytest.approx(float(wanted.median()), rel=0.05)

@@ -18,10 +18,9 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.importance import initialize, removal_error
 from clod_adapter.progress import Phase, Progress, Stopped
 from clod_adapter.render import render
-from clod_adapter.training.ablation import largest_change, needed_share, seen, sh_degree_losses
 from clod_adapter.training.loop import adapt
-from clod_adapter.training.plan import NAMES, NOT_NEEDED, RATES, Decision, Override, Plan
-from clod_adapter.training.planner import make_plan
+from clod_adapter.training.plan import NAMES, NOT_NEEDED, RATES, Decision, Override, Plan, largest_change
+from clod_adapter.training.planner import make_plan, needed_share, seen, sh_degree_losses
 from scenes import assert_equal, gaussians, photograph, ring, with_unseen
 
 Pair = tuple[Gaussians, Scene]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 
 import numpy as np
 import pytest
@@ -17,16 +16,12 @@ from clod_adapter.training.camera_placement import place_cameras
 from clod_adapter.training.pseudo_views import (
     FARTHER,
     MOVED,
-    TIMES,
     TURNED,
     ZOOMED,
     PseudoView,
     add_pseudo_views,
     moved,
-    reaches,
     render_pseudo_views,
-    shown,
-    teachers_to,
 )
 from clod_adapter.training.schedule import ViewSampler
 
@@ -66,17 +61,6 @@ def test_each_step_renders_the_checkpoint_from_another_camera(blob: clod.Gaussia
     assert all(torch.equal(a.camera.viewmat, b.camera.viewmat) for a, b in zip(drawn, again, strict=True))
 
 
-def test_views_of_one_teacher_share_it_on_another_device(blob: clod.Gaussians) -> None:
-    placed = render_pseudo_views(blob, scenes.ring(3, 16, 12)).train
-    photograph = scenes.photograph(blob, scenes.ring(1, 16, 12))[0]
-    *there, same = teachers_to((*placed, photograph), "meta")
-    assert same is photograph
-    for view, own in zip(there, placed, strict=True):
-        assert isinstance(view, PseudoView) and isinstance(there[0], PseudoView) and isinstance(own, PseudoView)
-        assert view.teacher is there[0].teacher and view.teacher.means.device.type == "meta"
-        assert view.camera is own.camera and view.reach == own.reach
-
-
 def test_moved_cameras_have_the_documented_offsets() -> None:
     camera, random, reach = scenes.ring(1, 40, 30)[0], np.random.default_rng(0), 3.0
     found = [moved(camera, reach, random) for _ in range(2000)]
@@ -91,20 +75,6 @@ def test_moved_cameras_have_the_documented_offsets() -> None:
     assert torch.equal(zooms[:, 0], zooms[:, 1]) and 0.9 * ZOOMED < zooms.abs().max() <= 1.001 * ZOOMED
     for each in found[:9]:
         assert torch.equal(each.K[:, 2], camera.K[:, 2]) and (each.width, each.name) == (camera.width, camera.name)
-
-
-def test_offsets_follow_the_distance_of_camera_and_scene(blob: clod.Gaussians) -> None:
-    """In any unit, and whatever the sizes of the Gaussians; also for a camera that looks past the scene."""
-    cameras, rows = scenes.ring(5, 40, 30), torch.arange(len(blob)).repeat_interleave(8)
-    usual = reaches(blob, cameras)
-    assert usual == pytest.approx([float(camera.position.norm()) for camera in cameras], rel=0.3)
-    smaller = blob.select(rows).replace(log_scales=blob.log_scales[rows] - math.log(2))
-    assert reaches(smaller, cameras) == pytest.approx(usual)
-    larger = blob.replace(means=1000 * blob.means, log_scales=blob.log_scales + math.log(1000))
-    far = [dataclasses.replace(c, viewmat=c.viewmat * torch.tensor([[1.0, 1, 1, 1000]])) for c in cameras]
-    assert reaches(larger, far) == pytest.approx([1000 * each for each in usual], rel=1e-4)
-    (alone,) = scenes.ring(1, 40, 30, radius=100.0)
-    assert reaches(blob, [*cameras, alone])[-1] < 2 * max(usual)
 
 
 def test_training_on_pseudo_views_improves_held_out_views() -> None:
@@ -144,18 +114,6 @@ def test_photographs_that_show_too_little_get_pseudo_views(
     scene, lighter = add_pseudo_views(faint, clod.Scene(around[:2], ()), config)
     assert scene.train == around[:2] and "no pseudo views can be added" in scene.notes[-1]
     assert clod.adapt(faint, scene, lighter).steps == 1
-
-
-def test_share_shown_often_enough(blob: clod.Gaussians) -> None:
-    """Of what the cameras see; photographs from elsewhere do not count."""
-    cameras = scenes.ring(40, 80, 60)
-    views = scenes.photograph(blob, cameras)
-    behind = torch.eye(4)
-    behind[2, 3] = -50.0
-    away = clod.View(dataclasses.replace(cameras[0], viewmat=behind @ cameras[0].viewmat), views[0].image)
-    assert shown(blob, views, cameras) > 0.95
-    assert shown(blob, views[: TIMES - 1], cameras) == 0 == shown(blob, [away] * 8, cameras)
-    assert 0 < shown(blob, [*views[:TIMES], away], cameras) < 0.95
 
 
 def test_some_moved_cameras_step_back(blob: clod.Gaussians) -> None:

@@ -80,17 +80,6 @@ def test_untrained_rows_keep_their_units_when_resumed(captured: Pair, distance: 
     torch.testing.assert_close(whole.gaussians.sigma_d[rest], base.sigma_d[rest] * distance)
 
 
-def test_a_state_holds_trained_parameters_only(captured: Pair) -> None:
-    base, states = captured[0], dict[int, TrainingState]()
-    still = {"lr_shN": 0.0, "lr_means": 0.0}
-    adapt(*captured, config_of(iters=10, **still), states_of({1, 10}, states))
-    changing = {"quats", "log_scales", "opacity_logits", "sh0", "log_sigma", "growth_d"}
-    for step, kinds in ((1, {"parameter", "first", "second", "steps"}), (10, {"mean"})):
-        assert {name.split(".")[1] for name in states[step].tensors} == changing | {"kept", "all", "checks"}
-        assert kinds <= {name.split(".")[0] for name in states[step].tensors}
-    assert "mean.quats" not in states[1].tensors and len(states[1].tensors["first.sh0"]) == len(base)
-
-
 def test_a_state_of_another_run_is_refused(captured: Pair) -> None:
     base, scene = captured
     config, states = config_of(iters=2), dict[int, TrainingState]()

@@ -2,22 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import pytest
 import torch
 from torch import Tensor
 
-from clod_adapter.adapter import with_dial
 from clod_adapter.config import AdaptConfig, AttenuationConfig
-from clod_adapter.equation.attenuation import dial
 from clod_adapter.equation.extinction import sigma_for_extinction
 from clod_adapter.equation.growth import growth_factors
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.initialization import growth_start, importance
-from clod_adapter.initialization.growth_start import MOST, SHARE, initial_growth
-from clod_adapter.initialization.importance import for_training, has_dial, initialize, scene_distance
-from clod_adapter.initialization.pruning_order import PruningOrder, pruning_order
+from clod_adapter.initialization.importance import initialize
+from clod_adapter.initialization.pruning_order import MOST, SHARE, initial_growth, pruning_order
 from scenes import gaussians, photograph, ring
 
 MAX_SV = 5.0
@@ -42,7 +36,7 @@ def test_growth_preserves_the_area(
     monkeypatch: pytest.MonkeyPatch, opacities: list[float], until: list[float], substitutes: list[int], larger: float
 ) -> None:
     """Fitted at the end of the dial alone, the remaining one has the area of all that it stands for."""
-    monkeypatch.setattr(growth_start, "DIALS", 2)
+    monkeypatch.setattr("clod_adapter.initialization.pruning_order.DIALS", 2)
     some, d = equal_ones(opacities, until)
     fitted = initial_growth(some, torch.tensor(substitutes), d) / SHARE
     factor = growth_factors(fitted, d, MAX_SV, 1.0)[-1]
@@ -64,51 +58,9 @@ def test_exponents_are_in_range_and_0_without_descendants() -> None:
     assert not initial_growth(alone, order.substitute, d).any()  # a dial of one value
 
 
-def test_extreme_areas_and_circles_of_substitutes() -> None:
-    """Gaussians of no opacity, no size or infinite size; removed ones that are each other's substitutes."""
-    some, d = equal_ones([0.5] * 4, [2.0, 2.0, 2.0, 9.0])
-    scales = torch.stack([torch.full((3,), size) for size in (-500.0, 500.0, 0.0, 0.0)])
-    some = some.replace(log_scales=scales, opacity_logits=some.opacity_logits.index_fill(0, torch.tensor([2]), -200.0))
-    for substitutes in ([3, 3, 3, 3], [1, 2, 0, 3]):
-        found = initial_growth(some, torch.tensor(substitutes), d)
-        assert found.isfinite().all() and found.min() >= 0 and found.max() <= MOST * SHARE
-
-
 @pytest.mark.parametrize("iters", [1, 0])
 def test_growth_is_fitted_without_training_only(iters: int) -> None:
     """An exponent of 0 is trained as any other."""
     some = gaussians(60, 0, 0)
     found = initialize(some, photograph(some, ring(2, 16, 12)), AdaptConfig(iters=iters)).growth_d
     assert found is not None and bool(found.any()) == (iters == 0)
-
-
-def test_a_dial_of_the_base_keeps_its_growth(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where it has none growth starts at 0, and without growth it is dropped."""
-    some = gaussians(60, 0, 0)
-    views, fitted = photograph(some, ring(2, 16, 12)), list[Any]()
-    grown = initialize(some, views, AdaptConfig(iters=0))
-    plain = initialize(some, views, AdaptConfig(growth="off"))
-    assert plain.growth_d is None and torch.equal(plain.sigma_d, grown.sigma_d)
-
-    def order(*given: Any) -> PruningOrder:
-        fitted.append(given)
-        return pruning_order(*given)
-
-    monkeypatch.setattr(importance, "pruning_order", order)
-    assert initialize(grown, views, AdaptConfig()).growth_d is grown.growth_d
-    assert not initialize(plain, views, AdaptConfig()).growth_d.any()
-    assert initialize(grown, views, AdaptConfig(growth="off")).growth_d is None and fitted == []
-
-
-def test_unknown_unit_of_growth_is_measured_once() -> None:
-    """By the initialization, in all views; what follows finds it known, however few views it has."""
-    some = gaussians(60, 0, 0)
-    views = photograph(some, ring(2, 16, 12))
-    initial = initialize(with_dial(some, torch.full((60,), 3.0), None, torch.full((60,), 0.5)), views, AdaptConfig())
-    assert initial.attenuation is not None
-    assert initial.attenuation.reference_distance == scene_distance(some, views)
-    trained = for_training(initial, views[:1], AdaptConfig())
-    before, after = (dial(one, views[0].camera, 2.0).growth for one in (initial, trained))
-    assert before is not None and after is not None and (before > 1).any()
-    torch.testing.assert_close(after, before)
-    assert has_dial(with_dial(some, None, None, torch.full((60,), 0.5))) and not has_dial(with_dial(some))
