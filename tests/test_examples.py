@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-import json
+import os
 import re
 import runpy
 import shutil
+import signal
+import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -15,6 +17,7 @@ import pytest
 import torch
 from PIL import Image
 
+import browser
 import clod_adapter
 import gsplat_in_torch
 from clod_adapter.io.checkpoint import blank
@@ -112,20 +115,28 @@ def test_a_loop_of_gsplat_trains_a_dial(
     assert len(rows) == 2 and model.growth_d.abs().max() > 0.05 and len(model) == 300
 
 
-def test_the_notebook() -> None:
-    """Its cells run, with fewer steps, and what it stores is from one run of all of them, without errors."""
-    cells = json.loads((FOLDER / "notebook.ipynb").read_text(encoding="utf-8"))["cells"]
-    code = [cell for cell in cells if cell["cell_type"] == "code"]
-    outputs = [output for cell in code for output in cell["outputs"]]
-    assert [cell["execution_count"] for cell in code] == list(range(1, len(code) + 1))
-    assert all(output["output_type"] != "error" and output.get("name") != "stderr" for output in outputs)
-    assert [
-        len(output["data"]["image/jpeg"]) < 100_000 for output in outputs if "image/jpeg" in output.get("data", {})
-    ] == [True] * 2
-    source = "\n".join("".join(cell["source"]) for cell in code)
-    fewer = source.replace("= 600, 200", "= 5, 5")
-    assert fewer != source
-    exec(compile(fewer, "notebook.ipynb", "exec"), {})
+def test_the_slider_turns_the_dial_while_it_trains(capture: Any, tmp_path: Path) -> None:
+    pytest.importorskip("viser", reason="pip install viser")
+    words = [sys.executable, str(EXAMPLES[8]), str(capture.ply), str(capture.scene)]
+    environment = os.environ | {"PYTHONPATH": str(FOLDER.parent), "PYTHONUNBUFFERED": "1"}
+    process = subprocess.Popen(words, cwd=tmp_path, env=environment, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    try:
+        with browser.launch() as chromium:
+            page = chromium.new_page()
+            page.goto(next(found[0] for line in process.stdout if (found := re.search(r"http://\S+", line))))
+            dial, drawn = (page.get_by_role("textbox").nth(k) for k in range(2))
+            page.wait_for_function("[...document.querySelectorAll('input')].some((one) => / of 300/.test(one.value))")
+            full = int(drawn.input_value().partition(" ")[0])
+            dial.fill("5")
+            dial.press("Enter")
+            page.wait_for_timeout(1500)
+            assert int(drawn.input_value().partition(" ")[0]) < full / 2
+        process.send_signal(signal.SIGINT)
+        process.wait(20)
+    finally:
+        process.kill()
+    assert clod_adapter.load(tmp_path / "slider.ply").gaussians.attenuation.max_sv == 5
 
 
 def test_bad_arguments_are_refused(run: Any) -> None:
@@ -138,5 +149,5 @@ def test_bad_arguments_are_refused(run: Any) -> None:
 
 def test_the_readme_lists_every_example() -> None:
     listed = re.findall(r"\]\((.+?)\)", (FOLDER / "README.md").read_text(encoding="utf-8"))
-    assert listed == [*(path.name for path in EXAMPLES.values()), "notebook.ipynb"]
+    assert listed == [path.name for path in EXAMPLES.values()]
     assert list(EXAMPLES) == list(range(1, len(EXAMPLES) + 1))
