@@ -19,8 +19,7 @@ from clod_adapter import Gaussians, attach, evaluate, from_gsplat, render, to_gs
 from clod_adapter.adapter import detach
 from clod_adapter.alignment.check import check_alignment
 from clod_adapter.bake import bake, order_by_extinction
-from clod_adapter.blocks.divide import divide
-from clod_adapter.blocks.targets import target_image
+from clod_adapter.blocks.divide import divide, target_image
 from clod_adapter.blocks.train import adapt_block, merge
 from clod_adapter.cameras import Camera, Scene
 from clod_adapter.config import AdaptConfig

@@ -16,8 +16,7 @@ from torch import Tensor
 import inria_forks
 from clod_adapter.adapter import detach, with_dial
 from clod_adapter.bake import bake, order_by_extinction
-from clod_adapter.blocks.divide import divide
-from clod_adapter.blocks.targets import block_target, context_rows
+from clod_adapter.blocks.divide import block_target, context_rows, divide
 from clod_adapter.cameras import View
 from clod_adapter.config import AdaptConfig, AttenuationConfig
 from clod_adapter.equation import attenuation, growth

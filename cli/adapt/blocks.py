@@ -8,9 +8,8 @@ from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass, replace
 
 from clod_adapter._support.version import package_version
-from clod_adapter.blocks.divide import Division, check_divisible, divide
+from clod_adapter.blocks.divide import Division, block_config, check_divisible, divide
 from clod_adapter.blocks.memory import MemoryPlan
-from clod_adapter.blocks.targets import block_config
 from clod_adapter.blocks.train import Learned, adapt_block, merge
 from clod_adapter.cameras import View
 from clod_adapter.errors import ClodError

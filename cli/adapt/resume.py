@@ -14,8 +14,7 @@ from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.robustness import scene_fingerprint
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.training.state import TrainingState
-from clod_adapter.training.state_file import load_state
+from clod_adapter.training.state import TrainingState, load_state
 
 from ..commands.settings import OPTIONS
 from ..shared.console import Console

@@ -12,8 +12,7 @@ from pathlib import Path
 
 from clod_adapter.errors import ClodError
 from clod_adapter.progress import Listener, Progress, Stopped
-from clod_adapter.training.state import StateRefused
-from clod_adapter.training.state_file import save_state
+from clod_adapter.training.state import StateRefused, save_state
 
 from ..shared.console import Console
 from ..shared.process import GracefulStop

@@ -1,23 +1,36 @@
-"""Division of a scene into blocks: the Gaussians of each, the views that see it, and the shared initialization."""
+"""Division of a scene into blocks, and the training data of each: views, context, target images, shares, settings."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from clod_adapter.cameras import View
+from clod_adapter.adapter import detach
+from clod_adapter.cameras import Camera, View, spread
 from clod_adapter.config import AdaptConfig
+from clod_adapter.equation.attenuation import dial
+from clod_adapter.equation.distances import normalized_distances, typical_distance
 from clod_adapter.errors import ClodError
-from clod_adapter.gaussians import Gaussians
+from clod_adapter.gaussians import SH_C0, Gaussians
 from clod_adapter.initialization.importance import coverage, reduced
+from clod_adapter.losses import unit
 from clod_adapter.progress import Listener, Phase, tell
+from clod_adapter.render import splat
+from clod_adapter.training.target_count import TargetShare, target_curve
 
 UNSEEN = 0.005  # of a block's coverage over all views, the share that the views it is not trained on may have
+LEFT_OUT = 1e-3  # of an image, the share that the Gaussians left out of a block's context may cover
+CONTEXT_VIEWS = 32  # most views that the context is chosen in
+BARE = 0.01  # of a pixel: where Gaussians cover less, blocks share the error by their sizes too
+DIALS = 9  # dial values at which the Gaussians kept by the initialization are counted
+SECOND = 0.25  # of the steps, those of the second pass
+LEAST_SEEN = 0.02  # of an image: a block that covers less has too small a part of the whole loss
 
 
 @dataclass(frozen=True)
@@ -140,3 +153,126 @@ def check_divisible(config: AdaptConfig) -> None:
             "the paper's form cannot be trained in blocks: its count and its distances are of all Gaussians at once; "
             "leave out --form paper, or --memory"
         )
+
+
+def context_rows(
+    division: Division,
+    block: int,
+    views: Sequence[View],
+    after: Gaussians | None = None,
+    progress: Listener | None = None,
+) -> Tensor:
+    """``[m]`` int64, ascending: the Gaussians of other blocks that any of the views needs.
+
+    Those left out cover at most LEFT_OUT of each image together, at s = 0, 1 and max_sv; at most
+    CONTEXT_VIEWS views are rendered, evenly spread.
+
+    Args:
+        after: in the second pass, the scene after the first; other blocks are then drawn at the dial.
+    """
+    own = division.block == block
+    scene = after or division.initial
+    assert scene.attenuation is not None
+    drawn, views = torch.zeros_like(own), spread(views, CONTEXT_VIEWS)
+    for k, view in enumerate(views):
+        distances = normalized_distances(scene.means, view.camera, scene.attenuation)
+        for s in (0.0, 1.0, scene.attenuation.max_sv):
+            dialled = dial(scene, distances, s)
+            opacities, growth = dialled.drawn, dialled.growth
+            if not after:
+                opacities = torch.where(own, opacities, scene.opacities)
+                growth = torch.where(own, growth, 1)
+            covered = coverage(scene, opacities, view.camera, growth)
+            drawn |= covered > _least_covered(covered)
+        tell(progress, Phase.CONTEXT, k + 1, len(views))
+    return (drawn & ~own).nonzero()[:, 0]
+
+
+def _least_covered(covered: Tensor) -> Tensor:
+    """0-d, the coverage up to which all Gaussians together cover at most LEFT_OUT of the image."""
+    ordered = covered[covered > 0].sort().values
+    few = int((ordered.double().cumsum(0) <= LEFT_OUT * ordered.double().sum()).sum())
+    return ordered[few - 1] if few else covered.new_zeros(())
+
+
+def block_target(
+    division: Division, block: int, cameras: Sequence[Camera], config: AdaptConfig, *, first: bool
+) -> Callable[[float], TargetShare]:
+    """The block's target in the count term, by dial value.
+
+    In an undivided run the count term's gradient on each of all N Gaussians is ``loss (eta / target - 1) / (target
+    N)``. For a block, ``eta / target`` is the number that the block keeps divided by the number that it should keep:
+    ``target N`` times its part of the Gaussians that the initialization keeps at this s. So after initialization each
+    block is penalised like the whole scene, and an allocation found between blocks stays. The loss is that of the whole
+    image; in the first pass the block's is the part of the image it covers. Views that do not show the block would
+    penalise it too: each of its own views also counts for some of those.
+
+    Args:
+        cameras: the whole scene's, which Gaussians are counted at typical distances from.
+    """
+    initial, numbers = division.initial, division.views(block)
+    assert initial.attenuation is not None
+    distances, own = typical_distance(initial.means, cameras, initial.attenuation), division.block == block
+    kept = [dial(initial, distances, s).keep for s in _dial_grid(config)]
+    parts = np.array([float((rows & own).sum() / rows.sum().clamp(min=1)) for rows in kept])
+    stands_for = len(division.seen) / len(numbers)
+    if first:
+        stands_for /= max(float(division.seen[numbers, block].mean()), LEAST_SEEN)
+    return partial(_target_share, config, parts, stands_for, int(own.sum()), division.total)
+
+
+def _dial_grid(config: AdaptConfig) -> list[float]:
+    """DIALS dial values from 1 to ``max_sv`` in even steps of their logarithm."""
+    return [config.max_sv ** (k / (DIALS - 1)) for k in range(DIALS)]
+
+
+def _target_share(
+    config: AdaptConfig, parts: np.ndarray, stands_for: float, count: int, total: int, virtual_scale: float
+) -> TargetShare:
+    """The target of ``count`` of ``total`` Gaussians, which are ``parts [DIALS]`` of the kept ones."""
+    at = math.log(virtual_scale) / math.log(config.max_sv) * (DIALS - 1)
+    part = float(np.interp(at, np.arange(DIALS), parts))
+    whole = target_curve(virtual_scale, config.share, config.exponent)
+    wanted = max(whole * total * part, 1.0)
+    return TargetShare(wanted / count, stands_for * count / (whole * total))
+
+
+@torch.no_grad()
+def target_image(gaussians: Gaussians, own: int, view: View) -> Tensor:
+    """``[H, W, 3]`` uint8: the checkpoint's image, plus the block's part of its difference from the photograph.
+
+    ``p + w (q - p)`` of image p and photograph q, with w the part of a pixel that the first ``own`` Gaussians cover.
+    Over all blocks these parts add up to 1, so the requested changes add up to the whole difference, and no two blocks
+    correct the same error.
+    """
+    plain = detach(gaussians)
+    image, alpha = splat(plain, gaussians.opacities, view.camera)
+    marked = torch.full_like(gaussians.sh0, -0.5 / SH_C0)
+    marked[:own] = 0.5 / SH_C0
+    mine, _ = splat(plain.replace(sh0=marked, shN=gaussians.shN[:, :0]), gaussians.opacities, view.camera)
+    part = ((mine[..., :1] + BARE * own / len(gaussians)) / (alpha[..., None] + BARE)).clamp(0, 1)
+    aimed = ((image + part * (unit(view.image, image) - image)).clamp(0, 1) * 255).round().to(torch.uint8)
+    return aimed.cpu()  # where photographs are: a device would fill up with them
+
+
+def block_config(division: Division, block: int, config: AdaptConfig, *, first: bool) -> AdaptConfig:
+    """The settings of one block in one pass: its steps, share of a time budget, and own seed."""
+    steps, light = _steps(division, block, config)
+    every = sum(division.steps(other, config) for other in range(division.count))
+    own = steps - light if first else light
+    seed = (config.seed + 1 + block + (0 if first else division.count)) % 2**63
+    budget = config.time_budget and config.time_budget * own / max(every, 1) or None
+    return replace(config, iters=own, time_budget=budget, seed=seed)
+
+
+def block_span(division: Division, block: int, config: AdaptConfig, *, first: bool) -> tuple[float, float]:
+    """``TrainableSubset.span`` of one pass: the second takes up the schedule where the first one ends."""
+    steps, light = _steps(division, block, config)
+    between = 1 - light / max(steps, 1)
+    return (0.0, between) if first else (between, 1.0)
+
+
+def _steps(division: Division, block: int, config: AdaptConfig) -> tuple[int, int]:
+    """The steps of a block in both passes, and in the second one."""
+    steps = division.steps(block, config)
+    return steps, round(SECOND * steps) if division.passes > 1 else 0

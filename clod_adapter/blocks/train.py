@@ -26,8 +26,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from clod_adapter.blocks.divide import Division
-from clod_adapter.blocks.targets import block_config, block_span, block_target, context_rows, target_image
+from clod_adapter.blocks.divide import Division, block_config, block_span, block_target, context_rows, target_image
 from clod_adapter.cameras import Scene, View, spread
 from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError

@@ -10,8 +10,8 @@ from clod_adapter.adapter import Adapter
 from clod_adapter.inspection.statistics import Spread
 from clod_adapter.io.adapter_file import FORMAT, KEY, load_adapter
 from clod_adapter.io.tensor_file import read_tensor_header
-from clod_adapter.training.state_file import KEY as STATE_KEY
-from clod_adapter.training.state_file import load_state
+from clod_adapter.training.state import KEY as STATE_KEY
+from clod_adapter.training.state import load_state
 
 
 def inspect_tensors(path: Path) -> tuple[str, dict[str, Any], tuple[str, ...]] | None:

@@ -10,8 +10,17 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from clod_adapter.blocks.divide import Division, divide, split
-from clod_adapter.blocks.targets import LEFT_OUT, block_config, block_span, block_target, context_rows, target_image
+from clod_adapter.blocks.divide import (
+    LEFT_OUT,
+    Division,
+    block_config,
+    block_span,
+    block_target,
+    context_rows,
+    divide,
+    split,
+    target_image,
+)
 from clod_adapter.blocks.train import Learned, adapt_block, merge
 from clod_adapter.cameras import Scene
 from clod_adapter.config import AdaptConfig

@@ -25,7 +25,7 @@ from clod_adapter.cli.shared import measure
 from clod_adapter.progress import Phase, tell
 from clod_adapter.training import planner
 from clod_adapter.training.interrupts import ENDING, PRESSED
-from clod_adapter.training.state_file import load_state
+from clod_adapter.training.state import load_state
 from runs import OUTPUTS, STATE, Launched, Server, launch, log_of, names, pressing, wait_for
 from scenes import stripped
 

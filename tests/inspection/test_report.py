@@ -27,8 +27,7 @@ from clod_adapter.io.checkpoint import blank, load, save
 from clod_adapter.io.file_formats import write as save_as
 from clod_adapter.io.ply.columns import rows_of
 from clod_adapter.origin import NOWHERE
-from clod_adapter.training.state import TrainingState
-from clod_adapter.training.state_file import save_state
+from clod_adapter.training.state import TrainingState, save_state
 from formats import CALIBRATION, with_columns
 from packing import write_packed
 

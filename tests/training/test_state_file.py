@@ -16,9 +16,7 @@ from safetensors.torch import load_file, save_file
 
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
-from clod_adapter.training import state_file
-from clod_adapter.training.state import TrainingState
-from clod_adapter.training.state_file import load_state, save_state
+from clod_adapter.training.state import KEY, TrainingState, load_state, save_state
 
 BELONGS = {"config": {"seed": 2**63 - 1, "lr": 0.1}, "base": "abc"}
 
@@ -62,12 +60,12 @@ def test_other_files_are_refused(tmp_path: Path, state: TrainingState) -> None:
     save_state(good, state, BELONGS)
     tensors = load_file(good)
     with safe_open(good, framework="pt") as file:
-        about = json.loads(file.metadata()[state_file.KEY])
+        about = json.loads(file.metadata()[KEY])
     for content in (good.read_bytes()[:-5], b"ply"):
         bad.write_bytes(content)
         assert_refused(bad)
     for text in ("[]", *(json.dumps(about | changes) for changes in CHANGES)):
-        save_file(tensors, bad, {state_file.KEY: text})
+        save_file(tensors, bad, {KEY: text})
         assert_refused(bad)
     save_file(tensors, bad)  # an adapter, say
     assert_refused(bad)

@@ -17,7 +17,7 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.progress import Phase, Progress
 from clod_adapter.training import planner
 from clod_adapter.training.plan import NAMES
-from clod_adapter.training.state_file import load_state, save_state
+from clod_adapter.training.state import load_state, save_state
 from runs import OUTPUTS
 
 TINY = ("--iters", 24, "--max-sv", 4, "--out", "dial.ply")

@@ -20,7 +20,7 @@ from clod_adapter.cli.main import build_parser
 from clod_adapter.cli.shared.process import Launch, launched
 from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
-from clod_adapter.training.state_file import load_state
+from clod_adapter.training.state import load_state
 from runs import STATE, Launched, Server, accepted, launch
 
 TINY = ("--max-sv", 4, "--out", "dial.ply", "--batch", 2, "--iters", 12)

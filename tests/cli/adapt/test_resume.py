@@ -35,7 +35,7 @@ from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.progress import Phase, Progress
 from clod_adapter.training.loop import adapt
-from clod_adapter.training.state_file import KEY
+from clod_adapter.training.state import KEY
 from runs import OUTPUTS, STATE, names
 from scenes import capture as small_capture
 from scenes import stripped
