@@ -14,7 +14,6 @@ from clod_adapter.cameras import Camera
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.equation.attenuation import attenuate
 from clod_adapter.equation.distances import normalized_distances, viewpoint_of
-from clod_adapter.equation.extinction import extinction_scale, sigma_for_extinction
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.budget import dial_for
 from clod_adapter.gaussians import Gaussians
@@ -41,17 +40,6 @@ def test_opacities_are_those_drawn(cut: str) -> None:
     assert len(baked) == 7 and baked.opacity_logits.isfinite().all()
     torch.testing.assert_close(baked.opacities, want.drawn, atol=1e-7, rtol=2e-6)
     assert (want.drawn[-1] < 0.9 * want.opacities[-1]) == (cut == "soft")
-
-
-@CUTS
-def test_opacities_at_the_threshold_have_finite_logits(cut: str) -> None:
-    config = AttenuationConfig(tau=0.02, cut=cut, scene_distance=4.0)
-    logits, ones = torch.linspace(-2, 6, 5000), torch.ones(5000)
-    for s in (1.0, 1.7, 3.3):
-        sigma = sigma_for_extinction(logits, ones, s * ones, config)
-        some = with_dial(at_one_place(gaussians(5000, 0, 0)).replace(opacity_logits=logits), sigma, config)
-        baked = bake(some, s, camera())
-        assert 0 < len(baked) < 5000 and baked.opacity_logits.isfinite().all()
 
 
 def test_a_dial_without_effect_changes_nothing() -> None:
@@ -97,16 +85,6 @@ def test_prefixes_match_baked_rows(cameras: list[Camera]) -> None:
         assert torch.equal(head.means, ordered.means[:kept])  # those kept are the first, in their order
 
 
-def test_rows_with_equal_extinction_stay_in_order() -> None:
-    some = at_one_place(gaussians(40, 0, 3))
-    same = with_dial(some.replace(opacity_logits=torch.zeros(40)), torch.ones(40), CONFIG)
-    assert torch.equal(order_by_extinction(same, [camera()]), torch.arange(40))
-    some = with_dial(some, torch.linspace(0.1, 2, 40), CONFIG)
-    order = order_by_extinction(some, [camera()])
-    scales = extinction_scale(some.opacity_logits, some.sigma_d, torch.ones(40), CONFIG)[order]
-    assert (scales.diff() <= 0).all() and scales[0] > scales[-1]
-
-
 def test_several_cameras_share_one_distance_per_gaussian() -> None:
     some, cameras, s = spread(), ring(3, 61, 45), 3.0
     assert some.sigma_d is not None and some.attenuation is not None
@@ -119,13 +97,6 @@ def test_several_cameras_share_one_distance_per_gaussian() -> None:
     torch.testing.assert_close(baked.scales, (some.scales * grown.growth[:, None])[kept.keep], atol=1e-6, rtol=1e-5)
     places = [viewpoint_of(each, some.means, CONFIG) for each in cameras]
     assert torch.equal(bake(some, s, cameras=places).means, baked.means)
-
-
-def test_without_growth_scales_are_unchanged() -> None:
-    some = spread()
-    for growth_d in (None, torch.zeros(300)):
-        baked = bake(some.replace(growth_d=growth_d), 2.5, camera())
-        assert torch.equal(baked.log_scales, some.log_scales[render(some, camera(), 2.5).kept])
 
 
 @pytest.mark.parametrize("several", [False, True])

@@ -120,16 +120,6 @@ def test_a_damaged_table_is_ignored(tmp_path: Path, old: bytes, new: bytes, said
     assert any(re.search(said, note) for note in loaded.notes), loaded.notes
 
 
-def test_a_table_without_its_kind_is_against_photographs(tmp_path: Path) -> None:
-    about = Calibration(**GOOD).as_dict()
-    assert about.pop("against") == "photographs" and Calibration.from_dict(about) == Calibration(**GOOD)
-    base = load(edited(dialled(tmp_path / "a.ply"), b" 8 photographs", b" 8"))
-    assert base.calibration == Calibration(**{**GOOD, "total": 4})
-    save(tmp_path / "b.ply", base.gaussians, base)
-    assert load(tmp_path / "b.ply").calibration is None
-    assert b"calibrated" not in (tmp_path / "b.ply").read_bytes()
-
-
 def test_stored_viewpoints_are_cameras_again(tmp_path: Path) -> None:
     cameras = ring(3, 40, 30)
     config = AttenuationConfig()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from clod_adapter.config import AttenuationConfig
 from clod_adapter.equation.attenuation import dial
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.hook import Hold, Hook
+from clod_adapter.hook import Hook
 from scenes import camera, gaussians
 
 N = 200
@@ -55,42 +56,6 @@ def test_numpy_and_torch_agree_with_a_rendering(tmp_path: Path, normalizer: str,
             assert (array == tensor.numpy()).all()
         counts.append(int(keep.sum()))
     assert counts[0] > counts[1] > counts[2]
-
-
-def test_without_growth_d_factors_are_ones() -> None:
-    model, view = adapted(), camera()
-    hook = replace(hook_of(model), growth_d=None)
-    growth = hook(model.means, model.opacities, view.viewmat)[2]
-    assert torch.equal(growth, torch.ones(N))
-    double = hook(model.means.double().numpy(), model.opacities.double().numpy(), view.viewmat)[2]
-    assert double.dtype == np.float64 and (double == 1).all()
-
-
-def test_shape_and_type_are_those_of_the_opacities() -> None:
-    model, view = adapted(), camera()
-    column, _, _ = hook_of(model)(model.means, model.opacities[:, None], view.viewmat)
-    assert column.shape == (N, 1)
-    double, keep, _ = hook_of(model)(model.means.double(), model.opacities.double(), view.viewmat.double())
-    assert double.dtype == torch.float64 and keep.shape == (N,)
-    half, _, _ = hook_of(model)(model.means, model.opacities.half(), view.viewmat)
-    assert half.dtype == torch.float16
-    torch.testing.assert_close(column[:, 0].double(), double, rtol=1e-4, atol=1e-6)
-
-
-def test_float16_and_autocast_keep_distances() -> None:
-    """Squares of the distances overflow float16, and autocast would round products to bfloat16."""
-    model, view = adapted(scene_distance=300.0, normalizer="quantile"), camera()
-    viewmat = view.viewmat.clone()
-    viewmat[:3, 3] = torch.tensor([100.0, 200.0, 300.0])
-    given = (viewmat, view.K, view.width, view.height)
-    means = (300 * model.means).half()
-    drawn, keep, _ = hook_of(model)(means.float(), model.opacities, *given)
-    assert 0 < int(keep.sum()) < N
-    half, same, _ = hook_of(model)(means, model.opacities, *given)
-    assert torch.equal(half, drawn) and torch.equal(same, keep)
-    with torch.autocast("cpu", torch.bfloat16):
-        cast, same, _ = hook_of(model)(means.float(), model.opacities, *given)
-    assert torch.equal(cast, drawn) and torch.equal(same, keep)
 
 
 def test_mixed_and_strided_arrays_are_accepted() -> None:
@@ -159,38 +124,14 @@ def test_hold_moves_the_dial_by_the_times_it_takes() -> None:
     assert replace(start, virtual_scale=9.0).hold(10).hook.virtual_scale == 5
 
 
-def test_hold_measures_the_block_and_the_work_on_the_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The clock counts CUDA's work at the end of the block, and not the work from before it."""
-    clock = {"now": 0.0, "queued": 99.0}
-
-    def synchronize() -> None:
-        clock["now"] += clock.pop("queued", 0.0)
-
-    monkeypatch.setattr(torch.cuda, "is_initialized", lambda: True)
-    monkeypatch.setattr(torch.cuda, "synchronize", synchronize)
-    monkeypatch.setattr("clod_adapter.hook.time.perf_counter", lambda: clock["now"])
-    hold, times = hook_of(adapted(), 2.0).hold(10), []
-    monkeypatch.setattr(Hold, "took", lambda self, milliseconds: times.append(milliseconds))
-    with hold.frame() as hook:
-        assert hook is hold.hook
-        clock.update(now=clock["now"] + 0.002, queued=0.005)
+def test_hold_measures_the_block() -> None:
+    hold = hook_of(adapted(), 2.0).hold(milliseconds=1)
+    for _ in range(4):
+        with hold.frame() as hook:
+            assert hook is hold.hook
+            time.sleep(0.002)
+    assert hold.hook.virtual_scale > 2
+    before = hold.hook
     with pytest.raises(KeyError), hold.frame():
         raise KeyError  # a frame that was not finished has no time
-    assert times == [pytest.approx(7.0)]
-
-
-@pytest.mark.parametrize("milliseconds", [0, -1, float("nan"), float("inf")])
-def test_hold_refuses_times_that_are_none(milliseconds: float) -> None:
-    with pytest.raises(ClodError, match="milliseconds is .*, it must be above 0 and finite"):
-        hook_of(adapted()).hold(milliseconds)
-    if milliseconds:
-        with pytest.raises(ClodError, match="the time of a frame is .*, it must be at least 0 ms and finite"):
-            hook_of(adapted()).hold(10).took(milliseconds)
-
-
-def test_a_hook_of_arrays() -> None:
-    model = adapted()
-    assert model.sigma_d is not None and model.growth_d is not None
-    arrays = replace(hook_of(model), sigma_d=model.sigma_d.numpy(), growth_d=model.growth_d.numpy())
-    given = model.means, model.opacities, camera().viewmat
-    assert all(map(torch.equal, arrays(*given), hook_of(model)(*given)))
+    assert hold.hook is before

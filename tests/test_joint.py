@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
 from collections.abc import Callable
 from dataclasses import replace
-from types import ModuleType
 from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
-import inria_forks
 from clod_adapter.adapter import detach, with_dial
 from clod_adapter.bake import bake, order_by_extinction
 from clod_adapter.blocks.divide import block_target, context_rows, divide
@@ -87,53 +83,6 @@ def hook(model: Gaussians) -> list[Tensor]:
     return list(dialled(model.means, model.opacities, view.viewmat))
 
 
-def copy_with(name: str, installed: ModuleType, needs: str) -> Any:
-    """A copy of one of our integrations, made while ``installed`` is the renderer's module."""
-    spec = importlib.util.find_spec(f"clod_adapter.integrations.{name}")
-    assert spec is not None and spec.loader is not None
-    copy = importlib.util.module_from_spec(spec)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(sys.modules, needs, installed)
-        spec.loader.exec_module(copy)
-    return copy
-
-
-def gsplat(model: Gaussians) -> list[Tensor]:
-    """The opacities and scales that gsplat is called with."""
-
-    def rasterization(
-        means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor, viewmats: Tensor, Ks: Tensor,
-        width: int, height: int, near_plane: float = 0.01, sh_degree: int | None = None, distributed: bool = False,
-        covars: Tensor | None = None,
-    ) -> Any:  # fmt: skip
-        return opacities, scales
-
-    installed = ModuleType("gsplat")
-    others = ("rasterization_2dgs", "rasterization_inria_wrapper", "rasterization_2dgs_inria_wrapper")
-    for name in ("rasterization", *others, "fully_fused_projection"):
-        setattr(installed, name, rasterization)
-    view = CAMERAS[0]
-    dial: Any = {"sigma_d": model.sigma_d, "growth_d": model.growth_d, "attenuation": model.attenuation}
-    found = copy_with("gsplat", installed, "gsplat").rasterization(
-        model.means, model.quats, model.scales, model.opacities, model.sh0[:, 0], view.viewmat[None], view.K[None],
-        view.width, view.height, virtual_scale=DIAL, **dial,
-    )  # fmt: skip
-    return list(found)
-
-
-def inria(model: Gaussians) -> list[Tensor]:
-    """What a fork of diff-gaussian-rasterization draws."""
-    installed = inria_forks.module("inria 2023")
-    ours = copy_with("inria", installed, "diff_gaussian_rasterization")
-    rasterizer = ours.GaussianRasterizer(inria_forks.settings_of(installed.GaussianRasterizationSettings, CAMERAS[0]))
-    given = {
-        "means3D": model.means, "means2D": torch.zeros(N, 3), "opacities": model.opacities[:, None],
-        "shs": torch.cat([model.sh0, model.shN], 1), "scales": model.scales, "rotations": model.quats,
-    }  # fmt: skip
-    dial = {"sigma_d": model.sigma_d, "growth_d": model.growth_d, "attenuation": model.attenuation}
-    return [rasterizer(**given, **dial, virtual_scale=DIAL)[0]]
-
-
 def blocks(model: Gaussians) -> list[Any]:
     """A block's context, and its target share."""
     views, config = views_of(model), AdaptConfig(max_sv=4.0)
@@ -176,8 +125,6 @@ CONSUMERS: dict[str, Callable[[Gaussians], list[Any]]] = {
     "bake for one camera": baked(camera=CAMERAS[0]),
     "bake for several cameras": baked(cameras=CAMERAS),
     "Hook": hook,
-    "gsplat": gsplat,
-    "diff-gaussian-rasterization": inria,
     "popping": popping,
     "blocks": blocks,
     "order_by_extinction": order,

@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 import pytest
 import torch
 
 from clod_adapter.adapter import detach, with_dial
-from clod_adapter.config import FILTERS, AttenuationConfig
-from clod_adapter.equation.attenuation import attenuate, dial
-from clod_adapter.equation.distances import normalized_distances
+from clod_adapter.config import AttenuationConfig
+from clod_adapter.equation.attenuation import dial
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.rasterizers import Rasterizer, reference
 from clod_adapter.render import render, splat
-from scenes import camera, gaussians
+from scenes import camera, dialled, gaussians
 
 SCALES = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0)
 FAINTEST = {"tau": 1 / 255, "cut": "hard"}  # what this drops, the rasterizer skips
@@ -47,47 +45,6 @@ def test_a_disabled_adapter_is_the_base(seed: int) -> None:
         identity = render(with_dial(base, attenuation=config), view)
         assert torch.equal(identity.image, want.image) and torch.equal(identity.alpha, want.alpha), f"seed {seed}"
         assert torch.equal(identity.kept, base.opacities > 1 / 255)
-
-
-@pytest.mark.parametrize("s", SCALES)
-def test_image_matches_baked_opacities(s: float) -> None:
-    """Culled Gaussians are removed, and others have the opacity of this view and dial value."""
-    some, view = adapted(), camera()
-    found = render(some, view, s, background=torch.tensor([0.1, 0.5, 0.9]))
-    distances = normalized_distances(some.means, view, some.attenuation)
-    torch.testing.assert_close(distances, (some.means - view.position).norm(dim=1) / 3)
-    by_hand = some.opacities * torch.exp(-((distances * s) ** 2) / (2 * some.sigma_d**2 + 1e-8))
-    assert torch.equal(found.kept, by_hand > s / 255)
-    further = render(some, view, 1.2 * s).kept
-    assert (further <= found.kept).all() and 0 < further.sum() < found.kept.sum() < len(some)
-    baked = detach(some.select(found.kept))
-    baked = baked.replace(opacity_logits=by_hand[found.kept].logit())
-    want = render(baked, view, background=torch.tensor([0.1, 0.5, 0.9]))
-    torch.testing.assert_close(found.image, want.image, rtol=0, atol=1e-5)
-    torch.testing.assert_close(found.alpha, want.alpha, rtol=0, atol=1e-5)
-
-
-def test_the_rasterizer_gets_kept_opacities_only() -> None:
-    seen = []
-
-    def spy(means, quats, scales, opacities, sh0, shN, camera, background, screen_filter):
-        seen.append(opacities)
-        assert screen_filter == FILTERS["mip"]
-        return torch.zeros(camera.height, camera.width, 3), torch.zeros(camera.height, camera.width)
-
-    some, view = adapted().replace(screen_filter=FILTERS["mip"]), camera()
-    rendering = render(some, view, 3.0, rasterizer=Rasterizer(spy))
-    assert torch.equal(seen[0] > 0, rendering.kept)
-    expected = attenuate(some.opacity_logits, some.sigma_d, normalized_distances(some.means, view, CONFIG), 3.0, CONFIG)
-    assert torch.equal(seen[0][rendering.kept], expected.opacities[expected.keep])
-
-
-def test_default_background_is_black() -> None:
-    view = camera()
-    far = gaussians(20, 0, 0).replace(means=torch.full((20, 3), 1e4))
-    assert (render(far, view).image == 0).all()
-    behind = torch.tensor([0.2, 0.4, 0.6])
-    assert torch.equal(render(far, view, background=behind).image, behind.expand(45, 61, 3))
 
 
 @pytest.mark.parametrize("s", [1.0, 2.5])
@@ -141,9 +98,12 @@ def test_rendering_no_gaussians() -> None:
         assert rendering.kept.shape == (0,) and (rendering.image == 0).all() and (rendering.alpha == 0).all()
 
 
-def test_a_background_of_numpy() -> None:
-    some, grey = adapted(), [0.2, 0.4, 0.6]
-    assert torch.equal(
-        render(some, camera(), 2, background=np.array(grey)).image,
-        render(some, camera(), 2, background=torch.tensor(grey)).image,
-    )
+@pytest.mark.parametrize("cut", ["soft", "hard"])
+def test_a_dial_of_0_shows_the_file_without_its_dial(cut: str) -> None:
+    own, view = dialled(400, 1, 3, cut=cut).replace(growth_d=torch.linspace(0, 1, 400)), camera()
+    assert torch.equal(render(own, view, 0.0).image, render(detach(own), view).image)
+    shown = dial(own, view, 0.0)
+    assert bool(shown.keep.all()) and torch.equal(shown.drawn, own.opacities) and bool((shown.growth == 1).all())
+    faded = [dial(own, view, s) for s in (0.0, 1e-4, 0.3, 0.6, 1 - 1e-4, 1.0, 2.0)]
+    for nearer, farther in zip(faded, faded[1:], strict=False):
+        assert bool((farther.opacities <= nearer.opacities).all()) and bool((farther.keep <= nearer.keep).all())

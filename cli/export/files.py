@@ -12,8 +12,7 @@ from clod_adapter.bake import bake
 from clod_adapter.calibration import Viewpoint
 from clod_adapter.cameras import Camera
 from clod_adapter.errors import ClodError
-from clod_adapter.evaluation.geometric_error import geometric_errors
-from clod_adapter.evaluation.level_errors import level_errors, looking
+from clod_adapter.evaluation.level_errors import geometric_errors, level_errors, looking
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.checkpoint import Checkpoint

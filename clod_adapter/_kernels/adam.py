@@ -45,22 +45,9 @@ def step_columns(parameter, first, second, gradient, rows, width, at, many, lane
 
 @kernel
 def adam_rows(  # type: ignore[no-untyped-def]
-    worker,
-    workers,
-    parameter,
-    first,
-    second,
-    gradient,
-    mask,
-    steps,
-    counted,
-    corrections,
-    units,
-    rate,
-    beta1,
-    beta2,
+    worker, workers, parameter, first, second, gradient, mask, steps, counted, corrections, units, rate, beta1, beta2,
     epsilon,
-):
+):  # fmt: skip
     """Updates the rows of ``parameter [N, width]`` and of its moments where ``mask [N]`` is set, with ``gradient``.
 
     ``steps[row]`` counts the updates of the row: ``counted``, 1 or 0, is added first. For n updates

@@ -30,30 +30,18 @@ INTEGERS = ir.VectorType(ir.IntType(32), LANES)
 _mask = ir.VectorType(ir.IntType(1), LANES)
 
 
-class _F32x16(types.Type):
-    def __init__(self) -> None:
-        super().__init__(name="F32x16")
+def _vector_type(name: str, llvm: ir.Type) -> types.Type:
+    """A type of values that LLVM keeps in registers."""
+    kind = type(name, (types.Type,), {})
+
+    def of_type(self, dmm, fe_type):  # type: ignore[no-untyped-def]
+        models.PrimitiveModel.__init__(self, dmm, fe_type, llvm)
+
+    register_model(kind)(type(f"{name}Model", (models.PrimitiveModel,), {"__init__": of_type}))
+    return kind(name=name)
 
 
-class _Mask16(types.Type):
-    def __init__(self) -> None:
-        super().__init__(name="Mask16")
-
-
-f32x16 = _F32x16()
-mask16 = _Mask16()
-
-
-@register_model(_F32x16)
-class _VectorModel(models.PrimitiveModel):
-    def __init__(self, dmm, fe_type):  # type: ignore[no-untyped-def]
-        super().__init__(dmm, fe_type, VECTOR)
-
-
-@register_model(_Mask16)
-class _MaskModel(models.PrimitiveModel):
-    def __init__(self, dmm, fe_type):  # type: ignore[no-untyped-def]
-        super().__init__(dmm, fe_type, _mask)
+f32x16, mask16 = _vector_type("F32x16", VECTOR), _vector_type("Mask16", _mask)
 
 
 def call_llvm(builder, name, result, arguments):  # type: ignore[no-untyped-def]

@@ -83,7 +83,7 @@ def attenuate(
 ) -> Attenuated:  # fmt: skip
     """What is drawn of Gaussians at one dial value. Rendering, training, baking and renderers' hooks all call this.
 
-    ``a'' = a exp(log_attenuation)``, then the cut, differentiable, once, in ``opacities`` and ``sigma_d``; distances
+    ``a'' = a exp(-u)``, then the cut, differentiable, once, in ``opacities`` and ``sigma_d``; distances
     are constants. Where the factor is exactly 1, a'' equals a bit for bit: with the hard cut a dial without effect
     changes only Gaussians fainter than tau. Kept sets are nested: a Gaussian kept at s is kept at every smaller dial.
     Without a ``sigma_d`` there is no dial: all Gaussians are kept and drawn with a.
@@ -140,26 +140,6 @@ def dial(gaussians: Gaussians, seen_from: Camera | Tensor, virtual_scale: float)
         gaussians.opacity_logits, gaussians.sigma_d, where, virtual_scale, gaussians.attenuation,
         growth_d=gaussians.growth_d,
     )  # fmt: skip
-
-
-def log_attenuation(sigma_d: Tensor, d: Tensor, virtual_scale: float, eps: float) -> Tensor:
-    """``[N]`` log of the attenuation factor, ``-(d s)^2 / (2 relu(sigma)^2 + eps)``, in [-inf, 0].
-
-    Differentiable in ``sigma_d`` only, once: with ``u = (d s)^2 / (2 v)`` the slope is
-    ``2 u relu(sigma) / v``. ``d = 0`` gives 0 for every sigma; ``sigma <= 0`` with ``eps = 0`` and d > 0
-    gives -inf. A slope that overflows is 0: no opacity is left there that it could change. Never NaN.
-
-    Args:
-        virtual_scale: the dial s, >= 0.
-        eps: the paper's epsilon, >= 0.
-
-    Raises:
-        ClodError: the dial is negative or not finite, or the shapes differ.
-    """
-    check_dial(virtual_scale)
-    sigma_d, d = conform(sigma_d=sigma_d, d=d)
-    opaque = torch.full_like(sigma_d, math.inf)  # log a'' of a Gaussian with log a = 0
-    return Attenuate.apply(opaque, sigma_d, d.detach(), float(virtual_scale), eps)[1]
 
 
 def culling_threshold(tau: float, virtual_scale: Scale) -> Scale:

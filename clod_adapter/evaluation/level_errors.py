@@ -1,6 +1,7 @@
-"""The errors of a streamed set's leaves at each level, by which viewers share a budget of Gaussians among the leaves.
+"""The errors of levels of detail, by which viewers choose them: of the leaves of a streamed set, and of a tile set.
 
-A viewer starts with every leaf at its coarsest level and takes single steps to finer ones, those first that have most
+Viewers of streamed sets share a budget of Gaussians among the leaves. They start with every leaf at its coarsest level
+and take single steps to finer ones, those first that have most
 
     coverage error_removed / Gaussians_added
 
@@ -19,6 +20,22 @@ that viewers take without tables, ``log(finest_count / count)``, scaled to the o
 
 Sources: playcanvas/engine 2.22, ``gsplat-lod-table.js`` and ``gsplat-octree-instance.js``; playcanvas/splat-transform
 3.7, whose own errors, of a leaf alone and relative to its image, need a GPU.
+
+The levels of a tile set have an error that is a length (``geometric_errors``). A viewer of 3D Tiles shows a tile where
+its ``geometricError`` g at distance d covers at most a number of pixels, 16 by default:
+
+    g f / d <= 16
+
+with f the focal length in pixels. Two images of which one is the other shifted by e pixels differ by about e times
+their slope. So level l is as far from the finest as a shift of
+
+    e_l = |I_l - I_0| / |dI_0|
+
+pixels, with ``|.|`` root mean squares over pixels and channels and ``dI_0`` the mean slope of the image along x and y.
+Seen from d this is the length ``e_l d / f``. Its mean over cameras, with d the median distance of the Gaussians in the
+image, is the error of the level. Times 16, the default of viewers allows a shift of one pixel.
+
+Source of the rule: 3D Tiles 1.1 (OGC 22-025r4), "Geometric error"; CesiumJS's ``maximumScreenSpaceError`` is 16.
 """
 
 from __future__ import annotations
@@ -33,10 +50,12 @@ from torch import Tensor
 
 from clod_adapter.calibration import Viewpoint
 from clod_adapter.cameras import Camera
+from clod_adapter.equation.distances import median_distance
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.formats.lod_meta import Leaf
+from clod_adapter.io.formats.tileset import ALLOWED
 from clod_adapter.progress import Listener, Phase, tell
-from clod_adapter.render import splat
+from clod_adapter.render import render, splat
 from clod_adapter.training.camera_placement import FIELD, HEIGHT, WIDTH
 
 VIEWS = 16  # cameras that errors are measured from
@@ -81,6 +100,11 @@ def _toward(target: np.ndarray, viewpoint: Viewpoint) -> Camera:
     return Camera(torch.from_numpy(viewmat).float(), K.float(), WIDTH, HEIGHT)
 
 
+def _picked(cameras: Sequence[Camera]) -> list[Camera]:
+    """At most VIEWS of them, evenly chosen."""
+    return [cameras[k] for k in np.linspace(0, len(cameras) - 1, min(VIEWS, len(cameras))).round().astype(int)]
+
+
 @torch.no_grad()
 def level_errors(
     levels: Sequence[Gaussians], leaves: Sequence[Leaf], cameras: Sequence[Camera], *, progress: Listener | None = None
@@ -95,9 +119,9 @@ def level_errors(
         progress: called in ``Phase.LEVELS`` after each camera.
     """
     scene, found = _Scene(levels, leaves), np.zeros((len(leaves), len(levels)))
-    picked = np.linspace(0, len(cameras) - 1, min(VIEWS, len(cameras))).round().astype(int)
+    picked = _picked(cameras)
     energy, covered = 0.0, np.zeros((len(leaves), 1))
-    for done, view in enumerate(cameras[k] for k in picked):
+    for done, view in enumerate(picked):
         images = [scene.picture(opacities, view) for opacities in scene.shown]
         found += [scene.removed(leaf, view, images) for leaf in leaves]
         covered[:, 0] += [coverage(leaf, view) for leaf in leaves]
@@ -176,3 +200,31 @@ class _Scene:
         moved = camera.K.clone()
         moved[:2, 2] -= torch.tensor([x, y]).to(moved)
         return replace(camera, K=moved, width=right - x, height=bottom - y)
+
+
+@torch.no_grad()
+def geometric_errors(
+    levels: Sequence[Gaussians], cameras: Sequence[Camera], *, progress: Listener | None = None
+) -> np.ndarray:
+    """``[L]`` float64, >= 0, world units: 0 for the finest level, ascending.
+
+    Args:
+        levels: without a dial, the finest first.
+        cameras: at least one; VIEWS of them are used, evenly chosen.
+        progress: called in ``Phase.LEVELS`` after each camera.
+    """
+    picked = _picked(cameras)
+    found = np.zeros((len(picked), len(levels)))
+    for done, view in enumerate(picked):
+        images = [render(level, view).image.clamp(0, 1) for level in levels]
+        slope = max(_slope(images[0]), 1e-6)
+        length = median_distance(levels[0].means, view) / float(view.K[0, 0])
+        found[done] = [length / slope * float((image - images[0]).square().mean().sqrt()) for image in images]
+        tell(progress, Phase.LEVELS, done + 1, len(picked))
+    return ALLOWED * np.maximum.accumulate(found.mean(0))  # type: ignore[no-any-return]
+
+
+def _slope(image: Tensor) -> float:
+    """Root mean square of the differences between neighbouring pixels, along x and y."""
+    across, down = image.diff(dim=1).square().mean(), image.diff(dim=0).square().mean()
+    return float(((across + down) / 2).sqrt())

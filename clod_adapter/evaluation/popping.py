@@ -27,8 +27,9 @@ from dataclasses import asdict, dataclass
 from functools import lru_cache
 from typing import Any
 
+import numpy as np
 import torch
-import torch.nn.functional as F
+from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
 
 from clod_adapter.cameras import Camera
@@ -152,32 +153,17 @@ def path(cameras: Sequence[Camera], steps: int) -> list[Camera]:
     require(steps >= 2, "steps", steps, "at least 2")
     if len(cameras) < 2:
         raise ClodError(f"a camera path needs at least two cameras, not {len(cameras)}")
-    centres = torch.stack([camera.position for camera in cameras]).double()
-    lengths = (centres[1:] - centres[:-1]).norm(dim=1)
-    lengths = lengths if lengths.sum() > 0 else torch.ones_like(lengths)
-    ends = lengths.cumsum(0)
-    found = []
-    for distance in torch.linspace(0, float(ends[-1]), steps + 1, dtype=torch.float64).clamp(max=ends[-1]):
-        i = int(torch.searchsorted(ends, distance))
-        share = float(1 - (ends[i] - distance) / lengths[i]) if lengths[i] > 0 else 0.0
-        rotation = _turned(cameras[i].viewmat[:3, :3], cameras[i + 1].viewmat[:3, :3], share)
-        viewmat = torch.eye(4, dtype=torch.float64)
-        viewmat[:3, :3] = rotation
-        viewmat[:3, 3] = -rotation @ torch.lerp(centres[i], centres[i + 1], share)
-        first = cameras[0]
-        found.append(Camera(viewmat.to(first.viewmat), first.K, first.width, first.height, near=first.near))
-    return found
-
-
-def _turned(start: Tensor, end: Tensor, share: float) -> Tensor:
-    """The rotation ``share`` of the way from one to the other (slerp): ``exp(share log(end start^T)) start``."""
-    turn = end.double() @ start.double().T
-    angle = math.acos(min(max((float(turn.trace()) - 1) / 2, -1.0), 1.0))
-    axis = torch.stack([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
-    if float(axis.norm()) < 1e-9:  # no rotation, or half a turn, which does not occur between neighbours of a capture
-        return start.double()
-    cross = torch.linalg.cross(torch.eye(3, dtype=torch.float64), F.normalize(axis, dim=0).expand(3, 3))
-    return torch.linalg.matrix_exp(share * angle * cross) @ start.double()
+    first, centres = cameras[0], np.stack([camera.position.double().numpy() for camera in cameras])
+    lengths = np.linalg.norm(np.diff(centres, axis=0), axis=1)
+    lengths = np.maximum(lengths, 1e-9 * lengths.sum() or 1.0)
+    places = np.concatenate([[0.0], lengths.cumsum()])
+    at = np.linspace(0, places[-1], steps + 1)
+    poses = np.tile(np.eye(4), (steps + 1, 1, 1))
+    poses[:, :3, :3] = Slerp(places, Rotation.from_matrix([c.viewmat[:3, :3].numpy() for c in cameras]))(at).as_matrix()
+    moved = np.stack([np.interp(at, places, axis) for axis in centres.T], 1)
+    poses[:, :3, 3] = -np.einsum("nij,nj->ni", poses[:, :3, :3], moved)
+    viewmats = torch.from_numpy(poses).to(first.viewmat)
+    return [Camera(viewmat, first.K, first.width, first.height, near=first.near) for viewmat in viewmats]
 
 
 def _change(delta: Tensor) -> tuple[float, float]:

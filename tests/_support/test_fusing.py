@@ -11,14 +11,12 @@ import torch
 import torch._functorch.config
 from torch import Tensor
 
-from clod_adapter._support import fusing
 from clod_adapter._support.fusing import Fused
 from clod_adapter.cameras import Camera
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.equation import attenuation
 from clod_adapter.equation.attenuation import attenuate
 from clod_adapter.training import optimizer
-from clod_adapter.training.optimizer import RowAdam
 from scenes import camera
 
 SOFT = AttenuationConfig(cut="soft", scene_distance=2.0)
@@ -125,30 +123,3 @@ def test_a_failure_to_compile_warns_once_and_falls_back(
     with pytest.raises(torch.cuda.OutOfMemoryError):
         fused.compiled(torch.zeros(1))
     assert not fused._failed
-
-
-def test_only_many_rows_on_a_gpu_are_compiled() -> None:
-    class Rows(list[int]):
-        is_cuda = True
-
-    fused, many = Fused(lambda x: x), Rows(range(fusing.ROWS))
-    assert fused.compiles(many)  # type: ignore[arg-type]
-    assert not fused.compiles(Rows(many[1:])) and not fused.compiles(torch.zeros(fusing.ROWS))  # type: ignore[arg-type]
-
-
-def test_a_traced_step_of_adam_is_the_plain_one(monkeypatch: pytest.MonkeyPatch, request: Any, n: int = 50) -> None:
-    def stepped() -> RowAdam:
-        g = torch.Generator().manual_seed(0)
-        rest = RowAdam({"means": torch.randn(n + 7, 3, generator=g)[:n], "sigma": torch.randn(n, generator=g)})
-        for k in range(3):
-            slopes = {"means": torch.randn(n, 3, generator=g), "sigma": torch.randn(n, generator=g)}
-            rest._step_plain(slopes, torch.arange(n) % (k + 2) == 0, {"means": 0.1, "sigma": 0.02})
-        return rest
-
-    want = stepped()
-    request.getfixturevalue("everything_compiles")
-    faster(monkeypatch)
-    found = stepped()
-    assert not optimizer._adam._failed
-    for name, value in want.parameters.items():
-        torch.testing.assert_close(found.parameters[name], value, rtol=1e-6, atol=1e-7)

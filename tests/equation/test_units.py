@@ -74,16 +74,6 @@ def test_nominal_distance_is_that_of_the_training_views() -> None:
     assert nominal_distance(means, replace(config, normalizer="max", reference_distance=2.5)) == 1.0
 
 
-def test_estimated_distance_ignores_outliers() -> None:
-    means = gaussians(1000, 0, 1).means
-    distance = estimated_distance(means)
-    stray = means.clone()
-    stray[:30] *= 1e6
-    assert estimated_distance(stray) == pytest.approx(distance, rel=0.3)
-    assert estimated_distance(7 * means + 100) == pytest.approx(7 * distance, rel=1e-3)
-    assert estimated_distance(means[:0]) == 1.0 and estimated_distance(means[:1]) == 1.0
-
-
 @pytest.mark.parametrize("typical", [1e-4, 0.006, 3.0, 4.2e5])
 def test_eps_is_stable_over_repeated_training(typical: float) -> None:
     some = dialled(scene_distance=typical)

@@ -17,7 +17,7 @@ from clod_adapter.cameras import Camera
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.equation.attenuation import dial
 from clod_adapter.errors import ClodError
-from clod_adapter.evaluation.budget import dial_for, frame_times
+from clod_adapter.evaluation.budget import dial_for
 from clod_adapter.gaussians import Gaussians
 from scenes import gaussians, ring
 
@@ -56,16 +56,6 @@ def test_counts_are_exact_up_to_ties(n: int, seed: int, views: int, share: float
     # The Gaussian whose distance is the unit is at distance 1, and its s* is the same in each view where it is that.
     ties = 0 if normalizer == "scene" else views - 1
     assert wanted - found <= max(1, 0.001 * wanted) + ties, (seed, found, wanted)
-
-
-def test_ties_are_culled_together() -> None:
-    row, camera = adapted(6, 0), ring(1, 48, 36)
-    logits = torch.tensor([2.0, 2, 2, 2, 3, 5])
-    same = row.replace(means=torch.zeros(6, 3), opacity_logits=logits, sigma_d=torch.ones(6))
-    solved = dial_for(same, keep=4, cameras=camera)
-    assert kept(same, camera, solved.virtual_scale) == 2
-    assert kept(same, camera, solved.virtual_scale * (1 - 1e-6)) == 6
-    assert kept(same, camera, dial_for(same, keep=1, cameras=camera).virtual_scale) == 1
 
 
 def test_counts_out_of_reach() -> None:
@@ -121,33 +111,6 @@ def test_frame_rate(times: list[float], fps: float, dial_value: float) -> None:
     assert solved.note == ("s = 1 draws 50 frames a second already" if fps == 30 else "")
     with pytest.raises(ClodError, match="at s = [48], .* takes 5.0 ms, 200 a second"):
         dial_for(adapted(3, 0), fps=201, calibration=calibration)
-
-
-def test_frames_are_timed_where_nothing_is_stored(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The clock is simulated: a frame at s takes 8/s ms."""
-    seen: list[tuple[str, float]] = []
-    now = [0.0]
-
-    def draw(some: Gaussians, camera: Camera, s: float) -> None:
-        seen.append((camera.name, s))
-        now[0] += 0.008 / s
-
-    monkeypatch.setattr("clod_adapter.evaluation.frame_times.render", draw)
-    monkeypatch.setattr("clod_adapter.evaluation.frame_times.time.perf_counter", lambda: now[0])
-    cameras, some = ring(9, 48, 36), adapted(20, 0)
-    solved = dial_for(some, fps=250, cameras=cameras)
-    assert solved.virtual_scale == pytest.approx(2, rel=0.03)  # the curve is not a line in log s
-    assert len({name for name, _ in seen}) <= 4 and {s for _, s in seen} >= {1.0, MAX_SV}
-
-
-def test_frame_times_of_a_real_clock() -> None:
-    calls: list[int] = []
-    times, notes = frame_times(adapted(20, 0), ring(2, 48, 36), progress=lambda now: calls.append(now.done))
-    assert [s for s, _ in times] == pytest.approx([MAX_SV ** (k / 5) for k in range(6)])
-    assert all(0 < taken < 1e4 for _, taken in times)
-    assert calls == list(range(1, 6)) and notes == []
-    alone = adapted(20, 0).replace(attenuation=AttenuationConfig(max_sv=1.0))
-    assert len(frame_times(alone, ring(1, 48, 36))[0]) == 1
 
 
 def test_bad_arguments_are_refused() -> None:

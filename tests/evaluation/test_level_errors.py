@@ -8,10 +8,12 @@ import torch
 
 from clod_adapter.calibration import Viewpoint
 from clod_adapter.cameras import Camera
-from clod_adapter.evaluation.level_errors import FLOOR, coverage, level_errors, looking
+from clod_adapter.evaluation.level_errors import FLOOR, coverage, geometric_errors, level_errors, looking
 from clod_adapter.gaussians import SH_C0, Gaussians
 from clod_adapter.io.formats.lod_meta import Leaf
+from clod_adapter.io.formats.tileset import ALLOWED
 from clod_adapter.render import render
+from scenes import gaussians
 
 VIEWPOINTS = [Viewpoint(0.0, 0.0, -6.0, 1.0), Viewpoint(0.5, 0.2, -6.0, 1.0)]
 
@@ -42,17 +44,6 @@ def test_coverage(cameras: list[Camera]) -> None:
     assert coverage(leaf(0, 0, [0]), cameras[0]) == pytest.approx((3**0.5 / (3**0.5 + 5)) ** 2)
 
 
-def test_a_viewpoint_looks_at_the_middle() -> None:
-    """Three of five centres are at (1, 2, 3)."""
-    scene = balls((1, 2, 3), (1, 2, 3), (1, 2, 3), (90, 0, 0), (0, -80, 70))
-    for camera in looking([*VIEWPOINTS, Viewpoint(1.0, 2.0, 3.0, 1.0)], scene):
-        x, y, z = camera.viewmat[:3] @ torch.tensor([1.0, 2.0, 3.0, 1.0])
-        assert abs(x) < 1e-5 and abs(y) < 1e-5 and z >= 0
-        torch.testing.assert_close(camera.viewmat[:3, :3].det(), torch.tensor(1.0))
-    given = looking(VIEWPOINTS, scene)
-    assert looking(given, scene) == given
-
-
 def test_errors_are_of_the_image(cameras: list[Camera]) -> None:
     """A step that changes nothing has only the share by counts, one that removes what is seen has more."""
     finest = balls((-2, 0, 0), (-2, 0.5, 0), (2, 0, 0), (2, 0.5, 0))
@@ -76,34 +67,6 @@ def test_errors_are_the_sum_over_cameras_per_coverage(cameras: list[Camera]) -> 
     assert none == 0 and found == pytest.approx((1 + FLOOR) * want, rel=1e-3)
 
 
-def test_a_part_of_the_image_is_enough(cameras: list[Camera], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whether the rest of it is rendered changes nothing; the leaf lies at a corner."""
-    levels = [balls((-2.4, 1.8, 0), (-2, 1, 0), (1, 0, 0)), balls((-2, 1, 0), (1, 0, 0))]
-    leaves = [leaf(-2, 0, [0, 1], [0]), leaf(1, 0, [2], [1])]
-    found = []
-    for share in (0.0, 1.0):
-        monkeypatch.setattr("clod_adapter.evaluation.level_errors.LARGE", share)
-        found.append(level_errors(levels, leaves, cameras))
-    assert found[0][0, 1] > 0
-    np.testing.assert_allclose(*found, rtol=1e-3)
-
-
-def test_a_leaf_behind_another_has_a_smaller_error(cameras: list[Camera]) -> None:
-    wall = [(x / 4, y / 4, -2.0) for x in range(-8, 9) for y in range(-8, 9)]
-    finest, coarse = balls((0, 0, 2), (0.5, 0, 2), *wall, opacity=0.99), balls((0, 0, 2), *wall, opacity=0.99)
-    rows, fewer = list(range(2, 2 + len(wall))), list(range(1, 1 + len(wall)))
-    leaves = [leaf(0, 2, [0, 1], [0]), leaf(0, -2, rows, fewer)]
-    behind = level_errors([finest, coarse], leaves, cameras)[0, 1]
-    alone = level_errors([balls((0, 0, 2), (0.5, 0, 2)), balls((0, 0, 2))], [leaf(0, 2, [0, 1], [0])], cameras)[0, 1]
-    assert 0 <= behind < 0.01 * alone
-
-
-def test_errors_ascend_where_a_coarser_level_is_the_better_one(cameras: list[Camera]) -> None:
-    levels = [balls((0, 0, 0), (0.5, 0, 0)), balls((0, 0, 0)), balls((0, 0, 0), (0.5, 0, 0))]
-    (found,) = level_errors(levels, [leaf(0, 0, [0, 1], [0], [0, 1])], cameras)
-    assert 0 < found[1] == found[2]
-
-
 def test_unseen_leaves_keep_the_order_of_their_counts(cameras: list[Camera]) -> None:
     """A viewer steps to finer levels only where they have less error."""
     levels = [balls((0, 0, 0), (0.5, 0, 0), (0, 0, -20), (0, 0, -20)), balls((0, 0, 0), (0, 0, -20))]
@@ -115,3 +78,38 @@ def test_a_leaf_without_the_finest_level_is_compared_with_the_finest_it_has(came
     levels = [balls((1, 0, 0)), balls((1, 0, 0), (0, 0, 0), (0.5, 0, 0)), balls((1, 0, 0), (0, 0, 0))]
     other, found = level_errors(levels, [leaf(1, 0, [0], [0], [0]), leaf(0, 0, [], [1, 2], [1])], cameras)
     assert (other == 0).all() and (found[:2] == 0).all() and found[2] > 0
+
+
+WIDTH, HEIGHT, FOCAL, DISTANCE = 96, 72, 90.0, 6.0
+
+
+def smooth() -> Gaussians:
+    """Wide Gaussians at one distance, so that a shift of the image is the same everywhere."""
+    found = gaussians(40, 0, 3, size=0.3)
+    means = found.means * torch.tensor([0.7, 0.5, 0.0]) + torch.tensor([0.0, 0.0, DISTANCE])
+    return found.replace(means=means, opacity_logits=found.opacity_logits.clamp(-1, 2))
+
+
+def view() -> Camera:
+    K = torch.tensor([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
+    return Camera(torch.eye(4), K, WIDTH, HEIGHT)
+
+
+@pytest.mark.parametrize("pixels", [0.25, 0.5])
+def test_a_shift_has_its_own_length(pixels: float) -> None:
+    """Moved across by so many pixels, seen from so far: pixels d / f, times what viewers allow."""
+    finest = smooth()
+    length = pixels * DISTANCE / FOCAL
+    moved = finest.replace(means=finest.means + torch.tensor([length, length, 0.0]) / 2**0.5)
+    errors = geometric_errors([finest, moved], [view()])
+    assert errors[0] == 0
+    assert errors[1] == pytest.approx(ALLOWED * length, rel=0.15)
+
+
+def test_errors_ascend_and_grow_with_what_is_missing() -> None:
+    """A level that happens to be nearer to the finest than the level before has that one's error."""
+    finest = smooth()
+    order = finest.opacity_logits.argsort(descending=True)
+    half, few = finest[order[:20]], finest[order[:5]]
+    errors = geometric_errors([finest, half, few, half], [view(), view()])
+    assert 0 == errors[0] < errors[1] < errors[2] == errors[3]

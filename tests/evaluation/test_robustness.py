@@ -11,9 +11,9 @@ from clod_adapter.adapter import with_dial
 from clod_adapter.cameras import Scene
 from clod_adapter.config import AdaptConfig
 from clod_adapter.evaluation.evaluate import evaluate
-from clod_adapter.evaluation.robustness import adapt_at_range, baseline, distribution, most_opaque, scene_fingerprint
+from clod_adapter.evaluation.robustness import adapt_at_range, baseline, most_opaque, scene_fingerprint
 from clod_adapter.progress import Phase, Stopped
-from scenes import capture, gaussians
+from scenes import capture
 
 
 def test_a_range_is_adapted_and_measured_beyond_it() -> None:
@@ -54,17 +54,6 @@ def test_baseline_keeps_the_most_opaque() -> None:
     assert outcome.rows[0]["psnr"] == whole.psnr > outcome.rows[2]["psnr"]
     assert outcome.adapter is None and "log10_sigma_d" not in outcome.distribution
     assert frames == [(k + 1, 3 * len(scene.test)) for k in range(3 * len(scene.test))]
-
-
-def test_distribution() -> None:
-    model = gaussians(4, 0, 0).replace(opacity_logits=torch.tensor([-9.0, 0.1, 9.0, float("inf")]))
-    sigma = torch.tensor([0.0, 1e-2, 1.0, 1e9])
-    found = distribution(with_dial(model, sigma))
-    opacity, log_sigma = found["opacity"], found["log10_sigma_d"]
-    for histogram in (opacity, log_sigma):
-        assert len(histogram["edges"]) == len(histogram["shares"]) + 1 and sum(histogram["shares"]) == pytest.approx(1)
-    assert (opacity["shares"][0], opacity["shares"][20], opacity["shares"][-1]) == (0.25, 0.25, 0.5)
-    assert (log_sigma["shares"][0], log_sigma["shares"][-1]) == (0.25, 0.25)
 
 
 def test_fingerprint_depends_on_images_and_split() -> None:

@@ -33,14 +33,6 @@ def test_both_forms_agree(n: int, s: float, seed: int, share: float, eps: float,
     torch.testing.assert_close(got.double(), want, rtol=1e-4, atol=1e-6 * max(float(want.abs().max()), 1e-9))
 
 
-def test_culled_rows_are_brought_back_where_too_few_are_kept() -> None:
-    d, logits, sigma = torch.ones(40), torch.zeros(40), torch.full((40,), 0.05)
-    few = count_gradient_at(d, logits, sigma, 5.0, AttenuationConfig(), 0.1, CONFIG, TargetShare(0.3, 1 / 0.3))
-    assert bool((few < 0).all())
-    none = count_gradient_at(d, logits, sigma, 5.0, AttenuationConfig(), 0.0, CONFIG, TargetShare(0.3, 1 / 0.3))
-    assert not none.any()
-
-
 @pytest.mark.parametrize("logit", [-math.inf, -200.0, 200.0, math.inf])
 def test_extreme_opacities_are_finite(logit: float) -> None:
     d, sigma = torch.tensor([0.0, 1e-6, 1.0, 1e6]).repeat(8), torch.tensor([1e-4, 1.0, 1e9, 1e-4]).repeat_interleave(8)

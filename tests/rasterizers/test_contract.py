@@ -77,17 +77,6 @@ def test_several_forward_passes_keep_their_own_state(rasterize: Backend, order: 
         assert_same(result_of(*alive[k]), alone[k], **rasterize.rounding)
 
 
-@pytest.mark.parametrize("weight", [-0.5, 0.0])
-def test_backward_is_linear(rasterize: Backend, weight: float) -> None:
-    view, some = camera(), scene(200, 1, 0)
-    v = weights(view)
-    once = differentiate(rasterize, some, view, v).gradients
-    scaled = differentiate(rasterize, some, view, (weight * v[0], weight * v[1])).gradients
-    for name in once:
-        # Powers of two: exact.
-        torch.testing.assert_close(scaled[name], weight * once[name], **rasterize.rounding, msg=name)
-
-
 def test_non_contiguous_tensors(rasterize: Backend) -> None:
     """Strided inputs and incoming gradients; those of ``image.sum()`` are expanded, and alpha's are absent."""
     view, some = camera(), scene(200, 2, 0)
@@ -117,18 +106,6 @@ def test_gradient_of_one_input_alone(rasterize: Backend, name: str) -> None:
     total(*rasterize(**inputs, camera=view)).backward()
     torch.testing.assert_close(inputs[name].grad, want[name], **rasterize.rounding)
     assert all(value.grad is None for key, value in inputs.items() if key != name)
-
-
-def test_without_gradients(rasterize: Backend) -> None:
-    view, leaves = camera(), leaves_of(scene(200, 1, 0))
-    want, _ = rasterize(**leaves, camera=view)
-    assert want.requires_grad
-    for mode in (torch.no_grad, torch.inference_mode):
-        with mode():
-            image, alpha = rasterize(**leaves, camera=view)
-        assert torch.equal(image, want) and not image.requires_grad and not alpha.requires_grad
-    plain = {name: leaf.detach() for name, leaf in leaves.items()}
-    assert not rasterize(**plain, camera=view)[0].requires_grad
 
 
 def test_calls_from_two_threads(rasterize: Backend) -> None:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from clod_adapter.cameras import Camera
-from clod_adapter.config import CLASSIC, FILTERS, ScreenFilter
+from clod_adapter.config import FILTERS, ScreenFilter
 from clod_adapter.rasterizers import reference
 from scenes import camera, in_front, scene
 
@@ -71,45 +71,6 @@ def test_projection_matches_finite_differences(seed: int) -> None:
         W = viewmat[:3, :3]
         want = jacobian @ W @ sigma @ W.T @ jacobian.T + 0.7 * torch.eye(2, dtype=torch.float64)
         torch.testing.assert_close(found, want, rtol=1e-6, atol=1e-6, msg=lambda m: f"seed {seed}: {m}")
-
-
-@pytest.mark.parametrize(("name", "size"), [("on", 0.5), ("mip", 1.0), ("on", 4.0)])
-def test_a_compensated_gaussian_keeps_its_integral(name: str, size: float) -> None:
-    """The sum over pixels of a Gaussian of ``size`` pixels is ``2 pi`` opacity ``size^2`` under any filter."""
-    view = Camera(torch.eye(4), torch.tensor([[100.0, 0, 40], [0, 100.0, 40], [0, 0, 1]]), 80, 80)
-    some = one(view, means=torch.tensor([[0.0, 0.0, 2.0]]), scales=torch.full((1, 3), size / 50))
-    _, alpha = reference.rasterize(**some, camera=view, background=BLACK, screen_filter=FILTERS[name])
-    widened = size**2 + FILTERS[name].variance
-    lost = 1 / 255 * widened  # what is below 1/255 is not drawn: of a Gaussian's integral its edge's height times area
-    torch.testing.assert_close(float(alpha.sum()), 2 * math.pi * (0.8 * size**2 - lost), rtol=0.03, atol=0)
-
-
-def test_a_compensated_opacity_below_the_minimum_is_dropped() -> None:
-    """At 0.1 pixels the classic filter draws 0.8 at the centre, antialiasing 0.8 * 0.01 / 0.31; at 0.035 nothing."""
-    view = Camera(torch.eye(4), torch.tensor([[100.0, 0, 40.5], [0, 100.0, 40.5], [0, 0, 1]]), 81, 81)
-    for size, want in ((0.1, 0.8 * 0.01 / 0.31), (0.035, 0.0)):
-        some = one(view, means=torch.tensor([[0.0, 0.0, 2.0]]), scales=torch.full((1, 3), size / 50))
-        shown = [
-            reference.rasterize(**some, camera=view, background=BLACK, screen_filter=chosen)[1]
-            for chosen in (CLASSIC, FILTERS["on"])
-        ]
-        torch.testing.assert_close([float(a.max()) for a in shown], [0.8, want], rtol=1e-6, atol=0)
-
-
-@pytest.mark.parametrize("axis", [0, 1])
-def test_the_ray_is_clamped_beyond_the_image(axis: int) -> None:
-    """The Jacobian's ray is clamped from 0.15 of the image's size beyond its edge; the centre is not."""
-    view = camera(80, 60)
-    K, size = view.K.double(), torch.tensor([80.0, 60.0]).double()
-    edge = ((1.15 * size - K[:2, 2]) / K.diagonal()[:2])[axis]
-    points = torch.zeros(3, 3).double()
-    points[:, 2], points[:, axis] = 1.0, torch.stack([edge * 0.99, edge, edge * 3])
-    arguments = torch.tensor([[1.0, 0, 0, 0]]).double().repeat(3, 1), torch.full((3, 3), 0.1).double()
-    centres, factors = reference.project(points, *arguments, torch.eye(4).double(), K, view)
-    covariances = factors @ factors.mT
-    torch.testing.assert_close(centres, pixels_of(view, points))
-    torch.testing.assert_close(covariances[1], covariances[2])
-    assert (covariances[0] - covariances[1])[axis, axis].abs() > 1e-3
 
 
 @pytest.mark.parametrize("seed", range(5))

@@ -5,7 +5,7 @@ buffer with the bytes of an SPZ file, attributes without data, and a node with a
 
 The root has the coarsest level of the whole scene. Its children are cells of at most LARGEST Gaussians of the finest
 level, each a chain of tiles from the next finer level to the finest; a tile replaces its parent (refine REPLACE).
-``geometricError`` of a tile is that of its level (``evaluation.geometric_error``). That of the index is of showing
+``geometricError`` of a tile is that of its level (``evaluation.level_errors``). That of the index is of showing
 nothing: viewers leave out the whole set where it covers at most ALLOWED pixels. It is ALLOWED diagonals of the root's
 box and the root's own error, so that a set is drawn until it is about one pixel large.
 
