@@ -28,7 +28,7 @@ from clod_adapter.render import render
 from clod_adapter.viewer.payload import Payload, page_config
 
 PAGE, STYLE, SCRIPT = "page.html", "viewer.css", "viewer.js"
-MAX_CHARACTERS = 1 << 26  # per script element; browsers limit strings to about 5e8
+PART = 3 << 24  # bytes of a script element, a multiple of 3; browsers limit strings to about 5e8
 POSTER_SIDE, POSTER_BYTES = 512, 40_000  # of the picture shown while the page loads: pixels, bytes before base64
 # In this order.
 PLACEHOLDERS = (
@@ -74,13 +74,9 @@ def write_viewer_page(
         checkpoints = {"clod-model": model} | ({"clod-base": base} if base else {})
         payloads = {element: Payload.of(each) for element, each in checkpoints.items()}
         entries = [{"name": payload.name, "element": element} for element, payload in payloads.items()]
-        if exact:
-            data: dict[str, Iterable[bytes]] = {element: payload.blocks() for element, payload in payloads.items()}
-            found, notes = payloads["clod-model"].gaussians, tuple[str, ...]()
-        else:
-            packed = {element: payload.packed(f"{temporary}.spz") for element, payload in payloads.items()}
-            data = {element: (spz,) for element, (spz, *_) in packed.items()}
-            _, found, notes = packed["clod-model"]
+        packed = {element: payload.packed(f"{temporary}.spz", exact) for element, payload in payloads.items()}
+        data = {element: part for element, (part, *_) in packed.items()}
+        _, found, notes = packed["clod-model"]
         config = page_config(entries[0], entries[1] if base else None, shown, virtual_scale, placed=placed)
         opening = virtual_scale if virtual_scale is not None else 0.0 if placed else 1.0
         poster = _poster(found, shown[0], opening) if shown else ""
@@ -134,29 +130,12 @@ def _document(config: Mapping[str, Any], data: Iterable[bytes], meta: str, poste
     yield rest.encode()
 
 
-def _elements(data: Mapping[str, Iterable[bytes]]) -> Iterator[bytes]:
-    """Script elements with the bytes as base64, by id; large data are split into several with the same id."""
-    for element, blocks in data.items():
-        begin, end = f'<script type="application/octet-stream" id="{element}">'.encode(), b"</script>\n"
-        yield begin
-        length = 0
-        for characters in _base64(blocks):
-            if length > MAX_CHARACTERS:
-                yield end + begin
-                length = 0
-            yield characters
-            length += len(characters)
-        yield end
-
-
-def _base64(blocks: Iterable[bytes]) -> Iterator[bytes]:
-    rest = b""
-    for block in blocks:
-        rest += block
-        end = len(rest) - len(rest) % 3  # encodes without padding
-        yield base64.b64encode(rest[:end])
-        rest = rest[end:]
-    yield base64.b64encode(rest)
+def _elements(data: Mapping[str, bytes]) -> Iterator[bytes]:
+    """Script elements with the bytes as base64, by id; large data are divided among several with the same id."""
+    for element, whole in data.items():
+        for start in range(0, len(whole), PART):
+            part = base64.b64encode(whole[start : start + PART])
+            yield b'<script type="application/octet-stream" id="%s">%s</script>\n' % (element.encode(), part)
 
 
 @cache

@@ -23,7 +23,7 @@ from clod_adapter.cameras import Camera
 from clod_adapter.gaussians import OPAQUE, Gaussians
 from clod_adapter.io.checkpoint import Checkpoint, load
 from clod_adapter.io.file_formats import write
-from clod_adapter.io.ply.columns import column_map, dial_columns, inria_dtype
+from clod_adapter.io.ply.columns import dial_columns, inria_dtype
 from clod_adapter.io.ply.header import write_comments
 from clod_adapter.origin import NOWHERE, Origin
 
@@ -64,8 +64,7 @@ class Payload:
     @property
     def size(self) -> int:
         """Bytes of the PLY."""
-        columns = sum(map(len, column_map(self.gaussians.sh_degree).values())) + len(dial_of(self.gaussians))
-        return len(self.header) + 4 * columns * len(self.gaussians)
+        return len(self.header) + 4 * self.header.count(b"\nproperty ") * len(self.gaussians)
 
     def blocks(self) -> Iterator[bytes]:
         """The PLY in blocks of rows: little-endian float32, Inria's layout without normals, the dial last.
@@ -76,11 +75,12 @@ class Payload:
         for start in range(0, len(self.gaussians), BLOCK_ROWS):
             yield _values(self.gaussians, slice(start, start + BLOCK_ROWS)).astype("<f4", copy=False).tobytes()
 
-    def packed(self, file: str | Path) -> tuple[bytes, Gaussians, tuple[str, ...]]:
-        """The splat as SPZ, of which rows that are near one another take a tenth less.
+    def packed(self, file: str | Path, exact: bool = False) -> tuple[bytes, Gaussians, tuple[str, ...]]:
+        """The splat in one piece: as SPZ, of which rows that are near one another take a tenth less, or as PLY.
 
         Args:
             file: a temporary name.
+            exact: PLY.
 
         Returns:
             The bytes, the Gaussians in them, and a line for each loss.
@@ -88,6 +88,8 @@ class Payload:
         Raises:
             ClodError: as ``file_formats.write``.
         """
+        if exact:
+            return b"".join(self.blocks()), self.gaussians, ()
         rows = _along_curve(self.gaussians.means)
         try:
             notes = write(file, self.gaussians.select(rows), origin=self.origin, calibration=self.calibration)

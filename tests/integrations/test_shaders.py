@@ -7,10 +7,10 @@ from contextlib import closing
 from importlib.resources import files
 from typing import Any
 
+import golden
 import pytest
 
 import browser
-from clod_adapter.integrations.shaders import golden
 
 SHADERS = files("clod_adapter.integrations.shaders")
 STORED = json.loads(SHADERS.joinpath("golden.json").read_text(encoding="utf-8"))

@@ -22,7 +22,7 @@ from clod_adapter.calibration import Calibration, CalibrationRow
 from clod_adapter.equation.attenuation import dial
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.render import render
-from clod_adapter.viewer import page, payload
+from clod_adapter.viewer import page
 from clod_adapter.viewer.payload import page_config
 from shown import SIZE, Shown, assert_same, serve
 
@@ -80,8 +80,7 @@ def test_one_exact_file_needs_no_network(
     chromium: Any, shown: Shown, model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Large data are divided among several elements, because browsers limit the size of a text."""
-    monkeypatch.setattr(page, "MAX_CHARACTERS", 20_000)
-    monkeypatch.setattr(payload, "BLOCK_ROWS", 100)
+    monkeypatch.setattr(page, "PART", 15_000)
     loaded = clod_adapter.load(model)
     out = tmp_path / "page.html"
     page.write_viewer_page(out, loaded, base=loaded, cameras=scenes.ring(2, 320, 240), virtual_scale=2.0, exact=True)

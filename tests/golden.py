@@ -1,6 +1,6 @@
 """Makes ``golden.json``: values of the equation in float64, for tests of implementations in other languages.
 
-    python -m clod_adapter.integrations.shaders.golden
+    python tests/golden.py
 
 A row has the inputs opacity, sigma, distance, scale, eps, tau, soft, and the results ``faded``, the attenuated opacity
 ``a''``, and ``drawn``, the opacity for the rasterizer. Inputs are float32 numbers, written in full. A float32
@@ -25,6 +25,7 @@ from clod_adapter.equation.attenuation import attenuate
 from clod_adapter.equation.extinction import extinction_scale
 from clod_adapter.equation.growth import growth_factors
 
+FILE = Path(__file__).parents[1] / "clod_adapter" / "integrations" / "shaders" / "golden.json"
 COLUMNS = ("opacity", "sigma", "distance", "scale", "eps", "tau", "soft", "faded", "drawn")
 SCALE_COLUMNS = ("growth", "distance", "scale", "reach", "factor")
 TOLERANCE = 3e-5  # float32 rounding times the steepest slope and the largest exponent, with a margin
@@ -102,4 +103,4 @@ def text() -> str:
 
 
 if __name__ == "__main__":
-    Path(__file__).with_name("golden.json").write_text(text(), encoding="utf-8")
+    FILE.write_text(text(), encoding="utf-8")
