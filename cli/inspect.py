@@ -43,7 +43,7 @@ def run(args: Namespace) -> dict[str, Any]:
     from clod_adapter.inspection.report import inspect
 
     found = inspect(args.file)
-    put("\n".join(lines_of(found)), hang=WIDTH)
+    put("\n".join(lines_of(found)))
     return {"command": "inspect", "version": package_version(), **found.as_dict()}
 
 

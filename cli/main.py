@@ -69,10 +69,6 @@ def refuse(why: str, code: int, words: list[str]) -> int:
     """Prints why a command failed, with --json also as the one object on stdout; returns the exit code."""
     why = why if len(why) <= LONGEST else f"{why[:LONGEST]} ..."
     line = f"{PROG}: {why}" if code == INTERRUPTED else f"{PROG}: error: {why}"
-    if sys.stderr.isatty():
-        from .shared.console import folded
-
-        line = folded(line, sys.stderr)
     print(line, file=sys.stderr)
     if "--json" in words:
         print(json.dumps({"error": as_text(why), "code": code}))

@@ -6,7 +6,6 @@ import json
 import math
 import os
 import re
-import subprocess
 import sys
 import webbrowser
 from argparse import ArgumentParser, Namespace
@@ -199,24 +198,15 @@ def find_browser() -> webbrowser.BaseBrowser | None:
         return None
     if type(browser) is not webbrowser.GenericBrowser:
         return browser
-    return None if "BROWSER" not in os.environ or browser.basename in IN_TERMINAL else browser
+    if "BROWSER" not in os.environ or browser.basename in IN_TERMINAL:
+        return None
+    return webbrowser.BackgroundBrowser([browser.name, *browser.args])  # an editor's, whose end is not waited for
 
 
 def open_browser(url: str) -> bool:
     """Opens ``url`` in a browser window; False if there is no such browser."""
     browser = find_browser()
-    if browser is None:
-        return False
-    if type(browser) is not webbrowser.GenericBrowser:
-        return browser.open(url)
-    # A program of the user's, or of an editor that shows the page in its own window. Its open() would wait for it.
-    command = [browser.name, *(word.replace("%s", url) for word in browser.args)]
-    nowhere = subprocess.DEVNULL
-    try:
-        subprocess.Popen(command, stdin=nowhere, stdout=nowhere, stderr=nowhere, start_new_session=True)
-    except OSError:
-        return False
-    return True
+    return browser is not None and browser.open(url)
 
 
 COMMAND = Command(

@@ -6,17 +6,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-import torch
-
 from clod_adapter.alignment.check import MOST_VIEWS, Alignment, check_alignment
-from clod_adapter.alignment.frames import focus_of
 from clod_adapter.alignment.search import Guess, cameras_in, guess_frame, scene_in
 from clod_adapter.cameras import Camera, Scene, View
 from clod_adapter.errors import ClodError
 from clod_adapter.io.checkpoint import Checkpoint
 from clod_adapter.io.scene.colmap import load_points
 from clod_adapter.io.scene.load import load_cameras, load_scene
-from clod_adapter.origin import Origin
 
 from .console import Console
 from .inputs import prepare_kernels
@@ -58,7 +54,7 @@ def align(
         notes = [FLAT.format(images=images)] if required and not found.views else []
         notes += [OTHER_COLOURS.format(ply=ply, images=images)] if required and found.margin < 0 else []
     else:
-        message = f"{ply}: does not match {images}: {mismatch(checkpoint, views, found, guess)}"
+        message = f"{ply}: does not match {images}: {mismatch(found, guess)}"
         if required:
             raise ClodError(f"{message}; use --misaligned-ok to train anyway")
         notes = [f"warning: {message}"]
@@ -109,7 +105,7 @@ def _other_frame(
         return guess_frame(checkpoint.gaussians, views, found, points, cameras)
 
 
-def mismatch(checkpoint: Checkpoint, views: Sequence[View], found: Alignment, guess: Guess | None) -> str:
+def mismatch(found: Alignment, guess: Guess | None) -> str:
     """The measurements, and a remedy."""
     share = f"{found.in_view:.2g}" if 0 < found.in_view < 0.01 else f"{found.in_view:.0%}"
     facts = f"{share} of its Gaussians are in view"
@@ -125,24 +121,4 @@ def mismatch(checkpoint: Checkpoint, views: Sequence[View], found: Alignment, gu
         )
     if guess:
         return f"{facts}; in another frame renders have {guess.psnr:.1f} dB: {guess.frame.description}"
-    return f"{facts}; {positions(checkpoint, views)}; give the checkpoint of this scene, in the cameras' frame"
-
-
-def positions(checkpoint: Checkpoint, views: Sequence[View]) -> str:
-    """The positions of Gaussians and cameras, in the coordinates of their files."""
-    base, origin = checkpoint.gaussians, checkpoint.origin
-    if not len(base):
-        return "it is empty"
-    middle = base.means.median(dim=0).values
-    radius = float((base.means - middle).norm(dim=1).median())
-    centres = torch.stack([view.camera.position for view in views])
-    focus = focus_of(torch.stack([view.camera.viewmat for view in views])).to(centres)
-    away = float((centres - focus).norm(dim=1).median())
-    return (
-        f"half of the Gaussians lie within {radius:.3g} of {_point(middle, origin)}, the cameras look at about "
-        f"{_point(focus, origin)} from a distance of {away:.3g}"
-    )
-
-
-def _point(position: torch.Tensor, origin: Origin) -> str:
-    return "(" + ", ".join(f"{value + by:.3g}" for value, by in zip(position.tolist(), origin, strict=True)) + ")"
+    return f"{facts}; give the checkpoint of this scene, in the cameras' frame"

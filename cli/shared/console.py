@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import os
 import sys
-import textwrap
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any, TextIO
+from typing import Any
 
 from tqdm import tqdm
 
@@ -18,7 +16,7 @@ from clod_adapter.progress import Listener, Progress
 
 tqdm.monitor_interval = 0  # bars are updated at every step anyway, and its thread may fail to start
 LINE_EVERY = 10.0  # seconds between progress lines if stderr is not a terminal
-WIDTH = 80  # of progress lines and tables, and of a terminal whose size is unknown
+WIDTH = 80  # of tables
 TEXT = 36  # most characters of the text beside a bar, so that 80 columns have room for label, time and bar
 BAR_FORMAT = "{desc} {percentage:3.0f}%|{bar}| {remaining} left{postfix}"
 
@@ -31,7 +29,7 @@ class Console:
 
     def say(self, text: str) -> None:
         if not self.quiet:
-            tqdm.write(folded(text, sys.stderr), file=sys.stderr)  # print would overwrite a bar on this line
+            tqdm.write(text, file=sys.stderr)  # print would overwrite a bar on this line
             sys.stderr.flush()
 
     def note(self, text: str) -> None:
@@ -121,46 +119,14 @@ class Meter:
             self.bar = None
 
 
-def put(text: str, hang: int = 4, end: str = "\n") -> None:
-    """Prints a result on stdout, as ``folded``."""
-    print(folded(text, sys.stdout, hang), end=end)
-
-
-def folded(text: str, stream: TextIO, hang: int = 4) -> str:
-    """``text`` as ``stream`` shows it: on a terminal, long lines are broken between words; elsewhere it is unchanged.
-
-    Args:
-        hang: further indentation of the lines that continue another.
-    """
-    if not stream.isatty():
-        return text
-    try:
-        width = os.get_terminal_size(stream.fileno()).columns or WIDTH
-    except (OSError, ValueError):
-        width = WIDTH
-    return "\n".join(_broken(line, width, hang) for line in text.split("\n"))
-
-
-def _broken(line: str, width: int, hang: int) -> str:
-    if len(line) <= width:
-        return line
-    indent = " " * (len(line) - len(line.lstrip()) + hang)
-    return textwrap.fill(
-        line, width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False,
-        expand_tabs=False, replace_whitespace=False,
-    )  # fmt: skip
+def put(text: str, end: str = "\n") -> None:
+    """Prints a result on stdout."""
+    print(text, end=end)
 
 
 def command_line(*parts: str) -> str:
-    """An indented command; one that is too long is continued in the way of shells, between its parts."""
-    lines = [f"  {parts[0]}"]
-    for part in parts[1:]:
-        if len(lines[-1]) + 1 + len(part) + 2 > WIDTH:  # with a space, and a backslash after it
-            lines[-1] += " \\"
-            lines.append(f"      {part}")
-        else:
-            lines[-1] += f" {part}"
-    return "\n".join(lines)
+    """An indented command."""
+    return f"  {' '.join(parts)}"
 
 
 def clipped(text: str, most: int) -> str:

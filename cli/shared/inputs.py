@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path, PureWindowsPath
 
@@ -30,7 +29,7 @@ from clod_adapter.training.camera_placement import place_cameras
 from clod_adapter.training.loop import adapt
 from clod_adapter.training.pseudo_views import LIGHTEST, STEPS_PER_PLACED, add_pseudo_views, render_pseudo_views
 
-from .console import Console, Meter
+from .console import Console
 from .outputs import size
 
 
@@ -221,10 +220,6 @@ def _shorter(name: str) -> tuple[str, ...]:
 
 
 CPU = torch.device("cpu")
-OTHER = ""
-# Share of each kernel in the time to compile all of them; used only for the progress shown. The projection and its
-# gradient are compiled twice: with a dial, and without.
-SHARES = {"project": 0.12, "project_gradient": 0.13, "adam_rows": 0.1, OTHER: 0.035}
 
 
 def prepare_kernels(
@@ -241,62 +236,30 @@ def prepare_kernels(
     viewmat, K = torch.eye(4), torch.eye(3)
     viewmat[2, 3] = 2.0
     view = View(Camera(viewmat, K, 4, 4), torch.zeros(4, 4, 3, dtype=torch.uint8))
-    with announced_compiling(console, SHARES), one_thread():
-        evaluate(one, [view], [1.0])
-        if training:
-            adapted = adapt(one, Scene((view,), ()), AdaptConfig(iters=1), progress=False)
-            if adapted.interrupted:
-                raise Stopped("stopped while the kernels were compiled")
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Limits torch to one thread; after a Ctrl-C in one, each of several threads would compile on its own."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # after a Ctrl-C in one, each of several would compile on its own
     try:
-        yield
+        with install_listener("numba:compile", _Compiling(console)):
+            evaluate(one, [view], [1.0])
+            if training:
+                adapted = adapt(one, Scene((view,), ()), AdaptConfig(iters=1), progress=False)
+                if adapted.interrupted:
+                    raise Stopped("stopped while the kernels were compiled")
     finally:
-        torch.set_num_threads(before)
-
-
-@contextmanager
-def announced_compiling(console: Console, shares: Mapping[str, float]) -> Iterator[None]:
-    """Prints a line when something is compiled within the block, and the progress.
-
-    Args:
-        shares: of the compile time, by kernel and for ``OTHER`` ones.
-    """
-    listener = _Compiling(console, shares)
-    try:
-        with install_listener("numba:compile", listener):
-            yield
-    finally:
-        listener.close()
+        torch.set_num_threads(threads)
 
 
 class _Compiling(Listener):  # type: ignore[misc]
-    """Follows compilations; functions that a kernel calls are compiled within its own."""
+    """Says once that something is compiled."""
 
-    def __init__(self, console: Console, shares: Mapping[str, float]) -> None:
-        self.console, self.shares = console, shares
-        self.meter: Meter | None = None
-        self.depth, self.done = 0, 0.0
+    def __init__(self, console: Console) -> None:
+        self.console, self.said = console, False
 
     def on_start(self, event: Event) -> None:
-        self.depth += 1
-        if not self.meter:
-            cached = not isinstance(event.data["dispatcher"]._cache, NullCache)
+        if not self.said:
+            self.said, cached = True, not isinstance(event.data["dispatcher"]._cache, NullCache)
             nowhere = "on every run, as no cache folder is writable: set NUMBA_CACHE_DIR"
             self.console.say(f"compiling kernels ({'first run only, well under a minute' if cached else nowhere}) ...")
-            self.meter = Meter(self.console, "compiling", slow=True)
 
     def on_end(self, event: Event) -> None:
-        self.depth -= 1
-        if self.depth == 0 and self.meter:
-            self.done += self.shares.get(event.data["dispatcher"].py_func.__name__, self.shares[OTHER])
-            self.meter.update(self.done)
-
-    def close(self) -> None:
-        if self.meter:
-            self.meter.close()
+        pass

@@ -207,16 +207,12 @@ def _check_no_input(outputs: Outputs) -> None:
 
 def _check_not_beside(outputs: Outputs) -> None:
     """Refuses a named output that adapting wrote beside an input."""
-    beside = {
-        key: file
-        for file in outputs.inputs
-        for name in (Path(file), Path(file).resolve())
-        for suffix in SUFFIXES
-        for key in _keys(name.with_suffix(suffix))
-    }
     for path in outputs.named:
-        if found := [beside[key] for key in _keys(path) if key in beside and BESIDE.search(_beginning(path))]:
-            raise ClodError(f"{path}: is the adapter, state or report of {found[0]}; choose another output")
+        written = BESIDE.search(_beginning(path)) is not None
+        for file in outputs.inputs if written else ():
+            beside = [name.with_suffix(suffix) for name in (Path(file), Path(file).resolve()) for suffix in SUFFIXES]
+            if any(other.exists() and path.samefile(other) for other in beside):
+                raise ClodError(f"{path}: is the adapter, state or report of {file}; choose another output")
 
 
 def _is_ours(path: Path) -> bool:

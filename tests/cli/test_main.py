@@ -4,25 +4,51 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 
 from clod_adapter._support.version import package_version
-from runs import fail
+
+CAUSED = SystemError("returned a result with an exception set")  # as numba hands on a Ctrl-C
+CAUSED.__cause__ = KeyboardInterrupt()
+LITTLE = "error: not enough memory \\(.*\\); free some memory, or raise the limit on it \\(ulimit -v\\)"
+BUG = f"error: this is a bug in clod-adapt {package_version()}, not in the input: please report it, with the lines"
 
 
-def test_oserror_is_one_line(clod: Any, capture: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(*_: Any) -> None:
-        raise OSError(28, "No space left on device", "some/file")
+@pytest.mark.parametrize(
+    ("error", "code", "said"),
+    [
+        (OSError(28, "No space left on device", "a/file"), 2, "error: a/file: No space left on device; check the path"),
+        (KeyboardInterrupt(), 130, "interrupted$"), (CAUSED, 130, "interrupted$"),
+        (ZeroDivisionError("of ours"), 1, BUG), (SystemError("of numba"), 1, BUG), (RuntimeError("unknown"), 1, BUG),
+        (MemoryError(), 2, LITTLE), (RuntimeError("can't start new thread"), 2, LITTLE),
+        (RuntimeError("[enforce fail at alloc_cpu.cpp:119] . DefaultCPUAllocator: can't allocate memory"), 2, LITTLE),
+        (torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB."), 2, LITTLE),
+        (ImportError("libtorch_cpu.so: failed to map segment from shared object"), 2, LITTLE),
+        (OSError(12, "Cannot allocate memory"), 2, LITTLE),
+    ],
+)  # fmt: skip
+def test_errors_of_the_work(
+    clod: Any, capture: Any, monkeypatch: pytest.MonkeyPatch, error: BaseException, code: int, said: str
+) -> None:
+    """One line, with --json also an object on stdout; below a traceback only where the error is ours."""
 
-    monkeypatch.setattr("clod_adapter.cli.shared.inputs.read_scene", full)
-    done = clod("eval", capture.ply, "--images", capture.scene)
-    assert (done.code, done.out) == (2, ""), done
-    assert done.err.splitlines()[-1].startswith("clod-adapt: error: some/file: No space left on device; check")
+    def read(*_: object, **__: object) -> None:
+        raise error
+
+    monkeypatch.setattr("clod_adapter.cli.shared.inputs.load", read)
+    done = clod("eval", capture.ply, "--images", capture.scene, "--json", "--quiet")
+    lines, found = done.err.splitlines(), json.loads(done.out)
+    assert done.code == found["code"] == code and lines[-1].endswith(found["error"]), done
+    assert re.match(f"clod-adapt: {said}", lines[-1]), done
+    assert (lines[0] == "Traceback (most recent call last):") == (code == 1) == (len(lines) > 1)
+    assert code != 1 or str(error) in lines[-2]
 
 
 def test_torch_is_imported_with_idle_threads_and_the_collector_on() -> None:
@@ -35,64 +61,11 @@ def test_torch_is_imported_with_idle_threads_and_the_collector_on() -> None:
         "sys.meta_path.insert(0, Spy())\n"
         "from clod_adapter.cli.main import import_library\n"
         "import_library(quiet=True)\n"
-        "assert 'torch' in sys.modules\n"
-        "assert gc.isenabled() and gc.get_freeze_count() > 1000\n"
+        "assert 'torch' in sys.modules and gc.isenabled() and gc.get_freeze_count() > 1000\n"
     )
     environment = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
     assert done.stdout.split()[0] == "PASSIVE"
-
-
-def test_ctrl_c_within_compiled_code(clod: Any, capture: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Numba's dispatcher raises a SystemError from it; other SystemErrors are bugs."""
-    for cause, code, last in ((KeyboardInterrupt(), 130, "clod-adapt: interrupted"), (None, 1, "please report it")):
-
-        def read(*_: object, cause: BaseException | None = cause) -> None:
-            raise SystemError("returned a result with an exception set") from cause
-
-        monkeypatch.setattr("clod_adapter.cli.shared.inputs.read_checkpoint", read)
-        done = clod("eval", capture.ply, "--images", capture.scene)
-        assert done.code == code and last in done.err.splitlines()[-1], done
-
-
-def test_unexpected_error_prints_a_traceback_and_where_to_report_it(
-    clod: Any, capture: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("clod_adapter.cli.shared.inputs.read_checkpoint", fail)
-    done = clod("eval", capture.ply, "--images", capture.scene, "--json", "--quiet")
-    lines = done.err.splitlines()
-    assert done.code == 1 and lines[0] == "Traceback (most recent call last):", done
-    assert lines[-2] == "ZeroDivisionError: of ours" and 'raise ZeroDivisionError("of ours")' in done.err
-    assert lines[-1].startswith(f"clod-adapt: error: this is a bug in clod-adapt {package_version()}, not in the input")
-    assert "please report it, with the lines above" in lines[-1]
-
-
-def test_errors_are_one_json_object(clod: Any, capture: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Bad input, an interrupt and a fault of ours; on stdout, beside the line on stderr."""
-    words = ("eval", capture.ply, "--images", capture.scene, "--json")
-    done = clod(*words, "--sv=-1")
-    assert json.loads(done.out) == {
-        "error": "--sv has -1, it must be at least 0 (1 is full quality, 0 everything)",
-        "code": 2,
-    }
-    for error, code, said in ((KeyboardInterrupt(), 130, "interrupted"), (ZeroDivisionError(), 1, "this is a bug in")):
-
-        def read(*_: object, error: BaseException = error) -> None:
-            raise error
-
-        monkeypatch.setattr("clod_adapter.cli.shared.inputs.read_scene", read)
-        done = clod(*words)
-        found = json.loads(done.out)
-        assert done.code == found["code"] == code and found["error"].startswith(said), done
-        assert done.err.splitlines()[-1].endswith(found["error"])
-
-
-@pytest.mark.parametrize(("word", "command"), [("veiw", "view"), ("Eval", "eval"), ("robustnes", "robustness")])
-def test_a_misspelt_command_is_suggested(clod: Any, tmp_path: Path, word: str, command: str) -> None:
-    done = clod(word, "some.ply")
-    assert done.code == 2 and f"{word}: no such file or command; did you mean clod-adapt {command}?\n" in done.err
-    (tmp_path / word).touch()
-    assert "did you mean" not in clod(word).err  # a file
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="Linux has this device")
@@ -103,3 +76,8 @@ def test_results_that_cannot_be_printed_are_an_error(capture: Any, words: str) -
         done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
     said = "clod-adapt: error: stdout cannot be written (No space left on device), so the result is lost; open it\n"
     assert (done.returncode, done.stderr) == (2, said)
+
+
+def test_a_file_of_nearly_a_commands_name(clod: Any, tmp_path: Path) -> None:
+    (tmp_path / "veiw").touch()
+    assert "did you mean" not in clod("veiw").err

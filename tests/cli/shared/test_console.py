@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from clod_adapter.cli.shared.console import Console, Meter, command_line, duration
+from clod_adapter.cli.shared.console import Console, Meter, duration
 
 
 class Terminal(io.StringIO):
@@ -77,33 +77,8 @@ def test_duration() -> None:
     assert {seconds: duration(seconds) for seconds in texts} == texts
 
 
-def test_text_of_a_status_changes(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    now = 0.0
-    monkeypatch.setattr("clod_adapter.cli.shared.console.time", SimpleNamespace(perf_counter=lambda: now))
-    with Console().status("packing ...") as show:
-        for now in range(1, 31):
-            show(f"packing, {now} s")
-    assert capsys.readouterr().err.splitlines() == ["packing, 10 s", "packing, 20 s", "packing, 30 s"]
-    monkeypatch.setattr(sys, "stderr", terminal := Terminal())
-    with Console().status("packing ...") as show:
-        show("packing, 1 s")
-    lines = terminal.getvalue().split("\r")
-    assert "packing, 1 s" in terminal.getvalue() and not lines[-1].strip() and "\n" not in terminal.getvalue()
-    with Console(quiet=True).status("packing ...") as show:
-        show("packing, 99 s")
-    assert "99" not in terminal.getvalue()
-
-
 def test_long_text_leaves_room_for_the_bar(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("clod_adapter.cli.shared.console.LINE_EVERY", 0)
     Meter(Console(), "pruning order").update(0.5, "a checkpoint of a long name, at its 12th step of 3000")
     (line,) = capsys.readouterr().err.splitlines()
     assert line.endswith(" left, a checkpoint of a long name, at i...") and len(line) <= 80
-
-
-def test_commands_are_continued_between_their_parts() -> None:
-    """Also a shell's continuation, so that a long command can be copied."""
-    assert command_line("clod-adapt view a.ply", "--base b.ply") == "  clod-adapt view a.ply --base b.ply"
-    lines = command_line("clod-adapt view a.ply", f"--base {'b' * 60}", "--images c").splitlines()
-    assert lines == ["  clod-adapt view a.ply \\", f"      --base {'b' * 60} \\", "      --images c"]
-    assert max(map(len, lines)) <= 80

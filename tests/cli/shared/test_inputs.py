@@ -1,17 +1,29 @@
-"""Checkpoints in formats of other tools."""
+"""What commands read, in formats of other tools; their device; kernels, compiled before times are measured."""
 
 from __future__ import annotations
 
+import importlib
 import json
+import pkgutil
+import re
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from numba.core.dispatcher import Dispatcher
 from plyfile import PlyData
 
-from clod_adapter.cli.main import COMMANDS, build_parser
+import clod_adapter
+from clod_adapter import _kernels
+from clod_adapter.cli.main import main
+from clod_adapter.cli.shared import inputs
+from clod_adapter.cli.shared.console import Console
+from clod_adapter.cli.shared.inputs import pick_device, prepare_kernels
+from clod_adapter.errors import ClodError
 from clod_adapter.io.file_formats import write
 from packing import write_packed
 
@@ -69,12 +81,6 @@ def test_values_that_look_activated_need_the_option(clod: Any, capture: Any, tmp
     assert errors[0] > 40 and abs(errors[1] - errors[0]) < 0.5 and errors[2] < 20
 
 
-def test_commands_that_read_a_checkpoint_have_the_option() -> None:
-    for name in ("", *COMMANDS):
-        options = {option for action in build_parser(name)._actions for option in action.option_strings}
-        assert ("--activated" in options) == (name not in ("demo", "inspect", "doctor")), name
-
-
 @pytest.mark.parametrize("name", ["base.compressed.ply", "base.spz", "base.splat", "base.glb", "base.safetensors"])
 def test_other_formats_are_adapted(clod: Any, capture: Any, tmp_path: Path, name: str) -> None:
     (write_packed if name.endswith(".ply") else write)(tmp_path / name, capture.gaussians)
@@ -84,3 +90,82 @@ def test_other_formats_are_adapted(clod: Any, capture: Any, tmp_path: Path, name
     assert clod("apply", name, "dial.safetensors", "--out", "again.ply").code == 0
     assert (tmp_path / "again.ply").read_bytes() == (tmp_path / "dial.ply").read_bytes()
     assert clod("eval", name, "--images", capture.scene, "--keep", 10).code == 2
+
+
+def test_auto_and_named_devices(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """Without a GPU nothing is printed; a GPU is named, or the reason that it is not used."""
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert pick_device("auto", Console()) == pick_device("cpu", Console()) == torch.device("cpu")
+    assert capsys.readouterr() == ("", "")
+    for name, value in (("is_available", True), ("current_device", 0), ("get_device_name", "NVIDIA Test 1")):
+        monkeypatch.setattr(torch.cuda, name, lambda *_, value=value: value)
+    monkeypatch.setattr(inputs, "_fails", lambda: None)
+    monkeypatch.setattr(inputs, "unusable", lambda: None)
+    assert pick_device("auto", Console()) == pick_device("cuda", Console()) == torch.device("cuda", 0)
+    assert capsys.readouterr().err.splitlines() == ["on NVIDIA Test 1"] * 2
+    assert pick_device("cpu", Console()) == torch.device("cpu")
+    monkeypatch.setattr(inputs, "unusable", lambda: "gsplat is absent: pip install gsplat==1.5.3")
+    assert pick_device("auto", Console()) == torch.device("cpu")
+    said = "on the CPU, although there is a GPU: gsplat is absent: pip install gsplat==1.5.3"
+    assert capsys.readouterr().err.splitlines() == [said]
+    with pytest.raises(ClodError, match=r"--device cuda: gsplat is absent: pip install gsplat==1.5.3; or use"):
+        pick_device("cuda", Console())
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="torch computes on the GPU that is here")
+def test_gpu_that_torch_cannot_compute_on_is_not_used(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """For example, torch has no code for its compute capability: torch finds it, and the first operation fails."""
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(inputs, "unusable", lambda: pytest.fail("gsplat would be compiled for nothing"))
+    assert pick_device("auto", Console()) == torch.device("cpu")
+    assert "although there is a GPU: torch cannot compute on it (" in capsys.readouterr().err
+    with pytest.raises(ClodError, match=r"--device cuda: torch cannot compute on it .*doctor.*or use --device cpu"):
+        pick_device("cuda", Console())
+
+
+def test_cuda_without_a_gpu_is_refused(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], capture: Any
+) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    for build, why in ((None, "is built without CUDA: install torch from"), ("12.4", "torch finds no NVIDIA GPU")):
+        monkeypatch.setattr(torch.version, "cuda", build)
+        words = ["eval", str(capture.ply), "--images", str(capture.scene), "--device", "cuda"]
+        assert main(words) == 2
+        last = capsys.readouterr().err.strip().splitlines()[-1]
+        assert why in last and last.endswith("or use --device cpu")
+
+
+def kernels() -> dict[str, Dispatcher]:
+    """The kernels that Python calls, by name."""
+    modules = [
+        importlib.import_module(f"{_kernels.__name__}.{m.name}") for m in pkgutil.iter_modules(_kernels.__path__)
+    ]
+    found = [value for module in modules for value in vars(module).values() if isinstance(value, Dispatcher)]
+    return {d.py_func.__name__: d for d in found if not d.targetoptions.get("forceinline")}
+
+
+def test_adapting_compiles_nothing_more(capture: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    """For any SH degree; without compiling nothing is printed."""
+    base, scene = capture.gaussians, clod_adapter.load_scene(capture.scene)
+    prepare_kernels(Console(quiet=True))
+    prepare_kernels(Console())
+    assert capsys.readouterr().err == ""
+    before = {name: len(kernel.signatures) for name, kernel in kernels().items()}
+    assert min(before.values()) >= 1, before
+    for bands in (0, 3):
+        base = base.replace(shN=base.shN[:, :bands])
+        result = clod_adapter.adapt(base, scene, clod_adapter.AdaptConfig(iters=2)).gaussians
+        clod_adapter.evaluate(result, scene.test, [1.0, 3.0])
+    assert {name: len(kernel.signatures) for name, kernel in kernels().items()} == before
+
+
+def test_compiling_is_announced(tmp_path: Path) -> None:
+    """Once, where nothing is cached yet."""
+    code = "from clod_adapter.cli.shared.inputs import Console, _Compiling, install_listener\nimport numba\n"
+    code += "with install_listener('numba:compile', _Compiling(Console())):\n"
+    code += "    f = numba.njit(lambda x: x + 1)\n    f(1); f(1.0)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    (line,) = done.stderr.splitlines()
+    assert re.match(r"compiling kernels \(on every run, .* set NUMBA_CACHE_DIR\) \.\.\.$", line)
