@@ -1,16 +1,19 @@
-"""Adapting in blocks against adapting whole: quality, and peak memory.
+"""Adapting in blocks against adapting whole, and in two processes against one.
 
     python benchmarks/blocks.py quality plush_half         # 4 and 8 blocks; --iters 300 for a quick look
     python benchmarks/blocks.py memory                     # 2 million Gaussians, 60 photographs of 960x540
+    python benchmarks/blocks.py processes plush_half       # 300 views
 
 ``quality`` adapts a capture whole, whole with another seed, and in a fixed number of blocks, and compares each with the
 photographs and with the first at s = 1, 3, 5 on the held-out views. ``memory`` runs the command on a synthetic town
-with and without --memory. Rows go to ``results/blocks.jsonl``.
+with and without --memory. ``processes`` runs it with one view a step, with two, and with two processes of one view
+each, and compares the last two files. Rows go to ``results/blocks.jsonl``.
 """
 
 from __future__ import annotations
 
 import json
+import sys
 import tempfile
 from argparse import Namespace
 from dataclasses import replace
@@ -22,7 +25,7 @@ from clod_adapter.blocks.divide import divide
 from clod_adapter.blocks.train import adapt_block, merge
 from clod_adapter.initialization.importance import initialize, usable_views
 from clod_adapter.metrics import psnr
-from common import COMMAND, Process, Row, append, arguments, checkpoint, photographs
+from common import COMMAND, Process, Row, append, arguments, capture, checkpoint, photographs
 
 import torch
 
@@ -77,6 +80,25 @@ def memory(_: Namespace) -> None:
             append(FILE, row | process.cost() | {"plan": found.get("memory"), "steps": found["steps"]})
 
 
+def processes(args: Namespace) -> None:
+    torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", 2, "-m"]
+    runs = {
+        "one view": (COMMAND, {"iters": 300, "batch": 1}), "two views": (COMMAND, {"iters": 150, "batch": 2}),
+        "two processes": ((*torchrun, "clod_adapter"), {"iters": 150, "batch": 2}),
+    }  # fmt: skip
+    with tempfile.TemporaryDirectory() as folder:
+        for name in args.scenes:
+            found, files = {}, []
+            for label, (command, options) in runs.items():
+                out = Path(folder) / f"{label}.ply".replace(" ", "_")
+                words = [capture(name) / "pretrained.ply", "--images", capture(name), "--out", out, "--quiet"]
+                run = Process([*command, *words, *(w for k, v in options.items() for w in (f"--{k}", v))])
+                report = json.loads(out.with_suffix(".json").read_text(encoding="utf-8"))
+                found[label] = options | run.cost() | {"rows": report["rows"]}
+                files.append(clod.load(out).gaussians)
+            append(FILE, {"what": "processes", "scene": name, "runs": found, "alike": files[1] == files[2]})
+
+
 def main() -> None:
     parser = arguments(__doc__)
     commands = parser.add_subparsers(required=True)
@@ -86,6 +108,9 @@ def main() -> None:
     one.add_argument("--iters", type=int, default=clod.AdaptConfig().steps)
     one.set_defaults(run=quality)
     commands.add_parser("memory").set_defaults(run=memory)
+    two = commands.add_parser("processes")
+    two.add_argument("scenes", nargs="+")
+    two.set_defaults(run=processes)
     args = parser.parse_args()
     args.run(args)
 

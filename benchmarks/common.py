@@ -12,8 +12,7 @@ import sys
 import tempfile
 import time
 import xml.etree.ElementTree as xml
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from threading import Thread
 from typing import Any
@@ -101,58 +100,11 @@ def stored(file: str) -> list[Row]:
     return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()] if path.exists() else []
 
 
-@torch.no_grad()
-def supersampled(shown: clod.Gaussians, camera: clod.Camera, samples: int) -> torch.Tensor:
-    """``[H, W, 3]`` uint8, a render with ``samples`` by ``samples`` samples in a pixel."""
-    K = camera.K * torch.tensor([[samples], [samples], [1.0]])
-    large = replace(camera, K=K, width=samples * camera.width, height=samples * camera.height)
-    image = clod.render(shown, large).image.clamp(0, 1)
-    image = image.reshape(camera.height, samples, camera.width, samples, 3).mean((1, 3))
-    return (255 * image).round().to(torch.uint8)
-
-
-def timed(jobs: Mapping[str, Callable[[], Any]], repeats: int) -> dict[str, list[float]]:
-    """Milliseconds of each job, the jobs in turn."""
-    times: dict[str, list[float]] = {name: [] for name in jobs}
-    for _ in range(repeats):
-        for name, job in jobs.items():
-            began = time.perf_counter()
-            job()
-            times[name].append(1e3 * (time.perf_counter() - began))
-    return times
-
-
 def table(heads: Sequence[str], rows: Iterable[Sequence[object]], numbers_from: int | None = None) -> str:
     """A Markdown table; columns from ``numbers_from`` on are aligned to the right."""
     marks = ["---:" if numbers_from is not None and k >= numbers_from else "---" for k in range(len(heads))]
     lines = [f"| {' | '.join(map(str, cells))} |" for cells in (heads, *rows)]
     return "\n".join([lines[0], f"|{'|'.join(marks)}|", *lines[1:]])
-
-
-def flat(row: Row, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Numbers and texts of nested dictionaries, by dotted key."""
-    for key, value in row.items():
-        if isinstance(value, dict):
-            yield from flat(value, f"{prefix}{key}.")
-        elif not isinstance(value, list):
-            yield prefix + key, f"{value:.6g}" if isinstance(value, float) else "" if value is None else value
-
-
-def print_rows(file: str, *columns: str) -> None:
-    """Prints the stored rows as a Markdown table, a line for each of a row's ``rows``; columns are keys or parents."""
-    rows = [dict(flat({**row, **each})) for row in stored(file) for each in row.get("rows", [{}])]
-    found = {key: None for name in columns for row in rows for key in row if f"{key}.".startswith(f"{name}.")}
-    print(table(list(found), [[row.get(key, "") for key in found] for row in rows]))
-
-
-def fill_in(page: Path, name: str, text: str) -> None:
-    """Puts the text between the page's comments of this name, and prints it."""
-    between = rf"(<!-- {name}: [^>]*-->\n).*(\n<!-- end of {name} -->)"
-    filled, count = re.subn(between, lambda ends: f"{ends[1]}\n{text}\n{ends[2]}", page.read_text("utf-8"), flags=re.S)
-    if not count:
-        sys.exit(f"{page}: there is no place for {name}, between <!-- {name}: ... --> and <!-- end of {name} -->")
-    page.write_text(filled, encoding="utf-8")
-    print(text)
 
 
 def falling(values: Any) -> Any:

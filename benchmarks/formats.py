@@ -1,4 +1,4 @@
-"""Each file format: bytes per Gaussian, seconds, the error of sigma_d, and PSNR against the PLY.
+"""Each file format: bytes per Gaussian, the error of sigma_d, and PSNR against the PLY.
 
     python benchmarks/formats.py plush_half
     python benchmarks/formats.py --table                  # the rows as a Markdown table
@@ -13,28 +13,24 @@ from __future__ import annotations
 
 import math
 import tempfile
-import time
 from collections.abc import Sequence
 from pathlib import Path
-from statistics import fmean, median
+from statistics import fmean
 from typing import Any
 
 import clod_adapter as clod
 from clod_adapter.initialization.importance import initialize, usable_views
 from clod_adapter.io.file_formats import FORMATS, WRITABLE, write
-from common import append, arguments, checkpoint, photographs, print_rows
+from common import append, arguments, checkpoint, photographs, stored, table
 
 import torch
 
 FILE = "formats.jsonl"
-COLUMNS = ("scene", "suffix", "bytes_per_gaussian", "write_seconds", "read_seconds", "sigma_error", "s1.psnr",
-           "s5.psnr")  # fmt: skip
 DIALS = (1.0, 5.0)
-REPEATS = 5
 
 
 def main() -> None:
-    parser = arguments(__doc__, table=lambda: print_rows(FILE, *COLUMNS))
+    parser = arguments(__doc__, table=print_table)
     parser.add_argument("scenes", nargs="*")
     for scene in parser.parse_args().scenes:
         run(scene, clod.AdaptConfig(max_sv=max(DIALS)))
@@ -58,16 +54,8 @@ def run(scene: str, config: clod.AdaptConfig) -> None:
 
 
 def round_trip(path: Path, gaussians: clod.Gaussians) -> dict[str, Any]:
-    """What writing and reading take, and the largest relative error of sigma_d, of those of at least 1e-4."""
-    writing, reading = [], []
-    for _ in range(REPEATS):
-        began = time.perf_counter()
-        notes = write(path, gaussians)
-        written = time.perf_counter()
-        again = clod.load(path).gaussians
-        writing.append(written - began)
-        reading.append(time.perf_counter() - written)
-    error = None
+    """The size, and the largest relative error of sigma_d, of those of at least 1e-4."""
+    notes, again, error = write(path, gaussians), clod.load(path).gaussians, None
     if gaussians.sigma_d is not None and again.sigma_d is not None:
         there = (again.means - gaussians.means).abs().amax(1) <= 1e-3  # SPZ moves the farthest nearer
         old, new = gaussians.sigma_d.double()[there], again.sigma_d.double()[there]
@@ -75,7 +63,6 @@ def round_trip(path: Path, gaussians: clod.Gaussians) -> dict[str, Any]:
     return {
         "count": len(gaussians), "sh_degree": gaussians.sh_degree, "notes": notes, "sigma_error": error,
         "bytes_per_gaussian": round(path.stat().st_size / len(gaussians), 2),
-        "write_seconds": round(median(writing), 4), "read_seconds": round(median(reading), 4),
     }  # fmt: skip
 
 
@@ -90,6 +77,12 @@ def pictures(
         error = float((ours.image.clamp(0, 1) - theirs.image.clamp(0, 1)).double().square().mean())
         decibels += [-10 * math.log10(error)] if error > 0 else []
     return {"psnr": round(fmean(decibels), 2) if len(decibels) == len(cameras) else None}
+
+
+def print_table() -> None:
+    keys = ("scene", "suffix", "bytes_per_gaussian", "sigma_error")
+    lines = [[*(row[key] for key in keys), row["s1"]["psnr"], row["s5"]["psnr"]] for row in stored(FILE)]
+    print(table([*keys, "PSNR at s = 1", "at s = 5"], lines))
 
 
 if __name__ == "__main__":

@@ -6,7 +6,7 @@
 ``tests``: the contract of every backend, the gsplat integration, the optimizer and the compiled formula.
 ``plush``: plush_half adapted on the GPU and on the CPU with the same settings: seconds, and held-out quality.
 ``city``: a synthetic city adapted (peak memory), then near and far frames in turn with plain gsplat, packed and not, on
-the same file: times, the dial's share (attenuation, culling and compaction), PSNR.
+the same file: times, the dial's share, PSNR.
 
 Each adds rows to ``results/gpu.jsonl``. Without a GPU, plain is this package's CPU rasterizer without the dial.
 """
@@ -107,10 +107,7 @@ def adapt_plush(device: torch.device, size: Size, small: bool) -> list[dict[str,
     rows = []
     for place in dict.fromkeys([device, torch.device("cpu")]):
         own = base.to(place)
-        warm = clod.AdaptConfig(iters=1)  # compiles and loads kernels before the clock starts; timed separately
-        began = time.perf_counter()
-        clod.adapt(own, clod.Scene(scene.train[:1], ()), warm)
-        warm_seconds = time.perf_counter() - began
+        clod.adapt(own, clod.Scene(scene.train[:1], ()), clod.AdaptConfig(iters=1))  # compiled before the clock starts
         reset_peak(place)
         adapted = clod.adapt(own, scene, config)
         wait_for(place)
@@ -118,7 +115,7 @@ def adapt_plush(device: torch.device, size: Size, small: bool) -> list[dict[str,
         found = clod.evaluate(adapted.gaussians, scene.test, [1.0, 3.0, config.max_sv])
         rows.append({
             "on": place.type, "scene": "synthetic" if small else "plush_half", "config": asdict(config),
-            "count": len(own), "warm_seconds": round(warm_seconds, 2), "start_seconds": round(adapted.start_seconds, 2),
+            "count": len(own), "start_seconds": round(adapted.start_seconds, 2),
             "train_seconds": round(adapted.seconds, 2), "peak_bytes": peak(place), "base": base_row.as_dict(),
             "rows": [row.as_dict() for row in found],
         })  # fmt: skip
@@ -154,7 +151,6 @@ def frames(model: clod.Gaussians, views: list[clod.View], where: str, s: float, 
         "ours": lambda camera: clod.render(model, camera, s).image,
         **plain,
         "dial": lambda camera: dial(model, camera, s),
-        "compact": compaction(model, s),
     }
     times: dict[str, list[float]] = {name: [] for name in jobs}
     for job in jobs.values():
@@ -174,7 +170,7 @@ def frames(model: clod.Gaussians, views: list[clod.View], where: str, s: float, 
     return {
         "what": "frames", "where": where, "virtual_scale": s, "kept": fmean(int(p.kept.sum()) for p in shown), "ms": ms,
         "faster": {name: ms[name] / ms["ours"] for name in plain},
-        "dial_share": (ms["dial"] + ms["compact"]) / ms["ours"],
+        "dial_share": ms["dial"] / ms["ours"],
         "psnr_full": fmean(psnr(p.image, f) for p, f in zip(shown, pixels, strict=True)),
         "psnr_truth": fmean(psnr(p.image, view.image) for p, view in zip(shown, views, strict=True)),
     }  # fmt: skip
@@ -197,19 +193,6 @@ def plain_frames(model: clod.Gaussians) -> dict[str, Callable[[clod.Camera], Ten
         )[0][0]  # fmt: skip
 
     return {"plain packed": partial(draw, packed=True), "plain unpacked": partial(draw, packed=False)}
-
-
-def compaction(model: clod.Gaussians, s: float) -> Callable[[clod.Camera], Any]:
-    """Removal of the culled rows, given the opacities."""
-    scales = model.scales
-    drawn: dict[str, Tensor] = {}
-
-    def run(camera: clod.Camera) -> Any:
-        if camera.name not in drawn:
-            drawn[camera.name] = dial(model, camera, s).drawn
-        return cuda.compact(model.means, model.quats, scales, drawn[camera.name])
-
-    return run
 
 
 def synthetic(size: Size, device: torch.device) -> tuple[clod.Gaussians, clod.Scene]:

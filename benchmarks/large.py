@@ -22,7 +22,7 @@ from pathlib import Path
 
 import clod_adapter as clod
 from clod_adapter.evaluation.baselines import matching_dial
-from common import COMMAND, Process, Row, append, arguments, stored, supersampled, table
+from common import COMMAND, Process, Row, append, arguments, stored, table
 from tuning import TIMEOUT, find_tool
 
 import torch
@@ -85,6 +85,15 @@ def compared(finest: Path, levels: list[Path], adapted: Path | None, truth: Path
             yield {"method": name, "level": level.stem, "gaussians": len(found), "share": share, "psnr": row.psnr}
     if len(counts) > 1:  # a streaming set has several levels
         yield from streamed(out, [matching_dial(dial, cameras, count) for count in counts], views, len(base), folder)
+
+
+@torch.no_grad()
+def supersampled(shown: clod.Gaussians, camera: clod.Camera, samples: int) -> torch.Tensor:
+    """``[H, W, 3]`` uint8, a render with ``samples`` by ``samples`` samples in a pixel."""
+    K = camera.K * torch.tensor([[samples], [samples], [1.0]])
+    image = clod.render(shown, replace(camera, K=K, width=samples * camera.width, height=samples * camera.height)).image
+    image = image.clamp(0, 1).reshape(camera.height, samples, camera.width, samples, 3).mean((1, 3))
+    return (255 * image).round().to(torch.uint8)
 
 
 def write_photographs(shown: clod.Gaussians, folder: Path) -> Path:

@@ -4,9 +4,8 @@
     python benchmarks/nophoto.py plush_half --few 12 --kinds complemented
     python benchmarks/nophoto.py --table                  # the rows as a Markdown table
 
-The kinds of views: ``photographs`` (real cameras and photographs), ``teacher`` (real cameras, renders of the
-checkpoint), ``placed`` (placed cameras, renders of the checkpoint) and ``complemented`` (few photographs and pseudo
-views, as clod-adapt combines them). Each run adds one row to ``results/nophoto.jsonl``.
+The kinds of views: ``photographs``, ``placed`` (placed cameras, renders of the checkpoint) and ``complemented`` (few
+photographs and pseudo views, as clod-adapt combines them). Each run adds one row to ``results/nophoto.jsonl``.
 """
 
 from __future__ import annotations
@@ -21,14 +20,14 @@ from common import append, arguments, checkpoint, stored, table
 from common import photographs as photographs_of
 
 FILE = "nophoto.jsonl"
-KINDS = ("photographs", "teacher", "placed", "complemented")
+KINDS = ("photographs", "placed", "complemented")
 DIALS = (1.0, 2.0, 3.0, 5.0, 7.0)
 
 
 def main() -> None:
     parser = arguments(__doc__, table=print_table)
     parser.add_argument("scenes", nargs="*")
-    parser.add_argument("--kinds", nargs="+", choices=KINDS, default=KINDS[:3])
+    parser.add_argument("--kinds", nargs="+", choices=KINDS, default=KINDS[:2])
     parser.add_argument("--few", type=int, metavar="K", help="of the photographs to train on, only K, evenly spread")
     parser.add_argument("--iters", type=int, help="training steps (default: by the number of views, as clod-adapt)")
     parser.add_argument("--max-sv", type=float, default=7.0)
@@ -45,9 +44,6 @@ def run(scene: str, kind: str, config: clod.AdaptConfig, few: int | None) -> Non
         photographs = clod.Scene(train, photographs.test)
     base_row = clod.evaluate(base, photographs.test, [1.0])[0]
     began, views = time.perf_counter(), photographs
-    if kind == "teacher":  # of the views to train on alone; none is held out of them
-        rendered = render_pseudo_views(base, [view.camera for view in photographs.train])
-        views = clod.Scene(tuple(view.at(view.camera) for view in (*rendered.train, *rendered.test)), ())
     if kind == "placed":
         views = render_pseudo_views(base, clod.place_cameras(base, seed=config.seed))
         config = config.lighter(LIGHTEST).for_views(len(views.train), STEPS_PER_PLACED)  # as the command does

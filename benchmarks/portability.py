@@ -14,7 +14,6 @@ exit code is 1 where a test failed or a condition could not be had. The conditio
 - ``ignored_sigint``, ``blocked_signals``: as a script's background job, and below a program that blocks signals;
 - ``c_locale``: ASCII as the encoding of files and of the terminal, and a day's time zone away from Greenwich;
 - ``folders``: temporary files, home and kernel cache in folders with spaces and other letters in their names;
-- ``checkout``: the last commit as a clone in such a folder, with an environment of its own (pip installs it).
 """
 
 from __future__ import annotations
@@ -22,7 +21,6 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-import sysconfig
 import tempfile
 import time
 from collections.abc import Sequence
@@ -69,7 +67,6 @@ CONDITIONS = {
     "folders": Condition(
         {"TMPDIR": "{work}/tmp", "HOME": "{work}/home", "XDG_CACHE_HOME": "", "NUMBA_CACHE_DIR": "{work}/cache"}
     ),
-    "checkout": Condition(),
 }
 
 
@@ -86,43 +83,20 @@ def run(name: str, tests: Sequence[str], parallel: Sequence[str] = PARALLEL) -> 
         work = Path(outer) / SPACED
         for folder in ("tmp", "home", "cache"):
             (work / folder).mkdir(parents=True)
-        root, python = clone(work) if "checkout" in names else (ROOT, Path(sys.executable))
         report = Path(outer) / "report.xml"
-        words = [*condition.prefix, str(python), "-m", "pytest", *parallel, f"--junitxml={report}", *tests]
+        words = [*condition.prefix, sys.executable, "-m", "pytest", *parallel, f"--junitxml={report}", *tests]
         environment = {key: value.format(work=work) for key, value in condition.environment.items()}
         environment["CLOD_SHARED_DATA"] = str(SHARED)  # the default is relative to the checkout
         began = time.perf_counter()
         done = subprocess.run(
-            words, cwd=root, env=os.environ | environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+            words, cwd=ROOT, env=os.environ | environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
             errors="replace", check=False,
         )  # fmt: skip
         seconds = round(time.perf_counter() - began, 1)
-        found = outcomes(report) if report.exists() else {"failures": [last_line(done.stdout)]}
+        found = outcomes(report) if report.exists() else {"failures": [done.stdout.strip()[-200:]]}
     if done.returncode != 0 and not found["failures"]:
-        found["failures"] = [f"exit code {done.returncode}: {last_line(done.stdout)}"]
+        found["failures"] = [f"exit code {done.returncode}: {done.stdout.strip()[-200:]}"]
     return {"passed": 0, "failed": 1, "skipped": 0, **found, "seconds": seconds}
-
-
-def clone(work: Path) -> tuple[Path, Path]:
-    """A clone of the last commit, and the Python of an environment with it and this environment's packages."""
-    root = work / ROOT.name
-    subprocess.run(["git", "clone", "--quiet", str(ROOT), str(root)], check=True)
-    subprocess.run([sys.executable, "-m", "venv", str(root / ".venv")], check=True)
-    python = root / ".venv" / "bin" / "python"
-    (site,) = (root / ".venv").glob("lib/python*/site-packages")
-    (site / "beside.pth").write_text(site_packages(), encoding="utf-8")
-    subprocess.run([str(python), "-m", "pip", "install", "--quiet", "--no-deps", "--editable", str(root)], check=True)
-    return root, python
-
-
-def site_packages() -> str:
-    """Where this environment's packages are, in lines of a .pth file."""
-    own = Path(sysconfig.get_path("purelib"))
-    return "\n".join(path for path in sys.path if Path(path) == own or Path(path).name == "site-packages")
-
-
-def last_line(text: str) -> str:
-    return next((line for line in reversed(text.splitlines()) if line.strip()), "no output")
 
 
 def main() -> None:

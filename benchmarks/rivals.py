@@ -7,7 +7,7 @@
 - ``specialist``: the merged file, tuned for that count alone;
 - ``tuned``: the whole base, tuned for as many steps;
 - ``prefix``: one file whose prefixes are the counts, by removal error, tuned with random prefixes (``tuning.tune``);
-- ``ranking``: prefixes without tuning, ordered by opacity, by contribution and by removal error.
+- ``ranking``: prefixes by removal error without tuning.
 
 A scene is named as for adapt.py. Each run adds a row to ``results/rivals.jsonl``.
 """
@@ -19,11 +19,9 @@ from dataclasses import asdict
 from typing import Any
 
 import clod_adapter as clod
-from clod_adapter.initialization.importance import coverage, removal_error
+from clod_adapter.initialization.importance import removal_error
 from common import Row, append, arguments, checkpoint, falling, head, photographs, stored, table
 from tuning import MERGINGS, Tuning, find_tool, merge, tune
-
-import torch
 
 FILE = "rivals.jsonl"
 RIVALS = ("merging", "specialist", "tuned", "prefix", "ranking")
@@ -79,11 +77,8 @@ def contest(
         files = {share: head(tuned, count) for share, count in ({1.0: len(some)} | counts).items()}
         yield "prefixes by removal error, lengths log", files, about | {"train_seconds": seconds}
     else:
-        seen = sum((coverage(some, some.opacities, view.camera) for view in train), torch.zeros(()))
-        worths = {"opacity": some.opacity_logits, "contribution": seen, "removal error": removal_error(some, train)}
-        for order, worth in worths.items():
-            ranked = some.select(falling(worth))
-            yield f"untouched, by {order}", {share: head(ranked, count) for share, count in counts.items()}, {}
+        ranked = some.select(falling(removal_error(some, train)))
+        yield "untouched, by removal error", {share: head(ranked, count) for share, count in counts.items()}, {}
 
 
 def print_table() -> None:

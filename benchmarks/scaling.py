@@ -5,7 +5,7 @@
     python benchmarks/scaling.py --table    # the tables of docs/performance.md, from the stored rows
 
 Runs each command in its own process on synthetic towns, which are kept in benchmarks/cache. Measures wall and CPU
-seconds and resident memory by phase. A town of 1000 Gaussians gives the start-up cost. Rows go to
+seconds and peak memory. A town of 1000 Gaussians gives the start-up cost. Rows go to
 results/scaling.jsonl; the last row of a kind counts.
 """
 
@@ -19,7 +19,7 @@ import signal
 import sys
 import tempfile
 import urllib.request
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
@@ -32,9 +32,6 @@ FILE, CITIES = "scaling.jsonl", CACHE / "scaling"
 FLOOR, SIZES, FROM = 1000, (10_000, 100_000, 1_000_000, 5_000_000), 100_000  # exponents are fitted from FROM on
 # The last fifth of STEPS has photographs of full size.
 IMAGES, WIDTH, HEIGHT, STEPS, MAX_SV = 10, 640, 400, 20, 3
-SAID = {
-    "load": r": \d+ photographs to train on", "base": r"^base: ", "train": r"^trained ", "write": r"^wrote ",
-}  # fmt: skip
 # Loading, importance and the pruning order by themselves; the report has all of "start".
 PARTS = """
 import json, sys, time, torch
@@ -86,29 +83,12 @@ def dial_of(folder: Path) -> Path:
 
 
 def run_adapt(folder: Path) -> Row:
-    """A few steps: seconds and memory by phase."""
+    """A few steps."""
     out = dial_of(folder)
     words = [folder / "city.ply", "--images", folder, "--iters", STEPS, "--max-sv", MAX_SV, "--out", out]
-    run = Process([*COMMAND, *words], SAID)
-    seconds, at = json.loads(out.with_suffix(".json").read_text(encoding="utf-8"))["seconds"], run.moments
-    ends = {
-        "load": at["load"], "base": at["base"], "start": at["train"] - seconds["train"], "train": at["train"],
-        "write": at["write"], "measure and write again": run.seconds,
-    }  # fmt: skip
-    peaks, cpu = by_phase(run, ends.items())
-    return {**run.cost(), "step_seconds": seconds["train"] / STEPS, "step_cpu": cpu["train"] / STEPS,
-            "phases": seconds, "phase_peaks": peaks, "phase_cpu": cpu}  # fmt: skip
-
-
-def by_phase(run: Process, ends: Iterable[tuple[str, float]]) -> tuple[dict[str, int], dict[str, float]]:
-    """Peak memory and CPU seconds of consecutive phases that end at these times."""
-    peaks, seconds, start, before = dict[str, int](), dict[str, float](), 0.0, 0.0
-    for name, end in ends:
-        samples = [(size, cpu) for at, size, cpu in run.memory if start <= at < end]
-        peaks[name] = max((size for size, _ in samples), default=0)
-        now = max((cpu for _, cpu in samples), default=before)
-        seconds[name], start, before = round(now - before, 2), end, now
-    return peaks, seconds
+    run = Process([*COMMAND, *words])
+    seconds = json.loads(out.with_suffix(".json").read_text(encoding="utf-8"))["seconds"]
+    return {**run.cost(), "step_seconds": seconds["train"] / STEPS, "phases": seconds}
 
 
 def run_export(folder: Path) -> Row:
@@ -157,7 +137,7 @@ def print_tables() -> None:
             floor = dict(times).get(FLOOR, 0.0)
             powers.append(exponent([(n, t - floor) for n, t in times if n >= FROM]))
         cells = [f"{row.get(f'{part}_seconds' if part else 'seconds', math.nan):.3g}" for row in rows]
-        lines.append([part or command, *cells, *(f"{power:.2f}" for power in powers)])
+        lines.append([part or command, *cells, *(f"{power:.2f}" if power == power else "" for power in powers)])
         if not part and len(rows) > 1:
             (n, low), (m, high) = ((row["gaussians"], row["peak_bytes"]) for row in rows[-2:])
             peaks.append([command, f"{low / 1e9:.2f}", f"{high / 1e9:.2f}", f"{(high - low) / (m - n):,.0f}"])

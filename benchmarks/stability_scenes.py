@@ -19,15 +19,12 @@ from typing import Any
 
 import clod_adapter as clod
 from clod_adapter.cameras import Scene, View, in_its_unit
-from clod_adapter.gaussians import SH_C0
-from clod_adapter.io.scene.colmap import write_model
 from clod_adapter.training.pseudo_views import add_pseudo_views
 from common import capture, checkpoint, photographs, table
 
 import numpy as np
 import pycolmap
 import torch
-from PIL import Image
 from plyfile import PlyData, PlyElement
 
 CAPTURE = "ci_banana"
@@ -70,18 +67,6 @@ def floater(base: clod.Gaussians, scene: Scene) -> Case:
     means[0] = ahead.position + 1e6 * size_of(base) * ahead.viewmat[2, :3]
     scales[0] = math.log(1e4 * size_of(base))
     return Case(base.replace(means=means, log_scales=scales), scene)
-
-
-def only_one(base: clod.Gaussians, scene: Scene) -> Case:
-    one = base.select(torch.tensor([0]))
-    mean = torch.stack([view.image.float().mean((0, 1)) for view in scene.train]).mean(0) / 255
-    return Case(
-        one.replace(
-            means=base.means.median(0).values[None], log_scales=torch.full((1, 3), math.log(size_of(base) / 2)),
-            opacity_logits=torch.full((1,), 2.0), sh0=((mean - 0.5) / SH_C0)[None, None], shN=torch.zeros(1, 0, 3),
-        ),
-        scene,
-    )  # fmt: skip
 
 
 def behind(base: clod.Gaussians, scene: Scene) -> Case:
@@ -142,22 +127,6 @@ def georeferenced(base: clod.Gaussians, scene: Scene, kind: str) -> Case:
         return Case(checkpoint.gaussians, clod.load_scene(folder, origin=checkpoint.origin))
 
 
-def with_alpha(base: clod.Gaussians, scene: Scene) -> Case:
-    """Photographs cut out along a soft circle, as PNG with alpha, read back by our reader."""
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        (folder / "images").mkdir()
-        views = sorted((*scene.train, *scene.test), key=lambda view: view.camera.name)
-        for view in views:
-            y, x = np.mgrid[-1 : 1 : view.camera.height * 1j, -1 : 1 : view.camera.width * 1j]
-            alpha = np.clip(4 * (1 - np.hypot(x, y)), 0, 1) * 255
-            rgba = np.dstack([view.image.numpy(), alpha.astype(np.uint8)])
-            Image.fromarray(rgba).save(folder / "images" / f"{view.camera.name}.png")
-        cameras = [view.camera for view in views]
-        write_model(folder, cameras, [f"{camera.name}.png" for camera in cameras])
-        return Case(base, clod.load_scene(folder))
-
-
 def of_views(scene: Scene, change: Callable[[View], View]) -> Scene:
     return Scene(tuple(map(change, scene.train)), tuple(map(change, scene.test)))
 
@@ -175,7 +144,6 @@ CASES: dict[str, Change] = {
     "scaled by 1e-4": partial(similar, scale=1e-4),
     "scaled by 1e4": partial(similar, scale=1e4),
     "one floater at 1e6 times the size": floater,
-    "one Gaussian in all": only_one,
     "all Gaussians in one place": lambda base, scene: Case(
         base.replace(means=base.means.median(0).values.repeat(len(base), 1)), scene
     ),
@@ -189,7 +157,6 @@ CASES: dict[str, Change] = {
     "a single training image, scaled by 1e-4": partial(one_view, scale=1e-4),
     "a single training image, scaled by 1e4": partial(one_view, scale=1e4),
     "black images": black,
-    "images with alpha": with_alpha,
     "two cameras at one place": lambda base, scene: Case(base, Scene((*scene.train, scene.train[0]), scene.test)),
     "max_sv 1": partial(Case, settings={"max_sv": 1.0}),
     "max_sv 100, tau 0.004": partial(Case, settings={"max_sv": 100.0, "tau": 0.004}),

@@ -17,7 +17,7 @@ import clod_adapter as clod
 from clod_adapter.initialization.importance import removal_error
 from clod_adapter.report.charts import draw_training
 from clod_adapter.report.style import new_figure, save_figure
-from common import ROOT, Row, append, arguments, checkpoint, falling, head, photographs, stored, table
+from common import ROOT, Row, append, arguments, checkpoint, falling, head, photographs, stored
 from tuning import Tuning, merge, tune
 
 FILE = "tradeoff.jsonl"
@@ -31,7 +31,7 @@ LABELS = {
 
 
 def main() -> None:
-    parser = arguments(__doc__, table=print_table)
+    parser = arguments(__doc__)
     parser.add_argument("scene", help="a folder of the shared data")
     parser.add_argument("--iters", nargs="+", type=int, default=list(ITERS))
     parser.add_argument("--only", nargs="+", choices=LABELS, default=list(LABELS), help="some of the methods")
@@ -119,15 +119,6 @@ def plot(scene: str) -> None:
             axes.set_title(f"s = {s:g}", loc="left", fontsize=10, weight="bold")
         save_figure(figure, PICTURE)
     print(PICTURE)
-
-
-def print_table() -> None:
-    lines = [
-        [scene, f"s = {s:g}", LABELS[method], f"{p['seconds']:.0f}", f"{p['psnr']:.2f}", f"{p['share']:.1%}"]
-        for scene in dict.fromkeys(row["scene"] for row in stored(FILE))
-        for k, s in enumerate(DIALS) for method, points in curves(scene, k).items() for p in points
-    ]  # fmt: skip
-    print(table(["scene", "dial", "method", "seconds", "PSNR", "kept"], lines))
 
 
 if __name__ == "__main__":

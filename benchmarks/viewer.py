@@ -2,19 +2,17 @@
 
 Each capture's checkpoint is first adapted for 100 steps (kept in ``benchmarks/cache``). At some held-out cameras and
 dial values, and with the equation off: PSNR between the browser's picture and ``clod_adapter.render``, and the counts.
-The time to the first frame is that of WebGL in software. Each capture adds a row to ``results/viewer.jsonl``.
+Each capture adds a row to ``results/viewer.jsonl``.
 """
 
 from __future__ import annotations
 
 import sys
-import time
 from pathlib import Path
-from statistics import fmean
 from typing import Any
 
 import clod_adapter as clod
-from common import CACHE, COMMAND, ROOT, Process, Row, append, arguments, capture, table
+from common import CACHE, COMMAND, ROOT, Process, Row, append, arguments, capture
 
 import numpy as np
 import torch
@@ -34,13 +32,11 @@ def main() -> None:
     parser.add_argument("captures", nargs="*", default=CAPTURES)
     with browser.launch() as chromium:
         for name in parser.parse_args().captures:
-            row = measure(chromium, name)
-            append(FILE, row)
-            print(summary(row))
+            append(FILE, measure(chromium, name))
 
 
 def measure(chromium: Any, name: str) -> Row:
-    """Pictures and counts at held-out cameras, and seconds to the first frame."""
+    """Pictures and counts at held-out cameras."""
     path = adapted(name)
     model = clod.load(path)
     views = clod.load_scene(capture(name), origin=model.origin).test
@@ -48,13 +44,11 @@ def measure(chromium: Any, name: str) -> Row:
     size = {"width": cameras[0].width, "height": cameras[0].height}
     with serve(path) as url, chromium.new_context(viewport=size) as context:
         context.set_default_timeout(300_000)
-        began = time.perf_counter()
         shown = Shown(context.new_page()).ready(url)
-        seconds = time.perf_counter() - began
         rows = [each for camera in cameras for each in compare(shown, model.gaussians, camera)]
         return {
             "capture": name, "gaussians": len(model.gaussians), "sh_degree": model.gaussians.sh_degree, "picture": size,
-            "chromium": chromium.version, "first_frame_seconds": seconds, "rows": rows, "errors": shown.errors,
+            "chromium": chromium.version, "rows": rows, "errors": shown.errors,
         }  # fmt: skip
 
 
@@ -83,17 +77,6 @@ def adapted(name: str) -> Path:
         words = [capture(name) / "pretrained.ply", "--images", capture(name), "--max-sv", 5, "--iters", 100, "-o", path]
         Process([*COMMAND, *words])
     return path
-
-
-def summary(row: Row) -> str:
-    """PSNR and the largest difference of counts, at each dial value and with the equation off."""
-    lines = []
-    for dial in (*DIALS, None):
-        found = [each for each in row["rows"] if each["virtual_scale"] == dial]
-        errors = [each["psnr"] for each in found]
-        psnr = [f"{value:.1f}" for value in (min(errors), max(errors), fmean(errors))]
-        lines.append([dial or "equation off", *psnr, max(abs(each["kept"] - each["kept_in_page"]) for each in found)])
-    return table(["s", "least dB", "most", "mean", "counts differ by"], lines)
 
 
 if __name__ == "__main__":

@@ -145,8 +145,6 @@ def extremes() -> dict[str, Callable[[Workload], Workload]]:
         "1,000 that cover the image": lambda w1: covering(w1, 1000),
         "a million in one patch": lambda w1: patch(w1, 1_000_000),
         "needles": needles,
-        "on and behind the camera plane": near_plane,
-        "empty view": lambda w1: w1.changed("", means=_in_front(w1.camera, _in_camera(w1) * torch.tensor([1, 1, -1]))),
     }
 
 
@@ -178,22 +176,6 @@ def patch(w1: Workload, count: int, edge: int = 16) -> Workload:
 def needles(w1: Workload) -> Workload:
     """W1's Gaussians, 0.3 long and a millionth of that thick: lines of about a hundred pixels."""
     return w1.changed("", scales=torch.tensor([0.3, 3e-7, 3e-7]).repeat(len(w1.means), 1))
-
-
-def near_plane(w1: Workload) -> Workload:
-    """W1's Gaussians moved along their depth: thirds behind the camera's plane, on it, and up to 0.05 before it."""
-    points, draw = _in_camera(w1), torch.Generator().manual_seed(4)
-    third = torch.arange(len(points)) % 3
-    before = 0.05 * torch.rand(len(points), generator=draw)
-    depths = torch.where(third == 0, -points[:, 2], torch.where(third == 1, 0, before))
-    rays = points[:, :2] / points[:, 2:].clamp(min=0.3)
-    sideways = torch.where(third[:, None] == 2, rays * before[:, None], points[:, :2])
-    return w1.changed("", means=_in_front(w1.camera, torch.cat([sideways, depths[:, None]], 1)))
-
-
-def _in_camera(workload: Workload) -> Tensor:
-    viewmat = workload.camera.viewmat
-    return workload.means @ viewmat[:3, :3].T + viewmat[:3, 3]
 
 
 def _in_front(camera: Camera, points: Tensor) -> Tensor:
