@@ -23,8 +23,9 @@ def main(checkpoint: str, folder: str, out: str = "adapted.ply") -> None:
     result = clod.adapt(base.gaussians, scene, config)
 
     # The adapter is the difference from the base; the file is made of both.
-    about = {"fingerprint": base.fingerprint, "config": asdict(config), "origin": base.origin}
-    adapter = clod.extract(base.gaussians, result.gaussians, **about)
+    adapter = clod.extract(
+        base.gaussians, result.gaussians, fingerprint=base.fingerprint, config=asdict(config), origin=base.origin
+    )
     adapted = adapter.apply(base.gaussians)
     clod.save(out, adapted, base)
 
