@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import statistics
-import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
@@ -15,10 +14,10 @@ from clod_adapter.cameras import View
 from clod_adapter.equation.attenuation import check_dial
 from clod_adapter.equation.distances import in_frustum
 from clod_adapter.errors import ClodError
+from clod_adapter.evaluation.frame_times import timed_frame
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.metrics import psnr_ssim
 from clod_adapter.progress import Listener, Phase, Progress
-from clod_adapter.rasterizers import wait_for
 from clod_adapter.render import Rendering, render
 
 SCORED = 4  # views whose SSIM is computed at a time: each takes 83 bytes a pixel
@@ -105,18 +104,10 @@ def _compared(
     with ThreadPoolExecutor(workers) as pool:
         for first in range(0, len(views), workers):
             some = views[first : first + workers]
-            found = [_timed(gaussians, view, virtual_scale) for view in some]
+            found = [timed_frame(gaussians, view.camera, virtual_scale) for view in some]
             scores = pool.map(psnr_ssim, [rendering.image for rendering, _ in found], [view.image for view in some])
             for view, (rendering, seconds), score in zip(some, found, scores, strict=True):
                 yield view, rendering, seconds, score
-
-
-def _timed(gaussians: Gaussians, view: View, virtual_scale: float) -> tuple[Rendering, float]:
-    wait_for(gaussians.means.device)
-    began = time.perf_counter()
-    rendering = render(gaussians, view.camera, virtual_scale)
-    wait_for(gaussians.means.device)
-    return rendering, time.perf_counter() - began
 
 
 def _counts(gaussians: Gaussians, view: View, rendering: Rendering) -> tuple[int, int]:

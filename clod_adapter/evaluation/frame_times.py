@@ -19,7 +19,7 @@ from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.progress import Listener, Phase, tell
 from clod_adapter.rasterizers import wait_for
-from clod_adapter.render import render
+from clod_adapter.render import Rendering, render
 
 VIEWS, PASSES, FEWEST = 3, 5, 3
 SECONDS = 10.0  # after which no pass begins, once there are FEWEST; a pass that would take a third of it has one view
@@ -123,8 +123,13 @@ def _warm_up(gaussians: Gaussians, virtual_scale: float, camera: Camera) -> floa
 
 
 def _seconds(gaussians: Gaussians, virtual_scale: float, camera: Camera) -> float:
+    return timed_frame(gaussians, camera, 1.0 if gaussians.sigma_d is None else virtual_scale)[1]
+
+
+def timed_frame(gaussians: Gaussians, camera: Camera, virtual_scale: float) -> tuple[Rendering, float]:
+    """A rendering, and the seconds that it took, the device's work included."""
     wait_for(gaussians.means.device)
     began = time.perf_counter()
-    render(gaussians, camera, 1.0 if gaussians.sigma_d is None else virtual_scale)
+    rendering = render(gaussians, camera, virtual_scale)
     wait_for(gaussians.means.device)
-    return time.perf_counter() - began
+    return rendering, time.perf_counter() - began

@@ -41,9 +41,9 @@ def test_exp2_has_a_relative_error_below_3e_7() -> None:
 
 
 def test_log2_has_an_absolute_error_below_1e_7() -> None:
-    """In addition to one and a half units of the result (tests/other_libm); for every mantissa of two octaves, and all
-    normal exponents."""
-    octaves = np.float32(0.5).view(np.uint32) + np.arange(1 << 24, dtype=np.uint32)
+    """In addition to one and a half units of the result (tests/other_libm); for every fifth mantissa of two octaves, and
+    all normal exponents."""
+    octaves = np.float32(0.5).view(np.uint32) + np.arange(0, 1 << 24, 5, dtype=np.uint32)
     every = np.arange(0x00800000, np.float32(3.4e38).view(np.uint32), 997, dtype=np.uint32)
     ends = np.array([2.0**-126, 3e38, np.finfo(np.float32).max], np.float32)
     for x in (octaves.view(np.float32), np.concatenate([ends, every.view(np.float32)])):
