@@ -40,7 +40,7 @@ def tables(draw: st.DrawFn, total: int = 4) -> Calibration:
     )  # fmt: skip
 
 
-@settings(deadline=None, max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(deadline=None, max_examples=12, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(tables())
 def test_round_trips(tmp_path: Path, calibration: Calibration) -> None:
     assert Calibration.from_dict(json.loads(json.dumps(calibration.as_dict(), allow_nan=False))) == calibration

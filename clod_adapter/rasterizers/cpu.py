@@ -78,14 +78,14 @@ class _Compiled(Rasterizer):
         self, gaussians: Gaussians, camera: Camera, virtual_scale: float = 1.0, *,
         background: Tensor | np.ndarray | None = None, seen_from: Camera | None = None, trained: int | None = None,
     ) -> tuple[Tensor, Tensor]:  # fmt: skip
-        black = behind(gaussians, background)
-        if seen_from is not None or not _all_float32(*gaussians.tensors().values(), black):
-            return super().draw(gaussians, camera, virtual_scale, background=black, seen_from=seen_from)
+        background = behind(gaussians, background)
+        if seen_from is not None or not _all_float32(*gaussians.tensors().values(), background):
+            return super().draw(gaussians, camera, virtual_scale, background=background, seen_from=seen_from)
         check_dial(virtual_scale)
         g, nothing = gaussians, _nothing()
         sigma_d, growth_d = (nothing if x is None else x for x in (g.sigma_d, g.growth_d))
         return _Picture.apply(  # type: ignore[no-any-return, no-untyped-call]
-            g.means, g.quats, g.log_scales, g.opacity_logits, sigma_d, growth_d, g.sh0, g.shN, black, camera,
+            g.means, g.quats, g.log_scales, g.opacity_logits, sigma_d, growth_d, g.sh0, g.shN, background, camera,
             g.screen_filter, _dial_vector(g, camera, virtual_scale), len(g) if trained is None else trained,
         )  # fmt: skip
 

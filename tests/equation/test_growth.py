@@ -15,7 +15,6 @@ from clod_adapter.adapter import with_dial
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.equation.attenuation import Attenuated, attenuate
 from clod_adapter.equation.attenuation import dial as at_dial
-from clod_adapter.equation.distances import normalized_distances
 from clod_adapter.equation.growth import GROWTH_RANGE, LOG_GROWTH_MAX, growth_factors
 from clod_adapter.equation.units import in_world_units, with_distance
 from clod_adapter.errors import ClodError
@@ -80,27 +79,6 @@ def test_edges_are_finite(dtype: torch.dtype) -> None:
         assert out.isfinite().all() and slope.isfinite().all()
         assert (out >= 0.99 * math.exp(-20)).all() and (out <= 1.01 * math.exp(20)).all()
         assert (out[(h == 0) | (d == 0)] == 1).all()
-
-
-@pytest.mark.parametrize("cut", ["hard", "soft"])
-@pytest.mark.parametrize("form", ["logits", "centres", "opacities"])
-def test_opacities_and_kept_sets_do_not_depend_on_growth(form: str, cut: str) -> None:
-    some, view = gaussians(300, 0, 1), camera()
-    settings = config(0.02, cut=cut, scene_distance=2.0, reference_distance=3.0, max_sv=5.0)
-    sigma, h = torch.linspace(0.1, 3, 300).requires_grad_(), torch.linspace(-1, 3, 300)
-    d = normalized_distances(some.means, view, settings)
-    shown = some.opacities if form == "opacities" else some.opacity_logits
-    given = shown, sigma, (some.means, view) if form == "centres" else d
-    for s in (1.0, 2.7, 5.0):
-        without, grown = (
-            attenuate(*given, s, settings, activated=form == "opacities", growth_d=growth_d) for growth_d in (None, h)
-        )
-        assert torch.equal(without.growth, torch.ones(300)) and 0 < int(without.keep.sum()) < 300
-        assert all(torch.equal(a, b) for a, b in zip(without[:4], grown[:4], strict=True))
-        slopes = [torch.autograd.grad(out.drawn.sum(), sigma)[0] for out in (without, grown)]
-        assert torch.equal(*slopes)
-        assert torch.equal(growth(grown), growth_factors(h, d, s, 1.5))
-    assert growth(grown).max() > 2
 
 
 def test_growth_needs_a_dial_and_one_shape() -> None:

@@ -72,14 +72,3 @@ def test_kernels_run_without_a_writable_cache(number: Start, monkeypatch: pytest
     monkeypatch.setenv("NUMBA_CACHE_LOCATOR_CLASSES", "UserProvidedCacheLocator")
     process = number(1, "print(type(sums.f._cache).__name__)", cache=os.path.join(os.devnull, "cache"))
     assert said(process) == "NullCache\n2.0"
-
-
-def test_a_damaged_file_is_compiled_again(number: Start, tmp_path: Path) -> None:
-    assert said(number(1)) == "2.0"
-    files = [path for path in (tmp_path / "cache").rglob("*") if path.is_file()]
-    whole = {path: path.read_bytes() for path in files}
-    for left in (0.5,):
-        for path, data in whole.items():
-            path.write_bytes(data[: int(left * len(data))])
-        assert said(number(1)) == "2.0"
-        assert whole and all(len(path.read_bytes()) == len(data) for path, data in whole.items())

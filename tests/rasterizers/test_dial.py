@@ -52,10 +52,9 @@ def assert_same(model: Gaussians, s: float, *frozen: str) -> dict[str, Tensor]:
     *wanted, want = results(COMPOSED, model, s, *frozen)
     for found, expected in zip(pictures, wanted, strict=True):
         torch.testing.assert_close(found, expected, rtol=0, atol=5e-3)  # an alpha of 1/255 more or less
-        assert float((found - expected).abs().mean()) < 1e-5
-    for name, expected in want.items():
-        atol = 1e-4 * (max(float(expected.abs().max()), 1e-6) if expected.numel() else 1.0)
-        torch.testing.assert_close(slopes[name], expected, rtol=1e-3, atol=atol, msg=lambda m, n=name: f"{n}: {m}")
+        assert found.numel() == 0 or float((found - expected).abs().mean()) < 3e-5
+    for name, expected in want.items():  # one pixel with 1/255 more or less changes a few
+        assert float((slopes[name] - expected).norm()) <= 5e-3 * float(expected.norm()) + 1e-6, name
     kept = [each.kept(model, VIEW, s) for each in (KERNELS, COMPOSED)]
     assert torch.equal(*kept) and kept[0].dtype == torch.bool
     return slopes
