@@ -107,7 +107,7 @@ def options() -> Iterator[Case]:
         "--iters nan", "--iters 1e3", "--iters -1", "--iters 0x10", "--max-sv nan", "--max-sv inf", "--max-sv 0",
         "--max-sv 1e400", "--batch 0", "--batch 1000000", "--batch 1.5", "--seed -1", "--seed 99999999999999999999",
         "--time-budget 0", "--time-budget nan", "--time-budget inf", "--memory 0", "--memory nan", "--memory 8XB",
-        "--memory 1e400GB", "--memory 8GB --block 0", "--memory 8GB --block ²", "--with x", "--missing",
+        "--memory 1e400GB", "--with x", "--missing",
         "--iters $(printf 1%.0s $(seq 100000))", "--max-sv",
     ):  # fmt: skip
         yield Case(f"clod-adapt base.ply --images scene -o new.ply {words}")

@@ -15,8 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import clod_adapter as clod
-from clod_adapter.cli.demo import CROP, VIEW, measured
-from clod_adapter.demo.pictures import dial_strip
+from clod_adapter.demo.pictures import CROP, VIEW, dial_strip, measured
 from clod_adapter.evaluation.baselines import matching_dial
 from clod_adapter.io.atomic import atomic_path
 from common import ROOT, arguments

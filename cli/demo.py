@@ -2,39 +2,43 @@
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Sequence
+from argparse import ArgumentParser, Namespace
 from pathlib import Path
 from typing import Any
 
-import torch
-
-from clod_adapter.cameras import View
-from clod_adapter.demo.packed import unpack
-from clod_adapter.demo.pictures import Panel, dial_strip, quality_curve
 from clod_adapter.errors import ClodError
-from clod_adapter.evaluation.evaluate import evaluate
-from clod_adapter.evaluation.frame_times import time_frames
-from clod_adapter.gaussians import Gaussians
-from clod_adapter.io.checkpoint import load
-from clod_adapter.io.scene.load import load_scene
-from clod_adapter.render import render
+from clod_adapter.report.style import check_matplotlib
 
-from .adapt import run as adapt
-from .commands.adapt import ADAPT
-from .commands.demo import picture_files
+from . import adapt
+from .shared.command import Command
 from .shared.console import Console, duration, put
-from .shared.inputs import prepare_kernels
-from .shared.measure import Stopwatch
-from .shared.outputs import AdaptFiles, claimed
+from .shared.outputs import AdaptFiles, Outputs, claimed
 
 MAX_SV = 5.0
-DIALS = (1.0, 2.0, 3.0, 5.0)
-VIEW = 0  # the held-out view on the strip: across the whole room
-CROP = (150, 150, 150, 75)  # left, top, width and height of the part shown enlarged, pixels
 
 
-def run(args: argparse.Namespace) -> dict[str, Any]:
+def add_arguments(parser: ArgumentParser) -> None:
+    output = parser.add_argument_group("output")
+    output.add_argument("-o", "--out", metavar="DIR", default="demo", help="output folder (default: demo)")
+
+
+def outputs(args: Namespace) -> Outputs:
+    folder = Path(args.out)
+    model = AdaptFiles.of("", str(folder / "gallery.ply"))
+    return Outputs(derived=[*vars(model).values(), *picture_files(folder).values()], folders=[folder])
+
+
+def picture_files(folder: Path) -> dict[str, Path]:
+    return {"dial": folder / "dial.png", "curve": folder / "curve.png"}
+
+
+def run(args: Namespace) -> dict[str, Any]:
+    from clod_adapter.demo.packed import unpack
+    from clod_adapter.demo.pictures import draw
+
+    from .shared.inputs import prepare_kernels
+    from .shared.measure import Stopwatch
+
     console, watch, folder = Console(args.quiet), Stopwatch(), Path(args.out)
     capture, base, model = folder / "capture", folder / "base.ply", folder / "gallery.ply"
     pictures = picture_files(folder)
@@ -44,52 +48,53 @@ def run(args: argparse.Namespace) -> dict[str, Any]:
     unpack(capture, base)
     console.say(f"the scene is in {capture}, its checkpoint is {base}")
     arguments = adapt_arguments(args, base, capture, model)
-    with claimed(ADAPT.outputs(arguments)):
-        report = adapt.run(arguments)
+    with claimed(adapt.COMMAND.outputs(arguments)):
+        report = adapt.COMMAND.run(arguments)
+    assert report is not None
     for path in pictures.values():  # of an earlier run
         path.unlink(missing_ok=True)
     if report["rows"]:
         draw(capture, base, model, report, pictures)
     else:
         pictures = {}
-    print_next(folder, pictures, watch)
-    return report | {"command": "demo", "folder": str(folder), "pictures": {k: str(v) for k, v in pictures.items()}}
-
-
-def adapt_arguments(args: argparse.Namespace, base: Path, capture: Path, model: Path) -> argparse.Namespace:
-    """The arguments of the main command for the demo's files."""
-    words = [f"--images={capture}", f"--max-sv={MAX_SV:g}", f"--out={model}"]
-    words += [f"--{name}" for name in ("quiet", "json") if getattr(args, name)]
-    words += ["--resume"] if AdaptFiles.of(str(base), str(model)).state.exists() else []
-    return ADAPT.parser("clod-adapt").parse_args([*words, "--", str(base)])
-
-
-def print_next(folder: Path, pictures: dict[str, Path], watch: Stopwatch) -> None:
     put(f"\n{duration(watch.total())} for the demo; everything is in {folder.resolve()}")
     if pictures:
         put("dial.png shows a view at several dial values, curve.png quality against count")
     else:
         put("no figures: the measurements were interrupted")
     print("next, a splat of your own:\n  clod-adapt YOURS.ply --images YOUR_SCENE")
+    return report | {"command": "demo", "folder": str(folder), "pictures": {k: str(v) for k, v in pictures.items()}}
 
 
-def draw(capture: Path, base: Path, model: Path, report: dict[str, Any], pictures: dict[str, Path]) -> None:
-    """Draws a held-out view of the base and at several dial values, and the quality curve of all held-out views."""
-    view, gaussians = load_scene(capture).test[VIEW], load(model).gaussians
-    panels = [Panel(view.image.numpy(), "photograph"), *measured(load(base).gaussians, gaussians, DIALS, view)]
-    dial_strip(pictures["dial"], panels, "One file, one dial: a held-out view", crop=CROP)
-    title = "Quality against Gaussians, mean over the held-out views"
-    quality_curve(pictures["curve"], report["rows"], report["base_rows"][0], title)
+def adapt_arguments(args: Namespace, base: Path, capture: Path, model: Path) -> Namespace:
+    """The arguments of the main command for the demo's files."""
+    words = [f"--images={capture}", f"--max-sv={MAX_SV:g}", f"--out={model}"]
+    words += [f"--{name}" for name in ("quiet", "json") if getattr(args, name)]
+    words += ["--resume"] if AdaptFiles.of(str(base), str(model)).state.exists() else []
+    parsed: Namespace = adapt.COMMAND.parser("clod-adapt").parse_args([*words, "--", str(base)])
+    return parsed
 
 
-@torch.no_grad()
-def measured(base: Gaussians, model: Gaussians, dials: Sequence[float], view: View) -> list[Panel]:
-    """Panels of the base and of the ascending dial values."""
-    times = time_frames([(base, [1.0]), (model, dials)], [view.camera]).milliseconds
-    shown = [("base", base, 1.0), *((f"s = {s:.3g}", model, s) for s in dials)]
-    panels = []
-    for (heading, gaussians, s), taken in zip(shown, (*times[0], *times[1]), strict=True):
-        (row,) = evaluate(gaussians, [view], [s])
-        image = render(gaussians, view.camera, s).image.numpy()
-        panels.append(Panel(image, heading, row.kept, row.kept_share, row.psnr, taken))
-    return panels
+COMMAND = Command(
+    summary="Run everything on a built-in scene; nothing to download.",
+    description="""\
+Run all steps on a scene that comes with the package.
+
+Unpacks photographs of a ray-traced gallery and a checkpoint that was trained
+on them to its end, adapts the checkpoint, measures the result and draws two
+pictures. Takes about a minute on two CPU cores.
+""",
+    usage="[--out DIR] [options]",
+    epilog="""\
+outputs in DIR:
+  capture/          80 images and their COLMAP model
+  base.ply          the checkpoint
+  gallery.ply       the adapted file; gallery.safetensors, gallery.json
+  dial.png          one held-out view: photograph, base, several dial values
+  curve.png         quality against the number of Gaussians
+""",
+    add_arguments=add_arguments,
+    check=lambda args: check_matplotlib(),  # before a minute is spent
+    run=run,
+    outputs=outputs,
+)

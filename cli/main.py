@@ -18,10 +18,7 @@ from clod_adapter._support.version import package_version
 from clod_adapter.errors import ClodError
 from clod_adapter.progress import Stopped
 
-from . import apply, doctor, evaluate, inspect, render, view
-from .commands.adapt import ADAPT
-from .commands.demo import DEMO
-from .commands.robustness import ROBUSTNESS
+from . import adapt, apply, demo, doctor, evaluate, inspect, render, robustness, view
 from .export.command import COMMAND as EXPORT
 from .shared.command import Command, Parser
 from .shared.outputs import claimed
@@ -43,10 +40,19 @@ LIBRARY = ("torch", "numba", "clod_adapter.io.scene.load", "clod_adapter.trainin
 NEAR = 0.75  # similarity of a misspelt command: two neighbouring letters exchanged in "view" have it
 REPORT = "please report it, with the lines above, as an issue of this program's repository"
 
+FIRST = f"""\
+Give a trained 3D Gaussian splat a quality dial:
+  {PROG} PLY --images DIR   DIR: the photographs and their COLMAP model
+  {PROG} PLY                without photographs
+  {PROG} demo               on a built-in scene
+  {PROG} --help             all options and commands
+"""
+
 # Adapting is the main command and has no name.
 COMMANDS: dict[str, Command] = {
     "view": view.COMMAND, "inspect": inspect.COMMAND, "eval": evaluate.COMMAND, "render": render.COMMAND,
-    "export": EXPORT, "apply": apply.COMMAND, "robustness": ROBUSTNESS, "demo": DEMO, "doctor": doctor.COMMAND,
+    "export": EXPORT, "apply": apply.COMMAND, "robustness": robustness.COMMAND, "demo": demo.COMMAND,
+    "doctor": doctor.COMMAND,
 }  # fmt: skip
 
 
@@ -79,10 +85,13 @@ def _main(words: list[str]) -> int:
     name = words[0] if words and words[0] in COMMANDS else ""
     try:
         with interrupt_as_stopped():
+            if not words:
+                print(FIRST, end="")
+                return 0
             if not name:
                 check_command(words)
             args = build_parser(name).parse_args(words[1:] if name else words)
-            return run_here(COMMANDS.get(name, ADAPT), args)
+            return run_here(COMMANDS.get(name, adapt.COMMAND), args)
     except ClodError as error:
         return refuse(" ".join(str(error).splitlines()), 2, words)
     except Stopped:
@@ -107,7 +116,7 @@ def run_here(command: Command, args: argparse.Namespace) -> int:
     launch = launched()
     if launch.size == 1:
         return run(command, args)
-    if command is not ADAPT:
+    if command is not adapt.COMMAND:
         raise ClodError("only adapting takes several processes; run this command without torchrun")
     from .adapt.processes import leading, take_part
 
@@ -161,7 +170,7 @@ def import_library(quiet: bool) -> None:
 
 def build_parser(name: str) -> Parser:
     """The parser of a command; of the main command for an empty name."""
-    command = COMMANDS.get(name, ADAPT)
+    command = COMMANDS.get(name, adapt.COMMAND)
     parser = command.parser(f"{PROG} {name}".strip())
     if not name:
         others = "\n".join(f"  {PROG} {word:<10} {other.summary}" for word, other in COMMANDS.items())

@@ -2,186 +2,288 @@
 
 from __future__ import annotations
 
-import argparse
 import csv
+import json
+from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
 from contextlib import closing
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from clod_adapter._support.text import as_text
 from clod_adapter._support.version import package_version
-from clod_adapter.cameras import Scene
+from clod_adapter.config import CLASSIC, AdaptConfig
 from clod_adapter.errors import ClodError
-from clod_adapter.evaluation.robustness import CellResult, adapt_at_range, baseline, scene_fingerprint
 from clod_adapter.io.atomic import atomic_path
-from clod_adapter.io.checkpoint import Checkpoint
-from clod_adapter.progress import Listener, Phase, Progress, Stopped
-from clod_adapter.report.robustness_figure import robustness_figure
+from clod_adapter.progress import Phase, Progress, Stopped
+from clod_adapter.report.style import check_matplotlib
 
-from .commands.robustness import result_files
-from .commands.settings import make_configs
-from .robustness_cells import Cell, cells_of
-from .shared.alignment import align
+from .shared.command import (
+    Command,
+    add_activated,
+    add_antialiasing,
+    add_device,
+    add_images,
+    add_misaligned_ok,
+    check_checkpoint,
+    check_scene,
+)  # fmt: skip
 from .shared.console import Console, Meter, clipped, duration, put
-from .shared.inputs import on_device, pick_device, prepare_kernels, read_checkpoint, read_scene, with_filter
-from .shared.measure import Stopwatch, machine, report_dials
-from .shared.outputs import labels, write_report
+from .shared.outputs import Outputs, labels, write_report
 from .shared.process import GracefulStop
+from .shared.settings import add_settings, make_configs
+
+if TYPE_CHECKING:
+    from clod_adapter.cameras import Scene
+    from clod_adapter.evaluation.robustness import CellResult
+    from clod_adapter.io.checkpoint import Checkpoint
+
+    from .shared.measure import Stopwatch
 
 COLUMNS = (
     "checkpoint", "max_sv", "within_range", "virtual_scale", "psnr", "ssim", "kept", "kept_share", "in_view", "frame_ms"
 )  # fmt: skip
+# Where a phase begins and ends in a cell, and its label.
+PARTS = {
+    Phase.IMPORTANCE: (0.0, 0.05, "importance"), Phase.PRUNING_ORDER: (0.05, 0.1, "importance"),
+    Phase.TRAINING: (0.1, 0.8, "training"), Phase.EVALUATION: (0.8, 1.0, "measuring"),
+}  # fmt: skip
 LONGEST = 16  # characters of a checkpoint's name in the table
 
 
-def run(args: argparse.Namespace) -> dict[str, Any]:
+def add_arguments(parser: ArgumentParser) -> None:
+    given = parser.add_argument_group("input")
+    given.add_argument("ply", metavar="PLY", nargs="+", help="checkpoints of one scene; never modified")
+    add_images(given)
+    add_activated(given)
+    add_antialiasing(given)
+    output = parser.add_argument_group("output")
+    output.add_argument(
+        "-o", "--out", metavar="DIR", default="robustness",
+        help="output folder; resumed if it exists (default: robustness)",
+    )  # fmt: skip
+    training = parser.add_argument_group("training")
+    training.add_argument(
+        "--max-sv", metavar="S", type=float, nargs="+", default=[1.0, 3.0, 5.0, 7.0],
+        help="largest dial value of each adaptation; 1 trains at full detail only (default: 1 3 5 7)",
+    )  # fmt: skip
+    add_settings(training, without=["max_sv"])
+    add_misaligned_ok(training)
+    add_device(training, "train and measure")
+
+
+def check(args: Namespace) -> None:
+    check_matplotlib()
+    make_configs(args)
+    labels(args.ply)
+    for path in args.ply:
+        check_checkpoint(path)
+    check_scene(args.images)
+
+
+def outputs(args: Namespace) -> Outputs:
+    folder, cells = Path(args.out), Path(args.out) / "cells"
+    names = [cell_name(label, max_sv) for label in labels(args.ply) for max_sv in (None, *args.max_sv)]
+    files = [*result_files(folder).values()]
+    files += [cells / f"{name}{suffix}" for name in names for suffix in (".json", ".safetensors")]
+    return Outputs(derived=files, folders=[folder, cells], inputs=args.ply, scene=args.images)
+
+
+def result_files(folder: Path) -> dict[str, Path]:
+    """The figure and the measurements, by suffix."""
+    return {kind: folder / f"robustness.{kind}" for kind in ("png", "csv", "json")}
+
+
+def cell_name(label: str, max_sv: float | None) -> str:
+    """The name of a checkpoint's cell: at a range, or of the baseline for None."""
+    return f"{label}_base" if max_sv is None else f"{label}_sv{max_sv:g}"
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One checkpoint at one range, or its baseline, on disk.
+
+    Attributes:
+        label: names the checkpoint.
+        config: of the adaptation; None for the baseline.
+        points: dial values, or shares of the baseline, that are measured.
+        scene_sha256: of its photographs.
+        folder: of all cells.
+    """
+
+    label: str
+    checkpoint: Checkpoint
+    config: AdaptConfig | None
+    points: tuple[float, ...]
+    scene_sha256: str
+    folder: Path
+
+    @property
+    def name(self) -> str:
+        return cell_name(self.label, self.config.max_sv if self.config else None)
+
+    def file(self, suffix: str) -> Path:
+        return self.folder / f"{self.name}{suffix}"
+
+    def key(self) -> dict[str, Any]:
+        """Everything that the result depends on, as JSON."""
+        drawn, config = self.checkpoint.gaussians.screen_filter, asdict(self.config) if self.config else None
+        return {
+            "version": package_version(), "config": config, "points": list(self.points),
+            "checkpoint_sha256": self.checkpoint.fingerprint, "scene_sha256": self.scene_sha256,
+            **({"screen_filter": repr(drawn)} if drawn != CLASSIC else {}),
+        }  # fmt: skip
+
+    def read(self) -> dict[str, Any] | None:
+        """The finished cell, or None if there is none with this key."""
+        try:
+            found = json.loads(self.file(".json").read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            return None
+        same = isinstance(found, dict) and found.get("key") == self.key()
+        return found if same and (self.config is None or self.file(".safetensors").is_file()) else None
+
+    def measure(self, scene: Scene, progress: Any) -> CellResult:
+        """Raises Stopped if ``progress`` returns False."""
+        from clod_adapter.evaluation.robustness import adapt_at_range, baseline
+
+        base = self.checkpoint.gaussians
+        if self.config is None:
+            return baseline(base, scene.test, self.points, progress=progress)
+        return adapt_at_range(
+            base, scene, self.config, self.points, fingerprint=self.checkpoint.fingerprint,
+            origin=self.checkpoint.origin, progress=progress,
+        )  # fmt: skip
+
+    def write(self, result: CellResult) -> dict[str, Any]:
+        """Writes the adapter and then the rows, which mark the cell as finished."""
+        from clod_adapter.io.adapter_file import save_adapter
+
+        from .shared.measure import machine
+
+        self.file(".json").unlink(missing_ok=True)
+        adapter = self.file(".safetensors") if result.adapter else None
+        if result.adapter and adapter:
+            save_adapter(adapter, result.adapter)
+        cell = {
+            "checkpoint": as_text(self.label), "max_sv": self.config.max_sv if self.config else None,
+            "adapter": adapter and str(adapter), "seconds": round(result.seconds, 3), "rows": result.rows,
+            "distribution": result.distribution, "machine": machine(), "key": self.key(),
+        }  # fmt: skip
+        write_report(self.file(".json"), cell)
+        return cell
+
+
+def run(args: Namespace) -> dict[str, Any]:
+    from .shared.inputs import prepare_kernels
+    from .shared.measure import Stopwatch, machine
+
     console, watch, stop = Console(args.quiet), Stopwatch(), GracefulStop()
-    outputs = result_files(Path(args.out))
-    with watch.time("load"):
-        checkpoints = read_checkpoints(args, console)
-        scene = read_scene(args.images, console, checkpoints[0].origin)
-    if not scene.test:
-        raise ClodError(f"{args.images}: there are no held-out photographs to evaluate on; give at least two")
-    device = checkpoints[0].gaussians.means.device
-    with watch.time("kernels"):
-        prepare_kernels(console, device, training=False)
-    with watch.time("evaluate"):
-        scene = aligned_scene(checkpoints, scene, args, console)
-        checkpoints = [with_filter(each, args, console, scene.test) for each in checkpoints]
+    checkpoints, scene = read(args, console, watch)
     cells = plan(args, checkpoints, scene)
-    found = {cell.name: read for cell in cells if (read := cell.read())}
+    found = {cell.name: done for cell in cells if (done := cell.read())}
     missing = [cell for cell in cells if cell.name not in found]
     if found:
         console.say(f"{len(found)} of {len(cells)} cells are done already: {', '.join(found)}")
     if missing:
         with watch.time("kernels"):
             for screen_filter in dict.fromkeys(each.gaussians.screen_filter for each in checkpoints):
+                device = checkpoints[0].gaussians.means.device
                 prepare_kernels(console, device, screen_filter=screen_filter)
     with stop.listening():
         with watch.time("cells"):
             done = run_cells(missing, scene, console, stop)
         found |= done
-        interrupted = len(done) < len(missing)
         if not found:
             raise Stopped("stopped before the first cell was finished")
-        report = describe_cells(args, cells, found, interrupted, list(scene.notes)) | {
-            "views": len(scene.test), "machine": machine(), "seconds": watch.report(),
-            "outputs": {k: str(v) for k, v in outputs.items()},
+        files = result_files(Path(args.out))
+        report = {
+            "command": "robustness", "version": package_version(), "scene": args.images,
+            "checkpoints": [
+                {"checkpoint": label, "model": path, "count": len(each.gaussians), "sha256": each.fingerprint,
+                 "notes": each.notes} for label, path, each in zip(labels(args.ply), args.ply, checkpoints, strict=True)
+            ],
+            "cells": [found[cell.name] for cell in cells if cell.name in found],
+            "missing": [cell.name for cell in cells if cell.name not in found],
+            "interrupted": len(done) < len(missing), "notes": list(scene.notes), "views": len(scene.test),
+            "machine": machine(), "seconds": watch.report(), "outputs": {k: str(v) for k, v in files.items()},
         }  # fmt: skip
-        write_outputs(report, outputs, Path(args.images).resolve().name)
-    print_cells(report, outputs, watch)
+        write_results(report, files, Path(args.images).resolve().name)
+    print_cells(report)
+    print("\n" + "\n".join(map(str, files.values())) + f"\n\n{duration(watch.total())} in all")
     return report
 
 
-def read_checkpoints(args: argparse.Namespace, console: Console) -> list[Checkpoint]:
-    """Reads all checkpoints, relative to one origin."""
-    found, device = list[Checkpoint](), pick_device(args.device, console)
-    for path in args.ply:
-        origin = found[0].origin if found else None
-        found.append(on_device(read_checkpoint(path, console, args.activated, origin), device))
-        if found[-1].gaussians.sigma_d is not None:
-            console.say(f"  note: the dial of {path} is ignored")
-    return found
-
-
-def aligned_scene(checkpoints: Sequence[Checkpoint], scene: Scene, args: argparse.Namespace, console: Console) -> Scene:
-    """The scene in the checkpoints' frame.
+def read(args: Namespace, console: Console, watch: Stopwatch) -> tuple[list[Checkpoint], Scene]:
+    """Reads all checkpoints, relative to one origin, and the photographs, whose cameras are moved into their frame.
 
     Raises:
-        ClodError: a checkpoint does not match, or they are in different frames.
+        ClodError: nothing is held out, a checkpoint does not match, or they are in different frames.
     """
-    for number, checkpoint in enumerate(checkpoints):
-        scene, numbers = align(checkpoint, scene, args.images, console, required=not args.misaligned_ok)
-        if number and numbers["frame"]:
-            raise ClodError(f"{checkpoint.path}: in another frame than {checkpoints[0].path}; give it alone")
-    return scene
+    from .shared.alignment import align
+    from .shared.inputs import on_device, pick_device, prepare_kernels, read_checkpoint, read_scene, with_filter
+
+    found, device = list[Any](), pick_device(args.device, console)
+    with watch.time("load"):
+        for path in args.ply:
+            origin = found[0].origin if found else None
+            found.append(on_device(read_checkpoint(path, console, args.activated, origin), device))
+            if found[-1].gaussians.sigma_d is not None:
+                console.say(f"  note: the dial of {path} is ignored")
+        scene = read_scene(args.images, console, found[0].origin)
+    if not scene.test:
+        raise ClodError(f"{args.images}: there are no held-out photographs to evaluate on; give at least two")
+    with watch.time("kernels"):
+        prepare_kernels(console, device, training=False)
+    with watch.time("evaluate"):
+        for number, checkpoint in enumerate(found):
+            scene, numbers = align(checkpoint, scene, args.images, console, required=not args.misaligned_ok)
+            if number and numbers["frame"]:
+                raise ClodError(f"{checkpoint.path}: in another frame than {found[0].path}; give it alone")
+        return [with_filter(each, args, console, scene.test) for each in found], scene
 
 
-def plan(args: argparse.Namespace, checkpoints: Sequence[Checkpoint], scene: Scene) -> list[Cell]:
+def plan(args: Namespace, checkpoints: Sequence[Checkpoint], scene: Scene) -> list[Cell]:
     """All cells. Every range is measured at the dial values of the widest one and at its own end."""
-    configs = make_configs(args)
+    from clod_adapter.evaluation.robustness import BASELINE_SHARES, scene_fingerprint
+
+    from .shared.measure import report_dials
+
+    configs, sha256, cells = make_configs(args), scene_fingerprint(scene), list[Cell]()
     dials = sorted({*report_dials(configs[-1].max_sv), *(config.max_sv for config in configs)})
-    seen, cells = scene_fingerprint(scene), list[Cell]()
     for checkpoint, label in zip(checkpoints, labels(args.ply), strict=True):
-        cells += cells_of(label, checkpoint, configs, dials, seen, Path(args.out) / "cells")
+        for config in (None, *configs):
+            points = BASELINE_SHARES if config is None else tuple(dials)
+            cells.append(Cell(label, checkpoint, config, points, sha256, Path(args.out) / "cells"))
     return cells
 
 
 def run_cells(cells: Sequence[Cell], scene: Scene, console: Console, stop: GracefulStop) -> dict[str, dict[str, Any]]:
     """Runs the cells; returns those that were finished, by name."""
     found: dict[str, dict[str, Any]] = {}
-    costs = [cell.cost(len(scene.train), len(scene.test)) for cell in cells]
     with closing(Meter(console, "robustness", slow=True)) as meter:
         for k, cell in enumerate(cells):
-            before, weight = sum(costs[:k]) / sum(costs), costs[k] / sum(costs)
 
-            def show(
-                now: Progress, before: float = before, weight: float = weight, cell: Cell = cell, k: int = k
-            ) -> None:
-                share, text = position(cell, scene, now)
-                meter.update(before + weight * share, f"{cell.name} ({k + 1}/{len(cells)}) {text}".rstrip())
+            def show(now: Progress, cell: Cell = cell, k: int = k) -> None:
+                begin, end, text = PARTS.get(now.phase, PARTS[Phase.IMPORTANCE])
+                share = (k + begin + (end - begin) * now.share) / len(cells)
+                meter.update(share, f"{cell.name} ({k + 1}/{len(cells)}) {text}")
 
             try:
-                outcome = run_cell(cell, scene, stop.heeding(show))
+                found[cell.name] = cell.write(cell.measure(scene, stop.heeding(show)))
             except Stopped:
                 console.say(f"stopping: {cell.name} was not finished; the same command continues with it")
                 break
-            found[cell.name] = cell.write(outcome)
     return found
 
 
-def run_cell(cell: Cell, scene: Scene, progress: Listener) -> CellResult:
-    """Measures one cell.
+def write_results(report: dict[str, Any], files: dict[str, Path], scene: str) -> None:
+    from clod_adapter.report.robustness_figure import robustness_figure
 
-    Raises:
-        Stopped: ``progress`` returned False.
-    """
-    base = cell.checkpoint.gaussians
-    if cell.config is None:
-        return baseline(base, scene.test, cell.points, progress=progress)
-    return adapt_at_range(
-        base, scene, cell.config, cell.points, fingerprint=cell.checkpoint.fingerprint,
-        origin=cell.checkpoint.origin, progress=progress,
-    )  # fmt: skip
-
-
-def position(cell: Cell, scene: Scene, now: Progress) -> tuple[float, str]:
-    """The share of the cell that is done, by the costs of ``cell.cost``, and a text."""
-    if cell.config is None:
-        return now.share, "baseline"
-    measuring = len(cell.points) * len(scene.test) / cell.cost(len(scene.train), len(scene.test))
-    if now.phase == Phase.EVALUATION:
-        return 1 - measuring * (1 - now.share), "measuring"
-    begin, end = {Phase.IMPORTANCE: (0.0, 0.04), Phase.PRUNING_ORDER: (0.04, 0.05)}.get(now.phase, (0.05, 1.0))
-    text = f"step {now.done}" if now.phase == Phase.TRAINING else "importance"
-    return (1 - measuring) * (begin + (end - begin) * now.share), text
-
-
-def describe_cells(
-    args: argparse.Namespace,
-    cells: Sequence[Cell],
-    found: dict[str, dict[str, Any]],
-    interrupted: bool,
-    notes: list[str],
-) -> dict[str, Any]:
-    checkpoints = {cell.label: cell.checkpoint for cell in cells}
-    return {
-        "command": "robustness", "version": package_version(), "scene": args.images,
-        "checkpoints": [
-            {"checkpoint": label, "model": path, "count": len(c.gaussians), "sha256": c.fingerprint, "notes": c.notes}
-            for path, (label, c) in zip(args.ply, checkpoints.items(), strict=True)
-        ],
-        "cells": [found[cell.name] for cell in cells if cell.name in found],
-        "missing": [cell.name for cell in cells if cell.name not in found],
-        "interrupted": interrupted, "notes": notes,
-    }  # fmt: skip
-
-
-def write_outputs(report: dict[str, Any], outputs: dict[str, Path], scene: str) -> None:
     title = f"{as_text(scene)}: the dial after the fact, by range; mean of {report['views']} held-out photographs"
-    robustness_figure(outputs["png"], report["cells"], title)
-    with atomic_path(outputs["csv"]) as part, open(part, "w", newline="", encoding="utf-8") as file:
+    robustness_figure(files["png"], report["cells"], title)
+    with atomic_path(files["csv"]) as part, open(part, "w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, COLUMNS)
         writer.writeheader()
         for cell in report["cells"]:
@@ -189,10 +291,10 @@ def write_outputs(report: dict[str, Any], outputs: dict[str, Path], scene: str) 
             for row in cell["rows"]:
                 inside = "" if limit is None else row["virtual_scale"] <= limit
                 writer.writerow({"checkpoint": name, "max_sv": limit or "base", "within_range": inside, **row})
-    write_report(outputs["json"], report)
+    write_report(files["json"], report)
 
 
-def print_cells(report: dict[str, Any], outputs: dict[str, Path], watch: Stopwatch) -> None:
+def print_cells(report: dict[str, Any]) -> None:
     """One line per cell: its first and last row."""
     names = [clipped(cell["checkpoint"], LONGEST) for cell in report["cells"]]
     width = max(map(len, ["checkpoint", *names]))
@@ -203,7 +305,36 @@ def print_cells(report: dict[str, Any], outputs: dict[str, Path], watch: Stopwat
         put(f"{checkpoint:<{width}}  {name:<8}  {ends[0]}    {ends[1]}")
     if report["missing"]:
         put(f"\nmissing: {', '.join(report['missing'])}; the same command continues")
-    print()
-    for path in outputs.values():
-        print(path)
-    print(f"\n{duration(watch.total())} in all")
+
+
+COMMAND = Command(
+    summary="Adapt checkpoints at several ranges, and plot them.",
+    description="""\
+Run the robustness experiment of CLoD-GS: checkpoints adapted at several ranges.
+
+Adapts each checkpoint at each --max-sv and measures all at the same dial values
+on the held-out photographs, also beyond the trained range. The baseline is the
+checkpoint itself, pruned to its most opaque Gaussians without tuning.
+""",
+    usage="PLY [PLY ...] --images DIR [options]",
+    epilog="""\
+outputs in DIR:
+  robustness.png   PSNR and SSIM against Gaussians kept, histograms of opacity
+                   and sigma_d; one row per checkpoint, one line per range
+  robustness.csv, robustness.json
+                   the measurements; with settings and histograms
+  cells/           adapter and rows of each adaptation; "clod-adapt apply" makes
+                   a model of PLY and its adapter
+
+The same command resumes: it skips finished cells with the same files, settings
+and version. Ctrl-C drops the current cell and writes the finished ones (exit
+code 0, "interrupted": true; 130 if there are none). Remove DIR to start over.
+
+example:
+  clod-adapt robustness 3dgs.ply mask.ply --images garden --max-sv 1 3 5 7
+""",
+    add_arguments=add_arguments,
+    check=check,
+    run=run,
+    outputs=outputs,
+)

@@ -11,7 +11,8 @@ from itertools import groupby
 from pathlib import Path
 
 import clod_adapter
-from clod_adapter.cli.main import ADAPT, COMMANDS, PROG, build_parser
+from clod_adapter.cli import adapt
+from clod_adapter.cli.main import COMMANDS, PROG, build_parser
 from clod_adapter.cli.shared.command import Command
 from clod_adapter.config import AdaptConfig, AttenuationConfig, field_descriptions
 
@@ -45,7 +46,7 @@ INTEGRATIONS = (
 def commands_page() -> str:
     """Usage, description, options and notes of each command, as in ``--help``."""
     parts = ["# Commands\n\nThe `--help` text of every command.\n"]
-    return "\n".join(parts + [command_section(name, each) for name, each in [("", ADAPT), *COMMANDS.items()]])
+    return "\n".join(parts + [command_section(name, each) for name, each in [("", adapt.COMMAND), *COMMANDS.items()]])
 
 
 def command_section(name: str, command: Command) -> str:

@@ -32,7 +32,7 @@ import json, os, signal, sys, tempfile
 import torch
 torch.set_num_threads(1)  # a process that forks must have no threads
 from clod_adapter.cli import main
-from clod_adapter.cli.adapt import processes, saver
+from clod_adapter.cli.adapt import listeners, processes
 from clod_adapter.cli.adapt import run as adapt
 from clod_adapter.cli.shared.console import Console
 from clod_adapter.cli.shared.inputs import prepare_kernels
@@ -57,7 +57,7 @@ for line in sys.stdin:
         for stream in (1, 2):
             os.dup2(log, stream)
         torch.set_num_threads(1 if about["environment"] else 2)
-        saver.SAVE_EVERY, saver.SAVE_COST = 0.0, 1e9  # a state after each step
+        listeners.SAVE_EVERY, listeners.SAVE_COST = 0.0, 1e9  # a state after each step
         code = 1
         try:
             exec(about["before"])

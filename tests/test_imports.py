@@ -34,11 +34,11 @@ ORDER: list[set[str]] = [
     {"io.formats"},
     {"io.adapter_file"},
     {"alignment", "report", "training", "viewer"},
-    {"blocks", "demo", "evaluation", "inspection", "nerfstudio"},
+    {"blocks", "evaluation", "inspection", "nerfstudio"},
+    {"demo"},
     {""},  # the package itself, whose __init__ re-exports from the rows above
     {"cli.shared"},
-    {"cli.commands"},
-    {"cli.robustness_cells", "cli.view"},
+    {"cli.view"},
     {"cli.adapt", "cli.apply", "cli.doctor", "cli.evaluate", "cli.export", "cli.inspect", "cli.render",
      "cli.robustness"},
     {"cli.demo"},  # runs adapt

@@ -1,0 +1,165 @@
+"""``clod-adapt``, the main command: its text, options and checks; ``run`` is in ``adapt.run``."""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser, Namespace
+from typing import Any
+
+from clod_adapter.blocks.memory import parse_size
+from clod_adapter.errors import ClodError
+
+from ..shared.command import (
+    Command,
+    add_activated,
+    add_antialiasing,
+    add_device,
+    add_misaligned_ok,
+    check_checkpoint,
+    check_scene,
+    page_files,
+)  # fmt: skip
+from ..shared.outputs import AdaptFiles, Outputs, check_ply_name
+from ..shared.process import launched
+from ..shared.settings import add_settings, make_config
+
+# As in clod_adapter.training.plan, which imports torch; a test compares the two.
+NAMES = ("bands", "unseen", "means", "quats", "scales", "opacities", "sh0")
+
+
+def add_arguments(parser: ArgumentParser) -> None:
+    given = parser.add_argument_group("input")
+    given.add_argument(
+        "ply", metavar="PLY",
+        help="checkpoint: a PLY in Inria's 3DGS layout, or another file that inspect reads; never modified",
+    )  # fmt: skip
+    given.add_argument(
+        "--images", metavar="DIR",
+        help="scene folder: images/ with a COLMAP model in sparse/0, or a transforms.json of nerfstudio or instant-ngp "
+        "(default: none, see below)",
+    )  # fmt: skip
+    add_activated(given)
+    add_antialiasing(given)
+    output = parser.add_argument_group("output")
+    output.add_argument(
+        "-o", "--out", metavar="OUT.ply", help="output file (default: name of PLY with _clod, in the current folder)"
+    )
+    output.add_argument("--report", action="store_true", help="also write a page, OUT.html, and its charts")
+    training = parser.add_argument_group("training")
+    add_settings(training)
+    training.add_argument("--resume", action="store_true", help="continue the same command where it was interrupted")
+    add_misaligned_ok(training)
+    training.add_argument(
+        "--accept-loss", action="store_true", help="exit code 0 even if s = 1 is far below the base (see exit codes)"
+    )
+    add_device(training, "train and measure")
+    options = parser.add_argument_group("advanced")
+    options.add_argument(
+        "--with", dest="keep_in", metavar="NAME", nargs="+", action="extend", choices=NAMES, default=[],
+        help=f"train these whatever the plan measures: {', '.join(NAMES)}",
+    )  # fmt: skip
+    options.add_argument(
+        "--without", dest="leave_out", metavar="NAME", nargs="+", action="extend", choices=NAMES, default=[],
+        help="exclude or freeze these whatever the plan measures",
+    )  # fmt: skip
+    options.add_argument("--trim", action="store_true", help="do not write the SH degrees and Gaussians excluded")
+    options.add_argument("--memory", metavar="SIZE", help="memory limit, as in 8GB; larger scenes are split in blocks")
+
+
+def check(args: Namespace) -> None:
+    make_config(args)
+    if both := sorted(set(args.keep_in) & set(args.leave_out)):
+        raise ClodError(f"--with and --without both name {', '.join(both)}; give each to one of them")
+    if args.memory is not None:
+        parse_size(args.memory)
+        if launched().size > 1:
+            raise ClodError("--memory needs a single process: run without torchrun")
+    check_checkpoint(args.ply)
+    if args.images is not None:
+        check_scene(args.images)
+
+
+def outputs(args: Namespace) -> Outputs:
+    files = AdaptFiles.of(args.ply, args.out)
+    check_ply_name(files.ply, "--out")
+    page = page_files(files.ply.with_suffix(".html"), ["rendering", "adapting"]) if args.report else []
+    named, default = ([], [files.ply]) if args.out is None else ([files.ply], [])
+    blocks = files.blocks() if args.memory is not None else []
+    return Outputs(
+        named, [*default, files.adapter, files.report, files.state, *page, *blocks],
+        inputs=[args.ply], scene=args.images,
+    )  # fmt: skip
+
+
+def run_adapt(args: Namespace) -> dict[str, Any]:
+    from .run import adapt
+
+    return adapt(args)
+
+
+COMMAND = Command(
+    summary="Give a trained 3D Gaussian splat a quality dial.",
+    description="""\
+Give a trained 3D Gaussian splat a quality dial: one file for every budget.
+
+Learns two numbers per Gaussian: sigma_d, by which a renderer fades detail out
+with distance, and growth_d, by which the others grow into the gaps. Fine-tunes
+the other attributes. The dial s is set when rendering: s = 1 is full quality;
+at s about s^-1.5 of the Gaussians are drawn.
+""",
+    usage="PLY [--images DIR] [--max-sv S] [--out OUT.ply] [options]",
+    epilog="""\
+outputs (existing files are replaced):
+  OUT.ply          the splat with sigma_d and growth_d, and a calibration in its
+                   header: dial value, count, PSNR, SSIM and frame time
+  OUT.safetensors  the adapter: "clod-adapt apply" rebuilds OUT.ply from it
+  OUT.json         the report: settings, machine, times, and quality on held-out
+                   photographs (every 8th by name) per dial value
+  OUT.html, OUT_rendering.png, OUT_adapting.png
+                   with --report: a self-contained page and its charts; needs
+                   matplotlib (pip install matplotlib)
+The same seed gives the same Gaussians, bit for bit.
+
+without --images:
+  Cameras are placed, and the checkpoint itself renders the target images: all
+  quality numbers are relative to it. Photographs give a better result.
+
+plan:
+  Printed before training: what is left out or frozen for this scene, by which
+  measured effect, and the option that overrides it (--with, --without). Values
+  left out are in OUT.ply unchanged, or with --trim not at all.
+
+alignment:
+  Cameras in another frame (gsplat's or nerfstudio's normalization, axes, scale,
+  inverted or OpenGL poses) are moved into the checkpoint's, and a line says so.
+  What matches in no frame, or over white, stops.
+
+interruption:
+  Ctrl-C, SIGTERM, a closed terminal or the warning of a scheduler (SIGUSR1,
+  SIGUSR2, SIGXCPU) ends training after the step and writes the result so far
+  (exit code 0, "interrupted": true); a second Ctrl-C or SIGTERM aborts. The
+  state is saved in OUT.resume.safetensors about once a minute (2 % of the
+  time): after an interrupt, a crash or a full disk the same command with
+  --resume gives the same Gaussians, bit for bit (on as many threads).
+
+large scenes, several processes:
+  --memory 8GB trains a scene that does not fit in blocks, in two passes; after
+  an interrupt the same command continues. Processes of torchrun train together;
+  the result is that of one process with the same --batch, up to rounding.
+
+exit codes: 0 written; 1 written, but a loss was not finite, or s = 1 is more
+than 1 dB below the base (without photographs: below 25 dB) and --accept-loss is
+not given, or a fault of this program; 2 bad input or a full disk; 130
+interrupted without a result
+
+examples:
+  clod-adapt garden.ply --images garden --max-sv 5
+  clod-adapt garden.ply --images garden --time-budget 120 --out out/dial.ply
+  clod-adapt garden.ply --images garden --quiet --json > report.json
+  clod-adapt garden.ply --max-sv 5
+  torchrun --nproc-per-node 8 -m clod_adapter garden.ply --images garden
+""",
+    add_arguments=add_arguments,
+    check=check,
+    run=run_adapt,
+    outputs=outputs,
+)

@@ -1,18 +1,21 @@
-"""``--memory`` for scenes that do not fit: training in blocks, in one process or as separate jobs (``block_job``)."""
+"""``--memory`` for scenes that do not fit: training in blocks, whose results stay in files until all are merged."""
 
 from __future__ import annotations
 
+import hashlib
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
 
-from clod_adapter._support.version import package_version
+import torch
+
 from clod_adapter.blocks.divide import Division, block_config, check_divisible, divide
-from clod_adapter.blocks.memory import MemoryPlan
+from clod_adapter.blocks.file import checked, load_block, refused_if_damaged, save_block
 from clod_adapter.blocks.train import Learned, adapt_block, merge
 from clod_adapter.cameras import View
-from clod_adapter.errors import ClodError
+from clod_adapter.config import AdaptConfig
 from clod_adapter.evaluation.robustness import scene_fingerprint
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.importance import usable_views
@@ -20,177 +23,135 @@ from clod_adapter.io.scene.load import ImageCache
 from clod_adapter.progress import Phase, Stopped
 from clod_adapter.rasterizers.frame import release_memory
 from clod_adapter.training.plan import Plan
-from clod_adapter.training.planner import make_plan
 from clod_adapter.training.state import Adapted
 
 from ..shared.console import duration
-from .block_files import BlockFiles
-from .display import ProgressDisplay
-from .inputs import Inputs
-from .memory import move_to_disk
-from .plan import complete, override
-from .resume import check_resumed, find_state, settings_key
-from .saver import Saver
-from .setup import Setup
+from .listeners import ProgressDisplay, Saver, find_state, fingerprint, settings_key
+from .prepare import Run, decide
 
 
-@dataclass(frozen=True)
-class Pass:
-    """One block in one pass, and the result of the pass before."""
+def adapt_in_blocks(run: Run) -> tuple[Plan, Adapted]:
+    """Trains the blocks whose files do not exist, and merges all; the result is of all Gaussians.
 
-    block: int
-    number: int
-    before: Gaussians | None = None
+    Raises:
+        Stopped: Ctrl-C; the same command resumes.
+    """
+    assert run.memory is not None
+    check_divisible(run.config)
+    with run.console.meter(Phase.FINGERPRINT) as meter:
+        photographs = scene_fingerprint(run.scene, meter)
+    began, base = time.perf_counter(), run.base.gaussians
+    views = usable_views(base, run.scene.train)
+    with _displayed(run) as display:
+        plan = decide(run, display)
+        division = divide(plan.lean, views, plan.config, run.memory.blocks, total=len(plan.start), progress=display)
+    release_memory()
+    start_seconds, counts = time.perf_counter() - began, [division.steps(k, plan.config) for k in range(division.count)]
+    run.console.say(
+        f"{division.count} blocks of {min(counts)} to {max(counts)} steps, {sum(counts)} in all (each takes "
+        f"{plan.config.steps} times its share of the views)"
+    )
+    blocks = Blocks(run, plan.config, division, views, photographs)
+    failed, steps, seconds, held, merged = list[str](), 0, 0.0, 0, None
+    for number in range(1, division.passes + 1):
+        results = [blocks.train(block, number, merged) for block in range(division.count)]
+        merged = merge(division, results)
+        steps += sum(result.steps for result in results)
+        seconds += sum(result.seconds for result in results)
+        held = max(held, sum(result.held for result in results))  # mostly the same rows in both passes
+        failed += [f"{blocks.name(k, number)}: {each.failed}" for k, each in enumerate(results) if each.failed]
+    assert merged is not None
+    release_memory()
+    return plan, Adapted(
+        plan.whole(base, merged), steps, seconds, start_seconds, interrupted=False, failed="; ".join(failed) or None,
+        held=held,
+    )  # fmt: skip
 
-    def name(self, division: Division) -> str:
-        return f"block {self.block + 1} of {division.count}, pass {self.number} of {division.passes}"
 
-
-@dataclass(frozen=True)
-class Divided:
-    """The plan, what it trains in blocks, their views, and their files."""
-
-    plan: Plan
-    division: Division
-    views: Sequence[View]
-    files: BlockFiles
-
-
-@dataclass(frozen=True)
 class Blocks:
-    """A run in blocks. Its files hold its progress, so any process can continue it."""
+    """The blocks of a run, and their files.
 
-    setup: Setup
-    plan: MemoryPlan
-    files: BlockFiles
+    Attributes:
+        key: identifies run and division in the files; hashes of two divisions differ if rounding has.
+    """
 
-    @classmethod
-    def of(cls, setup: Setup, inputs: Inputs) -> Blocks | None:
-        """None if the whole scene is trained at once; not for one block of a run that was started in blocks."""
-        args, plan, files = setup.args, inputs.memory, BlockFiles(setup.outputs.ply, {})
-        if plan is None or (plan.blocks == 1 and not args.block and not files.start.exists()):
-            return None
-        check_divisible(inputs.config)
-        with setup.console.meter(Phase.FINGERPRINT) as meter:
-            photographs = scene_fingerprint(inputs.scene, meter)
-        run_of = {
-            "version": package_version(), "settings": asdict(inputs.config), "checkpoint": inputs.base.fingerprint,
-            "photographs": photographs, "screen_filter": asdict(inputs.base.gaussians.screen_filter),
-            "--with or --without": [sorted(args.keep_in), sorted(args.leave_out)],
+    def __init__(
+        self, run: Run, config: AdaptConfig, division: Division, views: Sequence[View], photographs: str
+    ) -> None:
+        self.run, self.config, self.division, self.views = run, config, division, views
+        digest = hashlib.sha256(fingerprint(division.initial).encode())
+        for tensor in (division.block, division.seen):
+            digest.update(tensor.cpu().numpy().data)
+        self.key: dict[str, Any] = settings_key(config) | {
+            "photographs": photographs, "number of blocks": division.count, "checkpoint": digest.hexdigest(),
         }  # fmt: skip
-        return cls(setup, plan, BlockFiles(setup.outputs.ply, run_of))
 
-    def adapt(self, inputs: Inputs) -> tuple[Plan, Adapted]:
-        """Trains the blocks that are not done yet, and merges all; the result is of all Gaussians.
+    def name(self, block: int, number: int) -> str:
+        return f"block {block + 1} of {self.division.count}, pass {number} of {self.division.passes}"
 
-        Raises:
-            Stopped: Ctrl-C; finished blocks are in their files.
-        """
-        began = time.perf_counter()
-        divided, failed, merged, steps, seconds, held = self.divided(inputs), list[str](), None, 0, 0.0, 0
-        start_seconds, division, plan = time.perf_counter() - began, divided.division, divided.plan
-        plan = complete(plan, self.setup, inputs)
-        for number in range(1, division.passes + 1):
-            jobs = [Pass(block, number, merged) for block in range(division.count)]
-            results = [self.train(inputs, divided, job) for job in jobs]
-            merged = merge(division, results)
-            steps += sum(result.steps for result in results)
-            seconds += sum(result.seconds for result in results)
-            held = max(held, sum(result.held for result in results))  # mostly the same rows in both passes
-            ended = zip(jobs, results, strict=True)
-            failed += [f"{job.name(division)}: {result.failed}" for job, result in ended if result.failed]
-        assert merged is not None
-        return plan, Adapted(
-            plan.whole(inputs.base.gaussians, merged), steps, seconds, start_seconds, interrupted=False,
-            failed="; ".join(failed) or None, held=held,
-        )  # fmt: skip
-
-    def divided(self, inputs: Inputs) -> Divided:
-        """The plan and the division in the file, which is made if it does not exist.
-
-        Raises:
-            ClodError: the file is of another run, or of one with another number of blocks.
-            Stopped: Ctrl-C.
-        """
-        console, base, path = self.setup.console, inputs.base.gaussians, self.files.start
-        views, exists = usable_views(base, inputs.scene.train), path.exists()
-        if not exists:
-            with self._display(Phase.TRAINING) as display:
-                plan = make_plan(base, inputs.scene, inputs.config, override(self.setup.args), display)
-                made = divide(plan.lean, views, plan.config, self.plan.blocks, total=len(plan.start), progress=display)
-            self.files.save_start(plan, made)
-            del plan, made
-            release_memory()
-        plan, division, files = self.files.load_start(base, views)
-        if plan.kept is not None:  # what is trained is a copy
-            move_to_disk(base, self.files.ply.parent)
-        if division.count != self.plan.blocks:
-            raise ClodError(
-                f"{path}: is of a run in {division.count} blocks, and --memory {self.setup.args.memory} makes "
-                f"{self.plan.blocks}; use the original --memory, or delete it to start over"
-            )
-        steps = [division.steps(block, plan.config) for block in range(division.count)]
-        console.say(
-            f"{path}: the initialization of {division.count} blocks exists" if exists else
-            f"wrote {path}: {division.count} blocks of {min(steps)} to {max(steps)} steps, {sum(steps)} in "
-            f"all (each takes {plan.config.steps} times its share of the views)"
-        )  # fmt: skip
-        return Divided(plan, division, views, files)
-
-    def train(self, inputs: Inputs, divided: Divided, job: Pass) -> Learned:
+    def train(self, block: int, number: int, before: Gaussians | None) -> Learned:
         """Trains one block in one pass, unless its file exists.
 
+        Args:
+            before: the merged result of the first pass, in the second.
+
         Raises:
-            Stopped: Ctrl-C; the same command resumes.
+            Stopped: Ctrl-C.
         """
-        division, files, console = divided.division, divided.files, self.setup.console
-        if files.block(job.block, job.number).exists():
-            return files.load_learned(division, job.block, job.number)
-        name = job.name(division)
-        config = divided.plan.config
-        own = block_config(division, job.block, config, first=job.number == 1)
-        path = files.state(job.block, job.number)
-        resumed = find_state(path, path.exists(), own, console)
-        of = f"{files.run_of['checkpoint']}, {files.run_of['start']}, {name}"
-        run_of = settings_key(own) | {"base_sha256": of, "views_sha256": files.run_of["photographs"]}
-        check_resumed(resumed, run_of, f"{self.setup.args.ply} in {files.start}", "before", console)
-        saver = Saver(path, run_of, resumed, console, self.setup.stop)
+        run, division, name = self.run, self.division, self.name(block, number)
+        path = run.outputs.ply.with_suffix(f".block{block + 1}.pass{number}.safetensors")
+        key = self.key | {"block": name}
+        if path.exists():
+            return self._load(path, key, block)
+        own = block_config(division, block, self.config, first=number == 1)
+        state = path.with_suffix(".resume.safetensors")
+        run_of = settings_key(own) | {"base_sha256": f"{key['checkpoint']}, {name}", "views_sha256": key["photographs"]}
+        resumed = find_state(state, state.exists(), own, run.console)
+        saver = Saver(state, run_of, resumed, run.console, run.stop, (run.args.ply, "before"))
         with saver.rescuing("the same command"):
-            with self._display(name) as display:
+            with _displayed(run, name) as display:
                 learned, adapted = adapt_block(
-                    division, divided.views, config, job.block, after=job.before,
-                    progress=saver.saving(display), resume=resumed.state if resumed else None,
-                    cache=ImageCache(self.plan.cache),
+                    division, self.views, self.config, block, after=before, progress=saver.saving(display),
+                    resume=resumed.state if resumed else None,
+                    cache=ImageCache(run.memory.cache) if run.memory else None,
                 )  # fmt: skip
             saver.keep()
             release_memory()
             if adapted.failed or not adapted.interrupted:
-                files.save_learned(learned, job.block, job.number)
-        self._finish(name, saver, learned, adapted)
-        return learned
-
-    def _finish(self, name: str, saver: Saver, learned: Learned, adapted: Adapted) -> None:
-        """Says how the training of a block has ended.
-
-        Raises:
-            Stopped: it was interrupted.
-        """
-        say = self.setup.console.say
+                about = {name: getattr(learned, name) for name in ("steps", "seconds", "failed", "held")}
+                save_block(path, learned.values, about, key)
         if adapted.failed:
-            say(f"{name}: ended after step {adapted.steps}: {adapted.failed}")
+            run.console.say(f"{name}: ended after step {adapted.steps}: {adapted.failed}")
         elif adapted.interrupted:
             more = "" if saver.saved is None else "; the same command resumes it"
-            say(f"{name}: stopped after step {adapted.steps}{more}")
+            run.console.say(f"{name}: stopped after step {adapted.steps}{more}")
             raise Stopped(f"stopped in {name}")
         saver.close(finished=True)
-        say(f"{name}: {len(learned.rows):,} Gaussians, {learned.steps} steps, {duration(learned.seconds)}")
+        run.console.say(f"{name}: {len(learned.rows):,} Gaussians, {learned.steps} steps, {duration(learned.seconds)}")
+        return learned
 
-    def remove(self) -> None:
-        """Removes the files of this run, once its outputs are written."""
-        replace(self.files, count=self.plan.blocks).remove()
+    def _load(self, path: Path, key: dict[str, Any], block: int) -> Learned:
+        """The result of a block after a pass.
 
-    @contextmanager
-    def _display(self, training: str) -> Iterator[ProgressDisplay]:
-        display = ProgressDisplay(self.setup.console, self.setup.stop, None, (), None, training)
-        with self.setup.stop.listening(), closing(display):
-            yield display
+        Raises:
+            ClodError: the file cannot be read, is damaged, or of another run, division, block or pass.
+        """
+        rows = self.division.rows(block)
+        values, about = load_block(path, key)
+        shapes: dict[str, tuple[torch.dtype, tuple[int, ...]]] = {
+            name: (tensor.dtype, (len(rows), *tensor.shape[1:]))
+            for name, tensor in self.division.initial.tensors().items() if name in values or name == "sigma_d"
+        }  # fmt: skip
+        checked(path, values, shapes)
+        with refused_if_damaged(path):
+            steps, seconds, held = int(about["steps"]), float(about["seconds"]), int(about["held"])
+            failed = None if about["failed"] is None else str(about["failed"])
+        values = {name: value.to(rows.device) for name, value in values.items()}
+        return Learned(rows, values, steps, seconds, failed, held)
+
+
+@contextmanager
+def _displayed(run: Run, training: str = Phase.TRAINING) -> Iterator[ProgressDisplay]:
+    display = ProgressDisplay(run.console, run.stop, training)
+    with run.stop.listening(), closing(display):
+        yield display

@@ -1,18 +1,17 @@
 """Adapting in several processes: the first one runs the command, the others only train.
 
-They communicate through the launcher's store. Only the first one reads files, prints and writes; it sends the others
-what they need. They wait for work until it says that there is no more.
+They communicate through the launcher's store. Only the first one reads files, prints and writes. The others wait for
+the training job that it sends them, or until it says that there is none, and end after it.
 """
 
 from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import count
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -30,13 +29,13 @@ from clod_adapter.training.pseudo_views import teachers_to
 from clod_adapter.training.state import Adapted, TrainingState
 
 from ..shared.process import GracefulStop, Launch, launched
-from .display import ProgressDisplay
+from .listeners import ProgressDisplay
 
 BACKENDS = {"cpu": "gloo", "cuda": "nccl"}  # of torch.distributed, by device
 if TYPE_CHECKING:
     from torch.distributed.distributed_c10d import Store
 
-JOBS, OVER = "clod/jobs", "clod/over"  # keys in the store: the number of jobs so far, and that there are no more
+JOBS, OVER = "clod/jobs", "clod/over"  # keys in the store: the number of jobs, 0 or 1, and that none will come
 POLL_EVERY = 0.05  # seconds between checks for work
 
 
@@ -51,16 +50,10 @@ class TrainingJob:
     subset: TrainableSubset
     device: str
 
-    @classmethod
-    def of(cls, plan: Plan, scene: Scene, state: TrainingState | None) -> TrainingJob:
-        """The job of ``plan.adapt``, from ``state``."""
-        lean = plan.lean
-        return cls(lean, scene.train, plan.config, state, plan.subset, lean.means.device.type)
-
 
 @contextmanager
 def leading() -> Iterator[None]:
-    """Within the block the first process may give jobs to the others; after it they end."""
+    """Within the block the first process may give the others a job; after it they end."""
     store = _store()
     try:
         with _threads(Launch()):
@@ -71,8 +64,10 @@ def leading() -> Iterator[None]:
 
 
 @contextmanager
-def together(make_job: Callable[[], TrainingJob], display: ProgressDisplay) -> Iterator[ProcessGroup | None]:
-    """The group to train with, after giving the job to the others; None for a single process.
+def together(
+    plan: Plan, scene: Scene, state: TrainingState | None, display: ProgressDisplay
+) -> Iterator[ProcessGroup | None]:
+    """The group to train with, after giving the others the job of ``plan.adapt``; None for a single process.
 
     Raises:
         ClodError: a process was lost before the first step; says why it ended.
@@ -82,15 +77,19 @@ def together(make_job: Callable[[], TrainingJob], display: ProgressDisplay) -> I
     if launch.size == 1:
         yield None
         return
-    job = make_job()
-    display.console.say(_describe(launch, job.config, job.device))
-    number = _store().add(JOBS, 1)
+    lean, config = plan.lean, plan.config
+    job = TrainingJob(lean, scene.train, config, state, plan.subset, lean.means.device.type)
+    display.console.say(
+        f"{launch.size} processes ({BACKENDS[job.device]}): {config.batch} views a step, {config.steps:,} steps, "
+        f"{config.batch * config.steps:,} views in all"
+    )
+    _store().add(JOBS, 1)
     try:
         if any(_store().check([_reason(rank)]) for rank in range(1, launch.size)):  # it would wait for ten minutes
             raise ProcessLost("a process of the group has ended")
-        with _threads(launch), joined(_of_job(number), launch.rank, launch.size) as group:
+        with _threads(launch), joined(_job_store(), launch.rank, launch.size) as group:
             group.broadcast(job)
-            del job
+            del job, lean
             yield group
     except ProcessLost as error:
         if display.stop.requests:
@@ -99,16 +98,12 @@ def together(make_job: Callable[[], TrainingJob], display: ProgressDisplay) -> I
 
 
 def take_part() -> None:
-    """What a process that is not the first does: trains silently until there are no more jobs."""
-    launch, store, stop = launched(), _store(), GracefulStop(aborts=False)
-    with stop.listening(), _threads(launch):
-        for number in count(1):
-            if not _is_called(store, number, stop, launch.rank):
-                return
-            try:
-                _train(number, launch, stop)
-            except ProcessLost:
-                continue  # reported by the first process, or by the launcher
+    """What a process that is not the first does: trains silently, if there is a job."""
+    launch, stop = launched(), GracefulStop(aborts=False)
+    # A process that is lost is reported by the first one, or by the launcher.
+    with stop.listening(), _threads(launch), suppress(ProcessLost):
+        if _is_called(stop, launch.rank):
+            _train(launch, stop)
 
 
 def explain(lost: str) -> str:
@@ -134,20 +129,17 @@ def describe_processes(adapted: Adapted, batch: int) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _train(number: int, launch: Launch, stop: GracefulStop) -> None:
-    with joined(_of_job(number), launch.rank, launch.size) as group, _giving_reasons(launch.rank):
+def _train(launch: Launch, stop: GracefulStop) -> None:
+    with joined(_job_store(), launch.rank, launch.size) as group, _giving_reasons(launch.rank):
         job: Any = group.broadcast(None)
-        if job.device == "cuda":
-            _take_gpu(launch)
+        if job.device == "cuda":  # one for each process on this machine
+            if (gpus := torch.cuda.device_count()) < launch.local_size:
+                raise ClodError(
+                    f"{launch.local_size} processes on a machine with {gpus} GPUs; start as many as there are"
+                )
+            torch.cuda.set_device(launch.local_rank)
         base, scene = job.base.to(job.device), Scene(teachers_to(job.views, job.device), ())
         adapt(base, scene, job.config, stop.heeding(), job.state, subset=job.subset, group=group)
-
-
-def _take_gpu(launch: Launch) -> None:
-    """Selects a GPU for each process on this machine."""
-    if (gpus := torch.cuda.device_count()) < launch.local_size:
-        raise ClodError(f"{launch.local_size} processes on a machine with {gpus} GPUs; start as many as there are")
-    torch.cuda.set_device(launch.local_rank)
 
 
 @contextmanager
@@ -163,15 +155,16 @@ def _giving_reasons(rank: int) -> Iterator[None]:
         raise
 
 
-def _is_called(store: Store, number: int, stop: GracefulStop, rank: int) -> bool:
-    """Waits for work. Polls, because a wait of the store's own would delay signals."""
+def _is_called(stop: GracefulStop, rank: int) -> bool:
+    """Waits for the job. Polls, because a wait of the store's own would delay signals."""
+    store = _store()
     try:
-        while store.add(JOBS, 0) < number:
+        while store.add(JOBS, 0) == 0:
             if store.check([OVER]):
                 return False
             if stop.requests:
                 store.set(_reason(rank), f"process {rank}: ended by a signal")
-                return store.add(JOBS, 0) >= number  # the first one may have called before it could know
+                return store.add(JOBS, 0) > 0  # the first one may have called before it could know
             time.sleep(POLL_EVERY)
     except RuntimeError:  # the store has ended, and the first process with it
         return False
@@ -191,10 +184,10 @@ def _store() -> Store:
     return store
 
 
-def _of_job(number: int) -> Store:
+def _job_store() -> Store:
     from torch.distributed.distributed_c10d import PrefixStore
 
-    return PrefixStore(f"clod/job{number}", _store())
+    return PrefixStore("clod/job", _store())
 
 
 def _reason(rank: int) -> str:
@@ -209,17 +202,9 @@ def _threads(launch: Launch) -> Iterator[None]:
     """
     before = torch.get_num_threads()
     if os.environ.get("OMP_NUM_THREADS", "1") == "1":
-        torch.set_num_threads(max(_cores() // launch.local_size, 1))
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        torch.set_num_threads(max(cores // launch.local_size, 1))
     try:
         yield
     finally:
         torch.set_num_threads(before)
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def _describe(launch: Launch, config: AdaptConfig, device: str) -> str:
-    views = f"{config.batch} views a step, {config.steps:,} steps"
-    return f"{launch.size} processes ({BACKENDS[device]}): {views}, {config.batch * config.steps:,} views in all"

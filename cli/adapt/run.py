@@ -1,97 +1,114 @@
-"""``clod-adapt``: gives a checkpoint its dial, and writes the extended file, the adapter and a report.
-
-A pipeline of values: ``Setup -> Inputs -> Plan -> Result -> report``.
-"""
+"""``clod-adapt``: gives a checkpoint its dial, and writes the extended file, the adapter and a report."""
 
 from __future__ import annotations
 
 import argparse
+import shlex
 from contextlib import closing
-from dataclasses import replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
+from clod_adapter._support.version import package_version
+from clod_adapter.adapter import Adapter, detach, extract, trim
+from clod_adapter.errors import ClodError
+from clod_adapter.evaluation.evaluate import Row
+from clod_adapter.evaluation.robustness import scene_fingerprint
+from clod_adapter.gaussians import Gaussians
+from clod_adapter.io.adapter_file import save_adapter
+from clod_adapter.io.atomic import atomic_paths, remove_leftovers
+from clod_adapter.io.checkpoint import Checkpoint, save, trimmed
 from clod_adapter.progress import Progress
 from clod_adapter.rasterizers.frame import release_memory
 from clod_adapter.training.plan import Plan
 from clod_adapter.training.state import Adapted
 
-from ..shared.console import duration
+from ..shared.console import command_line, duration, put
+from ..shared.measure import calibrate, machine, measure, report_dials, table, with_frame_times
+from ..shared.outputs import size, write_report
 from ..shared.pages import AdaptPage
-from .block_job import run_job
-from .blocks import Blocks
-from .display import ProgressDisplay
-from .inputs import Inputs, read_inputs, with_base_rows
-from .memory import move_to_disk
-from .plan import decide
-from .processes import TrainingJob, together
-from .report import finish
-from .result import make_result
-from .resume import identify
-from .saver import Saver
-from .setup import Setup
+from ..shared.process import GracefulStop, listen_no_more
+from .blocks import adapt_in_blocks
+from .listeners import ProgressDisplay, Saver, fingerprint, settings_key
+from .prepare import Run, against_forecast, decide, forecast
+from .processes import describe_processes, explain, hurried, together
+
+# dB: of s = 1 below the base, and against the checkpoint's renderings without photographs, what is told and what fails.
+LOST, ENOUGH = (0.1, 1.0), (33.0, 25.0)
 
 
-def run(args: argparse.Namespace) -> dict[str, Any]:
-    setup = Setup.of(args)
-    inputs = read_inputs(setup)
-    blocks = Blocks.of(setup, inputs)
-    if blocks is None:
-        return adapt_whole(setup, inputs)
-    return run_job(blocks, inputs) if args.block else adapt_blocks(setup, inputs, blocks)
+@dataclass(frozen=True)
+class Result:
+    """What is written.
+
+    Attributes:
+        base: the checkpoint with the rows and SH degrees that are written; with ``--trim`` not all of them.
+        gaussians: ``adapter`` applied to ``base``.
+        notes: of the training, for the report.
+    """
+
+    plan: Plan
+    adapted: Adapted
+    base: Checkpoint
+    adapter: Adapter
+    gaussians: Gaussians
+    notes: list[str]
 
 
-def adapt_whole(setup: Setup, inputs: Inputs) -> dict[str, Any]:
+@dataclass(frozen=True)
+class Measurements:
+    """The rows of the base; of the result over the dial, and without it, as a viewer shows it that does not know it."""
+
+    base: list[Row]
+    rows: list[Row]
+    plain: list[Row]
+    notes: list[str]
+    interrupted: bool
+
+
+def adapt(args: argparse.Namespace) -> dict[str, Any]:
     """Plans, trains, writes and reports."""
-    run_of = identify(setup.resumed, inputs.base.gaussians, inputs.scene, setup.config, setup.args, setup.console)
-    inputs = with_base_rows(setup, inputs)
-    with setup.stop.listening():  # until training has ended, so that a Ctrl-C loses nothing
-        display = show_progress(setup, inputs)
-        plan = decide(setup, inputs, display)
-        if plan.kept is not None:  # what is trained is a copy
-            move_to_disk(inputs.base.gaussians, setup.outputs.ply.parent)
-        page = make_page(setup, inputs)
-        saver = Saver(setup.outputs.state, run_of, setup.resumed, setup.console, setup.stop)
+    run, saver = Run(args), None
+    run.read()
+    if run.memory is not None and run.memory.blocks > 1:
+        run.measure_base()
+        with run.stop.listening():  # until training has ended, so that a Ctrl-C loses nothing
+            page = make_page(run)
+            result = make_result(run, *adapt_in_blocks(run))
+        return finish(run, result, page, None)
+    saver = Saver(
+        run.outputs.state, key_of(run), run.resumed, run.console, run.stop,
+        (args.ply, args.images or "the pseudo views"),
+    )  # fmt: skip
+    run.measure_base()
+    with run.stop.listening():
+        display = ProgressDisplay(run.console, run.stop)
+        plan = decide(run, display)
+        page, run.forecast = make_page(run), forecast(run, plan)
         with saver.rescuing():
-            adapted = train(setup, inputs, plan, display, saver, page)
-            result = make_result(setup, inputs, plan, adapted)
+            result = make_result(run, plan, train(run, plan, display, saver, page))
     with saver.rescuing():
-        return finish(setup, inputs, result, page, saver.close)
+        return finish(run, result, page, saver)
 
 
-def adapt_blocks(setup: Setup, inputs: Inputs, blocks: Blocks) -> dict[str, Any]:
-    """The same in blocks."""
-    inputs = with_base_rows(setup, inputs)
-    with setup.stop.listening():
-        page = make_page(setup, inputs)
-        plan, adapted = blocks.adapt(inputs)
-        release_memory()
-        result = make_result(setup, inputs, plan, adapted)
-    return finish(setup, inputs, result, page, lambda complete: blocks.remove() if complete else None)
+def key_of(run: Run) -> dict[str, Any]:
+    """Identifies the run in its state file."""
+    hashes = {"base_sha256": fingerprint(run.base.gaussians), "views_sha256": scene_fingerprint(run.scene)}
+    requested = {"--with": sorted(run.args.keep_in), "--without": sorted(run.args.leave_out)}
+    return settings_key(run.given) | hashes | {"overruled": requested}
 
 
-def show_progress(setup: Setup, inputs: Inputs) -> ProgressDisplay:
-    base = inputs.base.gaussians if setup.args.images is not None else None
-    row = inputs.base_rows[0] if inputs.base_rows else None
-    return ProgressDisplay(setup.console, setup.stop, base, inputs.scene.test, row)
+def make_page(run: Run) -> AdaptPage | None:
+    return AdaptPage(run.base.gaussians, run.scene, run.config, run.console) if run.args.report else None
 
 
-def make_page(setup: Setup, inputs: Inputs) -> AdaptPage | None:
-    if not setup.args.report:
-        return None
-    return AdaptPage(inputs.base.gaussians, inputs.scene, inputs.config, setup.console)
-
-
-def train(
-    setup: Setup, inputs: Inputs, plan: Plan, display: ProgressDisplay, saver: Saver, page: AdaptPage | None
-) -> Adapted:
+def train(run: Run, plan: Plan, display: ProgressDisplay, saver: Saver, page: AdaptPage | None) -> Adapted:
     """Trains as planned; returns the result for all Gaussians.
 
     Raises:
         ClodError: the state to resume from does not fit.
         KeyboardInterrupt: a second Ctrl-C.
     """
-    base, console, scene = inputs.base.gaussians, setup.console, inputs.scene
-    state = setup.resumed.state if setup.resumed else None
+    base, scene, state = run.base.gaussians, run.scene, run.resumed.state if run.resumed else None
 
     def show(now: Progress) -> bool:
         part = now.gaussians
@@ -100,14 +117,202 @@ def train(
             page(now)
         return display(now)
 
-    with closing(display), together(lambda: TrainingJob.of(plan, scene, state), display) as group:
+    with closing(display), together(plan, scene, state, display) as group:
         adapted = plan.adapt(scene, saver.saving(show), state, group)
     saver.keep()
-    adapted = replace(
-        adapted, gaussians=plan.whole(base, adapted.gaussians),
-        start_seconds=adapted.start_seconds + plan.seconds["start"],
-    )  # fmt: skip
+    start_seconds = adapted.start_seconds + plan.seconds["start"]
+    adapted = replace(adapted, gaussians=plan.whole(base, adapted.gaussians), start_seconds=start_seconds)
     how = "ended after" if adapted.failed else "interrupted after" if adapted.interrupted else "trained"
-    console.say(f"{how} {adapted.steps} steps, {duration(adapted.seconds)}")
+    run.console.say(f"{how} {adapted.steps} steps, {duration(adapted.seconds)}")
     release_memory()
     return adapted
+
+
+def make_result(run: Run, plan: Plan, adapted: Adapted) -> Result:
+    """Extracts the adapter, and applies it to the base."""
+    if hurried(adapted):
+        listen_no_more()
+    gaussians, kept, degree = run.base.gaussians, None, None
+    if run.args.trim and plan.trims(gaussians):
+        kept, degree = plan.kept, plan.sh_degree
+    base = trimmed(run.base, kept, degree)
+    adapter = extract(
+        trim(gaussians, kept, degree), trim(adapted.gaussians, kept, degree), fingerprint=base.fingerprint,
+        config=asdict(run.config), origin=base.origin,
+    )  # fmt: skip
+    adapter = replace(adapter, kept=kept, sh_degree=degree)
+    notes = training_notes(run, adapter, adapted)
+    for note in notes:
+        run.console.say(note)
+    return Result(plan, adapted, base, adapter, adapter.apply(gaussians), notes)
+
+
+def training_notes(run: Run, adapter: Adapter, adapted: Adapted) -> list[str]:
+    notes, tau = list[str](), adapter.attenuation.tau
+    if run.base.gaussians.sigma_d is None and tau < run.config.tau:
+        notes.append(f"tau is {tau:.2g} instead of {run.config.tau:g}, because the Gaussians are faint")
+    if adapted.lost:
+        notes.append(f"training ended at step {adapted.steps}: {explain(adapted.lost)}")
+    if adapted.failed:
+        notes.append(f"training ended early, and the result so far is written: {adapted.failed}")
+    if adapted.watched and (times := adapted.watched.rollbacks):
+        what = "attributes were frozen in the end" if adapted.watched.frozen else "learning rates were halved"
+        back = f"training made s = 1 worse on watched views and returned to an earlier state {times} times"
+        notes.append(f"{back}: {what}; the views watched are not trained on")
+    if adapted.held:
+        notes.append(f"{adapted.held:,} Gaussians were not moved by some steps: their gradients were not finite")
+    return notes
+
+
+def finish(run: Run, result: Result, page: AdaptPage | None, saver: Saver | None) -> dict[str, Any]:
+    """Measures the result, writes it once, and returns the report."""
+    interrupted, console, outputs = result.adapted.interrupted, run.console, run.outputs
+    # After a Ctrl-C that ended training the next one aborts, as its message says.
+    stop = GracefulStop(run.stop.aborts, run.stop.presses if interrupted else 0)
+    with stop.listening():  # a first Ctrl-C ends the measurement, and lets the writing finish
+        measured = measure_result(run, result, stop)
+        report = write_result(run, result, measured)
+    complete = not interrupted and not measured.interrupted
+    if saver:
+        saver.close(complete)
+    for path in outputs.blocks() if complete else ():
+        path.unlink(missing_ok=True)
+        remove_leftovers(path)
+    if page and (measured.interrupted or stop.requests):
+        console.say("interrupted: the page of --report was not written")
+    elif page:  # after the report, which it changes
+        path = outputs.ply.with_suffix(".html")
+        report |= {"seconds": seconds(run, result)}  # with those of writing; the page shows the total without its own
+        with run.watch.time("page"):
+            changes = page.write(path, report, result.gaussians, result.adapted.start_seconds)
+        changes["seconds"] = report["seconds"] | {"page": run.watch.report()["page"]}
+        report |= changes | {"forecast": against_forecast(run)}
+        write_report(outputs.report, report)
+    print_summary(run, measured, report)
+    if "loss" in report:
+        console.say(f"\nwarning: {report['loss']}")
+    return report
+
+
+def measure_result(run: Run, result: Result, stop: GracefulStop) -> Measurements:
+    """Measures the result on the held-out views, unless the run is to end now.
+
+    That is after a Ctrl-C that came when training was complete, and if the launcher ends the processes.
+
+    Args:
+        stop: as in ``measure``.
+    """
+    views, console, base = run.scene.test, run.console, list(run.base_rows)
+    if run.stop.requests > 0 and not result.adapted.interrupted or hurried(result.adapted):
+        return Measurements(base, [], [], [], interrupted=True)
+    plain, notes, detached = list[Row](), list[str](), detach(result.gaussians)
+    with run.watch.time("evaluate"):
+        rows, interrupted = measure(result.gaussians, views, report_dials(run.config.max_sv), console, stop=stop)
+        if not interrupted:
+            plain, interrupted = measure(detached, views, [1.0], console, "plain", stop=stop)
+        if not interrupted:
+            measured = [(run.base.gaussians, base), (result.gaussians, rows), (detached, plain)]
+            (base, rows, plain), notes, interrupted = with_frame_times(measured, views, console, stop)
+    return Measurements(base, rows, plain, notes, interrupted)
+
+
+def write_result(run: Run, result: Result, measured: Measurements) -> dict[str, Any]:
+    """Writes the three files, and returns the report.
+
+    All three are complete, beside those of an earlier run, before the first replaces its predecessor. Only a kill
+    between two renames leaves files of different runs; if one cannot be written, the earlier files stay.
+    """
+    outputs, console, adapter, gaussians = run.outputs, run.console, result.adapter, result.gaussians
+    if measured.rows and not measured.interrupted:
+        try:
+            found = calibrate(measured.rows, gaussians, run.scene, teacher(run.args), result.base.origin)
+            adapter = replace(adapter, calibration=found)
+        except ClodError as error:
+            console.say(f"the files have no calibration, so --fps and --psnr-drop will not work: {error}")
+    report = describe(run, result, measured)
+    with (
+        console.status(f"writing {outputs.ply} ..."),
+        atomic_paths(outputs.adapter, outputs.ply, outputs.report) as (small, large, about),
+    ):
+        save_adapter(small, adapter)
+        save(large, gaussians, result.base, version=adapter.version, calibration=adapter.calibration)
+        report["calibration"] = adapter.calibration and adapter.calibration.as_dict()
+        report |= {"adapter_bytes": small.stat().st_size, "ply_bytes": large.stat().st_size}
+        write_report(about, report)
+    console.say(f"wrote {outputs.adapter} and {outputs.ply}")
+    return report
+
+
+def describe(run: Run, result: Result, measured: Measurements) -> dict[str, Any]:
+    """The report, except the calibration and the sizes of the files."""
+    args, adapted, adapter = run.args, result.adapted, result.adapter
+    late = "the measurements were interrupted: only the dial values that were finished are reported"
+    notes = [*result.base.notes, *run.scene.notes, *run.notes, *result.notes, *measured.notes]
+    if measured.interrupted:
+        run.console.say(late)
+        notes.append(late)
+    report = {
+        "command": "adapt", "version": package_version(), "model": args.ply, "scene": args.images,
+        "teacher": teacher(args), "screen_filter": asdict(result.gaussians.screen_filter),
+        "base_count": adapter.base_count, "config": adapter.config, "attenuation": asdict(adapter.attenuation),
+        "steps": adapted.steps, "interrupted": adapted.interrupted, "machine": machine(),
+        "processes": describe_processes(adapted, run.config.batch), "outputs": run.outputs.names(),
+        "sh_degree": result.gaussians.sh_degree, "device": str(result.gaussians.means.device),
+        "seconds": seconds(run, result), "resumed_from": run.resumed and run.resumed.state.steps,
+        "alignment": run.alignment, "notes": notes, "base_rows": [row.as_dict() for row in measured.base],
+        "rows": [row.as_dict() for row in measured.rows],
+        "detached_row": measured.plain[0].as_dict() if measured.plain else None,
+        "watched": adapted.watched and asdict(adapted.watched), "plan": result.plan.as_dict(),
+        "memory": run.memory and asdict(run.memory), "forecast": against_forecast(run),
+    }  # fmt: skip
+    line, failed = ("", False) if report["interrupted"] else judge(measured, args.images is not None)
+    failed = adapted.failed is not None or failed and not args.accept_loss
+    return report | ({"loss": line} if line else {}) | ({"exit_code": 1} if failed else {})
+
+
+def judge(measured: Measurements, photographs: bool) -> tuple[str, bool]:
+    """What is wrong with s = 1 and what to do, empty if nothing is; and whether the result has failed."""
+    full = [row.psnr for row in measured.rows if row.virtual_scale == 1]
+    if not full or not measured.base:
+        return "", False
+    if photographs:
+        lost = measured.base[0].psnr - full[0]
+        line = f"s = 1 is {lost:.2f} dB below the base on the held-out photographs"
+        bad, failed = not lost <= LOST[0], not lost <= LOST[1]
+    else:
+        line = f"s = 1 has {full[0]:.2f} dB against the checkpoint's own renderings"
+        bad, failed = not full[0] >= ENOUGH[0], not full[0] >= ENOUGH[1]
+    more = "" if photographs else ", or give the photographs (--images)"
+    return (f"{line}:\ntrain longer (--iters){more}, or keep the base for full quality" if bad else ""), failed
+
+
+def seconds(run: Run, result: Result) -> dict[str, float]:
+    """Wall times by phase."""
+    plan, adapted = result.plan, result.adapted
+    planning = sum(plan.seconds.values()) - plan.seconds["start"]
+    times = {"plan": planning, "start": adapted.start_seconds, "train": adapted.seconds}
+    return {name: round(value, 3) for name, value in times.items()} | run.watch.report()
+
+
+def teacher(args: argparse.Namespace) -> str:
+    return "checkpoint" if args.images is None else "photographs"
+
+
+def print_summary(run: Run, measured: Measurements, report: dict[str, Any]) -> None:
+    """Prints the measurements, the files, and what to do next."""
+    args, outputs = run.args, run.outputs
+    if measured.rows:
+        put(f"\n{table(measured.rows, measured.base, measured.plain)}\n")
+        if measured.plain:
+            put(f"plain: {outputs.ply} in a viewer that does not know the dial\n")
+    for path in vars(outputs).values():
+        put(f"{size(path):>9}  {path}")
+    page = report["seconds"].get("page")
+    more = f", and {duration(page)} for the page" if page else ""
+    put(f"\n{duration(report['seconds']['total'] if page else run.watch.total())} in all{more}; next:")
+    model = shlex.quote(str(outputs.ply))
+    images = [] if args.images is None else [f"--images {shlex.quote(args.images)}"]
+    print(command_line(f"clod-adapt view {model}", f"--base {shlex.quote(args.ply)}", *images))
+    if images:
+        sv = " ".join(f"{s:g}" for s in sorted({1.0, args.max_sv}))
+        print(command_line(f"clod-adapt eval {model}", *images, f"--sv {sv}"))

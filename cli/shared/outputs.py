@@ -42,10 +42,8 @@ class AdaptFiles:
         return self.ply.with_suffix(".resume.safetensors")
 
     def blocks(self) -> list[Path]:
-        """Existing files of an unfinished run in blocks (``adapt.block_files``)."""
-        stem = escape(self.ply.stem)
-        names = (f"{stem}.start.safetensors", f"{stem}.block*.pass*.safetensors")
-        return [path for name in names for path in self.ply.parent.glob(name)]
+        """Existing files of an unfinished run in blocks (``adapt.blocks``)."""
+        return list(self.ply.parent.glob(f"{escape(self.ply.stem)}.block*.pass*.safetensors"))
 
     def names(self) -> dict[str, str]:
         return {name: str(path) for name, path in vars(self).items()}
@@ -118,7 +116,6 @@ class Outputs:
         whole: whether ``named`` is a new folder, not a file.
         inputs: files named to be read.
         scene: a scene folder, all of whose files are inputs (``scene_files``).
-        shared: whether other runs that share the outputs may be at work, as the jobs of one run are.
     """
 
     named: Sequence[Path] = ()
@@ -127,7 +124,6 @@ class Outputs:
     whole: bool = False
     inputs: Sequence[str] = ()
     scene: str | None = None
-    shared: bool = False
 
     @property
     def files(self) -> tuple[Path, ...]:
@@ -150,8 +146,8 @@ def claimed(outputs: Outputs) -> Iterator[None]:
         for folder in outputs.folders[:1]:
             stack.enter_context(output_lock(folder / "outputs", of=folder))
         for path in () if outputs.folders else outputs.files:
-            stack.enter_context(output_lock(path, shared=outputs.shared))
-        for path in () if outputs.shared else outputs.files:
+            stack.enter_context(output_lock(path))
+        for path in outputs.files:
             remove_leftovers(path)
         yield
 

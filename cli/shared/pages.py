@@ -17,8 +17,7 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.metrics import psnr
 from clod_adapter.progress import Phase, Progress, Stopped
 from clod_adapter.render import render
-from clod_adapter.report.page import Picture
-from clod_adapter.report.tradeoff_page import own_teacher, write_tradeoff_report
+from clod_adapter.report.page import Picture, own_teacher, write_page
 
 from .console import Console
 from .outputs import jsonable
@@ -104,7 +103,7 @@ def _write(
     try:
         with interrupt_as_stopped(), console.status(f"writing {path} ..."):
             frames, others = pictures(model, base, scene.test, own_teacher(report))
-            written = write_tradeoff_report(path, jsonable(report), frames, others, jsonable(training))
+            written = write_page(path, jsonable(report), frames, others, jsonable(training))
     except Stopped:
         return _without(report, console, INTERRUPTED)
     except ClodError as error:

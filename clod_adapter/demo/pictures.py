@@ -8,8 +8,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
+from clod_adapter.cameras import View
+from clod_adapter.evaluation.evaluate import evaluate
+from clod_adapter.evaluation.frame_times import time_frames
+from clod_adapter.gaussians import Gaussians
+from clod_adapter.io.checkpoint import load
+from clod_adapter.io.scene.load import load_scene
+from clod_adapter.render import render
 from clod_adapter.report.style import BLUE, INK, ORANGE, QUIET, label_log, new_figure, save_figure, tidy
+
+DIALS = (1.0, 2.0, 3.0, 5.0)
+VIEW = 0  # the held-out view on the strip: across the whole room
+CROP = (150, 150, 150, 75)  # left, top, width and height of the part shown enlarged, pixels
 
 
 @dataclass(frozen=True)
@@ -31,6 +43,32 @@ class Panel:
     kept_share: float = 0.0
     psnr: float = 0.0
     frame_ms: float = 0.0
+
+
+def draw(capture: Path, base: Path, model: Path, report: Mapping[str, Any], pictures: Mapping[str, Path]) -> None:
+    """Draws a held-out view of the base and at several dial values, and the quality curve of all held-out views.
+
+    Args:
+        report: of the adaptation; pictures: the files to write, ``dial`` and ``curve``.
+    """
+    view, gaussians = load_scene(capture).test[VIEW], load(model).gaussians
+    panels = [Panel(view.image.numpy(), "photograph"), *measured(load(base).gaussians, gaussians, DIALS, view)]
+    dial_strip(pictures["dial"], panels, "One file, one dial: a held-out view", crop=CROP)
+    title = "Quality against Gaussians, mean over the held-out views"
+    quality_curve(pictures["curve"], report["rows"], report["base_rows"][0], title)
+
+
+@torch.no_grad()
+def measured(base: Gaussians, model: Gaussians, dials: Sequence[float], view: View) -> list[Panel]:
+    """Panels of the base and of the ascending dial values."""
+    times = time_frames([(base, [1.0]), (model, dials)], [view.camera]).milliseconds
+    shown = [("base", base, 1.0), *((f"s = {s:.3g}", model, s) for s in dials)]
+    panels = []
+    for (heading, gaussians, s), taken in zip(shown, (*times[0], *times[1]), strict=True):
+        (row,) = evaluate(gaussians, [view], [s])
+        image = render(gaussians, view.camera, s).image.numpy()
+        panels.append(Panel(image, heading, row.kept, row.kept_share, row.psnr, taken))
+    return panels
 
 
 def dial_strip(

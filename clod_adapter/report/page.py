@@ -1,24 +1,34 @@
-"""A self-contained HTML page, from functions that return HTML.
+"""The HTML report of one model: quality and cost by dial value, and error against adapting time.
 
-Style, script, charts and images are in the file; nothing is loaded from a network.
+``page.html`` is its template. Style, script, charts and images are in the file; nothing is loaded from a network.
 """
 
 from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from html import escape
 from importlib.resources import files
-from pathlib import Path
+from os.path import abspath
+from pathlib import Path, PurePath
 from typing import Any
 
 import numpy as np
 from PIL import Image
 
 from clod_adapter._support.text import as_text, script_json
-from clod_adapter.io.atomic import atomic_path
+from clod_adapter.io.atomic import atomic_paths
+from clod_adapter.report.charts import (
+    Draw,
+    Series,
+    chart_file,
+    inline_svg,
+    rendering_chart,
+    series_of,
+    training_chart,
+    write_chart,
+)  # fmt: skip
 
 WIDEST = 1000  # pixels; wider pictures are scaled down
 QUALITY = 88  # of WebP
@@ -37,116 +47,144 @@ class Picture:
     title: str
     detail: str = ""
 
+    @property
+    def url(self) -> str:
+        """The image as WebP in a data: URL, at most WIDEST pixels wide."""
+        image, file = self.image, io.BytesIO()
+        picture = Image.fromarray(image if image.dtype == np.uint8 else (image.clip(0, 1) * 255).round().astype("u1"))
+        if picture.width > WIDEST:
+            picture = picture.resize((WIDEST, round(picture.height * WIDEST / picture.width)), Image.Resampling.LANCZOS)
+        picture.save(file, "WEBP", quality=QUALITY)
+        return "data:image/webp;base64," + base64.b64encode(file.getvalue()).decode("ascii")
 
-def write_page(path: str | Path, title: str, kicker: str, body: Iterable[str], data: Mapping[str, Any]) -> None:
-    """Writes the page, including ``data`` as JSON under the id ``data``.
+
+def own_teacher(report: Mapping[str, Any]) -> bool:
+    """Whether the reference of the metrics is renders of the checkpoint, without photographs."""
+    return report.get("teacher") == "checkpoint"
+
+
+def write_page(
+    path: str | Path, report: Mapping[str, Any], frames: Sequence[Picture], others: Mapping[str, Picture],
+    training: Mapping[str, Any] | None = None,
+) -> dict[str, Path]:  # fmt: skip
+    """Writes the page and its charts as PNGs in the same folder, atomically; returns the paths.
+
+    Args:
+        report: output of ``clod-adapt`` or ``clod-adapt eval`` with --json; see ``series_of`` for its rows. The page
+            includes it as JSON under the id ``data``.
+        frames: one held-out view at ascending dial values.
+        others: images of the same view to compare with, by name: the photograph, if any, and the base.
+        training: ``curves`` and ``base_psnr`` of ``charts.training_chart``, and the number of ``views``.
 
     Raises:
-        ClodError: the file cannot be written.
+        ClodError: matplotlib is missing, or a file cannot be written.
     """
+    import jinja2
+
+    path, own, series = Path(path), own_teacher(report), series_of(report)
+    # Against its own renders, the base has only rounding errors, far below the range of the charts.
+    drawn = [one for one in series if not (own and one.is_base)]
+    figures = _figures(drawn, training, own)
+    few = dict.fromkeys(round(k * (len(frames) - 1) / 3) for k in range(4)) if frames else ()
+    height, width = frames[0].image.shape[:2] if frames else (1, 1)
     source = files("clod_adapter.report")
-    style, script = ((source / name).read_text(encoding="utf-8") for name in ("style.css", "dial.js"))
-    page = f"""<!doctype html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{escape(title)}</title>
-<style>
-{style}</style>
-</head>
-<body>
-<header><p class="kicker">{escape(kicker)}</p><h1>{escape(title)}</h1></header>
-<main>
-{"".join(body)}
-</main>
-<script type="application/json" id="data">{script_json(data)}</script>
-<script type="module">
-{script}</script>
-</body>
-</html>
-"""
-    with atomic_path(path) as part:
-        part.write_text(as_text(page), encoding="utf-8")
+    parts = {name: (source / file).read_text(encoding="utf-8") for name, file in PARTS.items()}
+    page = jinja2.Environment(autoescape=True).from_string(parts.pop("template")).render(
+        report=report, own=own, title=_title(report), lead=_lead(report, series), tiles=_tiles(drawn), frames=frames,
+        others=others, aspect=f"{width} / {height}", strip=[*others.values(), *(frames[k] for k in few)] if few else [],
+        figures=[(head, inline_svg(draw, name, head), text) for name, (head, draw, text) in figures.items()],
+        series=series, decisions=(report.get("plan") or {}).get("decisions", ()), settings=_settings(report),
+        config={name: f"{v:.4g}" if isinstance(v, float) else v for name, v in _config(report).items()},
+        data=script_json({"report": report, "training": training}), **parts,
+    )  # fmt: skip
+    outputs = {name: chart_file(path, name) for name in figures}
+    with atomic_paths(path, *outputs.values()) as (temporary, *pngs):
+        for png, (_, draw, _) in zip(pngs, figures.values(), strict=True):
+            write_chart(png, draw)
+        temporary.write_text(as_text(page), encoding="utf-8")
+    return {"page": path, **outputs}
 
 
-def section(title: str, *parts: str) -> str:
-    return f"<section><h2>{escape(title)}</h2>{''.join(parts)}</section>\n"
+PARTS = {"template": "page.html", "style": "style.css", "script": "dial.js"}
 
 
-def paragraph(text: str, kind: str = "") -> str:
-    return f'<p class="{kind}">{escape(text)}</p>' if kind else f"<p>{escape(text)}</p>"
+def _figures(
+    drawn: Sequence[Series], training: Mapping[str, Any] | None, own: bool
+) -> dict[str, tuple[str, Draw, str]]:
+    """Heading, chart and caption by name."""
+    found: dict[str, tuple[str, Draw, str]] = {}
+    if drawn:
+        caption = "Lower left is better: less error, less time."
+        if len(drawn) > 1 and drawn[-1].label.startswith("plain"):
+            caption += " A plain viewer ignores the dial and shows all Gaussians of the adapted file unfaded."
+        found["rendering"] = ("Error against frame time", rendering_chart(drawn), caption)
+    if training:
+        seen = "held-out synthetic views" if own else "held-out photographs"
+        caption = (
+            f"One run, measured on {training['views']} {seen}. The state was copied at evenly spaced points of this "
+            "axis and measured after the end, so measuring took no training time. Times include the initialization."
+        )
+        draw = training_chart(training["curves"], None if own else training["base_psnr"])
+        found["adapting"] = ("Error against adapting time", draw, caption)
+    return found
 
 
-def tiles(entries: Sequence[tuple[str, str, str]]) -> str:
-    """Key figures: label, value and note."""
-    cells = (
-        f"<div><dt>{escape(what)}</dt><dd>{escape(value)}<small>{escape(note)}</small></dd></div>"
-        for what, value, note in entries
+def _title(report: Mapping[str, Any]) -> str:
+    return f"{PurePath(report.get('outputs', {}).get('ply', report['model'])).name}: quality against time"
+
+
+def _lead(report: Mapping[str, Any], series: Sequence[Series]) -> list[str]:
+    """Summary sentences: inputs and results."""
+    own, count = own_teacher(report), report["base_count"]
+    scene = "" if own else PurePath(abspath(report["scene"])).name
+    if report["command"] == "eval":
+        first = f"{report['model']} holds {count:,} Gaussians. It was measured on held-out photographs of {scene}."
+    else:
+        seen, minutes = "synthetic views" if own else f"the photographs of {scene}", divmod(_total(report), 60)
+        first = (
+            f"{PurePath(report['model']).name}, a trained splat of {count:,} Gaussians, was given a quality dial: "
+            f"{report['steps']:,} steps on {seen}, {minutes[0]}:{minutes[1]:02} minutes in all."
+        )
+        first += " Training was interrupted." if report["interrupted"] else ""
+    if not series:
+        return [first, "Nothing was measured: " + " ".join(report["notes"])]
+    rows = sorted(series[0].rows, key=lambda row: row.get("virtual_scale", 1))
+    base = next((one.rows[0] for one in series if one.is_base), None)
+    best, last = rows[0], rows[-1]
+    if not series[0].dial or best["kept"] == last["kept"]:
+        return [first, f"It reaches {best['psnr']:.2f} dB at {best['frame_ms']:.1f} ms per frame."]
+    second = (
+        f"At s = {best['virtual_scale']:g} it reaches {best['psnr']:.2f} dB with {best['kept_share']:.0%} of the "
+        f"Gaussians, at {best['frame_ms']:.1f} ms per frame; at s = {last['virtual_scale']:g}, {last['psnr']:.2f} dB "
+        f"with {last['kept_share']:.0%}, at {last['frame_ms']:.1f} ms."
     )
-    return f'<dl class="tiles">{"".join(cells)}</dl>'
+    if base and own:
+        second += f" The reference is the unadapted file's own renders, which take {base['frame_ms']:.1f} ms per frame."
+    elif base:
+        second += f" The unadapted base has {base['psnr']:.2f} dB at {base['frame_ms']:.1f} ms."
+    return [first, second]
 
 
-def facts(entries: Mapping[str, Any]) -> str:
-    cells = (f"<div><dt>{escape(k)}</dt><dd>{escape(str(v))}</dd></div>" for k, v in entries.items())
-    return f'<dl class="facts">{"".join(cells)}</dl>'
+def _total(report: Mapping[str, Any]) -> int:
+    return round(report["seconds"]["total"])
 
 
-def bullets(lines: Iterable[str]) -> str:
-    return f"<ul>{''.join(f'<li>{escape(line)}</li>' for line in lines)}</ul>"
+def _tiles(series: Sequence[Series]) -> list[tuple[str, Mapping[str, Any]]]:
+    """Key figures: the base, and both ends and the middle of the dial."""
+    found = [(one.label, one.rows[0]) for one in series if one.is_base]
+    if series and series[0].dial:
+        rows = sorted(series[0].rows, key=lambda row: row["virtual_scale"])
+        picked = dict.fromkeys((0, len(rows) // 2, len(rows) - 1))
+        found += [(f"s = {rows[k]['virtual_scale']:g}", rows[k]) for k in picked]
+    return found
 
 
-def chart(svg: str, caption: str) -> str:
-    return f'<figure><div class="chart">{svg}</div><figcaption>{escape(caption)}</figcaption></figure>'
+def _config(report: Mapping[str, Any]) -> Mapping[str, Any]:
+    return report.get("config") or report.get("attenuation") or {}
 
 
-def html_table(head: Sequence[str], groups: Iterable[tuple[str, Sequence[Sequence[str]]]]) -> str:
-    """A table of groups, each with a heading and rows of cells."""
-    lines = ["<tr>" + "".join(f"<th>{escape(cell)}</th>" for cell in head) + "</tr>"]
-    for name, rows in groups:
-        lines.append(f'<tr class="group"><td colspan="{len(head)}">{escape(name)}</td></tr>')
-        lines += ["<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in rows]
-    return f'<div class="scroll"><table>{"".join(lines)}</table></div>'
-
-
-def strip(pictures: Sequence[Picture]) -> str:
-    """Images side by side."""
-    cells = (
-        f'<figure><img src="{data_url(p.image)}" alt="{escape(p.title)}"><figcaption><b>{escape(p.title)}</b> '
-        f"{escape(p.detail)}</figcaption></figure>"
-        for p in pictures
-    )
-    return f'<div class="strip">{"".join(cells)}</div>'
-
-
-def dial_figure(frames: Sequence[Picture], others: Mapping[str, Picture]) -> str:
-    """A slider over the frames, in order of dial values; an image of ``others`` is shown while its button is held."""
-    height, width = frames[0].image.shape[:2]
-    images = [_frame(picture) for picture in frames] + [_frame(picture, name) for name, picture in others.items()]
-    buttons = (f'<button type="button" data-shows="{escape(n)}">hold for {escape(n)}</button>' for n in others)
-    return (
-        f'<figure class="dial" hidden><div class="frames" style="aspect-ratio: {width} / {height}">{"".join(images)}'
-        '</div><div class="readout"><b></b><span class="quiet"></span></div>'
-        f'<input type="range" min="0" max="{len(frames) - 1}" value="0" step="1" aria-label="dial value">'
-        f'<div class="ends"><span>{escape(frames[0].title)}, full quality</span><span>{escape(frames[-1].title)}</span>'
-        f'</div><div class="buttons">{"".join(buttons)}</div></figure>'
-        '<noscript><p class="quiet">The slider needs JavaScript; the images below show the same view.</p></noscript>'
-    )
-
-
-def _frame(picture: Picture, name: str = "") -> str:
-    return (
-        f'<img src="{data_url(picture.image)}" alt="{escape(picture.title)}" data-name="{escape(name)}" '
-        f'data-title="{escape(picture.title)}" data-detail="{escape(picture.detail)}">'
-    )
-
-
-def data_url(image: np.ndarray) -> str:
-    """The image as WebP in a data: URL, at most WIDEST pixels wide."""
-    pixels = image if image.dtype == np.uint8 else (np.clip(image, 0, 1) * 255).round().astype(np.uint8)
-    picture = Image.fromarray(pixels)
-    if picture.width > WIDEST:
-        picture = picture.resize((WIDEST, round(picture.height * WIDEST / picture.width)), Image.Resampling.LANCZOS)
-    file = io.BytesIO()
-    picture.save(file, "WEBP", quality=QUALITY)
-    return "data:image/webp;base64," + base64.b64encode(file.getvalue()).decode("ascii")
+def _settings(report: Mapping[str, Any]) -> dict[str, Any]:
+    scene = "none (synthetic views)" if own_teacher(report) else report["scene"]
+    seconds = {f"{name}, seconds": value for name, value in report["seconds"].items()}
+    flat = {"model": report["model"], "scene": scene, "version": report["version"]}
+    return flat | report["machine"] | {"device": report["device"]} | seconds

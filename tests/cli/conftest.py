@@ -56,7 +56,7 @@ def clod(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest
 @pytest.fixture
 def blank_figure(monkeypatch: pytest.MonkeyPatch) -> None:
     """Replaces the figure of ``clod-adapt robustness``, which takes a second to draw, by an empty file."""
-    monkeypatch.setattr("clod_adapter.cli.robustness.robustness_figure", lambda path, *_: Path(path).touch())
+    monkeypatch.setattr("clod_adapter.report.robustness_figure.robustness_figure", lambda path, *_: Path(path).touch())
 
 
 @pytest.fixture(scope="session")

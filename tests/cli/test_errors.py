@@ -21,7 +21,8 @@ import pytest
 from PIL import Image
 
 import clod_adapter
-from clod_adapter.cli.main import ADAPT, COMMANDS, build_parser
+from clod_adapter.cli import adapt
+from clod_adapter.cli.main import COMMANDS, build_parser
 from clod_adapter.cli.shared.outputs import Outputs, claimed
 
 POSE = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 5], [0, 0, 0, 1]]
@@ -93,7 +94,7 @@ FOREIGN = "exists and is not known to be written by clod-adapt; move it, or choo
 
 ERRORS = [
     # Arguments, and inputs that are none.
-    ("", "arguments are required: PLY .*--help"),
+    ("--quiet", "arguments are required: PLY .*--help"),
     ("veiw base.ply", "veiw: no such file or command; did you mean clod-adapt view"),
     ("Eval base.ply --images scene --json", "did you mean clod-adapt eval"),
     ("missing.ply --images scene", "missing.ply: .*No such file.*check the path"),
@@ -246,7 +247,7 @@ def test_pipe_as_output_is_refused(clod: Any, folder: Path, monkeypatch: pytest.
 def outputs_of(line: str) -> Outputs:
     words = line.split()
     name = words[0] if words[0] in COMMANDS else ""
-    return COMMANDS.get(name, ADAPT).outputs(build_parser(name).parse_args(words[1:] if name else words))
+    return COMMANDS.get(name, adapt.COMMAND).outputs(build_parser(name).parse_args(words[1:] if name else words))
 
 
 @pytest.mark.parametrize(

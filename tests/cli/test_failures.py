@@ -14,9 +14,9 @@ import pytest
 import torch
 
 import clod_adapter
-from clod_adapter.cli.adapt import report as reporting
-from clod_adapter.cli.adapt import saver
-from clod_adapter.cli.adapt.display import ProgressDisplay
+from clod_adapter.cli.adapt import listeners
+from clod_adapter.cli.adapt import run as adapt_run
+from clod_adapter.cli.adapt.listeners import ProgressDisplay
 from clod_adapter.cli.shared import pages
 from clod_adapter.errors import ClodError
 from clod_adapter.progress import Phase, Progress
@@ -72,10 +72,10 @@ def after_step(patch: pytest.MonkeyPatch, step: int, action: Any) -> None:
     [
         (lambda patch: change_step(patch, 6, fail), 1, 5),
         (lambda patch: after_step(patch, 7, fail), 1, 7),
-        (lambda patch: patch.setattr(reporting, "measure_result", fail), 1, ITERS),
-        (lambda patch: patch.setattr(reporting, "save", raising(ClodError("dial.ply: cannot be written"))), 2, ITERS),
-        (lambda patch: patch.setattr(reporting, "save", raising(MemoryError())), 2, ITERS),
-        (lambda patch: patch.setattr(reporting, "save", fail), 1, ITERS),
+        (lambda patch: patch.setattr(adapt_run, "measure_result", fail), 1, ITERS),
+        (lambda patch: patch.setattr(adapt_run, "save", raising(ClodError("dial.ply: cannot be written"))), 2, ITERS),
+        (lambda patch: patch.setattr(adapt_run, "save", raising(MemoryError())), 2, ITERS),
+        (lambda patch: patch.setattr(adapt_run, "save", fail), 1, ITERS),
     ],
     ids=["step, quiet", "listener", "measuring", "full disk", "memory", "writing"],
 )
@@ -152,8 +152,8 @@ def test_removed_output_folder(clod: Any, outside: list[Any], whole: Any, tmp_pa
 def test_state_that_cannot_be_saved(clod: Any, outside: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Only the error of the output is printed."""
     (tmp_path / "temporary").rmdir()
-    monkeypatch.setattr(reporting, "write_files", lambda *_: shutil.rmtree("out") or fail())
-    monkeypatch.setattr(saver, "save_state", raising(ClodError("full")))
+    monkeypatch.setattr(adapt_run, "save_adapter", lambda *_: shutil.rmtree("out") or fail())
+    monkeypatch.setattr(listeners, "save_state", raising(ClodError("full")))
     done = clod(*outside)
     assert done.code == 1 and "ZeroDivisionError: of ours" in done.err and "resumes from" not in done.err, done
 

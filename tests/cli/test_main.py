@@ -51,6 +51,11 @@ def test_errors_of_the_work(
     assert code != 1 or str(error) in lines[-2]
 
 
+def test_without_arguments_it_says_what_to_do(clod: Any) -> None:
+    done = clod()
+    assert (done.code, done.err, done.out.count("\n")) == (0, "", 5) and "clod-adapt PLY --images DIR" in done.out
+
+
 def test_torch_is_imported_with_idle_threads_and_the_collector_on() -> None:
     """The command sets OpenMP's wait policy before torch reads it."""
     code = (

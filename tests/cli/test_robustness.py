@@ -16,8 +16,7 @@ import pytest
 from PIL import Image
 
 import clod_adapter
-from clod_adapter.cli import robustness as command
-from clod_adapter.evaluation.robustness import BASELINE_SHARES
+from clod_adapter.evaluation import robustness as experiment
 from runs import pressing
 
 pytest.importorskip("matplotlib")
@@ -40,104 +39,81 @@ def stamps(folder: Path) -> dict[str, int]:
     return {path.name: path.stat().st_mtime_ns for path in (folder / "cells").iterdir()}
 
 
-def at(cell: dict[str, Any], virtual_scale: float) -> dict[str, Any]:
-    """The cell's row at a dial value."""
-    (row,) = [row for row in cell["rows"] if row["virtual_scale"] == virtual_scale]
-    return row  # type: ignore[no-any-return]
-
-
-def test_outputs_of_all_cells(run: Any, clod: Any, tmp_path: Path) -> None:
+def test_outputs_of_all_cells(run: Any, clod: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("clod_adapter.cli.shared.console.LINE_EVERY", 0)
     done = run("--json")
     assert done.code == 0, done
     folder = tmp_path / "robustness"
     assert sorted(p.name for p in folder.iterdir()) == ["cells", *OUTPUTS]
     report = json.loads(done.out)
     assert report == json.loads((folder / "robustness.json").read_text())
-    cells = [(cell["checkpoint"], cell["max_sv"]) for cell in report["cells"]]
-    assert cells == [(name, max_sv) for name in ("plain", "masked") for max_sv in (None, 1, 3)]
+    cells = {(cell["checkpoint"], cell["max_sv"]): cell["rows"] for cell in report["cells"]}
+    assert list(cells) == [(name, max_sv) for name in ("plain", "masked") for max_sv in (None, 1, 3)]
     assert report["missing"] == [] and not report["interrupted"]
-    for cell in report["cells"]:
-        dials = [row["virtual_scale"] for row in cell["rows"]]
-        assert dials == ([1.0] * len(BASELINE_SHARES) if cell["max_sv"] is None else [1, 1.5, 2, 3])
-        assert ("log10_sigma_d" in cell["distribution"]) == (cell["max_sv"] is not None)
+    for (_, max_sv), rows in cells.items():
+        dials = [row["virtual_scale"] for row in rows]
+        assert dials == ([1.0] * len(experiment.BASELINE_SHARES) if max_sv is None else [1, 1.5, 2, 3])
     with open(folder / "robustness.csv", newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
-    assert len(rows) == 2 * (len(BASELINE_SHARES) + 8)
-    (row,) = [r for r in rows if (r["checkpoint"], r["max_sv"], r["virtual_scale"]) == ("masked", "1.0", "2.0")]
-    assert float(row["psnr"]) == at(report["cells"][4], 2)["psnr"] and row["within_range"] == "False"
+        table = list(csv.DictReader(file))
+    assert len(table) == 2 * (len(experiment.BASELINE_SHARES) + 8)
+    within = {"1.0": "TFFF", "3.0": "TTTT", "base": " " * len(experiment.BASELINE_SHARES)}
+    for max_sv, want in within.items():
+        rows = [row for row in table if (row["checkpoint"], row["max_sv"]) == ("masked", max_sv)]
+        assert "".join(row["within_range"][:1] or " " for row in rows) == want
+        found = cells["masked", None if max_sv == "base" else float(max_sv)]
+        assert [float(row["psnr"]) for row in rows] == [row["psnr"] for row in found]
     assert Image.open(folder / "robustness.png").size[0] > 2000
     # The adapter of a cell gives the measured model.
     assert clod("apply", "plain.ply", "robustness/cells/plain_sv3.safetensors", "-o", "x.ply").code == 0
     scene = clod_adapter.load_scene(report["scene"])
     (again,) = clod_adapter.evaluate(clod_adapter.load("x.ply").gaussians, scene.test, [3.0])
-    assert again.psnr == at(report["cells"][2], 3)["psnr"]
-
-
-@pytest.mark.usefixtures("blank_figure")
-def test_unfinished_and_changed_cells_are_run_again(run: Any, tmp_path: Path) -> None:
-    first = run()
-    assert first.code == 0 and "done already" not in first.err, first
-    folder = tmp_path / "robustness"
-    before = stamps(folder)
-    assert len(before) == 10
-    (folder / "cells" / "masked_sv1.safetensors").unlink()
-    (folder / "robustness.png").unlink()
-    again = run()
-    assert again.code == 0 and "5 of 6 cells are done already" in again.err
-    changed = {name for name, stamp in stamps(folder).items() if stamp != before.get(name)}
-    assert changed == {"masked_sv1.safetensors", "masked_sv1.json"} and (folder / "robustness.png").exists()
-    other = run("--seed", 1)  # baselines do not depend on the seed
-    assert "2 of 6 cells are done already: plain_base, masked_base" in other.err
-    before = stamps(folder)
-    Path("masked.ply").write_bytes(Path("plain.ply").read_bytes())
-    assert "3 of 6 cells are done already: plain_base, plain_sv1, plain_sv3" in run("--seed", 1).err
-    assert {name for name, stamp in stamps(folder).items() if stamp != before[name]} == {
-        f"masked_{what}" for what in ("base.json", "sv1.json", "sv1.safetensors", "sv3.json", "sv3.safetensors")
-    }
-
-
-@pytest.mark.usefixtures("blank_figure")
-def test_interrupt_keeps_finished_cells(run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    calls, real = [], pressing(command.adapt_at_range, signal.SIGINT, at=2)
-    monkeypatch.setattr(command, "adapt_at_range", lambda *a, **options: calls.append(a) or real(*a, **options))
-    done = run("--json")
-    report, folder = json.loads(done.out), tmp_path / "robustness"
-    assert done.code == 0 and report["interrupted"] and "plain_sv3 was not finished" in done.err
-    assert [cell["max_sv"] for cell in report["cells"]] == [None, 1]
-    assert report["missing"] == ["plain_sv3", "masked_base", "masked_sv1", "masked_sv3"]
-    assert all((folder / name).exists() for name in OUTPUTS)
-    finished = json.loads(run("--json").out)
-    assert finished["missing"] == [] and finished["cells"][:2] == report["cells"] and len(calls) == 5
-
-
-def test_interrupt_of_the_first_cell_writes_nothing(run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    calls, real = [], command.scene_fingerprint
-    monkeypatch.setattr(command, "scene_fingerprint", lambda scene: calls.append(scene) or real(scene))
-    monkeypatch.setattr(command, "baseline", pressing(command.baseline, signal.SIGINT))
-    assert run().code == 130 and len(calls) == 1
-    assert not (tmp_path / "robustness").exists()
-
-
-@pytest.mark.usefixtures("blank_figure")
-def test_progress_is_over_all_cells(run: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("clod_adapter.cli.shared.console.LINE_EVERY", 0)
-    done = run()
+    assert again.psnr == cells["plain", 3][-1]["psnr"]
+    # Progress is over all cells.
     lines = re.findall(r"^robustness +(\d+)%, .* left, (\w+) \((\d)/6\)", done.err, re.M)
     shares = [int(share) for share, *_ in lines]
     assert shares == sorted(shares) and shares[-1] == 100 and len(set(shares)) > 20
     assert list(dict.fromkeys(k for *_, k in lines)) == list("123456")
-    assert run("--quiet", "--out", "other").err == ""
 
 
-def test_unreadable_inputs_or_missing_matplotlib_make_no_folder(
-    clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.usefixtures("blank_figure")
+def test_interrupted_unfinished_and_changed_cells(run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Finished cells stay; those without a file, or of other settings or checkpoints, are run again."""
+    folder = tmp_path / "robustness"
+    with monkeypatch.context() as patch:
+        patch.setattr(experiment, "adapt_at_range", pressing(experiment.adapt_at_range, signal.SIGINT, at=2))
+        done = run("--json")
+    report = json.loads(done.out)
+    assert done.code == 0 and report["interrupted"] and "plain_sv3 was not finished" in done.err
+    assert [cell["max_sv"] for cell in report["cells"]] == [None, 1]
+    assert report["missing"] == ["plain_sv3", "masked_base", "masked_sv1", "masked_sv3"]
+    assert all((folder / name).exists() for name in OUTPUTS)
+    done = run("--json", "--quiet")
+    finished = json.loads(done.out)
+    assert finished["missing"] == [] and finished["cells"][:2] == report["cells"] and done.err == ""
+    before = stamps(folder)
+    assert len(before) == 10
+    (folder / "cells" / "masked_sv1.safetensors").unlink()
+    again = run()
+    assert again.code == 0 and "5 of 6 cells are done already" in again.err
+    changed = {name for name, stamp in stamps(folder).items() if stamp != before.get(name)}
+    assert changed == {"masked_sv1.safetensors", "masked_sv1.json"}
+    Path("masked.ply").write_bytes(Path("plain.ply").read_bytes())
+    other = run("--seed", 1)  # baselines do not depend on the seed
+    assert "1 of 6 cells are done already: plain_base" in other.err
+
+
+def test_nothing_is_written_without_a_cell(
+    run: Any, clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    scene = tmp_path / "scene"
-    shutil.copytree(capture.scene, scene)
-    (scene / "images" / "003.png").write_text("no picture")
-    done = clod("robustness", capture.ply, "--images", scene, "--iters", 1)
+    """After an interrupt of the first one, with unreadable inputs, or without matplotlib."""
+    with monkeypatch.context() as patch:
+        patch.setattr(experiment, "baseline", pressing(experiment.baseline, signal.SIGINT))
+        assert run().code == 130
+    shutil.copytree(capture.scene, tmp_path / "scene")
+    (tmp_path / "scene" / "images" / "003.png").write_text("no picture")
+    done = clod("robustness", capture.ply, "--images", "scene", "--iters", 1)
     assert done.code == 2 and "003.png" in done.err, done
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     done = clod("robustness", capture.ply, "--images", capture.scene)
     assert done.code == 2 and "pip install matplotlib" in done.err
-    assert [path.name for path in tmp_path.iterdir()] == ["scene"]
+    assert not (tmp_path / "robustness").exists()

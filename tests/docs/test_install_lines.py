@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from clod_adapter.cli.main import ADAPT
+from clod_adapter.cli import adapt
 from clod_adapter.cli.shared import command
 from fences import ROOT
 
@@ -51,6 +51,6 @@ def test_help_names_the_installed_page(tmp_path: Path, monkeypatch: pytest.Monke
     assert command.manual() == ROOT / "docs" / "index.md"  # of the checkout
     monkeypatch.setattr(command, "__file__", str(tmp_path / "lib" / "cli" / "shared" / "command.py"))
     monkeypatch.setattr(metadata, "files", lambda name: [File()])
-    assert ADAPT.parser("clod-adapt").format_help().endswith(f"\nmanual: {page}\n")
+    assert adapt.COMMAND.parser("clod-adapt").format_help().endswith(f"\nmanual: {page}\n")
     monkeypatch.setattr(metadata, "files", lambda name: None)
-    assert "manual:" not in ADAPT.parser("clod-adapt").format_help()
+    assert "manual:" not in adapt.COMMAND.parser("clod-adapt").format_help()

@@ -1,4 +1,4 @@
-"""The page is self-contained and escapes its texts."""
+"""The page is self-contained and escapes its texts; its charts have log axes, and labels that do not collide."""
 
 from __future__ import annotations
 
@@ -6,18 +6,39 @@ import base64
 import io
 import json
 import re
+import sys
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from clod_adapter.report import page
-from clod_adapter.report.page import Picture
+from clod_adapter.errors import ClodError
+from clod_adapter.report.charts import Series, error, rendering_chart, series_of, training_chart
+from clod_adapter.report.page import Picture, write_page
+from clod_adapter.report.style import new_figure, shades
 
-NASTY = 'a <b> & "c" </script>'
+pytest.importorskip("matplotlib")
+NASTY = r'a <b> & "c" $\co$ </script>'
 VOID = {"meta", "img", "input", "link", "br"}
+
+
+def row(s: float, psnr: float | None = 20.0, ms: float = 3.0) -> dict[str, Any]:
+    return {"virtual_scale": s, "psnr": psnr, "ssim": 0.9, "kept": 10 / s, "kept_share": 0.5, "in_view": 9,
+            "frame_ms": ms}  # fmt: skip
+
+
+def report(**changes: Any) -> dict[str, Any]:
+    made = {"what": NASTY, "verdict": "kept", "measured": "-", "why": NASTY}
+    return {
+        "command": "adapt", "version": "1", "model": NASTY, "scene": NASTY, "base_count": 10, "steps": 9,
+        "interrupted": False, "seconds": {"train": 60.0, "total": 215.4}, "machine": {"cpu": NASTY}, "device": "cpu",
+        "notes": [NASTY], "config": {"seed": 1}, "plan": {"decisions": [made]},
+        "rows": [row(s, 30 - s, 20 / s) for s in (1, 2, 5)], "base_rows": [row(1, 29.5, 25)],
+        "detached_row": row(1, 19),
+    } | changes  # fmt: skip
 
 
 class Outline(HTMLParser):
@@ -39,35 +60,37 @@ class Outline(HTMLParser):
         assert self.open.pop() == tag
 
 
-def picture(level: float, title: str = NASTY) -> Picture:
-    return Picture(np.full((6, 8, 3), level, np.float32), title, NASTY)
-
-
-def test_page_is_self_contained_and_escaped(tmp_path: Path) -> None:
-    body = [
-        page.section(NASTY, page.paragraph(NASTY), page.tiles([(NASTY, "1", NASTY)]), page.facts({NASTY: NASTY})),
-        page.dial_figure([picture(0.0), picture(0.5), picture(1.0)], {"photograph": picture(0.2)}),
-        page.bullets([NASTY]),
-        page.strip([picture(0.3)]), page.html_table(["x", NASTY], [(NASTY, [["1", NASTY]])]),
-        page.chart("<svg></svg>", NASTY),
-    ]  # fmt: skip
-    data = {"rows": [{"note": NASTY, "psnr": None}]}
-    page.write_page(tmp_path / "page.html", NASTY, NASTY, body, data)
+def test_page_is_self_contained_and_escaped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    frames = [Picture(np.full((6, 8, 3), level, np.float32), NASTY, NASTY) for level in (0.0, 0.5, 1.0)]
+    training = {"views": 2, "base_psnr": 29.0, "curves": [{"label": NASTY, "points": [{"seconds": 2, "psnr": 20}] * 2}]}
+    written = write_page(tmp_path / "page.html", report(), frames, {"photograph": frames[0]}, training)
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(path.name for path in written.values())
     text = (tmp_path / "page.html").read_text(encoding="utf-8")
-    outline = Outline(text)
-    assert "a <b>" not in text.partition('<script type="application/json"')[0]
+    outline, visible = Outline(text), text.partition('<script type="application/json"')[0]
+    assert "a <b>" not in visible and "a &lt;b&gt; &amp;" in visible and "9 steps on" in visible
+    assert "3:35 minutes in all" in visible and "29.00 dB" in visible and "base, unadapted" in visible
     for tag, attributes in outline.found:  # nothing from elsewhere
         assert tag not in ("link", "iframe") and not (tag == "script" and "src" in attributes)
-        assert all(value and value.startswith("data:") for name, value in attributes.items() if name in ("src", "href"))
-    assert not re.search(r"https?://(?!www\.w3\.org)|@import|url\(", text)
+        links = [value for name, value in attributes.items() if name in ("src", "href") and value]
+        assert all(value.startswith(("data:", "#")) for value in links)
+    assert not re.search(r"https?://(?!www\.w3\.org)|@import|url\((?!#)", text)
+    names = [attributes["id"] for _, attributes in outline.found if "id" in attributes]
+    assert len(names) == len(set(names))
+    assert ".tiles > div {" in visible
+    assert {"var(--ink)", "var(--quiet)", "var(--series-1)"} <= set(re.findall(r"var\([^)]*\)", text.split("<svg")[1]))
     stored = re.search(r'<script type="application/json" id="data">(.*?)</script>', text, re.S)
-    assert stored and json.loads(stored[1]) == data and "<" not in stored[1]  # <!--<script> would hide the rest
-    frames = [a for tag, a in outline.found if tag == "img" and "data-title" in a]
-    assert [a["data-name"] for a in frames] == ["", "", "", "photograph"]
-    (slider,) = [a for tag, a in outline.found if tag == "input"]
-    assert (slider["min"], slider["max"]) == ("0", "2")
-    (button,) = [a for tag, a in outline.found if tag == "button"]
-    assert button["data-shows"] == "photograph"
+    assert stored and json.loads(stored[1]) == {"report": report(), "training": training} and "<" not in stored[1]
+    shown = [a["data-name"] for tag, a in outline.found if tag == "img" and "data-title" in a]
+    assert shown == ["", "", "", "photograph"]
+    for png in (written["rendering"], written["adapting"]):
+        pixels = np.asarray(Image.open(png).convert("RGB"))
+        assert min(pixels.shape[:2]) > 500 and 0.005 < (pixels < 128).any(2).mean() < 0.3
+    write_page(tmp_path / "page.html", report(rows=[], base_rows=[], detached_row=None, teacher="checkpoint"), [], {})
+    assert "Nothing was measured" in (tmp_path / "page.html").read_text(encoding="utf-8")
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    with pytest.raises(ClodError, match="pip install matplotlib"):
+        write_page(tmp_path / "other.html", report(), [], {})
+    assert not (tmp_path / "other.html").exists()
 
 
 @pytest.mark.parametrize("kind", [np.uint8, np.float32])
@@ -75,8 +98,59 @@ def test_images_are_embedded(kind: type) -> None:
     """Embedded images keep their pixels; wide ones are scaled down."""
     ramp = np.linspace(0, 255, 32 * 24 * 3).reshape(24, 32, 3)
     image = ramp.astype(np.uint8) if kind is np.uint8 else (ramp / 255).astype(np.float32)
-    urls = [page.data_url(each) for each in (image, np.zeros((300, 2000, 3), kind))]
+    urls = [Picture(each, "").url for each in (image, np.zeros((300, 2000, 3), kind))]
     assert all(url.startswith("data:image/webp;base64,") for url in urls)
     decoded, wide = (Image.open(io.BytesIO(base64.b64decode(url.partition(",")[2]))) for url in urls)
     assert decoded.size == (32, 24) and wide.size == (1000, 150)
     assert np.abs(np.asarray(decoded.convert("RGB")).astype(float) - ramp).mean() < 4
+
+
+def test_charts() -> None:
+    """Log axes with PSNR on the right; where dial values are near each other, not all have labels."""
+    dials = (1.0, 1.01, 1.02, 2.0, 4.0)
+    series = [
+        Series("dial", [row(s, 30 - s, 20 / s) for s in dials], dial=True), Series("base", [row(1, 29.5, 25)]),
+    ]  # fmt: skip
+    with new_figure((6, 4), layout="constrained") as figure:
+        rendering_chart(series)(figure)
+        figure.canvas.draw()
+        left, right = figure.axes
+        assert (left.get_xscale(), left.get_yscale(), right.get_yscale()) == ("log", "log", "log")
+        dial, base = left.get_lines()
+        assert dial.get_xdata().tolist() == [20 / s for s in dials] and base.get_linestyle() == "None"
+        assert dial.get_ydata() == pytest.approx([10 ** (-(30 - s) / 10) for s in dials])
+        labels = [text for text in left.texts if text.get_text().startswith("s = ")]
+        assert sorted(text.get_text() for text in labels) == ["s = 1", "s = 2", "s = 4"]
+        boxes = [text.get_window_extent() for text in labels]
+        assert not any(box.count_overlaps(boxes[:k]) for k, box in enumerate(boxes))
+        for tick, label in zip(right.get_yticks(), right.get_yticklabels(), strict=True):
+            assert error(float(label.get_text())) == pytest.approx(tick)
+        assert len(right.get_yticks()) >= 3 and left.get_ylim() == right.get_ylim()
+    with new_figure((6, 4)) as figure:
+        points = [{"seconds": 2.0**k, "psnr": 20.0 + k} for k in range(6)]
+        training_chart([{"label": "s = 1", "points": points}], 29.0)(figure)
+        curve, base = figure.axes[0].get_lines()
+        assert curve.get_xdata().tolist() == [1, 2, 4, 8, 16, 32] and base.get_ydata() == pytest.approx([10**-2.9] * 2)
+    for count in (1, 2, 5):  # from light to dark
+        sums = [sum(bytes.fromhex(colour[1:])) for colour in shades(count)]
+        assert len(sums) == count and sums == sorted(sums, reverse=True) and len(set(sums)) == count
+
+
+def test_series_of_reports() -> None:
+    """The dial, the base and its pruned versions, other files, and the file without its dial; rows without a PSNR."""
+    compared = {
+        "rows": [row(1), row(3), row(5, None)], "base_row": row(1, 22), "detached_row": row(1, 19),
+        "ranked": [{"by": by, "row": row(1, psnr)} for psnr in (21, 17) for by in ("opacity", "removal error")],
+        "against": [
+            {"model": "x/a.ply", "label": "x_a", "theirs": row(1)},
+            *({"model": "y/a.ply", "label": "y_a", "theirs": row(s)} for s in (1, 3)),
+        ],
+    }  # fmt: skip
+    assert {one.label: (one.dial, [r["psnr"] for r in one.rows]) for one in series_of(compared)} == {
+        "dial, one file": (True, [20, 20]), "base, unadapted": (False, [22]),
+        "base pruned by opacity": (False, [21, 17]), "base pruned by removal error": (False, [21, 17]),
+        "x_a": (False, [20]), "y_a": (True, [20, 20]), "plain viewer, no dial": (False, [19]),
+    }  # fmt: skip
+    (plain,) = series_of({"rows": [row(1), row(2)], "attenuation": None})
+    assert (plain.label, plain.dial) == ("the file, no dial", False)
+    assert series_of({"rows": [], "base_rows": [], "detached_row": None}) == []

@@ -4,21 +4,20 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
 import clod_adapter
-from clod_adapter.cli.adapt.display import ProgressDisplay
-from clod_adapter.cli.commands import adapt as adapt_command
+from clod_adapter.cli import adapt
+from clod_adapter.cli.adapt.prepare import move_to_disk, rows_on_disk
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.progress import Phase, Progress
-from clod_adapter.training import planner
 from clod_adapter.training.plan import NAMES
-from clod_adapter.training.state import load_state, save_state
-from runs import OUTPUTS
 
 TINY = ("--iters", 24, "--max-sv", 4, "--out", "dial.ply")
 
@@ -88,16 +87,6 @@ def test_apply_rebuilds_trimmed_files(clod: Any, capture: Any, wasteful: Path, t
     assert refused.code == 2 and "a different base was given" in refused.err
 
 
-def test_trimming_without_photographs_warns(
-    clod: Any, capture: Any, wasteful: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    scene = clod_adapter.load_scene(capture.scene)
-    monkeypatch.setattr("clod_adapter.cli.adapt.inputs.place_scene", lambda _, config, __: (scene, config))
-    words = ("--iters", 2, "--with", "bands", "--trim")
-    assert "no placed camera sees them, but" in clod(wasteful, *words, "--out", "dial.ply").err
-    assert "no placed camera" not in clod(wasteful, *words, "--images", capture.scene, "--out", "dial.ply").err
-
-
 def test_overrides(clod: Any, capture: Any, wasteful: Path, tmp_path: Path) -> None:
     options = ("--with", "bands", "unseen", "--without", "quats", "--with", "sh0", "--without", "means", "--trim")
     done = clod(wasteful, "--images", capture.scene, *TINY, *options)
@@ -114,39 +103,23 @@ def test_overrides(clod: Any, capture: Any, wasteful: Path, tmp_path: Path) -> N
 
 
 def test_options_name_the_items_of_the_plan() -> None:
-    assert adapt_command.NAMES == NAMES
+    assert adapt.NAMES == NAMES
 
 
-def test_resuming_with_a_frozen_attribute(
-    clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The same options give the same bits; a state of other trained attributes is refused."""
-    plain = (capture.ply, "--images", capture.scene, *TINY)
-    words = (*plain, "--without", "quats")
-    assert clod(*words).code == 0
-    want = clod_adapter.load(tmp_path / "dial.ply").gaussians
-    follow = ProgressDisplay.__call__
-    with monkeypatch.context() as patch:
-
-        def interrupted(self: ProgressDisplay, now: Progress) -> bool:
-            self.stop.requests += now.phase == Phase.TRAINING and now.done == 12
-            return follow(self, now)
-
-        patch.setattr(ProgressDisplay, "__call__", interrupted)
-        assert "--resume resumes from step 12" in clod(*words).err
-    path = tmp_path / "dial.resume.safetensors"
-    saved = path.read_bytes()
-    with monkeypatch.context() as patch:
-        patch.setattr(planner, "sh_degree_losses", lambda *_: pytest.fail("measured before it was refused"))
-        refused = clod(*plain, "--with", "sh0", "--resume")
-    assert refused.code == 2 and "is of a run with --without quats; use the original" in refused.err, refused
-    # A development version froze attributes by itself, and stored no option for it.
-    state, run_of = load_state(path)
-    save_state(path, state, run_of | {"overruled": {"--with": [], "--without": []}, "frozen": ["quats"]})
-    refused = clod(*plain, "--resume")
-    assert refused.code == 2 and "is of other Gaussians, views or settings; delete it to start over" in refused.err
-    path.write_bytes(saved)
-    assert clod(*words, "--resume").code == 0
-    found = clod_adapter.load(tmp_path / "dial.ply").gaussians
-    assert all(torch.equal(value, found.tensors()[name]) for name, value in want.tensors().items())
-    assert [path.name for path in sorted(tmp_path.iterdir()) if path.is_file()] == OUTPUTS
+def test_rows_and_tensors_on_disk(capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In files without a name, or in memory where there is no room; all that refer to a tensor see it there."""
+    base, same = (clod_adapter.load(capture.ply) for _ in range(2))
+    mapped = rows_on_disk(base, tmp_path)
+    assert isinstance(mapped.vertex.base, np.memmap) and np.array_equal(mapped.vertex, base.vertex)
+    assert rows_on_disk(base, tmp_path / "absent").vertex is base.vertex
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=3 * base.vertex.nbytes))
+    assert rows_on_disk(base, tmp_path).vertex is base.vertex
+    monkeypatch.undo()
+    other = base.gaussians.replace(opacity_logits=base.gaussians.opacity_logits.clone())
+    move_to_disk(base.gaussians, tmp_path)
+    assert not list(tmp_path.iterdir())
+    for name, tensor in base.gaussians.tensors().items():
+        assert torch.equal(tensor, getattr(same.gaussians, name))
+        shared = getattr(other, name)
+        assert (shared.data_ptr() == tensor.data_ptr()) == (name != "opacity_logits"), name
+    base.gaussians.means[0] = 1.0  # a private copy of the page

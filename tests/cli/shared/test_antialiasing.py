@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 import clod_adapter
-from clod_adapter.cli.adapt.resume import _fingerprint
+from clod_adapter.cli.adapt.listeners import fingerprint
 from clod_adapter.cli.main import build_parser
 from clod_adapter.cli.shared.console import Console
 from clod_adapter.cli.view import make_page
@@ -85,7 +85,7 @@ def test_option_overrides_the_file(clod: Any, trained: tuple[Path, Path], tmp_pa
 
 def test_key_of_a_run_depends_on_the_filter(trained: tuple[Path, Path]) -> None:
     some = clod_adapter.load(trained[0]).gaussians
-    assert len({_fingerprint(some.replace(screen_filter=each)) for each in FILTERS.values()}) == len(FILTERS)
+    assert len({fingerprint(some.replace(screen_filter=each)) for each in FILTERS.values()}) == len(FILTERS)
 
 
 @pytest.mark.usefixtures("blank_figure")

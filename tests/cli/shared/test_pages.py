@@ -48,7 +48,7 @@ def test_adapt(clod: Any, capture: Any, tmp_path: Path) -> None:
     assert curves[0]["points"][-1]["seconds"] == pytest.approx(trained, abs=0.05)
     text = (tmp_path / "dial.html").read_text(encoding="utf-8")
     assert "change no pixel of" in text and page["report"]["plan"] == report["plan"]
-    assert text.count("<svg") == 2 and "base.ply, a trained splat of 300 Gaussians" in text
+    assert text.count("<svg") == 4 and "base.ply, a trained splat of 300 Gaussians" in text
     assert text.count('data-name=""') == pages.FRAMES and text.count('data-name="base"') == 1
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from clod_adapter.config import AdaptConfig, field_descriptions
 from clod_adapter.errors import ClodError
 
-from ..shared.process import launched
+from .process import launched
 
 if TYPE_CHECKING:
     from argparse import _ActionsContainer

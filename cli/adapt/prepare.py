@@ -1,0 +1,284 @@
+"""A run of ``clod-adapt`` before its training: the arguments, what is read, the memory plan and the training plan."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import shutil
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from clod_adapter.adapter import dial_tensors
+from clod_adapter.blocks.memory import IMAGES, MemoryEstimate, MemoryPlan, in_words, parse_size, plan_for_limit
+from clod_adapter.cameras import Scene, StoredView, View
+from clod_adapter.evaluation.evaluate import Row
+from clod_adapter.gaussians import Gaussians
+from clod_adapter.io.checkpoint import Checkpoint
+from clod_adapter.io.scene.load import ImageCache
+from clod_adapter.progress import Phase, Stopped
+from clod_adapter.rasterizers.frame import release_memory
+from clod_adapter.training.loop import time_steps
+from clod_adapter.training.plan import NOT_NEEDED, Decision, Override, Plan
+from clod_adapter.training.planner import make_plan
+
+from ..shared.alignment import align
+from ..shared.console import Console
+from ..shared.inputs import (
+    on_device,
+    pick_device,
+    place_scene,
+    prepare_kernels,
+    read_checkpoint,
+    read_scene,
+    with_filter,
+    with_pseudo_views,
+)
+from ..shared.measure import Stopwatch, measure, report_dials
+from ..shared.outputs import AdaptFiles
+from ..shared.pages import SNAPSHOT_VIEWS
+from ..shared.process import GracefulStop, launched
+from ..shared.settings import make_config
+from .listeners import ProgressDisplay, Resumed, find_state
+
+LONG = 100  # steps of a run that is worth a forecast
+CHEAPER = 0.7  # measuring a dial value, of measuring the base
+WRITING = 1e8  # bytes of a PLY per second, with everything that is written beside it
+
+
+class Run:
+    """The arguments, checked, the services that all steps use, and what ``read`` has found.
+
+    Attributes:
+        given: the settings of the options, by which ``--resume`` finds a run.
+        resumed: the state that it found.
+        scene, config: without photographs or with too few, with pseudo views and lower learning rates.
+        alignment: the measurements of the alignment check, for the report; None without photographs.
+        memory: the plan for ``--memory``; None without the option.
+        notes, forecast: for the report.
+        base_rows: the base at dial value 1; empty if nothing is held out; base_seconds: the time of measuring it.
+
+    Raises:
+        ClodError: options, or a state file, cannot be used.
+    """
+
+    base: Checkpoint
+    scene: Scene
+    alignment: dict[str, Any] | None = None
+    memory: MemoryPlan | None = None
+    base_rows: tuple[Row, ...] = ()
+    base_seconds = 0.0
+    forecast: dict[str, Any] | None = None
+    forecast_at = 0.0
+
+    def __init__(self, args: argparse.Namespace) -> None:
+        self.args, self.console, self.watch = args, Console(args.quiet), Stopwatch()
+        self.stop = GracefulStop(aborts=launched().size == 1)
+        self.given = self.config = make_config(args)
+        self.outputs = AdaptFiles.of(args.ply, args.out)
+        self.notes: list[str] = []
+        resume = args.resume and (not args.memory or self.outputs.state.exists())  # blocks have files of their own
+        self.resumed: Resumed | None = find_state(self.outputs.state, resume, self.config, self.console)
+
+    def read(self) -> None:
+        """Reads checkpoint and photographs, or places cameras.
+
+        Raises:
+            ClodError: something cannot be read, checkpoint and photographs do not fit, or memory is too small.
+        """
+        args, console, watch, views = self.args, self.console, self.watch, list[View]()
+        cache = ImageCache(int(IMAGES * parse_size(args.memory))) if args.memory else None
+        with watch.time("load"):
+            base = on_device(read_checkpoint(args.ply, console, args.activated), pick_device(args.device, console))
+            base = rows_on_disk(base, self.outputs.ply.parent)
+            photographs = read_scene(args.images, console, base.origin, cache) if args.images else None
+        device = base.gaussians.means.device
+        with watch.time("kernels"):
+            prepare_kernels(console, device)
+        with watch.time("evaluate"):
+            if photographs is not None:
+                required = not args.misaligned_ok
+                photographs, self.alignment = align(base, photographs, args.images, console, required=required)
+                views = [*photographs.test, *photographs.train]
+            self.base = base = with_filter(base, args, console, views)
+        if base.gaussians.screen_filter.compensate:
+            with watch.time("kernels"):
+                prepare_kernels(console, device, screen_filter=base.gaussians.screen_filter)
+        if photographs is None:
+            with watch.time("place"):
+                self.scene, self.config = place_scene(base.gaussians, self.config, console)
+        else:
+            with watch.time("evaluate"):
+                self.scene, self.config = with_pseudo_views(base.gaussians, photographs, self.config, console)
+        if args.memory:
+            self.memory = plan_memory(base, self.scene, parse_size(args.memory), console)
+
+    def measure_base(self) -> None:
+        """Measures the base on the held-out views.
+
+        Raises:
+            Stopped: Ctrl-C.
+        """
+        args, console, scene = self.args, self.console, self.scene
+        if columns := tuple(dial_tensors(self.base.gaussians)):
+            used = columns if self.config.growth == "on" else columns[:1]
+            dropped = "; its growth_d is dropped, as growth is off" if used < columns else ""
+            self.notes.append(f"{args.ply} has a dial already: continuing from its {' and '.join(used)}{dropped}")
+        if not scene.test:
+            self.notes.append("no photographs are held out, so nothing is measured; at least two are needed")
+        began = time.perf_counter()
+        with self.watch.time("evaluate"):
+            rows, interrupted = measure(self.base.gaussians, scene.test, [1.0], console, "base")
+        if interrupted:
+            raise Stopped("stopped while the base was measured")
+        if rows and args.images is not None:  # of pseudo views only the rounding is measured
+            console.say(f"base: {rows[0].psnr:.2f} dB on the held-out photographs")
+        for note in self.notes:
+            console.say(note)
+        self.base_rows, self.base_seconds = tuple(rows), time.perf_counter() - began
+
+
+def decide(run: Run, display: ProgressDisplay) -> Plan:
+    """Makes the plan, with the effect of ``--trim``, and prints it.
+
+    Raises:
+        Stopped: Ctrl-C.
+    """
+    args, console, base = run.args, run.console, run.base.gaussians
+    override = Override(frozenset(args.keep_in), frozenset(args.leave_out))
+    plan = make_plan(base, run.scene, run.config, override, display)
+    display.close()
+    release_memory()  # of looking at all Gaussians, before only those that are kept are trained
+    if args.trim and plan.trims(base):
+        began = time.perf_counter()
+        with console.meter(Phase.TRIMMING) as meter:
+            effect = plan.trimming_effect(base, run.scene, meter)
+        seconds = plan.seconds | {"trim": time.perf_counter() - began}
+        plan = replace(plan, decisions=(*plan.decisions, effect), seconds=seconds)
+    show_plan(plan.decisions, console)
+    if plan.kept is not None:  # what is trained is a copy
+        move_to_disk(base, run.outputs.ply.parent)
+    return plan
+
+
+def forecast(run: Run, plan: Plan) -> dict[str, Any] | None:
+    """Seconds and peak memory of the rest of the run, which are printed; from a few steps that are thrown away.
+
+    None for runs that are too short, and in several processes.
+    """
+    config, views, base = plan.config, len(run.scene.test), run.base
+    steps = config.steps - (run.resumed.state.steps if run.resumed else 0)
+    if steps < LONG or launched().size > 1:
+        return None
+    with run.console.status("timing a few steps ..."):
+        each, fixed = time_steps(plan.lean, run.scene, config, min(max(steps // 40, 8), 24), plan.subset)
+    release_memory()
+    training = fixed + min(1.02 * steps * each, config.time_budget or math.inf)  # with saving the state
+    dials, frame = len(report_dials(config.max_sv)) + 1, run.base_rows[0].frame_ms / 1e3 if run.base_rows else 0.0
+    measuring = CHEAPER * dials * (run.base_seconds + 15 * frame)
+    peak = peak_bytes()
+    if run.args.report:  # curves of seven states at three dial values, 15 pictures and the charts
+        measuring += CHEAPER * (21 * run.base_seconds * min(SNAPSHOT_VIEWS / max(views, 1), 1) + 15 * frame) + 5
+        peak += 7 * sum(4 * t.numel() for name, t in plan.start.tensors().items() if name != "shN")
+    seconds = training + measuring + base.vertex.nbytes / WRITING
+    minutes = f"{seconds:.0f} seconds" if seconds < 90 else f"{seconds / 60:.0f} minutes"
+    run.console.say(f"forecast: {minutes}, {in_words(peak)} ({steps:,} steps)")
+    run.forecast_at = time.perf_counter()
+    return {"seconds": round(seconds, 1), "bytes": peak, "steps": steps}
+
+
+def against_forecast(run: Run) -> dict[str, Any] | None:
+    """The forecast, and what the run has taken since."""
+    taken = {"actual_seconds": round(time.perf_counter() - run.forecast_at, 1), "actual_bytes": peak_bytes()}
+    return run.forecast and run.forecast | taken
+
+
+def peak_bytes() -> int:
+    """Of the memory of this process so far; 0 where that is not known."""
+    if sys.platform == "win32":
+        return 0
+    import resource
+
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+
+
+def show_plan(decisions: Sequence[Decision], console: Console) -> None:
+    """One aligned line per decision, and one line with the names of what this scene does not need."""
+    rows = [
+        (decision.what, decision.verdict, decision.measured, _option(decision))
+        for decision in decisions if decision.verdict != NOT_NEEDED
+    ]  # fmt: skip
+    a, b, c = (max(map(len, column)) for column in list(zip(*rows, strict=True))[:3]) if rows else (0, 0, 0)
+    console.say("plan: action, measured effect, option that overrides it; reasons in the report")
+    for what, verdict, effect, option in rows:
+        console.say(f"  {what:<{a}}  {verdict:<{b}}  {effect:>{c}}  {option}".rstrip())
+    if others := [decision.what for decision in decisions if decision.verdict == NOT_NEEDED]:
+        console.say(f"  does not apply: {', '.join(others)}")
+
+
+def _option(decision: Decision) -> str:
+    option = "--without" if decision.verdict == "kept" else "--with"
+    return f"{option} {decision.name}" if decision.name else ""
+
+
+def plan_memory(base: Checkpoint, scene: Scene, limit: int, console: Console) -> MemoryPlan:
+    """The plan for ``--memory``, which is printed.
+
+    Raises:
+        ClodError: it is too small; gives the minimum.
+    """
+    views, gaussians = (*scene.train, *scene.test), base.gaussians
+    pixels = [view.camera.width * view.camera.height for view in views]
+    attributes = sum(tensor.element_size() * tensor.numel() for tensor in gaussians.tensors().values())
+    made = sum(3 * size for view, size in zip(views, pixels, strict=True) if not isinstance(view, StoredView))
+    needs = MemoryEstimate(
+        len(gaussians), math.ceil(attributes / len(gaussians)), base.vertex.dtype.itemsize,
+        images=3 * sum(pixels) - made, pixels=max(pixels), pictures=made,
+    )  # fmt: skip
+    plan = plan_for_limit(needs, limit)
+    how = "the whole scene at once" if plan.blocks == 1 else f"in {plan.blocks} blocks"
+    console.say(f"memory: {in_words(plan.peak)} of {in_words(plan.limit)}, {how}; peaks, including the program itself:")
+    for name, what in (
+        ("base", "reading the checkpoint"), ("start", "initialization of the whole scene"), ("train", "training"),
+        ("write", "writing"), ("cache", "of it for photographs"),
+    ):  # fmt: skip
+        console.say(f"  {in_words(getattr(plan, name)):>8}  {what}")
+    return plan
+
+
+def rows_on_disk(base: Checkpoint, folder: Path) -> Checkpoint:
+    """The checkpoint with its file's rows, which only writing needs, on disk (``_mapped``).
+
+    A later change of the checkpoint's file does not reach them.
+    """
+    return replace(base, vertex=_mapped(base.vertex, folder))
+
+
+def move_to_disk(gaussians: Gaussians, folder: Path) -> None:
+    """Replaces, in place, the memory of all tensors on the CPU by a file (``_mapped``), whoever refers to them."""
+    for tensor in gaussians.tensors().values():
+        if tensor.device.type == "cpu" and tensor.numel():
+            tensor.data = torch.from_numpy(_mapped(tensor.numpy(), folder))
+
+
+def _mapped(array: np.ndarray, folder: Path) -> np.ndarray:
+    """The array in a mapped file without a name in ``folder``; itself where that cannot be written.
+
+    Room for the outputs remains: four times its size must be free.
+    """
+    try:
+        if array.nbytes == 0 or shutil.disk_usage(folder).free < 4 * array.nbytes:
+            return array
+        with tempfile.TemporaryFile(dir=folder) as file:
+            file.write(array.reshape(-1).view(np.uint8).data)  # not tofile, which loses the error of a full disk
+            file.flush()
+            return np.asarray(np.memmap(file, array.dtype, "c", shape=array.shape))
+    except OSError:
+        return array
