@@ -3,7 +3,7 @@
     python benchmarks/portability.py --record                          # all conditions: an hour on two idle cores
     python benchmarks/portability.py plain no_root+c_locale --tests tests/io   # one, and two of them at once
 
-Run by another virtual environment's Python it tests the versions that are installed there (docs/dependencies.md). The
+Run by another virtual environment's Python it tests the versions that are installed there. The
 exit code is 1 where a test failed or a condition could not be had. The conditions:
 
 - ``plain``: as ``make test`` runs it;

@@ -1,7 +1,7 @@
 """The memory that adapting takes, and the number of blocks that keeps it below a limit.
 
-Bytes per Gaussian are measured (docs/blocks.md), with the CPU rasterizer in float32; each is the peak of its phase. The
-context of a block depends on the cameras; a plan assumes that it is the whole scene.
+Bytes per Gaussian are measured, with the CPU rasterizer in float32; each is the peak of its phase. The context of a
+block depends on the cameras; a plan assumes that it is the whole scene.
 """
 
 from __future__ import annotations

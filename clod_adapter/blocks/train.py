@@ -4,7 +4,7 @@ In the first pass each block is trained against the *checkpoint* of the others: 
 dial value, which is what their own training aims at, and the block's target images are the photographs as far as its
 Gaussians cover them (``target_image``). So no block corrects the errors of another. (Trained against the others'
 initialization at the same dial value, each block brightens what all have faded: images of the merged result were 8 to
-11 dB worse, docs/blocks.md.) In the second pass each block continues with the others at the dial, as the first pass
+11 dB worse.) In the second pass each block continues with the others at the dial, as the first pass
 trained them, which makes the blocks consistent. Within a pass blocks are independent and may be trained in any order;
 their rows are then merged.
 
