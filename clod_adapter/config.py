@@ -69,12 +69,8 @@ class AttenuationConfig:
         reference = self.reference_distance
         require(0 <= reference < math.inf, "reference_distance", reference, "at least 0 and finite")
         require(1 <= self.max_sv < math.inf, "max_sv", self.max_sv, "at least 1 and finite")
-        require(
-            self.tau * self.max_sv < 1,
-            "tau",
-            self.tau,
-            f"below 1/max_sv = {1 / self.max_sv:.3g}, or every Gaussian is culled at max_sv",
-        )
+        all_culled = f"below 1/max_sv = {1 / self.max_sv:.3g}, or every Gaussian is culled at max_sv"
+        require(self.tau * self.max_sv < 1, "tau", self.tau, all_culled)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,11 +118,7 @@ class ScreenFilter:
 
 
 CLASSIC = ScreenFilter()
-FILTERS = {
-    "off": CLASSIC,
-    "on": ScreenFilter(compensate=True),
-    "mip": ScreenFilter(variance=0.1, compensate=True),
-}
+FILTERS = {"off": CLASSIC, "on": ScreenFilter(compensate=True), "mip": ScreenFilter(variance=0.1, compensate=True)}
 """Values of ``--antialiasing``: off is 3DGS, on is gsplat's and Inria's antialiasing, mip is Mip-Splatting."""
 
 
@@ -156,9 +148,7 @@ class AdaptConfig:
     reg_weight: float = option(0.75, "weight of the count loss (the paper's lambda_reg)")
     ssim_weight: float = option(0.2, "weight w of 1 - SSIM; L1 has 1 - w")
     lr_sigma: float = option(0.1, "learning rate of log sigma_d: its largest relative change per step")
-    growth: str = option(
-        "on", "growth of the Gaussians that remain, by a growth_d beside sigma_d: on or off (the paper's)"
-    )
+    growth: str = option("on", "growth of the Gaussians that remain, by a growth_d beside sigma_d: on or off")
     lr_growth: float = option(1.2e-2, "learning rate of growth_d")
     lr_means: float = option(0.06, "learning rate of means, times the Gaussian's own size")
     lr_quats: float = option(1.6e-3, "learning rate of quats")

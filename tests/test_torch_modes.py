@@ -22,7 +22,7 @@ def results(capture: Any) -> tuple[list[Tensor], str]:
     (row,) = clod.evaluate(adapted, scene.test, [2.0])
     plan = clod.make_plan(base, scene)
     baked = clod.bake(adapted, 2, cameras=cameras)
-    dialled = [attached.sigma_d, clod.place_cameras(base)[0].viewmat, *baked.tensors().values()]
+    dialled = [attached.sigma_d, clod.place_cameras(base, views=2)[0].viewmat, *baked.tensors().values()]
     return [*adapted.tensors().values(), image, *dialled], repr((plan.decisions, row.psnr, row.kept))
 
 

@@ -101,7 +101,7 @@ def adversary(normalizer: str, cut: str) -> tuple[Gaussians, list[Camera]]:
         means=means, log_scales=torch.full((7, 3), math.log(0.4)), opacity_logits=torch.full((7,), 3.0),
         sh0=torch.tensor([1.7] * 4 + [-1.7] * 3)[:, None, None].expand(7, 1, 3),
     )  # fmt: skip
-    config = AdaptConfig(normalizer=normalizer, cut=cut).attenuation(4.0)
+    config = dataclasses.replace(AdaptConfig().attenuation(4.0), normalizer=normalizer, cut=cut)
     leave = torch.tensor([2.2] * 4 + [3.0, 4.0, 5.0])
     sigma = sigma_for_extinction(some.opacity_logits, normalized_distances(means, camera, config), leave, config)
     turn = torch.eye(4)

@@ -98,13 +98,14 @@ def test_an_interrupt_before_the_first_step_is_raised(monkeypatch: pytest.Monkey
 
 def test_a_second_interrupt_is_raised_at_once() -> None:
     """Not one of the signals that are repeated."""
-    before = signal.signal(signal.SIGHUP, signal.default_int_handler)
+    before, deferred = signal.signal(signal.SIGHUP, signal.default_int_handler), 0
     with pytest.raises(KeyboardInterrupt), DeferredInterrupt() as interrupt:
         interrupt.begin()
-        for number in (signal.SIGHUP, signal.SIGHUP, signal.SIGINT, signal.SIGHUP):
+        for number in (signal.SIGHUP, signal.SIGHUP, signal.SIGINT, signal.SIGHUP, signal.SIGINT):
             signal.raise_signal(number)
             assert interrupt.received
-        signal.raise_signal(signal.SIGINT)
+            deferred += 1
+    assert deferred == 4
     assert signal.getsignal(signal.SIGINT) is signal.signal(signal.SIGHUP, before) is signal.default_int_handler
 
 
