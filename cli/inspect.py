@@ -17,8 +17,7 @@ from .shared.outputs import size
 
 if TYPE_CHECKING:
     from clod_adapter.calibration import Calibration
-    from clod_adapter.inspection.report import Inspection
-    from clod_adapter.inspection.splat import Splat
+    from clod_adapter.inspection.report import Inspection, Splat
     from clod_adapter.inspection.statistics import Spread
 
 WIDTH = 13  # of the labels

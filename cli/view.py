@@ -19,7 +19,7 @@ from clod_adapter._support.text import as_text
 from clod_adapter._support.version import package_version
 from clod_adapter.errors import ClodError
 from clod_adapter.io.file_formats import FORMATS
-from clod_adapter.io.ply.header import VIEWPOINT
+from clod_adapter.io.ply_settings import VIEWPOINT
 from clod_adapter.progress import Stopped
 
 from .shared.command import (

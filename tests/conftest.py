@@ -25,10 +25,10 @@ from clod_adapter.cli.main import main
 from clod_adapter.evaluation import frame_times
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.formats.splat_transform import VARIABLE
-from clod_adapter.io.ply.columns import rows_of
 from clod_adapter.io.scene.colmap import write_model
 from clod_adapter.render import render
 from clod_adapter.training import pseudo_views
+from formats import inria_rows
 from runs import accepted
 from scenes import looking
 
@@ -103,8 +103,7 @@ def dialled(capture: Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def _write_inria(path: Path, gaussians: Gaussians) -> Path:
     """A plain file as Inria's trainer writes it, normals included."""
     plain = gaussians.replace(sigma_d=None, attenuation=None)
-    vertex = rows_of({name: value.numpy() for name, value in plain.tensors().items()})
-    PlyData([PlyElement.describe(vertex, "vertex")], byte_order="<").write(str(path))
+    PlyData([PlyElement.describe(inria_rows(plain), "vertex")], byte_order="<").write(str(path))
     return path
 
 

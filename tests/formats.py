@@ -153,3 +153,21 @@ def change_glb(path: Path, change: Callable[[dict[str, Any]], object]) -> Path:
     head = struct.pack("<4sIIII", b"glTF", 2, 20 + len(text) + len(rest), len(text), 0x4E4F534A)
     path.write_bytes(head + text + rest)
     return path
+
+
+def inria_rows(g: Gaussians) -> np.ndarray:
+    """The vertices that Inria's trainer writes of these Gaussians, normals included; the dial's columns last."""
+    count, bands = len(g), g.shN.shape[1]
+    flat = g.shN.numpy().transpose(0, 2, 1).reshape(count, 3 * bands)  # channel by channel
+    parts = [g.means.numpy(), np.zeros((count, 3)), g.sh0.numpy()[:, 0], flat, g.opacity_logits.numpy()[:, None]]
+    parts += [g.log_scales.numpy(), g.quats.numpy()]
+    names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", *(f"f_rest_{k}" for k in range(3 * bands))]
+    names += ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+    for name in ("sigma_d", "growth_d"):
+        if (column := getattr(g, name)) is not None:
+            parts.append(column.numpy()[:, None])
+            names.append(name)
+    rows, table = np.empty(count, [(name, "f4") for name in names]), np.concatenate(parts, 1)
+    for k, name in enumerate(names):
+        rows[name] = table[:, k]
+    return rows

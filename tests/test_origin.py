@@ -18,13 +18,6 @@ from scenes import gaussians
 UTM = np.array([437_123.25, -4_481_010.5, 1_000.0])
 
 
-def rows(means: np.ndarray, kind: str = "f8") -> np.ndarray:
-    table = np.zeros(len(means), [(axis, kind) for axis in "xyz"])
-    for axis, column in zip("xyz", means.T, strict=True):
-        table[axis] = column
-    return table
-
-
 def moved(path: Path, out: Path, kind: str) -> Path:
     """The file's coordinates UTM away, as columns of ``kind``."""
     old = PlyData.read(str(path))["vertex"].data
@@ -37,17 +30,17 @@ def moved(path: Path, out: Path, kind: str) -> Path:
 
 def test_only_distant_scenes_have_an_origin() -> None:
     near = np.random.default_rng(0).normal(size=(500, 3))
-    assert origin_of(rows(near)) == origin_of(rows(near + 40)) == NOWHERE
-    assert origin_of(rows(near[:1] + UTM)) == NOWHERE  # of one Gaussian there is no telling what is far
-    assert origin_of(rows(np.zeros((0, 3)))) == origin_of(rows(np.full((3, 3), np.nan))) == NOWHERE
+    assert origin_of(near) == origin_of(near + 40) == NOWHERE
+    assert origin_of(near[:1] + UTM) == NOWHERE  # of one Gaussian there is no telling what is far
+    assert origin_of(np.zeros((0, 3))) == origin_of(np.full((3, 3), np.nan)) == NOWHERE
     with_floater = np.concatenate([near, [[1e9, 0, 0]]])
-    assert origin_of(rows(with_floater)) == NOWHERE
-    assert np.abs(np.array(origin_of(rows(with_floater + UTM))) - UTM).max() < 5
+    assert origin_of(with_floater) == NOWHERE
+    assert np.abs(np.array(origin_of(with_floater + UTM)) - UTM).max() < 5
     line = np.array([[1.0, 0.0, 0.0]] * 100)
     for length in (1e-320, 1e-9):
         line[:, 2] = np.linspace(0, length, 100)
-        assert origin_of(rows(line))[0] == 1.0
-    origin = origin_of(rows(near * [1, 1, 1e-3] + [1e6, -0.1, -1e-4]))
+        assert origin_of(line)[0] == 1.0
+    origin = origin_of(near * [1, 1, 1e-3] + [1e6, -0.1, -1e-4])
     assert origin[0] > 9e5 and [str(value) for value in origin[1:]] == ["0.0", "0.0"]  # not -0.0
 
 

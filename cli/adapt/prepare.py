@@ -187,7 +187,7 @@ def forecast(run: Run, plan: Plan) -> dict[str, Any] | None:
     if run.args.report:  # curves of seven states at three dial values, 15 pictures and the charts
         measuring += CHEAPER * (21 * run.base_seconds * min(SNAPSHOT_VIEWS / max(views, 1), 1) + 15 * frame) + 5
         peak += 7 * sum(4 * t.numel() for name, t in plan.start.tensors().items() if name != "shN")
-    seconds = training + measuring + base.vertex.nbytes / WRITING
+    seconds = training + measuring + _row_bytes(base) * len(base.gaussians) / WRITING
     minutes = f"{seconds:.0f} seconds" if seconds < 90 else f"{seconds / 60:.0f} minutes"
     run.console.say(f"forecast: {minutes}, {in_words(peak)} ({steps:,} steps)")
     run.forecast_at = time.perf_counter()
@@ -239,7 +239,7 @@ def plan_memory(base: Checkpoint, scene: Scene, limit: int, console: Console) ->
     attributes = sum(tensor.element_size() * tensor.numel() for tensor in gaussians.tensors().values())
     made = sum(3 * size for view, size in zip(views, pixels, strict=True) if not isinstance(view, StoredView))
     needs = MemoryEstimate(
-        len(gaussians), math.ceil(attributes / len(gaussians)), base.vertex.dtype.itemsize,
+        len(gaussians), math.ceil(attributes / len(gaussians)), _row_bytes(base),
         images=3 * sum(pixels) - made, pixels=max(pixels), pictures=made,
     )  # fmt: skip
     plan = plan_for_limit(needs, limit)
@@ -253,12 +253,19 @@ def plan_memory(base: Checkpoint, scene: Scene, limit: int, console: Console) ->
     return plan
 
 
+def _row_bytes(base: Checkpoint) -> int:
+    """Bytes of a row of its file; 4 for each value where that is no PLY."""
+    if base.vertex is not None:
+        return base.vertex.dtype.itemsize
+    return sum(4 * tensor[:1].numel() for tensor in base.gaussians.tensors().values())
+
+
 def rows_on_disk(base: Checkpoint, folder: Path) -> Checkpoint:
     """The checkpoint with its file's rows, which only writing needs, on disk (``_mapped``).
 
     A later change of the checkpoint's file does not reach them.
     """
-    return replace(base, vertex=_mapped(base.vertex, folder))
+    return base if base.vertex is None else replace(base, vertex=_mapped(base.vertex, folder))
 
 
 def move_to_disk(gaussians: Gaussians, folder: Path) -> None:

@@ -223,12 +223,13 @@ def dial_values(args: Namespace, export: Export, console: Console) -> tuple[list
 
 def dropped_columns(model: Checkpoint) -> list[str]:
     """A note on columns of the model that outputs do not have."""
-    from clod_adapter.io.ply.columns import MASKS, dial_columns, inria_dtype
-    from clod_adapter.io.ply.constants import PREFIX
+    from clod_adapter.io.ply import MASK_COLUMNS, inria_dtype
+    from clod_adapter.io.ply_settings import COLUMN
+    from clod_adapter.io.values import FILTER, dial_columns
 
-    names = model.vertex.dtype.names or ()
-    known = {*(inria_dtype(model.gaussians.sh_degree, dial=dial_columns(names)).names or ()), *MASKS}
-    others = [name for name in names if name not in known and not name.startswith(PREFIX)]  # the prefix marks settings
+    names = (model.vertex.dtype.names if model.vertex is not None else None) or ()
+    known = {*(inria_dtype(model.gaussians.sh_degree, dial=dial_columns(names)).names or ()), *MASK_COLUMNS, FILTER}
+    others = [name for name in names if name not in known and not name.startswith(COLUMN)]  # the prefix marks settings
     return [f"columns dropped: {', '.join(others)}"] if others else []
 
 

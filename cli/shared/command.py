@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any, NoReturn
 from clod_adapter.config import DEVICES, FILTERS
 from clod_adapter.errors import ClodError
 from clod_adapter.io.file_formats import PLY, check_readable, file_has_dial, format_of
-from clod_adapter.io.ply.header import PREFIX, ROW, all_comments, read_head
+from clod_adapter.io.ply import all_comments, read_head
+from clod_adapter.io.ply_settings import PREFIX, ROW
 from clod_adapter.io.scene.folder import find_cameras
 from clod_adapter.report.charts import chart_file
 from clod_adapter.report.style import check_matplotlib

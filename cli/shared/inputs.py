@@ -19,9 +19,8 @@ from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.evaluate import evaluate
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.checkpoint import Checkpoint, load
-from clod_adapter.io.ply.columns import dial_columns
-from clod_adapter.io.ply.values import Activated
 from clod_adapter.io.scene.load import ImageCache, load_scene
+from clod_adapter.io.values import Activated, dial_columns
 from clod_adapter.origin import Origin
 from clod_adapter.progress import Phase, Stopped
 from clod_adapter.rasterizers.cuda import unusable

@@ -17,7 +17,7 @@ from typing import Any
 from clod_adapter._support.text import as_text
 from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import atomic_path, check_target, remove_leftovers
-from clod_adapter.io.file_formats import check_suffix, read_model
+from clod_adapter.io.file_formats import check_suffix, read_source
 from clod_adapter.io.lock import output_lock
 from clod_adapter.io.scene.folder import scene_files
 
@@ -217,7 +217,7 @@ def _is_ours(path: Path) -> bool:
     if path.suffix.lower() != ".spz":
         return not start or OURS.search(start) is not None
     with suppress(ClodError):
-        return read_model(path).metadata.described
+        return read_source(path).metadata.described
     return not start
 
 

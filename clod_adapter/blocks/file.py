@@ -19,7 +19,7 @@ from torch import Tensor
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import atomic_path
-from clod_adapter.io.sniff import refuse_irregular
+from clod_adapter.io.file_formats import refuse_irregular
 from clod_adapter.io.tensor_file import read_tensors, write_tensors
 
 KEY = "clod_adapter_block"

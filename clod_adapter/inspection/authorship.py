@@ -5,11 +5,10 @@ from __future__ import annotations
 import re
 
 from clod_adapter.config import SH_COUNTS
-from clod_adapter.io.ply.columns import MASKS, column_map, dial_columns, inria_dtype
-from clod_adapter.io.ply.constants import PREFIX as CONSTANT
-from clod_adapter.io.ply.header import PREFIX, Head, all_comments
-from clod_adapter.io.ply.packed import is_packed
-from clod_adapter.io.ply.values import FILTER
+from clod_adapter.io.ply import MASK_COLUMNS, Head, all_comments, column_map, inria_dtype
+from clod_adapter.io.ply_packed import is_packed
+from clod_adapter.io.ply_settings import COLUMN, PREFIX
+from clod_adapter.io.values import FILTER, dial_columns
 
 NERFSTUDIO = "nerfstudio's exporter, ns-export gaussian-splat"
 # A comment, and the program that writes it: nerfstudio's exporter (the spelling is its own), PlayCanvas's tools, Brush,
@@ -39,11 +38,11 @@ def looks_like(head: Head) -> str | None:
 
 
 def _by_layout(names: list[str]) -> str | None:
-    if set(MASKS) <= set(names):
+    if set(MASK_COLUMNS) <= set(names):
         return "MaskGaussian's trainer, an early version"
     if FILTER in names:
         return "Mip-Splatting's trainer"
-    plain = [name for name in names if name not in dial_columns(names) and not name.startswith(CONSTANT)]
+    plain = [name for name in names if name not in dial_columns(names) and not name.startswith(COLUMN)]
     rest = sum(name.startswith("f_rest_") for name in names)
     degree = next((degree for degree, count in SH_COUNTS.items() if 3 * (count - 1) == rest), 0)
     inria = list(inria_dtype(degree).names or ())

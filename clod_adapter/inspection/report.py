@@ -9,23 +9,81 @@ from typing import Any
 
 import numpy as np
 
-from clod_adapter.config import CLASSIC, AdaptConfig, AttenuationConfig
+from clod_adapter.adapter import Adapter
+from clod_adapter.calibration import Calibration
+from clod_adapter.config import SH_COUNTS, AdaptConfig, AttenuationConfig, ScreenFilter
 from clod_adapter.errors import ClodError
 from clod_adapter.inspection.authorship import NERFSTUDIO, looks_like
-from clod_adapter.inspection.splat import Anomaly, Dial, Splat, anomalies_of, left_out_of
-from clod_adapter.inspection.statistics import values_of
-from clod_adapter.io.file_formats import PLY, Model, format_of, read_model
-from clod_adapter.io.ply.columns import MASKS, SIGMA, column_map, dial_columns, read_table, rows_of
-from clod_adapter.io.ply.constants import PREFIX as CONSTANT
-from clod_adapter.io.ply.header import PREFIX, Head
-from clod_adapter.io.ply.packed import is_packed
-from clod_adapter.io.ply.rows import PlyRows, read_ply
-from clod_adapter.io.ply.values import FILTER, as_stored_by_inria, choice_of, in_question
-from clod_adapter.io.screen_filter import implied_filter
-from clod_adapter.io.settings import matching_calibration
-from clod_adapter.origin import origin_of
+from clod_adapter.inspection.statistics import FAR, Spread, Values, values_of
+from clod_adapter.io.adapter_file import FORMAT, KEY, load_adapter
+from clod_adapter.io.checkpoint import plausibility, stated_filter
+from clod_adapter.io.file_formats import read_source
+from clod_adapter.io.ply import MASK_COLUMNS, Head, column_map
+from clod_adapter.io.ply_packed import is_packed
+from clod_adapter.io.ply_settings import COLUMN, PREFIX
+from clod_adapter.io.settings import Source, matching_calibration
+from clod_adapter.io.tensor_file import read_tensor_header
+from clod_adapter.io.values import FILTER, choice_of, dial_columns, in_question, prepared
+from clod_adapter.origin import Origin
+from clod_adapter.training.state import KEY as STATE_KEY
+from clod_adapter.training.state import load_state
 
 NORMALS = ("nx", "ny", "nz")
+
+
+@dataclass(frozen=True)
+class Anomaly:
+    """A property that most files do not have.
+
+    Attributes:
+        kind: one word, for scripts.
+        count: of Gaussians or columns; 0 for the whole file.
+        says: one line.
+    """
+
+    kind: str
+    count: int
+    says: str
+
+
+@dataclass(frozen=True)
+class Dial:
+    """The settings of a file with a dial."""
+
+    attenuation: AttenuationConfig
+    calibration: Calibration | None
+
+
+@dataclass(frozen=True)
+class Splat:
+    """A file of Gaussians.
+
+    Attributes:
+        sh_degree: of the file; ``values.used_sh_degree`` is the highest with coefficients that are not 0.
+        encoding: of a PLY: "binary little-endian", "binary big-endian" or "ascii".
+        columns: the vertices' properties in the order of the file, with their types; empty for other formats.
+        extra: properties without a meaning here, copied to outputs unchanged.
+        comments: of the header, without ours.
+        tau: the threshold of ``values.fainter_than_tau``: the dial's, or the default of adapting.
+        origin: what adapting reads the positions relative to, world units; 0 unless they are far from 0.
+        screen_filter: that it is drawn with, stated or implied by the file.
+    """
+
+    sh_degree: int
+    encoding: str
+    columns: tuple[tuple[str, str], ...]
+    extra: tuple[str, ...]
+    comments: tuple[str, ...]
+    values: Values
+    tau: float
+    origin: Origin
+    dial: Dial | None
+    screen_filter: ScreenFilter
+
+    @property
+    def dial_columns(self) -> str:
+        """The columns of the dial, of a file that has one."""
+        return "sigma_d" if self.values.growth is None else "sigma_d and growth_d"
 
 
 @dataclass(frozen=True)
@@ -76,66 +134,39 @@ def inspect(path: str | Path) -> Inspection:
         ClodError: the file is none of these, damaged, or has no usable Gaussian.
     """
     path = Path(path)
-    if path.suffix.lower() == ".safetensors":
-        from clod_adapter.inspection.tensors import inspect_tensors
-
-        if (found := inspect_tensors(path)) is not None:
-            what, about, notes = found
-            return Inspection(str(path), path.stat().st_size, what, about["writer"], None, about, (), (), notes)
-    if format_of(path) is PLY:
-        rows = read_ply(path)
-        return _inspect_splat(path, rows, rows.vertex, rows.sh_degree, rows.head)
-    model = read_model(path)
-    vertex = rows_of(
-        {name: tensor.numpy() for name, tensor in model.gaussians.tensors().items()}, model.metadata.origin
-    )
-    return _inspect_splat(path, model, vertex, model.gaussians.sh_degree, None)
-
-
-def _inspect_splat(
-    path: Path, source: PlyRows | Model, vertex: np.ndarray, sh_degree: int, head: Head | None
-) -> Inspection:
-    metadata, notes, names = source.metadata, list(source.notes), vertex.dtype.names or ()
-    implied = implied_filter(source.comments, names) if isinstance(source, PlyRows) else source.gaussians.screen_filter
-    questions = in_question(vertex) if source.activation_unknown else {}
-    vertex, _, changes = as_stored_by_inria(path, vertex, choice_of(questions))
-    origin = metadata.origin if any(metadata.origin) else origin_of(vertex)
+    if path.suffix.lower() == ".safetensors" and (found := _inspect_tensors(path)) is not None:
+        what, about, told = found
+        return Inspection(str(path), path.stat().st_size, what, about["writer"], None, about, (), (), told)
+    source = read_source(path)
+    metadata, head, notes = source.metadata, source.head, [*source.notes, *source.metadata.notes]
+    questions = in_question(source.arrays) if source.activation_unknown else {}
+    rows = prepared(path, source.arrays, choice_of(questions), metadata.origin, None)
+    if not rows.keep.any():
+        raise ClodError(f"{path}: no usable Gaussian in it, of {len(rows.keep)} rows; export it again")
     tau = metadata.attenuation.tau if metadata.attenuation else AdaptConfig().tau
-    values = values_of(vertex, sh_degree, origin, tau)
-    if values is None:
-        raise ClodError(f"{path}: no usable Gaussian in it, of {len(vertex)} rows; export it again")
-    dial, notes = None, [*notes, *metadata.notes]
+    values, dial = values_of(rows, tau), None
     if metadata.attenuation is not None:
         calibration, mismatch = matching_calibration(metadata, values.count)
         dial = Dial(metadata.attenuation, calibration)
-        notes += [*([] if metadata.described else _plausible(vertex, dial.attenuation)), *mismatch]
-    columns = _columns(head)
-    comments = source.comments if isinstance(source, PlyRows) else metadata.about
+        if not metadata.described:
+            part = {name: rows.arrays[name][rows.keep] for name in ("means", "opacity_logits", "sigma_d")}
+            notes += plausibility(part, metadata.attenuation)
+        notes += mismatch
+    columns, degree = _columns(head), next(d for d, n in SH_COUNTS.items() if n == rows.arrays["shN"].shape[1] + 1)
     splat = Splat(
-        sh_degree=sh_degree, encoding=_encoding(head), columns=columns,
-        extra=() if head and is_packed(head.ply) else _extra([name for name, _ in columns], sh_degree),
-        comments=tuple(comment for comment in comments if not comment.startswith(PREFIX)), values=values, tau=tau,
-        origin=origin, dial=dial, screen_filter=metadata.screen_filter or (CLASSIC if dial else implied),
+        sh_degree=degree, encoding=_encoding(head), columns=columns,
+        extra=() if head and is_packed(head.ply) else _extra([name for name, _ in columns], degree),
+        comments=tuple(comment for comment in source.comments if not comment.startswith(PREFIX)), values=values,
+        tau=tau, origin=rows.origin, dial=dial, screen_filter=stated_filter(source),
     )  # fmt: skip
     writer = looks_like(head) if head else f"clod-adapter {metadata.version}" if metadata.version else None
     if writer == NERFSTUDIO:
-        notes = [*notes, "in nerfstudio's own frame: its dataparser_transforms.json belongs in the scene's folder"]
+        notes.append("in nerfstudio's own frame: its dataparser_transforms.json belongs in the scene's folder")
     return Inspection(
         path=str(path), size=path.stat().st_size, what=_what(path, source, splat), writer=writer, splat=splat,
         about=None, anomalies=tuple(anomalies_of(splat, questions)),
-        left_out=tuple(left_out_of(splat, source.notes, changes)), notes=tuple(notes),
+        left_out=tuple(left_out_of(splat, source.notes, rows.changes)), notes=tuple(notes),
     )  # fmt: skip
-
-
-def _plausible(vertex: np.ndarray, attenuation: AttenuationConfig) -> list[str]:
-    """Notes on a dial without settings; ``vertex`` as ``as_stored_by_inria`` gives it."""
-    import torch  # here: most files have settings
-
-    from clod_adapter.io.ply.plausible import check_plausible
-
-    table = torch.from_numpy(read_table(vertex, ("x", "y", "z", "opacity", SIGMA)))
-    usable = table[table.isfinite().all(1)]
-    return check_plausible(usable[:, :3], usable[:, 3], usable[:, 4], attenuation) if len(usable) else []
 
 
 def _columns(head: Head | None) -> tuple[tuple[str, str], ...]:
@@ -150,7 +181,7 @@ def _encoding(head: Head | None) -> str:
     return "ascii" if head.ply.text else f"binary {'little' if head.ply.byte_order in '<=' else 'big'}-endian"
 
 
-def _what(path: Path, source: PlyRows | Model, splat: Splat) -> str:
+def _what(path: Path, source: Source, splat: Splat) -> str:
     kind = f"an adapted splat, with {splat.dial_columns}" if splat.dial else "a splat"
     packed = any("quantised" in note for note in source.notes)
     suffix = path.suffix.lower() or "PLY"
@@ -159,5 +190,88 @@ def _what(path: Path, source: PlyRows | Model, splat: Splat) -> str:
 
 def _extra(names: Sequence[str], sh_degree: int) -> tuple[str, ...]:
     known = {name for group in column_map(sh_degree).values() for name in group}
-    known |= {*NORMALS, *dial_columns(names), *MASKS, FILTER}
-    return tuple(name for name in names if name not in known and not name.startswith(CONSTANT))
+    known |= {*NORMALS, *dial_columns(names), *MASK_COLUMNS, FILTER}
+    return tuple(name for name in names if name not in known and not name.startswith(COLUMN))
+
+
+def anomalies_of(splat: Splat, questions: dict[str, tuple[float, float]]) -> list[Anomaly]:
+    """The anomalies of a file; ``questions`` are the ranges of columns that look activated, by name."""
+    v, found = splat.values, []
+
+    def note(kind: str, count: int, says: str) -> None:
+        if count:
+            found.append(Anomaly(kind, count, says.format(count=count)))
+
+    for name, (low, high) in questions.items():
+        says = f"{name} from {low:.4g} to {high:.4g}: looks activated, and is read as activated here; adapting needs"
+        found.append(Anomaly("activated", 0, f"{says} --activated {choice_of(questions)}"))
+    for reason, gone in v.dropped.items():
+        note("unusable", gone, f"{{count:,}} rows are not used: {reason}")
+    note("infinite_opacity", v.infinite_opacity, "{count:,} have opacity = +inf, which is fully opaque")
+    note("doubles", v.doubles, "{count:,} have the same position as another Gaussian")
+    note("far", v.far, f"{{count:,}} are at least {FAR:g} times as far from the centre as 90 % of all")
+    note("giant", v.giant, "{count:,} are larger than half the scene")
+    if splat.sh_degree and not v.used_sh_degree:
+        note("empty_harmonics", 1, "all higher harmonics are 0: no view-dependent colour")
+    if any(splat.origin):
+        found.append(Anomaly("far_from_0", 0, "coordinates are far from 0; they are read relative to a local origin"))
+    wide = [name for name, kind in splat.columns if kind == "float64"]
+    note("double_precision", len(wide), f"{{count}} properties are double: {_list(wide)}")
+    if splat.screen_filter.compensate:
+        found.append(Anomaly("antialiased", 0, f"trained with antialiasing: {splat.screen_filter.description}"))
+    return found
+
+
+def left_out_of(splat: Splat, notes: Sequence[str], changes: Sequence[str]) -> list[str]:
+    """Parts that adapting leaves out or does not change, a line each, from the reader's notes and changes."""
+    v, lines = splat.values, []
+    if gone := v.total - v.count:
+        lines.append(f"{gone:,} of {v.total:,} rows, which are not usable")
+    lines += [note.removeprefix("not carried over to outputs: ") for note in notes if "carried over" in note]
+    if any(name == FILTER for name, _ in splat.columns):
+        lines.append("filter_3D, which is merged into scale and opacity")
+    if splat.sh_degree > v.used_sh_degree:
+        lines.append(f"harmonics above degree {v.used_sh_degree}, which are 0: skipped in training, kept in the output")
+    if splat.extra:
+        lines.append(f"{_list(splat.extra)}: not used, copied to outputs")
+    return lines + [change for change in changes if "taken as activated" in change]
+
+
+def _list(names: Sequence[str]) -> str:
+    return ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")
+
+
+def _inspect_tensors(path: Path) -> tuple[str, dict[str, Any], tuple[str, ...]] | None:
+    """The kind of such a file, plain JSON about it, and notes; None where it is neither.
+
+    Raises:
+        ClodError: it cannot be read, or is damaged.
+    """
+    metadata = read_tensor_header(path)[1]
+    if STATE_KEY in metadata:
+        return "the state of an interrupted run, for --resume", _state(path), ()
+    if KEY in metadata and f'"{FORMAT}"' in metadata[KEY]:
+        adapter = load_adapter(path)
+        return "an adapter: what clod-adapt learned, without its checkpoint", _adapter(adapter), adapter.notes
+    return None
+
+
+def _adapter(adapter: Adapter) -> dict[str, Any]:
+    kinds = {name: f"{str(t.dtype).removeprefix('torch.')} {list(t.shape)}" for name, t in adapter.updates.items()}
+    growth = None if adapter.growth_d is None else asdict(Spread.of(adapter.growth_d.numpy()))
+    return {
+        "kind": "adapter", "writer": f"clod-adapter {adapter.version}", "count": len(adapter.sigma_d),
+        "base": adapter.base_fingerprint, "attenuation": asdict(adapter.attenuation), "config": adapter.config,
+        "updates": kinds, "origin": list(adapter.origin), "sigma": asdict(Spread.of(adapter.sigma_d.numpy())),
+        "growth": growth,
+        "calibration": adapter.calibration and adapter.calibration.as_dict(),
+    }  # fmt: skip
+
+
+def _state(path: Path) -> dict[str, Any]:
+    state, belongs = load_state(path)
+    return {
+        "kind": "state", "writer": None, "count": next((len(t) for t in state.tensors.values() if t.ndim), 0),
+        "steps": state.steps, "seconds": state.seconds, "loss": state.loss, "belongs": belongs,
+        "attenuation": asdict(state.attenuation),
+    }  # fmt: skip

@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
 
 from clod_adapter.config import SH_COUNTS
-from clod_adapter.io.ply.columns import GROWTH, SIGMA, column_map, dial_columns
-from clod_adapter.io.ply.rows import usable_blocks
-from clod_adapter.origin import Origin
+from clod_adapter.io.values import GROWTH, SIGMA, Prepared
 
 BULK = (0.01, 0.99)  # quantiles that bound the middle 98 %
 NEEDLE = 10.0  # a Gaussian this many times as long as its second axis
 FAR = 10.0  # times the distance from the median position within which nine tenths lie
 FAINT = 1 / 255  # opacity that rasterizers leave out
-_MAIN = ("means", "quats", "log_scales", "opacity_logits", "sh0")
 
 
 @dataclass(frozen=True)
@@ -79,16 +75,11 @@ class Values:
     growth: Spread | None
 
 
-def values_of(vertex: np.ndarray, sh_degree: int, origin: Origin, tau: float) -> Values | None:
-    """The numbers of ``[N]`` rows of logits and logarithms; None where none is usable.
-
-    Args:
-        origin: what far coordinates are measured from, so that float32 has digits for them.
-    """
-    columns, keep, dropped, used = _gather(vertex, sh_degree, origin)
-    if not keep.any():
-        return None
-    means, logits = columns["means"], columns["opacity_logits"][0].astype(np.float64)
+def values_of(found: Prepared, tau: float) -> Values:
+    """The statistics of a file's rows, of which one is usable at least."""
+    keep, dropped = found.keep, {reason: gone for reason, gone in found.dropped.items() if gone}
+    columns = {name: np.ascontiguousarray(array[keep].T) for name, array in found.arrays.items() if name != "shN"}
+    means, logits = columns["means"], columns["opacity_logits"].astype(np.float64)
     with np.errstate(over="ignore"):
         scales = np.sort(np.exp(columns["log_scales"].astype(np.float64)), 0)
         opacities = 1 / (1 + np.exp(-logits))
@@ -98,10 +89,11 @@ def values_of(vertex: np.ndarray, sh_degree: int, origin: Origin, tau: float) ->
     distance = np.linalg.norm(means.astype(np.float64) - middle, axis=0)
     diagonal = float(np.linalg.norm([spread.high - spread.low for spread in position]))
     length = np.linalg.norm(columns["quats"].astype(np.float64), axis=0)
-    x, y, z = (_moved(spread, by) for spread, by in zip(position, origin, strict=True))
+    x, y, z = (_moved(spread, by) for spread, by in zip(position, found.origin, strict=True))
     q1, q2, q3 = (float(value) for value in np.quantile(opacities, (0.25, 0.5, 0.75)))
     return Values(
-        total=len(vertex), count=int(keep.sum()), dropped=dropped, used_sh_degree=used, position=(x, y, z),
+        total=len(keep), count=int(keep.sum()), dropped=dropped, position=(x, y, z),
+        used_sh_degree=_used_degree(found.arrays["shN"], keep),
         scale=Spread.of(scales.ravel()), largest_scale=Spread.of(scales[2]), opacity=Spread.of(opacities),
         opacity_quartiles=(q1, q2, q3), needles=float((scales[2] > NEEDLE * scales[1]).mean()),
         infinite_opacity=int(np.isposinf(logits).sum()),
@@ -109,32 +101,15 @@ def values_of(vertex: np.ndarray, sh_degree: int, origin: Origin, tau: float) ->
         far=int((distance > FAR * np.quantile(distance, 0.9)).sum()),
         giant=int((scales[2] > diagonal / 2).sum()) if diagonal > 0 else 0,
         fainter_than_tau=float((opacities < tau).mean()), fainter_than_visible=float((opacities < FAINT).mean()),
-        sigma=Spread.of(columns[SIGMA][0]) if SIGMA in columns else None,
-        growth=Spread.of(columns[GROWTH][0]) if GROWTH in columns else None,
+        sigma=Spread.of(columns[SIGMA]) if SIGMA in columns else None,
+        growth=Spread.of(columns[GROWTH]) if GROWTH in columns else None,
     )  # fmt: skip
 
 
-def _gather(
-    vertex: np.ndarray, sh_degree: int, origin: Origin
-) -> tuple[dict[str, np.ndarray], np.ndarray, dict[str, int], int]:
-    """The usable rows' attributes ``[P, N]`` float32, which rows they are, why others are not, the SH degree used.
-
-    The higher harmonics, three quarters of a file, are examined and not kept.
-    """
-    groups = column_map(sh_degree)
-    wanted = {key: groups[key] for key in _MAIN} | dial_columns(vertex.dtype.names or ())
-    columns = {key: np.empty((len(group), len(vertex)), np.float32) for key, group in wanted.items()}
-    keep, dropped, used = np.zeros(len(vertex), bool), Counter[str](), np.zeros(len(groups["shN"]), bool)
-    for rows, values, usable in usable_blocks(vertex, sh_degree, origin, dropped):
-        keep[rows] = usable
-        used |= (values["shN"][usable] != 0).any(0)
-        for key in wanted:
-            columns[key][:, rows] = values[key].T
-    if not keep.all():
-        columns = {key: values[:, keep] for key, values in columns.items()}
-    highest = int(used.nonzero()[0].max()) // 3 + 1 if used.any() else 0  # the last coefficient that is used
-    degree = next(degree for degree, count in SH_COUNTS.items() if count > highest)
-    return columns, keep, {reason: gone for reason, gone in dropped.items() if gone}, degree
+def _used_degree(harmonics: np.ndarray, keep: np.ndarray) -> int:
+    """The highest SH degree with a coefficient that is not 0."""
+    used = [k + 1 for k in range(harmonics.shape[1]) if harmonics[:, k][keep].any()]
+    return next(degree for degree, count in SH_COUNTS.items() if count > max(used, default=0))
 
 
 def _doubles(means: np.ndarray) -> int:

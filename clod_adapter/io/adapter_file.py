@@ -19,8 +19,8 @@ from clod_adapter.adapter import Adapter, dial_tensors
 from clod_adapter.config import CLASSIC
 from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import atomic_path
-from clod_adapter.io.formats.metadata import FORMAT as MODEL
 from clod_adapter.io.settings import DAMAGE, Metadata, damaged, document, read_metadata, stored_values
+from clod_adapter.io.settings import FORMAT as MODEL
 from clod_adapter.io.tensor_file import load_tensors, read_tensor_header, write_tensors
 
 KEY = "clod_adapter"

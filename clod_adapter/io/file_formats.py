@@ -1,11 +1,15 @@
-"""The file formats of Gaussians, by the suffix of the file: one table, which needs no torch."""
+"""The file formats of Gaussians, by the suffix of the file: one table, and first checks of a file, without torch."""
 
 from __future__ import annotations
 
+import hashlib
+import re
+import sys
 from collections.abc import Sequence
 from importlib import import_module
+from io import BufferedReader
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 
 from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import atomic_path
@@ -14,40 +18,14 @@ from clod_adapter.origin import NOWHERE, Origin
 if TYPE_CHECKING:
     from clod_adapter.calibration import Calibration
     from clod_adapter.gaussians import Gaussians
-    from clod_adapter.io.settings import Metadata
-
-
-class Model(NamedTuple):
-    """The content of a file.
-
-    Attributes:
-        gaussians: every row of the file, also rows with values that are not finite.
-        metadata: its settings.
-        sha256: of the file that was parsed, hex.
-        notes: what the reader noticed, one line each, besides the notes of the metadata.
-        activation_unknown: whether opacities and scales may be activated already, as the format does not tell.
-    """
-
-    gaussians: Gaussians
-    metadata: Metadata
-    sha256: str
-    notes: tuple[str, ...] = ()
-    activation_unknown: bool = False
-
-
-class History(NamedTuple):
-    """Of Gaussians that are written: lines on it, what their means are relative to, and their calibration."""
-
-    about: tuple[str, ...] = ()
-    origin: Origin = NOWHERE
-    calibration: Calibration | None = None
+    from clod_adapter.io.settings import Source
 
 
 class Format(NamedTuple):
     """A format: functions by module and name under ``clod_adapter.io``, imported when they are called.
 
     Attributes:
-        read: a path to a ``Model``; of the PLY, to ``PlyRows``.
+        read: a path to a ``Source``.
         check: refuses, by the first bytes and without torch, a file that is not of the format.
         open: whether a file has a sigma_d; refuses what ``read`` would by header, settings and sizes, without reading
             the values (but of an .spz). "" where no file has one, and ``check`` is all.
@@ -63,24 +41,19 @@ class Format(NamedTuple):
     carries_sigma: bool = False
 
 
-_CHECK = "formats.checks.check_model"
-_CONVERTED = Format("formats.converted.load_converted", "formats.converted.check_converted")
-PLY = Format("ply.rows.read_ply", "ply.rows.check_ply", "ply.rows.open_ply", "formats.ply.write_ply", True)
+_CHECK = "file_formats.check_start"
+_CONVERTED = Format("formats.splat_transform.load_converted", "formats.splat_transform.check_converted")
+KEY = "clod_adapter"  # of the JSON document in formats other than PLY
+PLY = Format("ply.read_ply", "ply.check_ply", "ply.open_ply", "checkpoint.write_ply", True)
 FORMATS = {
     ".ply": PLY,
-    ".glb": Format(
-        "formats.glb_reader.load_glb", _CHECK, "formats.glb_reader.open_glb", "formats.glb.write_glb", True
-    ),
-    ".spz": Format(
-        "formats.spz_reader.load_spz", _CHECK, "formats.spz_reader.open_spz", "formats.spz.write_spz", True
-    ),
+    ".glb": Format("formats.glb.load_glb", _CHECK, "formats.glb.open_glb", "formats.glb.write_glb", True),
+    ".spz": Format("formats.spz.load_spz", _CHECK, "formats.spz.open_spz", "formats.spz.write_spz", True),
     ".safetensors": Format(
         "formats.safetensors.load_safetensors", _CHECK, "formats.safetensors.open_safetensors",
         "formats.safetensors.write_safetensors", True,
     ),
-    ".pt": Format(
-        "formats.pt_model.load_pt", "formats.pt.check_pt", "formats.pt_model.open_pt", "formats.pt_model.write_pt", True
-    ),
+    ".pt": Format("formats.pt.load_pt", "formats.pt.check_pt", "formats.pt.open_pt", "formats.pt.write_pt", True),
     ".splat": Format("formats.splat.load_splat", _CHECK, "", "formats.splat.write_splat"),
     ".sog": _CONVERTED,
     ".ksplat": _CONVERTED,
@@ -139,17 +112,17 @@ def check_written(path: Path) -> None:
         raise ClodError(f"{path}: is not written, because it could not be read again: {reason}") from error
 
 
-def read_model(path: str | Path) -> Model:
-    """The content of a file in any format but the PLY, which ``checkpoint.load`` reads.
+def read_source(path: Path) -> Source:
+    """The content of a file in any format.
 
     Raises:
         ClodError: the file is damaged, of another kind, or a package or program that its format needs is missing.
     """
-    path = Path(path)
-    if format_of(path) is PLY:
-        raise ClodError(f"{path}: is read by clod_adapter.load")
-    check_readable(path)
-    return _call(format_of(path).read, path)
+    form = format_of(path)
+    if form is not PLY:  # which is checked while it is read
+        check_readable(path)
+    found: Source = _call(form.read, path)
+    return found
 
 
 def write(
@@ -180,6 +153,7 @@ def write(
     if gaussians.sigma_d is not None and not FORMATS[suffix].carries_sigma:
         raise ClodError(f"{path}: {Path(path).suffix} has no room for a dial; choose a dial value to bake")
     from clod_adapter.equation.units import in_world_units  # here: the table needs no torch
+    from clod_adapter.io.settings import History
 
     history = History(tuple(about), origin, calibration)
     with atomic_path(path) as temporary:
@@ -188,6 +162,171 @@ def write(
     return notes
 
 
+NEW_SPZ = b"NGSP"  # first bytes of version 4, which splat-transform reads; earlier versions are gzipped
+_START: dict[str, tuple[bytes, ...]] = {".glb": (b"glTF",), ".spz": (b"\x1f\x8b", NEW_SPZ)}
+
+
+def check_start(path: Path) -> None:
+    """Refuses a file whose first bytes are not of its suffix's format.
+
+    Raises:
+        ClodError: they are not, the file is an adapter, or it cannot be read.
+    """
+    suffix, start = path.suffix.lower(), read_start(path)
+    refuse_known(path, start)
+    if suffix in _START and not start.startswith(_START[suffix]):
+        refuse(path, start, f"is not a {suffix} file by its first bytes; copy or export it again")
+    if suffix == ".spz" and start.startswith(NEW_SPZ):
+        _call("formats.splat_transform.check_converted", path, " of version 4")
+    if suffix == ".splat" and (path.stat().st_size % 32 or start.startswith(b"ply")):  # else any bytes are one
+        refuse(path, start, "is not a .splat file, whose rows have 32 bytes; copy or export it again")
+    if suffix == ".safetensors" and '"clod-adapter"' in _call("tensor_file.read_tensor_header", path)[1].get(KEY, ""):
+        raise ClodError(f"{path}: is an adapter, not a model; clod-adapt apply BASE.ply {path.name} -o OUT.ply")
+
+
 def _call(function: str, *args: Any) -> Any:
     module, name = function.rsplit(".", 1)
     return getattr(import_module(f"clod_adapter.io.{module}"), name)(*args)
+
+
+_CONVERT = "convert it: splat-transform IN{suffix} OUT.ply; better still, adapt the PLY that it was made from"
+
+_PAGE = "which clod-adapt export wrote to be opened in a browser, or a download went wrong"
+
+# First bytes (after white space) that determine the kind of a file, its name, and the remedy.
+CONTENTS = (
+    (b"version https://git-lfs", "a Git LFS pointer, not the file it stands for", "fetch that: git lfs pull"),
+    (b"<!doctype html", f"a web page, {_PAGE}", "download the file itself"),
+    (b"<html", f"a web page, {_PAGE}", "download the file itself"),
+    (b"<?xml", "an XML document, perhaps an error that a server sent", "download the file itself"),
+)
+# The same by suffix, for formats without characteristic first bytes.
+SUFFIXES = {
+    ".lcc": ("an LCC file, compressed for delivery", _CONVERT),
+    ".hier": (
+        "a Hierarchical-3DGS tree, whose levels of detail are its own",
+        "use the chunk's point_cloud.ply that the tree was built from",
+    ),
+    ".ckpt": (
+        "a training checkpoint, as Nerfstudio writes it",
+        "export a PLY: ns-export gaussian-splat --load-config CONFIG.yml --output-dir OUT",
+    ),
+    ".pth": (
+        "a trainer's own checkpoint, as Inria's code writes it to resume from",
+        "use the point_cloud/iteration_N/point_cloud.ply beside it",
+    ),
+    ".json": ("a JSON document; of an unbundled SOG it is the table of contents", _CONVERT),
+}
+# The same by first bytes, where neither table above matches.
+ARCHIVES = (
+    (b"\x1f\x8b", "compressed with gzip", "unpack it first: gunzip"),
+    (b"PK\x03\x04", "a zip archive", "unpack it first; a gsplat checkpoint must be called .pt to be read as one"),
+    (b"\xfd7zXZ\x00", "compressed with xz", "unpack it first: unxz"),
+    (b"BZh", "compressed with bzip2", "unpack it first: bunzip2"),
+    (b"\x28\xb5\x2f\xfd", "compressed with Zstandard", "unpack it first: unzstd"),
+    (b"7z\xbc\xaf\x27\x1c", "a 7z archive", "unpack it first"),
+    (b"glTF", "a glTF model", "call it .glb"),
+    (b"NGSP", "an SPZ file", "call it .spz"),
+    (b"ply\n", "a PLY file", "call it .ply"),
+    (b"ply\r", "a PLY file", "call it .ply"),
+)
+
+
+def refuse_irregular(path: Path, remedy: str = "give the name of a file") -> None:
+    """Refuses what exists and is not a regular file: reading a pipe would wait.
+
+    Raises:
+        ClodError: the path is not a regular file.
+    """
+    if path.exists() and not path.is_file():
+        raise ClodError(f"{path}: cannot be read (it is not a regular file); {remedy}")
+
+
+def refuse_long_numbers(path: Path, text: bytes) -> None:
+    """Refuses a number of a thousand digits, of which parsers make copies.
+
+    Raises:
+        ClodError: ``text``, of ``path``, has one.
+    """
+    if re.search(rb"\d{1000}", text):
+        raise ClodError(f"{path}: is damaged (a number of more than 1,000 digits); copy or export it again")
+
+
+def read_start(path: Path, size: int = 64) -> bytes:
+    """The first bytes of a file, at most ``size``.
+
+    Raises:
+        ClodError: the file cannot be read, or is not a regular file.
+    """
+    try:
+        refuse_irregular(path)
+        with open(path, "rb") as file:
+            return file.read(size)
+    except (OSError, ValueError) as error:  # ValueError: a name that holds a NUL
+        raise ClodError(f"{path}: cannot be read ({getattr(error, 'strerror', error)}); check the path") from error
+
+
+def read_whole(path: Path) -> bytes:
+    """A file's bytes.
+
+    Raises:
+        ClodError: it cannot be read.
+    """
+    try:
+        refuse_irregular(path)
+        return path.read_bytes()
+    except (OSError, ValueError) as error:  # ValueError: a name that holds a NUL
+        raise ClodError(f"{path}: cannot be read ({getattr(error, 'strerror', error)}); check the path") from error
+
+
+def handle_name(file: BufferedReader) -> str:
+    """A name of an open file, for libraries that open a file themselves and take names in UTF-8 only.
+
+    It names the same file after another one has replaced it; on Windows nothing replaces an open file.
+    """
+    return str(file.name) if sys.platform == "win32" else f"/dev/fd/{file.fileno()}"
+
+
+def file_sha256(file: BufferedReader) -> str:
+    """SHA-256 of an open file, hex."""
+    file.seek(0)
+    digest = hashlib.sha256()
+    while block := file.read(1 << 20):
+        digest.update(block)
+    return digest.hexdigest()
+
+
+def refuse_known(path: Path, start: bytes) -> None:
+    """Refuses a file whose first bytes are never those of a splat.
+
+    Raises:
+        ClodError: it is empty, or is one of ``CONTENTS``.
+    """
+    if not start:
+        raise ClodError(f"{path}: is empty; copy or export it again")
+    text = start.lstrip()[:64].lower()
+    for magic, what, remedy in CONTENTS:
+        if text.startswith(magic):
+            raise ClodError(f"{path}: is {what}; {remedy}")
+
+
+def refuse(
+    path: Path, start: bytes, otherwise: str = "is not a PLY file; convert it to a .ply in Inria's 3DGS layout first"
+) -> NoReturn:
+    """Refuses a file, with its kind by its first bytes.
+
+    Args:
+        otherwise: the message for a file in none of the tables.
+
+    Raises:
+        ClodError: always.
+    """
+    refuse_known(path, start)
+    suffix = path.suffix.lower()
+    if suffix in SUFFIXES:
+        what, remedy = SUFFIXES[suffix]
+        raise ClodError(f"{path}: is {what}; {remedy.format(suffix=path.suffix)}")
+    for magic, what, remedy in ARCHIVES:
+        if start.startswith(magic):
+            raise ClodError(f"{path}: is {what}; {remedy}")
+    raise ClodError(f"{path}: {otherwise}")

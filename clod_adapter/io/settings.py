@@ -9,22 +9,30 @@ Each format gives the same mapping of names to values, whose numbers may be text
     about          lines of text
     package_version
 
-The same rules hold everywhere: an unknown field is ignored with a note, a damaged setting is refused, and a damaged
+Formats other than PLY store it as a JSON document under the key ``clod_adapter`` (``file_formats.KEY``). The same rules
+hold everywhere: an unknown field is ignored with a note, a damaged setting is refused, and a damaged
 calibration, which rendering does not need, is ignored with a note.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import json
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from clod_adapter._support.version import package_version
 from clod_adapter.calibration import Calibration
-from clod_adapter.config import CLASSIC, AttenuationConfig, ScreenFilter
+from clod_adapter.config import CLASSIC, FILTERS, AttenuationConfig, ScreenFilter
 from clod_adapter.errors import ClodError
 from clod_adapter.origin import NOWHERE, Origin, parse_origin
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from clod_adapter.gaussians import Gaussians
 
 WARNING = "warning: "  # prefix of a note that must not be missed
 FILTER = "screen_filter"
@@ -62,6 +70,39 @@ class Metadata:
     version: str = ""
     described: bool = False
     notes: tuple[str, ...] = ()
+
+
+class Source(NamedTuple):
+    """The content of a file, as every reader returns it; ``checkpoint.load`` makes a checkpoint of it.
+
+    Attributes:
+        arrays: by the names of ``Gaussians.tensors``, every row of the file, float32; means may be float64, and of a
+            PLY there may be "masks" ``[N, 2]`` (MaskGaussian's) and "filter_3D" ``[N, 1]`` (Mip-Splatting's) too.
+        metadata: its settings; means are relative to ``metadata.origin``.
+        sha256: of the file that was parsed, hex.
+        notes: what the reader noticed, one line each, besides the notes of the metadata.
+        comments: lines on its history, and settings in a PLY's comments.
+        activation_unknown: whether opacities and scales may be activated already, as the file does not tell.
+        rows: ``[N]`` structured array of a PLY as it is in the file, native byte order; None for other formats.
+        head: ``ply.Head`` of a PLY.
+    """
+
+    arrays: dict[str, np.ndarray]
+    metadata: Metadata
+    sha256: str
+    notes: tuple[str, ...] = ()
+    comments: tuple[str, ...] = ()
+    activation_unknown: bool = False
+    rows: np.ndarray | None = None
+    head: Any = None
+
+
+class History(NamedTuple):
+    """Of Gaussians that are written: lines on it, what their means are relative to, and their calibration."""
+
+    about: tuple[str, ...] = ()
+    origin: Origin = NOWHERE
+    calibration: Calibration | None = None
 
 
 def read_metadata(path: Path, values: Mapping[str, Any], *, dial: bool, described: bool = True) -> Metadata:
@@ -168,3 +209,70 @@ def _calibration(stored: Any, notes: list[str]) -> Calibration | None:
 def _note_unknown(stored: Mapping[str, Any], known: Any, notes: list[str]) -> None:
     if unknown := [name for name in stored if name not in known]:
         notes.append(f"settings unknown to this version ignored: {', '.join(map(repr, unknown))}")
+
+
+FORMAT, FORMAT_VERSION = "clod-model", 1
+
+
+def write_metadata(gaussians: Gaussians, history: History) -> dict[str, Any]:
+    """Plain JSON that ``parse_metadata`` inverts."""
+    values = stored_values(gaussians.attenuation, gaussians.screen_filter, history.origin, history.calibration)
+    return document(FORMAT, FORMAT_VERSION) | values | ({"about": list(history.about)} if history.about else {})
+
+
+def metadata_text(values: dict[str, Any]) -> str:
+    """The document with sorted keys, so that equal models give equal files."""
+    return json.dumps(values, sort_keys=True, allow_nan=False)
+
+
+def parse_metadata(path: Path, text: str | bytes | dict[str, Any] | None, *, dial: bool) -> Metadata:
+    """The settings in a document, parsed or not; those of a file of another program where it is None.
+
+    Args:
+        dial: whether the file has sigma_d.
+
+    Raises:
+        ClodError: the document is damaged, of another kind, or of a newer format.
+    """
+    if text is None:
+        return read_metadata(path, {}, dial=dial, described=False)
+    try:
+        values = text if isinstance(text, dict) else json.loads(text)
+        kind, version = values["format"], values["format_version"]
+        newer = version > FORMAT_VERSION
+        values["package_version"]  # noqa: B018  always there
+    except DAMAGE as error:
+        raise damaged(path, error) from error
+    if kind != FORMAT:
+        raise ClodError(f"{path}: is not a model but {kind!r:.40}; clod-adapt apply makes one of an adapter")
+    if newer:
+        raise ClodError(f"{path}: its format {version!r:.20} is too new for this version; upgrade clod-adapter")
+    return read_metadata(path, values, dial=dial)
+
+
+# The screen-space filter as other programs state it: Brush and splat-transform write the comment TAG, Postshot
+# ``antialiased 1``, SPZ a flag, Mip-Splatting the column ``filter_3D``. None of them states the variance.
+TAG = "SplatRenderMode: mip"
+_ANTIALIASED = r"(?i)\s*(splatrendermode:\s*mip|antialiased 1)\s*"
+_EITHER = r"(?i)\s*(splatrendermode:\s*\S*|antialiased [01])\s*"
+_BRUSH = "Exported from Brush"
+
+
+def is_antialiased(comments: Iterable[str]) -> bool:
+    """Whether a comment of another program states that opacities are compensated."""
+    return any(re.fullmatch(_ANTIALIASED, comment) for comment in comments)
+
+
+def tagged(comments: Sequence[str], screen_filter: ScreenFilter) -> list[str]:
+    """The comments, with those of other programs corrected where they contradict ``screen_filter``."""
+    if is_antialiased(comments) == screen_filter.compensate:
+        return list(comments)
+    rest = [comment for comment in comments if not re.fullmatch(_EITHER, comment)]
+    return [*rest, TAG] if screen_filter.compensate else rest
+
+
+def implied_filter(comments: Sequence[str], columns: Iterable[str]) -> ScreenFilter:
+    """The filter implied by other programs' comments and by the names of the columns; else the classic one."""
+    if "filter_3D" in columns or (is_antialiased(comments) and _BRUSH in comments):
+        return FILTERS["mip"]
+    return FILTERS["on"] if is_antialiased(comments) else CLASSIC

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from safetensors import safe_open
 
 from clod_adapter.errors import ClodError
-from clod_adapter.io.sniff import file_sha256, handle_name, read_start, refuse_known
+from clod_adapter.io.file_formats import file_sha256, handle_name, read_start, refuse_known
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -23,8 +23,9 @@ from clod_adapter.cameras import Camera
 from clod_adapter.gaussians import OPAQUE, Gaussians
 from clod_adapter.io.checkpoint import Checkpoint, load
 from clod_adapter.io.file_formats import write
-from clod_adapter.io.ply.columns import dial_columns, inria_dtype
-from clod_adapter.io.ply.header import write_comments
+from clod_adapter.io.ply import inria_dtype
+from clod_adapter.io.ply_settings import write_comments
+from clod_adapter.io.values import dial_columns
 from clod_adapter.origin import NOWHERE, Origin
 
 BLOCK_ROWS = 1 << 14

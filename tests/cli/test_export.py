@@ -24,7 +24,7 @@ from clod_adapter.calibration import Calibration, CalibrationRow, Viewpoint
 from clod_adapter.errors import ClodError
 from clod_adapter.io.checkpoint import load, save
 from clod_adapter.io.formats.splat_transform import INSTALL, SplatTransform
-from clod_adapter.io.ply.header import write_comments
+from clod_adapter.io.ply_settings import write_comments
 from scenes import gaussians as random_gaussians
 
 FLIP = torch.tensor([1.0, -1, -1, 1])  # the axes of OpenGL's cameras

@@ -7,8 +7,7 @@ import pytest
 from plyfile import PlyData, PlyElement
 
 from clod_adapter.inspection.authorship import looks_like
-from clod_adapter.io.ply.columns import inria_dtype
-from clod_adapter.io.ply.header import read_head
+from clod_adapter.io.ply import inria_dtype, read_head
 from packing import write_packed
 from scenes import gaussians
 

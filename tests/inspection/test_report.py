@@ -21,14 +21,12 @@ from clod_adapter.cli.shared.outputs import jsonable
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.inspection.report import Inspection, inspect
-from clod_adapter.inspection.statistics import values_of
 from clod_adapter.io.adapter_file import save_adapter
-from clod_adapter.io.checkpoint import blank, load, save
+from clod_adapter.io.checkpoint import load, save
 from clod_adapter.io.file_formats import write as save_as
-from clod_adapter.io.ply.columns import rows_of
 from clod_adapter.origin import NOWHERE
 from clod_adapter.training.state import TrainingState, save_state
-from formats import CALIBRATION, with_columns
+from formats import CALIBRATION, inria_rows, with_columns
 from packing import write_packed
 
 ATTENUATION = AttenuationConfig(tau=0.01, max_sv=6.0, cut="soft", reference_distance=3.5)
@@ -38,7 +36,7 @@ def table(n: int = 300, degree: int = 1, seed: int = 0) -> np.ndarray:
     """Rows in Inria's layout, with unit quaternions and nonzero values in every column."""
     g = scenes.gaussians(n, degree, seed)
     g = g.replace(quats=torch.nn.functional.normalize(g.quats))
-    return rows_of({name: tensor.numpy() for name, tensor in g.tensors().items()})
+    return inria_rows(g)
 
 
 def write(path: Path, vertex: np.ndarray, *, comments: tuple[str, ...] = (), order: str = "<") -> Path:
@@ -55,7 +53,7 @@ def adapted(path: Path, growth: bool = False) -> Path:
     """A file with a dial and its calibration."""
     g = with_dial(scenes.gaussians(40, 1, 0), attenuation=ATTENUATION)
     g = g.replace(growth_d=torch.linspace(-1, 3, 40)) if growth else g
-    save(path, g, blank(40, 1), calibration=CALIBRATION)
+    save(path, g, calibration=CALIBRATION)
     return path
 
 
@@ -160,8 +158,10 @@ def test_anomalies_are_counted(tmp_path: Path) -> None:
     assert found.splat.values.not_unit == 5 / 600
     for axis in "xyz":  # all in one place, and -0 is 0
         vertex[axis] = np.where(np.arange(600) % 2, -0.0, 0.0) if axis != "z" else 1.5
-    v = values_of(vertex, 1, NOWHERE, 0.02)
-    assert v is not None and v.doubles == 599 and v.far == v.giant == 0
+    found = inspect(write(tmp_path / "b.ply", vertex))
+    assert found.splat is not None
+    v = found.splat.values
+    assert v.doubles == 599 and v.far == v.giant == 0
 
 
 def test_values_that_look_activated_are_read_as_activated(tmp_path: Path) -> None:

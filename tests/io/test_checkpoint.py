@@ -19,10 +19,10 @@ from clod_adapter.adapter import detach, trim
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.io.checkpoint import blank, load, save, trimmed
+from clod_adapter.io.checkpoint import Checkpoint, load, save, trimmed
+from clod_adapter.io.file_formats import handle_name
 from clod_adapter.io.file_formats import write as save_as
-from clod_adapter.io.ply.columns import column_map
-from clod_adapter.io.sniff import handle_name
+from clod_adapter.io.ply import column_map
 from formats import model, write_elements, write_rows
 
 RESTS = (0, 9, 24, 45, 72)
@@ -328,7 +328,7 @@ def test_the_suffix_decides_the_format(tmp_path: Path, suffix: str) -> None:
 def test_other_formats_keep_what_the_base_says(tmp_path: Path) -> None:
     """Its origin and its comments; the input is not overwritten."""
     some = model(1, 9)
-    base = dataclasses.replace(blank(len(some), 1, (10.0, 20.0, 3.0)), comments=("from a trainer",))
+    base = Checkpoint(some, None, ("from a trainer",), (), "", Path(), origin=(10.0, 20.0, 3.0))
     save(tmp_path / "out.pt", some, base)
     again = load(tmp_path / "out.pt", origin=(10.0, 20.0, 3.0))
     assert again.comments == ("from a trainer",)

@@ -12,7 +12,7 @@ from clod_adapter.config import CLASSIC, FILTERS, ScreenFilter
 from clod_adapter.errors import ClodError
 from clod_adapter.io.checkpoint import load, save
 from clod_adapter.io.file_formats import write
-from clod_adapter.io.screen_filter import implied_filter, is_antialiased, tagged
+from clod_adapter.io.settings import implied_filter, is_antialiased, tagged
 from formats import model, without_comments
 
 

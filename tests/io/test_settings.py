@@ -17,9 +17,8 @@ from clod_adapter.errors import ClodError
 from clod_adapter.io.adapter_file import load_adapter, save_adapter
 from clod_adapter.io.checkpoint import load, save
 from clod_adapter.io.file_formats import write
-from clod_adapter.io.formats.metadata import parse_metadata
-from clod_adapter.io.ply.columns import inria_dtype
-from clod_adapter.io.settings import EARLIER, read_metadata
+from clod_adapter.io.ply import inria_dtype
+from clod_adapter.io.settings import EARLIER, parse_metadata, read_metadata
 from formats import ATTENUATION, CALIBRATION, change_setting, model, write_rows
 
 pytest.importorskip("pygltflib", reason="pygltflib is not installed")

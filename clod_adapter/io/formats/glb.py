@@ -9,19 +9,35 @@ about z, and a translation where there is an origin. ``asset.extras.clod_adapter
 
 from __future__ import annotations
 
+import json
+import struct
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from clod_adapter._support.version import package_version
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.io.file_formats import History
-from clod_adapter.io.formats.arrays import arrays_of, colours_of, normalized, scales_of, sigmoid
-from clod_adapter.io.formats.metadata import KEY, write_metadata
-from clod_adapter.io.ply.columns import GROWTH, SIGMA, dial_columns
-from clod_adapter.origin import Origin
+from clod_adapter.io.file_formats import KEY, read_whole
+from clod_adapter.io.settings import History, Metadata, Source, parse_metadata, write_metadata
+from clod_adapter.io.values import (
+    GROWTH,
+    SIGMA,
+    arrays_of,
+    colours_of,
+    dial_columns,
+    float32,
+    half_turn,
+    logit,
+    logs_of,
+    normalized,
+    scales_of,
+    sha256_of,
+    sigmoid,
+)
+from clod_adapter.origin import NOWHERE, Origin, origin_of
 
 EXTENSION = "KHR_gaussian_splatting"
 DIAL = {SIGMA: "_SIGMA_D", GROWTH: "_GROWTH_D"}
@@ -36,6 +52,19 @@ _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 def coefficient(degree: int, index: int) -> str:
     """The attribute of a spherical harmonic: ``index`` of ``2 degree + 1``, in the order of ``Gaussians.shN``."""
     return f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{index}"
+
+
+_JSON, _BIN = 0x4E4F534A, 0x004E4942
+# Component types: those that the extension allows in the place of floats, whose largest value stands for 1, and these.
+_KINDS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", _FLOAT: "<f4"}
+_WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+_ATTRIBUTES = {
+    "means": ("POSITION", 3), "quats": (f"{EXTENSION}:ROTATION", 4), "log_scales": (f"{EXTENSION}:SCALE", 3),
+    "opacity_logits": (f"{EXTENSION}:OPACITY", 1), "sh0": (coefficient(0, 0), 3),
+}  # fmt: skip
+_REMEDY = "export it again, as a .ply"
+IDENTITY = [0.0, 0.0, 0.0, 1.0]  # as xyzw
+_FAINTEST = -100.0  # logit of an opacity that float32 has rounded to 0
 
 
 def write_glb(path: Path, gaussians: Gaussians, history: History) -> tuple[str, ...]:
@@ -110,3 +139,183 @@ def _accessor(pygltflib: Any, index: int, name: str, array: np.ndarray) -> Any:
     if name == "POSITION":
         accessor.min, accessor.max = array.min(0).tolist(), array.max(0).tolist()
     return accessor
+
+
+def load_glb(path: Path) -> Source:
+    """Reads the first primitive with the extension, into the axes of checkpoints: y down.
+
+    Under a node without a rotation the values are in glTF's own axes, and are turned here; files of this package have
+    the half turn in the node and store the checkpoint's values.
+
+    Raises:
+        ClodError: the file cannot be read, is damaged, has no such primitive or a compressed one, or its node stands
+            below another, is scaled, or turned in another way.
+    """
+    data = read_whole(path)
+    parts = _parts(path, memoryview(data))
+    arrays, metadata, moved = {name: _values(view) for name, view in parts.views.items()}, parts.metadata, parts.moved
+    rest = [arrays.pop(name) for name in parts.bands]
+    arrays["shN"] = np.stack(rest, 1) if rest else np.zeros((len(arrays["means"]), 0, 3), np.float32)
+    stored = _stored(arrays) if parts.turned else half_turn(_stored(arrays), "z")
+    if moved != metadata.origin:  # another program moved the node
+        stored["means"], moved = _moved(stored["means"], moved)
+        metadata = replace(metadata, origin=moved)
+    return Source(float32(stored), metadata, sha256_of(data), tuple(parts.ignored), metadata.about)
+
+
+def open_glb(path: Path) -> bool:
+    """Whether a file has sigma_d, without reading its values; errors as ``load_glb``."""
+    return SIGMA in _parts(path, np.memmap(path, np.uint8, "r").data).views
+
+
+class _Parts(NamedTuple):
+    """A file without its values.
+
+    Attributes:
+        views: attributes by our names, spherical harmonics above degree 0 by their own, in ``bands``; each after
+            whether it is normalized.
+        turned, moved: of ``_placed``.
+        ignored: notes on the parts of the file that are not used.
+    """
+
+    views: dict[str, tuple[bool, np.ndarray]]
+    bands: list[str]
+    metadata: Metadata
+    turned: bool
+    moved: Origin
+    ignored: list[str]
+
+
+def _parts(path: Path, data: memoryview) -> _Parts:
+    try:
+        gltf, binary = _chunks(data)
+        (mesh, primitive), *others = _find(gltf)
+        attributes, ignored = primitive["attributes"], _ignored(primitive, len(others))
+        views = {key: _view(gltf, binary, attributes[name], width) for key, (name, width) in _ATTRIBUTES.items()}
+        degree = 0
+        while degree < DEGREE and coefficient(degree + 1, 0) in attributes:
+            degree += 1
+        bands = [coefficient(band, index) for band in range(1, degree + 1) for index in range(2 * band + 1)]
+        views |= {name: _view(gltf, binary, attributes[name], 3) for name in bands}
+        for name in dial_columns([name for name, attribute in DIAL.items() if attribute in attributes]):
+            views[name] = _view(gltf, binary, attributes[DIAL[name]], 1)
+        if len({len(values) for _, values in views.values()}) > 1:
+            raise ClodError(f"its attributes are of different lengths; {_REMEDY}")
+        text = gltf["asset"].get("extras", {}).get(KEY)
+        turned, moved = _placed(gltf, mesh)
+    except ClodError as error:
+        raise ClodError(f"{path}: {error}") from error
+    except (AttributeError, IndexError, KeyError, OverflowError, RecursionError, TypeError, ValueError) as error:
+        raise ClodError(f"{path}: is damaged or no such .glb ({error!r:.80}); {_REMEDY}") from error
+    return _Parts(views, bands, parse_metadata(path, text, dial=SIGMA in views), turned, moved, ignored)
+
+
+def _chunks(data: memoryview) -> tuple[dict[str, Any], memoryview]:
+    """The JSON and the binary chunk."""
+    if bytes(data[:4]) != b"glTF":
+        raise ClodError(f"is no glTF binary file; {_REMEDY}")
+    version, length = struct.unpack_from("<II", data, 4) if len(data) >= 12 else (0, 0)
+    if version != 2 or length > len(data):
+        raise ClodError("is truncated, or no glTF 2.0; copy or export it again")
+    found: dict[int, memoryview] = {}
+    start = 12
+    while start + 8 <= length:
+        size, kind = struct.unpack_from("<II", data, start)
+        if start + 8 + size > length:
+            raise ClodError("is truncated; copy or export it again")
+        found.setdefault(kind, data[start + 8 : start + 8 + size])
+        start += 8 + size
+    if _JSON not in found:
+        raise ClodError("has no JSON chunk; export it again")
+    return json.loads(bytes(found[_JSON])), found.get(_BIN, data[:0])
+
+
+def _find(gltf: dict[str, Any]) -> list[tuple[int, dict[str, Any]]]:
+    """The primitives with Gaussians, at least one, each after the number of its mesh."""
+    found = [
+        (number, primitive)
+        for number, mesh in enumerate(gltf.get("meshes", []))
+        for primitive in mesh["primitives"]
+        if EXTENSION in primitive.get("extensions", {})
+    ]
+    if not found:
+        raise ClodError(f"has no Gaussians in it ({EXTENSION}), so it is a mesh; give a checkpoint of Gaussians")
+    _, first = found[0]
+    compressed = first["extensions"][EXTENSION].get("extensions")
+    if compressed or any(name not in first["attributes"] for name, _ in _ATTRIBUTES.values()):
+        raise ClodError("its Gaussians are compressed, or have no spherical harmonics; export them as a .ply")
+    return found
+
+
+def _ignored(primitive: dict[str, Any], others: int) -> list[str]:
+    """Notes on the parts of the file that are not used."""
+    space = primitive["extensions"][EXTENSION].get("colorSpace", COLOR_SPACE)
+    notes = [f"its colours are in {space!r:.40}, and taken as {COLOR_SPACE}"] if space != COLOR_SPACE else []
+    return notes + ([f"{others} more primitives with Gaussians in it are left out"] if others else [])
+
+
+def _view(gltf: dict[str, Any], binary: memoryview, number: int, width: int) -> tuple[bool, np.ndarray]:
+    """Whether an accessor is normalized, and its values ``[N, width]`` as stored, ``[N]`` where the width is 1."""
+    accessor = gltf["accessors"][_whole(number)]
+    if "sparse" in accessor or _WIDTHS[accessor["type"]] != width:
+        raise ClodError(f"an attribute is sparse or of type {accessor['type']!r:.20}; {_REMEDY}")
+    kind = _KINDS[accessor["componentType"]]
+    view = gltf["bufferViews"][_whole(accessor["bufferView"])]
+    if _whole(view["buffer"]) or "uri" in gltf["buffers"][0] or view.get("extensions"):
+        raise ClodError(f"its data are compressed, or in another file; {_REMEDY}")
+    item = np.dtype(kind).itemsize
+    stride = _whole(view.get("byteStride", item * width))
+    start, count = _whole(accessor.get("byteOffset", 0)), _whole(accessor["count"])
+    data = binary[_whole(view.get("byteOffset", 0)) :][: _whole(view["byteLength"])]
+    if not count or stride < item * width or start + (count - 1) * stride + item * width > len(data):
+        raise ClodError("an attribute has no values, or more than the file; copy or export it again")
+    values = np.ndarray((count, width), kind, data, start, (stride, item))
+    return bool(accessor.get("normalized")), values[:, 0] if width == 1 else values
+
+
+def _values(view: tuple[bool, np.ndarray]) -> np.ndarray:
+    """float32."""
+    normalized, stored = view
+    values = stored.astype(np.float32)
+    if normalized and stored.dtype.kind != "f":
+        values = np.maximum(values / np.float32(np.iinfo(stored.dtype).max), -1)
+    return values
+
+
+def _whole(value: Any) -> int:
+    if not isinstance(value, int) or value < 0:
+        raise ValueError(f"{value!r:.20} is no count")
+    return value
+
+
+def _placed(gltf: dict[str, Any], mesh: int) -> tuple[bool, Origin]:
+    """Whether the node of the mesh makes the half turn, and its translation as an origin in the axes of checkpoints."""
+    nodes: list[dict[str, Any]] = gltf.get("nodes", [])
+    number = next((number for number, node in enumerate(nodes) if node.get("mesh") == mesh), -1)
+    node = nodes[number] if number >= 0 else {}
+    below = any(number in other.get("children", []) for other in nodes)
+    rotation = [float(value) for value in node.get("rotation", IDENTITY)]
+    scale = [float(value) for value in node.get("scale", [1, 1, 1])]
+    turned = np.allclose(np.abs(rotation), HALF_TURN)
+    if below or "matrix" in node or scale != [1, 1, 1] or not (turned or np.allclose(np.abs(rotation), IDENTITY)):
+        raise ClodError("its node is scaled or turned, which is not undone here; apply the transform and export again")
+    x, y, z = (float(value) for value in node.get("translation", [0, 0, 0]))
+    if not np.isfinite([x, y, z]).all():
+        raise ClodError("its node has a translation that is not finite; export it again")
+    return turned, (0.0 - x, 0.0 - y, z)
+
+
+def _moved(means: np.ndarray, by: Origin) -> tuple[np.ndarray, Origin]:
+    """Means and their origin; an origin near 0 is added to the means, where float32 has enough digits."""
+    wide = means.astype(np.float64) + by
+    return (means, by) if any(origin_of(wide)) else (wide.astype(np.float32), NOWHERE)
+
+
+def _stored(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The values as checkpoints store them."""
+    quats = np.roll(arrays["quats"], 1, axis=1)
+    logits = logit(np.clip(arrays["opacity_logits"], 0, 1))
+    return {
+        **arrays, "log_scales": logs_of(arrays["log_scales"]), "quats": quats,
+        "opacity_logits": np.maximum(logits, _FAINTEST), "sh0": arrays["sh0"][:, None],
+    }  # fmt: skip

@@ -6,6 +6,7 @@ Files of this package have more tensors among the ``splats``, ``sigma_d`` and ``
 
 from __future__ import annotations
 
+import io
 import pickle
 import pickletools
 import re
@@ -13,16 +14,17 @@ import struct
 import warnings
 import zipfile
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from clod_adapter.config import SH_COUNTS
 from clod_adapter.errors import ClodError
-from clod_adapter.io.formats.metadata import KEY
-from clod_adapter.io.ply.columns import GROWTH, SIGMA, dial_columns
-from clod_adapter.io.settings import damaged
-from clod_adapter.io.sniff import file_sha256, handle_name, read_start, refuse
+from clod_adapter.io.file_formats import KEY, file_sha256, handle_name, read_start, refuse
+from clod_adapter.io.settings import History, Source, damaged, metadata_text, parse_metadata, write_metadata
+from clod_adapter.io.values import SIGMA, arrays_of, dial_columns, float32
+
+if TYPE_CHECKING:
+    from clod_adapter.gaussians import Gaussians
 
 FRAME = "gsplat's trainer may have normalised the coordinates; photographs must be in the same"
 _PICKLE_LIMIT = 1 << 20  # bytes; of a few tensors it has a few hundred
@@ -74,7 +76,7 @@ def _check_pickle(path: Path, data: bytes) -> None:
 
 
 def read_splats(path: Path, digest: bool = True) -> tuple[dict[str, np.ndarray], str | None, str]:
-    """The parameters by gsplat's names, float32, in matching shapes; the JSON document, if any; the SHA-256, hex.
+    """The parameters by gsplat's names, float32; the JSON document, if any; the SHA-256, hex.
 
     Scales are logarithms, opacities logits, as in Inria's layout. Read with ``weights_only``: a pickle that calls
     anything but what makes tensors is refused, and nothing is called.
@@ -98,7 +100,6 @@ def read_splats(path: Path, digest: bool = True) -> tuple[dict[str, np.ndarray],
         )
     wanted = (*NAMES, *dial_columns(splats))
     values = {name: _values(path, name, splats) for name in wanted}
-    _check_shapes(path, values)
     text = checkpoint.get(KEY)
     if text is not None and not isinstance(text, str):
         raise damaged(path, TypeError(f"a {type(text).__name__}, not text"))
@@ -140,15 +141,40 @@ def _values(path: Path, name: str, splats: dict[str, Any]) -> np.ndarray:
     return value.detach().float().numpy()
 
 
-def _check_shapes(path: Path, values: dict[str, np.ndarray]) -> None:
-    count = len(values["means"]) if values["means"].ndim else 0
-    bands = values["shN"].shape[1] if values["shN"].ndim == 3 else -1
-    shapes = {
-        "means": (count, 3), "quats": (count, 4), "scales": (count, 3), "opacities": (count,), "sh0": (count, 1, 3),
-        "shN": (count, bands, 3), SIGMA: (count,), GROWTH: (count,),
-    }  # fmt: skip
-    for name, value in values.items():
-        if value.shape != shapes[name]:
-            raise ClodError(f"{path}: splats[{name!r}] has shape {value.shape}, not {shapes[name]}; export it again")
-    if bands + 1 not in SH_COUNTS.values():
-        raise ClodError(f"{path}: splats['shN'] has {bands} coefficients, which fit no SH degree; export it again")
+def write_pt(path: Path, gaussians: Gaussians, history: History) -> tuple[str, ...]:
+    """Writes every value unchanged; arguments and errors as ``file_formats.write``."""
+    import torch
+
+    from clod_adapter.integrations.splats import NAMES
+
+    arrays = arrays_of(path, gaussians)
+    names = NAMES | {name: name for name in dial_columns(arrays)}
+    splats = {name: torch.from_numpy(arrays[ours]) for name, ours in names.items()}
+    text = metadata_text(write_metadata(gaussians, history))
+    # By way of memory, as the entries of a file are named after it, and this one's name is temporary.
+    buffer = io.BytesIO()
+    torch.save({"step": 0, "splats": splats, KEY: text}, buffer)
+    path.write_bytes(buffer.getbuffer())
+    return ()
+
+
+def open_pt(path: Path) -> bool:
+    """Whether a checkpoint has sigma_d, without reading its values; errors as ``load_pt``."""
+    values, text, _ = read_splats(path, digest=False)
+    parse_metadata(path, text, dial=SIGMA in values)
+    return SIGMA in values
+
+
+def load_pt(path: Path) -> Source:
+    """Reads a checkpoint of gsplat's trainer, or one written here.
+
+    Raises:
+        ClodError: as ``read_splats``, or its settings are damaged.
+    """
+    from clod_adapter.integrations.splats import NAMES
+
+    values, text, sha256 = read_splats(path)
+    metadata = parse_metadata(path, text, dial=SIGMA in values)
+    arrays = {NAMES.get(name, name): value for name, value in values.items()}
+    notes = () if metadata.described else (FRAME,)
+    return Source(float32(arrays), metadata, sha256, notes, metadata.about, not metadata.described)

@@ -13,12 +13,10 @@ from safetensors.numpy import save
 
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.io.file_formats import History, Model
-from clod_adapter.io.formats.arrays import arrays_of, gaussians_of
-from clod_adapter.io.formats.metadata import KEY, metadata_text, parse_metadata, write_metadata
-from clod_adapter.io.ply.columns import SIGMA, dial_columns
-from clod_adapter.io.settings import Metadata
+from clod_adapter.io.file_formats import KEY
+from clod_adapter.io.settings import History, Metadata, Source, metadata_text, parse_metadata, write_metadata
 from clod_adapter.io.tensor_file import load_tensors, read_tensor_header
+from clod_adapter.io.values import SIGMA, arrays_of, dial_columns, float32
 
 _NAMES = ("means", "quats", "log_scales", "opacity_logits", "sh0", "shN")
 
@@ -38,7 +36,7 @@ def open_safetensors(path: Path) -> bool:
     return SIGMA in names
 
 
-def load_safetensors(path: Path) -> Model:
+def load_safetensors(path: Path) -> Source:
     """Reads a model.
 
     Raises:
@@ -50,7 +48,7 @@ def load_safetensors(path: Path) -> Model:
     if odd := [name for name in wanted if not tensors[name].is_floating_point()]:
         raise ClodError(f"{path}: tensor {odd[0]!r} is not of floating-point numbers; export it again")
     arrays = {name: tensors[name].float().numpy() for name in wanted}
-    return Model(gaussians_of(path, arrays, metadata), metadata, sha256)
+    return Source(float32(arrays), metadata, sha256, comments=metadata.about)
 
 
 def _metadata(path: Path, names: Collection[str], stored: dict[str, str]) -> Metadata:

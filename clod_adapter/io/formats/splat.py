@@ -13,21 +13,20 @@ import numpy as np
 
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import SH_C0, Gaussians
-from clod_adapter.io.file_formats import History, Model
-from clod_adapter.io.formats.arrays import (
+from clod_adapter.io.file_formats import read_whole
+from clod_adapter.io.settings import History, Metadata, Source
+from clod_adapter.io.values import (
     arrays_of,
     bytes_of,
     colours_of,
-    gaussians_of,
+    float32,
     logits_of_bytes,
     logs_of,
     normalized,
-    read_whole,
     scales_of,
     sha256_of,
     sigmoid,
 )
-from clod_adapter.io.settings import Metadata
 
 QUANTISED = "quantised: colours, opacities and rotations in 8 bits, no view-dependent colour"
 _ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
@@ -51,7 +50,7 @@ def write_splat(path: Path, gaussians: Gaussians, history: History) -> tuple[str
     return (*notes, *(["the origin is dropped: coordinates are relative to it"] if any(history.origin) else []))
 
 
-def load_splat(path: Path) -> Model:
+def load_splat(path: Path) -> Source:
     """Reads rows as ``write_splat`` writes them; SH degree 0.
 
     Raises:
@@ -68,4 +67,4 @@ def load_splat(path: Path) -> Model:
         "opacity_logits": logits_of_bytes(rows["rgba"][:, 3]), "shN": np.zeros((len(rows), 0, 3)),
         "sh0": ((rgba[:, None, :3] / 255) - 0.5) / SH_C0,
     }  # fmt: skip
-    return Model(gaussians_of(path, arrays, Metadata()), Metadata(), sha256_of(data), (QUANTISED,))
+    return Source(float32(arrays), Metadata(), sha256_of(data), (QUANTISED,))

@@ -1,10 +1,12 @@
 """Finds and runs splat-transform, PlayCanvas's converter of splat files: an optional tool that needs Node.
 
-It compresses to SOG and to compressed PLY, makes streaming sets of several levels, and merges Gaussians.
+It compresses to SOG and to compressed PLY, makes streaming sets of several levels, merges Gaussians, and reads what
+this package does not read itself.
 """
 
 from __future__ import annotations
 
+import hashlib
 import os
 import re
 import shlex
@@ -15,8 +17,14 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
 
 from clod_adapter.errors import ClodError
+from clod_adapter.io.file_formats import read_start, read_whole, refuse_known
+
+if TYPE_CHECKING:
+    from clod_adapter.io.settings import Source
 
 VARIABLE = "CLOD_SPLAT_TRANSFORM"
 NEEDED, NODE_NEEDED = (3, 7), 22
@@ -27,6 +35,7 @@ HELP = (
 )
 ASKING = 30.0  # seconds that a question about itself may take
 LIMIT, LIMIT_EACH = 600.0, 0.02  # seconds for a run, and per Gaussian; ten times what was measured
+LIMIT_CONVERT = 1800.0  # seconds; five million Gaussians take about a minute
 TICK = 0.2  # seconds between two checks for its end
 # Without a GPU, where a round of SOG's clustering of spherical harmonics takes minutes, and its usual ten take an hour.
 # Two rounds more give 0.02 dB.
@@ -117,6 +126,46 @@ class SplatTransform:
 def time_limit(count: int) -> float:
     """Seconds after which a run over this many Gaussians has hung."""
     return LIMIT + LIMIT_EACH * count
+
+
+def check_converted(path: Path, version: str = "") -> SplatTransform:
+    """The converter; refuses a file that is something else, or that cannot be converted here.
+
+    Args:
+        version: of the format, where only one version is read in this way.
+
+    Raises:
+        ClodError: the file is something else, or splat-transform is missing or too old.
+    """
+    refuse_known(path, read_start(path))
+    try:
+        return SplatTransform.find()
+    except ClodError as error:
+        raise ClodError(
+            f"{path}: {path.suffix}{version} is read through splat-transform ({error}); better still, adapt the PLY "
+            "that it was made from"
+        ) from error
+
+
+def load_converted(path: Path, version: str = "") -> Source:
+    """The Gaussians of the PLY that splat-transform converts the file to; ``version`` as in ``check_converted``.
+
+    Raises:
+        ClodError: splat-transform is missing, or cannot read the file.
+    """
+    from clod_adapter.io.ply import read_ply  # here: check_converted needs neither plyfile nor numpy
+    from clod_adapter.io.settings import Metadata, Source
+
+    tool, sha256 = check_converted(path, version), hashlib.sha256(read_whole(path)).hexdigest()
+    with TemporaryDirectory() as folder:
+        converted = Path(folder) / "converted.ply"
+        try:
+            tool.run(path, converted, timeout=LIMIT_CONVERT)
+        except ClodError as error:
+            raise ClodError(f"{path}: cannot be read ({error}); copy or export it again") from error
+        arrays = read_ply(converted).arrays
+    note = f"quantised: {path.suffix} stores positions, scales, rotations and colours in a few bits each"
+    return Source(arrays, Metadata(), sha256, (note, f"read through splat-transform {tool.version}"))
 
 
 def _words(given: str) -> tuple[str, ...]:

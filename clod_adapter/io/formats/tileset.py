@@ -26,9 +26,9 @@ import torch
 
 from clod_adapter._support.version import package_version
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.io.file_formats import History
 from clod_adapter.io.formats.glb import COLOR_SPACE, DEGREE, EXTENSION, coefficient
 from clod_adapter.io.formats.spz import write_spz
+from clod_adapter.io.settings import History
 from clod_adapter.origin import Origin
 
 TILESET = "tileset.json"

@@ -14,8 +14,8 @@ import torch
 from clod_adapter.cameras import Camera
 from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import atomic_path
+from clod_adapter.io.file_formats import refuse_irregular, refuse_long_numbers
 from clod_adapter.io.scene.folder import find_cameras, name_parts
-from clod_adapter.io.sniff import refuse_irregular, refuse_long_numbers
 from clod_adapter.origin import NOWHERE
 
 try:

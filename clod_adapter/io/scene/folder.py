@@ -16,7 +16,7 @@ from typing import Any
 
 from clod_adapter._support.text import as_text, file_name
 from clod_adapter.errors import ClodError
-from clod_adapter.io.sniff import refuse_long_numbers
+from clod_adapter.io.file_formats import refuse_long_numbers
 
 TRANSFORMS = ("transforms_train.json", "transforms.json")
 DATAPARSER = "dataparser_transforms.json"  # nerfstudio's: the frame it trained in

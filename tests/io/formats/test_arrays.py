@@ -6,7 +6,7 @@ import torch
 
 from clod_adapter.cameras import Camera
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.io.formats.arrays import half_turn
+from clod_adapter.io.values import half_turn
 from clod_adapter.render import render
 from scenes import camera, gaussians
 

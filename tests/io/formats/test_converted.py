@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from clod_adapter.errors import ClodError
-from clod_adapter.io.checkpoint import blank, load, save
+from clod_adapter.io.checkpoint import load, save
 from clod_adapter.io.file_formats import check_readable, file_has_dial
 from formats import rows_by_place, splat_transform
 from scenes import gaussians
@@ -25,7 +25,7 @@ def stand_in(folder: Path, monkeypatch: pytest.MonkeyPatch, script: str) -> None
 @pytest.mark.parametrize("name", ["a.sog", "a.KSPLAT", "a.spz"])
 def test_converted_file_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     was = gaussians(5, 1, 0)
-    save(tmp_path / "plain.ply", was, blank(5, 1))
+    save(tmp_path / "plain.ply", was)
     stand_in(tmp_path, monkeypatch, f'cd \'{tmp_path}\'; echo "$@" >seen; cp plain.ply "$last"')
     (tmp_path / name).write_bytes(b"NGSP, if it is an SPZ: of version 4")
     check_readable(tmp_path / name)
@@ -51,7 +51,7 @@ def test_conversion_errors_name_the_file(tmp_path: Path, monkeypatch: pytest.Mon
 @pytest.mark.parametrize("name", ["a.sog", "a.spz"])
 def test_splat_transform_converts(tmp_path: Path, name: str) -> None:
     was = gaussians(300, 1, 0)
-    save(tmp_path / "plain.ply", was, blank(300, 1))
+    save(tmp_path / "plain.ply", was)
     splat_transform("-g", "cpu", tmp_path / "plain.ply", tmp_path / name)
     means = load(tmp_path / name).gaussians.means
     assert (means[rows_by_place(was.means.numpy(), means.numpy())] - was.means).abs().max() < 1e-3

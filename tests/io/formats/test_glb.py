@@ -12,9 +12,8 @@ import torch
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import SH_C0
-from clod_adapter.io.checkpoint import save
+from clod_adapter.io.checkpoint import load, save
 from clod_adapter.io.file_formats import write
-from clod_adapter.io.formats.glb_reader import load_glb
 from formats import ATTENUATION, ORIGIN, change_glb, covariances, model, splat_transform, turned
 from scenes import gaussians
 
@@ -67,12 +66,13 @@ def test_file_of_splat_transform(tmp_path: Path) -> None:
     g = gaussians(40, 3, 2)
     save(tmp_path / "a.ply", g)
     splat_transform(tmp_path / "a.ply", tmp_path / "b.glb")
-    again, metadata = load_glb(tmp_path / "b.glb")[:2]
+    found = load(tmp_path / "b.glb")
+    again = found.gaussians
     assert torch.equal(again.means, g.means) and torch.equal(again.sh0, g.sh0)
     torch.testing.assert_close(covariances(again), covariances(g), atol=1e-7, rtol=1e-4)
     torch.testing.assert_close(again.opacities, g.opacities, atol=1e-6, rtol=1e-6)
     torch.testing.assert_close(again.shN, g.shN, atol=1e-6, rtol=1e-6)
-    assert not any(metadata.origin)
+    assert not any(found.origin)
 
 
 @pytest.mark.parametrize(
@@ -99,15 +99,16 @@ def test_file_of_splat_transform(tmp_path: Path) -> None:
 def test_invalid_json_is_refused(tmp_path: Path, change: Any, message: str) -> None:
     write(tmp_path / "a.glb", model(0, 5))
     with pytest.raises(ClodError, match=message):
-        load_glb(change_glb(tmp_path / "a.glb", change))
+        load(change_glb(tmp_path / "a.glb", change))
 
 
 def test_file_of_another_program(tmp_path: Path) -> None:
     """Interleaved, in short integers, moved, without metadata: sigma_d then has the default settings."""
     write(tmp_path / "a.glb", model(0, 5), origin=ORIGIN)
     path = change_glb(tmp_path / "a.glb", lambda g: g["asset"].pop("extras"))
-    again, metadata, _, notes, _ = load_glb(path)
-    assert metadata.origin == ORIGIN and not notes and again.sigma_d is not None
+    found = load(path)
+    again = found.gaussians
+    assert found.origin == ORIGIN and again.sigma_d is not None
     assert again.attenuation == AttenuationConfig()
     rows = np.zeros(5, [("position", "<f4", 3), ("rotation", "<i2", 4), ("opacity", "u1"), ("pad", "u1", 3)])
     rows["position"], rows["rotation"], rows["opacity"] = np.arange(15).reshape(5, 3), [0, 0, 0, 32767], 255
@@ -126,7 +127,7 @@ def test_file_of_another_program(tmp_path: Path) -> None:
     body = data[start + size + 8 :] + rows.tobytes()
     head = struct.pack("<4sII", b"glTF", 2, start + size + 8 + len(body)) + data[12 : start + size]
     path.write_bytes(head + struct.pack("<II", len(body), 0x004E4942) + body)
-    g = load_glb(path).gaussians
+    g = load(path).gaussians
     np.testing.assert_array_equal(g.means, rows["position"] * [-1, -1, 1])
     assert g.quats.tolist() == [[1, 0, 0, 0]] * 5 and torch.isposinf(g.opacity_logits).all()
 
@@ -135,11 +136,13 @@ def test_moved_node_moves_the_model(tmp_path: Path) -> None:
     """The node takes precedence over the origin in the metadata."""
     write(tmp_path / "a.glb", model(0, 5), origin=ORIGIN)
     to = [-1e6, 0.0, 0.0]
-    again, metadata = load_glb(change_glb(tmp_path / "a.glb", lambda g: g["nodes"][0].update(translation=to)))[:2]
-    assert metadata.origin == (1e6, 0.0, 0.0) and again.attenuation == model().attenuation
+    found = load(change_glb(tmp_path / "a.glb", lambda g: g["nodes"][0].update(translation=to)))
+    again = found.gaussians
+    assert found.origin == (1e6, 0.0, 0.0) and again.attenuation == model().attenuation
     near = {"translation": [1.0, -2.0, 4.0]}  # no origin: float32 has digits for it
-    moved, metadata = load_glb(change_glb(tmp_path / "a.glb", lambda g: g["nodes"][0].update(near)))[:2]
-    assert not any(metadata.origin)
+    found = load(change_glb(tmp_path / "a.glb", lambda g: g["nodes"][0].update(near)))
+    moved = found.gaussians
+    assert not any(found.origin)
     torch.testing.assert_close(moved.means, again.means + torch.tensor([-1.0, 2.0, 4.0]))
 
 
@@ -150,11 +153,11 @@ def test_unused_content_is_noted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         g["meshes"].append({"primitives": [*g["meshes"][0]["primitives"], {"attributes": {"POSITION": 0}}]})
         g["meshes"][0]["primitives"][0]["extensions"][KHR]["colorSpace"] = "lin_rec709_display"
 
-    colours, others = load_glb(change_glb(tmp_path / "a.glb", change)).notes
+    colours, others = load(change_glb(tmp_path / "a.glb", change)).notes[-2:]
     assert "'lin_rec709_display'" in colours and others.startswith("1 more primitives")
     (tmp_path / "a.glb").write_bytes(b"ply\n")
-    with pytest.raises(ClodError, match="no glTF binary"):
-        load_glb(tmp_path / "a.glb")
+    with pytest.raises(ClodError, match="a PLY file; call it .ply"):
+        load(tmp_path / "a.glb")
     monkeypatch.setitem(sys.modules, "pygltflib", None)
     with pytest.raises(ClodError, match="pip install pygltflib"):
         write(tmp_path / "b.glb", model())

@@ -8,8 +8,8 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from clod_adapter.errors import ClodError
+from clod_adapter.io.checkpoint import load
 from clod_adapter.io.file_formats import write
-from clod_adapter.io.formats.safetensors import load_safetensors
 from scenes import gaussians
 
 
@@ -18,7 +18,7 @@ from scenes import gaussians
     [
         ({"means": torch.ones(4, 3)}, "quats has shape"),
         ({"means": torch.ones(())}, "has shape|no Gaussians"),
-        ({"shN": torch.ones(5, 2, 3)}, "shN has shape"),
+        ({"shN": torch.ones(5, 2, 3)}, "shN has 2 coefficients"),
         ({"quats": torch.ones(5, 4, dtype=torch.int32)}, "not of floating-point"),
         ({"quats": None}, "has no tensor 'quats'"),
     ],
@@ -30,7 +30,7 @@ def test_invalid_tensors_are_refused(tmp_path: Path, change: dict[str, torch.Ten
     kept = {name: tensor for name, tensor in tensors.items() if tensor is not None}
     save_file(kept, tmp_path / "b.safetensors", {"clod_adapter": json.dumps(about)})
     with pytest.raises(ClodError, match=message):
-        load_safetensors(tmp_path / "b.safetensors")
+        load(tmp_path / "b.safetensors")
     save_file(kept, tmp_path / "b.safetensors")
     with pytest.raises(ClodError, match="not a model of clod-adapter"):
-        load_safetensors(tmp_path / "b.safetensors")
+        load(tmp_path / "b.safetensors")

@@ -11,7 +11,6 @@ from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import SH_C0
 from clod_adapter.io.checkpoint import load
 from clod_adapter.io.file_formats import write
-from clod_adapter.io.formats.splat import load_splat
 from formats import ORIGIN, model, rows_by_place, turned
 
 
@@ -35,7 +34,7 @@ def test_losses(tmp_path: Path) -> None:
     g = detach(model(1, 300))
     notes = write(tmp_path / "a.splat", g, origin=ORIGIN)
     assert "8 bits" in notes[0] and "view-dependent" in notes[1] and "origin" in notes[2]
-    again = load_splat(tmp_path / "a.splat").gaussians
+    again = load(tmp_path / "a.splat").gaussians
     found = again.select(torch.from_numpy(rows_by_place(g.means.numpy(), again.means.numpy())))
     assert torch.equal(found.means, g.means) and again.sh_degree == 0
     torch.testing.assert_close(found.log_scales, g.log_scales, atol=1e-6, rtol=0)

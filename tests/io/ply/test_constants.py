@@ -20,7 +20,7 @@ from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.inspection.report import inspect
 from clod_adapter.io.checkpoint import load, save
-from clod_adapter.io.ply.constants import simplest
+from clod_adapter.io.ply_settings import simplest
 from formats import splat_transform, without_comments, write_rows
 from scenes import camera, gaussians
 

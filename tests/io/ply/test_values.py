@@ -11,7 +11,7 @@ from clod_adapter.config import FILTERS, AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.io.adapter_file import load_adapter, save_adapter
 from clod_adapter.io.checkpoint import load, save
-from clod_adapter.io.ply.columns import inria_dtype
+from clod_adapter.io.ply import inria_dtype
 from formats import write_rows
 
 SCALES = ("scale_0", "scale_1", "scale_2")

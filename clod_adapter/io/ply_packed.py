@@ -16,8 +16,9 @@ from pathlib import Path
 import numpy as np
 from plyfile import PlyData, PlyListProperty
 
+from clod_adapter.config import SH_COUNTS
 from clod_adapter.errors import ClodError
-from clod_adapter.io.ply.columns import column_map, degree_of, inria_dtype
+from clod_adapter.io.values import Arrays, degree_of
 
 BLOCK = 256
 _BITS = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
@@ -46,13 +47,8 @@ def check_packed(path: Path, header: PlyData) -> int:
     return degree_of(path, rest)
 
 
-def packed_elements(header: PlyData) -> tuple[str, ...]:
-    """The elements that ``unpack`` needs."""
-    return ("chunk", "vertex", "sh") if "sh" in header and header["sh"].properties else ("chunk", "vertex")
-
-
-def unpack(path: Path, elements: Mapping[str, np.ndarray], degree: int) -> np.ndarray:
-    """``[N]`` rows in Inria's layout of the Gaussians of such a file.
+def unpack(path: Path, elements: Mapping[str, np.ndarray], degree: int) -> Arrays:
+    """The attributes of the Gaussians of such a file.
 
     An opacity of 0 or 255 becomes a quarter of a step within, so that no logit is infinite.
 
@@ -65,30 +61,31 @@ def unpack(path: Path, elements: Mapping[str, np.ndarray], degree: int) -> np.nd
     from clod_adapter.gaussians import SH_C0  # here: check_packed needs no torch
 
     chunks, packed = elements["chunk"], elements["vertex"]
-    if len(chunks) * BLOCK < len(packed):
+    count = len(packed)
+    if len(chunks) * BLOCK < count:
         raise ClodError(
-            f"{path}: is damaged: {len(packed)} Gaussians need {-(-len(packed) // BLOCK)} chunks, and it has "
-            f"{len(chunks)}; copy or export it again"
+            f"{path}: is damaged: {count} Gaussians need {-(-count // BLOCK)} chunks, and it has {len(chunks)}; copy "
+            "or export it again"
         )
-    columns, vertex = column_map(degree), np.zeros(len(packed), inria_dtype(degree))
-    block = np.arange(len(packed)) // BLOCK
+    block, sh0 = np.arange(count) // BLOCK, np.empty((count, 1, 3), np.float32)
+    means, log_scales = np.empty((count, 3), np.float32), np.empty((count, 3), np.float32)
     with np.errstate(invalid="ignore", over="ignore"):  # ranges that are not finite: their rows are dropped later
-        for what, bits in (("", packed["packed_position"]), ("scale_", packed["packed_scale"])):
-            for k, (axis, share) in enumerate(zip(_AXES, _shares(bits, (11, 10, 11)), strict=True)):
+        for what, target, bits in (("", means, "packed_position"), ("scale_", log_scales, "packed_scale")):
+            for k, (axis, share) in enumerate(zip(_AXES, _shares(packed[bits], (11, 10, 11)), strict=True)):
                 low, high = (chunks[f"{end}_{what}{axis}"][block] for end in ("min", "max"))
-                vertex[columns["log_scales" if what else "means"][k]] = low * (1 - share) + high * share
+                target[:, k] = low * (1 - share) + high * share
         *colours, opacity = _shares(packed["packed_color"], (8, 8, 8, 8))
         for k, (channel, share) in enumerate(zip("rgb", colours, strict=True)):
             if set(_COLOURS) <= set(chunks.dtype.names or ()):
                 share = chunks[f"min_{channel}"][block] * (1 - share) + chunks[f"max_{channel}"][block] * share
-            vertex[columns["sh0"][k]] = (share - 0.5) / SH_C0
+            sh0[:, 0, k] = (share - 0.5) / SH_C0
     opacity = np.clip(opacity, 0.25 / 255, 254.75 / 255)
-    vertex["opacity"] = np.log(opacity / (1 - opacity))
-    for name, values in zip(columns["quats"], _rotations(packed["packed_rotation"]), strict=True):
-        vertex[name] = values
-    if degree:
-        _unpack_harmonics(path, elements["sh"], vertex)
-    return vertex
+    logits = np.log(opacity / (1 - opacity)).astype(np.float32)
+    return {
+        "means": means, "log_scales": log_scales, "sh0": sh0,
+        "quats": np.ascontiguousarray(_rotations(packed["packed_rotation"]).T.astype(np.float32)),
+        "opacity_logits": logits, "shN": _harmonics(path, elements.get("sh"), count, degree),
+    }  # fmt: skip
 
 
 def _require(path: Path, header: PlyData, element: str, names: tuple[str, ...], kind: str) -> None:
@@ -126,10 +123,15 @@ def _rotations(bits: np.ndarray) -> np.ndarray:
     ])  # fmt: skip
 
 
-def _unpack_harmonics(path: Path, table: np.ndarray, vertex: np.ndarray) -> None:
-    if len(table) != len(vertex):
-        raise ClodError(f"{path}: is damaged: {len(table)} harmonics for {len(vertex)} Gaussians; export it again")
+def _harmonics(path: Path, table: np.ndarray | None, count: int, degree: int) -> np.ndarray:
+    bands = SH_COUNTS[degree] - 1
+    found = np.empty((count, bands, 3), np.float32)
+    if table is None or not bands:
+        return found
+    if len(table) != count:
+        raise ClodError(f"{path}: is damaged: {len(table)} harmonics for {count} Gaussians; export it again")
     levels = np.arange(256, dtype=np.float32)
     values = (np.where(levels == 0, 0, np.where(levels == 255, 1, (levels + 0.5) / 256)) - 0.5) * 8
-    for name in table.dtype.names or ():
-        vertex[name] = values[table[name]]
+    for k in range(3 * bands):
+        found[:, k % bands, k // bands] = values[table[f"f_rest_{k}"]]  # channel by channel
+    return found

@@ -1,0 +1,186 @@
+"""The settings in a PLY: comments of the header, and constant columns for tools that drop comments and keep columns.
+
+A setting that is not the default is stored in a float column whose name begins with ``clod_`` too, before ``sigma_d``.
+``reference_distance`` is stored so where there is a ``growth_d``, which is measured in it.
+``max_sv``, the end of the trained range, has no column: reading sigma_d does not need it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import astuple, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from clod_adapter._support.version import package_version
+from clod_adapter.calibration import Calibration, CalibrationRow, Viewpoint
+from clod_adapter.config import CLASSIC, AttenuationConfig, ScreenFilter
+from clod_adapter.errors import ClodError
+from clod_adapter.io.settings import FILTER, Metadata, read_metadata, tagged
+
+PREFIX = "clod_adapter "
+# Comments of the calibration: machine; total, views, width, height, reference; one for each row and each viewpoint.
+MACHINE, EXTENT, ROW, VIEWPOINT = "calibrated_on", "calibrated_with", "calibrated", "viewpoint"
+COLUMN = "clod_"
+TAU, EPS, HARD, QUANTILE, MAX = "clod_tau", "clod_eps", "clod_hard_cut", "clod_quantile", "clod_max"
+REFERENCE = "clod_reference_distance"
+VARIANCE, COMPENSATE = "clod_screen_variance", "clod_compensate"
+DIGITS = 6  # decimal digits that every float32 holds
+
+
+def ply_metadata(path: Path, comments: tuple[str, ...], rows: np.ndarray | None = None, *, dial: bool) -> Metadata:
+    """The settings of the comments, completed by those of the columns of ``rows``.
+
+    Raises:
+        ClodError: a setting is damaged, or a column has more than one value.
+    """
+    columns = constant_settings(read_constants(path, rows)) if dial and rows is not None else {}
+    ours = any(comment.startswith(PREFIX) for comment in comments)
+    values = columns | stored_settings(comments)
+    values["attenuation"] = columns.get("attenuation", {}) | values["attenuation"]
+    found = read_metadata(path, values, dial=dial, described=ours)
+    if ours or not columns.get("attenuation"):
+        return found
+    names = ", ".join(columns["attenuation"])
+    return replace(found, notes=(f"settings of the dial read from columns: {names}", *found.notes))
+
+
+def write_comments(
+    config: AttenuationConfig | None,
+    inherited: Iterable[str],
+    version: str | None = None,
+    calibration: Calibration | None = None,
+    screen_filter: ScreenFilter = CLASSIC,
+) -> list[str]:
+    """The comments of an output: the inherited ones, then the settings, which replace inherited settings.
+
+    One comment per field of ``config``, as ``clod_adapter tau 0.00392156862745098``: the shortest decimal that gives
+    the same double. Some readers do not take long comments, so each row of the calibration has its own.
+
+    Args:
+        version: of the package that made the values; by default the running one.
+    """
+    comments = tagged([comment for comment in inherited if not comment.startswith(PREFIX)], screen_filter)
+    comments.append(f"{PREFIX}version {version or package_version()}")
+    for field in fields(config) if config is not None else ():
+        value = getattr(config, field.name)
+        kind: Any = type(field.default)
+        comments.append(f"{PREFIX}{field.name} {value if value is None else kind(value)}")
+    if screen_filter != CLASSIC:
+        comments.append(f"{PREFIX}{FILTER} {screen_filter.variance} {screen_filter.compensate}")
+    if calibration is not None:
+        c = calibration
+        comments.append(f"{PREFIX}{MACHINE} {c.machine}")
+        comments.append(f"{PREFIX}{EXTENT} {c.total} {c.views} {c.width} {c.height} {c.against}")
+        for name, lines in ((ROW, c.rows), (VIEWPOINT, c.viewpoints)):
+            comments += [f"{PREFIX}{name} {' '.join(map(repr, astuple(line)))}" for line in lines]
+    return comments
+
+
+def stored_settings(comments: Iterable[str]) -> dict[str, Any]:
+    """The settings in the comments, as ``settings.read_metadata`` takes them; the last of equal names counts."""
+    found: dict[str, list[list[str]]] = {}
+    for words in (comment[len(PREFIX) :].split() for comment in comments if comment.startswith(PREFIX)):
+        if words:
+            found.setdefault(words[0], []).append(words[1:])
+    rows = {name: found.pop(name, []) for name in (MACHINE, EXTENT, ROW, VIEWPOINT)}
+    last = {name: " ".join(lines[-1]) for name, lines in found.items() if lines[-1]}
+    values: dict[str, Any] = {"package_version": last.pop("version", "")}
+    if FILTER in found:
+        values[FILTER] = last.pop(FILTER, "")
+    if any(rows.values()):
+        values["calibration"] = _calibration(rows)
+    return values | {"attenuation": last}
+
+
+def _calibration(lines: dict[str, list[list[str]]]) -> dict[str, Any]:
+    """``Calibration.as_dict`` of the comments' words; fields that are missing are left out."""
+
+    def records(name: str, kind: type) -> list[dict[str, str]]:
+        return [dict(zip([field.name for field in fields(kind)], words, strict=False)) for words in lines[name]]
+
+    found: dict[str, Any] = {"rows": records(ROW, CalibrationRow), "viewpoints": records(VIEWPOINT, Viewpoint)}
+    if len(lines[MACHINE]) == 1:
+        found["machine"] = " ".join(lines[MACHINE][0])
+    if len(lines[EXTENT]) == 1:
+        extent = lines[EXTENT][0]
+        found |= zip(("total", "views", "width", "height"), extent, strict=False)
+        found |= {"against": " ".join(extent[4:])} if extent[4:] else {}
+    return found
+
+
+def dial_constants(config: AttenuationConfig | None, growth: bool) -> dict[str, float]:
+    """The columns, by name, of settings that are not the defaults; sigma_d in world units.
+
+    Args:
+        growth: whether there is a growth_d.
+    """
+    if config is None:
+        return {}
+    usual = AttenuationConfig()
+    found = {TAU: config.tau} if config.tau != usual.tau else {}
+    found |= {EPS: config.eps} if config.eps != usual.eps else {}
+    found |= {HARD: 1.0} if config.cut == "hard" else {}
+    found |= {QUANTILE: config.quantile} if config.normalizer == "quantile" else {}
+    found |= {REFERENCE: config.reference_distance} if growth and config.reference_distance else {}
+    return found | ({MAX: 1.0} if config.normalizer == "max" else {})
+
+
+def filter_constants(screen_filter: ScreenFilter) -> dict[str, float]:
+    """The columns, by name, of a screen-space filter that is not the classic one."""
+    found = {VARIANCE: screen_filter.variance} if screen_filter.variance != CLASSIC.variance else {}
+    return found | ({COMPENSATE: 1.0} if screen_filter.compensate else {})
+
+
+def constant_settings(constants: Mapping[str, float]) -> dict[str, Any]:
+    """The settings in the columns, as ``settings.read_metadata`` takes them; the inverse of the two functions above."""
+    found: dict[str, Any] = {}
+    for column, name in ((TAU, "tau"), (EPS, "eps"), (QUANTILE, "quantile"), (REFERENCE, "reference_distance")):
+        if column in constants:
+            found[name] = constants[column]
+    if constants.get(HARD):
+        found["cut"] = "hard"
+    if QUANTILE in constants or constants.get(MAX):
+        found["normalizer"] = "max" if constants.get(MAX) else "quantile"
+    values: dict[str, Any] = {"attenuation": found} if found else {}
+    if VARIANCE in constants or COMPENSATE in constants:
+        variance = constants.get(VARIANCE, CLASSIC.variance)
+        values[FILTER] = {"variance": variance, "compensate": bool(constants.get(COMPENSATE))}
+    return values
+
+
+def read_constants(path: Path, vertex: np.ndarray) -> dict[str, float]:
+    """The value of each column whose name begins with ``clod_``, by ``simplest``.
+
+    Args:
+        vertex: ``[N]`` rows of the file.
+
+    Raises:
+        ClodError: a column has more than one value, as in a merge of files with different settings.
+    """
+    found = {}
+    for name in vertex.dtype.names or ():
+        if name.startswith(COLUMN) and len(vertex):
+            values = vertex[name]
+            if not (values == values[0]).all():
+                raise ClodError(
+                    f"{path}: property {name} must be one value for all rows and has several, so files of different "
+                    "settings were merged; give one of them"
+                )
+            found[name] = simplest(values[0])
+    return found
+
+
+def simplest(value: Any) -> float:
+    """The simplest number that float32 rounds to ``value``, which is the number that was written.
+
+    The shortest decimal; where that has more than six digits, 1/n if that is one for a whole n (1/255).
+    """
+    narrow = np.float32(value)
+    shortest = float(str(narrow))
+    if np.float32(f"{shortest:.{DIGITS}g}") == narrow or not 0 < shortest < 1:
+        return shortest
+    fraction = 1 / round(1 / shortest)
+    return fraction if np.float32(fraction) == narrow else shortest

@@ -1,0 +1,347 @@
+"""The values of Gaussians between a file and memory: activations, filters, usable rows, the origin, quantised levels.
+
+Some trainers and tools store activated opacities or scales, which only their range shows. Mip-Splatting (Yu et al.,
+CVPR 2024, equation 9) stores a filter beside them, ``filter_3D``, that its renderer applies.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections import Counter
+from collections.abc import Container, Iterable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal, NamedTuple, get_args
+
+import numpy as np
+
+from clod_adapter.config import SH_COUNTS
+from clod_adapter.errors import ClodError
+from clod_adapter.io.atomic import check_target
+from clod_adapter.origin import Origin, origin_of, relative
+
+if TYPE_CHECKING:
+    from clod_adapter.gaussians import Gaussians
+
+Activated = Literal["none", "opacity", "scales", "both"]
+Arrays = dict[str, np.ndarray]
+SIGMA, GROWTH, FILTER, MASKS = "sigma_d", "growth_d", "filter_3D", "masks"
+UNROTATED = "zero or not of a usable length"
+ROWS = 4096  # in a block, which stays in the processor's cache
+_FEW = 10  # Gaussians; fewer may have any range
+_FAINTEST = -0.1  # logit of 0.475; trainers keep fainter Gaussians, and files of |a| reach just below 0
+_TINY = float(np.finfo(np.float32).tiny)
+_OPAQUE = 1 - 2.0**-24  # the largest float32 below 1
+_SH_C0 = 0.28209479177387814  # gaussians.SH_C0, without torch
+# The axes in which each spherical harmonic is odd, in the order of ``Gaussians.shN``.
+_ODD = (
+    "y", "z", "x",
+    "xy", "yz", "", "xz", "",
+    "y", "xyz", "y", "z", "x", "z", "x",
+    "xy", "yz", "xy", "yz", "", "xz", "", "xz", "",
+)  # fmt: skip
+
+
+def dial_columns(names: Container[str]) -> dict[str, tuple[str, ...]]:
+    """The dial's columns among ``names``, by attribute; growth_d without a sigma_d is another tool's."""
+    return {name: (name,) for name in (SIGMA, GROWTH) if name in names} if SIGMA in names else {}
+
+
+def degree_of(path: Path, rest: int) -> int:
+    """The SH degree that this many ``f_rest_*`` make.
+
+    Raises:
+        ClodError: they make none.
+    """
+    degrees = {3 * (count - 1): degree for degree, count in SH_COUNTS.items()}
+    if rest not in degrees:
+        wanted = ", ".join(map(str, degrees))
+        raise ClodError(f"{path}: {rest} f_rest_* properties fit no SH degree ({wanted} do); export the file again")
+    return degrees[rest]
+
+
+class Prepared(NamedTuple):
+    """Every row of a file as ``Gaussians`` take it.
+
+    Attributes:
+        arrays: of ``Gaussians.tensors``, float32, means relative to ``origin``.
+        keep: ``[N]`` bool, the rows that can be drawn.
+        origin: world units.
+        activated: what was taken as activated.
+        changes: to values that were not stored as logits and logarithms, one line each.
+        dropped: the number of other rows by reason.
+    """
+
+    arrays: Arrays
+    keep: np.ndarray
+    origin: Origin
+    activated: Activated
+    changes: list[str]
+    dropped: Counter[str]
+
+    @property
+    def dropped_notes(self) -> list[str]:
+        """One line for each reason."""
+        total = len(self.keep)
+        return [f"{lost} of {total} Gaussians dropped: {reason}" for reason, lost in self.dropped.items() if lost]
+
+
+def prepared(
+    path: Path, arrays: Mapping[str, np.ndarray], activated: Activated | None, at: Origin, origin: Origin | None
+) -> Prepared:
+    """The values of ``file_formats.Source.arrays`` as ``Gaussians`` take them.
+
+    Args:
+        activated: which values are activated, where their range allows both; None to refuse then.
+        at: what the means are relative to.
+        origin: what they are to be relative to; None for ``at``, or what ``origin_of`` finds where that is 0.
+
+    Raises:
+        ClodError: there are no rows, or arrays do not fit together; or the range allows both, and ``activated`` is None
+            or no valid choice.
+    """
+    _check_shapes(path, arrays)
+    if not len(arrays["means"]):
+        raise ClodError(f"{path}: no usable Gaussian in it (it has 0 rows); export it again")
+    values, was, changes = _as_logits(path, dict(arrays), activated)
+    if origin is None:
+        origin = at if any(at) else origin_of(values["means"])
+    values["means"] = relative(values["means"], at, origin)
+    keep, dropped = _usable(values)
+    values.pop(MASKS, None)
+    return Prepared(values, keep, origin, was, changes, dropped)
+
+
+def _check_shapes(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    count = len(arrays["means"]) if arrays["means"].ndim else 0
+    bands = arrays["shN"].shape[1] if arrays["shN"].ndim == 3 else 0
+    wanted: dict[str, tuple[int, ...]] = {
+        "means": (3,), "quats": (4,), "log_scales": (3,), "sh0": (1, 3), "shN": (bands, 3), MASKS: (2,), FILTER: (1,)
+    }  # fmt: skip
+    for name, array in arrays.items():
+        if array.shape != (shape := (count, *wanted.get(name, ()))):
+            raise ClodError(f"{path}: {name} has shape {array.shape}, expected {shape}; export it again")
+    if bands + 1 not in SH_COUNTS.values():
+        raise ClodError(f"{path}: shN has {bands} coefficients, which fit no SH degree; export it again")
+
+
+def _as_logits(path: Path, arrays: Arrays, activated: Activated | None) -> tuple[Arrays, Activated, list[str]]:
+    """Logit opacities, logarithmic scales and no ``filter_3D``; what was activated; a line for each change."""
+    if activated is not None and activated not in get_args(Activated):
+        raise ClodError(f"activated is {activated!r}, it must be one of {', '.join(get_args(Activated))}")
+    found = in_question(arrays) if activated != "none" else {}
+    if found and activated is None:
+        raise ClodError(f"{path}: {_question(found)}")
+    taken, notes = [name for name in found if activated in (name, "both")], list[str]()
+    if "opacity" in taken:
+        opacity = np.abs(arrays["opacity_logits"].astype(np.float64))  # the absolute value is Taming-3DGS's activation
+        above = int((opacity > 1).sum())
+        opacity = np.clip(opacity, _TINY, _OPAQUE)
+        arrays["opacity_logits"] = _narrow(np.log(opacity) - np.log1p(-opacity))
+        more = f" ({above} above 1 taken as 1)" if above else ""
+        notes.append(f"opacity taken as activated, and stored as logits{more}")
+    if "scales" in taken:
+        arrays["log_scales"] = _narrow(logs_of(arrays["log_scales"]))
+        notes.append("scales taken as activated, and stored as logarithms")
+    if FILTER in arrays:
+        arrays["log_scales"], arrays["opacity_logits"] = _fused(arrays, arrays.pop(FILTER))
+        notes.append("Mip-Splatting's filter_3D is fused into scale and opacity, and left out of outputs")
+    return arrays, choice_of(taken), notes
+
+
+def in_question(arrays: Mapping[str, np.ndarray]) -> dict[str, tuple[float, float]]:
+    """The range of "opacity" and of "scales", where it looks activated."""
+    found, opacity = {}, arrays["opacity_logits"]
+    extent = _range(opacity[:, None], _FAINTEST)
+    # At most half of the values above 1: not true of logits whose faint ones were pruned.
+    if extent and 2 * np.count_nonzero(opacity > 1) <= len(opacity):
+        found["opacity"] = extent
+    if extent := _range(arrays["log_scales"], 0.0):
+        found["scales"] = extent
+    return found
+
+
+def choice_of(found: Iterable[str]) -> Activated:
+    """The choice of ``Activated`` for these values."""
+    kinds = set(found)
+    return "both" if len(kinds) == 2 else "opacity" if "opacity" in kinds else "scales" if kinds else "none"
+
+
+def _range(values: np.ndarray, least: float) -> tuple[float, float] | None:
+    """The smallest and the largest, if none is below ``least`` and there are at least ``_FEW``."""
+    finite = np.isfinite(values).all(1)
+    if finite.sum() < _FEW:
+        return None
+    low = float(np.min(values, where=finite[:, None], initial=np.inf))
+    high = float(np.max(values, where=finite[:, None], initial=-np.inf))
+    return (low, high) if low >= least and (low < high or high == 1) else None
+
+
+def _question(found: dict[str, tuple[float, float]]) -> str:
+    ranges = " and ".join(f"{name} from {low:.4g} to {high:.4g}" for name, (low, high) in found.items())
+    choice = choice_of(found)
+    return (
+        f"has {ranges}, which looks like activated values where a 3DGS file has logits (opacity) and logarithms "
+        f"(scales); if they are, give --activated {choice}, if not, --activated none (activated= in Python)"
+    )
+
+
+def _fused(arrays: Arrays, filter_3d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """With the filter ``f``: scales ``sqrt(s^2 + f^2)``, opacity ``a sqrt(det(s^2) / det(s^2 + f^2))``, in logs."""
+    scales, logits = arrays["log_scales"].astype(np.float64), arrays["opacity_logits"][:, None].astype(np.float64)
+    with np.errstate(all="ignore"):  # values that are not finite stay so; their rows are dropped later
+        size = np.log(np.abs(filter_3d.astype(np.float64)))
+        wider = 0.5 * np.logaddexp(2 * scales, 2 * size)
+        log_opacity = -np.logaddexp(0, -logits) + (scales - wider).sum(1, keepdims=True)
+        # log(1 - a), of a near 1 from the logit itself where there is no filter
+        fused = np.where(log_opacity < 0, log_opacity - np.log(-np.expm1(log_opacity)), np.inf)
+        unfiltered = (wider == scales).all(1, keepdims=True)
+    return _narrow(wider), _narrow(np.where(unfiltered, logits, fused)[:, 0])
+
+
+def _narrow(values: np.ndarray) -> np.ndarray:
+    with np.errstate(over="ignore"):
+        return values.astype(np.float32)
+
+
+def _usable(arrays: Arrays) -> tuple[np.ndarray, Counter[str]]:
+    """``[N]`` bool, the Gaussians that can be drawn, and the others by the first rule that they break."""
+    keep, dropped = np.ones(len(arrays["means"]), bool), Counter[str]()
+    for start in range(0, len(keep), ROWS):
+        block = {name: array[start : start + ROWS] for name, array in arrays.items()}
+        keep[start : start + ROWS] = _usable_rows(block, dropped)
+    return keep, dropped
+
+
+def _usable_rows(attributes: Arrays, dropped: Counter[str]) -> np.ndarray:
+    count = len(attributes["means"])
+    exists, finite = np.ones(count, bool), np.ones(count, bool)
+    for name, values in attributes.items():
+        usable = np.isfinite(values) | (values == np.inf) if name == "opacity_logits" else np.isfinite(values)
+        if not usable.all():  # which is far faster than by rows
+            finite &= usable.reshape(count, -1).all(1)
+    if MASKS in attributes:  # sigmoid(first - second) >= 0.5; NaN is for the next rule
+        exists = ~(attributes[MASKS][:, 0] < attributes[MASKS][:, 1])
+    keep = np.ones(count, bool)
+    for rule, reason in (
+        (exists, "MaskGaussian existence probability below 0.5"),
+        (finite, "a value is not finite"),
+        (_rotated(attributes["quats"]), f"rotation is {UNROTATED}"),
+    ):
+        dropped[reason] += int((keep & ~rule).sum())
+        keep &= rule
+    return keep
+
+
+def _rotated(quats: np.ndarray) -> np.ndarray:
+    """``[N]`` bool, whether the quaternions ``[N, 4]`` float32 have a length that rasterizers can divide by."""
+    from clod_adapter._kernels import QUAT_MAX, QUAT_MIN  # here: a header is checked without numba
+
+    with np.errstate(over="ignore", invalid="ignore"):
+        length = np.sqrt(np.square(quats).sum(1))
+    return (length >= QUAT_MIN) & (length <= QUAT_MAX)
+
+
+def arrays_of(path: Path, gaussians: Gaussians) -> Arrays:
+    """The float32 arrays of ``Gaussians.tensors``, checked for writing.
+
+    Raises:
+        ClodError: there are none, a value is not finite (opacity = +inf aside), a rotation is unusable, or the target
+            cannot be written.
+    """
+    check_target(path)
+    if len(gaussians) == 0:
+        raise ClodError(f"{path}: there are no Gaussians to write, and no reader takes a file without any")
+    arrays = {
+        name: np.ascontiguousarray(tensor.detach().float().cpu().numpy())
+        for name, tensor in gaussians.tensors().items()
+    }
+    for name, array in arrays.items():
+        finite = np.isfinite(array) | (array == np.inf) if name == "opacity_logits" else np.isfinite(array)
+        if not finite.all():
+            raise ClodError(f"{path}: {name} holds a value that is not finite; drop such rows first, as load does")
+    if not _rotated(arrays["quats"]).all():
+        raise ClodError(f"{path}: a rotation is {UNROTATED}; drop such rows first, as load does")
+    return arrays
+
+
+def float32(arrays: Mapping[str, np.ndarray]) -> Arrays:
+    """The arrays as a ``Source`` has them."""
+    return {name: np.array(array, np.float32, order="C") for name, array in arrays.items()}
+
+
+def half_turn(arrays: Mapping[str, np.ndarray], axis: str) -> dict[str, np.ndarray]:
+    """The Gaussians under a half turn about ``x`` or ``z``, between axes with y down and with y up.
+
+    Exact, and its own inverse. With ``P`` the turn (two signs), means become ``P mu``, rotations ``P R P``, which
+    gives the same ellipsoids, and harmonics change sign where they are odd in an odd number of the axes that flip.
+    """
+    signs = {name: np.float32(1 if name == axis else -1) for name in "xyz"}
+    harmonics = [np.prod([signs[name] for name in odd]) for odd in _ODD]
+    bands = arrays["shN"].shape[1]
+    return {
+        **arrays, "means": arrays["means"] * np.array([*signs.values()], np.float32),
+        "quats": arrays["quats"] * np.array([1, *signs.values()], np.float32),
+        "shN": arrays["shN"] * np.array(harmonics[:bands], np.float32)[:, None],
+    }  # fmt: skip
+
+
+def normalized(quats: np.ndarray) -> np.ndarray:
+    """``[N, 4]`` float32 quaternions of unit length; none is zero."""
+    wide = quats.astype(np.float64)
+    return (wide / np.linalg.norm(wide, axis=1, keepdims=True)).astype(np.float32)
+
+
+def sigmoid(logits: np.ndarray) -> np.ndarray:
+    """Opacities of logits, in float64; 1 for +inf."""
+    with np.errstate(over="ignore"):
+        return 1 / (1 + np.exp(-logits.astype(np.float64)))
+
+
+def logit(opacities: np.ndarray) -> np.ndarray:
+    """The inverse of ``sigmoid``."""
+    wide = opacities.astype(np.float64)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.log(wide) - np.log1p(-wide)
+
+
+def scales_of(path: Path, log_scales: np.ndarray) -> np.ndarray:
+    """Standard deviations of their logarithms, float32.
+
+    Raises:
+        ClodError: one is beyond float32's range.
+    """
+    with np.errstate(over="ignore"):
+        scales = np.exp(log_scales)
+    if not np.isfinite(scales).all():
+        raise ClodError(f"{path}: a scale is beyond float32's range; drop such rows first")
+    return scales
+
+
+def logs_of(scales: np.ndarray) -> np.ndarray:
+    """The inverse of ``scales_of``, in float64; values of 0 or less are read as float32's smallest number."""
+    with np.errstate(invalid="ignore"):  # a NaN that signals
+        return np.log(np.maximum(scales.astype(np.float64), _TINY))
+
+
+def colours_of(sh0: np.ndarray, opacities: np.ndarray) -> np.ndarray:
+    """``[N, 4]`` uint8 RGBA of SH degree 0."""
+    colours = 0.5 + _SH_C0 * sh0.reshape(-1, 3).astype(np.float64)
+    return bytes_of(255 * np.concatenate([colours, opacities[:, None]], 1))
+
+
+def bytes_of(values: np.ndarray) -> np.ndarray:
+    """Rounded to 0 to 255."""
+    return np.clip(np.round(values), 0, 255).astype(np.uint8)
+
+
+def logits_of_bytes(levels: np.ndarray) -> np.ndarray:
+    """Logits of opacities in 255ths; the first and last level are read as a quarter of a level from 0 and 1.
+
+    So no logit is infinite.
+    """
+    return logit(np.clip(levels.astype(np.float64), 0.25, 254.75) / 255)
+
+
+def sha256_of(data: bytes) -> str:
+    """SHA-256, hex."""
+    return hashlib.sha256(data).hexdigest()
