@@ -39,7 +39,8 @@ def faults(words: Sequence[str]) -> Iterator[tuple[str, dict[str, Any]]]:
 
 def first_failure(copy: Path, tests: Sequence[str]) -> str:
     """The first test that fails in the copy; empty where all pass. A run that fails without a test is one too."""
-    words = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "--numprocesses=0", *tests]
+    options = ["-x", "-q", "-p", "no:cacheprovider", "--numprocesses=0", "-o", "timeout=900"]  # kernels are compiled
+    words = [sys.executable, "-m", "pytest", *options, *tests]
     environment = os.environ | {"PYTHONPATH": str(copy), "CLOD_SHARED_DATA": str(SHARED)}
     done = subprocess.run(words, cwd=copy, env=environment, capture_output=True, text=True, check=False)
     if done.returncode == 0:
