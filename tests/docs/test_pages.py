@@ -109,3 +109,15 @@ def test_tables_of_the_equation_match_the_results() -> None:
         found = [rows[quantity, dtype] for dtype in ("float64", "float32")]
         assert written == [f"{row['worst']:.2g} ({row['worst_of_bound']:.0%})" for row in found], name
     assert not sum(row["failed"] + row["nan"] for row in rows.values())
+
+
+def test_table_of_extreme_scenes_matches_the_results() -> None:
+    rows = {row["case"]: row for row in rows_of("stability.jsonl") if row["part"] == "scenes" and "error" not in row}
+    (page,) = [table for table in tables(DOCS / "performance.md") if table[0][-1] == "passes"]
+    for name, *written in page[1:]:
+        row = rows.get(
+            {"the same, 1,500 steps": "max_sv 100, tau 0.004, 1,500 steps"}.get(name, re.split("[;,] at|;", name)[0])
+        )
+        assert row, name
+        ends = [f"{r['psnr']:.2f} @ {r['kept_share']:.0%}" for r in (row["rows"][0], row["rows"][-1])]
+        assert written == [f"{row['base_psnr']:.2f}", *ends, "yes" if row["holds"] else "no"], name
