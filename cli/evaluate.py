@@ -137,8 +137,7 @@ def run(args: Namespace) -> dict[str, Any]:
 
 def read_inputs(args: Namespace, console: Console) -> tuple[Checkpoint, dict[str, Gaussians], Scene]:
     """The model, the files of --base and --against by path, and the scene; all with their screen-space filters."""
-    from .shared.alignment import align
-    from .shared.inputs import prepare_kernels, read_model_and_scene, with_filter
+    from .shared.inputs import align, prepare_kernels, read_model_and_scene, with_filter
 
     paths = [*([args.base] if args.base else []), *args.against]
     model, others, scene, device = read_model_and_scene(args, console, paths)

@@ -79,8 +79,7 @@ def outputs(args: Namespace) -> Outputs:
 
 
 def run(args: Namespace) -> dict[str, Any]:
-    from .shared.alignment import align
-    from .shared.inputs import pick_views, prepare_kernels, read_model_and_scene, with_filter
+    from .shared.inputs import align, pick_views, prepare_kernels, read_model_and_scene, with_filter
     from .shared.measure import Stopwatch, choose_dials, solve_dials
 
     console, watch, out = Console(args.quiet), Stopwatch(), Path(args.out)

@@ -221,8 +221,7 @@ def read(args: Namespace, console: Console, watch: Stopwatch) -> tuple[list[Chec
     Raises:
         ClodError: nothing is held out, a checkpoint does not match, or they are in different frames.
     """
-    from .shared.alignment import align
-    from .shared.inputs import on_device, pick_device, prepare_kernels, read_checkpoint, read_scene, with_filter
+    from .shared.inputs import align, on_device, pick_device, prepare_kernels, read_checkpoint, read_scene, with_filter
 
     found, device = list[Any](), pick_device(args.device, console)
     with watch.time("load"):

@@ -140,8 +140,7 @@ def make_page(args: Namespace, console: Console) -> tuple[dict[str, Response], d
     from clod_adapter.viewer.payload import Payload, page_config
     from clod_adapter.viewer.server import Response
 
-    from .shared.alignment import read_cameras
-    from .shared.inputs import read_checkpoint, with_filter, with_filter_of
+    from .shared.inputs import read_cameras, read_checkpoint, with_filter, with_filter_of
     from .shared.measure import solve_dials
 
     files, base = view_files(args.models), None

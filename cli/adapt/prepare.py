@@ -29,9 +29,9 @@ from clod_adapter.training.loop import time_steps
 from clod_adapter.training.plan import NOT_NEEDED, Decision, Override, Plan
 from clod_adapter.training.planner import make_plan
 
-from ..shared.alignment import align
 from ..shared.console import Console
 from ..shared.inputs import (
+    align,
     on_device,
     pick_device,
     place_scene,

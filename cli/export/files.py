@@ -23,9 +23,8 @@ from clod_adapter.io.formats.tileset import write_tileset
 from clod_adapter.training.camera_placement import place_cameras
 from clod_adapter.viewer.page import write_viewer_page
 
-from ..shared.alignment import read_cameras
 from ..shared.console import Console, duration
-from ..shared.inputs import named, prepare_kernels
+from ..shared.inputs import named, prepare_kernels, read_cameras
 from .formats import LOD_META, PACKED, PAGE
 
 PLACED = 16  # cameras placed where none are known

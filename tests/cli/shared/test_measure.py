@@ -54,7 +54,7 @@ def test_eval_keeps_the_order_of_its_rows(clod: Any, capture: Any, dialled: Path
 
 
 def test_an_interrupt_keeps_the_rows(clod: Any, capture: Any, dialled: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(frame_times, "render", pressing(frame_times.render, signal.SIGINT, at=3))
+    monkeypatch.setattr(frame_times, "render", pressing(frame_times.render, signal.SIGINT, at=7))
     done = clod("eval", dialled, "--images", capture.scene, "--sv", 1, 3, "--json")
     report = json.loads(done.out)
     assert report["interrupted"] and len(report["rows"]) == 2 and report["rows"][0]["frame_ms"] > 0, done
