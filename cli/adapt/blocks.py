@@ -12,8 +12,15 @@ from typing import Any
 import torch
 
 from clod_adapter.blocks.divide import Division, block_config, check_divisible, divide
-from clod_adapter.blocks.file import checked, load_block, refused_if_damaged, save_block
-from clod_adapter.blocks.train import Learned, adapt_block, merge
+from clod_adapter.blocks.train import (
+    Learned,
+    adapt_block,
+    checked,
+    load_block,
+    merge,
+    refused_if_damaged,
+    save_block,
+)
 from clod_adapter.cameras import View
 from clod_adapter.config import AdaptConfig
 from clod_adapter.evaluation.robustness import scene_fingerprint

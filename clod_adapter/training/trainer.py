@@ -39,7 +39,7 @@ class Trainer:
     Attributes:
         dial: what is trained, with the splats' parameters; count: the number of trained rows, the first ones.
         parameters: tensors by name, those of the dial too; ``stepped``: names of those that are trained.
-        mean: of the trained parameters over the last ``average`` of the steps; averaged: how many steps it has.
+        mean: of the trained parameters over the last steps, by the schedule; averaged: how many steps it has.
         loss: running mean of the photometric loss, NaN before the first step.
         done: steps; seconds: spent in them; start_seconds: spent before the first.
         held: ``[trained]`` bool, rows that some step did not move because their gradient was not finite.
