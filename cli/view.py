@@ -164,7 +164,7 @@ def make_page(args: Namespace, console: Console) -> tuple[dict[str, Response], d
     for note in notes:
         console.note(note)
     payloads = payloads_of([model, *others]) | ({BASE: Payload.of(base)} if base else {})
-    entries = {path: {"name": each.name, "href": path, "size": each.size} for path, each in payloads.items()}
+    entries = {path: {"name": each.name, "href": path} for path, each in payloads.items()}
     model_entry, base_entry = entries.pop(MODEL), entries.pop(BASE, None)
     shown, placed, rest = cameras or model.cameras, model.placed and not cameras, tuple(entries.values())
     page = served_page(page_config(model_entry, base_entry, shown, opening, rest, placed))

@@ -111,8 +111,7 @@ def page_config(
     """The page's configuration.
 
     Args:
-        model, base: their ``name``, and where the data are: ``href`` and ``size`` on the server, or ``element`` in the
-            page.
+        model, base: their ``name``, and where the data are: ``href`` on the server, or ``element`` in the page.
         cameras: selectable viewpoints, in this order, in the frame of the Gaussians.
         virtual_scale: the initial dial value, >= 0; None for 1 with photographs, else 0 (everything), and then what
             suits the device.

@@ -45,7 +45,7 @@ async function start() {
   stage.listeners.error = (error) => viewer.ui.showMessage(error.message);
   new ResizeObserver(actions.layOut).observe(elements.canvas);
   elements.canvas.addEventListener("webglcontextlost", () => viewer.ui.showMessage("The graphics device was lost; reload the page."));
-  viewer.ui.showName(config.title || "clod-adapt", 0, viewer.files.map(({ name }) => name));
+  viewer.ui.showName(config.title || "clod-adapter", 0, viewer.files.map(({ name }) => name));
   viewer.ui.update();
   if (!config.model) return viewer.ui.showProgress("Drop a splat here, or open one");
   await files.open(() => {
