@@ -28,7 +28,6 @@ from shown import Shown, serve  # noqa: E402
 
 IMAGES = ROOT / "docs" / "images"
 SIZE = {"width": 1280, "height": 800}
-LARGEST = 300_000  # bytes
 DIAL = 5.0
 SHARE = 0.2  # of the Gaussians, beside all
 TITLE = "The base, and the dial at a fifth of its Gaussians"
@@ -71,15 +70,10 @@ def viewer(chromium: Any, folder: Path) -> bytes:
 
 
 def keep(path: Path, picture: bytes) -> None:
-    """Writes a screenshot as WebP, as sharp as fits."""
-    for quality in (90, 80, 70, 60):
-        file = io.BytesIO()
-        Image.open(io.BytesIO(picture)).convert("RGB").save(file, "WEBP", quality=quality, method=6)
-        if len(file.getvalue()) <= LARGEST:
-            break
+    """Writes a screenshot as WebP."""
     with atomic_path(path) as temporary:
-        temporary.write_bytes(file.getvalue())
-    print(f"wrote {path}: {len(file.getvalue()) / 1e3:.0f} kB")
+        Image.open(io.BytesIO(picture)).convert("RGB").save(temporary, "WEBP", quality=80, method=6)
+    print(f"wrote {path}: {path.stat().st_size / 1e3:.0f} kB")
 
 
 if __name__ == "__main__":

@@ -34,7 +34,6 @@ from common import ROOT, SHARED, append, arguments, outcomes
 FILE = "portability.jsonl"
 SPACED = os.fsdecode("a folder, spàced".encode())  # under an ASCII locale too
 OTHER_LIBM = str(ROOT / "tests" / "other_libm")
-# As in the Makefile.
 PARALLEL = ["--numprocesses=auto", "--maxprocesses=4", "--dist=loadfile", "--no-loadscope-reorder"]
 
 

@@ -1,4 +1,4 @@
-"""Times of the CPU rasterizer and of a C++ baseline; or its agreement with a float64 reference; or extreme scenes.
+"""Times of the CPU rasterizer and of a C++ baseline; or its agreement with a float64 reference.
 
 The baseline is the yardstick, a hand-written C++ kernel outside the repository, built with g++; its fields are null
 where it is absent. Each runs in its own process with 2 threads, in turn step by step, so that drift of the machine
@@ -42,13 +42,11 @@ JOBS: Jobs = {}  # of a worker's process
 
 def main() -> None:
     parser = arguments(__doc__, record=FILE)
-    modes = parser.add_mutually_exclusive_group()
-    modes.add_argument("--accuracy", action="store_true", help="agreement with float64 instead of times")
-    modes.add_argument("--extreme", action="store_true", help="times of extreme scenes instead, ours only")
+    parser.add_argument("--accuracy", action="store_true", help="agreement with float64 instead of times")
     args = parser.parse_args()
     torch.set_num_threads(THREADS)
-    kind = "accuracy" if args.accuracy else "extreme" if args.extreme else "speed"
-    for row in {"accuracy": accuracy, "extreme": extreme, "speed": speed}[kind]():
+    kind = "accuracy" if args.accuracy else "speed"
+    for row in accuracy() if args.accuracy else speed():
         print(json.dumps(row, indent=1), flush=True)
         if args.record:
             append(FILE, {"benchmark": "rasterize", "kind": kind, **row})
@@ -205,26 +203,6 @@ def differentiate(scene: Workload, draw: Callable[..., Any], dtype: torch.dtype)
     image = draw(**leaves, camera=scene.camera, background=torch.zeros(3, dtype=dtype))[0]
     found = torch.autograd.grad((image * scene.weights).sum(), list(leaves.values()))
     return image.detach(), dict(zip(leaves, found, strict=True))
-
-
-def extreme() -> list[Row]:
-    """A step of each extreme scene, in turn with one of W1; and whether everything that comes out is finite."""
-    w1, rows = workloads.make("W1"), []
-    w1_draw, w1_leaves = ours(w1)
-    for name, make in workloads.extremes().items():
-        scene = make(w1)
-        draw, leaves = ours(scene)
-        steps, w1_steps = [], []
-        for _ in range(6):
-            w1_steps.append(timed_step(w1_draw, w1_leaves, w1.weights)[1])
-            steps.append(timed_step(draw, leaves, scene.weights)[1])
-        finite = all(leaf.grad.isfinite().all().item() for leaf in leaves) and draw().isfinite().all().item()
-        both = median(steps[1:])
-        rows.append({
-            "scene": name, "gaussians": len(scene.means), "both_ms": round(both, 2),
-            "times_w1": round(both / median(w1_steps[1:]), 2), "finite": finite,
-        })  # fmt: skip
-    return rows
 
 
 if __name__ == "__main__":

@@ -125,7 +125,7 @@ def exponent(points: Sequence[tuple[float, float]]) -> float:
 
 def print_tables() -> None:
     """Seconds by size with the exponents above start-up, from FROM on; peaks, and bytes a Gaussian between the last."""
-    last = {(row["command"], row["gaussians"]): row for row in stored(FILE)}
+    last = {(row["command"], row["gaussians"]): row for row in stored(FILE) if "command" in row}
     sizes = sorted({count for _, count in last})
     parts = [(command, "") for command in RUNS] + [("adapt", part) for part in ("load", "importance", "order", "step")]
     lines, peaks = [], []

@@ -55,7 +55,6 @@ def tune(start: clod.Gaussians, views: tuple[clod.View, ...], config: Tuning) ->
     tuned = [name for name in ATTRIBUTES if parameters[name].numel()]
     optimizer, random = RowAdam({name: parameters[name] for name in tuned}), np.random.default_rng(config.seed)
     everyone, order = torch.ones(len(start), dtype=torch.bool), list[int]()
-    # Compiled before the clock starts.
     _gradients(start, parameters, tuned, views[0], len(start) if config.prefixes else None)
     began = time.perf_counter()
     for step in tqdm(range(config.iters), leave=False):

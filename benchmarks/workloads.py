@@ -1,4 +1,4 @@
-"""The scenes that the rasterizer is timed on: W1 and W2, synthetic rooms, and extreme ones.
+"""The scenes that the rasterizer is timed on: W1 and W2, synthetic rooms.
 
 W1 and W2 are a room with spheres and boxes in it, its surfaces covered with small flat Gaussians of mixed
 opacity, one in twenty large and faint. The yardstick makes the same ones: ``differences`` compares.
@@ -6,8 +6,6 @@ opacity, one in twenty large and faint. The yardstick makes the same ones: ``dif
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 from clod_adapter.cameras import Camera
@@ -135,49 +133,3 @@ def differences(ours: Workload, theirs: dict[str, Array | int]) -> list[str]:
         "viewmat": camera.viewmat, "K": camera.K, "G": ours.weights, "width": camera.width, "height": camera.height,
     }  # fmt: skip
     return [name for name, value in mine.items() if not np.array_equal(np.asarray(value), np.asarray(theirs[name]))]
-
-
-def extremes() -> dict[str, Callable[[Workload], Workload]]:
-    """Scenes made from W1, with its camera and, where they need no other, its parameters."""
-    return {
-        "W1": lambda w1: w1,
-        "one that covers the image": lambda w1: covering(w1, 1),
-        "1,000 that cover the image": lambda w1: covering(w1, 1000),
-        "a million in one patch": lambda w1: patch(w1, 1_000_000),
-        "needles": needles,
-    }
-
-
-def covering(w1: Workload, count: int) -> Workload:
-    """Gaussians so large and faint that each is drawn at every pixel, and no pixel ends before the last."""
-    depths = torch.linspace(3, 5, count)
-    means = torch.stack([torch.zeros(count), torch.zeros(count), depths], 1)
-    return w1.changed(
-        "", slice(count), means=_in_front(w1.camera, means), scales=torch.full((count, 3), 20.0),
-        opacities=torch.full((count,), 0.5 if count == 1 else 8 / count),
-    )  # fmt: skip
-
-
-def patch(w1: Workload, count: int, edge: int = 16) -> Workload:
-    """Gaussians with one footprint, the circle around a square patch; its pixels end early, those on the rim never."""
-    camera, draw = w1.camera, torch.Generator().manual_seed(3)
-    focal = camera.K[0, 0]
-    depths = 3 + 2 * torch.rand(count, generator=draw)
-    centre = torch.tensor([camera.width, camera.height]) // (4 * edge) * 2 * edge + edge / 2 - camera.K[:2, 2]
-    points = torch.cat([centre / focal * depths[:, None], depths[:, None]], 1)
-    sigma = edge / 2 * math.sqrt(2) / math.sqrt(2 * math.log(255 * 0.02))  # alpha is 1/255 at the corners
-    rows = torch.arange(count) % len(w1.means)
-    return w1.changed(
-        "", rows, means=_in_front(camera, points), scales=(sigma * depths / focal)[:, None].repeat(1, 3),
-        opacities=torch.full((count,), 0.02),
-    )  # fmt: skip
-
-
-def needles(w1: Workload) -> Workload:
-    """W1's Gaussians, 0.3 long and a millionth of that thick: lines of about a hundred pixels."""
-    return w1.changed("", scales=torch.tensor([0.3, 3e-7, 3e-7]).repeat(len(w1.means), 1))
-
-
-def _in_front(camera: Camera, points: Tensor) -> Tensor:
-    """World positions of camera-space ``points [n, 3]``."""
-    return (points - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3]
