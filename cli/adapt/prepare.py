@@ -178,7 +178,7 @@ def forecast(run: Run, plan: Plan) -> dict[str, Any] | None:
     if steps < LONG or launched().size > 1:
         return None
     with run.console.status("timing a few steps ..."):
-        each, fixed = time_steps(plan.lean, run.scene, config, min(max(steps // 40, 8), 24), plan.subset)
+        each, fixed = time_steps(plan.lean, run.scene, config, min(max(steps // 40, 16), 24), plan.subset)
     release_memory()
     training = fixed + min(1.02 * steps * each, config.time_budget or math.inf)  # with saving the state
     dials, frame = len(report_dials(config.max_sv)) + 1, run.base_rows[0].frame_ms / 1e3 if run.base_rows else 0.0

@@ -84,6 +84,18 @@ def test_progress_has_an_estimate(clod: Any, capture: Any, monkeypatch: pytest.M
     assert re.search(r"^importance  50%, \d.* left, \d+/\d+$", done.err, re.M), done
 
 
+def test_forecast_of_time_and_memory(clod: Any, capture: Any) -> None:
+    """In a line before training, and with what the run took in the report; short runs have none."""
+    words = (capture.ply, "--images", capture.scene, "--max-sv", 2, "--out", "dial.ply", "--json", "--iters")
+    done = clod(*words, 100)
+    found = json.loads(done.out)["forecast"]
+    assert re.search(r"^forecast: \d+ seconds, \d.* [MG]B \(100 steps\)$", done.err, re.M), done
+    assert done.err.index("\nforecast: ") < done.err.index("\ntrained 100 steps")
+    assert found["steps"] == 100 and found["seconds"] > 0 and found["actual_seconds"] > 0
+    assert found["bytes"] == pytest.approx(found["actual_bytes"], rel=1 / 3)
+    assert json.loads(clod(*words, 1).out)["forecast"] is None
+
+
 def test_quiet_json_writes_nothing_to_stderr(clod: Any, capture: Any, dialled: Path, tmp_path: Path) -> None:
     for words in ((*TINY, "--seed", 4), ("--iters", -1)):
         done = clod(capture.ply, "--images", capture.scene, *words, "--quiet", "--json")
@@ -316,5 +328,5 @@ def test_a_result_worse_than_its_base_fails_unless_that_is_accepted(
         found = json.loads(capsys.readouterr().out)
         assert "dB" in found["loss"] and "train longer (--iters)" in found["loss"]
         base, full = (found[name][0]["psnr"] for name in ("base_rows", "rows"))
-        measured = f"{base - full:.2f} dB below the base" if photographs else f"{full:.2f} dB against the checkpoint's"
-        assert measured in found["loss"]
+        measured = f"is {base - full:.2f} dB below the base" if photographs else f"has {full:.2f} dB against"
+        assert f"s = 1 {measured}" in found["loss"]
