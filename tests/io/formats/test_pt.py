@@ -3,6 +3,7 @@ from __future__ import annotations
 import os
 import pickle
 import zipfile
+from copy import copy
 from pathlib import Path
 from typing import Any
 
@@ -80,6 +81,22 @@ def test_false_sizes_allocate_nothing(tmp_path: Path) -> None:
     with names as old, zipfile.ZipFile(tmp_path / "bomb.pt", "w", zipfile.ZIP_DEFLATED) as new:
         for name in old.namelist():
             new.writestr(name, old.read(name) + bytes(1 << 20))
+    with pytest.raises(ClodError, match="torch.save does not write"):
+        load(tmp_path / "bomb.pt")
+
+
+def test_overlapping_entries_are_refused(tmp_path: Path) -> None:
+    """A hundred names of the same megabyte."""
+    with zipfile.ZipFile(write(tmp_path / "a.pt", {"splats": splats()})) as old:
+        entries = {name: old.read(name) for name in old.namelist()}
+    with zipfile.ZipFile(tmp_path / "bomb.pt", "w") as new:
+        for name, data in entries.items():
+            new.writestr(name, data)
+        new.writestr("a/data/99", bytes(1 << 20))
+        for k in range(100):
+            more = copy(new.getinfo("a/data/99"))
+            more.filename = f"a/data/{k + 100}"
+            new.filelist.append(more)
     with pytest.raises(ClodError, match="torch.save does not write"):
         load(tmp_path / "bomb.pt")
 
