@@ -5,28 +5,25 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from clod_adapter.adapter import Adapter
 from clod_adapter.calibration import Calibration
 from clod_adapter.config import SH_COUNTS, AdaptConfig, AttenuationConfig, ScreenFilter
 from clod_adapter.errors import ClodError
 from clod_adapter.inspection.authorship import NERFSTUDIO, looks_like
 from clod_adapter.inspection.statistics import FAR, Spread, Values, values_of
-from clod_adapter.io.adapter_file import FORMAT, KEY, load_adapter
-from clod_adapter.io.checkpoint import plausibility, stated_filter
 from clod_adapter.io.file_formats import read_source
 from clod_adapter.io.ply import MASK_COLUMNS, Head, column_map
 from clod_adapter.io.ply_packed import is_packed
 from clod_adapter.io.ply_settings import COLUMN, PREFIX
-from clod_adapter.io.settings import Source, matching_calibration
-from clod_adapter.io.tensor_file import read_tensor_header
+from clod_adapter.io.settings import Source, matching_calibration, stated_filter
 from clod_adapter.io.values import FILTER, choice_of, dial_columns, in_question, prepared
 from clod_adapter.origin import Origin
-from clod_adapter.training.state import KEY as STATE_KEY
-from clod_adapter.training.state import load_state
+
+if TYPE_CHECKING:
+    from clod_adapter.adapter import Adapter
 
 NORMALS = ("nx", "ny", "nz")
 
@@ -149,6 +146,8 @@ def inspect(path: str | Path) -> Inspection:
         calibration, mismatch = matching_calibration(metadata, values.count)
         dial = Dial(metadata.attenuation, calibration)
         if not metadata.described:
+            from clod_adapter.io.checkpoint import plausibility  # here: other files are inspected without torch
+
             part = {name: rows.arrays[name][rows.keep] for name in ("means", "opacity_logits", "sigma_d")}
             notes += plausibility(part, metadata.attenuation)
         notes += mismatch
@@ -247,6 +246,10 @@ def _inspect_tensors(path: Path) -> tuple[str, dict[str, Any], tuple[str, ...]] 
     Raises:
         ClodError: it cannot be read, or is damaged.
     """
+    from clod_adapter.io.adapter_file import FORMAT, KEY, load_adapter
+    from clod_adapter.io.tensor_file import read_tensor_header
+    from clod_adapter.training.state import KEY as STATE_KEY
+
     metadata = read_tensor_header(path)[1]
     if STATE_KEY in metadata:
         return "the state of an interrupted run, for --resume", _state(path), ()
@@ -269,6 +272,8 @@ def _adapter(adapter: Adapter) -> dict[str, Any]:
 
 
 def _state(path: Path) -> dict[str, Any]:
+    from clod_adapter.training.state import load_state
+
     state, belongs = load_state(path)
     return {
         "kind": "state", "writer": None, "count": next((len(t) for t in state.tensors.values() if t.ndim), 0),

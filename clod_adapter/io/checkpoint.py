@@ -15,7 +15,7 @@ from torch import Tensor
 from clod_adapter.adapter import trim
 from clod_adapter.calibration import Calibration, Viewpoint
 from clod_adapter.cameras import Camera, with_near_planes
-from clod_adapter.config import CLASSIC, AttenuationConfig, ScreenFilter
+from clod_adapter.config import AttenuationConfig
 from clod_adapter.equation.attenuation import attenuate
 from clod_adapter.equation.distances import camera_of
 from clod_adapter.equation.units import in_world_units, nominal_distance
@@ -29,9 +29,8 @@ from clod_adapter.io.ply_settings import PREFIX, dial_constants, filter_constant
 from clod_adapter.io.settings import (
     WARNING,
     History,
-    Source,
-    implied_filter,
     matching_calibration,
+    stated_filter,
     tagged,
     that_fit,
 )
@@ -159,15 +158,6 @@ def load(path: str | Path, *, activated: Activated | None = None, origin: Origin
         source.sha256 if found.activated == "none" else f"{found.activated}:{source.sha256}", path, calibration,
         found.origin, filter_known=dial or metadata.screen_filter is not None,
     )  # fmt: skip
-
-
-def stated_filter(source: Source) -> ScreenFilter:
-    """The screen-space filter that a file states, or that other programs' comments and columns imply."""
-    metadata = source.metadata
-    if metadata.screen_filter is not None:
-        return metadata.screen_filter
-    settled = SIGMA in source.arrays or (metadata.described and source.head is None)
-    return CLASSIC if settled else implied_filter(source.comments, source.arrays)
 
 
 def _unusual(gaussians: Gaussians, origin: Origin) -> list[str]:

@@ -276,3 +276,12 @@ def implied_filter(comments: Sequence[str], columns: Iterable[str]) -> ScreenFil
     if "filter_3D" in columns or (is_antialiased(comments) and _BRUSH in comments):
         return FILTERS["mip"]
     return FILTERS["on"] if is_antialiased(comments) else CLASSIC
+
+
+def stated_filter(source: Source) -> ScreenFilter:
+    """The screen-space filter that a file states, or that other programs' comments and columns imply."""
+    metadata = source.metadata
+    if metadata.screen_filter is not None:
+        return metadata.screen_filter
+    settled = "sigma_d" in source.arrays or (metadata.described and source.head is None)
+    return CLASSIC if settled else implied_filter(source.comments, source.arrays)
