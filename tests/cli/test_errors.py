@@ -272,7 +272,7 @@ def test_two_runs_at_once(
             with claimed(outputs_of(second)):
                 pass
         else:
-            running = rf"^{said}: another run \(process {os.getpid()}\) is writing it; wait for that"
+            running = rf"^{said}: another run is writing it; wait for that"
             refused(clod, folder, running, second)
     assert everything(folder) == before
 
