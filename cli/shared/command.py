@@ -121,7 +121,7 @@ def manual() -> Path | None:
 OPTIONS: tuple[tuple[str, str, type, str], ...] = (
     ("keep", "N", int, "the dial value that keeps N Gaussians {where}"),
     ("fps", "F", float, "the dial value that renders F frames per second, by frame times {times}"),
-    ("psnr_drop", "DB", float, "the dial value that loses DB decibels against s = 1, {decibels}"),
+    ("psnr_drop", "DB", float, "the dial value that loses DB decibels against s = 1, by the calibration"),
 )  # fmt: skip
 BUDGETS = """\
 budgets, each solved for a dial value:
@@ -168,13 +168,12 @@ def add_misaligned_ok(options: _ActionsContainer) -> None:
 def add_dial_options(options: _ActionsContainer, sv_help: str, where: str, *, several: bool) -> None:
     """Adds --sv and the budgets, of which one may be given; ``several`` allows more than one value of it."""
     times = "measured first" if several else "in the file, or with --images measured first"
-    decibels = "by the calibration" if several else "by the calibration, or with --images measured"
     group: Any = options.add_mutually_exclusive_group()
     count = "+" if several else 1
     group.add_argument("--sv", metavar="S", type=float, nargs=count, help=sv_help)
     for name, metavar, kind, text in OPTIONS:
         option = f"--{name.replace('_', '-')}"
-        shown = text.format(where=where, times=times, decibels=decibels)
+        shown = text.format(where=where, times=times)
         group.add_argument(option, metavar=metavar, type=kind, nargs=count, help=shown)
     if not several:
         add_device_preset(group)
