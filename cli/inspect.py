@@ -189,5 +189,4 @@ examples:
     add_arguments=add_arguments,
     check=check,
     run=run,
-    needs_torch=False,
 )
