@@ -189,7 +189,8 @@ def forecast(run: Run, plan: Plan) -> dict[str, Any] | None:
         peak += 7 * sum(4 * t.numel() for name, t in plan.start.tensors().items() if name != "shN")
     seconds = training + measuring + _row_bytes(base) * len(base.gaussians) / WRITING
     minutes = f"{seconds:.0f} seconds" if seconds < 90 else f"{seconds / 60:.0f} minutes"
-    run.console.say(f"forecast: {minutes}, {in_words(peak)} ({steps:,} steps)")
+    memory = f", {in_words(peak)}" if peak else ""
+    run.console.say(f"forecast: {minutes}{memory} ({steps:,} steps)")
     run.forecast_at = time.perf_counter()
     return {"seconds": round(seconds, 1), "bytes": peak, "steps": steps}
 
@@ -202,9 +203,10 @@ def against_forecast(run: Run) -> dict[str, Any] | None:
 
 def peak_bytes() -> int:
     """Of the memory of this process so far; 0 where that is not known."""
-    if sys.platform == "win32":
+    try:
+        import resource
+    except ImportError:  # Windows
         return 0
-    import resource
 
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
 

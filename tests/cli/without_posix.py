@@ -1,0 +1,84 @@
+"""Removes from Python what Windows or macOS lack, then runs ``clod-adapt`` with each list of words of a JSON list.
+
+    python without_posix.py JSON
+
+Where a renamed, replaced or removed file is open or mapped in this process, that raises the PermissionError of Windows.
+"""
+
+import json
+import os
+import signal
+import sys
+from importlib.abc import MetaPathFinder
+
+import filelock  # noqa: F401  other packages look at sys.platform, and use what Linux has
+import numba  # noqa: F401
+import plyfile  # noqa: F401
+import pycolmap  # noqa: F401
+import safetensors.torch  # noqa: F401
+import skimage.metrics  # noqa: F401
+import torch  # noqa: F401
+import tqdm  # noqa: F401
+
+LINUX = ("sched_getaffinity", "sched_setaffinity", "posix_fadvise", "posix_fallocate", "memfd_create", "pidfd_open")
+POSIX = (
+    "fork", "forkpty", "wait3", "wait4", "getuid", "geteuid", "getgid", "getegid", "getpgid", "setsid", "killpg",
+    "mkfifo", "mknod", "fchmod", "chown", "getloadavg", "sysconf", "nice", "pread", "pwrite",
+)  # fmt: skip
+SIGNALS = ("SIGHUP", "SIGUSR1", "SIGUSR2", "SIGXCPU", "SIGKILL", "SIGALRM", "SIGCHLD", "SIGPIPE")
+MASKS = ("pthread_sigmask", "pthread_kill", "sigwait", "setitimer", "alarm", "siginterrupt")
+MODULES = ("fcntl", "resource", "termios", "pwd", "grp", "pty", "tty", "syslog", "readline")
+
+
+class Absent(MetaPathFinder):
+    def find_spec(self, name, path=None, target=None):
+        if name in MODULES:
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+        return None
+
+
+def open_files():
+    """What this process has open or mapped."""
+    found = set()
+    for number in os.listdir("/proc/self/fd"):
+        try:
+            found.add(os.readlink(f"/proc/self/fd/{number}"))
+        except OSError:  # that of the listing
+            continue
+    fd = READ(b"/proc/self/maps", os.O_RDONLY)
+    with os.fdopen(fd) as maps:
+        return found | {line.split(None, 5)[5].strip() for line in maps if line.count("/")}
+
+
+def watch(event, given):
+    global busy
+    if busy:
+        return
+    if event == "open" and str(given[0]).startswith(("/proc", "/sys", "/dev/fd")):
+        raise FileNotFoundError(2, "No such file or directory", given[0])
+    if event in ("os.rename", "os.remove", "os.rmdir"):
+        busy = True
+        taken = open_files()
+        busy = False
+        for name in given[: 2 if event == "os.rename" else 1]:
+            if os.path.abspath(os.fsdecode(name)) in taken:
+                raise PermissionError(13, "The process cannot access the file because it is being used", name)
+
+
+READ, busy = os.open, False
+for name in LINUX + POSIX:
+    if hasattr(os, name):
+        delattr(os, name)
+for name in SIGNALS + MASKS:
+    if hasattr(signal, name):
+        delattr(signal, name)
+for name in MODULES:
+    sys.modules.pop(name, None)
+sys.meta_path.insert(0, Absent())
+sys.addaudithook(watch)
+
+from clod_adapter.cli.main import main  # noqa: E402
+
+for words in json.loads(sys.argv[1]):
+    if (code := main(words)) != 0:
+        sys.exit(f"exit code {code}: {' '.join(words)}")
