@@ -76,6 +76,10 @@ def add_arguments(parser: ArgumentParser) -> None:
         "--order", choices=["extinction"],
         help="sort the Gaussians by the dial value at which they are culled, latest first, for prefix rendering",
     )  # fmt: skip
+    output.add_argument(
+        "--exact", action="store_true",
+        help="store float32 values in an .html page, in place of rounded ones: eight times the size",
+    )  # fmt: skip
     add_device(output, "time frames for --fps with --images")
 
 
@@ -120,6 +124,7 @@ def check_together(args: Namespace, bakes: bool) -> None:
         (page and (args.levels or args.camera is not None or args.order),
          f"a {PAGE} page contains the whole dial; remove --levels, --camera and --order"),
         (args.camera is not None and not bakes, "--camera needs a dial value to bake; give one, as in --sv 2"),
+        (args.exact and not page, f"--exact is for {PAGE} pages; another format has its own precision: remove it"),
         (args.images is not None and not (bakes or args.order or page),
          f"--images is used for baking, --order and {PAGE} only; add one of them, as in --sv 2"),
     )  # fmt: skip
@@ -200,7 +205,7 @@ def prepare(args: Namespace, model: Checkpoint, console: Console) -> tuple[Expor
     gaussians = model.gaussians
     if args.order:
         gaussians = gaussians.select(order_by_extinction(gaussians, target.cameras))
-    return Export(model, gaussians, target, cameras, bool(args.order), console), notes
+    return Export(model, gaussians, target, cameras, bool(args.order), args.exact, console), notes
 
 
 def dial_values(args: Namespace, export: Export, console: Console) -> tuple[list[float] | None, list[str]]:
@@ -333,7 +338,8 @@ other tools:
   SIBR reads a baked .ply of SH degree 1 to 3, and takes the degree from
   sh_degree in cfg_args next to the file.
   .html is the page of "clod-adapt view" in one file; --sv or a budget sets its
-  initial dial value. Its splat is rounded as in .spz.
+  initial dial value. Its splat is rounded as in .spz; the PSNR against MODEL is
+  measured and printed. With --exact it is float32.
   .sog, .compressed.ply and --lod-meta need splat-transform 3.7 with
   Node 22, on the PATH or in CLOD_SPLAT_TRANSFORM. Without a GPU, 100,000
   Gaussians take minutes for .sog.

@@ -6,11 +6,12 @@ from argparse import Namespace
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import fmean
 from tempfile import TemporaryDirectory
 
 from clod_adapter.bake import bake
 from clod_adapter.calibration import Viewpoint
-from clod_adapter.cameras import Camera
+from clod_adapter.cameras import Camera, spread
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.level_errors import geometric_errors, level_errors, looking
 from clod_adapter.gaussians import Gaussians
@@ -20,6 +21,8 @@ from clod_adapter.io.file_formats import write
 from clod_adapter.io.formats.lod_meta import cutting_options, read_leaves, write_errors
 from clod_adapter.io.formats.splat_transform import SplatTransform, time_limit
 from clod_adapter.io.formats.tileset import write_tileset
+from clod_adapter.metrics import psnr
+from clod_adapter.render import render
 from clod_adapter.training.camera_placement import place_cameras
 from clod_adapter.viewer.page import write_viewer_page
 
@@ -28,6 +31,7 @@ from ..shared.inputs import named, prepare_kernels, read_cameras
 from .formats import LOD_META, PACKED, PAGE
 
 PLACED = 16  # cameras placed where none are known
+COMPARED = 4  # views on which a page is compared with the exact values
 
 
 @dataclass(frozen=True)
@@ -82,6 +86,7 @@ class Export:
         target: the cameras to bake for.
         cameras: of the scene, for the views of a page.
         ordered: whether the rows are sorted by extinction.
+        exact: whether a page has float32 values.
         console: for progress.
     """
 
@@ -90,6 +95,7 @@ class Export:
     target: Target
     cameras: list[Camera]
     ordered: bool
+    exact: bool
     console: Console
 
     def content(self, virtual_scale: float | None) -> tuple[Gaussians, tuple[str, ...]]:
@@ -109,9 +115,7 @@ class Export:
     def write(self, path: Path, suffix: str, virtual_scale: float | None) -> tuple[int, tuple[str, ...]]:
         """Writes a file; its number of Gaussians, and notes on losses of the format."""
         if suffix == PAGE:
-            prepare_kernels(self.console, self.gaussians.means.device, training=False)  # for its picture
-            _, losses = write_viewer_page(path, self.model, cameras=self.cameras, virtual_scale=virtual_scale)
-            return len(self.gaussians), losses
+            return len(self.gaussians), self._write_page(path, virtual_scale)
         gaussians, about = self.content(virtual_scale)
         if suffix in PACKED:
             return len(gaussians), self._pack(path, suffix, gaussians, about)
@@ -156,6 +160,21 @@ class Export:
             errors = level_errors(levels, leaves, looking(self.target.cameras, levels[-1]), progress=meter)
         write_errors(index, meta, leaves, errors.tolist())
         return ()
+
+    def _write_page(self, path: Path, virtual_scale: float | None) -> tuple[str, ...]:
+        """Writes the page; notes on its losses, with the PSNR of its renders against those of the exact Gaussians."""
+        prepare_kernels(self.console, self.gaussians.means.device, training=False)
+        known = self.cameras
+        shown, losses = write_viewer_page(
+            path, self.model, cameras=known, virtual_scale=virtual_scale, exact=self.exact
+        )
+        if self.exact:
+            return losses
+        views = spread(self.cameras or self.model.cameras or place_cameras(self.gaussians, views=COMPARED), COMPARED)
+        with self.console.status("comparing with the exact values ..."):
+            found = fmean(psnr(render(shown, each).image, render(self.gaussians, each).pixels) for each in views)
+        about = f"renders of the page have a PSNR of {found:.1f} dB against the exact file ({len(views)} views, s = 1)"
+        return (*losses, f"{about}; --exact keeps all digits")
 
     def _pack(self, path: Path, suffix: str, gaussians: Gaussians, about: tuple[str, ...]) -> tuple[str, ...]:
         with TemporaryDirectory(dir=path.parent, prefix=".tmp-") as folder:

@@ -43,7 +43,7 @@ FORMATS = {
     ".splat": ExportFormat(("8 bits, SH degree 0",), ordered=False, sigma=False),
     **PACKED,
     PAGE: ExportFormat(
-        ("the viewer with the splat, in one file, as .spz",),
+        ("the viewer with the splat, in one file;", "as .spz, or with --exact as float32"),
         ordered=False,
     ),
 }

@@ -150,6 +150,7 @@ ERRORS = [
     ("export bare.ply -o x.ply --fps 60", "bare.ply: has no calibration .* --fps needs"),
     ("export bare.ply -o x.ply --sv 2 --levels 1,2", "--levels gives the dial values; give no other"),
     ("export bare.ply -o page.html --levels 1,2", "remove --levels, --camera and --order"),
+    ("export bare.ply -o x.spz --exact", "--exact is for .html pages; another format has its own precision"),
     ("export bare.ply -o x.ply --levels 1,4,2", "--levels: '1,4,2' must be ascending dial values of at least 0"),
     ("export bare.ply -o x.ply --levels 1,inf", "--levels: '1,inf' must be"),
     ("export bare.ply -o x --lod-meta", "--lod-meta needs several levels; give them"),

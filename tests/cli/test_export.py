@@ -457,4 +457,15 @@ def test_page_holds_the_splat_and_its_dial(
     held = clod_adapter.load(tmp_path / "held.spz")
     assert len(held.gaussians) == output["count"] == 300 and output["bytes"] == (tmp_path / "page.html").stat().st_size
     assert held.gaussians.sigma_d is not None and held.calibration is not None
-    assert [path.name for path in tmp_path.glob(".tmp-*")] == []
+    said = re.search(r"PSNR of (\S+) dB against the exact file \(4 views, s = 1\)", done.err)
+    assert said and float(said[1]) > 40 and [path.name for path in tmp_path.glob(".tmp-*")] == []
+
+
+def test_exact_page_holds_every_digit(clod: Any, dialled: Path, tmp_path: Path) -> None:
+    done = clod("export", dialled, "-o", "page.html", "--exact")
+    assert done.code == 0 and "PSNR" not in done.err
+    text = (tmp_path / "page.html").read_text(encoding="utf-8")
+    (tmp_path / "held.ply").write_bytes(base64.b64decode(re.findall('id="clod-model">(.*?)</script>', text)[0]))
+    held, model = clod_adapter.load(tmp_path / "held.ply").gaussians, clod_adapter.load(dialled).gaussians
+    for name, value in model.tensors().items():
+        assert torch.equal(held.tensors()[name], value), name
