@@ -192,7 +192,12 @@ def _refuse_long_lines(file: io.BufferedReader, head: Head) -> None:
 
 
 def _native(mapped: np.ndarray) -> np.ndarray:
-    return np.array(mapped, mapped.dtype.newbyteorder("="))
+    kind = mapped.dtype.newbyteorder("=")
+    if mapped.dtype != kind:
+        return np.array(mapped, kind)
+    rows = np.empty(mapped.shape, kind)
+    rows.view(np.uint8)[:] = mapped.view(np.uint8)  # at once; numpy copies rows column by column
+    return rows
 
 
 def _arrays(rows: np.ndarray, sh_degree: int) -> Arrays:
