@@ -5,11 +5,13 @@ Any property order, byte order or ascii; plain, or PlayCanvas's compressed layou
 
 from __future__ import annotations
 
+import hashlib
 import io
+import itertools
 import os
 import re
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
@@ -153,16 +155,13 @@ def read_ply(path: Path) -> Source:
     try:
         file_formats.refuse_irregular(path)
         with open(path, "rb") as file:
-            head = parse_head(path, file.read(HEADER_LIMIT))
+            start = file.read(HEADER_LIMIT)
+            head = parse_head(path, start)
             degree = _degree(path, head.ply)
             _check_length(path, head, os.fstat(file.fileno()).st_size)
             if head.ply.text:
                 _refuse_long_lines(file, head)
-            sha256 = file_formats.file_sha256(file)
-            file.seek(0)
-            with warnings.catch_warnings(), np.errstate(over="ignore"):
-                warnings.simplefilter("ignore")  # of text that is beyond float32's range
-                ply = PlyData.read(file)
+            elements, sha256 = _elements(file, head, start[: head.size])
     except OSError as error:
         raise ClodError(f"{path}: cannot be read ({error.strerror or error}); check the path") from error
     except (PlyParseError, ValueError, TypeError, MemoryError) as error:
@@ -171,11 +170,10 @@ def read_ply(path: Path) -> Source:
         raise ClodError(f"{path}: damaged or truncated ({error}); copy or export it again") from error
     comments = all_comments(head.ply)
     if is_packed(head.ply):
-        arrays = unpack(path, {element.name: element.data for element in ply}, degree)
+        arrays = unpack(path, elements, degree)
         metadata = ply_metadata(path, comments, dial=False)
         return Source(arrays, metadata, sha256, (NOTE,), comments, head=head)
-    rows = _native(ply["vertex"].data)
-    del ply  # and with it the mapping
+    rows = elements["vertex"]
     arrays = _arrays(rows, degree)
     metadata = ply_metadata(path, comments, rows, dial=SIGMA in arrays)
     return Source(arrays, metadata, sha256, _not_kept(head.ply), comments, not metadata.described, rows, head)
@@ -191,13 +189,43 @@ def _refuse_long_lines(file: io.BufferedReader, head: Head) -> None:
     text.detach()
 
 
-def _native(mapped: np.ndarray) -> np.ndarray:
-    kind = mapped.dtype.newbyteorder("=")
-    if mapped.dtype != kind:
-        return np.array(mapped, kind)
-    rows = np.empty(mapped.shape, kind)
-    rows.view(np.uint8)[:] = mapped.view(np.uint8)  # at once; numpy copies rows column by column
-    return rows
+def _elements(file: io.BufferedReader, head: Head, header: bytes) -> tuple[dict[str, np.ndarray], str]:
+    """The rows of elements by name, native byte order, and the SHA-256 of the bytes of the file that they are from.
+
+    The bytes are read once, and not mapped: another program may write the file meanwhile. Elements from the first one
+    with lists on are left out where the Gaussians stand before it.
+    """
+    plain = list(itertools.takewhile(lambda both: not head.ply.text and not _has_lists(both[0]), _counted(head)))
+    file.seek(head.size)
+    if "vertex" not in {element.name for element, _ in plain}:
+        content = header + file.read()
+        with warnings.catch_warnings(), np.errstate(over="ignore"):
+            warnings.simplefilter("ignore")  # of text that is beyond float32's range
+            parsed = PlyData.read(io.BytesIO(content))
+        return {each.name: _native(each.data) for each in parsed}, hashlib.sha256(content).hexdigest()
+    digest, found = hashlib.sha256(header), dict[str, np.ndarray]()
+    for element, count in plain:
+        rows = np.empty(count, element.dtype(head.ply.byte_order))
+        raw = rows.view(np.uint8).data if rows.nbytes else memoryview(bytearray())
+        if (size := file.readinto(raw)) < len(raw):
+            raise ValueError(f"{size // rows.itemsize} of {count} rows are there")
+        digest.update(raw)
+        found[element.name] = _native(rows)
+    while block := file.read(1 << 20):
+        digest.update(block)
+    return found, digest.hexdigest()
+
+
+def _counted(head: Head) -> Iterator[tuple[PlyElement, int]]:
+    return zip(head.ply, head.counts, strict=True)
+
+
+def _has_lists(element: PlyElement) -> bool:
+    return any(isinstance(each, PlyListProperty) for each in element.properties)
+
+
+def _native(rows: np.ndarray) -> np.ndarray:
+    return rows.astype(rows.dtype.newbyteorder("="), copy=False)
 
 
 def _arrays(rows: np.ndarray, sh_degree: int) -> Arrays:
@@ -236,10 +264,10 @@ def _not_kept(header: PlyData) -> tuple[str, ...]:
 def _check_length(path: Path, head: Head, length: int) -> None:
     """Refuses a file that is too short for the least bytes that the rows of its header take."""
     least = head.size - (1 if head.ply.text else 0)  # the last line may lack its end
-    for element, count in zip(head.ply, head.counts, strict=True):
+    for element, count in _counted(head):
         least += count * _least_bytes(element, head.ply.text)
     if least > length:
-        rows = ", ".join(f"{count} of {e.name}" for e, count in zip(head.ply, head.counts, strict=True))
+        rows = ", ".join(f"{count} of {element.name}" for element, count in _counted(head))
         raise ClodError(
             f"{path}: is truncated, or its header is damaged: it claims {rows}, which take at least {least} bytes, "
             f"and the file has {length}; copy or export it again"

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
+import threading
 import tracemalloc
 import warnings
 from pathlib import Path
@@ -95,6 +97,29 @@ COMMENTED = header("ascii", 0).replace(b"element", b"comment @\nelement")
 
 
 LIST = "element face 1\nproperty list uchar int a\n"
+
+
+def test_the_fingerprint_is_of_the_rows_that_were_read(tmp_path: Path) -> None:
+    """Another program writes the file in place all the while, as trainers do."""
+    path, start, ended = tmp_path / "in.ply", header("binary_little_endian", 20_000), threading.Event()
+    path.write_bytes(start + np.ones((20_000, 17), "<f4").tobytes())
+
+    def rewrite() -> None:
+        with open(path, "r+b", buffering=0) as file:
+            for k in itertools.takewhile(lambda _: not ended.is_set(), itertools.count()):
+                file.seek(len(start))
+                file.write(np.full((20_000, 17), (1 + k % 100) / 100, "<f4").tobytes())
+
+    writer = threading.Thread(target=rewrite)
+    writer.start()
+    try:
+        for _ in range(8):
+            found = load(path, activated="none")
+            assert found.vertex is not None
+            assert found.fingerprint == hashlib.sha256(start + found.vertex.tobytes()).hexdigest()
+    finally:
+        ended.set()
+        writer.join()
 
 
 @pytest.mark.parametrize(
