@@ -47,7 +47,7 @@ class Progress:
         time_share: the share of the time budget that is used; 0 without one.
         loss: running mean of the photometric loss at the smaller dial value of each view, NaN in other phases. In the
             first half of the steps that is above 1 in every second one.
-        gaussians: in training, gives the result so far (within the last ``average`` of the steps the mean). It shares
+        gaussians: in training, gives the result so far (while steps are averaged the mean). It shares
             memory with the parameters, so use it within the listener.
         state: in training, gives the ``TrainingState`` to resume from, likewise.
         error: why training ends here: a process was lost, or a step failed.

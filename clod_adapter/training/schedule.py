@@ -27,7 +27,8 @@ class Schedule:
         coarse: share of the training, at first, in which steps beyond s = 1 have photographs of half the size (not
             small ones).
         lr_final: final learning rates as a share of the first ones, between which they decay exponentially.
-        average: share of the steps, at the end, whose parameters are averaged for the result.
+        average: share of the steps, at the end, whose parameters are averaged for the result; of a training that ends
+            earlier in the schedule, share of the steps up to there.
         rendered, counted: times max_sv, the largest dial values of steps, and of counts.
     """
 

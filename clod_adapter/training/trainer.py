@@ -109,7 +109,9 @@ class Trainer:
             self.sampler.restore(*before)
             raise
         self.loss = loss if math.isnan(self.loss) else 0.98 * self.loss + 0.02 * loss
-        if whole >= end - self.dial.schedule.average:  # the optimizer continues from the parameters, not from the mean
+        # Of a part of the schedule, as of the whole: the last steps up to its end. The optimizer continues from the
+        # parameters, not from the mean.
+        if whole >= end * (1 - self.dial.schedule.average):
             self.averaged += 1
             add_to_mean(self.mean, self.trained(), self.averaged)
         self.done += 1

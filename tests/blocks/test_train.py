@@ -30,6 +30,7 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.importance import initialize
 from clod_adapter.progress import Phase, Progress
 from clod_adapter.render import render
+from clod_adapter.training.dial import TrainableSubset
 from clod_adapter.training.loop import adapt
 from clod_adapter.training.state import TrainingState
 from clod_adapter.training.target_count import target_curve
@@ -112,6 +113,24 @@ def test_a_block_has_the_views_that_see_it(divided: Division, captured: tuple[Ga
     # In the capture, whose cameras stand around it, all see everything.
     assert all(divided.views(k) == list(range(len(captured[1].train))) for k in range(BLOCKS))
     torch.testing.assert_close(divided.seen.sum(1), torch.ones(len(divided.seen)))
+
+
+@pytest.mark.parametrize(
+    ("span", "averaged"), [((0.0, 1.0), 4), ((0.0, 0.75), 4), ((0.75, 1.0), 16)], ids=["undivided", "first", "second"]
+)
+def test_the_last_fifth_of_the_schedule_so_far_is_averaged(
+    captured: tuple[Gaussians, Scene], span: tuple[float, float], averaged: int
+) -> None:
+    """In the first pass the last fifth of its own steps; in the second that of both passes' steps."""
+    base, scene = captured
+    states = list[TrainingState]()
+
+    def watch(now: Progress) -> None:
+        if now.phase is Phase.TRAINING and now.done == 20:
+            states.append(now.state())
+
+    adapt(base, scene, AdaptConfig(iters=20), watch, subset=TrainableSubset(len(base), span=span))
+    assert [state.averaged for state in states] == [averaged]
 
 
 def test_rows_left_out_of_the_context_are_not_needed(captured: tuple[Gaussians, Scene]) -> None:
