@@ -26,6 +26,7 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.importance import initialize, scene_distance
 from clod_adapter.io.checkpoint import load, save
 from clod_adapter.progress import Phase, Progress, Stopped
+from clod_adapter.training.dial import TrainableSubset
 from clod_adapter.training.loop import Adapted, TrainingState, adapt
 from clod_adapter.training.planner import make_plan
 from runs import change_step, config_of, fail, states_of
@@ -336,3 +337,14 @@ def test_a_bar_by_default(captured: Pair, monkeypatch: pytest.MonkeyPatch, capsy
     for progress in (False, lambda now: None):
         adapt(*captured, iters=2, progress=progress)
     assert capsys.readouterr().err == ""
+
+
+def test_the_paper_counts_the_trained_part_of_a_full_context(captured: Pair) -> None:
+    """Other Gaussians that are drawn without a dial are no part of the share kept: here invisible ones."""
+    base, scene = captured
+    faint = base.replace(opacity_logits=torch.full_like(base.opacity_logits, -40.0))
+    more = base.replace(**{n: torch.cat([t, faint.tensors()[n]]) for n, t in base.tensors().items()})
+    part, config = TrainableSubset(len(base), full_context=True), AdaptConfig.paper(iters=6, reg_weight=100.0)
+    alone, among = (adapt(each, scene, config, subset=part).gaussians for each in (base, more))
+    for name, tensor in alone.tensors().items():
+        torch.testing.assert_close(among.tensors()[name][: len(base)], tensor, rtol=1e-4, atol=1e-4)
