@@ -153,17 +153,18 @@ def path(cameras: Sequence[Camera], steps: int) -> list[Camera]:
     require(steps >= 2, "steps", steps, "at least 2")
     if len(cameras) < 2:
         raise ClodError(f"a camera path needs at least two cameras, not {len(cameras)}")
-    first, centres = cameras[0], np.stack([camera.position.double().numpy() for camera in cameras])
+    first, viewmats = cameras[0], torch.stack([camera.viewmat.detach().double().cpu() for camera in cameras]).numpy()
+    centres = -np.einsum("nji,nj->ni", viewmats[:, :3, :3], viewmats[:, :3, 3])
     lengths = np.linalg.norm(np.diff(centres, axis=0), axis=1)
     lengths = np.maximum(lengths, 1e-9 * lengths.sum() or 1.0)
     places = np.concatenate([[0.0], lengths.cumsum()])
     at = np.linspace(0, places[-1], steps + 1)
     poses = np.tile(np.eye(4), (steps + 1, 1, 1))
-    poses[:, :3, :3] = Slerp(places, Rotation.from_matrix([c.viewmat[:3, :3].numpy() for c in cameras]))(at).as_matrix()
+    poses[:, :3, :3] = Slerp(places, Rotation.from_matrix(viewmats[:, :3, :3]))(at).as_matrix()
     moved = np.stack([np.interp(at, places, axis) for axis in centres.T], 1)
     poses[:, :3, 3] = -np.einsum("nij,nj->ni", poses[:, :3, :3], moved)
-    viewmats = torch.from_numpy(poses).to(first.viewmat)
-    return [Camera(viewmat, first.K, first.width, first.height, near=first.near) for viewmat in viewmats]
+    found = torch.from_numpy(poses).to(first.viewmat)
+    return [Camera(viewmat, first.K, first.width, first.height, near=first.near) for viewmat in found]
 
 
 def _change(delta: Tensor) -> tuple[float, float]:

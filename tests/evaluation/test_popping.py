@@ -66,7 +66,8 @@ def test_camera_motion_alone_is_no_change() -> None:
 
 
 def test_path_passes_through_the_cameras_at_equal_steps() -> None:
-    cameras = [dataclasses.replace(camera, near=1e-4) for camera in ring(8, 32, 24)[:3]]
+    matrices = [camera.viewmat.clone().requires_grad_() for camera in ring(8, 32, 24)[:3]]  # as where poses are learned
+    cameras = [dataclasses.replace(ring(8, 32, 24)[0], viewmat=each, near=1e-4) for each in matrices]
     found = path(cameras, 40)
     assert len(found) == 41 and {camera.near for camera in found} == {1e-4}
     for want, got in ((cameras[0], found[0]), (cameras[2], found[-1])):
