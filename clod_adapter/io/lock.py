@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -27,12 +28,14 @@ def output_lock(final: Path, *, of: Path | None = None) -> Iterator[None]:
     from filelock import FileLock, Timeout  # here: --help needs no lock
 
     path = lock_file(final)
-    lock = FileLock(path, timeout=0)
+    lock, busy = FileLock(path, timeout=0), "another run is writing it; wait for that, or choose another name"
     try:
         lock.acquire()
     except Timeout as error:
-        raise ClodError(f"{of or final}: another run is writing it; wait for that, or choose another name") from error
-    except (OSError, NotImplementedError):  # no locks here
+        raise ClodError(f"{of or final}: {busy}") from error
+    except (OSError, NotImplementedError) as error:  # no locks here
+        if isinstance(error, PermissionError) and os.path.exists(path):  # the run of another user
+            raise ClodError(f"{of or final}: {busy}") from error
         with suppress(OSError):
             path.unlink()
     try:

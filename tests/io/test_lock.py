@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from clod_adapter.errors import ClodError
-from clod_adapter.io.atomic import remove_leftovers
+from clod_adapter.io.atomic import lock_file, remove_leftovers
 from clod_adapter.io.lock import output_lock
 
 fcntl = pytest.importorskip("fcntl", reason="locks are those of POSIX")
@@ -50,3 +50,16 @@ def test_file_system_without_locks(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(fcntl, "flock", refuse)
     with output_lock(tmp_path / "out.ply"), output_lock(tmp_path / "out.ply"):
         assert os.listdir(tmp_path) == []
+
+
+def test_the_lock_of_another_user_keeps_out_and_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a shared folder; root, who may run this, can open every file."""
+
+    def refuse(*_: object) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    lock_file(tmp_path / "out.ply").touch()
+    monkeypatch.setattr(os, "open", refuse)
+    with pytest.raises(ClodError, match="another run is writing it"), output_lock(tmp_path / "out.ply"):
+        raise AssertionError("the body must not run")
+    assert lock_file(tmp_path / "out.ply").exists()
