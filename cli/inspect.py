@@ -189,4 +189,5 @@ examples:
     add_arguments=add_arguments,
     check=check,
     run=run,
+    needs_torch=False,  # loaded for files other than PLY
 )

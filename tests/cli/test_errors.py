@@ -298,12 +298,12 @@ LIGHT = """
 base.ply --images scene --max-sv 0 | base.ply --images scene --out nowhere/dial.ply
 eval base.ply --images scene --sv=-1 | eval base.ply --images scene --keep 10 | render base.ply --images scene -o scene
 export base.ply --sv 2 -o x.ply | export bare.ply --psnr-drop 2 -o x.ply | export bare.ply -o x.splat
-apply text.ply dial.safetensors -o dial.ply
+apply text.ply dial.safetensors -o dial.ply | inspect base.ply
 view bare.ply bare.ply --device-preset phone | export base.ply --device-preset phone -o x.ply
 """
 
 
-def test_help_and_errors_do_not_import_torch(folder: Path) -> None:
+def test_help_errors_and_inspect_do_not_import_torch(folder: Path) -> None:
     lines = [line.split() for line in LIGHT.replace("\n", " | ").split(" | ") if line]
     script = (
         "import json, sys\n"
@@ -318,9 +318,9 @@ def test_help_and_errors_do_not_import_torch(folder: Path) -> None:
     done = subprocess.run(
         [sys.executable, "-c", script, json.dumps(lines)], cwd=folder, capture_output=True, text=True, check=False
     )
-    wanted = [0 if line[-1] in ("--help", "--version") else 2 for line in lines]
+    wanted = [0 if line[-1] in ("--help", "--version") or line[0] == "inspect" else 2 for line in lines]
     assert "Traceback" not in done.stderr and json.loads(done.stdout.splitlines()[-1]) == wanted, done
-    assert done.returncode == 2 and len(lines) == 20
+    assert done.returncode == 2 and len(lines) == 21
 
 
 def test_help_is_fast() -> None:
