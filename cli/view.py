@@ -19,7 +19,6 @@ from clod_adapter._support.text import as_text
 from clod_adapter._support.version import package_version
 from clod_adapter.errors import ClodError
 from clod_adapter.io.file_formats import FORMATS
-from clod_adapter.io.ply_settings import VIEWPOINT
 from clod_adapter.progress import Stopped
 
 from .shared.command import (
@@ -112,7 +111,7 @@ def check(args: Namespace) -> None:
     if args.images is not None:
         check_scene(args.images)
     elif args.device_preset:
-        check_stored_cameras(files[0], may_store(files[0], VIEWPOINT))
+        check_stored_cameras(files[0], may_store(files[0], "viewpoint"))
 
 
 def run(args: Namespace) -> None:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
+if TYPE_CHECKING:
+    import numpy as np
 
 Origin = tuple[float, float, float]
 NOWHERE: Origin = (0.0, 0.0, 0.0)
@@ -21,6 +22,8 @@ def origin_of(means: np.ndarray) -> Origin:
     The median, rounded to multiples of a power of two near the spread (the middle 80 % along the widest axis), so that
     subtracting it from float32 coordinates is exact.
     """
+    import numpy as np  # here: --help needs none
+
     with np.errstate(invalid="ignore"):  # signalling NaN
         finite = np.isfinite(means).all(1)
     if not finite.any():
@@ -48,6 +51,8 @@ def parse_origin(values: Any) -> Origin:
 
 def relative(means: np.ndarray, at: Sequence[float], origin: Sequence[float]) -> np.ndarray:
     """``[N, 3]`` float32: coordinates that are relative to ``at``, relative to ``origin``."""
+    import numpy as np  # here: --help needs none
+
     with np.errstate(over="ignore", invalid="ignore"):
         if tuple(at) == tuple(origin):
             return means.astype(np.float32, copy=False)

@@ -135,7 +135,7 @@ def test_import_is_light_and_names_are_lazy(tmp_path: Path) -> None:
     """Names are imported on first use, and functions stay functions where a submodule has the same name."""
     heavy = ["torch", "numpy", "numba", "gsplat", "pycolmap", "plyfile", "matplotlib", "skimage"]
     code = (
-        f"import sys, {PACKAGE}\n"
+        f"import sys, {PACKAGE}, {PACKAGE}.cli.main\n"
         f"assert not [m for m in {heavy} if m in sys.modules]\n"
         f"import {PACKAGE} as package, {PACKAGE}.render, {PACKAGE}.bake\n"
         "kinds = {name: type(getattr(package, name)).__name__ for name in package.__all__}\n"

@@ -13,8 +13,6 @@ from typing import TYPE_CHECKING, Any, NoReturn
 from clod_adapter.config import DEVICES, FILTERS
 from clod_adapter.errors import ClodError
 from clod_adapter.io.file_formats import PLY, check_readable, file_has_dial, format_of
-from clod_adapter.io.ply import all_comments, read_head
-from clod_adapter.io.ply_settings import PREFIX, ROW
 from clod_adapter.io.scene.folder import find_cameras
 from clod_adapter.report.charts import chart_file
 from clod_adapter.report.style import check_matplotlib
@@ -236,7 +234,7 @@ def check_dials(args: Namespace, model: str, *, measured: Collection[str] = ("fp
     if not model_has_dial(model):
         raise ClodError(f"{model}: has no sigma_d, which {option} needs; adapt it first: clod-adapt {model} ...")
     needed = name != "keep" and name not in measured
-    if needed and not may_store(model, ROW):
+    if needed and not may_store(model, "calibrated"):
         raise ClodError(
             f"{model}: has no calibration in its header, which {option} needs; adapt it again without interrupting, "
             "or give --sv or --keep"
@@ -244,7 +242,10 @@ def check_dials(args: Namespace, model: str, *, measured: Collection[str] = ("fp
 
 
 def may_store(model: str, name: str) -> bool:
-    """Whether a PLY's header has a comment of this name (``ply.header``); True of other formats, which must be read."""
+    """Whether a PLY's header has a comment of this name (``ply_settings``); True of formats that must be read."""
+    from clod_adapter.io.ply import all_comments, read_head  # here: --help needs no plyfile
+    from clod_adapter.io.ply_settings import PREFIX
+
     path = Path(model)
     if format_of(path) is not PLY:
         return True

@@ -32,6 +32,8 @@ def output_lock(final: Path, *, of: Path | None = None) -> Iterator[None]:
     try:
         lock.acquire()
     except Timeout as error:
+        if not path.exists():  # also raised where no file can be made
+            raise ClodError(f"{of or final}: cannot be written; check the path") from error
         raise ClodError(f"{of or final}: {busy}") from error
     except (OSError, NotImplementedError) as error:  # no locks here
         if isinstance(error, PermissionError) and os.path.exists(path):  # the run of another user
