@@ -139,10 +139,11 @@ def run(command: Command, args: argparse.Namespace) -> int:
     if args.json:
         check_printed()
     command.check(args)
-    with claimed(command.outputs(args)):
+    with signals_as_interrupt(), claimed(command.outputs(args)):
         if command.needs_torch:
             import_library(args.quiet)
         aside = io.StringIO() if args.quiet else sys.stderr
+        # Again: pycolmap, imported just now, sets a handler.
         with redirect_stdout(aside) if args.json else nullcontext(), signals_as_interrupt():
             report = command.run(args)
     if args.json and report is not None:
