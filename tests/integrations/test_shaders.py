@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from contextlib import closing
 from importlib.resources import files
 from typing import Any
@@ -21,36 +22,29 @@ CALLS = {  # the golden rows of each function, and its call
 
 # One vertex a row, its result caught by transform feedback.
 WEBGL = """([source, call, rows]) => {
-  const gl = document.createElement("canvas").getContext("webgl2");
-  const shader = (type, text) => {
-    const made = gl.createShader(type);
-    gl.shaderSource(made, "#version 300 es\\nprecision highp float;\\n" + text);
-    gl.compileShader(made);
-    if (!gl.getShaderParameter(made, gl.COMPILE_STATUS)) throw new Error(gl.getShaderInfoLog(made));
-    return made;
-  };
-  const program = gl.createProgram();
-  gl.attachShader(program, shader(gl.VERTEX_SHADER, `
-    in vec4 a; in vec3 b; out float drawn;
-    ${source}
-    void main() { drawn = ${call}; gl_PointSize = 1.0; }`));
-  gl.attachShader(program, shader(gl.FRAGMENT_SHADER, "out vec4 colour; void main() { colour = vec4(1.0); }"));
+  const gl = document.createElement("canvas").getContext("webgl2"), program = gl.createProgram();
+  const vertex = `in vec4 a; in vec3 b; out float drawn;\n${source}\nvoid main() { drawn = ${call}; }`;
+  for (const [type, text] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, "void main() {}"]]) {
+    const shader = gl.createShader(type);
+    gl.shaderSource(shader, "#version 300 es\\nprecision highp float;\\n" + text);
+    gl.compileShader(shader);
+    gl.attachShader(program, shader);
+  }
+  gl.bindAttribLocation(program, 0, "a");
+  gl.bindAttribLocation(program, 1, "b");
   gl.transformFeedbackVaryings(program, ["drawn"], gl.SEPARATE_ATTRIBS);
   gl.linkProgram(program);
-  if (!gl.getProgramParameter(program, gl.LINK_STATUS)) throw new Error(gl.getProgramInfoLog(program));
+  const log = gl.getAttachedShaders(program).map((shader) => gl.getShaderInfoLog(shader)).join();
+  if (!gl.getProgramParameter(program, gl.LINK_STATUS)) throw new Error(log);
   gl.useProgram(program);
   gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
   gl.bufferData(gl.ARRAY_BUFFER, new Float32Array(rows.flat()), gl.STATIC_DRAW);
-  for (const [name, size, offset] of [["a", 4, 0], ["b", 3, 16]]) {
-    const at = gl.getAttribLocation(program, name);
-    if (at < 0) continue;  // not read by this function
+  for (const [at, size] of [[0, 4], [1, 3]]) {
     gl.enableVertexAttribArray(at);
-    gl.vertexAttribPointer(at, size, gl.FLOAT, false, 28, offset);
+    gl.vertexAttribPointer(at, size, gl.FLOAT, false, 28, 16 * at);
   }
-  const caught = gl.createBuffer();
-  gl.bindBuffer(gl.TRANSFORM_FEEDBACK_BUFFER, caught);
+  gl.bindBufferBase(gl.TRANSFORM_FEEDBACK_BUFFER, 0, gl.createBuffer());
   gl.bufferData(gl.TRANSFORM_FEEDBACK_BUFFER, 4 * rows.length, gl.STREAM_READ);
-  gl.bindBufferBase(gl.TRANSFORM_FEEDBACK_BUFFER, 0, caught);
   gl.enable(gl.RASTERIZER_DISCARD);
   gl.beginTransformFeedback(gl.POINTS);
   gl.drawArrays(gl.POINTS, 0, rows.length);
@@ -62,27 +56,33 @@ WEBGL = """([source, call, rows]) => {
 }"""
 
 
-def run(chromium: Any, shader: str, table: str) -> list[float]:
+def run(page: Any, shader: str, table: str) -> list[float]:
     """The shader's result for every golden row of a table; rows are padded to seven inputs."""
     source = SHADERS.joinpath(shader).read_text(encoding="utf-8")
     inputs = len(STORED[table.replace("rows", "columns")]) - (2 if table == "rows" else 1)
     rows = [[*map(float, row[:inputs]), *[0.0] * (7 - inputs)] for row in STORED[table]]
+    if shader.endswith("glsl"):
+        return list(page.evaluate(WEBGL, [source, CALLS[table], rows]))
+    inputs_of = "let a = vec4f(rows[at], rows[at + 1], rows[at + 2], rows[at + 3]);"
+    inputs_of += "let b = vec3f(rows[at + 4], rows[at + 5], rows[at + 6]);"
+    return [row[0] for row in browser.compute(page, source, f"{inputs_of} rows[at] = {CALLS[table]};", rows)]
+
+
+@pytest.fixture(scope="module")
+def page(chromium: Any) -> Iterator[Any]:
+    """A page from a secure place, as WebGPU needs it; nothing is fetched."""
     with closing(chromium.new_page()) as page:
         page.route("**/*", lambda route: route.fulfill(body="<!doctype html>", content_type="text/html"))
-        page.goto("http://127.0.0.1/")  # answered above; WebGPU is only given to pages from a secure place
-        if shader.endswith("glsl"):
-            return list(page.evaluate(WEBGL, [source, CALLS[table], rows]))
-        inputs_of = "let a = vec4f(rows[at], rows[at + 1], rows[at + 2], rows[at + 3]);"
-        inputs_of += "let b = vec3f(rows[at + 4], rows[at + 5], rows[at + 6]);"
-        return [row[0] for row in browser.compute(page, source, f"{inputs_of} rows[at] = {CALLS[table]};", rows)]
+        page.goto("http://127.0.0.1/")
+        yield page
 
 
 @pytest.mark.parametrize("shader", ["attenuation.glsl", "attenuation.wgsl"])
-def test_shaders_match_the_golden_values(chromium: Any, shader: str) -> None:
-    for got, row in zip(run(chromium, shader, "rows"), STORED["rows"], strict=True):
+def test_shaders_match_the_golden_values(page: Any, shader: str) -> None:
+    for got, row in zip(run(page, shader, "rows"), STORED["rows"], strict=True):
         *_, faded, want = row
         assert abs(got - want) <= STORED["tolerance"] * faded and (want > 0 or got == 0), (row, got)
-    for got, row in zip(run(chromium, shader, "scale_rows"), STORED["scale_rows"], strict=True):
+    for got, row in zip(run(page, shader, "scale_rows"), STORED["scale_rows"], strict=True):
         assert abs(got - row[-1]) <= STORED["tolerance"] * row[-1], (row, got)
 
 

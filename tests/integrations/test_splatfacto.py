@@ -1,4 +1,4 @@
-"""What the nerfstudio method computes, on splatfacto's parameters as plain tensors."""
+"""The parameters of gsplat's trainer and of splatfacto as Gaussians, and what the nerfstudio method makes of them."""
 
 from __future__ import annotations
 
@@ -13,25 +13,59 @@ from torch import Tensor
 import scenes
 from clod_adapter import load
 from clod_adapter.cameras import Camera
-from clod_adapter.config import FILTERS, AdaptConfig
+from clod_adapter.config import FILTERS, AdaptConfig, ScreenFilter
 from clod_adapter.equation.units import in_world_units
 from clod_adapter.errors import ClodError
+from clod_adapter.integrations.splats import from_gsplat, to_gsplat
 from clod_adapter.nerfstudio.splatfacto import chosen, new_dial, shown, state_of, view_of, write_ply
 from clod_adapter.render import render
 from clod_adapter.training.dial import Dial
 
 N, WIDTH, HEIGHT = 60, 32, 24
 CONFIG = AdaptConfig(max_sv=5.0)
+BASE = scenes.gaussians(N, 1, 0, size=0.15)
 
 
-def splatfacto(seed: int = 0) -> dict[str, Tensor]:
-    """Parameters with the names and shapes of splatfacto's ``gauss_params``."""
-    base = scenes.gaussians(N, 1, seed, size=0.15)
-    values = {
-        "means": base.means, "scales": base.log_scales, "quats": base.quats, "features_dc": base.sh0[:, 0],
-        "features_rest": base.shN, "opacities": base.opacity_logits[:, None],
-    }  # fmt: skip
-    return {name: value.clone().requires_grad_() for name, value in values.items()}
+def splatfacto() -> dict[str, Tensor]:
+    """``BASE`` with the names and shapes of splatfacto's ``gauss_params``."""
+    named = to_gsplat(BASE)
+    named |= {"features_dc": named.pop("sh0")[:, 0], "features_rest": named.pop("shN")}
+    named["opacities"] = named["opacities"][:, None]
+    return {name: value.clone().requires_grad_() for name, value in named.items()}
+
+
+def test_parameters_of_gsplats_trainer_are_shared() -> None:
+    splats = to_gsplat(BASE)
+    assert list(splats) == ["means", "quats", "scales", "opacities", "sh0", "shN"]
+    again = from_gsplat(torch.nn.ParameterDict(splats), screen_filter=ScreenFilter(compensate=True))
+    assert again.screen_filter.compensate and again.sigma_d is None
+    arrays = from_gsplat({name: value.double().numpy() for name, value in splats.items()})
+    scenes.assert_equal(arrays, BASE)
+    for name, value in BASE.tensors().items():
+        assert getattr(again, name).data_ptr() == value.data_ptr(), name
+
+
+def test_parameters_of_splatfacto() -> None:
+    """Without higher SH degrees, colours are logits."""
+    named = splatfacto()
+    again = from_gsplat(named)
+    scenes.assert_equal(again, BASE)
+    again.opacities.sum().backward()
+    assert named["opacities"].grad.shape == (N, 1)
+    for rest in ({}, {"features_rest": torch.zeros(N, 0, 3)}):
+        named = {name: value for name, value in splatfacto().items() if name != "features_rest"} | rest
+        colours = from_gsplat(named)
+        torch.testing.assert_close(0.5 + 0.28209479177 * colours.sh0[:, 0], named["features_dc"].sigmoid())
+        assert colours.sh_degree == 0
+
+
+def test_what_is_missing_is_named() -> None:
+    named = to_gsplat(BASE)
+    with pytest.raises(ClodError, match=r"opacity_logits has shape \(60, 2\)"):
+        from_gsplat(named | {"opacities": torch.zeros(N, 2)})
+    named["features"] = named.pop("sh0")
+    with pytest.raises(ClodError, match=r"splats needs sh0 too, it has means, .*; with appearance optimisation"):
+        from_gsplat(named)
 
 
 def cameras_of(view: Camera) -> SimpleNamespace:
@@ -65,38 +99,25 @@ def test_cameras_are_nerfstudios(views: list[Any]) -> None:
 
 
 def test_splatfacto_draws_what_render_draws(parameters: dict[str, Tensor], dial: Dial, views: list[Any]) -> None:
-    """Activated as splatfacto does, the changed parameters give the picture of the adapted Gaussians."""
-    camera = views[0].camera
-    for scale in (1.0, 3.0):
+    """Activated as splatfacto does. Culled rows are behind the camera, with gradient 0."""
+    camera, model = views[1].camera, dial.gaussians()
+    plain = model.replace(sigma_d=None, growth_d=None, attenuation=None)
+    for scale in (1.0, 5.0):
         changed = shown(parameters, dial, camera, scale)
-        assert {name: value.shape for name, value in changed.items()} == {
-            name: parameters[name].shape for name in ("means", "opacities", "scales")
-        }
-        model = dial.gaussians()
-        plain = model.replace(sigma_d=None, growth_d=None, attenuation=None)
+        assert all(value.shape == parameters[name].shape for name, value in changed.items())
         drawn = plain.replace(
             means=changed["means"], log_scales=changed["scales"], opacity_logits=changed["opacities"][:, 0].nan_to_num()
         )
         torch.testing.assert_close(render(drawn, camera).image, render(model, camera, scale).image, rtol=0, atol=1e-5)
-
-
-def test_culled_rows_are_behind_the_camera_with_gradient_0(
-    parameters: dict[str, Tensor], dial: Dial, views: list[Any]
-) -> None:
-    camera = views[1].camera
-    changed = shown(parameters, dial, camera, 5.0)
     keep = dial(camera, 5.0).keep
     assert 0 < int(keep.sum()) < N
     depths = changed["means"] @ camera.viewmat[2, :3] + camera.viewmat[2, 3]
-    torch.testing.assert_close(depths[~keep], torch.full((int((~keep).sum()),), -1.0))
+    assert torch.allclose(depths[~keep], torch.tensor(-1.0)) and not changed["opacities"].sigmoid()[~keep].any()
     assert torch.equal(changed["means"][keep], parameters["means"][keep])
-    assert torch.equal(changed["opacities"].sigmoid()[~keep], torch.zeros(int((~keep).sum()), 1))
     sum(value.exp().sum() if name == "scales" else value.sigmoid().sum() for name, value in changed.items()).backward()
-    for name in ("means", "opacities"):
-        gradient = parameters[name].grad
-        assert gradient is not None and gradient.isfinite().all() and not gradient[~keep].any()
-        assert gradient[keep].any()
-    assert dial.log_sigma.grad is not None and dial.log_sigma.grad.isfinite().all() and dial.log_sigma.grad.any()
+    for value in (parameters["means"], parameters["opacities"]):
+        assert value.grad.isfinite().all() and not value.grad[~keep].any() and value.grad[keep].any()
+    assert dial.log_sigma.grad.isfinite().all() and dial.log_sigma.grad.any()
 
 
 def test_an_opaque_gaussian_has_finite_gradients(parameters: dict[str, Tensor], dial: Dial, views: list[Any]) -> None:
@@ -105,22 +126,20 @@ def test_an_opaque_gaussian_has_finite_gradients(parameters: dict[str, Tensor], 
     dial.log_sigma.data[:] = 10.0
     changed = shown(parameters, dial, views[0].camera, 1.0)
     changed["opacities"].sigmoid().sum().backward()
-    assert parameters["opacities"].grad is not None and parameters["opacities"].grad.isfinite().all()
+    assert parameters["opacities"].grad.isfinite().all()
 
 
-def test_a_saved_dial_is_the_same_dial(parameters: dict[str, Tensor], dial: Dial, views: list[Any]) -> None:
-    state = state_of(dial)
+def test_a_saved_dial_is_the_same_dial(
+    parameters: dict[str, Tensor], dial: Dial, views: list[Any], tmp_path: Any
+) -> None:
+    """Its state is read without running code, as nerfstudio's commands read checkpoints with today's torch."""
+    torch.save(state_of(dial), tmp_path / "dial.ckpt")
+    state = torch.load(tmp_path / "dial.ckpt", weights_only=True)
     again = new_dial(parameters, views, CONFIG, state)
     scenes.assert_equal(again.gaussians(), dial.gaussians())
     torch.testing.assert_close(again.typical, dial.typical)
     with pytest.raises(ClodError, match="trained up to 5; set --pipeline.model.max-sv"):
         new_dial(parameters, views, AdaptConfig(max_sv=7.0), state)
-
-
-def test_its_state_is_read_without_running_code(dial: Dial, tmp_path: Any) -> None:
-    """As nerfstudio's commands read checkpoints with today's torch."""
-    torch.save(state_of(dial), tmp_path / "dial.ckpt")
-    assert torch.load(tmp_path / "dial.ckpt", weights_only=True).keys() == state_of(dial).keys()
 
 
 def test_the_dial_value_of_the_commands(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import runpy
-import sys
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -26,19 +25,15 @@ PAGE = (ROOT / "docs" / "writing_a_renderer.md").read_text(encoding="utf-8")
 DIALS = (1, 2, 3, 5)
 
 
-def my_opacity(
-    opacity: float, sigma: float, distance: float, scale: float, eps: float, tau: float, soft: bool
-) -> float:
+def my_opacity(opacity: float, sigma: float, d: float, scale: float, eps: float, tau: float, soft: bool) -> float:
     """The package's opacity, in float32."""
     config = AttenuationConfig(eps=eps, tau=tau, cut="soft" if soft else "hard", max_sv=1)
-    values = (torch.tensor([value], dtype=torch.float32) for value in (opacity, sigma, distance))
-    return float(attenuate(*values, scale, config, activated=True).drawn)
+    return float(attenuate(*torch.tensor([[opacity], [sigma], [d]]), scale, config, activated=True).drawn)
 
 
 def my_scale(growth: float, distance: float, scale: float, reach: float) -> float:
     """The package's factor of the scales, in float32."""
-    growth_d, d = (torch.tensor([value], dtype=torch.float32) for value in (growth, distance))
-    return float(growth_factors(growth_d, d, scale, reach))
+    return float(growth_factors(*torch.tensor([[growth], [distance]]), scale, reach))
 
 
 @pytest.fixture
@@ -88,11 +83,8 @@ def test_defaults_of_the_page_match_the_reader() -> None:
         assert value == default if isinstance(default, str) else eval(value) == pytest.approx(default)
 
 
-def test_the_hook_example(
-    adapted: clod_adapter.Gaussians, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(sys, "argv", ["04_hook.py", "adapted.ply"])
-    runpy.run_path(str(ROOT / "examples" / "04_hook.py"), run_name="__main__")
+def test_the_hook_example(adapted: clod_adapter.Gaussians, capsys: pytest.CaptureFixture[str]) -> None:
+    runpy.run_path(str(ROOT / "examples" / "04_hook.py"))["main"]("adapted.ply")
     counts = [int(row.split(": ")[1].split()[0]) for row in capsys.readouterr().out.splitlines()]
     assert counts == sorted(counts, reverse=True) and counts[0] > counts[-1] > 0
     pictures = [np.asarray(Image.open(f"adapted_dots_sv{dial}.png")) for dial in DIALS]
