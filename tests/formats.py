@@ -21,7 +21,7 @@ from plyfile import PlyData, PlyElement
 from scipy.spatial.transform import Rotation
 
 from clod_adapter.calibration import Calibration, CalibrationRow
-from clod_adapter.config import AttenuationConfig
+from clod_adapter.config import SH_COUNTS, AttenuationConfig
 from clod_adapter.gaussians import Gaussians
 from scenes import gaussians
 
@@ -153,6 +153,21 @@ def change_glb(path: Path, change: Callable[[dict[str, Any]], object]) -> Path:
     head = struct.pack("<4sIIII", b"glTF", 2, 20 + len(text) + len(rest), len(text), 0x4E4F534A)
     path.write_bytes(head + text + rest)
     return path
+
+
+def needed(degree: int = 0) -> list[str]:
+    """The columns that every reader needs, in Inria's order."""
+    rest = [f"f_rest_{k}" for k in range(3 * (SH_COUNTS[degree] - 1))]
+    shape = ["scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+    return ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", *rest, "opacity", *shape]
+
+
+def random_rows(count: int, names: Sequence[str], seed: int = 0, types: dict[str, str] | None = None) -> np.ndarray:
+    """Normal values in columns of float32 or of ``types``."""
+    rng, rows = np.random.default_rng(seed), np.empty(count, [(name, (types or {}).get(name, "f4")) for name in names])
+    for name in names:
+        rows[name] = rng.integers(0, 99, count) if rows.dtype[name].kind in "iu" else rng.normal(size=count)
+    return rows
 
 
 def inria_rows(g: Gaussians) -> np.ndarray:

@@ -1,3 +1,5 @@
+"""Adapters and the tensor files that they are written as."""
+
 from __future__ import annotations
 
 import json
@@ -11,12 +13,13 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from safetensors import safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save, save_file
 
 from clod_adapter.adapter import Adapter
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.io.adapter_file import check_config, load_adapter, save_adapter
+from clod_adapter.io.tensor_file import read_tensors, write_tensors
 
 CONFIG = {"steps": 3, "lr": 0.1, "names": ["a", None], "nested": {"b": True}, "ü": "é"}
 
@@ -145,3 +148,21 @@ def test_config_must_be_json_and_version_is_kept(tmp_path: Path, monkeypatch: py
     loaded = load_adapter(tmp_path / "a")
     save_adapter(tmp_path / "b", loaded)
     assert loaded.version == "7.8.9" and (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+
+
+def test_files_are_those_of_safetensors(tmp_path: Path) -> None:
+    """Byte for byte: types in any order, a transposed and an empty tensor, a scalar, text that is not ASCII."""
+    generator = torch.Generator().manual_seed(0)
+    tensors = {
+        "mask": torch.tensor([True, False, True]), "bytes": torch.arange(5, dtype=torch.uint8),
+        "block": torch.arange(3, dtype=torch.int16), "half": torch.randn(3, generator=generator).half(),
+        "steps": torch.arange(4, dtype=torch.int32), "means": torch.randn(3, 2, generator=generator).T,
+        "first.sh0": torch.randn(2, 1, 3, generator=generator), "none": torch.zeros(0, 3), "one": torch.tensor(2.5),
+        "long": torch.arange(2), "double": torch.randn(2, generator=generator, dtype=torch.float64),
+    }  # fmt: skip
+    metadata = {"about": 'a "quoted" é'}
+    write_tensors(tmp_path / "a", tensors, metadata)
+    whole = {name: tensor.contiguous() for name, tensor in tensors.items()}
+    assert (tmp_path / "a").read_bytes() == save(whole, metadata)
+    found, about = read_tensors(tmp_path / "a")
+    assert about == metadata and all(torch.equal(found[name], tensor) for name, tensor in tensors.items())

@@ -1,25 +1,38 @@
-"""Settings in files: one reader, which every format and the adapter use."""
+"""Settings in files: one reader, which every format and the adapter use; in a PLY comments, and columns for tools that
+drop comments; the screen-space filter as other programs state it."""
 
 from __future__ import annotations
 
 import re
+import zlib
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from plyfile import PlyData
 
-from clod_adapter.adapter import Adapter, detach, extract
+from clod_adapter.adapter import Adapter, detach, extract, with_dial
 from clod_adapter.calibration import Calibration
 from clod_adapter.config import CLASSIC, FILTERS, AttenuationConfig, ScreenFilter
+from clod_adapter.equation.attenuation import attenuate
+from clod_adapter.equation.extinction import sigma_for_extinction
+from clod_adapter.equation.units import estimated_distance
 from clod_adapter.errors import ClodError
+from clod_adapter.gaussians import Gaussians
+from clod_adapter.inspection.report import inspect
 from clod_adapter.io.adapter_file import load_adapter, save_adapter
 from clod_adapter.io.checkpoint import load, save
 from clod_adapter.io.file_formats import write
 from clod_adapter.io.ply import inria_dtype
-from clod_adapter.io.settings import EARLIER, parse_metadata, read_metadata
-from formats import ATTENUATION, CALIBRATION, change_setting, model, write_rows
+from clod_adapter.io.ply_settings import simplest
+from clod_adapter.io.settings import EARLIER, implied_filter, is_antialiased, parse_metadata, read_metadata, tagged
+from formats import ATTENUATION, CALIBRATION, change_setting, model, splat_transform, without_comments, write_rows
+from scenes import camera, gaussians
 
 pytest.importorskip("pygltflib", reason="pygltflib is not installed")
 KINDS = ["a.ply", "a.glb", "a.spz", "a.safetensors", "a.pt", "adapter.safetensors"]
@@ -171,3 +184,203 @@ def test_header_of_an_earlier_version(tmp_path: Path) -> None:
 def test_unknown_range_fits_tau(tmp_path: Path, tau: float) -> None:
     found = read_metadata(tmp_path, {"attenuation": {"tau": tau}}, dial=True, described=False).attenuation
     assert found is not None and found.tau == tau and found.max_sv >= 1 and (found.max_sv == 5) == (tau < 0.2)
+
+
+def test_spz_flag(tmp_path: Path) -> None:
+    """Bit 0: written with every compensating filter; other programs store nothing else."""
+
+    def flags(path: Path) -> bytearray:
+        return bytearray(zlib.decompress(path.read_bytes(), wbits=31))
+
+    plain = detach(model(1))
+    for screen_filter, want in ((CLASSIC, 2), (FILTERS["on"], 3), (FILTERS["mip"], 3), (ScreenFilter(variance=1), 2)):
+        write(tmp_path / "a.spz", plain.replace(screen_filter=screen_filter))
+        assert flags(tmp_path / "a.spz")[14] == want
+    write(tmp_path / "a.spz", plain)
+    data = flags(tmp_path / "a.spz")
+    data[14] |= 1
+    gzip = zlib.compressobj(wbits=31)
+    (tmp_path / "b.spz").write_bytes(gzip.compress(bytes(data)) + gzip.flush())
+    found = load(tmp_path / "b.spz")
+    assert found.gaussians.screen_filter == FILTERS["on"] and not found.filter_known
+    assert is_antialiased(found.comments)
+
+
+def test_filter_of_a_dial_is_that_of_its_settings(tmp_path: Path) -> None:
+    """It takes precedence over a comment of another program."""
+    write(tmp_path / "a.ply", model(1))
+    data = (tmp_path / "a.ply").read_bytes()
+    (tmp_path / "a.ply").write_bytes(data.replace(b"end_header", b"comment antialiased 1\nend_header", 1))
+    found = load(tmp_path / "a.ply")
+    assert found.gaussians.screen_filter == CLASSIC and found.filter_known
+    save(tmp_path / "b.ply", detach(found.gaussians), found)
+    assert not is_antialiased(load(tmp_path / "b.ply").comments)
+
+
+@pytest.mark.parametrize("screen_filter", [*FILTERS.values(), ScreenFilter(variance=0.123, compensate=True)], ids=str)
+def test_columns_store_the_filter(tmp_path: Path, screen_filter: ScreenFilter) -> None:
+    """In a file with a dial; a plain one has no columns but those of Inria's layout."""
+    write(tmp_path / "a.ply", model(1).replace(screen_filter=screen_filter))
+    found = load(without_comments(tmp_path / "a.ply"))
+    assert found.gaussians.screen_filter == screen_filter and found.filter_known and found.comments == ()
+    write(tmp_path / "b.ply", detach(found.gaussians))
+    assert not any(name.startswith("clod_") for name in load(tmp_path / "b.ply").vertex.dtype.names or ())
+
+
+def test_columns_of_other_programs_and_damaged_columns(tmp_path: Path) -> None:
+    write(tmp_path / "a.ply", detach(model(1)))
+    found = load(without_comments(tmp_path / "a.ply", filter_3D=0.01))  # of Mip-Splatting
+    assert found.gaussians.screen_filter == FILTERS["mip"] and not found.filter_known
+    save(tmp_path / "b.ply", found.gaussians, found)  # without the column, which is fused
+    assert load(tmp_path / "b.ply").gaussians.screen_filter == FILTERS["mip"]
+    write(tmp_path / "a.ply", model(1))
+    with pytest.raises(ClodError, match=r"rewritten.ply: its settings are damaged \(variance is -1.0"):
+        load(without_comments(tmp_path / "a.ply", clod_screen_variance=-1.0))
+
+
+def test_comments_of_other_programs() -> None:
+    """Brush, whose filter has 0.1 px^2, splat-transform and Postshot."""
+    assert not is_antialiased(["SplatRenderMode: default", "antialiased 0", "not antialiased 1"])
+    assert implied_filter((), ("x", "y")) == implied_filter(("antialiased 0",), ()) == CLASSIC
+    assert implied_filter(("Exported from Brush", "SplatRenderMode: mip"), ()) == FILTERS["mip"]
+    mixed = ["made by hand", "SplatRenderMode: default", "antialiased 0"]
+    assert tagged(mixed, CLASSIC) == mixed
+    assert tagged(mixed, FILTERS["on"]) == ["made by hand", "SplatRenderMode: mip"]
+    for comment in ("SplatRenderMode: mip", "antialiased 1"):
+        assert implied_filter(("x", comment), ()) == FILTERS["on"]
+        assert tagged(["made by hand", comment], FILTERS["on"]) == ["made by hand", comment]
+        assert tagged(["made by hand", comment], CLASSIC) == ["made by hand"]
+
+
+USUAL = AttenuationConfig(reference_distance=3.0)
+PAPER = AttenuationConfig(tau=1 / 255, cut="hard", normalizer="max", reference_distance=3.0)
+EACH = {
+    "usual": USUAL, "tau": replace(USUAL, tau=0.013), "faint": replace(USUAL, tau=1.23457e-05),
+    "large tau": replace(USUAL, tau=0.4, max_sv=2.0), "hard": replace(USUAL, cut="hard"), "paper": PAPER,
+    "eps": replace(USUAL, eps=1e-6), "no eps": replace(USUAL, eps=0.0),
+    "quantile": replace(USUAL, normalizer="quantile"), "median": replace(USUAL, normalizer="quantile", quantile=0.5),
+}  # fmt: skip
+
+
+def dialled(config: AttenuationConfig, growth: bool = False) -> Gaussians:
+    some = with_dial(gaussians(400, 1, 2), torch.logspace(-1, 1.3, 400), config)
+    return some.replace(growth_d=torch.linspace(-1, 3, 400)) if growth else some
+
+
+def same_dial(found: Gaussians, g: Gaussians) -> None:
+    """The same Gaussians are kept and drawn, bit for bit, at three dial values."""
+    assert found.sigma_d is not None and g.sigma_d is not None and found.attenuation and g.attenuation
+    for s in (1.0, 1.7, 3.1):
+        want, got = (
+            attenuate(x.opacity_logits, x.sigma_d, (x.means, camera()), s, x.attenuation)  # type: ignore[arg-type]
+            for x in (g, found)
+        )
+        assert torch.equal(want.keep, got.keep) and torch.equal(want.drawn, got.drawn)
+        assert 0 < want.keep.sum() < len(g) or s > 1 / g.attenuation.tau
+
+
+@pytest.mark.parametrize("name", EACH)
+def test_dial_survives_a_rewrite_without_comments(tmp_path: Path, name: str) -> None:
+    config = EACH[name]
+    g = dialled(config)
+    save(tmp_path / "a.ply", g)
+    assert load(tmp_path / "a.ply").gaussians.attenuation == config
+    rows = PlyData.read(str(tmp_path / "a.ply"))["vertex"].data
+    assert rows.dtype.names[-1] == "sigma_d" and (name == "usual") == ("clod_" not in " ".join(rows.dtype.names))
+    path = without_comments(tmp_path / "a.ply")
+    again = load(path).gaussians
+    same_dial(again, g)
+    for field in ("tau", "cut", "eps", "normalizer", "quantile"):
+        assert getattr(again.attenuation, field) == getattr(config, field)
+    found = inspect(path)
+    assert found.splat is not None and found.splat.dial is not None and found.splat.extra == ()
+    assert found.splat.dial.attenuation == again.attenuation
+    assert name != "paper" or any("read from columns: tau, cut, normalizer" in note for note in found.notes)
+    if name in ("usual", "paper"):
+        splat_transform(tmp_path / "a.ply", tmp_path / "b.ply")
+        other = load(tmp_path / "b.ply")
+        assert not any("clod_adapter" in comment for comment in other.comments)
+        same_dial(other.gaussians, g)
+
+
+@pytest.mark.parametrize("unit", [1.0, 7.0])
+@pytest.mark.parametrize("distance", [0.0, 3.0, 0.123456789])
+@pytest.mark.parametrize("name", ["usual", "paper", "median"])
+def test_growth_survives_a_rewrite_without_comments(tmp_path: Path, name: str, distance: float, unit: float) -> None:
+    g = dialled(replace(EACH[name], reference_distance=distance, scene_distance=unit), growth=True)
+    save(tmp_path / "a.ply", g)
+    rows = PlyData.read(str(tmp_path / "a.ply"))["vertex"].data
+    assert rows.dtype.names[-2:] == ("sigma_d", "growth_d")
+    again = load(without_comments(tmp_path / "a.ply")).gaussians
+    for s in (1.7, 3.1):
+        want, got = (
+            attenuate(x.opacity_logits, x.sigma_d, (x.means, camera()), s, x.attenuation, growth_d=x.growth_d).growth
+            for x in (g, again)
+        )
+        assert want is not None and got is not None and want.max() > 1.1
+        torch.testing.assert_close(got, want, rtol=1e-5, atol=0)  # the columns are float32
+
+
+def test_comments_take_precedence_over_columns(tmp_path: Path) -> None:
+    exact = replace(USUAL, tau=0.0123456789012345)
+    save(tmp_path / "a.ply", dialled(exact))
+    base = load(tmp_path / "a.ply")
+    assert base.gaussians.attenuation == exact and base.notes == ()
+    save(tmp_path / "b.ply", base.gaussians.replace(attenuation=replace(USUAL, cut="hard")), base)
+    names = PlyData.read(str(tmp_path / "b.ply"))["vertex"].data.dtype.names
+    assert names[-2:] == ("clod_hard_cut", "sigma_d") and "clod_tau" not in names
+    assert load(without_comments(tmp_path / "b.ply")).gaussians.attenuation == AttenuationConfig(cut="hard")
+    save(tmp_path / "c.ply", base.gaussians.replace(sigma_d=None, attenuation=None), base)
+    assert "clod_tau" not in PlyData.read(str(tmp_path / "c.ply"))["vertex"].data.dtype.names
+
+
+@settings(max_examples=200)
+@given(st.integers(1, 999_999), st.integers(-12, 4))
+def test_six_digits_are_read_as_written(digits: int, power: int) -> None:
+    value = float(f"{digits}e{power}")
+    assert simplest(np.float32(value)) == value
+
+
+@settings(max_examples=200)
+@given(st.floats(2**-90, 2**90, width=32))
+def test_value_read_is_the_float32_stored(value: float) -> None:
+    assert np.float32(simplest(np.float32(value))) == np.float32(value)
+
+
+@pytest.mark.parametrize(
+    ("rows", "value", "message"),
+    [
+        (3, 0.5, "property clod_tau must be one value for all rows and has several"),
+        (slice(None), np.nan, "clod_tau"),
+    ],
+)
+def test_invalid_column_values_are_refused(tmp_path: Path, rows: Any, value: float, message: str) -> None:
+    save(tmp_path / "a.ply", dialled(EACH["tau"]))
+    table = np.array(PlyData.read(str(tmp_path / "a.ply"))["vertex"].data)
+    table["clod_tau"][rows] = value
+    write_rows(tmp_path / "b.ply", table)
+    for read in (load, inspect):
+        with pytest.raises(ClodError, match=message):
+            read(tmp_path / "b.ply")
+
+
+@pytest.mark.parametrize(
+    ("factor", "begin", "parts"),
+    [
+        (1.0, "its dial is not", ["world units, tau 0.02, soft cut: keeps 60% at s = 1"]),
+        (0.05, "warning: ", ["keeps 0% at s = 1", "likely not what was adapted"]),
+    ],
+)
+def test_file_without_settings_has_a_note(tmp_path: Path, factor: float, begin: str, parts: list[str]) -> None:
+    """The file keeps six tenths at s = 1 from its reference distance; sigma_d is multiplied by ``factor``."""
+    config, path, some = AttenuationConfig(), tmp_path / "a.ply", gaussians(500, 0, 1)
+    some = some.replace(means=10 * some.means, opacity_logits=some.opacity_logits.clamp(min=-2))
+    d = torch.full((500,), estimated_distance(some.means))
+    sigma = sigma_for_extinction(some.opacity_logits, d, torch.linspace(0.5, 1.75, 500), config)
+    save(path, with_dial(some, factor * sigma, config))
+    assert load(path).notes == () and inspect(path).notes == ()
+    base = load(without_comments(path))
+    assert base.gaussians.attenuation == config
+    for notes in (base.notes, inspect(path.with_name("rewritten.ply")).notes):
+        (note,) = notes
+        assert note.startswith(begin) and all(part in note for part in parts)

@@ -1,0 +1,356 @@
+"""What each format stores, byte by byte where its readers document it; files of other programs, and files they read."""
+
+from __future__ import annotations
+
+import gzip
+import json
+import struct
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from clod_adapter.adapter import detach
+from clod_adapter.cameras import Camera
+from clod_adapter.config import AttenuationConfig
+from clod_adapter.equation.distances import normalized_distances
+from clod_adapter.equation.growth import growth_distance, growth_factors
+from clod_adapter.errors import ClodError
+from clod_adapter.gaussians import SH_C0, Gaussians
+from clod_adapter.io.checkpoint import load, save
+from clod_adapter.io.file_formats import write
+from clod_adapter.io.values import half_turn
+from clod_adapter.render import render
+from formats import ATTENUATION, ORIGIN, change_glb, covariances, model, rows_by_place, splat_transform, turned
+from scenes import camera, gaussians
+
+KHR = "KHR_gaussian_splatting"
+
+
+@pytest.mark.parametrize("axis", ["x", "z"])
+def test_half_turn_of_scene_and_camera_keeps_the_image(axis: str) -> None:
+    """Of positions, rotations and harmonics; a wrong sign in one changes the image."""
+    g, view = gaussians(400, 4, 3, size=0.15), camera()
+    arrays = {name: tensor.numpy() for name, tensor in g.tensors().items()}
+    turned = Gaussians(**{name: torch.from_numpy(array) for name, array in half_turn(arrays, axis).items()})
+    turn = torch.diag(torch.tensor([1.0, -1, -1, 1] if axis == "x" else [-1.0, -1, 1, 1]))
+    same = render(turned, Camera(view.viewmat @ turn, view.K, view.width, view.height)).image
+    torch.testing.assert_close(same, render(g, view).image, atol=2e-5, rtol=0)
+    back = half_turn(half_turn(arrays, axis), axis)
+    assert all(np.array_equal(back[name], array) for name, array in arrays.items())
+
+
+def test_glb_in_pygltflib(tmp_path: Path) -> None:
+    pygltflib = pytest.importorskip("pygltflib", reason="pygltflib is not installed")
+    g = model(3)
+    write(tmp_path / "a.glb", g, origin=ORIGIN)
+    gltf = pygltflib.GLTF2().load(str(tmp_path / "a.glb"))
+    (mesh,), (node,) = gltf.meshes, gltf.nodes
+    (primitive,) = mesh.primitives
+    assert primitive.mode == pygltflib.POINTS and gltf.extensionsUsed == [KHR] and not gltf.extensionsRequired
+    assert primitive.extensions[KHR] == {
+        "kernel": "ellipse", "colorSpace": "srgb_rec709_display", "projection": "perspective",
+        "sortingMethod": "cameraDistance",
+    }  # fmt: skip
+    assert gltf.asset.extras["clod_adapter"]["attenuation"]["reference_distance"] == ATTENUATION.reference_distance
+    found, blob = {}, gltf.binary_blob()
+    for name, number in vars(primitive.attributes).items():
+        if number is not None:
+            accessor = gltf.accessors[number]
+            view = gltf.bufferViews[accessor.bufferView]
+            kind = {pygltflib.FLOAT: "<f4", pygltflib.UNSIGNED_BYTE: "u1"}[accessor.componentType]
+            data = blob[view.byteOffset : view.byteOffset + view.byteLength]
+            found[name] = np.frombuffer(data, kind).reshape(accessor.count, -1)
+            assert view.byteOffset % 4 == 0 and bool(accessor.normalized) == (name == "COLOR_0")
+    position = gltf.accessors[primitive.attributes.POSITION]
+    assert position.min == g.means.amin(0).tolist() and position.max == g.means.amax(0).tolist()
+    assert set(found) == {
+        "POSITION", "COLOR_0", "_SIGMA_D", "_GROWTH_D", f"{KHR}:ROTATION", f"{KHR}:SCALE", f"{KHR}:OPACITY",
+        *(f"{KHR}:SH_DEGREE_{d}_COEF_{k}" for d in range(4) for k in range(2 * d + 1)),
+    }  # fmt: skip
+    np.testing.assert_allclose(found[f"{KHR}:SCALE"], g.scales, rtol=1e-6)
+    np.testing.assert_allclose(found[f"{KHR}:OPACITY"][:, 0], g.opacities, rtol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(found[f"{KHR}:ROTATION"], axis=1), 1, rtol=1e-6)
+    assert turned(torch.from_numpy(found[f"{KHR}:ROTATION"][:, [3, 0, 1, 2]].copy()), g.quats) < 1e-6
+    np.testing.assert_array_equal(found[f"{KHR}:SH_DEGREE_2_COEF_1"], g.shN[:, 4])
+    np.testing.assert_array_equal(found["_SIGMA_D"][:, 0], g.sigma_d)
+    np.testing.assert_array_equal(found["_GROWTH_D"][:, 0], g.growth_d)
+    np.testing.assert_allclose(found["COLOR_0"][:, :3] / 255, (0.5 + SH_C0 * g.sh0[:, 0]).clamp(0, 1), atol=2.1e-3)
+    # The node turns y down into glTF's y up: (x, y, z) becomes (-x, -y, z).
+    assert node.rotation == [0, 0, 1, 0] and node.translation == [-ORIGIN[0], -ORIGIN[1], ORIGIN[2]]
+
+
+def test_glb_of_another_program(tmp_path: Path) -> None:
+    """Interleaved, in short integers, moved, without metadata: sigma_d then has the default settings."""
+    write(tmp_path / "a.glb", model(0, 5), origin=ORIGIN)
+    path = change_glb(tmp_path / "a.glb", lambda g: g["asset"].pop("extras"))
+    found = load(path)
+    assert found.origin == ORIGIN and found.gaussians.attenuation == AttenuationConfig()
+    rows = np.zeros(5, [("position", "<f4", 3), ("rotation", "<i2", 4), ("opacity", "u1"), ("pad", "u1", 3)])
+    rows["position"], rows["rotation"], rows["opacity"] = np.arange(15).reshape(5, 3), [0, 0, 0, 32767], 255
+
+    def interleave(g: dict[str, Any]) -> None:
+        primitive, accessors = g["meshes"][0]["primitives"][0], g["accessors"]
+        names = primitive["attributes"]
+        for name, offset, kind in (("POSITION", 0, 5126), (f"{KHR}:ROTATION", 12, 5122), (f"{KHR}:OPACITY", 20, 5121)):
+            where = {"bufferView": len(g["bufferViews"]), "byteOffset": offset, "componentType": kind}
+            accessors[names[name]].update(where, normalized=kind != 5126)
+        view = {"buffer": 0, "byteOffset": g["buffers"][0]["byteLength"], "byteLength": rows.nbytes, "byteStride": 24}
+        g["bufferViews"].append(view)
+        g["nodes"][0].pop("rotation")
+        g["meshes"].append({"primitives": [primitive, {"attributes": {"POSITION": 0}}]})
+        primitive["extensions"][KHR]["colorSpace"] = "lin_rec709_display"
+
+    data = change_glb(path, interleave).read_bytes()
+    size, start = struct.unpack_from("<I", data, 12)[0], 20
+    body = data[start + size + 8 :] + rows.tobytes()
+    head = struct.pack("<4sII", b"glTF", 2, start + size + 8 + len(body)) + data[12 : start + size]
+    path.write_bytes(head + struct.pack("<II", len(body), 0x004E4942) + body)
+    found = load(path)
+    np.testing.assert_array_equal(found.gaussians.means, rows["position"] * [-1, -1, 1])
+    assert found.gaussians.quats.tolist() == [[1, 0, 0, 0]] * 5 and found.gaussians.opacity_logits.isposinf().all()
+    colours, others = found.notes[-2:]
+    assert "'lin_rec709_display'" in colours and others.startswith("1 more primitives")
+
+
+def test_moved_node_moves_the_model(tmp_path: Path) -> None:
+    """The node takes precedence over the origin in the metadata; near 0 the model has no origin."""
+    write(tmp_path / "a.glb", model(0, 5), origin=ORIGIN)
+    for to, origin in (([-1e6, 0.0, 0.0], (1e6, 0.0, 0.0)), ([1.0, -2.0, 4.0], (0.0, 0.0, 0.0))):
+        path = change_glb(tmp_path / "a.glb", lambda g, to=to: g["nodes"][0].update(translation=to))
+        found = load(path)
+        assert found.origin == origin and found.gaussians.attenuation == ATTENUATION
+        shift = torch.tensor([0.0, 0, 0] if any(origin) else [-1.0, 2.0, 4.0])
+        torch.testing.assert_close(found.gaussians.means, model(0, 5).means + shift)
+
+
+def spz(path: Path) -> bytearray:
+    return bytearray(gzip.decompress(path.read_bytes()))
+
+
+def test_header_and_record_of_an_spz(tmp_path: Path) -> None:
+    g = model(1)
+    write(tmp_path / "a.spz", g)
+    data = spz(tmp_path / "a.spz")
+    magic, version, count, degree, bits, flags, reserved = struct.unpack_from("<IIIBBBB", data)
+    assert (data[:4], version, count, degree, flags, reserved) == (b"NGSP", 3, 40, 1, 2, 0)
+    end = 16 + 40 * (9 + 1 + 3 + 3 + 4 + 9)
+    assert struct.unpack_from("<III", data, end) == (0xADBE0003, 4, 6)  # right, down, forward
+    kind, size, text = struct.unpack_from("<III", data, end + 12)
+    assert kind == 0x434C0001 and len(data) == end + 20 + size and size == 4 + text + 2 * 2 * 40
+    document, values = json.loads(data[end + 24 : end + 24 + text]), data[end + 24 + text :]
+    assert document["columns"] == ["sigma_d", "growth_d"] and g.growth_d is not None
+    np.testing.assert_array_equal(np.frombuffer(values, "<f2")[40:], g.growth_d.half())
+    write(tmp_path / "b.spz", detach(g))
+    assert spz(tmp_path / "b.spz") == data[: end + 12]
+
+
+@pytest.mark.parametrize(("axes", "signs"), [(4, [1, -1, -1]), (7, [-1, -1, 1]), (16, None)])
+def test_axes_of_an_spz(tmp_path: Path, axes: int, signs: list[int] | None) -> None:
+    write(tmp_path / "a.spz", model(1))
+    data = spz(tmp_path / "a.spz")
+    struct.pack_into("<I", data, 16 + 40 * 29 + 8, axes)
+    (tmp_path / "b.spz").write_bytes(gzip.compress(data))
+    if signs:
+        ours, other = (load(tmp_path / name).gaussians.means for name in ("a.spz", "b.spz"))
+        assert torch.equal(other, ours * torch.tensor(signs))
+    else:
+        with pytest.raises(ClodError, match="axes are of kind 16"):
+            load(tmp_path / "b.spz")
+
+
+def test_spz_of_version_2(tmp_path: Path) -> None:
+    """Rotations in three bytes: x, y, z of unit length with w >= 0."""
+    rows = struct.pack("<IIIBBBB", 0x5053474E, 2, 2, 0, 12, 0, 0) + bytes(18) + bytes([0, 255]) + bytes(12)
+    (tmp_path / "a.spz").write_bytes(gzip.compress(rows + bytes([128, 128, 128, 255, 128, 128])))
+    g = load(tmp_path / "a.spz").gaussians
+    assert turned(g.quats, torch.tensor([[1.0, 0, 0, 0], [0, 1, 0, 0]])) < 0.02
+    assert g.opacity_logits.isfinite().all()
+
+
+def grown(g: Gaussians, s: float) -> torch.Tensor:
+    """``[N, 3]`` logarithms of the scales that a camera at 0 sees."""
+    assert g.attenuation is not None and g.growth_d is not None
+    from_0 = replace(camera(), viewmat=torch.eye(4))
+    d = normalized_distances(g.means, from_0, g.attenuation)
+    return g.log_scales + growth_factors(g.growth_d, d, s, growth_distance(g.attenuation)).log()[:, None]
+
+
+@pytest.mark.parametrize("known", [True, False])
+@pytest.mark.parametrize("typical", [3.0, 250.0, 40_000.0])
+def test_dial_of_an_spz_in_other_units(tmp_path: Path, typical: float, known: bool) -> None:
+    """A sigma_d of large units is not clipped to float16, and the growth is the same."""
+    g, sigma = model(0), typical * torch.logspace(-1, 3.3, 40)
+    config = replace(ATTENUATION, reference_distance=typical if known else 0.0)
+    means = typical * torch.nn.functional.normalize(g.means) * torch.linspace(0.5, 2, 40)[:, None]
+    g = g.replace(means=means, attenuation=config, sigma_d=sigma, growth_d=torch.linspace(-1, 1, 40))
+    write(tmp_path / "a.spz", g)
+    again = load(tmp_path / "a.spz").gaussians
+    assert again.attenuation is not None and again.attenuation.scene_distance == 1
+    assert again.attenuation.eps == config.eps and (not known or again.attenuation.reference_distance == typical)
+    torch.testing.assert_close(again.sigma_d, sigma, rtol=2.0**-11, atol=0)
+    for s in (1.0, 6.0):
+        assert (grown(again, s) - grown(g, s)).abs().max() <= 0.04  # half a step of the scales, of 1/16
+
+
+def test_positions_of_an_spz_use_the_available_bits(tmp_path: Path) -> None:
+    """A few far positions are moved closer, with the same direction, angular size and fading seen from 0."""
+    path, g = tmp_path / "a.spz", model(0, 400).replace(growth_d=torch.full((400,), 0.25))
+    for factor, step in ((1e-3, 2.0**-20), (1e3, 2.0**-10), (5e5, 1.0)):
+        scaled = g.replace(means=g.means * factor)
+        write(path, scaled)
+        assert (load(path).gaussians.means - scaled.means).abs().max() <= step
+    with pytest.raises(ClodError, match="within 4,000,000 of 0"):
+        write(tmp_path / "b.spz", g.replace(means=g.means * 1e7))
+    assert not (tmp_path / "b.spz").exists() and g.sigma_d is not None
+    means, scales = g.means.clone(), g.log_scales.clone()
+    means[9], scales[9] = torch.tensor([3e5, -1e5, 2e3]), 9.0
+    far = g.replace(means=means, log_scales=scales)
+    notes = write(path, far)
+    again = load(path).gaussians
+    assert again.sigma_d is not None and "the 1 farthest are moved to 64 from 0" in notes[0]
+    others, factor = torch.arange(400) != 9, 64 / 3e5
+    assert (again.means - means)[others].abs().max() <= 2.0**-17
+    torch.testing.assert_close(again.means[9], means[9] * factor, atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close(again.sigma_d[9], g.sigma_d[9] * factor, atol=0, rtol=1e-3)
+    for s in (1.0, 6.0):  # the angle that it covers
+        size, close = (grown(x, s) - x.means.norm(dim=1).log()[:, None] for x in (far, again))
+        assert (close - size)[9].abs().max() <= 0.04
+    write(path, far.replace(growth_d=None))
+    torch.testing.assert_close(load(path).gaussians.log_scales[9], scales[9] + np.log(factor), atol=0.04, rtol=0)
+
+
+def test_row_of_a_splat(tmp_path: Path) -> None:
+    g = detach(model(0)).select(torch.arange(1))
+    assert len(write(tmp_path / "a.splat", g)) == 1
+    data = (tmp_path / "a.splat").read_bytes()
+    assert len(data) == 32
+    floats, levels = np.frombuffer(data[:24], "<f4"), np.frombuffer(data[24:], np.uint8)
+    np.testing.assert_array_equal(floats[:3], g.means[0])
+    np.testing.assert_allclose(floats[3:], g.scales[0], rtol=1e-6)
+    color = (0.5 + SH_C0 * g.sh0[0, 0]).clamp(0, 1) * 255
+    np.testing.assert_array_equal(levels[:4], [*color.round().int(), 255])
+    quat = g.quats[0] / g.quats[0].norm()
+    np.testing.assert_array_equal(levels[4:], (quat * 128 + 128).round().clamp(max=255))
+
+
+def test_losses_of_a_splat(tmp_path: Path) -> None:
+    """Precision, view-dependent colours, the origin, and the order: the largest come first."""
+    g = detach(model(1, 300))
+    notes = write(tmp_path / "a.splat", g, origin=ORIGIN)
+    assert "8 bits" in notes[0] and "view-dependent" in notes[1] and "origin" in notes[2]
+    again = load(tmp_path / "a.splat").gaussians
+    found = again.select(torch.from_numpy(rows_by_place(g.means.numpy(), again.means.numpy())))
+    assert torch.equal(found.means, g.means) and again.sh_degree == 0
+    torch.testing.assert_close(found.log_scales, g.log_scales, atol=1e-6, rtol=0)
+    assert (found.opacities - g.opacities).abs().max() <= 0.501 / 255
+    assert found.opacity_logits.isfinite().all()
+    assert turned(found.quats, g.quats) < 0.02
+    seen = (0.5 + SH_C0 * g.sh0).clamp(0, 1)
+    assert (0.5 + SH_C0 * found.sh0 - seen).abs().max() <= 0.501 / 255
+    weights = (g.scales.prod(1) * g.opacities)[rows_by_place(again.means.numpy(), g.means.numpy())]
+    assert (weights[1:] <= weights[:-1] * (1 + 1e-5)).all()
+
+
+NAMES = {"scales": "log_scales", "opacities": "opacity_logits"}  # gsplat's, where they are not ours
+
+
+@pytest.mark.parametrize("degree", [0, 3, 4])
+def test_checkpoint_of_gsplat(tmp_path: Path, degree: int) -> None:
+    """Also with other number types and strides, other entries, and a row that is not finite."""
+    g = gaussians(12, degree, 0)
+    values = {name: getattr(g, NAMES.get(name, name)).clone() for name in ("means", "quats", "scales", "opacities")}
+    values |= {"sh0": g.sh0, "shN": g.shN, "means": g.means.double(), "quats": g.quats.half().T.contiguous().T}
+    values["scales"][3] = torch.nan
+    splats = torch.nn.ParameterDict(values).state_dict()
+    extra = {"app_module": torch.nn.Linear(2, 2).state_dict(), "optimizer": [torch.zeros(3)]}
+    torch.save({"step": 6999, "splats": splats, **extra}, tmp_path / "a.PT")
+    base = load(tmp_path / "a.PT")
+    assert base.gaussians.sh_degree == degree and base.gaussians.sigma_d is None and "normalised" in base.notes[1]
+    assert "1 of 12 Gaussians dropped" in base.notes[0] and len(base.fingerprint) == 64
+    for name, tensor in values.items():
+        assert torch.equal(getattr(base.gaussians, NAMES.get(name, name)), tensor[torch.arange(12) != 3].float()), name
+    save(tmp_path / "out.ply", base.gaussians, base)
+    again = load(tmp_path / "out.ply")
+    assert again.gaussians == base.gaussians and again.vertex.dtype.names[3:6] == ("nx", "ny", "nz")
+
+
+def test_written_tensors_are_those_of_gsplat(tmp_path: Path) -> None:
+    """As in examples/simple_trainer.py (--ckpt) and simple_viewer.py: by name, with weights_only."""
+    g = model(2)
+    write(tmp_path / "a.pt", g)
+    checkpoint = torch.load(tmp_path / "a.pt", map_location="cpu", weights_only=True)
+    splats = checkpoint["splats"]
+    for name in ("means", "quats", "scales", "opacities", "sh0", "shN", "sigma_d", "growth_d"):
+        assert torch.equal(splats[name], getattr(g, NAMES.get(name, name)))
+    assert torch.cat([splats["sh0"], splats["shN"]], dim=-2).shape == (40, 9, 3) and checkpoint["step"] == 0
+
+
+@pytest.mark.parametrize(
+    ("suffix", "degree", "atol"), [(".ply", 0, 0.0), (".ply", 2, 0.0), (".ply", 3, 0.0), (".spz", 3, 1e-5)]
+)
+def test_gsply_reads_and_writes_files(tmp_path: Path, suffix: str, degree: int, atol: float) -> None:
+    gsply = pytest.importorskip("gsply", reason="gsply is not installed")
+    spz = pytest.importorskip("gsply.spz", reason="gsply has no spz")
+    path = tmp_path / f"a{suffix}"
+    write(path, model(degree))
+    found, ours = (spz.read_spz if atol else gsply.plyread)(path), load(path).gaussians
+    for name, want in (("means", ours.means), ("scales", ours.log_scales), ("sh0", ours.sh0[:, 0])):
+        np.testing.assert_allclose(getattr(found, name), want, atol=atol, rtol=0)
+    assert turned(torch.from_numpy(found.quats), ours.quats) <= 100 * atol
+    if degree:
+        np.testing.assert_allclose(found.shN, ours.shN, atol=atol, rtol=0)
+    opacities = 1 / (1 + np.exp(-found.opacities.ravel().astype(np.float64)))
+    np.testing.assert_allclose(opacities, ours.opacities, atol=max(110 * atol, 1e-6))
+    if (suffix, degree) == (".ply", 3):
+        gsply.plywrite(tmp_path / "b.ply", found)
+        again = load(tmp_path / "b.ply").gaussians
+        assert torch.equal(again.means, ours.means) and torch.equal(again.shN, ours.shN)
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".spz", ".splat"])
+def test_splat_transform_reads_files(tmp_path: Path, suffix: str) -> None:
+    """It keeps the dial's columns of a PLY bit for bit and in order, but drops the comments with the settings."""
+    write(tmp_path / f"a{suffix}", detach(model(0)) if suffix == ".splat" else model(3))
+    splat_transform(tmp_path / f"a{suffix}", tmp_path / "b.ply")
+    ours, found = load(tmp_path / f"a{suffix}").gaussians, load(tmp_path / "b.ply")
+    theirs, atol = found.gaussians, 0.0 if suffix == ".ply" else 1e-5
+    for name in ("means", "sh0", "shN"):
+        torch.testing.assert_close(getattr(theirs, name), getattr(ours, name), atol=atol, rtol=0)
+    if suffix == ".splat":
+        assert turned(theirs.quats, ours.quats) < 0.02
+    else:
+        torch.testing.assert_close(covariances(theirs), covariances(ours), atol=1e-6, rtol=1e-3)
+    # 1.1e-3: the levels 0 and 255 are read as a quarter of a level inside.
+    torch.testing.assert_close(theirs.opacities, ours.opacities, atol=1.1e-3, rtol=0)
+    if suffix == ".ply":
+        for name in ("sigma_d", "growth_d"):
+            assert torch.equal(getattr(theirs, name), getattr(ours, name))
+        assert theirs.attenuation == AttenuationConfig(reference_distance=3.217)
+        assert any("its dial is not described" in note for note in found.notes)
+
+
+@pytest.mark.parametrize("suffix", [".glb", ".spz"])
+def test_files_of_splat_transform(tmp_path: Path, suffix: str) -> None:
+    """A .glb in glTF's axes under a node without a rotation; an .spz of version 3, and of version 4."""
+    g, packed = gaussians(40, 3, 2), suffix == ".spz"
+    save(tmp_path / "a.ply", g)
+    splat_transform(*(("--spz-version", "3") if packed else ()), tmp_path / "a.ply", tmp_path / f"b{suffix}")
+    found = load(tmp_path / f"b{suffix}")
+    again = found.gaussians
+    assert again.sigma_d is None and not any(found.origin)
+    assert (again.means - g.means).abs().max() <= (2.0**-13 if packed else 0)
+    assert (again.sh0 - g.sh0).abs().max() <= (0.51 / (0.15 * 255) if packed else 0)
+    assert (again.opacities - g.opacities).abs().max() <= (0.501 / 255 if packed else 1e-6)
+    if packed:
+        assert (again.log_scales - g.log_scales).abs().max() <= 0.5001 / 16 and turned(again.quats, g.quats) < 5e-3
+        assert (again.shN - g.shN.clamp(-1, 127 / 128)).abs().max() <= 8.6 / 128
+        assert found.notes[-1].startswith("quantised: positions in 24 bits")
+        splat_transform(tmp_path / "a.ply", tmp_path / "c.spz")
+        assert load(tmp_path / "c.spz").gaussians.means.shape == g.means.shape
+    else:
+        torch.testing.assert_close(covariances(again), covariances(g), atol=1e-7, rtol=1e-4)
+        torch.testing.assert_close(again.shN, g.shN, atol=1e-6, rtol=1e-6)

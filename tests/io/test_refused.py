@@ -1,0 +1,347 @@
+"""Files that are no splats, damaged or hostile: an error that names the file, in one line, and little memory."""
+
+from __future__ import annotations
+
+import gzip
+import io
+import json
+import os
+import struct
+import tracemalloc
+import zipfile
+from collections.abc import Callable
+from copy import copy
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from plyfile import PlyElement
+from safetensors.torch import load_file, save_file
+
+from clod_adapter.errors import ClodError
+from clod_adapter.io.checkpoint import load
+from clod_adapter.io.file_formats import FORMATS, check_readable, write
+from formats import change_glb, model, needed, random_rows, write_elements, write_rows
+from packing import write_packed
+from scenes import gaussians
+
+KHR = "KHR_gaussian_splatting"
+LFS = b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 248\n"
+Content = bytes | Callable[[Path], object]
+
+
+def refused(tmp_path: Path, name: str, content: Content, message: str) -> None:
+    path = tmp_path / name
+    path.write_bytes(content) if isinstance(content, bytes) else content(path)
+    with pytest.raises(ClodError, match=f"{name}: .*{message}") as caught:
+        load(path)
+    assert str(caught.value).isprintable()
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("a.ply", LFS, "Git LFS pointer.*git lfs pull"),
+        ("a.ply", b"\r\n<!DOCTYPE html><html>", "web page.*download the file itself"),
+        ("a.ply", b"<html lang=en>", "web page"),
+        ("a.ply", b"<?xml version='1.0'?><Error>", "XML document"),
+        ("a.ply", gzip.compress(b"ply\n", mtime=0), "gzip.*gunzip"),
+        ("a.ply", b"NGSP", "an SPZ file; call it .spz"),
+        ("a.ply", b"glTF", "glTF model; call it .glb"),
+        ("a.ply", b"PK\x03\x04rest", "zip archive"),
+        ("a.ply", b"solid teapot", "is not a PLY file"),
+        ("a.ply", b"plyx", "is not a PLY file"),
+        ("a.spz", b"NGSP" + bytes(60), "(spz of version 4 is read through splat-transform|cannot be read)"),
+        ("a.spz", bytes(64), "not a .spz file by its first bytes"),
+        ("a.spz", b"glTF", "a glTF model; call it .glb"),
+        ("a.glb", b"ply\nformat ascii 1.0\n", "a PLY file; call it .ply"),
+        ("a.pt", b"ply\r\nformat ascii 1.0\n", "a PLY file; call it .ply"),
+        ("a.pt", bytes(64), "no file of torch.save"),
+        ("a.splat", bytes(63), "not a .splat file, whose rows have 32"),
+        ("a.splat", b"ply\n" + bytes(60), "is a PLY file; call it .ply"),
+        ("a.safetensors", bytes(64), "not a safetensors file, or damaged"),
+        ("a.lcc", bytes(64), "LCC.*splat-transform IN.lcc OUT.ply"),
+        ("a.hier", bytes(64), "Hierarchical-3DGS.*point_cloud.ply"),
+        ("a.ckpt", b"PK\x03\x04rest", "Nerfstudio.*ns-export gaussian-splat"),
+        ("chkpnt30000.pth", b"PK\x03\x04rest", "Inria.*point_cloud.ply"),
+        ("meta.json", b"{}", "SOG.*splat-transform"),
+    ],
+)  # fmt: skip
+def test_other_kinds_of_file(tmp_path: Path, name: str, content: bytes, message: str) -> None:
+    refused(tmp_path, name, content, message)
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_what_is_no_file_of_the_format(tmp_path: Path, suffix: str) -> None:
+    (tmp_path / f"folder{suffix}").mkdir()
+    os.mkfifo(tmp_path / f"pipe{suffix}")
+    for name, content in (("empty", b""), ("pointer", LFS), ("other", b"an unknown format")):
+        (tmp_path / f"{name}{suffix}").write_bytes(content)
+    for name, message in (
+        ("missing", "cannot be read .No such file"), ("folder", "cannot be read"), ("pipe", "not a regular file"),
+        ("empty", "is empty"), ("pointer", "is a Git LFS pointer"), ("other", ""),
+    ):  # fmt: skip
+        for read in (load,) if name == "other" else (check_readable, load):  # of some kinds splat-transform tells
+            with pytest.raises(ClodError, match=f"{name}{suffix}: .*{message}"):
+                read(tmp_path / f"{name}{suffix}")
+
+
+def rows(*names: str, count: int = 2, without: tuple[str, ...] = (), **types: str) -> np.ndarray:
+    return random_rows(count, [name for name in (names or needed(1)) if name not in without], types=types)
+
+
+def filled(name: str, value: float) -> np.ndarray:
+    table = rows(count=3)
+    for column in needed(1):
+        table[column] = value if column.startswith(name) else table[column]
+    return table
+
+
+def with_a_list(path: Path) -> None:
+    lists = np.ones(2, [(name, "f4") for name in needed()] + [("bones", "O")])
+    lists["bones"] = [np.array([1], "i4"), np.array([2, 3], "i4")]
+    write_rows(path, lists)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (rows("packed_position", "packed_rotation"), "compressed PLY without its element chunk"),
+        (rows(*needed(1), "f_offset_0", "f_anchor_feat_0"), "Scaffold-GS"),
+        (rows(without=("scale_2",)), "2DGS"),
+        (rows("x", "y", "z", "nx", "ny", "nz"), "mesh or a point cloud"),
+        *((rows(without=(name,)), f"property {name} is missing") for name in ("rot_3", "y", "opacity", "f_dc_1")),
+        (rows(without=("f_rest_4",)), "8 f_rest"),
+        (rows(*needed(1), "f_rest_9", without=("f_rest_4",)), "property f_rest_4 is missing"),
+        (rows(x="i4"), "property x is not float"),
+        (rows(count=0), "no usable Gaussian"),
+        (filled("x", np.nan), "no usable Gaussian.*3 of 3"), (filled("rot", 0), "no usable Gaussian.*3 of 3"),
+        (lambda path: write_rows(path, rows(count=0), "ascii"), "no usable Gaussian|damaged"),
+        (lambda path: write_elements(path, [PlyElement.describe(rows(), "point")]), "no vertex element.*point"),
+        (with_a_list, "property bones is a list"),
+        (b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty float x\nelement face 999999999\n"
+         b"property list uchar int vertex_indices\nend_header\n", "mesh or a point cloud"),  # without reading its faces
+    ],
+)  # fmt: skip
+def test_layouts_of_a_ply(tmp_path: Path, content: Any, message: str) -> None:
+    table = isinstance(content, np.ndarray)
+    refused(tmp_path, "in.ply", (lambda path: write_rows(path, content)) if table else content, message)
+
+
+def header(form: str, count: object, before: str = "", after: str = "") -> bytes:
+    properties = "".join(f"property float {name}\n" for name in needed())
+    return f"ply\nformat {form} 1.0\n{before}element vertex {count}\n{properties}{after}end_header\n".encode()
+
+
+LITTLE, BIG, GOOD = "binary_little_endian", "binary_big_endian", "1.0 " * 14 + "\n"
+COMMENTED = header("ascii", 0).replace(b"element", b"comment @\nelement")
+LIST = "property list uchar int a\n"
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        *((header(LITTLE, count) + bytes(300), "header is damaged")
+          for count in (-1, "nan", "0x10", "1_0", "9" * 21, "9" * 5000, "2.0", "+3", "")),
+        *((header("ascii", 3) + f"{GOOD}{bad}\n{GOOD}".encode(), "damaged or truncated")
+          for bad in ("1.0 " * 13, "1.0 " * 15, "1.0 " * 13 + "x", "1.0 " * 13 + "\u0661")),
+        (header(LITTLE, 1, f"element face 1\n{LIST}") + bytes(100), "no usable Gaussian"),  # lists before it are read
+        (COMMENTED.replace(b"@", b"\x1b[2J"), "not printable ASCII"),
+        (COMMENTED.replace(b"@", "\u00e9".encode()), "not printable ASCII"),
+        (b"ply\nformat ascii 1.0\n" + b"comment x\n" * 200_000 + b"end_header\n", "no end"),
+        *((header(form, count) + b"0 " * 24, rf"is truncated.*claims {count} of vertex.*the file has")
+          for form, count in (("ascii", 1 << 31), (LITTLE, (1 << 64) - 1), (BIG, 10))),
+        # before the test's time limit, in which no loop counts that far
+        *((header(form, 1, before, after) + body, "")
+          for form, body, kind in (("ascii", GOOD.encode(), "property uchar a\n"), ("ascii", GOOD.encode(), LIST),
+                                   (LITTLE, bytes(56), ""), (BIG, bytes(56), LIST))
+          for other in [f"element a {1 << 40}\n{kind}"] for before, after in ((other, ""), ("", other))),
+        (header("ascii", 1) + b"0 " * 13 + b"1" * (1 << 23), "damaged or truncated .a row of more than"),
+    ],
+)  # fmt: skip
+def test_headers_and_rows_of_a_ply(tmp_path: Path, content: bytes, message: str) -> None:
+    """Nothing is allocated for what a header claims, nor copied of a row of any length."""
+    (tmp_path / "whole.ply").write_bytes(header("ascii", 1) + GOOD.encode())
+    load(tmp_path / "whole.ply", activated="none")  # so that nothing is imported while it is measured
+    tracemalloc.start()
+    try:
+        refused(tmp_path, "in.ply", content, message)
+        assert tracemalloc.get_traced_memory()[1] < (16 << 20)
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        (b"element chunk 1", b"element block 1", "without its element chunk"),
+        (b"property float max_scale_y", b"property float max_scale_q", "no max_scale_y"),
+        (b"property uint packed_scale", b"property uint packed_other", "no packed_scale"),
+        (b"property uint packed_color", b"property int packed_color", "no packed_color of type u4"),
+        (b"property uchar f_rest_4", b"property uchar f_rest_9", "no f_rest_4"),
+        (b"property uchar f_rest_8\n", b"", "8 f_rest_"),
+        (b"property float min_r", b"property list uchar float min_r", "has a list"),
+        (b"element vertex 7", b"element vertex 6", "7 harmonics for 6 Gaussians|damaged"),
+        (b"element chunk 1", b"element chunk 0", "is damaged: 7 Gaussians need 1 chunks"),
+        (b"element vertex 7", b"element vertex 7000000", "is truncated"),
+    ],
+)
+def test_packed_ply(tmp_path: Path, old: bytes, new: bytes, message: str) -> None:
+    content = write_packed(tmp_path / "whole.ply", gaussians(7, 1, 0)).read_bytes()
+    assert old in content
+    refused(tmp_path, "a.ply", content.replace(old, new), f"({message})")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda g: g["accessors"][0].update(count=1 << 60), "more than the file"),
+        (lambda g: g["accessors"][0].update(count=3), "of different lengths"),
+        (lambda g: g["accessors"][0].update(count=-1), "is no count"),
+        (lambda g: g["accessors"][0].update(count=1.5), "is no count"),
+        (lambda g: g["bufferViews"][0].update(byteStride=0), "more than the file"),
+        (lambda g: g["bufferViews"][0].update(byteOffset=1 << 70), "more than the file"),
+        (lambda g: g["buffers"][0].update(uri="../secret"), "in another file"),
+        (lambda g: g["accessors"][0].update(sparse={}), "sparse"),
+        (lambda g: g["meshes"][0]["primitives"][0].pop("extensions"), "so it is a mesh"),
+        (lambda g: g["meshes"][0]["primitives"][0]["extensions"][KHR].update(extensions={"x": {}}), "compressed"),
+        (lambda g: g["nodes"][0].update(rotation=[0, 1, 0, 0]), "scaled or turned"),
+        (lambda g: g["nodes"][0].update(scale=[2, 2, 2]), "scaled or turned"),
+        (lambda g: g["nodes"].append({"children": [0]}), "scaled or turned"),
+        (lambda g: g["asset"]["extras"]["clod_adapter"].update(format_version=2), "too new"),
+        (lambda g: g["asset"]["extras"]["clod_adapter"]["attenuation"].update(tau=7), "tau"),
+        (lambda g: g.pop("accessors"), "damaged"),
+    ],
+)
+def test_glb(tmp_path: Path, change: Any, message: str) -> None:
+    write(tmp_path / "a.glb", model(0, 5))
+    refused(tmp_path, "a.glb", lambda path: change_glb(path, change), message)
+
+
+def claiming(count: int) -> bytes:
+    return gzip.compress(struct.pack("<IIIBBBB", 0x5053474E, 3, count, 3, 12, 0, 0), mtime=0)
+
+
+def with_record(columns: Any, values: int) -> Callable[[Path], object]:
+    """An .spz of a model of 40 whose record of the dial names these columns and has so many values."""
+
+    def make(path: Path) -> None:
+        write(path, model(0))
+        data, at = gzip.decompress(path.read_bytes()), 16 + 40 * 20 + 12
+        size = struct.unpack_from("<I", data, at + 8)[0]
+        text = json.dumps(json.loads(data[at + 12 : at + 12 + size]) | {"columns": columns}).encode()
+        body = struct.pack("<I", len(text)) + text + bytes(2 * values)
+        path.write_bytes(gzip.compress(data[:at] + struct.pack("<II", 0x434C0001, len(body)) + body))
+
+    return make
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (gzip.compress(bytes(1 << 26), mtime=0), "unpacks to more"), (claiming(9_999_999), "truncated"),
+        (claiming(1 << 31), "no SPZ file of version"), (claiming(0), "no Gaussians"),
+        (gzip.compress(b"short", mtime=0), "truncated"),
+        *((with_record(columns, values), "its record of sigma_d is damaged") for columns, values in (
+            (["sigma_d", "growth_d"], 40), (["sigma_d"], 80), (["growth_d", "sigma_d"], 80), (7, 40))),
+    ],
+)  # fmt: skip
+def test_spz(tmp_path: Path, content: Content, message: str) -> None:
+    refused(tmp_path, "a.spz", content, message)
+
+
+@pytest.mark.parametrize(("values", "dial"), [(40, ["sigma_d"]), (80, ["sigma_d", "growth_d"]), (0, [])])
+def test_spz_with_fewer_columns_is_read(tmp_path: Path, values: int, dial: list[str]) -> None:
+    with_record(dial or ["sigma_d", "growth_d"], values)(tmp_path / "a.spz")
+    found = load(tmp_path / "a.spz").gaussians.tensors()
+    assert [name for name in ("sigma_d", "growth_d") if name in found] == dial
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"means": torch.ones(4, 3)}, "quats has shape"),
+        ({"means": torch.ones(())}, "has shape|no Gaussians"),
+        ({"shN": torch.ones(5, 2, 3)}, "shN has 2 coefficients"),
+        ({"quats": torch.ones(5, 4, dtype=torch.int32)}, "not of floating-point"),
+        ({"quats": None}, "has no tensor 'quats'"),
+    ],
+)
+def test_safetensors(tmp_path: Path, change: dict[str, torch.Tensor | None], message: str) -> None:
+    write(tmp_path / "whole.safetensors", gaussians(5, 1, 0))
+    about = {"format": "clod-model", "format_version": 1, "package_version": "0"}
+    tensors = {**load_file(tmp_path / "whole.safetensors"), **change}
+    kept = {name: tensor for name, tensor in tensors.items() if tensor is not None}
+    described = {"clod_adapter": json.dumps(about)}
+    refused(tmp_path, "a.safetensors", lambda path: save_file(kept, path, described), message)
+    refused(tmp_path, "a.safetensors", lambda path: save_file(kept, path), "not a model of clod-adapter")
+
+
+def splats(count: int = 12, **changes: Any) -> dict[str, Any]:
+    shapes = {
+        "means": (count, 3), "quats": (count, 4), "scales": (count, 3), "opacities": (count,), "sh0": (count, 1, 3),
+        "shN": (count, 15, 3),
+    }  # fmt: skip
+    return {"splats": {name: torch.zeros(shape) for name, shape in shapes.items()} | changes}
+
+
+class Call:
+    def __init__(self, *what: Any) -> None:
+        self.what = what
+
+    def __reduce__(self) -> Any:
+        return self.what[0], self.what[1:]
+
+
+@pytest.mark.parametrize(
+    ("checkpoint", "message"),
+    [
+        ([1], "no dictionary 'splats'.*list"), ({"model": 1}, "no dictionary 'splats'.*'model'"),
+        ({"splats": [1]}, "no dictionary 'splats'"), ({"splats": {}}, "no 'means'"),
+        (splats(shN=None, features=torch.zeros(12, 32)), "no 'shN'; with appearance"),
+        (splats(shN=torch.zeros(12, 7, 3)), "7 coefficients"), (splats(shN=torch.zeros(12)), "shape"),
+        (splats(quats=torch.zeros(11, 4)), "quats has shape .11, 4., expected .12, 4."),
+        (splats(means=torch.tensor(1.0)), "shape"), (splats(means=torch.zeros(12, 3).int()), "no plain tensor"),
+        (splats(means=torch.eye(3).to_sparse()), "more than tensors"), (splats(0), "it has 0 rows"),
+        (splats() | {"clod_adapter": 3}, "settings are damaged .*a int, not text"),
+        (splats() | {"clod_adapter": "[" * 100_000}, "settings are damaged"),
+        (splats() | {"clod_adapter": '{"format": "clod-model"}'}, "settings are damaged"),
+        (splats(sigma_d=torch.ones(3)), "sigma_d has shape .3,., expected .12,."),
+        (splats(sigma_d="1"), "no plain tensor"),
+        (splats(sigma_d=torch.ones(12), growth_d=torch.ones(3)), "growth_d has shape .3,."),
+        # claims that would allocate, and code, which is not run
+        (splats(means=torch.zeros(1).expand(1 << 40, 3)), "no plain tensor|more than tensors"),
+        (splats(means=torch.zeros(3, 3, device="meta")), "no plain tensor|more than tensors"),
+        (splats(means=Call(bytearray, 1 << 33)), "no plain tensor|more than tensors"),
+        (splats(means=Call(os.mkdir, "ran")), "more than tensors, and is not unpickled"),
+        (splats(means=Call(eval, "__import__('os').mkdir('ran')")), "more than tensors, and is not unpickled"),
+    ],
+)  # fmt: skip
+def test_pt(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, checkpoint: Any, message: str) -> None:
+    monkeypatch.chdir(tmp_path)
+    refused(tmp_path, "a.pt", lambda path: torch.save(checkpoint, path), message)
+    assert os.listdir(tmp_path) == ["a.pt"]
+
+
+def test_pt_that_is_another_archive(tmp_path: Path) -> None:
+    """Compressed; a hundred names of the same megabyte; and a pickle without an archive."""
+    buffer = io.BytesIO()
+    torch.save(splats(), buffer)
+    with zipfile.ZipFile(buffer) as old:
+        entries = {name: old.read(name) for name in old.namelist()}
+    with zipfile.ZipFile(tmp_path / "bomb.pt", "w", zipfile.ZIP_DEFLATED) as new:
+        for name, data in entries.items():
+            new.writestr(name, data + bytes(1 << 20))
+    with zipfile.ZipFile(tmp_path / "many.pt", "w") as new:
+        for name, data in entries.items():
+            new.writestr(name, data)
+        new.writestr("a/data/99", bytes(1 << 20))
+        for k in range(100):
+            more = copy(new.getinfo("a/data/99"))
+            more.filename = f"a/data/{k + 100}"
+            new.filelist.append(more)
+    for name in ("bomb.pt", "many.pt"):
+        refused(tmp_path, name, (tmp_path / name).read_bytes(), "torch.save does not write")
+    refused(tmp_path, "old.pt", b"\x80\x04]\x94.", "format before 1.6")

@@ -1,0 +1,142 @@
+"""Finding and running splat-transform, with substitutes that fail in every way, and reading what it converts."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from clod_adapter.errors import ClodError
+from clod_adapter.io.checkpoint import load, save
+from clod_adapter.io.file_formats import check_readable, file_has_dial
+from clod_adapter.io.formats.splat_transform import INSTALL, VARIABLE, SplatTransform
+from formats import rows_by_place, splat_transform
+from scenes import gaussians
+
+BEGIN = "import os, sys, time\nwords = sys.argv[1:]\nsys.stdout.reconfigure(encoding='utf-8')"
+# What it answers to questions about itself, before it runs.
+ANSWERS = (
+    "if '--version' in words or '--list-gpus' in words: sys.exit(print('node:v22.1.0;splat-transform v3.7.2 (abc)'))"
+)
+
+
+@pytest.fixture
+def tool(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Makes a substitute that runs these lines of Python with ``words``; the environment names it."""
+
+    def make(*lines: str) -> None:
+        script = tmp_path / "with space" / "tool.py"
+        script.parent.mkdir(exist_ok=True)
+        script.write_text("\n".join([BEGIN, *lines]))
+        monkeypatch.setenv(VARIABLE, shlex.join([sys.executable, str(script)]))
+
+    return make
+
+
+def test_find(tool: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    for gpus, has_gpu in (("[0] A GPU", True), ("No GPU adapters found.", False)):
+        tool(f"print('node:v22.1.0;splat-transform v3.7.2 (abc)' if words == ['--version'] else {gpus!r})")
+        found = SplatTransform.find()
+        assert (found.version, found.gpu, found.command[0]) == ("3.7.2", has_gpu, sys.executable)
+    for line, message in (
+        ("print('node:v20.9.0;splat-transform v3.7.0')", "run by Node 20 and needs 22 or newer; "),
+        ("print('node:v22.9.0;splat-transform v2.7.1')", "splat-transform is 2.7.1, 3.7 or newer is needed; "),
+        ("print('node:v22.9.0;splat-transform v3.6.9')", "is 3.6.9, 3.7 or newer"),
+        ("print('something v9.9.9')", "does not run as splat-transform; "),
+        ("sys.exit('node: --import= is not allowed in NODE_OPTIONS')", "does not run as splat-transform; "),
+    ):
+        tool(line)
+        with pytest.raises(ClodError) as error:
+            SplatTransform.find()
+        assert message in str(error.value) and INSTALL in str(error.value)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    for named, message in (
+        ("", "^splat-transform is not installed; in a folder of its own: npm install"),
+        ("nowhere/tool -g 0", "^nowhere/tool, which CLOD_SPLAT_TRANSFORM names, is not installed; "),
+        ("a 'b", "which is no command"),
+    ):
+        monkeypatch.setenv(VARIABLE, named)
+        with pytest.raises(ClodError, match=message):
+            SplatTransform.find()
+
+
+def stand_in(*lines: str) -> SplatTransform:
+    return SplatTransform((sys.executable, "-c", "\n".join([BEGIN, *lines])), "3.7.0")
+
+
+def test_run_passes_arguments_and_measures_time(tmp_path: Path) -> None:
+    out, ticks = tmp_path / "out", list[float]()
+    tool = stand_in("open(words[-1], 'w').write(' '.join(words[:-1]))", "time.sleep(0.5)")
+    seconds = tool.run("a.ply", out, timeout=60, progress=ticks.append)
+    assert out.read_text() == "-w -g cpu -i 1 a.ply" and 0.5 < seconds < 30
+    assert len(ticks) > 1 and ticks == sorted(ticks) and ticks[-1] <= seconds
+    SplatTransform(tool.command, "3.7.0", gpu=True).run(Path("-a.ply"), out, timeout=60)
+    assert out.read_text() == f"-w {Path.cwd() / '-a.ply'}"
+
+
+def test_error_message_is_passed_on() -> None:
+    for lines, message in (
+        (["print('splat-transform v3.7.0')", "print('  \\u2717 Error: no room')", "print('    at f (x.mjs:1)')",
+          "print('\\u2717 failed in 0.1s')", "sys.exit(1)"], "Error: no room"),
+        (["sys.stderr.write('first\\nlast\\n')", "sys.exit(3)"], "last"),
+        (["sys.exit(1)"], "no output"),
+    ):  # fmt: skip
+        with pytest.raises(ClodError, match=f"^splat-transform 3.7.0 failed: {message}$"):
+            stand_in(*lines).run(timeout=60)
+
+
+def test_process_ends_on_timeout_and_interrupt(tmp_path: Path) -> None:
+    mark = tmp_path / "mark"
+    tool = stand_in(f"print(os.getpid(), file=open({str(mark)!r}, 'w'), flush=True)", "time.sleep(100)")
+
+    def interrupt(_: float) -> None:
+        if mark.exists() and mark.read_text():
+            raise KeyboardInterrupt
+
+    for timeout, progress, error, said in (
+        (60, interrupt, KeyboardInterrupt, None), (1, None, ClodError, "took longer than 1 s"),
+    ):  # fmt: skip
+        with pytest.raises(error, match=said):
+            tool.run(timeout=timeout, progress=progress)
+        with pytest.raises(ProcessLookupError):
+            os.kill(int(mark.read_text()), 0)
+
+
+def test_converted_files(tmp_path: Path, tool: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    was = gaussians(5, 1, 0)
+    save(tmp_path / "plain.ply", was)
+    seen, plain = repr(str(tmp_path / "seen")), repr(str(tmp_path / "plain.ply"))
+    tool(ANSWERS, f"open({seen}, 'w').write(' '.join(words))", f"import shutil; shutil.copy({plain}, words[-1])")
+    for name in ("a.sog", "a.KSPLAT", "a.spz"):
+        path = tmp_path / name
+        path.write_bytes(b"NGSP, if it is an SPZ: of version 4")
+        check_readable(path)
+        assert not file_has_dial(path)
+        found = load(path)
+        assert torch.equal(found.gaussians.means, was.means) and "quantised" in found.notes[0]
+        assert f" {path} " in (tmp_path / "seen").read_text()
+    tool(ANSWERS, "sys.stderr.write('  Error: not a zip\\n   at main\\n')", "sys.exit(1)")
+    with pytest.raises(ClodError, match=r"a.sog: cannot be read \(.*failed: Error: not a zip\)"):
+        load(tmp_path / "a.sog")
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.delenv(VARIABLE)
+    for read in (check_readable, load):
+        with pytest.raises(ClodError, match="a.sog: .*npm install node@22 @playcanvas/splat-transform"):
+            read(tmp_path / "a.sog")
+
+
+@pytest.mark.parametrize("name", ["a.sog", "a.spz"])
+def test_splat_transform_converts(tmp_path: Path, name: str) -> None:
+    was = gaussians(300, 1, 0)
+    save(tmp_path / "plain.ply", was)
+    splat_transform("-g", "cpu", tmp_path / "plain.ply", tmp_path / name)
+    means = load(tmp_path / name).gaussians.means
+    assert (means[rows_by_place(was.means.numpy(), means.numpy())] - was.means).abs().max() < 1e-3
+    (tmp_path / f"b{name}").write_bytes((tmp_path / name).read_bytes()[:400])
+    with pytest.raises(ClodError, match=f"b{name}: cannot be read"):
+        load(tmp_path / f"b{name}")
