@@ -17,39 +17,48 @@ from clod_adapter.cli.adapt import run as adapt_run
 from clod_adapter.demo import packed, pictures
 from runs import pressing
 
-PICTURES = ("dial.png", "curve.png")
+PICTURES = {"dial.png", "curve.png"}
 
 
-@pytest.fixture
-def short(monkeypatch: pytest.MonkeyPatch, capture: Any) -> None:
-    """The tests' own capture in place of the gallery, a few steps, and empty pictures."""
+def test_demo(clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It names its files and the next command, resumes, and reports no figures that were not drawn.
+
+    A state that cannot be resumed is an error that does not name --resume, which the demo does not have.
+    """
     pytest.importorskip("matplotlib")
 
     def unpack(scene: Path, base: Path) -> None:
         shutil.copytree(capture.scene, scene, dirs_exist_ok=True)
         shutil.copyfile(capture.ply, base)
 
-    monkeypatch.setattr(packed, "unpack", unpack)
+    monkeypatch.setattr(packed, "unpack", unpack)  # the tests' own capture, a few steps, and empty pictures
     monkeypatch.setattr(pictures, "draw", lambda *given: [path.write_bytes(b"") for path in given[-1].values()])
     monkeypatch.setattr(config, "STEPS", 2)
     monkeypatch.setattr(config, "STEPS_PER_VIEW", 0)
     monkeypatch.setattr(adapt_run, "LOST", (99.0, 99.0))  # two steps cannot keep full quality
-
-
-def test_demo(clod: Any, short: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It names its files and the next command; figures that were not drawn are not reported."""
+    folder = tmp_path / "-odd"
+    state = folder / "gallery.resume.safetensors"
+    with monkeypatch.context() as patch:
+        patch.setattr(listeners, "save_state", pressing(listeners.save_state, signal.SIGINT, signal.SIGTERM, at=2))
+        assert clod("demo", "--out=-odd").code == 130
+    with monkeypatch.context() as patch:
+        patch.setattr(listeners, "package_version", lambda: "0.0.7")
+        done = clod("demo", "--out=-odd")
+    assert done.code == 2 and f"{state.relative_to(tmp_path)}: is of " in done.err, done
+    assert "delete it to start over" in done.err and "--resume" not in done.err and state.exists()
+    done = clod("demo", "--out=-odd", "--json")
+    assert done.code == 0 and json.loads(done.out)["resumed_from"] == 1 and not state.exists(), done
     done = clod("demo", "--out=-odd")
-    assert done.code == 0, done
-    assert f"everything is in {tmp_path / '-odd'}" in done.out and "clod-adapt YOURS.ply" in done.out
+    assert f"everything is in {folder}" in done.out and "clod-adapt YOURS.ply" in done.out and done.code == 0, done
     found = json.loads(clod("demo", "--out=-odd", "--quiet", "--json").out)
     assert found["command"] == "demo" and found["folder"] == "-odd" and found["scene"] == "-odd/capture"
     assert found["pictures"] == {"dial": "-odd/dial.png", "curve": "-odd/curve.png"} and found["config"]["max_sv"] == 5
-    made = {path.name for path in (tmp_path / "-odd").iterdir()}
+    made = {path.name for path in folder.iterdir()}
     assert made == {"capture", "base.ply", "gallery.ply", "gallery.safetensors", "gallery.json", *PICTURES}
     monkeypatch.setattr(adapt_run, "extract", pressing(adapt_run.extract, signal.SIGINT))  # nothing is measured
     done = clod("demo", "--out=-odd", "--json")
     assert done.code == 0 and json.loads(done.out)["pictures"] == {} and "no figures" in done.err
-    assert not any((tmp_path / "-odd" / name).exists() for name in PICTURES)
+    assert not PICTURES & {path.name for path in folder.iterdir()}
 
 
 def test_missing_package_is_named_at_the_start(clod: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -57,18 +66,3 @@ def test_missing_package_is_named_at_the_start(clod: Any, tmp_path: Path, monkey
     done = clod("demo")
     assert done.code == 2 and "matplotlib: pip install matplotlib" in done.err
     assert list(tmp_path.iterdir()) == []
-
-
-def test_interrupted_demo_is_resumed(clod: Any, short: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A state that cannot be resumed is an error that does not name --resume, which the demo does not have."""
-    with monkeypatch.context() as patch:
-        patch.setattr(listeners, "save_state", pressing(listeners.save_state, signal.SIGINT, signal.SIGTERM, at=2))
-        assert clod("demo").code == 130
-    state = tmp_path / "demo" / "gallery.resume.safetensors"
-    with monkeypatch.context() as patch:
-        patch.setattr(listeners, "package_version", lambda: "0.0.7")
-        done = clod("demo")
-    assert done.code == 2 and f"{state.relative_to(tmp_path)}: is of " in done.err, done
-    assert "delete it to start over" in done.err and "--resume" not in done.err and state.exists()
-    done = clod("demo", "--json")
-    assert done.code == 0 and json.loads(done.out)["resumed_from"] == 1 and not state.exists(), done

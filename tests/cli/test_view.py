@@ -1,4 +1,4 @@
-"""``clod-adapt view`` without a browser: messages, served files, interrupts."""
+"""``clod-adapt view`` without a page in a browser: messages, served files, interrupts, and the browser it opens."""
 
 from __future__ import annotations
 
@@ -16,7 +16,9 @@ import pytest
 
 import clod_adapter
 from clod_adapter.cli import view
-from clod_adapter.cli.main import build_parser, main
+from clod_adapter.cli.main import build_parser
+
+URL = "http://127.0.0.1:1/"
 
 
 def fetch(url: str) -> bytes:
@@ -24,112 +26,100 @@ def fetch(url: str) -> bytes:
         return bytes(response.read())
 
 
+def config_of(page: bytes) -> Any:
+    """The settings that a page holds."""
+    return json.loads(re.findall(r'id="clod-config">(.*?)</script>', page.decode(), re.DOTALL)[0])
+
+
+def assert_holds(data: bytes, file: Path, folder: Path) -> None:
+    """Asserts that the data is the splat of a file."""
+    (folder / "served.ply").write_bytes(data)
+    served, shown = (clod_adapter.load(path).gaussians for path in (folder / "served.ply", file))
+    assert len(served) == len(shown) and (served.attenuation is None) == (shown.attenuation is None)
+
+
 def test_serves_until_it_is_interrupted(spawn: Any, capture: Any, dialled: Path, tmp_path: Path) -> None:
     words = [dialled, "--base", capture.ply, "--images", capture.scene, "--sv", 2, "--no-browser", "--json"]
     process = spawn("view", *words, cwd=tmp_path)
     report = json.loads(process.stdout.readline())
     assert report["url"] == f"http://127.0.0.1:{report['port']}/" and report["cameras"] == 10
-    (config,) = re.findall(r'id="clod-config">(.*?)</script>', fetch(report["url"]).decode(), re.DOTALL)
-    config = json.loads(config)
+    config = config_of(fetch(report["url"]))
     assert config["title"] == "dial.ply" and config["virtual_scale"] == 2 and len(config["cameras"]) == 10
     assert (config["model"]["href"], config["base"]["href"]) == ("/files/model", "/files/base")
     for entry, file in (config["model"], dialled), (config["base"], capture.ply):
-        (tmp_path / "served.ply").write_bytes(fetch(report["url"] + entry["href"][1:]))
-        served, shown = (clod_adapter.load(path).gaussians for path in (tmp_path / "served.ply", file))
-        assert len(served) == len(shown) and (served.attenuation is None) == (shown.attenuation is None)
+        assert_holds(fetch(report["url"] + entry["href"][1:]), file, tmp_path)
     process.send_signal(signal.SIGTERM)
     out, err = process.communicate(timeout=20)
     assert (process.returncode, out) == (0, "") and "Traceback" not in err and "GET" not in err, err
 
 
-def test_dial_values_beyond_the_page_are_noted(capture: Any, dialled: Path, capsys: Any) -> None:
+def test_dial_values_and_files_of_a_page(capture: Any, dialled: Path, tmp_path: Path, capsys: Any) -> None:
+    """Dial values beyond the page's are noted.
+
+    Of a folder it has the splats by name, numbers by value; files with the same name have the names of their folders.
+    """
+
+    def page_of(*words: object) -> tuple[Any, Any, str]:
+        args = build_parser("view").parse_args([*map(str, words)])
+        view.COMMAND.check(args)
+        answers, report = view.make_page(args, view.Console(False))
+        return answers, report, capsys.readouterr().err
+
     for path, opens, said in (
         (dialled, 4, "the page's dial ends at s = 4"), (capture.ply, 1, "s = 9 has no effect"),
     ):  # fmt: skip
-        answers, report = view.make_page(build_parser("view").parse_args([str(path), "--sv=9"]), view.Console(False))
-        (config,) = re.findall(r'id="clod-config">(.*?)</script>', b"".join(answers["/"].blocks()).decode(), re.DOTALL)
-        assert json.loads(config)["virtual_scale"] == opens and any(said in note for note in report["notes"])
-        assert said in capsys.readouterr().err
+        answers, report, err = page_of(path, "--sv=9")
+        assert config_of(b"".join(answers["/"].blocks()))["virtual_scale"] == opens
+        assert any(said in note for note in report["notes"]) and said in err
+    for name in ("lod10.ply", "lod2.ply"):
+        (tmp_path / name).write_bytes(dialled.read_bytes())
+    (tmp_path / "points.ply").write_text("ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nend_header\n")
+    (tmp_path / "more").mkdir()
+    (tmp_path / "more" / "lod2.ply").write_bytes(capture.ply.read_bytes())
+    answers, report, _ = page_of(tmp_path, tmp_path / "more" / "lod2.ply")
+    config, folder = config_of(b"".join(answers["/"].blocks())), tmp_path.name
+    entries = [config["model"], *config["others"]]
+    assert [entry["name"] for entry in entries] == [f"{folder}/lod2.ply", f"{folder}/lod10.ply", "more/lod2.ply"]
+    for entry, file in zip(entries, (dialled, dialled, capture.ply), strict=True):
+        assert_holds(b"".join(answers[entry["href"]].blocks()), file, tmp_path)
+    assert report["model"].endswith("lod2.ply") and len(report["files"]) == 3
 
 
-@pytest.mark.parametrize("name", ["print", "open_browser"])
-def test_interrupt_right_after_the_address(capture: Any, monkeypatch: Any, capsys: Any, name: str) -> None:
-    def interrupted(*args: Any, **kwargs: Any) -> None:
-        raise KeyboardInterrupt
+def test_interrupts_and_browsers(clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One that opens a window is opened; an interrupt right after the address ends the command as usual."""
+    opened = []
 
-    monkeypatch.setattr(view, name, interrupted, raising=False)
-    assert main(["view", str(capture.ply), "--quiet"]) == 0
-    out, err = capsys.readouterr()
-    assert err == "" and (name == "print" or re.fullmatch(r"http://127\.0\.0\.1:\d+/  \(Ctrl-C ends\)\n", out))
+    class Browser(webbrowser.BaseBrowser):
+        def open(self, url: str, new: int = 0, autoraise: bool = True) -> bool:
+            opened.append(url)
+            raise KeyboardInterrupt
 
-
-def test_port_in_use(clod: Any, capture: Any) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        done = clod("view", capture.ply, "--no-browser", "--port", taken.getsockname()[1])
-    assert (done.code, done.out) == (2, ""), done
-    assert re.search(r"(?m)^clod-adapt: error: .*port \d+ of 127.0.0.1 is not available .*choose another", done.err)
-
-
-class Browser(webbrowser.BaseBrowser):
-    def __init__(self) -> None:
-        super().__init__("a browser")
-        self.opened: list[str] = []
-
-    def open(self, url: str, new: int = 0, autoraise: bool = True) -> bool:
-        self.opened.append(url)
-        return True
-
-
-def test_graphical_browsers_are_opened_and_text_browsers_not(monkeypatch: pytest.MonkeyPatch) -> None:
-    browser = Browser()
-    monkeypatch.setattr(webbrowser, "get", lambda: browser)
-    assert view.open_browser("http://127.0.0.1:1/") and browser.opened == ["http://127.0.0.1:1/"]
+    monkeypatch.setattr(webbrowser, "get", Browser)
+    done = clod("view", capture.ply, "--quiet")
+    assert (done.code, done.err) == (0, "") and done.out == f"{opened[0]}  (Ctrl-C ends)\n"
     monkeypatch.delenv("BROWSER", raising=False)
     monkeypatch.setattr(webbrowser, "get", lambda: webbrowser.GenericBrowser("true"))
-    assert not view.open_browser("http://127.0.0.1:1/")
-
-    def none() -> None:
-        raise webbrowser.Error("could not locate runnable browser")
-
-    monkeypatch.setattr(webbrowser, "get", none)
-    assert not view.open_browser("http://127.0.0.1:1/")
-
-
-def test_program_in_browser_variable_is_opened(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Editors set BROWSER. The command does not wait for the program."""
+    assert not view.open_browser(URL)
+    # Editors set BROWSER to a program; the command does not wait for it.
     helper = tmp_path / "helper.sh"
     helper.write_text(f"#!/bin/sh\ncd '{tmp_path}'; echo \"$1\" > part; mv part url; sleep 3\n")
     helper.chmod(0o755)
     monkeypatch.setenv("BROWSER", str(helper))
     monkeypatch.setattr(webbrowser, "get", lambda: webbrowser.GenericBrowser(str(helper)))
     began = time.monotonic()
-    assert view.open_browser("http://127.0.0.1:1/") and time.monotonic() - began < 30
+    assert view.open_browser(URL) and time.monotonic() - began < 30
     while not (tmp_path / "url").exists():
         time.sleep(0.02)
-    assert (tmp_path / "url").read_text() == "http://127.0.0.1:1/\n"
-    monkeypatch.setenv("BROWSER", "lynx")
+    assert (tmp_path / "url").read_text() == f"{URL}\n"
     monkeypatch.setattr(webbrowser, "get", lambda: webbrowser.GenericBrowser("lynx"))
-    assert not view.open_browser("http://127.0.0.1:1/")
+    assert not view.open_browser(URL)
 
+    def none() -> None:
+        raise webbrowser.Error("could not locate runnable browser")
 
-def test_a_folder_and_several_files(capture: Any, dialled: Path, tmp_path: Path) -> None:
-    """A folder's splats by name, numbers by value, without what is none; files with the same name by their folder."""
-    for name in ("lod10.ply", "lod2.ply"):
-        (tmp_path / name).write_bytes(dialled.read_bytes())
-    (tmp_path / "points.ply").write_text("ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nend_header\n")
-    (tmp_path / "more").mkdir()
-    (tmp_path / "more" / "lod2.ply").write_bytes(capture.ply.read_bytes())
-    words = ["view", str(tmp_path), str(tmp_path / "more" / "lod2.ply")]
-    args = build_parser("view").parse_args(words[1:])
-    view.COMMAND.check(args)
-    answers, report = view.make_page(args, view.Console(True))
-    (config,) = re.findall(r'id="clod-config">(.*?)</script>', b"".join(answers["/"].blocks()).decode(), re.DOTALL)
-    config = json.loads(config)
-    entries = [config["model"], *config["others"]]
-    folder = tmp_path.name
-    assert [entry["name"] for entry in entries] == [f"{folder}/lod2.ply", f"{folder}/lod10.ply", "more/lod2.ply"]
-    for entry, file in zip(entries, (dialled, dialled, capture.ply), strict=True):
-        (tmp_path / "served.ply").write_bytes(b"".join(answers[entry["href"]].blocks()))
-        served, shown = (clod_adapter.load(path).gaussians for path in (tmp_path / "served.ply", file))
-        assert len(served) == len(shown) and (served.attenuation is None) == (shown.attenuation is None)
-    assert report["model"].endswith("lod2.ply") and len(report["files"]) == 3
+    monkeypatch.setattr(webbrowser, "get", none)
+    assert not view.open_browser(URL)
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        done = clod("view", capture.ply, "--no-browser", "--port", taken.getsockname()[1])
+    assert (done.code, done.out) == (2, ""), done
+    assert re.search(r"(?m)^clod-adapt: error: .*port \d+ of 127.0.0.1 is not available .*choose another", done.err)
