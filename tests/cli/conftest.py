@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import io
 import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -27,28 +30,39 @@ def signals_arrive() -> Iterator[None]:
     signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
 
 
+@dataclass(frozen=True)
 class Done:
-    """Exit code, stdout and stderr."""
+    code: int
+    out: str
+    err: str
 
-    def __init__(self, code: int, out: str, err: str) -> None:
-        self.code, self.out, self.err = code, out, err
 
-    def __repr__(self) -> str:
-        return f"exit {self.code}\n--- stdout\n{self.out}\n--- stderr\n{self.err}"
+def command(*words: object, accept: bool = True) -> Done:
+    """Runs ``clod-adapt`` with these words in this process; adapting ``accept``s its loss (``runs.accepted``)."""
+    out, err = io.StringIO(), io.StringIO()
+    with redirect_stdout(out), redirect_stderr(err):
+        try:
+            code = main(accepted(words) if accept else [str(word) for word in words])
+        except SystemExit as done:  # argparse, for --help
+            code = int(done.code or 0)
+    return Done(code, out.getvalue(), err.getvalue())
 
 
 @pytest.fixture
-def clod(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Done]:
-    """Runs ``clod-adapt`` with these words, in this process, with the test's folder as the current one."""
+def clod(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Done]:
+    """``command`` with the test's folder as the current one."""
     monkeypatch.chdir(tmp_path)
+    return command
 
-    def run(*words: object) -> Done:
-        capsys.readouterr()
-        try:
-            code = main(accepted(words))
-        except SystemExit as done:  # argparse, for --help
-            code = int(done.code or 0)
-        return Done(code, *capsys.readouterr())
+
+@pytest.fixture(scope="session")
+def run_in() -> Callable[..., Done]:
+    """``command`` in a folder, for fixtures that several tests share."""
+
+    def run(folder: Path, *words: object, accept: bool = True) -> Done:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.chdir(folder)
+            return command(*words, accept=accept)
 
     return run
 

@@ -18,10 +18,9 @@ import pytest
 from safetensors.torch import load_file
 
 import clod_adapter
-from clod_adapter.cli.adapt import listeners
-from clod_adapter.cli.shared import measure
+from clod_adapter.cli.adapt import listeners, run
+from clod_adapter.cli.shared import measure, pages
 from clod_adapter.training import planner
-from clod_adapter.training.interrupts import PRESSED
 from clod_adapter.training.state import load_state
 from runs import OUTPUTS, STATE, Launched, Server, launch, log_of, names, pressing, wait_for
 from scenes import stripped
@@ -43,12 +42,12 @@ def words(capture: Any) -> list[Any]:
 
 
 @pytest.fixture(scope="module")
-def undisturbed(server: Server, words: list[Any], tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, float]:
-    """The folder of an uninterrupted run, and its wall time in seconds."""
-    folder, began = tmp_path_factory.mktemp("undisturbed"), time.perf_counter()
+def undisturbed(server: Server, words: list[Any], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of an uninterrupted run."""
+    folder = tmp_path_factory.mktemp("undisturbed")
     code, log = server.run(folder, *words)
     assert code == 0, log
-    return folder, time.perf_counter() - began
+    return folder
 
 
 def fingerprints(*roots: Path) -> dict[Path, str]:
@@ -151,66 +150,93 @@ def kill(server: Server, run: Launched, draw: random.Random, seconds: float, sav
 
 
 def test_one_interrupt_of_training_writes_the_result_so_far(
-    server: Server, words: list[Any], undisturbed: tuple[Path, float], tmp_path: Path, clod: Any
+    server: Server, words: list[Any], undisturbed: Path, tmp_path: Path, clod: Any
 ) -> None:
-    """The state is written too, and the log has only the command's lines."""
+    """The state is written too, and the log has only the command's lines. No other run may write there before."""
     child = server.start(tmp_path, *words)
     wait_for(tmp_path / STATE)
+    os.kill(child, signal.SIGSTOP)
+    before = fingerprints(tmp_path / STATE)
+    done = clod(*words, "--resume")
+    assert done.code == 2 and "dial.ply: another run is writing it; wait" in done.err, done
+    assert fingerprints(tmp_path / STATE) == before
     os.kill(child, signal.SIGINT)
+    os.kill(child, signal.SIGCONT)
     code, log = server.wait(child), log_of(tmp_path)
     report = json.loads((tmp_path / "dial.json").read_text())
     assert code == 0 and report["interrupted"] and report["resumed_from"] is None and "interrupted after" in log, log
     assert names(tmp_path) == sorted([*OUTPUTS, STATE]) and load_state(tmp_path / STATE)[0].steps == report["steps"]
     assert f"--resume resumes from step {report['steps']}, which is in {STATE}" in log and "SIGTERM" not in log
     assert_whole(tmp_path)
-    assert clod("apply", words[0], "dial.safetensors", "-o", tmp_path.with_suffix(".ply")).code == 0
-    assert tmp_path.with_suffix(".ply").read_bytes() == (tmp_path / "dial.ply").read_bytes()
     code, log = server.run(tmp_path, *words, "--resume")
     assert code == 0 and f"resuming {STATE} from step {report['steps']}" in log, log
-    assert_same(tmp_path, undisturbed[0])
+    assert_same(tmp_path, undisturbed)
     assert json.loads((tmp_path / "dial.json").read_text())["resumed_from"] == report["steps"]
 
 
-def test_two_interrupts_abort(server: Server, words: list[Any], undisturbed: Any, tmp_path: Path) -> None:
-    child = server.start(tmp_path, *words)
-    wait_for(tmp_path / STATE)
-    os.kill(child, signal.SIGINT)
-    os.kill(child, signal.SIGTERM)  # two equal signals could arrive as one
-    assert server.wait(child) == 130 and names(tmp_path) == [STATE], log_of(tmp_path)
-    assert server.run(tmp_path, *words, "--resume")[0] == 0
-    assert_same(tmp_path, undisturbed[0])
+INT, TERM = signal.SIGINT, signal.SIGTERM
+SAVING, BOTH = (listeners, "save_state"), sorted([*OUTPUTS, STATE])  # while training
+ABORTED = f"--resume resumes from step {ITERS}, which is in {STATE}\nclod-adapt: interrupted"
+MOMENTS = [  # where signals arrive, which, exit code, files, and the report's "interrupted" or the end of stderr
+    ((planner, "sh_degree_losses"), [INT], 130, [], "clod-adapt: interrupted"),
+    (SAVING, [signal.SIGUSR1] * 3, 0, BOTH, True),
+    (SAVING, [signal.SIGHUP] * 3, 0, BOTH, True),
+    ((run, "extract"), [INT], 0, BOTH, False),
+    ((run, "save_adapter"), [INT, TERM], 130, [STATE], ABORTED),
+    ((run, "save"), [INT], 0, OUTPUTS, False),  # the files without the page
+    ((pages, "pictures"), [INT], 0, OUTPUTS, False),
+]
 
 
-def test_second_interrupt_aborts_the_measurement_too(
-    clod: Any, words: list[Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """As the message after the first one says; a message names the saved step."""
-    monkeypatch.setattr(listeners, "save_state", pressing(listeners.save_state, signal.SIGINT))
-    monkeypatch.setattr(measure, "evaluate", pressing(measure.evaluate, signal.SIGINT, at=2))  # the first: the base
-    done = clod(*words)
-    assert done.code == 130 and names(tmp_path) == [STATE] and "Ctrl-C again aborts without writing" in done.err, done
-    step = load_state(tmp_path / STATE)[0].steps
-    assert f"--resume resumes from step {step}, which is in {STATE}\nclod-adapt: interrupted" in done.err, done
+@pytest.mark.parametrize(("place", "numbers", "code", "files", "said"), MOMENTS)
+def test_signals_at_a_moment(
+    clod: Any, words: list[Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, place: tuple[Any, str],
+    numbers: list[int], code: int, files: list[str], said: bool | str,
+) -> None:  # fmt: skip
+    """Warnings may be repeated, as launchers do; a second Ctrl-C or SIGTERM aborts."""
+    monkeypatch.setattr(*place, pressing(getattr(*place), *numbers))
+    done = clod(*words, "--json", *(["--report"] if files == OUTPUTS else []))
+    assert done.code == code and names(tmp_path) == files, done
+    if code == 0:
+        report = json.loads(done.out)
+        assert report["interrupted"] == said and "page" not in report["outputs"]
+        assert bool(report["rows"]) == bool(report["calibration"]) == (place[1] != "extract")
+    else:
+        assert done.err.rstrip().endswith(str(said)), done
+    assert signal.getsignal(INT) is signal.default_int_handler and signal.getsignal(TERM) is signal.SIG_DFL
 
 
-@pytest.mark.parametrize(
-    ("number", "ignored"),
-    [(signal.SIGUSR1, False), (signal.SIGHUP, False), (signal.SIGINT, True), (signal.SIGTERM, True)],
-)
-def test_warnings_end_training_and_may_be_repeated(
-    clod: Any, words: list[Any], monkeypatch: pytest.MonkeyPatch, number: int, ignored: bool
-) -> None:
-    """Ignored signals stay ignored, as in a background job of a script or below nohup; SIGTERM still ends it."""
-    times = 1 if number in PRESSED else 3
-    monkeypatch.setattr(listeners, "save_state", pressing(listeners.save_state, *[number] * times))
-    before = signal.signal(number, signal.SIG_IGN) if ignored else signal.getsignal(number)
+@pytest.mark.parametrize("number", [INT, TERM])
+def test_ignored_signals(clod: Any, words: list[Any], monkeypatch: pytest.MonkeyPatch, number: int) -> None:
+    """They stay ignored, as in a background job of a script or below nohup; SIGTERM still ends training."""
+    monkeypatch.setattr(*SAVING, pressing(listeners.save_state, number))
+    before = signal.signal(number, signal.SIG_IGN)
     try:
-        done = clod(*words, "--json")
-        assert signal.getsignal(number) is (signal.SIG_IGN if ignored else before)
+        assert json.loads(clod(*words, "--json").out)["interrupted"] == (number == TERM)
+        assert signal.getsignal(number) is signal.SIG_IGN
     finally:
         signal.signal(number, before)
-    ends = not ignored or number == signal.SIGTERM
-    assert done.code == 0 and json.loads(done.out)["interrupted"] == ends, done
+
+
+def test_interrupts_of_the_measurement(
+    clod: Any, words: list[Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first one keeps the finished rows; one after an interrupt of training aborts, as its message says."""
+    real = measure.evaluate
+
+    def evaluate(gaussians: Any, views: Any, dials: list[float], progress: Any, **rest: Any) -> Any:
+        pressed = pressing(progress, INT, at=3 * len(views) + 1)
+        return real(gaussians, views, dials, progress=pressed if len(dials) == 5 else progress, **rest)
+
+    monkeypatch.setattr(measure, "evaluate", evaluate)
+    report = json.loads((done := clod(*words, "--json")).out)
+    assert done.code == 0 and [row["virtual_scale"] for row in report["rows"]] == [1, 1.5, 2]
+    assert "measurements were interrupted" in report["notes"][0] in done.err and report["interrupted"] is False
+    assert report["calibration"] is None and clod_adapter.load(tmp_path / "dial.ply").calibration is None
+    assert names(tmp_path) == BOTH
+    monkeypatch.setattr(*SAVING, pressing(listeners.save_state, INT))
+    done = clod(*words)
+    assert done.code == 130 and "Ctrl-C again aborts without writing" in done.err and "interrupted after" in done.err
 
 
 def test_closed_terminal_does_not_end_the_writing(server: Server, words: list[Any], tmp_path: Path) -> None:
@@ -224,34 +250,5 @@ def test_closed_terminal_does_not_end_the_writing(server: Server, words: list[An
     os.close(other)
     os.close(terminal)
     assert server.wait(child) == 0
-    assert json.loads((tmp_path / "dial.json").read_text())["interrupted"]
-    assert names(tmp_path) == sorted([*OUTPUTS, STATE])
+    assert json.loads((tmp_path / "dial.json").read_text())["interrupted"] and names(tmp_path) == BOTH
     assert_whole(tmp_path)
-
-
-def test_interrupt_before_the_first_step_writes_nothing(
-    clod: Any, words: list[Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(planner, "sh_degree_losses", pressing(planner.sh_degree_losses, signal.SIGINT))
-    done = clod(*words)
-    assert "plan:" not in done.err, done
-    assert done.code == 130 and done.err.splitlines()[-1] == "clod-adapt: interrupted" and names(tmp_path) == []
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
-
-
-def test_second_run_with_the_same_output_is_refused(
-    server: Server, words: list[Any], undisturbed: tuple[Path, float], tmp_path: Path, clod: Any
-) -> None:
-    """While the first process exists, also suspended; its result does not change."""
-    child = server.start(tmp_path, *words)
-    wait_for(tmp_path / STATE)
-    os.kill(child, signal.SIGSTOP)
-    before = fingerprints(tmp_path / STATE)
-    for more in ((), ("--resume",)):
-        done = clod(*words, *more)
-        assert done.code == 2 and "dial.ply: another run is writing it; wait" in done.err, done
-    assert fingerprints(tmp_path / STATE) == before
-    os.kill(child, signal.SIGCONT)
-    assert server.wait(child) == 0, log_of(tmp_path)
-    assert_same(tmp_path, undisturbed[0])

@@ -16,7 +16,6 @@ import clod_adapter
 from clod_adapter.adapter import ATTRIBUTES
 from clod_adapter.blocks.memory import MemoryPlan, plan_for_limit
 from clod_adapter.cli.adapt import listeners, prepare
-from clod_adapter.io.adapter_file import load_adapter
 from clod_adapter.progress import Phase, Progress
 from runs import change_step, fail, names
 from scenes import stripped
@@ -25,70 +24,53 @@ BLOCKS = 3
 TINY = ("--iters", 9, "--max-sv", 3, "--antialiasing", "off")
 
 
+def in_blocks(*args: Any) -> MemoryPlan:
+    """Blocks, although the scene fits in memory."""
+    return replace(plan_for_limit(*args), blocks=BLOCKS)
+
+
 @pytest.fixture
 def forced(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Trains in blocks, although the scene fits in memory."""
-
-    def plan(*args: Any) -> MemoryPlan:
-        return replace(plan_for_limit(*args), blocks=BLOCKS)
-
-    monkeypatch.setattr(prepare, "plan_for_limit", plan)
+    monkeypatch.setattr(prepare, "plan_for_limit", in_blocks)
 
 
 @pytest.fixture(scope="module")
-def opaque(capture: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The capture's checkpoint, some of whose opacities are infinite, as in files in the wild."""
+def given(capture: Any, tmp_path_factory: pytest.TempPathFactory) -> list[Any]:
+    """Arguments; some opacities of the checkpoint are infinite, as in files in the wild."""
     logits = capture.gaussians.opacity_logits.clone()
     logits[::7] = float("inf")
     path = tmp_path_factory.mktemp("opaque") / "opaque.ply"
-    return Path(capture.write(path, capture.gaussians.replace(opacity_logits=logits)))
+    capture.write(path, capture.gaussians.replace(opacity_logits=logits))
+    return [path, "--images", capture.scene, *TINY]
 
 
 @pytest.fixture
-def adapt(clod: Callable[..., Any], capture: Any, opaque: Path) -> Callable[..., Any]:
+def adapt(clod: Callable[..., Any], given: list[Any]) -> Callable[..., Any]:
     """Adapts with ``--memory``, in blocks with ``forced``."""
-
-    def run(out: str, *more: object) -> Any:
-        return clod(opaque, "--images", capture.scene, *TINY, "--memory", "8GB", "--out", out, *more)
-
-    return run
-
-
-@pytest.fixture(scope="module")
-def kept() -> dict[str, bytes]:
-    return {}
-
-
-@pytest.fixture
-def whole(adapt: Callable[..., Any], forced: None, tmp_path: Path, kept: dict[str, bytes]) -> dict[str, bytes]:
-    """The files of an uninterrupted run; it runs once."""
-    if kept:
-        return kept
-    (tmp_path / "one.blocks.safetensors").write_bytes(b"the user's")
-    done = adapt("one.ply", "--json")
-    assert done.code == 0, done
-    report = json.loads(done.out)
-    assert report["memory"]["blocks"] == BLOCKS and report["steps"] == 26 and len(report["rows"]) > 2
-    left_out = next(each for each in report["plan"]["decisions"] if each["name"] == "unseen")["number"]
-    trained = (300 - int(left_out)) // BLOCKS
-    assert 0 < left_out < 100 and f"of 3, pass 1 of 2: {trained} Gaussians, 7 steps" in done.err
-    assert "in 3 blocks" in done.err and "unseen Gaussians" in done.err and report["seconds"]["start"] > 0
-    logits = clod_adapter.load(tmp_path / "one.ply").gaussians.opacity_logits
-    assert torch.equal(logits.isinf(), torch.arange(300) % 7 == 0) and not logits.isnan().any()
-    (tmp_path / "one.blocks.safetensors").unlink()
-    assert names(tmp_path) == ["one.json", "one.ply", "one.safetensors"]
-    kept.update(outputs(tmp_path, "one"))
-    for path in tmp_path.iterdir():
-        path.unlink()
-    return kept
+    return lambda out, *more: clod(*given, "--memory", "8GB", "--out", out, *more)
 
 
 def outputs(folder: Path, name: str) -> dict[str, bytes]:
     return {suffix: stripped((folder / f"{name}{suffix}").read_bytes()) for suffix in (".ply", ".safetensors")}
 
 
-class Killed(BaseException):
-    """Ends a run, and the run does not handle it."""
+@pytest.fixture(scope="module")
+def whole(given: list[Any], run_in: Any, tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    """The files of an uninterrupted run."""
+    folder = tmp_path_factory.mktemp("whole")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(prepare, "plan_for_limit", in_blocks)
+        done = run_in(folder, *given, "--memory", "8GB", "--out", "one.ply", "--json")
+    report = json.loads(done.out)
+    assert report["memory"]["blocks"] == BLOCKS and report["steps"] == 26 and len(report["rows"]) > 2
+    left_out = next(each for each in report["plan"]["decisions"] if each["name"] == "unseen")["number"]
+    trained = (300 - int(left_out)) // BLOCKS
+    assert 0 < left_out < 100 and f"of 3, pass 1 of 2: {trained} Gaussians, 7 steps" in done.err
+    assert "in 3 blocks" in done.err and "unseen Gaussians" in done.err and report["seconds"]["start"] > 0
+    logits = clod_adapter.load(folder / "one.ply").gaussians.opacity_logits
+    assert torch.equal(logits.isinf(), torch.arange(300) % 7 == 0) and not logits.isnan().any()
+    assert names(folder) == ["one.json", "one.ply", "one.safetensors"]
+    return outputs(folder, "one")
 
 
 def at_step(patch: pytest.MonkeyPatch, block: str, step: int, do: Callable[[Any], None]) -> None:
@@ -107,13 +89,6 @@ def at_step(patch: pytest.MonkeyPatch, block: str, step: int, do: Callable[[Any]
     patch.setattr(listeners.Saver, "saving", listening)
 
 
-def kill(patch: pytest.MonkeyPatch) -> None:
-    def die(_: Any) -> None:
-        raise Killed
-
-    at_step(patch, "block2.pass1", 5, die)
-
-
 def interrupt(patch: pytest.MonkeyPatch) -> None:
     def press(saver: Any) -> None:
         saver.stop.requests += 1
@@ -121,6 +96,7 @@ def interrupt(patch: pytest.MonkeyPatch) -> None:
     at_step(patch, "block2.pass1", 3, press)
 
 
+@pytest.mark.usefixtures("forced")
 @pytest.mark.parametrize(
     ("ended", "code", "said", "state", "steps"),
     [
@@ -133,56 +109,51 @@ def interrupt(patch: pytest.MonkeyPatch) -> None:
 def test_same_command_resumes_an_interrupted_block(
     adapt: Any, whole: dict[str, bytes], tmp_path: Path, ended: Any, code: int, said: str, state: str, steps: int
 ) -> None:
-    """Finished blocks are kept, the interrupted one is resumed, and the files are the same."""
+    """Finished blocks are kept, the interrupted one is resumed, and the files are the same.
+
+    Until then files of another run, of another block, or damaged ones are refused, and stay.
+    """
     with pytest.MonkeyPatch.context() as patch:
         ended(patch)
         done = adapt("a.ply", *(["--quiet"] if code == 1 else []))
     assert done.code == code and said in done.err, done
-    assert names(tmp_path) == sorted([*(["a.block1.pass1.safetensors"] if "block2" in state else []), state])
+    finished = ["a.block1.pass1.safetensors"] if "block2" in state else []
+    assert names(tmp_path) == sorted([*finished, state])
+    for name in finished:
+        assert_others_are_refused(adapt, tmp_path / name, tmp_path / "a.block2.pass1.safetensors")
     done = adapt("a.ply")
     assert done.code == 0 and f"resuming {state} from step {steps}" in done.err, done
     assert ("block 1 of 3, pass 1" in done.err) == ("block1" in state)
     assert outputs(tmp_path, "a") == whole and names(tmp_path) == ["a.json", "a.ply", "a.safetensors"]
 
 
-@pytest.mark.usefixtures("forced")
-def test_files_of_another_run_are_refused(adapt: Callable[..., Any], tmp_path: Path) -> None:
-    """Other settings, another block, and a damaged file; what was trained stays."""
-
+def assert_others_are_refused(adapt: Any, first: Path, second: Path) -> None:
     def refused(message: str, *more: object) -> None:
         done = adapt("a.ply", *more)
-        assert done.code == 2 and message in done.err and not (tmp_path / "a.ply").exists(), done
+        assert done.code == 2 and message in done.err, done
 
-    with pytest.MonkeyPatch.context() as patch, pytest.raises(Killed):
-        kill(patch)
-        adapt("a.ply")
-    first, second = (tmp_path / f"a.block{k}.pass1.safetensors" for k in (1, 2))
-    assert names(tmp_path) == ["a.block1.pass1.safetensors", "a.block2.pass1.resume.safetensors"]
+    content = first.read_bytes()
     refused(f"{first.name}: is of a run with another config; remove it, or give --out", "--seed", 1)
     refused(f"{first.name}: is of a run with another config; remove it", "--with", "unseen")
     shutil.copy(first, second)
     refused(f"{second.name}: is of a run with another block")
     second.unlink()
-    first.write_bytes(first.read_bytes()[:-9])
+    first.write_bytes(content[:-9])
     refused(f"{first.name}: is no block or damaged")
-    first.write_bytes(b"the user's")
-    refused(f"{first.name}: exists and is not known to be written by clod-adapt")
+    first.write_bytes(content)
 
 
 @pytest.mark.usefixtures("forced")
-def test_blocks_follow_the_plan_of_the_whole(
-    clod: Callable[..., Any], adapt: Callable[..., Any], capture: Any, opaque: Path, tmp_path: Path
-) -> None:
+def test_blocks_follow_the_plan_of_the_whole(clod: Any, adapt: Any, given: list[Any], tmp_path: Path) -> None:
     """The same decisions; with --trim what is left out is not written, else it is the base's; frozen is not tuned."""
     frozen = ["--without", "means", "--growth", "off", "--json"]
-    given = [opaque, "--images", capture.scene, *TINY, "--out", "a.ply"]
-    runs = [clod(*given, *frozen), adapt("b.ply", *frozen), adapt("c.ply", *frozen, "--trim")]
+    runs = [clod(*given, "--out", "a.ply", *frozen), adapt("b.ply", *frozen), adapt("c.ply", *frozen, "--trim")]
     plans = [json.loads(done.out)["plan"]["decisions"] for done in runs]
     assert plans[1] == plans[0] and any((each["what"], each["verdict"]) == ("means", "frozen") for each in plans[0])
     assert plans[2][:-1] == plans[1] and plans[2][-1]["verdict"] == "trimmed"
     whole, few = (clod_adapter.load(tmp_path / f"{name}.ply").gaussians for name in "bc")
     assert set(whole.tensors()) == {*ATTRIBUTES, "sigma_d"}
-    base, adapter = clod_adapter.load(opaque).gaussians, load_adapter(tmp_path / "c.safetensors")
+    base, adapter = clod_adapter.load(given[0]).gaussians, clod_adapter.load_adapter(tmp_path / "c.safetensors")
     assert adapter.kept is not None and len(few) == int(adapter.kept.sum()) < len(whole) == len(base)
     assert torch.equal(whole.means, base.means) and torch.equal(whole.sh0[~adapter.kept], base.sh0[~adapter.kept])
     assert all(torch.equal(getattr(few, name), getattr(whole, name)[adapter.kept]) for name in ATTRIBUTES[:5])
@@ -193,39 +164,35 @@ def test_blocks_that_fail_or_are_held_are_reported(
     adapt: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A block whose loss is not finite ends early; all that was learned is written, with exit code 1."""
-    with monkeypatch.context() as patch:
-        change_step(patch, 3, lambda found: replace(found, loss=float("nan")))
-        done = adapt("a.ply", "--json")
-    report = json.loads(done.out)
-    note = "block 1 of 3, pass 1 of 2: the loss of step 3 is not finite"
-    assert done.code == 1 and any(note in each for each in report["notes"]) and len(report["rows"]) > 2, done
-    assert "block 1 of 3, pass 1 of 2: ended after step 2: the loss of step 3" in done.err
-    assert clod_adapter.load(tmp_path / "a.ply").gaussians.sigma_d is not None
 
     def spoil(found: Any) -> Any:
         found.gradients["quats"][5] = float("nan")
         return found
 
-    change_step(monkeypatch, 3, spoil)
-    assert "1 Gaussians were not moved by some steps" in adapt("b.ply").err
+    change_step(monkeypatch, 2, spoil)
+    change_step(monkeypatch, 3, lambda found: replace(found, loss=float("nan")))
+    done = adapt("a.ply", "--json")
+    report = json.loads(done.out)
+    note = "block 1 of 3, pass 1 of 2: the loss of step 3 is not finite"
+    assert done.code == 1 and any(note in each for each in report["notes"]) and len(report["rows"]) > 2, done
+    assert "block 1 of 3, pass 1 of 2: ended after step 2: the loss of step 3" in done.err
+    assert "1 Gaussians were not moved by some steps" in done.err
+    assert clod_adapter.load(tmp_path / "a.ply").gaussians.sigma_d is not None
 
 
-def test_unusable_options(clod: Callable[..., Any], adapt: Callable[..., Any], forced: None, tmp_path: Path) -> None:
+def test_unusable_options(adapt: Callable[..., Any], forced: None, tmp_path: Path) -> None:
     for words, message in (
         (["--memory", "8"], "--memory is '8'; give a number and its unit, as in 8GB"),
         (["--memory", "100MB"], "--memory is 100 MB, and 300 Gaussians take at least"),
         (["--form", "paper"], "the paper's form cannot be trained in blocks"),
     ):
         done = adapt("a.ply", *words)
-        assert done.code == 2 and message in done.err, done
-    assert not list(tmp_path.iterdir())
+        assert done.code == 2 and message in done.err and not list(tmp_path.iterdir()), done
 
 
-def test_sufficient_memory_changes_nothing(
-    clod: Callable[..., Any], adapt: Callable[..., Any], capture: Any, opaque: Path, tmp_path: Path
-) -> None:
+def test_sufficient_memory_changes_nothing(clod: Any, adapt: Any, given: list[Any], tmp_path: Path) -> None:
     """Files of an earlier run in blocks are removed with the result."""
-    assert clod(opaque, "--images", capture.scene, *TINY, "--out", "a.ply").code == 0
+    assert clod(*given, "--out", "a.ply").code == 0
     (tmp_path / "[b].block1.pass1.safetensors").write_bytes((tmp_path / "a.safetensors").read_bytes())
     done = adapt("[b].ply")
     assert done.code == 0 and "the whole scene at once" in done.err and "training" in done.err
