@@ -18,8 +18,7 @@ from clod_adapter._support.version import package_version
 from clod_adapter.errors import ClodError
 from clod_adapter.progress import Stopped
 
-from . import adapt, apply, demo, doctor, evaluate, inspect, render, robustness, view
-from .export.command import COMMAND as EXPORT
+from . import adapt, apply, demo, doctor, evaluate, export, inspect, render, robustness, view
 from .shared.command import Command, Parser
 from .shared.outputs import claimed
 from .shared.process import (
@@ -51,7 +50,7 @@ Give a trained 3D Gaussian splat a quality dial:
 # Adapting is the main command and has no name.
 COMMANDS: dict[str, Command] = {
     "view": view.COMMAND, "inspect": inspect.COMMAND, "eval": evaluate.COMMAND, "render": render.COMMAND,
-    "export": EXPORT, "apply": apply.COMMAND, "robustness": robustness.COMMAND, "demo": demo.COMMAND,
+    "export": export.COMMAND, "apply": apply.COMMAND, "robustness": robustness.COMMAND, "demo": demo.COMMAND,
     "doctor": doctor.COMMAND,
 }  # fmt: skip
 

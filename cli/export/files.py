@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from argparse import Namespace
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
 from tempfile import TemporaryDirectory
+from typing import Any
 
 from clod_adapter.bake import bake
 from clod_adapter.calibration import Viewpoint
@@ -17,7 +18,7 @@ from clod_adapter.evaluation.level_errors import geometric_errors, level_errors,
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.checkpoint import Checkpoint
-from clod_adapter.io.file_formats import write
+from clod_adapter.io.file_formats import WRITABLE, write
 from clod_adapter.io.formats.lod_meta import cutting_options, read_leaves, write_errors
 from clod_adapter.io.formats.splat_transform import SplatTransform, time_limit
 from clod_adapter.io.formats.tileset import write_tileset
@@ -28,52 +29,34 @@ from clod_adapter.viewer.page import write_viewer_page
 
 from ..shared.console import Console, duration
 from ..shared.inputs import named, prepare_kernels, read_cameras
-from .formats import LOD_META, PACKED, PAGE
 
 PLACED = 16  # cameras placed where none are known
 COMPARED = 4  # views on which a page is compared with the exact values
 
 
-@dataclass(frozen=True)
-class Target:
-    """The cameras that a dial value is baked for.
-
-    Attributes:
-        camera: the one of ``--camera``, for which the result is exact; else None.
-        cameras: that one, or all that the file is baked for; empty for a model without a dial.
-        about: a description in printable ASCII.
-    """
-
-    camera: Camera | None
-    cameras: Sequence[Camera | Viewpoint]
-    about: str
-
-
-def find_target(args: Namespace, model: Checkpoint, console: Console) -> tuple[Target, list[str]]:
-    """The cameras of --camera, --images or the model's file, else placed ones; and notes on them."""
+def find_cameras(
+    args: Namespace, model: Checkpoint, console: Console
+) -> tuple[Sequence[Camera | Viewpoint], str, list[str]]:
+    """The cameras of --camera, --images or the model's file, else placed ones; what they are; and notes on them."""
     if args.camera is not None:
         cameras, notes = read_cameras(model, args.images, console)
         found = named(cameras, args.camera, "--camera")
         if len(found) > 1:
             both = f"{found[0].name} and {found[1].name}"
             raise ClodError(f"--camera: {args.camera!r} matches {both}; give the full name")
-        return Target(found[0], found, "one camera"), notes
+        return found, "one camera", notes
     if args.images is not None:
         cameras, notes = read_cameras(model, args.images, console, training=True)
-        return Target(None, cameras, f"{len(cameras)} training cameras"), notes
+        return cameras, f"{len(cameras)} training cameras", notes
     if model.viewpoints:
-        return Target(None, model.viewpoints, f"{len(model.viewpoints)} training cameras"), []
-    return _placed(model, console)
-
-
-def _placed(model: Checkpoint, console: Console) -> tuple[Target, list[str]]:
+        return model.viewpoints, f"{len(model.viewpoints)} training cameras", []
     try:
         with console.meter("placing cameras") as meter:
             cameras = place_cameras(model.gaussians, views=PLACED, progress=meter)
     except ClodError as error:
         raise ClodError(f"{model.path}: no cameras stored to bake for, and {error}; give --images") from error
     note = f"{model.path} stores no cameras: baked for {len(cameras)} placed ones; --images gives a better result"
-    return Target(None, cameras, f"{len(cameras)} placed cameras"), [note]
+    return cameras, f"{len(cameras)} placed cameras", [note]
 
 
 @dataclass(frozen=True)
@@ -82,42 +65,42 @@ class Export:
 
     Attributes:
         model: as read.
-        gaussians: the model's, sorted if ``ordered``.
-        target: the cameras to bake for.
-        cameras: of the scene, for the views of a page.
-        ordered: whether the rows are sorted by extinction.
-        exact: whether a page has float32 values.
+        gaussians: the model's, sorted with ``--order``.
+        cameras: to bake for; empty where nothing is baked.
+        about: these cameras, in printable ASCII.
+        views: cameras of the scene, for a page.
         console: for progress.
     """
 
+    args: Namespace
     model: Checkpoint
     gaussians: Gaussians
-    target: Target
-    cameras: list[Camera]
-    ordered: bool
-    exact: bool
+    cameras: Sequence[Camera | Viewpoint]
+    about: str
+    views: list[Camera]
     console: Console
+
+    @property
+    def camera(self) -> Camera | None:
+        """The one of ``--camera``, for which the result is exact."""
+        return next((each for each in self.cameras if isinstance(each, Camera) and self.args.camera is not None), None)
 
     def content(self, virtual_scale: float | None) -> tuple[Gaussians, tuple[str, ...]]:
         """The Gaussians of one file, baked if there is a dial value; and its comments, those of the model first."""
-        about, gaussians = [*self.model.comments], self.gaussians
+        about, gaussians, camera = [*self.model.comments], self.gaussians, self.camera
         if virtual_scale is not None:
-            baked, camera = f"baked at s = {virtual_scale:.6g} by clod-adapter", self.target.camera
-            if camera:
-                about.append(f"{baked} for the camera at {self._position(camera)}: exact from there only")
-                gaussians = bake(gaussians, virtual_scale, camera)
-            else:
-                about.append(f"{baked} for {self.target.about}")
-                gaussians = bake(gaussians, virtual_scale, cameras=self.target.cameras)
-        about += ["rows in the order in which the dial keeps them longest"] if self.ordered else []
+            cameras = f"the camera at {self._position(camera)}: exact from there only" if camera else self.about
+            about.append(f"baked at s = {virtual_scale:.6g} by clod-adapter for {cameras}")
+            gaussians = bake(gaussians, virtual_scale, camera, cameras=() if camera else self.cameras)
+        about += ["rows in the order in which the dial keeps them longest"] if self.args.order else []
         return gaussians, tuple(dict.fromkeys(about))
 
     def write(self, path: Path, suffix: str, virtual_scale: float | None) -> tuple[int, tuple[str, ...]]:
         """Writes a file; its number of Gaussians, and notes on losses of the format."""
-        if suffix == PAGE:
+        if suffix == ".html":
             return len(self.gaussians), self._write_page(path, virtual_scale)
         gaussians, about = self.content(virtual_scale)
-        if suffix in PACKED:
+        if suffix not in WRITABLE:
             return len(gaussians), self._pack(path, suffix, gaussians, about)
         calibration = self.model.calibration if virtual_scale is None else None
         notes = write(path, gaussians, about, origin=self.model.origin, calibration=calibration)
@@ -125,52 +108,49 @@ class Export:
             notes += ("x, y and z are doubles, which SIBR and some other readers misread",)
         return len(gaussians), notes
 
-    def write_levels(self, folder: Path, levels: list[float]) -> tuple[list[int], list[str]]:
-        """Writes a streaming set to ``folder``; the number of Gaussians per level, and notes."""
-        folder.mkdir()
+    def write_folder(self, index: Path, levels: list[float]) -> tuple[list[int], list[str]]:
+        """Writes a streaming or 3D Tiles set to a new folder; the number of Gaussians per level, and notes."""
+        index.parent.mkdir()
         contents = [self.content(level) for level in levels]
-        counts = [len(gaussians) for gaussians, _ in contents]
-        with TemporaryDirectory(dir=folder) as temporary:
-            words: list[str | Path] = [*cutting_options(sum(counts))]
+        found = [gaussians for gaussians, _ in contents]
+        if "--3dtiles" in self.args.folder:
+            notes = write_tileset(index.parent, found, self._errors(found, geometric_errors), origin=self.model.origin)
+        else:
+            notes = self._stream(index, contents)
+        return [len(gaussians) for gaussians in found], [*notes]
+
+    def _stream(self, index: Path, contents: list[tuple[Gaussians, tuple[str, ...]]]) -> tuple[str, ...]:
+        """Has splat-transform write a streaming set, and adds the leaves' errors at each level."""
+        levels = [gaussians for gaussians, _ in contents]
+        count = sum(map(len, levels))
+        with TemporaryDirectory(dir=index.parent) as temporary:
+            words: list[str | Path] = [*cutting_options(count)]
             for k, (gaussians, about) in enumerate(contents):
                 source = Path(temporary) / f"{k}.ply"
                 write(source, gaussians, about)
                 words += [source, "-l", str(k)]
-            notes = self._transform(words, folder / LOD_META, sum(counts))
-        return counts, [*notes, *self._add_errors(folder / LOD_META, [gaussians for gaussians, _ in contents])]
-
-    def write_tiles(self, folder: Path, levels: list[float]) -> tuple[list[int], list[str]]:
-        """Writes a 3D Tiles set to ``folder``; the number of Gaussians per level, and notes."""
-        folder.mkdir()
-        contents = [self.content(level)[0] for level in levels]
-        prepare_kernels(self.console, contents[0].means.device, training=False)
-        with self.console.meter("errors of levels") as meter:
-            errors = geometric_errors(contents, looking(self.target.cameras, contents[-1]), progress=meter)
-        notes = write_tileset(folder, contents, errors.tolist(), origin=self.model.origin)
-        return [len(each) for each in contents], [*notes]
-
-    def _add_errors(self, index: Path, levels: list[Gaussians]) -> tuple[str, ...]:
-        """Adds the leaves' errors at each level to a streaming set; a note if its leaves are unknown."""
+            notes = self._transform(words, index, count)
         try:
             meta, leaves = read_leaves(index, [level.means.cpu().numpy() for level in levels])
         except ClodError as error:
-            return (f"without tables of errors, viewers judge levels by their counts: {error}",)
+            return (*notes, f"without tables of errors, viewers judge levels by their counts: {error}")
+        write_errors(index, meta, leaves, self._errors(levels, level_errors, leaves))
+        return notes
+
+    def _errors(self, levels: list[Gaussians], measure: Callable[..., Any], *given: Any) -> Any:
         prepare_kernels(self.console, levels[0].means.device, training=False)
         with self.console.meter("errors of levels") as meter:
-            errors = level_errors(levels, leaves, looking(self.target.cameras, levels[-1]), progress=meter)
-        write_errors(index, meta, leaves, errors.tolist())
-        return ()
+            return measure(levels, *given, looking(self.cameras, levels[-1]), progress=meter).tolist()
 
     def _write_page(self, path: Path, virtual_scale: float | None) -> tuple[str, ...]:
         """Writes the page; notes on its losses, with the PSNR of its renders against those of the exact Gaussians."""
         prepare_kernels(self.console, self.gaussians.means.device, training=False)
-        known = self.cameras
         shown, losses = write_viewer_page(
-            path, self.model, cameras=known, virtual_scale=virtual_scale, exact=self.exact
+            path, self.model, cameras=self.views, virtual_scale=virtual_scale, exact=self.args.exact
         )
-        if self.exact:
+        if self.args.exact:
             return losses
-        views = spread(self.cameras or self.model.cameras or place_cameras(self.gaussians, views=COMPARED), COMPARED)
+        views = spread(self.views or self.model.cameras or place_cameras(self.gaussians, views=COMPARED), COMPARED)
         with self.console.status("comparing with the exact values ..."):
             found = fmean(psnr(render(shown, each).image, render(self.gaussians, each).pixels) for each in views)
         about = f"renders of the page have a PSNR of {found:.1f} dB against the exact file ({len(views)} views, s = 1)"

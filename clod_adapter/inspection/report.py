@@ -154,7 +154,7 @@ def inspect(path: str | Path) -> Inspection:
     columns, degree = _columns(head), next(d for d, n in SH_COUNTS.items() if n == rows.arrays["shN"].shape[1] + 1)
     splat = Splat(
         sh_degree=degree, encoding=_encoding(head), columns=columns,
-        extra=() if head and is_packed(head.ply) else _extra([name for name, _ in columns], degree),
+        extra=() if head and is_packed(head.ply) else extra_columns([name for name, _ in columns], degree),
         comments=tuple(comment for comment in source.comments if not comment.startswith(PREFIX)), values=values,
         tau=tau, origin=rows.origin, dial=dial, screen_filter=stated_filter(source),
     )  # fmt: skip
@@ -187,7 +187,8 @@ def _what(path: Path, source: Source, splat: Splat) -> str:
     return f"{kind}, {'compressed ' if packed else ''}{'PLY' if splat.encoding else suffix}"
 
 
-def _extra(names: Sequence[str], sh_degree: int) -> tuple[str, ...]:
+def extra_columns(names: Sequence[str], sh_degree: int) -> tuple[str, ...]:
+    """The properties of a PLY without a meaning here."""
     known = {name for group in column_map(sh_degree).values() for name in group}
     known |= {*NORMALS, *dial_columns(names), *MASK_COLUMNS, FILTER}
     return tuple(name for name in names if name not in known and not name.startswith(COLUMN))

@@ -32,29 +32,46 @@ class Format(NamedTuple):
         write: called with path, Gaussians in world units and a ``History``; gives a line for each loss; "" where the
             format is only read.
         carries_sigma: whether the dial is written: sigma_d, growth_d and their settings.
+        about: of a format that is written, the precision of its values; lines of at most 54 letters.
+        ordered: whether the rows keep their order.
     """
 
-    read: str
-    check: str
+    read: str = ""
+    check: str = ""
     open: str = ""
     write: str = ""
     carries_sigma: bool = False
+    about: tuple[str, ...] = ()
+    ordered: bool = True
 
 
 _CHECK = "file_formats.check_start"
 _CONVERTED = Format("formats.splat_transform.load_converted", "formats.splat_transform.check_converted")
 KEY = "clod_adapter"  # of the JSON document in formats other than PLY
-PLY = Format("ply.read_ply", "ply.check_ply", "ply.open_ply", "checkpoint.write_ply", True)
+PLY = Format(
+    "ply.read_ply", "ply.check_ply", "ply.open_ply", "checkpoint.write_ply", True, ("exact; baked, in Inria's layout",)
+)
 FORMATS = {
     ".ply": PLY,
-    ".glb": Format("formats.glb.load_glb", _CHECK, "formats.glb.open_glb", "formats.glb.write_glb", True),
-    ".spz": Format("formats.spz.load_spz", _CHECK, "formats.spz.open_spz", "formats.spz.write_spz", True),
+    ".glb": Format(
+        "formats.glb.load_glb", _CHECK, "formats.glb.open_glb", "formats.glb.write_glb", True,
+        ("float32, SH degree up to 3", "(KHR_gaussian_splatting, _SIGMA_D, _GROWTH_D)"),
+    ),
+    ".spz": Format(
+        "formats.spz.load_spz", _CHECK, "formats.spz.open_spz", "formats.spz.write_spz", True,
+        ("6 to 24 bits, SH degree up to 3, the dial 16-bit floats",),
+    ),
     ".safetensors": Format(
         "formats.safetensors.load_safetensors", _CHECK, "formats.safetensors.open_safetensors",
-        "formats.safetensors.write_safetensors", True,
+        "formats.safetensors.write_safetensors", True, ("exact; for Python",),
     ),
-    ".pt": Format("formats.pt.load_pt", "formats.pt.check_pt", "formats.pt.open_pt", "formats.pt.write_pt", True),
-    ".splat": Format("formats.splat.load_splat", _CHECK, "", "formats.splat.write_splat"),
+    ".pt": Format(
+        "formats.pt.load_pt", "formats.pt.check_pt", "formats.pt.open_pt", "formats.pt.write_pt", True,
+        ("exact; layout of gsplat's trainer",),
+    ),
+    ".splat": Format(
+        "formats.splat.load_splat", _CHECK, "", "formats.splat.write_splat", False, ("8 bits, SH degree 0",), False
+    ),
     ".sog": _CONVERTED,
     ".ksplat": _CONVERTED,
 }  # fmt: skip
