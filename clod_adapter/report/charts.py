@@ -13,9 +13,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from clod_adapter.report.style import GRID, INK, PAPER, QUIET, SERIES, label_log, new_figure, save_figure
+from clod_adapter.report.style import GRID, INK, PAPER, QUIET, SERIES, label_log, new_figure
 
-Draw = Callable[[Any], None]
+Draw = Callable[[Any], None]  # of the axes of an empty figure
 SIZE, NARROW = (7.2, 4.1), (4.0, 4.0)  # inches; NARROW for phones
 STEPS = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)  # dB between grid lines
 MARKERS = "oDs^vPX"
@@ -44,36 +44,23 @@ def series_of(report: Mapping[str, Any]) -> list[Series]:
     """The series of a report: the model at its dial values first, then the measured comparisons.
 
     Keys: ``rows``; ``base_row`` or ``base_rows``, the unadapted base; ``detached_row``, the file without its dial;
-    ``ranked``, ``[{by, row}]``, the base pruned by rank; ``against``, ``[{model, label, theirs}]``, other files. Rows
+    ``ranked``, ``[{by, row}]``, the base pruned by rank; ``against``, ``[{label, theirs}]``, other files. Rows
     without a PSNR (null in JSON if infinite) are skipped.
     """
     base: list[Any] = report.get("base_rows") or [report.get("base_row")]
     plain_model = report.get("attenuation", {}) is None  # evaluation of a file without a dial
     model = Series("the file, no dial" if plain_model else "dial, one file", report.get("rows", []), not plain_model)
-    found = [model, Series("base, unadapted", base)]
-    ranked = report.get("ranked") or []
-    for by in dict.fromkeys(entry["by"] for entry in ranked):
-        found.append(Series(f"base pruned by {by}", [entry["row"] for entry in ranked if entry["by"] == by]))
-    against = report.get("against") or []
-    for path in dict.fromkeys(entry["model"] for entry in against):
-        rows = [entry["theirs"] for entry in against if entry["model"] == path]
-        label = next(entry["label"] for entry in against if entry["model"] == path)
-        found.append(Series(label, rows, dial=len(rows) > 1))
+    found, ranked, against = [model, Series("base, unadapted", base)], dict[str, Any](), dict[str, Any]()
+    for entry in report.get("ranked") or []:
+        ranked.setdefault(f"base pruned by {entry['by']}", []).append(entry["row"])
+    for entry in report.get("against") or []:
+        against.setdefault(entry["label"], []).append(entry["theirs"])
+    found += [Series(label, rows) for label, rows in ranked.items()]
+    found += [Series(label, rows, dial=len(rows) > 1) for label, rows in against.items()]
     plain: list[Any] = [report.get("detached_row")]
     found.append(Series("plain viewer, no dial", plain))
     complete = [Series(s.label, [r for r in s.rows if r and r["psnr"] is not None], s.dial) for s in found]
     return [series for series in complete if series.rows]
-
-
-def write_chart(path: str | Path, draw: Draw) -> None:
-    """Draws a chart into a PNG file.
-
-    Raises:
-        ClodError: matplotlib is missing, or the file cannot be written.
-    """
-    with new_figure(SIZE, layout="constrained") as figure:
-        draw(figure)
-        save_figure(figure, path)
 
 
 def chart_file(page: Path, name: str) -> Path:
@@ -92,7 +79,7 @@ def inline_svg(draw: Draw, name: str, label: str) -> list[str]:
     found = []
     for kind, size in (("wide", SIZE), ("narrow", NARROW)):
         with new_figure(size, layout="constrained") as figure:
-            draw(figure)
+            draw(figure.subplots())
             text = io.StringIO()
             figure.savefig(text, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
         svg = text.getvalue()[text.getvalue().index("<svg") :]
@@ -106,48 +93,35 @@ def inline_svg(draw: Draw, name: str, label: str) -> list[str]:
     return found
 
 
-def rendering_chart(series: Sequence[Series]) -> Draw:
-    """Error against milliseconds per frame: lines for files with a dial, points for others."""
-
-    def draw(figure: Any) -> None:
-        axes, notes = figure.subplots(), list[tuple[str, tuple[float, float]]]()
-        for k, one in enumerate(series):
-            style = {"color": SERIES[k % len(SERIES)], "marker": MARKERS[k % len(MARKERS)], "label": one.label}
-            points = [(row["frame_ms"], error(row["psnr"])) for row in one.rows]
-            style["linestyle"] = "-" if one.dial else "none"
-            axes.plot(*zip(*points, strict=True), markersize=5.5, linewidth=1.8, **style)
-            if one.dial:
-                notes += [(f"s = {row['virtual_scale']:g}", at) for row, at in zip(one.rows, points, strict=True)]
-        axes.set_xscale("log")
-        axes.set_xlabel("milliseconds per frame (log scale)")
-        finish_axes(axes)
-        _annotate(axes, notes)
-
-    return draw
+def draw_rendering(axes: Any, series: Sequence[Series]) -> None:
+    """Draws error against milliseconds per frame: lines for files with a dial, points for others."""
+    notes = list[tuple[str, tuple[float, float]]]()
+    for k, one in enumerate(series):
+        points = [(row["frame_ms"], error(row["psnr"])) for row in one.rows]
+        _line(axes, k, one.label, points, linestyle="-" if one.dial else "none")
+        if one.dial:
+            notes += [(f"s = {row['virtual_scale']:g}", at) for row, at in zip(one.rows, points, strict=True)]
+    _finish(axes, "milliseconds per frame (log scale)")
+    _annotate(axes, notes)
 
 
-def training_chart(curves: Sequence[Mapping[str, Any]], base_psnr: float | None) -> Draw:
-    """Held-out error against seconds of adapting.
+def draw_training(axes: Any, curves: Sequence[Mapping[str, Any]], base_psnr: float | None) -> None:
+    """Draws held-out error against seconds of adapting.
 
     Args:
         curves: each with ``label`` and ``points``; a point has ``seconds`` and ``psnr``.
         base_psnr: of the unadapted base, drawn as a horizontal line.
     """
-
-    return lambda figure: draw_training(figure.subplots(), curves, base_psnr)
-
-
-def draw_training(axes: Any, curves: Sequence[Mapping[str, Any]], base_psnr: float | None) -> None:
-    """Draws ``training_chart`` into one panel of a figure."""
     for k, curve in enumerate(curves):
-        points = [(point["seconds"], error(point["psnr"])) for point in curve["points"]]
-        style = {"color": SERIES[k % len(SERIES)], "marker": MARKERS[k % len(MARKERS)], "label": curve["label"]}
-        axes.plot(*zip(*points, strict=True), linewidth=1.8, markersize=5, **style)
+        _line(axes, k, curve["label"], [(point["seconds"], error(point["psnr"])) for point in curve["points"]])
     if base_psnr is not None:
         axes.axhline(error(base_psnr), color=INK, linestyle="--", linewidth=1.1, label="base, unadapted")
-    axes.set_xscale("log")
-    axes.set_xlabel("seconds of adapting (log scale)")
-    finish_axes(axes)
+    _finish(axes, "seconds of adapting (log scale)")
+
+
+def _line(axes: Any, k: int, label: str, points: Sequence[tuple[float, float]], linestyle: str = "-") -> None:
+    style = {"color": SERIES[k % len(SERIES)], "marker": MARKERS[k % len(MARKERS)], "linestyle": linestyle}
+    axes.plot(*zip(*points, strict=True), linewidth=1.8, markersize=5.5, label=label, **style)
 
 
 def error(psnr: float) -> float:
@@ -166,8 +140,10 @@ def _annotate(axes: Any, notes: Sequence[tuple[str, tuple[float, float]]]) -> No
             axes.annotate(text, at, (-5, -11), textcoords="offset points", ha="right", fontsize=8, color=QUIET)
 
 
-def finish_axes(axes: Any) -> None:
+def _finish(axes: Any, label: str) -> None:
     """Axes of an error chart: log error on the left, with ticks at round PSNR values, which are on the right."""
+    axes.set_xscale("log")
+    axes.set_xlabel(label)
     axes.set_yscale("log")
     axes.margins(x=0.2, y=0.12)
     low, high = (-10 * math.log10(value) for value in reversed(axes.get_ylim()))

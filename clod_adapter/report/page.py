@@ -9,6 +9,7 @@ import base64
 import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from importlib.resources import files
 from os.path import abspath
 from pathlib import Path, PurePath
@@ -20,15 +21,16 @@ from PIL import Image
 from clod_adapter._support.text import as_text, script_json
 from clod_adapter.io.atomic import atomic_paths
 from clod_adapter.report.charts import (
+    SIZE,
     Draw,
     Series,
     chart_file,
+    draw_rendering,
+    draw_training,
     inline_svg,
-    rendering_chart,
     series_of,
-    training_chart,
-    write_chart,
 )  # fmt: skip
+from clod_adapter.report.style import new_figure, save_figure
 
 WIDEST = 1000  # pixels; wider pictures are scaled down
 QUALITY = 88  # of WebP
@@ -74,7 +76,7 @@ def write_page(
             includes it as JSON under the id ``data``.
         frames: one held-out view at ascending dial values.
         others: images of the same view to compare with, by name: the photograph, if any, and the base.
-        training: ``curves`` and ``base_psnr`` of ``charts.training_chart``, and the number of ``views``.
+        training: ``curves`` and ``base_psnr`` of ``charts.draw_training``, and the number of ``views``.
 
     Raises:
         ClodError: matplotlib is missing, or a file cannot be written.
@@ -82,30 +84,32 @@ def write_page(
     import jinja2
 
     path, own, series = Path(path), own_teacher(report), series_of(report)
+    name = PurePath(report.get("outputs", {}).get("ply", report["model"])).name
+    config = report.get("config") or report.get("attenuation") or {}
     # Against its own renders, the base has only rounding errors, far below the range of the charts.
     drawn = [one for one in series if not (own and one.is_base)]
     figures = _figures(drawn, training, own)
     few = dict.fromkeys(round(k * (len(frames) - 1) / 3) for k in range(4)) if frames else ()
     height, width = frames[0].image.shape[:2] if frames else (1, 1)
     source = files("clod_adapter.report")
-    parts = {name: (source / file).read_text(encoding="utf-8") for name, file in PARTS.items()}
-    page = jinja2.Environment(autoescape=True).from_string(parts.pop("template")).render(
-        report=report, own=own, title=_title(report), lead=_lead(report, series), tiles=_tiles(drawn), frames=frames,
-        others=others, aspect=f"{width} / {height}", strip=[*others.values(), *(frames[k] for k in few)] if few else [],
+    template, style, script = ((source / n).read_text("utf-8") for n in ("page.html", "style.css", "dial.js"))
+    page = jinja2.Environment(autoescape=True).from_string(template).render(
+        report=report, own=own, title=f"{name}: quality against time", lead=_lead(report, series), tiles=_tiles(drawn),
+        frames=frames, others=others, aspect=f"{width} / {height}",
+        strip=[*others.values(), *(frames[k] for k in few)] if few else [],
         figures=[(head, inline_svg(draw, name, head), text) for name, (head, draw, text) in figures.items()],
         series=series, decisions=(report.get("plan") or {}).get("decisions", ()), settings=_settings(report),
-        config={name: f"{v:.4g}" if isinstance(v, float) else v for name, v in _config(report).items()},
-        data=script_json({"report": report, "training": training}), **parts,
+        config={name: f"{v:.4g}" if isinstance(v, float) else v for name, v in config.items()},
+        data=script_json({"report": report, "training": training}), style=style, script=script,
     )  # fmt: skip
     outputs = {name: chart_file(path, name) for name in figures}
     with atomic_paths(path, *outputs.values()) as (temporary, *pngs):
         for png, (_, draw, _) in zip(pngs, figures.values(), strict=True):
-            write_chart(png, draw)
+            with new_figure(SIZE, layout="constrained") as figure:
+                draw(figure.subplots())
+                save_figure(figure, png)
         temporary.write_text(as_text(page), encoding="utf-8")
     return {"page": path, **outputs}
-
-
-PARTS = {"template": "page.html", "style": "style.css", "script": "dial.js"}
 
 
 def _figures(
@@ -117,20 +121,17 @@ def _figures(
         caption = "Lower left is better: less error, less time."
         if len(drawn) > 1 and drawn[-1].label.startswith("plain"):
             caption += " A plain viewer ignores the dial and shows all Gaussians of the adapted file unfaded."
-        found["rendering"] = ("Error against frame time", rendering_chart(drawn), caption)
+        found["rendering"] = ("Error against frame time", partial(draw_rendering, series=drawn), caption)
     if training:
         seen = "held-out synthetic views" if own else "held-out photographs"
         caption = (
             f"One run, measured on {training['views']} {seen}. The state was copied at evenly spaced points of this "
             "axis and measured after the end, so measuring took no training time. Times include the initialization."
         )
-        draw = training_chart(training["curves"], None if own else training["base_psnr"])
+        base_psnr = None if own else training["base_psnr"]
+        draw = partial(draw_training, curves=training["curves"], base_psnr=base_psnr)
         found["adapting"] = ("Error against adapting time", draw, caption)
     return found
-
-
-def _title(report: Mapping[str, Any]) -> str:
-    return f"{PurePath(report.get('outputs', {}).get('ply', report['model'])).name}: quality against time"
 
 
 def _lead(report: Mapping[str, Any], series: Sequence[Series]) -> list[str]:
@@ -140,7 +141,8 @@ def _lead(report: Mapping[str, Any], series: Sequence[Series]) -> list[str]:
     if report["command"] == "eval":
         first = f"{report['model']} holds {count:,} Gaussians. It was measured on held-out photographs of {scene}."
     else:
-        seen, minutes = "synthetic views" if own else f"the photographs of {scene}", divmod(_total(report), 60)
+        seen = "synthetic views" if own else f"the photographs of {scene}"
+        minutes = divmod(round(report["seconds"]["total"]), 60)
         first = (
             f"{PurePath(report['model']).name}, a trained splat of {count:,} Gaussians, was given a quality dial: "
             f"{report['steps']:,} steps on {seen}, {minutes[0]}:{minutes[1]:02} minutes in all."
@@ -165,10 +167,6 @@ def _lead(report: Mapping[str, Any], series: Sequence[Series]) -> list[str]:
     return [first, second]
 
 
-def _total(report: Mapping[str, Any]) -> int:
-    return round(report["seconds"]["total"])
-
-
 def _tiles(series: Sequence[Series]) -> list[tuple[str, Mapping[str, Any]]]:
     """Key figures: the base, and both ends and the middle of the dial."""
     found = [(one.label, one.rows[0]) for one in series if one.is_base]
@@ -177,10 +175,6 @@ def _tiles(series: Sequence[Series]) -> list[tuple[str, Mapping[str, Any]]]:
         picked = dict.fromkeys((0, len(rows) // 2, len(rows) - 1))
         found += [(f"s = {rows[k]['virtual_scale']:g}", rows[k]) for k in picked]
     return found
-
-
-def _config(report: Mapping[str, Any]) -> Mapping[str, Any]:
-    return report.get("config") or report.get("attenuation") or {}
 
 
 def _settings(report: Mapping[str, Any]) -> dict[str, Any]:

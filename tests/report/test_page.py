@@ -16,7 +16,7 @@ import pytest
 from PIL import Image
 
 from clod_adapter.errors import ClodError
-from clod_adapter.report.charts import Series, error, rendering_chart, series_of, training_chart
+from clod_adapter.report.charts import Series, draw_rendering, draw_training, error, series_of
 from clod_adapter.report.page import Picture, write_page
 from clod_adapter.report.style import new_figure, shades
 
@@ -112,7 +112,7 @@ def test_charts() -> None:
         Series("dial", [row(s, 30 - s, 20 / s) for s in dials], dial=True), Series("base", [row(1, 29.5, 25)]),
     ]  # fmt: skip
     with new_figure((6, 4), layout="constrained") as figure:
-        rendering_chart(series)(figure)
+        draw_rendering(figure.subplots(), series)
         figure.canvas.draw()
         left, right = figure.axes
         assert (left.get_xscale(), left.get_yscale(), right.get_yscale()) == ("log", "log", "log")
@@ -128,7 +128,7 @@ def test_charts() -> None:
         assert len(right.get_yticks()) >= 3 and left.get_ylim() == right.get_ylim()
     with new_figure((6, 4)) as figure:
         points = [{"seconds": 2.0**k, "psnr": 20.0 + k} for k in range(6)]
-        training_chart([{"label": "s = 1", "points": points}], 29.0)(figure)
+        draw_training(figure.subplots(), [{"label": "s = 1", "points": points}], 29.0)
         curve, base = figure.axes[0].get_lines()
         assert curve.get_xdata().tolist() == [1, 2, 4, 8, 16, 32] and base.get_ydata() == pytest.approx([10**-2.9] * 2)
     for count in (1, 2, 5):  # from light to dark
