@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
 from collections.abc import Iterable, Sequence
+from dataclasses import astuple
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,6 +25,7 @@ WIDTH = 13  # of the labels
 MOST_ROWS = 8  # of a calibration, including the first and last
 MOST_LINES = 6  # under one label
 LONGEST = 100  # characters of a comment
+SETTINGS = ("max_sv", "iters", "seed", "tau", "cut")  # of the training settings, those shown
 
 
 def add_arguments(parser: ArgumentParser) -> None:
@@ -56,18 +58,18 @@ def lines_of(found: Inspection) -> list[str]:
         lines += splat_lines(found.splat)
     if found.about is not None:
         lines += tensor_lines(found.about)
-    lines += _block("anomaly", [anomaly.says for anomaly in found.anomalies])
-    lines += _block("excluded", found.left_out)
     warnings = [note.removeprefix(WARNING) for note in found.notes if note.startswith(WARNING)]
-    lines += _block("note", [note for note in found.notes if not note.startswith(WARNING)])
-    return lines + _block("warning", warnings)
+    notes = [note for note in found.notes if not note.startswith(WARNING)]
+    blocks = {"anomaly": [a.says for a in found.anomalies], "excluded": found.left_out, "note": notes}
+    return lines + [line for name, says in (blocks | {"warning": warnings}).items() for line in _block(name, says)]
 
 
 def splat_lines(splat: Splat) -> list[str]:
     """Counts, ranges and the dial."""
     v = splat.values
     count = f"{v.count:,}" if v.count == v.total else f"{v.count:,} usable of {v.total:,}"
-    lines = [_line("Gaussians", count), _line("harmonics", _harmonics(splat))]
+    used = f", of which only {v.used_sh_degree} is used" if v.used_sh_degree < splat.sh_degree else ""
+    lines = [_line("Gaussians", count), _line("harmonics", f"degree {splat.sh_degree}{used}")]
     if splat.encoding:
         names = ", ".join(splat.extra[:6]) + (", ..." if len(splat.extra) > 6 else "")
         more = f", not read: {names}" if splat.extra else ""
@@ -83,7 +85,10 @@ def splat_lines(splat: Splat) -> list[str]:
     if splat.dial is None:
         return [*lines, _line("dial", "none: no sigma_d")]
     a = splat.dial.attenuation
-    how = f"s = 1 to {a.max_sv:g}, {a.cut} culling at tau, distances {_unit(a)}"
+    unit = f"over each view's {a.normalizer}"
+    if a.normalizer == "scene":
+        unit = "in world units" if a.scene_distance == 1 else f"over {a.scene_distance:.4g}"
+    how = f"s = 1 to {a.max_sv:g}, {a.cut} culling at tau, distances {unit}"
     lines.append(_line("dial", f"{splat.dial_columns}, {how}"))
     return lines + calibration_lines(splat.dial.calibration)
 
@@ -93,8 +98,7 @@ def spread_table(rows: Sequence[tuple[str, Spread]]) -> list[str]:
     names = ("least", "1 %", "median", "99 %", "greatest")
     lines = [" " * WIDTH + "".join(f"{name:>11}" for name in names)]
     for name, spread in rows:
-        numbers = (spread.least, spread.low, spread.median, spread.high, spread.greatest)
-        lines.append(f"{name:<{WIDTH}}" + "".join(f"{number:>11.4g}" for number in numbers))
+        lines.append(f"{name:<{WIDTH}}" + "".join(f"{number:>11.4g}" for number in astuple(spread)))
     return lines
 
 
@@ -134,20 +138,6 @@ def tensor_lines(about: dict[str, Any]) -> list[str]:
     )
     calibration = about["calibration"]
     return lines + calibration_lines(calibration and Calibration.from_dict(calibration))
-
-
-SETTINGS = ("max_sv", "iters", "seed", "tau", "cut")  # of the training settings, those shown
-
-
-def _harmonics(splat: Splat) -> str:
-    used = splat.values.used_sh_degree
-    return f"degree {splat.sh_degree}" + (f", of which only {used} is used" if used < splat.sh_degree else "")
-
-
-def _unit(attenuation: Any) -> str:
-    if attenuation.normalizer == "scene":
-        return "in world units" if attenuation.scene_distance == 1 else f"over {attenuation.scene_distance:.4g}"
-    return f"over each view's {attenuation.normalizer}"
 
 
 def _block(name: str, says: Iterable[str]) -> list[str]:

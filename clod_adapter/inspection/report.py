@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +15,7 @@ from clod_adapter.errors import ClodError
 from clod_adapter.inspection.authorship import NERFSTUDIO, looks_like
 from clod_adapter.inspection.statistics import FAR, Spread, Values, values_of
 from clod_adapter.io.file_formats import read_source
-from clod_adapter.io.ply import MASK_COLUMNS, Head, column_map
+from clod_adapter.io.ply import MASK_COLUMNS, column_map
 from clod_adapter.io.ply_packed import is_packed
 from clod_adapter.io.ply_settings import COLUMN, PREFIX
 from clod_adapter.io.settings import Source, matching_calibration, stated_filter
@@ -110,15 +110,10 @@ class Inspection:
 
     def as_dict(self) -> dict[str, Any]:
         """Plain JSON."""
-        found = {field.name: getattr(self, field.name) for field in fields(self)}
-        found["oddities"] = [asdict(anomaly) for anomaly in found.pop("anomalies")]
-        found["splat"] = None
-        if self.splat is not None:
-            rest = asdict(self.splat)
-            values, dial = rest.pop("values"), rest.pop("dial")
-            if dial is not None and dial["calibration"] is not None:
-                dial["calibration"]["rows"] = list(dial["calibration"]["rows"])
-            found["splat"] = {**rest, **values, "dial": dial}
+        found = asdict(self)
+        found["oddities"] = found.pop("anomalies")
+        if found["splat"]:
+            found["splat"] |= found["splat"].pop("values")
         return found
 
 
@@ -151,9 +146,13 @@ def inspect(path: str | Path) -> Inspection:
             part = {name: rows.arrays[name][rows.keep] for name in ("means", "opacity_logits", "sigma_d")}
             notes += plausibility(part, metadata.attenuation)
         notes += mismatch
-    columns, degree = _columns(head), next(d for d, n in SH_COUNTS.items() if n == rows.arrays["shN"].shape[1] + 1)
+    degree, encoding = next(d for d, n in SH_COUNTS.items() if n == rows.arrays["shN"].shape[1] + 1), ""
+    columns: tuple[tuple[str, str], ...] = ()
+    if head:
+        columns = tuple((column.name, str(np.dtype(column.val_dtype))) for column in head.ply["vertex"].properties)
+        encoding = f"binary {'little' if head.ply.byte_order in '<=' else 'big'}-endian"
     splat = Splat(
-        sh_degree=degree, encoding=_encoding(head), columns=columns,
+        sh_degree=degree, encoding="ascii" if head and head.ply.text else encoding, columns=columns,
         extra=() if head and is_packed(head.ply) else extra_columns([name for name, _ in columns], degree),
         comments=tuple(comment for comment in source.comments if not comment.startswith(PREFIX)), values=values,
         tau=tau, origin=rows.origin, dial=dial, screen_filter=stated_filter(source),
@@ -166,18 +165,6 @@ def inspect(path: str | Path) -> Inspection:
         about=None, anomalies=tuple(anomalies_of(splat, questions)),
         left_out=tuple(left_out_of(splat, source.notes, rows.changes)), notes=tuple(notes),
     )  # fmt: skip
-
-
-def _columns(head: Head | None) -> tuple[tuple[str, str], ...]:
-    """The vertices' properties and their types, as they are in the file."""
-    found = head.ply["vertex"].properties if head else ()
-    return tuple((column.name, str(np.dtype(column.val_dtype))) for column in found)
-
-
-def _encoding(head: Head | None) -> str:
-    if head is None:
-        return ""
-    return "ascii" if head.ply.text else f"binary {'little' if head.ply.byte_order in '<=' else 'big'}-endian"
 
 
 def _what(path: Path, source: Source, splat: Splat) -> str:
@@ -196,27 +183,23 @@ def extra_columns(names: Sequence[str], sh_degree: int) -> tuple[str, ...]:
 
 def anomalies_of(splat: Splat, questions: dict[str, tuple[float, float]]) -> list[Anomaly]:
     """The anomalies of a file; ``questions`` are the ranges of columns that look activated, by name."""
-    v, found = splat.values, []
-
-    def note(kind: str, count: int, says: str) -> None:
-        if count:
-            found.append(Anomaly(kind, count, says.format(count=count)))
-
+    v, wide = splat.values, [name for name, kind in splat.columns if kind == "float64"]
+    counted = [("unusable", gone, f"rows are not used: {reason}") for reason, gone in v.dropped.items()]
+    counted += [
+        ("infinite_opacity", v.infinite_opacity, "have opacity = +inf, which is fully opaque"),
+        ("doubles", v.doubles, "have the same position as another Gaussian"),
+        ("far", v.far, f"are at least {FAR:g} times as far from the centre as 90 % of all"),
+        ("giant", v.giant, "are larger than half the scene"),
+        ("double_precision", len(wide), f"properties are double: {_list(wide)}"),
+    ]
+    found = [Anomaly(kind, count, f"{count:,} {says}") for kind, count, says in counted if count]
     for name, (low, high) in questions.items():
         says = f"{name} from {low:.4g} to {high:.4g}: looks activated, and is read as activated here; adapting needs"
         found.append(Anomaly("activated", 0, f"{says} --activated {choice_of(questions)}"))
-    for reason, gone in v.dropped.items():
-        note("unusable", gone, f"{{count:,}} rows are not used: {reason}")
-    note("infinite_opacity", v.infinite_opacity, "{count:,} have opacity = +inf, which is fully opaque")
-    note("doubles", v.doubles, "{count:,} have the same position as another Gaussian")
-    note("far", v.far, f"{{count:,}} are at least {FAR:g} times as far from the centre as 90 % of all")
-    note("giant", v.giant, "{count:,} are larger than half the scene")
     if splat.sh_degree and not v.used_sh_degree:
-        note("empty_harmonics", 1, "all higher harmonics are 0: no view-dependent colour")
+        found.append(Anomaly("empty_harmonics", 0, "all higher harmonics are 0: no view-dependent colour"))
     if any(splat.origin):
         found.append(Anomaly("far_from_0", 0, "coordinates are far from 0; they are read relative to a local origin"))
-    wide = [name for name, kind in splat.columns if kind == "float64"]
-    note("double_precision", len(wide), f"{{count}} properties are double: {_list(wide)}")
     if splat.screen_filter.compensate:
         found.append(Anomaly("antialiased", 0, f"trained with antialiasing: {splat.screen_filter.description}"))
     return found
@@ -267,8 +250,7 @@ def _adapter(adapter: Adapter) -> dict[str, Any]:
         "kind": "adapter", "writer": f"clod-adapter {adapter.version}", "count": len(adapter.sigma_d),
         "base": adapter.base_fingerprint, "attenuation": asdict(adapter.attenuation), "config": adapter.config,
         "updates": kinds, "origin": list(adapter.origin), "sigma": asdict(Spread.of(adapter.sigma_d.numpy())),
-        "growth": growth,
-        "calibration": adapter.calibration and adapter.calibration.as_dict(),
+        "growth": growth, "calibration": adapter.calibration and adapter.calibration.as_dict(),
     }  # fmt: skip
 
 
