@@ -36,7 +36,6 @@ from .shared.settings import add_settings, make_configs
 
 if TYPE_CHECKING:
     from clod_adapter.cameras import Scene
-    from clod_adapter.evaluation.robustness import CellResult
     from clod_adapter.io.checkpoint import Checkpoint
 
     from .shared.measure import Stopwatch
@@ -123,9 +122,7 @@ class Cell:
     def name(self) -> str:
         return cell_name(self.label, self.config.max_sv if self.config else None)
 
-    def file(self, suffix: str) -> Path:
-        return self.folder / f"{self.name}{suffix}"
-
+    @property
     def key(self) -> dict[str, Any]:
         """Everything that the result depends on, as JSON."""
         drawn, config = self.checkpoint.gaussians.screen_filter, asdict(self.config) if self.config else None
@@ -135,53 +132,64 @@ class Cell:
             **({"screen_filter": repr(drawn)} if drawn != CLASSIC else {}),
         }  # fmt: skip
 
+    def file(self, suffix: str) -> Path:
+        return self.folder / f"{self.name}{suffix}"
+
     def read(self) -> dict[str, Any] | None:
         """The finished cell, or None if there is none with this key."""
         try:
             found = json.loads(self.file(".json").read_text(encoding="utf-8"))
         except (OSError, ValueError):
             return None
-        same = isinstance(found, dict) and found.get("key") == self.key()
+        same = isinstance(found, dict) and found.get("key") == self.key
         return found if same and (self.config is None or self.file(".safetensors").is_file()) else None
 
-    def measure(self, scene: Scene, progress: Any) -> CellResult:
-        """Raises Stopped if ``progress`` returns False."""
+    def run(self, scene: Scene, progress: Any) -> dict[str, Any]:
+        """Measures; writes the adapter and then the rows, which mark the cell as finished.
+
+        Raises Stopped if ``progress`` returns False.
+        """
         from clod_adapter.evaluation.robustness import adapt_at_range, baseline
-
-        base = self.checkpoint.gaussians
-        if self.config is None:
-            return baseline(base, scene.test, self.points, progress=progress)
-        return adapt_at_range(
-            base, scene, self.config, self.points, fingerprint=self.checkpoint.fingerprint,
-            origin=self.checkpoint.origin, progress=progress,
-        )  # fmt: skip
-
-    def write(self, result: CellResult) -> dict[str, Any]:
-        """Writes the adapter and then the rows, which mark the cell as finished."""
         from clod_adapter.io.adapter_file import save_adapter
 
         from .shared.measure import machine
 
+        base = self.checkpoint
+        if self.config is None:
+            result = baseline(base.gaussians, scene.test, self.points, progress=progress)
+        else:
+            result = adapt_at_range(
+                base.gaussians, scene, self.config, self.points, fingerprint=base.fingerprint, origin=base.origin,
+                progress=progress,
+            )  # fmt: skip
         self.file(".json").unlink(missing_ok=True)
-        adapter = self.file(".safetensors") if result.adapter else None
-        if result.adapter and adapter:
-            save_adapter(adapter, result.adapter)
+        if result.adapter:
+            save_adapter(self.file(".safetensors"), result.adapter)
         cell = {
             "checkpoint": as_text(self.label), "max_sv": self.config.max_sv if self.config else None,
-            "adapter": adapter and str(adapter), "seconds": round(result.seconds, 3), "rows": result.rows,
-            "distribution": result.distribution, "machine": machine(), "key": self.key(),
+            "adapter": str(self.file(".safetensors")) if result.adapter else None, "rows": result.rows,
+            "seconds": round(result.seconds, 3), "distribution": result.distribution, "machine": machine(),
+            "key": self.key,
         }  # fmt: skip
         write_report(self.file(".json"), cell)
         return cell
 
 
 def run(args: Namespace) -> dict[str, Any]:
+    from clod_adapter.evaluation.robustness import BASELINE_SHARES, scene_fingerprint
+
     from .shared.inputs import prepare_kernels
-    from .shared.measure import Stopwatch, machine
+    from .shared.measure import Stopwatch, machine, report_dials
 
     console, watch, stop = Console(args.quiet), Stopwatch(), GracefulStop()
     checkpoints, scene = read(args, console, watch)
-    cells = plan(args, checkpoints, scene)
+    names, configs, sha256 = labels(args.ply), make_configs(args), scene_fingerprint(scene)
+    # Every range is measured at the dial values of the widest one and at its own end.
+    dials = tuple(sorted({*report_dials(configs[-1].max_sv), *(config.max_sv for config in configs)}))
+    cells = [
+        Cell(name, base, config, BASELINE_SHARES if config is None else dials, sha256, Path(args.out) / "cells")
+        for base, name in zip(checkpoints, names, strict=True) for config in (None, *configs)
+    ]  # fmt: skip
     found = {cell.name: done for cell in cells if (done := cell.read())}
     missing = [cell for cell in cells if cell.name not in found]
     if found:
@@ -202,7 +210,7 @@ def run(args: Namespace) -> dict[str, Any]:
             "command": "robustness", "version": package_version(), "scene": args.images,
             "checkpoints": [
                 {"checkpoint": label, "model": path, "count": len(each.gaussians), "sha256": each.fingerprint,
-                 "notes": each.notes} for label, path, each in zip(labels(args.ply), args.ply, checkpoints, strict=True)
+                 "notes": each.notes} for label, path, each in zip(names, args.ply, checkpoints, strict=True)
             ],
             "cells": [found[cell.name] for cell in cells if cell.name in found],
             "missing": [cell.name for cell in cells if cell.name not in found],
@@ -243,21 +251,6 @@ def read(args: Namespace, console: Console, watch: Stopwatch) -> tuple[list[Chec
         return [with_filter(each, args, console, scene.test) for each in found], scene
 
 
-def plan(args: Namespace, checkpoints: Sequence[Checkpoint], scene: Scene) -> list[Cell]:
-    """All cells. Every range is measured at the dial values of the widest one and at its own end."""
-    from clod_adapter.evaluation.robustness import BASELINE_SHARES, scene_fingerprint
-
-    from .shared.measure import report_dials
-
-    configs, sha256, cells = make_configs(args), scene_fingerprint(scene), list[Cell]()
-    dials = sorted({*report_dials(configs[-1].max_sv), *(config.max_sv for config in configs)})
-    for checkpoint, label in zip(checkpoints, labels(args.ply), strict=True):
-        for config in (None, *configs):
-            points = BASELINE_SHARES if config is None else tuple(dials)
-            cells.append(Cell(label, checkpoint, config, points, sha256, Path(args.out) / "cells"))
-    return cells
-
-
 def run_cells(cells: Sequence[Cell], scene: Scene, console: Console, stop: GracefulStop) -> dict[str, dict[str, Any]]:
     """Runs the cells; returns those that were finished, by name."""
     found: dict[str, dict[str, Any]] = {}
@@ -270,7 +263,7 @@ def run_cells(cells: Sequence[Cell], scene: Scene, console: Console, stop: Grace
                 meter.update(share, f"{cell.name} ({k + 1}/{len(cells)}) {text}")
 
             try:
-                found[cell.name] = cell.write(cell.measure(scene, stop.heeding(show)))
+                found[cell.name] = cell.run(scene, stop.heeding(show))
             except Stopped:
                 console.say(f"stopping: {cell.name} was not finished; the same command continues with it")
                 break
