@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 
+from clod_adapter._kernels.memory import release
 from clod_adapter.blocks.divide import Division, block_config, check_divisible, divide
 from clod_adapter.blocks.train import (
     Learned,
@@ -28,7 +29,6 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.importance import usable_views
 from clod_adapter.io.scene.load import ImageCache
 from clod_adapter.progress import Phase, Stopped
-from clod_adapter.rasterizers.frame import release_memory
 from clod_adapter.training.plan import Plan
 from clod_adapter.training.state import Adapted
 
@@ -52,7 +52,7 @@ def adapt_in_blocks(run: Run) -> tuple[Plan, Adapted]:
     with _displayed(run) as display:
         plan = decide(run, display)
         division = divide(plan.lean, views, plan.config, run.memory.blocks, total=len(plan.start), progress=display)
-    release_memory()
+    release()
     start_seconds, counts = time.perf_counter() - began, [division.steps(k, plan.config) for k in range(division.count)]
     run.console.say(
         f"{division.count} blocks of {min(counts)} to {max(counts)} steps, {sum(counts)} in all (each takes "
@@ -68,7 +68,7 @@ def adapt_in_blocks(run: Run) -> tuple[Plan, Adapted]:
         held = max(held, sum(result.held for result in results))  # mostly the same rows in both passes
         failed += [f"{blocks.name(k, number)}: {each.failed}" for k, each in enumerate(results) if each.failed]
     assert merged is not None
-    release_memory()
+    release()
     return plan, Adapted(
         plan.whole(base, merged), steps, seconds, start_seconds, interrupted=False, failed="; ".join(failed) or None,
         held=held,
@@ -123,7 +123,7 @@ class Blocks:
                     cache=ImageCache(run.memory.cache) if run.memory else None,
                 )  # fmt: skip
             saver.keep()
-            release_memory()
+            release()
             if adapted.failed or not adapted.interrupted:
                 about = {name: getattr(learned, name) for name in ("steps", "seconds", "failed", "held")}
                 save_block(path, learned.values, about, key)

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from clod_adapter._kernels.memory import release
 from clod_adapter.adapter import dial_tensors
 from clod_adapter.blocks.memory import IMAGES, MemoryEstimate, MemoryPlan, in_words, parse_size, plan_for_limit
 from clod_adapter.cameras import Scene, StoredView, View
@@ -24,7 +25,6 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.checkpoint import Checkpoint
 from clod_adapter.io.scene.load import ImageCache
 from clod_adapter.progress import Phase, Stopped
-from clod_adapter.rasterizers.frame import release_memory
 from clod_adapter.training.loop import time_steps
 from clod_adapter.training.plan import NOT_NEEDED, Decision, Override, Plan
 from clod_adapter.training.planner import make_plan
@@ -155,7 +155,7 @@ def decide(run: Run, display: ProgressDisplay) -> Plan:
     override = Override(frozenset(args.keep_in), frozenset(args.leave_out))
     plan = make_plan(base, run.scene, run.config, override, display)
     display.close()
-    release_memory()  # of looking at all Gaussians, before only those that are kept are trained
+    release()  # of looking at all Gaussians, before only those that are kept are trained
     if args.trim and plan.trims(base):
         began = time.perf_counter()
         with console.meter(Phase.TRIMMING) as meter:
@@ -179,7 +179,7 @@ def forecast(run: Run, plan: Plan) -> dict[str, Any] | None:
         return None
     with run.console.status("timing a few steps ..."):
         each, fixed = time_steps(plan.lean, run.scene, config, min(max(steps // 40, 16), 24), plan.subset)
-    release_memory()
+    release()
     training = fixed + min(1.02 * steps * each, config.time_budget or math.inf)  # with saving the state
     dials, frame = len(report_dials(config.max_sv)) + 1, run.base_rows[0].frame_ms / 1e3 if run.base_rows else 0.0
     measuring = CHEAPER * dials * (run.base_seconds + 15 * frame)

@@ -8,6 +8,7 @@ from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
+from clod_adapter._kernels.memory import release
 from clod_adapter._support.version import package_version
 from clod_adapter.adapter import Adapter, detach, extract, trim
 from clod_adapter.errors import ClodError
@@ -18,7 +19,6 @@ from clod_adapter.io.adapter_file import save_adapter
 from clod_adapter.io.atomic import atomic_paths, remove_leftovers
 from clod_adapter.io.checkpoint import Checkpoint, save, trimmed
 from clod_adapter.progress import Progress
-from clod_adapter.rasterizers.frame import release_memory
 from clod_adapter.training.plan import Plan
 from clod_adapter.training.state import Adapted
 
@@ -124,7 +124,7 @@ def train(run: Run, plan: Plan, display: ProgressDisplay, saver: Saver, page: Ad
     adapted = replace(adapted, gaussians=plan.whole(base, adapted.gaussians), start_seconds=start_seconds)
     how = "ended after" if adapted.failed else "interrupted after" if adapted.interrupted else "trained"
     run.console.say(f"{how} {adapted.steps} steps, {duration(adapted.seconds)}")
-    release_memory()
+    release()
     return adapted
 
 

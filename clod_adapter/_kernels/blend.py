@@ -28,10 +28,9 @@ from clod_adapter._kernels.blocks import (
 )
 from clod_adapter._kernels.compiling import kernel, part
 from clod_adapter._kernels.elementary import exp2, vabs
-from clod_adapter._kernels.pixels import load_colors, load_plane, store_colors, store_plane
 from clod_adapter._kernels.pointers import fetch_add, pointer, prefetch, scratch
 from clod_adapter._kernels.rows import store_sums
-from clod_adapter._kernels.simd import anywhere, both, but_not, f32x16, fma, ge, gt, load, select, splat, store, vmin
+from clod_adapter._kernels.simd import anywhere, both, but_not, fma, ge, gt, load, select, splat, store, vmin
 
 
 @part
@@ -117,54 +116,43 @@ def write_tile(ox, oy, width, height, state, background, image, alpha):  # type:
         x, y, at = ox + BLOCK * (block % ACROSS), oy + BLOCK * (block // ACROSS), block * 64
         if x >= width or y >= height:
             continue
-        t, pixel = vabs(load(state, at)), y * width + x
-        red, green = (
-            fma(t, splat(background[0]), load(state, at + 16)),
-            fma(t, splat(background[1]), load(state, at + 32)),
-        )
-        blue, opaque = fma(t, splat(background[2]), load(state, at + 48)), splat(float32(1)) - t
-        if x + BLOCK <= width and y + BLOCK <= height:
-            store_colors(image, 3 * pixel, 3 * width, red, green, blue)
-            store_plane(alpha, pixel, width, opaque)
-        else:
-            store(part, 0, red)
-            store(part, 16, green)
-            store(part, 32, blue)
-            store(part, 48, opaque)
-            for lane in range(16):
-                if x + lane % 4 < width and y + lane // 4 < height:
-                    own = pixel + (lane // 4) * width + lane % 4
-                    alpha[own] = part[48 + lane]
-                    for channel in range(3):
-                        image[3 * own + channel] = part[16 * channel + lane]
+        t = vabs(load(state, at))
+        for channel in range(3):
+            color = fma(t, splat(background[channel]), load(state, at + 16 + 16 * channel))
+            store(part, 16 * channel, color)
+        store(part, 48, splat(float32(1)) - t)
+        for lane in range(16):
+            if x + lane % 4 < width and y + lane // 4 < height:
+                pixel = (y + lane // 4) * width + x + lane % 4
+                alpha[pixel] = part[48 + lane]
+                for channel in range(3):
+                    image[3 * pixel + channel] = part[16 * channel + lane]
 
 
 @part
 def read_tile(ox, oy, width, height, image, alpha, v_image, v_alpha, state):  # type: ignore[no-untyped-def]
     """Loads for each pixel the remainder of v . C behind the current Gaussian, and v of the three channels."""
-    color, v = scratch(f32x16, 3), scratch(f32x16, 3)
+    part = scratch(float32, 80)
     for block in range(BLOCKS):
         x, y, at = ox + BLOCK * (block % ACROSS), oy + BLOCK * (block // ACROSS), block * 80
         if x >= width or y >= height:
             continue
-        pixel = y * width + x
-        if x + BLOCK <= width and y + BLOCK <= height:
-            load_colors(image, 3 * pixel, 3 * width, color)
-            load_colors(v_image, 3 * pixel, 3 * width, v)
-            rest = load_plane(v_alpha, pixel, width) * (load_plane(alpha, pixel, width) - splat(float32(1)))
-            store(state, at + 16, fma(v[0], color[0], fma(v[1], color[1], fma(v[2], color[2], rest))))
-            for channel in range(3):
-                store(state, at + 32 + 16 * channel, v[channel])
-        else:
-            for lane in range(16):
-                if x + lane % 4 < width and y + lane // 4 < height:
-                    own = pixel + (lane // 4) * width + lane % 4
-                    left = -v_alpha[own] * (float32(1) - alpha[own])
-                    for channel in range(3):
-                        slope = v_image[3 * own + channel]
-                        state[at + 32 + 16 * channel + lane] = slope
-                        left += slope * image[3 * own + channel]
-                    state[at + 16 + lane] = left
+        whole = x + BLOCK <= width and y + BLOCK <= height
+        for lane in range(16):
+            if whole or (x + lane % 4 < width and y + lane // 4 < height):
+                own = (y + lane // 4) * width + x + lane % 4
+                left = part[lane] = -v_alpha[own] * (float32(1) - alpha[own])
+                for channel in range(3):
+                    slope = v_image[3 * own + channel]
+                    state[at + 32 + 16 * channel + lane] = slope
+                    part[16 + 16 * channel + lane] = image[3 * own + channel]
+                    left += slope * image[3 * own + channel]
+                state[at + 16 + lane] = left
+        if whole:  # in vectors: the last bits of the result have always been these
+            rest = load(part, 0)
+            for channel in range(2, -1, -1):
+                rest = fma(load(state, at + 32 + 16 * channel), load(part, 16 + 16 * channel), rest)
+            store(state, at + 16, rest)
 
 
 @kernel

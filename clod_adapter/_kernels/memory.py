@@ -13,25 +13,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-# Most idle arrays; beyond it the oldest is freed.
-IDLE = 24
+IDLE, IDLE_FLOATS = 48, 1 << 27  # most idle arrays, and their size; beyond it the oldest is freed
 _SMALL = 16384
-# Bytes beyond which an array is freed: numpy asks for huge pages for it, so a new one takes little time.
-_LARGE = 16_000_000
 _idle: dict[int, list[np.ndarray]] = {}
 _recent: deque[int] = deque()
 
 
-def aligned(size: int, dtype: Any) -> np.ndarray:
-    """A 1-D array that begins on a cache line, so that no vector and no record spans two."""
-    item = np.dtype(dtype).itemsize
-    whole = np.empty(size + 64 // item, dtype)
-    skip = -whole.ctypes.data % 64 // item
-    return whole[skip : skip + size]
-
-
 def recycled(shape: torch.Size | tuple[int, ...]) -> Tensor:
-    """An uninitialised float32 tensor in memory of an earlier, freed one."""
+    """An uninitialised float32 tensor in memory of an earlier, freed one.
+
+    A large one begins on a cache line, so that no vector and no record spans two.
+    """
     size = math.prod(shape)
     if size < _SMALL:
         return torch.empty(shape, dtype=torch.float32, device="cpu")
@@ -42,20 +34,26 @@ def recycled(shape: torch.Size | tuple[int, ...]) -> Tensor:
         with contextlib.suppress(ValueError):
             _recent.remove(room)
     except (KeyError, IndexError):
-        whole = aligned(room, np.float32)
+        unaligned = np.empty(room + 16, np.float32)
+        whole = unaligned[-unaligned.ctypes.data % 64 // 4 :][:room]
     array = whole[:size].reshape(shape)
     # torch keeps a reference to this object as long as a tensor uses its memory.
     weakref.finalize(array, _give_back, whole).atexit = False
     return torch.from_numpy(array)
 
 
+def recycled_array(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
+    """``recycled`` as an array, of a type with 4 or 8 bytes."""
+    size = math.prod(shape)
+    # Views keep a tensor's array alive, as they would not keep another view.
+    return recycled((size * np.dtype(dtype).itemsize // 4,)).numpy().view(dtype).reshape(shape)
+
+
 def _give_back(whole: np.ndarray) -> None:
-    if whole.nbytes > _LARGE:
-        return
     # No lock: this runs where the last tensor is freed, perhaps within ``recycled``. Each operation is atomic.
     _idle.setdefault(len(whole), []).append(whole)
     _recent.append(len(whole))
-    if len(_recent) > IDLE:
+    while len(_recent) > IDLE or sum(_recent) > IDLE_FLOATS:
         with contextlib.suppress(IndexError):  # already in use again
             _idle[_recent.popleft()].pop(0)
 
@@ -64,7 +62,6 @@ def release() -> None:
     """Returns the memory of idle arrays to the system."""
     _recent.clear()
     _idle.clear()
-    with contextlib.suppress(
-        AttributeError, OSError, TypeError
-    ):  # only glibc retains freed memory and has this function
+    # Only glibc retains freed memory and has this function.
+    with contextlib.suppress(AttributeError, OSError, TypeError):
         ctypes.CDLL(None).malloc_trim(0)

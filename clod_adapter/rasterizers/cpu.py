@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import weakref
 from typing import Any
 
 import numpy as np
@@ -19,7 +18,7 @@ from clod_adapter.config import CLASSIC, ScreenFilter
 from clod_adapter.equation.attenuation import check_dial
 from clod_adapter.equation.distances import camera_unit
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.rasterizers.frame import camera_vector, dial_vector, give, prepare, workers_for
+from clod_adapter.rasterizers.frame import camera_vector, dial_vector, prepare, workers_for
 from clod_adapter.rasterizers.protocol import Rasterizer, behind, require_float32
 
 
@@ -46,7 +45,6 @@ class _Picture(torch.autograd.Function):
         image, alpha = frame.blend(background.detach().contiguous().numpy())
         ctx.frame, ctx.dialling, ctx.trained = frame, dialling, trained
         ctx.save_for_backward(*inputs, background, image, alpha)
-        weakref.finalize(frame, give, frame.buffers)
         return image, alpha
 
     @staticmethod

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,7 +9,7 @@ import numpy as np
 from torch import Tensor
 
 from clod_adapter._kernels import blend, blocks, conventions, threads, tiles
-from clod_adapter._kernels.memory import aligned, recycled, release
+from clod_adapter._kernels.memory import recycled, recycled_array
 from clod_adapter._kernels.project import project
 from clod_adapter.cameras import Camera
 from clod_adapter.config import CLASSIC, AttenuationConfig, ScreenFilter
@@ -20,47 +19,10 @@ from clod_adapter.equation.growth import growth_distance
 FEW = 4096  # rows that one thread projects or lists in about a tenth of a millisecond
 
 
-class Buffers:
-    """Scratch arrays kept between calls: page faults of a new large array cost more than the work on it."""
-
-    def __init__(self) -> None:
-        self._arrays: dict[str, np.ndarray] = {}
-
-    def get(self, name: str, shape: tuple[int, ...], dtype: Any) -> np.ndarray:
-        size = math.prod(shape)
-        flat = self._arrays.get(name)
-        if flat is None or flat.size < size:
-            flat = self._arrays[name] = aligned(size + size // 4, dtype)
-        return flat[:size].reshape(shape)
-
-
-_idle: list[Buffers] = []
-
-
-def take() -> Buffers:
-    try:
-        return _idle.pop()
-    except IndexError:
-        return Buffers()
-
-
-def give(buffers: Buffers) -> None:
-    # No lock: this runs as a finalizer, perhaps within take of the same thread. List operations are atomic.
-    if len(_idle) < 4:
-        _idle.append(buffers)
-
-
-def release_memory() -> None:
-    """Frees the scratch memory of earlier renders."""
-    _idle.clear()
-    release()
-
-
 @dataclass
 class Frame:
-    """State of the forward pass for the backward pass. The arrays are views of pooled buffers."""
+    """State of the forward pass for the backward pass."""
 
-    buffers: Buffers
     camera: np.ndarray
     width: int
     height: int
@@ -92,7 +54,7 @@ class Frame:
     ) -> np.ndarray:
         """The sums over pixels of each pair of Gaussian and tile, those of shape and colour if asked for."""
         # Reads of the last pair are sixteen floats wide too.
-        sums = self.buffers.get("pair_sums", (len(self.entries) * conventions.PAIR + 16,), np.float32)
+        sums = recycled_array((len(self.entries) * conventions.PAIR + 16,), np.float32)
         given = [x.contiguous().numpy() for x in (image, alpha, v_image, v_alpha)]
         threads.run(
             blend.blend_gradient, self.workers, self.records, self.entries, self.entry_slots, self.offsets,
@@ -103,7 +65,7 @@ class Frame:
 
     def _room(self, size: int) -> np.ndarray:
         """Scratch floats for each worker."""
-        return self.buffers.get("room", (self.workers, size), np.float32)
+        return recycled_array((self.workers, size), np.float32)
 
 
 def camera_vector(camera: Camera, screen_filter: ScreenFilter = CLASSIC) -> np.ndarray:
@@ -137,17 +99,17 @@ def workers_for(rows: int) -> int:
     return threads.worker_count() if rows >= FEW else 1
 
 
-def _sorted(buffers: Buffers, n: int, inputs: tuple[Any, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def _sorted(n: int, inputs: tuple[Any, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Runs a projection. Packed records of the visible of n Gaussians, their row numbers, the count of each worker, and
     the depth order."""
     workers = workers_for(n)
-    records = buffers.get("records", ((n + workers) * conventions.RECORD,), np.float32)
-    depths, packed_ids = buffers.get("depths", (n,), np.float32), buffers.get("packed_ids", (n,), np.int32)
+    records = recycled_array(((n + workers) * conventions.RECORD,), np.float32)
+    depths, packed_ids = recycled_array((n,), np.float32), recycled_array((n,), np.int32)
     counts = np.zeros(workers, np.int64)
     threads.run(project, workers, *inputs, records, depths, packed_ids, counts)
     visible = int(counts.sum())
-    keys, order = buffers.get("keys", (visible,), np.uint32), buffers.get("order", (visible,), np.int32)
-    other = buffers.get("keys2", (visible,), np.uint32), buffers.get("order2", (visible,), np.int32)
+    keys, order = recycled_array((visible,), np.uint32), recycled_array((visible,), np.int32)
+    other = recycled_array((visible,), np.uint32), recycled_array((visible,), np.int32)
     return records, packed_ids, counts, tiles.depth_order(depths.view(np.uint32), counts, keys, order, *other)
 
 
@@ -155,20 +117,20 @@ def prepare(
     arrays: list[np.ndarray], degree: int, camera: Camera, screen_filter: ScreenFilter, dial: np.ndarray | None
 ) -> Frame:
     """Projection, depth order and tile lists of ``arrays``, which are as the kernel ``project`` takes them."""
-    buffers, cam, n = take(), camera_vector(camera, screen_filter), len(arrays[0])
-    records, packed_ids, counts, order = _sorted(buffers, n, (*arrays, degree, cam, dial))
+    cam, n = camera_vector(camera, screen_filter), len(arrays[0])
+    records, packed_ids, counts, order = _sorted(n, (*arrays, degree, cam, dial))
     across, down = -(-camera.width // conventions.TILE), -(-camera.height // conventions.TILE)
     listing = workers_for(len(order))
     histogram, totals = np.empty((listing, across * down), np.int64), np.empty(listing, np.int64)
-    offsets, slots = np.empty(across * down + 1, np.int64), buffers.get("slots", (2 * n,), np.int32)
+    offsets, slots = np.empty(across * down + 1, np.int64), recycled_array((2 * n,), np.int32)
     threads.run(tiles.count_tiles, listing, records, order, across, histogram, totals)
     total = tiles.tile_offsets(histogram, offsets, totals)
-    entries, entry_slots = buffers.get("entries", (total,), np.int32), buffers.get("entry_slots", (total,), np.int32)
+    entries, entry_slots = recycled_array((total,), np.int32), recycled_array((total,), np.int32)
     threads.run(tiles.fill_tiles, listing, records, order, across, histogram, totals, slots, entries, entry_slots)
     # Longest lists first: no thread starts a long tile when the others are done.
     longest_first = np.argsort(-np.diff(offsets), kind="stable")
     return Frame(
-        buffers, cam, camera.width, camera.height, across, records, packed_ids, counts, slots, entries,
-        entry_slots, buffers.get("masks", (total * blocks.WORDS,), np.uint64), offsets, longest_first,
+        cam, camera.width, camera.height, across, records, packed_ids, counts, slots, entries,
+        entry_slots, recycled_array((total * blocks.WORDS,), np.uint64), offsets, longest_first,
         screen_filter.compensate or None, threads.worker_count(),
     )  # fmt: skip

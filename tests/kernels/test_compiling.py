@@ -19,7 +19,8 @@ def test_disabled_compilation_is_an_error(capture: Any, tmp_path: Path) -> None:
     environment = os.environ | {"NUMBA_DISABLE_JIT": "1"}
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 2 and os.listdir(tmp_path) == []
-    assert done.stderr == "clod-adapt: error: NUMBA_DISABLE_JIT is set, and the kernels run compiled only; unset it\n"
+    last = done.stderr.splitlines()[-1]
+    assert last == "clod-adapt: error: NUMBA_DISABLE_JIT is set, and the kernels run compiled only; unset it"
 
 
 @pytest.fixture
@@ -60,10 +61,8 @@ def said(process: subprocess.Popen[str]) -> str:
 def test_cache_survives_a_process_killed_while_writing(number: Start) -> None:
     """The code of the previous version is not used."""
     assert said(number(1)) == "2.0"
-    for written, version in ((0, 5),):
-        dies = f"left = [os.replace] * {written}\nos.replace = lambda *a: left.pop()(*a) if left else os._exit(9)"
-        number(version, dies).communicate(timeout=60)
-        assert said(number(version)) == f"{version + 1}.0"
+    number(5, "os.replace = lambda *a: os._exit(9)").communicate(timeout=60)
+    assert said(number(5)) == "6.0"
 
 
 def test_kernels_run_without_a_writable_cache(number: Start, monkeypatch: pytest.MonkeyPatch) -> None:
