@@ -344,9 +344,7 @@ budgets:
 levels and order:
   --levels 1,2,4,7 writes OUT_s1.ply, OUT_s2.ply and so on, all or none. With
   --lod-meta OUT is a new folder with lod-meta.json, level 0 the finest, and the
-  chunks that a streaming viewer loads. Its leaves have tables of errors,
-  measured from the cameras above, by which the viewer spends its budget of
-  Gaussians.
+  chunks that a streaming viewer loads.
   With --3dtiles OUT is a new folder with tileset.json and .glb tiles, packed
   as in .spz, as CesiumJS wants them; cells have at most 262,144 Gaussians.
   geometricError is measured from the same cameras: with a viewer's default of

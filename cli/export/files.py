@@ -3,24 +3,22 @@
 from __future__ import annotations
 
 from argparse import Namespace
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
 from tempfile import TemporaryDirectory
-from typing import Any
 
 from clod_adapter.bake import bake
 from clod_adapter.calibration import Viewpoint
 from clod_adapter.cameras import Camera, spread
 from clod_adapter.errors import ClodError
-from clod_adapter.evaluation.level_errors import geometric_errors, level_errors, looking
+from clod_adapter.evaluation.level_errors import geometric_errors, looking
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.checkpoint import Checkpoint
 from clod_adapter.io.file_formats import WRITABLE, write
-from clod_adapter.io.formats.lod_meta import cutting_options, read_leaves, write_errors
-from clod_adapter.io.formats.splat_transform import SplatTransform, time_limit
+from clod_adapter.io.formats.splat_transform import SplatTransform, cutting_options, time_limit
 from clod_adapter.io.formats.tileset import write_tileset
 from clod_adapter.metrics import psnr
 from clod_adapter.render import render
@@ -114,33 +112,24 @@ class Export:
         contents = [self.content(level) for level in levels]
         found = [gaussians for gaussians, _ in contents]
         if "--3dtiles" in self.args.folder:
-            notes = write_tileset(index.parent, found, self._errors(found, geometric_errors), origin=self.model.origin)
+            prepare_kernels(self.console, found[0].means.device, training=False)
+            with self.console.meter("errors of levels") as meter:
+                errors = geometric_errors(found, looking(self.cameras, found[-1]), progress=meter)
+            notes = write_tileset(index.parent, found, errors.tolist(), origin=self.model.origin)
         else:
             notes = self._stream(index, contents)
         return [len(gaussians) for gaussians in found], [*notes]
 
     def _stream(self, index: Path, contents: list[tuple[Gaussians, tuple[str, ...]]]) -> tuple[str, ...]:
-        """Has splat-transform write a streaming set, and adds the leaves' errors at each level."""
-        levels = [gaussians for gaussians, _ in contents]
-        count = sum(map(len, levels))
+        """Has splat-transform write a streaming set."""
+        count = sum(len(gaussians) for gaussians, _ in contents)
         with TemporaryDirectory(dir=index.parent) as temporary:
             words: list[str | Path] = [*cutting_options(count)]
             for k, (gaussians, about) in enumerate(contents):
                 source = Path(temporary) / f"{k}.ply"
                 write(source, gaussians, about)
                 words += [source, "-l", str(k)]
-            notes = self._transform(words, index, count)
-        try:
-            meta, leaves = read_leaves(index, [level.means.cpu().numpy() for level in levels])
-        except ClodError as error:
-            return (*notes, f"without tables of errors, viewers judge levels by their counts: {error}")
-        write_errors(index, meta, leaves, self._errors(levels, level_errors, leaves))
-        return notes
-
-    def _errors(self, levels: list[Gaussians], measure: Callable[..., Any], *given: Any) -> Any:
-        prepare_kernels(self.console, levels[0].means.device, training=False)
-        with self.console.meter("errors of levels") as meter:
-            return measure(levels, *given, looking(self.cameras, levels[-1]), progress=meter).tolist()
+            return self._transform(words, index, count)
 
     def _write_page(self, path: Path, virtual_scale: float | None) -> tuple[str, ...]:
         """Writes the page; notes on its losses, with the PSNR of its renders against those of the exact Gaussians."""

@@ -1,5 +1,4 @@
-"""Sets of several levels: leaves and errors of ``lod-meta.json``, and 3D Tiles with the tiles as the SPZ reader finds
-them. Indexes of splat-transform are in ``tests/cli/test_export.py``."""
+"""Sets of several levels: 3D Tiles with the tiles as the SPZ reader finds them, and options of streaming sets."""
 
 from __future__ import annotations
 
@@ -14,50 +13,13 @@ import torch
 
 import scenes
 from clod_adapter import load
-from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.formats import tileset
-from clod_adapter.io.formats.lod_meta import cutting_options, read_leaves, write_errors
+from clod_adapter.io.formats.splat_transform import cutting_options
 from clod_adapter.io.formats.tileset import TILESET, write_tileset
 from clod_adapter.origin import NOWHERE
 
 ERRORS = [0.0, 0.25, 1.0]
-# Six centres along z, and in the second level the fourth and the second of them.
-FINEST = np.array([[0, 0, 5], [0, 0, 1], [0, 0, 9], [3, 0, 9], [0, 0, 2], [0, 0, 3]], np.float32)
-CENTRES = [FINEST, FINEST[[3, 1]]]
-
-
-def leaf(*counts: int) -> dict[str, Any]:
-    """A leaf with so many Gaussians of each level; of 0, without that level."""
-    lods = {str(level): {"file": level, "offset": 0, "count": count} for level, count in enumerate(counts) if count}
-    return {"bound": {"min": [0, 0, 0], "max": [1, 2, 3]}, "lods": lods}
-
-
-def meta(path: Path, *leaves: dict[str, Any]) -> Path:
-    first, second, third = leaves
-    path.write_text(json.dumps({"lodErrors": False, "tree": {"children": [first, {"children": [second, third]}]}}))
-    return path
-
-
-def test_leaves_have_the_halves_across_the_longest_side(tmp_path: Path) -> None:
-    """z first: 1, 1, 2, 3 before 5, 9, 9, 9; then of the latter z again: 5 and one 9 before two 9."""
-    path = meta(tmp_path / "lod-meta.json", leaf(3, 1), leaf(2), leaf(1, 1))
-    values, (low, middle, high) = read_leaves(path, CENTRES)
-    assert sorted(low.rows[0]) == [1, 4, 5] and low.rows[1].tolist() == [1] and low.levels == [0, 1]
-    assert 0 in middle.rows[0] and len(middle.rows[0]) + len(middle.rows[1]) == 2 and middle.levels == [0]
-    assert sorted([*middle.rows[0], *high.rows[0]]) == [0, 2, 3]
-    assert high.bound.tolist() == [[0, 0, 0], [1, 2, 3]]
-    write_errors(path, values, [low, middle, high], [[0.0, 1 / 3], [0.0, 0.0], [0.0, 1.0]])
-    written = json.loads(path.read_text())
-    assert written["lodErrors"] is True
-    assert written["tree"]["children"][0] == {**leaf(3, 1), "errors": [0.0, 0.3333333]}
-    for text, message in (
-        (meta(path, leaf(4), leaf(2), leaf(1, 1)).read_text(), r"lod-meta\.json: its leaves are cut in another way"),
-        ("{}", "has no tree of leaves"),
-    ):
-        path.write_text(text)
-        with pytest.raises(ClodError, match=message):
-            read_leaves(path, CENTRES)
 
 
 def test_cutting_options_give_few_hundred_leaves() -> None:

@@ -42,6 +42,15 @@ TICK = 0.2  # seconds between two checks for its end
 ON_CPU = ("-g", "cpu", "-i", "1")
 # Prints the version of the Node that runs the tool, also if a wrapper or a symbolic link starts it.
 _SAY_NODE = "--import=data:text/javascript,process.stderr.write(`node:${process.version};`)"
+LEAVES, SMALLEST = 128, 8  # fewest leaves of a large set, and thousands (1,024) of Gaussians below which none is cut
+
+
+def cutting_options(count: int) -> tuple[str, ...]:
+    """Options for the leaves of a streaming set of ``count`` Gaussians over all levels, in any unit of length.
+
+    By default the tool cuts what is wider than 16 units, which suits a scene in metres only.
+    """
+    return "--lod-chunk-extent", "0", "--lod-chunk-min", str(max(SMALLEST, count // (1024 * LEAVES)))
 
 
 @dataclass(frozen=True)
