@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import re
+import runpy
 import shutil
+import sys
+from contextlib import redirect_stdout
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,10 +14,16 @@ from typing import Any
 import pytest
 
 import clod_adapter
+from clod_adapter.cli.main import COMMANDS, build_parser, main
 from clod_adapter.config import AdaptConfig
-from fences import LANGUAGES, PAGES, ROOT, SHELL, STEPS, blocks, parse, run, skipped, spoken
+from fences import PAGES, ROOT, blocks, spoken
+from runs import accepted
 
 IDS = [str(page.relative_to(ROOT)) for page in PAGES]
+LANGUAGES = {"sh", "console", "python", "text", "json", "glsl", "wgsl", "html", "css", "js"}
+STEPS = 20  # of a training that the pages run, at most
+# Commands that are not run: two change the environment that the tests run in, and one takes a minute (test_demo.py).
+SKIPPED = ("pip", "make", "clod-adapt demo")
 
 
 @pytest.mark.usefixtures("without_splat_transform")
@@ -32,28 +41,46 @@ def test_blocks_run_in_the_order_of_the_page(page: Path, desk: Path, tmp_path: P
         try:
             if block.language == "python":
                 exec(compile(block.text, block.place, "exec"), names)
-            elif block.language in SHELL:
-                for words in block.commands():
-                    if not skipped(words):
-                        run(words)
+            for words in block.commands():
+                if not " ".join(words).startswith(SKIPPED):
+                    monkeypatch.setattr(sys, "argv", words[1:])
+                    run(words)
         except (Exception, SystemExit) as error:
             pytest.fail(f"{block.place}: {error}")
 
 
 def short(**settings: Any) -> AdaptConfig:
-    """Settings of a Python block, trained for STEPS steps at most."""
+    """Settings of a Python block."""
     config = AdaptConfig(**settings)
     return replace(config, iters=min(config.steps, STEPS))
+
+
+def run(words: list[str]) -> None:
+    """Runs a command of a shell block in the current folder."""
+    words, out = (words[:-2], Path(words[-1])) if ">" in words else (words, Path("said.txt"))
+    assert words[0] in ("clod-adapt", "python"), f"{words[0]}: not known; mark the block with <!-- not run: REASON -->"
+    with out.open("w", encoding="utf-8") as stream, redirect_stdout(stream):
+        if words[0] == "python":
+            runpy.run_path(str(ROOT / words[1]), run_name="__main__")
+            return
+        if words[1] not in COMMANDS or words[1] == "robustness":
+            at = words.index("--iters") if "--iters" in words else len(words)
+            steps = min([STEPS, *map(int, words[at + 1 : at + 2])])
+            words = [*words[:at], "--iters", str(steps), *words[at + 2 :]]
+        code = main(accepted(words[1:]))
+    assert code == 0, f"{words}: exit code {code}"
 
 
 @pytest.mark.parametrize("page", PAGES, ids=IDS)
 def test_named_options_exist(page: Path) -> None:
     """Also of commands that are not run; each reason for not running a block stands above it."""
     written, text = blocks(page), page.read_text(encoding="utf-8")
-    commands = [words for block in written if block.language in SHELL for words in block.commands()]
-    for words in [*commands, *(command.split() for command in spoken(page, "clod-adapt"))]:
+    said = [command.split() for command in spoken(page, "clod-adapt")]
+    for words in [*said, *(words for block in written for words in block.commands())]:
         if words[0] == "clod-adapt":
-            parse(words)
+            words = words[1 : words.index(">")] if ">" in words else words[1:]
+            name = words[0] if words and words[0] in COMMANDS else ""
+            build_parser(name).parse_args(words[1:] if name else words)
     shared = (ROOT / "benchmarks" / "common.py").read_text(encoding="utf-8")
     for command in spoken(page, "python benchmarks/"):
         script, *words = command.split()[1:]
