@@ -7,7 +7,7 @@ import warnings
 from argparse import Namespace
 from collections.abc import Callable
 from contextlib import redirect_stdout
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from clod_adapter._support.text import first_line
 from clod_adapter._support.version import package_version
@@ -16,9 +16,6 @@ from .shared.command import Command
 from .shared.console import WIDTH, Console, put
 from .view import find_browser
 
-if TYPE_CHECKING:
-    import torch
-
 TORCH = "pip install --force-reinstall torch (https://pytorch.org has the command for a GPU)"
 REINSTALL = "pip install --force-reinstall numba; if that does not help, report it with clod-adapt doctor --json"
 NO_BROWSER = "clod-adapt view --no-browser --port 8000, and ssh -L 8000:127.0.0.1:8000 HOST where there is a browser"
@@ -26,30 +23,23 @@ TOLERANCE = 2e-4  # RMS of colours in [0, 1]: rounding, and a pixel or two on th
 RENDERERS = ("cpu", "gsplat")
 
 
-class CheckFailed(Exception):
-    """Something does not work; with the reason, and the command to type or what to do."""
-
-    def __init__(self, found: str, fix: str) -> None:
-        super().__init__(found)
-        self.found, self.fix = found, fix
+Found = tuple[bool, str, str]  # whether it works, the result, and a command to type or what to do
 
 
-def check_torch() -> str:
+def check_torch() -> Found:
     try:
         import torch
     except Exception as error:  # OSError too, where a library that it links to is missing
-        raise CheckFailed(f"cannot be imported ({first_line(error)})", TORCH) from error
+        return False, f"cannot be imported ({first_line(error)})", TORCH
     built = f"built for CUDA {torch.version.cuda}" if torch.version.cuda else "a CPU build"
-    return f"{torch.__version__}, {built}, {torch.get_num_threads()} threads"
+    return True, f"{torch.__version__}, {built}, {torch.get_num_threads()} threads", ""
 
 
-def check_cpu() -> str:
-    import torch
-
-    return rendered(torch.device("cpu"), REINSTALL)
+def check_cpu() -> Found:
+    return rendered("cpu", "", REINSTALL)
 
 
-def check_gsplat() -> str:
+def check_gsplat() -> Found:
     """gsplat on the GPU; may compile its kernels for minutes, once."""
     import torch
 
@@ -57,30 +47,25 @@ def check_gsplat() -> str:
 
     if reason := no_gpu():
         found, _, fix = reason.partition(": ")
-        raise CheckFailed(found, fix or "install NVIDIA's driver, and a torch for its CUDA from https://pytorch.org")
-    said = rendered(torch.device("cuda"), "pip install --force-reinstall gsplat==1.5.3")
-    return f"{torch.cuda.get_device_name()}; {said}"
+        return False, found, fix or "install NVIDIA's driver, and a torch for its CUDA from https://pytorch.org"
+    return rendered("cuda", f"{torch.cuda.get_device_name()}; ", "pip install --force-reinstall gsplat==1.5.3")
 
 
-def check_browser() -> str:
+def check_browser() -> Found:
     """Finds a browser without opening it."""
     found = find_browser()
     if found is None:
-        raise CheckFailed("none found that opens a window", NO_BROWSER)
-    return str(getattr(found, "name", "") or type(found).__name__)
+        return False, "none found that opens a window", NO_BROWSER
+    return True, str(getattr(found, "name", "") or type(found).__name__), ""
 
 
-CHECKS: dict[str, Callable[[], str]] = {
+CHECKS: dict[str, Callable[[], Found]] = {
     "torch": check_torch, "cpu": check_cpu, "gsplat": check_gsplat, "browser": check_browser,
 }  # fmt: skip
 
 
-def rendered(device: torch.device, fix: str) -> str:
-    """Renders sixty Gaussians and compares the image with the reference rasterizer's.
-
-    Raises:
-        CheckFailed: the root mean square difference exceeds TOLERANCE, or is no number.
-    """
+def rendered(device: str, name: str, fix: str) -> Found:
+    """Renders sixty Gaussians and compares the image with the reference rasterizer's."""
     import torch
 
     from clod_adapter.cameras import Camera
@@ -100,35 +85,33 @@ def rendered(device: torch.device, fix: str) -> str:
     viewmat[2, 3] = 4.0
     camera = Camera(viewmat, torch.tensor([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]]), 64, 48)
     want, _ = reference.rasterize(**scene, camera=camera)
-    splat = for_device(device).splat
+    splat = for_device(torch.device(device)).splat
     image, _ = splat(**{name: value.to(device) for name, value in scene.items()}, camera=camera)
     error = float((image.detach().cpu() - want).square().mean().sqrt())
-    if not error <= TOLERANCE:
-        raise CheckFailed(f"renders another image than the reference (RMS {error:.2g})", fix)
-    return f"renders the reference image (RMS {error:.0e})"
+    if not error <= TOLERANCE:  # or no number
+        return False, f"renders another image than the reference (RMS {error:.2g})", fix
+    return True, f"{name}renders the reference image (RMS {error:.0e})", ""
 
 
-def outcome(name: str, check: Callable[[], str]) -> dict[str, Any]:
+def outcome(name: str, check: Callable[[], Found]) -> dict[str, Any]:
     """Name, whether it works, what was found, and a fix. Any error is a result: the code belongs to other projects."""
     try:
         with warnings.catch_warnings(), redirect_stdout(io.StringIO()):  # gsplat prints, torch warns
             warnings.simplefilter("ignore")
-            return {"name": name, "ok": True, "found": check(), "fix": ""}
-    except CheckFailed as failed:
-        return {"name": name, "ok": False, "found": failed.found, "fix": failed.fix}
+            ok, found, fix = check()
     except Exception as error:
         if isinstance(error.__cause__, KeyboardInterrupt):  # within the dispatching of a compiled function
             raise
-        return {"name": name, "ok": False, "found": f"{type(error).__name__}: {first_line(error)}", "fix": ""}
+        ok, found, fix = False, f"{type(error).__name__}: {first_line(error)}", ""
+    return {"name": name, "ok": ok, "found": found, "fix": fix}
 
 
 def line_of(found: dict[str, Any]) -> str:
     """``name  ok/off  found  -> fix``; a long line has the fix below it."""
-    line = f"{found['name']:<9}{'ok' if found['ok'] else 'off':<5}{found['found']}"
-    if not found["fix"]:
-        return line
-    beside = f"{line}  -> {found['fix']}"
-    return beside if len(beside) <= WIDTH else f"{line}\n    -> {found['fix']}"
+    line, fix = f"{found['name']:<9}{'ok' if found['ok'] else 'off':<5}{found['found']}", found["fix"]
+    if fix and len(line) + len(fix) + 5 > WIDTH:
+        return f"{line}\n    -> {fix}"
+    return f"{line}  -> {fix}" if fix else line
 
 
 def run(args: Namespace) -> dict[str, Any]:
