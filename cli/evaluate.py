@@ -256,7 +256,7 @@ class Comparisons:
         paths = list(dict.fromkeys(path for path, *_ in self.against))
         names = dict(zip(paths, labels(paths), strict=True))
         return {
-            "base_row": self.base_row.as_dict() if self.base_row else None,
+            "base_row": self.base_row and self.base_row.as_dict(),
             "ranked": [
                 {"virtual_scale": ours.virtual_scale, "by": by, "row": row.as_dict()} for ours, by, row in self.ranked
             ],
@@ -271,21 +271,20 @@ class Comparisons:
         """For the console; empty without comparisons."""
         from .shared.measure import popping_table, rows_table
 
-        parts = []
+        parts: list[str] = []
+        others: dict[str, list[tuple[str, Row]]] = {}
         if self.base_row:
-            marked = [("base", self.base_row)]
+            marked = {("base", 0.0): self.base_row}  # by label and dial value, in the order of the table
             for ours, by, row in self.ranked:
-                label = f"s={ours.virtual_scale:g}"
-                marked += [(label, ours)] if (label, ours) not in marked else []
-                marked.append((by, row))
-            title = "the unadapted base, pruned to the same counts by two rankings:"
-            parts.append(f"{title}\n{rows_table(marked)}")
-        if self.against:
-            parts.append("other files, each row followed by the dial value with the same count:")
-        for path in dict.fromkeys(path for path, *_ in self.against):
-            pairs = [pair for other, *pair in self.against if other == path]
-            marked = [m for their, our in pairs for m in (("theirs", their), (f"s={our.virtual_scale:.4g}", our))]
-            parts[-1] += f"\n{path}\n{rows_table(marked)}"
+                marked[f"s={ours.virtual_scale:g}", ours.virtual_scale] = ours
+                marked[by, ours.virtual_scale] = row
+            rows = [(label, row) for (label, _), row in marked.items()]
+            parts.append(f"the unadapted base, pruned to the same counts by two rankings:\n{rows_table(rows)}")
+        for path, theirs, ours in self.against:
+            others.setdefault(path, []).extend([("theirs", theirs), (f"s={ours.virtual_scale:.4g}", ours)])
+        if others:
+            found = "".join(f"\n{path}\n{rows_table(rows)}" for path, rows in others.items())
+            parts.append(f"other files, each row followed by the dial value with the same count:{found}")
         if self.popping:
             parts.append(popping_table(self.popping))
         return "".join(f"\n{part}\n" for part in parts)

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path, PureWindowsPath
 from statistics import fmean
 from typing import TYPE_CHECKING, Any
@@ -98,24 +97,18 @@ def run(args: Namespace) -> dict[str, Any]:
     for note in notes:
         console.say(note)
     gaussians = model.gaussians.without_empty_bands()
-    pictures, interrupted = write_all(write_images(gaussians, views, dials, out, args.beside), len(views), console)
-    put(summary(pictures, dials, len(gaussians), out))
+    pictures = write_images(gaussians, views, dials, args, console)
+    put(f"wrote {len(pictures)} image{'s' * (len(pictures) != 1)} to {out}")
+    for k, dial in enumerate(dials):
+        kept, error = (fmean(picture[key][k] for picture in pictures) for key in ("kept", "psnr"))
+        about = f"{kept:,.0f} of {len(gaussians):,} Gaussians, {error:.2f} dB, means over the images"
+        put(f"  s = {dial:.5g}: {about}")
     return {
         "command": "render", "version": package_version(), "model": args.model, "scene": args.images,
-        "base_count": len(gaussians), "virtual_scales": dials, "pictures": [vars(picture) for picture in pictures],
-        "interrupted": interrupted, "notes": [*model.notes, *scene.notes, *notes], "seconds": watch.report(),
-        "outputs": {"folder": args.out},
+        "base_count": len(gaussians), "virtual_scales": dials, "pictures": pictures,
+        "interrupted": len(pictures) < len(views), "notes": [*model.notes, *scene.notes, *notes],
+        "seconds": watch.report(), "outputs": {"folder": args.out},
     }  # fmt: skip
-
-
-@dataclass(frozen=True)
-class Written:
-    """An image file of a view; per dial value the Gaussians kept, and PSNR (dB) against the photograph."""
-
-    view: str
-    file: str
-    kept: list[int]
-    psnr: list[float]
 
 
 def image_names(views: Sequence[View]) -> list[Path]:
@@ -125,36 +118,36 @@ def image_names(views: Sequence[View]) -> list[Path]:
     return short if len(set(short)) == len(short) else [path.with_name(f"{path.name}.png") for path in paths]
 
 
-def write_all(images: Iterator[Written], total: int, console: Console) -> tuple[list[Written], bool]:
-    """Writes the images with a progress bar; those written, and whether Ctrl-C ended it. A second one aborts."""
-    written, stop = list[Written](), GracefulStop()
-    with console.meter("render") as meter, stop.listening():
-        for image in images:
-            written.append(image)
-            meter.update(len(written) / total, f"{len(written)}/{total}")
-            if stop.requests:
-                break
-    return written, len(written) < total
-
-
 def write_images(
-    gaussians: Gaussians, views: Sequence[View], dials: Sequence[float], out: Path, beside: bool
-) -> Iterator[Written]:
-    """Writes an image per view: the dial values from left to right, after the photograph with ``beside``."""
+    gaussians: Gaussians, views: Sequence[View], dials: Sequence[float], args: Namespace, console: Console
+) -> list[dict[str, Any]]:
+    """Writes an image per view: the dial values from left to right, after the photograph with ``--beside``.
+
+    Ctrl-C ends it after the image under way; a second one aborts.
+
+    Returns:
+        Of each image the view, the file, and per dial value the Gaussians kept, and PSNR (dB) against the photograph.
+    """
     import torch
 
     from clod_adapter.metrics import psnr
     from clod_adapter.render import render
 
-    for view, name in zip(views, image_names(views), strict=True):
-        plain = gaussians.sigma_d is None
-        with torch.no_grad():
-            shown = [render(gaussians, view.camera, 1.0 if plain else dial) for dial in dials]
-        panels = [rendering.pixels.cpu() for rendering in shown]
-        write_png(out / name, torch.cat([view.image, *panels] if beside else panels, dim=1))
-        kept = [int(rendering.kept.sum()) for rendering in shown]
-        errors = [psnr(rendering.image, view.image) for rendering in shown]
-        yield Written(view.camera.name, str(out / name), kept, errors)
+    written, stop, out = list[dict[str, Any]](), GracefulStop(), Path(args.out)
+    with console.meter("render") as meter, stop.listening():
+        for view, name in zip(views, image_names(views), strict=True):
+            plain = gaussians.sigma_d is None
+            with torch.no_grad():
+                shown = [render(gaussians, view.camera, 1.0 if plain else dial) for dial in dials]
+            panels = [rendering.pixels.cpu() for rendering in shown]
+            write_png(out / name, torch.cat([view.image, *panels] if args.beside else panels, dim=1))
+            kept = [int(rendering.kept.sum()) for rendering in shown]
+            errors = [psnr(rendering.image, view.image) for rendering in shown]
+            written.append({"view": view.camera.name, "file": str(out / name), "kept": kept, "psnr": errors})
+            meter.update(len(written) / len(views), f"{len(written)}/{len(views)}")
+            if stop.requests:
+                break
+    return written
 
 
 def write_png(path: Path, pixels: Tensor) -> None:
@@ -166,15 +159,6 @@ def write_png(path: Path, pixels: Tensor) -> None:
         about = PngImagePlugin.PngInfo()
         about.add_text("Software", f"clod-adapter {package_version()}")  # outputs.OURS looks for it
         Image.fromarray(pixels.cpu().numpy()).save(temporary, pnginfo=about)
-
-
-def summary(pictures: Sequence[Written], dials: Sequence[float], total: int, out: Path) -> str:
-    lines = [f"wrote {len(pictures)} image{'s' * (len(pictures) != 1)} to {out}"]
-    for k, dial in enumerate(dials):
-        kept = fmean(picture.kept[k] for picture in pictures)
-        error = fmean(picture.psnr[k] for picture in pictures)
-        lines.append(f"  s = {dial:.5g}: {kept:,.0f} of {total:,} Gaussians, {error:.2f} dB, means over the images")
-    return "\n".join(lines)
 
 
 COMMAND = Command(
