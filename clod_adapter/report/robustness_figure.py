@@ -48,22 +48,22 @@ def robustness_figure(path: str | Path, cells: Sequence[Mapping[str, Any]], titl
 def _quality(axes: Any, cells: Sequence[Mapping[str, Any]], key: str, colours: Mapping[float, str]) -> None:
     axes.set_xscale("log")
     for cell in cells:
-        points = sorted((row["kept"], row["virtual_scale"], row[key]) for row in cell["rows"] if row[key] is not None)
+        points = sorted((row["kept"], row[key], row["virtual_scale"]) for row in cell["rows"] if row[key] is not None)
         if cell["max_sv"] is None:
-            axes.plot(*_xy(points), "--", color=ORANGE, linewidth=1.4, marker="D", markersize=3, zorder=2)
+            _plot(axes, points, "--", color=ORANGE, linewidth=1.4, marker="D", markersize=3, zorder=2)
             continue
-        inside = [point for point in points if point[1] <= cell["max_sv"]]
-        beyond = [point for point in points if point[1] >= cell["max_sv"]]
-        colour = colours[cell["max_sv"]]
-        axes.plot(*_xy(beyond), ":", color=colour, linewidth=1.2, marker="o", markersize=3.4, mfc="white", zorder=3)
-        axes.plot(*_xy(inside), "-", color=colour, linewidth=1.8, marker="o", markersize=4.2, zorder=4)
+        inside = [point for point in points if point[2] <= cell["max_sv"]]
+        beyond = [point for point in points if point[2] >= cell["max_sv"]]
+        style = {"color": colours[cell["max_sv"]], "marker": "o"}
+        _plot(axes, beyond, ":", linewidth=1.2, markersize=3.4, mfc="white", zorder=3, **style)
+        _plot(axes, inside, "-", linewidth=1.8, markersize=4.2, zorder=4, **style)
     axes.margins(x=0.06, y=0.12)
     label_log(axes.xaxis)
     tidy(axes)
 
 
-def _xy(points: Sequence[tuple[float, float, float]]) -> tuple[list[float], list[float]]:
-    return [point[0] for point in points], [point[2] for point in points]
+def _plot(axes: Any, points: Sequence[tuple[float, ...]], line: str, **style: Any) -> None:
+    axes.plot([point[0] for point in points], [point[1] for point in points], line, **style)
 
 
 def _distribution(axes: Any, cells: Sequence[Mapping[str, Any]], key: str, colours: Mapping[float, str]) -> None:

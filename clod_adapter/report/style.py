@@ -19,7 +19,6 @@ INK, QUIET, GRID, PAPER = "#1c1c1e", "#6b6b70", "#e4e4e7", "#ffffff"
 BLUE, ORANGE, GREEN, PURPLE = "#1f5fa8", "#c2571a", "#2d7d5a", "#7a4fa3"
 SERIES = (BLUE, ORANGE, GREEN, PURPLE, QUIET)  # in the order that lines are drawn
 DPI = 200
-INSTALL = "pip install matplotlib"
 STYLE: dict[Any, Any] = {
     "font.family": "DejaVu Sans",  # included in matplotlib, so text has the same size everywhere
     "text.color": INK,
@@ -37,7 +36,7 @@ STYLE: dict[Any, Any] = {
 def check_matplotlib() -> None:
     """Raises ClodError if matplotlib is missing, for a check before long work."""
     if importlib.util.find_spec("matplotlib") is None:
-        raise ClodError(f"pictures need matplotlib: {INSTALL}")
+        raise ClodError("pictures need matplotlib: pip install matplotlib")
 
 
 @contextmanager
@@ -47,11 +46,10 @@ def new_figure(inches: tuple[float, float], **options: Any) -> Iterator[Any]:
     Raises:
         ClodError: matplotlib is not installed.
     """
-    try:
-        import matplotlib
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise ClodError(f"pictures need matplotlib: {INSTALL}") from error
+    check_matplotlib()
+    import matplotlib
+    from matplotlib.figure import Figure
+
     with matplotlib.rc_context(STYLE):
         yield Figure(figsize=inches, dpi=DPI, facecolor=PAPER, **options)
 
