@@ -10,15 +10,8 @@ from typing import Any
 import hostile
 
 PARTS = (
-    "--json >&-",
-    "--help",
-    "pipefail",
-    "new.spz >",
-    "cd gone",
-    'export base.ply -o ""',
-    "--batch 1000000",
-    "TERM=",
-)
+    "--json >&-", "--help", "pipefail", "new.spz >", "cd gone", 'export base.ply -o ""', "--batch 1000000", "TERM=",
+)  # fmt: skip
 
 
 def test_hostile_surroundings(capture: Any) -> None:

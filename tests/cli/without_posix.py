@@ -9,17 +9,11 @@ import json
 import os
 import signal
 import sys
+from importlib import import_module
 from importlib.abc import MetaPathFinder
 
-import filelock  # noqa: F401  other packages look at sys.platform, and use what Linux has
-import numba  # noqa: F401
-import plyfile  # noqa: F401
-import pycolmap  # noqa: F401
-import safetensors.torch  # noqa: F401
-import skimage.metrics  # noqa: F401
-import torch  # noqa: F401
-import tqdm  # noqa: F401
-
+for other in ("filelock", "numba", "plyfile", "pycolmap", "safetensors.torch", "skimage.metrics", "torch", "tqdm"):
+    import_module(other)  # these look at sys.platform, and use what Linux has
 LINUX = ("sched_getaffinity", "sched_setaffinity", "posix_fadvise", "posix_fallocate", "memfd_create", "pidfd_open")
 POSIX = (
     "fork", "forkpty", "wait3", "wait4", "getuid", "geteuid", "getgid", "getegid", "getpgid", "setsid", "killpg",
