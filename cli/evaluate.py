@@ -13,20 +13,7 @@ from clod_adapter._support.version import package_version
 from clod_adapter.errors import ClodError
 from clod_adapter.progress import Listener, Stopped
 
-from .shared.command import (
-    BUDGETS,
-    Command,
-    add_activated,
-    add_antialiasing,
-    add_device,
-    add_dial_options,
-    add_images,
-    check_checkpoint,
-    check_dials,
-    check_scene,
-    model_has_dial,
-    page_files,
-)  # fmt: skip
+from .shared import command as common
 from .shared.console import Console, put
 from .shared.outputs import Outputs, labels
 from .shared.process import GracefulStop
@@ -46,12 +33,12 @@ PATH_CAMERAS = 5  # neighbours by name, which are usually photographed one after
 def add_arguments(parser: ArgumentParser) -> None:
     given = parser.add_argument_group("input")
     given.add_argument("model", metavar="MODEL.ply", help="an adapted file, or a plain one as a baseline")
-    add_images(given)
-    add_activated(given)
-    add_antialiasing(given)
+    common.add_images(given)
+    common.add_activated(given)
+    common.add_antialiasing(given)
     dial = parser.add_argument_group("dial values, one of")
     default = "dial values from 1 (full quality) (default: 1 2 3 5 below the largest trained, and that)"
-    add_dial_options(dial, default, "(mean over the held-out views)", several=True)
+    common.add_dial_options(dial, default, "(mean over the held-out views)", several=True)
     measuring = parser.add_argument_group("measuring")
     measuring.add_argument(
         "--base", metavar="BASE.ply", help="also measure the checkpoint, pruned to the count of each row"
@@ -63,62 +50,54 @@ def add_arguments(parser: ArgumentParser) -> None:
     measuring.add_argument(
         "--popping", action="store_true", help="also measure how evenly the image changes with the dial and the camera"
     )
-    add_device(measuring, "render")
+    common.add_device(measuring, "render")
     output = parser.add_argument_group("output")
     output.add_argument("--report", metavar="OUT.html", help="also write a self-contained page, and its charts")
 
 
 def check(args: Namespace) -> None:
-    check_dials(args, args.model)
+    common.check_dials(args, args.model)
     labels(args.against)
     for path in (args.model, *args.against):
-        check_checkpoint(path)
+        common.check_checkpoint(path)
     if args.base:
-        check_checkpoint(args.base)
-        if model_has_dial(args.base):
+        common.check_checkpoint(args.base)
+        if common.model_has_dial(args.base):
             raise ClodError(
                 f"{args.base}: has a dial (sigma_d); give --base the checkpoint that was adapted, or use --against"
             )
-    check_scene(args.images)
+    common.check_scene(args.images)
 
 
 def outputs(args: Namespace) -> Outputs:
     if not args.report:
         return Outputs()
-    page, *charts = page_files(Path(args.report), ["rendering"])
+    page, *charts = common.page_files(Path(args.report), ["rendering"])
     inputs = [args.model, *args.against, *([args.base] if args.base else [])]
     return Outputs([page], charts, inputs=inputs, scene=args.images)
 
 
 def run(args: Namespace) -> dict[str, Any]:
-    from .shared.measure import (
-        Stopwatch,
-        choose_dials,
-        machine,
-        measure,
-        solve_dials,
-        table,
-        with_frame_times,
-    )  # fmt: skip
+    from .shared import measure as measuring
     from .shared.pages import write_eval_page
 
-    console, watch = Console(args.quiet), Stopwatch()
+    console, watch = Console(args.quiet), measuring.Stopwatch()
     with watch.time("load"):
         model, others, scene = read_inputs(args, console)
     gaussians, base = model.gaussians, others[args.base] if args.base else None
-    given, notes = solve_dials(args, model, [view.camera for view in scene.test], console)
-    dials, beyond = choose_dials(given, gaussians.attenuation)
+    given, notes = measuring.solve_dials(args, model, [view.camera for view in scene.test], console)
+    dials, beyond = measuring.choose_dials(given, gaussians.attenuation)
     notes += beyond
     for note in notes:
         console.say(note)
     with watch.time("evaluate"):
-        rows, interrupted = measure(gaussians, scene.test, dials, console)
+        rows, interrupted = measuring.measure(gaussians, scene.test, dials, console)
         if interrupted and not rows:
             raise Stopped("stopped before the first row")
         if not interrupted:
-            (rows,), rough, interrupted = with_frame_times([(gaussians, rows)], scene.test, console)
+            (rows,), rough, interrupted = measuring.with_frame_times([(gaussians, rows)], scene.test, console)
             notes += rough
-    put(table(rows))
+    put(measuring.table(rows))
     comparisons, against = Comparisons(gaussians, scene, console), {path: others[path] for path in args.against}
     if not interrupted:
         with watch.time("comparisons"):
@@ -129,7 +108,7 @@ def run(args: Namespace) -> dict[str, Any]:
         "base_count": len(gaussians), "sh_degree": gaussians.sh_degree, "views": len(scene.test),
         "rows": [row.as_dict() for row in rows], "base": args.base, **comparisons.report(),
         "interrupted": interrupted, "attenuation": asdict(gaussians.attenuation) if gaussians.attenuation else None,
-        "notes": [*model.notes, *scene.notes, *notes, *comparisons.notes], "machine": machine(),
+        "notes": [*model.notes, *scene.notes, *notes, *comparisons.notes], "machine": measuring.machine(),
         "device": str(gaussians.means.device), "seconds": watch.report(),
     }  # fmt: skip
     return report | write_eval_page(args, report, gaussians, base, scene, console)
@@ -297,12 +276,12 @@ def neighbours(views: Sequence[View]) -> list[View]:
     return ordered[first : first + PATH_CAMERAS]
 
 
-COMMAND = Command(
+COMMAND = common.Command(
     summary="Measure quality, count and time at some dial values.",
     description="Measure quality, Gaussians kept and frame time at several dial values.",
     usage="MODEL.ply --images DIR [--sv S [S ...]] [options]",
     epilog=f"""\
-{BUDGETS}
+{common.BUDGETS}
 columns, over the held-out photographs (every 8th by name):
   PSNR, SSIM  means against the photographs
   kept        Gaussians kept, and their share of all

@@ -14,17 +14,7 @@ from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.scene.folder import find_cameras, photograph_folders
 
-from .shared.command import (
-    Command,
-    add_activated,
-    add_antialiasing,
-    add_device,
-    add_dial_options,
-    add_images,
-    check_checkpoint,
-    check_dials,
-    check_scene,
-)  # fmt: skip
+from .shared import command as common
 from .shared.console import Console, put
 from .shared.outputs import Outputs, check_outputs, make_folder
 from .shared.process import GracefulStop
@@ -39,25 +29,25 @@ if TYPE_CHECKING:
 def add_arguments(parser: ArgumentParser) -> None:
     given = parser.add_argument_group("input")
     given.add_argument("model", metavar="MODEL.ply", help="an adapted file, or a plain one")
-    add_images(given)
+    common.add_images(given)
     given.add_argument(
         "--views", metavar="NAME", nargs="+", default=["held-out"],
         help="photographs whose cameras to render: names, all, or held-out (default)",
     )  # fmt: skip
-    add_activated(given)
-    add_antialiasing(given)
+    common.add_activated(given)
+    common.add_antialiasing(given)
     dial = parser.add_argument_group("dial values, one of")
-    add_dial_options(dial, "dial values (default: 1)", "(mean over the images)", several=True)
+    common.add_dial_options(dial, "dial values (default: 1)", "(mean over the images)", several=True)
     output = parser.add_argument_group("output")
     output.add_argument("-o", "--out", metavar="FOLDER", required=True, help="output folder; made if missing")
     output.add_argument("--beside", action="store_true", help="put the photograph left of the renders")
-    add_device(output, "render")
+    common.add_device(output, "render")
 
 
 def check(args: Namespace) -> None:
-    check_dials(args, args.model)
-    check_checkpoint(args.model)
-    check_scene(args.images)
+    common.check_dials(args, args.model)
+    common.check_checkpoint(args.model)
+    common.check_scene(args.images)
     check_folder(Path(args.out), Path(args.images))
 
 
@@ -161,7 +151,7 @@ def write_png(path: Path, pixels: Tensor) -> None:
         Image.fromarray(pixels.cpu().numpy()).save(temporary, pnginfo=about)
 
 
-COMMAND = Command(
+COMMAND = common.Command(
     summary="Render a scene's cameras at some dial values to PNG.",
     description="""\
 Render the cameras of a scene's photographs at some dial values to PNG files.

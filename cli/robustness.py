@@ -19,16 +19,7 @@ from clod_adapter.io.atomic import atomic_path
 from clod_adapter.progress import Phase, Progress, Stopped
 from clod_adapter.report.style import check_matplotlib
 
-from .shared.command import (
-    Command,
-    add_activated,
-    add_antialiasing,
-    add_device,
-    add_images,
-    add_misaligned_ok,
-    check_checkpoint,
-    check_scene,
-)  # fmt: skip
+from .shared import command as common
 from .shared.console import Console, Meter, clipped, duration, put
 from .shared.outputs import Outputs, labels, write_report
 from .shared.process import GracefulStop
@@ -54,9 +45,9 @@ LONGEST = 16  # characters of a checkpoint's name in the table
 def add_arguments(parser: ArgumentParser) -> None:
     given = parser.add_argument_group("input")
     given.add_argument("ply", metavar="PLY", nargs="+", help="checkpoints of one scene; never modified")
-    add_images(given)
-    add_activated(given)
-    add_antialiasing(given)
+    common.add_images(given)
+    common.add_activated(given)
+    common.add_antialiasing(given)
     output = parser.add_argument_group("output")
     output.add_argument(
         "-o", "--out", metavar="DIR", default="robustness",
@@ -68,8 +59,8 @@ def add_arguments(parser: ArgumentParser) -> None:
         help="largest dial value of each adaptation; 1 trains at full detail only (default: 1 3 5 7)",
     )  # fmt: skip
     add_settings(training, without=["max_sv"])
-    add_misaligned_ok(training)
-    add_device(training, "train and measure")
+    common.add_misaligned_ok(training)
+    common.add_device(training, "train and measure")
 
 
 def check(args: Namespace) -> None:
@@ -77,8 +68,8 @@ def check(args: Namespace) -> None:
     make_configs(args)
     labels(args.ply)
     for path in args.ply:
-        check_checkpoint(path)
-    check_scene(args.images)
+        common.check_checkpoint(path)
+    common.check_scene(args.images)
 
 
 def outputs(args: Namespace) -> Outputs:
@@ -299,7 +290,7 @@ def print_cells(report: dict[str, Any]) -> None:
         put(f"\nmissing: {', '.join(report['missing'])}; the same command continues")
 
 
-COMMAND = Command(
+COMMAND = common.Command(
     summary="Adapt checkpoints at several ranges, and plot them.",
     description="""\
 Run the robustness experiment of CLoD-GS: checkpoints adapted at several ranges.

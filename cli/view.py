@@ -21,18 +21,7 @@ from clod_adapter.errors import ClodError
 from clod_adapter.io.file_formats import FORMATS
 from clod_adapter.progress import Stopped
 
-from .shared.command import (
-    Command,
-    add_activated,
-    add_antialiasing,
-    add_device_preset,
-    check_checkpoint,
-    check_scene,
-    check_stored_cameras,
-    initial_dial,
-    may_store,
-    model_has_dial,
-)  # fmt: skip
+from .shared import command as common
 from .shared.console import Console
 from .shared.outputs import jsonable
 from .shared.process import interrupt_as_stopped
@@ -54,15 +43,15 @@ def add_arguments(parser: ArgumentParser) -> None:
     )  # fmt: skip
     given.add_argument("--base", metavar="BASE.ply", help="the checkpoint, or another file, to compare with")
     given.add_argument("--images", metavar="DIR", help="scene folder, for its cameras only")
-    add_activated(given)
-    add_antialiasing(given, photographs=False)
+    common.add_activated(given)
+    common.add_antialiasing(given, photographs=False)
     page = parser.add_argument_group("page")
     initial: Any = page.add_mutually_exclusive_group()
     initial.add_argument(
         "--sv", metavar="S", type=float,
         help="initial dial value (default: 1 with photographs, else everything; then what the browser draws at 30 fps)",
     )  # fmt: skip
-    add_device_preset(initial)
+    common.add_device_preset(initial)
     page.add_argument("--port", metavar="P", type=int, default=0, help="port of the server (default: a free one)")
     page.add_argument("--no-browser", action="store_true", help="print the address only")
 
@@ -80,22 +69,15 @@ def _files_in(folder: Path) -> list[str]:
     def natural(path: Path) -> list[tuple[int, str]]:
         return [(int(part), "") if part.isdigit() else (0, part) for part in re.split(r"(\d+)", path.name)]
 
-    found = sorted(
-        (path for path in folder.iterdir() if path.suffix.lower() in FORMATS and path.is_file()), key=natural
-    )
-    splats = [str(path) for path in found if _is_checkpoint(path)]
+    splats = []
+    for path in sorted(folder.iterdir(), key=natural):
+        if path.suffix.lower() in FORMATS and path.is_file():
+            with suppress(ClodError):  # point clouds and meshes are .ply files too
+                common.check_checkpoint(str(path))
+                splats.append(str(path))
     if not splats:
         raise ClodError(f"{folder}: has no splat in it; give the file, or the folder that has it")
     return splats
-
-
-def _is_checkpoint(path: Path) -> bool:
-    """Whether it is one by its first bytes; point clouds and meshes are .ply files too."""
-    try:
-        check_checkpoint(str(path))
-    except ClodError:
-        return False
-    return True
 
 
 def check(args: Namespace) -> None:
@@ -105,13 +87,13 @@ def check(args: Namespace) -> None:
         raise ClodError(f"--sv is {args.sv:g}, it must be at least 0 (1 is full quality, 0 everything)")
     files = view_files(args.models)
     for path in (*files, *([args.base] if args.base else [])):
-        check_checkpoint(path)
-    if args.device_preset and not model_has_dial(files[0]):
+        common.check_checkpoint(path)
+    if args.device_preset and not common.model_has_dial(files[0]):
         raise ClodError(f"{files[0]}: has no sigma_d, which --device-preset needs; adapt it first")
     if args.images is not None:
-        check_scene(args.images)
+        common.check_scene(args.images)
     elif args.device_preset:
-        check_stored_cameras(files[0], may_store(files[0], "viewpoint"))
+        common.check_stored_cameras(files[0], common.may_store(files[0], "viewpoint"))
 
 
 def run(args: Namespace) -> None:
@@ -145,7 +127,7 @@ def make_page(args: Namespace, console: Console) -> tuple[dict[str, Response], d
     files, base = view_files(args.models), None
     model = with_filter(read_checkpoint(files[0], console, args.activated), args, console)
     if args.device_preset and args.images is None:
-        check_stored_cameras(files[0], bool(model.viewpoints))
+        common.check_stored_cameras(files[0], bool(model.viewpoints))
     others = [
         with_filter(read_checkpoint(file, console, args.activated, model.origin), args, console) for file in files[1:]
     ]
@@ -158,7 +140,7 @@ def make_page(args: Namespace, console: Console) -> tuple[dict[str, Response], d
     opening = solved[0] if args.device_preset and solved else args.sv
     notes += asked
     if opening is not None:
-        opening, more = initial_dial(opening, attenuation.max_sv if attenuation else None)
+        opening, more = common.initial_dial(opening, attenuation.max_sv if attenuation else None)
         notes += more
     for note in notes:
         console.note(note)
@@ -207,7 +189,7 @@ def open_browser(url: str) -> bool:
     return browser is not None and browser.open(url)
 
 
-COMMAND = Command(
+COMMAND = common.Command(
     summary="Look at a file in the browser, and turn its dial.",
     description="""\
 Show a file in the browser, with its dial and a free camera.

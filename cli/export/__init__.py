@@ -15,19 +15,7 @@ from clod_adapter.io import file_formats
 from clod_adapter.io.file_formats import Format
 from clod_adapter.io.formats.splat_transform import SplatTransform
 
-from ..shared.command import (
-    Command,
-    add_activated,
-    add_antialiasing,
-    add_device,
-    add_dial_options,
-    check_checkpoint,
-    check_dials,
-    check_scene,
-    given_budget,
-    initial_dial,
-    model_has_dial,
-)  # fmt: skip
+from ..shared import command as common
 from ..shared.console import Console, put
 from ..shared.outputs import Outputs, size
 
@@ -73,10 +61,10 @@ def add_arguments(parser: ArgumentParser) -> None:
     given.add_argument(
         "--camera", metavar="PHOTO", help="bake for the camera of this photograph alone; its suffix can be left out"
     )
-    add_activated(given)
-    add_antialiasing(given, photographs=False)
+    common.add_activated(given)
+    common.add_antialiasing(given, photographs=False)
     dial = parser.add_argument_group("dial values, one of")
-    add_dial_options(dial, "the dial value to bake", "(in the file written)", several=False)
+    common.add_dial_options(dial, "the dial value to bake", "(in the file written)", several=False)
     dial.add_argument(
         "--levels", metavar="S,S,...", type=levels_of, help="several dial values, each baked into its own file"
     )
@@ -98,11 +86,11 @@ def add_arguments(parser: ArgumentParser) -> None:
         "--exact", action="store_true",
         help="store float32 values in an .html page, in place of rounded ones: eight times the size",
     )  # fmt: skip
-    add_device(output, "time frames for --fps with --images")
+    common.add_device(output, "time frames for --fps with --images")
 
 
 def check(args: Namespace) -> None:
-    one = args.sv is not None or given_budget(args) is not None
+    one = args.sv is not None or common.given_budget(args) is not None
     bakes, page, folder, out = one or bool(args.levels), is_page(args), folder_option(args), Path(args.out)
     refuse(
         (args.levels and one, "--levels gives the dial values; give no other option for them"),
@@ -120,7 +108,7 @@ def check(args: Namespace) -> None:
          f"--images is used for baking, --order and {PAGE} only; add one of them, as in --sv 2"),
     )  # fmt: skip
     if args.images is not None:
-        check_scene(args.images)
+        common.check_scene(args.images)
     if folder:
         refuse(
             (out.suffix.lower() in (".json", *FORMATS),
@@ -129,9 +117,9 @@ def check(args: Namespace) -> None:
             (not out.name, f"{out}: is the current folder; --out must name a new one"),  # ".", which is not replaced
         )  # fmt: skip
     suffix = "" if folder else suffix_of(out)
-    check_dials(args, args.model, measured=("fps",) if args.images is not None else ())
-    check_checkpoint(args.model)
-    dial, form = model_has_dial(args.model), FORMATS.get(suffix)
+    common.check_dials(args, args.model, measured=("fps",) if args.images is not None else ())
+    common.check_checkpoint(args.model)
+    dial, form = common.model_has_dial(args.model), FORMATS.get(suffix)
     others = ", ".join(other for other, each in FORMATS.items() if each.carries_sigma)
     refuse(
         (bakes and not dial, f"{args.model}: has no sigma_d, so no dial value can be baked; export it without one"),
@@ -230,7 +218,8 @@ def prepare(args: Namespace, model: Checkpoint, console: Console) -> tuple[Expor
     page, views, notes = is_page(args), list[Any](), list[str]()
     cameras: Sequence[Any] = ()
     about = ""
-    if args.order or args.levels or (args.sv and not page) or (given_budget(args) and not (page and args.psnr_drop)):
+    counts = common.given_budget(args) and not (page and args.psnr_drop)
+    if args.order or args.levels or counts or (args.sv and not page):
         cameras, about, notes = find_cameras(args, model, console)
     if page and args.images is not None:
         views, notes = load_cameras(args.images, model.origin)
@@ -252,7 +241,7 @@ def dial_values(args: Namespace, export: Export, console: Console) -> tuple[list
     if solved is None:
         return None, notes
     if page and attenuation is not None:
-        opening, more = initial_dial(solved[0], attenuation.max_sv)
+        opening, more = common.initial_dial(solved[0], attenuation.max_sv)
         return [opening], notes + more
     dials, beyond = choose_dials(solved, attenuation)
     return dials, notes + beyond
@@ -313,7 +302,7 @@ def format_table() -> str:
     return "\n".join(lines)
 
 
-COMMAND = Command(
+COMMAND = common.Command(
     summary="Write a file for other tools: another format, or plain.",
     description="""\
 Write a model for other tools: in another format, with its dial if the format
