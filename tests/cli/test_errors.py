@@ -45,12 +45,13 @@ def folder(capture: Any, dialled: Path, tmp_path_factory: pytest.TempPathFactory
         shutil.copy(dialled.with_suffix(suffix), there / f"dial{suffix}")
     for suffix in (".ply", ".glb"):
         clod_adapter.save(there / f"bare{suffix}", clod_adapter.with_dial(capture.gaussians))
-    for name in ("text.ply", "broken.safetensors", "a.hier", "a.lcc", "a.ckpt"):
+    for name in ("text.ply", "broken.safetensors", "a.hier", "a.ckpt"):
         (there / name).write_text("hello")
     (there / "cut.ply").write_bytes(capture.ply.read_bytes()[:-100])
     (there / "mesh.ply").write_text(MESH)
-    for name in ("empty", "folder.ply", "out/cells"):
+    for name in ("empty", "out/cells"):
         (there / name).mkdir(parents=True)
+    os.mkfifo(there / "pipe.ply")
     return there
 
 
@@ -96,101 +97,76 @@ ERRORS = [
     # Arguments, and inputs that are none.
     ("--quiet", "arguments are required: PLY .*--help"),
     ("veiw base.ply", "veiw: no such file or command; did you mean clod-adapt view"),
-    ("Eval base.ply --images scene --json", "did you mean clod-adapt eval"),
     ("missing.ply --images scene", "missing.ply: .*No such file.*check the path"),
     ("text.ply --images scene --json", "text.ply: is not a PLY.*convert"),
     ("cut.ply --images scene", "cut.ply: .*truncated.*again"),
     ("a.hier --out x.ply", "Hierarchical-3DGS"),
-    ("a.lcc --out x.ply", "splat-transform"),
     ("a.ckpt --out x.ply", "ns-export"),
     ("base.ply --images nowhere", "nowhere: is not a folder; give"),
     ("base.ply --images empty", "empty: no COLMAP model.*, and no transforms.json; give the folder"),
-    ("base.ply --images nerf/transforms.json", "nerf/transforms.json: is not a folder"),
     ("base.ply --images scene --max-sv 0.5", "--max-sv is 0.5, it must be at least 1"),
-    ("base.ply --images scene --max-sv nan", "--max-sv is nan"),
     ("base.ply --images scene --max-sv 300", "--max-sv is 300, it must be below 50"),
     ("base.ply --images scene --iters -1", "--iters is -1, it must be at least 0"),
-    ("base.ply --images scene --seed -1", "--seed is -1, it must be at least 0"),
     ("base.ply --images scene --time-budget inf", "--time-budget is inf, it must be"),
     ("base.ply --images scene --with colour", "--with: invalid choice: 'colour' .*bands.*unseen.*means.*sh0"),
     ("base.ply --images scene --with quats --without sh0 quats", "--with and --without both name quats"),
     ("base.ply --images scene --out nowhere/x.ply", "nowhere/x.ply: folder nowhere does not exist; create"),
     ("base.ply --images scene --out x.splat", "x.splat: .*must end in .ply"),
     ("base.ply --images scene --out x.compressed.ply", "x.compressed.ply: is written by clod-adapt export alone"),
-    ("base.ply --images scene --out folder.ply", "folder.ply: is a folder"),
     ("eval base.ply --images scene --against base.ply text.ply", "text.ply: is not a PLY"),
     ("eval base.ply --images scene --against base.ply base.ply", "base.ply: is given twice"),
-    ("eval base.ply --images scene --base missing.ply", "missing.ply: .*check the path"),
     ("eval base.ply --images scene --base dial.ply", "has a dial .*; give --base the checkpoint.* --against$"),
     ("eval base.ply --images scene --sv=-0.5 --json", "--sv has -0.5, it must be at least 0"),
     ("eval base.ply --images scene --sv", "--sv: expected at least one argument.*clod-adapt eval --help"),
     ("eval base.ply --images scene --keep 10", "base.ply: has no sigma_d, which --keep needs; adapt it first"),
-    ("eval base.ply --images scene --keep 0 --json", "--keep has 0, it must be positive"),
-    ("eval base.ply --images scene --fps nan", "--fps has nan, it must be positive"),
     ("eval base.ply --images scene --sv 2 --keep 10", "--keep: not allowed with argument --sv"),
     ("eval bare.ply --images scene --psnr-drop 1", "bare.ply: has no calibration .* --psnr-drop needs; adapt it"),
     ("eval dial.ply --images scene --keep 1", r"--keep 1: .*at s = 4, .* \d+ are kept$"),
     ("eval dial.ply --images scene --fps 1e7", r"--fps 1e\+07: .*at s = 4, .* a frame takes \S+ ms"),
     ("eval base.ply --images scene --report page.txt", "page.txt: --report names the page.*end in .html"),
     ("render base.ply --images scene --json", "required: -o/--out"),
-    ("render base.ply --images scene -o pictures --sv=-1", "--sv has -1"),
     ("render base.ply --images scene -o text.ply", "text.ply: text.ply is a file; choose another --out"),
     ("render base.ply --images scene -o x --views banana", "--views: no photograph is named 'banana'; .* 000.png, 001"),
     *[(f"render base.ply --images {scene} -o {out}", "the scene's own photographs may be there") for scene, out in (
-        ("scene", "scene"), ("scene", "scene/images"), ("scene/sparse/0", "scene/images/sub"), ("nerf", "nerf"),
-        ("scene/images", "scene/images/sub"), ("nerf", "nerf/train"), ("nerf", "scene/../nerf/train"),
+        ("scene", "scene"), ("scene/sparse/0", "scene/images/sub"), ("nerf", "nerf"), ("nerf", "scene/../nerf/train"),
     )],
     ("export bare.ply", "required: -o/--out"),
     ("export bare.ply -o x", "x: --out must end in one of .ply, .*, which is the format"),
-    ("export bare.ply -o .ply --sv 2", ".ply: --out must end in one of"),
     ("export bare.ply -o x.splat", "x.splat: .splat cannot store a dial; choose a dial value .* format .*.ply"),
     ("export bare.ply -o x.splat --sv 2 --order extinction", "x.splat: .splat sorts the Gaussians itself"),
-    ("export bare.ply -o folder.ply --sv 2", "folder.ply: is a folder"),
-    ("export bare.ply -o nowhere/x.glb", "nowhere/x.glb: folder nowhere does not exist"),
-    ("export bare.ply -o x.ply --fps 60", "bare.ply: has no calibration .* --fps needs"),
     ("export bare.ply -o x.ply --sv 2 --levels 1,2", "--levels gives the dial values; give no other"),
     ("export bare.ply -o page.html --levels 1,2", "remove --levels, --camera and --order"),
     ("export bare.ply -o x.spz --exact", "--exact is for .html pages; another format has its own precision"),
     ("export bare.ply -o x.ply --levels 1,4,2", "--levels: '1,4,2' must be ascending dial values of at least 0"),
-    ("export bare.ply -o x.ply --levels 1,inf", "--levels: '1,inf' must be"),
     ("export bare.ply -o x --lod-meta", "--lod-meta needs several levels; give them"),
     ("export bare.ply -o lod-meta.json --lod-meta --levels 1,2", "--out names the folder for lod-meta.json"),
     ("export bare.ply -o . --lod-meta --levels 1,2", ".: is the current folder; --out must name a new one"),
-    ("export bare.ply -o x --3dtiles --levels 2", "--3dtiles needs several levels; give them"),
     ("export bare.ply -o x --3dtiles --lod-meta --levels 1,2", "write a folder each; give one of them"),
-    ("export bare.ply -o x --3dtiles --levels 1,2 --order extinction", "--3dtiles sorts the Gaussians itself"),
     ("export bare.ply -o x.glb --3dtiles --levels 1,2", "x.glb: with --3dtiles, --out names the folder for tileset"),
     ("export bare.ply -o x.ply --sv 2 --camera 003", "--camera needs the scene of the photograph"),
     ("export bare.ply -o x.ply --images scene", "--images is used for baking, --order and .html"),
     ("export bare.ply -o x.ply --camera 003 --images scene", "--camera needs a dial value to bake; give one"),
     ("export bare.ply -o x.ply --sv 2 --camera no --images scene", "--camera: no photograph is named 'no'; .* 000"),
     ("export base.ply -o x.ply --levels 1,2", "base.ply: has no sigma_d, so no dial value can be baked"),
-    ("export base.ply -o x.ply --order extinction", "base.ply: has no sigma_d to order its Gaussians by"),
-    ("export base.ply -o x.ply --device-preset phone", "has no sigma_d, which --device-preset"),
+    ("apply base.ply dial.safetensors -o pipe.ply", "pipe.ply: is no regular file"),
     ("apply base.ply missing.safetensors -o x.ply", "missing.safetensors: .*No such file"),
-    ("apply base.ply text.ply -o x.ply --json", "text.ply: is not a safetensors file"),
     ("apply bare.ply dial.safetensors -o x.ply", "bare.ply: a different base"),
     ("inspect cut.ply --json", "cut.ply: "),
     ("inspect broken.safetensors", "broken.safetensors: "),
     ("view base.ply --base text.ply", "text.ply: is not a PLY"),
     ("view empty", "empty: has no splat in it; give the file"),
     ("view base.ply --port 65536", "--port is 65536, it must be between 1 and 65535"),
-    ("view base.ply --sv=-0.5", "--sv is -0.5, it must be at least 0"),
     ("view bare.ply --device-preset phone", "bare.ply: stores no cameras, which --device-preset needs; give"),
-    ("view bare.glb --device-preset phone", "bare.glb: stores no cameras, which --device-preset needs"),
     ("view bare.ply --sv 2 --device-preset phone", "not allowed with"),
-    ("robustness base.ply base.ply --images scene", "base.ply: is given twice"),
     ("robustness base.ply --images scene --max-sv 1 0.5", "--max-sv is 0.5, it must be at least 1"),
     ("demo -o base.ply/here", "base.ply/here: base.ply is a file; choose another --out"),
     # Inputs: checkpoints, adapters, photographs, masks, files of a COLMAP model; by hard and symbolic links.
     ("base.ply --images scene --out base.ply", "base.ply: is an input file.*choose another"),
     (ADAPTED, rf"out/dial.ply: {INPUT} \(base.ply\), which is never overwritten", "out/dial.ply~base.ply"),
     (ADAPTED, rf"out/dial.safetensors: {INPUT} \(scene", "out/dial.safetensors>scene/images/004.png"),
-    (ADAPTED, rf"out/dial.json: {INPUT} \(scene", "out/dial.json~scene/sparse/0/images.bin"),
     ("base.ply --images nerf --max-sv 2 -o nerf/transforms.ply", f"nerf/transforms.json: {INPUT}, which"),
     (f"dial.ply {BLOCKS}", f"x.block1.pass1.safetensors: {INPUT}", "x.block1.pass1.safetensors>dial.ply"),
     (EVAL, rf"page.html: {INPUT} \(nerf", "page.html~nerf/masks/003.png"),
-    (EVAL, rf"page_rendering.png: {INPUT} \(nerf", "page_rendering.png~nerf/images/002.png"),
     (RENDER, rf"out/008.png: {INPUT} \(scene", "out/008.png>scene/images/000.png"),
     (f"{EXPORT} x.ply --levels 1,2", rf"x_s2.ply: {INPUT} \(scene", "x_s2.ply~scene/images/000.png"),
     ("export dial.ply -o y.spz", rf"y.spz: {INPUT} \(dial.ply\)", "y.spz~dial.ply"),
@@ -199,11 +175,8 @@ ERRORS = [
     # Files of adapting beside the input, which are named for something else.
     ("export dial.ply -o dial.safetensors", f"dial.safetensors: {BESIDE} dial.ply; choose another output"),
     ("export link.ply -o dial.safetensors", f"dial.safetensors: {BESIDE} link.ply", "link.ply>dial.ply"),
-    ("export dial.ply -o dial.html", f"dial.html: {BESIDE} dial.ply", "dial.html=dial.json"),
-    ("export dial.ply -o l.safetensors", f"l.safetensors: {BESIDE} dial.ply", "l.safetensors>dial.safetensors"),
     # Names that follow from others, where a file is that another program wrote.
     (f"base.ply {TINY} -o out.ply", f"out.json: {FOREIGN}", "out.json"),
-    (f"base.ply {TINY} -o out.ply", f"out.resume.safetensors: {FOREIGN}", "out.resume.safetensors"),
     (f"base.ply {TINY} --report -o out.ply", f"out_rendering.png: {FOREIGN}", "out_rendering.png"),
     (f"base.ply {TINY}", f"base_clod.ply: {FOREIGN}", "base_clod.ply"),
     (f"base.ply {BLOCKS}", f"x.block1.pass1.safetensors: {FOREIGN}", "x.block1.pass1.safetensors"),
@@ -213,7 +186,6 @@ ERRORS = [
     (f"{EXPORT} x --levels 1,2 --3dtiles", "x: is a file; with --3dtiles, --out must name a new folder", "x"),
     (f"{EXPORT} nerf --levels 1,2 --3dtiles", "nerf: is a folder that is not empty"),
     (ROBUSTNESS, f"out/cells/base_sv2.safetensors: {FOREIGN}", "out/cells/base_sv2.safetensors"),
-    (ROBUSTNESS, f"out/robustness.csv: {FOREIGN}", "out/robustness.csv"),
     ("demo -o out", f"out/curve.png: {FOREIGN}", "out/curve.png"),
 ]  # fmt: skip
 
@@ -237,14 +209,6 @@ def refused(clod: Any, folder: Path, said: str, line: str) -> None:
     assert everything(folder) == before
 
 
-def test_pipe_as_output_is_refused(clod: Any, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(folder)
-    os.mkfifo("x.ply")
-    refused(clod, folder, "x.ply: is no regular file", "apply base.ply dial.safetensors -o x.ply")
-    assert Path("x.ply").is_fifo()
-    Path("x.ply").unlink()
-
-
 def outputs_of(line: str) -> Outputs:
     words = line.split()
     name = words[0] if words[0] in COMMANDS else ""
@@ -254,28 +218,22 @@ def outputs_of(line: str) -> Outputs:
 @pytest.mark.parametrize(
     ("first", "second", "said"),
     [
-        (f"base.ply {TINY} -o two.ply", f"base.ply {TINY} -o two.PLY", "two.PLY"),
         (f"base.ply {TINY} -o two.ply", "export dial.ply -o two.safetensors", "two.safetensors"),
         (f"base.ply {TINY} -o two.ply --report", "eval dial.ply --images scene --report two.html", "two.html"),
         ("export dial.ply -o x.ply --levels 1,2", "export dial.ply -o x_s2.ply", "x_s2.ply"),
-        ("export dial.ply -o x --levels 1,2 --3dtiles", "export dial.ply -o x --levels 1,2 --3dtiles", "x"),
-        (RENDER, RENDER, "out"), (ROBUSTNESS, ROBUSTNESS, "out"), ("demo -o out", "demo -o out", "out"),
-        ("export dial.ply -o two.ply", "export dial.ply -o two.spz", None),
+        (RENDER, RENDER, "out"), ("export dial.ply -o two.ply", "export dial.ply -o two.spz", ""),
     ],
 )  # fmt: skip
 def test_two_runs_at_once(
-    clod: Any, folder: Path, monkeypatch: pytest.MonkeyPatch, first: str, second: str, said: str | None
+    clod: Any, folder: Path, monkeypatch: pytest.MonkeyPatch, first: str, second: str, said: str
 ) -> None:
     monkeypatch.chdir(folder)
-    before = everything(folder)
     with claimed(outputs_of(first)):
-        if said is None:
+        if said:
+            refused(clod, folder, rf"^{said}: another run is writing it; wait for that", second)
+        else:
             with claimed(outputs_of(second)):
                 pass
-        else:
-            running = rf"^{said}: another run is writing it; wait for that"
-            refused(clod, folder, running, second)
-    assert everything(folder) == before
 
 
 def test_earlier_outputs_are_replaced(clod: Any, capture: Any, tmp_path: Path) -> None:
@@ -284,7 +242,6 @@ def test_earlier_outputs_are_replaced(clod: Any, capture: Any, tmp_path: Path) -
     for _ in range(2):
         for line in (
             f"{capture.ply} --images SCENE --iters 2 --max-sv 2 -o out.ply",
-            "eval out.ply --images SCENE --sv 1 --report page.html",
             "render out.ply --images SCENE -o pictures",
             "export out.ply -o x.safetensors",
             "export out.ply -o x.spz --levels 1,2",
@@ -304,30 +261,22 @@ view bare.ply bare.ply --device-preset phone | export base.ply --device-preset p
 
 
 def test_help_errors_and_inspect_do_not_import_torch(folder: Path) -> None:
+    """``--help`` takes 0.1 s of a core where nothing else runs, and does not import numpy either."""
     lines = [line.split() for line in LIGHT.replace("\n", " | ").split(" | ") if line]
     script = (
-        "import json, sys\n"
+        "import json, resource, sys\n"
         "sys.modules.update(torch=None, pycolmap=None, numba=None)\n"  # importing one is an error
         "from clod_adapter.cli.main import main\n"
         "def code(words):\n"
         "    try: return main(words)\n"
         "    except SystemExit as done: return done.code or 0\n"
-        "codes = [code(words) for words in json.loads(sys.argv[1])]\n"
-        "print(json.dumps(codes)); sys.exit(code(['--nonsense']))"
+        "code(['--help'])\n"
+        "assert sum(resource.getrusage(resource.RUSAGE_SELF)[:2]) < 0.4 and 'numpy' not in sys.modules\n"
+        "print(json.dumps([code(words) for words in json.loads(sys.argv[1])]))\n"
     )
     done = subprocess.run(
         [sys.executable, "-c", script, json.dumps(lines)], cwd=folder, capture_output=True, text=True, check=False
     )
     wanted = [0 if line[-1] in ("--help", "--version") or line[0] == "inspect" else 2 for line in lines]
+    assert done.returncode == 0, done
     assert "Traceback" not in done.stderr and json.loads(done.stdout.splitlines()[-1]) == wanted, done
-    assert done.returncode == 2 and len(lines) == 21
-
-
-def test_help_is_fast() -> None:
-    """0.1 s of a core, as measured on an idle machine, and not a second."""
-    code = (
-        "import resource, sys; from clod_adapter.cli.main import main\ntry: main(['--help'])\nexcept SystemExit: pass\n"
-    )
-    code += "sys.exit(int(100 * sum(resource.getrusage(resource.RUSAGE_SELF)[:2])))"
-    taken = min(subprocess.run([sys.executable, "-c", code], capture_output=True, check=False).returncode for _ in "12")
-    assert 0 < taken < 40  # hundredths
