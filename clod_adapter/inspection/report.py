@@ -230,7 +230,8 @@ def _inspect_tensors(path: Path) -> tuple[str, dict[str, Any], tuple[str, ...]] 
     Raises:
         ClodError: it cannot be read, or is damaged.
     """
-    from clod_adapter.io.adapter_file import FORMAT, KEY, load_adapter
+    from clod_adapter.io.adapter_file import FORMAT, load_adapter
+    from clod_adapter.io.file_formats import KEY
     from clod_adapter.io.tensor_file import read_tensor_header
     from clod_adapter.training.state import KEY as STATE_KEY
 

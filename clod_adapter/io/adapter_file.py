@@ -19,11 +19,11 @@ from clod_adapter.adapter import Adapter, dial_tensors
 from clod_adapter.config import CLASSIC
 from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import atomic_path
+from clod_adapter.io.file_formats import KEY
 from clod_adapter.io.settings import DAMAGE, Metadata, damaged, document, read_metadata, stored_values
 from clod_adapter.io.settings import FORMAT as MODEL
 from clod_adapter.io.tensor_file import load_tensors, read_tensor_header, write_tensors
 
-KEY = "clod_adapter"
 FORMAT = "clod-adapter"
 FORMAT_VERSION = 3
 UNTRIMMED, TRIMMED = 1, 2  # formats of adapters without growth, which earlier versions of this package read

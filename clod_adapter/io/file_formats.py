@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
 import re
-import sys
 from collections.abc import Sequence
 from importlib import import_module
-from io import BufferedReader
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 
@@ -27,8 +24,6 @@ class Format(NamedTuple):
     Attributes:
         read: a path to a ``Source``.
         check: refuses, by the first bytes and without torch, a file that is not of the format.
-        open: whether a file has a sigma_d; refuses what ``read`` would by header, settings and sizes, without reading
-            the values (but of an .spz). "" where no file has one, and ``check`` is all.
         write: called with path, Gaussians in world units and a ``History``; gives a line for each loss; "" where the
             format is only read.
         carries_sigma: whether the dial is written: sigma_d, growth_d and their settings.
@@ -38,7 +33,6 @@ class Format(NamedTuple):
 
     read: str = ""
     check: str = ""
-    open: str = ""
     write: str = ""
     carries_sigma: bool = False
     about: tuple[str, ...] = ()
@@ -48,29 +42,25 @@ class Format(NamedTuple):
 _CHECK = "file_formats.check_start"
 _CONVERTED = Format("formats.splat_transform.load_converted", "formats.splat_transform.check_converted")
 KEY = "clod_adapter"  # of the JSON document in formats other than PLY
-PLY = Format(
-    "ply.read_ply", "ply.check_ply", "ply.open_ply", "checkpoint.write_ply", True, ("exact; baked, in Inria's layout",)
-)
+PLY = Format("ply.read_ply", "ply.check_ply", "checkpoint.write_ply", True, ("exact; baked, in Inria's layout",))
 FORMATS = {
     ".ply": PLY,
     ".glb": Format(
-        "formats.glb.load_glb", _CHECK, "formats.glb.open_glb", "formats.glb.write_glb", True,
+        "formats.glb.load_glb", _CHECK, "formats.glb.write_glb", True,
         ("float32, SH degree up to 3", "(KHR_gaussian_splatting, _SIGMA_D, _GROWTH_D)"),
     ),
     ".spz": Format(
-        "formats.spz.load_spz", _CHECK, "formats.spz.open_spz", "formats.spz.write_spz", True,
+        "formats.spz.load_spz", _CHECK, "formats.spz.write_spz", True,
         ("6 to 24 bits, SH degree up to 3, the dial 16-bit floats",),
     ),
     ".safetensors": Format(
-        "formats.safetensors.load_safetensors", _CHECK, "formats.safetensors.open_safetensors",
-        "formats.safetensors.write_safetensors", True, ("exact; for Python",),
+        "tensor_file.load_safetensors", _CHECK, "tensor_file.write_safetensors", True, ("exact; for Python",)
     ),
     ".pt": Format(
-        "formats.pt.load_pt", "formats.pt.check_pt", "formats.pt.open_pt", "formats.pt.write_pt", True,
-        ("exact; layout of gsplat's trainer",),
+        "formats.pt.load_pt", "formats.pt.check_pt", "formats.pt.write_pt", True, ("exact; layout of gsplat's trainer",)
     ),
     ".splat": Format(
-        "formats.splat.load_splat", _CHECK, "", "formats.splat.write_splat", False, ("8 bits, SH degree 0",), False
+        "formats.splat.load_splat", _CHECK, "formats.splat.write_splat", False, ("8 bits, SH degree 0",), False
     ),
     ".sog": _CONVERTED,
     ".ksplat": _CONVERTED,
@@ -93,14 +83,17 @@ def check_readable(path: Path) -> None:
 
 
 def file_has_dial(path: Path) -> bool:
-    """Whether the file has a sigma_d.
+    """Whether the file has a sigma_d; of a PLY the header, settings and length alone are read.
 
     Raises:
-        ClodError: as ``check_readable``, or its header, settings or sizes are damaged.
+        ClodError: as ``read_source``.
     """
     check_readable(path)
-    opened = format_of(path).open
-    return bool(opened) and _call(opened, path)
+    form = format_of(path)
+    if form is PLY:
+        return bool(_call("ply.open_ply", path))
+    possible = form.carries_sigma and not read_start(path).startswith(NEW_SPZ)
+    return possible and "sigma_d" in read_source(path).arrays
 
 
 def check_suffix(path: Path) -> None:
@@ -117,7 +110,7 @@ def check_suffix(path: Path) -> None:
 
 
 def check_written(path: Path) -> None:
-    """Refuses a file just written, under its temporary name, that the reader of its format would refuse: ``open``.
+    """Refuses a file just written, under its temporary name, that the reader of its format would refuse.
 
     Raises:
         ClodError: it would.
@@ -135,10 +128,8 @@ def read_source(path: Path) -> Source:
     Raises:
         ClodError: the file is damaged, of another kind, or a package or program that its format needs is missing.
     """
-    form = format_of(path)
-    if form is not PLY:  # which is checked while it is read
-        check_readable(path)
-    found: Source = _call(form.read, path)
+    check_readable(path)
+    found: Source = _call(format_of(path).read, path)
     return found
 
 
@@ -270,7 +261,7 @@ def refuse_long_numbers(path: Path, text: bytes) -> None:
 
 
 def read_start(path: Path, size: int = 64) -> bytes:
-    """The first bytes of a file, at most ``size``.
+    """The first bytes of a file, at most ``size``; all with -1.
 
     Raises:
         ClodError: the file cannot be read, or is not a regular file.
@@ -284,33 +275,8 @@ def read_start(path: Path, size: int = 64) -> bytes:
 
 
 def read_whole(path: Path) -> bytes:
-    """A file's bytes.
-
-    Raises:
-        ClodError: it cannot be read.
-    """
-    try:
-        refuse_irregular(path)
-        return path.read_bytes()
-    except (OSError, ValueError) as error:  # ValueError: a name that holds a NUL
-        raise ClodError(f"{path}: cannot be read ({getattr(error, 'strerror', error)}); check the path") from error
-
-
-def handle_name(file: BufferedReader) -> str:
-    """A name of an open file, for libraries that open a file themselves and take names in UTF-8 only.
-
-    It names the same file after another one has replaced it; on Windows nothing replaces an open file.
-    """
-    return str(file.name) if sys.platform == "win32" else f"/dev/fd/{file.fileno()}"
-
-
-def file_sha256(file: BufferedReader) -> str:
-    """SHA-256 of an open file, hex."""
-    file.seek(0)
-    digest = hashlib.sha256()
-    while block := file.read(1 << 20):
-        digest.update(block)
-    return digest.hexdigest()
+    """A file's bytes; errors as ``read_start``."""
+    return read_start(path, -1)
 
 
 def refuse_known(path: Path, start: bytes) -> None:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import hashlib
 import io
 import itertools
-import os
 import re
 import warnings
 from collections.abc import Iterable, Iterator, Mapping
@@ -153,22 +152,16 @@ def read_ply(path: Path) -> Source:
         ClodError: not a checkpoint, damaged, or its settings are.
     """
     try:
-        file_formats.refuse_irregular(path)
-        with open(path, "rb") as file:
-            start = file.read(HEADER_LIMIT)
-            head = parse_head(path, start)
-            degree = _degree(path, head.ply)
-            _check_length(path, head, os.fstat(file.fileno()).st_size)
-            if head.ply.text:
-                _refuse_long_lines(file, head)
-            elements, sha256 = _elements(file, head, start[: head.size])
+        data = np.fromfile(path, np.uint8)  # once, and not mapped: another program may write the file meanwhile
+        head = parse_head(path, data[:HEADER_LIMIT].tobytes())
+        degree = _degree(path, head.ply)
+        _check_length(path, head, len(data))
+        elements = _elements(data, head)
     except OSError as error:
         raise ClodError(f"{path}: cannot be read ({error.strerror or error}); check the path") from error
     except (PlyParseError, ValueError, TypeError, MemoryError) as error:
-        if "\0" in str(path):
-            raise ClodError(f"{path}: cannot be read ({error}); check the path") from error
         raise ClodError(f"{path}: damaged or truncated ({error}); copy or export it again") from error
-    comments = all_comments(head.ply)
+    comments, sha256 = all_comments(head.ply), hashlib.sha256(data.data).hexdigest()
     if is_packed(head.ply):
         arrays = unpack(path, elements, degree)
         metadata = ply_metadata(path, comments, dial=False)
@@ -179,41 +172,27 @@ def read_ply(path: Path) -> Source:
     return Source(arrays, metadata, sha256, _not_kept(head.ply), comments, not metadata.described, rows, head)
 
 
-def _refuse_long_lines(file: io.BufferedReader, head: Head) -> None:
-    """A row of any length would be copied several times."""
-    file.seek(head.size)
-    text = io.TextIOWrapper(file, "ascii")
-    while line := text.readline(_LONGEST):
-        if len(line) == _LONGEST:
-            raise ValueError(f"a row of more than {_LONGEST:,} characters")
-    text.detach()
+def _elements(data: np.ndarray, head: Head) -> dict[str, np.ndarray]:
+    """The rows of elements by name, native byte order; ``data`` is all bytes of the file.
 
-
-def _elements(file: io.BufferedReader, head: Head, header: bytes) -> tuple[dict[str, np.ndarray], str]:
-    """The rows of elements by name, native byte order, and the SHA-256 of the bytes of the file that they are from.
-
-    The bytes are read once, and not mapped: another program may write the file meanwhile. Elements from the first one
-    with lists on are left out where the Gaussians stand before it.
+    Elements from the first one with lists on are left out where the Gaussians stand before it.
     """
     plain = list(itertools.takewhile(lambda both: not head.ply.text and not _has_lists(both[0]), _counted(head)))
-    file.seek(head.size)
     if "vertex" not in {element.name for element, _ in plain}:
-        content = header + file.read()
+        content = data.tobytes()
+        lines = io.TextIOWrapper(io.BytesIO(content), "ascii")
+        lines.buffer.seek(head.size)
+        if head.ply.text and any(len(line) == _LONGEST for line in iter(lambda: lines.readline(_LONGEST), "")):
+            raise ValueError(f"a row of more than {_LONGEST:,} characters")  # which would be copied several times
         with warnings.catch_warnings(), np.errstate(over="ignore"):
             warnings.simplefilter("ignore")  # of text that is beyond float32's range
-            parsed = PlyData.read(io.BytesIO(content))
-        return {each.name: _native(each.data) for each in parsed}, hashlib.sha256(content).hexdigest()
-    digest, found = hashlib.sha256(header), dict[str, np.ndarray]()
+            return {each.name: _native(each.data) for each in PlyData.read(io.BytesIO(content))}
+    at, found = head.size, {}
     for element, count in plain:
-        rows = np.empty(count, element.dtype(head.ply.byte_order))
-        raw = rows.view(np.uint8).data if rows.nbytes else memoryview(bytearray())
-        if (size := file.readinto(raw)) < len(raw):
-            raise ValueError(f"{size // rows.itemsize} of {count} rows are there")
-        digest.update(raw)
-        found[element.name] = _native(rows)
-    while block := file.read(1 << 20):
-        digest.update(block)
-    return found, digest.hexdigest()
+        kind = np.dtype(element.dtype(head.ply.byte_order))
+        found[element.name] = _native(data[at : at + count * kind.itemsize].view(kind))
+        at += count * kind.itemsize
+    return found
 
 
 def _counted(head: Head) -> Iterator[tuple[PlyElement, int]]:

@@ -1,31 +1,41 @@
-"""Safetensors files: tensors and metadata."""
+"""Safetensors files: tensors and metadata; and whole models as such files, every value unchanged.
+
+A model has the tensors of ``Gaussians`` by their names there, float32. The metadata key ``clod_adapter`` holds the JSON
+document (``metadata``), whose format distinguishes a model from an adapter.
+"""
 
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from io import BufferedReader
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from safetensors import safe_open
 
 from clod_adapter.errors import ClodError
-from clod_adapter.io.file_formats import file_sha256, handle_name, read_start, refuse_known
+from clod_adapter.io.file_formats import KEY, read_start, read_whole, refuse_known
+from clod_adapter.io.settings import History, Source, metadata_text, parse_metadata, write_metadata
+from clod_adapter.io.values import SIGMA, arrays_of, dial_columns, float32, sha256_of
 
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from clod_adapter.gaussians import Gaussians
 
 TYPES = {
     "int64": "I64", "float64": "F64", "float32": "F32", "int32": "I32", "float16": "F16", "int16": "I16",
     "uint8": "U8", "bool": "BOOL",
 }  # fmt: skip
 """Names of types in a file, by numpy's name, in the order in which a file has its tensors."""
+_NAMES = ("means", "quats", "log_scales", "opacity_logits", "sh0", "shN")
 
 
-def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> None:
+def write_tensors(path: Path, tensors: Mapping[str, Tensor | np.ndarray], metadata: Mapping[str, str]) -> None:
     """Writes the file that safetensors' own ``save`` makes, byte for byte, without copies of tensors on the CPU.
 
     ``save`` holds the whole file in memory, and ``save_file`` makes files that only their owner can read.
@@ -33,7 +43,10 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[s
     Raises:
         OSError: it cannot be written.
     """
-    arrays = {name: tensor.detach().cpu().contiguous().numpy() for name, tensor in tensors.items()}
+    arrays = {
+        name: tensor if isinstance(tensor, np.ndarray) else tensor.detach().cpu().contiguous().numpy()
+        for name, tensor in tensors.items()
+    }
     header, at, types = dict[str, Any](__metadata__=dict(metadata)), 0, list(TYPES)
     names = sorted(arrays, key=lambda name: (types.index(arrays[name].dtype.name), name))
     for name in names:
@@ -50,18 +63,23 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[s
 
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     """The tensors and the metadata of a file; raises OSError, or for a damaged file any error of safetensors."""
-    with open(path, "rb") as file:
-        return _content(file)
+    with open(path, "rb") as file, safe_open(_name_of(file), framework="pt") as tensors:
+        # Copies, since the file may change under a memory map.
+        return {name: tensors.get_tensor(name).clone() for name in tensors.keys()}, tensors.metadata() or {}  # noqa: SIM118
 
 
 def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str], str]:
-    """The tensors, the metadata and the SHA-256, hex, of an input file, which is opened once.
+    """The tensors, the metadata and the SHA-256, hex, of an input file, which is read once.
 
     Raises:
         ClodError: it cannot be read, is something else, or damaged.
     """
-    with _one_line_errors(path), open(path, "rb") as file:
-        return *_content(file), file_sha256(file)
+    from safetensors.torch import load  # here: a header is read without torch
+
+    with _one_line_errors(path):
+        data = read_whole(path)
+        tensors, head = load(data), data[8 : 8 + int.from_bytes(data[:8], "little")]
+        return tensors, json.loads(head).get("__metadata__", {}), sha256_of(data)
 
 
 def read_tensor_header(path: Path) -> tuple[list[str], dict[str, str]]:
@@ -70,14 +88,13 @@ def read_tensor_header(path: Path) -> tuple[list[str], dict[str, str]]:
     Raises:
         ClodError: as ``load_tensors``.
     """
-    with _one_line_errors(path), open(path, "rb") as file, safe_open(handle_name(file), framework="np") as tensors:
+    with _one_line_errors(path), open(path, "rb") as file, safe_open(_name_of(file), framework="np") as tensors:
         return list(tensors.keys()), tensors.metadata() or {}
 
 
-def _content(file: BufferedReader) -> tuple[dict[str, Tensor], dict[str, str]]:
-    with safe_open(handle_name(file), framework="pt") as tensors:
-        # Copies, since the file may change under a memory map.
-        return {name: tensors.get_tensor(name).clone() for name in tensors.keys()}, tensors.metadata() or {}  # noqa: SIM118
+def _name_of(file: BufferedReader) -> str:
+    """A name of an open file for safetensors, which takes names in UTF-8 only."""
+    return str(file.name) if sys.platform == "win32" else f"/dev/fd/{file.fileno()}"
 
 
 @contextmanager
@@ -85,9 +102,34 @@ def _one_line_errors(path: Path) -> Iterator[None]:
     refuse_known(path, read_start(path))
     try:
         yield
+    except (ClodError, MemoryError):  # of a file that is whole
+        raise
     except OSError as error:
         raise ClodError(f"{path}: cannot be read ({error.strerror or error}); check the path") from error
-    except MemoryError:  # of a file that is whole
-        raise
     except Exception as error:  # SafetensorError, and others for a crafted header
         raise ClodError(f"{path}: is not a safetensors file, or damaged ({error}); copy or export it again") from error
+
+
+def write_safetensors(path: Path, gaussians: Gaussians, history: History) -> tuple[str, ...]:
+    """Writes every value unchanged; arguments and errors as ``file_formats.write``."""
+    write_tensors(path, arrays_of(path, gaussians), {KEY: metadata_text(write_metadata(gaussians, history))})
+    return ()
+
+
+def load_safetensors(path: Path) -> Source:
+    """Reads a model.
+
+    Raises:
+        ClodError: the file cannot be read, is damaged, an adapter or another safetensors file.
+    """
+    tensors, stored, sha256 = load_tensors(path)
+    if KEY not in stored:
+        raise ClodError(f"{path}: is a safetensors file but not a model of clod-adapter; give a file that it wrote")
+    metadata = parse_metadata(path, stored[KEY], dial=SIGMA in tensors)
+    if missing := [name for name in _NAMES if name not in tensors]:
+        raise ClodError(f"{path}: has no tensor {missing[0]!r}; export it again")
+    wanted = (*_NAMES, *dial_columns(tensors))
+    if odd := [name for name in wanted if not tensors[name].is_floating_point()]:
+        raise ClodError(f"{path}: tensor {odd[0]!r} is not of floating-point numbers; export it again")
+    arrays = {name: tensors[name].float().numpy() for name in wanted}
+    return Source(float32(arrays), metadata, sha256, comments=metadata.about)

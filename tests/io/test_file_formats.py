@@ -23,7 +23,7 @@ from clod_adapter.inspection.report import inspect
 from clod_adapter.io.adapter_file import load_adapter, save_adapter
 from clod_adapter.io.checkpoint import load, save
 from clod_adapter.io.file_formats import FORMATS, WRITABLE, check_readable, file_has_dial, write
-from clod_adapter.io.formats.safetensors import load_safetensors
+from clod_adapter.io.tensor_file import load_safetensors
 from formats import (
     ABOUT,
     ATTENUATION,
@@ -39,7 +39,6 @@ from formats import (
 from packing import write_packed
 from scenes import gaussians
 
-pytest.importorskip("pygltflib", reason="pygltflib is not installed")
 DIAL = tuple(suffix for suffix in WRITABLE if FORMATS[suffix].carries_sigma)
 KINDS = (*WRITABLE, ".ascii.ply", ".big.ply", ".compressed.ply", ".adapter.safetensors")
 

@@ -34,7 +34,6 @@ from clod_adapter.io.settings import EARLIER, implied_filter, is_antialiased, pa
 from formats import ATTENUATION, CALIBRATION, change_setting, model, splat_transform, without_comments, write_rows
 from scenes import camera, gaussians
 
-pytest.importorskip("pygltflib", reason="pygltflib is not installed")
 KINDS = ["a.ply", "a.glb", "a.spz", "a.safetensors", "a.pt", "adapter.safetensors"]
 OTHER_FORMAT = ("clod-model", "clod-other"), ("clod-adapter", "clod-strange")
 OTHER = ScreenFilter(variance=0.123456789, compensate=True)

@@ -11,17 +11,19 @@ from __future__ import annotations
 
 import json
 import struct
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
+import torch
 
 from clod_adapter._support.version import package_version
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.file_formats import KEY, read_whole
-from clod_adapter.io.settings import History, Metadata, Source, parse_metadata, write_metadata
+from clod_adapter.io.settings import DAMAGE, History, Source, parse_metadata, write_metadata
 from clod_adapter.io.values import (
     GROWTH,
     SIGMA,
@@ -46,7 +48,6 @@ DEGREE = 3  # the highest that the extension has
 HALF_TURN = [0.0, 0.0, 1.0, 0.0]  # about z, as xyzw: x right, y down becomes x left, y up; as splat-transform has it
 _LIMIT = 1 << 32  # bytes of a file, whose header says how many in 32 bits
 _FLOAT, _BYTE = 5126, 5121
-_TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 
 
 def coefficient(degree: int, index: int) -> str:
@@ -69,42 +70,65 @@ _FAINTEST = -100.0  # logit of an opacity that float32 has rounded to 0
 
 def write_glb(path: Path, gaussians: Gaussians, history: History) -> tuple[str, ...]:
     """Writes with float32's rounding of the activations; arguments and errors as ``file_formats.write``."""
-    try:
-        import pygltflib
-    except ModuleNotFoundError as error:
-        raise ClodError(f"{path}: .glb needs pygltflib: pip install pygltflib") from error
     columns, dropped = _columns(path, gaussians)
     size = sum(array.nbytes for array in columns.values())
     if size >= _LIMIT - (1 << 20):
         raise ClodError(f"{path}: {size:,} bytes are more than a .glb can hold; keep fewer Gaussians or write a .ply")
-    gltf = pygltflib.GLTF2(
-        asset=pygltflib.Asset(generator=f"clod-adapter {package_version()}"),
-        extensionsUsed=[EXTENSION], scene=0, scenes=[pygltflib.Scene(nodes=[0])],
-        nodes=[pygltflib.Node(mesh=0, rotation=HALF_TURN, translation=_in_gltf(history.origin))],
-        buffers=[pygltflib.Buffer(byteLength=size)],
-    )  # fmt: skip
-    gltf.asset.extras = {KEY: write_metadata(gaussians, history)}
-    offset = 0
-    for index, (name, array) in enumerate(columns.items()):
-        view = {"buffer": 0, "byteOffset": offset, "byteLength": array.nbytes, "target": pygltflib.ARRAY_BUFFER}
-        gltf.bufferViews.append(pygltflib.BufferView(**view))
-        gltf.accessors.append(_accessor(pygltflib, index, name, array))
+    accessors, views, offset = dict[str, dict[str, Any]](), list[dict[str, Any]](), 0
+    for name, array in columns.items():
+        kind = "SCALAR" if array.ndim == 1 else f"VEC{array.shape[1]}"
+        accessors[name] = {"bufferView": len(views), "count": len(array), "type": kind}
+        views.append({"buffer": 0, "byteOffset": offset, "byteLength": array.nbytes, "target": 34962})
         offset += array.nbytes
-    attributes = pygltflib.Attributes(**{name: index for index, name in enumerate(columns)})
-    how = {
-        "kernel": "ellipse", "colorSpace": COLOR_SPACE, "projection": "perspective",
-        "sortingMethod": "cameraDistance",
-    }  # fmt: skip
-    primitive = pygltflib.Primitive(attributes=attributes, mode=pygltflib.POINTS, extensions={EXTENSION: how})
-    gltf.meshes = [pygltflib.Mesh(primitives=[primitive])]
-    gltf.set_binary_blob(b"".join(array.tobytes() for array in columns.values()))
-    gltf.save_binary(str(path))
+    node: dict[str, Any] = {"rotation": HALF_TURN}
+    if any(history.origin):
+        x, y, z = history.origin
+        node["translation"] = [0.0 - x, 0.0 - y, z]
+    extras = {KEY: write_metadata(gaussians, history)}
+    gltf = document(gaussians.means, accessors, node, size, extras=extras) | {"bufferViews": views}
+    write_chunks(path, gltf | {"extensionsUsed": [EXTENSION]}, [array.data for array in columns.values()])
     return dropped
 
 
-def _in_gltf(origin: Origin) -> list[float] | None:
-    x, y, z = origin
-    return [0.0 - x, 0.0 - y, z] if any(origin) else None
+def document(
+    means: torch.Tensor, accessors: dict[str, dict[str, Any]], node: dict[str, Any], size: int,
+    extensions: dict[str, Any] | None = None, **asset: Any,
+) -> dict[str, Any]:  # fmt: skip
+    """The JSON of one POINTS primitive.
+
+    Args:
+        accessors: by attribute, without component type and bounds; POSITION, of ``means``, is one of them.
+        node: besides its mesh.
+        size: bytes of the buffer.
+        extensions: of KHR_gaussian_splatting.
+    """
+    for name, accessor in accessors.items():
+        accessor |= {"componentType": _FLOAT} if name != "COLOR_0" else {"componentType": _BYTE, "normalized": True}
+    accessors["POSITION"] |= {"min": means.amin(0).tolist(), "max": means.amax(0).tolist()}
+    how = {
+        "kernel": "ellipse", "colorSpace": COLOR_SPACE, "projection": "perspective",
+        "sortingMethod": "cameraDistance", **({"extensions": extensions} if extensions else {}),
+    }  # fmt: skip
+    attributes = {name: index for index, name in enumerate(accessors)}
+    return {
+        "asset": {"version": "2.0", "generator": f"clod-adapter {package_version()}", **asset},
+        "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0, **node}],
+        "meshes": [{"primitives": [{"attributes": attributes, "mode": 0, "extensions": {EXTENSION: how}}]}],
+        "accessors": list(accessors.values()), "buffers": [{"byteLength": size}],
+    }  # fmt: skip
+
+
+def write_chunks(path: Path, gltf: dict[str, Any], buffer: Sequence[memoryview | bytes]) -> None:
+    """Writes the JSON, and the parts of its buffer one after another."""
+    text = json.dumps(gltf, separators=(",", ":"), allow_nan=False).encode()
+    text += b" " * (-len(text) % 4)
+    size = sum(memoryview(part).nbytes for part in buffer)
+    padded = size + -size % 4
+    with open(path, "wb") as file:
+        file.write(struct.pack("<4sIIII", b"glTF", 2, 28 + len(text) + padded, len(text), _JSON) + text)
+        file.write(struct.pack("<II", padded, _BIN))
+        file.writelines(buffer)
+        file.write(bytes(padded - size))
 
 
 def _columns(path: Path, gaussians: Gaussians) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
@@ -130,17 +154,6 @@ def _columns(path: Path, gaussians: Gaussians) -> tuple[dict[str, np.ndarray], t
     return columns, (f"spherical harmonics above degree {DEGREE} are dropped",) if lost else ()
 
 
-def _accessor(pygltflib: Any, index: int, name: str, array: np.ndarray) -> Any:
-    accessor = pygltflib.Accessor(
-        bufferView=index, count=len(array), type=_TYPES[array.shape[1] if array.ndim == 2 else 1],
-        componentType=_BYTE if array.dtype == np.uint8 else _FLOAT,
-    )  # fmt: skip
-    accessor.normalized = array.dtype == np.uint8
-    if name == "POSITION":
-        accessor.min, accessor.max = array.min(0).tolist(), array.max(0).tolist()
-    return accessor
-
-
 def load_glb(path: Path) -> Source:
     """Reads the first primitive with the extension, into the axes of checkpoints: y down.
 
@@ -151,63 +164,34 @@ def load_glb(path: Path) -> Source:
         ClodError: the file cannot be read, is damaged, has no such primitive or a compressed one, or its node stands
             below another, is scaled, or turned in another way.
     """
-    data = read_whole(path)
-    parts = _parts(path, memoryview(data))
-    arrays, metadata, moved = {name: _values(view) for name, view in parts.views.items()}, parts.metadata, parts.moved
-    rest = [arrays.pop(name) for name in parts.bands]
-    arrays["shN"] = np.stack(rest, 1) if rest else np.zeros((len(arrays["means"]), 0, 3), np.float32)
-    stored = _stored(arrays) if parts.turned else half_turn(_stored(arrays), "z")
-    if moved != metadata.origin:  # another program moved the node
-        stored["means"], moved = _moved(stored["means"], moved)
-        metadata = replace(metadata, origin=moved)
-    return Source(float32(stored), metadata, sha256_of(data), tuple(parts.ignored), metadata.about)
-
-
-def open_glb(path: Path) -> bool:
-    """Whether a file has sigma_d, without reading its values; errors as ``load_glb``."""
-    return SIGMA in _parts(path, np.memmap(path, np.uint8, "r").data).views
-
-
-class _Parts(NamedTuple):
-    """A file without its values.
-
-    Attributes:
-        views: attributes by our names, spherical harmonics above degree 0 by their own, in ``bands``; each after
-            whether it is normalized.
-        turned, moved: of ``_placed``.
-        ignored: notes on the parts of the file that are not used.
-    """
-
-    views: dict[str, tuple[bool, np.ndarray]]
-    bands: list[str]
-    metadata: Metadata
-    turned: bool
-    moved: Origin
-    ignored: list[str]
-
-
-def _parts(path: Path, data: memoryview) -> _Parts:
+    data, ignored, arrays = read_whole(path), list[str](), dict[str, np.ndarray]()
     try:
-        gltf, binary = _chunks(data)
+        gltf, binary = _chunks(memoryview(data))
         (mesh, primitive), *others = _find(gltf)
         attributes, ignored = primitive["attributes"], _ignored(primitive, len(others))
-        views = {key: _view(gltf, binary, attributes[name], width) for key, (name, width) in _ATTRIBUTES.items()}
+        arrays = {key: _values(gltf, binary, attributes[name], width) for key, (name, width) in _ATTRIBUTES.items()}
         degree = 0
         while degree < DEGREE and coefficient(degree + 1, 0) in attributes:
             degree += 1
         bands = [coefficient(band, index) for band in range(1, degree + 1) for index in range(2 * band + 1)]
-        views |= {name: _view(gltf, binary, attributes[name], 3) for name in bands}
+        rest = [_values(gltf, binary, attributes[name], 3) for name in bands]
         for name in dial_columns([name for name, attribute in DIAL.items() if attribute in attributes]):
-            views[name] = _view(gltf, binary, attributes[DIAL[name]], 1)
-        if len({len(values) for _, values in views.values()}) > 1:
+            arrays[name] = _values(gltf, binary, attributes[DIAL[name]], 1)
+        if len({len(values) for values in (*arrays.values(), *rest)}) > 1:
             raise ClodError(f"its attributes are of different lengths; {_REMEDY}")
         text = gltf["asset"].get("extras", {}).get(KEY)
         turned, moved = _placed(gltf, mesh)
     except ClodError as error:
         raise ClodError(f"{path}: {error}") from error
-    except (AttributeError, IndexError, KeyError, OverflowError, RecursionError, TypeError, ValueError) as error:
+    except DAMAGE + (IndexError,) as error:
         raise ClodError(f"{path}: is damaged or no such .glb ({error!r:.80}); {_REMEDY}") from error
-    return _Parts(views, bands, parse_metadata(path, text, dial=SIGMA in views), turned, moved, ignored)
+    metadata = parse_metadata(path, text, dial=SIGMA in arrays)
+    arrays["shN"] = np.stack(rest, 1) if rest else np.zeros((len(arrays["means"]), 0, 3), np.float32)
+    stored = _stored(arrays) if turned else half_turn(_stored(arrays), "z")
+    if moved != metadata.origin:  # another program moved the node
+        stored["means"], moved = _moved(stored["means"], moved)
+        metadata = replace(metadata, origin=moved)
+    return Source(float32(stored), metadata, sha256_of(data), tuple(ignored), metadata.about)
 
 
 def _chunks(data: memoryview) -> tuple[dict[str, Any], memoryview]:
@@ -254,32 +238,25 @@ def _ignored(primitive: dict[str, Any], others: int) -> list[str]:
     return notes + ([f"{others} more primitives with Gaussians in it are left out"] if others else [])
 
 
-def _view(gltf: dict[str, Any], binary: memoryview, number: int, width: int) -> tuple[bool, np.ndarray]:
-    """Whether an accessor is normalized, and its values ``[N, width]`` as stored, ``[N]`` where the width is 1."""
+def _values(gltf: dict[str, Any], binary: memoryview, number: int, width: int) -> np.ndarray:
+    """``[N, width]`` float32, the values of an accessor; ``[N]`` where the width is 1."""
     accessor = gltf["accessors"][_whole(number)]
     if "sparse" in accessor or _WIDTHS[accessor["type"]] != width:
         raise ClodError(f"an attribute is sparse or of type {accessor['type']!r:.20}; {_REMEDY}")
-    kind = _KINDS[accessor["componentType"]]
+    kind = np.dtype(_KINDS[accessor["componentType"]])
     view = gltf["bufferViews"][_whole(accessor["bufferView"])]
     if _whole(view["buffer"]) or "uri" in gltf["buffers"][0] or view.get("extensions"):
         raise ClodError(f"its data are compressed, or in another file; {_REMEDY}")
-    item = np.dtype(kind).itemsize
-    stride = _whole(view.get("byteStride", item * width))
+    stride = _whole(view.get("byteStride", kind.itemsize * width))
     start, count = _whole(accessor.get("byteOffset", 0)), _whole(accessor["count"])
     data = binary[_whole(view.get("byteOffset", 0)) :][: _whole(view["byteLength"])]
-    if not count or stride < item * width or start + (count - 1) * stride + item * width > len(data):
+    size = kind.itemsize * width
+    if not count or stride < size or start + (count - 1) * stride + size > len(data):
         raise ClodError("an attribute has no values, or more than the file; copy or export it again")
-    values = np.ndarray((count, width), kind, data, start, (stride, item))
-    return bool(accessor.get("normalized")), values[:, 0] if width == 1 else values
-
-
-def _values(view: tuple[bool, np.ndarray]) -> np.ndarray:
-    """float32."""
-    normalized, stored = view
-    values = stored.astype(np.float32)
-    if normalized and stored.dtype.kind != "f":
-        values = np.maximum(values / np.float32(np.iinfo(stored.dtype).max), -1)
-    return values
+    values = np.ndarray((count, width), kind, data, start, (stride, kind.itemsize)).astype(np.float32)
+    if accessor.get("normalized") and kind.kind != "f":
+        values = np.maximum(values / np.float32(np.iinfo(kind).max), -1)
+    return values[:, 0] if width == 1 else values
 
 
 def _whole(value: Any) -> int:

@@ -19,9 +19,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from clod_adapter.errors import ClodError
-from clod_adapter.io.file_formats import KEY, file_sha256, handle_name, read_start, refuse
+from clod_adapter.io.file_formats import KEY, read_start, read_whole, refuse
 from clod_adapter.io.settings import History, Source, damaged, metadata_text, parse_metadata, write_metadata
-from clod_adapter.io.values import SIGMA, arrays_of, dial_columns, float32
+from clod_adapter.io.values import SIGMA, arrays_of, dial_columns, float32, sha256_of
 
 if TYPE_CHECKING:
     from clod_adapter.gaussians import Gaussians
@@ -75,21 +75,19 @@ def _check_pickle(path: Path, data: bytes) -> None:
         raise ClodError(f"{path}: is damaged ({error}); copy or export it again") from error
 
 
-def read_splats(path: Path, digest: bool = True) -> tuple[dict[str, np.ndarray], str | None, str]:
-    """The parameters by gsplat's names, float32; the JSON document, if any; the SHA-256, hex.
+def load_pt(path: Path) -> Source:
+    """Reads a checkpoint of gsplat's trainer, or one written here.
 
     Scales are logarithms, opacities logits, as in Inria's layout. Read with ``weights_only``: a pickle that calls
     anything but what makes tensors is refused, and nothing is called.
 
-    Args:
-        digest: whether to compute the SHA-256, which reads the whole file; else it is "".
-
     Raises:
-        ClodError: not such a checkpoint, damaged, or more than tensors.
+        ClodError: not such a checkpoint, damaged, or more than tensors; or its settings are damaged.
     """
     from clod_adapter.integrations.splats import NAMES  # here and not above, as check_pt does without torch
 
-    checkpoint, sha256 = _load(path, digest)
+    data = read_whole(path)
+    checkpoint = _unpickled(path, data)
     splats = checkpoint.get("splats") if isinstance(checkpoint, dict) else None
     if not isinstance(splats, dict):
         found = (
@@ -99,23 +97,22 @@ def read_splats(path: Path, digest: bool = True) -> tuple[dict[str, np.ndarray],
             f"{path}: has no dictionary 'splats', as gsplat's trainer writes (but {found}); export it as a PLY"
         )
     wanted = (*NAMES, *dial_columns(splats))
-    values = {name: _values(path, name, splats) for name in wanted}
+    arrays = {NAMES.get(name, name): _values(path, name, splats, len(data)) for name in wanted}
     text = checkpoint.get(KEY)
     if text is not None and not isinstance(text, str):
         raise damaged(path, TypeError(f"a {type(text).__name__}, not text"))
-    return values, text, sha256
+    metadata = parse_metadata(path, text, dial=SIGMA in arrays)
+    notes = () if metadata.described else (FRAME,)
+    return Source(float32(arrays), metadata, sha256_of(data), notes, metadata.about, not metadata.described)
 
 
-def _load(path: Path, digest: bool) -> tuple[Any, str]:
+def _unpickled(path: Path, data: bytes) -> Any:
     import torch
 
-    check_pt(path)
     try:
-        # Mapped, so that what else a checkpoint holds (optimisers, networks) is not read.
-        with warnings.catch_warnings(), open(path, "rb") as file:
+        with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            found = torch.load(handle_name(file), map_location="cpu", weights_only=True, mmap=True)
-            return found, file_sha256(file) if digest else ""
+            return torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
     except pickle.UnpicklingError as error:
         raise ClodError(
             f"{path}: holds more than tensors, or is damaged, and was not unpickled; export the checkpoint as a PLY"
@@ -127,8 +124,8 @@ def _load(path: Path, digest: bool) -> tuple[Any, str]:
         raise ClodError(f"{path}: is damaged ({reason}); copy or export it again") from error
 
 
-def _values(path: Path, name: str, splats: dict[str, Any]) -> np.ndarray:
-    """A parameter as float32, unless it is none or claims more values than the file has bytes."""
+def _values(path: Path, name: str, splats: dict[str, Any], size: int) -> np.ndarray:
+    """A parameter as float32, unless it is none or claims more values than the file's ``size`` in bytes."""
     import torch
 
     value = splats.get(name)
@@ -136,7 +133,7 @@ def _values(path: Path, name: str, splats: dict[str, Any]) -> np.ndarray:
         more = "; with appearance optimisation its trainer stores no colours" if "features" in splats else ""
         raise ClodError(f"{path}: splats has no {name!r}{more}; export it as a PLY with spherical harmonics")
     usable = isinstance(value, torch.Tensor) and value.device.type == "cpu" and value.layout == torch.strided
-    if not usable or not value.is_floating_point() or value.nbytes > path.stat().st_size:
+    if not usable or not value.is_floating_point() or value.nbytes > size:
         raise ClodError(f"{path}: splats[{name!r}] is no plain tensor of numbers; export the checkpoint as a PLY")
     return value.detach().float().numpy()
 
@@ -156,25 +153,3 @@ def write_pt(path: Path, gaussians: Gaussians, history: History) -> tuple[str, .
     torch.save({"step": 0, "splats": splats, KEY: text}, buffer)
     path.write_bytes(buffer.getbuffer())
     return ()
-
-
-def open_pt(path: Path) -> bool:
-    """Whether a checkpoint has sigma_d, without reading its values; errors as ``load_pt``."""
-    values, text, _ = read_splats(path, digest=False)
-    parse_metadata(path, text, dial=SIGMA in values)
-    return SIGMA in values
-
-
-def load_pt(path: Path) -> Source:
-    """Reads a checkpoint of gsplat's trainer, or one written here.
-
-    Raises:
-        ClodError: as ``read_splats``, or its settings are damaged.
-    """
-    from clod_adapter.integrations.splats import NAMES
-
-    values, text, sha256 = read_splats(path)
-    metadata = parse_metadata(path, text, dial=SIGMA in values)
-    arrays = {NAMES.get(name, name): value for name, value in values.items()}
-    notes = () if metadata.described else (FRAME,)
-    return Source(float32(arrays), metadata, sha256, notes, metadata.about, not metadata.described)

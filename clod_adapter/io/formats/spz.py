@@ -34,7 +34,7 @@ from clod_adapter.config import CLASSIC, SH_COUNTS
 from clod_adapter.equation.units import estimated_distance, in_world_units, known_distance, with_distance
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.io.file_formats import NEW_SPZ, read_start, read_whole
+from clod_adapter.io.file_formats import NEW_SPZ, read_whole
 from clod_adapter.io.formats.splat_transform import load_converted
 from clod_adapter.io.settings import (
     DAMAGE,
@@ -231,11 +231,6 @@ def _with_dial_in_world_units(arrays: Arrays, metadata: Metadata) -> Metadata:
     assert gaussians.sigma_d is not None
     arrays[SIGMA] = gaussians.sigma_d.numpy()
     return replace(metadata, attenuation=gaussians.attenuation)
-
-
-def open_spz(path: Path) -> bool:
-    """Whether a file has sigma_d; reads all of it, which is never much. Errors as ``load_spz``."""
-    return not read_start(path).startswith(NEW_SPZ) and SIGMA in load_spz(path).arrays
 
 
 def _unpacked(path: Path, data: bytes) -> bytes:

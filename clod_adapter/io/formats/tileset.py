@@ -16,7 +16,6 @@ of the model is at (-x, -z, -y) of the tile set, in which the bounding boxes are
 from __future__ import annotations
 
 import json
-import struct
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -26,14 +25,13 @@ import torch
 
 from clod_adapter._support.version import package_version
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.io.formats.glb import COLOR_SPACE, DEGREE, EXTENSION, coefficient
+from clod_adapter.io.formats.glb import DEGREE, EXTENSION, coefficient, document, write_chunks
 from clod_adapter.io.formats.spz import write_spz
 from clod_adapter.io.settings import History
 from clod_adapter.origin import Origin
 
 TILESET = "tileset.json"
 SPZ = "KHR_gaussian_splatting_compression_spz_2"
-_FLOAT, _BYTE = 5126, 5121
 ALLOWED = 16.0  # pixels of screen-space error that viewers allow by default
 LARGEST = 1 << 18  # Gaussians of the finest level in a cell, unless they share one centre
 STRAY = 0.02  # share of the centres that may be outside of a tile's box, along each axis
@@ -92,39 +90,17 @@ def write_tile(path: Path, gaussians: Gaussians, origin: Origin) -> tuple[str, .
     notes = write_spz(packed, gaussians, History())
     data = packed.read_bytes()
     packed.unlink()
-    lowest, highest = gaussians.means.amin(0).tolist(), gaussians.means.amax(0).tolist()
     shapes = {
         "POSITION": "VEC3", "COLOR_0": "VEC4", f"{EXTENSION}:SCALE": "VEC3", f"{EXTENSION}:ROTATION": "VEC4",
     }  # fmt: skip
     for band in range(1, min(gaussians.sh_degree, DEGREE) + 1):
         shapes |= {coefficient(band, index): "VEC3" for index in range(2 * band + 1)}
-    accessors: list[dict[str, Any]] = [
-        {"componentType": _FLOAT, "count": len(gaussians), "type": shape} for shape in shapes.values()
-    ]
-    accessors[0] |= {"min": lowest, "max": highest}
-    accessors[1] |= {"componentType": _BYTE, "normalized": True}
+    accessors: dict[str, Any] = {name: {"count": len(gaussians), "type": shape} for name, shape in shapes.items()}
     x, y, z = origin
-    how = {
-        "kernel": "ellipse", "colorSpace": COLOR_SPACE, "projection": "perspective",
-        "sortingMethod": "cameraDistance", "extensions": {SPZ: {"bufferView": 0}},
-    }  # fmt: skip
-    attributes = {name: index for index, name in enumerate(shapes)}
-    gltf = {
-        "asset": {"version": "2.0", "generator": f"clod-adapter {package_version()}"},
-        "extensionsUsed": [EXTENSION, SPZ],
-        "extensionsRequired": [EXTENSION, SPZ],
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "matrix": [-1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1, 0, -x, -y, z, 1]}],  # a half turn about z
-        "meshes": [{"primitives": [{"attributes": attributes, "mode": 0, "extensions": {EXTENSION: how}}]}],
-        "accessors": accessors,
-        "bufferViews": [{"buffer": 0, "byteLength": len(data)}],
-        "buffers": [{"byteLength": len(data)}],
-    }
-    text = json.dumps(gltf, separators=(",", ":")).encode()
-    chunks = [(b"JSON", text + b" " * (-len(text) % 4)), (b"BIN\0", data + b"\0" * (-len(data) % 4))]
-    body = b"".join(struct.pack("<I4s", len(chunk), kind) + chunk for kind, chunk in chunks)
-    path.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(body)) + body)
+    node = {"matrix": [-1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1, 0, -x, -y, z, 1]}  # a half turn about z
+    gltf = document(gaussians.means, accessors, node, len(data), {SPZ: {"bufferView": 0}})
+    gltf |= {"extensionsUsed": [EXTENSION, SPZ], "extensionsRequired": [EXTENSION, SPZ]}
+    write_chunks(path, gltf | {"bufferViews": [{"buffer": 0, "byteLength": len(data)}]}, [data])
     return notes
 
 
