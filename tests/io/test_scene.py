@@ -38,7 +38,6 @@ from photographs import (
     damage,
     model_of,
     pixels,
-    pose,
     psnr_of,
     seen,
     write_images,
@@ -152,34 +151,6 @@ def test_written_model_is_read_by_pycolmap(tmp_path: Path) -> None:
         load_scene(tmp_path / "none")
 
 
-def test_poses_of_a_rig_are_composed(tmp_path: Path) -> None:
-    reconstruction = pycolmap.Reconstruction()
-    for i in (1, 2):
-        size = {"width": 40, "height": 30}
-        reconstruction.add_camera(pycolmap.Camera(model="PINHOLE", params=[33, 33, 20, 15], camera_id=i, **size))
-    rig = pycolmap.Rig(rig_id=1)
-    sensors = [pycolmap.sensor_t(type=pycolmap.SensorType.CAMERA, id=i) for i in (1, 2)]
-    rig.add_ref_sensor(sensors[0])
-    rig.add_sensor(sensors[1], pycolmap.Rigid3d(pose(1)[:3].double().numpy()))
-    reconstruction.add_rig(rig)
-    frame = pycolmap.Frame(rig_id=1, frame_id=1)
-    for i in (0, 1):
-        frame.add_data_id(pycolmap.data_t(sensor_id=sensors[i], id=i + 1))
-    frame.rig_from_world = pycolmap.Rigid3d(pose(2)[:3].double().numpy())
-    reconstruction.add_frame(frame)
-    for i in (1, 2):
-        image = pycolmap.Image(name=f"{i}.png", camera_id=i, image_id=i)
-        image.frame_id = 1
-        reconstruction.add_image(image)
-        Image.fromarray(pixels(i)).save(tmp_path / f"{i}.png")
-    reconstruction.register_frame(1)
-    (tmp_path / "sparse").mkdir()
-    reconstruction.write_binary(str(tmp_path / "sparse"))
-    loaded = load_scene(tmp_path)
-    torch.testing.assert_close(loaded.test[0].camera.viewmat, pose(2), atol=1e-5, rtol=0)
-    torch.testing.assert_close(loaded.train[0].camera.viewmat, pose(1) @ pose(2), atol=1e-5, rtol=0)
-
-
 @pytest.mark.parametrize("file", ["cameras", "images", "points3D", "rigs", "frames"])
 def test_records_beyond_the_file_are_refused(tmp_path: Path, file: str) -> None:
     """Handed to COLMAP as it is, a cut points3D.bin makes it allocate until memory runs out."""
@@ -255,20 +226,6 @@ def test_unusual_names_and_linked_folders_are_read(tmp_path: Path) -> None:
     (tmp_path / "scene" / "images").symlink_to(tmp_path / "elsewhere", target_is_directory=True)
     scene = load_scene(tmp_path / "scene")
     assert [view.camera.name for view in (*scene.test, *scene.train)] == list(names)
-
-
-@pytest.mark.parametrize(
-    ("name", "train", "test", "size"), [("ci_banana", 12, 2, (332, 221)), ("plush_half", 84, 13, (494, 370))]
-)
-def test_real_scenes_load(
-    shared_data: Callable[[str], Path], name: str, train: int, test: int, size: tuple[int, int]
-) -> None:
-    loaded = load_scene(shared_data(name))
-    assert (len(loaded.train), len(loaded.test), loaded.notes) == (train, test, ())
-    first = loaded.test[0].camera
-    assert (first.width, first.height) == size and first.name < loaded.train[0].camera.name
-    assert first.K[0, 2] == size[0] / 2
-    torch.testing.assert_close(first.viewmat[:3, :3] @ first.viewmat[:3, :3].T, torch.eye(3), atol=1e-5, rtol=0)
 
 
 def test_without_pycolmap_the_error_says_where_it_is() -> None:
@@ -462,11 +419,11 @@ def there(folder: Path) -> set[str]:
 
 @pytest.mark.parametrize("text", [False, True])
 def test_files_of_a_colmap_scene(tmp_path: Path, text: bool) -> None:
-    """All that no output may overwrite, and nothing else."""
+    """All that no output may overwrite, and nothing else in the scene's folder."""
     write_scene(tmp_path, 3)
     if text:
         as_text(tmp_path)
-    (tmp_path / "images" / "another.png").write_bytes(b"not of the scene")
+    (tmp_path / "rendered.png").write_bytes(b"not of the scene")
     (tmp_path / "images_2" / "sub").mkdir(parents=True)
     (tmp_path / "images_2" / "sub" / "001.png").write_bytes(b"a smaller one")
     (tmp_path / "dataparser_transforms.json").write_text("{}")

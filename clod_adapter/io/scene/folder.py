@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import os
-import struct
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from os.path import isfile
@@ -22,6 +21,7 @@ TRANSFORMS = ("transforms_train.json", "transforms.json")
 DATAPARSER = "dataparser_transforms.json"  # nerfstudio's: the frame it trained in
 DESCRIPTIONS = (*TRANSFORMS, "transforms_test.json", "transforms_val.json", DATAPARSER)
 PATHS = ("file_path", "mask_path", "depth_file_path")  # of a frame
+PHOTOGRAPHS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp")
 ENDINGS = ("", ".png", ".jpg", ".jpeg")  # that the path of a frame may omit
 MAX_BYTES = 256 * 2**20  # a hundred thousand frames have a tenth of that
 SMALLER = ("images_2", "images_4", "images_8")  # copies at a part of the size, as Mip-NeRF 360 and Inria's code have
@@ -35,9 +35,6 @@ def find_cameras(folder: Path) -> Path:
 
     A model is looked for in ``sparse/0``, ``sparse`` and ``folder`` itself; then ``transforms_train.json`` and
     ``transforms.json`` there; then a model in the first two beside ``folder``, which may be the images' own.
-
-    Raises:
-        ClodError: none of them is there.
     """
     beside = folder.resolve().parent / "sparse"
     for model in (folder / "sparse" / "0", folder / "sparse", folder):
@@ -82,9 +79,6 @@ def find_photographs(
     Args:
         raw: whether they may be in ``input``. They may not where the cameras are pinholes, which Inria's code makes
             together with other photographs.
-
-    Raises:
-        ClodError: a name is there twice or leads out of the folder, or more than half of the photographs are missing.
     """
     parts = [tuple(map(file_name, name_parts(name, cameras))) for name in names]
     if twice := [name for name, count in Counter(names).items() if count > 1]:
@@ -131,45 +125,21 @@ def name_parts(name: str, cameras: Path) -> tuple[str, ...]:
 
 
 def scene_files(folder: Path) -> Iterator[Path]:
-    """The files of the model or the transforms, photographs, masks and depths; some may not exist.
+    """What no output may overwrite: the model or the transforms, photographs, masks and depths; some may not exist.
 
-    A damaged file gives no names; its reader refuses it.
-
-    Raises:
-        ClodError: the folder has no cameras.
+    A damaged transforms file gives no names; its reader refuses it.
     """
     cameras = find_cameras(folder)
-    homes = dict.fromkeys((folder, cameras if cameras.is_dir() else cameras.parent))
-    for home in homes:
-        yield from (home / name for name in DESCRIPTIONS)
+    home = cameras if cameras.is_dir() else cameras.parent
+    yield from (each / name for each in dict.fromkeys((folder, home)) for name in DESCRIPTIONS)
     if cameras.is_dir():
         yield from (path for path in cameras.iterdir() if path.suffix in (".bin", ".txt"))
-        names = [*_names_in_binary(cameras / "images.bin"), *_names_in_text(cameras / "images.txt")]
+        named = [each for each in photograph_folders(folder, cameras) if each.name in ("images", *SMALLER, RAW)]
+        for each in [path for path in named if path.is_dir() and any(path.iterdir())] or [folder]:
+            yield from (path for path in each.rglob("*") if path.suffix.lower() in PHOTOGRAPHS)
     else:
         names = [name for each in DESCRIPTIONS for name in _names_in_json(cameras.with_name(each))]
-    for root in photograph_folders(folder, cameras):
-        yield from (root.joinpath(*Path(name).parts) for name in names)
-
-
-def _names_in_binary(path: Path) -> Iterator[str]:
-    try:
-        data, at = path.read_bytes(), 8
-        for _ in range(struct.unpack_from("<Q", data)[0]):
-            end = data.index(b"\0", at + 64)  # after id, rotation, translation and camera
-            yield os.fsdecode(data[at + 64 : end].replace(b"\\", b"/"))
-            at = end + 9 + 24 * struct.unpack_from("<Q", data, end + 1)[0]
-    except (OSError, ValueError, struct.error):
-        return
-
-
-def _names_in_text(path: Path) -> Iterator[str]:
-    try:
-        lines = path.read_bytes().splitlines()
-    except OSError:
-        return
-    for line in lines:  # of two lines an image the second has points, and at most names what is not there
-        if not line.startswith(b"#") and len(words := line.split(None, 9)) == 10:
-            yield os.fsdecode(words[9].strip().replace(b"\\", b"/"))
+        yield from (home / name for name in names)
 
 
 def _names_in_json(path: Path) -> Iterator[str]:
@@ -193,11 +163,7 @@ def _on_disk(name: str) -> str:
 
 
 def read_json(path: Path) -> Any:
-    """What a JSON file holds.
-
-    Raises:
-        ClodError: it cannot be read, is damaged, or larger than MAX_BYTES.
-    """
+    """What a JSON file holds."""
     try:
         if path.stat().st_size > MAX_BYTES:
             raise ClodError(f"{path}: is larger than {MAX_BYTES >> 20} MB, so it is no list of cameras; check the path")
