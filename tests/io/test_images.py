@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import struct
-import threading
 import zlib
 from pathlib import Path
 
@@ -11,7 +10,7 @@ from PIL import Image
 
 from clod_adapter.errors import ClodError
 from clod_adapter.io.scene import images
-from clod_adapter.io.scene.images import BAND, Room, image_size, read_image
+from clod_adapter.io.scene.images import BAND, image_size, read_image
 from photographs import pixels
 
 GREY = pixels(0)[..., 0]
@@ -193,29 +192,3 @@ def test_wrong_shape_is_refused(tmp_path: Path) -> None:
     for height in (30, 40):  # a turned one, too, as there is no EXIF
         with pytest.raises(ClodError, match=f"a.png: is 40x30, its camera 30x{height}, another shape"):
             read(tmp_path / "a.png", 30, height)
-
-
-def test_pixels_in_work_are_limited() -> None:
-    """Two that fit are worked on together, a third waits, and one that is too large for all comes in alone."""
-    room, order = Room(100), list[str]()
-    ready = threading.Barrier(3)
-
-    def work(name: str, pixels: int) -> None:
-        with room.of(pixels):
-            order.append(name)
-            if name in "ab":
-                ready.wait(10)
-
-    pair = [threading.Thread(target=work, args=(name, 50)) for name in "ab"]
-    for thread in pair:
-        thread.start()
-    large = threading.Thread(target=work, args=("large", 1000))
-    while len(order) < 2:
-        pass
-    large.start()
-    large.join(0.1)
-    assert sorted(order) == ["a", "b"] and large.is_alive()
-    ready.wait(10)
-    for thread in (*pair, large):
-        thread.join(10)
-    assert order[2:] == ["large"] and room.taken == 0

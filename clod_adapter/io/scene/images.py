@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -94,11 +93,7 @@ def read_image(path: Path, width: int, height: int, max_width: int) -> tuple[Ima
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Width and height, from the file's header.
-
-    Raises:
-        ClodError: the header cannot be read.
-    """
+    """Width and height, from the file's header."""
     with _opened(path) as source:
         return source.size
 
@@ -165,25 +160,3 @@ def _converted(source: Image.Image, deep: bool, notes: list[Note]) -> Image.Imag
         return rgba.convert("RGB")
     notes.append(TRANSPARENT)
     return Image.alpha_composite(Image.new("RGBA", rgba.size, (0, 0, 0, 255)), rgba).convert("RGB")
-
-
-class Room:
-    """A limit of the pixels in work in all threads together; a larger photograph is processed alone."""
-
-    def __init__(self, pixels: int) -> None:
-        self.pixels, self.taken = pixels, 0
-        self._changed = threading.Condition()
-
-    @contextmanager
-    def of(self, pixels: int) -> Iterator[None]:
-        """Waits until there is room for ``pixels``."""
-        with self._changed:
-            while self.taken and self.taken + pixels > self.pixels:
-                self._changed.wait()
-            self.taken += pixels
-        try:
-            yield
-        finally:
-            with self._changed:
-                self.taken -= pixels
-                self._changed.notify_all()

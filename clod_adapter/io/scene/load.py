@@ -22,14 +22,14 @@ from clod_adapter.cameras import Camera, Scene, StoredView, View, in_its_unit, s
 from clod_adapter.errors import ClodError
 from clod_adapter.io.scene.colmap import HUGE, TEST_EVERY, PosedImage, held_out, read_colmap
 from clod_adapter.io.scene.folder import find_cameras, find_photographs
-from clod_adapter.io.scene.images import LARGE, Note, Photograph, Room, image_size, read_image
+from clod_adapter.io.scene.images import LARGE, Note, Photograph, image_size, read_image
 from clod_adapter.io.scene.transforms import read_transforms, trained_frame
 from clod_adapter.io.scene.undistort import cache_folder, kept, undistort
 from clod_adapter.origin import NOWHERE
 from clod_adapter.progress import Listener, Phase, tell
 
 MOST_AT_ONCE = 8  # photographs of full size in memory
-ROOM = Room(1 << 28)  # their pixels in memory, of 4 bytes each while they are decoded
+_ONE_LARGE = threading.Lock()  # of more than LARGE pixels one at a time
 
 
 class ImageCache:
@@ -250,10 +250,11 @@ def _load_view(
 def _photograph(image: PosedImage, path: Path, max_width: int) -> Photograph:
     """The photograph as a pinhole camera has it, no wider than ``max_width``."""
     width, height = image_size(path)
-    with ROOM.of(width * height):
+    if width * height <= LARGE:
+        return _worked_on(image, path, max_width)
+    with _ONE_LARGE:
         photograph = _worked_on(image, path, max_width)
-        if width * height > LARGE:
-            release()  # or this thread keeps memory that the next one allocates again
+        release()  # or this thread keeps memory that the next one allocates again
         return photograph
 
 
