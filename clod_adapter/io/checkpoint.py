@@ -25,7 +25,7 @@ from clod_adapter.hook import Hook
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.file_formats import PLY, check_suffix, check_written, format_of, read_source, write
 from clod_adapter.io.ply import column_map, write_rows
-from clod_adapter.io.ply_settings import PREFIX, dial_constants, filter_constants, write_comments
+from clod_adapter.io.ply_settings import PREFIX, constants_of, write_comments
 from clod_adapter.io.settings import (
     WARNING,
     History,
@@ -251,9 +251,9 @@ def _write(
     version: str | None = None,
 ) -> None:  # fmt: skip
     about = write_comments(gaussians.attenuation, history.about, version, history.calibration, gaussians.screen_filter)
-    constants = dial_constants(gaussians.attenuation, gaussians.growth_d is not None)
-    if gaussians.sigma_d is not None:  # a plain file has the columns of Inria's layout and no others
-        constants |= filter_constants(gaussians.screen_filter)
+    constants, dial = dict[str, float](), gaussians.attenuation
+    if dial is not None:  # a plain file has the columns of Inria's layout and no others
+        constants = constants_of(dial, gaussians.growth_d is not None, gaussians.screen_filter)
     with open(target, "wb") as file:
         write_rows(file, path, gaussians, vertex, history.origin, about, constants)
 

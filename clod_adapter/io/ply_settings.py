@@ -31,11 +31,7 @@ DIGITS = 6  # decimal digits that every float32 holds
 
 
 def ply_metadata(path: Path, comments: tuple[str, ...], rows: np.ndarray | None = None, *, dial: bool) -> Metadata:
-    """The settings of the comments, completed by those of the columns of ``rows``.
-
-    Raises:
-        ClodError: a setting is damaged, or a column has more than one value.
-    """
+    """The settings of the comments, completed by those of the columns of ``rows``."""
     columns = constant_settings(read_constants(path, rows)) if dial and rows is not None else {}
     ours = any(comment.startswith(PREFIX) for comment in comments)
     values = columns | stored_settings(comments)
@@ -111,31 +107,28 @@ def _calibration(lines: dict[str, list[list[str]]]) -> dict[str, Any]:
     return found
 
 
-def dial_constants(config: AttenuationConfig | None, growth: bool) -> dict[str, float]:
+def constants_of(config: AttenuationConfig, growth: bool, screen_filter: ScreenFilter) -> dict[str, float]:
     """The columns, by name, of settings that are not the defaults; sigma_d in world units.
 
     Args:
         growth: whether there is a growth_d.
     """
-    if config is None:
-        return {}
     usual = AttenuationConfig()
-    found = {TAU: config.tau} if config.tau != usual.tau else {}
-    found |= {EPS: config.eps} if config.eps != usual.eps else {}
-    found |= {HARD: 1.0} if config.cut == "hard" else {}
-    found |= {QUANTILE: config.quantile} if config.normalizer == "quantile" else {}
-    found |= {REFERENCE: config.reference_distance} if growth and config.reference_distance else {}
-    return found | ({MAX: 1.0} if config.normalizer == "max" else {})
-
-
-def filter_constants(screen_filter: ScreenFilter) -> dict[str, float]:
-    """The columns, by name, of a screen-space filter that is not the classic one."""
-    found = {VARIANCE: screen_filter.variance} if screen_filter.variance != CLASSIC.variance else {}
-    return found | ({COMPENSATE: 1.0} if screen_filter.compensate else {})
+    columns = (
+        (TAU, config.tau, config.tau != usual.tau),
+        (EPS, config.eps, config.eps != usual.eps),
+        (HARD, 1.0, config.cut == "hard"),
+        (QUANTILE, config.quantile, config.normalizer == "quantile"),
+        (REFERENCE, config.reference_distance, growth and config.reference_distance > 0),
+        (MAX, 1.0, config.normalizer == "max"),
+        (VARIANCE, screen_filter.variance, screen_filter.variance != CLASSIC.variance),
+        (COMPENSATE, 1.0, screen_filter.compensate),
+    )
+    return {name: value for name, value, there in columns if there}
 
 
 def constant_settings(constants: Mapping[str, float]) -> dict[str, Any]:
-    """The settings in the columns, as ``settings.read_metadata`` takes them; the inverse of the two functions above."""
+    """The settings in the columns, as ``settings.read_metadata`` takes them; the inverse of ``constants_of``."""
     found: dict[str, Any] = {}
     for column, name in ((TAU, "tau"), (EPS, "eps"), (QUANTILE, "quantile"), (REFERENCE, "reference_distance")):
         if column in constants:
@@ -156,9 +149,6 @@ def read_constants(path: Path, vertex: np.ndarray) -> dict[str, float]:
 
     Args:
         vertex: ``[N]`` rows of the file.
-
-    Raises:
-        ClodError: a column has more than one value, as in a merge of files with different settings.
     """
     found = {}
     for name in vertex.dtype.names or ():
