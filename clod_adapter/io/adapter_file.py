@@ -57,11 +57,7 @@ def save_adapter(path: str | Path, adapter: Adapter) -> None:
 
 
 def check_config(config: dict[str, Any]) -> None:
-    """Refuses a config that ``save_adapter`` would refuse; called before training.
-
-    Raises:
-        ClodError: it is not plain JSON.
-    """
+    """Refuses a config that ``save_adapter`` would refuse; called before training."""
     try:
         json.dumps(config, sort_keys=True, allow_nan=False)
     except (TypeError, ValueError) as error:

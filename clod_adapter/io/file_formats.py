@@ -1,4 +1,7 @@
-"""The file formats of Gaussians, by the suffix of the file: one table, and first checks of a file, without torch."""
+"""The file formats of Gaussians, by the suffix of the file: one table, and first checks of a file, without torch.
+
+What reads, checks or refuses a file, here and in the readers, raises a ClodError of one line that names the file.
+"""
 
 from __future__ import annotations
 
@@ -74,20 +77,12 @@ def format_of(path: Path) -> Format:
 
 
 def check_readable(path: Path) -> None:
-    """Refuses, without torch, a file whose first bytes are not of its format.
-
-    Raises:
-        ClodError: they are not, or the file cannot be read.
-    """
+    """Refuses, without torch, a file whose first bytes are not of its format."""
     _call(format_of(path).check, path)
 
 
 def file_has_dial(path: Path) -> bool:
-    """Whether the file has a sigma_d; of a PLY the header, settings and length alone are read.
-
-    Raises:
-        ClodError: as ``read_source``.
-    """
+    """Whether the file has a sigma_d; of a PLY the header, settings and length alone are read."""
     check_readable(path)
     form = format_of(path)
     if form is PLY:
@@ -97,11 +92,7 @@ def file_has_dial(path: Path) -> bool:
 
 
 def check_suffix(path: Path) -> None:
-    """Refuses a name whose suffix is none of WRITABLE.
-
-    Raises:
-        ClodError: it is not.
-    """
+    """Refuses a name whose suffix is none of WRITABLE."""
     if path.name.lower().endswith((".sog", ".compressed.ply")):
         raise ClodError(f"{path}: is written by clod-adapt export alone: save a .ply, then clod-adapt export it")
     if path.suffix.lower() not in WRITABLE:
@@ -110,11 +101,7 @@ def check_suffix(path: Path) -> None:
 
 
 def check_written(path: Path) -> None:
-    """Refuses a file just written, under its temporary name, that the reader of its format would refuse.
-
-    Raises:
-        ClodError: it would.
-    """
+    """Refuses a file just written, under its temporary name, that the reader of its format would refuse."""
     try:
         file_has_dial(path)
     except ClodError as error:
@@ -123,11 +110,7 @@ def check_written(path: Path) -> None:
 
 
 def read_source(path: Path) -> Source:
-    """The content of a file in any format.
-
-    Raises:
-        ClodError: the file is damaged, of another kind, or a package or program that its format needs is missing.
-    """
+    """The content of a file in any format; every reader refuses, in one line, what is damaged or of another kind."""
     check_readable(path)
     found: Source = _call(format_of(path).read, path)
     return found
@@ -175,11 +158,7 @@ _START: dict[str, tuple[bytes, ...]] = {".glb": (b"glTF",), ".spz": (b"\x1f\x8b"
 
 
 def check_start(path: Path) -> None:
-    """Refuses a file whose first bytes are not of its suffix's format.
-
-    Raises:
-        ClodError: they are not, the file is an adapter, or it cannot be read.
-    """
+    """Refuses a file whose first bytes are not of its suffix's format."""
     suffix, start = path.suffix.lower(), read_start(path)
     refuse_known(path, start)
     if suffix in _START and not start.startswith(_START[suffix]):
@@ -251,21 +230,13 @@ def refuse_irregular(path: Path, remedy: str = "give the name of a file") -> Non
 
 
 def refuse_long_numbers(path: Path, text: bytes) -> None:
-    """Refuses a number of a thousand digits, of which parsers make copies.
-
-    Raises:
-        ClodError: ``text``, of ``path``, has one.
-    """
+    """Refuses a number of a thousand digits, of which parsers make copies."""
     if re.search(rb"\d{1000}", text):
         raise ClodError(f"{path}: is damaged (a number of more than 1,000 digits); copy or export it again")
 
 
 def read_start(path: Path, size: int = 64) -> bytes:
-    """The first bytes of a file, at most ``size``; all with -1.
-
-    Raises:
-        ClodError: the file cannot be read, or is not a regular file.
-    """
+    """The first bytes of a file, at most ``size``; all with -1."""
     try:
         refuse_irregular(path)
         with open(path, "rb") as file:
@@ -280,11 +251,7 @@ def read_whole(path: Path) -> bytes:
 
 
 def refuse_known(path: Path, start: bytes) -> None:
-    """Refuses a file whose first bytes are never those of a splat.
-
-    Raises:
-        ClodError: it is empty, or is one of ``CONTENTS``.
-    """
+    """Refuses a file whose first bytes are never those of a splat."""
     if not start:
         raise ClodError(f"{path}: is empty; copy or export it again")
     text = start.lstrip()[:64].lower()
@@ -300,9 +267,6 @@ def refuse(
 
     Args:
         otherwise: the message for a file in none of the tables.
-
-    Raises:
-        ClodError: always.
     """
     refuse_known(path, start)
     suffix = path.suffix.lower()

@@ -80,11 +80,7 @@ class Head:
 
 
 def read_head(path: Path) -> Head:
-    """The header alone, so that a large mesh is refused without parsing its faces.
-
-    Raises:
-        ClodError: the file cannot be read, or as ``parse_head``.
-    """
+    """The header alone, so that a large mesh is refused without parsing its faces."""
     return parse_head(path, file_formats.read_start(path, HEADER_LIMIT))
 
 
@@ -93,9 +89,6 @@ def parse_head(path: Path, start: bytes) -> Head:
 
     Args:
         start: the first ``HEADER_LIMIT`` bytes of ``path``, or all where there are fewer.
-
-    Raises:
-        ClodError: the file is not a PLY, or its header is damaged or longer than ``HEADER_LIMIT``.
     """
     if not re.match(rb"ply\r?\n|ply\r", start):
         file_formats.refuse(path, start)
@@ -125,11 +118,7 @@ def all_comments(ply: PlyData) -> tuple[str, ...]:
 
 
 def check_ply(path: Path) -> None:
-    """Refuses, by its header, a file that is not a checkpoint.
-
-    Raises:
-        ClodError: it is not.
-    """
+    """Refuses, by its header, a file that is not a checkpoint."""
     _degree(path, read_head(path).ply)
 
 
@@ -147,9 +136,6 @@ def read_ply(path: Path) -> Source:
     """Reads a PLY; its rows are in memory, so that a later change of the file does not reach them.
 
     The length of the file is compared with the rows that the header states before anything is allocated for them.
-
-    Raises:
-        ClodError: not a checkpoint, damaged, or its settings are.
     """
     try:
         data = np.fromfile(path, np.uint8)  # once, and not mapped: another program may write the file meanwhile

@@ -34,11 +34,7 @@ def is_packed(header: PlyData) -> bool:
 
 
 def check_packed(path: Path, header: PlyData) -> int:
-    """The SH degree of such a file, by its header.
-
-    Raises:
-        ClodError: an element or a property is missing or of another type.
-    """
+    """The SH degree of such a file, by its header."""
     _require(path, header, "chunk", _RANGES, "f4")
     _require(path, header, "vertex", _BITS, "u4")
     rest = len(header["sh"].properties) if "sh" in header else 0
@@ -54,9 +50,6 @@ def unpack(path: Path, elements: Mapping[str, np.ndarray], degree: int) -> Array
 
     Args:
         degree: of the spherical harmonics, from ``check_packed``.
-
-    Raises:
-        ClodError: there are fewer chunks or harmonics than Gaussians.
     """
     from clod_adapter.gaussians import SH_C0  # here: check_packed needs no torch
 

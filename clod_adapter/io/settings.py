@@ -112,9 +112,6 @@ def read_metadata(path: Path, values: Mapping[str, Any], *, dial: bool, describe
         dial: whether the file has sigma_d. If so, missing settings take their defaults.
         described: whether the values are a description by this package, where missing settings take the defaults of
             earlier versions (``EARLIER``).
-
-    Raises:
-        ClodError: a setting is damaged or out of range.
     """
     notes: list[str] = []
     try:
@@ -230,9 +227,6 @@ def parse_metadata(path: Path, text: str | bytes | dict[str, Any] | None, *, dia
 
     Args:
         dial: whether the file has sigma_d.
-
-    Raises:
-        ClodError: the document is damaged, of another kind, or of a newer format.
     """
     if text is None:
         return read_metadata(path, {}, dial=dial, described=False)

@@ -39,9 +39,6 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor | np.ndarray], metada
     """Writes the file that safetensors' own ``save`` makes, byte for byte, without copies of tensors on the CPU.
 
     ``save`` holds the whole file in memory, and ``save_file`` makes files that only their owner can read.
-
-    Raises:
-        OSError: it cannot be written.
     """
     arrays = {
         name: tensor if isinstance(tensor, np.ndarray) else tensor.detach().cpu().contiguous().numpy()
@@ -69,11 +66,7 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
 
 
 def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str], str]:
-    """The tensors, the metadata and the SHA-256, hex, of an input file, which is read once.
-
-    Raises:
-        ClodError: it cannot be read, is something else, or damaged.
-    """
+    """The tensors, the metadata and the SHA-256, hex, of an input file, which is read once."""
     from safetensors.torch import load  # here: a header is read without torch
 
     with _one_line_errors(path):
@@ -83,11 +76,7 @@ def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str], str]:
 
 
 def read_tensor_header(path: Path) -> tuple[list[str], dict[str, str]]:
-    """The names of the tensors and the metadata, without torch.
-
-    Raises:
-        ClodError: as ``load_tensors``.
-    """
+    """The names of the tensors and the metadata, without torch."""
     with _one_line_errors(path), open(path, "rb") as file, safe_open(_name_of(file), framework="np") as tensors:
         return list(tensors.keys()), tensors.metadata() or {}
 
@@ -117,11 +106,7 @@ def write_safetensors(path: Path, gaussians: Gaussians, history: History) -> tup
 
 
 def load_safetensors(path: Path) -> Source:
-    """Reads a model.
-
-    Raises:
-        ClodError: the file cannot be read, is damaged, an adapter or another safetensors file.
-    """
+    """Reads a model."""
     tensors, stored, sha256 = load_tensors(path)
     if KEY not in stored:
         raise ClodError(f"{path}: is a safetensors file but not a model of clod-adapter; give a file that it wrote")

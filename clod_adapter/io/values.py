@@ -47,11 +47,7 @@ def dial_columns(names: Container[str]) -> dict[str, tuple[str, ...]]:
 
 
 def degree_of(path: Path, rest: int) -> int:
-    """The SH degree that this many ``f_rest_*`` make.
-
-    Raises:
-        ClodError: they make none.
-    """
+    """The SH degree that this many ``f_rest_*`` make; refuses a number that makes none."""
     degrees = {3 * (count - 1): degree for degree, count in SH_COUNTS.items()}
     if rest not in degrees:
         wanted = ", ".join(map(str, degrees))
@@ -94,10 +90,6 @@ def prepared(
         activated: which values are activated, where their range allows both; None to refuse then.
         at: what the means are relative to.
         origin: what they are to be relative to; None for ``at``, or what ``origin_of`` finds where that is 0.
-
-    Raises:
-        ClodError: there are no rows, or arrays do not fit together; or the range allows both, and ``activated`` is None
-            or no valid choice.
     """
     _check_shapes(path, arrays)
     if not len(arrays["means"]):
@@ -305,11 +297,7 @@ def logit(opacities: np.ndarray) -> np.ndarray:
 
 
 def scales_of(path: Path, log_scales: np.ndarray) -> np.ndarray:
-    """Standard deviations of their logarithms, float32.
-
-    Raises:
-        ClodError: one is beyond float32's range.
-    """
+    """Standard deviations of their logarithms, float32."""
     with np.errstate(over="ignore"):
         scales = np.exp(log_scales)
     if not np.isfinite(scales).all():

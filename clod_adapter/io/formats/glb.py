@@ -159,10 +159,6 @@ def load_glb(path: Path) -> Source:
 
     Under a node without a rotation the values are in glTF's own axes, and are turned here; files of this package have
     the half turn in the node and store the checkpoint's values.
-
-    Raises:
-        ClodError: the file cannot be read, is damaged, has no such primitive or a compressed one, or its node stands
-            below another, is scaled, or turned in another way.
     """
     data, ignored, arrays = read_whole(path), list[str](), dict[str, np.ndarray]()
     try:

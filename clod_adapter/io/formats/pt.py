@@ -32,11 +32,7 @@ _PLAIN = r"collections OrderedDict|torch\._utils _rebuild_(tensor_v2|parameter)|
 
 
 def check_pt(path: Path) -> None:
-    """Refuses, without torch, what is not a file of ``torch.save``, or would unpack to more than it is.
-
-    Raises:
-        ClodError: it is not, or cannot be read.
-    """
+    """Refuses, without torch, what is not a file of ``torch.save``, or would unpack to more than it is."""
     start = read_start(path)
     if start.startswith(b"\x80"):
         raise ClodError(f"{path}: is a pickle in PyTorch's format before 1.6; load it and torch.save it again")
@@ -80,9 +76,6 @@ def load_pt(path: Path) -> Source:
 
     Scales are logarithms, opacities logits, as in Inria's layout. Read with ``weights_only``: a pickle that calls
     anything but what makes tensors is refused, and nothing is called.
-
-    Raises:
-        ClodError: not such a checkpoint, damaged, or more than tensors; or its settings are damaged.
     """
     from clod_adapter.integrations.splats import NAMES  # here and not above, as check_pt does without torch
 

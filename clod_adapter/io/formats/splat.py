@@ -51,11 +51,7 @@ def write_splat(path: Path, gaussians: Gaussians, history: History) -> tuple[str
 
 
 def load_splat(path: Path) -> Source:
-    """Reads rows as ``write_splat`` writes them; SH degree 0.
-
-    Raises:
-        ClodError: the file cannot be read, or is not a whole number of rows.
-    """
+    """Reads rows as ``write_splat`` writes them; SH degree 0."""
     data = read_whole(path)
     if not data or len(data) % _ROW.itemsize:
         raise ClodError(f"{path}: {len(data)} bytes are not a .splat file, whose rows have 32; copy or export it again")

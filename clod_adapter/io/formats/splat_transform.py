@@ -142,9 +142,6 @@ def check_converted(path: Path, version: str = "") -> SplatTransform:
 
     Args:
         version: of the format, where only one version is read in this way.
-
-    Raises:
-        ClodError: the file is something else, or splat-transform is missing or too old.
     """
     refuse_known(path, read_start(path))
     try:
@@ -157,11 +154,7 @@ def check_converted(path: Path, version: str = "") -> SplatTransform:
 
 
 def load_converted(path: Path, version: str = "") -> Source:
-    """The Gaussians of the PLY that splat-transform converts the file to; ``version`` as in ``check_converted``.
-
-    Raises:
-        ClodError: splat-transform is missing, or cannot read the file.
-    """
+    """The Gaussians of the PLY that splat-transform converts the file to; ``version`` as in ``check_converted``."""
     from clod_adapter.io.ply import read_ply  # here: check_converted needs neither plyfile nor numpy
     from clod_adapter.io.settings import Metadata, Source
 

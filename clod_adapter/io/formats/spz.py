@@ -89,9 +89,6 @@ def write_spz(path: Path, gaussians: Gaussians, history: History) -> tuple[str, 
 
     Positions have as many of their 24 bits for the fraction as they leave, 20 at most. A few Gaussians at an enormous
     distance, as many checkpoints have them, would leave the rest too few: see ``_nearer``.
-
-    Raises:
-        ClodError: more than 10,000,000 Gaussians, or a scene that reaches farther than 4,000,000, besides.
     """
     gaussians = _within_float16(gaussians)
     arrays, bits, moved = _nearer(arrays_of(path, gaussians))

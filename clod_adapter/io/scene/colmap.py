@@ -69,11 +69,7 @@ def held_out(images: Sequence[PosedImage], test_every: int) -> set[str]:
 
 
 def check_posed(image: PosedImage, source: Path) -> PosedImage:
-    """The image as it is.
-
-    Raises:
-        ClodError: its camera or pose is not finite, too large, or cannot be undistorted to a pinhole.
-    """
+    """The image; refuses a camera or pose that is not finite, too large, or cannot become a pinhole."""
     camera = image.camera
     if not camera.is_perspective_pinhole() and not camera.is_perspective_fisheye():
         raise ClodError(
@@ -91,11 +87,7 @@ def check_posed(image: PosedImage, source: Path) -> PosedImage:
 
 
 def read_colmap(model: Path) -> tuple[list[PosedImage], list[str]]:
-    """The registered images of a model, sorted by name, and notes.
-
-    Raises:
-        ClodError: the model is damaged or empty, or a camera is not usable.
-    """
+    """The registered images of a model, sorted by name, and notes."""
     check_records(model)
     try:
         reconstruction = pycolmap.Reconstruction(str(model))

@@ -38,9 +38,6 @@ def read_transforms(path: Path) -> tuple[list[PosedImage], list[str]]:
     it is there, are held out.
 
     Source: nerfstudio's documentation, "Data conventions"; instant-ngp's ``scripts/colmap2nerf.py``.
-
-    Raises:
-        ClodError: a file is damaged or too large, or a frame has no usable name, camera or pose.
     """
     test = path.with_name(path.name.replace("train", "test"))
     if test == path or not test.is_file():
@@ -172,11 +169,7 @@ class TrainedFrame:
     note: str
 
     def bring(self, images: Sequence[PosedImage], source: Path) -> list[PosedImage]:
-        """The images with their cameras in that frame.
-
-        Raises:
-            ClodError: a pose is not usable there.
-        """
+        """The images with their cameras in that frame."""
         brought = []
         for image in images:
             viewmat = np.eye(4)
@@ -192,9 +185,6 @@ def trained_frame(folder: Path, cameras: Path) -> TrainedFrame | None:
     Args:
         cameras: what ``find_cameras`` found: a model's folder, or a transforms file, whose ``applied_transform`` and
             ``applied_scale`` are taken out again, as its poses have them already.
-
-    Raises:
-        ClodError: the file is damaged, or holds no rotation, translation and scale.
     """
     path = folder / DATAPARSER
     if not path.is_file():

@@ -29,9 +29,6 @@ def undistort(path: Path, pixels: Image.Image, camera: pycolmap.Camera) -> tuple
     Args:
         path: the photograph's, for messages.
         camera: a distorted one, of the size of ``pixels``.
-
-    Raises:
-        ClodError: COLMAP cannot undistort with these parameters.
     """
     try:
         bitmap, pinhole = pycolmap.undistort_image(
@@ -44,11 +41,7 @@ def undistort(path: Path, pixels: Image.Image, camera: pycolmap.Camera) -> tuple
 
 
 def user_caches() -> Path:
-    """``$XDG_CACHE_HOME``, or where the platform has its users' caches; it need not be there.
-
-    Raises:
-        ClodError: there is neither that nor a home folder.
-    """
+    """``$XDG_CACHE_HOME``, or where the platform has its users' caches; it need not be there."""
     if chosen := os.environ.get("XDG_CACHE_HOME"):
         return Path(chosen)
     try:
@@ -61,11 +54,7 @@ def user_caches() -> Path:
 
 
 def cache_folder(scene: Path) -> Path:
-    """The cache folder of a scene's undistorted photographs in ``user_caches()``; created if missing.
-
-    Raises:
-        ClodError: it cannot be made or written to.
-    """
+    """The cache folder of a scene's undistorted photographs in ``user_caches()``; created if missing."""
     scene = scene.resolve()
     name = f"{scene.name}-{hashlib.sha256(str(scene).encode(errors='surrogateescape')).hexdigest()[:8]}"
     folder = user_caches() / "clod-adapter" / "undistorted" / name
