@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shlex
 import sys
 from pathlib import Path
@@ -88,23 +87,6 @@ def test_error_message_is_passed_on() -> None:
     ):  # fmt: skip
         with pytest.raises(ClodError, match=f"^splat-transform 3.7.0 failed: {message}$"):
             stand_in(*lines).run(timeout=60)
-
-
-def test_process_ends_on_timeout_and_interrupt(tmp_path: Path) -> None:
-    mark = tmp_path / "mark"
-    tool = stand_in(f"print(os.getpid(), file=open({str(mark)!r}, 'w'), flush=True)", "time.sleep(100)")
-
-    def interrupt(_: float) -> None:
-        if mark.exists() and mark.read_text():
-            raise KeyboardInterrupt
-
-    for timeout, progress, error, said in (
-        (60, interrupt, KeyboardInterrupt, None), (1, None, ClodError, "took longer than 1 s"),
-    ):  # fmt: skip
-        with pytest.raises(error, match=said):
-            tool.run(timeout=timeout, progress=progress)
-        with pytest.raises(ProcessLookupError):
-            os.kill(int(mark.read_text()), 0)
 
 
 def test_converted_files(tmp_path: Path, tool: Any, monkeypatch: pytest.MonkeyPatch) -> None:
