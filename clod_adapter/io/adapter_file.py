@@ -20,7 +20,7 @@ from clod_adapter.config import CLASSIC
 from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.file_formats import KEY
-from clod_adapter.io.settings import DAMAGE, Metadata, damaged, document, read_metadata, stored_values
+from clod_adapter.io.settings import DAMAGE, Metadata, damaged, document, parse_document, read_metadata, stored_values
 from clod_adapter.io.settings import FORMAT as MODEL
 from clod_adapter.io.tensor_file import load_tensors, read_tensor_header, write_tensors
 
@@ -102,20 +102,13 @@ def _description(path: Path, metadata: dict[str, str]) -> tuple[dict[str, Any], 
     """The JSON document of an adapter, and the settings in it; refuses another file."""
     if KEY not in metadata:
         raise ClodError(f"{path}: is a safetensors file but not an adapter; give a file that this package wrote")
-    try:
-        about = json.loads(metadata[KEY])
-        kind, newer = about["format"], about["format"] == FORMAT and about["format_version"] > FORMAT_VERSION
-        for name, wanted in (("base_sha256", str), ("package_version", str), ("config", dict)):
-            if kind == FORMAT and not newer and not isinstance(about[name], wanted):
-                raise TypeError(f"{name} is {about[name]!r:.40}, not a {wanted.__name__}")
-    except DAMAGE as error:
-        raise damaged(path, error) from error
-    if kind == MODEL:
+    if f'"{MODEL}"' in metadata[KEY]:
         raise ClodError(f"{path}: is a whole model, not an adapter; it needs no base, give it in the model's place")
-    if kind != FORMAT:
-        raise ClodError(f"{path}: is not a clod-adapter file but {kind!r:.40}; give a file that this package wrote")
-    if newer:
-        raise ClodError(f"{path}: its format {about['format_version']} is too new; upgrade clod-adapter")
+    wrong = "is not a clod-adapter file but {}; give a file that this package wrote"
+    about = parse_document(path, metadata[KEY], FORMAT, FORMAT_VERSION, wrong)
+    for name, wanted in (("base_sha256", str), ("package_version", str), ("config", dict)):
+        if not isinstance(about.get(name), wanted):
+            raise damaged(path, TypeError(f"{name} is {about.get(name)!r:.40}, not a {wanted.__name__}"))
     return about, read_metadata(path, about, dial=True)
 
 

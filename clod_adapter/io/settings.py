@@ -230,18 +230,25 @@ def parse_metadata(path: Path, text: str | bytes | dict[str, Any] | None, *, dia
     """
     if text is None:
         return read_metadata(path, {}, dial=dial, described=False)
+    wrong = "is not a model but {}; clod-adapt apply makes one of an adapter"
+    return read_metadata(path, parse_document(path, text, FORMAT, FORMAT_VERSION, wrong), dial=dial)
+
+
+def parse_document(
+    path: Path, text: str | bytes | dict[str, Any], kind: str, version: int, wrong: str
+) -> dict[str, Any]:
+    """A document of this kind, up to this version of it; ``wrong`` is the message for another kind."""
     try:
-        values = text if isinstance(text, dict) else json.loads(text)
-        kind, version = values["format"], values["format_version"]
-        newer = version > FORMAT_VERSION
+        values: dict[str, Any] = text if isinstance(text, dict) else json.loads(text)
+        found, newer = values["format"], values["format"] == kind and values["format_version"] > version
         values["package_version"]  # noqa: B018  always there
     except DAMAGE as error:
         raise damaged(path, error) from error
-    if kind != FORMAT:
-        raise ClodError(f"{path}: is not a model but {kind!r:.40}; clod-adapt apply makes one of an adapter")
+    if found != kind:
+        raise ClodError(f"{path}: {wrong.format(f'{found!r:.40}')}")
     if newer:
-        raise ClodError(f"{path}: its format {version!r:.20} is too new for this version; upgrade clod-adapter")
-    return read_metadata(path, values, dial=dial)
+        raise ClodError(f"{path}: its format {values['format_version']!r:.20} is too new; upgrade clod-adapter")
+    return values
 
 
 # The screen-space filter as other programs state it: Brush and splat-transform write the comment TAG, Postshot

@@ -23,7 +23,7 @@ from clod_adapter.errors import ClodError
 from clod_adapter.io.scene.colmap import HUGE, TEST_EVERY, PosedImage, held_out, read_colmap
 from clod_adapter.io.scene.folder import find_cameras, find_photographs
 from clod_adapter.io.scene.images import LARGE, Note, Photograph, image_size, read_image
-from clod_adapter.io.scene.transforms import read_transforms, trained_frame
+from clod_adapter.io.scene.transforms import in_trained_frame, read_transforms
 from clod_adapter.io.scene.undistort import cache_folder, kept, undistort
 from clod_adapter.origin import NOWHERE
 from clod_adapter.progress import Listener, Phase, tell
@@ -118,12 +118,9 @@ def load_scene(
     if test_every < 2 or max_width < 1:
         raise ClodError(f"test_every is {test_every}, max_width {max_width}; they must be at least 2 and 1")
     folder = Path(folder)
-    cameras = find_cameras(folder)
-    images, notes = (read_transforms if cameras.is_file() else read_colmap)(cameras)
+    cameras, images, notes = _posed(folder)
     if not cameras.is_file() and (folder / "transforms.json").is_file():
         notes.append("the cameras are the COLMAP model's, not those of transforms.json")
-    if frame := trained_frame(folder, cameras):
-        images, notes = frame.bring(images, cameras), [*notes, frame.note]
     names = [image.name for image in images]
     paths, more = find_photographs(folder, cameras, names, raw=not all(image.is_pinhole for image in images))
     notes += more
@@ -157,10 +154,7 @@ def load_cameras(
         ClodError: there are no cameras, or none is usable.
     """
     folder = Path(folder)
-    source = find_cameras(folder)
-    images, notes = (read_transforms if source.is_file() else read_colmap)(source)
-    if frame := trained_frame(folder, source):
-        images, notes = frame.bring(images, source), [*notes, frame.note]
+    source, images, notes = _posed(folder)
     testing = held_out(images, TEST_EVERY) if training else set()
     cameras = []
     for image in images:
@@ -176,6 +170,14 @@ def load_cameras(
             f"{source}: has no size of a photograph, and no photograph is there; put them beside it, or w and h into it"
         )
     return [camera for camera in with_near_planes(cameras) if camera.name not in testing], notes
+
+
+def _posed(folder: Path) -> tuple[Path, list[PosedImage], list[str]]:
+    """The model or transforms file, its images, and notes."""
+    cameras = find_cameras(folder)
+    images, notes = (read_transforms if cameras.is_file() else read_colmap)(cameras)
+    images, more = in_trained_frame(folder, cameras, images)
+    return cameras, images, notes + more
 
 
 def _load(

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections import ChainMap
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import replace
 from os.path import isfile
 from pathlib import Path
 from typing import Any
@@ -140,13 +140,13 @@ def _focal(pixels: int, angle: float) -> float:
     return pixels / (2 * math.tan(angle / 2)) if 0 < angle < math.pi else 0.0
 
 
-@dataclass(frozen=True)
-class TrainedFrame:
-    """The frame that nerfstudio trained in: ``dataparser_transforms.json``, which ns-train writes.
+def in_trained_frame(folder: Path, cameras: Path, images: list[PosedImage]) -> tuple[list[PosedImage], list[str]]:
+    """The images in the frame that nerfstudio trained in, and a note; unchanged without its file in ``folder``.
 
     nerfstudio rotates, moves and scales its cameras, trains in that frame and exports its splats in it. With
-    ``transform`` the file's 3x4 matrix ``[R | t]`` and ``scale`` its number, a point ``x`` of the world that the data
-    came in (COLMAP's, where ``ns-process-data`` or the colmap dataparser turned it first) is in that frame
+    ``transform`` of dataparser_transforms.json the 3x4 matrix ``[R | t]`` and ``scale`` its number, a point ``x`` of
+    the world that the data came in (COLMAP's, where ``ns-process-data`` or the colmap dataparser turned it first) is in
+    that frame
 
         x_trained = scale (R x + t)
 
@@ -156,39 +156,13 @@ class TrainedFrame:
     Source: nerfstudio 1.1, ``base_dataparser.save_dataparser_transform`` and ``nerfstudio_dataparser``, which
     multiplies ``transform`` by the ``applied_transform`` of a transforms.json, and ``scale`` by its ``applied_scale``.
 
-    Attributes:
-        rotation: ``[3, 3]`` float64, proper.
-        offset: ``[3]`` world units before scaling.
-        scale: positive.
-        note: for the scene's notes.
-    """
-
-    rotation: np.ndarray
-    offset: np.ndarray
-    scale: float
-    note: str
-
-    def bring(self, images: Sequence[PosedImage], source: Path) -> list[PosedImage]:
-        """The images with their cameras in that frame."""
-        brought = []
-        for image in images:
-            viewmat = np.eye(4)
-            viewmat[:3, :3] = image.viewmat[:3, :3] @ self.rotation.T
-            viewmat[:3, 3] = self.scale * (image.viewmat[:3, 3] - viewmat[:3, :3] @ self.offset)
-            brought.append(check_posed(replace(image, viewmat=viewmat), source))
-        return brought
-
-
-def trained_frame(folder: Path, cameras: Path) -> TrainedFrame | None:
-    """The frame that ``folder/dataparser_transforms.json`` gives the cameras of a scene; None where there is none.
-
     Args:
         cameras: what ``find_cameras`` found: a model's folder, or a transforms file, whose ``applied_transform`` and
             ``applied_scale`` are taken out again, as its poses have them already.
     """
     path = folder / DATAPARSER
     if not path.is_file():
-        return None
+        return images, []
     values = _object(path)
     pose, scale = read_pose(path, values, "transform"), _number(path, values.get("scale", 1.0), "scale")
     if cameras.is_file():
@@ -198,8 +172,14 @@ def trained_frame(folder: Path, cameras: Path) -> TrainedFrame | None:
         if applied.get("applied_scale") is not None:
             scale /= _number(cameras, applied["applied_scale"], "applied_scale")
     left, _, right = np.linalg.svd(pose[:3, :3])
+    brought = []
+    for image in images:
+        viewmat = np.eye(4)
+        viewmat[:3, :3] = image.viewmat[:3, :3] @ (left @ right).T
+        viewmat[:3, 3] = scale * (image.viewmat[:3, 3] - viewmat[:3, :3] @ pose[:3, 3])
+        brought.append(check_posed(replace(image, viewmat=viewmat), cameras))
     note = f"the cameras are brought into the frame of {DATAPARSER}: the splat must be what nerfstudio exported"
-    return TrainedFrame(left @ right, pose[:3, 3], scale, note)
+    return brought, [note]
 
 
 def _object(path: Path) -> dict[str, Any]:
