@@ -71,22 +71,6 @@ def test_trimmed_adapter_round_trips(tmp_path: Path, count: int, degree: int | N
         refused(tmp_path / "b", about, more, r"Adapter.kept is bool \[\d+\], it must be bool with \d+ set")
 
 
-def test_invalid_tensors_are_refused(tmp_path: Path) -> None:
-    save_adapter(tmp_path / "a", adapter())
-    about, tensors = stored(tmp_path / "a")
-    for change, message in (
-        ({"extra": torch.ones(5)}, "updates has 'extra'"),
-        ({"means": torch.ones(4, 3)}, "5 rows"),
-        ({"means": torch.ones(5, 3, dtype=torch.int32)}, "float16 or float32"),
-        ({"sigma_d": torch.full((5,), torch.nan)}, "not finite"),
-        ({"sigma_d": torch.ones(5, 1)}, "float32"),
-        ({"growth_d": torch.full((5,), torch.inf)}, "growth_d holds a value that is not finite"),
-        ({"growth_d": torch.ones(4)}, r"growth_d is float32 \[4\], it must be float32 \[5\]"),
-    ):
-        refused(tmp_path / "b", about, tensors | change, message)
-    refused(tmp_path / "b", about, {name: t for name, t in tensors.items() if name != "sigma_d"}, "sigma_d")
-
-
 def stored(path: Path) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
     """The document and the tensors of a file."""
     with safe_open(path, framework="pt") as file:
@@ -99,11 +83,22 @@ def refused(path: Path, about: object, tensors: dict[str, torch.Tensor], message
         load_adapter(path)
 
 
-def test_invalid_metadata_is_refused(tmp_path: Path) -> None:
+def test_invalid_files_are_refused(tmp_path: Path) -> None:
     save_adapter(tmp_path / "a", adapter())
     about, tensors = stored(tmp_path / "a")
     assert about["format"] == "clod-adapter" and about["format_version"] == 1 and "package_version" in about
     assert about["base_sha256"] == "ab" * 32 and about["attenuation"]["tau"] == 0.1 / 3
+    for change, message in (
+        ({"extra": torch.ones(5)}, "updates has 'extra'"),
+        ({"means": torch.ones(4, 3)}, "5 rows"),
+        ({"means": torch.ones(5, 3, dtype=torch.int32)}, "float16 or float32"),
+        ({"sigma_d": torch.full((5,), torch.nan)}, "not finite"),
+        ({"sigma_d": torch.ones(5, 1)}, "float32"),
+        ({"growth_d": torch.full((5,), torch.inf)}, "growth_d holds a value that is not finite"),
+        ({"growth_d": torch.ones(4)}, r"growth_d is float32 \[4\], it must be float32 \[5\]"),
+    ):
+        refused(tmp_path / "b", about, tensors | change, message)
+    refused(tmp_path / "b", about, {name: t for name, t in tensors.items() if name != "sigma_d"}, "sigma_d")
     for change, message in (
         ({"format": None}, "not a clod-adapter file"),
         ({"base_sha256": 5}, "base_sha256 is 5"),
