@@ -269,11 +269,10 @@ def refuse(
         otherwise: the message for a file in none of the tables.
     """
     refuse_known(path, start)
-    suffix = path.suffix.lower()
-    if suffix in SUFFIXES:
-        what, remedy = SUFFIXES[suffix]
+    found = SUFFIXES.get(path.suffix.lower()) or next(
+        (kind for magic, *kind in ARCHIVES if start.startswith(magic)), None
+    )
+    if found:
+        what, remedy = found
         raise ClodError(f"{path}: is {what}; {remedy.format(suffix=path.suffix)}")
-    for magic, what, remedy in ARCHIVES:
-        if start.startswith(magic):
-            raise ClodError(f"{path}: is {what}; {remedy}")
     raise ClodError(f"{path}: {otherwise}")

@@ -114,13 +114,6 @@ def test_exif_rotation_is_applied_if_the_camera_has_the_rotated_shape(tmp_path: 
     assert turned.shape == (40, 30, 3) and notes == ["rotated by their EXIF orientation, as the cameras are"]
 
 
-def test_damaged_exif_is_ignored_if_the_shape_fits(tmp_path: Path) -> None:
-    Image.fromarray(pixels(0)).save(tmp_path / "a.png", exif=b"Exif\0\0" + bytes(range(200)))
-    np.testing.assert_array_equal(read(tmp_path / "a.png")[0], pixels(0))
-    with pytest.raises(ClodError, match="a.png: "):
-        read(tmp_path / "a.png", 30, 40)
-
-
 @pytest.mark.parametrize("name", ["a.jpg", "a.png", "a.tif", "a.webp", "a.heic", "absent.png"])
 def test_what_cannot_be_decoded_is_refused(tmp_path: Path, name: str) -> None:
     path, message = tmp_path / name, f"{name}: cannot be decoded"

@@ -129,20 +129,17 @@ def test_written_model_is_read_by_pycolmap(tmp_path: Path) -> None:
     cameras, names = [camera(0), camera(1), camera(2, focal=50.0)], ["a b.png", "c.png", "ü.png"]
     write_model(tmp_path, cameras, names, xyz, rgb)
     found = pycolmap.Reconstruction(str(tmp_path / "sparse" / "0"))
-    assert len(found.cameras) == 2 and {c.model_name for c in found.cameras.values()} == {"PINHOLE"}
-    images = sorted(found.images.values(), key=lambda image: image.name)
-    assert [image.name for image in images] == names
-    for image, wanted in zip(images, cameras, strict=True):
-        np.testing.assert_allclose(image.cam_from_world().matrix(), wanted.viewmat[:3], atol=1e-6)
+    assert [c.model_name for c in found.cameras.values()] == ["PINHOLE", "PINHOLE"]
+    poses = {image.name: image.cam_from_world().matrix() for image in found.images.values()}
+    for name, wanted in zip(names, cameras, strict=True):
+        np.testing.assert_allclose(poses.pop(name), wanted.viewmat[:3], atol=1e-6)
     points = [found.points3D[i] for i in sorted(found.points3D)]
-    np.testing.assert_array_equal([point.xyz for point in points], xyz)
-    np.testing.assert_array_equal([point.color for point in points], rgb)
-    assert sorted(load_points(tmp_path).tolist()) == xyz.tolist()
+    np.testing.assert_array_equal([[*point.xyz, *point.color] for point in points], np.hstack([xyz, rgb]))
+    assert not poses and sorted(load_points(tmp_path).tolist()) == xyz.tolist()
     for folder, names, message in (
-        (tmp_path, ["a.png"], "not empty"),
+        (tmp_path, ["a.png"], "not empty"), (tmp_path / "no", ["a.png"], "does not exist"),
         (tmp_path, ["a.png", "a.png"], "as many different names"),
-        (tmp_path / "no", ["a.png"], "does not exist"),
-    ):
+    ):  # fmt: skip
         with pytest.raises(ClodError, match=message):
             write_model(folder, cameras[: len(names)], names)
     (tmp_path / "none").mkdir()

@@ -50,9 +50,9 @@ _LIMIT = 1 << 32  # bytes of a file, whose header says how many in 32 bits
 _FLOAT, _BYTE = 5126, 5121
 
 
-def coefficient(degree: int, index: int) -> str:
-    """The attribute of a spherical harmonic: ``index`` of ``2 degree + 1``, in the order of ``Gaussians.shN``."""
-    return f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{index}"
+def harmonics(degree: int) -> list[str]:
+    """The attributes of the spherical harmonics up to a degree, 0 first, in the order of ``Gaussians.shN``."""
+    return [f"{EXTENSION}:SH_DEGREE_{band}_COEF_{index}" for band in range(degree + 1) for index in range(2 * band + 1)]
 
 
 _JSON, _BIN = 0x4E4F534A, 0x004E4942
@@ -61,7 +61,7 @@ _KINDS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", _FLOAT: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 _ATTRIBUTES = {
     "means": ("POSITION", 3), "quats": (f"{EXTENSION}:ROTATION", 4), "log_scales": (f"{EXTENSION}:SCALE", 3),
-    "opacity_logits": (f"{EXTENSION}:OPACITY", 1), "sh0": (coefficient(0, 0), 3),
+    "opacity_logits": (f"{EXTENSION}:OPACITY", 1), "sh0": (harmonics(0)[0], 3),
 }  # fmt: skip
 _REMEDY = "export it again, as a .ply"
 IDENTITY = [0.0, 0.0, 0.0, 1.0]  # as xyzw
@@ -143,12 +143,10 @@ def _columns(path: Path, gaussians: Gaussians) -> tuple[dict[str, np.ndarray], t
         f"{EXTENSION}:ROTATION": np.ascontiguousarray(np.roll(normalized(arrays["quats"]), -1, axis=1)),
         f"{EXTENSION}:SCALE": scales,
         f"{EXTENSION}:OPACITY": opacities,
-        coefficient(0, 0): sh0,
+        harmonics(0)[0]: sh0,
     }
     degree = min(gaussians.sh_degree, DEGREE)
-    for band in range(1, degree + 1):
-        for index in range(2 * band + 1):
-            columns[coefficient(band, index)] = np.ascontiguousarray(arrays["shN"][:, band**2 - 1 + index])
+    columns |= {name: np.ascontiguousarray(arrays["shN"][:, k]) for k, name in enumerate(harmonics(degree)[1:])}
     columns |= {DIAL[name]: arrays[name] for name in dial_columns(arrays)}
     lost = arrays["shN"][:, (degree + 1) ** 2 - 1 :].any()
     return columns, (f"spherical harmonics above degree {DEGREE} are dropped",) if lost else ()
@@ -167,10 +165,9 @@ def load_glb(path: Path) -> Source:
         attributes, ignored = primitive["attributes"], _ignored(primitive, len(others))
         arrays = {key: _values(gltf, binary, attributes[name], width) for key, (name, width) in _ATTRIBUTES.items()}
         degree = 0
-        while degree < DEGREE and coefficient(degree + 1, 0) in attributes:
+        while degree < DEGREE and harmonics(degree + 1)[(degree + 1) ** 2] in attributes:
             degree += 1
-        bands = [coefficient(band, index) for band in range(1, degree + 1) for index in range(2 * band + 1)]
-        rest = [_values(gltf, binary, attributes[name], 3) for name in bands]
+        rest = [_values(gltf, binary, attributes[name], 3) for name in harmonics(degree)[1:]]
         for name in dial_columns([name for name, attribute in DIAL.items() if attribute in attributes]):
             arrays[name] = _values(gltf, binary, attributes[DIAL[name]], 1)
         if len({len(values) for values in (*arrays.values(), *rest)}) > 1:
@@ -192,8 +189,6 @@ def load_glb(path: Path) -> Source:
 
 def _chunks(data: memoryview) -> tuple[dict[str, Any], memoryview]:
     """The JSON and the binary chunk."""
-    if bytes(data[:4]) != b"glTF":
-        raise ClodError(f"is no glTF binary file; {_REMEDY}")
     version, length = struct.unpack_from("<II", data, 4) if len(data) >= 12 else (0, 0)
     if version != 2 or length > len(data):
         raise ClodError("is truncated, or no glTF 2.0; copy or export it again")

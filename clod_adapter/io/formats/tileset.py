@@ -25,7 +25,7 @@ import torch
 
 from clod_adapter._support.version import package_version
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.io.formats.glb import DEGREE, EXTENSION, coefficient, document, write_chunks
+from clod_adapter.io.formats.glb import DEGREE, EXTENSION, document, harmonics, write_chunks
 from clod_adapter.io.formats.spz import write_spz
 from clod_adapter.io.settings import History
 from clod_adapter.origin import Origin
@@ -93,8 +93,7 @@ def write_tile(path: Path, gaussians: Gaussians, origin: Origin) -> tuple[str, .
     shapes = {
         "POSITION": "VEC3", "COLOR_0": "VEC4", f"{EXTENSION}:SCALE": "VEC3", f"{EXTENSION}:ROTATION": "VEC4",
     }  # fmt: skip
-    for band in range(1, min(gaussians.sh_degree, DEGREE) + 1):
-        shapes |= {coefficient(band, index): "VEC3" for index in range(2 * band + 1)}
+    shapes |= dict.fromkeys(harmonics(min(gaussians.sh_degree, DEGREE))[1:], "VEC3")
     accessors: dict[str, Any] = {name: {"count": len(gaussians), "type": shape} for name, shape in shapes.items()}
     x, y, z = origin
     node = {"matrix": [-1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1, 0, -x, -y, z, 1]}  # a half turn about z
