@@ -116,7 +116,7 @@ def page_config(
         virtual_scale: the initial dial value, >= 0; None for 1 with photographs, else 0 (everything), and then what
             suits the device.
         others: further models to switch to.
-        placed: the cameras are not photographs'; the page levels them by the scene's up axis.
+        placed: the cameras are not photographs'; the page levels them.
     """
     return {
         "version": package_version(), "title": model["name"], "model": model, "base": base,

@@ -123,24 +123,6 @@ def test_pointer_touch_and_wheel_move_the_camera(chromium: Any, show: Any, model
     assert np.array_equal(shown.picture(), fitted)
 
 
-def test_comparisons(shown: Shown) -> None:
-    """Another dial value than the present one, whatever was compared before; the dial is on, or both would be one."""
-    fold(shown, True)
-    for dial, other in ((1, 5), (5, 1), (2, 5), (4, 1)):
-        shown.page.select_option("#compare", "off")
-        shown.run("clod.setWipe(null, given)", dial)  # compared last time
-        shown.run("clod.setDial(given)", dial)
-        shown.run("clod.setEquation(false)")
-        shown.page.select_option("#compare", "dial")
-        assert shown.text("#other-value") == f"s = {other:.2f}" and shown.page.is_checked("#equation")
-    shown.page.focus("#wipe")
-    shown.page.keyboard.press("Home")
-    assert shown.page.get_attribute("#wipe", "aria-valuenow") == "0"
-    shown.run("clod.setEquation(false)")
-    shown.page.select_option("#compare", "base")
-    assert "dial off" in shown.text("#wipe-right") and shown.page.is_checked("#equation")
-
-
 def test_files_and_cameras_are_listed(show: Any, save: Any, gaussians: Gaussians, tmp_path: Path) -> None:
     """Switched by keys, lists and a link: view and base stay, and the dial value where the file has it."""
     second = gaussians.replace(sh0=-gaussians.sh0, attenuation=replace(gaussians.attenuation, max_sv=2.0))
@@ -167,7 +149,7 @@ def test_files_and_cameras_are_listed(show: Any, save: Any, gaussians: Gaussians
     shown.page.keyboard.press("2")
     shown.until("document.title === 'b.ply'")
     assert not np.array_equal(shown.picture(), first) and shown.text("#dial-value") == "s = 2.00"
-    shown.run("clod.setWipe(0.4, 'base')")
+    shown.run("clod.setWipe(0.4)")
     assert shown.text("#wipe-right") == "base · 400"
     shown.page.keyboard.press("l")
     hashed, of_second = shown.page.evaluate("location.hash"), shown.picture()
@@ -178,6 +160,6 @@ def test_files_and_cameras_are_listed(show: Any, save: Any, gaussians: Gaussians
     assert shown.counts()["total"] == 9 and shown.text("#dial-value") == "s = 3.00"
     shown.page.keyboard.press("1")
     shown.until("document.title === 'a.ply'")
-    assert shown.page.inner_text("#compare option:nth-child(2)") == "with the base"
+    assert shown.text("#compare-with") == "Compare with the base"
     opened = show(*words, address=hashed, viewport=TALL)
     assert opened.page.title() == "b.ply" and not differ(opened.picture(), of_second)

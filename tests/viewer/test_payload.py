@@ -1,4 +1,4 @@
-"""The data of the page: one PLY layout for Gaussians from any file."""
+"""The data of the page: one PLY layout for Gaussians from any file, or SPZ."""
 
 from __future__ import annotations
 
@@ -17,60 +17,39 @@ from clod_adapter.calibration import Calibration, CalibrationRow
 from clod_adapter.config import FILTERS
 from clod_adapter.equation.units import with_distance
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.viewer.payload import BLOCK_ROWS, Payload, page_config
+from clod_adapter.viewer.payload import Payload, page_config
+
+MEASURED = Calibration((CalibrationRow(1.0, 30.5, 29.25, 0.9, 4.0),), 40, 2, 8, 6, "a machine")
 
 
 def dialled(n: int = 40, degree: int = 1) -> Gaussians:
     return scenes.dialled(n, degree, 3, scene_distance=1.0).replace(screen_filter=FILTERS["mip"])
 
 
-def read_back(payload: Payload, folder: Path) -> Any:
-    """The payload as our reader reads it."""
-    path = folder / "payload.ply"
-    path.write_bytes(b"".join(payload.blocks()))
-    assert path.stat().st_size == payload.size
-    return clod_adapter.load(path)
-
-
-def assert_same(one: Gaussians, other: Gaussians) -> None:
-    assert one.attenuation == other.attenuation and one.screen_filter == other.screen_filter
-    assert one.tensors().keys() == other.tensors().keys()
-    for name, value in one.tensors().items():
-        assert torch.equal(value, other.tensors()[name]), name
-
-
 @pytest.mark.parametrize(("degree", "growth"), [(0, False), (4, True)])
 def test_bytes_are_a_plain_ply(degree: int, growth: bool, tmp_path: Path) -> None:
-    gaussians = dialled(BLOCK_ROWS + 3, degree)  # more than one block
+    """In blocks; an opaque Gaussian, whose logit is infinite, has a finite one of the same opacity."""
+    gaussians, calibration = dialled(20_000, degree), dataclasses.replace(MEASURED, total=20_000)
     gaussians = gaussians.replace(growth_d=torch.linspace(-1, 2, len(gaussians)) if growth else None)
-    calibration = Calibration((CalibrationRow(1.0, 30.5, 29.25, 0.9, 4.0),), len(gaussians), 2, 8, 6, "a machine")
-    read = read_back(Payload("a.ply", gaussians, calibration), tmp_path)
-    assert_same(read.gaussians, gaussians)
-    assert read.calibration == calibration
-    names = PlyData.read(str(tmp_path / "payload.ply"))["vertex"].data.dtype
-    assert names.names[:6] == ("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2")
-    assert names.names[names.names.index("rot_3") + 1 :] == (("sigma_d", "growth_d") if growth else ("sigma_d",))
-    assert {names[name].str for name in names.names} == {"<f4"}
-    rest = [name for name in names.names if name.startswith("f_rest_")]
+    gaussians.opacity_logits[3] = torch.inf
+    payload, file = Payload("a.ply", gaussians, calibration), tmp_path / "payload.ply"
+    file.write_bytes(b"".join(payload.blocks()))
+    read = clod_adapter.load(file)
+    assert file.stat().st_size == payload.size and read.calibration == calibration
+    scenes.assert_equal(read.gaussians, gaussians.replace(opacity_logits=gaussians.opacity_logits.clamp(max=20)))
+    assert read.gaussians.screen_filter == FILTERS["mip"] and float(read.gaussians.opacities[3]) == 1.0
+    layout = PlyData.read(str(file))["vertex"].data.dtype
+    assert layout.names[:6] == ("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2")
+    assert layout.names[layout.names.index("rot_3") + 1 :] == (("sigma_d", "growth_d") if growth else ("sigma_d",))
+    assert {layout[name].str for name in layout.names} == {"<f4"}
+    rest = [name for name in layout.names if name.startswith("f_rest_")]
     assert rest == [f"f_rest_{k}" for k in range(3 * (degree + 1) ** 2 - 3)]
-
-
-def test_a_pt_and_its_opaque_gaussians(tmp_path: Path) -> None:
-    plain = scenes.gaussians(20, 2, 3)
-    logits = plain.opacity_logits.clone()
-    logits[3] = torch.inf
-    tensors = {"means": plain.means, "quats": plain.quats, "scales": plain.log_scales, "opacities": logits}
-    torch.save({"splats": tensors | {"sh0": plain.sh0, "shN": plain.shN}}, tmp_path / "a.pt")
-    read = read_back(Payload.of(clod_adapter.load(tmp_path / "a.pt")), tmp_path).gaussians
-    assert_same(read, plain.replace(opacity_logits=logits.clamp(max=20)))
-    assert float(read.opacities[3]) == 1.0
 
 
 def test_empty_sh_degrees_and_dropped_rows_are_left_out(capture: Any, tmp_path: Path) -> None:
     gaussians = dialled(degree=3).replace(shN=torch.zeros(40, 15, 3))
-    means = gaussians.means.clone()
-    means[7, 1] = torch.nan
-    capture.write(tmp_path / "a.ply", gaussians.replace(means=means, sigma_d=None, attenuation=None))
+    gaussians.means[7, 1] = torch.nan
+    capture.write(tmp_path / "a.ply", gaussians)
     checkpoint = dataclasses.replace(clod_adapter.load(tmp_path / "a.ply"), path=Path("b\udcff.ply"))
     payload = Payload.of(checkpoint)
     assert b"f_rest" not in payload.header and len(payload.gaussians) == 39
@@ -79,19 +58,17 @@ def test_empty_sh_degrees_and_dropped_rows_are_left_out(capture: Any, tmp_path: 
 
 def test_spz_has_the_same_settings_and_leaves_no_file(tmp_path: Path) -> None:
     """In world units that float16 would not hold, and relative to the origin. Its rows are in another order."""
-    rows = (CalibrationRow(1.0, 30.5, 29.25, 0.9, 4.0), CalibrationRow(3.0, 9.0, 28.0, 0.8, 2.0))
     model = with_distance(dialled(degree=4), 1000.0)
-    payload = Payload("a.ply", model, Calibration(rows, 40, 2, 8, 6, "a machine"), (5e5, 4e6, 0.0))
+    payload = Payload("a.ply", model, MEASURED, (5e5, 4e6, 0.0))
     data, found, losses = payload.packed(tmp_path / "temporary.spz")
     assert list(tmp_path.iterdir()) == [] and any("above degree 3 are dropped" in line for line in losses)
     (tmp_path / "a.spz").write_bytes(data)
     read = clod_adapter.load(tmp_path / "a.spz", origin=payload.origin)
-    assert read.calibration == payload.calibration and read.gaussians.screen_filter == FILTERS["mip"]
-    rows_of = (model.means[:, None] - found.means).norm(dim=2).argmin(1)
-    assert sorted(rows_of.tolist()) == list(range(40))
-    wanted = with_distance(model, 1.0)
-    assert torch.allclose(found.sigma_d[rows_of], wanted.sigma_d, rtol=1e-3)
-    assert torch.allclose(found.means[rows_of], model.means, atol=1e-4)
+    assert read.calibration == MEASURED and read.gaussians.screen_filter == FILTERS["mip"]
+    rows = (model.means[:, None] - found.means).norm(dim=2).argmin(1)
+    assert sorted(rows.tolist()) == list(range(40))
+    assert torch.allclose(found.sigma_d[rows], with_distance(model, 1.0).sigma_d, rtol=1e-3)
+    assert torch.allclose(found.means[rows], model.means, atol=1e-4)
 
 
 def test_cameras_keep_all_digits_of_float32() -> None:

@@ -17,7 +17,7 @@ from clod_adapter.config import FILTERS, ScreenFilter
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.file_formats import write
 from clod_adapter.render import render
-from shown import Shown, assert_alike, assert_same, take
+from shown import TALL, Shown, assert_alike, assert_same, take
 
 VIEW, WIDE = scenes.camera(320, 240), ScreenFilter(variance=2.0)
 
@@ -88,18 +88,26 @@ def test_a_small_unit_of_length(shown: Shown, save: Any, artefacts: Path) -> Non
 
 
 def test_wipe_shows_both_sides(show: Any, save: Any, artefacts: Path) -> None:
+    """The base, or the same file without its dial, which is then on at the left; by a switch, and by C."""
     gaussians = scenes.dialled(1500, 0, 7)
-    plain = gaussians.replace(sigma_d=None, attenuation=None, sh0=-gaussians.sh0)
-    shown = show(save(gaussians), "--base", save(plain, "base.ply"), "--sv", 3)
-    shown.camera(VIEW)
-    sides = {"base": render(plain, VIEW), 1.5: render(gaussians, VIEW, 1.5)}
-    for other, right in sides.items():
-        shown.run("clod.setWipe(0.4, given)", other)
-        left = render(gaussians, VIEW, 3.0).pixels.numpy()
-        both = np.concatenate([left[:, :128], right.pixels.numpy()[:, 128:]], axis=1)
-        assert_alike(shown.picture(), both, artefacts / f"wipe_{other}.png")
-    shown.run("clod.setWipe(null)")
-    assert_same(shown, render(gaussians, VIEW, 3.0), artefacts / "wipe_off.png")
+    base = gaussians.replace(sigma_d=None, attenuation=None, sh0=-gaussians.sh0)
+    shown = show(save(gaussians), "--base", save(base, "base.ply"), "--sv", 3, viewport=TALL)
+    left = render(gaussians, VIEW, 3.0).pixels.numpy()
+    for right in (base, base.replace(sh0=gaussians.sh0)):
+        shown.camera(VIEW)
+        shown.page.check("#compare")
+        shown.run("clod.setWipe(0.4)")
+        both = np.concatenate([left[:, :128], render(right, VIEW).pixels.numpy()[:, 128:]], axis=1)
+        assert_alike(shown.picture(), both, artefacts / "wipe.png")
+        shown.page.keyboard.press("c")
+        assert_same(shown, render(gaussians, VIEW, 3.0), artefacts / "wipe_off.png")
+        take(shown, save(gaussians))
+        shown.run("clod.setEquation(false)")
+    shown.page.keyboard.press("c")
+    assert shown.page.is_checked("#equation") and "dial off" in shown.text("#wipe-right")
+    shown.page.focus("#wipe")
+    shown.page.keyboard.press("Home")
+    assert shown.page.get_attribute("#wipe", "aria-valuenow") == "0"
 
 
 def test_python_converts_every_format(show: Any, artefacts: Path, tmp_path: Path) -> None:

@@ -6,7 +6,8 @@ import http.client
 import socket
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 
 import pytest
 
@@ -15,18 +16,34 @@ from clod_adapter.viewer import server as served
 from clod_adapter.viewer.server import Response, Server
 
 BLOCKS = (b"a" * 1000, b"b" * 24)
+RESPONSES = {
+    "/": Response("text/html; charset=utf-8", 5, lambda: (b"hello",), "default-src 'none'; script-src 'sha256-x'"),
+    "/files/model": Response("application/octet-stream", 1024, lambda: BLOCKS),
+}
+
+
+@contextmanager
+def running(responses: Mapping[str, Response]) -> Iterator[Server]:
+    with Server(responses) as server:
+        thread = threading.Thread(target=server.serve_forever, args=(0.01,))
+        thread.start()
+        yield server
+        server.shutdown()
+    thread.join()
+
+
+@contextmanager
+def asking(server: Server) -> Iterator[socket.socket]:
+    """A connection that has asked for the first page."""
+    with socket.create_connection(("127.0.0.1", server.port)) as connection:
+        connection.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        yield connection
 
 
 @pytest.fixture(scope="module")
 def server() -> Iterator[Server]:
-    responses = {
-        "/": Response("text/html; charset=utf-8", 5, lambda: (b"hello",), "default-src 'none'; script-src 'sha256-x'"),
-        "/files/model": Response("application/octet-stream", 1024, lambda: BLOCKS),
-    }
-    with Server(responses) as server:
-        threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
+    with running(RESPONSES) as server:
         yield server
-        server.shutdown()
 
 
 def request(server: Server, path: str, method: str = "GET", **headers: str) -> tuple[int, dict[str, str], bytes]:
@@ -54,22 +71,6 @@ def test_responses(server: Server) -> None:
         assert "python" not in headers["server"].lower()
 
 
-def test_a_busy_page_gets_the_rest_later(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It takes no bytes for longer than an idle connection is kept."""
-    monkeypatch.setattr(served._Handler, "timeout", 0.1)
-    size = 1 << 25
-    with Server({"/": Response("text/html", size, lambda: (bytes(size),))}) as server:
-        threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
-        with socket.create_connection(("127.0.0.1", server.port)) as connection:
-            connection.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
-            time.sleep(0.4)
-            found = 0
-            while found < size and (data := connection.recv(1 << 20)):
-                found += len(data)
-        assert found >= size
-        server.shutdown()
-
-
 def test_other_requests_are_refused(server: Server) -> None:
     for path in ("/files", "/files/", "/files/base", "/files/../", "/etc/passwd", "/%2e%2e/", "/index.html", "*"):
         assert request(server, path)[0] == 404, path
@@ -85,32 +86,19 @@ def test_other_requests_are_refused(server: Server) -> None:
         Server({}, server.port)
 
 
-def test_a_browser_that_disconnects(server: Server, capfd: pytest.CaptureFixture[str]) -> None:
-    disconnected = threading.Event()
-
-    def blocks() -> Iterator[bytes]:
-        yield b"x" * (1 << 20)
-        disconnected.wait(10)
-        while True:
-            yield b"x" * (1 << 20)
-
-    server.responses["/long"] = Response("text/plain", 1 << 40, blocks)
-    before = threading.active_count()
-    with socket.create_connection(("127.0.0.1", server.port)) as connection:
-        connection.sendall(b"GET /long HTTP/1.1\r\nHost: localhost\r\n\r\n")
-        assert connection.recv(1000)
-    disconnected.set()
-    for thread in threading.enumerate():
-        if "process_request_thread" in thread.name:
-            thread.join(10)
-    assert threading.active_count() <= before and request(server, "/")[0] == 200
-    assert capfd.readouterr() == ("", "")
+def test_a_busy_page_gets_the_rest_later(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It takes no bytes for longer than an idle connection is kept."""
+    monkeypatch.setattr(served._Handler, "timeout", 0.1)
+    size = 1 << 25
+    with running({"/": Response("text/html", size, lambda: (bytes(size),))}) as server, asking(server) as connection:
+        time.sleep(0.4)
+        found = 0
+        while found < size and (data := connection.recv(1 << 20)):
+            found += len(data)
+        assert found >= size
 
 
-def test_closing_disconnects_and_waits_for_running_responses() -> None:
-    """A thread that holds a tensor when the interpreter exits would abort the process."""
-    ended: list[int] = []
-
+def endless(ended: list[int]) -> Callable[[], Iterable[bytes]]:
     def blocks() -> Iterator[bytes]:
         try:
             while True:
@@ -118,19 +106,31 @@ def test_closing_disconnects_and_waits_for_running_responses() -> None:
         finally:
             ended.append(1)
 
-    with Server({"/": Response("application/octet-stream", 1 << 40, blocks)}) as server:
-        thread = threading.Thread(target=server.serve_forever, args=(0.01,))
-        thread.start()
+    return blocks
+
+
+def test_disconnected_and_closed(capfd: pytest.CaptureFixture[str]) -> None:
+    """A browser may end; closing waits for running responses: a thread that holds a tensor when the interpreter exits
+    would abort the process.
+    """
+    ended: list[int] = []
+    response = Response("application/octet-stream", 1 << 40, endless(ended))
+    with running({"/": response, "/other": RESPONSES["/"]}) as server:
+        with asking(server) as connection:
+            assert connection.recv(100)
+        for thread in threading.enumerate():
+            if "process_request_thread" in thread.name:
+                thread.join(10)
+        assert ended == [1] and request(server, "/other")[0] == 200
         with (
-            socket.create_connection(("127.0.0.1", server.port)) as slow,
+            asking(server) as slow,
             socket.create_connection(("127.0.0.1", server.port)),
-        ):  # the second one requests nothing
-            slow.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        ):  # the second requests nothing
             assert slow.recv(100)
             server.shutdown()
             server.server_close()
-            assert ended == [1]
-    thread.join()
+            assert ended == [1, 1]
+    assert capfd.readouterr() == ("", "")
 
 
 def test_an_interrupt_while_a_thread_starts(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,7 +1,6 @@
 // Pointer, wheel, touch and keys on the canvas, which orbit or fly the camera.
 
 const ROTATION = 0.005; // radians per pixel
-const SLIP = 6, DOUBLE = 350; // pixels and milliseconds: a press that moves less is no drag; two presses within are a double click
 const MIN_PRESS = 1 / 30; // seconds that a key press counts for at least
 const KEYS = { // right, down, forward
   w: [0, 0, 1], s: [0, 0, -1], a: [-1, 0, 0], d: [1, 0, 0], pageup: [0, -1, 0], pagedown: [0, 1, 0],
@@ -9,14 +8,11 @@ const KEYS = { // right, down, forward
 const ZOOMS = { "+": -1, "=": -1, "-": 1 };
 const ARROWS = { arrowleft: [-1, 0], arrowright: [1, 0], arrowup: [0, -1], arrowdown: [0, 1] };
 
-const apart = (a, b) => Math.hypot(a.x - b.x, a.y - b.y);
-
-/** Calls `onMove()` after every change of the camera, and `onDouble(x, y)` after a double click or tap, in shares of the
- *  canvas's size. Returns the mode, {flying}. */
-export function createControls(canvas, camera, onMove, onDouble) {
+/** Calls `onMove()` after every change of the camera. Returns the mode, {flying}. */
+export function createControls(canvas, camera, onMove) {
   const mode = { flying: false };
   const pointers = new Map(), pressed = new Map(); // keys by code, because Shift changes event.key
-  let last = 0, fast = false, press = null, tap = null; // the pointer's last press; the last release without a drag
+  let last = 0, fast = false;
 
   function drag(event) {
     const before = pointers.get(event.pointerId);
@@ -79,13 +75,6 @@ export function createControls(canvas, camera, onMove, onDouble) {
     canvas.focus({ preventScroll: true });
     canvas.setPointerCapture(event.pointerId);
     pointers.set(event.pointerId, { x: event.clientX, y: event.clientY, button: event.button });
-    press = pointers.size === 1 && event.button === 0 ? { x: event.clientX, y: event.clientY } : null;
-  });
-  canvas.addEventListener("pointerup", (event) => {
-    const now = { x: event.clientX, y: event.clientY, time: performance.now() };
-    const isTap = press && apart(press, now) < SLIP, isDouble = isTap && tap && now.time - tap.time < DOUBLE && apart(tap, now) < 3 * SLIP;
-    tap = isTap && !isDouble ? now : null;
-    if (isDouble) onDouble(now.x / canvas.clientWidth, now.y / canvas.clientHeight);
   });
   canvas.addEventListener("pointermove", drag);
   for (const kind of ["pointerup", "pointercancel"]) canvas.addEventListener(kind, (event) => pointers.delete(event.pointerId));

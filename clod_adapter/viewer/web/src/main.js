@@ -1,20 +1,16 @@
 // Assembles the page, and defines `window.clod` for tests and scripts.
 import { createCamera } from "./camera.js";
 import { createControls } from "./controls.js";
-import { createFiles } from "./files.js";
+import { createFiles, readConfig } from "./files.js";
 import { canRecord } from "./media.js";
 import { createModel } from "./model.js";
 import { createMotion } from "./motion.js";
-import { readConfig } from "./payload.js";
-import { createPlayback } from "./playback.js";
 import { createRenderer } from "./renderer.js";
 import { createStage } from "./stage.js";
 import { createUi, elementsOf } from "./ui.js";
-import { dot } from "./vector.js";
 import { createViews } from "./views.js";
 
 const OPENING = 30, HOPELESS = Math.log(2); // frames per second that the dial is moved for; excess at its largest value, above which it is not moved
-const STEEP = 0.7; // sine of a placed camera's angle to the horizon
 
 const elements = elementsOf(document), config = readConfig();
 const viewer = { cameraNumber: 0, cameras: config.cameras, up: "", recording: null, file: 0, opening: null, notes: "" }; // opening: the dial value that a file was opened at, null once that is settled; notes: on a dropped file
@@ -27,12 +23,11 @@ async function start() {
     viewer.ui.showNote(""); // it was of another view
   };
   Object.assign(actions, files, createViews(elements, viewer, { update, clampDial, showFile: files.showFile }));
-  Object.assign(actions, createPlayback(elements, viewer, update));
   const controls = createControls(elements.canvas, camera, () => {
     viewer.motion.stop();
     viewer.ui.selectCamera(null);
     moved();
-  }, actions.focus);
+  });
   Object.assign(viewer, { renderer, camera, stage, controls, motion: createMotion(camera, moved, () => viewer.ui.update()) });
   viewer.ui = createUi(elements, viewer, actions, canRecord());
   stage.listeners.frame = viewer.ui.updateFrame;
@@ -79,13 +74,12 @@ const upload = ({ gaussians, metadata }) => createModel(viewer.renderer.gl, gaus
 function show(model, base, cameras, dial) {
   const { stage, ui } = viewer;
   const [uploaded, uploadedBase] = [upload(model), base && upload(base)];
-  Object.assign(stage.state, { dial: 1, equation: true, marks: false, wipe: null, other: "base" });
+  Object.assign(stage.state, { dial: 1, equation: true, wipe: null });
   viewer.up = viewer.notes = "";
   stage.setHold(null);
   stage.show(uploaded, uploadedBase);
-  const isSteep = ({ placed, viewmat }) => placed && Math.abs(dot(viewmat[2], uploaded.extent.up)) > STEEP;
-  viewer.cameras = [...cameras.filter((each) => !isSteep(each)), ...cameras.filter(isSteep)];
-  ui.listCameras(viewer.cameras);
+  viewer.cameras = cameras;
+  ui.listCameras(cameras);
   ui.update(); // rows of the panel, before the picture is placed beside it
   actions.layOut();
   actions.reset();
@@ -107,14 +101,7 @@ function update() {
   viewer.ui.updateFrame();
 }
 
-/** The last other dial value if it differs from the present one, else the end of the dial that is farther from it. */
-function otherDial({ dial, other }) {
-  const max = viewer.stage.model.max_sv;
-  if (other !== "base" && Math.abs(Math.log(other / dial)) > 0.05 * Math.log(max)) return other;
-  return dial * dial > max ? 1 : max;
-}
-
-/** What the controls call; `start` adds those of files, views and playback. */
+/** What the controls call; `start` adds those of files and views. */
 const actions = {
   isFlying: () => viewer.controls.flying,
   setDial(dial) {
@@ -131,19 +118,16 @@ const actions = {
   setHold(fps) {
     const { stage } = viewer;
     viewer.opening = null;
-    if (fps) Object.assign(stage.state, { equation: true, marks: false });
+    if (fps) stage.state.equation = true;
     stage.setHold(fps);
     update();
   },
-  setWipe(position, other = viewer.stage.state.other) {
-    Object.assign(viewer.stage.state, { wipe: position, other });
+  /** Compares with the base, or with the model without its dial, right of a share of the width; null ends that. */
+  setWipe(position) {
+    const { state, base } = viewer.stage;
+    if (position !== null && !base) state.equation = true; // else both sides would be the same
+    state.wipe = position;
     update();
-  },
-  compare(mode) {
-    const { state } = viewer.stage, position = state.wipe ?? 0.5;
-    if (mode === "off") return actions.setWipe(null);
-    if (mode === "dial" || !viewer.stage.base) state.equation = true; // else both sides would be the same
-    actions.setWipe(position, mode === "base" ? "base" : otherDial(state));
   },
   async setTarget(text) {
     const target = Number(text.replaceAll(/[\s,_.'](?=\d{3}(?!\d))/g, ""));
@@ -157,14 +141,6 @@ const actions = {
     if (kept > target) viewer.ui.showNote(`s = ${max}, the largest trained value, keeps ${count} in this view`);
     else if (dial === 1) viewer.ui.showNote(`s = 1 already keeps no more than ${count} in this view`);
     else viewer.ui.showNote(`s = ${dial.toFixed(3)} keeps ${count} in this view`);
-  },
-  /** Shows the Gaussians that the dial removes, in orange. */
-  setMarks(on) {
-    const { stage } = viewer;
-    stage.state.marks = Boolean(on);
-    if (!on) return update();
-    stage.state.equation = true;
-    actions.setHold(null); // it would measure the removed ones too
   },
   toggleFlying() {
     viewer.controls.flying = !viewer.controls.flying;

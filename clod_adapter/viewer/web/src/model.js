@@ -1,10 +1,7 @@
 // A splat on the GPU, and the worker that culls and sorts its Gaussians.
-import { extinctions, prepare } from "../../../../viewers/equation.js";
 import { WIDTH, dataTexture, heightOf, maxTexels } from "./gpu.js";
 import { half } from "./half.js";
 import { SH_TEXELS } from "./shaders.js";
-import { select } from "./read.js";
-import { upOfGaussians } from "./up.js";
 import { add } from "./vector.js";
 import workerSource from "worker:./worker.js";
 
@@ -12,9 +9,8 @@ const SH_C0 = 0.28209479177387814;
 const RECORD_TEXELS = 4;
 const VISIBLE = 3.4; // standard deviations to alpha 1/255
 
-/** `metadata`: name, attenuation or null, screen_filter, no_dial, max_sv, calibration. `all`: the Gaussians, from read.js. */
-export function createModel(gl, all, metadata) {
-  const gaussians = fitted(all, roomFor(gl, all.degree), metadata.attenuation), leftOut = all.count - gaussians.count;
+/** `metadata`: name, attenuation or null, screen_filter, no_dial, max_sv, calibration. */
+export function createModel(gl, gaussians, metadata) {
   const { count, degree, means, opacityLogits } = gaussians, { records, sh } = upload(gl, gaussians);
   const attenuation = gaussians.sigmaD ? metadata.attenuation : null, extent = extentOf(gaussians), worker = startWorker();
   const { logScales: s, sigmaD = null, growthD = null } = gaussians, blur = metadata.screen_filter.variance;
@@ -23,7 +19,7 @@ export function createModel(gl, all, metadata) {
   const spare = []; // buffers for orders, which are transferred to the worker and back
 
   return {
-    ...metadata, attenuation, count, leftOut, degree, records, sh, extent,
+    ...metadata, attenuation, count, degree, records, sh, extent,
     /** Requests the rows to draw, and calls `use({rows, drawn, kept, distance})`; `rows` is valid until it returns. */
     async order(state, use) {
       const buffer = spare.pop() ?? new ArrayBuffer(4 * WIDTH * heightOf(count));
@@ -40,33 +36,11 @@ export function createModel(gl, all, metadata) {
   };
 }
 
-/** The number of Gaussians that the device's textures hold. */
-const roomFor = (gl, degree) => Math.floor(maxTexels(gl) / Math.max(SH_TEXELS[degree], RECORD_TEXELS));
-
-/** Without the Gaussians beyond `most` that the dial removes first at the distance D; without a dial, the faintest and
- *  smallest. */
-function fitted(gaussians, most, attenuation) {
-  const { count, opacityLogits, sigmaD, logScales } = gaussians;
-  if (count <= most) return gaussians;
-  let score;
-  if (sigmaD && attenuation) {
-    const { tau, eps } = attenuation;
-    score = extinctions(new Float32Array(3 * count), prepare(opacityLogits, sigmaD, eps), [1, 0, 0], 1, tau);
-  } else {
-    score = Float64Array.from(opacityLogits, (l, i) => {
-      const sizes = [logScales[3 * i], logScales[3 * i + 1], logScales[3 * i + 2]];
-      return sizes[0] + sizes[1] + sizes[2] - Math.min(...sizes) - Math.log1p(Math.exp(-l));
-    });
-  }
-  const least = score.slice().sort()[count - most - 1], rows = new Uint32Array(most);
-  let size = 0;
-  for (let i = 0; i < count; i++) if (score[i] > least) rows[size++] = i;
-  return select(gaussians, rows.subarray(0, size));
-}
-
 /** A separate function, so that no closure of the model keeps the values in memory after the upload. */
 function upload(gl, gaussians) {
-  const texels = SH_TEXELS[gaussians.degree], integer = new Intl.NumberFormat("en").format;
+  const texels = SH_TEXELS[gaussians.degree], most = Math.floor(maxTexels(gl) / Math.max(texels, RECORD_TEXELS));
+  const holds = (what) => new Error(`this graphics device ${what} Gaussians; export it at a larger dial value (--sv)`), number = gaussians.count.toLocaleString("en");
+  if (gaussians.count > most) throw holds(`holds at most ${most.toLocaleString("en")} of the ${number}`);
   if (gl.isContextLost()) throw new Error("the graphics device was lost; reload the page");
   const textures = {
     records: dataTexture(gl, RECORD_TEXELS * gaussians.count, Float32Array, (target) => fillRecords(target, gaussians)),
@@ -74,7 +48,7 @@ function upload(gl, gaussians) {
   };
   if (gl.getError() !== gl.OUT_OF_MEMORY) return textures;
   for (const each of Object.values(textures)) gl.deleteTexture(each);
-  throw new Error(`this graphics device has too little memory for ${integer(gaussians.count)} Gaussians; export it at a larger dial value (--sv)`);
+  throw holds(`has too little memory for ${number}`);
 }
 
 function fillRecords(target, { count, means, quats, logScales, opacityLogits, sh0, sigmaD, growthD }) {
@@ -100,22 +74,22 @@ function fillSh(target, { count, degree, shN }, texels) {
   }
 }
 
-/** {centre, radius, up} of a sample: a ball that contains its Gaussians, and the up axis. Where more than 2 % of them are
- *  beyond twice the radius that contains 80 %, a background, it is the ball of these about the median. */
-function extentOf(gaussians) {
-  const { means, logScales, up } = gaussians, step = Math.max(Math.floor(means.length / 3 / 20000), 1), points = [], sizes = [];
+/** {centre, radius} of a ball that contains a sample of the Gaussians. Where more than 2 % of them are beyond twice the radius
+ *  that contains 80 %, a background, it is the ball of these about the median. */
+function extentOf({ means, logScales }) {
+  const step = Math.max(Math.floor(means.length / 3 / 20000), 1), points = [], sizes = [];
   for (let at = 0; at < means.length; at += 3 * step) {
     points.push([means[at], means[at + 1], means[at + 2]]);
     sizes.push(VISIBLE * Math.exp(Math.max(logScales[at], logScales[at + 1], logScales[at + 2])));
   }
   const reachesFrom = (centre) => Float64Array.from(points, (point, i) => Math.hypot(...add(point, centre, -1)) + sizes[i]);
-  const median = [0, 1, 2].map((k) => Float64Array.from(points, (point) => point[k]).sort()[points.length >> 1]);
-  const reaches = reachesFrom(median), sorted = reaches.slice().sort();
-  const bulk = sorted[Math.floor(0.8 * sorted.length)], bounded = sorted[Math.floor(0.98 * sorted.length)] < 2 * bulk;
-  const rows = [...points.keys()].filter((i) => reaches[i] <= (bounded ? 2 : 1) * bulk), bounds = [0, 1, 2].map((k) => rows.map((i) => points[i][k]));
-  const centre = bounded ? bounds.map((values) => (values.reduce((a, b) => Math.min(a, b)) + values.reduce((a, b) => Math.max(a, b))) / 2) : median;
-  const radius = bounded ? reachesFrom(centre).filter((_, i) => reaches[i] <= 2 * bulk).reduce((a, b) => Math.max(a, b)) : bulk;
-  return { centre, radius: Math.min(Math.max(radius, 1e-6), 1e30), up: up ?? upOfGaussians(gaussians, rows.map((i) => i * step)) };
+  const axes = [0, 1, 2].map((k) => Float64Array.from(points, (point) => point[k]).sort());
+  const median = axes.map((values) => values[values.length >> 1]), reaches = reachesFrom(median), sorted = reaches.slice().sort();
+  const bulk = sorted[Math.floor(0.8 * sorted.length)], near = points.filter((_, i) => reaches[i] <= 2 * bulk);
+  if (sorted[Math.floor(0.98 * sorted.length)] >= 2 * bulk) return { centre: median, radius: Math.min(Math.max(bulk, 1e-6), 1e30) };
+  const bounds = [0, 1, 2].map((k) => near.reduce(([low, high], point) => [Math.min(low, point[k]), Math.max(high, point[k])], [Infinity, -Infinity]));
+  const centre = bounds.map(([low, high]) => (low + high) / 2), radius = reachesFrom(centre).filter((_, i) => reaches[i] <= 2 * bulk).sort().at(-1);
+  return { centre, radius: Math.min(Math.max(radius, 1e-6), 1e30) };
 }
 
 function startWorker() {

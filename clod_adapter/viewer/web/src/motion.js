@@ -1,7 +1,6 @@
-// Animations of the camera: a glide to a pose, the path through the photographs, and the turntable. A pose is camera.pose.
+// Animations of the camera: the path through the photographs, and the turntable. A pose is camera.pose.
 import { add, cross, dot, scaled } from "./vector.js";
 
-const GLIDE = 0.4; // seconds
 const TURN = 20; // seconds of the turntable's turn
 const SPEED = 0.6; // of the path: radians, or distances to the pivot, a second
 const STOPS = 40; // photographs of a path; of more, every second one or fewer is taken
@@ -36,14 +35,6 @@ export function createMotion(camera, onMove, onEnd) {
   return {
     stop,
     get running() { return step !== null; },
-    glide(pose) {
-      const from = camera.pose, seconds = window.matchMedia("(prefers-reduced-motion: reduce)").matches ? 0 : GLIDE;
-      run((time) => {
-        const share = seconds ? Math.min(time / seconds, 1) : 1;
-        camera.pose = blend([from, from, pose, pose], share * share * (3 - 2 * share));
-        return share < 1;
-      });
-    },
     /** Rotates about the pivot; `turns`: how often. */
     turntable(turns, ended) {
       let before = 0;

@@ -38,7 +38,7 @@ export function createRenderer(canvas) {
     return projectors.get(degree);
   }
 
-  function project(side, view, depthUnit = 0) {
+  function project(side, view) {
     const { model } = side, { handle, uniforms: u } = projector(model.degree);
     resizeProjected(heightOf(model.count));
     gl.bindFramebuffer(gl.FRAMEBUFFER, projected.target);
@@ -53,8 +53,6 @@ export function createRenderer(canvas) {
     gl.uniform1f(u.blur, model.screen_filter.variance);
     gl.uniform1i(u.compensate, model.screen_filter.compensate);
     gl.uniform1i(u.attenuated, side.attenuated);
-    gl.uniform1i(u.marks, side.marks);
-    gl.uniform1f(u.depth_unit, depthUnit);
     if (side.attenuated) {
       gl.uniform1f(u.dial, side.dial);
       gl.uniform1f(u.distance_unit, side.distance);
@@ -104,17 +102,6 @@ export function createRenderer(canvas) {
     release(side) {
       gl.deleteTexture(side.order);
       side.order = null;
-    },
-    /** The depth at a pixel, the mean over the Gaussians there by their share of the picture; null where there is none. */
-    depthAt(side, view, x, y, depthUnit) {
-      resize(view);
-      clear();
-      project(side, view, depthUnit);
-      blend(side, view);
-      const pixel = new Float32Array(4);
-      gl.readPixels(x, height - 1 - y, 1, 1, gl.RGBA, gl.FLOAT, pixel);
-      const share = pixel[0] / pixel[3];
-      return pixel[3] > 0.1 && share < 1 ? (share * depthUnit) / (1 - share) : null;
     },
     /** Draws each side in its range [from, to] of the image's width, in [0, 1]; returns the milliseconds that it took. */
     draw: (sides, view) => timed(gl, () => {

@@ -6,8 +6,6 @@ import { WIDTH } from "./gpu.js";
 /** By SH degree: texels per Gaussian, of 8 float16 values each, for the coefficients of degrees 1 and up. */
 export const SH_TEXELS = [0, 2, 3, 6, 9];
 
-const MARK = "vec3(1.0, 0.42, 0.05)"; // orange, the colour of #marks-key in style.css
-
 const BASIS = `
 vec3 shColor(int row, vec3 d) {
   float x = d.x, y = d.y, z = d.z, xx = x * x, yy = y * y, zz = z * z, xy = x * y, yz = y * z, xz = x * z;
@@ -52,8 +50,7 @@ uniform mat3 view;           // world to camera, OpenCV axes
 uniform vec3 eye;
 uniform vec4 pinhole;        // fx, fy, cx, cy
 uniform vec3 size;           // width, height, near
-uniform bool attenuated, soft, marks;   // marks: culled Gaussians are drawn in MARK, the others in dark grey
-uniform float depth_unit;    // where it is not 0, colours are replaced by depth / (depth + depth_unit)
+uniform bool attenuated, soft;
 uniform float dial, distance_unit, reach, eps, tau;
 uniform float blur;          // px^2 that the screen-space filter adds to covariances
 uniform bool compensate;     // whether opacities are scaled by the ratio of the areas without and with the filter
@@ -80,11 +77,9 @@ void main() {
   if (!(point.z >= size.z)) return;
   float opacity = mean.w, distance = length(ray) / distance_unit;
   if (attenuated) opacity = clodOpacity(opacity, shape.w, distance, dial, eps, tau, soft);
-  bool marked = marks && attenuated && opacity == 0.0;
-  if (marked) opacity = mean.w;
   if (opacity < 1.0 / 255.0) return;
   vec4 tint = texelFetch(records, texelAt(record + 3), 0);
-  if (attenuated && !marked) shape.xyz *= clodScale(tint.a, distance, dial, reach);
+  if (attenuated) shape.xyz *= clodScale(tint.a, distance, dial, reach);
 
   vec2 margin = 0.15 * size.xy / pinhole.xy;
   vec2 slope = clamp(point.xy / point.z, -pinhole.zw / pinhole.xy - margin, (size.xy - pinhole.zw) / pinhole.xy + margin);
@@ -110,8 +105,6 @@ void main() {
   if (any(lessThan(centre + extent, vec2(0.0))) || any(greaterThan(centre - extent, size.xy))) return;
   vec3 rgb = tint.rgb;
   ${degree ? "rgb += shColor(row, normalize(ray));" : ""}
-  if (marks && attenuated) rgb = marked ? ${MARK} : vec3(0.3 * clamp(dot(rgb, vec3(0.2126, 0.7152, 0.0722)), 0.0, 1.0));
-  if (depth_unit > 0.0) rgb = vec3(point.z / (point.z + depth_unit));
   float far = length(abs(centre - 0.5 * size.xy) + 0.5 * size.xy);   // to the farthest corner: no quad need be longer
   footprint = floatBitsToUint(vec4(centre, min(radius * sqrt(major), far) * normalize(direction)));
   conic = floatBitsToUint(vec4(vec3(yy, -xy, xx) / det, min(radius * sqrt(minor), far)));

@@ -7,7 +7,7 @@ const SLOW = 50, FAST = 25; // ms of a frame, above and below which the resoluti
 const IDLE = 180; // ms without motion, until a frame at full resolution
 
 export function createStage(renderer, canvas, camera) {
-  const state = { dial: 1, equation: true, marks: false, wipe: null, other: "base", steady: false }; // steady: full resolution in motion
+  const state = { dial: 1, equation: true, wipe: null, steady: false }; // steady: full resolution in motion
   const listeners = { frame: () => {}, held: () => {}, error: () => {} };
   let main = makeSide(), second = makeSide(), model = null, base = null;
   let version = 0, drawnVersion = -1, resolution = 1, lastMotion = -Infinity, idleTimer = 0, frame = 0, frameMs = null;
@@ -18,16 +18,10 @@ export function createStage(renderer, canvas, camera) {
     return { model: null, order: null, drawn: 0, sortedVersion: -1, kept: 0, distance: 1, from: 0, to: 1, busy: false };
   }
 
-  /** Each side with the model, dial value and equation that it shows now. */
+  /** Each side with the model, dial value and equation that it shows now; the right one has no dial. */
   function sides() {
     const left = { side: main, model, dial: state.dial, equation: state.equation };
-    if (state.wipe === null || !model) return [left];
-    const againstBase = state.other === "base";
-    const right = {
-      side: second, model: againstBase ? base ?? model : model, dial: againstBase ? 1 : state.other,
-      equation: againstBase ? false : state.equation,
-    };
-    return [left, right];
+    return state.wipe === null || !model ? [left] : [left, { side: second, model: base ?? model, dial: 1, equation: false }];
   }
 
   function size() {
@@ -74,10 +68,8 @@ export function createStage(renderer, canvas, camera) {
   }
 
   function prepare({ side, dial, equation, model: of }, k, { length }) {
-    const attenuated = equation && of.attenuation !== null;
-    Object.assign(side, { dial, attenuated, marks: state.marks && attenuated });
-    side.from = k === 0 ? 0 : state.wipe;
-    side.to = length === 1 || k === 1 ? 1 : state.wipe;
+    const from = k === 0 ? 0 : state.wipe, to = length === 1 || k === 1 ? 1 : state.wipe;
+    Object.assign(side, { dial, from, to, attenuated: equation && of.attenuation !== null });
   }
 
   /** Takes the milliseconds of a frame: for the resolution in motion, or the held frame rate, whose next frame has
@@ -99,7 +91,7 @@ export function createStage(renderer, canvas, camera) {
     if (side.busy || (side.sortedVersion === current && side.model === of)) return;
     side.busy = true;
     try {
-      await of.order({ view, dial, equation, marks: state.marks }, ({ rows, drawn: count, kept, distance }) => {
+      await of.order({ view, dial, equation }, ({ rows, drawn: count, kept, distance }) => {
         if (of.destroyed) return;
         if (side.model !== of) renderer.release(side);
         Object.assign(side, { model: of, sortedVersion: current, kept, distance });
@@ -137,16 +129,6 @@ export function createStage(renderer, canvas, camera) {
     otherCounts: () => (state.wipe === null ? null : { total: second.model?.count ?? 0, kept: second.kept }),
     /** Resolves once the current state is drawn, and a held frame rate has settled. */
     whenDrawn: () => (isDrawn() || !model ? Promise.resolve() : new Promise((resolve) => { callbacks.push(resolve); schedule(); })),
-    /** The point under a position of the canvas, in shares of its size; null where nothing is. */
-    pick(x, y) {
-      if (main.model !== model || !model) return null;
-      const view = camera.view(...size()), { rotation: r } = view;
-      const column = Math.min(Math.floor(x * view.width), view.width - 1), line = Math.min(Math.floor(y * view.height), view.height - 1);
-      const depth = renderer.depthAt({ ...main, marks: false, from: 0, to: 1 }, view, column, line, camera.distance);
-      if (depth === null) return null;
-      const across = [(column + 0.5 - view.cx) / view.fx, (line + 0.5 - view.cy) / view.fy, 1];
-      return [0, 1, 2].map((k) => view.eye[k] + depth * (across[0] * r[k] + across[1] * r[3 + k] + r[6 + k]));
-    },
     /** Ends the lower resolution during motion at once. */
     endMotion() {
       if (performance.now() - lastMotion >= IDLE) return;

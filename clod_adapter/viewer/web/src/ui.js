@@ -2,7 +2,6 @@
 
 const TICKS = 1000, BELOW = 100; // of a slider: to s = 1 in equal steps of s, which begins at 0, and then of log s
 const integer = new Intl.NumberFormat("en").format;
-const formatDial = (dial) => (dial === 0 ? "all" : `s = ${dial.toFixed(2)}`);
 
 export const elementsOf = (document) =>
   new Proxy({}, { get: (_, name) => document.getElementById(name.replace(/[A-Z]/g, (c) => `-${c.toLowerCase()}`)) });
@@ -27,33 +26,29 @@ function psnrAt(rows, dial) {
 /** `viewer`: stage, motion, cameras, up, recording; `actions`: the functions that the controls call (main.js). */
 export function createUi(elements, viewer, actions, canRecord) {
   const { stage } = viewer, { state } = stage, { wipe, wipeLeft, wipeRight, message } = elements;
+  const { dial, hold, rate, equation, compare, target, files, camera, up, fold } = elements;
   const maxDial = () => stage.model?.max_sv ?? 1;
-  const comparison = () => (state.wipe === null ? "off" : state.other === "base" ? "base" : "dial");
+  const named = () => (!state.equation ? "off" : state.dial === 0 ? "all" : `s = ${state.dial.toFixed(2)}`);
 
   /** Shows the present state on the controls. */
   function update() {
-    const { model } = stage, hasDial = Boolean(model?.attenuation), mode = comparison(), left = model?.leftOut ?? 0;
-    for (const name of ["dial", "rate", "hold", "target", "equation", "marks"]) elements[name].disabled = !hasDial;
+    const { model } = stage, hasDial = Boolean(model?.attenuation);
+    for (const name of ["dial", "rate", "hold", "target", "equation"]) elements[name].disabled = !hasDial;
     for (const name of ["reset", "move", "menuOpen"]) elements[name].disabled = !model;
     elements.compare.disabled = !hasDial && !stage.base;
-    elements.compare.options[1].textContent = stage.base ? "with the base" : "without the dial";
-    elements.compare.options[2].disabled = !hasDial;
-    elements.compare.value = mode;
+    elements.compare.checked = state.wipe !== null;
+    elements.compareWith.textContent = stage.base ? "Compare with the base" : "Compare without the dial";
     elements.target.placeholder = hasDial ? `e.g. ${integer(Math.ceil(model.count / 2))}` : "";
-    elements.noDial.hidden = !model || (hasDial && !left);
-    const leftOut = `${integer(left)} of ${integer(left + model?.count)} Gaussians do not fit on this graphics device; left out are those that the dial removes first.`;
-    elements.noDial.textContent = [left && leftOut, model?.no_dial].filter(Boolean).join(" ");
-    setSlider(elements.dial, elements.dialValue, hasDial ? state.dial : null);
-    if (hasDial && !state.equation) elements.dialValue.textContent = "off";
+    elements.noDial.textContent = model?.no_dial ?? "";
+    dial.value = toTick(hasDial ? state.dial : 1, maxDial());
+    elements.dialValue.textContent = hasDial ? named() : "";
+    dial.setAttribute("aria-valuetext", elements.dialValue.textContent || "none");
     elements.equation.checked = state.equation && hasDial;
     elements.hold.checked = stage.holds;
-    elements.otherRow.hidden = mode !== "dial";
-    if (mode === "dial") setSlider(elements.other, elements.otherValue, state.other);
     elements.move.textContent = actions.isFlying() ? "Fly" : "Orbit";
     elements.canvas.classList.toggle("flying", actions.isFlying());
-    elements.marks.checked = state.marks;
     elements.up.value = viewer.up;
-    elements.up.options[0].textContent = viewer.cameras.some(({ placed }) => !placed) ? "as in the photographs" : "found from the scene";
+    elements.up.options[0].textContent = viewer.cameras.some(({ placed }) => !placed) ? "as in the photographs" : "−Y, as in COLMAP";
     elements.play.classList.toggle("playing", viewer.motion.running);
     elements.turn.textContent = viewer.motion.running ? "Stop" : "Turntable";
     elements.record.textContent = viewer.recording ? "Stop recording" : "Record video";
@@ -62,25 +57,17 @@ export function createUi(elements, viewer, actions, canRecord) {
     wipe.setAttribute("aria-valuenow", Math.round(100 * state.wipe));
   }
 
-  function setSlider(slider, output, dial) {
-    slider.value = toTick(dial ?? 1, maxDial());
-    output.textContent = dial === null ? "" : formatDial(dial);
-    slider.setAttribute("aria-valuetext", output.textContent || "none");
-  }
-
   /** Shows count, frame time and PSNR of the last frame. */
   function updateFrame() {
     const { model } = stage, { total, kept } = stage.counts(), other = stage.otherCounts();
     const share = `${((100 * kept) / total).toFixed(kept === total ? 0 : 1)} %`;
     elements.counts.textContent = total ? `${integer(kept)} of ${integer(total)} kept (${share})` : "";
     elements.frame.textContent = stage.frameMs === null ? "" : `${stage.frameMs.toFixed(stage.frameMs < 10 ? 1 : 0)} ms per frame`;
-    const psnr = model?.attenuation && state.equation && actions.isCalibrated() ? psnrAt(model.calibration, state.dial) : null;
+    const psnr = model?.attenuation && state.equation ? psnrAt(model.calibration, state.dial) : null;
     elements.quality.textContent = psnr === null ? "" : `${psnr.toFixed(1)} dB`;
     if (!other) return;
-    const named = (dial) => (state.equation ? formatDial(dial) : "dial off");
-    const right = state.other !== "base" ? named(state.other) : stage.base ? "base" : "dial off";
-    wipeLeft.textContent = `${model.attenuation ? named(state.dial) : model.name} · ${integer(kept)}`;
-    wipeRight.textContent = `${right} · ${integer(other.kept)}`;
+    wipeLeft.textContent = `${model.attenuation ? named() : model.name} · ${integer(kept)}`;
+    wipeRight.textContent = `${stage.base ? "base" : "dial off"} · ${integer(other.kept)}`;
   }
 
   function moveWipe(position) {
@@ -103,16 +90,15 @@ export function createUi(elements, viewer, actions, canRecord) {
 
   const holdRate = (on) => actions.setHold(on ? Number(elements.rate.value) : null);
   const toggleControls = () => toggle(elements.more, elements.fold);
-  const { dial, other, hold, rate, equation, compare, target, files, camera, marks, up, fold } = elements;
+  const toggleComparison = () => actions.setWipe(state.wipe === null ? 0.5 : null);
   const heard = [
     [dial, "input", () => actions.setDial(toDial(dial.value, maxDial()))],
-    [other, "input", () => actions.setWipe(state.wipe ?? 0.5, toDial(other.value, maxDial()))],
     [hold, "change", () => holdRate(hold.checked)], [rate, "change", () => holdRate(true)],
-    [equation, "change", () => actions.setEquation(equation.checked)], [compare, "change", () => actions.compare(compare.value)],
+    [equation, "change", () => actions.setEquation(equation.checked)], [compare, "change", toggleComparison],
     [target, "change", () => actions.setTarget(target.value)],
     [target, "keydown", ({ key }) => key === "Enter" && actions.setTarget(target.value)], // change does not fire for the same text
     [files, "change", () => actions.showFile(files.selectedIndex)], [camera, "change", () => actions.goTo(camera.selectedIndex)],
-    [marks, "change", () => actions.setMarks(marks.checked)], [up, "change", () => actions.setUp(up.value)],
+    [up, "change", () => actions.setUp(up.value)],
     [elements.file, "change", openFile],
   ];
   for (const [element, event, action] of heard) element.addEventListener(event, action);
@@ -146,17 +132,16 @@ export function createUi(elements, viewer, actions, canRecord) {
   });
 
   const stepDial = (ticks) => actions.setDial(toDial(Math.min(Math.max(toTick(state.dial, maxDial()) + ticks, 0), TICKS), maxDial()));
-  const nextComparison = () => actions.compare({ off: "base", base: stage.model.attenuation ? "dial" : "off", dial: "off" }[comparison()]);
   const always = {
     f: actions.fullScreen, m: toggleControls, o: clicks.open, "?": clicks.helpOpen,
     h: () => { elements.panel.hidden = !elements.panel.hidden; actions.layOut(); },
   };
   const withModel = {
     v: actions.toggleFlying, 0: actions.reset, n: () => actions.nextCamera(1), p: () => actions.nextCamera(-1), l: actions.copyLink,
-    " ": actions.play, t: actions.turntable, x: actions.savePicture, c: () => compare.disabled || nextComparison(),
+    " ": actions.play, t: actions.turntable, x: actions.savePicture, c: () => compare.disabled || toggleComparison(),
   };
   const withDial = {
-    r: () => holdRate(!stage.holds), e: () => actions.setEquation(!state.equation), k: () => actions.setMarks(!state.marks),
+    r: () => holdRate(!stage.holds), e: () => actions.setEquation(!state.equation),
     "[": () => stepDial(-20), "]": () => stepDial(20),
   };
   document.addEventListener("keydown", (event) => {

@@ -1,23 +1,43 @@
-// Changes of the view by keys, buttons and links.
+// Changes of the view by keys, buttons and links, and what plays: the path through the photographs, the turntable, and
+// recordings of them.
+import { createCamera } from "./camera.js";
 import { readLink, writeLink } from "./link.js";
-import { upOfCameras } from "./up.js";
-import { unit } from "./vector.js";
+import { download, record } from "./media.js";
+import { add, cross, unit } from "./vector.js";
 
-/** `viewer`: camera, cameras, stage, motion, ui, up (main.js); `update()` shows a changed state. */
+const Y_DOWN = [0, -1, 0]; // COLMAP's y axis points down
+
+/** The mean up vector of the photographs' cameras; minus y without these, or where their mean is 0. */
+function upOf(cameras) {
+  const sum = cameras.reduce((total, { viewmat, placed }) => (placed ? total : add(total, viewmat[1].slice(0, 3), -1)), [0, 0, 0]);
+  return Math.hypot(...sum) > 1e-3 * cameras.length ? unit(sum) : Y_DOWN;
+}
+
+/** `viewer`: camera, cameras, stage, motion, ui, up, recording (main.js); `update()` shows a changed state. */
 export function createViews(elements, viewer, { update, showFile, clampDial }) {
-  const axisOf = (value) => (value ? value.split(",").map(Number) : upOfCameras(viewer.cameras) ?? viewer.stage.model.extent.up);
+  const axisOf = (value) => (value ? value.split(",").map(Number) : upOf(viewer.cameras));
+  const fileName = (suffix) => `${viewer.stage.model.name.replace(/\.[^.]*$/, "")}_s${viewer.stage.state.dial.toFixed(2)}.${suffix}`;
+
+  function select(number) {
+    if (number !== null) viewer.cameraNumber = number;
+    viewer.ui.selectCamera(number);
+  }
+
+  function playOnce(ended) {
+    const { cameras, motion, camera, ui } = viewer;
+    if (cameras.length < 2) motion.turntable(1, ended);
+    else motion.path(posesOf(cameras, camera), select, ended);
+    ui.update();
+  }
 
   const views = {
     reset() {
       viewer.motion.stop();
       viewer.camera.fit(viewer.stage.model.extent, viewer.cameras, axisOf(viewer.up));
       viewer.camera.intrinsics = null; // fills the window
-      viewer.cameraNumber = 0;
-      viewer.ui.selectCamera(0);
+      select(0);
       update();
     },
-    /** Whether the calibration tells of such a view: it is of the cameras', if there are any to compare with. */
-    isCalibrated: () => !viewer.cameras.length || viewer.camera.isNear(viewer.cameras),
     nextCamera(step) {
       const { length } = viewer.cameras;
       if (length) views.goTo((viewer.cameraNumber + step + length) % length);
@@ -26,23 +46,15 @@ export function createViews(elements, viewer, { update, showFile, clampDial }) {
       viewer.motion.stop();
       viewer.camera.set(viewer.cameras[number]);
       viewer.camera.intrinsics = null;
-      viewer.cameraNumber = number;
-      viewer.ui.selectCamera(number);
+      select(number);
       update();
     },
-    /** Turns to the point at a position of the canvas, in shares of its size, and orbits about it from now on. */
-    focus(x, y) {
-      const point = viewer.stage.pick(x, y);
-      if (!point) return;
-      viewer.ui.selectCamera(null);
-      viewer.motion.glide(viewer.camera.lookingAt(point));
-    },
-    /** `value`: "x,y,z" of an axis; "" for that of the cameras or the scene. */
+    /** `value`: "x,y,z" of an axis; "" for that of the cameras. */
     setUp(value) {
       viewer.motion.stop();
       viewer.up = value;
       viewer.camera.setUp(axisOf(value));
-      viewer.ui.selectCamera(null);
+      select(null);
       update();
     },
     /** Tells the camera where the panel is. */
@@ -63,26 +75,63 @@ export function createViews(elements, viewer, { update, showFile, clampDial }) {
     },
     /** Shows the view of a link, by its fragment. */
     async applyLink(hash) {
-      const { file, eye, forward, down, fov, aspect, up, distance, dial, equation, wipe, other } = readLink(hash);
-      const { camera, stage } = viewer;
-      if (viewer.file !== null && file !== viewer.file) await showFile(file);
+      const { file: [number] = [1], eye, axes, fov, up, distance, dial, equation, wipe } = readLink(hash), { camera, stage } = viewer;
+      if (viewer.file !== null && number - 1 !== viewer.file) await showFile(number - 1);
       viewer.motion.stop();
       if (up) [viewer.up, camera.up] = [String(up), unit(up)];
-      if (eye && forward) {
-        camera.pose = { ...camera.pose, eye, forward, down, aspect };
-        viewer.ui.selectCamera(null);
+      if (eye && axes) {
+        const down = axes.slice(3);
+        camera.pose = { ...camera.pose, eye, down, forward: cross(axes.slice(0, 3), down) };
+        select(null);
       }
-      camera.fov = fov ?? camera.fov;
-      camera.distance = distance ?? camera.distance;
+      if (fov) [camera.fov, camera.aspect] = fov;
+      if (distance) [camera.distance] = distance;
       stage.setHold(null);
-      if (dial !== null || wipe !== null || !equation) viewer.opening = null;
-      const { attenuation } = stage.model, comparable = wipe !== null && (attenuation || stage.base);
-      Object.assign(stage.state, {
-        dial: clampDial(dial ?? stage.state.dial), equation, wipe: comparable ? Math.min(Math.max(wipe, 0), 1) : null,
-        other: other === "base" || !attenuation ? "base" : clampDial(other),
-      });
+      if (dial || wipe || !equation) viewer.opening = null;
+      const comparable = wipe && (stage.model.attenuation || stage.base);
+      Object.assign(stage.state, { equation, wipe: comparable ? Math.min(Math.max(wipe[0], 0), 1) : null, dial: clampDial(dial?.[0] ?? stage.state.dial) });
+      update();
+    },
+    /** Plays the path through the photographs or, without any, a turn about the pivot; stops what plays. */
+    play() {
+      if (viewer.motion.running) viewer.motion.stop();
+      else playOnce(views.play); // again and again
+    },
+    turntable() {
+      if (viewer.motion.running) return viewer.motion.stop();
+      select(null);
+      viewer.motion.turntable(Infinity);
+      viewer.ui.update();
+    },
+    async savePicture() {
+      const { stage, motion } = viewer;
+      if (!motion.running) await stage.whenDrawn();
+      stage.redraw();
+      elements.canvas.toBlob((blob) => download(blob, fileName("png")));
+    },
+    /** Records the path or the turn to its end, or what the camera does until the next call. */
+    async record() {
+      const { stage, motion, recording } = viewer;
+      stage.state.steady = !recording;
+      if (recording) {
+        viewer.recording = null;
+        motion.stop();
+        const { blob, suffix } = await recording.stop();
+        download(blob, fileName(suffix));
+      } else {
+        viewer.recording = record(elements.canvas);
+        playOnce(() => viewer.recording && views.record());
+      }
       update();
     },
   };
   return views;
+}
+
+function posesOf(cameras, { distance, up }) {
+  const each = Object.assign(createCamera(), { up });
+  return cameras.map((entry) => {
+    each.set(entry);
+    return { ...each.pose, distance };
+  });
 }

@@ -15,11 +15,11 @@ const jobs = {
   },
 
   /** Writes the rows to draw, farthest first, into the buffer `rows`, which is transferred in both directions. */
-  order({ view, dial, equation, marks, rows }) {
+  order({ view, dial, equation, rows }) {
     const on = equation && attenuation !== null;
     const distance = on ? normalizingDistance(means, view, attenuation) : 1;
     const order = new Uint32Array(rows);
-    const [kept, drawn] = cullAndSort(order, view, on ? { dial, distance } : null, marks, insideOf(view, on && dial / distance));
+    const [kept, drawn] = cullAndSort(order, view, on ? { dial, distance } : null, insideOf(view, on && dial / distance));
     return [{ rows, kept, drawn, distance }, [rows]];
   },
 
@@ -45,8 +45,8 @@ function insideOf(view, far) {
 }
 
 /** Fills `order` with the kept rows in front of the camera and `inside`, farthest first; returns the counts of kept and of
- *  drawn Gaussians. `attenuated`: {dial, distance}; null keeps all. With `marks` the culled ones are in the order too. */
-function cullAndSort(order, { rotation: r, eye, near }, attenuated, marks, inside) {
+ *  drawn Gaussians. `attenuated`: {dial, distance}; null keeps all. */
+function cullAndSort(order, { rotation: r, eye, near }, attenuated, inside) {
   const [ex, ey, ez] = eye;
   const k = attenuated ? (attenuated.dial / attenuated.distance) ** 2 : 0;
   const threshold = attenuated ? Math.log(attenuation.tau * attenuated.dial) : 0;
@@ -54,9 +54,8 @@ function cullAndSort(order, { rotation: r, eye, near }, attenuated, marks, insid
   let kept = 0, drawn = 0;
   for (let i = 0, at = 0; at < means.length; i++, at += 3) {
     const x = means[at] - ex, y = means[at + 1] - ey, z = means[at + 2] - ez;
-    const culled = attenuated && !(prepared.logA[i] - k * (x * x + y * y + z * z) * prepared.inverse[i] > threshold);
-    if (culled && !marks) continue;
-    if (!culled) kept++;
+    if (attenuated && !(prepared.logA[i] - k * (x * x + y * y + z * z) * prepared.inverse[i] > threshold)) continue;
+    kept++;
     depth[0] = r[6] * x + r[7] * y + r[8] * z;
     if (!(depth[0] >= near && inside(i, x, y, z, depth[0]))) continue;
     keys[drawn] = ~bits[0]; // positive floats have the order of their bits
