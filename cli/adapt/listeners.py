@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import sys
-import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -189,30 +188,23 @@ class Saver:
 
     def keep(self) -> None:
         """Saves the latest state, if it is not saved yet. If that fails, the run continues."""
-        if self.latest is None:
+        if self.latest is None or self.latest.state is None:
             return
         began = time.perf_counter()
-        if (error := self._save(self.path)) is None:
+        try:
+            save_state(self.path, self.latest.state(), self.run_of)
             self.saved, self.latest = self.latest.done, None
-        elif not self.warned:
-            self.console.say(f"warning: the run continues, but --resume will not find it: {error}")
+        except (ClodError, MemoryError) as error:
+            if not self.warned:
+                self.console.say(f"warning: the run continues, but --resume will not find it: {error}")
             self.warned = True
         now = time.perf_counter()
         cost = now - began
         self.due = now + max(SAVE_EVERY, min(cost / SAVE_COST, OLDEST), cost / MOST_COST)
 
-    def _save(self, path: Path) -> Exception | None:
-        """Writes the latest state; returns what prevented it."""
-        assert self.latest is not None and self.latest.state is not None
-        try:
-            save_state(path, self.latest.state(), self.run_of)
-        except (ClodError, MemoryError) as error:
-            return error
-        return None
-
     @contextmanager
     def rescuing(self, how: str = "--resume") -> Iterator[None]:
-        """Calls ``rescue`` on an error within the block; after an abort only names the saved step.
+        """After an error within the block says on stderr, also with ``--quiet``, from which step ``how`` resumes.
 
         Raises:
             ClodError: the state to resume from was refused; names its file.
@@ -223,33 +215,13 @@ class Saver:
             raise
         except StateRefused as error:
             raise ClodError(f"{self.path}: {str(error).partition(';')[0]}; delete it to start over") from error
-        except KeyboardInterrupt:
+        except BaseException as error:
+            if isinstance(error, Exception):  # not after an abort
+                self.keep()
             if self.saved is not None:
-                _tell(f"{how} resumes from step {self.saved}, which is in {self.path}")
+                with suppress(OSError):  # stderr is closed, or on the disk that is full
+                    print(f"{how} resumes from step {self.saved}, which is in {self.path}", file=sys.stderr)
             raise
-        except Exception:
-            self.rescue(how)
-            raise
-
-    def rescue(self, how: str = "--resume") -> None:
-        """After an error: says on stderr, also with ``--quiet``, from which step ``how`` resumes.
-
-        A state that cannot be saved beside the output is saved in a new folder for temporary files.
-        """
-        self.keep()
-        if self.latest is not None and (path := self._save_elsewhere()):
-            _tell(f"step {self.latest.done} is in {path}: move it to {self.path}, and {how} resumes from there")
-        elif self.saved is not None:
-            _tell(f"{how} resumes from step {self.saved}, which is in {self.path}")
-
-    def _save_elsewhere(self) -> Path | None:
-        """The file, if it could be saved."""
-        with suppress(OSError):
-            folder = Path(tempfile.mkdtemp(prefix="clod-adapt-"))
-            if self._save(folder / self.path.name) is None:
-                return folder / self.path.name
-            folder.rmdir()
-        return None
 
     def close(self, finished: bool) -> None:
         """Removes the run's file if the run is finished, else says how to resume."""
@@ -261,8 +233,3 @@ class Saver:
             self.saved = None
         else:
             self.console.say(f"--resume resumes from step {self.saved}, which is in {self.path}")
-
-
-def _tell(text: str) -> None:
-    with suppress(OSError):  # stderr is closed, or on the disk that is full
-        print(text, file=sys.stderr)
