@@ -123,16 +123,6 @@ without --images:
   Cameras are placed, and the checkpoint itself renders the target images: all
   quality numbers are relative to it. Photographs give a better result.
 
-plan:
-  Printed before training: what is left out or frozen for this scene, by which
-  measured effect, and the option that overrides it (--with, --without). Values
-  left out are in OUT.ply unchanged, or with --trim not at all.
-
-alignment:
-  Cameras in another frame (gsplat's or nerfstudio's normalization, axes, scale,
-  inverted or OpenGL poses) are moved into the checkpoint's, and a line says so.
-  What matches in no frame, or over white, stops.
-
 interruption:
   Ctrl-C, SIGTERM, a closed terminal or the warning of a scheduler (SIGUSR1,
   SIGUSR2, SIGXCPU) ends training after the step and writes the result so far

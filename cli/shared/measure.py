@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
+import argparse
 import os
 import platform
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from clod_adapter.evaluation.evaluate import Row
-    from clod_adapter.evaluation.popping import Popping
-
-import argparse
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
@@ -28,6 +23,7 @@ from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.budget import dial_for, dial_for_times, frame_times
 from clod_adapter.evaluation.evaluate import Row, evaluate
 from clod_adapter.evaluation.frame_times import time_frames
+from clod_adapter.evaluation.popping import Popping
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.checkpoint import Checkpoint
 from clod_adapter.origin import Origin

@@ -118,10 +118,8 @@ def interrupt_as_stopped() -> Iterator[None]:
     """Within the block Ctrl-C raises Stopped. From the dispatcher of a compiled function it comes as a SystemError."""
     try:
         yield
-    except KeyboardInterrupt as error:
-        raise Stopped("interrupted") from error
-    except SystemError as error:
-        if not isinstance(error.__cause__, KeyboardInterrupt):
+    except (KeyboardInterrupt, SystemError) as error:
+        if not isinstance(error, KeyboardInterrupt) and not isinstance(error.__cause__, KeyboardInterrupt):
             raise
         raise Stopped("interrupted") from error
 
