@@ -94,11 +94,4 @@ def test_arrays_become_tensors() -> None:
     again = View(Camera(*arrays, 20, 16), view.image.numpy()[:, ::-1])
     assert torch.equal(again.camera.viewmat, view.camera.viewmat) and again.camera.K.dtype == torch.float32
     assert torch.equal(again.image, view.image.flip(1))
-
-
-def test_repr_is_short() -> None:
-    views = photograph(gaussians(5, 0, 0), [dataclasses.replace(each, name="a.png") for each in ring(3, 20, 16)])
-    assert repr(views[0].camera) == "Camera('a.png', 20x16)" and repr(views[0]) == "View('a.png', 20x16)"
-    assert repr(Scene(views[:2], views[2:])) == "Scene(2 training views, 1 held out, 20x16)"
-    other = photograph(gaussians(5, 0, 0), ring(1, 8, 6))
-    assert repr(Scene(views, other)) == "Scene(3 training views, 1 held out, 2 sizes)"
+    assert repr(again) == "View('', 20x16)" and repr(Scene((again,), ())).endswith("0 held out, 20x16)")

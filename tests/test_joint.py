@@ -133,19 +133,11 @@ CONSUMERS: dict[str, Callable[[Gaussians], list[Any]]] = {
 }
 
 
-CLOSED_FORMS = ("order_by_extinction", "extinction", "initialization")  # these share the threshold with the cut alone
-
-
 # Growth is no part of the culling rule, and none of the paper's form.
 WITHOUT_GROWTH = (
-    *CLOSED_FORMS, "the paper's objective", "dial_for one camera", "dial_for several cameras", "dial_for a baked file",
+    "order_by_extinction", "extinction", "initialization", "the paper's objective", "dial_for one camera",
+    "dial_for several cameras", "dial_for a baked file",
 )  # fmt: skip
-
-
-@pytest.fixture
-def composed(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The default ``draw``, which the CPU's kernels override. tests/kernels compares the two."""
-    monkeypatch.setitem(BACKENDS, "cpu", lambda: Rasterizer(cpu.rasterize))
 
 
 def same(these: list[Any], those: list[Any]) -> bool:
@@ -165,26 +157,13 @@ def test_everything_follows_the_culling_threshold(name: str, monkeypatch: pytest
     assert 10 * TAU == RAISED and same(consumer(model_of(TAU)), wanted)
 
 
-@pytest.mark.usefixtures("composed")
-@pytest.mark.parametrize("name", [name for name in CONSUMERS if name not in CLOSED_FORMS])
-def test_everything_passes_through_one_function(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A result of ``attenuate`` without what is faint changes whatever renders, counts or bakes."""
-    consumer = CONSUMERS[name]
-    before, result = consumer(model_of(TAU)), attenuation.Attenuated
-
-    def strict(opacities: Tensor, log_opacities: Tensor, keep: Tensor, drawn: Tensor, growth: Tensor) -> Any:
-        faint = opacities < 0.15
-        logs = log_opacities.masked_fill(faint, -torch.inf)
-        return result(opacities.masked_fill(faint, 0), logs, keep & ~faint, drawn.masked_fill(faint, 0), growth)
-
-    monkeypatch.setattr(attenuation, "Attenuated", strict)
-    assert not same(consumer(model_of(TAU)), before)
-
-
-@pytest.mark.usefixtures("composed")
 @pytest.mark.parametrize("name", CONSUMERS)
 def test_everything_grows_by_one_function(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Other factors change whatever draws, and nothing that counts or culls."""
+    """Other factors change whatever draws, and nothing that counts or culls.
+
+    By the default ``draw``: the CPU's kernels override it (tests/rasterizers/test_dial.py compares the two).
+    """
+    monkeypatch.setitem(BACKENDS, "cpu", lambda: Rasterizer(cpu.rasterize))
     consumer = CONSUMERS[name]
     before = consumer(model_of(TAU))
     monkeypatch.setattr(

@@ -70,12 +70,6 @@ def test_gradients_reach_sigma_and_all_attributes(s: float) -> None:
     assert all(gradient.isfinite().all() and gradient.abs().sum() > 0 for gradient in found.values())
     dropped = ~render(some.replace(**doubles), view, s, rasterizer=plain).kept
     assert dropped.any() and (found["sigma_d"][dropped] == 0).all()
-    # The fast rasterizer's gradients, through the same chain.
-    singles = {name: value.detach().float().requires_grad_() for name, value in doubles.items()}
-    image = render(some.replace(**singles), view, s).image
-    fast = torch.autograd.grad((image * weights.float()).sum(), singles.values())
-    for (name, want), gradient in zip(found.items(), fast, strict=True):
-        assert (gradient - want).norm() <= 2e-3 * want.norm(), name
 
 
 def test_bad_arguments_are_refused() -> None:

@@ -4,20 +4,15 @@ from __future__ import annotations
 
 from llvmlite import ir
 from numba import types
-from numba.core import cgutils
 from numba.extending import intrinsic
 
-from clod_adapter._kernels.simd import INTEGERS, LANES, f32x16, mask16
+from clod_adapter._kernels.simd import INTEGERS, LANES, call_llvm, f32x16, mask16, operation
 
 
-@intrinsic
-def bits_of(typingctx, mask):  # type: ignore[no-untyped-def]
+@operation(types.uint64, mask16)
+def bits_of(builder, mask):  # type: ignore[no-untyped-def]
     """The mask as the low sixteen bits of a uint64."""
-
-    def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
-        return builder.zext(builder.bitcast(args[0], ir.IntType(LANES)), ir.IntType(64))
-
-    return types.uint64(mask16), codegen
+    return builder.zext(builder.bitcast(mask, ir.IntType(LANES)), ir.IntType(64))
 
 
 @intrinsic(prefer_literal=True)
@@ -43,26 +38,13 @@ def set_spans(typingctx, words, index, low, high, quarter):  # type: ignore[no-u
     return types.none(words, types.intp, f32x16, f32x16, quarter), codegen
 
 
-@intrinsic
-def lowest(typingctx, bits):  # type: ignore[no-untyped-def]
+@operation(types.int64, types.uint64)
+def lowest(builder, bits):  # type: ignore[no-untyped-def]
     """Index of the lowest bit that is set in a uint64 other than 0."""
-
-    def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
-        i64 = ir.IntType(64)
-        kind = ir.FunctionType(i64, [i64, ir.IntType(1)])
-        function = cgutils.get_or_insert_function(builder.module, kind, "llvm.cttz.i64")
-        return builder.call(function, [args[0], ir.Constant(ir.IntType(1), 1)])
-
-    return types.int64(types.uint64), codegen
+    return call_llvm(builder, "llvm.cttz.i64", bits.type, [bits, ir.Constant(ir.IntType(1), 1)])
 
 
-@intrinsic
-def ones(typingctx, bits):  # type: ignore[no-untyped-def]
+@operation(types.int64, types.uint64)
+def ones(builder, bits):  # type: ignore[no-untyped-def]
     """How many bits of a uint64 are set."""
-
-    def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
-        i64 = ir.IntType(64)
-        function = cgutils.get_or_insert_function(builder.module, ir.FunctionType(i64, [i64]), "llvm.ctpop.i64")
-        return builder.call(function, args)
-
-    return types.int64(types.uint64), codegen
+    return call_llvm(builder, "llvm.ctpop.i64", bits.type, [bits])

@@ -183,13 +183,9 @@ def project_gradient(  # type: ignore[no-untyped-def]
     sigma, growth, shN, cam = pointer(sigma), pointer(growth), pointer(shN), pointer(cam)
     settings = settings_of(dial)
     records, packed_ids, slots, pair_sums = pointer(records), pointer(packed_ids), pointer(slots), pointer(pair_sums)
-    v_means, v_quats, v_scales, v_opacities = (
-        pointer(v_means),
-        pointer(v_quats),
-        pointer(v_scales),
-        pointer(v_opacities),
-    )
-    v_sigma, v_growth, v_sh0, v_shN = pointer(v_sigma), pointer(v_growth), pointer(v_sh0), pointer(v_shN)
+    v_means, v_quats, v_scales = pointer(v_means), pointer(v_quats), pointer(v_scales)
+    v_opacities, v_sigma, v_growth = pointer(v_opacities), pointer(v_sigma), pointer(v_growth)
+    v_sh0, v_shN = pointer(v_sh0), pointer(v_shN)
     while end > first and packed_ids[end - 1] >= trained:
         end -= 1
     if dialled:

@@ -56,16 +56,6 @@ def _pointer(context, builder, kind, value, index):  # type: ignore[no-untyped-d
 
 
 @intrinsic
-def splat(typingctx, value):  # type: ignore[no-untyped-def]
-    """Sixteen copies of a float32."""
-
-    def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
-        return _spread(builder, args[0])
-
-    return f32x16(types.float32), codegen
-
-
-@intrinsic
 def load(typingctx, array, index):  # type: ignore[no-untyped-def]
     """``array[index : index + 16]``."""
 
@@ -130,86 +120,62 @@ def _negative(context, builder, signature, args):  # type: ignore[no-untyped-def
     return builder.fneg(args[0])
 
 
-def _compare(predicate: str):  # type: ignore[no-untyped-def]
-    @intrinsic
-    def operation(typingctx, a, b):  # type: ignore[no-untyped-def]
+def operation(result, *kinds):  # type: ignore[no-untyped-def]
+    """Makes a function of a builder and one to three LLVM values an intrinsic from ``kinds`` to ``result``."""
+
+    def intrinsic_of(build):  # type: ignore[no-untyped-def]
         def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
-            return builder.fcmp_ordered(predicate, *args)
+            return build(builder, *args)
 
-        return mask16(f32x16, f32x16), codegen
+        typed = result(*kinds), codegen
+        takes = (lambda ctx, a: typed), (lambda ctx, a, b: typed), (lambda ctx, a, b, c: typed)
+        return intrinsic(takes[len(kinds) - 1])
 
-    return operation
-
-
-ge, gt, eq = _compare(">="), _compare(">"), _compare("==")
-
-
-def _ternary(intrinsic_name: str):  # type: ignore[no-untyped-def]
-    @intrinsic
-    def operation(typingctx, a, b, c):  # type: ignore[no-untyped-def]
-        def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
-            return call_llvm(builder, intrinsic_name, VECTOR, args)
-
-        return f32x16(f32x16, f32x16, f32x16), codegen
-
-    return operation
+    return intrinsic_of
 
 
+def llvm_function(name, count):  # type: ignore[no-untyped-def]
+    """LLVM's intrinsic ``name`` of ``count`` vectors."""
+    return operation(f32x16, *[f32x16] * count)(
+        lambda builder, *args: call_llvm(builder, f"llvm.{name}.v16f32", VECTOR, args)
+    )
+
+
+# Sixteen copies of a float32.
+splat = operation(f32x16, types.float32)(_spread)
 # fmuladd fuses where the processor can and is two operations where it cannot.
-fma = _ternary("llvm.fmuladd.v16f32")
+fma = llvm_function("fmuladd", 3)
 
-
-def _extremum(predicate: str):  # type: ignore[no-untyped-def]
-    @intrinsic
-    def operation(typingctx, a, b):  # type: ignore[no-untyped-def]
-        def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
-            return builder.select(builder.fcmp_ordered(predicate, *args), *args)
-
-        return f32x16(f32x16, f32x16), codegen
-
-    return operation
-
-
+_pair = f32x16, f32x16
+_compare, _extremum = operation(mask16, *_pair), operation(f32x16, *_pair)
+ge = _compare(lambda builder, a, b: builder.fcmp_ordered(">=", a, b))
+gt = _compare(lambda builder, a, b: builder.fcmp_ordered(">", a, b))
+eq = _compare(lambda builder, a, b: builder.fcmp_ordered("==", a, b))
 # If one is NaN, the result is the second.
-vmin, vmax = _extremum("<"), _extremum(">")
+vmin = _extremum(lambda builder, a, b: builder.select(builder.fcmp_ordered("<", a, b), a, b))
+vmax = _extremum(lambda builder, a, b: builder.select(builder.fcmp_ordered(">", a, b), a, b))
 
 
-@intrinsic
-def both(typingctx, a, b):  # type: ignore[no-untyped-def]
+@operation(mask16, mask16, mask16)
+def both(builder, a, b):  # type: ignore[no-untyped-def]
     """Lanes set in a and in b."""
-
-    def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
-        return builder.and_(*args)
-
-    return mask16(mask16, mask16), codegen
+    return builder.and_(a, b)
 
 
-@intrinsic
-def but_not(typingctx, a, b):  # type: ignore[no-untyped-def]
+@operation(mask16, mask16, mask16)
+def but_not(builder, a, b):  # type: ignore[no-untyped-def]
     """Lanes set in a and not in b."""
-
-    def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
-        return builder.and_(args[0], builder.xor(args[1], ir.Constant(_mask, [1] * LANES)))
-
-    return mask16(mask16, mask16), codegen
+    return builder.and_(a, builder.xor(b, ir.Constant(_mask, [1] * LANES)))
 
 
-@intrinsic
-def anywhere(typingctx, mask):  # type: ignore[no-untyped-def]
+@operation(types.boolean, mask16)
+def anywhere(builder, mask):  # type: ignore[no-untyped-def]
     """Whether any lane is set."""
-
-    def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
-        bits = builder.bitcast(args[0], ir.IntType(LANES))
-        return builder.icmp_unsigned("!=", bits, ir.Constant(ir.IntType(LANES), 0))
-
-    return types.boolean(mask16), codegen
+    bits = builder.bitcast(mask, ir.IntType(LANES))
+    return builder.icmp_unsigned("!=", bits, ir.Constant(ir.IntType(LANES), 0))
 
 
-@intrinsic
-def select(typingctx, mask, a, b):  # type: ignore[no-untyped-def]
+@operation(f32x16, mask16, f32x16, f32x16)
+def select(builder, mask, a, b):  # type: ignore[no-untyped-def]
     """a where the mask is set, b elsewhere."""
-
-    def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
-        return builder.select(*args)
-
-    return f32x16(mask16, f32x16, f32x16), codegen
+    return builder.select(mask, a, b)

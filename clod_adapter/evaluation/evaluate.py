@@ -82,7 +82,8 @@ def evaluate(
         results, times = [], []
         for j, (view, rendering, seconds, scores) in enumerate(_compared(gaussians, views, dials[i])):
             times.append(seconds * 1e3)
-            results.append((*scores, *_counts(gaussians, view, rendering)))
+            inside = in_frustum(gaussians.means, view.camera)
+            results.append((*scores, int(rendering.kept.sum()), int((rendering.kept & inside).sum())))
             done = Progress(Phase.EVALUATION, i * len(views) + j + 1, len(virtual_scales) * len(views))
             stopped = progress is not None and progress(done) is False
             if stopped and j + 1 < len(views):
@@ -108,7 +109,3 @@ def _compared(
             scores = pool.map(psnr_ssim, [rendering.image for rendering, _ in found], [view.image for view in some])
             for view, (rendering, seconds), score in zip(some, found, scores, strict=True):
                 yield view, rendering, seconds, score
-
-
-def _counts(gaussians: Gaussians, view: View, rendering: Rendering) -> tuple[int, int]:
-    return int(rendering.kept.sum()), int((rendering.kept & in_frustum(gaussians.means, view.camera)).sum())

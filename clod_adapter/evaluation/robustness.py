@@ -97,8 +97,9 @@ def baseline(
         Stopped: ``progress`` returned False.
     """
     base, rows = detach(base), []
+    order = by_opacity(base)
     for k, share in enumerate(shares):
-        pruned = most_opaque(base, max(1, round(share * len(base))))
+        pruned = base.select(order[: max(1, round(share * len(base)))].sort().values)  # in their own order
         part = within(progress, k * len(views), len(shares) * len(views))
         (row,) = _complete(evaluate(pruned, views, [1.0], progress=part), 1)
         rows.append(row.as_dict() | {"kept_share": len(pruned) / len(base)})
@@ -109,11 +110,6 @@ def _complete(rows: list[Row], count: int) -> list[Row]:
     if len(rows) < count:
         raise Stopped(f"stopped after {len(rows)} of {count} rows")
     return rows
-
-
-def most_opaque(gaussians: Gaussians, count: int) -> Gaussians:
-    """The ``count`` Gaussians of highest opacity, in their original order."""
-    return gaussians.select(by_opacity(gaussians)[:count].sort().values)
 
 
 def distribution(gaussians: Gaussians) -> dict[str, Any]:

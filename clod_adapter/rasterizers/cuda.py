@@ -78,7 +78,8 @@ def rasterize(
         "background": background,
     }  # fmt: skip
     require_float32("CUDA", **{name: tensor for name, tensor in given.items() if tensor.is_cuda})
-    rows, geometry = compact(means, quats, scales, opacities)
+    rows = drawable(quats, opacities).nonzero()[:, 0]
+    geometry = [_Rows.apply(rows, x) for x in (means, quats, scales, opacities)]
     drawn = _project(geometry, sh0, shN, rows, camera, screen_filter) if len(rows) else None
     if drawn is None or len(drawn["means2d"]) == 0:
         # Nothing to draw; the gradients are 0.
@@ -87,12 +88,6 @@ def rasterize(
         return background + empty[..., None], empty
     image, alpha = _blend(drawn, camera)
     return image + (1 - alpha)[..., None] * background, alpha
-
-
-def compact(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor) -> tuple[Tensor, list[Tensor]]:
-    """The numbers of the rows that are drawn, and the geometry and opacity of these alone."""
-    rows = drawable(quats, opacities).nonzero()[:, 0]
-    return rows, [_Rows.apply(rows, x) for x in (means, quats, scales, opacities)]
 
 
 def _project(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from torch import Tensor
@@ -99,26 +98,16 @@ def workers_for(rows: int) -> int:
     return threads.worker_count() if rows >= FEW else 1
 
 
-def _sorted(n: int, inputs: tuple[Any, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Runs a projection. Packed records of the visible of n Gaussians, their row numbers, the count of each worker, and
-    the depth order."""
-    workers = workers_for(n)
-    records = recycled_array(((n + workers) * conventions.RECORD,), np.float32)
-    depths, packed_ids = recycled_array((n,), np.float32), recycled_array((n,), np.int32)
-    counts = np.zeros(workers, np.int64)
-    threads.run(project, workers, *inputs, records, depths, packed_ids, counts)
-    visible = int(counts.sum())
-    keys, order = recycled_array((visible,), np.uint32), recycled_array((visible,), np.int32)
-    other = recycled_array((visible,), np.uint32), recycled_array((visible,), np.int32)
-    return records, packed_ids, counts, tiles.depth_order(depths.view(np.uint32), counts, keys, order, *other)
-
-
 def prepare(
     arrays: list[np.ndarray], degree: int, camera: Camera, screen_filter: ScreenFilter, dial: np.ndarray | None
 ) -> Frame:
     """Projection, depth order and tile lists of ``arrays``, which are as the kernel ``project`` takes them."""
-    cam, n = camera_vector(camera, screen_filter), len(arrays[0])
-    records, packed_ids, counts, order = _sorted(n, (*arrays, degree, cam, dial))
+    cam, n, workers = camera_vector(camera, screen_filter), len(arrays[0]), workers_for(len(arrays[0]))
+    records, counts = recycled_array(((n + workers) * conventions.RECORD,), np.float32), np.zeros(workers, np.int64)
+    depths, packed_ids = recycled_array((n,), np.float32), recycled_array((n,), np.int32)
+    threads.run(project, workers, *arrays, degree, cam, dial, records, depths, packed_ids, counts)
+    keys, order, *others = (recycled_array((int(counts.sum()),), kind) for kind in (np.uint32, np.int32) * 2)
+    order = tiles.depth_order(depths.view(np.uint32), counts, keys, order, *others)
     across, down = -(-camera.width // conventions.TILE), -(-camera.height // conventions.TILE)
     listing = workers_for(len(order))
     histogram, totals = np.empty((listing, across * down), np.int64), np.empty(listing, np.int64)

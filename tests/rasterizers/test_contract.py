@@ -58,8 +58,7 @@ def test_same_input_same_bits(rasterize: Backend) -> None:
     assert all(torch.equal(some[name], given[name]) for name in some)
 
 
-@pytest.mark.parametrize("order", [(0, 1, 2, 1), (2, 1, 0, 0)], ids=str)
-def test_several_forward_passes_keep_their_own_state(rasterize: Backend, order: tuple[int, ...]) -> None:
+def test_several_forward_passes_keep_their_own_state(rasterize: Backend) -> None:
     """Backward passes in any order and repeated give the results of separate passes.
 
     Images and gradients are large enough for recycled memory.
@@ -73,7 +72,7 @@ def test_several_forward_passes_keep_their_own_state(rasterize: Backend, order: 
         alive.append((leaves, *rasterize(**leaves, camera=view)))
         differentiate(rasterize, *cases[0], weights(cases[0][1]))  # dropped
     rasterize(**cases[1][0], camera=cases[1][1], background=BACKGROUND)
-    for k in order:
+    for k in (2, 1, 0, 0, 2):
         assert_same(result_of(*alive[k]), alone[k], **rasterize.rounding)
 
 
