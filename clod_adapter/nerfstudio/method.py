@@ -58,11 +58,8 @@ class ClodPipeline(VanillaPipeline):  # type: ignore[misc]
         exporter = getattr(sys.modules.get(EXPORTER) or sys.modules["__main__"], "ExportGaussianSplat", None)
         if exporter is None:
             return
-        plain, screen_filter = (
-            exporter.write_ply,
-            ScreenFilter(compensate=self.model.config.rasterize_mode != "classic"),
-        )
-        adapted = partial(write_ply, dial=self.model.dial, screen_filter=screen_filter)
+        plain, compensate = exporter.write_ply, self.model.config.rasterize_mode != "classic"
+        adapted = partial(write_ply, dial=self.model.dial, screen_filter=ScreenFilter(compensate=compensate))
 
         def write(filename: str, count: int, map_to_tensors: dict[str, Any]) -> None:
             if "f_dc_0" in map_to_tensors:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
@@ -30,10 +31,6 @@ from clod_adapter.viewer.payload import Payload, page_config
 PAGE, STYLE, SCRIPT = "page.html", "viewer.css", "viewer.js"
 PART = 3 << 24  # bytes of a script element, a multiple of 3; browsers limit strings to about 5e8
 POSTER_SIDE, POSTER_BYTES = 512, 40_000  # of the picture shown while the page loads: pixels, bytes before base64
-# In this order.
-PLACEHOLDERS = (
-    "<!--CLOD-STYLE-->", "<!--CLOD-POSTER-->", "<!--CLOD-CONFIG-->", "<!--CLOD-DATA-->", "<!--CLOD-SCRIPT-->",
-)  # fmt: skip
 
 
 def served_page(config: Mapping[str, Any]) -> bytes:
@@ -71,13 +68,12 @@ def write_viewer_page(
     """
     shown, placed = cameras or model.cameras, model.placed and not cameras
     with atomic_path(path) as temporary:
-        checkpoints = {"clod-model": model} | ({"clod-base": base} if base else {})
-        payloads = {element: Payload.of(each) for element, each in checkpoints.items()}
-        entries = [{"name": payload.name, "element": element} for element, payload in payloads.items()]
+        payloads = {"clod-model": Payload.of(model)} | ({"clod-base": Payload.of(base)} if base else {})
+        first, *second = ({"name": payload.name, "element": element} for element, payload in payloads.items())
         packed = {element: payload.packed(f"{temporary}.spz", exact) for element, payload in payloads.items()}
         data = {element: part for element, (part, *_) in packed.items()}
         _, found, notes = packed["clod-model"]
-        config = page_config(entries[0], entries[1] if base else None, shown, virtual_scale, placed=placed)
+        config = page_config(first, second[0] if base else None, shown, virtual_scale, placed=placed)
         opening = virtual_scale if virtual_scale is not None else 0.0 if placed else 1.0
         poster = _poster(found, shown[0], opening) if shown else ""
         meta = f'<meta http-equiv="Content-Security-Policy" content="{policy()}">\n'
@@ -115,19 +111,17 @@ def policy(connect: str = "") -> str:
 
 def _document(config: Mapping[str, Any], data: Iterable[bytes], meta: str, poster: str) -> Iterator[bytes]:
     """The page in pieces, because data may be large; ``meta`` is added to its head, ``poster`` above its canvas."""
-    rest = _static_file(PAGE)
-    content: dict[str, Iterable[bytes]] = {
-        PLACEHOLDERS[0]: (f"{meta}<style>{_static_file(STYLE)}</style>".encode(),),
-        PLACEHOLDERS[1]: (poster.encode(),),
-        PLACEHOLDERS[2]: (f'<script type="application/json" id="clod-config">{script_json(config)}</script>'.encode(),),
-        PLACEHOLDERS[3]: data,
-        PLACEHOLDERS[4]: (f'<script type="module">{_static_file(SCRIPT)}</script>'.encode(),),
+    content = {
+        "STYLE": f"{meta}<style>{_static_file(STYLE)}</style>",
+        "POSTER": poster,
+        "CONFIG": f'<script type="application/json" id="clod-config">{script_json(config)}</script>',
+        "SCRIPT": f'<script type="module">{_static_file(SCRIPT)}</script>',
     }
-    for placeholder, pieces in content.items():
-        before, _, rest = rest.partition(placeholder)
-        yield before.encode()
-        yield from pieces
-    yield rest.encode()
+    for number, part in enumerate(re.split("<!--CLOD-([A-Z]+)-->", _static_file(PAGE))):
+        if part == "DATA":
+            yield from data
+        else:
+            yield (content[part] if number % 2 else part).encode()
 
 
 def _elements(data: Mapping[str, bytes]) -> Iterator[bytes]:

@@ -32,6 +32,15 @@ def grown(count: int, degree: int, power: float, by: float, **settings: Any) -> 
     return finer(model, by, growth_d=torch.linspace(-1, power, count))
 
 
+def small(size: float) -> tuple[Gaussians, tuple[float, ...], Camera]:
+    """In another unit of length, with a nearer near plane."""
+    model = scenes.dialled(1500, 0, 7, scene_distance=3 * size)
+    viewmat = VIEW.viewmat.clone()
+    viewmat[:3, 3] *= size
+    model = finer(model, -float(np.log(size)), means=size * model.means)
+    return model, (1.0,), replace(VIEW, viewmat=viewmat, near=0.01 * size)
+
+
 # Model, dial values and camera; each differs from the others in what is named.
 CASES: dict[str, tuple[Gaussians, tuple[float, ...], Camera]] = {
     "degree 3": (scenes.dialled(1500, 3, 7), (1.0, 3.0), VIEW),
@@ -50,6 +59,7 @@ CASES: dict[str, tuple[Gaussians, tuple[float, ...], Camera]] = {
     "far beyond the picture": (grown(300, 0, 5, 0, max_sv=40.0, reference_distance=2.0), (20.0,), VIEW),
     "narrow": (finer(scenes.dialled(1500, 0, 7), 0.5), (1.0,), scenes.camera(64, 48, fov=10)),
     "portrait": (scenes.dialled(1500, 0, 7), (1.0,), scenes.camera(180, 240, fov=100)),
+    "millimetres": small(1e-3),
     "off centre": (scenes.dialled(1500, 0, 7), (1.0,), scenes.camera(320, 240, off_centre=(0.1, 0.9))),
 }  # fmt: skip
 
@@ -70,21 +80,6 @@ def test_the_picture_and_the_count(shown: Shown, save: Any, artefacts: Path, nam
     shown.run("clod.setEquation(false)")
     bare = model.replace(sigma_d=None, growth_d=None, attenuation=None)
     assert_same(shown, render(bare, camera), artefacts / f"{name}_off.png")
-
-
-def test_a_small_unit_of_length(shown: Shown, save: Any, artefacts: Path) -> None:
-    """With a nearer near plane."""
-    size, model = 1e-3, CASES["portrait"][0]
-    small = model.replace(
-        means=size * model.means, log_scales=model.log_scales + float(np.log(size)),
-        attenuation=replace(model.attenuation, scene_distance=3 * size),
-    )  # fmt: skip
-    viewmat = VIEW.viewmat.clone()
-    viewmat[:3, 3] *= size
-    near = replace(VIEW, viewmat=viewmat, near=0.01 * size)
-    take(shown, save(small))
-    shown.camera(near)
-    assert_same(shown, render(small, near), artefacts / "small.png")
 
 
 def test_wipe_shows_both_sides(show: Any, save: Any, artefacts: Path) -> None:
