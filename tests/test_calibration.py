@@ -66,25 +66,23 @@ ROW = CalibrationRow(1.0, 10.0, 30.0, 0.9, 5.0)
 GOOD: dict[str, Any] = {"rows": (ROW,), "total": 10, "views": 1, "width": 8, "height": 8, "machine": "m"}
 
 
-@pytest.mark.parametrize(
-    ("bad", "said"),
-    [
-        ({"rows": ()}, "ascend from 1"),
-        ({"rows": (CalibrationRow(2.0, 1.0, 1.0, 1.0, 1.0),)}, "ascend from 1"),
-        ({"rows": (ROW, ROW)}, "ascend from 1"),
-        ({"rows": (CalibrationRow(1.0, 1.0, float("inf"), 1.0, 1.0),)}, "not finite"),
-        ({"rows": (CalibrationRow(1.0, 1.0, 1.0, 1.0, 0.0),)}, "not positive"),
-        ({"total": 0}, "not positive"),
-        ({"against": "thin air"}, "against 'thin air', it must be one of photographs, checkpoint"),
-        ({"machine": ""}, "machine"),
-        ({"machine": "two  spaces"}, "machine"),
-        ({"machine": "caf\u00e9"}, "machine"),
-    ],
-)
-def test_bad_tables_are_refused(bad: dict[str, Any], said: str) -> None:
-    Calibration(**GOOD)
-    with pytest.raises(ClodError, match=said):
-        Calibration(**{**GOOD, **bad})
+BAD: list[tuple[dict[str, Any], str]] = [
+    ({"rows": ()}, "ascend from 1"),
+    ({"rows": (replace(ROW, virtual_scale=2.0),)}, "ascend from 1"),
+    ({"rows": (ROW, ROW)}, "ascend from 1"),
+    ({"rows": (replace(ROW, psnr=float("inf")),)}, "not finite"),
+    ({"rows": (replace(ROW, frame_ms=0.0),)}, "not positive"),
+    ({"total": 0}, "not positive"),
+    ({"against": "thin air"}, "against 'thin air', it must be one of photographs, checkpoint"),
+    ({"machine": "two  spaces"}, "machine"),
+    ({"machine": "caf\u00e9"}, "machine"),
+]
+
+
+def test_bad_tables_are_refused() -> None:
+    for bad, said in BAD:
+        with pytest.raises(ClodError, match=said):
+            Calibration(**{**GOOD, **bad})
 
 
 def dialled(path: Path, **more: Any) -> Path:
@@ -93,29 +91,23 @@ def dialled(path: Path, **more: Any) -> Path:
     return path
 
 
-def edited(path: Path, old: bytes, new: bytes) -> Path:
-    data = path.read_bytes()
-    assert old in data, data[:2000]
-    path.write_bytes(data.replace(old, new))
-    return path
-
-
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
         (b"calibrated 1.0", b"calibrated one", "unusable and ignored"),
-        (b"calibrated 1.0", b"calibrated 3.0", "unusable and ignored.*ascend"),
         (b"calibrated_with 4 1 8 8", b"calibrated_with 4 1 8", "unusable and ignored"),
         (b"8 photographs", b"8 paintings", "unusable and ignored.*against 'paintings'"),
         (b"calibrated_with 4", b"calibrated_with 5", "of 5 Gaussians and ignored, these are 4"),
         (b"viewpoint 1.5", b"viewpoint nan", "unusable and ignored.*finite"),
         (b"viewpoint 1.5 2.5 3.5 4.5", b"viewpoint 1.5 2.5 3.5 0.0", "unusable and ignored.*unit.*positive"),
-        (b"viewpoint 1.5 2.5 3.5 4.5", b"viewpoint 1.5 2.5 3.5", "unusable and ignored"),
     ],
 )
 def test_a_damaged_table_is_ignored(tmp_path: Path, old: bytes, new: bytes, said: str) -> None:
     path = dialled(tmp_path / "a.ply", viewpoints=(Viewpoint(1.5, 2.5, 3.5, 4.5),))
-    loaded = load(edited(path, old, new))
+    data = path.read_bytes()
+    assert old in data
+    path.write_bytes(data.replace(old, new))
+    loaded = load(path)
     assert loaded.calibration is None and loaded.gaussians.sigma_d is not None
     assert any(re.search(said, note) for note in loaded.notes), loaded.notes
 

@@ -10,7 +10,7 @@ from backends import torch_threads
 from clod_adapter.losses import photometric_loss, photometric_loss_plain
 
 # Smaller than the window of 11, one larger, multiples of 16 and not.
-SIZES = [(1, 1), (1, 30), (3, 7), (10, 11), (11, 11), (12, 16), (33, 50), (64, 48), (17, 101)]
+SIZES = [(1, 1), (3, 7), (11, 11), (12, 16), (33, 50), (17, 101)]
 
 
 def pair(height: int, width: int, seed: int = 0) -> tuple[Tensor, Tensor]:
@@ -32,9 +32,7 @@ def value_and_gradient(function, image: Tensor, target: Tensor, weight: float) -
     return loss.detach(), gradient
 
 
-@pytest.mark.parametrize(
-    ("size", "weight"), [(size, (0.0, 0.2, 1.0)[k % 3]) for k, size in enumerate((*SIZES, (3, 7), (33, 50)))], ids=str
-)
+@pytest.mark.parametrize(("size", "weight"), [(size, (0.0, 0.2, 1.0)[k % 3]) for k, size in enumerate(SIZES)])
 def test_fused_loss_matches_the_plain_loss(size: tuple[int, int], weight: float) -> None:
     """In float32, against float64: the value within 2e-6, the gradient within 1e-4 of its length."""
     image, target = pair(*size)

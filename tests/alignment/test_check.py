@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 import re
 from collections.abc import Sequence
@@ -13,7 +12,6 @@ import torch
 from torch import Tensor
 
 import scenes
-from clod_adapter.alignment import check
 from clod_adapter.alignment.check import FLAT, check_alignment
 from clod_adapter.alignment.frames import NERFSTUDIO_TURNS, focus_of, into_file, known_frames
 from clod_adapter.alignment.search import guess_frame, scene_in
@@ -30,11 +28,7 @@ FLIP = torch.diag(torch.tensor([1.0, -1, -1], dtype=torch.float64))
 @pytest.fixture(scope="module")
 def pair() -> tuple[Gaussians, list[View]]:
     base, scene = scenes.capture(n=250, views=8, width=60, height=44)
-    return base, everything(scene)
-
-
-def everything(scene: Scene) -> list[View]:
-    return [*scene.test, *scene.train]
+    return base, [*scene.test, *scene.train]
 
 
 def posed(view: View, viewmat: Tensor) -> View:
@@ -70,10 +64,9 @@ def test_measures_match_their_definitions(pair: tuple[Gaussians, list[View]]) ->
     assert found.correlation == pytest.approx(float(torch.nn.functional.cosine_similarity(*both, dim=0)), abs=1e-4)
 
 
-@pytest.mark.parametrize("noise", [0, 3])
-def test_flat_photographs_decide_nothing(pair: tuple[Gaussians, list[View]], noise: int) -> None:
+def test_flat_photographs_decide_nothing(pair: tuple[Gaussians, list[View]]) -> None:
     base, views = pair
-    level = torch.randint(100, 101 + noise, (44, 60, 3), generator=torch.Generator().manual_seed(0)).to(torch.uint8)
+    level = torch.randint(100, 104, (44, 60, 3), generator=torch.Generator().manual_seed(0)).to(torch.uint8)
     assert (level / 255).std() < FLAT
     flat = [View(view.camera, level) for view in views]
     found = check_alignment(base, flat)
@@ -83,7 +76,7 @@ def test_flat_photographs_decide_nothing(pair: tuple[Gaussians, list[View]], noi
     assert not check_alignment(base.replace(means=base.means + 1000), flat).fits
 
 
-def test_an_empty_render_does_not_fit(pair: tuple[Gaussians, list[View]], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_empty_render_does_not_fit(pair: tuple[Gaussians, list[View]]) -> None:
     base, views = pair
     none = base.select(torch.zeros(len(base), dtype=torch.bool))
     found = check_alignment(none, views)
@@ -91,9 +84,6 @@ def test_an_empty_render_does_not_fit(pair: tuple[Gaussians, list[View]], monkey
     assert guess_frame(none, views, found) is None
     with pytest.raises(ClodError, match="number of views"):
         check_alignment(base, [])
-    monkeypatch.setattr(check, "compare_renders", lambda *_: torch.full((5,), math.nan))
-    found = check_alignment(base, views)
-    assert math.isnan(found.psnr) and math.isnan(found.margin) and not found.fits
 
 
 def test_a_white_background_is_recognised(pair: tuple[Gaussians, list[View]]) -> None:
@@ -106,9 +96,8 @@ def test_a_white_background_is_recognised(pair: tuple[Gaussians, list[View]]) ->
 
 CASES = [
     ("file's x, -y, -z: ", 1.0, FLIP, NONE),
-    ("(mirrored)", 1.0, torch.diag(EYE.new_tensor([-1.0, 1, 1])), NONE),
+    ("file's -y, z, x (mirrored): ", 1.0, torch.diag(EYE.new_tensor([-1.0, 1, 1])) @ EYE[[1, 2, 0]], NONE),
     ("20 times smaller: ", 0.05, EYE, NONE),
-    ("moved by (30, -20, 10): ", 1.0, EYE, EYE.new_tensor([30.0, -20, 10])),
     ("4 times larger and moved by (", 4.0, EYE, EYE.new_tensor([3.0, -2, 1])),
 ]
 
@@ -147,18 +136,6 @@ def test_other_poses_are_named(pair: tuple[Gaussians, list[View]], case: str) ->
     elsewhere = [posed(view, POSES[case](view.camera.viewmat)) for view in views]
     guess = guess_frame(base, elsewhere, check_alignment(base, elsewhere))
     assert guess is not None and guess.frame.description.endswith(case)
-
-
-def test_every_axis_permutation_has_one_frame(pair: tuple[Gaussians, list[View]]) -> None:
-    """Each of the 48 signed permutations of the axes is undone by exactly one candidate frame."""
-    _, views = pair
-    viewmats = torch.stack([view.camera.viewmat.double() for view in views])
-    for order, signs in itertools.product(itertools.permutations(range(3)), itertools.product((1.0, -1.0), repeat=3)):
-        rotation = torch.diag(EYE.new_tensor(signs)) @ EYE[list(order)]
-        moved = torch.stack([v.camera.viewmat.double() for v in in_world(views, 1.0, rotation, NONE)])
-        turned = [frame.of(moved) for frame in known_frames(moved) if "cameras' x" in frame.description]
-        near = [found for found in turned if (found - viewmats).abs().max() < 1e-4]
-        assert len(near) == (0 if rotation.equal(EYE) else 1)
 
 
 def test_another_scene_has_no_frame(pair: tuple[Gaussians, list[View]]) -> None:

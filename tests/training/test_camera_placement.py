@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 import clod_adapter as clod
-from clod_adapter.initialization.importance import coverage, reduced
-from clod_adapter.render import splat
+from clod_adapter.initialization.importance import coverage
 from clod_adapter.training import camera_placement
 from clod_adapter.training.camera_placement import FIELD, HEIGHT, WIDTH, place_cameras
 
@@ -44,8 +43,6 @@ def test_placed_cameras_are_valid_and_see_the_scene(blob: clod.Gaussians) -> Non
         assert (camera.width, camera.height) == (WIDTH, HEIGHT)
         assert 2 * math.degrees(math.atan(WIDTH / 2 / float(camera.K[0, 0]))) == pytest.approx(FIELD)
         assert clod.render(blob, camera).alpha.mean() > 0.02
-    forward = torch.stack([c.viewmat[2, :3] for c in cameras])
-    assert (forward @ forward.T).min() < 0  # from all around
     plain = blob.replace(shN=blob.shN[:, :0])
     one, two, other = (torch.stack([c.viewmat for c in place_cameras(plain, views=4, seed=k)]) for k in (1, 1, 2))
     assert len(one) == 4 and torch.equal(one, two) and not torch.equal(one, other)
@@ -77,25 +74,3 @@ def test_cameras_face_the_side_where_sh_was_trained(axis: int, few: bool, monkey
     positions = torch.stack([c.position for c in place_cameras(truth, views=12)])
     assert (torch.nn.functional.normalize(positions, dim=1) @ side).mean() > 0.4
     assert torch.cdist(positions, truth.means[:-1]).min() > 3 * 0.05 and positions.norm(dim=1).min() > 1
-
-
-def test_a_sample_is_as_solid_as_the_whole_and_scored_like_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A tenth of the discs of a sphere, enlarged, covers what all cover; few and large ones are all drawn."""
-    whole = ball(8000, torch.eye(3)[2])
-    whole = whole.replace(log_scales=whole.log_scales - math.log(2.0))
-    rows = torch.arange(len(whole))
-    every, growth = camera_placement.sample(whole, rows, 0)
-    assert growth is None and torch.equal(every.means, whole.means)
-    cameras = [reduced(camera) for camera in place_cameras(whole, views=16)]
-    monkeypatch.setattr(camera_placement, "SAMPLE", 800)
-    few, growth = camera_placement.sample(whole, rows, 0)
-    assert growth is not None and 700 < len(few) < 900
-    assert float(few.log_scales.max()) == float(whole.log_scales.max()) and float(growth.min()) == 1
-    for camera in cameras:
-        shown = [splat(each, each.opacities, camera, growth=grown)[1] for each, grown in ((whole, None), (few, growth))]
-        assert float((shown[0] - shown[1]).abs().mean()) < 0.1
-    scores = torch.tensor(
-        [[camera_placement.score(*each, c) for c in cameras] for each in ((whole, None), (few, growth))]
-    )
-    seen = scores.isfinite().all(0)  # the others are too empty
-    assert int(seen.sum()) > 5 and float(torch.corrcoef(scores[:, seen])[0, 1]) > 0.8

@@ -44,9 +44,8 @@ def test_sound_training_is_left_alone(many: Pair) -> None:
     assert lost(many, result.gaussians, begun) < 0
 
 
-@pytest.mark.parametrize("faster", [30.0, 1e3, 1e5])
-def test_diverging_training_is_not_worse_than_none(many: Pair, faster: float) -> None:
-    result, begun = run(many, faster), initialize(many[0], many[1].train, config_of())
+def test_diverging_training_is_not_worse_than_none(many: Pair) -> None:
+    result, begun = run(many, 30.0), initialize(many[0], many[1].train, config_of())
     assert result.watched is not None and result.watched.rollbacks > 0
     assert lost(many, result.gaussians, begun) < 0.5
 
@@ -60,11 +59,10 @@ def test_attributes_are_frozen_in_the_end(many: Pair) -> None:
     assert not torch.equal(result.gaussians.sigma_d, initialize(base, many[1].train, config_of()).sigma_d)
 
 
-@pytest.mark.parametrize("step", [3, 20])
-def test_a_run_with_rollbacks_resumes_to_the_same_bits(many: Pair, step: int) -> None:
+def test_a_run_with_rollbacks_resumes_to_the_same_bits(many: Pair) -> None:
     config, states = config_of(iters=40).lighter(1e3), dict[int, TrainingState]()
-    whole = adapt(*many, config, states_of({step}, states))
-    again = adapt(*many, config, progress=False, resume=states[step])
+    whole = adapt(*many, config, states_of({20}, states))
+    again = adapt(*many, config, progress=False, resume=states[20])
     assert_equal(again.gaussians, whole.gaussians)
     assert again.watched == whole.watched and whole.watched.rollbacks > 0
 

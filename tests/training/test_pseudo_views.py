@@ -20,22 +20,19 @@ from clod_adapter.training.pseudo_views import (
     ZOOMED,
     PseudoView,
     add_pseudo_views,
-    moved,
     render_pseudo_views,
 )
 from clod_adapter.training.schedule import ViewSampler
 
 
-@pytest.mark.parametrize("with_dial", [False, True])
-def test_images_are_renders_of_the_checkpoint(blob: clod.Gaussians, with_dial: bool) -> None:
+def test_images_are_renders_of_the_checkpoint(blob: clod.Gaussians) -> None:
     """Renders of a file with a dial are at s = 1."""
-    own, cameras, told = blob, scenes.ring(9, 40, 30), []
-    if with_dial:
-        own = clod.with_dial(blob, torch.full((len(blob),), 0.3), clod.AttenuationConfig(scene_distance=4.0))
+    cameras, told = scenes.ring(9, 40, 30), []
+    own = clod.with_dial(blob, torch.full((len(blob),), 0.3), clod.AttenuationConfig(scene_distance=4.0))
     scene = render_pseudo_views(own, cameras, progress=lambda now: told.append((now.done, now.total)))
     assert [view.camera for view in scene.test] == [cameras[0], cameras[8]] and len(scene.train) == 7
     image, plain = ((clod.render(g, cameras[1]).image.clamp(0, 1) * 255).round().byte() for g in (own, blob))
-    assert torch.equal(scene.train[0].image, image) and torch.equal(image, plain) != with_dial
+    assert torch.equal(scene.train[0].image, image) and not torch.equal(image, plain)
     assert "7 pseudo views to train on, 2 held out, 40x30" in scene.notes[0] and told == [(1, 2), (2, 2)]
     assert render_pseudo_views(own, cameras[:1]).test == ()
 
@@ -59,22 +56,6 @@ def test_each_step_renders_the_checkpoint_from_another_camera(blob: clod.Gaussia
     sampler.restore(*state)
     again = [sampler.draw(k, 0.0).view for k in range(9)]
     assert all(torch.equal(a.camera.viewmat, b.camera.viewmat) for a, b in zip(drawn, again, strict=True))
-
-
-def test_moved_cameras_have_the_documented_offsets() -> None:
-    camera, random, reach = scenes.ring(1, 40, 30)[0], np.random.default_rng(0), 3.0
-    found = [moved(camera, reach, random) for _ in range(2000)]
-    own = camera.viewmat.double()
-    steps = torch.stack([each.viewmat.double() @ own.inverse() for each in found])
-    turns, shifts = steps[:, :3, :3], steps[:, :3, 3]
-    torch.testing.assert_close(turns @ turns.mT, torch.eye(3).double().expand(2000, 3, 3), rtol=0, atol=1e-5)
-    assert shifts.std(0).tolist() == pytest.approx([MOVED * reach] * 3, rel=0.1)
-    angles = ((turns.diagonal(dim1=1, dim2=2).sum(1) - 1) / 2).clamp(-1, 1).acos()
-    assert angles.square().mean().sqrt() == pytest.approx(TURNED * 3**0.5, rel=0.1)
-    zooms = torch.stack([each.K / camera.K for each in found])[:, [0, 1], [0, 1]].log()
-    assert torch.equal(zooms[:, 0], zooms[:, 1]) and 0.9 * ZOOMED < zooms.abs().max() <= 1.001 * ZOOMED
-    for each in found[:9]:
-        assert torch.equal(each.K[:, 2], camera.K[:, 2]) and (each.width, each.name) == (camera.width, camera.name)
 
 
 def test_training_on_pseudo_views_improves_held_out_views() -> None:
@@ -116,14 +97,18 @@ def test_photographs_that_show_too_little_get_pseudo_views(
     assert clod.adapt(faint, scene, lighter).steps == 1
 
 
-def test_some_moved_cameras_step_back(blob: clod.Gaussians) -> None:
-    """Along their direction of view, up to FARTHER reaches from the scene."""
-    camera, random = scenes.ring(1, 16, 12)[0], np.random.default_rng(0)
-    near, back = (PseudoView(camera, blob, 3.0, share) for share in (0.0, 1.0))
-
-    def behind(view: PseudoView) -> torch.Tensor:
-        eyes = torch.stack([view.moved(random).camera.position for _ in range(200)])
-        return (camera.position - eyes) @ camera.viewmat[2, :3] / 3.0
-
-    assert behind(near).abs().max() < 6 * MOVED
-    assert behind(back).min() > -6 * MOVED and FARTHER / 2 < behind(back).max() < FARTHER - 1 + 6 * MOVED
+def test_moved_cameras_have_the_documented_offsets(blob: clod.Gaussians) -> None:
+    """Of position, direction and focal length; some step back along their direction of view, up to FARTHER reaches."""
+    camera, random = scenes.ring(1, 40, 30)[0], np.random.default_rng(0)
+    near, back = (
+        [PseudoView(camera, blob, 3.0, share).moved(random).camera for _ in range(500)] for share in (0.0, 1.0)
+    )
+    steps = torch.stack([each.viewmat.double() @ camera.viewmat.double().inverse() for each in near])
+    assert steps[:, :3, 3].std(0).tolist() == pytest.approx([MOVED * 3.0] * 3, rel=0.2)
+    angles = ((steps.diagonal(dim1=1, dim2=2).sum(1) - 2) / 2).clamp(-1, 1).acos()
+    assert angles.square().mean().sqrt() == pytest.approx(TURNED * 3**0.5, rel=0.2)
+    zooms = torch.stack([each.K / camera.K for each in near])[:, [0, 1], [0, 1]].log()
+    assert torch.equal(zooms[:, 0], zooms[:, 1]) and 0.9 * ZOOMED < zooms.abs().max() <= 1.001 * ZOOMED
+    eyes = torch.stack([each.position for each in back])
+    behind = (camera.position - eyes) @ camera.viewmat[2, :3] / 3.0
+    assert behind.min() > -6 * MOVED and FARTHER / 2 < behind.max() < FARTHER - 1 + 6 * MOVED

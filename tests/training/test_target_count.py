@@ -73,36 +73,24 @@ def test_count_gradient_penalises_excess_and_deficit() -> None:
     assert (gradient(logits, mixed, d, 6.0) >= 0).all() and (gradient(logits, mixed, d, 6.0)[1::2] == 0).all()
 
 
-@pytest.mark.parametrize("start", [-1.0, 0.7, None])
-def test_counts_reach_the_curve_without_an_image_loss(start: float | None) -> None:
-    """With the optimiser's steps, from too few, from too many, and from none (every sigma at its minimum).
-
-    Steps of constant size end up to a quarter from the curve, so they shrink, as in training.
-    Ten orders of the dial values then end within 0.07 of it.
-    """
-    logits, log_sigma, d = some()
+@pytest.mark.parametrize("start", [1.0, 1e-4])
+def test_counts_reach_the_curve_without_an_image_loss(start: float) -> None:
+    """With the optimiser's steps, from too many, and from none (every sigma at its minimum)."""
+    logits, _, d = some()
     # Opaque enough to reach the target: a Gaussian fainter than tau s is kept nowhere.
-    logits, log_sigma = logits.clamp(min=-1.5) + 1, log_sigma + (start or 0)
-    if start is None:
-        log_sigma = torch.full((N,), math.log(1e-4))
-    random = np.random.default_rng(0)
+    logits, log_sigma, random = logits.clamp(min=-1.5) + 1, torch.full((N,), math.log(start)), np.random.default_rng(0)
 
-    def worst(dials: list[float]) -> float:
-        """Largest deviation of the shares kept from the curve, as a logarithm."""
-        kept = [attenuate(logits, log_sigma.exp(), d, s, ATTENUATION).keep.float().mean() for s in dials]
-        curve = [target_curve(s, CONFIG.share, CONFIG.exponent) for s in dials]
-        return max(abs(math.log(max(float(eta), 1e-9) / want)) for eta, want in zip(kept, curve, strict=True))
+    def deviation() -> float:
+        """Of the share kept at s = 1 from the curve, as a logarithm."""
+        kept = float(attenuate(logits, log_sigma.exp(), d, 1.0, ATTENUATION).keep.float().mean())
+        return abs(math.log(max(kept, 1e-9) / target_curve(1.0, CONFIG.share, CONFIG.exponent)))
 
-    dials = [1.0, 1.4, 2.0, 3.1, 4.5, 6.0]
-    assert worst(dials) > 0.3
+    assert deviation() > 0.3
     optimizer, rows = RowAdam({"log_sigma": log_sigma}), torch.ones(N, dtype=torch.bool)
-    for step in range(1500 if start else 600):
-        slope, rate = gradient(logits, log_sigma, d, 6.0 ** random.random()), 0.03 * 0.02 ** (max(step - 1000, 0) / 500)
-        if start is None:
-            slope, rate = slope + gradient(logits, log_sigma, d, 1.0), 0.1 * 0.1 ** (step / 600)
-        optimizer.step({"log_sigma": slope}, rows, {"log_sigma": rate})
-    assert worst(dials) < 0.2 if start else worst([1.0]) < 0.1
-    assert (log_sigma > math.log(1e-4) + 2).all()
+    for step in range(600):
+        slope = gradient(logits, log_sigma, d, 6.0 ** random.random()) + gradient(logits, log_sigma, d, 1.0)
+        optimizer.step({"log_sigma": slope}, rows, {"log_sigma": 0.1 * 0.1 ** (step / 600)})
+    assert deviation() < 0.1 and (log_sigma > math.log(1e-4) + 2).all()
 
 
 def test_count_slope_is_that_of_the_soft_count() -> None:
@@ -120,24 +108,20 @@ def test_count_slope_is_that_of_the_soft_count() -> None:
     torch.testing.assert_close(got[touched > 1], want[touched > 1])
     q = torch.sigmoid((logs - math.log(tau * s)) / temperature)
     torch.testing.assert_close(got[touched <= 1], (q * (1 - q) / (temperature * 200))[touched <= 1])
-    gone = count_slope(torch.zeros(2), torch.tensor([-math.inf, -1e30]), s, tau, temperature)
-    assert gone.tolist() == [0, 0]
 
 
-@pytest.mark.parametrize(("form", "s"), [("ours", 1.0), ("ours", 3.0), ("paper", 3.0)])
-def test_shares_count_gaussians_that_are_left_out(form: str, s: float) -> None:
+@pytest.mark.parametrize("form", ["ours", "paper"])
+def test_shares_count_gaussians_that_are_left_out(form: str) -> None:
     """Gaussians left out because they are never drawn count as culled."""
-    config = AdaptConfig(form=form)
-    random = torch.Generator().manual_seed(1)
-    logits = torch.cat([torch.randn(40, generator=random), torch.full((25,), -40.0)])
-    found = []
+    logits, log_sigma, d = some()
+    logits[40:65], found, s = -40.0, [], 3.0
     for count, total in ((65, None), (40, 65)):
-        sigma = (0.5 + torch.rand(65, generator=torch.Generator().manual_seed(2)))[:count].requires_grad_()
-        dialled = attenuate(logits[:count], sigma, torch.full((count,), 0.1), s, AttenuationConfig(tau=0.02))
+        sigma = log_sigma[:count].exp().requires_grad_()
+        dialled = attenuate(logits[:count], sigma, 0.1 * d[:count], s, ATTENUATION)
         if form == "paper":
-            paper_count(dialled, s, 0.02, config, total).backward()
+            paper_count(dialled, s, ATTENUATION.tau, CONFIG, total).backward()
             found.append(sigma.grad[:40])
         else:
-            target = target_share(s, count, config, total)
-            found.append(count_gradient(dialled, logits[:count], s, 0.02, 0.3, config, target)[:40])
+            target = target_share(s, count, CONFIG, total)
+            found.append(count_gradient(dialled, logits[:count], s, ATTENUATION.tau, 0.3, CONFIG, target)[:40])
     assert found[0].abs().max() > 0 and torch.allclose(*found, rtol=1e-5, atol=0)
