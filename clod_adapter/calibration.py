@@ -10,28 +10,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import astuple, dataclass, replace
-from typing import Any, Protocol
+from typing import Any
 
 from clod_adapter.config import require
 from clod_adapter.errors import ClodError
 
 AGAINST = ("photographs", "checkpoint")
 MOST = 1000  # rows and viewpoints, and characters of the machine's name, for which every file has room
-
-
-class Measured(Protocol):
-    """The fields that a table takes from a row of ``evaluate``."""
-
-    @property
-    def virtual_scale(self) -> float: ...
-    @property
-    def kept(self) -> float: ...
-    @property
-    def psnr(self) -> float: ...
-    @property
-    def ssim(self) -> float: ...
-    @property
-    def frame_ms(self) -> float: ...
 
 
 @dataclass(frozen=True)
@@ -138,7 +123,7 @@ class Calibration:
     @classmethod
     def of(
         cls,
-        rows: Iterable[Measured],
+        rows: Iterable[Any],
         *,
         total: int,
         views: int,
@@ -147,7 +132,7 @@ class Calibration:
         against: str = "photographs",
         viewpoints: Sequence[Viewpoint] = (),
     ) -> Calibration:
-        """The table of an evaluation's rows, in any order, for images of ``size`` (width, height).
+        """The table of an evaluation's rows (``evaluate.Row``), in any order, for images of ``size`` (width, height).
 
         Raises:
             ClodError: there is no row at s = 1, or a value is not finite (the PSNR of equal images).

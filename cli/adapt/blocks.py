@@ -6,22 +6,11 @@ import hashlib
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
-from pathlib import Path
 from typing import Any
-
-import torch
 
 from clod_adapter._kernels.memory import release
 from clod_adapter.blocks.divide import Division, block_config, check_divisible, divide
-from clod_adapter.blocks.train import (
-    Learned,
-    adapt_block,
-    checked,
-    load_block,
-    merge,
-    refused_if_damaged,
-    save_block,
-)
+from clod_adapter.blocks.train import Learned, adapt_block, load_block, merge, save_block
 from clod_adapter.cameras import View
 from clod_adapter.config import AdaptConfig
 from clod_adapter.evaluation.robustness import scene_fingerprint
@@ -109,8 +98,8 @@ class Blocks:
         path = run.outputs.ply.with_suffix(f".block{block + 1}.pass{number}.safetensors")
         key = self.key | {"block": name}
         if path.exists():
-            return self._load(path, key, block)
-        own = block_config(division, block, self.config, first=number == 1)
+            return load_block(path, key, division, block)
+        own, _ = block_config(division, block, self.config, first=number == 1)
         state = path.with_suffix(".resume.safetensors")
         run_of = settings_key(own) | {"base_sha256": f"{key['checkpoint']}, {name}", "views_sha256": key["photographs"]}
         resumed = find_state(state, state.exists(), own, run.console)
@@ -125,8 +114,7 @@ class Blocks:
             saver.keep()
             release()
             if adapted.failed or not adapted.interrupted:
-                about = {name: getattr(learned, name) for name in ("steps", "seconds", "failed", "held")}
-                save_block(path, learned.values, about, key)
+                save_block(path, learned, key)
         if adapted.failed:
             run.console.say(f"{name}: ended after step {adapted.steps}: {adapted.failed}")
         elif adapted.interrupted:
@@ -136,25 +124,6 @@ class Blocks:
         saver.close(finished=True)
         run.console.say(f"{name}: {len(learned.rows):,} Gaussians, {learned.steps} steps, {duration(learned.seconds)}")
         return learned
-
-    def _load(self, path: Path, key: dict[str, Any], block: int) -> Learned:
-        """The result of a block after a pass.
-
-        Raises:
-            ClodError: the file cannot be read, is damaged, or of another run, division, block or pass.
-        """
-        rows = self.division.rows(block)
-        values, about = load_block(path, key)
-        shapes: dict[str, tuple[torch.dtype, tuple[int, ...]]] = {
-            name: (tensor.dtype, (len(rows), *tensor.shape[1:]))
-            for name, tensor in self.division.initial.tensors().items() if name in values or name == "sigma_d"
-        }  # fmt: skip
-        checked(path, values, shapes)
-        with refused_if_damaged(path):
-            steps, seconds, held = int(about["steps"]), float(about["seconds"]), int(about["held"])
-            failed = None if about["failed"] is None else str(about["failed"])
-        values = {name: value.to(rows.device) for name, value in values.items()}
-        return Learned(rows, values, steps, seconds, failed, held)
 
 
 @contextmanager

@@ -28,7 +28,7 @@ UNSEEN = 0.005  # of a block's coverage over all views, the share that the views
 LEFT_OUT = 1e-3  # of an image, the share that the Gaussians left out of a block's context may cover
 CONTEXT_VIEWS = 32  # most views that the context is chosen in
 BARE = 0.01  # of a pixel: where Gaussians cover less, blocks share the error by their sizes too
-DIALS = 9  # dial values at which the Gaussians kept by the initialization are counted
+DIALS = 9  # dial values, evenly spaced in log s, at which the Gaussians kept by the initialization are counted
 SECOND = 0.25  # of the steps, those of the second pass
 LEAST_SEEN = 0.02  # of an image: a block that covers less has too small a part of the whole loss
 
@@ -98,17 +98,11 @@ def split(means: Tensor, count: int) -> Tensor:
             continue
         some = points[rows[:: max(len(rows) // 100_000, 1)]]
         low, high = np.quantile(some, (0.05, 0.95), axis=0)
-        fewer = parts // 2
-        cut = first_size(len(rows), parts, fewer)
+        fewer, (size, larger) = parts // 2, divmod(len(rows), parts)
+        cut = fewer * size + min(fewer, larger)
         order = np.argpartition(points[rows, int((high - low).argmax())], cut)
         todo += [(rows[order[:cut]], first, fewer), (rows[order[cut:]], first + fewer, parts - fewer)]
     return torch.from_numpy(block).to(means.device)
-
-
-def first_size(total: int, parts: int, fewer: int) -> int:
-    """Size of the first ``fewer`` of ``parts`` even parts of ``total``."""
-    whole, rest = divmod(total, parts)
-    return fewer * whole + min(fewer, rest)
 
 
 def divide(
@@ -213,17 +207,12 @@ def block_target(
     initial, numbers = division.initial, division.views(block)
     assert initial.attenuation is not None
     distances, own = typical_distance(initial.means, cameras, initial.attenuation), division.block == block
-    kept = [dial(initial, distances, s).keep for s in _dial_grid(config)]
+    kept = [dial(initial, distances, config.max_sv ** (k / (DIALS - 1))).keep for k in range(DIALS)]
     parts = np.array([float((rows & own).sum() / rows.sum().clamp(min=1)) for rows in kept])
     stands_for = len(division.seen) / len(numbers)
     if first:
         stands_for /= max(float(division.seen[numbers, block].mean()), LEAST_SEEN)
     return partial(_target_share, config, parts, stands_for, int(own.sum()), division.total)
-
-
-def _dial_grid(config: AdaptConfig) -> list[float]:
-    """DIALS dial values from 1 to ``max_sv`` in even steps of their logarithm."""
-    return [config.max_sv ** (k / (DIALS - 1)) for k in range(DIALS)]
 
 
 def _target_share(
@@ -255,24 +244,17 @@ def target_image(gaussians: Gaussians, own: int, view: View) -> Tensor:
     return aimed.cpu()  # where photographs are: a device would fill up with them
 
 
-def block_config(division: Division, block: int, config: AdaptConfig, *, first: bool) -> AdaptConfig:
-    """The settings of one block in one pass: its steps, share of a time budget, and own seed."""
-    steps, light = _steps(division, block, config)
+def block_config(
+    division: Division, block: int, config: AdaptConfig, *, first: bool
+) -> tuple[AdaptConfig, tuple[float, float]]:
+    """The settings of one block in one pass (steps, share of a time budget, own seed), and ``TrainableSubset.span``.
+
+    The second pass takes up the schedule where the first one ends.
+    """
+    steps = division.steps(block, config)
+    light = round(SECOND * steps) if division.passes > 1 else 0  # steps of the second pass
     every = sum(division.steps(other, config) for other in range(division.count))
-    own = steps - light if first else light
+    own, between = steps - light if first else light, 1 - light / max(steps, 1)
     seed = (config.seed + 1 + block + (0 if first else division.count)) % 2**63
     budget = config.time_budget and config.time_budget * own / max(every, 1) or None
-    return replace(config, iters=own, time_budget=budget, seed=seed)
-
-
-def block_span(division: Division, block: int, config: AdaptConfig, *, first: bool) -> tuple[float, float]:
-    """``TrainableSubset.span`` of one pass: the second takes up the schedule where the first one ends."""
-    steps, light = _steps(division, block, config)
-    between = 1 - light / max(steps, 1)
-    return (0.0, between) if first else (between, 1.0)
-
-
-def _steps(division: Division, block: int, config: AdaptConfig) -> tuple[int, int]:
-    """The steps of a block in both passes, and in the second one."""
-    steps = division.steps(block, config)
-    return steps, round(SECOND * steps) if division.passes > 1 else 0
+    return replace(config, iters=own, time_budget=budget, seed=seed), (0.0, between) if first else (between, 1.0)

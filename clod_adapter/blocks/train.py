@@ -21,9 +21,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -31,9 +30,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from clod_adapter.blocks.divide import Division, block_config, block_span, block_target, context_rows, target_image
+from clod_adapter.blocks.divide import Division, block_config, block_target, context_rows, target_image
 from clod_adapter.cameras import Scene, View, spread
-from clod_adapter.config import AdaptConfig, AttenuationConfig
+from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.importance import MOST_VIEWS
@@ -44,7 +43,7 @@ from clod_adapter.io.tensor_file import read_tensors, write_tensors
 from clod_adapter.progress import Listener, Phase, tell
 from clod_adapter.training.dial import TrainableSubset
 from clod_adapter.training.loop import adapt
-from clod_adapter.training.state import Adapted, TrainingState
+from clod_adapter.training.state import Adapted, TrainingState, refused_if_damaged
 
 KEY = "clod_adapter_block"  # of the JSON document that identifies the run of a block's file
 
@@ -106,9 +105,8 @@ def adapt_block(
         own = _with_target_images(gaussians, len(rows), own, cache, progress)
     cameras = [view.camera for view in spread(views, MOST_VIEWS)]
     target = block_target(division, block, cameras, config, first=after is None)
-    span = block_span(division, block, config, first=after is None)
+    settings, span = block_config(division, block, config, first=after is None)
     part = TrainableSubset(len(rows), after is None, target=target, cameras=cameras, span=span)
-    settings = block_config(division, block, config, first=after is None)
     adapted = adapt(gaussians, Scene(tuple(own), ()), settings, progress, resume, subset=part)
     return _learned(division, rows, adapted)
 
@@ -156,60 +154,45 @@ def merge(division: Division, learned: Sequence[Learned]) -> Gaussians:
     return division.initial.replace(**merged)
 
 
-def save_block(path: Path, tensors: dict[str, Tensor], about: dict[str, Any], belongs: dict[str, Any]) -> None:
-    """Writes tensors with a description; loading gives the same bits.
+def save_block(path: Path, learned: Learned, belongs: dict[str, Any]) -> None:
+    """Writes the trained rows of a block; loading gives the same bits.
 
     Args:
-        about: plain JSON, describes this file; an ``AttenuationConfig`` in it is written as its fields.
-        belongs: plain JSON, identifies the run.
+        belongs: plain JSON, identifies run, division, block and pass.
 
     Raises:
         ClodError: the file cannot be written.
     """
-    plain = {name: asdict(value) if isinstance(value, AttenuationConfig) else value for name, value in about.items()}
-    metadata = {KEY: json.dumps({"about": plain, "belongs": belongs}, sort_keys=True)}
+    about = {name: getattr(learned, name) for name in ("steps", "seconds", "failed", "held")}
+    metadata = {KEY: json.dumps({"about": about, "belongs": belongs}, sort_keys=True)}
     with atomic_path(path) as temporary:
-        write_tensors(temporary, tensors, metadata)
+        write_tensors(temporary, learned.values, metadata)
 
 
-def load_block(path: Path, belongs: dict[str, Any]) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """The tensors and their description.
+def load_block(path: Path, belongs: dict[str, Any], division: Division, block: int) -> Learned:
+    """The inverse of ``save_block``.
 
     Raises:
-        ClodError: the file cannot be read, is damaged, or is of another run than ``belongs``.
+        ClodError: the file cannot be read, is damaged, or does not belong to ``belongs`` and the division.
     """
+    again = "remove it to have it made anew"
     refuse_irregular(path, "remove it")
-    with refused_if_damaged(path):
+    with refused_if_damaged(path, "is no block", again):
         tensors, metadata = read_tensors(path)
         found = json.loads(metadata[KEY])
-        about, theirs = dict(found["about"]), dict(found["belongs"])
+        about, theirs = found["about"], dict(found["belongs"])
+        steps, seconds, held = int(about["steps"]), float(about["seconds"]), int(about["held"])
+        failed = None if about["failed"] is None else str(about["failed"])
     different = [name for name in belongs if theirs.get(name) != belongs[name]]
     if different:
         raise ClodError(f"{path}: is of a run with another {different[0]}; remove it, or give --out another name")
-    possible = {name: tensor.isfinite() for name, tensor in tensors.items()}
-    if (logits := tensors.get("opacity_logits")) is not None:  # files in the wild have +inf: fully opaque
-        possible["opacity_logits"] |= logits == math.inf
-    if not all(bool(each.all()) for each in possible.values()):
-        raise ClodError(f"{path}: holds a value that is not finite; remove it to have it made anew")
-    return tensors, about
-
-
-@contextmanager
-def refused_if_damaged(path: Path) -> Iterator[None]:
-    """Turns errors of reading a file, raised within, into a ClodError that names it."""
-    try:
-        yield
-    except OSError as error:
-        raise ClodError(f"{path}: cannot be read ({error.strerror or error}); check the path") from error
-    except MemoryError:  # of a file that is whole
-        raise
-    except Exception as error:  # SafetensorError, and anything that a crafted file provokes
-        raise ClodError(f"{path}: is no block or damaged ({error!r}); remove it to have it made anew") from error
-
-
-def checked(path: Path, tensors: dict[str, Tensor], shapes: dict[str, tuple[torch.dtype, tuple[int, ...]]]) -> None:
-    """Refuses a file whose tensors are not those of ``shapes``; raises ClodError."""
-    found = {name: (tensor.dtype, tuple(tensor.shape)) for name, tensor in tensors.items()}
-    wrong = [name for name in {**found, **shapes} if found.get(name) != shapes.get(name)]
-    if wrong:
-        raise ClodError(f"{path}: its {wrong[0]} is not that of this scene; remove it to have it made anew")
+    rows = division.rows(block)
+    shapes = {name: (len(rows), *value.shape[1:]) for name, value in division.initial.tensors().items()}
+    for name in {"sigma_d": None, **tensors}:
+        value = tensors.get(name)
+        if value is None or value.dtype != torch.float32 or value.shape != shapes.get(name):
+            raise ClodError(f"{path}: its {name} is not that of this scene; {again}")
+        opaque = value == math.inf if name == "opacity_logits" else False  # files in the wild have these logits
+        if not bool((value.isfinite() | opaque).all()):
+            raise ClodError(f"{path}: holds a value that is not finite; {again}")
+    return Learned(rows, {name: value.to(rows.device) for name, value in tensors.items()}, steps, seconds, failed, held)

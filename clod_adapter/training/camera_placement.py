@@ -18,11 +18,14 @@ that its projected area times its probability is what it was: surfaces are cover
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
+from functools import partial
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from clod_adapter.adapter import detach
@@ -47,14 +50,6 @@ FAR = 4.0  # cameras stand at most this many times as far away as the scene is l
 VISIBLE = 0.05  # Gaussians of lower opacity are ignored
 SAMPLE = 200_000  # Gaussians that are rendered, about
 ROUNDS = 30  # of the search for the probabilities, whose sum is then SAMPLE to a thousandth
-
-
-@dataclass(frozen=True)
-class Candidate:
-    """A camera and its score (larger is better, no unit)."""
-
-    camera: Camera
-    score: float
 
 
 @torch.inference_mode(False)
@@ -92,7 +87,10 @@ def place_cameras(
             found += placement.round(VIEWS)
         except ClodError:  # what is left cannot be shown
             break
-    return [_resized(camera, WIDTH, HEIGHT, k) for k, camera in enumerate(found)]
+    for k, camera in enumerate(found):
+        K = _intrinsics(float(camera.K[0, 0]) / camera.width, WIDTH, HEIGHT)
+        found[k] = replace(camera, K=K, width=WIDTH, height=HEIGHT, name=f"placed_{k:03}")
+    return found
 
 
 class _Placement:
@@ -115,23 +113,52 @@ class _Placement:
             ClodError: none sees anything.
         """
         tries, start = TRIES * views, self.judged
-        judged: list[Candidate] = []
+        scored: list[tuple[float, Camera]] = []
 
-        def judge(cameras: Iterable[Camera]) -> None:
+        def ranked(cameras: Iterable[Camera]) -> list[tuple[float, Camera]]:
+            """These and the cameras before with their scores, the best first; none that are empty."""
             for camera in cameras:
-                judged.append(Candidate(camera, score(self.few, self.growth, camera)))
-                tell(self.progress, Phase.CAMERAS, start + len(judged), start + 2 * tries)
+                scored.append((score(self.few, self.growth, camera), camera))
+                tell(self.progress, Phase.CAMERAS, start + len(scored), start + 2 * tries)
+            return sorted((each for each in scored if each[0] > -math.inf), key=lambda each: -each[0])
 
-        weight = self.weight * self.hidden
-        judge(_towards(self.few.means, weight / largest_scale(self.few).clamp(min=1e-12), tries, self.reach, self.zoom,
-                       self.generator))  # fmt: skip
-        good = _best(judged, math.inf, max(round(BEST * tries), 1))
+        good = ranked(self._towards(tries))[: max(round(BEST * tries), 1)]
         if not good:
             raise ClodError("no camera can be placed: the checkpoint is empty from every candidate camera")
-        judge(_beside(good, tries, self.reach, self.zoom, self.generator))
-        self.judged += len(judged)
-        good = _best(judged, good[-1].score, views)
-        return [c.camera for c in _spread(good, views, self.reach)]
+        least, found = good[-1][0], ranked(self._beside([camera for _, camera in good], tries))
+        self.judged += len(scored)
+        enough = max(views, sum(value >= least for value, _ in found))
+        return self._spread([camera for _, camera in found[:enough]], views)
+
+    def _towards(self, count: int) -> Iterator[Camera]:
+        """Cameras towards rows, preferably small opaque ones, from uniform directions, at half to twice the reach."""
+        means, random = self.few.means, partial(torch.rand, generator=self.generator)
+        # torch.multinomial has a limit of 2^24 weights.
+        interest = self.weight * self.hidden / largest_scale(self.few).clamp(min=1e-12)
+        ends = interest.double().cumsum(0).cpu()  # cameras are placed on the CPU
+        drawn = torch.searchsorted(ends, random(count, dtype=torch.float64) * ends[-1])
+        targets = means[drawn.clamp(max=len(means) - 1).to(means.device)].cpu()
+        sides = F.normalize(torch.randn(count, 3, generator=self.generator, dtype=torch.float32), dim=1)
+        away = self.reach * 2 ** (2 * random(count, 1, dtype=torch.float32) - 1)
+        for eye, target in zip(targets + away * sides, targets, strict=True):
+            yield _looking(eye, target, self.zoom)
+
+    def _beside(self, cameras: list[Camera], count: int) -> Iterator[Camera]:
+        """Cameras with random offsets of position and direction from these, each in turn."""
+        steps = STEP * torch.randn(count, 2, 3, generator=self.generator, dtype=torch.float32)
+        for camera, (turn, step) in zip(itertools.cycle(cameras), steps, strict=False):
+            eye = camera.position + self.reach * step
+            yield _looking(eye, eye + self.reach * (camera.viewmat[2, :3] + turn), self.zoom)
+
+    def _spread(self, cameras: list[Camera], count: int) -> list[Camera]:
+        """``count`` of the cameras by farthest-point sampling of position and direction, from the first one."""
+        places = torch.stack([torch.cat([c.position / self.reach, c.viewmat[2, :3]]) for c in cameras])
+        taken = [0]
+        gap = (places - places[0]).norm(dim=1)
+        while len(taken) < min(count, len(cameras)):
+            taken.append(int(gap.argmax()))
+            gap = gap.minimum((places - places[taken[-1]]).norm(dim=1))
+        return [cameras[k] for k in taken]
 
     def shown_share(self, cameras: Sequence[Camera]) -> float:
         """The share of the Gaussians, by opacity, that these cameras and those before show: COVERED pixels or more."""
@@ -163,67 +190,19 @@ def _usable(gaussians: Gaussians) -> Tensor:
     return rows.nonzero()[:, 0]
 
 
-def _towards(
-    means: Tensor, interest: Tensor, count: int, reach: float, zoom: float, generator: torch.Generator
-) -> list[Camera]:
-    """Cameras towards Gaussians sampled by interest ``[n]``, from uniform directions, at half to twice the reach."""
-    # torch.multinomial has a limit of 2^24 weights.
-    ends = interest.double().cumsum(0).cpu()  # cameras are placed on the CPU
-    drawn = torch.searchsorted(ends, torch.rand(count, generator=generator, dtype=torch.float64) * ends[-1])
-    targets = means[drawn.clamp(max=len(means) - 1).to(means.device)].cpu()
-    sides = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator, dtype=torch.float32), dim=1)
-    away = reach * 2 ** (2 * torch.rand(count, 1, generator=generator, dtype=torch.float32) - 1)
-    return [_looking(eye, target, zoom) for eye, target in zip(targets + away * sides, targets, strict=True)]
-
-
-def _beside(
-    candidates: list[Candidate], count: int, reach: float, zoom: float, generator: torch.Generator
-) -> list[Camera]:
-    """Cameras with random offsets of position and direction from the candidates, each in turn."""
-    steps = STEP * torch.randn(count, 2, 3, generator=generator, dtype=torch.float32)
-    cameras = []
-    for k in range(count):
-        camera = candidates[k % len(candidates)].camera
-        forward = camera.viewmat[2, :3] + steps[k, 0]
-        eye = camera.position + reach * steps[k, 1]
-        cameras.append(_looking(eye, eye + reach * forward, zoom))
-    return cameras
-
-
-def _best(judged: list[Candidate], least: float, count: int) -> list[Candidate]:
-    """By score: those of at least ``least``, or the first ``count`` if that is more, but no empty ones."""
-    ranked = sorted((c for c in judged if c.score > -math.inf), key=lambda c: -c.score)
-    return ranked[: max(count, sum(c.score >= least for c in ranked))]
-
-
-def _spread(candidates: list[Candidate], count: int, reach: float) -> list[Candidate]:
-    """``count`` candidates by farthest-point sampling of position and direction, from the best one."""
-    places = torch.stack([torch.cat([c.camera.position / reach, c.camera.viewmat[2, :3]]) for c in candidates])
-    taken = [0]
-    gap = (places - places[0]).norm(dim=1)
-    while len(taken) < min(count, len(candidates)):
-        taken.append(int(gap.argmax()))
-        gap = gap.minimum((places - places[taken[-1]]).norm(dim=1))
-    return [candidates[k] for k in taken]
-
-
 def _looking(eye: Tensor, target: Tensor, zoom: float) -> Camera:
     """A camera for scoring. The up direction is unknown; COLMAP's y axis usually points down."""
-    forward = torch.nn.functional.normalize(target - eye, dim=0)
+    forward = F.normalize(target - eye, dim=0)
     down = torch.tensor([0.0, 1.0, 0.0] if abs(float(forward[1])) < 0.99 else [0.0, 0.0, 1.0], dtype=torch.float32)
-    right = torch.nn.functional.normalize(torch.linalg.cross(down, forward), dim=0)
+    right = F.normalize(torch.linalg.cross(down, forward), dim=0)
     viewmat = torch.eye(4, dtype=torch.float32)
     viewmat[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward])
     viewmat[:3, 3] = -viewmat[:3, :3] @ eye
-    width, height = LOOK
-    K = torch.tensor([[zoom * width, 0, width / 2], [0, zoom * width, height / 2], [0, 0, 1.0]], dtype=torch.float32)
-    return Camera(viewmat, K, width, height, near=near_plane(float((target - eye).norm())))
+    return Camera(viewmat, _intrinsics(zoom, *LOOK), *LOOK, near=near_plane(float((target - eye).norm())))
 
 
-def _resized(camera: Camera, width: int, height: int, number: int) -> Camera:
-    focal = float(camera.K[0, 0]) / camera.width * width
-    K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]], dtype=torch.float32)
-    return Camera(camera.viewmat, K, width, height, f"placed_{number:03}", camera.near)
+def _intrinsics(zoom: float, width: int, height: int) -> Tensor:
+    return torch.tensor([[zoom * width, 0, width / 2], [0, zoom * width, height / 2], [0, 0, 1.0]], dtype=torch.float32)
 
 
 def _zoom(field: float) -> float:

@@ -10,14 +10,13 @@ from __future__ import annotations
 import io
 import math
 import os
-import pickle
 import re
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import timedelta
 from functools import partial
-from typing import TYPE_CHECKING, Any, TypeVar, cast
+from typing import TYPE_CHECKING, TypeVar, cast
 
 import torch
 import torch.distributed as dist
@@ -34,6 +33,7 @@ T = TypeVar("T")
 
 # A process that does not answer for so long counts as lost. The first one may be evaluating or saving meanwhile.
 PATIENCE = timedelta(minutes=10)
+CHUNK = 1 << 28  # bytes sent at a time
 OLDEST = "2.9"  # torch
 
 
@@ -128,18 +128,21 @@ class ProcessGroup:
 
     def broadcast(self, value: T) -> T:
         """The first process's value, with its tensors on the CPU; the argument of the others is ignored."""
-        tensors: list[Tensor] = []
+        file = io.BytesIO()
         self._meet()
         with self._exchange():
-            about: list[Any] = [None, None]
             if self.rank == 0:
-                about = [_without_tensors(value, tensors), [(t.shape, t.dtype) for t in tensors]]
-            dist.broadcast_object_list(about, device=torch.device("cpu"))
-            if self.rank > 0:
-                tensors = [torch.empty(shape, dtype=dtype) for shape, dtype in about[1]]
-            for tensor in filter(Tensor.numel, tensors):
-                dist.broadcast(tensor.view(-1).view(torch.uint8), 0)  # a type that every backend has
-        return value if self.rank == 0 else _with_tensors(about[0], tensors)
+                torch.save(value, file)
+            size = torch.tensor([len(file.getbuffer())])
+            dist.broadcast(size, 0)
+            sent = torch.empty(int(size), dtype=torch.uint8)
+            if self.rank == 0:
+                sent = torch.frombuffer(file.getbuffer(), dtype=torch.uint8)
+            for part in sent.split(CHUNK):
+                dist.broadcast(part, 0)
+        if self.rank == 0:
+            return value
+        return cast(T, torch.load(io.BytesIO(sent.numpy()), map_location="cpu", weights_only=False))
 
     def _meet(self, said: Tensor | None = None, how: str = "SUM") -> None:
         """Waits for all processes and reduces a few numbers, on the CPU: gloo reports a lost process at once."""
@@ -220,28 +223,3 @@ def _losses() -> Iterator[None]:
     except RuntimeError as error:
         what = re.sub(r"^\[[^]]*\] *", "", str(error).partition("\n")[0]).partition(". ")[0]
         raise ProcessLost(f"a process of the group has ended ({what})") from error
-
-
-def _without_tensors(value: Any, tensors: list[Tensor]) -> bytes:
-    """A pickle of ``value`` with numbers in place of its tensors, which are appended to ``tensors``."""
-
-    class Pickler(pickle.Pickler):
-        def persistent_id(self, found: Any) -> int | None:
-            if not isinstance(found, Tensor):
-                return None
-            tensors.append(found.detach().cpu().contiguous())
-            return len(tensors) - 1
-
-    file = io.BytesIO()
-    Pickler(file).dump(value)
-    return file.getvalue()
-
-
-def _with_tensors(pickled: bytes, tensors: list[Tensor]) -> Any:
-    """The inverse of ``_without_tensors``."""
-
-    class Unpickler(pickle.Unpickler):
-        def persistent_load(self, number: int) -> Tensor:
-            return tensors[number]
-
-    return Unpickler(io.BytesIO(pickled)).load()

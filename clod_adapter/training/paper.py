@@ -81,8 +81,6 @@ class PaperDial(Dial):
     def objective(self, loss: Tensor, shown: Gaussians, camera: Camera, virtual_scale: float) -> Tensor:
         if self.config.reg_weight > 0 and virtual_scale >= 1:
             dialled = dial(shown, camera, virtual_scale)
-            if self.part.full_context:  # only the trained rows have a dial
-                dialled = Attenuated(*(each[: self.part.trained] for each in dialled))
             loss = loss + paper_count(dialled, virtual_scale, self.attenuation.tau, self.config, self.part.total)
         return self.weight(virtual_scale) * loss
 

@@ -11,7 +11,6 @@ from clod_adapter.blocks.divide import (
     LEFT_OUT,
     Division,
     block_config,
-    block_span,
     block_target,
     context_rows,
     divide,
@@ -77,13 +76,13 @@ def test_a_block_has_the_views_that_see_it(divided: Division) -> None:
     assert division.views(0) == [0, 1, 2] and division.views(1) == [3]
     assert division.steps(0, CONFIG) == 90 and division.steps(1, CONFIG) == 30
     config = replace(CONFIG, time_budget=8.0)
-    passes = [[block_config(division, k, config, first=first) for first in (True, False)] for k in (0, 1)]
-    assert [[each.steps for each in both] for both in passes] == [[68, 22], [22, 8]]
-    spans = [[block_span(division, k, config, first=first) for first in (True, False)] for k in (0, 1)]
-    assert spans == [[(0.0, 1 - 22 / 90), (1 - 22 / 90, 1.0)], [(0.0, 1 - 8 / 30), (1 - 8 / 30, 1.0)]]
-    assert sum(each.time_budget for both in passes for each in both) == pytest.approx(8.0)
+    passes = [block_config(division, k, config, first=first) for k in (0, 1) for first in (True, False)]
+    assert [each.steps for each, _ in passes] == [68, 22, 22, 8]
+    spans = [(0.0, 1 - 22 / 90), (1 - 22 / 90, 1.0), (0.0, 1 - 8 / 30), (1 - 8 / 30, 1.0)]
+    assert [span for _, span in passes] == spans
+    assert sum(each.time_budget for each, _ in passes) == pytest.approx(8.0)
     whole = replace(CONFIG, seed=2**63 - 1)
-    seeds = {block_config(divided, k, whole, first=first).seed for k in range(BLOCKS) for first in (True, False)}
+    seeds = {block_config(divided, k, whole, first=first)[0].seed for k in range(BLOCKS) for first in (True, False)}
     assert len(seeds) == 2 * BLOCKS and whole.seed not in seeds
     torch.testing.assert_close(divided.seen.sum(1), torch.ones(len(divided.seen)))
 

@@ -20,7 +20,6 @@ from safetensors.torch import load_file
 import clod_adapter
 from clod_adapter.cli.adapt import listeners, run
 from clod_adapter.cli.shared import measure, pages
-from clod_adapter.training import planner
 from clod_adapter.training.state import load_state
 from runs import OUTPUTS, STATE, Launched, Server, launch, log_of, names, pressing, wait_for
 from scenes import stripped

@@ -139,7 +139,7 @@ def assert_others_are_refused(adapt: Any, first: Path, second: Path) -> None:
     refused(f"{second.name}: is of a run with another block")
     second.unlink()
     first.write_bytes(content[:-9])
-    refused(f"{first.name}: is no block or damaged")
+    refused(f"{first.name}: is no block or is damaged")
     first.write_bytes(content)
 
 
