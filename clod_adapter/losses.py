@@ -69,34 +69,28 @@ def unit(photograph: Tensor, like: Tensor) -> Tensor:
     return photograph.to(like.device, non_blocking=like.device.type != "cpu").to(like.dtype) / 255
 
 
-def _compare(image: Tensor, target: Tensor, l1: float, dssim: float) -> tuple[Tensor, float, float]:
-    """The gradient of ``l1 sum |x - y| - dssim sum SSIM`` with respect to the image, ``sum |x - y|``, and ``sum SSIM``.
-
-    One fused pass on the CPU.
-    """
-    from clod_adapter._kernels import ssim as kernels
-    from clod_adapter._kernels import threads
-    from clod_adapter._kernels.memory import recycled
-
-    (height, width, _), workers = image.shape, threads.worker_count()
-    shape = (3, height, kernels.stride(width))
-    x, y, similarity, *slopes = (recycled(shape).numpy() for _ in range(6))
-    for plane in (x, y):
-        plane[:, :, kernels.PAD + width :] = 0  # lanes beyond the image; the margins of the other planes are not read
-    sums, differences = np.zeros(workers), np.zeros(workers)
-    out = torch.empty(height, width, 3, dtype=torch.float32, device="cpu")
-    threads.run(kernels.to_planes, workers, image.detach().contiguous().numpy(), target.contiguous().numpy(), x, y)
-    threads.run(kernels.ssim_map, workers, x, y, width, similarity, *slopes, sums)
-    threads.run(kernels.loss_gradient, workers, x, y, width, *slopes, l1, dssim, out.numpy(), differences)
-    return out, float(differences.sum()), float(sums.sum())
-
-
 class _FusedLoss(torch.autograd.Function):
+    """``photometric_loss`` on the CPU in float32, with its gradient, in one pass."""
+
     @staticmethod
     def forward(ctx: Any, image: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
+        from clod_adapter._kernels import ssim as kernels
+        from clod_adapter._kernels import threads
+        from clod_adapter._kernels.memory import recycled
+
         l1, dssim = (1 - ssim_weight) / image.numel(), ssim_weight / image.numel()
-        gradient, difference, similarity = _compare(image, target, l1, dssim)
+        (height, width, _), workers = image.shape, threads.worker_count()
+        shape = (3, height, kernels.stride(width))
+        x, y, similarities, *slopes = (recycled(shape).numpy() for _ in range(6))
+        for plane in (x, y):
+            plane[:, :, kernels.PAD + width :] = 0  # lanes beyond the image; margins of the other planes are not read
+        sums, differences = np.zeros(workers), np.zeros(workers)
+        gradient = torch.empty(height, width, 3, dtype=torch.float32, device="cpu")
+        threads.run(kernels.to_planes, workers, image.detach().contiguous().numpy(), target.contiguous().numpy(), x, y)
+        threads.run(kernels.ssim_map, workers, x, y, width, similarities, *slopes, sums)
+        threads.run(kernels.loss_gradient, workers, x, y, width, *slopes, l1, dssim, gradient.numpy(), differences)
         ctx.save_for_backward(gradient)
+        difference, similarity = float(differences.sum()), float(sums.sum())
         return torch.tensor(l1 * difference + ssim_weight - dssim * similarity, dtype=torch.float32)
 
     @staticmethod

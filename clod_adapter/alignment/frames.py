@@ -84,11 +84,6 @@ def into_file(viewmats: Tensor, rotation: Tensor, scale: float, offset: Tensor) 
     return out
 
 
-def centres_of(viewmats: Tensor) -> Tensor:
-    """``[V, 3]`` camera centres."""
-    return torch.linalg.inv(viewmats)[:, :3, 3]
-
-
 def focus_of(viewmats: Tensor, rounds: int = 1) -> Tensor:
     """``[3]`` the least-squares point closest to the optical axes; the mean centre if they are parallel.
 
@@ -106,11 +101,6 @@ def focus_of(viewmats: Tensor, rounds: int = 1) -> Tensor:
         away = (across @ (focus - centres)[:, :, None]).flatten(1).norm(dim=1)
         weights = 1 / away.clamp(min=max(0.01 * float(away.median()), 1e-9))
     return focus
-
-
-def median(rows: Tensor) -> Tensor:
-    """Median of each column, with numpy's mean of the middle two."""
-    return rows.quantile(0.5, dim=0)
 
 
 POSES = (
@@ -164,7 +154,7 @@ def _gsplat(viewmats: Tensor, points: Tensor | None) -> Iterator[Frame]:
     poses = torch.linalg.inv(viewmats)
     rotation = _turning(-poses[:, :3, 1].mean(0), viewmats.new_tensor([0.0, -1, 0]))
     centres, forward = poses[:, :3, 3] @ rotation.T, poses[:, :3, 2] @ rotation.T
-    focus = median(centres - (forward * centres).sum(1, keepdim=True) * forward)
+    focus = (centres - (forward * centres).sum(1, keepdim=True) * forward).quantile(0.5, dim=0)  # as numpy's median
     distance = float((centres - focus).norm(dim=1).quantile(0.5))
     if distance == 0:
         return
@@ -172,7 +162,7 @@ def _gsplat(viewmats: Tensor, points: Tensor | None) -> Iterator[Frame]:
     if points is None or len(points) < 3:
         return
     turned = points.to(viewmats) @ rotation.T
-    middle = median(turned)
+    middle = turned.quantile(0.5, dim=0)
     axes = torch.linalg.eigh((turned - middle).T.cov()).eigenvectors.flip(1).T
     axes = axes * torch.linalg.det(axes).sign()
     for signs in ((1.0, 1, 1), (1.0, -1, -1), (-1.0, 1, -1), (-1.0, -1, 1)):  # eigenvectors have no sign

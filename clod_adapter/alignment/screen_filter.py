@@ -7,9 +7,9 @@ is chosen if it is clearly closer to the photographs than the expected one.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from statistics import fmean
 
 import torch
 from torch import Tensor
@@ -33,8 +33,7 @@ class FilterComparison:
 
     Attributes:
         psnr: dB by name in FILTERS, mean over the views.
-        expected: name of the filter used unless another is clearly better.
-        chosen: name of the filter for rendering.
+        expected, chosen: names of the filter used unless another is clearly better, and of that for rendering.
     """
 
     psnr: dict[str, float]
@@ -59,9 +58,15 @@ def compare_filters(gaussians: Gaussians, views: Sequence[View], expected: str =
         expected: name of the filter used unless another is clearly better.
     """
     views = spread(views, MOST_VIEWS)
-    errors = {name: _errors(gaussians.replace(screen_filter=each), views) for name, each in FILTERS.items()}
-    psnr = {name: _decibels(table) for name, table in errors.items()}
-    constant = _constant(views)
+    photographs = [unit(view.image, gaussians.means) for view in views]
+    constant = fmean(float((image - image.mean((0, 1))).square().mean()) for image in photographs)
+    errors, psnr = dict[str, Tensor](), dict[str, Tensor]()
+    for name, each in FILTERS.items():
+        filtered = gaussians.replace(screen_filter=each)
+        pictures = [render(filtered, view.camera).image.clamp(0, 1) for view in views]
+        pairs = zip(pictures, photographs, strict=True)
+        errors[name] = torch.stack([(image - photograph).square().mean() for image, photograph in pairs])
+        psnr[name] = -10 * errors[name].clamp(min=1e-10).log10()
     clear = [
         name
         for name in FILTERS
@@ -71,21 +76,3 @@ def compare_filters(gaussians: Gaussians, views: Sequence[View], expected: str =
     ]
     means = {name: float(each.mean()) for name, each in psnr.items()}
     return FilterComparison(means, expected, max(clear, key=means.__getitem__, default=expected))
-
-
-def _errors(gaussians: Gaussians, views: Sequence[View]) -> Tensor:
-    """``[views]`` mean squared errors of the clamped renders."""
-    pictures = [render(gaussians, view.camera).image.clamp(0, 1) for view in views]
-    return torch.stack(
-        [(image - unit(view.image, image)).square().mean() for view, image in zip(views, pictures, strict=True)]
-    )
-
-
-def _constant(views: Sequence[View]) -> float:
-    """Mean squared error of each photograph's mean colour."""
-    pixels = [view.image.float() / 255 for view in views]
-    return math.fsum(float((image - image.mean((0, 1))).square().mean()) for image in pixels) / len(pixels)
-
-
-def _decibels(errors: Tensor) -> Tensor:
-    return -10 * errors.clamp(min=1e-10).log10()

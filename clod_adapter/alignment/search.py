@@ -16,7 +16,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from clod_adapter.alignment.check import CLEAR, DOUBTFUL, Alignment, check_alignment, compare_renders
-from clod_adapter.alignment.frames import Frame, centres_of, focus_of, known_frames
+from clod_adapter.alignment.frames import Frame, focus_of, known_frames
 from clod_adapter.cameras import Camera, Scene, View, in_its_unit, spread, with_near_planes
 from clod_adapter.gaussians import Gaussians
 
@@ -70,7 +70,7 @@ def guess_frame(
     small = _Stage(gaussians, views, *COARSE)
 
     def measured(frame: Frame) -> Guess | None:
-        psnr = check_alignment(gaussians, [moved(view, frame) for view in views]).psnr
+        psnr = check_alignment(gaussians, in_file(views, frame)).psnr
         enough = max(found.mean_colour_psnr + BETTER_THAN_MEAN, found.psnr + CLEAR)
         return Guess(frame, psnr, psnr >= found.mean_colour_psnr + DOUBTFUL) if psnr >= enough else None
 
@@ -81,9 +81,9 @@ def guess_frame(
     return measured(searched) if searched else None
 
 
-def moved(view: View, frame: Frame) -> View:
-    """The photograph with its camera in the file's frame."""
-    return view.at(camera_in(view.camera, frame))
+def in_file(views: Sequence[View], frame: Frame) -> tuple[View, ...]:
+    """The photographs with their cameras in the file's frame."""
+    return tuple(view.at(camera_in(view.camera, frame)) for view in views)
 
 
 def camera_in(camera: Camera, frame: Frame) -> Camera:
@@ -94,8 +94,7 @@ def camera_in(camera: Camera, frame: Frame) -> Camera:
 
 def scene_in(scene: Scene, frame: Frame) -> Scene:
     """The scene with its cameras in the file's frame, and the near planes of that frame's unit."""
-    train, test = (tuple(moved(view, frame) for view in views) for views in (scene.train, scene.test))
-    return in_its_unit(replace(scene, train=train, test=test))
+    return in_its_unit(replace(scene, train=in_file(scene.train, frame), test=in_file(scene.test, frame)))
 
 
 def cameras_in(cameras: Sequence[Camera], frame: Frame) -> list[Camera]:
@@ -116,7 +115,7 @@ class _Stage:
 
     def score(self, frame: Frame) -> float:
         """Correlation in [-1, 1] of the photographs with renders in this frame."""
-        views = [moved(view, frame) for view in self.views]
+        views = in_file(self.views, frame)
         rows = [row for view in views if (row := compare_renders(self.gaussians, view)) is not None]
         if not rows:
             return -1.0
@@ -133,7 +132,7 @@ def _search(gaussians: Gaussians, views: Sequence[View], small: _Stage, viewmats
     middle, found = gaussians.means.double().median(dim=0).values.cpu(), []  # where cameras are
     for towards, rounds in ((0.0, 1), (1.0, 1), (1.0, ROUNDS)):
         focus = focus_of(viewmats, rounds)
-        unit = float((centres_of(viewmats) - focus).norm(dim=1).quantile(0.5).clamp(min=1e-9))
+        unit = float((torch.linalg.inv(viewmats)[:, :3, 3] - focus).norm(dim=1).quantile(0.5).clamp(min=1e-9))
         places = [_placed(scale, towards * (focus - scale * middle), unit) for scale in SCALES]
         found.append((*_climb(small, max(places, key=small.score), focus, unit, (0.1, 0.02)), focus, unit))
     score, frame, focus, unit = max(found, key=lambda start: start[0])

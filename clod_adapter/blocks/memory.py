@@ -71,15 +71,13 @@ def plan_for_limit(needs: MemoryEstimate, limit: int) -> MemoryPlan:
     Raises:
         ClodError: no number of blocks is enough; the message gives the least memory.
     """
-    most = min(MOST_BLOCKS, max(needs.count, 1))
-    plans = (_plan(needs, limit, blocks) for blocks in range(1, most + 1))
-    plan = next((plan for plan in plans if plan.peak <= limit), _plan(needs, limit, 1))
-    if plan.peak > limit:
-        raise ClodError(
-            f"--memory is {in_words(limit)}, and {needs.count:,} Gaussians take at least {in_words(least(needs))}, "
-            "however small the blocks; give that"
-        )
-    return plan
+    for blocks in range(1, min(MOST_BLOCKS, max(needs.count, 1)) + 1):
+        if (plan := _plan(needs, limit, blocks)).peak <= limit:
+            return plan
+    raise ClodError(
+        f"--memory is {in_words(limit)}, and {needs.count:,} Gaussians take at least {in_words(least(needs))}, "
+        "however small the blocks; give that"
+    )
 
 
 def least(needs: MemoryEstimate) -> int:
@@ -93,14 +91,11 @@ def least(needs: MemoryEstimate) -> int:
 def _plan(needs: MemoryEstimate, limit: int, blocks: int) -> MemoryPlan:
     count, cache = needs.count, min(needs.images, int(IMAGES * limit))
     always = PROCESS + cache + needs.pictures + PIXEL * needs.pixels
+    held = needs.attributes
+    train = always + count * (held + DRAWN + TRAINED)
     if blocks > 1:  # a block has target images of its own
-        cache = min(needs.images + needs.pictures, int(IMAGES * limit))
+        cache, held = min(needs.images + needs.pictures, int(IMAGES * limit)), held + 8
         always += cache
-    if blocks == 1:
-        held = needs.attributes
-        train = always + count * (held + DRAWN + TRAINED)
-    else:
-        held = needs.attributes + 8
         train = always + count * (held + MERGED + needs.attributes + DRAWN) + math.ceil(count / blocks) * TRAINED
     base = PROCESS + count * (needs.row + 2 * needs.attributes)
     start = always + count * (held + max(DRAWN, ORDERED))

@@ -151,8 +151,14 @@ def _initialized_from(lean: Gaussians, resume: TrainingState, config: AdaptConfi
 
 def _train(trainer: Trainer, progress: Listener | None) -> Adapted:
     """Steps until the steps or the time budget are used up, or something ends training early."""
-    group, before, lost, failed = trainer.group, _waits(trainer.group), None, None
+    group, lost, failed = trainer.group, None, None
     began, going = time.perf_counter() - trainer.seconds, True
+    before = (group.waiting, group.exchanging) if group else (0.0, 0.0)
+
+    def tell(error: str | None = None) -> bool:
+        """Whether the listener wants training to go on."""
+        return progress is None or progress(_progress(trainer, trainer.seconds, error)) is not False
+
     with DeferredInterrupt() as interrupt:
         try:
             while True:
@@ -162,39 +168,34 @@ def _train(trainer: Trainer, progress: Listener | None) -> Adapted:
                     share, going = group.agree(share, going)
                 if share >= 1 or not going:
                     break
-                _step(trainer, share, progress, began + (trainer.config.time_budget or math.inf))
+                try:
+                    trainer.step(share, began + (trainer.config.time_budget or math.inf))
+                except (ProcessLost, LossNotFinite):
+                    raise
+                except Exception as error:  # the listener can save the state
+                    if trainer.done > 0:
+                        tell(str(error) or type(error).__name__)
+                    raise
                 trainer.seconds = time.perf_counter() - began
                 interrupt.begin()  # from here on there is a result
-                going = _tell(trainer, progress) and not interrupt.received
+                going = tell() and not interrupt.received
         except ProcessLost as error:
             going, lost = False, str(error)
-            _tell(trainer, progress, lost)
+            tell(lost)
         except LossNotFinite as error:
             if trainer.done == 0:
                 more = largest_colour(trainer.gaussians())
                 raise ClodError(f"{error}, so nothing can be learned; {more}") from error
             going, failed = False, str(error)
-            _tell(trainer, progress, failed)
+            tell(failed)
         trainer.seconds = time.perf_counter() - began
         seen = trainer.gate.finish() if trainer.gate and not lost else None
-        waiting, exchanging = (after - then for after, then in zip(_waits(group), before, strict=True))
+        waited = (group.waiting - before[0], group.exchanging - before[1]) if group else (0.0, 0.0)
         adapted = Adapted(
-            trainer.gaussians(), trainer.done, trainer.seconds, trainer.start_seconds, not going, lost, waiting,
-            exchanging, failed, int(trainer.held.sum()), watched=seen,
+            trainer.gaussians(), trainer.done, trainer.seconds, trainer.start_seconds, not going, lost, *waited,
+            failed, int(trainer.held.sum()), watched=seen,
         )  # fmt: skip
     return replace(adapted, interrupted=adapted.interrupted or interrupt.received, signalled=interrupt.received)
-
-
-def _step(trainer: Trainer, share: float, progress: Listener | None, until: float) -> None:
-    """One step; an error of it that nothing handles is told to the listener first, so that it can save the state."""
-    try:
-        trainer.step(share, until)
-    except (ProcessLost, LossNotFinite):
-        raise
-    except Exception as error:
-        if trainer.done > 0:
-            _tell(trainer, progress, str(error) or type(error).__name__)
-        raise
 
 
 def _progress(trainer: Trainer, seconds: float, error: str | None = None) -> Progress:
@@ -203,12 +204,3 @@ def _progress(trainer: Trainer, seconds: float, error: str | None = None) -> Pro
         Phase.TRAINING, trainer.done, trainer.config.steps, seconds, seconds / budget if budget else 0.0, trainer.loss,
         trainer.gaussians, trainer.state, error,
     )  # fmt: skip
-
-
-def _tell(trainer: Trainer, progress: Listener | None, error: str | None = None) -> bool:
-    """Whether the listener wants training to go on."""
-    return progress is None or progress(_progress(trainer, trainer.seconds, error)) is not False
-
-
-def _waits(group: ProcessGroup | None) -> tuple[float, float]:
-    return (group.waiting, group.exchanging) if group else (0.0, 0.0)

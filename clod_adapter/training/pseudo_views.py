@@ -113,8 +113,9 @@ def render_pseudo_views(gaussians: Gaussians, cameras: Sequence[Camera], *, prog
     for k in held_out:
         test.append(View(cameras[k], render(teacher, cameras[k]).pixels.cpu()))
         tell(progress, Phase.PSEUDO_VIEWS, len(test), len(held_out))
+    size = f"{cameras[0].width}x{cameras[0].height}, {_field(cameras[0]):.0f} degrees wide"
     note = (
-        f"no photographs: {len(train)} pseudo views to train on, {len(test)} held out, {_describe(cameras)}; the "
+        f"no photographs: {len(train)} pseudo views to train on, {len(test)} held out, {size}; the "
         "checkpoint is the teacher, and all numbers compare with its renderings, not with photographs"
     )
     return Scene(train, tuple(test), (note,))
@@ -186,16 +187,12 @@ def reaches(gaussians: Gaussians, cameras: Sequence[Camera]) -> list[float]:
 
 def teachers_to(views: Sequence[View], device: str) -> tuple[View, ...]:
     """The views with their teachers on ``device``: equal ones once, as a checkpoint is large."""
-    there: dict[int, Gaussians] = {}
-    found = list[View]()
-    for view in views:
-        if isinstance(view, PseudoView):
-            if id(view.teacher) not in there:
-                there[id(view.teacher)] = view.teacher.to(device)
-            teacher = there[id(view.teacher)]
-            view = PseudoView(view.camera, teacher, view.reach, view.backed)
-        found.append(view)
-    return tuple(found)
+    own = {id(view.teacher): view.teacher for view in views if isinstance(view, PseudoView)}
+    there = {number: teacher.to(device) for number, teacher in own.items()}
+    return tuple(
+        PseudoView(view.camera, there[id(view.teacher)], view.reach, view.backed)
+        if isinstance(view, PseudoView) else view for view in views
+    )  # fmt: skip
 
 
 def shown(gaussians: Gaussians, photographs: Sequence[View], cameras: Sequence[Camera]) -> float:
@@ -210,12 +207,6 @@ def shown(gaussians: Gaussians, photographs: Sequence[View], cameras: Sequence[C
         times += covered(view.camera) > least
     seen = reduce(torch.add, map(covered, cameras))
     return float(seen[times >= TIMES].sum() / seen.sum().clamp(min=1e-9))
-
-
-def _describe(cameras: Sequence[Camera]) -> str:
-    if not cameras:
-        return "no images"
-    return f"{cameras[0].width}x{cameras[0].height}, {_field(cameras[0]):.0f} degrees wide"
 
 
 def _field(camera: Camera) -> float:
