@@ -66,9 +66,7 @@ class Run(Protocol):
     group: ProcessGroup | None
     parameters: dict[str, Tensor]
 
-    def image(self, parameters: dict[str, Tensor], camera: Camera, s: float, halved: bool) -> Tensor: ...
-
-    def undialled(self, camera: Camera, halved: bool) -> Tensor: ...
+    def image(self, parameters: dict[str, Tensor] | None, camera: Camera, halved: bool) -> Tensor: ...
 
     def trained(self) -> dict[str, Tensor]: ...
 
@@ -106,9 +104,19 @@ class Gate:
     def check(self, share_done: float) -> None:
         """Checks the parameters if it is time to."""
         made = int(self.numbers[2])
-        if made < len(CHECKS) and share_done >= CHECKS[made]:
-            self.numbers[2] = sum(share_done >= due for due in CHECKS)
-            self._judge(self._loss(self.trainer.parameters))
+        if made == len(CHECKS) or share_done < CHECKS[made]:
+            return
+        self.numbers[2] = sum(share_done >= due for due in CHECKS)
+        loss = self._loss(self.trainer.parameters)
+        best, last, self.numbers[3] = float(self.numbers[0]), float(self.numbers[3]), loss
+        if loss <= best + WORSE:
+            self.numbers[0] = min(best, loss)
+            for name, value in self.trainer.trained().items():
+                self.good[name].copy_(value)
+        elif not loss <= best + RUINED or best + WORSE < last <= loss:  # the first also if it is NaN
+            self.numbers[1] += 1
+            self.numbers[3] = best
+            self.trainer.return_to(self.good)
 
     def finish(self) -> Watched:
         """Checks the result; one that is too bad is replaced by the last good state."""
@@ -124,17 +132,6 @@ class Gate:
         frozen = set(ATTRIBUTES) if self.rollbacks > HALVINGS else set()
         return {name: 0.0 if name in frozen else rate * 0.5**self.rollbacks for name, rate in rates.items()}
 
-    def _judge(self, loss: float) -> None:
-        best, last, self.numbers[3] = float(self.numbers[0]), float(self.numbers[3]), loss
-        if loss <= best + WORSE:
-            self.numbers[0] = min(best, loss)
-            for name, value in self.trainer.trained().items():
-                self.good[name].copy_(value)
-        elif not loss <= best + RUINED or best + WORSE < last <= loss:  # the first also if it is NaN
-            self.numbers[1] += 1
-            self.numbers[3] = best
-            self.trainer.return_to(self.good)
-
     def _loss(self, parameters: dict[str, Tensor]) -> float:
         """``decibels_below`` the base of these parameters at s = 1; in a group the first process's."""
         group = self.trainer.group
@@ -148,8 +145,4 @@ class Gate:
         """Of s = 1 of the parameters, or of the base without a dial."""
         small = view.camera.halvable
         view = view.halved() if small else view
-        if parameters is None:
-            image = self.trainer.undialled(view.camera, small)
-        else:
-            image = self.trainer.image(parameters, view.camera, 1.0, small)
-        return squared_error(image, view)
+        return squared_error(self.trainer.image(parameters, view.camera, small), view)

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from clod_adapter._kernels.threads import torch_on_one_thread
-from clod_adapter.adapter import ATTRIBUTES
+from clod_adapter.adapter import ATTRIBUTES, detach
 from clod_adapter.cameras import Camera, View
 from clod_adapter.config import AdaptConfig
 from clod_adapter.equation.units import in_world_units
@@ -131,8 +131,9 @@ class Trainer:
         (view, s, counted, halved), first = sample, slice(self.count)
         leaves = {name: value.detach().requires_grad_(name in self.stepped) for name, value in self.parameters.items()}
         shown = self._shown(leaves, halved)
-        kept = for_device(shown.means.device).kept(shown, view.camera, s)[first]
-        image = self._draw(shown, view.camera, s)
+        rasterizer = for_device(shown.means.device)
+        kept = rasterizer.kept(shown, view.camera, s)[first]
+        image = rasterizer.draw(shown, view.camera, s, trained=self.count)[0]
         loss = photometric_loss(image, view.image, self.config.ssim_weight)
         total = self.dial.objective(loss, shown, view.camera, s)
         found = torch.autograd.grad(total, [leaves[name] for name in self.stepped])
@@ -143,14 +144,14 @@ class Trainer:
             gradients[decay] = gradients[decay] + self.dial.count_gradient(logits, parameter, at, weighted)
         return GradientSum(gradients, kept, plain)
 
-    def image(self, parameters: dict[str, Tensor], camera: Camera, s: float, halved: bool) -> Tensor:
-        """The image ``[H, W, 3]`` of the parameters; ``halved`` if the camera is for images of half the size."""
-        return self._draw(self._shown(parameters, halved), camera, s)
+    def image(self, parameters: dict[str, Tensor] | None, camera: Camera, halved: bool) -> Tensor:
+        """The image ``[H, W, 3]`` of the parameters at s = 1; ``halved`` if the camera is for images of half the size.
 
-    def undialled(self, camera: Camera, halved: bool) -> Tensor:
-        """``image`` of the present parameters without a dial: before the first step it is the base's."""
-        shown = self._shown(self.parameters, halved)
-        return self._draw(shown.replace(sigma_d=None, growth_d=None, attenuation=None), camera, 1.0)
+        None: of the present ones without a dial, before the first step those of the base.
+        """
+        shown = self._shown(self.parameters if parameters is None else parameters, halved)
+        shown = detach(shown) if parameters is None else shown
+        return for_device(shown.means.device).draw(shown, camera, 1.0, trained=self.count)[0]
 
     def _shown(self, parameters: dict[str, Tensor], halved: bool = False) -> Gaussians:
         """Gaussians of these parameters, as they are drawn."""
@@ -161,9 +162,6 @@ class Trainer:
         assert found.sigma_d is not None
         growth_d = None if found.growth_d is None else _ending_in(0.0, found.growth_d, self.count)
         return found.replace(sigma_d=_ending_in(math.inf, found.sigma_d, self.count), growth_d=growth_d)
-
-    def _draw(self, shown: Gaussians, camera: Camera, s: float) -> Tensor:
-        return for_device(shown.means.device).draw(shown, camera, s, trained=self.count)[0]
 
     def _update(self, found: GradientSum, share_done: float) -> None:
         """Moves the rows whose gradients are finite; none if the loss is not, without asking which."""
