@@ -12,6 +12,8 @@ from typing import Any
 
 import pytest
 import torch
+import torch.distributed as dist
+from torch.torch_version import TorchVersion
 
 from clod_adapter.adapter import ATTRIBUTES, with_dial
 from clod_adapter.cameras import Scene
@@ -23,10 +25,11 @@ from clod_adapter.evaluation.evaluate import evaluate
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.importance import initialize, scene_distance
 from clod_adapter.progress import Phase, Progress, Stopped
+from clod_adapter.training.distributed import joined
 from clod_adapter.training.loop import Adapted, TrainingState, adapt
 from clod_adapter.training.plan import make_plan
 from runs import change_step, config_of, fail, states_of
-from scenes import assert_equal, gaussians, photograph, ring
+from scenes import assert_equal, capture, gaussians, photograph, ring
 
 Pair = tuple[Gaussians, Scene]
 Trained = tuple[Adapted, list[Progress]]
@@ -283,3 +286,25 @@ def test_a_bar_by_default(captured: Pair, monkeypatch: pytest.MonkeyPatch, capsy
     for progress in (False, lambda now: None):
         adapt(*captured, iters=2, progress=progress)
     assert capsys.readouterr().err == ""
+
+
+def test_a_group_of_one_changes_no_bit() -> None:
+    base, scene = capture(n=60, views=4)
+    config = AdaptConfig(iters=3, batch=2)
+    want = adapt(base, scene, config)
+    with joined(dist.HashStore(), 0, 1) as peers:
+        found = adapt(base, scene, config, group=peers)
+        assert_equal(found.gaussians, want.gaussians)
+        assert found.waiting > 0 and want.waiting == want.exchanging == 0 and found.lost is None
+        peers.size = 3
+        with pytest.raises(ClodError, match="batch is 2, it must be at least 3, a view for each of the processes"):
+            adapt(base, scene, config, group=peers)
+
+
+def test_several_processes_need_a_torch_that_does_not_hang(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch, "__version__", TorchVersion("2.6.0+cu124"))
+    with (
+        joined(dist.HashStore(), 0, 1),
+        pytest.raises(ClodError, match=r"need torch 2.9 or newer, and this is 2.6.0\+"),
+    ):
+        joined(dist.HashStore(), 0, 2).__enter__()
