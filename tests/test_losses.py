@@ -1,13 +1,17 @@
-"""The fused loss against plain torch, and the padding of SSIM; test_metrics.py has scikit-image's."""
+"""The fused loss against plain torch, and the PSNR and SSIM of reports against those of training."""
 
 from __future__ import annotations
+
+import math
 
 import pytest
 import torch
 from torch import Tensor
 
 from backends import torch_threads
+from clod_adapter import losses
 from clod_adapter.losses import photometric_loss, photometric_loss_plain
+from clod_adapter.metrics import psnr, psnr_ssim
 
 # Smaller than the window of 11, one larger, multiples of 16 and not.
 SIZES = [(1, 1), (3, 7), (11, 11), (12, 16), (33, 50), (17, 101)]
@@ -63,3 +67,30 @@ def test_threads_and_strides_change_nothing() -> None:
     assert all(map(torch.equal, value_and_gradient(photometric_loss, wide, turned, 0.2), want))
     _, scaled = value_and_gradient(lambda *a: 8 * photometric_loss(*a), image, target, 0.2)
     assert torch.equal(scaled, 8 * want[1])
+
+
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("darker", [1, 40])
+def test_training_and_report_metrics_agree(size: tuple[int, int], darker: int) -> None:
+    image, target = pair(*size)
+    target = target // darker
+    shown, photo = image.clamp(0, 1), target / 255
+    value, similarity = psnr_ssim(image.requires_grad_(), target)
+    assert value == psnr(image, target)
+    assert value == pytest.approx(losses.psnr(image, target), rel=1e-6)
+    fused = 1 - losses.photometric_loss(shown, target, 1.0).item()
+    plain = losses.ssim_plain(shown.double(), photo.double()).item()
+    assert similarity == pytest.approx(fused, abs=1e-5) and similarity == pytest.approx(plain, abs=1e-5)
+
+
+@pytest.mark.parametrize("function", [psnr, losses.psnr])
+def test_psnr_of_known_images(function) -> None:
+    black = torch.zeros(12, 12, 3, dtype=torch.uint8)
+    assert function(torch.full((12, 12, 3), 0.5), black) == pytest.approx(20 * math.log10(2), abs=1e-6)
+    image = torch.zeros(12, 12, 3)
+    assert function(image, black) == math.inf
+    image[3, 4, 1] = math.nan
+    assert math.isnan(function(image, black))
+    stripes = torch.tensor([0, 255], dtype=torch.uint8).repeat(6, 3)[..., None].expand(6, 6, 3).contiguous()
+    beyond = torch.where(stripes > 0, 7.0, -3.0)  # renders are clamped first
+    assert function(beyond, stripes) == math.inf and psnr_ssim(beyond, stripes)[1] == pytest.approx(1, abs=1e-6)
