@@ -65,33 +65,21 @@ class PseudoView(StoredView):
         return PseudoView, (self.camera, self.teacher, self.reach, self.backed)
 
     def moved(self, random: np.random.Generator) -> View:
-        """A view from a random camera near this one, or behind it; rendered when its image is read."""
-        camera = moved(self.camera, self.reach, random)
-        if random.random() < self.backed:
-            camera = stepped_back(camera, self.reach * (FARTHER ** random.random() - 1))
+        """A view from a random camera near this one, or behind it; rendered when its image is read.
+
+        Offsets of position and direction are normal, that of log focal length is uniform.
+        """
+        x, y, z = TURNED * random.standard_normal(3)
+        step = torch.eye(4, dtype=torch.float64)  # on the CPU, where cameras are placed
+        step[:3, :3] = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64).matrix_exp()
+        step[:3, 3] = torch.from_numpy(MOVED * self.reach * random.standard_normal(3))
+        zoom = math.exp(ZOOMED * (2 * random.random() - 1))
+        viewmat = (step @ self.camera.viewmat.double()).to(self.camera.viewmat)
+        if random.random() < self.backed:  # against the direction of view
+            viewmat[2, 3] += self.reach * (FARTHER ** random.random() - 1)
+        K = self.camera.K * self.camera.K.new_tensor([[zoom, 1, 1], [1, zoom, 1], [1, 1, 1]])
+        camera = replace(self.camera, viewmat=viewmat, K=K)
         return StoredView(camera, lambda: render(self.teacher, camera).pixels)
-
-
-def stepped_back(camera: Camera, distance: float) -> Camera:
-    """The camera, moved against its direction of view, world units."""
-    viewmat = camera.viewmat.clone()
-    viewmat[2, 3] += distance
-    return replace(camera, viewmat=viewmat)
-
-
-def moved(camera: Camera, reach: float, random: np.random.Generator) -> Camera:
-    """The camera with a normal offset of position and direction and a uniform one of log focal length.
-
-    Args:
-        reach: unit of the position's offset, world units.
-    """
-    x, y, z = TURNED * random.standard_normal(3)
-    step = torch.eye(4, dtype=torch.float64)  # on the CPU, where cameras are placed
-    step[:3, :3] = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64).matrix_exp()
-    step[:3, 3] = torch.from_numpy(MOVED * reach * random.standard_normal(3))
-    zoom = math.exp(ZOOMED * (2 * random.random() - 1))
-    viewmat = (step @ camera.viewmat.double()).to(camera.viewmat)
-    return replace(camera, viewmat=viewmat, K=camera.K * camera.K.new_tensor([[zoom, 1, 1], [1, zoom, 1], [1, 1, 1]]))
 
 
 @torch.no_grad()
