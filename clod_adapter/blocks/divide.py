@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 import torch
@@ -212,18 +211,15 @@ def block_target(
     stands_for = len(division.seen) / len(numbers)
     if first:
         stands_for /= max(float(division.seen[numbers, block].mean()), LEAST_SEEN)
-    return partial(_target_share, config, parts, stands_for, int(own.sum()), division.total)
+    count, total = int(own.sum()), division.total
 
+    def target(virtual_scale: float) -> TargetShare:
+        at = math.log(virtual_scale) / math.log(config.max_sv) * (DIALS - 1)
+        whole = target_curve(virtual_scale, config.share, config.exponent) * total
+        wanted = max(whole * float(np.interp(at, np.arange(DIALS), parts)), 1.0)
+        return TargetShare(wanted / count, stands_for * count / whole)
 
-def _target_share(
-    config: AdaptConfig, parts: np.ndarray, stands_for: float, count: int, total: int, virtual_scale: float
-) -> TargetShare:
-    """The target of ``count`` of ``total`` Gaussians, which are ``parts [DIALS]`` of the kept ones."""
-    at = math.log(virtual_scale) / math.log(config.max_sv) * (DIALS - 1)
-    part = float(np.interp(at, np.arange(DIALS), parts))
-    whole = target_curve(virtual_scale, config.share, config.exponent)
-    wanted = max(whole * total * part, 1.0)
-    return TargetShare(wanted / count, stands_for * count / (whole * total))
+    return target
 
 
 @torch.no_grad()
