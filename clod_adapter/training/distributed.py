@@ -142,7 +142,7 @@ class ProcessGroup:
                 dist.broadcast(part, 0)
         if self.rank == 0:
             return value
-        return cast(T, torch.load(io.BytesIO(sent.numpy()), map_location="cpu", weights_only=False))
+        return cast(T, torch.load(io.BytesIO(sent.numpy().data), map_location="cpu", weights_only=False))
 
     def _meet(self, said: Tensor | None = None, how: str = "SUM") -> None:
         """Waits for all processes and reduces a few numbers, on the CPU: gloo reports a lost process at once."""
