@@ -9,6 +9,7 @@ import subprocess
 import sys
 import tomllib
 from graphlib import CycleError, TopologicalSorter
+from importlib.util import resolve_name
 from pathlib import Path
 
 import pytest
@@ -79,11 +80,9 @@ def imports_of(path: Path, tree: ast.AST) -> list[tuple[int, str]]:
         if isinstance(node, ast.Import):
             targets = [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
-            base = node.module or ""
-            if node.level:
-                here = f"{PACKAGE}.{module_of(path)}".rstrip(".").split(".")
-                cut = node.level - (path.name == "__init__.py")
-                base = ".".join((*here[: len(here) - cut], *([base] if base else [])))
+            here = f"{PACKAGE}.{module_of(path)}".rstrip(".")
+            here = here if path.name == "__init__.py" else here.rpartition(".")[0]
+            base = resolve_name("." * node.level + (node.module or ""), here)
             # "from clod_adapter import io" names a module, "from clod_adapter import Gaussians" a re-export.
             below = [f"{base}.{a.name}" for a in node.names if f"{base}.{a.name}".partition(".")[2] in MODULES]
             targets = [*below, *([base] if len(below) < len(node.names) else [])]

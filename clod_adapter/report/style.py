@@ -64,14 +64,10 @@ def save_figure(figure: Any, path: str | Path) -> None:
 
 def shades(count: int) -> list[str]:
     """``count`` shades from light to dark, for an ordered quantity."""
-    stops = ((0x9E, 0xC3, 0xE6), (0x1F, 0x5F, 0xA8), (0x10, 0x22, 0x4A))
-    colours = []
-    for k in range(count):
-        at = 2 * k / (count - 1) if count > 1 else 1.0
-        low = min(int(at), 1)
-        mixed = (a + (at - low) * (b - a) for a, b in zip(stops[low], stops[low + 1], strict=True))
-        colours.append("#" + "".join(f"{round(value):02x}" for value in mixed))
-    return colours
+    from matplotlib.colors import LinearSegmentedColormap, to_hex
+
+    ramp = LinearSegmentedColormap.from_list("", ["#9ec3e6", BLUE, "#10224a"])
+    return [to_hex(ramp(k / (count - 1) if count > 1 else 0.5)) for k in range(count)]
 
 
 def tidy(axes: Any) -> None:

@@ -200,21 +200,8 @@ def test_adapters_and_states(tmp_path: Path) -> None:
     json.dumps(jsonable(found.as_dict()), allow_nan=False)
 
 
-@pytest.mark.parametrize(
-    ("name", "content", "message"),
-    [
-        ("a.ply", b"<html>", "web page"),
-        ("a.safetensors", b"xxxxxxxxxxxxxxxx", "not a safetensors file, or damaged"),
-        ("a.pt", b"PK\x03\x04", "damaged or truncated"),
-        ("a.ply", b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n", "mesh or a point"),
-        ("a.ply", None, "no usable Gaussian in it, of 12 rows"),
-    ],
-)
-def test_files_without_a_splat_are_refused(tmp_path: Path, name: str, content: bytes | None, message: str) -> None:
+def test_files_without_a_usable_gaussian_are_refused(tmp_path: Path) -> None:
     vertex = table(12)
     vertex["x"] = np.nan
-    write(tmp_path / name, vertex)
-    if content is not None:
-        (tmp_path / name).write_bytes(content)
-    with pytest.raises(ClodError, match=f"{name}: .*{message}"):
-        inspect(tmp_path / name)
+    with pytest.raises(ClodError, match="a.ply: no usable Gaussian in it, of 12 rows"):
+        inspect(write(tmp_path / "a.ply", vertex))
