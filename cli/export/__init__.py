@@ -333,11 +333,8 @@ budgets:
 levels and order:
   --levels 1,2,4,7 writes OUT_s1.ply, OUT_s2.ply and so on, all or none. With
   --lod-meta OUT is a new folder with lod-meta.json, level 0 the finest, and the
-  chunks that a streaming viewer loads.
-  With --3dtiles OUT is a new folder with tileset.json and .glb tiles, packed
-  as in .spz, as CesiumJS wants them; cells have at most 262,144 Gaussians.
-  geometricError is measured from the same cameras: with a viewer's default of
-  16 pixels a level differs from the finest like a shift of one pixel.
+  chunks that a streaming viewer loads; with --3dtiles one with tileset.json and
+  .glb tiles, packed as in .spz.
   --order extinction is for renderers that draw the first n rows: for any n
   these are the rows of --keep n, with the opacities and scales of the file.
   They pop where the dial fades.
@@ -346,8 +343,7 @@ other tools:
   SIBR reads a baked .ply of SH degree 1 to 3, and takes the degree from
   sh_degree in cfg_args next to the file.
   .html is the page of "clod-adapt view" in one file; --sv or a budget sets its
-  initial dial value. Its splat is rounded as in .spz; the PSNR against MODEL is
-  measured and printed. With --exact it is float32.
+  initial dial value. The PSNR of its rounded splat is measured and printed.
   .sog, .compressed.ply and --lod-meta need splat-transform 3.7 with
   Node 22, on the PATH or in CLOD_SPLAT_TRANSFORM. Without a GPU, 100,000
   Gaussians take minutes for .sog.
