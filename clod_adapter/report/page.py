@@ -150,21 +150,9 @@ def _lead(report: Mapping[str, Any], series: Sequence[Series]) -> list[str]:
         first += " Training was interrupted." if report["interrupted"] else ""
     if not series:
         return [first, "Nothing was measured: " + " ".join(report["notes"])]
-    rows = sorted(series[0].rows, key=lambda row: row.get("virtual_scale", 1))
-    base = next((one.rows[0] for one in series if one.is_base), None)
-    best, last = rows[0], rows[-1]
-    if not series[0].dial or best["kept"] == last["kept"]:
-        return [first, f"It reaches {best['psnr']:.2f} dB at {best['frame_ms']:.1f} ms per frame."]
-    second = (
-        f"At s = {best['virtual_scale']:g} it reaches {best['psnr']:.2f} dB with {best['kept_share']:.0%} of the "
-        f"Gaussians, at {best['frame_ms']:.1f} ms per frame; at s = {last['virtual_scale']:g}, {last['psnr']:.2f} dB "
-        f"with {last['kept_share']:.0%}, at {last['frame_ms']:.1f} ms."
-    )
-    if base and own:
-        second += f" The reference is the unadapted file's own renders, which take {base['frame_ms']:.1f} ms per frame."
-    elif base:
-        second += f" The unadapted base has {base['psnr']:.2f} dB at {base['frame_ms']:.1f} ms."
-    return [first, second]
+    best = min(series[0].rows, key=lambda row: row.get("virtual_scale", 1))
+    at = f" at s = {best['virtual_scale']:g}" if series[0].dial else ""
+    return [first, f"It reaches {best['psnr']:.2f} dB{at}, in {best['frame_ms']:.1f} ms per frame."]
 
 
 def _tiles(series: Sequence[Series]) -> list[tuple[str, Mapping[str, Any]]]:
