@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import shutil
+import sys
 import tempfile
 import time
 from collections.abc import Sequence
@@ -24,6 +25,7 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.checkpoint import Checkpoint
 from clod_adapter.io.scene.load import ImageCache
 from clod_adapter.progress import Phase, Stopped
+from clod_adapter.training.loop import time_steps
 from clod_adapter.training.plan import NOT_NEEDED, Decision, Override, Plan, make_plan
 
 from ..shared.console import Console
@@ -38,11 +40,16 @@ from ..shared.inputs import (
     with_filter,
     with_pseudo_views,
 )
-from ..shared.measure import Stopwatch, measure
+from ..shared.measure import Stopwatch, measure, report_dials
 from ..shared.outputs import AdaptFiles
+from ..shared.pages import SNAPSHOT_VIEWS
 from ..shared.process import GracefulStop, launched
 from ..shared.settings import make_config
 from .listeners import ProgressDisplay, Resumed, find_state
+
+LONG = 100  # steps of a run that is worth a forecast
+CHEAPER = 0.7  # measuring a dial value, of measuring the base
+WRITING = 1e8  # bytes of a PLY per second, with everything that is written beside it
 
 
 class Run:
@@ -54,8 +61,8 @@ class Run:
         scene, config: without photographs or with too few, with pseudo views and lower learning rates.
         alignment: the measurements of the alignment check, for the report; None without photographs.
         memory: the plan for ``--memory``; None without the option.
-        notes: for the report.
-        base_rows: the base at dial value 1; empty if nothing is held out.
+        notes, forecast: for the report.
+        base_rows: the base at dial value 1; empty if nothing is held out; base_seconds: the time of measuring it.
 
     Raises:
         ClodError: options, or a state file, cannot be used.
@@ -66,6 +73,9 @@ class Run:
     alignment: dict[str, Any] | None = None
     memory: MemoryPlan | None = None
     base_rows: tuple[Row, ...] = ()
+    base_seconds = 0.0
+    forecast: dict[str, Any] | None = None
+    forecast_at = 0.0
 
     def __init__(self, args: argparse.Namespace) -> None:
         self.args, self.console, self.watch = args, Console(args.quiet), Stopwatch()
@@ -122,6 +132,7 @@ class Run:
             self.notes.append(f"{args.ply} has a dial already: continuing from its {' and '.join(used)}{dropped}")
         if not scene.test:
             self.notes.append("no photographs are held out, so nothing is measured; at least two are needed")
+        began = time.perf_counter()
         with self.watch.time("evaluate"):
             rows, interrupted = measure(self.base.gaussians, scene.test, [1.0], console, "base")
         if interrupted:
@@ -130,7 +141,7 @@ class Run:
             console.say(f"base: {rows[0].psnr:.2f} dB on the held-out photographs")
         for note in self.notes:
             console.say(note)
-        self.base_rows = tuple(rows)
+        self.base_rows, self.base_seconds = tuple(rows), time.perf_counter() - began
 
 
 def decide(run: Run, display: ProgressDisplay) -> Plan:
@@ -154,6 +165,49 @@ def decide(run: Run, display: ProgressDisplay) -> Plan:
     if plan.kept is not None:  # what is trained is a copy
         move_to_disk(base, run.outputs.ply.parent)
     return plan
+
+
+def forecast(run: Run, plan: Plan) -> dict[str, Any] | None:
+    """Seconds and peak memory of the rest of the run, which are printed; from a few steps that are thrown away.
+
+    None for runs that are too short, and in several processes.
+    """
+    config, views, base = plan.config, len(run.scene.test), run.base
+    steps = config.steps - (run.resumed.state.steps if run.resumed else 0)
+    if steps < LONG or launched().size > 1:
+        return None
+    with run.console.status("timing a few steps ..."):
+        each, fixed = time_steps(plan.lean, run.scene, config, min(max(steps // 40, 16), 24), plan.subset)
+    release()
+    training = fixed + min(1.02 * steps * each, config.time_budget or math.inf)  # with saving the state
+    dials, frame = len(report_dials(config.max_sv)) + 1, run.base_rows[0].frame_ms / 1e3 if run.base_rows else 0.0
+    measuring = CHEAPER * dials * (run.base_seconds + 15 * frame)
+    peak = peak_bytes()
+    if run.args.report:  # curves of seven states at three dial values, 15 pictures and the charts
+        measuring += CHEAPER * (21 * run.base_seconds * min(SNAPSHOT_VIEWS / max(views, 1), 1) + 15 * frame) + 5
+        peak += 7 * sum(4 * t.numel() for name, t in plan.start.tensors().items() if name != "shN")
+    seconds = training + measuring + _row_bytes(base) * len(base.gaussians) / WRITING
+    minutes = f"{seconds:.0f} seconds" if seconds < 90 else f"{seconds / 60:.0f} minutes"
+    memory = f", {in_words(peak)}" if peak else ""
+    run.console.say(f"forecast: {minutes}{memory} ({steps:,} steps)")
+    run.forecast_at = time.perf_counter()
+    return {"seconds": round(seconds, 1), "bytes": peak, "steps": steps}
+
+
+def against_forecast(run: Run) -> dict[str, Any] | None:
+    """The forecast, and what the run has taken since."""
+    taken = {"actual_seconds": round(time.perf_counter() - run.forecast_at, 1), "actual_bytes": peak_bytes()}
+    return run.forecast and run.forecast | taken
+
+
+def peak_bytes() -> int:
+    """Of the memory of this process so far; 0 where that is not known."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return 0
+
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
 
 
 def show_plan(decisions: Sequence[Decision], console: Console) -> None:

@@ -29,7 +29,7 @@ from ..shared.pages import AdaptPage
 from ..shared.process import GracefulStop, listen_no_more
 from .blocks import adapt_in_blocks
 from .listeners import ProgressDisplay, Saver, fingerprint, settings_key
-from .prepare import Run, decide
+from .prepare import Run, against_forecast, decide, forecast
 from .processes import describe_processes, explain, hurried, together
 
 # dB: of s = 1 below the base, and against the checkpoint's renderings without photographs, what is told and what fails.
@@ -83,7 +83,7 @@ def adapt(args: argparse.Namespace) -> dict[str, Any]:
     with run.stop.listening():
         display = ProgressDisplay(run.console, run.stop)
         plan = decide(run, display)
-        page = make_page(run)
+        page, run.forecast = make_page(run), forecast(run, plan)
         with saver.rescuing():
             result = make_result(run, plan, train(run, plan, display, saver, page))
     with saver.rescuing():
@@ -186,7 +186,7 @@ def finish(run: Run, result: Result, page: AdaptPage | None, saver: Saver | None
         with run.watch.time("page"):
             changes = page.write(path, report, result.gaussians, result.adapted.start_seconds)
         changes["seconds"] = report["seconds"] | {"page": run.watch.report()["page"]}
-        report |= changes
+        report |= changes | {"forecast": against_forecast(run)}
         write_report(outputs.report, report)
     print_summary(run, measured, report)
     if "loss" in report:
@@ -263,7 +263,7 @@ def describe(run: Run, result: Result, measured: Measurements) -> dict[str, Any]
         "rows": [row.as_dict() for row in measured.rows],
         "detached_row": measured.plain[0].as_dict() if measured.plain else None,
         "watched": adapted.watched and asdict(adapted.watched), "plan": result.plan.as_dict(),
-        "memory": run.memory and asdict(run.memory),
+        "memory": run.memory and asdict(run.memory), "forecast": against_forecast(run),
     }  # fmt: skip
     line, failed = ("", False) if report["interrupted"] else judge(measured, args.images is not None)
     failed = adapted.failed is not None or failed and not args.accept_loss

@@ -20,7 +20,7 @@ from clod_adapter.initialization.importance import for_training, usable_views, w
 from clod_adapter.progress import Listener, Phase, Progress, shown
 from clod_adapter.training.dial import TrainableSubset, require_trainable
 from clod_adapter.training.distributed import ProcessGroup, ProcessLost
-from clod_adapter.training.gate import split_views
+from clod_adapter.training.gate import CHECKS, split_views
 from clod_adapter.training.interrupts import DeferredInterrupt
 from clod_adapter.training.paper import form_of
 from clod_adapter.training.state import Adapted, StateRefused, TrainingState
@@ -114,6 +114,29 @@ def _adapt(
             raise StateRefused(str(error)) from error
     del resume, begun, base, lean  # the trainer has copies
     return _train(trainer, progress)
+
+
+def time_steps(
+    base: Gaussians, scene: Scene, config: AdaptConfig, steps: int, subset: TrainableSubset | None = None
+) -> tuple[float, float]:
+    """Seconds of a step of ``adapt``, and of all that does not depend on the number of steps.
+
+    The former is the mean of ``steps`` spread over the schedule, whose result is thrown away.
+    """
+    began = time.perf_counter()
+    views, watched = training_views(base, scene.train, config)
+    trainer = Trainer(_initialized(base, views, config, None, None), views, config, subset, None, watched)
+    fixed = time.perf_counter() - began
+    trainer.step(0.0)  # allocates memory
+    if trainer.gate:
+        began = time.perf_counter()
+        trainer.gate.finish()
+        fixed += (len(CHECKS) + 1) * (time.perf_counter() - began)
+        trainer.gate.numbers[2] = len(CHECKS)
+    began = time.perf_counter()
+    for k in range(steps):
+        trainer.step((k + 0.5) / steps)
+    return (time.perf_counter() - began) / steps, fixed
 
 
 def training_views(

@@ -102,6 +102,16 @@ def test_a_result_worse_than_its_base_fails_unless_that_is_accepted(adapted: tup
     assert adapted[1].err.endswith(f"\nwarning: {report['loss']}\n")
 
 
+def test_forecast_of_time_and_memory(clod: Any, capture: Any) -> None:
+    """In a line before training, and with what the run took in the report."""
+    done = clod(capture.ply, "--images", capture.scene, "--max-sv", 2, "--out", "dial.ply", "--json", "--iters", 100)
+    found = json.loads(done.out)["forecast"]
+    assert re.search(r"^forecast: \d+ seconds, \d.* [MG]B \(100 steps\)$", done.err, re.M), done
+    assert done.err.index("\nforecast: ") < done.err.index("\ntrained 100 steps")
+    assert found["steps"] == 100 and found["seconds"] > 0 and found["actual_seconds"] > 0
+    assert found["bytes"] == pytest.approx(found["actual_bytes"], rel=1 / 3)
+
+
 def test_report_agrees_with_the_files(clod: Any, capture: Any, dialled: Path) -> None:
     """PSNR and SSIM at both ends of the dial and without it, and the calibration."""
     report = json.loads(dialled.with_suffix(".json").read_text())
