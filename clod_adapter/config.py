@@ -15,6 +15,7 @@ NORMALIZERS = ("max", "quantile", "scene")
 CUTS = ("hard", "soft")
 FORMS = ("ours", "paper")
 GROWTHS = ("on", "off")
+FARTHEST = 3e38  # world units: a float32, as which distances are divided by it
 STEPS, STEPS_PER_VIEW = 900, 8.5  # of training, by default, with one view a step
 # Gaussians that viewers draw at most on a device, by their makers; docs/formats.md has the sources.
 DEVICES = {"quest3": 500_000, "phone": 1_000_000, "laptop": 2_000_000, "desktop": 4_000_000}
@@ -65,9 +66,9 @@ class AttenuationConfig:
         require(0 <= self.eps < 1, "eps", self.eps, "at least 0 and below 1")
         require(self.normalizer in NORMALIZERS, "normalizer", self.normalizer, f"one of {', '.join(NORMALIZERS)}")
         require(0 < self.quantile <= 1, "quantile", self.quantile, "above 0 and at most 1")
-        require(0 < self.scene_distance < math.inf, "scene_distance", self.scene_distance, "positive and finite")
-        reference = self.reference_distance
-        require(0 <= reference < math.inf, "reference_distance", reference, "at least 0 and finite")
+        distance, reference = self.scene_distance, self.reference_distance
+        require(0 < distance < FARTHEST, "scene_distance", distance, f"above 0 and below {FARTHEST:g}")
+        require(0 <= reference < FARTHEST, "reference_distance", reference, f"at least 0 and below {FARTHEST:g}")
         require(1 <= self.max_sv < math.inf, "max_sv", self.max_sv, "at least 1 and finite")
         all_culled = f"below 1/max_sv = {1 / self.max_sv:.3g}, or every Gaussian is culled at max_sv"
         require(self.tau * self.max_sv < 1, "tau", self.tau, all_culled)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 from typing import Any
 
 import pytest
@@ -21,7 +22,7 @@ TABLES: dict[type, dict[str, list[Any]]] = {
     },
     AttenuationConfig: BOTH | {
         "eps": [-1e-9, 1.0, math.nan], "normalizer": ["mean"], "quantile": [0.0, 1.01], "cut": ["none"],
-        "scene_distance": [0.0, math.inf, math.nan], "reference_distance": [-1.0, math.inf],
+        "scene_distance": [0.0, 1e308, math.nan], "reference_distance": [-1.0, math.inf],
     },
     ScreenFilter: {"variance": [9e-4, 101.0, math.nan], "compensate": [1, "yes", None]},
 }  # fmt: skip
@@ -31,7 +32,7 @@ TABLES: dict[type, dict[str, list[Any]]] = {
 def test_impossible_values_are_named(kind: type) -> None:
     for name, values in TABLES[kind].items():
         for value in values:
-            with pytest.raises(ClodError, match=f"^{name} is {value}, it must be "):
+            with pytest.raises(ClodError, match=re.escape(f"{name} is {value}, it must be ")):
                 kind(**{name: value})
 
 

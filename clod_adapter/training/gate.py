@@ -104,7 +104,7 @@ class Gate:
     def check(self, share_done: float) -> None:
         """Checks the parameters if it is time to."""
         made = int(self.numbers[2])
-        if made == len(CHECKS) or share_done < CHECKS[made]:
+        if made >= len(CHECKS) or share_done < CHECKS[made]:
             return
         self.numbers[2] = sum(share_done >= due for due in CHECKS)
         loss = self._loss(self.trainer.parameters)

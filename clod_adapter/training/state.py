@@ -173,7 +173,10 @@ def load_state(path: str | Path) -> tuple[TrainingState, dict[str, Any]]:
         about = _typed(json.loads(metadata[KEY]), dict)
         belongs, random = _typed(about.pop("belongs"), dict), _typed(about.pop("random"), dict)
         settings = _typed(about.pop("attenuation"), dict)
-        attenuation = AttenuationConfig(**{name: _typed(each, float, int, str) for name, each in settings.items()})
+        values = {
+            name: each if isinstance(each, str) else float(_typed(each, float, int)) for name, each in settings.items()
+        }
+        attenuation = AttenuationConfig(**values)  # type: ignore[arg-type]
         order = tuple(_typed(view, int) for view in _typed(about.pop("order"), list))
         counts = {name: _typed(about.pop(name), int) for name in ("averaged", "steps")}
         rest = {name: float(_typed(value, float, int)) for name, value in about.items()}
