@@ -3,12 +3,13 @@ import { add, cross, dot, row, rotated, unit } from "./vector.js";
 
 const DEFAULT_FOV = (50 * Math.PI) / 180; // without a configured camera
 const NEAR = 0.01; // depth of the near plane, world units, as in clod_adapter/cameras.py
+const BESIDE = 0.5, ALIKE = 0.7; // of isNear: of the distance; cosine
 const MAX_PITCH = 0.995; // of |forward . up|: orbiting stops before it looks straight up or down
 
 export function createCamera() {
   const camera = {
     rotation: [1, 0, 0, 0, 1, 0, 0, 0, 1], // rows: right, down, forward, in world axes
-    eye: [0, 0, 0], up: [0, -1, 0], distance: 1, // distance: from the eye to the pivot, the point ahead that orbiting rotates about
+    eye: [0, 0, 0], up: [0, -1, 0], distance: 1, reach: 1, // distance: from the eye to the pivot, the point ahead that orbiting rotates about
     near: NEAR,
     fov: DEFAULT_FOV, aspect: 1, // of the picture that the canvas shows in full: across its shorter side, radians; width over height
     panel: [0, 0], // shares of the canvas that the panel covers from the left and from the bottom, with what is beside it
@@ -87,6 +88,14 @@ export function createCamera() {
       camera.distance = distance;
     },
 
+    /** Whether one of the cameras is near and looks the same way, by the distance to the pivot when they were fitted. */
+    isNear(cameras) {
+      return cameras.some(({ viewmat }) => {
+        const { eye, forward } = axisOf(viewmat);
+        return Math.hypot(...add(camera.eye, eye, -1)) < BESIDE * camera.reach && dot(forward, row(camera.rotation, 2)) > ALIKE;
+      });
+    },
+
     /** Shows the first of `cameras`, with the pivot where they look; without cameras, all Gaussians of the extent. */
     fit(extent, cameras, up) {
       const { centre, radius } = extent;
@@ -94,6 +103,7 @@ export function createCamera() {
       if (cameras.length) {
         camera.set(cameras[0]);
         camera.distance = focusDistance(cameras) ?? Math.max(dot(row(camera.rotation, 2), add(centre, camera.eye, -1)), 0.1 * radius);
+        camera.reach = camera.distance;
         return;
       }
       camera.near = Math.min(NEAR, 1e-3 * radius);

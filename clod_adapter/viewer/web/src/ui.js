@@ -57,13 +57,16 @@ export function createUi(elements, viewer, actions, canRecord) {
     wipe.setAttribute("aria-valuenow", Math.round(100 * state.wipe));
   }
 
+  /** Whether the calibration tells of such a view: it is of the cameras', if there are any to compare with. */
+  const isCalibrated = () => !viewer.cameras.length || viewer.camera.isNear(viewer.cameras);
+
   /** Shows count, frame time and PSNR of the last frame. */
   function updateFrame() {
     const { model } = stage, { total, kept } = stage.counts(), other = stage.otherCounts();
     const share = `${((100 * kept) / total).toFixed(kept === total ? 0 : 1)} %`;
     elements.counts.textContent = total ? `${integer(kept)} of ${integer(total)} kept (${share})` : "";
     elements.frame.textContent = stage.frameMs === null ? "" : `${stage.frameMs.toFixed(stage.frameMs < 10 ? 1 : 0)} ms per frame`;
-    const psnr = model?.attenuation && state.equation ? psnrAt(model.calibration, state.dial) : null;
+    const psnr = model?.attenuation && state.equation && isCalibrated() ? psnrAt(model.calibration, state.dial) : null;
     elements.quality.textContent = psnr === null ? "" : `${psnr.toFixed(1)} dB`;
     if (!other) return;
     wipeLeft.textContent = `${model.attenuation ? named() : model.name} · ${integer(kept)}`;
