@@ -47,18 +47,37 @@ def points(means: Any, size: float, sh0: Any = None) -> Gaussians:
     )  # fmt: skip
 
 
-def test_the_up_axis(show: Any, model: Path, tmp_path: Path) -> None:
-    """That of the photographs' cameras, else -y; or a chosen one, which a link keeps."""
-    shown = show(model, viewport=TALL)
-    view = link(shown)
-    assert abs(view["axes"][1]) < 1e-6 and view["axes"][4] > 0.8
+ANGLE = np.radians(25)
+TURN = np.array([[1, 0, 0], [0, np.cos(ANGLE), -np.sin(ANGLE)], [0, np.sin(ANGLE), np.cos(ANGLE)]])
+
+
+@pytest.fixture
+def ground() -> Gaussians:
+    """A ground whose normal is TURN @ [0, -1, 0]: two thirds are flat and lie along it."""
+    model = points(np.random.default_rng(0).uniform(-1, 1, (1000, 3)) * [2, 0.02, 2] @ TURN.T, 0.01)
+    flat = torch.arange(1000)[:, None] % 3 > 0
+    scales = torch.where(flat, torch.tensor([0.0, -3.0, 0.0]), torch.tensor([-2.0, 0.0, 0.0]))
+    quats = torch.where(flat, torch.tensor([np.cos(ANGLE / 2), np.sin(ANGLE / 2), 0.0, 0.0]), model.quats).float()
+    return model.replace(log_scales=model.log_scales + scales, quats=quats)
+
+
+def test_the_up_axis(show: Any, save: Any, ground: Gaussians, tmp_path: Path) -> None:
+    """That of a tilted ground; that of the photographs' cameras, if any; or a chosen one, which a link keeps."""
+    path = save(ground)
+    shown = show(path, viewport=TALL)
+
+    def up_of(view: dict[str, np.ndarray], tilt: float) -> np.ndarray:
+        return np.asarray(-np.cos(tilt) * view["axes"][3:] - np.sin(tilt) * forward(view))
+
+    assert up_of(link(shown), np.arctan(0.5)) @ (TURN @ [0, -1, 0]) > np.cos(np.radians(5))
     shown.page.click("#menu-open")
+    assert shown.page.inner_text("#up option") == "found from the scene"
     shown.page.select_option("#up", "0,0,1")
     chosen = link(shown)
     assert chosen["up"].tolist() == [0, 0, 1] and abs(chosen["axes"][2]) < 1e-6 and forward(chosen)[2] < 0
     cameras = [replace(camera, name=f"{k}.jpg") for k, camera in enumerate(scenes.ring(3, 320, 240))]
     write_model(tmp_path, cameras, [camera.name for camera in cameras])
-    with_cameras = show(model, "--images", tmp_path, viewport=TALL)
+    with_cameras = show(path, "--images", tmp_path, viewport=TALL)
     assert with_cameras.page.text_content("#up option") == "as in the photographs"
     before = link(with_cameras)["axes"]
     with_cameras.page.keyboard.press("ArrowLeft")

@@ -2,6 +2,7 @@
 import { WIDTH, dataTexture, heightOf, maxTexels } from "./gpu.js";
 import { half } from "./half.js";
 import { SH_TEXELS } from "./shaders.js";
+import { upOfGaussians } from "./up.js";
 import { add } from "./vector.js";
 import workerSource from "worker:./worker.js";
 
@@ -74,9 +75,10 @@ function fillSh(target, { count, degree, shN }, texels) {
   }
 }
 
-/** {centre, radius} of a ball that contains a sample of the Gaussians. Where more than 2 % of them are beyond twice the radius
+/** {centre, radius, up}: a ball that contains a sample of the Gaussians, and their up axis. Where more than 2 % of them are beyond twice the radius
  *  that contains 80 %, a background, it is the ball of these about the median. */
-function extentOf({ means, logScales }) {
+function extentOf(gaussians) {
+  const { means, logScales } = gaussians;
   const step = Math.max(Math.floor(means.length / 3 / 20000), 1), points = [], sizes = [];
   for (let at = 0; at < means.length; at += 3 * step) {
     points.push([means[at], means[at + 1], means[at + 2]]);
@@ -85,11 +87,13 @@ function extentOf({ means, logScales }) {
   const reachesFrom = (centre) => Float64Array.from(points, (point, i) => Math.hypot(...add(point, centre, -1)) + sizes[i]);
   const axes = [0, 1, 2].map((k) => Float64Array.from(points, (point) => point[k]).sort());
   const median = axes.map((values) => values[values.length >> 1]), reaches = reachesFrom(median), sorted = reaches.slice().sort();
-  const bulk = sorted[Math.floor(0.8 * sorted.length)], near = points.filter((_, i) => reaches[i] <= 2 * bulk);
-  if (sorted[Math.floor(0.98 * sorted.length)] >= 2 * bulk) return { centre: median, radius: Math.min(Math.max(bulk, 1e-6), 1e30) };
+  const bulk = sorted[Math.floor(0.8 * sorted.length)], bounded = sorted[Math.floor(0.98 * sorted.length)] < 2 * bulk;
+  const rows = [...points.keys()].filter((i) => reaches[i] <= (bounded ? 2 : 1) * bulk), near = rows.map((i) => points[i]);
+  const up = upOfGaussians(gaussians, rows.map((i) => i * step));
+  if (!bounded) return { centre: median, radius: Math.min(Math.max(bulk, 1e-6), 1e30), up };
   const bounds = [0, 1, 2].map((k) => near.reduce(([low, high], point) => [Math.min(low, point[k]), Math.max(high, point[k])], [Infinity, -Infinity]));
   const centre = bounds.map(([low, high]) => (low + high) / 2), radius = reachesFrom(centre).filter((_, i) => reaches[i] <= 2 * bulk).sort().at(-1);
-  return { centre, radius: Math.min(Math.max(radius, 1e-6), 1e30) };
+  return { centre, radius: Math.min(Math.max(radius, 1e-6), 1e30), up };
 }
 
 function startWorker() {

@@ -48,7 +48,7 @@ export function createUi(elements, viewer, actions, canRecord) {
     elements.move.textContent = actions.isFlying() ? "Fly" : "Orbit";
     elements.canvas.classList.toggle("flying", actions.isFlying());
     elements.up.value = viewer.up;
-    elements.up.options[0].textContent = viewer.cameras.some(({ placed }) => !placed) ? "as in the photographs" : "−Y, as in COLMAP";
+    elements.up.options[0].textContent = viewer.cameras.some(({ placed }) => !placed) ? "as in the photographs" : "found from the scene";
     elements.play.classList.toggle("playing", viewer.motion.running);
     elements.turn.textContent = viewer.motion.running ? "Stop" : "Turntable";
     elements.record.textContent = viewer.recording ? "Stop recording" : "Record video";

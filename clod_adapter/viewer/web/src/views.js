@@ -3,19 +3,12 @@
 import { createCamera } from "./camera.js";
 import { readLink, writeLink } from "./link.js";
 import { download, record } from "./media.js";
-import { add, cross, unit } from "./vector.js";
-
-const Y_DOWN = [0, -1, 0]; // COLMAP's y axis points down
-
-/** The mean up vector of the photographs' cameras; minus y without these, or where their mean is 0. */
-function upOf(cameras) {
-  const sum = cameras.reduce((total, { viewmat, placed }) => (placed ? total : add(total, viewmat[1].slice(0, 3), -1)), [0, 0, 0]);
-  return Math.hypot(...sum) > 1e-3 * cameras.length ? unit(sum) : Y_DOWN;
-}
+import { upOfCameras } from "./up.js";
+import { cross, unit } from "./vector.js";
 
 /** `viewer`: camera, cameras, stage, motion, ui, up, recording (main.js); `update()` shows a changed state. */
 export function createViews(elements, viewer, { update, showFile, clampDial }) {
-  const axisOf = (value) => (value ? value.split(",").map(Number) : upOf(viewer.cameras));
+  const axisOf = (value) => (value ? value.split(",").map(Number) : upOfCameras(viewer.cameras) ?? viewer.stage.model.extent.up);
   const fileName = (suffix) => `${viewer.stage.model.name.replace(/\.[^.]*$/, "")}_s${viewer.stage.state.dial.toFixed(2)}.${suffix}`;
 
   function select(number) {
@@ -49,7 +42,7 @@ export function createViews(elements, viewer, { update, showFile, clampDial }) {
       select(number);
       update();
     },
-    /** `value`: "x,y,z" of an axis; "" for that of the cameras. */
+    /** `value`: "x,y,z" of an axis; "" for that of the cameras or the scene. */
     setUp(value) {
       viewer.motion.stop();
       viewer.up = value;
