@@ -27,6 +27,7 @@ class Format(NamedTuple):
     Attributes:
         read: a path to a ``Source``.
         check: refuses, by the first bytes and without torch, a file that is not of the format.
+        dial: whether a file that ``check`` passes has a sigma_d, by its header (an .spz is read); "" where none has.
         write: called with path, Gaussians in world units and a ``History``; gives a line for each loss; "" where the
             format is only read.
         carries_sigma: whether the dial is written: sigma_d, growth_d and their settings.
@@ -36,6 +37,7 @@ class Format(NamedTuple):
 
     read: str = ""
     check: str = ""
+    dial: str = ""
     write: str = ""
     carries_sigma: bool = False
     about: tuple[str, ...] = ()
@@ -45,25 +47,29 @@ class Format(NamedTuple):
 _CHECK = "file_formats.check_start"
 _CONVERTED = Format("formats.splat_transform.load_converted", "formats.splat_transform.check_converted")
 KEY = "clod_adapter"  # of the JSON document in formats other than PLY
-PLY = Format("ply.read_ply", "ply.check_ply", "checkpoint.write_ply", True, ("exact; baked, in Inria's layout",))
+PLY = Format(
+    "ply.read_ply", "ply.check_ply", "ply.open_ply", "checkpoint.write_ply", True, ("exact; baked, in Inria's layout",)
+)
 FORMATS = {
     ".ply": PLY,
     ".glb": Format(
-        "formats.glb.load_glb", _CHECK, "formats.glb.write_glb", True,
+        "formats.glb.load_glb", _CHECK, "formats.glb.has_dial", "formats.glb.write_glb", True,
         ("float32, SH degree up to 3", "(KHR_gaussian_splatting, _SIGMA_D, _GROWTH_D)"),
     ),
     ".spz": Format(
-        "formats.spz.load_spz", _CHECK, "formats.spz.write_spz", True,
+        "formats.spz.load_spz", _CHECK, "formats.spz.has_dial", "formats.spz.write_spz", True,
         ("6 to 24 bits, SH degree up to 3, the dial 16-bit floats",),
     ),
     ".safetensors": Format(
-        "tensor_file.load_safetensors", _CHECK, "tensor_file.write_safetensors", True, ("exact; for Python",)
+        "tensor_file.load_safetensors", _CHECK, "tensor_file.has_dial", "tensor_file.write_safetensors", True,
+        ("exact; for Python",),
     ),
     ".pt": Format(
-        "formats.pt.load_pt", "formats.pt.check_pt", "formats.pt.write_pt", True, ("exact; layout of gsplat's trainer",)
+        "formats.pt.load_pt", "formats.pt.check_pt", "formats.pt.has_dial", "formats.pt.write_pt", True,
+        ("exact; layout of gsplat's trainer",),
     ),
     ".splat": Format(
-        "formats.splat.load_splat", _CHECK, "formats.splat.write_splat", False, ("8 bits, SH degree 0",), False
+        "formats.splat.load_splat", _CHECK, "", "formats.splat.write_splat", False, ("8 bits, SH degree 0",), False
     ),
     ".sog": _CONVERTED,
     ".ksplat": _CONVERTED,
@@ -82,13 +88,10 @@ def check_readable(path: Path) -> None:
 
 
 def file_has_dial(path: Path) -> bool:
-    """Whether the file has a sigma_d; of a PLY the header, settings and length alone are read."""
+    """Whether the file has a sigma_d: ``Format.dial``."""
     check_readable(path)
-    form = format_of(path)
-    if form is PLY:
-        return bool(_call("ply.open_ply", path))
-    possible = form.carries_sigma and not read_start(path).startswith(NEW_SPZ)
-    return possible and "sigma_d" in read_source(path).arrays
+    dial = format_of(path).dial
+    return bool(dial) and bool(_call(dial, path))
 
 
 def check_suffix(path: Path) -> None:
@@ -101,9 +104,12 @@ def check_suffix(path: Path) -> None:
 
 
 def check_written(path: Path) -> None:
-    """Refuses a file just written, under its temporary name, that the reader of its format would refuse."""
+    """Refuses a file just written, under its temporary name, that the reader of its format would refuse.
+
+    Of a PLY header, settings and length are read; any other format is read whole.
+    """
     try:
-        file_has_dial(path)
+        (file_has_dial if format_of(path) is PLY else read_source)(path)
     except ClodError as error:
         reason = str(error).removeprefix(f"{path}: ")
         raise ClodError(f"{path}: is not written, because it could not be read again: {reason}") from error

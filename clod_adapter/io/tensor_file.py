@@ -105,6 +105,11 @@ def write_safetensors(path: Path, gaussians: Gaussians, history: History) -> tup
     return ()
 
 
+def has_dial(path: Path) -> bool:
+    """By the names of the tensors."""
+    return SIGMA in read_tensor_header(path)[0]
+
+
 def load_safetensors(path: Path) -> Source:
     """Reads a model."""
     tensors, stored, sha256 = load_tensors(path)

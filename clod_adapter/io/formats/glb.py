@@ -11,7 +11,8 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -152,6 +153,14 @@ def _columns(path: Path, gaussians: Gaussians) -> tuple[dict[str, np.ndarray], t
     return columns, (f"spherical harmonics above degree {DEGREE} are dropped",) if lost else ()
 
 
+def has_dial(path: Path) -> bool:
+    """By the attributes of the primitive; the file is mapped, and its values are not read."""
+    with _one_line_errors(path):
+        gltf, _ = _chunks(np.memmap(path, np.uint8, "r").data)
+        (_, primitive), *_ = _find(gltf)
+        return DIAL[SIGMA] in primitive["attributes"]
+
+
 def load_glb(path: Path) -> Source:
     """Reads the first primitive with the extension, into the axes of checkpoints: y down.
 
@@ -159,7 +168,7 @@ def load_glb(path: Path) -> Source:
     the half turn in the node and store the checkpoint's values.
     """
     data, ignored, arrays = read_whole(path), list[str](), dict[str, np.ndarray]()
-    try:
+    with _one_line_errors(path):
         gltf, binary = _chunks(memoryview(data))
         (mesh, primitive), *others = _find(gltf)
         attributes, ignored = primitive["attributes"], _ignored(primitive, len(others))
@@ -174,10 +183,6 @@ def load_glb(path: Path) -> Source:
             raise ClodError(f"its attributes are of different lengths; {_REMEDY}")
         text = gltf["asset"].get("extras", {}).get(KEY)
         turned, moved = _placed(gltf, mesh)
-    except ClodError as error:
-        raise ClodError(f"{path}: {error}") from error
-    except DAMAGE + (IndexError,) as error:
-        raise ClodError(f"{path}: is damaged or no such .glb ({error!r:.80}); {_REMEDY}") from error
     metadata = parse_metadata(path, text, dial=SIGMA in arrays)
     arrays["shN"] = np.stack(rest, 1) if rest else np.zeros((len(arrays["means"]), 0, 3), np.float32)
     stored = _stored(arrays) if turned else half_turn(_stored(arrays), "z")
@@ -185,6 +190,16 @@ def load_glb(path: Path) -> Source:
         stored["means"], moved = _moved(stored["means"], moved)
         metadata = replace(metadata, origin=moved)
     return Source(float32(stored), metadata, sha256_of(data), tuple(ignored), metadata.about)
+
+
+@contextmanager
+def _one_line_errors(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except ClodError as error:
+        raise ClodError(f"{path}: {error}") from error
+    except DAMAGE + (IndexError,) as error:
+        raise ClodError(f"{path}: is damaged or no such .glb ({error!r:.80}); {_REMEDY}") from error
 
 
 def _chunks(data: memoryview) -> tuple[dict[str, Any], memoryview]:

@@ -71,6 +71,13 @@ def _check_pickle(path: Path, data: bytes) -> None:
         raise ClodError(f"{path}: is damaged ({error}); copy or export it again") from error
 
 
+def has_dial(path: Path) -> bool:
+    """By the names in the pickle, which is not unpickled."""
+    with zipfile.ZipFile(path) as archive:
+        (pickled,) = (entry for entry in archive.infolist() if entry.filename.endswith("/data.pkl"))
+        return any(argument == SIGMA for _, argument, _ in pickletools.genops(archive.read(pickled)))
+
+
 def load_pt(path: Path) -> Source:
     """Reads a checkpoint of gsplat's trainer, or one written here.
 

@@ -34,7 +34,7 @@ from clod_adapter.config import CLASSIC, SH_COUNTS
 from clod_adapter.equation.units import estimated_distance, in_world_units, known_distance, with_distance
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.io.file_formats import NEW_SPZ, read_whole
+from clod_adapter.io.file_formats import NEW_SPZ, read_start, read_whole
 from clod_adapter.io.formats.splat_transform import load_converted
 from clod_adapter.io.settings import (
     DAMAGE,
@@ -183,6 +183,11 @@ def _losses(arrays: dict[str, np.ndarray], bits: int, degree: int) -> tuple[str,
         "scales beyond e^-10 to e^5.9": (np.abs(arrays["log_scales"] + 2.03125) > 8).any(),
     }
     return (*notes, *(f"{what} are cut to it" for what, there in beyond.items() if there))
+
+
+def has_dial(path: Path) -> bool:
+    """Reads all of the file, which is never much."""
+    return not read_start(path).startswith(NEW_SPZ) and SIGMA in load_spz(path).arrays
 
 
 def load_spz(path: Path) -> Source:
