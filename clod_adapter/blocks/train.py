@@ -39,11 +39,11 @@ from clod_adapter.initialization.importance import MOST_VIEWS
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.file_formats import refuse_irregular
 from clod_adapter.io.scene.load import ImageCache
-from clod_adapter.io.tensor_file import read_tensors, write_tensors
+from clod_adapter.io.tensor_file import read_tensors, refused_if_damaged, write_tensors
 from clod_adapter.progress import Listener, Phase, tell
 from clod_adapter.training.dial import TrainableSubset
 from clod_adapter.training.loop import adapt
-from clod_adapter.training.state import Adapted, TrainingState, refused_if_damaged
+from clod_adapter.training.state import Adapted, TrainingState
 
 KEY = "clod_adapter_block"  # of the JSON document that identifies the run of a block's file
 
@@ -177,7 +177,7 @@ def load_block(path: Path, belongs: dict[str, Any], division: Division, block: i
     """
     again = "remove it to have it made anew"
     refuse_irregular(path, "remove it")
-    with refused_if_damaged(path, "is no block", again):
+    with refused_if_damaged(path, "is no block or is damaged", again):
         tensors, metadata = read_tensors(path)
         found = json.loads(metadata[KEY])
         about, theirs = found["about"], dict(found["belongs"])

@@ -32,6 +32,7 @@ TYPES = {
     "uint8": "U8", "bool": "BOOL",
 }  # fmt: skip
 """Names of types in a file, by numpy's name, in the order in which a file has its tensors."""
+_DAMAGED = "is not a safetensors file, or damaged", "copy or export it again"
 _NAMES = ("means", "quats", "log_scales", "opacity_logits", "sh0", "shN")
 
 
@@ -69,15 +70,18 @@ def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str], str]:
     """The tensors, the metadata and the SHA-256, hex, of an input file, which is read once."""
     from safetensors.torch import load  # here: a header is read without torch
 
-    with _one_line_errors(path):
-        data = read_whole(path)
+    data = read_whole(path)
+    refuse_known(path, data[:64])
+    with refused_if_damaged(path, *_DAMAGED):
         tensors, head = load(data), data[8 : 8 + int.from_bytes(data[:8], "little")]
         return tensors, json.loads(head).get("__metadata__", {}), sha256_of(data)
 
 
 def read_tensor_header(path: Path) -> tuple[list[str], dict[str, str]]:
     """The names of the tensors and the metadata, without torch."""
-    with _one_line_errors(path), open(path, "rb") as file, safe_open(_name_of(file), framework="np") as tensors:
+    refuse_known(path, read_start(path))
+    refused = refused_if_damaged(path, *_DAMAGED)
+    with refused, open(path, "rb") as file, safe_open(_name_of(file), framework="np") as tensors:
         return list(tensors.keys()), tensors.metadata() or {}
 
 
@@ -87,16 +91,16 @@ def _name_of(file: BufferedReader) -> str:
 
 
 @contextmanager
-def _one_line_errors(path: Path) -> Iterator[None]:
-    refuse_known(path, read_start(path))
+def refused_if_damaged(path: Path, what: str, fix: str) -> Iterator[None]:
+    """Turns errors of reading a file, raised within, into a ClodError that names it: ``what``, and the ``fix``."""
     try:
         yield
-    except (ClodError, MemoryError):  # of a file that is whole
-        raise
     except OSError as error:
         raise ClodError(f"{path}: cannot be read ({error.strerror or error}); check the path") from error
-    except Exception as error:  # SafetensorError, and others for a crafted header
-        raise ClodError(f"{path}: is not a safetensors file, or damaged ({error}); copy or export it again") from error
+    except MemoryError:  # of a file that is whole
+        raise
+    except Exception as error:  # SafetensorError, and whatever a crafted file provokes
+        raise ClodError(f"{path}: {what} ({error}); {fix}") from error
 
 
 def write_safetensors(path: Path, gaussians: Gaussians, history: History) -> tuple[str, ...]:

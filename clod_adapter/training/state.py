@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -17,7 +15,7 @@ from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.file_formats import refuse_irregular
-from clod_adapter.io.tensor_file import read_tensors, write_tensors
+from clod_adapter.io.tensor_file import read_tensors, refused_if_damaged, write_tensors
 
 KEY = "clod_adapter_state"  # of the JSON document in the metadata of a file
 OTHER_RUN = "the training state is of other Gaussians, views or settings; use those it was saved with"
@@ -168,7 +166,7 @@ def load_state(path: str | Path) -> tuple[TrainingState, dict[str, Any]]:
     """
     path = Path(path)
     refuse_irregular(path, "delete it to start over")
-    with refused_if_damaged(path, "is not a training state", "delete it to start over"):
+    with refused_if_damaged(path, "is not a training state or is damaged", "delete it to start over"):
         tensors, metadata = read_tensors(path)
         about = _typed(json.loads(metadata[KEY]), dict)
         belongs, random = _typed(about.pop("belongs"), dict), _typed(about.pop("random"), dict)
@@ -181,19 +179,6 @@ def load_state(path: str | Path) -> tuple[TrainingState, dict[str, Any]]:
         counts = {name: _typed(about.pop(name), int) for name in ("averaged", "steps")}
         rest = {name: float(_typed(value, float, int)) for name, value in about.items()}
         return TrainingState(tensors, attenuation, random, order, **counts, **rest), belongs  # type: ignore[arg-type]
-
-
-@contextmanager
-def refused_if_damaged(path: Path, what: str, fix: str) -> Iterator[None]:
-    """Turns errors of reading a file, raised within, into a ClodError that names it: ``what``, and the ``fix``."""
-    try:
-        yield
-    except OSError as error:
-        raise ClodError(f"{path}: cannot be read ({error.strerror or error}); check the path") from error
-    except MemoryError:  # of a file that is whole
-        raise
-    except Exception as error:  # SafetensorError, and whatever a crafted file provokes
-        raise ClodError(f"{path}: {what} or is damaged ({error}); {fix}") from error
 
 
 def _typed(value: Any, *kinds: type) -> Any:
