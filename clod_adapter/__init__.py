@@ -41,7 +41,8 @@ if TYPE_CHECKING:
     from clod_adapter.training.camera_placement import place_cameras
     from clod_adapter.training.dial import Dial, TrainableSubset, attach
     from clod_adapter.training.loop import Adapted, adapt
-    from clod_adapter.training.plan import Decision, Override, Plan, make_plan
+    from clod_adapter.training.plan import Decision, Override, Plan
+    from clod_adapter.training.planner import make_plan
     from clod_adapter.training.pseudo_views import render_pseudo_views
 
 # Imported on first use: torch takes a second or two, which the command's --help and most of its errors do without.
@@ -62,7 +63,8 @@ on_first_use(__name__, {
     "io.checkpoint": ("Checkpoint", "load", "save"),
     "training.camera_placement": ("place_cameras",),
     "training.pseudo_views": ("render_pseudo_views",),
-    "training.plan": ("Decision", "Override", "Plan", "make_plan"),
+    "training.plan": ("Decision", "Override", "Plan"),
+    "training.planner": ("make_plan",),
     "progress": ("Phase", "Progress", "Stopped"),
     "render": ("Rendering", "render"),
     "training.dial": ("Dial", "TrainableSubset", "attach"),

@@ -32,7 +32,7 @@ from clod_adapter.metrics import psnr_ssim
 from clod_adapter.rasterizers import BACKENDS, Rasterizer, cuda
 from clod_adapter.training.camera_placement import place_cameras
 from clod_adapter.training.loop import adapt
-from clod_adapter.training.plan import make_plan
+from clod_adapter.training.planner import make_plan
 from clod_adapter.training.pseudo_views import PseudoView, render_pseudo_views
 from clod_adapter.training.trainer import Trainer
 from fake_gpu import fake_gpu, waits

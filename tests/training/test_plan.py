@@ -20,19 +20,8 @@ from clod_adapter.progress import Progress
 from clod_adapter.render import render
 from clod_adapter.training.dial import TrainableSubset
 from clod_adapter.training.loop import adapt
-from clod_adapter.training.plan import (
-    NAMES,
-    NOT_NEEDED,
-    RATES,
-    Decision,
-    Override,
-    Plan,
-    largest_change,
-    make_plan,
-    needed_share,
-    seen,
-    sh_degree_losses,
-)
+from clod_adapter.training.plan import NAMES, NOT_NEEDED, RATES, Decision, Override, Plan, largest_change
+from clod_adapter.training.planner import make_plan, needed_share, seen, sh_degree_losses
 from scenes import assert_equal, gaussians, photograph, ring, with_unseen
 
 Pair = tuple[Gaussians, Scene]
