@@ -62,7 +62,7 @@ def viewer(chromium: Any, folder: Path) -> bytes:
         cameras = shown.run("JSON.parse(document.getElementById('clod-config').textContent).cameras.map((c) => c.name)")
         for _ in range(cameras.index(camera.name)):  # as a user goes to it, so that the view fills the window
             shown.page.keyboard.press("n")
-        shown.run("clod.setWipe(0.55, 'base')")
+        shown.run("clod.setWipe(0.55)")
         shown.page.evaluate("document.getElementById('frame').style.visibility = 'hidden'")
         shown.page.wait_for_timeout(250)  # longer than the page draws fewer pixels after a movement
         shown.run("clod.whenDrawn()")

@@ -92,7 +92,7 @@ def test_one_exact_file_needs_no_network(
         for each in (shown, alone):
             each.camera(scenes.camera(320, 240))
         assert np.array_equal(shown.picture(), alone.picture()) and shown.counts() == alone.counts()
-        alone.run("clod.setWipe(0.5, 'base')")
+        alone.run("clod.setWipe(0.5)")
         assert alone.text("#wipe-right") == "base · 400" and alone.errors == []
         assert [url for url in alone.asked if not url.startswith(("file:", "blob:", "data:"))] == []
 
