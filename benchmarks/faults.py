@@ -37,20 +37,19 @@ def faults(words: Sequence[str]) -> Iterator[tuple[str, dict[str, Any]]]:
                 yield name, entry
 
 
-def first_failure(copy: Path, tests: Sequence[str]) -> str:
-    """The first test that fails in the copy; empty where all pass. A run that fails without a test is one too."""
+def first_failure(copy: Path, tests: Sequence[str]) -> tuple[str, str]:
+    """The first test that fails in the copy, or the run's error, empty where all pass; and pytest's last line."""
     options = ["-x", "-q", "-p", "no:cacheprovider", "--numprocesses=0", "-o", "timeout=900"]  # kernels are compiled
     words = [sys.executable, "-m", "pytest", *options, *tests]
     environment = os.environ | {"PYTHONPATH": str(copy), "CLOD_SHARED_DATA": str(SHARED)}
     done = subprocess.run(words, cwd=copy, env=environment, capture_output=True, text=True, check=False)
-    if done.returncode == 0:
-        return ""
-    lines = (done.stdout + done.stderr).splitlines()
-    return next((line.split()[1] for line in lines if line.startswith(("FAILED", "ERROR "))), "".join(lines[-1:]))
+    lines = (done.stdout + done.stderr).splitlines() or [""]
+    failed = (line.split()[1] for line in lines if line.startswith(("FAILED", "ERROR ")))
+    return next(failed, lines[-1]) if done.returncode else "", lines[-1]
 
 
-def run(copy: Path, entry: dict[str, Any], whole: bool) -> str:
-    """What catches the fault, as by ``first_failure``."""
+def run(copy: Path, entry: dict[str, Any], whole: bool) -> tuple[str, str]:
+    """What catches the fault, and the counts, as by ``first_failure``."""
     path = copy / entry["file"]
     text = path.read_text(encoding="utf-8")
     if text.count(entry["before"]) != 1:
@@ -59,7 +58,8 @@ def run(copy: Path, entry: dict[str, Any], whole: bool) -> str:
         )
     path.write_text(text.replace(entry["before"], entry["after"]), encoding="utf-8")
     try:
-        return first_failure(copy, entry["tests"]) or (first_failure(copy, ["tests"]) if whole else "")
+        found = first_failure(copy, entry["tests"])
+        return first_failure(copy, ["tests"]) if whole and not found[0] else found
     finally:
         path.write_text(text, encoding="utf-8")
 
@@ -76,9 +76,9 @@ def main() -> None:
         (copy / "clod_adapter" / "cli").symlink_to(copy / "cli")  # else the installed one is imported
         for name, entry in faults(args.faults):
             began = time.perf_counter()
-            by = run(copy, entry, args.whole)
+            by, counts = run(copy, entry, args.whole)
             missed += not by
-            print(f"{name:40} {by or 'NOT CAUGHT'}", flush=True)
+            print(f"{name:40} {by or f'NOT CAUGHT ({counts})'}", flush=True)
             if args.record:
                 seconds = round(time.perf_counter() - began, 1)
                 append(FILE, {"benchmark": "faults", "fault": name, "caught_by": by, "seconds": seconds})
