@@ -10,7 +10,6 @@ import torch
 
 from clod_adapter.adapter import with_dial
 from clod_adapter.bake import bake, order_by_extinction
-from clod_adapter.cameras import Camera
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.equation.attenuation import attenuate
 from clod_adapter.equation.distances import normalized_distances, viewpoint_of
@@ -21,25 +20,6 @@ from clod_adapter.render import render
 from scenes import camera, gaussians, ring
 
 CONFIG = AttenuationConfig(scene_distance=4.0)
-CUTS = pytest.mark.parametrize("cut", ["hard", "soft"])
-
-
-def at_one_place(some: Gaussians) -> Gaussians:
-    """All Gaussians exactly at d' = 1 from ``camera()`` with a ``scene_distance`` of 4."""
-    return some.replace(means=camera().position.add(torch.tensor([0.0, 0.0, 4.0])).expand(len(some), 3))
-
-
-@CUTS
-def test_opacities_are_those_drawn(cut: str) -> None:
-    config = replace(CONFIG, cut=cut, tau=1 / 255)
-    logits = torch.tensor([-3.0, 0, 8, 30, math.inf, math.inf, 2.0])
-    sigma = torch.tensor([2.0, 2, 2, 2, 2, 1e9, 0.6765])  # the last between tau s and 1.5 tau s
-    some = with_dial(at_one_place(gaussians(7, 0, 0)).replace(opacity_logits=logits), sigma, config)
-    want = attenuate(logits, sigma, torch.ones(7), 2.0, config)
-    baked = bake(some, 2.0, camera())
-    assert len(baked) == 7 and baked.opacity_logits.isfinite().all()
-    torch.testing.assert_close(baked.opacities, want.drawn, atol=1e-7, rtol=2e-6)
-    assert (want.drawn[-1] < 0.9 * want.opacities[-1]) == (cut == "soft")
 
 
 def test_a_dial_without_effect_changes_nothing() -> None:
@@ -51,10 +31,11 @@ def test_a_dial_without_effect_changes_nothing() -> None:
     assert torch.equal(baked.opacity_logits[2:], want[2:]) and baked.opacity_logits[0] == 22
 
 
-def spread(n: int = 300, normalizer: str = "scene", cut: str = "soft") -> Gaussians:
+def spread(normalizer: str = "scene", cut: str = "soft") -> Gaussians:
     """Gaussians at many distances from ``camera()``, some of which are culled, and most of which grow."""
-    sigma, growth = torch.rand(2, n, generator=torch.Generator().manual_seed(2))
-    some = with_dial(gaussians(n, 1, 7), 2 * sigma + 0.1, replace(CONFIG, cut=cut, normalizer=normalizer))
+    sigma, growth = torch.rand(2, 300, generator=torch.Generator().manual_seed(2))
+    some = with_dial(gaussians(300, 1, 7), 2 * sigma + 0.1, replace(CONFIG, cut=cut, normalizer=normalizer))
+    some.opacity_logits[:30:10] = math.inf
     return some.replace(growth_d=1.5 * growth - 0.25)
 
 
@@ -63,13 +44,11 @@ def spread(n: int = 300, normalizer: str = "scene", cut: str = "soft") -> Gaussi
     [("soft", "scene", 1.0), ("hard", "quantile", 2.5), ("soft", "max", 2.5), ("hard", "scene", 4.5)],
 )
 def test_baked_image_matches_render_from_its_camera(cut: str, normalizer: str, s: float) -> None:
-    some = spread(normalizer=normalizer, cut=cut)
+    some = spread(normalizer, cut)
     want, baked = render(some, camera(), s), bake(some, s, camera())
-    assert baked.sigma_d is baked.growth_d is baked.attenuation is None and 0 < len(baked) < 300
-    assert len(baked) == want.kept.sum()
+    assert baked.sigma_d is baked.growth_d is baked.attenuation is None and baked.opacity_logits.isfinite().all()
+    assert len(baked) == want.kept.sum() and 0 < len(baked) < 300
     torch.testing.assert_close(render(baked, camera()).image, want.image, atol=2e-5, rtol=0)
-    elsewhere = bake(some, s, cameras=ring(4, 61, 45))
-    assert (render(elsewhere, camera()).image - want.image).abs().max() > 0.01 or s == 1
 
 
 def test_several_cameras_share_one_distance_per_gaussian() -> None:
@@ -86,9 +65,8 @@ def test_several_cameras_share_one_distance_per_gaussian() -> None:
     assert torch.equal(bake(some, s, cameras=places).means, baked.means)
 
 
-@pytest.mark.parametrize("cameras", [[camera()], ring(3, 61, 45)], ids=["one", "several"])
-def test_a_solved_count_is_the_number_of_rows_of_a_prefix(cameras: list[Camera]) -> None:
-    some = spread()
+def test_a_solved_count_is_the_number_of_rows_of_a_prefix() -> None:
+    some, cameras = spread(), ring(3, 61, 45)
     ordered = some.select(order_by_extinction(some, cameras))
     few, many = (len(bake(some, s, cameras=cameras)) for s in (3.0, 1.0))
     assert few + 10 < many
@@ -104,7 +82,6 @@ def test_bad_arguments_are_refused() -> None:
         "virtual_scale is -0.5": lambda: bake(some, -0.5, camera()),
         "no Gaussian is kept at s = 200": lambda: bake(some, 200.0, camera()),
         "either camera or cameras": lambda: bake(some, 2.0),
-        "either camera or cameras;": lambda: bake(some, 2.0, camera(), cameras=[camera()]),
         "no camera is given": lambda: order_by_extinction(some, []),
         "no pruning order": lambda: order_by_extinction(plain, [camera()]),
     }.items():

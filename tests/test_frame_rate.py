@@ -14,8 +14,8 @@ from clod_adapter.frame_rate import next_dial
 
 BUDGET = 10.0  # ms
 MAX_SV = 7.0
-EXPONENTS = (0.2, 0.35, 0.5, 0.75, 1.0, 1.25, 1.5)
-FIXED = (0.0, 0.2, 0.5)  # of the time at the start
+EXPONENTS = (0.2, 0.75, 1.5)
+FIXED = (0.0, 0.5)  # of the time at the start
 BEFORE, AFTER = 25, 100  # frames before and after a change of the load
 
 
@@ -60,7 +60,7 @@ class Renderer:
         return dials
 
 
-@pytest.mark.parametrize("load", [2.0, 4.0, 1 / 3, 0.5, 1.3])
+@pytest.mark.parametrize("load", [2.0, 4.0, 1 / 3])
 @pytest.mark.parametrize("outliers", [False, True])
 def test_the_time_is_within_10_percent_after_15_frames(load: float, outliers: bool) -> None:
     """Later only where steps of 10 % per frame need more. It stays there; without outliers, it never turns back."""
@@ -75,7 +75,7 @@ def test_the_time_is_within_10_percent_after_15_frames(load: float, outliers: bo
 
 def test_it_does_not_oscillate_under_noise_of_20_percent() -> None:
     """Over 400 frames of one load: the dial's changes are small, and the time stays near the budget."""
-    for exponent, fixed, seed in product(EXPONENTS, FIXED, range(3)):
+    for exponent, fixed, seed in product(EXPONENTS, FIXED, range(2)):
         renderer, noise = Renderer(exponent, fixed, start=3.0), np.random.default_rng(seed).lognormal(0.0, 0.2, 400)
         dials = np.array(renderer.follow([1.0] * 400, lambda frame, noise=noise: float(noise[frame])))
         times = np.log([renderer.ms(dial) / BUDGET for dial in dials])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -38,46 +37,34 @@ def test_numpy_and_torch_agree_with_a_rendering(tmp_path: Path, normalizer: str,
     model, view = adapted(normalizer=normalizer, cut=cut), camera()
     clod_adapter.save(tmp_path / "model.ply", model)
     hook = clod_adapter.load(tmp_path / "model.ply").hook(virtual_scale=2)
-    given, counts = (model.means, model.opacities, view.viewmat, view.K), []
-    for s in (2.0, 3.0, 5.0):
-        turned = replace(hook, virtual_scale=s)
-        drawn, keep, growth = turned(*given, view.width, view.height)
-        want = dial(model, view, s)
-        assert torch.equal(keep, want.keep) and 0 < int(keep.sum()) < N
-        torch.testing.assert_close(drawn, want.drawn)
-        torch.testing.assert_close(growth, want.growth)
-        assert growth.min() < 0.9 and growth.max() > 1.1
-        arrays = tuple(tensor.numpy() for tensor in given)
-        found = turned(*arrays, view.width, view.height)
-        assert [(type(each).__name__, str(each.dtype)) for each in found] == [
-            ("ndarray", dtype) for dtype in ("float32", "bool", "float32")
-        ]
-        for array, tensor in zip(found, (drawn, keep, growth), strict=True):
-            assert (array == tensor.numpy()).all()
-        counts.append(int(keep.sum()))
-    assert counts[0] > counts[1] > counts[2]
+    given = model.means, model.opacities, view.viewmat, view.K
+    for s in (2.0, 5.0):
+        turned, want = replace(hook, virtual_scale=s), dial(model, view, s)
+        found = turned(*given, view.width, view.height)
+        arrays = turned(*(tensor.numpy() for tensor in given), view.width, view.height)
+        for array, tensor, wanted in zip(arrays, found, (want.drawn, want.keep, want.growth), strict=True):
+            torch.testing.assert_close(tensor, wanted)
+            assert type(array) is np.ndarray and array.dtype == tensor.numpy().dtype and (array == tensor.numpy()).all()
+        assert 0 < int(want.keep.sum()) < N and want.growth.min() < 0.9 and want.growth.max() > 1.1
 
 
 def test_mixed_and_strided_arrays_are_accepted() -> None:
     """Mixed numpy and torch, integers, negative strides, the other byte order, and lists."""
-    model, view = adapted(normalizer="max"), camera()
-    means, a, viewmat = model.means.numpy(), model.opacities.numpy(), view.viewmat.numpy()
-    hook, size = hook_of(model), (view.width, view.height)
-    want = hook(means, a, viewmat, view.K.numpy(), *size)
-    mixed = hook(model.means, model.opacities, viewmat, view.K.numpy(), *size)
-    assert isinstance(mixed[0], torch.Tensor) and (mixed[0].numpy() == want[0]).all()
+    model, size = adapted(normalizer="max"), (64, 48)
+    means, a, K = model.means.numpy(), model.opacities.numpy(), camera().K.numpy()
+    pose = np.array([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 2], [0, 0, 0, 1]])
+    hook = hook_of(model)
+    want = hook(means, a, pose * 1.0, K, *size)
+    assert isinstance(hook(model.means, model.opacities, pose, K, *size)[0], torch.Tensor)
     for others in (
-        (means, a, view.viewmat, view.K),
-        (means[::-1][::-1], np.stack([a, a], 1)[:, 0], np.asfortranarray(viewmat), view.K.numpy()),
-        (means.astype(">f4"), a.astype(">f4"), viewmat.astype(">f8"), view.K.numpy()),
-        (means.tolist(), a, viewmat.tolist(), view.K.tolist()),
+        (means, a, pose, torch.from_numpy(K)),
+        (means[::-1][::-1], np.stack([a, a], 1)[:, 0], np.asfortranarray(pose), K),
+        (means.astype(">f4"), a.astype(">f4"), pose.astype(">f8"), K),
+        (means.tolist(), a, pose.tolist(), K.tolist()),
     ):
         drawn, keep, _ = hook(*others, *size)
         assert type(drawn) is type(keep) is np.ndarray and drawn.dtype.isnative
         assert (keep == want[1]).all() and np.allclose(drawn, want[0], rtol=1e-5)
-    whole = np.array([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 2], [0, 0, 0, 1]])
-    of_whole, of_floats = (hook(means, a, pose, view.K.numpy(), *size)[0] for pose in (whole, whole * 1.0))
-    assert (of_whole == of_floats).all()
 
 
 def test_gradients_reach_opacities_sigma_d_and_growth_d_only() -> None:
@@ -114,24 +101,15 @@ def test_hold_moves_the_dial_by_the_times_it_takes() -> None:
     for _ in range(8):
         hold.took(30)
     assert hold.hook.virtual_scale == pytest.approx(2 * 1.1**6) and start.virtual_scale == 2  # from the third frame on
-    assert torch.equal(hold.hook.sigma_d, start.sigma_d) and not hold.out_of_reach
+    assert hold.hook.sigma_d is start.sigma_d and not hold.out_of_reach
     for _ in range(10):
         hold.took(30)
     assert hold.hook.virtual_scale == 5 and hold.out_of_reach
     for _ in range(4):
-        hold.took(2)
-    assert hold.hook.virtual_scale < 5 and not hold.out_of_reach
-    assert replace(start, virtual_scale=9.0).hold(10).hook.virtual_scale == 5
-
-
-def test_hold_measures_the_block() -> None:
-    hold = hook_of(adapted(), 2.0).hold(milliseconds=1)
-    for _ in range(4):
         with hold.frame() as hook:
             assert hook is hold.hook
-            time.sleep(0.002)
-    assert hold.hook.virtual_scale > 2
-    before = hold.hook
+    assert hold.hook.virtual_scale < 5 and not hold.out_of_reach
     with pytest.raises(KeyError), hold.frame():
+        hook = hold.hook
         raise KeyError  # a frame that was not finished has no time
-    assert hold.hook is before
+    assert hold.hook is hook and replace(start, virtual_scale=9.0).hold(10).hook.virtual_scale == 5

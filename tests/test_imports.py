@@ -8,7 +8,7 @@ import shutil
 import subprocess
 import sys
 import tomllib
-from graphlib import CycleError, TopologicalSorter
+from graphlib import TopologicalSorter
 from importlib.util import resolve_name
 from pathlib import Path
 
@@ -46,14 +46,14 @@ ORDER: list[set[str]] = [
     {"cli.main"},
     {"__main__"},
 ]  # fmt: skip
+LEVELS = {unit: level for level, units in enumerate(ORDER) for unit in units}
 SOURCES = sorted([*(ROOT / PACKAGE).rglob("*.py"), *(ROOT / "cli").rglob("*.py")])
 
 
 def module_of(path: Path) -> str:
     """Dotted name below the package: ``io.checkpoint``, ``cli.main``, and an empty one for the package itself."""
     parts = path.relative_to(ROOT).with_suffix("").parts
-    parts = parts[1:] if parts[0] == PACKAGE else parts
-    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+    return ".".join(part for part in parts if part not in (PACKAGE, "__init__"))
 
 
 MODULES = {module_of(path) for path in SOURCES}
@@ -65,34 +65,19 @@ def unit_of(module: str) -> str:
     return ".".join(parts[: 2 if parts[0] in ("io", "cli") else 1])
 
 
-def level_of(module: str) -> int:
-    for level, units in enumerate(ORDER):
-        if unit_of(module) in units:
-            return level
-    pytest.fail(f"{unit_of(module)} has no place: add it to ORDER of {Path(__file__).name}")
-
-
-def imports_of(path: Path, tree: ast.AST) -> list[tuple[int, str]]:
-    """Line and module (as by ``module_of``) of every import from the package in a file, at any depth."""
-    found = []
-    for node in ast.walk(tree):
-        targets: list[str] = []
+def imports_of(path: Path) -> dict[str, int]:
+    """The lines of every import from the package in a file, at any depth, by module (as by ``module_of``)."""
+    found = list[tuple[str, int]]()
+    here = f"{PACKAGE}.{module_of(path.parent / '__init__.py')}".rstrip(".")
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
-            targets = [alias.name for alias in node.names]
+            found += [(alias.name, node.lineno) for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
-            here = f"{PACKAGE}.{module_of(path)}".rstrip(".")
-            here = here if path.name == "__init__.py" else here.rpartition(".")[0]
             base = resolve_name("." * node.level + (node.module or ""), here)
-            # "from clod_adapter import io" names a module, "from clod_adapter import Gaussians" a re-export.
-            below = [f"{base}.{a.name}" for a in node.names if f"{base}.{a.name}".partition(".")[2] in MODULES]
-            targets = [*below, *([base] if len(below) < len(node.names) else [])]
-        for target in targets:
-            head, _, rest = target.partition(".")
-            if head == PACKAGE:
-                found.append((node.lineno, rest))
-            elif head == "cli":
-                found.append((node.lineno, target))
-    return found
+            for name in (f"{base}.{alias.name}" for alias in node.names):
+                # "from clod_adapter import io" names a module, "from clod_adapter import Gaussians" a re-export.
+                found.append((name if name.partition(".")[2] in MODULES else base, node.lineno))
+    return {name.partition(".")[2]: line for name, line in found if name.partition(".")[0] == PACKAGE}
 
 
 def test_imports_fall() -> None:
@@ -100,71 +85,66 @@ def test_imports_fall() -> None:
     wrong, graph = [], dict[str, set[str]]()
     for path in SOURCES:
         own = module_of(path)
-        found = imports_of(path, ast.parse(path.read_text(encoding="utf-8")))
-        graph[own] = {target for _, target in found} - {own}
-        for line, target in found:
-            if unit_of(target) != unit_of(own) and level_of(target) >= level_of(own):
+        found = imports_of(path)
+        graph[own] = found.keys() - {own}
+        for target, line in found.items():
+            if unit_of(target) != unit_of(own) and LEVELS[unit_of(target)] >= LEVELS[unit_of(own)]:
                 wrong.append(f"{path.relative_to(ROOT)}:{line} imports {target}, which is not below it")
     assert not wrong, "\n".join(wrong)
-    try:
-        TopologicalSorter(graph).prepare()
-    except CycleError as error:
-        pytest.fail(" <- ".join(error.args[1]))
+    TopologicalSorter(graph).prepare()  # raises CycleError
 
 
-def test_import_is_light_and_names_are_lazy(tmp_path: Path) -> None:
-    """Names are imported on first use, and functions stay functions where a submodule has the same name."""
-    heavy = ["torch", "numpy", "numba", "gsplat", "pycolmap", "plyfile", "matplotlib", "skimage"]
-    code = (
-        f"import sys, {PACKAGE}, {PACKAGE}.cli.main\n"
-        f"assert not [m for m in {heavy} if m in sys.modules]\n"
-        f"import {PACKAGE} as package, {PACKAGE}.render, {PACKAGE}.bake\n"
-        "kinds = {name: type(getattr(package, name)).__name__ for name in package.__all__}\n"
-        "assert set(kinds.values()) <= {'type', 'EnumType', 'function'}, kinds\n"
-        "assert set(package.__all__) == {name for name in dir(package) if not name.startswith('_')}\n"
-        "assert not hasattr(package, 'nonsense')\n"
-    )
-    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
+def run(code: str) -> None:
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
+
+
+def test_import_is_light_and_names_are_lazy() -> None:
+    """Names are imported on first use, and functions stay functions where a submodule has the same name."""
+    run("""
+import sys, clod_adapter.cli.main
+heavy = {"torch", "numpy", "numba", "gsplat", "pycolmap", "plyfile", "matplotlib", "skimage"}
+assert not heavy & set(sys.modules)
+import clod_adapter as package, clod_adapter.render, clod_adapter.bake
+kinds = {name: type(getattr(package, name)).__name__ for name in package.__all__}
+assert set(kinds.values()) <= {"type", "EnumType", "function"}, kinds
+assert set(package.__all__) == {name for name in dir(package) if not name.startswith("_")}
+assert not hasattr(package, "nonsense")
+""")
 
 
 def test_hook_and_drop_ins_need_torch_and_numpy_alone() -> None:
     """So that they work in a training's environment, after pip install --no-deps."""
-    code = f"""
+    run("""
 import sys, types
 import numpy, torch
 
 class Installed:
     def find_spec(self, name, path=None, target=None):
         top = name.partition(".")[0]
-        if top not in sys.stdlib_module_names and top != "{PACKAGE}" and top not in sys.modules:
+        if top not in sys.stdlib_module_names and top != "clod_adapter" and top not in sys.modules:
             raise ModuleNotFoundError(name)
 
-sys.path.insert(0, {str(ROOT / "tests")!r})
+sys.path.insert(0, "tests")
 import gsplat_versions
 sys.meta_path.insert(0, Installed())
 inria = types.ModuleType("diff_gaussian_rasterization")
 inria.GaussianRasterizationSettings, inria.GaussianRasterizer = tuple, torch.nn.Module
-sys.modules |= {{"gsplat": gsplat_versions.module("1.4.0", lambda *given: given), inria.__name__: inria}}
-import {PACKAGE} as clod
-import {PACKAGE}.integrations.inria
-from {PACKAGE}.integrations.gsplat import rasterization
+sys.modules |= {"gsplat": gsplat_versions.module("1.4.0", lambda *given: given), inria.__name__: inria}
+import clod_adapter as clod
+import clod_adapter.integrations.inria
+from clod_adapter.integrations.gsplat import rasterization
 
 means, ones, eye = torch.rand(5, 3), torch.ones(5), torch.eye(4)
-model = clod.from_gsplat({{"means": means, "quats": torch.rand(5, 4), "scales": means, "opacities": ones,
-                          "sh0": torch.rand(5, 1, 3)}})
-model = clod.with_dial(model, ones, growth_d=ones)
-drawn, keep, growth = clod.Hook(model.sigma_d, model.attenuation, 2, model.growth_d)(means, ones, eye)
-_, _, given = rasterization(means, model.quats, means, ones, means, eye[None], eye[None, :3, :3], 4, 4, virtual_scale=2,
-                            sigma_d=ones, growth_d=ones, attenuation=model.attenuation)
+dial = {"sigma_d": ones, "growth_d": ones, "attenuation": clod.AttenuationConfig(), "virtual_scale": 2}
+drawn, keep, growth = clod.Hook(**dial)(means, ones, eye)
+given = rasterization(means, torch.rand(5, 4), means, ones, means, eye[None], eye[None, :3, :3], 4, 4, **dial)[2]
 assert torch.equal(given["opacities"], drawn) and torch.equal(given["scales"], means * growth[:, None])
 try:
     clod.load("model.ply")
 except ModuleNotFoundError as error:
     assert "plyfile" in str(error)
-"""
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
+""")
 
 
 def test_every_package_is_installed() -> None:

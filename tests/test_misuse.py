@@ -98,11 +98,6 @@ def test_calls_are_refused(
     assert not list(tmp_path.iterdir())
 
 
-def test_gaussians_are_compared_as_a_whole() -> None:
-    same, numpy = MODEL.replace(), MODEL.replace(means=MODEL.means.numpy())
-    assert (same == MODEL) is True and (numpy == MODEL) is True and (same != MODEL) is False
-    for other in (
-        MODEL[:5], MODEL.replace(means=MODEL.means + 1), MODEL.replace(means=MODEL.means.double()), gaussians(N, 1, 0),
-        MODEL.replace(growth_d=None), MODEL.replace(attenuation=clod.AttenuationConfig(max_sv=2)), "text",
-    ):  # fmt: skip
-        assert (other == MODEL) is False
+def test_a_message_is_one_printable_line() -> None:
+    message = str(clod.ClodError("a.ply: property \x1b[2J\nx\r\x00 is odd (é)"))
+    assert message == "a.ply: property  [2J x   is odd (é)" and message.isprintable()

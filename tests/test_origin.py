@@ -6,13 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from plyfile import PlyData, PlyElement
 
 import clod_adapter as clod
-from clod_adapter.io.scene.colmap import load_points
 from clod_adapter.origin import NOWHERE, origin_of
-from photographs import write_scene
 from scenes import gaussians
 
 UTM = np.array([437_123.25, -4_481_010.5, 1_000.0])
@@ -30,16 +27,12 @@ def moved(path: Path, out: Path, kind: str) -> Path:
 
 def test_only_distant_scenes_have_an_origin() -> None:
     near = np.random.default_rng(0).normal(size=(500, 3))
-    assert origin_of(near) == origin_of(near + 40) == NOWHERE
-    assert origin_of(near[:1] + UTM) == NOWHERE  # of one Gaussian there is no telling what is far
-    assert origin_of(np.zeros((0, 3))) == origin_of(np.full((3, 3), np.nan)) == NOWHERE
-    with_floater = np.concatenate([near, [[1e9, 0, 0]]])
-    assert origin_of(with_floater) == NOWHERE
-    assert np.abs(np.array(origin_of(with_floater + UTM)) - UTM).max() < 5
-    line = np.array([[1.0, 0.0, 0.0]] * 100)
+    floater = np.concatenate([near, [[1e9, 0, 0]]])
+    none = (near, near + 40, floater, near[:1] + UTM, np.zeros((0, 3)), np.full((3, 3), np.nan))
+    assert {origin_of(each) for each in none} == {NOWHERE}
+    assert np.abs(np.array(origin_of(floater + UTM)) - UTM).max() < 5
     for length in (1e-320, 1e-9):
-        line[:, 2] = np.linspace(0, length, 100)
-        assert origin_of(line)[0] == 1.0
+        assert origin_of(np.linspace([1, 0, 0], [1, 0, length], 100))[0] == 1.0
     origin = origin_of(near * [1, 1, 1e-3] + [1e6, -0.1, -1e-4])
     assert origin[0] > 9e5 and [str(value) for value in origin[1:]] == ["0.0", "0.0"]  # not -0.0
 
@@ -77,19 +70,3 @@ def test_an_adapter_stores_the_origin(tmp_path: Path) -> None:
     adapter = clod.load_adapter(tmp_path / "far.safetensors")
     assert adapter.origin == far.origin
     assert adapter.apply(clod.load(tmp_path / "far.ply", origin=adapter.origin).gaussians).means.equal(adapted.means)
-
-
-def test_cameras_are_read_relative_to_the_origin(tmp_path: Path) -> None:
-    """A georeferenced model, stored in float64, has the same cameras as near 0."""
-    pycolmap = pytest.importorskip("pycolmap")  # which alone moves models
-    for name in ("near", "far"):
-        (tmp_path / name).mkdir()
-        write_scene(tmp_path / name, 4)
-    near = clod.load_scene(tmp_path / "near")
-    model = pycolmap.Reconstruction(str(tmp_path / "near" / "sparse" / "0"))
-    model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(), UTM))
-    model.write_binary(str(tmp_path / "far" / "sparse" / "0"))
-    far = clod.load_scene(tmp_path / "far", origin=tuple(UTM))
-    for a, b in zip((*near.train, *near.test), (*far.train, *far.test), strict=True):
-        torch.testing.assert_close(b.camera.viewmat, a.camera.viewmat, rtol=0, atol=1e-6)
-    assert load_points(tmp_path / "far", tuple(UTM)).shape[1] == 3

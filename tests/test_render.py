@@ -16,34 +16,26 @@ from clod_adapter.rasterizers import Rasterizer, reference
 from clod_adapter.render import render, splat
 from scenes import camera, dialled, gaussians
 
-SCALES = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0)
 FAINTEST = {"tau": 1 / 255, "cut": "hard"}  # what this drops, the rasterizer skips
 CONFIG = AttenuationConfig(**FAINTEST, scene_distance=3.0)
 
 
-def adapted(n: int = 300, seed: int = 0, **config: object) -> Gaussians:
-    g = torch.Generator().manual_seed(seed + 100)
-    sigma = (0.8 * torch.randn(n, generator=g)).exp()
-    return with_dial(gaussians(n, 1, seed), sigma, AttenuationConfig(**(FAINTEST | {"scene_distance": 3.0} | config)))
+def adapted(n: int = 300) -> Gaussians:
+    sigma = (0.8 * torch.randn(n, generator=torch.Generator().manual_seed(100))).exp()
+    return with_dial(gaussians(n, 1, 0), sigma, CONFIG)
 
 
 @pytest.mark.filterwarnings("ignore:virtual_scale")
-@pytest.mark.parametrize("seed", range(3))
-def test_a_disabled_adapter_is_the_base(seed: int) -> None:
+def test_a_disabled_adapter_is_the_base() -> None:
     """Bit for bit: without a dial at any s, and with a dial without decay at s = 1."""
-    base, view = gaussians(300, seed % 4, seed), camera()
+    base, view = gaussians(300, 1, 0), camera()
     want = render(base, view)
     assert want.image.abs().sum() > 0 and want.kept.all()
-    detached = detach(adapted(seed=seed).replace(**base.tensors()))
-    for found in (render(detached, view, 3.0), *(render(base, view, s) for s in SCALES)):
+    for found in (render(detach(adapted()), view, 3.0), *(render(base, view, s) for s in (1.0, 2.0, 7.0))):
         assert all(torch.equal(getattr(found, name), getattr(want, name)) for name in ("image", "alpha", "kept"))
-    untouched = dial(base, view, 3.0)
-    assert torch.equal(untouched.opacities, base.opacities) and untouched.keep.all()
-    torch.testing.assert_close(untouched.log_opacities.exp(), base.opacities)
-    others = [AttenuationConfig(**FAINTEST, normalizer=normalizer) for normalizer in ("max", "quantile")]
-    for config in (None, CONFIG, *others):
+    for config in (None, CONFIG, AttenuationConfig(**FAINTEST, normalizer="max")):
         identity = render(with_dial(base, attenuation=config), view)
-        assert torch.equal(identity.image, want.image) and torch.equal(identity.alpha, want.alpha), f"seed {seed}"
+        assert torch.equal(identity.image, want.image) and torch.equal(identity.alpha, want.alpha)
         assert torch.equal(identity.kept, base.opacities > 1 / 255)
 
 
@@ -51,7 +43,7 @@ def test_a_disabled_adapter_is_the_base(seed: int) -> None:
 def test_gradients_reach_sigma_and_all_attributes(s: float) -> None:
     """Gradients through attenuation, culling and rasterizer match central differences in float64."""
     view, plain = camera(20, 16), Rasterizer(reference.rasterize)
-    some = adapted(40, 3)
+    some = adapted(40)
     doubles = {name: value.double() for name, value in some.replace(log_scales=some.log_scales + 1.5).tensors().items()}
     weights = torch.randn(16, 20, 3, generator=torch.Generator().manual_seed(0)).double()
 
@@ -74,10 +66,9 @@ def test_gradients_reach_sigma_and_all_attributes(s: float) -> None:
 
 def test_bad_arguments_are_refused() -> None:
     base = gaussians(5, 0, 0)
-    for value in (-1e-3, -1.0, math.inf, math.nan):
-        for some in (adapted(), base):
-            with pytest.raises(ClodError, match="virtual_scale"):
-                render(some, camera(), value)
+    for value in (-1e-3, math.inf, math.nan):
+        with pytest.raises(ClodError, match="virtual_scale"):
+            render(base, camera(), value)
     with pytest.raises(ClodError, match="background"):  # a kernel would read past its end
         render(base, camera(), background=torch.ones(1))
     with pytest.raises(ClodError, match="opacities"):
