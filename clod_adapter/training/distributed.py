@@ -1,8 +1,7 @@
 """Several processes that train one set of Gaussians, on ``torch.distributed``.
 
 Each process holds all parameters, samples the same views from the same seed, and makes every step. Only the views of a
-batch are divided: each process computes the gradients of its share, and the gradients are summed before the step. All
-processes therefore hold the same parameters; the result is that of the first one.
+batch are divided, and the gradients are summed before the step, so all processes hold the same parameters.
 """
 
 from __future__ import annotations
@@ -12,10 +11,9 @@ import math
 import os
 import re
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from datetime import timedelta
-from functools import partial
 from typing import TYPE_CHECKING, TypeVar, cast
 
 import torch
@@ -23,7 +21,6 @@ import torch.distributed as dist
 from torch import Tensor
 
 from clod_adapter.errors import ClodError
-from clod_adapter.progress import Listener, Phase, Progress, Stopped
 from clod_adapter.training.optimizer import GradientSum
 
 if TYPE_CHECKING:
@@ -44,12 +41,8 @@ class ProcessLost(ClodError):
 class ProcessGroup:
     """The processes that train together: the default group of ``torch.distributed``.
 
-    All processes call the methods in the same order. They raise ProcessLost if a process has ended; no further
-    exchange is possible then.
-
-    Attributes:
-        rank, size: of this process, from 0, and of the group.
-        waiting, exchanging: seconds spent waiting for the slowest process, and sending and summing.
+    All call the methods in the same order. They raise ProcessLost if a process has ended; no exchange is possible then.
+    ``waiting`` and ``exchanging`` are seconds spent waiting for the slowest process, and sending and summing.
     """
 
     def __init__(self) -> None:
@@ -82,49 +75,6 @@ class ProcessGroup:
             if kept.is_cuda:
                 torch.cuda.synchronize()  # NCCL's own wait returns at once
         return GradientSum(gradients, kept.bool(), loss[0], int(loss[1]))
-
-    def once(self, compute: Callable[[Listener], T], progress: Listener | None = None) -> T:
-        """What ``compute`` returns in the first process, which alone calls it; in the others with tensors on the CPU.
-
-        The listener that ``compute`` is given calls ``progress`` in all processes. The others wait as long as it takes,
-        if no two of these calls are PATIENCE apart.
-
-        Raises:
-            Stopped: ``progress`` returned False in one of the processes.
-            ClodError: that of ``compute``, and in the other processes any error of it.
-        """
-        found, failure = None, None
-        if self.rank == 0:
-            try:
-                found = compute(partial(self._relay, progress))
-            except ProcessLost:
-                raise
-            except Exception as error:
-                failure = error
-            self._exchange_progress(None, True)
-        else:
-            now, going = self._exchange_progress(None, True)
-            while now:
-                going = progress is None or progress(now) is not False
-                now, _ = self._exchange_progress(None, going)
-        known = failure is None or isinstance(failure, (ClodError, Stopped))
-        found, told = self.broadcast((found, failure if known else ClodError(str(failure) or type(failure).__name__)))
-        if failure := failure or told:
-            raise failure
-        return cast(T, found)
-
-    def _relay(self, progress: Listener | None, now: Progress) -> bool:
-        """Calls the listeners of all processes; whether all go on, the other processes as of the call before."""
-        going = progress is None or progress(now) is not False
-        return self._exchange_progress(now, going)[1]
-
-    def _exchange_progress(self, now: Progress | None, going: bool) -> tuple[Progress | None, bool]:
-        """The first process's progress, None at the end, and whether all processes go on."""
-        place = [-1.0] * 3 if now is None else [list(Phase).index(now.phase), now.done, now.total]
-        said = torch.tensor([*place, 0.0 if going else 1.0], dtype=torch.float64)
-        self._meet(said, "MAX")
-        phase, done, total = map(int, said[:3])
-        return (None if phase < 0 else Progress(list(Phase)[phase], done, total)), not said[3]
 
     def broadcast(self, value: T) -> T:
         """The first process's value, with its tensors on the CPU; the argument of the others is ignored."""
@@ -160,15 +110,9 @@ class ProcessGroup:
 
 
 def require_distributed() -> None:
-    """Refuses a torch that cannot train in several processes.
-
-    Raises:
-        ClodError: it is built without ``torch.distributed``, or hangs in the exchange, as 2.4 and 2.6 do with three.
-    """
+    """Refuses a torch that cannot train in several processes; 2.4 and 2.6 hang in the exchange of three."""
     if not dist.is_available():
-        raise ClodError(
-            "this build of torch has no torch.distributed, so only one process can train: leave out torchrun"
-        )
+        raise ClodError("this torch has no torch.distributed, so only one process can train: leave out torchrun")
     if torch.__version__ < OLDEST:
         raise ClodError(
             f"several processes need torch {OLDEST} or newer, and this is {torch.__version__}: "
@@ -178,11 +122,7 @@ def require_distributed() -> None:
 
 @contextmanager
 def joined(store: Store, rank: int, size: int) -> Iterator[ProcessGroup]:
-    """The group of the processes that enter with the same ``store``: gloo on CPUs, NCCL on GPUs.
-
-    Raises:
-        ClodError: as ``require_distributed``, of several processes.
-    """
+    """The group of the processes that enter with the same ``store``: gloo on CPUs, NCCL on GPUs."""
     if size > 1:
         require_distributed()
     nccl = torch.cuda.is_available() and dist.is_nccl_available()

@@ -86,34 +86,25 @@ def adapt(
     """
     config = replace(config or AdaptConfig(), **settings).for_views(len(scene.train))
     require_trainable(base, scene, config, group.size if group else 1)
-    with shown(False if progress is None and group and group.rank else progress) as listener:
-        return _adapt(base, scene, config, listener, resume, subset, group)
-
-
-def _adapt(
-    base: Gaussians, scene: Scene, config: AdaptConfig, progress: Listener | None, resume: TrainingState | None,
-    subset: TrainableSubset | None, group: ProcessGroup | None,
-) -> Adapted:  # fmt: skip
-    """``adapt`` with the listener that it has."""
     began = time.perf_counter()
     # Empty higher SH degrees that are not tuned stay empty, so they are not rendered.
     lean = base if config.lr_shN > 0 else base.without_empty_bands()
     views, watched = training_views(base, scene.train, config)
-    begun = (
-        _initialized(lean, views, config, progress, group)
-        if resume is None
-        else _initialized_from(lean, resume, config)
-    )
-    trainer = Trainer(begun, views, config, subset, group, watched)
-    trainer.empty_sh = None if lean is base else base.shN.clone()
-    trainer.start_seconds = time.perf_counter() - began
-    if resume is not None:
-        try:
-            trainer.restore(resume)
-        except ClodError as error:
-            raise StateRefused(str(error)) from error
-    del resume, begun, base, lean  # the trainer has copies
-    return _train(trainer, progress)
+    with shown(False if progress is None and group and group.rank else progress) as listener:
+        if resume is None:
+            begun = _initialized(lean, views, config, listener, group)
+        else:
+            begun = _initialized_from(lean, resume, config)
+        trainer = Trainer(begun, views, config, subset, group, watched)
+        trainer.empty_sh = None if lean is base else base.shN.clone()
+        trainer.start_seconds = time.perf_counter() - began
+        if resume is not None:
+            try:
+                trainer.restore(resume)
+            except ClodError as error:
+                raise StateRefused(str(error)) from error
+        del resume, begun, base, lean  # the trainer has copies
+        return _train(trainer, listener)
 
 
 def time_steps(
@@ -142,11 +133,7 @@ def time_steps(
 def training_views(
     base: Gaussians, views: Sequence[View], config: AdaptConfig
 ) -> tuple[tuple[View, ...], tuple[View, ...]]:
-    """The usable views to train on, and those that watch s = 1 (``gate.Gate``); none watch the paper's objective.
-
-    Raises:
-        ClodError: no view is usable.
-    """
+    """The usable views to train on, and those that watch s = 1 (``gate.Gate``); none watch the paper's objective."""
     usable = usable_views(base, views)
     return split_views(usable) if form_of(config).measured else (usable, ())
 
@@ -155,14 +142,10 @@ def _initialized(
     lean: Gaussians, views: tuple[View, ...], config: AdaptConfig, progress: Listener | None,
     group: ProcessGroup | None,
 ) -> Gaussians:  # fmt: skip
-    """The Gaussians with the initial dial; of a group, the first process computes it."""
-
-    def initial(listener: Listener | None) -> dict[str, Any]:
-        begun = for_training(form_of(config).initial(lean, views, config, listener), views, config)
-        return {name: getattr(begun, name) for name in ("sigma_d", "growth_d", "attenuation")}
-
-    found = group.once(initial, progress) if group else initial(progress)
-    return lean.replace(**found).to(lean.means.device)
+    """The Gaussians with the initial dial: of a group, which may round differently, the first process's."""
+    begun = for_training(form_of(config).initial(lean, views, config, progress), views, config)
+    found: Any = {name: getattr(begun, name) for name in ("sigma_d", "growth_d", "attenuation")}
+    return lean.replace(**(group.broadcast(found) if group else found)).to(lean.means.device)
 
 
 def _initialized_from(lean: Gaussians, resume: TrainingState, config: AdaptConfig) -> Gaussians:
@@ -176,7 +159,6 @@ def _train(trainer: Trainer, progress: Listener | None) -> Adapted:
     """Steps until the steps or the time budget are used up, or something ends training early."""
     group, lost, failed = trainer.group, None, None
     began, going = time.perf_counter() - trainer.seconds, True
-    before = (group.waiting, group.exchanging) if group else (0.0, 0.0)
 
     def tell(error: str | None = None) -> bool:
         """Whether the listener wants training to go on."""
@@ -213,7 +195,7 @@ def _train(trainer: Trainer, progress: Listener | None) -> Adapted:
             tell(failed)
         trainer.seconds = time.perf_counter() - began
         seen = trainer.gate.finish() if trainer.gate and not lost else None
-        waited = (group.waiting - before[0], group.exchanging - before[1]) if group else (0.0, 0.0)
+        waited = (group.waiting, group.exchanging) if group else (0.0, 0.0)
         adapted = Adapted(
             trainer.gaussians(), trainer.done, trainer.seconds, trainer.start_seconds, not going, lost, *waited,
             failed, int(trainer.held.sum()), watched=seen,
