@@ -21,13 +21,13 @@ from typing import Any
 
 import clod_adapter as clod
 from clod_adapter._kernels.threads import torch_on_one_thread
-from clod_adapter.equation.attenuation import SIGMA_MAX, Attenuated, attenuate
+from clod_adapter.equation.attenuation import SIGMA_MAX, attenuate
 from clod_adapter.initialization.importance import sigma_from_importance
 from clod_adapter.report.style import BLUE, GREEN, ORANGE, PURPLE, QUIET, label_log, new_figure, save_figure, tidy
 from clod_adapter.training.dial import SIGMA_RANGE, Dial
 from clod_adapter.training.optimizer import RowAdam
 from clod_adapter.training.schedule import OURS
-from clod_adapter.training.target_count import count_gradient
+from clod_adapter.training.target_count import count_gradient, target_share
 from common import table
 
 import numpy as np
@@ -147,8 +147,8 @@ def gradients(task: Problem, x: Tensor, log: bool, dials: Sequence[int], count: 
         weight = (1 - Dial.weight_slope * s / CONFIG.max_sv) ** 2
         total = total + weight * losses.sum()
         for run, loss in enumerate((weight * losses.detach()).tolist() if count else []):
-            own = Attenuated(*(value[run * n : (run + 1) * n] for value in dialled))
-            pull[run] += count_gradient(own, task.logits, s, settings.tau, loss, CONFIG)
+            own, target = sigma.detach()[run * n : (run + 1) * n], target_share(s, n, CONFIG)
+            pull[run] += count_gradient(task.distances, task.logits, own, s, settings, loss, CONFIG, target)
     (gradient,) = torch.autograd.grad(total, leaf)
     return gradient + (pull if log else pull / x.detach())
 

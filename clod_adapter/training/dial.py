@@ -11,10 +11,8 @@
         optimizer.zero_grad()
     clod_adapter.save("dial.ply", dial.gaussians())
 
-Initialization, dial values and objective are those of ``training.loop.adapt``, which drives a dial too. Its own step is
-faster on a CPU: it steps the kept rows alone, and averages the last steps.
-
-The splats are trained already, and their number is fixed: densify and prune before.
+Initialization, dial values and objective are those of ``training.loop.adapt``, which drives a dial too, steps the kept
+rows alone, and averages the last steps. The number of splats is fixed: densify and prune before.
 """
 
 from __future__ import annotations
@@ -40,7 +38,7 @@ from clod_adapter.initialization.importance import MOST_VIEWS, for_training, ini
 from clod_adapter.integrations.splats import NAMES, from_gsplat
 from clod_adapter.progress import Listener, shown
 from clod_adapter.training.schedule import OURS, Schedule, ViewSampler
-from clod_adapter.training.target_count import TargetShare, count_gradient_at, target_share
+from clod_adapter.training.target_count import TargetShare, count_gradient, target_share
 
 ATTRIBUTE_OF = {**NAMES, "features_dc": "sh0", "features_rest": "shN"}
 # Sigma stays where the equation still resolves it; below, a Gaussian would be culled for good.
@@ -85,22 +83,15 @@ class Dial(nn.Module):
         typical: ``[N]`` normalised distances at which Gaussians are counted; no view's own, whose counts differ from
             the mean's: gradients that correct such differences cancel out, and only add noise.
 
-    Of every dial of this form:
-
-    Attributes:
-        decay, limits: name of the parameter that sigma_d is trained through, and its lowest and highest value.
-        everywhere: names of parameters, besides it, whose culled rows have gradients too.
-        schedule: of the training.
-        weight_slope: k of ``weight``.
-        measured: whether a plan measures what a scene needs, and views watch s = 1.
     """
 
+    # The parameter that sigma_d is trained through, and others whose culled rows have gradients too.
     decay: ClassVar[str] = "log_sigma"
-    limits: ClassVar[tuple[float, float]] = (math.log(SIGMA_RANGE[0]), math.log(SIGMA_RANGE[1]))
     everywhere: ClassVar[frozenset[str]] = frozenset()
+    limits: ClassVar[tuple[float, float]] = (math.log(SIGMA_RANGE[0]), math.log(SIGMA_RANGE[1]))
     schedule: ClassVar[Schedule] = OURS
     weight_slope: ClassVar[float] = 0.25
-    measured: ClassVar[bool] = True
+    measured: ClassVar[bool] = True  # by the plan, and by views that watch s = 1
 
     typical: Tensor
     log_sigma: Tensor
@@ -119,10 +110,8 @@ class Dial(nn.Module):
         self.part = subset or TrainableSubset(len(start))
         self.attenuation, self.config = start.attenuation, config.for_views(len(views))
         self.register_parameter(self.decay, nn.Parameter(self.parameter_of(start.sigma_d)))
-        growth_d = (
-            None if start.growth_d is None else nn.Parameter(start.growth_d.detach().float().clamp(*GROWTH_RANGE))
-        )
-        self.register_parameter("growth_d", growth_d)
+        growth_d = start.growth_d
+        self.growth_d = None if growth_d is None else nn.Parameter(growth_d.detach().float().clamp(*GROWTH_RANGE))
         cameras = self.part.cameras or [view.camera for view in spread(views, MOST_VIEWS)]
         typical = typical_distance(start.means, cameras, start.attenuation)[: self.part.trained]
         self.register_buffer("typical", typical, persistent=False)
@@ -134,17 +123,16 @@ class Dial(nn.Module):
         cls, base: Gaussians, views: Sequence[View], config: AdaptConfig, progress: Listener | None = None,
         error: Tensor | None = None,
     ) -> Gaussians:  # fmt: skip
-        """The Gaussians with the dial that training begins with, as ``importance.initialize``."""
+        """The Gaussians with the dial that training begins with, as ``importance.initialize`` gives them."""
         return initialize(base, views, config, progress, error)
 
     @staticmethod
     def sigma_of(parameter: Tensor) -> Tensor:
-        """``[N]`` sigma_d from the parameter ``decay``, differentiable."""
+        """``[N]`` sigma_d from the parameter ``decay``, differentiable; ``parameter_of`` is the inverse, clamped."""
         return parameter.exp()
 
     @staticmethod
     def parameter_of(sigma_d: Tensor) -> Tensor:
-        """The inverse of ``sigma_of``, clamped to the trained range."""
         return sigma_d.detach().float().clamp(*SIGMA_RANGE).log()
 
     def __repr__(self) -> str:
@@ -166,14 +154,13 @@ class Dial(nn.Module):
         """
         rates = learning_rates(self.config, self.decay)
         rates["means"] *= self._own_size  # an optimizer has one rate for all rows
-        found = [{"params": [value], "lr": rates[name], "name": name} for name, value in self.named_parameters()]
+        found: dict[str, Any] = dict(self.named_parameters())
         if splats:
             (given,) = self._given
-            for name, value in (given.tensors() if isinstance(given, Gaussians) else given).items():
-                rate = rates.get(ATTRIBUTE_OF.get(name, name))
-                if rate is not None and getattr(value, "requires_grad", False):
-                    found.append({"params": [value], "lr": rate, "name": name})
-        return found
+            own = given.tensors() if isinstance(given, Gaussians) else given
+            found |= {name: value for name, value in own.items() if getattr(value, "requires_grad", False)}
+        named = [(name, value, rates.get(ATTRIBUTE_OF.get(name, name))) for name, value in found.items()]
+        return [{"params": [value], "lr": rate, "name": name} for name, value, rate in named if rate is not None]
 
     def sample(self) -> float:
         """The next dial value, by ``schedule`` over ``config.steps`` calls.
@@ -212,10 +199,9 @@ class Dial(nn.Module):
         return max(1 - self.weight_slope * virtual_scale / self.config.max_sv, 0.0) ** 2
 
     def counts(self, virtual_scale: float, counted: float | None, loss: Tensor) -> list[tuple[float, Tensor]]:
-        """The dial values at which Gaussians are counted, and the losses that weigh the count term there.
+        """The dial values, from 1 on, at which Gaussians are counted, and the losses that weigh the count term there.
 
-        None below s = 1, where all are to be kept. The weight at ``counted`` is 1: with half of w_s, counts at the far
-        end were 1.25 times the target, at a gain of 0.05 to 0.1 dB at equal counts.
+        The weight at ``counted`` is 1: with half of w_s, counts at the far end were 1.25 times the target.
         """
         if counted is None:
             return []
@@ -223,7 +209,7 @@ class Dial(nn.Module):
         return [*here, (counted, loss)]
 
     def objective(self, loss: Tensor, shown: Gaussians, camera: Camera, virtual_scale: float) -> Tensor:
-        """0-d, for ``adapt``: what it differentiates, of the photometric loss of a rendering of ``shown``."""
+        """0-d, what ``adapt`` differentiates, of the photometric loss of a rendering of ``shown``."""
         return self.weight(virtual_scale) * loss
 
     def count_loss(self, virtual_scale: float, rendering_loss: Tensor) -> Tensor:
@@ -244,23 +230,15 @@ class Dial(nn.Module):
 
     @torch.no_grad()
     def count_gradient(self, logits: Tensor, parameter: Tensor, virtual_scale: float, loss: Tensor) -> Tensor:
-        """``[trained]`` the count term's gradient of ``log_sigma`` at one dial value, by ``count_gradient_at``.
-
-        Args:
-            logits, parameter: of the trained rows.
-        """
-        sigma, target = self.sigma_of(parameter), self._target(virtual_scale)
-        return count_gradient_at(
-            self.typical, logits, sigma, virtual_scale, self.attenuation, loss, self.config, target
-        )
+        """``[trained]`` the count term's gradient of ``log_sigma`` at one dial value, of the trained rows."""
+        sigma, target, at = self.sigma_of(parameter), self._target(virtual_scale), (virtual_scale, self.attenuation)
+        return count_gradient(self.typical, logits, sigma, *at, loss, self.config, target)
 
     def _target(self, virtual_scale: float) -> TargetShare:
         part = self.part
-        return (
-            part.target(virtual_scale)
-            if part.target
-            else target_share(virtual_scale, part.trained, self.config, part.total)
-        )
+        if part.target:
+            return part.target(virtual_scale)
+        return target_share(virtual_scale, part.trained, self.config, part.total)
 
     def target_share(self, virtual_scale: float) -> float:
         """The share of the splats that the target-count curve keeps at s, in (0, 1]; 1 below s = 1."""
@@ -269,8 +247,6 @@ class Dial(nn.Module):
     def gaussians(self) -> Gaussians:
         """The splats with this dial, for ``render`` in the loop and ``save`` after it: gradients reach both.
 
-        It has the splats' own tensors.
-
         Raises:
             ClodError: their number has changed.
         """
@@ -278,10 +254,8 @@ class Dial(nn.Module):
         current = given if isinstance(given, Gaussians) else from_gsplat(given)
         count = len(getattr(self, self.decay))
         if len(current) != count:
-            raise ClodError(
-                f"there are {len(current)} splats now, but the dial is for {count}; attach it after "
-                "densification and pruning"
-            )
+            now = f"there are {len(current)} splats now, but the dial is for {count}"
+            raise ClodError(f"{now}; attach it after densification and pruning")
         return current.replace(sigma_d=self.sigma_d, attenuation=self.attenuation, growth_d=self.growth_d)
 
     @torch.no_grad()
@@ -314,7 +288,7 @@ def attach(
     if config.form != "ours":
         raise ClodError(f"attach has no form {config.form}: call adapt, or leave the form out")
     given = scene.train if isinstance(scene, Scene) else scene
-    views = tuple(each if isinstance(each, View) else _without_photograph(each) for each in given)
+    views = tuple(each if isinstance(each, View) else StoredView(each, _no_photograph) for each in given)
     base = splats if isinstance(splats, Gaussians) else from_gsplat(splats)
     base = base.replace(**{name: value.detach() for name, value in base.tensors().items()})
     require_trainable(base, Scene(views, ()), config)
@@ -349,11 +323,10 @@ def learning_rates(config: AdaptConfig, decay: str) -> dict[str, float]:
 def own_sizes(log_scales: Tensor) -> Tensor:
     """``[N]`` the unit of each Gaussian's position steps, world units: the geometric mean of its scales.
 
-    A length of the scene, 3DGS's unit, is a hundred times the size of most Gaussians in a scene of millions.
+    A length of the scene, as in 3DGS, is a hundred times the size of most Gaussians in a scene of millions.
     """
     return log_scales.detach().float().mean(1).exp()
 
 
-def _without_photograph(camera: Camera) -> View:
-    """A view for functions that only take its camera."""
-    return StoredView(camera, lambda: torch.zeros(camera.height, camera.width, 3, dtype=torch.uint8))
+def _no_photograph() -> Tensor:
+    raise AssertionError("only the camera of this view is used")

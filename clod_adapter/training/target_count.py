@@ -11,7 +11,7 @@ from torch import Tensor
 
 from clod_adapter._support.fusing import Number
 from clod_adapter.config import AdaptConfig, AttenuationConfig
-from clod_adapter.equation.attenuation import Attenuated, attenuate, conform, log_threshold
+from clod_adapter.equation.attenuation import attenuate, conform, log_threshold
 
 TEMPERATURE = 0.15  # width of the sigmoid of the soft count, in log opacity
 # Lower bound of the sigmoid's slope, which is at most 1/4, for culled Gaussians while too few are kept. Some widths
@@ -20,11 +20,9 @@ LIFT = 1e-3
 
 
 class TargetShare(NamedTuple):
-    """The count term's target for some Gaussians at one dial value.
+    """The share > 0 of some Gaussians to keep at one dial value, and the weight of a relative deviation from it.
 
-    Attributes:
-        share: of these Gaussians to keep, above 0.
-        weight: of a relative deviation from ``share``; ``1 / share`` where these are all Gaussians of the scene.
+    The weight is ``1 / share`` where these are all Gaussians of the scene.
     """
 
     share: float
@@ -44,50 +42,32 @@ def target_curve(virtual_scale: float, share: float, exponent: float) -> float:
 
 
 def target_share(virtual_scale: float, count: int, config: AdaptConfig, total: int | None = None) -> TargetShare:
-    """The target of ``count`` Gaussians: ``target_curve``, but at least one Gaussian.
-
-    Args:
-        total: number of Gaussians that the curve is a share of, including those that were left out because no view
-            sees them: the target may then exceed ``count``. By default ``count``.
-    """
+    """The target of ``count`` of ``total`` Gaussians (all if None): ``target_curve``, but at least one Gaussian."""
     total = total or max(count, 1)
     share = max(target_curve(virtual_scale, config.share, config.exponent), 1 / total) * (total / max(count, 1))
     return TargetShare(share, 1 / share)
 
 
 def count_gradient(
-    dialled: Attenuated, opacity_logits: Tensor, virtual_scale: float, tau: float, loss: Number, config: AdaptConfig,
-    target: TargetShare | None = None,
-) -> Tensor:  # fmt: skip
-    """``[N]`` the count term's gradient of log sigma_d at one dial value; opacities are constants.
-
-    The gradient of ``loss reg_weight (eta / target - 1)^2``, eta the share kept, through ``count_slope``. Gaussians
-    whose loss gradient is smaller than this fade, the others stay. The term penalises deviations in both directions. It
-    is relative to the target, as the last percent of the Gaussians matters as much as the first, and to the weighted
-    ``loss``, a constant here, so that one setting suits scenes and dial values that are fitted well or badly. The last
-    Gaussian is never penalised. Where too few are kept, culled Gaussians are brought back, however far below the
-    threshold: with a slope of at least ``LIFT / (temperature N)``.
-
-    Args:
-        target: of these Gaussians, where they are not the whole scene; by default ``target_share``.
-    """
-    target = target or target_share(virtual_scale, len(opacity_logits), config)
-    eta = dialled.keep.sum().double() / len(opacity_logits)  # a tensor: a float would wait for a GPU
-    penalty = _penalty(eta, target, loss, config)
-    slope = count_slope(opacity_logits, dialled.log_opacities.detach(), virtual_scale, tau, TEMPERATURE)
-    least = (torch.as_tensor(penalty < 0) & ~dialled.keep) * (LIFT / (TEMPERATURE * len(slope)))
-    return slope.clamp_(min=least).mul_(penalty)
-
-
-def count_gradient_at(
     distances: Tensor, opacity_logits: Tensor, sigma_d: Tensor, virtual_scale: float, attenuation: AttenuationConfig,
     loss: Number, config: AdaptConfig, target: TargetShare,
 ) -> Tensor:  # fmt: skip
-    """``count_gradient`` at given ``distances [N]``; on the CPU in float32 two compiled passes."""
+    """``[N]`` the count term's gradient of log sigma_d at one dial value; opacities are constants.
+
+    The gradient of ``loss reg_weight (eta / target - 1)^2``, eta the share kept, through ``count_slope``. It is
+    relative to the target, as the last percent of the Gaussians matters as much as the first, and to the weighted
+    ``loss``, a constant here, so that one setting suits scenes and dial values that are fitted well or badly. Where too
+    few are kept, culled Gaussians are brought back: with a slope of at least ``LIFT / (temperature N)``.
+    """
     given = opacity_logits, sigma_d, distances
     if any(x.device.type != "cpu" or x.dtype != torch.float32 for x in given):
         dialled = attenuate(*given, virtual_scale, attenuation)
-        return count_gradient(dialled, opacity_logits, virtual_scale, attenuation.tau, loss, config, target)
+        eta = dialled.keep.sum().double() / len(opacity_logits)  # a tensor: a float would wait for a GPU
+        penalty = _penalty(eta, target, loss, config)
+        slope = count_slope(opacity_logits, dialled.log_opacities, virtual_scale, attenuation.tau, TEMPERATURE)
+        least = (torch.as_tensor(penalty < 0) & ~dialled.keep) * (LIFT / (TEMPERATURE * len(slope)))
+        return slope.clamp_(min=least).mul_(penalty)
+    # The same in two compiled passes.
     from clod_adapter._kernels import count, threads
     from clod_adapter.rasterizers.frame import dial_vector, workers_for
 
@@ -97,11 +77,8 @@ def count_gradient_at(
     dial, counts = dial_vector(attenuation, virtual_scale), np.zeros(workers, np.int64)
     threads.run(count.count_kept, workers, *arrays, dial, counts)
     penalty = float(_penalty(float(counts.sum()) / n, target, loss, config))
-    lift = LIFT if penalty < 0 else 0.0
-    threads.run(
-        count.count_slope, workers, *arrays, dial, TEMPERATURE, lift, penalty / (TEMPERATURE * n),
-        out.numpy(),
-    )  # fmt: skip
+    scale = TEMPERATURE, LIFT if penalty < 0 else 0.0, penalty / (TEMPERATURE * n)
+    threads.run(count.count_slope, workers, *arrays, dial, *scale, out.numpy())
     return out
 
 
@@ -119,13 +96,6 @@ def count_slope(
     ``q (1 - q) / (temperature N) max(2 u, 1)`` with ``q = sigmoid((log a'' - log(tau s)) / temperature)`` and
     ``u = log a - log a''``: the slope of a soft count by ``log sigma_d``, except that its factor ``2 u`` is
     at least 1: Gaussians that are not attenuated yet have u = 0 and would never be. 0 at log a'' = -inf.
-
-    Args:
-        log_opacities: ``[N]`` log a'' from ``attenuate``.
-        temperature: > 0, in units of log opacity.
-
-    Raises:
-        ClodError: the shapes differ.
     """
     opacity_logits, log_opacities = conform(opacity_logits=opacity_logits, log_opacities=log_opacities)
     factor = (F.logsigmoid(opacity_logits) - log_opacities).mul_(2).clamp_(min=1)

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from backends import torch_threads
 from clod_adapter.config import AdaptConfig, AttenuationConfig
-from clod_adapter.training.target_count import TargetShare, count_gradient_at
+from clod_adapter.training.target_count import TargetShare, count_gradient
 
 CONFIG = AdaptConfig(max_sv=7.0)
 
@@ -27,9 +27,9 @@ def test_both_forms_agree(n: int, s: float, seed: int, share: float, eps: float,
     sigma = 2 * torch.rand(n, generator=random) + 1e-3
     dial, target = AttenuationConfig(eps=eps, max_sv=10.0), TargetShare(share, 1 / share)
     with torch_threads(workers):
-        got = count_gradient_at(d, logits, sigma, s, dial, 0.1, CONFIG, target)
+        got = count_gradient(d, logits, sigma, s, dial, 0.1, CONFIG, target)
     exact = (x.double() for x in (d, logits, sigma))
-    want = count_gradient_at(*exact, s, dial, 0.1, CONFIG, target)
+    want = count_gradient(*exact, s, dial, 0.1, CONFIG, target)
     torch.testing.assert_close(got.double(), want, rtol=1e-4, atol=1e-6 * max(float(want.abs().max()), 1e-9))
 
 
@@ -38,5 +38,5 @@ def test_extreme_opacities_are_finite(logit: float) -> None:
     d, sigma = torch.tensor([0.0, 1e-6, 1.0, 1e6]).repeat(8), torch.tensor([1e-4, 1.0, 1e9, 1e-4]).repeat_interleave(8)
     logits = torch.full_like(d, logit)
     for target in (0.01, 1.0):
-        given = count_gradient_at(d, logits, sigma, 3.0, AttenuationConfig(), 0.1, CONFIG, TargetShare(target, 1.0))
+        given = count_gradient(d, logits, sigma, 3.0, AttenuationConfig(), 0.1, CONFIG, TargetShare(target, 1.0))
         assert given.isfinite().all()
