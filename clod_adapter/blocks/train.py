@@ -2,19 +2,12 @@
 
 In the first pass each block is trained against the *checkpoint* of the others: these are drawn without a dial at every
 dial value, which is what their own training aims at, and the block's target images are the photographs as far as its
-Gaussians cover them (``target_image``). So no block corrects the errors of another. (Trained against the others'
-initialization at the same dial value, each block brightens what all have faded: images of the merged result were 8 to
-11 dB worse.) In the second pass each block continues with the others at the dial, as the first pass
-trained them, which makes the blocks consistent. Within a pass blocks are independent and may be trained in any order;
-their rows are then merged.
+Gaussians cover them (``target_image``). (Trained against the others' initialization at the same dial value, each block
+brightens what all have faded: images were 8 to 11 dB worse.) In the second pass each block continues with the others at
+the dial, as the first pass trained them. Within a pass blocks are independent; their rows are then merged.
 
-Each block has its share of an undivided run:
-
-- The initialization (importance, pruning order, sigma_d, growth_d, tau) is that of the whole scene.
-- A block takes as many steps as the undivided run takes of the views that see it, so that each Gaussian is stepped as
-  often. All blocks together take more, as a view may see several.
-- The target-count curve counts all Gaussians. A block's target is its share of the Gaussians that the initialization
-  keeps at the same dial value, scaled to the curve (``block_target``).
+The initialization is that of the whole scene. A block takes as many steps as an undivided run takes of the views that
+see it, and its target count is its share of the Gaussians that the initialization keeps (``block_target``).
 """
 
 from __future__ import annotations
@@ -22,7 +15,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -50,15 +43,7 @@ KEY = "clod_adapter_block"  # of the JSON document that identifies the run of a 
 
 @dataclass(frozen=True)
 class Learned:
-    """The trained rows of one block.
-
-    Attributes:
-        rows: ``[n]`` int64, rows of the scene.
-        values: ``sigma_d`` and what else training changed, by name.
-        steps, seconds: of the training.
-        failed: which step's loss was not finite, so that training ended early.
-        held: as ``Adapted.held``.
-    """
+    """The trained rows ``[n]`` of one block, with sigma_d and what else training changed; the rest as ``Adapted``."""
 
     rows: Tensor
     values: dict[str, Tensor]
@@ -79,20 +64,7 @@ def adapt_block(
     resume: TrainingState | None = None,
     cache: ImageCache | None = None,
 ) -> tuple[Learned, Adapted]:
-    """One pass of training one block; the same arguments give the same bits on every machine of a kind.
-
-    Args:
-        views: all views that ``divide`` was given.
-        config: of the whole scene; ``block_config`` derives the block's.
-        block: from 0.
-        after: in the second pass, the scene after the first, from ``merge``.
-        resume: as in ``training.loop.adapt``, from an earlier call for the same block and pass.
-        cache: of target images, which otherwise all stay in memory.
-
-    Returns:
-        The trained rows, and the result of ``training.loop.adapt``, whose first Gaussians are those of the block. A
-        block that no view sees stays unchanged.
-    """
+    """One pass of training one block; the same arguments give the same bits on every machine of a kind."""
     scene = after or division.initial
     # Context and target images are of the placed cameras, so pseudo views stay there.
     rows, own = division.rows(block), [views[k].at(views[k].camera) for k in division.views(block)]
@@ -134,35 +106,18 @@ def _with_target_images(
 
 
 def merge(division: Division, learned: Sequence[Learned]) -> Gaussians:
-    """The scene with the trained rows of its blocks.
-
-    Raises:
-        ClodError: a Gaussian is in no block or in two.
-    """
-    times = torch.zeros_like(division.block, dtype=torch.int32)
-    for part in learned:
-        times[part.rows] += 1
-    if not bool((times == 1).all()):
-        raise ClodError(f"{int((times != 1).sum())} Gaussians are in no block or in two; give each block once")
+    """The scene with the trained rows of its blocks, each given once."""
     merged = {}
     for name, initial in division.initial.tensors().items():
-        if any(name in part.values for part in learned):
-            merged[name] = initial.clone()
-            for part in learned:
-                if name in part.values:
-                    merged[name][part.rows] = part.values[name]
+        parts = [part for part in learned if name in part.values]
+        merged[name] = initial.clone() if parts else initial
+        for part in parts:
+            merged[name][part.rows] = part.values[name]
     return division.initial.replace(**merged)
 
 
 def save_block(path: Path, learned: Learned, belongs: dict[str, Any]) -> None:
-    """Writes the trained rows of a block; loading gives the same bits.
-
-    Args:
-        belongs: plain JSON, identifies run, division, block and pass.
-
-    Raises:
-        ClodError: the file cannot be written.
-    """
+    """Writes the trained rows of a block, and plain JSON that identifies run, block and pass."""
     about = {name: getattr(learned, name) for name in ("steps", "seconds", "failed", "held")}
     metadata = {KEY: json.dumps({"about": about, "belongs": belongs}, sort_keys=True)}
     with atomic_path(path) as temporary:
@@ -170,24 +125,17 @@ def save_block(path: Path, learned: Learned, belongs: dict[str, Any]) -> None:
 
 
 def load_block(path: Path, belongs: dict[str, Any], division: Division, block: int) -> Learned:
-    """The inverse of ``save_block``.
-
-    Raises:
-        ClodError: the file cannot be read, is damaged, or does not belong to ``belongs`` and the division.
-    """
+    """The inverse of ``save_block``."""
     again = "remove it to have it made anew"
     refuse_irregular(path, "remove it")
     with refused_if_damaged(path, "is no block or is damaged", again):
         tensors, metadata = read_tensors(path)
         found = json.loads(metadata[KEY])
-        about, theirs = found["about"], dict(found["belongs"])
-        steps, seconds, held = int(about["steps"]), float(about["seconds"]), int(about["held"])
-        failed = None if about["failed"] is None else str(about["failed"])
+        theirs, learned = dict(found["belongs"]), Learned(division.rows(block), tensors, **found["about"])
     different = [name for name in belongs if theirs.get(name) != belongs[name]]
     if different:
         raise ClodError(f"{path}: is of a run with another {different[0]}; remove it, or give --out another name")
-    rows = division.rows(block)
-    shapes = {name: (len(rows), *value.shape[1:]) for name, value in division.initial.tensors().items()}
+    shapes = {name: (len(learned.rows), *value.shape[1:]) for name, value in division.initial.tensors().items()}
     for name in {"sigma_d": None, **tensors}:
         value = tensors.get(name)
         if value is None or value.dtype != torch.float32 or value.shape != shapes.get(name):
@@ -195,4 +143,4 @@ def load_block(path: Path, belongs: dict[str, Any], division: Division, block: i
         opaque = value == math.inf if name == "opacity_logits" else False  # files in the wild have these logits
         if not bool((value.isfinite() | opaque).all()):
             raise ClodError(f"{path}: holds a value that is not finite; {again}")
-    return Learned(rows, {name: value.to(rows.device) for name, value in tensors.items()}, steps, seconds, failed, held)
+    return replace(learned, values={name: value.to(learned.rows.device) for name, value in tensors.items()})

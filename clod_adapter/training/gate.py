@@ -5,15 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from statistics import fmean
-from typing import Protocol
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from clod_adapter.adapter import ATTRIBUTES
-from clod_adapter.cameras import Camera, View
+from clod_adapter.cameras import View
 from clod_adapter.losses import psnr
-from clod_adapter.training.distributed import ProcessGroup
 from clod_adapter.training.pseudo_views import PseudoView
 from clod_adapter.training.state import Watched
 
@@ -27,8 +26,8 @@ ERROR_FLOOR = 1e-3  # mean squared error of a render at 30 dB
 def split_views(views: Sequence[View]) -> tuple[tuple[View, ...], tuple[View, ...]]:
     """Views to train on, and views to watch: the right halves of a few, whose left halves are trained on.
 
-    Whole photographs are too many to leave out: without 7 of 84, s = 1 loses 0.15 dB on plush_half. Of pseudo views,
-    which cost nothing, whole ones are watched. Of few views all are trained on, and watched.
+    Without 7 of 84 whole photographs s = 1 loses 0.15 dB on plush_half. Of pseudo views, which cost nothing, whole ones
+    are watched; of few views all are trained on, and watched.
     """
     if len(views) < FEW:
         return tuple(views), tuple(views)
@@ -60,21 +59,6 @@ def squared_error(image: Tensor, view: View) -> float:
     return 10 ** (-psnr(image, view.image) / 10)
 
 
-class Run(Protocol):
-    """What the gate needs of ``trainer.Trainer``."""
-
-    group: ProcessGroup | None
-    parameters: dict[str, Tensor]
-
-    def image(self, parameters: dict[str, Tensor] | None, camera: Camera, halved: bool) -> Tensor: ...
-
-    def trained(self) -> dict[str, Tensor]: ...
-
-    def averages(self) -> dict[str, Tensor]: ...
-
-    def return_to(self, trained: dict[str, Tensor]) -> None: ...
-
-
 class Gate:
     """Measures s = 1 against the base, from the first steps on, in images of half the size (not small ones).
 
@@ -82,16 +66,13 @@ class Gate:
     state that was not, Adam's moments are forgotten, and the learning rates are halved; after HALVINGS of these the
     attributes are frozen. The first steps always cost some tenths that the next ones gain.
 
-    Args:
-        trainer: before its first step.
-        views: what is watched; trained_on: as in ``Watched``.
-
     Attributes:
+        trainer: a ``trainer.Trainer``, which imports this module.
         good: by name, the trained parameters of the last state that passed.
         numbers: ``[4]`` float64: the best loss (``decibels_below``), rollbacks so far, CHECKS made, the last loss.
     """
 
-    def __init__(self, trainer: Run, views: Sequence[View], trained_on: bool) -> None:
+    def __init__(self, trainer: Any, views: Sequence[View], trained_on: bool) -> None:
         self.trainer, self.views, self.trained_on = trainer, views, trained_on
         self.base = [self._error(view, None) for view in views]
         self.good = {name: value.clone() for name, value in trainer.trained().items()}

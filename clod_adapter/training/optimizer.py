@@ -21,7 +21,6 @@ class GradientSum:
         gradients: by name of the trained parameter, of its first ``trained`` rows.
         kept: ``[trained]`` bool, the rows that at least one rendering kept.
         loss: 0-d float64, photometric loss of each view, summed.
-        views: their number.
     """
 
     gradients: dict[str, Tensor]
@@ -37,18 +36,11 @@ class GradientSum:
 class RowAdam:
     """Adam (Kingma and Ba 2015) over named ``[N, ...]`` parameters, the same subset of their rows in a step.
 
-    A row that is not stepped keeps its value and its moments, and costs next to nothing; the bias
-    correction counts a row's own steps, so its first step is as long as anyone's.
+    A row that is not stepped keeps its value and its moments; the bias correction counts a row's own ``steps``.
 
     Args:
         parameters: at least one; updated in place; float32, contiguous, as the leading rows of a larger tensor are.
         units: ``[N]`` factors of the rates of each row, by parameter; by default 1.
-
-    Attributes:
-        steps: ``[N]`` int32, of each row.
-
-    Raises:
-        ValueError: no parameters.
     """
 
     def __init__(
@@ -59,9 +51,7 @@ class RowAdam:
         one = torch.ones(1, dtype=torch.float32)
         self._units = {name: (units or {}).get(name, one.to(p.device)) for name, p in parameters.items()}
         self.beta1, self.beta2, self.epsilon = beta1, beta2, epsilon
-        self._moments = {name: (_zeros(p), _zeros(p)) for name, p in parameters.items()}
-        if not parameters:
-            raise ValueError("there are no parameters to optimize")
+        self._moments = {name: (torch.zeros_like(p), torch.zeros_like(p)) for name, p in parameters.items()}
         some = next(iter(parameters.values()))
         self.steps = torch.zeros(len(some), dtype=torch.int32, device=some.device)
         # After so many steps of its own a row's bias corrections are 1 in float32.
@@ -72,7 +62,7 @@ class RowAdam:
         self._table: Tensor | None = None  # the same, where the parameters are if that is not the CPU
 
     def moments(self) -> dict[str, dict[str, Tensor]]:
-        """The tensors themselves that it keeps of each parameter: ``first`` and ``second``."""
+        """The ``first`` and ``second`` moments of each parameter, themselves."""
         return {kind: {n: both[k] for n, both in self._moments.items()} for k, kind in enumerate(("first", "second"))}
 
     def forget(self) -> None:
@@ -127,10 +117,7 @@ class RowAdam:
 
 @torch.no_grad()
 def add_to_mean(mean: dict[str, Tensor], values: dict[str, Tensor], count: int) -> None:
-    """Takes the ``count``-th ``values`` into their running ``mean``, in place; the first make it.
-
-    An infinite value is its own mean: it is an opacity that no step changes, and inf - inf would be NaN.
-    """
+    """Takes the ``count``-th ``values`` into their running ``mean``; infinite ones, opacities, are their own mean."""
     for name, value in values.items():
         if count == 1:
             mean[name] = value.clone()
@@ -152,10 +139,3 @@ def _adam_rows(
 
 
 _adam = Fused(_adam_rows)
-
-
-def _zeros(parameter: Tensor) -> Tensor:
-    """Of its shape. On the CPU what is never stepped, as frozen harmonics are, takes no memory: no page is touched."""
-    if parameter.device.type != "cpu":
-        return torch.zeros_like(parameter)
-    return torch.from_numpy(np.zeros(parameter.shape, np.float32))

@@ -29,8 +29,6 @@ class StateRefused(ClodError):
 class TrainingState:
     """Everything that later steps depend on, except the base, the views and the config.
 
-    ``adapt`` resumes from it to the same bits as an uninterrupted run, with as many threads and processes.
-
     Attributes:
         tensors: by kind and name, as in ``parameter.means``: of each trained attribute its ``parameter``, Adam's
             ``first`` and ``second`` moment, and the ``mean`` if there is one. float32. ``steps.kept`` and ``steps.all``
@@ -40,9 +38,6 @@ class TrainingState:
         random: the state of NumPy's generator; order: the remaining views of this round, the next one last.
         loss: its running mean; averaged: the number of steps in the mean.
         steps, seconds: of training; start_seconds: before it.
-
-    Raises:
-        StateRefused: steps or seconds are impossible.
     """
 
     tensors: dict[str, Tensor]
@@ -62,14 +57,7 @@ class TrainingState:
             raise StateRefused("the training state has impossible counts of steps or seconds; start over")
 
     def check(self, own: dict[str, Tensor]) -> None:
-        """Compares the tensors with those of a run, and their values with what training can produce.
-
-        Args:
-            own: the tensors of the run, which are not changed.
-
-        Raises:
-            StateRefused: it is of another run, or damaged.
-        """
+        """Refuses a state of another run than that with tensors ``own``, and values that training cannot produce."""
         shapes = [{name: (t.shape, t.dtype) for name, t in tensors.items()} for tensors in (own, self.tensors)]
         if shapes[0] != shapes[1]:
             raise StateRefused(OTHER_RUN)
@@ -143,14 +131,7 @@ class Adapted:
 
 
 def save_state(path: str | Path, state: TrainingState, belongs: dict[str, Any]) -> None:
-    """Writes a state; loading it gives the same bits.
-
-    Args:
-        belongs: identifies the run; plain JSON.
-
-    Raises:
-        ClodError: the file cannot be written.
-    """
+    """Writes a state, and plain JSON that identifies its run; loading gives the same bits."""
     # Not asdict of the whole, which would copy the tensors.
     about = {f.name: getattr(state, f.name) for f in fields(state) if f.name != "tensors"}
     metadata = {KEY: json.dumps({**about, "attenuation": asdict(state.attenuation), "belongs": belongs})}
@@ -159,30 +140,15 @@ def save_state(path: str | Path, state: TrainingState, belongs: dict[str, Any]) 
 
 
 def load_state(path: str | Path) -> tuple[TrainingState, dict[str, Any]]:
-    """Reads a state, and ``belongs`` of the run that saved it.
-
-    Raises:
-        ClodError: the file cannot be read, is damaged, or is not a training state.
-    """
+    """Reads a state, and ``belongs`` of the run that saved it."""
     path = Path(path)
     refuse_irregular(path, "delete it to start over")
     with refused_if_damaged(path, "is not a training state or is damaged", "delete it to start over"):
         tensors, metadata = read_tensors(path)
-        about = _typed(json.loads(metadata[KEY]), dict)
-        belongs, random = _typed(about.pop("belongs"), dict), _typed(about.pop("random"), dict)
-        settings = _typed(about.pop("attenuation"), dict)
-        values = {
-            name: each if isinstance(each, str) else float(_typed(each, float, int)) for name, each in settings.items()
-        }
-        attenuation = AttenuationConfig(**values)  # type: ignore[arg-type]
-        order = tuple(_typed(view, int) for view in _typed(about.pop("order"), list))
-        counts = {name: _typed(about.pop(name), int) for name in ("averaged", "steps")}
-        rest = {name: float(_typed(value, float, int)) for name, value in about.items()}
-        return TrainingState(tensors, attenuation, random, order, **counts, **rest), belongs  # type: ignore[arg-type]
-
-
-def _typed(value: Any, *kinds: type) -> Any:
-    """The value, if it is of one of these JSON types (a bool is not a number); raises TypeError otherwise."""
-    if type(value) not in kinds:
-        raise TypeError(f"{value!r:.40} is not of the type {kinds[0].__name__}")
-    return value
+        about = json.loads(metadata[KEY])
+        belongs, random = dict(about.pop("belongs")), dict(about.pop("random"))
+        attenuation = AttenuationConfig(**about.pop("attenuation"))
+        order = tuple(int(view) for view in about.pop("order"))
+        counts: Any = {name: int(about.pop(name)) for name in ("averaged", "steps")}
+        rest: Any = {name: float(value) for name, value in about.items()}
+        return TrainingState(tensors, attenuation, random, order, **counts, **rest), belongs
