@@ -1,15 +1,9 @@
 """Checks before training that a checkpoint and the posed photographs share a world frame.
 
-The baseline predictor of a photograph is its mean colour, whose error is the photograph's variance. With ``I_v`` the
-render at s = 1 over black, clamped to [0, 1], and ``P_v`` the photograph of view v, means over pixels and channels,
-
-    error_v    = mean (I_v - P_v)^2
-    constant_v = mean (P_v - mean P_v)^2        with the mean of each channel
-
-If the pooled error exceeds the pooled constant, the checkpoint nearly always has another position, other axes or
-another scale. Three other causes are told apart: views outside the checkpoint's coverage (by the share of explained
-views), another exposure (by the correlation, which ignores gain and offset) and another background (by a render over
-white).
+The baseline predictor of a photograph is its mean colour, whose error is the photograph's variance. If the error of the
+renders at s = 1 is larger, the checkpoint nearly always has another position, other axes or another scale. Three other
+causes are told apart: views outside the checkpoint's coverage (by the share of explained views), another exposure (by
+the correlation, which ignores gain and offset) and another background (by a render over white).
 """
 
 from __future__ import annotations
@@ -67,8 +61,7 @@ class Alignment:
     def fits(self) -> bool:
         """Whether any measure supports a common frame and none a white background.
 
-        With flat photographs only: whether FEWEST_IN_VIEW of the Gaussians are in view. Otherwise a file with nothing
-        in view does not fit, because a black image is never better than the mean colour.
+        With flat photographs only: whether FEWEST_IN_VIEW of the Gaussians are in view.
         """
         if not self.views:
             return self.in_view >= FEWEST_IN_VIEW
@@ -91,17 +84,12 @@ class Alignment:
         return self.margin < 0 < self.white_psnr - self.mean_colour_psnr and self.white_psnr > self.psnr + CLEAR
 
     def as_dict(self) -> dict[str, float]:
-        """The fields by name, for reports."""
         return asdict(self)
 
 
 @torch.no_grad()
 def check_alignment(gaussians: Gaussians, views: Sequence[View]) -> Alignment:
-    """Renders at most MOST_VIEWS of the views, evenly spread, at s = 1, and compares them with the photographs.
-
-    Raises:
-        ClodError: there are no views.
-    """
+    """Renders at most MOST_VIEWS of the views, evenly spread, at s = 1, and compares them with the photographs."""
     require(len(views) > 0, "number of views", len(views), "at least 1")
     views = spread(views, MOST_VIEWS)
     seen = torch.zeros(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
@@ -123,8 +111,8 @@ def check_alignment(gaussians: Gaussians, views: Sequence[View]) -> Alignment:
 def compare_renders(gaussians: Gaussians, view: View) -> Tensor | None:
     """``[5]`` means over pixels and channels; None if the photograph is one colour.
 
-    Squared error of the render over black, of the render over white, and of the photograph's mean colour (its
-    variance); variance of the render; covariance of render and photograph.
+    Squared error of the render over black, over white, and of the photograph's mean colour; variance of the render;
+    covariance of render and photograph.
     """
     photograph = unit(view.image, gaussians.means)
     about = photograph - photograph.mean((0, 1))
@@ -139,5 +127,4 @@ def compare_renders(gaussians: Gaussians, view: View) -> Tensor | None:
 
 
 def _decibels(error: float) -> float:
-    """PSNR of a mean squared error: infinite for 0, NaN for NaN."""
     return math.inf if error == 0 else -10 * math.log10(error)

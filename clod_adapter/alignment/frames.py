@@ -34,24 +34,15 @@ NERFSTUDIO_TURNS = (
 
 @dataclass(frozen=True)
 class Frame:
-    """A frame of the file, ``x_cameras = scale R x_file + offset``, after the poses were corrected.
-
-    Attributes:
-        name: for the report, like ``gsplat``.
-        description: cause and remedy, for messages.
-        rotation: ``[3, 3]`` R; a mirrored frame has determinant -1.
-        scale, offset: > 0, and ``[3]`` in the cameras' world units.
-        inverted: the poses given are camera to world.
-        opengl: the cameras look along -z with y up.
-    """
+    """A frame of the file, ``x_cameras = scale rotation x_file + offset``, after the poses were corrected."""
 
     name: str
-    description: str
-    rotation: Tensor
+    description: str  # cause and remedy, for messages
+    rotation: Tensor  # a mirrored frame has determinant -1
     scale: float
     offset: Tensor
-    inverted: bool = False
-    opengl: bool = False
+    inverted: bool = False  # the poses given are camera to world
+    opengl: bool = False  # the cameras look along -z with y up
 
     def of(self, viewmats: Tensor) -> Tensor:
         """``[V, 4, 4]`` float64, world to camera in the file's frame, of cameras as they were given."""
@@ -67,12 +58,7 @@ class Frame:
 
 
 def known_frames(viewmats: Tensor, points: Tensor | None = None) -> list[Frame]:
-    """The frames that follow from the cameras and the scene's points alone.
-
-    Args:
-        viewmats: ``[V, 4, 4]`` float64, of all cameras: trainers normalize by all of them.
-        points: ``[M, 3]`` of the COLMAP model, world units; gsplat's trainer uses them for its normalization.
-    """
+    """The frames that follow from all cameras ``[V, 4, 4]`` and the scene's points, by which trainers normalize."""
     return [*_poses(), *_axes(viewmats), *_nerfstudio(viewmats), *_gsplat(viewmats, points)]
 
 
@@ -87,7 +73,7 @@ def into_file(viewmats: Tensor, rotation: Tensor, scale: float, offset: Tensor) 
 def focus_of(viewmats: Tensor, rounds: int = 1) -> Tensor:
     """``[3]`` the least-squares point closest to the optical axes; the mean centre if they are parallel.
 
-    After ``rounds``, with the inverse distances as weights, of least distances: one far camera does not decide it.
+    After many ``rounds``, weighted by inverse distances, of least distances: one far camera does not decide it.
     """
     poses = torch.linalg.inv(viewmats.double())
     centres, forward = poses[:, :3, 3], poses[:, :3, 2]

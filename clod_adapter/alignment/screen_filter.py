@@ -1,8 +1,6 @@
-"""Detects the screen-space filter of a checkpoint's training by comparing renders with the photographs.
+"""Detects the screen-space filter of a checkpoint's training, which most files do not name.
 
-Opacities and scales of a checkpoint fit one ``ScreenFilter``, which most files do not name. With another filter,
-Gaussians of about a pixel render too opaque or too faint. The views are rendered with each known filter, and a filter
-is chosen if it is clearly closer to the photographs than the expected one.
+With another filter, Gaussians of about a pixel render too opaque or too faint.
 """
 
 from __future__ import annotations
@@ -29,12 +27,7 @@ MOST = 0.75  # share of the views in which the chosen filter must be better
 
 @dataclass(frozen=True)
 class FilterComparison:
-    """Agreement of renders with each filter and the photographs.
-
-    Attributes:
-        psnr: dB by name in FILTERS, mean over the views.
-        expected, chosen: names of the filter used unless another is clearly better, and of that for rendering.
-    """
+    """Mean PSNR by name in FILTERS; the filter used unless another is clearly better, and that for rendering."""
 
     psnr: dict[str, float]
     expected: str
@@ -42,7 +35,6 @@ class FilterComparison:
 
     @property
     def screen_filter(self) -> ScreenFilter:
-        """The chosen filter."""
         return FILTERS[self.chosen]
 
 
@@ -50,12 +42,8 @@ class FilterComparison:
 def compare_filters(gaussians: Gaussians, views: Sequence[View], expected: str = "off") -> FilterComparison:
     """Renders at most MOST_VIEWS of the views, evenly spread, at s = 1, with each of FILTERS.
 
-    A filter other than ``expected`` is chosen if its mean PSNR is CLEAR dB higher, its PSNR is higher in MOST of the
-    views, and its pooled error is ``check.DOUBTFUL`` dB below that of the photographs' mean colours (otherwise the
-    frame may be wrong, and a fainter render is closer for that reason). Of several, the one with the highest mean.
-
-    Args:
-        expected: name of the filter used unless another is clearly better.
+    Another than ``expected`` is chosen if its mean PSNR is CLEAR dB higher, its PSNR is higher in MOST of the views and
+    its pooled error is DOUBTFUL dB below that of the photographs' mean colours (in a wrong frame, fainter is closer).
     """
     views = spread(views, MOST_VIEWS)
     photographs = [unit(view.image, gaussians.means) for view in views]

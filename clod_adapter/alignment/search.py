@@ -1,8 +1,7 @@
 """Searches the frame of a checkpoint that does not fit its cameras.
 
-Known frames (``frames.known_frames``) are ranked by the correlation of small renders of the largest Gaussians with the
-photographs. If none fits, a scale and an offset are searched. The result is measured by ``check_alignment`` and
-given only if it fits clearly better.
+Known frames are ranked by the correlation of small renders with the photographs. If none fits, a scale and an offset
+are searched. The result is measured by ``check_alignment`` and given only if it fits clearly better.
 """
 
 from __future__ import annotations
@@ -33,17 +32,11 @@ BETTER_THAN_MEAN = 1.5  # dB
 
 @dataclass(frozen=True)
 class Guess:
-    """A frame in which the checkpoint fits.
-
-    Attributes:
-        frame: the transform, its name, and what to do.
-        psnr: dB, pooled, of the renders in that frame.
-        clear: whether it is as far above the photographs' mean colours as files in their own frame are (DOUBTFUL).
-    """
+    """A frame in which the checkpoint fits."""
 
     frame: Frame
-    psnr: float
-    clear: bool
+    psnr: float  # pooled, of the renders in that frame
+    clear: bool  # as far above the photographs' mean colours as files in their own frame are (DOUBTFUL)
 
 
 @torch.no_grad()
@@ -54,15 +47,9 @@ def guess_frame(
     points: Tensor | None = None,
     cameras: Sequence[Camera] = (),
 ) -> Guess | None:
-    """A frame that explains the photographs clearly better than that of the cameras; None if none was found.
+    """A frame whose PSNR is BETTER_THAN_MEAN dB above the photographs' mean colours and CLEAR dB above ``found``.
 
-    Its PSNR must be BETTER_THAN_MEAN dB above the photographs' mean colours and CLEAR dB above ``found``.
-
-    Args:
-        views: photographs to compare with; at most MOST_VIEWS are.
-        found: result of ``check_alignment`` for these views.
-        points: ``[M, 3]`` the scene's points, world units.
-        cameras: all cameras, by which trainers normalize, if ``views`` are not all.
+    ``cameras`` are all of the scene's, if ``views`` are not, and ``points`` those of its model.
     """
     if len(gaussians) == 0 or found.views == 0:
         return None
@@ -106,8 +93,7 @@ class _Stage:
     """Small renders of the Gaussians that cover most, compared with small photographs."""
 
     def __init__(self, gaussians: Gaussians, views: Sequence[View], width: int, most: int):
-        chosen = spread(range(len(views)), VIEWS)
-        self.views = [_shrunk(views[k], width) for k in chosen]
+        self.views = [_shrunk(view, width) for view in spread(views, VIEWS)]
         if len(gaussians) > most:
             cover = F.logsigmoid(gaussians.opacity_logits) + gaussians.log_scales.topk(2, dim=1).values.sum(1)
             gaussians = gaussians.select(cover.topk(most).indices)
@@ -126,8 +112,8 @@ class _Stage:
 def _search(gaussians: Gaussians, views: Sequence[View], small: _Stage, viewmats: Tensor) -> Frame | None:
     """The best scale and offset; None if no correlation reaches LOWEST_CORRELATION.
 
-    Starts from the best scale about the origin, and from the best one about the points that all and most cameras look
-    at with the median of the Gaussians moved there; climbs from each to the nearest maximum of the correlation.
+    Climbs to the nearest maximum from the best scale about the origin, and from the best ones about the points that all
+    and most cameras look at, with the median of the Gaussians moved there.
     """
     middle, found = gaussians.means.double().median(dim=0).values.cpu(), []  # where cameras are
     for towards, rounds in ((0.0, 1), (1.0, 1), (1.0, ROUNDS)):

@@ -34,11 +34,9 @@ LEAST_SEEN = 0.02  # of an image: a block that covers less has too small a part 
 
 @dataclass(frozen=True)
 class Division:
-    """A scene divided into blocks, with its initialization.
+    """The N Gaussians that are trained, with their initial dial and the ``[N]`` int16 block of each.
 
     Attributes:
-        initial: the Gaussians that are trained, N, with the initial dial.
-        block: ``[N]`` int16, the block of each Gaussian.
         seen: ``[V, B]`` float32, the share of each view's image that each block covers.
         total: number of Gaussians that target counts are shares of: N and those that a plan leaves out.
     """
@@ -50,12 +48,11 @@ class Division:
 
     @property
     def count(self) -> int:
-        """Number of blocks."""
         return self.seen.shape[1]
 
     @property
     def passes(self) -> int:
-        """Number of training passes over each block; a single block needs no second one."""
+        """Over each block; a single one needs no second."""
         return 2 if self.count > 1 else 1
 
     def rows(self, block: int) -> Tensor:
@@ -79,11 +76,8 @@ class Division:
 def split(means: Tensor, count: int) -> Tensor:
     """``[N]`` int16: the block, of ``count``, of each centre; block sizes differ by at most one.
 
-    A k-d tree: the longest side is split at the median (at the corresponding quantile where the count is odd). Sides
-    are measured between the 5 % and the 95 % quantile, so that a few far Gaussians do not determine the split.
-
-    Raises:
-        ClodError: there are fewer Gaussians than blocks.
+    A k-d tree: the longest side, between the 5 % and the 95 % quantile, is split at the median (at the corresponding
+    quantile where the count is odd).
     """
     if not 1 <= count <= min(len(means), 2**15 - 1):
         raise ClodError(f"{len(means)} Gaussians cannot be split into {count} blocks; take from 1 to as many as these")
@@ -113,17 +107,7 @@ def divide(
     total: int | None = None,
     progress: Listener | None = None,
 ) -> Division:
-    """Splits a scene into ``count`` blocks.
-
-    Args:
-        initial: the whole scene, from ``importance.initialize``, or as much of it as a plan trains.
-        views: ``importance.usable_views`` of the training views.
-        total: ``Division.total``; by default the number of Gaussians in ``initial``.
-        progress: called in ``Phase.COVERAGE`` after each view.
-
-    Raises:
-        ClodError: blocks cannot be trained with these settings, or there are fewer Gaussians than blocks.
-    """
+    """Splits the initialized scene, or as much of it as a plan trains, into ``count`` blocks."""
     check_divisible(config)
     assert initial.attenuation is not None
     if initial.attenuation.normalizer != "scene":
@@ -155,13 +139,10 @@ def context_rows(
     after: Gaussians | None = None,
     progress: Listener | None = None,
 ) -> Tensor:
-    """``[m]`` int64, ascending: the Gaussians of other blocks that any of the views needs.
+    """``[m]`` int64, ascending: the Gaussians of other blocks that any of the views, up to CONTEXT_VIEWS, needs.
 
-    Those left out cover at most LEFT_OUT of each image together, at s = 0, 1 and max_sv; at most
-    CONTEXT_VIEWS views are rendered, evenly spread.
-
-    Args:
-        after: in the second pass, the scene after the first; other blocks are then drawn at the dial.
+    Those left out cover at most LEFT_OUT of each image together, at s = 0, 1 and max_sv. In the second pass, with the
+    scene ``after`` the first, other blocks are drawn at the dial.
     """
     own = division.block == block
     scene = after or division.initial
@@ -191,17 +172,13 @@ def _least_covered(covered: Tensor) -> Tensor:
 def block_target(
     division: Division, block: int, cameras: Sequence[Camera], config: AdaptConfig, *, first: bool
 ) -> Callable[[float], TargetShare]:
-    """The block's target in the count term, by dial value.
+    """The block's target in the count term, by dial value; ``cameras`` are the whole scene's.
 
     In an undivided run the count term's gradient on each of all N Gaussians is ``loss (eta / target - 1) / (target
-    N)``. For a block, ``eta / target`` is the number that the block keeps divided by the number that it should keep:
-    ``target N`` times its part of the Gaussians that the initialization keeps at this s. So after initialization each
-    block is penalised like the whole scene, and an allocation found between blocks stays. The loss is that of the whole
-    image; in the first pass the block's is the part of the image it covers. Views that do not show the block would
-    penalise it too: each of its own views also counts for some of those.
-
-    Args:
-        cameras: the whole scene's, which Gaussians are counted at typical distances from.
+    N)``. For a block, ``eta / target`` is the number that it keeps divided by the number that it should keep: ``target
+    N`` times its part of the Gaussians that the initialization keeps at this s. The loss is that of the whole image; in
+    the first pass the block's is the part that it covers. Views that do not show the block would penalise it too: each
+    of its own views also counts for some of those.
     """
     initial, numbers = division.initial, division.views(block)
     assert initial.attenuation is not None
@@ -227,8 +204,7 @@ def target_image(gaussians: Gaussians, own: int, view: View) -> Tensor:
     """``[H, W, 3]`` uint8: the checkpoint's image, plus the block's part of its difference from the photograph.
 
     ``p + w (q - p)`` of image p and photograph q, with w the part of a pixel that the first ``own`` Gaussians cover.
-    Over all blocks these parts add up to 1, so the requested changes add up to the whole difference, and no two blocks
-    correct the same error.
+    Over all blocks these add up to 1, so no two blocks correct the same error.
     """
     plain = detach(gaussians)
     image, alpha = splat(plain, gaussians.opacities, view.camera)

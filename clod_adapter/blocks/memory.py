@@ -25,36 +25,23 @@ MOST_BLOCKS = 1024
 
 @dataclass(frozen=True)
 class MemoryEstimate:
-    """The sizes that a scene's memory is estimated from.
-
-    Attributes:
-        count: Gaussians; attributes: bytes of one in memory; row: its bytes in the file.
-        images: bytes of all photographs; pixels: of the largest.
-        pictures: bytes of rendered images, which cannot be read again and stay in memory.
-    """
+    """The sizes that a scene's memory is estimated from."""
 
     count: int
-    attributes: int
-    row: int
-    images: int
-    pixels: int
-    pictures: int = 0
+    attributes: int  # bytes of a Gaussian in memory
+    row: int  # its bytes in the file
+    images: int  # bytes of all photographs
+    pixels: int  # of the largest
+    pictures: int = 0  # bytes of rendered images, which cannot be read again and stay in memory
 
 
 @dataclass(frozen=True)
 class MemoryPlan:
-    """A plan for adapting below a limit; sizes in bytes.
-
-    Attributes:
-        blocks: their number; 1 where the whole scene fits.
-        cache: limit of photographs in memory, and, for blocks, again of target images.
-        base, start, train, write: peak memory while the checkpoint is read, during initialization, in training, and
-            while the result is written.
-    """
+    """A plan for adapting below a limit: sizes in bytes, and the peaks of the parts of a run."""
 
     limit: int
-    blocks: int
-    cache: int
+    blocks: int  # 1 where the whole scene fits
+    cache: int  # of photographs in memory, and, for blocks, again of target images
     base: int
     start: int
     train: int
@@ -66,11 +53,7 @@ class MemoryPlan:
 
 
 def plan_for_limit(needs: MemoryEstimate, limit: int) -> MemoryPlan:
-    """The plan with the fewest blocks whose peak is at most ``limit`` bytes.
-
-    Raises:
-        ClodError: no number of blocks is enough; the message gives the least memory.
-    """
+    """The plan with the fewest blocks whose peak is at most ``limit`` bytes; otherwise the error names the least."""
     for blocks in range(1, min(MOST_BLOCKS, max(needs.count, 1)) + 1):
         if (plan := _plan(needs, limit, blocks)).peak <= limit:
             return plan
@@ -112,11 +95,7 @@ UNITS = {"K": 1, "M": 2, "G": 3, "T": 4}
 
 
 def parse_size(text: str) -> int:
-    """Bytes of a size with a unit: ``8GB``, ``500 MB``, ``7.5GiB``, ``16G``.
-
-    Raises:
-        ClodError: the text is no size, or has no unit.
-    """
+    """Bytes of a size with a unit: ``8GB``, ``500 MB``, ``7.5GiB``, ``16G``."""
     found = re.fullmatch(r"\s*([0-9]+\.?[0-9]*|\.[0-9]+)\s*([KMGT])(i?)B?\s*", text, re.IGNORECASE)
     if found is None:
         raise ClodError(f"--memory is {text!r}; give a number and its unit, as in 8GB, 500MB or 7.5GiB")

@@ -25,11 +25,7 @@ CROP = (150, 150, 150, 75)  # left, top, width and height of the part shown enla
 
 
 def draw(capture: Path, base: Path, model: Path, report: Mapping[str, Any], pictures: Mapping[str, Path]) -> None:
-    """Draws a held-out view of the base and at several dial values, and the quality curve of all held-out views.
-
-    Args:
-        report: of the adaptation; pictures: the files to write, ``dial`` and ``curve``.
-    """
+    """Draws a held-out view of the base and at several dial values, and the quality curve of all held-out views."""
     view, gaussians = load_scene(capture).test[VIEW], load(model).gaussians
     panels = [Picture(view.image.numpy(), "photograph", "held out from training")]
     panels += measured(load(base).gaussians, gaussians, DIALS, view)
@@ -53,17 +49,7 @@ def measured(base: Gaussians, model: Gaussians, dials: Sequence[float], view: Vi
 
 
 def dial_strip(path: str | Path, panels: Sequence[Picture], title: str, crop: tuple[int, int, int, int] = CROP) -> None:
-    """Draws one view side by side, photograph, base, dial values, above a part of each enlarged.
-
-    Args:
-        path: the picture to write; its suffix chooses the format.
-        panels: from left to right, of one size.
-        title: one line above.
-        crop: left, top, width, height in pixels of the part.
-
-    Raises:
-        ClodError: matplotlib is missing, or the file cannot be written.
-    """
+    """Draws panels of one size side by side, above the part ``crop`` (left, top, width, height) of each enlarged."""
     height, width = panels[0].image.shape[:2]
     left, right, top, bottom = crop[0], crop[0] + crop[2], crop[1], crop[1] + crop[3]
     cell, gap, head, caption = 2.6, 0.08, 0.42, 0.66  # inches
@@ -90,12 +76,7 @@ def dial_strip(path: str | Path, panels: Sequence[Picture], title: str, crop: tu
 
 
 def quality_curve(figure: Any, rows: Sequence[Mapping[str, float]], base_row: Mapping[str, float]) -> None:
-    """Draws PSNR, and below it SSIM, against the number of Gaussians kept, one labelled point per dial value.
-
-    Args:
-        rows: with virtual_scale, psnr, ssim and kept, in any order.
-        base_row: the checkpoint before adapting, with psnr, ssim and kept; drawn as a separate point.
-    """
+    """Draws PSNR, and below it SSIM, against the number of Gaussians kept, one labelled point per dial value."""
     title = "Quality against Gaussians, mean over the held-out views"
     figure.suptitle(title, fontsize=11, weight="bold", x=0.02, ha="left")
     both = figure.subplots(2, 1, sharex=True, height_ratios=[1.5, 1])

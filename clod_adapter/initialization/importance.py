@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -44,24 +43,20 @@ def initialize(
     progress: Listener | None = None,
     error: Tensor | None = None,
 ) -> Gaussians:
-    """The Gaussians with an initial sigma_d and growth_d, from renderings of up to MOST_VIEWS evenly spread views.
+    """The Gaussians with an initial sigma_d, in world units, and growth_d, from up to MOST_VIEWS evenly spread views.
 
-    The sigma_d is in world units. A dial that ``base`` already has is kept, with its own settings except the config's
-    ``max_sv``; one without effect (``SIGMA_MAX`` throughout, as ``with_dial`` makes it) counts as none.
-
-    Args:
-        progress: called in ``Phase.IMPORTANCE`` after each view, and then in ``Phase.PRUNING_ORDER``.
-        error: ``[N]`` from ``removal_error`` of these views and seed, where it is known.
+    A dial that ``base`` already has, with any effect, is kept with its own settings except the config's ``max_sv``.
+    ``error`` is ``removal_error`` of these views and seed, where it is known.
     """
     if base.attenuation is not None and has_dial(base):
         known = _reference_distance(base, views, config)
-        own = dataclasses.replace(base.attenuation, max_sv=config.max_sv, reference_distance=known)
+        own = replace(base.attenuation, max_sv=config.max_sv, reference_distance=known)
         return in_world_units(with_growth(base.replace(attenuation=own), config, base.growth_d))
     views = spread(views, MOST_VIEWS)
     attenuation = config.attenuation(scene_distance(base, views))
     if error is None:
         error = removal_error(base, views, seed=config.seed, progress=progress)
-    attenuation = dataclasses.replace(attenuation, tau=fitting_tau(base.opacities, error, config))
+    attenuation = replace(attenuation, tau=fitting_tau(base.opacities, error, config))
     pruned = pruning_order(base, error.sqrt() * base.opacities, progress)
     distances = typical_distance(base.means, [view.camera for view in views], attenuation)
     sigma = sigma_from_importance(
@@ -85,7 +80,7 @@ def for_training(initial: Gaussians, views: Sequence[View], config: AdaptConfig)
     """``initial`` with sigma_d in units of the reference distance, ``scene_distance`` where it is unknown."""
     known = _reference_distance(initial, views, config)
     assert initial.attenuation is not None
-    own = dataclasses.replace(initial.attenuation, reference_distance=known)
+    own = replace(initial.attenuation, reference_distance=known)
     return with_distance(initial.replace(attenuation=own), known)
 
 
@@ -102,11 +97,7 @@ def has_dial(base: Gaussians) -> bool:
 
 
 def usable_views(base: Gaussians, views: Sequence[View]) -> tuple[View, ...]:
-    """The views with at least one Gaussian's centre beyond their near plane; the others render nothing.
-
-    Raises:
-        ClodError: there are none.
-    """
+    """The views with at least one Gaussian's centre beyond their near plane; the others render nothing."""
     found = []
     for view in views:
         depths = base.means @ view.camera.viewmat[2, :3].to(base.means) + view.camera.viewmat[2, 3].to(base.means)
@@ -121,13 +112,10 @@ def usable_views(base: Gaussians, views: Sequence[View]) -> tuple[View, ...]:
 
 
 def fitting_tau(opacities: Tensor, error: Tensor, config: AdaptConfig) -> float:
-    """``config.tau``, or less for a faint checkpoint; lowered to no less than TAU_MIN.
+    """``config.tau``, or less for a faint checkpoint, to no less than TAU_MIN; six digits, which a float32 holds.
 
     At most 1/FADING of the opacity below which lies FAINT_SHARE of all removal error; and so low that as many Gaussians
-    as the target-count curve has at ``max_sv`` exceed the threshold there. Six digits, which a float32 holds.
-
-    Args:
-        error: ``[N]`` from ``removal_error``.
+    as the target-count curve has at ``max_sv`` exceed the threshold there.
     """
     ordered, order = opacities.sort()
     lost = error[order].double().cumsum(0)
@@ -143,9 +131,8 @@ def fitting_tau(opacities: Tensor, error: Tensor, config: AdaptConfig) -> float:
 def scene_distance(base: Gaussians, views: Sequence[View]) -> float:
     """D of the scene normaliser, world units: the median distance in the frustum, of the nearest views.
 
-    That of the NEAREST share of the views, the farthest of these, and at least the second nearest of three or more: a
-    single view must not decide. Growth begins there. Beyond it growth fills the gaps; nearer, stored scales and
-    opacities must, and those act at all distances (docs/method.md, "Near to far").
+    The farthest of the NEAREST share of the views, and at least the second nearest of three or more. Growth begins
+    there: nearer, stored scales and opacities must fill the gaps (docs/method.md, "Near to far").
     """
     medians = sorted(median_distance(base.means, view.camera) for view in views)
     return medians[max(math.ceil(NEAREST * len(medians)), 2 if len(medians) > 2 else 1) - 1]
@@ -154,19 +141,11 @@ def scene_distance(base: Gaussians, views: Sequence[View]) -> float:
 def removal_error(
     gaussians: Gaussians, views: Sequence[View], *, seed: int = 0, progress: Listener | None = None
 ) -> Tensor:
-    """``[N]`` estimate of the squared image error of removing each Gaussian alone.
+    """``[N]`` estimate of the squared image error of removing each Gaussian alone, mean over the views.
 
-    To first order removing Gaussian i changes pixel p by ``a_i dC_p/da_i``. Its sum of squares over
-    the pixels, mean over the views, is estimated without bias by one backward pass per view: with random signs
-    z, ``E[(sum_p z_p dC_p/da_i)^2] = sum_p (dC_p/da_i)^2`` (Hutchinson's estimator on the
-    Gauss-Newton matrix). Works with every differentiable rasterizer. Images have half the size, unless they are small:
-    a third of the time, and a few hundredths of a dB in the trained result.
-
-    Args:
-        progress: called in ``Phase.IMPORTANCE`` after each view.
-
-    Raises:
-        ClodError: an error is not finite, as colours overflow in the images.
+    To first order removing Gaussian i changes pixel p by ``a_i dC_p/da_i``. The sum of squares over the pixels is
+    estimated without bias by one backward pass per view: with random signs z, ``E[(sum_p z_p dC_p/da_i)^2] =
+    sum_p (dC_p/da_i)^2`` (Hutchinson). Images have half the size, unless they are small, in a third of the time.
     """
     generator = torch.Generator().manual_seed(seed)
     total = torch.zeros_like(gaussians.means[:, 0])
@@ -197,13 +176,8 @@ def sigma_from_importance(
 ) -> Tensor:
     """``[N]`` the sigma_d with which the share kept follows the target-count curve before any training.
 
-    Gaussians are ranked by importance. The one at rank fraction r (0 the most important) is culled at the dial value
-    where ``target_count.target_curve`` falls to r. Ranks beyond ``share`` are culled before s = 1.
-
-    Args:
-        importance: ``[N]``, larger is kept longer.
-        distances: ``[N]`` normalised distance at which the curve holds.
-        share: of all Gaussians, kept at s = 1; in (0.5, 1].
+    The Gaussian at rank fraction r by importance (0 the most important) is culled at the dial value where
+    ``target_count.target_curve`` falls to r. Ranks beyond ``share`` are culled before s = 1.
     """
     rank, order = torch.empty_like(distances), importance.argsort(descending=True, stable=True)
     rank[order] = (torch.arange(len(rank), dtype=rank.dtype, device=rank.device) + 0.5) / len(rank)
@@ -213,13 +187,7 @@ def sigma_from_importance(
 
 
 def coverage(gaussians: Gaussians, opacities: Tensor, camera: Camera, growth: Tensor | None = None) -> Tensor:
-    """``[N]`` pixels that each Gaussian covers: the sum over the image of its transmittance times its alpha.
-
-    This is the gradient of the image by the Gaussians' colours.
-
-    Args:
-        growth: ``[N]`` factor of the scales; None for 1.
-    """
+    """``[N]`` pixels that each Gaussian covers: the gradient of the image by its colour."""
     grey = gaussians.sh0.new_zeros(gaussians.sh0.shape).requires_grad_()
     plain = gaussians.replace(sh0=grey, shN=gaussians.shN[:, :0])
     image, _ = splat(plain, opacities, camera, growth=growth)

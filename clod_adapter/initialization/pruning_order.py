@@ -32,11 +32,9 @@ JITTER = 1e-6  # by this share of their size: a k-d tree cannot split equal poin
 
 
 class PruningOrder(NamedTuple):
-    """The order in which Gaussians are removed.
+    """How many Gaussians are removed before each, and the similar one, removed later, that took its importance.
 
-    Attributes:
-        position: ``[N]`` int64, how many Gaussians are removed before each.
-        substitute: ``[N]`` int64, the similar neighbour, removed later, that took its importance; itself for the last.
+    Both are ``[N]`` int64. The last one's substitute is itself.
     """
 
     position: Tensor
@@ -51,28 +49,16 @@ def pruning_order(gaussians: Gaussians, importance: Tensor, progress: Listener |
     of SH degree 0, r the distance of the centres and l the largest scales. The cheapest REMOVED of them are removed,
     except those whose j is cheaper or which are the j of a removed one; their importance is added to that of j.
     Ranking by importance alone thins out plain surfaces, whose Gaussians have little importance each, until none is
-    left there to grow into the gaps.
-
-    Source: half-edge collapse (Kobbelt, Campagna and Seidel 1998) with distances between Gaussians in place of
-    quadrics; measured in docs/method.md.
-
-    Args:
-        importance: ``[N]`` >= 0, of each Gaussian alone.
-        progress: called in ``Phase.PRUNING_ORDER`` after each round, with the number of Gaussians ranked so far.
-
-    Raises:
-        ClodError: a centre is not finite.
+    left there to grow into the gaps. (Kobbelt, Campagna and Seidel 1998, without quadrics; measured in docs/method.md.)
     """
     if not bool(gaussians.means.isfinite().all()):
         raise ClodError("means are not all finite, so neighbours are not defined; remove such rows")
     count = len(gaussians)
-    centres = gaussians.means.detach().double().cpu().numpy()
     colours = 0.5 + SH_C0 * gaussians.sh0.detach()[:, 0].double().cpu().numpy()
     sizes = gaussians.log_scales.detach().double().exp().amax(1).cpu().numpy() if count else np.empty(0)
     weights, order = importance.detach().double().cpu().numpy().copy(), np.empty(count, np.int64)
-    favoured = np.arange(count)
-    centres = _without_crowds(centres, sizes)
-    left, gone = np.arange(count), 0
+    centres = _without_crowds(gaussians.means.detach().double().cpu().numpy(), sizes)
+    favoured, left, gone = np.arange(count), np.arange(count), 0
     while len(left) > 1:
         substitute, difference = _substitutes(centres[left], colours[left], sizes[left])
         removed = _removed(weights[left] * difference, substitute)
@@ -88,7 +74,7 @@ def pruning_order(gaussians: Gaussians, importance: Tensor, progress: Listener |
 
 
 def _without_crowds(centres: np.ndarray, sizes: np.ndarray) -> np.ndarray:
-    """The centres, displaced by a millionth of the Gaussians' size where too many may be equal."""
+    """The centres, displaced by JITTER where too many may be equal."""
     x = np.sort(centres[:, 0])
     if not (x[CROWD:] == x[:-CROWD]).any():
         return centres
@@ -128,11 +114,7 @@ def _substitutes(centres: np.ndarray, colours: np.ndarray, sizes: np.ndarray) ->
 def _most_similar(
     rows: np.ndarray, near: np.ndarray, apart: np.ndarray, channels: np.ndarray, sizes: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Of the neighbours ``near [K, n]`` of ``rows [n]``, at distances ``apart``: the most similar, its dissimilarity.
-
-    Args:
-        channels: ``[3, N]`` colours.
-    """
+    """Of the neighbours ``near [K, n]`` of ``rows [n]`` the most similar, and its dissimilarity."""
     substitute, least = near[0].copy(), np.full(len(rows), np.inf)
     own, size = channels[:, rows], sizes[rows]
     with np.errstate(invalid="ignore"):  # inf - inf
@@ -155,11 +137,6 @@ def initial_growth(gaussians: Gaussians, substitutes: Tensor, distances: Tensor)
     substitute, was kept. Areas A are opacity times the product of the two larger scales, as merging tools weigh them.
     h is the least-squares fit of ``h log m(s) = log(sum of A / own A) / 2`` over the dial values at which it is kept,
     times SHARE.
-
-    Args:
-        gaussians: with a sigma_d; its settings have max_sv.
-        substitutes: ``[N]`` int64, from ``pruning_order``.
-        distances: ``[N]`` normalised distances at which sigma_d follows the pruning order.
     """
     config: AttenuationConfig | None = gaussians.attenuation
     assert config is not None and gaussians.sigma_d is not None

@@ -30,16 +30,10 @@ NORMALS = ("nx", "ny", "nz")
 
 @dataclass(frozen=True)
 class Anomaly:
-    """A property that most files do not have.
+    """A property that most files do not have."""
 
-    Attributes:
-        kind: one word, for scripts.
-        count: of Gaussians or columns; 0 for the whole file.
-        says: one line.
-    """
-
-    kind: str
-    count: int
+    kind: str  # one word, for scripts
+    count: int  # of Gaussians or columns; 0 for the whole file
     says: str
 
 
@@ -53,26 +47,15 @@ class Dial:
 
 @dataclass(frozen=True)
 class Splat:
-    """A file of Gaussians.
-
-    Attributes:
-        sh_degree: of the file; ``values.used_sh_degree`` is the highest with coefficients that are not 0.
-        encoding: of a PLY: "binary little-endian", "binary big-endian" or "ascii".
-        columns: the vertices' properties in the order of the file, with their types; empty for other formats.
-        extra: properties without a meaning here, copied to outputs unchanged.
-        comments: of the header, without ours.
-        tau: the threshold of ``values.fainter_than_tau``: the dial's, or the default of adapting.
-        origin: what adapting reads the positions relative to, world units; 0 unless they are far from 0.
-        screen_filter: that it is drawn with, stated or implied by the file.
-    """
+    """A file of Gaussians."""
 
     sh_degree: int
-    encoding: str
-    columns: tuple[tuple[str, str], ...]
-    extra: tuple[str, ...]
-    comments: tuple[str, ...]
+    encoding: str  # of a PLY
+    columns: tuple[tuple[str, str], ...]  # the properties of a PLY in its order, with their types
+    extra: tuple[str, ...]  # properties without a meaning here, copied to outputs unchanged
+    comments: tuple[str, ...]  # of the header, without ours
     values: Values
-    tau: float
+    tau: float  # of ``values.fainter_than_tau``: the dial's, or the default of adapting
     origin: Origin
     dial: Dial | None
     screen_filter: ScreenFilter
@@ -85,28 +68,17 @@ class Splat:
 
 @dataclass(frozen=True)
 class Inspection:
-    """The result of ``inspect``.
-
-    Attributes:
-        path, size: the file, and its bytes.
-        what: the kind of file, in a few words.
-        writer: the program that probably wrote it; None where it cannot be told.
-        splat: of a file of Gaussians; else None.
-        about: of an adapter or a training state, plain JSON; else None.
-        anomalies: properties that most files do not have.
-        left_out: what adapting leaves out or does not change, one line each.
-        notes: of the reader.
-    """
+    """The result of ``inspect``."""
 
     path: str
     size: int
-    what: str
-    writer: str | None
+    what: str  # the kind of file, in a few words
+    writer: str | None  # the program that probably wrote it
     splat: Splat | None
-    about: dict[str, Any] | None
+    about: dict[str, Any] | None  # of an adapter or a training state, plain JSON
     anomalies: tuple[Anomaly, ...]
-    left_out: tuple[str, ...]
-    notes: tuple[str, ...]
+    left_out: tuple[str, ...]  # what adapting leaves out or does not change, one line each
+    notes: tuple[str, ...]  # of the reader
 
     def as_dict(self) -> dict[str, Any]:
         """Plain JSON."""
@@ -118,13 +90,7 @@ class Inspection:
 
 
 def inspect(path: str | Path) -> Inspection:
-    """Inspects a splat in any format that ``load`` reads, an adapter, or the state of an interrupted run.
-
-    Values that look activated are taken as activated, and an anomaly states that.
-
-    Raises:
-        ClodError: the file is none of these, damaged, or has no usable Gaussian.
-    """
+    """Inspects a splat in any format that ``load`` reads, an adapter, or the state of an interrupted run."""
     path = Path(path)
     if path.suffix.lower() == ".safetensors" and (found := _inspect_tensors(path)) is not None:
         what, about, told = found
@@ -225,11 +191,7 @@ def _list(names: Sequence[str]) -> str:
 
 
 def _inspect_tensors(path: Path) -> tuple[str, dict[str, Any], tuple[str, ...]] | None:
-    """The kind of such a file, plain JSON about it, and notes; None where it is neither.
-
-    Raises:
-        ClodError: it cannot be read, or is damaged.
-    """
+    """The kind of such a file, plain JSON about it, and notes; None where it is neither."""
     from clod_adapter.io.adapter_file import FORMAT, load_adapter
     from clod_adapter.io.file_formats import KEY
     from clod_adapter.io.tensor_file import read_tensor_header

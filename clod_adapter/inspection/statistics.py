@@ -35,37 +35,21 @@ class Spread:
 
 @dataclass(frozen=True)
 class Values:
-    """Statistics of the usable rows.
+    """Statistics of the usable rows."""
 
-    Attributes:
-        total: rows of the file.
-        count: usable ones; the others by ``dropped``: the reason, and how many.
-        used_sh_degree: the highest with a coefficient that is not 0.
-        position: of x, y and z, world units.
-        scale: of all three standard deviations, world units.
-        opacity: activated.
-        needles: share more than NEEDLE times as long as along their second axis.
-        infinite_opacity: rows with opacity = +inf.
-        doubles: rows that stand exactly where an earlier one does.
-        far: rows FAR times as far from the median position as nine tenths are.
-        giant: rows whose largest standard deviation is over half the diagonal of the middle 98 %.
-        fainter_than_tau, fainter_than_visible: shares whose opacity is below ``values_of``'s ``tau``, and FAINT.
-        sigma, growth: of sigma_d and growth_d, where they are there.
-    """
-
-    total: int
-    count: int
-    dropped: dict[str, int]
-    used_sh_degree: int
+    total: int  # rows of the file
+    count: int  # usable ones
+    dropped: dict[str, int]  # the others, by the reason
+    used_sh_degree: int  # the highest with a coefficient that is not 0
     position: tuple[Spread, Spread, Spread]
-    scale: Spread
+    scale: Spread  # of all three standard deviations
     opacity: Spread
-    needles: float
-    infinite_opacity: int
-    doubles: int
-    far: int
-    giant: int
-    fainter_than_tau: float
+    needles: float  # share more than NEEDLE times as long as along their second axis
+    infinite_opacity: int  # opacity = +inf
+    doubles: int  # rows that stand exactly where an earlier one does
+    far: int  # FAR times as far from the median position as nine tenths are
+    giant: int  # largest standard deviation over half the diagonal of the middle 98 %
+    fainter_than_tau: float  # shares
     fainter_than_visible: float
     sigma: Spread | None
     growth: Spread | None

@@ -1,19 +1,13 @@
 """Cameras for a checkpoint without photographs, placed from its Gaussians alone.
 
-A checkpoint is accurate only where its photographs looked. Two properties of the Gaussians tell where that was:
-
-- Gaussians are a pixel or two large in their nearest cameras. The smallest ones therefore give the distance of the
-  cameras (``typical_reach``), and a rendering full of Gaussians many pixels wide shows a place without photographs.
-- The higher SH degrees start at 0 and are changed only by photographs, so their contribution to the colour is strong
-  in the directions from which a Gaussian was photographed and weak in others.
+Two properties of the Gaussians tell where photographs looked. They are a pixel or two large in their nearest cameras,
+so the smallest ones give the distance of the cameras (``_reach``), and a rendering full of large ones shows a place
+without photographs. And the higher SH degrees start at 0 and are changed only by photographs, so their contribution to
+the colour is strong in the directions from which a Gaussian was photographed.
 
 Candidate cameras look at random Gaussians, preferably small opaque ones, from random directions. Each is scored by two
-small renderings (``score``), and as many again are tried near the best. Of the good ones, cameras far from each other
+small renderings (``_score``), and as many again are tried near the best. Of the good ones, cameras far from each other
 are chosen. The method needs no up direction, scene type or unit.
-
-The time of a rendering follows the number of Gaussians, and hundreds of cameras are scored. Beyond SAMPLE of them a
-sample is rendered. With the probability p of a Gaussian as in ``sample``, its scales are multiplied by ``p^-1/2``, so
-that its projected area times its probability is what it was: surfaces are covered as before, and walls stay opaque.
 """
 
 from __future__ import annotations
@@ -98,27 +92,22 @@ class _Placement:
 
     def __init__(self, plain: Gaussians, seed: int, field: float, progress: Listener | None) -> None:
         usable = _usable(plain)
-        self.few, self.growth = sample(plain, usable, seed)
-        self.reach = typical_reach(plain.replace(shN=plain.shN[:, :0]).select(usable), field)
-        self.zoom, self.generator, self.progress = _zoom(field), torch.Generator().manual_seed(seed), progress
-        self.judged = 0
+        self.few, self.growth = _sample(plain, usable, seed)
+        self.zoom = 0.5 / math.tan(math.radians(field) / 2)  # the focal length in image widths
+        self.reach = _reach(plain.replace(shN=plain.shN[:, :0]).select(usable), self.zoom)
+        self.generator, self.progress, self.judged = torch.Generator().manual_seed(seed), progress, 0
         # Each row stands for growth^2 of the checkpoint's.
         self.weight = self.few.opacities if self.growth is None else self.few.opacities * self.growth**2
         self.hidden = torch.ones_like(self.weight)
 
     def round(self, views: int) -> list[Camera]:
-        """Cameras that look at rows not shown yet.
-
-        Raises:
-            ClodError: none sees anything.
-        """
+        """Cameras that look at rows not shown yet; raises ClodError if none sees anything."""
         tries, start = TRIES * views, self.judged
         scored: list[tuple[float, Camera]] = []
 
         def ranked(cameras: Iterable[Camera]) -> list[tuple[float, Camera]]:
-            """These and the cameras before with their scores, the best first; none that are empty."""
             for camera in cameras:
-                scored.append((score(self.few, self.growth, camera), camera))
+                scored.append((_score(self.few, self.growth, camera), camera))
                 tell(self.progress, Phase.CAMERAS, start + len(scored), start + 2 * tries)
             return sorted((each for each in scored if each[0] > -math.inf), key=lambda each: -each[0])
 
@@ -134,7 +123,7 @@ class _Placement:
         """Cameras towards rows, preferably small opaque ones, from uniform directions, at half to twice the reach."""
         means, random = self.few.means, partial(torch.rand, generator=self.generator)
         # torch.multinomial has a limit of 2^24 weights.
-        interest = self.weight * self.hidden / largest_scale(self.few).clamp(min=1e-12)
+        interest = self.weight * self.hidden / _largest_scale(self.few).clamp(min=1e-12)
         ends = interest.double().cumsum(0).cpu()  # cameras are placed on the CPU
         drawn = torch.searchsorted(ends, random(count, dtype=torch.float64) * ends[-1])
         targets = means[drawn.clamp(max=len(means) - 1).to(means.device)].cpu()
@@ -168,13 +157,12 @@ class _Placement:
         return 1 - float((self.weight * self.hidden).sum() / self.weight.sum())
 
 
-def typical_reach(gaussians: Gaussians, field: float = FIELD) -> float:
-    """Estimated distance between cameras and scene, world units.
+def _reach(gaussians: Gaussians, zoom: float) -> float:
+    """The distance, world units, at which the smallest tenth of the Gaussians is at most SMALL_PIXELS pixels large.
 
-    The distance at which the smallest tenth of the visible Gaussians is at most SMALL_PIXELS pixels large; at most FAR
-    times the median distance of the Gaussians from their centre. ``field`` is the horizontal field of view, degrees.
+    At most FAR times the median distance of the Gaussians from their centre.
     """
-    footprint = _quantile(largest_scale(gaussians), SMALL) * WIDTH * _zoom(field) / SMALL_PIXELS
+    footprint = _quantile(_largest_scale(gaussians), SMALL) * WIDTH * zoom / SMALL_PIXELS
     from_centre = (gaussians.means - gaussians.means.median(0).values).norm(dim=1)
     return min(footprint, FAR * _quantile(from_centre, 0.5)) or footprint
 
@@ -205,24 +193,19 @@ def _intrinsics(zoom: float, width: int, height: int) -> Tensor:
     return torch.tensor([[zoom * width, 0, width / 2], [0, zoom * width, height / 2], [0, 0, 1.0]], dtype=torch.float32)
 
 
-def _zoom(field: float) -> float:
-    """The focal length in image widths, of a horizontal field of view in degrees."""
-    return 0.5 / math.tan(math.radians(field) / 2)
-
-
 def _quantile(values: Tensor, share: float) -> float:
     return float(values.kthvalue(max(round(share * len(values)), 1)).values)
 
 
-def sample(gaussians: Gaussians, rows: Tensor, seed: int) -> tuple[Gaussians, Tensor | None]:
+def _sample(gaussians: Gaussians, rows: Tensor, seed: int) -> tuple[Gaussians, Tensor | None]:
     """About SAMPLE of the Gaussians at ``rows [n]``, and the factors of their scales; all, and None, if n <= SAMPLE.
 
-    A Gaussian is drawn with probability ``p_i = min(1, c l_i)``, l its largest scale and c such that the sum is
-    SAMPLE: large ones, of which few cover much, stay as they are.
+    One of largest scale l is drawn with probability ``p = min(1, c l)``, the sum of which is SAMPLE. Its scales are
+    multiplied by ``p^-1/2``, so that surfaces are covered as before and walls stay opaque.
     """
     if len(rows) <= SAMPLE:
         return gaussians.select(rows).without_empty_bands(), None
-    size = largest_scale(gaussians)[rows].double().nan_to_num(0.0, 0.0)  # infinite ones are not drawn
+    size = _largest_scale(gaussians)[rows].double().nan_to_num(0.0, 0.0)  # infinite ones are not drawn
     share = size * (SAMPLE / size.sum())
     for _ in range(ROUNDS):
         share = (share * (SAMPLE / share.sum())).clamp_(max=1)
@@ -231,14 +214,11 @@ def sample(gaussians: Gaussians, rows: Tensor, seed: int) -> tuple[Gaussians, Te
     return gaussians.select(rows[drawn]).without_empty_bands(), share[drawn].rsqrt().to(gaussians.means)
 
 
-def score(gaussians: Gaussians, growth: Tensor | None, camera: Camera) -> float:
-    """How likely a photograph was taken from here; -inf if the rendering is empty.
+def _score(gaussians: Gaussians, growth: Tensor | None, camera: Camera) -> float:
+    """How likely a photograph was taken from here, ``log h - 0.5 p - 2 e``; -inf if the rendering is empty.
 
-    ``log h - 0.5 p - 2 e`` with h the mean magnitude of the higher SH degrees' colour, p the mean log size in pixels
-    (both weighted by alpha), e the share of pixels that are not covered.
-
-    Args:
-        growth: of ``sample``. p is of the sizes without it.
+    h is the mean magnitude of the higher SH degrees' colour, p the mean log size in pixels without ``growth`` (both
+    weighted by alpha), e the share of pixels that are not covered.
     """
     higher = torch.zeros_like(gaussians.sh0)  # the colour is then 0.5 + that of the higher degrees
     bands, alpha = splat(gaussians.replace(sh0=higher), gaussians.opacities, camera, growth=growth)
@@ -247,7 +227,7 @@ def score(gaussians: Gaussians, growth: Tensor | None, camera: Camera) -> float:
         return -math.inf
     row = camera.viewmat[2].to(gaussians.means)
     depths = gaussians.means @ row[:3] + row[3]
-    pixels = largest_scale(gaussians) * WIDTH / camera.width * camera.K[0, 0] / depths.clamp(min=1e-6)
+    pixels = _largest_scale(gaussians) * WIDTH / camera.width * camera.K[0, 0] / depths.clamp(min=1e-6)
     shade = (pixels.clamp(1e-3, 1e4).log() + 7)[:, None, None].expand(-1, 1, 3)  # positive, as colours are
     plain = gaussians.replace(sh0=(shade - 0.5) / SH_C0, shN=gaussians.shN[:, :0])
     sizes, _ = splat(plain, gaussians.opacities, camera, growth=growth)
@@ -257,6 +237,6 @@ def score(gaussians: Gaussians, growth: Tensor | None, camera: Camera) -> float:
     return math.log(strength + 1e-4) - 0.5 * size - 2 * empty
 
 
-def largest_scale(gaussians: Gaussians) -> Tensor:
+def _largest_scale(gaussians: Gaussians) -> Tensor:
     """``[N]`` the largest standard deviation, world units."""
     return gaussians.scales.amax(1)

@@ -1,7 +1,7 @@
-"""CLoD-GS's own training (section 3.3), behind the methods of this project's: initialization, dial values, objective.
+"""CLoD-GS's own training (section 3.3); those of its settings that are fields are in ``AdaptConfig.paper``.
 
-Those of its settings that are fields are in ``AdaptConfig.paper``. Not in the paper, chosen here: sigma_d initialized
-to 1, a straight-through count with a sigmoid SOFTNESS wide, learning rates that decay to a twentieth.
+Not in the paper, chosen here: sigma_d initialized to 1, a straight-through count with a sigmoid SOFTNESS wide, learning
+rates that decay to a twentieth.
 """
 
 from __future__ import annotations
@@ -36,7 +36,6 @@ class PaperSchedule(Schedule):
         super().__init__(full=0.0, coarse=0.0, lr_final=0.05, average=0.0, rendered=1.0, counted=0.0)
 
     def dial(self, place: float, share_done: float, end: float) -> float:
-        """Uniform from 1 to ``end``."""
         return 1 + (end - 1) * place
 
 
@@ -93,11 +92,7 @@ def form_of(config: AdaptConfig) -> type[Dial]:
 def paper_count(
     dialled: Attenuated, virtual_scale: float, tau: float, config: AdaptConfig, total: int | None = None
 ) -> Tensor:
-    """0-d, the paper's ``lambda L_reg = lambda (s - 1)^2 relu(eta - s^-p)^2``; eta is ``soft_count``.
-
-    Args:
-        total: number of Gaussians that eta is a share of, as in ``target_count.target_share``.
-    """
+    """0-d, the paper's ``lambda L_reg = lambda (s - 1)^2 relu(eta - s^-p)^2``; eta is ``soft_count``, of ``total``."""
     count = soft_count(dialled.log_opacities, virtual_scale, tau, SOFTNESS)
     count = count * (len(dialled.log_opacities) / (total or len(dialled.log_opacities)))
     excess = (count - virtual_scale**-config.exponent).clamp(min=0)
@@ -109,18 +104,12 @@ def soft_count(log_opacities: Tensor, virtual_scale: float, tau: float, temperat
 
     Forward: mean of ``log a'' > log(tau s)``; 0 for no Gaussians. Backward, straight through: the gradient
     of the mean of ``sigmoid((log a'' - log(tau s)) / temperature)``, which is 0 at log a'' = -inf.
-
-    Args:
-        log_opacities: ``[N]`` from ``attenuate``, in [-inf, 0].
-        temperature: > 0, in units of log opacity; the larger, the farther from the threshold it acts.
     """
     (log_opacities,) = conform(log_opacities=log_opacities)
     return _SoftCount.apply(log_opacities, log_threshold(tau, virtual_scale), temperature)
 
 
 class _SoftCount(Function):
-    """``soft_count`` above a log threshold."""
-
     @staticmethod
     def forward(ctx: Any, log_opacities: Tensor, threshold: float, temperature: float) -> Tensor:
         ctx.save_for_backward(log_opacities)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial, reduce
 from statistics import median
@@ -45,12 +45,7 @@ class PseudoView(StoredView):
     """A view whose photograph is a rendering of ``teacher``, made when it is read, and from nearby in each step.
 
     With a fixed set of renderings Gaussians drift towards what only these cameras see. ``at`` returns a fixed one.
-
-    Args:
-        camera: the placed camera.
-        teacher: the checkpoint, rendered at s = 1.
-        reach: unit of the offsets of moved cameras, world units (``reaches``).
-        backed: share of the moved cameras that step back as well.
+    ``reach`` is the unit of a moved camera's offset (``reaches``), ``backed`` the share that step back as well.
     """
 
     def __init__(self, camera: Camera, teacher: Gaussians, reach: float, backed: float = 0.0) -> None:
@@ -65,10 +60,7 @@ class PseudoView(StoredView):
         return PseudoView, (self.camera, self.teacher, self.reach, self.backed)
 
     def moved(self, random: np.random.Generator) -> View:
-        """A view from a random camera near this one, or behind it; rendered when its image is read.
-
-        Offsets of position and direction are normal, that of log focal length is uniform.
-        """
+        """A view from a random camera near this one, or behind it; rendered when its image is read."""
         x, y, z = TURNED * random.standard_normal(3)
         step = torch.eye(4, dtype=torch.float64)  # on the CPU, where cameras are placed
         step[:3, :3] = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64).matrix_exp()
@@ -114,12 +106,8 @@ def add_pseudo_views(
 ) -> tuple[Scene, AdaptConfig]:
     """Adds ADDED pseudo views, and halves all learning rates but the dial's, if photographs show too little.
 
-    Training on such photographs alone would damage what they do not show. Where they show enough, pseudo views harm
-    more than they help, as they contain the errors of the checkpoint and have other distances (docs/method.md). Placed
-    cameras have the field of view of the first photograph. If no camera can be placed, a note says so.
-
-    Args:
-        progress: called in ``Phase.CAMERAS``.
+    Where they show enough, pseudo views harm more than they help: they contain the errors of the checkpoint and have
+    other distances (docs/method.md).
     """
     photographs = scene.train
     if not 0 < len(photographs) < MANY:
@@ -132,26 +120,19 @@ def add_pseudo_views(
             if share >= SHOWN:
                 return scene, config
             few = f"the {len(photographs)} photographs to train on show only {share:.0%} of the scene {TIMES} times"
-        own = _complementary(gaussians, photographs, place)
+        each = max(min(NEAR, ADDED // 2 // len(photographs)), 1)
+        placed = place(views=max(ADDED - each * len(photographs), ADDED // 2))
     except ClodError as error:
         note = f"{len(photographs)} photographs to train on may be too few, and no pseudo views can be added: {error}"
         return replace(scene, notes=(*scene.notes, note)), config
+    teacher = gaussians.without_empty_bands()  # one for all: it may be a copy
+    near = _views(teacher, [view.camera for view in photographs], wider=WIDER)
+    own = (*each * near, *_views(teacher, placed))
     note = (
         f"{few}: {len(own)} pseudo views, the checkpoint's own renderings, are added, and all "
         "learning rates but the dial's are halved"
     )
     return replace(scene, train=(*photographs, *own), notes=(*scene.notes, note)), config.lighter(LIGHTER)
-
-
-def _complementary(
-    gaussians: Gaussians, photographs: Sequence[View], place: Callable[..., list[Camera]]
-) -> tuple[View, ...]:
-    """ADDED pseudo views, at the cameras of the photographs and at placed ones."""
-    each = max(min(NEAR, ADDED // 2 // len(photographs)), 1)
-    placed = place(views=max(ADDED - each * len(photographs), ADDED // 2))
-    teacher = gaussians.without_empty_bands()  # one for all: it may be a copy
-    near = _views(teacher, [view.camera for view in photographs], wider=WIDER)
-    return *each * near, *_views(teacher, placed)
 
 
 def _views(
@@ -162,10 +143,9 @@ def _views(
 
 
 def reaches(gaussians: Gaussians, cameras: Sequence[Camera]) -> list[float]:
-    """Of each camera its distance to the scene, world units.
+    """Of each camera its distance to the scene, world units: the median in its image, or over the cameras if less.
 
-    It is the median in its image, at most the median over the cameras: of a camera that looks past the scene, the
-    median in the image is that of the background.
+    A camera that looks past the scene has the background's.
     """
     some = gaussians.means[:: len(gaussians) // SAMPLE + 1]
     medians = [median_distance(some, camera) for camera in cameras]

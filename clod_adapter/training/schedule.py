@@ -55,14 +55,7 @@ OURS = Schedule()
 
 
 class Sample(NamedTuple):
-    """What one step does with one view.
-
-    Attributes:
-        view: camera and photograph.
-        dial: the dial value that it is rendered at.
-        counted: a dial value that Gaussians are only counted at; None with a single dial value.
-        halved: whether the view has half its size.
-    """
+    """A view, perhaps of half its size, the dial value it is rendered at, and another, where Gaussians are counted."""
 
     view: View
     dial: float
@@ -73,12 +66,8 @@ class Sample(NamedTuple):
 class ViewSampler:
     """Samples views and dial values from ``config.seed``; the same in every process.
 
-    Args:
-        tau: the culling threshold at s = 1, where it is not the config's.
-
-    Attributes:
-        order: the numbers of the remaining views of this round, the next one last.
-        offset: of the sequence of dial values.
+    ``order`` has the numbers of the remaining views of this round, the next one last. ``tau`` is by default the
+    config's.
     """
 
     def __init__(
@@ -90,12 +79,7 @@ class ViewSampler:
         self.offset = self.random.random()
 
     def draw(self, number: int, share_done: float) -> Sample:
-        """The next view, each one once per round, and its dial value.
-
-        Args:
-            number: of the sample in the run, from 0.
-            share_done: of the steps or the time budget, in [0, 1].
-        """
+        """The next view, each one once per round, and its dial value; ``number`` counts samples from 0."""
         if not self.order:
             self.order = self.random.permutation(len(self.views)).tolist()
         view = self.views[self.order.pop()]
@@ -135,11 +119,7 @@ class ViewSampler:
         return dict(self.random.bit_generator.state), tuple(self.order)
 
     def restore(self, random: dict[str, Any], order: tuple[int, ...]) -> None:
-        """The inverse of ``state``.
-
-        Raises:
-            ClodError: they are of other views, or damaged.
-        """
+        """The inverse of ``state``."""
         if not all(0 <= view < len(self.views) for view in order) or len(set(order)) < len(order):
             raise ClodError(OTHER_RUN)
         try:

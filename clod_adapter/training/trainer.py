@@ -37,13 +37,11 @@ class Trainer:
     """Holds everything that training steps change. The start has a growth_d if the config has growth.
 
     Attributes:
-        dial: what is trained, with the splats' parameters; count: the number of trained rows, the first ones.
+        count: the number of trained rows, the first ones.
         parameters: tensors by name, those of the dial too; ``stepped``: names of those that are trained.
         mean: of the trained parameters over the last steps, by the schedule; averaged: how many steps it has.
         loss: running mean of the photometric loss, NaN before the first step.
-        done: steps; seconds: spent in them; start_seconds: spent before the first.
         held: ``[trained]`` bool, rows that some step did not move because their gradient was not finite.
-        gate: watches s = 1; None without watched views.
     """
 
     def __init__(
@@ -82,11 +80,7 @@ class Trainer:
     def step(self, share_done: float, until: float = math.inf) -> None:
         """Samples views and dial values, sums the gradients of their losses, and updates the parameters once.
 
-        Args:
-            until: as for ``gradient_sum``: the step has fewer views if the time is over.
-
-        Raises:
-            LossNotFinite, or any error of the rasterizer: nothing has changed.
+        Nothing has changed after LossNotFinite, or an error of the rasterizer. A view is not begun after ``until``.
         """
         if self.gate:
             self.gate.check(share_done)
@@ -118,7 +112,7 @@ class Trainer:
         self._updating = False
 
     def gradient_sum(self, samples: Sequence[Sample], until: float = math.inf) -> GradientSum:
-        """The gradients summed over the samples: the first, and those begun before ``until`` (``perf_counter``)."""
+        """The gradients summed over the first sample and those begun before ``until`` (``perf_counter``)."""
         found = self._of_view(samples[0])
         for sample in samples[1:]:
             if time.perf_counter() >= until:
@@ -145,9 +139,9 @@ class Trainer:
         return GradientSum(gradients, kept, plain)
 
     def image(self, parameters: dict[str, Tensor] | None, camera: Camera, halved: bool) -> Tensor:
-        """The image ``[H, W, 3]`` of the parameters at s = 1; ``halved`` if the camera is for images of half the size.
+        """The image ``[H, W, 3]`` of the parameters at s = 1, or of the present ones without a dial.
 
-        None: of the present ones without a dial, before the first step those of the base.
+        ``halved`` if the camera is for images of half the size.
         """
         shown = self._shown(self.parameters if parameters is None else parameters, halved)
         shown = detach(shown) if parameters is None else shown
@@ -176,11 +170,7 @@ class Trainer:
         self.dial.clamp()
 
     def state(self) -> TrainingState:
-        """Everything that later steps depend on; its tensors are the trainer's own.
-
-        Raises:
-            ClodError: a step failed while it updated the parameters.
-        """
+        """Everything that later steps depend on; its tensors are the trainer's own."""
         if self._updating:
             raise ClodError(f"step {self.done + 1} failed while it updated the parameters, so they cannot be saved")
         random, order = self.sampler.state()
@@ -191,11 +181,7 @@ class Trainer:
         )  # fmt: skip
 
     def restore(self, state: TrainingState) -> None:
-        """The inverse of ``state``; copies its tensors.
-
-        Raises:
-            ClodError: it is of other Gaussians, views or settings, or damaged.
-        """
+        """The inverse of ``state``; copies its tensors. Raises ClodError if it is of another run, or damaged."""
         if state.averaged:
             self.mean = {name: torch.empty_like(value) for name, value in self.trained().items()}
         own = self._changing()
@@ -219,7 +205,6 @@ class Trainer:
         return self.mean if whole else {n: torch.cat([m, self.parameters[n][rest]]) for n, m in self.mean.items()}
 
     def _assembled(self, parameters: dict[str, Tensor]) -> Gaussians:
-        """Gaussians of these parameters."""
         values: Any = {name: parameters[name] for name in ATTRIBUTES}
         return Gaussians(
             **values, sigma_d=self.dial.sigma_of(parameters[self.dial.decay]), attenuation=self.dial.attenuation,
@@ -240,10 +225,8 @@ class Trainer:
 
     def _optimizer(self, names: set[str]) -> RowAdam | None:
         """Of these parameters; None without any."""
-        own = {name: value for name, value in self.trained().items() if name in names}
-        units = {"means": self.unit}
-        betas = {"beta1": BETA1**self.config.batch, "beta2": BETA2**self.config.batch}
-        return RowAdam(own, **betas, units=units) if own else None
+        own, batch = {name: value for name, value in self.trained().items() if name in names}, self.config.batch
+        return RowAdam(own, beta1=BETA1**batch, beta2=BETA2**batch, units={"means": self.unit}) if own else None
 
     def _changing(self) -> dict[str, Tensor]:
         """All tensors that steps change, named as in ``TrainingState``."""
@@ -255,9 +238,8 @@ class Trainer:
                 found[f"steps.{rows}"] = optimizer.steps
         found |= {f"mean.{name}": value for name, value in self.mean.items()}
         if self.gate:
-            found |= {f"good.{name}": value for name, value in self.gate.good.items()} | {
-                "gate.checks": self.gate.numbers
-            }
+            found |= {f"good.{name}": value for name, value in self.gate.good.items()}
+            found["gate.checks"] = self.gate.numbers
         return found
 
 
