@@ -78,7 +78,7 @@ def blocks(model: Gaussians) -> list[Any]:
     views = views_of(model)
     division = divide(initialize(model, views, CONFIG), views, CONFIG, 2)
     share = block_target(division, 0, CAMERAS, CONFIG, first=False)(DIAL)
-    return [*(context_rows(division, 0, views, after) for after in (None, model)), *share]
+    return [*(context_rows(division, 0, views, after).double().mean() for after in (None, model)), *share]
 
 
 def popping(model: Gaussians) -> list[Any]:

@@ -112,9 +112,8 @@ def test_extracting_ignores_a_dial_of_the_base_and_drops_graphs() -> None:
 
 
 def test_other_input_is_refused() -> None:
-    base, three, full = gaussians(), torch.ones(3), partial(torch.full, (6,))
+    base, full = gaussians(), partial(torch.full, (6,))
     adapter, small = extract(base, adapt(base, ["shN"])), extract(gaussians(3), with_dial(gaussians(3)))
-    made = partial(Adapter, attenuation=CONFIG, base_fingerprint="f", config={})
     refused = {
         "different base.*SHA-256 is bbbb": lambda: adapter.apply(base, "b" * 64),
         "different base.*7 Gaussians, the adapter 6": lambda: adapter.apply(gaussians(7)),
@@ -124,12 +123,8 @@ def test_other_input_is_refused() -> None:
         "sigma_d holds .* diverged": lambda: extract(base, with_dial(base, full(torch.nan))),
         "growth_d holds": lambda: extract(base, with_dial(base, full(1.0), growth_d=full(torch.inf))),
         "sh0 holds a new": lambda: extract(base, with_dial(base.replace(sh0=torch.full((6, 1, 3), torch.inf)))),
-        r"sigma_d is float64 \[3\], it must be float32 \[3\]": lambda: made(three.double(), updates={}),
-        r"growth_d is .*, it must be float32 \[3\]": lambda: made(three, updates={}, growth_d=torch.ones(4)),
-        "'colour'": lambda: made(three, updates={"colour": three}),
-        "version": lambda: made(three, updates={}, version="1.0\nproperty float x"),
+        "'colour'": lambda: replace(small, updates={"colour": torch.ones(3)}),
         "Adapter.kept is .* it must be bool with 3 set": lambda: replace(small, kept=torch.ones(4).bool()),
-        "Adapter.sh_degree is 7": lambda: replace(small, sh_degree=7),
     }
     for message, call in refused.items():
         with pytest.raises(ClodError, match=message):

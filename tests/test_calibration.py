@@ -1,8 +1,7 @@
-"""The calibration table: its checks, and exact round trips through JSON, adapter and PLY."""
+"""The calibration table: its checks, and exact round trips through adapter and PLY."""
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -58,7 +57,7 @@ def test_rows_of_an_evaluation() -> None:
 
 
 ROW = CalibrationRow(1.0, 10.0, 30.0, 0.9, 5.0)
-GOOD: dict[str, Any] = {"rows": (ROW,), "total": 10, "views": 1, "width": 8, "height": 8, "machine": "m"}
+GOOD: dict[str, Any] = {"rows": (ROW,), "total": 4, "views": 1, "width": 8, "height": 8, "machine": "m"}
 
 
 @pytest.mark.parametrize(
@@ -79,39 +78,27 @@ def test_bad_tables_are_refused(bad: dict[str, Any], said: str) -> None:
         Calibration(**{**GOOD, **bad})
 
 
-def dialled(path: Path, **more: Any) -> Path:
-    calibration = Calibration(**{**GOOD, "total": 4, **more})
-    save(path, with_dial(gaussians(4, 0, 0), torch.ones(4)), calibration=calibration)
-    return path
-
-
 @pytest.mark.parametrize(
-    ("old", "new", "said"),
+    ("bad", "said"),
     [
-        (b"calibrated 1.0", b"calibrated one", "unusable and ignored"),
-        (b"8 photographs", b"8 paintings", "unusable and ignored.*against 'paintings'"),
-        (b"calibrated_with 4", b"calibrated_with 5", "of 5 Gaussians and ignored, these are 4"),
-        (b"viewpoint 1.5 2.5 3.5 4.5", b"viewpoint 1.5 2.5 3.5 0.0", "unusable and ignored.*unit.*positive"),
+        ({"x": float("nan")}, "centre"),
+        ({"unit": 0.0}, "unit"),
+        ({"up_x": 7.0}, "direction"),
+        ({"fov": -1}, "direction"),
     ],
 )
-def test_a_damaged_table_is_ignored(tmp_path: Path, old: bytes, new: bytes, said: str) -> None:
-    path = dialled(tmp_path / "a.ply", viewpoints=(Viewpoint(1.5, 2.5, 3.5, 4.5),))
-    data = path.read_bytes()
-    assert old in data
-    path.write_bytes(data.replace(old, new))
-    loaded = load(path)
-    assert loaded.calibration is None and loaded.gaussians.sigma_d is not None
-    assert any(re.search(said, note) for note in loaded.notes), loaded.notes
+def test_bad_viewpoints_are_refused(bad: dict[str, float], said: str) -> None:
+    with pytest.raises(ClodError, match=f"the {said} of a viewpoint is"):
+        replace(Viewpoint(1.5, 2.5, 3.5, 4.5, look_z=1.0, up_y=-1.0, fov=0.8), **bad)
 
 
 def test_stored_viewpoints_are_cameras_again(tmp_path: Path) -> None:
-    cameras = ring(3, 40, 30)
+    cameras, dialled = ring(3, 40, 30), with_dial(gaussians(4, 0, 0), torch.ones(4))
     viewpoints = tuple(viewpoint_of(camera, torch.randn(50, 3), AttenuationConfig()) for camera in cameras)
-    stored = load(dialled(tmp_path / "a.ply", viewpoints=viewpoints))
-    assert stored.viewpoints == viewpoints
-    for camera, found in zip(cameras, stored.cameras, strict=True):
-        assert torch.allclose(found.viewmat, camera.viewmat, atol=1e-5)
-        assert float(found.K[1, 1]) / found.height == pytest.approx(float(camera.K[1, 1]) / camera.height, rel=1e-5)
-    assert not load(dialled(tmp_path / "b.ply", viewpoints=(Viewpoint(1.5, 2.5, 3.5, 4.5),))).cameras
-    with pytest.raises(ClodError, match="direction of a viewpoint"):
-        replace(viewpoints[0], up_x=7.0)
+    for places in (viewpoints, (Viewpoint(1.5, 2.5, 3.5, 4.5),)):
+        save(tmp_path / "a.ply", dialled, calibration=Calibration(**GOOD, viewpoints=places))
+        stored = load(tmp_path / "a.ply")
+        assert stored.viewpoints == places and len(stored.cameras) == len(places) - (len(places) == 1)
+        for camera, found in zip(cameras, stored.cameras, strict=False):
+            assert torch.allclose(found.viewmat, camera.viewmat, atol=1e-5)
+            assert float(found.K[1, 1]) / found.height == pytest.approx(float(camera.K[1, 1]) / 30, rel=1e-5)

@@ -40,14 +40,6 @@ class Renderer:
         """Distance of the noiseless log time from the best in range."""
         return abs(math.log(self.ms(dial, load) / self.ms(self.best(load), load)))
 
-    def frames_needed(self, dial: float, load: float) -> int:
-        """Frames to within 10 % with steps of 10 %."""
-        count, best = 0, self.best(load)
-        while self.off(dial, load) > 0.1:
-            dial = min(dial * 1.1, best) if best > dial else max(dial / 1.1, best)
-            count += 1
-        return count
-
     def follow(self, loads: list[float], measured: Callable[[int], float]) -> list[float]:
         """Dial values of frames with these loads, whose times are multiplied by ``measured``."""
         frames, dial = list[tuple[float, float]](), self.start
@@ -62,13 +54,16 @@ class Renderer:
 
 @pytest.mark.parametrize("load", [2.0, 4.0, 1 / 3])
 @pytest.mark.parametrize("outliers", [False, True])
-def test_the_time_is_within_10_percent_after_15_frames(load: float, outliers: bool) -> None:
-    """Later only where steps of 10 % per frame need more. It stays there; without outliers, it never turns back."""
+def test_the_time_is_within_10_percent_after_a_change(load: float, outliers: bool) -> None:
+    """After at most 22 frames: 4, and 18 steps of 10 % from one end of the dial to the other.
+
+    It stays there; without outliers, it never turns back.
+    """
     for exponent, fixed in product(EXPONENTS, FIXED):
         renderer = Renderer(exponent, fixed, start=2.0 if load > 1 else 5.0)
         loads = [1.0] * BEFORE + [load] * AFTER
-        dials = renderer.follow(loads, lambda frame: 5.0 if outliers and frame % 20 == 7 else 1.0)[BEFORE:]
-        settled = dials[max(15, renderer.frames_needed(dials[0], load) + 4) :]
+        dials = renderer.follow(loads, lambda frame: 5.0 if outliers and frame % 20 == 7 else 1.0)
+        settled = dials[BEFORE + 22 :]
         assert all(renderer.off(dial, load) <= 0.1 for dial in settled), (exponent, fixed)
         assert outliers or sorted(settled) in (settled, settled[::-1]), (exponent, fixed)
 
@@ -82,12 +77,6 @@ def test_it_does_not_oscillate_under_noise_of_20_percent() -> None:
         changes = np.abs(np.diff(np.log(dials)))
         assert changes.mean() <= 0.015 and np.median(changes) <= 0.005, (exponent, fixed, seed)
         assert np.log(dials).std() <= 0.2 and times.std() <= 0.1, (exponent, fixed, seed)
-
-
-@pytest.mark.parametrize(("load", "end"), [(50.0, MAX_SV), (0.01, 1.0)])
-def test_a_budget_out_of_reach_ends_at_the_nearest_dial_value(load: float, end: float) -> None:
-    dials = Renderer(1.0, 0.0, start=2.0).follow([1.0] * BEFORE + [load] * 40, lambda frame: 1.0)
-    assert dials[-20:] == [end] * 20
 
 
 def test_the_first_frames_and_single_outliers_do_not_move_it() -> None:

@@ -52,16 +52,13 @@ def column_map(sh_degree: int) -> dict[str, tuple[str, ...]]:
     }
 
 
-def inria_dtype(sh_degree: int, origin: Origin = NOWHERE, dial: Iterable[str] = ()) -> np.dtype:
-    """The rows of the file that Inria's trainer writes, normals included, and the dial's columns.
-
-    Positions with an origin are doubles.
-    """
+def inria_dtype(sh_degree: int, dial: Iterable[str] = ()) -> np.dtype:
+    """The rows of the file that Inria's trainer writes, normals included, and the dial's columns."""
     groups = column_map(sh_degree)
     rest = sorted(groups["shN"], key=lambda name: int(name.rsplit("_", 1)[1]))  # the map lists them by coefficient
     names = [*groups["means"], "nx", "ny", "nz", *groups["sh0"], *rest]
     names += [*groups["opacity_logits"], *groups["log_scales"], *groups["quats"], *dial]
-    return np.dtype([(name, "f8" if any(origin) and name in _XYZ else "f4") for name in names])
+    return np.dtype([(name, "f4") for name in names])
 
 
 @dataclass(frozen=True)
