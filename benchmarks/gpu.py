@@ -3,7 +3,7 @@
     python benchmarks/gpu.py                         # needs torch with CUDA, gsplat 1.5.3 and the shared data
     python benchmarks/gpu.py --device cpu --small    # the same code, in seconds
 
-``tests``: the contract of every backend, the gsplat integration, the optimizer and the compiled formula.
+``tests``: the contract of every backend, the gsplat integration and the optimizer.
 ``plush``: plush_half adapted on the GPU and on the CPU with the same settings: seconds, and held-out quality.
 ``city``: a synthetic city adapted (peak memory), then near and far frames in turn with plain gsplat on the same
 file: times, the dial's share, PSNR.
@@ -40,7 +40,7 @@ CHECKS = ("tests", "plush", "city")
 DIALS = (1.0, 3.0, 7.0)
 TESTS = (
     "tests/rasterizers", "tests/integrations/test_gsplat.py", "tests/test_devices.py",
-    "tests/training/test_optimizer.py", "tests/_support/test_fusing.py",
+    "tests/training/test_optimizer.py",
 )  # fmt: skip
 
 

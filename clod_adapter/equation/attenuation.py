@@ -35,17 +35,16 @@ from __future__ import annotations
 import math
 import warnings
 from functools import reduce
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from clod_adapter._support.fusing import Fused, Number
 from clod_adapter.cameras import Camera
 from clod_adapter.config import AttenuationConfig, require
 from clod_adapter.equation.autograd import Attenuate, Fade
-from clod_adapter.equation.distances import euclidean, normalized_distances, normalizing_distance
+from clod_adapter.equation.distances import normalized_distances
 from clod_adapter.equation.growth import growth_distance, growth_factors
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
@@ -88,10 +87,6 @@ def attenuate(
     changes only Gaussians fainter than tau. Kept sets are nested: a Gaussian kept at s is kept at every smaller dial.
     Without a ``sigma_d`` there is no dial: all Gaussians are kept and drawn with a.
 
-    From logits and centres, on a GPU, of many Gaussians, this is compiled to one pass (``fusing``) that reads 20 bytes
-    of a float32 Gaussian (centre, logit, sigma) and writes the 13 of the results. The plain passes move 340 to 370.
-    Growth reads and writes 4 bytes more.
-
     Args:
         opacities: ``[N]`` logits. At a logit of +inf, a is 1 and its gradient 0.
         seen_from: ``[N]`` distances d (``distances.normalized_distances``), or the centres ``[N, 3]``, world units, and
@@ -111,30 +106,31 @@ def attenuate(
         keep = torch.ones_like(shown, dtype=torch.bool)
         logs = opacities.log() if activated else F.logsigmoid(opacities)
         return Attenuated(shown, logs, keep, shown, torch.ones_like(shown))
-    named = {"opacities" if activated else "opacity_logits": opacities, "sigma_d": sigma_d}
-    more: Any = {"activated": activated, "eps": config.eps, "cut": config.cut}
-    if growth_d is not None:
-        more["growth_d"] = conform(sigma_d=sigma_d, growth_d=growth_d)[1]
-        more["reach"] = growth_distance(config)
-    if isinstance(seen_from, tuple) and _dialled.compiles(seen_from[0]) and not activated:
-        where, more["position"], more["unit"] = _centres(*seen_from, config)
-        rows = conform(**named, x=where[:, 0])[:2]
+    d = normalized_distances(*seen_from, config) if isinstance(seen_from, tuple) else seen_from
+    named = {"opacities" if activated else "opacity_logits": opacities, "sigma_d": sigma_d, "d": d}
+    opacities, sigma, d = conform(**named)
+    if growth_d is None:
+        growth = torch.ones_like(d)
     else:
-        d = normalized_distances(*seen_from, config) if isinstance(seen_from, tuple) else seen_from
-        *rows, where = conform(**named, d=d)
-    numbers = float(virtual_scale), log_threshold(config.tau, virtual_scale)
-    return Attenuated(*_dialled(*rows, where.detach(), *numbers, **more))
+        conform(sigma_d=sigma_d, growth_d=growth_d)
+        growth = growth_factors(growth_d, d, virtual_scale, growth_distance(config))
+    logits = torch.full_like(opacities, math.inf) if activated else opacities
+    faded, log_opacities = Attenuate.apply(logits, sigma, d.detach(), virtual_scale, config.eps)
+    if activated:
+        nothing = opacities <= 0
+        logs = opacities.masked_fill(nothing, 1).log().masked_fill(nothing, -math.inf)  # no slope, rather than 1 / 0
+        faded, log_opacities = opacities * faded, logs + log_opacities
+    threshold, undialled = log_threshold(config.tau, virtual_scale), sigma.detach() == math.inf
+    keep = (log_opacities.detach() > threshold) | undialled
+    if config.cut == "hard":
+        drawn = faded * keep.to(faded)  # five times as fast as where
+    else:
+        drawn = torch.where(undialled, faded, Fade.apply(faded, log_opacities, threshold))
+    return Attenuated(faded, log_opacities, keep, drawn, growth)
 
 
 def dial(gaussians: Gaussians, seen_from: Camera | Tensor, virtual_scale: float) -> Attenuated:
-    """``attenuate`` of a container of Gaussians: their opacities and growth at one dial value.
-
-    Args:
-        seen_from: the camera, or ``[N]`` distances d where they are known.
-
-    Raises:
-        ClodError: the dial is negative or not finite.
-    """
+    """``attenuate`` of Gaussians, seen from a camera, or from distances d ``[N]`` where these are known."""
     where = seen_from if isinstance(seen_from, Tensor) else (gaussians.means, seen_from)
     return attenuate(
         gaussians.opacity_logits, gaussians.sigma_d, where, virtual_scale, gaussians.attenuation,
@@ -150,43 +146,6 @@ def culling_threshold(tau: float, virtual_scale: Scale) -> Scale:
 def log_threshold(tau: float, virtual_scale: float) -> float:
     """Logarithm of ``culling_threshold``; log a'' must exceed it. At least that of FAINTEST, for s = 0."""
     return math.log(max(culling_threshold(tau, virtual_scale), FAINTEST))
-
-
-@torch.no_grad()
-def _centres(means: Tensor, camera: Camera, config: AttenuationConfig) -> tuple[Tensor, Tensor, Number]:
-    """Centres, the camera's position and D: what the compiled pass computes distances from."""
-    with torch.autocast(means.device.type, enabled=False):
-        means = means.detach().to(torch.promote_types(means.dtype, torch.float32))
-        position = camera.position.to(means, non_blocking=means.device.type != "cpu")
-        if config.normalizer == "scene":
-            return means, position, config.scene_distance
-        return means, position, normalizing_distance(euclidean(means, position), means, camera, config)
-
-
-@Fused
-def _dialled(
-    opacities: Tensor, sigma: Tensor, where: Tensor, virtual_scale: Number, threshold: Number, *, activated: bool,
-    eps: float, cut: str, position: Tensor | None = None, unit: Number = 1.0, growth_d: Tensor | None = None,
-    reach: float = 1.0,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
-    """The fields of ``Attenuated``; ``where`` are distances, or with a ``position`` the centres."""
-    d = where if position is None else euclidean(where, position).div_(unit)
-    if activated:
-        opaque = torch.full_like(opacities, math.inf)
-        factor, log_factor = Attenuate.apply(opaque, sigma, d, virtual_scale, eps)
-        nothing = opacities <= 0
-        logs = opacities.masked_fill(nothing, 1).log().masked_fill(nothing, -math.inf)  # no slope, rather than 1 / 0
-        opacities, log_opacities = opacities * factor, logs + log_factor
-    else:
-        opacities, log_opacities = Attenuate.apply(opacities, sigma, d, virtual_scale, eps)
-    undialled = sigma.detach() == math.inf
-    keep = (log_opacities.detach() > threshold) | undialled
-    if cut == "hard":
-        drawn = opacities * keep.to(opacities)  # five times as fast as where
-    else:
-        drawn = torch.where(undialled, opacities, Fade.apply(opacities, log_opacities, threshold))
-    growth = torch.ones_like(d) if growth_d is None else growth_factors(growth_d, d, virtual_scale, reach)
-    return opacities, log_opacities, keep, drawn, growth
 
 
 def check_dial(virtual_scale: float) -> None:

@@ -13,8 +13,6 @@ from torch import Tensor
 from torch.autograd import Function
 from torch.autograd.function import once_differentiable
 
-from clod_adapter._support.fusing import Number
-
 
 def twice_variance(sigma: Tensor, eps: float) -> Tensor:
     """``2 v = 2 relu(sigma)^2 + eps`` in float64, where squares of float32's numbers neither underflow nor overflow."""
@@ -29,7 +27,7 @@ class Attenuate(Function):
     """
 
     @staticmethod
-    def forward(ctx: Any, logits: Tensor, sigma: Tensor, d: Tensor, virtual_scale: Number, eps: float) -> Any:
+    def forward(ctx: Any, logits: Tensor, sigma: Tensor, d: Tensor, virtual_scale: float, eps: float) -> Any:
         dtype, variance = logits.dtype, twice_variance(sigma, eps)
         u = d.double().mul(virtual_scale).square_().div_(variance)
         if eps == 0:  # then the variance may be 0, and 0/0 is to be 0
@@ -67,7 +65,7 @@ class Fade(Function):
     """
 
     @staticmethod
-    def forward(ctx: Any, opacities: Tensor, log_opacities: Tensor, threshold: Number) -> Tensor:
+    def forward(ctx: Any, opacities: Tensor, log_opacities: Tensor, threshold: float) -> Tensor:
         share = (log_opacities - threshold).clamp_(max=1).expm1_().mul_(2).clamp_(0, 1)
         ctx.save_for_backward(opacities, share)
         return opacities * share

@@ -10,8 +10,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from clod_adapter._support.fusing import Fused, Number
-
 
 @dataclass
 class GradientSum:
@@ -109,10 +107,13 @@ class RowAdam:
         length, correction = self._table[:, self.steps.clamp(max=self._table.shape[1] - 1)].unsqueeze(2)
         for name, parameter in self.parameters.items():
             values = (parameter, *self._moments[name])
-            flat = [x.view(len(x), math.prod(x.shape[1:])) for x in values]
-            flat.append(gradients[name].reshape(flat[0].shape))
-            lengths = length * self._units[name][:, None]
-            _adam(*flat, rows[:, None], lengths, correction, rates[name], self.beta1, self.beta2, self.epsilon)
+            x, first, second = (each.view(len(each), math.prod(each.shape[1:])) for each in values)
+            gradient, lengths = gradients[name].reshape(x.shape), length * self._units[name][:, None]
+            m = self.beta1 * first + (1 - self.beta1) * gradient
+            v = self.beta2 * second + (1 - self.beta2) * gradient * gradient
+            moved = x - rates[name] * lengths * m / (v.sqrt() * correction + self.epsilon)
+            for old, new in ((first, m), (second, v), (x, moved)):
+                old.copy_(torch.where(rows[:, None], new, old))
 
 
 @torch.no_grad()
@@ -123,19 +124,3 @@ def add_to_mean(mean: dict[str, Tensor], values: dict[str, Tensor], count: int) 
             mean[name] = value.clone()
         else:
             torch.where(value.isinf(), value, mean[name].lerp_(value, 1 / count), out=mean[name])
-
-
-def _adam_rows(
-    parameter: Tensor, first: Tensor, second: Tensor, gradient: Tensor, rows: Tensor, length: Tensor,
-    correction: Tensor, rate: Number, beta1: Number, beta2: Number, epsilon: Number,
-) -> None:  # fmt: skip
-    """``_kernels.adam.adam_rows`` of ``[N, width]``, with ``rows [N, 1]`` and the corrections ``[N, 1]`` of each."""
-    m = beta1 * first + (1 - beta1) * gradient
-    v = beta2 * second + (1 - beta2) * gradient * gradient
-    moved = parameter - rate * length * m / (v.sqrt() * correction + epsilon)
-    first.copy_(torch.where(rows, m, first))
-    second.copy_(torch.where(rows, v, second))
-    parameter.copy_(torch.where(rows, moved, parameter))
-
-
-_adam = Fused(_adam_rows)

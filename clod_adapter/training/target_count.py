@@ -9,7 +9,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from clod_adapter._support.fusing import Number
 from clod_adapter.config import AdaptConfig, AttenuationConfig
 from clod_adapter.equation.attenuation import attenuate, conform, log_threshold
 
@@ -17,6 +16,7 @@ TEMPERATURE = 0.15  # width of the sigmoid of the soft count, in log opacity
 # Lower bound of the sigmoid's slope, which is at most 1/4, for culled Gaussians while too few are kept. Some widths
 # below the culling threshold it is exactly 0, and so is the image's gradient: no step would bring such a sigma back.
 LIFT = 1e-3
+Number = float | Tensor
 
 
 class TargetShare(NamedTuple):
@@ -69,7 +69,7 @@ def count_gradient(
         return slope.clamp_(min=least).mul_(penalty)
     # The same in two compiled passes.
     from clod_adapter._kernels import count, threads
-    from clod_adapter.rasterizers.frame import dial_vector, workers_for
+    from clod_adapter.rasterizers.cpu import dial_vector, workers_for
 
     out = torch.empty_like(opacity_logits, memory_format=torch.contiguous_format)
     n, workers = len(out), workers_for(len(out))
