@@ -14,7 +14,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from clod_adapter.rasterizers import frame
+from clod_adapter.rasterizers import cpu
 
 
 @dataclass(frozen=True)
@@ -65,14 +65,14 @@ BACKENDS = {
 @contextmanager
 def torch_threads(count: int) -> Iterator[None]:
     """Sets the number of torch's threads, which kernels then use for few rows too, and restores it at the end."""
-    before, few = torch.get_num_threads(), frame.FEW
+    before, few = torch.get_num_threads(), cpu.FEW
     torch.set_num_threads(count)
-    frame.FEW = 0
+    cpu.FEW = 0
     try:
         yield
     finally:
         torch.set_num_threads(before)
-        frame.FEW = few
+        cpu.FEW = few
 
 
 def fresh_copy(monkeypatch: pytest.MonkeyPatch, name: str, package: str, installed: ModuleType | None) -> ModuleType:

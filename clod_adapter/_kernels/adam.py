@@ -6,15 +6,14 @@ from numba import float32, int64
 
 from clod_adapter._kernels.compiling import kernel, part
 from clod_adapter._kernels.elementary import vsqrt
-from clod_adapter._kernels.pointers import pointer, scratch
-from clod_adapter._kernels.rows import load_rows, store_rows
+from clod_adapter._kernels.pointers import load_rows, pointer, scratch, store_rows
 from clod_adapter._kernels.simd import f32x16, load
 
 ONE = float32(1)
 
 
 @part
-def find_rows(mask, i, end, rows):  # type: ignore[no-untyped-def]
+def find_rows(mask, i, end, rows):
     """Lists up to sixteen selected rows from ``i`` on; returns their number and the row to continue from."""
     found = 0
     while i < end and found < 16:
@@ -25,7 +24,7 @@ def find_rows(mask, i, end, rows):  # type: ignore[no-untyped-def]
 
 
 @part
-def step_columns(parameter, first, second, gradient, rows, width, at, many, lanes, length, correction, constants):  # type: ignore[no-untyped-def]
+def step_columns(parameter, first, second, gradient, rows, width, at, many, lanes, length, correction, constants):
     """Steps the columns from ``at`` on, ``many`` of them, of sixteen rows."""
     beta1, beta2, epsilon = constants
     load_rows(parameter, rows, width, at, many, lanes, 0)
@@ -44,7 +43,7 @@ def step_columns(parameter, first, second, gradient, rows, width, at, many, lane
 
 
 @kernel
-def adam_rows(  # type: ignore[no-untyped-def]
+def adam_rows(
     worker, workers, parameter, first, second, gradient, mask, steps, counted, corrections, units, rate, beta1, beta2,
     epsilon,
 ):  # fmt: skip

@@ -7,34 +7,84 @@ its transmittance negated; a block is finished when all its pixels are.
 
 from __future__ import annotations
 
+import numpy as np
 from numba import float32, uint64
 
 from clod_adapter._kernels import conventions as c
-from clod_adapter._kernels.bits import lowest
-from clod_adapter._kernels.blocks import (
-    ACROSS,
-    BACKWARD_STATE,
-    BLOCK,
-    BLOCK_X,
-    BLOCK_Y,
-    BLOCKS,
-    FORWARD_STATE,
-    LANE_X,
-    LANE_Y,
-    WORDS,
-    find_blocks,
-    none_set,
-    start_tile,
-)
 from clod_adapter._kernels.compiling import kernel, part
-from clod_adapter._kernels.elementary import exp2, vabs
-from clod_adapter._kernels.pointers import fetch_add, pointer, prefetch, scratch
-from clod_adapter._kernels.rows import store_sums
-from clod_adapter._kernels.simd import anywhere, both, but_not, fma, ge, gt, load, select, splat, store, vmin
+from clod_adapter._kernels.elementary import exp2, lowest, set_spans, vabs, vceil, vfloor, vsqrt
+from clod_adapter._kernels.pointers import fetch_add, pointer, prefetch, scratch, store_sums
+from clod_adapter._kernels.simd import anywhere, both, but_not, eq, fma, ge, gt, load, select, splat, store, vmax, vmin
+
+BLOCK, ACROSS = 4, 16  # pixels of a block, and blocks of a tile
+BLOCKS = ACROSS * ACROSS
+WORDS = BLOCKS // 64
+FORWARD_STATE, BACKWARD_STATE = BLOCKS * 64, BLOCKS * 80
+BLOCK_X = np.tile(np.arange(ACROSS, dtype=np.float32) * BLOCK, ACROSS)
+BLOCK_Y = np.repeat(np.arange(ACROSS, dtype=np.float32) * BLOCK, ACROSS)
+LANE_X = np.tile(np.arange(4, dtype=np.float32) + 0.5, 4)
+LANE_Y = np.repeat(np.arange(4, dtype=np.float32) + 0.5, 4)
+ROW_Y = np.arange(ACROSS, dtype=np.float32) * BLOCK + np.float32(0.5)  # centre of a block's first row of pixels
+LAST = float32(ACROSS - 1)
 
 
 @part
-def spread(records, r):  # type: ignore[no-untyped-def]
+def start_tile(ox, oy, width, height, state, stride, live):
+    """Marks blocks with pixels in the image as live, pixels outside as finished."""
+    for word in range(WORDS):
+        live[word] = uint64(0)
+    for block in range(BLOCKS):
+        x, y = ox + (block % ACROSS) * BLOCK, oy + (block // ACROSS) * BLOCK
+        if x < width and y < height:
+            live[block // 64] |= uint64(1) << uint64(block % 64)
+        if x + BLOCK <= width and y + BLOCK <= height:
+            store(state, block * stride, splat(float32(1)))
+        else:
+            for lane in range(16):
+                inside = x + lane % 4 < width and y + lane // 4 < height
+                state[block * stride + lane] = 1.0 if inside else -1.0
+
+
+@part
+def none_set(words, at):
+    """Whether the WORDS words from ``at`` on are 0."""
+    any_set = uint64(0)
+    for word in range(WORDS):
+        any_set |= words[at + word]
+    return any_set == uint64(0)
+
+
+@part
+def find_blocks(records, r, ox, oy, masks, at):
+    """Sets in ``masks[at : at + WORDS]`` the tile's blocks that the ellipse of the record at ``r`` touches.
+
+    The ellipse is where alpha reaches 1/255; see ``tiles.extent``, which this computes for all rows of blocks at once.
+    """
+    my, rx, b = splat(records[r + c.MY]), splat(records[r + c.RX]), splat(records[r + c.QB])
+    row = load(ROW_Y, 0) + splat(float32(oy))
+    top = vmax(row, splat(records[r + c.Y0] + c.HALF)) - my
+    bottom = vmin(row + splat(float32(BLOCK - 1)), splat(records[r + c.Y1] + c.HALF)) - my
+    tip = splat(-records[r + c.QB] / (records[r + c.QC] * float32(2)) * records[r + c.RX])
+    zero, half, det = splat(float32(0)), splat(c.HALF / records[r + c.QA]), splat(records[r + c.DET])
+    reach = splat(float32(4) * records[r + c.QA] * records[r + c.REACH])
+    right, left = vmin(vmax(tip, top), bottom), vmin(vmax(zero - tip, top), bottom)
+    wide = vsqrt(vmax(reach - det * right * right, zero))
+    x1 = select(eq(right, tip), rx, (wide - b * right) * half)
+    wide = vsqrt(vmax(reach - det * left * left, zero))
+    x0 = select(eq(left, zero - tip), zero - rx, (zero - wide - b * left) * half)
+    mx = splat(records[r + c.MX] - c.HALF)
+    low = vmax(vceil(mx + x0 - splat(c.SLACK)), splat(records[r + c.X0])) - splat(float32(ox))
+    high = vmin(vfloor(mx + x1 + splat(c.SLACK)), splat(records[r + c.X1])) - splat(float32(ox))
+    quarter = splat(float32(1 / BLOCK))
+    # Clamped before the cast to integers: values may be 1e10.
+    low = vmin(vmax(vfloor(low * quarter), zero), splat(LAST + float32(1)))
+    high = vmax(vmin(vfloor(high * quarter), splat(LAST)), splat(float32(-1)))
+    high = select(both(ge(bottom, top), ge(high, low)), high, splat(float32(-1)))
+    set_spans(masks, at, low, high)
+
+
+@part
+def spread(records, r):
     """Exponent ``-QA, -QB, -QC, LOG`` and colour of the record at ``r``, the same in every lane."""
     qa, qb, qc = splat(-records[r + c.QA]), splat(-records[r + c.QB]), splat(-records[r + c.QC])
     red, green, blue = splat(records[r + c.RED]), splat(records[r + c.GREEN]), splat(records[r + c.BLUE])
@@ -42,14 +92,14 @@ def spread(records, r):  # type: ignore[no-untyped-def]
 
 
 @part
-def offsets_from(records, r, ox, oy):  # type: ignore[no-untyped-def]
+def offsets_from(records, r, ox, oy):
     """From the centre of the record at ``r`` to the pixels of the tile's first block, along x and along y."""
     base_x = load(LANE_X, 0) + splat(float32(ox) - records[r + c.MX])
     return base_x, load(LANE_Y, 0) + splat(float32(oy) - records[r + c.MY])
 
 
 @kernel
-def blend(  # type: ignore[no-untyped-def]
+def blend(
     worker, workers, records, entries, offsets, across, width, height, background, tiles, cursor, room, masks,
     image, alpha,
 ):  # fmt: skip
@@ -109,7 +159,7 @@ def blend(  # type: ignore[no-untyped-def]
 
 
 @part
-def write_tile(ox, oy, width, height, state, background, image, alpha):  # type: ignore[no-untyped-def]
+def write_tile(ox, oy, width, height, state, background, image, alpha):
     """Composites the tile over the background into the image."""
     part = scratch(float32, 64)
     for block in range(BLOCKS):
@@ -130,7 +180,7 @@ def write_tile(ox, oy, width, height, state, background, image, alpha):  # type:
 
 
 @part
-def read_tile(ox, oy, width, height, image, alpha, v_image, v_alpha, state):  # type: ignore[no-untyped-def]
+def read_tile(ox, oy, width, height, image, alpha, v_image, v_alpha, state):
     """Loads for each pixel the remainder of v . C behind the current Gaussian, and v of the three channels."""
     part = scratch(float32, 80)
     for block in range(BLOCKS):
@@ -156,7 +206,7 @@ def read_tile(ox, oy, width, height, image, alpha, v_image, v_alpha, state):  # 
 
 
 @kernel
-def blend_gradient(  # type: ignore[no-untyped-def]
+def blend_gradient(
     worker, workers, records, entries, entry_slots, offsets, across, width, height, image, alpha, v_image, v_alpha,
     tiles, cursor, room, masks, shaped, colored, pair_sums,
 ):  # fmt: skip

@@ -1,21 +1,88 @@
-"""Colours of Gaussians: spherical harmonics in the viewing direction, sixteen Gaussians at a time."""
+"""Colours: real spherical harmonics up to degree 4, in the order and signs of 3DGS, of sixteen Gaussians at a time."""
 
 from __future__ import annotations
 
-from numba import int64, uint64
+from numba import float32, int64, uint64
 
-from clod_adapter._kernels.bits import bits_of
 from clod_adapter._kernels.compiling import part
 from clod_adapter._kernels.conventions import EYE, HALF, HUGE, MEAN, ONE, RECORD, RED, ZERO
-from clod_adapter._kernels.elementary import vabs, vsqrt
-from clod_adapter._kernels.pointers import scratch
-from clod_adapter._kernels.rows import load_rows, store_rows
-from clod_adapter._kernels.sh import sh_basis
+from clod_adapter._kernels.elementary import bits_of, vabs, vsqrt
+from clod_adapter._kernels.pointers import load_rows, scratch, store_rows
 from clod_adapter._kernels.simd import f32x16, fma, gt, splat, vmax
+
+C0 = float32(0.28209479177387814)
+C1 = float32(0.4886025119029199)
+C20, C22, C24 = float32(1.0925484305920792), float32(0.31539156525252005), float32(0.5462742152960396)
+C30, C31, C32 = float32(-0.5900435899266435), float32(2.890611442640554), float32(-0.4570457994644658)
+C33, C35 = float32(0.3731763325901154), float32(1.445305721320277)
+C40, C41, C42 = float32(2.5033429417967046), float32(-1.7701307697799304), float32(0.9461746957575601)
+C43, C44 = float32(-0.6690465435572892), float32(0.10578554691520431)
+C46, C48 = float32(0.47308734787878004), float32(0.6258357354491761)
+F2, F3, F4, F7 = float32(2), float32(3), float32(4), float32(7)
+F6, F30, F35 = float32(6), float32(30), float32(35)
 
 
 @part
-def view_direction(w, cam, out):  # type: ignore[no-untyped-def]
+def sh_basis(degree, x, y, z, out):
+    """Values of the (degree + 1)^2 basis functions in the unit direction (x, y, z)."""
+    out[0] = splat(C0)
+    if degree < 1:
+        return
+    out[1], out[2], out[3] = -C1 * y, C1 * z, -C1 * x
+    if degree < 2:
+        return
+    xx, yy, zz, xy, yz, xz = x * x, y * y, z * z, x * y, y * z, x * z
+    out[4], out[5], out[7] = C20 * xy, -C20 * yz, -C20 * xz
+    out[6], out[8] = C22 * (F2 * zz - xx - yy), C24 * (xx - yy)
+    if degree < 3:
+        return
+    four = F4 * zz - xx - yy
+    out[9], out[10], out[11] = C30 * y * (F3 * xx - yy), C31 * xy * z, C32 * y * four
+    out[12], out[13] = C33 * z * (F2 * zz - F3 * xx - F3 * yy), C32 * x * four
+    out[14], out[15] = C35 * z * (xx - yy), C30 * x * (xx - F3 * yy)
+    if degree < 4:
+        return
+    out[16], out[17] = C40 * xy * (xx - yy), C41 * yz * (F3 * xx - yy)
+    out[18], out[19] = C42 * xy * (F7 * zz - ONE), C43 * yz * (F7 * zz - F3)
+    out[20], out[21] = C44 * (zz * (F35 * zz - F30) + F3), C43 * xz * (F7 * zz - F3)
+    out[22], out[23] = C46 * (xx - yy) * (F7 * zz - ONE), C41 * xz * (xx - F3 * yy)
+    out[24] = C48 * (xx * (xx - F3 * yy) - yy * (F3 * xx - yy))
+
+
+@part
+def sh_basis_gradient(degree, x, y, z, v):
+    """Gradient of ``sum_k v[k] * basis_k`` with respect to (x, y, z) as free variables."""
+    gx = gy = gz = splat(float32(0))
+    if degree >= 1:
+        gx, gy, gz = -C1 * v[3], -C1 * v[1], C1 * v[2]
+    if degree >= 2:
+        gx += C20 * (y * v[4] - z * v[7]) - F2 * C22 * x * v[6] + F2 * C24 * x * v[8]
+        gy += C20 * (x * v[4] - z * v[5]) - F2 * C22 * y * v[6] - F2 * C24 * y * v[8]
+        gz += C20 * (-y * v[5] - x * v[7]) + F4 * C22 * z * v[6]
+    if degree >= 3:
+        xx, yy, zz, xy, yz, xz = x * x, y * y, z * z, x * y, y * z, x * z
+        gx += F6 * C30 * xy * v[9] + C31 * yz * v[10] - F2 * C32 * xy * v[11] - F6 * C33 * xz * v[12]
+        gx += C32 * (F4 * zz - F3 * xx - yy) * v[13] + F2 * C35 * xz * v[14] + F3 * C30 * (xx - yy) * v[15]
+        gy += F3 * C30 * (xx - yy) * v[9] + C31 * xz * v[10] + C32 * (F4 * zz - xx - F3 * yy) * v[11]
+        gy += -F6 * C33 * yz * v[12] - F2 * C32 * xy * v[13] - F2 * C35 * yz * v[14] - F6 * C30 * xy * v[15]
+        gz += C31 * xy * v[10] + F4 * F2 * C32 * yz * v[11] + F3 * C33 * (F2 * zz - xx - yy) * v[12]
+        gz += F4 * F2 * C32 * xz * v[13] + C35 * (xx - yy) * v[14]
+    if degree >= 4:
+        seven = F7 * zz
+        gx += C40 * y * (F3 * xx - yy) * v[16] + F6 * C41 * xy * z * v[17] + C42 * y * (seven - ONE) * v[18]
+        gx += C43 * z * (seven - F3) * v[21] + F2 * C46 * x * (seven - ONE) * v[22]
+        gx += F3 * C41 * z * (xx - yy) * v[23] + F4 * C48 * x * (xx - F3 * yy) * v[24]
+        gy += C40 * x * (xx - F3 * yy) * v[16] + F3 * C41 * z * (xx - yy) * v[17] + C42 * x * (seven - ONE) * v[18]
+        gy += C43 * z * (seven - F3) * v[19] - F2 * C46 * y * (seven - ONE) * v[22]
+        gy += -F6 * C41 * xy * z * v[23] + F4 * C48 * y * (yy - F3 * xx) * v[24]
+        gz += C41 * y * (F3 * xx - yy) * v[17] + F2 * F7 * C42 * xy * z * v[18] + C43 * y * (F3 * seven - F3) * v[19]
+        gz += C44 * z * (F4 * F35 * zz - F2 * F30) * v[20] + C43 * x * (F3 * seven - F3) * v[21]
+        gz += F2 * F7 * C46 * z * (xx - yy) * v[22] + C41 * x * (xx - F3 * yy) * v[23]
+    return gx, gy, gz
+
+
+@part
+def view_direction(w, cam, out):
     """Unit directions from the camera to the Gaussians into ``out[:3]``; returns 1 / distance."""
     x, y, z = w[MEAN] - cam[EYE], w[MEAN + 1] - cam[EYE + 1], w[MEAN + 2] - cam[EYE + 2]
     inverse = ONE / vsqrt(x * x + y * y + z * z)
@@ -24,14 +91,14 @@ def view_direction(w, cam, out):  # type: ignore[no-untyped-def]
 
 
 @part
-def load_sh(shN, rows, terms, w):  # type: ignore[no-untyped-def]
+def load_sh(shN, rows, terms, w):
     """Loads the ``terms`` harmonics above degree 0 of sixteen rows, three channels each, into ``w``."""
     for first in range(0, 3 * terms, 16):
         load_rows(shN, rows, 3 * terms, first, min(3 * terms - first, 16), w, first)
 
 
 @part
-def color(first, found, means, sh0, shN, degree, cam, records, depths, ids):  # type: ignore[no-untyped-def]
+def color(first, found, means, sh0, shN, degree, cam, records, depths, ids):
     """Writes the colours ``max(0, 0.5 + SH)`` of the packed records; returns how many remain: only finite ones."""
     w, sh, basis = scratch(f32x16, 16), scratch(f32x16, 80), scratch(f32x16, 25)
     rows, targets = scratch(int64, 16), scratch(int64, 16)

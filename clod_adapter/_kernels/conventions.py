@@ -36,8 +36,7 @@ MEAN, STORED, SCALE, POINT, ROT, UMAT, PMAT = 0, 3, 7, 10, 13, 22, 28
 COV, COVDET, QUAT, QINV, RAWDET = 34, 37, 38, 42, 43
 WORKSPACE = 44 + 16  # load_rows always fills sixteen vectors
 
-# Edge of a tile in pixels: a multiple of the 4 of a block.
-TILE = 64
+TILE = 64  # pixels: sixteen blocks of four
 # Extents are widened by this many pixels against rounding at the 1/255 edge.
 SLACK = float32(0.01)
 # Sums over pixels per pair of Gaussian and tile, for the projection's gradient.

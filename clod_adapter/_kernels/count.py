@@ -4,17 +4,16 @@ from __future__ import annotations
 
 from numba import float32, uint64
 
-from clod_adapter._kernels.bits import bits_of, ones
 from clod_adapter._kernels.compiling import kernel, part
 from clod_adapter._kernels.conventions import LOG2E, LOG_THRESHOLD, ONE, TWO, ZERO
 from clod_adapter._kernels.dial import LN2, exponent, reciprocal_opacity
-from clod_adapter._kernels.elementary import exp2, log2, vabs
+from clod_adapter._kernels.elementary import bits_of, exp2, log2, ones, vabs
 from clod_adapter._kernels.pointers import pointer, scratch
 from clod_adapter._kernels.simd import f32x16, gt, load, select, splat, store, vmax
 
 
 @part
-def load_sixteen(values, i, last):  # type: ignore[no-untyped-def]
+def load_sixteen(values, i, last):
     """The rows from ``i`` on; beyond the last, that one again."""
     if i + 16 <= last:
         return load(values, i)
@@ -25,7 +24,7 @@ def load_sixteen(values, i, last):  # type: ignore[no-untyped-def]
 
 
 @part
-def load_logs(i, last, logits, sigma, d, dial, w):  # type: ignore[no-untyped-def]
+def load_logs(i, last, logits, sigma, d, dial, w):
     """``w[0]`` log a'' less the threshold's, and ``w[1]`` u, of up to sixteen rows from ``i`` on."""
     w[0], w[1], w[2] = load_sixteen(logits, i, last), load_sixteen(sigma, i, last), load_sixteen(d, i, last)
     w[1] = exponent(w[2], w[1], dial)
@@ -33,7 +32,7 @@ def load_logs(i, last, logits, sigma, d, dial, w):  # type: ignore[no-untyped-de
 
 
 @kernel
-def count_kept(worker, workers, logits, sigma, d, dial, counts):  # type: ignore[no-untyped-def]
+def count_kept(worker, workers, logits, sigma, d, dial, counts):
     """``counts[worker]``: how many of this worker's rows are kept at the distances ``d [N]``."""
     first, last = len(logits) * worker // workers, len(logits) * (worker + 1) // workers
     logits, sigma, d, dial, w = pointer(logits), pointer(sigma), pointer(d), pointer(dial), scratch(f32x16, 3)
@@ -48,7 +47,7 @@ def count_kept(worker, workers, logits, sigma, d, dial, counts):  # type: ignore
 
 
 @kernel
-def count_slope(worker, workers, logits, sigma, d, dial, temperature, lift, penalty, out):  # type: ignore[no-untyped-def]
+def count_slope(worker, workers, logits, sigma, d, dial, temperature, lift, penalty, out):
     """``out [N]``: ``penalty q (1 - q) max(2 u, 1)``; where a row is culled, at least ``penalty lift``.
 
     ``q = sigmoid((log a'' - log(tau s)) / temperature)``.

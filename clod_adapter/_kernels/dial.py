@@ -11,12 +11,10 @@ from __future__ import annotations
 from numba import float32, int64, uint64
 
 from clod_adapter._kernels import conventions as c
-from clod_adapter._kernels.bits import bits_of
 from clod_adapter._kernels.compiling import kernel, part
-from clod_adapter._kernels.elementary import exp2, log2, vsqrt
-from clod_adapter._kernels.pointers import pointer, scratch
-from clod_adapter._kernels.rows import load_rows, load_triples
-from clod_adapter._kernels.simd import both, f32x16, ge, gt, load, select, splat, vmax, vmin
+from clod_adapter._kernels.elementary import bits_of, exp2, log2, vabs, vsqrt
+from clod_adapter._kernels.pointers import load_rows, load_triples, pointer, scratch
+from clod_adapter._kernels.simd import both, f32x16, ge, gt, load, select, splat, store, vmax, vmin
 
 LN2 = float32(0.6931471805599453)
 FARTHEST_EXPONENT = float32(126)  # of exp2
@@ -25,7 +23,7 @@ NEARLY = float32(0.99)  # of the near plane: the projection decides exactly
 
 
 @part
-def settings_of(dial):  # type: ignore[no-untyped-def]
+def settings_of(dial):
     """The address of a dial's settings, or None."""
     if dial is None:
         return None
@@ -33,14 +31,14 @@ def settings_of(dial):  # type: ignore[no-untyped-def]
 
 
 @part
-def distance(x, y, z, cam):  # type: ignore[no-untyped-def]
+def distance(x, y, z, cam):
     """From the camera's centre, world units."""
     dx, dy, dz = x - cam[c.EYE], y - cam[c.EYE + 1], z - cam[c.EYE + 2]
     return vsqrt(dx * dx + dy * dy + dz * dz)
 
 
 @part
-def exponent(d, sigma, dial):  # type: ignore[no-untyped-def]
+def exponent(d, sigma, dial):
     """``u = (d s)^2 / (2 v)``; 0 where d is 0."""
     sigma = vmax(sigma, splat(c.ZERO))
     ratio = d * dial[c.RATE] / vsqrt(sigma * sigma + dial[c.HALF_EPS])
@@ -48,13 +46,13 @@ def exponent(d, sigma, dial):  # type: ignore[no-untyped-def]
 
 
 @part
-def reciprocal_opacity(logit):  # type: ignore[no-untyped-def]
+def reciprocal_opacity(logit):
     """``1 / sigmoid(logit)``."""
     return c.ONE + exp2(vmin(-logit * c.LOG2E, splat(FARTHEST_EXPONENT)))
 
 
 @part
-def survives(w, logit, decay, cam, dial):  # type: ignore[no-untyped-def]
+def survives(w, logit, decay, cam, dial):
     """Which of sixteen rows with centres ``w[:3]`` the dial keeps."""
     u = exponent(distance(w[0], w[1], w[2], cam), decay, dial)
     log_opacity = -(LN2 * log2(reciprocal_opacity(logit))) - u
@@ -62,7 +60,7 @@ def survives(w, logit, decay, cam, dial):  # type: ignore[no-untyped-def]
 
 
 @part
-def kept(at, many, means, opacities, sigma, cam, dial, dialled):  # type: ignore[no-untyped-def]
+def kept(at, many, means, opacities, sigma, cam, dial, dialled):
     """The bits of those of ``many`` rows from ``at`` on that are in front of the camera and not culled.
 
     Without a ``dial``, opacities are activated, and those of the rows are 1/255 at least.
@@ -80,7 +78,7 @@ def kept(at, many, means, opacities, sigma, cam, dial, dialled):  # type: ignore
 
 
 @kernel
-def mark_kept(worker, workers, means, logits, sigma, cam, dial, out):  # type: ignore[no-untyped-def]
+def mark_kept(worker, workers, means, logits, sigma, cam, dial, out):
     """``out [N]`` uint8: 1 for rows that the dial keeps, in front of the camera or not."""
     first, last = len(logits) * worker // workers, len(logits) * (worker + 1) // workers
     means, logits, sigma, out = pointer(means), pointer(logits), pointer(sigma), pointer(out)
@@ -97,7 +95,7 @@ def mark_kept(worker, workers, means, logits, sigma, cam, dial, out):  # type: i
 
 
 @part
-def drawn(rows, opacities, sigma, growth, cam, dial, dialled, grows, w):  # type: ignore[no-untyped-def]
+def drawn(rows, opacities, sigma, growth, cam, dial, dialled, grows, w):
     """The drawn opacities of sixteen rows, whose centres and logarithms of scales ``w`` holds; makes these scales.
 
     Without a ``dial``, opacities and scales are activated.
@@ -127,3 +125,59 @@ def drawn(rows, opacities, sigma, growth, cam, dial, dialled, grows, w):  # type
     for k in range(c.SCALE, c.SCALE + 3):
         w[k] = exp2(vmin(w[k] * c.LOG2E + size, splat(FARTHEST_EXPONENT)))
     return opacity
+
+
+@part
+def dial_gradient(rows, given, cam, dial, dialled, grows, shaped, w, g):
+    """Gradients of logit, sigma and growth of sixteen rows; makes those of the scales in ``g`` of their logarithms.
+
+    With w the gradient of log a'' and f the factor of the cut (``equation/attenuation.py``), per Gaussian::
+
+        w            = dL/dlog(drawn) (1 + (f + 2) / f where 0 < f < 1)     f's slope by log a'' is f + 2
+        dL/dlogit    = w sigmoid(-logit)
+        dL/dsigma    = w 2 u sigma / v                                      distances are constants
+        dL/dlogscale = dL/dscale scale
+        dL/dgrowth   = sum of dL/dlogscale, times log m                     0 where the growth is clamped
+
+    Without a ``dial``, that of the activated opacity alone. ``given`` are the three, and where their gradients go.
+    """
+    opacities, sigma, growth, v_opacities, v_sigma, v_growth = given
+    values = scratch(float32, 48)
+    for lane in range(16):
+        values[lane] = opacities[rows[lane]]
+    if dial is None:
+        store(values, 0, g[c.SUMS + 3] / load(values, 0))
+        for lane in range(16):
+            v_opacities[rows[lane]] = values[lane]
+        return
+    odds = exp2(vmin(-load(values, 0) * c.LOG2E, splat(FARTHEST_EXPONENT)))  # (1 - a) / a
+    total = g[c.SUMS + 3]
+    if shaped:
+        for k in range(c.V_SCALE, c.V_SCALE + 3):
+            g[k] = g[k] * w[c.SCALE + k - c.V_SCALE]
+    if dialled:
+        for lane in range(16):
+            values[16 + lane] = sigma[rows[lane]]
+        decay, d = vmax(load(values, 16), splat(c.ZERO)), distance(w[c.MEAN], w[c.MEAN + 1], w[c.MEAN + 2], cam)
+        u = exponent(d, decay, dial)
+        if dial[c.SOFT] > c.ZERO:
+            opacity = exp2(-(c.LOG2E * u)) / (c.ONE + odds)
+            fade = c.TWO * (opacity / splat(dial[c.THRESHOLD])) - c.TWO
+            fading = both(both(gt(fade, splat(c.ZERO)), gt(splat(c.ONE), fade)), gt(splat(c.HUGE), decay))
+            total = total * select(fading, c.TWO + c.TWO / fade, splat(c.ONE))
+        slope = select(gt(u, splat(c.ZERO)), c.TWO * u * decay / (decay * decay + dial[c.HALF_EPS]), splat(c.ZERO))
+        store(values, 16, total * slope)
+        for lane in range(16):
+            v_sigma[rows[lane]] = values[16 + lane]
+        if grows and shaped:
+            for lane in range(16):
+                values[32 + lane] = growth[rows[lane]]
+            magnification = log2(vmax(d * dial[c.GROWTH_RATE], splat(c.ONE)))
+            inside = gt(splat(LOG2_GROWTH_MAX), vabs(load(values, 32) * magnification))
+            size = LN2 * magnification * (g[c.V_SCALE] + g[c.V_SCALE + 1] + g[c.V_SCALE + 2])
+            store(values, 32, select(inside, size, splat(c.ZERO)))
+            for lane in range(16):
+                v_growth[rows[lane]] = values[32 + lane]
+    store(values, 0, total * odds / (c.ONE + odds))
+    for lane in range(16):
+        v_opacities[rows[lane]] = values[lane]

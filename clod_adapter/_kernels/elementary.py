@@ -1,20 +1,18 @@
-"""Elementary functions of sixteen-lane vectors: square root, rounding, absolute value, exp2 and log2."""
+"""Elementary functions of sixteen-lane vectors, and sets of blocks and of lanes as bits of a uint64."""
 
 from __future__ import annotations
 
 import math
 
 from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic
 
-from clod_adapter._kernels.simd import INTEGERS, LANES, VECTOR, call_llvm, f32x16, llvm_function, operation
+from clod_adapter._kernels.simd import INTEGERS, LANES, VECTOR, call_llvm, f32x16, llvm_function, mask16, operation
 
 
 def _constant(value: float) -> ir.Constant:
-    return ir.Constant(VECTOR, [value] * LANES)
-
-
-def _whole(value: int) -> ir.Constant:
-    return ir.Constant(INTEGERS, [value] * LANES)
+    return ir.Constant(VECTOR if isinstance(value, float) else INTEGERS, [value] * LANES)
 
 
 vsqrt, vfloor, vceil, vabs = (llvm_function(name, 1) for name in ("sqrt", "floor", "ceil", "fabs"))
@@ -28,7 +26,7 @@ _ROUNDING = 1.5 * 2**23
 
 
 @operation(f32x16, f32x16)
-def exp2(builder, x):  # type: ignore[no-untyped-def]
+def exp2(builder, x):
     """``2**x`` for x <= 127, 2**-126 for anything smaller than -126."""
     low = _constant(-126.0)
     x = builder.select(builder.fcmp_ordered(">", x, low), x, low)
@@ -37,7 +35,7 @@ def exp2(builder, x):  # type: ignore[no-untyped-def]
     p = _constant(_EXP2[0])
     for c in _EXP2[1:]:
         p = call_llvm(builder, "llvm.fmuladd.v16f32", VECTOR, [p, f, _constant(c)])
-    exponent = builder.shl(builder.bitcast(shifted, INTEGERS), _whole(23))
+    exponent = builder.shl(builder.bitcast(shifted, INTEGERS), _constant(23))
     return builder.bitcast(builder.add(builder.bitcast(p, INTEGERS), exponent), VECTOR)
 
 
@@ -45,13 +43,50 @@ _TINY = 0x3F3504F3  # bits of sqrt(1/2)
 
 
 @operation(f32x16, f32x16)
-def log2(builder, x):  # type: ignore[no-untyped-def]
+def log2(builder, x):
     """``log2(x)`` of positive normal numbers, to 1e-7 plus its own rounding; 0 at 1."""
     bits = builder.bitcast(x, INTEGERS)
-    exponent = builder.ashr(builder.sub(bits, _whole(_TINY)), _whole(23))
-    m = builder.bitcast(builder.sub(bits, builder.shl(exponent, _whole(23))), VECTOR)  # in [sqrt(1/2), sqrt(2))
+    exponent = builder.ashr(builder.sub(bits, _constant(_TINY)), _constant(23))
+    m = builder.bitcast(builder.sub(bits, builder.shl(exponent, _constant(23))), VECTOR)  # in [sqrt(1/2), sqrt(2))
     s = builder.fdiv(builder.fsub(m, _constant(1.0)), builder.fadd(m, _constant(1.0)))
     square, p = builder.fmul(s, s), _constant(2 / math.log(2) / 9)
     for k in (7, 5, 3, 1):
         p = call_llvm(builder, "llvm.fmuladd.v16f32", VECTOR, [p, square, _constant(2 / math.log(2) / k)])
     return call_llvm(builder, "llvm.fmuladd.v16f32", VECTOR, [p, s, builder.sitofp(exponent, VECTOR)])
+
+
+@operation(types.uint64, mask16)
+def bits_of(builder, mask):
+    """The mask as the low sixteen bits of a uint64."""
+    return builder.zext(builder.bitcast(mask, ir.IntType(LANES)), ir.IntType(64))
+
+
+@intrinsic
+def set_spans(typingctx, words, index, low, high):
+    """In the r-th of sixteen groups of sixteen bits from ``words[index]`` on, sets bits low[r] to high[r].
+
+    Both are rounded towards zero; where high < low no bit is set.
+    """
+
+    def codegen(context, builder, signature, args):
+        low, high = (builder.fptosi(x, INTEGERS) for x in args[2:])
+        bits = builder.sub(builder.shl(_constant(2), high), builder.shl(_constant(1), low))
+        bits = builder.select(builder.icmp_signed(">=", high, low), bits, _constant(0))
+        narrow = builder.trunc(bits, ir.VectorType(ir.IntType(16), LANES))
+        data = builder.gep(args[0], [args[1]])
+        builder.store(narrow, builder.bitcast(data, narrow.type.as_pointer()), align=8)
+        return context.get_dummy_value()
+
+    return types.none(words, types.intp, f32x16, f32x16), codegen
+
+
+@operation(types.int64, types.uint64)
+def lowest(builder, bits):
+    """Index of the lowest bit that is set in a uint64 other than 0."""
+    return call_llvm(builder, "llvm.cttz.i64", bits.type, [bits, ir.Constant(ir.IntType(1), 1)])
+
+
+@operation(types.int64, types.uint64)
+def ones(builder, bits):
+    """How many bits of a uint64 are set."""
+    return call_llvm(builder, "llvm.ctpop.i64", bits.type, [bits])

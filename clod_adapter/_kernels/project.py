@@ -10,19 +10,17 @@ from __future__ import annotations
 from numba import float32, float64, int64, uint64
 
 from clod_adapter._kernels import conventions as c
-from clod_adapter._kernels.bits import bits_of, lowest
 from clod_adapter._kernels.colors import color
 from clod_adapter._kernels.compiling import kernel, part
 from clod_adapter._kernels.conventions import RECORD, WORKSPACE
 from clod_adapter._kernels.dial import drawn, kept, settings_of
-from clod_adapter._kernels.elementary import log2, vceil, vfloor, vsqrt
-from clod_adapter._kernels.pointers import pointer, scratch
-from clod_adapter._kernels.rows import load_rows, store_rows
+from clod_adapter._kernels.elementary import bits_of, log2, lowest, vceil, vfloor, vsqrt
+from clod_adapter._kernels.pointers import load_rows, pointer, scratch, store_rows
 from clod_adapter._kernels.simd import both, f32x16, ge, gt, load, splat, vmax, vmin
 
 
 @part
-def load_stored(means, quats, scales, rows, w):  # type: ignore[no-untyped-def]
+def load_stored(means, quats, scales, rows, w):
     """Loads what is stored of sixteen rows into the workspace ``w``."""
     load_rows(means, rows, 3, 0, 3, w, c.MEAN)
     load_rows(quats, rows, 4, 0, 4, w, c.STORED)
@@ -30,7 +28,7 @@ def load_stored(means, quats, scales, rows, w):  # type: ignore[no-untyped-def]
 
 
 @part
-def covariance(cam, w):  # type: ignore[no-untyped-def]
+def covariance(cam, w):
     """Fills the rest of the workspace ``w``; returns which are in front of the near plane and have a rotation."""
     for d in range(3):
         row = 4 * d
@@ -61,7 +59,7 @@ def covariance(cam, w):  # type: ignore[no-untyped-def]
 
 
 @part
-def rotation(w):  # type: ignore[no-untyped-def]
+def rotation(w):
     """Rotation matrix, row-major, of the unit quaternion."""
     q0, q1, q2, q3 = w[c.QUAT], w[c.QUAT + 1], w[c.QUAT + 2], w[c.QUAT + 3]
     w[c.ROT] = c.ONE - c.TWO * (q2 * q2 + q3 * q3)
@@ -76,7 +74,7 @@ def rotation(w):  # type: ignore[no-untyped-def]
 
 
 @part
-def finish_covariance(w, cam):  # type: ignore[no-untyped-def]
+def finish_covariance(w, cam):
     """Covariance ``P P^T + blur``, and determinants with and without blur as sums of squares, exact for needles."""
     blur = cam[c.BLUR]
     p0, p1, p2, p3, p4, p5 = w[c.PMAT], w[c.PMAT + 1], w[c.PMAT + 2], w[c.PMAT + 3], w[c.PMAT + 4], w[c.PMAT + 5]
@@ -88,7 +86,7 @@ def finish_covariance(w, cam):  # type: ignore[no-untyped-def]
 
 
 @part
-def centres(means, rows, cam, out):  # type: ignore[no-untyped-def]
+def centres(means, rows, cam, out):
     """Sixteen centres on the image, x then y in pixels, and their depths, into ``out [48]``.
 
     In float64: at the edge of a picture 960 wide a float32 centre is off by 1e-4 pixels, and alpha by as much.
@@ -104,7 +102,7 @@ def centres(means, rows, cam, out):  # type: ignore[no-untyped-def]
 
 
 @part
-def make_records(w, centre, opacity, cam, record):  # type: ignore[no-untyped-def]
+def make_records(w, centre, opacity, cam, record):
     """Fills the sixteen columns of the records except the colours; returns which of them reach a pixel centre."""
     mx, my = load(centre, 0), load(centre, 16)
     idet = c.ONE / w[c.COVDET]
@@ -127,7 +125,7 @@ def make_records(w, centre, opacity, cam, record):  # type: ignore[no-untyped-de
 
 
 @part
-def add_records(rows, filled, packed, spare, means, opacity, cam, w, records, depths, ids):  # type: ignore[no-untyped-def]
+def add_records(rows, filled, packed, spare, means, opacity, cam, w, records, depths, ids):
     """Packs those of the first ``filled`` of sixteen ``rows`` that reach a pixel centre, from the record ``packed`` on.
 
     ``w`` holds what is stored of the rows. Returns the number of the next record.
@@ -150,7 +148,7 @@ def add_records(rows, filled, packed, spare, means, opacity, cam, w, records, de
 
 
 @kernel
-def project(  # type: ignore[no-untyped-def]
+def project(
     worker, workers, means, quats, scales, opacities, sigma, growth, sh0, shN, degree, cam, dial, records, depths, ids,
     counts,
 ):  # fmt: skip

@@ -5,20 +5,17 @@ from __future__ import annotations
 from numba import float32, int64
 
 from clod_adapter._kernels import conventions as c
-from clod_adapter._kernels.colors import load_sh, view_direction
+from clod_adapter._kernels.colors import C0, load_sh, sh_basis, sh_basis_gradient, view_direction
 from clod_adapter._kernels.compiling import kernel, part
 from clod_adapter._kernels.conventions import GRADIENTS, WORKSPACE
-from clod_adapter._kernels.dial import drawn, settings_of
-from clod_adapter._kernels.dial_gradient import dial_gradient
-from clod_adapter._kernels.pointers import pointer, scratch
+from clod_adapter._kernels.dial import dial_gradient, drawn, settings_of
+from clod_adapter._kernels.pointers import load_rows, pointer, scratch, store_rows
 from clod_adapter._kernels.project import covariance, load_stored
-from clod_adapter._kernels.rows import load_rows, store_rows
-from clod_adapter._kernels.sh import C0, sh_basis, sh_basis_gradient
 from clod_adapter._kernels.simd import eq, f32x16, gt, load, select, splat, store, vmax, vmin
 
 
 @part
-def covariance_gradient(w, g, cam, compensated):  # type: ignore[no-untyped-def]
+def covariance_gradient(w, g, cam, compensated):
     """Gradients of scales, rotation matrix and mean from the sums over pixels."""
     idet = c.ONE / w[c.COVDET]
     a, b, e = w[c.COV + 2] * idet, -(w[c.COV + 1] * idet), w[c.COV] * idet
@@ -47,7 +44,7 @@ def covariance_gradient(w, g, cam, compensated):  # type: ignore[no-untyped-def]
 
 
 @part
-def compensation_gradient(w, g, k, t0, t1):  # type: ignore[no-untyped-def]
+def compensation_gradient(w, g, k, t0, t1):
     """Adds the gradient through the compensation c to column k of P: that of log c is ``(P P^T)^-1 P - K P``.
 
     ``t0, t1`` is the column of K P. The gradient with respect to log c equals that with respect to log opacity.
@@ -62,7 +59,7 @@ def compensation_gradient(w, g, k, t0, t1):  # type: ignore[no-untyped-def]
 
 
 @part
-def point_gradient(w, g, v_x, v_y, cam):  # type: ignore[no-untyped-def]
+def point_gradient(w, g, v_x, v_y, cam):
     """Adds the gradients through the projected centre and through the Jacobian to that of the mean."""
     x, y, iz = w[c.POINT], w[c.POINT + 1], c.ONE / w[c.POINT + 2]
     rx, ry = x * iz, y * iz
@@ -87,7 +84,7 @@ def point_gradient(w, g, v_x, v_y, cam):  # type: ignore[no-untyped-def]
 
 
 @part
-def quat_gradient(w, g):  # type: ignore[no-untyped-def]
+def quat_gradient(w, g):
     """Gradient of the stored quaternion from that of the rotation matrix."""
     q0, q1, q2, q3, r = w[c.QUAT], w[c.QUAT + 1], w[c.QUAT + 2], w[c.QUAT + 3], c.V_ROT
     x, y, z = g[r + 7] - g[r + 5], g[r + 2] - g[r + 6], g[r + 3] - g[r + 1]
@@ -102,7 +99,7 @@ def quat_gradient(w, g):  # type: ignore[no-untyped-def]
 
 
 @part
-def color_gradient(w, g, shN, rows, degree, cam, sh, basis, tuned, v_shN):  # type: ignore[no-untyped-def]
+def color_gradient(w, g, shN, rows, degree, cam, sh, basis, tuned, v_shN):
     """Gradients of the harmonics above degree 0 if ``tuned``, and of the mean through the direction."""
     inverse = view_direction(w, cam, sh)
     x, y, z = sh[0], sh[1], sh[2]
@@ -124,14 +121,14 @@ def color_gradient(w, g, shN, rows, degree, cam, sh, basis, tuned, v_shN):  # ty
 
 
 @part
-def clear(values, first, last):  # type: ignore[no-untyped-def]
+def clear(values, first, last):
     """Sets the elements from ``first`` up to ``last`` to 0."""
     for k in range(first, last):
         values[k] = c.ZERO
 
 
 @part
-def no_gradient(first, last, shaped, colored, terms, v_means, v_quats, v_scales, v_opacities, v_sh0, v_shN):  # type: ignore[no-untyped-def]
+def no_gradient(first, last, shaped, colored, terms, v_means, v_quats, v_scales, v_opacities, v_sh0, v_shN):
     """Sets the gradients of the rows from ``first`` up to ``last``, which are not visible, to 0."""
     clear(v_opacities, first, last)
     if shaped:
@@ -144,7 +141,7 @@ def no_gradient(first, last, shaped, colored, terms, v_means, v_quats, v_scales,
 
 
 @part
-def add_slots(pair_sums, slots, records, packed, lanes, sums, g):  # type: ignore[no-untyped-def]
+def add_slots(pair_sums, slots, records, packed, lanes, sums, g):
     """Sums the slots of sixteen packed Gaussians into ``g[SUMS]`` and into the rows of ``sums [16, 16]``."""
     for lane in range(16):
         total = splat(c.ZERO)
@@ -161,7 +158,7 @@ def add_slots(pair_sums, slots, records, packed, lanes, sums, g):  # type: ignor
 
 
 @kernel
-def project_gradient(  # type: ignore[no-untyped-def]
+def project_gradient(
     worker, workers, means, quats, scales, opacities, sigma, growth, shN, degree, cam, dial, records, packed_ids,
     counts, slots, pair_sums, compensated, trained, v_means, v_quats, v_scales, v_opacities, v_sigma, v_growth, v_sh0,
     v_shN,

@@ -1,18 +1,13 @@
 """Sixteen-lane float vectors for Numba, as LLVM vectors.
 
-Numba's loop vectoriser does not vectorise the splatting loops (aliasing, masks), so the kernels use explicit vectors:
-``F32x16`` is LLVM's ``<16 x float>`` and ``Mask16`` its ``<16 x i1>``. LLVM lowers them to one AVX-512, two AVX or four
-SSE/NEON registers, whichever the processor has.
-
-Vectors are made by ``splat`` and ``load`` and combined by ``+ - *``, ``fma``, ``vmin``, comparisons
-``ge``, ``gt``, ``eq``, and ``select``. Loads and stores take a 1-D contiguous
-float32 array, or a pointer to one, and the index of the first lane; bounds are not checked.
+Numba's loop vectoriser does not vectorise the splatting loops (aliasing, masks). LLVM lowers ``<16 x float>`` to one
+AVX-512, two AVX or four SSE/NEON registers. Loads and stores take a contiguous float32 array or a pointer, and the
+index of the first lane; bounds are not checked.
 """
 
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable
 
 from llvmlite import ir
 from numba import float32, types
@@ -20,8 +15,6 @@ from numba.core import cgutils
 from numba.core.typing.templates import AbstractTemplate, infer_global
 from numba.core.typing.templates import signature as typing_signature
 from numba.extending import intrinsic, lower_builtin, models, register_model
-
-from clod_adapter._kernels.pointers import data_of
 
 LANES = 16
 ZERO = float32(0)
@@ -34,7 +27,7 @@ def _vector_type(name: str, llvm: ir.Type) -> types.Type:
     """A type of values that LLVM keeps in registers."""
     kind = type(name, (types.Type,), {})
 
-    def of_type(self, dmm, fe_type):  # type: ignore[no-untyped-def]
+    def of_type(self, dmm, fe_type):
         models.PrimitiveModel.__init__(self, dmm, fe_type, llvm)
 
     register_model(kind)(type(f"{name}Model", (models.PrimitiveModel,), {"__init__": of_type}))
@@ -44,32 +37,35 @@ def _vector_type(name: str, llvm: ir.Type) -> types.Type:
 f32x16, mask16 = _vector_type("F32x16", VECTOR), _vector_type("Mask16", _mask)
 
 
-def call_llvm(builder, name, result, arguments):  # type: ignore[no-untyped-def]
-    function = cgutils.get_or_insert_function(
-        builder.module, ir.FunctionType(result, [a.type for a in arguments]), name
-    )
-    return builder.call(function, arguments)
+def data_of(context, builder, kind, value):
+    """The address of an array's elements; a pointer is returned unchanged."""
+    return value if isinstance(kind, types.CPointer) else context.make_array(kind)(context, builder, value).data
 
 
-def _pointer(context, builder, kind, value, index):  # type: ignore[no-untyped-def]
+def call_llvm(builder, name, result, arguments):
+    kind = ir.FunctionType(result, [a.type for a in arguments])
+    return builder.call(cgutils.get_or_insert_function(builder.module, kind, name), arguments)
+
+
+def _pointer(context, builder, kind, value, index):
     return builder.bitcast(builder.gep(data_of(context, builder, kind, value), [index]), VECTOR.as_pointer())
 
 
 @intrinsic
-def load(typingctx, array, index):  # type: ignore[no-untyped-def]
+def load(typingctx, array, index):
     """``array[index : index + 16]``."""
 
-    def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
+    def codegen(context, builder, signature, args):
         return builder.load(_pointer(context, builder, signature.args[0], args[0], args[1]), align=4)
 
     return f32x16(array, types.intp), codegen
 
 
 @intrinsic
-def store(typingctx, array, index, value):  # type: ignore[no-untyped-def]
+def store(typingctx, array, index, value):
     """``array[index : index + 16] = value``."""
 
-    def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
+    def codegen(context, builder, signature, args):
         pointer = _pointer(context, builder, signature.args[0], args[0], args[1])
         builder.store(args[2], pointer, align=4)
         return context.get_dummy_value()
@@ -77,7 +73,7 @@ def store(typingctx, array, index, value):  # type: ignore[no-untyped-def]
     return types.none(array, types.intp, f32x16), codegen
 
 
-def _spread(builder, value):  # type: ignore[no-untyped-def]
+def _spread(builder, value):
     """Sixteen copies of a float; a vector as it is."""
     if value.type == VECTOR:
         return value
@@ -85,46 +81,36 @@ def _spread(builder, value):  # type: ignore[no-untyped-def]
     return builder.shuffle_vector(one, ir.Constant(VECTOR, ir.Undefined), ir.Constant(INTEGERS, [0] * LANES))
 
 
-def _operators(name: str, *operators: Callable[..., object]) -> None:
-    """Defines operators of two vectors, or of a vector and a float32."""
-    pairs = (f32x16, f32x16), (f32x16, types.float32), (types.float32, f32x16)
+def _operators(name, kinds, flags, *operators):
+    """Defines operators of vectors: ``kinds`` are the arguments' types."""
 
     class Typing(AbstractTemplate):  # type: ignore[misc]
-        def generic(self, args, kws):  # type: ignore[no-untyped-def]
-            return typing_signature(f32x16, *args) if tuple(args) in pairs else None
+        def generic(self, args, kws):
+            return typing_signature(f32x16, *args) if tuple(args) in kinds else None
 
-    def lower(context, builder, signature, args):  # type: ignore[no-untyped-def]
-        return getattr(builder, name)(*(_spread(builder, arg) for arg in args), flags=("nsz", "contract"))
+    def lower(context, builder, signature, args):
+        return getattr(builder, name)(*(_spread(builder, arg) for arg in args), flags=flags)
 
     for each in operators:
         infer_global(each)(Typing)
-        for pair in pairs:
-            lower_builtin(each, *pair)(lower)
+        for kind in kinds:
+            lower_builtin(each, *kind)(lower)
 
 
 # Not ``overload``: inlining hundreds of operators takes numba minutes.
-_operators("fadd", operator.add, operator.iadd)
-_operators("fsub", operator.sub, operator.isub)
-_operators("fmul", operator.mul, operator.imul)
-_operators("fdiv", operator.truediv, operator.itruediv)
+_pairs, _loose = ((f32x16, f32x16), (f32x16, types.float32), (types.float32, f32x16)), ("nsz", "contract")
+_operators("fadd", _pairs, _loose, operator.add, operator.iadd)
+_operators("fsub", _pairs, _loose, operator.sub, operator.isub)
+_operators("fmul", _pairs, _loose, operator.mul, operator.imul)
+_operators("fdiv", _pairs, _loose, operator.truediv, operator.itruediv)
+_operators("fneg", ((f32x16,),), (), operator.neg)
 
 
-@infer_global(operator.neg)
-class _Negative(AbstractTemplate):  # type: ignore[misc]
-    def generic(self, args, kws):  # type: ignore[no-untyped-def]
-        return typing_signature(f32x16, f32x16) if tuple(args) == (f32x16,) else None
-
-
-@lower_builtin(operator.neg, f32x16)
-def _negative(context, builder, signature, args):  # type: ignore[no-untyped-def]
-    return builder.fneg(args[0])
-
-
-def operation(result, *kinds):  # type: ignore[no-untyped-def]
+def operation(result, *kinds):
     """Makes a function of a builder and one to three LLVM values an intrinsic from ``kinds`` to ``result``."""
 
-    def intrinsic_of(build):  # type: ignore[no-untyped-def]
-        def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
+    def intrinsic_of(build):
+        def codegen(context, builder, signature, args):
             return build(builder, *args)
 
         typed = result(*kinds), codegen
@@ -134,7 +120,7 @@ def operation(result, *kinds):  # type: ignore[no-untyped-def]
     return intrinsic_of
 
 
-def llvm_function(name, count):  # type: ignore[no-untyped-def]
+def llvm_function(name, count):
     """LLVM's intrinsic ``name`` of ``count`` vectors."""
     return operation(f32x16, *[f32x16] * count)(
         lambda builder, *args: call_llvm(builder, f"llvm.{name}.v16f32", VECTOR, args)
@@ -157,25 +143,25 @@ vmax = _extremum(lambda builder, a, b: builder.select(builder.fcmp_ordered(">", 
 
 
 @operation(mask16, mask16, mask16)
-def both(builder, a, b):  # type: ignore[no-untyped-def]
+def both(builder, a, b):
     """Lanes set in a and in b."""
     return builder.and_(a, b)
 
 
 @operation(mask16, mask16, mask16)
-def but_not(builder, a, b):  # type: ignore[no-untyped-def]
+def but_not(builder, a, b):
     """Lanes set in a and not in b."""
     return builder.and_(a, builder.xor(b, ir.Constant(_mask, [1] * LANES)))
 
 
 @operation(types.boolean, mask16)
-def anywhere(builder, mask):  # type: ignore[no-untyped-def]
+def anywhere(builder, mask):
     """Whether any lane is set."""
     bits = builder.bitcast(mask, ir.IntType(LANES))
     return builder.icmp_unsigned("!=", bits, ir.Constant(ir.IntType(LANES), 0))
 
 
 @operation(f32x16, mask16, f32x16, f32x16)
-def select(builder, mask, a, b):  # type: ignore[no-untyped-def]
+def select(builder, mask, a, b):
     """a where the mask is set, b elsewhere."""
     return builder.select(mask, a, b)

@@ -25,7 +25,7 @@ def stride(width: int) -> int:
 
 
 @kernel
-def to_planes(worker, workers, image, target, x, y):  # type: ignore[no-untyped-def]
+def to_planes(worker, workers, image, target, x, y):
     """Copies two ``[H, W, 3]`` images into planes; the uint8 ``target`` is scaled to [0, 1]."""
     height, width = image.shape[0], image.shape[1]
     for row in range(height * worker // workers, height * (worker + 1) // workers):
@@ -36,7 +36,7 @@ def to_planes(worker, workers, image, target, x, y):  # type: ignore[no-untyped-
 
 
 @part
-def blur_row(lines, line, length):  # type: ignore[no-untyped-def]
+def blur_row(lines, line, length):
     """Horizontal blur of 16 columns from ``line`` of a row buffer."""
     out = splat(float32(0))
     for tap in range(11):
@@ -45,7 +45,7 @@ def blur_row(lines, line, length):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def ssim_map(worker, workers, x, y, width, similarity, g_mean, g_square, g_product, sums):  # type: ignore[no-untyped-def]
+def ssim_map(worker, workers, x, y, width, similarity, g_mean, g_square, g_product, sums):
     """SSIM of each pixel into ``similarity``, and its derivatives by the blurred x, x^2 and x y.
 
     The planes are flat. ``sums[worker]`` receives the sum of SSIM over the image's pixels.
@@ -94,7 +94,7 @@ def ssim_map(worker, workers, x, y, width, similarity, g_mean, g_square, g_produ
 
 
 @kernel
-def loss_gradient(worker, workers, x, y, width, g_mean, g_square, g_product, l1, dssim, v_image, sums):  # type: ignore[no-untyped-def]
+def loss_gradient(worker, workers, x, y, width, g_mean, g_square, g_product, l1, dssim, v_image, sums):
     """Gradient of ``l1 sum |x - y| - dssim sum SSIM`` by x, as ``[H, W, 3]``; ``sums[worker]``: sum of |x - y|."""
     channels, height, step = x.shape
     x, y = x.reshape(-1), y.reshape(-1)

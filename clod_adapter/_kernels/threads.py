@@ -47,11 +47,7 @@ def torch_on_one_thread() -> Iterator[None]:
 
 
 def run(kernel: Callable[..., Any], workers: int, *arguments: Any) -> None:
-    """Calls ``kernel(worker, workers, *arguments)`` for each worker and waits for all of them.
-
-    Raises:
-        MemoryError: a thread cannot be started.
-    """
+    """Calls ``kernel(worker, workers, *arguments)`` for each worker and waits for all of them."""
     if workers == 1:
         kernel(0, 1, *arguments)
         return

@@ -13,13 +13,13 @@ from clod_adapter._kernels.pointers import pointer, prefetch
 
 
 @part
-def within(value, otherwise, low, high):  # type: ignore[no-untyped-def]
+def within(value, otherwise, low, high):
     """``value`` clamped and cast to int32, ``otherwise`` for NaN: an ellipse may extend over 1e10 pixels."""
     return np.int32(otherwise if value != value else min(max(value, low), high))
 
 
 @part
-def extent(records, r, first, last):  # type: ignore[no-untyped-def]
+def extent(records, r, first, last):
     """Columns the ellipse of the record at ``r`` covers between the pixel rows ``first`` and ``last``.
 
     The ellipse is where alpha reaches 1/255. Between two rows it is widest at its own leftmost and
@@ -42,7 +42,7 @@ def extent(records, r, first, last):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def depth_order(depths, counts, keys, order, keys_other, order_other):  # type: ignore[no-untyped-def]
+def depth_order(depths, counts, keys, order, keys_other, order_other):
     """The packed records, near ones first; equal ones stay in order. ``keys`` and ``order`` are scratch, twice.
 
     A radix sort of positive floats by their bits, 11 at a time.
@@ -74,7 +74,7 @@ def depth_order(depths, counts, keys, order, keys_other, order_other):  # type: 
 
 
 @part
-def tiles_across(records, r, ty, y0, y1):  # type: ignore[no-untyped-def]
+def tiles_across(records, r, ty, y0, y1):
     """First and last column of tiles that the record at ``r`` touches in the tile row ``ty``; none: last < first."""
     x0, x1 = np.int32(records[r + c.X0]), np.int32(records[r + c.X1])
     if y0 // c.TILE == y1 // c.TILE and x0 // c.TILE == x1 // c.TILE:
@@ -84,7 +84,7 @@ def tiles_across(records, r, ty, y0, y1):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def count_tiles(worker, workers, records, order, across, histogram, totals):  # type: ignore[no-untyped-def]
+def count_tiles(worker, workers, records, order, across, histogram, totals):
     """Counts this worker's Gaussians per tile (its row of the histogram) and pairs of Gaussian and tile (its total)."""
     histogram[worker, :] = 0
     first, last = len(order) * worker // workers, len(order) * (worker + 1) // workers
@@ -103,7 +103,7 @@ def count_tiles(worker, workers, records, order, across, histogram, totals):  # 
 
 
 @kernel
-def tile_offsets(histogram, offsets, totals):  # type: ignore[no-untyped-def]
+def tile_offsets(histogram, offsets, totals):
     """Turns the counts into offsets; returns the number of entries."""
     total = 0
     for tile in range(histogram.shape[1]):
@@ -118,7 +118,7 @@ def tile_offsets(histogram, offsets, totals):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def fill_tiles(worker, workers, records, order, across, histogram, totals, slots, entries, entry_slots):  # type: ignore[no-untyped-def]
+def fill_tiles(worker, workers, records, order, across, histogram, totals, slots, entries, entry_slots):
     """Writes each tile's Gaussians in depth order, with the slot that receives the pair's gradient.
 
     ``slots[2 p]`` to ``slots[2 p + 1]`` are the slots of the record p.

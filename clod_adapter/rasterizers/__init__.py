@@ -30,11 +30,7 @@ BACKENDS: dict[str, Callable[[], Rasterizer]] = {"cpu": _cpu, "cuda": _cuda}
 
 
 def for_device(device: torch.device) -> Rasterizer:
-    """The rasterizer for tensors on ``device``, imported on first use.
-
-    Raises:
-        ClodError: there is none for that kind of device, or gsplat is not installed or does not work.
-    """
+    """The rasterizer for tensors on ``device``, imported on first use; ClodError where there is none that works."""
     if device.type not in BACKENDS:
         raise ClodError(f"no rasterizer for device {device}: move the Gaussians to the CPU with .to('cpu')")
     return BACKENDS[device.type]()

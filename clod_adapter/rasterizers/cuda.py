@@ -1,12 +1,9 @@
 """Splatting on an NVIDIA GPU by the kernels of gsplat 1.4.0 to 1.6.0, restricted to the rows that are drawn.
 
-gsplat's projection tests the opacity last, after all other work on a row, and packed mode does that work twice. Rows
-below 1/255, such as culled ones, are therefore removed first: only their opacity (4 bytes) is read. The geometry of the
-other rows (40 bytes) is gathered once and projected in packed mode. Spherical harmonics (up to 300 bytes) are gathered
-only for rows that the projection finds in the image; unpacked, gsplat would need them for every row.
-
-The backward pass writes each gathered row to one place, without additions; gradients of removed rows are 0. gsplat sums
-over pixels in no fixed order, so results repeat except for rounding.
+gsplat's projection tests the opacity last, after all other work on a row, and packed mode does that work twice. So rows
+below 1/255, such as culled ones, are removed first; the geometry of the others is gathered once and projected in packed
+mode, and spherical harmonics (up to 300 bytes a row) only of rows that the projection finds in the image. Gradients of
+removed rows are 0. gsplat sums over pixels in no fixed order, so results repeat except for rounding.
 """
 
 from __future__ import annotations
@@ -68,11 +65,7 @@ def rasterize(
     means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh0: Tensor, shN: Tensor, camera: Camera,
     background: Tensor, screen_filter: ScreenFilter = CLASSIC,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """See ``clod_adapter.rasterizers.Splat``.
-
-    Raises:
-        ClodError: a tensor is not float32.
-    """
+    """See ``clod_adapter.rasterizers.Splat``; of float32 tensors alone."""
     given = {
         "means": means, "quats": quats, "scales": scales, "opacities": opacities, "sh0": sh0, "shN": shN,
         "background": background,

@@ -21,22 +21,12 @@ __all__ = ["ALPHA_MAX", "ALPHA_MIN", "T_MIN", "Rasterizer", "Splat", "drawable",
 
 
 class Splat(Protocol):
-    """Splats activated Gaussians into one camera.
+    """Splats activated Gaussians into one camera, on ``background [3]``, differentiably in every tensor argument.
 
-    Args:
-        means: ``[N, 3]`` world units.
-        quats: ``[N, 4]`` wxyz, any length from QUAT_MIN to QUAT_MAX.
-        scales: ``[N, 3]`` standard deviations, world units.
-        opacities: ``[N]`` in [0, 1]; rows below 1/255 are skipped before any other work.
-        sh0: ``[N, 1, 3]``; shN: ``[N, K-1, 3]``.
-        camera: the viewpoint; gets no gradient.
-        background: ``[3]``.
-        screen_filter: variance added to the projected covariances, and whether opacities are compensated for it; rows
-            whose compensated opacity is below 1/255 are skipped.
-
-    Returns:
-        The image ``[H, W, 3]``, not clamped, and the accumulated alpha ``[H, W]``; both
-        differentiable in every tensor argument.
+    ``means [N, 3]`` and the standard deviations ``scales [N, 3]`` are in world units, ``quats [N, 4]`` wxyz of any
+    length from QUAT_MIN to QUAT_MAX, ``sh0 [N, 1, 3]``, ``shN [N, K-1, 3]``. Rows whose ``opacities [N]``, compensated
+    by the ``screen_filter``, are below 1/255 are skipped. Returns the image ``[H, W, 3]``, not clamped, and the
+    accumulated alpha ``[H, W]``.
     """
 
     def __call__(
@@ -49,11 +39,8 @@ class Splat(Protocol):
 class Rasterizer:
     """What makes a picture of Gaussians at a dial value. Whatever renders, trains or measures pictures calls ``draw``.
 
-    The dial is composed with ``splat``. A subclass may have kernels with the dial in them instead, which then give the
-    same to rounding.
-
-    Attributes:
-        splat: draws activated Gaussians, without a dial.
+    The dial is composed with ``splat``. A subclass may have kernels with the dial in them, which give the same to
+    rounding.
     """
 
     splat: Splat
@@ -69,9 +56,6 @@ class Rasterizer:
             background: ``[3]``; black by default.
             seen_from: the camera of the dial's distances, where it is not ``camera``.
             trained: how many rows, the first ones, need gradients; those of others may be 0.
-
-        Raises:
-            ClodError: the dial is negative or not finite, or the background has the wrong shape.
         """
         dialled, g = dial(gaussians, seen_from or camera, virtual_scale), gaussians
         return self.splat(
