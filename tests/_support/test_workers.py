@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 import time
 from functools import partial
-from typing import Any
 
 import pytest
 import torch
@@ -33,13 +32,8 @@ def test_an_error_is_raised_after_started_calls_end() -> None:
         time.sleep(0.05)
         done.append(number)
 
-    def calls() -> Any:
-        for number in range(100):
-            asked.append(number)
-            yield partial(call, number)
-
     with pytest.raises(ValueError, match="one"):
-        list(in_order(calls(), 2))
+        list(in_order((asked.append(k) or partial(call, k) for k in range(100)), 2))
     assert set(done) <= set(asked) - {1} and len(asked) < 10
     count = len(done)
     time.sleep(0.1)

@@ -8,7 +8,6 @@ import torch
 from clod_adapter.cameras import Camera
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.equation.distances import normalized_distances, normalizing_distance, typical_distance, viewpoint_of
-from exact import config
 from scenes import camera, gaussians, ring
 
 CONFIG = AttenuationConfig(scene_distance=4.0)
@@ -54,13 +53,13 @@ def test_distances_are_divided_by_the_configured_normalizer() -> None:
         ("quantile", {"quantile": 1.0}, 10.0),
         ("quantile", {"quantile": 1e-9}, 1.0),
     ]:
-        chosen = config(normalizer=kind, **other)
+        chosen = AttenuationConfig(normalizer=kind, **other)
         assert normalizing_distance(distances, means, camera, chosen).item() == want
         torch.testing.assert_close(normalized_distances(means, camera, chosen), distances / want)
         found = normalized_distances(camera.position[None].requires_grad_(), camera, chosen)
         assert found.tolist() == [0.0] and not found.requires_grad
         assert normalized_distances(torch.empty(0, 3), camera, chosen).shape == (0,)
-    largest = config(normalizer="max")
+    largest = AttenuationConfig(normalizer="max")
     assert normalizing_distance(distances[10:12], means[10:12], camera, largest).item() == 50.0
     for x, y, inside in [(-0.49, 0, True), (-0.51, 0, False), (0.49, 0, True), (0.51, 0, False), (0, 0.41, False)]:
         pair = torch.tensor([[0.0, 0.0, -1.0], [x, y, -1.0]])

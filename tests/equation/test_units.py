@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 
 from clod_adapter.adapter import with_dial
 from clod_adapter.config import AttenuationConfig
-from clod_adapter.equation.attenuation import SIGMA_MAX, attenuate
-from clod_adapter.equation.distances import normalized_distances
+from clod_adapter.equation.attenuation import SIGMA_MAX, dial
 from clod_adapter.equation.units import (
     estimated_distance,
     in_world_units,
@@ -31,22 +30,23 @@ def dialled(n: int = 400, **config: float | str) -> Gaussians:
 
 
 @settings(deadline=None, max_examples=30)
-@given(st.floats(1e-3, 1e4), st.sampled_from([0.0, 1e-8, 0.3]), st.floats(1, 20))
-def test_changing_the_unit_keeps_the_dial(distance: float, eps: float, s: float) -> None:
-    some = dialled(eps=eps, max_sv=20.0)
-    some = some.replace(sigma_d=some.sigma_d.double(), means=some.means.double())
+@given(
+    st.floats(1e-3, 1e4), st.sampled_from([0.0, 1e-8, 0.3]), st.floats(1, 20),
+    st.sampled_from(["scene", "max", "quantile"]), st.sampled_from([0.0, 2.5]),
+)  # fmt: skip
+def test_changing_the_unit_keeps_the_dial(distance: float, eps: float, s: float, normalizer: str, known: float) -> None:
+    some = dialled(eps=eps, max_sv=20.0, normalizer=normalizer, reference_distance=known)
+    some = some.replace(sigma_d=some.sigma_d.double(), means=some.means.double(), growth_d=torch.linspace(-1, 3, 400))
     other = with_distance(some, distance)
     assert other.attenuation is not None and other.attenuation.scene_distance == distance
-    assert known_distance(other.attenuation) == 3.7
-    found = []
-    for each in (some, other):
-        assert each.sigma_d is not None and each.attenuation is not None
-        d = normalized_distances(each.means, camera(), each.attenuation)
-        found.append(attenuate(each.opacity_logits, each.sigma_d, d, s, each.attenuation).log_opacities)
+    assert known_distance(other.attenuation) == (known or 3.7)
+    found, want = (dial(each, camera(), s) for each in (other, some))
     # Where the unit grows a little, eps alone may fade less than a tiny sigma did: sigma' would have to be imaginary.
     possible = other.sigma_d > 0
     assert eps > 1e-6 or possible[some.sigma_d > 0.01].all()
-    torch.testing.assert_close(found[1][possible], found[0][possible], rtol=1e-6, atol=1e-9)
+    torch.testing.assert_close(found.log_opacities[possible], want.log_opacities[possible], rtol=1e-6, atol=1e-9)
+    torch.testing.assert_close(found.growth, want.growth, rtol=1e-5, atol=0)
+    assert torch.equal(in_world_units(other).sigma_d, other.sigma_d) == (normalizer != "scene" or distance == 1)
 
 
 def test_special_values_and_other_normalizers_keep_sigma() -> None:
@@ -57,11 +57,6 @@ def test_special_values_and_other_normalizers_keep_sigma() -> None:
     assert there.sigma_d[3].item() == pytest.approx(16.0)
     assert in_world_units(there) is there and in_world_units(gaussians(4, 0, 0)).attenuation is None
     assert there.attenuation == AttenuationConfig(reference_distance=8.0)
-    for normalizer in ("max", "quantile"):
-        some = dialled(normalizer=normalizer)
-        there = in_world_units(some)
-        assert torch.equal(there.sigma_d, some.sigma_d) and there.attenuation is not None
-        assert (there.attenuation.scene_distance, there.attenuation.reference_distance) == (1.0, 3.7)
 
 
 def test_nominal_distance_is_that_of_the_training_views() -> None:

@@ -20,7 +20,7 @@ from backends import fresh_copy
 from clod_adapter.config import FILTERS
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.checkpoint import Checkpoint
-from clod_adapter.rasterizers import Rasterizer, cpu, reference
+from clod_adapter.rasterizers import Rasterizer, reference
 from clod_adapter.render import render
 
 DIAL = 3.0
@@ -28,10 +28,6 @@ VIEW = scenes.camera(48, 32, off_centre=(0.5, 0.5))  # Inria's settings have no 
 KIT = Path(__file__).parents[2] / "viewers" / "kit"
 
 Draw = Callable[[Checkpoint, pytest.MonkeyPatch], Tensor]
-
-
-def through_cpu(checkpoint: Checkpoint, monkeypatch: pytest.MonkeyPatch) -> Tensor:
-    return render(checkpoint.gaussians, VIEW, DIAL, rasterizer=Rasterizer(cpu.rasterize)).image
 
 
 def through_gsplat(checkpoint: Checkpoint, monkeypatch: pytest.MonkeyPatch) -> Tensor:
@@ -78,15 +74,7 @@ def through_hook(checkpoint: Checkpoint, monkeypatch: pytest.MonkeyPatch) -> Ten
     return render(plain[keep], VIEW, rasterizer=Rasterizer(reference.rasterize)).image
 
 
-def through_baked_file(checkpoint: Checkpoint, monkeypatch: pytest.MonkeyPatch) -> Tensor:
-    baked, path = clod.bake(checkpoint.gaussians, DIAL, VIEW), checkpoint.path.with_name("baked.ply")
-    clod.save(path, baked)
-    plain = clod.load(path).gaussians
-    assert plain.sigma_d is plain.growth_d is None and len(plain) < len(checkpoint.gaussians)
-    return render(plain, VIEW).image
-
-
-PATHS: tuple[Draw, ...] = (through_cpu, through_gsplat, through_inria, through_hook, through_baked_file)
+PATHS: tuple[Draw, ...] = (through_gsplat, through_inria, through_hook)
 
 
 def adapted() -> Gaussians:

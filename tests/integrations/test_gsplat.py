@@ -19,7 +19,6 @@ import gsplat_versions
 from clod_adapter.cameras import Camera
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.equation.attenuation import attenuate
-from clod_adapter.errors import ClodError
 from scenes import camera, ring, scene
 
 N, WIDTH, HEIGHT = 40, 40, 28
@@ -184,16 +183,3 @@ def test_memory_is_released(tools: SimpleNamespace, sigma_d: Tensor) -> None:
             assert points() is None
     finally:
         gc.enable()
-
-
-def test_bad_arguments_are_refused(tools: SimpleNamespace, sigma_d: Tensor) -> None:
-    given, views = arguments(2, device=tools.device)
-    for dial, message in (
-        ({"distributed": True, "sigma_d": sigma_d}, "distributed=True shares one opacity"),
-        ({"sigma_d": sigma_d[1:]}, r"sigma_d is \(39,\) and opacities \(40,\)"),
-        ({"sigma_d": sigma_d, "growth_d": sigma_d[1:], "attenuation": WHOLE}, r"growth_d is \(39,\) and"),
-    ):
-        with pytest.raises(ClodError, match=message):
-            tools.ours(**given, **views, **dial)
-    with pytest.raises(TypeError, match="missing a required argument: 'viewmats'"):
-        tools.ours(*given.values(), sigma_d=sigma_d)

@@ -71,12 +71,8 @@ def configured(method: Any, folder: Path, load_dir: Path) -> Any:
     """What ``ns-train clod-splatfacto --load-dir ...`` makes, in world coordinates and with a short training."""
     config = copy.deepcopy(method.config)
     parser = config.pipeline.datamanager.dataparser
-    parser.data, parser.orientation_method, parser.center_method, parser.auto_scale_poses = (
-        folder,
-        "none",
-        "none",
-        False,
-    )
+    parser.data, parser.auto_scale_poses = folder, False
+    parser.orientation_method = parser.center_method = "none"
     model = config.pipeline.model
     model.random_init, model.num_random, model.sh_degree = True, 10, 1
     model.background_color = "black"
@@ -155,11 +151,9 @@ def test_a_dial_is_trained_and_found_by_the_other_commands(
     monkeypatch.setenv("CLOD_VIRTUAL_SCALE", "3")
     pipeline = eval_setup(written, test_mode="test")[1]
     assert [element.name for _, element in parse_object(pipeline, ViewerElement, "Custom Elements")] == ["Dial s"]
-    scene = dict(
-        zip((path.name for path in pipeline.datamanager.train_dataset.image_filenames), range(99), strict=False)
-    )
-    view = next(view for view in scenes.ring(8, WIDTH, HEIGHT) if view.name in scene)
-    camera = pipeline.datamanager.train_dataset.cameras[scene[view.name] : scene[view.name] + 1]
+    dataset = pipeline.datamanager.train_dataset
+    view = next(view for view in scenes.ring(8, WIDTH, HEIGHT) if view.name == dataset.image_filenames[0].name)
+    camera = dataset.cameras[:1]
     for dial in (3.0, 1.0):
         pipeline.model.slider.default_value = dial
         image = pipeline.model.get_outputs_for_camera(camera)["rgb"]

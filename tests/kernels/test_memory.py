@@ -29,7 +29,7 @@ def nothing_idle() -> Iterator[None]:
 
 
 def test_shapes_and_alignment() -> None:
-    for shape in [(), (0,), (100_000, 0, 3), (5,), (16_383,), (16_384,), (16_385,), SHAPE, torch.Size((9, 9999))] * 3:
+    for shape in [(), (100_000, 0, 3), (16_383,), (16_384,), torch.Size((9, 9999))] * 3:
         tensor = recycled(shape)
         assert tensor.shape == shape and tensor.dtype == torch.float32 and tensor.is_contiguous()
         for dtype in (np.float32, np.int32, np.uint64):
@@ -39,23 +39,13 @@ def test_shapes_and_alignment() -> None:
         tensor.fill_(1)
 
 
-def grad_of(tensor: Tensor) -> Tensor:
-    leaf = torch.zeros(SHAPE, requires_grad=True)
-    leaf.grad = tensor
-    return leaf
-
-
 HOLDERS: dict[str, Callable[[Tensor], Any]] = {
-    "tensor": lambda t: t,
     "slice": lambda t: t[5:, 3],
-    "parameter": lambda t: torch.nn.Parameter(t),
     "storage": lambda t: t.untyped_storage(),
     "numpy view of a view": lambda t: t[7:].numpy()[1:].reshape(-1)[5:],
     "other type": lambda t: t.numpy().reshape(-1).view(np.uint64)[2:],
-    "memoryview": lambda t: memoryview(t.numpy()),
     "dlpack": lambda t: torch.from_dlpack(t),
     "graph": lambda t: t.clone().requires_grad_() * t,
-    "gradient": grad_of,
 }
 
 

@@ -1,14 +1,12 @@
-"""Fixtures of every rasterizer, and of the number of threads."""
+"""The fixture of every rasterizer."""
 
 from __future__ import annotations
-
-from collections.abc import Iterator
 
 import pytest
 import torch
 
 import gsplat_in_torch
-from backends import BACKENDS, Backend, torch_threads
+from backends import BACKENDS, Backend
 
 
 @pytest.fixture(params=BACKENDS)
@@ -21,9 +19,3 @@ def rasterize(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -
         elif not torch.cuda.is_available():
             pytest.skip("no CUDA device")
     return backend
-
-
-@pytest.fixture(params=[1, 2])
-def one_or_two_threads(request: pytest.FixtureRequest) -> Iterator[None]:
-    with torch_threads(request.param):
-        yield

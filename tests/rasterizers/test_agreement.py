@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import time
 from typing import Any
 
 import pytest
 import torch
 
-from backends import Backend
+from backends import torch_threads
 from clod_adapter.cameras import Camera
 from clod_adapter.config import FILTERS, ScreenFilter
 from clod_adapter.rasterizers import Splat
-from oracle import BACKGROUND, IMAGE, ON_A_CUT, assert_agrees, differentiate, weights
+from oracle import BACKGROUND, IMAGE, ON_A_CUT, assert_agrees
 from scenes import camera, in_front, scene
 
 # Neither multiples of 4 nor of a tile, but one; principal points on either side.
@@ -30,35 +29,28 @@ def test_random_scenes(rasterize: Splat, degree: int) -> None:
 
 
 @pytest.mark.parametrize("n", [1, 15, 16, 17, 33])
-@pytest.mark.usefixtures("one_or_two_threads")
 def test_counts_around_sixteen(rasterize: Splat, n: int) -> None:
     """The kernels take sixteen Gaussians at a time; here all are in the image."""
     view, some = camera(), scene(n, 3, n, size=0.15)
     z = 2 + 2 * torch.rand(n, 1)
     some["means"] = in_front(view, torch.cat([(torch.rand(n, 2) - 0.5) * torch.tensor([0.9, 0.7]) * z, z], 1))
     some["opacities"] = 0.1 + 0.3 * torch.rand(n)
-    assert_agrees(rasterize, some, view)
+    with torch_threads(2):
+        assert_agrees(rasterize, some, view)
 
 
-@pytest.mark.parametrize(
-    "view",
-    [
-        *({"width": w, "height": h} for w, h in [(130, 50), (1, 1), (3, 200), (200, 3), (33, 1)]),
-        {"fov": 5.0}, {"fov": 150.0}, {"off_centre": (1.3, -0.2)},
-    ],
-    ids=lambda view: " ".join(map(str, view.values())),
-)  # fmt: skip
-def test_cameras(rasterize: Splat, view: dict[str, Any]) -> None:
-    """Image sizes; narrow and wide lenses; the principal point outside the image.
-
-    With the wide lens, centres are far outside the image, where the Jacobian's ray is clamped.
-    """
-    cut = 0.05 if "width" in view else ON_A_CUT
-    some = scene(120, 1, 7, size=0.3 if "width" in view else 0.2)
-    assert_agrees(rasterize, some, camera(**{"width": 50, "height": 40} | view), cut=cut)
+@pytest.mark.parametrize(("width", "height"), [(130, 50), (1, 1), (3, 200), (200, 3)])
+def test_sizes(rasterize: Splat, width: int, height: int) -> None:
+    assert_agrees(rasterize, scene(120, 1, 7, size=0.3), camera(width, height), cut=0.05)
 
 
-@pytest.mark.parametrize("near", [1e-6, 0.01, 3.0])
+@pytest.mark.parametrize("view", [{"fov": 5.0}, {"fov": 150.0}, {"off_centre": (1.3, -0.2)}])
+def test_lenses(rasterize: Splat, view: dict[str, Any]) -> None:
+    """With the wide one, centres are far outside the image, where the Jacobian's ray is clamped."""
+    assert_agrees(rasterize, scene(120, 1, 7, size=0.2), camera(50, 40, **view))
+
+
+@pytest.mark.parametrize("near", [1e-6, 3.0])
 def test_near_the_camera_plane(rasterize: Splat, near: float) -> None:
     """Centres just before, on and just beyond the near plane; those before it are not drawn."""
     view, unit = camera(40, 30), near / 0.01
@@ -75,10 +67,9 @@ def test_near_the_camera_plane(rasterize: Splat, near: float) -> None:
     assert_agrees(rasterize, some, view, rows=depths >= near)
 
 
-@pytest.mark.parametrize("opacity", [0.0, 1 / 255 * 0.999, 0.9995, 1.0])
-def test_opacity_of_a_few(rasterize: Splat, opacity: float) -> None:
+def test_opacities_at_their_limits(rasterize: Splat) -> None:
     some = scene(120, 1, 1, size=0.15)
-    some["opacities"][::3] = opacity
+    some["opacities"][::3] = torch.tensor([0.0, 1 / 255 * 0.999, 0.9995, 1.0]).repeat(10)
     assert_agrees(rasterize, some, camera(), rows=some["opacities"] >= 1 / 255)
 
 
@@ -96,18 +87,15 @@ def test_opaque_layers(rasterize: Splat, saturated: bool) -> None:
     ids=["needle", "short", "disc"],
 )
 def test_axis_ratio_of_a_million(rasterize: Splat, scales: tuple[float, float, float], seed: int) -> None:
-    """Bounds of a needle are wider: its exponent is a small difference of terms of up to ``61^2 / (2 x 0.3) = 6,200``.
-
-    Each is rounded by ``2^-24`` of itself in float32, in all by about 1e-3. Processors round differently: 40 seeds
-    reach 4.7e-4 in the image and 3e-3 in the gradients on one of them.
-    """
+    """Bounds of a needle are wider: its exponent is a small difference of terms of up to ``61^2 / (2 x 0.3) = 6,200``,
+    each rounded by ``2^-24`` of itself in float32, in all by about 1e-3."""
     some = scene(80, 1, seed)
     some["scales"] = torch.tensor(scales).repeat(80, 1)
     wider = {} if scales[1] > 1e-3 else {"image": 1e-3, "gradient": 1e-2}
     assert_agrees(rasterize, some, camera(), **wider)
 
 
-@pytest.mark.parametrize(("axes", "length"), [(1, 1e-8), (3, 0.0), (1, 1e2), (3, 1e3), (1, 1e4)])
+@pytest.mark.parametrize(("axes", "length"), [(1, 1e-8), (3, 0.0), (3, 1e3), (1, 1e4)])
 def test_extreme_scales(rasterize: Splat, axes: int, length: float) -> None:
     """With quaternions of any length."""
     if axes == 1 and length >= 100 and getattr(rasterize, "looser", 1.0) > 1:
@@ -119,24 +107,20 @@ def test_extreme_scales(rasterize: Splat, axes: int, length: float) -> None:
     assert_agrees(rasterize, some, camera(), image=IMAGE if axes == 3 or length < 1 else 1e-4)
 
 
-def test_thousands_in_one_tile(rasterize: Backend) -> None:
+def test_thousands_in_one_tile(rasterize: Splat) -> None:
     """20,000 faint Gaussians before 5x4 pixels, some of which end early."""
     some = scene(20_000, 1, 2, size=0.02)
     some["means"] *= 0.5
     some["opacities"] = some["opacities"] * 0.02 + 1 / 255
     # So many alphas per pixel that a cut is nearby in most: look closer.
     assert_agrees(rasterize, some, camera(5, 4), cut=0.1, nudge=1e-5)
-    if not rasterize.stands_in:  # for the kernels, whose pace torch does not have
-        began, view = time.perf_counter(), camera(30, 28)
-        differentiate(rasterize, some, view, weights(view))
-        assert time.perf_counter() - began < 5  # measured: 0.03 s
 
 
 @pytest.mark.parametrize(
     ("scales", "screen_filter"),
     [
-        (0.005, FILTERS["on"]), (0.02, FILTERS["mip"]), (0.2, FILTERS["on"]), (0.02, ScreenFilter(variance=2.0)),
-        ((1.0, 1e-6, 1e-6), FILTERS["on"]), ((0.3, 4e-3, 4e-3), FILTERS["on"]), ((0.3, 0.3, 3e-7), FILTERS["on"]),
+        (0.005, FILTERS["on"]), (0.02, FILTERS["mip"]), (0.02, ScreenFilter(variance=2.0)),
+        ((1.0, 1e-6, 1e-6), FILTERS["on"]), ((0.3, 0.3, 3e-7), FILTERS["on"]),
     ],
     ids=str,
 )  # fmt: skip
@@ -153,9 +137,9 @@ def test_screen_filters(rasterize: Splat, scales: Any, screen_filter: ScreenFilt
     assert_agrees(rasterize, some, view, screen_filter=screen_filter, image=image, cut=cut)
 
 
-@pytest.mark.parametrize("far", [1e4, 1e8])
-def test_an_ellipse_beyond_the_range_of_integers(rasterize: Splat, far: float) -> None:
-    """The centre is up to 1e12 pixels away, the long axis crosses the image; all pixels are finite and in range."""
+def test_an_ellipse_beyond_the_range_of_integers(rasterize: Splat) -> None:
+    """The centre is 1e12 pixels away, the long axis crosses the image; all pixels are finite and in range."""
+    far = 1e8
     view = Camera(torch.eye(4), torch.tensor([[100.0, 0, 64], [0, 100.0, 64], [0, 0, 1]]), 128, 128)
     some = scene(20, 0, 0)
     some["means"][:, 2] += 4

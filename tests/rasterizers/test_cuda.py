@@ -79,9 +79,8 @@ def kernel(name: str, version: str, given: dict[str, Any]) -> Any:
     return kernels.rasterize_to_pixels(*list(given.values())[:9], **dict(list(given.items())[9:]))
 
 
-@pytest.mark.parametrize("screen_filter", FILTERS)
 @pytest.mark.parametrize("version", gsplat_versions.signatures())
-def test_every_version_draws_the_same(monkeypatch: pytest.MonkeyPatch, version: str, screen_filter: str) -> None:
+def test_every_version_draws_the_same(monkeypatch: pytest.MonkeyPatch, version: str) -> None:
     """Image and gradients; without opacities in the projection, as in 1.4.0, splats end a tenth nearer."""
     pytest.importorskip("gsplat", minversion="1.5.3", reason="pip install gsplat==1.5.3")
     pytest.importorskip("gsplat.cuda._torch_impl")
@@ -90,7 +89,7 @@ def test_every_version_draws_the_same(monkeypatch: pytest.MonkeyPatch, version: 
         some = {name: x.double().requires_grad_() for name, x in scene(120, 2, 3).items()}
         background = torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64)
         image, alpha = cuda.rasterize(
-            **some, camera=camera(40, 30), background=background, screen_filter=FILTERS[screen_filter]
+            **some, camera=camera(40, 30), background=background, screen_filter=FILTERS["mip"]
         )
         image.square().mean().backward()
         return [image.detach(), alpha.detach(), *(x.grad for x in some.values() if x.grad is not None)]

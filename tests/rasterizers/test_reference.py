@@ -11,11 +11,9 @@ import torch
 from torch import Tensor
 
 from clod_adapter.cameras import Camera
-from clod_adapter.config import FILTERS, ScreenFilter
+from clod_adapter.config import ScreenFilter
 from clod_adapter.rasterizers import reference
-from scenes import camera, in_front, scene
-
-BLACK = torch.zeros(3, dtype=torch.float64)
+from scenes import camera, in_front
 
 
 def pixels_of(view: Camera, points: Tensor) -> Tensor:
@@ -24,21 +22,16 @@ def pixels_of(view: Camera, points: Tensor) -> Tensor:
     return focal * points[:, :2] / points[:, 2:] + view.K[:2, 2].double()
 
 
-def one(view: Camera, **changes: Tensor) -> dict[str, Tensor]:
-    """A white, isotropic Gaussian before the camera."""
-    values = {
-        "means": in_front(view, torch.tensor([[0.1, -0.05, 2.5]])), "quats": torch.tensor([[1.0, 0, 0, 0]]),
-        "scales": torch.full((1, 3), 0.2), "opacities": torch.tensor([0.8]), "sh0": torch.zeros(1, 1, 3),
-        "shN": torch.zeros(1, 0, 3),
-    }  # fmt: skip
-    return {name: value.double() for name, value in (values | changes).items()}
-
-
 def test_one_gaussian_matches_its_closed_form() -> None:
     """On the optical axis: variance (f s / z)^2 + 0.3 along x and y, peak at the projected centre, grey 0.5."""
     view = camera(41, 31)
     focal = view.K.double().diagonal()[:2]
-    some = one(view, means=in_front(view, torch.tensor([[0.0, 0.0, 2.5]])))
+    some = {
+        "means": in_front(view, torch.tensor([[0.0, 0.0, 2.5]])), "quats": torch.tensor([[1.0, 0, 0, 0]]),
+        "scales": torch.full((1, 3), 0.2), "opacities": torch.tensor([0.8]), "sh0": torch.zeros(1, 1, 3),
+        "shN": torch.zeros(1, 0, 3),
+    }  # fmt: skip
+    some = {name: value.double() for name, value in some.items()}
     behind = torch.tensor([0.3, 0.6, 0.9]).double()
     image, alpha = reference.rasterize(**some, camera=view, background=behind)
     variance = (focal * 0.2 / 2.5) ** 2 + 0.3
@@ -49,10 +42,9 @@ def test_one_gaussian_matches_its_closed_form() -> None:
     torch.testing.assert_close(image, 0.5 * alpha[..., None] + (1 - alpha)[..., None] * behind)
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_projection_matches_finite_differences(seed: int) -> None:
+def test_projection_matches_finite_differences() -> None:
     """``J W Sigma W^T J^T + variance``, J from finite differences of the pinhole, Sigma from a rotation matrix."""
-    g = torch.Generator().manual_seed(seed)
+    g = torch.Generator().manual_seed(0)
     view = camera(80, 60)
     points = torch.tensor([[0.3, 0.2, 2.0]]).double() + 0.3 * torch.randn(5, 3, generator=g).double()
     quats, scales = torch.randn(5, 4, generator=g).double(), torch.rand(5, 3, generator=g).double() + 0.01
@@ -70,13 +62,12 @@ def test_projection_matches_finite_differences(seed: int) -> None:
         sigma = rotation @ torch.diag(scale**2) @ rotation.T
         W = viewmat[:3, :3]
         want = jacobian @ W @ sigma @ W.T @ jacobian.T + 0.7 * torch.eye(2, dtype=torch.float64)
-        torch.testing.assert_close(found, want, rtol=1e-6, atol=1e-6, msg=lambda m: f"seed {seed}: {m}")
+        torch.testing.assert_close(found, want, rtol=1e-6, atol=1e-6)
 
 
-@pytest.mark.parametrize("seed", range(5))
-def test_blending_is_front_to_back(seed: int) -> None:
+def test_blending_is_front_to_back() -> None:
     """Compared with a loop over the list of each pixel."""
-    g = torch.Generator().manual_seed(seed)
+    g = torch.Generator().manual_seed(0)
     alphas = torch.rand(40, 30, generator=g).double() ** 2
     alphas[torch.rand(40, 30, generator=g) < 0.3] = 0
     alphas[::2] *= 0.2  # some pixels that do not end
@@ -89,7 +80,7 @@ def test_blending_is_front_to_back(seed: int) -> None:
             if t * (1 - a) <= 1e-4:
                 break
             want[i], t = a * t, t * (1 - a)
-        torch.testing.assert_close(weights[p].tolist(), want, msg=lambda m, p=p: f"seed {seed}, pixel {p}: {m}")
+        torch.testing.assert_close(weights[p].tolist(), want)
         assert through[p].item() == pytest.approx(t, abs=1e-12)
     assert (through < 1e-3).any() and (through > 1e-2).any()
 
@@ -109,20 +100,3 @@ def test_harmonics_match_mpmath() -> None:
             np.testing.assert_allclose(
                 found[:, degree * degree + degree + m], want, atol=1e-12, err_msg=f"l {degree}, m {m}"
             )
-
-
-@pytest.mark.parametrize(("degree", "name"), [(0, "off"), (2, "off"), (0, "on"), (1, "mip")])
-def test_gradients_match_finite_differences(degree: int, name: str) -> None:
-    """Autograd treats thresholds as constants, so the scene has no value near one."""
-    view = camera(6, 5)
-    some = {name: value.double() for name, value in scene(3, degree, 1).items()}
-    some["means"] = in_front(view, torch.tensor([[0.1, 0, 2.0], [-0.1, 0.1, 3.0], [0.0, -0.2, 4.0]])).double()
-    some["scales"] = some["scales"] + 2.0
-    if name != "off":  # of a few pixels: of larger ones the compensation is 1
-        view = Camera(view.viewmat, view.K / torch.tensor([[40.0, 1, 1], [1, 40.0, 1], [1, 1, 1]]), 6, 5)
-    some["opacities"] = torch.tensor([0.6, 0.5, 0.7]).double()
-    some["sh0"] = some["sh0"].abs()
-    leaves = [value.requires_grad_() for value in some.values()]
-    background = torch.tensor([0.1, 0.2, 0.3]).double().requires_grad_()
-    inputs = [*leaves, background]
-    assert torch.autograd.gradcheck(lambda *p: reference.rasterize(*p[:6], view, p[6], FILTERS[name]), inputs)
