@@ -15,7 +15,7 @@ from torch import Tensor
 from clod_adapter._support.arrays import tensor_of
 from clod_adapter._support.version import package_version
 from clod_adapter.calibration import Calibration
-from clod_adapter.config import CLASSIC, SH_COUNTS, AttenuationConfig, ScreenFilter
+from clod_adapter.config import CLASSIC, SH_COUNTS, AttenuationConfig, ScreenFilter, require
 from clod_adapter.equation.attenuation import SIGMA_MAX
 from clod_adapter.equation.units import in_world_units
 from clod_adapter.errors import ClodError
@@ -66,35 +66,30 @@ class Adapter:
     notes: tuple[str, ...] = field(default=(), compare=False)
 
     def __post_init__(self) -> None:
-        for name in ("sigma_d", "growth_d", "kept"):
+        for name in (*DIAL, "kept"):
             if (column := getattr(self, name)) is not None:
                 object.__setattr__(self, name, tensor_of(column))
         object.__setattr__(self, "updates", {name: tensor_of(update) for name, update in self.updates.items()})
         count = self.sigma_d.numel()
         for name, column in dial_tensors(self).items():
-            if column.shape != (count,) or column.dtype != torch.float32:
-                raise ClodError(f"Adapter.{name} is {_kind(column)}, it must be float32 [{count}]")
+            sound = column.shape == (count,) and column.dtype == torch.float32
+            require(sound, f"Adapter.{name}", _kind(column), f"float32 [{count}]")
             if not column.isfinite().all():
                 raise ClodError(f"Adapter.{name} holds a value that is not finite; the training has diverged")
-        if not (self.version.isascii() and self.version.isprintable()):
-            raise ClodError(f"Adapter.version is {self.version!r}, it must be printable ASCII")
+        plain = self.version.isascii() and self.version.isprintable()
+        require(plain, "Adapter.version", repr(self.version), "printable ASCII")
         for name, update in self.updates.items():
             if name not in ATTRIBUTES:
                 raise ClodError(f"Adapter.updates has {name!r}, it may have {', '.join(ATTRIBUTES)}")
-            if update.dtype not in (torch.float16, torch.float32) or update.shape[:1] != self.sigma_d.shape:
-                wanted = f"float16 or float32 of {len(self.sigma_d)} rows"
-                raise ClodError(f"Adapter.updates[{name!r}] is {_kind(update)}, it must be {wanted}")
-        if self.kept is not None and (
-            self.kept.dim() != 1 or self.kept.dtype != torch.bool or int(self.kept.sum()) != len(self.sigma_d)
-        ):
-            raise ClodError(f"Adapter.kept is {_kind(self.kept)}, it must be bool with {len(self.sigma_d)} set")
-        if self.sh_degree is not None and self.sh_degree not in SH_COUNTS:
-            raise ClodError(
-                f"Adapter.sh_degree is {self.sh_degree!r}, it must be one of {', '.join(map(str, SH_COUNTS))}"
-            )
+            sound = update.dtype in (torch.float16, torch.float32) and update.shape[:1] == self.sigma_d.shape
+            require(sound, f"Adapter.updates[{name!r}]", _kind(update), f"float16 or float32 of {count} rows")
+        if (kept := self.kept) is not None:
+            sound = kept.dim() == 1 and kept.dtype == torch.bool and int(kept.sum()) == count
+            require(sound, "Adapter.kept", _kind(kept), f"bool with {count} set")
+        degrees = ", ".join(map(str, SH_COUNTS))
+        require(self.sh_degree in (None, *SH_COUNTS), "Adapter.sh_degree", repr(self.sh_degree), f"one of {degrees}")
 
     def __repr__(self) -> str:
-        """As in ``Adapter(120,000 Gaussians, dial to 5 with growth, updates of means, sh0)``."""
         dial = f"dial to {self.attenuation.max_sv:g}{'' if self.growth_d is None else ' with growth'}"
         return f"Adapter({len(self.sigma_d):,} Gaussians, {dial}, updates of {', '.join(self.updates) or 'nothing'})"
 
@@ -114,21 +109,15 @@ class Adapter:
         Raises:
             ClodError: a different base was given.
         """
+        other = None
         if fingerprint is not None and fingerprint != self.base_fingerprint:
-            raise ClodError(
-                f"a different base was given: its SHA-256 is {fingerprint[:12]}..., the adapter was trained on "
-                f"{self.base_fingerprint[:12]}...; give that checkpoint"
-            )
-        if len(base) != self.base_count:
-            raise ClodError(
-                f"a different base was given: it has {len(base)} Gaussians, the adapter {self.base_count}; "
-                "give the checkpoint it was trained on"
-            )
-        if self.sh_degree is not None and base.sh_degree < self.sh_degree:
-            raise ClodError(
-                f"a different base was given: it has SH degree {base.sh_degree}, the adapter {self.sh_degree}; "
-                "give the checkpoint it was trained on"
-            )
+            other = f"its SHA-256 is {fingerprint[:12]}..., the adapter was trained on {self.base_fingerprint[:12]}..."
+        elif len(base) != self.base_count:
+            other = f"it has {len(base)} Gaussians, the adapter {self.base_count}"
+        elif self.sh_degree is not None and base.sh_degree < self.sh_degree:
+            other = f"it has SH degree {base.sh_degree}, the adapter {self.sh_degree}"
+        if other:
+            raise ClodError(f"a different base was given: {other}; give the checkpoint it was trained on")
         base = trim(base, self.kept, self.sh_degree)
         changes: dict[str, Tensor] = {}
         for name, update in self.updates.items():
@@ -171,21 +160,17 @@ def extract(
     Raises:
         ClodError: ``adapted`` has no dial, is not finite, or is not the same Gaussians as ``base``.
     """
-    if adapted.sigma_d is None or adapted.attenuation is None:
-        raise ClodError(
-            "the adapted Gaussians have no sigma_d, so there is no dial to extract; give the result of adapt"
-        )
     adapted = in_world_units(adapted)
-    updates, columns = dict[str, Tensor](), dict[str, Any]()
+    if adapted.attenuation is None:
+        raise ClodError("the adapted Gaussians have no sigma_d, and so no dial; give the result of adapt")
+    updates = dict[str, Tensor]()
     for name in ATTRIBUTES:
         old, new = getattr(base, name).detach().float(), getattr(adapted, name).detach().float()
         if old.shape != new.shape:
             raise ClodError(f"{name} is {_kind(new)}, in the base {_kind(old)}; give the Gaussians that were adapted")
         if not torch.equal(old, new):
             updates[name] = _update(name, old, new).cpu()
-    for name, column in dial_tensors(adapted).items():
-        columns[name] = column.detach().float().cpu().clone()
-    assert adapted.attenuation is not None
+    columns: Any = {name: x.detach().float().cpu().clone() for name, x in dial_tensors(adapted).items()}
     return Adapter(
         **columns, attenuation=adapted.attenuation, updates=updates, base_fingerprint=fingerprint, config=dict(config),
         origin=origin, screen_filter=adapted.screen_filter,

@@ -33,23 +33,15 @@ def bake(
     """The Gaussians that one dial value keeps, with the opacities and scales of that dial value and without a dial.
 
     ``logit' = log o - log(1 - o)`` with ``o`` the drawn opacity, ``log_scales' = log_scales + log g`` with ``g`` the
-    growth (``attenuation.attenuate``). Lossy: the result has
-    neither the dial nor the culled Gaussians.
-
-    For one ``camera`` the image from there equals the rendering at s: ``o`` is taken at its distances.
-
-    For ``cameras`` each Gaussian has one distance (``distances.typical_distance``). The Gaussians kept there at s are
-    kept, with the opacities drawn at ``s^FADED``: fading Gaussians before they are culled prevents popping, which a
-    plain file does not have. As they cover more then, the scales are those of ``s^GROWN``.
-
-    Where the dial has no effect the logits are unchanged, except +inf, which becomes ``OPAQUE``.
+    growth (``attenuation.attenuate``); +inf becomes ``OPAQUE``. For one ``camera`` the image from there equals the
+    rendering at s. For ``cameras`` each Gaussian has one distance (``distances.typical_distance``): those kept there at
+    s are kept, with the opacities of ``s^FADED``, as fading before culling only prevents popping, and, as they cover
+    more then, the scales of ``s^GROWN``.
 
     Args:
-        gaussians: with a dial.
         virtual_scale: the dial s >= 0; ``budget.dial_for(gaussians, keep=n, cameras=cameras, baked=True)`` gives the
             one that keeps n.
-        camera: the one from where the result is exact. Its direction matters for the normalisers ``quantile`` and
-            ``max`` only.
+        camera: the one from where the result is exact.
         cameras: instead of ``camera``: the training cameras, or some of them, such as ``load(path).viewpoints``.
 
     Raises:

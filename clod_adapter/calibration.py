@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import astuple, dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 from clod_adapter.config import require
@@ -107,16 +108,16 @@ class Calibration:
 
     def __post_init__(self) -> None:
         dials = [row.virtual_scale for row in self.rows]
-        if not dials or dials[0] != 1 or any(b <= a for a, b in zip(dials, dials[1:], strict=False)):
+        if dials[:1] != [1] or any(b <= a for a, b in pairwise(dials)):
             raise ClodError(f"calibration has dial values {dials}, they must ascend from 1")
         if not all(math.isfinite(value) for row in self.rows for value in astuple(row)):
             raise ClodError("calibration has a value that is not finite")
         if min(self.total, self.views, self.width, self.height) < 1 or min(row.frame_ms for row in self.rows) <= 0:
             raise ClodError("calibration has a count, size or frame time that is not positive")
-        if len(self.rows) + len(self.viewpoints) > MOST:
-            raise ClodError(f"calibration has more than {MOST} rows and viewpoints, for which files have no room")
-        if not self.machine or not self.machine.isascii() or self.machine != _plain(self.machine):
-            raise ClodError(f"calibration has the machine {self.machine!r}, it must be one line of printable ASCII")
+        entries = len(self.rows) + len(self.viewpoints)
+        require(entries <= MOST, "the number of rows and viewpoints", entries, f"at most {MOST}")
+        plain = self.machine.isascii() and self.machine == _plain(self.machine) != ""
+        require(plain, "the machine of a calibration", repr(self.machine), "one line of printable ASCII")
         if self.against not in AGAINST:
             raise ClodError(f"calibration is against {self.against!r}, it must be one of {', '.join(AGAINST)}")
 
@@ -132,26 +133,15 @@ class Calibration:
         against: str = "photographs",
         viewpoints: Sequence[Viewpoint] = (),
     ) -> Calibration:
-        """The table of an evaluation's rows (``evaluate.Row``), in any order, for images of ``size`` (width, height).
-
-        Raises:
-            ClodError: there is no row at s = 1, or a value is not finite (the PSNR of equal images).
-        """
-        found = {
-            r.virtual_scale: CalibrationRow(*map(float, (r.virtual_scale, r.kept, r.psnr, r.ssim, r.frame_ms)))
-            for r in rows
-        }
-        ascending = tuple(found[s] for s in sorted(found))
+        """The table of an evaluation's rows (``evaluate.Row``) for images of ``size`` (width, height)."""
+        found = [CalibrationRow(*map(float, (r.virtual_scale, r.kept, r.psnr, r.ssim, r.frame_ms))) for r in rows]
+        ascending = tuple({row.virtual_scale: row for row in sorted(found, key=lambda r: r.virtual_scale)}.values())
         name = _plain(machine.encode("ascii", "replace").decode()) or "unknown"
         return cls(ascending, total, views, *size, name, against, tuple(viewpoints))
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Calibration:
-        """The inverse of ``as_dict``.
-
-        Raises:
-            ClodError, KeyError, TypeError or ValueError: ``values`` is not such a dictionary.
-        """
+        """The inverse of ``as_dict``; ClodError, KeyError, TypeError or ValueError where it is none."""
         rows = tuple(CalibrationRow(**{name: float(value) for name, value in row.items()}) for row in values["rows"])
         counts = {name: int(values[name]) for name in ("total", "views", "width", "height")}
         against = str(values.get("against", AGAINST[0]))  # files of earlier versions have no such key
@@ -167,12 +157,8 @@ class Calibration:
 def crossing(dials: Sequence[float], values: Sequence[float], target: float) -> float | None:
     """The smallest dial value from which ``values`` stay at most ``target``; None if the last one is above it.
 
-    Piecewise linear in log s. A measured curve need not be monotone: a dip below the target does not count
-    if the curve rises above it again.
-
-    Args:
-        dials: ascending, positive.
-        values: one for each.
+    Piecewise linear in log s for ascending ``dials``. A dip below the target does not count if the measured curve rises
+    above it again.
     """
     above = [k for k, value in enumerate(values) if value > target]
     if not above:

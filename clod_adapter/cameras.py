@@ -16,7 +16,6 @@ T = TypeVar("T")
 NEAR = 0.01
 """Distance of the near plane, world units, as in gsplat."""
 SMALLEST = 128  # pixels a side that an image of half the size has at least: smaller ones show too little
-SMALL_EXTENT = 1.0  # extent of the cameras, world units, below which the near plane is scaled down
 ROUNDING = 1e-6  # of the distance from 0: float32 does not resolve cameras closer together than that
 
 
@@ -113,12 +112,9 @@ class View:
 
 
 class StoredView(View):
-    """A view that reads its photograph on every access instead of holding it.
+    """A view that reads its photograph on every access; a pickle or a deep copy is a plain View that holds it.
 
-    A pickle or a deep copy is a plain View that holds the photograph.
-
-    Args:
-        image: returns the pixels of ``View.image``; or the pixels themselves (``dataclasses.replace`` passes these).
+    ``image`` returns the pixels of ``View.image``, or is the pixels (``dataclasses.replace`` passes these).
     """
 
     def __init__(self, camera: Camera, image: Callable[[], Tensor] | Tensor) -> None:
@@ -182,8 +178,8 @@ def camera_extent(cameras: Sequence[Camera]) -> float:
 
 
 def near_plane(extent: float) -> float:
-    """Distance of the near plane, world units, > 0: NEAR, scaled by the extent if that is below SMALL_EXTENT."""
-    return NEAR * min(extent / SMALL_EXTENT, 1.0)
+    """Distance of the near plane, world units, > 0: NEAR, scaled by the extent of the cameras if that is below 1."""
+    return NEAR * min(extent, 1.0)
 
 
 def with_near_planes(cameras: Sequence[Camera]) -> list[Camera]:

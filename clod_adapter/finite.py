@@ -14,11 +14,8 @@ class LossNotFinite(Exception):
 
 
 def bad_rows(values: Tensor) -> Tensor | None:
-    """``[N]`` bool, the rows of ``values [N, ...]`` with a value that is not finite; None if there is none.
-
-    One pass without extra memory if all are finite: a sum with a term that is not finite is not finite.
-    """
-    if bool(values.sum().isfinite()):
+    """``[N]`` bool, the rows of ``values [N, ...]`` with a value that is not finite; None if there is none."""
+    if bool(values.sum().isfinite()):  # one pass without extra memory
         return None
     bad = ~values.isfinite().reshape(len(values), -1).all(1)
     return bad if bool(bad.any()) else None
@@ -36,28 +33,13 @@ def spoilt_rows(gradients: dict[str, Tensor]) -> Tensor:
     return spoilt
 
 
-def bad_gaussians(gaussians: Gaussians) -> dict[str, Tensor]:
-    """``bad_rows`` by attribute, if there are any. An opacity logit may be +-inf: an opacity of 1 or 0."""
-    found = {}
+def require_finite(gaussians: Gaussians, what: str, remedy: str) -> None:
+    """Raises ClodError, ``what`` being its subject and ``remedy`` its end, where an attribute is not finite."""
     for name, values in gaussians.tensors().items():
         if name == "opacity_logits":
-            values = torch.where(values.isinf(), 0.0, values)
-        if (bad := bad_rows(values)) is not None:
-            found[name] = bad
-    return found
-
-
-def require_finite(gaussians: Gaussians, what: str, remedy: str) -> None:
-    """Refuses Gaussians with an attribute that is not finite.
-
-    Args:
-        what: subject of the message, such as the file.
-        remedy: end of the message, what to do.
-
-    Raises:
-        ClodError: a value is not finite; an opacity logit of +-inf is allowed.
-    """
-    for name, bad in bad_gaussians(gaussians).items():
+            values = torch.where(values.isinf(), 0.0, values)  # +-inf are opacities of 1 and 0
+        if (bad := bad_rows(values)) is None:
+            continue
         first = int(bad.nonzero()[0, 0])
         raise ClodError(f"{what}: {name} is not finite in {int(bad.sum()):,} rows (the first is {first}); {remedy}")
 

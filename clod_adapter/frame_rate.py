@@ -36,12 +36,7 @@ Frame = tuple[float, float]
 
 
 def excess(frames: Sequence[Frame], milliseconds: float) -> float:
-    """log of the time of a frame at the dial value of the newest one over the budget, positive if it takes longer.
-
-    Args:
-        frames: dial values and milliseconds >= 0, oldest first; at least one.
-        milliseconds: the budget, > 0.
-    """
+    """e of dial values and milliseconds, oldest first, at least one; positive if frames take longer than allowed."""
     predicted = []
     for age, (dial, took) in enumerate(reversed(frames[-FRAMES:])):
         distance = math.log(dial / frames[-1][0])
@@ -54,10 +49,7 @@ def excess(frames: Sequence[Frame], milliseconds: float) -> float:
 
 
 def next_dial(frames: Sequence[Frame], milliseconds: float, max_sv: float) -> float:
-    """The dial value of the next frame, in [1, max_sv]; that of the newest frame until there are 3.
-
-    Arguments as for ``excess``; the dial values are in [1, max_sv].
-    """
+    """The dial value of the next frame, in [1, max_sv]; that of the newest frame until there are 3."""
     dial = frames[-1][0]
     if len(frames) < NEWEST:
         return dial

@@ -61,12 +61,9 @@ class Hook:
         """The opacities to draw with, the kept rows, and the factors of the scales.
 
         Opacities are 0 for culled Gaussians; ``[N]`` bool are the kept ones (CLoD-GS Eq. 2, its mask). The factors are
-        ``[N]`` (``growth.growth_factors``), in float32 or, if an input is float64, in float64; ones where the hook has
-        no ``growth_d``.
-
-        numpy in, numpy out; torch in, torch out, on the means' device, differentiable in ``opacities``, ``sigma_d`` and
-        ``growth_d``. Distances are constants: no gradient reaches ``means`` and ``viewmat``. The camera's arguments may
-        be numpy arrays or tensors, as viewers keep cameras in numpy and Gaussians on a GPU.
+        ``[N]`` (``growth.growth_factors``); ones where the hook has no ``growth_d``. numpy in, numpy out; torch in,
+        torch out, on the means' device, differentiable in ``opacities``, ``sigma_d`` and ``growth_d``.
+        The camera's arguments may be numpy arrays or tensors.
 
         Args:
             means: ``[N, 3]`` world units.
@@ -111,11 +108,7 @@ class Hook:
 def dropped_in(
     sigma_d: Tensor | None, virtual_scale: float, attenuation: AttenuationConfig | None, growth_d: Tensor | None
 ) -> AttenuationConfig | None:
-    """The settings of a drop-in's call; None without a ``sigma_d``, and a warning if ``virtual_scale`` is above 1.
-
-    Raises:
-        ClodError: the dial is negative or not finite, or ``growth_d`` lacks ``sigma_d`` or ``attenuation``.
-    """
+    """The settings of a drop-in's call; None without a ``sigma_d``, and a warning if ``virtual_scale`` is above 1."""
     if growth_d is not None and (sigma_d is None or attenuation is None):
         raise ClodError(
             "growth_d needs sigma_d and attenuation, which says where growth begins; pass Gaussians.attenuation of the "
@@ -139,10 +132,9 @@ class Hold:
 
     The drop-ins for gsplat and Inria's rasterizer take ``virtual_scale=hook.virtual_scale`` inside the block.
 
-    The budget is for the work of a frame, not for the interval between frames, which a display with vertical
-    synchronisation rounds up to whole refreshes. Half of the frames take longer than the median that is held: leave
-    room for the noise, for example 13 ms for 60 frames per second. A frame is fastest at ``max_sv``; see
-    ``out_of_reach``.
+    The budget is for the work of a frame, not for the interval between frames, which vertical synchronisation rounds up
+    to whole refreshes. Half of the frames take longer than the median that is held: leave room for the noise, for
+    example 13 ms for 60 frames per second.
 
     Attributes:
         hook: the hook of the next frame. The dial stays in [1, max_sv] and changes by at most 10 % per frame.

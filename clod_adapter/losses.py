@@ -15,21 +15,13 @@ C1, C2 = 0.01**2, 0.03**2
 
 
 def psnr(image: Tensor, target: Tensor) -> float:
-    """PSNR in dB of a ``[H, W, 3]`` float render, clamped to [0, 1], against a uint8 photograph.
-
-    ``-10 log10 mean (image - target)^2``; infinite for equal images, NaN if a pixel of the render is NaN. What the plan
-    and the progress display compare; reports have ``metrics.psnr``.
-    """
+    """``metrics.psnr`` on the image's device, for what the plan and the progress display compare."""
     error = float((image.detach().clamp(0, 1) - unit(target, image)).double().square().mean())
     return math.inf if error == 0 else -10 * math.log10(error)
 
 
 def ssim_plain(image: Tensor, target: Tensor) -> Tensor:
-    """Mean structural similarity of two ``[H, W, 3]`` float images in [0, 1]: a 0-d tensor, differentiable.
-
-    Gaussian window of 11 taps with sigma 1.5, zero padding, data range 1: the form of 3DGS and its descendants (Wang et
-    al. 2004).
-    """
+    """``metrics.psnr_ssim``'s similarity of two ``[H, W, 3]`` float images in [0, 1]: a 0-d tensor, differentiable."""
     places = torch.arange(WINDOW, dtype=image.dtype, device=image.device)
     taps = torch.exp(-((places - WINDOW // 2) ** 2) / (2 * SIGMA**2))
     taps = taps / taps.sum()
@@ -47,11 +39,7 @@ def ssim_plain(image: Tensor, target: Tensor) -> Tensor:
 def photometric_loss(image: Tensor, target: Tensor, ssim_weight: float = 0.2) -> Tensor:
     """``(1 - w) mean |image - target| + w (1 - SSIM)``, w = ssim_weight (3DGS; CLoD-GS's L_render has 0.2).
 
-    Args:
-        image: ``[H, W, 3]`` float render, not clamped.
-        target: ``[H, W, 3]`` uint8 photograph.
-
-    On the CPU in float32 one fused pass computes the loss and its gradient; otherwise plain torch.
+    Of a float render ``[H, W, 3]`` that is not clamped, and a uint8 photograph.
     """
     if image.device.type == "cpu" and image.dtype == torch.float32:
         return _FusedLoss.apply(image, target, ssim_weight)  # type: ignore[no-any-return, no-untyped-call]

@@ -78,11 +78,7 @@ class Stopped(Exception):
 
 
 def tell(listener: Listener | None, phase: Phase, done: int, total: int) -> None:
-    """Calls the listener.
-
-    Raises:
-        Stopped: it returned False.
-    """
+    """Calls the listener; raises Stopped if it returns False."""
     if listener is not None and listener(Progress(phase, done, total)) is False:
         raise Stopped(f"stopped at {phase} {done}/{total}")
 
@@ -100,31 +96,21 @@ def shown(progress: Listener | Literal[False] | None) -> Iterator[Listener | Non
     if progress is not None or not (sys.stderr.isatty() or "ipykernel" in sys.modules):
         yield progress or None
         return
-    bar = _Bar()
-    try:
-        yield bar
-    finally:
-        bar.close()
+    from tqdm import tqdm
 
+    bars: list[Any] = []
 
-class _Bar:
-    """A listener that shows each phase as a bar of tqdm."""
-
-    def __init__(self) -> None:
-        self.phase: Phase | None = None
-        self.bar: Any = None
-
-    def __call__(self, now: Progress) -> None:
-        from tqdm import tqdm
-
-        if now.phase != self.phase:
-            self.close()
-            self.phase = now.phase
-            self.bar = tqdm(total=now.total, desc=now.phase, file=sys.stderr, leave=False, dynamic_ncols=True)
+    def show(now: Progress) -> None:
+        if not bars or bars[-1].desc != now.phase:
+            for earlier in bars:
+                earlier.close()
+            bars.append(tqdm(total=now.total, desc=now.phase, file=sys.stderr, leave=False, dynamic_ncols=True))
         if not math.isnan(now.loss):
-            self.bar.set_postfix_str(f"loss {now.loss:.4f}", refresh=False)
-        self.bar.update(round(now.share * now.total) - self.bar.n)
+            bars[-1].set_postfix_str(f"loss {now.loss:.4f}", refresh=False)
+        bars[-1].update(round(now.share * now.total) - bars[-1].n)
 
-    def close(self) -> None:
-        if self.bar is not None:
-            self.bar.close()
+    try:
+        yield show
+    finally:
+        for bar in bars:
+            bar.close()

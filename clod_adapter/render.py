@@ -53,14 +53,9 @@ def splat(
     camera: Camera,
     growth: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Image ``[H, W, 3]``, on black, and alpha ``[H, W]`` of the Gaussians with opacities of their own, without a dial.
+    """Image ``[H, W, 3]``, on black, and alpha ``[H, W]`` of the Gaussians without a dial.
 
-    Args:
-        opacities: ``[N]``, activated.
-        growth: ``[N]`` factor of the scales; None for 1.
-
-    Raises:
-        ClodError: the opacities have the wrong shape.
+    Drawn with activated ``opacities [N]`` and scales times ``growth [N]``; ClodError if their shape is another.
     """
     if opacities.shape != (len(gaussians),):
         raise ClodError(f"opacities are {tuple(opacities.shape)} and must be ({len(gaussians)},)")

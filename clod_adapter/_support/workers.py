@@ -25,11 +25,7 @@ if hasattr(os, "register_at_fork"):
 
 
 def submit(pool: ThreadPoolExecutor, call: Callable[..., Result], *given: Any) -> Future[Result]:
-    """``pool.submit``.
-
-    Raises:
-        MemoryError: a thread cannot be started. The pool's calls that have not begun are dropped.
-    """
+    """``pool.submit``. Where a thread cannot be started, the pool's calls that have not begun are dropped."""
     try:
         return pool.submit(call, *given)
     except RuntimeError as error:

@@ -29,12 +29,9 @@ NEAREST = 1e-6  # lower bound of d in the geometric mean: a camera in a Gaussian
 
 @torch.no_grad()
 def normalized_distances(means: Tensor, camera: Camera, config: AttenuationConfig) -> Tensor:
-    """``[N]`` the equation's d, without unit, >= 0, in float32 or, from float64, in float64.
+    """``[N]`` the equation's d, without unit, >= 0, of ``means [N, 3]``, in float32 or, from float64, in float64.
 
-    A constant for autograd: the dial adds nothing to the gradient of ``means``. ``torch.autocast`` has no effect here.
-
-    Args:
-        means: ``[N, 3]`` world units.
+    A constant for autograd: the dial adds nothing to the gradient of ``means``.
     """
     means = means.to(torch.promote_types(means.dtype, torch.float32))  # float16's square overflows from 256 on
     with torch.autocast(means.device.type, enabled=False):  # it would round the camera's position to 3 digits
@@ -56,10 +53,6 @@ def normalizing_distance(distances: Tensor, means: Tensor, camera: Camera, confi
     centre projects into the image from beyond the near plane, or over all Gaussians where there is none. The quantile
     is an element, the ``ceil(q n)``-th smallest, not an interpolation. D is at least the smallest normal number, so
     that 0 / D is 0, and 1 where there are no Gaussians.
-
-    Args:
-        distances: ``[N]`` from the camera's centre, world units.
-        means: ``[N, 3]`` world units.
     """
     if config.normalizer == "scene" or len(distances) == 0:
         value = config.scene_distance if config.normalizer == "scene" else 1.0
@@ -122,14 +115,7 @@ def typical_distance(means: Tensor, places: Sequence[Camera | Viewpoint], config
     """``[N]`` d_i, without unit, >= 0: the distances from one place, or the geometric mean over several.
 
     Places more than OUTLIER times as far from the scene's centre as the median place, and as half of the Gaussians
-    are, do not count.
-
-    Args:
-        means: ``[N, 3]`` world units.
-        places: at least one.
-
-    Raises:
-        ClodError: there is no place.
+    are, do not count. ClodError where there is no place.
     """
     if not places:
         raise ClodError("no camera is given, so there is no distance for the dial to fade by; give at least one")

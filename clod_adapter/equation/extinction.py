@@ -27,9 +27,6 @@ def extinction_scale(opacity_logits: Tensor, sigma_d: Tensor, d: Tensor, config:
 
     Accuracy: relative error within ``(6 + |log a|) * finfo.eps`` where ``a`` is a normal number. Logarithms that are
     off by a unit in the last place, as on some processors, add ``|log tau|``.
-
-    Raises:
-        ClodError: the shapes differ.
     """
     opacity_logits, sigma_d, d = conform(opacity_logits=opacity_logits, sigma_d=sigma_d, d=d)
     radius = twice_variance(sigma_d, config.eps).div_(2).sqrt_()
@@ -51,14 +48,7 @@ def sigma_for_extinction(opacity_logits: Tensor, d: Tensor, extinction: Tensor, 
     allows, and at d = 0, where sigma has no effect. No gradient.
 
     Computed in float64. Accuracy: sigma^2 is off by at most ``4 finfo.eps``, and ``(|log a| + |log(tau s*)| + 1) /
-    log(a / (tau s*))`` of float64's eps, times the larger of v and eps/2: the last step before ``a/tau`` is a steep
-    one.
-
-    Args:
-        extinction: ``[N]`` s*, >= 0.
-
-    Raises:
-        ClodError: the shapes differ.
+    log(a / (tau s*))`` of float64's eps, times the larger of v and eps/2: the last step before ``a/tau`` is steep.
     """
     given = conform(opacity_logits=opacity_logits, d=d, extinction=extinction)
     opacity_logits, d, extinction = (t.double() for t in given)

@@ -40,14 +40,8 @@ def growth_distance(config: AttenuationConfig) -> float:
 def growth_factors(growth_d: Tensor, d: Tensor, virtual_scale: float | Tensor, reach: float) -> Tensor:
     """``[N]`` the factors g of the scales; exactly 1 where ``growth_d`` is 0 or ``d s <= r``.
 
-    Differentiable in ``growth_d``: the slope is ``g log m``, and 0 where g is clamped. Never NaN. The result has the
-    dtype of ``d``, float32 or float64.
-
-    Args:
-        growth_d: ``[N]`` exponents h, finite.
-        d: ``[N]`` normalised distances, >= 0.
-        virtual_scale: the dial s, >= 0.
-        reach: r, from ``growth_distance``, > 0.
+    Differentiable in ``growth_d [N]``, the finite exponents h: the slope is ``g log m``, and 0 where g is clamped.
+    Never NaN. The result has the dtype of ``d [N]``, float32 or float64. ``reach`` is r.
     """
     # d s is float64's: a dial beyond float32 times a distance of 0 would be NaN.
     magnification = d.detach().double().mul(virtual_scale).div_(reach).clamp_(1, torch.finfo(d.dtype).max)

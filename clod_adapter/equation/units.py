@@ -68,11 +68,7 @@ def known_distance(config: AttenuationConfig) -> float:
 def nominal_distance(means: Tensor, config: AttenuationConfig) -> float:
     """The normalised distance d of a viewpoint, for scenes without cameras; > 0.
 
-    ``known_distance`` over D, or where that is unknown ``estimated_distance`` over D; 1 for the normalisers ``max``
-    and ``quantile``.
-
-    Args:
-        means: ``[N, 3]`` world units.
+    ``known_distance`` over D, or where that is unknown ``estimated_distance`` over D; 1 for ``max`` and ``quantile``.
     """
     if config.normalizer != "scene":
         return 1.0
@@ -81,10 +77,7 @@ def nominal_distance(means: Tensor, config: AttenuationConfig) -> float:
 
 @torch.no_grad()
 def estimated_distance(means: Tensor) -> float:
-    """World units, > 0: the REACH quantile of the distances from the centre of the scene; 1 for a scene without extent.
-
-    The centre is the median of each coordinate. An estimate for a scene whose cameras are unknown.
-    """
+    """World units, > 0: the REACH quantile of the distances from the median; 1 for a scene without extent."""
     if len(means) == 0:
         return 1.0
     distances = (means - means.median(0).values).double().norm(dim=1)

@@ -38,11 +38,7 @@ def render(
 ) -> Any:
     """``function``'s result for arguments by name, with ``sigma_d`` and ``growth_d`` among them.
 
-    Args:
-        hide: whether culled centres move behind the camera, as this function draws rows of opacity 0.
-
-    Raises:
-        ClodError: see ``gsplat.rasterization``.
+    With ``hide``, culled centres move behind the camera, as this function draws rows of opacity 0.
     """
     if given.get("distributed"):
         raise ClodError("distributed=True shares one opacity among all cameras, a dial needs one each; set it to False")

@@ -62,12 +62,7 @@ class GaussianRasterizer(installed.GaussianRasterizer):  # type: ignore[misc]
 
         Args:
             means3D, means2D, opacities, args, kwargs: those of the fork, by position or by name.
-            sigma_d: ``[N]``; None calls the fork's function unchanged, with a warning if ``virtual_scale`` is above 1.
-            virtual_scale: the dial s >= 0.
-            attenuation: settings of the equation, ``Gaussians.attenuation`` of the file; by default
-                ``AttenuationConfig()``, with distances in world units.
-            growth_d: ``[N]`` exponents of the growth of the scales, which begins at ``reference_distance`` of the
-                attenuation, which is needed then, or, where that is 0, at 1 world unit; None for no growth.
+            sigma_d, virtual_scale, attenuation, growth_d: as for ``integrations.gsplat.rasterization``, each ``[N]``.
 
         Raises:
             ClodError: the dial is negative, growth_d comes without attenuation, a tensor holds integers, the shapes do

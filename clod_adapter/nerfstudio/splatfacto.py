@@ -63,11 +63,7 @@ def shown(parameters: Mapping[str, Tensor], dial: Dial, camera: Camera, virtual_
 def new_dial(
     parameters: Mapping[str, Tensor], views: Sequence[View], config: AdaptConfig, saved: Mapping[str, Any]
 ) -> Dial:
-    """The dial that ``saved`` describes (``state_of``), or an initialized one if it is empty.
-
-    Raises:
-        ClodError: the saved dial is for another range, or ``attach`` does.
-    """
+    """The dial that ``saved`` describes (``state_of``), or an initialized one if it is empty."""
     if not saved:
         return attach(parameters, views, config)
     attenuation = AttenuationConfig(**saved[SETTINGS])
@@ -88,11 +84,7 @@ def state_of(dial: Dial) -> dict[str, Any]:
 
 
 def chosen(default: float) -> float:
-    """The dial value of ``CLOD_VIRTUAL_SCALE``, or the default.
-
-    Raises:
-        ClodError: it is no number, or negative.
-    """
+    """The dial value of ``CLOD_VIRTUAL_SCALE``, or the default."""
     text = os.environ.get(VIRTUAL_SCALE, "")
     try:
         value = float(text) if text else default
@@ -105,11 +97,8 @@ def chosen(default: float) -> float:
 def write_ply(path: str, columns: Mapping[str, np.ndarray[Any, Any]], dial: Dial, screen_filter: ScreenFilter) -> None:
     """The rows that nerfstudio exports, with their dial, as an extended PLY.
 
-    nerfstudio drops rows (faint, not finite, outside of a box) and keeps the order of the others. The dial's rows are
-    found by their attributes.
-
-    Args:
-        columns: those of nerfstudio's PLY, ``[M]`` or ``[M, 1]`` each.
+    nerfstudio drops rows (faint, not finite, outside of a box) and keeps the order of the others; ``columns`` are
+    ``[M]`` or ``[M, 1]`` each. The dial's rows are found by their attributes.
     """
     gaussians = dial.gaussians().cpu().replace(screen_filter=screen_filter)
     exported = np.stack([columns[name].ravel() for name in ("x", "y", "z", "opacity")], 1).astype(np.float32)
