@@ -8,9 +8,10 @@ from typing import Any
 
 from clod_adapter._support.version import package_version
 from clod_adapter.errors import ClodError
+from clod_adapter.io.file_formats import check_readable
 
-from .shared.command import Command, add_activated, check_checkpoint
-from .shared.console import Console, put
+from .shared.command import Command, add_activated
+from .shared.console import Console
 from .shared.outputs import Outputs, check_ply_name, size
 
 
@@ -27,7 +28,7 @@ def check(args: Namespace) -> None:
     check_ply_name(Path(args.out), "--out")
     if not Path(args.adapter).is_file():
         raise ClodError(f"{args.adapter}: No such file; give the .safetensors that clod-adapt wrote")
-    check_checkpoint(args.base)
+    check_readable(Path(args.base))
 
 
 def run(args: Namespace) -> dict[str, Any]:
@@ -39,7 +40,7 @@ def run(args: Namespace) -> dict[str, Any]:
 
     console, adapter = Console(args.quiet), load_adapter(args.adapter)
     for note in adapter.notes:
-        console.note(f"{args.adapter}: {note}")
+        console.note(note)
     base = read_checkpoint(args.base, console, args.activated, adapter.origin)
     try:
         adapted = adapter.apply(base.gaussians, base.fingerprint)
@@ -48,10 +49,10 @@ def run(args: Namespace) -> dict[str, Any]:
     rows = trimmed(base, adapter.kept, adapter.sh_degree)
     save(args.out, adapted, rows, version=adapter.version, calibration=adapter.calibration)
     dial = " and ".join(dial_tensors(adapted))
-    put(f"wrote {args.out} ({size(Path(args.out))}): {len(adapted):,} Gaussians with {dial}")
+    print(f"wrote {args.out} ({size(Path(args.out))}): {len(adapted):,} Gaussians with {dial}")
     return {
         "command": "apply", "version": package_version(), "base": args.base, "adapter": args.adapter,
-        "base_count": adapter.base_count, "changed": sorted(adapter.updates), "notes": [*adapter.notes, *base.notes],
+        "base_count": adapter.base_count, "changed": sorted(adapter.updates), "notes": console.notes,
         "outputs": {"ply": args.out},
     }  # fmt: skip
 

@@ -11,7 +11,7 @@ from clod_adapter.report.style import check_matplotlib
 
 from . import adapt
 from .shared.command import Command
-from .shared.console import Console, duration, put
+from .shared.console import Console, duration
 from .shared.outputs import AdaptFiles, Outputs, claimed
 
 MAX_SV = 5.0
@@ -57,11 +57,11 @@ def run(args: Namespace) -> dict[str, Any]:
         draw(capture, base, model, report, pictures)
     else:
         pictures = {}
-    put(f"\n{duration(watch.total())} for the demo; everything is in {folder.resolve()}")
+    print(f"\n{duration(watch.total())} for the demo; everything is in {folder.resolve()}")
     if pictures:
-        put("dial.png shows a view at several dial values, curve.png quality against count")
+        print("dial.png shows a view at several dial values, curve.png quality against count")
     else:
-        put("no figures: the measurements were interrupted")
+        print("no figures: the measurements were interrupted")
     print("next, a splat of your own:\n  clod-adapt YOURS.ply --images YOUR_SCENE")
     return report | {"command": "demo", "folder": str(folder), "pictures": {k: str(v) for k, v in pictures.items()}}
 

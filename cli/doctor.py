@@ -13,7 +13,7 @@ from clod_adapter._support.text import first_line
 from clod_adapter._support.version import package_version
 
 from .shared.command import Command
-from .shared.console import WIDTH, Console, put
+from .shared.console import WIDTH, Console
 from .view import find_browser
 
 TORCH = "pip install --force-reinstall torch (https://pytorch.org has the command for a GPU)"
@@ -119,9 +119,9 @@ def run(args: Namespace) -> dict[str, Any]:
     with Console(args.quiet).status("checking ..."):
         findings = [outcome(name, check) for name, check in CHECKS.items()]
     draws = [found["name"] for found in findings if found["ok"] and found["name"] in RENDERERS]
-    put("\n".join(line_of(found) for found in findings))
+    print("\n".join(line_of(found) for found in findings))
     failed = "no rendering backend works: fix torch first, then the CPU backend"
-    put(f"rendering and training backends: {', '.join(draws)}" if draws else failed)
+    print(f"rendering and training backends: {', '.join(draws)}" if draws else failed)
     return {
         "command": "doctor", "version": package_version(), "draws": draws, "exit_code": 0 if draws else 1,
         "findings": findings,

@@ -11,19 +11,19 @@ from typing import TYPE_CHECKING, Any
 
 from clod_adapter._support.version import package_version
 from clod_adapter.errors import ClodError
+from clod_adapter.io.file_formats import check_readable, file_has_dial
 from clod_adapter.progress import Listener, Stopped
 
 from .shared import command as common
-from .shared.console import Console, put
+from .shared.console import Console
 from .shared.outputs import Outputs, labels
 from .shared.process import GracefulStop
 
 if TYPE_CHECKING:
-    from clod_adapter.cameras import Scene, View
+    from clod_adapter.cameras import Scene
     from clod_adapter.evaluation.evaluate import Row
     from clod_adapter.evaluation.popping import Popping
     from clod_adapter.gaussians import Gaussians
-    from clod_adapter.io.checkpoint import Checkpoint
 
 CLOSE = 0.01  # relative difference up to which two counts are equal
 POPPING_VIEWS = 2  # held-out views in which the dial is turned
@@ -33,9 +33,7 @@ PATH_CAMERAS = 5  # neighbours by name, which are usually photographed one after
 def add_arguments(parser: ArgumentParser) -> None:
     given = parser.add_argument_group("input")
     given.add_argument("model", metavar="MODEL.ply", help="an adapted file, or a plain one as a baseline")
-    common.add_images(given)
-    common.add_activated(given)
-    common.add_antialiasing(given)
+    common.add_reading(given)
     dial = parser.add_argument_group("dial values, one of")
     default = "dial values from 1 (full quality) (default: 1 2 3 5 below the largest trained, and that)"
     common.add_dial_options(dial, default, "(mean over the held-out views)", several=True)
@@ -55,17 +53,19 @@ def add_arguments(parser: ArgumentParser) -> None:
     output.add_argument("--report", metavar="OUT.html", help="also write a self-contained page, and its charts")
 
 
+def paths(args: Namespace) -> list[str]:
+    return [args.model, *args.against, *([args.base] if args.base else [])]
+
+
 def check(args: Namespace) -> None:
     common.check_dials(args, args.model)
     labels(args.against)
-    for path in (args.model, *args.against):
-        common.check_checkpoint(path)
-    if args.base:
-        common.check_checkpoint(args.base)
-        if common.model_has_dial(args.base):
-            raise ClodError(
-                f"{args.base}: has a dial (sigma_d); give --base the checkpoint that was adapted, or use --against"
-            )
+    for path in paths(args):
+        check_readable(Path(path))
+    if args.base and file_has_dial(Path(args.base)):
+        raise ClodError(
+            f"{args.base}: has a dial (sigma_d); give --base the checkpoint that was adapted, or use --against"
+        )
     common.check_scene(args.images)
 
 
@@ -73,61 +73,48 @@ def outputs(args: Namespace) -> Outputs:
     if not args.report:
         return Outputs()
     page, *charts = common.page_files(Path(args.report), ["rendering"])
-    inputs = [args.model, *args.against, *([args.base] if args.base else [])]
-    return Outputs([page], charts, inputs=inputs, scene=args.images)
+    return Outputs([page], charts, inputs=paths(args), scene=args.images)
 
 
 def run(args: Namespace) -> dict[str, Any]:
     from .shared import measure as measuring
-    from .shared.pages import write_eval_page
+    from .shared.inputs import read_inputs, require_held_out
+    from .shared.pages import add_page
 
-    console, watch = Console(args.quiet), measuring.Stopwatch()
+    console, watch, stop = Console(args.quiet), measuring.Stopwatch(), GracefulStop()
     with watch.time("load"):
-        model, others, scene = read_inputs(args, console)
-    gaussians, base = model.gaussians, others[args.base] if args.base else None
-    given, notes = measuring.solve_dials(args, model, [view.camera for view in scene.test], console)
-    dials, beyond = measuring.choose_dials(given, gaussians.attenuation)
-    notes += beyond
-    for note in notes:
-        console.say(note)
-    with watch.time("evaluate"):
-        rows, interrupted = measuring.measure(gaussians, scene.test, dials, console)
-        if interrupted and not rows:
-            raise Stopped("stopped before the first row")
-        if not interrupted:
-            (rows,), rough, interrupted = measuring.with_frame_times([(gaussians, rows)], scene.test, console)
-            notes += rough
-    put(measuring.table(rows))
-    comparisons, against = Comparisons(gaussians, scene, console), {path: others[path] for path in args.against}
-    if not interrupted:
-        with watch.time("comparisons"):
-            interrupted = not comparisons.measure(rows, base, against, args.popping)
-    put(comparisons.text(), end="")
+        models, scene = read_inputs(args, paths(args), console, training=bool(args.base))
+        require_held_out(scene, args.images)
+    model, *others = (each.gaussians for each in models)
+    base = others.pop() if args.base else None
+    if model.sigma_d is None:
+        console.note(f"{args.model} has no sigma_d, so every dial value renders all of it")
+    given = measuring.solve_dials(args, models[0], [view.camera for view in scene.test], console)
+    dials = measuring.choose_dials(given, model.attenuation, console)
+    comparisons = Comparisons(model, scene, console, stop)
+    with stop.listening():
+        with watch.time("evaluate"):
+            rows = measuring.measure(model, scene.test, dials, console, stop)
+            if not rows:
+                raise Stopped("stopped before the first row")
+            if not stop.requests:
+                (rows,) = measuring.with_frame_times([(model, rows)], scene.test, console, stop)
+        print(measuring.table(measuring.by_dial(rows)))
+        if not stop.requests:
+            with watch.time("comparisons"):
+                comparisons.measure(rows, base, dict(zip(args.against, others, strict=True)), args.popping)
+    print(comparisons.text(), end="")
     report: dict[str, Any] = {
         "command": "eval", "version": package_version(), "model": args.model, "scene": args.images,
-        "base_count": len(gaussians), "sh_degree": gaussians.sh_degree, "views": len(scene.test),
+        "base_count": len(model), "sh_degree": model.sh_degree, "views": len(scene.test),
         "rows": [row.as_dict() for row in rows], "base": args.base, **comparisons.report(),
-        "interrupted": interrupted, "attenuation": asdict(gaussians.attenuation) if gaussians.attenuation else None,
-        "notes": [*model.notes, *scene.notes, *notes, *comparisons.notes], "machine": measuring.machine(),
-        "device": str(gaussians.means.device), "seconds": watch.report(),
+        "interrupted": stop.requests > 0, "attenuation": asdict(model.attenuation) if model.attenuation else None,
+        "notes": console.notes, "machine": measuring.machine(), "device": str(model.means.device),
+        "seconds": watch.report(),
     }  # fmt: skip
-    return report | write_eval_page(args, report, gaussians, base, scene, console)
-
-
-def read_inputs(args: Namespace, console: Console) -> tuple[Checkpoint, dict[str, Gaussians], Scene]:
-    """The model, the files of --base and --against by path, and the scene; all with their screen-space filters."""
-    from .shared.inputs import align, prepare_kernels, read_model_and_scene, with_filter
-
-    paths = [*([args.base] if args.base else []), *args.against]
-    model, others, scene, device = read_model_and_scene(args, console, paths)
-    if not scene.test:
-        raise ClodError(f"{args.images}: there are no held-out photographs to evaluate on; give at least two")
-    prepare_kernels(console, device, training=bool(args.base))
-    scene, _ = align(model, scene, args.images, console, required=False)
-    model = with_filter(model, args, console, scene.test)
-    if model.gaussians.sigma_d is None:
-        console.say(f"{args.model} has no sigma_d, so every dial value renders all of it")
-    return model, {p: with_filter(each, args, console, scene.test).gaussians for p, each in others.items()}, scene
+    if args.report:
+        add_page(Path(args.report), report, model, base, scene, console)
+    return report
 
 
 @dataclass
@@ -144,31 +131,25 @@ class Comparisons:
     model: Gaussians
     scene: Scene
     console: Console
-    stop: GracefulStop = field(default_factory=GracefulStop)
+    stop: GracefulStop
     base_row: Row | None = None
     ranked: list[tuple[Row, str, Row]] = field(default_factory=list)
     against: list[tuple[str, Row, Row]] = field(default_factory=list)
     popping: list[tuple[str, Popping]] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)
 
     def measure(
         self, rows: Sequence[Row], base: Gaussians | None, others: Mapping[str, Gaussians], popping: bool
-    ) -> bool:
-        """Measures those asked for; False if Ctrl-C ended them early.
-
-        The base is pruned to the counts of ``rows``; other files with a dial are measured at their dial values.
-        """
-        with self.stop.listening():
-            try:
-                if base is not None:
-                    self.prune(base, rows)
-                if others:
-                    self.match(others, rows)
-                if popping:
-                    self.pop(max(row.virtual_scale for row in rows))
-            except Stopped:
-                return False
-        return True
+    ) -> None:
+        """Measures those asked for, until Ctrl-C: the base at the counts of ``rows``, others at their dial values."""
+        try:
+            if base is not None:
+                self.prune(base, rows)
+            if others:
+                self.match(others, rows)
+            if popping:
+                self.pop(max(row.virtual_scale for row in rows))
+        except Stopped:
+            return
 
     def prune(self, base: Gaussians, rows: Sequence[Row]) -> None:
         from clod_adapter.evaluation.baselines import rankings
@@ -194,7 +175,7 @@ class Comparisons:
                 same = matching_dial(self.model, cameras, count)
                 if abs((kept := mean_kept(self.model, cameras, same)) - count) > CLOSE * count:
                     more = f"{'at most' if kept < count else 'at least'} {kept:,.0f}"
-                    self._note(f"{path} keeps {count:,.0f} Gaussians; the model is compared with {more}")
+                    self.console.note(f"{path} keeps {count:,.0f} Gaussians; the model is compared with {more}")
                 listener = meter.part(i, len(jobs), path)
                 theirs = self._row(other, s, listener)
                 self.against.append((path, theirs, self._row(self.model, same, listener)))
@@ -203,16 +184,18 @@ class Comparisons:
         from clod_adapter.evaluation.popping import dial_popping, path_popping
 
         if self.model.sigma_d is None or max_sv <= 1:
-            self._note("popping is not measured: there is no dial, or only s = 1 was requested")
+            self.console.note("popping is not measured: there is no dial, or only s = 1 was requested")
             return
-        test, walk = self.scene.test, neighbours([*self.scene.train, *self.scene.test])
-        views = [test[(2 * k + 1) * len(test) // (2 * POPPING_VIEWS)] for k in range(min(POPPING_VIEWS, len(test)))]
+        test = [view.camera for view in self.scene.test]
+        some = [test[(2 * k + 1) * len(test) // (2 * POPPING_VIEWS)] for k in range(min(POPPING_VIEWS, len(test)))]
         jobs: list[tuple[str, Any]] = [
-            (f"dial, {v.camera.name}", partial(dial_popping, self.model, v.camera, max_sv)) for v in views
+            (f"dial, {camera.name}", partial(dial_popping, self.model, camera, max_sv)) for camera in some
         ]
+        ordered = sorted([*test, *(view.camera for view in self.scene.train)], key=lambda camera: camera.name)
+        walk = ordered[max((len(ordered) - PATH_CAMERAS) // 2, 0) :][:PATH_CAMERAS]  # the middle of the capture
         if len(walk) > 1:
-            path = partial(path_popping, self.model, [view.camera for view in walk], max_sv)
-            jobs.append((f"camera, {walk[0].camera.name} to {walk[-1].camera.name}, s = {max_sv:g}", path))
+            path = partial(path_popping, self.model, walk, max_sv)
+            jobs.append((f"camera, {walk[0].name} to {walk[-1].name}, s = {max_sv:g}", path))
         with self.console.meter("popping") as meter:
             for i, (moved, sweep) in enumerate(jobs):
                 found = sweep(progress=self.stop.heeding(meter.part(i, len(jobs), moved)))
@@ -226,14 +209,13 @@ class Comparisons:
             raise Stopped("stopped within a comparison")
         return rows[0]
 
-    def _note(self, text: str) -> None:
-        self.console.say(text)
-        self.notes.append(text)
+    def _names(self) -> dict[str, str]:
+        files = list(dict.fromkeys(path for path, *_ in self.against))
+        return dict(zip(files, labels(files), strict=True))
 
     def report(self) -> dict[str, Any]:
         """For --json."""
-        paths = list(dict.fromkeys(path for path, *_ in self.against))
-        names = dict(zip(paths, labels(paths), strict=True))
+        names = self._names()
         return {
             "base_row": self.base_row and self.base_row.as_dict(),
             "ranked": [
@@ -248,32 +230,23 @@ class Comparisons:
 
     def text(self) -> str:
         """For the console; empty without comparisons."""
-        from .shared.measure import popping_table, rows_table
+        from .shared.measure import popping_table, table
 
         parts: list[str] = []
-        others: dict[str, list[tuple[str, Row]]] = {}
         if self.base_row:
-            marked = {("base", 0.0): self.base_row}  # by label and dial value, in the order of the table
+            rows = [("base", self.base_row)]
             for ours, by, row in self.ranked:
-                marked[f"s={ours.virtual_scale:g}", ours.virtual_scale] = ours
-                marked[by, ours.virtual_scale] = row
-            rows = [(label, row) for (label, _), row in marked.items()]
-            parts.append(f"the unadapted base, pruned to the same counts by two rankings:\n{rows_table(rows)}")
-        for path, theirs, ours in self.against:
-            others.setdefault(path, []).extend([("theirs", theirs), (f"s={ours.virtual_scale:.4g}", ours)])
-        if others:
-            found = "".join(f"\n{path}\n{rows_table(rows)}" for path, rows in others.items())
-            parts.append(f"other files, each row followed by the dial value with the same count:{found}")
+                model = (f"s={ours.virtual_scale:g}", ours)
+                rows += [*([] if model in rows else [model]), (by, row)]
+            parts.append(f"the unadapted base, pruned to the same counts by two rankings:\n{table(rows)}")
+        if self.against:
+            rows, names = [], self._names()
+            for path, theirs, ours in self.against:
+                rows += [(names[path], theirs), (f"s={ours.virtual_scale:.4g}", ours)]
+            parts.append(f"other files, each row followed by the dial value with the same count:\n{table(rows)}")
         if self.popping:
             parts.append(popping_table(self.popping))
         return "".join(f"\n{part}\n" for part in parts)
-
-
-def neighbours(views: Sequence[View]) -> list[View]:
-    """PATH_CAMERAS from the middle of the capture, in the order of their names."""
-    ordered = sorted(views, key=lambda view: view.camera.name)
-    first = max((len(ordered) - PATH_CAMERAS) // 2, 0)
-    return ordered[first : first + PATH_CAMERAS]
 
 
 COMMAND = common.Command(

@@ -13,7 +13,7 @@ from clod_adapter.io.file_formats import check_readable
 from clod_adapter.io.settings import WARNING
 
 from .shared.command import Command
-from .shared.console import duration, put
+from .shared.console import duration
 from .shared.outputs import size
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ def run(args: Namespace) -> dict[str, Any]:
     from clod_adapter.inspection.report import inspect
 
     found = inspect(args.file)
-    put("\n".join(lines_of(found)))
+    print("\n".join(lines_of(found)))
     return {"command": "inspect", "version": package_version(), **found.as_dict()}
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import gc
 import io
 import json
 import os
@@ -20,7 +19,8 @@ from clod_adapter.progress import Stopped
 
 from . import adapt, apply, demo, doctor, evaluate, export, inspect, render, robustness, view
 from .shared.command import Command, Parser
-from .shared.outputs import claimed
+from .shared.console import Console
+from .shared.outputs import claimed, jsonable
 from .shared.process import (
     check_printed,
     check_surroundings,
@@ -34,7 +34,6 @@ from .shared.process import (
 
 PROG = "clod-adapt"
 INTERRUPTED = 130  # exit code
-LONGEST = 10_000  # characters of an error; a word of the command line may have more
 LIBRARY = ("torch", "numba", "clod_adapter.io.scene.load", "clod_adapter.training.loop")  # what most commands import
 NEAR = 0.75  # similarity of a misspelt command: two neighbouring letters exchanged in "view" have it
 REPORT = "please report it, with the lines above, as an issue of this program's repository"
@@ -56,10 +55,7 @@ COMMANDS: dict[str, Command] = {
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Runs a command line; returns its exit code: 0, 2 for bad input, 130 if interrupted with nothing written.
-
-    A report may have its own exit_code. An unexpected error prints its traceback and returns 1.
-    """
+    """Runs a command line; returns its exit code: 2 for bad input, 130 if interrupted without a result, 1 for a bug."""
     words = sys.argv[1:] if argv is None else argv
     with unbreakable_streams():
         try:
@@ -72,7 +68,6 @@ def main(argv: list[str] | None = None) -> int:
 
 def refuse(why: str, code: int, words: list[str]) -> int:
     """Prints why a command failed, with --json also as the one object on stdout; returns the exit code."""
-    why = why if len(why) <= LONGEST else f"{why[:LONGEST]} ..."
     line = f"{PROG}: {why}" if code == INTERRUPTED else f"{PROG}: error: {why}"
     print(line, file=sys.stderr)
     if "--json" in words:
@@ -128,12 +123,7 @@ def run_here(command: Command, args: argparse.Namespace) -> int:
 
 
 def run(command: Command, args: argparse.Namespace) -> int:
-    """Runs a command, prints its report with --json, and returns the report's exit code, or 0.
-
-    Without files and --json the result is what was printed.
-    """
-    from .shared.outputs import jsonable
-
+    """Runs a command, prints its report with --json, and returns the report's exit code, or 0."""
     check_surroundings()
     if args.json:
         check_printed()
@@ -153,23 +143,13 @@ def run(command: Command, args: argparse.Namespace) -> int:
 
 
 def import_library(quiet: bool) -> None:
-    """Imports LIBRARY, which takes a second or two."""
-    from .shared.console import Console
-
-    if all(name in sys.modules for name in LIBRARY):
-        return
-    gc.disable()  # a tenth of the time, with nothing to collect
-    try:
+    if not all(name in sys.modules for name in LIBRARY):
         with Console(quiet).status("starting ..."):
             for name in LIBRARY:
                 import_module(name)
-    finally:
-        gc.freeze()  # later collections, one of them at exit, skip what was imported
-        gc.enable()
 
 
 def build_parser(name: str) -> Parser:
-    """The parser of a command; of the main command for an empty name."""
     command = COMMANDS.get(name, adapt.COMMAND)
     parser = command.parser(f"{PROG} {name}".strip())
     if not name:

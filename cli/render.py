@@ -12,10 +12,11 @@ from clod_adapter._support.text import file_name
 from clod_adapter._support.version import package_version
 from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import atomic_path
+from clod_adapter.io.file_formats import check_readable
 from clod_adapter.io.scene.folder import find_cameras, photograph_folders
 
 from .shared import command as common
-from .shared.console import Console, put
+from .shared.console import Console
 from .shared.outputs import Outputs, check_outputs, make_folder
 from .shared.process import GracefulStop
 
@@ -29,13 +30,11 @@ if TYPE_CHECKING:
 def add_arguments(parser: ArgumentParser) -> None:
     given = parser.add_argument_group("input")
     given.add_argument("model", metavar="MODEL.ply", help="an adapted file, or a plain one")
-    common.add_images(given)
+    common.add_reading(given)
     given.add_argument(
         "--views", metavar="NAME", nargs="+", default=["held-out"],
         help="photographs whose cameras to render: names, all, or held-out (default)",
     )  # fmt: skip
-    common.add_activated(given)
-    common.add_antialiasing(given)
     dial = parser.add_argument_group("dial values, one of")
     common.add_dial_options(dial, "dial values (default: 1)", "(mean over the images)", several=True)
     output = parser.add_argument_group("output")
@@ -46,7 +45,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def check(args: Namespace) -> None:
     common.check_dials(args, args.model)
-    common.check_checkpoint(args.model)
+    check_readable(Path(args.model))
     common.check_scene(args.images)
     check_folder(Path(args.out), Path(args.images))
 
@@ -68,36 +67,30 @@ def outputs(args: Namespace) -> Outputs:
 
 
 def run(args: Namespace) -> dict[str, Any]:
-    from .shared.inputs import align, pick_views, prepare_kernels, read_model_and_scene, with_filter
+    from .shared.inputs import pick_views, read_inputs
     from .shared.measure import Stopwatch, choose_dials, solve_dials
 
     console, watch, out = Console(args.quiet), Stopwatch(), Path(args.out)
-    model, _, scene, device = read_model_and_scene(args, console)
-    prepare_kernels(console, device, training=False)
-    scene, _ = align(model, scene, args.images, console, required=False)
-    model = with_filter(model, args, console, [*scene.test, *scene.train])
+    (model,), scene = read_inputs(args, [args.model], console)
     views = pick_views(scene, args.views)
     images = [out / name for name in image_names(views)]
     check_outputs(Outputs(derived=images, folders=[out], inputs=[args.model], scene=args.images))
-    solved, notes = solve_dials(args, model, [view.camera for view in views], console)
-    dials, beyond = choose_dials(solved or [1.0], model.gaussians.attenuation)
-    notes += beyond
+    solved = solve_dials(args, model, [view.camera for view in views], console)
+    dials = choose_dials(solved or [1.0], model.gaussians.attenuation, console)
     if model.gaussians.sigma_d is None and max(dials) > 1:
-        notes.append(f"{args.model} has no sigma_d, so every dial value renders all of it")
-    for note in notes:
-        console.say(note)
+        console.note(f"{args.model} has no sigma_d, so every dial value renders all of it")
     gaussians = model.gaussians.without_empty_bands()
     pictures = write_images(gaussians, views, dials, args, console)
-    put(f"wrote {len(pictures)} image{'s' * (len(pictures) != 1)} to {out}")
+    print(f"wrote {len(pictures)} image{'s' * (len(pictures) != 1)} to {out}")
     for k, dial in enumerate(dials):
         kept, error = (fmean(picture[key][k] for picture in pictures) for key in ("kept", "psnr"))
         about = f"{kept:,.0f} of {len(gaussians):,} Gaussians, {error:.2f} dB, means over the images"
-        put(f"  s = {dial:.5g}: {about}")
+        print(f"  s = {dial:.5g}: {about}")
     return {
         "command": "render", "version": package_version(), "model": args.model, "scene": args.images,
         "base_count": len(gaussians), "virtual_scales": dials, "pictures": pictures,
-        "interrupted": len(pictures) < len(views), "notes": [*model.notes, *scene.notes, *notes],
-        "seconds": watch.report(), "outputs": {"folder": args.out},
+        "interrupted": len(pictures) < len(views), "notes": console.notes, "seconds": watch.report(),
+        "outputs": {"folder": args.out},
     }  # fmt: skip
 
 
@@ -111,12 +104,9 @@ def image_names(views: Sequence[View]) -> list[Path]:
 def write_images(
     gaussians: Gaussians, views: Sequence[View], dials: Sequence[float], args: Namespace, console: Console
 ) -> list[dict[str, Any]]:
-    """Writes an image per view: the dial values from left to right, after the photograph with ``--beside``.
+    """Writes an image per view, until Ctrl-C: the dial values from left to right, after the photograph if asked for.
 
-    Ctrl-C ends it after the image under way; a second one aborts.
-
-    Returns:
-        Of each image the view, the file, and per dial value the Gaussians kept, and PSNR (dB) against the photograph.
+    Gives of each the view, the file, and per dial value the Gaussians kept, and PSNR (dB) against the photograph.
     """
     import torch
 
@@ -141,7 +131,7 @@ def write_images(
 
 
 def write_png(path: Path, pixels: Tensor) -> None:
-    """Writes ``[H, W, 3]`` uint8 pixels; makes the folder if it is missing."""
+    """Writes ``[H, W, 3]`` uint8 pixels."""
     from PIL import Image, PngImagePlugin
 
     make_folder(path.parent)

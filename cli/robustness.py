@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import json
 from argparse import ArgumentParser, Namespace
-from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -16,11 +15,12 @@ from clod_adapter._support.version import package_version
 from clod_adapter.config import CLASSIC, AdaptConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import atomic_path
-from clod_adapter.progress import Phase, Progress, Stopped
+from clod_adapter.io.file_formats import check_readable
+from clod_adapter.progress import Listener, Stopped
 from clod_adapter.report.style import check_matplotlib
 
 from .shared import command as common
-from .shared.console import Console, Meter, clipped, duration, put
+from .shared.console import Console, ProgressDisplay, clipped, duration
 from .shared.outputs import Outputs, labels, write_report
 from .shared.process import GracefulStop
 from .shared.settings import add_settings, make_configs
@@ -29,25 +29,16 @@ if TYPE_CHECKING:
     from clod_adapter.cameras import Scene
     from clod_adapter.io.checkpoint import Checkpoint
 
-    from .shared.measure import Stopwatch
-
 COLUMNS = (
     "checkpoint", "max_sv", "within_range", "virtual_scale", "psnr", "ssim", "kept", "kept_share", "in_view", "frame_ms"
 )  # fmt: skip
-# Where a phase begins and ends in a cell, and its label.
-PARTS = {
-    Phase.IMPORTANCE: (0.0, 0.05, "importance"), Phase.PRUNING_ORDER: (0.05, 0.1, "importance"),
-    Phase.TRAINING: (0.1, 0.8, "training"), Phase.EVALUATION: (0.8, 1.0, "measuring"),
-}  # fmt: skip
 LONGEST = 16  # characters of a checkpoint's name in the table
 
 
 def add_arguments(parser: ArgumentParser) -> None:
     given = parser.add_argument_group("input")
     given.add_argument("ply", metavar="PLY", nargs="+", help="checkpoints of one scene; never modified")
-    common.add_images(given)
-    common.add_activated(given)
-    common.add_antialiasing(given)
+    common.add_reading(given)
     output = parser.add_argument_group("output")
     output.add_argument(
         "-o", "--out", metavar="DIR", default="robustness",
@@ -59,8 +50,6 @@ def add_arguments(parser: ArgumentParser) -> None:
         help="largest dial value of each adaptation; 1 trains at full detail only (default: 1 3 5 7)",
     )  # fmt: skip
     add_settings(training, without=["max_sv"])
-    common.add_misaligned_ok(training)
-    common.add_device(training, "train and measure")
 
 
 def check(args: Namespace) -> None:
@@ -68,7 +57,7 @@ def check(args: Namespace) -> None:
     make_configs(args)
     labels(args.ply)
     for path in args.ply:
-        common.check_checkpoint(path)
+        check_readable(Path(path))
     common.check_scene(args.images)
 
 
@@ -92,11 +81,10 @@ def cell_name(label: str, max_sv: float | None) -> str:
 
 @dataclass(frozen=True)
 class Cell:
-    """One checkpoint at one range, or its baseline, on disk.
+    """One checkpoint at one range, or its baseline, where ``config`` is None; on disk.
 
     Attributes:
         label: names the checkpoint.
-        config: of the adaptation; None for the baseline.
         points: dial values, or shares of the baseline, that are measured.
         scene_sha256: of its photographs.
         folder: of all cells.
@@ -110,8 +98,12 @@ class Cell:
     folder: Path
 
     @property
+    def max_sv(self) -> float | None:
+        return self.config.max_sv if self.config else None
+
+    @property
     def name(self) -> str:
-        return cell_name(self.label, self.config.max_sv if self.config else None)
+        return cell_name(self.label, self.max_sv)
 
     @property
     def key(self) -> dict[str, Any]:
@@ -135,11 +127,8 @@ class Cell:
         same = isinstance(found, dict) and found.get("key") == self.key
         return found if same and (self.config is None or self.file(".safetensors").is_file()) else None
 
-    def run(self, scene: Scene, progress: Any) -> dict[str, Any]:
-        """Measures; writes the adapter and then the rows, which mark the cell as finished.
-
-        Raises Stopped if ``progress`` returns False.
-        """
+    def run(self, scene: Scene, progress: Listener) -> dict[str, Any]:
+        """Measures; writes the adapter and then the rows, which mark the cell as finished."""
         from clod_adapter.evaluation.robustness import adapt_at_range, baseline
         from clod_adapter.io.adapter_file import save_adapter
 
@@ -157,8 +146,8 @@ class Cell:
         if result.adapter:
             save_adapter(self.file(".safetensors"), result.adapter)
         cell = {
-            "checkpoint": as_text(self.label), "max_sv": self.config.max_sv if self.config else None,
-            "adapter": str(self.file(".safetensors")) if result.adapter else None, "rows": result.rows,
+            "checkpoint": as_text(self.label), "max_sv": self.max_sv, "rows": result.rows,
+            "adapter": str(self.file(".safetensors")) if result.adapter else None,
             "seconds": round(result.seconds, 3), "distribution": result.distribution, "machine": machine(),
             "key": self.key,
         }  # fmt: skip
@@ -169,11 +158,20 @@ class Cell:
 def run(args: Namespace) -> dict[str, Any]:
     from clod_adapter.evaluation.robustness import BASELINE_SHARES, scene_fingerprint
 
-    from .shared.inputs import prepare_kernels
+    from .shared.inputs import align, prepare_kernels, read_inputs, require_held_out
     from .shared.measure import Stopwatch, machine, report_dials
 
-    console, watch, stop = Console(args.quiet), Stopwatch(), GracefulStop()
-    checkpoints, scene = read(args, console, watch)
+    console, watch, stop, required = Console(args.quiet), Stopwatch(), GracefulStop(), not args.misaligned_ok
+    with watch.time("load"):
+        checkpoints, scene = read_inputs(args, args.ply, console, training=True, required=required)
+        require_held_out(scene, args.images)
+        for each in checkpoints[1:]:
+            if align(each, scene, args.images, console, required=required)[1]["frame"]:
+                raise ClodError(f"{each.path}: in another frame than {args.ply[0]}; give it alone")
+        for each in checkpoints:
+            if each.gaussians.sigma_d is not None:
+                console.note(f"the dial of {each.path} is ignored")
+            prepare_kernels(console, each.gaussians.means.device, screen_filter=each.gaussians.screen_filter)
     names, configs, sha256 = labels(args.ply), make_configs(args), scene_fingerprint(scene)
     # Every range is measured at the dial values of the widest one and at its own end.
     dials = tuple(sorted({*report_dials(configs[-1].max_sv), *(config.max_sv for config in configs)}))
@@ -182,31 +180,24 @@ def run(args: Namespace) -> dict[str, Any]:
         for base, name in zip(checkpoints, names, strict=True) for config in (None, *configs)
     ]  # fmt: skip
     found = {cell.name: done for cell in cells if (done := cell.read())}
-    missing = [cell for cell in cells if cell.name not in found]
     if found:
         console.say(f"{len(found)} of {len(cells)} cells are done already: {', '.join(found)}")
-    if missing:
-        with watch.time("kernels"):
-            for screen_filter in dict.fromkeys(each.gaussians.screen_filter for each in checkpoints):
-                device = checkpoints[0].gaussians.means.device
-                prepare_kernels(console, device, screen_filter=screen_filter)
     with stop.listening():
         with watch.time("cells"):
-            done = run_cells(missing, scene, console, stop)
-        found |= done
+            interrupted = not run_cells(cells, found, scene, console, stop)
         if not found:
             raise Stopped("stopped before the first cell was finished")
         files = result_files(Path(args.out))
         report = {
             "command": "robustness", "version": package_version(), "scene": args.images,
             "checkpoints": [
-                {"checkpoint": label, "model": path, "count": len(each.gaussians), "sha256": each.fingerprint,
-                 "notes": each.notes} for label, path, each in zip(names, args.ply, checkpoints, strict=True)
+                {"checkpoint": label, "model": str(each.path), "count": len(each.gaussians), "sha256": each.fingerprint}
+                for label, each in zip(names, checkpoints, strict=True)
             ],
             "cells": [found[cell.name] for cell in cells if cell.name in found],
             "missing": [cell.name for cell in cells if cell.name not in found],
-            "interrupted": len(done) < len(missing), "notes": list(scene.notes), "views": len(scene.test),
-            "machine": machine(), "seconds": watch.report(), "outputs": {k: str(v) for k, v in files.items()},
+            "interrupted": interrupted, "notes": console.notes, "views": len(scene.test), "machine": machine(),
+            "seconds": watch.report(), "outputs": {k: str(v) for k, v in files.items()},
         }  # fmt: skip
         write_results(report, files, Path(args.images).resolve().name)
     print_cells(report)
@@ -214,51 +205,19 @@ def run(args: Namespace) -> dict[str, Any]:
     return report
 
 
-def read(args: Namespace, console: Console, watch: Stopwatch) -> tuple[list[Checkpoint], Scene]:
-    """Reads all checkpoints, relative to one origin, and the photographs, whose cameras are moved into their frame.
-
-    Raises:
-        ClodError: nothing is held out, a checkpoint does not match, or they are in different frames.
-    """
-    from .shared.inputs import align, on_device, pick_device, prepare_kernels, read_checkpoint, read_scene, with_filter
-
-    found, device = list[Any](), pick_device(args.device, console)
-    with watch.time("load"):
-        for path in args.ply:
-            origin = found[0].origin if found else None
-            found.append(on_device(read_checkpoint(path, console, args.activated, origin), device))
-            if found[-1].gaussians.sigma_d is not None:
-                console.say(f"  note: the dial of {path} is ignored")
-        scene = read_scene(args.images, console, found[0].origin)
-    if not scene.test:
-        raise ClodError(f"{args.images}: there are no held-out photographs to evaluate on; give at least two")
-    with watch.time("kernels"):
-        prepare_kernels(console, device, training=False)
-    with watch.time("evaluate"):
-        for number, checkpoint in enumerate(found):
-            scene, numbers = align(checkpoint, scene, args.images, console, required=not args.misaligned_ok)
-            if number and numbers["frame"]:
-                raise ClodError(f"{checkpoint.path}: in another frame than {found[0].path}; give it alone")
-        return [with_filter(each, args, console, scene.test) for each in found], scene
-
-
-def run_cells(cells: Sequence[Cell], scene: Scene, console: Console, stop: GracefulStop) -> dict[str, dict[str, Any]]:
-    """Runs the cells; returns those that were finished, by name."""
-    found: dict[str, dict[str, Any]] = {}
-    with closing(Meter(console, "robustness", slow=True)) as meter:
-        for k, cell in enumerate(cells):
-
-            def show(now: Progress, cell: Cell = cell, k: int = k) -> None:
-                begin, end, text = PARTS.get(now.phase, PARTS[Phase.IMPORTANCE])
-                share = (k + begin + (end - begin) * now.share) / len(cells)
-                meter.update(share, f"{cell.name} ({k + 1}/{len(cells)}) {text}")
-
-            try:
-                found[cell.name] = cell.run(scene, stop.heeding(show))
-            except Stopped:
-                console.say(f"stopping: {cell.name} was not finished; the same command continues with it")
-                break
-    return found
+def run_cells(
+    cells: list[Cell], found: dict[str, dict[str, Any]], scene: Scene, console: Console, stop: GracefulStop
+) -> bool:
+    """Adds the cells that are not in ``found`` by name; False if Ctrl-C ended one."""
+    for k, cell in enumerate(cells, 1):
+        display = ProgressDisplay(console, stop, f"{cell.name} ({k}/{len(cells)}) training")
+        try:
+            with closing(display):
+                found[cell.name] = found.get(cell.name) or cell.run(scene, display)
+        except Stopped:
+            console.say(f"{cell.name} was not finished; the same command continues with it")
+            return False
+    return True
 
 
 def write_results(report: dict[str, Any], files: dict[str, Path], scene: str) -> None:
@@ -281,13 +240,13 @@ def print_cells(report: dict[str, Any]) -> None:
     """One line per cell: its first and last row."""
     names = [clipped(cell["checkpoint"], LONGEST) for cell in report["cells"]]
     width = max(map(len, ["checkpoint", *names]))
-    put(f"\n{'checkpoint':<{width}}  range     at the first              at the last")
+    print(f"\n{'checkpoint':<{width}}  range     at the first              at the last")
     for checkpoint, cell in zip(names, report["cells"], strict=True):
         ends = [f"{row['psnr'] or 0:6.2f} dB @ {row['kept']:9,.0f}" for row in (cell["rows"][0], cell["rows"][-1])]
         name = "base" if cell["max_sv"] is None else f"[1, {cell['max_sv']:g}]"
-        put(f"{checkpoint:<{width}}  {name:<8}  {ends[0]}    {ends[1]}")
+        print(f"{checkpoint:<{width}}  {name:<8}  {ends[0]}    {ends[1]}")
     if report["missing"]:
-        put(f"\nmissing: {', '.join(report['missing'])}; the same command continues")
+        print(f"\nmissing: {', '.join(report['missing'])}; the same command continues")
 
 
 COMMAND = common.Command(

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 from clod_adapter._support.text import as_text
 from clod_adapter._support.version import package_version
 from clod_adapter.errors import ClodError
-from clod_adapter.io.file_formats import FORMATS
+from clod_adapter.io.file_formats import FORMATS, check_readable, file_has_dial
 from clod_adapter.progress import Stopped
 
 from .shared import command as common
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from clod_adapter.viewer.server import Response
 
 MODEL, BASE = "/files/model", "/files/base"
+NO_CAMERAS = "stores no cameras, which --device-preset needs; give --images"
 IN_TERMINAL = ("lynx", "w3m", "links", "links2", "elinks", "www-browser")  # they would take over the terminal
 
 
@@ -42,9 +43,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         help="an adapted file, or a plain one, which has no dial; several, or a folder of them, to switch between",
     )  # fmt: skip
     given.add_argument("--base", metavar="BASE.ply", help="the checkpoint, or another file, to compare with")
-    given.add_argument("--images", metavar="DIR", help="scene folder, for its cameras only")
-    common.add_activated(given)
-    common.add_antialiasing(given, photographs=False)
+    common.add_reading(given, "scene folder, for its cameras only", photographs=False)
     page = parser.add_argument_group("page")
     initial: Any = page.add_mutually_exclusive_group()
     initial.add_argument(
@@ -57,11 +56,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 
 def view_files(given: Sequence[str]) -> list[str]:
-    """The files to show: those given, and of a folder the checkpoints in it, by name, numbers by their value.
-
-    Raises:
-        ClodError: a folder has none.
-    """
+    """The files to show: those given, and of a folder the checkpoints in it, by name, numbers by their value."""
     return [file for path in given for file in (_files_in(Path(path)) if Path(path).is_dir() else [path])]
 
 
@@ -73,7 +68,7 @@ def _files_in(folder: Path) -> list[str]:
     for path in sorted(folder.iterdir(), key=natural):
         if path.suffix.lower() in FORMATS and path.is_file():
             with suppress(ClodError):  # point clouds and meshes are .ply files too
-                common.check_checkpoint(str(path))
+                check_readable(path)
                 splats.append(str(path))
     if not splats:
         raise ClodError(f"{folder}: has no splat in it; give the file, or the folder that has it")
@@ -87,13 +82,13 @@ def check(args: Namespace) -> None:
         raise ClodError(f"--sv is {args.sv:g}, it must be at least 0 (1 is full quality, 0 everything)")
     files = view_files(args.models)
     for path in (*files, *([args.base] if args.base else [])):
-        common.check_checkpoint(path)
-    if args.device_preset and not common.model_has_dial(files[0]):
+        check_readable(Path(path))
+    if args.device_preset and not file_has_dial(Path(files[0])):
         raise ClodError(f"{files[0]}: has no sigma_d, which --device-preset needs; adapt it first")
     if args.images is not None:
         common.check_scene(args.images)
-    elif args.device_preset:
-        common.check_stored_cameras(files[0], common.may_store(files[0], "viewpoint"))
+    elif args.device_preset and not common.may_store(files[0], "viewpoint"):
+        raise ClodError(f"{files[0]}: {NO_CAMERAS}")
 
 
 def run(args: Namespace) -> None:
@@ -121,30 +116,28 @@ def make_page(args: Namespace, console: Console) -> tuple[dict[str, Response], d
     from clod_adapter.viewer.payload import Payload, page_config
     from clod_adapter.viewer.server import Response
 
-    from .shared.inputs import read_cameras, read_checkpoint, with_filter, with_filter_of
+    from .shared.inputs import read_cameras, read_checkpoint, with_filter
     from .shared.measure import solve_dials
 
-    files, base = view_files(args.models), None
-    model = with_filter(read_checkpoint(files[0], console, args.activated), args, console)
-    if args.device_preset and args.images is None:
-        common.check_stored_cameras(files[0], bool(model.viewpoints))
-    others = [
-        with_filter(read_checkpoint(file, console, args.activated, model.origin), args, console) for file in files[1:]
-    ]
-    if args.base:
-        base = with_filter(read_checkpoint(args.base, console, args.activated, model.origin), args, console)
-        base = with_filter_of(base, model, args)
-    cameras, notes = read_cameras(model, args.images, console) if args.images else ([], [])
-    attenuation = model.gaussians.attenuation
-    solved, asked = solve_dials(args, model, cameras or model.viewpoints, console)
-    opening = solved[0] if args.device_preset and solved else args.sv
-    notes += asked
+    files = view_files(args.models)
+    models: list[Checkpoint] = []
+    for path in (*files, *([args.base] if args.base else [])):
+        origin = models[0].origin if models else None
+        models.append(with_filter(read_checkpoint(path, console, args.activated, origin), args, console))
+    base, model = models.pop() if args.base else None, models[0]
+    if args.device_preset and args.images is None and not model.viewpoints:
+        raise ClodError(f"{model.path}: {NO_CAMERAS}")
+    if base and args.antialiasing == "auto" and not base.filter_known:  # drawn as the model is
+        drawn = model.gaussians.screen_filter
+        base = replace(base, gaussians=base.gaussians.replace(screen_filter=drawn))
+    cameras = read_cameras(model, args.images, console) if args.images else []
+    attenuation, opening = model.gaussians.attenuation, args.sv
+    solved = solve_dials(args, model, cameras or model.viewpoints, console)
+    if args.device_preset and solved:
+        opening = solved[0]
     if opening is not None:
-        opening, more = common.initial_dial(opening, attenuation.max_sv if attenuation else None)
-        notes += more
-    for note in notes:
-        console.note(note)
-    payloads = payloads_of([model, *others]) | ({BASE: Payload.of(base)} if base else {})
+        opening = common.initial_dial(opening, attenuation.max_sv if attenuation else None, console)
+    payloads = payloads_of(models) | ({BASE: Payload.of(base)} if base else {})
     entries = {path: {"name": each.name, "href": path} for path, each in payloads.items()}
     model_entry, base_entry = entries.pop(MODEL), entries.pop(BASE, None)
     shown, placed, rest = cameras or model.cameras, model.placed and not cameras, tuple(entries.values())
@@ -154,8 +147,7 @@ def make_page(args: Namespace, console: Console) -> tuple[dict[str, Response], d
         answers[path] = Response("application/octet-stream", payload.size, payload.blocks)
     return answers, {
         "command": "view", "version": package_version(), "model": files[0], "files": files, "base": args.base,
-        "scene": args.images, "base_count": len(model.gaussians), "cameras": len(cameras),
-        "notes": [*model.notes, *notes],
+        "scene": args.images, "base_count": len(model.gaussians), "cameras": len(cameras), "notes": console.notes,
     }  # fmt: skip
 
 

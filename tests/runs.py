@@ -150,11 +150,6 @@ def names(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
 
 
-def notes_of(report: Any) -> list[str]:
-    """Without the note on LPIPS and FLIP, which depends on installed packages."""
-    return [note for note in report["notes"] if not note.startswith("without ")]
-
-
 def log_of(folder: Path, rank: object = "") -> str:
     return Path(f"{folder}{rank}.log").read_text()
 

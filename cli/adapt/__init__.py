@@ -3,21 +3,14 @@
 from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
+from pathlib import Path
 from typing import Any
 
 from clod_adapter.blocks.memory import parse_size
 from clod_adapter.errors import ClodError
+from clod_adapter.io.file_formats import check_readable
 
-from ..shared.command import (
-    Command,
-    add_activated,
-    add_antialiasing,
-    add_device,
-    add_misaligned_ok,
-    check_checkpoint,
-    check_scene,
-    page_files,
-)  # fmt: skip
+from ..shared.command import Command, add_reading, check_scene, page_files
 from ..shared.outputs import AdaptFiles, Outputs, check_ply_name
 from ..shared.process import launched
 from ..shared.settings import add_settings, make_config
@@ -32,13 +25,10 @@ def add_arguments(parser: ArgumentParser) -> None:
         "ply", metavar="PLY",
         help="checkpoint: a PLY in Inria's 3DGS layout, or another file that inspect reads; never modified",
     )  # fmt: skip
-    given.add_argument(
-        "--images", metavar="DIR",
-        help="scene folder: images/ with a COLMAP model in sparse/0, or a transforms.json of nerfstudio or instant-ngp "
-        "(default: none, see below)",
+    add_reading(
+        given, "scene folder: images/ with a COLMAP model in sparse/0, or a transforms.json of nerfstudio or "
+        "instant-ngp (default: none, see below)",
     )  # fmt: skip
-    add_activated(given)
-    add_antialiasing(given)
     output = parser.add_argument_group("output")
     output.add_argument(
         "-o", "--out", metavar="OUT.ply", help="output file (default: name of PLY with _clod, in the current folder)"
@@ -47,11 +37,9 @@ def add_arguments(parser: ArgumentParser) -> None:
     training = parser.add_argument_group("training")
     add_settings(training)
     training.add_argument("--resume", action="store_true", help="continue the same command where it was interrupted")
-    add_misaligned_ok(training)
     training.add_argument(
         "--accept-loss", action="store_true", help="exit code 0 even if s = 1 is far below the base (see exit codes)"
     )
-    add_device(training, "train and measure")
     options = parser.add_argument_group("advanced")
     options.add_argument(
         "--with", dest="keep_in", metavar="NAME", nargs="+", action="extend", choices=NAMES, default=[],
@@ -73,7 +61,7 @@ def check(args: Namespace) -> None:
         parse_size(args.memory)
         if launched().size > 1:
             raise ClodError("--memory needs a single process: run without torchrun")
-    check_checkpoint(args.ply)
+    check_readable(Path(args.ply))
     if args.images is not None:
         check_scene(args.images)
 

@@ -21,17 +21,13 @@ from clod_adapter.progress import Phase, Stopped
 from clod_adapter.training.plan import Plan
 from clod_adapter.training.state import Adapted
 
-from ..shared.console import duration
-from .listeners import ProgressDisplay, Saver, find_state, fingerprint, settings_key
+from ..shared.console import ProgressDisplay, duration
+from .listeners import Saver, fingerprint, settings_key
 from .prepare import Run, decide
 
 
 def adapt_in_blocks(run: Run) -> tuple[Plan, Adapted]:
-    """Trains the blocks whose files do not exist, and merges all; the result is of all Gaussians.
-
-    Raises:
-        Stopped: Ctrl-C; the same command resumes.
-    """
+    """Trains the blocks whose files do not exist, and merges all; the result is of all Gaussians."""
     assert run.memory is not None
     check_divisible(run.config)
     with run.console.meter(Phase.FINGERPRINT) as meter:
@@ -65,11 +61,7 @@ def adapt_in_blocks(run: Run) -> tuple[Plan, Adapted]:
 
 
 class Blocks:
-    """The blocks of a run, and their files.
-
-    Attributes:
-        key: identifies run and division in the files; hashes of two divisions differ if rounding has.
-    """
+    """The blocks of a run, and their files; ``key`` identifies run and division, whose hash differs if rounding has."""
 
     def __init__(
         self, run: Run, config: AdaptConfig, division: Division, views: Sequence[View], photographs: str
@@ -86,14 +78,7 @@ class Blocks:
         return f"block {block + 1} of {self.division.count}, pass {number} of {self.division.passes}"
 
     def train(self, block: int, number: int, before: Gaussians | None) -> Learned:
-        """Trains one block in one pass, unless its file exists.
-
-        Args:
-            before: the merged result of the first pass, in the second.
-
-        Raises:
-            Stopped: Ctrl-C.
-        """
+        """Trains one block in one pass, the second from the result ``before``, unless its file exists."""
         run, division, name = self.run, self.division, self.name(block, number)
         path = run.outputs.ply.with_suffix(f".block{block + 1}.pass{number}.safetensors")
         key = self.key | {"block": name}
@@ -101,15 +86,14 @@ class Blocks:
             return load_block(path, key, division, block)
         own, _ = block_config(division, block, self.config, first=number == 1)
         state = path.with_suffix(".resume.safetensors")
-        run_of = settings_key(own) | {"base_sha256": f"{key['checkpoint']}, {name}", "views_sha256": key["photographs"]}
-        resumed = find_state(state, state.exists(), own, run.console)
-        saver = Saver(state, run_of, resumed, run.console, run.stop, (run.args.ply, "before"))
+        saver = Saver(state, own, run.console, run.stop, resume=state.exists())
+        checkpoint = f"{key['checkpoint']}, {name}"
+        saver.identify(run.args.ply, "before", base_sha256=checkpoint, views_sha256=key["photographs"])
         with saver.rescuing("the same command"):
             with _displayed(run, name) as display:
                 learned, adapted = adapt_block(
                     division, self.views, self.config, block, after=before, progress=saver.saving(display),
-                    resume=resumed.state if resumed else None,
-                    cache=ImageCache(run.memory.cache) if run.memory else None,
+                    resume=saver.state, cache=ImageCache(run.memory.cache) if run.memory else None,
                 )  # fmt: skip
             saver.keep()
             release()

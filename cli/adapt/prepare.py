@@ -21,7 +21,7 @@ from clod_adapter.adapter import dial_tensors
 from clod_adapter.blocks.memory import IMAGES, MemoryEstimate, MemoryPlan, in_words, parse_size, plan_for_limit
 from clod_adapter.cameras import Scene, StoredView, View
 from clod_adapter.evaluation.evaluate import Row
-from clod_adapter.gaussians import Gaussians
+from clod_adapter.evaluation.robustness import scene_fingerprint
 from clod_adapter.io.checkpoint import Checkpoint
 from clod_adapter.io.scene.load import ImageCache
 from clod_adapter.progress import Phase, Stopped
@@ -29,24 +29,23 @@ from clod_adapter.training.loop import time_steps
 from clod_adapter.training.plan import NOT_NEEDED, Decision, Override, Plan
 from clod_adapter.training.planner import make_plan
 
-from ..shared.console import Console
+from ..shared.console import Console, ProgressDisplay
 from ..shared.inputs import (
     align,
     on_device,
     pick_device,
-    place_scene,
     prepare_kernels,
     read_checkpoint,
     read_scene,
+    scene_to_train,
     with_filter,
-    with_pseudo_views,
 )
 from ..shared.measure import Stopwatch, measure, report_dials
 from ..shared.outputs import AdaptFiles
 from ..shared.pages import SNAPSHOT_VIEWS
 from ..shared.process import GracefulStop, launched
 from ..shared.settings import make_config
-from .listeners import ProgressDisplay, Resumed, find_state
+from .listeners import Saver, fingerprint
 
 LONG = 100  # steps of a run that is worth a forecast
 CHEAPER = 0.7  # measuring a dial value, of measuring the base
@@ -54,50 +53,40 @@ WRITING = 1e8  # bytes of a PLY per second, with everything that is written besi
 
 
 class Run:
-    """The arguments, checked, the services that all steps use, and what ``read`` has found.
+    """The arguments, the services that all steps use, and what ``read`` has found.
 
     Attributes:
-        given: the settings of the options, by which ``--resume`` finds a run.
-        resumed: the state that it found.
         scene, config: without photographs or with too few, with pseudo views and lower learning rates.
-        alignment: the measurements of the alignment check, for the report; None without photographs.
+        alignment: the measurements of the alignment check; None without photographs.
         memory: the plan for ``--memory``; None without the option.
-        notes, forecast: for the report.
-        base_rows: the base at dial value 1; empty if nothing is held out; base_seconds: the time of measuring it.
-
-    Raises:
-        ClodError: options, or a state file, cannot be used.
+        base_rows: the base at dial value 1, none if nothing is held out; base_seconds: the time of measuring it.
     """
 
     base: Checkpoint
     scene: Scene
     alignment: dict[str, Any] | None = None
     memory: MemoryPlan | None = None
-    base_rows: tuple[Row, ...] = ()
+    base_rows: list[Row]
     base_seconds = 0.0
     forecast: dict[str, Any] | None = None
     forecast_at = 0.0
 
     def __init__(self, args: argparse.Namespace) -> None:
         self.args, self.console, self.watch = args, Console(args.quiet), Stopwatch()
-        self.stop = GracefulStop(aborts=launched().size == 1)
-        self.given = self.config = make_config(args)
+        self.stop = GracefulStop(aborts=launched().size == 1)  # launchers repeat signals
+        self.config = make_config(args)
         self.outputs = AdaptFiles.of(args.ply, args.out)
-        self.notes: list[str] = []
         resume = args.resume and (not args.memory or self.outputs.state.exists())  # blocks have files of their own
-        self.resumed: Resumed | None = find_state(self.outputs.state, resume, self.config, self.console)
+        self.saver = Saver(self.outputs.state, self.config, self.console, self.stop, resume)
 
     def read(self) -> None:
-        """Reads checkpoint and photographs, or places cameras.
-
-        Raises:
-            ClodError: something cannot be read, checkpoint and photographs do not fit, or memory is too small.
-        """
+        """Reads checkpoint and photographs, or places cameras."""
         args, console, watch, views = self.args, self.console, self.watch, list[View]()
         cache = ImageCache(int(IMAGES * parse_size(args.memory))) if args.memory else None
         with watch.time("load"):
             base = on_device(read_checkpoint(args.ply, console, args.activated), pick_device(args.device, console))
-            base = rows_on_disk(base, self.outputs.ply.parent)
+            if base.vertex is not None:  # only writing needs the file's rows
+                base = replace(base, vertex=mapped(base.vertex, self.outputs.ply.parent))
             photographs = read_scene(args.images, console, base.origin, cache) if args.images else None
         device = base.gaussians.means.device
         with watch.time("kernels"):
@@ -111,46 +100,40 @@ class Run:
         if base.gaussians.screen_filter.compensate:
             with watch.time("kernels"):
                 prepare_kernels(console, device, screen_filter=base.gaussians.screen_filter)
-        if photographs is None:
-            with watch.time("place"):
-                self.scene, self.config = place_scene(base.gaussians, self.config, console)
-        else:
-            with watch.time("evaluate"):
-                self.scene, self.config = with_pseudo_views(base.gaussians, photographs, self.config, console)
+        with watch.time("place" if photographs is None else "evaluate"):
+            self.scene, self.config = scene_to_train(base.gaussians, photographs, self.config, console)
         if args.memory:
             self.memory = plan_memory(base, self.scene, parse_size(args.memory), console)
 
-    def measure_base(self) -> None:
-        """Measures the base on the held-out views.
+    def identify(self) -> None:
+        """Refuses the state of another run."""
+        self.saver.identify(
+            self.args.ply, self.args.images or "the pseudo views",
+            base_sha256=fingerprint(self.base.gaussians), views_sha256=scene_fingerprint(self.scene),
+            overruled={"--with": sorted(self.args.keep_in), "--without": sorted(self.args.leave_out)},
+        )  # fmt: skip
 
-        Raises:
-            Stopped: Ctrl-C.
-        """
+    def measure_base(self) -> None:
+        """Measures the base on the held-out views."""
         args, console, scene = self.args, self.console, self.scene
         if columns := tuple(dial_tensors(self.base.gaussians)):
             used = columns if self.config.growth == "on" else columns[:1]
             dropped = "; its growth_d is dropped, as growth is off" if used < columns else ""
-            self.notes.append(f"{args.ply} has a dial already: continuing from its {' and '.join(used)}{dropped}")
+            console.note(f"{args.ply} has a dial already: continuing from its {' and '.join(used)}{dropped}")
         if not scene.test:
-            self.notes.append("no photographs are held out, so nothing is measured; at least two are needed")
+            console.note("no photographs are held out, so nothing is measured; at least two are needed")
         began = time.perf_counter()
-        with self.watch.time("evaluate"):
-            rows, interrupted = measure(self.base.gaussians, scene.test, [1.0], console, "base")
-        if interrupted:
+        with self.watch.time("evaluate"), self.stop.listening():
+            rows = measure(self.base.gaussians, scene.test, [1.0], console, self.stop, "base")
+        if self.stop.requests:
             raise Stopped("stopped while the base was measured")
         if rows and args.images is not None:  # of pseudo views only the rounding is measured
             console.say(f"base: {rows[0].psnr:.2f} dB on the held-out photographs")
-        for note in self.notes:
-            console.say(note)
-        self.base_rows, self.base_seconds = tuple(rows), time.perf_counter() - began
+        self.base_rows, self.base_seconds = rows, time.perf_counter() - began
 
 
 def decide(run: Run, display: ProgressDisplay) -> Plan:
-    """Makes the plan, with the effect of ``--trim``, and prints it.
-
-    Raises:
-        Stopped: Ctrl-C.
-    """
+    """Makes the plan, with the effect of ``--trim``, and prints it."""
     args, console, base = run.args, run.console, run.base.gaussians
     override = Override(frozenset(args.keep_in), frozenset(args.leave_out))
     plan = make_plan(base, run.scene, run.config, override, display)
@@ -163,20 +146,21 @@ def decide(run: Run, display: ProgressDisplay) -> Plan:
         seconds = plan.seconds | {"trim": time.perf_counter() - began}
         plan = replace(plan, decisions=(*plan.decisions, effect), seconds=seconds)
     show_plan(plan.decisions, console)
-    if plan.kept is not None:  # what is trained is a copy
-        move_to_disk(base, run.outputs.ply.parent)
+    for tensor in base.tensors().values() if plan.kept is not None else ():  # what is trained is a copy
+        if tensor.device.type == "cpu" and tensor.numel():
+            tensor.data = torch.from_numpy(mapped(tensor.numpy(), run.outputs.ply.parent))
     return plan
 
 
-def forecast(run: Run, plan: Plan) -> dict[str, Any] | None:
-    """Seconds and peak memory of the rest of the run, which are printed; from a few steps that are thrown away.
+def forecast(run: Run, plan: Plan) -> None:
+    """Estimates seconds and peak memory of the rest of the run, from a few steps that are thrown away.
 
-    None for runs that are too short, and in several processes.
+    Not of runs that are too short, and not in several processes.
     """
-    config, views, base = plan.config, len(run.scene.test), run.base
-    steps = config.steps - (run.resumed.state.steps if run.resumed else 0)
+    config, views, base, state = plan.config, len(run.scene.test), run.base, run.saver.state
+    steps = config.steps - (state.steps if state else 0)
     if steps < LONG or launched().size > 1:
-        return None
+        return
     with run.console.status("timing a few steps ..."):
         each, fixed = time_steps(plan.lean, run.scene, config, min(max(steps // 40, 16), 24), plan.subset)
     release()
@@ -192,7 +176,7 @@ def forecast(run: Run, plan: Plan) -> dict[str, Any] | None:
     memory = f", {in_words(peak)}" if peak else ""
     run.console.say(f"forecast: {minutes}{memory} ({steps:,} steps)")
     run.forecast_at = time.perf_counter()
-    return {"seconds": round(seconds, 1), "bytes": peak, "steps": steps}
+    run.forecast = {"seconds": round(seconds, 1), "bytes": peak, "steps": steps}
 
 
 def against_forecast(run: Run) -> dict[str, Any] | None:
@@ -202,17 +186,14 @@ def against_forecast(run: Run) -> dict[str, Any] | None:
 
 
 def peak_bytes() -> int:
-    """Of the memory of this process so far; 0 where that is not known."""
     try:
         import resource
     except ImportError:  # Windows
-        return 0
-
+        return 0  # not known
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
 
 
 def show_plan(decisions: Sequence[Decision], console: Console) -> None:
-    """One aligned line per decision, and one line with the names of what this scene does not need."""
     rows = [
         (decision.what, decision.verdict, decision.measured, _option(decision))
         for decision in decisions if decision.verdict != NOT_NEEDED
@@ -231,11 +212,6 @@ def _option(decision: Decision) -> str:
 
 
 def plan_memory(base: Checkpoint, scene: Scene, limit: int, console: Console) -> MemoryPlan:
-    """The plan for ``--memory``, which is printed.
-
-    Raises:
-        ClodError: it is too small; gives the minimum.
-    """
     views, gaussians = (*scene.train, *scene.test), base.gaussians
     pixels = [view.camera.width * view.camera.height for view in views]
     attributes = sum(tensor.element_size() * tensor.numel() for tensor in gaussians.tensors().values())
@@ -262,22 +238,7 @@ def _row_bytes(base: Checkpoint) -> int:
     return sum(4 * tensor[:1].numel() for tensor in base.gaussians.tensors().values())
 
 
-def rows_on_disk(base: Checkpoint, folder: Path) -> Checkpoint:
-    """The checkpoint with its file's rows, which only writing needs, on disk (``_mapped``).
-
-    A later change of the checkpoint's file does not reach them.
-    """
-    return base if base.vertex is None else replace(base, vertex=_mapped(base.vertex, folder))
-
-
-def move_to_disk(gaussians: Gaussians, folder: Path) -> None:
-    """Replaces, in place, the memory of all tensors on the CPU by a file (``_mapped``), whoever refers to them."""
-    for tensor in gaussians.tensors().values():
-        if tensor.device.type == "cpu" and tensor.numel():
-            tensor.data = torch.from_numpy(_mapped(tensor.numpy(), folder))
-
-
-def _mapped(array: np.ndarray, folder: Path) -> np.ndarray:
+def mapped(array: np.ndarray, folder: Path) -> np.ndarray:
     """The array in a mapped file without a name in ``folder``; itself where that cannot be written.
 
     Room for the outputs remains: four times its size must be free.

@@ -1,7 +1,7 @@
 """Adapting in several processes: the first one runs the command, the others only train.
 
-They communicate through the launcher's store. Only the first one reads files, prints and writes. The others wait for
-the training job that it sends them, or until it says that there is none, and end after it.
+Only the first one reads files, prints and writes. The others wait for the training job that it sends them through the
+launcher's store, or until it says that there is none, and end after it.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ from clod_adapter.training.plan import Plan
 from clod_adapter.training.pseudo_views import teachers_to
 from clod_adapter.training.state import Adapted, TrainingState
 
+from ..shared.console import ProgressDisplay
 from ..shared.process import GracefulStop, Launch, launched
-from .listeners import ProgressDisplay
 
 BACKENDS = {"cpu": "gloo", "cuda": "nccl"}  # of torch.distributed, by device
 if TYPE_CHECKING:
@@ -55,9 +55,9 @@ class TrainingJob:
 def leading() -> Iterator[None]:
     """Within the block the first process may give the others a job; after it they end."""
     store = _store()
+    _use_threads(1)
     try:
-        with _threads(Launch()):
-            yield
+        yield
     finally:
         with suppress(RuntimeError):  # the launcher has ended, which the others notice
             store.set(OVER, "1")
@@ -67,12 +67,7 @@ def leading() -> Iterator[None]:
 def together(
     plan: Plan, scene: Scene, state: TrainingState | None, display: ProgressDisplay
 ) -> Iterator[ProcessGroup | None]:
-    """The group to train with, after giving the others the job of ``plan.adapt``; None for a single process.
-
-    Raises:
-        ClodError: a process was lost before the first step; says why it ended.
-        Stopped: Ctrl-C, which the others have received too.
-    """
+    """The group to train with, after giving the others the job of ``plan.adapt``; None for a single process."""
     launch = launched()
     if launch.size == 1:
         yield None
@@ -87,7 +82,8 @@ def together(
     try:
         if any(_store().check([_reason(rank)]) for rank in range(1, launch.size)):  # it would wait for ten minutes
             raise ProcessLost("a process of the group has ended")
-        with _threads(launch), joined(_job_store(), launch.rank, launch.size) as group:
+        _use_threads(launch.local_size)
+        with joined(_job_store(), launch.rank, launch.size) as group:
             group.broadcast(job)
             del job, lean
             yield group
@@ -95,13 +91,16 @@ def together(
         if display.stop.requests:
             raise Stopped("stopped before the first step") from error
         raise ClodError(f"{explain(str(error))}; this was before the first step, so start again") from error
+    finally:
+        _use_threads(1)  # the others are done
 
 
 def take_part() -> None:
     """What a process that is not the first does: trains silently, if there is a job."""
     launch, stop = launched(), GracefulStop(aborts=False)
     # A process that is lost is reported by the first one, or by the launcher.
-    with stop.listening(), _threads(launch), suppress(ProcessLost):
+    _use_threads(launch.local_size)
+    with stop.listening(), suppress(ProcessLost):
         if _is_called(stop, launch.rank):
             _train(launch, stop)
 
@@ -194,17 +193,8 @@ def _reason(rank: int) -> str:
     return f"clod/reason{rank}"
 
 
-@contextmanager
-def _threads(launch: Launch) -> Iterator[None]:
-    """Within the block this process uses its share of the machine's cores, or OMP_NUM_THREADS.
-
-    torchrun sets that to 1 by default, which is ignored.
-    """
-    before = torch.get_num_threads()
+def _use_threads(local_size: int) -> None:
+    """Uses this process's share of the machine's cores, or OMP_NUM_THREADS, unless it is torchrun's default, 1."""
     if os.environ.get("OMP_NUM_THREADS", "1") == "1":
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        torch.set_num_threads(max(cores // launch.local_size, 1))
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
+        torch.set_num_threads(max(cores // local_size, 1))

@@ -13,7 +13,6 @@ from clod_adapter._support.version import package_version
 from clod_adapter.adapter import Adapter, detach, extract, trim
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.evaluate import Row
-from clod_adapter.evaluation.robustness import scene_fingerprint
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.adapter_file import save_adapter
 from clod_adapter.io.atomic import atomic_paths, remove_leftovers
@@ -22,13 +21,12 @@ from clod_adapter.progress import Progress
 from clod_adapter.training.plan import Plan
 from clod_adapter.training.state import Adapted
 
-from ..shared.console import command_line, duration, put
-from ..shared.measure import calibrate, machine, measure, report_dials, table, with_frame_times
+from ..shared.console import ProgressDisplay, duration
+from ..shared.measure import by_dial, calibrate, machine, measure, report_dials, table, with_frame_times
 from ..shared.outputs import size, write_report
 from ..shared.pages import AdaptPage
 from ..shared.process import GracefulStop, listen_no_more
 from .blocks import adapt_in_blocks
-from .listeners import ProgressDisplay, Saver, fingerprint, settings_key
 from .prepare import Run, against_forecast, decide, forecast
 from .processes import describe_processes, explain, hurried, together
 
@@ -38,20 +36,13 @@ LOST, ENOUGH = (0.1, 1.0), (33.0, 25.0)
 
 @dataclass(frozen=True)
 class Result:
-    """What is written.
-
-    Attributes:
-        base: the checkpoint with the rows and SH degrees that are written; with ``--trim`` not all of them.
-        gaussians: ``adapter`` applied to ``base``.
-        notes: of the training, for the report.
-    """
+    """What is written: ``gaussians``, which are ``adapter`` applied to ``base``, of which ``--trim`` keeps a part."""
 
     plan: Plan
     adapted: Adapted
     base: Checkpoint
     adapter: Adapter
     gaussians: Gaussians
-    notes: list[str]
 
 
 @dataclass(frozen=True)
@@ -61,54 +52,34 @@ class Measurements:
     base: list[Row]
     rows: list[Row]
     plain: list[Row]
-    notes: list[str]
     interrupted: bool
 
 
 def adapt(args: argparse.Namespace) -> dict[str, Any]:
     """Plans, trains, writes and reports."""
-    run, saver = Run(args), None
+    run = Run(args)
     run.read()
+    page = AdaptPage(run.base.gaussians, run.scene, run.config, run.console) if args.report else None
     if run.memory is not None and run.memory.blocks > 1:
         run.measure_base()
         with run.stop.listening():  # until training has ended, so that a Ctrl-C loses nothing
-            page = make_page(run)
             result = make_result(run, *adapt_in_blocks(run))
-        return finish(run, result, page, None)
-    saver = Saver(
-        run.outputs.state, key_of(run), run.resumed, run.console, run.stop,
-        (args.ply, args.images or "the pseudo views"),
-    )  # fmt: skip
+        return finish(run, result, page)
+    run.identify()
     run.measure_base()
     with run.stop.listening():
         display = ProgressDisplay(run.console, run.stop)
         plan = decide(run, display)
-        page, run.forecast = make_page(run), forecast(run, plan)
-        with saver.rescuing():
-            result = make_result(run, plan, train(run, plan, display, saver, page))
-    with saver.rescuing():
-        return finish(run, result, page, saver)
+        forecast(run, plan)
+        with run.saver.rescuing():
+            result = make_result(run, plan, train(run, plan, display, page))
+    with run.saver.rescuing():
+        return finish(run, result, page)
 
 
-def key_of(run: Run) -> dict[str, Any]:
-    """Identifies the run in its state file."""
-    hashes = {"base_sha256": fingerprint(run.base.gaussians), "views_sha256": scene_fingerprint(run.scene)}
-    requested = {"--with": sorted(run.args.keep_in), "--without": sorted(run.args.leave_out)}
-    return settings_key(run.given) | hashes | {"overruled": requested}
-
-
-def make_page(run: Run) -> AdaptPage | None:
-    return AdaptPage(run.base.gaussians, run.scene, run.config, run.console) if run.args.report else None
-
-
-def train(run: Run, plan: Plan, display: ProgressDisplay, saver: Saver, page: AdaptPage | None) -> Adapted:
-    """Trains as planned; returns the result for all Gaussians.
-
-    Raises:
-        ClodError: the state to resume from does not fit.
-        KeyboardInterrupt: a second Ctrl-C.
-    """
-    base, scene, state = run.base.gaussians, run.scene, run.resumed.state if run.resumed else None
+def train(run: Run, plan: Plan, display: ProgressDisplay, page: AdaptPage | None) -> Adapted:
+    """Trains as planned; returns the result for all Gaussians."""
+    base, scene, saver = run.base.gaussians, run.scene, run.saver
 
     def show(now: Progress) -> bool:
         part = now.gaussians
@@ -117,8 +88,8 @@ def train(run: Run, plan: Plan, display: ProgressDisplay, saver: Saver, page: Ad
             page(now)
         return display(now)
 
-    with closing(display), together(plan, scene, state, display) as group:
-        adapted = plan.adapt(scene, saver.saving(show), state, group)
+    with closing(display), together(plan, scene, saver.state, display) as group:
+        adapted = plan.adapt(scene, saver.saving(show), saver.state, group)
     saver.keep()
     start_seconds = adapted.start_seconds + plan.seconds["start"]
     adapted = replace(adapted, gaussians=plan.whole(base, adapted.gaussians), start_seconds=start_seconds)
@@ -141,30 +112,27 @@ def make_result(run: Run, plan: Plan, adapted: Adapted) -> Result:
         config=asdict(run.config), origin=base.origin,
     )  # fmt: skip
     adapter = replace(adapter, kept=kept, sh_degree=degree)
-    notes = training_notes(run, adapter, adapted)
-    for note in notes:
-        run.console.say(note)
-    return Result(plan, adapted, base, adapter, adapter.apply(gaussians), notes)
+    note_training(run, adapter, adapted)
+    return Result(plan, adapted, base, adapter, adapter.apply(gaussians))
 
 
-def training_notes(run: Run, adapter: Adapter, adapted: Adapted) -> list[str]:
-    notes, tau = list[str](), adapter.attenuation.tau
+def note_training(run: Run, adapter: Adapter, adapted: Adapted) -> None:
+    note, tau = run.console.note, adapter.attenuation.tau
     if run.base.gaussians.sigma_d is None and tau < run.config.tau:
-        notes.append(f"tau is {tau:.2g} instead of {run.config.tau:g}, because the Gaussians are faint")
+        note(f"tau is {tau:.2g} instead of {run.config.tau:g}, because the Gaussians are faint")
     if adapted.lost:
-        notes.append(f"training ended at step {adapted.steps}: {explain(adapted.lost)}")
+        note(f"training ended at step {adapted.steps}: {explain(adapted.lost)}")
     if adapted.failed:
-        notes.append(f"training ended early, and the result so far is written: {adapted.failed}")
+        note(f"training ended early, and the result so far is written: {adapted.failed}")
     if adapted.watched and (times := adapted.watched.rollbacks):
         what = "attributes were frozen in the end" if adapted.watched.frozen else "learning rates were halved"
         back = f"training made s = 1 worse on watched views and returned to an earlier state {times} times"
-        notes.append(f"{back}: {what}; the views watched are not trained on")
+        note(f"{back}: {what}; the views watched are not trained on")
     if adapted.held:
-        notes.append(f"{adapted.held:,} Gaussians were not moved by some steps: their gradients were not finite")
-    return notes
+        note(f"{adapted.held:,} Gaussians were not moved by some steps: their gradients were not finite")
 
 
-def finish(run: Run, result: Result, page: AdaptPage | None, saver: Saver | None) -> dict[str, Any]:
+def finish(run: Run, result: Result, page: AdaptPage | None) -> dict[str, Any]:
     """Measures the result, writes it once, and returns the report."""
     interrupted, console, outputs = result.adapted.interrupted, run.console, run.outputs
     # After a Ctrl-C that ended training the next one aborts, as its message says.
@@ -173,8 +141,7 @@ def finish(run: Run, result: Result, page: AdaptPage | None, saver: Saver | None
         measured = measure_result(run, result, stop)
         report = write_result(run, result, measured)
     complete = not interrupted and not measured.interrupted
-    if saver:
-        saver.close(complete)
+    run.saver.close(complete)
     for path in outputs.blocks() if complete else ():
         path.unlink(missing_ok=True)
         remove_leftovers(path)
@@ -182,11 +149,11 @@ def finish(run: Run, result: Result, page: AdaptPage | None, saver: Saver | None
         console.say("interrupted: the page of --report was not written")
     elif page:  # after the report, which it changes
         path = outputs.ply.with_suffix(".html")
-        report |= {"seconds": seconds(run, result)}  # with those of writing; the page shows the total without its own
+        report["seconds"] = seconds(run, result)  # with those of writing; the page shows the total without its own
         with run.watch.time("page"):
-            changes = page.write(path, report, result.gaussians, result.adapted.start_seconds)
-        changes["seconds"] = report["seconds"] | {"page": run.watch.report()["page"]}
-        report |= changes | {"forecast": against_forecast(run)}
+            page.write(path, report, result.gaussians, result.adapted.start_seconds)
+        report["seconds"]["page"] = run.watch.report()["page"]
+        report["forecast"] = against_forecast(run)
         write_report(outputs.report, report)
     print_summary(run, measured, report)
     if "loss" in report:
@@ -198,30 +165,23 @@ def measure_result(run: Run, result: Result, stop: GracefulStop) -> Measurements
     """Measures the result on the held-out views, unless the run is to end now.
 
     That is after a Ctrl-C that came when training was complete, and if the launcher ends the processes.
-
-    Args:
-        stop: as in ``measure``.
     """
-    views, console, base = run.scene.test, run.console, list(run.base_rows)
+    views, console, base, plain = run.scene.test, run.console, run.base_rows, list[Row]()
     if run.stop.requests > 0 and not result.adapted.interrupted or hurried(result.adapted):
-        return Measurements(base, [], [], [], interrupted=True)
-    plain, notes, detached = list[Row](), list[str](), detach(result.gaussians)
+        return Measurements(base, [], [], interrupted=True)
+    detached = detach(result.gaussians)
     with run.watch.time("evaluate"):
-        rows, interrupted = measure(result.gaussians, views, report_dials(run.config.max_sv), console, stop=stop)
-        if not interrupted:
-            plain, interrupted = measure(detached, views, [1.0], console, "plain", stop=stop)
-        if not interrupted:
+        rows = measure(result.gaussians, views, report_dials(run.config.max_sv), console, stop)
+        if not stop.requests:
+            plain = measure(detached, views, [1.0], console, stop, "plain")
+        if not stop.requests:
             measured = [(run.base.gaussians, base), (result.gaussians, rows), (detached, plain)]
-            (base, rows, plain), notes, interrupted = with_frame_times(measured, views, console, stop)
-    return Measurements(base, rows, plain, notes, interrupted)
+            base, rows, plain = with_frame_times(measured, views, console, stop)
+    return Measurements(base, rows, plain, stop.requests > 0)
 
 
 def write_result(run: Run, result: Result, measured: Measurements) -> dict[str, Any]:
-    """Writes the three files, and returns the report.
-
-    All three are complete, beside those of an earlier run, before the first replaces its predecessor. Only a kill
-    between two renames leaves files of different runs; if one cannot be written, the earlier files stay.
-    """
+    """Writes the three files, all before the first replaces that of an earlier run, and returns the report."""
     outputs, console, adapter, gaussians = run.outputs, run.console, result.adapter, result.gaussians
     if measured.rows and not measured.interrupted:
         try:
@@ -246,20 +206,18 @@ def write_result(run: Run, result: Result, measured: Measurements) -> dict[str, 
 def describe(run: Run, result: Result, measured: Measurements) -> dict[str, Any]:
     """The report, except the calibration and the sizes of the files."""
     args, adapted, adapter = run.args, result.adapted, result.adapter
-    late = "the measurements were interrupted: only the dial values that were finished are reported"
-    notes = [*result.base.notes, *run.scene.notes, *run.notes, *result.notes, *measured.notes]
     if measured.interrupted:
-        run.console.say(late)
-        notes.append(late)
+        run.console.note("the measurements were interrupted: only the dial values that were finished are reported")
     report = {
         "command": "adapt", "version": package_version(), "model": args.ply, "scene": args.images,
         "teacher": teacher(args), "screen_filter": asdict(result.gaussians.screen_filter),
         "base_count": adapter.base_count, "config": adapter.config, "attenuation": asdict(adapter.attenuation),
         "steps": adapted.steps, "interrupted": adapted.interrupted, "machine": machine(),
-        "processes": describe_processes(adapted, run.config.batch), "outputs": run.outputs.names(),
+        "processes": describe_processes(adapted, run.config.batch),
+        "outputs": {name: str(path) for name, path in vars(run.outputs).items()},
         "sh_degree": result.gaussians.sh_degree, "device": str(result.gaussians.means.device),
-        "seconds": seconds(run, result), "resumed_from": run.resumed and run.resumed.state.steps,
-        "alignment": run.alignment, "notes": notes, "base_rows": [row.as_dict() for row in measured.base],
+        "seconds": seconds(run, result), "resumed_from": run.saver.state and run.saver.state.steps,
+        "alignment": run.alignment, "notes": run.console.notes, "base_rows": [row.as_dict() for row in measured.base],
         "rows": [row.as_dict() for row in measured.rows],
         "detached_row": measured.plain[0].as_dict() if measured.plain else None,
         "watched": adapted.watched and asdict(adapted.watched), "plan": result.plan.as_dict(),
@@ -287,7 +245,6 @@ def judge(measured: Measurements, photographs: bool) -> tuple[str, bool]:
 
 
 def seconds(run: Run, result: Result) -> dict[str, float]:
-    """Wall times by phase."""
     plan, adapted = result.plan, result.adapted
     planning = sum(plan.seconds.values()) - plan.seconds["start"]
     times = {"plan": planning, "start": adapted.start_seconds, "train": adapted.seconds}
@@ -299,20 +256,20 @@ def teacher(args: argparse.Namespace) -> str:
 
 
 def print_summary(run: Run, measured: Measurements, report: dict[str, Any]) -> None:
-    """Prints the measurements, the files, and what to do next."""
     args, outputs = run.args, run.outputs
     if measured.rows:
-        put(f"\n{table(measured.rows, measured.base, measured.plain)}\n")
+        marked = [("base", row) for row in measured.base] + by_dial(measured.rows)
+        print(f"\n{table(marked + [('plain', row) for row in measured.plain])}\n")
         if measured.plain:
-            put(f"plain: {outputs.ply} in a viewer that does not know the dial\n")
+            print(f"plain: {outputs.ply} in a viewer that does not know the dial\n")
     for path in vars(outputs).values():
-        put(f"{size(path):>9}  {path}")
+        print(f"{size(path):>9}  {path}")
     page = report["seconds"].get("page")
     more = f", and {duration(page)} for the page" if page else ""
-    put(f"\n{duration(report['seconds']['total'] if page else run.watch.total())} in all{more}; next:")
+    print(f"\n{duration(report['seconds']['total'] if page else run.watch.total())} in all{more}; next:")
     model = shlex.quote(str(outputs.ply))
     images = [] if args.images is None else [f"--images {shlex.quote(args.images)}"]
-    print(command_line(f"clod-adapt view {model}", f"--base {shlex.quote(args.ply)}", *images))
+    print("  clod-adapt view", model, f"--base {shlex.quote(args.ply)}", *images)
     if images:
         sv = " ".join(f"{s:g}" for s in sorted({1.0, args.max_sv}))
-        print(command_line(f"clod-adapt eval {model}", *images, f"--sv {sv}"))
+        print("  clod-adapt eval", model, *images, f"--sv {sv}")

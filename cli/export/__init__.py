@@ -12,16 +12,14 @@ from typing import TYPE_CHECKING, Any
 from clod_adapter._support.version import package_version
 from clod_adapter.errors import ClodError
 from clod_adapter.io import file_formats
-from clod_adapter.io.file_formats import Format
+from clod_adapter.io.file_formats import Format, check_readable, file_has_dial
 from clod_adapter.io.formats.splat_transform import SplatTransform
 
 from ..shared import command as common
-from ..shared.console import Console, put
+from ..shared.console import Console
 from ..shared.outputs import Outputs, size
 
 if TYPE_CHECKING:
-    from clod_adapter.io.checkpoint import Checkpoint
-
     from .files import Export
 
 DIGITS = 6  # significant digits of a level, all of them in its file's name
@@ -57,12 +55,11 @@ def levels_of(text: str) -> list[float]:
 def add_arguments(parser: ArgumentParser) -> None:
     given = parser.add_argument_group("input")
     given.add_argument("model", metavar="MODEL", help="an adapted file, or a plain one to convert")
-    given.add_argument("--images", metavar="DIR", help="scene folder: cameras to bake for, and for the views of a page")
+    about = "scene folder: cameras to bake for, and for the views of a page"
+    common.add_reading(given, about, photographs=False)
     given.add_argument(
         "--camera", metavar="PHOTO", help="bake for the camera of this photograph alone; its suffix can be left out"
     )
-    common.add_activated(given)
-    common.add_antialiasing(given, photographs=False)
     dial = parser.add_argument_group("dial values, one of")
     common.add_dial_options(dial, "the dial value to bake", "(in the file written)", several=False)
     dial.add_argument(
@@ -118,8 +115,8 @@ def check(args: Namespace) -> None:
         )  # fmt: skip
     suffix = "" if folder else suffix_of(out)
     common.check_dials(args, args.model, measured=("fps",) if args.images is not None else ())
-    common.check_checkpoint(args.model)
-    dial, form = common.model_has_dial(args.model), FORMATS.get(suffix)
+    check_readable(Path(args.model))
+    dial, form = file_has_dial(Path(args.model)), FORMATS.get(suffix)
     others = ", ".join(other for other, each in FORMATS.items() if each.carries_sigma)
     refuse(
         (bakes and not dial, f"{args.model}: has no sigma_d, so no dial value can be baked; export it without one"),
@@ -141,20 +138,16 @@ def refuse(*cases: tuple[object, str]) -> None:
 
 
 def suffix_of(out: Path) -> str:
-    """The known suffix of ``out``, in lower case.
-
-    Raises:
-        ClodError: it has none.
-    """
+    """The known suffix of ``out``, in lower case."""
     found = [suffix for suffix in FORMATS if out.name.lower().endswith(suffix) and len(out.name) > len(suffix)]
     if not found:
         raise ClodError(f"{out}: --out must end in one of {', '.join(FORMATS)}, which is the format")
     return max(found, key=len)  # .compressed.ply ends in .ply
 
 
-def folder_option(args: Namespace) -> str | None:
-    """The option with which OUT is a folder of levels."""
-    return args.folder[0] if args.folder else None
+def folder_option(args: Namespace) -> str:
+    """The option with which OUT is a folder of levels, or an empty one."""
+    return args.folder[0] if args.folder else ""
 
 
 def is_page(args: Namespace) -> bool:
@@ -162,125 +155,86 @@ def is_page(args: Namespace) -> bool:
 
 
 def level_paths(out: Path, levels: Sequence[float]) -> list[Path]:
-    """``out`` with ``_s2`` before its suffix for each dial value."""
     suffix = out.name[-len(suffix_of(out)) :]
     return [out.with_name(f"{out.name.removesuffix(suffix)}_s{level:g}{suffix}") for level in levels]
 
 
 def outputs(args: Namespace) -> Outputs:
-    out, folder = Path(args.out), folder_option(args) is not None
+    out, folder = Path(args.out), bool(args.folder)
     levels = level_paths(out, args.levels) if args.levels and not folder else []
     return Outputs([] if levels else [out], levels, whole=folder, inputs=[args.model], scene=args.images)
 
 
 def run(args: Namespace) -> dict[str, Any]:
+    from clod_adapter.bake import order_by_extinction
     from clod_adapter.inspection.report import extra_columns
 
-    from ..shared.inputs import on_device, pick_device, read_checkpoint, with_filter
-    from ..shared.measure import Stopwatch
+    from ..shared.inputs import on_device, pick_device, read_cameras, read_checkpoint, with_filter
+    from ..shared.measure import Stopwatch, choose_dials, solve_dials
+    from .files import Export, find_cameras
 
-    console, watch = Console(args.quiet), Stopwatch()
+    console, watch, page = Console(args.quiet), Stopwatch(), is_page(args)
     model = with_filter(read_checkpoint(args.model, console, args.activated), args, console)
     if args.images is not None and args.fps:
         model = on_device(model, pick_device(args.device, console))
-    export, notes = prepare(args, model, console)
-    dials, more = dial_values(args, export, console)
-    names = (model.vertex.dtype.names if model.vertex is not None else None) or ()
-    if dropped := extra_columns(names, model.gaussians.sh_degree):
-        more.append(f"columns dropped: {', '.join(dropped)}")
-    notes += [*more, *filter_notes(args, export, dials)]
-    for note in notes:
-        console.say(note)
-    written, losses = write(args, export, dials)
-    losses = list(dict.fromkeys(losses))
-    for note in losses:
-        console.note(note)
-    put("\n".join(output_line(output, len(export.gaussians)) for output in written))
+    cameras: Sequence[Any] = ()
+    about, views, gaussians, attenuation = "", list[Any](), model.gaussians, model.gaussians.attenuation
+    counts = common.given_budget(args) and not (page and args.psnr_drop)
+    if args.order or args.levels or counts or (args.sv and not page):
+        cameras, about = find_cameras(args, model, console)
+    if page and args.images is not None:
+        views = read_cameras(model, args.images, console)
+    if args.order:
+        gaussians = gaussians.select(order_by_extinction(gaussians, cameras))
+    export = Export(args, model, gaussians, cameras, about, views, console)
     camera = export.camera
-    if dials is not None and not is_page(args):
-        cameras = f"exact at the camera of {camera.name} only" if camera else f"baked for {export.about}"
+    dials = args.levels or solve_dials(args, model, cameras, console, baked=camera is None and not page)
+    if dials and page and attenuation is not None:
+        dials = [common.initial_dial(dials[0], attenuation.max_sv, console)]
+    elif dials:
+        dials = choose_dials(dials, attenuation, console)
+    names = (model.vertex.dtype.names if model.vertex is not None else None) or ()
+    if dropped := extra_columns(names, gaussians.sh_degree):
+        console.note(f"columns dropped: {', '.join(dropped)}")
+    drawn, dialled = gaussians.screen_filter, gaussians.sigma_d is not None and not dials
+    if drawn.compensate and not dialled and (args.folder or suffix_of(Path(args.out)) not in STORE_FILTER):
+        options = 'antiAlias in PlayCanvas, rasterize_mode="antialiased" in gsplat'
+        console.note(f"trained antialiased ({drawn.description}): most readers need an option for it: {options}")
+    written = write(args, export, dials)
+    print("\n".join(output_line(output, len(gaussians)) for output in written))
+    if dials and not page:
+        baked = f"exact at the camera of {camera.name} only" if camera else f"baked for {about}"
         scales = "" if model.gaussians.growth_d is None else "; the scales include growth"
-        put(f"{cameras}; lossy: without the dial and the Gaussians culled at this dial value{scales}")
+        print(f"{baked}; lossy: without the dial and the Gaussians culled at this dial value{scales}")
     return {
-        "command": "export", "version": package_version(), "model": args.model, "base_count": len(export.gaussians),
-        "camera": camera.name if camera else None, "cameras": len(export.cameras), "order": args.order,
-        "outputs": written, "notes": [*model.notes, *notes, *losses], "seconds": watch.report(),
+        "command": "export", "version": package_version(), "model": args.model, "base_count": len(gaussians),
+        "camera": camera.name if camera else None, "cameras": len(cameras), "order": args.order,
+        "outputs": written, "notes": console.notes, "seconds": watch.report(),
     }  # fmt: skip
 
 
-def prepare(args: Namespace, model: Checkpoint, console: Console) -> tuple[Export, list[str]]:
-    """The model sorted as asked for, with the cameras to bake for; and notes on these."""
-    from clod_adapter.bake import order_by_extinction
-    from clod_adapter.io.scene.load import load_cameras
-
-    from .files import Export, find_cameras
-
-    page, views, notes = is_page(args), list[Any](), list[str]()
-    cameras: Sequence[Any] = ()
-    about = ""
-    counts = common.given_budget(args) and not (page and args.psnr_drop)
-    if args.order or args.levels or counts or (args.sv and not page):
-        cameras, about, notes = find_cameras(args, model, console)
-    if page and args.images is not None:
-        views, notes = load_cameras(args.images, model.origin)
-    gaussians = model.gaussians
-    if args.order:
-        gaussians = gaussians.select(order_by_extinction(gaussians, cameras))
-    return Export(args, model, gaussians, cameras, about, views, console), notes
-
-
-def dial_values(args: Namespace, export: Export, console: Console) -> tuple[list[float] | None, list[str]]:
-    """The dial values to bake, the initial one for a page, or None to keep the dial; and notes on them."""
-    from ..shared.measure import choose_dials, solve_dials
-
-    page, attenuation = is_page(args), export.model.gaussians.attenuation
-    solved, notes = args.levels, list[str]()
-    if solved is None:
-        baked = export.camera is None and not page
-        solved, notes = solve_dials(args, export.model, export.cameras, console, baked=baked)
-    if solved is None:
-        return None, notes
-    if page and attenuation is not None:
-        opening, more = common.initial_dial(solved[0], attenuation.max_sv)
-        return [opening], notes + more
-    dials, beyond = choose_dials(solved, attenuation)
-    return dials, notes + beyond
-
-
-def filter_notes(args: Namespace, export: Export, dials: list[float] | None) -> list[str]:
-    """A note on an antialiasing filter that readers of the output do not find in the file."""
-    drawn, dialled = export.gaussians.screen_filter, export.gaussians.sigma_d is not None and dials is None
-    if not drawn.compensate or dialled or (not args.folder and suffix_of(Path(args.out)) in STORE_FILTER):
-        return []
-    options = 'antiAlias in PlayCanvas, rasterize_mode="antialiased" in gsplat'
-    return [f"trained antialiased ({drawn.description}): most readers need an option for it: {options}"]
-
-
-def write(args: Namespace, export: Export, dials: list[float] | None) -> tuple[list[dict[str, Any]], list[str]]:
-    """Writes all files of the command, all or none; a description of each, and notes."""
+def write(args: Namespace, export: Export, dials: list[float] | None) -> list[dict[str, Any]]:
+    """Writes all files of the command, all or none; a description of each."""
     from clod_adapter.io.atomic import atomic_path, atomic_paths
 
-    out, outputs, notes = Path(args.out), list[dict[str, Any]](), list[str]()
+    out, outputs = Path(args.out), list[dict[str, Any]]()
     if option := folder_option(args):
-        assert dials is not None  # by check
         with atomic_path(out) as folder:
-            counts, notes = export.write_folder(folder / FOLDERS[option], dials)
+            counts = export.write_folder(folder / FOLDERS[option], dials or [])
             total = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
-        levels = [{"virtual_scale": dial, "count": count} for dial, count in zip(dials, counts, strict=True)]
-        return [{"file": str(out / FOLDERS[option]), "levels": levels, "count": sum(counts), "bytes": total}], notes
+        levels = [{"virtual_scale": dial, "count": count} for dial, count in zip(dials or [], counts, strict=True)]
+        return [{"file": str(out / FOLDERS[option]), "levels": levels, "count": sum(counts), "bytes": total}]
     paths = level_paths(out, args.levels) if args.levels else [out]
     chosen: list[Any] = dials or [None]
     with atomic_paths(*paths) as temporaries:
         for path, temporary, dial in zip(paths, temporaries, chosen, strict=True):
-            count, more = export.write(temporary, suffix_of(path), dial)
+            count = export.write(temporary, suffix_of(path), dial)
             taken = temporary.stat().st_size
             outputs.append({"file": str(path), "virtual_scale": dial, "count": count, "bytes": taken})
-            notes += more
-    return outputs, notes
+    return outputs
 
 
 def output_line(output: dict[str, Any], total: int) -> str:
-    """One line on an output of a model of ``total`` Gaussians."""
     line, dial = f"wrote {output['file']} ({size(output['bytes'])}): {output['count']:,}", output.get("virtual_scale")
     if levels := output.get("levels"):
         shown = ", ".join(f"{level['count']:,} at s = {level['virtual_scale']:.5g}" for level in levels)
@@ -293,7 +247,6 @@ def output_line(output: dict[str, Any], total: int) -> str:
 
 
 def format_table() -> str:
-    """The table of formats for --help."""
     lines = []
     for suffix, form in FORMATS.items():
         first, *more = form.about

@@ -6,13 +6,13 @@ import math
 from argparse import ArgumentParser, Namespace, RawDescriptionHelpFormatter
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
-from importlib import import_module, metadata
+from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from clod_adapter.config import DEVICES, FILTERS
 from clod_adapter.errors import ClodError
-from clod_adapter.io.file_formats import PLY, check_readable, file_has_dial, format_of
+from clod_adapter.io.file_formats import PLY, file_has_dial, format_of
 from clod_adapter.io.scene.folder import find_cameras
 from clod_adapter.report.charts import chart_file
 from clod_adapter.report.style import check_matplotlib
@@ -23,6 +23,8 @@ from .process import check_printed
 if TYPE_CHECKING:
     from argparse import _ActionsContainer  # a parser or one of its groups
 
+    from .console import Console
+
 MANUAL = "index.md"  # the first page; where it is installed: pyproject.toml's data-files
 
 
@@ -30,15 +32,8 @@ MANUAL = "index.md"  # the first page; where it is installed: pyproject.toml's d
 class Command:
     """The texts of ``--help``, and the functions that parse, check and run a command.
 
-    A module of a command imports torch, and what imports it, within functions, so that ``--help`` and errors of
-    arguments take no second.
-
-    Attributes:
-        add_arguments: adds the options, in groups, to a parser.
-        check: raises ClodError, before torch is imported, for arguments and files that cannot work.
-        run: does the work; returns the object that --json prints, or None.
-        outputs: the files that the arguments name for writing, and those they name for reading; after ``check``.
-        needs_torch: whether ``run`` needs it.
+    Its module imports torch within functions, so that ``--help`` and errors of arguments, which ``check`` raises, take
+    no second. ``run`` returns the object that --json prints, or None; ``outputs`` is called after ``check``.
     """
 
     summary: str
@@ -66,19 +61,10 @@ class Command:
         return parser
 
 
-def run_of(module: str) -> Callable[[Namespace], dict[str, Any] | None]:
-    """``run`` of a module below ``clod_adapter.cli``, imported when it is called."""
-    return lambda args: import_module(f"clod_adapter.cli.{module}").run(args)
-
-
 class Parser(ArgumentParser):
-    """Reports misuse as a ClodError, which ``main`` prints in one line.
+    """Reports misuse as a ClodError, which ``main`` prints in one line."""
 
-    Attributes:
-        general: the last group of ``--help``: options that all commands have.
-    """
-
-    general: Any
+    general: Any  # the last group of --help: options that all commands have
 
     def parse_args(self, args: Any = None, namespace: Any = None) -> Any:
         """Refuses empty values too: Path takes one for the current folder, and ``or`` for none."""
@@ -103,7 +89,7 @@ class Parser(ArgumentParser):
 
 
 def manual() -> Path | None:
-    """The first page of the documentation on this machine: of a checkout, or as installed; None without it."""
+    """The first page of the documentation on this machine: of a checkout, or as installed."""
     checkout = Path(__file__).resolve().parents[2] / "docs" / MANUAL
     if checkout.is_file():
         return checkout
@@ -138,7 +124,11 @@ def add_activated(options: _ActionsContainer) -> None:
     )  # fmt: skip
 
 
-def add_antialiasing(options: _ActionsContainer, photographs: bool = True) -> None:
+def add_reading(options: _ActionsContainer, images: str = "", photographs: bool = True) -> None:
+    """Adds ``--images``, required unless there is another help for it, and the options for reading a checkpoint."""
+    scene = images or "scene folder: photographs, and a COLMAP model or transforms.json"
+    options.add_argument("--images", metavar="DIR", required=not images, help=scene)
+    add_activated(options)
     otherwise = "by the photographs" if photographs else "off"
     options.add_argument(
         "--antialiasing", choices=["auto", *FILTERS], default="auto",
@@ -152,17 +142,6 @@ def add_device(options: _ActionsContainer, what: str) -> None:
     options.add_argument("--device", choices=["auto", "cpu", "cuda"], default="auto", help=f"where to {what}; {usual}")
 
 
-def add_images(options: _ActionsContainer) -> None:
-    scene = "scene folder: photographs, and a COLMAP model or transforms.json"
-    options.add_argument("--images", metavar="DIR", required=True, help=scene)
-
-
-def add_misaligned_ok(options: _ActionsContainer) -> None:
-    options.add_argument(
-        "--misaligned-ok", action="store_true", help="train even if the checkpoint does not match the photographs"
-    )
-
-
 def add_dial_options(options: _ActionsContainer, sv_help: str, where: str, *, several: bool) -> None:
     """Adds --sv and the budgets, of which one may be given; ``several`` allows more than one value of it."""
     times = "measured first" if several else "in the file, or with --images measured first"
@@ -170,9 +149,8 @@ def add_dial_options(options: _ActionsContainer, sv_help: str, where: str, *, se
     count = "+" if several else 1
     group.add_argument("--sv", metavar="S", type=float, nargs=count, help=sv_help)
     for name, metavar, kind, text in OPTIONS:
-        option = f"--{name.replace('_', '-')}"
         shown = text.format(where=where, times=times)
-        group.add_argument(option, metavar=metavar, type=kind, nargs=count, help=shown)
+        group.add_argument(as_option(name), metavar=metavar, type=kind, nargs=count, help=shown)
     if not several:
         add_device_preset(group)
 
@@ -184,17 +162,17 @@ def add_device_preset(options: _ActionsContainer) -> None:
     )
 
 
-def initial_dial(virtual_scale: float, max_sv: float | None) -> tuple[float, list[str]]:
-    """The initial dial value of a page, and a note where it differs from the one asked for.
+def as_option(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
 
-    Args:
-        max_sv: largest value of the page's dial; None for a file without a dial.
-    """
-    if max_sv is None:
-        return 1.0, [f"no sigma_d, so s = {virtual_scale:g} has no effect"] if virtual_scale > 1 else []
-    if virtual_scale > max_sv:
-        return max_sv, [f"the page's dial ends at s = {max_sv:g}, the largest value trained for, and opens there"]
-    return virtual_scale, []
+
+def initial_dial(virtual_scale: float, max_sv: float | None, console: Console) -> float:
+    """The initial dial value of a page whose dial ends at ``max_sv``, None without a dial."""
+    if max_sv is None and virtual_scale > 1:
+        console.note(f"no sigma_d, so s = {virtual_scale:g} has no effect")
+    if max_sv is not None and virtual_scale > max_sv:
+        console.note(f"the page's dial ends at s = {max_sv:g}, the largest value trained for, and opens there")
+    return 1.0 if max_sv is None else min(virtual_scale, max_sv)
 
 
 def given_budget(args: Namespace) -> tuple[str, str, list[float]] | None:
@@ -203,7 +181,7 @@ def given_budget(args: Namespace) -> tuple[str, str, list[float]] | None:
         return "keep", f"--device-preset {device}, --keep", [DEVICES[device]]
     for name, *_ in OPTIONS:
         if getattr(args, name, None) is not None:
-            return name, f"--{name.replace('_', '-')}", getattr(args, name)
+            return name, as_option(name), getattr(args, name)
     return None
 
 
@@ -216,11 +194,7 @@ def page_files(path: Path, charts: list[str]) -> list[Path]:
 
 
 def check_dials(args: Namespace, model: str, *, measured: Collection[str] = ("fps",)) -> None:
-    """Refuses dial values out of range, and budgets that need something the file does not have.
-
-    Args:
-        measured: budgets that the command solves by measuring, without a calibration.
-    """
+    """Refuses dial values out of range, and budgets that need what the file lacks, except those to be ``measured``."""
     for virtual_scale in args.sv or ():
         if not 0 <= virtual_scale < math.inf:
             raise ClodError(f"--sv has {virtual_scale:g}, it must be at least 0 (1 is full quality, 0 everything)")
@@ -231,7 +205,7 @@ def check_dials(args: Namespace, model: str, *, measured: Collection[str] = ("fp
     for value in values:
         if not 0 < value < math.inf:
             raise ClodError(f"{option} has {value:g}, it must be positive and finite")
-    if not model_has_dial(model):
+    if not file_has_dial(Path(model)):
         raise ClodError(f"{model}: has no sigma_d, which {option} needs; adapt it first: clod-adapt {model} ...")
     needed = name != "keep" and name not in measured
     if needed and not may_store(model, "calibrated"):
@@ -250,22 +224,6 @@ def may_store(model: str, name: str) -> bool:
     if format_of(path) is not PLY:
         return True
     return any(comment.startswith(f"{PREFIX}{name} ") for comment in all_comments(read_head(path).ply))
-
-
-def check_stored_cameras(model: str, stored: bool) -> None:
-    """Refuses --device-preset without a scene, of a file that stores no cameras."""
-    if not stored:
-        raise ClodError(f"{model}: stores no cameras, which --device-preset needs; give --images")
-
-
-def model_has_dial(model: str) -> bool:
-    """Whether the file's header has a sigma_d."""
-    return file_has_dial(Path(model))
-
-
-def check_checkpoint(path: str) -> None:
-    """Refuses a file that is no checkpoint, by its first bytes."""
-    check_readable(Path(path))
 
 
 def check_scene(folder: str) -> None:

@@ -5,14 +5,16 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
 from tqdm import tqdm
 
 from clod_adapter.io.settings import WARNING
-from clod_adapter.progress import Listener, Progress
+from clod_adapter.progress import Listener, Phase, Progress
+
+from .process import GracefulStop
 
 tqdm.monitor_interval = 0  # bars are updated at every step anyway, and its thread may fail to start
 LINE_EVERY = 10.0  # seconds between progress lines if stderr is not a terminal
@@ -23,9 +25,10 @@ BAR_FORMAT = "{desc} {percentage:3.0f}%|{bar}| {remaining} left{postfix}"
 
 @dataclass(frozen=True)
 class Console:
-    """Writes lines to stderr; nothing with ``quiet``."""
+    """Writes lines to stderr, nothing with ``quiet``; keeps the notes, for the report."""
 
     quiet: bool = False
+    notes: list[str] = field(default_factory=list)
 
     def say(self, text: str) -> None:
         if not self.quiet:
@@ -33,14 +36,16 @@ class Console:
             sys.stderr.flush()
 
     def note(self, text: str) -> None:
-        """Writes a note on input or output, or a warning if it begins so."""
-        self.say(f"  {text}" if text.startswith(WARNING) else f"  note: {text}")
+        """Writes and keeps a note on input or output, or a warning if it begins so."""
+        if text not in self.notes:
+            self.notes.append(text)
+            self.say(f"  {text}" if text.startswith(WARNING) else f"  note: {text}")
 
     @contextmanager
     def status(self, text: str) -> Iterator[Callable[[str], None]]:
-        """Shows on a terminal the work under way, if its progress is unknown.
+        """Shows the work under way, if its progress is unknown; yields a function that changes the text.
 
-        Yields a function that changes the text; without a terminal it writes a line now and then.
+        Without a terminal that function writes a line now and then.
         """
         shown, printed = None, time.perf_counter()
         if not self.quiet and sys.stderr.isatty():
@@ -60,38 +65,25 @@ class Console:
             if shown is not None:
                 shown.close()
 
-    @contextmanager
-    def meter(self, label: str) -> Iterator[Meter]:
+    def meter(self, label: str) -> closing[Meter]:
         """The progress of a phase, until the end of the block."""
-        meter = Meter(self, label)
-        try:
-            yield meter
-        finally:
-            meter.close()
+        return closing(Meter(self, label))
 
 
-@dataclass
 class Meter:
-    """Progress with the time left: a bar on a terminal, otherwise a line now and then. Is a ``progress.Listener``.
+    """A listener: a bar on a terminal, otherwise a line now and then, with the time left.
 
     Args:
-        slow: for few and uneven steps: shown from the start, with the time left from the mean pace.
         initial: the share that was done before.
     """
 
-    console: Console
-    label: str
-    slow: bool = False
-    initial: float = 0.0
-    bar: Any = None
-    began: float = field(default_factory=time.perf_counter)
-    printed: float = field(default_factory=time.perf_counter)
-
-    def __post_init__(self) -> None:
-        if not self.console.quiet and sys.stderr.isatty():
+    def __init__(self, console: Console, label: str, initial: float = 0.0) -> None:
+        self.console, self.label, self.initial = console, label, initial
+        self.began = self.printed = time.perf_counter()
+        self.bar: Any = None
+        if not console.quiet and sys.stderr.isatty():
             self.bar = tqdm(
-                total=1.0, initial=self.initial, desc=self.label, bar_format=BAR_FORMAT, file=sys.stderr,
-                leave=False, delay=0 if self.slow else 0.5, smoothing=0 if self.slow else 0.3,
+                total=1.0, initial=initial, desc=label, bar_format=BAR_FORMAT, file=sys.stderr, leave=False, delay=0.5,
                 miniters=0, dynamic_ncols=True,
             )  # fmt: skip
 
@@ -119,14 +111,34 @@ class Meter:
             self.bar = None
 
 
-def put(text: str, end: str = "\n") -> None:
-    """Prints a result on stdout."""
-    print(text, end=end)
+class ProgressDisplay:
+    """A listener that shows each phase, training as ``training``, and stops on Ctrl-C."""
 
+    def __init__(self, console: Console, stop: GracefulStop, training: str = Phase.TRAINING) -> None:
+        self.console, self.stop, self.training = console, stop, training
+        self.phase: Phase | None = None
+        self.meter: Meter | None = None
 
-def command_line(*parts: str) -> str:
-    """An indented command."""
-    return f"  {' '.join(parts)}"
+    def __call__(self, now: Progress) -> bool:
+        training = now.phase == Phase.TRAINING
+        if self.meter is None or now.phase != self.phase:
+            self.close()
+            self.phase, before = now.phase, now.share if now.done > 1 else 0.0  # a resumed training's
+            self.meter = Meter(self.console, self.training if training else now.phase, before)
+        by_time = now.share > now.done / max(now.total, 1)
+        self.meter.update(now.share, f"step {now.done}" if by_time else f"{now.done}/{now.total}")
+        if not now.error and not self.stop.requests:
+            return True
+        self.close()
+        if training and not now.error:
+            again = " (Ctrl-C again aborts without writing)" if self.stop.aborts and self.stop.presses else ""
+            self.console.say(f"stopping{again}")
+        return False
+
+    def close(self) -> None:
+        if self.meter is not None:
+            self.meter.close()
+            self.meter = None
 
 
 def clipped(text: str, most: int) -> str:

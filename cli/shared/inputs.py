@@ -14,7 +14,7 @@ from numba.core.event import Event, Listener, install_listener
 
 from clod_adapter._support.text import first_line
 from clod_adapter.alignment.check import MOST_VIEWS, Alignment, check_alignment
-from clod_adapter.alignment.screen_filter import FilterComparison, compare_filters
+from clod_adapter.alignment.screen_filter import compare_filters
 from clod_adapter.alignment.search import Guess, cameras_in, guess_frame, scene_in
 from clod_adapter.cameras import Camera, Scene, View
 from clod_adapter.config import CLASSIC, FILTERS, AdaptConfig, ScreenFilter
@@ -39,22 +39,18 @@ from .outputs import size
 def read_checkpoint(
     path: str, console: Console, activated: Activated | None = None, origin: Origin | None = None
 ) -> Checkpoint:
-    """Reads a checkpoint and prints its contents; options as for ``load``."""
     with console.status(f"reading {path} ({size(Path(path))}) ..."):
         checkpoint = load(path, activated=activated, origin=origin)
     gaussians = checkpoint.gaussians
-    columns = " and ".join(dial_columns(gaussians.tensors()))
-    dial = f", with {columns}" if columns else ""
-    drawn = gaussians.screen_filter
-    filtered = "" if drawn == CLASSIC else f", drawn with {drawn.description}"
-    console.say(f"{path}: {len(gaussians):,} Gaussians, SH degree {gaussians.sh_degree}{dial}{filtered}")
+    columns, drawn = " and ".join(dial_columns(gaussians.tensors())), gaussians.screen_filter
+    more = f", with {columns}" * bool(columns) + f", drawn with {drawn.description}" * (drawn != CLASSIC)
+    console.say(f"{path}: {len(gaussians):,} Gaussians, SH degree {gaussians.sh_degree}{more}")
     for note in checkpoint.notes:
         console.note(note)
     return checkpoint
 
 
 def read_scene(folder: str, console: Console, origin: Origin, cache: ImageCache | None = None) -> Scene:
-    """Reads the photographs and prints how they are used."""
     with console.meter(Phase.PHOTOGRAPHS) as meter:
         scene = load_scene(folder, origin=origin, progress=meter, cache=cache)
     camera = scene.train[0].camera
@@ -65,48 +61,48 @@ def read_scene(folder: str, console: Console, origin: Origin, cache: ImageCache 
     return scene
 
 
-def with_pseudo_views(
-    gaussians: Gaussians, scene: Scene, config: AdaptConfig, console: Console
+def scene_to_train(
+    gaussians: Gaussians, photographs: Scene | None, config: AdaptConfig, console: Console
 ) -> tuple[Scene, AdaptConfig]:
-    """``pseudo_views.add_pseudo_views``, with its notes."""
+    """Adds pseudo views where photographs are few, and replaces them where there are none; and the settings for it."""
     with console.meter(Phase.CAMERAS) as meter:
-        more, lighter = add_pseudo_views(gaussians, scene, config, meter)
-    for note in more.notes[len(scene.notes) :]:
-        console.note(note)
-    return more, lighter
-
-
-def place_scene(gaussians: Gaussians, config: AdaptConfig, console: Console) -> tuple[Scene, AdaptConfig]:
-    """A scene of pseudo views, with its notes, and the settings to train on it."""
-    with console.meter(Phase.CAMERAS) as meter:
-        cameras = place_cameras(gaussians, seed=config.seed, progress=meter)
-    with console.meter(Phase.PSEUDO_VIEWS) as meter:
-        scene = render_pseudo_views(gaussians, cameras, progress=meter)
+        if photographs is not None:
+            scene, config = add_pseudo_views(gaussians, photographs, config, meter)
+        else:
+            cameras = place_cameras(gaussians, seed=config.seed, progress=meter)
+    if photographs is None:
+        with console.meter(Phase.PSEUDO_VIEWS) as meter:
+            scene = render_pseudo_views(gaussians, cameras, progress=meter)
+        config = config.lighter(LIGHTEST).for_views(len(scene.train), STEPS_PER_PLACED)
     for note in scene.notes:
-        console.say(note)
-    return scene, config.lighter(LIGHTEST).for_views(len(scene.train), STEPS_PER_PLACED)
+        console.note(note)
+    return scene, config
 
 
-def read_model_and_scene(
-    args: argparse.Namespace, console: Console, others: Sequence[str] = ()
-) -> tuple[Checkpoint, dict[str, Checkpoint], Scene, torch.device]:
-    """The model of ``args``, other files by path, the scene, and the device that the Gaussians are on.
+def read_inputs(
+    args: argparse.Namespace, paths: Sequence[str], console: Console, *, training: bool = False, required: bool = False
+) -> tuple[list[Checkpoint], Scene]:
+    """Checkpoints, with their screen-space filters, and the photographs in the frame of the first one.
 
-    All coordinates are relative to the model's origin.
+    All coordinates are relative to its origin.
     """
-    device = pick_device(args.device, console)
-    model = read_checkpoint(args.model, console, args.activated)
-    read = {path: read_checkpoint(path, console, args.activated, model.origin) for path in others}
-    scene = read_scene(args.images, console, model.origin)
-    return on_device(model, device), {path: on_device(each, device) for path, each in read.items()}, scene, device
+    device, found = pick_device(args.device, console), list[Checkpoint]()
+    for path in paths:
+        origin = found[0].origin if found else None
+        found.append(on_device(read_checkpoint(path, console, args.activated, origin), device))
+    scene = read_scene(args.images, console, found[0].origin)
+    prepare_kernels(console, device, training=training)
+    scene, _ = align(found[0], scene, args.images, console, required=required)
+    return [with_filter(each, args, console, [*scene.test, *scene.train]) for each in found], scene
+
+
+def require_held_out(scene: Scene, images: str) -> None:
+    if not scene.test:
+        raise ClodError(f"{images}: there are no held-out photographs to evaluate on; give at least two")
 
 
 def pick_device(name: str, console: Console) -> torch.device:
-    """The device of ``--device``; prints why a GPU is not used.
-
-    Raises:
-        ClodError: cuda was asked for and does not work; the message says what to install.
-    """
+    """The device of ``--device``; prints why a GPU is not used. Without one that works, cuda is an error."""
     if name == "cpu" or (name == "auto" and not torch.cuda.is_available()):
         return torch.device("cpu")
     reason = no_gpu()
@@ -122,24 +118,18 @@ def pick_device(name: str, console: Console) -> torch.device:
 
 def no_gpu() -> str | None:
     """Why no GPU backend works, None if one does. The first call may compile gsplat for minutes."""
-    if torch.cuda.is_available():
-        return _fails() or unusable()
-    if torch.version.cuda is None:
+    if not torch.cuda.is_available() and torch.version.cuda is None:
         return f"torch {torch.__version__} is built without CUDA: install torch from https://pytorch.org for your CUDA"
-    return "torch finds no NVIDIA GPU; check with nvidia-smi that there is one and that its driver is new enough"
-
-
-def _fails() -> str | None:
-    """Why torch cannot compute on the GPU that it finds: not supported by this torch, or in use."""
+    if not torch.cuda.is_available():
+        return "torch finds no NVIDIA GPU; check with nvidia-smi that there is one and that its driver is new enough"
     try:
         torch.ones(1, device="cuda").add_(1).item()
-    except (RuntimeError, AssertionError) as error:
+    except (RuntimeError, AssertionError) as error:  # not supported by this torch, or in use
         return f"torch cannot compute on it ({first_line(error)}); clod-adapt doctor prints a fix"
-    return None
+    return unusable()
 
 
 def on_device(checkpoint: Checkpoint, device: torch.device) -> Checkpoint:
-    """The checkpoint with its Gaussians on the device. Photographs stay in main memory and are copied one at a time."""
     return replace(checkpoint, gaussians=checkpoint.gaussians.to(device))
 
 
@@ -149,47 +139,28 @@ WORDS = {"off": "without antialiasing", "on": "with antialiasing", "mip": "with 
 def with_filter(
     checkpoint: Checkpoint, args: argparse.Namespace, console: Console, views: Sequence[View] = ()
 ) -> Checkpoint:
-    """The checkpoint with the filter to render it with, and a note, also printed, where the file has another or none.
+    """The checkpoint with the screen-space filter of ``--antialiasing``.
 
-    The filter is that of ``--antialiasing``. With ``auto`` it is the file's; if the file has none, the one whose
-    renders of ``views`` are clearly closest to the photographs, or without views the default.
+    With ``auto`` it is the file's; if that has none, the one whose renders of ``views`` are clearly the closest.
     """
-    gaussians = checkpoint.gaussians
-    if args.antialiasing != "auto":
-        given = FILTERS[args.antialiasing]
-        if given == gaussians.screen_filter or not checkpoint.filter_known:
-            return replace(checkpoint, gaussians=gaussians.replace(screen_filter=given))
-        stored = gaussians.screen_filter.description
-        note = f"{checkpoint.path}: rendered {WORDS[args.antialiasing]} (--antialiasing); the file has {stored}"
-        return _noted(checkpoint, given, note, console)
-    if checkpoint.filter_known or not views:
+    gaussians, name = checkpoint.gaussians, args.antialiasing
+    stored = gaussians.screen_filter
+    if name == "auto" and views and not checkpoint.filter_known:
+        with console.status("comparing screen-space filters with the photographs ..."):
+            found = compare_filters(gaussians, views, stored.name or "off")
+        name = found.chosen
+        if name != found.expected:
+            chosen, expected = (f"{found.psnr[each]:.2f} dB {WORDS[each]}" for each in (name, found.expected))
+            console.note(
+                f"{checkpoint.path}: by the photographs it was trained {WORDS[name]}: {chosen}, {expected}; rendered "
+                f"so (--antialiasing {found.expected} overrides it)"
+            )
+    elif name != "auto" and checkpoint.filter_known and FILTERS[name] != stored:
+        had = f"the file has {stored.description}"
+        console.note(f"{checkpoint.path}: rendered {WORDS[name]} (--antialiasing); {had}")
+    if name == "auto":
         return checkpoint
-    with console.status("comparing screen-space filters with the photographs ..."):
-        found = compare_filters(gaussians, views, gaussians.screen_filter.name or "off")
-    if found.chosen == found.expected:
-        return checkpoint
-    return _noted(checkpoint, found.screen_filter, _measured_note(checkpoint, found), console)
-
-
-def with_filter_of(base: Checkpoint, model: Checkpoint, args: argparse.Namespace) -> Checkpoint:
-    """The base of a model, with the model's filter if its own file has none."""
-    if args.antialiasing != "auto" or base.filter_known or not model.filter_known:
-        return base
-    return replace(base, gaussians=base.gaussians.replace(screen_filter=model.gaussians.screen_filter))
-
-
-def _measured_note(checkpoint: Checkpoint, found: FilterComparison) -> str:
-    chosen, expected = (f"{found.psnr[name]:.2f} dB {WORDS[name]}" for name in (found.chosen, found.expected))
-    return (
-        f"{checkpoint.path}: by the photographs it was trained {WORDS[found.chosen]}: {chosen}, {expected}; "
-        f"rendered so (--antialiasing {found.expected} overrides it)"
-    )
-
-
-def _noted(checkpoint: Checkpoint, screen_filter: ScreenFilter, note: str, console: Console) -> Checkpoint:
-    console.say(note)
-    gaussians = checkpoint.gaussians.replace(screen_filter=screen_filter)
-    return replace(checkpoint, gaussians=gaussians, notes=(*checkpoint.notes, note))
+    return replace(checkpoint, gaussians=gaussians.replace(screen_filter=FILTERS[name]))
 
 
 def pick_views(scene: Scene, wanted: Sequence[str]) -> list[View]:
@@ -205,11 +176,7 @@ def pick_views(scene: Scene, wanted: Sequence[str]) -> list[View]:
 
 
 def named(cameras: Sequence[Camera], name: str, option: str) -> list[Camera]:
-    """The cameras whose photograph has this name; if none has, without its suffix, its folder, or both.
-
-    Raises:
-        ClodError: no photograph has this name.
-    """
+    """The cameras whose photograph has this name; if none has, without its suffix, its folder, or both."""
     whole = [camera for camera in cameras if camera.name == name]
     if found := whole or [camera for camera in cameras if name in _shorter(camera.name)]:
         return found
@@ -228,10 +195,7 @@ CPU = torch.device("cpu")
 def prepare_kernels(
     console: Console, device: torch.device = CPU, *, training: bool = True, screen_filter: ScreenFilter = CLASSIC
 ) -> None:
-    """Evaluates, and with ``training`` adapts, a scene of one Gaussian, so that all kernels are compiled.
-
-    Training with a filter that compensates opacities needs another kernel.
-    """
+    """Evaluates, and with ``training`` adapts, a scene of one Gaussian, so that all kernels are compiled."""
     one = Gaussians(
         torch.zeros(1, 3), torch.ones(1, 4), torch.zeros(1, 3), torch.zeros(1), torch.zeros(1, 1, 3),
         torch.zeros(1, 3, 3), screen_filter=screen_filter,
@@ -279,81 +243,59 @@ SMALL = 320  # pixels, width of photographs that only tell the frame
 def align(
     checkpoint: Checkpoint, scene: Scene, images: str, console: Console, *, required: bool
 ) -> tuple[Scene, dict[str, Any]]:
-    """Compares renders with the photographs; after a poor match tries other frames, and uses one that fits clearly.
+    """The scene with its cameras in the checkpoint's frame, if that fits clearly; and measurements for the report.
 
-    Args:
-        required: for training: raises where the checkpoint fits in no frame, and warns of a poor match; otherwise
-            warns of the former alone.
-
-    Returns:
-        The scene with its cameras in the checkpoint's frame, and with notes, which are printed. For the report, the
-        numbers of ``check_alignment``, in the frame given; ``guess``, another frame that fits, in words; and ``frame``,
-        the one that the cameras were moved to, with its ``psnr``.
-
-    Raises:
-        ClodError: the checkpoint does not match.
+    Where the checkpoint fits in no frame, that is an error if ``required``, for training, and otherwise a warning.
     """
-    base, ply, views = checkpoint.gaussians, checkpoint.path, [*scene.test, *scene.train]
-    with console.status("comparing the checkpoint with the photographs ..."):
-        found = check_alignment(base, views)
-    guess = _other_frame(checkpoint, views, found, images, console) if found.doubtful else None
-    numbers: dict[str, Any] = found.as_dict() | {"guess": guess and guess.frame.description, "frame": None}
+    ply, views = checkpoint.path, [*scene.test, *scene.train]
+    found, guess = _compared(checkpoint, views, images, console)
+    frame = None
     if guess and guess.clear:
-        scene, numbers["frame"] = scene_in(scene, guess.frame), guess.frame.as_dict() | {"psnr": guess.psnr}
-        notes = [_moved(checkpoint, images, found, guess)]
-    elif found.fits and guess is None:
-        notes = [FLAT.format(images=images)] if required and not found.views else []
-        notes += [OTHER_COLOURS.format(ply=ply, images=images)] if required and found.margin < 0 else []
-    else:
+        scene, frame = scene_in(scene, guess.frame), guess.frame.as_dict() | {"psnr": guess.psnr}
+    elif guess or not found.fits:
         message = f"{ply}: does not match {images}: {mismatch(found, guess)}"
         if required:
             raise ClodError(f"{message}; use --misaligned-ok to train anyway")
-        notes = [f"warning: {message}"]
+        console.note(f"warning: {message}")
+    elif required and not found.views:
+        console.note(FLAT.format(images=images))
+    elif required and found.margin < 0:
+        console.note(OTHER_COLOURS.format(ply=ply, images=images))
+    return scene, found.as_dict() | {"guess": guess and guess.frame.description, "frame": frame}
+
+
+def read_cameras(model: Checkpoint, images: str, console: Console, *, training: bool = False) -> list[Camera]:
+    """``load_cameras``, moved into the model's frame, which few small photographs tell."""
+    every, notes = load_cameras(images, model.origin)
+    cameras = load_cameras(images, model.origin, training=True)[0] if training else every
     for note in notes:
-        console.say(note)
-    return replace(scene, notes=(*scene.notes, *notes)), numbers
-
-
-def read_cameras(
-    model: Checkpoint, images: str, console: Console, *, training: bool = False
-) -> tuple[list[Camera], list[str]]:
-    """``load_cameras``, moved into the model's frame, which few small photographs tell; and notes."""
-    cameras, notes = load_cameras(images, model.origin, training=training)
+        console.note(note)
     try:
         scene = load_scene(images, origin=model.origin, max_width=SMALL, most=MOST_VIEWS)
     except ClodError:  # cameras alone will do
-        return cameras, notes
+        return cameras
     prepare_kernels(console, model.gaussians.means.device, training=False)
-    views = [*scene.test, *scene.train]
-    found = check_alignment(model.gaussians, views)
+    _, guess = _compared(model, [*scene.test, *scene.train], images, console, every)
+    return cameras_in(cameras, guess.frame) if guess and guess.clear else cameras
+
+
+def _compared(
+    checkpoint: Checkpoint, views: Sequence[View], images: str, console: Console, cameras: Sequence[Camera] = ()
+) -> tuple[Alignment, Guess | None]:
+    """How renders match the photographs, and after a poor match another frame that explains them better."""
+    with console.status("comparing the checkpoint with the photographs ..."):
+        found = check_alignment(checkpoint.gaussians, views)
     if not found.doubtful:
-        return cameras, notes
-    every = load_cameras(images, model.origin)[0] if training else cameras
-    guess = _other_frame(model, views, found, images, console, every)
-    if guess is None or not guess.clear:
-        return cameras, notes
-    return cameras_in(cameras, guess.frame), [*notes, _moved(model, images, found, guess)]
-
-
-def _moved(checkpoint: Checkpoint, images: str, found: Alignment, guess: Guess) -> str:
-    return (
-        f"{images}: the cameras are moved into the frame of {checkpoint.path} ({guess.frame.name}): renders have "
-        f"{guess.psnr:.1f} dB there, {found.psnr:.1f} dB as given"
-    )
-
-
-def _other_frame(
-    checkpoint: Checkpoint,
-    views: Sequence[View],
-    found: Alignment,
-    images: str,
-    console: Console,
-    cameras: Sequence[Camera] = (),
-) -> Guess | None:
-    """Another frame that explains the photographs better, if there is one."""
+        return found, None
     with console.status("poor match: trying other frames ..."):
         points = load_points(images, checkpoint.origin)
-        return guess_frame(checkpoint.gaussians, views, found, points, cameras)
+        guess = guess_frame(checkpoint.gaussians, views, found, points, cameras)
+    if guess and guess.clear:
+        console.note(
+            f"{images}: the cameras are moved into the frame of {checkpoint.path} ({guess.frame.name}): renders have "
+            f"{guess.psnr:.1f} dB there, {found.psnr:.1f} dB as given"
+        )
+    return found, guess
 
 
 def mismatch(found: Alignment, guess: Guess | None) -> str:

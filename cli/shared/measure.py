@@ -27,12 +27,12 @@ from clod_adapter.evaluation.popping import Popping
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.checkpoint import Checkpoint
 from clod_adapter.origin import Origin
-from clod_adapter.progress import Phase, Progress, Stopped
+from clod_adapter.progress import Phase, Stopped
 
 from .command import given_budget
 from .console import Console
 from .inputs import prepare_kernels
-from .process import GracefulStop, launched
+from .process import GracefulStop
 
 # Round values, each about 1.4 times the last, or more between 1 and 5; max_sv < 1/tau = 50.
 REPORT_DIALS = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0, 10.0, 14.0, 20.0, 28.0, 40.0)
@@ -62,7 +62,6 @@ class Stopwatch:
 
 
 def machine() -> dict[str, Any]:
-    """The hardware and software that times were measured on."""
     import numba
     import torch
 
@@ -79,11 +78,9 @@ def machine() -> dict[str, Any]:
 
 
 def machine_name(device: str = "cpu") -> str:
-    """The machine in one line: the hardware that determines frame times on that type of device."""
+    """The hardware that determines frame times on that type of device."""
     about = machine()
-    if device == "cuda":
-        return about["gpu"]
-    return f"{about['cpu']}, {about['threads']} threads"
+    return about["gpu"] if device == "cuda" else f"{about['cpu']}, {about['threads']} threads"
 
 
 def _cpu_name() -> str:
@@ -101,13 +98,11 @@ def report_dials(max_sv: float) -> list[float]:
     return [s for s in REPORT_DIALS if s < max_sv] + [max_sv]
 
 
-def table(rows: Sequence[Row], base_rows: Sequence[Row] = (), plain_rows: Sequence[Row] = ()) -> str:
-    """A table: the base first, then the dial values, then the rows without the dial."""
-    marked = [("base", row) for row in base_rows] + [(f"{row.virtual_scale:.5g}", row) for row in rows]
-    return rows_table(marked + [("plain", row) for row in plain_rows])
+def by_dial(rows: Sequence[Row]) -> list[tuple[str, Row]]:
+    return [(f"{row.virtual_scale:.5g}", row) for row in rows]
 
 
-def rows_table(marked: Sequence[tuple[str, Row]]) -> str:
+def table(marked: Sequence[tuple[str, Row]]) -> str:
     """A table of labelled rows."""
     width = max(6, *(len(label) for label, _ in marked))
     lines = [f"{'dial':>{width}}  PSNR dB    SSIM        kept            in view  frame ms"]
@@ -118,7 +113,6 @@ def rows_table(marked: Sequence[tuple[str, Row]]) -> str:
 
 
 def popping_table(results: Sequence[tuple[str, Popping]]) -> str:
-    """A table of popping measurements, with an explanation; what moves is above its numbers."""
     lines = [
         "popping: change of the image per step, in levels of 255 (RMS over the image,",
         "largest change of a pixel). Halving the step halves the largest change of a",
@@ -137,74 +131,45 @@ def popping_table(results: Sequence[tuple[str, Popping]]) -> str:
 DIALS = (1.0, 2.0, 3.0, 5.0)
 
 
-def choose_dials(given: list[float] | None, attenuation: AttenuationConfig | None) -> tuple[list[float], list[str]]:
-    """The dial values to measure, and a note if they are outside the trained range."""
+def choose_dials(given: list[float] | None, attenuation: AttenuationConfig | None, console: Console) -> list[float]:
+    """The dial values to measure; a note if they are outside the trained range."""
     trained = attenuation.max_sv if attenuation else None
     if given is None:
-        return [s for s in DIALS if trained is None or s < trained] + ([trained] if trained else []), []
-    if trained is None or max(given) <= trained:
-        return given, []
-    return given, [f"trained up to s = {trained:g}; larger dial values were not trained"]
+        return [s for s in DIALS if trained is None or s < trained] + ([trained] if trained else [])
+    if trained is not None and max(given) > trained:
+        console.note(f"trained up to s = {trained:g}; larger dial values were not trained")
+    return given
 
 
 def measure(
-    gaussians: Gaussians,
-    views: Sequence[View],
-    virtual_scales: Sequence[float],
-    console: Console,
+    gaussians: Gaussians, views: Sequence[View], dials: Sequence[float], console: Console, stop: GracefulStop,
     label: str = "measure",
-    stop: GracefulStop | None = None,
-) -> tuple[list[Row], bool]:
-    """The rows of the dial values, none without views, and whether Ctrl-C ended the measurement early.
-
-    Args:
-        stop: counts the signals, if it is not a new one.
-    """
-    stop = stop or GracefulStop(aborts=launched().size == 1)  # launchers repeat signals
-    if not views:
-        return [], False
-    with console.meter(label) as meter, stop.listening():
-
-        def show(now: Progress) -> bool:
-            meter.update(now.share, f"s={virtual_scales[(now.done - 1) // len(views)]:g}")
-            return stop.requests == 0
-
-        rows = evaluate(gaussians, views, virtual_scales, progress=show)
-    return rows, stop.requests > 0
+) -> list[Row]:  # fmt: skip
+    """The rows of the dial values; those that were finished when ``stop`` has heard a signal, none without views."""
+    with console.meter(label) as meter:
+        return evaluate(gaussians, views, dials, progress=stop.heeding(meter)) if views else []
 
 
 def with_frame_times(
-    measured: Sequence[tuple[Gaussians, Sequence[Row]]],
-    views: Sequence[View],
-    console: Console,
-    stop: GracefulStop | None = None,
-) -> tuple[list[list[Row]], list[str], bool]:
-    """The rows of each model with frame times that can be compared, notes, and whether Ctrl-C ended the timing.
-
-    Then and without rows they are returned unchanged.
-    """
-    stop = stop or GracefulStop(aborts=launched().size == 1)
-    rows = [list(each) for _, each in measured]
-    dials = [sorted({row.virtual_scale for row in each}) for each in rows]
-    if not any(rows):
-        return rows, [], False
+    measured: Sequence[tuple[Gaussians, list[Row]]], views: Sequence[View], console: Console, stop: GracefulStop
+) -> list[list[Row]]:
+    """The rows of each model with frame times that can be compared; unchanged after a signal."""
+    jobs = [(model, sorted({row.virtual_scale for row in rows})) for model, rows in measured]
+    unchanged = [rows for _, rows in measured]
+    if not any(unchanged):
+        return unchanged
     try:
-        with console.meter(Phase.FRAME_TIMES) as meter, stop.listening():
-
-            def show(now: Progress) -> bool:
-                meter(now)
-                return stop.requests == 0
-
-            models = [(some, each) for (some, _), each in zip(measured, dials, strict=True)]
-            times = time_frames(models, [view.camera for view in views], show)
+        with console.meter(Phase.FRAME_TIMES) as meter:
+            times = time_frames(jobs, [view.camera for view in views], stop.heeding(meter))
     except Stopped:
-        return rows, [], True
+        return unchanged
     for note in times.notes:
-        console.say(note)
-    for each, scales, found in zip(rows, dials, times.milliseconds, strict=True):
-        taken = dict(zip(scales, found, strict=True))
-        each[:] = [replace(row, frame_ms=taken[row.virtual_scale]) for row in each]
-    return rows, times.notes, False
+        console.note(note)
+    taken = [dict(zip(dials, found, strict=True)) for (_, dials), found in zip(jobs, times.milliseconds, strict=True)]
+    return [
+        [replace(row, frame_ms=found[row.virtual_scale]) for row in rows]
+        for rows, found in zip(unchanged, taken, strict=True)
+    ]
 
 
 BLOCK = 8  # pixels
@@ -218,8 +183,8 @@ def solve_dials(
     console: Console,
     *,
     baked: bool = False,
-) -> tuple[list[float] | None, list[str]]:
-    """The dial values of --sv or of a budget, None without either; and notes on the solution.
+) -> list[float] | None:
+    """The dial values of --sv or of a budget, None without either.
 
     Args:
         cameras: those that the command renders, or bakes for. Where none of them has an image size, as those stored in
@@ -228,49 +193,36 @@ def solve_dials(
     """
     budget = given_budget(args)
     if budget is None:
-        return args.sv, []
+        return args.sv
     name, option, values = budget
-    whole = [camera for camera in cameras if isinstance(camera, Camera)]
-    times, notes = timed_here(model, whole, console) if name == "fps" and whole else (None, [])
-    calibration, machine = None if times else _calibration_for(name, option, model), ""
-    if name == "psnr_drop" and calibration is not None and calibration.against == "checkpoint":
-        notes.append("--psnr-drop uses a calibration made without photographs, against renders of the checkpoint")
-    if name == "fps" and calibration is not None:
+    whole, calibration = [camera for camera in cameras if isinstance(camera, Camera)], model.calibration
+    times, machine = None, ""
+    if name == "fps" and whole:
+        prepare_kernels(console, model.gaussians.means.device, training=False)
+        with console.meter("timing") as meter:
+            times, notes = frame_times(model.gaussians, whole, progress=meter)
+        (first, slow), (last, fast) = times[0], times[-1]
+        for note in (f"frames timed here: {slow:.1f} ms at s = {first:g}, {fast:.1f} ms at s = {last:g}", *notes):
+            console.note(note)
+    elif name != "keep" and calibration is None:
+        why = next((note for note in model.notes if "calibration" in note), "there is no calibration in the header")
+        raise ClodError(f"{model.path}: {option}: {why}; adapt it again, or give --sv or --keep")
+    elif name == "fps" and calibration is not None:
         machine = f" (frame times of {calibration.machine} at {calibration.width}x{calibration.height})"
+    elif name == "psnr_drop" and calibration is not None and calibration.against == "checkpoint":
+        console.note("--psnr-drop uses a calibration made without photographs, against renders of the checkpoint")
     dials = []
     for value in values:
         asked = f"{option} {value}" if isinstance(value, int) else f"{option} {value:g}"
+        wanted: dict[str, Any] = {name: value, "cameras": cameras, "calibration": calibration, "baked": baked}
         try:
-            if times:
-                solved = dial_for_times(times, value)
-            else:
-                budgets = {name: value}
-                solved = dial_for(model.gaussians, **budgets, cameras=cameras, calibration=calibration, baked=baked)
+            solved = dial_for_times(times, value) if times else dial_for(model.gaussians, **wanted)
         except ClodError as error:
             raise ClodError(f"{asked}: {error}{machine}") from error
         dials.append(solved.virtual_scale)
-        note = solved.note and f" ({solved.note})"
-        notes.append(f"{asked}: s = {solved.virtual_scale:.5g}{note}{machine}")
-    return dials, notes
-
-
-def _calibration_for(name: str, option: str, model: Checkpoint) -> Calibration | None:
-    """The stored calibration, which every budget but a count needs."""
-    if model.calibration is None and name != "keep":
-        why = next((note for note in model.notes if "calibration" in note), "there is no calibration in the header")
-        raise ClodError(f"{model.path}: {option}: {why}; adapt it again, or give --sv or --keep")
-    return model.calibration
-
-
-def timed_here(
-    model: Checkpoint, cameras: Sequence[Camera], console: Console
-) -> tuple[list[tuple[float, float]], list[str]]:
-    """``budget.frame_times`` with a progress bar, and notes on the result."""
-    prepare_kernels(console, model.gaussians.means.device, training=False)
-    with console.meter("timing") as meter:
-        times, notes = frame_times(model.gaussians, cameras, progress=meter)
-    (first, slow), (last, fast) = times[0], times[-1]
-    return times, [f"frames timed here: {slow:.1f} ms at s = {first:g}, {fast:.1f} ms at s = {last:g}", *notes]
+        more = solved.note and f" ({solved.note})"
+        console.note(f"{asked}: s = {solved.virtual_scale:.5g}{more}{machine}")
+    return dials
 
 
 def _interest(view: View) -> float:

@@ -6,11 +6,10 @@ import json
 import math
 import os
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from glob import escape
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +31,6 @@ class AdaptFiles:
 
     @classmethod
     def of(cls, checkpoint: str, out: str | None) -> AdaptFiles:
-        """From ``out``; by default the checkpoint's name with _clod, in the current folder."""
         ply = Path(out or f"{Path(checkpoint).stem}_clod.ply")
         return cls(ply, ply.with_suffix(".safetensors"), ply.with_suffix(".json"))
 
@@ -45,9 +43,6 @@ class AdaptFiles:
         """Existing files of an unfinished run in blocks (``adapt.blocks``)."""
         return list(self.ply.parent.glob(f"{escape(self.ply.stem)}.block*.pass*.safetensors"))
 
-    def names(self) -> dict[str, str]:
-        return {name: str(path) for name, path in vars(self).items()}
-
 
 def check_ply_name(path: Path, option: str) -> None:
     if path.suffix.lower() != ".ply":
@@ -56,11 +51,7 @@ def check_ply_name(path: Path, option: str) -> None:
 
 
 def labels(paths: Sequence[str]) -> list[str]:
-    """A distinct label per file: its stem, with the folder's name where two stems are equal.
-
-    Raises:
-        ClodError: a file is given twice, or two labels are equal.
-    """
+    """A distinct label per file: its stem, with the folder's name where two stems are equal."""
     resolved = [Path(path).resolve() for path in paths]
     if len(set(resolved)) < len(resolved):
         raise ClodError(f"{next(p for k, p in enumerate(paths) if resolved[k] in resolved[:k])}: is given twice")
@@ -90,7 +81,6 @@ def jsonable(value: Any) -> Any:
 
 
 def write_report(path: Path, report: dict[str, Any]) -> None:
-    """Writes the report as an indented JSON file."""
     with atomic_path(path) as temporary:
         text = json.dumps(jsonable(report), indent=2, allow_nan=False, ensure_ascii=False)
         temporary.write_text(text + "\n", encoding="utf-8")
@@ -132,13 +122,7 @@ class Outputs:
 
 @contextmanager
 def claimed(outputs: Outputs) -> Iterator[None]:
-    """Checks the outputs, and in the body holds their locks.
-
-    The folders exist in the body; those that it leaves empty are removed again.
-
-    Raises:
-        ClodError: as ``check_outputs``, or another run writes one of them.
-    """
+    """Checks the outputs, and in the body holds their locks; there the folders exist, afterwards no empty one."""
     check_outputs(outputs)
     with ExitStack() as stack:
         for folder in outputs.folders:
@@ -153,14 +137,13 @@ def claimed(outputs: Outputs) -> Iterator[None]:
 
 
 def check_outputs(outputs: Outputs) -> None:
-    """Refuses outputs that cannot be written, or would replace an input or a foreign file.
-
-    Raises:
-        ClodError: an output is a folder or no regular file; is an input, also by a hard or symbolic link; is named and
-            is what adapting wrote beside an input; is derived and not known to be written by clod-adapt.
-    """
+    """Refuses outputs that cannot be written, or would replace an input, what is beside it, or a foreign file."""
     for folder in outputs.folders:
-        _check_makeable(folder)
+        parent = next(parent for parent in (folder, *folder.parents) if parent.exists())
+        if not parent.is_dir():
+            raise ClodError(f"{folder}: {parent} is a file; choose another --out")
+        if not os.access(parent, os.W_OK | os.X_OK):
+            raise ClodError(f"{folder}: folder {parent} is not writable; choose another --out")
     for path in outputs.files:
         if path.parent.exists() or not set(outputs.folders) & set(path.parents):
             check_target(path)
@@ -168,8 +151,11 @@ def check_outputs(outputs: Outputs) -> None:
             raise ClodError(f"{path}: is a folder; give the name of a file in it")
         if path.exists() and not (path.is_file() or path.is_dir()):
             raise ClodError(f"{path}: is no regular file; choose another output")
-    _check_no_input(outputs)
-    _check_not_beside(outputs)
+    taken = {key: path for path in outputs.files if (key := _key(path))}
+    for file, what in _inputs(outputs) if taken else ():
+        if (key := _key(file)) in taken:
+            other = "" if os.path.abspath(file) == os.path.abspath(taken[key]) else f" ({file})"
+            raise ClodError(f"{taken[key]}: is {what}{other}, which is never overwritten; choose another output")
     for path in outputs.derived:
         if path.exists() and not _is_ours(path):
             raise ClodError(
@@ -177,38 +163,24 @@ def check_outputs(outputs: Outputs) -> None:
             )
 
 
-def _check_makeable(folder: Path) -> None:
-    parent = next(parent for parent in (folder, *folder.parents) if parent.exists())
-    if not parent.is_dir():
-        raise ClodError(f"{folder}: {parent} is a file; choose another --out")
-    if not os.access(parent, os.W_OK | os.X_OK):
-        raise ClodError(f"{folder}: folder {parent} is not writable; choose another --out")
-
-
-def _check_no_input(outputs: Outputs) -> None:
-    taken = {key: path for path in outputs.files for key in _keys(path)}
-    if not taken:  # no output exists yet
-        return
-    files: Iterable[Path] = map(Path, outputs.inputs)
+def _inputs(outputs: Outputs) -> Iterator[tuple[Path, str]]:
+    """The files that must not be overwritten, and what they are."""
+    for file in map(Path, outputs.inputs):
+        yield file, "an input file"
+        for beside in (name.with_suffix(suffix) for name in (file, file.resolve()) for suffix in SUFFIXES):
+            if BESIDE.search(_beginning(beside)):
+                yield beside, "the adapter, state or report of an input"
     if outputs.scene is not None:
-        files = chain(files, scene_files(Path(outputs.scene)))
-    for file in files:
-        for key in _keys(file):
-            if key in taken:
-                other = "" if os.path.abspath(file) == os.path.abspath(taken[key]) else f" ({file})"
-                raise ClodError(
-                    f"{taken[key]}: is an input file{other}, which is never overwritten; choose another output"
-                )
+        yield from ((file, "an input file") for file in scene_files(Path(outputs.scene)))
 
 
-def _check_not_beside(outputs: Outputs) -> None:
-    """Refuses a named output that adapting wrote beside an input."""
-    for path in outputs.named:
-        written = BESIDE.search(_beginning(path)) is not None
-        for file in outputs.inputs if written else ():
-            beside = [name.with_suffix(suffix) for name in (Path(file), Path(file).resolve()) for suffix in SUFFIXES]
-            if any(other.exists() and path.samefile(other) for other in beside):
-                raise ClodError(f"{path}: is the adapter, state or report of {file}; choose another output")
+def _key(path: Path) -> tuple[int, int] | None:
+    """Equal for two names of one file."""
+    try:
+        found = os.stat(path)
+        return found.st_dev, found.st_ino
+    except (OSError, ValueError):  # does not exist, or no valid name
+        return None
 
 
 def _is_ours(path: Path) -> bool:
@@ -242,18 +214,7 @@ def _made(folder: Path) -> Iterator[None]:
 
 
 def make_folder(folder: Path) -> None:
-    """Makes a folder and its parents, unless it exists."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ClodError(f"{folder}: cannot be made ({error.strerror or error}); choose another --out") from error
-
-
-def _keys(path: Path) -> Iterator[object]:
-    """Keys that are equal for two names of one file: device and inode, and the path without links."""
-    try:
-        found = os.stat(path)
-        yield found.st_dev, found.st_ino
-        yield os.path.realpath(path)
-    except (OSError, ValueError):  # does not exist, or no valid name
-        return

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,22 +24,27 @@ from .process import interrupt_as_stopped
 
 FRAMES = 13  # positions of the page's slider
 SNAPSHOTS = tuple(2.0**-k for k in range(6, 0, -1))  # shares of the training at which the result so far is copied
-INTERRUPTED = "the page was interrupted and not written"
 SNAPSHOT_VIEWS = 12  # held-out views that snapshots are measured on, at most
 
 
-def write_eval_page(
-    args: argparse.Namespace,
-    report: dict[str, Any],
-    model: Gaussians,
-    base: Gaussians | None,
-    scene: Scene,
-    console: Console,
-) -> dict[str, Any]:
-    """Writes the page if ``--report`` requests it; returns the entries of the report that it changes."""
-    if not args.report:
-        return {}
-    return _write(Path(args.report), report, model, base, scene, console)
+def add_page(
+    path: Path, report: dict[str, Any], model: Gaussians, base: Gaussians | None, scene: Scene, console: Console,
+    training: Callable[[], dict[str, Any] | None] = lambda: None,
+) -> None:  # fmt: skip
+    """Writes the page and adds its files to the report, unless Ctrl-C or the disk stops it, which a note says."""
+    try:
+        with interrupt_as_stopped():
+            curves = training()
+            with console.status(f"writing {path} ..."):
+                frames, others = pictures(model, base, scene.test, own_teacher(report))
+                written = write_page(path, jsonable(report), frames, others, jsonable(curves))
+    except Stopped:
+        console.note("the page was interrupted and not written")
+    except ClodError as error:
+        console.note(f"the page was not written: {error}")
+    else:
+        console.say(f"wrote {path}: open it in a browser")
+        report["outputs"] = report.get("outputs", {}) | {name: str(file) for name, file in written.items()}
 
 
 class AdaptPage:
@@ -65,14 +69,11 @@ class AdaptPage:
         changing = {name: value.clone() for name, value in state.tensors().items() if name not in fixed}
         return state.replace(**changing, **fixed)
 
-    def write(self, path: Path, report: dict[str, Any], result: Gaussians, start_seconds: float) -> dict[str, Any]:
-        """Writes the page, unless Ctrl-C or the disk stops it; returns the entries of the report that it changes."""
-        try:
-            with interrupt_as_stopped():
-                training = self._training(result, start_seconds) if self.scene.test and self.snapshots else None
-        except Stopped:
-            return _without(report, self.console, INTERRUPTED)
-        return _write(path, report, result, self.base, self.scene, self.console, training)
+    def write(self, path: Path, report: dict[str, Any], result: Gaussians, start_seconds: float) -> None:
+        def training() -> dict[str, Any] | None:
+            return self._training(result, start_seconds) if self.scene.test and self.snapshots else None
+
+        add_page(path, report, result, self.base, self.scene, self.console, training)
 
     def _training(self, result: Gaussians, start_seconds: float) -> dict[str, Any]:
         """Held-out PSNR of the copies and of the result, at s = 1, 3 and the largest."""
@@ -91,42 +92,11 @@ class AdaptPage:
         return {"views": len(views), "base_psnr": base.psnr, "curves": curves}
 
 
-def _write(
-    path: Path,
-    report: dict[str, Any],
-    model: Gaussians,
-    base: Gaussians | None,
-    scene: Scene,
-    console: Console,
-    training: dict[str, Any] | None = None,
-) -> dict[str, Any]:
-    try:
-        with interrupt_as_stopped(), console.status(f"writing {path} ..."):
-            frames, others = pictures(model, base, scene.test, own_teacher(report))
-            written = write_page(path, jsonable(report), frames, others, jsonable(training))
-    except Stopped:
-        return _without(report, console, INTERRUPTED)
-    except ClodError as error:
-        return _without(report, console, f"the page was not written: {error}")
-    console.say(f"wrote {path}: open it in a browser")
-    return {"outputs": {**report.get("outputs", {}), **{name: str(file) for name, file in written.items()}}}
-
-
-def _without(report: dict[str, Any], console: Console, why: str) -> dict[str, Any]:
-    """A note: the report is kept without its page."""
-    console.say(why)
-    return {"outputs": report.get("outputs", {}), "notes": [*report["notes"], why]}
-
-
 @torch.no_grad()
 def pictures(
     model: Gaussians, base: Gaussians | None, views: Sequence[View], own: bool = False
 ) -> tuple[list[Picture], dict[str, Picture]]:
-    """The middle held-out view at the slider's dial values, and the photograph and the base to compare with.
-
-    Args:
-        own: the views are pseudo views.
-    """
+    """The middle held-out view at the dial values of the slider, and what to compare it with."""
     if not views:
         return [], {}
     view = views[len(views) // 2]

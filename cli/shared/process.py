@@ -78,11 +78,7 @@ def check_printed() -> None:
 class GracefulStop:
     """Counts signals. The first one requests a stop after the step under way.
 
-    The second Ctrl-C or SIGTERM raises KeyboardInterrupt. The other signals are repeated, and do not.
-
-    Args:
-        aborts: whether the second one does. Launchers repeat all signals, so their processes do not abort.
-        presses: of Ctrl-C or SIGTERM before.
+    The second Ctrl-C or SIGTERM raises KeyboardInterrupt, unless a launcher repeats them (``aborts``).
     """
 
     def __init__(self, aborts: bool = True, presses: int = 0) -> None:
@@ -160,10 +156,7 @@ MESSAGES = (
 
 
 def check_surroundings() -> None:
-    """Refuses a current folder that was deleted, where libraries raise errors of their own.
-
-    Variables of what is not used here, numba's threads and matplotlib's windows, are removed.
-    """
+    """Refuses a deleted current folder; removes variables that numba and matplotlib would refuse."""
     for name in ("NUMBA_NUM_THREADS", "MPLBACKEND"):
         os.environ.pop(name, None)
     try:
@@ -186,12 +179,7 @@ NEEDED = ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")
 
 @dataclass(frozen=True)
 class Launch:
-    """The place of this process in its group.
-
-    Attributes:
-        rank, size: index of this process, from 0, and number of processes.
-        local_rank, local_size: the same among the processes on this machine.
-    """
+    """The index of this process, from 0, and their number: among all, and on this machine."""
 
     rank: int = 0
     size: int = 1
@@ -200,22 +188,13 @@ class Launch:
 
 
 def launched() -> Launch:
-    """Reads the environment variables; a single process without them.
-
-    Raises:
-        ClodError: their values are inconsistent.
-    """
+    """By the environment variables of torchrun; a single process without them."""
     if not all(name in os.environ for name in NEEDED):
         return Launch()
-    names = ("RANK", "WORLD_SIZE", "LOCAL_RANK", "LOCAL_WORLD_SIZE")
-    found = {name: os.environ[name] for name in names if name in os.environ}
-    try:
-        launch = Launch(*(int(found.get(name, default)) for name, default in zip(names, (0, 1, 0, 1), strict=True)))
-    except ValueError:
-        launch = Launch(-1)
-    if not 0 <= launch.rank < launch.size or not 0 <= launch.local_rank < launch.local_size:
-        shown = ", ".join(f"{name}={value}" for name, value in found.items())
-        raise ClodError(f"inconsistent environment variables: {shown}; start the processes with torchrun")
+    names = {"RANK": 0, "WORLD_SIZE": 1, "LOCAL_RANK": 0, "LOCAL_WORLD_SIZE": 1}
+    launch = Launch(*(int(os.environ.get(name, default)) for name, default in names.items()))
+    if launch.rank >= launch.size or launch.local_rank >= launch.local_size:
+        raise ClodError(f"inconsistent environment variables {', '.join(names)}; start the processes with torchrun")
     return launch
 
 

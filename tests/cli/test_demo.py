@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import shutil
 import signal
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -59,10 +58,3 @@ def test_demo(clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.Monke
     done = clod("demo", "--out=-odd", "--json")
     assert done.code == 0 and json.loads(done.out)["pictures"] == {} and "no figures" in done.err
     assert not PICTURES & {path.name for path in folder.iterdir()}
-
-
-def test_missing_package_is_named_at_the_start(clod: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "matplotlib", None)
-    done = clod("demo")
-    assert done.code == 2 and "matplotlib: pip install matplotlib" in done.err
-    assert list(tmp_path.iterdir()) == []

@@ -41,14 +41,14 @@ def test_json_without_torch() -> None:
     assert done.stderr.splitlines()[-1] == "no rendering backend works: fix torch first, then the CPU backend"
 
 
-@pytest.mark.parametrize("change", ["roll", "nan", "transpose"])
+@pytest.mark.parametrize("change", ["roll", "nan"])
 def test_a_wrong_image_is_reported(clod: Any, monkeypatch: pytest.MonkeyPatch, change: str) -> None:
     def rasterize(**given: Any) -> tuple[torch.Tensor, torch.Tensor]:
         image, alpha = reference.rasterize(**given)
-        return {"roll": image.roll(1, 1), "nan": image * torch.nan, "transpose": image.transpose(0, 1)}[change], alpha
+        return {"roll": image.roll(1, 1), "nan": image * torch.nan}[change], alpha
 
     monkeypatch.setitem(rasterizers.BACKENDS, "cpu", lambda: rasterizers.Rasterizer(rasterize))
     done = clod("doctor", "--json", "--quiet")
     found = {found["name"]: found for found in json.loads(done.out)["findings"]}
     assert done.code == 1 and not found["cpu"]["ok"] and found["torch"]["ok"]
-    assert change == "transpose" or found["cpu"]["found"].startswith("renders another image than the reference")
+    assert found["cpu"]["found"].startswith("renders another image than the reference")

@@ -45,7 +45,7 @@ def folder(capture: Any, dialled: Path, tmp_path_factory: pytest.TempPathFactory
         shutil.copy(dialled.with_suffix(suffix), there / f"dial{suffix}")
     for suffix in (".ply", ".glb"):
         clod_adapter.save(there / f"bare{suffix}", clod_adapter.with_dial(capture.gaussians))
-    for name in ("text.ply", "broken.safetensors", "a.hier", "a.ckpt"):
+    for name in ("text.ply", "a.hier"):
         (there / name).write_text("hello")
     (there / "cut.ply").write_bytes(capture.ply.read_bytes()[:-100])
     (there / "mesh.ply").write_text(MESH)
@@ -90,7 +90,7 @@ EVAL = "eval dial.ply --images nerf --base base.ply --against base.ply --report 
 RENDER = "render dial.ply --images scene -o out"
 EXPORT = "export dial.ply --images scene -o"
 ROBUSTNESS = f"robustness base.ply {TINY} -o out"
-INPUT, BESIDE = "is an input file", "is the adapter, state or report of"
+INPUT, BESIDE = "is an input file", "is the adapter, state or report of an input"
 FOREIGN = "exists and is not known to be written by clod-adapt; move it, or choose another output"
 
 ERRORS = [
@@ -98,67 +98,46 @@ ERRORS = [
     ("--quiet", "arguments are required: PLY .*--help"),
     ("veiw base.ply", "veiw: no such file or command; did you mean clod-adapt view"),
     ("missing.ply --images scene", "missing.ply: .*No such file.*check the path"),
-    ("text.ply --images scene --json", "text.ply: is not a PLY.*convert"),
     ("cut.ply --images scene", "cut.ply: .*truncated.*again"),
     ("a.hier --out x.ply", "Hierarchical-3DGS"),
-    ("a.ckpt --out x.ply", "ns-export"),
-    ("base.ply --images nowhere", "nowhere: is not a folder; give"),
     ("base.ply --images empty", "empty: no COLMAP model.*, and no transforms.json; give the folder"),
     ("base.ply --images scene --max-sv 0.5", "--max-sv is 0.5, it must be at least 1"),
     ("base.ply --images scene --max-sv 300", "--max-sv is 300, it must be below 50"),
-    ("base.ply --images scene --iters -1", "--iters is -1, it must be at least 0"),
     ("base.ply --images scene --time-budget inf", "--time-budget is inf, it must be"),
     ("base.ply --images scene --with colour", "--with: invalid choice: 'colour' .*bands.*unseen.*means.*sh0"),
     ("base.ply --images scene --with quats --without sh0 quats", "--with and --without both name quats"),
     ("base.ply --images scene --out nowhere/x.ply", "nowhere/x.ply: folder nowhere does not exist; create"),
-    ("base.ply --images scene --out x.splat", "x.splat: .*must end in .ply"),
     ("base.ply --images scene --out x.compressed.ply", "x.compressed.ply: is written by clod-adapt export alone"),
-    ("eval base.ply --images scene --against base.ply text.ply", "text.ply: is not a PLY"),
+    ("base.ply --images scene --memory 8", "--memory is '8'; give a number and its unit, as in 8GB"),
+    ("base.ply --images scene --memory 100MB", "--memory is 100 MB, and 300 Gaussians take at least"),
     ("eval base.ply --images scene --against base.ply base.ply", "base.ply: is given twice"),
     ("eval base.ply --images scene --base dial.ply", "has a dial .*; give --base the checkpoint.* --against$"),
     ("eval base.ply --images scene --sv=-0.5 --json", "--sv has -0.5, it must be at least 0"),
-    ("eval base.ply --images scene --sv", "--sv: expected at least one argument.*clod-adapt eval --help"),
-    ("eval base.ply --images scene --keep 10", "base.ply: has no sigma_d, which --keep needs; adapt it first"),
     ("eval base.ply --images scene --sv 2 --keep 10", "--keep: not allowed with argument --sv"),
     ("eval bare.ply --images scene --psnr-drop 1", "bare.ply: has no calibration .* --psnr-drop needs; adapt it"),
     ("eval dial.ply --images scene --keep 1", r"--keep 1: .*at s = 4, .* \d+ are kept$"),
     ("eval dial.ply --images scene --fps 1e7", r"--fps 1e\+07: .*at s = 4, .* a frame takes \S+ ms"),
     ("eval base.ply --images scene --report page.txt", "page.txt: --report names the page.*end in .html"),
-    ("render base.ply --images scene --json", "required: -o/--out"),
     ("render base.ply --images scene -o text.ply", "text.ply: text.ply is a file; choose another --out"),
     ("render base.ply --images scene -o x --views banana", "--views: no photograph is named 'banana'; .* 000.png, 001"),
     *[(f"render base.ply --images {scene} -o {out}", "the scene's own photographs may be there") for scene, out in (
         ("scene", "scene"), ("scene/sparse/0", "scene/images/sub"), ("nerf", "nerf"), ("nerf", "scene/../nerf/train"),
     )],
-    ("export bare.ply", "required: -o/--out"),
     ("export bare.ply -o x", "x: --out must end in one of .ply, .*, which is the format"),
     ("export bare.ply -o x.splat", "x.splat: .splat cannot store a dial; choose a dial value .* format .*.ply"),
     ("export bare.ply -o x.splat --sv 2 --order extinction", "x.splat: .splat sorts the Gaussians itself"),
     ("export bare.ply -o x.ply --sv 2 --levels 1,2", "--levels gives the dial values; give no other"),
-    ("export bare.ply -o page.html --levels 1,2", "remove --levels, --camera and --order"),
     ("export bare.ply -o x.spz --exact", "--exact is for .html pages; another format has its own precision"),
     ("export bare.ply -o x.ply --levels 1,4,2", "--levels: '1,4,2' must be ascending dial values of at least 0"),
     ("export bare.ply -o x --lod-meta", "--lod-meta needs several levels; give them"),
     ("export bare.ply -o lod-meta.json --lod-meta --levels 1,2", "--out names the folder for lod-meta.json"),
     ("export bare.ply -o . --lod-meta --levels 1,2", ".: is the current folder; --out must name a new one"),
-    ("export bare.ply -o x --3dtiles --lod-meta --levels 1,2", "write a folder each; give one of them"),
-    ("export bare.ply -o x.glb --3dtiles --levels 1,2", "x.glb: with --3dtiles, --out names the folder for tileset"),
     ("export bare.ply -o x.ply --sv 2 --camera 003", "--camera needs the scene of the photograph"),
     ("export bare.ply -o x.ply --images scene", "--images is used for baking, --order and .html"),
-    ("export bare.ply -o x.ply --camera 003 --images scene", "--camera needs a dial value to bake; give one"),
-    ("export bare.ply -o x.ply --sv 2 --camera no --images scene", "--camera: no photograph is named 'no'; .* 000"),
-    ("export base.ply -o x.ply --levels 1,2", "base.ply: has no sigma_d, so no dial value can be baked"),
     ("apply base.ply dial.safetensors -o pipe.ply", "pipe.ply: is no regular file"),
-    ("apply base.ply missing.safetensors -o x.ply", "missing.safetensors: .*No such file"),
-    ("apply bare.ply dial.safetensors -o x.ply", "bare.ply: a different base"),
-    ("inspect cut.ply --json", "cut.ply: "),
-    ("inspect broken.safetensors", "broken.safetensors: "),
-    ("view base.ply --base text.ply", "text.ply: is not a PLY"),
     ("view empty", "empty: has no splat in it; give the file"),
     ("view base.ply --port 65536", "--port is 65536, it must be between 1 and 65535"),
     ("view bare.ply --device-preset phone", "bare.ply: stores no cameras, which --device-preset needs; give"),
-    ("view bare.ply --sv 2 --device-preset phone", "not allowed with"),
-    ("robustness base.ply --images scene --max-sv 1 0.5", "--max-sv is 0.5, it must be at least 1"),
     ("demo -o base.ply/here", "base.ply/here: base.ply is a file; choose another --out"),
     # Inputs: checkpoints, adapters, photographs, masks, files of a COLMAP model; by hard and symbolic links.
     ("base.ply --images scene --out base.ply", "base.ply: is an input file.*choose another"),
@@ -173,17 +152,13 @@ ERRORS = [
     ("apply base.ply dial.safetensors -o x.ply", rf"x.ply: {INPUT} \(dial.safet", "x.ply~dial.safetensors"),
     (ROBUSTNESS, rf"out/cells/base_base.json: {INPUT} \(base.ply\)", "out/cells/base_base.json~base.ply"),
     # Files of adapting beside the input, which are named for something else.
-    ("export dial.ply -o dial.safetensors", f"dial.safetensors: {BESIDE} dial.ply; choose another output"),
-    ("export link.ply -o dial.safetensors", f"dial.safetensors: {BESIDE} link.ply", "link.ply>dial.ply"),
+    ("export link.ply -o dial.safetensors", f"dial.safetensors: {BESIDE}", "link.ply>dial.ply"),
     # Names that follow from others, where a file is that another program wrote.
     (f"base.ply {TINY} -o out.ply", f"out.json: {FOREIGN}", "out.json"),
     (f"base.ply {TINY} --report -o out.ply", f"out_rendering.png: {FOREIGN}", "out_rendering.png"),
     (f"base.ply {TINY}", f"base_clod.ply: {FOREIGN}", "base_clod.ply"),
     (f"base.ply {BLOCKS}", f"x.block1.pass1.safetensors: {FOREIGN}", "x.block1.pass1.safetensors"),
-    (EVAL, f"page_rendering.png: {FOREIGN}", "page_rendering.png"),
-    (RENDER, f"out/000.png: {FOREIGN}", "out/000.png"),
     (f"{EXPORT} x.spz --levels 1,2", f"x_s1.spz: {FOREIGN}", "x_s1.spz"),
-    (f"{EXPORT} x --levels 1,2 --3dtiles", "x: is a file; with --3dtiles, --out must name a new folder", "x"),
     (f"{EXPORT} nerf --levels 1,2 --3dtiles", "nerf: is a folder that is not empty"),
     (ROBUSTNESS, f"out/cells/base_sv2.safetensors: {FOREIGN}", "out/cells/base_sv2.safetensors"),
     ("demo -o out", f"out/curve.png: {FOREIGN}", "out/curve.png"),
@@ -250,13 +225,10 @@ def test_earlier_outputs_are_replaced(clod: Any, capture: Any, tmp_path: Path) -
 
 
 LIGHT = """
---help | eval --help | --version | render --help | export --help
---nonsense | missing.ply --images scene | mesh.ply --images scene | base.ply --images empty
-base.ply --images scene --max-sv 0 | base.ply --images scene --out nowhere/dial.ply
-eval base.ply --images scene --sv=-1 | eval base.ply --images scene --keep 10 | render base.ply --images scene -o scene
-export base.ply --sv 2 -o x.ply | export bare.ply --psnr-drop 2 -o x.ply | export bare.ply -o x.splat
-apply text.ply dial.safetensors -o dial.ply | inspect base.ply
-view bare.ply bare.ply --device-preset phone | export base.ply --device-preset phone -o x.ply
+--help | eval --help | --version | --nonsense | missing.ply --images scene | mesh.ply --images scene
+base.ply --images scene --out nowhere/dial.ply | eval base.ply --images scene --keep 10 | render base.ply --images scene
+export bare.ply --psnr-drop 2 -o x.ply | apply text.ply dial.safetensors -o dial.ply | inspect base.ply
+view bare.ply bare.ply --device-preset phone
 """
 
 

@@ -25,21 +25,18 @@ def measured(clod: Any, *words: object) -> tuple[Any, str]:
     return json.loads(done.out), done.err
 
 
-def test_rows_and_default_dial_values(clod: Any, capture: Any) -> None:
+def test_rows_and_default_dial_values(clod: Any, capture: Any, dialled: Path) -> None:
     """The defaults are within the trained range; a plain file has one picture and no popping."""
-    for max_sv, dials in ((2.5, [1, 2, 2.5]), (1, [1]), (7, [1, 2, 3, 5, 7])):
-        settings = clod_adapter.AttenuationConfig(max_sv=max_sv)
-        clod_adapter.save("dial.ply", clod_adapter.with_dial(capture.gaussians, torch.linspace(0.5, 5, 300), settings))
-        report, err = measured(clod, "dial.ply", "--images", capture.scene)
-        assert [row["virtual_scale"] for row in report["rows"]] == dials and report["notes"] == []
-    assert (report["model"], report["scene"], report["base_count"]) == ("dial.ply", str(capture.scene), 300)
+    report, err = measured(clod, dialled, "--images", capture.scene)
+    assert [row["virtual_scale"] for row in report["rows"]] == [1, 2, 3, 4] and report["notes"] == []
+    assert (report["model"], report["scene"], report["base_count"]) == (str(dialled), str(capture.scene), 300)
     for row in report["rows"]:
         assert set(row) == ROW and row["in_view"] <= row["kept"]
         assert row["kept_share"] == row["kept"] / 300 and row["frame_ms"] > 0
         assert 0 < row["psnr"] < 100 and 0 < row["ssim"] <= 1
     assert "PSNR dB" in err
-    report, err = measured(clod, "dial.ply", "--images", capture.scene, "--sv", 8)
-    assert [note.partition(";")[0] for note in report["notes"]] == ["trained up to s = 7"] and report["notes"][0] in err
+    report, err = measured(clod, dialled, "--images", capture.scene, "--sv", 8)
+    assert [note.partition(";")[0] for note in report["notes"]] == ["trained up to s = 4"] and report["notes"][0] in err
     report, err = measured(clod, capture.ply, "--images", capture.scene, "--popping")
     assert report["popping"] == [] and any("popping is not measured" in note for note in report["notes"])
     assert [row["virtual_scale"] for row in report["rows"]] == [1, 2, 3, 5]

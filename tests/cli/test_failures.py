@@ -34,11 +34,10 @@ ROWS: list[tuple[Break, int, int, list[str]]] = [  # what breaks, exit code, the
     (lambda patch: change_step(patch, 6, fail), 1, 5, [STATE]),
     (lambda patch: change_step(patch, 6, spoil), 1, 5, BOTH),
     (lambda patch: patch.setattr(adapt_run, "save", full), 2, ITERS, [STATE]),
-    (lambda patch: patch.setattr(adapt_run, "save", fail), 1, ITERS, [STATE]),
 ]
 
 
-@pytest.mark.parametrize(("broken", "code", "step", "files"), ROWS, ids=["step", "loss", "full disk", "writing"])
+@pytest.mark.parametrize(("broken", "code", "step", "files"), ROWS, ids=["step", "loss", "full disk"])
 def test_resuming_after_an_error(
     clod: Any, capture: Any, dialled: Path, tmp_path: Path, broken: Break, code: int, step: int, files: list[str]
 ) -> None:

@@ -6,11 +6,8 @@ import hashlib
 import json
 import os
 import pty
-import random
-import shutil
 import signal
 import time
-from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -22,18 +19,14 @@ from clod_adapter.cli.adapt import listeners, run
 from clod_adapter.cli.shared import measure, pages
 from clod_adapter.training import planner
 from clod_adapter.training.state import load_state
-from runs import OUTPUTS, STATE, Launched, Server, launch, log_of, names, pressing, wait_for
+from runs import OUTPUTS, STATE, Server, log_of, names, pressing, wait_for
 from scenes import stripped
 
-ITERS, FEW = 24, 2
-KILLS = int(os.environ.get("CLOD_KILLS", FEW))  # in each mode
-SIGNALS = (signal.SIGKILL, signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
+ITERS = 24
 IN_BLOCKS = (
     "from dataclasses import replace; from clod_adapter.cli.adapt import prepare; real = prepare.plan_for_limit\n"
     "prepare.plan_for_limit = lambda *given: replace(real(*given), blocks=3)"
 )
-# Options, code that is run first, and the number of processes.
-MODES = {"whole": ((), "", 1), "blocks": (("--memory", "8GB"), IN_BLOCKS, 1), "processes": (("--batch", 2), "", 2)}
 
 
 @pytest.fixture(scope="module")
@@ -71,9 +64,9 @@ def assert_whole(folder: Path) -> None:
             assert load_file(path)
 
 
-def assert_same(folder: Path, want: Path, rank: object = "") -> None:
+def assert_same(folder: Path, want: Path) -> None:
     """The same bits, except measured times, and no other files."""
-    assert names(folder) == OUTPUTS, log_of(folder, rank)
+    assert names(folder) == OUTPUTS, log_of(folder)
     for name in OUTPUTS[1:]:
         assert stripped((folder / name).read_bytes()) == stripped((want / name).read_bytes()), name
     found, wanted = (json.loads((path / "dial.json").read_text()) for path in (folder, want))
@@ -81,72 +74,31 @@ def assert_same(folder: Path, want: Path, rank: object = "") -> None:
     assert found["steps"] == wanted["steps"] and not found["interrupted"]
 
 
-@pytest.mark.timeout(0 if KILLS > FEW else 300)
-@pytest.mark.parametrize("mode", MODES)
-def test_kills_at_random_moments(server: Server, words: list[Any], capture: Any, tmp_path: Path, mode: str) -> None:
-    """Each run is killed and resumed until it ends before its kill; every second chain replaces earlier files.
-
-    Every second kill comes after a state was saved, however fast the machine is.
-    """
-    more, prepare, size = MODES[mode]
-    (tmp_path / "earlier").mkdir()
-    assert server.run(tmp_path / "earlier", *words, "--seed", 4)[0] == 0
-
-    def start(folder: Path) -> Launched:
-        return launch(server, folder, *words, *more, "--resume", size=size, before={0: prepare})
-
-    began, want = time.perf_counter(), tmp_path / "want"
-    assert start(want).wait() == [0] * size, log_of(want, 0)
-    seconds, inputs = time.perf_counter() - began, fingerprints(capture.ply, capture.scene)
-    draw, kills = random.Random(f"{mode} {KILLS}"), 0
-    for chain in count():
-        if kills >= KILLS:
-            break
-        folder, codes = tmp_path / f"chain{chain}", list[int]()
-        shutil.copytree(tmp_path / "earlier", folder) if chain % 2 else folder.mkdir()
-        while codes != [0] * size or names(folder) != OUTPUTS:
-            run = start(folder)
-            if kills < KILLS:
-                kills += kill(server, run, draw, seconds, saved=kills % 2 == 1)
-            codes = run.wait()
-            assert {*codes} <= {0, 130, -signal.SIGKILL, *([2] if size > 1 else [])}, log_of(folder, 0)
-            assert "Traceback" not in log_of(folder, 0), log_of(folder, 0)
-            assert_whole(folder)
-            assert fingerprints(capture.ply, capture.scene) == inputs
-        assert_same(folder, want, 0)
-
-
-def kill(server: Server, run: Launched, draw: random.Random, seconds: float, saved: bool) -> bool:
-    """Sends a signal to some processes; False if one had ended before.
-
-    If only some end, torchrun sends SIGTERM to the others, and SIGKILL after 30 s.
-
-    Args:
-        seconds: within which it is sent; within an eighth of them after a state or block was saved.
-    """
-
-    def ended() -> bool:
-        return any(server.ask(ended=pid) for pid in run.pids)
-
-    while saved and not list(run.folder.glob("dial.*.safetensors")) and not ended():
-        time.sleep(0.002)
-    until = time.monotonic() + draw.uniform(0, seconds / 8 if saved else seconds)
-    while time.monotonic() < until and not ended():
-        time.sleep(0.002)
-    if ended():
-        return False
-    number, victims = draw.choice(SIGNALS), draw.choice([run.pids, run.pids[:1], run.pids[-1:]])
-    for pid in victims:
-        os.kill(pid, number)
-    until = time.monotonic() + 30
-    while not all(server.ask(ended=pid) for pid in run.pids):
-        late = time.monotonic() > until
-        if (late or number == signal.SIGKILL) and ended():
-            for pid in (pid for pid in run.pids if late or pid not in victims):
-                if not server.ask(ended=pid):
-                    os.kill(pid, signal.SIGKILL if late else signal.SIGTERM)
-        time.sleep(0.2)
-    return True
+@pytest.mark.parametrize(("more", "prepare"), [((), ""), (("--memory", "8GB"), IN_BLOCKS)], ids=["whole", "blocks"])
+def test_kills(
+    server: Server, words: list[Any], capture: Any, tmp_path: Path, more: tuple[str, ...], prepare: str
+) -> None:
+    """A run that replaces earlier files is killed soon after a state or block was saved, and later, and resumed."""
+    inputs, folders = fingerprints(capture.ply, capture.scene), [tmp_path / "want", tmp_path / "killed"]
+    for folder in folders:
+        folder.mkdir()
+    assert server.run(folders[1], *words, "--seed", 4)[0] == 0
+    started = [server.start(folder, *words, *more, before=prepare) for folder in folders]
+    assert server.wait(started[0]) == 0, log_of(folders[0])
+    child = started[1]
+    for delay in (0.0, 0.4):
+        until = time.monotonic() + 60
+        while not list(folders[1].glob("dial.*.safetensors")) and not server.ask(ended=child):
+            assert time.monotonic() < until
+            time.sleep(0.002)
+        time.sleep(delay)
+        os.kill(child, signal.SIGKILL)
+        assert server.wait(child) in (0, -signal.SIGKILL) and "Traceback" not in log_of(folders[1])
+        assert_whole(folders[1])
+        child = server.start(folders[1], *words, *more, "--resume", before=prepare)
+    assert server.wait(child) == 0, log_of(folders[1])
+    assert_same(folders[1], folders[0])
+    assert fingerprints(capture.ply, capture.scene) == inputs
 
 
 def test_one_interrupt_of_training_writes_the_result_so_far(

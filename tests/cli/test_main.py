@@ -26,7 +26,7 @@ BUG = f"error: this is a bug in clod-adapt {package_version()}, not in the input
     [
         (OSError(28, "No space left on device", "a/file"), 2, "error: a/file: No space left on device; check the path"),
         (KeyboardInterrupt(), 130, "interrupted$"), (CAUSED, 130, "interrupted$"),
-        (ZeroDivisionError("of ours"), 1, BUG), (SystemError("of numba"), 1, BUG), (RuntimeError("unknown"), 1, BUG),
+        (SystemError("of numba"), 1, BUG), (RuntimeError("unknown"), 1, BUG),
         (MemoryError(), 2, LITTLE), (RuntimeError("can't start new thread"), 2, LITTLE),
         (RuntimeError("[enforce fail at alloc_cpu.cpp:119] . DefaultCPUAllocator: can't allocate memory"), 2, LITTLE),
         (torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB."), 2, LITTLE),
@@ -56,17 +56,17 @@ def test_without_arguments_it_says_what_to_do(clod: Any) -> None:
     assert (done.code, done.err, done.out.count("\n")) == (0, "", 5) and "clod-adapt PLY --images DIR" in done.out
 
 
-def test_torch_is_imported_with_idle_threads_and_the_collector_on() -> None:
+def test_torch_is_imported_with_idle_threads() -> None:
     """The command sets OpenMP's wait policy before torch reads it."""
     code = (
-        "import sys, gc, os\n"
+        "import sys, os\n"
         "class Spy:\n"
         "    def find_spec(self, name, *rest):\n"
         "        if name == 'torch': print(os.environ.get('OMP_WAIT_POLICY'))\n"
         "sys.meta_path.insert(0, Spy())\n"
         "from clod_adapter.cli.main import import_library\n"
         "import_library(quiet=True)\n"
-        "assert 'torch' in sys.modules and gc.isenabled() and gc.get_freeze_count() > 1000\n"
+        "assert 'torch' in sys.modules\n"
     )
     environment = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
@@ -74,7 +74,7 @@ def test_torch_is_imported_with_idle_threads_and_the_collector_on() -> None:
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="Linux has this device")
-@pytest.mark.parametrize("words", ["inspect PLY", "inspect PLY --json", "--help"])
+@pytest.mark.parametrize("words", ["inspect PLY --json", "--help"])
 def test_results_that_cannot_be_printed_are_an_error(capture: Any, words: str) -> None:
     command = [sys.executable, "-m", "clod_adapter", *words.replace("PLY", str(capture.ply)).split()]
     with open("/dev/full", "w") as full:

@@ -10,17 +10,12 @@ from typing import Any
 
 from runs import names
 
-ADAPT = "base.ply --images scene -o dial.ply --iters 4 --accept-loss"
-COMMANDS = f"""
-{ADAPT} --report
-{ADAPT} --resume
-eval dial.ply --images scene --sv 1 2
+COMMANDS = """
+base.ply --images scene -o dial.ply --iters 2 --accept-loss --report
 render dial.ply --images scene --sv 1 -o pictures
 apply base.ply dial.safetensors -o again.ply
 export dial.ply -o plain.spz
 export dial.ply -o plain.html
-export dial.ply -o plain.glb
-export dial.ply -o plain.ply --keep 50
 """
 
 

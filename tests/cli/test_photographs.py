@@ -13,14 +13,11 @@ HELPERS = (
     "gs", "gswin32c", "gswin64c", "djpeg", "cjpeg", "ffmpeg", "convert", "magick", "gm", "display", "xv", "netpbm",
 )  # fmt: skip
 SIZE = (64, 48)  # the camera's
-FITS = (b"SIMPLE  = T", b"BITPIX  = 8", b"NAXIS   = 2", b"NAXIS1  = 64", b"NAXIS2  = 48", b"END")
 CONTENT = {
     "PostScript": b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 64 48\n%%EndComments\nshowpage\n%%EOF\n",
     "PDF": b"%PDF-1.4\n1 0 obj\n<< /Type /Catalog >>\nendobj\n%%EOF\n",
     "GIF": b"GIF89a" + struct.pack("<HH", *SIZE) + bytes(40),
     "WMF": b"\xd7\xcd\xc6\x9a\0\0" + struct.pack("<4hHLH", 0, 0, *SIZE, 72, 0, 0) + b"\x01\x00\x09\x00" + bytes(100),
-    "FITS": b"".join(line.ljust(80) for line in FITS).ljust(2880) + bytes(64 * 48),
-    "FLI": struct.pack("<LHHHHHH", 128, 0xAF11, 1, *SIZE, 8, 0).ljust(144, b"\0"),
     "PPM": b"P6 64 48 255\n" + bytes(3 * 64 * 48),
 }
 

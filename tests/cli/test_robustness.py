@@ -40,7 +40,7 @@ def stamps(folder: Path) -> dict[str, int]:
 def test_outputs_of_all_cells(run: Any, clod: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("clod_adapter.cli.shared.console.LINE_EVERY", 0)
     done = run("--json")
-    assert done.code == 0, done
+    assert done.code == 0, done.err
     folder = tmp_path / "robustness"
     assert sorted(p.name for p in folder.iterdir()) == ["cells", *OUTPUTS]
     report = json.loads(done.out)
@@ -65,11 +65,8 @@ def test_outputs_of_all_cells(run: Any, clod: Any, tmp_path: Path, monkeypatch: 
     scene = clod_adapter.load_scene(report["scene"])
     (again,) = clod_adapter.evaluate(clod_adapter.load("x.ply").gaussians, scene.test, [3.0])
     assert again.psnr == cells["plain", 3][-1]["psnr"]
-    # Progress is over all cells.
-    lines = re.findall(r"^robustness +(\d+)%, .* left, (\w+) \((\d)/6\)", done.err, re.M)
-    shares = [int(share) for share, *_ in lines]
-    assert shares == sorted(shares) and shares[-1] == 100 and len(set(shares)) > 20
-    assert list(dict.fromkeys(k for *_, k in lines)) == list("123456")
+    lines = re.findall(r"^(\w+) \((\d)/6\) training +\d+%, .* left", done.err, re.M)
+    assert list(dict.fromkeys(lines))[0] == ("plain_sv1", "2") and len(set(lines)) == 4
 
 
 @pytest.mark.usefixtures("blank_figure")

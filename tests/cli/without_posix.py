@@ -14,14 +14,12 @@ from importlib.abc import MetaPathFinder
 
 for other in ("filelock", "numba", "plyfile", "pycolmap", "safetensors.torch", "skimage.metrics", "torch", "tqdm"):
     import_module(other)  # these look at sys.platform, and use what Linux has
-LINUX = ("sched_getaffinity", "sched_setaffinity", "posix_fadvise", "posix_fallocate", "memfd_create", "pidfd_open")
-POSIX = (
-    "fork", "forkpty", "wait3", "wait4", "getuid", "geteuid", "getgid", "getegid", "getpgid", "setsid", "killpg",
-    "mkfifo", "mknod", "fchmod", "chown", "getloadavg", "sysconf", "nice", "pread", "pwrite",
+ABSENT = (
+    "sched_getaffinity", "sched_setaffinity", "posix_fadvise", "posix_fallocate", "fork", "getuid", "geteuid", "setsid",
+    "killpg", "mkfifo", "fchmod", "chown", "getloadavg", "sysconf", "pread", "pwrite",
 )  # fmt: skip
-SIGNALS = ("SIGHUP", "SIGUSR1", "SIGUSR2", "SIGXCPU", "SIGKILL", "SIGALRM", "SIGCHLD", "SIGPIPE")
-MASKS = ("pthread_sigmask", "pthread_kill", "sigwait", "setitimer", "alarm", "siginterrupt")
-MODULES = ("fcntl", "resource", "termios", "pwd", "grp", "pty", "tty", "syslog", "readline")
+SIGNALS = ("SIGHUP", "SIGUSR1", "SIGUSR2", "SIGXCPU", "SIGKILL", "pthread_sigmask", "setitimer")
+MODULES = ("fcntl", "resource", "termios", "pwd", "grp", "pty", "tty")
 
 
 class Absent(MetaPathFinder):
@@ -60,12 +58,9 @@ def watch(event, given):
 
 
 READ, busy = os.open, False
-for name in LINUX + POSIX:
-    if hasattr(os, name):
-        delattr(os, name)
-for name in SIGNALS + MASKS:
-    if hasattr(signal, name):
-        delattr(signal, name)
+for module, names in ((os, ABSENT), (signal, SIGNALS)):
+    for name in names:
+        delattr(module, name)
 for name in MODULES:
     sys.modules.pop(name, None)
 sys.meta_path.insert(0, Absent())

@@ -145,18 +145,16 @@ def assert_others_are_refused(adapt: Any, first: Path, second: Path) -> None:
 
 @pytest.mark.usefixtures("forced")
 def test_blocks_follow_the_plan_of_the_whole(clod: Any, adapt: Any, given: list[Any], tmp_path: Path) -> None:
-    """The same decisions; with --trim what is left out is not written, else it is the base's; frozen is not tuned."""
+    """The same decisions; with --trim what is left out is not written; what is frozen is not tuned."""
     frozen = ["--without", "means", "--growth", "off", "--json"]
-    runs = [clod(*given, "--out", "a.ply", *frozen), adapt("b.ply", *frozen), adapt("c.ply", *frozen, "--trim")]
+    runs = [clod(*given, "--out", "a.ply", *frozen), adapt("c.ply", *frozen, "--trim")]
     plans = [json.loads(done.out)["plan"]["decisions"] for done in runs]
-    assert plans[1] == plans[0] and any((each["what"], each["verdict"]) == ("means", "frozen") for each in plans[0])
-    assert plans[2][:-1] == plans[1] and plans[2][-1]["verdict"] == "trimmed"
-    whole, few = (clod_adapter.load(tmp_path / f"{name}.ply").gaussians for name in "bc")
-    assert set(whole.tensors()) == {*ATTRIBUTES, "sigma_d"}
-    base, adapter = clod_adapter.load(given[0]).gaussians, clod_adapter.load_adapter(tmp_path / "c.safetensors")
-    assert adapter.kept is not None and len(few) == int(adapter.kept.sum()) < len(whole) == len(base)
-    assert torch.equal(whole.means, base.means) and torch.equal(whole.sh0[~adapter.kept], base.sh0[~adapter.kept])
-    assert all(torch.equal(getattr(few, name), getattr(whole, name)[adapter.kept]) for name in ATTRIBUTES[:5])
+    assert any((each["what"], each["verdict"]) == ("means", "frozen") for each in plans[0])
+    assert plans[1][:-1] == plans[0] and plans[1][-1]["verdict"] == "trimmed"
+    base, few = (clod_adapter.load(path).gaussians for path in (given[0], tmp_path / "c.ply"))
+    kept = clod_adapter.load_adapter(tmp_path / "c.safetensors").kept
+    assert set(few.tensors()) == {*ATTRIBUTES, "sigma_d"}
+    assert kept is not None and len(few) == int(kept.sum()) < len(base) and torch.equal(few.means, base.means[kept])
 
 
 @pytest.mark.usefixtures("forced")
@@ -178,16 +176,6 @@ def test_blocks_that_fail_or_are_held_are_reported(
     assert "block 1 of 3, pass 1 of 2: ended after step 2: the loss of step 3" in done.err
     assert "1 Gaussians were not moved by some steps" in done.err
     assert clod_adapter.load(tmp_path / "a.ply").gaussians.sigma_d is not None
-
-
-def test_unusable_options(adapt: Callable[..., Any], forced: None, tmp_path: Path) -> None:
-    for words, message in (
-        (["--memory", "8"], "--memory is '8'; give a number and its unit, as in 8GB"),
-        (["--memory", "100MB"], "--memory is 100 MB, and 300 Gaussians take at least"),
-        (["--form", "paper"], "the paper's form cannot be trained in blocks"),
-    ):
-        done = adapt("a.ply", *words)
-        assert done.code == 2 and message in done.err and not list(tmp_path.iterdir()), done
 
 
 def test_sufficient_memory_changes_nothing(clod: Any, adapt: Any, given: list[Any], tmp_path: Path) -> None:

@@ -63,14 +63,6 @@ def test_two_give_the_result_of_one(server: Server, words: list[Any], alone: Pat
     assert run.log(1) == "" and not (run.folder / STATE).exists()
 
 
-def test_three_with_uneven_shares(server: Server, words: list[Any], tmp_path: Path) -> None:
-    settings = (*TINY[:-2], "--iters", 6, "--batch", 4, "--form", "paper")
-    one = launch(server, tmp_path / "one", *words, *settings, size=1)
-    three = launch(server, tmp_path / "three", *words, *settings, size=3)
-    assert [*one.wait(), *three.wait()] == [0, 0, 0, 0], three.log(0)
-    assert_close(three.folder, one.folder)
-
-
 def test_time_budget_ends_all_after_the_same_step(server: Server, words: list[Any], tmp_path: Path) -> None:
     """By the clock of the first process; that of the second is far ahead."""
     ahead = "import clod_adapter.training.loop as t; at = t.time.perf_counter; t.time.perf_counter = lambda: 1e3 * at()"
@@ -103,67 +95,35 @@ def test_signals_of_the_launcher_do_not_end_the_writing(server: Server, words: l
 
 
 BREAK = """
-from dataclasses import replace; from clod_adapter.training.trainer import Trainer
+from clod_adapter.training.trainer import Trainer
 real, calls = Trainer.gradient_sum, []
 def pull(*arguments):
     calls.append(1)
-    found = real(*arguments)
-    if len(calls) == 5: CHANGE
-    return found
+    if len(calls) == 5: raise MemoryError('no room for this view')
+    return real(*arguments)
 Trainer.gradient_sum = pull
 """
 
 
-@pytest.mark.parametrize(
-    ("change", "codes", "said"),
-    [
-        ("found = replace(found, loss=float('nan'))", [1, 0], "the loss of step 5 is not finite"),
-        ("raise MemoryError('no room for this view')", [0, 2], "; process 1: no room for this view"),
-    ],
-)
-def test_error_within_a_step_loses_no_step(
-    server: Server, words: list[Any], alone: Path, tmp_path: Path, change: str, codes: list[int], said: str
-) -> None:
+def test_error_within_a_step_loses_no_step(server: Server, words: list[Any], alone: Path, tmp_path: Path) -> None:
     """The first process prints the error of the second; a resumed run gives the result of an uninterrupted one."""
-    run = launch(server, tmp_path / "run", *words, *TINY, before={1: BREAK.replace("CHANGE", change)})
-    assert run.wait() == codes, run.log(0)
+    run = launch(server, tmp_path / "run", *words, *TINY, before={1: BREAK})
+    assert run.wait() == [0, 2], run.log(0)
     report = run.report()
-    assert report["steps"] == 4 and report["interrupted"] and said in run.log(0) and run.log(1) == "", run.log(0)
-    assert bool(report["rows"]) == (codes[0] == 1) and load_state(run.folder / STATE)[0].steps == 4
+    assert report["steps"] == 4 and report["interrupted"] and run.log(1) == "", run.log(0)
+    assert "; process 1: no room for this view" in run.log(0) and load_state(run.folder / STATE)[0].steps == 4
     again = launch(server, run.folder, *words, *TINY, "--resume")
     assert again.wait() == [0, 0] and again.report()["resumed_from"] == 4, again.log(0)
     assert_close(run.folder, alone)
 
 
 def test_process_lost_before_the_first_step(server: Server, words: list[Any], tmp_path: Path) -> None:
-    """Nothing is written; here there is no second GPU."""
-    on_gpus = (
-        "real = processes.ProcessGroup.broadcast\n"
-        "def broadcast(*arguments):\n"
-        "    job = real(*arguments)\n"
-        "    object.__setattr__(job, 'device', 'cuda')\n"
-        "    return job\n"
-        "processes.ProcessGroup.broadcast = broadcast; torch.cuda.device_count = lambda: 1"
-    )
-    run = launch(server, tmp_path / "run", *words, *TINY, before={1: on_gpus})
+    """Nothing is written."""
+    lost = "def adapt(*_, **__): raise MemoryError('no room')\nprocesses.adapt = adapt"
+    run = launch(server, tmp_path / "run", *words, *TINY, before={1: lost})
     assert run.wait() == [2, 2] and run.log(1) == "" and list(run.folder.iterdir()) == [], run.log(0)
-    why = "process 1: 2 processes on a machine with 1 GPUs; start as many as there are"
     log = run.log(0)
-    assert log.count("error:") == 1 and f"; {why}; this was before the first step, so start again\n" in log
-
-
-def test_killed_first_process(server: Server, words: list[Any], alone: Path, tmp_path: Path) -> None:
-    """Any number of processes can resume its last state; the others wait for the launcher's signal."""
-    slowly = "from clod_adapter.training.trainer import Trainer; real = Trainer.step\n"
-    slowly += "def step(*a):\n    processes.time.sleep(0.05)\n    real(*a)\nTrainer.step = step"
-    run = launch(server, tmp_path / "run", *words, *TINY, before={0: slowly}, wait=STATE)
-    os.kill(run.pids[0], signal.SIGKILL)
-    os.kill(run.pids[1], signal.SIGTERM)
-    assert run.wait() == [-signal.SIGKILL, 0] and run.log(1) == "", run.log(1)
-    assert [path.name for path in run.folder.iterdir() if not path.name.startswith(".tmp-")] == [STATE]
-    again = launch(server, run.folder, *words, *TINY, "--resume", size=1)
-    assert again.wait() == [0] and again.report()["resumed_from"] >= 1, again.log(0)
-    assert_close(run.folder, alone)
+    assert log.count("error:") == 1 and "; process 1: no room; this was before the first step, so start again\n" in log
 
 
 def test_interrupt_stops_all_after_the_same_step(server: Server, words: list[Any], tmp_path: Path) -> None:
@@ -221,16 +181,12 @@ def test_rank_and_default_steps_from_the_environment(monkeypatch: pytest.MonkeyP
     for name, value in AT.items():
         monkeypatch.setenv(name, value)
     assert launched() == Launch(1, 4, 0, 1)
-    for rank in ("4", "one"):
-        monkeypatch.setenv("RANK", rank)
-        with pytest.raises(ClodError, match="inconsistent .*; start the processes with torchrun"):
-            launched()
+    monkeypatch.setenv("RANK", "4")
+    with pytest.raises(ClodError, match="inconsistent .*; start the processes with torchrun"):
+        launched()
     monkeypatch.setenv("RANK", "0")
     steps = AdaptConfig().steps
-    for words, size, want in (
-        ((), 1, (1, steps)), ((), 4, (4, round(steps / 4))), (("--batch", "3"), 2, (3, round(steps / 3))),
-        (("--batch", str(2 * steps)), 1, (2 * steps, 1)), (("--iters", "100"), 4, (4, 100)),
-    ):  # fmt: skip
+    for words, size, want in (((), 1, (1, steps)), ((), 4, (4, round(steps / 4))), (("--iters", "100"), 4, (4, 100))):
         monkeypatch.setenv("WORLD_SIZE", str(size))
         config = make_config(build_parser("").parse_args(["x.ply", *words]))
         assert (config.batch, config.for_views(1).iters) == want, words

@@ -7,6 +7,7 @@ import re
 import shlex
 import shutil
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +18,11 @@ from plyfile import PlyData
 
 import clod_adapter
 from clod_adapter.cli.adapt import run
-from clod_adapter.cli.shared.measure import machine_name, report_dials
+from clod_adapter.cli.shared import inputs
+from clod_adapter.cli.shared.measure import machine_name
 from clod_adapter.config import AdaptConfig
 from clod_adapter.io.scene.colmap import write_model
-from clod_adapter.training import camera_placement
+from clod_adapter.training import camera_placement, pseudo_views
 from runs import OUTPUTS, names
 from scenes import stripped
 
@@ -54,17 +56,17 @@ def test_writes_three_files(adapted: tuple[Path, Any], capture: Any, dialled: Pa
     assert names(folder) == OUTPUTS, done
     assert len({path.stat().st_mode for path in folder.iterdir()}) == 1
     report = json.loads((folder / "dial.json").read_text())
-    assert report["command"] == "adapt" and report["version"]
-    assert (report["model"], report["scene"]) == (str(capture.ply), str(capture.scene))
-    assert (report["base_count"], report["sh_degree"], report["steps"]) == (300, 1, 12)
-    assert report["interrupted"] is False and report["notes"] == []
+    want = {
+        "command": "adapt", "model": str(capture.ply), "scene": str(capture.scene), "base_count": 300, "sh_degree": 1,
+        "steps": 12, "interrupted": False, "notes": [], "screen_filter": {"variance": 0.3, "compensate": False},
+        "outputs": {"ply": "dial.ply", "adapter": "dial.safetensors", "report": "dial.json"},
+        "adapter_bytes": (folder / "dial.safetensors").stat().st_size,
+    }  # fmt: skip
+    assert {name: report[name] for name in want} == want
     assert (report["alignment"]["guess"], report["alignment"]["explained"]) == (None, 1)
-    assert report["screen_filter"] == {"variance": 0.3, "compensate": False}
     assert set(report["config"]) == set(AdaptConfig.__dataclass_fields__) and report["config"]["max_sv"] == 4
     assert set(report["machine"]) >= {"cpu", "cores", "python", "torch", "numba"}
     assert set(report["seconds"]) == {"load", "kernels", "plan", "start", "train", "evaluate", "total"}
-    assert report["adapter_bytes"] == (folder / "dial.safetensors").stat().st_size
-    assert report["outputs"] == {"ply": "dial.ply", "adapter": "dial.safetensors", "report": "dial.json"}
     assert [row["virtual_scale"] for row in report["rows"]] == [1, 1.5, 2, 3, 4]
     shares = [row["kept_share"] for row in report["rows"]]
     assert shares == sorted(shares, reverse=True) and 0 < shares[-1] < 0.5
@@ -178,55 +180,48 @@ def test_without_held_out_photographs(clod: Any, capture: Any, tmp_path: Path) -
     (tmp_path / "one" / "images").mkdir(parents=True)
     write_model(tmp_path / "one", [view.camera], ["a.png"])
     Image.fromarray(view.image.numpy()).save(tmp_path / "one" / "images" / "a.png")
-    done = clod(capture.ply, "--images", "one", *TINY, "--json")
+    done = clod(capture.ply, "--images", "one", "--iters", 0, "--max-sv", 4, "--out", "dial.ply", "--json")
     report = json.loads(done.out)
     assert done.code == 0 and report["rows"] == report["base_rows"] == [] and "no photographs" in done.err
     assert clod("eval", "dial.ply", "--images", "one").code == 2
 
 
 def test_without_photographs(clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(camera_placement, "WIDTH", 186)  # smaller, for speed
-    monkeypatch.setattr(camera_placement, "HEIGHT", 138)
+    """The target images are renders of the base, rounded to bytes."""
+    monkeypatch.setattr(camera_placement, "WIDTH", 62)  # smaller and fewer, for speed
+    monkeypatch.setattr(camera_placement, "HEIGHT", 46)
+    monkeypatch.setattr(inputs, "place_cameras", partial(inputs.place_cameras, views=16))
     done = clod(capture.ply, *TINY, "--json")
     report = json.loads(done.out)
     assert done.code == 0 and names(tmp_path) == OUTPUTS, done
     assert report["scene"] is None and report["teacher"] == "checkpoint" and report["seconds"]["place"] > 0
-    assert len(report["notes"]) == 1 and report["notes"][0] in done.err
-    assert re.match(r"no photographs: 84 pseudo views to train on, 12 held out, 186x138, ", report["notes"][0])
+    (note,) = report["notes"]
+    assert note in done.err and "no photographs: 14 pseudo views to train on, 2 held out, 62x46, " in note
     assert "held-out photographs" not in done.err and "--images" not in done.err.split("next:\n")[1].split("warning")[0]
-    # The target images are renders of the base, rounded to bytes.
     full = report["rows"][0]["psnr"]
     assert report["base_rows"][0]["psnr"] > 50 > full > report["rows"][-1]["psnr"] and len(report["rows"]) == 5
     assert f"s = 1 has {full:.2f} dB against" in report["loss"]
     assert rebuilt(clod, capture.ply, tmp_path) and report["calibration"]["against"] == "checkpoint"
     (note, *_) = json.loads(clod("export", "dial.ply", "--psnr-drop", 1, "-o", "plain.ply", "--json").out)["notes"]
     assert "without photographs, against renders of the checkpoint" in note
-    photographs = json.loads(clod("eval", "dial.ply", "--images", capture.scene, "--sv", 1, 4, "--json").out)["rows"]
-    assert photographs[0]["psnr"] > 20 and photographs[0]["psnr"] > photographs[1]["psnr"]
-
-
-def test_report_dials() -> None:
-    dials = [1, 1.5, 2, 3, 5, 7, 10, 14, 20]
-    for max_sv, want in ((1, [1]), (1.2, [1, 1.2]), (8.5, [*dials[:6], 8.5]), (20, dials)):
-        assert report_dials(max_sv) == want
 
 
 def test_ci_banana(clod: Any, shared_data: Callable[[str], Path], tmp_path: Path) -> None:
     scene = shared_data("ci_banana")
-    done = clod(scene / "pretrained.ply", "--images", scene / "images", "--iters", 20, "--out", "dial.ply", "--json")
-    assert done.code == 0, done
+    done = clod(scene / "pretrained.ply", "--images", scene / "images", "--iters", 5, "--out", "dial.ply", "--json")
     report = json.loads(done.out)
     assert report["base_count"] == 20_000 and report["base_rows"][0]["psnr"] == pytest.approx(25.81, abs=0.02)
-    assert report["rows"][-1]["kept_share"] < 0.3 and rebuilt(clod, scene / "pretrained.ply", tmp_path)
+    assert report["rows"][-1]["kept_share"] < 0.3
 
 
-def test_unusual_inputs(clod: Any, capture: Any, tmp_path: Path) -> None:
+def test_unusual_inputs(clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Few photographs get pseudo views, faint Gaussians a lower tau; invisible ones cannot do without any."""
+    monkeypatch.setattr(pseudo_views, "ADDED", 8)
     shutil.copytree(capture.scene, tmp_path / "few")
     for name in sorted((tmp_path / "few" / "images").iterdir())[1:5]:
         name.unlink()
     report = json.loads(clod(capture.ply, "--images", "few", "--iters", 2, "--out", "dial.ply", "--json").out)
-    assert any("photographs to train on" in note and "96 pseudo views" in note for note in report["notes"])
+    assert any("photographs to train on" in note and "8 pseudo views" in note for note in report["notes"])
     assert report["config"]["lr_means"] == AdaptConfig().lr_means / 2
     assert report["config"]["lr_sigma"] == AdaptConfig().lr_sigma
     logits = torch.full_like(capture.gaussians.opacity_logits, -4.6)

@@ -66,7 +66,7 @@ def test_eval_and_render_use_the_detected_filter(clod: Any, trained: tuple[Path,
         psnr = [report["rows"][0]["psnr"], report["base_row"]["psnr"], report["against"][0]["theirs"]["psnr"]]
         found[more] = [*psnr, drawn["pictures"][0]["psnr"][0]]
         for each in (report, drawn):
-            assert any("ntialias" in note for note in each["notes"]) == (more == ()), each
+            assert any("was trained with antialiasing" in note for note in each["notes"]) == (more == ()), each["notes"]
     assert min(found[()]) > 45 > 35 > max(found["--antialiasing", "off"]), found
 
 
@@ -75,12 +75,9 @@ def test_option_overrides_the_file(clod: Any, trained: tuple[Path, Path]) -> Non
     ply, scene = trained
     done = clod(ply, "--images", scene, *FAST, "--antialiasing", "mip")
     assert done.code == 0 and "by the photographs" not in done.err, done
-    quiet = clod("eval", "dial.ply", "--images", scene, "--sv", 1, "--json")
-    assert "0.1 px^2 of blur" in quiet.err and "by the photographs" not in quiet.err
     told = clod("eval", "dial.ply", "--images", scene, "--sv", 1, "--json", "--antialiasing", "off")
     (note,) = [note for note in json.loads(told.out)["notes"] if "(--antialiasing)" in note]
     assert "the file has 0.1 px^2 of blur, opacities compensated" in note and note in told.err
-    assert json.loads(clod("inspect", "dial.ply", "--json").out)["splat"]["screen_filter"]["variance"] == 0.1
 
 
 @pytest.mark.usefixtures("without_splat_transform")

@@ -15,7 +15,6 @@ from clod_adapter.cli import view
 from clod_adapter.cli.main import build_parser
 from clod_adapter.cli.shared.command import DEVICES
 from clod_adapter.io.checkpoint import load, save
-from runs import notes_of
 
 
 def stored(path: Path) -> clod_adapter.Calibration:
@@ -25,13 +24,13 @@ def stored(path: Path) -> clod_adapter.Calibration:
 
 
 def test_eval_at_a_budget(clod: Any, capture: Any, dialled: Path) -> None:
-    """Of s = 1 and within the range, with a note on each solution; a psnr drop out of reach gives the range's end."""
+    """Within the range, at s = 1 if that is enough; a psnr drop out of reach gives the range's end; with notes."""
     rows = stored(dialled).rows
     middle, drop = round(rows[0].kept * 0.4 + rows[-1].kept * 0.6), rows[0].psnr - rows[2].psnr
 
     def at(*words: object) -> tuple[list[Any], list[str]]:
         report = json.loads(clod("eval", dialled, "--images", capture.scene, *words, "--json").out)
-        return report["rows"], notes_of(report)
+        return report["rows"], report["notes"]
 
     (found, whole), notes = at("--keep", middle, 300)
     s = found["virtual_scale"]
@@ -47,15 +46,7 @@ def test_eval_at_a_budget(clod: Any, capture: Any, dialled: Path) -> None:
     assert re.match(r"--fps 1: s = 1 \(s = 1 draws \d+ frames a second already\)", notes[-1])
 
 
-def test_error_names_an_unusable_calibration(clod: Any, dialled: Path, tmp_path: Path) -> None:
-    data = dialled.read_bytes().replace(b"calibrated_with 300 ", b"calibrated_with 299 ")
-    (tmp_path / "other.ply").write_bytes(data)
-    done = clod("export", "other.ply", "--psnr-drop", 1, "-o", "x.ply")
-    said = "other.ply: --psnr-drop: the calibration is of 299 Gaussians and ignored, these are 300; adapt"
-    assert done.code == 2 and said in done.err
-
-
-def test_baking_to_a_budget(clod: Any, dialled: Path, tmp_path: Path) -> None:
+def test_baking_to_a_budget(clod: Any, dialled: Path) -> None:
     def baked(*words: object) -> Any:
         report = json.loads(clod("export", *words, "--json").out)
         return report, report["outputs"][0]
@@ -71,7 +62,6 @@ def test_baking_to_a_budget(clod: Any, dialled: Path, tmp_path: Path) -> None:
     assert report["notes"] == ["--fps 250: s = 2 (frame times of another at 640x480)"]
     done = clod("export", "there.ply", "--fps", 10**6, "-o", "g.ply")
     assert done.code == 2 and done.err.rstrip().endswith("500 a second (frame times of another at 640x480)")
-    assert not (tmp_path / "g.ply").exists()
     output = baked(dialled, "--psnr-drop", rows[0].psnr - rows[2].psnr, "-o", "p.ply")[1]
     assert output["virtual_scale"] == pytest.approx(rows[2].virtual_scale)
 

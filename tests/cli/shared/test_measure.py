@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import signal
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -14,7 +12,6 @@ import clod_adapter
 from clod_adapter.cli.shared import measure
 from clod_adapter.evaluation import frame_times
 from clod_adapter.evaluation.frame_times import FrameTimes, Model
-from runs import pressing
 
 
 def test_frames_are_timed_together(clod: Any, capture: Any, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -38,10 +35,3 @@ def test_frames_are_timed_together(clod: Any, capture: Any, monkeypatch: pytest.
     assert done.err.count("frame times are rough") == 1
     rows = json.loads(clod("eval", "dial.ply", *scene, "--sv", 3, 1).out)["rows"]
     assert [(row["virtual_scale"], round(row["frame_ms"])) for row in rows] == [(3, 333), (1, 1000)]
-
-
-def test_an_interrupt_keeps_the_rows(clod: Any, capture: Any, dialled: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(frame_times, "render", pressing(frame_times.render, signal.SIGINT, at=7))
-    done = clod("eval", dialled, "--images", capture.scene, "--sv", 1, 3, "--json")
-    report = json.loads(done.out)
-    assert report["interrupted"] and len(report["rows"]) == 2 and report["rows"][0]["frame_ms"] > 0, done
