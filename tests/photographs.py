@@ -10,33 +10,21 @@ from typing import Any
 import numpy as np
 import pycolmap
 import torch
-from hypothesis import strategies as st
 from PIL import Image
 
 from clod_adapter.cameras import Camera
 from clod_adapter.io.scene.colmap import write_model
-from formats import damaged
 
 SIZE = {"width": 160, "height": 120}
 INTRINSICS = {"fl_x": 30.0, "fl_y": 31.0, "cx": 19.25, "cy": 15.5, "w": 40, "h": 30}  # of a transforms file
 LENSES = {
     "SIMPLE_RADIAL": [140, 82, 58, -0.12],
-    "RADIAL": [140, 82, 58, -0.15, 0.05],
     "OPENCV": [140, 142, 82, 58, -0.15, 0.05, 0.004, -0.003],
     "FULL_OPENCV": [140, 142, 82, 58, -0.15, 0.05, 0.004, -0.003, 0.01, 0.02, 0.01, 0],
     "FOV": [140, 142, 82, 58, 0.5],
-    "SIMPLE_DIVISION": [140, 82, 58, 0.1],
-    "DIVISION": [140, 142, 82, 58, -0.1],
-    "EUCM": [140, 142, 82, 58, 0.3, 1.1],
     "SIMPLE_FISHEYE": [100, 82, 58],
-    "FISHEYE": [100, 102, 82, 58],
-    "SIMPLE_RADIAL_FISHEYE": [100, 82, 58, 0.03],
-    "RADIAL_FISHEYE": [100, 82, 58, 0.03, -0.01],
     "OPENCV_FISHEYE": [100, 102, 82, 58, 0.03, -0.01, 0.002, 0.001],
     "THIN_PRISM_FISHEYE": [100, 102, 82, 58, 0.03, -0.01, 0.001, 0.002, 0.01, 0.02, 0.001, 0.002],
-    "RAD_TAN_THIN_PRISM_FISHEYE": [
-        *(100, 102, 82, 58, 0.03, -0.01, 0.01, 0.002, 0.001, 0.0003, 0.002, -0.003, 0.004, 0.001, -0.002, 0.003)
-    ],
 }
 
 
@@ -114,9 +102,3 @@ def seen(camera: pycolmap.Camera) -> np.ndarray:
 
 def psnr_of(picture: np.ndarray, other: np.ndarray) -> float:
     return float(-10 * np.log10(np.square((picture.astype(float) - other) / 255).mean() + 1e-9))
-
-
-def damage(data: st.DataObject, files: list[Path]) -> None:
-    """Truncates one of the files, or overwrites some of its bytes."""
-    path = data.draw(st.sampled_from(files))
-    path.write_bytes(damaged(path.read_bytes(), data))

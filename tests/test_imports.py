@@ -29,7 +29,7 @@ ORDER: list[set[str]] = [
     {"adapter", "integrations", "render"},
     {"bake", "initialization"},
     {"io.atomic", "io.settings"},
-    {"io.file_formats", "io.lock", "io.ply_settings", "io.values"},
+    {"io.file_formats", "io.ply_settings", "io.values"},
     {"io.ply_packed", "io.scene", "io.tensor_file"},
     {"io.ply"},
     {"io.checkpoint", "io.formats"},

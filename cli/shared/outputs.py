@@ -15,9 +15,8 @@ from typing import Any
 
 from clod_adapter._support.text import as_text
 from clod_adapter.errors import ClodError
-from clod_adapter.io.atomic import atomic_path, check_target, remove_leftovers
+from clod_adapter.io.atomic import atomic_path, check_target, output_lock, remove_leftovers
 from clod_adapter.io.file_formats import check_suffix, read_source
-from clod_adapter.io.lock import output_lock
 from clod_adapter.io.scene.folder import scene_files
 
 

@@ -20,13 +20,11 @@ from clod_adapter.config import CLASSIC
 from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.file_formats import KEY
-from clod_adapter.io.settings import DAMAGE, Metadata, damaged, document, parse_document, read_metadata, stored_values
+from clod_adapter.io.settings import DAMAGE, Metadata, damaged, document, parse_document, read_metadata
 from clod_adapter.io.settings import FORMAT as MODEL
 from clod_adapter.io.tensor_file import load_tensors, read_tensor_header, write_tensors
 
-FORMAT = "clod-adapter"
-FORMAT_VERSION = 3
-UNTRIMMED, TRIMMED = 1, 2  # formats of adapters without growth, which earlier versions of this package read
+FORMAT, FORMAT_VERSION = "clod-adapter", 3
 
 
 def save_adapter(path: str | Path, adapter: Adapter) -> None:
@@ -35,18 +33,12 @@ def save_adapter(path: str | Path, adapter: Adapter) -> None:
     Raises:
         ClodError: its config is not plain JSON, or the file cannot be written.
     """
-    trimmed = adapter.kept is not None or adapter.sh_degree is not None
-    lowest = TRIMMED if trimmed else UNTRIMMED
-    about = {
-        **document(FORMAT, lowest if adapter.growth_d is None else FORMAT_VERSION),
-        "package_version": adapter.version,
-        "base_sha256": adapter.base_fingerprint,
-        "config": adapter.config,
-        **stored_values(adapter.attenuation, adapter.screen_filter, adapter.origin, adapter.calibration),
-    }
-    if trimmed:
-        about["trimmed"] = {"base_count": adapter.base_count, "sh_degree": adapter.sh_degree}
     check_config(adapter.config)
+    settings = adapter.attenuation, adapter.screen_filter, adapter.origin, adapter.calibration
+    about = document(FORMAT, FORMAT_VERSION, *settings)
+    about |= {"package_version": adapter.version, "base_sha256": adapter.base_fingerprint, "config": adapter.config}
+    if adapter.kept is not None or adapter.sh_degree is not None:
+        about["trimmed"] = {"base_count": adapter.base_count, "sh_degree": adapter.sh_degree}
     metadata = {KEY: json.dumps(about, sort_keys=True, allow_nan=False)}
     tensors = {**dial_tensors(adapter), **adapter.updates}
     if adapter.kept is not None:

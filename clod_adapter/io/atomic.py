@@ -1,4 +1,4 @@
-"""Outputs appear whole or not at all: write under a temporary name, then rename."""
+"""Outputs appear whole or not at all: write under a temporary name, then rename; and one run at a time writes them."""
 
 from __future__ import annotations
 
@@ -17,13 +17,8 @@ from clod_adapter.errors import ClodError
 def atomic_path(final: str | Path) -> Iterator[Path]:
     """Gives a temporary name beside ``final``; on success the file written there replaces it.
 
-    The body writes a file, or makes a folder, at the yielded path, which does not exist yet. It is
-    flushed to disk before it is renamed, so a crash leaves either the old ``final`` or the new one.
-    On any exception (KeyboardInterrupt too) the temporary is removed and ``final`` is untouched.
-
-    Raises:
-        ClodError: the folder is missing or not writable, ``final`` is a folder that is not empty, or
-            the operating system refuses the write (a full disk, say).
+    The body writes a file, or makes a folder, there. It is flushed to disk before it is renamed, so a crash leaves the
+    old ``final`` or the new one; on any exception (KeyboardInterrupt too) the temporary is removed.
     """
     with atomic_paths(final) as (temporary,):
         yield temporary
@@ -31,10 +26,7 @@ def atomic_path(final: str | Path) -> Iterator[Path]:
 
 @contextmanager
 def atomic_paths(*finals: str | Path) -> Iterator[tuple[Path, ...]]:
-    """``atomic_path`` for several files: all are complete and flushed before the first is renamed.
-
-    A ClodError of the body names the final paths in place of the temporary ones.
-    """
+    """``atomic_path`` for several: all are flushed before the first is renamed. Errors name the final paths."""
     targets = [Path(final) for final in finals]
     for target in targets:
         check_target(target)
@@ -65,18 +57,44 @@ def atomic_paths(*finals: str | Path) -> Iterator[tuple[Path, ...]]:
 def remove_leftovers(final: Path) -> None:
     """Removes temporaries of ``final`` that killed processes left, where permissions allow."""
     for path in final.parent.glob(f"{_mark(final)}*"):
-        if not path.name.endswith("-lock"):  # of ``lock_file``
+        if not path.name.endswith("-lock"):  # of ``output_lock``
             with suppress(OSError):
                 _remove(path)
 
 
-def lock_file(final: Path) -> Path:
-    """The file beside ``final`` that ``lock.output_lock`` locks: one for names that differ in case only."""
-    return final.parent / f"{_mark(final.with_name(final.name.casefold()))}lock"
+@contextmanager
+def output_lock(final: Path, *, of: Path | None = None) -> Iterator[None]:
+    """Holds, in the body, the lock of ``final``, by a hidden file beside it; errors name ``of``.
+
+    Of two runs the second would remove the temporaries of the first. The lock ends with the process, however that ends.
+    On a file system without locks nothing is locked.
+    """
+    from filelock import FileLock, Timeout  # here: --help needs no lock
+
+    path = final.parent / f"{_mark(final.with_name(final.name.casefold()))}lock"  # some file systems ignore case
+    lock, busy = FileLock(path, timeout=0), "another run is writing it; wait for that, or choose another name"
+    try:
+        lock.acquire()
+    except Timeout as error:
+        # Also raised where no file can be made.
+        why = busy if path.exists() else "cannot be written; check the path"
+        raise ClodError(f"{of or final}: {why}") from error
+    except (OSError, NotImplementedError) as error:  # no locks here
+        if isinstance(error, PermissionError) and os.path.exists(path):  # the run of another user
+            raise ClodError(f"{of or final}: {busy}") from error
+        with suppress(OSError):
+            path.unlink()
+    try:
+        yield
+    finally:
+        if lock.is_locked:
+            with suppress(OSError):  # Windows removes no open file; there releasing does
+                path.unlink()
+            lock.release()
 
 
 def check_target(final: Path) -> None:
-    """Raises the ClodError of ``atomic_path`` that can be predicted before anything is written."""
+    """Refuses, before anything is written, what ``atomic_path`` could not write."""
     folder = final.parent
     if not folder.is_dir():
         raise ClodError(f"{final}: folder {folder} does not exist; create it first")

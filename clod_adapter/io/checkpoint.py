@@ -1,4 +1,4 @@
-"""Checkpoints: a reader of every format, and the writer of the extended PLY."""
+"""Checkpoints: a reader of every format."""
 
 from __future__ import annotations
 
@@ -20,21 +20,14 @@ from clod_adapter.equation.attenuation import attenuate
 from clod_adapter.equation.distances import camera_of
 from clod_adapter.equation.units import in_world_units, nominal_distance
 from clod_adapter.errors import ClodError
-from clod_adapter.gaussians import OPAQUE, Gaussians
+from clod_adapter.gaussians import Gaussians
 from clod_adapter.hook import Hook
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.file_formats import PLY, check_suffix, check_written, format_of, read_source, write
 from clod_adapter.io.ply import column_map, write_rows
-from clod_adapter.io.ply_settings import PREFIX, constants_of, write_comments
-from clod_adapter.io.settings import (
-    WARNING,
-    History,
-    matching_calibration,
-    stated_filter,
-    tagged,
-    that_fit,
-)
-from clod_adapter.io.values import SIGMA, Activated, arrays_of, prepared
+from clod_adapter.io.ply_settings import PREFIX
+from clod_adapter.io.settings import WARNING, History, matching_calibration, stated_filter, tagged, that_fit
+from clod_adapter.io.values import SIGMA, Activated, prepared
 from clod_adapter.origin import NOWHERE, Origin
 
 # Adapted files of three captures keep 38 to 97 % at s = 1, with sigma_d in other units 3 to 43 %.
@@ -84,7 +77,7 @@ class Checkpoint:
 
     @property
     def cameras(self) -> list[Camera]:
-        """The viewpoints as cameras with the size of the calibration's images; none in files of earlier versions."""
+        """The viewpoints as cameras with the size of the calibration's images."""
         if self.calibration is None:
             return []
         size = self.calibration.width, self.calibration.height
@@ -150,8 +143,8 @@ def load(path: str | Path, *, activated: Activated | None = None, origin: Origin
     calibration, mismatch = matching_calibration(metadata, len(gaussians)) if dial else (None, [])
     about = [comment for comment in source.comments if not comment.startswith(PREFIX)]
     if source.head is None:
-        about = ["".join(c if c.isascii() and c.isprintable() else "?" for c in line) for line in about]
-        about = tagged(about, screen_filter)
+        printable = ["".join(c if c.isascii() and c.isprintable() else "?" for c in line) for line in about]
+        about = tagged(printable, screen_filter)
     comments, dropped = that_fit([*about, *found.changes])
     return Checkpoint(
         gaussians, rows, comments, (*notes, *mismatch, *source.notes, *dropped),
@@ -162,7 +155,7 @@ def load(path: str | Path, *, activated: Activated | None = None, origin: Origin
 
 def _unusual(gaussians: Gaussians, origin: Origin) -> list[str]:
     notes = []
-    if opaque := int((gaussians.opacity_logits == torch.inf).sum()):
+    if opaque := int(gaussians.opacity_logits.isposinf().sum()):
         notes.append(f"{opaque} Gaussians have opacity = +inf and are taken as fully opaque")
     if any(origin):
         where = ", ".join(f"{value:.10g}" for value in origin)
@@ -174,8 +167,7 @@ def _unusual(gaussians: Gaussians, origin: Origin) -> list[str]:
 def plausibility(arrays: Mapping[str, np.ndarray], config: AttenuationConfig) -> list[str]:
     """Of a dial without settings, a line with the share that it keeps at s = 1 from the nominal distance.
 
-    A warning where that is too small, as of a sigma_d in units of a distance (as earlier versions wrote), or of a file
-    whose positions were enlarged. A sigma_d that is too large is not detected. Empty for normalisers other than
+    A warning where that is too small, as of a file whose positions were enlarged. Nothing for normalisers other than
     ``scene``, which are invariant to scale.
     """
     if config.normalizer != "scene":
@@ -212,7 +204,7 @@ def save(
     overwritten only where it differs from the base's float32 reading, so what was not tuned stays
     byte-equal. Where the base has an origin, x, y and z are written as double. sigma_d is written in world units
     (``units.in_world_units``). The settings follow the element line as comments, and those that are not the defaults
-    are stored in columns too (``ply.constants``). Without a sigma_d a plain file results.
+    are stored in columns too. Without a sigma_d a plain file results.
 
     Args:
         version: of the package that made the values, for the header (``Adapter.version``); by default the running one.
@@ -242,40 +234,14 @@ def save(
             warnings.warn(f"{path}: {note}", stacklevel=2)
         return
     with atomic_path(path) as temporary:
-        _write(path, temporary, in_world_units(gaussians), vertex, History(about, origin, calibration), version)
+        write_rows(temporary, in_world_units(gaussians), History(about, origin, calibration), vertex, version)
         check_written(temporary)
 
 
-def _write(
-    path: Path, target: Path, gaussians: Gaussians, vertex: np.ndarray | None, history: History,
-    version: str | None = None,
-) -> None:  # fmt: skip
-    about = write_comments(gaussians.attenuation, history.about, version, history.calibration, gaussians.screen_filter)
-    constants, dial = dict[str, float](), gaussians.attenuation
-    if dial is not None:  # a plain file has the columns of Inria's layout and no others
-        constants = constants_of(dial, gaussians.growth_d is not None, gaussians.screen_filter)
-    with open(target, "wb") as file:
-        write_rows(file, path, gaussians, vertex, history.origin, about, constants)
-
-
-def write_ply(path: Path, gaussians: Gaussians, history: History) -> tuple[str, ...]:
-    """Writes Gaussians without a base, every value unchanged but opacity = +inf; else as ``file_formats.write``."""
-    arrays_of(path, gaussians)  # refuses rows that load would drop
-    opaque = gaussians.opacity_logits == torch.inf
-    finite = torch.where(opaque, torch.full_like(gaussians.opacity_logits, OPAQUE), gaussians.opacity_logits)
-    _write(path, path, gaussians.replace(opacity_logits=finite), None, history)
-    return (f"{int(opaque.sum())} opacities of +inf are written as {OPAQUE:g}, which is 1 too",) if opaque.any() else ()
-
-
 def trimmed(checkpoint: Checkpoint, kept: Tensor | None, sh_degree: int | None) -> Checkpoint:
-    """The checkpoint with fewer rows and SH degrees; every other column is unchanged.
+    """The checkpoint with the rows ``kept [N]`` and a lower SH degree, None for all; other columns are unchanged.
 
-    ``f_rest_*`` are numbered channel by channel, so with a lower degree a number means another coefficient: values
-    move between columns, and the remaining columns keep their order.
-
-    Args:
-        kept: ``[N]`` bool; None for all rows.
-        sh_degree: None for the checkpoint's.
+    ``f_rest_*`` are numbered channel by channel, so with a lower degree values move between columns.
     """
     if kept is None and sh_degree is None:
         return checkpoint

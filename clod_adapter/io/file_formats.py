@@ -5,7 +5,6 @@ What reads, checks or refuses a file, here and in the readers, raises a ClodErro
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
@@ -22,59 +21,35 @@ if TYPE_CHECKING:
 
 
 class Format(NamedTuple):
-    """A format: functions by module and name under ``clod_adapter.io``, imported when they are called.
+    """A format. Its module has ``read``, of a path to a ``Source``.
 
-    Attributes:
-        read: a path to a ``Source``.
-        check: refuses, by the first bytes and without torch, a file that is not of the format.
-        dial: whether a file that ``check`` passes has a sigma_d, by its header (an .spz is read); "" where none has.
-        write: called with path, Gaussians in world units and a ``History``; gives a line for each loss; "" where the
-            format is only read.
-        carries_sigma: whether the dial is written: sigma_d, growth_d and their settings.
-        about: of a format that is written, the precision of its values; lines of at most 54 letters.
-        ordered: whether the rows keep their order.
+    If it carries sigma_d also ``has_dial``, of a file that was checked; if it is written also ``write``, of a path,
+    Gaussians in world units and a ``History``, to a line for each loss.
     """
 
-    read: str = ""
-    check: str = ""
-    dial: str = ""
-    write: str = ""
-    carries_sigma: bool = False
-    about: tuple[str, ...] = ()
-    ordered: bool = True
+    module: str = ""  # under ``clod_adapter.io``, imported when it is used
+    check: str = "file_formats.check_start"  # refuses, by the first bytes and without torch, a file of another format
+    carries_sigma: bool = False  # whether the dial is written: sigma_d, growth_d and their settings
+    about: tuple[str, ...] = ()  # where it is written, the precision of its values; lines of at most 54 letters
+    ordered: bool = True  # whether the rows keep their order
 
 
-_CHECK = "file_formats.check_start"
-_CONVERTED = Format("formats.splat_transform.load_converted", "formats.splat_transform.check_converted")
 KEY = "clod_adapter"  # of the JSON document in formats other than PLY
-PLY = Format(
-    "ply.read_ply", "ply.check_ply", "ply.open_ply", "checkpoint.write_ply", True, ("exact; baked, in Inria's layout",)
-)
+_GLB = "float32, SH degree up to 3", "(KHR_gaussian_splatting, _SIGMA_D, _GROWTH_D)"
+_SPZ = ("6 to 24 bits, SH degree up to 3, the dial 16-bit floats",)
+_CONVERTED = Format("formats.splat_transform", "formats.splat_transform.check")
+PLY = Format("ply", "ply.check", carries_sigma=True, about=("exact; baked, in Inria's layout",))
 FORMATS = {
     ".ply": PLY,
-    ".glb": Format(
-        "formats.glb.load_glb", _CHECK, "formats.glb.has_dial", "formats.glb.write_glb", True,
-        ("float32, SH degree up to 3", "(KHR_gaussian_splatting, _SIGMA_D, _GROWTH_D)"),
-    ),
-    ".spz": Format(
-        "formats.spz.load_spz", _CHECK, "formats.spz.has_dial", "formats.spz.write_spz", True,
-        ("6 to 24 bits, SH degree up to 3, the dial 16-bit floats",),
-    ),
-    ".safetensors": Format(
-        "tensor_file.load_safetensors", _CHECK, "tensor_file.has_dial", "tensor_file.write_safetensors", True,
-        ("exact; for Python",),
-    ),
-    ".pt": Format(
-        "formats.pt.load_pt", "formats.pt.check_pt", "formats.pt.has_dial", "formats.pt.write_pt", True,
-        ("exact; layout of gsplat's trainer",),
-    ),
-    ".splat": Format(
-        "formats.splat.load_splat", _CHECK, "", "formats.splat.write_splat", False, ("8 bits, SH degree 0",), False
-    ),
+    ".glb": Format("formats.glb", carries_sigma=True, about=_GLB),
+    ".spz": Format("formats.spz", carries_sigma=True, about=_SPZ),
+    ".safetensors": Format("tensor_file", carries_sigma=True, about=("exact; for Python",)),
+    ".pt": Format("formats.pt", "formats.pt.check", carries_sigma=True, about=("exact; layout of gsplat's trainer",)),
+    ".splat": Format("formats.splat", about=("8 bits, SH degree 0",), ordered=False),
     ".sog": _CONVERTED,
     ".ksplat": _CONVERTED,
-}  # fmt: skip
-WRITABLE = tuple(suffix for suffix, form in FORMATS.items() if form.write)
+}
+WRITABLE = tuple(suffix for suffix, form in FORMATS.items() if form.about)
 
 
 def format_of(path: Path) -> Format:
@@ -88,10 +63,10 @@ def check_readable(path: Path) -> None:
 
 
 def file_has_dial(path: Path) -> bool:
-    """Whether the file has a sigma_d: ``Format.dial``."""
+    """Whether the file has a sigma_d, by its header (an .spz is read)."""
     check_readable(path)
-    dial = format_of(path).dial
-    return bool(dial) and bool(_call(dial, path))
+    form = format_of(path)
+    return form.carries_sigma and bool(_call(f"{form.module}.has_dial", path))
 
 
 def check_suffix(path: Path) -> None:
@@ -104,10 +79,7 @@ def check_suffix(path: Path) -> None:
 
 
 def check_written(path: Path) -> None:
-    """Refuses a file just written, under its temporary name, that the reader of its format would refuse.
-
-    Of a PLY header, settings and length are read; any other format is read whole.
-    """
+    """Refuses a file just written that could not be read again: a PLY by its header and length, others read whole."""
     try:
         (file_has_dial if format_of(path) is PLY else read_source)(path)
     except ClodError as error:
@@ -118,7 +90,7 @@ def check_written(path: Path) -> None:
 def read_source(path: Path) -> Source:
     """The content of a file in any format; every reader refuses, in one line, what is damaged or of another kind."""
     check_readable(path)
-    found: Source = _call(format_of(path).read, path)
+    found: Source = _call(f"{format_of(path).module}.read", path)
     return found
 
 
@@ -133,28 +105,23 @@ def write(
     """Writes Gaussians in the format of the name's suffix, whole or not at all, sigma_d in world units.
 
     Args:
-        gaussians: with or without a dial.
         about: lines on their history, printable ASCII, for formats that store text.
         origin: what their means are relative to (``Checkpoint.origin``), world units.
         calibration: of these Gaussians, for formats that store text.
 
     Returns:
         One line for each loss.
-
-    Raises:
-        ClodError: an unknown suffix, sigma_d for a format that does not carry it, no Gaussians, a value that is not
-            finite (opacity = +inf aside), a missing package, or the file cannot be written or not be read again.
     """
     check_suffix(Path(path))
-    suffix = Path(path).suffix.lower()
-    if gaussians.sigma_d is not None and not FORMATS[suffix].carries_sigma:
+    form = format_of(Path(path))
+    if gaussians.sigma_d is not None and not form.carries_sigma:
         raise ClodError(f"{path}: {Path(path).suffix} has no room for a dial; choose a dial value to bake")
     from clod_adapter.equation.units import in_world_units  # here: the table needs no torch
     from clod_adapter.io.settings import History
 
     history = History(tuple(about), origin, calibration)
     with atomic_path(path) as temporary:
-        notes: tuple[str, ...] = _call(FORMATS[suffix].write, temporary, in_world_units(gaussians), history)
+        notes: tuple[str, ...] = _call(f"{form.module}.write", temporary, in_world_units(gaussians), history)
         check_written(temporary)
     return notes
 
@@ -170,7 +137,7 @@ def check_start(path: Path) -> None:
     if suffix in _START and not start.startswith(_START[suffix]):
         refuse(path, start, f"is not a {suffix} file by its first bytes; copy or export it again")
     if suffix == ".spz" and start.startswith(NEW_SPZ):
-        _call("formats.splat_transform.check_converted", path, " of version 4")
+        _call("formats.splat_transform.check", path, " of version 4")
     if suffix == ".splat" and (path.stat().st_size % 32 or start.startswith(b"ply")):  # else any bytes are one
         refuse(path, start, "is not a .splat file, whose rows have 32 bytes; copy or export it again")
     if suffix == ".safetensors" and '"clod-adapter"' in _call("tensor_file.read_tensor_header", path)[1].get(KEY, ""):
@@ -183,23 +150,19 @@ def _call(function: str, *args: Any) -> Any:
 
 
 _CONVERT = "convert it: splat-transform IN{suffix} OUT.ply; better still, adapt the PLY that it was made from"
-
-_PAGE = "which clod-adapt export wrote to be opened in a browser, or a download went wrong"
-
-# First bytes (after white space) that determine the kind of a file, its name, and the remedy.
+_PAGE = "a web page, which clod-adapt export wrote to be opened in a browser, or a download went wrong"
+_DOWNLOAD = "download the file itself"
+# First bytes (after white space) that are never those of a splat, what the file is, and the remedy.
 CONTENTS = (
     (b"version https://git-lfs", "a Git LFS pointer, not the file it stands for", "fetch that: git lfs pull"),
-    (b"<!doctype html", f"a web page, {_PAGE}", "download the file itself"),
-    (b"<html", f"a web page, {_PAGE}", "download the file itself"),
-    (b"<?xml", "an XML document, perhaps an error that a server sent", "download the file itself"),
+    (b"<!doctype html", _PAGE, _DOWNLOAD),
+    (b"<html", _PAGE, _DOWNLOAD),
+    (b"<?xml", "an XML document, perhaps an error that a server sent", _DOWNLOAD),
 )
 # The same by suffix, for formats without characteristic first bytes.
 SUFFIXES = {
     ".lcc": ("an LCC file, compressed for delivery", _CONVERT),
-    ".hier": (
-        "a Hierarchical-3DGS tree, whose levels of detail are its own",
-        "use the chunk's point_cloud.ply that the tree was built from",
-    ),
+    ".hier": ("a Hierarchical-3DGS tree", "use the chunk's point_cloud.ply that the tree was built from"),
     ".ckpt": (
         "a training checkpoint, as Nerfstudio writes it",
         "export a PLY: ns-export gaussian-splat --load-config CONFIG.yml --output-dir OUT",
@@ -214,10 +177,6 @@ SUFFIXES = {
 ARCHIVES = (
     (b"\x1f\x8b", "compressed with gzip", "unpack it first: gunzip"),
     (b"PK\x03\x04", "a zip archive", "unpack it first; a gsplat checkpoint must be called .pt to be read as one"),
-    (b"\xfd7zXZ\x00", "compressed with xz", "unpack it first: unxz"),
-    (b"BZh", "compressed with bzip2", "unpack it first: bunzip2"),
-    (b"\x28\xb5\x2f\xfd", "compressed with Zstandard", "unpack it first: unzstd"),
-    (b"7z\xbc\xaf\x27\x1c", "a 7z archive", "unpack it first"),
     (b"glTF", "a glTF model", "call it .glb"),
     (b"NGSP", "an SPZ file", "call it .spz"),
     (b"ply\n", "a PLY file", "call it .ply"),
@@ -226,19 +185,9 @@ ARCHIVES = (
 
 
 def refuse_irregular(path: Path, remedy: str = "give the name of a file") -> None:
-    """Refuses what exists and is not a regular file: reading a pipe would wait.
-
-    Raises:
-        ClodError: the path is not a regular file.
-    """
+    """Refuses what exists and is not a regular file: reading a pipe would wait."""
     if path.exists() and not path.is_file():
         raise ClodError(f"{path}: cannot be read (it is not a regular file); {remedy}")
-
-
-def refuse_long_numbers(path: Path, text: bytes) -> None:
-    """Refuses a number of a thousand digits, of which parsers make copies."""
-    if re.search(rb"\d{1000}", text):
-        raise ClodError(f"{path}: is damaged (a number of more than 1,000 digits); copy or export it again")
 
 
 def read_start(path: Path, size: int = 64) -> bytes:
@@ -252,7 +201,7 @@ def read_start(path: Path, size: int = 64) -> bytes:
 
 
 def read_whole(path: Path) -> bytes:
-    """A file's bytes; errors as ``read_start``."""
+    """All bytes of a file."""
     return read_start(path, -1)
 
 
@@ -269,11 +218,7 @@ def refuse_known(path: Path, start: bytes) -> None:
 def refuse(
     path: Path, start: bytes, otherwise: str = "is not a PLY file; convert it to a .ply in Inria's 3DGS layout first"
 ) -> NoReturn:
-    """Refuses a file, with its kind by its first bytes.
-
-    Args:
-        otherwise: the message for a file in none of the tables.
-    """
+    """Refuses a file, with its kind by the tables, or else with the message ``otherwise``."""
     refuse_known(path, start)
     found = SUFFIXES.get(path.suffix.lower()) or next(
         (kind for magic, *kind in ARCHIVES if start.startswith(magic)), None

@@ -10,10 +10,10 @@ import io
 import itertools
 import re
 import warnings
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO
+from typing import TYPE_CHECKING
 
 import numpy as np
 from plyfile import PlyData, PlyElement, PlyListProperty, PlyParseError
@@ -22,9 +22,9 @@ from clod_adapter.config import SH_COUNTS
 from clod_adapter.errors import ClodError
 from clod_adapter.io import file_formats
 from clod_adapter.io.ply_packed import NOTE, check_packed, is_packed, unpack
-from clod_adapter.io.ply_settings import COLUMN, ply_metadata
-from clod_adapter.io.settings import Source
-from clod_adapter.io.values import FILTER, GROWTH, MASKS, ROWS, SIGMA, Arrays, degree_of, dial_columns
+from clod_adapter.io.ply_settings import COLUMN, constants_of, ply_metadata, write_comments
+from clod_adapter.io.settings import History, Source
+from clod_adapter.io.values import FILTER, GROWTH, MASKS, ROWS, SIGMA, Arrays, arrays_of, degree_of, dial_columns
 from clod_adapter.origin import NOWHERE, Origin, relative
 
 if TYPE_CHECKING:
@@ -33,14 +33,10 @@ if TYPE_CHECKING:
 MASK_COLUMNS = ("masks_0", "masks_1")
 _XYZ = ("x", "y", "z")
 HEADER_LIMIT = 1 << 20  # bytes
-_LONGEST = 1 << 20  # characters of a row of text
 
 
 def column_map(sh_degree: int) -> dict[str, tuple[str, ...]]:
-    """The columns of each Gaussians attribute, in the order of its flattened values.
-
-    ``f_rest`` is channel-major in the file: ``f_rest_{c * (K-1) + k}`` is ``shN[:, k, c]``.
-    """
+    """The columns of each Gaussians attribute; ``f_rest_{c * (K-1) + k}`` is ``shN[:, k, c]``."""
     bands = SH_COUNTS[sh_degree] - 1
     return {
         "means": ("x", "y", "z"),
@@ -53,7 +49,7 @@ def column_map(sh_degree: int) -> dict[str, tuple[str, ...]]:
 
 
 def inria_dtype(sh_degree: int, dial: Iterable[str] = ()) -> np.dtype:
-    """The rows of the file that Inria's trainer writes, normals included, and the dial's columns."""
+    """The rows that Inria's trainer writes, normals included, and the dial's columns."""
     groups = column_map(sh_degree)
     rest = sorted(groups["shN"], key=lambda name: int(name.rsplit("_", 1)[1]))  # the map lists them by coefficient
     names = [*groups["means"], "nx", "ny", "nz", *groups["sh0"], *rest]
@@ -63,30 +59,20 @@ def inria_dtype(sh_degree: int, dial: Iterable[str] = ()) -> np.dtype:
 
 @dataclass(frozen=True)
 class Head:
-    """A PLY header.
+    """A PLY header."""
 
-    Attributes:
-        ply: elements, properties and comments; every element has 0 rows.
-        counts: the number of rows that the header states for each element, in order.
-        size: bytes of the header; the data starts there.
-    """
-
-    ply: PlyData
-    counts: tuple[int, ...]
-    size: int
+    ply: PlyData  # elements, properties and comments; every element has 0 rows
+    counts: tuple[int, ...]  # of the rows that the header states for each element, in order
+    size: int  # bytes; the data starts there
 
 
 def read_head(path: Path) -> Head:
     """The header alone, so that a large mesh is refused without parsing its faces."""
-    return parse_head(path, file_formats.read_start(path, HEADER_LIMIT))
+    return _parse_head(path, file_formats.read_start(path, HEADER_LIMIT))
 
 
-def parse_head(path: Path, start: bytes) -> Head:
-    """The header at the start of a file; allocates nothing for the rows that it states.
-
-    Args:
-        start: the first ``HEADER_LIMIT`` bytes of ``path``, or all where there are fewer.
-    """
+def _parse_head(path: Path, start: bytes) -> Head:
+    """The header in the first ``HEADER_LIMIT`` bytes; allocates nothing for the rows that it states."""
     if not re.match(rb"ply\r?\n|ply\r", start):
         file_formats.refuse(path, start)
     end = re.search(rb"[\r\n]end_header(\r?\n|\r)", start)
@@ -114,12 +100,12 @@ def all_comments(ply: PlyData) -> tuple[str, ...]:
     return (*ply.comments, *(comment for element in ply for comment in element.comments))
 
 
-def check_ply(path: Path) -> None:
+def check(path: Path) -> None:
     """Refuses, by its header, a file that is not a checkpoint."""
     _degree(path, read_head(path).ply)
 
 
-def open_ply(path: Path) -> bool:
+def has_dial(path: Path) -> bool:
     """Whether the header has a sigma_d; refuses damaged settings in it, and a file too short for its rows."""
     head = read_head(path)
     _degree(path, head.ply)
@@ -129,14 +115,11 @@ def open_ply(path: Path) -> bool:
     return dial
 
 
-def read_ply(path: Path) -> Source:
-    """Reads a PLY; its rows are in memory, so that a later change of the file does not reach them.
-
-    The length of the file is compared with the rows that the header states before anything is allocated for them.
-    """
+def read(path: Path) -> Source:
+    """Reads a PLY into memory; nothing is allocated for rows that its length does not have."""
     try:
         data = np.fromfile(path, np.uint8)  # once, and not mapped: another program may write the file meanwhile
-        head = parse_head(path, data[:HEADER_LIMIT].tobytes())
+        head = _parse_head(path, data[:HEADER_LIMIT].tobytes())
         degree = _degree(path, head.ply)
         _check_length(path, head, len(data))
         elements = _elements(data, head)
@@ -156,20 +139,16 @@ def read_ply(path: Path) -> Source:
 
 
 def _elements(data: np.ndarray, head: Head) -> dict[str, np.ndarray]:
-    """The rows of elements by name, native byte order; ``data`` is all bytes of the file.
+    """The rows of elements by name, native byte order, of all bytes of a file.
 
-    Elements from the first one with lists on are left out where the Gaussians stand before it.
+    plyfile reads text, and binary lists row by row: elements from the first with lists on are left out where the
+    Gaussians stand before it.
     """
     plain = list(itertools.takewhile(lambda both: not head.ply.text and not _has_lists(both[0]), _counted(head)))
     if "vertex" not in {element.name for element, _ in plain}:
-        content = data.tobytes()
-        lines = io.TextIOWrapper(io.BytesIO(content), "ascii")
-        lines.buffer.seek(head.size)
-        if head.ply.text and any(len(line) == _LONGEST for line in iter(lambda: lines.readline(_LONGEST), "")):
-            raise ValueError(f"a row of more than {_LONGEST:,} characters")  # which would be copied several times
         with warnings.catch_warnings(), np.errstate(over="ignore"):
             warnings.simplefilter("ignore")  # of text that is beyond float32's range
-            return {each.name: _native(each.data) for each in PlyData.read(io.BytesIO(content))}
+            return {each.name: _native(each.data) for each in PlyData.read(io.BytesIO(data.tobytes()))}
     at, found = head.size, {}
     for element, count in plain:
         kind = np.dtype(element.dtype(head.ply.byte_order))
@@ -244,11 +223,7 @@ def _least_bytes(element: PlyElement, text: bool) -> int:
 
 
 def sh_degree_of(path: Path, header: PlyData) -> int:
-    """The SH degree of a file with plain Gaussians, by its header.
-
-    Raises:
-        ClodError: the file holds something else, or a needed column is missing or of a wrong type.
-    """
+    """The SH degree of plain Gaussians, by the header; refuses something else, and missing columns."""
     if "vertex" not in header:
         found = ", ".join(element.name for element in header) or "none"
         raise ClodError(f"{path}: has no vertex element (elements: {found}); give a splat in Inria's 3DGS layout")
@@ -284,22 +259,30 @@ def _refuse_foreign(path: Path, names: set[str]) -> None:
         )
 
 
+def write(path: Path, gaussians: Gaussians, history: History) -> tuple[str, ...]:
+    """Writes Gaussians without a base, every value unchanged but opacity = +inf, which some viewers do not take."""
+    from clod_adapter.gaussians import OPAQUE  # here: a header is checked without torch
+
+    arrays_of(path, gaussians)  # refuses rows that load would drop
+    opaque = gaussians.opacity_logits.isposinf()
+    gaussians = gaussians.replace(opacity_logits=gaussians.opacity_logits.masked_fill(opaque, OPAQUE))
+    write_rows(path, gaussians, history)
+    return (f"{int(opaque.sum())} opacities of +inf are written as {OPAQUE:g}, which is 1 too",) if opaque.any() else ()
+
+
 def write_rows(
-    file: BinaryIO, path: Path, gaussians: Gaussians, base: np.ndarray | None, origin: Origin, comments: list[str],
-    constants: Mapping[str, float],
-) -> None:  # fmt: skip
-    """Writes header and rows of a binary little-endian PLY, in blocks: a large file is never held twice.
+    path: Path, gaussians: Gaussians, history: History, base: np.ndarray | None = None, version: str | None = None
+) -> None:
+    """Writes a binary little-endian PLY, in blocks: a large file is never held twice.
 
     Args:
-        path: the name of the output, for messages.
         base: ``[N]`` rows of the file that ``gaussians`` come from; None for Inria's layout.
-        origin: what the means are relative to; where it is not 0 coordinates become doubles.
-        comments: of the element, in the header.
-        constants: by name, float columns of one value each (``ply_settings``); those of the base are dropped.
-
-    Raises:
-        ClodError: a new value is not finite.
+        version: of the package that made the values, by default the running one.
     """
+    origin, config, screen_filter = history.origin, gaussians.attenuation, gaussians.screen_filter
+    comments = write_comments(config, history.about, version, history.calibration, screen_filter)
+    # A plain file has the columns of Inria's layout and no others.
+    constants = constants_of(config, gaussians.growth_d is not None, screen_filter) if config is not None else {}
     tensors = {name: tensor.detach() for name, tensor in gaussians.tensors().items()}
     groups, dial = column_map(gaussians.sh_degree), dial_columns(tensors)
     layout = inria_dtype(gaussians.sh_degree) if base is None else base.dtype
@@ -309,25 +292,26 @@ def write_rows(
     kind = np.dtype(kinds + [(name, np.dtype("f4")) for name in (*constants, *dial)])
     one = np.broadcast_to(np.zeros((), kind), len(gaussians))  # of which plyfile makes a header without the rows
     element = PlyElement.describe(one, "vertex", comments=comments)
-    file.write(f"{PlyData([element], byte_order='<').header}\n".encode("ascii"))
-    for start in range(0, len(gaussians), ROWS):
-        part = slice(start, start + ROWS)
-        new = {name: tensor[part].float().cpu().numpy() for name, tensor in tensors.items()}
-        old, block = None if base is None else base[part], np.zeros(len(new["means"]), kind)
-        if old is not None:
-            for name in own:
-                block[name] = old[name]
-        for attribute, group in groups.items():
-            values = np.ascontiguousarray(new[attribute]).reshape(len(block), -1)
-            _write_changes(path, attribute, group, values, old, origin, block)
-        for name in dial:
-            block[name] = new[name]
-            if not np.isfinite(block[name]).all():
-                instead = "a large number for no decay" if name == SIGMA else "0 for no growth"
-                raise ClodError(f"{path}: {name} holds a value that is not finite; use {instead}")
-        for name, value in constants.items():
-            block[name] = value
-        file.write(block.astype(kind.newbyteorder("<"), copy=False).data)
+    with open(path, "wb") as file:
+        file.write(f"{PlyData([element], byte_order='<').header}\n".encode("ascii"))
+        for start in range(0, len(gaussians), ROWS):
+            part = slice(start, start + ROWS)
+            new = {name: tensor[part].float().cpu().numpy() for name, tensor in tensors.items()}
+            old, block = None if base is None else base[part], np.zeros(len(new["means"]), kind)
+            if old is not None:
+                for name in own:
+                    block[name] = old[name]
+            for attribute, group in groups.items():
+                values = np.ascontiguousarray(new[attribute]).reshape(len(block), -1)
+                _write_changes(path, attribute, group, values, old, origin, block)
+            for name in dial:
+                block[name] = new[name]
+                if not np.isfinite(block[name]).all():
+                    instead = "a large number for no decay" if name == SIGMA else "0 for no growth"
+                    raise ClodError(f"{path}: {name} holds a value that is not finite; use {instead}")
+            for name, value in constants.items():
+                block[name] = value
+            file.write(block.astype(kind.newbyteorder("<"), copy=False).data)
 
 
 def _write_changes(

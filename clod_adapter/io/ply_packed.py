@@ -44,13 +44,7 @@ def check_packed(path: Path, header: PlyData) -> int:
 
 
 def unpack(path: Path, elements: Mapping[str, np.ndarray], degree: int) -> Arrays:
-    """The attributes of the Gaussians of such a file.
-
-    An opacity of 0 or 255 becomes a quarter of a step within, so that no logit is infinite.
-
-    Args:
-        degree: of the spherical harmonics, from ``check_packed``.
-    """
+    """The attributes of the Gaussians of such a file, of the degree from ``check_packed``."""
     from clod_adapter.gaussians import SH_C0  # here: check_packed needs no torch
 
     chunks, packed = elements["chunk"], elements["vertex"]
@@ -72,7 +66,7 @@ def unpack(path: Path, elements: Mapping[str, np.ndarray], degree: int) -> Array
             if set(_COLOURS) <= set(chunks.dtype.names or ()):
                 share = chunks[f"min_{channel}"][block] * (1 - share) + chunks[f"max_{channel}"][block] * share
             sh0[:, 0, k] = (share - 0.5) / SH_C0
-    opacity = np.clip(opacity, 0.25 / 255, 254.75 / 255)
+    opacity = np.clip(opacity, 0.25 / 255, 254.75 / 255)  # so that no logit is infinite
     logits = np.log(opacity / (1 - opacity)).astype(np.float32)
     return {
         "means": means, "log_scales": log_scales, "sh0": sh0,

@@ -21,20 +21,16 @@ from clod_adapter.errors import ClodError
 from clod_adapter.io.settings import FILTER, Metadata, read_metadata, tagged
 
 PREFIX = "clod_adapter "
+COLUMN = "clod_"
 # Comments of the calibration: machine; total, views, width, height, reference; one for each row and each viewpoint.
 MACHINE, EXTENT, ROW, VIEWPOINT = "calibrated_on", "calibrated_with", "calibrated", "viewpoint"
-COLUMN = "clod_"
-TAU, EPS, HARD, QUANTILE, MAX = "clod_tau", "clod_eps", "clod_hard_cut", "clod_quantile", "clod_max"
-REFERENCE = "clod_reference_distance"
-VARIANCE, COMPENSATE = "clod_screen_variance", "clod_compensate"
-DIGITS = 6  # decimal digits that every float32 holds
 
 
 def ply_metadata(path: Path, comments: tuple[str, ...], rows: np.ndarray | None = None, *, dial: bool) -> Metadata:
     """The settings of the comments, completed by those of the columns of ``rows``."""
-    columns = constant_settings(read_constants(path, rows)) if dial and rows is not None else {}
+    columns = _constant_settings(_read_constants(path, rows)) if dial and rows is not None else {}
     ours = any(comment.startswith(PREFIX) for comment in comments)
-    values = columns | stored_settings(comments)
+    values = columns | _stored_settings(comments)
     values["attenuation"] = columns.get("attenuation", {}) | values["attenuation"]
     found = read_metadata(path, values, dial=dial, described=ours)
     if ours or not columns.get("attenuation"):
@@ -54,9 +50,6 @@ def write_comments(
 
     One comment per field of ``config``, as ``clod_adapter tau 0.00392156862745098``: the shortest decimal that gives
     the same double. Some readers do not take long comments, so each row of the calibration has its own.
-
-    Args:
-        version: of the package that made the values; by default the running one.
     """
     comments = tagged([comment for comment in inherited if not comment.startswith(PREFIX)], screen_filter)
     comments.append(f"{PREFIX}version {version or package_version()}")
@@ -75,7 +68,7 @@ def write_comments(
     return comments
 
 
-def stored_settings(comments: Iterable[str]) -> dict[str, Any]:
+def _stored_settings(comments: Iterable[str]) -> dict[str, Any]:
     """The settings in the comments, as ``settings.read_metadata`` takes them; the last of equal names counts."""
     found: dict[str, list[list[str]]] = {}
     for words in (comment[len(PREFIX) :].split() for comment in comments if comment.startswith(PREFIX)):
@@ -108,48 +101,37 @@ def _calibration(lines: dict[str, list[list[str]]]) -> dict[str, Any]:
 
 
 def constants_of(config: AttenuationConfig, growth: bool, screen_filter: ScreenFilter) -> dict[str, float]:
-    """The columns, by name, of settings that are not the defaults; sigma_d in world units.
-
-    Args:
-        growth: whether there is a growth_d.
-    """
+    """The columns, by name, of settings that are not the defaults; sigma_d in world units."""
     usual = AttenuationConfig()
     columns = (
-        (TAU, config.tau, config.tau != usual.tau),
-        (EPS, config.eps, config.eps != usual.eps),
-        (HARD, 1.0, config.cut == "hard"),
-        (QUANTILE, config.quantile, config.normalizer == "quantile"),
-        (REFERENCE, config.reference_distance, growth and config.reference_distance > 0),
-        (MAX, 1.0, config.normalizer == "max"),
-        (VARIANCE, screen_filter.variance, screen_filter.variance != CLASSIC.variance),
-        (COMPENSATE, 1.0, screen_filter.compensate),
+        ("tau", config.tau, config.tau != usual.tau),
+        ("eps", config.eps, config.eps != usual.eps),
+        ("hard_cut", 1.0, config.cut == "hard"),
+        ("quantile", config.quantile, config.normalizer == "quantile"),
+        ("reference_distance", config.reference_distance, growth and config.reference_distance > 0),
+        ("max", 1.0, config.normalizer == "max"),
+        ("screen_variance", screen_filter.variance, screen_filter.variance != CLASSIC.variance),
+        ("compensate", 1.0, screen_filter.compensate),
     )
-    return {name: value for name, value, there in columns if there}
+    return {COLUMN + name: value for name, value, there in columns if there}
 
 
-def constant_settings(constants: Mapping[str, float]) -> dict[str, Any]:
+def _constant_settings(constants: Mapping[str, float]) -> dict[str, Any]:
     """The settings in the columns, as ``settings.read_metadata`` takes them; the inverse of ``constants_of``."""
-    found: dict[str, Any] = {}
-    for column, name in ((TAU, "tau"), (EPS, "eps"), (QUANTILE, "quantile"), (REFERENCE, "reference_distance")):
-        if column in constants:
-            found[name] = constants[column]
-    if constants.get(HARD):
-        found["cut"] = "hard"
-    if QUANTILE in constants or constants.get(MAX):
-        found["normalizer"] = "max" if constants.get(MAX) else "quantile"
+    there = {name.removeprefix(COLUMN): value for name, value in constants.items()}
+    found: dict[str, Any] = {n: there[n] for n in ("tau", "eps", "quantile", "reference_distance") if n in there}
+    found |= {"cut": "hard"} if there.get("hard_cut") else {}
+    found |= {"normalizer": "quantile"} if "quantile" in there else {}
+    found |= {"normalizer": "max"} if there.get("max") else {}
     values: dict[str, Any] = {"attenuation": found} if found else {}
-    if VARIANCE in constants or COMPENSATE in constants:
-        variance = constants.get(VARIANCE, CLASSIC.variance)
-        values[FILTER] = {"variance": variance, "compensate": bool(constants.get(COMPENSATE))}
+    if "screen_variance" in there or "compensate" in there:
+        variance = there.get("screen_variance", CLASSIC.variance)
+        values[FILTER] = {"variance": variance, "compensate": bool(there.get("compensate"))}
     return values
 
 
-def read_constants(path: Path, vertex: np.ndarray) -> dict[str, float]:
-    """The value of each column whose name begins with ``clod_``, by ``simplest``.
-
-    Args:
-        vertex: ``[N]`` rows of the file.
-    """
+def _read_constants(path: Path, vertex: np.ndarray) -> dict[str, float]:
+    """The value of each column whose name begins with ``clod_``, by ``_simplest``."""
     found = {}
     for name in vertex.dtype.names or ():
         if name.startswith(COLUMN) and len(vertex):
@@ -159,18 +141,18 @@ def read_constants(path: Path, vertex: np.ndarray) -> dict[str, float]:
                     f"{path}: property {name} must be one value for all rows and has several, so files of different "
                     "settings were merged; give one of them"
                 )
-            found[name] = simplest(values[0])
+            found[name] = _simplest(values[0])
     return found
 
 
-def simplest(value: Any) -> float:
+def _simplest(value: Any) -> float:
     """The simplest number that float32 rounds to ``value``, which is the number that was written.
 
     The shortest decimal; where that has more than six digits, 1/n if that is one for a whole n (1/255).
     """
     narrow = np.float32(value)
     shortest = float(str(narrow))
-    if np.float32(f"{shortest:.{DIGITS}g}") == narrow or not 0 < shortest < 1:
+    if np.float32(f"{shortest:.6g}") == narrow or not 0 < shortest < 1:  # six digits, which every float32 holds
         return shortest
     fraction = 1 / round(1 / shortest)
     return fraction if np.float32(fraction) == narrow else shortest

@@ -9,9 +9,9 @@ Each format gives the same mapping of names to values, whose numbers may be text
     about          lines of text
     package_version
 
-Formats other than PLY store it as a JSON document under the key ``clod_adapter`` (``file_formats.KEY``). The same rules
-hold everywhere: an unknown field is ignored with a note, a damaged setting is refused, and a damaged
-calibration, which rendering does not need, is ignored with a note.
+Formats other than PLY store it as a JSON document under the key ``clod_adapter`` (``file_formats.KEY``). An unknown
+field is ignored with a note, a damaged setting is refused, and a damaged calibration, which rendering does not need, is
+ignored with a note.
 """
 
 from __future__ import annotations
@@ -36,65 +36,41 @@ if TYPE_CHECKING:
 
 WARNING = "warning: "  # prefix of a note that must not be missed
 FILTER = "screen_filter"
-# Defaults of earlier versions, for files whose description lacks a setting.
-EARLIER: dict[str, Any] = {
-    "tau": 1 / 255, "cut": "hard", "eps": 1e-8, "normalizer": "scene", "quantile": 0.95, "scene_distance": 1.0,
-    "max_sv": 5.0,
-}  # fmt: skip
+FORMAT, FORMAT_VERSION = "clod-model", 1
 DAMAGE = (AttributeError, KeyError, OverflowError, RecursionError, TypeError, ValueError)
-_LONGEST = 1 << 16  # characters of ``about``; a PLY header must have room for them
-_INHERITED = 60_000  # of these, for lines that an output inherits; the rest is for its own
+_INHERITED = 60_000  # bytes of history that an output inherits; a PLY header must have room for them
 _OVERHEAD = 9  # bytes of a PLY's comment besides its text
 
 
 @dataclass(frozen=True)
 class Metadata:
-    """The settings of a file.
+    """The settings of a file."""
 
-    Attributes:
-        attenuation: of sigma_d; None for a file without one.
-        screen_filter: None where the file does not store one.
-        calibration: as stored; ``matching_calibration`` compares it with the Gaussians.
-        origin: what the means are relative to, world units.
-        about: lines on the history of the file.
-        version: of the package that wrote the file; "" for another program.
-        described: whether the file has a description by this package.
-        notes: what was filled in or ignored, one line each.
-    """
-
-    attenuation: AttenuationConfig | None = None
-    screen_filter: ScreenFilter | None = None
-    calibration: Calibration | None = None
-    origin: Origin = NOWHERE
-    about: tuple[str, ...] = ()
-    version: str = ""
-    described: bool = False
-    notes: tuple[str, ...] = ()
+    attenuation: AttenuationConfig | None = None  # None for a file without a sigma_d
+    screen_filter: ScreenFilter | None = None  # None where the file does not store one
+    calibration: Calibration | None = None  # as stored; ``matching_calibration`` compares it with the Gaussians
+    origin: Origin = NOWHERE  # what the means are relative to, world units
+    about: tuple[str, ...] = ()  # lines on the history of the file
+    version: str = ""  # of the package that wrote the file; "" for another program
+    described: bool = False  # whether the file has a description by this package
+    notes: tuple[str, ...] = ()  # what was ignored, one line each
 
 
 class Source(NamedTuple):
     """The content of a file, as every reader returns it; ``checkpoint.load`` makes a checkpoint of it.
 
-    Attributes:
-        arrays: by the names of ``Gaussians.tensors``, every row of the file, float32; means may be float64, and of a
-            PLY there may be "masks" ``[N, 2]`` (MaskGaussian's) and "filter_3D" ``[N, 1]`` (Mip-Splatting's) too.
-        metadata: its settings; means are relative to ``metadata.origin``.
-        sha256: of the file that was parsed, hex.
-        notes: what the reader noticed, one line each, besides the notes of the metadata.
-        comments: lines on its history, and settings in a PLY's comments.
-        activation_unknown: whether opacities and scales may be activated already, as the file does not tell.
-        rows: ``[N]`` structured array of a PLY as it is in the file, native byte order; None for other formats.
-        head: ``ply.Head`` of a PLY.
+    ``arrays`` are every row of the file, by the names of ``Gaussians.tensors``, float32; means may be float64, and of a
+    PLY there may be "masks" ``[N, 2]`` (MaskGaussian's) and "filter_3D" ``[N, 1]`` (Mip-Splatting's) too.
     """
 
     arrays: dict[str, np.ndarray]
-    metadata: Metadata
-    sha256: str
-    notes: tuple[str, ...] = ()
-    comments: tuple[str, ...] = ()
-    activation_unknown: bool = False
-    rows: np.ndarray | None = None
-    head: Any = None
+    metadata: Metadata  # means are relative to its origin
+    sha256: str  # of the file that was parsed, hex
+    notes: tuple[str, ...] = ()  # what the reader noticed, one line each, besides the notes of the metadata
+    comments: tuple[str, ...] = ()  # lines on its history, and settings in a PLY's comments
+    activation_unknown: bool = False  # whether opacities and scales may be activated already
+    rows: np.ndarray | None = None  # ``[N]`` structured array of a PLY as it is in the file, native byte order
+    head: Any = None  # ``ply.Head`` of a PLY
 
 
 class History(NamedTuple):
@@ -106,82 +82,27 @@ class History(NamedTuple):
 
 
 def read_metadata(path: Path, values: Mapping[str, Any], *, dial: bool, described: bool = True) -> Metadata:
-    """The settings in a mapping.
-
-    Args:
-        dial: whether the file has sigma_d. If so, missing settings take their defaults.
-        described: whether the values are a description by this package, where missing settings take the defaults of
-            earlier versions (``EARLIER``).
-    """
+    """The settings in a mapping; of a file that has a sigma_d (``dial``) missing ones take their defaults."""
     notes: list[str] = []
     try:
-        about, version = tuple(map(str, values.get("about", ()))), values.get("package_version", "")
+        version = values.get("package_version", "")
         if not isinstance(version, str):
             raise TypeError(f"package_version is {version!r:.40}, not a string")
-        if sum(map(len, about)) + len(version) > _LONGEST:
-            raise ValueError(f"more than {_LONGEST:,} characters of text")
         return Metadata(
-            attenuation=_attenuation(values.get("attenuation", {}), described, notes) if dial else None,
+            attenuation=_attenuation(values.get("attenuation", {}), notes) if dial else None,
             screen_filter=_screen_filter(values[FILTER], notes) if FILTER in values else None,
             calibration=_calibration(values.get("calibration"), notes),
-            origin=parse_origin(values.get("origin", NOWHERE)),
-            about=about, version=version, described=described, notes=tuple(notes),
+            origin=parse_origin(values.get("origin", NOWHERE)), about=tuple(map(str, values.get("about", ()))),
+            version=version, described=described, notes=tuple(notes),
         )  # fmt: skip
     except (ClodError, *DAMAGE) as error:
         raise damaged(path, error) from error
 
 
-def that_fit(lines: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """The lines of a file's history that every output has room for, the last ones first; and a note on the others."""
-    kept, room = list[str](), _INHERITED
-    for line in reversed(lines):
-        if len(line) + _OVERHEAD <= room:
-            kept.append(line)
-            room -= len(line) + _OVERHEAD
-    if len(kept) == len(lines):
-        return tuple(lines), ()
-    note = f"{len(lines) - len(kept)} of {len(lines)} comments are not carried over to outputs, which have room for "
-    return tuple(reversed(kept)), (f"{note}{_INHERITED:,} characters",)
-
-
-def damaged(path: Path, error: Exception) -> ClodError:
-    """The error of a file with damaged settings, whatever the format."""
-    reason = str(error) if isinstance(error, ClodError) else repr(error)
-    return ClodError(f"{path}: its settings are damaged ({reason:.120}); restore them, or export the file again")
-
-
-def matching_calibration(metadata: Metadata, count: int) -> tuple[Calibration | None, list[str]]:
-    """The calibration if it was measured on ``count`` Gaussians; else None and a note."""
-    found = metadata.calibration
-    if found is None or found.total == count:
-        return found, []
-    return None, [f"the calibration is of {found.total} Gaussians and ignored, these are {count}"]
-
-
-def stored_values(
-    attenuation: AttenuationConfig | None, screen_filter: ScreenFilter, origin: Origin, calibration: Calibration | None
-) -> dict[str, Any]:
-    """Plain JSON that ``read_metadata`` inverts; the classic filter and an origin of 0 are left out."""
-    values: dict[str, Any] = {} if attenuation is None else {"attenuation": asdict(attenuation)}
-    values |= {} if screen_filter == CLASSIC else {FILTER: asdict(screen_filter)}
-    values |= {"origin": list(origin)} if any(origin) else {}
-    return values | ({} if calibration is None else {"calibration": calibration.as_dict()})
-
-
-def document(kind: str, version: int) -> dict[str, Any]:
-    """The beginning of a JSON document: what it is, and the package that writes it."""
-    return {"format": kind, "format_version": version, "package_version": package_version()}
-
-
-def _attenuation(stored: Mapping[str, Any], described: bool, notes: list[str]) -> AttenuationConfig:
+def _attenuation(stored: Mapping[str, Any], notes: list[str]) -> AttenuationConfig:
     kinds: dict[str, Any] = {field.name: type(field.default) for field in fields(AttenuationConfig)}
     values = {name: kind(stored[name]) for name, kind in kinds.items() if name in stored}
-    if described:
-        if missing := [name for name in EARLIER if name not in stored]:
-            notes.append(f"settings that are missing have the defaults of earlier versions: {', '.join(missing)}")
-        values = EARLIER | values
-        values.setdefault("reference_distance", values["scene_distance"])  # earlier: the same number
-    elif "max_sv" not in values and values.get("tau", 0.0) * AttenuationConfig().max_sv >= 1:
+    if "max_sv" not in values and values.get("tau", 0.0) * AttenuationConfig().max_sv >= 1:
         values["max_sv"] = max(0.99 / values["tau"], 1.0)  # the largest that this tau allows
     _note_unknown(stored, kinds, notes)
     return AttenuationConfig(**values)
@@ -208,13 +129,50 @@ def _note_unknown(stored: Mapping[str, Any], known: Any, notes: list[str]) -> No
         notes.append(f"settings unknown to this version ignored: {', '.join(map(repr, unknown))}")
 
 
-FORMAT, FORMAT_VERSION = "clod-model", 1
+def damaged(path: Path, error: Exception) -> ClodError:
+    """The error of a file with damaged settings, whatever the format."""
+    reason = str(error) if isinstance(error, ClodError) else repr(error)
+    return ClodError(f"{path}: its settings are damaged ({reason:.120}); restore them, or export the file again")
+
+
+def that_fit(lines: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """The lines of a file's history that every output has room for, the last ones first; and a note on the others."""
+    kept, room = list[str](), _INHERITED
+    for line in reversed(lines):
+        if len(line) + _OVERHEAD <= room:
+            kept.append(line)
+            room -= len(line) + _OVERHEAD
+    if len(kept) == len(lines):
+        return tuple(lines), ()
+    note = f"{len(lines) - len(kept)} of {len(lines)} comments are not carried over to outputs, which have room for "
+    return tuple(reversed(kept)), (f"{note}{_INHERITED:,} characters",)
+
+
+def matching_calibration(metadata: Metadata, count: int) -> tuple[Calibration | None, list[str]]:
+    """The calibration if it was measured on ``count`` Gaussians; else None and a note."""
+    found = metadata.calibration
+    if found is None or found.total == count:
+        return found, []
+    return None, [f"the calibration is of {found.total} Gaussians and ignored, these are {count}"]
+
+
+def document(
+    kind: str, version: int, attenuation: AttenuationConfig | None, screen_filter: ScreenFilter, origin: Origin,
+    calibration: Calibration | None,
+) -> dict[str, Any]:  # fmt: skip
+    """Plain JSON that ``read_metadata`` inverts; the classic filter and an origin of 0 are left out."""
+    values = {"format": kind, "format_version": version, "package_version": package_version()}
+    values |= {} if attenuation is None else {"attenuation": asdict(attenuation)}
+    values |= {} if screen_filter == CLASSIC else {FILTER: asdict(screen_filter)}
+    values |= {"origin": list(origin)} if any(origin) else {}
+    return values | ({} if calibration is None else {"calibration": calibration.as_dict()})
 
 
 def write_metadata(gaussians: Gaussians, history: History) -> dict[str, Any]:
     """Plain JSON that ``parse_metadata`` inverts."""
-    values = stored_values(gaussians.attenuation, gaussians.screen_filter, history.origin, history.calibration)
-    return document(FORMAT, FORMAT_VERSION) | values | ({"about": list(history.about)} if history.about else {})
+    dial, screen_filter = gaussians.attenuation, gaussians.screen_filter
+    values = document(FORMAT, FORMAT_VERSION, dial, screen_filter, history.origin, history.calibration)
+    return values | ({"about": list(history.about)} if history.about else {})
 
 
 def metadata_text(values: dict[str, Any]) -> str:
@@ -223,11 +181,7 @@ def metadata_text(values: dict[str, Any]) -> str:
 
 
 def parse_metadata(path: Path, text: str | bytes | dict[str, Any] | None, *, dial: bool) -> Metadata:
-    """The settings in a document, parsed or not; those of a file of another program where it is None.
-
-    Args:
-        dial: whether the file has sigma_d.
-    """
+    """The settings in a document, parsed or not; those of a file of another program where it is None."""
     if text is None:
         return read_metadata(path, {}, dial=dial, described=False)
     wrong = "is not a model but {}; clod-adapt apply makes one of an adapter"
@@ -241,7 +195,6 @@ def parse_document(
     try:
         values: dict[str, Any] = text if isinstance(text, dict) else json.loads(text)
         found, newer = values["format"], values["format"] == kind and values["format_version"] > version
-        values["package_version"]  # noqa: B018  always there
     except DAMAGE as error:
         raise damaged(path, error) from error
     if found != kind:
@@ -272,17 +225,13 @@ def tagged(comments: Sequence[str], screen_filter: ScreenFilter) -> list[str]:
     return [*rest, TAG] if screen_filter.compensate else rest
 
 
-def implied_filter(comments: Sequence[str], columns: Iterable[str]) -> ScreenFilter:
-    """The filter implied by other programs' comments and by the names of the columns; else the classic one."""
-    if "filter_3D" in columns or (is_antialiased(comments) and _BRUSH in comments):
-        return FILTERS["mip"]
-    return FILTERS["on"] if is_antialiased(comments) else CLASSIC
-
-
 def stated_filter(source: Source) -> ScreenFilter:
     """The screen-space filter that a file states, or that other programs' comments and columns imply."""
-    metadata = source.metadata
+    metadata, compensated = source.metadata, is_antialiased(source.comments)
     if metadata.screen_filter is not None:
         return metadata.screen_filter
-    settled = "sigma_d" in source.arrays or (metadata.described and source.head is None)
-    return CLASSIC if settled else implied_filter(source.comments, source.arrays)
+    if "sigma_d" in source.arrays or (metadata.described and source.head is None):
+        return CLASSIC
+    if "filter_3D" in source.arrays or (compensated and _BRUSH in source.comments):
+        return FILTERS["mip"]
+    return FILTERS["on" if compensated else "off"]

@@ -27,29 +27,26 @@ if TYPE_CHECKING:
 
     from clod_adapter.gaussians import Gaussians
 
-TYPES = {
-    "int64": "I64", "float64": "F64", "float32": "F32", "int32": "I32", "float16": "F16", "int16": "I16",
-    "uint8": "U8", "bool": "BOOL",
-}  # fmt: skip
-"""Names of types in a file, by numpy's name, in the order in which a file has its tensors."""
 _DAMAGED = "is not a safetensors file, or damaged", "copy or export it again"
 _NAMES = ("means", "quats", "log_scales", "opacity_logits", "sh0", "shN")
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor | np.ndarray], metadata: Mapping[str, str]) -> None:
-    """Writes the file that safetensors' own ``save`` makes, byte for byte, without copies of tensors on the CPU.
+    """Writes a file, the widest types first.
 
-    ``save`` holds the whole file in memory, and ``save_file`` makes files that only their owner can read.
+    safetensors' ``save`` holds all of it in memory; ``save_file`` takes names in UTF-8 only, and makes files that only
+    their owner can read.
     """
     arrays = {
         name: tensor if isinstance(tensor, np.ndarray) else tensor.detach().cpu().contiguous().numpy()
         for name, tensor in tensors.items()
     }
-    header, at, types = dict[str, Any](__metadata__=dict(metadata)), 0, list(TYPES)
-    names = sorted(arrays, key=lambda name: (types.index(arrays[name].dtype.name), name))
+    header, at = dict[str, Any](__metadata__=dict(metadata)), 0
+    names = sorted(arrays, key=lambda name: (-arrays[name].itemsize, name))
     for name in names:
         array, end = arrays[name], at + arrays[name].nbytes
-        header[name] = {"dtype": TYPES[array.dtype.name], "shape": list(array.shape), "data_offsets": [at, end]}
+        kind = "BOOL" if array.dtype.kind == "b" else f"{array.dtype.kind.upper()}{8 * array.itemsize}"
+        header[name] = {"dtype": kind, "shape": list(array.shape), "data_offsets": [at, end]}
         at = end
     head = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
     head += b" " * (-len(head) % 8)
@@ -60,7 +57,7 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor | np.ndarray], metada
 
 
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """The tensors and the metadata of a file; raises OSError, or for a damaged file any error of safetensors."""
+    """The tensors and the metadata of a file; for ``refused_if_damaged``."""
     with open(path, "rb") as file, safe_open(_name_of(file), framework="pt") as tensors:
         # Copies, since the file may change under a memory map.
         return {name: tensors.get_tensor(name).clone() for name in tensors.keys()}, tensors.metadata() or {}  # noqa: SIM118
@@ -86,7 +83,7 @@ def read_tensor_header(path: Path) -> tuple[list[str], dict[str, str]]:
 
 
 def _name_of(file: BufferedReader) -> str:
-    """A name of an open file for safetensors, which takes names in UTF-8 only."""
+    """A name of an open file, in UTF-8 as safetensors takes it."""
     return str(file.name) if sys.platform == "win32" else f"/dev/fd/{file.fileno()}"
 
 
@@ -103,8 +100,8 @@ def refused_if_damaged(path: Path, what: str, fix: str) -> Iterator[None]:
         raise ClodError(f"{path}: {what} ({error}); {fix}") from error
 
 
-def write_safetensors(path: Path, gaussians: Gaussians, history: History) -> tuple[str, ...]:
-    """Writes every value unchanged; arguments and errors as ``file_formats.write``."""
+def write(path: Path, gaussians: Gaussians, history: History) -> tuple[str, ...]:
+    """Writes every value unchanged."""
     write_tensors(path, arrays_of(path, gaussians), {KEY: metadata_text(write_metadata(gaussians, history))})
     return ()
 
@@ -114,7 +111,7 @@ def has_dial(path: Path) -> bool:
     return SIGMA in read_tensor_header(path)[0]
 
 
-def load_safetensors(path: Path) -> Source:
+def read(path: Path) -> Source:
     """Reads a model."""
     tensors, stored, sha256 = load_tensors(path)
     if KEY not in stored:

@@ -16,7 +16,6 @@ import numpy as np
 
 from clod_adapter.config import SH_COUNTS
 from clod_adapter.errors import ClodError
-from clod_adapter.io.atomic import check_target
 from clod_adapter.origin import Origin, origin_of, relative
 
 if TYPE_CHECKING:
@@ -56,23 +55,14 @@ def degree_of(path: Path, rest: int) -> int:
 
 
 class Prepared(NamedTuple):
-    """Every row of a file as ``Gaussians`` take it.
+    """Every row of a file as ``Gaussians`` take it."""
 
-    Attributes:
-        arrays: of ``Gaussians.tensors``, float32, means relative to ``origin``.
-        keep: ``[N]`` bool, the rows that can be drawn.
-        origin: world units.
-        activated: what was taken as activated.
-        changes: to values that were not stored as logits and logarithms, one line each.
-        dropped: the number of other rows by reason.
-    """
-
-    arrays: Arrays
-    keep: np.ndarray
-    origin: Origin
-    activated: Activated
-    changes: list[str]
-    dropped: Counter[str]
+    arrays: Arrays  # of ``Gaussians.tensors``, float32, means relative to ``origin``
+    keep: np.ndarray  # ``[N]`` bool, the rows that can be drawn
+    origin: Origin  # world units
+    activated: Activated  # what was taken as activated
+    changes: list[str]  # to values that were not stored as logits and logarithms, one line each
+    dropped: Counter[str]  # the number of other rows by reason
 
     @property
     def dropped_notes(self) -> list[str]:
@@ -84,12 +74,11 @@ class Prepared(NamedTuple):
 def prepared(
     path: Path, arrays: Mapping[str, np.ndarray], activated: Activated | None, at: Origin, origin: Origin | None
 ) -> Prepared:
-    """The values of ``file_formats.Source.arrays`` as ``Gaussians`` take them.
+    """The values of ``Source.arrays``, whose means are relative to ``at``, as ``Gaussians`` take them.
 
     Args:
         activated: which values are activated, where their range allows both; None to refuse then.
-        at: what the means are relative to.
-        origin: what they are to be relative to; None for ``at``, or what ``origin_of`` finds where that is 0.
+        origin: what the means are to be relative to; None for ``at``, or what ``origin_of`` finds where that is 0.
     """
     _check_shapes(path, arrays)
     if not len(arrays["means"]):
@@ -122,7 +111,12 @@ def _as_logits(path: Path, arrays: Arrays, activated: Activated | None) -> tuple
         raise ClodError(f"activated is {activated!r}, it must be one of {', '.join(get_args(Activated))}")
     found = in_question(arrays) if activated != "none" else {}
     if found and activated is None:
-        raise ClodError(f"{path}: {_question(found)}")
+        ranges = " and ".join(f"{name} from {low:.4g} to {high:.4g}" for name, (low, high) in found.items())
+        raise ClodError(
+            f"{path}: has {ranges}, which looks like activated values where a 3DGS file has logits (opacity) and "
+            f"logarithms (scales); if they are, give --activated {choice_of(found)}, if not, --activated none "
+            "(activated= in Python)"
+        )
     taken, notes = [name for name in found if activated in (name, "both")], list[str]()
     if "opacity" in taken:
         opacity = np.abs(arrays["opacity_logits"].astype(np.float64))  # the absolute value is Taming-3DGS's activation
@@ -168,15 +162,6 @@ def _range(values: np.ndarray, least: float) -> tuple[float, float] | None:
     return (low, high) if low >= least and (low < high or high == 1) else None
 
 
-def _question(found: dict[str, tuple[float, float]]) -> str:
-    ranges = " and ".join(f"{name} from {low:.4g} to {high:.4g}" for name, (low, high) in found.items())
-    choice = choice_of(found)
-    return (
-        f"has {ranges}, which looks like activated values where a 3DGS file has logits (opacity) and logarithms "
-        f"(scales); if they are, give --activated {choice}, if not, --activated none (activated= in Python)"
-    )
-
-
 def _fused(arrays: Arrays, filter_3d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """With the filter ``f``: scales ``sqrt(s^2 + f^2)``, opacity ``a sqrt(det(s^2) / det(s^2 + f^2))``, in logs."""
     scales, logits = arrays["log_scales"].astype(np.float64), arrays["opacity_logits"][:, None].astype(np.float64)
@@ -197,31 +182,28 @@ def _narrow(values: np.ndarray) -> np.ndarray:
 
 def _usable(arrays: Arrays) -> tuple[np.ndarray, Counter[str]]:
     """``[N]`` bool, the Gaussians that can be drawn, and the others by the first rule that they break."""
-    keep, dropped = np.ones(len(arrays["means"]), bool), Counter[str]()
-    for start in range(0, len(keep), ROWS):
-        block = {name: array[start : start + ROWS] for name, array in arrays.items()}
-        keep[start : start + ROWS] = _usable_rows(block, dropped)
-    return keep, dropped
-
-
-def _usable_rows(attributes: Arrays, dropped: Counter[str]) -> np.ndarray:
-    count = len(attributes["means"])
+    count = len(arrays["means"])
     exists, finite = np.ones(count, bool), np.ones(count, bool)
-    for name, values in attributes.items():
-        usable = np.isfinite(values) | (values == np.inf) if name == "opacity_logits" else np.isfinite(values)
+    for name, values in arrays.items():
+        usable = _finite(name, values)
         if not usable.all():  # which is far faster than by rows
             finite &= usable.reshape(count, -1).all(1)
-    if MASKS in attributes:  # sigmoid(first - second) >= 0.5; NaN is for the next rule
-        exists = ~(attributes[MASKS][:, 0] < attributes[MASKS][:, 1])
-    keep = np.ones(count, bool)
+    if MASKS in arrays:  # sigmoid(first - second) >= 0.5; NaN is for the next rule
+        exists = ~(arrays[MASKS][:, 0] < arrays[MASKS][:, 1])
+    keep, dropped = np.ones(count, bool), Counter[str]()
     for rule, reason in (
         (exists, "MaskGaussian existence probability below 0.5"),
         (finite, "a value is not finite"),
-        (_rotated(attributes["quats"]), f"rotation is {UNROTATED}"),
+        (_rotated(arrays["quats"]), f"rotation is {UNROTATED}"),
     ):
         dropped[reason] += int((keep & ~rule).sum())
         keep &= rule
-    return keep
+    return keep, dropped
+
+
+def _finite(name: str, values: np.ndarray) -> np.ndarray:
+    """Whether values are finite, or the +inf of a full opacity."""
+    return np.isfinite(values) | (values == np.inf) if name == "opacity_logits" else np.isfinite(values)
 
 
 def _rotated(quats: np.ndarray) -> np.ndarray:
@@ -234,13 +216,7 @@ def _rotated(quats: np.ndarray) -> np.ndarray:
 
 
 def arrays_of(path: Path, gaussians: Gaussians) -> Arrays:
-    """The float32 arrays of ``Gaussians.tensors``, checked for writing.
-
-    Raises:
-        ClodError: there are none, a value is not finite (opacity = +inf aside), a rotation is unusable, or the target
-            cannot be written.
-    """
-    check_target(path)
+    """The float32 arrays of ``Gaussians.tensors``; refuses none, and values that ``load`` would drop."""
     if len(gaussians) == 0:
         raise ClodError(f"{path}: there are no Gaussians to write, and no reader takes a file without any")
     arrays = {
@@ -248,8 +224,7 @@ def arrays_of(path: Path, gaussians: Gaussians) -> Arrays:
         for name, tensor in gaussians.tensors().items()
     }
     for name, array in arrays.items():
-        finite = np.isfinite(array) | (array == np.inf) if name == "opacity_logits" else np.isfinite(array)
-        if not finite.all():
+        if not _finite(name, array).all():
             raise ClodError(f"{path}: {name} holds a value that is not finite; drop such rows first, as load does")
     if not _rotated(arrays["quats"]).all():
         raise ClodError(f"{path}: a rotation is {UNROTATED}; drop such rows first, as load does")
@@ -323,10 +298,7 @@ def bytes_of(values: np.ndarray) -> np.ndarray:
 
 
 def logits_of_bytes(levels: np.ndarray) -> np.ndarray:
-    """Logits of opacities in 255ths; the first and last level are read as a quarter of a level from 0 and 1.
-
-    So no logit is infinite.
-    """
+    """Finite logits of opacities in 255ths: the first and last level are a quarter of a level from 0 and 1."""
     return logit(np.clip(levels.astype(np.float64), 0.25, 254.75) / 255)
 
 

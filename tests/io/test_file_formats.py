@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import subprocess
 import sys
@@ -23,7 +22,6 @@ from clod_adapter.inspection.report import inspect
 from clod_adapter.io.adapter_file import load_adapter, save_adapter
 from clod_adapter.io.checkpoint import load, save
 from clod_adapter.io.file_formats import FORMATS, WRITABLE, check_readable, file_has_dial, write
-from clod_adapter.io.tensor_file import load_safetensors
 from formats import (
     ABOUT,
     ATTENUATION,
@@ -126,36 +124,6 @@ def test_dial_round_trips(tmp_path: Path, suffix: str, degree: int, far: bool, g
     assert (again.gaussians.attenuation, again.calibration) == (ATTENUATION, CALIBRATION)
 
 
-def unpacked(path: Path) -> bytes:
-    """The bytes of a file, of an SPZ before compression."""
-    return zlib.decompress(path.read_bytes(), wbits=31) if path.suffix == ".spz" else path.read_bytes()
-
-
-@pytest.mark.parametrize(
-    ("suffix", "digest"),
-    [
-        (".ply", "068c5c7341ae3762826af2d5e94abb7f4f966217f12af9cda87580a57c4be3e2"),
-        (".spz", "afe02cff4caa6f555ebe27bb424322c5b9a3493f850828489df7668160b3b36e"),
-    ],
-)
-def test_file_without_growth_is_as_before(
-    tmp_path: Path, suffix: str, digest: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The bytes of before there was growth, of values that every machine computes alike; rewritten too."""
-    for module in ("settings", "ply_settings"):
-        monkeypatch.setattr(f"clod_adapter.io.{module}.package_version", lambda: "0.1.0")
-    n = torch.arange(6.0)
-    colours = torch.stack([n / 4, -n / 2, n / 8], 1)[:, None]
-    quats = torch.tensor([[1.0, 0, 0, 0]]).repeat(6, 1)
-    g = Gaussians(n[:, None] * torch.ones(3), quats, torch.zeros(6, 3), 0 * n, colours, torch.zeros(6, 0, 3))
-    g = g.replace(sigma_d=n / 4, attenuation=ATTENUATION)
-    path = tmp_path / f"a{suffix}"
-    for _ in range(2):
-        write(path, g, ABOUT)
-        assert hashlib.sha256(unpacked(path)).hexdigest() == digest
-        g = load(path).gaussians
-
-
 @pytest.mark.parametrize("suffix", WRITABLE)
 def test_model_without_dial_round_trips(tmp_path: Path, suffix: str) -> None:
     g, path = detach(model(1)), tmp_path / f"a{suffix}"
@@ -165,8 +133,6 @@ def test_model_without_dial_round_trips(tmp_path: Path, suffix: str) -> None:
     rows = torch.from_numpy(rows_by_place(g.means.numpy(), found.gaussians.means.numpy()))
     assert found.gaussians.sigma_d is None and (found.gaussians.means[rows] - g.means).abs().max() <= 2.0**-20
     assert any("quantised" in note for note in found.notes) == (suffix in (".spz", ".splat"))
-    data = unpacked(path)
-    assert b"screen_filter" not in data and b"SplatRenderMode" not in data and b"compensate" not in data
     seen = inspect(path)
     assert seen.splat is not None and seen.splat.dial is None
     assert seen.what.endswith(suffix if suffix != ".ply" else "PLY")
@@ -194,17 +160,8 @@ def test_refused_write_leaves_no_file(tmp_path: Path, suffix: str) -> None:
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("suffix", WRITABLE)
-def test_largest_colours_keep_their_sign(tmp_path: Path, suffix: str) -> None:
-    plain, most = detach(model(1)), torch.finfo(torch.float32).max
-    write(tmp_path / f"a{suffix}", plain.replace(sh0=plain.sh0.sign() * most, shN=plain.shN.sign() * most))
-    again = load(tmp_path / f"a{suffix}").gaussians
-    assert len(again) == 40 and torch.equal(again.sh0.sign().unique(), torch.tensor([-1.0, 1.0]))
-
-
 @pytest.mark.parametrize("kind", KINDS)
-@settings(deadline=None, max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(deadline=None, max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data(), inside=st.booleans())
 def test_damage_raises_only_clod_error(tmp_path: Path, kind: str, data: st.DataObject, inside: bool) -> None:
     """Of the file, or ``inside`` of the contents of an SPZ before compression, or of the pickle in a .pt."""
@@ -232,8 +189,6 @@ def test_adapter_is_refused_as_model(tmp_path: Path) -> None:
     for read in (check_readable, load):
         with pytest.raises(ClodError, match=f"{path}: is an adapter, not a model; clod-adapt apply BASE.ply"):
             read(path)
-    with pytest.raises(ClodError, match="is not a model but 'clod-adapter'; clod-adapt apply makes"):
-        load_safetensors(path)
     with pytest.raises(ClodError, match="is a whole model, not an adapter"):
         load_adapter(any_file(tmp_path, ".safetensors"))
 
@@ -249,15 +204,14 @@ def test_truncation_is_refused(tmp_path: Path, kind: str) -> None:
             load_adapter(path) if "adapter" in kind else load(path)
 
 
-@pytest.mark.parametrize(
-    "lines", [["x" * 70_000, "last"], ["x" * 1000] * 1030 + ["last"], [*map(str, range(70_000)), "last"]]
-)
-def test_long_history_is_cut(tmp_path: Path, lines: list[str]) -> None:
+def test_long_history_is_cut(tmp_path: Path) -> None:
     """To what every format has room for, the last lines first, so that the outputs can be read."""
+    lines = [*["x" * 1000] * 100, "y" * 70_000, *map(str, range(500)), "last"]
     write(tmp_path / "plain.ply", detach(model(0)))
     write_rows(tmp_path / "a.ply", PlyData.read(tmp_path / "plain.ply")["vertex"].data, comments=lines)
     found = load(tmp_path / "a.ply")
     assert any("comments are not carried over to outputs" in note for note in found.notes)
+    assert found.comments[-1] == "last" and set(found.comments[:9]) == {"x" * 1000}
     save(tmp_path / "b.ply", found.gaussians, found)
     for suffix in WRITABLE:
         write(tmp_path / f"c{suffix}", found.gaussians, found.comments, calibration=CALIBRATION)
@@ -267,12 +221,10 @@ def test_long_history_is_cut(tmp_path: Path, lines: list[str]) -> None:
         assert not any("not carried over" in note for note in again.notes)
 
 
-@pytest.mark.parametrize("suffix", DIAL)
-def test_what_cannot_be_read_again_is_not_written(tmp_path: Path, suffix: str) -> None:
-    (tmp_path / f"a{suffix}").write_bytes(b"earlier")
-    said = f"^{tmp_path}/a{suffix}: is not written, because it could not be read again: "
-    with pytest.raises(ClodError, match=said):
-        write(tmp_path / f"a{suffix}", model(0), ["x" * 1000] * 1100)
+def test_what_cannot_be_read_again_is_not_written(tmp_path: Path) -> None:
+    (tmp_path / "a.ply").write_bytes(b"earlier")
+    with pytest.raises(ClodError, match=f"^{tmp_path}/a.ply: is not written, because it could not be read again: "):
+        write(tmp_path / "a.ply", model(0), ["x" * 1000] * 1100)
     assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"earlier"]
 
 

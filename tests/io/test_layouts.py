@@ -23,6 +23,7 @@ from clod_adapter.gaussians import SH_C0, Gaussians
 from clod_adapter.io.checkpoint import load, save
 from clod_adapter.io.file_formats import write
 from clod_adapter.io.values import half_turn
+from clod_adapter.origin import NOWHERE
 from clod_adapter.render import render
 from formats import ATTENUATION, ORIGIN, change_glb, covariances, model, rows_by_place, splat_transform, turned
 from scenes import camera, gaussians
@@ -89,6 +90,11 @@ def test_glb_of_another_program(tmp_path: Path) -> None:
     path = change_glb(tmp_path / "a.glb", lambda g: g["asset"].pop("extras"))
     found = load(path)
     assert found.origin == ORIGIN and found.gaussians.attenuation == AttenuationConfig()
+    change_glb(path, lambda g: g["nodes"][0].update(translation=[1.0, -2.0, 4.0]))  # near 0 there is no origin
+    moved = load(path)
+    torch.testing.assert_close(moved.gaussians.means, model(0, 5).means + torch.tensor([-1.0, 2.0, 4.0]))
+    assert moved.origin == NOWHERE
+    change_glb(path, lambda g: g["nodes"][0].pop("translation"))
     rows = np.zeros(5, [("position", "<f4", 3), ("rotation", "<i2", 4), ("opacity", "u1"), ("pad", "u1", 3)])
     rows["position"], rows["rotation"], rows["opacity"] = np.arange(15).reshape(5, 3), [0, 0, 0, 32767], 255
 
@@ -114,17 +120,6 @@ def test_glb_of_another_program(tmp_path: Path) -> None:
     assert found.gaussians.quats.tolist() == [[1, 0, 0, 0]] * 5 and found.gaussians.opacity_logits.isposinf().all()
     colours, others = found.notes[-2:]
     assert "'lin_rec709_display'" in colours and others.startswith("1 more primitives")
-
-
-def test_moved_node_moves_the_model(tmp_path: Path) -> None:
-    """The node takes precedence over the origin in the metadata; near 0 the model has no origin."""
-    write(tmp_path / "a.glb", model(0, 5), origin=ORIGIN)
-    for to, origin in (([-1e6, 0.0, 0.0], (1e6, 0.0, 0.0)), ([1.0, -2.0, 4.0], (0.0, 0.0, 0.0))):
-        path = change_glb(tmp_path / "a.glb", lambda g, to=to: g["nodes"][0].update(translation=to))
-        found = load(path)
-        assert found.origin == origin and found.gaussians.attenuation == ATTENUATION
-        shift = torch.tensor([0.0, 0, 0] if any(origin) else [-1.0, 2.0, 4.0])
-        torch.testing.assert_close(found.gaussians.means, model(0, 5).means + shift)
 
 
 def spz(path: Path) -> bytearray:
@@ -179,8 +174,7 @@ def grown(g: Gaussians, s: float) -> torch.Tensor:
     return g.log_scales + growth_factors(g.growth_d, d, s, growth_distance(g.attenuation)).log()[:, None]
 
 
-@pytest.mark.parametrize("known", [True, False])
-@pytest.mark.parametrize("typical", [3.0, 250.0, 40_000.0])
+@pytest.mark.parametrize(("typical", "known"), [(3.0, True), (250.0, False), (40_000.0, True)])
 def test_dial_of_an_spz_in_other_units(tmp_path: Path, typical: float, known: bool) -> None:
     """A sigma_d of large units is not clipped to float16, and the growth is the same."""
     g, sigma = model(0), typical * torch.logspace(-1, 3.3, 40)
@@ -238,27 +232,23 @@ def test_row_of_a_splat(tmp_path: Path) -> None:
 
 
 def test_losses_of_a_splat(tmp_path: Path) -> None:
-    """Precision, view-dependent colours, the origin, and the order: the largest come first."""
+    """View-dependent colours, the origin, and the order: the largest come first."""
     g = detach(model(1, 300))
     notes = write(tmp_path / "a.splat", g, origin=ORIGIN)
     assert "8 bits" in notes[0] and "view-dependent" in notes[1] and "origin" in notes[2]
     again = load(tmp_path / "a.splat").gaussians
-    found = again.select(torch.from_numpy(rows_by_place(g.means.numpy(), again.means.numpy())))
-    assert torch.equal(found.means, g.means) and again.sh_degree == 0
-    torch.testing.assert_close(found.log_scales, g.log_scales, atol=1e-6, rtol=0)
-    assert (found.opacities - g.opacities).abs().max() <= 0.501 / 255
-    assert found.opacity_logits.isfinite().all()
-    assert turned(found.quats, g.quats) < 0.02
-    seen = (0.5 + SH_C0 * g.sh0).clamp(0, 1)
-    assert (0.5 + SH_C0 * found.sh0 - seen).abs().max() <= 0.501 / 255
-    weights = (g.scales.prod(1) * g.opacities)[rows_by_place(again.means.numpy(), g.means.numpy())]
+    rows = rows_by_place(again.means.numpy(), g.means.numpy())
+    assert torch.equal(again.means, g.means[rows]) and again.sh_degree == 0
+    assert (again.opacities - g.opacities[rows]).abs().max() <= 0.501 / 255 and again.opacity_logits.isfinite().all()
+    assert turned(again.quats, g.quats[rows]) < 0.02
+    weights = (g.scales.prod(1) * g.opacities)[rows]
     assert (weights[1:] <= weights[:-1] * (1 + 1e-5)).all()
 
 
 NAMES = {"scales": "log_scales", "opacities": "opacity_logits"}  # gsplat's, where they are not ours
 
 
-@pytest.mark.parametrize("degree", [0, 3, 4])
+@pytest.mark.parametrize("degree", [0, 3])
 def test_checkpoint_of_gsplat(tmp_path: Path, degree: int) -> None:
     """Also with other number types and strides, other entries, and a row that is not finite."""
     g = gaussians(12, degree, 0)
@@ -289,9 +279,7 @@ def test_written_tensors_are_those_of_gsplat(tmp_path: Path) -> None:
     assert torch.cat([splats["sh0"], splats["shN"]], dim=-2).shape == (40, 9, 3) and checkpoint["step"] == 0
 
 
-@pytest.mark.parametrize(
-    ("suffix", "degree", "atol"), [(".ply", 0, 0.0), (".ply", 2, 0.0), (".ply", 3, 0.0), (".spz", 3, 1e-5)]
-)
+@pytest.mark.parametrize(("suffix", "degree", "atol"), [(".ply", 3, 0.0), (".spz", 3, 1e-5)])
 def test_gsply_reads_and_writes_files(tmp_path: Path, suffix: str, degree: int, atol: float) -> None:
     gsply = pytest.importorskip("gsply", reason="gsply is not installed")
     spz = pytest.importorskip("gsply.spz", reason="gsply has no spz")
@@ -301,11 +289,10 @@ def test_gsply_reads_and_writes_files(tmp_path: Path, suffix: str, degree: int, 
     for name, want in (("means", ours.means), ("scales", ours.log_scales), ("sh0", ours.sh0[:, 0])):
         np.testing.assert_allclose(getattr(found, name), want, atol=atol, rtol=0)
     assert turned(torch.from_numpy(found.quats), ours.quats) <= 100 * atol
-    if degree:
-        np.testing.assert_allclose(found.shN, ours.shN, atol=atol, rtol=0)
+    np.testing.assert_allclose(found.shN, ours.shN, atol=atol, rtol=0)
     opacities = 1 / (1 + np.exp(-found.opacities.ravel().astype(np.float64)))
     np.testing.assert_allclose(opacities, ours.opacities, atol=max(110 * atol, 1e-6))
-    if (suffix, degree) == (".ply", 3):
+    if suffix == ".ply":
         gsply.plywrite(tmp_path / "b.ply", found)
         again = load(tmp_path / "b.ply").gaussians
         assert torch.equal(again.means, ours.means) and torch.equal(again.shN, ours.shN)

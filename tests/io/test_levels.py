@@ -15,17 +15,10 @@ import scenes
 from clod_adapter import load
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.formats import tileset
-from clod_adapter.io.formats.splat_transform import cutting_options
 from clod_adapter.io.formats.tileset import TILESET, write_tileset
 from clod_adapter.origin import NOWHERE
 
 ERRORS = [0.0, 0.25, 1.0]
-
-
-def test_cutting_options_give_few_hundred_leaves() -> None:
-    assert cutting_options(1) == ("--lod-chunk-extent", "0", "--lod-chunk-min", "8")
-    words = cutting_options(10_000_000)
-    assert 128 <= 10_000_000 / (1024 * int(words[-1])) <= 140
 
 
 def levels(n: int = 400) -> list[Gaussians]:

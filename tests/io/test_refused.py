@@ -10,7 +10,6 @@ import struct
 import tracemalloc
 import zipfile
 from collections.abc import Callable
-from copy import copy
 from pathlib import Path
 from typing import Any
 
@@ -45,19 +44,16 @@ def refused(tmp_path: Path, name: str, content: Content, message: str) -> None:
     [
         ("a.ply", LFS, "Git LFS pointer.*git lfs pull"),
         ("a.ply", b"\r\n<!DOCTYPE html><html>", "web page.*download the file itself"),
-        ("a.ply", b"<html lang=en>", "web page"),
         ("a.ply", b"<?xml version='1.0'?><Error>", "XML document"),
         ("a.ply", gzip.compress(b"ply\n", mtime=0), "gzip.*gunzip"),
         ("a.ply", b"NGSP", "an SPZ file; call it .spz"),
         ("a.ply", b"glTF", "glTF model; call it .glb"),
         ("a.ply", b"PK\x03\x04rest", "zip archive"),
         ("a.ply", b"solid teapot", "is not a PLY file"),
-        ("a.ply", b"plyx", "is not a PLY file"),
         ("a.spz", b"NGSP" + bytes(60), "(spz of version 4 is read through splat-transform|cannot be read)"),
         ("a.spz", bytes(64), "not a .spz file by its first bytes"),
         ("a.spz", b"glTF", "a glTF model; call it .glb"),
         ("a.glb", b"ply\nformat ascii 1.0\n", "a PLY file; call it .ply"),
-        ("a.pt", b"ply\r\nformat ascii 1.0\n", "a PLY file; call it .ply"),
         ("a.pt", bytes(64), "no file of torch.save"),
         ("a.splat", bytes(63), "not a .splat file, whose rows have 32"),
         ("a.splat", b"ply\n" + bytes(60), "is a PLY file; call it .ply"),
@@ -158,11 +154,10 @@ LIST = "property list uchar int a\n"
           for form, body, kind in (("ascii", GOOD.encode(), "property uchar a\n"), ("ascii", GOOD.encode(), LIST),
                                    (LITTLE, bytes(56), ""), (BIG, bytes(56), LIST))
           for other in [f"element a {1 << 40}\n{kind}"] for before, after in ((other, ""), ("", other))),
-        (header("ascii", 1) + b"0 " * 13 + b"1" * (1 << 23), "damaged or truncated .a row of more than"),
     ],
 )  # fmt: skip
 def test_headers_and_rows_of_a_ply(tmp_path: Path, content: bytes, message: str) -> None:
-    """Nothing is allocated for what a header claims, nor copied of a row of any length."""
+    """Nothing is allocated for what a header claims."""
     (tmp_path / "whole.ply").write_bytes(header("ascii", 1) + GOOD.encode())
     load(tmp_path / "whole.ply", activated="none")  # so that nothing is imported while it is measured
     tracemalloc.start()
@@ -252,13 +247,6 @@ def test_spz(tmp_path: Path, content: Content, message: str) -> None:
     refused(tmp_path, "a.spz", content, message)
 
 
-@pytest.mark.parametrize(("values", "dial"), [(40, ["sigma_d"]), (80, ["sigma_d", "growth_d"]), (0, [])])
-def test_spz_with_fewer_columns_is_read(tmp_path: Path, values: int, dial: list[str]) -> None:
-    with_record(dial or ["sigma_d", "growth_d"], values)(tmp_path / "a.spz")
-    found = load(tmp_path / "a.spz").gaussians.tensors()
-    assert [name for name in ("sigma_d", "growth_d") if name in found] == dial
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -326,22 +314,11 @@ def test_pt(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, checkpoint: Any, me
 
 
 def test_pt_that_is_another_archive(tmp_path: Path) -> None:
-    """Compressed; a hundred names of the same megabyte; and a pickle without an archive."""
+    """Compressed, so that it unpacks to more than it is; and a pickle without an archive."""
     buffer = io.BytesIO()
     torch.save(splats(), buffer)
-    with zipfile.ZipFile(buffer) as old:
-        entries = {name: old.read(name) for name in old.namelist()}
-    with zipfile.ZipFile(tmp_path / "bomb.pt", "w", zipfile.ZIP_DEFLATED) as new:
-        for name, data in entries.items():
-            new.writestr(name, data + bytes(1 << 20))
-    with zipfile.ZipFile(tmp_path / "many.pt", "w") as new:
-        for name, data in entries.items():
-            new.writestr(name, data)
-        new.writestr("a/data/99", bytes(1 << 20))
-        for k in range(100):
-            more = copy(new.getinfo("a/data/99"))
-            more.filename = f"a/data/{k + 100}"
-            new.filelist.append(more)
-    for name in ("bomb.pt", "many.pt"):
-        refused(tmp_path, name, (tmp_path / name).read_bytes(), "torch.save does not write")
+    with zipfile.ZipFile(buffer) as old, zipfile.ZipFile(tmp_path / "bomb.pt", "w", zipfile.ZIP_DEFLATED) as new:
+        for name in old.namelist():
+            new.writestr(name, old.read(name) + bytes(1 << 20))
+    refused(tmp_path, "b.pt", (tmp_path / "bomb.pt").read_bytes(), "torch.save does not write")
     refused(tmp_path, "old.pt", b"\x80\x04]\x94.", "format before 1.6")

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import os
-import pickle
 import shutil
 import subprocess
 import sys
@@ -18,15 +16,11 @@ import numpy as np
 import pycolmap
 import pytest
 import torch
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 
-import scenes
-from clod_adapter._support.text import file_name
-from clod_adapter.cameras import Camera, Scene, StoredView, View, camera_extent
+from clod_adapter.cameras import Camera, StoredView, View
 from clod_adapter.errors import ClodError
-from clod_adapter.io.scene.colmap import load_points, read_colmap, write_model
 from clod_adapter.io.scene.folder import name_parts, scene_files
 from clod_adapter.io.scene.load import ImageCache, load_cameras, load_scene
 from clod_adapter.progress import Stopped
@@ -35,12 +29,10 @@ from photographs import (
     SIZE,
     as_text,
     camera,
-    damage,
     model_of,
     pixels,
     psnr_of,
     seen,
-    write_images,
     write_scene,
 )
 
@@ -124,30 +116,6 @@ def test_model_and_images_are_found_in_other_folders(tmp_path: Path) -> None:
         load_scene(tmp_path / "images" / "deeper")
 
 
-def test_written_model_is_read_by_pycolmap(tmp_path: Path) -> None:
-    xyz, rgb = np.arange(12.0).reshape(4, 3), np.arange(12, dtype=np.uint8).reshape(4, 3)
-    cameras, names = [camera(0), camera(1), camera(2, focal=50.0)], ["a b.png", "c.png", "ü.png"]
-    write_model(tmp_path, cameras, names, xyz, rgb)
-    found = pycolmap.Reconstruction(str(tmp_path / "sparse" / "0"))
-    assert [c.model_name for c in found.cameras.values()] == ["PINHOLE", "PINHOLE"]
-    poses = {image.name: image.cam_from_world().matrix() for image in found.images.values()}
-    for name, wanted in zip(names, cameras, strict=True):
-        np.testing.assert_allclose(poses.pop(name), wanted.viewmat[:3], atol=1e-6)
-    points = [found.points3D[i] for i in sorted(found.points3D)]
-    np.testing.assert_array_equal([[*point.xyz, *point.color] for point in points], np.hstack([xyz, rgb]))
-    assert not poses and sorted(load_points(tmp_path).tolist()) == xyz.tolist()
-    for folder, names, message in (
-        (tmp_path, ["a.png"], "not empty"), (tmp_path / "no", ["a.png"], "does not exist"),
-        (tmp_path, ["a.png", "a.png"], "as many different names"),
-    ):  # fmt: skip
-        with pytest.raises(ClodError, match=message):
-            write_model(folder, cameras[: len(names)], names)
-    (tmp_path / "none").mkdir()
-    write_model(tmp_path / "none", [], [])
-    with pytest.raises(ClodError, match="no registered image"):
-        load_scene(tmp_path / "none")
-
-
 @pytest.mark.parametrize("file", ["cameras", "images", "points3D", "rigs", "frames"])
 def test_records_beyond_the_file_are_refused(tmp_path: Path, file: str) -> None:
     """Handed to COLMAP as it is, a cut points3D.bin makes it allocate until memory runs out."""
@@ -160,19 +128,6 @@ def test_records_beyond_the_file_are_refused(tmp_path: Path, file: str) -> None:
             load_scene(tmp_path)
 
 
-@settings(deadline=None, max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(st.data(), st.sampled_from(["binary", "text"]))
-def test_damage_raises_only_clod_error(tmp_path: Path, data: st.DataObject, form: str) -> None:
-    damaged = tmp_path / "damaged"
-    shutil.rmtree(damaged, ignore_errors=True)
-    shutil.copytree(model(tmp_path / form, form), damaged)
-    damage(data, sorted(damaged.iterdir()))
-    try:
-        read_colmap(damaged)
-    except ClodError as error:
-        assert str(damaged) in str(error)
-
-
 def write(path: Path, content: bytes) -> None:
     path.write_bytes(content)
 
@@ -181,8 +136,6 @@ def write(path: Path, content: bytes) -> None:
     ("form", "change", "message"),
     [
         ("text", lambda at: write(at / "images.txt", b"1 nonsense\n\n"), "COLMAP cannot read this model"),
-        ("text", lambda at: write(at / "cameras.txt", b"1 PINHOLE 40 30 %b 33 20 15\n" % (b"1" * 10_000)),
-         "cameras.txt: .*a number of more than 1,000 digits"),
         ("text", lambda at: write(at / "images.txt", (at / "images.txt").read_bytes().replace(b"sub/b.png", b"a.png")),
          "has image a.png more than once"),
         ("text", lambda at: os.mkfifo(at / "rigs.bin"), "rigs.bin: .*not a regular file"),
@@ -202,8 +155,7 @@ def test_unusable_models_are_refused(tmp_path: Path, form: str, change: Callable
     ("name", "message"),
     [
         ("a" * 300 + ".png", "is no file's name"), ("a/" * 2500 + "b.png", "is no file's name"),
-        ("\u00e9" * 130, "is no file's name"), ("a\x00b.png", "is no file's name"), ("a\nb.png", "is no file's name"),
-        ("\x1b[2J.png", "is no file's name"), ("a\x9b2J.png", "is no file's name"), ("\ud800.png", "is not UTF-8"),
+        ("\u00e9" * 130, "is no file's name"), ("\x1b[2J.png", "is no file's name"), ("\ud800.png", "is not UTF-8"),
         ("", "leaves the images folder"), ("../a.png", "leaves the images folder"),
         ("sub/../../a.png", "leaves the images folder"), ("/etc/a.png", "leaves the images folder"),
         ("..\\a.png", "leaves the images folder"), ("C:\\a.png", "leaves the images folder"),
@@ -213,16 +165,6 @@ def test_invalid_image_names_are_refused(name: str, message: str) -> None:
     with pytest.raises(ClodError, match=f"transforms.json: image name .*{message}") as caught:
         name_parts(name, Path("transforms.json"))
     assert str(caught.value).isprintable()
-
-
-@pytest.mark.skipif(sys.getfilesystemencoding() != "utf-8", reason="files have ASCII names here")
-def test_unusual_names_and_linked_folders_are_read(tmp_path: Path) -> None:
-    names = ("$HOME.png", "a.b/c d.png", "sub\\of windows.png", "~/a.png", "äö ü/日本 (1).png")
-    model(tmp_path / "scene", "binary", names)
-    write_images(tmp_path / "elsewhere", [name.replace("\\", "/") for name in names], width=8, height=6)
-    (tmp_path / "scene" / "images").symlink_to(tmp_path / "elsewhere", target_is_directory=True)
-    scene = load_scene(tmp_path / "scene")
-    assert [view.camera.name for view in (*scene.test, *scene.train)] == list(names)
 
 
 def test_without_pycolmap_the_error_says_where_it_is() -> None:
@@ -312,58 +254,31 @@ def test_undistorted_image_is_that_of_the_pinhole_camera(tmp_path: Path, cache: 
     assert {path: path.read_bytes() for path in scene.rglob("*") if path.is_file()} == sources
 
 
-@pytest.mark.parametrize(
-    ("kind", "params", "fy"), [("OPENCV", [140, 142, 82, 58, 0, 0, 0, 0], 142), ("SIMPLE_PINHOLE", [140, 82, 58], 140)]
-)
-def test_lens_without_distortion_is_a_pinhole(
-    tmp_path: Path, cache: Path, kind: str, params: list[float], fy: float
-) -> None:
-    scene = capture_of(tmp_path / "scene", kind, params)
-    loaded = load_scene(scene)
-    with Image.open(scene / "images" / "a.png") as image:
-        np.testing.assert_array_equal(loaded.train[0].image, np.asarray(image))
-    assert loaded.train[0].camera.K.tolist() == [[140, 0, 82], [0, fy, 58], [0, 0, 1]]
-    assert loaded.notes == () and not cache.exists()
-
-
-def same(one: Scene, other: Scene) -> bool:
-    a, b = one.train[0], other.train[0]
-    return a.image.equal(b.image) and a.camera.K.equal(b.camera.K) and one.notes == other.notes
-
-
-def test_cached_images_are_reused(tmp_path: Path, cache: Path) -> None:
+def test_cached_images_are_reused(tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """While the photograph, its camera and the width are the same; a damaged one is made again."""
     scene = capture_of(tmp_path / "scene", "OPENCV", LENSES["OPENCV"])
     first = load_scene(scene, max_width=100)
     (file,) = cache.rglob("*.png")
     with Image.open(file) as kept:
-        about, changed = kept.info["clod-adapter"], Image.new("RGB", kept.size, (1, 2, 3))
-    from PIL.PngImagePlugin import PngInfo
-
-    info = PngInfo()
-    info.add_text("clod-adapter", about)
+        info, changed = PngInfo(), Image.new("RGB", kept.size, (1, 2, 3))
+        info.add_text("clod-adapter", kept.info["clod-adapter"])
     changed.save(file, pnginfo=info)
     assert load_scene(scene, max_width=100).train[0].image.unique().tolist() == [1, 2, 3]  # the cached one is read
     file.write_bytes(file.read_bytes()[:-50])
-    assert same(load_scene(scene, max_width=100), first) and len(list(cache.rglob("*.png"))) == 1
+    again = load_scene(scene, max_width=100)
+    assert again.train[0].image.equal(first.train[0].image) and again.train[0].camera.K.equal(first.train[0].camera.K)
+    assert again.notes == first.notes and len(list(cache.rglob("*.png"))) == 1
     load_scene(scene, max_width=90)
     os.utime(scene / "images" / "a.png", ns=(1, 1))
     load_scene(scene, max_width=100)
-    assert len(list(cache.rglob("*.png"))) == 3
     model_of(tmp_path / "other", "OPENCV", [*LENSES["OPENCV"][:4], 0.01, 0, 0, 0], **SIZE)  # calibrated again
     shutil.copytree(tmp_path / "other" / "sparse", scene / "sparse", dirs_exist_ok=True)
-    assert not same(load_scene(scene, max_width=100), first)
-
-
-def test_cache_folder_must_be_writable(tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    scene = capture_of(tmp_path / "scene", "OPENCV", LENSES["OPENCV"])
+    load_scene(scene, max_width=100)
+    assert len(list(cache.rglob("*.png"))) == 4
+    shutil.rmtree(cache)
     cache.write_text("a file, so that no folder can be made")
     with pytest.raises(ClodError, match="undistorted photographs cannot be kept there .*set XDG_CACHE_HOME"):
         load_scene(scene)
-    monkeypatch.delenv("XDG_CACHE_HOME")
-    monkeypatch.setenv("HOME", str(tmp_path / "home"))
-    load_scene(scene)
-    assert len(list((tmp_path / "home").rglob("clod-adapter/undistorted/scene-*/*.png"))) == 1
 
 
 @pytest.mark.parametrize(
@@ -371,9 +286,7 @@ def test_cache_folder_must_be_writable(tmp_path: Path, cache: Path, monkeypatch:
     [
         ("EQUIRECTANGULAR", [160, 120], "EQUIRECTANGULAR, no perspective camera"),
         ("OPENCV", [140, 140, 80, 60, float("nan"), 0, 0, 0], "not usable"),
-        ("OPENCV", [140, 140, 80, 60, 1e300, 0, 0, 0], "not usable"),
         ("SIMPLE_RADIAL", [-140, 80, 60, 0.1], "not usable"),
-        ("PINHOLE", [140, 140, float("inf"), 60], "not usable"),
         ("PINHOLE", [0, 140, 80, 60], "not usable"),
         *(("OPENCV", [140, 140, 80, 60, k, 0, 0, 0], "") for k in (-5.0, 1e8, -1e8)),
     ],
@@ -401,25 +314,13 @@ def test_cameras_equal_those_of_load_scene(capture: Any, origin: tuple[float, fl
     assert training == [view.camera.name for view in scene.train] and len(training) == 8
 
 
-def test_near_plane_follows_the_unit_of_length(tmp_path: Path) -> None:
-    unit = torch.tensor([[1e-3], [1e-3], [1e-3], [1.0]])
-    cameras = [
-        replace(c, viewmat=torch.cat([c.viewmat[:, :3], c.viewmat[:, 3:] * unit], 1)) for c in scenes.ring(4, 20, 10)
-    ]
-    write_model(tmp_path, cameras, [each.name for each in cameras])  # and no photographs, which cameras do not need
-    assert {each.near for each in load_cameras(tmp_path)[0]} == {0.01 * camera_extent(cameras)}
-
-
 def there(folder: Path) -> set[str]:
     return {str(path.relative_to(folder)) for path in scene_files(folder) if path.is_file()}
 
 
-@pytest.mark.parametrize("text", [False, True])
-def test_files_of_a_colmap_scene(tmp_path: Path, text: bool) -> None:
+def test_files_of_a_colmap_scene(tmp_path: Path) -> None:
     """All that no output may overwrite, and nothing else in the scene's folder."""
     write_scene(tmp_path, 3)
-    if text:
-        as_text(tmp_path)
     (tmp_path / "rendered.png").write_bytes(b"not of the scene")
     (tmp_path / "images_2" / "sub").mkdir(parents=True)
     (tmp_path / "images_2" / "sub" / "001.png").write_bytes(b"a smaller one")
@@ -427,23 +328,14 @@ def test_files_of_a_colmap_scene(tmp_path: Path, text: bool) -> None:
     files = {str(path.relative_to(tmp_path)) for path in (tmp_path / "sparse" / "0").iterdir()}
     photographs = {f"images/sub/{k:03}.png" for k in (1, 2, 3)} | {"images_2/sub/001.png"}
     assert len(files) >= 3 and there(tmp_path) == files | photographs | {"dataparser_transforms.json"}
-    images = tmp_path / "sparse" / "0" / ("images.txt" if text else "images.bin")
-    images.write_bytes(images.read_bytes()[:-9])  # a damaged one is still the scene's
-    assert os.path.relpath(images, tmp_path) in there(tmp_path)
 
 
-def test_files_of_transforms_scenes(tmp_path: Path) -> None:
-    train = {"frames": [{"file_path": "./train/r_0", "mask_path": "masks/0.png"}, {"file_path": "train\\ü.jpg"}, 7]}
-    test = {"frames": [{"file_path": "test/r_0.png", "depth_file_path": "depth/0.tif"}, {"file_path": "a\0\ud800"}]}
-    (tmp_path / "transforms_train.json").write_text(json.dumps(train))
-    (tmp_path / "transforms_test.json").write_text(json.dumps(test))
-    (tmp_path / "transforms.json").write_text("no JSON")
-    names = ["train/r_0.png", "train/ü.jpg", "masks/0.png", "test/r_0.png", "depth/0.tif"]
-    names = [file_name(name) for name in names]
-    for name in [*names, "train/r_1.png"]:
+@pytest.mark.parametrize("photograph", ["images/a.jpg", "train/r_0.png"])
+def test_files_of_transforms_scenes(tmp_path: Path, photograph: str) -> None:
+    for name in (photograph, "transforms_train.json", "transforms_test.json", "report.json"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_bytes(b"")
-    assert there(tmp_path) == {*names, "transforms.json", "transforms_train.json", "transforms_test.json"}
+    assert there(tmp_path) == {photograph, "transforms_train.json", "transforms_test.json"}
 
 
 ONE = 64 * 48 * 3
@@ -464,16 +356,13 @@ def numbered(count: int, cache: ImageCache) -> tuple[list[View], list[int]]:
     return [made(k) for k in range(count)], reads
 
 
-@pytest.mark.parametrize("room", [0, 1, 3, 10])
+@pytest.mark.parametrize("room", [0, 3])
 def test_cache_stays_within_its_limit(room: int) -> None:
     cache = ImageCache(room * ONE + ONE // 2)
     views, _ = numbered(8, cache)
-    for k in [*range(8), 3, 3, 0, 7, 7, 2]:
-        assert int(views[k].image.unique()) == k
-        assert cache.held <= cache.limit and cache.held == min(room, 8) * ONE
     with ThreadPoolExecutor(8) as pool:
         looked = list(pool.map(lambda k: int(views[k % 5].image.unique()), range(400)))
-    assert looked == [k % 5 for k in range(400)] and cache.held <= cache.limit
+    assert looked == [k % 5 for k in range(400)] and cache.held == room * ONE
 
 
 def test_most_recently_used_images_are_kept() -> None:
@@ -484,8 +373,6 @@ def test_most_recently_used_images_are_kept() -> None:
     assert reads == [0, 0, 0] and cache.reads == 0
     _ = views[0].image, views[2].image, views[1].image  # 0 takes the place of 1
     assert reads == [1, 1, 0] and cache.reads == 2
-    again = pickle.loads(pickle.dumps(views[1]))
-    assert type(again) is View and again.camera.name == "1" and torch.equal(again.image, views[1].image)
 
 
 def test_cached_scene_equals_the_scene(capture: Any, tmp_path: Path) -> None:

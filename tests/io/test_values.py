@@ -58,20 +58,17 @@ def test_activated_values_need_the_option(tmp_path: Path, what: tuple[str, ...])
 
 
 def test_usual_values_need_no_option(tmp_path: Path) -> None:
-    few = activate(inria(9), "opacity", "scales")
-    same = inria(40)
+    few, same = activate(inria(9), "opacity", "scales"), inria(40)
     same["opacity"], same["scale_0"], same["scale_1"], same["scale_2"] = 0.5, 0.5, 0.5, 0.5
     pruned = inria(200)
-    pruned = pruned[pruned["opacity"] > 0]
-    for vertex in (inria(40), few, same, pruned):
-        for activated in (None, "both", "none"):
-            loaded = load(write_rows(tmp_path / "in.ply", vertex), activated=activated)
-            np.testing.assert_array_equal(loaded.gaussians.opacity_logits, vertex["opacity"])
-            assert loaded.notes == () and ":" not in loaded.fingerprint
+    for vertex in (few, same, pruned[pruned["opacity"] > 0]):
+        loaded = load(write_rows(tmp_path / "in.ply", vertex))
+        np.testing.assert_array_equal(loaded.gaussians.opacity_logits, vertex["opacity"])
+        assert loaded.notes == () and ":" not in loaded.fingerprint
 
 
-def mip(count: int = 40, kind: str = "f4") -> np.ndarray:
-    vertex = inria(count, ("filter_3D",), kind)
+def mip(count: int = 40) -> np.ndarray:
+    vertex = inria(count, ("filter_3D",))
     vertex["filter_3D"] = np.exp(np.random.default_rng(1).normal(size=count) - 2.5)
     return vertex
 
@@ -102,9 +99,8 @@ def test_mip_splatting_extreme_values(tmp_path: Path) -> None:
     np.testing.assert_allclose(g.opacity_logits[5], log, rtol=1e-6)
 
 
-@pytest.mark.parametrize("kind", ["f4", "f8"])
-def test_mip_splatting_is_fused(tmp_path: Path, kind: str) -> None:
-    vertex = mip(kind=kind)
+def test_mip_splatting_is_fused(tmp_path: Path) -> None:
+    vertex = mip()
     base = load(write_rows(tmp_path / "in.ply", vertex))
     scales, opacities = fused(vertex)
     assert base.gaussians.screen_filter == FILTERS["mip"]
@@ -148,10 +144,9 @@ def test_own_outputs_need_no_option(tmp_path: Path, kind: str) -> None:
     applied = load_adapter(tmp_path / "a.safetensors").apply(again.gaussians, again.fingerprint)
     save(tmp_path / "again.ply", applied, again)
     assert (tmp_path / "out.ply").read_bytes() == (tmp_path / "again.ply").read_bytes()
-    for activated in (None, "both"):
-        out = load(tmp_path / "out.ply", activated=activated)
-        torch.testing.assert_close(out.gaussians.opacity_logits, g.opacity_logits.abs(), atol=2e-2, rtol=1e-3)
-        assert out.comments[:2] == base.notes
+    out = load(tmp_path / "out.ply")
+    torch.testing.assert_close(out.gaussians.opacity_logits, g.opacity_logits.abs(), atol=2e-2, rtol=1e-3)
+    assert out.comments[:2] == base.notes
     with pytest.raises(ClodError, match="different base.*trained on both:"):
         other = load(path, activated="none")
         adapter.apply(other.gaussians, other.fingerprint)

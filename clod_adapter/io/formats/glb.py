@@ -69,8 +69,8 @@ IDENTITY = [0.0, 0.0, 0.0, 1.0]  # as xyzw
 _FAINTEST = -100.0  # logit of an opacity that float32 has rounded to 0
 
 
-def write_glb(path: Path, gaussians: Gaussians, history: History) -> tuple[str, ...]:
-    """Writes with float32's rounding of the activations; arguments and errors as ``file_formats.write``."""
+def write(path: Path, gaussians: Gaussians, history: History) -> tuple[str, ...]:
+    """Writes with float32's rounding of the activations."""
     columns, dropped = _columns(path, gaussians)
     size = sum(array.nbytes for array in columns.values())
     if size >= _LIMIT - (1 << 20):
@@ -95,13 +95,9 @@ def document(
     means: torch.Tensor, accessors: dict[str, dict[str, Any]], node: dict[str, Any], size: int,
     extensions: dict[str, Any] | None = None, **asset: Any,
 ) -> dict[str, Any]:  # fmt: skip
-    """The JSON of one POINTS primitive.
+    """The JSON of one POINTS primitive and its buffer of ``size`` bytes.
 
-    Args:
-        accessors: by attribute, without component type and bounds; POSITION, of ``means``, is one of them.
-        node: besides its mesh.
-        size: bytes of the buffer.
-        extensions: of KHR_gaussian_splatting.
+    ``accessors`` are by attribute, without component type and bounds; ``extensions`` those of KHR_gaussian_splatting.
     """
     for name, accessor in accessors.items():
         accessor |= {"componentType": _FLOAT} if name != "COLOR_0" else {"componentType": _BYTE, "normalized": True}
@@ -161,7 +157,7 @@ def has_dial(path: Path) -> bool:
         return DIAL[SIGMA] in primitive["attributes"]
 
 
-def load_glb(path: Path) -> Source:
+def read(path: Path) -> Source:
     """Reads the first primitive with the extension, into the axes of checkpoints: y down.
 
     Under a node without a rotation the values are in glTF's own axes, and are turned here; files of this package have
@@ -187,8 +183,10 @@ def load_glb(path: Path) -> Source:
     arrays["shN"] = np.stack(rest, 1) if rest else np.zeros((len(arrays["means"]), 0, 3), np.float32)
     stored = _stored(arrays) if turned else half_turn(_stored(arrays), "z")
     if moved != metadata.origin:  # another program moved the node
-        stored["means"], moved = _moved(stored["means"], moved)
-        metadata = replace(metadata, origin=moved)
+        wide = stored["means"].astype(np.float64) + moved
+        near = not any(origin_of(wide))  # float32 has enough digits
+        stored["means"] = wide if near else stored["means"]
+        metadata = replace(metadata, origin=NOWHERE if near else moved)
     return Source(float32(stored), metadata, sha256_of(data), tuple(ignored), metadata.about)
 
 
@@ -286,12 +284,6 @@ def _placed(gltf: dict[str, Any], mesh: int) -> tuple[bool, Origin]:
     if not np.isfinite([x, y, z]).all():
         raise ClodError("its node has a translation that is not finite; export it again")
     return turned, (0.0 - x, 0.0 - y, z)
-
-
-def _moved(means: np.ndarray, by: Origin) -> tuple[np.ndarray, Origin]:
-    """Means and their origin; an origin near 0 is added to the means, where float32 has enough digits."""
-    wide = means.astype(np.float64) + by
-    return (means, by) if any(origin_of(wide)) else (wide.astype(np.float32), NOWHERE)
 
 
 def _stored(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -31,7 +31,7 @@ _PICKLE_LIMIT = 1 << 20  # bytes; of a few tensors it has a few hundred
 _PLAIN = r"collections OrderedDict|torch\._utils _rebuild_(tensor_v2|parameter)|torch \w+Storage"
 
 
-def check_pt(path: Path) -> None:
+def check(path: Path) -> None:
     """Refuses, without torch, what is not a file of ``torch.save``, or would unpack to more than it is."""
     start = read_start(path)
     if start.startswith(b"\x80"):
@@ -78,13 +78,9 @@ def has_dial(path: Path) -> bool:
         return any(argument == SIGMA for _, argument, _ in pickletools.genops(archive.read(pickled)))
 
 
-def load_pt(path: Path) -> Source:
-    """Reads a checkpoint of gsplat's trainer, or one written here.
-
-    Scales are logarithms, opacities logits, as in Inria's layout. Read with ``weights_only``: a pickle that calls
-    anything but what makes tensors is refused, and nothing is called.
-    """
-    from clod_adapter.integrations.splats import NAMES  # here and not above, as check_pt does without torch
+def read(path: Path) -> Source:
+    """Reads a checkpoint of gsplat's trainer, or one written here; with ``weights_only``, so that no code runs."""
+    from clod_adapter.integrations.splats import NAMES  # here and not above, as check does without torch
 
     data = read_whole(path)
     checkpoint = _unpickled(path, data)
@@ -138,8 +134,8 @@ def _values(path: Path, name: str, splats: dict[str, Any], size: int) -> np.ndar
     return value.detach().float().numpy()
 
 
-def write_pt(path: Path, gaussians: Gaussians, history: History) -> tuple[str, ...]:
-    """Writes every value unchanged; arguments and errors as ``file_formats.write``."""
+def write(path: Path, gaussians: Gaussians, history: History) -> tuple[str, ...]:
+    """Writes every value unchanged."""
     import torch
 
     from clod_adapter.integrations.splats import NAMES

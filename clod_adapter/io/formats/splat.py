@@ -32,8 +32,8 @@ QUANTISED = "quantised: colours, opacities and rotations in 8 bits, no view-depe
 _ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
 
 
-def write_splat(path: Path, gaussians: Gaussians, history: History) -> tuple[str, ...]:
-    """Writes Gaussians without a dial, and no text; arguments and errors as ``file_formats.write``."""
+def write(path: Path, gaussians: Gaussians, history: History) -> tuple[str, ...]:
+    """Writes Gaussians without a dial, and no text."""
     arrays = arrays_of(path, gaussians)
     scales = scales_of(path, arrays["log_scales"])
     opacities = sigmoid(arrays["opacity_logits"])
@@ -50,8 +50,8 @@ def write_splat(path: Path, gaussians: Gaussians, history: History) -> tuple[str
     return (*notes, *(["the origin is dropped: coordinates are relative to it"] if any(history.origin) else []))
 
 
-def load_splat(path: Path) -> Source:
-    """Reads rows as ``write_splat`` writes them; SH degree 0."""
+def read(path: Path) -> Source:
+    """Reads rows as ``write`` writes them; SH degree 0."""
     data = read_whole(path)
     if not data or len(data) % _ROW.itemsize:
         raise ClodError(f"{path}: {len(data)} bytes are not a .splat file, whose rows have 32; copy or export it again")

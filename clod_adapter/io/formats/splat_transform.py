@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from clod_adapter.io.settings import Source
 
 VARIABLE = "CLOD_SPLAT_TRANSFORM"
-NEEDED, NODE_NEEDED = (3, 7), 22
+NEEDED = (3, 7)
 INSTALL = "npm install node@22 @playcanvas/splat-transform@3.7"
 HELP = (
     f"in a folder of its own: {INSTALL}; then PATH=FOLDER/node_modules/node/bin:FOLDER/node_modules/.bin:$PATH, or the "
@@ -40,40 +40,25 @@ TICK = 0.2  # seconds between two checks for its end
 # Without a GPU, where a round of SOG's clustering of spherical harmonics takes minutes, and its usual ten take an hour.
 # Two rounds more give 0.02 dB.
 ON_CPU = ("-g", "cpu", "-i", "1")
-# Prints the version of the Node that runs the tool, also if a wrapper or a symbolic link starts it.
-_SAY_NODE = "--import=data:text/javascript,process.stderr.write(`node:${process.version};`)"
 LEAVES, SMALLEST = 128, 8  # fewest leaves of a large set, and thousands (1,024) of Gaussians below which none is cut
 
 
 def cutting_options(count: int) -> tuple[str, ...]:
-    """Options for the leaves of a streaming set of ``count`` Gaussians over all levels, in any unit of length.
-
-    By default the tool cuts what is wider than 16 units, which suits a scene in metres only.
-    """
+    """Options for the leaves of a streaming set; by default the tool cuts what is wider than 16 units of length."""
     return "--lod-chunk-extent", "0", "--lod-chunk-min", str(max(SMALLEST, count // (1024 * LEAVES)))
 
 
 @dataclass(frozen=True)
 class SplatTransform:
-    """The tool as it is here.
+    """The tool as it is here."""
 
-    Attributes:
-        command: how it is started.
-        version: of the tool, three numbers.
-        gpu: whether it sees a GPU; without one it clusters spherical harmonics on the CPU, in one round.
-    """
-
-    command: tuple[str, ...]
-    version: str
-    gpu: bool = False
+    command: tuple[str, ...]  # how it is started
+    version: str  # three numbers
+    gpu: bool = False  # whether it sees one; else it clusters spherical harmonics on the CPU, in one round
 
     @classmethod
     def find(cls) -> SplatTransform:
-        """The one in the environment's ``CLOD_SPLAT_TRANSFORM``, a command with its words, or on the PATH.
-
-        Raises:
-            ClodError: it is not there, it or its Node is too old, or it does not run; with the install line.
-        """
+        """The one in the environment's ``CLOD_SPLAT_TRANSFORM``, a command with its words, or on the PATH."""
         given = os.environ.get(VARIABLE, "")
         name, *more = _words(given) or ("splat-transform",)
         program = shutil.which(name)
@@ -81,12 +66,9 @@ class SplatTransform:
             where = f"{name}, which {VARIABLE} names, is" if given else "splat-transform is"
             raise ClodError(f"{where} not installed; {HELP}")
         command = (program, *more)
-        output = _ask(command, "--version")
-        version, node = re.search(r"splat-transform v(\d+)\.(\d+)\.(\d+)", output), re.search(r"node:v(\d+)", output)
-        if node is not None and int(node[1]) < NODE_NEEDED:
-            raise ClodError(f"splat-transform is run by Node {node[1]} and needs {NODE_NEEDED} or newer; {HELP}")
+        version = re.search(r"splat-transform v(\d+)\.(\d+)\.(\d+)", _ask(command, "--version"))
         if version is None:
-            raise ClodError(f"{shlex.join(command)} does not run as splat-transform; {HELP}")
+            raise ClodError(f"{shlex.join(command)} does not run as splat-transform; it needs Node 22; {HELP}")
         found = tuple(map(int, version.groups()))
         if found[:2] < NEEDED:
             wanted = ".".join(map(str, NEEDED))
@@ -95,19 +77,13 @@ class SplatTransform:
         return cls(command, ".".join(version.groups()), gpu)
 
     def run(self, *words: str | Path, timeout: float, progress: Callable[[float], None] | None = None) -> float:
-        """Runs it with these words, replacing outputs; the seconds it took.
+        """Runs it with these words, replacing outputs; the seconds it took. An exception, as of Ctrl-C, ends the tool.
 
-        A Path is made absolute, so that it is read neither as an option nor as an address. Ctrl-C and every other
-        exception raised here end the tool.
-
-        Args:
-            timeout: seconds after which it is ended.
-            progress: called now and then with the seconds so far.
-
-        Raises:
-            ClodError: it fails, with the last line of its output, or takes longer than that.
+        A Path is made absolute, so that it is read neither as an option nor as an address. ``progress`` is called now
+        and then with the seconds so far.
         """
-        command = [*self.command, "-w", *(() if self.gpu else ON_CPU), *map(_word, words)]
+        given = [str(word.absolute()) if isinstance(word, Path) else word for word in words]
+        command = [*self.command, "-w", *(() if self.gpu else ON_CPU), *given]
         began = time.perf_counter()
         process = subprocess.Popen(
             command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
@@ -137,12 +113,8 @@ def time_limit(count: int) -> float:
     return LIMIT + LIMIT_EACH * count
 
 
-def check_converted(path: Path, version: str = "") -> SplatTransform:
-    """The converter; refuses a file that is something else, or that cannot be converted here.
-
-    Args:
-        version: of the format, where only one version is read in this way.
-    """
+def check(path: Path, version: str = "") -> SplatTransform:
+    """The converter; refuses what cannot be converted here. ``version`` is of the format, where it is only one."""
     refuse_known(path, read_start(path))
     try:
         return SplatTransform.find()
@@ -153,19 +125,19 @@ def check_converted(path: Path, version: str = "") -> SplatTransform:
         ) from error
 
 
-def load_converted(path: Path, version: str = "") -> Source:
-    """The Gaussians of the PLY that splat-transform converts the file to; ``version`` as in ``check_converted``."""
-    from clod_adapter.io.ply import read_ply  # here: check_converted needs neither plyfile nor numpy
+def read(path: Path, version: str = "") -> Source:
+    """The Gaussians of the PLY that splat-transform converts the file to."""
+    from clod_adapter.io import ply  # here: check needs neither plyfile nor numpy
     from clod_adapter.io.settings import Metadata, Source
 
-    tool, sha256 = check_converted(path, version), hashlib.sha256(read_whole(path)).hexdigest()
+    tool, sha256 = check(path, version), hashlib.sha256(read_whole(path)).hexdigest()
     with TemporaryDirectory() as folder:
         converted = Path(folder) / "converted.ply"
         try:
             tool.run(path, converted, timeout=LIMIT_CONVERT)
         except ClodError as error:
             raise ClodError(f"{path}: cannot be read ({error}); copy or export it again") from error
-        arrays = read_ply(converted).arrays
+        arrays = ply.read(converted).arrays
     note = f"quantised: {path.suffix} stores positions, scales, rotations and colours in a few bits each"
     return Source(arrays, Metadata(), sha256, (note, f"read through splat-transform {tool.version}"))
 
@@ -180,17 +152,12 @@ def _words(given: str) -> tuple[str, ...]:
         raise ClodError(f"{VARIABLE} is {given!r}, which is no command ({error}); {HELP}") from error
 
 
-def _word(word: str | Path) -> str:
-    return str(word.absolute()) if isinstance(word, Path) else word
-
-
 def _ask(command: tuple[str, ...], question: str) -> str:
     """Its output for an option that asks about it; empty where it does not run."""
-    options = f"{os.environ.get('NODE_OPTIONS', '')} {_SAY_NODE}".strip()
     try:
         done = subprocess.run(
             [*command, question], stdin=subprocess.DEVNULL, capture_output=True, text=True, encoding="utf-8",
-            errors="replace", timeout=ASKING, env={**os.environ, "NODE_OPTIONS": options},
+            errors="replace", timeout=ASKING,
         )  # fmt: skip
     except (OSError, subprocess.TimeoutExpired):
         return ""

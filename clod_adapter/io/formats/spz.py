@@ -35,7 +35,7 @@ from clod_adapter.equation.units import estimated_distance, in_world_units, know
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.file_formats import NEW_SPZ, read_start, read_whole
-from clod_adapter.io.formats.splat_transform import load_converted
+from clod_adapter.io.formats import splat_transform
 from clod_adapter.io.settings import (
     DAMAGE,
     TAG,
@@ -84,8 +84,8 @@ _UNTURNED = struct.pack("<I", RDF)
 _SMALL = 1 << 24  # bytes that any file may
 
 
-def write_spz(path: Path, gaussians: Gaussians, history: History) -> tuple[str, ...]:
-    """Writes with the format's quantisation, about 8 bits; arguments and errors as ``file_formats.write``.
+def write(path: Path, gaussians: Gaussians, history: History) -> tuple[str, ...]:
+    """Writes with the format's quantisation, about 8 bits.
 
     Positions have as many of their 24 bits for the fraction as they leave, 20 at most. A few Gaussians at an enormous
     distance, as many checkpoints have them, would leave the rest too few: see ``_nearer``.
@@ -187,20 +187,14 @@ def _losses(arrays: dict[str, np.ndarray], bits: int, degree: int) -> tuple[str,
 
 def has_dial(path: Path) -> bool:
     """Reads all of the file, which is never much."""
-    return not read_start(path).startswith(NEW_SPZ) and SIGMA in load_spz(path).arrays
+    return not read_start(path).startswith(NEW_SPZ) and SIGMA in read(path).arrays
 
 
-def load_spz(path: Path) -> Source:
-    """Reads versions 2 and 3, SH degree 0 to 4; version 4 is converted by splat-transform.
-
-    A quantised value is read as the middle of its interval.
-
-    Raises:
-        ClodError: the file cannot be read, is damaged, of another version, or unpacks to far more than it could hold.
-    """
+def read(path: Path) -> Source:
+    """Reads versions 2 and 3, SH degree 0 to 4; version 4 is converted by splat-transform."""
     whole = read_whole(path)
     if whole.startswith(NEW_SPZ):
-        return load_converted(path, " of version 4")
+        return splat_transform.read(path, " of version 4")
     data = _unpacked(path, whole)
     magic, version, count, degree, bits, flags, _ = HEADER.unpack_from(data)
     if magic != MAGIC or version not in (2, 3) or degree not in SH_COUNTS or bits > 24 or count > MOST:
@@ -302,7 +296,7 @@ def _unquantized(columns: dict[str, np.ndarray], bits: int, bands: int) -> dict[
 
 
 def _smallest_three(quats: np.ndarray) -> np.ndarray:
-    """``[N, 4]`` wxyz; the inverse of ``spz._packed_quats``."""
+    """``[N, 4]`` wxyz; the inverse of ``_packed_quats``."""
     packed = np.ascontiguousarray(quats).view("<u4")[:, 0]
     largest, xyzw = packed >> 30, np.zeros((len(packed), 4), np.float64)
     for axis in (3, 2, 1, 0):

@@ -13,8 +13,7 @@ import torch
 
 from clod_adapter.cameras import Camera
 from clod_adapter.errors import ClodError
-from clod_adapter.io.atomic import atomic_path
-from clod_adapter.io.file_formats import refuse_irregular, refuse_long_numbers
+from clod_adapter.io.file_formats import read_whole
 from clod_adapter.io.scene.folder import find_cameras, name_parts
 from clod_adapter.origin import NOWHERE
 
@@ -32,19 +31,12 @@ HUGE = 1e9  # world units and pixels; larger values are damage, and may not fit 
 
 @dataclass(frozen=True)
 class PosedImage:
-    """A photograph's name, pose and camera.
+    """A photograph's name, pose and camera."""
 
-    Attributes:
-        name: its path in the folder of photographs, parts joined by /.
-        viewmat: ``[4, 4]`` float64, world to camera, OpenCV axes.
-        camera: any of COLMAP's perspective models; pixel centres lie at +0.5.
-        held_out: whether the scene marks it for testing; None where the scene marks none.
-    """
-
-    name: str
-    viewmat: np.ndarray
-    camera: pycolmap.Camera
-    held_out: bool | None = None
+    name: str  # its path in the folder of photographs, parts joined by /
+    viewmat: np.ndarray  # ``[4, 4]`` float64, world to camera, OpenCV axes
+    camera: pycolmap.Camera  # any of COLMAP's perspective models; pixel centres lie at +0.5
+    held_out: bool | None = None  # whether the scene marks it for testing; None where the scene marks none
 
     @property
     def is_pinhole(self) -> bool:
@@ -59,10 +51,7 @@ class PosedImage:
 
 
 def held_out(images: Sequence[PosedImage], test_every: int) -> set[str]:
-    """Names of the test images: those that the scene marks, else the 0th and every ``test_every``-th.
-
-    A single image is for training.
-    """
+    """Names of the test images: those that the scene marks, else the 0th and every ``test_every``-th of several."""
     if any(image.held_out is not None for image in images):
         return {image.name for image in images if image.held_out}
     return {image.name for image in images[::test_every]} if len(images) > 1 else set()
@@ -88,7 +77,7 @@ def check_posed(image: PosedImage, source: Path) -> PosedImage:
 
 def read_colmap(model: Path) -> tuple[list[PosedImage], list[str]]:
     """The registered images of a model, sorted by name, and notes."""
-    check_records(model)
+    _check_records(model)
     try:
         reconstruction = pycolmap.Reconstruction(str(model))
         images = sorted(reconstruction.images.values(), key=lambda image: image.name)
@@ -97,7 +86,7 @@ def read_colmap(model: Path) -> tuple[list[PosedImage], list[str]]:
         posed = [_posed_image(model, image) for image in images if image.has_pose]
     except (ValueError, OverflowError, IndexError, KeyError, RuntimeError, MemoryError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise ClodError(f"{model}: COLMAP cannot read this model ({reason}); copy or export it again") from error
+        raise ClodError(f"{model}: COLMAP cannot read this model ({reason:.200}); copy or export it again") from error
     if not posed:
         raise ClodError(f"{model}: the model has no registered image; run COLMAP's mapper again")
     unposed = len(images) - len(posed)
@@ -105,10 +94,7 @@ def read_colmap(model: Path) -> tuple[list[PosedImage], list[str]]:
 
 
 def load_points(folder: str | Path, origin: Sequence[float] = NOWHERE) -> torch.Tensor:
-    """``[M, 3]`` float64, the points of the scene's COLMAP model less ``origin``, world units; none without a model.
-
-    The model is one that loads.
-    """
+    """``[M, 3]`` float64, the points of the scene's COLMAP model less ``origin``; none without a model."""
     model = find_cameras(Path(folder))
     points = pycolmap.Reconstruction(str(model)).points3D.values() if model.is_dir() else ()
     return torch.from_numpy(np.array([point.xyz for point in points], np.float64).reshape(-1, 3) - origin)
@@ -121,22 +107,12 @@ def write_model(
     points: np.ndarray | None = None,
     colors: np.ndarray | None = None,
 ) -> None:
-    """Writes a binary COLMAP model to ``folder/sparse/0``, which must not exist or be empty.
+    """Writes a binary COLMAP model of pinhole cameras to ``folder/sparse/0``.
 
-    Args:
-        folder: an existing folder.
-        cameras: one per image; those with the same intrinsics and size share a PINHOLE camera.
-        names: the images' names under ``folder/images``.
-        points: ``[M, 3]`` positions for points3D, world units; without them it is empty.
-        colors: ``[M, 3]`` uint8 RGB of the points, which are black without.
-
-    Raises:
-        ClodError: names and cameras differ in number, or the model cannot be written there.
+    ``points [M, 3]`` are black without ``colors [M, 3]`` uint8.
     """
-    if len(names) != len(cameras) or len(set(names)) != len(names):
-        raise ClodError(f"{folder}: {len(cameras)} cameras need as many different names, {len(set(names))} were given")
     reconstruction = pycolmap.Reconstruction()
-    ids: dict[tuple[float, ...], int] = {}
+    ids: dict[tuple[float, ...], int] = {}  # of cameras, which images of the same intrinsics and size share
     for image_id, (camera, name) in enumerate(zip(cameras, names, strict=True), start=1):
         K = camera.K.double().cpu()
         params = (K[0, 0].item(), K[1, 1].item(), K[0, 2].item(), K[1, 2].item())
@@ -154,11 +130,8 @@ def write_model(
     for position, color in zip(xyz, rgb, strict=True):
         reconstruction.add_point3D(position, pycolmap.Track(), color)
     target = Path(folder) / "sparse" / "0"
-    if Path(folder).is_dir():
-        target.parent.mkdir(exist_ok=True)
-    with atomic_path(target) as temporary:
-        temporary.mkdir()
-        reconstruction.write_binary(str(temporary))
+    target.mkdir(parents=True, exist_ok=True)
+    reconstruction.write_binary(str(target))
 
 
 def _posed_image(model: Path, image: pycolmap.Image) -> PosedImage:
@@ -171,36 +144,20 @@ def _posed_image(model: Path, image: pycolmap.Image) -> PosedImage:
     return check_posed(PosedImage(image.name, viewmat, copy(image.camera)), model)
 
 
-def check_records(model: Path) -> None:
-    """Walks the binary records, as COLMAP reads past the end of a cut file until memory runs out.
-
-    Raises:
-        ClodError: a file cannot be read or does not hold the number of records that it states.
-    """
+def _check_records(model: Path) -> None:
+    """Walks the binary records, as COLMAP reads past the end of a cut file until memory runs out."""
     for name, after in _RECORDS.items():
         path = model / name
-        text = path.with_suffix(".txt")
-        if data := _content(text):
-            refuse_long_numbers(text, data)
-        if not (data := _content(path)) and not path.exists():
+        if not path.exists():
             continue
+        data, at = read_whole(path), 8
         try:
-            at = 8
             for _ in range(struct.unpack_from("<Q", data)[0]):
                 at = after(data, at)
         except (struct.error, ValueError, OverflowError):
             at = len(data) + 1
         if at > len(data):
             raise ClodError(f"{path}: is truncated or damaged; copy or export the model again")
-
-
-def _content(path: Path) -> bytes:
-    """The file's bytes; none where there is no file."""
-    refuse_irregular(path, "copy the model again")
-    try:
-        return path.read_bytes() if path.is_file() else b""
-    except OSError as error:
-        raise ClodError(f"{path}: cannot be read ({error.strerror or error}); check the path") from error
 
 
 def _count(data: bytes, at: int) -> int:

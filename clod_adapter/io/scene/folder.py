@@ -15,17 +15,16 @@ from typing import Any
 
 from clod_adapter._support.text import as_text, file_name
 from clod_adapter.errors import ClodError
-from clod_adapter.io.file_formats import refuse_long_numbers
+from clod_adapter.io.file_formats import read_whole
 
 TRANSFORMS = ("transforms_train.json", "transforms.json")
 DATAPARSER = "dataparser_transforms.json"  # nerfstudio's: the frame it trained in
 DESCRIPTIONS = (*TRANSFORMS, "transforms_test.json", "transforms_val.json", DATAPARSER)
-PATHS = ("file_path", "mask_path", "depth_file_path")  # of a frame
 PHOTOGRAPHS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp")
 ENDINGS = ("", ".png", ".jpg", ".jpeg")  # that the path of a frame may omit
-MAX_BYTES = 256 * 2**20  # a hundred thousand frames have a tenth of that
 SMALLER = ("images_2", "images_4", "images_8")  # copies at a part of the size, as Mip-NeRF 360 and Inria's code have
 RAW = "input"  # Inria's name for the photographs before they are undistorted into images
+INPUTS = ("images", *SMALLER, RAW, "masks", "depths", "train", "test", "val")  # folders of inputs
 MISSING = 0.5  # the share of photographs that may be missing
 LONGEST_NAME, LONGEST_PART = 4000, 255  # characters of a path, bytes of one of its parts
 
@@ -74,11 +73,8 @@ def find_photographs(
 ) -> tuple[list[Path | None], list[str]]:
     """The files of these names, None for those that are missing, and notes.
 
-    All are from one of ``photograph_folders``, the one that has most of them.
-
-    Args:
-        raw: whether they may be in ``input``. They may not where the cameras are pinholes, which Inria's code makes
-            together with other photographs.
+    All are from the one of ``photograph_folders`` that has most of them; ``input`` is one of these only with ``raw``:
+    where the cameras are pinholes, Inria's code made them together with other photographs.
     """
     parts = [tuple(map(file_name, name_parts(name, cameras))) for name in names]
     if twice := [name for name, count in Counter(names).items() if count > 1]:
@@ -106,12 +102,7 @@ def find_photographs(
 
 
 def name_parts(name: str, cameras: Path) -> tuple[str, ...]:
-    """The parts of a photograph's name, split at / and at the \\ of files made on Windows.
-
-    Raises:
-        ClodError: the name is empty, not UTF-8, longer than file systems allow, holds control characters, or leads out
-            of the folder of photographs.
-    """
+    """The parts of a photograph's name, split at / and at the \\ of files made on Windows; refuses what is no name."""
     if as_text(name) != name:
         raise ClodError(f"{cameras}: image name {as_text(name)[:80]!r} is not UTF-8; rename the photograph, there too")
     path = PureWindowsPath(name)
@@ -125,52 +116,25 @@ def name_parts(name: str, cameras: Path) -> tuple[str, ...]:
 
 
 def scene_files(folder: Path) -> Iterator[Path]:
-    """What no output may overwrite: the model or the transforms, photographs, masks and depths; some may not exist.
-
-    A damaged transforms file gives no names; its reader refuses it.
-    """
+    """What no output may overwrite: the model or the transforms, photographs and masks; some may not exist."""
     cameras = find_cameras(folder)
-    home = cameras if cameras.is_dir() else cameras.parent
+    model = cameras.is_dir()
+    home = cameras if model else cameras.parent
     yield from (each / name for each in dict.fromkeys((folder, home)) for name in DESCRIPTIONS)
-    if cameras.is_dir():
-        yield from (path for path in cameras.iterdir() if path.suffix in (".bin", ".txt"))
-        named = [each for each in photograph_folders(folder, cameras) if each.name in ("images", *SMALLER, RAW)]
-        for each in [path for path in named if path.is_dir() and any(path.iterdir())] or [folder]:
-            yield from (path for path in each.rglob("*") if path.suffix.lower() in PHOTOGRAPHS)
-    else:
-        names = [name for each in DESCRIPTIONS for name in _names_in_json(cameras.with_name(each))]
-        yield from (home / name for name in names)
+    yield from (path for path in cameras.glob("*") if path.suffix in (".bin", ".txt"))
+    bases = (folder, home.parent, home.parent.parent) if model else (folder, home)
+    roots = dict.fromkeys(base / name for base in bases for name in INPUTS)
+    for each in [path for path in roots if path.is_dir() and any(path.iterdir())] or [folder]:
+        yield from (path for path in each.rglob("*") if path.suffix.lower() in PHOTOGRAPHS)
 
 
-def _names_in_json(path: Path) -> Iterator[str]:
+def read_json(path: Path) -> dict[str, Any]:
+    """The object in a JSON file."""
+    text = read_whole(path)
     try:
-        content: Any = read_json(path)
-    except ClodError:
-        return
-    frames = content.get("frames") if isinstance(content, dict) else None
-    for frame in frames if isinstance(frames, list) else ():
-        for key in PATHS if isinstance(frame, dict) else ():
-            if isinstance(frame.get(key), str) and (name := _on_disk(frame[key])):
-                yield from (name + ending for ending in ENDINGS)
-
-
-def _on_disk(name: str) -> str:
-    """The name as the file system encodes it; empty for an impossible one."""
-    try:
-        return file_name(name.replace("\\", "/")) if "\0" not in name else ""
-    except UnicodeEncodeError:
-        return ""
-
-
-def read_json(path: Path) -> Any:
-    """What a JSON file holds."""
-    try:
-        if path.stat().st_size > MAX_BYTES:
-            raise ClodError(f"{path}: is larger than {MAX_BYTES >> 20} MB, so it is no list of cameras; check the path")
-        text = path.read_bytes()
-        refuse_long_numbers(path, text)
-        return json.loads(text)
-    except OSError as error:
-        raise ClodError(f"{path}: cannot be read ({error.strerror or error}); check the path") from error
+        content = json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise ClodError(f"{path}: is no JSON or damaged ({error}); export it again") from error
+        raise ClodError(f"{path}: is no JSON or damaged ({error!s:.200}); export it again") from error
+    if not isinstance(content, dict):
+        raise ClodError(f"{path}: is no JSON object; copy or export it again")
+    return content

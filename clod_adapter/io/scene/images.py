@@ -17,19 +17,12 @@ Note = tuple[str, str]
 
 
 class Photograph(NamedTuple):
-    """A photograph of a pinhole camera.
+    """A photograph of a pinhole camera."""
 
-    Attributes:
-        pixels: 8-bit RGB, at the size that is used.
-        K: ``[3, 3]`` the intrinsics of that camera.
-        source: width and height in the file.
-        notes: on the changes.
-    """
-
-    pixels: Image.Image
-    K: np.ndarray
-    source: tuple[int, int]
-    notes: list[Note]
+    pixels: Image.Image  # 8-bit RGB, at the size that is used
+    K: np.ndarray  # ``[3, 3]`` the intrinsics of that camera
+    source: tuple[int, int]  # width and height in the file
+    notes: list[Note]  # on the changes
 
 
 # Pillow opens files by content, and starts another program for some (PostScript). JPEG includes the MPO of phones.
@@ -38,11 +31,8 @@ OTHERS = {
     b"ftyphei": "HEIC", b"ftypmif1": "HEIC", b"ftypavif": "AVIF", b"jP  ": "JPEG 2000", b"GIF8": "GIF",
     b"%!PS": "PostScript", b"%PDF": "PDF",
 }  # by what is in their first 12 bytes, for the message  # fmt: skip
-TRANSPARENT: Note = ("have transparency: laid over black", "")
 
-LARGE = 1 << 26  # pixels; a larger photograph is reduced first
-BAND = 64  # rows of the reduced photograph that are made at a time
-
+LARGE = 1 << 26  # pixels; a larger JPEG is reduced while it is decoded
 _TURNS = {
     5: Image.Transpose.TRANSPOSE,
     6: Image.Transpose.ROTATE_270,
@@ -59,15 +49,11 @@ def read_image(path: Path, width: int, height: int, max_width: int) -> tuple[Ima
     not applied. The EXIF rotation is not either, as COLMAP does not, unless the photograph has its camera's shape only
     once it is turned: then the model was made from turned copies.
 
-    A photograph of more than LARGE pixels is first reduced by an integer factor, to ``2 max_width`` or more: a JPEG
-    by its decoder, others by the mean over squares of pixels.
+    A JPEG of more than LARGE pixels is reduced by its decoder, to ``2 max_width`` or more.
 
     Args:
         width, height: the camera's; the photograph may be of another size, but not of another shape.
         max_width: its final width at most.
-
-    Raises:
-        ClodError: the file is not of FORMATS, cannot be decoded, has too many pixels, or another shape than the camera.
     """
     notes: list[Note] = []
     with _opened(path) as source:
@@ -81,15 +67,14 @@ def read_image(path: Path, width: int, height: int, max_width: int) -> tuple[Ima
                 "give the images the model was made from"
             )
         factor = max(1, shape[0] // (2 * max_width)) if size[0] * size[1] > LARGE else 1
-        if factor > 1:
-            source.draft(source.mode, (size[0] // factor, size[1] // factor))  # of JPEG alone
-            factor = max(1, factor * source.width // size[0])
+        source.draft(source.mode, (size[0] // factor, size[1] // factor))  # of JPEG alone
+        if source.size != size:
             notes.append((f"have more than {LARGE / 1e6:.0f} million pixels, which takes long: reduced first", ""))
-        pixels = _rgb(path, source, factor, notes)
+        pixels = _rgb(path, source, notes)
     if turn is not None:
         pixels = pixels.transpose(turn)
         notes.append(("rotated by their EXIF orientation, as the cameras are", ""))
-    return pixels, size, list(dict.fromkeys(notes))
+    return pixels, size, notes
 
 
 def image_size(path: Path) -> tuple[int, int]:
@@ -126,8 +111,7 @@ def _same_shape(size: tuple[int, int], width: int, height: int) -> bool:
     return abs(size[0] * height / (size[1] * width) - 1) <= 0.01  # a scaled copy is rounded to whole pixels
 
 
-def _rgb(path: Path, source: Image.Image, factor: int, notes: list[Note]) -> Image.Image:
-    """The photograph in 8-bit RGB, its width and height divided by ``factor``."""
+def _rgb(path: Path, source: Image.Image, notes: list[Note]) -> Image.Image:
     tags: dict[int, Any] = getattr(source, "tag_v2", {})  # a TIFF's
     if tags.get(_PLANES) == 2 and max(tags.get(_BITS) or (8,)) > 8:  # Pillow would take each byte for a pixel
         raise ClodError(f"{path}: has more than 8 bits in planes of one colour each; convert it to 8 bits")
@@ -136,17 +120,6 @@ def _rgb(path: Path, source: Image.Image, factor: int, notes: list[Note]) -> Ima
         raise ClodError(f"{path}: has 32 bits per channel, whose range is not known; convert it to 8 bits")
     if source.mode == "CMYK":
         notes.append(("are CMYK: brought to RGB without their colour profile", ""))
-    if factor == 1:
-        return _converted(source, deep, notes)
-    source.load()
-    small, rows = Image.new("RGB", (-(-source.width // factor), -(-source.height // factor))), factor * BAND
-    for top in range(0, source.height, rows):  # no copy of the whole is made
-        band = source.crop((0, top, source.width, min(top + rows, source.height)))
-        small.paste(_converted(band, deep, notes).reduce(factor), (0, top // factor))
-    return small
-
-
-def _converted(source: Image.Image, deep: bool, notes: list[Note]) -> Image.Image:
     if deep:
         values = np.asarray(source).astype(np.uint32)  # grey; 16-bit colour Pillow has brought to 8 bits itself
         return Image.fromarray(((values + 128) // 257).astype(np.uint8)).convert("RGB")
@@ -158,5 +131,5 @@ def _converted(source: Image.Image, deep: bool, notes: list[Note]) -> Image.Imag
     rgba = source.convert("RGBA")
     if rgba.getchannel("A").getextrema() == (255, 255):
         return rgba.convert("RGB")
-    notes.append(TRANSPARENT)
+    notes.append(("have transparency: laid over black", ""))
     return Image.alpha_composite(Image.new("RGBA", rgba.size, (0, 0, 0, 255)), rgba).convert("RGB")

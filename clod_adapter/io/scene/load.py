@@ -16,34 +16,25 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from clod_adapter._kernels.memory import release
 from clod_adapter._support.workers import in_order
 from clod_adapter.cameras import Camera, Scene, StoredView, View, in_its_unit, spread, with_near_planes
 from clod_adapter.errors import ClodError
 from clod_adapter.io.scene.colmap import HUGE, TEST_EVERY, PosedImage, held_out, read_colmap
 from clod_adapter.io.scene.folder import find_cameras, find_photographs
-from clod_adapter.io.scene.images import LARGE, Note, Photograph, image_size, read_image
+from clod_adapter.io.scene.images import Note, Photograph, read_image
 from clod_adapter.io.scene.transforms import in_trained_frame, read_transforms
 from clod_adapter.io.scene.undistort import cache_folder, kept, undistort
 from clod_adapter.origin import NOWHERE
 from clod_adapter.progress import Listener, Phase, tell
 
 MOST_AT_ONCE = 8  # photographs of full size in memory
-_ONE_LARGE = threading.Lock()  # of more than LARGE pixels one at a time
 
 
 class ImageCache:
-    """Pixels of photographs, least recently used dropped first, of at most ``limit`` bytes in total.
-
-    A single photograph larger than ``limit`` is not kept.
-
-    Attributes:
-        limit: bytes; held: bytes in memory now.
-        reads: how often a photograph was read again.
-    """
+    """Pixels of photographs, least recently used dropped first, of at most ``limit`` bytes in total."""
 
     def __init__(self, limit: int) -> None:
-        self.limit, self.held, self.reads = limit, 0, 0
+        self.limit, self.held, self.reads = limit, 0, 0  # bytes, those in memory now, and photographs read again
         self._images: OrderedDict[int, Tensor] = OrderedDict()
         self._lock, self._count = threading.Lock(), 0
 
@@ -140,18 +131,10 @@ def load_scene(
 def load_cameras(
     folder: str | Path, origin: Sequence[float] = NOWHERE, *, training: bool = False
 ) -> tuple[list[Camera], list[str]]:
-    """The cameras that ``scene.load_scene`` would give photographs to, sorted by name, and notes.
+    """The cameras that ``load_scene`` would give photographs to, sorted by name, and notes.
 
-    A distorted one is the pinhole of the same focal length and centre, not that of its undistorted photograph. Of a
+    A distorted one is the pinhole of the same focal length and centre. With ``training`` without those held out. Of a
     transforms.json without sizes, cameras whose photograph is missing too are left out.
-
-    Args:
-        folder: the scene's, usually the one with ``sparse/0/`` or ``transforms.json``.
-        origin: ``[3]`` what the world is to be relative to, in its units: ``Checkpoint.origin``.
-        training: excludes those that ``load_scene`` holds out.
-
-    Raises:
-        ClodError: there are no cameras, or none is usable.
     """
     folder = Path(folder)
     source, images, notes = _posed(folder)
@@ -207,12 +190,7 @@ def _load(
 
 
 def _left_out(views: Sequence[View], sizes: Sequence[tuple[int, int]], pinhole: bool) -> tuple[tuple[str, str], ...]:
-    """Steps of reading that are skipped, and why: ``Scene.left_out``.
-
-    Args:
-        sizes: of the photographs in their files.
-        pinhole: whether all cameras are pinholes.
-    """
+    """Steps of reading that are skipped, and why: ``Scene.left_out``; ``sizes`` are those in the files."""
     whole, used = sum(w * h for w, h in sizes), sum(view.camera.width * view.camera.height for view in views)
     found = [("undistortion", f"all {len(views)} cameras are pinholes")] if pinhole else []
     found += [("scaling", f"all {len(views)} photographs are used at full resolution")] if used >= whole else []
@@ -251,16 +229,6 @@ def _load_view(
 
 def _photograph(image: PosedImage, path: Path, max_width: int) -> Photograph:
     """The photograph as a pinhole camera has it, no wider than ``max_width``."""
-    width, height = image_size(path)
-    if width * height <= LARGE:
-        return _worked_on(image, path, max_width)
-    with _ONE_LARGE:
-        photograph = _worked_on(image, path, max_width)
-        release()  # or this thread keeps memory that the next one allocates again
-        return photograph
-
-
-def _worked_on(image: PosedImage, path: Path, max_width: int) -> Photograph:
     camera = copy(image.camera)
     pixels, source, notes = read_image(path, camera.width, camera.height, max_width)
     if pixels.size != (camera.width, camera.height):

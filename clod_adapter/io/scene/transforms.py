@@ -51,7 +51,7 @@ def read_transforms(path: Path) -> tuple[list[PosedImage], list[str]]:
 
 def _frames(path: Path, held_out: bool | None) -> tuple[list[PosedImage], list[str]]:
     content = read_json(path)
-    frames = content.get("frames") if isinstance(content, dict) else None
+    frames = content.get("frames")
     if not isinstance(frames, list) or not frames:
         raise ClodError(f"{path}: has no list of frames; give nerfstudio's or instant-ngp's transforms.json")
     images = []
@@ -77,11 +77,7 @@ def _name(path: Path, file_path: str) -> str:
 
 
 def read_pose(where: object, values: Mapping[str, Any], key: str) -> np.ndarray:
-    """``[4, 4]`` float64: the rotation, as the file rounds it, and translation under ``key``, 3x4 or 4x4.
-
-    Raises:
-        ClodError: it is something else; the message begins with ``where``.
-    """
+    """``[4, 4]`` float64: the rotation, as the file rounds it, and translation under ``key``, 3x4 or 4x4."""
     try:
         pose = np.array(values.get(key), np.float64)
     except (TypeError, ValueError, OverflowError):
@@ -156,17 +152,15 @@ def in_trained_frame(folder: Path, cameras: Path, images: list[PosedImage]) -> t
     Source: nerfstudio 1.1, ``base_dataparser.save_dataparser_transform`` and ``nerfstudio_dataparser``, which
     multiplies ``transform`` by the ``applied_transform`` of a transforms.json, and ``scale`` by its ``applied_scale``.
 
-    Args:
-        cameras: what ``find_cameras`` found: a model's folder, or a transforms file, whose ``applied_transform`` and
-            ``applied_scale`` are taken out again, as its poses have them already.
+    Those of a transforms file are taken out again, as its poses have them already.
     """
     path = folder / DATAPARSER
     if not path.is_file():
         return images, []
-    values = _object(path)
+    values = read_json(path)
     pose, scale = read_pose(path, values, "transform"), _number(path, values.get("scale", 1.0), "scale")
     if cameras.is_file():
-        applied = _object(cameras)
+        applied = read_json(cameras)
         if applied.get("applied_transform") is not None:
             pose = pose @ np.linalg.inv(read_pose(cameras, applied, "applied_transform"))
         if applied.get("applied_scale") is not None:
@@ -182,15 +176,7 @@ def in_trained_frame(folder: Path, cameras: Path, images: list[PosedImage]) -> t
     return brought, [note]
 
 
-def _object(path: Path) -> dict[str, Any]:
-    content = read_json(path)
-    if not isinstance(content, dict):
-        raise ClodError(f"{path}: is no JSON object; copy it again from beside the config.yml of ns-train")
-    return content
-
-
 def _number(path: Path, value: Any, key: str) -> float:
-    usable = isinstance(value, int | float) and not isinstance(value, bool) and 1 / HUGE < value < HUGE
-    if not usable:
+    if not isinstance(value, int | float) or isinstance(value, bool) or not 1 / HUGE < value < HUGE:
         raise ClodError(f"{path}: {key} is {value!r:.40}, it must be a positive number; copy or export it again")
     return float(value)

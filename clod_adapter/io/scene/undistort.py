@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import sys
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -24,12 +23,7 @@ _KEY = "clod-adapter"  # of the text in a cached PNG
 
 
 def undistort(path: Path, pixels: Image.Image, camera: pycolmap.Camera) -> tuple[Image.Image, pycolmap.Camera]:
-    """As ``colmap image_undistorter`` by default: bilinear, the same focal length, cropped to have no blank pixel.
-
-    Args:
-        path: the photograph's, for messages.
-        camera: a distorted one, of the size of ``pixels``.
-    """
+    """As ``colmap image_undistorter`` by default: bilinear, the same focal length, cropped to have no blank pixel."""
     try:
         bitmap, pinhole = pycolmap.undistort_image(
             pycolmap.UndistortCameraOptions(), pycolmap.Bitmap.from_array(np.asarray(pixels)), camera
@@ -40,24 +34,12 @@ def undistort(path: Path, pixels: Image.Image, camera: pycolmap.Camera) -> tuple
     return Image.fromarray(bitmap.to_array()), pinhole
 
 
-def user_caches() -> Path:
-    """``$XDG_CACHE_HOME``, or where the platform has its users' caches; it need not be there."""
-    if chosen := os.environ.get("XDG_CACHE_HOME"):
-        return Path(chosen)
-    try:
-        home = Path.home()
-    except RuntimeError as error:
-        raise ClodError("no home folder to keep undistorted photographs in; set XDG_CACHE_HOME to a folder") from error
-    if sys.platform == "win32":
-        return Path(os.environ.get("LOCALAPPDATA", home / "AppData" / "Local"))
-    return home / "Library" / "Caches" if sys.platform == "darwin" else home / ".cache"
-
-
 def cache_folder(scene: Path) -> Path:
-    """The cache folder of a scene's undistorted photographs in ``user_caches()``; created if missing."""
+    """The folder of a scene's undistorted photographs in ``$XDG_CACHE_HOME`` or ``~/.cache``; created if missing."""
     scene = scene.resolve()
     name = f"{scene.name}-{hashlib.sha256(str(scene).encode(errors='surrogateescape')).hexdigest()[:8]}"
-    folder = user_caches() / "clod-adapter" / "undistorted" / name
+    caches = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"))
+    folder = caches / "clod-adapter" / "undistorted" / name
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if not os.access(folder, os.W_OK | os.X_OK):
@@ -71,11 +53,7 @@ def cache_folder(scene: Path) -> Path:
 
 
 def kept(folder: Path, image: PosedImage, path: Path, max_width: int, make: Callable[[], Photograph]) -> Photograph:
-    """The result of ``make``, from ``folder`` where an earlier run has cached it.
-
-    One PNG for each photograph, written atomically. Its name is a hash of its inputs: the photograph's path,
-    size and modification time, the camera, ``max_width`` and the libraries' versions.
-    """
+    """The result of ``make``, from ``folder`` where an earlier run cached it: a PNG named by a hash of its inputs."""
     state, camera = path.stat(), image.camera
     made_of = (
         str(path.resolve()), state.st_size, state.st_mtime_ns, camera.model_name, camera.width, camera.height,
