@@ -29,6 +29,7 @@ from clod_adapter.render import render
 from clod_adapter.viewer.payload import Payload, page_config
 
 PAGE, STYLE, SCRIPT = "page.html", "viewer.css", "viewer.js"
+ELEMENT = "clod-model"  # id of the elements with the splats
 PART = 3 << 24  # bytes of a script element, a multiple of 3; browsers limit strings to about 5e8
 POSTER_SIDE, POSTER_BYTES = 512, 40_000  # of the picture shown while the page loads: pixels, bytes before base64
 
@@ -42,7 +43,6 @@ def write_viewer_page(
     path: str | Path,
     model: Checkpoint,
     *,
-    base: Checkpoint | None = None,
     cameras: Sequence[Camera] = (),
     virtual_scale: float | None = None,
     exact: bool = False,
@@ -53,7 +53,6 @@ def write_viewer_page(
 
     Args:
         model: with or without a dial.
-        base: shown for comparison; relative to the same origin.
         cameras: selectable viewpoints, in the frame of the Gaussians (relative to the origin); by default the stored
             ones. A picture from the first one is shown while the page loads.
         virtual_scale: the initial dial value, >= 0; None for 1 with photographs, else 0 (everything), and then what
@@ -68,12 +67,9 @@ def write_viewer_page(
     """
     shown, placed = cameras or model.cameras, model.placed and not cameras
     with atomic_path(path) as temporary:
-        payloads = {"clod-model": Payload.of(model)} | ({"clod-base": Payload.of(base)} if base else {})
-        first, *second = ({"name": payload.name, "element": element} for element, payload in payloads.items())
-        packed = {element: payload.packed(f"{temporary}.spz", exact) for element, payload in payloads.items()}
-        data = {element: part for element, (part, *_) in packed.items()}
-        _, found, notes = packed["clod-model"]
-        config = page_config(first, second[0] if base else None, shown, virtual_scale, placed=placed)
+        payload = Payload.of(model)
+        data, found, notes = payload.packed(f"{temporary}.spz", exact)
+        config = page_config({"name": payload.name, "element": ELEMENT}, None, shown, virtual_scale, placed=placed)
         opening = virtual_scale if virtual_scale is not None else 0.0 if placed else 1.0
         poster = _poster(found, shown[0], opening) if shown else ""
         meta = f'<meta http-equiv="Content-Security-Policy" content="{policy()}">\n'
@@ -124,12 +120,11 @@ def _document(config: Mapping[str, Any], data: Iterable[bytes], meta: str, poste
             yield (content[part] if number % 2 else part).encode()
 
 
-def _elements(data: Mapping[str, bytes]) -> Iterator[bytes]:
-    """Script elements with the bytes as base64, by id; large data are divided among several with the same id."""
-    for element, whole in data.items():
-        for start in range(0, len(whole), PART):
-            part = base64.b64encode(whole[start : start + PART])
-            yield b'<script type="application/octet-stream" id="%s">%s</script>\n' % (element.encode(), part)
+def _elements(data: bytes) -> Iterator[bytes]:
+    """Script elements with the bytes as base64; large data are divided among several with the same id."""
+    for start in range(0, len(data), PART):
+        part = base64.b64encode(data[start : start + PART])
+        yield b'<script type="application/octet-stream" id="%s">%s</script>\n' % (ELEMENT.encode(), part)
 
 
 @cache

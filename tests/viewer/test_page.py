@@ -61,7 +61,7 @@ def test_the_text_of_one_file(tmp_path: Path) -> None:
     saved, cameras = clod_adapter.load(tmp_path / "model.ply"), scenes.ring(2, 1000, 500)
     out = tmp_path / "out" / "page.html"
     out.parent.mkdir()
-    shown, losses = page.write_viewer_page(out, saved, base=saved, cameras=cameras, virtual_scale=2.0)
+    shown, losses = page.write_viewer_page(out, saved, cameras=cameras, virtual_scale=2.0)
     assert [each.name for each in out.parent.iterdir()] == ["page.html"] and losses
     text = out.read_text(encoding="utf-8")
     policy = re.search('<meta http-equiv="Content-Security-Policy" content="([^"]*)">', text)
@@ -73,7 +73,7 @@ def test_the_text_of_one_file(tmp_path: Path) -> None:
     assert len(poster) < 60_000 and picture.shape == wanted.shape and np.abs(picture - wanted).mean() < 3
     page.write_viewer_page(tmp_path / "alone.html", saved)
     text = (tmp_path / "alone.html").read_text(encoding="utf-8")
-    assert "clod-base" not in text and '<img id="poster"' not in text  # no viewpoint is stored
+    assert '<img id="poster"' not in text  # no viewpoint is stored
 
 
 def test_one_exact_file_needs_no_network(
@@ -83,7 +83,7 @@ def test_one_exact_file_needs_no_network(
     monkeypatch.setattr(page, "PART", 15_000)
     loaded = clod_adapter.load(model)
     out = tmp_path / "page.html"
-    page.write_viewer_page(out, loaded, base=loaded, cameras=scenes.ring(2, 320, 240), virtual_scale=2.0, exact=True)
+    page.write_viewer_page(out, loaded, cameras=scenes.ring(2, 320, 240), virtual_scale=2.0, exact=True)
     assert out.read_text(encoding="utf-8").count('id="clod-model"') > 2
     shown.run("clod.setDial(2)")
     with chromium.new_context(viewport=SIZE, offline=True) as context:
@@ -93,7 +93,7 @@ def test_one_exact_file_needs_no_network(
             each.camera(scenes.camera(320, 240))
         assert np.array_equal(shown.picture(), alone.picture()) and shown.counts() == alone.counts()
         alone.run("clod.setWipe(0.5)")
-        assert alone.text("#wipe-right") == "base · 400" and alone.errors == []
+        assert alone.text("#wipe-right") == "dial off · 400" and alone.errors == []
         assert [url for url in alone.asked if not url.startswith(("file:", "blob:", "data:"))] == []
 
 
