@@ -10,6 +10,7 @@ import math
 import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -38,18 +39,12 @@ pseudo_views.MANY = 8  # the tests' captures of eight show too little by the mea
 
 
 @pytest.fixture
-def shared_data() -> Callable[[str], Path]:
-    """A path in the shared data folder (CLOD_SHARED_DATA, or shared/data beside the checkout); skips without it."""
-    default = Path(__file__).resolve().parents[2] / "shared" / "data"
-    root = Path(os.environ.get("CLOD_SHARED_DATA", default))
-
-    def get(relative: str) -> Path:
-        path = root / relative
-        if not path.exists():
-            pytest.skip(f"shared data absent: {path} (set CLOD_SHARED_DATA)")
-        return path
-
-    return get
+def ci_banana() -> Path:
+    """A small real scene of the shared data: CLOD_SHARED_DATA, or shared/data beside the checkout."""
+    shared = os.environ.get("CLOD_SHARED_DATA", Path(__file__).resolve().parents[2] / "shared" / "data")
+    if not (path := Path(shared) / "ci_banana").exists():
+        pytest.skip(f"shared data absent: {path} (set CLOD_SHARED_DATA)")
+    return path
 
 
 @pytest.fixture(scope="session")
@@ -81,13 +76,15 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
     folder = tmp_path_factory.mktemp("capture")
     scene = folder / "scene"
     (scene / "images").mkdir(parents=True)
-    gaussians = _blob(300)
-    cameras = [_camera(2 * math.pi * i / 10) for i in range(10)]
-    names = [f"{i:03}.png" for i in range(10)]
+    normal = partial(torch.randn, generator=torch.Generator().manual_seed(1))
+    gaussians = Gaussians(
+        means=normal(300, 3), quats=normal(300, 4), log_scales=normal(300, 3) * 0.5 - 2.0,
+        opacity_logits=normal(300) * 1.5 + 1.0, sh0=normal(300, 1, 3), shN=normal(300, 3, 3) * 0.1,
+    )  # fmt: skip
+    cameras, names = [_camera(2 * math.pi * i / 10) for i in range(10)], [f"{i:03}.png" for i in range(10)]
     write_model(scene, cameras, names)
     for camera, name in zip(cameras, names, strict=True):
-        image = (render(gaussians, camera).image.clamp(0, 1) * 255).round().to(torch.uint8)
-        Image.fromarray(image.numpy()).save(scene / "images" / name)
+        Image.fromarray(render(gaussians, camera).pixels.numpy()).save(scene / "images" / name)
     return Capture(scene, _write_inria(folder / "base.ply", gaussians), gaussians, _write_inria)
 
 
@@ -105,18 +102,6 @@ def _write_inria(path: Path, gaussians: Gaussians) -> Path:
     plain = gaussians.replace(sigma_d=None, attenuation=None)
     PlyData([PlyElement.describe(inria_rows(plain), "vertex")], byte_order="<").write(str(path))
     return path
-
-
-def _blob(count: int) -> Gaussians:
-    random = torch.Generator().manual_seed(1)
-
-    def normal(*shape: int) -> torch.Tensor:
-        return torch.randn(*shape, generator=random)
-
-    return Gaussians(
-        means=normal(count, 3), quats=normal(count, 4), log_scales=normal(count, 3) * 0.5 - 2.0,
-        opacity_logits=normal(count) * 1.5 + 1.0, sh0=normal(count, 1, 3), shN=normal(count, 3, 3) * 0.1,
-    )  # fmt: skip
 
 
 def _camera(angle: float) -> Camera:

@@ -5,26 +5,19 @@ from __future__ import annotations
 import re
 import shlex
 import textwrap
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", ROOT / "examples" / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 FENCE = re.compile(r"^( *)(`{3,})(\w*)\n(.*?)^\1\2 *$", re.DOTALL | re.MULTILINE)
 
 
-@dataclass(frozen=True)
-class Block:
-    """A fenced block.
-
-    Attributes:
-        place: page and line.
-        language: of the fence; ``sh`` for the README's, which have none.
-        reason: why it is not run, from ``<!-- not run: REASON -->`` above it; empty if it is run.
-    """
+class Block(NamedTuple):
+    """A fenced block; ``reason`` is that of ``<!-- not run: REASON -->`` above it, and empty if it is run."""
 
     place: str
-    language: str
+    language: str  # of the fence; ``sh`` for the README's, which have none
     text: str
     reason: str
 

@@ -31,23 +31,19 @@ class Result(NamedTuple):
     gradients: dict[str, Tensor]
 
 
-def weights(camera: Camera, seed: int = 0) -> tuple[Tensor, Tensor]:
+def weights(camera: Camera) -> tuple[Tensor, Tensor]:
     """Random weights of the pixels of image and alpha."""
-    g = torch.Generator().manual_seed(seed)
-    return (
-        torch.randn(camera.height, camera.width, 3, generator=g),
-        torch.randn(camera.height, camera.width, generator=g),
-    )
+    g, size = torch.Generator().manual_seed(0), (camera.height, camera.width)
+    return torch.randn(*size, 3, generator=g), torch.randn(*size, generator=g)
 
 
 def differentiate(
-    rasterize: Splat, scene: Parameters, camera: Camera, v: tuple[Tensor, Tensor],
-    background: Tensor = BACKGROUND, screen_filter: ScreenFilter = CLASSIC,
-) -> Result:  # fmt: skip
+    rasterize: Splat, scene: Parameters, camera: Camera, v: tuple[Tensor, Tensor], screen_filter: ScreenFilter = CLASSIC
+) -> Result:
     """Forward and backward, in the scene's float type."""
     dtype = scene["means"].dtype
     leaves = {name: value.clone().requires_grad_() for name, value in scene.items()}
-    behind = background.to(dtype, copy=True).requires_grad_()
+    behind = BACKGROUND.to(dtype, copy=True).requires_grad_()
     image, alpha = rasterize(**leaves, camera=camera, background=behind, screen_filter=screen_filter)
     total = (image * v[0].to(dtype)).sum() + (alpha * v[1].to(dtype)).sum()
     found = torch.autograd.grad(total, [*leaves.values(), behind])
@@ -92,10 +88,8 @@ def assert_agrees(
     assert share <= cut, f"{share:.2%} of the pixels are on a cut: this scene tests nothing"
     v_image, v_alpha = weights(camera)
     v = v_image * ~unsure[..., None], v_alpha * ~unsure
-    found, want = (
-        differentiate(*case, camera, v, screen_filter=screen_filter)
-        for case in ((rasterize, scene), (reference.rasterize, twin))
-    )
+    found = differentiate(rasterize, scene, camera, v, screen_filter)
+    want = differentiate(reference.rasterize, twin, camera, v, screen_filter)
     colors = want.image.abs().max().clamp(min=1)
     for name in ("image", "alpha"):
         error = (getattr(found, name) - getattr(want, name)).abs()
@@ -105,15 +99,10 @@ def assert_agrees(
     for name, expected in want.gradients.items():
         got = found.gradients[name].double()
         if rows is not None and name != "background":
-            others = got.clone()
-            others[rows] = 0
-            assert (others == 0).all(), f"rows that are not drawn have a gradient of {name}"
+            assert (got[~rows] == 0).all(), f"rows that are not drawn have a gradient of {name}"
             got = got[rows]
-        error = (got - expected).norm().item()
-        length = expected.norm().item()
-        assert error <= gradient * length, (
-            f"gradient of {name} is off by {error / max(length, 1e-300):.1e} of its length"
-        )
+        error, length = (got - expected).norm().item(), expected.norm().item()
+        assert error <= gradient * length, f"gradient of {name} is off by {error:.1e} of {length:.1e}"
 
 
 def assert_same(a: Result, b: Result, **tolerance: Any) -> None:

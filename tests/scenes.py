@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from functools import partial
 from typing import Any
 
 import torch
@@ -37,11 +38,7 @@ def in_front(view: Camera, points: Tensor) -> Tensor:
 
 def scene(n: int, degree: int, seed: int, *, size: float = 0.08) -> dict[str, Tensor]:
     """Activated float32 parameters of n Gaussians in front of, beside and behind the camera."""
-    g = torch.Generator().manual_seed(seed)
-
-    def normal(*shape: int) -> Tensor:
-        return torch.randn(*shape, generator=g)
-
+    normal = partial(torch.randn, generator=torch.Generator().manual_seed(seed))
     return {
         "means": normal(n, 3) * torch.tensor([1.5, 1.2, 1.5]),
         "quats": normal(n, 4),
@@ -94,7 +91,7 @@ def ring(count: int, width: int, height: int, *, radius: float = 4.0) -> list[Ca
 @torch.no_grad()
 def photograph(truth: Gaussians, cameras: list[Camera]) -> tuple[View, ...]:
     """Views of ``truth`` as uint8 images."""
-    return tuple(View(c, (render(truth, c).image.clamp(0, 1) * 255).round().to(torch.uint8)) for c in cameras)
+    return tuple(View(each, render(truth, each).pixels) for each in cameras)
 
 
 def capture(n: int = 300, views: int = 8, width: int = 48, height: int = 36, seed: int = 0) -> tuple[Gaussians, Scene]:

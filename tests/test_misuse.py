@@ -96,8 +96,3 @@ def test_calls_are_refused(
     with pytest.raises(clod.ClodError, match=message):
         call()
     assert not list(tmp_path.iterdir())
-
-
-def test_a_message_is_one_printable_line() -> None:
-    message = str(clod.ClodError("a.ply: property \x1b[2J\nx\r\x00 is odd (é)"))
-    assert message == "a.ply: property  [2J x   is odd (é)" and message.isprintable()

@@ -6,7 +6,6 @@ import json
 import re
 import shlex
 import shutil
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -206,9 +205,10 @@ def test_without_photographs(clod: Any, capture: Any, tmp_path: Path, monkeypatc
     assert "without photographs, against renders of the checkpoint" in note
 
 
-def test_ci_banana(clod: Any, shared_data: Callable[[str], Path], tmp_path: Path) -> None:
-    scene = shared_data("ci_banana")
-    done = clod(scene / "pretrained.ply", "--images", scene / "images", "--iters", 5, "--out", "dial.ply", "--json")
+def test_ci_banana(clod: Any, ci_banana: Path) -> None:
+    done = clod(
+        ci_banana / "pretrained.ply", "--images", ci_banana / "images", "--iters", 5, "--out", "dial.ply", "--json"
+    )
     report = json.loads(done.out)
     assert report["base_count"] == 20_000 and report["base_rows"][0]["psnr"] == pytest.approx(25.81, abs=0.02)
     assert report["rows"][-1]["kept_share"] < 0.3
