@@ -1,7 +1,6 @@
 """The adapter: what training adds to a checkpoint, small, exact and removable.
 
-The adapter is the result. What a training run writes out is ``extract(...).apply(base)``, so applying
-the adapter to the same base gives the same Gaussians again, bit for bit.
+A training run writes ``extract(...).apply(base)``: applied to the same base it gives the same Gaussians, bit for bit.
 """
 
 from __future__ import annotations

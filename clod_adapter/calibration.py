@@ -1,8 +1,6 @@
 """The calibration table: count, quality and frame time of an adapted file at each dial value. Stored in the file.
 
-Frame times belong to the machine and the image size that the table names. Values between rows are interpolated linearly
-in log s. The table also has the positions of some training cameras, so that a dial value can be baked without the
-photographs (``bake.bake``).
+It also has the positions of some training cameras, so that a dial value can be baked without the photographs.
 """
 
 from __future__ import annotations
@@ -22,14 +20,8 @@ MOST = 1000  # rows and viewpoints, and characters of the machine's name, for wh
 
 @dataclass(frozen=True)
 class CalibrationRow:
-    """One dial value, means over the held-out views.
-
-    Attributes:
-        virtual_scale: the dial s.
-        kept: Gaussians that are not culled.
-        psnr: dB; ssim: in [-1, 1]; both against the images named by ``Calibration.against``.
-        frame_ms: median time of a frame, milliseconds.
-    """
+    """Means over the held-out views at one dial value: Gaussians that are kept, PSNR in dB and SSIM against the images
+    that ``Calibration.against`` names, and the median milliseconds of a frame."""
 
     virtual_scale: float
     kept: float
@@ -93,8 +85,7 @@ class Calibration:
         viewpoints: of some training cameras, in the file's coordinates; empty in files of earlier versions.
 
     Raises:
-        ClodError: there are no rows, dial values do not ascend from 1, a value is not finite, a count, size or time is
-            not positive, or ``machine`` or ``against`` is invalid.
+        ClodError: a field is out of range, or dial values do not ascend from 1.
     """
 
     rows: tuple[CalibrationRow, ...]

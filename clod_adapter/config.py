@@ -100,11 +100,7 @@ class ScreenFilter:
         require(isinstance(self.compensate, bool), "compensate", self.compensate, "true or false")
 
     def halved(self) -> ScreenFilter:
-        """The same filter in the px^2 of images of half the size: ``variance / 4``.
-
-        Such a render is within 44 to 46 dB of the mean of 2x2 pixels of the whole one (``cameras.View.halved``). The
-        variance that this mean adds would make images denser, as opacities are not compensated: 41 to 43 dB.
-        """
+        """The same filter in the px^2 of images of half the size, which are means of 2x2 pixels: ``variance / 4``."""
         return replace(self, variance=max(self.variance / 4, 1e-3))
 
     @property
@@ -181,8 +177,8 @@ class AdaptConfig:
     def paper(cls, **changes: Any) -> AdaptConfig:
         """The paper's form with its settings where it gives them, and the defaults elsewhere; then ``changes``.
 
-        The form itself is ``training/paper.py``. CLoD-GS section 3.3: lambda 1, sigma_d itself trained at 1e-2. Not in
-        the paper, chosen here: tau 1/255 (the limit of rasterizers), half the default learning rates.
+        CLoD-GS section 3.3: lambda 1, sigma_d itself trained at 1e-2. Chosen here: tau 1/255 (rasterizers have that),
+        half the default learning rates.
         """
         own: dict[str, Any] = {
             "form": "paper", "iters": 1600, "tau": 1 / 255, "reg_weight": 1.0, "growth": "off", "lr_sigma": 1e-2,

@@ -163,11 +163,7 @@ class Hold:
         self.took(1000 * (time.perf_counter() - start))
 
     def took(self, milliseconds: float) -> None:
-        """Takes the time of the frame that ``hook`` drew, from a GPU's timer for example, and moves the dial.
-
-        Raises:
-            ClodError: the time is below 0 or not finite.
-        """
+        """Takes the time of the frame that ``hook`` drew, from a GPU's timer for example, and moves the dial."""
         require(0 <= milliseconds < np.inf, "the time of a frame", milliseconds, "at least 0 ms and finite")
         self._frames = [*self._frames, (self.hook.virtual_scale, milliseconds)][-FRAMES:]
         dial = next_dial(self._frames, self.milliseconds, self.hook.attenuation.max_sv)

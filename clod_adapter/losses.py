@@ -43,11 +43,6 @@ def photometric_loss(image: Tensor, target: Tensor, ssim_weight: float = 0.2) ->
     """
     if image.device.type == "cpu" and image.dtype == torch.float32:
         return _FusedLoss.apply(image, target, ssim_weight)  # type: ignore[no-any-return, no-untyped-call]
-    return photometric_loss_plain(image, target, ssim_weight)
-
-
-def photometric_loss_plain(image: Tensor, target: Tensor, ssim_weight: float = 0.2) -> Tensor:
-    """``photometric_loss`` in plain torch."""
     wanted = unit(target, image)
     return (1 - ssim_weight) * (image - wanted).abs().mean() + ssim_weight * (1 - ssim_plain(image, wanted))
 

@@ -16,15 +16,19 @@ def psnr(image: Tensor, target: Tensor) -> float:
 
     ``-10 log10 mean (image - target)^2``; infinite for equal images, NaN if a pixel of the render is NaN.
     """
-    return _psnr(*_arrays(image, target))
+    from skimage.metrics import peak_signal_noise_ratio
+
+    shown, photograph = _arrays(image, target)
+    with np.errstate(divide="ignore"):  # equal images
+        return float(peak_signal_noise_ratio(photograph, shown, data_range=1))
 
 
 def psnr_ssim(image: Tensor, target: Tensor) -> tuple[float, float]:
     """``psnr``, and the mean structural similarity in [-1, 1] (Wang et al. 2004) of the same two images.
 
-    Gaussian window of 11 taps with sigma 1.5, population covariance, data range 1. Windows at the border read zeros
-    beyond it and every pixel counts, as in 3DGS and its descendants. scikit-image alone leaves out the pixels within 5
-    of the border; zeros added there are what it leaves out here. Without them SSIM differs in the second digit.
+    Gaussian window of 11 taps with sigma 1.5, population covariance, data range 1. As in 3DGS, windows at the border
+    read zeros beyond it and every pixel counts: scikit-image leaves out the pixels within 5 of the border, and zeros
+    added there are what it leaves out here.
     """
     from skimage.metrics import structural_similarity
 
@@ -34,14 +38,7 @@ def psnr_ssim(image: Tensor, target: Tensor) -> tuple[float, float]:
         np.pad(photograph, border), np.pad(shown, border), gaussian_weights=True, sigma=SIGMA,
         use_sample_covariance=False, data_range=1, channel_axis=-1,
     )  # fmt: skip
-    return _psnr(shown, photograph), float(similarity)
-
-
-def _psnr(shown: np.ndarray, photograph: np.ndarray) -> float:
-    from skimage.metrics import peak_signal_noise_ratio
-
-    with np.errstate(divide="ignore"):  # equal images
-        return float(peak_signal_noise_ratio(photograph, shown, data_range=1))
+    return psnr(image, target), float(similarity)
 
 
 def _arrays(image: Tensor, target: Tensor) -> tuple[np.ndarray, np.ndarray]:

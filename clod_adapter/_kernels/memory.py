@@ -20,10 +20,7 @@ _recent: deque[int] = deque()
 
 
 def recycled(shape: torch.Size | tuple[int, ...]) -> Tensor:
-    """An uninitialised float32 tensor in memory of an earlier, freed one.
-
-    A large one begins on a cache line, so that no vector and no record spans two.
-    """
+    """An uninitialised float32 tensor in memory of an earlier, freed one; a large one begins on a cache line."""
     size = math.prod(shape)
     if size < _SMALL:
         return torch.empty(shape, dtype=torch.float32, device="cpu")

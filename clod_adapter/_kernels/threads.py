@@ -29,7 +29,7 @@ def worker_count() -> int:
 def torch_on_one_thread() -> Iterator[None]:
     """A context in which torch's operations use one thread, and kernels as many workers as before.
 
-    For operations on about a hundred thousand numbers, which take less time than waking other threads.
+    Operations on about a hundred thousand numbers take less time than waking other threads.
     """
     global _alone, _before
     with _lock:

@@ -43,12 +43,9 @@ def extent(records, r, first, last):
 
 @kernel
 def depth_order(depths, counts, keys, order, keys_other, order_other):
-    """The packed records, near ones first; equal ones stay in order. ``keys`` and ``order`` are scratch, twice.
+    """The packed records, near ones first: a radix sort of positive floats by their bits, 11 at a time.
 
-    A radix sort of positive floats by their bits, 11 at a time.
-
-    Args:
-        depths: ``[N]`` as uint32; worker w packed the first ``counts[w]`` of its part.
+    Worker w packed the first ``counts[w]`` of its part of ``depths [N]``, as uint32; the others are scratch.
     """
     digits, n = np.zeros((3, 2048), np.int64), 0
     for worker in range(len(counts)):

@@ -4,10 +4,8 @@ For a camera with centre c, a Gaussian with centre mu and the normaliser's D (al
 
     d = |mu - c| / D
 
-A plain file and an order of rows have one distance for each Gaussian instead of one for each view. That is the
-geometric mean over the known cameras v, ``d_i = exp(mean over v of log d_iv)``. Cameras that do not see a Gaussian
-count like the others: measured against a mean over the cameras that see it, and against one weighted by the Gaussian's
-contribution there, this was as good, and it needs no frustum.
+A plain file and an order of rows have one distance for each Gaussian: the geometric mean over the known cameras v,
+``d_i = exp(mean over v of log d_iv)``. A mean over the cameras that see it was no better.
 """
 
 from __future__ import annotations

@@ -98,7 +98,8 @@ def _project(
         opacities=opacities.detach(),
     )  # fmt: skip
     ids = found[:3][-1]  # of cameras, Gaussians; 1.5.3 has batches before them, 1.6.0 also the bounds of each image
-    colors = _colors(_Rows.apply(ids, means), viewmat, eye, _Rows.apply(rows[ids], sh0, shN))
+    harmonics = torch.cat([_Rows.apply(rows[ids], x) for x in (sh0, shN)], 1)
+    colors = _colors(_Rows.apply(ids, means), viewmat, eye, harmonics)
     shown = _Rows.apply(ids, opacities) * (1 if compensations is None else compensations)
     # Rows with values that are not finite are not drawn; the kernels would draw them opaque.
     sound = (means2d.sum(1) + conics.sum(1) + colors.sum(1) + shown).detach().isfinite()
@@ -152,26 +153,19 @@ def _camera(camera: Camera, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 class _Rows(Function):
-    """Selected rows of one tensor, or of several concatenated along the second dimension; each row at most once.
+    """Selected rows of a tensor, each at most once.
 
     The backward pass replaces values that are not finite by 0: they are 0 times the projection of rows not drawn.
     """
 
     @staticmethod
-    def forward(ctx: Any, rows: Tensor, *tensors: Tensor) -> Tensor:
+    def forward(ctx: Any, rows: Tensor, values: Tensor) -> Tensor:
         ctx.save_for_backward(rows)
-        ctx.shapes = [x.shape for x in tensors]
-        if len(tensors) == 1:
-            return tensors[0].index_select(0, rows)
-        return torch.cat([x.index_select(0, rows) for x in tensors if x.shape[1]], 1)
+        ctx.shape = values.shape
+        return values.index_select(0, rows)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        (rows,), found, at = ctx.saved_tensors, [], 0
-        for shape, wanted in zip(ctx.shapes, ctx.needs_input_grad[1:], strict=True):
-            part = grad if len(ctx.shapes) == 1 else grad[:, at : at + shape[1]]
-            at += shape[1] if len(ctx.shapes) > 1 else 0
-            sound = part.nan_to_num(0.0, 0.0, 0.0) if wanted else None  # frozen harmonics take no memory here
-            found.append(None if sound is None else grad.new_zeros(shape).index_copy_(0, rows, sound))
-        return None, *found
+    def backward(ctx: Any, grad: Tensor) -> tuple[None, Tensor]:
+        (rows,) = ctx.saved_tensors
+        return None, grad.new_zeros(ctx.shape).index_copy_(0, rows, grad.nan_to_num(0.0, 0.0, 0.0))

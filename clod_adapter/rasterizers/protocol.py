@@ -49,13 +49,10 @@ class Rasterizer:
         self, gaussians: Gaussians, camera: Camera, virtual_scale: float = 1.0, *,
         background: Tensor | np.ndarray | None = None, seen_from: Camera | None = None, trained: int | None = None,
     ) -> tuple[Tensor, Tensor]:  # fmt: skip
-        """Image ``[H, W, 3]`` and alpha ``[H, W]`` at one dial value, differentiable in every tensor.
+        """Image ``[H, W, 3]`` and alpha ``[H, W]`` at one dial value, on black by default; differentiable throughout.
 
-        Args:
-            gaussians: without a ``sigma_d`` all are drawn as stored, at any dial value.
-            background: ``[3]``; black by default.
-            seen_from: the camera of the dial's distances, where it is not ``camera``.
-            trained: how many rows, the first ones, need gradients; those of others may be 0.
+        ``seen_from`` is the camera of the dial's distances, where it is another. The first ``trained`` rows alone need
+        gradients.
         """
         dialled, g = dial(gaussians, seen_from or camera, virtual_scale), gaussians
         return self.splat(

@@ -96,17 +96,6 @@ def test_non_contiguous_tensors(rasterize: Backend) -> None:
     assert_same(Result(image, alpha, dict(zip(leaves, found, strict=True))), want, **rasterize.rounding)
 
 
-@pytest.mark.parametrize("name", ["means", "shN", "background"])
-def test_gradient_of_one_input_alone(rasterize: Backend, name: str) -> None:
-    view, some = camera(), scene(200, 1, 0)
-    want = differentiate(rasterize, some, view, weights(view)).gradients
-    inputs = some | {"background": BACKGROUND.clone()}
-    inputs[name].requires_grad_()
-    total(*rasterize(**inputs, camera=view)).backward()
-    torch.testing.assert_close(inputs[name].grad, want[name], **rasterize.rounding)
-    assert all(value.grad is None for key, value in inputs.items() if key != name)
-
-
 def test_calls_from_two_threads(rasterize: Backend) -> None:
     """As when a viewer draws during training."""
     cases = [(scene(400, 1, seed), camera(*size)) for seed, size in enumerate([(61, 45), (97, 31)])]
