@@ -69,7 +69,8 @@ def baked(**given: Any) -> Callable[[Gaussians], list[Any]]:
 
 
 def hook(model: Gaussians) -> list[Any]:
-    dialled = Hook(model.sigma_d, model.attenuation, DIAL, model.growth_d)  # type: ignore[arg-type]
+    own = model.cpu()  # the hook follows the means
+    dialled = Hook(own.sigma_d, own.attenuation, DIAL, own.growth_d)  # type: ignore[arg-type]
     return list(dialled(model.means, model.opacities, CAMERAS[0].viewmat))
 
 

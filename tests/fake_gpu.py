@@ -119,12 +119,9 @@ class _Functions(TorchFunctionMode):
 
 @lru_cache(maxsize=1)
 def register() -> bool:
-    """Registers the device; must precede the first backward pass, when autograd starts a thread per device.
+    """Whether this torch has devices written in Python; registers this one, unless there is a real GPU.
 
-    Does nothing with a real GPU, since autograd would use this one as the accelerator.
-
-    Returns:
-        Whether this version of torch supports devices written in Python.
+    It must precede the first backward pass, when autograd starts a thread per device, and takes this one for its own.
     """
     if torch.cuda.is_available():
         return True
