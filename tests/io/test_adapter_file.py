@@ -50,7 +50,7 @@ def test_adapter_round_trips(tmp_path: Path, n: int, tau: float, growth: bool) -
     assert (tmp_path / "a.safetensors").read_bytes() == (tmp_path / "b.safetensors").read_bytes()
 
 
-@pytest.mark.parametrize(("count", "degree"), [(1, None), (8, 1), (9, 0), (100, None)])
+@pytest.mark.parametrize(("count", "degree"), [(8, 1), (9, None)])
 def test_trimmed_adapter_round_trips(tmp_path: Path, count: int, degree: int | None) -> None:
     kept = torch.arange(count) % 3 != 1
     saved = replace(adapter(int(kept.sum())), kept=kept, sh_degree=degree)
@@ -129,7 +129,7 @@ def test_invalid_files_are_refused(tmp_path: Path) -> None:
         load_adapter(tmp_path / "b")
 
 
-@pytest.mark.parametrize("count", [1 << 31, 1 << 62, -1])
+@pytest.mark.parametrize("count", [1 << 31, -1])
 def test_false_header_sizes_allocate_nothing(tmp_path: Path, count: int) -> None:
     path = tmp_path / "a"
     for kind in ("F32", "a\nb\x1b[2J"):

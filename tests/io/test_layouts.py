@@ -279,38 +279,16 @@ def test_written_tensors_are_those_of_gsplat(tmp_path: Path) -> None:
     assert torch.cat([splats["sh0"], splats["shN"]], dim=-2).shape == (40, 9, 3) and checkpoint["step"] == 0
 
 
-@pytest.mark.parametrize(("suffix", "degree", "atol"), [(".ply", 3, 0.0), (".spz", 3, 1e-5)])
-def test_gsply_reads_and_writes_files(tmp_path: Path, suffix: str, degree: int, atol: float) -> None:
-    gsply = pytest.importorskip("gsply", reason="gsply is not installed")
-    spz = pytest.importorskip("gsply.spz", reason="gsply has no spz")
-    path = tmp_path / f"a{suffix}"
-    write(path, model(degree))
-    found, ours = (spz.read_spz if atol else gsply.plyread)(path), load(path).gaussians
-    for name, want in (("means", ours.means), ("scales", ours.log_scales), ("sh0", ours.sh0[:, 0])):
-        np.testing.assert_allclose(getattr(found, name), want, atol=atol, rtol=0)
-    assert turned(torch.from_numpy(found.quats), ours.quats) <= 100 * atol
-    np.testing.assert_allclose(found.shN, ours.shN, atol=atol, rtol=0)
-    opacities = 1 / (1 + np.exp(-found.opacities.ravel().astype(np.float64)))
-    np.testing.assert_allclose(opacities, ours.opacities, atol=max(110 * atol, 1e-6))
-    if suffix == ".ply":
-        gsply.plywrite(tmp_path / "b.ply", found)
-        again = load(tmp_path / "b.ply").gaussians
-        assert torch.equal(again.means, ours.means) and torch.equal(again.shN, ours.shN)
-
-
-@pytest.mark.parametrize("suffix", [".ply", ".spz", ".splat"])
+@pytest.mark.parametrize("suffix", [".ply", ".spz"])
 def test_splat_transform_reads_files(tmp_path: Path, suffix: str) -> None:
     """It keeps the dial's columns of a PLY bit for bit and in order, but drops the comments with the settings."""
-    write(tmp_path / f"a{suffix}", detach(model(0)) if suffix == ".splat" else model(3))
+    write(tmp_path / f"a{suffix}", model(3))
     splat_transform(tmp_path / f"a{suffix}", tmp_path / "b.ply")
     ours, found = load(tmp_path / f"a{suffix}").gaussians, load(tmp_path / "b.ply")
     theirs, atol = found.gaussians, 0.0 if suffix == ".ply" else 1e-5
     for name in ("means", "sh0", "shN"):
         torch.testing.assert_close(getattr(theirs, name), getattr(ours, name), atol=atol, rtol=0)
-    if suffix == ".splat":
-        assert turned(theirs.quats, ours.quats) < 0.02
-    else:
-        torch.testing.assert_close(covariances(theirs), covariances(ours), atol=1e-6, rtol=1e-3)
+    torch.testing.assert_close(covariances(theirs), covariances(ours), atol=1e-6, rtol=1e-3)
     # 1.1e-3: the levels 0 and 255 are read as a quarter of a level inside.
     torch.testing.assert_close(theirs.opacities, ours.opacities, atol=1.1e-3, rtol=0)
     if suffix == ".ply":

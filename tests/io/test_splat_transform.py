@@ -109,13 +109,9 @@ def test_converted_files(tmp_path: Path, tool: Any, monkeypatch: pytest.MonkeyPa
             read(tmp_path / "a.sog")
 
 
-@pytest.mark.parametrize("name", ["a.sog", "a.spz"])
-def test_splat_transform_converts(tmp_path: Path, name: str) -> None:
-    was = gaussians(300, 1, 0)
+def test_splat_transform_converts(tmp_path: Path) -> None:
+    was, name = gaussians(300, 0, 0), "a.sog"
     save(tmp_path / "plain.ply", was)
     splat_transform("-g", "cpu", tmp_path / "plain.ply", tmp_path / name)
     means = load(tmp_path / name).gaussians.means
     assert (means[rows_by_place(was.means.numpy(), means.numpy())] - was.means).abs().max() < 1e-3
-    (tmp_path / f"b{name}").write_bytes((tmp_path / name).read_bytes()[:400])
-    with pytest.raises(ClodError, match=f"b{name}: cannot be read"):
-        load(tmp_path / f"b{name}")

@@ -130,10 +130,9 @@ def test_activated_opacities_extreme_values(tmp_path: Path) -> None:
         load(write_rows(tmp_path / "in.ply", vertex))
 
 
-@pytest.mark.parametrize("kind", ["f4", "f8"])
-def test_own_outputs_need_no_option(tmp_path: Path, kind: str) -> None:
+def test_own_outputs_need_no_option(tmp_path: Path) -> None:
     """An opaque result, as every logit may be above 0 after tuning, and its adapter, bit for bit."""
-    path = write_rows(tmp_path / "in.ply", activate(inria(40, kind=kind), "opacity", "scales"))
+    path = write_rows(tmp_path / "in.ply", activate(inria(40), "opacity", "scales"))
     base = load(path, activated="both")
     g = base.gaussians
     tuned = with_dial(g.replace(opacity_logits=g.opacity_logits.abs()), torch.rand(40), AttenuationConfig())

@@ -21,7 +21,6 @@ class Photograph(NamedTuple):
 
     pixels: Image.Image  # 8-bit RGB, at the size that is used
     K: np.ndarray  # ``[3, 3]`` the intrinsics of that camera
-    source: tuple[int, int]  # width and height in the file
     notes: list[Note]  # on the changes
 
 
@@ -33,6 +32,7 @@ OTHERS = {
 }  # by what is in their first 12 bytes, for the message  # fmt: skip
 
 LARGE = 1 << 26  # pixels; a larger JPEG is reduced while it is decoded
+REDUCED = f"have more than {LARGE / 1e6:.0f} million pixels, which takes long: reduced first"
 _TURNS = {
     5: Image.Transpose.TRANSPOSE,
     6: Image.Transpose.ROTATE_270,
@@ -42,8 +42,8 @@ _TURNS = {
 _ORIENTATION, _BITS, _PLANES = 0x0112, 258, 284  # tags of EXIF and TIFF
 
 
-def read_image(path: Path, width: int, height: int, max_width: int) -> tuple[Image.Image, tuple[int, int], list[Note]]:
-    """The file as 8-bit RGB in the shape of its camera, its size in the file, and notes on the changes.
+def read_image(path: Path, width: int, height: int, max_width: int) -> tuple[Image.Image, list[Note]]:
+    """The file as 8-bit RGB in the shape of its camera, and notes on the changes.
 
     16 bits per channel are reduced to 8, grey becomes RGB, transparency is composited over black. Colour profiles are
     not applied. The EXIF rotation is not either, as COLMAP does not, unless the photograph has its camera's shape only
@@ -69,12 +69,12 @@ def read_image(path: Path, width: int, height: int, max_width: int) -> tuple[Ima
         factor = max(1, shape[0] // (2 * max_width)) if size[0] * size[1] > LARGE else 1
         source.draft(source.mode, (size[0] // factor, size[1] // factor))  # of JPEG alone
         if source.size != size:
-            notes.append((f"have more than {LARGE / 1e6:.0f} million pixels, which takes long: reduced first", ""))
+            notes.append((REDUCED, ""))
         pixels = _rgb(path, source, notes)
     if turn is not None:
         pixels = pixels.transpose(turn)
         notes.append(("rotated by their EXIF orientation, as the cameras are", ""))
-    return pixels, size, notes
+    return pixels, notes
 
 
 def image_size(path: Path) -> tuple[int, int]:

@@ -21,12 +21,13 @@ from clod_adapter.cameras import Camera, Scene, StoredView, View, in_its_unit, s
 from clod_adapter.errors import ClodError
 from clod_adapter.io.scene.colmap import HUGE, TEST_EVERY, PosedImage, held_out, read_colmap
 from clod_adapter.io.scene.folder import find_cameras, find_photographs
-from clod_adapter.io.scene.images import Note, Photograph, read_image
+from clod_adapter.io.scene.images import REDUCED, Note, Photograph, read_image
 from clod_adapter.io.scene.transforms import in_trained_frame, read_transforms
 from clod_adapter.io.scene.undistort import cache_folder, kept, undistort
 from clod_adapter.origin import NOWHERE
 from clod_adapter.progress import Listener, Phase, tell
 
+SCALED = "scaled {} (Pillow bicubic, as in Inria's code)"
 MOST_AT_ONCE = 8  # photographs of full size in memory
 
 
@@ -120,12 +121,15 @@ def load_scene(
     if not any(image.name not in testing for image, _ in present):
         raise ClodError(f"{folder}: has no photograph to train on, as all that are there are held out; add more")
     present = [(image.relative_to(origin), path) for image, path in spread(present, most or len(present))]
-    views, sizes, done = _load(present, folder, max_width, progress, cache)
+    views, done = _load(present, folder, max_width, progress, cache)
     train = tuple(view for view in views if view.camera.name not in testing)
     test = tuple(view for view in views if view.camera.name in testing)
-    pinhole = all(image.is_pinhole for image, _ in present)
-    spared = _left_out(views, sizes, pinhole)
-    return in_its_unit(Scene(train, test, (*notes, *_summary(done, len(views))), spared))
+    left_out = list[tuple[str, str]]()
+    if all(image.is_pinhole for image, _ in present):
+        left_out.append(("undistortion", f"all {len(views)} cameras are pinholes"))
+    if not any(what in (REDUCED, SCALED) for what, _ in done):
+        left_out.append(("scaling", f"all {len(views)} photographs are used at full resolution"))
+    return in_its_unit(Scene(train, test, (*notes, *_summary(done, len(views))), tuple(left_out)))
 
 
 def load_cameras(
@@ -169,35 +173,24 @@ def _load(
     max_width: int,
     progress: Listener | None,
     keep: ImageCache | None,
-) -> tuple[list[View], list[tuple[int, int]], list[Note]]:
-    """The views of the images, their sizes in the files, and notes. Each worker holds one of full size at a time."""
-    cache = None
-    if not all(image.is_pinhole for image, _ in present):
-        cache = cache_folder(folder)
-    views, sizes, notes = list[View](), list[tuple[int, int]](), list[Note]()
+) -> tuple[list[View], list[Note]]:
+    """The views of the images, and notes. Each worker holds one photograph of full size at a time."""
+    cache = None if all(image.is_pinhole for image, _ in present) else cache_folder(folder)
+    views, notes = list[View](), list[Note]()
     workers = min(MOST_AT_ONCE, max(2, torch.get_num_threads()))
     with warnings.catch_warnings():
         # Large, but below the size at which it is refused: photographs are no attack.
         warnings.simplefilter("ignore", Image.DecompressionBombWarning)
         loads = [partial(_load_view, image, path, cache, max_width) for image, path in present]
         with closing(in_order(loads, workers)) as found:
-            for (view, size, remarks), load in zip(found, loads, strict=True):
+            for (view, remarks), load in zip(found, loads, strict=True):
                 views.append(keep.store(view, partial(_again, load)) if keep else view)
-                sizes.append(size)
                 notes += remarks
                 tell(progress, Phase.PHOTOGRAPHS, len(views), len(present))
-    return views, sizes, notes
+    return views, notes
 
 
-def _left_out(views: Sequence[View], sizes: Sequence[tuple[int, int]], pinhole: bool) -> tuple[tuple[str, str], ...]:
-    """Steps of reading that are skipped, and why: ``Scene.left_out``; ``sizes`` are those in the files."""
-    whole, used = sum(w * h for w, h in sizes), sum(view.camera.width * view.camera.height for view in views)
-    found = [("undistortion", f"all {len(views)} cameras are pinholes")] if pinhole else []
-    found += [("scaling", f"all {len(views)} photographs are used at full resolution")] if used >= whole else []
-    return tuple(found)
-
-
-def _again(load: Callable[[], tuple[View, tuple[int, int], list[Note]]]) -> torch.Tensor:
+def _again(load: Callable[[], tuple[View, list[Note]]]) -> torch.Tensor:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", Image.DecompressionBombWarning)
         return load()[0].image
@@ -213,24 +206,22 @@ def _summary(notes: Sequence[Note], total: int) -> list[str]:
     return lines
 
 
-def _load_view(
-    image: PosedImage, path: Path, cache: Path | None, max_width: int
-) -> tuple[View, tuple[int, int], list[Note]]:
+def _load_view(image: PosedImage, path: Path, cache: Path | None, max_width: int) -> tuple[View, list[Note]]:
     if cache is None or image.is_pinhole:
-        pixels, K, source, notes = _photograph(image, path, max_width)
+        pixels, K, notes = _photograph(image, path, max_width)
     else:
-        pixels, K, source, notes = kept(cache, image, path, max_width, lambda: _photograph(image, path, max_width))
+        pixels, K, notes = kept(cache, image, path, max_width, lambda: _photograph(image, path, max_width))
         lens = f"from {image.camera.model_name} into {cache}"
         notes = [*notes, ("undistorted {}, which may be deleted; the sources are untouched", lens)]
     viewmat = torch.from_numpy(image.viewmat).float()
     camera = Camera(viewmat, torch.from_numpy(K).float(), pixels.width, pixels.height, image.name)
-    return View(camera, torch.from_numpy(np.array(pixels))), source, notes
+    return View(camera, torch.from_numpy(np.array(pixels))), notes
 
 
 def _photograph(image: PosedImage, path: Path, max_width: int) -> Photograph:
     """The photograph as a pinhole camera has it, no wider than ``max_width``."""
     camera = copy(image.camera)
-    pixels, source, notes = read_image(path, camera.width, camera.height, max_width)
+    pixels, notes = read_image(path, camera.width, camera.height, max_width)
     if pixels.size != (camera.width, camera.height):
         sizes = f"{pixels.width}x{pixels.height} where the model has {camera.width}x{camera.height}"
         notes.append(("are {}: intrinsics scaled", sizes))
@@ -243,8 +234,8 @@ def _photograph(image: PosedImage, path: Path, max_width: int) -> Photograph:
         size = (max_width, max(1, int(height * max_width / width)))
         pixels = pixels.resize(size, Image.Resampling.BICUBIC)
         sizes = f"from {width}x{height} to {size[0]}x{size[1]}"
-        notes.append(("scaled {} (Pillow bicubic, as in Inria's code)", sizes))
+        notes.append((SCALED, sizes))
     K = np.array([[pixels.width / width], [pixels.height / height], [1.0]]) * camera.calibration_matrix()
     if not 0 < min(K[0, 0], K[1, 1]) <= np.abs(K).max() < HUGE:
         raise ClodError(f"{path}: its camera is not usable once undistorted; check the camera's parameters")
-    return Photograph(pixels, K, source, notes)
+    return Photograph(pixels, K, notes)

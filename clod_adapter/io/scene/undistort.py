@@ -64,10 +64,10 @@ def kept(folder: Path, image: PosedImage, path: Path, max_width: int, make: Call
     with suppress(Exception), Image.open(file, formats=["PNG"]) as source:
         about = json.loads(source.info[_KEY])
         notes = [(what, each) for what, each in about["notes"]]
-        return Photograph(source.convert("RGB"), np.array(about["K"]), tuple(about["source"]), notes)
+        return Photograph(source.convert("RGB"), np.array(about["K"]), notes)
     photograph = make()
     about = PngImagePlugin.PngInfo()
-    values = {"K": photograph.K.tolist(), "source": photograph.source, "notes": photograph.notes}
+    values = {"K": photograph.K.tolist(), "notes": photograph.notes}
     about.add_text(_KEY, json.dumps(values))
     with atomic_path(file) as temporary:
         photograph.pixels.save(temporary, pnginfo=about, compress_level=1)
