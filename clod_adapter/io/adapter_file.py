@@ -21,7 +21,6 @@ from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.file_formats import KEY
 from clod_adapter.io.settings import DAMAGE, Metadata, damaged, document, parse_document, read_metadata
-from clod_adapter.io.settings import FORMAT as MODEL
 from clod_adapter.io.tensor_file import load_tensors, read_tensor_header, write_tensors
 
 FORMAT, FORMAT_VERSION = "clod-adapter", 3
@@ -94,9 +93,7 @@ def _description(path: Path, metadata: dict[str, str]) -> tuple[dict[str, Any], 
     """The JSON document of an adapter, and the settings in it; refuses another file."""
     if KEY not in metadata:
         raise ClodError(f"{path}: is a safetensors file but not an adapter; give a file that this package wrote")
-    if f'"{MODEL}"' in metadata[KEY]:
-        raise ClodError(f"{path}: is a whole model, not an adapter; it needs no base, give it in the model's place")
-    wrong = "is not a clod-adapter file but {}; give a file that this package wrote"
+    wrong = "is not an adapter but {}; give what clod-adapt wrote beside its PLY; a 'clod-model' needs no adapter"
     about = parse_document(path, metadata[KEY], FORMAT, FORMAT_VERSION, wrong)
     for name, wanted in (("base_sha256", str), ("package_version", str), ("config", dict)):
         if not isinstance(about.get(name), wanted):

@@ -7,10 +7,9 @@ from __future__ import annotations
 
 import hashlib
 import io
-import itertools
 import re
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -62,7 +61,7 @@ class Head:
     """A PLY header."""
 
     ply: PlyData  # elements, properties and comments; every element has 0 rows
-    counts: tuple[int, ...]  # of the rows that the header states for each element, in order
+    elements: tuple[tuple[PlyElement, int], ...]  # each with the number of rows that the header states
     size: int  # bytes; the data starts there
 
 
@@ -92,7 +91,7 @@ def _parse_head(path: Path, start: bytes) -> Head:
         raise ClodError(f"{path}: the PLY header is damaged ({error}); export the file again") from error
     if len(counts) != len(ply.elements):
         raise ClodError(f"{path}: the PLY header is damaged (a row count is not a number); export the file again")
-    return Head(ply, tuple(map(int, counts)), end.end())
+    return Head(ply, tuple(zip(ply, map(int, counts), strict=True)), end.end())
 
 
 def all_comments(ply: PlyData) -> tuple[str, ...]:
@@ -144,25 +143,18 @@ def _elements(data: np.ndarray, head: Head) -> dict[str, np.ndarray]:
     plyfile reads text, and binary lists row by row: elements from the first with lists on are left out where the
     Gaussians stand before it.
     """
-    plain = list(itertools.takewhile(lambda both: not head.ply.text and not _has_lists(both[0]), _counted(head)))
-    if "vertex" not in {element.name for element, _ in plain}:
-        with warnings.catch_warnings(), np.errstate(over="ignore"):
-            warnings.simplefilter("ignore")  # of text that is beyond float32's range
-            return {each.name: _native(each.data) for each in PlyData.read(io.BytesIO(data.tobytes()))}
-    at, found = head.size, {}
-    for element, count in plain:
+    at, found = head.size, dict[str, np.ndarray]()
+    for element, count in () if head.ply.text else head.elements:
+        if any(isinstance(each, PlyListProperty) for each in element.properties):
+            break
         kind = np.dtype(element.dtype(head.ply.byte_order))
         found[element.name] = _native(data[at : at + count * kind.itemsize].view(kind))
         at += count * kind.itemsize
+    if "vertex" not in found:
+        with warnings.catch_warnings(), np.errstate(over="ignore"):
+            warnings.simplefilter("ignore")  # of text that is beyond float32's range
+            return {each.name: _native(each.data) for each in PlyData.read(io.BytesIO(data.tobytes()))}
     return found
-
-
-def _counted(head: Head) -> Iterator[tuple[PlyElement, int]]:
-    return zip(head.ply, head.counts, strict=True)
-
-
-def _has_lists(element: PlyElement) -> bool:
-    return any(isinstance(each, PlyListProperty) for each in element.properties)
 
 
 def _native(rows: np.ndarray) -> np.ndarray:
@@ -205,10 +197,10 @@ def _not_kept(header: PlyData) -> tuple[str, ...]:
 def _check_length(path: Path, head: Head, length: int) -> None:
     """Refuses a file that is too short for the least bytes that the rows of its header take."""
     least = head.size - (1 if head.ply.text else 0)  # the last line may lack its end
-    for element, count in _counted(head):
+    for element, count in head.elements:
         least += count * _least_bytes(element, head.ply.text)
     if least > length:
-        rows = ", ".join(f"{count} of {element.name}" for element, count in _counted(head))
+        rows = ", ".join(f"{count} of {element.name}" for element, count in head.elements)
         raise ClodError(
             f"{path}: is truncated, or its header is damaged: it claims {rows}, which take at least {least} bytes, "
             f"and the file has {length}; copy or export it again"

@@ -97,7 +97,8 @@ def refused_if_damaged(path: Path, what: str, fix: str) -> Iterator[None]:
     except MemoryError:  # of a file that is whole
         raise
     except Exception as error:  # SafetensorError, and whatever a crafted file provokes
-        raise ClodError(f"{path}: {what} ({error}); {fix}") from error
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise ClodError(f"{path}: {what} ({reason:.200}); {fix}") from error
 
 
 def write(path: Path, gaussians: Gaussians, history: History) -> tuple[str, ...]:

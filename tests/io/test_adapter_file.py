@@ -113,7 +113,7 @@ def test_invalid_files_are_refused(tmp_path: Path) -> None:
         refused(tmp_path / "b", about, tensors | change, message)
     refused(tmp_path / "b", about, {name: t for name, t in tensors.items() if name != "sigma_d"}, "sigma_d")
     for change, message in (
-        ({"format": None}, "not a clod-adapter file"),
+        ({"format": None}, "is not an adapter but None"),
         ({"base_sha256": 5}, "base_sha256 is 5"),
         ({"package_version": "1\n2"}, "printable"),
         ({"format_version": "x"}, "settings are damaged"),
@@ -127,20 +127,6 @@ def test_invalid_files_are_refused(tmp_path: Path) -> None:
     save_file(tensors, tmp_path / "b")
     with pytest.raises(ClodError, match="not an adapter"):
         load_adapter(tmp_path / "b")
-
-
-@pytest.mark.parametrize("count", [1 << 31, -1])
-def test_false_header_sizes_allocate_nothing(tmp_path: Path, count: int) -> None:
-    path = tmp_path / "a"
-    for kind in ("F32", "a\nb\x1b[2J"):
-        header = json.dumps({"sigma_d": {"dtype": kind, "shape": [count], "data_offsets": [0, 4 * count]}}).encode()
-        path.write_bytes(len(header).to_bytes(8, "little") + header + bytes(64))
-        with pytest.raises(ClodError, match="damaged") as caught:
-            load_adapter(path)
-        assert str(caught.value).isprintable()
-    path.write_bytes(count.to_bytes(8, "little", signed=count < 0) + bytes(64))  # a header of that length
-    with pytest.raises(ClodError, match="damaged"):
-        load_adapter(path)
 
 
 def test_config_must_be_json_and_version_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -189,7 +189,7 @@ def test_adapter_is_refused_as_model(tmp_path: Path) -> None:
     for read in (check_readable, load):
         with pytest.raises(ClodError, match=f"{path}: is an adapter, not a model; clod-adapt apply BASE.ply"):
             read(path)
-    with pytest.raises(ClodError, match="is a whole model, not an adapter"):
+    with pytest.raises(ClodError, match="is not an adapter but 'clod-model'; give"):
         load_adapter(any_file(tmp_path, ".safetensors"))
 
 

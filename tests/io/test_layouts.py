@@ -143,18 +143,14 @@ def test_header_and_record_of_an_spz(tmp_path: Path) -> None:
     assert spz(tmp_path / "b.spz") == data[: end + 12]
 
 
-@pytest.mark.parametrize(("axes", "signs"), [(4, [1, -1, -1]), (7, [-1, -1, 1]), (16, None)])
-def test_axes_of_an_spz(tmp_path: Path, axes: int, signs: list[int] | None) -> None:
+@pytest.mark.parametrize(("axes", "signs"), [(4, [1, -1, -1]), (7, [-1, -1, 1])])
+def test_axes_of_an_spz(tmp_path: Path, axes: int, signs: list[int]) -> None:
     write(tmp_path / "a.spz", model(1))
     data = spz(tmp_path / "a.spz")
     struct.pack_into("<I", data, 16 + 40 * 29 + 8, axes)
     (tmp_path / "b.spz").write_bytes(gzip.compress(data))
-    if signs:
-        ours, other = (load(tmp_path / name).gaussians.means for name in ("a.spz", "b.spz"))
-        assert torch.equal(other, ours * torch.tensor(signs))
-    else:
-        with pytest.raises(ClodError, match="axes are of kind 16"):
-            load(tmp_path / "b.spz")
+    ours, other = (load(tmp_path / name).gaussians.means for name in ("a.spz", "b.spz"))
+    assert torch.equal(other, ours * torch.tensor(signs))
 
 
 def test_spz_of_version_2(tmp_path: Path) -> None:
@@ -193,7 +189,7 @@ def test_dial_of_an_spz_in_other_units(tmp_path: Path, typical: float, known: bo
 def test_positions_of_an_spz_use_the_available_bits(tmp_path: Path) -> None:
     """A few far positions are moved closer, with the same direction, angular size and fading seen from 0."""
     path, g = tmp_path / "a.spz", model(0, 400).replace(growth_d=torch.full((400,), 0.25))
-    for factor, step in ((1e-3, 2.0**-20), (1e3, 2.0**-10), (5e5, 1.0)):
+    for factor, step in ((1e-3, 2.0**-20), (5e5, 1.0)):
         scaled = g.replace(means=g.means * factor)
         write(path, scaled)
         assert (load(path).gaussians.means - scaled.means).abs().max() <= step
@@ -213,8 +209,6 @@ def test_positions_of_an_spz_use_the_available_bits(tmp_path: Path) -> None:
     for s in (1.0, 6.0):  # the angle that it covers
         size, close = (grown(x, s) - x.means.norm(dim=1).log()[:, None] for x in (far, again))
         assert (close - size)[9].abs().max() <= 0.04
-    write(path, far.replace(growth_d=None))
-    torch.testing.assert_close(load(path).gaussians.log_scales[9], scales[9] + np.log(factor), atol=0.04, rtol=0)
 
 
 def test_row_of_a_splat(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import struct
 import tracemalloc
 import zipfile
 from collections.abc import Callable
+from copy import copy
 from pathlib import Path
 from typing import Any
 
@@ -108,13 +109,12 @@ def with_a_list(path: Path) -> None:
         (rows(*needed(1), "f_offset_0", "f_anchor_feat_0"), "Scaffold-GS"),
         (rows(without=("scale_2",)), "2DGS"),
         (rows("x", "y", "z", "nx", "ny", "nz"), "mesh or a point cloud"),
-        *((rows(without=(name,)), f"property {name} is missing") for name in ("rot_3", "y", "opacity", "f_dc_1")),
+        *((rows(without=(name,)), f"property {name} is missing") for name in ("rot_3", "y")),
         (rows(without=("f_rest_4",)), "8 f_rest"),
         (rows(*needed(1), "f_rest_9", without=("f_rest_4",)), "property f_rest_4 is missing"),
         (rows(x="i4"), "property x is not float"),
         (rows(count=0), "no usable Gaussian"),
         (filled("x", np.nan), "no usable Gaussian.*3 of 3"), (filled("rot", 0), "no usable Gaussian.*3 of 3"),
-        (lambda path: write_rows(path, rows(count=0), "ascii"), "no usable Gaussian|damaged"),
         (lambda path: write_elements(path, [PlyElement.describe(rows(), "point")]), "no vertex element.*point"),
         (with_a_list, "property bones is a list"),
         (b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty float x\nelement face 999999999\n"
@@ -145,7 +145,6 @@ LIST = "property list uchar int a\n"
           for bad in ("1.0 " * 13, "1.0 " * 15, "1.0 " * 13 + "x", "1.0 " * 13 + "\u0661")),
         (header(LITTLE, 1, f"element face 1\n{LIST}") + bytes(100), "no usable Gaussian"),  # lists before it are read
         (COMMENTED.replace(b"@", b"\x1b[2J"), "not printable ASCII"),
-        (COMMENTED.replace(b"@", "\u00e9".encode()), "not printable ASCII"),
         (b"ply\nformat ascii 1.0\n" + b"comment x\n" * 200_000 + b"end_header\n", "no end"),
         *((header(form, count) + b"0 " * 24, rf"is truncated.*claims {count} of vertex.*the file has")
           for form, count in (("ascii", 1 << 31), (LITTLE, (1 << 64) - 1), (BIG, 10))),
@@ -171,12 +170,9 @@ def test_headers_and_rows_of_a_ply(tmp_path: Path, content: bytes, message: str)
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        (b"element chunk 1", b"element block 1", "without its element chunk"),
         (b"property float max_scale_y", b"property float max_scale_q", "no max_scale_y"),
-        (b"property uint packed_scale", b"property uint packed_other", "no packed_scale"),
         (b"property uint packed_color", b"property int packed_color", "no packed_color of type u4"),
         (b"property uchar f_rest_4", b"property uchar f_rest_9", "no f_rest_4"),
-        (b"property uchar f_rest_8\n", b"", "8 f_rest_"),
         (b"property float min_r", b"property list uchar float min_r", "has a list"),
         (b"element vertex 7", b"element vertex 6", "7 harmonics for 6 Gaussians|damaged"),
         (b"element chunk 1", b"element chunk 0", "is damaged: 7 Gaussians need 1 chunks"),
@@ -195,18 +191,13 @@ def test_packed_ply(tmp_path: Path, old: bytes, new: bytes, message: str) -> Non
         (lambda g: g["accessors"][0].update(count=1 << 60), "more than the file"),
         (lambda g: g["accessors"][0].update(count=3), "of different lengths"),
         (lambda g: g["accessors"][0].update(count=-1), "is no count"),
-        (lambda g: g["accessors"][0].update(count=1.5), "is no count"),
         (lambda g: g["bufferViews"][0].update(byteStride=0), "more than the file"),
-        (lambda g: g["bufferViews"][0].update(byteOffset=1 << 70), "more than the file"),
         (lambda g: g["buffers"][0].update(uri="../secret"), "in another file"),
         (lambda g: g["accessors"][0].update(sparse={}), "sparse"),
         (lambda g: g["meshes"][0]["primitives"][0].pop("extensions"), "so it is a mesh"),
         (lambda g: g["meshes"][0]["primitives"][0]["extensions"][KHR].update(extensions={"x": {}}), "compressed"),
         (lambda g: g["nodes"][0].update(rotation=[0, 1, 0, 0]), "scaled or turned"),
-        (lambda g: g["nodes"][0].update(scale=[2, 2, 2]), "scaled or turned"),
         (lambda g: g["nodes"].append({"children": [0]}), "scaled or turned"),
-        (lambda g: g["asset"]["extras"]["clod_adapter"].update(format_version=2), "too new"),
-        (lambda g: g["asset"]["extras"]["clod_adapter"]["attenuation"].update(tau=7), "tau"),
         (lambda g: g.pop("accessors"), "damaged"),
     ],
 )
@@ -251,7 +242,6 @@ def test_spz(tmp_path: Path, content: Content, message: str) -> None:
     ("change", "message"),
     [
         ({"means": torch.ones(4, 3)}, "quats has shape"),
-        ({"means": torch.ones(())}, "has shape|no Gaussians"),
         ({"shN": torch.ones(5, 2, 3)}, "shN has 2 coefficients"),
         ({"quats": torch.ones(5, 4, dtype=torch.int32)}, "not of floating-point"),
         ({"quats": None}, "has no tensor 'quats'"),
@@ -289,7 +279,6 @@ class Call:
         ([1], "no dictionary 'splats'.*list"), ({"model": 1}, "no dictionary 'splats'.*'model'"),
         ({"splats": [1]}, "no dictionary 'splats'"), ({"splats": {}}, "no 'means'"),
         (splats(shN=None, features=torch.zeros(12, 32)), "no 'shN'; with appearance"),
-        (splats(shN=torch.zeros(12, 7, 3)), "7 coefficients"), (splats(shN=torch.zeros(12)), "shape"),
         (splats(quats=torch.zeros(11, 4)), "quats has shape .11, 4., expected .12, 4."),
         (splats(means=torch.tensor(1.0)), "shape"), (splats(means=torch.zeros(12, 3).int()), "no plain tensor"),
         (splats(means=torch.eye(3).to_sparse()), "more than tensors"), (splats(0), "it has 0 rows"),
@@ -297,7 +286,6 @@ class Call:
         (splats() | {"clod_adapter": "[" * 100_000}, "settings are damaged"),
         (splats() | {"clod_adapter": '{"format": "clod-model"}'}, "settings are damaged"),
         (splats(sigma_d=torch.ones(3)), "sigma_d has shape .3,., expected .12,."),
-        (splats(sigma_d="1"), "no plain tensor"),
         (splats(sigma_d=torch.ones(12), growth_d=torch.ones(3)), "growth_d has shape .3,."),
         # claims that would allocate, and code, which is not run
         (splats(means=torch.zeros(1).expand(1 << 40, 3)), "no plain tensor|more than tensors"),
@@ -314,11 +302,16 @@ def test_pt(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, checkpoint: Any, me
 
 
 def test_pt_that_is_another_archive(tmp_path: Path) -> None:
-    """Compressed, so that it unpacks to more than it is; and a pickle without an archive."""
+    """Compressed; many names of the same megabyte; and a pickle without an archive."""
     buffer = io.BytesIO()
     torch.save(splats(), buffer)
-    with zipfile.ZipFile(buffer) as old, zipfile.ZipFile(tmp_path / "bomb.pt", "w", zipfile.ZIP_DEFLATED) as new:
-        for name in old.namelist():
-            new.writestr(name, old.read(name) + bytes(1 << 20))
-    refused(tmp_path, "b.pt", (tmp_path / "bomb.pt").read_bytes(), "torch.save does not write")
+    for name, kind in (("packed.pt", zipfile.ZIP_DEFLATED), ("many.pt", zipfile.ZIP_STORED)):
+        with zipfile.ZipFile(buffer) as old, zipfile.ZipFile(tmp_path / name, "w", kind) as new:
+            for each in old.namelist():
+                new.writestr(each, old.read(each))
+            new.writestr("a/data/99", bytes(1 << 20))
+            for k in range(100) if name == "many.pt" else ():
+                new.filelist.append(copy(new.getinfo("a/data/99")))
+                new.filelist[-1].filename = f"a/data/{k + 100}"
+        refused(tmp_path, name, (tmp_path / name).read_bytes(), "torch.save does not write")
     refused(tmp_path, "old.pt", b"\x80\x04]\x94.", "format before 1.6")

@@ -7,7 +7,6 @@ Files of this package have more tensors among the ``splats``, ``sigma_d`` and ``
 from __future__ import annotations
 
 import io
-import pickle
 import pickletools
 import re
 import struct
@@ -21,6 +20,7 @@ import numpy as np
 from clod_adapter.errors import ClodError
 from clod_adapter.io.file_formats import KEY, read_start, read_whole, refuse
 from clod_adapter.io.settings import History, Source, damaged, metadata_text, parse_metadata, write_metadata
+from clod_adapter.io.tensor_file import refused_if_damaged
 from clod_adapter.io.values import SIGMA, arrays_of, dial_columns, float32, sha256_of
 
 if TYPE_CHECKING:
@@ -105,19 +105,10 @@ def read(path: Path) -> Source:
 def _unpickled(path: Path, data: bytes) -> Any:
     import torch
 
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            return torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
-    except pickle.UnpicklingError as error:
-        raise ClodError(
-            f"{path}: holds more than tensors, or is damaged, and was not unpickled; export the checkpoint as a PLY"
-        ) from error
-    except MemoryError:
-        raise
-    except Exception as error:  # torch lets RuntimeError, KeyError, TypeError and more through
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise ClodError(f"{path}: is damaged ({reason}); copy or export it again") from error
+    refused = refused_if_damaged(path, "is damaged, or holds more than tensors", "export the checkpoint as a PLY")
+    with refused, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
 
 
 def _values(path: Path, name: str, splats: dict[str, Any], size: int) -> np.ndarray:
