@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-import struct
-import zlib
 from pathlib import Path
 
 import numpy as np
@@ -22,15 +20,6 @@ def read(path: Path, width: int = 40, height: int = 30) -> tuple[np.ndarray, lis
     return np.asarray(image), [what for what, _ in notes]
 
 
-def deep_png(path: Path, values: np.ndarray) -> None:
-    """A PNG of 16 bits per channel in colour, which Pillow reads and does not write."""
-    rows = b"".join(b"\0" + row.astype(">u2").tobytes() for row in values)
-    parts = [(b"IHDR", struct.pack(">IIBBBBB", values.shape[1], values.shape[0], 16, 2, 0, 0, 0))]
-    parts += [(b"IDAT", zlib.compress(rows)), (b"IEND", b"")]
-    chunks = [struct.pack(">I", len(d)) + t + d + struct.pack(">I", zlib.crc32(t + d)) for t, d in parts]
-    path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(chunks))
-
-
 def test_grey_and_palette_images(tmp_path: Path) -> None:
     Image.fromarray(GREY).save(tmp_path / "grey.png")
     Image.fromarray(GREY).convert("P").save(tmp_path / "palette.png")
@@ -42,16 +31,12 @@ def test_grey_and_palette_images(tmp_path: Path) -> None:
 
 
 def test_16_bit_images(tmp_path: Path) -> None:
-    """Grey to the nearest level. Colour by Pillow: exact for former 8 bits, within a level for others."""
-    deep = np.random.default_rng(0).integers(0, 65536, (30, 40, 3), dtype=np.uint16)
-    deep[0, :3, 0] = 0, 65535, 128  # the ends, and the last value that is nearest to black
+    """Grey to the nearest level; 16-bit colour Pillow reads itself."""
+    deep = np.random.default_rng(0).integers(0, 65536, (30, 40), dtype=np.uint16)
+    deep[0, :3] = 0, 65535, 128  # the ends, and the last value that is nearest to black
     for name in ("a.png", "a.tif"):
-        Image.fromarray(deep[..., 0]).save(tmp_path / name)
-        np.testing.assert_array_equal(read(tmp_path / name)[0][..., 1], np.rint(deep[..., 0] / 257))
-    deep_png(tmp_path / "a.png", pixels(0).astype(np.uint16) * 257)
-    np.testing.assert_array_equal(read(tmp_path / "a.png")[0], pixels(0))
-    deep_png(tmp_path / "a.png", deep)
-    assert np.abs(read(tmp_path / "a.png")[0] - deep / 257).max() <= 1
+        Image.fromarray(deep).save(tmp_path / name)
+        np.testing.assert_array_equal(read(tmp_path / name)[0][..., 1], np.rint(deep / 257))
 
 
 def test_separate_planes_and_32_bits_are_refused(tmp_path: Path) -> None:
@@ -122,14 +107,6 @@ def test_what_cannot_be_decoded_is_refused(tmp_path: Path, name: str) -> None:
     if name == "a.heic":
         with pytest.raises(ClodError, match=message):
             image_size(path)
-
-
-def test_too_many_pixels_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    Image.new("1", (60, 40)).save(tmp_path / "a.png")
-    assert 2 * Image.MAX_IMAGE_PIXELS == 178_956_970
-    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 1000)
-    with pytest.raises(ClodError, match="a.png: has more than the 178 million pixels"):
-        read(tmp_path / "a.png", 60, 40)
 
 
 def test_large_jpeg_is_reduced_while_decoding(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
