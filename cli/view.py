@@ -48,7 +48,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     initial: Any = page.add_mutually_exclusive_group()
     initial.add_argument(
         "--sv", metavar="S", type=float,
-        help="initial dial value (default: 1 with photographs, else everything; then what the browser draws at 30 fps)",
+        help="initial dial value (default: 1 with photographs, else everything; then it holds 30 frames per second)",
     )  # fmt: skip
     common.add_device_preset(initial)
     page.add_argument("--port", metavar="P", type=int, default=0, help="port of the server (default: a free one)")
@@ -191,10 +191,10 @@ runs until Ctrl-C.
 """,
     usage="MODEL.ply ... [--base BASE.ply] [--images DIR] [options]",
     epilog="""\
-The page opens at s = 1 with photographs, else with everything shown, then at
-the dial value at which the browser draws 30 frames per second; --sv sets one
-that stays. It shows the Gaussians kept and the frame time, switches the
-attenuation on and off, and compares two dial values, or MODEL.ply and BASE.ply,
+The page opens at s = 1 with photographs, else with everything shown, and holds
+30 frames per second by the dial; --sv sets a value that stays. It shows the
+Gaussians kept and the frame time, switches the attenuation on and off, and
+compares two dial values, or MODEL.ply and BASE.ply,
 on the two sides of a line. Drop another file on the page to open it; --sv
 holds for it too, within its trained range. The address holds the view. With
 --images the page can jump between the scene's cameras. Several files, such as

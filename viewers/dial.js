@@ -1,5 +1,5 @@
 // The dial of an adapted file, without a viewer: what the file says, and what turns it.
-import { countAt, dialForCount, extinctionScales, growthDistance, prepare } from "./equation.js";
+import { countKept, dialForCount, growthDistance, prepare } from "./equation.js";
 import { createHold } from "./frame_rate.js";
 import { readGaussians } from "./read.js";
 
@@ -40,23 +40,20 @@ export class Dial {
     show(1);
   }
 
-  /** s >= 0, where 0 shows everything; or {keep}: the smallest s in [1, max_sv] with at most so many Gaussians from here. */
+  // The public methods are described in types.d.ts.
   set(value) {
     this.#hold = null;
-    this.#turn(typeof value === "number" ? value : dialForCount(this.#extinctions(), value.keep, this.file.settings.max_sv).dial);
+    this.#turn(typeof value === "number" ? value : dialForCount((s) => this.#count(s), value.keep, this.file.settings.max_sv).dial);
   }
 
-  /** The number of Gaussians that the dial keeps for the camera. */
   get kept() {
-    return this.s === 0 ? this.file.count : countAt(this.#extinctions(), this.s);
+    return this.#count(this.s);
   }
 
-  /** Follows the time of frames from now on, so that `fps` are drawn each second. */
   hold(fps) {
     this.#hold = createHold(fps);
   }
 
-  /** Calls `draw()`, which draws a frame, and turns the dial if a frame rate is held. */
   async frame(draw) {
     const hold = this.#hold;
     if (!hold || hold.busy) return draw();
@@ -71,9 +68,9 @@ export class Dial {
     if (s !== this.s) this.show((this.s = s));
   }
 
-  #extinctions() {
+  #count(s) {
     const { means, opacityLogits, sigma, settings } = this.file;
     this.prepared ??= prepare(opacityLogits, sigma, settings.eps);
-    return extinctionScales(means, this.prepared, this.eye(), settings.scene_distance, settings.tau);
+    return countKept(means, this.prepared, settings.tau, this.eye(), settings.scene_distance, s);
   }
 }

@@ -30,25 +30,33 @@ export function nextDial(frames, milliseconds, maxSv) {
   return Math.min(Math.max(dial * Math.exp(step), 1), maxSv);
 }
 
-/** Follows frames of an animation that is drawn after changes only, at `fps` frames per second, with dial values from `least` on. */
-export function createHold(fps, least = 1) {
+/** Follows frames of an animation that is drawn after changes only, at `fps` frames per second. */
+export function createHold(fps) {
   const milliseconds = (WORK * 1000) / fps;
   let frames = [], left = REST;
-  const excessAt = (dial) => (frames.length < NEWEST ? 0 : excess(frames, milliseconds) - EXPONENT * Math.log(dial / frames.at(-1)[0]));
   return {
-    /** log of the time of a frame at a dial value over the budget, expected from the frames so far; 0 before these. */
-    excessAt,
     /** The displayed state has changed: further frames are measured. */
     wake() { left = REST; },
     get settled() { return left <= 0; },
     /** Takes a frame's time; returns the dial value of the next frame. A value below 1 stays while it is fast enough. */
     took(dial, took, maxSv) {
       frames = [...frames, [Math.max(dial, 1), took]].slice(-FRAMES);
-      const held = Math.max(nextDial(frames, milliseconds, maxSv), least), next = held > 1 ? held : Math.min(dial, 1);
+      const held = nextDial(frames, milliseconds, maxSv), next = held > 1 ? held : Math.min(dial, 1);
       left -= next === dial ? UNCHANGED : 1;
       return next;
     },
     /** Whether frames at maxSv take longer than the budget. */
-    outOfReach: (maxSv) => frames.slice(-NEWEST).every(([dial]) => dial === maxSv) && excessAt(maxSv) > DEAD_BAND,
+    outOfReach: (maxSv) => frames.slice(-NEWEST).every(([dial]) => dial === maxSv) && excess(frames, milliseconds) > DEAD_BAND,
   };
+}
+
+// The time of a frame's work. The interval between two frames would not do: a display rounds it up to whole refreshes.
+
+/** The milliseconds of `draw()` and its work on a WebGL 2 context, or a promise of them for a WebGPU device. */
+export function timed(device, draw) {
+  const start = performance.now();
+  draw();
+  if (device.queue) return device.queue.onSubmittedWorkDone().then(() => performance.now() - start);
+  device.readPixels(0, 0, 1, 1, device.RGBA, device.UNSIGNED_BYTE, new Uint8Array(4));
+  return performance.now() - start;
 }

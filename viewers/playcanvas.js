@@ -1,10 +1,9 @@
 // The dial in PlayCanvas, and so in SuperSplat's engine: a work buffer modifier with the library's GLSL or WGSL.
 import { PIXELFORMAT_RG32F, Vec3, WORKBUFFER_UPDATE_ONCE } from "playcanvas";
 import { Dial, checked, constants, texels } from "./dial.js";
-import { constantsOf } from "./ply.js";
-import { readSettings } from "./settings.js";
+import { timed } from "./frame_rate.js";
+import { constantsOf, readSettings } from "./read.js";
 import { glsl, wgsl } from "./shaders.js";
-import { timed, timedByQueue } from "./timer.js";
 
 /** Attaches the dial of an adapted PLY to an entity with its gsplat; distances are from `camera`, an entity. */
 export function attach(app, entity, camera) {
@@ -29,7 +28,7 @@ export function attach(app, entity, camera) {
     gsplat.workBufferUpdate = WORKBUFFER_UPDATE_ONCE;
   };
   app.on("prerender", update);
-  const { gl, wgpu } = app.graphicsDevice, time = (draw) => (gl ? timed(gl, draw) : timedByQueue(wgpu, draw));
+  const { gl, wgpu } = app.graphicsDevice, time = (draw) => timed(gl ?? wgpu, draw);
   const dial = new Dial(file, { eye, show: (value) => (scale = value), time });
   const render = app.render.bind(app);
   app.render = () => void dial.frame(render);
@@ -40,8 +39,8 @@ function fileOf(data) {
   const column = (name) => data.getProp(name), [x, y, z] = ["x", "y", "z"].map(column), count = data.numSplats;
   const means = new Float32Array(3 * count);
   for (let i = 0; i < count; i++) means.set([x[i], y[i], z[i]], 3 * i);
-  const columns = (name, each) => column(name).forEach((value, i) => each(i, value));
-  const settings = readSettings(data.comments ?? [], constantsOf(data.getElement("vertex"), columns));
+  const names = data.getElement("vertex").properties.map(({ name }) => name);
+  const settings = readSettings(data.comments ?? [], constantsOf(names, (name) => column(name)[0]));
   return checked({ count, means, opacityLogits: column("opacity"), sigma: column("sigma_d"), growth: column("growth_d"), settings });
 }
 

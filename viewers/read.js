@@ -1,9 +1,18 @@
 // Reads what a browser gets: binary PLY and SPZ. Python converts every other format.
-import { readPly } from "./ply.js";
 import { readSpz } from "./spz.js";
 
-/** The Gaussians of a file's bytes: values as in Inria's PLY, with shN [count, coefficients, 3]; sigmaD and growthD, null where
- *  absent; settings of the dial, screenFilter and calibration. */
+const DEFAULTS = {
+  tau: 0.02, cut: "soft", eps: 1e-8, normalizer: "scene", quantile: 0.95, scene_distance: 1, reference_distance: 0, max_sv: 5,
+};
+const TYPES = { // the other names are those of DataView, in lower case
+  char: "Int8", uchar: "Uint8", short: "Int16", ushort: "Uint16", int: "Int32", uint: "Uint32", float: "Float32", double: "Float64",
+};
+const DEGREES = [0, 9, 24, 45, 72]; // f_rest columns by SH degree
+const NEEDED = "x y z rot_0 rot_1 rot_2 rot_3 scale_0 scale_1 scale_2 f_dc_0 f_dc_1 f_dc_2 opacity".split(" ");
+const VERTEX = /^element vertex (\d+)((?:\n(?:property|comment|obj_info) .*)*)/m;
+const CONVERTED = /^property \w+ (packed_|masks_|filter_3D|f_anchor_feat)|^element \w+ [^]*^element vertex/m; // other layouts
+
+/** The Gaussians of a file: values as in Inria's PLY, with shN [count, coefficients, 3]; sigmaD, growthD and settings or null. */
 export async function readGaussians(bytes) {
   try {
     const magic = String.fromCharCode(...bytes.subarray(0, 3));
@@ -15,3 +24,79 @@ export async function readGaussians(bytes) {
   }
   throw new Error(bytes.length ? "it is neither .ply nor .spz" : "it is empty");
 }
+
+/** The values of the clod_* columns, the same in all rows (io/ply_settings.py); `first(name)`: of the first row. */
+export const constantsOf = (names, first) =>
+  Object.fromEntries(names.filter((name) => name.startsWith("clod_")).map((name) => [name, Math.fround(first(name))]));
+
+/** The Gaussians of a binary PLY in Inria's layout, with columns of any order and type. */
+function readPly(bytes) {
+  const text = new TextDecoder("latin1").decode(bytes.subarray(0, 1 << 20)), end = /[\r\n]end_header(\r\n|\n|\r)/.exec(text);
+  if (!end) throw new Error("the PLY header has no end_header line, so the file is truncated; copy or export it again");
+  const header = text.slice(0, end.index).replaceAll(/\r\n?/g, "\n"), vertex = VERTEX.exec(header), start = end.index + end[0].length;
+  if (!vertex || !/^format binary/m.test(header) || CONVERTED.test(header)) throw new Error("it is not a binary .ply in Inria's layout");
+  const comments = [...header.matchAll(/^comment (.*)/gm)].map(([, comment]) => comment), count = Number(vertex[1]), columns = new Map();
+  let size = 0; // of a row
+  for (const [, word, name] of vertex[2].matchAll(/property (\w+) (\w+)/g)) {
+    const type = TYPES[word] ?? word[0].toUpperCase() + word.slice(1);
+    columns.set(name, { get: DataView.prototype[`get${type}`], offset: size });
+    size += Number(/\d*$/.exec(type)) / 8 || NaN; // of a list, which has no size
+  }
+  const names = [...columns.keys()], missing = NEEDED.find((name) => !columns.has(name)), last = start + count * size;
+  const degree = DEGREES.indexOf(names.filter((name) => name.startsWith("f_rest_")).length), terms = (degree + 1) ** 2 - 1;
+  if (missing || degree < 0) throw new Error(missing ? `${missing} is missing` : "its f_rest columns are of no SH degree");
+  if (!(bytes.length >= last)) throw new Error(`it is truncated: its header describes ${last} bytes and it has ${bytes.length}; copy or export it again`);
+  const isLittle = header.includes("binary_little_endian"), view = new DataView(bytes.buffer, bytes.byteOffset + start);
+  const read = (...picked) => {
+    const values = new Float32Array(picked.length * count);
+    for (const [k, { get, offset }] of picked.map((name) => columns.get(name)).entries()) {
+      for (let i = 0; i < count; i++) values[picked.length * i + k] = get.call(view, i * size + offset, isLittle);
+    }
+    return values;
+  };
+  const numbered = (stem, length) => read(...Array.from({ length }, (_, k) => `${stem}_${k}`));
+  const rest = Array.from({ length: 3 * terms }, (_, k) => `f_rest_${(k % 3) * terms + Math.floor(k / 3)}`); // stored by channel
+  const hasDial = columns.has("sigma_d"), constants = hasDial ? constantsOf(names, (name) => read(name)[0]) : {};
+  return {
+    count, degree, means: read("x", "y", "z"), quats: numbered("rot", 4), logScales: numbered("scale", 3),
+    opacityLogits: read("opacity"), sh0: numbered("f_dc", 3), shN: read(...rest), sigmaD: hasDial ? read("sigma_d") : null,
+    growthD: hasDial && columns.has("growth_d") ? read("growth_d") : null, settings: hasDial ? readSettings(comments, constants) : null,
+    screenFilter: readScreenFilter(comments, constants, hasDial), calibration: readCalibration(comments, count),
+  };
+}
+
+/** The dial's settings from the comments (io/ply_settings.py), else from `constants` (clod_* columns), else defaults. */
+export function readSettings(comments, constants = {}) {
+  const settings = { ...DEFAULTS };
+  for (const name of Object.keys(DEFAULTS)) settings[name] = constants[`clod_${name}`] ?? settings[name];
+  if (constants.clod_hard_cut) settings.cut = "hard";
+  if (constants.clod_max || constants.clod_quantile) settings.normalizer = constants.clod_max ? "max" : "quantile";
+  for (const [name, value] of entries(comments)) {
+    if (name in DEFAULTS) settings[name] = typeof DEFAULTS[name] === "number" ? Number(value) : value;
+  }
+  return settings;
+}
+
+/** The screen-space filter from comments, ours or another program's, or from columns; as in io/screen_filter.py. */
+function readScreenFilter(comments, { clod_screen_variance, clod_compensate }, hasDial) {
+  const written = entries(comments).findLast(([name]) => name === "screen_filter")?.[1];
+  if (written) {
+    const [variance, compensate] = written.split(" ");
+    return { variance: Number(variance), compensate: compensate === "True" };
+  }
+  if (clod_screen_variance || clod_compensate) return { variance: clod_screen_variance ?? 0.3, compensate: Boolean(clod_compensate) };
+  // A dial was trained with the default filter, unless the file names another.
+  const compensate = !hasDial && comments.some((comment) => /^\s*(splatrendermode:\s*mip|antialiased 1)\s*$/i.test(comment));
+  return { variance: compensate && comments.includes("Exported from Brush") ? 0.1 : 0.3, compensate };
+}
+
+/** Rows {virtual_scale, psnr}; none without a table, or if the number of Gaussians is not the table's. */
+function readCalibration(comments, total) {
+  const found = entries(comments), numbers = (wanted) => found.filter(([name]) => name === wanted).map(([, value]) => value.split(" ").map(Number));
+  if (numbers("calibrated_with")[0]?.[0] !== total) return [];
+  return numbers("calibrated").map(([virtual_scale, , psnr]) => ({ virtual_scale, psnr }));
+}
+
+/** [name, value] of each of our comments. */
+const entries = (comments) =>
+  comments.map((comment) => /^clod_adapter +(\S+)\s+(.*\S)/.exec(comment)).filter(Boolean).map(([, name, value]) => [name, value]);

@@ -3,7 +3,7 @@ import { dyno } from "@sparkjsdev/spark";
 import { DataTexture, FloatType, RGFormat } from "three";
 import { Dial, constants, readDial, texels } from "./dial.js";
 import { glsl } from "./shaders.js";
-import { timed } from "./timer.js";
+import { timed } from "./frame_rate.js";
 
 const WIDTH = 2048; // of the texture
 
@@ -26,8 +26,7 @@ export async function attach(mesh, bytes, renderer) {
     s.value = value;
     mesh.updateVersion();
   };
-  const place = () => eye.value.toArray();
-  return new Dial(file, { eye: place, show, time: (draw) => timed(renderer.getContext(), draw) });
+  return new Dial(file, { eye: () => eye.value.toArray(), show, time: (draw) => timed(renderer.getContext(), draw) });
 }
 
 function attenuated(file) {

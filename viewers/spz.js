@@ -1,18 +1,13 @@
-// Niantic's .spz, versions 2 and 3, and our vendor record, which has the dial's columns (io/formats/spz.py). Axes are not
-// converted: converters keep those of the PLY.
+// Niantic's .spz, versions 2 and 3, and our vendor record, which has the dial's columns (io/formats/spz.py).
 
 const MAGIC = 0x5053474e, HEADER = 16;
 const ANTIALIASED = 1, EXTENDED = 2, RECORD = 0x434c0001; // flags: compensated opacities, vendor records; type of our record
 const COLOR = 0.15; // colours are 0.15 f_dc + 0.5
 
-async function inflate(bytes) {
-  const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
-  return new Uint8Array(await new Response(stream).arrayBuffer());
-}
-
 /** The Gaussians of a file, as in read.js. */
 export async function readSpz(file) {
-  const bytes = await inflate(file), view = new DataView(bytes.buffer);
+  const stream = new Blob([file]).stream().pipeThrough(new DecompressionStream("gzip"));
+  const bytes = new Uint8Array(await new Response(stream).arrayBuffer()), view = new DataView(bytes.buffer);
   if (bytes.length < HEADER || view.getUint32(0, true) !== MAGIC) throw new Error("it is gzip data but not .spz");
   const version = view.getUint32(4, true), count = view.getUint32(8, true), degree = bytes[12], shSize = 3 * ((degree + 1) ** 2 - 1);
   if (version < 2 || version > 3 || degree > 3) throw new Error(`it is .spz of version ${version} and SH degree ${degree}, not of 2 or 3 and 3 at most`);
@@ -20,11 +15,7 @@ export async function readSpz(file) {
   sizes.forEach((size) => starts.push(starts.at(-1) + size * count));
   const [means, alphas, colours, scales, rotations, harmonics, end] = starts, unit = 2 ** -bytes[13];
   if (bytes.length < end) throw new Error("it is truncated; copy or export it again");
-  const read = (stride, value) => {
-    const values = new Float32Array(stride * count);
-    for (let k = 0; k < values.length; k++) values[k] = value(k);
-    return values;
-  };
+  const read = (stride, value) => new Float32Array(stride * count).map((_, k) => value(k));
   const quats = new Float32Array(4 * count);
   for (let i = 0; i < count; i++) quats.set(version === 3 ? quatOfBits(view.getUint32(rotations + 4 * i, true)) : quatOfBytes(bytes, rotations + 3 * i), 4 * i);
   const { metadata: { attenuation = null, screen_filter: screenFilter, calibration } = {}, columns } = recordOf(bytes, view, count, end);
@@ -42,21 +33,19 @@ export async function readSpz(file) {
   };
 }
 
-/** Our record: {metadata, columns}, a Float32Array for each name; both empty without a record, and columns without a dial. */
+/** Our record: {metadata, columns}, a Float32Array for each name; both empty without a record. */
 function recordOf(bytes, view, count, first) {
-  for (let at = bytes[14] & EXTENDED ? first : bytes.length; at + 8 <= bytes.length;) {
-    const type = view.getUint32(at, true), start = at + 12, last = at + 8 + view.getUint32(at + 4, true);
-    at = last;
-    if (type !== RECORD || last > bytes.length) continue;
-    const end = start + view.getUint32(start - 4, true), metadata = JSON.parse(new TextDecoder().decode(bytes.subarray(start, end)));
-    const { columns: names = ["sigma_d"] } = metadata, column = (k) => {
-      const from = end + 2 * count * k;
-      return Float32Array.from({ length: count }, (_, i) => floatOfHalf(view.getUint16(from + 2 * i, true)));
-    };
-    const dialled = last - end === 2 * count * names.length && metadata.attenuation;
-    return { metadata, columns: dialled ? Object.fromEntries(names.map((name, k) => [name, column(k)])) : {} };
+  const columns = {}, word = (at) => view.getUint32(at, true);
+  let at = bytes[14] & EXTENDED ? first : bytes.length;
+  while (at + 8 <= bytes.length && word(at) !== RECORD) at += 8 + word(at + 4);
+  if (at + 8 > bytes.length) return { columns };
+  let start = at + 12 + word(at + 8);
+  const metadata = JSON.parse(new TextDecoder().decode(bytes.subarray(at + 12, start)));
+  for (const name of metadata.attenuation ? metadata.columns ?? ["sigma_d"] : []) {
+    columns[name] = Float32Array.from({ length: count }, (_, i) => floatOfHalf(view.getUint16(start + 2 * i, true)));
+    start += 2 * count;
   }
-  return { columns: {} };
+  return { metadata, columns };
 }
 
 /** The value of a finite float16. */

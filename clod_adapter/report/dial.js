@@ -1,23 +1,20 @@
 // Flips through the pre-rendered pictures of one view. Every frame shown was rendered; nothing is blended.
 for (const dial of document.querySelectorAll(".dial")) {
-  const frames = [...dial.querySelectorAll(".frames img")];
-  const slider = dial.querySelector("input");
-  const at = (name) => frames.find((frame) => frame.dataset.name === name);
-  const values = frames.filter((frame) => !frame.dataset.name);
-  const show = (frame) => {
-    for (const other of frames) other.classList.toggle("on", other === frame);
-    dial.querySelector(".readout b").textContent = frame.dataset.title;
-    dial.querySelector(".readout span").textContent = frame.dataset.detail;
-    slider.setAttribute("aria-valuetext", `${frame.dataset.title}, ${frame.dataset.detail}`);
+  const frames = [...dial.querySelectorAll(".frames img")], slider = dial.querySelector("input");
+  const show = (shown) => {
+    const { title, detail } = shown.dataset;
+    for (const frame of frames) frame.classList.toggle("on", frame === shown);
+    dial.querySelector(".readout b").textContent = title;
+    dial.querySelector(".readout span").textContent = detail;
+    slider.setAttribute("aria-valuetext", `${title}, ${detail}`);
   };
-  const current = () => show(values[slider.value]);
+  const current = () => show(frames[slider.value]); // the compared ones come last
   slider.addEventListener("input", current);
   for (const button of dial.querySelectorAll("button")) {
-    const hold = (event) => { event.preventDefault(); button.classList.add("held"); show(at(button.dataset.shows)); };
-    const release = () => { button.classList.remove("held"); current(); };
-    button.addEventListener("pointerdown", hold);
-    button.addEventListener("keydown", (event) => [" ", "Enter"].includes(event.key) && hold(event));
-    for (const kind of ["pointerup", "pointerleave", "pointercancel", "keyup", "blur"]) button.addEventListener(kind, release);
+    const compared = frames.find(({ dataset }) => dataset.name === button.dataset.shows);
+    button.addEventListener("pointerdown", () => show(compared));
+    button.addEventListener("keydown", ({ key }) => [" ", "Enter"].includes(key) && show(compared));
+    for (const kind of ["pointerup", "pointerleave", "pointercancel", "keyup", "blur"]) button.addEventListener(kind, current);
   }
   dial.hidden = false;
   current();

@@ -118,7 +118,7 @@ def assert_the_wgsl_of_playcanvas_gives_the_equation(page: Any, about: dict[str,
     wgsl = page.evaluate("import('/viewers/playcanvas.js').then(({ modifier }) => modifier(dial.file).wgsl)")
     members = re.findall(r"uniform (\w+: \w+);", wgsl)
     body = re.sub(r"uniform \w+: \w+;", "", wgsl).replace("uniform.", "given.")
-    for s in (0.0, 1.0, 3.0, 5.0):
+    for s in (0.0, 3.0):
         source = f"""
             struct Uniforms {{ {", ".join(members)} }}
             const given = Uniforms(vec3f({eye}), vec2f({s}, 1));
@@ -142,7 +142,7 @@ def test_the_dial_is_as_exact_as_the_viewer(tabs: Any, viewer: str, suffix: str)
         page.wait_for_function("window.dial")
         page.evaluate("document.forms[0].hidden = true")
         place(page, viewer, about)
-        for frame in about["frames"]:
+        for frame in about["frames"][::2]:
             page.evaluate("(s) => dial.set(s)", frame["s"])
             assert page.evaluate("dial.kept") == pytest.approx(frame["kept"], rel=0.005 if suffix == "spz" else 0)
             error = (settled(page) - read_picture(KIT / frame["picture"])) / 255

@@ -26,7 +26,7 @@ CAMERA = scenes.camera(320, 240)
 def test_ply_and_spz_are_shown_as_python_reads_them(
     shown: Shown, gaussians: Gaussians, plain: Gaussians, artefacts: Path, tmp_path: Path
 ) -> None:
-    """With and without our comments, which other tools remove; in other types; with a row that cannot be drawn."""
+    """With and without our comments, which other tools remove; in other types."""
     settings = replace(gaussians.attenuation, reference_distance=1.5, max_sv=6.0)
     model = gaussians.replace(
         growth_d=torch.linspace(-1, 1, 400), attenuation=settings, log_scales=gaussians.log_scales - 2.0,
@@ -37,7 +37,6 @@ def test_ply_and_spz_are_shown_as_python_reads_them(
     write(tmp_path / "plain.spz", plain)
     data, rows = (tmp_path / "usual.ply").read_bytes(), PlyData.read(tmp_path / "usual.ply", mmap=False)["vertex"]
     (tmp_path / "bare.ply").write_bytes(re.sub(rb"(?m)^comment .*\n", b"", data))
-    (tmp_path / "nan.ply").write_bytes(data.replace(model.growth_d[7].numpy().tobytes(), b"\xff\xff\xff\xff"))
     doubles = rows.data.astype([(name, "f8") for name in rows.data.dtype.names])
     PlyData([PlyElement.describe(doubles, "vertex", comments=rows.comments)], byte_order=">").write(
         str(tmp_path / "doubles.ply")
@@ -47,7 +46,6 @@ def test_ply_and_spz_are_shown_as_python_reads_them(
     (tmp_path / "tag.ply").write_bytes(tagged.replace(b"format", b"comment SplatRenderMode: mip\nformat", 1))
     for path in sorted(tmp_path.glob("*.*")):
         found = clod_adapter.load(path).gaussians
-        assert len(found) == 400 - (path.name == "nan.ply")
         drop(shown, path.name, path.read_bytes())
         shown.until(f"document.title === '{path.name}'")
         shown.camera(CAMERA)
@@ -59,21 +57,18 @@ def test_ply_and_spz_are_shown_as_python_reads_them(
 
 def test_other_files_are_errors_and_the_picture_stays(shown: Shown, model: Path, tmp_path: Path) -> None:
     """What only Python reads names the command."""
-    data, cameras = model.read_bytes(), [CAMERA]
+    data = model.read_bytes()
     write(tmp_path / "a.glb", clod_adapter.load(model).gaussians)
-    write(tmp_path / "a.splat", clod_adapter.bake(clod_adapter.load(model).gaussians, 1.0, cameras=cameras))
     header, _, _ = data.partition(b"end_header")
     python = "clod-adapt view {} opens every format"
     refused = (
         ("a.glb", (tmp_path / "a.glb").read_bytes(), python),
-        ("a.splat", (tmp_path / "a.splat").read_bytes(), python),
         ("a.sog", b"PK\3\4" + bytes(60), python),
         ("ascii.ply", header.replace(b"binary_little_endian", b"ascii") + b"end_header\n1 2\n", python),
         ("mip.ply", data.replace(b"property float x\n", b"property float filter_3D\nproperty float x\n"), python),
         ("mesh.ply", b"ply\nformat binary_little_endian 1.0\nelement vertex 0\nend_header\n", "x is missing"),
         ("cut.ply", data[:-100], "truncated"),
         ("head.ply", data[:300], "truncated"),
-        ("words.ply", b"good morning", "neither .ply nor .spz"),
         ("empty.ply", b"", "empty"),
         ("cut.spz", gzip.compress(bytes(100), mtime=0)[:-9], "damaged or too large"),
         ("zeros.spz", gzip.compress(bytes(100), mtime=0), "not .spz"),

@@ -180,23 +180,6 @@ def test_the_path_and_the_turntable(show: Any, model: Path, tmp_path: Path) -> N
     shown.until(f"{playing} === null")
 
 
-def test_motion_on_a_slow_device_ends_at_full_resolution(shown: Shown) -> None:
-    shown.page.evaluate("""() => {
-        const { prototype } = WebGL2RenderingContext, { readPixels } = prototype;
-        window.undo = () => { prototype.readPixels = readPixels };
-        prototype.readPixels = () => { for (const end = performance.now() + 60; performance.now() < end;); };
-    }""")
-    canvas = "document.getElementById('canvas')"
-    for _ in range(8):
-        shown.page.mouse.wheel(0, 10)
-        shown.page.wait_for_timeout(60)
-    shown.page.mouse.move(200, 60)
-    shown.page.mouse.wheel(0, 10)
-    shown.until(f"{canvas}.width < {canvas}.clientWidth")
-    shown.until(f"{canvas}.width === {canvas}.clientWidth")
-    shown.page.evaluate("window.undo()")
-
-
 def test_pictures_and_videos_are_saved(shown: Shown) -> None:
     shown.run("clod.setDial(2)")
     picture = shown.picture()

@@ -1,11 +1,5 @@
 // What is drawn of a Gaussian's opacity (CLoD-GS, Eq. 2, and its cut); 0 where it is left out.
-//   opacity   activated, in [0, 1]
-//   sigma     the file's sigma_d
-//   distance  |mean - camera| / D, at least 0
-//   scale     the dial s, at least 0
-//   eps, tau  of the file's header
-//   soft      the header's cut: true where it fades to 0, false for the paper's hard one
-// golden.json beside this file has values to test it with.
+// Arguments as in attenuation.glsl.
 fn clodOpacity(opacity: f32, sigma: f32, distance: f32, scale: f32, eps: f32, tau: f32, soft: bool) -> f32 {
   let unit = max(max(sigma, 0.0), sqrt(eps));
   let far = distance * scale;
@@ -24,10 +18,6 @@ fn clodOpacity(opacity: f32, sigma: f32, distance: f32, scale: f32, eps: f32, ta
 }
 
 // The factor of the three scales of a Gaussian: those that the dial keeps grow with distance and dial; 1 for growth 0.
-//   growth    the file's growth_d
-//   distance  as above
-//   scale     the dial s, as above
-//   reach     reference_distance / D of the header; 1 where reference_distance is 0, or for another normalizer
 fn clodScale(growth: f32, distance: f32, scale: f32, reach: f32) -> f32 {
   let magnification = clamp(distance * scale / reach, 1.0, 3e38);
   return exp(clamp(growth * log(magnification), -20.0, 20.0));

@@ -1,36 +1,28 @@
 // A splat on the GPU, and the worker that culls and sorts its Gaussians.
-import { WIDTH, dataTexture, heightOf, maxTexels } from "./gpu.js";
-import { half } from "./half.js";
+import { dataTexture, maxTexels } from "./gpu.js";
 import { SH_TEXELS } from "./shaders.js";
-import { upOfGaussians } from "./up.js";
-import { add } from "./vector.js";
-import workerSource from "worker:./worker.js";
+import { add, cross, dot, scaled, unit } from "./vector.js";
 
 const SH_C0 = 0.28209479177387814;
-const RECORD_TEXELS = 4;
 const VISIBLE = 3.4; // standard deviations to alpha 1/255
+const Y_DOWN = [0, -1, 0]; // COLMAP's y axis points down
+const FLAT = Math.log(2); // a flat Gaussian's least scale is at most half the next one
+const BESIDE = Math.cos(Math.PI / 5), SURE = 0.3; // share of the flat ones beside the axis, by chance 0.19
 
-/** `metadata`: name, attenuation or null, screen_filter, no_dial, max_sv, calibration. */
-export function createModel(gl, gaussians, metadata) {
-  const { count, degree, means, opacityLogits } = gaussians, { records, sh } = upload(gl, gaussians);
-  const attenuation = gaussians.sigmaD ? metadata.attenuation : null, extent = extentOf(gaussians), worker = startWorker();
-  const { logScales: s, sigmaD = null, growthD = null } = gaussians, blur = metadata.screen_filter.variance;
+/** `read`: of a file, as in viewers/read.js, with its name. */
+export function createModel(gl, read) {
+  const { name, count, degree, means, opacityLogits, logScales: s, sigmaD, growthD, settings, screenFilter, calibration } = read;
+  const { records, sh } = upload(gl, read), extent = extentOf(read), worker = startWorker();
   const scales = Float32Array.from({ length: count }, (_, i) => Math.exp(Math.max(s[3 * i], s[3 * i + 1], s[3 * i + 2])));
+  const blur = screenFilter.variance, attenuation = settings, maxDial = settings?.max_sv ?? 1;
   worker.request("model", { means, opacityLogits, scales, sigmaD, growthD, attenuation, blur }, [means.buffer, scales.buffer]);
-  const spare = []; // buffers for orders, which are transferred to the worker and back
-
   return {
-    ...metadata, attenuation, count, degree, records, sh, extent,
-    /** Requests the rows to draw, and calls `use({rows, drawn, kept, distance})`; `rows` is valid until it returns. */
-    async order(state, use) {
-      const buffer = spare.pop() ?? new ArrayBuffer(4 * WIDTH * heightOf(count));
-      const result = await worker.request("order", { ...state, rows: buffer }, [buffer]);
-      use({ ...result, rows: new Uint32Array(result.rows) });
-      spare.push(result.rows);
-    },
-    dialFor: (view, target) => worker.request("dialFor", { view, target, maxSv: metadata.max_sv }),
+    name, attenuation, maxDial, screenFilter, calibration, count, degree, records, sh, extent,
+    /** {rows, drawn, kept, distance}: the rows to draw, farthest first. */
+    order: (shown) => worker.request("order", shown),
+    dialFor: (view, target) => worker.request("dialFor", { view, target, maxDial }),
     destroy() {
-      worker.stop();
+      worker.terminate();
       gl.deleteTexture(records);
       gl.deleteTexture(sh);
     },
@@ -39,31 +31,23 @@ export function createModel(gl, gaussians, metadata) {
 
 /** A separate function, so that no closure of the model keeps the values in memory after the upload. */
 function upload(gl, gaussians) {
-  const texels = SH_TEXELS[gaussians.degree], most = Math.floor(maxTexels(gl) / Math.max(texels, RECORD_TEXELS));
-  const holds = (what) => new Error(`this graphics device ${what} Gaussians; export it at a larger dial value (--sv)`), number = gaussians.count.toLocaleString("en");
-  if (gaussians.count > most) throw holds(`holds at most ${most.toLocaleString("en")} of the ${number}`);
+  const texels = SH_TEXELS[gaussians.degree], most = Math.floor(maxTexels(gl) / Math.max(texels, 4));
+  const failed = (what) => new Error(`this graphics device ${what} Gaussians; export it at a larger dial value (--sv)`);
+  if (gaussians.count > most) throw failed(`holds at most ${most} of the ${gaussians.count}`);
   if (gl.isContextLost()) throw new Error("the graphics device was lost; reload the page");
-  const textures = {
-    records: dataTexture(gl, RECORD_TEXELS * gaussians.count, Float32Array, (target) => fillRecords(target, gaussians)),
-    sh: dataTexture(gl, texels * gaussians.count, Uint32Array, (target) => fillSh(target, gaussians, texels)),
-  };
-  if (gl.getError() !== gl.OUT_OF_MEMORY) return textures;
-  for (const each of Object.values(textures)) gl.deleteTexture(each);
-  throw holds(`has too little memory for ${number}`);
+  const records = dataTexture(gl, 4 * gaussians.count, Float32Array, (target) => fillRecords(target, gaussians));
+  const sh = dataTexture(gl, texels * gaussians.count, Uint32Array, (target) => fillSh(target, gaussians, texels));
+  if (gl.getError() !== gl.OUT_OF_MEMORY) return { records, sh };
+  for (const each of [records, sh]) gl.deleteTexture(each);
+  throw failed(`has too little memory for ${gaussians.count}`);
 }
 
 function fillRecords(target, { count, means, quats, logScales, opacityLogits, sh0, sigmaD, growthD }) {
-  for (let i = 0, at = 0; i < count; i++, at += 16) {
-    for (let k = 0; k < 3; k++) {
-      target[at + k] = means[3 * i + k];
-      target[at + 8 + k] = Math.exp(logScales[3 * i + k]);
-      target[at + 12 + k] = 0.5 + SH_C0 * sh0[3 * i + k];
-    }
-    target[at + 3] = 1 / (1 + Math.exp(-opacityLogits[i]));
-    const norm = Math.hypot(quats[4 * i], quats[4 * i + 1], quats[4 * i + 2], quats[4 * i + 3]);
-    for (let k = 0; k < 4; k++) target[at + 4 + k] = quats[4 * i + k] / norm;
-    target[at + 11] = sigmaD ? sigmaD[i] : 0;
-    target[at + 15] = growthD ? growthD[i] : 0;
+  for (let i = 0; i < count; i++) {
+    const [a, b, c, d] = quats.subarray(4 * i, 4 * i + 4), norm = Math.hypot(a, b, c, d), at = 3 * i;
+    const opacity = 1 / (1 + Math.exp(-opacityLogits[i])), color = (k) => 0.5 + SH_C0 * sh0[at + k], scale = (k) => Math.exp(logScales[at + k]);
+    target.set([means[at], means[at + 1], means[at + 2], opacity, a / norm, b / norm, c / norm, d / norm], 16 * i);
+    target.set([scale(0), scale(1), scale(2), sigmaD?.[i] ?? 0, color(0), color(1), color(2), growthD?.[i] ?? 0], 16 * i + 8);
   }
 }
 
@@ -75,44 +59,62 @@ function fillSh(target, { count, degree, shN }, texels) {
   }
 }
 
-/** {centre, radius, up}: a ball that contains a sample of the Gaussians, and their up axis. Where more than 2 % of them are beyond twice the radius
- *  that contains 80 %, a background, it is the ball of these about the median. */
-function extentOf(gaussians) {
-  const { means, logScales } = gaussians;
-  const step = Math.max(Math.floor(means.length / 3 / 20000), 1), points = [], sizes = [];
-  for (let at = 0; at < means.length; at += 3 * step) {
-    points.push([means[at], means[at + 1], means[at + 2]]);
-    sizes.push(VISIBLE * Math.exp(Math.max(logScales[at], logScales[at + 1], logScales[at + 2])));
-  }
-  const reachesFrom = (centre) => Float64Array.from(points, (point, i) => Math.hypot(...add(point, centre, -1)) + sizes[i]);
-  const axes = [0, 1, 2].map((k) => Float64Array.from(points, (point) => point[k]).sort());
-  const median = axes.map((values) => values[values.length >> 1]), reaches = reachesFrom(median), sorted = reaches.slice().sort();
-  const bulk = sorted[Math.floor(0.8 * sorted.length)], bounded = sorted[Math.floor(0.98 * sorted.length)] < 2 * bulk;
-  const rows = [...points.keys()].filter((i) => reaches[i] <= (bounded ? 2 : 1) * bulk), near = rows.map((i) => points[i]);
-  const up = upOfGaussians(gaussians, rows.map((i) => i * step));
-  if (!bounded) return { centre: median, radius: Math.min(Math.max(bulk, 1e-6), 1e30), up };
-  const bounds = [0, 1, 2].map((k) => near.reduce(([low, high], point) => [Math.min(low, point[k]), Math.max(high, point[k])], [Infinity, -Infinity]));
-  const centre = bounds.map(([low, high]) => (low + high) / 2), radius = reachesFrom(centre).filter((_, i) => reaches[i] <= 2 * bulk).sort().at(-1);
-  return { centre, radius: Math.min(Math.max(radius, 1e-6), 1e30), up };
+const float = new Float32Array(1), bits = new Uint32Array(float.buffer);
+
+/** Bits of the nearest float16; values beyond its range become the largest finite one. */
+function half(value) {
+  float[0] = value;
+  const x = bits[0], sign = (x >>> 16) & 0x8000, magnitude = x & 0x7fffffff;
+  if (magnitude >= 0x477ff000) return sign | 0x7bff;
+  if (magnitude < 0x38800000) return sign | Math.round(Math.abs(value) * 2 ** 24); // subnormal
+  return sign | ((magnitude - 0x38000000 + 0x0fff + ((magnitude >>> 13) & 1)) >>> 13);
 }
 
+/** A ball about the median with 98 % of a sample or, where that has twice the radius of 80 % by a background, with these. */
+function extentOf(gaussians) {
+  const { means, logScales } = gaussians, step = 3 * Math.max(Math.floor(means.length / 60000), 1), all = [];
+  for (let at = 0; at < means.length; at += step) {
+    const size = VISIBLE * Math.exp(Math.max(...logScales.subarray(at, at + 3)));
+    all.push({ row: at / 3, point: means.subarray(at, at + 3), size });
+  }
+  const centre = [0, 1, 2].map((k) => Float32Array.from(all, ({ point }) => point[k]).sort()[all.length >> 1]);
+  for (const each of all) each.reach = Math.hypot(...add(each.point, centre, -1)) + each.size;
+  const reaches = Float64Array.from(all, ({ reach }) => reach).sort(), share = (part) => reaches[Math.floor(part * all.length)];
+  const radius = share(0.98) < 2 * share(0.8) ? share(0.98) : share(0.8);
+  const near = all.filter(({ reach }) => reach <= radius).map(({ row }) => row);
+  return { centre, radius: Math.min(Math.max(radius, 1e-6), 1e30), up: upOf(gaussians, near) };
+}
+
+/** The direction that flat Gaussians face, a ground or a table: from minus y, up in most files, to the mean within 36 degrees. */
+function upOf({ quats, logScales, opacityLogits }, rows) {
+  const flat = rows.map((i) => {
+    const [least, next] = logScales.subarray(3 * i, 3 * i + 3).toSorted(), thin = logScales.subarray(3 * i, 3 * i + 3).indexOf(least);
+    const axis = [0, 1, 2].map((k) => Number(k === thin)), [w, ...v] = quats.subarray(4 * i, 4 * i + 4), twice = scaled(cross(v, axis), 2);
+    const normal = unit(add(add(scaled(axis, w * w + dot(v, v)), twice, w), cross(v, twice))); // the axis rotated
+    return { normal, weight: least + FLAT < next ? 1 / (1 + Math.exp(-opacityLogits[i])) : 0 };
+  });
+  const weigh = (normals) => normals.reduce((total, { weight }) => total + weight, 0);
+  let up = Y_DOWN, near = flat;
+  for (let step = 0; step < 10 && weigh(near); step++) {
+    near = flat.filter(({ normal }) => Math.abs(dot(normal, up)) > BESIDE);
+    up = unit(near.reduce((sum, { normal, weight }) => add(sum, normal, weight * Math.sign(dot(normal, up))), [0, 0, 0]));
+  }
+  return weigh(near) > SURE * weigh(flat) ? up : Y_DOWN;
+}
+
+/** A worker of WORKER, the text of worker.js, with `request(job, message, transferred)`, whose answers have the order of the requests. */
 function startWorker() {
-  const url = URL.createObjectURL(new Blob([workerSource], { type: "text/javascript" }));
-  const worker = new Worker(url), waiting = new Map();
-  let next = 0;
-  worker.onmessage = ({ data }) => {
-    const { resolve, reject } = waiting.get(data.id);
-    waiting.delete(data.id);
+  const url = URL.createObjectURL(new Blob([WORKER], { type: "text/javascript" }));
+  const worker = new Worker(url), waiting = [];
+  worker.onmessage = ({ data: { error, result } }) => {
+    const { resolve, reject } = waiting.shift();
     URL.revokeObjectURL(url);
-    if (data.error) reject(new Error(data.error));
-    else resolve(data);
+    if (error) reject(new Error(error));
+    else resolve(result);
   };
-  return {
-    request: (job, message, transferred = []) =>
-      new Promise((resolve, reject) => {
-        waiting.set(++next, { resolve, reject });
-        worker.postMessage({ id: next, job, ...message }, transferred);
-      }),
-    stop: () => worker.terminate(),
+  worker.request = (job, message, transferred = []) => {
+    worker.postMessage([job, message], transferred);
+    return new Promise((resolve, reject) => { waiting.push({ resolve, reject }); });
   };
+  return worker;
 }

@@ -6,12 +6,6 @@ import { WIDTH } from "./gpu.js";
 /** By SH degree: texels per Gaussian, of 8 float16 values each, for the coefficients of degrees 1 and up. */
 export const SH_TEXELS = [0, 2, 3, 6, 9];
 
-const BASIS = `
-vec3 shColor(int row, vec3 d) {
-  float x = d.x, y = d.y, z = d.z, xx = x * x, yy = y * y, zz = z * z, xy = x * y, yz = y * z, xz = x * z;
-  float zz4 = 4.0 * zz - xx - yy, zz7m1 = 7.0 * zz - 1.0, zz7m3 = 7.0 * zz - 3.0;
-  vec3 sum = vec3(0.0);`;
-
 // The harmonics of degrees 1 and up, in the order and signs of 3DGS, as in clod_adapter/_kernels/sh.py.
 const TERMS = [
   "-0.4886025119029199 * y", "0.4886025119029199 * z", "-0.4886025119029199 * x",
@@ -36,7 +30,13 @@ function shSource(degree) {
   for (let k = 0; k < count; k++) {
     lines.push(`sum += (${TERMS[k]}) * vec3(${[0, 1, 2].map((c) => value(3 * k + c)).join(", ")});`);
   }
-  return `${BASIS}\n${lines.join("\n")}\nreturn sum;\n}`;
+  return `vec3 shColor(int row, vec3 d) {
+  float x = d.x, y = d.y, z = d.z, xx = x * x, yy = y * y, zz = z * z, xy = x * y, yz = y * z, xz = x * z;
+  float zz4 = 4.0 * zz - xx - yy, zz7m1 = 7.0 * zz - 1.0, zz7m3 = 7.0 * zz - 3.0;
+  vec3 sum = vec3(0.0);
+  ${lines.join("\n")}
+  return sum;
+}`;
 }
 
 /** Projects the Gaussians, one per pixel, in drawing order; a Gaussian that is not drawn has zeros. */
@@ -61,12 +61,7 @@ layout(location = 0) out uvec4 footprint; layout(location = 1) out uvec4 conic; 
 ivec2 texelAt(int index) { return ivec2(index % ${WIDTH}, index / ${WIDTH}); }
 ${attenuation}
 ${degree ? shSource(degree) : ""}
-mat3 rotation(vec4 q) {
-  float w = q.x, x = q.y, y = q.z, z = q.w;
-  return mat3(1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y),
-    2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + w * x),
-    2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y));
-}
+vec3 unrotated(vec4 q, vec3 v) { return v + 2.0 * cross(q.yzw, cross(q.yzw, v) - q.x * v); }
 void main() {
   footprint = conic = color = uvec4(0);
   ivec2 pixel = ivec2(gl_FragCoord.xy);
@@ -77,19 +72,16 @@ void main() {
   if (!(point.z >= size.z)) return;
   float opacity = mean.w, distance = length(ray) / distance_unit;
   if (attenuated) opacity = clodOpacity(opacity, shape.w, distance, dial, eps, tau, soft);
-  if (opacity < 1.0 / 255.0) return;
   vec4 tint = texelFetch(records, texelAt(record + 3), 0);
   if (attenuated) shape.xyz *= clodScale(tint.a, distance, dial, reach);
 
   vec2 margin = 0.15 * size.xy / pinhole.xy;
   vec2 slope = clamp(point.xy / point.z, -pinhole.zw / pinhole.xy - margin, (size.xy - pinhole.zw) / pinhole.xy + margin);
-  vec3 right = vec3(view[0].x, view[1].x, view[2].x), down = vec3(view[0].y, view[1].y, view[2].y);
-  vec3 forward = vec3(view[0].z, view[1].z, view[2].z);
-  mat3 axes = rotation(texelFetch(records, texelAt(record + 1), 0));
-  vec3 p = pinhole.x / point.z * ((right - slope.x * forward) * axes) * shape.xyz;
-  vec3 q = pinhole.y / point.z * ((down - slope.y * forward) * axes) * shape.xyz;
-  float xx = dot(p, p), yy = dot(q, q), xy = dot(p, q);
-  vec3 c = cross(p, q);
+  vec4 q = texelFetch(records, texelAt(record + 1), 0);
+  vec3 u = pinhole.x / point.z * unrotated(q, vec3(1.0, 0.0, -slope.x) * view) * shape.xyz;   // of rows of the view
+  vec3 v = pinhole.y / point.z * unrotated(q, vec3(0.0, 1.0, -slope.y) * view) * shape.xyz;
+  float xx = dot(u, u), yy = dot(v, v), xy = dot(u, v);
+  vec3 c = cross(u, v);
   float area = dot(c, c), det = area + blur * (xx + yy) + blur * blur;   // sums of squares: accurate for needles too
   xx += blur; yy += blur;
   if (!(det < 3e38)) return;
@@ -114,15 +106,16 @@ void main() {
 export const splatVertex = `#version 300 es
 precision highp float; precision highp int; precision highp usampler2D;
 uniform usampler2D footprint, conic, color;
-uniform vec3 size;
+uniform vec2 size;
 flat out vec2 centre; flat out vec3 form; flat out vec4 rgba;
 void main() {
-  ivec2 texel = ivec2(gl_VertexID >> 2, gl_InstanceID);
+  int row = gl_VertexID / 6, k = gl_VertexID % 6;   // two triangles, of the corners 0 1 2 and 3 2 1
+  ivec2 texel = ivec2(row % ${WIDTH}, row / ${WIDTH}), at = ivec2(k < 3 ? k : 6 - k);
   vec4 a = uintBitsToFloat(texelFetch(footprint, texel, 0)), b = uintBitsToFloat(texelFetch(conic, texel, 0));
   gl_Position = vec4(2.0, 2.0, 0.0, 1.0);
   if (!(b.w > 0.0)) return;
   rgba = uintBitsToFloat(texelFetch(color, texel, 0));
-  vec2 corner = vec2(gl_VertexID & 1, (gl_VertexID >> 1) & 1) * 2.0 - 1.0, minor = normalize(a.zw) * b.w;
+  vec2 corner = vec2(at & ivec2(1, 2)) * vec2(2.0, 1.0) - 1.0, minor = normalize(a.zw) * b.w;
   vec2 position = (a.xy + corner.x * a.zw + corner.y * vec2(-minor.y, minor.x)) / size.xy;
   gl_Position = vec4(position.x * 2.0 - 1.0, 1.0 - position.y * 2.0, 0.0, 1.0);
   centre = vec2(a.x, size.y - a.y);

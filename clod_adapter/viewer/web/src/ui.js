@@ -1,193 +1,183 @@
-// The panel: its texts and its controls. All controls are native, so that keys and screen readers work.
+// The panel. In page.html, data-key names the key that clicks a control, and data-needs what it is disabled without.
+import { openFile, showFile } from "./files.js";
+import { config, elements, state, viewer } from "./page.js";
+import * as stage from "./stage.js";
+import * as views from "./views.js";
 
 const TICKS = 1000, BELOW = 100; // of a slider: to s = 1 in equal steps of s, which begins at 0, and then of log s
 const integer = new Intl.NumberFormat("en").format;
 
-export const elementsOf = (document) =>
-  new Proxy({}, { get: (_, name) => document.getElementById(name.replace(/[A-Z]/g, (c) => `-${c.toLowerCase()}`)) });
+const maxDial = () => stage.model?.maxDial ?? 1;
+const named = () => (!state.equation ? "off" : state.dial === 0 ? "all" : `s = ${state.dial.toFixed(2)}`);
 
-const ticksBelow = (maxDial) => (maxDial > 1 ? BELOW : TICKS);
-function toDial(tick, maxDial) {
-  const below = ticksBelow(maxDial);
-  return tick <= below ? tick / below : maxDial ** ((tick - below) / (TICKS - below));
-}
-function toTick(dial, maxDial) {
-  const below = ticksBelow(maxDial);
-  return Math.round(dial <= 1 ? dial * below : below + ((TICKS - below) * Math.log(dial)) / Math.log(maxDial));
-}
+const toDial = (tick) => (tick <= BELOW ? tick / BELOW : maxDial() ** ((tick - BELOW) / (TICKS - BELOW)));
+const toTick = (dial) => (dial <= 1 ? dial * BELOW : BELOW + ((TICKS - BELOW) * Math.log(dial)) / Math.log(maxDial()));
 
 /** PSNR at a dial value, interpolated linearly in log s between the calibration's rows; null outside their range. */
 function psnrAt(rows, dial) {
   const next = rows.findIndex((row) => row.virtual_scale >= dial), [a, b] = [rows[next - 1], rows[next]];
   if (b?.virtual_scale === dial) return b.psnr;
-  return a && b ? a.psnr + (Math.log(dial / a.virtual_scale) / Math.log(b.virtual_scale / a.virtual_scale)) * (b.psnr - a.psnr) : null;
+  if (!a || !b) return null;
+  return a.psnr + (Math.log(dial / a.virtual_scale) / Math.log(b.virtual_scale / a.virtual_scale)) * (b.psnr - a.psnr);
 }
 
-/** `viewer`: stage, motion, cameras, up, recording; `actions`: the functions that the controls call (main.js). */
-export function createUi(elements, viewer, actions, canRecord) {
-  const { stage } = viewer, { state } = stage, { wipe, wipeLeft, wipeRight, message } = elements;
-  const { dial, hold, rate, equation, compare, target, files, camera, up, fold } = elements;
-  const maxDial = () => stage.model?.max_sv ?? 1;
-  const named = () => (!state.equation ? "off" : state.dial === 0 ? "all" : `s = ${state.dial.toFixed(2)}`);
+/** Shows the present state on the controls. */
+export function update() {
+  const { model, base } = stage, hasDial = Boolean(model?.attenuation);
+  const has = { model: Boolean(model), dial: hasDial, comparison: hasDial || Boolean(base) };
+  for (const each of document.querySelectorAll("[data-needs]")) each.disabled = !has[each.dataset.needs];
+  elements.compare.checked = state.wipe !== null;
+  elements.compareWith.textContent = base ? "Compare with the base" : "Compare without the dial";
+  const command = `clod-adapt ${model?.name} --images SCENE`;
+  elements.noDial.textContent = !model || hasDial ? "" : `${model.name} has no sigma_d, so it has no dial; add one: ${command}`;
+  elements.dial.value = toTick(hasDial ? state.dial : 1);
+  elements.dialValue.textContent = hasDial ? named() : "";
+  elements.dial.setAttribute("aria-valuetext", elements.dialValue.textContent || "none");
+  elements.equation.checked = state.equation && hasDial;
+  elements.hold.checked = stage.hold !== null;
+  elements.move.textContent = viewer.flying ? "Fly" : "Orbit";
+  elements.canvas.classList.toggle("flying", viewer.flying);
+  elements.up.value = viewer.up;
+  elements.up.options[0].textContent = viewer.photographs.length ? "as in the photographs" : "found from the scene";
+  elements.cameraRow.hidden = !viewer.cameras.length;
+  elements.play.classList.toggle("playing", views.isRunning());
+  elements.turn.textContent = views.isRunning() ? "Stop" : "Turntable";
+  elements.record.textContent = viewer.recording ? "Stop recording" : "Record video";
+  for (const name of ["wipe", "wipeLeft", "wipeRight"]) elements[name].hidden = state.wipe === null;
+  elements.wipe.value = TICKS * state.wipe;
+}
 
-  /** Shows the present state on the controls. */
-  function update() {
-    const { model } = stage, hasDial = Boolean(model?.attenuation);
-    for (const name of ["dial", "rate", "hold", "target", "equation"]) elements[name].disabled = !hasDial;
-    for (const name of ["reset", "move", "menuOpen"]) elements[name].disabled = !model;
-    elements.compare.disabled = !hasDial && !stage.base;
-    elements.compare.checked = state.wipe !== null;
-    elements.compareWith.textContent = stage.base ? "Compare with the base" : "Compare without the dial";
-    elements.target.placeholder = hasDial ? `e.g. ${integer(Math.ceil(model.count / 2))}` : "";
-    elements.noDial.textContent = model?.no_dial ?? "";
-    dial.value = toTick(hasDial ? state.dial : 1, maxDial());
-    elements.dialValue.textContent = hasDial ? named() : "";
-    dial.setAttribute("aria-valuetext", elements.dialValue.textContent || "none");
-    elements.equation.checked = state.equation && hasDial;
-    elements.hold.checked = stage.holds;
-    elements.move.textContent = actions.isFlying() ? "Fly" : "Orbit";
-    elements.canvas.classList.toggle("flying", actions.isFlying());
-    elements.up.value = viewer.up;
-    elements.up.options[0].textContent = viewer.cameras.some(({ placed }) => !placed) ? "as in the photographs" : "found from the scene";
-    elements.play.classList.toggle("playing", viewer.motion.running);
-    elements.turn.textContent = viewer.motion.running ? "Stop" : "Turntable";
-    elements.record.textContent = viewer.recording ? "Stop recording" : "Record video";
-    wipe.hidden = wipeLeft.hidden = wipeRight.hidden = state.wipe === null;
-    wipe.style.left = `${100 * state.wipe}%`;
-    wipe.setAttribute("aria-valuenow", Math.round(100 * state.wipe));
-  }
+/** Shows count, frame time and PSNR of the last frame. */
+export function updateFrame() {
+  elements.poster?.remove(); // the picture for the time until the first frame
+  const { model, base, frameMs } = stage, { total, kept } = stage.counts();
+  const share = `${((100 * kept) / total).toFixed(kept === total ? 0 : 1)} %`;
+  elements.counts.textContent = total ? `${integer(kept)} of ${integer(total)} kept (${share})` : "";
+  elements.frame.textContent = frameMs === null ? "" : `${frameMs.toFixed(frameMs < 10 ? 1 : 0)} ms per frame`;
+  const psnr = model?.attenuation && state.equation ? psnrAt(model.calibration, state.dial) : null;
+  elements.quality.textContent = psnr === null ? "" : `${psnr.toFixed(1)} dB`;
+  if (state.wipe === null) return;
+  elements.wipeLeft.textContent = `${model.attenuation ? named() : model.name} · ${integer(kept)}`;
+  elements.wipeRight.textContent = `${base ? "base" : "dial off"} · ${integer(stage.counts(1).kept)}`;
+}
 
-  /** Whether the calibration tells of such a view: it is of the cameras', if there are any to compare with. */
-  const isCalibrated = () => !viewer.cameras.length || viewer.camera.isNear(viewer.cameras);
+/** Shows a changed state, and removes the note, which was of the former one. */
+export function changed() {
+  showNote("");
+  stage.change();
+  update();
+}
 
-  /** Shows count, frame time and PSNR of the last frame. */
-  function updateFrame() {
-    const { model } = stage, { total, kept } = stage.counts(), other = stage.otherCounts();
-    const share = `${((100 * kept) / total).toFixed(kept === total ? 0 : 1)} %`;
-    elements.counts.textContent = total ? `${integer(kept)} of ${integer(total)} kept (${share})` : "";
-    elements.frame.textContent = stage.frameMs === null ? "" : `${stage.frameMs.toFixed(stage.frameMs < 10 ? 1 : 0)} ms per frame`;
-    const psnr = model?.attenuation && state.equation && isCalibrated() ? psnrAt(model.calibration, state.dial) : null;
-    elements.quality.textContent = psnr === null ? "" : `${psnr.toFixed(1)} dB`;
-    if (!other) return;
-    wipeLeft.textContent = `${model.attenuation ? named() : model.name} · ${integer(kept)}`;
-    wipeRight.textContent = `${stage.base ? "base" : "dial off"} · ${integer(other.kept)}`;
-  }
+/** A frame was measured for the held frame rate. */
+export function heldFrame(outOfReach) {
+  update();
+  showNote(outOfReach ? `s = ${maxDial()}, the largest trained value, is too slow for this frame rate` : "");
+}
 
-  function moveWipe(position) {
-    state.wipe = Math.min(Math.max(position, 0), 1);
-    stage.change({ moving: true });
-    update();
-  }
+export const clampDial = (dial) => Math.min(Math.max(dial, 0), maxDial());
 
-  function toggle(part, button) {
-    part.hidden = !part.hidden;
-    button.setAttribute("aria-expanded", !part.hidden);
-    actions.layOut();
-  }
+export function setDial(dial) {
+  state.dial = dial;
+  setHold(null);
+}
 
-  function openFile() {
-    const [file] = elements.file.files;
-    elements.file.value = "";
-    if (file) actions.openFile(file);
-  }
+/** Holds a frame rate by the dial, frames per second; null ends that. */
+export function setHold(fps) {
+  if (fps) [state.equation, elements.rate.value] = [true, fps];
+  stage.setHold(fps);
+  changed();
+}
 
-  const holdRate = (on) => actions.setHold(on ? Number(elements.rate.value) : null);
-  const toggleControls = () => toggle(elements.more, elements.fold);
-  const toggleComparison = () => actions.setWipe(state.wipe === null ? 0.5 : null);
-  const heard = [
-    [dial, "input", () => actions.setDial(toDial(dial.value, maxDial()))],
-    [hold, "change", () => holdRate(hold.checked)], [rate, "change", () => holdRate(true)],
-    [equation, "change", () => actions.setEquation(equation.checked)], [compare, "change", toggleComparison],
-    [target, "change", () => actions.setTarget(target.value)],
-    [target, "keydown", ({ key }) => key === "Enter" && actions.setTarget(target.value)], // change does not fire for the same text
-    [files, "change", () => actions.showFile(files.selectedIndex)], [camera, "change", () => actions.goTo(camera.selectedIndex)],
-    [up, "change", () => actions.setUp(up.value)],
-    [elements.file, "change", openFile],
-  ];
-  for (const [element, event, action] of heard) element.addEventListener(event, action);
-  const clicks = {
-    move: actions.toggleFlying, reset: actions.reset, open: () => elements.file.click(), helpOpen: () => elements.help.showModal(), fold: toggleControls,
-    dismiss: () => { message.hidden = true; }, menuOpen: () => toggle(elements.menu, elements.menuOpen), play: actions.play, turn: actions.turntable,
-    picture: actions.savePicture, record: actions.record, link: actions.copyLink, full: actions.fullScreen,
+export function setEquation(on) {
+  state.equation = on;
+  if (on) changed();
+  else setHold(null); // no dial value changes a frame's time then
+}
+
+/** Compares with the base, or with the model without its dial, right of a share of the width; null ends that. */
+export function setWipe(position) {
+  if (position !== null && !stage.base) state.equation = true; // else both sides would be the same
+  state.wipe = position;
+  changed();
+}
+
+/** Sets the dial value that keeps a typed number of Gaussians in this view. */
+async function setTarget({ value }) {
+  const target = Number(value.replaceAll(/[\s,_.'](?=\d{3}(?!\d))/g, ""));
+  if (!value.trim()) return showNote("");
+  if (!(Number.isInteger(target) && target > 0)) return showNote("Enter a number of Gaussians, such as 20000");
+  const { dial, kept } = await stage.model.dialFor(stage.view(), target), count = integer(kept);
+  state.equation = true;
+  setDial(dial);
+  showNote(`s = ${dial.toFixed(3)}${kept > target ? ", the largest trained value," : ""} keeps ${count} in this view`);
+}
+
+const toggle = (button) => button.setAttribute("aria-expanded", button.ariaExpanded !== "true");
+const stepDial = (ticks) => setDial(toDial(Math.min(Math.max(toTick(state.dial) + ticks, 0), TICKS)));
+
+/** Listens to the controls, each by its id. */
+export function start() {
+  const actions = {
+    dial: ({ value }) => setDial(toDial(value)), lower: () => stepDial(-20), raise: () => stepDial(20),
+    hold: ({ checked }) => setHold(checked ? elements.rate.value : null), rate: ({ value }) => setHold(value),
+    equation: ({ checked }) => setEquation(checked), compare: ({ checked }) => setWipe(checked ? 0.5 : null),
+    wipe: ({ value }) => setWipe(value / TICKS), target: setTarget, files: ({ selectedIndex }) => showFile(selectedIndex),
+    camera: ({ selectedIndex }) => views.goTo(selectedIndex), up: ({ value }) => views.setUp(value),
+    next: () => views.goBy(1), previous: () => views.goBy(-1), move: () => { viewer.flying = !viewer.flying; update(); }, reset: views.reset,
+    open: () => elements.file.click(), file: ({ files }) => openFile(files[0]), helpOpen: () => elements.help.showModal(),
+    fold: toggle, menuOpen: toggle, hide: () => { elements.panel.hidden = !elements.panel.hidden; },
+    dismiss: () => showMessage(null), play: views.play, turn: views.turn, picture: views.savePicture,
+    record: views.record, link: views.copyLink, full: () => (document.fullscreenElement ? document.exitFullscreen() : document.documentElement.requestFullscreen()),
   };
-  for (const [name, action] of Object.entries(clicks)) elements[name].addEventListener("click", () => action());
-  elements.record.hidden = !canRecord;
+  for (const [name, action] of Object.entries(actions)) {
+    const element = elements[name], kind = element.localName === "button" ? "click" : element.type === "range" ? "input" : "change";
+    element.addEventListener(kind, () => action(element));
+  }
+  elements.target.addEventListener("keydown", ({ key }) => key === "Enter" && setTarget(elements.target)); // the same text again
+  elements.record.hidden = !views.videoType;
   elements.full.hidden = !document.fullscreenEnabled; // false on iPhones
-  if (window.matchMedia("(max-width: 34rem), (max-height: 28rem)").matches) {
-    elements.more.hidden = true;
-    fold.setAttribute("aria-expanded", false);
-  }
-
-  wipe.addEventListener("pointerdown", (event) => {
-    wipe.setPointerCapture(event.pointerId);
-    wipe.focus();
-    event.preventDefault();
-  });
-  wipe.addEventListener("pointermove", (event) => {
-    const box = wipe.parentElement.getBoundingClientRect();
-    if (wipe.hasPointerCapture(event.pointerId) && state.wipe !== null) moveWipe((event.clientX - box.left) / box.width);
-  });
-  wipe.addEventListener("keydown", (event) => {
-    const step = { ArrowLeft: -0.02, ArrowRight: 0.02, Home: -1, End: 1 }[event.key];
-    if (!step) return;
-    event.preventDefault();
-    moveWipe(state.wipe + step);
-  });
-
-  const stepDial = (ticks) => actions.setDial(toDial(Math.min(Math.max(toTick(state.dial, maxDial()) + ticks, 0), TICKS), maxDial()));
-  const always = {
-    f: actions.fullScreen, m: toggleControls, o: clicks.open, "?": clicks.helpOpen,
-    h: () => { elements.panel.hidden = !elements.panel.hidden; actions.layOut(); },
-  };
-  const withModel = {
-    v: actions.toggleFlying, 0: actions.reset, n: () => actions.nextCamera(1), p: () => actions.nextCamera(-1), l: actions.copyLink,
-    " ": actions.play, t: actions.turntable, x: actions.savePicture, c: () => compare.disabled || toggleComparison(),
-  };
-  const withDial = {
-    r: () => holdRate(!stage.holds), e: () => actions.setEquation(!state.equation),
-    "[": () => stepDial(-20), "]": () => stepDial(20),
-  };
+  if (window.matchMedia("(max-width: 34rem), (max-height: 28rem)").matches) toggle(elements.fold);
   document.addEventListener("keydown", (event) => {
-    const key = event.key.toLowerCase(), { model } = stage;
+    const key = event.key.toLowerCase(), control = document.querySelector(`[data-key="${CSS.escape(key)}"]`);
     if (event.ctrlKey || event.metaKey || event.altKey || elements.help.open || (event.repeat && !"[]".includes(key))) return;
     if (event.target.matches("input[type=text], select") || (key === " " && event.target.matches("button, input"))) return;
-    const action = always[key] ?? (model && withModel[key]) ?? (model?.attenuation && withDial[key]);
-    if (!action && !/^[1-9]$/.test(key)) return;
+    if (!control && !/^[1-9]$/.test(key)) return;
     event.preventDefault();
-    if (action) action();
-    else actions.showFile(key - 1);
+    if (control) control.click();
+    else showFile(key - 1);
   });
+  elements.files.replaceChildren(...viewer.files.map(({ name }) => new Option(name)));
+  elements.files.hidden = elements.filesHelp.hidden = viewer.files.length < 2;
+  showName(config.title, 0);
+  update();
+}
 
-  return {
-    update, updateFrame,
-    /** Shows an error message; null hides it. */
-    showMessage(text) {
-      message.hidden = !text;
-      message.firstElementChild.textContent = text ?? "";
-    },
-    /** Shows the name of the file, or its number in the list where there are several; null for one that is not listed. */
-    showName(name, number, names = []) {
-      document.title = elements.title.textContent = name;
-      if (names.length) files.replaceChildren(...names.map((each) => new Option(each)));
-      files.hidden = elements.filesHelp.hidden = files.length < 2;
-      elements.title.hidden = files.length > 1 && number !== null;
-      files.selectedIndex = number ?? -1;
-    },
-    /** Lists the cameras by name, and last what is shown for a view of none, which cannot be chosen. */
-    listCameras(cameras) {
-      const free = new Option("free view");
-      free.hidden = free.disabled = true;
-      elements.cameraRow.hidden = !cameras.length;
-      camera.replaceChildren(...cameras.map(({ name }) => new Option(name)), free);
-    },
-    /** Selects the camera of the present view in the list; null for none. */
-    selectCamera(number) { camera.selectedIndex = number ?? camera.length - 1; },
-    showNote(text) { elements.targetNote.textContent = text; },
-    /** Shows progress in the canvas, at its top where there is a picture; null hides it. */
-    showProgress(text) {
-      elements.busy.hidden = !text;
-      elements.busy.classList.toggle("tag", Boolean(stage.model || elements.poster));
-      elements.busy.textContent = text ?? "";
-    },
-  };
+/** Shows the name of the file, and its number in the list; null for one that is not listed. */
+export function showName(name, number) {
+  document.title = elements.title.textContent = name;
+  elements.title.hidden = viewer.files.length > 1 && number !== null;
+  elements.files.selectedIndex = number ?? -1;
+}
+
+/** Lists the cameras by name, and last what is shown for a view of none, which cannot be chosen. */
+export function listCameras() {
+  const free = Object.assign(new Option("free view"), { hidden: true, disabled: true });
+  elements.camera.replaceChildren(...viewer.cameras.map(({ name }) => new Option(name)), free);
+}
+
+/** Shows an error message; null hides it. */
+export function showMessage(text) {
+  elements.message.hidden = !text;
+  elements.message.firstElementChild.textContent = text ?? "";
+}
+
+export function showNote(text) {
+  elements.targetNote.textContent = text;
+}
+
+/** Shows progress in the canvas, at its top where there is a picture; null hides it. */
+export function showProgress(text) {
+  elements.busy.hidden = !text;
+  elements.busy.classList.toggle("tag", Boolean(stage.model || elements.poster));
+  elements.busy.textContent = text ?? "";
 }

@@ -1,69 +1,61 @@
-// The worker of a model: culls the Gaussians for each camera and dial value, and sorts the kept ones by depth. Those that are
-// culled or outside the picture are neither sorted nor drawn.
-import { dialForCount, extinctionScales, growthDistance, growthFactor, normalizingDistance, prepare } from "../../../../viewers/equation.js";
-import { frustumOf } from "./frustum.js";
+// The worker of a model: culls the Gaussians for each camera and dial value, and sorts the others in the picture by depth.
+import { countKept, dialForCount, growthDistance, growthFactor, keeping, normalizingDistance, prepare } from "../../../../viewers/equation.js";
+
+const WIDTH = 2048; // texels per row of a texture (gpu.js)
+const MARGIN = 0.25; // of the picture on each side: Gaussians that a moving camera shows before the next order
+const RADIUS = 3.34; // standard deviations to alpha 1/255, and more than in shaders.js
 
 let means, scales, growthD, blur, attenuation, prepared, keys, scratchKeys, scratchRows;
 
 const jobs = {
   model(message) {
     ({ means, scales, growthD, blur, attenuation } = message);
-    const count = means.length / 3;
     prepared = attenuation && prepare(message.opacityLogits, message.sigmaD, attenuation.eps);
-    [keys, scratchKeys, scratchRows] = [0, 1, 2].map(() => new Uint32Array(count));
-    return [{}, []];
+    [keys, scratchKeys, scratchRows] = [0, 1, 2].map(() => new Uint32Array(scales.length));
   },
 
-  /** Writes the rows to draw, farthest first, into the buffer `rows`, which is transferred in both directions. */
-  order({ view, dial, equation, rows }) {
-    const on = equation && attenuation !== null;
-    const distance = on ? normalizingDistance(means, view, attenuation) : 1;
-    const order = new Uint32Array(rows);
-    const [kept, drawn] = cullAndSort(order, view, on ? { dial, distance } : null, insideOf(view, on && dial / distance));
-    return [{ rows, kept, drawn, distance }, [rows]];
+  order({ view, dial, attenuated }) {
+    const distance = attenuated ? normalizingDistance(means, view, attenuation) : 1;
+    return { distance, ...cullAndSort(view, attenuated && { dial, distance }) };
   },
 
-  dialFor({ view, target, maxSv }) {
+  dialFor({ view, target, maxDial }) {
     const distance = normalizingDistance(means, view, attenuation);
-    const found = extinctionScales(means, prepared, view.eye, distance, attenuation.tau);
-    return [dialForCount(found, target, maxSv), []];
+    return dialForCount((dial) => countKept(means, prepared, attenuation.tau, view.eye, distance, dial), target, maxDial);
   },
 };
 
-/** Whether row i, at [x, y, z] from the eye and a depth, has a pixel in the picture or its margin. `far`: s d per distance, of
- *  growth; false without the equation. */
-function insideOf(view, far) {
-  const { rotation: r } = view, { focal, shift, border, reach } = frustumOf(view, blur), reference = far && growthDistance(attenuation);
-  const [fx, fy] = focal, [sx, sy] = shift, [bx, by] = border, [ex, ey] = reach;
-  return (i, x, y, z, depth) => {
-    const across = Math.abs(fx * (r[0] * x + r[1] * y + r[2] * z) + sx * depth) - bx * depth;
-    const down = Math.abs(fy * (r[3] * x + r[4] * y + r[5] * z) + sy * depth) - by * depth;
-    const needed = Math.max(across / ex, down / ey); // the scale that reaches the margin
-    if (needed <= scales[i]) return true; // or less, where it shrinks
-    return far && growthD && growthD[i] > 0 && needed <= scales[i] * growthFactor(growthD[i], far * Math.hypot(x, y, z) / reference);
-  };
-}
-
-/** Fills `order` with the kept rows in front of the camera and `inside`, farthest first; returns the counts of kept and of
- *  drawn Gaussians. `attenuated`: {dial, distance}; null keeps all. */
-function cullAndSort(order, { rotation: r, eye, near }, attenuated, inside) {
-  const [ex, ey, ez] = eye;
-  const k = attenuated ? (attenuated.dial / attenuated.distance) ** 2 : 0;
-  const threshold = attenuated ? Math.log(attenuation.tau * attenuated.dial) : 0;
+/** The rows with a pixel in the picture or its margin, farthest first; numbers of `kept` and `drawn` Gaussians. */
+function cullAndSort({ rotation: r, eye, near, fx, fy, cx, cy, width, height }, attenuated) {
+  const rows = new Uint32Array(WIDTH * Math.ceil(scales.length / WIDTH)), [ex, ey, ez] = eye;
   const bits = new Uint32Array(1), depth = new Float32Array(bits.buffer);
+  // Of depth, how far the picture with its margin extends; and how far a scale of 1 does, as in shaders.js.
+  const border = (focal, centre, size) => (Math.max(centre, size - centre) + MARGIN * size + RADIUS * Math.sqrt(blur)) / focal;
+  const reach = (focal, centre, size) => RADIUS * Math.hypot(1, (Math.max(centre, size - centre) + 0.15 * size) / focal);
+  const bx = border(fx, cx, width), by = border(fy, cy, height), sx = reach(fx, cx, width), sy = reach(fy, cy, height);
+  const isKept = attenuated ? keeping(prepared, attenuation.tau, attenuated.dial) : () => true, square = attenuated.distance ** 2;
   let kept = 0, drawn = 0;
   for (let i = 0, at = 0; at < means.length; i++, at += 3) {
     const x = means[at] - ex, y = means[at + 1] - ey, z = means[at + 2] - ez;
-    if (attenuated && !(prepared.logA[i] - k * (x * x + y * y + z * z) * prepared.inverse[i] > threshold)) continue;
+    if (!isKept(i, (x * x + y * y + z * z) / square)) continue;
     kept++;
     depth[0] = r[6] * x + r[7] * y + r[8] * z;
-    if (!(depth[0] >= near && inside(i, x, y, z, depth[0]))) continue;
+    if (!(depth[0] >= near)) continue;
+    const across = Math.abs(r[0] * x + r[1] * y + r[2] * z) - bx * depth[0];
+    const down = Math.abs(r[3] * x + r[4] * y + r[5] * z) - by * depth[0];
+    const needed = Math.max(across / sx, down / sy); // the scale that reaches the margin
+    if (needed > scales[i] && !(needed <= scales[i] * growthOf(i, Math.hypot(x, y, z), attenuated))) continue;
     keys[drawn] = ~bits[0]; // positive floats have the order of their bits
-    order[drawn++] = i;
+    rows[drawn++] = i;
   }
-  radixPass(order, drawn, 0, keys, scratchKeys, scratchRows);
-  radixPass(scratchRows, drawn, 16, scratchKeys, keys, order);
-  return [kept, drawn];
+  radixPass(rows, drawn, 0, keys, scratchKeys, scratchRows);
+  radixPass(scratchRows, drawn, 16, scratchKeys, keys, rows);
+  return { rows, kept, drawn };
+}
+
+function growthOf(i, far, attenuated) {
+  if (!attenuated || !(growthD?.[i] > 0)) return 1; // or less, where it shrinks
+  return growthFactor(growthD[i], (attenuated.dial * far) / attenuated.distance / growthDistance(attenuation));
 }
 
 /** One pass of a radix sort by 16 bits of the keys. It is exact and stable: equal depths keep the file's order. */
@@ -78,11 +70,11 @@ function radixPass(rows, count, shift, from, to, toRows) {
   }
 }
 
-self.onmessage = ({ data: { id, job, ...rest } }) => {
+self.onmessage = ({ data: [job, message] }) => {
   try {
-    const [result, transferred] = jobs[job](rest);
-    self.postMessage({ id, ...result }, transferred);
+    const result = jobs[job](message);
+    self.postMessage({ result }, result?.rows ? [result.rows.buffer] : []);
   } catch (error) {
-    self.postMessage({ id, error: String(error?.message ?? error) });
+    self.postMessage({ error: String(error?.message ?? error) });
   }
 };
