@@ -36,11 +36,7 @@ def matching_dial(gaussians: Gaussians, cameras: Sequence[Camera], count: float)
 def rankings(base: Gaussians, views: Sequence[View], progress: Listener | None = None) -> dict[str, Tensor]:
     """``[N]`` indices of the Gaussians of an unadapted base, most important first, by two rankings.
 
-    ``opacity``: as stored. ``removal error``: the image error of removing the Gaussian alone, in up to 64 evenly
-    spread training views (``importance.removal_error``). ``base.select(order[:n])`` is the base pruned to n Gaussians.
-
-    Args:
-        progress: called in ``Phase.IMPORTANCE`` after each view.
+    ``removal error`` is the image error of removing the Gaussian alone, in up to 64 evenly spread training views.
     """
     removal = removal_error(base, spread(views, MOST_VIEWS), progress=progress)
     return {"opacity": by_opacity(base), "removal error": removal.argsort(descending=True, stable=True)}

@@ -3,12 +3,9 @@
 - A count needs no measurement. For one camera, Gaussian i is kept iff s is below its extinction scale
   ``s*_i`` (``extinction.extinction_scale``) and kept sets are nested, so the dial that keeps n lies between the n-th
   and the (n+1)-th largest ``s*``. For the mean over V cameras the same holds for the pooled ``s*`` of all cameras
-  and for n V. A baked file has one distance for each Gaussian and counts as one camera. Exact up to ties:
-  Gaussians whose ``s*`` are equal in float32 are culled together. A Gaussian whose distance is the unit in every view
-  (normalizers ``max`` and ``quantile``) is culled in all views at once.
+  and for n V. Exact up to ties: Gaussians whose ``s*`` are equal in float32 are culled together.
 - PSNR is read from the calibration table that is stored with the file (``calibration.py``).
-- Frame rates depend on the machine, the image size and the load. With cameras some frames are timed
-  (``frame_times``, some seconds): under load the times of one machine differ by a factor of ten. The table's times
+- Frame rates depend on the machine, the image size and the load. With cameras some frames are timed; the table's times
   are used only where they are passed in, or (``clod-adapt export``) where nothing can be timed.
 
 A budget that s = 1 already meets is no error: the dial is 1, and a note says so. s = 1 keeps fewer Gaussians than the
@@ -98,11 +95,7 @@ def dial_for(
 def dial_for_times(times: Sequence[tuple[float, float]], fps: float) -> DialValue:
     """The smallest dial value from which frames take at most ``1000 / fps`` ms, linear in log s between the times.
 
-    Args:
-        times: dial values, ascending from 1, each with its milliseconds per frame.
-
-    Raises:
-        ClodError: a frame takes longer even at the last dial value.
+    ``times`` has dial values, ascending from 1, each with its milliseconds per frame.
     """
     dials, taken = [s for s, _ in times], [ms for _, ms in times]
     found = crossing(dials, taken, 1e3 / fps)
@@ -119,23 +112,12 @@ def dial_for_times(times: Sequence[tuple[float, float]], fps: float) -> DialValu
 def frame_times(
     gaussians: Gaussians, cameras: Sequence[Camera], *, progress: Listener | None = None
 ) -> tuple[list[tuple[float, float]], list[str]]:
-    """Measures milliseconds per frame at six dial values from 1 to max_sv, in even steps of log s.
-
-    Args:
-        progress: as for ``frame_times.time_frames``.
-
-    Returns:
-        The dial values, each with its milliseconds; and notes on the measurement.
-
-    Raises:
-        ClodError: there are no cameras, or the Gaussians have no dial.
-    """
-    if gaussians.attenuation is None:
-        raise ClodError("the Gaussians have no sigma_d, so there are no dial values to time")
+    """Measures milliseconds per frame at six dial values up to max_sv, in even steps of log s; and notes on that."""
+    assert gaussians.attenuation is not None
     if not cameras:
         raise ClodError("frames a second need a calibration or cameras to time frames from")
     max_sv = gaussians.attenuation.max_sv
-    virtual_scales = [max_sv ** (k / (TIMED_DIALS - 1)) for k in range(TIMED_DIALS)] if max_sv > 1 else [1.0]
+    virtual_scales = sorted({max_sv ** (k / (TIMED_DIALS - 1)) for k in range(TIMED_DIALS)})
     found = time_frames([(gaussians, virtual_scales)], cameras, progress)
     return list(zip(virtual_scales, found.milliseconds[0], strict=True)), found.notes
 

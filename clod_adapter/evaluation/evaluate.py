@@ -31,8 +31,8 @@ class Row:
         virtual_scale: the dial s.
         psnr: dB; ssim: in [-1, 1] (``metrics.psnr_ssim``).
         kept: Gaussians the dial leaves in, of all; kept_share: that divided by all.
-        in_view: kept Gaussians that also take part in the picture (their centre is in the image).
-        frame_ms: median time of a frame, milliseconds; one frame a view, so compare with ``frame_times.time_frames``.
+        in_view: kept Gaussians whose centre is in the image.
+        frame_ms: median time of a frame, milliseconds; ``frame_times.time_frames`` has times to compare.
     """
 
     virtual_scale: float

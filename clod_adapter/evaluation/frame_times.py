@@ -27,18 +27,14 @@ WARM_FRAMES, WARM_SECONDS, STEADY = 8, 2.0, 0.1  # the warm-up ends with two fra
 RISE = 0.05  # an increase of the time in every pass is real if it is at least this large
 NOISY = 0.2  # a larger spread of the passes is reported
 
-
-Model = tuple[Gaussians, Sequence[float]]
-"""Gaussians and the dial values, ascending, to time them at."""
+Model = tuple[Gaussians, Sequence[float]]  # and the dial values, ascending, to time it at
 
 
 @dataclass(frozen=True)
 class FrameTimes:
-    """Milliseconds per frame.
+    """Milliseconds per frame of each dial value of each model: means over the views, medians over the passes.
 
-    Attributes:
-        milliseconds: of each dial value of each model; each a mean over the views, the median over the passes.
-        spread: interquartile range of the passes over their median; the median over the dial values. 0 for equal times.
+    ``spread`` is the interquartile range of the passes over their median; the median over the dial values.
     """
 
     milliseconds: tuple[tuple[float, ...], ...]
@@ -54,16 +50,7 @@ class FrameTimes:
 
 @torch.no_grad()
 def time_frames(models: Sequence[Model], cameras: Sequence[Camera], progress: Listener | None = None) -> FrameTimes:
-    """Times frames from at most three of the cameras, evenly spread.
-
-    Args:
-        models: the first at its first dial value is the slowest, for the warm-up.
-        progress: called in ``Phase.FRAME_TIMES`` with the passes so far; not all of PASSES are made of slow frames.
-
-    Raises:
-        ClodError: no cameras.
-        Stopped: ``progress`` returned False.
-    """
+    """Times frames from at most three of the cameras, evenly spread; the first dial value of all is the slowest."""
     if not cameras:
         raise ClodError("there are no cameras to time frames from")
     jobs = [(lean, s) for some, dials in models for lean in [some.without_empty_bands()] for s in dials]
@@ -80,35 +67,25 @@ def time_frames(models: Sequence[Model], cameras: Sequence[Camera], progress: Li
     for _, dials in models:
         found.append(tuple(settled([each[first : first + len(dials)] for each in passes])))
         first += len(dials)
-    return FrameTimes(tuple(found), spread_of(passes))
+    spread = statistics.median(_spread(column) for column in zip(*passes, strict=True))
+    return FrameTimes(tuple(found), spread)
 
 
 def settled(passes: Sequence[Sequence[float]]) -> list[float]:
     """``[K]`` medians of ``[P, K]`` times; without increases from one to the next on which the passes do not agree."""
-    medians = [statistics.median(column) for column in zip(*passes, strict=True)]
-    found, run = list[float](), list[list[float]]()  # levels of the run since the last real increase
-    for k, value in enumerate(medians):
-        if k and all(each[k] > (1 + RISE) * each[k - 1] for each in passes):  # fewer Gaussians, which have grown
-            found += _levels(run)
-            run = []
-        run.append([value])
-        while len(run) > 1 and statistics.fmean(run[-1]) > statistics.fmean(run[-2]):
-            last = run.pop()
-            run[-1] += last
-    return found + _levels(run)
+    levels = list[list[float]]()  # of equal times
+    for k, column in enumerate(zip(*passes, strict=True)):
+        levels.append([statistics.median(column)])
+        if not k or all(each[k] > (1 + RISE) * each[k - 1] for each in passes):  # fewer Gaussians, which have grown
+            start = len(levels) - 1
+        while len(levels) > start + 1 and statistics.fmean(levels[-1]) > statistics.fmean(levels[-2]):
+            levels[-2:] = [levels[-2] + levels[-1]]
+    return [statistics.fmean(level) for level in levels for _ in level]
 
 
-def _levels(run: Sequence[Sequence[float]]) -> list[float]:
-    return [statistics.fmean(level) for level in run for _ in level]
-
-
-def spread_of(passes: Sequence[Sequence[float]]) -> float:
-    """``FrameTimes.spread`` of ``[P, K]`` times."""
-    shares = []
-    for column in zip(*passes, strict=True):
-        low, middle, high = statistics.quantiles(column, n=4, method="inclusive")
-        shares.append((high - low) / middle)
-    return statistics.median(shares)
+def _spread(times: Sequence[float]) -> float:
+    low, middle, high = statistics.quantiles(times, n=4, method="inclusive")
+    return (high - low) / middle
 
 
 def _warm_up(gaussians: Gaussians, virtual_scale: float, camera: Camera) -> float:

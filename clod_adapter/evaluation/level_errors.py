@@ -59,13 +59,7 @@ def _toward(target: np.ndarray, viewpoint: Viewpoint) -> Camera:
 def geometric_errors(
     levels: Sequence[Gaussians], cameras: Sequence[Camera], *, progress: Listener | None = None
 ) -> np.ndarray:
-    """``[L]`` float64, >= 0, world units: 0 for the finest level, ascending.
-
-    Args:
-        levels: without a dial, the finest first.
-        cameras: at least one; VIEWS of them are used, evenly chosen.
-        progress: called in ``Phase.LEVELS`` after each camera.
-    """
+    """``[L]`` float64, world units, ascending from 0, of levels without a dial, the finest first."""
     picked = spread(cameras, VIEWS)
     found = np.zeros((len(picked), len(levels)))
     for done, view in enumerate(picked):

@@ -43,17 +43,10 @@ from clod_adapter.render import render
 
 @dataclass(frozen=True)
 class Popping:
-    """How the image changes over a sweep; changes are in levels of 255.
+    """How the image changes over a sweep, in steps of equal length; changes are in levels of 255.
 
-    Attributes:
-        steps: number of steps of equal length.
-        mean: mean change of a step.
-        largest: largest change of a step; at: its end, as a dial value or a share of the camera path.
-        ratio: largest / mean, in [1, steps]; NaN if nothing changes.
-        persistence: largest / the largest over two steps at once: 0.5 a fade, 1 a jump, at most 1; NaN as above.
-        pixel: largest change of one channel of one pixel in one step; pixel_at: its end.
-        pixel_persistence: persistence of the largest changes of one pixel.
-        changes: of every step.
+    ``mean`` and ``largest`` are changes of a step, ``at`` the end of the largest one, as a dial value or a share of the
+    camera path; ``pixel`` is the largest change of one channel of one pixel. Ratios are NaN if nothing changes.
     """
 
     steps: int
@@ -73,17 +66,7 @@ class Popping:
 
 @torch.no_grad()
 def sweep(show: Callable[[int, int], Tensor], positions: Sequence[float], progress: Listener | None = None) -> Popping:
-    """Measures any sequence of images.
-
-    Args:
-        show: ``show(k, j)`` is the image ``[H, W, 3]`` from the camera of step k with the Gaussians of step j.
-        positions: of the steps, at least three.
-        progress: called in ``Phase.POPPING`` after each step.
-
-    Raises:
-        ClodError: fewer than three positions.
-        Stopped: ``progress`` returned False.
-    """
+    """Measures images: ``show(k, j)`` is that ``[H, W, 3]`` from the camera of step k with the Gaussians of step j."""
     require(len(positions) >= 3, "number of positions", len(positions), "at least 3")
     once, twice = [], []
     for k in range(1, len(positions)):
@@ -106,11 +89,7 @@ def sweep(show: Callable[[int, int], Tensor], positions: Sequence[float], progre
 def dial_popping(
     gaussians: Gaussians, camera: Camera, max_sv: float, *, steps: int = 200, progress: Listener | None = None
 ) -> Popping:
-    """Turns the dial from 1 to ``max_sv`` in steps of equal ratio, for one camera.
-
-    Raises:
-        ClodError: ``max_sv`` is not above 1 or not finite, or there are fewer than two steps.
-    """
+    """Turns the dial from 1 to ``max_sv`` in steps of equal ratio, for one camera."""
     require(1 < max_sv < math.inf, "max_sv", max_sv, "above 1 and finite")
     positions = [max_sv ** (k / steps) for k in range(steps + 1)]
     gaussians = gaussians.without_empty_bands()
@@ -127,11 +106,7 @@ def path_popping(
     steps: int = 200,
     progress: Listener | None = None,
 ) -> Popping:
-    """Moves through the ``cameras`` in steps of equal length (``path``), at one dial value.
-
-    Raises:
-        ClodError: fewer than two cameras or two steps, or the dial is negative or not finite.
-    """
+    """Moves through the ``cameras`` in steps of equal length (``path``), at one dial value."""
     gaussians, shown = gaussians.without_empty_bands(), path(cameras, steps)
     rasterizer = for_device(gaussians.means.device)
 
@@ -146,9 +121,6 @@ def path(cameras: Sequence[Camera], steps: int) -> list[Camera]:
 
     Centres are interpolated linearly and rotations by slerp. If no centre moves, each rotation takes the same number
     of steps. Size and intrinsics are the first camera's.
-
-    Raises:
-        ClodError: fewer than two cameras or two steps.
     """
     require(steps >= 2, "steps", steps, "at least 2")
     if len(cameras) < 2:

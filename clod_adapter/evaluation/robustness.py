@@ -33,14 +33,7 @@ LOG_SIGMA_EDGES = tuple(-3 + k / 10 for k in range(61))  # log10 of sigma_d; the
 
 @dataclass(frozen=True)
 class CellResult:
-    """The result of a cell.
-
-    Attributes:
-        rows: ``evaluate.Row.as_dict`` per dial value (of a range) or share (of a baseline).
-        distribution: ``distribution`` of the Gaussians.
-        adapter: None for a baseline.
-        seconds: wall time of the adaptation with its initialization; 0 for a baseline.
-    """
+    """The result of a cell, with a row for each dial value of a range, or share of a baseline, which has no adapter."""
 
     rows: list[dict[str, float]]
     distribution: dict[str, Any]
@@ -58,17 +51,9 @@ def adapt_at_range(
     origin: Origin = NOWHERE,
     progress: Listener | None = None,
 ) -> CellResult:
-    """Adapts ``base`` at the range ``[1, config.max_sv]`` and measures the result on the held-out views.
+    """Adapts ``base`` at the range ``[1, config.max_sv]`` and measures dial values, also beyond it, on held-out views.
 
-    Args:
-        base: the checkpoint; a dial it has is ignored.
-        virtual_scales: dial values to measure; those above ``max_sv`` are outside the trained range.
-        fingerprint: of the checkpoint file; origin: of its means; both for the adapter.
-        progress: called in the phases of ``adapt`` and then in ``Phase.EVALUATION``.
-
-    Raises:
-        Stopped: ``progress`` returned False, or Ctrl-C ended training: an incomplete adaptation is not a cell.
-        ClodError: the loss of a step is not finite.
+    ``fingerprint`` and ``origin`` are for the adapter. An incomplete adaptation is not a cell: it raises Stopped.
     """
     base, config = detach(base), config.for_views(len(scene.train))
     adapted = adapt(base, scene, config, progress)
@@ -91,11 +76,7 @@ def baseline(
     *,
     progress: Listener | None = None,
 ) -> CellResult:
-    """The unadapted base with only its most opaque Gaussians: one row per share.
-
-    Raises:
-        Stopped: ``progress`` returned False.
-    """
+    """The unadapted base with only its most opaque Gaussians: one row per share."""
     base, rows = detach(base), []
     order = by_opacity(base)
     for k, share in enumerate(shares):
@@ -113,10 +94,7 @@ def _complete(rows: list[Row], count: int) -> list[Row]:
 
 
 def distribution(gaussians: Gaussians) -> dict[str, Any]:
-    """Histograms with ``edges`` and ``shares``: ``opacity`` over [0, 1], and ``log10_sigma_d`` if there is a dial.
-
-    Shares sum to 1. The end bins include values outside the edges.
-    """
+    """Histograms with ``edges`` and ``shares``: ``opacity`` over [0, 1], and ``log10_sigma_d`` if there is a dial."""
     found = {"opacity": _histogram(gaussians.opacities, OPACITY_EDGES)}
     if gaussians.sigma_d is not None:
         found["log10_sigma_d"] = _histogram(gaussians.sigma_d.clamp(min=1e-30).log10(), LOG_SIGMA_EDGES)
@@ -133,9 +111,6 @@ def scene_fingerprint(scene: Scene, progress: Listener | None = None) -> str:
     """SHA-256, hex, of the photographs' pixels, their cameras and the split; independent of their folder.
 
     Of a pseudo view the camera alone: the checkpoint that it shows has a hash of its own.
-
-    Args:
-        progress: called in ``Phase.FINGERPRINT`` after each photograph.
     """
     digest, done = hashlib.sha256(), 0
     for views in (scene.train, scene.test):

@@ -20,24 +20,16 @@ SIZE, NARROW = (7.2, 4.1), (4.0, 4.0)  # inches; NARROW for phones
 STEPS = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)  # dB between grid lines
 MARKERS = "oDs^vPX"
 ROOM = (38, 11)  # points that a label takes
+BASE = "base, unadapted"
 
 
 @dataclass(frozen=True)
 class Series:
-    """Rows of one file or baseline.
-
-    Attributes:
-        rows: each with psnr, ssim, kept, frame_ms, and for a dial virtual_scale.
-        dial: whether the rows are one file at several dial values.
-    """
+    """Rows of one file or baseline; ``dial``: they are one file at several dial values."""
 
     label: str
     rows: Sequence[Mapping[str, Any]]
     dial: bool = False
-
-    @property
-    def is_base(self) -> bool:
-        return self.label.startswith("base, ")
 
 
 def series_of(report: Mapping[str, Any]) -> list[Series]:
@@ -50,7 +42,7 @@ def series_of(report: Mapping[str, Any]) -> list[Series]:
     base: list[Any] = report.get("base_rows") or [report.get("base_row")]
     plain_model = report.get("attenuation", {}) is None  # evaluation of a file without a dial
     model = Series("the file, no dial" if plain_model else "dial, one file", report.get("rows", []), not plain_model)
-    found, ranked, against = [model, Series("base, unadapted", base)], dict[str, Any](), dict[str, Any]()
+    found, ranked, against = [model, Series(BASE, base)], dict[str, Any](), dict[str, Any]()
     for entry in report.get("ranked") or []:
         ranked.setdefault(f"base pruned by {entry['by']}", []).append(entry["row"])
     for entry in report.get("against") or []:
@@ -69,11 +61,7 @@ def chart_file(page: Path, name: str) -> Path:
 
 
 def inline_svg(draw: Draw, name: str, label: str) -> list[str]:
-    """The chart as two SVG elements, for desktops and phones, with the colours of ``style.css`` (``--ink``, ...).
-
-    Args:
-        name: of the chart in its page, so that ids differ.
-    """
+    """The chart as SVG elements for desktops and phones, in the colours of ``style.css``, with ids by its name."""
     names = {INK: "ink", QUIET: "quiet", GRID: "line", PAPER: "paper"}
     names |= {colour: f"series-{k + 1}" for k, colour in enumerate(SERIES[:-1])}
     found = []
@@ -106,16 +94,11 @@ def draw_rendering(axes: Any, series: Sequence[Series]) -> None:
 
 
 def draw_training(axes: Any, curves: Sequence[Mapping[str, Any]], base_psnr: float | None) -> None:
-    """Draws held-out error against seconds of adapting.
-
-    Args:
-        curves: each with ``label`` and ``points``; a point has ``seconds`` and ``psnr``.
-        base_psnr: of the unadapted base, drawn as a horizontal line.
-    """
+    """Draws held-out error against seconds of adapting, and that of the unadapted base as a horizontal line."""
     for k, curve in enumerate(curves):
         _line(axes, k, curve["label"], [(point["seconds"], error(point["psnr"])) for point in curve["points"]])
     if base_psnr is not None:
-        axes.axhline(error(base_psnr), color=INK, linestyle="--", linewidth=1.1, label="base, unadapted")
+        axes.axhline(error(base_psnr), color=INK, linestyle="--", linewidth=1.1, label=BASE)
     _finish(axes, "seconds of adapting (log scale)")
 
 

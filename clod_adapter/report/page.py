@@ -21,6 +21,7 @@ from PIL import Image
 from clod_adapter._support.text import as_text, script_json
 from clod_adapter.io.atomic import atomic_paths
 from clod_adapter.report.charts import (
+    BASE,
     SIZE,
     Draw,
     Series,
@@ -38,12 +39,7 @@ QUALITY = 88  # of WebP
 
 @dataclass(frozen=True)
 class Picture:
-    """An image with its caption.
-
-    Attributes:
-        image: ``[H, W, 3]`` uint8, or float in 0..1.
-        title: one or two words; detail: its numbers.
-    """
+    """An image, ``[H, W, 3]`` uint8 or float in 0..1, with its caption."""
 
     image: np.ndarray
     title: str
@@ -71,15 +67,9 @@ def write_page(
 ) -> dict[str, Path]:  # fmt: skip
     """Writes the page and its charts as PNGs in the same folder, atomically; returns the paths.
 
-    Args:
-        report: output of ``clod-adapt`` or ``clod-adapt eval`` with --json; see ``series_of`` for its rows. The page
-            includes it as JSON under the id ``data``.
-        frames: one held-out view at ascending dial values.
-        others: images of the same view to compare with, by name: the photograph, if any, and the base.
-        training: ``curves`` and ``base_psnr`` of ``charts.draw_training``, and the number of ``views``.
-
-    Raises:
-        ClodError: matplotlib is missing, or a file cannot be written.
+    ``report`` is the output of ``clod-adapt`` or ``clod-adapt eval`` with --json; ``frames`` are one held-out view at
+    ascending dial values, ``others`` the photograph and the base by name; ``training`` has ``curves`` and ``base_psnr``
+    of ``charts.draw_training``, and the number of ``views``.
     """
     import jinja2
 
@@ -87,7 +77,7 @@ def write_page(
     name = PurePath(report.get("outputs", {}).get("ply", report["model"])).name
     config = report.get("config") or report.get("attenuation") or {}
     # Against its own renders, the base has only rounding errors, far below the range of the charts.
-    drawn = [one for one in series if not (own and one.is_base)]
+    drawn = [one for one in series if not (own and one.label == BASE)]
     figures = _figures(drawn, training, own)
     few = dict.fromkeys(round(k * (len(frames) - 1) / 3) for k in range(4)) if frames else ()
     height, width = frames[0].image.shape[:2] if frames else (1, 1)
@@ -157,7 +147,7 @@ def _lead(report: Mapping[str, Any], series: Sequence[Series]) -> list[str]:
 
 def _tiles(series: Sequence[Series]) -> list[tuple[str, Mapping[str, Any]]]:
     """Key figures: the base, and both ends and the middle of the dial."""
-    found = [(one.label, one.rows[0]) for one in series if one.is_base]
+    found = [(one.label, one.rows[0]) for one in series if one.label == BASE]
     if series and series[0].dial:
         rows = sorted(series[0].rows, key=lambda row: row["virtual_scale"])
         picked = dict.fromkeys((0, len(rows) // 2, len(rows) - 1))

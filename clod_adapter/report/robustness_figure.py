@@ -15,14 +15,7 @@ PANELS = ("PSNR (dB)", "SSIM", "opacity", "decay sigma_d (log scale)")
 def robustness_figure(path: str | Path, cells: Sequence[Mapping[str, Any]], title: str) -> None:
     """Draws four panels per checkpoint: PSNR and SSIM against Gaussians kept, opacity, sigma_d.
 
-    Args:
-        path: the file to write; its suffix selects the format.
-        cells: with ``checkpoint``, ``max_sv`` (None for the baseline), ``rows`` and ``distribution``, from the
-            experiment's JSON; cells may be missing.
-        title: one line above.
-
-    Raises:
-        ClodError: matplotlib is missing, or the file cannot be written.
+    ``cells`` are those of the experiment's JSON, of which some may be missing; a baseline's ``max_sv`` is None.
     """
     names = list(dict.fromkeys(cell["checkpoint"] for cell in cells))
     ranges = sorted({cell["max_sv"] for cell in cells if cell["max_sv"] is not None})
@@ -69,13 +62,10 @@ def _plot(axes: Any, points: Sequence[tuple[float, ...]], line: str, **style: An
 def _distribution(axes: Any, cells: Sequence[Mapping[str, Any]], key: str, colours: Mapping[float, str]) -> None:
     """Outlines of the histograms, in percent of the Gaussians per bin."""
     for cell in cells:
-        histogram = cell["distribution"].get(key)
-        if histogram is None:
-            continue
-        heights = [100 * share for share in histogram["shares"]]
-        base = cell["max_sv"] is None
-        style = {"color": ORANGE, "linestyle": "--"} if base else {"color": colours[cell["max_sv"]]}
-        axes.stairs(heights, histogram["edges"], linewidth=1.4, **style)
+        if histogram := cell["distribution"].get(key):
+            heights, base = [100 * share for share in histogram["shares"]], cell["max_sv"] is None
+            style = {"color": ORANGE, "linestyle": "--"} if base else {"color": colours[cell["max_sv"]]}
+            axes.stairs(heights, histogram["edges"], linewidth=1.4, **style)
     axes.set_ylabel("% of Gaussians per bin", color=QUIET, fontsize=8)
     if key == "opacity":
         axes.set_yscale("log")  # most are nearly transparent

@@ -41,11 +41,7 @@ def check_matplotlib() -> None:
 
 @contextmanager
 def new_figure(inches: tuple[float, float], **options: Any) -> Iterator[Any]:
-    """A matplotlib figure in the common style; without pyplot, so a notebook's figures are not affected.
-
-    Raises:
-        ClodError: matplotlib is not installed.
-    """
+    """A matplotlib figure in the common style; without pyplot, so a notebook's figures are not affected."""
     check_matplotlib()
     import matplotlib
     from matplotlib.figure import Figure
@@ -55,7 +51,6 @@ def new_figure(inches: tuple[float, float], **options: Any) -> Iterator[Any]:
 
 
 def save_figure(figure: Any, path: str | Path) -> None:
-    """Writes the figure atomically."""
     # Text in a PNG by which a later run recognizes its own output.
     about = {"Software": f"clod-adapter {package_version()}"} if Path(path).suffix.lower() == ".png" else None
     with atomic_path(path) as part:

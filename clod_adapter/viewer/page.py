@@ -31,7 +31,7 @@ from clod_adapter.viewer.payload import Payload, page_config
 PAGE, STYLE, SCRIPT = "page.html", "viewer.css", "viewer.js"
 ELEMENT = "clod-model"  # id of the elements with the splats
 PART = 3 << 24  # bytes of a script element, a multiple of 3; browsers limit strings to about 5e8
-POSTER_SIDE, POSTER_BYTES = 512, 40_000  # of the picture shown while the page loads: pixels, bytes before base64
+POSTER_SIDE, POSTER_QUALITY = 512, 60  # of the picture shown while the page loads: pixels, and of JPEG
 
 
 def served_page(config: Mapping[str, Any]) -> bytes:
@@ -47,23 +47,10 @@ def write_viewer_page(
     virtual_scale: float | None = None,
     exact: bool = False,
 ) -> tuple[Gaussians, tuple[str, ...]]:
-    """Writes the page as one file that includes the splats, for opening without a server or network.
+    """Writes the page as one file with the splats in it; the same arguments give the same bytes.
 
-    The same arguments give the same bytes; what is installed has no influence.
-
-    Args:
-        model: with or without a dial.
-        cameras: selectable viewpoints, in the frame of the Gaussians (relative to the origin); by default the stored
-            ones. A picture from the first one is shown while the page loads.
-        virtual_scale: the initial dial value, >= 0; None for 1 with photographs, else 0 (everything), and then what
-            suits the device.
-        exact: includes the splats as float32, not as SPZ, which has an eighth of the size.
-
-    Returns:
-        The model's Gaussians as the page shows them, and a line for each loss.
-
-    Raises:
-        ClodError: the file cannot be written, or SPZ cannot store the splat.
+    ``virtual_scale`` is as in ``page_config``; ``exact`` includes float32, not SPZ. Returns the Gaussians as the page
+    shows them, and a line for each loss.
     """
     shown, placed = cameras or model.cameras, model.placed and not cameras
     with atomic_path(path) as temporary:
@@ -86,14 +73,10 @@ def _poster(gaussians: Gaussians, camera: Camera, virtual_scale: float) -> str:
     small = replace(camera, K=K, width=width, height=height)
     dial = 1.0 if gaussians.sigma_d is None else virtual_scale
     image = Image.fromarray(render(gaussians, small, dial).pixels.cpu().numpy())
-    for quality in (80, 60, 40, 20, 5):
-        buffer = BytesIO()
-        image.save(buffer, "JPEG", quality=quality)
-        if buffer.tell() <= POSTER_BYTES:
-            break
-    return (
-        f'<img id="poster" alt="" src="data:image/jpeg;base64,{base64.b64encode(buffer.getvalue()).decode("ascii")}">'
-    )
+    buffer = BytesIO()
+    image.save(buffer, "JPEG", quality=POSTER_QUALITY)
+    text = base64.b64encode(buffer.getvalue()).decode("ascii")
+    return f'<img id="poster" alt="" src="data:image/jpeg;base64,{text}">'
 
 
 def policy(connect: str = "") -> str:

@@ -17,7 +17,6 @@ from plyfile import PlyData, PlyElement
 from torch import Tensor
 
 from clod_adapter._support.text import as_text
-from clod_adapter._support.version import package_version
 from clod_adapter.calibration import Calibration
 from clod_adapter.cameras import Camera
 from clod_adapter.gaussians import OPAQUE, Gaussians
@@ -33,14 +32,7 @@ BLOCK_ROWS = 1 << 14
 
 @dataclass(frozen=True)
 class Payload:
-    """A splat for the page.
-
-    Attributes:
-        name: the file name without its folder.
-        gaussians: without SH degrees that are 0; means are relative to the checkpoint's origin.
-        calibration: the file's calibration table, if any.
-        origin: the checkpoint's.
-    """
+    """A splat for the page, without SH degrees that are 0; means are relative to the origin."""
 
     name: str
     gaussians: Gaussians
@@ -77,17 +69,9 @@ class Payload:
             yield _values(self.gaussians, slice(start, start + BLOCK_ROWS)).astype("<f4", copy=False).tobytes()
 
     def packed(self, file: str | Path, exact: bool = False) -> tuple[bytes, Gaussians, tuple[str, ...]]:
-        """The splat in one piece: as SPZ, of which rows that are near one another take a tenth less, or as PLY.
+        """The splat as SPZ, of which rows that are near one another take a tenth less, or ``exact`` as PLY.
 
-        Args:
-            file: a temporary name.
-            exact: PLY.
-
-        Returns:
-            The bytes, the Gaussians in them, and a line for each loss.
-
-        Raises:
-            ClodError: as ``file_formats.write``.
+        ``file`` is a temporary name. Returns the bytes, the Gaussians in them, and a line for each loss.
         """
         if exact:
             return b"".join(self.blocks()), self.gaussians, ()
@@ -108,20 +92,14 @@ def page_config(
     others: Sequence[Mapping[str, Any]] = (),
     placed: bool = False,
 ) -> dict[str, Any]:
-    """The page's configuration.
+    """The page's configuration. ``model`` and ``base`` have a ``name``, and ``href`` or ``element`` for their data.
 
-    Args:
-        model, base: their ``name``, and where the data are: ``href`` on the server, or ``element`` in the page.
-        cameras: selectable viewpoints, in this order, in the frame of the Gaussians.
-        virtual_scale: the initial dial value, >= 0; None for 1 with photographs, else 0 (everything), and then what
-            suits the device.
-        others: further models to switch to.
-        placed: the cameras are not photographs'; the page levels them.
+    ``virtual_scale`` is the first dial value; None for 1 with photographs, else 0 (everything), and then what suits the
+    device. ``placed``: the cameras are not photographs'; the page levels them.
     """
     return {
-        "version": package_version(), "title": model["name"], "model": model, "base": base,
-        "others": list(others), "cameras": [_camera(camera) | {"placed": placed} for camera in cameras],
-        "virtual_scale": virtual_scale,
+        "title": model["name"], "model": model, "base": base, "others": list(others),
+        "cameras": [_camera(camera) | {"placed": placed} for camera in cameras], "virtual_scale": virtual_scale,
     }  # fmt: skip
 
 
@@ -131,9 +109,8 @@ def dial_of(gaussians: Gaussians) -> dict[str, Tensor]:
     return {name: tensors[name] for name in dial_columns(tensors)}
 
 
-def _values(gaussians: Gaussians, rows: slice) -> np.ndarray:
+def _values(g: Gaussians, rows: slice) -> np.ndarray:
     """``[n, P]`` float32 values of these rows in the order of the header."""
-    g = gaussians
     count = len(g.means[rows])
     parts = [
         g.means[rows], g.sh0[rows].reshape(count, 3), g.shN[rows].transpose(1, 2).reshape(count, -1),
@@ -153,10 +130,10 @@ def _along_curve(means: Tensor) -> Tensor:
 
 
 def _camera(camera: Camera) -> dict[str, Any]:
-    def nested_list(matrix: torch.Tensor) -> list[list[float]]:
+    def digits(matrix: torch.Tensor) -> list[list[float]]:
         return [[float(f"{value:.9g}") for value in row] for row in matrix.tolist()]  # full float32 precision
 
     return {
-        "name": camera.name, "viewmat": nested_list(camera.viewmat), "K": nested_list(camera.K), "width": camera.width,
+        "name": camera.name, "viewmat": digits(camera.viewmat), "K": digits(camera.K), "width": camera.width,
         "height": camera.height, "near": camera.near,
     }  # fmt: skip

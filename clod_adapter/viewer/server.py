@@ -10,7 +10,6 @@ import re
 import socket
 import socketserver
 import sys
-import threading
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -27,14 +26,7 @@ IDLE_TIMEOUT = 30  # of a connection between responses, seconds
 
 @dataclass(frozen=True)
 class Response:
-    """The response to a path.
-
-    Attributes:
-        media_type: of Content-Type.
-        size: in bytes.
-        blocks: returns the bytes in pieces, called for each request.
-        policy: Content-Security-Policy.
-    """
+    """The response to a path; ``blocks`` returns its bytes in pieces, ``policy`` is the Content-Security-Policy."""
 
     media_type: str
     size: int
@@ -43,32 +35,20 @@ class Response:
 
 
 class Server(ThreadingHTTPServer):
-    """Serves ``responses`` on loopback once ``serve_forever`` runs; a context manager that closes the port.
-
-    Args:
-        responses: by path with its leading slash; a query (``?...``) is ignored.
-        port: 0 selects a free one.
-
-    Raises:
-        ClodError: the port is in use or not permitted.
-    """
+    """Serves ``responses``, by path, on loopback once ``serve_forever`` runs; port 0 selects a free one."""
 
     # Not daemons: a thread that holds a tensor when the interpreter exits would abort the process.
     daemon_threads = False
-    # server_close joins instead; socketserver's would also wait for threads that a Ctrl-C kept from starting.
-    block_on_close = False
     allow_reuse_address = sys.platform != "win32"  # on Windows two servers would share a port
 
     def __init__(self, responses: Mapping[str, Response], port: int = 0) -> None:
         self.responses = dict(responses)
         self._sockets: set[socket.socket] = set()
-        self._threads_of_requests: list[threading.Thread] = []
         try:
             super().__init__((HOST, port), _Handler)
         except OSError as error:
             raise ClodError(
-                f"port {port} of {HOST} is not available ({error.strerror or error}); choose another, or 0 for a free "
-                "one"
+                f"port {port} of {HOST} is not available ({error.strerror}); choose another, or 0 for a free one"
             ) from error
 
     @property
@@ -88,11 +68,6 @@ class Server(ThreadingHTTPServer):
         self._sockets.add(request)
         return request, address
 
-    def process_request(self, request: Any, client_address: Any) -> None:
-        thread = threading.Thread(target=self.process_request_thread, args=(request, client_address))
-        self._threads_of_requests = [*(each for each in self._threads_of_requests if each.is_alive()), thread]
-        thread.start()
-
     def shutdown_request(self, request: Any) -> None:
         self._sockets.discard(request)
         super().shutdown_request(request)
@@ -103,9 +78,6 @@ class Server(ThreadingHTTPServer):
             with suppress(OSError):
                 request.shutdown(socket.SHUT_RDWR)
         super().server_close()
-        for thread in self._threads_of_requests:
-            if thread.is_alive():  # false for one that never started
-                thread.join()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Ignores connections closed by the browser, for example with its tab."""
@@ -120,13 +92,8 @@ class _Handler(BaseHTTPRequestHandler):
     server: Server
 
     def do_GET(self) -> None:
-        self._respond(body=True)
-
-    def do_HEAD(self) -> None:
-        self._respond(body=False)
-
-    def _respond(self, *, body: bool) -> None:
-        if not names_loopback(self.headers.get_all("Host") or []):
+        hosts = self.headers.get_all("Host") or []
+        if len(hosts) != 1 or not LOOPBACK.fullmatch(hosts[0].lower()):  # an ssh tunnel may have another port
             self.send_error(HTTPStatus.MISDIRECTED_REQUEST)
             return
         response = self.server.responses.get(self.path.partition("?")[0])
@@ -139,9 +106,11 @@ class _Handler(BaseHTTPRequestHandler):
         self.send_header("Content-Security-Policy", f"{response.policy}; frame-ancestors 'none'")
         self.end_headers()
         self.connection.settimeout(None)  # a page that is busy with a file's first rows takes no bytes
-        for block in response.blocks() if body else ():
+        for block in response.blocks() if self.command == "GET" else ():
             self.wfile.write(block)
         self.connection.settimeout(self.timeout)
+
+    do_HEAD = do_GET
 
     def end_headers(self) -> None:
         """Adds the headers of every response, including errors."""
@@ -154,8 +123,3 @@ class _Handler(BaseHTTPRequestHandler):
 
     def log_message(self, format: str, *args: Any) -> None:
         """Requests are not logged."""
-
-
-def names_loopback(hosts: list[str]) -> bool:
-    """Whether the Host headers name this machine, with any port (an ssh tunnel may have another)."""
-    return len(hosts) == 1 and LOOPBACK.fullmatch(hosts[0].lower()) is not None
