@@ -24,6 +24,5 @@ def test_a_process_is_timed_by_its_messages() -> None:
         common.Process([sys.executable, "-c", "raise SystemExit(3)"])
 
 
-@pytest.mark.parametrize("power", [0.5, 1.0, 2.0])
-def test_an_exponent_is_that_of_the_power(power: float) -> None:
-    assert scaling.exponent([(n, 3 * n**power) for n in scaling.SIZES]) == pytest.approx(power)
+def test_an_exponent_is_that_of_the_power() -> None:
+    assert scaling.exponent([(n, 3 * n**0.5) for n in scaling.SIZES]) == pytest.approx(0.5)

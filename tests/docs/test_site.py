@@ -43,13 +43,6 @@ def test_links_and_pictures_exist() -> None:
         assert picture.suffix == ".svg" or any(picture.name in text for text in texts.values()), picture.name
 
 
-def test_colours_match_the_reports() -> None:
-    ours, theirs = DOCS / "style.css", ROOT / "clod_adapter" / "report" / "style.css"
-    pairs = [re.findall(r"(--[a-z0-9-]+): ([^;]+);", path.read_text(encoding="utf-8")) for path in (ours, theirs)]
-    names = {name for name, _ in pairs[1]}
-    assert [(name, value) for name, value in pairs[0] if name in names] == pairs[1]
-
-
 def test_the_built_site(tmp_path: Path) -> None:
     """Built as by ``make docs``, where a broken link is an error; its search covers all pages and public names."""
     pytest.importorskip("mkdocs", reason="pip install '.[docs]'")

@@ -16,7 +16,7 @@ from clod_adapter.errors import ClodError
 from clod_adapter.evaluation import frame_times
 from clod_adapter.evaluation.frame_times import PASSES, VIEWS, FrameTimes, settled, time_frames
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.progress import Progress, Stopped
+from clod_adapter.progress import Stopped
 from scenes import gaussians, ring
 
 DIALS = (1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 7.0)
@@ -88,10 +88,7 @@ def test_noise_is_levelled_and_a_real_increase_is_not() -> None:
 
 
 def test_stopping_and_no_cameras() -> None:
-    def stop(now: Progress) -> bool:
-        return False
-
     with pytest.raises(Stopped):
-        of_one(progress=stop)
+        of_one(progress=lambda now: False)
     with pytest.raises(ClodError, match="no cameras to time"):
         time_frames([(adapted(), DIALS)], [])
