@@ -116,7 +116,7 @@ class Export:
         if "--3dtiles" in self.args.folder:
             prepare_kernels(self.console, found[0].means.device, training=False)
             with self.console.meter("errors of levels") as meter:
-                errors = geometric_errors(found, looking(self.cameras, found[-1]), progress=meter)
+                errors = geometric_errors(found, looking(self.cameras), progress=meter)
             for note in write_tileset(index.parent, found, errors.tolist(), origin=self.model.origin):
                 self.console.note(note)
             return counts

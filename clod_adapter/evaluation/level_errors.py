@@ -26,33 +26,21 @@ from torch import Tensor
 
 from clod_adapter.calibration import Viewpoint
 from clod_adapter.cameras import Camera, spread
-from clod_adapter.equation.distances import median_distance
+from clod_adapter.equation.distances import camera_of, median_distance
+from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.formats.tileset import ALLOWED
 from clod_adapter.progress import Listener, Phase, tell
 from clod_adapter.render import render
-from clod_adapter.training.camera_placement import FIELD, HEIGHT, WIDTH
+from clod_adapter.training.camera_placement import HEIGHT, WIDTH
 
 VIEWS = 16  # cameras that errors are measured from
 
 
-def looking(places: Sequence[Camera | Viewpoint], gaussians: Gaussians) -> list[Camera]:
-    """The cameras; a viewpoint has no direction, and looks at the median of the centres."""
-    middle = gaussians.means.median(0).values.cpu().double().numpy()
-    return [place if isinstance(place, Camera) else _toward(middle, place) for place in places]
-
-
-def _toward(target: np.ndarray, viewpoint: Viewpoint) -> Camera:
-    place = np.array([viewpoint.x, viewpoint.y, viewpoint.z])
-    forward = target - place
-    forward = forward / max(float(np.linalg.norm(forward)), 1e-12) if forward.any() else np.array([0.0, 0.0, 1.0])
-    right = np.cross(np.eye(3)[np.abs(forward).argmin()], forward)
-    right /= np.linalg.norm(right)
-    viewmat, focal = np.eye(4), WIDTH / 2 / np.tan(np.radians(FIELD) / 2)
-    viewmat[:3, :3] = right, np.cross(forward, right), forward
-    viewmat[:3, 3] = -viewmat[:3, :3] @ place
-    K = torch.tensor([[focal, 0, WIDTH / 2], [0, focal, HEIGHT / 2], [0, 0, 1]], dtype=torch.float32)
-    return Camera(torch.from_numpy(viewmat).float(), K.float(), WIDTH, HEIGHT)
+def looking(places: Sequence[Camera | Viewpoint]) -> list[Camera]:
+    """The cameras, those of viewpoints in the size of placed ones; without viewpoints that have no direction."""
+    known = [place for place in places if isinstance(place, Camera) or place.fov > 0]
+    return [place if isinstance(place, Camera) else camera_of(place, WIDTH, HEIGHT) for place in known]
 
 
 @torch.no_grad()
@@ -60,6 +48,8 @@ def geometric_errors(
     levels: Sequence[Gaussians], cameras: Sequence[Camera], *, progress: Listener | None = None
 ) -> np.ndarray:
     """``[L]`` float64, world units, ascending from 0, of levels without a dial, the finest first."""
+    if not cameras:
+        raise ClodError("the cameras of the file have no direction to measure its levels in; give --images")
     picked = spread(cameras, VIEWS)
     found = np.zeros((len(picked), len(levels)))
     for done, view in enumerate(picked):
