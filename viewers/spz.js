@@ -4,7 +4,6 @@ const MAGIC = 0x5053474e, HEADER = 16;
 const ANTIALIASED = 1, EXTENDED = 2, RECORD = 0x434c0001; // flags: compensated opacities, vendor records; type of our record
 const COLOR = 0.15; // colours are 0.15 f_dc + 0.5
 
-/** The Gaussians of a file, as in read.js. */
 export async function readSpz(file) {
   const stream = new Blob([file]).stream().pipeThrough(new DecompressionStream("gzip"));
   const bytes = new Uint8Array(await new Response(stream).arrayBuffer()), view = new DataView(bytes.buffer);

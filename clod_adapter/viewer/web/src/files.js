@@ -7,7 +7,6 @@ import { applyLink, reset } from "./views.js";
 
 const OPENING = 30; // frames per second that are held when a file opens
 
-/** What an entry of the configuration holds. */
 const fetchModel = async ({ name, href, element }) => readFile(href ? await download(href) : included(element), name);
 
 /** The bytes that the elements with this id have in base64; removes these elements, for their memory. */

@@ -9,7 +9,6 @@ const Y_DOWN = [0, -1, 0]; // COLMAP's y axis points down
 const FLAT = Math.log(2); // a flat Gaussian's least scale is at most half the next one
 const BESIDE = Math.cos(Math.PI / 5), SURE = 0.3; // share of the flat ones beside the axis, by chance 0.19
 
-/** `read`: of a file, as in viewers/read.js, with its name. */
 export function createModel(gl, read) {
   const { name, count, degree, means, opacityLogits, logScales: s, sigmaD, growthD, settings, screenFilter, calibration } = read;
   const { records, sh } = upload(gl, read), extent = extentOf(read), worker = startWorker();

@@ -21,7 +21,6 @@ function psnrAt(rows, dial) {
   return a.psnr + (Math.log(dial / a.virtual_scale) / Math.log(b.virtual_scale / a.virtual_scale)) * (b.psnr - a.psnr);
 }
 
-/** Shows the present state on the controls. */
 export function update() {
   const { model, base } = stage, hasDial = Boolean(model?.attenuation);
   const has = { model: Boolean(model), dial: hasDial, comparison: hasDial || Boolean(base) };
