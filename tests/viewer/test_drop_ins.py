@@ -86,14 +86,11 @@ def read_picture(file: Any) -> np.ndarray:
 
 def settled(page: Any) -> np.ndarray:
     """The picture, once it has stopped changing: both viewers sort in a worker."""
-    before = None
-    for _ in range(60):
+    before, picture = b"", page.screenshot()
+    while picture != before:
         page.wait_for_timeout(250)
-        picture = read_picture(io.BytesIO(page.screenshot()))
-        if before is not None and np.array_equal(picture, before):
-            break
-        before = picture
-    return picture
+        before, picture = picture, page.screenshot()
+    return read_picture(io.BytesIO(picture))
 
 
 def assert_the_wgsl_of_playcanvas_gives_the_equation(page: Any, about: dict[str, Any]) -> None:
@@ -134,7 +131,7 @@ def assert_the_wgsl_of_playcanvas_gives_the_equation(page: Any, about: dict[str,
         torch.testing.assert_close(scale[alpha > 0], want.growth[alpha > 0], rtol=1e-4, atol=0)
 
 
-@pytest.mark.parametrize(("viewer", "suffix"), [("spark", "ply"), ("spark", "spz"), ("playcanvas", "ply")])
+@pytest.mark.parametrize(("viewer", "suffix"), [("spark", "spz"), ("playcanvas", "ply")])
 def test_the_dial_is_as_exact_as_the_viewer(tabs: Any, viewer: str, suffix: str) -> None:
     about = json.loads((KIT / "cameras.json").read_text())["cameras"][0]
     undialled = 0.0
@@ -156,7 +153,7 @@ def test_the_dial_is_as_exact_as_the_viewer(tabs: Any, viewer: str, suffix: str)
         page.evaluate("dial.hold(2000)")  # out of reach
         page.wait_for_function("dial.s === dial.file.settings.max_sv")
         page.evaluate("dial.set(2)")
-        page.wait_for_timeout(500)
+        page.wait_for_timeout(200)
         assert page.evaluate("dial.s") == 2
         if viewer == "playcanvas":
             assert_the_wgsl_of_playcanvas_gives_the_equation(page, about)

@@ -73,35 +73,27 @@ def dial_of(shown: Shown) -> float:
 
 
 def test_the_law_is_that_of_python(tab_of_model: Shown) -> None:
-    """On sequences with steps of the load, noise, outliers, and times of 0."""
+    """On frames with steps of the load, noise, outliers, and a time of 0."""
     random = np.random.default_rng(0)
-    sequences = []
-    for max_sv in (1.0, 5.0, 12.0):
-        load = np.repeat([1.0, 2.5, 0.3, 0.9], 20) * random.lognormal(0, 0.2, 80)
-        load[::13] *= 5
-        load[40] = 0
-        frames = [(1.0, 20.0)]
-        for each in load:
-            dial = next_dial(frames, 10.0, max_sv)
-            frames.append((dial, round(float(each * 18 / dial), 3)))
-        sequences.append((frames, max_sv))
-    script = """async ([source, sequences]) => {
+    load = np.repeat([1.0, 2.5, 0.3, 0.9], 20) * random.lognormal(0, 0.2, 80)
+    load[::13] *= 5
+    load[40] = 0
+    frames = [(1.0, 20.0)]
+    for each in load:
+        dial = next_dial(frames, 10.0, 5.0)
+        frames.append((dial, round(float(each * 18 / dial), 3)))
+    script = """async ([source, frames]) => {
         const { excess, nextDial } = await import(`data:text/javascript;base64,${source}`);
-        return sequences.map(([frames, maxSv]) => frames.map((_, k) => {
-            const known = frames.slice(0, k + 1);
-            return [excess(known, 10), nextDial(known, 10, maxSv)];
-        }));
+        const known = frames.map((_, k) => frames.slice(0, k + 1));
+        return known.map((each) => [excess(each, 10), nextDial(each, 10, 5)]);
     }"""
     blank = tab_of_model.page.context.new_page()  # of no policy
-    found = blank.evaluate(script, [base64.b64encode(LAW.read_bytes()).decode(), sequences])
+    found = blank.evaluate(script, [base64.b64encode(LAW.read_bytes()).decode(), frames])
     blank.close()
-    want = [
-        [(excess(frames[: k + 1], 10.0), next_dial(frames[: k + 1], 10.0, max_sv)) for k in range(len(frames))]
-        for frames, max_sv in sequences
-    ]
-    for ours, theirs in zip(want, found, strict=True):
-        np.testing.assert_allclose(theirs, ours, rtol=1e-9, atol=1e-9)
-    assert len({dial for _, dial in want[1]}) > 20
+    known = [frames[: k + 1] for k in range(len(frames))]
+    want = [(excess(each, 10.0), next_dial(each, 10.0, 5.0)) for each in known]
+    np.testing.assert_allclose(found, want, rtol=1e-9, atol=1e-9)
+    assert len({dial for _, dial in want}) > 20
 
 
 def test_the_dial_follows_a_load_that_is_switched_on_and_off(held: Shown) -> None:
