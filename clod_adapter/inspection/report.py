@@ -116,9 +116,10 @@ def inspect(path: str | Path) -> Inspection:
     columns: tuple[tuple[str, str], ...] = ()
     if head:
         columns = tuple((column.name, str(np.dtype(column.val_dtype))) for column in head.ply["vertex"].properties)
-        encoding = f"binary {'little' if head.ply.byte_order in '<=' else 'big'}-endian"
+        order = "little" if head.ply.byte_order in "<=" else "big"
+        encoding = "ascii" if head.ply.text else f"binary {order}-endian"
     splat = Splat(
-        sh_degree=degree, encoding="ascii" if head and head.ply.text else encoding, columns=columns,
+        sh_degree=degree, encoding=encoding, columns=columns,
         extra=() if head and is_packed(head.ply) else extra_columns([name for name, _ in columns], degree),
         comments=tuple(comment for comment in source.comments if not comment.startswith(PREFIX)), values=values,
         tau=tau, origin=rows.origin, dial=dial, screen_filter=stated_filter(source),
@@ -149,21 +150,18 @@ def extra_columns(names: Sequence[str], sh_degree: int) -> tuple[str, ...]:
 
 def anomalies_of(splat: Splat, questions: dict[str, tuple[float, float]]) -> list[Anomaly]:
     """The anomalies of a file; ``questions`` are the ranges of columns that look activated, by name."""
-    v, wide = splat.values, [name for name, kind in splat.columns if kind == "float64"]
+    v = splat.values
     counted = [("unusable", gone, f"rows are not used: {reason}") for reason, gone in v.dropped.items()]
     counted += [
         ("infinite_opacity", v.infinite_opacity, "have opacity = +inf, which is fully opaque"),
         ("doubles", v.doubles, "have the same position as another Gaussian"),
         ("far", v.far, f"are at least {FAR:g} times as far from the centre as 90 % of all"),
         ("giant", v.giant, "are larger than half the scene"),
-        ("double_precision", len(wide), f"properties are double: {_list(wide)}"),
     ]
     found = [Anomaly(kind, count, f"{count:,} {says}") for kind, count, says in counted if count]
     for name, (low, high) in questions.items():
         says = f"{name} from {low:.4g} to {high:.4g}: looks activated, and is read as activated here; adapting needs"
         found.append(Anomaly("activated", 0, f"{says} --activated {choice_of(questions)}"))
-    if splat.sh_degree and not v.used_sh_degree:
-        found.append(Anomaly("empty_harmonics", 0, "all higher harmonics are 0: no view-dependent colour"))
     if any(splat.origin):
         found.append(Anomaly("far_from_0", 0, "coordinates are far from 0; they are read relative to a local origin"))
     if splat.screen_filter.compensate:

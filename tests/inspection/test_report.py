@@ -9,8 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from plyfile import PlyData, PlyElement
 
 import scenes
@@ -28,7 +26,6 @@ from formats import CALIBRATION, inria_rows, with_columns
 from packing import write_packed
 
 ATTENUATION = AttenuationConfig(tau=0.01, max_sv=6.0, cut="soft", reference_distance=3.5)
-each_example = settings(deadline=None, max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 def table(n: int = 300, degree: int = 1, seed: int = 0) -> np.ndarray:
@@ -74,35 +71,30 @@ def test_a_plain_file(tmp_path: Path) -> None:
     assert v.needles == (scales[2] > 10 * scales[1]).mean()
 
 
-@each_example
-@given(st.integers(0, 4), st.integers(0, 4), st.integers(0, 3))
-def test_empty_sh_degrees_are_those_that_adapting_skips(tmp_path: Path, degree: int, used: int, seed: int) -> None:
-    vertex = table(20, degree, seed)
-    bands = (degree + 1) ** 2 - 1
+@pytest.mark.parametrize(("degree", "used"), [(0, 0), (2, 1), (3, 0), (4, 4)])
+def test_empty_sh_degrees_are_those_that_adapting_skips(tmp_path: Path, degree: int, used: int) -> None:
+    vertex, bands = table(20, degree), (degree + 1) ** 2 - 1
     for name in vertex.dtype.names or ():
         if name.startswith("f_rest_") and int(name[7:]) % bands >= (used + 1) ** 2 - 1:
             vertex[name] = 0
     found, splat = seen(write(tmp_path / "a.ply", vertex))
     lean = load(tmp_path / "a.ply").gaussians.without_empty_bands()
-    assert splat.values.used_sh_degree == lean.sh_degree == min(used, degree)
+    assert splat.values.used_sh_degree == lean.sh_degree == used
     assert any("skipped in training" in line for line in found.left_out) == (used < degree)
-    assert ("empty_harmonics" in kinds(found)) == (degree > 0 == lean.sh_degree)
 
 
-@each_example
-@given(st.integers(0, 999))
-def test_dropped_rows_are_those_that_load_drops(tmp_path: Path, seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    vertex = table(40, 1, seed)
-    for name in rng.choice(vertex.dtype.names, 3):
+def test_dropped_rows_are_those_that_load_drops(tmp_path: Path) -> None:
+    rng, vertex = np.random.default_rng(0), table(40)
+    for name in rng.choice(vertex.dtype.names, 6):
         vertex[name][rng.integers(40, size=2)] = rng.choice([np.nan, np.inf, -np.inf])
+    vertex["opacity"][5] = np.inf
     for k in range(4):
         vertex[f"rot_{k}"][:2] = 0
     v, base = seen(write(tmp_path / "a.ply", vertex))[1].values, load(tmp_path / "a.ply")
-    assert v.count == len(base.gaussians) and v.total == 40
+    assert v.count == len(base.gaussians) < 38 and v.total == 40
     notes = [note for note in base.notes if "dropped" in note]
     assert notes == [f"{gone} of 40 Gaussians dropped: {reason}" for reason, gone in v.dropped.items()]
-    assert v.infinite_opacity == int((base.gaussians.opacity_logits == torch.inf).sum())
+    assert v.infinite_opacity == int((base.gaussians.opacity_logits == torch.inf).sum()) > 0
     assert v.position[0].greatest == float(base.gaussians.means[:, 0].max())
 
 
@@ -113,18 +105,16 @@ def test_anomalies_are_counted(tmp_path: Path) -> None:
         vertex[name][10:14] = vertex[name][9]  # four on top of one
         vertex[name][20] = 1e4
     vertex["scale_1"][30:32] = 9.0
-    wide = with_columns(vertex, label=1).astype(
-        [(n, "f8" if n == "x" else "f4") for n in (*(vertex.dtype.names or ()), "label")]
-    )
-    found, splat = seen(write(tmp_path / "a.ply", wide, comments=("SplatRenderMode: mip",)))
-    assert kinds(found) == {
-        "infinite_opacity": 3, "doubles": 4, "far": 1, "giant": 2, "double_precision": 1, "antialiased": 0,
-    }  # fmt: skip
+    labelled = with_columns(vertex, label=1)
+    found, splat = seen(write(tmp_path / "a.ply", labelled, comments=("SplatRenderMode: mip",)))
+    assert kinds(found) == {"infinite_opacity": 3, "doubles": 4, "far": 1, "giant": 2, "antialiased": 0}
     assert splat.extra == ("label",) and any("label" in line for line in found.left_out)
-    for axis in "xyz":  # all in one place, and -0 is 0
-        vertex[axis] = np.where(np.arange(600) % 2, -0.0, 0.0) if axis != "z" else 1.5
+    vertex["x"], vertex["y"], vertex["z"] = np.where(np.arange(600) % 2, -0.0, 0.0), 0, 1.5  # -0 is 0
     v = seen(write(tmp_path / "b.ply", vertex))[1].values
     assert v.doubles == 599 and v.far == v.giant == 0
+    vertex["x"] = np.nan
+    with pytest.raises(ClodError, match="c.ply: no usable Gaussian in it, of 600 rows"):
+        inspect(write(tmp_path / "c.ply", vertex))
 
 
 def test_values_that_look_activated_are_read_as_activated(tmp_path: Path) -> None:
@@ -164,18 +154,16 @@ def test_other_trainers_encodings_and_coordinates(tmp_path: Path) -> None:
     assert sorted(splat.columns) == sorted(packed) and "quantised" in found.notes[0]
 
 
-@pytest.mark.parametrize("growth", [False, True])
-def test_a_dial(tmp_path: Path, growth: bool) -> None:
-    g = with_dial(scenes.gaussians(40, 1, 0), attenuation=ATTENUATION)
-    g = g.replace(growth_d=torch.linspace(-1, 3, 40)) if growth else g
+def test_a_dial(tmp_path: Path) -> None:
+    g = with_dial(scenes.gaussians(40, 1, 0), attenuation=ATTENUATION, growth_d=torch.linspace(-1, 3, 40))
     save(tmp_path / "a.ply", g, calibration=CALIBRATION)
-    (found, splat), names = seen(tmp_path / "a.ply"), "sigma_d and growth_d" if growth else "sigma_d"
+    (found, splat), names = seen(tmp_path / "a.ply"), "sigma_d and growth_d"
     assert splat.dial is not None and splat.dial.calibration == CALIBRATION and splat.dial.attenuation == ATTENUATION
     assert found.what == f"an adapted splat, with {names}, PLY" and "clod-adapter" in (found.writer or "")
     assert splat.values.sigma is not None and splat.values.sigma.least > 0 and splat.comments == splat.extra == ()
     assert splat.tau == 0.01 and any(line.startswith(f"dial         {names}, s = 1 to 6") for line in lines_of(found))
     rows = [line.split() for line in lines_of(found) if line.startswith("growth_d")]
-    assert rows == ([["growth_d", "-1", "-0.96", "1", "2.96", "3"]] if growth else [])
+    assert rows == [["growth_d", "-1", "-0.96", "1", "2.96", "3"]]
     # Another tool's column of the same name, which is no growth without a sigma_d.
     _, splat = seen(write(tmp_path / "c.ply", with_columns(table(), growth_d=0.5)))
     assert splat.values.growth is None and splat.extra == ("growth_d",)
@@ -198,10 +186,3 @@ def test_adapters_and_states(tmp_path: Path) -> None:
     assert found.about is not None and "interrupted run" in found.what
     assert (found.about["count"], found.about["steps"], found.about["belongs"]["base"]) == (7, 9, "abc")
     json.dumps(jsonable(found.as_dict()), allow_nan=False)
-
-
-def test_files_without_a_usable_gaussian_are_refused(tmp_path: Path) -> None:
-    vertex = table(12)
-    vertex["x"] = np.nan
-    with pytest.raises(ClodError, match="a.ply: no usable Gaussian in it, of 12 rows"):
-        inspect(write(tmp_path / "a.ply", vertex))
