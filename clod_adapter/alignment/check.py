@@ -16,7 +16,6 @@ import torch
 from torch import Tensor
 
 from clod_adapter.cameras import View, spread
-from clod_adapter.config import require
 from clod_adapter.equation.distances import in_frustum
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.losses import unit
@@ -37,25 +36,15 @@ DOUBTFUL = 6.0  # dB above the mean colours, below which the frame may be wrong;
 
 @dataclass(frozen=True)
 class Alignment:
-    """Agreement of renders and photographs. PSNRs are in dB and pooled: of the mean squared error over the views.
+    """Agreement of renders and photographs; PSNRs are of the mean squared error over the views, NaN without any."""
 
-    Attributes:
-        views: number of views compared; photographs of one colour are skipped.
-        in_view: share of the Gaussians whose centre projects into any of the views, in [0, 1].
-        psnr: of the renders; NaN, like the next four, if no view was compared.
-        mean_colour_psnr: of each photograph's mean colour.
-        white_psnr: of the renders over white.
-        correlation: of renders and photographs, each minus its mean colour, in [-1, 1].
-        explained: share of the views whose render has a smaller error than the mean colour, in [0, 1].
-    """
-
-    views: int
-    in_view: float
-    psnr: float
-    mean_colour_psnr: float
-    white_psnr: float
-    correlation: float
-    explained: float
+    views: int  # number of views compared; photographs of one colour are skipped
+    in_view: float  # share of the Gaussians whose centre projects into any of the views
+    psnr: float  # of the renders
+    mean_colour_psnr: float  # of each photograph's mean colour
+    white_psnr: float  # of the renders over white
+    correlation: float  # of renders and photographs, each minus its mean colour
+    explained: float  # share of the views whose render has a smaller error than the mean colour
 
     @property
     def fits(self) -> bool:
@@ -90,7 +79,6 @@ class Alignment:
 @torch.no_grad()
 def check_alignment(gaussians: Gaussians, views: Sequence[View]) -> Alignment:
     """Renders at most MOST_VIEWS of the views, evenly spread, at s = 1, and compares them with the photographs."""
-    require(len(views) > 0, "number of views", len(views), "at least 1")
     views = spread(views, MOST_VIEWS)
     seen = torch.zeros(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
     for view in views:

@@ -32,6 +32,18 @@ NERFSTUDIO_TURNS = (
 )
 
 
+POSES = (
+    ("OpenGL poses", False, True,
+     "the cameras look along -z with y up (OpenGL), where COLMAP's look along z with y down: negate the y and z axes "
+     "of their poses"),
+    ("inverted poses", True, False,
+     "the poses are camera to world, where COLMAP's are world to camera: invert them"),
+    ("inverted OpenGL poses", True, True,
+     "the poses are camera to world in OpenGL's axes, where COLMAP's are world to camera: negate their y and z axes "
+     "and invert them"),
+)  # fmt: skip
+
+
 @dataclass(frozen=True)
 class Frame:
     """A frame of the file, ``x_cameras = scale rotation x_file + offset``, after the poses were corrected."""
@@ -59,7 +71,9 @@ class Frame:
 
 def known_frames(viewmats: Tensor, points: Tensor | None = None) -> list[Frame]:
     """The frames that follow from all cameras ``[V, 4, 4]`` and the scene's points, by which trainers normalize."""
-    return [*_poses(), *_axes(viewmats), *_nerfstudio(viewmats), *_gsplat(viewmats, points)]
+    here = torch.eye(3, dtype=torch.float64), 1.0, torch.zeros(3, dtype=torch.float64)
+    poses = [Frame(name, text, *here, inverted, opengl) for name, inverted, opengl, text in POSES]
+    return [*poses, *_axes(viewmats), *_nerfstudio(viewmats), *_gsplat(viewmats, points)]
 
 
 def into_file(viewmats: Tensor, rotation: Tensor, scale: float, offset: Tensor) -> Tensor:
@@ -87,24 +101,6 @@ def focus_of(viewmats: Tensor, rounds: int = 1) -> Tensor:
         away = (across @ (focus - centres)[:, :, None]).flatten(1).norm(dim=1)
         weights = 1 / away.clamp(min=max(0.01 * float(away.median()), 1e-9))
     return focus
-
-
-POSES = (
-    ("OpenGL poses", False, True,
-     "the cameras look along -z with y up (OpenGL), where COLMAP's look along z with y down: negate the y and z axes "
-     "of their poses"),
-    ("inverted poses", True, False,
-     "the poses are camera to world, where COLMAP's are world to camera: invert them"),
-    ("inverted OpenGL poses", True, True,
-     "the poses are camera to world in OpenGL's axes, where COLMAP's are world to camera: negate their y and z axes "
-     "and invert them"),
-)  # fmt: skip
-
-
-def _poses() -> Iterator[Frame]:
-    """Wrong conventions of the individual poses."""
-    here = torch.eye(3, dtype=torch.float64), 1.0, torch.zeros(3, dtype=torch.float64)
-    yield from (Frame(name, text, *here, inverted, opengl) for name, inverted, opengl, text in POSES)
 
 
 def _axes(viewmats: Tensor) -> Iterator[Frame]:

@@ -82,7 +82,6 @@ class Dial(nn.Module):
         config: settings of the training.
         typical: ``[N]`` normalised distances at which Gaussians are counted; no view's own, whose counts differ from
             the mean's: gradients that correct such differences cancel out, and only add noise.
-
     """
 
     # The parameter that sigma_d is trained through, and others whose culled rows have gradients too.

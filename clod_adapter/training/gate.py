@@ -65,16 +65,12 @@ class Gate:
     If s = 1 is more than WORSE below its best in two checks, and not recovering, the parameters return to the last
     state that was not, Adam's moments are forgotten, and the learning rates are halved; after HALVINGS of these the
     attributes are frozen. The first steps always cost some tenths that the next ones gain.
-
-    Attributes:
-        trainer: a ``trainer.Trainer``, which imports this module.
-        good: by name, the trained parameters of the last state that passed.
-        numbers: ``[4]`` float64: the best loss (``decibels_below``), rollbacks so far, CHECKS made, the last loss.
     """
 
-    def __init__(self, trainer: Any, views: Sequence[View], trained_on: bool) -> None:
+    def __init__(self, trainer: Any, views: Sequence[View], trained_on: bool) -> None:  # training.trainer.Trainer
         self.trainer, self.views, self.trained_on = trainer, views, trained_on
         self.base = [self._error(view, None) for view in views]
+        # The last state that passed; the best loss (``decibels_below``), rollbacks so far, CHECKS made, the last loss.
         self.good = {name: value.clone() for name, value in trainer.trained().items()}
         self.numbers = torch.tensor([math.inf, 0.0, 0.0, 0.0], dtype=torch.float64)
 

@@ -16,11 +16,7 @@ ENDING = (*PRESSED, *(getattr(signal, name) for name in WARNINGS if hasattr(sign
 class DeferredInterrupt:
     """Records signals of ENDING instead of raising KeyboardInterrupt; a second Ctrl-C or SIGTERM raises it at once.
 
-    Replaces Python's own handler only, from ``begin`` to the end of the block. A handler that the application has
-    installed stays, as does the handler in a thread other than the main one, which signals do not reach.
-
-    Attributes:
-        received: whether there was one.
+    From ``begin`` to the end of the block, in the main thread, and in place of Python's own handler only.
     """
 
     def __init__(self) -> None:

@@ -44,17 +44,11 @@ def adapt(
 ) -> Adapted:
     """Learns sigma_d for ``base`` on the training views of ``scene``, and tunes the other attributes lightly.
 
-    A ``dial.Dial`` gives the objective, for which each step samples ``batch`` views (1 by default) and follows the sum
-    of their gradients. Each view is rendered at one dial value, by ``schedule.Schedule``: s = 1 in half of the steps at
-    first, s = 0 in a quarter of these, and else log-uniform from 1 to 1.25 max_sv, to minimise ``w_s L_render(s)``,
-    where L_render is ``losses.photometric_loss`` and ``w_s`` is ``Dial.weight``. In most of the training, photographs
-    have half their size beyond s = 1, unless that is below 128 pixels a side. ``target_count.count_gradient`` moves
-    sigma_d so that the share of Gaussians kept at their typical distances follows the target-count curve.
-    The result is the mean of the parameters over the last fifth of the steps, so learning rates can stay large
-    to the end. A base that has a sigma_d is continued from. Training divides sigma_d by the reference distance; the
-    result has it in world units.
-
-    ``AdaptConfig.paper`` gives CLoD-GS's own training instead (``paper.PaperDial``).
+    A step follows the sum of the gradients of ``batch`` views, each rendered at one dial value (``schedule.Schedule``),
+    to minimise ``w_s L_render(s)``, where L_render is ``losses.photometric_loss`` and ``w_s`` is ``Dial.weight``.
+    ``target_count.count_gradient`` moves sigma_d so that the share of Gaussians kept at their typical distances follows
+    the target-count curve. The result is the mean of the parameters over the last fifth of the steps, in world units.
+    A base that has a sigma_d is continued from. ``AdaptConfig.paper`` gives CLoD-GS's own training instead.
 
     Training ends early, and returns the result so far with ``Adapted.interrupted``, in these cases. After the
     last one ``progress`` is called once more, with ``Progress.error``.
@@ -110,10 +104,7 @@ def adapt(
 def time_steps(
     base: Gaussians, scene: Scene, config: AdaptConfig, steps: int, subset: TrainableSubset | None = None
 ) -> tuple[float, float]:
-    """Seconds of a step of ``adapt``, and of all that does not depend on the number of steps.
-
-    The former is the mean of ``steps`` spread over the schedule, whose result is thrown away.
-    """
+    """Seconds of a step of ``adapt``, as the mean of ``steps`` over the schedule, and of all beside the steps."""
     began = time.perf_counter()
     views, watched = training_views(base, scene.train, config)
     trainer = Trainer(_initialized(base, views, config, None, None), views, config, subset, None, watched)

@@ -13,17 +13,11 @@ from torch import Tensor
 
 @dataclass
 class GradientSum:
-    """Gradients of the objective, summed over views.
+    """Gradients of the objective, summed over views."""
 
-    Attributes:
-        gradients: by name of the trained parameter, of its first ``trained`` rows.
-        kept: ``[trained]`` bool, the rows that at least one rendering kept.
-        loss: 0-d float64, photometric loss of each view, summed.
-    """
-
-    gradients: dict[str, Tensor]
-    kept: Tensor
-    loss: Tensor
+    gradients: dict[str, Tensor]  # by parameter, of its trained rows, the first ones
+    kept: Tensor  # [trained] bool, the rows that at least one rendering kept
+    loss: Tensor  # 0-d float64, photometric
     views: int = 1
 
     def __add__(self, other: GradientSum) -> GradientSum:

@@ -19,26 +19,15 @@ GOLDEN = (5**0.5 - 1) / 2
 
 @dataclass(frozen=True)
 class Schedule:
-    """What changes over a training; docs/method.md has the measurements. Shares of a training are in [0, 1].
+    """What changes over a training; docs/method.md has the measurements."""
 
-    Attributes:
-        full: share of the steps at s = 1 at first, a quarter of these at s = 0; it falls linearly to ``full_final`` of
-            itself: s = 1 is learned before the far end of the dial.
-        coarse: share of the training, at first, in which steps beyond s = 1 have photographs of half the size (not
-            small ones).
-        lr_final: final learning rates as a share of the first ones, between which they decay exponentially.
-        average: share of the steps, at the end, whose parameters are averaged for the result; of a training that ends
-            earlier in the schedule, share of the steps up to there.
-        rendered, counted: times max_sv, the largest dial values of steps, and of counts.
-    """
-
-    full: float = 0.5
-    full_final: float = 0.4
-    coarse: float = 0.9
-    lr_final: float = 0.1
-    average: float = 0.2
-    rendered: float = 1.25
-    counted: float = 1.5
+    full: float = 0.5  # share of the steps at s = 1 at first, a quarter of these at s = 0
+    full_final: float = 0.4  # of itself, to which that falls linearly: s = 1 is learned before the far end
+    coarse: float = 0.9  # share of the training in which steps beyond s = 1 have photographs of half the size
+    lr_final: float = 0.1  # final learning rates as a share of the first ones, between which they decay exponentially
+    average: float = 0.2  # share of the steps so far, at the end, whose parameters are averaged for the result
+    rendered: float = 1.25  # times max_sv, the largest dial value of steps
+    counted: float = 1.5  # and of counts
 
     def dial(self, place: float, share_done: float, end: float) -> float:
         """The dial value at ``place`` in [0, 1): 0, 1, or log-uniform from 1 to ``end``.

@@ -34,8 +34,7 @@ class TrainingState:
             ``first`` and ``second`` moment, and the ``mean`` if there is one. float32. ``steps.kept`` and ``steps.all``
             count Adam's steps of each row of parameters that move where the dial keeps the row, or always; int32.
             ``good`` and ``gate.checks`` are the gate's.
-        attenuation: the settings that sigma_d is defined by.
-        random: the state of NumPy's generator; order: the remaining views of this round, the next one last.
+        random, order: of ``schedule.ViewSampler``.
         loss: its running mean; averaged: the number of steps in the mean.
         steps, seconds: of training; start_seconds: before it.
     """
@@ -79,20 +78,13 @@ class TrainingState:
 
 @dataclass(frozen=True)
 class Watched:
-    """What the gate (``gate.Gate``) measured and did.
+    """What the gate (``gate.Gate``) measured and did."""
 
-    Attributes:
-        views: number of watched views; trained_on: whether training used them too, as there are few.
-        loss: dB that s = 1 of the result is below the base there, negative above (``gate.decibels_below``).
-        rollbacks: how often training returned to an earlier state, with half the learning rates.
-        frozen: whether the attributes were frozen in the end, and the dial alone was trained.
-    """
-
-    views: int
-    trained_on: bool
-    loss: float
-    rollbacks: int
-    frozen: bool
+    views: int  # number of watched ones
+    trained_on: bool  # whether training used them too, as there are few
+    loss: float  # dB that s = 1 of the result is below the base there (``gate.decibels_below``)
+    rollbacks: int  # how often training returned to an earlier state, with half the learning rates
+    frozen: bool  # whether the attributes were frozen in the end
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from clod_adapter._kernels.threads import torch_on_one_thread
@@ -154,8 +155,9 @@ class Trainer:
         if not self.dial.part.full_context:
             return found
         assert found.sigma_d is not None
-        growth_d = None if found.growth_d is None else _ending_in(0.0, found.growth_d, self.count)
-        return found.replace(sigma_d=_ending_in(math.inf, found.sigma_d, self.count), growth_d=growth_d)
+        context = (0, len(found) - self.count)
+        growth_d = None if found.growth_d is None else F.pad(found.growth_d[: self.count], context)
+        return found.replace(sigma_d=F.pad(found.sigma_d[: self.count], context, value=math.inf), growth_d=growth_d)
 
     def _update(self, found: GradientSum, share_done: float) -> None:
         """Moves the rows whose gradients are finite; none if the loss is not, without asking which."""
@@ -241,8 +243,3 @@ class Trainer:
             found |= {f"good.{name}": value for name, value in self.gate.good.items()}
             found["gate.checks"] = self.gate.numbers
         return found
-
-
-def _ending_in(value: float, tensor: Tensor, trained: int) -> Tensor:
-    """``[N]`` with this value in the rows from ``trained`` on."""
-    return torch.cat([tensor[:trained], torch.full_like(tensor[trained:], value)])
