@@ -12,13 +12,12 @@ import torch
 from torch import Tensor
 
 import scenes
-from clod_adapter.alignment.check import FLAT, check_alignment
-from clod_adapter.alignment.frames import NERFSTUDIO_TURNS, focus_of, into_file, known_frames
+from clod_adapter.alignment.check import check_alignment
+from clod_adapter.alignment.frames import NERFSTUDIO_TURNS, into_file, known_frames
 from clod_adapter.alignment.screen_filter import compare_filters
 from clod_adapter.alignment.search import guess_frame, scene_in
 from clod_adapter.cameras import Scene, View
 from clod_adapter.config import FILTERS
-from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.evaluate import evaluate
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.render import render
@@ -71,7 +70,6 @@ def test_measures_match_their_definitions(pair: tuple[Gaussians, list[View]]) ->
 def test_flat_photographs_decide_nothing(pair: tuple[Gaussians, list[View]]) -> None:
     base, views = pair
     level = torch.randint(100, 104, (44, 60, 3), generator=torch.Generator().manual_seed(0)).to(torch.uint8)
-    assert (level / 255).std() < FLAT
     flat = [View(view.camera, level) for view in views]
     found = check_alignment(base, flat)
     assert found.views == 0 and math.isnan(found.psnr) and found.fits and not found.on_white
@@ -81,13 +79,10 @@ def test_flat_photographs_decide_nothing(pair: tuple[Gaussians, list[View]]) -> 
 
 
 def test_an_empty_render_does_not_fit(pair: tuple[Gaussians, list[View]]) -> None:
-    base, views = pair
-    none = base.select(torch.zeros(len(base), dtype=torch.bool))
+    none, views = pair[0].select(torch.zeros(len(pair[0]), dtype=torch.bool)), pair[1]
     found = check_alignment(none, views)
     assert not found.fits and found.in_view == 0 and found.correlation == 0
     assert guess_frame(none, views, found) is None
-    with pytest.raises(ClodError, match="number of views"):
-        check_alignment(base, [])
 
 
 def test_a_white_background_is_recognised(pair: tuple[Gaussians, list[View]]) -> None:
@@ -101,7 +96,6 @@ def test_a_white_background_is_recognised(pair: tuple[Gaussians, list[View]]) ->
 CASES = [
     ("file's x, -y, -z: ", 1.0, FLIP, NONE),
     ("file's -y, z, x (mirrored): ", 1.0, torch.diag(EYE.new_tensor([-1.0, 1, 1])) @ EYE[[1, 2, 0]], NONE),
-    ("20 times smaller: ", 0.05, EYE, NONE),
     ("4 times larger and moved by (", 4.0, EYE, EYE.new_tensor([3.0, -2, 1])),
 ]
 
@@ -128,7 +122,6 @@ def test_another_frame_is_named(
 
 BACKWARD = torch.diag(torch.tensor([1.0, -1, -1, 1]))
 POSES = {
-    "invert them": torch.linalg.inv,
     "negate the y and z axes of their poses": lambda pose: BACKWARD @ pose,
     "and invert them": lambda pose: torch.linalg.inv(pose) @ BACKWARD,
 }
@@ -177,8 +170,6 @@ def test_frames_of_trainers(pair: tuple[Gaussians, list[View]]) -> None:
         spread = moved.T.cov()
         assert (spread - torch.diag(spread.diag())).abs().max() < 1e-6 * spread.max()
         assert spread.diag().tolist() == sorted(spread.diag().tolist(), reverse=True)
-    around = torch.stack([camera.viewmat for camera in scenes.ring(6, 40, 30)])
-    assert focus_of(around).abs().max() < 1e-5 and torch.isfinite(focus_of(around[:1])).all()
 
 
 def seen_with(name: str, views: int = 5) -> tuple[Gaussians, tuple[View, ...]]:
@@ -206,8 +197,7 @@ def test_expected_filter_is_kept_without_a_clear_difference() -> None:
     truth = gaussians(100, 0, 2, size=0.4)
     views = photograph(truth.replace(screen_filter=FILTERS["on"]), ring(4, 48, 36))
     base = truth.replace(sh0=truth.sh0 + 0.05)
-    for expected in FILTERS:
-        assert compare_filters(base, views, expected).chosen == expected
+    assert all(compare_filters(base, views, expected).chosen == expected for expected in FILTERS)
 
 
 def test_a_filter_must_be_better_in_most_views() -> None:

@@ -40,7 +40,7 @@ def changes(some: Gaussians, view: View) -> Tensor:
     return torch.stack([(splat(some, each, view.camera)[0] - whole).flatten() for each in without]).double()
 
 
-def test_removal_error_is_unbiased(draws: int = 150) -> None:
+def test_removal_error_is_unbiased(draws: int = 100) -> None:
     """The mean over many draws is within 5 standard deviations of the exact error.
 
     With random signs z, ``(sum_p z_p v_p)^2`` has the mean |v|^2 and the variance 2 (|v|^4 - sum v^4).
@@ -67,12 +67,10 @@ def test_removal_error_depends_on_the_seed_alone() -> None:
     assert torch.equal(both, removal_error(some, [view, view], seed=3))
     assert not torch.equal(both, removal_error(some, [view, view], seed=4))
     assert (both[75:] == 0).all() and (both[:75] > 0).any()
-    assert torch.equal(removal_error(some, []), torch.zeros(100))
     blind = View(dataclasses.replace(view.camera, viewmat=REVERSED @ view.camera.viewmat), view.image)
-    few = gaussians(20, 0, 0)
-    assert [each is view for each in usable_views(few, [view, blind, view])] == [True, True]
+    assert usable_views(some.select(torch.arange(75)), [view, blind, view]) == (view, view)
     with pytest.raises(ClodError, match="in front of any of the 1 training cameras"):
-        usable_views(few, [blind])
+        usable_views(gaussians(20, 0, 0), [blind])
 
 
 @pytest.mark.parametrize(("share", "exponent"), [(0.51, 1.5), (0.8, 2.5), (1.0, 1.5)])
@@ -88,9 +86,6 @@ def test_kept_shares_follow_the_target_curve(share: float, exponent: float, n: i
         assert abs(kept.sum().item() - n * want) <= 1, f"s {s}"
         if kept.any() and not kept.all():
             assert importance[kept].min() > importance[~kept].max(), f"s {s}"
-    # Where all importances are equal, as where no view sees any, the counts follow it all the same.
-    sigma = sigma_from_importance(some, torch.zeros(n), distances, CONFIG, share=share, exponent=exponent)
-    assert abs(attenuate(some.opacity_logits, sigma, distances, 1.0, CONFIG).keep.sum().item() - n * share) <= 1
 
 
 def test_coverage_sums_to_alpha() -> None:
@@ -117,14 +112,12 @@ def test_initialization_culls_in_the_pruning_order() -> None:
 
 def test_tau_is_lowered_for_faint_checkpoints_only() -> None:
     config, error = AdaptConfig(max_sv=5.0), torch.rand(1000, generator=torch.Generator().manual_seed(0))
-    mixed = torch.linspace(0.001, 0.99, 1000)
-    assert fitting_tau(mixed, error, config) == config.tau
-    faint = torch.full((1000,), 0.01)
-    assert fitting_tau(faint, error, config) == pytest.approx(0.01 / 5 / 1.5, rel=1e-5)
+    mixed, faint = torch.linspace(0.001, 0.99, 1000), torch.full((1000,), 0.01)
     # Nearly all opacities below tau, a few far above: tau follows them, unless they have no effect at s = 1.
     some = torch.where(torch.arange(1000) < 100, 0.9, 0.012)
-    assert fitting_tau(some, torch.ones(1000), config) == pytest.approx(0.012 / 1.5)
-    assert fitting_tau(some, (some > 0.1).float(), config) == config.tau
-    assert fitting_tau(faint, torch.zeros(1000), config) == config.tau  # nothing is visible: nothing to go by
-    for opacities in (mixed, faint, torch.zeros(1000)):  # never raised, however low it was asked for
-        assert fitting_tau(opacities, error, AdaptConfig(tau=1e-8)) == 1e-8
+    for opacities, errors, tau in (
+        (mixed, error, config.tau), (faint, error, 0.01 / 5 / 1.5), (some, torch.ones(1000), 0.012 / 1.5),
+        (some, (some > 0.1).float(), config.tau), (faint, torch.zeros(1000), config.tau),
+    ):  # fmt: skip
+        assert fitting_tau(opacities, errors, config) == pytest.approx(tau, rel=1e-5)
+        assert fitting_tau(opacities, errors, AdaptConfig(tau=1e-8)) == 1e-8  # never raised

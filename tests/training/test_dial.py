@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from typing import Any
 
 import numpy as np
@@ -30,7 +29,6 @@ def trainable(base: Gaussians, form: str = "gsplat") -> torch.nn.ParameterDict:
     named = clod.to_gsplat(base)
     if form == "splatfacto":
         named["features_dc"], named["features_rest"] = named.pop("sh0")[:, 0], named.pop("shN")
-    if form != "gsplat":
         named["opacities"] = named["opacities"][:, None]
     return torch.nn.ParameterDict({name: torch.nn.Parameter(value.clone()) for name, value in named.items()})
 
@@ -43,7 +41,7 @@ def loss_of(dial: Dial, scene: Scene, s: float, view: int = 0) -> Tensor:
 def test_a_loop_learns(captured: Pair) -> None:
     """As far as adapt does in as many steps: quality at both ends, and counts near the target."""
     base, scene = captured
-    splats, steps = trainable(base), 60
+    splats, steps = trainable(base), 40
     dial = attach(splats, scene)
     optimizer = torch.optim.Adam(dial.param_groups(splats=True), eps=1e-15)
     schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, OURS.lr_final ** (1 / steps))
@@ -80,9 +78,7 @@ def test_the_objective_is_that_of_adapt(captured: Pair) -> None:
     assert dial.count_loss(0.5, torch.tensor(0.3)) == 0 and dial.target_share(0.5) == 1
 
 
-@pytest.mark.parametrize(
-    ("form", "part"), [(AdaptConfig, {}), (AdaptConfig, {"full_context": True}), (AdaptConfig.paper, {"total": 900})]
-)
+@pytest.mark.parametrize(("form", "part"), [(AdaptConfig, {"full_context": True}), (AdaptConfig.paper, {"total": 900})])
 def test_gradients_are_slopes_of_the_loss(captured: Pair, part: dict[str, Any], form: Any) -> None:
     """Of what is trained, in a step of its own along the gradient; and the context is drawn."""
     base, scene = captured
@@ -106,7 +102,7 @@ def test_gradients_are_slopes_of_the_loss(captured: Pair, part: dict[str, Any], 
 
 
 @pytest.mark.filterwarnings("error")  # of numbers read from tensors in a graph: the initialization needs none
-@pytest.mark.parametrize("form", ["gsplat", "columns", "splatfacto"])
+@pytest.mark.parametrize("form", ["gsplat", "splatfacto"])
 def test_trainers_tensors_are_used_as_they_are(captured: Pair, form: str) -> None:
     base, scene = captured
     splats = trainable(base, form)
@@ -117,60 +113,33 @@ def test_trainers_tensors_are_used_as_they_are(captured: Pair, form: str) -> Non
     groups = {group["name"]: group["params"][0] for group in dial.param_groups(splats=True)}
     assert set(groups) == {"log_sigma", *splats}
     assert all(groups[name] is splats[name] and splats[name].grad is not None for name in splats)
-    assert all(value.requires_grad for value in dial.gaussians().tensors().values())
     assert dial.gaussians().means.data_ptr() == splats["means"].data_ptr()
-    with torch.no_grad():
-        splats["sh0" if "sh0" in splats else "features_dc"] += 1
-    torch.testing.assert_close(dial.gaussians().sh0, base.sh0 + 1)
 
 
-def test_learning_rates_are_those_of_the_settings(captured: Pair) -> None:
+def test_rates_and_ranges_of_the_parameters(captured: Pair) -> None:
     base, scene = captured
     config = AdaptConfig(batch=4, lr_sh0=1.0)
-    rates = {group["name"]: group["lr"] for group in attach(trainable(base), scene, config).param_groups(splats=True)}
+    dial = attach(trainable(base), scene, config)
+    rates = {group["name"]: group["lr"] for group in dial.param_groups(splats=True)}
     assert rates["sh0"] == 2 and rates["shN"] == 0 and rates["opacities"] == 2 * config.lr_opacities
     assert rates["log_sigma"] == 2 * config.lr_sigma and rates["growth_d"] == 2 * config.lr_growth
     assert len(attach(base, scene).param_groups(splats=True)) == 2  # none of the Gaussians' tensors has a gradient
-
-
-def test_parameters_stay_in_range(captured: Pair) -> None:
-    dial = attach(*captured)
     with torch.no_grad():
-        dial.log_sigma[0], dial.log_sigma[1] = -100, 100
-        dial.growth_d[0] = 9
+        dial.log_sigma[0], dial.log_sigma[1], dial.growth_d[0] = -100, 100, 9
     dial.sample()
     torch.testing.assert_close(dial.sigma_d[:2], torch.tensor(SIGMA_RANGE))
     assert dial.growth_d[0].item() == 3
 
 
-def test_the_result_is_saved_in_world_units(captured: Pair, tmp_path: Any) -> None:
-    base, scene = captured
-    dial = attach(base, scene)
-    assert dial.gaussians().attenuation.scene_distance != 1
-    clod.save(tmp_path / "dial.ply", dial.gaussians())
-    again, camera = clod.load(tmp_path / "dial.ply").gaussians, scene.test[0].camera
-    assert again.attenuation.scene_distance == 1 and again.attenuation.max_sv == MAX_SV
-    assert torch.equal(clod.render(again, camera, 3).kept, dial(camera, 3).keep)
-
-
 def test_what_does_not_fit_is_refused(captured: Pair) -> None:
     base, scene = captured
-    with pytest.raises(ClodError, match="call adapt"):
-        attach(base, scene, AdaptConfig.paper())
-    with pytest.raises(ClodError, match="no training views"):
-        attach(base, [])
-    with pytest.raises(ClodError, match="splats needs quats, scales, opacities, sh0 too, it has means"):
-        attach({"means": base.means}, scene)
     splats = trainable(base)
     dial = attach(splats, scene)
-    for name, value in trainable(base[:5]).items():
-        splats[name] = value
-    with pytest.raises(ClodError, match="5 splats now, but the dial is for 300"):
-        dial.loss(1.0, torch.tensor(1.0))
-
-
-def test_copies_have_the_splats_they_are_copied_with(captured: Pair) -> None:
-    """As in a copy of a whole model."""
-    splats = trainable(captured[0])
-    splats_too, copied = copy.deepcopy((splats, attach(splats, captured[1])))
-    assert copied.gaussians().means is splats_too["means"]
+    splats.update(trainable(base.select(torch.arange(len(base)) < 5)))
+    for call, message in (
+        (lambda: attach(base, scene, form="paper"), "call adapt"), (lambda: attach(base, []), "no training views"),
+        (lambda: attach({"means": base.means}, scene), "needs quats, scales, opacities, sh0 too, it has means"),
+        (lambda: dial.loss(1.0, torch.tensor(1.0)), "5 splats now, but the dial is for 300"),
+    ):  # fmt: skip
+        with pytest.raises(ClodError, match=message):
+            call()

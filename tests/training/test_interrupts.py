@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import signal
-import threading
 from collections.abc import Iterator
 from copy import deepcopy
 from typing import Any
@@ -13,10 +12,8 @@ import pytest
 from clod_adapter import adapt
 from clod_adapter.config import AdaptConfig
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.progress import Phase, Progress
 from clod_adapter.training import trainer
 from clod_adapter.training.interrupts import DeferredInterrupt
-from clod_adapter.training.loop import Adapted
 from runs import pressing
 from scenes import assert_equal, capture
 
@@ -45,15 +42,6 @@ def test_an_interrupt_within_the_update_completes_the_step(monkeypatch: pytest.M
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
-def test_an_interrupt_before_the_first_step_is_raised(monkeypatch: pytest.MonkeyPatch) -> None:
-    def press(now: Progress) -> None:
-        if now.phase == Phase.PRUNING_ORDER:
-            signal.raise_signal(signal.SIGINT)
-
-    with pytest.raises(KeyboardInterrupt):
-        adapt(*SCENE, CONFIG, press)
-
-
 def test_a_second_interrupt_is_raised_at_once() -> None:
     """Not one of the signals that are repeated."""
     before, deferred = signal.signal(signal.SIGHUP, signal.default_int_handler), 0
@@ -67,15 +55,10 @@ def test_a_second_interrupt_is_raised_at_once() -> None:
     assert signal.getsignal(signal.SIGINT) is signal.signal(signal.SIGHUP, before) is signal.default_int_handler
 
 
-def test_other_handlers_and_threads_are_not_affected() -> None:
+def test_other_handlers_are_not_affected() -> None:
     heard: list[int] = []
     signal.signal(signal.SIGINT, lambda number, frame: heard.append(number))
     with DeferredInterrupt() as interrupt:
         interrupt.begin()
         signal.raise_signal(signal.SIGINT)
     assert heard == [signal.SIGINT] and not interrupt.received
-    found: list[Adapted] = []
-    thread = threading.Thread(target=lambda: found.append(adapt(*SCENE, AdaptConfig(iters=2))))
-    thread.start()
-    thread.join()
-    assert found[0].steps == 2

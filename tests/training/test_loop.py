@@ -53,30 +53,26 @@ def test_training_improves_psnr(captured: Pair, trained: Trained) -> None:
 
 def test_growth_improves_the_far_end(captured: Pair, trained: Trained) -> None:
     """By the initialization alone and by training; counts do not depend on it."""
-    for steps, gain in ((0, 0.5), (120, 1.5)):
-        with_growth = trained[0] if steps else adapt(*captured, config_of(iters=0))
+    for steps, gain, grown in ((0, 0.5, adapt(*captured, config_of(iters=0))), (120, 1.5, trained[0])):
         plain = adapt(*captured, config_of(iters=steps, growth="off"))
-        found, wanted = (evaluate(one.gaussians, captured[1].test, (1.0, 5.0)) for one in (with_growth, plain))
+        found, wanted = (evaluate(one.gaussians, captured[1].test, (1.0, 5.0)) for one in (grown, plain))
         assert found[1].psnr > wanted[1].psnr + gain and found[0].psnr > wanted[0].psnr - 0.3
         assert [row.kept_share for row in found] == pytest.approx([row.kept_share for row in wanted], abs=0.03)
 
 
 def test_progress_is_reported(captured: Pair, trained: Trained) -> None:
     result, seen = trained
-    views, n = len(captured[1].train), len(captured[0])
-    begun = [p for p in seen if p.phase != Phase.TRAINING]
-    counts = [(p.phase, p.done, p.total) for p in begun]
+    views, n, order = len(captured[1].train), len(captured[0]), Phase.PRUNING_ORDER
+    counts = [(p.phase, p.done, p.total) for p in seen]
     assert counts[:views] == [(Phase.IMPORTANCE, k + 1, views) for k in range(views)]
-    assert all(c[0] == Phase.PRUNING_ORDER and c[2] == n for c in counts[views:])
-    assert counts[-1] == (Phase.PRUNING_ORDER, n, n)
-    steps = seen[len(begun) :]
-    assert [(p.phase, p.done, p.total) for p in steps] == [(Phase.TRAINING, k + 1, 120) for k in range(120)]
-    assert begun[-1].share == steps[-1].share == 1 and all(p.loss > 0 for p in steps)
+    assert {phase for phase, *_ in counts[views:-120]} == {order} and counts[-121] == (order, n, n)
+    assert counts[-120:] == [(Phase.TRAINING, k + 1, 120) for k in range(120)]
+    assert seen[-121].share == seen[-1].share == 1 and all(p.loss > 0 for p in seen[-120:])
     assert result.steps == 120 and not result.interrupted and result.seconds > 0 and result.start_seconds > 0
 
 
 def test_results_are_reproducible_from_the_seed(captured: Pair) -> None:
-    runs = [adapt(*captured, config_of(iters=15, seed=seed)).gaussians for seed in (7, 7, 8)]
+    runs = [adapt(*captured, config_of(iters=4, seed=seed)).gaussians for seed in (7, 7, 8)]
     assert_equal(runs[0], runs[1])
     assert not torch.equal(runs[0].sigma_d, runs[2].sigma_d)
 
@@ -86,34 +82,27 @@ def test_zero_steps_return_the_initialization(captured: Pair) -> None:
     result = adapt(base, scene, config_of(iters=0))
     want = initialize(base, scene.train, config_of())
     assert result.steps == 0 and not result.interrupted
-    for name in ATTRIBUTES:
-        assert torch.equal(getattr(result.gaussians, name), getattr(base, name)), name
+    assert all(torch.equal(getattr(result.gaussians, name), getattr(base, name)) for name in ATTRIBUTES)
     torch.testing.assert_close(result.gaussians.sigma_d, want.sigma_d, rtol=1e-5, atol=0)  # by way of its logarithm
     assert result.gaussians.attenuation == want.attenuation and want.attenuation.scene_distance == 1
     assert want.attenuation.reference_distance == pytest.approx(scene_distance(base, scene.train))
     # At SIGMA_MAX no gradient reaches sigma_d, so a dial of with_dial is initialized, too.
     assert_equal(adapt(with_dial(base), scene, config_of(iters=0)).gaussians, result.gaussians)
-    base = base.replace(opacity_logits=base.opacity_logits.abs())  # so that all can last
-    found = initialize(base, scene.train, config_of(start_share=0.7, exponent=1.5))
-    for row in evaluate(found, scene.train, SCALES):
-        s = row.virtual_scale
-        assert row.kept_share == pytest.approx(1 / (s**1.5 + (1 / 0.7 - 1) * s**-1.5), rel=0.25)
 
 
-@pytest.mark.parametrize("lost", [False, True], ids=["known", "lost"])
-def test_a_second_run_continues_from_sigma_d(captured: Pair, trained: Trained, lost: bool) -> None:
+def test_a_second_run_continues_from_sigma_d(captured: Pair, trained: Trained) -> None:
     """No importance pass; the unit is the file's reference distance, or the views' where another tool dropped it."""
-    first, phases = trained[0].gaussians, list[Phase]()
-    if lost:
-        first = first.replace(attenuation=replace(first.attenuation, reference_distance=0.0))
-    config = config_of(iters=1, max_sv=3.0)
-    result = adapt(first, captured[1], config, lambda now: phases.append(now.phase)).gaussians
-    want = scene_distance(first, captured[1].train) if lost else first.attenuation.reference_distance
-    found = result.attenuation.reference_distance
-    assert phases == [Phase.TRAINING] and found == pytest.approx(want) and want > 2
-    assert result.attenuation == replace(first.attenuation, max_sv=3.0, reference_distance=found)
-    assert (result.sigma_d / first.sigma_d).log().abs().max() <= 1.01e-2  # a step of log sigma
-    assert (result.growth_d - first.growth_d).abs().max() <= 1.01e-2 and first.growth_d.unique().numel() > 50
+    first, phases, config = trained[0].gaussians, list[Phase](), config_of(iters=1, max_sv=3.0)
+    unknown = first.replace(attenuation=replace(first.attenuation, reference_distance=0.0))
+    for given, want in (
+        (first, first.attenuation.reference_distance), (unknown, scene_distance(first, captured[1].train)),
+    ):  # fmt: skip
+        result = adapt(given, captured[1], config, lambda now: phases.append(now.phase)).gaussians
+        found = result.attenuation.reference_distance
+        assert found == pytest.approx(want) and want > 2 and set(phases) == {Phase.TRAINING}
+        assert result.attenuation == replace(first.attenuation, max_sv=3.0, reference_distance=found)
+        assert (result.sigma_d / first.sigma_d).log().abs().max() <= 1.01e-2  # a step of log sigma
+        assert (result.growth_d - first.growth_d).abs().max() <= 1.01e-2 and first.growth_d.unique().numel() > 50
     # A sigma_d learned under one tau and normalizer means something else under others: the file's are kept.
     own = AttenuationConfig(tau=0.02, eps=1e-6, normalizer="max", scene_distance=2.0, max_sv=4.0)
     dialled = with_dial(captured[0], torch.full((len(captured[0]),), 1.5), own)
@@ -134,14 +123,13 @@ def test_result_is_the_mean_of_the_last_steps(captured: Pair) -> None:
 
 def test_time_budget_ends_training(captured: Pair) -> None:
     """The budget includes the time of an earlier part of the run."""
-    config, states = config_of(iters=10_000_000, time_budget=0.3), dict[int, TrainingState]()
+    config, states = config_of(iters=10_000_000, time_budget=0.2), dict[int, TrainingState]()
     result = adapt(*captured, config, states_of({3}, states))
-    assert 0 < result.steps < 10_000 and 0.3 <= result.seconds < 5 and not result.interrupted
+    assert 0 < result.steps < 10_000 and 0.2 <= result.seconds < 5 and not result.interrupted
     assert adapt(*captured, config_of(iters=3, time_budget=60.0)).steps == 3
-    result = adapt(*captured, config, None, replace(states[3], seconds=0.28))
-    assert 3 < result.steps < 10_000 and 0.3 <= result.seconds < 5
-    result = adapt(*captured, config_of(batch=4096, time_budget=0.3))  # within the first step
-    assert result.steps == 1 and 0.3 <= result.seconds < 3 and result.gaussians.sigma_d.isfinite().all()
+    result = adapt(*captured, config, None, replace(states[3], seconds=0.18))
+    assert 3 < result.steps < 10_000 and 0.2 <= result.seconds < 5
+    assert adapt(*captured, config_of(batch=4096, time_budget=0.2)).seconds < 3  # within the first step
 
 
 def test_a_listener_that_stops_returns_the_result_so_far(captured: Pair) -> None:
@@ -157,8 +145,8 @@ def test_a_listener_that_stops_returns_the_result_so_far(captured: Pair) -> None
         with pytest.raises(Stopped):
             adapt(*captured, config_of(iters=5), lambda now, phase=phase: now.phase != phase)
     assert result.interrupted and not result.signalled and result.steps == 5
-    for name, value in result.gaussians.tensors().items():
-        assert torch.equal(value, states[-1][name]) and value.isfinite().all() and not value.requires_grad, name
+    found = result.gaussians.tensors().items()
+    assert all(torch.equal(value, states[-1][name]) and not value.requires_grad for name, value in found)
 
 
 def test_degenerate_scenes(captured: Pair) -> None:
@@ -168,7 +156,6 @@ def test_degenerate_scenes(captured: Pair) -> None:
         one = gaussians(1, 0, 0).replace(means=torch.tensor(means))
         found = adapt(one, Scene(views, ()), config_of(iters=5)).gaussians
         assert all(value.isfinite().all() for value in found.tensors().values())
-    # Cameras in one place.
     base, scene = captured
     found = adapt(base, Scene(scene.train[:1] * 2, ()), config_of(iters=3)).gaussians
     assert not found.means.equal(base.means)
@@ -176,10 +163,9 @@ def test_degenerate_scenes(captured: Pair) -> None:
 
 @pytest.mark.parametrize(
     ("config", "logit"),
-    [(config_of(iters=10), math.inf), (config_of(iters=6), -math.inf),
-     (AdaptConfig.paper(iters=6), math.inf)],
-    ids=["ours", "invisible", "paper"],
-)  # fmt: skip
+    [(config_of(iters=10), math.inf), (AdaptConfig.paper(iters=6), -math.inf)],
+    ids=["ours", "paper"],
+)
 def test_infinite_opacities_are_kept(captured: Pair, config: AdaptConfig, logit: float) -> None:
     """Infinite logits are unchanged; all other values are finite and trained."""
     base, scene = captured
@@ -198,13 +184,11 @@ def test_bad_inputs_are_refused(captured: Pair) -> None:
             run(base, Scene((), scene.test))
         with pytest.raises(ClodError, match="no Gaussians"):
             run(gaussians(0, 1, 0), scene)
-    for run, name, value in (
-        (make_plan, "sh0", math.inf), (adapt, "log_scales", -math.inf), (adapt, "opacity_logits", math.nan),
-    ):  # fmt: skip
-        values = getattr(base, name).clone()
-        values[5:7] = value
-        with pytest.raises(ClodError, match=rf"{name} is not finite in 2 rows \(the first is 5\); leave out"):
-            run(base.replace(**{name: values}), scene, config_of(iters=1))
+        for name, value in (("sh0", math.inf), ("opacity_logits", math.nan)):
+            values = getattr(base, name).clone()
+            values[5:7] = value
+            with pytest.raises(ClodError, match=rf"{name} is not finite in 2 rows \(the first is 5\); leave out"):
+                run(base.replace(**{name: values}), scene, config_of(iters=1))
     huge = torch.full_like(base.sh0, 1e38)
     huge[7] = 2e38
     for config in (config_of(iters=1), AdaptConfig.paper(iters=1)):  # looked at before training, or by its first step
@@ -221,16 +205,12 @@ def test_a_row_with_a_nonfinite_gradient_is_not_stepped(captured: Pair, monkeypa
 
     base, scene = captured
     change_step(monkeypatch, 1, spoil)
-    seen: list[Gaussians] = []
-    config = config_of(iters=12)
-    result = adapt(
-        base, scene, config, lambda p: seen.append(p.gaussians().select(torch.arange(9))) if p.state else None
-    )
+    seen, config = list[Gaussians](), config_of(iters=12)
+    result = adapt(base, scene, config, lambda p: seen.append(copy.deepcopy(p.gaussians())) if p.state else None)
     assert result.held == 2 and all(value.isfinite().all() for value in result.gaussians.tensors().values())
-    first = initialize(base, scene.train, config)
-    moved = (seen[0].sigma_d / first.sigma_d[:9] - 1).abs() > 1e-5
-    assert not moved[3:5].any() and moved.any()
-    assert (result.gaussians.sigma_d[3:5] != first.sigma_d[3:5]).all()
+    first = initialize(base, scene.train, config).sigma_d
+    moved = (seen[0].sigma_d / first - 1).abs() > 1e-5
+    assert not moved[3:5].any() and moved.any() and (result.gaussians.sigma_d[3:5] != first[3:5]).all()
 
 
 def test_a_failed_step_ends_training_before_it(captured: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -260,31 +240,30 @@ def test_a_failed_step_ends_training_before_it(captured: Pair, monkeypatch: pyte
 
 def test_growth_begins_at_the_median_distance_in_the_second_nearest_view(captured: Pair) -> None:
     base, scene = captured
-    alone = sorted(scene_distance(base, [view]) for view in scene.train)
-    assert scene_distance(base, scene.train) == alone[1] > alone[0]
-    (view,) = (view for view in scene.train if scene_distance(base, [view]) == alone[0])
-    median = (base.means - view.camera.position).norm(dim=1)[in_frustum(base.means, view.camera)].median()
-    assert alone[0] == pytest.approx(float(median), rel=1e-5)
+    nearest, second = sorted(scene.train, key=lambda view: scene_distance(base, [view]))[:2]
+    assert scene_distance(base, scene.train) == scene_distance(base, [second]) > scene_distance(base, [nearest])
+    median = (base.means - second.camera.position).norm(dim=1)[in_frustum(base.means, second.camera)].median()
+    assert scene_distance(base, [second]) == pytest.approx(float(median), rel=1e-5)
 
 
 def test_settings_as_keywords(captured: Pair) -> None:
     adapted = adapt(*captured, config_of(iters=3), max_sv=7, growth="off")
-    assert adapted.steps == 3 and adapted.gaussians.attenuation.max_sv == 7 and adapted.gaussians.growth_d is None
     assert repr(adapted).startswith("Adapted(Gaussians(300, SH degree 1, dial to 7, cpu), 3 steps, ")
+    assert adapted.gaussians.growth_d is None
     with pytest.raises(TypeError, match="max_vs"):
         adapt(*captured, max_vs=7)
 
 
 def test_a_bar_by_default(captured: Pair, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """On a terminal or in a notebook; not elsewhere, not with a listener of one's own, and not with False."""
-    adapt(*captured, iters=2)
+    adapt(*captured, iters=1)
     assert capsys.readouterr().err == ""
     monkeypatch.setitem(sys.modules, "ipykernel", ModuleType("ipykernel"))
-    adapt(*captured, iters=2)
+    adapt(*captured, iters=1)
     shown = capsys.readouterr().err
-    assert all(phase in shown for phase in ("importance", "pruning order", "training: ", "/2 ["))
+    assert all(phase in shown for phase in ("importance", "pruning order", "training: ", "/1 ["))
     for progress in (False, lambda now: None):
-        adapt(*captured, iters=2, progress=progress)
+        adapt(*captured, iters=1, progress=progress)
     assert capsys.readouterr().err == ""
 
 

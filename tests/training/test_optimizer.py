@@ -6,7 +6,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from backends import torch_threads
 from clod_adapter.training.optimizer import RowAdam
 
 SHAPES = {"means": (3,), "quats": (4,), "opacity_logits": (), "sh0": (1, 3), "shN": (8, 3), "none": (0, 3)}
@@ -41,7 +40,7 @@ def everything(n: int) -> Tensor:
 
 @pytest.mark.parametrize("kind", [RowAdam, PlainRowAdam])
 @pytest.mark.parametrize(
-    ("steps", "beta1", "beta2", "epsilon"), [(12, 0.9, 0.999, 1e-15), (220, 0.5, 0.8, 1e-2)],
+    ("steps", "beta1", "beta2", "epsilon"), [(12, 0.9, 0.999, 1e-15), (90, 0.5, 0.8, 1e-2)],
     ids=["defaults", "past the last bias correction that is stored, the 79th"],
 )  # fmt: skip
 def test_all_rows_match_torch_adam(
@@ -61,7 +60,7 @@ def test_all_rows_match_torch_adam(
 
 
 @pytest.mark.parametrize("kind", [RowAdam, PlainRowAdam])
-@pytest.mark.parametrize(("more", "filler"), [(0, 0.0), (11, torch.nan), (11, torch.inf)])
+@pytest.mark.parametrize(("more", "filler"), [(0, torch.inf), (11, torch.nan)])
 def test_only_selected_rows_are_stepped(kind: type[RowAdam], more: int, filler: float, n: int = 40) -> None:
     """Other rows keep every bit, and their gradients are ignored; so do rows behind a leading part."""
     larger, alone = parameters(n + more), {name: value[:n] for name, value in parameters(n + more).items()}
@@ -97,17 +96,3 @@ def test_units_multiply_the_rates_of_rows(kind: type[RowAdam], n: int = 40) -> N
     assert torch.equal(one["sh0"], other["sh0"])
     # Steps of 0.1 up and down may cancel.
     torch.testing.assert_close(other["means"] / units[:, None], one["means"], rtol=1e-5, atol=1e-7)
-
-
-def test_a_row_is_independent_of_other_rows_and_threads(n: int = 100) -> None:
-    """A row's value does not depend on the other stepped rows, nor on the number of threads."""
-    gradient = gradients(n, 0)["shN"]
-    g = torch.Generator().manual_seed(0)
-    results = []
-    for count, some in [(1, everything(n)), (2, everything(n)), (3, torch.rand(n, generator=g) < 0.6)]:
-        optimizer = RowAdam({"shN": parameters(n)["shN"]})
-        for _ in range(3):
-            with torch_threads(count):
-                optimizer.step({"shN": gradient}, some, {"shN": 0.01})
-        results.append(optimizer.parameters["shN"])
-    assert torch.equal(results[0], results[1]) and torch.equal(results[0][some], results[2][some])

@@ -12,7 +12,6 @@ from torch import Tensor
 
 from clod_adapter.config import AdaptConfig, AttenuationConfig
 from clod_adapter.equation.attenuation import attenuate
-from clod_adapter.training.optimizer import RowAdam
 from clod_adapter.training.paper import paper_count, soft_count
 from clod_adapter.training.target_count import (
     TEMPERATURE,
@@ -71,26 +70,6 @@ def test_count_gradient_penalises_excess_and_deficit() -> None:
         assert (gradient(logits, torch.full((N,), gone), d, 2.0) < 0).all()
     mixed = torch.where(torch.arange(N) % 2 == 0, 5.0, -9.2)  # half are kept, where the curve at s = 6 has 7 %
     assert (gradient(logits, mixed, d, 6.0) >= 0).all() and (gradient(logits, mixed, d, 6.0)[1::2] < 1e-20).all()
-
-
-@pytest.mark.parametrize("start", [1.0, 1e-4])
-def test_counts_reach_the_curve_without_an_image_loss(start: float) -> None:
-    """With the optimiser's steps, from too many, and from none (every sigma at its minimum)."""
-    logits, _, d = some()
-    # Opaque enough to reach the target: a Gaussian fainter than tau s is kept nowhere.
-    logits, log_sigma, random = logits.clamp(min=-1.5) + 1, torch.full((N,), math.log(start)), np.random.default_rng(0)
-
-    def deviation() -> float:
-        """Of the share kept at s = 1 from the curve, as a logarithm."""
-        kept = float(attenuate(logits, log_sigma.exp(), d, 1.0, ATTENUATION).keep.float().mean())
-        return abs(math.log(max(kept, 1e-9) / target_curve(1.0, CONFIG.share, CONFIG.exponent)))
-
-    assert deviation() > 0.3
-    optimizer, rows = RowAdam({"log_sigma": log_sigma}), torch.ones(N, dtype=torch.bool)
-    for step in range(600):
-        slope = gradient(logits, log_sigma, d, 6.0 ** random.random()) + gradient(logits, log_sigma, d, 1.0)
-        optimizer.step({"log_sigma": slope}, rows, {"log_sigma": 0.1 * 0.1 ** (step / 600)})
-    assert deviation() < 0.1 and (log_sigma > math.log(1e-4) + 2).all()
 
 
 def test_count_slope_is_that_of_the_soft_count() -> None:
