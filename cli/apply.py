@@ -10,7 +10,7 @@ from clod_adapter._support.version import package_version
 from clod_adapter.errors import ClodError
 from clod_adapter.io.file_formats import check_readable
 
-from .shared.command import Command, add_activated
+from .shared.command import add_activated
 from .shared.console import Console
 from .shared.outputs import Outputs, check_ply_name, size
 
@@ -31,7 +31,11 @@ def check(args: Namespace) -> None:
     check_readable(Path(args.base))
 
 
-def run(args: Namespace) -> dict[str, Any]:
+def outputs(args: Namespace) -> Outputs:
+    return Outputs([Path(args.out)], inputs=[args.base, args.adapter])
+
+
+def execute(args: Namespace) -> dict[str, Any]:
     from clod_adapter.adapter import dial_tensors
     from clod_adapter.io.adapter_file import load_adapter
     from clod_adapter.io.checkpoint import save, trimmed
@@ -57,19 +61,13 @@ def run(args: Namespace) -> dict[str, Any]:
     }  # fmt: skip
 
 
-COMMAND = Command(
-    summary="Rebuild the adapted PLY from checkpoint and adapter.",
-    description="Rebuild the adapted PLY from the checkpoint and the small adapter file.",
-    usage="BASE.ply ADAPTER.safetensors -o OUT.ply [--json]",
-    epilog="""\
+SUMMARY = "Rebuild the adapted PLY from checkpoint and adapter."
+DESCRIPTION = "Rebuild the adapted PLY from the checkpoint and the small adapter file."
+USAGE = "BASE.ply ADAPTER.safetensors -o OUT.ply [--json]"
+EPILOG = """\
 OUT.ply equals the file that clod-adapt wrote, bit for bit. BASE.ply must be the
 checkpoint that was adapted: the adapter stores its SHA-256.
 
 example:
   clod-adapt apply garden.ply garden_clod.safetensors -o again.ply
-""",
-    add_arguments=add_arguments,
-    check=check,
-    run=run,
-    outputs=lambda args: Outputs([Path(args.out)], inputs=[args.base, args.adapter]),
-)
+"""

@@ -10,7 +10,7 @@ from clod_adapter.errors import ClodError
 from clod_adapter.report.style import check_matplotlib
 
 from . import adapt
-from .shared.command import Command
+from .shared.command import parser_of
 from .shared.console import Console, duration
 from .shared.outputs import AdaptFiles, Outputs, claimed
 
@@ -20,6 +20,10 @@ MAX_SV = 5.0
 def add_arguments(parser: ArgumentParser) -> None:
     output = parser.add_argument_group("output")
     output.add_argument("-o", "--out", metavar="DIR", default="demo", help="output folder (default: demo)")
+
+
+def check(args: Namespace) -> None:
+    check_matplotlib()  # before a minute is spent
 
 
 def outputs(args: Namespace) -> Outputs:
@@ -32,7 +36,7 @@ def picture_files(folder: Path) -> dict[str, Path]:
     return {"dial": folder / "dial.png", "curve": folder / "curve.png"}
 
 
-def run(args: Namespace) -> dict[str, Any]:
+def execute(args: Namespace) -> dict[str, Any]:
     from clod_adapter.demo.packed import unpack
     from clod_adapter.demo.pictures import draw
 
@@ -48,9 +52,8 @@ def run(args: Namespace) -> dict[str, Any]:
     unpack(capture, base)
     console.say(f"the scene is in {capture}, its checkpoint is {base}")
     arguments = adapt_arguments(args, base, capture, model)
-    with claimed(adapt.COMMAND.outputs(arguments)):
-        report = adapt.COMMAND.run(arguments)
-    assert report is not None
+    with claimed(adapt.outputs(arguments)):
+        report = adapt.execute(arguments)
     for path in pictures.values():  # of an earlier run
         path.unlink(missing_ok=True)
     if report["rows"]:
@@ -71,30 +74,24 @@ def adapt_arguments(args: Namespace, base: Path, capture: Path, model: Path) -> 
     words = [f"--images={capture}", f"--max-sv={MAX_SV:g}", f"--out={model}"]
     words += [f"--{name}" for name in ("quiet", "json") if getattr(args, name)]
     words += ["--resume"] if AdaptFiles.of(str(base), str(model)).state.exists() else []
-    parsed: Namespace = adapt.COMMAND.parser("clod-adapt").parse_args([*words, "--", str(base)])
+    parsed: Namespace = parser_of(adapt, "clod-adapt").parse_args([*words, "--", str(base)])
     return parsed
 
 
-COMMAND = Command(
-    summary="Run everything on a built-in scene; nothing to download.",
-    description="""\
+SUMMARY = "Run everything on a built-in scene; nothing to download."
+DESCRIPTION = """\
 Run all steps on a scene that comes with the package.
 
 Unpacks photographs of a ray-traced gallery and a checkpoint that was trained
 on them to its end, adapts the checkpoint, measures the result and draws two
 pictures. Takes about a minute on two CPU cores.
-""",
-    usage="[--out DIR] [options]",
-    epilog="""\
+"""
+USAGE = "[--out DIR] [options]"
+EPILOG = """\
 outputs in DIR:
   capture/          80 images and their COLMAP model
   base.ply          the checkpoint
   gallery.ply       the adapted file; gallery.safetensors, gallery.json
   dial.png          one held-out view: photograph, base, several dial values
   curve.png         quality against the number of Gaussians
-""",
-    add_arguments=add_arguments,
-    check=lambda args: check_matplotlib(),  # before a minute is spent
-    run=run,
-    outputs=outputs,
-)
+"""

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import io
 import warnings
-from argparse import Namespace
+from argparse import ArgumentParser, Namespace
 from collections.abc import Callable
 from contextlib import redirect_stdout
+from functools import partial
 from typing import Any
 
 from clod_adapter._support.text import first_line
 from clod_adapter._support.version import package_version
 
-from .shared.command import Command
 from .shared.console import WIDTH, Console
 from .view import find_browser
 
@@ -21,6 +21,14 @@ REINSTALL = "pip install --force-reinstall numba; if that does not help, report 
 NO_BROWSER = "clod-adapt view --no-browser --port 8000, and ssh -L 8000:127.0.0.1:8000 HOST where there is a browser"
 TOLERANCE = 2e-4  # RMS of colours in [0, 1]: rounding, and a pixel or two on the other side of a threshold
 RENDERERS = ("cpu", "gsplat")
+
+
+def add_arguments(parser: ArgumentParser) -> None:
+    """None but those of all commands."""
+
+
+def check(args: Namespace) -> None:
+    """Nothing can be wrong."""
 
 
 Found = tuple[bool, str, str]  # whether it works, the result, and a command to type or what to do
@@ -33,10 +41,6 @@ def check_torch() -> Found:
         return False, f"cannot be imported ({first_line(error)})", TORCH
     built = f"built for CUDA {torch.version.cuda}" if torch.version.cuda else "a CPU build"
     return True, f"{torch.__version__}, {built}, {torch.get_num_threads()} threads", ""
-
-
-def check_cpu() -> Found:
-    return rendered("cpu", "", REINSTALL)
 
 
 def check_gsplat() -> Found:
@@ -60,7 +64,8 @@ def check_browser() -> Found:
 
 
 CHECKS: dict[str, Callable[[], Found]] = {
-    "torch": check_torch, "cpu": check_cpu, "gsplat": check_gsplat, "browser": check_browser,
+    "torch": check_torch, "cpu": lambda: rendered("cpu", "", REINSTALL), "gsplat": check_gsplat,
+    "browser": check_browser,
 }  # fmt: skip
 
 
@@ -71,11 +76,7 @@ def rendered(device: str, name: str, fix: str) -> Found:
     from clod_adapter.cameras import Camera
     from clod_adapter.rasterizers import for_device, reference
 
-    random = torch.Generator().manual_seed(7)
-
-    def normal(*shape: int) -> torch.Tensor:
-        return torch.randn(*shape, generator=random)
-
+    normal = partial(torch.randn, generator=torch.Generator().manual_seed(7))
     scene: dict[str, Any] = {
         "means": normal(60, 3).clamp(-1.5, 1.5), "quats": normal(60, 4), "scales": (0.5 * normal(60, 3) - 2).exp(),
         "opacities": (1.5 * normal(60)).sigmoid().clamp(max=0.95), "sh0": normal(60, 1, 3),
@@ -114,7 +115,7 @@ def line_of(found: dict[str, Any]) -> str:
     return f"{line}  -> {fix}" if fix else line
 
 
-def run(args: Namespace) -> dict[str, Any]:
+def execute(args: Namespace) -> dict[str, Any]:
     """Runs all checks; the report's exit code is 1 where nothing renders."""
     with Console(args.quiet).status("checking ..."):
         findings = [outcome(name, check) for name, check in CHECKS.items()]
@@ -128,14 +129,13 @@ def run(args: Namespace) -> dict[str, Any]:
     }  # fmt: skip
 
 
-COMMAND = Command(
-    summary="Check what renders here, and say how to fix it.",
-    description="""\
+SUMMARY = "Check what renders here, and say how to fix it."
+DESCRIPTION = """\
 Check which backends work on this machine. For each that does not, print the
 reason and what fixes it.
-""",
-    usage="[--json] [--quiet]",
-    epilog="""\
+"""
+USAGE = "[--json] [--quiet]"
+EPILOG = """\
 Each line has a name, ok or off, the result, and after -> the fix.
 
   torch          version, build and threads
@@ -147,9 +147,4 @@ Nothing is installed or downloaded. The first run compiles the CPU's kernels,
 and on a GPU gsplat's, which can take minutes.
 
 exit codes: 0 cpu or gsplat works; 1 neither does
-""",
-    add_arguments=lambda parser: None,
-    check=lambda args: None,
-    run=run,
-    needs_torch=False,  # it reports a torch that is missing
-)
+"""

@@ -76,15 +76,13 @@ def outputs(args: Namespace) -> Outputs:
     return Outputs([page], charts, inputs=paths(args), scene=args.images)
 
 
-def run(args: Namespace) -> dict[str, Any]:
+def execute(args: Namespace) -> dict[str, Any]:
     from .shared import measure as measuring
-    from .shared.inputs import read_inputs, require_held_out
+    from .shared.inputs import read_inputs
     from .shared.pages import add_page
 
     console, watch, stop = Console(args.quiet), measuring.Stopwatch(), GracefulStop()
-    with watch.time("load"):
-        models, scene = read_inputs(args, paths(args), console, training=bool(args.base))
-        require_held_out(scene, args.images)
+    models, scene = read_inputs(args, paths(args), console, training=bool(args.base))
     model, *others = (each.gaussians for each in models)
     base = others.pop() if args.base else None
     if model.sigma_d is None:
@@ -93,16 +91,14 @@ def run(args: Namespace) -> dict[str, Any]:
     dials = measuring.choose_dials(given, model.attenuation, console)
     comparisons = Comparisons(model, scene, console, stop)
     with stop.listening():
-        with watch.time("evaluate"):
-            rows = measuring.measure(model, scene.test, dials, console, stop)
-            if not rows:
-                raise Stopped("stopped before the first row")
-            if not stop.requests:
-                (rows,) = measuring.with_frame_times([(model, rows)], scene.test, console, stop)
+        rows = measuring.measure(model, scene.test, dials, console, stop)
+        if not rows:
+            raise Stopped("stopped before the first row")
+        if not stop.requests:
+            (rows,) = measuring.with_frame_times([(model, rows)], scene.test, console, stop)
         print(measuring.table(measuring.by_dial(rows)))
         if not stop.requests:
-            with watch.time("comparisons"):
-                comparisons.measure(rows, base, dict(zip(args.against, others, strict=True)), args.popping)
+            comparisons.measure(rows, base, dict(zip(args.against, others, strict=True)), args.popping)
     print(comparisons.text(), end="")
     report: dict[str, Any] = {
         "command": "eval", "version": package_version(), "model": args.model, "scene": args.images,
@@ -249,11 +245,10 @@ class Comparisons:
         return "".join(f"\n{part}\n" for part in parts)
 
 
-COMMAND = common.Command(
-    summary="Measure quality, count and time at some dial values.",
-    description="Measure quality, Gaussians kept and frame time at several dial values.",
-    usage="MODEL.ply --images DIR [--sv S [S ...]] [options]",
-    epilog=f"""\
+SUMMARY = "Measure quality, count and time at some dial values."
+DESCRIPTION = "Measure quality, Gaussians kept and frame time at several dial values."
+USAGE = "MODEL.ply --images DIR [--sv S [S ...]] [options]"
+EPILOG = f"""\
 {common.BUDGETS}
 columns, over the held-out photographs (every 8th by name):
   PSNR, SSIM  means against the photographs
@@ -281,9 +276,4 @@ examples:
   clod-adapt eval garden_clod.ply --images garden --base garden.ply --popping
   clod-adapt eval garden_clod.ply --images garden --against merged.ply cut.ply
   clod-adapt eval garden_clod.ply --images garden --keep 500000 200000
-""",
-    add_arguments=add_arguments,
-    check=check,
-    run=run,
-    outputs=outputs,
-)
+"""

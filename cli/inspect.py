@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import astuple
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,7 +12,6 @@ from clod_adapter._support.version import package_version
 from clod_adapter.io.file_formats import check_readable
 from clod_adapter.io.settings import WARNING
 
-from .shared.command import Command
 from .shared.console import duration
 from .shared.outputs import size
 
@@ -40,7 +39,7 @@ def check(args: Namespace) -> None:
         check_readable(path)
 
 
-def run(args: Namespace) -> dict[str, Any]:
+def execute(args: Namespace) -> dict[str, Any]:
     from clod_adapter.inspection.report import inspect
 
     found = inspect(args.file)
@@ -49,23 +48,18 @@ def run(args: Namespace) -> dict[str, Any]:
 
 
 def lines_of(found: Inspection) -> list[str]:
-    """The lines to print."""
     lines = [f"{found.path} ({size(Path(found.path))})", _line("what", found.what)]
     if found.writer:
-        by_us = found.writer.startswith("clod-adapter")
-        lines.append(_line("written by" if by_us else "looks like", found.writer))
-    if found.splat is not None:
-        lines += splat_lines(found.splat)
-    if found.about is not None:
-        lines += tensor_lines(found.about)
+        lines.append(_line("written by" if found.writer.startswith("clod-adapter") else "looks like", found.writer))
+    lines += splat_lines(found.splat) if found.splat else []
+    lines += tensor_lines(found.about) if found.about else []
     warnings = [note.removeprefix(WARNING) for note in found.notes if note.startswith(WARNING)]
+    lines += _block("anomaly", [anomaly.says for anomaly in found.anomalies]) + _block("excluded", found.left_out)
     notes = [note for note in found.notes if not note.startswith(WARNING)]
-    blocks = {"anomaly": [a.says for a in found.anomalies], "excluded": found.left_out, "note": notes}
-    return lines + [line for name, says in (blocks | {"warning": warnings}).items() for line in _block(name, says)]
+    return lines + _block("note", notes) + _block("warning", warnings)
 
 
 def splat_lines(splat: Splat) -> list[str]:
-    """Counts, ranges and the dial."""
     v = splat.values
     count = f"{v.count:,}" if v.count == v.total else f"{v.count:,} usable of {v.total:,}"
     used = f", of which only {v.used_sh_degree} is used" if v.used_sh_degree < splat.sh_degree else ""
@@ -74,7 +68,7 @@ def splat_lines(splat: Splat) -> list[str]:
         names = ", ".join(splat.extra[:6]) + (", ..." if len(splat.extra) > 6 else "")
         more = f", not read: {names}" if splat.extra else ""
         lines.append(_line("layout", f"{splat.encoding}, {len(splat.columns)} properties{more}"))
-    lines += _block("says", (comment[:LONGEST] for comment in splat.comments))
+    lines += _block("says", [comment[:LONGEST] for comment in splat.comments])
     rows = [*zip("xyz", v.position, strict=True), ("scale", v.scale), ("opacity", v.opacity)]
     rows += [(name, spread) for name, spread in (("sigma_d", v.sigma), ("growth_d", v.growth)) if spread is not None]
     lines += ["", *spread_table(rows), ""]
@@ -94,7 +88,6 @@ def splat_lines(splat: Splat) -> list[str]:
 
 
 def spread_table(rows: Sequence[tuple[str, Spread]]) -> list[str]:
-    """One line per range, below the column names."""
     names = ("least", "1 %", "median", "99 %", "greatest")
     lines = [" " * WIDTH + "".join(f"{name:>11}" for name in names)]
     for name, spread in rows:
@@ -118,7 +111,6 @@ def calibration_lines(calibration: Calibration | None) -> list[str]:
 
 
 def tensor_lines(about: dict[str, Any]) -> list[str]:
-    """The lines of an adapter or a training state."""
     from clod_adapter.calibration import Calibration
     from clod_adapter.inspection.statistics import Spread
 
@@ -140,24 +132,22 @@ def tensor_lines(about: dict[str, Any]) -> list[str]:
     return lines + calibration_lines(calibration and Calibration.from_dict(calibration))
 
 
-def _block(name: str, says: Iterable[str]) -> list[str]:
-    said = list(says)
-    lines = [_line(name if k == 0 else "", line) for k, line in enumerate(said[:MOST_LINES])]
-    return lines + ([_line("", f"and {len(said) - MOST_LINES} more: --json")] if len(said) > MOST_LINES else [])
+def _block(name: str, says: Sequence[str]) -> list[str]:
+    lines = [_line(name if k == 0 else "", line) for k, line in enumerate(says[:MOST_LINES])]
+    return lines + ([_line("", f"and {len(says) - MOST_LINES} more: --json")] if len(says) > MOST_LINES else [])
 
 
 def _line(name: str, says: str) -> str:
     return f"{name:<{WIDTH}}{''.join(c if c.isprintable() else ' ' for c in says)}"
 
 
-COMMAND = Command(
-    summary="Print what a file is and what it contains.",
-    description="""\
+SUMMARY = "Print what a file is and what it contains."
+DESCRIPTION = """\
 Print what a file is, which program wrote it, what it contains, and what
 adapting it would exclude. Reads only.
-""",
-    usage="FILE [--json]",
-    epilog="""\
+"""
+USAGE = "FILE [--json]"
+EPILOG = """\
 FILE can be a PLY (also compressed), gsplat's .pt, an adapter or the state of an
 interrupted run (.safetensors), any format of clod-adapt export, and, with
 splat-transform installed, .sog or .ksplat.
@@ -175,9 +165,4 @@ exit codes: 0 read; 2 damaged or of another kind, one line on stderr
 examples:
   clod-adapt inspect garden.ply
   clod-adapt inspect garden_clod.safetensors --json
-""",
-    add_arguments=add_arguments,
-    check=check,
-    run=run,
-    needs_torch=False,  # loaded for files other than PLY
-)
+"""

@@ -18,9 +18,9 @@ from clod_adapter.errors import ClodError
 from clod_adapter.progress import Stopped
 
 from . import adapt, apply, demo, doctor, evaluate, export, inspect, render, robustness, view
-from .shared.command import Command, Parser
+from .shared.command import Command, Parser, parser_of
 from .shared.console import Console
-from .shared.outputs import claimed, jsonable
+from .shared.outputs import Outputs, claimed, jsonable
 from .shared.process import (
     check_printed,
     check_surroundings,
@@ -48,10 +48,10 @@ Give a trained 3D Gaussian splat a quality dial:
 
 # Adapting is the main command and has no name.
 COMMANDS: dict[str, Command] = {
-    "view": view.COMMAND, "inspect": inspect.COMMAND, "eval": evaluate.COMMAND, "render": render.COMMAND,
-    "export": export.COMMAND, "apply": apply.COMMAND, "robustness": robustness.COMMAND, "demo": demo.COMMAND,
-    "doctor": doctor.COMMAND,
+    "view": view, "inspect": inspect, "eval": evaluate, "render": render, "export": export, "apply": apply,
+    "robustness": robustness, "demo": demo, "doctor": doctor,
 }  # fmt: skip
+WITHOUT_TORCH = (inspect, doctor)  # which load it where they need it
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -85,7 +85,7 @@ def _main(words: list[str]) -> int:
             if not name:
                 check_command(words)
             args = build_parser(name).parse_args(words[1:] if name else words)
-            return run_here(COMMANDS.get(name, adapt.COMMAND), args)
+            return run_here(COMMANDS.get(name, adapt), args)
     except ClodError as error:
         return refuse(" ".join(str(error).splitlines()), 2, words)
     except Stopped:
@@ -110,7 +110,7 @@ def run_here(command: Command, args: argparse.Namespace) -> int:
     launch = launched()
     if launch.size == 1:
         return run(command, args)
-    if command is not adapt.COMMAND:
+    if command is not adapt:
         raise ClodError("only adapting takes several processes; run this command without torchrun")
     from .adapt.processes import leading, take_part
 
@@ -128,13 +128,14 @@ def run(command: Command, args: argparse.Namespace) -> int:
     if args.json:
         check_printed()
     command.check(args)
-    with signals_as_interrupt(), claimed(command.outputs(args)):
-        if command.needs_torch:
+    outputs = command.outputs(args) if hasattr(command, "outputs") else Outputs()
+    with signals_as_interrupt(), claimed(outputs):
+        if command not in WITHOUT_TORCH:
             import_library(args.quiet)
         aside = io.StringIO() if args.quiet else sys.stderr
         # Again: pycolmap, imported just now, sets a handler.
         with redirect_stdout(aside) if args.json else nullcontext(), signals_as_interrupt():
-            report = command.run(args)
+            report = command.execute(args)
     if args.json and report is not None:
         print(json.dumps(jsonable(report), allow_nan=False))
     if args.json or "outputs" not in (report or {"outputs": ()}):
@@ -150,11 +151,11 @@ def import_library(quiet: bool) -> None:
 
 
 def build_parser(name: str) -> Parser:
-    command = COMMANDS.get(name, adapt.COMMAND)
-    parser = command.parser(f"{PROG} {name}".strip())
+    command = COMMANDS.get(name, adapt)
+    parser = parser_of(command, f"{PROG} {name}".strip())
     if not name:
-        others = "\n".join(f"  {PROG} {word:<10} {other.summary}" for word, other in COMMANDS.items())
-        parser.epilog = f"other commands, each with its own --help:\n{others}\n\n{command.epilog}"
+        others = "\n".join(f"  {PROG} {word:<10} {other.SUMMARY}" for word, other in COMMANDS.items())
+        parser.epilog = f"other commands, each with its own --help:\n{others}\n\n{command.EPILOG}"
         parser.general.add_argument("--version", action="version", version=f"{PROG} {package_version()}")
     return parser
 

@@ -66,12 +66,12 @@ def outputs(args: Namespace) -> Outputs:
     return Outputs(folders=[Path(args.out)], inputs=[args.model], scene=args.images)
 
 
-def run(args: Namespace) -> dict[str, Any]:
+def execute(args: Namespace) -> dict[str, Any]:
     from .shared.inputs import pick_views, read_inputs
     from .shared.measure import Stopwatch, choose_dials, solve_dials
 
     console, watch, out = Console(args.quiet), Stopwatch(), Path(args.out)
-    (model,), scene = read_inputs(args, [args.model], console)
+    (model,), scene = read_inputs(args, [args.model], console, held_out=False)
     views = pick_views(scene, args.views)
     images = [out / name for name in image_names(views)]
     check_outputs(Outputs(derived=images, folders=[out], inputs=[args.model], scene=args.images))
@@ -141,16 +141,15 @@ def write_png(path: Path, pixels: Tensor) -> None:
         Image.fromarray(pixels.cpu().numpy()).save(temporary, pnginfo=about)
 
 
-COMMAND = common.Command(
-    summary="Render a scene's cameras at some dial values to PNG.",
-    description="""\
+SUMMARY = "Render a scene's cameras at some dial values to PNG."
+DESCRIPTION = """\
 Render the cameras of a scene's photographs at some dial values to PNG files.
 
 Each image has the name of its photograph and shows all dial values side by
 side, in the order given.
-""",
-    usage="MODEL.ply --images DIR -o FOLDER [options]",
-    epilog="""\
+"""
+USAGE = "MODEL.ply --images DIR -o FOLDER [options]"
+EPILOG = """\
 "clod-adapt eval --help" explains the budgets --keep, --fps and --psnr-drop.
 Ctrl-C finishes the image under way (exit code 0, "interrupted": true); a second
 one aborts.
@@ -159,9 +158,4 @@ examples:
   clod-adapt render garden_clod.ply --images garden -o out --sv 3
   clod-adapt render garden_clod.ply --images garden -o out --sv 1 2 5 --beside
   clod-adapt render garden_clod.ply --images garden -o out --views a.jpg --sv 2
-""",
-    add_arguments=add_arguments,
-    check=check,
-    run=run,
-    outputs=outputs,
-)
+"""

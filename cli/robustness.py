@@ -20,7 +20,7 @@ from clod_adapter.progress import Listener, Stopped
 from clod_adapter.report.style import check_matplotlib
 
 from .shared import command as common
-from .shared.console import Console, ProgressDisplay, clipped, duration
+from .shared.console import Console, ProgressDisplay, duration
 from .shared.outputs import Outputs, labels, write_report
 from .shared.process import GracefulStop
 from .shared.settings import add_settings, make_configs
@@ -32,7 +32,6 @@ if TYPE_CHECKING:
 COLUMNS = (
     "checkpoint", "max_sv", "within_range", "virtual_scale", "psnr", "ssim", "kept", "kept_share", "in_view", "frame_ms"
 )  # fmt: skip
-LONGEST = 16  # characters of a checkpoint's name in the table
 
 
 def add_arguments(parser: ArgumentParser) -> None:
@@ -155,23 +154,21 @@ class Cell:
         return cell
 
 
-def run(args: Namespace) -> dict[str, Any]:
+def execute(args: Namespace) -> dict[str, Any]:
     from clod_adapter.evaluation.robustness import BASELINE_SHARES, scene_fingerprint
 
-    from .shared.inputs import align, prepare_kernels, read_inputs, require_held_out
+    from .shared.inputs import align, prepare_kernels, read_inputs
     from .shared.measure import Stopwatch, machine, report_dials
 
     console, watch, stop, required = Console(args.quiet), Stopwatch(), GracefulStop(), not args.misaligned_ok
-    with watch.time("load"):
-        checkpoints, scene = read_inputs(args, args.ply, console, training=True, required=required)
-        require_held_out(scene, args.images)
-        for each in checkpoints[1:]:
-            if align(each, scene, args.images, console, required=required)[1]["frame"]:
-                raise ClodError(f"{each.path}: in another frame than {args.ply[0]}; give it alone")
-        for each in checkpoints:
-            if each.gaussians.sigma_d is not None:
-                console.note(f"the dial of {each.path} is ignored")
-            prepare_kernels(console, each.gaussians.means.device, screen_filter=each.gaussians.screen_filter)
+    checkpoints, scene = read_inputs(args, args.ply, console, training=True, required=required)
+    for each in checkpoints[1:]:
+        if align(each, scene, args.images, console, required=required)[1]["frame"]:
+            raise ClodError(f"{each.path}: in another frame than {args.ply[0]}; give it alone")
+    for each in checkpoints:
+        if each.gaussians.sigma_d is not None:
+            console.note(f"the dial of {each.path} is ignored")
+        prepare_kernels(console, each.gaussians.means.device, screen_filter=each.gaussians.screen_filter)
     names, configs, sha256 = labels(args.ply), make_configs(args), scene_fingerprint(scene)
     # Every range is measured at the dial values of the widest one and at its own end.
     dials = tuple(sorted({*report_dials(configs[-1].max_sv), *(config.max_sv for config in configs)}))
@@ -183,8 +180,7 @@ def run(args: Namespace) -> dict[str, Any]:
     if found:
         console.say(f"{len(found)} of {len(cells)} cells are done already: {', '.join(found)}")
     with stop.listening():
-        with watch.time("cells"):
-            interrupted = not run_cells(cells, found, scene, console, stop)
+        interrupted = not run_cells(cells, found, scene, console, stop)
         if not found:
             raise Stopped("stopped before the first cell was finished")
         files = result_files(Path(args.out))
@@ -238,7 +234,7 @@ def write_results(report: dict[str, Any], files: dict[str, Path], scene: str) ->
 
 def print_cells(report: dict[str, Any]) -> None:
     """One line per cell: its first and last row."""
-    names = [clipped(cell["checkpoint"], LONGEST) for cell in report["cells"]]
+    names = [cell["checkpoint"] for cell in report["cells"]]
     width = max(map(len, ["checkpoint", *names]))
     print(f"\n{'checkpoint':<{width}}  range     at the first              at the last")
     for checkpoint, cell in zip(names, report["cells"], strict=True):
@@ -249,17 +245,16 @@ def print_cells(report: dict[str, Any]) -> None:
         print(f"\nmissing: {', '.join(report['missing'])}; the same command continues")
 
 
-COMMAND = common.Command(
-    summary="Adapt checkpoints at several ranges, and plot them.",
-    description="""\
+SUMMARY = "Adapt checkpoints at several ranges, and plot them."
+DESCRIPTION = """\
 Run the robustness experiment of CLoD-GS: checkpoints adapted at several ranges.
 
 Adapts each checkpoint at each --max-sv and measures all at the same dial values
 on the held-out photographs, also beyond the trained range. The baseline is the
 checkpoint itself, pruned to its most opaque Gaussians without tuning.
-""",
-    usage="PLY [PLY ...] --images DIR [options]",
-    epilog="""\
+"""
+USAGE = "PLY [PLY ...] --images DIR [options]"
+EPILOG = """\
 outputs in DIR:
   robustness.png   PSNR and SSIM against Gaussians kept, histograms of opacity
                    and sigma_d; one row per checkpoint, one line per range
@@ -274,9 +269,4 @@ code 0, "interrupted": true; 130 if there are none). Remove DIR to start over.
 
 example:
   clod-adapt robustness 3dgs.ply mask.ply --images garden --max-sv 1 3 5 7
-""",
-    add_arguments=add_arguments,
-    check=check,
-    run=run,
-    outputs=outputs,
-)
+"""

@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from clod_adapter.viewer.server import Response
 
 MODEL, BASE = "/files/model", "/files/base"
-NO_CAMERAS = "stores no cameras, which --device-preset needs; give --images"
 IN_TERMINAL = ("lynx", "w3m", "links", "links2", "elinks", "www-browser")  # they would take over the terminal
 
 
@@ -87,11 +86,9 @@ def check(args: Namespace) -> None:
         raise ClodError(f"{files[0]}: has no sigma_d, which --device-preset needs; adapt it first")
     if args.images is not None:
         common.check_scene(args.images)
-    elif args.device_preset and not common.may_store(files[0], "viewpoint"):
-        raise ClodError(f"{files[0]}: {NO_CAMERAS}")
 
 
-def run(args: Namespace) -> None:
+def execute(args: Namespace) -> None:
     """Prints the address, or with --json the report, and serves the page until it is interrupted."""
     from clod_adapter.viewer.server import Server
 
@@ -126,7 +123,7 @@ def make_page(args: Namespace, console: Console) -> tuple[dict[str, Response], d
         models.append(with_filter(read_checkpoint(path, console, args.activated, origin), args, console))
     base, model = models.pop() if args.base else None, models[0]
     if args.device_preset and args.images is None and not model.viewpoints:
-        raise ClodError(f"{model.path}: {NO_CAMERAS}")
+        raise ClodError(f"{model.path}: stores no cameras, which --device-preset needs; give --images")
     if base and args.antialiasing == "auto" and not base.filter_known:  # drawn as the model is
         drawn = model.gaussians.screen_filter
         base = replace(base, gaussians=base.gaussians.replace(screen_filter=drawn))
@@ -181,16 +178,15 @@ def open_browser(url: str) -> bool:
     return browser is not None and browser.open(url)
 
 
-COMMAND = common.Command(
-    summary="Look at a file in the browser, and turn its dial.",
-    description="""\
+SUMMARY = "Look at a file in the browser, and turn its dial."
+DESCRIPTION = """\
 Show a file in the browser, with its dial and a free camera.
 
 Serves a page on 127.0.0.1, prints the address, opens it in the browser, and
 runs until Ctrl-C.
-""",
-    usage="MODEL.ply ... [--base BASE.ply] [--images DIR] [options]",
-    epilog="""\
+"""
+USAGE = "MODEL.ply ... [--base BASE.ply] [--images DIR] [options]"
+EPILOG = """\
 The page opens at s = 1 with photographs, else with everything shown, and holds
 30 frames per second by the dial; --sv sets a value that stays. It shows the
 Gaussians kept and the frame time, switches the attenuation on and off, and
@@ -218,8 +214,4 @@ examples:
   clod-adapt view garden_clod.ply --base garden.ply --images garden --sv 3
   clod-adapt view garden_clod.ply --device-preset phone
   clod-adapt view levels/
-""",
-    add_arguments=add_arguments,
-    check=check,
-    run=run,
-)
+"""

@@ -46,7 +46,7 @@ INTEGRATIONS = (
 def commands_page() -> str:
     """Usage, description, options and notes of each command, as in ``--help``."""
     parts = ["# Commands\n\nThe `--help` text of every command.\n"]
-    return "\n".join(parts + [command_section(name, each) for name, each in [("", adapt.COMMAND), *COMMANDS.items()]])
+    return "\n".join(parts + [command_section(name, each) for name, each in [("", adapt), *COMMANDS.items()]])
 
 
 def command_section(name: str, command: Command) -> str:
@@ -54,8 +54,8 @@ def command_section(name: str, command: Command) -> str:
     title = f"{PROG} {name}".strip()
     rows = [option_row(action) for action in build_parser(name)._actions if action.dest != "help"]
     table = "\n".join(["| | |", "|---|---|", *rows])
-    usage, notes = f"```text\n{title} {command.usage}\n```\n", f"```text\n{command.epilog.strip()}\n```\n"
-    return f"## {title}\n\n{usage}\n{command.description.strip()}\n\n{table}\n\n{notes}"
+    usage, notes = f"```text\n{title} {command.USAGE}\n```\n", f"```text\n{command.EPILOG.strip()}\n```\n"
+    return f"## {title}\n\n{usage}\n{command.DESCRIPTION.strip()}\n\n{table}\n\n{notes}"
 
 
 def option_row(action: argparse.Action) -> str:

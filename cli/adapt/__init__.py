@@ -10,7 +10,7 @@ from clod_adapter.blocks.memory import parse_size
 from clod_adapter.errors import ClodError
 from clod_adapter.io.file_formats import check_readable
 
-from ..shared.command import Command, add_reading, check_scene, page_files
+from ..shared.command import add_reading, check_scene, page_files
 from ..shared.outputs import AdaptFiles, Outputs, check_ply_name
 from ..shared.process import launched
 from ..shared.settings import add_settings, make_config
@@ -78,24 +78,23 @@ def outputs(args: Namespace) -> Outputs:
     )  # fmt: skip
 
 
-def run_adapt(args: Namespace) -> dict[str, Any]:
+def execute(args: Namespace) -> dict[str, Any]:
     from .run import adapt
 
     return adapt(args)
 
 
-COMMAND = Command(
-    summary="Give a trained 3D Gaussian splat a quality dial.",
-    description="""\
+SUMMARY = "Give a trained 3D Gaussian splat a quality dial."
+DESCRIPTION = """\
 Give a trained 3D Gaussian splat a quality dial: one file for every budget.
 
 Learns two numbers per Gaussian: sigma_d, by which a renderer fades detail out
 with distance, and growth_d, by which the others grow into the gaps. Fine-tunes
 the other attributes. The dial s is set when rendering: s = 1 is full quality;
 at s about s^-1.5 of the Gaussians are drawn.
-""",
-    usage="PLY [--images DIR] [--max-sv S] [--out OUT.ply] [options]",
-    epilog="""\
+"""
+USAGE = "PLY [--images DIR] [--max-sv S] [--out OUT.ply] [options]"
+EPILOG = """\
 outputs (existing files are replaced):
   OUT.ply          the splat with sigma_d and growth_d, and a calibration in its
                    header: dial value, count, PSNR, SSIM and frame time
@@ -135,9 +134,4 @@ examples:
   clod-adapt garden.ply --images garden --quiet --json > report.json
   clod-adapt garden.ply --max-sv 5
   torchrun --nproc-per-node 8 -m clod_adapter garden.ply --images garden
-""",
-    add_arguments=add_arguments,
-    check=check,
-    run=run_adapt,
-    outputs=outputs,
-)
+"""

@@ -149,13 +149,11 @@ def finish(run: Run, result: Result, page: AdaptPage | None) -> dict[str, Any]:
         console.say("interrupted: the page of --report was not written")
     elif page:  # after the report, which it changes
         path = outputs.ply.with_suffix(".html")
-        report["seconds"] = seconds(run, result)  # with those of writing; the page shows the total without its own
         with run.watch.time("page"):
             page.write(path, report, result.gaussians, result.adapted.start_seconds)
-        report["seconds"]["page"] = run.watch.report()["page"]
-        report["forecast"] = against_forecast(run)
+        report |= {"seconds": seconds(run, result), "forecast": against_forecast(run)}
         write_report(outputs.report, report)
-    print_summary(run, measured, report)
+    print_summary(run, measured)
     if "loss" in report:
         console.say(f"\nwarning: {report['loss']}")
     return report
@@ -255,7 +253,7 @@ def teacher(args: argparse.Namespace) -> str:
     return "checkpoint" if args.images is None else "photographs"
 
 
-def print_summary(run: Run, measured: Measurements, report: dict[str, Any]) -> None:
+def print_summary(run: Run, measured: Measurements) -> None:
     args, outputs = run.args, run.outputs
     if measured.rows:
         marked = [("base", row) for row in measured.base] + by_dial(measured.rows)
@@ -264,9 +262,7 @@ def print_summary(run: Run, measured: Measurements, report: dict[str, Any]) -> N
             print(f"plain: {outputs.ply} in a viewer that does not know the dial\n")
     for path in vars(outputs).values():
         print(f"{size(path):>9}  {path}")
-    page = report["seconds"].get("page")
-    more = f", and {duration(page)} for the page" if page else ""
-    print(f"\n{duration(report['seconds']['total'] if page else run.watch.total())} in all{more}; next:")
+    print(f"\n{duration(run.watch.total())} in all; next:")
     model = shlex.quote(str(outputs.ply))
     images = [] if args.images is None else [f"--images {shlex.quote(args.images)}"]
     print("  clod-adapt view", model, f"--base {shlex.quote(args.ply)}", *images)

@@ -61,18 +61,19 @@ def add_arguments(parser: ArgumentParser) -> None:
         "--camera", metavar="PHOTO", help="bake for the camera of this photograph alone; its suffix can be left out"
     )
     dial = parser.add_argument_group("dial values, one of")
-    common.add_dial_options(dial, "the dial value to bake", "(in the file written)", several=False)
-    dial.add_argument(
+    values = common.add_dial_options(dial, "the dial value to bake", "(in the file written)", several=False)
+    values.add_argument(
         "--levels", metavar="S,S,...", type=levels_of, help="several dial values, each baked into its own file"
     )
     output = parser.add_argument_group("output")
     output.add_argument("-o", "--out", metavar="OUT", required=True, help="output file; its suffix is the format")
-    output.add_argument(
-        "--lod-meta", dest="folder", action="append_const", const="--lod-meta",
+    sets = output.add_mutually_exclusive_group()
+    sets.add_argument(
+        "--lod-meta", dest="folder", action="store_const", const="--lod-meta",
         help="write the levels as one streaming set for PlayCanvas's viewers, in the new folder OUT",
     )  # fmt: skip
-    output.add_argument(
-        "--3dtiles", dest="folder", action="append_const", const="--3dtiles",
+    sets.add_argument(
+        "--3dtiles", dest="folder", action="store_const", const="--3dtiles",
         help="write the levels as one 3D Tiles set, for CesiumJS, in the new folder OUT",
     )  # fmt: skip
     output.add_argument(
@@ -87,11 +88,9 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 
 def check(args: Namespace) -> None:
-    one = args.sv is not None or common.given_budget(args) is not None
-    bakes, page, folder, out = one or bool(args.levels), is_page(args), folder_option(args), Path(args.out)
+    bakes = args.sv is not None or common.given_budget(args) is not None or bool(args.levels)
+    page, folder, out = is_page(args), args.folder, Path(args.out)
     refuse(
-        (args.levels and one, "--levels gives the dial values; give no other option for them"),
-        (len(set(args.folder or ())) > 1, "--lod-meta and --3dtiles write a folder each; give one of them"),
         (folder and len(args.levels or ()) < 2,
          f"{folder} needs several levels; give them, as in --levels 1,2,4,7"),
         (folder and args.order, f"{folder} sorts the Gaussians itself; remove --order"),
@@ -114,7 +113,7 @@ def check(args: Namespace) -> None:
             (not out.name, f"{out}: is the current folder; --out must name a new one"),  # ".", which is not replaced
         )  # fmt: skip
     suffix = "" if folder else suffix_of(out)
-    common.check_dials(args, args.model, measured=("fps",) if args.images is not None else ())
+    common.check_dials(args, args.model)
     check_readable(Path(args.model))
     dial, form = file_has_dial(Path(args.model)), FORMATS.get(suffix)
     others = ", ".join(other for other, each in FORMATS.items() if each.carries_sigma)
@@ -145,11 +144,6 @@ def suffix_of(out: Path) -> str:
     return max(found, key=len)  # .compressed.ply ends in .ply
 
 
-def folder_option(args: Namespace) -> str:
-    """The option with which OUT is a folder of levels, or an empty one."""
-    return args.folder[0] if args.folder else ""
-
-
 def is_page(args: Namespace) -> bool:
     return Path(args.out).suffix.lower() == PAGE
 
@@ -165,7 +159,7 @@ def outputs(args: Namespace) -> Outputs:
     return Outputs([] if levels else [out], levels, whole=folder, inputs=[args.model], scene=args.images)
 
 
-def run(args: Namespace) -> dict[str, Any]:
+def execute(args: Namespace) -> dict[str, Any]:
     from clod_adapter.bake import order_by_extinction
     from clod_adapter.inspection.report import extra_columns
 
@@ -218,7 +212,7 @@ def write(args: Namespace, export: Export, dials: list[float] | None) -> list[di
     from clod_adapter.io.atomic import atomic_path, atomic_paths
 
     out, outputs = Path(args.out), list[dict[str, Any]]()
-    if option := folder_option(args):
+    if option := args.folder:
         with atomic_path(out) as folder:
             counts = export.write_folder(folder / FOLDERS[option], dials or [])
             total = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
@@ -255,14 +249,13 @@ def format_table() -> str:
     return "\n".join(lines)
 
 
-COMMAND = common.Command(
-    summary="Write a file for other tools: another format, or plain.",
-    description="""\
+SUMMARY = "Write a file for other tools: another format, or plain."
+DESCRIPTION = """\
 Write a model for other tools: in another format, with its dial if the format
 can store it, or with one dial value baked in.
-""",
-    usage="MODEL -o OUT [--sv S | --keep N | ... | --levels S,...]",
-    epilog=f"""\
+"""
+USAGE = "MODEL -o OUT [--sv S | --keep N | ... | --levels S,...]"
+EPILOG = f"""\
 formats, by the suffix of OUT:
   suffix           dial  values
 {format_table()}
@@ -311,9 +304,4 @@ examples:
   clod-adapt export garden_clod.ply --levels 1,2,4,7 --lod-meta -o garden_lod
   clod-adapt export garden_clod.ply --levels 1,2,4,7 --3dtiles -o garden_tiles
   clod-adapt export garden_clod.ply --order extinction -o sorted.ply
-""",
-    add_arguments=add_arguments,
-    check=check,
-    run=run,
-    outputs=outputs,
-)
+"""

@@ -113,7 +113,7 @@ class Export:
         contents = [self.content(level) for level in levels]
         found = [gaussians for gaussians, _ in contents]
         counts = [len(gaussians) for gaussians in found]
-        if "--3dtiles" in self.args.folder:
+        if self.args.folder == "--3dtiles":
             prepare_kernels(self.console, found[0].means.device, training=False)
             with self.console.meter("errors of levels") as meter:
                 errors = geometric_errors(found, looking(self.cameras), progress=meter)

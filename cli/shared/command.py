@@ -4,20 +4,17 @@ from __future__ import annotations
 
 import math
 from argparse import ArgumentParser, Namespace, RawDescriptionHelpFormatter
-from collections.abc import Callable, Collection
-from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn, Protocol
 
 from clod_adapter.config import DEVICES, FILTERS
 from clod_adapter.errors import ClodError
-from clod_adapter.io.file_formats import PLY, file_has_dial, format_of
+from clod_adapter.io.file_formats import file_has_dial
 from clod_adapter.io.scene.folder import find_cameras
 from clod_adapter.report.charts import chart_file
 from clod_adapter.report.style import check_matplotlib
 
-from .outputs import Outputs
 from .process import check_printed
 
 if TYPE_CHECKING:
@@ -28,37 +25,38 @@ if TYPE_CHECKING:
 MANUAL = "index.md"  # the first page; where it is installed: pyproject.toml's data-files
 
 
-@dataclass(frozen=True)
-class Command:
-    """The texts of ``--help``, and the functions that parse, check and run a command.
+class Command(Protocol):
+    """The module of a command; it may also have ``outputs``, which is called after ``check``.
 
-    Its module imports torch within functions, so that ``--help`` and errors of arguments, which ``check`` raises, take
-    no second. ``run`` returns the object that --json prints, or None; ``outputs`` is called after ``check``.
+    It imports torch within functions, so that ``--help`` and the errors of ``check`` take no second.
     """
 
-    summary: str
-    description: str
-    usage: str
-    epilog: str
-    add_arguments: Callable[[ArgumentParser], None]
-    check: Callable[[Namespace], None]
-    run: Callable[[Namespace], dict[str, Any] | None]
-    outputs: Callable[[Namespace], Outputs] = lambda args: Outputs()
-    needs_torch: bool = True
+    SUMMARY: str
+    DESCRIPTION: str
+    USAGE: str
+    EPILOG: str
 
-    def parser(self, prog: str) -> Parser:
-        """The parser, with the options that all commands have."""
-        parser = Parser(
-            prog=prog, usage=f"{prog} {self.usage}", description=self.description, epilog=self.epilog,
-            formatter_class=RawDescriptionHelpFormatter, add_help=False, allow_abbrev=False,
-        )  # fmt: skip
-        self.add_arguments(parser)
-        parser.general = parser.add_argument_group("general")
-        parser.general.add_argument("-h", "--help", action="help", help="show this text")
-        if parser.get_default("quiet") is None:
-            parser.general.add_argument("--quiet", action="store_true", help="no progress, no notes")
-        parser.general.add_argument("--json", action="store_true", help="one JSON object on stdout")
-        return parser
+    def add_arguments(self, parser: ArgumentParser) -> None: ...
+
+    def check(self, args: Namespace) -> None: ...
+
+    def execute(self, args: Namespace) -> dict[str, Any] | None:
+        """The object that --json prints, or None."""
+
+
+def parser_of(command: Command, prog: str) -> Parser:
+    """The parser, with the options that all commands have."""
+    parser = Parser(
+        prog=prog, usage=f"{prog} {command.USAGE}", description=command.DESCRIPTION, epilog=command.EPILOG,
+        formatter_class=RawDescriptionHelpFormatter, add_help=False, allow_abbrev=False,
+    )  # fmt: skip
+    command.add_arguments(parser)
+    parser.general = parser.add_argument_group("general")
+    parser.general.add_argument("-h", "--help", action="help", help="show this text")
+    if parser.get_default("quiet") is None:
+        parser.general.add_argument("--quiet", action="store_true", help="no progress, no notes")
+    parser.general.add_argument("--json", action="store_true", help="one JSON object on stdout")
+    return parser
 
 
 class Parser(ArgumentParser):
@@ -142,8 +140,8 @@ def add_device(options: _ActionsContainer, what: str) -> None:
     options.add_argument("--device", choices=["auto", "cpu", "cuda"], default="auto", help=f"where to {what}; {usual}")
 
 
-def add_dial_options(options: _ActionsContainer, sv_help: str, where: str, *, several: bool) -> None:
-    """Adds --sv and the budgets, of which one may be given; ``several`` allows more than one value of it."""
+def add_dial_options(options: _ActionsContainer, sv_help: str, where: str, *, several: bool) -> _ActionsContainer:
+    """Adds --sv and the budgets, of which one may be given, with ``several`` values; returns their group."""
     times = "measured first" if several else "in the file, or with --images measured first"
     group: Any = options.add_mutually_exclusive_group()
     count = "+" if several else 1
@@ -153,6 +151,7 @@ def add_dial_options(options: _ActionsContainer, sv_help: str, where: str, *, se
         group.add_argument(as_option(name), metavar=metavar, type=kind, nargs=count, help=shown)
     if not several:
         add_device_preset(group)
+    return group
 
 
 def add_device_preset(options: _ActionsContainer) -> None:
@@ -193,37 +192,20 @@ def page_files(path: Path, charts: list[str]) -> list[Path]:
     return [path, *(chart_file(path, name) for name in charts)]
 
 
-def check_dials(args: Namespace, model: str, *, measured: Collection[str] = ("fps",)) -> None:
-    """Refuses dial values out of range, and budgets that need what the file lacks, except those to be ``measured``."""
+def check_dials(args: Namespace, model: str) -> None:
+    """Refuses dial values out of range, and budgets of a file without a dial."""
     for virtual_scale in args.sv or ():
         if not 0 <= virtual_scale < math.inf:
             raise ClodError(f"--sv has {virtual_scale:g}, it must be at least 0 (1 is full quality, 0 everything)")
     budget = given_budget(args)
     if budget is None:
         return
-    name, option, values = budget
+    _, option, values = budget
     for value in values:
         if not 0 < value < math.inf:
             raise ClodError(f"{option} has {value:g}, it must be positive and finite")
     if not file_has_dial(Path(model)):
         raise ClodError(f"{model}: has no sigma_d, which {option} needs; adapt it first: clod-adapt {model} ...")
-    needed = name != "keep" and name not in measured
-    if needed and not may_store(model, "calibrated"):
-        raise ClodError(
-            f"{model}: has no calibration in its header, which {option} needs; adapt it again without interrupting, "
-            "or give --sv or --keep"
-        )
-
-
-def may_store(model: str, name: str) -> bool:
-    """Whether a PLY's header has a comment of this name (``ply_settings``); True of formats that must be read."""
-    from clod_adapter.io.ply import all_comments, read_head  # here: --help needs no plyfile
-    from clod_adapter.io.ply_settings import PREFIX
-
-    path = Path(model)
-    if format_of(path) is not PLY:
-        return True
-    return any(comment.startswith(f"{PREFIX}{name} ") for comment in all_comments(read_head(path).ply))
 
 
 def check_scene(folder: str) -> None:

@@ -43,27 +43,12 @@ class Console:
 
     @contextmanager
     def status(self, text: str) -> Iterator[Callable[[str], None]]:
-        """Shows the work under way, if its progress is unknown; yields a function that changes the text.
-
-        Without a terminal that function writes a line now and then.
-        """
-        shown, printed = None, time.perf_counter()
-        if not self.quiet and sys.stderr.isatty():
-            shown = tqdm(bar_format="{desc}", desc=text, file=sys.stderr, leave=False, dynamic_ncols=True)
-
-        def show(more: str) -> None:
-            nonlocal printed
-            if shown is not None:
-                shown.set_description_str(more)
-            elif time.perf_counter() - printed >= LINE_EVERY:
-                printed = time.perf_counter()
-                self.say(more)
-
-        try:
-            yield show
-        finally:
-            if shown is not None:
-                shown.close()
+        """Shows on a terminal the work under way, if its progress is unknown; yields a function that changes it."""
+        if self.quiet or not sys.stderr.isatty():
+            yield lambda more: None
+            return
+        with tqdm(bar_format="{desc}", desc=text, file=sys.stderr, leave=False, dynamic_ncols=True) as shown:
+            yield shown.set_description_str
 
     def meter(self, label: str) -> closing[Meter]:
         """The progress of a phase, until the end of the block."""
@@ -89,7 +74,7 @@ class Meter:
 
     def update(self, share: float, text: str = "") -> None:
         """Shows the ``share`` that is done, in [0, 1], followed by ``text``."""
-        now, text = time.perf_counter(), clipped(text, TEXT)
+        now, text = time.perf_counter(), text if len(text) <= TEXT else f"{text[: TEXT - 3].rstrip()}..."
         if self.bar is not None:
             self.bar.set_postfix_str(text, refresh=False)
             self.bar.update(min(share, 1.0) - self.bar.n)
@@ -139,11 +124,6 @@ class ProgressDisplay:
         if self.meter is not None:
             self.meter.close()
             self.meter = None
-
-
-def clipped(text: str, most: int) -> str:
-    """``text`` with at most this many characters."""
-    return text if len(text) <= most else f"{text[: most - 3].rstrip()}..."
 
 
 def duration(seconds: float) -> str:

@@ -9,7 +9,6 @@ from pathlib import Path, PureWindowsPath
 from typing import Any
 
 import torch
-from numba.core.caching import NullCache
 from numba.core.event import Event, Listener, install_listener
 
 from clod_adapter._support.text import first_line
@@ -80,8 +79,9 @@ def scene_to_train(
 
 
 def read_inputs(
-    args: argparse.Namespace, paths: Sequence[str], console: Console, *, training: bool = False, required: bool = False
-) -> tuple[list[Checkpoint], Scene]:
+    args: argparse.Namespace, paths: Sequence[str], console: Console, *, held_out: bool = True, training: bool = False,
+    required: bool = False,
+) -> tuple[list[Checkpoint], Scene]:  # fmt: skip
     """Checkpoints, with their screen-space filters, and the photographs in the frame of the first one.
 
     All coordinates are relative to its origin.
@@ -91,14 +91,11 @@ def read_inputs(
         origin = found[0].origin if found else None
         found.append(on_device(read_checkpoint(path, console, args.activated, origin), device))
     scene = read_scene(args.images, console, found[0].origin)
+    if held_out and not scene.test:
+        raise ClodError(f"{args.images}: there are no held-out photographs to evaluate on; give at least two")
     prepare_kernels(console, device, training=training)
     scene, _ = align(found[0], scene, args.images, console, required=required)
     return [with_filter(each, args, console, [*scene.test, *scene.train]) for each in found], scene
-
-
-def require_held_out(scene: Scene, images: str) -> None:
-    if not scene.test:
-        raise ClodError(f"{images}: there are no held-out photographs to evaluate on; give at least two")
 
 
 def pick_device(name: str, console: Console) -> torch.device:
@@ -224,9 +221,8 @@ class _Compiling(Listener):  # type: ignore[misc]
 
     def on_start(self, event: Event) -> None:
         if not self.said:
-            self.said, cached = True, not isinstance(event.data["dispatcher"]._cache, NullCache)
-            nowhere = "on every run, as no cache folder is writable: set NUMBA_CACHE_DIR"
-            self.console.say(f"compiling kernels ({'first run only, well under a minute' if cached else nowhere}) ...")
+            self.said = True
+            self.console.say("compiling kernels (first run only, or without a writable NUMBA_CACHE_DIR) ...")
 
     def on_end(self, event: Event) -> None:
         pass

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import io
 import signal
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
@@ -71,19 +69,6 @@ def run_in() -> Callable[..., Done]:
 def blank_figure(monkeypatch: pytest.MonkeyPatch) -> None:
     """Replaces the figure of ``clod-adapt robustness``, which takes a second to draw, by an empty file."""
     monkeypatch.setattr("clod_adapter.report.robustness_figure.robustness_figure", lambda path, *_: Path(path).touch())
-
-
-@pytest.fixture(scope="session")
-def spawn() -> Callable[..., subprocess.Popen[str]]:
-    """Starts ``clod-adapt`` with these words in a process of its own, with a progress line every ``line_every`` s."""
-
-    def start(*words: object, cwd: Path, line_every: float = 10) -> subprocess.Popen[str]:
-        code = "import sys; from clod_adapter.cli import main; from clod_adapter.cli.shared import console; "
-        code += f"console.LINE_EVERY = {line_every}"
-        command = [sys.executable, "-c", f"{code}; sys.exit(main.main())", *accepted(words)]
-        return subprocess.Popen(command, cwd=cwd, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
-
-    return start
 
 
 @pytest.fixture(scope="session")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import signal
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,10 @@ import pytest
 import torch
 
 import clod_adapter
+from clod_adapter.cli.shared import measure
 from clod_adapter.evaluation import evaluate as module
+from clod_adapter.evaluation import frame_times
+from clod_adapter.evaluation.frame_times import FrameTimes, Model
 from runs import pressing
 
 ROW = {"virtual_scale", "psnr", "ssim", "kept", "kept_share", "in_view", "frame_ms"}
@@ -66,17 +70,12 @@ def test_base_by_rank_and_popping(clod: Any, capture: Any, dialled: Path) -> Non
     dial, other, walk = report["popping"]
     assert (dial["moved"], other["moved"]) == ("dial, 000.png", "dial, 008.png")
     assert walk["moved"] == "camera, 002.png to 006.png, s = 4"
-    for entry in (dial, other, walk):
-        assert entry["steps"] == len(entry["changes"]) == 200
-        assert entry["largest"] == max(entry["changes"]) and 1 < entry["ratio"] < 200
-        assert 0.3 < entry["persistence"] <= 1 and entry["largest"] < entry["pixel"] < 255
-    assert 1 < dial["at"] <= 4 and 0 < walk["at"] <= 1
+    assert all(entry["steps"] == len(entry["changes"]) == 200 and entry["ratio"] > 1 for entry in report["popping"])
     assert re.search(r"^ +steps +mean", err, re.M) and "\ncamera, 002.png to 006.png, s = 4\n" in err
 
 
 def test_against_at_matched_counts(clod: Any, capture: Any, dialled: Path, tmp_path: Path) -> None:
-    """Files of one name have their folders as labels, also in the page."""
-    pytest.importorskip("matplotlib")
+    """Files of one name have their folders as labels."""
     shown = measured(clod, dialled, "--images", capture.scene, "--sv", 1, 4)[0]["rows"]
     count = round((shown[0]["kept"] + shown[1]["kept"]) / 2)  # within the dial's reach
     paths = []
@@ -84,11 +83,8 @@ def test_against_at_matched_counts(clod: Any, capture: Any, dialled: Path, tmp_p
         (tmp_path / name).mkdir()
         paths.append(capture.write(tmp_path / name / "cloud.ply", capture.gaussians.select(torch.arange(size))))
     words = (dialled, "--images", capture.scene, "--sv", 1, 2, "--against", *paths, dialled)
-    report, err = measured(clod, *words, "--report", "page.html")
-    labels = ["a_cloud", "b_cloud", "dial", "dial"]
-    assert [entry["label"] for entry in report["against"]] == labels
-    text = (tmp_path / "page.html").read_text(encoding="utf-8")
-    assert all(f'"label": "{name}"' in text for name in labels)
+    report, err = measured(clod, *words)
+    assert [entry["label"] for entry in report["against"]] == ["a_cloud", "b_cloud", "dial", "dial"]
     pairs = [(entry["theirs"]["kept"], entry["ours"]["kept"]) for entry in report["against"]]
     assert pairs[0][0] == count == pytest.approx(pairs[0][1], abs=1)
     assert pairs[1][0] == 300 > pairs[1][1] == report["rows"][0]["kept"]
@@ -106,3 +102,26 @@ def test_interrupt_keeps_finished_comparisons(
     report, _ = measured(clod, *words)
     assert report["interrupted"] is True and len(report["rows"]) == 2 and report["popping"] == []
     assert report["base_row"] and [entry["by"] for entry in report["ranked"]] == ["opacity"]
+
+
+def test_frames_are_timed_together(clod: Any, capture: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those of base, result and plain file; frames take 1000/s ms, and those of the k-th model k times that."""
+    seen = list[list[int]]()
+
+    def times(models: Sequence[Model], cameras: Any, progress: Any) -> FrameTimes:
+        seen.append([len(some) for some, _ in models])
+        found = tuple(tuple(1000.0 * (k + 1) / s for s in dials) for k, (_, dials) in enumerate(models))
+        return FrameTimes(found, 0.5)
+
+    monkeypatch.setattr(measure, "time_frames", times)
+    monkeypatch.setattr(frame_times, "NOISY", 0.2)
+    scene = ("--images", capture.scene, "--json")
+    done = clod(capture.ply, *scene, "--iters", 2, "--max-sv", 4, "--out", "dial.ply")
+    report, table = json.loads(done.out), clod_adapter.load("dial.ply").calibration
+    assert seen == [[300, 300, 300]] and table is not None
+    assert [row.frame_ms * row.virtual_scale for row in table.rows] == pytest.approx([2000] * 5)
+    assert (report["base_rows"][0]["frame_ms"], report["detached_row"]["frame_ms"]) == (1000, 3000)
+    assert any("frame times are rough: they varied by 50%" in note for note in report["notes"])
+    assert done.err.count("frame times are rough") == 1
+    rows = json.loads(clod("eval", "dial.ply", *scene, "--sv", 3, 1).out)["rows"]
+    assert [(row["virtual_scale"], round(row["frame_ms"])) for row in rows] == [(3, 333), (1, 1000)]

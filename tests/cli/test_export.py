@@ -19,6 +19,7 @@ from plyfile import PlyData, PlyElement
 
 import clod_adapter
 from clod_adapter.calibration import Calibration, CalibrationRow, Viewpoint
+from clod_adapter.cli.shared.inputs import named
 from clod_adapter.errors import ClodError
 from clod_adapter.io.checkpoint import load, save
 from clod_adapter.io.formats import splat_transform
@@ -26,7 +27,6 @@ from clod_adapter.io.ply_settings import write_comments
 from formats import with_columns
 from scenes import gaussians as random_gaussians
 
-FLIP = torch.tensor([1.0, -1, -1, 1])  # the axes of OpenGL's cameras
 ONE, SET = ("--sv", 2, "-o", "x.sog"), ("--levels", "1,2", "--lod-meta", "-o", "out")
 TOOL = """
 import json, pathlib, sys
@@ -112,18 +112,17 @@ def test_baking(clod: Any, capture: Any, dialled: Path, tmp_path: Path) -> None:
     assert torch.equal(load("x.ply").gaussians.means, want.means)
 
 
-def test_names_of_cameras(clod: Any, capture: Any, dialled: Path, tmp_path: Path) -> None:
-    """With or without suffix and folder; two photographs of one name need the whole one."""
-    train = clod_adapter.load_scene(capture.scene).train
-    frames = [
-        {"file_path": name, "transform_matrix": (torch.linalg.inv(view.camera.viewmat) * FLIP).tolist()}
-        for name, view in zip(["a.jpg", "a.png", "images/b.jpg", "b.jpg"], train, strict=False)
-    ]
-    (tmp_path / "transforms.json").write_text(json.dumps({"fl_x": 60, "w": 64, "h": 48, "frames": frames}))
-    for name, code in {"a": 2, "a.png": 0, "b.jpg": 0, "images/b": 0, "c": 2}.items():
-        done = clod("export", dialled, "--sv", 2, "--images", tmp_path, "-o", "x.ply", "--camera", name)
-        assert done.code == code, done
-        assert name != "a" or "--camera: 'a' matches a.jpg and a.png; give the full name" in done.err
+def test_names_of_cameras(clod: Any, capture: Any, dialled: Path) -> None:
+    """With or without suffix; one of several photographs of that name needs more."""
+    there = ("export", dialled, "--sv", 2, "--images", "scene", "-o", "x.ply", "--camera")
+    (scene := Path("scene")).symlink_to(capture.scene)
+    views = clod_adapter.load_scene(scene).train
+    names = ["a.jpg", "a.png", "images/b.jpg", "b.jpg"]
+    found = [replace(view.camera, name=name) for view, name in zip(views, names, strict=False)]
+    for name, want in {"a": names[:2], "a.png": ["a.png"], "b.jpg": ["b.jpg"], "images/b": ["images/b.jpg"]}.items():
+        assert [camera.name for camera in named(found, name, "--camera")] == want
+    assert clod(*there, "003").code == clod(*there, "003.png").code == 0
+    assert "no photograph is named 'no'" in clod(*there, "no").err
 
 
 def test_levels(clod: Any, dialled: Path, tmp_path: Path) -> None:

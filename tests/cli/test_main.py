@@ -1,4 +1,4 @@
-"""``cli/main.py``: exit codes, signals, pipes, and errors of every kind."""
+"""``cli/main.py``: exit codes, pipes, errors of every kind, and ``--help``."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ import pytest
 import torch
 
 from clod_adapter._support.version import package_version
+from clod_adapter.cli.main import COMMANDS
 
 CAUSED = SystemError("returned a result with an exception set")  # as numba hands on a Ctrl-C
 CAUSED.__cause__ = KeyboardInterrupt()
@@ -28,10 +29,8 @@ BUG = f"error: this is a bug in clod-adapt {package_version()}, not in the input
         (KeyboardInterrupt(), 130, "interrupted$"), (CAUSED, 130, "interrupted$"),
         (SystemError("of numba"), 1, BUG), (RuntimeError("unknown"), 1, BUG),
         (MemoryError(), 2, LITTLE), (RuntimeError("can't start new thread"), 2, LITTLE),
-        (RuntimeError("[enforce fail at alloc_cpu.cpp:119] . DefaultCPUAllocator: can't allocate memory"), 2, LITTLE),
         (torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB."), 2, LITTLE),
         (ImportError("libtorch_cpu.so: failed to map segment from shared object"), 2, LITTLE),
-        (OSError(12, "Cannot allocate memory"), 2, LITTLE),
     ],
 )  # fmt: skip
 def test_errors_of_the_work(
@@ -86,3 +85,22 @@ def test_results_that_cannot_be_printed_are_an_error(capture: Any, words: str) -
 def test_a_file_of_nearly_a_commands_name(clod: Any, tmp_path: Path) -> None:
     (tmp_path / "veiw").touch()
     assert "did you mean" not in clod("veiw").err
+
+
+@pytest.mark.parametrize("command", ["", *COMMANDS])
+def test_help(clod: Any, command: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Options are grouped: inputs come first and general options last; none is outside a group."""
+    monkeypatch.setenv("COLUMNS", "80")
+    done = clod(*command.split(), "--help")
+    assert done.code == 0 and done.out.startswith("usage: clod-adapt") and "--json" in done.out
+    *lines, page = done.out.splitlines()
+    assert max(map(len, lines)) <= 80 and page.startswith("manual: ") and page.endswith("index.md")
+    short = re.search(r"\n  -o[ ,]", done.out) is not None  # Python 3.13 writes "-o, --out X", 3.12 "-o X, --out X"
+    assert ("--out " in done.out) == short == (command not in ("eval", "inspect", "view", "doctor"))
+    titles = re.findall(r"(?m)^(\w[\w ,]*):\n  (?:-|[A-Z])", done.out)
+    titles = titles[: titles.index("general") + 1]
+    assert titles[0] == {"demo": "output", "doctor": "general"}.get(command, "input")
+    assert not {"positional arguments", "options"} & set(titles)
+    if not command:
+        assert all(f"clod-adapt {other}" in done.out for other in COMMANDS)
+        assert clod("--version").out.split() == ["clod-adapt", package_version()]

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import signal
 import socket
+import time
 import urllib.request
 import webbrowser
 from pathlib import Path
@@ -16,6 +18,7 @@ import pytest
 import clod_adapter
 from clod_adapter.cli import view
 from clod_adapter.cli.main import build_parser
+from runs import Server, log_of, wait_for
 
 URL = "http://127.0.0.1:1/"
 
@@ -36,19 +39,23 @@ def assert_holds(data: bytes, file: Path, folder: Path) -> None:
     assert len(served) == len(shown) and (served.attenuation is None) == (shown.attenuation is None)
 
 
-def test_serves_until_it_is_interrupted(spawn: Any, capture: Any, dialled: Path, tmp_path: Path) -> None:
-    words = [dialled, "--base", capture.ply, "--images", capture.scene, "--sv", 2, "--no-browser", "--json"]
-    process = spawn("view", *words, cwd=tmp_path)
-    report = json.loads(process.stdout.readline())
+def test_serves_until_it_is_interrupted(server: Server, capture: Any, dialled: Path, tmp_path: Path) -> None:
+    words = [dialled, "--base", capture.ply, "--images", capture.scene, "--sv", 2, "--no-browser", "--json", "--quiet"]
+    process = server.start(tmp_path, "view", *words)
+    wait_for(Path(f"{tmp_path}.log"))
+    until = time.monotonic() + 60
+    while "\n" not in log_of(tmp_path):
+        assert time.monotonic() < until
+        time.sleep(0.02)
+    report = json.loads(log_of(tmp_path))
     assert report["url"] == f"http://127.0.0.1:{report['port']}/" and report["cameras"] == 10
     config = config_of(fetch(report["url"]))
     assert config["title"] == "dial.ply" and config["virtual_scale"] == 2 and len(config["cameras"]) == 10
     assert (config["model"]["href"], config["base"]["href"]) == ("/files/model", "/files/base")
     for entry, file in (config["model"], dialled), (config["base"], capture.ply):
         assert_holds(fetch(report["url"] + entry["href"][1:]), file, tmp_path)
-    process.send_signal(signal.SIGTERM)
-    out, err = process.communicate(timeout=20)
-    assert (process.returncode, out) == (0, "") and "Traceback" not in err and "GET" not in err, err
+    os.kill(process, signal.SIGTERM)
+    assert server.wait(process) == 0 and log_of(tmp_path).count("\n") == 1
 
 
 def test_dial_values_and_files_of_a_page(capture: Any, dialled: Path, tmp_path: Path, capsys: Any) -> None:
@@ -59,7 +66,7 @@ def test_dial_values_and_files_of_a_page(capture: Any, dialled: Path, tmp_path: 
 
     def page_of(*words: object) -> tuple[Any, Any, str]:
         args = build_parser("view").parse_args([*map(str, words)])
-        view.COMMAND.check(args)
+        view.check(args)
         answers, report = view.make_page(args, view.Console(False))
         return answers, report, capsys.readouterr().err
 

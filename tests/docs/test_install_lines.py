@@ -38,6 +38,6 @@ def test_help_names_the_installed_page(tmp_path: Path, monkeypatch: pytest.Monke
     assert command.manual() == ROOT / "docs" / "index.md"  # of the checkout
     monkeypatch.setattr(command, "__file__", str(tmp_path / "lib" / "cli" / "shared" / "command.py"))
     monkeypatch.setattr(metadata, "files", lambda name: [File()])
-    assert adapt.COMMAND.parser("clod-adapt").format_help().endswith(f"\nmanual: {page}\n")
+    assert command.parser_of(adapt, "clod-adapt").format_help().endswith(f"\nmanual: {page}\n")
     monkeypatch.setattr(metadata, "files", lambda name: None)
-    assert "manual:" not in adapt.COMMAND.parser("clod-adapt").format_help()
+    assert "manual:" not in command.parser_of(adapt, "clod-adapt").format_help()

@@ -1,4 +1,4 @@
-"""Resuming: the state of the same run gives the same bits; one of another run, or a damaged one, is refused."""
+"""Resuming: after an error, and that the state of another run, or a damaged one, is refused."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import math
 import shutil
 import signal
 from collections.abc import Callable
+from dataclasses import replace
 from functools import reduce
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,9 @@ from safetensors.torch import load_file, save_file
 
 from clod_adapter._support.version import package_version
 from clod_adapter.cli.adapt import listeners
+from clod_adapter.cli.adapt import run as adapt_run
 from clod_adapter.cli.adapt.listeners import Saver
+from clod_adapter.cli.shared import pages
 from clod_adapter.cli.shared.console import Console
 from clod_adapter.cli.shared.process import GracefulStop
 from clod_adapter.config import AdaptConfig
@@ -30,8 +33,9 @@ from clod_adapter.errors import ClodError
 from clod_adapter.progress import Phase, Progress
 from clod_adapter.training.loop import adapt
 from clod_adapter.training.state import KEY
-from runs import OUTPUTS, STATE, names, pressing
+from runs import OUTPUTS, STATE, change_step, fail, names, pressing
 from scenes import capture as small_capture
+from scenes import stripped
 
 CONFIG, QUIET = AdaptConfig(iters=3, max_sv=3.0), Console(quiet=True)
 HASHES = {"base_sha256": "of the base", "views_sha256": "of the views", "overruled": {"--with": ["means"]}}
@@ -185,3 +189,56 @@ def test_the_state_is_recent_and_saving_takes_a_small_share_of_the_time(
         follow(Progress(Phase.TRAINING, done, 600, clock[0], state=lambda: clock[0]))
     assert saved[1] == step and len(saved) > 4
     assert max(ages[2:]) <= oldest and save * (len(saved) - 1) / clock[0] <= share
+
+
+def full(*_: Any, **__: Any) -> None:
+    raise ClodError("dial.ply: cannot be written")
+
+
+def spoil(found: Any) -> Any:
+    return replace(found, loss=math.nan)
+
+
+BOTH = sorted([*OUTPUTS, STATE])
+ROWS: list[Any] = [  # what breaks, exit code, the step that is saved, files
+    (lambda patch: change_step(patch, 6, fail), 1, 5, [STATE]),
+    (lambda patch: change_step(patch, 6, spoil), 1, 5, BOTH),
+    (lambda patch: patch.setattr(adapt_run, "save", full), 2, 12, [STATE]),
+]
+
+
+@pytest.mark.parametrize(("broken", "code", "step", "files"), ROWS, ids=["step", "loss", "full disk"])
+def test_resuming_after_an_error(
+    clod: Any, capture: Any, dialled: Path, tmp_path: Path, broken: Any, code: int, step: int, files: list[str]
+) -> None:
+    """The same command with --resume then writes the files of a run without an error."""
+    words = [capture.ply, "--images", capture.scene, *TINY]
+    with pytest.MonkeyPatch.context() as patch:
+        broken(patch)
+        done = clod(*words, *(["--quiet"] if STATE in files[:1] else ["--json"]))
+    assert done.code == code and names(tmp_path) == files, done
+    assert f"--resume resumes from step {step}, which is in {STATE}\n" in done.err
+    assert ("please report it" in done.err) == ("ZeroDivisionError: of ours" in done.err)
+    if files == BOTH:
+        report = json.loads(done.out)
+        assert report["interrupted"] and report["steps"] == 5 and len(report["rows"]) > 2
+        assert any("the result so far is written: the loss of step 6 is not finite" in n for n in report["notes"])
+    done = clod(*words, "--resume")
+    assert done.code == 0 and f"resuming {STATE} from step {step}" in done.err, done
+    assert names(tmp_path) == OUTPUTS
+    for suffix in (".ply", ".safetensors"):
+        assert stripped((tmp_path / f"dial{suffix}").read_bytes()) == stripped(dialled.with_suffix(suffix).read_bytes())
+
+
+def test_error_in_the_page(clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All other files are written, and no state remains; gradients that are not finite move nothing."""
+
+    def without_a_gradient(found: Any) -> Any:
+        found.gradients["quats"][5] = math.nan
+        return found
+
+    change_step(monkeypatch, 6, without_a_gradient)
+    monkeypatch.setattr(pages.AdaptPage, "write", fail)
+    done = clod(capture.ply, "--images", capture.scene, *TINY, "--report")
+    assert done.code == 1 and names(tmp_path) == OUTPUTS and "--resume" not in done.err, done
+    assert "1 Gaussians were not moved by some steps: their gradients" in done.err, done
