@@ -89,7 +89,7 @@ def test_one_exact_file_needs_no_network(
 
 
 def test_a_page_shows_its_spz(show: Any, save: Any, artefacts: Path) -> None:
-    """What Python reads of it, with growth, in units that float16 does not hold."""
+    """What Python reads of it, with growth, in units that float16 does not hold; its dB near its cameras only."""
     size, model = 1000.0, scenes.dialled(1000, 3, 4, scene_distance=1.0, reference_distance=3.0)
     far = model.replace(
         means=size * model.means, log_scales=model.log_scales + float(np.log(size)), sigma_d=size * model.sigma_d,
@@ -105,6 +105,12 @@ def test_a_page_shows_its_spz(show: Any, save: Any, artefacts: Path) -> None:
     read, _ = page.write_viewer_page(out, calibrated, cameras=[seen], virtual_scale=1.0)
     shown = show(url=out.as_uri())
     assert shown.text("#quality") == "31.5 dB"
+    shown.page.keyboard.press("l")
+    here = shown.page.evaluate("location.hash")
+    away = re.sub("eye=[^&]*", f"eye={40 * size},0,{-40 * size}", here)
+    for view, quality in ((away, ""), (here, "31.5 dB")):
+        shown.page.evaluate("hash => { location.hash = hash }", view)
+        shown.until(f"document.getElementById('quality').textContent === '{quality}'")
     shown.camera(seen)
     for s in (1.0, 3.0):
         shown.run("clod.setDial(given)", s)

@@ -4,12 +4,13 @@ import { add, cross, dot, row, rotated, scaled, unit } from "./vector.js";
 
 const DEFAULT_FOV = (50 * Math.PI) / 180; // without a configured camera
 const NEAR = 0.01; // depth of the near plane, world units, as in clod_adapter/cameras.py
+const BESIDE = 0.5, ALIKE = 0.7; // of isNear: of the distance to the pivot; cosine
 const MAX_PITCH = 0.995; // of |forward . up|: orbiting stops before it looks straight up or down
 
 export const camera = {
   rotation: [1, 0, 0, 0, 1, 0, 0, 0, 1], // rows: right, down, forward, in world axes
   eye: [0, 0, 0], up: [0, -1, 0], near: NEAR,
-  distance: 1, // from the eye to the pivot, the point ahead that orbiting rotates about
+  distance: 1, reach: 1, // from the eye to the pivot, the point ahead that orbiting rotates about; when last fitted
   fov: DEFAULT_FOV, aspect: 1, // of the picture: across its shorter side, radians; width over height
   intrinsics: null, // {fx, fy, cx, cy, width, height} of a camera to reproduce exactly, until the view moves
 };
@@ -83,7 +84,7 @@ export function fit({ centre, radius }, cameras, up) {
   camera.up = up;
   if (cameras.length) {
     setCamera(cameras[0]);
-    camera.distance = Math.max(dot(forward(), add(focus(cameras, centre), camera.eye, -1)), 0.1 * radius);
+    camera.reach = camera.distance = Math.max(dot(forward(), add(focus(cameras, centre), camera.eye, -1)), 0.1 * radius);
     return;
   }
   const ahead = lookingDown(up), distance = radius / Math.sin(DEFAULT_FOV / 2);
@@ -91,6 +92,10 @@ export function fit({ centre, radius }, cameras, up) {
   const eye = add(centre, ahead, -distance);
   setPose({ eye, forward: ahead, down: scaled(up, -1), fov: DEFAULT_FOV, aspect: 1, distance });
 }
+
+/** Whether one of the cameras is near and looks the same way. */
+export const isNear = (cameras) => cameras.map(poseOf).some(({ eye, forward: ahead }) =>
+  Math.hypot(...add(camera.eye, eye, -1)) < BESIDE * camera.reach && dot(ahead, forward()) > ALIKE);
 
 /** Along the z axis, or y where z is up, and down by 27 degrees. */
 function lookingDown(up) {

@@ -25,7 +25,6 @@ function drag({ pointerId, clientX: x, clientY: y, shiftKey }) {
   movedByHand();
 }
 
-// The same angles in both modes: orbiting rotates about the pivot, flying about the eye.
 const turn = (yaw, pitch) => rotate(yaw, pitch, !viewer.flying);
 
 function pan(dx, dy) {

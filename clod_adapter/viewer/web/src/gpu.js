@@ -25,8 +25,6 @@ export function program(gl, vertex, fragment) {
 
 export const heightOf = (texels) => Math.max(Math.ceil(texels / WIDTH), 1);
 
-export const maxTexels = (gl) => WIDTH * gl.getParameter(gl.MAX_TEXTURE_SIZE);
-
 /** A texture, WIDTH wide, of `texels` texels of four values; `fill(target)` writes the values. `type`: the array's. */
 export function dataTexture(gl, texels, type, fill) {
   const height = heightOf(texels), data = new type(4 * WIDTH * height);

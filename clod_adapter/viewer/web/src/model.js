@@ -1,11 +1,11 @@
 // A splat on the GPU, and the worker that culls and sorts its Gaussians.
-import { dataTexture, maxTexels } from "./gpu.js";
+import { WIDTH, dataTexture } from "./gpu.js";
 import { SH_TEXELS } from "./shaders.js";
 import { add, cross, dot, scaled, unit } from "./vector.js";
 
 const SH_C0 = 0.28209479177387814;
 const VISIBLE = 3.4; // standard deviations to alpha 1/255
-const Y_DOWN = [0, -1, 0]; // COLMAP's y axis points down
+const UPS = [[0, -1, 0], [0, 0, 1]]; // of COLMAP, whose y axis points down, and of tools with z up
 const FLAT = Math.log(2); // a flat Gaussian's least scale is at most half the next one
 const BESIDE = Math.cos(Math.PI / 5), SURE = 0.3; // share of the flat ones beside the axis, by chance 0.19
 
@@ -30,7 +30,7 @@ export function createModel(gl, read) {
 
 /** A separate function, so that no closure of the model keeps the values in memory after the upload. */
 function upload(gl, gaussians) {
-  const texels = SH_TEXELS[gaussians.degree], most = Math.floor(maxTexels(gl) / Math.max(texels, 4));
+  const texels = SH_TEXELS[gaussians.degree], most = Math.floor((WIDTH * gl.getParameter(gl.MAX_TEXTURE_SIZE)) / Math.max(texels, 4));
   const failed = (what) => new Error(`this graphics device ${what} Gaussians; export it at a larger dial value (--sv)`);
   if (gaussians.count > most) throw failed(`holds at most ${most} of the ${gaussians.count}`);
   if (gl.isContextLost()) throw new Error("the graphics device was lost; reload the page");
@@ -84,7 +84,7 @@ function extentOf(gaussians) {
   return { centre, radius: Math.min(Math.max(radius, 1e-6), 1e30), up: upOf(gaussians, near) };
 }
 
-/** The direction that flat Gaussians face, a ground or a table: from minus y, up in most files, to the mean within 36 degrees. */
+/** The direction that flat Gaussians face, a ground or a table: from the first of UPS that has some, to the mean within 36 degrees. */
 function upOf({ quats, logScales, opacityLogits }, rows) {
   const flat = rows.map((i) => {
     const [least, next] = logScales.subarray(3 * i, 3 * i + 3).toSorted(), thin = logScales.subarray(3 * i, 3 * i + 3).indexOf(least);
@@ -93,12 +93,15 @@ function upOf({ quats, logScales, opacityLogits }, rows) {
     return { normal, weight: least + FLAT < next ? 1 / (1 + Math.exp(-opacityLogits[i])) : 0 };
   });
   const weigh = (normals) => normals.reduce((total, { weight }) => total + weight, 0);
-  let up = Y_DOWN, near = flat;
-  for (let step = 0; step < 10 && weigh(near); step++) {
-    near = flat.filter(({ normal }) => Math.abs(dot(normal, up)) > BESIDE);
-    up = unit(near.reduce((sum, { normal, weight }) => add(sum, normal, weight * Math.sign(dot(normal, up))), [0, 0, 0]));
+  for (let up of UPS) {
+    let near = flat;
+    for (let step = 0; step < 10 && weigh(near); step++) {
+      near = flat.filter(({ normal }) => Math.abs(dot(normal, up)) > BESIDE);
+      up = unit(near.reduce((sum, { normal, weight }) => add(sum, normal, weight * Math.sign(dot(normal, up))), [0, 0, 0]));
+    }
+    if (weigh(near) > SURE * weigh(flat)) return up;
   }
-  return weigh(near) > SURE * weigh(flat) ? up : Y_DOWN;
+  return UPS[0];
 }
 
 /** A worker of WORKER, the text of worker.js, with `request(job, message, transferred)`, whose answers have the order of the requests. */

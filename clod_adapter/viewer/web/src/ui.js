@@ -1,4 +1,5 @@
 // The panel. In page.html, data-key names the key that clicks a control, and data-needs what it is disabled without.
+import { isNear } from "./camera.js";
 import { openFile, showFile } from "./files.js";
 import { config, elements, state, viewer } from "./page.js";
 import * as stage from "./stage.js";
@@ -46,14 +47,15 @@ export function update() {
   elements.wipe.value = TICKS * state.wipe;
 }
 
-/** Shows count, frame time and PSNR of the last frame. */
+/** Shows count, frame time and PSNR of the last frame; the PSNR is of the cameras' views, if there are cameras. */
 export function updateFrame() {
   elements.poster?.remove(); // the picture for the time until the first frame
   const { model, base, frameMs } = stage, { total, kept } = stage.counts();
   const share = `${((100 * kept) / total).toFixed(kept === total ? 0 : 1)} %`;
   elements.counts.textContent = total ? `${integer(kept)} of ${integer(total)} kept (${share})` : "";
   elements.frame.textContent = frameMs === null ? "" : `${frameMs.toFixed(frameMs < 10 ? 1 : 0)} ms per frame`;
-  const psnr = model?.attenuation && state.equation ? psnrAt(model.calibration, state.dial) : null;
+  const tells = model?.attenuation && state.equation && (!viewer.cameras.length || isNear(viewer.cameras));
+  const psnr = tells ? psnrAt(model.calibration, state.dial) : null;
   elements.quality.textContent = psnr === null ? "" : `${psnr.toFixed(1)} dB`;
   if (state.wipe === null) return;
   elements.wipeLeft.textContent = `${model.attenuation ? named() : model.name} · ${integer(kept)}`;
@@ -170,9 +172,7 @@ export function showMessage(text) {
   elements.message.firstElementChild.textContent = text ?? "";
 }
 
-export function showNote(text) {
-  elements.targetNote.textContent = text;
-}
+export const showNote = (text) => { elements.targetNote.textContent = text; };
 
 /** Shows progress in the canvas, at its top where there is a picture; null hides it. */
 export function showProgress(text) {
