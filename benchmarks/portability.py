@@ -7,8 +7,8 @@ Run by another virtual environment's Python it tests the versions that are insta
 exit code is 1 where a test failed or a condition could not be had. The conditions:
 
 - ``plain``: as ``make test`` runs it;
-- ``aten_default``, ``aten_avx2``, ``mkl_compatible``, ``numba_generic``: vector instructions of older processors, which
-  differ in the last bits of exp, log and the like;
+- ``aten_default``, ``aten_avx2``, ``mkl_compatible``, ``numba_generic``: vector instructions of older processors;
+- ``libm_0``, ``libm_1``, ``libm_2``: other last bits of exp, log and the like (``tests/other_libm``);
 - ``one_thread``, ``one_core``: a single thread; as many as otherwise, on one core;
 - ``no_root``: for root, in a user namespace without root's rights; for others ``plain`` is that;
 - ``ignored_sigint``, ``blocked_signals``: as a script's background job, and below a program that blocks signals;
@@ -33,6 +33,7 @@ from common import ROOT, SHARED, append, arguments, outcomes
 
 FILE = "portability.jsonl"
 SPACED = os.fsdecode("a folder, spàced".encode())  # under an ASCII locale too
+OTHER_LIBM = str(ROOT / "tests" / "other_libm")
 PARALLEL = ["--numprocesses=auto", "--maxprocesses=4", "--dist=loadfile", "--no-loadscope-reorder"]
 
 
@@ -44,7 +45,9 @@ class Condition:
     prefix: tuple[str, ...] = ()
 
     def __add__(self, other: Condition) -> Condition:
-        return Condition(self.environment | other.environment, self.prefix + other.prefix)
+        both = self.environment | other.environment
+        paths = [each.environment["PYTHONPATH"] for each in (self, other) if "PYTHONPATH" in each.environment]
+        return Condition(both | ({"PYTHONPATH": os.pathsep.join(paths)} if paths else {}), self.prefix + other.prefix)
 
 
 CONDITIONS = {
@@ -53,6 +56,7 @@ CONDITIONS = {
     "aten_avx2": Condition({"ATEN_CPU_CAPABILITY": "avx2"}),
     "mkl_compatible": Condition({"MKL_CBWR": "COMPATIBLE"}),
     "numba_generic": Condition({"NUMBA_CPU_NAME": "generic"}),
+    **{f"libm_{n}": Condition({"OTHER_LIBM": str(n), "PYTHONPATH": OTHER_LIBM}) for n in range(3)},
     "one_thread": Condition({"OMP_NUM_THREADS": "1"}),
     "one_core": Condition({}, ("taskset", "--cpu-list", str(min(os.sched_getaffinity(0))))),
     "no_root": Condition({}, ("unshare", "--user") if os.geteuid() == 0 else ()),

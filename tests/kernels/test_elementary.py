@@ -31,7 +31,7 @@ def test_exp2_has_a_relative_error_below_3e_7() -> None:
 
 
 def test_log2_has_an_absolute_error_below_1e_7() -> None:
-    """In addition to one and a half units of the result; for every fifth mantissa of two octaves and
+    """In addition to one and a half units of the result (tests/other_libm); for every fifth mantissa of two octaves and
     all normal exponents."""
     octaves = np.float32(0.5).view(np.uint32) + np.arange(0, 1 << 24, 5, dtype=np.uint32)
     every = np.arange(0x00800000, np.float32(3.4e38).view(np.uint32), 997, dtype=np.uint32)

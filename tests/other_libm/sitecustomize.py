@@ -1,0 +1,166 @@
+"""Another machine's elementary functions: their results differ from this machine's by one unit in the last place.
+
+    OTHER_LIBM=0 PYTHONPATH=tests/other_libm python -m pytest tests/equation
+
+The value of OTHER_LIBM is a seed, which says for each result whether it moves up or down; equal results move alike.
+Powers of two, whole numbers below 1024, infinities and NaN stay, so no sigmoid exceeds 1. NumPy's functions, torch's on
+the CPU and the kernels' are moved, each in its own way. Python runs this file at its start, also in a test's processes.
+"""
+
+from __future__ import annotations
+
+import importlib.machinery
+import os
+import sys
+import warnings
+import zlib
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+SEED = os.environ.get("OTHER_LIBM")
+WHOLE = 1024  # smaller whole numbers and powers of two are exact everywhere: log2(8), exp(0), sigmoid(0)
+COMMON = "exp exp2 expm1 log log2 log10 log1p sin cos tan sinh cosh tanh"
+NUMPY = f"{COMMON} arcsin arccos arctan arctan2 hypot logaddexp".split()
+TORCH = f"{COMMON} pow asin acos atan atan2 hypot logaddexp sigmoid log_sigmoid_forward softplus logit".split()
+EXACT = (-2, -1, -0.5, 0, 0.5, 1, 2, 3)  # powers that are products, roots or quotients
+
+
+def salt(library: str) -> int:
+    return zlib.crc32(f"{library} {SEED}".encode())
+
+
+def move(values: Any, library: str) -> None:
+    """Moves the floats of a contiguous 1-D array, in place; part by part, which needs little memory."""
+    import numpy as np
+
+    if values.dtype not in (np.float32, np.float64):
+        return
+    kind, factor = (np.uint32, 0x9E3779B1) if values.dtype == np.float32 else (np.uint64, 0x9E3779B97F4A7C15)
+    last, digits = kind(8 * values.itemsize - 1), kind((1 << np.finfo(values.dtype).nmant) - 1)
+    for first in range(0, values.size, 1 << 14):
+        part = values[first : first + (1 << 14)]
+        with np.errstate(all="ignore"):
+            bits = part.view(kind)
+            stays = (bits & digits == 0) | np.isnan(part) | ((np.abs(part) < WHOLE) & (part == np.floor(part)))
+            up = (bits + kind(salt(library))) * kind(factor) >> last == 1
+            towards = np.where(up, np.inf, -np.inf).astype(part.dtype)
+            part[:] = np.where(stays, part, np.nextafter(part, towards))
+
+
+def change_numpy(numpy: ModuleType) -> None:
+    class Other:
+        """A call of the ufunc is moved; the rest is the ufunc's own."""
+
+        def __init__(self, ufunc: Any) -> None:
+            self.ufunc = ufunc
+
+        def __call__(self, *args: Any, **kwargs: Any) -> Any:
+            found = self.ufunc(*args, **kwargs)
+            values = numpy.array(found, order="C")
+            move(values.reshape(-1), "numpy")
+            if not isinstance(found, numpy.ndarray):
+                return values[()]
+            numpy.copyto(found, values, where=kwargs.get("where", True))
+            return found
+
+        def __getattr__(self, name: str) -> Any:
+            return getattr(self.ufunc, name)
+
+    for name in NUMPY:
+        setattr(numpy, name, Other(getattr(numpy, name)))
+
+
+def change_torch(torch: ModuleType) -> None:
+    library = torch.library.Library("aten", "IMPL")
+    change_torch.keep = library  # its kernels end with it
+
+    def moved(tensor: Any) -> None:
+        values = tensor.detach().contiguous()
+        move(values.view(-1).numpy(), "torch")
+        if values.data_ptr() != tensor.data_ptr():
+            tensor.copy_(values)
+
+    def change(name: str) -> None:
+        kernel = torch.library.get_kernel(name, "CPU")
+
+        def other(keys: Any, *args: Any, **kwargs: Any) -> Any:
+            found = kernel.call_boxed(keys, *args, **kwargs)
+            if not (name.startswith("aten::pow") and isinstance(args[1], int | float) and args[1] in EXACT):
+                moved(found[0] if isinstance(found, tuple) else found)
+            return found
+
+        library.impl(name, other, "CPU", with_keyset=True)
+
+    for name in torch._C._dispatch_get_all_op_names():
+        function, _, form = name.partition(".")
+        named = function.removesuffix("_").removeprefix("aten::") in TORCH
+        inner = "out" in form  # the others call them
+        if named and not inner and torch._C._dispatch_has_kernel_for_dispatch_key(name, "CPU"):
+            with warnings.catch_warnings(action="ignore"):  # that a kernel is replaced
+                change(name)
+
+
+def change_kernels(elementary: ModuleType) -> None:
+    from llvmlite import ir
+    from numba.extending import intrinsic
+
+    def constant(type_: Any, value: float) -> Any:
+        return ir.Constant(type_, [value] * elementary.LANES)
+
+    def moved(original: Any) -> Any:
+        signature, codegen = original._defn(None, None)
+
+        @intrinsic
+        def other(typingctx, x):
+            def code(context, builder, signature, args):
+                y = codegen(context, builder, signature, args)
+                bits = builder.bitcast(y, elementary.INTEGERS)
+                mixed = builder.mul(bits, constant(elementary.INTEGERS, 0x9E3779B1))
+                mixed = builder.add(mixed, constant(elementary.INTEGERS, salt("kernels")))
+                sign = builder.ashr(mixed, constant(elementary.INTEGERS, 31))
+                step = builder.or_(sign, constant(elementary.INTEGERS, 1))  # 1 or -1
+                other = builder.bitcast(builder.add(bits, step), elementary.VECTOR)
+                floor = elementary.call_llvm(builder, "llvm.floor.v16f32", elementary.VECTOR, [y])
+                digits = builder.and_(bits, constant(elementary.INTEGERS, (1 << 23) - 1))
+                power = builder.icmp_unsigned("==", digits, constant(elementary.INTEGERS, 0))
+                return builder.select(builder.or_(power, builder.fcmp_unordered("==", y, floor)), y, other)
+
+            return signature, code
+
+        return other
+
+    elementary.exp2, elementary.log2 = moved(elementary.exp2), moved(elementary.log2)
+
+
+def change_stamp(compiling: ModuleType) -> None:
+    compiling._STAMP += f"{SEED} {zlib.crc32(Path(__file__).read_bytes())}"  # compiled code of its own
+
+
+class Finder:
+    """Changes a module when it has been imported."""
+
+    CHANGES = {
+        "numpy": change_numpy,
+        "torch": change_torch,
+        "clod_adapter._kernels.elementary": change_kernels,
+        "clod_adapter._kernels.compiling": change_stamp,
+    }
+
+    @classmethod
+    def find_spec(cls, name: str, path: Any = None, target: Any = None) -> Any:
+        change = cls.CHANGES.get(name)
+        spec = importlib.machinery.PathFinder.find_spec(name, path) if change else None
+        if spec:
+            execute = spec.loader.exec_module
+
+            def both(module: ModuleType) -> None:
+                execute(module)
+                change(module)
+
+            spec.loader.exec_module = both
+        return spec
+
+
+if SEED is not None:
+    sys.meta_path.insert(0, Finder)
