@@ -23,7 +23,7 @@ from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.hook import Hook
 from clod_adapter.io.atomic import atomic_path
-from clod_adapter.io.file_formats import PLY, check_suffix, format_of, read_source, write
+from clod_adapter.io.file_formats import PLY, check_suffix, check_written, format_of, read_source, write
 from clod_adapter.io.ply import column_map, write_rows
 from clod_adapter.io.ply_settings import PREFIX
 from clod_adapter.io.settings import WARNING, History, matching_calibration, stated_filter, tagged, that_fit
@@ -212,8 +212,8 @@ def save(
 
     Raises:
         ClodError: another suffix or none, there are no Gaussians, they do not match the base, a new value is not
-            finite, the target is the base itself or cannot be written; for another format than PLY also sigma_d that
-            it does not carry.
+            finite, the target is the base itself, cannot be written, or not be read again; for another format than
+            PLY also sigma_d that it does not carry.
     """
     path = Path(path)
     check_suffix(path)
@@ -235,6 +235,7 @@ def save(
         return
     with atomic_path(path) as temporary:
         write_rows(temporary, in_world_units(gaussians), History(about, origin, calibration), vertex, version)
+        check_written(temporary)
 
 
 def trimmed(checkpoint: Checkpoint, kept: Tensor | None, sh_degree: int | None) -> Checkpoint:

@@ -78,6 +78,15 @@ def check_suffix(path: Path) -> None:
         raise ClodError(f"{path}: {found} is no format to write; choose one of {', '.join(WRITABLE)}")
 
 
+def check_written(path: Path) -> None:
+    """Refuses a file just written that could not be read again: a PLY by its header and length, others read whole."""
+    try:
+        (file_has_dial if format_of(path) is PLY else read_source)(path)
+    except ClodError as error:
+        reason = str(error).removeprefix(f"{path}: ")
+        raise ClodError(f"{path}: is not written, because it could not be read again: {reason}") from error
+
+
 def read_source(path: Path) -> Source:
     """The content of a file in any format; every reader refuses, in one line, what is damaged or of another kind."""
     check_readable(path)
@@ -113,6 +122,7 @@ def write(
     history = History(tuple(about), origin, calibration)
     with atomic_path(path) as temporary:
         notes: tuple[str, ...] = _call(f"{form.module}.write", temporary, in_world_units(gaussians), history)
+        check_written(temporary)
     return notes
 
 

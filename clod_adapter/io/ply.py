@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 MASK_COLUMNS = ("masks_0", "masks_1")
 _XYZ = ("x", "y", "z")
 HEADER_LIMIT = 1 << 20  # bytes
+_LONGEST = 1 << 20  # characters of a row of text
 
 
 def column_map(sh_degree: int) -> dict[str, tuple[str, ...]]:
@@ -151,9 +152,13 @@ def _elements(data: np.ndarray, head: Head) -> dict[str, np.ndarray]:
         found[element.name] = _native(data[at : at + count * kind.itemsize].view(kind))
         at += count * kind.itemsize
     if "vertex" not in found:
+        content = data.tobytes()
+        lines = io.BytesIO(content if head.ply.text else b"")
+        if any(len(line) == _LONGEST for line in iter(lambda: lines.readline(_LONGEST), b"")):
+            raise ValueError(f"a row of more than {_LONGEST:,} characters")  # which would be copied several times
         with warnings.catch_warnings(), np.errstate(over="ignore"):
             warnings.simplefilter("ignore")  # of text that is beyond float32's range
-            return {each.name: _native(each.data) for each in PlyData.read(io.BytesIO(data.tobytes()))}
+            return {each.name: _native(each.data) for each in PlyData.read(io.BytesIO(content))}
     return found
 
 

@@ -221,6 +221,13 @@ def test_long_history_is_cut(tmp_path: Path) -> None:
         assert not any("not carried over" in note for note in again.notes)
 
 
+def test_what_cannot_be_read_again_is_not_written(tmp_path: Path) -> None:
+    (tmp_path / "a.ply").write_bytes(b"earlier")
+    with pytest.raises(ClodError, match=f"^{tmp_path}/a.ply: is not written, because it could not be read again: "):
+        write(tmp_path / "a.ply", model(0), ["x" * 1000] * 1100)
+    assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"earlier"]
+
+
 def test_text_is_made_ascii_and_infinite_opacity_finite(tmp_path: Path) -> None:
     write(tmp_path / "a.safetensors", model(0), ("caf\u00e9", "clod_adapter tau 0.5"))
     found = load(tmp_path / "a.safetensors")

@@ -153,6 +153,7 @@ LIST = "property list uchar int a\n"
           for form, body, kind in (("ascii", GOOD.encode(), "property uchar a\n"), ("ascii", GOOD.encode(), LIST),
                                    (LITTLE, bytes(56), ""), (BIG, bytes(56), LIST))
           for other in [f"element a {1 << 40}\n{kind}"] for before, after in ((other, ""), ("", other))),
+        (header("ascii", 1) + b"0 " * 13 + b"1" * (1 << 23), "damaged or truncated .a row of more than"),
     ],
 )  # fmt: skip
 def test_headers_and_rows_of_a_ply(tmp_path: Path, content: bytes, message: str) -> None:
