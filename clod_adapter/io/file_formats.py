@@ -5,6 +5,7 @@ What reads, checks or refuses a file, here and in the readers, raises a ClodErro
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
@@ -188,6 +189,12 @@ def refuse_irregular(path: Path, remedy: str = "give the name of a file") -> Non
     """Refuses what exists and is not a regular file: reading a pipe would wait."""
     if path.exists() and not path.is_file():
         raise ClodError(f"{path}: cannot be read (it is not a regular file); {remedy}")
+
+
+def refuse_long_numbers(path: Path, text: bytes) -> None:
+    """Refuses a number of a thousand digits, of which parsers make copies."""
+    if re.search(rb"\d{1000}", text):
+        raise ClodError(f"{path}: is damaged (a number of more than 1,000 digits); copy or export it again")
 
 
 def read_start(path: Path, size: int = 64) -> bytes:

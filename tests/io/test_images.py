@@ -8,7 +8,7 @@ from PIL import Image
 
 from clod_adapter.errors import ClodError
 from clod_adapter.io.scene import images
-from clod_adapter.io.scene.images import image_size, read_image
+from clod_adapter.io.scene.images import BAND, image_size, read_image
 from photographs import pixels
 
 GREY = pixels(0)[..., 0]
@@ -109,17 +109,43 @@ def test_what_cannot_be_decoded_is_refused(tmp_path: Path, name: str) -> None:
             image_size(path)
 
 
+def reduced(path: Path, monkeypatch: pytest.MonkeyPatch, width: int, height: int, max_width: int) -> np.ndarray:
+    monkeypatch.setattr(images, "LARGE", 1000)
+    image, notes = read_image(path, width, height, max_width)
+    assert len(notes) == len(set(notes)) and sum("takes long: reduced first" in what for what, _ in notes) == 1
+    return np.asarray(image).astype(float)
+
+
+@pytest.mark.parametrize("kind", ["RGB", "L", "RGBA", "P", "I;16", "CMYK"])
+def test_large_image_is_reduced_to_block_means(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
+    """By 3, so that it is at least twice as wide as what is made of it; in bands, of which the last one is cut."""
+    width, height = 200, 3 * BAND + 70
+    rgb = pixels(3, width, height)
+    image = Image.fromarray(rgb)
+    if kind == "RGBA":
+        image.putalpha(Image.fromarray(rgb[..., 0]))
+    elif kind == "I;16":
+        image = Image.fromarray(rgb[..., 0].astype(np.uint16) * 257)
+    else:
+        image = image.convert(kind)
+    path = tmp_path / ("a.tif" if kind == "CMYK" else "a.png")
+    image.save(path)
+    whole = read(path, width, height)[0].astype(float)
+    got = reduced(path, monkeypatch, width, height, 33)
+    assert got.shape == (-(-height // 3), -(-width // 3), 3)
+    want = whole[: height // 3 * 3, : width // 3 * 3].reshape(height // 3, 3, width // 3, 3, 3).mean((1, 3))
+    assert np.abs(got[: height // 3, : width // 3] - want).max() <= 1
+
+
 def test_large_jpeg_is_reduced_while_decoding(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ramp = np.linspace(0, 255, 400 * 300).reshape(300, 400).astype(np.uint8)
     exif = Image.Exif()
     exif[0x0112] = 6
     Image.fromarray(ramp).convert("RGB").save(tmp_path / "a.jpg", quality=95, exif=exif)
     whole = read(tmp_path / "a.jpg", 300, 400)[0].astype(float)
-    monkeypatch.setattr(images, "LARGE", 1000)
-    image, notes = read_image(tmp_path / "a.jpg", 300, 400, 30)  # by 4, as the decoder has no 5
-    assert image.size == (75, 100)
-    assert sum("which takes long: reduced first" in what for what, _ in notes) == 1
-    assert np.abs(np.asarray(image).astype(float) - whole.reshape(100, 4, 75, 4, 3).mean((1, 3))).max() < 4
+    got = reduced(tmp_path / "a.jpg", monkeypatch, 300, 400, 30)  # by 4, as the decoder has no 5
+    assert got.shape == (100, 75, 3)
+    assert np.abs(got - whole.reshape(100, 4, 75, 4, 3).mean((1, 3))).max() < 4
 
 
 def test_wrong_shape_is_refused(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import subprocess
@@ -19,6 +20,7 @@ import torch
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
+from clod_adapter._support.text import file_name
 from clod_adapter.cameras import Camera, StoredView, View
 from clod_adapter.errors import ClodError
 from clod_adapter.io.scene.folder import scene_files
@@ -136,6 +138,8 @@ def write(path: Path, content: bytes) -> None:
     ("form", "change", "message"),
     [
         ("text", lambda at: write(at / "images.txt", b"1 nonsense\n\n"), "COLMAP cannot read this model"),
+        ("text", lambda at: write(at / "cameras.txt", b"1 PINHOLE 40 30 %b 33 20 15\n" % (b"1" * 10_000)),
+         "cameras.txt: .*a number of more than 1,000 digits"),
         ("text", lambda at: write(at / "images.txt", (at / "images.txt").read_bytes().replace(b"sub/b.png", b"a.png")),
          "has image a.png more than once"),
         ("text", lambda at: os.mkfifo(at / "rigs.bin"), "rigs.bin: .*not a regular file"),
@@ -257,9 +261,23 @@ def test_cached_images_are_reused(tmp_path: Path, cache: Path, monkeypatch: pyte
     shutil.copytree(tmp_path / "other" / "sparse", scene / "sparse", dirs_exist_ok=True)
     load_scene(scene, max_width=100)
     assert len(list(cache.rglob("*.png"))) == 4
+
+
+def test_cache_folder_must_be_writable(tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = capture_of(tmp_path / "scene", "OPENCV", LENSES["OPENCV"])
+    (scene / "images" / "a.png").write_bytes(b"not read")
+    message = "undistorted photographs cannot be kept there .*set XDG_CACHE_HOME"
+    with monkeypatch.context() as patch, pytest.raises(ClodError, match=message):
+        patch.setattr(os, "access", lambda *_: False)  # root may write anywhere
+        load_scene(scene)
     shutil.rmtree(cache)
     cache.write_text("a file, so that no folder can be made")
-    with pytest.raises(ClodError, match="undistorted photographs cannot be kept there .*set XDG_CACHE_HOME"):
+    with pytest.raises(ClodError, match=message):
+        load_scene(scene)
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.delenv("HOME", raising=False)
+    monkeypatch.setattr(os, "getuid", lambda: 2**31 - 5)  # nobody's
+    with pytest.raises(ClodError, match="no home folder to keep undistorted photographs in; set XDG_CACHE_HOME"):
         load_scene(scene)
 
 
@@ -306,6 +324,24 @@ def test_files_of_a_colmap_scene(tmp_path: Path) -> None:
     files = {str(path.relative_to(tmp_path)) for path in (tmp_path / "sparse" / "0").iterdir()}
     photographs = {f"images/sub/{k:03}.png" for k in (1, 2, 3)} | {"images_2/sub/001.png"}
     assert len(files) >= 3 and there(tmp_path) == files | photographs | {"dataparser_transforms.json"}
+    for name in ("images", "images_2"):  # other folders of inputs do not stand for those
+        (tmp_path / name).rename(tmp_path / name.replace("images", "cam"))
+    (tmp_path / "masks").mkdir()
+    (tmp_path / "masks" / "a.png").write_bytes(b"")
+    assert {"cam/sub/001.png", "cam_2/sub/001.png", "masks/a.png"} <= there(tmp_path)
+
+
+def test_files_of_transforms_scenes(tmp_path: Path) -> None:
+    train = {"frames": [{"file_path": "./train/r_0", "mask_path": "masks/0.png"}, {"file_path": "rgb\\ü.jpg"}, 7]}
+    test = {"frames": [{"file_path": "test/r_0.png", "depth_file_path": "depth/0.tif"}, {"file_path": "a\0\ud800"}]}
+    (tmp_path / "transforms_train.json").write_text(json.dumps(train))
+    (tmp_path / "transforms_test.json").write_text(json.dumps(test))
+    (tmp_path / "transforms.json").write_text("no JSON")
+    names = [*map(file_name, ["train/r_0.png", "rgb/ü.jpg", "masks/0.png", "test/r_0.png", "depth/0.tif"])]
+    for name in [*names, "train/r_1.png"]:
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(b"")
+    assert there(tmp_path) == {*names, "transforms.json", "transforms_train.json", "transforms_test.json"}
 
 
 ONE = 64 * 48 * 3

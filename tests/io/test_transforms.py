@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from pathlib import Path
 from typing import Any
 
@@ -185,13 +186,15 @@ def test_invalid_frame_is_named(tmp_path: Path, change: dict[str, Any], message:
     [
         *((content, "no JSON or damaged") for content in (
             b"", b'{"frames": [', b"\xff\xfe\x00", b"[" * 100_000)),
-        (b'{"frames": ' + b"9" * 10_000 + b"}", "no JSON or damaged"), (b"[]", "is no JSON object"),
+        (b'{"frames": ' + b"9" * 10_000 + b"}", "a number of more than 1,000 digits"), (b"[]", "is no JSON object"),
         *((content, "no list of frames") for content in (b'{"frames": []}', b'{"frames": {}}')),
-        (b'{"frames": [3]}', "frame 0 has no file_path"),
+        (b'{"frames": [3]}', "frame 0 has no file_path"), (b"{", "is larger than 256 MB"),
     ],
 )  # fmt: skip
 def test_damaged_file_is_refused(tmp_path: Path, content: bytes, message: str) -> None:
     (tmp_path / "transforms.json").write_bytes(content)
+    if message.startswith("is larger"):
+        os.truncate(tmp_path / "transforms.json", 300 * 2**20)
     with pytest.raises(ClodError, match=f"transforms.json: .*{message}"):
         load_scene(tmp_path)
 

@@ -13,7 +13,7 @@ import torch
 
 from clod_adapter.cameras import Camera
 from clod_adapter.errors import ClodError
-from clod_adapter.io.file_formats import read_whole
+from clod_adapter.io.file_formats import read_whole, refuse_long_numbers
 from clod_adapter.io.scene.folder import find_cameras, name_parts
 from clod_adapter.origin import NOWHERE
 
@@ -145,9 +145,11 @@ def _posed_image(model: Path, image: pycolmap.Image) -> PosedImage:
 
 
 def _check_records(model: Path) -> None:
-    """Walks the binary records, as COLMAP reads past the end of a cut file until memory runs out."""
+    """Refuses long numbers and cut binary records, as COLMAP reads past the end of these until memory runs out."""
     for name, after in _RECORDS.items():
         path = model / name
+        if (text := path.with_suffix(".txt")).exists():
+            refuse_long_numbers(text, read_whole(text))
         if not path.exists():
             continue
         data, at = read_whole(path), 8

@@ -15,16 +15,17 @@ from typing import Any
 
 from clod_adapter._support.text import as_text, file_name
 from clod_adapter.errors import ClodError
-from clod_adapter.io.file_formats import read_whole
+from clod_adapter.io.file_formats import read_whole, refuse_long_numbers
 
 TRANSFORMS = ("transforms_train.json", "transforms.json")
 DATAPARSER = "dataparser_transforms.json"  # nerfstudio's: the frame it trained in
 DESCRIPTIONS = (*TRANSFORMS, "transforms_test.json", "transforms_val.json", DATAPARSER)
+PATHS = ("file_path", "mask_path", "depth_file_path")  # of a frame
 PHOTOGRAPHS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp")
 ENDINGS = ("", ".png", ".jpg", ".jpeg")  # that the path of a frame may omit
+MAX_BYTES = 256 * 2**20  # a hundred thousand frames have a tenth of that
 SMALLER = ("images_2", "images_4", "images_8")  # copies at a part of the size, as Mip-NeRF 360 and Inria's code have
 RAW = "input"  # Inria's name for the photographs before they are undistorted into images
-INPUTS = ("images", *SMALLER, RAW, "masks", "depths", "train", "test", "val")  # folders of inputs
 MISSING = 0.5  # the share of photographs that may be missing
 LONGEST_NAME, LONGEST_PART = 4000, 255  # characters of a path, bytes of one of its parts
 
@@ -116,21 +117,37 @@ def name_parts(name: str, cameras: Path) -> tuple[str, ...]:
 
 
 def scene_files(folder: Path) -> Iterator[Path]:
-    """What no output may overwrite: the model or the transforms, photographs and masks; some may not exist."""
+    """What no output may overwrite: the model or the transforms, photographs, masks and depths; some may not exist."""
     cameras = find_cameras(folder)
-    model = cameras.is_dir()
-    home = cameras if model else cameras.parent
+    home = cameras if cameras.is_dir() else cameras.parent
     yield from (each / name for each in dict.fromkeys((folder, home)) for name in DESCRIPTIONS)
+    if cameras.is_file():
+        yield from (home / name for each in DESCRIPTIONS for name in _names_in_json(cameras.with_name(each)))
+        return
     yield from (path for path in cameras.glob("*") if path.suffix in (".bin", ".txt"))
-    bases = (folder, home.parent, home.parent.parent) if model else (folder, home)
-    roots = dict.fromkeys(base / name for base in bases for name in INPUTS)
-    for each in [path for path in roots if path.is_dir() and any(path.iterdir())] or [folder]:
+    named = [each for each in photograph_folders(folder, cameras) if each.name in ("images", *SMALLER, RAW)]
+    for each in [path for path in named if any(path.glob("*"))] or [folder]:  # glob passes over what cannot be read
         yield from (path for path in each.rglob("*") if path.suffix.lower() in PHOTOGRAPHS)
+
+
+def _names_in_json(path: Path) -> Iterator[str]:
+    """What the frames of a transforms file name; nothing of a damaged one, which its reader refuses."""
+    try:
+        frames = read_json(path).get("frames")
+    except ClodError:
+        return
+    for frame in frames if isinstance(frames, list) else ():
+        for name in map(frame.get, PATHS) if isinstance(frame, dict) else ():
+            if isinstance(name, str) and as_text(name) == name:
+                yield from (file_name(name.replace("\\", "/") + ending) for ending in ENDINGS)
 
 
 def read_json(path: Path) -> dict[str, Any]:
     """The object in a JSON file."""
+    if path.is_file() and path.stat().st_size > MAX_BYTES:
+        raise ClodError(f"{path}: is larger than {MAX_BYTES >> 20} MB, so it is no list of cameras; check the path")
     text = read_whole(path)
+    refuse_long_numbers(path, text)
     try:
         content = json.loads(text)
     except (ValueError, RecursionError) as error:

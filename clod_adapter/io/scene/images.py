@@ -31,7 +31,8 @@ OTHERS = {
     b"%!PS": "PostScript", b"%PDF": "PDF",
 }  # by what is in their first 12 bytes, for the message  # fmt: skip
 
-LARGE = 1 << 26  # pixels; a larger JPEG is reduced while it is decoded
+LARGE = 1 << 26  # pixels; a larger photograph is reduced first
+BAND = 64  # rows of the reduced photograph that are made at a time
 REDUCED = f"have more than {LARGE / 1e6:.0f} million pixels, which takes long: reduced first"
 _TURNS = {
     5: Image.Transpose.TRANSPOSE,
@@ -49,7 +50,8 @@ def read_image(path: Path, width: int, height: int, max_width: int) -> tuple[Ima
     not applied. The EXIF rotation is not either, as COLMAP does not, unless the photograph has its camera's shape only
     once it is turned: then the model was made from turned copies.
 
-    A JPEG of more than LARGE pixels is reduced by its decoder, to ``2 max_width`` or more.
+    A photograph of more than LARGE pixels is first reduced by an integer factor, to ``2 max_width`` or more: a JPEG
+    by its decoder, others by the mean over squares of pixels.
 
     Args:
         width, height: the camera's; the photograph may be of another size, but not of another shape.
@@ -67,14 +69,15 @@ def read_image(path: Path, width: int, height: int, max_width: int) -> tuple[Ima
                 "give the images the model was made from"
             )
         factor = max(1, shape[0] // (2 * max_width)) if size[0] * size[1] > LARGE else 1
-        source.draft(source.mode, (size[0] // factor, size[1] // factor))  # of JPEG alone
-        if source.size != size:
+        if factor > 1:
+            source.draft(source.mode, (size[0] // factor, size[1] // factor))  # of JPEG alone
+            factor = max(1, factor * source.width // size[0])
             notes.append((REDUCED, ""))
-        pixels = _rgb(path, source, notes)
+        pixels = _rgb(path, source, factor, notes)
     if turn is not None:
         pixels = pixels.transpose(turn)
         notes.append(("rotated by their EXIF orientation, as the cameras are", ""))
-    return pixels, notes
+    return pixels, list(dict.fromkeys(notes))
 
 
 def image_size(path: Path) -> tuple[int, int]:
@@ -111,7 +114,8 @@ def _same_shape(size: tuple[int, int], width: int, height: int) -> bool:
     return abs(size[0] * height / (size[1] * width) - 1) <= 0.01  # a scaled copy is rounded to whole pixels
 
 
-def _rgb(path: Path, source: Image.Image, notes: list[Note]) -> Image.Image:
+def _rgb(path: Path, source: Image.Image, factor: int, notes: list[Note]) -> Image.Image:
+    """The photograph in 8-bit RGB, its width and height divided by ``factor``."""
     tags: dict[int, Any] = getattr(source, "tag_v2", {})  # a TIFF's
     if tags.get(_PLANES) == 2 and max(tags.get(_BITS) or (8,)) > 8:  # Pillow would take each byte for a pixel
         raise ClodError(f"{path}: has more than 8 bits in planes of one colour each; convert it to 8 bits")
@@ -120,6 +124,17 @@ def _rgb(path: Path, source: Image.Image, notes: list[Note]) -> Image.Image:
         raise ClodError(f"{path}: has 32 bits per channel, whose range is not known; convert it to 8 bits")
     if source.mode == "CMYK":
         notes.append(("are CMYK: brought to RGB without their colour profile", ""))
+    if factor == 1:
+        return _converted(source, deep, notes)
+    source.load()
+    small, rows = Image.new("RGB", (-(-source.width // factor), -(-source.height // factor))), factor * BAND
+    for top in range(0, source.height, rows):  # no copy of the whole is made
+        band = source.crop((0, top, source.width, min(top + rows, source.height)))
+        small.paste(_converted(band, deep, notes).reduce(factor), (0, top // factor))
+    return small
+
+
+def _converted(source: Image.Image, deep: bool, notes: list[Note]) -> Image.Image:
     if deep:
         values = np.asarray(source).astype(np.uint32)  # grey; 16-bit colour Pillow has brought to 8 bits itself
         return Image.fromarray(((values + 128) // 257).astype(np.uint8)).convert("RGB")

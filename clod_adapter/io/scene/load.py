@@ -16,12 +16,13 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+from clod_adapter._kernels.memory import release
 from clod_adapter._support.workers import in_order
 from clod_adapter.cameras import Camera, Scene, StoredView, View, in_its_unit, spread, with_near_planes
 from clod_adapter.errors import ClodError
 from clod_adapter.io.scene.colmap import HUGE, TEST_EVERY, PosedImage, held_out, read_colmap
 from clod_adapter.io.scene.folder import find_cameras, find_photographs
-from clod_adapter.io.scene.images import REDUCED, Note, Photograph, read_image
+from clod_adapter.io.scene.images import LARGE, REDUCED, Note, Photograph, image_size, read_image
 from clod_adapter.io.scene.transforms import in_trained_frame, read_transforms
 from clod_adapter.io.scene.undistort import cache_folder, kept, undistort
 from clod_adapter.origin import NOWHERE
@@ -29,6 +30,7 @@ from clod_adapter.progress import Listener, Phase, tell
 
 SCALED = "scaled {} (Pillow bicubic, as in Inria's code)"
 MOST_AT_ONCE = 8  # photographs of full size in memory
+_ONE_LARGE = threading.Lock()  # of more than LARGE pixels one at a time
 
 
 class ImageCache:
@@ -220,6 +222,16 @@ def _load_view(image: PosedImage, path: Path, cache: Path | None, max_width: int
 
 def _photograph(image: PosedImage, path: Path, max_width: int) -> Photograph:
     """The photograph as a pinhole camera has it, no wider than ``max_width``."""
+    width, height = image_size(path)
+    if width * height <= LARGE:
+        return _worked_on(image, path, max_width)
+    with _ONE_LARGE:
+        photograph = _worked_on(image, path, max_width)
+        release()  # or this thread keeps memory that the next one allocates again
+        return photograph
+
+
+def _worked_on(image: PosedImage, path: Path, max_width: int) -> Photograph:
     camera = copy(image.camera)
     pixels, notes = read_image(path, camera.width, camera.height, max_width)
     if pixels.size != (camera.width, camera.height):

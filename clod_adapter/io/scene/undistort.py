@@ -36,10 +36,15 @@ def undistort(path: Path, pixels: Image.Image, camera: pycolmap.Camera) -> tuple
 
 def cache_folder(scene: Path) -> Path:
     """The folder of a scene's undistorted photographs in ``$XDG_CACHE_HOME`` or ``~/.cache``; created if missing."""
-    caches = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"))
+    try:
+        caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    except RuntimeError as error:
+        raise ClodError("no home folder to keep undistorted photographs in; set XDG_CACHE_HOME to a folder") from error
     folder = caches / "clod-adapter" / "undistorted" / scene.resolve().name
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        if not os.access(folder, os.W_OK | os.X_OK):
+            raise PermissionError(13, "Permission denied")
     except OSError as error:
         raise ClodError(
             f"{folder}: undistorted photographs cannot be kept there ({error.strerror or error}); set XDG_CACHE_HOME "
