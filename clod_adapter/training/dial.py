@@ -37,6 +37,7 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.importance import MOST_VIEWS, for_training, initialize, usable_views
 from clod_adapter.integrations.splats import NAMES, from_gsplat
 from clod_adapter.progress import Listener, shown
+from clod_adapter.training.optimizer import learning_rates, own_sizes
 from clod_adapter.training.schedule import OURS, Schedule, ViewSampler
 from clod_adapter.training.target_count import TargetShare, count_gradient, target_share
 
@@ -306,25 +307,6 @@ def require_trainable(base: Gaussians, scene: Scene, config: AdaptConfig, proces
     if config.batch < processes:
         raise ClodError(f"batch is {config.batch}, it must be at least {processes}, a view for each of the processes")
     require_finite(base, "the checkpoint", "leave out such rows")
-
-
-def learning_rates(config: AdaptConfig, decay: str) -> dict[str, float]:
-    """By parameter, for a batch; that of means is in units of ``own_sizes``."""
-    rates = {
-        "means": config.lr_means, "quats": config.lr_quats, "log_scales": config.lr_scales,
-        "opacity_logits": config.lr_opacities, "sh0": config.lr_sh0, "shN": config.lr_shN,
-        decay: config.lr_sigma, "growth_d": config.lr_growth,
-    }  # fmt: skip
-    return {name: rate * math.sqrt(config.batch) for name, rate in rates.items()}
-
-
-@torch.no_grad()
-def own_sizes(log_scales: Tensor) -> Tensor:
-    """``[N]`` the unit of each Gaussian's position steps, world units: the geometric mean of its scales.
-
-    A length of the scene, as in 3DGS, is a hundred times the size of most Gaussians in a scene of millions.
-    """
-    return log_scales.detach().float().mean(1).exp()
 
 
 def _no_photograph() -> Tensor:

@@ -10,6 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from clod_adapter.config import AdaptConfig
+
 
 @dataclass
 class GradientSum:
@@ -108,6 +110,25 @@ class RowAdam:
             moved = x - rates[name] * lengths * m / (v.sqrt() * correction + self.epsilon)
             for old, new in ((first, m), (second, v), (x, moved)):
                 old.copy_(torch.where(rows[:, None], new, old))
+
+
+def learning_rates(config: AdaptConfig, decay: str) -> dict[str, float]:
+    """By parameter, for a batch; that of means is in units of ``own_sizes``."""
+    rates = {
+        "means": config.lr_means, "quats": config.lr_quats, "log_scales": config.lr_scales,
+        "opacity_logits": config.lr_opacities, "sh0": config.lr_sh0, "shN": config.lr_shN,
+        decay: config.lr_sigma, "growth_d": config.lr_growth,
+    }  # fmt: skip
+    return {name: rate * math.sqrt(config.batch) for name, rate in rates.items()}
+
+
+@torch.no_grad()
+def own_sizes(log_scales: Tensor) -> Tensor:
+    """``[N]`` the unit of each Gaussian's position steps, world units: the geometric mean of its scales.
+
+    A length of the scene, as in 3DGS, is a hundred times the size of most Gaussians in a scene of millions.
+    """
+    return log_scales.detach().float().mean(1).exp()
 
 
 @torch.no_grad()

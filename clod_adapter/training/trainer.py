@@ -21,10 +21,10 @@ from clod_adapter.finite import LossNotFinite, require_finite, spoilt_rows
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.losses import photometric_loss
 from clod_adapter.rasterizers import for_device
-from clod_adapter.training.dial import TrainableSubset, learning_rates, own_sizes
+from clod_adapter.training.dial import TrainableSubset
 from clod_adapter.training.distributed import ProcessGroup
 from clod_adapter.training.gate import Gate
-from clod_adapter.training.optimizer import GradientSum, RowAdam, add_to_mean
+from clod_adapter.training.optimizer import GradientSum, RowAdam, add_to_mean, learning_rates, own_sizes
 from clod_adapter.training.paper import form_of
 from clod_adapter.training.schedule import Sample
 from clod_adapter.training.state import TrainingState
