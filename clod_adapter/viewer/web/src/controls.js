@@ -52,7 +52,6 @@ function step(time) {
   requestAnimationFrame(step);
 }
 
-/** Applies the pressed keys for a number of seconds. */
 function applyKeys(seconds) {
   const speed = camera.distance * seconds * (fast ? 3 : 0.8), angle = (viewer.flying ? -1 : 1) * KEY_ROTATION * seconds;
   for (const key of pressed.values()) {

@@ -1,8 +1,7 @@
 // The files that the page shows: those of its server or its own, and dropped ones.
 import { readGaussians } from "../../../../viewers/read.js";
-import { config, elements, state, viewer } from "./page.js";
+import { config, elements, state, ui, viewer } from "./page.js";
 import * as stage from "./stage.js";
-import { changed, clampDial, listCameras, setHold, showMessage, showName, showProgress } from "./ui.js";
 import { applyLink, reset } from "./views.js";
 
 const OPENING = 30; // frames per second that are held when a file opens
@@ -41,11 +40,11 @@ function show(read, base, cameras) {
   stage.setHold(null);
   stage.show(read, base);
   Object.assign(viewer, { cameras, up: "" });
-  listCameras();
+  ui.listCameras();
   reset();
-  state.dial = clampDial(dial ?? (viewer.photographs.length ? 1 : 0));
-  if (dial === null && read.settings) setHold(OPENING);
-  changed();
+  state.dial = ui.clampDial(dial ?? (viewer.photographs.length ? 1 : 0));
+  if (dial === null && read.settings) ui.setHold(OPENING);
+  ui.changed();
 }
 
 let asked = 0; // files, the last of which is shown
@@ -53,26 +52,25 @@ let asked = 0; // files, the last of which is shown
 /** Opens a file by `read()` and `present(what is read)`, unless another one is asked for before it is there. */
 async function open(name, read, present) {
   const number = ++asked;
-  showProgress(`Loading ${name}`);
+  ui.showProgress(`Loading ${name}`);
   try {
     const found = await read();
     if (number !== asked) return;
-    showMessage(null);
+    ui.showMessage(null);
     present(found);
     await stage.whenDrawn();
   } catch (error) {
-    if (number === asked) showMessage(error.message);
+    if (number === asked) ui.showMessage(error.message);
     throw error;
   } finally {
-    if (number === asked) showProgress(null);
+    if (number === asked) ui.showProgress(null);
   }
 }
 
-/** Opens a file, a Blob. */
 export const load = (blob, name) => open(name, () => readFile(blob, name), (read) => {
   viewer.file = null;
   show(read, null, []);
-  showName(name, null);
+  ui.showName(name, null);
 });
 
 /** Opens one of the page's files: in the same view and at the same dial value, unless another scene is there. */
@@ -82,9 +80,9 @@ export async function openEntry(number) {
     if (isFirst || viewer.file === null) show(read, readBase, config.cameras);
     else stage.show(read, readBase ?? undefined);
     viewer.file = number;
-    showName(entry.name, number);
-    if (read.settings) state.dial = clampDial(state.dial);
-    changed();
+    ui.showName(entry.name, number);
+    if (read.settings) state.dial = ui.clampDial(state.dial);
+    ui.changed();
     if (isFirst && location.hash) applyLink();
   });
 }

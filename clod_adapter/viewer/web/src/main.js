@@ -2,9 +2,9 @@
 import { camera, setCamera } from "./camera.js";
 import "./controls.js";
 import { load, openEntry } from "./files.js";
-import { elements } from "./page.js";
+import { elements, ui } from "./page.js";
 import * as stage from "./stage.js";
-import * as ui from "./ui.js";
+import "./ui.js";
 import { applyLink } from "./views.js";
 
 async function start() {

@@ -14,3 +14,5 @@ export const viewer = {
   cameras: [], cameraNumber: 0, up: "", flying: false, recording: null,
   get photographs() { return viewer.cameras.filter(({ placed }) => !placed); },
 };
+
+export const ui = {}; // functions of ui.js by name, also for the modules that it imports itself

@@ -2,9 +2,8 @@
 import { createHold } from "../../../../viewers/frame_rate.js";
 import { viewOf } from "./camera.js";
 import { createModel } from "./model.js";
-import { elements, state } from "./page.js";
+import { elements, state, ui } from "./page.js";
 import { createRenderer } from "./renderer.js";
-import { heldFrame, showMessage, updateFrame } from "./ui.js";
 
 export let model = null, base = null, hold = null, frameMs = null;
 let renderer = null, sides = [], version = 0, drawnVersion = -1, frame = 0, moving = false;
@@ -52,7 +51,7 @@ function schedule() {
     try {
       if (model && !renderer.gl.isContextLost()) draw();
     } catch (error) {
-      showMessage(error.message);
+      ui.showMessage(error.message);
     }
   });
 }
@@ -68,7 +67,7 @@ function draw() {
   else schedule();
   warm = true;
   if (isDrawn()) for (const resolve of callbacks.splice(0)) resolve();
-  updateFrame();
+  ui.updateFrame();
 }
 
 /** Takes the time of a frame, for the held frame rate: the next one has another dial value until it has settled. */
@@ -79,7 +78,7 @@ function took(milliseconds) {
   state.dial = hold.took(dial, frameMs, model.maxDial);
   if (state.dial !== dial) version++;
   if (!isDrawn()) schedule();
-  heldFrame(hold.outOfReach(model.maxDial));
+  ui.heldFrame(hold.outOfReach(model.maxDial));
 }
 
 /** Requests the order for the current state, one at a time for each side. */
@@ -93,7 +92,7 @@ async function requestOrder({ side, model: of, dial, attenuated }, seen, current
     Object.assign(side, about, { model: of });
     renderer.upload(side, rows);
   } catch (error) {
-    showMessage(error.message);
+    ui.showMessage(error.message);
   }
   side.version = current;
   side.busy = false;

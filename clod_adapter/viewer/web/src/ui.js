@@ -1,7 +1,7 @@
 // The panel. In page.html, data-key names the key that clicks a control, and data-needs what it is disabled without.
 import { isNear } from "./camera.js";
 import { openFile, showFile } from "./files.js";
-import { config, elements, state, viewer } from "./page.js";
+import { config, elements, state, ui, viewer } from "./page.js";
 import * as stage from "./stage.js";
 import * as views from "./views.js";
 
@@ -22,7 +22,7 @@ function psnrAt(rows, dial) {
   return a.psnr + (Math.log(dial / a.virtual_scale) / Math.log(b.virtual_scale / a.virtual_scale)) * (b.psnr - a.psnr);
 }
 
-export function update() {
+function update() {
   const { model, base } = stage, hasDial = Boolean(model?.attenuation);
   const has = { model: Boolean(model), dial: hasDial, comparison: hasDial || Boolean(base) };
   for (const each of document.querySelectorAll("[data-needs]")) each.disabled = !has[each.dataset.needs];
@@ -48,7 +48,7 @@ export function update() {
 }
 
 /** Shows count, frame time and PSNR of the last frame; the PSNR is of the cameras' views, if there are cameras. */
-export function updateFrame() {
+function updateFrame() {
   elements.poster?.remove(); // the picture for the time until the first frame
   const { model, base, frameMs } = stage, { total, kept } = stage.counts();
   const share = `${((100 * kept) / total).toFixed(kept === total ? 0 : 1)} %`;
@@ -63,40 +63,40 @@ export function updateFrame() {
 }
 
 /** Shows a changed state, and removes the note, which was of the former one. */
-export function changed() {
+function changed() {
   showNote("");
   stage.change();
   update();
 }
 
 /** A frame was measured for the held frame rate. */
-export function heldFrame(outOfReach) {
+function heldFrame(outOfReach) {
   update();
   showNote(outOfReach ? `s = ${maxDial()}, the largest trained value, is too slow for this frame rate` : "");
 }
 
-export const clampDial = (dial) => Math.min(Math.max(dial, 0), maxDial());
+const clampDial = (dial) => Math.min(Math.max(dial, 0), maxDial());
 
-export function setDial(dial) {
+function setDial(dial) {
   state.dial = dial;
   setHold(null);
 }
 
 /** Holds a frame rate by the dial, frames per second; null ends that. */
-export function setHold(fps) {
+function setHold(fps) {
   if (fps) [state.equation, elements.rate.value] = [true, fps];
   stage.setHold(fps);
   changed();
 }
 
-export function setEquation(on) {
+function setEquation(on) {
   state.equation = on;
   if (on) changed();
   else setHold(null); // no dial value changes a frame's time then
 }
 
 /** Compares with the base, or with the model without its dial, right of a share of the width; null ends that. */
-export function setWipe(position) {
+function setWipe(position) {
   if (position !== null && !stage.base) state.equation = true; // else both sides would be the same
   state.wipe = position;
   changed();
@@ -117,7 +117,7 @@ const toggle = (button) => button.setAttribute("aria-expanded", button.ariaExpan
 const stepDial = (ticks) => setDial(toDial(Math.min(Math.max(toTick(state.dial) + ticks, 0), TICKS)));
 
 /** Listens to the controls, each by its id. */
-export function start() {
+function start() {
   const actions = {
     dial: ({ value }) => setDial(toDial(value)), lower: () => stepDial(-20), raise: () => stepDial(20),
     hold: ({ checked }) => setHold(checked ? elements.rate.value : null), rate: ({ value }) => setHold(value),
@@ -154,29 +154,34 @@ export function start() {
 }
 
 /** Shows the name of the file, and its number in the list; null for one that is not listed. */
-export function showName(name, number) {
+function showName(name, number) {
   document.title = elements.title.textContent = name;
   elements.title.hidden = viewer.files.length > 1 && number !== null;
   elements.files.selectedIndex = number ?? -1;
 }
 
 /** Lists the cameras by name, and last what is shown for a view of none, which cannot be chosen. */
-export function listCameras() {
+function listCameras() {
   const free = Object.assign(new Option("free view"), { hidden: true, disabled: true });
   elements.camera.replaceChildren(...viewer.cameras.map(({ name }) => new Option(name)), free);
 }
 
 /** Shows an error message; null hides it. */
-export function showMessage(text) {
+function showMessage(text) {
   elements.message.hidden = !text;
   elements.message.firstElementChild.textContent = text ?? "";
 }
 
-export const showNote = (text) => { elements.targetNote.textContent = text; };
+const showNote = (text) => { elements.targetNote.textContent = text; };
 
 /** Shows progress in the canvas, at its top where there is a picture; null hides it. */
-export function showProgress(text) {
+function showProgress(text) {
   elements.busy.hidden = !text;
   elements.busy.classList.toggle("tag", Boolean(stage.model || elements.poster));
   elements.busy.textContent = text ?? "";
 }
+
+Object.assign(ui, {
+  changed, clampDial, heldFrame, listCameras, setDial, setEquation, setHold, setWipe, showFile, showMessage, showName, showNote,
+  showProgress, start, update, updateFrame,
+});

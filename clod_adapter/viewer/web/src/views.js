@@ -1,9 +1,7 @@
 // Changes of the view by controls and links, what plays, and pictures and videos of it.
 import * as camera from "./camera.js";
-import { showFile } from "./files.js";
-import { elements, state, viewer } from "./page.js";
+import { elements, state, ui, viewer } from "./page.js";
 import * as stage from "./stage.js";
-import { changed, clampDial, showNote, update } from "./ui.js";
 import { add, cross, dot, unit } from "./vector.js";
 
 const TURN = 20; // seconds of the turntable's turn
@@ -33,7 +31,7 @@ function show(number, set) {
   stop();
   set();
   select(number);
-  changed();
+  ui.changed();
 }
 
 export const reset = () => show(0, () => camera.fit(stage.model.extent, viewer.cameras, axisOf(viewer.up)));
@@ -53,7 +51,7 @@ export function setUp(value) {
 
 function moved() {
   stage.change(true);
-  showNote(""); // it was of another view
+  ui.showNote(""); // it was of another view
 }
 
 export function movedByHand() {
@@ -73,10 +71,9 @@ export async function copyLink() {
   history.replaceState(null, "", `#${texts.join("&")}${state.equation ? "" : "&equation=off"}`);
   const copied = viewer.file === null ? "Link copied; it contains the view, not the file" : "Link copied";
   const note = await navigator.clipboard?.writeText(location.href).then(() => copied, () => ""); // file:// pages may not
-  showNote(note || "The link is in the address bar");
+  ui.showNote(note || "The link is in the address bar");
 }
 
-/** Shows the view of the page's link. */
 export async function applyLink() {
   const parts = new URLSearchParams(location.hash.slice(1));
   const numbers = (name, length) => {
@@ -86,7 +83,7 @@ export async function applyLink() {
   const eye = numbers("eye", 3), axes = numbers("axes", 6), up = numbers("up", 3), [wipe] = numbers("wipe", 1), [dial] = numbers("dial", 1);
   const [fov = view.fov, aspect = view.aspect] = numbers("fov", 2), [distance = view.distance] = numbers("distance", 1);
   const [file = 1] = numbers("file", 1);
-  if (viewer.file !== null && file - 1 !== viewer.file) await showFile(file - 1);
+  if (viewer.file !== null && file - 1 !== viewer.file) await ui.showFile(file - 1);
   stop();
   if (up.length) [viewer.up, view.up] = [String(up), unit(up)];
   if (eye.length && axes.length) {
@@ -97,8 +94,8 @@ export async function applyLink() {
   state.equation = parts.get("equation") !== "off";
   if (dial !== undefined || wipe !== undefined || !state.equation) stage.setHold(null);
   state.wipe = wipe !== undefined && (stage.model.attenuation || stage.base) ? Math.min(Math.max(wipe, 0), 1) : null;
-  state.dial = clampDial(dial ?? state.dial);
-  changed();
+  state.dial = ui.clampDial(dial ?? state.dial);
+  ui.changed();
 }
 
 export const isRunning = () => running !== null;
@@ -106,7 +103,7 @@ export const isRunning = () => running !== null;
 function stop() {
   if (!running) return;
   running = null;
-  update();
+  ui.update();
 }
 
 /** Ends what runs. `ended()` is called where the animation ends by itself. */
@@ -122,7 +119,7 @@ function run(step, ended) {
     ended();
   };
   requestAnimationFrame(tick);
-  update();
+  ui.update();
 }
 
 /** Rotates about the pivot; `turns`: how often. */
@@ -199,7 +196,7 @@ export function record() {
   if (viewer.recording) {
     viewer.recording.stop();
     viewer.recording = null;
-    return isRunning() ? stop() : update();
+    return isRunning() ? stop() : ui.update();
   }
   const stream = elements.canvas.captureStream(FPS);
   viewer.recording = new MediaRecorder(stream, { mimeType: videoType, videoBitsPerSecond: BITS });
