@@ -44,7 +44,7 @@ def execute(args: Namespace) -> dict[str, Any]:
 
     console, adapter = Console(args.quiet), load_adapter(args.adapter)
     for note in adapter.notes:
-        console.note(note)
+        console.note(note, args.adapter)
     base = read_checkpoint(args.base, console, args.activated, adapter.origin)
     try:
         adapted = adapter.apply(base.gaussians, base.fingerprint)

@@ -151,9 +151,10 @@ def finish(run: Run, result: Result, page: AdaptPage | None) -> dict[str, Any]:
         path = outputs.ply.with_suffix(".html")
         with run.watch.time("page"):
             page.write(path, report, result.gaussians, result.adapted.start_seconds)
-        report |= {"seconds": seconds(run, result), "forecast": against_forecast(run)}
+        report["seconds"] |= {"page": round(run.watch.seconds["page"], 3)}  # beside the total, which the page has too
+        report["forecast"] = against_forecast(run)
         write_report(outputs.report, report)
-    print_summary(run, measured)
+    print_summary(run, measured, report["seconds"])
     if "loss" in report:
         console.say(f"\nwarning: {report['loss']}")
     return report
@@ -253,7 +254,7 @@ def teacher(args: argparse.Namespace) -> str:
     return "checkpoint" if args.images is None else "photographs"
 
 
-def print_summary(run: Run, measured: Measurements) -> None:
+def print_summary(run: Run, measured: Measurements, taken: dict[str, float]) -> None:
     args, outputs = run.args, run.outputs
     if measured.rows:
         marked = [("base", row) for row in measured.base] + by_dial(measured.rows)
@@ -262,7 +263,8 @@ def print_summary(run: Run, measured: Measurements) -> None:
             print(f"plain: {outputs.ply} in a viewer that does not know the dial\n")
     for path in vars(outputs).values():
         print(f"{size(path):>9}  {path}")
-    print(f"\n{duration(run.watch.total())} in all; next:")
+    page = f", and {duration(taken['page'])} for the page" if "page" in taken else ""
+    print(f"\n{duration(taken['total'] if page else run.watch.total())} in all{page}; next:")
     model = shlex.quote(str(outputs.ply))
     images = [] if args.images is None else [f"--images {shlex.quote(args.images)}"]
     print("  clod-adapt view", model, f"--base {shlex.quote(args.ply)}", *images)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NoReturn, Protocol
 
 from clod_adapter.config import DEVICES, FILTERS
 from clod_adapter.errors import ClodError
-from clod_adapter.io.file_formats import file_has_dial
+from clod_adapter.io.file_formats import PLY, file_has_dial, format_of
 from clod_adapter.io.scene.folder import find_cameras
 from clod_adapter.report.charts import chart_file
 from clod_adapter.report.style import check_matplotlib
@@ -115,6 +115,9 @@ that is the result. A count or frame rate that is out of reach is an error.
 """
 
 
+NO_CALIBRATION = "there is no calibration in the header"
+
+
 def add_activated(options: _ActionsContainer) -> None:
     options.add_argument(
         "--activated", choices=["none", "opacity", "scales", "both"],
@@ -200,12 +203,18 @@ def check_dials(args: Namespace, model: str) -> None:
     budget = given_budget(args)
     if budget is None:
         return
-    _, option, values = budget
+    name, option, values = budget
     for value in values:
         if not 0 < value < math.inf:
             raise ClodError(f"{option} has {value:g}, it must be positive and finite")
     if not file_has_dial(Path(model)):
         raise ClodError(f"{model}: has no sigma_d, which {option} needs; adapt it first: clod-adapt {model} ...")
+    if name == "psnr_drop" and format_of(Path(model)) is PLY:
+        from clod_adapter.io.ply import all_comments, read_head  # here: --help needs no plyfile
+
+        comments = all_comments(read_head(Path(model)).ply)
+        if not any(comment.startswith("clod_adapter calibrated ") for comment in comments):
+            raise ClodError(f"{model}: {option}: {NO_CALIBRATION}; adapt it again, or give --sv or --keep")
 
 
 def check_scene(folder: str) -> None:

@@ -35,8 +35,10 @@ class Console:
             tqdm.write(text, file=sys.stderr)  # print would overwrite a bar on this line
             sys.stderr.flush()
 
-    def note(self, text: str) -> None:
-        """Writes and keeps a note on input or output, or a warning if it begins so."""
+    def note(self, text: str, of: str = "") -> None:
+        """Writes and keeps a note, or a warning if it begins so, on input or output; ``of``: the file that it is of."""
+        if of:
+            text = f"{WARNING * text.startswith(WARNING)}{of}: {text.removeprefix(WARNING)}"
         if text not in self.notes:
             self.notes.append(text)
             self.say(f"  {text}" if text.startswith(WARNING) else f"  note: {text}")

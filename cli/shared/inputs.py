@@ -45,7 +45,7 @@ def read_checkpoint(
     more = f", with {columns}" * bool(columns) + f", drawn with {drawn.description}" * (drawn != CLASSIC)
     console.say(f"{path}: {len(gaussians):,} Gaussians, SH degree {gaussians.sh_degree}{more}")
     for note in checkpoint.notes:
-        console.note(note)
+        console.note(note, path)
     return checkpoint
 
 

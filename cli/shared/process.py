@@ -192,8 +192,11 @@ def launched() -> Launch:
     if not all(name in os.environ for name in NEEDED):
         return Launch()
     names = {"RANK": 0, "WORLD_SIZE": 1, "LOCAL_RANK": 0, "LOCAL_WORLD_SIZE": 1}
-    launch = Launch(*(int(os.environ.get(name, default)) for name, default in names.items()))
-    if launch.rank >= launch.size or launch.local_rank >= launch.local_size:
+    try:
+        launch = Launch(*(int(os.environ.get(name, default)) for name, default in names.items()))
+    except ValueError:
+        launch = Launch(-1)
+    if not 0 <= launch.rank < launch.size or not 0 <= launch.local_rank < launch.local_size:
         raise ClodError(f"inconsistent environment variables {', '.join(names)}; start the processes with torchrun")
     return launch
 

@@ -153,8 +153,8 @@ def _elements(data: np.ndarray, head: Head) -> dict[str, np.ndarray]:
         at += count * kind.itemsize
     if "vertex" not in found:
         content = data.tobytes()
-        lines = io.BytesIO(content if head.ply.text else b"")
-        if any(len(line) == _LONGEST for line in iter(lambda: lines.readline(_LONGEST), b"")):
+        lines = io.TextIOWrapper(io.BytesIO(content if head.ply.text else b""), "latin-1")  # CR ends a line too
+        if any(len(line) == _LONGEST for line in iter(lambda: lines.readline(_LONGEST), "")):
             raise ValueError(f"a row of more than {_LONGEST:,} characters")  # which would be copied several times
         with warnings.catch_warnings(), np.errstate(over="ignore"):
             warnings.simplefilter("ignore")  # of text that is beyond float32's range

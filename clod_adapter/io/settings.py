@@ -89,7 +89,7 @@ def read_metadata(path: Path, values: Mapping[str, Any], *, dial: bool, describe
         if not isinstance(version, str):
             raise TypeError(f"package_version is {version!r:.40}, not a string")
         return Metadata(
-            attenuation=_attenuation(values.get("attenuation", {}), notes) if dial else None,
+            attenuation=_attenuation(values.get("attenuation", {}), described, notes) if dial else None,
             screen_filter=_screen_filter(values[FILTER], notes) if FILTER in values else None,
             calibration=_calibration(values.get("calibration"), notes),
             origin=parse_origin(values.get("origin", NOWHERE)), about=tuple(map(str, values.get("about", ()))),
@@ -99,12 +99,14 @@ def read_metadata(path: Path, values: Mapping[str, Any], *, dial: bool, describe
         raise damaged(path, error) from error
 
 
-def _attenuation(stored: Mapping[str, Any], notes: list[str]) -> AttenuationConfig:
+def _attenuation(stored: Mapping[str, Any], described: bool, notes: list[str]) -> AttenuationConfig:
     kinds: dict[str, Any] = {field.name: type(field.default) for field in fields(AttenuationConfig)}
     values = {name: kind(stored[name]) for name, kind in kinds.items() if name in stored}
     if "max_sv" not in values and values.get("tau", 0.0) * AttenuationConfig().max_sv >= 1:
         values["max_sv"] = max(0.99 / values["tau"], 1.0)  # the largest that this tau allows
     _note_unknown(stored, kinds, notes)
+    if missing := [name for name in kinds if name not in stored] * described:
+        notes.append(f"settings that are missing have their defaults: {', '.join(missing)}")
     return AttenuationConfig(**values)
 
 

@@ -184,10 +184,11 @@ def _usable(arrays: Arrays) -> tuple[np.ndarray, Counter[str]]:
     """``[N]`` bool, the Gaussians that can be drawn, and the others by the first rule that they break."""
     count = len(arrays["means"])
     exists, finite = np.ones(count, bool), np.ones(count, bool)
-    for name, values in arrays.items():
-        usable = _finite(name, values)
-        if not usable.all():  # which is far faster than by rows
-            finite &= usable.reshape(count, -1).all(1)
+    for start in range(0, count, ROWS):
+        for name, values in arrays.items():
+            usable = _finite(name, values[start : start + ROWS])
+            if not usable.all():  # which is far faster than by rows
+                finite[start : start + ROWS] &= usable.reshape(len(usable), -1).all(1)
     if MASKS in arrays:  # sigmoid(first - second) >= 0.5; NaN is for the next rule
         exists = ~(arrays[MASKS][:, 0] < arrays[MASKS][:, 1])
     keep, dropped = np.ones(count, bool), Counter[str]()
