@@ -99,9 +99,12 @@ def shown(progress: Listener | Literal[False] | None) -> Iterator[Listener | Non
     from tqdm import tqdm
 
     bars: list[Any] = []
+    phase: Phase | None = None
 
     def show(now: Progress) -> None:
-        if not bars or bars[-1].desc != now.phase:
+        nonlocal phase
+        if phase != now.phase:
+            phase = now.phase
             for earlier in bars:
                 earlier.close()
             bars.append(tqdm(total=now.total, desc=now.phase, file=sys.stderr, leave=False, dynamic_ncols=True))

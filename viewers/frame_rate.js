@@ -45,8 +45,8 @@ export function createHold(fps) {
       left -= next === dial ? UNCHANGED : 1;
       return next;
     },
-    /** Whether frames at maxSv take longer than the budget. */
-    outOfReach: (maxSv) => frames.slice(-NEWEST).every(([dial]) => dial === maxSv) && excess(frames, milliseconds) > DEAD_BAND,
+    /** Whether frames at maxSv take longer than the budget, by a log of the ratio. */
+    outOfReach: (maxSv, by = DEAD_BAND) => frames.slice(-NEWEST).every(([dial]) => dial === maxSv) && excess(frames, milliseconds) > by,
   };
 }
 

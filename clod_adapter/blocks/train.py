@@ -131,7 +131,9 @@ def load_block(path: Path, belongs: dict[str, Any], division: Division, block: i
     with refused_if_damaged(path, "is no block or is damaged", again):
         tensors, metadata = read_tensors(path)
         found = json.loads(metadata[KEY])
-        theirs, learned = dict(found["belongs"]), Learned(division.rows(block), tensors, **found["about"])
+        about, theirs = found["about"], dict(found["belongs"])
+        about |= {name: kind(about[name]) for name, kind in (("steps", int), ("seconds", float), ("held", int))}
+        learned = Learned(division.rows(block), tensors, **about)
     different = [name for name in belongs if theirs.get(name) != belongs[name]]
     if different:
         raise ClodError(f"{path}: is of a run with another {different[0]}; remove it, or give --out another name")

@@ -101,6 +101,7 @@ def attenuate(
         ClodError: the dial is negative or not finite, or the shapes differ.
     """
     check_dial(virtual_scale)
+    virtual_scale = float(virtual_scale)  # of a numpy array
     if sigma_d is None or config is None:
         shown = opacities if activated else opacities.sigmoid()
         keep = torch.ones_like(shown, dtype=torch.bool)

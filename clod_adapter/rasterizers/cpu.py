@@ -201,7 +201,7 @@ class _Compiled(Rasterizer):
 
     @torch.no_grad()
     def kept(self, gaussians: Gaussians, camera: Camera, virtual_scale: float) -> Tensor:
-        if gaussians.sigma_d is None:
+        if gaussians.sigma_d is None or gaussians.means.dtype != torch.float32:
             return super().kept(gaussians, camera, virtual_scale)
         found = np.empty(len(gaussians), np.uint8)
         given = _arrays((gaussians.means, gaussians.opacity_logits, gaussians.sigma_d.float()))

@@ -158,7 +158,8 @@ class Dial(nn.Module):
         if splats:
             (given,) = self._given
             own = given.tensors() if isinstance(given, Gaussians) else given
-            found |= {name: value for name, value in own.items() if getattr(value, "requires_grad", False)}
+            tuned = {name: value for name, value in own.items() if getattr(value, "requires_grad", False)}
+            found |= {name: value for name, value in tuned.items() if name not in found}  # growth_d is the dial's own
         named = [(name, value, rates.get(ATTRIBUTE_OF.get(name, name))) for name, value in found.items()]
         return [{"params": [value], "lr": rate, "name": name} for name, value, rate in named if rate is not None]
 

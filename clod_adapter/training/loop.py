@@ -150,6 +150,7 @@ def _train(trainer: Trainer, progress: Listener | None) -> Adapted:
     """Steps until the steps or the time budget are used up, or something ends training early."""
     group, lost, failed = trainer.group, None, None
     began, going = time.perf_counter() - trainer.seconds, True
+    before = (group.waiting, group.exchanging) if group else (0.0, 0.0)
 
     def tell(error: str | None = None) -> bool:
         """Whether the listener wants training to go on."""
@@ -186,7 +187,7 @@ def _train(trainer: Trainer, progress: Listener | None) -> Adapted:
             tell(failed)
         trainer.seconds = time.perf_counter() - began
         seen = trainer.gate.finish() if trainer.gate and not lost else None
-        waited = (group.waiting, group.exchanging) if group else (0.0, 0.0)
+        waited = (group.waiting - before[0], group.exchanging - before[1]) if group else (0.0, 0.0)
         adapted = Adapted(
             trainer.gaussians(), trainer.done, trainer.seconds, trainer.start_seconds, not going, lost, *waited,
             failed, int(trainer.held.sum()), watched=seen,

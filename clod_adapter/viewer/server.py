@@ -10,6 +10,7 @@ import re
 import socket
 import socketserver
 import sys
+import threading
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -39,11 +40,13 @@ class Server(ThreadingHTTPServer):
 
     # Not daemons: a thread that holds a tensor when the interpreter exits would abort the process.
     daemon_threads = False
+    block_on_close = False  # the base class would join a thread that a Ctrl-C kept from starting
     allow_reuse_address = sys.platform != "win32"  # on Windows two servers would share a port
 
     def __init__(self, responses: Mapping[str, Response], port: int = 0) -> None:
         self.responses = dict(responses)
         self._sockets: set[socket.socket] = set()
+        self._threads_of_requests: list[threading.Thread] = []
         try:
             super().__init__((HOST, port), _Handler)
         except OSError as error:
@@ -68,6 +71,11 @@ class Server(ThreadingHTTPServer):
         self._sockets.add(request)
         return request, address
 
+    def process_request(self, request: Any, client_address: Any) -> None:
+        thread = threading.Thread(target=self.process_request_thread, args=(request, client_address))
+        self._threads_of_requests = [*(each for each in self._threads_of_requests if each.is_alive()), thread]
+        thread.start()
+
     def shutdown_request(self, request: Any) -> None:
         self._sockets.discard(request)
         super().shutdown_request(request)
@@ -78,6 +86,9 @@ class Server(ThreadingHTTPServer):
             with suppress(OSError):
                 request.shutdown(socket.SHUT_RDWR)
         super().server_close()
+        for thread in self._threads_of_requests:
+            if thread.is_alive():  # false for one that never started
+                thread.join()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Ignores connections closed by the browser, for example with its tab."""

@@ -84,7 +84,9 @@ def test_every_format_uses_the_reader(tmp_path: Path, kind: str) -> None:
         read(change_setting(written(path), "tau", "0.02", "7.02"))
     found = read(change_setting(written(path), "", "max_sv", "max_sx"))
     assert found[:3] == (replace(ATTENUATION, max_sv=5.0), CLASSIC, CALIBRATION)
-    assert found.notes == ("settings unknown to this version ignored: 'max_sx'",)
+    assert found.notes == (
+        "settings unknown to this version ignored: 'max_sx'", "settings that are missing have their defaults: max_sv",
+    )  # fmt: skip
     total = "calibrated_with" if ply else "total"
     found = read(change_setting(written(path), total, "40", "-4"))
     assert found.calibration is None and found.attenuation == ATTENUATION

@@ -67,7 +67,7 @@ def test_other_formats_are_adapted(clod: Any, capture: Any, tmp_path: Path, name
     writer = {"ckpt.pt": write_pt, "base.compressed.ply": write_packed}.get(name, write)
     writer(tmp_path / name, capture.gaussians)
     done = clod(name, "--images", capture.scene, *TINY)
-    assert done.code == 0 and f"note: {note}" in done.err if note else "note: " not in done.err, done
+    assert done.code == 0 and f"note: {name}: {note}" in done.err if note else "note: " not in done.err, done
     assert clod("apply", name, "dial.safetensors", "--out", "again.ply").code == 0
     assert (tmp_path / "again.ply").read_bytes() == (tmp_path / "dial.ply").read_bytes()
 

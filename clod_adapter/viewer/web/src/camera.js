@@ -18,9 +18,15 @@ export const camera = {
 const forward = () => row(camera.rotation, 2);
 const pivot = () => add(camera.eye, forward(), camera.distance);
 
+let box = null; // the panel's rectangle when the picture was placed: a note below it moves nothing
+
+export function layOut() {
+  box = elements.panel.getBoundingClientRect();
+}
+
 /** The view for a canvas of this size in pixels, with the picture as large as it can be beside the panel or above it. */
 export function viewOf(width, height) {
-  const { rotation, eye, near, intrinsics, fov, aspect } = camera, box = elements.panel.getBoundingClientRect();
+  const { rotation, eye, near, intrinsics, fov, aspect } = camera;
   if (intrinsics) return { rotation, eye, near, ...intrinsics };
   const within = (w, h) => ({ side: Math.min(w / Math.max(aspect, 1), h * Math.min(aspect, 1)), cx: width - w / 2, cy: h / 2 });
   const beside = within(width * (1 - box.right / innerWidth), height);

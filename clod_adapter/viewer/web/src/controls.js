@@ -64,6 +64,7 @@ function applyKeys(seconds) {
 
 const { canvas } = elements;
 canvas.addEventListener("pointerdown", (event) => {
+  canvas.classList.add("pointed"); // without the focus ring of keys
   canvas.focus({ preventScroll: true });
   canvas.setPointerCapture(event.pointerId);
   pointers.set(event.pointerId, { x: event.clientX, y: event.clientY, button: event.button });
@@ -93,4 +94,5 @@ document.addEventListener("keydown", (event) => {
   applyKeys(MIN_PRESS);
 });
 document.addEventListener("keyup", (event) => pressed.delete(event.code));
+canvas.addEventListener("blur", () => canvas.classList.remove("pointed"));
 for (const target of [canvas, window]) target.addEventListener("blur", () => pressed.clear());

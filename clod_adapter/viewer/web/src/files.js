@@ -43,8 +43,8 @@ function show(read, base, cameras) {
   ui.listCameras();
   reset();
   state.dial = ui.clampDial(dial ?? (viewer.photographs.length ? 1 : 0));
-  if (dial === null && read.settings) ui.setHold(OPENING);
   ui.changed();
+  viewer.opening = dial === null && Boolean(read.settings);
 }
 
 let asked = 0; // files, the last of which is shown
@@ -59,12 +59,24 @@ async function open(name, read, present) {
     ui.showMessage(null);
     present(found);
     await stage.whenDrawn();
+    ui.showProgress(null);
+    if (viewer.opening) await settle();
   } catch (error) {
     if (number === asked) ui.showMessage(error.message);
     throw error;
   } finally {
     if (number === asked) ui.showProgress(null);
   }
+}
+
+/** Moves the dial from where a file was opened to what holds a frame rate, unless no dial value has half of it. */
+async function settle() {
+  const { dial } = state;
+  ui.setHold(OPENING);
+  await stage.whenDrawn();
+  if (!stage.hold?.outOfReach(stage.model.maxDial, Math.log(2))) return;
+  ui.setDial(dial);
+  ui.showNote(`Dial not moved: under ${OPENING / 2} fps at any value`);
 }
 
 export const load = (blob, name) => open(name, () => readFile(blob, name), (read) => {

@@ -1,5 +1,5 @@
 // Starts the page, and defines `window.clod` for tests and scripts.
-import { camera, setCamera } from "./camera.js";
+import { camera, layOut, setCamera } from "./camera.js";
 import "./controls.js";
 import { load, openEntry } from "./files.js";
 import { elements, ui } from "./page.js";
@@ -9,7 +9,8 @@ import { applyLink } from "./views.js";
 
 async function start() {
   ui.start();
-  for (const element of [elements.canvas, elements.panel]) new ResizeObserver(() => stage.change()).observe(element);
+  layOut();
+  new ResizeObserver(() => { layOut(); stage.change(); }).observe(elements.canvas);
   elements.canvas.addEventListener("webglcontextlost", () => ui.showMessage("The graphics device was lost; reload the page."));
   window.addEventListener("hashchange", applyLink);
   await openEntry(0);

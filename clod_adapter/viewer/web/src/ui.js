@@ -1,5 +1,5 @@
 // The panel. In page.html, data-key names the key that clicks a control, and data-needs what it is disabled without.
-import { isNear } from "./camera.js";
+import { isNear, layOut } from "./camera.js";
 import { openFile, showFile } from "./files.js";
 import { config, elements, state, ui, viewer } from "./page.js";
 import * as stage from "./stage.js";
@@ -34,6 +34,7 @@ function update() {
   elements.dialValue.textContent = hasDial ? named() : "";
   elements.dial.setAttribute("aria-valuetext", elements.dialValue.textContent || "none");
   elements.equation.checked = state.equation && hasDial;
+  elements.target.placeholder = hasDial ? `e.g. ${integer(Math.ceil(model.count / 2))}` : "";
   elements.hold.checked = stage.hold !== null;
   elements.move.textContent = viewer.flying ? "Fly" : "Orbit";
   elements.canvas.classList.toggle("flying", viewer.flying);
@@ -84,6 +85,7 @@ function setDial(dial) {
 
 /** Holds a frame rate by the dial, frames per second; null ends that. */
 function setHold(fps) {
+  viewer.opening = false;
   if (fps) [state.equation, elements.rate.value] = [true, fps];
   stage.setHold(fps);
   changed();
@@ -114,6 +116,7 @@ async function setTarget({ value }) {
 }
 
 const toggle = (button) => button.setAttribute("aria-expanded", button.ariaExpanded !== "true");
+const place = (change) => (button) => { change(button); layOut(); stage.change(); };
 const stepDial = (ticks) => setDial(toDial(Math.min(Math.max(toTick(state.dial) + ticks, 0), TICKS)));
 
 /** Listens to the controls, each by its id. */
@@ -125,8 +128,8 @@ function start() {
     wipe: ({ value }) => setWipe(value / TICKS), target: setTarget, files: ({ selectedIndex }) => showFile(selectedIndex),
     camera: ({ selectedIndex }) => views.goTo(selectedIndex), up: ({ value }) => views.setUp(value),
     next: () => views.goBy(1), previous: () => views.goBy(-1), move: () => { viewer.flying = !viewer.flying; update(); }, reset: views.reset,
-    open: () => elements.file.click(), file: ({ files }) => openFile(files[0]), helpOpen: () => elements.help.showModal(),
-    fold: toggle, menuOpen: toggle, hide: () => { elements.panel.hidden = !elements.panel.hidden; },
+    open: () => elements.file.click(), file: (input) => { openFile(input.files[0]); input.value = ""; }, helpOpen: () => elements.help.showModal(),
+    fold: place(toggle), menuOpen: toggle, hide: place(() => { elements.panel.hidden = !elements.panel.hidden; }),
     dismiss: () => showMessage(null), play: views.play, turn: views.turn, picture: views.savePicture,
     record: views.record, link: views.copyLink, full: () => (document.fullscreenElement ? document.exitFullscreen() : document.documentElement.requestFullscreen()),
   };

@@ -92,7 +92,7 @@ export async function applyLink() {
   }
   Object.assign(view, { fov, aspect, distance });
   state.equation = parts.get("equation") !== "off";
-  if (dial !== undefined || wipe !== undefined || !state.equation) stage.setHold(null);
+  if (dial !== undefined || wipe !== undefined || !state.equation) ui.setHold(null);
   state.wipe = wipe !== undefined && (stage.model.attenuation || stage.base) ? Math.min(Math.max(wipe, 0), 1) : null;
   state.dial = ui.clampDial(dial ?? state.dial);
   ui.changed();
