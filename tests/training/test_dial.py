@@ -124,6 +124,9 @@ def test_rates_and_ranges_of_the_parameters(captured: Pair) -> None:
     assert rates["sh0"] == 2 and rates["shN"] == 0 and rates["opacities"] == 2 * config.lr_opacities
     assert rates["log_sigma"] == 2 * config.lr_sigma and rates["growth_d"] == 2 * config.lr_growth
     assert len(attach(base, scene).param_groups(splats=True)) == 2  # none of the Gaussians' tensors has a gradient
+    grown = attach(dial.gaussians().replace(growth_d=torch.zeros(len(base)).requires_grad_()), scene)
+    named = {group["name"]: group["params"][0] for group in grown.param_groups(splats=True)}
+    assert named["growth_d"] is grown.growth_d  # and not the file's
     with torch.no_grad():
         dial.log_sigma[0], dial.log_sigma[1], dial.growth_d[0] = -100, 100, 9
     dial.sample()

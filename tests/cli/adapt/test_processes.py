@@ -181,9 +181,10 @@ def test_rank_and_default_steps_from_the_environment(monkeypatch: pytest.MonkeyP
     for name, value in AT.items():
         monkeypatch.setenv(name, value)
     assert launched() == Launch(1, 4, 0, 1)
-    monkeypatch.setenv("RANK", "4")
-    with pytest.raises(ClodError, match="inconsistent .*; start the processes with torchrun"):
-        launched()
+    for rank in ("4", "-1", "one"):
+        monkeypatch.setenv("RANK", rank)
+        with pytest.raises(ClodError, match="inconsistent .*; start the processes with torchrun"):
+            launched()
     monkeypatch.setenv("RANK", "0")
     steps = AdaptConfig().steps
     for words, size, want in (((), 1, (1, steps)), ((), 4, (4, round(steps / 4))), (("--iters", "100"), 4, (4, 100))):
