@@ -3,17 +3,21 @@
     OTHER_LIBM=0 PYTHONPATH=tests/other_libm python -m pytest tests/equation
 
 The value of OTHER_LIBM is a seed, which says for each result whether it moves up or down; equal results move alike.
-Powers of two, whole numbers below 1024, infinities and NaN stay, so no sigmoid exceeds 1. NumPy's functions, torch's on
-the CPU and the kernels' are moved, each in its own way. Python runs this file at its start, also in a test's processes.
+Powers of two, whole numbers below 1024, infinities and NaN stay, so no sigmoid exceeds 1. ``math``, NumPy's functions,
+torch's on the CPU and the kernels' are moved, each in its own way, as libraries differ. Python runs this file at its
+start, also in processes that a test starts.
 """
 
 from __future__ import annotations
 
 import importlib.machinery
+import math
 import os
 import sys
 import warnings
 import zlib
+from collections.abc import Callable
+from functools import wraps
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -21,6 +25,7 @@ from typing import Any
 SEED = os.environ.get("OTHER_LIBM")
 WHOLE = 1024  # smaller whole numbers and powers of two are exact everywhere: log2(8), exp(0), sigmoid(0)
 COMMON = "exp exp2 expm1 log log2 log10 log1p sin cos tan sinh cosh tanh"
+MATH = f"{COMMON} pow asin acos atan atan2".split()
 NUMPY = f"{COMMON} arcsin arccos arctan arctan2 hypot logaddexp".split()
 TORCH = f"{COMMON} pow asin acos atan atan2 hypot logaddexp sigmoid log_sigmoid_forward softplus logit".split()
 EXACT = (-2, -1, -0.5, 0, 0.5, 1, 2, 3)  # powers that are products, roots or quotients
@@ -46,6 +51,21 @@ def move(values: Any, library: str) -> None:
             up = (bits + kind(salt(library))) * kind(factor) >> last == 1
             towards = np.where(up, np.inf, -np.inf).astype(part.dtype)
             part[:] = np.where(stays, part, np.nextafter(part, towards))
+
+
+def change_math() -> None:
+    def moved(function: Callable[..., float]) -> Callable[..., float]:
+        @wraps(function)
+        def other(*args: Any) -> float:
+            x = function(*args)
+            if not math.isfinite(x) or math.frexp(abs(x))[0] == 0.5 or (abs(x) < WHOLE and x.is_integer()):
+                return x
+            return math.nextafter(x, math.inf if zlib.crc32(x.hex().encode(), salt("math")) & 1 else -math.inf)
+
+        return other
+
+    for name in MATH:
+        setattr(math, name, moved(getattr(math, name)))
 
 
 def change_numpy(numpy: ModuleType) -> None:
@@ -163,4 +183,5 @@ class Finder:
 
 
 if SEED is not None:
+    change_math()
     sys.meta_path.insert(0, Finder)
