@@ -115,7 +115,10 @@ that is the result. A count or frame rate that is out of reach is an error.
 """
 
 
-NO_CALIBRATION = "there is no calibration in the header"
+def no_calibration(model: Path, option: str, why: str = "") -> ClodError:
+    """The error of a budget that needs a calibration."""
+    why = why or "there is no calibration in the header"
+    return ClodError(f"{model}: {option}: {why}; adapt it again, or give --sv or --keep")
 
 
 def add_activated(options: _ActionsContainer) -> None:
@@ -211,10 +214,11 @@ def check_dials(args: Namespace, model: str) -> None:
         raise ClodError(f"{model}: has no sigma_d, which {option} needs; adapt it first: clod-adapt {model} ...")
     if name == "psnr_drop" and format_of(Path(model)) is PLY:
         from clod_adapter.io.ply import all_comments, read_head  # here: --help needs no plyfile
+        from clod_adapter.io.ply_settings import PREFIX
 
         comments = all_comments(read_head(Path(model)).ply)
-        if not any(comment.startswith("clod_adapter calibrated ") for comment in comments):
-            raise ClodError(f"{model}: {option}: {NO_CALIBRATION}; adapt it again, or give --sv or --keep")
+        if not any(comment.startswith(f"{PREFIX}calibrated ") for comment in comments):
+            raise no_calibration(Path(model), option)
 
 
 def check_scene(folder: str) -> None:

@@ -29,7 +29,7 @@ from clod_adapter.io.checkpoint import Checkpoint
 from clod_adapter.origin import Origin
 from clod_adapter.progress import Phase, Stopped
 
-from .command import NO_CALIBRATION, given_budget
+from .command import given_budget, no_calibration
 from .console import Console
 from .inputs import prepare_kernels
 from .process import GracefulStop
@@ -205,8 +205,8 @@ def solve_dials(
         for note in (f"frames timed here: {slow:.1f} ms at s = {first:g}, {fast:.1f} ms at s = {last:g}", *notes):
             console.note(note)
     elif name != "keep" and calibration is None:
-        why = next((note for note in model.notes if "calibration" in note), NO_CALIBRATION)
-        raise ClodError(f"{model.path}: {option}: {why}; adapt it again, or give --sv or --keep")
+        why = next((note for note in model.notes if "calibration" in note), "")
+        raise no_calibration(model.path, option, why)
     elif name == "fps" and calibration is not None:
         machine = f" (frame times of {calibration.machine} at {calibration.width}x{calibration.height})"
     elif name == "psnr_drop" and calibration is not None and calibration.against == "checkpoint":
