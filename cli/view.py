@@ -188,14 +188,14 @@ runs until Ctrl-C.
 USAGE = "MODEL.ply ... [--base BASE.ply] [--images DIR] [options]"
 EPILOG = """\
 The page opens at s = 1 with photographs, else with everything shown, and holds
-30 frames per second by the dial; --sv sets a value that stays. It shows the
-Gaussians kept and the frame time, switches the attenuation on and off, and
-compares two dial values, or MODEL.ply and BASE.ply,
-on the two sides of a line. Drop another file on the page to open it; --sv
-holds for it too, within its trained range. The address holds the view. With
---images the page can jump between the scene's cameras. Several files, such as
-levels or variants, and a folder of files open with a list to switch between
-them; the view and the dial value stay.
+30 frames per second by the dial if half of that is in reach; --sv sets a value
+that stays. It shows the Gaussians kept and the frame time, switches the
+attenuation on and off, and compares MODEL.ply with BASE.ply, or with itself
+without the dial, on the two sides of a line. Drop another file on the page to
+open it; --sv holds for it too, within its trained range. The address holds the
+view. With --images the page can jump between the scene's cameras. Several
+files, such as levels or variants, and a folder of files open with a list to
+switch between them; the view and the dial value stay.
 
 Other machines cannot reach the page, and it loads nothing from the network. To
 see it from another machine, forward the port (-t passes Ctrl-C on):

@@ -1,4 +1,4 @@
-"""Orbit centre, up axis, framing, animations, pictures and videos, and removed Gaussians, in a browser."""
+"""Orbit centre, up axis, framing, animations, pictures and videos, in a browser."""
 
 from __future__ import annotations
 
@@ -21,9 +21,6 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.scene.colmap import write_model
 from clod_adapter.viewer.page import write_viewer_page
 from shown import TALL, Shown
-
-C0 = 0.28209479177387814
-ORANGE = np.array([1.0, 0.42, 0.05])
 
 
 def link(shown: Shown) -> dict[str, np.ndarray]:
