@@ -20,7 +20,7 @@ const pivot = () => add(camera.eye, forward(), camera.distance);
 
 let box = null; // the panel's rectangle when the picture was placed: a note below it moves nothing
 
-export function layOut() {
+export function findPanel() {
   box = elements.panel.getBoundingClientRect();
 }
 

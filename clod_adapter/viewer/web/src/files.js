@@ -59,14 +59,13 @@ async function open(name, read, present) {
     ui.showMessage(null);
     present(found);
     await stage.whenDrawn();
-    ui.showProgress(null);
-    if (viewer.opening) await settle();
   } catch (error) {
     if (number === asked) ui.showMessage(error.message);
     throw error;
   } finally {
     if (number === asked) ui.showProgress(null);
   }
+  if (viewer.opening) await settle();
 }
 
 /** Moves the dial from where a file was opened to what holds a frame rate, unless no dial value has half of it. */

@@ -1,5 +1,5 @@
 // Starts the page, and defines `window.clod` for tests and scripts.
-import { camera, layOut, setCamera } from "./camera.js";
+import { camera, setCamera } from "./camera.js";
 import "./controls.js";
 import { load, openEntry } from "./files.js";
 import { elements, ui } from "./page.js";
@@ -9,8 +9,8 @@ import { applyLink } from "./views.js";
 
 async function start() {
   ui.start();
-  layOut();
-  new ResizeObserver(() => { layOut(); stage.change(); }).observe(elements.canvas);
+  stage.layOut();
+  new ResizeObserver(stage.layOut).observe(elements.canvas);
   elements.canvas.addEventListener("webglcontextlost", () => ui.showMessage("The graphics device was lost; reload the page."));
   window.addEventListener("hashchange", applyLink);
   await openEntry(0);

@@ -1,6 +1,6 @@
 // What is shown: a model, or two divided by a wipe. A frame is drawn after a change, and while a held frame rate settles.
 import { createHold } from "../../../../viewers/frame_rate.js";
-import { viewOf } from "./camera.js";
+import { findPanel, viewOf } from "./camera.js";
 import { createModel } from "./model.js";
 import { elements, state, ui } from "./page.js";
 import { createRenderer } from "./renderer.js";
@@ -41,6 +41,12 @@ export function change(inMotion = false) {
   moving = inMotion;
   hold?.wake();
   schedule();
+}
+
+/** Places the picture anew beside a panel or in a window that has changed. */
+export function layOut() {
+  findPanel();
+  change();
 }
 
 const isDrawn = () => drawnVersion === version && (!hold || hold.settled);

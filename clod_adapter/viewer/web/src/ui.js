@@ -1,5 +1,5 @@
 // The panel. In page.html, data-key names the key that clicks a control, and data-needs what it is disabled without.
-import { isNear, layOut } from "./camera.js";
+import { isNear } from "./camera.js";
 import { openFile, showFile } from "./files.js";
 import { config, elements, state, ui, viewer } from "./page.js";
 import * as stage from "./stage.js";
@@ -116,7 +116,7 @@ async function setTarget({ value }) {
 }
 
 const toggle = (button) => button.setAttribute("aria-expanded", button.ariaExpanded !== "true");
-const place = (change) => (button) => { change(button); layOut(); stage.change(); };
+const place = (change) => (button) => { change(button); stage.layOut(); };
 const stepDial = (ticks) => setDial(toDial(Math.min(Math.max(toTick(state.dial) + ticks, 0), TICKS)));
 
 /** Listens to the controls, each by its id. */
