@@ -7,8 +7,6 @@ A scene is a folder of the shared data, followed by the name of the checkpoint w
 adds one row to ``results/adapt.jsonl``: settings, commit, machine, the base and the dial.
 """
 
-from __future__ import annotations
-
 import ast
 from collections.abc import Sequence
 from dataclasses import asdict

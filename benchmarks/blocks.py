@@ -10,8 +10,6 @@ with and without --memory. ``processes`` runs it with one view a step, with two,
 each, and compares the last two files. Rows go to ``results/blocks.jsonl``.
 """
 
-from __future__ import annotations
-
 import json
 import sys
 import tempfile

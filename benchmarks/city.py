@@ -4,8 +4,6 @@ It replaces captures that are too large for a repository. More Gaussians make a 
 five for each square metre of surface. World axes: x right, y DOWN, z into the picture, in metres; the ground is y = 0.
 """
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Literal

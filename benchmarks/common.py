@@ -1,7 +1,5 @@
 """Shared by the benchmarks: options, captures, rows of results, tables, and processes that are timed from outside."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

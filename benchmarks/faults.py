@@ -8,8 +8,6 @@ paths that run. With ``--whole`` the whole suite runs where these pass, minutes 
 was not caught, and where a ``before`` does not occur once.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

@@ -9,8 +9,6 @@ null where they are equal. ``.splat`` stores no sigma_d: a model baked at s is w
 one row to ``results/formats.jsonl``.
 """
 
-from __future__ import annotations
-
 import math
 import tempfile
 from collections.abc import Sequence

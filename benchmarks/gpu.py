@@ -11,8 +11,6 @@ file: times, the dial's share, PSNR.
 Each adds rows to ``results/gpu.jsonl``. Without a GPU, plain is this package's CPU rasterizer without the dial.
 """
 
-from __future__ import annotations
-
 import os
 import resource
 import subprocess

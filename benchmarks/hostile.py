@@ -8,8 +8,6 @@ A failure is another exit code, a traceback or a warning, an error that is not o
 other new files than expected.
 """
 
-from __future__ import annotations
-
 import argparse
 import gzip
 import hashlib

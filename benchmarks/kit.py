@@ -7,8 +7,6 @@ The Gaussians are a random part of the demo's, enlarged to cover the same area. 
 ``clod_adapter.render``; a test compares them.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Iterator

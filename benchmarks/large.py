@@ -12,8 +12,6 @@ checkpoint, and PHOTOGRAPHS supersampled renders of the finest one are its photo
 earlier run.
 """
 
-from __future__ import annotations
-
 import json
 import tempfile
 from collections.abc import Iterator

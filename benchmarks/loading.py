@@ -4,8 +4,6 @@ python benchmarks/loading.py --record                         # 4,000,000 Gaussi
 python benchmarks/loading.py --against OLDER_CHECKOUT/.venv/bin/python    # in turn with another version
 """
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -8,8 +8,6 @@ The kinds of views: ``photographs``, ``placed`` (placed cameras, renders of the 
 photographs and pseudo views, as clod-adapt combines them). Each run adds one row to ``results/nophoto.jsonl``.
 """
 
-from __future__ import annotations
-
 import time
 from dataclasses import asdict
 

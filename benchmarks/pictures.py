@@ -6,8 +6,6 @@ python benchmarks/pictures.py    # dial.webp and viewer.webp in docs/images
 The dial's picture has numbers of the view shown, measured then. The other is of a headless Chromium.
 """
 
-from __future__ import annotations
-
 import io
 import sys
 import tempfile

@@ -6,8 +6,6 @@ affects both alike. Times are medians in milliseconds: ``forward_ms`` and ``both
 ``render_ms`` of a frame without gradients, and of frames of the most opaque Gaussians.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import multiprocessing

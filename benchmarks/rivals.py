@@ -12,8 +12,6 @@
 A scene is named as for adapt.py. Each run adds a row to ``results/rivals.jsonl``.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from typing import Any

@@ -9,8 +9,6 @@ seconds and peak memory. A town of 1000 Gaussians gives the start-up cost. Rows 
 results/scaling.jsonl; the last row of a kind counts.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import multiprocessing

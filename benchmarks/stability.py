@@ -8,8 +8,6 @@ Rows go to ``results/stability.jsonl``, where they replace those of the parts th
 docs/performance.md are printed, its pictures are written.
 """
 
-from __future__ import annotations
-
 import json
 import time
 

@@ -6,8 +6,6 @@ formula is computed as it stands, in the inputs' dtype. It fails where it is NaN
 number, or off by more than 1,000 eps.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any

@@ -4,8 +4,6 @@ The scene is made to pop: Gaussians in one place with one extinction scale, and 
 while the camera turns. A fade changes in proportion to the step's length (slope 1), a pop by the same amount (slope 0).
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from itertools import product

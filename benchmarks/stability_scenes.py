@@ -5,8 +5,6 @@ settings. It holds when every picture over the dial is finite and the full-quali
 checkpoint itself on the same held-out views.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import tempfile

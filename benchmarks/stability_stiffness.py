@@ -9,8 +9,6 @@ optimizer gets the same gradients.
 stuck if no dial value gives it a gradient, before and after 100 steps.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable, Sequence

@@ -9,8 +9,6 @@ base, tuned. Prefixes are one file, ordered by removal error and tuned with rand
 are measured. Each run adds a row to ``results/tradeoff.jsonl``.
 """
 
-from __future__ import annotations
-
 import time
 
 import clod_adapter as clod

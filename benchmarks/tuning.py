@@ -1,7 +1,5 @@
 """Plain tuning of a splat on photographs, without a dial, and merging by ``splat-transform --decimate`` (NanoGS)."""
 
-from __future__ import annotations
-
 import os
 import sys
 import tempfile

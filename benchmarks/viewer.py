@@ -5,8 +5,6 @@ dial values, and with the equation off: PSNR between the browser's picture and `
 Each capture adds a row to ``results/viewer.jsonl``.
 """
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 from typing import Any

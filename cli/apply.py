@@ -1,7 +1,5 @@
 """``clod-adapt apply``: rebuilds the adapted file from the checkpoint and an adapter."""
 
-from __future__ import annotations
-
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """``clod-adapt demo``: adapts a scene that comes with the package, and draws figures of the result."""
 
-from __future__ import annotations
-
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
 from typing import Any

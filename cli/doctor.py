@@ -1,7 +1,5 @@
 """``clod-adapt doctor``: what renders and shows on this machine, and how to fix what does not."""
 
-from __future__ import annotations
-
 import io
 import warnings
 from argparse import ArgumentParser, Namespace

@@ -1,7 +1,5 @@
 """The ``clod-adapt`` command: selects the command, runs it, and turns errors into one line."""
 
-from __future__ import annotations
-
 import argparse
 import io
 import json

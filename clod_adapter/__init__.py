@@ -8,8 +8,6 @@ clod.save("model.ply", result.gaussians, base)
 image = clod.render(result.gaussians, scene.test[0].camera, virtual_scale=3).image
 """
 
-from __future__ import annotations
-
 import os
 import sys
 from typing import TYPE_CHECKING

@@ -1,7 +1,5 @@
 """``python -m clod_adapter``: the command ``clod-adapt`` where only the interpreter is at hand, as under torchrun."""
 
-from __future__ import annotations
-
 import sys
 from importlib import import_module
 

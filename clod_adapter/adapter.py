@@ -3,8 +3,6 @@
 A training run writes ``extract(...).apply(base)``: applied to the same base it gives the same Gaussians, bit for bit.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Any
 

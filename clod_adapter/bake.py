@@ -1,7 +1,5 @@
 """Plain Gaussians from adapted ones: one dial value baked into the opacities; and rows in the order of the dial."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

@@ -1,7 +1,5 @@
 """The exception for bad input and bad use."""
 
-from __future__ import annotations
-
 from clod_adapter._support.text import as_text
 
 

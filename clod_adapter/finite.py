@@ -1,7 +1,5 @@
 """Rows with values that are not finite: finding them, and refusing them before training."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -18,8 +18,6 @@ noise of 20 % per frame the dial rests in most frames and changes by 0.6 % a fra
 law in JavaScript (viewers/frame_rate.js).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from statistics import median

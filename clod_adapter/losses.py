@@ -1,7 +1,5 @@
 """The photometric loss of a render against a photograph, and its parts: L1, SSIM and PSNR on any device."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

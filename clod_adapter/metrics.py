@@ -3,8 +3,6 @@
 Training and its decisions take theirs from ``losses``, which runs on the tensors' own device; a test ties the two.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from torch import Tensor
 

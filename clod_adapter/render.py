@@ -1,7 +1,5 @@
 """Rendering of Gaussians at a dial value: attenuate, cull, rasterize."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 

@@ -3,8 +3,6 @@
 python docs/make.py        # then mkdocs build, as make docs does
 """
 
-from __future__ import annotations
-
 import argparse
 import shutil
 from itertools import groupby

@@ -6,8 +6,6 @@
 a look; ``clod-adapt`` is the same with progress, reports and the full number of steps.
 """
 
-from __future__ import annotations
-
 import sys
 from dataclasses import asdict
 

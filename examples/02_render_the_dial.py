@@ -6,8 +6,6 @@ The view is the scene's first held-out camera, or its first one where none is he
 looks at the middle of the splat.
 """
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

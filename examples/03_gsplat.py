@@ -6,8 +6,6 @@ All held-out cameras are drawn in one call at several dial values; the first one
 CUDA devices only; 02_render_the_dial.py does the same without.
 """
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

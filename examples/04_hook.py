@@ -6,8 +6,6 @@ The renderer here is ten lines of numpy that draw each Gaussian as one pixel. do
 renderers in other languages.
 """
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

@@ -6,8 +6,6 @@ The file must be one that ``clod-adapt`` wrote, for the loss is read off the cal
 solved for exactly, over the scene's held-out cameras; for the frame rate some frames are timed here and now.
 """
 
-from __future__ import annotations
-
 import sys
 
 import clod_adapter as clod

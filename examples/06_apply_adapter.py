@@ -5,8 +5,6 @@
 The adapter is what ``clod-adapt`` writes beside its PLY. It goes onto the very file it was trained on and no other.
 """
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

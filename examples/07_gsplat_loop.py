@@ -6,8 +6,6 @@ Splats, optimizers and rendering call are the trainer's. The splats are trained 
 is no strategy. gsplat draws on CUDA devices only.
 """
 
-from __future__ import annotations
-
 import sys
 
 import torch

@@ -4,8 +4,6 @@ python examples/08_viewer_slider.py pretrained.ply scene/     # trains; Ctrl-C w
 python examples/08_viewer_slider.py adapted.ply scene/ --look # only shows
 """
 
-from __future__ import annotations
-
 import sys
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The rasterizers that share one contract. A new backend is a line in BACKENDS."""
 
-from __future__ import annotations
-
 import importlib.util
 import sys
 from collections.abc import Iterator

@@ -7,8 +7,6 @@ Needs Playwright's Python package (not its browsers) and a Chromium or Chrome on
 one is missing the test is skipped with a reason; with CLOD_NEED_BROWSER=1 it fails instead.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 from collections.abc import Iterator, Sequence

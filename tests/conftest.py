@@ -1,7 +1,5 @@
 """Fixtures of several folders: the shared data, a browser, and a tiny capture."""
 
-from __future__ import annotations
-
 # Before anything imports torch, whose idle threads would else spin and take the cores from the kernels.
 import clod_adapter  # noqa: F401
 

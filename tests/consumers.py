@@ -1,7 +1,5 @@
 """Everything that uses a dial, as functions of Gaussians that return tensors and numbers."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The documentation's pages, and their commands: fenced blocks, and commands within sentences."""
 
-from __future__ import annotations
-
 import re
 import shlex
 import textwrap

@@ -1,7 +1,5 @@
 """Helpers of the tests of file formats: models with extreme values, damaged files, splat-transform."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

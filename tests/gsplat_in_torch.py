@@ -5,8 +5,6 @@ the projection has opacities, rows below 1/255 are dropped in it and narrow by t
 keys are in the kernels' order, and what the packed kernels cannot do (a background, gsplat's issue 764) is refused.
 """
 
-from __future__ import annotations
-
 import inspect
 import itertools
 import math

@@ -1,7 +1,5 @@
 """Stand-ins for several versions of gsplat: modules with their signatures."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from pathlib import Path

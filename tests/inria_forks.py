@@ -4,8 +4,6 @@ Signatures and results from their sources: Inria's of 2023 and of 2024, MonoGS's
 and alpha, feature-3dgs. All of them cull what is nearer than 0.2 before anything else.
 """
 
-from __future__ import annotations
-
 from collections import namedtuple
 from inspect import Parameter, Signature
 from types import ModuleType

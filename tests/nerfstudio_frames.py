@@ -1,7 +1,5 @@
 """nerfstudio's transformation of cameras before training, from its source."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

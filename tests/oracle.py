@@ -5,8 +5,6 @@ threshold (an alpha at 1/255 or at the clamp, a transmittance at 1e-4) are exclu
 by the effect of one Gaussian at 1/255.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any, NamedTuple
 

@@ -1,7 +1,5 @@
 """A writer of compressed PLYs, from the format's description, for the tests of its reader."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

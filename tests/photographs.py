@@ -1,7 +1,5 @@
 """Photographs and their COLMAP models, shared by the tests of readers."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Shared by tests of the command: file names, injected errors and interrupts, processes that start fast."""
 
-from __future__ import annotations
-
 import copy
 import json
 import signal

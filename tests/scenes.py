@@ -1,7 +1,5 @@
 """Random scenes, cameras and captures that the tests share."""
 
-from __future__ import annotations
-
 import math
 import re
 from functools import partial

@@ -1,7 +1,5 @@
 """The adapter reproduces the result, can be removed exactly, and identifies its base."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 

@@ -1,7 +1,5 @@
 """Baking for one camera and for several, and the order of rows by extinction."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The calibration table: its checks, and exact round trips through adapter and PLY."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Cameras and views: conventions, checks, extent and near plane."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import pytest

@@ -1,7 +1,5 @@
 """Settings: every field has a description, and impossible values are refused."""
 
-from __future__ import annotations
-
 import math
 import re
 from typing import Any

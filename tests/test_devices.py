@@ -3,8 +3,6 @@
 On a GPU, if there is one; otherwise on a simulated one (``fake_gpu``), with torch in place of gsplat's kernels.
 """
 
-from __future__ import annotations
-
 import importlib
 from collections.abc import Callable, Iterator
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The control law on simulated renderers: a fixed part plus a power of the dial value, with noise and outliers."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The container of Gaussians: shapes, activations, selection, and SH degrees."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

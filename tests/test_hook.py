@@ -1,7 +1,5 @@
 """The hook gives the opacities of a rendering in numpy and in torch."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The structure of the package: import order, cost of an import, installed packages."""
 
-from __future__ import annotations
-
 import ast
 import re
 import shutil

@@ -1,7 +1,5 @@
 """One function decides what is drawn: change its threshold or its growth, and everything that uses a dial follows."""
 
-from __future__ import annotations
-
 import pytest
 
 from clod_adapter.equation import attenuation, growth

@@ -1,7 +1,5 @@
 """The fused loss against plain torch, and the PSNR and SSIM of reports against those of training."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

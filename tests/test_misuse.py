@@ -1,7 +1,5 @@
 """What would draw or store something else than was meant is refused or warned of, in one line."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable
 from functools import partial

@@ -1,7 +1,5 @@
 """Scenes far from 0 are read relative to an origin and written back exactly."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Rendering with and without a dial."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

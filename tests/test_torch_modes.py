@@ -1,7 +1,5 @@
 """The library gives the same results whatever the caller has set of torch."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from typing import Any

@@ -1,7 +1,5 @@
 """``clod-adapt``, the main command: its text, options and checks; ``run`` is in ``adapt.run``."""
 
-from __future__ import annotations
-
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
 from typing import Any

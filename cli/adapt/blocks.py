@@ -1,7 +1,5 @@
 """``--memory`` for scenes that do not fit: training in blocks, whose results stay in files until all are merged."""
 
-from __future__ import annotations
-
 import hashlib
 import time
 from collections.abc import Iterator, Sequence

@@ -1,7 +1,5 @@
 """The saver of the training state, which also finds and checks the one to resume from."""
 
-from __future__ import annotations
-
 import hashlib
 import sys
 import time

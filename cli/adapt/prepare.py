@@ -1,7 +1,5 @@
 """A run of ``clod-adapt`` before its training: the arguments, what is read, the memory plan and the training plan."""
 
-from __future__ import annotations
-
 import argparse
 import math
 import shutil

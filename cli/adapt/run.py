@@ -1,7 +1,5 @@
 """``clod-adapt``: gives a checkpoint its dial, and writes the extended file, the adapter and a report."""
 
-from __future__ import annotations
-
 import argparse
 import shlex
 from contextlib import closing

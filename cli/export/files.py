@@ -1,7 +1,5 @@
 """The cameras that ``clod-adapt export`` bakes for, and the files that it writes."""
 
-from __future__ import annotations
-
 from argparse import Namespace
 from collections.abc import Sequence
 from dataclasses import dataclass

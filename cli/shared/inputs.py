@@ -1,7 +1,5 @@
 """What commands read: checkpoints, scenes in their frame, and the device; and the kernels compiled for them."""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Sequence
 from dataclasses import replace

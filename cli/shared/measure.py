@@ -1,7 +1,5 @@
 """Dial values: solved from budgets, measured with progress, and shown in tables."""
 
-from __future__ import annotations
-
 import argparse
 import os
 import platform

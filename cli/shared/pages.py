@@ -1,7 +1,5 @@
 """``--report``: renders the images of a run's page; its rows are those of the report."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any

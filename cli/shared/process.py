@@ -1,7 +1,5 @@
 """The process: its streams, signals and limits, and its place among those of torchrun."""
 
-from __future__ import annotations
-
 import errno
 import io
 import os

@@ -1,7 +1,5 @@
 """Adam on selected rows, sixteen at a time."""
 
-from __future__ import annotations
-
 from numba import float32, int64
 
 from clod_adapter._kernels.compiling import kernel, part

@@ -5,8 +5,6 @@ transmittances, then 16 reds, greens and blues. A pixel whose transmittance woul
 its transmittance negated; a block is finished when all its pixels are.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numba import float32, uint64
 

@@ -1,7 +1,5 @@
 """Colours: real spherical harmonics up to degree 4, in the order and signs of 3DGS, of sixteen Gaussians at a time."""
 
-from __future__ import annotations
-
 from numba import float32, int64, uint64
 
 from clod_adapter._kernels.compiling import part

@@ -1,7 +1,5 @@
 """Compilation of kernels: without the interpreter lock, with inlining, cached on disk."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Callable
 from contextlib import suppress

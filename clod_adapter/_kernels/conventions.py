@@ -1,7 +1,5 @@
 """Constants of gsplat's conventions, and the layouts of records, cameras and workspaces."""
 
-from __future__ import annotations
-
 from numba import float32
 
 import clod_adapter._kernels as limits

@@ -1,7 +1,5 @@
 """The count term's gradient at typical distances (``training/target_count.py``), sixteen Gaussians at a time."""
 
-from __future__ import annotations
-
 from numba import float32, uint64
 
 from clod_adapter._kernels.compiling import kernel, part

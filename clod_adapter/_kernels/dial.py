@@ -6,8 +6,6 @@ float32: of a few hundred thousand Gaussians, one at the culling threshold may b
 with an opacity of 0 there (soft cut). A row whose sigma is infinite has no dial and no cut.
 """
 
-from __future__ import annotations
-
 from numba import float32, int64, uint64
 
 from clod_adapter._kernels import conventions as c

@@ -1,7 +1,5 @@
 """Elementary functions of sixteen-lane vectors, and sets of blocks and of lanes as bits of a uint64."""
 
-from __future__ import annotations
-
 import math
 
 from llvmlite import ir

@@ -1,7 +1,5 @@
 """Reuse of large arrays: page faults of a new one cost more than the work on it."""
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import math

@@ -1,7 +1,5 @@
 """Memory in kernels: pointers, stack memory, prefetching, atomics, and rows of a table, one lane per row."""
 
-from __future__ import annotations
-
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils

@@ -5,8 +5,6 @@ the opacity compensated for it; the Jacobian's ray clamped to 1.3 times the fiel
 either side), the camera's near plane, alpha below 1/255 dropped. Sixteen Gaussians at a time, one per lane.
 """
 
-from __future__ import annotations
-
 from numba import float32, float64, int64, uint64
 
 from clod_adapter._kernels import conventions as c

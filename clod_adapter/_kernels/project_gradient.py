@@ -1,7 +1,5 @@
 """Gradient of the projection: from the blending's sums over pixels to the parameters of each Gaussian."""
 
-from __future__ import annotations
-
 from numba import float32, int64
 
 from clod_adapter._kernels import conventions as c

@@ -5,8 +5,6 @@ AVX-512, two AVX or four SSE/NEON registers. Loads and stores take a contiguous 
 index of the first lane; bounds are not checked.
 """
 
-from __future__ import annotations
-
 import operator
 
 from llvmlite import ir

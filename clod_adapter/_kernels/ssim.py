@@ -4,8 +4,6 @@ Images are copied to planes ``[3, H, stride]`` with 16 zero lanes left and right
 need no edge cases. Rows beyond the image are skipped, which equals zero padding.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numba import float32
 

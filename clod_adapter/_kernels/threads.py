@@ -4,8 +4,6 @@ Kernels are compiled with ``nogil=True`` and take ``(worker, workers, *arguments
 OpenMP runtime, which would compete with torch's.
 """
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, wait

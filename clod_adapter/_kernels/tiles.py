@@ -1,7 +1,5 @@
 """Depth order and tile lists: which Gaussians each tile blends, front to back."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

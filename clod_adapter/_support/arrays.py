@@ -1,7 +1,5 @@
 """Arrays of numpy as tensors, where the library is called with them."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A package whose names are imported on first use."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Mapping, Sequence
 from importlib import import_module

@@ -1,7 +1,5 @@
 """File names as text for outputs: to the system a name is bytes, which need not be valid text."""
 
-from __future__ import annotations
-
 import json
 import os
 from typing import Any

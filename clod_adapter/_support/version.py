@@ -1,7 +1,5 @@
 """The package's version, which is written into files."""
 
-from __future__ import annotations
-
 from importlib import metadata
 
 

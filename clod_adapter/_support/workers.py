@@ -1,7 +1,5 @@
 """Worker threads of ``concurrent.futures``; where a thread cannot be started, MemoryError is raised."""
 
-from __future__ import annotations
-
 import os
 from collections import deque
 from collections.abc import Callable, Generator, Iterable

@@ -6,8 +6,6 @@ causes are told apart: views outside the checkpoint's coverage (by the share of 
 the correlation, which ignores gain and offset) and another background (by a render over white).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass

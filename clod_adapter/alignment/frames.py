@@ -5,8 +5,6 @@ Gaussians into that of the cameras, which is exact for spherical harmonics too. 
 length, so ``[R_c | t_c]`` becomes ``[R_c R | (R_c t + t_c) / s]``.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass

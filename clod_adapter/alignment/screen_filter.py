@@ -3,8 +3,6 @@
 With another filter, Gaussians of about a pixel render too opaque or too faint.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import fmean

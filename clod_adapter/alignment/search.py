@@ -4,8 +4,6 @@ Known frames are ranked by the correlation of small renders with the photographs
 are searched. The result is measured by ``check_alignment`` and given only if it fits clearly better.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

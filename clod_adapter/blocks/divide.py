@@ -1,7 +1,5 @@
 """Division of a scene into blocks, and the training data of each: views, context, target images, shares, settings."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

@@ -4,8 +4,6 @@ Bytes per Gaussian are measured, with the CPU rasterizer in float32; each is the
 block depends on the cameras; a plan assumes that it is the whole scene.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from dataclasses import dataclass

@@ -10,8 +10,6 @@ The initialization is that of the whole scene. A block takes as many steps as an
 see it, and its target count is its share of the Gaussians that the initialization keeps (``block_target``).
 """
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Sequence

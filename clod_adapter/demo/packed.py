@@ -1,7 +1,5 @@
 """The demo's capture and its base, as the package contains them."""
 
-from __future__ import annotations
-
 import zipfile
 from importlib import resources
 from pathlib import Path

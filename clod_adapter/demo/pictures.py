@@ -1,7 +1,5 @@
 """The demo's figures: one view at several dial values, and quality against the number of Gaussians."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any

@@ -30,8 +30,6 @@ within ``4 finfo.eps``, and so are, from float32, a'' and its gradients where a'
 are within ``4 + 3 u`` of them, ``u = (d s)^2 / (2 v)``.
 """
 
-from __future__ import annotations
-
 import math
 import warnings
 from functools import reduce

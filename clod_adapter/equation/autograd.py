@@ -3,8 +3,6 @@
 Equation and symbols are those of ``attenuation.py``.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

@@ -8,8 +8,6 @@ A plain file and an order of rows have one distance for each Gaussian: the geome
 ``d_i = exp(mean over v of log d_iv)``. A mean over the cameras that see it was no better.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -3,8 +3,6 @@
 Equation and symbols are those of ``attenuation.py``.
 """
 
-from __future__ import annotations
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor

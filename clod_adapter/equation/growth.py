@@ -16,8 +16,6 @@ Source: this project, after stochastic simplification of aggregate detail (Cook,
 2007): where elements are removed at random, the others grow to preserve the area. Here the exponent is learned.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

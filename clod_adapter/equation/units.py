@@ -6,8 +6,6 @@ Gaussian is seen. Training divides by the reference distance, where growth begin
 initialization are of the order of 1.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import torch

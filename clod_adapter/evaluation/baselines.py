@@ -1,7 +1,5 @@
 """What an adapted file is compared with: other files at the same counts, and its base cut down by rank."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from statistics import fmean
 

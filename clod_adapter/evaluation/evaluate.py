@@ -1,7 +1,5 @@
 """Quality, count and time over dial values, on held-out views."""
 
-from __future__ import annotations
-
 import statistics
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor

@@ -5,8 +5,6 @@ of them alike. The time of a dial value is the median over the passes, after a w
 above that of the dial value before it, which draws more, and the passes do not agree on that, both get their mean.
 """
 
-from __future__ import annotations
-
 import statistics
 import time
 from collections.abc import Sequence

@@ -16,8 +16,6 @@ image, is the error of the level. Times 16, the default of viewers allows a shif
 Source of the rule: 3D Tiles 1.1 (OGC 22-025r4), "Geometric error"; CesiumJS's ``maximumScreenSpaceError`` is 16.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -19,8 +19,6 @@ so ``max change (2 - 1 / persistence)`` approximates the largest change in the l
 single culled Gaussian hardly changes the root mean square, so the largest change of a pixel is measured too.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass

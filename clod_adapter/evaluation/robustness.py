@@ -3,8 +3,6 @@
 A cell is one checkpoint at one range, or its baseline. Cells are independent of each other.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass

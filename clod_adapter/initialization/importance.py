@@ -1,7 +1,5 @@
 """Initialization without training: each Gaussian's contribution to the views, and the sigma_d from its rank."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The pruning order, in which a similar neighbour remains for each Gaussian that is removed, and growth to cover it."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The program that probably wrote a PLY, by its header. The answer is a guess."""
 
-from __future__ import annotations
-
 import re
 
 from clod_adapter.config import SH_COUNTS

@@ -15,8 +15,6 @@ For gsplat 1.4.0 to 1.6.0, by the signature that is installed. The signatures he
 the arguments of all these versions; those that not all have are keywords.
 """
 
-from __future__ import annotations
-
 import functools
 import inspect
 from collections.abc import Callable

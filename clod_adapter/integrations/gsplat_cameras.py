@@ -5,8 +5,6 @@ versions. Rows of opacity 0 have to be culled before tiles and sorting. Where gs
 nothing is moved; elsewhere culled centres move to a point behind the camera, where every version culls them by depth.
 """
 
-from __future__ import annotations
-
 import math
 import sys
 import weakref

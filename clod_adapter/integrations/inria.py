@@ -12,8 +12,6 @@ first, by depth (0.2 or a changed near plane) or, for panoramas, by distance. Th
 view, which opacity 0 alone would not achieve. All rows keep their places: radii are 0, and gradients keep their shapes.
 """
 
-from __future__ import annotations
-
 import inspect
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The parameters that gsplat's ``simple_trainer`` and nerfstudio's splatfacto train, as ``Gaussians`` and back."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

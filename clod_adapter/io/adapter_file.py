@@ -6,8 +6,6 @@ float16 for a difference from the base, float32 for new values. Where the result
 ``clod_adapter``, keys sorted: equal adapters give equal files.
 """
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

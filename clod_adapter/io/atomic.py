@@ -1,7 +1,5 @@
 """Outputs appear whole or not at all: write under a temporary name, then rename; and one run at a time writes them."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import uuid

@@ -1,7 +1,5 @@
 """Checkpoints: a reader of every format."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace

@@ -8,8 +8,6 @@ three smaller components of the unit quaternion in 10 bits each and the index of
 Source: splat-transform 3.7, ``read-ply``; gsplat, ``exporter.splat2ply_bytes_compressed``.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 

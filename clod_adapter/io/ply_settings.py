@@ -5,8 +5,6 @@ A setting that is not the default is stored in a float column whose name begins 
 ``max_sv``, the end of the trained range, has no column: reading sigma_d does not need it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import astuple, fields, replace
 from pathlib import Path

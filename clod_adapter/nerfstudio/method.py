@@ -1,7 +1,5 @@
 """The method ``clod-splatfacto``, which nerfstudio finds by the entry point ``nerfstudio.method_configs``."""
 
-from __future__ import annotations
-
 import sys
 from dataclasses import dataclass, field
 from functools import partial

@@ -1,7 +1,5 @@
 """splatfacto with a dial: the model of ``clod-splatfacto``."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any

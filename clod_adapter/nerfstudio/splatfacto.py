@@ -1,7 +1,5 @@
 """Between splatfacto's parameters and a dial; nothing here imports nerfstudio."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict

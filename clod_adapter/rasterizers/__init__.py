@@ -1,7 +1,5 @@
 """Rasterizers behind one protocol, by which a dial value becomes a picture."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import torch

@@ -1,7 +1,5 @@
 """Tile-based splatting on the CPU, compiled by Numba: forward and backward pass on several threads."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any

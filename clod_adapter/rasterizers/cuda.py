@@ -6,8 +6,6 @@ mode, and spherical harmonics (up to 300 bytes a row) only of rows that the proj
 removed rows are 0. gsplat sums over pixels in no fixed order, so results repeat except for rounding.
 """
 
-from __future__ import annotations
-
 import contextlib
 import inspect
 import math

@@ -1,7 +1,5 @@
 """The interface of every rasterizer, by which a dial value becomes a picture, and their common checks."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Protocol
 

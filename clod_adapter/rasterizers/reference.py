@@ -5,8 +5,6 @@ the screen-space filter, the camera's near plane, alpha clamped to 0.999 and dro
 before its transmittance would fall to 1e-4.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

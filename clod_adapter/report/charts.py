@@ -3,8 +3,6 @@
 Their series are rows that ``clod-adapt --json`` and ``clod-adapt eval --json`` print.
 """
 
-from __future__ import annotations
-
 import io
 import math
 import re

@@ -3,8 +3,6 @@
 ``page.html`` is its template. Style, script, charts and images are in the file; nothing is loaded from a network.
 """
 
-from __future__ import annotations
-
 import base64
 import io
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """The figure of the robustness experiment: quality against count, distributions of opacity and sigma_d."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path

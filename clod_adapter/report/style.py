@@ -3,8 +3,6 @@
 matplotlib is an optional dependency, imported when a figure is drawn.
 """
 
-from __future__ import annotations
-
 import importlib.util
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager

@@ -10,8 +10,6 @@ small renderings (``_score``), and as many again are tried near the best. Of the
 are chosen. The method needs no up direction, scene type or unit.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Iterable, Iterator, Sequence

@@ -15,8 +15,6 @@ Initialization, dial values and objective are those of ``training.loop.adapt``, 
 rows alone, and averages the last steps. The number of splats is fixed: densify and prune before.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace

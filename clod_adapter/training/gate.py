@@ -1,7 +1,5 @@
 """The gate: watches full quality on views that are not trained on, and undoes training that harms it."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from statistics import fmean

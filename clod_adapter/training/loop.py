@@ -1,7 +1,5 @@
 """Adapting a trained checkpoint to virtual distance scaling: the training loop."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Sequence

@@ -4,8 +4,6 @@ Not in the paper, chosen here: sigma_d initialized to 1, a straight-through coun
 rates that decay to a twentieth.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """The training plan: what is trained, what is left out because the scene does not need it, and the measurements."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from statistics import fmean

@@ -1,7 +1,5 @@
 """Making a plan: before training, measures what the scene does not need."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager

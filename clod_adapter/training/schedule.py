@@ -1,7 +1,5 @@
 """The schedule of a training: which view a step renders, at which dial value and size, and how far it moves."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 

@@ -1,7 +1,5 @@
 """The state that training can be resumed from, its file, and the result of training."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import asdict, dataclass, fields

@@ -1,7 +1,5 @@
 """The target-count curve: the share of Gaussians to keep at each dial value, and the loss term that enforces it."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """One training run: parameters, optimizer and view sampler, and the step that changes them."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Sequence

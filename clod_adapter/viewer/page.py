@@ -4,8 +4,6 @@ The page loads nothing from other hosts: its Content-Security-Policy allows one 
 and connections to its own server only.
 """
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import re

@@ -4,8 +4,6 @@ Requests select one of the responses; no folder is served, no file is opened, no
 only if its Host header names this machine, which protects against DNS rebinding by other pages.
 """
 
-from __future__ import annotations
-
 import re
 import socket
 import socketserver

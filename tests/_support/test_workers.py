@@ -1,7 +1,5 @@
 """Threads for kernels and files: order of results, errors, and threads that cannot be started."""
 
-from __future__ import annotations
-
 import threading
 import time
 from functools import partial

@@ -1,7 +1,5 @@
 """The alignment of a checkpoint with its cameras: what fits, which frame is suggested, which screen filter is found."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Sequence

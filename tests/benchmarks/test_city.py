@@ -1,7 +1,5 @@
 """The synthetic town: its Gaussians, closed surfaces, and files that can be trained."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import city as made

@@ -1,7 +1,5 @@
 """Tables, processes that are timed from outside, and the exponents of their times."""
 
-from __future__ import annotations
-
 import sys
 
 import common

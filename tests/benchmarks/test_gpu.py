@@ -1,7 +1,5 @@
 """The GPU benchmark runs on the CPU at a small size."""
 
-from __future__ import annotations
-
 import json
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The command in surroundings and with words that took it down: success, or one line and exit code 2."""
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path

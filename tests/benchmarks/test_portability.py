@@ -1,7 +1,5 @@
 """The conditions are those that the tests find, and their counts are right."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

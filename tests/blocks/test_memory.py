@@ -1,7 +1,5 @@
 """Memory plans, and the sizes that --memory accepts."""
 
-from __future__ import annotations
-
 import re
 
 import pytest

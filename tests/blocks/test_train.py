@@ -1,7 +1,5 @@
 """Adapting block by block: division, views, context, targets, and agreement with undivided training."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """Runs the command, in its own process or, faster, in this one."""
 
-from __future__ import annotations
-
 import io
 import signal
 from collections.abc import Callable, Iterator

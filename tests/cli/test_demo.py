@@ -1,7 +1,5 @@
 """``clod-adapt demo``, with a few steps on the tests' own capture."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import signal

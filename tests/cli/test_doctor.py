@@ -1,7 +1,5 @@
 """``clod-adapt doctor``: on this machine, without torch, and with a wrong image."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -3,8 +3,6 @@
 One table for all commands: what is typed, what the line says, and the files that are there before.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -1,7 +1,5 @@
 """``clod-adapt eval``: its rows, and its comparisons: pruned base, other files, popping."""
 
-from __future__ import annotations
-
 import json
 import re
 import signal

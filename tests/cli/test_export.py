@@ -1,7 +1,5 @@
 """``clod-adapt export``: formats, baked files, levels, streaming sets, orders and pages."""
 
-from __future__ import annotations
-
 import base64
 import json
 import re

@@ -1,7 +1,5 @@
 """A full disk at any write: one line, exit code 2, unchanged files of an earlier run."""
 
-from __future__ import annotations
-
 import json
 import sys
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """The text and the JSON of ``clod-adapt inspect``."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Kills and signals: inputs are unchanged, outputs are complete or absent, and --resume gives the same files."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

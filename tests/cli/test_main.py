@@ -1,7 +1,5 @@
 """``cli/main.py``: exit codes, pipes, errors of every kind, and ``--help``."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

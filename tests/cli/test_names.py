@@ -1,7 +1,5 @@
 """Names of files that are not UTF-8: all outputs are text."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

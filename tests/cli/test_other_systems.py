@@ -1,7 +1,5 @@
 """The commands without what Windows and macOS lack; files that are open are not renamed or removed."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

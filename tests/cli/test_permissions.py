@@ -1,7 +1,5 @@
 """Inputs that may not be read, outputs that may not be written, as of another user: one line, before any work."""
 
-from __future__ import annotations
-
 import os
 import shutil
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Photographs that are none by their content: refused with one line, and no other program is started."""
 
-from __future__ import annotations
-
 import shutil
 import struct
 from pathlib import Path

@@ -1,7 +1,5 @@
 """``clod-adapt render``: images, selected views, notes, interrupts."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

@@ -1,7 +1,5 @@
 """``clod-adapt robustness``: outputs, resuming, interrupts, progress."""
 
-from __future__ import annotations
-
 import csv
 import json
 import re

@@ -1,7 +1,5 @@
 """``clod-adapt view`` without a page in a browser: messages, served files, interrupts, and the browser it opens."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -1,7 +1,5 @@
 """The scene and the base that come with the package."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from clod_adapter.demo import packed

@@ -1,7 +1,5 @@
 """The demo's pictures are drawn and are not empty."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The folder in which the documentation's commands run: a tiny capture, its checkpoints and results."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 from typing import Any

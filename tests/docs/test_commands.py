@@ -1,7 +1,5 @@
 """Every command in the documentation parses, and runs unless its block states a reason."""
 
-from __future__ import annotations
-
 import re
 import runpy
 import shutil

@@ -1,7 +1,5 @@
 """Install lines work before a release too: they name other packages, or a checkout. The pages are installed."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 from importlib import metadata

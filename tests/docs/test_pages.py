@@ -1,7 +1,5 @@
 """The pages agree with the code and the results: the report's fields are explained, and tables match the rows."""
 
-from __future__ import annotations
-
 import csv
 import json
 import re

@@ -1,7 +1,5 @@
 """The site: its links exist, it fetches nothing from other hosts, and its reference covers the code."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

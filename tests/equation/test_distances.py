@@ -1,7 +1,5 @@
 """Normalised distances of a camera, the typical distance over cameras, and stored viewpoints."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

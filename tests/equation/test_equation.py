@@ -1,7 +1,5 @@
 """The equation, its inverse and growth against mpmath at 50 digits, and the properties the dial stands on."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from functools import cache

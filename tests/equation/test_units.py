@@ -1,7 +1,5 @@
 """The unit of sigma_d: the dial does not depend on it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """The dial value of a count, and rankings of the base."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -1,7 +1,5 @@
 """Budgets: solved dial values keep the counts asked for, and interpolate known curves."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """Rows of an evaluation: values computed by hand, and those of an unadapted file."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

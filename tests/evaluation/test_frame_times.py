@@ -1,7 +1,5 @@
 """Frame times on a simulated clock: a machine that warms up, drifts, is interrupted, and one that is too busy."""
 
-from __future__ import annotations
-
 import random
 from collections.abc import Callable
 from typing import Any

@@ -1,7 +1,5 @@
 """The errors of levels are lengths by which the picture seems shifted."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -1,7 +1,5 @@
 """The measure of popping separates a jump from a fade and excludes the camera's motion."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from itertools import product

@@ -1,7 +1,5 @@
 """Cells of the robustness experiment: measurements, baseline, distributions and fingerprints."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import pytest

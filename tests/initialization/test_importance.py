@@ -1,7 +1,5 @@
 """The importance estimate against brute force, and the counts kept with the resulting sigma_d."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import pytest

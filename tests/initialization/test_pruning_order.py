@@ -1,7 +1,5 @@
 """The pruning order against a plain implementation, its effect, and the growth that follows from it."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch import Tensor

@@ -1,7 +1,5 @@
 """What ``inspect`` finds in a file: values, anomalies, the dial, adapters and states; and what it refuses."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path

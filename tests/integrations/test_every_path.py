@@ -1,7 +1,5 @@
 """One adapted file looks the same through every path that draws it, and so do the files of viewers/kit."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

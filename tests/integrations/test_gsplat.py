@@ -1,7 +1,5 @@
 """The wrappers against the installed gsplat, with its kernels on CUDA or with torch in their place."""
 
-from __future__ import annotations
-
 import gc
 import inspect
 import math

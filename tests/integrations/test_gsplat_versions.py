@@ -1,7 +1,5 @@
 """The wrappers against stand-ins with the signatures of gsplat 1.4.0 to 1.6.0."""
 
-from __future__ import annotations
-
 import inspect
 import sys
 from types import SimpleNamespace

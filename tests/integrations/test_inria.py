@@ -1,7 +1,5 @@
 """The wrapper against the fork with the kept rows alone: stand-ins for five forks."""
 
-from __future__ import annotations
-
 from types import ModuleType
 from typing import Any
 

@@ -10,8 +10,6 @@ Skipped where nerfstudio is absent. Without CUDA, open3d and pymeshlab, beside t
 gsplat's kernels are torch (``gsplat_in_torch``); open3d, pymeshlab and the weights of LPIPS are absent.
 """
 
-from __future__ import annotations
-
 import copy
 import importlib
 import json

@@ -1,7 +1,5 @@
 """The shader functions match the golden values in WebGL 2 and WebGPU, and so does the equation."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from contextlib import closing

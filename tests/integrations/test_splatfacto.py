@@ -1,7 +1,5 @@
 """The parameters of gsplat's trainer and of splatfacto as Gaussians, and what the nerfstudio method makes of them."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The code and the defaults in docs/writing_a_renderer.md, and its two examples."""
 
-from __future__ import annotations
-
 import re
 import runpy
 from dataclasses import fields

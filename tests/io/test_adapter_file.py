@@ -1,7 +1,5 @@
 """Adapters and the tensor files that they are written as."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Outputs appear whole or not at all, and of two runs one writes."""
 
-from __future__ import annotations
-
 import os
 import stat
 import subprocess

@@ -1,7 +1,5 @@
 """Checks that hold for every format: round trips, damaged files, refused models."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """What each format stores, byte by byte where its readers document it; files of other programs, and files they read."""
 
-from __future__ import annotations
-
 import gzip
 import json
 import struct

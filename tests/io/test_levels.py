@@ -1,7 +1,5 @@
 """Sets of several levels: 3D Tiles with the tiles as the SPZ reader finds them, and options of streaming sets."""
 
-from __future__ import annotations
-
 import json
 import struct
 from pathlib import Path

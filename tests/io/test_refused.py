@@ -1,7 +1,5 @@
 """Files that are no splats, damaged or hostile: an error that names the file, in one line, and little memory."""
 
-from __future__ import annotations
-
 import gzip
 import io
 import json

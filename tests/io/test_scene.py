@@ -1,7 +1,5 @@
 """Scenes as ``load_scene`` gives them: COLMAP models, photographs that are missing or distorted, what is held out."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

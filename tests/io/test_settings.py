@@ -1,8 +1,6 @@
 """Settings in files: one reader, which every format and the adapter use; in a PLY comments, and columns for tools that
 drop comments; the screen-space filter as other programs state it."""
 
-from __future__ import annotations
-
 import re
 import zlib
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Finding and running splat-transform, with substitutes that fail in every way, and reading what it converts."""
 
-from __future__ import annotations
-
 import shlex
 import sys
 from pathlib import Path

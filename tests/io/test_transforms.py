@@ -1,7 +1,5 @@
 """Scenes of nerfstudio, instant-ngp and Blender; and nerfstudio's frames, made here as its source makes them."""
 
-from __future__ import annotations
-
 import json
 import math
 import os

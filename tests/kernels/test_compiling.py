@@ -1,7 +1,5 @@
 """The cache of compiled kernels, and its failures."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """The compiled count term, compared with the plain one in float64."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """Accuracy of the elementary functions, against numpy in float64."""
 
-from __future__ import annotations
-
 import numpy as np
 from numba import njit
 

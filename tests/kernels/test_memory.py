@@ -1,7 +1,5 @@
 """Recycled memory is not reused while a tensor, an array or an alias of it is alive, and then it is."""
 
-from __future__ import annotations
-
 import gc
 import random
 import sys

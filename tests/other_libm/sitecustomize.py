@@ -8,8 +8,6 @@ torch's on the CPU and the kernels' are moved, each in its own way, as libraries
 start, also in processes that a test starts.
 """
 
-from __future__ import annotations
-
 import importlib.machinery
 import math
 import os

@@ -1,7 +1,5 @@
 """The fixture of every rasterizer."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

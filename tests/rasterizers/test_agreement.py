@@ -1,7 +1,5 @@
 """Every backend agrees with the float64 reference in images and gradients."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from typing import Any

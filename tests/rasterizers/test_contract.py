@@ -1,7 +1,5 @@
 """The contract of every backend: autograd, repeatability, robustness."""
 
-from __future__ import annotations
-
 import math
 from concurrent.futures import ThreadPoolExecutor
 

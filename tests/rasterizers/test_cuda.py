@@ -1,7 +1,5 @@
 """Why gsplat cannot be used, in one line; the interfaces of its versions."""
 
-from __future__ import annotations
-
 import builtins
 import re
 import sys

@@ -1,7 +1,5 @@
 """The CPU's kernels have the dial in them: they draw, keep and differentiate what the default ``draw`` composes."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

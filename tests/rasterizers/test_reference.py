@@ -1,7 +1,5 @@
 """The float64 reference against closed forms, plain loops and numerical derivatives."""
 
-from __future__ import annotations
-
 import math
 
 import mpmath

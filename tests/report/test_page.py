@@ -1,7 +1,5 @@
 """The page is self-contained and escapes its texts; its charts have log axes, and labels that do not collide."""
 
-from __future__ import annotations
-
 import base64
 import io
 import json

@@ -1,7 +1,5 @@
 """Captures and Gaussians that the tests of training share."""
 
-from __future__ import annotations
-
 import pytest
 
 from clod_adapter.cameras import Scene

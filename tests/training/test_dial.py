@@ -1,7 +1,5 @@
 """The dial as a component of a loop of one's own."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The gate: training that harms s = 1 is undone."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

@@ -1,7 +1,5 @@
 """Ctrl-C within ``adapt``."""
 
-from __future__ import annotations
-
 import signal
 from collections.abc import Iterator
 from copy import deepcopy

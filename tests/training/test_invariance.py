@@ -1,7 +1,5 @@
 """The result of adapting does not depend on unit, place and direction of a scene, nor on what is far from it."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Adapting a small generated scene: quality, dial, reproducibility, resuming, and errors."""
 
-from __future__ import annotations
-
 import copy
 import math
 import re

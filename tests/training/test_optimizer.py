@@ -1,7 +1,5 @@
 """RowAdam is torch's Adam on the selected rows, and does not change the others."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch import Tensor

@@ -1,7 +1,5 @@
 """The plan: its measurements on scenes with known results, its decisions, and training with it."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace

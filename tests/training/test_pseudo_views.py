@@ -1,7 +1,5 @@
 """Pseudo views, renders of the checkpoint as target images, and the cameras that are placed for them."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The schedule: each view once a round, dial values evenly spread, reproducibly from a seed or a state."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """States of training and their files: resumed runs end with the same bits, and other states are refused."""
 
-from __future__ import annotations
-
 import copy
 import math
 import os

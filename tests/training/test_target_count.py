@@ -1,7 +1,5 @@
 """The target-count curve: its values, its gradients, and convergence of the counts."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

@@ -1,7 +1,5 @@
 """Fixtures for the page in a browser: one browser context for all tests, and one server per shown file."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack

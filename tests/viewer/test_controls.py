@@ -1,7 +1,5 @@
 """Keys, pointer, touch, typed counts, links and lists, in a browser."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

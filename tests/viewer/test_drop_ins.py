@@ -1,7 +1,5 @@
 """The dial in Spark and PlayCanvas: the pages of viewers/examples in a browser, with the engines from npm."""
 
-from __future__ import annotations
-
 import io
 import json
 import re

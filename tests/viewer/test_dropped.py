@@ -1,7 +1,5 @@
 """Files dropped on the page: what it reads as Python does, and what it leaves to Python or cannot read."""
 
-from __future__ import annotations
-
 import gzip
 import re
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """A held frame rate: the law in JavaScript, and the page on a simulated GPU, whose time follows the Gaussians drawn."""
 
-from __future__ import annotations
-
 import base64
 from collections.abc import Iterator
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """The page's text, the page as one file, and its messages."""
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import io

@@ -1,7 +1,5 @@
 """The data of the page: one PLY layout for Gaussians from any file, or SPZ."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from pathlib import Path

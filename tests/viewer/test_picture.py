@@ -1,7 +1,5 @@
 """The browser's picture equals ``clod_adapter.render`` at the same camera and dial value."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

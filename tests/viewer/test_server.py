@@ -1,7 +1,5 @@
 """Responses of the server, and requests that it refuses."""
 
-from __future__ import annotations
-
 import http.client
 import socket
 import threading

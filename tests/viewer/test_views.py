@@ -1,7 +1,5 @@
 """Orbit centre, up axis, framing, animations, pictures and videos, in a browser."""
 
-from __future__ import annotations
-
 import io
 from dataclasses import replace
 from pathlib import Path

@@ -7,8 +7,6 @@ extension. The values are the checkpoint's: glTF's y is up and its x goes left, 
 about z, and a translation where there is an origin. ``asset.extras.clod_adapter`` holds the document (``metadata``).
 """
 
-from __future__ import annotations
-
 import json
 import struct
 from collections.abc import Iterator, Sequence

@@ -5,8 +5,6 @@ A row is the position and the standard deviations, three float32 each, then four
 and most opaque come first (by volume times opacity), as viewers draw what has arrived.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

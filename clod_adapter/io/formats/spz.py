@@ -17,8 +17,6 @@ know; most do not even read so far. Two are written:
   ``(d' s)^2 1.2e-10`` of an opacity.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import struct

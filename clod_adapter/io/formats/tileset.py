@@ -13,8 +13,6 @@ Viewers turn glTF's y-up axes into z-up ones, (x, y, z) to (x, -z, y), after the
 of the model is at (-x, -z, -y) of the tile set, in which the bounding boxes are.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path

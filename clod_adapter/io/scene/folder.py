@@ -3,8 +3,6 @@
 Needs neither pycolmap nor torch, so that a wrong folder is refused before they are imported.
 """
 
-from __future__ import annotations
-
 import json
 import os
 from collections import Counter

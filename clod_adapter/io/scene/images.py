@@ -1,7 +1,5 @@
 """Photographs of the common formats, decoded to 8-bit RGB."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path

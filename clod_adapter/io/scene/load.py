@@ -1,7 +1,5 @@
 """Reads posed photographs, or their cameras alone, from a COLMAP model or a transforms file."""
 
-from __future__ import annotations
-
 import threading
 import warnings
 from collections import Counter, OrderedDict

@@ -1,7 +1,5 @@
 """Cameras as nerfstudio, instant-ngp and Blender's synthetic scenes have them: ``transforms.json``."""
 
-from __future__ import annotations
-
 import math
 from collections import ChainMap
 from collections.abc import Mapping

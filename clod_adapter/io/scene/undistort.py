@@ -1,7 +1,5 @@
 """Undistorts photographs to those of pinhole cameras, and caches the results."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

@@ -1,7 +1,5 @@
 """``--memory``: a scene in blocks is trained in one process, also after a kill, an interrupt or an error."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Callable

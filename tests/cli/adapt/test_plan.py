@@ -1,7 +1,5 @@
 """The plan as ``clod-adapt`` prints, stores, overrides and applies it."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Several processes: the result of one; a killed process, an interrupt or bad input ends all of them."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

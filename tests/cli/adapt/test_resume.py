@@ -1,7 +1,5 @@
 """Resuming: after an error, and that the state of another run, or a damaged one, is refused."""
 
-from __future__ import annotations
-
 import copy
 import json
 import math

@@ -1,7 +1,5 @@
 """``clod-adapt PLY --images DIR``: files, report and what is printed."""
 
-from __future__ import annotations
-
 import json
 import re
 import shlex

@@ -1,7 +1,5 @@
 """Checkpoints that do not match the photographs: errors, warnings, report."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """``--antialiasing``: stored, detected or requested; used for training, measuring and export."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Budgets on the command line: ``eval`` and ``export`` with --keep, --fps and --psnr-drop."""
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import replace

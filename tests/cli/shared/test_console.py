@@ -1,7 +1,5 @@
 """Progress and messages, with and without a terminal."""
 
-from __future__ import annotations
-
 import io
 import sys
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """What commands read, in formats of other tools; their device; kernels, compiled before times are measured."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """``--report``: the page of adapting and of ``eval``."""
 
-from __future__ import annotations
-
 import json
 import re
 import sys
