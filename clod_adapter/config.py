@@ -11,7 +11,7 @@ from typing import Any
 
 from clod_adapter.errors import ClodError
 
-NORMALIZERS = ("max", "quantile", "scene")
+NORMALIZERS = ("max", "scene")
 CUTS = ("hard", "soft")
 FORMS = ("ours", "paper")
 GROWTHS = ("on", "off")
@@ -42,8 +42,7 @@ class AttenuationConfig:
     The normalizer D turns a distance into the ``d'`` of the equation:
 
     - ``scene``: the constant ``scene_distance`` for every view; 1 in files, where sigma_d is in world units;
-    - ``quantile``: that ``quantile`` of the distances of the Gaussians in the view frustum;
-    - ``max``: the largest of these distances, the paper's form.
+    - ``max``: the largest of the distances of the Gaussians in the view frustum, the paper's form.
 
     Raises:
         ClodError: a field is out of range.
@@ -52,8 +51,7 @@ class AttenuationConfig:
     tau: float = option(0.02, "culling threshold on opacity at s = 1; rasterizers drop opacities below 1/255 anyway")
     cut: str = option("soft", "culling threshold: hard (opacity drops to 0 at tau s, the paper's) or soft (fades to 0)")
     eps: float = option(1e-8, "the paper's epsilon, added to 2 sigma_d^2; defines sigma_d = 0")
-    normalizer: str = option("scene", "divisor D of distances: scene, quantile or max")
-    quantile: float = option(0.95, "quantile of the distances in the frustum that is D (normalizer quantile)")
+    normalizer: str = option("scene", "divisor D of distances: scene or max")
     scene_distance: float = option(1.0, "D in world units (normalizer scene); files have 1, sigma_d in world units")
     reference_distance: float = option(
         0.0, "median distance in the nearest training views, world units, from which on scales grow; 0 if unknown"
@@ -65,7 +63,6 @@ class AttenuationConfig:
         require(self.cut in CUTS, "cut", self.cut, f"one of {', '.join(CUTS)}")
         require(0 <= self.eps < 1, "eps", self.eps, "at least 0 and below 1")
         require(self.normalizer in NORMALIZERS, "normalizer", self.normalizer, f"one of {', '.join(NORMALIZERS)}")
-        require(0 < self.quantile <= 1, "quantile", self.quantile, "above 0 and at most 1")
         distance, reference = self.scene_distance, self.reference_distance
         require(0 < distance < FARTHEST, "scene_distance", distance, f"above 0 and below {FARTHEST:g}")
         require(0 <= reference < FARTHEST, "reference_distance", reference, f"at least 0 and below {FARTHEST:g}")

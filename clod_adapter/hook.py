@@ -70,7 +70,7 @@ class Hook:
             opacities: ``[N]`` or ``[N, 1]`` activated, in [0, 1]; the result has its shape and dtype.
             viewmat: ``[4, 4]`` world to camera, a rotation and a translation, OpenCV axes.
             K: ``[3, 3]`` intrinsics in pixels. With ``width``, ``height`` and ``near`` it defines the frustum of the
-                normalisers ``max`` and ``quantile``; ``scene`` needs none of them.
+                normaliser ``max``; ``scene`` needs none of them.
 
         Raises:
             ClodError: the shapes do not fit the hook or each other, means or opacities are integers, or a normaliser

@@ -18,7 +18,7 @@ TABLES: dict[type, dict[str, list[Any]]] = {
         "batch": [0, 4097], "seed": [-1, 2**63], **{f"lr_{name}": [-1e-9, 1.1e6, math.nan] for name in RATES},
     },
     AttenuationConfig: BOTH | {
-        "eps": [-1e-9, 1.0, math.nan], "normalizer": ["mean"], "quantile": [0.0, 1.01], "cut": ["none"],
+        "eps": [-1e-9, 1.0, math.nan], "normalizer": ["mean"], "cut": ["none"],
         "scene_distance": [0.0, 1e308, math.nan], "reference_distance": [-1.0, math.inf],
     },
     ScreenFilter: {"variance": [9e-4, 101.0, math.nan], "compensate": [1, "yes", None]},

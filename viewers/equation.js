@@ -16,17 +16,16 @@ export function prepare(opacityLogits, sigmaD, eps) {
 }
 
 /** D, the unit of the distances, in world units (attenuation.normalizing_distance). */
-export function normalizingDistance(means, view, { normalizer, scene_distance, quantile }) {
+export function normalizingDistance(means, view, { normalizer, scene_distance }) {
   if (normalizer === "scene") return scene_distance;
-  const [ex, ey, ez] = view.eye, all = [], inside = [];
+  const [ex, ey, ez] = view.eye;
+  let all = 0, inside = 0;
   for (let at = 0; at < means.length; at += 3) {
     const x = means[at] - ex, y = means[at + 1] - ey, z = means[at + 2] - ez, distance = Math.hypot(x, y, z);
-    all.push(distance);
-    if (inFrustum(x, y, z, view)) inside.push(distance);
+    all = Math.max(all, distance);
+    if (inFrustum(x, y, z, view)) inside = Math.max(inside, distance);
   }
-  const found = Float64Array.from(inside.length ? inside : all).sort();
-  const rank = normalizer === "max" ? found.length : Math.max(Math.ceil(quantile * found.length), 1);
-  return Math.max(found[rank - 1], 2 ** -126);
+  return Math.max(inside || all, 2 ** -126);
 }
 
 function inFrustum(x, y, z, { rotation: r, fx, fy, cx, cy, width, height, near }) {

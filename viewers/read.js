@@ -2,7 +2,7 @@
 import { readSpz } from "./spz.js";
 
 const DEFAULTS = {
-  tau: 0.02, cut: "soft", eps: 1e-8, normalizer: "scene", quantile: 0.95, scene_distance: 1, reference_distance: 0, max_sv: 5,
+  tau: 0.02, cut: "soft", eps: 1e-8, normalizer: "scene", scene_distance: 1, reference_distance: 0, max_sv: 5,
 };
 const TYPES = { // the other names are those of DataView, in lower case
   char: "Int8", uchar: "Uint8", short: "Int16", ushort: "Uint16", int: "Int32", uint: "Uint32", float: "Float32", double: "Float64",
@@ -70,7 +70,7 @@ export function readSettings(comments, constants = {}) {
   const settings = { ...DEFAULTS };
   for (const name of Object.keys(DEFAULTS)) settings[name] = constants[`clod_${name}`] ?? settings[name];
   if (constants.clod_hard_cut) settings.cut = "hard";
-  if (constants.clod_max || constants.clod_quantile) settings.normalizer = constants.clod_max ? "max" : "quantile";
+  if (constants.clod_max) settings.normalizer = "max";
   for (const [name, value] of entries(comments)) {
     if (name in DEFAULTS) settings[name] = typeof DEFAULTS[name] === "number" ? Number(value) : value;
   }

@@ -45,22 +45,16 @@ def euclidean(means: Tensor, position: Tensor) -> Tensor:
 def normalizing_distance(distances: Tensor, means: Tensor, camera: Camera, config: AttenuationConfig) -> Tensor:
     """0-d, the D of ``config.normalizer``, world units, > 0.
 
-    ``scene`` is ``config.scene_distance``. ``max`` (the paper's) and ``quantile`` are taken over the Gaussians whose
-    centre projects into the image from beyond the near plane, or over all Gaussians where there is none. The quantile
-    is an element, the ``ceil(q n)``-th smallest, not an interpolation. D is at least the smallest normal number, so
-    that 0 / D is 0, and 1 where there are no Gaussians.
+    ``scene`` is ``config.scene_distance``. ``max`` (the paper's) is taken over the Gaussians whose centre projects into
+    the image from beyond the near plane, or over all Gaussians where there is none. D is at least the smallest normal
+    number, so that 0 / D is 0, and 1 where there are no Gaussians.
     """
     if config.normalizer == "scene" or len(distances) == 0:
         value = config.scene_distance if config.normalizer == "scene" else 1.0
         return torch.full((), value, dtype=distances.dtype, device=distances.device)
     inside = in_frustum(means, camera)
-    if config.normalizer == "max":  # without a selection, for whose size the host would wait for a GPU
-        found = distances.where(inside | ~inside.any(), 0).max()
-    else:
-        visible = distances[inside] if bool(inside.any()) else distances
-        # Not torch.quantile: it sorts, and refuses more than 16M elements.
-        found = visible.kthvalue(min(max(math.ceil(config.quantile * len(visible)), 1), len(visible))).values
-    return found.clamp(min=torch.finfo(found.dtype).tiny)
+    # Without a selection, for whose size the host would wait for a GPU.
+    return distances.where(inside | ~inside.any(), 0).max().clamp(min=torch.finfo(distances.dtype).tiny)
 
 
 def in_frustum(means: Tensor, camera: Camera) -> Tensor:
@@ -81,7 +75,10 @@ def camera_unit(means: Tensor, camera: Camera, config: AttenuationConfig) -> flo
 
 def median_distance(means: Tensor, camera: Camera) -> float:
     """Of the centres ``means [N, 3]`` in the image, or of all if there is none; world units."""
-    return camera_unit(means, camera, AttenuationConfig(normalizer="quantile", quantile=0.5))
+    inside = in_frustum(means, camera)
+    distances = (means - camera.position.to(means)).norm(dim=1)
+    visible = distances[inside] if bool(inside.any()) else distances
+    return float(visible.median().clamp(min=torch.finfo(visible.dtype).tiny))
 
 
 def viewpoint_of(camera: Camera, means: Tensor, config: AttenuationConfig) -> Viewpoint:

@@ -30,7 +30,7 @@ def with_distance(gaussians: Gaussians, distance: float) -> Gaussians:
     ``sigma'^2 = ((D / D')^2 (2 sigma^2 + eps) - eps) / 2``, in float64, at least 0. Values of 0 or below and SIGMA_MAX
     stay. Where D / D' is below SMALL, eps would hide sigma': there it becomes ``(D / D')^2 eps``, to six
     digits; where D / D' is above 1 / SMALL, eps grows back so, to four digits, but not beyond the default. The
-    normalisers ``max`` and ``quantile`` do not use D, and keep their sigma_d. The result's ``reference_distance`` is
+    normaliser ``max`` does not use D, and keeps its sigma_d. The result's ``reference_distance`` is
     ``known_distance`` of the input. Where that is unknown and there is a ``growth_d``, it is D: growth begins there.
     """
     config, sigma = gaussians.attenuation, gaussians.sigma_d
@@ -66,7 +66,7 @@ def known_distance(config: AttenuationConfig) -> float:
 def nominal_distance(means: Tensor, config: AttenuationConfig) -> float:
     """The normalised distance d of a viewpoint, for scenes without cameras; > 0.
 
-    ``known_distance`` over D, or where that is unknown ``estimated_distance`` over D; 1 for ``max`` and ``quantile``.
+    ``known_distance`` over D, or where that is unknown ``estimated_distance`` over D; 1 for ``max``.
     """
     if config.normalizer != "scene":
         return 1.0

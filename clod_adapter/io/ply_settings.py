@@ -105,7 +105,6 @@ def constants_of(config: AttenuationConfig, growth: bool, screen_filter: ScreenF
         ("tau", config.tau, config.tau != usual.tau),
         ("eps", config.eps, config.eps != usual.eps),
         ("hard_cut", 1.0, config.cut == "hard"),
-        ("quantile", config.quantile, config.normalizer == "quantile"),
         ("reference_distance", config.reference_distance, growth and config.reference_distance > 0),
         ("max", 1.0, config.normalizer == "max"),
         ("screen_variance", screen_filter.variance, screen_filter.variance != CLASSIC.variance),
@@ -117,9 +116,8 @@ def constants_of(config: AttenuationConfig, growth: bool, screen_filter: ScreenF
 def _constant_settings(constants: Mapping[str, float]) -> dict[str, Any]:
     """The settings in the columns, as ``settings.read_metadata`` takes them; the inverse of ``constants_of``."""
     there = {name.removeprefix(COLUMN): value for name, value in constants.items()}
-    found: dict[str, Any] = {n: there[n] for n in ("tau", "eps", "quantile", "reference_distance") if n in there}
+    found: dict[str, Any] = {n: there[n] for n in ("tau", "eps", "reference_distance") if n in there}
     found |= {"cut": "hard"} if there.get("hard_cut") else {}
-    found |= {"normalizer": "quantile"} if "quantile" in there else {}
     found |= {"normalizer": "max"} if there.get("max") else {}
     values: dict[str, Any] = {"attenuation": found} if found else {}
     if "screen_variance" in there or "compensate" in there:

@@ -30,7 +30,7 @@ def dialled(n: int = 400, **config: float | str) -> Gaussians:
 @settings(deadline=None, max_examples=30)
 @given(
     st.floats(1e-3, 1e4), st.sampled_from([0.0, 1e-8, 0.3]), st.floats(1, 20),
-    st.sampled_from(["scene", "max", "quantile"]), st.sampled_from([0.0, 2.5]),
+    st.sampled_from(["scene", "max"]), st.sampled_from([0.0, 2.5]),
 )  # fmt: skip
 def test_changing_the_unit_keeps_the_dial(distance: float, eps: float, s: float, normalizer: str, known: float) -> None:
     some = dialled(eps=eps, max_sv=20.0, normalizer=normalizer, reference_distance=known)

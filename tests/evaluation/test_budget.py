@@ -34,10 +34,10 @@ def kept(some: Gaussians, cameras: Sequence[Camera], s: float) -> int:
 
 
 @settings(deadline=None, max_examples=30)
-@example(n=2, seed=2, views=5, share=0.25, normalizer="quantile")  # one Gaussian is at distance 1 in three views
+@example(n=2, seed=2, views=5, share=0.25, normalizer="max")  # one Gaussian is at distance 1 in three views
 @given(
     n=st.integers(2, 3000), seed=st.integers(0, 10**6), views=st.integers(1, 5), share=st.floats(0, 1),
-    normalizer=st.sampled_from(["scene", "quantile", "max"]),
+    normalizer=st.sampled_from(["scene", "max"]),
 )  # fmt: skip
 def test_counts_are_exact_up_to_ties(n: int, seed: int, views: int, share: float, normalizer: str) -> None:
     some, cameras = adapted(n, seed, normalizer), ring(views, 48, 36)

@@ -38,7 +38,7 @@ def arguments(name: str = "inria 2024") -> dict[str, Any]:
 def dial(growing: bool = True, normalizer: str = "scene") -> dict[str, Any]:
     """The dial's arguments."""
     sigma_d, growth_d = torch.rand(2, N, generator=torch.Generator().manual_seed(7))
-    settings = AttenuationConfig(scene_distance=5.0, normalizer=normalizer, quantile=0.5)
+    settings = AttenuationConfig(scene_distance=5.0, normalizer=normalizer)
     growth = {"growth_d": (2 * growth_d - 0.6).requires_grad_()} if growing else {}
     return {"sigma_d": (0.2 + sigma_d).requires_grad_(), "virtual_scale": DIAL, "attenuation": settings} | growth
 
@@ -51,7 +51,7 @@ def faded(given: dict[str, Any], dial: dict[str, Any]) -> Any:
 @pytest.mark.parametrize("name", FORKS)
 def test_kept_rows_are_drawn_as_by_the_fork(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Also called by position. Without sigma_d, results are the fork's."""
-    fork, given, more = inria_forks.module(name), arguments(name), dial(name != "w-pose", "quantile")
+    fork, given, more = inria_forks.module(name), arguments(name), dial(name != "w-pose", "max")
     settings = settings_of(fork.GaussianRasterizationSettings, VIEW, bg=torch.tensor([0.2, 0.5, 0.1]))
     theirs, module = fork.GaussianRasterizer(settings), wrapper(monkeypatch, fork)
     ours = module.GaussianRasterizer(raster_settings=settings)

@@ -18,7 +18,7 @@ from formats import model, needed, random_rows, splat_transform, write_elements,
 from packing import write_packed
 from scenes import gaussians
 
-CONFIG = AttenuationConfig(tau=0.02, eps=1e-7, normalizer="quantile", quantile=1 / 3, max_sv=7.0)
+CONFIG = AttenuationConfig(tau=0.02, eps=1e-7, normalizer="max", max_sv=7.0)
 
 
 def read_back(path: Path) -> tuple[list[str], np.ndarray]:
@@ -78,7 +78,7 @@ def test_every_layout_round_trips(tmp_path: Path, file: tuple[np.ndarray, str, i
     save(out, tuned.replace(means=changes["means"].requires_grad_(), sigma_d=sigma_d.double().requires_grad_()), base)
     _, rows = read_back(out)
     own = [name for name in vertex.dtype.names if name != "growth_d"]
-    added = ["clod_eps", "clod_quantile", "sigma_d"]  # of CONFIG, what is not the default, but for max_sv
+    added = ["clod_eps", "clod_max", "sigma_d"]  # of CONFIG, what is not the default, but for max_sv
     added += ["growth_d"] if growth_d is not None else []
     assert list(rows.dtype.names) == own + added and {rows.dtype[name].str for name in added} == {"<f4"}
     for name in own:
@@ -107,7 +107,7 @@ def test_header_of_an_extended_file(tmp_path: Path) -> None:
     lines, rows = read_back(tmp_path / "out.ply")
     assert lines[:4] == ["ply", "format binary_little_endian 1.0", "element vertex 2", "comment a photo"]
     assert sum("clod_adapter tau" in line for line in lines) == 1 and not any("odd" in line for line in lines)
-    for line in (f"tau {float(config.tau)!r}", "normalizer quantile", "version 7.8.9"):
+    for line in (f"tau {float(config.tau)!r}", "normalizer max", "version 7.8.9"):
         assert f"comment clod_adapter {line}" in lines
     assert lines[-1] == "property float sigma_d" and rows.dtype.names[-1] == "sigma_d"
     assert sum(name == "sigma_d" for name in rows.dtype.names) == 1
