@@ -22,6 +22,7 @@ import clod_adapter
 from clod_adapter.cli import adapt
 from clod_adapter.cli.main import COMMANDS, build_parser
 from clod_adapter.cli.shared.outputs import Outputs, claimed
+from clod_adapter.io.file_formats import FORMATS, WRITABLE, write
 
 POSE = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 5], [0, 0, 0, 1]]
 MESH = "ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nend_header\n"
@@ -41,8 +42,9 @@ def folder(capture: Any, dialled: Path, tmp_path_factory: pytest.TempPathFactory
     shutil.copy(capture.ply, there / "base.ply")
     for suffix in (".ply", ".safetensors", ".json"):
         shutil.copy(dialled.with_suffix(suffix), there / f"dial{suffix}")
-    for suffix in (".ply", ".glb"):
-        clod_adapter.save(there / f"bare{suffix}", clod_adapter.with_dial(capture.gaussians))
+    bare = clod_adapter.with_dial(capture.gaussians)
+    for suffix in WRITABLE:
+        write(there / f"bare{suffix}", bare if FORMATS[suffix].carries_sigma else capture.gaussians)
     for name in ("text.ply", "a.hier"):
         (there / name).write_text("hello")
     (there / "cut.ply").write_bytes(capture.ply.read_bytes()[:-100])
@@ -210,17 +212,17 @@ def test_two_runs_at_once(
                 pass
 
 
-def test_earlier_outputs_are_replaced(clod: Any, capture: Any, tmp_path: Path) -> None:
+def test_earlier_outputs_are_replaced(clod: Any, capture: Any, dialled: Path, tmp_path: Path) -> None:
     """And a foreign file, if the command line names it."""
+    for suffix in (".safetensors", ".json"):
+        shutil.copy(dialled.with_suffix(suffix), tmp_path / f"out{suffix}")
     (tmp_path / "out.ply").write_bytes(b"foreign, but named")
-    for _ in range(2):
-        for line in (
-            f"{capture.ply} --images SCENE --iters 2 --max-sv 2 -o out.ply",
-            "render out.ply --images SCENE -o pictures",
-            "export out.ply -o x.safetensors",
-            "export out.ply -o x.spz --levels 1,2",
-        ):
-            assert (done := clod(*line.replace("SCENE", str(capture.scene)).split(), "--quiet")).code == 0, done
+    export = f"export {dialled} -o x"
+    for line in (
+        f"{capture.ply} --images SCENE --iters 2 --max-sv 2 -o out.ply",
+        *[f"render {dialled} --images SCENE -o pictures", f"{export}.safetensors", f"{export}.spz --levels 1,2"] * 2,
+    ):
+        assert (done := clod(*line.replace("SCENE", str(capture.scene)).split(), "--quiet")).code == 0, done
 
 
 LIGHT = """
@@ -232,22 +234,26 @@ view base.ply --device-preset phone
 
 
 def test_help_errors_and_inspect_do_not_import_torch(folder: Path) -> None:
-    """``--help`` does not import numpy either: it takes 0.1 s of a core where nothing else runs."""
+    """``--help`` does not import numpy either: it takes 0.1 s of a core where nothing else runs.
+
+    Idle threads of OpenMP are set to wait before torch reads that.
+    """
     lines = [line.split() for line in LIGHT.replace("\n", " | ").split(" | ") if line]
+    lines += [["eval", f"bare{suffix}", "--images", "empty"] for suffix in WRITABLE]
     script = (
-        "import json, sys\n"
+        "import json, os, sys, clod_adapter\n"
         "sys.modules.update(torch=None, pycolmap=None, numba=None)\n"  # importing one is an error
         "from clod_adapter.cli.main import main\n"
         "def code(words):\n"
         "    try: return main(words)\n"
         "    except SystemExit as done: return done.code or 0\n"
         "code(['--help'])\n"
-        "assert 'numpy' not in sys.modules\n"
+        "assert 'numpy' not in sys.modules and os.environ['OMP_WAIT_POLICY'] == 'PASSIVE'\n"
         "print(json.dumps([code(words) for words in json.loads(sys.argv[1])]))\n"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", script, json.dumps(lines)], cwd=folder, capture_output=True, text=True, check=False
-    )
+    words = [sys.executable, "-c", script, json.dumps(lines)]
+    environment = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
+    done = subprocess.run(words, cwd=folder, env=environment, capture_output=True, text=True, check=False)
     wanted = [0 if line[-1] in ("--help", "--version") or line[0] == "inspect" else 2 for line in lines]
     assert done.returncode == 0, done
     assert "Traceback" not in done.stderr and json.loads(done.stdout.splitlines()[-1]) == wanted, done

@@ -1,7 +1,6 @@
 """``cli/main.py``: exit codes, pipes, errors of every kind, and ``--help``."""
 
 import json
-import os
 import re
 import subprocess
 import sys
@@ -51,23 +50,6 @@ def test_errors_of_the_work(
 def test_without_arguments_it_says_what_to_do(clod: Any) -> None:
     done = clod()
     assert (done.code, done.err, done.out.count("\n")) == (0, "", 5) and "clod-adapt PLY --images DIR" in done.out
-
-
-def test_torch_is_imported_with_idle_threads() -> None:
-    """The command sets OpenMP's wait policy before torch reads it."""
-    code = (
-        "import sys, os\n"
-        "class Spy:\n"
-        "    def find_spec(self, name, *rest):\n"
-        "        if name == 'torch': print(os.environ.get('OMP_WAIT_POLICY'))\n"
-        "sys.meta_path.insert(0, Spy())\n"
-        "from clod_adapter.cli.main import import_library\n"
-        "import_library(quiet=True)\n"
-        "assert 'torch' in sys.modules\n"
-    )
-    environment = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
-    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
-    assert done.stdout.split()[0] == "PASSIVE"
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="Linux has this device")

@@ -9,7 +9,7 @@ from typing import Any
 from runs import names
 
 COMMANDS = """
-base.ply --images scene -o dial.ply --iters 2 --accept-loss --report
+base.ply --images scene -o dial.ply --iters 2 --accept-loss
 render dial.ply --images scene --sv 1 -o pictures
 apply base.ply dial.safetensors -o again.ply
 export dial.ply -o plain.spz
@@ -24,5 +24,5 @@ def test_commands_without_posix(capture: Any, tmp_path: Path) -> None:
     words = [sys.executable, str(program), json.dumps(commands)]
     done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=300)
     assert done.returncode == 0, done.stdout + done.stderr
-    assert {"dial.ply", "dial.html", "pictures", "plain.spz"} <= set(names(tmp_path))
+    assert {"dial.ply", "dial.json", "pictures", "plain.spz", "plain.html"} <= set(names(tmp_path))
     assert (tmp_path / "again.ply").read_bytes() == (tmp_path / "dial.ply").read_bytes()
