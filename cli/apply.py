@@ -41,8 +41,7 @@ def execute(args: Namespace) -> dict[str, Any]:
     from .shared.inputs import read_checkpoint
 
     console, adapter = Console(args.quiet), load_adapter(args.adapter)
-    for note in adapter.notes:
-        console.note(note, args.adapter)
+    console.note(*adapter.notes, of=args.adapter)
     base = read_checkpoint(args.base, console, args.activated, adapter.origin)
     try:
         adapted = adapter.apply(base.gaussians, base.fingerprint)

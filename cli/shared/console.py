@@ -18,7 +18,6 @@ from .process import GracefulStop
 
 tqdm.monitor_interval = 0  # bars are updated at every step anyway, and its thread may fail to start
 LINE_EVERY = 10.0  # seconds between progress lines if stderr is not a terminal
-WIDTH = 80  # of tables
 TEXT = 36  # most characters of the text beside a bar, so that 80 columns have room for label, time and bar
 BAR_FORMAT = "{desc} {percentage:3.0f}%|{bar}| {remaining} left{postfix}"
 
@@ -35,13 +34,14 @@ class Console:
             tqdm.write(text, file=sys.stderr)  # print would overwrite a bar on this line
             sys.stderr.flush()
 
-    def note(self, text: str, of: str = "") -> None:
-        """Writes and keeps a note, or a warning if it begins so, on input or output; ``of``: the file that it is of."""
-        if of:
-            text = f"{WARNING * text.startswith(WARNING)}{of}: {text.removeprefix(WARNING)}"
-        if text not in self.notes:
-            self.notes.append(text)
-            self.say(f"  {text}" if text.startswith(WARNING) else f"  note: {text}")
+    def note(self, *texts: str, of: str = "") -> None:
+        """Writes and keeps notes, or warnings if they begin so, on input or output, ``of`` this file."""
+        for text in texts:
+            mark = WARNING * text.startswith(WARNING)
+            kept = f"{mark}{of}: {text.removeprefix(mark)}" if of else text
+            if kept not in self.notes:
+                self.notes.append(kept)
+                self.say(f"  {kept}" if mark else f"  note: {kept}")
 
     @contextmanager
     def status(self, text: str) -> Iterator[Callable[[str], None]]:
@@ -58,17 +58,19 @@ class Console:
 
 
 class Meter:
-    """A listener: a bar on a terminal, otherwise a line now and then, with the time left.
-
-    Args:
-        initial: the share that was done before.
-    """
+    """A listener: a bar on a terminal, otherwise a line now and then, with the time left."""
 
     def __init__(self, console: Console, label: str, initial: float = 0.0) -> None:
-        self.console, self.label, self.initial = console, label, initial
-        self.began = self.printed = time.perf_counter()
+        self.console = console
         self.bar: Any = None
-        if not console.quiet and sys.stderr.isatty():
+        self.begin(label, initial)
+
+    def begin(self, label: str, initial: float) -> None:
+        """Begins a phase, of which the share ``initial`` was done before."""
+        self.close()
+        self.label, self.initial = label, initial
+        self.began = self.printed = time.perf_counter()
+        if not self.console.quiet and sys.stderr.isatty():
             self.bar = tqdm(
                 total=1.0, initial=initial, desc=label, bar_format=BAR_FORMAT, file=sys.stderr, leave=False, delay=0.5,
                 miniters=0, dynamic_ncols=True,
@@ -85,8 +87,9 @@ class Meter:
             left = (now - self.began) * (1 - share) / max(share - self.initial, 1e-9)
             self.console.say(f"{self.label} {share:4.0%}, {duration(left)} left, {text}".removesuffix(", "))
 
-    def __call__(self, now: Progress) -> None:
+    def __call__(self, now: Progress) -> bool | None:
         self.update(now.share, f"{now.done}/{now.total}")
+        return None
 
     def part(self, index: int, count: int, text: str) -> Listener:
         """The listener of the ``index``-th of ``count`` equal parts."""
@@ -98,22 +101,21 @@ class Meter:
             self.bar = None
 
 
-class ProgressDisplay:
+class ProgressDisplay(Meter):
     """A listener that shows each phase, training as ``training``, and stops on Ctrl-C."""
 
     def __init__(self, console: Console, stop: GracefulStop, training: str = Phase.TRAINING) -> None:
         self.console, self.stop, self.training = console, stop, training
         self.phase: Phase | None = None
-        self.meter: Meter | None = None
+        self.bar = None
 
     def __call__(self, now: Progress) -> bool:
         training = now.phase == Phase.TRAINING
-        if self.meter is None or now.phase != self.phase:
-            self.close()
+        if now.phase != self.phase:
             self.phase, before = now.phase, now.share if now.done > 1 else 0.0  # a resumed training's
-            self.meter = Meter(self.console, self.training if training else now.phase, before)
+            self.begin(self.training if training else now.phase, before)
         by_time = now.share > now.done / max(now.total, 1)
-        self.meter.update(now.share, f"step {now.done}" if by_time else f"{now.done}/{now.total}")
+        self.update(now.share, f"step {now.done}" if by_time else f"{now.done}/{now.total}")
         if not now.error and not self.stop.requests:
             return True
         self.close()
@@ -121,11 +123,6 @@ class ProgressDisplay:
             again = " (Ctrl-C again aborts without writing)" if self.stop.aborts and self.stop.presses else ""
             self.console.say(f"stopping{again}")
         return False
-
-    def close(self) -> None:
-        if self.meter is not None:
-            self.meter.close()
-            self.meter = None
 
 
 def duration(seconds: float) -> str:

@@ -42,8 +42,7 @@ def read_checkpoint(
     columns, drawn = " and ".join(dial_columns(gaussians.tensors())), gaussians.screen_filter
     more = f", with {columns}" * bool(columns) + f", drawn with {drawn.description}" * (drawn != CLASSIC)
     console.say(f"{path}: {len(gaussians):,} Gaussians, SH degree {gaussians.sh_degree}{more}")
-    for note in checkpoint.notes:
-        console.note(note, path)
+    console.note(*checkpoint.notes, of=path)
     return checkpoint
 
 
