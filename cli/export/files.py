@@ -1,19 +1,21 @@
-"""The cameras that ``clod-adapt export`` bakes for, and the files that it writes."""
+"""What ``clod-adapt export`` does: the cameras that it bakes for, and the files that it writes."""
 
 from argparse import Namespace
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
 from tempfile import TemporaryDirectory
+from typing import Any
 
-from clod_adapter.bake import bake
+from clod_adapter._support.version import package_version
+from clod_adapter.bake import bake, order_by_extinction
 from clod_adapter.calibration import Viewpoint
 from clod_adapter.cameras import Camera, spread
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.level_errors import geometric_errors, looking
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.io.checkpoint import Checkpoint
+from clod_adapter.inspection.report import extra_columns
+from clod_adapter.io.atomic import atomic_path, atomic_paths
 from clod_adapter.io.file_formats import WRITABLE, write
 from clod_adapter.io.formats.splat_transform import SplatTransform, cutting_options, time_limit
 from clod_adapter.io.formats.tileset import write_tileset
@@ -22,75 +24,164 @@ from clod_adapter.render import render
 from clod_adapter.training.camera_placement import place_cameras
 from clod_adapter.viewer.page import write_viewer_page
 
+from ..shared.command import given_budget, initial_dial
 from ..shared.console import Console, duration
-from ..shared.inputs import named, prepare_kernels, read_cameras
+from ..shared.inputs import (
+    named,
+    on_device,
+    pick_device,
+    prepare_kernels,
+    read_cameras,
+    read_checkpoint,
+    with_filter,
+)
+from ..shared.measure import Stopwatch, choose_dials, solve_dials
+from ..shared.outputs import size
+from .names import FOLDERS, PAGE, STORE_FILTER, is_page, level_paths, suffix_of
 
 PLACED = 16  # cameras placed where none are known
 COMPARED = 4  # views on which a page is compared with the exact values
 
 
-def find_cameras(args: Namespace, model: Checkpoint, console: Console) -> tuple[Sequence[Camera | Viewpoint], str]:
-    """The cameras of --camera, --images or the model's file, else placed ones; and what they are."""
-    if args.images is not None:
-        cameras = read_cameras(model, args.images, console, training=args.camera is None)
-        if args.camera is None:
-            return cameras, f"{len(cameras)} training cameras"
-        found = named(cameras, args.camera, "--camera")
-        if len(found) > 1:
-            both = f"{found[0].name} and {found[1].name}"
-            raise ClodError(f"--camera: {args.camera!r} matches {both}; give the full name")
-        return found, "one camera"
-    if model.viewpoints:
-        return model.viewpoints, f"{len(model.viewpoints)} training cameras"
-    try:
-        with console.meter("placing cameras") as meter:
-            cameras = place_cameras(model.gaussians, views=PLACED, progress=meter)
-    except ClodError as error:
-        raise ClodError(f"{model.path}: no cameras stored to bake for, and {error}; give --images") from error
-    placed = f"baked for {len(cameras)} placed ones; --images gives a better result"
-    console.note(f"{model.path} stores no cameras: {placed}")
-    return cameras, f"{len(cameras)} placed cameras"
+def export(args: Namespace) -> dict[str, Any]:
+    """Reads, bakes and writes; prints what was written, and returns the report."""
+    watch, export = Stopwatch(), Export(args)
+    export.note_losses()
+    total, camera, written = len(export.gaussians), export.camera, export.write()
+    for output in written:
+        print(line_of(output, total))
+    if export.dials and not export.page:
+        baked = f"exact at the camera of {camera.name} only" if camera else f"baked for {export.about}"
+        scales = "" if export.gaussians.growth_d is None else "; the scales include growth"
+        print(f"{baked}; lossy: without the dial and the Gaussians culled at this dial value{scales}")
+    return {
+        "command": "export", "version": package_version(), "model": args.model, "base_count": total,
+        "camera": camera.name if camera else None, "cameras": len(export.cameras), "order": args.order,
+        "outputs": written, "notes": export.console.notes, "seconds": watch.report(),
+    }  # fmt: skip
 
 
-@dataclass(frozen=True)
+def line_of(output: dict[str, Any], total: int) -> str:
+    """What was written, in a line, of a model of ``total`` Gaussians."""
+    line = f"wrote {output['file']} ({size(output['bytes'])}): {output['count']:,}"
+    if levels := output.get("levels"):
+        shown = ", ".join(f"{level['count']:,} at s = {level['virtual_scale']:.5g}" for level in levels)
+        return f"{line} Gaussians in {len(levels)} levels, {shown}"
+    if output["virtual_scale"] is None:
+        return f"{line} Gaussians"
+    about = "Gaussians, initial dial value" if output["file"].lower().endswith(PAGE) else f"of {total:,} Gaussians,"
+    return f"{line} {about} s = {output['virtual_scale']:.5g}"
+
+
 class Export:
-    """A model and how to write it.
+    """A model as read, and how it is written.
 
     Attributes:
-        model: as read; gaussians: the model's, sorted with ``--order``.
-        cameras: to bake for, empty where nothing is baked; about: these cameras, in printable ASCII.
+        cameras: to bake for, empty where nothing is baked; ``about``: these cameras, in printable ASCII.
+        camera: the one of ``--camera``, for which the result is exact.
         views: cameras of the scene, for a page.
+        gaussians: the model's, sorted with ``--order``.
+        dials: the dial values that are baked, or the one at which a page opens; empty without any.
     """
 
-    args: Namespace
-    model: Checkpoint
-    gaussians: Gaussians
-    cameras: Sequence[Camera | Viewpoint]
-    about: str
-    views: list[Camera]
-    console: Console
+    def __init__(self, args: Namespace) -> None:
+        self.args, self.page, self.console = args, is_page(args), Console(args.quiet)
+        self.model = with_filter(read_checkpoint(args.model, self.console, args.activated), args, self.console)
+        if args.images is not None and args.fps:
+            self.model = on_device(self.model, pick_device(args.device, self.console))
+        self.cameras: Sequence[Camera | Viewpoint] = ()
+        self.about, self.views = "", list[Camera]()
+        counts = given_budget(args) and not (self.page and args.psnr_drop)
+        if args.order or args.levels or counts or (args.sv and not self.page):
+            self.cameras, self.about = self._find_cameras()
+        if self.page and args.images is not None:
+            self.views = read_cameras(self.model, args.images, self.console)
+        only = self.cameras[0] if args.camera is not None else None
+        self.camera = only if isinstance(only, Camera) else None
+        self.gaussians = self.model.gaussians
+        if args.order:
+            self.gaussians = self.gaussians.select(order_by_extinction(self.gaussians, self.cameras))
+        self.dials = self._solve()
 
-    @property
-    def camera(self) -> Camera | None:
-        """The one of ``--camera``, for which the result is exact."""
-        return next((each for each in self.cameras if isinstance(each, Camera) and self.args.camera is not None), None)
+    def _find_cameras(self) -> tuple[Sequence[Camera | Viewpoint], str]:
+        """The cameras of --camera, --images or the model's file, else placed ones; and what they are."""
+        args, model = self.args, self.model
+        if args.images is not None:
+            cameras = read_cameras(model, args.images, self.console, training=args.camera is None)
+            if args.camera is None:
+                return cameras, f"{len(cameras)} training cameras"
+            found = named(cameras, args.camera, "--camera")
+            if len(found) > 1:
+                both = f"{found[0].name} and {found[1].name}"
+                raise ClodError(f"--camera: {args.camera!r} matches {both}; give the full name")
+            return found, "one camera"
+        if model.viewpoints:
+            return model.viewpoints, f"{len(model.viewpoints)} training cameras"
+        try:
+            with self.console.meter("placing cameras") as meter:
+                cameras = place_cameras(model.gaussians, views=PLACED, progress=meter)
+        except ClodError as error:
+            raise ClodError(f"{model.path}: no cameras stored to bake for, and {error}; give --images") from error
+        placed = f"baked for {len(cameras)} placed ones; --images gives a better result"
+        self.console.note(f"{model.path} stores no cameras: {placed}")
+        return cameras, f"{len(cameras)} placed cameras"
 
-    def content(self, virtual_scale: float | None) -> tuple[Gaussians, tuple[str, ...]]:
+    def _solve(self) -> list[float]:
+        baked, attenuation = self.camera is None and not self.page, self.gaussians.attenuation
+        dials = self.args.levels or solve_dials(self.args, self.model, self.cameras, self.console, baked=baked)
+        if dials and self.page:
+            return [initial_dial(dials[0], attenuation.max_sv if attenuation else None, self.console)]
+        return choose_dials(dials, attenuation, self.console) if dials else []
+
+    def note_losses(self) -> None:
+        """Of columns, and of the screen-space filter where most readers do not find it."""
+        names = (self.model.vertex.dtype.names if self.model.vertex is not None else None) or ()
+        if dropped := extra_columns(names, self.gaussians.sh_degree):
+            self.console.note(f"columns dropped: {', '.join(dropped)}")
+        drawn, dialled = self.gaussians.screen_filter, self.gaussians.sigma_d is not None and not self.dials
+        stored = not self.args.folder and suffix_of(Path(self.args.out)) in STORE_FILTER
+        if drawn.compensate and not dialled and not stored:
+            options = 'antiAlias in PlayCanvas, rasterize_mode="antialiased" in gsplat'
+            about = f"trained antialiased ({drawn.description}): most readers need an option for it: {options}"
+            self.console.note(about)
+
+    def write(self) -> list[dict[str, Any]]:
+        """Writes all files of the command, all or none; a description of each."""
+        out, written = Path(self.args.out), list[dict[str, Any]]()
+        if option := self.args.folder:
+            with atomic_path(out) as folder:
+                folder.mkdir()
+                counts = self._write_set(folder / FOLDERS[option])
+                taken = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+            levels = [{"virtual_scale": dial, "count": n} for dial, n in zip(self.dials, counts, strict=True)]
+            return [{"file": str(out / FOLDERS[option]), "levels": levels, "count": sum(counts), "bytes": taken}]
+        paths = level_paths(out, self.args.levels) if self.args.levels else [out]
+        dials: Sequence[float | None] = self.dials or [None]
+        with atomic_paths(*paths) as temporaries:
+            for path, temporary, dial in zip(paths, temporaries, dials, strict=True):
+                count = self._write_file(temporary, suffix_of(path), dial)
+                taken = temporary.stat().st_size
+                written.append({"file": str(path), "virtual_scale": dial, "count": count, "bytes": taken})
+        return written
+
+    def _content(self, virtual_scale: float | None) -> tuple[Gaussians, tuple[str, ...]]:
         """The Gaussians of one file, baked if there is a dial value; and its comments, those of the model first."""
-        about, gaussians, camera = [*self.model.comments], self.gaussians, self.camera
+        about, gaussians, cameras = [*self.model.comments], self.gaussians, self.about
         if virtual_scale is not None:
-            cameras = f"the camera at {self._position(camera)}: exact from there only" if camera else self.about
+            if self.camera:
+                place = zip(self.camera.position.double().tolist(), self.model.origin, strict=True)
+                cameras = f"the camera at ({', '.join(f'{x + by:.9g}' for x, by in place)}): exact from there only"
             about.append(f"baked at s = {virtual_scale:.6g} by clod-adapter for {cameras}")
-            gaussians = bake(gaussians, virtual_scale, camera, cameras=() if camera else self.cameras)
+            gaussians = bake(gaussians, virtual_scale, self.camera, cameras=() if self.camera else self.cameras)
         about += ["rows in the order in which the dial keeps them longest"] if self.args.order else []
         return gaussians, tuple(dict.fromkeys(about))
 
-    def write(self, path: Path, suffix: str, virtual_scale: float | None) -> int:
+    def _write_file(self, path: Path, suffix: str, virtual_scale: float | None) -> int:
         """Writes a file, with notes on losses of the format; its number of Gaussians."""
-        if suffix == ".html":
+        if suffix == PAGE:
             self._write_page(path, virtual_scale)
             return len(self.gaussians)
-        gaussians, about = self.content(virtual_scale)
+        gaussians, about = self._content(virtual_scale)
         if suffix not in WRITABLE:
             with TemporaryDirectory(dir=path.parent, prefix=".tmp-") as folder:
                 source, packed = Path(folder) / "plain.ply", Path(folder) / f"packed{suffix}"  # suffix: the format
@@ -99,24 +190,21 @@ class Export:
                 packed.replace(path)
             return len(gaussians)
         calibration = self.model.calibration if virtual_scale is None else None
-        for note in write(path, gaussians, about, origin=self.model.origin, calibration=calibration):
-            self.console.note(note)
+        self.console.note(*write(path, gaussians, about, origin=self.model.origin, calibration=calibration))
         if suffix == ".ply" and any(self.model.origin):
             self.console.note("x, y and z are doubles, which SIBR and some other readers misread")
         return len(gaussians)
 
-    def write_folder(self, index: Path, levels: list[float]) -> list[int]:
-        """Writes a streaming or 3D Tiles set to a new folder; the number of Gaussians per level."""
-        index.parent.mkdir()
-        contents = [self.content(level) for level in levels]
+    def _write_set(self, index: Path) -> list[int]:
+        """Writes a streaming or 3D Tiles set to the folder of ``index``; the number of Gaussians per level."""
+        contents = [self._content(level) for level in self.dials]
         found = [gaussians for gaussians, _ in contents]
         counts = [len(gaussians) for gaussians in found]
         if self.args.folder == "--3dtiles":
             prepare_kernels(self.console, found[0].means.device, training=False)
             with self.console.meter("errors of levels") as meter:
                 errors = geometric_errors(found, looking(self.cameras), progress=meter)
-            for note in write_tileset(index.parent, found, errors.tolist(), origin=self.model.origin):
-                self.console.note(note)
+            self.console.note(*write_tileset(index.parent, found, errors.tolist(), origin=self.model.origin))
             return counts
         with TemporaryDirectory(dir=index.parent) as temporary:
             words: list[str | Path] = [*cutting_options(sum(counts))]
@@ -133,8 +221,7 @@ class Export:
         shown, losses = write_viewer_page(
             path, self.model, cameras=self.views, virtual_scale=virtual_scale, exact=self.args.exact
         )
-        for note in losses:
-            self.console.note(note)
+        self.console.note(*losses)
         if self.args.exact:
             return
         views = spread(self.views or self.model.cameras or place_cameras(self.gaussians, views=COMPARED), COMPARED)
@@ -144,8 +231,7 @@ class Export:
         self.console.note(f"{about}; --exact keeps all digits")
 
     def _transform(self, words: list[str | Path], out: Path, count: int) -> None:
-        tool = SplatTransform.find()
-        text = f"splat-transform packs {count:,} Gaussians"
+        tool, text = SplatTransform.find(), f"splat-transform packs {count:,} Gaussians"
         with self.console.status(f"{text} ...") as show:
             limit = time_limit(count)
             seconds = tool.run(*words, out, timeout=limit, progress=lambda s: show(f"{text}, {duration(s)} so far"))
@@ -155,7 +241,3 @@ class Export:
             self.console.note("coordinates are relative to the model's origin, which is dropped")
         if not tool.gpu and self.gaussians.sh_degree > 0 and out.suffix != ".ply":
             self.console.note("splat-transform runs without a GPU: its palette of spherical harmonics is coarser")
-
-    def _position(self, camera: Camera) -> str:
-        place = camera.position.double().tolist()
-        return f"({', '.join(f'{x + by:.9g}' for x, by in zip(place, self.model.origin, strict=True))})"

@@ -1,0 +1,43 @@
+"""The formats that ``clod-adapt export`` writes, and the names of its files."""
+
+from argparse import Namespace
+from collections.abc import Sequence
+from pathlib import Path
+
+from clod_adapter.errors import ClodError
+from clod_adapter.io import file_formats
+from clod_adapter.io.file_formats import Format
+
+PAGE = ".html"
+# Written by splat-transform, which sorts rows along a space-filling curve.
+PACKED = {
+    ".sog": Format(about=("8 to 16 bits, SH from a palette; by splat-transform",), ordered=False),
+    ".compressed.ply": Format(about=("8 to 11 bits; by splat-transform",), ordered=False),
+}
+FORMATS = {
+    **{suffix: file_formats.FORMATS[suffix] for suffix in file_formats.WRITABLE},
+    **PACKED,
+    PAGE: Format(
+        about=("the viewer with the splat, in one file;", "as .spz, or with --exact as float32"),
+        ordered=False, carries_sigma=True,
+    ),
+}  # fmt: skip
+STORE_FILTER = (".spz", ".safetensors", PAGE)  # formats in which every reader finds the screen-space filter
+FOLDERS = {"--lod-meta": "lod-meta.json", "--3dtiles": "tileset.json"}  # options that make OUT a folder, and its index
+
+
+def suffix_of(out: Path) -> str:
+    """The known suffix of ``out``, in lower case."""
+    found = [suffix for suffix in FORMATS if out.name.lower().endswith(suffix) and len(out.name) > len(suffix)]
+    if not found:
+        raise ClodError(f"{out}: --out must end in one of {', '.join(FORMATS)}, which is the format")
+    return max(found, key=len)  # .compressed.ply ends in .ply
+
+
+def is_page(args: Namespace) -> bool:
+    return Path(args.out).suffix.lower() == PAGE
+
+
+def level_paths(out: Path, levels: Sequence[float]) -> list[Path]:
+    suffix = out.name[-len(suffix_of(out)) :]
+    return [out.with_name(f"{out.name.removesuffix(suffix)}_s{level:g}{suffix}") for level in levels]
