@@ -2,7 +2,7 @@
 
 import io
 import warnings
-from argparse import ArgumentParser, Namespace
+from argparse import Namespace
 from collections.abc import Callable
 from contextlib import redirect_stdout
 from functools import partial
@@ -11,7 +11,7 @@ from typing import Any
 from clod_adapter._support.text import first_line
 from clod_adapter._support.version import package_version
 
-from .shared.console import WIDTH, Console
+from .shared.console import Console
 from .view import find_browser
 
 TORCH = "pip install --force-reinstall torch (https://pytorch.org has the command for a GPU)"
@@ -19,14 +19,6 @@ REINSTALL = "pip install --force-reinstall numba; if that does not help, report 
 NO_BROWSER = "clod-adapt view --no-browser --port 8000, and ssh -L 8000:127.0.0.1:8000 HOST where there is a browser"
 TOLERANCE = 2e-4  # RMS of colours in [0, 1]: rounding, and a pixel or two on the other side of a threshold
 RENDERERS = ("cpu", "gsplat")
-
-
-def add_arguments(parser: ArgumentParser) -> None:
-    """None but those of all commands."""
-
-
-def check(args: Namespace) -> None:
-    """Nothing can be wrong."""
 
 
 Found = tuple[bool, str, str]  # whether it works, the result, and a command to type or what to do
@@ -105,20 +97,15 @@ def outcome(name: str, check: Callable[[], Found]) -> dict[str, Any]:
     return {"name": name, "ok": ok, "found": found, "fix": fix}
 
 
-def line_of(found: dict[str, Any]) -> str:
-    """``name  ok/off  found  -> fix``; a long line has the fix below it."""
-    line, fix = f"{found['name']:<9}{'ok' if found['ok'] else 'off':<5}{found['found']}", found["fix"]
-    if fix and len(line) + len(fix) + 5 > WIDTH:
-        return f"{line}\n    -> {fix}"
-    return f"{line}  -> {fix}" if fix else line
-
-
 def execute(args: Namespace) -> dict[str, Any]:
     """Runs all checks; the report's exit code is 1 where nothing renders."""
     with Console(args.quiet).status("checking ..."):
         findings = [outcome(name, check) for name, check in CHECKS.items()]
     draws = [found["name"] for found in findings if found["ok"] and found["name"] in RENDERERS]
-    print("\n".join(line_of(found) for found in findings))
+    for each in findings:
+        print(f"{each['name']:<9}{'ok' if each['ok'] else 'off':<5}{each['found']}")
+        if each["fix"]:
+            print(f"    -> {each['fix']}")
     failed = "no rendering backend works: fix torch first, then the CPU backend"
     print(f"rendering and training backends: {', '.join(draws)}" if draws else failed)
     return {

@@ -9,6 +9,7 @@ import traceback
 from contextlib import nullcontext, redirect_stdout
 from difflib import get_close_matches
 from importlib import import_module
+from types import ModuleType
 
 from clod_adapter._support.text import as_text
 from clod_adapter._support.version import package_version
@@ -16,7 +17,7 @@ from clod_adapter.errors import ClodError
 from clod_adapter.progress import Stopped
 
 from . import adapt, apply, demo, doctor, evaluate, export, inspect, render, robustness, view
-from .shared.command import Command, Parser, parser_of
+from .shared.command import Parser, parser_of
 from .shared.console import Console
 from .shared.outputs import Outputs, claimed, jsonable
 from .shared.process import (
@@ -44,8 +45,10 @@ Give a trained 3D Gaussian splat a quality dial:
   {PROG} --help             all options and commands
 """
 
-# Adapting is the main command and has no name.
-COMMANDS: dict[str, Command] = {
+# Each has SUMMARY, DESCRIPTION, USAGE, EPILOG, and execute(args), which gives what --json prints, or None; it may have
+# add_arguments(parser), check(args), and outputs(args), which is called after it. It imports torch within functions, so
+# that --help and the errors of check take no second. Adapting is the main command and has no name.
+COMMANDS: dict[str, ModuleType] = {
     "view": view, "inspect": inspect, "eval": evaluate, "render": render, "export": export, "apply": apply,
     "robustness": robustness, "demo": demo, "doctor": doctor,
 }  # fmt: skip
@@ -80,8 +83,8 @@ def _main(words: list[str]) -> int:
             if not words:
                 print(FIRST, end="")
                 return 0
-            if not name:
-                check_command(words)
+            if not name and not os.path.exists(words[0]) and (near := get_close_matches(words[0], COMMANDS, 1, NEAR)):
+                raise ClodError(f"{words[0]}: no such file or command; did you mean {PROG} {near[0]}?")
             args = build_parser(name).parse_args(words[1:] if name else words)
             return run_here(COMMANDS.get(name, adapt), args)
     except ClodError as error:
@@ -97,13 +100,7 @@ def _main(words: list[str]) -> int:
         return refuse(f"{name}{error.strerror or error}; check the path and its permissions", 2, words)
 
 
-def check_command(words: list[str]) -> None:
-    """Refuses a first word that is no file and nearly the name of a command."""
-    if words and not os.path.exists(words[0]) and (near := get_close_matches(words[0], COMMANDS, 1, NEAR)):
-        raise ClodError(f"{words[0]}: no such file or command; did you mean {PROG} {near[0]}?")
-
-
-def run_here(command: Command, args: argparse.Namespace) -> int:
+def run_here(command: ModuleType, args: argparse.Namespace) -> int:
     """Runs a command and returns its exit code. Of several processes the first runs it; the others only train."""
     launch = launched()
     if launch.size == 1:
@@ -120,12 +117,13 @@ def run_here(command: Command, args: argparse.Namespace) -> int:
         return run(command, args)
 
 
-def run(command: Command, args: argparse.Namespace) -> int:
+def run(command: ModuleType, args: argparse.Namespace) -> int:
     """Runs a command, prints its report with --json, and returns the report's exit code, or 0."""
     check_surroundings()
     if args.json:
         check_printed()
-    command.check(args)
+    if hasattr(command, "check"):
+        command.check(args)
     outputs = command.outputs(args) if hasattr(command, "outputs") else Outputs()
     with signals_as_interrupt(), claimed(outputs):
         if command not in WITHOUT_TORCH:

@@ -7,11 +7,11 @@ import argparse
 import shutil
 from itertools import groupby
 from pathlib import Path
+from types import ModuleType
 
 import clod_adapter
 from clod_adapter.cli import adapt
 from clod_adapter.cli.main import COMMANDS, PROG, build_parser
-from clod_adapter.cli.shared.command import Command
 from clod_adapter.config import AdaptConfig, AttenuationConfig, field_descriptions
 
 HERE = Path(__file__).resolve().parent
@@ -47,7 +47,7 @@ def commands_page() -> str:
     return "\n".join(parts + [command_section(name, each) for name, each in [("", adapt), *COMMANDS.items()]])
 
 
-def command_section(name: str, command: Command) -> str:
+def command_section(name: str, command: ModuleType) -> str:
     """The section of one command; the empty name is ``clod-adapt PLY``."""
     title = f"{PROG} {name}".strip()
     rows = [option_row(action) for action in build_parser(name)._actions if action.dest != "help"]

@@ -6,7 +6,7 @@ import math
 from argparse import ArgumentParser, Namespace, RawDescriptionHelpFormatter
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn, Protocol
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from clod_adapter.config import DEVICES, FILTERS
 from clod_adapter.errors import ClodError
@@ -25,32 +25,14 @@ if TYPE_CHECKING:
 MANUAL = "index.md"  # the first page; where it is installed: pyproject.toml's data-files
 
 
-class Command(Protocol):
-    """The module of a command; it may also have ``outputs``, which is called after ``check``.
-
-    It imports torch within functions, so that ``--help`` and the errors of ``check`` take no second.
-    """
-
-    SUMMARY: str
-    DESCRIPTION: str
-    USAGE: str
-    EPILOG: str
-
-    def add_arguments(self, parser: ArgumentParser) -> None: ...
-
-    def check(self, args: Namespace) -> None: ...
-
-    def execute(self, args: Namespace) -> dict[str, Any] | None:
-        """The object that --json prints, or None."""
-
-
-def parser_of(command: Command, prog: str) -> Parser:
+def parser_of(command: Any, prog: str) -> Parser:
     """The parser, with the options that all commands have."""
     parser = Parser(
         prog=prog, usage=f"{prog} {command.USAGE}", description=command.DESCRIPTION, epilog=command.EPILOG,
         formatter_class=RawDescriptionHelpFormatter, add_help=False, allow_abbrev=False,
     )  # fmt: skip
-    command.add_arguments(parser)
+    if hasattr(command, "add_arguments"):
+        command.add_arguments(parser)
     parser.general = parser.add_argument_group("general")
     parser.general.add_argument("-h", "--help", action="help", help="show this text")
     if parser.get_default("quiet") is None:
