@@ -136,16 +136,6 @@ def test_target_images_of_blocks_add_up_to_the_photograph(captured: tuple[Gaussi
     torch.testing.assert_close(asked, view.image / 255 - picture.clamp(0, 1), rtol=0, atol=BLOCKS / 255)
 
 
-def test_merging_takes_each_row_from_its_block(divided: Division, learned: list[Learned]) -> None:
-    whole = merge(divided, learned)
-    for part in learned:
-        assert "growth_d" in part.values
-        for name, values in part.values.items():
-            assert torch.equal(getattr(whole, name)[part.rows], values), name
-            assert not torch.equal(values, getattr(divided.initial, name)[part.rows]), name
-    assert torch.equal(whole.shN, divided.initial.shN)
-
-
 def test_blocks_match_undivided_training(
     captured: tuple[Gaussians, Scene], divided: Division, learned: list[Learned]
 ) -> None:
@@ -164,18 +154,6 @@ def test_blocks_match_undivided_training(
     # The second pass brings the blocks into accord.
     before, after = (evaluate(g, scene.train, (3.0, 5.0)) for g in (first, whole))
     assert sum(row.psnr for row in after) > sum(row.psnr for row in before) + 0.5
-
-
-def test_a_block_resumes_with_the_same_bits(
-    captured: tuple[Gaussians, Scene], divided: Division, learned: list[Learned]
-) -> None:
-    states, views = dict[int, TrainingState](), captured[1].train
-    once, _ = adapt_block(divided, views, CONFIG, 1, progress=states_of({30}, states))
-    again, outcome = adapt_block(divided, views, CONFIG, 1, resume=states[30])
-    assert outcome.steps == 0.75 * divided.steps(1, CONFIG)
-    for part in (again, learned[1]):
-        assert part.values.keys() == once.values.keys()
-        assert all(torch.equal(value, once.values[name]) for name, value in part.values.items())
 
 
 def test_growth_is_drawn_in_the_context(divided: Division, captured: tuple[Gaussians, Scene]) -> None:

@@ -10,21 +10,16 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from safetensors.torch import load_file
 
 import clod_adapter
 from clod_adapter.cli.adapt import listeners, run
-from clod_adapter.cli.shared import measure, pages
+from clod_adapter.cli.shared import measure
 from clod_adapter.training import planner
 from clod_adapter.training.state import load_state
 from runs import OUTPUTS, STATE, Server, log_of, names, pressing, wait_for
 from scenes import stripped
 
 ITERS = 24
-IN_BLOCKS = (
-    "from dataclasses import replace; from clod_adapter.cli.adapt import prepare; real = prepare.plan_for_limit\n"
-    "prepare.plan_for_limit = lambda *given: replace(real(*given), blocks=3)"
-)
 
 
 @pytest.fixture(scope="module")
@@ -58,8 +53,8 @@ def assert_whole(folder: Path) -> None:
             json.loads(path.read_text())
         elif name.endswith(".resume.safetensors"):
             load_state(path)
-        elif not name.startswith(".tmp-"):  # a block, or the initialization of all
-            assert load_file(path)
+        else:
+            assert name.startswith(".tmp-"), name
 
 
 def assert_same(folder: Path, want: Path) -> None:
@@ -72,30 +67,20 @@ def assert_same(folder: Path, want: Path) -> None:
     assert found["steps"] == wanted["steps"] and not found["interrupted"]
 
 
-@pytest.mark.parametrize(("more", "prepare"), [((), ""), (("--memory", "8GB"), IN_BLOCKS)], ids=["whole", "blocks"])
-def test_kills(
-    server: Server, words: list[Any], capture: Any, tmp_path: Path, more: tuple[str, ...], prepare: str
-) -> None:
-    """A run that replaces earlier files is killed soon after a state or block was saved, and later, and resumed."""
-    inputs, folders = fingerprints(capture.ply, capture.scene), [tmp_path / "want", tmp_path / "killed"]
-    for folder in folders:
-        folder.mkdir()
-    assert server.run(folders[1], *words, "--seed", 4)[0] == 0
-    started = [server.start(folder, *words, *more, before=prepare) for folder in folders]
-    assert server.wait(started[0]) == 0, log_of(folders[0])
-    child = started[1]
+def test_kills(server: Server, words: list[Any], capture: Any, undisturbed: Path, tmp_path: Path) -> None:
+    """A run that replaces earlier files is killed soon after a state was saved, and later, and resumed."""
+    inputs = fingerprints(capture.ply, capture.scene)
+    assert server.run(tmp_path, *words, "--seed", 4)[0] == 0
+    child = server.start(tmp_path, *words)
     for delay in (0.0, 0.4):
-        until = time.monotonic() + 60
-        while not list(folders[1].glob("dial.*.safetensors")) and not server.ask(ended=child):
-            assert time.monotonic() < until
-            time.sleep(0.002)
+        wait_for(tmp_path / STATE)
         time.sleep(delay)
         os.kill(child, signal.SIGKILL)
-        assert server.wait(child) in (0, -signal.SIGKILL) and "Traceback" not in log_of(folders[1])
-        assert_whole(folders[1])
-        child = server.start(folders[1], *words, *more, "--resume", before=prepare)
-    assert server.wait(child) == 0, log_of(folders[1])
-    assert_same(folders[1], folders[0])
+        assert server.wait(child) in (0, -signal.SIGKILL) and "Traceback" not in log_of(tmp_path)
+        assert_whole(tmp_path)
+        child = server.start(tmp_path, *words, "--resume")
+    assert server.wait(child) == 0, log_of(tmp_path)
+    assert_same(tmp_path, undisturbed)
     assert fingerprints(capture.ply, capture.scene) == inputs
 
 
@@ -130,11 +115,9 @@ ABORTED = f"--resume resumes from step {ITERS}, which is in {STATE}\nclod-adapt:
 MOMENTS = [  # where signals arrive, which, exit code, files, and the report's "interrupted" or the end of stderr
     ((planner, "sh_degree_losses"), [INT], 130, [], "clod-adapt: interrupted"),
     (SAVING, [signal.SIGUSR1] * 3, 0, BOTH, True),
-    (SAVING, [signal.SIGHUP] * 3, 0, BOTH, True),
     ((run, "extract"), [INT], 0, BOTH, False),
     ((run, "save_adapter"), [INT, TERM], 130, [STATE], ABORTED),
     ((run, "save"), [INT], 0, OUTPUTS, False),  # the files without the page
-    ((pages, "pictures"), [INT], 0, OUTPUTS, False),
 ]
 
 

@@ -36,12 +36,6 @@ def lost(pair: Pair, result: Gaussians, begun: Gaussians) -> float:
     return decibels_below(*errors)
 
 
-def test_sound_training_is_left_alone(many: Pair) -> None:
-    result, begun = run(many, 1), initialize(many[0], many[1].train, config_of())
-    assert result.watched is not None and result.watched.rollbacks == 0 and not result.watched.frozen
-    assert lost(many, result.gaussians, begun) < 0
-
-
 def test_diverging_training_is_undone_and_resumes_to_the_same_bits(many: Pair) -> None:
     config, states = config_of(iters=40).lighter(30.0), dict[int, TrainingState]()
     whole = adapt(*many, config, states_of({20}, states))

@@ -10,12 +10,10 @@ import torch
 from clod_adapter.adapter import ATTRIBUTES, DIAL, with_dial
 from clod_adapter.cameras import Scene
 from clod_adapter.config import AdaptConfig
-from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.importance import initialize, removal_error
 from clod_adapter.render import render
 from clod_adapter.training.dial import TrainableSubset
-from clod_adapter.training.loop import adapt
 from clod_adapter.training.plan import NAMES, NOT_NEEDED, RATES, Decision, Override, Plan, largest_change
 from clod_adapter.training.planner import make_plan, needed_share, seen, sh_degree_losses
 from clod_adapter.training.state import TrainingState
@@ -139,13 +137,6 @@ def test_each_decision_can_be_overridden(visible: Pair, name: str) -> None:
     assert all(decision.why.startswith("as requested") for decision in gone.decisions if decision.name != "unseen")
 
 
-def test_impossible_overrides_are_refused() -> None:
-    with pytest.raises(ClodError, match=r"'colour' is not part of a plan; the names are bands, unseen, means"):
-        Override(keep=frozenset({"colour"}))
-    with pytest.raises(ClodError, match="'quats' is both kept and left out"):
-        Override(frozenset({"quats", "bands"}), frozenset({"quats"}))
-
-
 def test_unseen_gaussians_are_kept_where_another_dial_value_may_show_them(visible: Pair) -> None:
     """Of a base with a dial, in the paper's form, and of a checkpoint that is invisible altogether."""
     base, scene = with_unseen(visible[0])[0], visible[1]
@@ -158,15 +149,6 @@ def test_unseen_gaussians_are_kept_where_another_dial_value_may_show_them(visibl
     assert make_plan(with_dial(base), scene, CONFIG, asked).kept is not None
     faint = base.replace(opacity_logits=torch.full_like(base.opacity_logits, -9.0))
     assert make_plan(faint, scene, CONFIG).kept is None
-
-
-def test_training_is_the_same_if_nothing_is_left_out(visible: Pair) -> None:
-    base, scene = visible
-    plan = make_plan(base, replace(scene, left_out=(("undistortion", "the cameras are pinholes"),)), CONFIG)
-    assert plan.decisions[-1] == Decision("undistortion", NOT_NEEDED, None, "", "the cameras are pinholes")
-    assert plan.kept is None and plan.config == CONFIG and not plan.trims(base)
-    planned = plan.adapt(scene).gaussians
-    assert_equal(plan.whole(base, planned), adapt(plan.start, scene, CONFIG).gaussians)
 
 
 def test_a_resumed_plan_gives_the_same_bits(visible: Pair) -> None:
@@ -186,16 +168,3 @@ def test_a_resumed_plan_gives_the_same_bits(visible: Pair) -> None:
         assert torch.equal(getattr(found, name)[~kept], getattr(others, name)[~kept]), name
         assert torch.equal(getattr(found, name)[kept], getattr(lean, name)), name
     assert torch.equal(found.means, base.means) and not torch.equal(found.quats, base.quats)
-
-
-def test_what_is_left_out_returns_to_its_place(visible: Pair) -> None:
-    """Tuned SH degrees among those that are not; and no growth where there is to be none."""
-    (base, _), scene = with_unseen(visible[0]), visible[1]
-    more = base.replace(shN=torch.cat([base.shN, 1e-6 * torch.ones(len(base), 5, 3)], 1))
-    plan = make_plan(more, scene, replace(CONFIG, lr_shN=1e-2, iters=3))
-    whole = plan.whole(more, plan.adapt(scene).gaussians)
-    assert plan.sh_degree == 1 and torch.equal(whole.shN[:, 3:], more.shN[:, 3:])
-    assert not torch.equal(whole.shN[:, :3], more.shN[:, :3])
-    grown = initialize(base, scene.train, CONFIG)
-    plan = make_plan(grown, scene, replace(CONFIG, iters=2, growth="off"), Override(leave_out=frozenset({"bands"})))
-    assert plan.trims(grown) and plan.whole(grown, plan.adapt(scene).gaussians).growth_d is None

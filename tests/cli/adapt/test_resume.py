@@ -21,9 +21,7 @@ from safetensors.torch import load_file, save_file
 
 from clod_adapter._support.version import package_version
 from clod_adapter.cli.adapt import listeners
-from clod_adapter.cli.adapt import run as adapt_run
 from clod_adapter.cli.adapt.listeners import Saver
-from clod_adapter.cli.shared import pages
 from clod_adapter.cli.shared.console import Console
 from clod_adapter.cli.shared.process import GracefulStop
 from clod_adapter.config import AdaptConfig
@@ -58,7 +56,7 @@ def places(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
     return [*([path] if path else []), *(place for key, each in below for place in places(each, (*path, key)))]
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(data=st.data())
 def test_damaged_states_are_refused_or_harmless(state: Any, data: Any) -> None:
     """Entries of another type or out of range, or missing, at any depth; tensors of other shapes, types or values."""
@@ -189,10 +187,6 @@ def test_the_state_is_recent_and_saving_takes_a_small_share_of_the_time(
     assert max(ages[2:]) <= oldest and save * (len(saved) - 1) / clock[0] <= share
 
 
-def full(*_: Any, **__: Any) -> None:
-    raise ClodError("dial.ply: cannot be written")
-
-
 def spoil(found: Any) -> Any:
     return replace(found, loss=math.nan)
 
@@ -201,11 +195,10 @@ BOTH = sorted([*OUTPUTS, STATE])
 ROWS: list[Any] = [  # what breaks, exit code, the step that is saved, files
     (lambda patch: change_step(patch, 6, fail), 1, 5, [STATE]),
     (lambda patch: change_step(patch, 6, spoil), 1, 5, BOTH),
-    (lambda patch: patch.setattr(adapt_run, "save", full), 2, 12, [STATE]),
 ]
 
 
-@pytest.mark.parametrize(("broken", "code", "step", "files"), ROWS, ids=["step", "loss", "full disk"])
+@pytest.mark.parametrize(("broken", "code", "step", "files"), ROWS, ids=["step", "loss"])
 def test_resuming_after_an_error(
     clod: Any, capture: Any, dialled: Path, tmp_path: Path, broken: Any, code: int, step: int, files: list[str]
 ) -> None:
@@ -226,17 +219,3 @@ def test_resuming_after_an_error(
     assert names(tmp_path) == OUTPUTS
     for suffix in (".ply", ".safetensors"):
         assert stripped((tmp_path / f"dial{suffix}").read_bytes()) == stripped(dialled.with_suffix(suffix).read_bytes())
-
-
-def test_error_in_the_page(clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """All other files are written, and no state remains; gradients that are not finite move nothing."""
-
-    def without_a_gradient(found: Any) -> Any:
-        found.gradients["quats"][5] = math.nan
-        return found
-
-    change_step(monkeypatch, 6, without_a_gradient)
-    monkeypatch.setattr(pages.AdaptPage, "write", fail)
-    done = clod(capture.ply, "--images", capture.scene, *TINY, "--report")
-    assert done.code == 1 and names(tmp_path) == OUTPUTS and "--resume" not in done.err, done
-    assert "1 Gaussians were not moved by some steps: their gradients" in done.err, done

@@ -14,7 +14,6 @@ from PIL import Image
 from plyfile import PlyData
 
 import clod_adapter
-from clod_adapter.cli.adapt import run
 from clod_adapter.cli.shared import inputs
 from clod_adapter.cli.shared.measure import machine_name
 from clod_adapter.config import AdaptConfig
@@ -153,32 +152,6 @@ def test_dial_of_the_checkpoint_is_continued(clod: Any, capture: Any, dialled: P
     assert growth_d is not None and not growth_d.any()
 
 
-def test_apply_with_another_version(clod: Any, capture: Any, dialled: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("importlib.metadata.version", lambda name: "99.0")
-    assert clod("--version").out == "clod-adapt 99.0\n"
-    done = clod("apply", capture.ply, dialled.with_suffix(".safetensors"), "-o", "again.ply")
-    assert (
-        "300 Gaussians with sigma_d and growth_d" in done.out and Path("again.ply").read_bytes() == dialled.read_bytes()
-    )
-
-
-def test_outputs_replace_earlier_ones_together(
-    clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Once, after the measurement."""
-    for name in OUTPUTS:
-        (tmp_path / name).write_text(EARLIER)
-    save, seen = run.save, []
-
-    def watched(*args: Any, **rest: Any) -> None:
-        save(*args, **rest)
-        seen.append({(tmp_path / name).read_text() for name in OUTPUTS})
-
-    monkeypatch.setattr(run, "save", watched)
-    assert clod(capture.ply, "--images", capture.scene, *TINY).code == 0
-    assert seen == [{EARLIER}] and names(tmp_path) == OUTPUTS
-
-
 def test_without_held_out_photographs(clod: Any, capture: Any, tmp_path: Path) -> None:
     view = clod_adapter.load_scene(capture.scene).train[0]
     (tmp_path / "one" / "images").mkdir(parents=True)
@@ -208,15 +181,6 @@ def test_without_photographs(clod: Any, capture: Any, tmp_path: Path, monkeypatc
     assert rebuilt(clod, capture.ply, tmp_path) and report["calibration"]["against"] == "checkpoint"
     (note, *_) = json.loads(clod("export", "dial.ply", "--psnr-drop", 1, "-o", "plain.ply", "--json").out)["notes"]
     assert "without photographs, against renders of the checkpoint" in note
-
-
-def test_ci_banana(clod: Any, ci_banana: Path) -> None:
-    done = clod(
-        ci_banana / "pretrained.ply", "--images", ci_banana / "images", "--iters", 5, "--out", "dial.ply", "--json"
-    )
-    report = json.loads(done.out)
-    assert report["base_count"] == 20_000 and report["base_rows"][0]["psnr"] == pytest.approx(25.81, abs=0.02)
-    assert report["rows"][-1]["kept_share"] < 0.3
 
 
 def test_unusual_inputs(clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
