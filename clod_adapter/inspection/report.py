@@ -18,7 +18,7 @@ from clod_adapter.io.file_formats import read_source
 from clod_adapter.io.ply import MASK_COLUMNS, column_map
 from clod_adapter.io.ply_packed import is_packed
 from clod_adapter.io.ply_settings import COLUMN, PREFIX
-from clod_adapter.io.settings import Source, matching_calibration, stated_filter
+from clod_adapter.io.settings import ADAPTER, Source, matching_calibration, stated_filter
 from clod_adapter.io.values import FILTER, choice_of, dial_columns, in_question, prepared
 from clod_adapter.origin import Origin
 
@@ -190,7 +190,7 @@ def _list(names: Sequence[str]) -> str:
 
 def _inspect_tensors(path: Path) -> tuple[str, dict[str, Any], tuple[str, ...]] | None:
     """The kind of such a file, plain JSON about it, and notes; None where it is neither."""
-    from clod_adapter.io.adapter_file import FORMAT, load_adapter
+    from clod_adapter.io.adapter_file import load_adapter
     from clod_adapter.io.file_formats import KEY
     from clod_adapter.io.tensor_file import read_tensor_header
     from clod_adapter.training.state import KEY as STATE_KEY
@@ -198,7 +198,7 @@ def _inspect_tensors(path: Path) -> tuple[str, dict[str, Any], tuple[str, ...]] 
     metadata = read_tensor_header(path)[1]
     if STATE_KEY in metadata:
         return "the state of an interrupted run, for --resume", _state(path), ()
-    if KEY in metadata and f'"{FORMAT}"' in metadata[KEY]:
+    if KEY in metadata and f'"{ADAPTER}"' in metadata[KEY]:
         adapter = load_adapter(path)
         return "an adapter: what clod-adapt learned, without its checkpoint", _adapter(adapter), adapter.notes
     return None

@@ -18,10 +18,17 @@ from clod_adapter.config import CLASSIC
 from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.file_formats import KEY
-from clod_adapter.io.settings import DAMAGE, Metadata, damaged, document, parse_document, read_metadata
+from clod_adapter.io.settings import (
+    ADAPTER,
+    DAMAGE,
+    Metadata,
+    damaged,
+    document,
+    document_text,
+    parse_document,
+    read_metadata,
+)
 from clod_adapter.io.tensor_file import load_tensors, read_tensor_header, write_tensors
-
-FORMAT, FORMAT_VERSION = "clod-adapter", 3
 
 
 def save_adapter(path: str | Path, adapter: Adapter) -> None:
@@ -31,17 +38,16 @@ def save_adapter(path: str | Path, adapter: Adapter) -> None:
         ClodError: its config is not plain JSON, or the file cannot be written.
     """
     check_config(adapter.config)
-    settings = adapter.attenuation, adapter.screen_filter, adapter.origin, adapter.calibration
-    about = document(FORMAT, FORMAT_VERSION, *settings)
-    about |= {"package_version": adapter.version, "base_sha256": adapter.base_fingerprint, "config": adapter.config}
-    if adapter.kept is not None or adapter.sh_degree is not None:
-        about["trimmed"] = {"base_count": adapter.base_count, "sh_degree": adapter.sh_degree}
-    metadata = {KEY: json.dumps(about, sort_keys=True, allow_nan=False)}
-    tensors = {**dial_tensors(adapter), **adapter.updates}
-    if adapter.kept is not None:
-        tensors["kept"] = torch.from_numpy(np.packbits(adapter.kept.cpu().numpy()))
+    a = adapter
+    about = document(ADAPTER, Metadata(a.attenuation, a.screen_filter, a.calibration, a.origin, version=a.version))
+    about |= {"base_sha256": a.base_fingerprint, "config": a.config}
+    if a.kept is not None or a.sh_degree is not None:
+        about["trimmed"] = {"base_count": a.base_count, "sh_degree": a.sh_degree}
+    tensors = {**dial_tensors(a), **a.updates}
+    if a.kept is not None:
+        tensors["kept"] = torch.from_numpy(np.packbits(a.kept.cpu().numpy()))
     with atomic_path(path) as temporary:
-        write_tensors(temporary, tensors, metadata)
+        write_tensors(temporary, tensors, {KEY: document_text(about)})
         _description(temporary, read_tensor_header(temporary)[1])  # it can be read again
 
 
@@ -91,8 +97,7 @@ def _description(path: Path, metadata: dict[str, str]) -> tuple[dict[str, Any], 
     """The JSON document of an adapter, and the settings in it; refuses another file."""
     if KEY not in metadata:
         raise ClodError(f"{path}: is a safetensors file but not an adapter; give a file that this package wrote")
-    wrong = "is not an adapter but {}; give what clod-adapt wrote beside its PLY; a 'clod-model' needs no adapter"
-    about = parse_document(path, metadata[KEY], FORMAT, FORMAT_VERSION, wrong)
+    about = parse_document(path, metadata[KEY], ADAPTER)
     for name, wanted in (("base_sha256", str), ("package_version", str), ("config", dict)):
         if not isinstance(about.get(name), wanted):
             raise damaged(path, TypeError(f"{name} is {about.get(name)!r:.40}, not a {wanted.__name__}"))

@@ -22,9 +22,10 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.hook import Hook
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.file_formats import PLY, check_suffix, check_written, format_of, read_source, write
-from clod_adapter.io.ply import column_map, write_rows
+from clod_adapter.io.ply import column_map
 from clod_adapter.io.ply_settings import PREFIX
-from clod_adapter.io.settings import WARNING, History, matching_calibration, stated_filter, tagged, that_fit
+from clod_adapter.io.ply_write import write_rows
+from clod_adapter.io.settings import WARNING, Metadata, matching_calibration, stated_filter, tagged, that_fit
 from clod_adapter.io.values import SIGMA, Activated, prepared
 from clod_adapter.origin import NOWHERE, Origin
 
@@ -231,8 +232,10 @@ def save(
         for note in write(path, gaussians, about, origin=origin, calibration=calibration):
             warnings.warn(f"{path}: {note}", stacklevel=2)
         return
+    g = in_world_units(gaussians)
+    metadata = Metadata(g.attenuation, g.screen_filter, calibration, origin, about, version or "")
     with atomic_path(path) as temporary:
-        write_rows(temporary, in_world_units(gaussians), History(about, origin, calibration), vertex, version)
+        write_rows(temporary, g, metadata, vertex)
         check_written(temporary)
 
 

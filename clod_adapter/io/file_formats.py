@@ -25,7 +25,7 @@ class Format(NamedTuple):
     """A format. Its module has ``read``, of a path to a ``Source``.
 
     If it carries sigma_d also ``has_dial``, of a file that was checked; if it is written also ``write``, of a path,
-    Gaussians in world units and a ``History``, to a line for each loss.
+    Gaussians in world units and their ``Metadata``, to a line for each loss.
     """
 
     module: str = ""  # under ``clod_adapter.io``, imported when it is used
@@ -33,13 +33,14 @@ class Format(NamedTuple):
     carries_sigma: bool = False  # whether the dial is written: sigma_d, growth_d and their settings
     about: tuple[str, ...] = ()  # where it is written, the precision of its values; lines of at most 54 letters
     ordered: bool = True  # whether the rows keep their order
+    writer: str = ""  # the module with ``write``, where it is another
 
 
 KEY = "clod_adapter"  # of the JSON document in formats other than PLY
 _GLB = "float32, SH degree up to 3", "(KHR_gaussian_splatting, _SIGMA_D, _GROWTH_D)"
 _SPZ = ("6 to 24 bits, SH degree up to 3, the dial 16-bit floats",)
 _CONVERTED = Format("formats.splat_transform", "formats.splat_transform.check")
-PLY = Format("ply", "ply.check", carries_sigma=True, about=("exact; baked, in Inria's layout",))
+PLY = Format("ply", "ply.check", carries_sigma=True, about=("exact; baked, in Inria's layout",), writer="ply_write")
 FORMATS = {
     ".ply": PLY,
     ".glb": Format("formats.glb", carries_sigma=True, about=_GLB),
@@ -118,11 +119,12 @@ def write(
     if gaussians.sigma_d is not None and not form.carries_sigma:
         raise ClodError(f"{path}: {Path(path).suffix} has no room for a dial; choose a dial value to bake")
     from clod_adapter.equation.units import in_world_units  # here: the table needs no torch
-    from clod_adapter.io.settings import History
+    from clod_adapter.io.settings import Metadata
 
-    history = History(tuple(about), origin, calibration)
+    gaussians = in_world_units(gaussians)
+    metadata = Metadata(gaussians.attenuation, gaussians.screen_filter, calibration, origin, tuple(about))
     with atomic_path(path) as temporary:
-        notes: tuple[str, ...] = _call(f"{form.module}.write", temporary, in_world_units(gaussians), history)
+        notes: tuple[str, ...] = _call(f"{form.writer or form.module}.write", temporary, gaussians, metadata)
         check_written(temporary)
     return notes
 

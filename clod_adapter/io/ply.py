@@ -1,4 +1,4 @@
-"""PLY files of Gaussians, by plyfile: names of columns, headers, reading, and writing an extended file.
+"""PLY files of Gaussians, by plyfile: names of columns, headers, and reading.
 
 Any property order, byte order or ascii; plain, or PlayCanvas's compressed layout (``ply_packed``).
 """
@@ -12,7 +12,6 @@ import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from plyfile import PlyData, PlyElement, PlyListProperty, PlyParseError
@@ -21,16 +20,11 @@ from clod_adapter.config import SH_COUNTS
 from clod_adapter.errors import ClodError
 from clod_adapter.io import file_formats
 from clod_adapter.io.ply_packed import NOTE, check_packed, is_packed, unpack
-from clod_adapter.io.ply_settings import COLUMN, constants_of, ply_metadata, write_comments
-from clod_adapter.io.settings import History, Source
-from clod_adapter.io.values import FILTER, GROWTH, MASKS, ROWS, SIGMA, Arrays, arrays_of, degree_of, dial_columns
-from clod_adapter.origin import NOWHERE, Origin, relative
-
-if TYPE_CHECKING:
-    from clod_adapter.gaussians import Gaussians
+from clod_adapter.io.ply_settings import ply_metadata
+from clod_adapter.io.settings import Source
+from clod_adapter.io.values import FILTER, GROWTH, MASKS, ROWS, SIGMA, Arrays, degree_of, dial_columns
 
 MASK_COLUMNS = ("masks_0", "masks_1")
-_XYZ = ("x", "y", "z")
 HEADER_LIMIT = 1 << 20  # bytes
 _LONGEST = 1 << 20  # characters of a row of text
 
@@ -129,13 +123,15 @@ def read(path: Path) -> Source:
         raise ClodError(f"{path}: damaged or truncated ({error}); copy or export it again") from error
     comments, sha256 = all_comments(head.ply), hashlib.sha256(data.data).hexdigest()
     if is_packed(head.ply):
-        arrays = unpack(path, elements, degree)
         metadata = ply_metadata(path, comments, dial=False)
-        return Source(arrays, metadata, sha256, (NOTE,), comments, head=head)
+        return Source(unpack(path, elements, degree), metadata, sha256, (NOTE,), comments, head=head)
     rows = elements["vertex"]
     arrays = _arrays(rows, degree)
     metadata = ply_metadata(path, comments, rows, dial=SIGMA in arrays)
-    return Source(arrays, metadata, sha256, _not_kept(head.ply), comments, not metadata.described, rows, head)
+    parts = [f"element {element.name}" for element in head.ply if element.name != "vertex"]
+    parts += ["obj_info"] if head.ply.obj_info else []
+    notes = (f"not carried over to outputs: {', '.join(parts)}",) if parts else ()
+    return Source(arrays, metadata, sha256, notes, comments, not metadata.described, rows, head)
 
 
 def _elements(data: np.ndarray, head: Head) -> dict[str, np.ndarray]:
@@ -172,7 +168,7 @@ def _arrays(rows: np.ndarray, sh_degree: int) -> Arrays:
     groups = column_map(sh_degree) | dial_columns(names)
     groups |= {MASKS: MASK_COLUMNS} if set(MASK_COLUMNS) <= set(names) else {}
     groups |= {FILTER: (FILTER,)} if FILTER in names else {}
-    kinds = {"means": np.float64} if "f8" in {rows.dtype[name].str[1:] for name in _XYZ} else {}
+    kinds = {"means": np.float64} if "f8" in {rows.dtype[name].str[1:] for name in "xyz"} else {}
     found = {key: np.empty((len(rows), len(group)), kinds.get(key, np.float32)) for key, group in groups.items()}
     with np.errstate(over="ignore", invalid="ignore"):  # invalid: a NaN that signals
         for start in range(0, len(rows), ROWS):  # a block stays in cache, which is 8 times faster
@@ -192,31 +188,20 @@ def _degree(path: Path, header: PlyData) -> int:
     return check_packed(path, header) if is_packed(header) else sh_degree_of(path, header)
 
 
-def _not_kept(header: PlyData) -> tuple[str, ...]:
-    """A note on the parts of the file that an output will not have."""
-    parts = [f"element {element.name}" for element in header if element.name != "vertex"]
-    parts += ["obj_info"] if header.obj_info else []
-    return (f"not carried over to outputs: {', '.join(parts)}",) if parts else ()
-
-
 def _check_length(path: Path, head: Head, length: int) -> None:
     """Refuses a file that is too short for the least bytes that the rows of its header take."""
-    least = head.size - (1 if head.ply.text else 0)  # the last line may lack its end
+    text = head.ply.text
+    least = head.size - text
     for element, count in head.elements:
-        least += count * _least_bytes(element, head.ply.text)
+        kinds = [p.len_dtype if isinstance(p, PlyListProperty) else p.val_dtype for p in element.properties]
+        # Of text a digit, and a space or line end, which the last line may lack.
+        least += count * (max(1, 2 * len(kinds)) if text else sum(np.dtype(kind).itemsize for kind in kinds))
     if least > length:
         rows = ", ".join(f"{count} of {element.name}" for element, count in head.elements)
         raise ClodError(
             f"{path}: is truncated, or its header is damaged: it claims {rows}, which take at least {least} bytes, "
             f"and the file has {length}; copy or export it again"
         )
-
-
-def _least_bytes(element: PlyElement, text: bool) -> int:
-    if text:
-        return max(1, 2 * len(element.properties))  # a digit and a space or line end
-    kinds = [p.len_dtype if isinstance(p, PlyListProperty) else p.val_dtype for p in element.properties]
-    return sum(np.dtype(kind).itemsize for kind in kinds)
 
 
 def sh_degree_of(path: Path, header: PlyData) -> int:
@@ -254,78 +239,3 @@ def _refuse_foreign(path: Path, names: set[str]) -> None:
         raise ClodError(
             f"{path}: property scale_2 is missing, so this is a 2DGS file of flat disks; use a 3DGS checkpoint"
         )
-
-
-def write(path: Path, gaussians: Gaussians, history: History) -> tuple[str, ...]:
-    """Writes Gaussians without a base, every value unchanged but opacity = +inf, which some viewers do not take."""
-    from clod_adapter.gaussians import OPAQUE  # here: a header is checked without torch
-
-    arrays_of(path, gaussians)  # refuses rows that load would drop
-    opaque = gaussians.opacity_logits.isposinf()
-    gaussians = gaussians.replace(opacity_logits=gaussians.opacity_logits.masked_fill(opaque, OPAQUE))
-    write_rows(path, gaussians, history)
-    return (f"{int(opaque.sum())} opacities of +inf are written as {OPAQUE:g}, which is 1 too",) if opaque.any() else ()
-
-
-def write_rows(
-    path: Path, gaussians: Gaussians, history: History, base: np.ndarray | None = None, version: str | None = None
-) -> None:
-    """Writes a binary little-endian PLY, in blocks: a large file is never held twice.
-
-    Args:
-        base: ``[N]`` rows of the file that ``gaussians`` come from; None for Inria's layout.
-        version: of the package that made the values, by default the running one.
-    """
-    origin, config, screen_filter = history.origin, gaussians.attenuation, gaussians.screen_filter
-    comments = write_comments(config, history.about, version, history.calibration, screen_filter)
-    # A plain file has the columns of Inria's layout and no others.
-    constants = constants_of(config, gaussians.growth_d is not None, screen_filter) if config is not None else {}
-    tensors = {name: tensor.detach() for name, tensor in gaussians.tensors().items()}
-    groups, dial = column_map(gaussians.sh_degree), dial_columns(tensors)
-    layout = inria_dtype(gaussians.sh_degree) if base is None else base.dtype
-    gone = {FILTER, *((SIGMA, GROWTH) if dial else dial_columns(layout.names or ()))}  # growth_d alone is foreign
-    own = [name for name in layout.names or () if name not in gone and not name.startswith(COLUMN)]
-    kinds = [(name, np.dtype("f8") if any(origin) and name in _XYZ else layout[name]) for name in own]
-    kind = np.dtype(kinds + [(name, np.dtype("f4")) for name in (*constants, *dial)])
-    one = np.broadcast_to(np.zeros((), kind), len(gaussians))  # of which plyfile makes a header without the rows
-    element = PlyElement.describe(one, "vertex", comments=comments)
-    with open(path, "wb") as file:
-        file.write(f"{PlyData([element], byte_order='<').header}\n".encode("ascii"))
-        for start in range(0, len(gaussians), ROWS):
-            part = slice(start, start + ROWS)
-            new = {name: tensor[part].float().cpu().numpy() for name, tensor in tensors.items()}
-            old, block = None if base is None else base[part], np.zeros(len(new["means"]), kind)
-            if old is not None:
-                for name in own:
-                    block[name] = old[name]
-            for attribute, group in groups.items():
-                values = np.ascontiguousarray(new[attribute]).reshape(len(block), -1)
-                _write_changes(path, attribute, group, values, old, origin, block)
-            for name in dial:
-                block[name] = new[name]
-                if not np.isfinite(block[name]).all():
-                    instead = "a large number for no decay" if name == SIGMA else "0 for no growth"
-                    raise ClodError(f"{path}: {name} holds a value that is not finite; use {instead}")
-            for name, value in constants.items():
-                block[name] = value
-            file.write(block.astype(kind.newbyteorder("<"), copy=False).data)
-
-
-def _write_changes(
-    path: Path, attribute: str, group: tuple[str, ...], new: np.ndarray, rows: np.ndarray | None, origin: Origin,
-    block: np.ndarray,
-) -> None:  # fmt: skip
-    """Puts the ``new [n, P]`` values of an attribute into the block where they are not the bits that were read."""
-    changed = np.ones(new.shape, bool)
-    if rows is not None:
-        with np.errstate(over="ignore", invalid="ignore"):
-            old = np.stack([rows[name] for name in group], 1) if group else np.empty(new.shape, np.float32)
-            old = relative(old, NOWHERE, origin) if attribute == "means" else old.astype(np.float32, copy=False)
-        changed = new.view(np.uint32) != old.view(np.uint32)
-    unusual = new[changed] if attribute != "opacity_logits" or rows is not None else new[new != np.inf]
-    if not np.isfinite(unusual).all():
-        raise ClodError(f"{path}: {attribute} holds a new value that is not finite; the tuning has diverged")
-    for column in np.flatnonzero(changed.any(0)):
-        where = changed[:, column]
-        shift = origin[column] if attribute == "means" else 0.0
-        block[group[column]][where] = new[where, column].astype(np.float64) + shift if shift else new[where, column]

@@ -32,11 +32,16 @@ from clod_adapter.origin import NOWHERE, Origin, parse_origin
 if TYPE_CHECKING:
     import numpy as np
 
-    from clod_adapter.gaussians import Gaussians
-
 WARNING = "warning: "  # prefix of a note that must not be missed
 FILTER = "screen_filter"
-FORMAT, FORMAT_VERSION = "clod-model", 1
+MODEL, ADAPTER = "clod-model", "clod-adapter"
+# Of the kinds of documents: the version of the format, and the message for another kind.
+KINDS = {
+    MODEL: (1, "is not a model but {}; clod-adapt apply makes one of an adapter"),
+    ADAPTER: (
+        3, "is not an adapter but {}; give what clod-adapt wrote beside its PLY; a 'clod-model' needs no adapter"
+    ),
+}  # fmt: skip
 DAMAGE = (AttributeError, KeyError, OverflowError, RecursionError, TypeError, ValueError)
 _INHERITED = 60_000  # bytes of history that an output inherits; a PLY header must have room for them
 _OVERHEAD = 9  # bytes of a PLY's comment besides its text
@@ -44,14 +49,14 @@ _OVERHEAD = 9  # bytes of a PLY's comment besides its text
 
 @dataclass(frozen=True)
 class Metadata:
-    """The settings of a file."""
+    """The settings of a file, as read or to be written."""
 
     attenuation: AttenuationConfig | None = None  # None for a file without a sigma_d
     screen_filter: ScreenFilter | None = None  # None where the file does not store one
     calibration: Calibration | None = None  # as stored; ``matching_calibration`` compares it with the Gaussians
     origin: Origin = NOWHERE  # what the means are relative to, world units
     about: tuple[str, ...] = ()  # lines on the history of the file
-    version: str = ""  # of the package that wrote the file; "" for another program
+    version: str = ""  # of the package that made it; "" as read: another program, to be written: the running one
     described: bool = False  # whether the file has a description by this package
     notes: tuple[str, ...] = ()  # what was ignored, one line each
 
@@ -71,14 +76,6 @@ class Source(NamedTuple):
     activation_unknown: bool = False  # whether opacities and scales may be activated already
     rows: np.ndarray | None = None  # ``[N]`` structured array of a PLY as it is in the file, native byte order
     head: Any = None  # ``ply.Head`` of a PLY
-
-
-class History(NamedTuple):
-    """Of Gaussians that are written: lines on it, what their means are relative to, and their calibration."""
-
-    about: tuple[str, ...] = ()
-    origin: Origin = NOWHERE
-    calibration: Calibration | None = None
 
 
 def read_metadata(path: Path, values: Mapping[str, Any], *, dial: bool, described: bool = True) -> Metadata:
@@ -158,42 +155,37 @@ def matching_calibration(metadata: Metadata, count: int) -> tuple[Calibration | 
     return None, [f"the calibration is of {found.total} Gaussians and ignored, these are {count}"]
 
 
-def document(
-    kind: str, version: int, attenuation: AttenuationConfig | None, screen_filter: ScreenFilter, origin: Origin,
-    calibration: Calibration | None,
-) -> dict[str, Any]:  # fmt: skip
-    """Plain JSON that ``read_metadata`` inverts; the classic filter and an origin of 0 are left out."""
-    values = {"format": kind, "format_version": version, "package_version": package_version()}
-    values |= {} if attenuation is None else {"attenuation": asdict(attenuation)}
-    values |= {} if screen_filter == CLASSIC else {FILTER: asdict(screen_filter)}
-    values |= {"origin": list(origin)} if any(origin) else {}
-    return values | ({} if calibration is None else {"calibration": calibration.as_dict()})
+def document(kind: str, metadata: Metadata) -> dict[str, Any]:
+    """Plain JSON that ``parse_document`` and ``read_metadata`` invert; what is not set is left out."""
+    dial, calibration, screen_filter = metadata.attenuation, metadata.calibration, metadata.screen_filter or CLASSIC
+    values = {
+        "format": kind,
+        "format_version": KINDS[kind][0],
+        "package_version": metadata.version or package_version(),
+    }
+    optional = {
+        "attenuation": asdict(dial) if dial else None,
+        FILTER: asdict(screen_filter) if screen_filter != CLASSIC else None,
+        "origin": list(metadata.origin) if any(metadata.origin) else None,
+        "calibration": calibration.as_dict() if calibration else None, "about": list(metadata.about),
+    }  # fmt: skip
+    return values | {name: value for name, value in optional.items() if value}
 
 
-def write_metadata(gaussians: Gaussians, history: History) -> dict[str, Any]:
-    """Plain JSON that ``parse_metadata`` inverts."""
-    dial, screen_filter = gaussians.attenuation, gaussians.screen_filter
-    values = document(FORMAT, FORMAT_VERSION, dial, screen_filter, history.origin, history.calibration)
-    return values | ({"about": list(history.about)} if history.about else {})
-
-
-def metadata_text(values: dict[str, Any]) -> str:
+def document_text(values: dict[str, Any]) -> str:
     """The document with sorted keys, so that equal models give equal files."""
     return json.dumps(values, sort_keys=True, allow_nan=False)
 
 
 def parse_metadata(path: Path, text: str | bytes | dict[str, Any] | None, *, dial: bool) -> Metadata:
-    """The settings in a document, parsed or not; those of a file of another program where it is None."""
-    if text is None:
-        return read_metadata(path, {}, dial=dial, described=False)
-    wrong = "is not a model but {}; clod-adapt apply makes one of an adapter"
-    return read_metadata(path, parse_document(path, text, FORMAT, FORMAT_VERSION, wrong), dial=dial)
+    """The settings in a model's document, parsed or not; those of a file of another program where it is None."""
+    values = {} if text is None else parse_document(path, text, MODEL)
+    return read_metadata(path, values, dial=dial, described=text is not None)
 
 
-def parse_document(
-    path: Path, text: str | bytes | dict[str, Any], kind: str, version: int, wrong: str
-) -> dict[str, Any]:
-    """A document of this kind, up to this version of it; ``wrong`` is the message for another kind."""
+def parse_document(path: Path, text: str | bytes | dict[str, Any], kind: str) -> dict[str, Any]:
+    """A document of this kind; refuses another kind, and a newer version."""
+    version, wrong = KINDS[kind]
     try:
         values: dict[str, Any] = text if isinstance(text, dict) else json.loads(text)
         found, newer = values["format"], values["format"] == kind and values["format_version"] > version

@@ -19,7 +19,7 @@ from safetensors import safe_open
 
 from clod_adapter.errors import ClodError
 from clod_adapter.io.file_formats import KEY, read_start, read_whole, refuse_known
-from clod_adapter.io.settings import History, Source, metadata_text, parse_metadata, write_metadata
+from clod_adapter.io.settings import MODEL, Metadata, Source, document, document_text, parse_metadata
 from clod_adapter.io.values import SIGMA, arrays_of, dial_columns, float32, sha256_of
 
 if TYPE_CHECKING:
@@ -101,9 +101,9 @@ def refused_if_damaged(path: Path, what: str, fix: str) -> Iterator[None]:
         raise ClodError(f"{path}: {what} ({reason:.200}); {fix}") from error
 
 
-def write(path: Path, gaussians: Gaussians, history: History) -> tuple[str, ...]:
+def write(path: Path, gaussians: Gaussians, metadata: Metadata) -> tuple[str, ...]:
     """Writes every value unchanged."""
-    write_tensors(path, arrays_of(path, gaussians), {KEY: metadata_text(write_metadata(gaussians, history))})
+    write_tensors(path, arrays_of(path, gaussians), {KEY: document_text(document(MODEL, metadata))})
     return ()
 
 

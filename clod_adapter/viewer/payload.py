@@ -24,6 +24,7 @@ from clod_adapter.io.checkpoint import Checkpoint, load
 from clod_adapter.io.file_formats import write
 from clod_adapter.io.ply import inria_dtype
 from clod_adapter.io.ply_settings import write_comments
+from clod_adapter.io.settings import Metadata
 from clod_adapter.io.values import dial_columns
 from clod_adapter.origin import NOWHERE, Origin
 
@@ -50,7 +51,7 @@ class Payload:
         g = self.gaussians
         layout = inria_dtype(g.sh_degree, dial=dial_of(g))
         row = np.zeros((), [(name, "<f4") for name in layout.names or () if name not in ("nx", "ny", "nz")])
-        comments = write_comments(g.attenuation, (), calibration=self.calibration, screen_filter=g.screen_filter)
+        comments = write_comments(Metadata(g.attenuation, g.screen_filter, self.calibration))
         element = PlyElement.describe(np.broadcast_to(row, len(self.gaussians)), "vertex", comments=comments)
         return f"{PlyData([element], byte_order='<').header}\n".encode("ascii")
 

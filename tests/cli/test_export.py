@@ -22,6 +22,7 @@ from clod_adapter.errors import ClodError
 from clod_adapter.io.checkpoint import load, save
 from clod_adapter.io.formats import splat_transform
 from clod_adapter.io.ply_settings import write_comments
+from clod_adapter.io.settings import Metadata
 from formats import with_columns
 from scenes import gaussians as random_gaussians
 
@@ -174,7 +175,7 @@ def test_losses_are_noted(clod: Any, capture: Any, dialled: Path, tmp_path: Path
     far["x"] += 437_000.0
     there = tuple(viewpoint.moved([437_000.0, 0, 0]) for viewpoint in model.calibration.viewpoints)
     calibration = replace(model.calibration, viewpoints=there)
-    comments = write_comments(model.gaussians.attenuation, (), calibration=calibration)
+    comments = write_comments(Metadata(model.gaussians.attenuation, calibration=calibration))
     PlyData([PlyElement.describe(far, "vertex", comments=comments)]).write(tmp_path / "far.ply")
     report, _ = exported(clod, "far.ply", "--sv", 2, "-o", "x.ply")
     assert any("x, y and z are doubles" in note for note in report["notes"])

@@ -153,8 +153,8 @@ def test_refused_saves(tmp_path: Path) -> None:
     ]  # fmt: skip
     dial, bad = g.replace(sigma_d=torch.ones(3), attenuation=CONFIG), torch.tensor([1.0, torch.inf, torch.nan])
     refused += [
-        (out, dial.replace(sigma_d=bad), "sigma_d holds a value that is not finite; use a large number"),
-        (out, dial.replace(growth_d=bad), "growth_d holds a value that is not finite; use 0 for no growth"),
+        (out, dial.replace(sigma_d=bad), "sigma_d holds a new value that is not finite; use a large number"),
+        (out, dial.replace(growth_d=bad), "growth_d holds a new value that is not finite; use 0 for no growth"),
         (out, g.replace(means=bad.expand(3, 3)), "means holds a new value that is not finite"),
     ]
     for path, changed, message in refused:

@@ -22,7 +22,8 @@ from clod_adapter._support.version import package_version
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.file_formats import KEY, read_whole
-from clod_adapter.io.settings import DAMAGE, History, Source, parse_metadata, write_metadata
+from clod_adapter.io.settings import DAMAGE, MODEL, Metadata, Source, parse_metadata
+from clod_adapter.io.settings import document as settings_document
 from clod_adapter.io.values import (
     GROWTH,
     SIGMA,
@@ -67,7 +68,7 @@ IDENTITY = [0.0, 0.0, 0.0, 1.0]  # as xyzw
 _FAINTEST = -100.0  # logit of an opacity that float32 has rounded to 0
 
 
-def write(path: Path, gaussians: Gaussians, history: History) -> tuple[str, ...]:
+def write(path: Path, gaussians: Gaussians, metadata: Metadata) -> tuple[str, ...]:
     """Writes with float32's rounding of the activations."""
     columns, dropped = _columns(path, gaussians)
     size = sum(array.nbytes for array in columns.values())
@@ -80,10 +81,10 @@ def write(path: Path, gaussians: Gaussians, history: History) -> tuple[str, ...]
         views.append({"buffer": 0, "byteOffset": offset, "byteLength": array.nbytes, "target": 34962})
         offset += array.nbytes
     node: dict[str, Any] = {"rotation": HALF_TURN}
-    if any(history.origin):
-        x, y, z = history.origin
+    if any(metadata.origin):
+        x, y, z = metadata.origin
         node["translation"] = [0.0 - x, 0.0 - y, z]
-    extras = {KEY: write_metadata(gaussians, history)}
+    extras = {KEY: settings_document(MODEL, metadata)}
     gltf = document(gaussians.means, accessors, node, size, extras=extras) | {"bufferViews": views}
     write_chunks(path, gltf | {"extensionsUsed": [EXTENSION]}, [array.data for array in columns.values()])
     return dropped

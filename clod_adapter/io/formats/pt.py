@@ -19,7 +19,7 @@ import numpy as np
 
 from clod_adapter.errors import ClodError
 from clod_adapter.io.file_formats import KEY, read_start, read_whole, refuse
-from clod_adapter.io.settings import History, Source, damaged, metadata_text, parse_metadata, write_metadata
+from clod_adapter.io.settings import MODEL, Metadata, Source, damaged, document, document_text, parse_metadata
 from clod_adapter.io.tensor_file import refused_if_damaged
 from clod_adapter.io.values import SIGMA, arrays_of, dial_columns, float32, sha256_of
 
@@ -125,7 +125,7 @@ def _values(path: Path, name: str, splats: dict[str, Any], size: int) -> np.ndar
     return value.detach().float().numpy()
 
 
-def write(path: Path, gaussians: Gaussians, history: History) -> tuple[str, ...]:
+def write(path: Path, gaussians: Gaussians, metadata: Metadata) -> tuple[str, ...]:
     """Writes every value unchanged."""
     import torch
 
@@ -134,9 +134,8 @@ def write(path: Path, gaussians: Gaussians, history: History) -> tuple[str, ...]
     arrays = arrays_of(path, gaussians)
     names = NAMES | {name: name for name in dial_columns(arrays)}
     splats = {name: torch.from_numpy(arrays[ours]) for name, ours in names.items()}
-    text = metadata_text(write_metadata(gaussians, history))
     # By way of memory, as the entries of a file are named after it, and this one's name is temporary.
     buffer = io.BytesIO()
-    torch.save({"step": 0, "splats": splats, KEY: text}, buffer)
+    torch.save({"step": 0, "splats": splats, KEY: document_text(document(MODEL, metadata))}, buffer)
     path.write_bytes(buffer.getbuffer())
     return ()

@@ -12,7 +12,7 @@ import numpy as np
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import SH_C0, Gaussians
 from clod_adapter.io.file_formats import read_whole
-from clod_adapter.io.settings import History, Metadata, Source
+from clod_adapter.io.settings import Metadata, Source
 from clod_adapter.io.values import (
     arrays_of,
     bytes_of,
@@ -30,7 +30,7 @@ QUANTISED = "quantised: colours, opacities and rotations in 8 bits, no view-depe
 _ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
 
 
-def write(path: Path, gaussians: Gaussians, history: History) -> tuple[str, ...]:
+def write(path: Path, gaussians: Gaussians, metadata: Metadata) -> tuple[str, ...]:
     """Writes Gaussians without a dial, and no text."""
     arrays = arrays_of(path, gaussians)
     scales = scales_of(path, arrays["log_scales"])
@@ -45,7 +45,7 @@ def write(path: Path, gaussians: Gaussians, history: History) -> tuple[str, ...]
     path.write_bytes(rows[order].tobytes())
     notes = ["colours, opacities and rotations are rounded to 8 bits, and the rows are in another order"]
     notes += ["view-dependent colour is dropped"] if arrays["shN"].any() else []
-    return (*notes, *(["the origin is dropped: coordinates are relative to it"] if any(history.origin) else []))
+    return (*notes, *(["the origin is dropped: coordinates are relative to it"] if any(metadata.origin) else []))
 
 
 def read(path: Path) -> Source:

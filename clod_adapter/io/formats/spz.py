@@ -36,14 +36,14 @@ from clod_adapter.io.file_formats import NEW_SPZ, read_start, read_whole
 from clod_adapter.io.formats import splat_transform
 from clod_adapter.io.settings import (
     DAMAGE,
+    MODEL,
     TAG,
-    History,
     Metadata,
     Source,
     damaged,
-    metadata_text,
+    document,
+    document_text,
     parse_metadata,
-    write_metadata,
 )
 from clod_adapter.io.values import (
     GROWTH,
@@ -82,7 +82,7 @@ _UNTURNED = struct.pack("<I", RDF)
 _SMALL = 1 << 24  # bytes that any file may
 
 
-def write(path: Path, gaussians: Gaussians, history: History) -> tuple[str, ...]:
+def write(path: Path, gaussians: Gaussians, metadata: Metadata) -> tuple[str, ...]:
     """Writes with the format's quantisation, about 8 bits.
 
     Positions have as many of their 24 bits for the fraction as they leave, 20 at most. A few Gaussians at an enormous
@@ -96,14 +96,14 @@ def write(path: Path, gaussians: Gaussians, history: History) -> tuple[str, ...]
             f"within {float(gaussians.means.abs().max()):.4g}; keep fewer or write a .ply"
         )
     degree = min(gaussians.sh_degree, DEGREE)
-    screen_filter = gaussians.screen_filter
-    flags = EXTENDED | (ANTIALIASED if screen_filter.compensate else 0)
+    flags = EXTENDED | (ANTIALIASED if gaussians.screen_filter.compensate else 0)
     header = HEADER.pack(MAGIC, VERSION, len(gaussians), degree, bits, flags, 0)
     parts = [header, *_packed(arrays, bits, degree), struct.pack("<III", AXES, 4, RDF)]
-    if gaussians.sigma_d is not None or history != History() or screen_filter != CLASSIC:
+    metadata = replace(metadata, attenuation=gaussians.attenuation)
+    if metadata != Metadata(screen_filter=CLASSIC):
         columns = list(dial_columns(arrays))
         named = {COLUMNS: columns} if GROWTH in columns else {}  # sigma_d alone needs no name
-        text = metadata_text(write_metadata(gaussians, history) | named).encode()
+        text = document_text(document(MODEL, metadata) | named).encode()
         values = b"".join(np.clip(arrays[name], -_MOST, _MOST).astype("<f2").tobytes() for name in columns)
         parts.append(struct.pack("<III", RECORD, 4 + len(text) + len(values), len(text)) + text + values)
     gzip = zlib.compressobj(wbits=31)
@@ -207,8 +207,8 @@ def read(path: Path) -> Source:
         columns[name] = np.frombuffer(data, np.uint8, count * size, start).reshape(count, size)
         start += count * size
     records = _records(data[end:]) if flags & EXTENDED else {}
-    document, dial = _ours(path, records[RECORD], count) if RECORD in records else (None, {})
-    metadata = parse_metadata(path, document, dial=bool(dial))
+    stored, dial = _ours(path, records[RECORD], count) if RECORD in records else (None, {})
+    metadata = parse_metadata(path, stored, dial=bool(dial))
     arrays = _unquantized(columns, bits, bands)
     arrays = _in_our_axes(path, arrays, records.get(AXES, _UNTURNED)) | dial
     if dial:
@@ -259,14 +259,14 @@ def _ours(path: Path, body: bytes, count: int) -> tuple[dict[str, Any], dict[str
     length = struct.unpack_from("<I", body)[0] if len(body) >= 4 else 0
     text, values = body[4 : 4 + length], body[4 + length :]
     try:
-        document = json.loads(text)
-        names = document.get(COLUMNS, [SIGMA])
+        stored = json.loads(text)
+        names = stored.get(COLUMNS, [SIGMA])
     except DAMAGE as error:
         raise damaged(path, error) from error
     if names not in ([SIGMA], [SIGMA, GROWTH]) or len(values) not in (0, 2 * count * len(names)):
         raise ClodError(f"{path}: its record of sigma_d is damaged; copy or export it again")
     table = np.frombuffer(values, "<f2").astype(np.float32).reshape(-1, count)
-    return document, dict(zip(names, table, strict=False))  # no rows without a dial
+    return stored, dict(zip(names, table, strict=False))  # no rows without a dial
 
 
 def _in_our_axes(path: Path, arrays: dict[str, np.ndarray], record: bytes) -> dict[str, np.ndarray]:

@@ -25,7 +25,7 @@ from clod_adapter._support.version import package_version
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.formats import spz
 from clod_adapter.io.formats.glb import DEGREE, EXTENSION, document, harmonics, write_chunks
-from clod_adapter.io.settings import History
+from clod_adapter.io.settings import Metadata
 from clod_adapter.origin import Origin
 
 TILESET = "tileset.json"
@@ -85,7 +85,7 @@ def write_tileset(
 def write_tile(path: Path, gaussians: Gaussians, origin: Origin) -> tuple[str, ...]:
     """Writes a ``.glb`` whose only buffer is an SPZ file; what that rounds."""
     packed = path.with_suffix(".spz")
-    notes = spz.write(packed, gaussians, History())
+    notes = spz.write(packed, gaussians, Metadata(screen_filter=gaussians.screen_filter))
     data = packed.read_bytes()
     packed.unlink()
     shapes = {
