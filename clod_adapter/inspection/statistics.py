@@ -57,7 +57,7 @@ class Values:
 
 def values_of(found: Prepared, tau: float) -> Values:
     """The statistics of a file's rows, of which one is usable at least."""
-    keep, dropped = found.keep, {reason: gone for reason, gone in found.dropped.items() if gone}
+    keep = found.keep
     columns = {name: np.ascontiguousarray(array[keep].T) for name, array in found.arrays.items() if name != "shN"}
     means, logits = columns["means"], columns["opacity_logits"].astype(np.float64)
     with np.errstate(over="ignore"):
@@ -74,7 +74,7 @@ def values_of(found: Prepared, tau: float) -> Values:
     same = means[:, np.lexsort(means)]
     used = [k + 1 for k in range(found.arrays["shN"].shape[1]) if found.arrays["shN"][:, k][keep].any()]
     return Values(
-        total=len(keep), count=int(keep.sum()), dropped=dropped, position=(x, y, z),
+        total=len(keep), count=int(keep.sum()), dropped=found.dropped, position=(x, y, z),
         used_sh_degree=next(degree for degree, count in SH_COUNTS.items() if count > max(used, default=0)),
         scale=Spread.of(scales.ravel()), opacity=Spread.of(opacities),
         needles=float((scales[2] > NEEDLE * scales[1]).mean()), infinite_opacity=int(np.isposinf(logits).sum()),

@@ -17,7 +17,7 @@ from clod_adapter.adapter import Adapter, dial_tensors
 from clod_adapter.config import CLASSIC
 from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import atomic_path
-from clod_adapter.io.file_formats import KEY
+from clod_adapter.io.file_formats import KEY, read_whole
 from clod_adapter.io.settings import (
     ADAPTER,
     DAMAGE,
@@ -28,7 +28,7 @@ from clod_adapter.io.settings import (
     parse_document,
     read_metadata,
 )
-from clod_adapter.io.tensor_file import load_tensors, read_tensor_header, write_tensors
+from clod_adapter.io.tensor_file import parse_tensors, read_tensor_header, write_tensors
 
 
 def save_adapter(path: str | Path, adapter: Adapter) -> None:
@@ -66,7 +66,7 @@ def load_adapter(path: str | Path) -> Adapter:
         ClodError: the file cannot be read, is damaged, not an adapter, or of a newer format.
     """
     path = Path(path)
-    tensors, metadata, _ = load_tensors(path)
+    tensors, metadata = parse_tensors(path, read_whole(path))
     about, settings = _description(path, metadata)
     assert settings.attenuation is not None
     try:

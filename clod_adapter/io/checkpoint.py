@@ -127,16 +127,23 @@ def load(path: str | Path, *, activated: Activated | None = None, origin: Origin
     metadata, dial = source.metadata, SIGMA in source.arrays
     known = "none" if not source.activation_unknown else activated
     found = prepared(path, source.arrays, known, metadata.origin, origin)
-    arrays, rows = found.arrays, source.rows
+    arrays, rows, total = found.arrays, source.rows, len(found.keep)
+    dropped = [f"{lost} of {total} Gaussians dropped: {reason}" for reason, lost in found.dropped.items()]
     if not found.keep.any():
-        raise ClodError(f"{path}: no usable Gaussian in it ({'; '.join(found.dropped_notes)}); export it again")
+        raise ClodError(f"{path}: no usable Gaussian in it ({'; '.join(dropped)}); export it again")
     if not found.keep.all():
         arrays = {name: array[found.keep] for name, array in arrays.items()}
         rows = None if rows is None else rows[found.keep]
     screen_filter = stated_filter(source)
     tensors: dict[str, Any] = {name: torch.from_numpy(array) for name, array in arrays.items()}
     gaussians = Gaussians(**tensors, attenuation=metadata.attenuation if dial else None, screen_filter=screen_filter)
-    notes = [*found.changes, *found.dropped_notes, *_unusual(gaussians, found.origin), *metadata.notes]
+    notes = [*found.changes, *dropped]
+    if opaque := np.count_nonzero(arrays["opacity_logits"] == np.inf):
+        notes.append(f"{opaque} Gaussians have opacity = +inf and are taken as fully opaque")
+    if any(found.origin):
+        where = ", ".join(f"{value:.10g}" for value in found.origin)
+        notes.append(f"far from 0: read relative to ({where}); outputs have x, y, z as double")
+    notes += metadata.notes
     if gaussians.attenuation is not None and not metadata.described:
         notes += plausibility(arrays, gaussians.attenuation)
     calibration, mismatch = matching_calibration(metadata, len(gaussians)) if dial else (None, [])
@@ -144,22 +151,12 @@ def load(path: str | Path, *, activated: Activated | None = None, origin: Origin
     if source.head is None:
         printable = ["".join(c if c.isascii() and c.isprintable() else "?" for c in line) for line in about]
         about = tagged(printable, screen_filter)
-    comments, dropped = that_fit([*about, *found.changes])
+    comments, cut = that_fit([*about, *found.changes])
     return Checkpoint(
-        gaussians, rows, comments, (*notes, *mismatch, *source.notes, *dropped),
+        gaussians, rows, comments, (*notes, *mismatch, *source.notes, *cut),
         source.sha256 if found.activated == "none" else f"{found.activated}:{source.sha256}", path, calibration,
         found.origin, filter_known=dial or metadata.screen_filter is not None,
     )  # fmt: skip
-
-
-def _unusual(gaussians: Gaussians, origin: Origin) -> list[str]:
-    notes = []
-    if opaque := int(gaussians.opacity_logits.isposinf().sum()):
-        notes.append(f"{opaque} Gaussians have opacity = +inf and are taken as fully opaque")
-    if any(origin):
-        where = ", ".join(f"{value:.10g}" for value in origin)
-        notes.append(f"far from 0: read relative to ({where}); outputs have x, y, z as double")
-    return notes
 
 
 @torch.no_grad()

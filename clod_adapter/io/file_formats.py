@@ -5,6 +5,7 @@ What reads, checks or refuses a file, here and in the readers, raises a ClodErro
 
 from __future__ import annotations
 
+import hashlib
 import re
 from collections.abc import Sequence
 from importlib import import_module
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 
 
 class Format(NamedTuple):
-    """A format. Its module has ``read``, of a path to a ``Source``.
+    """A format. Its module has ``read``, of a path and the bytes of the file to a ``Source`` without their hash.
 
     If it carries sigma_d also ``has_dial``, of a file that was checked; if it is written also ``write``, of a path,
     Gaussians in world units and their ``Metadata``, to a line for each loss.
@@ -92,8 +93,9 @@ def check_written(path: Path) -> None:
 def read_source(path: Path) -> Source:
     """The content of a file in any format; every reader refuses, in one line, what is damaged or of another kind."""
     check_readable(path)
-    found: Source = _call(f"{format_of(path).module}.read", path)
-    return found
+    data = read_whole(path)  # once, and not mapped: another program may write the file meanwhile
+    found: Source = _call(f"{format_of(path).module}.read", path, data)
+    return found._replace(sha256=hashlib.sha256(data).hexdigest())
 
 
 def write(

@@ -5,7 +5,6 @@ Any property order, byte order or ascii; plain, or PlayCanvas's compressed layou
 
 from __future__ import annotations
 
-import hashlib
 import io
 import re
 import warnings
@@ -109,32 +108,29 @@ def has_dial(path: Path) -> bool:
     return dial
 
 
-def read(path: Path) -> Source:
-    """Reads a PLY into memory; nothing is allocated for rows that its length does not have."""
+def read(path: Path, data: bytes) -> Source:
+    """Reads a PLY; nothing is allocated for rows that its length does not have."""
+    head = _parse_head(path, data[:HEADER_LIMIT])
+    degree = _degree(path, head.ply)
+    _check_length(path, head, len(data))
     try:
-        data = np.fromfile(path, np.uint8)  # once, and not mapped: another program may write the file meanwhile
-        head = _parse_head(path, data[:HEADER_LIMIT].tobytes())
-        degree = _degree(path, head.ply)
-        _check_length(path, head, len(data))
         elements = _elements(data, head)
-    except OSError as error:
-        raise ClodError(f"{path}: cannot be read ({error.strerror or error}); check the path") from error
     except (PlyParseError, ValueError, TypeError, MemoryError) as error:
         raise ClodError(f"{path}: damaged or truncated ({error}); copy or export it again") from error
-    comments, sha256 = all_comments(head.ply), hashlib.sha256(data.data).hexdigest()
+    comments = all_comments(head.ply)
     if is_packed(head.ply):
         metadata = ply_metadata(path, comments, dial=False)
-        return Source(unpack(path, elements, degree), metadata, sha256, (NOTE,), comments, head=head)
+        return Source(unpack(path, elements, degree), metadata, (NOTE,), comments, head=head)
     rows = elements["vertex"]
     arrays = _arrays(rows, degree)
     metadata = ply_metadata(path, comments, rows, dial=SIGMA in arrays)
     parts = [f"element {element.name}" for element in head.ply if element.name != "vertex"]
     parts += ["obj_info"] if head.ply.obj_info else []
     notes = (f"not carried over to outputs: {', '.join(parts)}",) if parts else ()
-    return Source(arrays, metadata, sha256, notes, comments, not metadata.described, rows, head)
+    return Source(arrays, metadata, notes, comments, not metadata.described, rows, head)
 
 
-def _elements(data: np.ndarray, head: Head) -> dict[str, np.ndarray]:
+def _elements(data: bytes, head: Head) -> dict[str, np.ndarray]:
     """The rows of elements by name, native byte order, of all bytes of a file.
 
     plyfile reads text, and binary lists row by row: elements from the first with lists on are left out where the
@@ -145,16 +141,15 @@ def _elements(data: np.ndarray, head: Head) -> dict[str, np.ndarray]:
         if any(isinstance(each, PlyListProperty) for each in element.properties):
             break
         kind = np.dtype(element.dtype(head.ply.byte_order))
-        found[element.name] = _native(data[at : at + count * kind.itemsize].view(kind))
+        found[element.name] = _native(np.frombuffer(data, kind, count, at))
         at += count * kind.itemsize
     if "vertex" not in found:
-        content = data.tobytes()
-        lines = io.TextIOWrapper(io.BytesIO(content if head.ply.text else b""), "latin-1")  # CR ends a line too
+        lines = io.TextIOWrapper(io.BytesIO(data if head.ply.text else b""), "latin-1")  # CR ends a line too
         if any(len(line) == _LONGEST for line in iter(lambda: lines.readline(_LONGEST), "")):
             raise ValueError(f"a row of more than {_LONGEST:,} characters")  # which would be copied several times
         with warnings.catch_warnings(), np.errstate(over="ignore"):
             warnings.simplefilter("ignore")  # of text that is beyond float32's range
-            return {each.name: _native(each.data) for each in PlyData.read(io.BytesIO(content))}
+            return {each.name: _native(each.data) for each in PlyData.read(io.BytesIO(data))}
     return found
 
 

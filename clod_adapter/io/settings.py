@@ -64,18 +64,18 @@ class Metadata:
 class Source(NamedTuple):
     """The content of a file, as every reader returns it; ``checkpoint.load`` makes a checkpoint of it.
 
-    ``arrays`` are every row of the file, by the names of ``Gaussians.tensors``, float32; means may be float64, and of a
-    PLY there may be "masks" ``[N, 2]`` (MaskGaussian's) and "filter_3D" ``[N, 1]`` (Mip-Splatting's) too.
+    ``arrays`` are every row of the file, by the names of ``Gaussians.tensors``, in any type of floats; of a PLY also
+    "masks" ``[N, 2]`` (MaskGaussian's) and "filter_3D" ``[N, 1]`` (Mip-Splatting's), where it has them.
     """
 
     arrays: dict[str, np.ndarray]
     metadata: Metadata  # means are relative to its origin
-    sha256: str  # of the file that was parsed, hex
     notes: tuple[str, ...] = ()  # what the reader noticed, one line each, besides the notes of the metadata
     comments: tuple[str, ...] = ()  # lines on its history, and settings in a PLY's comments
     activation_unknown: bool = False  # whether opacities and scales may be activated already
     rows: np.ndarray | None = None  # ``[N]`` structured array of a PLY as it is in the file, native byte order
     head: Any = None  # ``ply.Head`` of a PLY
+    sha256: str = ""  # of the bytes that were parsed, hex
 
 
 def read_metadata(path: Path, values: Mapping[str, Any], *, dial: bool, described: bool = True) -> Metadata:

@@ -18,9 +18,9 @@ import numpy as np
 from safetensors import safe_open
 
 from clod_adapter.errors import ClodError
-from clod_adapter.io.file_formats import KEY, read_start, read_whole, refuse_known
+from clod_adapter.io.file_formats import KEY, read_start, refuse_known
 from clod_adapter.io.settings import MODEL, Metadata, Source, document, document_text, parse_metadata
-from clod_adapter.io.values import SIGMA, arrays_of, dial_columns, float32, sha256_of
+from clod_adapter.io.values import SIGMA, arrays_of, dial_columns
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -63,15 +63,14 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
         return {name: tensors.get_tensor(name).clone() for name in tensors.keys()}, tensors.metadata() or {}  # noqa: SIM118
 
 
-def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str], str]:
-    """The tensors, the metadata and the SHA-256, hex, of an input file, which is read once."""
+def parse_tensors(path: Path, data: bytes) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """The tensors and the metadata of an input file with these bytes."""
     from safetensors.torch import load  # here: a header is read without torch
 
-    data = read_whole(path)
     refuse_known(path, data[:64])
     with refused_if_damaged(path, *_DAMAGED):
         tensors, head = load(data), data[8 : 8 + int.from_bytes(data[:8], "little")]
-        return tensors, json.loads(head).get("__metadata__", {}), sha256_of(data)
+        return tensors, json.loads(head).get("__metadata__", {})
 
 
 def read_tensor_header(path: Path) -> tuple[list[str], dict[str, str]]:
@@ -112,9 +111,9 @@ def has_dial(path: Path) -> bool:
     return SIGMA in read_tensor_header(path)[0]
 
 
-def read(path: Path) -> Source:
+def read(path: Path, data: bytes) -> Source:
     """Reads a model."""
-    tensors, stored, sha256 = load_tensors(path)
+    tensors, stored = parse_tensors(path, data)
     if KEY not in stored:
         raise ClodError(f"{path}: is a safetensors file but not a model of clod-adapter; give a file that it wrote")
     metadata = parse_metadata(path, stored[KEY], dial=SIGMA in tensors)
@@ -124,4 +123,4 @@ def read(path: Path) -> Source:
     if odd := [name for name in wanted if not tensors[name].is_floating_point()]:
         raise ClodError(f"{path}: tensor {odd[0]!r} is not of floating-point numbers; export it again")
     arrays = {name: tensors[name].float().numpy() for name in wanted}
-    return Source(float32(arrays), metadata, sha256, comments=metadata.about)
+    return Source(arrays, metadata, comments=metadata.about)

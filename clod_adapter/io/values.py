@@ -6,15 +6,13 @@ CVPR 2024, equation 9) stores a filter beside them, ``filter_3D``, that its rend
 
 from __future__ import annotations
 
-import hashlib
-from collections import Counter
 from collections.abc import Container, Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, NamedTuple, get_args
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
-from clod_adapter.config import SH_COUNTS
+from clod_adapter.config import SH_COUNTS, require
 from clod_adapter.errors import ClodError
 from clod_adapter.origin import Origin, origin_of, relative
 
@@ -24,7 +22,7 @@ if TYPE_CHECKING:
 Activated = Literal["none", "opacity", "scales", "both"]
 Arrays = dict[str, np.ndarray]
 SIGMA, GROWTH, FILTER, MASKS = "sigma_d", "growth_d", "filter_3D", "masks"
-UNROTATED = "zero or not of a usable length"
+_UNROTATED = "rotation is zero or not of a usable length"
 ROWS = 4096  # in a block, which stays in the processor's cache
 _FEW = 10  # Gaussians; fewer may have any range
 _FAINTEST = -0.1  # logit of 0.475; trainers keep fainter Gaussians, and files of |a| reach just below 0
@@ -62,13 +60,7 @@ class Prepared(NamedTuple):
     origin: Origin  # world units
     activated: Activated  # what was taken as activated
     changes: list[str]  # to values that were not stored as logits and logarithms, one line each
-    dropped: Counter[str]  # the number of other rows by reason
-
-    @property
-    def dropped_notes(self) -> list[str]:
-        """One line for each reason."""
-        total = len(self.keep)
-        return [f"{lost} of {total} Gaussians dropped: {reason}" for reason, lost in self.dropped.items() if lost]
+    dropped: dict[str, int]  # the number of other rows by reason
 
 
 def prepared(
@@ -83,10 +75,11 @@ def prepared(
     _check_shapes(path, arrays)
     if not len(arrays["means"]):
         raise ClodError(f"{path}: no usable Gaussian in it (it has 0 rows); export it again")
-    values, was, changes = _as_logits(path, dict(arrays), activated)
+    narrow = {name: np.ascontiguousarray(array, np.float32) for name, array in arrays.items() if name != "means"}
+    values, was, changes = _as_logits(path, {**arrays, **narrow}, activated)
     if origin is None:
         origin = at if any(at) else origin_of(values["means"])
-    values["means"] = relative(values["means"], at, origin)
+    values["means"] = np.ascontiguousarray(relative(values["means"], at, origin))
     keep, dropped = _usable(values)
     values.pop(MASKS, None)
     return Prepared(values, keep, origin, was, changes, dropped)
@@ -107,8 +100,8 @@ def _check_shapes(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
 
 def _as_logits(path: Path, arrays: Arrays, activated: Activated | None) -> tuple[Arrays, Activated, list[str]]:
     """Logit opacities, logarithmic scales and no ``filter_3D``; what was activated; a line for each change."""
-    if activated is not None and activated not in get_args(Activated):
-        raise ClodError(f"activated is {activated!r}, it must be one of {', '.join(get_args(Activated))}")
+    choices = get_args(Activated)
+    require(activated in (None, *choices), "activated", repr(activated), f"one of {', '.join(choices)}")
     found = in_question(arrays) if activated != "none" else {}
     if found and activated is None:
         ranges = " and ".join(f"{name} from {low:.4g} to {high:.4g}" for name, (low, high) in found.items())
@@ -120,13 +113,11 @@ def _as_logits(path: Path, arrays: Arrays, activated: Activated | None) -> tuple
     taken, notes = [name for name in found if activated in (name, "both")], list[str]()
     if "opacity" in taken:
         opacity = np.abs(arrays["opacity_logits"].astype(np.float64))  # the absolute value is Taming-3DGS's activation
-        above = int((opacity > 1).sum())
-        opacity = np.clip(opacity, _TINY, _OPAQUE)
-        arrays["opacity_logits"] = _narrow(np.log(opacity) - np.log1p(-opacity))
-        more = f" ({above} above 1 taken as 1)" if above else ""
+        more = f" ({above} above 1 taken as 1)" if (above := int((opacity > 1).sum())) else ""
+        arrays["opacity_logits"] = logit(np.clip(opacity, _TINY, _OPAQUE)).astype(np.float32)
         notes.append(f"opacity taken as activated, and stored as logits{more}")
     if "scales" in taken:
-        arrays["log_scales"] = _narrow(logs_of(arrays["log_scales"]))
+        arrays["log_scales"] = logs_of(arrays["log_scales"]).astype(np.float32)
         notes.append("scales taken as activated, and stored as logarithms")
     if FILTER in arrays:
         arrays["log_scales"], arrays["opacity_logits"] = _fused(arrays, arrays.pop(FILTER))
@@ -135,31 +126,23 @@ def _as_logits(path: Path, arrays: Arrays, activated: Activated | None) -> tuple
 
 
 def in_question(arrays: Mapping[str, np.ndarray]) -> dict[str, tuple[float, float]]:
-    """The range of "opacity" and of "scales", where it looks activated."""
-    found, opacity = {}, arrays["opacity_logits"]
-    extent = _range(opacity[:, None], _FAINTEST)
+    """The range of "opacity" and of "scales", where it looks activated: at least ``_FEW`` values, none too small."""
+    found, opacity = dict[str, tuple[float, float]](), arrays["opacity_logits"]
     # At most half of the values above 1: not true of logits whose faint ones were pruned.
-    if extent and 2 * np.count_nonzero(opacity > 1) <= len(opacity):
-        found["opacity"] = extent
-    if extent := _range(arrays["log_scales"], 0.0):
-        found["scales"] = extent
+    faint = {"opacity": (opacity[:, None], _FAINTEST)} if 2 * np.count_nonzero(opacity > 1) <= len(opacity) else {}
+    for name, (values, least) in {**faint, "scales": (arrays["log_scales"], 0.0)}.items():
+        finite = np.isfinite(values).all(1)
+        low = float(np.min(values, where=finite[:, None], initial=np.inf))
+        high = float(np.max(values, where=finite[:, None], initial=-np.inf))
+        if finite.sum() >= _FEW and low >= least and (low < high or high == 1):
+            found[name] = low, high
     return found
 
 
 def choice_of(found: Iterable[str]) -> Activated:
     """The choice of ``Activated`` for these values."""
-    kinds = set(found)
-    return "both" if len(kinds) == 2 else "opacity" if "opacity" in kinds else "scales" if kinds else "none"
-
-
-def _range(values: np.ndarray, least: float) -> tuple[float, float] | None:
-    """The smallest and the largest, if none is below ``least`` and there are at least ``_FEW``."""
-    finite = np.isfinite(values).all(1)
-    if finite.sum() < _FEW:
-        return None
-    low = float(np.min(values, where=finite[:, None], initial=np.inf))
-    high = float(np.max(values, where=finite[:, None], initial=-np.inf))
-    return (low, high) if low >= least and (low < high or high == 1) else None
+    names: list[Any] = list(found)
+    return "both" if len(names) == 2 else names[0] if names else "none"
 
 
 def _fused(arrays: Arrays, filter_3d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -172,34 +155,27 @@ def _fused(arrays: Arrays, filter_3d: np.ndarray) -> tuple[np.ndarray, np.ndarra
         # log(1 - a), of a near 1 from the logit itself where there is no filter
         fused = np.where(log_opacity < 0, log_opacity - np.log(-np.expm1(log_opacity)), np.inf)
         unfiltered = (wider == scales).all(1, keepdims=True)
-    return _narrow(wider), _narrow(np.where(unfiltered, logits, fused)[:, 0])
+        return wider.astype(np.float32), np.where(unfiltered, logits, fused)[:, 0].astype(np.float32)
 
 
-def _narrow(values: np.ndarray) -> np.ndarray:
-    with np.errstate(over="ignore"):
-        return values.astype(np.float32)
-
-
-def _usable(arrays: Arrays) -> tuple[np.ndarray, Counter[str]]:
-    """``[N]`` bool, the Gaussians that can be drawn, and the others by the first rule that they break."""
-    count = len(arrays["means"])
-    exists, finite = np.ones(count, bool), np.ones(count, bool)
-    for start in range(0, count, ROWS):
-        for name, values in arrays.items():
-            usable = _finite(name, values[start : start + ROWS])
+def _usable(arrays: Arrays) -> tuple[np.ndarray, dict[str, int]]:
+    """``[N]`` bool, the Gaussians that can be drawn, and the number of the others by the first rule that they break."""
+    keep = np.ones(len(arrays["means"]), bool)
+    dropped = dict.fromkeys(("MaskGaussian existence probability below 0.5", "a value is not finite", _UNROTATED), 0)
+    for start in range(0, len(keep), ROWS):
+        block = {name: values[start : start + ROWS] for name, values in arrays.items()}
+        exists, finite = np.ones((2, len(block["means"])), bool)
+        if MASKS in block:  # sigmoid(first - second) >= 0.5; NaN is for the next rule
+            exists = ~(block[MASKS][:, 0] < block[MASKS][:, 1])
+        for name, values in block.items():
+            usable = _finite(name, values)
             if not usable.all():  # which is far faster than by rows
-                finite[start : start + ROWS] &= usable.reshape(len(usable), -1).all(1)
-    if MASKS in arrays:  # sigmoid(first - second) >= 0.5; NaN is for the next rule
-        exists = ~(arrays[MASKS][:, 0] < arrays[MASKS][:, 1])
-    keep, dropped = np.ones(count, bool), Counter[str]()
-    for rule, reason in (
-        (exists, "MaskGaussian existence probability below 0.5"),
-        (finite, "a value is not finite"),
-        (_rotated(arrays["quats"]), f"rotation is {UNROTATED}"),
-    ):
-        dropped[reason] += int((keep & ~rule).sum())
-        keep &= rule
-    return keep, dropped
+                finite &= usable.reshape(len(usable), -1).all(1)
+        kept = keep[start : start + ROWS]
+        for reason, rule in zip(dropped, (exists, finite, _rotated(block["quats"])), strict=True):
+            dropped[reason] += int((kept & ~rule).sum())
+            kept &= rule
+    return keep, {reason: lost for reason, lost in dropped.items() if lost}
 
 
 def _finite(name: str, values: np.ndarray) -> np.ndarray:
@@ -228,13 +204,8 @@ def arrays_of(path: Path, gaussians: Gaussians) -> Arrays:
         if not _finite(name, array).all():
             raise ClodError(f"{path}: {name} holds a value that is not finite; drop such rows first, as load does")
     if not _rotated(arrays["quats"]).all():
-        raise ClodError(f"{path}: a rotation is {UNROTATED}; drop such rows first, as load does")
+        raise ClodError(f"{path}: a {_UNROTATED}; drop such rows first, as load does")
     return arrays
-
-
-def float32(arrays: Mapping[str, np.ndarray]) -> Arrays:
-    """The arrays as a ``Source`` has them."""
-    return {name: np.array(array, np.float32, order="C") for name, array in arrays.items()}
 
 
 def half_turn(arrays: Mapping[str, np.ndarray], axis: str) -> dict[str, np.ndarray]:
@@ -301,8 +272,3 @@ def bytes_of(values: np.ndarray) -> np.ndarray:
 def logits_of_bytes(levels: np.ndarray) -> np.ndarray:
     """Finite logits of opacities in 255ths: the first and last level are a quarter of a level from 0 and 1."""
     return logit(np.clip(levels.astype(np.float64), 0.25, 254.75) / 255)
-
-
-def sha256_of(data: bytes) -> str:
-    """SHA-256, hex."""
-    return hashlib.sha256(data).hexdigest()

@@ -21,7 +21,7 @@ import torch
 from clod_adapter._support.version import package_version
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.io.file_formats import KEY, read_whole
+from clod_adapter.io.file_formats import KEY
 from clod_adapter.io.settings import DAMAGE, MODEL, Metadata, Source, parse_metadata
 from clod_adapter.io.settings import document as settings_document
 from clod_adapter.io.values import (
@@ -30,13 +30,11 @@ from clod_adapter.io.values import (
     arrays_of,
     colours_of,
     dial_columns,
-    float32,
     half_turn,
     logit,
     logs_of,
     normalized,
     scales_of,
-    sha256_of,
     sigmoid,
 )
 from clod_adapter.origin import NOWHERE, Origin, origin_of
@@ -156,13 +154,13 @@ def has_dial(path: Path) -> bool:
         return DIAL[SIGMA] in primitive["attributes"]
 
 
-def read(path: Path) -> Source:
+def read(path: Path, data: bytes) -> Source:
     """Reads the first primitive with the extension, into the axes of checkpoints: y down.
 
     Under a node without a rotation the values are in glTF's own axes, and are turned here; files of this package have
     the half turn in the node and store the checkpoint's values.
     """
-    data, ignored, arrays = read_whole(path), list[str](), dict[str, np.ndarray]()
+    ignored, arrays = list[str](), dict[str, np.ndarray]()
     with _one_line_errors(path):
         gltf, binary = _chunks(memoryview(data))
         (mesh, primitive), *others = _find(gltf)
@@ -186,7 +184,7 @@ def read(path: Path) -> Source:
         near = not any(origin_of(wide))  # float32 has enough digits
         stored["means"] = wide if near else stored["means"]
         metadata = replace(metadata, origin=NOWHERE if near else moved)
-    return Source(float32(stored), metadata, sha256_of(data), tuple(ignored), metadata.about)
+    return Source(stored, metadata, tuple(ignored), metadata.about)
 
 
 @contextmanager

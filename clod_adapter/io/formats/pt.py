@@ -18,10 +18,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from clod_adapter.errors import ClodError
-from clod_adapter.io.file_formats import KEY, read_start, read_whole, refuse
+from clod_adapter.io.file_formats import KEY, read_start, refuse
 from clod_adapter.io.settings import MODEL, Metadata, Source, damaged, document, document_text, parse_metadata
 from clod_adapter.io.tensor_file import refused_if_damaged
-from clod_adapter.io.values import SIGMA, arrays_of, dial_columns, float32, sha256_of
+from clod_adapter.io.values import SIGMA, arrays_of, dial_columns
 
 if TYPE_CHECKING:
     from clod_adapter.gaussians import Gaussians
@@ -78,11 +78,10 @@ def has_dial(path: Path) -> bool:
         return any(argument == SIGMA for _, argument, _ in pickletools.genops(archive.read(pickled)))
 
 
-def read(path: Path) -> Source:
+def read(path: Path, data: bytes) -> Source:
     """Reads a checkpoint of gsplat's trainer, or one written here; with ``weights_only``, so that no code runs."""
     from clod_adapter.integrations.splats import NAMES  # here and not above, as check does without torch
 
-    data = read_whole(path)
     checkpoint = _unpickled(path, data)
     splats = checkpoint.get("splats") if isinstance(checkpoint, dict) else None
     if not isinstance(splats, dict):
@@ -99,7 +98,7 @@ def read(path: Path) -> Source:
         raise damaged(path, TypeError(f"a {type(text).__name__}, not text"))
     metadata = parse_metadata(path, text, dial=SIGMA in arrays)
     notes = () if metadata.described else (FRAME,)
-    return Source(float32(arrays), metadata, sha256_of(data), notes, metadata.about, not metadata.described)
+    return Source(arrays, metadata, notes, metadata.about, not metadata.described)
 
 
 def _unpickled(path: Path, data: bytes) -> Any:

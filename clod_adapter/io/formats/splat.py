@@ -11,18 +11,15 @@ import numpy as np
 
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import SH_C0, Gaussians
-from clod_adapter.io.file_formats import read_whole
 from clod_adapter.io.settings import Metadata, Source
 from clod_adapter.io.values import (
     arrays_of,
     bytes_of,
     colours_of,
-    float32,
     logits_of_bytes,
     logs_of,
     normalized,
     scales_of,
-    sha256_of,
     sigmoid,
 )
 
@@ -48,17 +45,16 @@ def write(path: Path, gaussians: Gaussians, metadata: Metadata) -> tuple[str, ..
     return (*notes, *(["the origin is dropped: coordinates are relative to it"] if any(metadata.origin) else []))
 
 
-def read(path: Path) -> Source:
+def read(path: Path, data: bytes) -> Source:
     """Reads rows as ``write`` writes them; SH degree 0."""
-    data = read_whole(path)
     if not data or len(data) % _ROW.itemsize:
         raise ClodError(f"{path}: {len(data)} bytes are not a .splat file, whose rows have 32; copy or export it again")
     rows = np.frombuffer(data, _ROW)
     rgba = rows["rgba"].astype(np.float32)
     arrays = {
-        "means": rows["means"], "log_scales": logs_of(rows["scales"]),
+        "means": rows["means"].copy(), "log_scales": logs_of(rows["scales"]),
         "quats": (rows["quats"].astype(np.float32) - 128) / 128,
         "opacity_logits": logits_of_bytes(rows["rgba"][:, 3]), "shN": np.zeros((len(rows), 0, 3)),
         "sh0": ((rgba[:, None, :3] / 255) - 0.5) / SH_C0,
     }  # fmt: skip
-    return Source(float32(arrays), Metadata(), sha256_of(data), (QUANTISED,))
+    return Source(arrays, Metadata(), (QUANTISED,))

@@ -6,7 +6,6 @@ this package does not read itself.
 
 from __future__ import annotations
 
-import hashlib
 import os
 import re
 import shlex
@@ -125,21 +124,21 @@ def check(path: Path, version: str = "") -> SplatTransform:
         ) from error
 
 
-def read(path: Path, version: str = "") -> Source:
+def read(path: Path, _: bytes, version: str = "") -> Source:
     """The Gaussians of the PLY that splat-transform converts the file to."""
     from clod_adapter.io import ply  # here: check needs neither plyfile nor numpy
     from clod_adapter.io.settings import Metadata, Source
 
-    tool, sha256 = check(path, version), hashlib.sha256(read_whole(path)).hexdigest()
+    tool = check(path, version)
     with TemporaryDirectory() as folder:
         converted = Path(folder) / "converted.ply"
         try:
             tool.run(path, converted, timeout=LIMIT_CONVERT)
         except ClodError as error:
             raise ClodError(f"{path}: cannot be read ({error}); copy or export it again") from error
-        arrays = ply.read(converted).arrays
+        arrays = ply.read(converted, read_whole(converted)).arrays
     note = f"quantised: {path.suffix} stores positions, scales, rotations and colours in a few bits each"
-    return Source(arrays, Metadata(), sha256, (note, f"read through splat-transform {tool.version}"))
+    return Source(arrays, Metadata(), (note, f"read through splat-transform {tool.version}"))
 
 
 def _words(given: str) -> tuple[str, ...]:

@@ -52,11 +52,9 @@ from clod_adapter.io.values import (
     arrays_of,
     bytes_of,
     dial_columns,
-    float32,
     half_turn,
     logits_of_bytes,
     normalized,
-    sha256_of,
     sigmoid,
 )
 
@@ -185,15 +183,14 @@ def _losses(arrays: dict[str, np.ndarray], bits: int, degree: int) -> tuple[str,
 
 def has_dial(path: Path) -> bool:
     """Reads all of the file, which is never much."""
-    return not read_start(path).startswith(NEW_SPZ) and SIGMA in read(path).arrays
+    return not read_start(path).startswith(NEW_SPZ) and SIGMA in read(path, read_whole(path)).arrays
 
 
-def read(path: Path) -> Source:
+def read(path: Path, data: bytes) -> Source:
     """Reads versions 2 and 3, SH degree 0 to 4; version 4 is converted by splat-transform."""
-    whole = read_whole(path)
-    if whole.startswith(NEW_SPZ):
-        return splat_transform.read(path, " of version 4")
-    data = _unpacked(path, whole)
+    if data.startswith(NEW_SPZ):
+        return splat_transform.read(path, data, " of version 4")
+    data = _unpacked(path, data)
     magic, version, count, degree, bits, flags, _ = HEADER.unpack_from(data)
     if magic != MAGIC or version not in (2, 3) or degree not in SH_COUNTS or bits > 24 or count > MOST:
         raise ClodError(f"{path}: is no SPZ file of version 2 or 3 (version {version}, {count} Gaussians); {_CONVERT}")
@@ -215,12 +212,12 @@ def read(path: Path) -> Source:
         metadata = _with_dial_in_world_units(arrays, metadata)
     antialiased = flags & ANTIALIASED and not (metadata.screen_filter or CLASSIC).compensate
     comments = (*metadata.about, TAG) if antialiased else metadata.about  # of another program, which states no variance
-    return Source(float32(arrays), metadata, sha256_of(whole), (QUANTISED,), comments)
+    return Source(arrays, metadata, (QUANTISED,), comments)
 
 
 def _with_dial_in_world_units(arrays: Arrays, metadata: Metadata) -> Metadata:
     """Changes sigma_d, which is in units of the reference distance where that is large, and its settings."""
-    tensors: dict[str, Any] = {name: torch.from_numpy(array) for name, array in float32(arrays).items()}
+    tensors: dict[str, Any] = {name: torch.from_numpy(array).float() for name, array in arrays.items()}
     gaussians = in_world_units(Gaussians(**tensors, attenuation=metadata.attenuation))
     assert gaussians.sigma_d is not None
     arrays[SIGMA] = gaussians.sigma_d.numpy()
