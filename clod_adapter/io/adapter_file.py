@@ -18,16 +18,7 @@ from clod_adapter.config import CLASSIC
 from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.file_formats import KEY, read_whole
-from clod_adapter.io.settings import (
-    ADAPTER,
-    DAMAGE,
-    Metadata,
-    damaged,
-    document,
-    document_text,
-    parse_document,
-    read_metadata,
-)
+from clod_adapter.io.settings import ADAPTER, DAMAGE, Metadata, damaged, document, parse_document, read_metadata
 from clod_adapter.io.tensor_file import parse_tensors, read_tensor_header, write_tensors
 
 
@@ -38,16 +29,15 @@ def save_adapter(path: str | Path, adapter: Adapter) -> None:
         ClodError: its config is not plain JSON, or the file cannot be written.
     """
     check_config(adapter.config)
-    a = adapter
-    about = document(ADAPTER, Metadata(a.attenuation, a.screen_filter, a.calibration, a.origin, version=a.version))
-    about |= {"base_sha256": a.base_fingerprint, "config": a.config}
+    a, tensors = adapter, {**dial_tensors(adapter), **adapter.updates}
+    settings = Metadata(a.attenuation, a.screen_filter, a.calibration, a.origin, version=a.version)
+    about: dict[str, Any] = {"base_sha256": a.base_fingerprint, "config": a.config}
     if a.kept is not None or a.sh_degree is not None:
         about["trimmed"] = {"base_count": a.base_count, "sh_degree": a.sh_degree}
-    tensors = {**dial_tensors(a), **a.updates}
     if a.kept is not None:
         tensors["kept"] = torch.from_numpy(np.packbits(a.kept.cpu().numpy()))
     with atomic_path(path) as temporary:
-        write_tensors(temporary, tensors, {KEY: document_text(about)})
+        write_tensors(temporary, tensors, {KEY: document(ADAPTER, settings, **about)})
         _description(temporary, read_tensor_header(temporary)[1])  # it can be read again
 
 

@@ -155,8 +155,11 @@ def matching_calibration(metadata: Metadata, count: int) -> tuple[Calibration | 
     return None, [f"the calibration is of {found.total} Gaussians and ignored, these are {count}"]
 
 
-def document(kind: str, metadata: Metadata) -> dict[str, Any]:
-    """Plain JSON that ``parse_document`` and ``read_metadata`` invert; what is not set is left out."""
+def document(kind: str, metadata: Metadata, **more: Any) -> str:
+    """JSON that ``parse_document`` and ``read_metadata`` invert, without what is not set.
+
+    Its keys are sorted, so that equal models give equal files.
+    """
     dial, calibration, screen_filter = metadata.attenuation, metadata.calibration, metadata.screen_filter or CLASSIC
     values = {
         "format": kind,
@@ -169,12 +172,8 @@ def document(kind: str, metadata: Metadata) -> dict[str, Any]:
         "origin": list(metadata.origin) if any(metadata.origin) else None,
         "calibration": calibration.as_dict() if calibration else None, "about": list(metadata.about),
     }  # fmt: skip
-    return values | {name: value for name, value in optional.items() if value}
-
-
-def document_text(values: dict[str, Any]) -> str:
-    """The document with sorted keys, so that equal models give equal files."""
-    return json.dumps(values, sort_keys=True, allow_nan=False)
+    values |= {name: value for name, value in optional.items() if value}
+    return json.dumps(values | more, sort_keys=True, allow_nan=False)
 
 
 def parse_metadata(path: Path, text: str | bytes | dict[str, Any] | None, *, dial: bool) -> Metadata:

@@ -19,7 +19,7 @@ from safetensors import safe_open
 
 from clod_adapter.errors import ClodError
 from clod_adapter.io.file_formats import KEY, read_start, refuse_known
-from clod_adapter.io.settings import MODEL, Metadata, Source, document, document_text, parse_metadata
+from clod_adapter.io.settings import MODEL, Metadata, Source, document, parse_metadata
 from clod_adapter.io.values import SIGMA, arrays_of, dial_columns
 
 if TYPE_CHECKING:
@@ -102,7 +102,7 @@ def refused_if_damaged(path: Path, what: str, fix: str) -> Iterator[None]:
 
 def write(path: Path, gaussians: Gaussians, metadata: Metadata) -> tuple[str, ...]:
     """Writes every value unchanged."""
-    write_tensors(path, arrays_of(path, gaussians), {KEY: document_text(document(MODEL, metadata))})
+    write_tensors(path, arrays_of(path, gaussians), {KEY: document(MODEL, metadata)})
     return ()
 
 

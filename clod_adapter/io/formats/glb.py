@@ -21,22 +21,10 @@ import torch
 from clod_adapter._support.version import package_version
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
+from clod_adapter.io import values
 from clod_adapter.io.file_formats import KEY
-from clod_adapter.io.settings import DAMAGE, MODEL, Metadata, Source, parse_metadata
-from clod_adapter.io.settings import document as settings_document
-from clod_adapter.io.values import (
-    GROWTH,
-    SIGMA,
-    arrays_of,
-    colours_of,
-    dial_columns,
-    half_turn,
-    logit,
-    logs_of,
-    normalized,
-    scales_of,
-    sigmoid,
-)
+from clod_adapter.io.settings import DAMAGE, MODEL, Metadata, Source, document, parse_metadata
+from clod_adapter.io.values import GROWTH, SIGMA, arrays_of, dial_columns, half_turn
 from clod_adapter.origin import NOWHERE, Origin, origin_of
 
 EXTENSION = "KHR_gaussian_splatting"
@@ -68,7 +56,18 @@ _FAINTEST = -100.0  # logit of an opacity that float32 has rounded to 0
 
 def write(path: Path, gaussians: Gaussians, metadata: Metadata) -> tuple[str, ...]:
     """Writes with float32's rounding of the activations."""
-    columns, dropped = _columns(path, gaussians)
+    arrays, degree = arrays_of(path, gaussians), min(gaussians.sh_degree, DEGREE)
+    sh0, opacities = arrays["sh0"].reshape(-1, 3), values.sigmoid(arrays["opacity_logits"]).astype(np.float32)
+    columns: dict[str, np.ndarray] = {
+        "POSITION": arrays["means"],
+        "COLOR_0": values.colours_of(sh0, opacities),
+        f"{EXTENSION}:ROTATION": np.ascontiguousarray(np.roll(values.normalized(arrays["quats"]), -1, axis=1)),
+        f"{EXTENSION}:SCALE": values.scales_of(path, arrays["log_scales"]),
+        f"{EXTENSION}:OPACITY": opacities,
+        harmonics(0)[0]: sh0,
+    }
+    columns |= {name: np.ascontiguousarray(arrays["shN"][:, k]) for k, name in enumerate(harmonics(degree)[1:])}
+    columns |= {DIAL[name]: arrays[name] for name in dial_columns(arrays)}
     size = sum(array.nbytes for array in columns.values())
     if size >= _LIMIT - (1 << 20):
         raise ClodError(f"{path}: {size:,} bytes are more than a .glb can hold; keep fewer Gaussians or write a .ply")
@@ -78,17 +77,16 @@ def write(path: Path, gaussians: Gaussians, metadata: Metadata) -> tuple[str, ..
         accessors[name] = {"bufferView": len(views), "count": len(array), "type": kind}
         views.append({"buffer": 0, "byteOffset": offset, "byteLength": array.nbytes, "target": 34962})
         offset += array.nbytes
-    node: dict[str, Any] = {"rotation": HALF_TURN}
-    if any(metadata.origin):
-        x, y, z = metadata.origin
-        node["translation"] = [0.0 - x, 0.0 - y, z]
-    extras = {KEY: settings_document(MODEL, metadata)}
-    gltf = document(gaussians.means, accessors, node, size, extras=extras) | {"bufferViews": views}
+    x, y, z = metadata.origin
+    node = {"rotation": HALF_TURN} | ({"translation": [0.0 - x, 0.0 - y, z]} if any(metadata.origin) else {})
+    extras = {KEY: json.loads(document(MODEL, metadata))}
+    gltf = gltf_of(gaussians.means, accessors, node, size, extras=extras) | {"bufferViews": views}
     write_chunks(path, gltf | {"extensionsUsed": [EXTENSION]}, [array.data for array in columns.values()])
-    return dropped
+    lost = arrays["shN"][:, (degree + 1) ** 2 - 1 :].any()
+    return (f"spherical harmonics above degree {DEGREE} are dropped",) if lost else ()
 
 
-def document(
+def gltf_of(
     means: torch.Tensor, accessors: dict[str, dict[str, Any]], node: dict[str, Any], size: int,
     extensions: dict[str, Any] | None = None, **asset: Any,
 ) -> dict[str, Any]:  # fmt: skip
@@ -125,27 +123,6 @@ def write_chunks(path: Path, gltf: dict[str, Any], buffer: Sequence[memoryview |
         file.write(bytes(padded - size))
 
 
-def _columns(path: Path, gaussians: Gaussians) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
-    """The attributes, and a line for what the extension does not store."""
-    arrays = arrays_of(path, gaussians)
-    scales = scales_of(path, arrays["log_scales"])
-    opacities = sigmoid(arrays["opacity_logits"]).astype(np.float32)
-    sh0 = arrays["sh0"].reshape(-1, 3)
-    columns: dict[str, np.ndarray] = {
-        "POSITION": arrays["means"],
-        "COLOR_0": colours_of(sh0, opacities),
-        f"{EXTENSION}:ROTATION": np.ascontiguousarray(np.roll(normalized(arrays["quats"]), -1, axis=1)),
-        f"{EXTENSION}:SCALE": scales,
-        f"{EXTENSION}:OPACITY": opacities,
-        harmonics(0)[0]: sh0,
-    }
-    degree = min(gaussians.sh_degree, DEGREE)
-    columns |= {name: np.ascontiguousarray(arrays["shN"][:, k]) for k, name in enumerate(harmonics(degree)[1:])}
-    columns |= {DIAL[name]: arrays[name] for name in dial_columns(arrays)}
-    lost = arrays["shN"][:, (degree + 1) ** 2 - 1 :].any()
-    return columns, (f"spherical harmonics above degree {DEGREE} are dropped",) if lost else ()
-
-
 def has_dial(path: Path) -> bool:
     """By the attributes of the primitive; the file is mapped, and its values are not read."""
     with _one_line_errors(path):
@@ -160,22 +137,21 @@ def read(path: Path, data: bytes) -> Source:
     Under a node without a rotation the values are in glTF's own axes, and are turned here; files of this package have
     the half turn in the node and store the checkpoint's values.
     """
-    ignored, arrays = list[str](), dict[str, np.ndarray]()
     with _one_line_errors(path):
         gltf, binary = _chunks(memoryview(data))
         (mesh, primitive), *others = _find(gltf)
-        attributes, ignored = primitive["attributes"], _ignored(primitive, len(others))
-        arrays = {key: _values(gltf, binary, attributes[name], width) for key, (name, width) in _ATTRIBUTES.items()}
-        degree = 0
-        while degree < DEGREE and harmonics(degree + 1)[(degree + 1) ** 2] in attributes:
-            degree += 1
-        rest = [_values(gltf, binary, attributes[name], 3) for name in harmonics(degree)[1:]]
-        for name in dial_columns([name for name, attribute in DIAL.items() if attribute in attributes]):
-            arrays[name] = _values(gltf, binary, attributes[DIAL[name]], 1)
-        if len({len(values) for values in (*arrays.values(), *rest)}) > 1:
+        there = primitive["attributes"]
+        degree = max(k for k in range(DEGREE + 1) if harmonics(k)[-1] in there)
+        names = _ATTRIBUTES | {name: (DIAL[name], 1) for name in dial_columns([n for n in DIAL if DIAL[n] in there])}
+        arrays = {key: _values(gltf, binary, there[name], width) for key, (name, width) in names.items()}
+        rest = [_values(gltf, binary, there[name], 3) for name in harmonics(degree)[1:]]
+        if len({len(each) for each in (*arrays.values(), *rest)}) > 1:
             raise ClodError(f"its attributes are of different lengths; {_REMEDY}")
         text = gltf["asset"].get("extras", {}).get(KEY)
         turned, moved = _placed(gltf, mesh)
+    space = primitive["extensions"][EXTENSION].get("colorSpace", COLOR_SPACE)
+    notes = [f"its colours are in {space!r:.40}, and taken as {COLOR_SPACE}"] if space != COLOR_SPACE else []
+    notes += [f"{len(others)} more primitives with Gaussians in it are left out"] if others else []
     metadata = parse_metadata(path, text, dial=SIGMA in arrays)
     arrays["shN"] = np.stack(rest, 1) if rest else np.zeros((len(arrays["means"]), 0, 3), np.float32)
     stored = _stored(arrays) if turned else half_turn(_stored(arrays), "z")
@@ -184,7 +160,7 @@ def read(path: Path, data: bytes) -> Source:
         near = not any(origin_of(wide))  # float32 has enough digits
         stored["means"] = wide if near else stored["means"]
         metadata = replace(metadata, origin=NOWHERE if near else moved)
-    return Source(stored, metadata, tuple(ignored), metadata.about)
+    return Source(stored, metadata, tuple(notes), metadata.about)
 
 
 @contextmanager
@@ -193,7 +169,7 @@ def _one_line_errors(path: Path) -> Iterator[None]:
         yield
     except ClodError as error:
         raise ClodError(f"{path}: {error}") from error
-    except DAMAGE + (IndexError,) as error:
+    except (*DAMAGE, IndexError) as error:
         raise ClodError(f"{path}: is damaged or no such .glb ({error!r:.80}); {_REMEDY}") from error
 
 
@@ -232,13 +208,6 @@ def _find(gltf: dict[str, Any]) -> list[tuple[int, dict[str, Any]]]:
     return found
 
 
-def _ignored(primitive: dict[str, Any], others: int) -> list[str]:
-    """Notes on the parts of the file that are not used."""
-    space = primitive["extensions"][EXTENSION].get("colorSpace", COLOR_SPACE)
-    notes = [f"its colours are in {space!r:.40}, and taken as {COLOR_SPACE}"] if space != COLOR_SPACE else []
-    return notes + ([f"{others} more primitives with Gaussians in it are left out"] if others else [])
-
-
 def _values(gltf: dict[str, Any], binary: memoryview, number: int, width: int) -> np.ndarray:
     """``[N, width]`` float32, the values of an accessor; ``[N]`` where the width is 1."""
     accessor = gltf["accessors"][_whole(number)]
@@ -254,10 +223,10 @@ def _values(gltf: dict[str, Any], binary: memoryview, number: int, width: int) -
     size = kind.itemsize * width
     if not count or stride < size or start + (count - 1) * stride + size > len(data):
         raise ClodError("an attribute has no values, or more than the file; copy or export it again")
-    values = np.ndarray((count, width), kind, data, start, (stride, kind.itemsize)).astype(np.float32)
+    found = np.ndarray((count, width), kind, data, start, (stride, kind.itemsize)).astype(np.float32)
     if accessor.get("normalized") and kind.kind != "f":
-        values = np.maximum(values / np.float32(np.iinfo(kind).max), -1)
-    return values[:, 0] if width == 1 else values
+        found = np.maximum(found / np.float32(np.iinfo(kind).max), -1)
+    return found[:, 0] if width == 1 else found
 
 
 def _whole(value: Any) -> int:
@@ -285,9 +254,8 @@ def _placed(gltf: dict[str, Any], mesh: int) -> tuple[bool, Origin]:
 
 def _stored(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """The values as checkpoints store them."""
-    quats = np.roll(arrays["quats"], 1, axis=1)
-    logits = logit(np.clip(arrays["opacity_logits"], 0, 1))
+    logits = values.logit(np.clip(arrays["opacity_logits"], 0, 1))
     return {
-        **arrays, "log_scales": logs_of(arrays["log_scales"]), "quats": quats,
-        "opacity_logits": np.maximum(logits, _FAINTEST), "sh0": arrays["sh0"][:, None],
+        **arrays, "log_scales": values.logs_of(arrays["log_scales"]), "sh0": arrays["sh0"][:, None],
+        "quats": np.roll(arrays["quats"], 1, axis=1), "opacity_logits": np.maximum(logits, _FAINTEST),
     }  # fmt: skip

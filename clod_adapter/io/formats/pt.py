@@ -19,7 +19,7 @@ import numpy as np
 
 from clod_adapter.errors import ClodError
 from clod_adapter.io.file_formats import KEY, read_start, refuse
-from clod_adapter.io.settings import MODEL, Metadata, Source, damaged, document, document_text, parse_metadata
+from clod_adapter.io.settings import MODEL, Metadata, Source, damaged, document, parse_metadata
 from clod_adapter.io.tensor_file import refused_if_damaged
 from clod_adapter.io.values import SIGMA, arrays_of, dial_columns
 
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 FRAME = "gsplat's trainer may have normalised the coordinates; photographs must be in the same"
 _PICKLE_LIMIT = 1 << 20  # bytes; of a few tensors it has a few hundred
+_DAMAGE = zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, struct.error, ValueError, IndexError
 _PLAIN = r"collections OrderedDict|torch\._utils _rebuild_(tensor_v2|parameter)|torch \w+Storage"
 
 
@@ -46,48 +47,42 @@ def check(path: Path) -> None:
             whole = stored and sum(entry.file_size for entry in entries) <= path.stat().st_size
             if not whole or len(pickles) != 1 or pickles[0].file_size > _PICKLE_LIMIT:
                 raise ClodError(f"{path}: is a zip archive that torch.save does not write; export a PLY instead")
+            # A pickle that names anything but what plain tensors need: ``weights_only`` runs no code either, but lets
+            # a hundred bytes of it ask for gigabytes.
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # of odd escapes in it
-                _check_pickle(path, archive.read(pickles[0]))
-    except (OSError, ValueError) as error:
-        raise ClodError(f"{path}: cannot be read ({getattr(error, 'strerror', error)}); check the path") from error
-    except (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, struct.error) as error:
+                for opcode, argument, _ in pickletools.genops(archive.read(pickles[0])):
+                    named = opcode.name in ("GLOBAL", "INST", "STACK_GLOBAL")
+                    if named and not re.fullmatch(_PLAIN, str(argument)):
+                        what = f"holds {argument}, more than tensors, and is not unpickled"
+                        raise ClodError(f"{path}: {what}; export it as a PLY")
+    except OSError as error:
+        raise ClodError(f"{path}: cannot be read ({error.strerror}); check the path") from error
+    except _DAMAGE as error:
         raise ClodError(f"{path}: is damaged or truncated ({error}); copy or export it again") from error
-
-
-def _check_pickle(path: Path, data: bytes) -> None:
-    """Refuses a pickle that names anything but what plain tensors need.
-
-    ``weights_only`` runs no code either, but lets a pickle of a hundred bytes ask for gigabytes.
-    """
-    try:
-        for opcode, argument, _ in pickletools.genops(data):
-            named = opcode.name in ("GLOBAL", "INST", "STACK_GLOBAL")
-            if named and not re.fullmatch(_PLAIN, str(argument)):
-                raise ClodError(
-                    f"{path}: holds {argument}, more than tensors, and is not unpickled; export it as a PLY"
-                )
-    except (ValueError, IndexError) as error:  # no such opcode, or it ends early
-        raise ClodError(f"{path}: is damaged ({error}); copy or export it again") from error
 
 
 def has_dial(path: Path) -> bool:
     """By the names in the pickle, which is not unpickled."""
     with zipfile.ZipFile(path) as archive:
-        (pickled,) = (entry for entry in archive.infolist() if entry.filename.endswith("/data.pkl"))
-        return any(argument == SIGMA for _, argument, _ in pickletools.genops(archive.read(pickled)))
+        (name,) = (name for name in archive.namelist() if name.endswith("/data.pkl"))
+        return any(argument == SIGMA for _, argument, _ in pickletools.genops(archive.read(name)))
 
 
 def read(path: Path, data: bytes) -> Source:
     """Reads a checkpoint of gsplat's trainer, or one written here; with ``weights_only``, so that no code runs."""
-    from clod_adapter.integrations.splats import NAMES  # here and not above, as check does without torch
+    import torch  # here: check does without it
 
-    checkpoint = _unpickled(path, data)
-    splats = checkpoint.get("splats") if isinstance(checkpoint, dict) else None
+    from clod_adapter.integrations.splats import NAMES
+
+    refused = refused_if_damaged(path, "is damaged, or holds more than tensors", "export the checkpoint as a PLY")
+    with refused, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        checkpoint = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
+    found, splats = type(checkpoint).__name__, None
+    if isinstance(checkpoint, dict):
+        found, splats = ", ".join(map(repr, list(checkpoint)[:5])), checkpoint.get("splats")
     if not isinstance(splats, dict):
-        found = (
-            ", ".join(map(repr, list(checkpoint)[:5])) if isinstance(checkpoint, dict) else type(checkpoint).__name__
-        )
         raise ClodError(
             f"{path}: has no dictionary 'splats', as gsplat's trainer writes (but {found}); export it as a PLY"
         )
@@ -99,15 +94,6 @@ def read(path: Path, data: bytes) -> Source:
     metadata = parse_metadata(path, text, dial=SIGMA in arrays)
     notes = () if metadata.described else (FRAME,)
     return Source(arrays, metadata, notes, metadata.about, not metadata.described)
-
-
-def _unpickled(path: Path, data: bytes) -> Any:
-    import torch
-
-    refused = refused_if_damaged(path, "is damaged, or holds more than tensors", "export the checkpoint as a PLY")
-    with refused, warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        return torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
 
 
 def _values(path: Path, name: str, splats: dict[str, Any], size: int) -> np.ndarray:
@@ -135,6 +121,6 @@ def write(path: Path, gaussians: Gaussians, metadata: Metadata) -> tuple[str, ..
     splats = {name: torch.from_numpy(arrays[ours]) for name, ours in names.items()}
     # By way of memory, as the entries of a file are named after it, and this one's name is temporary.
     buffer = io.BytesIO()
-    torch.save({"step": 0, "splats": splats, KEY: document_text(document(MODEL, metadata))}, buffer)
+    torch.save({"step": 0, "splats": splats, KEY: document(MODEL, metadata)}, buffer)
     path.write_bytes(buffer.getbuffer())
     return ()

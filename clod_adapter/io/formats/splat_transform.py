@@ -17,7 +17,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from clod_adapter.errors import ClodError
 from clod_adapter.io.file_formats import read_start, read_whole, refuse_known
@@ -39,6 +39,10 @@ TICK = 0.2  # seconds between two checks for its end
 # Without a GPU, where a round of SOG's clustering of spherical harmonics takes minutes, and its usual ten take an hour.
 # Two rounds more give 0.02 dB.
 ON_CPU = ("-g", "cpu", "-i", "1")
+_TEXT: dict[str, Any] = {
+    "stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "encoding": "utf-8",
+    "errors": "replace",
+}  # fmt: skip
 LEAVES, SMALLEST = 128, 8  # fewest leaves of a large set, and thousands (1,024) of Gaussians below which none is cut
 
 
@@ -59,21 +63,22 @@ class SplatTransform:
     def find(cls) -> SplatTransform:
         """The one in the environment's ``CLOD_SPLAT_TRANSFORM``, a command with its words, or on the PATH."""
         given = os.environ.get(VARIABLE, "")
-        name, *more = _words(given) or ("splat-transform",)
+        try:  # a path with spaces in it that is there needs no quotes
+            name, *more = [given] if given and shutil.which(given) else shlex.split(given) or ["splat-transform"]
+        except ValueError as error:
+            raise ClodError(f"{VARIABLE} is {given!r}, which is no command ({error}); {HELP}") from error
         program = shutil.which(name)
         if program is None:
             where = f"{name}, which {VARIABLE} names, is" if given else "splat-transform is"
             raise ClodError(f"{where} not installed; {HELP}")
         command = (program, *more)
-        version = re.search(r"splat-transform v(\d+)\.(\d+)\.(\d+)", _ask(command, "--version"))
+        version = re.search(r"splat-transform v((\d+)\.(\d+)\.\d+)", _ask(command, "--version"))
         if version is None:
             raise ClodError(f"{shlex.join(command)} does not run as splat-transform; it needs Node 22; {HELP}")
-        found = tuple(map(int, version.groups()))
-        if found[:2] < NEEDED:
-            wanted = ".".join(map(str, NEEDED))
-            raise ClodError(f"splat-transform is {'.'.join(version.groups())}, {wanted} or newer is needed; {HELP}")
+        if (int(version[2]), int(version[3])) < NEEDED:
+            raise ClodError(f"splat-transform is {version[1]}, {'.'.join(map(str, NEEDED))} or newer is needed; {HELP}")
         gpu = re.search(r"(?m)^\s*\[\d+\] \S", _ask(command, "--list-gpus")) is not None
-        return cls(command, ".".join(version.groups()), gpu)
+        return cls(command, version[1], gpu)
 
     def run(self, *words: str | Path, timeout: float, progress: Callable[[float], None] | None = None) -> float:
         """Runs it with these words, replacing outputs; the seconds it took. An exception, as of Ctrl-C, ends the tool.
@@ -84,10 +89,7 @@ class SplatTransform:
         given = [str(word.absolute()) if isinstance(word, Path) else word for word in words]
         command = [*self.command, "-w", *(() if self.gpu else ON_CPU), *given]
         began = time.perf_counter()
-        process = subprocess.Popen(
-            command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
-            encoding="utf-8", errors="replace",
-        )  # fmt: skip
+        process = subprocess.Popen(command, **_TEXT)
         try:
             output = None
             while output is None:
@@ -141,31 +143,16 @@ def read(path: Path, _: bytes, version: str = "") -> Source:
     return Source(arrays, Metadata(), (note, f"read through splat-transform {tool.version}"))
 
 
-def _words(given: str) -> tuple[str, ...]:
-    """The words of a command; a path with spaces in it that is there needs no quotes."""
-    if not given or shutil.which(given):
-        return (given,) if given else ()
-    try:
-        return tuple(shlex.split(given))
-    except ValueError as error:
-        raise ClodError(f"{VARIABLE} is {given!r}, which is no command ({error}); {HELP}") from error
-
-
 def _ask(command: tuple[str, ...], question: str) -> str:
     """Its output for an option that asks about it; empty where it does not run."""
-    try:
-        done = subprocess.run(
-            [*command, question], stdin=subprocess.DEVNULL, capture_output=True, text=True, encoding="utf-8",
-            errors="replace", timeout=ASKING,
-        )  # fmt: skip
-    except (OSError, subprocess.TimeoutExpired):
-        return ""
-    return f"{done.stderr}\n{done.stdout}"
+    with suppress(OSError, subprocess.TimeoutExpired):
+        done = subprocess.run([*command, question], **_TEXT, timeout=ASKING)
+        return str(done.stdout)
+    return ""
 
 
 def _reason(output: str) -> str:
     """The line with the error, or the last one; without the stack trace and the duration."""
     lines = [line.strip(" \t✗·▸") for line in output.splitlines()]
     lines = [line for line in lines if line and not line.startswith(("at ", "failed in "))]
-    errors = [line for line in lines if "Error" in line]
-    return (errors or lines or ["no output"])[-1]
+    return ([line for line in lines if "Error" in line] or lines or ["no output"])[-1]

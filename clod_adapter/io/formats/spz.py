@@ -32,31 +32,11 @@ from clod_adapter.config import CLASSIC, SH_COUNTS
 from clod_adapter.equation.units import estimated_distance, in_world_units, known_distance, with_distance
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
+from clod_adapter.io import values
 from clod_adapter.io.file_formats import NEW_SPZ, read_start, read_whole
 from clod_adapter.io.formats import splat_transform
-from clod_adapter.io.settings import (
-    DAMAGE,
-    MODEL,
-    TAG,
-    Metadata,
-    Source,
-    damaged,
-    document,
-    document_text,
-    parse_metadata,
-)
-from clod_adapter.io.values import (
-    GROWTH,
-    SIGMA,
-    Arrays,
-    arrays_of,
-    bytes_of,
-    dial_columns,
-    half_turn,
-    logits_of_bytes,
-    normalized,
-    sigmoid,
-)
+from clod_adapter.io.settings import DAMAGE, MODEL, TAG, Metadata, Source, damaged, document, parse_metadata
+from clod_adapter.io.values import GROWTH, SIGMA, Arrays, arrays_of, bytes_of, dial_columns, half_turn
 
 HEADER = struct.Struct("<IIIBBBB")  # magic, version, count, SH degree, fractional bits, flags, 0
 MAGIC, VERSION = 0x5053474E, 3
@@ -76,7 +56,6 @@ QUANTISED = "quantised: positions in 24 bits, scales, opacities and harmonics in
 _BOMB = 64  # times its size that a file may unpack to; Gaussians that differ at all come to 10
 _CONVERT = "convert it: splat-transform IN.spz OUT.ply"
 _TURNS = {RDF: "", 4: "x", 7: "z"}  # right, up, back; left, up, forward
-_UNTURNED = struct.pack("<I", RDF)
 _SMALL = 1 << 24  # bytes that any file may
 
 
@@ -101,9 +80,9 @@ def write(path: Path, gaussians: Gaussians, metadata: Metadata) -> tuple[str, ..
     if metadata != Metadata(screen_filter=CLASSIC):
         columns = list(dial_columns(arrays))
         named = {COLUMNS: columns} if GROWTH in columns else {}  # sigma_d alone needs no name
-        text = document_text(document(MODEL, metadata) | named).encode()
-        values = b"".join(np.clip(arrays[name], -_MOST, _MOST).astype("<f2").tobytes() for name in columns)
-        parts.append(struct.pack("<III", RECORD, 4 + len(text) + len(values), len(text)) + text + values)
+        text = document(MODEL, metadata, **named).encode()
+        halves = b"".join(np.clip(arrays[name], -_MOST, _MOST).astype("<f2").tobytes() for name in columns)
+        parts.append(struct.pack("<III", RECORD, 4 + len(text) + len(halves), len(text)) + text + halves)
     gzip = zlib.compressobj(wbits=31)
     path.write_bytes(gzip.compress(b"".join(parts)) + gzip.flush())
     return (*moved, *_losses(arrays, bits, degree))
@@ -146,7 +125,7 @@ def _packed(arrays: dict[str, np.ndarray], bits: int, degree: int) -> list[bytes
     fixed = np.round(arrays["means"].astype(np.float64) * 2.0**bits).clip(-(2**23), 2**23 - 1).astype("<i4")
     parts = [
         np.ascontiguousarray(fixed[..., None].view(np.uint8)[..., :3]),
-        bytes_of(255 * sigmoid(arrays["opacity_logits"])),
+        bytes_of(255 * values.sigmoid(arrays["opacity_logits"])),
         bytes_of(255 * (COLOR * sh0 + 0.5)),
         bytes_of(16 * (arrays["log_scales"] + 10)),
         _packed_quats(arrays["quats"]),
@@ -158,7 +137,7 @@ def _packed(arrays: dict[str, np.ndarray], bits: int, degree: int) -> list[bytes
 
 def _packed_quats(quats: np.ndarray) -> np.ndarray:
     """``[N]`` uint32: the largest component's index in xyzw, then of each other a sign and 9 bits, over sqrt(1/2)."""
-    xyzw = np.roll(normalized(quats), -1, axis=1).astype(np.float64)
+    xyzw = np.roll(values.normalized(quats), -1, axis=1).astype(np.float64)
     rows, largest = np.arange(len(xyzw)), np.abs(xyzw).argmax(1)
     xyzw *= np.where(xyzw[rows, largest] < 0, -1.0, 1.0)[:, None]
     packed = largest.astype(np.uint32)
@@ -206,8 +185,11 @@ def read(path: Path, data: bytes) -> Source:
     records = _records(data[end:]) if flags & EXTENDED else {}
     stored, dial = _ours(path, records[RECORD], count) if RECORD in records else (None, {})
     metadata = parse_metadata(path, stored, dial=bool(dial))
+    axes = int.from_bytes(records.get(AXES, bytes([RDF])), "little")  # without a record as converters write them
+    if axes not in _TURNS:
+        raise ClodError(f"{path}: its axes are of kind {axes}, which this reader does not know; {_CONVERT}")
     arrays = _unquantized(columns, bits, bands)
-    arrays = _in_our_axes(path, arrays, records.get(AXES, _UNTURNED)) | dial
+    arrays = (half_turn(arrays, _TURNS[axes]) if _TURNS[axes] else arrays) | dial
     if dial:
         metadata = _with_dial_in_world_units(arrays, metadata)
     antialiased = flags & ANTIALIASED and not (metadata.screen_filter or CLASSIC).compensate
@@ -225,8 +207,6 @@ def _with_dial_in_world_units(arrays: Arrays, metadata: Metadata) -> Metadata:
 
 
 def _unpacked(path: Path, data: bytes) -> bytes:
-    if data[:2] != b"\x1f\x8b":
-        raise ClodError(f"{path}: is no SPZ file; copy or export it again")
     limit = max(_SMALL, _BOMB * len(data))
     gzip = zlib.decompressobj(wbits=31)
     try:
@@ -254,24 +234,16 @@ def _records(data: bytes) -> dict[int, bytes]:
 def _ours(path: Path, body: bytes, count: int) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """The JSON document of our record, and the columns of the dial if they are there."""
     length = struct.unpack_from("<I", body)[0] if len(body) >= 4 else 0
-    text, values = body[4 : 4 + length], body[4 + length :]
+    text, halves = body[4 : 4 + length], body[4 + length :]
     try:
         stored = json.loads(text)
         names = stored.get(COLUMNS, [SIGMA])
     except DAMAGE as error:
         raise damaged(path, error) from error
-    if names not in ([SIGMA], [SIGMA, GROWTH]) or len(values) not in (0, 2 * count * len(names)):
+    if names not in ([SIGMA], [SIGMA, GROWTH]) or len(halves) not in (0, 2 * count * len(names)):
         raise ClodError(f"{path}: its record of sigma_d is damaged; copy or export it again")
-    table = np.frombuffer(values, "<f2").astype(np.float32).reshape(-1, count)
+    table = np.frombuffer(halves, "<f2").astype(np.float32).reshape(-1, count)
     return stored, dict(zip(names, table, strict=False))  # no rows without a dial
-
-
-def _in_our_axes(path: Path, arrays: dict[str, np.ndarray], record: bytes) -> dict[str, np.ndarray]:
-    """Turned as Adobe's record states; without a record unchanged, as converters write them."""
-    (axes,) = struct.unpack("<I", record) if len(record) == 4 else (0,)
-    if axes not in _TURNS:
-        raise ClodError(f"{path}: its axes are of kind {axes}, which this reader does not know; {_CONVERT}")
-    return half_turn(arrays, _TURNS[axes]) if _TURNS[axes] else arrays
 
 
 def _unquantized(columns: dict[str, np.ndarray], bits: int, bands: int) -> dict[str, np.ndarray]:
@@ -279,12 +251,14 @@ def _unquantized(columns: dict[str, np.ndarray], bits: int, bands: int) -> dict[
     wide = np.zeros((count, 3, 4), np.uint8)
     wide[..., 1:] = columns["means"].reshape(count, 3, 3)
     fixed = wide.view("<i4")[..., 0] >> 8  # with the sign
-    quats = columns["quats"]
+    if (quats := columns["quats"]).shape[1] == 3:  # of version 2: x, y and z, w >= 0
+        xyz = quats / 127.5 - 1
+        wxyz = np.concatenate([np.sqrt(np.maximum(0, 1 - (xyz**2).sum(1, keepdims=True))), xyz], 1)
     return {
         "means": (fixed / 2.0**bits).astype(np.float32),
-        "quats": _smallest_three(quats) if quats.shape[1] == 4 else _first_three(quats),
+        "quats": _smallest_three(quats) if quats.shape[1] == 4 else wxyz,
         "log_scales": columns["scales"].astype(np.float32) / 16 - 10,
-        "opacity_logits": logits_of_bytes(columns["opacities"][:, 0]),
+        "opacity_logits": values.logits_of_bytes(columns["opacities"][:, 0]),
         "sh0": ((columns["colors"].astype(np.float32) / 255 - 0.5) / COLOR)[:, None],
         "shN": (columns["shN"].reshape(count, bands, 3).astype(np.float32) - 128) / 128,
     }
@@ -301,9 +275,3 @@ def _smallest_three(quats: np.ndarray) -> np.ndarray:
         packed = np.where(there, packed >> 10, packed)
     xyzw[np.arange(len(xyzw)), largest] = np.sqrt(np.maximum(0, 1 - (xyzw**2).sum(1)))
     return np.roll(xyzw, 1, axis=1).astype(np.float32)
-
-
-def _first_three(quats: np.ndarray) -> np.ndarray:
-    """``[N, 4]`` wxyz of version 2: x, y and z in bytes, w >= 0."""
-    xyz = quats.astype(np.float32) / 127.5 - 1
-    return np.concatenate([np.sqrt(np.maximum(0, 1 - (xyz**2).sum(1, keepdims=True))), xyz], 1)

@@ -24,7 +24,7 @@ import torch
 from clod_adapter._support.version import package_version
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.formats import spz
-from clod_adapter.io.formats.glb import DEGREE, EXTENSION, document, harmonics, write_chunks
+from clod_adapter.io.formats.glb import DEGREE, EXTENSION, gltf_of, harmonics, write_chunks
 from clod_adapter.io.settings import Metadata
 from clod_adapter.origin import Origin
 
@@ -95,7 +95,7 @@ def write_tile(path: Path, gaussians: Gaussians, origin: Origin) -> tuple[str, .
     accessors: dict[str, Any] = {name: {"count": len(gaussians), "type": shape} for name, shape in shapes.items()}
     x, y, z = origin
     node = {"matrix": [-1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1, 0, -x, -y, z, 1]}  # a half turn about z
-    gltf = document(gaussians.means, accessors, node, len(data), {SPZ: {"bufferView": 0}})
+    gltf = gltf_of(gaussians.means, accessors, node, len(data), {SPZ: {"bufferView": 0}})
     gltf |= {"extensionsUsed": [EXTENSION, SPZ], "extensionsRequired": [EXTENSION, SPZ]}
     write_chunks(path, gltf | {"bufferViews": [{"buffer": 0, "byteLength": len(data)}]}, [data])
     return notes
