@@ -164,8 +164,8 @@ CONTENTS = (
     (b"<html", _PAGE, _DOWNLOAD),
     (b"<?xml", "an XML document, perhaps an error that a server sent", _DOWNLOAD),
 )
-# The same by suffix, for formats without characteristic first bytes.
-SUFFIXES = {
+# The same by suffix, or else by first bytes, of other formats.
+OTHERS: dict[str | bytes, tuple[str, str]] = {
     ".lcc": ("an LCC file, compressed for delivery", _CONVERT),
     ".hier": ("a Hierarchical-3DGS tree", "use the chunk's point_cloud.ply that the tree was built from"),
     ".ckpt": (
@@ -177,16 +177,13 @@ SUFFIXES = {
         "use the point_cloud/iteration_N/point_cloud.ply beside it",
     ),
     ".json": ("a JSON document; of an unbundled SOG it is the table of contents", _CONVERT),
+    b"\x1f\x8b": ("compressed with gzip", "unpack it first: gunzip"),
+    b"PK\x03\x04": ("a zip archive", "unpack it first; a gsplat checkpoint must be called .pt to be read as one"),
+    b"glTF": ("a glTF model", "call it .glb"),
+    b"NGSP": ("an SPZ file", "call it .spz"),
+    b"ply\n": ("a PLY file", "call it .ply"),
+    b"ply\r": ("a PLY file", "call it .ply"),
 }
-# The same by first bytes, where neither table above matches.
-ARCHIVES = (
-    (b"\x1f\x8b", "compressed with gzip", "unpack it first: gunzip"),
-    (b"PK\x03\x04", "a zip archive", "unpack it first; a gsplat checkpoint must be called .pt to be read as one"),
-    (b"glTF", "a glTF model", "call it .glb"),
-    (b"NGSP", "an SPZ file", "call it .spz"),
-    (b"ply\n", "a PLY file", "call it .ply"),
-    (b"ply\r", "a PLY file", "call it .ply"),
-)
 
 
 def refuse_irregular(path: Path, remedy: str = "give the name of a file") -> None:
@@ -231,10 +228,8 @@ def refuse(
 ) -> NoReturn:
     """Refuses a file, with its kind by the tables, or else with the message ``otherwise``."""
     refuse_known(path, start)
-    found = SUFFIXES.get(path.suffix.lower()) or next(
-        (kind for magic, *kind in ARCHIVES if start.startswith(magic)), None
-    )
-    if found:
-        what, remedy = found
-        raise ClodError(f"{path}: is {what}; {remedy.format(suffix=path.suffix)}")
+    suffix = path.suffix.lower()
+    for key, (what, remedy) in OTHERS.items():
+        if key == suffix or (isinstance(key, bytes) and start.startswith(key)):
+            raise ClodError(f"{path}: is {what}; {remedy.format(suffix=path.suffix)}")
     raise ClodError(f"{path}: {otherwise}")

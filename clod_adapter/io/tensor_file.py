@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from clod_adapter.gaussians import Gaussians
 
 _DAMAGED = "is not a safetensors file, or damaged", "copy or export it again"
-_NAMES = ("means", "quats", "log_scales", "opacity_logits", "sh0", "shN")
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor | np.ndarray], metadata: Mapping[str, str]) -> None:
@@ -113,13 +112,15 @@ def has_dial(path: Path) -> bool:
 
 def read(path: Path, data: bytes) -> Source:
     """Reads a model."""
+    from clod_adapter.adapter import ATTRIBUTES
+
     tensors, stored = parse_tensors(path, data)
     if KEY not in stored:
         raise ClodError(f"{path}: is a safetensors file but not a model of clod-adapter; give a file that it wrote")
     metadata = parse_metadata(path, stored[KEY], dial=SIGMA in tensors)
-    if missing := [name for name in _NAMES if name not in tensors]:
+    if missing := [name for name in ATTRIBUTES if name not in tensors]:
         raise ClodError(f"{path}: has no tensor {missing[0]!r}; export it again")
-    wanted = (*_NAMES, *dial_columns(tensors))
+    wanted = (*ATTRIBUTES, *dial_columns(tensors))
     if odd := [name for name in wanted if not tensors[name].is_floating_point()]:
         raise ClodError(f"{path}: tensor {odd[0]!r} is not of floating-point numbers; export it again")
     arrays = {name: tensors[name].float().numpy() for name in wanted}

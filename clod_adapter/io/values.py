@@ -29,13 +29,6 @@ _FAINTEST = -0.1  # logit of 0.475; trainers keep fainter Gaussians, and files o
 _TINY = float(np.finfo(np.float32).tiny)
 _OPAQUE = 1 - 2.0**-24  # the largest float32 below 1
 _SH_C0 = 0.28209479177387814  # gaussians.SH_C0, without torch
-# The axes in which each spherical harmonic is odd, in the order of ``Gaussians.shN``.
-_ODD = (
-    "y", "z", "x",
-    "xy", "yz", "", "xz", "",
-    "y", "xyz", "y", "z", "x", "z", "x",
-    "xy", "yz", "xy", "yz", "", "xz", "", "xz", "",
-)  # fmt: skip
 
 
 def dial_columns(names: Container[str]) -> dict[str, tuple[str, ...]]:
@@ -46,10 +39,10 @@ def dial_columns(names: Container[str]) -> dict[str, tuple[str, ...]]:
 def degree_of(path: Path, rest: int) -> int:
     """The SH degree that this many ``f_rest_*`` make; refuses a number that makes none."""
     degrees = {3 * (count - 1): degree for degree, count in SH_COUNTS.items()}
-    if rest not in degrees:
-        wanted = ", ".join(map(str, degrees))
-        raise ClodError(f"{path}: {rest} f_rest_* properties fit no SH degree ({wanted} do); export the file again")
-    return degrees[rest]
+    if rest in degrees:
+        return degrees[rest]
+    wanted = ", ".join(map(str, degrees))
+    raise ClodError(f"{path}: {rest} f_rest_* properties fit no SH degree ({wanted} do); export the file again")
 
 
 class Prepared(NamedTuple):
@@ -214,12 +207,15 @@ def half_turn(arrays: Mapping[str, np.ndarray], axis: str) -> dict[str, np.ndarr
     Exact, and its own inverse. With ``P`` the turn (two signs), means become ``P mu``, rotations ``P R P``, which
     gives the same ellipsoids, and harmonics change sign where they are odd in an odd number of the axes that flip.
     """
-    signs = {name: np.float32(1 if name == axis else -1) for name in "xyz"}
-    harmonics = [np.prod([signs[name] for name in odd]) for odd in _ODD]
+    x, y, z = (np.float32(1 if name == axis else -1) for name in "xyz")
+    # Of degree and order: odd in y for a negative order, in x for an odd one (else an even one), in z where they differ
+    # by an odd number.
+    orders = [(degree, order) for degree in range(1, 5) for order in range(-degree, degree + 1)]
+    harmonics = [x ** ((abs(m) - (m < 0)) % 2) * y ** int(m < 0) * z ** ((degree - m) % 2) for degree, m in orders]
     bands = arrays["shN"].shape[1]
     return {
-        **arrays, "means": arrays["means"] * np.array([*signs.values()], np.float32),
-        "quats": arrays["quats"] * np.array([1, *signs.values()], np.float32),
+        **arrays, "means": arrays["means"] * np.array([x, y, z], np.float32),
+        "quats": arrays["quats"] * np.array([1, x, y, z], np.float32),
         "shN": arrays["shN"] * np.array(harmonics[:bands], np.float32)[:, None],
     }  # fmt: skip
 

@@ -175,33 +175,24 @@ def _one_line_errors(path: Path) -> Iterator[None]:
 
 def _chunks(data: memoryview) -> tuple[dict[str, Any], memoryview]:
     """The JSON and the binary chunk."""
-    version, length = struct.unpack_from("<II", data, 4) if len(data) >= 12 else (0, 0)
-    if version != 2 or length > len(data):
+    version, length, size, kind = struct.unpack_from("<IIII", data, 4) if len(data) >= 20 else (0, 0, 0, 0)
+    if version != 2 or kind != _JSON or max(length, 20 + size) > len(data):
         raise ClodError("is truncated, or no glTF 2.0; copy or export it again")
-    found: dict[int, memoryview] = {}
-    start = 12
-    while start + 8 <= length:
-        size, kind = struct.unpack_from("<II", data, start)
-        if start + 8 + size > length:
-            raise ClodError("is truncated; copy or export it again")
-        found.setdefault(kind, data[start + 8 : start + 8 + size])
-        start += 8 + size
-    if _JSON not in found:
-        raise ClodError("has no JSON chunk; export it again")
-    return json.loads(bytes(found[_JSON])), found.get(_BIN, data[:0])
+    more = struct.unpack_from("<I", data, 20 + size)[0] if 28 + size <= length else 0
+    binary = data[28 + size : 28 + size + more]
+    if len(binary) < more:
+        raise ClodError("is truncated; copy or export it again")
+    return json.loads(bytes(data[20 : 20 + size])), binary
 
 
 def _find(gltf: dict[str, Any]) -> list[tuple[int, dict[str, Any]]]:
     """The primitives with Gaussians, at least one, each after the number of its mesh."""
-    found = [
-        (number, primitive)
-        for number, mesh in enumerate(gltf.get("meshes", []))
-        for primitive in mesh["primitives"]
-        if EXTENSION in primitive.get("extensions", {})
-    ]
+    meshes = enumerate(gltf.get("meshes", []))
+    found = [(number, primitive) for number, mesh in meshes for primitive in mesh["primitives"]]
+    found = [(number, each) for number, each in found if EXTENSION in each.get("extensions", {})]
     if not found:
         raise ClodError(f"has no Gaussians in it ({EXTENSION}), so it is a mesh; give a checkpoint of Gaussians")
-    _, first = found[0]
+    first = found[0][1]
     compressed = first["extensions"][EXTENSION].get("extensions")
     if compressed or any(name not in first["attributes"] for name, _ in _ATTRIBUTES.values()):
         raise ClodError("its Gaussians are compressed, or have no spherical harmonics; export them as a .ply")

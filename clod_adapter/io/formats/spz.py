@@ -36,7 +36,7 @@ from clod_adapter.io import values
 from clod_adapter.io.file_formats import NEW_SPZ, read_start, read_whole
 from clod_adapter.io.formats import splat_transform
 from clod_adapter.io.settings import DAMAGE, MODEL, TAG, Metadata, Source, damaged, document, parse_metadata
-from clod_adapter.io.values import GROWTH, SIGMA, Arrays, arrays_of, bytes_of, dial_columns, half_turn
+from clod_adapter.io.values import GROWTH, SIGMA, arrays_of, bytes_of, dial_columns, half_turn
 
 HEADER = struct.Struct("<IIIBBBB")  # magic, version, count, SH degree, fractional bits, flags, 0
 MAGIC, VERSION = 0x5053474E, 3
@@ -49,7 +49,7 @@ MOST = 10_000_000  # Gaussians that the reference reads
 DEGREE = 3  # the highest that all readers know
 COLOR = 0.15  # of the range of bytes to one of sh0
 MAGNITUDE = 511 * math.sqrt(2)  # of the three components of a rotation that are not the largest
-_BITS = 6  # of a harmonic
+_STEP = 4  # of the harmonics, which have 6 bits
 _MOST = float(np.finfo(np.float16).max)
 _FAR = 25.0  # world units: a reference distance, from which on some sigma_d that fade at high dial values exceed that
 QUANTISED = "quantised: positions in 24 bits, scales, opacities and harmonics in 8, rotations in 10 or 8"
@@ -65,7 +65,10 @@ def write(path: Path, gaussians: Gaussians, metadata: Metadata) -> tuple[str, ..
     Positions have as many of their 24 bits for the fraction as they leave, 20 at most. A few Gaussians at an enormous
     distance, as many checkpoints have them, would leave the rest too few: see ``_nearer``.
     """
-    gaussians = _within_float16(gaussians)
+    config = gaussians.attenuation
+    if config is not None and config.normalizer == "scene":  # in world units float16 would cut a large sigma_d off
+        distance = known_distance(config) or estimated_distance(gaussians.means)
+        gaussians = with_distance(gaussians, distance) if distance > _FAR else gaussians
     arrays, bits, moved = _nearer(arrays_of(path, gaussians))
     if len(gaussians) > MOST or bits < 1:
         raise ClodError(
@@ -86,15 +89,6 @@ def write(path: Path, gaussians: Gaussians, metadata: Metadata) -> tuple[str, ..
     gzip = zlib.compressobj(wbits=31)
     path.write_bytes(gzip.compress(b"".join(parts)) + gzip.flush())
     return (*moved, *_losses(arrays, bits, degree))
-
-
-def _within_float16(gaussians: Gaussians) -> Gaussians:
-    """With sigma_d in units of the reference distance where that is large: in world units float16 would cut it off."""
-    config = gaussians.attenuation
-    if config is None or config.normalizer != "scene":
-        return gaussians
-    distance = known_distance(config) or estimated_distance(gaussians.means)
-    return with_distance(gaussians, distance) if distance > _FAR else gaussians
 
 
 def _nearer(arrays: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], int, tuple[str, ...]]:
@@ -129,9 +123,8 @@ def _packed(arrays: dict[str, np.ndarray], bits: int, degree: int) -> list[bytes
         bytes_of(255 * (COLOR * sh0 + 0.5)),
         bytes_of(16 * (arrays["log_scales"] + 10)),
         _packed_quats(arrays["quats"]),
+        bytes_of(128 + _STEP * np.round(128 / _STEP * harmonics)),
     ]
-    step = 1 << (8 - _BITS)
-    parts.append(bytes_of(128 + step * np.round(128 / step * harmonics)))
     return [part.tobytes() for part in parts]
 
 
@@ -173,37 +166,30 @@ def read(path: Path, data: bytes) -> Source:
     magic, version, count, degree, bits, flags, _ = HEADER.unpack_from(data)
     if magic != MAGIC or version not in (2, 3) or degree not in SH_COUNTS or bits > 24 or count > MOST:
         raise ClodError(f"{path}: is no SPZ file of version 2 or 3 (version {version}, {count} Gaussians); {_CONVERT}")
-    bands = SH_COUNTS[degree] - 1
-    sizes = {"means": 9, "opacities": 1, "colors": 3, "scales": 3, "quats": 4 if version == 3 else 3, "shN": 3 * bands}
-    end = HEADER.size + count * sum(sizes.values())
+    sizes = 9, 1, 3, 3, 4 if version == 3 else 3, 3 * (SH_COUNTS[degree] - 1)
+    end = HEADER.size + count * sum(sizes)
     if not count or end > len(data):
         raise ClodError(f"{path}: has no Gaussians or is truncated; copy or export it again")
-    columns, start = {}, HEADER.size
-    for name, size in sizes.items():
-        columns[name] = np.frombuffer(data, np.uint8, count * size, start).reshape(count, size)
-        start += count * size
+    table = np.frombuffer(data[HEADER.size : end], np.uint8)
+    parts = [part.reshape(count, -1) for part in np.split(table, count * np.cumsum(sizes)[:-1])]
     records = _records(data[end:]) if flags & EXTENDED else {}
     stored, dial = _ours(path, records[RECORD], count) if RECORD in records else (None, {})
     metadata = parse_metadata(path, stored, dial=bool(dial))
     axes = int.from_bytes(records.get(AXES, bytes([RDF])), "little")  # without a record as converters write them
     if axes not in _TURNS:
         raise ClodError(f"{path}: its axes are of kind {axes}, which this reader does not know; {_CONVERT}")
-    arrays = _unquantized(columns, bits, bands)
+    arrays = _unquantized(parts, bits)
     arrays = (half_turn(arrays, _TURNS[axes]) if _TURNS[axes] else arrays) | dial
-    if dial:
-        metadata = _with_dial_in_world_units(arrays, metadata)
+    if dial:  # whose sigma_d is in units of the reference distance where that is large
+        tensors: dict[str, Any] = {name: torch.from_numpy(array).float() for name, array in arrays.items()}
+        gaussians = in_world_units(Gaussians(**tensors, attenuation=metadata.attenuation))
+        arrays[SIGMA], metadata = (
+            gaussians.tensors()[SIGMA].numpy(),
+            replace(metadata, attenuation=gaussians.attenuation),
+        )
     antialiased = flags & ANTIALIASED and not (metadata.screen_filter or CLASSIC).compensate
     comments = (*metadata.about, TAG) if antialiased else metadata.about  # of another program, which states no variance
     return Source(arrays, metadata, (QUANTISED,), comments)
-
-
-def _with_dial_in_world_units(arrays: Arrays, metadata: Metadata) -> Metadata:
-    """Changes sigma_d, which is in units of the reference distance where that is large, and its settings."""
-    tensors: dict[str, Any] = {name: torch.from_numpy(array).float() for name, array in arrays.items()}
-    gaussians = in_world_units(Gaussians(**tensors, attenuation=metadata.attenuation))
-    assert gaussians.sigma_d is not None
-    arrays[SIGMA] = gaussians.sigma_d.numpy()
-    return replace(metadata, attenuation=gaussians.attenuation)
 
 
 def _unpacked(path: Path, data: bytes) -> bytes:
@@ -246,22 +232,24 @@ def _ours(path: Path, body: bytes, count: int) -> tuple[dict[str, Any], dict[str
     return stored, dict(zip(names, table, strict=False))  # no rows without a dial
 
 
-def _unquantized(columns: dict[str, np.ndarray], bits: int, bands: int) -> dict[str, np.ndarray]:
-    count = len(columns["means"])
-    wide = np.zeros((count, 3, 4), np.uint8)
-    wide[..., 1:] = columns["means"].reshape(count, 3, 3)
+def _unquantized(parts: list[np.ndarray], bits: int) -> dict[str, np.ndarray]:
+    means, opacities, colors, scales, quats, harmonics = parts
+    wide = np.zeros((len(means), 3, 4), np.uint8)
+    wide[..., 1:] = means.reshape(-1, 3, 3)
     fixed = wide.view("<i4")[..., 0] >> 8  # with the sign
-    if (quats := columns["quats"]).shape[1] == 3:  # of version 2: x, y and z, w >= 0
-        xyz = quats / 127.5 - 1
-        wxyz = np.concatenate([np.sqrt(np.maximum(0, 1 - (xyz**2).sum(1, keepdims=True))), xyz], 1)
     return {
         "means": (fixed / 2.0**bits).astype(np.float32),
-        "quats": _smallest_three(quats) if quats.shape[1] == 4 else wxyz,
-        "log_scales": columns["scales"].astype(np.float32) / 16 - 10,
-        "opacity_logits": values.logits_of_bytes(columns["opacities"][:, 0]),
-        "sh0": ((columns["colors"].astype(np.float32) / 255 - 0.5) / COLOR)[:, None],
-        "shN": (columns["shN"].reshape(count, bands, 3).astype(np.float32) - 128) / 128,
+        "quats": _smallest_three(quats) if quats.shape[1] == 4 else _first_three(quats / 127.5 - 1),
+        "log_scales": scales.astype(np.float32) / 16 - 10,
+        "opacity_logits": values.logits_of_bytes(opacities[:, 0]),
+        "sh0": ((colors.astype(np.float32) / 255 - 0.5) / COLOR)[:, None],
+        "shN": (harmonics.reshape(len(means), -1, 3).astype(np.float32) - 128) / 128,
     }
+
+
+def _first_three(xyz: np.ndarray) -> np.ndarray:
+    """``[N, 4]`` wxyz of version 2, w >= 0."""
+    return np.concatenate([np.sqrt(np.maximum(0, 1 - (xyz**2).sum(1, keepdims=True))), xyz], 1)
 
 
 def _smallest_three(quats: np.ndarray) -> np.ndarray:
