@@ -141,12 +141,7 @@ def trim(gaussians: Gaussians, kept: Tensor | None, sh_degree: int | None) -> Ga
 
 
 def extract(
-    base: Gaussians,
-    adapted: Gaussians,
-    *,
-    fingerprint: str,
-    config: dict[str, Any],
-    origin: Origin = NOWHERE,
+    base: Gaussians, adapted: Gaussians, *, fingerprint: str, config: dict[str, Any], origin: Origin = NOWHERE
 ) -> Adapter:
     """What has to be added to ``base`` to get ``adapted``, rounded to float16 differences.
 
@@ -176,7 +171,7 @@ def extract(
 
 def with_dial(
     gaussians: Gaussians, sigma_d: Tensor | None = None, attenuation: AttenuationConfig | None = None,
-    growth_d: Tensor | None = None,
+    growth_d: Tensor | None = None
 ) -> Gaussians:  # fmt: skip
     """The Gaussians with this dial alone, by the default settings; without ``sigma_d`` one that changes nothing.
 

@@ -61,19 +61,19 @@ class Gaussians:
         for field in dataclasses.fields(self):
             if isinstance(value := getattr(self, field.name), np.ndarray):
                 object.__setattr__(self, field.name, float_tensor(value))
+        n, bands = (
+            len(self.means),
+            next((k for k in self.shN.shape[1:2] if k + 1 in SH_COUNTS.values()), "0, 3, 8, 15 or 24"),
+        )
+        shapes = {
+            "means": (n, 3), "quats": (n, 4), "log_scales": (n, 3), "opacity_logits": (n,), "sh0": (n, 1, 3),
+            "shN": (n, bands, 3), "sigma_d": (n,), "growth_d": (n,),
+        }  # fmt: skip
         for name, value in self.tensors().items():
             require(value.is_floating_point(), f"Gaussians.{name}", value.dtype, "floating point: .float()")
-        n = self.means.shape[0]
-        expected = {"means": (n, 3), "quats": (n, 4), "log_scales": (n, 3), "opacity_logits": (n,), "sh0": (n, 1, 3)}
-        expected |= {name: (n,) for name in ("sigma_d", "growth_d") if getattr(self, name) is not None}
-        for name, shape in expected.items():
-            found = tuple(getattr(self, name).shape)
-            if found != shape:
-                raise ClodError(f"Gaussians.{name} has shape {found}, expected {shape}")
-        if self.shN.shape[0] != n or self.shN.shape[2:] != (3,) or self.shN.shape[1] + 1 not in SH_COUNTS.values():
-            raise ClodError(
-                f"Gaussians.shN has shape {tuple(self.shN.shape)}, expected ({n}, K-1, 3) with K-1 in 0, 3, 8, 15, 24"
-            )
+            found = tuple(value.shape)
+            if found != shapes[name]:
+                raise ClodError(f"Gaussians.{name} has shape {found}, expected {shapes[name]}")
         if (self.sigma_d is None) != (self.attenuation is None):
             raise ClodError("Gaussians needs both sigma_d and attenuation, or neither")
         if self.growth_d is not None and self.sigma_d is None:
@@ -162,10 +162,6 @@ class Gaussians:
     def to(self, device: torch.device | str) -> Gaussians:
         """A copy on another device."""
         return self.replace(**{name: value.to(device) for name, value in self.tensors().items()})
-
-    def cuda(self) -> Gaussians:
-        """A copy on the current CUDA device."""
-        return self.to("cuda")
 
     def cpu(self) -> Gaussians:
         """A copy in main memory."""

@@ -161,18 +161,15 @@ def document(kind: str, metadata: Metadata, **more: Any) -> str:
     Its keys are sorted, so that equal models give equal files.
     """
     dial, calibration, screen_filter = metadata.attenuation, metadata.calibration, metadata.screen_filter or CLASSIC
-    values = {
-        "format": kind,
-        "format_version": KINDS[kind][0],
-        "package_version": metadata.version or package_version(),
-    }
     optional = {
+        "package_version": metadata.version or package_version(),
         "attenuation": asdict(dial) if dial else None,
         FILTER: asdict(screen_filter) if screen_filter != CLASSIC else None,
         "origin": list(metadata.origin) if any(metadata.origin) else None,
         "calibration": calibration.as_dict() if calibration else None, "about": list(metadata.about),
     }  # fmt: skip
-    values |= {name: value for name, value in optional.items() if value}
+    values = {name: value for name, value in optional.items() if value}
+    values |= {"format": kind, "format_version": KINDS[kind][0]}
     return json.dumps(values | more, sort_keys=True, allow_nan=False)
 
 
