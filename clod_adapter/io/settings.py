@@ -161,7 +161,7 @@ def document(kind: str, metadata: Metadata, **more: Any) -> str:
     Its keys are sorted, so that equal models give equal files.
     """
     dial, calibration, screen_filter = metadata.attenuation, metadata.calibration, metadata.screen_filter or CLASSIC
-    optional = {
+    optional: dict[str, Any] = {
         "package_version": metadata.version or package_version(),
         "attenuation": asdict(dial) if dial else None,
         FILTER: asdict(screen_filter) if screen_filter != CLASSIC else None,
