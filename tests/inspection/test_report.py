@@ -20,8 +20,7 @@ from clod_adapter.io.adapter_file import save_adapter
 from clod_adapter.io.checkpoint import load, save
 from clod_adapter.origin import NOWHERE
 from clod_adapter.training.state import TrainingState, save_state
-from formats import CALIBRATION, inria_rows, with_columns
-from packing import write_packed
+from formats import CALIBRATION, inria_rows, with_columns, write_packed
 
 ATTENUATION = AttenuationConfig(tau=0.01, max_sv=6.0, cut="soft", reference_distance=3.5)
 

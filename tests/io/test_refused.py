@@ -21,8 +21,7 @@ from safetensors.torch import load_file, save_file
 from clod_adapter.errors import ClodError
 from clod_adapter.io.checkpoint import load
 from clod_adapter.io.file_formats import FORMATS, check_readable, write
-from formats import change_glb, model, needed, random_rows, write_elements, write_rows
-from packing import write_packed
+from formats import change_glb, model, needed, random_rows, write_elements, write_packed, write_rows
 from scenes import gaussians
 
 KHR = "KHR_gaussian_splatting"

@@ -17,7 +17,7 @@ from clod_adapter.cli.shared.inputs import pick_device, prepare_kernels
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.file_formats import write
-from packing import write_packed
+from formats import write_packed
 
 TINY = ("--iters", 2, "--max-sv", 4, "--out", "dial.ply")
 
