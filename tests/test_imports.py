@@ -30,6 +30,7 @@ ORDER: list[set[str]] = [
     {"io.file_formats", "io.ply_settings", "io.values"},
     {"io.ply_packed", "io.scene", "io.tensor_file"},
     {"io.ply"},
+    {"io.ply_write"},
     {"io.checkpoint", "io.formats"},
     {"io.adapter_file"},
     {"alignment", "report", "training", "viewer"},
