@@ -9,7 +9,9 @@ from pathlib import Path
 
 import pytest
 
+from clod_adapter.alignment import search
 from clod_adapter.cli.main import main
+from clod_adapter.training import camera_placement, pseudo_views
 from clod_adapter.training.interrupts import ENDING
 from runs import Server, accepted
 
@@ -24,6 +26,17 @@ def signals_arrive() -> Iterator[None]:
     for number, earlier in before.items():
         signal.signal(number, earlier)
     signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
+
+
+@pytest.fixture(autouse=True)
+def shorter(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Cameras are placed for small images, few are added, and the search for another frame gives up early."""
+    for module, changes in (
+        (camera_placement, {"WIDTH": 62, "HEIGHT": 46}), (pseudo_views, {"ADDED": 8}),
+        (search, {"SCALES": [1.0], "MOST_TRIALS": 8}),
+    ):  # fmt: skip
+        for name, value in changes.items():
+            monkeypatch.setattr(module, name, value)
 
 
 @dataclass(frozen=True)
