@@ -59,7 +59,6 @@ def execute(args: Namespace) -> dict[str, Any]:
 
 
 SUMMARY = "Rebuild the adapted PLY from checkpoint and adapter."
-DESCRIPTION = "Rebuild the adapted PLY from the checkpoint and the small adapter file."
 USAGE = "BASE.ply ADAPTER.safetensors -o OUT.ply [--json]"
 EPILOG = """\
 OUT.ply equals the file that clod-adapt wrote, bit for bit. BASE.ply must be the

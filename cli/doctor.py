@@ -114,11 +114,7 @@ def execute(args: Namespace) -> dict[str, Any]:
     }  # fmt: skip
 
 
-SUMMARY = "Check what renders here, and say how to fix it."
-DESCRIPTION = """\
-Check which backends work on this machine. For each that does not, print the
-reason and what fixes it.
-"""
+SUMMARY = "Check what renders here, and say how to fix the rest."
 USAGE = "[--json] [--quiet]"
 EPILOG = """\
 Each line has a name, ok or off, the result, and after -> the fix.

@@ -45,7 +45,7 @@ Give a trained 3D Gaussian splat a quality dial:
   {PROG} --help             all options and commands
 """
 
-# Each has SUMMARY, DESCRIPTION, USAGE, EPILOG, and execute(args), which gives what --json prints, or None; it may have
+# Each has SUMMARY, USAGE, EPILOG, and execute(args), which gives what --json prints, or None. It may have DESCRIPTION,
 # add_arguments(parser), check(args), and outputs(args), which is called after it. It imports torch within functions, so
 # that --help and the errors of check take no second. Adapting is the main command and has no name.
 COMMANDS: dict[str, ModuleType] = {

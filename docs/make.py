@@ -53,7 +53,8 @@ def command_section(name: str, command: ModuleType) -> str:
     rows = [option_row(action) for action in build_parser(name)._actions if action.dest != "help"]
     table = "\n".join(["| | |", "|---|---|", *rows])
     usage, notes = f"```text\n{title} {command.USAGE}\n```\n", f"```text\n{command.EPILOG.strip()}\n```\n"
-    return f"## {title}\n\n{usage}\n{command.DESCRIPTION.strip()}\n\n{table}\n\n{notes}"
+    about = getattr(command, "DESCRIPTION", command.SUMMARY).strip()
+    return f"## {title}\n\n{usage}\n{about}\n\n{table}\n\n{notes}"
 
 
 def option_row(action: argparse.Action) -> str:

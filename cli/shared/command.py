@@ -27,9 +27,10 @@ MANUAL = "index.md"  # the first page; where it is installed: pyproject.toml's d
 
 def parser_of(command: Any, prog: str) -> Parser:
     """The parser, with the options that all commands have."""
+    about = getattr(command, "DESCRIPTION", command.SUMMARY)
     parser = Parser(
-        prog=prog, usage=f"{prog} {command.USAGE}", description=command.DESCRIPTION, epilog=command.EPILOG,
-        formatter_class=RawDescriptionHelpFormatter, add_help=False, allow_abbrev=False,
+        prog=prog, usage=f"{prog} {command.USAGE}", description=about, epilog=command.EPILOG, add_help=False,
+        formatter_class=RawDescriptionHelpFormatter, allow_abbrev=False,
     )  # fmt: skip
     if hasattr(command, "add_arguments"):
         command.add_arguments(parser)

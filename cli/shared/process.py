@@ -8,9 +8,8 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
-from dataclasses import dataclass
 from types import FrameType
-from typing import Any, TextIO
+from typing import Any, NamedTuple, TextIO
 
 from clod_adapter.errors import ClodError
 from clod_adapter.progress import Listener, Progress, Stopped
@@ -175,8 +174,7 @@ def shortage(error: BaseException) -> str | None:
 NEEDED = ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")
 
 
-@dataclass(frozen=True)
-class Launch:
+class Launch(NamedTuple):
     """The index of this process, from 0, and their number: among all, and on this machine."""
 
     rank: int = 0

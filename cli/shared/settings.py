@@ -15,26 +15,22 @@ from .process import launched
 if TYPE_CHECKING:
     from argparse import _ActionsContainer
 
-OPTIONS: dict[str, Any] = {
-    "max_sv": ("S", float), "iters": ("N", int), "batch": ("N", int), "time_budget": ("SEC", float),
-    "seed": ("N", int), "growth": ("on|off", str),
+# By field: metavar, type, and what help says of a default that depends on another option or on the scene.
+OPTIONS: dict[str, tuple[str, Any, str | None]] = {
+    "max_sv": ("S", float, None), "iters": ("N", int, ""), "batch": ("N", int, " (default: 1 per process)"),
+    "time_budget": ("SEC", float, None), "seed": ("N", int, None),
+    "growth": ("on|off", str, " (default: on, with --form paper off)"),
 }  # fmt: skip
-# Defaults that depend on another option or on the scene.
-DEFAULTS = {
-    "iters": "",  # its help has it
-    "batch": " (default: 1 per process)",
-    "growth": " (default: on, with --form paper off)",
-}
 
 
 def add_settings(options: _ActionsContainer, without: Sequence[str] = ()) -> None:
     """Adds the options except the fields in ``without``, which a command has in another form."""
     helps, defaults = field_descriptions(AdaptConfig), AdaptConfig()
-    for name, (metavar, kind) in OPTIONS.items():
-        default = None if name in DEFAULTS else getattr(defaults, name)
-        shown = DEFAULTS.get(name, "" if default is None else f" (default: {default:g})")
-        if name not in without:
-            options.add_argument(as_option(name), metavar=metavar, type=kind, default=default, help=helps[name] + shown)
+    for name in [name for name in OPTIONS if name not in without]:
+        metavar, kind, shown = OPTIONS[name]
+        default = getattr(defaults, name) if shown is None else None
+        text = helps[name] + (shown or ("" if default is None else f" (default: {default:g})"))
+        options.add_argument(as_option(name), metavar=metavar, type=kind, default=default, help=text)
     options.add_argument(
         "--form", choices=["ours", "paper"], default="ours",
         help="training as measured here (ours) or as published (paper) (default: ours)",
