@@ -42,7 +42,7 @@ def adapt(base: Gaussians, names: list[str], scale: float = 0.01, seed: int = 1,
     return with_dial(base.replace(**changes), sigma_d, CONFIG, growth_d if growth else None)
 
 
-@settings(deadline=None)
+@settings(deadline=None, max_examples=30)
 @given(
     st.lists(st.sampled_from(ATTRIBUTES), unique=True), st.sampled_from([1e-9, 1e-3, 1.0, 1e4, 1e6]),
     st.integers(0, 1000), st.sampled_from([0, 3, 15]), st.booleans(),
@@ -67,25 +67,15 @@ def test_applying_an_adapter_gives_the_result(
         assert ((found - new).abs() <= 2.0**-10 * (new - old).abs() + 1e-6).all()
 
 
-@pytest.mark.parametrize(
-    ("unit", "step", "dtype"),
-    [(1.0, 0.01, torch.float16), (1.0, 1e6, torch.float32), (1e-4, 1e-7, torch.float32)],
-    ids=["half the size", "overflow", "underflow"],
-)
-def test_the_type_of_a_difference(unit: float, step: float, dtype: torch.dtype) -> None:
+def test_the_type_of_a_difference() -> None:
     """Differences in float16; new values in float32 where a difference overflows or underflows float16."""
-    base = gaussians(50)
-    base = base.replace(means=unit * base.means)
-    adapted = adapt(base, ["means"], step)
-    adapter = extract(base, adapted)
-    assert {name: update.dtype for name, update in adapter.updates.items()} == {"means": dtype}
-    assert dtype == torch.float16 or bits(adapter.apply(base))["means"] == bits(adapted)["means"]
-
-
-def test_an_infinite_logit_becomes_finite() -> None:
-    base = gaussians()
-    adapted = with_dial(base.replace(opacity_logits=torch.full((6,), 5.0)))
-    assert bits(extract(base, adapted).apply(base)) == bits(adapted)
+    for unit, step, dtype in (1.0, 0.01, torch.float16), (1.0, 1e6, torch.float32), (1e-4, 1e-7, torch.float32):
+        base = gaussians(50)
+        base = base.replace(means=unit * base.means)
+        adapted = adapt(base, ["means"], step)
+        adapter = extract(base, adapted)
+        assert {name: update.dtype for name, update in adapter.updates.items()} == {"means": dtype}
+        assert dtype == torch.float16 or bits(adapter.apply(base))["means"] == bits(adapted)["means"]
 
 
 def test_with_dial_and_detach() -> None:
@@ -129,18 +119,18 @@ def test_other_input_is_refused() -> None:
             call()
 
 
-@pytest.mark.parametrize("degree", [None, 1, 0])
+@pytest.mark.parametrize("degree", [None, 1])
 def test_a_trimmed_result(degree: int | None) -> None:
     base = gaussians(7, bands=8)
     kept = torch.arange(7) % 2 == 0
     less = trim(base, kept, degree)
-    assert len(less) == 4 and less.sh_degree == (2 if degree is None else degree)
-    adapted = adapt(less, ["means", "shN"] if degree else ["means"])
+    adapted = adapt(less, ["means", "shN"])
     adapter = replace(extract(less, adapted), kept=kept, sh_degree=degree)
+    assert len(less) == 4 and less.sh_degree == (degree or 2)
     assert bits(adapter.apply(base)) == bits(replace(adapter, kept=None, sh_degree=None).apply(less))
     with pytest.raises(ClodError, match="it has 4 Gaussians, the adapter 7"):
         adapter.apply(less)
-    if degree == 1:
+    if degree:
         with pytest.raises(ClodError, match="it has SH degree 0, the adapter 1"):
             adapter.apply(base.without_bands(0))
 
