@@ -152,24 +152,21 @@ def test_columns_of_other_programs_and_damaged_columns(tmp_path: Path) -> None:
         load(without_comments(tmp_path / "a.ply", clod_tau=np.arange(1, 41) / 100))
 
 
-@pytest.mark.parametrize(
-    ("comments", "name"),
-    [
+def test_comments_of_other_programs(tmp_path: Path) -> None:
+    """Brush, whose filter has 0.1 px^2, splat-transform and Postshot; outputs contradict none."""
+    for comments, name in (
         (("SplatRenderMode: default", "antialiased 0", "not antialiased 1"), "off"),
         (("Exported from Brush", "SplatRenderMode: mip"), "mip"), (("x", "SplatRenderMode: mip"), "on"),
         (("x", "antialiased 1"), "on"),
-    ],
-)  # fmt: skip
-def test_comments_of_other_programs(tmp_path: Path, comments: tuple[str, ...], name: str) -> None:
-    """Brush, whose filter has 0.1 px^2, splat-transform and Postshot; outputs contradict none."""
-    found = load(write_rows(tmp_path / "a.ply", random_rows(40, needed()), comments=comments), activated="none")
-    assert found.gaussians.screen_filter == FILTERS[name] and not found.filter_known
-    for other in FILTERS.values():
-        save(tmp_path / "b.ply", found.gaussians.replace(screen_filter=other), found)
-        again = load(tmp_path / "b.ply")
-        assert again.gaussians.screen_filter == other
-        stated = {"SplatRenderMode: mip", "antialiased 1"} & set(again.comments)
-        assert bool(stated) == other.compensate
+    ):  # fmt: skip
+        found = load(write_rows(tmp_path / "a.ply", random_rows(40, needed()), comments=comments), activated="none")
+        assert found.gaussians.screen_filter == FILTERS[name] and not found.filter_known
+        for other in FILTERS.values():
+            save(tmp_path / "b.ply", found.gaussians.replace(screen_filter=other), found)
+            again = load(tmp_path / "b.ply")
+            assert again.gaussians.screen_filter == other
+            stated = {"SplatRenderMode: mip", "antialiased 1"} & set(again.comments)
+            assert bool(stated) == other.compensate
 
 
 USUAL = AttenuationConfig(reference_distance=3.0)
@@ -236,23 +233,20 @@ def test_numbers_of_columns_are_read_as_written(tmp_path: Path, digits: int) -> 
     assert found is not None and found.tau == float(f"{digits}e-6")
 
 
-@pytest.mark.parametrize(
-    ("factor", "begin", "parts"),
-    [
+def test_file_without_settings_has_a_note(tmp_path: Path) -> None:
+    """The file keeps six tenths at s = 1 from its reference distance; sigma_d is multiplied by ``factor``."""
+    for factor, begin, parts in (
         (1.0, "its dial is not", ["world units, tau 0.02, soft cut: keeps 60% at s = 1"]),
         (0.05, "warning: ", ["keeps 0% at s = 1", "likely not what was adapted"]),
-    ],
-)
-def test_file_without_settings_has_a_note(tmp_path: Path, factor: float, begin: str, parts: list[str]) -> None:
-    """The file keeps six tenths at s = 1 from its reference distance; sigma_d is multiplied by ``factor``."""
-    config, path, some = AttenuationConfig(), tmp_path / "a.ply", gaussians(500, 0, 1)
-    some = some.replace(means=10 * some.means, opacity_logits=some.opacity_logits.clamp(min=-2))
-    d = torch.full((500,), estimated_distance(some.means))
-    sigma = sigma_for_extinction(some.opacity_logits, d, torch.linspace(0.5, 1.75, 500), config)
-    save(path, with_dial(some, factor * sigma, config))
-    assert load(path).notes == () and inspect(path).notes == ()
-    base = load(without_comments(path))
-    assert base.gaussians.attenuation == config
-    for notes in (base.notes, inspect(path.with_name("rewritten.ply")).notes):
-        (note,) = notes
-        assert note.startswith(begin) and all(part in note for part in parts)
+    ):
+        config, path, some = AttenuationConfig(), tmp_path / "a.ply", gaussians(500, 0, 1)
+        some = some.replace(means=10 * some.means, opacity_logits=some.opacity_logits.clamp(min=-2))
+        d = torch.full((500,), estimated_distance(some.means))
+        sigma = sigma_for_extinction(some.opacity_logits, d, torch.linspace(0.5, 1.75, 500), config)
+        save(path, with_dial(some, factor * sigma, config))
+        assert load(path).notes == () and inspect(path).notes == ()
+        base = load(without_comments(path))
+        assert base.gaussians.attenuation == config
+        for notes in (base.notes, inspect(path.with_name("rewritten.ply")).notes):
+            (note,) = notes
+            assert note.startswith(begin) and all(part in note for part in parts)
