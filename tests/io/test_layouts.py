@@ -143,14 +143,13 @@ def test_header_and_record_of_an_spz(tmp_path: Path) -> None:
     assert spz(tmp_path / "b.spz") == data[: end + 12]
 
 
-@pytest.mark.parametrize(("axes", "signs"), [(4, [1, -1, -1]), (7, [-1, -1, 1])])
-def test_axes_of_an_spz(tmp_path: Path, axes: int, signs: list[int]) -> None:
+def test_axes_of_an_spz(tmp_path: Path) -> None:
     write(tmp_path / "a.spz", model(1))
-    data = spz(tmp_path / "a.spz")
-    struct.pack_into("<I", data, 16 + 40 * 29 + 8, axes)
-    (tmp_path / "b.spz").write_bytes(gzip.compress(data))
-    ours, other = (load(tmp_path / name).gaussians.means for name in ("a.spz", "b.spz"))
-    assert torch.equal(other, ours * torch.tensor(signs))
+    data, ours = spz(tmp_path / "a.spz"), load(tmp_path / "a.spz").gaussians.means
+    for axes, signs in (4, [1, -1, -1]), (7, [-1, -1, 1]):
+        struct.pack_into("<I", data, 16 + 40 * 29 + 8, axes)
+        (tmp_path / "b.spz").write_bytes(gzip.compress(data))
+        assert torch.equal(load(tmp_path / "b.spz").gaussians.means, ours * torch.tensor(signs))
 
 
 def test_spz_of_version_2(tmp_path: Path) -> None:
@@ -232,11 +231,8 @@ def test_losses_of_a_splat(tmp_path: Path) -> None:
     assert "8 bits" in notes[0] and "view-dependent" in notes[1] and "origin" in notes[2]
     again = load(tmp_path / "a.splat").gaussians
     rows = rows_by_place(again.means.numpy(), g.means.numpy())
-    assert torch.equal(again.means, g.means[rows]) and again.sh_degree == 0
-    assert (again.opacities - g.opacities[rows]).abs().max() <= 0.501 / 255 and again.opacity_logits.isfinite().all()
-    assert turned(again.quats, g.quats[rows]) < 0.02
     weights = (g.scales.prod(1) * g.opacities)[rows]
-    assert (weights[1:] <= weights[:-1] * (1 + 1e-5)).all()
+    assert turned(again.quats, g.quats[rows]) < 0.02 and (weights[1:] <= weights[:-1] * (1 + 1e-5)).all()
 
 
 NAMES = {"scales": "log_scales", "opacities": "opacity_logits"}  # gsplat's, where they are not ours
@@ -260,17 +256,6 @@ def test_checkpoint_of_gsplat(tmp_path: Path, degree: int) -> None:
     save(tmp_path / "out.ply", base.gaussians, base)
     again = load(tmp_path / "out.ply")
     assert again.gaussians == base.gaussians and again.vertex.dtype.names[3:6] == ("nx", "ny", "nz")
-
-
-def test_written_tensors_are_those_of_gsplat(tmp_path: Path) -> None:
-    """As in examples/simple_trainer.py (--ckpt) and simple_viewer.py: by name, with weights_only."""
-    g = model(2)
-    write(tmp_path / "a.pt", g)
-    checkpoint = torch.load(tmp_path / "a.pt", map_location="cpu", weights_only=True)
-    splats = checkpoint["splats"]
-    for name in ("means", "quats", "scales", "opacities", "sh0", "shN", "sigma_d", "growth_d"):
-        assert torch.equal(splats[name], getattr(g, NAMES.get(name, name)))
-    assert torch.cat([splats["sh0"], splats["shN"]], dim=-2).shape == (40, 9, 3) and checkpoint["step"] == 0
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".spz"])
