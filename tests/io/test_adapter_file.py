@@ -120,16 +120,11 @@ def test_invalid_files_are_refused(tmp_path: Path) -> None:
         load_adapter(tmp_path / "b")
 
 
-def test_config_must_be_json_and_version_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_config_must_be_json_and_version_is_kept(tmp_path: Path) -> None:
     for value in ({1, 2}, torch.ones(1), float("nan"), object()):
         for refuse in (lambda config: save_adapter(tmp_path / "a", adapter(config=config)), check_config):
             with pytest.raises(ClodError, match="not plain JSON"):
                 refuse({"x": value})
-    check_config(CONFIG)
     assert list(tmp_path.iterdir()) == []
-    monkeypatch.setattr("importlib.metadata.version", lambda name: "7.8.9")
-    save_adapter(tmp_path / "a", adapter())
-    monkeypatch.undo()
-    loaded = load_adapter(tmp_path / "a")
-    save_adapter(tmp_path / "b", loaded)
-    assert loaded.version == "7.8.9" and (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+    save_adapter(tmp_path / "a", replace(adapter(), version="7.8.9"))
+    assert load_adapter(tmp_path / "a").version == "7.8.9"
