@@ -1,12 +1,12 @@
 """Helpers of the tests of file formats: models with extreme values, damaged files, splat-transform."""
 
+import gzip
 import json
 import os
 import re
 import shutil
 import struct
 import subprocess
-import zlib
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -104,11 +104,9 @@ def change_setting(path: Path, name: str, old: str, new: str) -> Path:
 
     if path.suffix == ".pt":
         checkpoint = torch.load(path, weights_only=True)
-        checkpoint["clod_adapter"] = changed(checkpoint["clod_adapter"].encode()).decode()
-        torch.save(checkpoint, path)
+        torch.save(checkpoint | {"clod_adapter": changed(checkpoint["clod_adapter"].encode()).decode()}, path)
     elif path.suffix == ".spz":
-        gzip = zlib.compressobj(wbits=31)
-        path.write_bytes(gzip.compress(changed(zlib.decompress(path.read_bytes(), wbits=31))) + gzip.flush())
+        path.write_bytes(gzip.compress(changed(gzip.decompress(path.read_bytes()))))
     else:
         path.write_bytes(changed(path.read_bytes()))
     return path
@@ -212,17 +210,9 @@ def random_rows(count: int, names: Sequence[str], seed: int = 0, types: dict[str
 
 def inria_rows(g: Gaussians) -> np.ndarray:
     """The vertices that Inria's trainer writes of these Gaussians, normals included; the dial's columns last."""
-    count, bands = len(g), g.shN.shape[1]
-    flat = g.shN.numpy().transpose(0, 2, 1).reshape(count, 3 * bands)  # channel by channel
-    parts = [g.means.numpy(), np.zeros((count, 3)), g.sh0.numpy()[:, 0], flat, g.opacity_logits.numpy()[:, None]]
-    parts += [g.log_scales.numpy(), g.quats.numpy()]
-    names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", *(f"f_rest_{k}" for k in range(3 * bands))]
-    names += ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
-    for name in ("sigma_d", "growth_d"):
-        if (column := getattr(g, name)) is not None:
-            parts.append(column.numpy()[:, None])
-            names.append(name)
-    rows, table = np.empty(count, [(name, "f4") for name in names]), np.concatenate(parts, 1)
-    for k, name in enumerate(names):
-        rows[name] = table[:, k]
-    return rows
+    flat = g.shN.numpy().transpose(0, 2, 1).reshape(len(g), -1)  # channel by channel
+    parts = [g.means, torch.zeros(len(g), 3), g.sh0[:, 0], flat, g.opacity_logits[:, None], g.log_scales, g.quats]
+    names = needed(g.sh_degree)
+    columns = dict(zip([*names[:3], "nx", "ny", "nz", *names[3:]], np.concatenate(parts, 1).T, strict=True))
+    columns |= {name: tensor.numpy() for name, tensor in g.tensors().items() if name in ("sigma_d", "growth_d")}
+    return _table(columns, "f4")
