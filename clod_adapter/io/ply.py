@@ -9,8 +9,8 @@ import io
 import re
 import warnings
 from collections.abc import Iterable
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from plyfile import PlyData, PlyElement, PlyListProperty, PlyParseError
@@ -44,14 +44,13 @@ def column_map(sh_degree: int) -> dict[str, tuple[str, ...]]:
 def inria_dtype(sh_degree: int, dial: Iterable[str] = ()) -> np.dtype:
     """The rows that Inria's trainer writes, normals included, and the dial's columns."""
     groups = column_map(sh_degree)
-    rest = sorted(groups["shN"], key=lambda name: int(name.rsplit("_", 1)[1]))  # the map lists them by coefficient
+    rest = (f"f_rest_{k}" for k in range(len(groups["shN"])))  # the map lists them by coefficient
     names = [*groups["means"], "nx", "ny", "nz", *groups["sh0"], *rest]
     names += [*groups["opacity_logits"], *groups["log_scales"], *groups["quats"], *dial]
     return np.dtype([(name, "f4") for name in names])
 
 
-@dataclass(frozen=True)
-class Head:
+class Head(NamedTuple):
     """A PLY header."""
 
     ply: PlyData  # elements, properties and comments; every element has 0 rows
@@ -95,13 +94,13 @@ def all_comments(ply: PlyData) -> tuple[str, ...]:
 
 def check(path: Path) -> None:
     """Refuses, by its header, a file that is not a checkpoint."""
-    _degree(path, read_head(path).ply)
+    sh_degree_of(path, read_head(path).ply)
 
 
 def has_dial(path: Path) -> bool:
     """Whether the header has a sigma_d; refuses damaged settings in it, and a file too short for its rows."""
     head = read_head(path)
-    _degree(path, head.ply)
+    sh_degree_of(path, head.ply)
     _check_length(path, head, path.stat().st_size)
     dial = SIGMA in {column.name for column in head.ply["vertex"].properties}
     ply_metadata(path, all_comments(head.ply), dial=dial)
@@ -111,7 +110,7 @@ def has_dial(path: Path) -> bool:
 def read(path: Path, data: bytes) -> Source:
     """Reads a PLY; nothing is allocated for rows that its length does not have."""
     head = _parse_head(path, data[:HEADER_LIMIT])
-    degree = _degree(path, head.ply)
+    degree = sh_degree_of(path, head.ply)
     _check_length(path, head, len(data))
     try:
         elements = _elements(data, head)
@@ -178,11 +177,6 @@ def _arrays(rows: np.ndarray, sh_degree: int) -> Arrays:
     return found | {name: found[name].reshape(len(rows), len(groups[name]) // 3, 3) for name in ("sh0", "shN")}
 
 
-def _degree(path: Path, header: PlyData) -> int:
-    """The SH degree of a checkpoint with this header; refuses what is not one."""
-    return check_packed(path, header) if is_packed(header) else sh_degree_of(path, header)
-
-
 def _check_length(path: Path, head: Head, length: int) -> None:
     """Refuses a file that is too short for the least bytes that the rows of its header take."""
     text = head.ply.text
@@ -200,7 +194,9 @@ def _check_length(path: Path, head: Head, length: int) -> None:
 
 
 def sh_degree_of(path: Path, header: PlyData) -> int:
-    """The SH degree of plain Gaussians, by the header; refuses something else, and missing columns."""
+    """The SH degree of a checkpoint with this header; refuses something else, and missing columns."""
+    if is_packed(header):
+        return check_packed(path, header)
     if "vertex" not in header:
         found = ", ".join(element.name for element in header) or "none"
         raise ClodError(f"{path}: has no vertex element (elements: {found}); give a splat in Inria's 3DGS layout")
@@ -208,13 +204,12 @@ def sh_degree_of(path: Path, header: PlyData) -> int:
     types = {p.name: "list" if isinstance(p, PlyListProperty) else p.val_dtype for p in properties}
     _refuse_foreign(path, set(types))
     degree = degree_of(path, sum(re.fullmatch(r"f_rest_\d+", name) is not None for name in types))
-    for name in [name for group in column_map(degree).values() for name in group]:
+    for name in (name for group in column_map(degree).values() for name in group):
         if name not in types:
             raise ClodError(f"{path}: property {name} is missing; export the file again in Inria's 3DGS layout")
         if types[name] not in ("f4", "f8"):
             raise ClodError(f"{path}: property {name} is not float or double; export the file again with float columns")
-    lists = [name for name, kind in types.items() if kind == "list"]
-    if lists:
+    if lists := [name for name, kind in types.items() if kind == "list"]:
         raise ClodError(f"{path}: property {lists[0]} is a list, which splat viewers cannot read; remove it")
     return degree
 

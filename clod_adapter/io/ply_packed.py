@@ -45,31 +45,38 @@ def unpack(path: Path, elements: Mapping[str, np.ndarray], degree: int) -> Array
     """The attributes of the Gaussians of such a file, of the degree from ``check_packed``."""
     from clod_adapter.gaussians import SH_C0  # here: check_packed needs no torch
 
-    chunks, packed = elements["chunk"], elements["vertex"]
-    count = len(packed)
+    chunks, packed, table = elements["chunk"], elements["vertex"], elements.get("sh")
+    count, bands = len(packed), SH_COUNTS[degree] - 1
     if len(chunks) * BLOCK < count:
         raise ClodError(
             f"{path}: is damaged: {count} Gaussians need {-(-count // BLOCK)} chunks, and it has {len(chunks)}; copy "
             "or export it again"
         )
-    block, sh0 = np.arange(count) // BLOCK, np.empty((count, 1, 3), np.float32)
-    means, log_scales = np.empty((count, 3), np.float32), np.empty((count, 3), np.float32)
+    if table is not None and len(table) != count:
+        raise ClodError(f"{path}: is damaged: {len(table)} harmonics for {count} Gaussians; export it again")
+
+    def within(name: str, share: np.ndarray) -> np.ndarray:
+        """Values at shares of the ranges of their blocks."""
+        low, high = (chunks[f"{end}_{name}"][np.arange(count) // BLOCK] for end in ("min", "max"))
+        return low * (1 - share) + high * share  # type: ignore[no-any-return]
+
     with np.errstate(invalid="ignore", over="ignore"):  # ranges that are not finite: their rows are dropped later
-        for what, target, bits in (("", means, "packed_position"), ("scale_", log_scales, "packed_scale")):
-            for k, (axis, share) in enumerate(zip(_AXES, _shares(packed[bits], (11, 10, 11)), strict=True)):
-                low, high = (chunks[f"{end}_{what}{axis}"][block] for end in ("min", "max"))
-                target[:, k] = low * (1 - share) + high * share
+        means, log_scales = (
+            np.stack(list(map(within, (what + axis for axis in _AXES), _shares(packed[bits], (11, 10, 11)))), 1)
+            for what, bits in (("", "packed_position"), ("scale_", "packed_scale"))
+        )
         *colours, opacity = _shares(packed["packed_color"], (8, 8, 8, 8))
-        for k, (channel, share) in enumerate(zip("rgb", colours, strict=True)):
-            if set(_COLOURS) <= set(chunks.dtype.names or ()):
-                share = chunks[f"min_{channel}"][block] * (1 - share) + chunks[f"max_{channel}"][block] * share
-            sh0[:, 0, k] = (share - 0.5) / SH_C0
+        if set(_COLOURS) <= set(chunks.dtype.names or ()):
+            colours = [within(channel, share) for channel, share in zip("rgb", colours, strict=True)]
     opacity = np.clip(opacity, 0.25 / 255, 254.75 / 255)  # so that no logit is infinite
-    logits = np.log(opacity / (1 - opacity)).astype(np.float32)
+    levels = np.arange(256, dtype=np.float32)
+    steps = (np.where(levels == 0, 0, np.where(levels == 255, 1, (levels + 0.5) / 256)) - 0.5) * 8
+    harmonics = [steps[table[f"f_rest_{k}"]] for k in range(3 * bands)] if table is not None and bands else []
     return {
-        "means": means, "log_scales": log_scales, "sh0": sh0,
+        "means": means, "log_scales": log_scales, "sh0": (np.stack(colours, 1)[:, None] - 0.5) / SH_C0,
         "quats": np.ascontiguousarray(_rotations(packed["packed_rotation"]).T.astype(np.float32)),
-        "opacity_logits": logits, "shN": _harmonics(path, elements.get("sh"), count, degree),
+        "opacity_logits": np.log(opacity / (1 - opacity)).astype(np.float32),
+        "shN": np.array(harmonics, np.float32).reshape(3, bands, count).transpose(2, 1, 0),  # channel by channel
     }  # fmt: skip
 
 
@@ -106,17 +113,3 @@ def _rotations(bits: np.ndarray) -> np.ndarray:
         np.where(missing == part, largest, np.where(missing > part, small[min(part, 2)], small[max(part - 1, 0)]))
         for part in range(4)
     ])  # fmt: skip
-
-
-def _harmonics(path: Path, table: np.ndarray | None, count: int, degree: int) -> np.ndarray:
-    bands = SH_COUNTS[degree] - 1
-    found = np.empty((count, bands, 3), np.float32)
-    if table is None or not bands:
-        return found
-    if len(table) != count:
-        raise ClodError(f"{path}: is damaged: {len(table)} harmonics for {count} Gaussians; export it again")
-    levels = np.arange(256, dtype=np.float32)
-    values = (np.where(levels == 0, 0, np.where(levels == 255, 1, (levels + 0.5) / 256)) - 0.5) * 8
-    for k in range(3 * bands):
-        found[:, k % bands, k // bands] = values[table[f"f_rest_{k}"]]  # channel by channel
-    return found

@@ -65,8 +65,16 @@ def prepared(
         activated: which values are activated, where their range allows both; None to refuse then.
         origin: what the means are to be relative to; None for ``at``, or what ``origin_of`` finds where that is 0.
     """
-    _check_shapes(path, arrays)
-    if not len(arrays["means"]):
+    count, bands = arrays["means"].shape[:1], arrays["shN"].shape[1:2]
+    shapes: dict[str, tuple[int, ...]] = {
+        "means": (3,), "quats": (4,), "log_scales": (3,), "sh0": (1, 3), "shN": (*bands, 3), MASKS: (2,), FILTER: (1,)
+    }  # fmt: skip
+    for name, array in arrays.items():
+        if array.shape != (shape := (*count, *shapes.get(name, ()))):
+            raise ClodError(f"{path}: {name} has shape {array.shape}, expected {shape}; export it again")
+    if bands[0] + 1 not in SH_COUNTS.values():
+        raise ClodError(f"{path}: shN has {bands[0]} coefficients, which fit no SH degree; export it again")
+    if count == (0,):
         raise ClodError(f"{path}: no usable Gaussian in it (it has 0 rows); export it again")
     narrow = {name: np.ascontiguousarray(array, np.float32) for name, array in arrays.items() if name != "means"}
     values, was, changes = _as_logits(path, {**arrays, **narrow}, activated)
@@ -76,19 +84,6 @@ def prepared(
     keep, dropped = _usable(values)
     values.pop(MASKS, None)
     return Prepared(values, keep, origin, was, changes, dropped)
-
-
-def _check_shapes(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    count = len(arrays["means"]) if arrays["means"].ndim else 0
-    bands = arrays["shN"].shape[1] if arrays["shN"].ndim == 3 else 0
-    wanted: dict[str, tuple[int, ...]] = {
-        "means": (3,), "quats": (4,), "log_scales": (3,), "sh0": (1, 3), "shN": (bands, 3), MASKS: (2,), FILTER: (1,)
-    }  # fmt: skip
-    for name, array in arrays.items():
-        if array.shape != (shape := (count, *wanted.get(name, ()))):
-            raise ClodError(f"{path}: {name} has shape {array.shape}, expected {shape}; export it again")
-    if bands + 1 not in SH_COUNTS.values():
-        raise ClodError(f"{path}: shN has {bands} coefficients, which fit no SH degree; export it again")
 
 
 def _as_logits(path: Path, arrays: Arrays, activated: Activated | None) -> tuple[Arrays, Activated, list[str]]:
