@@ -80,19 +80,21 @@ def write(path: Path, gaussians: Gaussians, metadata: Metadata) -> tuple[str, ..
     x, y, z = metadata.origin
     node = {"rotation": HALF_TURN} | ({"translation": [0.0 - x, 0.0 - y, z]} if any(metadata.origin) else {})
     extras = {KEY: json.loads(document(MODEL, metadata))}
-    gltf = gltf_of(gaussians.means, accessors, node, size, extras=extras) | {"bufferViews": views}
-    write_chunks(path, gltf | {"extensionsUsed": [EXTENSION]}, [array.data for array in columns.values()])
+    parts = [array.data for array in columns.values()]
+    write_points(path, gaussians.means, accessors, node, views, parts, extras=extras)
     lost = arrays["shN"][:, (degree + 1) ** 2 - 1 :].any()
     return (f"spherical harmonics above degree {DEGREE} are dropped",) if lost else ()
 
 
-def gltf_of(
-    means: torch.Tensor, accessors: dict[str, dict[str, Any]], node: dict[str, Any], size: int,
-    extensions: dict[str, Any] | None = None, **asset: Any,
-) -> dict[str, Any]:  # fmt: skip
-    """The JSON of one POINTS primitive and its buffer of ``size`` bytes.
+def write_points(
+    path: Path, means: torch.Tensor, accessors: dict[str, dict[str, Any]], node: dict[str, Any],
+    views: list[dict[str, Any]], parts: Sequence[memoryview | bytes], extensions: dict[str, Any] | None = None,
+    **asset: Any,
+) -> None:  # fmt: skip
+    """Writes one POINTS primitive, and the parts of its buffer one after another.
 
-    ``accessors`` are by attribute, without component type and bounds; ``extensions`` those of KHR_gaussian_splatting.
+    ``accessors`` are by attribute, without component type and bounds; ``extensions``, which readers must know, those of
+    KHR_gaussian_splatting.
     """
     for name, accessor in accessors.items():
         accessor |= {"componentType": _FLOAT} if name != "COLOR_0" else {"componentType": _BYTE, "normalized": True}
@@ -101,25 +103,22 @@ def gltf_of(
         "kernel": "ellipse", "colorSpace": COLOR_SPACE, "projection": "perspective",
         "sortingMethod": "cameraDistance", **({"extensions": extensions} if extensions else {}),
     }  # fmt: skip
-    attributes = {name: index for index, name in enumerate(accessors)}
-    return {
+    attributes, used = {name: index for index, name in enumerate(accessors)}, [EXTENSION, *(extensions or {})]
+    size = sum(memoryview(part).nbytes for part in parts)
+    gltf = {
         "asset": {"version": "2.0", "generator": f"clod-adapter {package_version()}", **asset},
         "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0, **node}],
         "meshes": [{"primitives": [{"attributes": attributes, "mode": 0, "extensions": {EXTENSION: how}}]}],
-        "accessors": list(accessors.values()), "buffers": [{"byteLength": size}],
+        "accessors": list(accessors.values()), "buffers": [{"byteLength": size}], "bufferViews": views,
+        "extensionsUsed": used, **({"extensionsRequired": used} if extensions else {}),
     }  # fmt: skip
-
-
-def write_chunks(path: Path, gltf: dict[str, Any], buffer: Sequence[memoryview | bytes]) -> None:
-    """Writes the JSON, and the parts of its buffer one after another."""
     text = json.dumps(gltf, separators=(",", ":"), allow_nan=False).encode()
     text += b" " * (-len(text) % 4)
-    size = sum(memoryview(part).nbytes for part in buffer)
     padded = size + -size % 4
     with open(path, "wb") as file:
         file.write(struct.pack("<4sIIII", b"glTF", 2, 28 + len(text) + padded, len(text), _JSON) + text)
         file.write(struct.pack("<II", padded, _BIN))
-        file.writelines(buffer)
+        file.writelines(parts)
         file.write(bytes(padded - size))
 
 

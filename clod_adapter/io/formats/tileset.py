@@ -24,7 +24,7 @@ import torch
 from clod_adapter._support.version import package_version
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.formats import spz
-from clod_adapter.io.formats.glb import DEGREE, EXTENSION, gltf_of, harmonics, write_chunks
+from clod_adapter.io.formats.glb import DEGREE, EXTENSION, harmonics, write_points
 from clod_adapter.io.settings import Metadata
 from clod_adapter.origin import Origin
 
@@ -52,10 +52,8 @@ def write_tileset(
 
     def tile(level: int, rows: Rows, name: str, children: list[dict[str, Any]]) -> dict[str, Any]:
         """A tile and its file; without one where it has no Gaussians."""
-        found: dict[str, Any] = {
-            "boundingVolume": {"box": _box(centres, rows, origin)},
-            "geometricError": errors[level],
-        }
+        box = {"box": _box(centres, rows, origin)}
+        found: dict[str, Any] = {"boundingVolume": box, "geometricError": errors[level]}
         if len(rows[level]):
             gaussians = levels[level].select(torch.from_numpy(rows[level]))
             notes.extend(write_tile(folder / name, gaussians, origin))
@@ -95,9 +93,8 @@ def write_tile(path: Path, gaussians: Gaussians, origin: Origin) -> tuple[str, .
     accessors: dict[str, Any] = {name: {"count": len(gaussians), "type": shape} for name, shape in shapes.items()}
     x, y, z = origin
     node = {"matrix": [-1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1, 0, -x, -y, z, 1]}  # a half turn about z
-    gltf = gltf_of(gaussians.means, accessors, node, len(data), {SPZ: {"bufferView": 0}})
-    gltf |= {"extensionsUsed": [EXTENSION, SPZ], "extensionsRequired": [EXTENSION, SPZ]}
-    write_chunks(path, gltf | {"bufferViews": [{"buffer": 0, "byteLength": len(data)}]}, [data])
+    views = [{"buffer": 0, "byteLength": len(data)}]
+    write_points(path, gaussians.means, accessors, node, views, [data], {SPZ: {"bufferView": 0}})
     return notes
 
 
