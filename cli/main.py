@@ -131,12 +131,12 @@ def run(command: ModuleType, args: argparse.Namespace) -> int:
         aside = io.StringIO() if args.quiet else sys.stderr
         # Again: pycolmap, imported just now, sets a handler.
         with redirect_stdout(aside) if args.json else nullcontext(), signals_as_interrupt():
-            report = command.execute(args)
-    if args.json and report is not None:
+            report = command.execute(args) or {}
+    if args.json and report:
         print(json.dumps(jsonable(report), allow_nan=False))
-    if args.json or "outputs" not in (report or {"outputs": ()}):
+    if args.json or (report and "outputs" not in report):
         check_printed()
-    return int((report or {}).get("exit_code", 0))
+    return int(report.get("exit_code", 0))
 
 
 def import_library(quiet: bool) -> None:

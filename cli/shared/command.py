@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
+import sysconfig
 from argparse import ArgumentParser, Namespace, RawDescriptionHelpFormatter
-from importlib import metadata
 from pathlib import Path
+from site import getuserbase
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from clod_adapter.config import DEVICES, FILTERS
@@ -21,8 +22,6 @@ if TYPE_CHECKING:
     from argparse import _ActionsContainer  # a parser or one of its groups
 
     from .console import Console
-
-MANUAL = "index.md"  # the first page; where it is installed: pyproject.toml's data-files
 
 
 def parser_of(command: Any, prog: str) -> Parser:
@@ -71,15 +70,9 @@ class Parser(ArgumentParser):
 
 def manual() -> Path | None:
     """The first page of the documentation on this machine: of a checkout, or as installed."""
-    checkout = Path(__file__).resolve().parents[2] / "docs" / MANUAL
-    if checkout.is_file():
-        return checkout
-    try:
-        files = metadata.files("clod-adapter") or []
-    except metadata.PackageNotFoundError:
-        return None
-    found = (Path(str(file.locate())).resolve() for file in files if file.parts[-2:] == ("clod-adapter", MANUAL))
-    return next((page for page in found if page.is_file()), None)
+    folders = [Path(__file__).resolve().parents[2] / "docs"]
+    folders += [Path(root, "share", "doc", "clod-adapter") for root in (sysconfig.get_path("data"), getuserbase())]
+    return next((page for folder in folders if (page := folder / "index.md").is_file()), None)
 
 
 # Budgets: name (as of budget.dial_for), metavar, type, help.

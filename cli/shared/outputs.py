@@ -52,13 +52,13 @@ def check_ply_name(path: Path, option: str) -> None:
 def labels(paths: Sequence[str]) -> list[str]:
     """A distinct label per file: its stem, with the folder's name where two stems are equal."""
     resolved = [Path(path).resolve() for path in paths]
-    if len(set(resolved)) < len(resolved):
-        raise ClodError(f"{next(p for k, p in enumerate(paths) if resolved[k] in resolved[:k])}: is given twice")
     stems = [path.stem for path in resolved]
     names = [f"{p.parent.name}_{p.stem}" if stems.count(p.stem) > 1 else p.stem for p in resolved]
-    for k, name in enumerate(names):
-        if name in names[:k]:
-            raise ClodError(f"{paths[k]}: has the same name as {paths[names.index(name)]}; rename one of them")
+    for k, path in enumerate(paths):
+        if resolved[k] in resolved[:k]:
+            raise ClodError(f"{path}: is given twice")
+        if names[k] in names[:k]:
+            raise ClodError(f"{path}: has the same name as {paths[names.index(names[k])]}; rename one of them")
     return names
 
 

@@ -54,15 +54,13 @@ def unbreakable_streams() -> Iterator[None]:
             os.fstat(number)
         except OSError:
             os.open(os.devnull, os.O_RDWR)
-    before = sys.stdout, sys.stderr
-    out, err = streams = Stream(sys.stdout), Stream(sys.stderr)
-    sys.stdout, sys.stderr = streams  # type: ignore[assignment]
-    try:
-        yield
-    finally:
-        out.flush()
-        err.flush()
-        sys.stdout, sys.stderr = before
+    out, err = Stream(sys.stdout), Stream(sys.stderr)
+    with redirect_stdout(out), redirect_stderr(err):  # type: ignore[type-var]
+        try:
+            yield
+        finally:
+            out.flush()
+            err.flush()
 
 
 def check_printed() -> None:

@@ -1,8 +1,8 @@
 """Install lines work before a release too: they name other packages, or a checkout. The pages are installed."""
 
 import re
+import sysconfig
 import tomllib
-from importlib import metadata
 from pathlib import Path
 
 import pytest
@@ -23,19 +23,12 @@ def test_no_line_installs_clod_adapter_from_the_index() -> None:
 def test_help_names_the_installed_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ((folder, patterns),) = PROJECT["tool"]["setuptools"]["data-files"].items()
     assert patterns == ["docs/*.md"] and all(url.startswith("https://") for url in PROJECT["project"]["urls"].values())
+    assert command.manual() == ROOT / "docs" / "index.md"  # of the checkout
+    monkeypatch.setattr(command, "__file__", str(tmp_path / "lib" / "cli" / "shared" / "command.py"))
+    monkeypatch.setattr(sysconfig, "get_path", lambda name: str(tmp_path))
+    monkeypatch.setattr(command, "getuserbase", lambda: str(tmp_path))
+    assert "manual:" not in command.parser_of(adapt, "clod-adapt").format_help()
     page = tmp_path / folder / "index.md"
     page.parent.mkdir(parents=True)
     page.touch()
-
-    class File:
-        parts = page.parts
-
-        def locate(self) -> Path:
-            return page
-
-    assert command.manual() == ROOT / "docs" / "index.md"  # of the checkout
-    monkeypatch.setattr(command, "__file__", str(tmp_path / "lib" / "cli" / "shared" / "command.py"))
-    monkeypatch.setattr(metadata, "files", lambda name: [File()])
     assert command.parser_of(adapt, "clod-adapt").format_help().endswith(f"\nmanual: {page}\n")
-    monkeypatch.setattr(metadata, "files", lambda name: None)
-    assert "manual:" not in command.parser_of(adapt, "clod-adapt").format_help()
