@@ -179,14 +179,11 @@ def check_dials(args: Namespace, model: str) -> None:
     for virtual_scale in args.sv or ():
         if not 0 <= virtual_scale < math.inf:
             raise ClodError(f"--sv has {virtual_scale:g}, it must be at least 0 (1 is full quality, 0 everything)")
-    budget = given_budget(args)
-    if budget is None:
-        return
-    name, option, values = budget
+    name, option, values = given_budget(args) or ("", "", [])
     for value in values:
         if not 0 < value < math.inf:
             raise ClodError(f"{option} has {value:g}, it must be positive and finite")
-    if not file_has_dial(Path(model)):
+    if name and not file_has_dial(Path(model)):
         raise ClodError(f"{model}: has no sigma_d, which {option} needs; adapt it first: clod-adapt {model} ...")
     if name == "psnr_drop" and format_of(Path(model)) is PLY:
         from clod_adapter.io.ply import all_comments, read_head  # here: --help needs no plyfile
