@@ -33,33 +33,18 @@ def add_arguments(parser: ArgumentParser) -> None:
     given.add_argument("model", metavar="MODEL", help="an adapted file, or a plain one to convert")
     about = "scene folder: cameras to bake for, and for the views of a page"
     common.add_reading(given, about, photographs=False)
-    given.add_argument(
-        "--camera", metavar="PHOTO", help="bake for the camera of this photograph alone; its suffix can be left out"
-    )
+    given.add_argument("--camera", metavar="PHOTO", help="bake for the camera of this photograph alone")
     dial = parser.add_argument_group("dial values, one of")
     values = common.add_dial_options(dial, "the dial value to bake", "(in the file written)", several=False)
-    values.add_argument(
-        "--levels", metavar="S,S,...", type=levels_of, help="several dial values, each baked into its own file"
-    )
+    values.add_argument("--levels", metavar="S,S,...", type=levels_of, help="dial values, each baked into a file")
     output = parser.add_argument_group("output")
     output.add_argument("-o", "--out", metavar="OUT", required=True, help="output file; its suffix is the format")
     sets = output.add_mutually_exclusive_group()
-    sets.add_argument(
-        "--lod-meta", dest="folder", action="store_const", const="--lod-meta",
-        help="write the levels as one streaming set for PlayCanvas's viewers, in the new folder OUT",
-    )  # fmt: skip
-    sets.add_argument(
-        "--3dtiles", dest="folder", action="store_const", const="--3dtiles",
-        help="write the levels as one 3D Tiles set, for CesiumJS, in the new folder OUT",
-    )  # fmt: skip
-    output.add_argument(
-        "--order", choices=["extinction"],
-        help="sort the Gaussians by the dial value at which they are culled, latest first, for prefix rendering",
-    )  # fmt: skip
-    output.add_argument(
-        "--exact", action="store_true",
-        help="store float32 values in an .html page, in place of rounded ones: eight times the size",
-    )  # fmt: skip
+    for option, form in (("--lod-meta", "streaming set for PlayCanvas's viewers"), ("--3dtiles", "3D Tiles set")):
+        text = f"write the levels as one {form}, in the new folder OUT"
+        sets.add_argument(option, dest="folder", action="store_const", const=option, help=text)
+    output.add_argument("--order", choices=["extinction"], help="put first the Gaussians that are culled last")
+    output.add_argument("--exact", action="store_true", help="an .html page with float32 values: eight times the size")
     common.add_device(output, "time frames for --fps with --images")
 
 
@@ -78,16 +63,13 @@ def check(args: Namespace) -> None:
         (args.exact and not page, f"--exact is for {PAGE} pages; another format has its own precision: remove it"),
         (args.images is not None and not (bakes or args.order or page),
          f"--images is used for baking, --order and {PAGE} only; add one of them, as in --sv 2"),
+        (folder and out.suffix.lower() in (".json", *FORMATS),
+         f"{out}: with {folder}, --out names the folder for {FOLDERS.get(folder)}, not a file"),
+        (folder and out.is_file(), f"{out}: is a file; with {folder}, --out must name a new folder"),
+        (folder and not out.name, f"{out}: is the current folder; --out must name a new one"),  # ".", never replaced
     )  # fmt: skip
     if args.images is not None:
         common.check_scene(args.images)
-    if folder:
-        refuse(
-            (out.suffix.lower() in (".json", *FORMATS),
-             f"{out}: with {folder}, --out names the folder for {FOLDERS[folder]}, not a file"),
-            (out.exists() and not out.is_dir(), f"{out}: is a file; with {folder}, --out must name a new folder"),
-            (not out.name, f"{out}: is the current folder; --out must name a new one"),  # ".", which is not replaced
-        )  # fmt: skip
     suffix = "" if folder else suffix_of(out)
     common.check_dials(args, args.model)
     check_readable(Path(args.model))
@@ -159,7 +141,7 @@ baking:
 
 levels and order:
   --levels 1,2,4,7 writes OUT_s1.ply, OUT_s2.ply and so on, all or none. With
-  --lod-meta or --3dtiles OUT is a new folder, level 0 the finest.
+  --lod-meta, or --3dtiles for CesiumJS, OUT is a new folder.
   --order extinction is for renderers that draw the first n rows: for any n
   these are the rows of --keep n. They pop where the dial fades.
 

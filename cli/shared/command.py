@@ -98,10 +98,8 @@ def no_calibration(model: Path, option: str, why: str = "") -> ClodError:
 
 
 def add_activated(options: _ActionsContainer) -> None:
-    options.add_argument(
-        "--activated", choices=["none", "opacity", "scales", "both"],
-        help="values that the file stores after activation (sigmoid of opacities, exp of scales)",
-    )  # fmt: skip
+    text = "values that the file stores after activation (sigmoid of opacities, exp of scales)"
+    options.add_argument("--activated", choices=["none", "opacity", "scales", "both"], help=text)
 
 
 def add_reading(options: _ActionsContainer, images: str = "", photographs: bool = True) -> None:
@@ -109,12 +107,11 @@ def add_reading(options: _ActionsContainer, images: str = "", photographs: bool 
     scene = images or "scene folder: photographs, and a COLMAP model or transforms.json"
     options.add_argument("--images", metavar="DIR", required=not images, help=scene)
     add_activated(options)
-    otherwise = "by the photographs" if photographs else "off"
-    options.add_argument(
-        "--antialiasing", choices=["auto", *FILTERS], default="auto",
-        help="screen-space filter of the training: off, on (gsplat's rasterize_mode antialiased, Inria's "
-        f"--antialiasing), mip (Mip-Splatting), or auto: as the file says, else {otherwise} (default: auto)",
-    )  # fmt: skip
+    text = (
+        "screen-space filter of the training: off, on (gsplat's rasterize_mode antialiased, Inria's --antialiasing), "
+        f"mip (Mip-Splatting), or auto: as the file says, else {'by the photographs' if photographs else 'off'}"
+    )
+    options.add_argument("--antialiasing", choices=["auto", *FILTERS], default="auto", help=f"{text} (default: auto)")
 
 
 def add_device(options: _ActionsContainer, what: str) -> None:
@@ -137,10 +134,8 @@ def add_dial_options(options: _ActionsContainer, sv_help: str, where: str, *, se
 
 
 def add_device_preset(options: _ActionsContainer) -> None:
-    counts = ", ".join(f"{count:,}" for count in DEVICES.values())
-    options.add_argument(
-        "--device-preset", choices=[*DEVICES], help=f"--keep with the number that viewers allow a device: {counts}"
-    )
+    text = f"--keep with the number that viewers allow a device: {', '.join(f'{n:,}' for n in DEVICES.values())}"
+    options.add_argument("--device-preset", choices=[*DEVICES], help=text)
 
 
 def as_option(name: str) -> str:

@@ -31,13 +31,10 @@ def add_settings(options: _ActionsContainer, without: Sequence[str] = ()) -> Non
         default = getattr(defaults, name) if shown is None else None
         text = helps[name] + (shown or ("" if default is None else f" (default: {default:g})"))
         options.add_argument(as_option(name), metavar=metavar, type=kind, default=default, help=text)
-    options.add_argument(
-        "--form", choices=["ours", "paper"], default="ours",
-        help="training as measured here (ours) or as published (paper) (default: ours)",
-    )  # fmt: skip
-    options.add_argument(
-        "--misaligned-ok", action="store_true", help="train even if the checkpoint does not match the photographs"
-    )
+    text = "training as measured here (ours) or as published (paper) (default: ours)"
+    options.add_argument("--form", choices=["ours", "paper"], default="ours", help=text)
+    text = "train even if the checkpoint does not match the photographs"
+    options.add_argument("--misaligned-ok", action="store_true", help=text)
     add_device(options, "train and measure")
 
 
