@@ -88,7 +88,7 @@ def names_page() -> str:
     parts = ["# Names\n\nAll are in `clod_adapter`, except those of `clod_adapter.integrations`.\n"]
     homes = sorted((clod_adapter._homes[name], name) for name in clod_adapter.__all__)
     for module, names in groupby(homes, key=lambda pair: pair[0]):
-        parts += [f"## {module}\n", *(f"::: clod_adapter.{module}.{name}\n" for _, name in names)]
+        parts += [f"## {module}\n", *(f"::: {module}.{name}\n" for _, name in names)]
     parts += ["## integrations\n", *(f"::: clod_adapter.{name}\n" for name in INTEGRATIONS)]
     return "\n".join(parts)
 

@@ -1,16 +1,20 @@
 """A package whose names are imported on first use."""
 
+import ast
 import sys
-from collections.abc import Mapping, Sequence
 from importlib import import_module
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 
-def on_first_use(package: str, names: Mapping[str, Sequence[str]]) -> None:
-    """Makes the names of each submodule attributes of the package that is being imported."""
+def on_first_use(package: str) -> None:
+    """Makes the names that the package's source imports from its submodules, for type checkers, its attributes."""
     module = sys.modules[package]
-    module.__dict__["_homes"] = {name: home for home, group in names.items() for name in group}
+    source = ast.parse(Path(str(module.__file__)).read_bytes())
+    imports = [node for node in ast.walk(source) if isinstance(node, ast.ImportFrom)]
+    homes = {alias.name: str(node.module) for node in imports for alias in node.names}
+    module.__dict__["_homes"] = {name: homes[name] for name in module.__all__}
     module.__class__ = _Lazy
 
 
@@ -20,7 +24,7 @@ class _Lazy(ModuleType):
     def __getattr__(self, name: str) -> Any:
         if name not in self._homes:
             raise AttributeError(f"module {self.__name__!r} has no attribute {name!r}")
-        value = self.__dict__[name] = getattr(import_module(f"{self.__name__}.{self._homes[name]}"), name)
+        value = self.__dict__[name] = getattr(import_module(self._homes[name]), name)
         return value
 
     def __setattr__(self, name: str, value: Any) -> None:

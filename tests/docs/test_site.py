@@ -60,7 +60,7 @@ def test_the_built_site(tmp_path: Path) -> None:
     entries = {entry["location"] for entry in index["docs"]}
     pages = {f"{page.stem}.html" for page in DOCS.glob("*.md")} | {"commands.html", "settings.html", "names.html"}
     assert pages == {entry.partition("#")[0] for entry in entries}
-    named = {f"names.html#clod_adapter.{clod_adapter._homes[name]}.{name}" for name in clod_adapter.__all__}
+    named = {f"names.html#{clod_adapter._homes[name]}.{name}" for name in clod_adapter.__all__}
     assert named | {f"commands.html#clod-adapt-{name}" for name in COMMANDS} <= entries
     assert (site / "search" / "search_index.js").is_file()  # for pages opened from a folder
     assert not list(site.rglob("*.py")) and not list(site.rglob("*.md"))
