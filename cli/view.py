@@ -1,9 +1,6 @@
 """``clod-adapt view``: serves the page that shows a file, on the loopback address until Ctrl-C."""
 
-from __future__ import annotations
-
 import json
-import math
 import os
 import re
 import sys
@@ -12,24 +9,20 @@ from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from clod_adapter._support.text import as_text
 from clod_adapter._support.version import package_version
 from clod_adapter.errors import ClodError
-from clod_adapter.io.file_formats import FORMATS, check_readable, file_has_dial
+from clod_adapter.io.file_formats import FORMATS, check_readable
 from clod_adapter.progress import Stopped
 
 from .shared import command as common
 from .shared.console import Console
 from .shared.outputs import jsonable
 from .shared.process import interrupt_as_stopped
-
-if TYPE_CHECKING:
-    from clod_adapter.io.checkpoint import Checkpoint
-    from clod_adapter.viewer.payload import Payload
-    from clod_adapter.viewer.server import Response
 
 MODEL, BASE = "/files/model", "/files/base"
 IN_TERMINAL = ("lynx", "w3m", "links", "links2", "elinks", "www-browser")  # they would take over the terminal
@@ -46,7 +39,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     page = parser.add_argument_group("page")
     initial: Any = page.add_mutually_exclusive_group()
     initial.add_argument(
-        "--sv", metavar="S", type=float,
+        "--sv", metavar="S", type=float, nargs=1,
         help="initial dial value (default: 1 with photographs, else everything; then it holds 30 frames per second)",
     )  # fmt: skip
     common.add_device_preset(initial)
@@ -77,13 +70,10 @@ def _files_in(folder: Path) -> list[str]:
 def check(args: Namespace) -> None:
     if not 0 <= args.port < 1 << 16:
         raise ClodError(f"--port is {args.port}, it must be between 1 and 65535, or 0 for a free one")
-    if args.sv is not None and not 0 <= args.sv < math.inf:
-        raise ClodError(f"--sv is {args.sv:g}, it must be at least 0 (1 is full quality, 0 everything)")
     files = view_files(args.models)
     for path in (*files, *([args.base] if args.base else [])):
         check_readable(Path(path))
-    if args.device_preset and not file_has_dial(Path(files[0])):
-        raise ClodError(f"{files[0]}: has no sigma_d, which --device-preset needs; adapt it first")
+    common.check_dials(args, files[0])
     if args.images is not None:
         common.check_scene(args.images)
 
@@ -101,44 +91,45 @@ def execute(args: Namespace) -> None:
         # Around print: a reader of the address may interrupt before the server waits.
         with suppress(Stopped), interrupt_as_stopped():
             print(shown, file=sys.__stdout__ if args.json else None, flush=True)
-            if not args.no_browser and not open_browser(server.url):
+            browser = None if args.no_browser else find_browser()
+            if not args.no_browser and not (browser and browser.open(server.url)):
                 console.say(f"no browser found; open {server.url}, from another machine through ssh -L")
             server.serve_forever()
         console.say("ended")
 
 
-def make_page(args: Namespace, console: Console) -> tuple[dict[str, Response], dict[str, Any]]:
-    """The answers of the server by path, and the report."""
-    from clod_adapter.viewer.page import policy, served_page
-    from clod_adapter.viewer.payload import Payload, page_config
+def make_page(args: Namespace, console: Console) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The server's ``Response``s by path, and the report."""
+    from clod_adapter.viewer.page import Payload, document, page_config, policy
     from clod_adapter.viewer.server import Response
 
     from .shared.inputs import read_cameras, read_checkpoint, with_filter
     from .shared.measure import solve_dials
 
-    files = view_files(args.models)
-    models: list[Checkpoint] = []
-    for path in (*files, *([args.base] if args.base else [])):
-        origin = models[0].origin if models else None
-        models.append(with_filter(read_checkpoint(path, console, args.activated, origin), args, console))
-    base, model = models.pop() if args.base else None, models[0]
+    files, read = view_files(args.models), partial(read_checkpoint, console=console, activated=args.activated)
+    model = with_filter(read(files[0]), args, console)
+    models = [model, *(with_filter(read(path, origin=model.origin), args, console) for path in files[1:])]
+    base = with_filter(read(args.base, origin=model.origin), args, console) if args.base else None
     if args.device_preset and args.images is None and not model.viewpoints:
         raise ClodError(f"{model.path}: stores no cameras, which --device-preset needs; give --images")
     if base and args.antialiasing == "auto" and not base.filter_known:  # drawn as the model is
         drawn = model.gaussians.screen_filter
         base = replace(base, gaussians=base.gaussians.replace(screen_filter=drawn))
     cameras = read_cameras(model, args.images, console) if args.images else []
-    attenuation, opening = model.gaussians.attenuation, args.sv
-    solved = solve_dials(args, model, cameras or model.viewpoints, console)
-    if args.device_preset and solved:
-        opening = solved[0]
-    if opening is not None:
-        opening = common.initial_dial(opening, attenuation.max_sv if attenuation else None, console)
-    payloads = payloads_of(models) | ({BASE: Payload.of(base)} if base else {})
-    entries = {path: {"name": each.name, "href": path} for path, each in payloads.items()}
-    model_entry, base_entry = entries.pop(MODEL), entries.pop(BASE, None)
-    shown, placed, rest = cameras or model.cameras, model.placed and not cameras, tuple(entries.values())
-    page = served_page(page_config(model_entry, base_entry, shown, opening, rest, placed))
+    attenuation, opening = model.gaussians.attenuation, None
+    if dials := solve_dials(args, model, cameras or model.viewpoints, console):
+        opening = common.initial_dial(dials[0], attenuation.max_sv if attenuation else None, console)
+    payloads = {MODEL if k == 0 else f"/files/{k}": Payload.of(each) for k, each in enumerate(models)}
+    names = [payload.name for payload in payloads.values()]
+    if len({*names}) < len(names):  # with their folders, to tell them apart
+        names = [as_text("/".join(Path(each.path).absolute().parts[-2:])) for each in models]
+    entries = [{"name": name, "href": path} for name, path in zip(names, payloads, strict=True)]
+    base_entry = None
+    if base:
+        payloads[BASE] = Payload.of(base)
+        base_entry = {"name": payloads[BASE].name, "href": BASE}
+    shown, placed = cameras or model.cameras, model.placed and not cameras
+    page = b"".join(document(page_config(entries[0], base_entry, shown, opening, entries[1:], placed)))
     answers = {"/": Response("text/html; charset=utf-8", len(page), lambda: (page,), policy("'self'"))}
     for path, payload in payloads.items():
         answers[path] = Response("application/octet-stream", payload.size, payload.blocks)
@@ -146,17 +137,6 @@ def make_page(args: Namespace, console: Console) -> tuple[dict[str, Response], d
         "command": "view", "version": package_version(), "model": files[0], "files": files, "base": args.base,
         "scene": args.images, "base_count": len(model.gaussians), "cameras": len(cameras), "notes": console.notes,
     }  # fmt: skip
-
-
-def payloads_of(models: list[Checkpoint]) -> dict[str, Payload]:
-    """The models by path; of two files with the same name, the names have their folders."""
-    from clod_adapter.viewer.payload import Payload
-
-    payloads = [Payload.of(model) for model in models]
-    if len({payload.name for payload in payloads}) < len(payloads):
-        names = [as_text("/".join(Path(model.path).absolute().parts[-2:])) for model in models]
-        payloads = [replace(payload, name=name) for payload, name in zip(payloads, names, strict=True)]
-    return {f"/files/{number}" if number else MODEL: payload for number, payload in enumerate(payloads)}
 
 
 def find_browser() -> webbrowser.BaseBrowser | None:
@@ -170,12 +150,6 @@ def find_browser() -> webbrowser.BaseBrowser | None:
     if "BROWSER" not in os.environ or browser.basename in IN_TERMINAL:
         return None
     return webbrowser.BackgroundBrowser([browser.name, *browser.args])  # an editor's, whose end is not waited for
-
-
-def open_browser(url: str) -> bool:
-    """Opens ``url`` in a browser window; False if there is no such browser."""
-    browser = find_browser()
-    return browser is not None and browser.open(url)
 
 
 SUMMARY = "Look at a file in the browser, and turn its dial."

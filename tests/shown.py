@@ -20,7 +20,7 @@ from clod_adapter.cli.main import build_parser
 from clod_adapter.cli.shared.console import Console
 from clod_adapter.cli.view import make_page
 from clod_adapter.render import Rendering
-from clod_adapter.viewer.payload import page_config
+from clod_adapter.viewer.page import page_config
 from clod_adapter.viewer.server import Server
 
 SIZE = {"width": 400, "height": 320}

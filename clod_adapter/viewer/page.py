@@ -1,40 +1,141 @@
-"""The viewer's page: assembled from its built parts, for the server or as one file that includes the splats.
+"""The viewer's page, for the server or as one file that includes the splats, and the data that it shows.
 
 The page loads nothing from other hosts: its Content-Security-Policy allows one script and one style, by their hashes,
-and connections to its own server only.
+and connections to its own server only. Splats are PLY in one layout, whatever the file (ascii, big-endian, doubles,
+masks, .pt), or SPZ.
 """
 
 import base64
 import hashlib
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
-from functools import cache
+from dataclasses import dataclass, replace
+from functools import cache, cached_property
 from importlib.resources import files
 from io import BytesIO
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from PIL import Image
+from plyfile import PlyData, PlyElement
+from torch import Tensor
 
-from clod_adapter._support.text import script_json
+from clod_adapter._support.text import as_text, script_json
+from clod_adapter.calibration import Calibration
 from clod_adapter.cameras import Camera
-from clod_adapter.gaussians import Gaussians
+from clod_adapter.gaussians import OPAQUE, Gaussians
 from clod_adapter.io.atomic import atomic_path
-from clod_adapter.io.checkpoint import Checkpoint
+from clod_adapter.io.checkpoint import Checkpoint, load
+from clod_adapter.io.file_formats import write
+from clod_adapter.io.ply import inria_dtype
+from clod_adapter.io.ply_settings import write_comments
+from clod_adapter.io.settings import Metadata
+from clod_adapter.io.values import dial_columns
+from clod_adapter.origin import NOWHERE, Origin
 from clod_adapter.render import render
-from clod_adapter.viewer.payload import Payload, page_config
 
-PAGE, STYLE, SCRIPT = "page.html", "viewer.css", "viewer.js"
+BLOCK_ROWS = 1 << 14
+STYLE, SCRIPT = "viewer.css", "viewer.js"
 ELEMENT = "clod-model"  # id of the elements with the splats
 PART = 3 << 24  # bytes of a script element, a multiple of 3; browsers limit strings to about 5e8
 POSTER_SIDE, POSTER_QUALITY = 512, 60  # of the picture shown while the page loads: pixels, and of JPEG
 
 
-def served_page(config: Mapping[str, Any]) -> bytes:
-    """The page that fetches its splats from its server."""
-    return b"".join(_document(config, (), "", ""))
+@dataclass(frozen=True)
+class Payload:
+    """A splat for the page, without SH degrees that are 0; means are relative to the origin."""
+
+    name: str
+    gaussians: Gaussians
+    calibration: Calibration | None = None
+    origin: Origin = NOWHERE
+
+    @classmethod
+    def of(cls, checkpoint: Checkpoint) -> "Payload":
+        gaussians = checkpoint.gaussians.without_empty_bands()
+        return cls(as_text(checkpoint.path.name), gaussians, checkpoint.calibration, checkpoint.origin)
+
+    @cached_property
+    def header(self) -> bytes:
+        """The PLY's header, with attenuation settings and calibration as comments."""
+        g = self.gaussians
+        names = inria_dtype(g.sh_degree, dial=dial_columns(g.tensors())).names or ()
+        row = np.zeros((), [(name, "<f4") for name in names if name not in ("nx", "ny", "nz")])
+        comments = write_comments(Metadata(g.attenuation, g.screen_filter, self.calibration))
+        element = PlyElement.describe(np.broadcast_to(row, len(g)), "vertex", comments=comments)
+        return f"{PlyData([element], byte_order='<').header}\n".encode("ascii")
+
+    @property
+    def size(self) -> int:
+        """Bytes of the PLY."""
+        return len(self.header) + 4 * self.header.count(b"\nproperty ") * len(self.gaussians)
+
+    def blocks(self) -> Iterator[bytes]:
+        """The PLY in blocks of rows: little-endian float32, Inria's layout without normals, the dial last.
+
+        A logit above 20 is written as 20, the same opacity in float32.
+        """
+        g, tensors = self.gaussians, self.gaussians.tensors()
+        columns = [g.means, g.sh0, g.shN.transpose(1, 2), g.opacity_logits.clamp(max=OPAQUE)[:, None], g.log_scales]
+        columns += [g.quats, *(tensors[name][:, None] for name in dial_columns(tensors))]
+        yield self.header
+        for parts in zip(*(column.split(BLOCK_ROWS) for column in columns), strict=True):
+            rows = torch.cat([part.flatten(1) for part in parts], 1).detach().float().cpu().numpy()
+            yield rows.astype("<f4", copy=False).tobytes()
+
+    def packed(self, file: str) -> tuple[bytes, Gaussians, tuple[str, ...]]:
+        """The splat as SPZ, of which rows that are near one another take a tenth less.
+
+        ``file`` is a temporary name. Returns the bytes, the Gaussians in them, and a line for each loss.
+        """
+        rows = _along_curve(self.gaussians.means)
+        try:
+            notes = write(file, self.gaussians.select(rows), origin=self.origin, calibration=self.calibration)
+            found = load(file, origin=self.origin).gaussians.to(self.gaussians.means.device)
+            return Path(file).read_bytes(), found, notes
+        finally:
+            Path(file).unlink(missing_ok=True)
+
+
+def _along_curve(means: Tensor) -> Tensor:
+    """The rows in Morton order, of cells that divide all but the outermost 1 % on each side by 1024."""
+    points = means.detach().double().cpu().numpy()
+    low, high = np.quantile(points, (0.01, 0.99), axis=0)
+    cells = (1023 * (points - low) / np.maximum(high - low, 1e-300)).clip(0, 1023).astype(np.int64)
+    code = sum(((cells[:, k] >> bit) & 1) << (3 * bit + k) for bit in range(10) for k in range(3))
+    return torch.from_numpy(np.argsort(code, kind="stable")).to(means.device)
+
+
+def page_config(
+    model: Mapping[str, Any],
+    base: Mapping[str, Any] | None,
+    cameras: Sequence[Camera],
+    virtual_scale: float | None,
+    others: Sequence[Mapping[str, Any]] = (),
+    placed: bool = False,
+) -> dict[str, Any]:
+    """The page's configuration. ``model`` and ``base`` have a ``name``, and ``href`` or ``element`` for their data.
+
+    ``virtual_scale`` is the first dial value; None for 1 with photographs, else 0 (everything), and then what suits the
+    device. ``placed``: the cameras are not photographs'; the page levels them.
+    """
+
+    def digits(matrix: Tensor) -> list[list[float]]:
+        return [[float(f"{value:.9g}") for value in row] for row in matrix.tolist()]  # full float32 precision
+
+    places = [
+        {
+            "name": each.name, "viewmat": digits(each.viewmat), "K": digits(each.K), "width": each.width,
+            "height": each.height, "near": each.near, "placed": placed,
+        }
+        for each in cameras
+    ]  # fmt: skip
+    return {
+        "title": model["name"], "model": model, "base": base, "others": list(others), "cameras": places,
+        "virtual_scale": virtual_scale,
+    }  # fmt: skip
 
 
 def write_viewer_page(
@@ -50,16 +151,19 @@ def write_viewer_page(
     ``virtual_scale`` is as in ``page_config``; ``exact`` includes float32, not SPZ. Returns the Gaussians as the page
     shows them, and a line for each loss.
     """
-    shown, placed = cameras or model.cameras, model.placed and not cameras
+    shown, placed, payload = cameras or model.cameras, model.placed and not cameras, Payload.of(model)
+    config = page_config({"name": payload.name, "element": ELEMENT}, None, shown, virtual_scale, placed=placed)
     with atomic_path(path) as temporary:
-        payload = Payload.of(model)
-        data, found, notes = payload.packed(f"{temporary}.spz", exact)
-        config = page_config({"name": payload.name, "element": ELEMENT}, None, shown, virtual_scale, placed=placed)
+        data, found, notes = b"", payload.gaussians, tuple[str, ...]()
+        if exact:
+            data = b"".join(payload.blocks())
+        else:
+            data, found, notes = payload.packed(f"{temporary}.spz")
         opening = virtual_scale if virtual_scale is not None else 0.0 if placed else 1.0
         poster = _poster(found, shown[0], opening) if shown else ""
         meta = f'<meta http-equiv="Content-Security-Policy" content="{policy()}">\n'
         with open(temporary, "wb") as file:
-            file.writelines(_document(config, _elements(data), meta, poster))
+            file.writelines(document(config, _elements(data), meta, poster))
     return found, notes
 
 
@@ -79,14 +183,17 @@ def _poster(gaussians: Gaussians, camera: Camera, virtual_scale: float) -> str:
 
 def policy(connect: str = "") -> str:
     """The page's Content-Security-Policy; ``connect`` is a further source that it may fetch from."""
-    script, style = (f"'sha256-{_digest(_static_file(name))}'" for name in (SCRIPT, STYLE))
+    digests = [hashlib.sha256(_static_file(name).encode()).digest() for name in (SCRIPT, STYLE)]
+    script, style = (f"'sha256-{base64.b64encode(each).decode()}'" for each in digests)
     return (
         f"default-src 'none'; script-src {script}; style-src {style}; img-src data: blob:; "
         f"connect-src {connect} data: blob:; worker-src blob:; base-uri 'none'; form-action 'none'"
     )
 
 
-def _document(config: Mapping[str, Any], data: Iterable[bytes], meta: str, poster: str) -> Iterator[bytes]:
+def document(
+    config: Mapping[str, Any], data: Iterable[bytes] = (), meta: str = "", poster: str = ""
+) -> Iterator[bytes]:
     """The page in pieces, because data may be large; ``meta`` is added to its head, ``poster`` above its canvas."""
     content = {
         "STYLE": f"{meta}<style>{_static_file(STYLE)}</style>",
@@ -94,7 +201,7 @@ def _document(config: Mapping[str, Any], data: Iterable[bytes], meta: str, poste
         "CONFIG": f'<script type="application/json" id="clod-config">{script_json(config)}</script>',
         "SCRIPT": f'<script type="module">{_static_file(SCRIPT)}</script>',
     }
-    for number, part in enumerate(re.split("<!--CLOD-([A-Z]+)-->", _static_file(PAGE))):
+    for number, part in enumerate(re.split("<!--CLOD-([A-Z]+)-->", _static_file("page.html"))):
         if part == "DATA":
             yield from data
         else:
@@ -111,7 +218,3 @@ def _elements(data: bytes) -> Iterator[bytes]:
 @cache
 def _static_file(name: str) -> str:
     return (files("clod_adapter.viewer") / "static" / name).read_text(encoding="utf-8")
-
-
-def _digest(text: str) -> str:
-    return base64.b64encode(hashlib.sha256(text.encode()).digest()).decode("ascii")

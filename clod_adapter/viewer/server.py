@@ -8,7 +8,6 @@ import re
 import socket
 import socketserver
 import sys
-import threading
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -21,6 +20,10 @@ from clod_adapter.errors import ClodError
 HOST = "127.0.0.1"
 LOOPBACK = re.compile(r"(127\.0\.0\.1|localhost)(:\d{1,5})?", re.ASCII)
 IDLE_TIMEOUT = 30  # of a connection between responses, seconds
+HEADERS = {
+    "Cache-Control": "no-store", "X-Content-Type-Options": "nosniff", "Cross-Origin-Resource-Policy": "same-origin",
+    "Cross-Origin-Opener-Policy": "same-origin", "Referrer-Policy": "no-referrer",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -38,13 +41,11 @@ class Server(ThreadingHTTPServer):
 
     # Not daemons: a thread that holds a tensor when the interpreter exits would abort the process.
     daemon_threads = False
-    block_on_close = False  # the base class would join a thread that a Ctrl-C kept from starting
     allow_reuse_address = sys.platform != "win32"  # on Windows two servers would share a port
 
     def __init__(self, responses: Mapping[str, Response], port: int = 0) -> None:
         self.responses = dict(responses)
         self._sockets: set[socket.socket] = set()
-        self._threads_of_requests: list[threading.Thread] = []
         try:
             super().__init__((HOST, port), _Handler)
         except OSError as error:
@@ -69,11 +70,6 @@ class Server(ThreadingHTTPServer):
         self._sockets.add(request)
         return request, address
 
-    def process_request(self, request: Any, client_address: Any) -> None:
-        thread = threading.Thread(target=self.process_request_thread, args=(request, client_address))
-        self._threads_of_requests = [*(each for each in self._threads_of_requests if each.is_alive()), thread]
-        thread.start()
-
     def shutdown_request(self, request: Any) -> None:
         self._sockets.discard(request)
         super().shutdown_request(request)
@@ -83,10 +79,8 @@ class Server(ThreadingHTTPServer):
         for request in list(self._sockets):
             with suppress(OSError):
                 request.shutdown(socket.SHUT_RDWR)
-        super().server_close()
-        for thread in self._threads_of_requests:
-            if thread.is_alive():  # false for one that never started
-                thread.join()
+        with suppress(RuntimeError):  # of a thread that a Ctrl-C kept from starting; Python waits for the others
+            super().server_close()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Ignores connections closed by the browser, for example with its tab."""
@@ -123,11 +117,8 @@ class _Handler(BaseHTTPRequestHandler):
 
     def end_headers(self) -> None:
         """Adds the headers of every response, including errors."""
-        self.send_header("Cache-Control", "no-store")
-        self.send_header("X-Content-Type-Options", "nosniff")
-        self.send_header("Cross-Origin-Resource-Policy", "same-origin")
-        self.send_header("Cross-Origin-Opener-Policy", "same-origin")
-        self.send_header("Referrer-Policy", "no-referrer")
+        for name, value in HEADERS.items():
+            self.send_header(name, value)
         super().end_headers()
 
     def log_message(self, format: str, *args: Any) -> None:

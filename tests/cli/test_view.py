@@ -18,8 +18,6 @@ from clod_adapter.cli import view
 from clod_adapter.cli.main import build_parser
 from runs import Server, log_of, wait_for
 
-URL = "http://127.0.0.1:1/"
-
 
 def fetch(url: str) -> bytes:
     with urllib.request.urlopen(url, timeout=10) as response:
@@ -102,18 +100,18 @@ def test_interrupts_and_browsers(clod: Any, capture: Any, monkeypatch: pytest.Mo
     assert (done.code, done.err) == (0, "") and done.out == f"{opened[0]}  (Ctrl-C ends)\n"
     monkeypatch.delenv("BROWSER", raising=False)
     monkeypatch.setattr(webbrowser, "get", lambda: webbrowser.GenericBrowser("true"))
-    assert not view.open_browser(URL)
+    assert view.find_browser() is None
     monkeypatch.setenv("BROWSER", "editor")  # a program whose end is not waited for
     monkeypatch.setattr(webbrowser, "get", lambda: webbrowser.GenericBrowser("editor"))
     assert isinstance(view.find_browser(), webbrowser.BackgroundBrowser)
     monkeypatch.setattr(webbrowser, "get", lambda: webbrowser.GenericBrowser("lynx"))
-    assert not view.open_browser(URL)
+    assert view.find_browser() is None
 
     def none() -> None:
         raise webbrowser.Error("could not locate runnable browser")
 
     monkeypatch.setattr(webbrowser, "get", none)
-    assert not view.open_browser(URL)
+    assert view.find_browser() is None
     with socket.create_server(("127.0.0.1", 0)) as taken:
         done = clod("view", capture.ply, "--no-browser", "--port", taken.getsockname()[1])
     assert (done.code, done.out) == (2, ""), done

@@ -14,7 +14,7 @@ from clod_adapter.calibration import Calibration, CalibrationRow
 from clod_adapter.config import FILTERS
 from clod_adapter.equation.units import with_distance
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.viewer.payload import Payload, page_config
+from clod_adapter.viewer.page import Payload, page_config
 
 MEASURED = Calibration((CalibrationRow(1.0, 30.5, 29.25, 0.9, 4.0),), 40, 2, 8, 6, "a machine")
 
