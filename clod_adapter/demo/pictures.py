@@ -15,7 +15,7 @@ from clod_adapter.io.checkpoint import load
 from clod_adapter.io.scene.load import load_scene
 from clod_adapter.render import render
 from clod_adapter.report.page import Picture
-from clod_adapter.report.style import BLUE, INK, ORANGE, QUIET, label_log, new_figure, save_figure, tidy
+from clod_adapter.report.style import BLUE, INK, ORANGE, label_log, new_figure, save_figure
 
 DIALS = (1.0, 2.0, 3.0, 5.0)
 VIEW = 0  # the held-out view on the strip: across the whole room
@@ -50,26 +50,19 @@ def dial_strip(path: str | Path, panels: Sequence[Picture], title: str, crop: tu
     """Draws panels of one size side by side, above the part ``crop`` (left, top, width, height) of each enlarged."""
     height, width = panels[0].image.shape[:2]
     left, right, top, bottom = crop[0], crop[0] + crop[2], crop[1], crop[1] + crop[3]
-    cell, gap, head, caption = 2.6, 0.08, 0.42, 0.66  # inches
-    tall = [cell * height / width, cell * crop[3] / crop[2]]
-    across, down = len(panels) * (cell + gap) + gap, sum(tall) + 2 * gap + head + caption
-    with new_figure((across, down)) as figure:
-        figure.text(gap / across, 1 - 0.5 * head / down, title, fontsize=11, weight="bold", va="center")
-        for k, panel in enumerate(panels):
+    tall, cell = [height / width, crop[3] / crop[2]], 2.6  # inches
+    with new_figure((len(panels) * cell, cell * sum(tall) + 1.1), layout="constrained") as figure:
+        figure.suptitle(title, fontsize=11, weight="bold", x=0.01, ha="left")
+        columns = figure.subplots(2, len(panels), height_ratios=tall, squeeze=False).T
+        for panel, (whole, part) in zip(panels, columns, strict=True):
             pixels = panel.image if panel.image.dtype == np.uint8 else np.clip(panel.image, 0, 1)
-            x, y = gap + k * (cell + gap), down - head
-            whole = figure.add_axes((x / across, (y - tall[0]) / down, cell / across, tall[0] / down))
-            y -= sum(tall) + gap
-            part = figure.add_axes((x / across, y / down, cell / across, tall[1] / down))
             whole.imshow(pixels, interpolation="antialiased", aspect="auto")
             part.imshow(pixels[top:bottom, left:right], interpolation="nearest", aspect="auto")
             xs, ys = np.array([left, right, right, left, left]), np.array([top, top, bottom, bottom, top])
             whole.plot(xs - 0.5, ys - 0.5, color="white", linewidth=1.4, scalex=False, scaley=False)
-            for axes in (whole, part):
-                axes.axis("off")
-            text = {"x": (x + cell / 2) / across, "ha": "center", "va": "top"}
-            figure.text(y=(y - gap - 0.04) / down, s=panel.title, fontsize=10.5, weight="bold", **text)
-            figure.text(y=(y - gap - 0.24) / down, s=panel.detail, fontsize=8.5, color=QUIET, linespacing=1.35, **text)
+            whole.set_axis_off()
+            part.set(xticks=[], yticks=[], frame_on=False)
+            part.set_xlabel(f"{panel.title}\n{panel.detail}", fontsize=8.5, linespacing=1.35)
         save_figure(figure, path)
 
 
@@ -78,20 +71,15 @@ def quality_curve(figure: Any, rows: Sequence[Mapping[str, float]], base_row: Ma
     title = "Quality against Gaussians, mean over the held-out views"
     figure.suptitle(title, fontsize=11, weight="bold", x=0.02, ha="left")
     both = figure.subplots(2, 1, sharex=True, height_ratios=[1.5, 1])
-    ordered = sorted(rows, key=lambda row: row["virtual_scale"])
     for axes, key, label, colour in zip(both, ("psnr", "ssim"), ("PSNR (dB)", "SSIM"), (BLUE, ORANGE), strict=True):
         axes.set_xscale("log")
         axes.margins(x=0.1, y=0.16)
-        points = [(row["kept"], row[key]) for row in ordered]
-        axes.plot(*zip(*points, strict=True), "-o", color=colour, markersize=5.5, linewidth=1.8, zorder=3)
-        for row, point in zip(ordered, points, strict=True):
-            name = f"{row['virtual_scale']:g}"  # neighbours near s = 1 leave no room for more
-            name = f"s = {name}" if row in (ordered[0], ordered[-1]) else name
-            axes.annotate(name, point, (-4, 5), textcoords="offset points", ha="right", fontsize=8.5)
-        spot = (base_row["kept"], base_row[key])
-        axes.plot(*spot, "D", color="white", markeredgecolor=INK, markersize=7, zorder=2)
-        axes.annotate("base", spot, (0, 8), textcoords="offset points", ha="center", fontsize=8.5)
+        points = [("base", (base_row["kept"], base_row[key]))]
+        points += [(f"{row['virtual_scale']:g}", (row["kept"], row[key])) for row in rows]
+        axes.plot(*zip(*(point for _, point in points[1:]), strict=True), "-o", color=colour, linewidth=1.8)
+        axes.plot(*points[0][1], "D", color="white", markeredgecolor=INK, markersize=7, zorder=1)
+        for text, point in points:
+            axes.annotate(text, point, (-4, 5), textcoords="offset points", ha="right", fontsize=8.5)
         axes.set_ylabel(label)
-        tidy(axes)
-    axes.set_xlabel("Gaussians kept (log scale)")
+    axes.set_xlabel("Gaussians kept (log scale); the numbers are dial values")
     label_log(axes.xaxis)

@@ -4,7 +4,6 @@ Their series are rows that ``clod-adapt --json`` and ``clod-adapt eval --json`` 
 """
 
 import io
-import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -15,7 +14,6 @@ from clod_adapter.report.style import GRID, INK, PAPER, QUIET, SERIES, label_log
 
 Draw = Callable[[Any], None]  # of the axes of an empty figure
 SIZE, NARROW = (7.2, 4.1), (4.0, 4.0)  # inches; NARROW for phones
-STEPS = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)  # dB between grid lines
 MARKERS = "oDs^vPX"
 ROOM = (38, 11)  # points that a label takes
 BASE = "base, unadapted"
@@ -83,20 +81,27 @@ def draw_rendering(axes: Any, series: Sequence[Series]) -> None:
     """Draws error against milliseconds per frame: lines for files with a dial, points for others."""
     notes = list[tuple[str, tuple[float, float]]]()
     for k, one in enumerate(series):
-        points = [(row["frame_ms"], error(row["psnr"])) for row in one.rows]
+        points = [(row["frame_ms"], row["psnr"]) for row in one.rows]
         _line(axes, k, one.label, points, linestyle="-" if one.dial else "none")
         if one.dial:
             notes += [(f"s = {row['virtual_scale']:g}", at) for row, at in zip(one.rows, points, strict=True)]
     _finish(axes, "milliseconds per frame (log scale)")
-    _annotate(axes, notes)
+    # Labels of points, without those that would cover another; the first and the last come first.
+    axes.figure.draw_without_rendering()  # so that the positions are those of the layout
+    unit, placed = axes.figure.dpi / 72, list[Any]()
+    for text, at in sorted(notes, key=lambda note: note not in (notes[0], notes[-1])):
+        x, y = axes.transData.transform(at) / unit
+        if all(abs(x - other[0]) > ROOM[0] or abs(y - other[1]) > ROOM[1] for other in placed):
+            placed.append((x, y))
+            axes.annotate(text, at, (-5, -11), textcoords="offset points", ha="right", fontsize=8, color=QUIET)
 
 
 def draw_training(axes: Any, curves: Sequence[Mapping[str, Any]], base_psnr: float | None) -> None:
     """Draws held-out error against seconds of adapting, and that of the unadapted base as a horizontal line."""
     for k, curve in enumerate(curves):
-        _line(axes, k, curve["label"], [(point["seconds"], error(point["psnr"])) for point in curve["points"]])
+        _line(axes, k, curve["label"], [(point["seconds"], point["psnr"]) for point in curve["points"]])
     if base_psnr is not None:
-        axes.axhline(error(base_psnr), color=INK, linestyle="--", linewidth=1.1, label=BASE)
+        axes.axhline(base_psnr, color=INK, linestyle="--", linewidth=1.1, label=BASE)
     _finish(axes, "seconds of adapting (log scale)")
 
 
@@ -110,40 +115,16 @@ def error(psnr: float) -> float:
     return 10.0 ** (-psnr / 10)
 
 
-def _annotate(axes: Any, notes: Sequence[tuple[str, tuple[float, float]]]) -> None:
-    """Labels of points, without those that would cover another; the first and the last come first."""
-    axes.figure.draw_without_rendering()  # so that the positions are those of the layout
-    unit, placed = axes.figure.dpi / 72, list[Any]()
-    for text, at in sorted(notes, key=lambda note: note not in (notes[0], notes[-1])):
-        x, y = axes.transData.transform(at) / unit
-        if all(abs(x - other[0]) > ROOM[0] or abs(y - other[1]) > ROOM[1] for other in placed):
-            placed.append((x, y))
-            axes.annotate(text, at, (-5, -11), textcoords="offset points", ha="right", fontsize=8, color=QUIET)
-
-
 def _finish(axes: Any, label: str) -> None:
-    """Axes of an error chart: log error on the left, with ticks at round PSNR values, which are on the right."""
+    """Axes of an error chart: PSNR downwards, which is the logarithm of the error; labels of both at the same ticks."""
     axes.set_xscale("log")
     axes.set_xlabel(label)
-    axes.set_yscale("log")
     axes.margins(x=0.2, y=0.12)
-    low, high = (-10 * math.log10(value) for value in reversed(axes.get_ylim()))
-    step = next((s for s in STEPS if (high - low) / s <= 8.5), STEPS[-1])
-    values = [k * step for k in range(math.ceil(low / step), math.floor(high / step) + 1)]
-    right = axes.twinx()
-    right.set_yscale("log")
-    right.set_ylim(axes.get_ylim())
-    errors = [error(value) for value in values]
-    for side, texts in ((axes, [f"{1e3 * e:.3g}" for e in errors]), (right, [f"{v:.4g}" for v in values])):
-        side.set_yticks(errors, texts)
-        side.set_yticks([], minor=True)
-        side.spines["top"].set_visible(False)
-        side.tick_params(length=0)
+    axes.invert_yaxis()
+    axes.secondary_yaxis("right").set_ylabel("PSNR (dB)")
     axes.set_ylabel("mean squared error, thousandths (log scale)")
-    right.set_ylabel("PSNR (dB)")
+    axes.yaxis.set_major_formatter(lambda psnr, _: f"{1e3 * error(psnr):.3g}")
     left, far = axes.get_xlim()
     label_log(axes.xaxis, "{:,g}", (1, 2, 5) if far / left > 20 else (1, 1.5, 2, 3, 4, 5, 7))
-    axes.grid(color=GRID, linewidth=0.8)
-    axes.set_axisbelow(True)
-    axes.legend(frameon=False, fontsize=8.5, loc="best")
+    axes.legend(loc="best")
     axes.annotate("better", (0.012, 0.018), xycoords="axes fraction", fontsize=8, color=QUIET, style="italic")

@@ -2,12 +2,14 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from clod_adapter.report.style import INK, ORANGE, QUIET, label_log, new_figure, save_figure, shades, tidy
+from clod_adapter.report.style import ORANGE, QUIET, label_log, new_figure, save_figure
 
 PANELS = ("PSNR (dB)", "SSIM", "opacity", "decay sigma_d (log scale)")
+BEYOND = "beyond the trained range"
 
 
 def robustness_figure(path: str | Path, cells: Sequence[Mapping[str, Any]], title: str) -> None:
@@ -17,8 +19,10 @@ def robustness_figure(path: str | Path, cells: Sequence[Mapping[str, Any]], titl
     """
     names = list(dict.fromkeys(cell["checkpoint"] for cell in cells))
     ranges = sorted({cell["max_sv"] for cell in cells if cell["max_sv"] is not None})
-    colours = dict(zip(ranges, shades(len(ranges)), strict=True))
     with new_figure((13.2, 0.95 + 3.0 * len(names)), layout="constrained") as figure:
+        import matplotlib
+
+        colours = {each: matplotlib.colormaps["Blues"](0.4 + 0.6 * k / len(ranges)) for k, each in enumerate(ranges, 1)}
         figure.suptitle(title, fontsize=11.5, weight="bold", x=0.008, ha="left")
         grid = figure.subplots(len(names), 4, squeeze=False, width_ratios=[1.35, 1.35, 1, 1])
         for axes, name in zip(grid, names, strict=True):
@@ -32,32 +36,34 @@ def robustness_figure(path: str | Path, cells: Sequence[Mapping[str, Any]], titl
                 panel.set_ylabel(label)
         for panel, label in zip(grid[-1], ("Gaussians kept (log scale)",) * 2 + PANELS[2:], strict=True):
             panel.set_xlabel(label)
-        _legend(figure, colours)
+        lines = {line.get_label(): line for axes in grid[:, 0] for line in axes.get_lines()}
+        labels = sorted(lines, key=lambda label: label == BEYOND)
+        figure.legend([lines[label] for label in labels], labels, loc="outside lower left", ncols=len(labels))
         save_figure(figure, path)
 
 
-def _quality(axes: Any, cells: Sequence[Mapping[str, Any]], key: str, colours: Mapping[float, str]) -> None:
+def _quality(axes: Any, cells: Sequence[Mapping[str, Any]], key: str, colours: Mapping[float, Any]) -> None:
     axes.set_xscale("log")
     for cell in cells:
-        points = sorted((row["kept"], row[key], row["virtual_scale"]) for row in cell["rows"] if row[key] is not None)
-        if cell["max_sv"] is None:
-            _plot(axes, points, "--", color=ORANGE, linewidth=1.4, marker="D", markersize=3, zorder=2)
-            continue
-        inside = [point for point in points if point[2] <= cell["max_sv"]]
-        beyond = [point for point in points if point[2] >= cell["max_sv"]]
-        style = {"color": colours[cell["max_sv"]], "marker": "o"}
-        _plot(axes, beyond, ":", linewidth=1.2, markersize=3.4, mfc="white", zorder=3, **style)
-        _plot(axes, inside, "-", linewidth=1.8, markersize=4.2, zorder=4, **style)
+        rows, last = [row for row in cell["rows"] if row[key] is not None], cell["max_sv"]
+        base, s_1 = "unadapted, pruned by opacity", "adapted at s = 1 only"
+        style = {"color": ORANGE, "marker": "D", "linestyle": "--", "label": base}
+        if last is not None:
+            label = s_1 if last == 1 else f"adapted, s in [1, {last:g}]"
+            style = {"color": colours[last], "marker": "o", "label": label}
+        _plot(axes, [row for row in rows if last is None or row["virtual_scale"] <= last], key, style)
+        if outside := [row for row in rows if last is not None and row["virtual_scale"] >= last]:
+            _plot(axes, outside, key, style | {"linestyle": ":", "mfc": "white", "label": BEYOND})
     axes.margins(x=0.06, y=0.12)
     label_log(axes.xaxis)
-    tidy(axes)
 
 
-def _plot(axes: Any, points: Sequence[tuple[float, ...]], line: str, **style: Any) -> None:
-    axes.plot([point[0] for point in points], [point[1] for point in points], line, **style)
+def _plot(axes: Any, rows: Sequence[Mapping[str, Any]], key: str, style: Mapping[str, Any]) -> None:
+    points = sorted((row["kept"], row[key]) for row in rows)
+    axes.plot([x for x, _ in points], [y for _, y in points], linewidth=1.5, markersize=4, **style)
 
 
-def _distribution(axes: Any, cells: Sequence[Mapping[str, Any]], key: str, colours: Mapping[float, str]) -> None:
+def _distribution(axes: Any, cells: Sequence[Mapping[str, Any]], key: str, colours: Mapping[float, Any]) -> None:
     """Outlines of the histograms, in percent of the Gaussians per bin."""
     for cell in cells:
         if histogram := cell["distribution"].get(key):
@@ -68,30 +74,12 @@ def _distribution(axes: Any, cells: Sequence[Mapping[str, Any]], key: str, colou
     if key == "opacity":
         axes.set_yscale("log")  # most are nearly transparent
         label_log(axes.yaxis, "{:g}")
-    else:
-        axes.set_ylim(bottom=0)
-        _trim(axes, [cell["distribution"][key] for cell in cells if key in cell["distribution"]])
-    tidy(axes)
-
-
-def _trim(axes: Any, histograms: Sequence[Mapping[str, Any]]) -> None:
-    """Limits the axis to the decades of sigma_d whose bins hold a thousandth of the Gaussians or more."""
-    used = [k for h in histograms for k, share in enumerate(h["shares"]) if share > 1e-3]
-    if used:
-        edges = histograms[0]["edges"]
-        low, high = math.floor(edges[min(used)]), math.ceil(edges[max(used) + 1])
+        return
+    # The decades of sigma_d whose bins hold a thousandth of the Gaussians or more.
+    axes.set_ylim(bottom=0)
+    histograms = [cell["distribution"][key] for cell in cells if key in cell["distribution"]]
+    bins = [each for h in histograms for each in zip(pairwise(h["edges"]), h["shares"], strict=True)]
+    if used := [edge for ends, share in bins if share > 1e-3 for edge in ends]:
+        low, high = math.floor(min(used)), math.ceil(max(used))
         axes.set_xlim(low, high)
         axes.set_xticks(range(low, high + 1), [f"{10.0**k:g}" for k in range(low, high + 1)])
-
-
-def _legend(figure: Any, colours: Mapping[float, str]) -> None:
-    from matplotlib.lines import Line2D
-
-    lines = [Line2D([], [], color=ORANGE, linestyle="--", marker="D", markersize=3)]
-    names = ["unadapted, pruned by opacity"]
-    for max_sv, colour in colours.items():
-        lines.append(Line2D([], [], color=colour, linewidth=1.8, marker="o", markersize=4.2))
-        names.append("adapted at s = 1 only" if max_sv == 1 else f"adapted, s in [1, {max_sv:g}]")
-    lines.append(Line2D([], [], color=INK, linestyle=":", marker="o", markersize=3.4, mfc="white"))
-    names.append("beyond the trained range")
-    figure.legend(lines, names, loc="outside lower left", ncols=len(names), frameon=False, fontsize=8.5)

@@ -23,6 +23,13 @@ STYLE: dict[Any, Any] = {
     "axes.edgecolor": QUIET,
     "axes.labelcolor": INK,
     "axes.linewidth": 0.8,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": GRID,
+    "legend.frameon": False,
+    "legend.fontsize": 8.5,
     "xtick.color": QUIET,
     "ytick.color": QUIET,
     "font.size": 9,
@@ -53,21 +60,6 @@ def save_figure(figure: Any, path: str | Path) -> None:
     about = {"Software": f"clod-adapter {package_version()}"} if Path(path).suffix.lower() == ".png" else None
     with atomic_path(path) as part:
         figure.savefig(part, facecolor=PAPER, metadata=about)
-
-
-def shades(count: int) -> list[str]:
-    """``count`` shades from light to dark, for an ordered quantity."""
-    from matplotlib.colors import LinearSegmentedColormap, to_hex
-
-    ramp = LinearSegmentedColormap.from_list("", ["#9ec3e6", BLUE, "#10224a"])
-    return [to_hex(ramp(k / (count - 1) if count > 1 else 0.5)) for k in range(count)]
-
-
-def tidy(axes: Any) -> None:
-    """Axes with a grid and without a box."""
-    axes.grid(color=GRID, linewidth=0.8)
-    axes.set_axisbelow(True)
-    axes.spines[["top", "right"]].set_visible(False)
 
 
 def label_log(axis: Any, text: str = "{:,.0f}", subs: Sequence[float] = (1, 2, 5)) -> None:
