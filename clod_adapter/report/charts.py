@@ -5,7 +5,8 @@ Their series are rows that ``clod-adapt --json`` and ``clod-adapt eval --json`` 
 
 import io
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from clod_adapter.report.style import GRID, INK, PAPER, QUIET, SERIES, label_log
 
 Draw = Callable[[Any], None]  # of the axes of an empty figure
 SIZE, NARROW = (7.2, 4.1), (4.0, 4.0)  # inches; NARROW for phones
+MARGINS = (0.75, 0.5, 0.65, 0.1)  # left, bottom, right and top of the axes, inches
 MARKERS = "oDs^vPX"
 ROOM = (38, 11)  # points that a label takes
 BASE = "base, unadapted"
@@ -56,14 +58,23 @@ def chart_file(page: Path, name: str) -> Path:
     return page.with_name(f"{page.stem}_{name}.png")
 
 
+@contextmanager
+def chart(draw: Draw, size: tuple[float, float]) -> Iterator[Any]:
+    """A figure with the chart in fixed margins, whose layout takes no time."""
+    (left, bottom, right, top), (width, height) = MARGINS, size
+    with new_figure(size) as figure:
+        place = (left / width, bottom / height, 1 - (left + right) / width, 1 - (bottom + top) / height)
+        draw(figure.add_axes(place))
+        yield figure
+
+
 def inline_svg(draw: Draw, name: str, label: str) -> list[str]:
     """The chart as SVG elements for desktops and phones, in the colours of ``style.css``, with ids by its name."""
     names = {INK: "ink", QUIET: "quiet", GRID: "line", PAPER: "paper"}
     names |= {colour: f"series-{k + 1}" for k, colour in enumerate(SERIES[:-1])}
     found = []
     for kind, size in (("wide", SIZE), ("narrow", NARROW)):
-        with new_figure(size, layout="constrained") as figure:
-            draw(figure.subplots())
+        with chart(draw, size) as figure:
             text = io.StringIO()
             figure.savefig(text, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
         svg = text.getvalue()[text.getvalue().index("<svg") :]
@@ -87,7 +98,6 @@ def draw_rendering(axes: Any, series: Sequence[Series]) -> None:
             notes += [(f"s = {row['virtual_scale']:g}", at) for row, at in zip(one.rows, points, strict=True)]
     _finish(axes, "milliseconds per frame (log scale)")
     # Labels of points, without those that would cover another; the first and the last come first.
-    axes.figure.draw_without_rendering()  # so that the positions are those of the layout
     unit, placed = axes.figure.dpi / 72, list[Any]()
     for text, at in sorted(notes, key=lambda note: note not in (notes[0], notes[-1])):
         x, y = axes.transData.transform(at) / unit

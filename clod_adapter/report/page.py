@@ -22,13 +22,14 @@ from clod_adapter.report.charts import (
     BASE,
     SIZE,
     Draw,
+    chart,
     chart_file,
     draw_rendering,
     draw_training,
     inline_svg,
     series_of,
 )  # fmt: skip
-from clod_adapter.report.style import new_figure, save_figure
+from clod_adapter.report.style import save_figure
 
 WIDEST = 1000  # pixels; wider pictures are scaled down
 QUALITY = 88  # of WebP
@@ -99,8 +100,7 @@ def write_page(
     outputs = {name: chart_file(path, name) for name in charts}
     with atomic_paths(path, *outputs.values()) as (temporary, *pngs):
         for png, draw in zip(pngs, charts.values(), strict=True):
-            with new_figure(SIZE, layout="constrained") as figure:
-                draw(figure.subplots())
+            with chart(draw, SIZE) as figure:
                 save_figure(figure, png)
         temporary.write_text(as_text(page), encoding="utf-8")
     return {"page": path, **outputs}

@@ -82,7 +82,7 @@ def test_charts() -> None:
     series = [
         Series("dial", [row(s, 30 - s, 20 / s) for s in dials], dial=True), Series("base", [row(1, 29.5, 25)]),
     ]  # fmt: skip
-    with new_figure((6, 4), layout="constrained") as figure:
+    with new_figure((6, 4)) as figure:
         draw_rendering(figure.subplots(), series)
         figure.canvas.draw()
         (left,) = figure.axes
