@@ -63,19 +63,7 @@ def _of_gsplat(typed: Typed) -> Typed:
         given = bound.arguments | bound.arguments.pop("kwargs", {}) | {"sigma_d": sigma_d, "growth_d": growth_d}
         return render(function, given, virtual_scale, settings, hide)
 
-    dialled.__signature__ = _signature(getattr(gsplat, name), typed)  # type: ignore[attr-defined]
     return dialled  # type: ignore[return-value]
-
-
-def _signature(theirs: Callable[..., Any], typed: Callable[..., Any]) -> inspect.Signature:
-    """Parameters of the installed gsplat and the four, for help() and editors."""
-    added = [
-        inspect.signature(typed).parameters[name] for name in ("sigma_d", "virtual_scale", "attenuation", "growth_d")
-    ]
-    signature = inspect.signature(theirs)
-    parameters = list(signature.parameters.values())
-    rest = [each for each in parameters if each.kind is each.VAR_KEYWORD]
-    return signature.replace(parameters=[*(each for each in parameters if each not in rest), *added, *rest])
 
 
 @_of_gsplat

@@ -1,1 +1,1 @@
-"""The nerfstudio method ``clod-splatfacto``; ``method`` and ``model`` are imported by nerfstudio alone."""
+"""The nerfstudio method ``clod-splatfacto``; ``method`` is imported by nerfstudio alone."""

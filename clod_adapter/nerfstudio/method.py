@@ -1,6 +1,7 @@
 """The method ``clod-splatfacto``, which nerfstudio finds by the entry point ``nerfstudio.method_configs``."""
 
 import sys
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -8,23 +9,31 @@ from typing import Any
 
 import numpy as np
 import torch
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.configs.base_config import ViewerConfig
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.engine.optimizers import AdamOptimizerConfig, Optimizers
 from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
+from nerfstudio.models.splatfacto import SplatfactoModel, SplatfactoModelConfig
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.plugins.types import MethodSpecification
+from nerfstudio.viewer.viewer_elements import ViewerSlider
+from torch import Tensor
+from torch.nn import Parameter
 
+from clod_adapter.cameras import View
 from clod_adapter.config import AdaptConfig, ScreenFilter
 from clod_adapter.errors import ClodError
-from clod_adapter.nerfstudio.model import ClodSplatfactoModelConfig
-from clod_adapter.nerfstudio.splatfacto import state_of, view_of, write_ply
+from clod_adapter.nerfstudio.splatfacto import chosen, new_dial, shown, state_of, view_of, write_ply
+from clod_adapter.training.dial import Dial
 from clod_adapter.training.schedule import OURS
 
 OWN = "_model.dial."
 EXPORTER = "nerfstudio.scripts.exporter"
+TRAINED = 30000
+"""Step from which splatfacto uses whole photographs and all SH degrees, as when it loads a checkpoint."""
 
 # Learning rates in nerfstudio's checkpoints are numpy's numbers, which torch 2.6 and newer refuse to read, in
 # nerfstudio's own commands too. These names run no code. Older versions of torch cannot be told of them.
@@ -34,6 +43,85 @@ if torch.__version__ >= "2.6":
         (SCALAR, "numpy._core.multiarray.scalar"), (SCALAR, "numpy.core.multiarray.scalar"),
         np.dtype, type(np.dtype("f8")),
     ])  # fmt: skip
+
+
+@dataclass
+class ClodSplatfactoModelConfig(SplatfactoModelConfig):  # type: ignore[misc]
+    """splatfacto's settings and those of the dial; densification has none, as the Gaussians stay the same."""
+
+    _target: type = field(default_factory=lambda: ClodSplatfactoModel)
+    max_sv: float = 5.0
+    """largest dial value to train for"""
+    exponent: float = 1.5
+    """target-count curve: the target share of Gaussians at s is s^-exponent"""
+    virtual_scale: float = 1.0
+    """dial value of the viewer's first picture and of ns-render; CLOD_VIRTUAL_SCALE overrides it"""
+
+
+class ClodSplatfactoModel(SplatfactoModel):  # type: ignore[misc]
+    """A trained splatfacto whose Gaussians fade out by the dial.
+
+    splatfacto reads its parameters through properties while it draws; there they are those of the dial value.
+    """
+
+    config: ClodSplatfactoModelConfig
+    dial: Dial | None
+    _shown: Mapping[str, Tensor] = {}
+
+    def populate_modules(self) -> None:
+        super().populate_modules()
+        self.dial = None
+        start = chosen(self.config.virtual_scale)
+        self.slider = ViewerSlider("Dial s", start, 1.0, max(self.config.max_sv, start), 0.01)
+        self.virtual_scale = start
+
+    def attach(self, views: Sequence[View], saved: Mapping[str, Any]) -> None:
+        """Gives the loaded Gaussians their dial, a saved or an initialized one (``new_dial``)."""
+        own = self.config
+        config = AdaptConfig(max_sv=own.max_sv, exponent=own.exponent, ssim_weight=own.ssim_lambda)
+        self.dial = new_dial(self.gauss_params, views, config, saved).to(self.device)
+        groups = {group["name"] for group in self.dial.param_groups(splats=True) if group["lr"] > 0}
+        for name, parameter in self.gauss_params.items():
+            parameter.requires_grad_(name in groups)
+
+    @property
+    def means(self) -> Tensor:
+        return self._shown.get("means", super().means)
+
+    @property
+    def scales(self) -> Tensor:
+        return self._shown.get("scales", super().scales)
+
+    @property
+    def opacities(self) -> Tensor:
+        return self._shown.get("opacities", super().opacities)
+
+    def get_outputs(self, camera: Cameras) -> dict[str, Any]:
+        if self.dial is None or not isinstance(camera, Cameras):
+            return super().get_outputs(camera)  # type: ignore[no-any-return]
+        self.virtual_scale = self.dial.sample() if self.training else float(self.slider.value)
+        self._shown = shown(self.gauss_params, self.dial, view_of(camera).camera, self.virtual_scale)
+        try:
+            return super().get_outputs(camera)  # type: ignore[no-any-return]
+        finally:
+            self._shown = {}
+
+    def get_loss_dict(self, outputs: Any, batch: Any, metrics_dict: Any = None) -> dict[str, Tensor]:
+        losses: dict[str, Tensor] = super().get_loss_dict(outputs, batch, metrics_dict)
+        if self.dial is not None and self.training:
+            losses["main_loss"] = self.dial.loss(self.virtual_scale, losses["main_loss"])
+        return losses
+
+    def get_param_groups(self) -> dict[str, list[Parameter]]:
+        groups = super().get_param_groups()
+        groups = {name: values for name, values in groups.items() if all(value.requires_grad for value in values)}
+        return groups | {name: [value] for name, value in (self.dial.named_parameters() if self.dial else ())}
+
+    def step_cb(self, optimizers: Optimizers, step: int) -> None:
+        super().step_cb(optimizers, TRAINED + step)
+
+    def step_post_backward(self, step: int) -> None:
+        """No densification, pruning or reset of opacities: the dial is of these Gaussians."""
 
 
 class ClodPipeline(VanillaPipeline):  # type: ignore[misc]
@@ -68,6 +156,12 @@ class ClodPipeline(VanillaPipeline):  # type: ignore[misc]
         exporter.write_ply = staticmethod(write)
 
 
+def decaying(rate: float, final: float, steps: int) -> dict[str, Any]:
+    """nerfstudio's Adam, with a learning rate that decays to ``final`` in so many steps."""
+    scheduler = ExponentialDecaySchedulerConfig(lr_final=final, max_steps=steps)
+    return {"optimizer": AdamOptimizerConfig(lr=rate, eps=1e-15), "scheduler": scheduler}
+
+
 class ClodTrainer(Trainer):  # type: ignore[misc]
     """Starts from a trained splatfacto; its optimizers are made anew, for the loaded Gaussians and the dial."""
 
@@ -77,13 +171,7 @@ class ClodTrainer(Trainer):  # type: ignore[misc]
             return Optimizers({}, {})
         rates = {group["name"]: group["lr"] for group in dial.param_groups(splats=True) if group["lr"] > 0}
         steps, final = self.config.max_num_iterations, OURS.lr_final
-        own = {
-            name: {
-                "optimizer": AdamOptimizerConfig(lr=rate, eps=1e-15),
-                "scheduler": ExponentialDecaySchedulerConfig(lr_final=final * rate, max_steps=steps),
-            }
-            for name, rate in rates.items()
-        }
+        own = {name: decaying(rate, final * rate, steps) for name, rate in rates.items()}
         return Optimizers(self.config.optimizers | own, self.pipeline.get_param_groups())
 
     def _load_checkpoint(self) -> None:
@@ -139,14 +227,8 @@ method = MethodSpecification(
             model=ClodSplatfactoModelConfig(),
         ),
         optimizers={
-            "camera_opt": {
-                "optimizer": AdamOptimizerConfig(lr=1e-4, eps=1e-15),
-                "scheduler": ExponentialDecaySchedulerConfig(lr_final=5e-7, max_steps=30000),
-            },
-            "bilateral_grid": {
-                "optimizer": AdamOptimizerConfig(lr=2e-3, eps=1e-15),
-                "scheduler": ExponentialDecaySchedulerConfig(lr_final=1e-4, max_steps=30000),
-            },
+            "camera_opt": decaying(1e-4, 5e-7, 30000),
+            "bilateral_grid": decaying(2e-3, 1e-4, 30000),
         },
         viewer=ViewerConfig(num_rays_per_chunk=1 << 15),
         vis="viewer",
