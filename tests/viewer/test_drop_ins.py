@@ -99,7 +99,7 @@ def assert_the_wgsl_of_playcanvas_gives_the_equation(page: Any, about: dict[str,
     shown = clod_adapter.load(KIT / "kit.ply").gaussians
     camera = clod_adapter.Camera(torch.tensor(about["world_to_camera"]), torch.eye(3), 8, 8)
     columns = (shown.means, shown.opacities[:, None], shown.sigma_d[:, None], shown.growth_d[:, None])
-    rows, eye = torch.cat(columns, 1).tolist(), ", ".join(map(str, camera.position.tolist()))
+    rows, eye = torch.cat(columns, 1)[::20].tolist(), ", ".join(map(str, camera.position.tolist()))
     statements = """
         let center = vec3f(rows[at], rows[at + 1], rows[at + 2]);
         clod = vec2f(rows[at + 4], rows[at + 5]);
@@ -110,6 +110,7 @@ def assert_the_wgsl_of_playcanvas_gives_the_equation(page: Any, about: dict[str,
         modifySplatColor(center, &color);
         rows[at] = color.a;
         rows[at + 1] = scale.x;"""
+    page.evaluate("app.autoRender = false")
     wgsl = page.evaluate("import('/viewers/playcanvas.js').then(({ modifier }) => modifier(dial.file).wgsl)")
     members = re.findall(r"uniform (\w+: \w+);", wgsl)
     body = re.sub(r"uniform \w+: \w+;", "", wgsl).replace("uniform.", "given.")
@@ -125,12 +126,13 @@ def assert_the_wgsl_of_playcanvas_gives_the_equation(page: Any, about: dict[str,
             shown.opacity_logits, shown.sigma_d, (shown.means, camera), s, shown.attenuation,
             growth_d=shown.growth_d,
         )  # fmt: skip
-        torch.testing.assert_close(alpha, want.drawn, rtol=1e-4, atol=1e-6)
-        torch.testing.assert_close(scale[alpha > 0], want.growth[alpha > 0], rtol=1e-4, atol=0)
+        drawn, growth = want.drawn[::20], want.growth[::20]
+        torch.testing.assert_close(alpha, drawn, rtol=1e-4, atol=1e-6)
+        torch.testing.assert_close(scale[alpha > 0], growth[alpha > 0], rtol=1e-4, atol=0)
 
 
 @pytest.mark.parametrize(("viewer", "suffix"), [("spark", "spz"), ("playcanvas", "ply")])
-def test_the_dial_is_as_exact_as_the_viewer(tabs: Any, viewer: str, suffix: str) -> None:
+def test_the_dial_is_as_exact_as_the_viewer(tabs: Any, viewer: str, suffix: str, tmp_path: Path) -> None:
     about = json.loads((KIT / "cameras.json").read_text())["cameras"][0]
     undialled = 0.0
     with opened(tabs, viewer, KIT / f"kit.{suffix}") as page:
@@ -153,12 +155,9 @@ def test_the_dial_is_as_exact_as_the_viewer(tabs: Any, viewer: str, suffix: str)
         page.evaluate("dial.set(2)")
         page.wait_for_timeout(200)
         assert page.evaluate("dial.s") == 2
+        clod_adapter.save(tmp_path / "plain.ply", scenes.gaussians(50, 0, 7))
+        plain = list((tmp_path / "plain.ply").read_bytes())
+        script = "import('/viewers/dial.js').then((m) => m.readDial(Uint8Array.from(given))).catch(String)"
+        assert "the file has no sigma_d, so no dial; adapt it with" in page.evaluate(f"(given) => {script}", plain)
         if viewer == "playcanvas":
             assert_the_wgsl_of_playcanvas_gives_the_equation(page, about)
-
-
-def test_a_file_without_a_dial_says_so(tabs: Any, tmp_path: Path) -> None:
-    clod_adapter.save(tmp_path / "plain.ply", scenes.gaussians(50, 0, 7))
-    with opened(tabs, "spark", tmp_path / "plain.ply") as page, page.expect_event("pageerror") as error:
-        pass
-    assert "the file has no sigma_d, so no dial; adapt it with clod-adapt" in str(error.value)

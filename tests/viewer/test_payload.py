@@ -12,7 +12,6 @@ import clod_adapter
 import scenes
 from clod_adapter.calibration import Calibration, CalibrationRow
 from clod_adapter.config import FILTERS
-from clod_adapter.equation.units import with_distance
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.viewer.page import Payload, page_config
 
@@ -50,21 +49,6 @@ def test_empty_sh_degrees_and_dropped_rows_are_left_out(capture: Any, tmp_path: 
     payload = Payload.of(checkpoint)
     assert b"f_rest" not in payload.header and len(payload.gaussians) == 39
     assert payload.name == "b\\xff.ply"
-
-
-def test_spz_has_the_same_settings_and_leaves_no_file(tmp_path: Path) -> None:
-    """In world units that float16 would not hold, and relative to the origin. Its rows are in another order."""
-    model = with_distance(dialled(degree=4), 1000.0)
-    payload = Payload("a.ply", model, MEASURED, (5e5, 4e6, 0.0))
-    data, found, losses = payload.packed(tmp_path / "temporary.spz")
-    assert list(tmp_path.iterdir()) == [] and any("above degree 3 are dropped" in line for line in losses)
-    (tmp_path / "a.spz").write_bytes(data)
-    read = clod_adapter.load(tmp_path / "a.spz", origin=payload.origin)
-    assert read.calibration == MEASURED and read.gaussians.screen_filter == FILTERS["mip"]
-    rows = (model.means[:, None] - found.means).norm(dim=2).argmin(1)
-    assert sorted(rows.tolist()) == list(range(40))
-    assert torch.allclose(found.sigma_d[rows], with_distance(model, 1.0).sigma_d, rtol=1e-3)
-    assert torch.allclose(found.means[rows], model.means, atol=1e-4)
 
 
 def test_cameras_keep_all_digits_of_float32() -> None:

@@ -8,12 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-import clod_adapter
 import scenes
 from clod_adapter.cameras import Camera
 from clod_adapter.config import FILTERS, ScreenFilter
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.io.file_formats import write
 from clod_adapter.render import render
 from shown import TALL, Shown, assert_alike, assert_same, take
 
@@ -32,7 +30,7 @@ def grown(count: int, degree: int, power: float, by: float, **settings: Any) -> 
 
 def small(size: float) -> tuple[Gaussians, tuple[float, ...], Camera]:
     """In another unit of length, with a nearer near plane."""
-    model = scenes.dialled(1500, 0, 7, scene_distance=3 * size)
+    model = scenes.dialled(500, 0, 7, scene_distance=3 * size)
     viewmat = VIEW.viewmat.clone()
     viewmat[:3, 3] *= size
     model = finer(model, -float(np.log(size)), means=size * model.means)
@@ -41,23 +39,21 @@ def small(size: float) -> tuple[Gaussians, tuple[float, ...], Camera]:
 
 # Model, dial values and camera; each differs from the others in what is named.
 CASES: dict[str, tuple[Gaussians, tuple[float, ...], Camera]] = {
-    "degree 3": (scenes.dialled(1500, 3, 7), (1.0, 3.0), VIEW),
-    "no dial": (scenes.dialled(1500, 3, 7).replace(sigma_d=None, attenuation=None), (1.0,), VIEW),
+    "degree 3": (scenes.dialled(500, 3, 7), (1.0, 3.0), VIEW),
     "hard, view's unit, compensated": (
-        finer(scenes.dialled(1500, 1, 7, cut="hard", normalizer="max"), 2, screen_filter=FILTERS["on"]), (2.0,), VIEW
+        finer(scenes.dialled(500, 1, 7, cut="hard", normalizer="max"), 2, screen_filter=FILTERS["on"]), (2.0,), VIEW
     ),
     "eps, wide blur": (
-        finer(scenes.dialled(1500, 1, 7, tau=0.05, eps=0.5, scene_distance=2.0), 2, screen_filter=WIDE),
+        finer(scenes.dialled(500, 1, 7, tau=0.05, eps=0.5, scene_distance=2.0), 2, screen_filter=WIDE),
         (2.0,), VIEW,
     ),
     "growth": (
-        grown(1500, 0, 1.5, 1, max_sv=10.0, reference_distance=4.5), (1.0, 3.0, 8.0), scenes.camera(320, 240, fov=40)
+        grown(1500, 0, 1.5, 1, max_sv=10.0, reference_distance=4.5), (1.0, 8.0), scenes.camera(320, 240, fov=40)
     ),
     # By factors up to 1e8: quads of that size would be drawn inexactly; they end at the picture's farthest corner.
     "far beyond the picture": (grown(300, 0, 5, 0, max_sv=40.0, reference_distance=2.0), (20.0,), VIEW),
-    "portrait": (scenes.dialled(1500, 0, 7), (1.0,), scenes.camera(180, 240, fov=100)),
     "millimetres": small(1e-3),
-    "off centre": (scenes.dialled(1500, 0, 7), (1.0,), scenes.camera(320, 240, off_centre=(0.1, 0.9))),
+    "off centre": (scenes.dialled(500, 0, 7), (1.0,), scenes.camera(180, 240, fov=100, off_centre=(0.1, 0.9))),
 }  # fmt: skip
 
 
@@ -81,7 +77,7 @@ def test_the_picture_and_the_count(shown: Shown, save: Any, artefacts: Path, nam
 
 def test_wipe_shows_both_sides(show: Any, save: Any, artefacts: Path) -> None:
     """The base, or the same file without its dial, which is then on at the left; by a switch, and by C."""
-    gaussians = scenes.dialled(1500, 0, 7)
+    gaussians = scenes.dialled(600, 0, 7)
     base = gaussians.replace(sigma_d=None, attenuation=None, sh0=-gaussians.sh0)
     shown = show(save(gaussians), "--base", save(base, "base.ply"), "--sv", 3, viewport=TALL)
     left = render(gaussians, VIEW, 3.0).pixels.numpy()
@@ -100,19 +96,3 @@ def test_wipe_shows_both_sides(show: Any, save: Any, artefacts: Path) -> None:
     shown.page.focus("#wipe")
     shown.page.keyboard.press("Home")
     assert shown.page.input_value("#wipe") == "0"
-
-
-def test_python_converts_every_format(show: Any, artefacts: Path, tmp_path: Path) -> None:
-    """The page shows what ``load`` reads; each file holds the same model, and is switched to from the one before."""
-    model = grown(1500, 1, 1, 1, max_sv=6.0, reference_distance=1.5)
-    files = [tmp_path / name for name in ("a.ply", "b.spz", "c.glb", "d.safetensors", "e.pt", "f.splat")]
-    for path in files:
-        baked = clod_adapter.bake(model, 1.0, cameras=[VIEW]) if path.suffix == ".splat" else model
-        write(path, baked)
-    shown = show(*files, "--sv", 3)
-    for number, path in enumerate(files, 1):
-        shown.page.keyboard.press(str(number))
-        shown.until(f"document.title === '{path.name}'")
-        shown.camera(VIEW)
-        found = clod_adapter.load(path).gaussians
-        assert_same(shown, render(found, VIEW, 3.0 if found.attenuation else 1.0), artefacts / f"{path.name}.png")
