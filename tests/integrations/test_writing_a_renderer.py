@@ -39,7 +39,9 @@ def block(word: str) -> str:
 def test_the_code_of_the_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The golden loop, which refuses functions that are off; the hook; and a held frame time, with 20 ms a frame."""
     monkeypatch.chdir(tmp_path)
-    adapted = scenes.dialled(300, 1, 3, scene_distance=1.0, reference_distance=5.0).replace(growth_d=torch.linspace(0, 1, 300))
+    adapted = scenes.dialled(300, 1, 3, scene_distance=1.0, reference_distance=5.0).replace(
+        growth_d=torch.linspace(0, 1, 300)
+    )
     clod_adapter.save("model.ply", adapted)
     own = {"my_opacity": my_opacity, "my_scale": my_scale}
     exec(block("golden"), dict(own))
