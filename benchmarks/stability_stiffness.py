@@ -21,7 +21,7 @@ import clod_adapter as clod
 from clod_adapter._kernels.threads import torch_on_one_thread
 from clod_adapter.equation.attenuation import SIGMA_MAX, attenuate
 from clod_adapter.initialization.importance import sigma_from_importance
-from clod_adapter.report.style import BLUE, GREEN, ORANGE, PURPLE, QUIET, label_log, new_figure, save_figure
+from clod_adapter.report.charts import BLUE, GREEN, ORANGE, PURPLE, QUIET, label_log, new_figure, save_figure
 from clod_adapter.training.dial import SIGMA_RANGE, Dial
 from clod_adapter.training.optimizer import RowAdam
 from clod_adapter.training.schedule import OURS

@@ -13,8 +13,7 @@ import time
 
 import clod_adapter as clod
 from clod_adapter.initialization.importance import removal_error
-from clod_adapter.report.charts import draw_training
-from clod_adapter.report.style import new_figure, save_figure
+from clod_adapter.report.charts import draw_training, new_figure, save_figure
 from common import ROOT, Row, append, arguments, checkpoint, falling, head, photographs, stored
 from tuning import Tuning, merge, tune
 

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from clod_adapter.errors import ClodError
-from clod_adapter.report.style import check_matplotlib
+from clod_adapter.report.charts import check_matplotlib
 
 from . import adapt
 from .shared.command import parser_of
@@ -13,6 +13,7 @@ from .shared.console import Console, duration
 from .shared.outputs import AdaptFiles, Outputs, claimed
 
 MAX_SV = 5.0
+PICTURES = {"dial": "dial.png", "curve": "curve.png"}
 
 
 def add_arguments(parser: ArgumentParser) -> None:
@@ -27,53 +28,40 @@ def check(args: Namespace) -> None:
 def outputs(args: Namespace) -> Outputs:
     folder = Path(args.out)
     model = AdaptFiles.of("", str(folder / "gallery.ply"))
-    return Outputs(derived=[*vars(model).values(), *picture_files(folder).values()], folders=[folder])
-
-
-def picture_files(folder: Path) -> dict[str, Path]:
-    return {"dial": folder / "dial.png", "curve": folder / "curve.png"}
+    pictures = [folder / file for file in PICTURES.values()]
+    return Outputs(derived=[*vars(model).values(), *pictures], folders=[folder])
 
 
 def execute(args: Namespace) -> dict[str, Any]:
-    from clod_adapter.demo.packed import unpack
-    from clod_adapter.demo.pictures import draw
+    from clod_adapter.demo.gallery import draw, unpack
 
     from .shared.inputs import prepare_kernels
     from .shared.measure import Stopwatch
 
     console, watch, folder = Console(args.quiet), Stopwatch(), Path(args.out)
     capture, base, model = folder / "capture", folder / "base.ply", folder / "gallery.ply"
-    pictures = picture_files(folder)
+    pictures = {name: folder / file for name, file in PICTURES.items()}
     if base.exists() and not capture.exists():
         raise ClodError(f"{base}: exists without {capture}, so the demo did not make it; choose another --out")
     prepare_kernels(console)
     unpack(capture, base)
     console.say(f"the scene is in {capture}, its checkpoint is {base}")
-    arguments = adapt_arguments(args, base, capture, model)
+    words = [f"--images={capture}", f"--max-sv={MAX_SV:g}", f"--out={model}"]
+    words += [f"--{name}" for name in ("quiet", "json") if getattr(args, name)]
+    words += ["--resume"] if AdaptFiles.of(str(base), str(model)).state.exists() else []
+    arguments = parser_of(adapt, "clod-adapt").parse_args([*words, "--", str(base)])
     with claimed(adapt.outputs(arguments)):
         report = adapt.execute(arguments)
     for path in pictures.values():  # of an earlier run
         path.unlink(missing_ok=True)
     if report["rows"]:
         draw(capture, base, model, report, pictures)
+        drawn = "dial.png shows a view at several dial values, curve.png quality against count"
     else:
-        pictures = {}
-    print(f"\n{duration(watch.total())} for the demo; everything is in {folder.resolve()}")
-    if pictures:
-        print("dial.png shows a view at several dial values, curve.png quality against count")
-    else:
-        print("no figures: the measurements were interrupted")
+        pictures, drawn = {}, "no figures: the measurements were interrupted"
+    print(f"\n{duration(watch.total())} for the demo; everything is in {folder.resolve()}\n{drawn}")
     print("next, a splat of your own:\n  clod-adapt YOURS.ply --images YOUR_SCENE")
     return report | {"command": "demo", "folder": str(folder), "pictures": {k: str(v) for k, v in pictures.items()}}
-
-
-def adapt_arguments(args: Namespace, base: Path, capture: Path, model: Path) -> Namespace:
-    """The arguments of the main command for the demo's files."""
-    words = [f"--images={capture}", f"--max-sv={MAX_SV:g}", f"--out={model}"]
-    words += [f"--{name}" for name in ("quiet", "json") if getattr(args, name)]
-    words += ["--resume"] if AdaptFiles.of(str(base), str(model)).state.exists() else []
-    parsed: Namespace = parser_of(adapt, "clod-adapt").parse_args([*words, "--", str(base)])
-    return parsed
 
 
 SUMMARY = "Run everything on a built-in scene; nothing to download."

@@ -17,7 +17,7 @@ from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.file_formats import check_readable
 from clod_adapter.progress import Listener, Stopped
-from clod_adapter.report.style import check_matplotlib
+from clod_adapter.report.charts import check_matplotlib
 
 from .shared import command as common
 from .shared.console import Console, ProgressDisplay, duration

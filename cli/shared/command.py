@@ -13,8 +13,7 @@ from clod_adapter.config import DEVICES, FILTERS
 from clod_adapter.errors import ClodError
 from clod_adapter.io.file_formats import PLY, file_has_dial, format_of
 from clod_adapter.io.scene.folder import find_cameras
-from clod_adapter.report.charts import chart_file
-from clod_adapter.report.style import check_matplotlib
+from clod_adapter.report.charts import chart_file, check_matplotlib
 
 from .process import check_printed
 

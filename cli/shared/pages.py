@@ -1,6 +1,7 @@
 """``--report``: renders the images of a run's page; its rows are those of the report."""
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -60,21 +61,19 @@ class AdaptPage:
             self.trained = now.seconds
             if self.due and now.share >= self.due[0]:
                 self.due = [share for share in self.due if share > now.share]
-                self.snapshots.append((now.seconds, self._copy(now.gaussians())))
-
-    def _copy(self, state: Gaussians) -> Gaussians:
-        fixed = {"shN": self.base.shN} if self.config.lr_shN == 0 else {}  # the largest tensor, if it is not trained
-        changing = {name: value.clone() for name, value in state.tensors().items() if name not in fixed}
-        return state.replace(**changing, **fixed)
+                state = now.gaussians()
+                fixed = {"shN": self.base.shN} if self.config.lr_shN == 0 else {}  # the largest, if it is not trained
+                changing = {name: value.clone() for name, value in state.tensors().items() if name not in fixed}
+                self.snapshots.append((now.seconds, state.replace(**changing, **fixed)))
 
     def write(self, path: Path, report: dict[str, Any], result: Gaussians, start_seconds: float) -> None:
-        def training() -> dict[str, Any] | None:
-            return self._training(result, start_seconds) if self.scene.test and self.snapshots else None
-
+        training = partial(self._training, result, start_seconds)
         add_page(path, report, result, self.base, self.scene, self.console, training)
 
-    def _training(self, result: Gaussians, start_seconds: float) -> dict[str, Any]:
+    def _training(self, result: Gaussians, start_seconds: float) -> dict[str, Any] | None:
         """Held-out PSNR of the copies and of the result, at s = 1, 3 and the largest."""
+        if not (self.scene.test and self.snapshots):
+            return None
         views = self.scene.test[:: -(-len(self.scene.test) // SNAPSHOT_VIEWS)]
         dials = sorted({1.0, min(3.0, self.config.max_sv), self.config.max_sv})
         if self.snapshots[-1][0] == self.trained:  # the result itself

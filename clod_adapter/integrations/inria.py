@@ -77,9 +77,10 @@ class GaussianRasterizer(installed.GaussianRasterizer):  # type: ignore[misc]
             )
         hook = Hook(sigma_d, config, virtual_scale, growth_d)
         viewmat = settings.viewmatrix.T  # Inria's matrices multiply from the right
-        drawn, keep, growth = hook(
-            means3D, opacities, viewmat, _intrinsics(settings), settings.image_width, settings.image_height
-        )
+        width, height = settings.image_width, settings.image_height
+        fx, fy = width / (2 * settings.tanfovx), height / (2 * settings.tanfovy)
+        K = torch.tensor([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1]], dtype=torch.float32)
+        drawn, keep, growth = hook(means3D, opacities, viewmat, K, width, height)
         hidden = settings.campos - NEAR * settings.viewmatrix[:3, 2]  # opposite to the viewing direction
         means3D = torch.where(keep[:, None], means3D, hidden.to(means3D))
         bound = inspect.signature(super().forward).bind(means3D, means2D, drawn, *args, **kwargs)
@@ -87,10 +88,3 @@ class GaussianRasterizer(installed.GaussianRasterizer):  # type: ignore[misc]
             if (value := bound.arguments.get(name)) is not None:
                 bound.arguments[name] = value * growth.to(value)[:, None] ** power
         return super().forward(*bound.args, **bound.kwargs)
-
-
-def _intrinsics(settings: Any) -> Tensor:
-    """``[3, 3]`` in pixels, with the principal point in the middle of the image."""
-    width, height = settings.image_width, settings.image_height
-    fx, fy = width / (2 * settings.tanfovx), height / (2 * settings.tanfovy)
-    return torch.tensor([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1]], dtype=torch.float32)

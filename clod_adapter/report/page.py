@@ -27,9 +27,9 @@ from clod_adapter.report.charts import (
     draw_rendering,
     draw_training,
     inline_svg,
+    save_figure,
     series_of,
 )  # fmt: skip
-from clod_adapter.report.style import save_figure
 
 WIDEST = 1000  # pixels; wider pictures are scaled down
 QUALITY = 88  # of WebP

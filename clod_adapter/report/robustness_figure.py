@@ -6,7 +6,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from clod_adapter.report.style import ORANGE, QUIET, label_log, new_figure, save_figure
+from clod_adapter.report.charts import ORANGE, QUIET, label_log, new_figure, save_figure
 
 PANELS = ("PSNR (dB)", "SSIM", "opacity", "decay sigma_d (log scale)")
 BEYOND = "beyond the trained range"

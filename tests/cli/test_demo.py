@@ -11,7 +11,7 @@ import pytest
 from clod_adapter import config
 from clod_adapter.cli.adapt import listeners
 from clod_adapter.cli.adapt import run as adapt_run
-from clod_adapter.demo import packed, pictures
+from clod_adapter.demo import gallery
 from runs import pressing
 
 PICTURES = {"dial.png", "curve.png"}
@@ -28,8 +28,8 @@ def test_demo(clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.Monke
         shutil.copytree(capture.scene, scene, dirs_exist_ok=True)
         shutil.copyfile(capture.ply, base)
 
-    monkeypatch.setattr(packed, "unpack", unpack)  # the tests' own capture, a few steps, and empty pictures
-    monkeypatch.setattr(pictures, "draw", lambda *given: [path.write_bytes(b"") for path in given[-1].values()])
+    monkeypatch.setattr(gallery, "unpack", unpack)  # the tests' own capture, a few steps, and empty pictures
+    monkeypatch.setattr(gallery, "draw", lambda *given: [path.write_bytes(b"") for path in given[-1].values()])
     monkeypatch.setattr(config, "STEPS", 2)
     monkeypatch.setattr(config, "STEPS_PER_VIEW", 0)
     monkeypatch.setattr(adapt_run, "LOST", (99.0, 99.0))  # two steps cannot keep full quality

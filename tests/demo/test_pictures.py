@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from clod_adapter.demo.pictures import dial_strip
+from clod_adapter.demo.gallery import dial_strip
 from clod_adapter.report.page import Picture
 
 pytest.importorskip("matplotlib")

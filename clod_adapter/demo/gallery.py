@@ -1,6 +1,8 @@
-"""The demo's figures: one view at several dial values, and quality against the number of Gaussians."""
+"""The demo's capture and base, as the package contains them, and its figures of the result."""
 
+import zipfile
 from collections.abc import Mapping, Sequence
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -11,15 +13,27 @@ from clod_adapter.cameras import View
 from clod_adapter.evaluation.evaluate import evaluate
 from clod_adapter.evaluation.frame_times import time_frames
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.io.checkpoint import load
+from clod_adapter.io.atomic import atomic_path
+from clod_adapter.io.checkpoint import load, save
 from clod_adapter.io.scene.load import load_scene
 from clod_adapter.render import render
+from clod_adapter.report.charts import BLUE, INK, ORANGE, label_log, new_figure, save_figure
 from clod_adapter.report.page import Picture
-from clod_adapter.report.style import BLUE, INK, ORANGE, label_log, new_figure, save_figure
 
 DIALS = (1.0, 2.0, 3.0, 5.0)
 VIEW = 0  # the held-out view on the strip: across the whole room
 CROP = (150, 150, 150, 75)  # left, top, width and height of the part shown enlarged, pixels
+
+
+def unpack(capture: Path, base: Path) -> None:
+    """Writes the capture and the base checkpoint that come with the package, unless they exist."""
+    packed = resources.files("clod_adapter.demo")
+    if not capture.exists():
+        with atomic_path(capture) as part, (packed / "capture.zip").open("rb") as file, zipfile.ZipFile(file) as photos:
+            photos.extractall(part)
+    if not base.exists():
+        with resources.as_file(packed / "base.spz") as path:
+            save(base, load(path).gaussians)
 
 
 def draw(capture: Path, base: Path, model: Path, report: Mapping[str, Any], pictures: Mapping[str, Path]) -> None:
