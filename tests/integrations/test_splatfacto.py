@@ -32,38 +32,29 @@ def splatfacto() -> dict[str, Tensor]:
     return {name: value.clone().requires_grad_() for name, value in named.items()}
 
 
-def test_parameters_of_gsplats_trainer_are_shared() -> None:
+def test_parameters_are_shared() -> None:
+    """Those of gsplat's trainer, as tensors or arrays, and of splatfacto, whose colours are logits at SH degree 0."""
     splats = to_gsplat(BASE)
     assert list(splats) == ["means", "quats", "scales", "opacities", "sh0", "shN"]
     again = from_gsplat(torch.nn.ParameterDict(splats), screen_filter=ScreenFilter(compensate=True))
     assert again.screen_filter.compensate and again.sigma_d is None
-    arrays = from_gsplat({name: value.double().numpy() for name, value in splats.items()})
-    scenes.assert_equal(arrays, BASE)
+    scenes.assert_equal(from_gsplat({name: value.double().numpy() for name, value in splats.items()}), BASE)
     for name, value in BASE.tensors().items():
         assert getattr(again, name).data_ptr() == value.data_ptr(), name
-
-
-def test_parameters_of_splatfacto() -> None:
-    """Without higher SH degrees, colours are logits."""
     named = splatfacto()
-    again = from_gsplat(named)
-    scenes.assert_equal(again, BASE)
-    again.opacities.sum().backward()
+    scenes.assert_equal(from_gsplat(named), BASE)
+    from_gsplat(named).opacities.sum().backward()
     assert named["opacities"].grad.shape == (N, 1)
+    del named["features_rest"]
     for rest in ({}, {"features_rest": torch.zeros(N, 0, 3)}):
-        named = {name: value for name, value in splatfacto().items() if name != "features_rest"} | rest
-        colours = from_gsplat(named)
+        colours = from_gsplat(named | rest)
         torch.testing.assert_close(0.5 + 0.28209479177 * colours.sh0[:, 0], named["features_dc"].sigmoid())
         assert colours.sh_degree == 0
-
-
-def test_what_is_missing_is_named() -> None:
-    named = to_gsplat(BASE)
     with pytest.raises(ClodError, match=r"opacity_logits has shape \(60, 2\)"):
-        from_gsplat(named | {"opacities": torch.zeros(N, 2)})
-    named["features"] = named.pop("sh0")
+        from_gsplat(splats | {"opacities": torch.zeros(N, 2)})
+    splats["features"] = splats.pop("sh0")
     with pytest.raises(ClodError, match=r"splats needs sh0 too, it has means, .*; with appearance optimisation"):
-        from_gsplat(named)
+        from_gsplat(splats)
 
 
 def cameras_of(view: Camera) -> SimpleNamespace:

@@ -13,9 +13,8 @@ import pytest
 from PIL import Image
 
 from clod_adapter.errors import ClodError
-from clod_adapter.report.charts import Series, draw_rendering, draw_training, series_of
+from clod_adapter.report.charts import Series, draw_rendering, draw_training, new_figure, series_of
 from clod_adapter.report.page import Picture, write_page
-from clod_adapter.report.style import new_figure
 
 pytest.importorskip("matplotlib")
 NASTY = r'a <b> & "c" $\co$ </script>'
@@ -58,8 +57,11 @@ def test_page_is_self_contained_and_escaped(tmp_path: Path, monkeypatch: pytest.
     for png in (written["rendering"], written["adapting"]):
         pixels = np.asarray(Image.open(png).convert("RGB"))
         assert min(pixels.shape[:2]) > 500 and 0.005 < (pixels < 128).any(2).mean() < 0.3
-    write_page(tmp_path / "page.html", report(rows=[], base_rows=[], detached_row=None, teacher="checkpoint"), [], {})
-    assert "Nothing was measured" in (tmp_path / "page.html").read_text(encoding="utf-8")
+    own = report(rows=[], base_rows=[], detached_row=None, teacher="checkpoint")
+    write_page(tmp_path / "page.html", own, frames, {"base": frames[0]})
+    text = (tmp_path / "page.html").read_text(encoding="utf-8")
+    assert all(part in text for part in ("Nothing was measured", "steps on synthetic views", "hold for base"))
+    assert re.findall(r"\S+ photograph", text[: text.index("Settings and machine")]) == ["without photograph"]
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     with pytest.raises(ClodError, match="pip install matplotlib"):
         write_page(tmp_path / "other.html", report(), [], {})
