@@ -203,15 +203,9 @@ class ClodTrainer(Trainer):  # type: ignore[misc]
         return found[-1]
 
 
-@dataclass
-class ClodTrainerConfig(TrainerConfig):  # type: ignore[misc]
-    """nerfstudio's settings of a training."""
-
-    _target: type = field(default_factory=lambda: ClodTrainer)
-
-
 method = MethodSpecification(
-    config=ClodTrainerConfig(
+    config=TrainerConfig(
+        _target=ClodTrainer,
         method_name="clod-splatfacto",
         steps_per_eval_image=100,
         steps_per_eval_batch=0,

@@ -1,6 +1,5 @@
 """Fixtures for the page in a browser: one browser context for all tests, and one server per shown file."""
 
-import os
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -13,14 +12,6 @@ import clod_adapter
 import scenes
 from clod_adapter.gaussians import Gaussians
 from shown import SIZE, Shown, fold, serve, take
-
-
-@pytest.fixture
-def artefacts(tmp_path: Path) -> Path:
-    """The folder for screenshots: CLOD_ARTIFACTS or a temporary folder."""
-    folder = Path(os.environ.get("CLOD_ARTIFACTS", tmp_path))
-    folder.mkdir(parents=True, exist_ok=True)
-    return folder
 
 
 @pytest.fixture(scope="session")

@@ -85,7 +85,7 @@ def test_one_exact_file_needs_no_network(
         assert [url for url in alone.asked if not url.startswith(("file:", "blob:", "data:"))] == []
 
 
-def test_a_page_shows_its_spz(show: Any, save: Any, artefacts: Path) -> None:
+def test_a_page_shows_its_spz(show: Any, save: Any) -> None:
     """What Python reads of it, with growth, in units that float16 does not hold; its dB near its cameras only."""
     size, model = 1000.0, scenes.dialled(1000, 3, 4, scene_distance=1.0, reference_distance=3.0)
     far = model.replace(
@@ -111,7 +111,7 @@ def test_a_page_shows_its_spz(show: Any, save: Any, artefacts: Path) -> None:
     shown.camera(seen)
     for s in (1.0, 3.0):
         shown.run("clod.setDial(given)", s)
-        assert_same(shown, render(read, seen, s), artefacts / f"spz_{s:g}.png")
+        assert_same(shown, render(read, seen, s))
 
 
 def test_a_file_without_sigma_d_has_no_dial(show: Any, save: Any, plain: Gaussians) -> None:
