@@ -25,7 +25,6 @@ from scenes import gaussians
 
 ATTENUATION = AttenuationConfig(tau=0.02, cut="soft", reference_distance=3.217, max_sv=7.0)
 CALIBRATION = Calibration((CalibrationRow(1, 30, 29.1, 0.9, 2.5),), 40, 3, 64, 48, "a machine")
-ABOUT = ("made in a test", "of two lines")
 ORIGIN = (5.1e5, -4096.0, 0.25)
 
 
@@ -198,6 +197,11 @@ def needed(degree: int = 0) -> list[str]:
     rest = [f"f_rest_{k}" for k in range(3 * (SH_COUNTS[degree] - 1))]
     shape = ["scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
     return ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", *rest, "opacity", *shape]
+
+
+def plain_rows(count: int, *more: str) -> np.ndarray:
+    """Normal values in the columns of SH degree 0, and in more."""
+    return random_rows(count, [*needed(), *more])
 
 
 def random_rows(count: int, names: Sequence[str], seed: int = 0, types: dict[str, str] | None = None) -> np.ndarray:

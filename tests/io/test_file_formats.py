@@ -18,7 +18,6 @@ from clod_adapter.io.adapter_file import load_adapter, save_adapter
 from clod_adapter.io.checkpoint import load, save
 from clod_adapter.io.file_formats import FORMATS, WRITABLE, check_readable, file_has_dial, write
 from formats import (
-    ABOUT,
     ATTENUATION,
     CALIBRATION,
     ORIGIN,
@@ -28,10 +27,10 @@ from formats import (
     turned,
     write_elements,
     write_packed,
-    write_rows,
 )
 from scenes import gaussians
 
+ABOUT = "made in a test", "of two lines"
 DIAL = tuple(suffix for suffix in WRITABLE if FORMATS[suffix].carries_sigma)
 KINDS = (*WRITABLE, ".ascii.ply", ".big.ply", ".compressed.ply", ".adapter.safetensors")
 
@@ -188,7 +187,9 @@ def test_long_history_is_cut(tmp_path: Path) -> None:
     """To what every format has room for, the last lines first, so that the outputs can be read."""
     lines = [*["x" * 1000] * 100, "y" * 70_000, *map(str, range(500)), "last"]
     write(tmp_path / "plain.ply", detach(model(0)))
-    write_rows(tmp_path / "a.ply", PlyData.read(tmp_path / "plain.ply")["vertex"].data, comments=lines)
+    plain = PlyData.read(tmp_path / "plain.ply", mmap=False)
+    plain.comments = lines
+    plain.write(tmp_path / "a.ply")
     found = load(tmp_path / "a.ply")
     assert any("comments are not carried over to outputs" in note for note in found.notes)
     assert found.comments[-1] == "last" and set(found.comments[:9]) == {"x" * 1000}

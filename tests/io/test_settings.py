@@ -30,8 +30,7 @@ from formats import (
     CALIBRATION,
     change_setting,
     model,
-    needed,
-    random_rows,
+    plain_rows,
     splat_transform,
     without_comments,
     write_rows,
@@ -101,8 +100,7 @@ def test_every_format_uses_the_reader(tmp_path: Path, kind: str) -> None:
 
 def described(path: Path, *comments: str) -> Path:
     """A PLY with a dial and these settings."""
-    rows = random_rows(40, [*needed(), "sigma_d"])
-    return write_rows(path, rows, comments=[f"clod_adapter {comment}" for comment in comments])
+    return write_rows(path, plain_rows(40, "sigma_d"), comments=[f"clod_adapter {comment}" for comment in comments])
 
 
 def test_damaged_settings_are_refused(tmp_path: Path) -> None:
@@ -158,7 +156,7 @@ def test_comments_of_other_programs(tmp_path: Path) -> None:
         (("Exported from Brush", "SplatRenderMode: mip"), "mip"), (("x", "SplatRenderMode: mip"), "on"),
         (("x", "antialiased 1"), "on"),
     ):  # fmt: skip
-        found = load(write_rows(tmp_path / "a.ply", random_rows(40, needed()), comments=comments), activated="none")
+        found = load(write_rows(tmp_path / "a.ply", plain_rows(40), comments=comments), activated="none")
         assert found.gaussians.screen_filter == FILTERS[name] and not found.filter_known
         for other in FILTERS.values():
             save(tmp_path / "b.ply", found.gaussians.replace(screen_filter=other), found)
