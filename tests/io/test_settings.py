@@ -5,7 +5,6 @@ import gzip
 import re
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -14,7 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from plyfile import PlyData
 
-from clod_adapter.adapter import Adapter, detach, extract, with_dial
+from clod_adapter.adapter import detach, extract, with_dial
 from clod_adapter.calibration import Calibration
 from clod_adapter.config import CLASSIC, FILTERS, AttenuationConfig, ScreenFilter
 from clod_adapter.equation.extinction import sigma_for_extinction
@@ -42,13 +41,6 @@ OTHER_FORMAT = ("clod-model", "clod-other"), ("clod-adapter", "clod-strange")
 OTHER = ScreenFilter(variance=0.123456789, compensate=True)
 
 
-class Read(NamedTuple):
-    attenuation: AttenuationConfig | None
-    screen_filter: ScreenFilter
-    calibration: Calibration | None
-    notes: tuple[str, ...]
-
-
 def written(path: Path, screen_filter: ScreenFilter = CLASSIC) -> Path:
     g = model(0).replace(screen_filter=screen_filter)
     if path.name.startswith("adapter"):
@@ -59,38 +51,35 @@ def written(path: Path, screen_filter: ScreenFilter = CLASSIC) -> Path:
     return path
 
 
-def read(path: Path) -> Read:
+def read(path: Path) -> tuple[AttenuationConfig | None, ScreenFilter, Calibration | None, list[str]]:
     if path.name.startswith("adapter"):
-        found: Adapter = load_adapter(path)
-        return Read(found.attenuation, found.screen_filter, found.calibration, found.notes)
+        adapter = load_adapter(path)
+        return adapter.attenuation, adapter.screen_filter, adapter.calibration, list(adapter.notes)
     base = load(path)
-    notes = tuple(note for note in base.notes if "opacity = +inf" not in note and "quantised" not in note)
-    return Read(base.gaussians.attenuation, base.gaussians.screen_filter, base.calibration, notes)
+    notes = [note for note in base.notes if "opacity = +inf" not in note and "quantised" not in note]
+    return base.gaussians.attenuation, base.gaussians.screen_filter, base.calibration, notes
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_format_uses_the_reader(tmp_path: Path, kind: str) -> None:
     path, ply = tmp_path / kind, kind == "a.ply"
     for screen_filter in (CLASSIC, OTHER):
-        assert read(written(path, screen_filter)) == (ATTENUATION, screen_filter, CALIBRATION, ())
+        assert read(written(path, screen_filter)) == (ATTENUATION, screen_filter, CALIBRATION, [])
     damage = f"{kind}: its settings are damaged .*MESSAGE.*; restore them, or export"
     with pytest.raises(ClodError, match=damage.replace("MESSAGE", "compensate is .*, it must be true or false")):
         read(change_setting(path, *(("0.123456789", "True", "Yess") if ply else ("compensate", "true", "7e+2"))))
     with pytest.raises(ClodError, match=damage.replace("MESSAGE", "tau is 7.02, it must be between 0 and 1")):
         read(change_setting(written(path), "tau", "0.02", "7.02"))
-    found = read(change_setting(written(path), "", "max_sv", "max_sx"))
-    assert found[:3] == (replace(ATTENUATION, max_sv=5.0), CLASSIC, CALIBRATION)
-    assert found.notes == (
-        "settings unknown to this version ignored: 'max_sx'", "settings that are missing have their defaults: max_sv",
-    )  # fmt: skip
+    notes = ["settings unknown to this version ignored: 'max_sx'"]
+    notes += ["settings that are missing have their defaults: max_sv"]
+    wanted = replace(ATTENUATION, max_sv=5.0), CLASSIC, CALIBRATION, notes
+    assert read(change_setting(written(path), "", "max_sv", "max_sx")) == wanted
     total = "calibrated_with" if ply else "total"
-    found = read(change_setting(written(path), total, "40", "-4"))
-    assert found.calibration is None and found.attenuation == ATTENUATION
-    assert len(found.notes) == 1 and re.search("unusable and ignored.*not positive", found.notes[0])
+    *found, (note,) = read(change_setting(written(path), total, "40", "-4"))
+    assert found == [ATTENUATION, CLASSIC, None] and re.search("unusable and ignored.*not positive", note)
     if kind != "adapter.safetensors":
-        found = read(change_setting(written(path), total, "40", "41"))
-        assert found.calibration is None
-        assert found.notes == ("the calibration is of 41 Gaussians and ignored, these are 40",)
+        *found, (note,) = read(change_setting(written(path), total, "40", "41"))
+        assert found[2] is None and note == "the calibration is of 41 Gaussians and ignored, these are 40"
     if not ply:
         with pytest.raises(ClodError, match=f"{kind}: its format 9 is too new.*upgrade"):
             read(change_setting(written(path), "format_version", "3" if "adapter" in kind else "1", "9"))
