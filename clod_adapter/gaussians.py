@@ -85,8 +85,13 @@ class Gaussians:
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Gaussians):
             return NotImplemented
-        pairs = ((getattr(self, field.name), getattr(other, field.name)) for field in dataclasses.fields(self))
-        return all(_same(a, b) for a, b in pairs)
+        pairs = [(getattr(self, field.name), getattr(other, field.name)) for field in dataclasses.fields(self)]
+        return all(
+            (a.device, a.dtype) == (b.device, b.dtype) and torch.equal(a, b)
+            if isinstance(a, Tensor) and isinstance(b, Tensor)
+            else a == b
+            for a, b in pairs
+        )
 
     __hash__ = None  # type: ignore[assignment]
 
@@ -166,9 +171,3 @@ class Gaussians:
     def cpu(self) -> Gaussians:
         """A copy in main memory."""
         return self.to("cpu")
-
-
-def _same(a: object, b: object) -> bool:
-    if isinstance(a, Tensor) and isinstance(b, Tensor):
-        return a.device == b.device and a.dtype == b.dtype and torch.equal(a, b)
-    return a == b

@@ -20,7 +20,6 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from clod_adapter.calibration import Viewpoint
 from clod_adapter.cameras import Camera, spread
@@ -52,14 +51,9 @@ def geometric_errors(
     found = np.zeros((len(picked), len(levels)))
     for done, view in enumerate(picked):
         images = [render(level, view).image.clamp(0, 1) for level in levels]
-        slope = max(_slope(images[0]), 1e-6)
+        across, down = (images[0].diff(dim=dim).square().mean() for dim in (1, 0))
+        slope = max(float(((across + down) / 2).sqrt()), 1e-6)
         length = median_distance(levels[0].means, view) / float(view.K[0, 0])
         found[done] = [length / slope * float((image - images[0]).square().mean().sqrt()) for image in images]
         tell(progress, Phase.LEVELS, done + 1, len(picked))
     return ALLOWED * np.maximum.accumulate(found.mean(0))  # type: ignore[no-any-return]
-
-
-def _slope(image: Tensor) -> float:
-    """Root mean square of the differences between neighbouring pixels, along x and y."""
-    across, down = image.diff(dim=1).square().mean(), image.diff(dim=0).square().mean()
-    return float(((across + down) / 2).sqrt())

@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,16 +17,15 @@ from clod_adapter.cameras import Camera, with_near_planes
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.equation.attenuation import attenuate
 from clod_adapter.equation.distances import camera_of
-from clod_adapter.equation.units import in_world_units, nominal_distance
+from clod_adapter.equation.units import nominal_distance
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.hook import Hook
-from clod_adapter.io.atomic import atomic_path
-from clod_adapter.io.file_formats import PLY, check_suffix, check_written, format_of, read_source, write
+from clod_adapter.io.file_formats import PLY, format_of, read_source, write
 from clod_adapter.io.ply import column_map
 from clod_adapter.io.ply_settings import PREFIX
 from clod_adapter.io.ply_write import write_rows
-from clod_adapter.io.settings import WARNING, Metadata, matching_calibration, stated_filter, tagged, that_fit
+from clod_adapter.io.settings import WARNING, matching_calibration, stated_filter, tagged, that_fit
 from clod_adapter.io.values import SIGMA, Activated, prepared
 from clod_adapter.origin import NOWHERE, Origin
 
@@ -212,9 +212,6 @@ def save(
             PLY also sigma_d that it does not carry.
     """
     path = Path(path)
-    check_suffix(path)
-    if len(gaussians) == 0:
-        raise ClodError(f"{path}: there are no Gaussians to write, and no reader takes a file without any")
     about, origin, vertex = (base.comments, base.origin, base.vertex) if base else ((), NOWHERE, None)
     if base is not None:
         if path.is_file() and base.path.is_file() and path.samefile(base.path):
@@ -225,15 +222,10 @@ def save(
                 f"{base.path} ({len(base.gaussians)} of degree {base.gaussians.sh_degree}); save with the checkpoint "
                 "they came from"
             )
-    if format_of(path) is not PLY:
-        for note in write(path, gaussians, about, origin=origin, calibration=calibration):
-            warnings.warn(f"{path}: {note}", stacklevel=2)
-        return
-    g = in_world_units(gaussians)
-    metadata = Metadata(g.attenuation, g.screen_filter, calibration, origin, about, version or "")
-    with atomic_path(path) as temporary:
-        write_rows(temporary, g, metadata, vertex)
-        check_written(temporary)
+    writer = partial(write_rows, base=vertex) if format_of(path) is PLY else None
+    settings: dict[str, Any] = {"origin": origin, "calibration": calibration, "version": version or ""}
+    for note in write(path, gaussians, about, **settings, writer=writer):
+        warnings.warn(f"{path}: {note}", stacklevel=2)
 
 
 def trimmed(checkpoint: Checkpoint, kept: Tensor | None, sh_degree: int | None) -> Checkpoint:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
@@ -105,6 +105,8 @@ def write(
     *,
     origin: Origin = NOWHERE,
     calibration: Calibration | None = None,
+    version: str = "",
+    writer: Callable[..., tuple[str, ...]] | None = None,
 ) -> tuple[str, ...]:
     """Writes Gaussians in the format of the name's suffix, whole or not at all, sigma_d in world units.
 
@@ -112,21 +114,26 @@ def write(
         about: lines on their history, printable ASCII, for formats that store text.
         origin: what their means are relative to (``Checkpoint.origin``), world units.
         calibration: of these Gaussians, for formats that store text.
+        version: of the package that made the values, by default the running one.
+        writer: instead of the format's ``write``.
 
     Returns:
         One line for each loss.
     """
     check_suffix(Path(path))
     form = format_of(Path(path))
+    if len(gaussians) == 0:
+        raise ClodError(f"{path}: there are no Gaussians to write, and no reader takes a file without any")
     if gaussians.sigma_d is not None and not form.carries_sigma:
         raise ClodError(f"{path}: {Path(path).suffix} has no room for a dial; choose a dial value to bake")
     from clod_adapter.equation.units import in_world_units  # here: the table needs no torch
     from clod_adapter.io.settings import Metadata
 
-    gaussians = in_world_units(gaussians)
-    metadata = Metadata(gaussians.attenuation, gaussians.screen_filter, calibration, origin, tuple(about))
+    g = in_world_units(gaussians)
+    metadata = Metadata(g.attenuation, g.screen_filter, calibration, origin, tuple(about), version)
     with atomic_path(path) as temporary:
-        notes: tuple[str, ...] = _call(f"{form.writer or form.module}.write", temporary, gaussians, metadata)
+        given = temporary, g, metadata
+        notes: tuple[str, ...] = writer(*given) if writer else _call(f"{form.writer or form.module}.write", *given)
         check_written(temporary)
     return notes
 

@@ -31,7 +31,7 @@ def write(path: Path, gaussians: Gaussians, metadata: Metadata) -> tuple[str, ..
     return (f"{int(opaque.sum())} opacities of +inf are written as {OPAQUE:g}, which is 1 too",) if opaque.any() else ()
 
 
-def write_rows(path: Path, gaussians: Gaussians, metadata: Metadata, base: np.ndarray | None = None) -> None:
+def write_rows(path: Path, gaussians: Gaussians, metadata: Metadata, base: np.ndarray | None = None) -> tuple[str, ...]:
     """Writes a binary little-endian PLY, in blocks: a large file is never held twice.
 
     A column of the base is overwritten where the new value is not the one that was read.
@@ -72,3 +72,4 @@ def write_rows(path: Path, gaussians: Gaussians, metadata: Metadata, base: np.nd
                         raise ClodError(f"{path}: {attribute} holds a new value that is not finite; {fix}")
                     block[name][changed] = new.astype(np.float64) + shift if shift else new
             file.write(block.astype(kind.newbyteorder("<"), copy=False).data)
+    return ()

@@ -181,9 +181,7 @@ def _rotated(quats: np.ndarray) -> np.ndarray:
 
 
 def arrays_of(path: Path, gaussians: Gaussians) -> Arrays:
-    """The float32 arrays of ``Gaussians.tensors``; refuses none, and values that ``load`` would drop."""
-    if len(gaussians) == 0:
-        raise ClodError(f"{path}: there are no Gaussians to write, and no reader takes a file without any")
+    """The float32 arrays of ``Gaussians.tensors``; refuses values that ``load`` would drop."""
     arrays = {
         name: np.ascontiguousarray(tensor.detach().float().cpu().numpy())
         for name, tensor in gaussians.tensors().items()
