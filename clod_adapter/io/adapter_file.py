@@ -6,7 +6,6 @@ float16 for a difference from the base, float32 for new values. Where the result
 ``clod_adapter``, keys sorted: equal adapters give equal files.
 """
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +27,6 @@ def save_adapter(path: str | Path, adapter: Adapter) -> None:
     Raises:
         ClodError: its config is not plain JSON, or the file cannot be written.
     """
-    check_config(adapter.config)
     a, tensors = adapter, {**dial_tensors(adapter), **adapter.updates}
     settings = Metadata(a.attenuation, a.screen_filter, a.calibration, a.origin, version=a.version)
     about: dict[str, Any] = {"base_sha256": a.base_fingerprint, "config": a.config}
@@ -36,17 +34,13 @@ def save_adapter(path: str | Path, adapter: Adapter) -> None:
         about["trimmed"] = {"base_count": a.base_count, "sh_degree": a.sh_degree}
     if a.kept is not None:
         tensors["kept"] = torch.from_numpy(np.packbits(a.kept.cpu().numpy()))
-    with atomic_path(path) as temporary:
-        write_tensors(temporary, tensors, {KEY: document(ADAPTER, settings, **about)})
-        _description(temporary, read_tensor_header(temporary)[1])  # it can be read again
-
-
-def check_config(config: dict[str, Any]) -> None:
-    """Refuses a config that ``save_adapter`` would refuse; called before training."""
     try:
-        json.dumps(config, sort_keys=True, allow_nan=False)
+        text = document(ADAPTER, settings, **about)
     except (TypeError, ValueError) as error:
         raise ClodError(f"the adapter's config is not plain JSON ({error}); use finite numbers and strings") from error
+    with atomic_path(path) as temporary:
+        write_tensors(temporary, tensors, {KEY: text})
+        _description(temporary, read_tensor_header(temporary)[1])  # it can be read again
 
 
 def load_adapter(path: str | Path) -> Adapter:

@@ -16,7 +16,7 @@ from safetensors.torch import load_file, save_file
 from clod_adapter.adapter import Adapter
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
-from clod_adapter.io.adapter_file import check_config, load_adapter, save_adapter
+from clod_adapter.io.adapter_file import load_adapter, save_adapter
 from clod_adapter.io.tensor_file import read_tensors, write_tensors
 
 CONFIG = {"steps": 3, "lr": 0.1, "names": ["a", None], "nested": {"b": True}, "ü": "é"}
@@ -122,9 +122,8 @@ def test_invalid_files_are_refused(tmp_path: Path) -> None:
 
 def test_config_must_be_json_and_version_is_kept(tmp_path: Path) -> None:
     for value in ({1, 2}, torch.ones(1), float("nan"), object()):
-        for refuse in (lambda config: save_adapter(tmp_path / "a", adapter(config=config)), check_config):
-            with pytest.raises(ClodError, match="not plain JSON"):
-                refuse({"x": value})
+        with pytest.raises(ClodError, match="not plain JSON"):
+            save_adapter(tmp_path / "a", adapter(config={"x": value}))
     assert list(tmp_path.iterdir()) == []
     save_adapter(tmp_path / "a", replace(adapter(), version="7.8.9"))
     assert load_adapter(tmp_path / "a").version == "7.8.9"
