@@ -39,8 +39,7 @@ if TYPE_CHECKING:
     from clod_adapter.training.camera_placement import place_cameras
     from clod_adapter.training.dial import Dial, TrainableSubset, attach
     from clod_adapter.training.loop import Adapted, adapt
-    from clod_adapter.training.plan import Decision, Override, Plan
-    from clod_adapter.training.planner import make_plan
+    from clod_adapter.training.plan import Decision, Override, Plan, make_plan
     from clod_adapter.training.pseudo_views import render_pseudo_views
 
 __all__ = [

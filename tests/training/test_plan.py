@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from clod_adapter import Decision, Override, Plan, make_plan
 from clod_adapter.adapter import ATTRIBUTES, DIAL, with_dial
 from clod_adapter.cameras import Scene
 from clod_adapter.config import AdaptConfig
@@ -14,8 +15,7 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.importance import initialize, removal_error
 from clod_adapter.render import render
 from clod_adapter.training.dial import TrainableSubset
-from clod_adapter.training.plan import NAMES, NOT_NEEDED, RATES, Decision, Override, Plan, largest_change
-from clod_adapter.training.planner import make_plan, needed_share, seen, sh_degree_losses
+from clod_adapter.training.plan import NAMES, NOT_NEEDED, RATES, largest_change, needed_share, seen, sh_degree_losses
 from clod_adapter.training.state import TrainingState
 from runs import states_of
 from scenes import assert_equal, gaussians, photograph, ring, with_unseen
