@@ -191,21 +191,19 @@ def peak_bytes() -> int:
 
 
 def show_plan(decisions: Sequence[Decision], console: Console) -> None:
-    rows = [
-        (decision.what, decision.verdict, decision.measured, _option(decision))
-        for decision in decisions if decision.verdict != NOT_NEEDED
-    ]  # fmt: skip
+    rows, others = list[tuple[str, str, str, str]](), list[str]()
+    for each in decisions:
+        option = f"--{'without' if each.verdict == 'kept' else 'with'} {each.name}" if each.name else ""
+        if each.verdict == NOT_NEEDED:
+            others.append(each.what)
+        else:
+            rows.append((each.what, each.verdict, each.measured, option))
     a, b, c = (max(map(len, column)) for column in list(zip(*rows, strict=True))[:3]) if rows else (0, 0, 0)
     console.say("plan: action, measured effect, option that overrides it; reasons in the report")
     for what, verdict, effect, option in rows:
         console.say(f"  {what:<{a}}  {verdict:<{b}}  {effect:>{c}}  {option}".rstrip())
-    if others := [decision.what for decision in decisions if decision.verdict == NOT_NEEDED]:
+    if others:
         console.say(f"  does not apply: {', '.join(others)}")
-
-
-def _option(decision: Decision) -> str:
-    option = "--without" if decision.verdict == "kept" else "--with"
-    return f"{option} {decision.name}" if decision.name else ""
 
 
 def plan_memory(base: Checkpoint, scene: Scene, limit: int, console: Console) -> MemoryPlan:

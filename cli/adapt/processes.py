@@ -119,15 +119,6 @@ def hurried(adapted: Adapted) -> bool:
     return adapted.interrupted and not adapted.failed and launched().size > 1
 
 
-def describe_processes(adapted: Adapted, batch: int) -> dict[str, Any]:
-    """For the report; the seconds are those of this process, 0 for a single one."""
-    count, device = launched().size, adapted.gaussians.means.device.type
-    return {
-        "count": count, "backend": BACKENDS[device] if count > 1 else None, "batch": batch,
-        "waiting_seconds": round(adapted.waiting, 3), "exchange_seconds": round(adapted.exchanging, 3),
-    }  # fmt: skip
-
-
 def _train(launch: Launch, stop: GracefulStop) -> None:
     with joined(_job_store(), launch.rank, launch.size) as group, _giving_reasons(launch.rank):
         job: Any = group.broadcast(None)

@@ -23,10 +23,10 @@ from ..shared.console import ProgressDisplay, duration
 from ..shared.measure import by_dial, calibrate, machine, measure, report_dials, table, with_frame_times
 from ..shared.outputs import size, write_report
 from ..shared.pages import AdaptPage
-from ..shared.process import GracefulStop, listen_no_more
+from ..shared.process import GracefulStop, launched, listen_no_more
 from .blocks import adapt_in_blocks
 from .prepare import Run, against_forecast, decide, forecast
-from .processes import describe_processes, explain, hurried, together
+from .processes import BACKENDS, explain, hurried, together
 
 # dB: of s = 1 below the base, and against the checkpoint's renderings without photographs, what is told and what fails.
 LOST, ENOUGH = (0.1, 1.0), (33.0, 25.0)
@@ -202,7 +202,11 @@ def write_result(run: Run, result: Result, measured: Measurements) -> dict[str, 
 
 def describe(run: Run, result: Result, measured: Measurements) -> dict[str, Any]:
     """The report, except the calibration and the sizes of the files."""
-    args, adapted, adapter = run.args, result.adapted, result.adapter
+    args, adapted, adapter, planning = run.args, result.adapted, result.adapter, result.plan.seconds
+    count, device = launched().size, result.gaussians.means.device
+    times = {
+        "plan": sum(planning.values()) - planning["start"], "start": adapted.start_seconds, "train": adapted.seconds,
+    }  # fmt: skip
     if measured.interrupted:
         run.console.note("the measurements were interrupted: only the dial values that were finished are reported")
     report = {
@@ -210,10 +214,14 @@ def describe(run: Run, result: Result, measured: Measurements) -> dict[str, Any]
         "teacher": teacher(args), "screen_filter": asdict(result.gaussians.screen_filter),
         "base_count": adapter.base_count, "config": adapter.config, "attenuation": asdict(adapter.attenuation),
         "steps": adapted.steps, "interrupted": adapted.interrupted, "machine": machine(),
-        "processes": describe_processes(adapted, run.config.batch),
+        "processes": {
+            "count": count, "backend": BACKENDS[device.type] if count > 1 else None, "batch": run.config.batch,
+            "waiting_seconds": round(adapted.waiting, 3), "exchange_seconds": round(adapted.exchanging, 3),
+        },
         "outputs": {name: str(path) for name, path in vars(run.outputs).items()},
-        "sh_degree": result.gaussians.sh_degree, "device": str(result.gaussians.means.device),
-        "seconds": seconds(run, result), "resumed_from": run.saver.state and run.saver.state.steps,
+        "sh_degree": result.gaussians.sh_degree, "device": str(device),
+        "seconds": {name: round(value, 3) for name, value in times.items()} | run.watch.report(),
+        "resumed_from": run.saver.state and run.saver.state.steps,
         "alignment": run.alignment, "notes": run.console.notes, "base_rows": [row.as_dict() for row in measured.base],
         "rows": [row.as_dict() for row in measured.rows],
         "detached_row": measured.plain[0].as_dict() if measured.plain else None,
@@ -239,13 +247,6 @@ def judge(measured: Measurements, photographs: bool) -> tuple[str, bool]:
         bad, failed = not full[0] >= ENOUGH[0], not full[0] >= ENOUGH[1]
     more = "" if photographs else ", or give the photographs (--images)"
     return (f"{line}:\ntrain longer (--iters){more}, or keep the base for full quality" if bad else ""), failed
-
-
-def seconds(run: Run, result: Result) -> dict[str, float]:
-    plan, adapted = result.plan, result.adapted
-    planning = sum(plan.seconds.values()) - plan.seconds["start"]
-    times = {"plan": planning, "start": adapted.start_seconds, "train": adapted.seconds}
-    return {name: round(value, 3) for name, value in times.items()} | run.watch.report()
 
 
 def teacher(args: argparse.Namespace) -> str:

@@ -155,16 +155,11 @@ def context_rows(
                 opacities = torch.where(own, opacities, scene.opacities)
                 growth = torch.where(own, growth, 1)
             covered = coverage(scene, opacities, view.camera, growth)
-            drawn |= covered > _least_covered(covered)
+            ordered = covered[covered > 0].sort().values
+            few = int((ordered.double().cumsum(0) <= LEFT_OUT * ordered.double().sum()).sum())
+            drawn |= covered > (ordered[few - 1] if few else 0)
         tell(progress, Phase.CONTEXT, k + 1, len(views))
     return (drawn & ~own).nonzero()[:, 0]
-
-
-def _least_covered(covered: Tensor) -> Tensor:
-    """0-d, the coverage up to which all Gaussians together cover at most LEFT_OUT of the image."""
-    ordered = covered[covered > 0].sort().values
-    few = int((ordered.double().cumsum(0) <= LEFT_OUT * ordered.double().sum()).sum())
-    return ordered[few - 1] if few else covered.new_zeros(())
 
 
 def block_target(
