@@ -21,14 +21,6 @@ NEARLY = float32(0.99)  # of the near plane: the projection decides exactly
 
 
 @part
-def settings_of(dial):
-    """The address of a dial's settings, or None."""
-    if dial is None:
-        return None
-    return pointer(dial)
-
-
-@part
 def distance(x, y, z, cam):
     """From the camera's centre, world units."""
     dx, dy, dz = x - cam[c.EYE], y - cam[c.EYE + 1], z - cam[c.EYE + 2]
@@ -61,9 +53,9 @@ def survives(w, logit, decay, cam, dial):
 def kept(at, many, means, opacities, sigma, cam, dial, dialled):
     """The bits of those of ``many`` rows from ``at`` on that are in front of the camera and not culled.
 
-    Without a ``dial``, opacities are activated, and those of the rows are 1/255 at least.
+    Activated opacities are 1/255 at least.
     """
-    if dial is None:
+    if dial[c.ACTIVATED] > c.ZERO:
         shown = both(ge(load(opacities, at), splat(c.ALPHA_MIN)), gt(splat(c.HUGE), load(opacities, at)))
     else:
         w = scratch(f32x16, 3)
@@ -96,12 +88,12 @@ def mark_kept(worker, workers, means, logits, sigma, cam, dial, out):
 def drawn(rows, opacities, sigma, growth, cam, dial, dialled, grows, w):
     """The drawn opacities of sixteen rows, whose centres and logarithms of scales ``w`` holds; makes these scales.
 
-    Without a ``dial``, opacities and scales are activated.
+    Activated ones stay as they are.
     """
     values = scratch(float32, 48)
     for lane in range(16):
         values[lane] = opacities[rows[lane]]
-    if dial is None:
+    if dial[c.ACTIVATED] > c.ZERO:
         return load(values, 0)
     opacity = c.ONE / reciprocal_opacity(load(values, 0))
     size = splat(c.ZERO)
@@ -137,13 +129,13 @@ def dial_gradient(rows, given, cam, dial, dialled, grows, shaped, w, g):
         dL/dlogscale = dL/dscale scale
         dL/dgrowth   = sum of dL/dlogscale, times log m                     0 where the growth is clamped
 
-    Without a ``dial``, that of the activated opacity alone. ``given`` are the three, and where their gradients go.
+    Of activated ones, that of the opacity alone. ``given`` are the three, and where their gradients go.
     """
     opacities, sigma, growth, v_opacities, v_sigma, v_growth = given
     values = scratch(float32, 48)
     for lane in range(16):
         values[lane] = opacities[rows[lane]]
-    if dial is None:
+    if dial[c.ACTIVATED] > c.ZERO:
         store(values, 0, g[c.SUMS + 3] / load(values, 0))
         for lane in range(16):
             v_opacities[rows[lane]] = values[lane]

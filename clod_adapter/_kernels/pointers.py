@@ -60,6 +60,36 @@ def fetch_add(typingctx, array, amount):
     return types.int64(array, types.int64), codegen
 
 
+def _masked(builder, kind, address, mask, *values):
+    """LLVM's masked ``load`` or ``store`` of a vector."""
+    address, align = builder.bitcast(address, VECTOR.as_pointer()), ir.Constant(ir.IntType(32), 4)
+    if kind == "load":
+        empty = ir.Constant(VECTOR, [0.0] * LANES)
+        return call_llvm(builder, "llvm.masked.load.v16f32.p0v16f32", VECTOR, [address, align, mask, empty])
+    return call_llvm(builder, "llvm.masked.store.v16f32.p0v16f32", ir.VoidType(), [*values, address, align, mask])
+
+
+@intrinsic
+def load_where(typingctx, mask, array, index):
+    """``array[index : index + 16]`` where the mask is set, 0 elsewhere, which is not read."""
+
+    def codegen(context, builder, signature, args):
+        return _masked(builder, "load", builder.gep(args[1], [args[2]]), args[0])
+
+    return f32x16(mask, array, types.intp), codegen
+
+
+@intrinsic
+def store_where(typingctx, mask, array, index, value):
+    """``array[index : index + 16] = value`` where the mask is set."""
+
+    def codegen(context, builder, signature, args):
+        _masked(builder, "store", builder.gep(args[1], [args[2]]), args[0], args[3])
+        return context.get_dummy_value()
+
+    return types.none(mask, array, types.intp, f32x16), codegen
+
+
 def _transposed(builder, rows):
     """The 16x16 transpose: lane i of vector j is lane j of vector i of ``rows``."""
     half = LANES // 2
@@ -78,7 +108,7 @@ def _row_access(builder, source, rows, width, first, count):
     for lane in range(LANES):
         row = builder.load(builder.gep(rows, [ir.Constant(i32, lane)]))
         index = builder.add(builder.mul(row, width), first)
-        addresses.append(builder.bitcast(builder.gep(source, [index]), VECTOR.as_pointer()))
+        addresses.append(builder.gep(source, [index]))
     numbers = ir.Constant(ir.VectorType(i64, LANES), list(range(LANES)))
     one = builder.insert_element(ir.Constant(numbers.type, ir.Undefined), count, ir.Constant(i32, 0))
     many = builder.shuffle_vector(one, one, ir.Constant(INTEGERS, [0] * LANES))
@@ -95,9 +125,7 @@ def load_rows(typingctx, source, rows, width, first, count, lanes, at):
     def codegen(context, builder, signature, args):
         source, rows, width, first, count, lanes, at = args
         addresses, mask = _row_access(builder, source, rows, width, first, count)
-        empty = ir.Constant(VECTOR, [0.0] * LANES)
-        arguments = [ir.Constant(ir.IntType(32), 4), mask, empty]
-        found = [call_llvm(builder, "llvm.masked.load.v16f32.p0v16f32", VECTOR, [a, *arguments]) for a in addresses]
+        found = [_masked(builder, "load", address, mask) for address in addresses]
         for k, vector in enumerate(_transposed(builder, found)):
             builder.store(vector, builder.gep(lanes, [builder.add(at, ir.Constant(ir.IntType(64), k))]), align=4)
         return context.get_dummy_value()
@@ -138,8 +166,7 @@ def store_rows(typingctx, destination, rows, width, first, count, lanes, at):
             for k in range(LANES)
         ]
         for address, row in zip(addresses, _transposed(builder, found), strict=True):
-            arguments = [row, address, ir.Constant(ir.IntType(32), 4), mask]
-            call_llvm(builder, "llvm.masked.store.v16f32.p0v16f32", ir.VoidType(), arguments)
+            _masked(builder, "store", address, mask, row)
         return context.get_dummy_value()
 
     i64 = types.int64

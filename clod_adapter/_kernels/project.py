@@ -11,7 +11,7 @@ from clod_adapter._kernels import conventions as c
 from clod_adapter._kernels.colors import color
 from clod_adapter._kernels.compiling import kernel, part
 from clod_adapter._kernels.conventions import RECORD, WORKSPACE
-from clod_adapter._kernels.dial import drawn, kept, settings_of
+from clod_adapter._kernels.dial import drawn, kept
 from clod_adapter._kernels.elementary import bits_of, log2, lowest, vceil, vfloor, vsqrt
 from clod_adapter._kernels.pointers import load_rows, pointer, scratch, store_rows
 from clod_adapter._kernels.simd import both, f32x16, ge, gt, load, splat, vmax, vmin
@@ -152,17 +152,15 @@ def project(
 ):  # fmt: skip
     """Writes records, depths and row numbers of this worker's visible Gaussians, packed from its first row.
 
-    With a ``dial``, scales and opacities are logarithms and logits as stored, and are drawn at that dial value; where
-    ``sigma`` or ``growth`` is empty, there is no decay, or no growth. ``dial`` is None for activated ones: a separate
-    type, for which numba compiles the kernel without the dial. After its N records, ``records`` has a spare one for
-    each worker.
+    Scales and opacities are logarithms and logits as stored, drawn at the ``dial``, or activated ones. Where ``sigma``
+    or ``growth`` is empty, there is no decay, or no growth. After its N records, ``records`` has a spare one for each
+    worker.
     """
     n, spare, dialled, grows = len(opacities), len(opacities) + worker, len(sigma) > 0, len(growth) > 0
     first, last = n * worker // workers, n * (worker + 1) // workers
     means, quats, scales, opacities = pointer(means), pointer(quats), pointer(scales), pointer(opacities)
     sigma, growth, sh0, shN = pointer(sigma), pointer(growth), pointer(sh0), pointer(shN)
-    cam, records, depths, ids = pointer(cam), pointer(records), pointer(depths), pointer(ids)
-    settings = settings_of(dial)
+    cam, dial, records, depths, ids = pointer(cam), pointer(dial), pointer(records), pointer(depths), pointer(ids)
     w, rows, queue = scratch(f32x16, WORKSPACE), scratch(int64, 16), scratch(int64, 32)
     last_means, last_opacities, last_sigma = scratch(float32, 48), scratch(float32, 16), scratch(float32, 16)
     i = packed = first
@@ -170,7 +168,7 @@ def project(
     while i < last or queued > 0:
         while i < last and queued < 16:
             if i + 16 <= n:
-                bits = kept(i, min(last - i, 16), means, opacities, sigma, cam, settings, dialled)
+                bits = kept(i, min(last - i, 16), means, opacities, sigma, cam, dial, dialled)
             else:  # from a copy: no vector may reach beyond an array
                 for k in range(n - i):
                     last_opacities[k] = opacities[i + k]
@@ -178,7 +176,7 @@ def project(
                         last_sigma[k] = sigma[i + k]
                     for axis in range(3):
                         last_means[3 * k + axis] = means[3 * (i + k) + axis]
-                bits = kept(0, last - i, last_means, last_opacities, last_sigma, cam, settings, dialled)
+                bits = kept(0, last - i, last_means, last_opacities, last_sigma, cam, dial, dialled)
             while bits != uint64(0):
                 queue[queued] = i + lowest(bits)
                 queued += 1
@@ -193,6 +191,6 @@ def project(
             queue[k] = queue[16 + k]
         queued -= filled
         load_stored(means, quats, scales, rows, w)
-        opacity = drawn(rows, opacities, sigma, growth, cam, settings, dialled, grows, w)
+        opacity = drawn(rows, opacities, sigma, growth, cam, dial, dialled, grows, w)
         packed = add_records(rows, filled, packed, spare, means, opacity, cam, w, records, depths, ids)
     counts[worker] = color(first, packed - first, means, sh0, shN, degree, cam, records, depths, ids)

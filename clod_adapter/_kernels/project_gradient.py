@@ -6,7 +6,7 @@ from clod_adapter._kernels import conventions as c
 from clod_adapter._kernels.colors import C0, load_sh, sh_basis, sh_basis_gradient, view_direction
 from clod_adapter._kernels.compiling import kernel, part
 from clod_adapter._kernels.conventions import GRADIENTS, WORKSPACE
-from clod_adapter._kernels.dial import dial_gradient, drawn, settings_of
+from clod_adapter._kernels.dial import dial_gradient, drawn
 from clod_adapter._kernels.pointers import load_rows, pointer, scratch, store_rows
 from clod_adapter._kernels.project import covariance, load_stored
 from clod_adapter._kernels.simd import eq, f32x16, gt, load, select, splat, store, vmax, vmin
@@ -175,8 +175,7 @@ def project_gradient(
     first, last = len(opacities) * worker // workers, len(opacities) * (worker + 1) // workers
     end = first + counts[worker]
     means, quats, scales, opacities = pointer(means), pointer(quats), pointer(scales), pointer(opacities)
-    sigma, growth, shN, cam = pointer(sigma), pointer(growth), pointer(shN), pointer(cam)
-    settings = settings_of(dial)
+    sigma, growth, shN, cam, dial = pointer(sigma), pointer(growth), pointer(shN), pointer(cam), pointer(dial)
     records, packed_ids, slots, pair_sums = pointer(records), pointer(packed_ids), pointer(slots), pointer(pair_sums)
     v_means, v_quats, v_scales = pointer(v_means), pointer(v_quats), pointer(v_scales)
     v_opacities, v_sigma, v_growth = pointer(v_opacities), pointer(v_sigma), pointer(v_growth)
@@ -197,7 +196,7 @@ def project_gradient(
             done = max(done, row + 1)
         add_slots(pair_sums, slots, records, packed, lanes, sums, g)
         load_stored(means, quats, scales, rows, w)
-        drawn(rows, opacities, sigma, growth, cam, settings, dialled, grows, w)
+        drawn(rows, opacities, sigma, growth, cam, dial, dialled, grows, w)
         if shaped or tuned:
             color_gradient(w, g, shN, rows, degree, cam, sh, basis, tuned, v_shN)
         if shaped:
@@ -207,7 +206,7 @@ def project_gradient(
             store_rows(v_means, rows, 3, 0, 3, g, c.V_MEAN)
             store_rows(v_quats, rows, 4, 0, 4, g, c.V_QUAT)
         given = opacities, sigma, growth, v_opacities, v_sigma, v_growth
-        dial_gradient(rows, given, cam, settings, dialled, grows, shaped, w, g)
+        dial_gradient(rows, given, cam, dial, dialled, grows, shaped, w, g)
         if shaped:
             store_rows(v_scales, rows, 3, 0, 3, g, c.V_SCALE)
         if colored:

@@ -83,6 +83,8 @@ def _operators(name, kinds, flags, *operators):
     """Defines operators of vectors: ``kinds`` are the arguments' types."""
 
     class Typing(AbstractTemplate):  # type: ignore[misc]
+        metadata = {"target": "cpu"}  # tried before the generic ones, of which each takes time to fail
+
         def generic(self, args, kws):
             return typing_signature(f32x16, *args) if tuple(args) in kinds else None
 

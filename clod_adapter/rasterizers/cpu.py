@@ -21,6 +21,8 @@ from clod_adapter.equation.growth import growth_distance
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.rasterizers.protocol import Rasterizer, behind, require_float32
 
+ACTIVATED = np.zeros(conventions.DIAL, np.float32)
+ACTIVATED[conventions.ACTIVATED] = 1
 FEW = 4096  # rows that one thread projects or lists in about a tenth of a millisecond
 
 
@@ -91,7 +93,7 @@ def camera_vector(camera: Camera, screen_filter: ScreenFilter = CLASSIC) -> np.n
 
 def dial_vector(config: AttenuationConfig, virtual_scale: float, unit: float = 1.0) -> np.ndarray:
     """A dial value in the layout of the kernels, for distances in multiples of ``unit``."""
-    out, rate = np.empty(conventions.DIAL, np.float32), virtual_scale / unit
+    out, rate = np.zeros(conventions.DIAL, np.float32), virtual_scale / unit
     out[conventions.RATE], out[conventions.GROWTH_RATE] = rate, rate / growth_distance(config)
     out[conventions.HALF_EPS], out[conventions.SOFT] = config.eps / 2, config.cut == "soft"
     out[conventions.THRESHOLD] = max(culling_threshold(config.tau, virtual_scale), FAINTEST)
@@ -105,7 +107,7 @@ def workers_for(rows: int) -> int:
 
 
 def prepare(
-    arrays: list[np.ndarray], degree: int, camera: Camera, screen_filter: ScreenFilter, dial: np.ndarray | None
+    arrays: list[np.ndarray], degree: int, camera: Camera, screen_filter: ScreenFilter, dial: np.ndarray
 ) -> Frame:
     """Projection, depth order and tile lists of ``arrays``, which are as the kernel ``project`` takes them."""
     cam, n, workers = camera_vector(camera, screen_filter), len(arrays[0]), workers_for(len(arrays[0]))
@@ -138,7 +140,7 @@ def _arrays(tensors: Any) -> list[np.ndarray]:
 
 
 class _Picture(torch.autograd.Function):
-    """Of Gaussians as they are stored, at one dial value; of activated ones where ``dialling`` is None.
+    """Of Gaussians as they are stored, at one dial value, or of activated ones, as ``dialling`` says.
 
     Without a dial, ``sigma_d`` is empty, without growth its exponents.
     """
@@ -228,7 +230,7 @@ def rasterize(
         "CPU", means=means, quats=quats, scales=scales, opacities=opacities, sh0=sh0, shN=shN, background=background
     )
     return _Picture.apply(  # type: ignore[no-any-return, no-untyped-call]
-        means, quats, scales, opacities, _nothing(), _nothing(), sh0, shN, background, camera, screen_filter, None,
+        means, quats, scales, opacities, _nothing(), _nothing(), sh0, shN, background, camera, screen_filter, ACTIVATED,
         len(means),
     )  # fmt: skip
 
