@@ -62,9 +62,3 @@ def test_bad_calls_are_named() -> None:
     ):
         with pytest.raises(ClodError, match=message):
             evaluate(row_of_four(), given, dials)
-
-
-def test_without_a_dial_every_dial_value_shows_the_base() -> None:
-    view = View(camera(), torch.zeros(45, 61, 3, dtype=torch.uint8))
-    rows = evaluate(gaussians(4, 0, 0), [view], [1, 3])
-    assert [(row.virtual_scale, row.kept) for row in rows] == [(1, 4), (3, 4)] and rows[0].psnr == rows[1].psnr

@@ -7,35 +7,9 @@ import torch
 
 from clod_adapter.adapter import with_dial
 from clod_adapter.cameras import Scene
-from clod_adapter.config import AdaptConfig
 from clod_adapter.evaluation.evaluate import evaluate
-from clod_adapter.evaluation.robustness import adapt_at_range, baseline, scene_fingerprint
-from clod_adapter.progress import Phase, Stopped
+from clod_adapter.evaluation.robustness import baseline, scene_fingerprint
 from scenes import capture
-
-
-def test_a_range_is_adapted_and_measured_beyond_it() -> None:
-    base, scene = capture()
-    frames: list[tuple[int, int]] = []
-    outcome = adapt_at_range(
-        base, scene, AdaptConfig(iters=20, max_sv=2), [1.0, 2.0, 4.0], fingerprint="f",
-        progress=lambda now: frames.append((now.done, now.total)),
-    )  # fmt: skip
-    assert [row["virtual_scale"] for row in outcome.rows] == [1, 2, 4]
-    kept = [row["kept"] for row in outcome.rows]
-    assert kept == sorted(kept, reverse=True) and kept[-1] < kept[0]
-    assert outcome.adapter is not None and outcome.adapter.attenuation.max_sv == 2 and outcome.seconds > 0
-    (again,) = evaluate(outcome.adapter.apply(base), scene.test, [2.0])
-    assert (again.psnr, again.kept) == (outcome.rows[1]["psnr"], outcome.rows[1]["kept"])
-    assert frames[-1] == (3 * len(scene.test), 3 * len(scene.test))
-
-
-def test_an_interrupted_adaptation_gives_no_cell() -> None:
-    base, scene = capture()
-    for phase in (Phase.TRAINING, Phase.EVALUATION):
-        config, listener = AdaptConfig(iters=4), lambda now, phase=phase: now.phase != phase
-        with pytest.raises(Stopped):
-            adapt_at_range(base, scene, config, [1.0], fingerprint="f", progress=listener)
 
 
 def test_baseline_keeps_the_most_opaque() -> None:
