@@ -19,7 +19,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import clod_adapter as clod
-from clod_adapter.evaluation.baselines import matching_dial
+from clod_adapter.evaluation.budget import matching_dial
 from common import COMMAND, Process, Row, append, arguments, stored, table
 from tuning import TIMEOUT, find_tool
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import clod_adapter as clod
 from clod_adapter.demo.gallery import CROP, VIEW, dial_strip, measured
-from clod_adapter.evaluation.baselines import matching_dial
+from clod_adapter.evaluation.budget import matching_dial
 from clod_adapter.io.atomic import atomic_path
 from common import ROOT, arguments
 

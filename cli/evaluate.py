@@ -148,10 +148,14 @@ class Comparisons:
             return
 
     def prune(self, base: Gaussians, rows: Sequence[Row]) -> None:
-        from clod_adapter.evaluation.baselines import rankings
+        from clod_adapter.cameras import spread
+        from clod_adapter.initialization.importance import MOST_VIEWS, removal_error
 
         with self.console.meter("removal error") as meter:
-            orders = rankings(base, self.scene.train, self.stop.heeding(meter))
+            views = spread(self.scene.train, MOST_VIEWS)
+            removal = removal_error(base, views, progress=self.stop.heeding(meter))
+        values = {"opacity": base.opacity_logits, "removal error": removal}
+        orders = {by: each.argsort(descending=True, stable=True) for by, each in values.items()}
         jobs = [(row, by, order) for row in rows for by, order in orders.items()]
         with self.console.meter("base") as meter:
             self.base_row = self._row(base, 1.0, meter.part(0, len(jobs) + 1, "all"))
@@ -160,7 +164,7 @@ class Comparisons:
                 self.ranked.append((ours, by, replace(row, kept_share=row.kept / len(base))))  # of the whole base
 
     def match(self, others: Mapping[str, Gaussians], rows: Sequence[Row]) -> None:
-        from clod_adapter.evaluation.baselines import matching_dial, mean_kept
+        from clod_adapter.evaluation.budget import matching_dial, mean_kept
 
         cameras = [view.camera for view in self.scene.test]
         dials = [row.virtual_scale for row in rows]

@@ -19,8 +19,7 @@ from clod_adapter.alignment.check import check_alignment
 from clod_adapter.blocks.divide import divide
 from clod_adapter.blocks.train import adapt_block, merge
 from clod_adapter.cameras import Scene
-from clod_adapter.evaluation.baselines import matching_dial, rankings
-from clod_adapter.evaluation.budget import frame_times
+from clod_adapter.evaluation.budget import frame_times, matching_dial
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.importance import for_training
 from clod_adapter.rasterizers import BACKENDS, Rasterizer, cpu, cuda
@@ -65,7 +64,6 @@ def own_loop(model: Gaussians) -> list[Any]:
 RUNS: dict[str, Callable[[Gaussians], list[Any]]] = CONSUMERS | {
     "a loop of one's own": own_loop,
     "alignment": lambda model: [check_alignment(model, views_of(model)).psnr],
-    "rankings": lambda model: [rankings(model, views_of(model)[:1])["opacity"]],
     "matching_dial": lambda model: [matching_dial(model, CAMERAS, 20)],
     "plan": lambda model: [d.number or 0.0 for d in make_plan(detach(model), Scene(views_of(model), ())).decisions],
     "placed cameras": lambda model: [place_cameras(model, views=1)[0].viewmat.numpy()],

@@ -12,11 +12,11 @@ A budget that s = 1 already meets is no error: the dial is 1, and a note says so
 file has. No budget is met beyond ``max_sv``: the equation is defined there, but nothing was trained.
 """
 
-from __future__ import annotations
-
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
+from statistics import fmean
 
 import torch
 from torch import Tensor
@@ -84,7 +84,7 @@ def dial_for(
     if gaussians.sigma_d is None or gaussians.attenuation is None:
         raise ClodError("the Gaussians have no sigma_d, so no dial value meets a budget; adapt them first")
     if name == "keep":
-        return _for_count(_Views(gaussians, cameras, baked), value)
+        return _for_count(gaussians, gaussians.attenuation, cameras, baked, value)
     if name == "psnr_drop":
         return _for_psnr_drop(calibration, value)
     stored = [(row.virtual_scale, row.frame_ms) for row in calibration.rows] if calibration else None
@@ -138,62 +138,65 @@ def _for_psnr_drop(calibration: Calibration | None, drop: float) -> DialValue:
 
 
 @torch.no_grad()
-def _for_count(views: _Views, keep: float) -> DialValue:
-    largest, wanted = views.config.max_sv, math.floor(keep * len(views))
+def _for_count(
+    gaussians: Gaussians, config: AttenuationConfig, cameras: Sequence[Camera | Viewpoint], baked: bool, keep: float
+) -> DialValue:
+    """Of the Gaussians at the distances of each camera, or ``baked``: at one distance over all cameras."""
+    views = [cameras] if baked or not cameras else [[camera] for camera in cameras]
+    largest, wanted = config.max_sv, math.floor(keep * len(views))
+
+    @lru_cache(maxsize=1)  # all at once would be views times Gaussians
+    def distances(k: int) -> Tensor:
+        return typical_distance(gaussians.means, views[k], config)
+
+    def count(virtual_scale: float) -> int:
+        return sum(int(dial(gaussians, distances(k), virtual_scale).keep.sum()) for k in range(len(views)))
+
     # Counts come from renderings, not from the roots: these differ by rounding.
-    most, fewest = views.count(1.0), views.count(largest)
+    most, fewest = count(1.0), count(largest)
     if wanted >= most:
-        note = f"s = 1 keeps {most / len(views):,.0f} of {len(views.gaussians):,} already" if wanted > most else ""
+        note = f"s = 1 keeps {most / len(views):,.0f} of {len(gaussians):,} already" if wanted > most else ""
         return DialValue(1.0, note)
     if wanted < fewest:
         raise ClodError(
             f"{keep:,.0f} Gaussians are out of reach: at s = {largest:g}, the largest dial value it was trained for, "
             f"{fewest / len(views):,.0f} are kept"
         )
-    pooled = torch.cat([scales[(scales > 1) & (scales <= largest)] for scales in views.extinction_scales()])
+    assert gaussians.sigma_d is not None
+    pools = []
+    for k in range(len(views)):
+        scales = extinction_scale(gaussians.opacity_logits, gaussians.sigma_d, distances(k), config)
+        pools.append(scales[(scales > 1) & (scales <= largest)])
+    pooled = torch.cat(pools)
     remaining = min(max(wanted - fewest, 0), len(pooled))  # of those culled within the range of the dial
     upper = float(pooled.kthvalue(len(pooled) - remaining + 1).values) if remaining > 0 else largest
     lower = float(pooled.kthvalue(len(pooled) - remaining).values) if remaining < len(pooled) else 1.0
-    return DialValue(_polished(math.sqrt(lower * upper), views, wanted))
-
-
-def _polished(guess: float, views: _Views, wanted: int) -> float:
-    """The dial value near ``guess`` that keeps ``wanted``; where ties prevent it, the smallest that keeps fewer."""
-    if views.count(guess) == wanted:
-        return guess
-    low, high = max(guess * (1 - 1e-4), 1.0), min(guess * (1 + 1e-4), views.config.max_sv)
-    if views.count(low) <= wanted:
+    guess = math.sqrt(lower * upper)
+    if count(guess) == wanted:
+        return DialValue(guess)
+    # Near it, where ties prevent the count: the smallest dial value that keeps fewer.
+    low, high = max(guess * (1 - 1e-4), 1.0), min(guess * (1 + 1e-4), largest)
+    if count(low) <= wanted:
         low = 1.0
-    if views.count(high) > wanted:
-        high = views.config.max_sv
+    if count(high) > wanted:
+        high = largest
     while high / low > 1 + 1e-9:
         middle = math.sqrt(low * high)
-        low, high = (low, middle) if views.count(middle) <= wanted else (middle, high)
-    return high
+        low, high = (low, middle) if count(middle) <= wanted else (middle, high)
+    return DialValue(high)
 
 
-class _Views:
-    """The Gaussians at the distances of each camera, or ``baked``: at one distance over all cameras."""
+@torch.no_grad()
+def mean_kept(gaussians: Gaussians, cameras: Sequence[Camera], virtual_scale: float) -> float:
+    """Gaussians kept at a dial value, mean over the cameras; without rendering."""
+    return fmean(int(dial(gaussians, camera, virtual_scale).keep.sum()) for camera in cameras)
 
-    def __init__(self, gaussians: Gaussians, cameras: Sequence[Camera | Viewpoint], baked: bool) -> None:
-        assert gaussians.sigma_d is not None and gaussians.attenuation is not None
-        self.config: AttenuationConfig = gaussians.attenuation
-        self.gaussians, self.sigma_d, self.cameras = gaussians, gaussians.sigma_d, cameras
-        self.typical = typical_distance(gaussians.means, cameras, self.config) if baked or not cameras else None
 
-    def __len__(self) -> int:
-        return len(self.cameras) if self.typical is None else 1
-
-    def _distances(self) -> Iterator[Tensor]:
-        if self.typical is not None:
-            return iter([self.typical])
-        return (typical_distance(self.gaussians.means, [camera], self.config) for camera in self.cameras)
-
-    def extinction_scales(self) -> Iterator[Tensor]:
-        """``[N]`` for each view, one at a time: all at once would be views times Gaussians."""
-        logits = self.gaussians.opacity_logits
-        return (extinction_scale(logits, self.sigma_d, d, self.config) for d in self._distances())
-
-    def count(self, virtual_scale: float) -> int:
-        """Gaussians kept, summed over the views."""
-        return sum(int(dial(self.gaussians, d, virtual_scale).keep.sum()) for d in self._distances())
+def matching_dial(gaussians: Gaussians, cameras: Sequence[Camera], count: float) -> float:
+    """The dial value that keeps ``count`` on average, clamped to [1, max_sv]; 1 without a dial."""
+    if gaussians.attenuation is None:
+        return 1.0
+    try:
+        return dial_for(gaussians, keep=max(count, 1), cameras=cameras).virtual_scale
+    except ClodError:  # out of reach
+        return gaussians.attenuation.max_sv

@@ -15,7 +15,6 @@ from clod_adapter.adapter import Adapter, detach, extract
 from clod_adapter.cameras import Scene, View
 from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
-from clod_adapter.evaluation.baselines import by_opacity
 from clod_adapter.evaluation.evaluate import Row, evaluate
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.origin import NOWHERE, Origin
@@ -76,7 +75,7 @@ def baseline(
 ) -> CellResult:
     """The unadapted base with only its most opaque Gaussians: one row per share."""
     base, rows = detach(base), []
-    order = by_opacity(base)
+    order = base.opacity_logits.argsort(descending=True, stable=True)
     for k, share in enumerate(shares):
         pruned = base.select(order[: max(1, round(share * len(base)))].sort().values)  # in their own order
         part = within(progress, k * len(views), len(shares) * len(views))
