@@ -82,18 +82,16 @@ def find_blocks(records, r, ox, oy, masks, at):
 
 
 @part
-def spread(records, r):
-    """Exponent ``-QA, -QB, -QC, LOG`` and colour of the record at ``r``, the same in every lane."""
+def spread(records, r, ox, oy):
+    """Of the record at ``r``: the exponent's ``-QA, -QB, -QC, LOG`` and the colour, the same in every lane.
+
+    And the offsets from its centre to the pixels of the tile's first block, along x and along y.
+    """
     qa, qb, qc = splat(-records[r + c.QA]), splat(-records[r + c.QB]), splat(-records[r + c.QC])
     red, green, blue = splat(records[r + c.RED]), splat(records[r + c.GREEN]), splat(records[r + c.BLUE])
-    return qa, qb, qc, splat(records[r + c.LOG]), red, green, blue
-
-
-@part
-def offsets_from(records, r, ox, oy):
-    """From the centre of the record at ``r`` to the pixels of the tile's first block, along x and along y."""
     base_x = load(LANE_X, 0) + splat(float32(ox) - records[r + c.MX])
-    return base_x, load(LANE_Y, 0) + splat(float32(oy) - records[r + c.MY])
+    base_y = load(LANE_Y, 0) + splat(float32(oy) - records[r + c.MY])
+    return qa, qb, qc, splat(records[r + c.LOG]), red, green, blue, base_x, base_y
 
 
 @kernel
@@ -126,8 +124,7 @@ def blend(
                 break
             r = entries[entry] * c.RECORD
             prefetch(records, entries[min(entry + c.AHEAD, offsets[tile + 1] - 1)] * c.RECORD)
-            qa, qb, qc, log, red, green, blue = spread(records, r)
-            base_x, base_y = offsets_from(records, r, ox, oy)
+            qa, qb, qc, log, red, green, blue, base_x, base_y = spread(records, r, ox, oy)
             find_blocks(records, r, ox, oy, masks, entry * WORDS)
             for word in range(WORDS):
                 bits = masks[entry * WORDS + word] & live[word]
@@ -239,8 +236,7 @@ def blend_gradient(
                 continue
             r = entries[entry] * c.RECORD
             prefetch(records, entries[min(entry + c.AHEAD, offsets[tile + 1] - 1)] * c.RECORD)
-            qa, qb, qc, log, red, green, blue = spread(records, r)
-            base_x, base_y = offsets_from(records, r, ox, oy)
+            qa, qb, qc, log, red, green, blue, base_x, base_y = spread(records, r, ox, oy)
             s_r = s_g = s_b = s_0 = s_x = s_y = s_xx = s_xy = s_yy = zero
             for word in range(WORDS):
                 bits = masks[entry * WORDS + word]

@@ -52,7 +52,14 @@ def covariance(cam, w):
         for k in range(3):
             along = w[u] * w[c.ROT + k] + w[u + 1] * w[c.ROT + 3 + k] + w[u + 2] * w[c.ROT + 6 + k]
             w[c.PMAT + 3 * row + k] = along * w[c.SCALE + k]
-    finish_covariance(w, cam)
+    # P P^T with and without blur, and determinants as sums of squares, exact for needles.
+    blur = cam[c.BLUR]
+    p0, p1, p2, p3, p4, p5 = w[c.PMAT], w[c.PMAT + 1], w[c.PMAT + 2], w[c.PMAT + 3], w[c.PMAT + 4], w[c.PMAT + 5]
+    xx, yy = p0 * p0 + p1 * p1 + p2 * p2, p3 * p3 + p4 * p4 + p5 * p5
+    w[c.COV], w[c.COV + 1], w[c.COV + 2] = xx + blur, p0 * p3 + p1 * p4 + p2 * p5, yy + blur
+    cx, cy, cz = p1 * p5 - p2 * p4, p2 * p3 - p0 * p5, p0 * p4 - p1 * p3
+    w[c.RAWDET] = cx * cx + cy * cy + cz * cz
+    w[c.COVDET] = w[c.RAWDET] + blur * (xx + yy) + blur * blur
     return both(valid, gt(splat(c.HUGE), w[c.COVDET]))
 
 
@@ -69,18 +76,6 @@ def rotation(w):
     w[c.ROT + 6] = c.TWO * (q1 * q3 - q0 * q2)
     w[c.ROT + 7] = c.TWO * (q2 * q3 + q0 * q1)
     w[c.ROT + 8] = c.ONE - c.TWO * (q1 * q1 + q2 * q2)
-
-
-@part
-def finish_covariance(w, cam):
-    """Covariance ``P P^T + blur``, and determinants with and without blur as sums of squares, exact for needles."""
-    blur = cam[c.BLUR]
-    p0, p1, p2, p3, p4, p5 = w[c.PMAT], w[c.PMAT + 1], w[c.PMAT + 2], w[c.PMAT + 3], w[c.PMAT + 4], w[c.PMAT + 5]
-    xx, yy = p0 * p0 + p1 * p1 + p2 * p2, p3 * p3 + p4 * p4 + p5 * p5
-    w[c.COV], w[c.COV + 1], w[c.COV + 2] = xx + blur, p0 * p3 + p1 * p4 + p2 * p5, yy + blur
-    cx, cy, cz = p1 * p5 - p2 * p4, p2 * p3 - p0 * p5, p0 * p4 - p1 * p3
-    w[c.RAWDET] = cx * cx + cy * cy + cz * cz
-    w[c.COVDET] = w[c.RAWDET] + blur * (xx + yy) + blur * blur
 
 
 @part

@@ -1,7 +1,6 @@
 """Tile-based splatting on the CPU, compiled by Numba: forward and backward pass on several threads."""
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -24,55 +23,6 @@ from clod_adapter.rasterizers.protocol import Rasterizer, behind, require_float3
 ACTIVATED = np.zeros(conventions.DIAL, np.float32)
 ACTIVATED[conventions.ACTIVATED] = 1
 FEW = 4096  # rows that one thread projects or lists in about a tenth of a millisecond
-
-
-@dataclass
-class Frame:
-    """State of the forward pass for the backward pass."""
-
-    camera: np.ndarray
-    width: int
-    height: int
-    across: int
-    records: np.ndarray
-    packed_ids: np.ndarray
-    counts: np.ndarray
-    slots: np.ndarray
-    entries: np.ndarray
-    entry_slots: np.ndarray
-    masks: np.ndarray
-    offsets: np.ndarray
-    tiles: np.ndarray
-    compensated: bool | None
-    workers: int
-
-    def blend(self, background: np.ndarray) -> tuple[Tensor, Tensor]:
-        """The image and its alpha."""
-        image, alpha = recycled((self.height, self.width, 3)), recycled((self.height, self.width))
-        threads.run(
-            blend.blend, self.workers, self.records, self.entries, self.offsets, self.across, self.width, self.height,
-            background, self.tiles, np.zeros(1, np.int64), self._room(blend.FORWARD_STATE), self.masks, image.numpy(),
-            alpha.numpy(),
-        )  # fmt: skip
-        return image, alpha
-
-    def blend_gradient(
-        self, image: Tensor, alpha: Tensor, v_image: Tensor, v_alpha: Tensor, shaped: bool, colored: bool
-    ) -> np.ndarray:
-        """The sums over pixels of each pair of Gaussian and tile, those of shape and colour if asked for."""
-        # Reads of the last pair are sixteen floats wide too.
-        sums = recycled_array((len(self.entries) * conventions.PAIR + 16,), np.float32)
-        given = [x.contiguous().numpy() for x in (image, alpha, v_image, v_alpha)]
-        threads.run(
-            blend.blend_gradient, self.workers, self.records, self.entries, self.entry_slots, self.offsets,
-            self.across, self.width, self.height, *given, self.tiles, np.zeros(1, np.int64),
-            self._room(blend.BACKWARD_STATE), self.masks, shaped, colored, sums,
-        )  # fmt: skip
-        return sums
-
-    def _room(self, size: int) -> np.ndarray:
-        """Scratch floats for each worker."""
-        return recycled_array((self.workers, size), np.float32)
 
 
 def camera_vector(camera: Camera, screen_filter: ScreenFilter = CLASSIC) -> np.ndarray:
@@ -106,31 +56,64 @@ def workers_for(rows: int) -> int:
     return threads.worker_count() if rows >= FEW else 1
 
 
-def prepare(
-    arrays: list[np.ndarray], degree: int, camera: Camera, screen_filter: ScreenFilter, dial: np.ndarray
-) -> Frame:
-    """Projection, depth order and tile lists of ``arrays``, which are as the kernel ``project`` takes them."""
-    cam, n, workers = camera_vector(camera, screen_filter), len(arrays[0]), workers_for(len(arrays[0]))
-    records, counts = recycled_array(((n + workers) * conventions.RECORD,), np.float32), np.zeros(workers, np.int64)
-    depths, packed_ids = recycled_array((n,), np.float32), recycled_array((n,), np.int32)
-    threads.run(project, workers, *arrays, degree, cam, dial, records, depths, packed_ids, counts)
-    keys, order, *others = (recycled_array((int(counts.sum()),), kind) for kind in (np.uint32, np.int32) * 2)
-    order = tiles.depth_order(depths.view(np.uint32), counts, keys, order, *others)
-    across, down = -(-camera.width // conventions.TILE), -(-camera.height // conventions.TILE)
-    listing = workers_for(len(order))
-    histogram, totals = np.empty((listing, across * down), np.int64), np.empty(listing, np.int64)
-    offsets, slots = np.empty(across * down + 1, np.int64), recycled_array((2 * n,), np.int32)
-    threads.run(tiles.count_tiles, listing, records, order, across, histogram, totals)
-    total = tiles.tile_offsets(histogram, offsets, totals)
-    entries, entry_slots = recycled_array((total,), np.int32), recycled_array((total,), np.int32)
-    threads.run(tiles.fill_tiles, listing, records, order, across, histogram, totals, slots, entries, entry_slots)
-    # Longest lists first: no thread starts a long tile when the others are done.
-    longest_first = np.argsort(-np.diff(offsets), kind="stable")
-    return Frame(
-        cam, camera.width, camera.height, across, records, packed_ids, counts, slots, entries,
-        entry_slots, recycled_array((total * blend.WORDS,), np.uint64), offsets, longest_first,
-        screen_filter.compensate or None, threads.worker_count(),
-    )  # fmt: skip
+class Frame:
+    """State of the forward pass for the backward pass: projection, depth order and tile lists.
+
+    ``arrays`` are as the kernel ``project`` takes them.
+    """
+
+    def __init__(
+        self, arrays: list[np.ndarray], degree: int, camera: Camera, screen_filter: ScreenFilter, dial: np.ndarray
+    ) -> None:
+        n, workers = len(arrays[0]), workers_for(len(arrays[0]))
+        self.camera, self.workers = camera_vector(camera, screen_filter), threads.worker_count()
+        self.compensated = screen_filter.compensate or None
+        self.records = recycled_array(((n + workers) * conventions.RECORD,), np.float32)
+        self.packed_ids, self.counts = recycled_array((n,), np.int32), np.zeros(workers, np.int64)
+        depths, packed = recycled_array((n,), np.float32), (self.packed_ids, self.counts)
+        threads.run(project, workers, *arrays, degree, self.camera, dial, self.records, depths, *packed)
+        keys, order, *others = (recycled_array((int(self.counts.sum()),), kind) for kind in (np.uint32, np.int32) * 2)
+        order = tiles.depth_order(depths.view(np.uint32), self.counts, keys, order, *others)
+        self.width, self.height, self.across = camera.width, camera.height, -(-camera.width // conventions.TILE)
+        count, listing = self.across * -(-camera.height // conventions.TILE), workers_for(len(order))
+        histogram, totals = np.empty((listing, count), np.int64), np.empty(listing, np.int64)
+        self.offsets, self.slots = np.empty(count + 1, np.int64), recycled_array((2 * n,), np.int32)
+        given = self.records, order, self.across, histogram, totals
+        threads.run(tiles.count_tiles, listing, *given)
+        total = tiles.tile_offsets(histogram, self.offsets, totals)
+        self.entries, self.entry_slots = recycled_array((total,), np.int32), recycled_array((total,), np.int32)
+        threads.run(tiles.fill_tiles, listing, *given, self.slots, self.entries, self.entry_slots)
+        # Longest lists first: no thread starts a long tile when the others are done.
+        self.tiles = np.argsort(-np.diff(self.offsets), kind="stable")
+        self.masks = recycled_array((total * blend.WORDS,), np.uint64)
+
+    def blend(self, background: np.ndarray) -> tuple[Tensor, Tensor]:
+        """The image and its alpha."""
+        image, alpha = recycled((self.height, self.width, 3)), recycled((self.height, self.width))
+        threads.run(
+            blend.blend, self.workers, self.records, self.entries, self.offsets, self.across, self.width, self.height,
+            background, self.tiles, np.zeros(1, np.int64), self._room(blend.FORWARD_STATE), self.masks, image.numpy(),
+            alpha.numpy(),
+        )  # fmt: skip
+        return image, alpha
+
+    def blend_gradient(
+        self, image: Tensor, alpha: Tensor, v_image: Tensor, v_alpha: Tensor, shaped: bool, colored: bool
+    ) -> np.ndarray:
+        """The sums over pixels of each pair of Gaussian and tile, those of shape and colour if asked for."""
+        # Reads of the last pair are sixteen floats wide too.
+        sums = recycled_array((len(self.entries) * conventions.PAIR + 16,), np.float32)
+        given = [x.contiguous().numpy() for x in (image, alpha, v_image, v_alpha)]
+        threads.run(
+            blend.blend_gradient, self.workers, self.records, self.entries, self.entry_slots, self.offsets,
+            self.across, self.width, self.height, *given, self.tiles, np.zeros(1, np.int64),
+            self._room(blend.BACKWARD_STATE), self.masks, shaped, colored, sums,
+        )  # fmt: skip
+        return sums
+
+    def _room(self, size: int) -> np.ndarray:
+        """Scratch floats for each worker."""
+        return recycled_array((self.workers, size), np.float32)
 
 
 def _arrays(tensors: Any) -> list[np.ndarray]:
@@ -152,7 +135,7 @@ class _Picture(torch.autograd.Function):
     ):  # fmt: skip
         inputs = (means, quats, scales, opacities, sigma_d, growth_d, sh0, shN)
         ctx.degree = math.isqrt(shN.shape[1] + 1) - 1
-        frame = prepare(_arrays(inputs), ctx.degree, camera, screen_filter, dialling)
+        frame = Frame(_arrays(inputs), ctx.degree, camera, screen_filter, dialling)
         image, alpha = frame.blend(background.detach().contiguous().numpy())
         ctx.frame, ctx.dialling, ctx.trained = frame, dialling, trained
         ctx.save_for_backward(*inputs, background, image, alpha)
