@@ -6,6 +6,7 @@ import clod_adapter  # noqa: F401
 # isort: split
 import math
 import os
+import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
@@ -14,6 +15,7 @@ from typing import Any
 
 import pytest
 import torch
+from filelock import FileLock
 from PIL import Image
 from plyfile import PlyData, PlyElement
 
@@ -21,6 +23,9 @@ import browser
 import fake_gpu
 from clod_adapter.cameras import Camera
 from clod_adapter.cli.main import main
+from clod_adapter.cli.shared.console import Console
+from clod_adapter.cli.shared.inputs import prepare_kernels
+from clod_adapter.config import FILTERS
 from clod_adapter.evaluation import frame_times
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.formats.splat_transform import VARIABLE
@@ -34,6 +39,14 @@ from scenes import looking
 fake_gpu.register()
 frame_times.NOISY = math.inf  # whether a note is given depends on the load
 pseudo_views.MANY = 8  # the tests' captures of eight show too little by the measure of real ones
+
+
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """Compiles the kernels; of several test processes the first does, and the others load them."""
+    if run := getattr(session.config, "workerinput", {}).get("testrunuid"):
+        with FileLock(Path(tempfile.gettempdir()) / f"clod-{run}.lock"):
+            for screen_filter in (FILTERS["off"], FILTERS["on"]):
+                prepare_kernels(Console(quiet=True), screen_filter=screen_filter)
 
 
 @pytest.fixture

@@ -35,9 +35,9 @@ each_dtype = pytest.mark.parametrize("dtype", DTYPES)
 each_cut = pytest.mark.parametrize("cut", ["hard", "soft"])
 
 
-def pairs(*axes: list[float]) -> list[tuple[Any, ...]]:
-    """All pairs of two axes, every second one in each type."""
-    return [(*values, DTYPES[k % 2]) for k, values in enumerate(itertools.product(*axes))]
+def paired(*axes: list[float]) -> list[tuple[Any, ...]]:
+    """Each value of the axes once or twice, in turn in each type."""
+    return [(*(axis[k % len(axis)] for axis in axes), DTYPES[k % 2]) for k in range(max(map(len, axes)))]
 
 
 def config(tau: float = 1 / 255, eps: float = 1e-8, **other: Any) -> AttenuationConfig:
@@ -84,7 +84,7 @@ def reference_extinction(logit: float, sigma: float, d: float, tau: float, eps: 
     return upper * mpmath.exp(-mpmath.lambertw((upper * d) ** 2 / v).real / 2)
 
 
-@pytest.mark.parametrize(("eps", "scale", "dtype"), pairs(EPSILONS, SCALES))
+@pytest.mark.parametrize(("eps", "scale", "dtype"), paired(EPSILONS, SCALES))
 def test_opacities_and_their_gradients_match_mpmath(dtype: torch.dtype, eps: float, scale: float) -> None:
     inputs = grid(LOGITS, SIGMAS, DISTANCES)
     logits, sigma, d = (t.to(dtype) for t in inputs)
@@ -225,7 +225,7 @@ def test_gradients_of_activated_opacities(cut: str) -> None:
     assert slope_a == pytest.approx([0, factor, 0, 1]) and slope_sigma == pytest.approx([0, factor / 4, 0, 0])
 
 
-@pytest.mark.parametrize(("eps", "tau", "dtype"), pairs(EPSILONS, TAUS))
+@pytest.mark.parametrize(("eps", "tau", "dtype"), paired(EPSILONS, TAUS))
 def test_extinction_scale_matches_mpmath(dtype: torch.dtype, eps: float, tau: float) -> None:
     inputs = grid(LOGITS, SIGMAS, DISTANCES)
     got = extinction_scale(*(t.to(dtype) for t in inputs), config(tau, eps))
@@ -235,7 +235,7 @@ def test_extinction_scale_matches_mpmath(dtype: torch.dtype, eps: float, tau: fl
     assert_close(got, want, allowed, floor=torch.finfo(dtype).tiny / tau)
 
 
-@pytest.mark.parametrize(("eps", "tau", "dtype"), pairs(EPSILONS, TAUS))
+@pytest.mark.parametrize(("eps", "tau", "dtype"), paired(EPSILONS, TAUS))
 def test_sigma_for_extinction_matches_mpmath(dtype: torch.dtype, eps: float, tau: float) -> None:
     inputs = grid(LOGITS[2:], DISTANCES, [0.0, 1e-6, 0.3, 1.0, 1.75, 1.999, 6.0, 100.0, 1e4])
     got = sigma_for_extinction(*(t.to(dtype) for t in inputs), config(tau, eps)).double()
