@@ -2,7 +2,7 @@
 
 import argparse
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path, PureWindowsPath
 from typing import Any
 
@@ -12,8 +12,8 @@ from numba.core.event import Event, Listener, install_listener
 from clod_adapter._support.text import first_line
 from clod_adapter.alignment.check import MOST_VIEWS, Alignment, check_alignment
 from clod_adapter.alignment.screen_filter import compare_filters
-from clod_adapter.alignment.search import Guess, cameras_in, guess_frame, scene_in
-from clod_adapter.cameras import Camera, Scene, View
+from clod_adapter.alignment.search import Guess, camera_in, guess_frame, scene_in
+from clod_adapter.cameras import Camera, Scene, View, with_near_planes
 from clod_adapter.config import CLASSIC, FILTERS, AdaptConfig, ScreenFilter
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.evaluate import evaluate
@@ -141,13 +141,12 @@ def with_filter(
     stored = gaussians.screen_filter
     if name == "auto" and views and not checkpoint.filter_known:
         with console.status("comparing screen-space filters with the photographs ..."):
-            found = compare_filters(gaussians, views, stored.name or "off")
-        name = found.chosen
-        if name != found.expected:
-            chosen, expected = (f"{found.psnr[each]:.2f} dB {WORDS[each]}" for each in (name, found.expected))
+            name, psnr = compare_filters(gaussians, views, expected := stored.name or "off")
+        if name != expected:
+            found = ", ".join(f"{psnr[each]:.2f} dB {WORDS[each]}" for each in (name, expected))
             console.note(
-                f"{checkpoint.path}: by the photographs it was trained {WORDS[name]}: {chosen}, {expected}; rendered "
-                f"so (--antialiasing {found.expected} overrides it)"
+                f"{checkpoint.path}: by the photographs it was trained {WORDS[name]}: {found}; rendered so "
+                f"(--antialiasing {expected} overrides it)"
             )
     elif name != "auto" and checkpoint.filter_known and FILTERS[name] != stored:
         had = f"the file has {stored.description}"
@@ -254,7 +253,7 @@ def align(
         console.note(FLAT.format(images=images))
     elif required and found.margin < 0:
         console.note(OTHER_COLOURS.format(ply=ply, images=images))
-    return scene, found.as_dict() | {"guess": guess and guess.frame.description, "frame": frame}
+    return scene, asdict(found) | {"guess": guess and guess.frame.description, "frame": frame}
 
 
 def read_cameras(model: Checkpoint, images: str, console: Console, *, training: bool = False) -> list[Camera]:
@@ -269,7 +268,9 @@ def read_cameras(model: Checkpoint, images: str, console: Console, *, training: 
         return cameras
     prepare_kernels(console, model.gaussians.means.device, training=False)
     _, guess = _compared(model, [*scene.test, *scene.train], images, console, every)
-    return cameras_in(cameras, guess.frame) if guess and guess.clear else cameras
+    if not (guess and guess.clear):
+        return cameras
+    return with_near_planes([camera_in(camera, guess.frame) for camera in cameras])
 
 
 def _compared(

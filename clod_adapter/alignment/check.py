@@ -8,10 +8,9 @@ the correlation, which ignores gain and offset) and another background (by a ren
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import torch
-from torch import Tensor
 
 from clod_adapter.cameras import View, spread
 from clod_adapter.equation.distances import in_frustum
@@ -70,46 +69,34 @@ class Alignment:
         """Whether the renders are worse than the mean colours over black, but better over white."""
         return self.margin < 0 < self.white_psnr - self.mean_colour_psnr and self.white_psnr > self.psnr + CLEAR
 
-    def as_dict(self) -> dict[str, float]:
-        return asdict(self)
-
 
 @torch.no_grad()
 def check_alignment(gaussians: Gaussians, views: Sequence[View]) -> Alignment:
     """Renders at most MOST_VIEWS of the views, evenly spread, at s = 1, and compares them with the photographs."""
-    views = spread(views, MOST_VIEWS)
+    views, rows = spread(views, MOST_VIEWS), []
     seen = torch.zeros(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
     for view in views:
         seen |= in_frustum(gaussians.means, view.camera)
+        photograph = unit(view.image, gaussians.means)
+        about = photograph - photograph.mean((0, 1))
+        if float(about.square().mean().sqrt()) < FLAT:
+            continue
+        rendering = render(gaussians, view.camera)
+        black = rendering.image.clamp(0, 1)
+        white = (rendering.image + (1 - rendering.alpha)[..., None]).clamp(0, 1)
+        centred = black - black.mean((0, 1))
+        errors = [(black - photograph).square(), (white - photograph).square(), about.square()]
+        rows.append(torch.stack([each.mean() for each in (*errors, centred.square(), centred * about)]))
     in_view = float(seen.float().mean()) if len(seen) else 0.0
-    compared = [row for view in views if (row := compare_renders(gaussians, view)) is not None]
-    if not compared:
+    if not rows:
         return Alignment(0, in_view, *[math.nan] * 5)
-    table = torch.stack(compared)
+    table = torch.stack(rows)
     error, over_white, constant, rendered, shared = table.mean(0).tolist()
     return Alignment(
-        views=len(compared), in_view=in_view, psnr=_decibels(error), mean_colour_psnr=_decibels(constant),
+        views=len(rows), in_view=in_view, psnr=_decibels(error), mean_colour_psnr=_decibels(constant),
         white_psnr=_decibels(over_white), correlation=shared / math.sqrt(constant * rendered) if rendered > 0 else 0.0,
         explained=float((table[:, 0] < table[:, 2]).float().mean()),
     )  # fmt: skip
-
-
-def compare_renders(gaussians: Gaussians, view: View) -> Tensor | None:
-    """``[5]`` means over pixels and channels; None if the photograph is one colour.
-
-    Squared error of the render over black, over white, and of the photograph's mean colour; variance of the render;
-    covariance of render and photograph.
-    """
-    photograph = unit(view.image, gaussians.means)
-    about = photograph - photograph.mean((0, 1))
-    if float(about.square().mean().sqrt()) < FLAT:
-        return None
-    rendering = render(gaussians, view.camera)
-    black = rendering.image.clamp(0, 1)
-    white = (rendering.image + (1 - rendering.alpha)[..., None]).clamp(0, 1)
-    centred = black - black.mean((0, 1))
-    rows = [(black - photograph).square(), (white - photograph).square(), about.square(), centred.square()]
-    return torch.stack([row.mean() for row in (*rows, centred * about)])
 
 
 def _decibels(error: float) -> float:

@@ -4,7 +4,6 @@ With another filter, Gaussians of about a pixel render too opaque or too faint.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from statistics import fmean
 
 import torch
@@ -12,7 +11,7 @@ from torch import Tensor
 
 from clod_adapter.alignment.check import DOUBTFUL
 from clod_adapter.cameras import View, spread
-from clod_adapter.config import FILTERS, ScreenFilter
+from clod_adapter.config import FILTERS
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.losses import unit
 from clod_adapter.render import render
@@ -23,25 +22,13 @@ CLEAR = 0.2  # dB, mean over the views
 MOST = 0.75  # share of the views in which the chosen filter must be better
 
 
-@dataclass(frozen=True)
-class FilterComparison:
-    """Mean PSNR by name in FILTERS; the filter used unless another is clearly better, and that for rendering."""
-
-    psnr: dict[str, float]
-    expected: str
-    chosen: str
-
-    @property
-    def screen_filter(self) -> ScreenFilter:
-        return FILTERS[self.chosen]
-
-
 @torch.no_grad()
-def compare_filters(gaussians: Gaussians, views: Sequence[View], expected: str = "off") -> FilterComparison:
-    """Renders at most MOST_VIEWS of the views, evenly spread, at s = 1, with each of FILTERS.
+def compare_filters(gaussians: Gaussians, views: Sequence[View], expected: str = "off") -> tuple[str, dict[str, float]]:
+    """The name in FILTERS of the filter that fits the photographs, and the mean PSNR with each.
 
-    Another than ``expected`` is chosen if its mean PSNR is CLEAR dB higher, its PSNR is higher in MOST of the views and
-    its pooled error is DOUBTFUL dB below that of the photographs' mean colours (in a wrong frame, fainter is closer).
+    Renders at most MOST_VIEWS of the views, evenly spread, at s = 1. Another than ``expected`` is chosen if its mean
+    PSNR is CLEAR dB higher, its PSNR is higher in MOST of the views and its pooled error is DOUBTFUL dB below that of
+    the photographs' mean colours (in a wrong frame, fainter is closer).
     """
     views = spread(views, MOST_VIEWS)
     photographs = [unit(view.image, gaussians.means) for view in views]
@@ -53,6 +40,7 @@ def compare_filters(gaussians: Gaussians, views: Sequence[View], expected: str =
         pairs = zip(pictures, photographs, strict=True)
         errors[name] = torch.stack([(image - photograph).square().mean() for image, photograph in pairs])
         psnr[name] = -10 * errors[name].clamp(min=1e-10).log10()
+    means = {name: float(each.mean()) for name, each in psnr.items()}
     clear = [
         name
         for name in FILTERS
@@ -60,5 +48,4 @@ def compare_filters(gaussians: Gaussians, views: Sequence[View], expected: str =
         and float((psnr[name] > psnr[expected]).float().mean()) >= MOST
         and float(errors[name].mean()) < constant * 10 ** (-DOUBTFUL / 10)
     ]
-    means = {name: float(each.mean()) for name, each in psnr.items()}
-    return FilterComparison(means, expected, max(clear, key=means.__getitem__, default=expected))
+    return max(clear, key=means.__getitem__, default=expected), means

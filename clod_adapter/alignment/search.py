@@ -4,17 +4,16 @@ Known frames are ranked by the correlation of small renders with the photographs
 are searched. The result is measured by ``check_alignment`` and given only if it fits clearly better.
 """
 
-import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from clod_adapter.alignment.check import CLEAR, DOUBTFUL, Alignment, check_alignment, compare_renders
+from clod_adapter.alignment.check import CLEAR, DOUBTFUL, Alignment, check_alignment
 from clod_adapter.alignment.frames import Frame, focus_of, known_frames
-from clod_adapter.cameras import Camera, Scene, View, in_its_unit, spread, with_near_planes
+from clod_adapter.cameras import Camera, Scene, View, in_its_unit, spread
 from clod_adapter.gaussians import Gaussians
 
 COARSE = (72, 20_000)  # of the small renders: pixels of width, Gaussians
@@ -52,23 +51,18 @@ def guess_frame(
     if len(gaussians) == 0 or found.views == 0:
         return None
     every = torch.stack([camera.viewmat.double() for camera in cameras or [view.camera for view in views]])
-    small = _Stage(gaussians, views, *COARSE)
+    score = _small(gaussians, views, *COARSE)
 
     def measured(frame: Frame) -> Guess | None:
-        psnr = check_alignment(gaussians, in_file(views, frame)).psnr
+        psnr = check_alignment(gaussians, views_in(views, frame)).psnr
         enough = max(found.mean_colour_psnr + BETTER_THAN_MEAN, found.psnr + CLEAR)
         return Guess(frame, psnr, psnr >= found.mean_colour_psnr + DOUBTFUL) if psnr >= enough else None
 
-    known = measured(max(known_frames(every, points), key=small.score))
+    known = measured(max(known_frames(every, points), key=score))
     if known:
         return known
-    searched = _search(gaussians, views, small, every)
+    searched = _search(gaussians, views, score, every)
     return measured(searched) if searched else None
-
-
-def in_file(views: Sequence[View], frame: Frame) -> tuple[View, ...]:
-    """The photographs with their cameras in the file's frame."""
-    return tuple(view.at(camera_in(view.camera, frame)) for view in views)
 
 
 def camera_in(camera: Camera, frame: Frame) -> Camera:
@@ -77,37 +71,28 @@ def camera_in(camera: Camera, frame: Frame) -> Camera:
     return replace(camera, viewmat=viewmat, near=camera.near / frame.scale)
 
 
+def views_in(views: Sequence[View], frame: Frame) -> tuple[View, ...]:
+    """The photographs with their cameras in the file's frame."""
+    return tuple(view.at(camera_in(view.camera, frame)) for view in views)
+
+
 def scene_in(scene: Scene, frame: Frame) -> Scene:
     """The scene with its cameras in the file's frame, and the near planes of that frame's unit."""
-    return in_its_unit(replace(scene, train=in_file(scene.train, frame), test=in_file(scene.test, frame)))
+    return in_its_unit(replace(scene, train=views_in(scene.train, frame), test=views_in(scene.test, frame)))
 
 
-def cameras_in(cameras: Sequence[Camera], frame: Frame) -> list[Camera]:
-    """The cameras of a scene in the file's frame, as ``scene_in``."""
-    return with_near_planes([camera_in(camera, frame) for camera in cameras])
+def _small(gaussians: Gaussians, views: Sequence[View], width: int, most: int) -> Callable[[Frame], float]:
+    """The correlation of small photographs with renders, in a frame, of the ``most`` Gaussians that cover most."""
+    shrunk = [_shrunk(view, width) for view in spread(views, VIEWS)]
+    if len(gaussians) > most:
+        cover = F.logsigmoid(gaussians.opacity_logits) + gaussians.log_scales.topk(2, dim=1).values.sum(1)
+        gaussians = gaussians.select(cover.topk(most).indices)
+    return lambda frame: check_alignment(gaussians, views_in(shrunk, frame)).correlation
 
 
-class _Stage:
-    """Small renders of the Gaussians that cover most, compared with small photographs."""
-
-    def __init__(self, gaussians: Gaussians, views: Sequence[View], width: int, most: int):
-        self.views = [_shrunk(view, width) for view in spread(views, VIEWS)]
-        if len(gaussians) > most:
-            cover = F.logsigmoid(gaussians.opacity_logits) + gaussians.log_scales.topk(2, dim=1).values.sum(1)
-            gaussians = gaussians.select(cover.topk(most).indices)
-        self.gaussians = gaussians
-
-    def score(self, frame: Frame) -> float:
-        """Correlation in [-1, 1] of the photographs with renders in this frame."""
-        views = in_file(self.views, frame)
-        rows = [row for view in views if (row := compare_renders(self.gaussians, view)) is not None]
-        if not rows:
-            return -1.0
-        _, _, constant, rendered, shared = torch.stack(rows).sum(0).tolist()
-        return shared / math.sqrt(constant * rendered) if rendered > 0 else 0.0
-
-
-def _search(gaussians: Gaussians, views: Sequence[View], small: _Stage, viewmats: Tensor) -> Frame | None:
+def _search(
+    gaussians: Gaussians, views: Sequence[View], score: Callable[[Frame], float], viewmats: Tensor
+) -> Frame | None:
     """The best scale and offset; None if no correlation reaches LOWEST_CORRELATION.
 
     Climbs to the nearest maximum from the best scale about the origin, and from the best ones about the points that all
@@ -117,44 +102,41 @@ def _search(gaussians: Gaussians, views: Sequence[View], small: _Stage, viewmats
     for towards, rounds in ((0.0, 1), (1.0, 1), (1.0, ROUNDS)):
         focus = focus_of(viewmats, rounds)
         unit = float((torch.linalg.inv(viewmats)[:, :3, 3] - focus).norm(dim=1).quantile(0.5).clamp(min=1e-9))
-        places = [_placed(scale, towards * (focus - scale * middle), unit) for scale in SCALES]
-        found.append((*_climb(small, max(places, key=small.score), focus, unit, (0.1, 0.02)), focus, unit))
-    score, frame, focus, unit = max(found, key=lambda start: start[0])
-    if score < LOWEST_CORRELATION:
+        places = [_placed(scale, towards * (focus - scale * middle)) for scale in SCALES]
+        found.append((*_climb(score, max(places, key=score), focus, unit, (0.1, 0.02)), focus, unit))
+    best, frame, focus, unit = max(found, key=lambda start: start[0])
+    if not best >= LOWEST_CORRELATION:
         return None
     for width, most, steps in FINER:
-        _, frame = _climb(_Stage(gaussians, views, width, most), frame, focus, unit, steps)
+        _, frame = _climb(_small(gaussians, views, width, most), frame, focus, unit, steps)
     return frame
 
 
-def _placed(scale: float, offset: Tensor, unit: float) -> Frame:
-    parts = []
-    if abs(math.log(scale)) > 0.02:
-        parts.append(f"{scale if scale > 1 else 1 / scale:.3g} times {'larger' if scale > 1 else 'smaller'}")
-    if float(offset.norm()) > 0.02 * unit:
-        parts.append("moved by (" + ", ".join(f"{value:.3g}" for value in offset.tolist()) + ")")
-    description = f"the file should be {' and '.join(parts) or 'moved slightly'}: export it in the cameras' frame"
+def _placed(scale: float, offset: Tensor) -> Frame:
+    by = ", ".join(f"{value:.3g}" for value in offset.tolist())
+    description = f"the file should be {scale:.3g} times as large and moved by ({by}): export it in the cameras' frame"
     return Frame("scale and offset", description, torch.eye(3, dtype=torch.float64), scale, offset)
 
 
-def _neighbours(frame: Frame, step: float, focus: Tensor, unit: float) -> list[Frame]:
-    """Moves along the axes, and scales about the point that the cameras look at, which keeps it in view."""
-    axes = torch.eye(3, dtype=focus.dtype)
-    moves = [_placed(frame.scale, frame.offset + sign * step * unit * axis, unit) for axis in axes for sign in (1, -1)]
-    factors = (1 + step, 1 / (1 + step))
-    return moves + [_placed(frame.scale * by, focus - by * (focus - frame.offset), unit) for by in factors]
+def _climb(
+    score: Callable[[Frame], float], frame: Frame, focus: Tensor, unit: float, steps: tuple[float, float]
+) -> tuple[float, Frame]:
+    """Pattern search for the nearest maximum; ``steps`` are the first and the last step, shares of ``unit``.
 
-
-def _climb(stage: _Stage, frame: Frame, focus: Tensor, unit: float, steps: tuple[float, float]) -> tuple[float, Frame]:
-    """Pattern search for the nearest maximum; ``steps`` are the first and the last step, shares of ``unit``."""
+    Moves along the axes, and scales about the point that the cameras look at, which keeps it in view.
+    """
     step, smallest = steps
-    best, trials = stage.score(frame), 0
+    best, trials = score(frame), 0
     while step >= smallest and trials < MOST_TRIALS:
-        for neighbour in _neighbours(frame, step, focus, unit):
+        moves = step * unit * torch.eye(3, dtype=focus.dtype).repeat_interleave(2, 0)
+        moves[1::2] *= -1
+        neighbours = [_placed(frame.scale, frame.offset + move) for move in moves]
+        for by in (1 + step, 1 / (1 + step)):
+            neighbours.append(_placed(frame.scale * by, focus - by * (focus - frame.offset)))
+        for neighbour in neighbours:
             trials += 1
-            score = stage.score(neighbour)
-            if score > best:
-                best, frame = score, neighbour
+            if (found := score(neighbour)) > best:
+                best, frame = found, neighbour
                 break
         else:
             step /= 2
