@@ -115,15 +115,11 @@ def test_anomalies_are_counted(tmp_path: Path) -> None:
 
 
 def test_values_that_look_activated_are_read_as_activated(tmp_path: Path) -> None:
-    plain, vertex = table(), table()
-    vertex["opacity"] = 1 / (1 + np.exp(-vertex["opacity"]))
-    for k in range(3):
-        vertex[f"scale_{k}"] = np.exp(vertex[f"scale_{k}"])
-    (found, splat), (_, want) = seen(write(tmp_path / "a.ply", vertex)), seen(write(tmp_path / "b.ply", plain))
-    assert [o.kind for o in found.anomalies] == ["activated", "activated"]
-    assert all("--activated both" in o.says for o in found.anomalies)
-    assert splat.values.scale.median == pytest.approx(want.values.scale.median, rel=1e-5)
-    assert splat.values.opacity.median == pytest.approx(want.values.opacity.median, rel=1e-5)
+    vertex = table()
+    opacity = vertex["opacity"] = 1 / (1 + np.exp(-vertex["opacity"]))
+    found, splat = seen(write(tmp_path / "a.ply", vertex))
+    assert [o.kind for o in found.anomalies] == ["activated"] and "--activated opacity" in found.anomalies[0].says
+    assert splat.values.opacity.median == pytest.approx(np.median(opacity), rel=1e-5)
 
 
 def test_other_trainers_encodings_and_coordinates(tmp_path: Path) -> None:
@@ -158,7 +154,6 @@ def test_a_dial(tmp_path: Path) -> None:
     assert splat.dial is not None and splat.dial.calibration == CALIBRATION and splat.dial.attenuation == ATTENUATION
     assert found.what == f"an adapted splat, with {names}, PLY" and "clod-adapter" in (found.writer or "")
     assert splat.values.sigma is not None and splat.values.sigma.least > 0 and splat.comments == splat.extra == ()
-    assert splat.tau == 0.01 and any(line.startswith(f"dial         {names}, s = 1 to 6") for line in lines_of(found))
     rows = [line.split() for line in lines_of(found) if line.startswith("growth_d")]
     assert rows == [["growth_d", "-1", "-0.96", "1", "2.96", "3"]]
     # Another tool's column of the same name, which is no growth without a sigma_d.
