@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -18,12 +18,9 @@ from clod_adapter.io.file_formats import read_source
 from clod_adapter.io.ply import MASK_COLUMNS, column_map
 from clod_adapter.io.ply_packed import is_packed
 from clod_adapter.io.ply_settings import COLUMN, PREFIX
-from clod_adapter.io.settings import ADAPTER, Source, matching_calibration, stated_filter
+from clod_adapter.io.settings import ADAPTER, matching_calibration, stated_filter
 from clod_adapter.io.values import FILTER, choice_of, dial_columns, in_question, prepared
 from clod_adapter.origin import Origin
-
-if TYPE_CHECKING:
-    from clod_adapter.adapter import Adapter
 
 NORMALS = ("nx", "ny", "nz")
 
@@ -127,18 +124,14 @@ def inspect(path: str | Path) -> Inspection:
     writer = looks_like(head) if head else f"clod-adapter {metadata.version}" if metadata.version else None
     if writer == NERFSTUDIO:
         notes.append("in nerfstudio's own frame: its dataparser_transforms.json belongs in the scene's folder")
+    kind = f"an adapted splat, with {splat.dial_columns}" if splat.dial else "a splat"
+    packed = "compressed " * any("quantised" in note for note in source.notes)
+    what = f"{kind}, {packed}{'PLY' if head else path.suffix.lower()}"
     return Inspection(
-        path=str(path), size=path.stat().st_size, what=_what(path, source, splat), writer=writer, splat=splat,
+        path=str(path), size=path.stat().st_size, what=what, writer=writer, splat=splat,
         about=None, anomalies=tuple(anomalies_of(splat, questions)),
         left_out=tuple(left_out_of(splat, source.notes, rows.changes)), notes=tuple(notes),
     )  # fmt: skip
-
-
-def _what(path: Path, source: Source, splat: Splat) -> str:
-    kind = f"an adapted splat, with {splat.dial_columns}" if splat.dial else "a splat"
-    packed = any("quantised" in note for note in source.notes)
-    suffix = path.suffix.lower() or "PLY"
-    return f"{kind}, {'compressed ' if packed else ''}{'PLY' if splat.encoding else suffix}"
 
 
 def extra_columns(names: Sequence[str], sh_degree: int) -> tuple[str, ...]:
@@ -180,12 +173,9 @@ def left_out_of(splat: Splat, notes: Sequence[str], changes: Sequence[str]) -> l
     if splat.sh_degree > v.used_sh_degree:
         lines.append(f"harmonics above degree {v.used_sh_degree}, which are 0: skipped in training, kept in the output")
     if splat.extra:
-        lines.append(f"{_list(splat.extra)}: not used, copied to outputs")
+        more = f" and {len(splat.extra) - 6} more" * (len(splat.extra) > 6)
+        lines.append(f"{', '.join(splat.extra[:6])}{more}: not used, copied to outputs")
     return lines + [change for change in changes if "taken as activated" in change]
-
-
-def _list(names: Sequence[str]) -> str:
-    return ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")
 
 
 def _inspect_tensors(path: Path) -> tuple[str, dict[str, Any], tuple[str, ...]] | None:
@@ -194,33 +184,24 @@ def _inspect_tensors(path: Path) -> tuple[str, dict[str, Any], tuple[str, ...]] 
     from clod_adapter.io.file_formats import KEY
     from clod_adapter.io.tensor_file import read_tensor_header
     from clod_adapter.training.state import KEY as STATE_KEY
+    from clod_adapter.training.state import load_state
 
     metadata = read_tensor_header(path)[1]
     if STATE_KEY in metadata:
-        return "the state of an interrupted run, for --resume", _state(path), ()
-    if KEY in metadata and f'"{ADAPTER}"' in metadata[KEY]:
-        adapter = load_adapter(path)
-        return "an adapter: what clod-adapt learned, without its checkpoint", _adapter(adapter), adapter.notes
-    return None
-
-
-def _adapter(adapter: Adapter) -> dict[str, Any]:
+        state, belongs = load_state(path)
+        count = next((len(t) for t in state.tensors.values() if t.ndim), 0)
+        return "the state of an interrupted run, for --resume", {
+            "kind": "state", "writer": None, "count": count, "steps": state.steps, "seconds": state.seconds,
+            "loss": state.loss, "belongs": belongs, "attenuation": asdict(state.attenuation),
+        }, ()  # fmt: skip
+    if KEY not in metadata or f'"{ADAPTER}"' not in metadata[KEY]:
+        return None
+    adapter = load_adapter(path)
     kinds = {name: f"{str(t.dtype).removeprefix('torch.')} {list(t.shape)}" for name, t in adapter.updates.items()}
     growth = None if adapter.growth_d is None else asdict(Spread.of(adapter.growth_d.numpy()))
-    return {
+    return "an adapter: what clod-adapt learned, without its checkpoint", {
         "kind": "adapter", "writer": f"clod-adapter {adapter.version}", "count": len(adapter.sigma_d),
         "base": adapter.base_fingerprint, "attenuation": asdict(adapter.attenuation), "config": adapter.config,
         "updates": kinds, "origin": list(adapter.origin), "sigma": asdict(Spread.of(adapter.sigma_d.numpy())),
         "growth": growth, "calibration": adapter.calibration and adapter.calibration.as_dict(),
-    }  # fmt: skip
-
-
-def _state(path: Path) -> dict[str, Any]:
-    from clod_adapter.training.state import load_state
-
-    state, belongs = load_state(path)
-    return {
-        "kind": "state", "writer": None, "count": next((len(t) for t in state.tensors.values() if t.ndim), 0),
-        "steps": state.steps, "seconds": state.seconds, "loss": state.loss, "belongs": belongs,
-        "attenuation": asdict(state.attenuation),
-    }  # fmt: skip
+    }, adapter.notes  # fmt: skip

@@ -109,7 +109,9 @@ def _joined_meta(metas: Sequence[dict[str, Any]], shape: torch.Size) -> dict[str
     packed = first.get("gaussian_ids") is not None
     counted: dict[str, Sequence[int]] = {}
     if "depths" in first:
-        tile_bits = _bits(first["tile_width"] * first["tile_height"])
+        # Width of the tile's number in gsplat's sorting key; gsplat 1.6 has a function for it.
+        bits = getattr(sys.modules.get("gsplat.cuda._torch_impl"), "_bits_for_count", int.bit_length)
+        tile_bits = int(bits(first["tile_width"] * first["tile_height"]))
         counted = {
             "batch_ids": [image // shape[-1] for image in images],
             "camera_ids": [image % shape[-1] for image in images],
@@ -132,12 +134,6 @@ def _joined_meta(metas: Sequence[dict[str, Any]], shape: torch.Size) -> dict[str
     for name in set(GRADIENTS) & set(first):
         _pass_gradients_on([meta[name] for meta in metas], joined[name])
     return joined
-
-
-def _bits(tiles: int) -> int:
-    """Width of the tile's number in gsplat's sorting key; gsplat 1.6 has a function for it."""
-    torch_code = sys.modules.get("gsplat.cuda._torch_impl")
-    return int(getattr(torch_code, "_bits_for_count", int.bit_length)(tiles))
 
 
 def _pass_gradients_on(parts: list[Tensor], whole: Tensor) -> None:
