@@ -170,16 +170,16 @@ def pick_views(scene: Scene, wanted: Sequence[str]) -> list[View]:
 
 def named(cameras: Sequence[Camera], name: str, option: str) -> list[Camera]:
     """The cameras whose photograph has this name; if none has, without its suffix, its folder, or both."""
-    whole = [camera for camera in cameras if camera.name == name]
-    if found := whole or [camera for camera in cameras if name in _shorter(camera.name)]:
+    if found := [camera for camera in cameras if camera.name == name]:
+        return found
+    for camera in cameras:
+        path = PureWindowsPath(camera.name)
+        if name in (str(Path(camera.name).with_suffix("")), path.name, path.stem):
+            found.append(camera)
+    if found:
         return found
     some = ", ".join(camera.name for camera in cameras[:3])
     raise ClodError(f"{option}: no photograph is named {name!r}; names are like {some}")
-
-
-def _shorter(name: str) -> tuple[str, ...]:
-    path = PureWindowsPath(name)
-    return str(Path(name).with_suffix("")), path.name, path.stem
 
 
 CPU = torch.device("cpu")
@@ -224,11 +224,6 @@ class _Compiling(Listener):  # type: ignore[misc]
         pass
 
 
-OTHER_COLOURS = (
-    "warning: {ply} matches the photographs in {images}, but some differ more from it than from their own mean "
-    "colours; check for another exposure, views that it does not cover, or a poor checkpoint"
-)
-FLAT = "warning: the photographs in {images} have a single colour each, on which the checkpoint is trained"
 SMALL = 320  # pixels, width of photographs that only tell the frame
 
 
@@ -250,9 +245,14 @@ def align(
             raise ClodError(f"{message}; use --misaligned-ok to train anyway")
         console.note(f"warning: {message}")
     elif required and not found.views:
-        console.note(FLAT.format(images=images))
+        console.note(
+            f"warning: the photographs in {images} have a single colour each, on which the checkpoint is trained"
+        )
     elif required and found.margin < 0:
-        console.note(OTHER_COLOURS.format(ply=ply, images=images))
+        console.note(
+            f"warning: {ply} matches the photographs in {images}, but some differ more from it than from their own "
+            "mean colours; check for another exposure, views that it does not cover, or a poor checkpoint"
+        )
     return scene, asdict(found) | {"guess": guess and guess.frame.description, "frame": frame}
 
 

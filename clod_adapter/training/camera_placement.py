@@ -1,7 +1,7 @@
 """Cameras for a checkpoint without photographs, placed from its Gaussians alone.
 
 Two properties of the Gaussians tell where photographs looked. They are a pixel or two large in their nearest cameras,
-so the smallest ones give the distance of the cameras (``_reach``), and a rendering full of large ones shows a place
+so the smallest ones give the distance of the cameras (``reach``), and a rendering full of large ones shows a place
 without photographs. And the higher SH degrees start at 0 and are changed only by photographs, so their contribution to
 the colour is strong in the directions from which a Gaussian was photographed.
 
@@ -92,7 +92,11 @@ class _Placement:
         usable = _usable(plain)
         self.few, self.growth = _sample(plain, usable, seed)
         self.zoom = 0.5 / math.tan(math.radians(field) / 2)  # the focal length in image widths
-        self.reach = _reach(plain.replace(shN=plain.shN[:, :0]).select(usable), self.zoom)
+        # The distance, world units, at which the smallest tenth is at most SMALL_PIXELS pixels large.
+        sizes, means = _largest_scale(plain)[usable], plain.means[usable]
+        footprint = _quantile(sizes, SMALL) * WIDTH * self.zoom / SMALL_PIXELS
+        from_centre = (means - means.median(0).values).norm(dim=1)
+        self.reach = min(footprint, FAR * _quantile(from_centre, 0.5)) or footprint
         self.generator, self.progress, self.judged = torch.Generator().manual_seed(seed), progress, 0
         # Each row stands for growth^2 of the checkpoint's.
         self.weight = self.few.opacities if self.growth is None else self.few.opacities * self.growth**2
@@ -153,16 +157,6 @@ class _Placement:
             pixels = coverage(self.few, self.few.opacities, camera, self.growth)
             self.hidden *= pixels * (WIDTH / camera.width) ** 2 < COVERED
         return 1 - float((self.weight * self.hidden).sum() / self.weight.sum())
-
-
-def _reach(gaussians: Gaussians, zoom: float) -> float:
-    """The distance, world units, at which the smallest tenth of the Gaussians is at most SMALL_PIXELS pixels large.
-
-    At most FAR times the median distance of the Gaussians from their centre.
-    """
-    footprint = _quantile(_largest_scale(gaussians), SMALL) * WIDTH * zoom / SMALL_PIXELS
-    from_centre = (gaussians.means - gaussians.means.median(0).values).norm(dim=1)
-    return min(footprint, FAR * _quantile(from_centre, 0.5)) or footprint
 
 
 def _usable(gaussians: Gaussians) -> Tensor:

@@ -35,15 +35,10 @@ def find_cameras(folder: Path) -> Path:
     ``transforms.json`` there; then a model in the first two beside ``folder``, which may be the images' own.
     """
     beside = folder.resolve().parent / "sparse"
-    for model in (folder / "sparse" / "0", folder / "sparse", folder):
-        if _is_model(model):
-            return model
-    for name in TRANSFORMS:
-        if (folder / name).is_file():
-            return folder / name
-    for model in (beside / "0", beside):
-        if _is_model(model):
-            return model
+    files = [folder / name for name in TRANSFORMS]
+    for each in (folder / "sparse" / "0", folder / "sparse", folder, *files, beside / "0", beside):
+        if each.is_file() if each in files else _is_model(each):
+            return each
     raise ClodError(
         f"{folder}: no COLMAP model (cameras, images, points3D as .bin or .txt) in sparse/0, sparse or the folder "
         "itself, and no transforms.json; give the folder that holds images/ and sparse/0, or transforms.json"

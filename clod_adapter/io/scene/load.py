@@ -4,7 +4,7 @@ import threading
 import warnings
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Sequence
-from contextlib import closing
+from contextlib import closing, nullcontext
 from copy import copy
 from functools import partial
 from pathlib import Path
@@ -221,30 +221,24 @@ def _load_view(image: PosedImage, path: Path, cache: Path | None, max_width: int
 def _photograph(image: PosedImage, path: Path, max_width: int) -> Photograph:
     """The photograph as a pinhole camera has it, no wider than ``max_width``."""
     width, height = image_size(path)
-    if width * height <= LARGE:
-        return _worked_on(image, path, max_width)
-    with _ONE_LARGE:
-        photograph = _worked_on(image, path, max_width)
-        release()  # or this thread keeps memory that the next one allocates again
-        return photograph
-
-
-def _worked_on(image: PosedImage, path: Path, max_width: int) -> Photograph:
-    camera = copy(image.camera)
-    pixels, notes = read_image(path, camera.width, camera.height, max_width)
-    if pixels.size != (camera.width, camera.height):
-        sizes = f"{pixels.width}x{pixels.height} where the model has {camera.width}x{camera.height}"
-        notes.append(("are {}: intrinsics scaled", sizes))
-        # With pixel centres at +0.5, in COLMAP as here, the principal point scales like the focal length.
-        camera.rescale(*pixels.size)
-    if not image.is_pinhole:
-        pixels, camera = undistort(path, pixels, camera)
-    width, height = pixels.size
-    if width > max_width:
-        size = (max_width, max(1, int(height * max_width / width)))
-        pixels = pixels.resize(size, Image.Resampling.BICUBIC)
-        sizes = f"from {width}x{height} to {size[0]}x{size[1]}"
-        notes.append((SCALED, sizes))
+    large = width * height > LARGE
+    with _ONE_LARGE if large else nullcontext():
+        camera = copy(image.camera)
+        pixels, notes = read_image(path, camera.width, camera.height, max_width)
+        if pixels.size != (camera.width, camera.height):
+            sizes = f"{pixels.width}x{pixels.height} where the model has {camera.width}x{camera.height}"
+            notes.append(("are {}: intrinsics scaled", sizes))
+            # With pixel centres at +0.5, in COLMAP as here, the principal point scales like the focal length.
+            camera.rescale(*pixels.size)
+        if not image.is_pinhole:
+            pixels, camera = undistort(path, pixels, camera)
+        width, height = pixels.size
+        if width > max_width:
+            size = (max_width, max(1, int(height * max_width / width)))
+            pixels = pixels.resize(size, Image.Resampling.BICUBIC)
+            notes.append((SCALED, f"from {width}x{height} to {size[0]}x{size[1]}"))
+        if large:
+            release()  # or this thread keeps memory that the next one allocates again
     K = np.array([[pixels.width / width], [pixels.height / height], [1.0]]) * camera.calibration_matrix()
     if not 0 < min(K[0, 0], K[1, 1]) <= np.abs(K).max() < HUGE:
         raise ClodError(f"{path}: its camera is not usable once undistorted; check the camera's parameters")

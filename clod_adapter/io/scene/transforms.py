@@ -59,7 +59,10 @@ def _frames(path: Path, held_out: bool | None) -> tuple[list[PosedImage], list[s
         name = _name(path, frame["file_path"])
         where = f"{path}: frame {name}"
         camera = _camera(where, path.parent / file_name(name), ChainMap(frame, content))
-        images.append(check_posed(PosedImage(name, _viewmat(where, frame), camera, held_out), path))
+        pose, viewmat = read_pose(where, frame, "transform_matrix"), np.eye(4)
+        viewmat[:3, :3] = (pose[:3, :3] @ np.diag([1.0, -1.0, -1.0])).T
+        viewmat[:3, 3] = -viewmat[:3, :3] @ pose[:3, 3]
+        images.append(check_posed(PosedImage(name, viewmat, camera, held_out), path))
     notes = []
     if "applied_transform" in content and not path.with_name(DATAPARSER).is_file():
         notes.append(f"{path.name} turned COLMAP's world (applied_transform): a checkpoint of the turned one is needed")
@@ -75,7 +78,7 @@ def _name(path: Path, file_path: str) -> str:
 
 
 def read_pose(where: object, values: Mapping[str, Any], key: str) -> np.ndarray:
-    """``[4, 4]`` float64: the rotation, as the file rounds it, and translation under ``key``, 3x4 or 4x4."""
+    """``[4, 4]`` float64: the rotation nearest to the file's rounded one, and translation under ``key``, 3x4 or 4x4."""
     try:
         pose = np.array(values.get(key), np.float64)
     except (TypeError, ValueError, OverflowError):
@@ -88,16 +91,9 @@ def read_pose(where: object, values: Mapping[str, Any], key: str) -> np.ndarray:
     # A file may have few digits, but a scale or a mirror image would give a picture of another scene.
     if not off < 0.01 or np.linalg.det(turn) < 0 or not np.array_equal(pose, whole[: len(pose)]):
         raise ClodError(f"{where}: {key} is no rotation and translation; copy or export it again")
+    left, _, right = np.linalg.svd(turn)
+    whole[:3, :3] = left @ right
     return whole
-
-
-def _viewmat(where: str, frame: Mapping[str, Any]) -> np.ndarray:
-    pose = read_pose(where, frame, "transform_matrix")
-    left, _, right = np.linalg.svd(pose[:3, :3])
-    viewmat = np.eye(4)
-    viewmat[:3, :3] = (left @ right @ np.diag([1.0, -1.0, -1.0])).T
-    viewmat[:3, 3] = -viewmat[:3, :3] @ pose[:3, 3]
-    return viewmat
 
 
 def _camera(where: str, photograph: Path, values: Mapping[str, Any]) -> pycolmap.Camera:
@@ -163,12 +159,10 @@ def in_trained_frame(folder: Path, cameras: Path, images: list[PosedImage]) -> t
             pose = pose @ np.linalg.inv(read_pose(cameras, applied, "applied_transform"))
         if applied.get("applied_scale") is not None:
             scale /= _number(cameras, applied["applied_scale"], "applied_scale")
-    left, _, right = np.linalg.svd(pose[:3, :3])
-    brought = []
+    back, brought = np.linalg.inv(pose), []
     for image in images:
-        viewmat = np.eye(4)
-        viewmat[:3, :3] = image.viewmat[:3, :3] @ (left @ right).T
-        viewmat[:3, 3] = scale * (image.viewmat[:3, 3] - viewmat[:3, :3] @ pose[:3, 3])
+        viewmat = image.viewmat @ back
+        viewmat[:3, 3] *= scale
         brought.append(check_posed(replace(image, viewmat=viewmat), cameras))
     note = f"the cameras are brought into the frame of {DATAPARSER}: the splat must be what nerfstudio exported"
     return brought, [note]
