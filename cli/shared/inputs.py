@@ -10,8 +10,7 @@ import torch
 from numba.core.event import Event, Listener, install_listener
 
 from clod_adapter._support.text import first_line
-from clod_adapter.alignment.check import MOST_VIEWS, Alignment, check_alignment
-from clod_adapter.alignment.screen_filter import compare_filters
+from clod_adapter.alignment.check import MOST_VIEWS, Alignment, check_alignment, compare_filters
 from clod_adapter.alignment.search import Guess, camera_in, guess_frame, scene_in
 from clod_adapter.cameras import Camera, Scene, View, with_near_planes
 from clod_adapter.config import CLASSIC, FILTERS, AdaptConfig, ScreenFilter

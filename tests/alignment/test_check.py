@@ -10,9 +10,8 @@ import torch
 from torch import Tensor
 
 import scenes
-from clod_adapter.alignment.check import check_alignment
+from clod_adapter.alignment.check import check_alignment, compare_filters
 from clod_adapter.alignment.frames import NERFSTUDIO_TURNS, into_file, known_frames
-from clod_adapter.alignment.screen_filter import compare_filters
 from clod_adapter.alignment.search import guess_frame, scene_in
 from clod_adapter.cameras import Scene, View
 from clod_adapter.config import FILTERS
