@@ -21,7 +21,7 @@ def extinction_scale(opacity_logits: Tensor, sigma_d: Tensor, d: Tensor, config:
     The unique root of ``a exp(-(d s)^2 / (2 v)) = tau s``, which is
     ``s*^2 = (v / d^2) W(a^2 d^2 / (tau^2 v))`` with W the principal Lambert function. In [0, a/tau]; below
     1 the Gaussian is kept at no dial value. ``a/tau`` where d = 0 (or d^2 / v is negligible); 0 where sigma <= 0,
-    eps = 0 and d > 0. No gradient.
+    eps = 0 and d > 0. Below ``s = FAINTEST / tau``, where the threshold no longer falls, more are culled. No gradient.
 
     Accuracy: relative error within ``(6 + |log a|) * finfo.eps`` where ``a`` is a normal number. Logarithms that are
     off by a unit in the last place, as on some processors, add ``|log tau|``.
