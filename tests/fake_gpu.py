@@ -41,9 +41,6 @@ class Walled(Tensor):
         made.inner = real
         return made
 
-    def __repr__(self) -> str:  # type: ignore[override]
-        return f"Walled({self.inner!r})"
-
     @classmethod
     def __torch_dispatch__(cls, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         return _run(function, args, kwargs or {})
@@ -64,7 +61,9 @@ def _run(function: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     args, kwargs = tree_map(lambda x: x.inner if isinstance(x, Walled) else x, (args, kwargs))
     own = {id(x.inner): x for x in walled}  # an operation in place returns what it was given
     out = function(*args, **kwargs)
-    return tree_map(lambda x: own[id(x)] if id(x) in own else _wall(x), out) if inside else out
+    if not inside:
+        return out
+    return tree_map(lambda x: own[id(x)] if id(x) in own else Walled(x) if isinstance(x, Tensor) else x, out)
 
 
 def _waits(function: Any, args: Any, kwargs: dict[str, Any], walled: list[Any]) -> bool:
@@ -93,10 +92,6 @@ def waits() -> Iterator[list[str]]:
     """The places at which the host waits for the device within the context, once for each time."""
     _log.clear()
     yield _log
-
-
-def _wall(value: Any) -> Any:
-    return Walled(value) if isinstance(value, Tensor) else value
 
 
 class _Dispatch(TorchDispatchMode):

@@ -15,7 +15,7 @@ from clod_adapter.blocks.divide import (
     split,
     target_image,
 )
-from clod_adapter.blocks.train import Learned, adapt_block, merge
+from clod_adapter.blocks.train import adapt_block, merge
 from clod_adapter.cameras import Scene
 from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
@@ -43,11 +43,6 @@ def captured() -> tuple[Gaussians, Scene]:
 def divided(captured: tuple[Gaussians, Scene]) -> Division:
     base, scene = captured
     return divide(initialize(base, scene.train, CONFIG), scene.train, CONFIG, BLOCKS)
-
-
-@pytest.fixture(scope="module")
-def learned(captured: tuple[Gaussians, Scene], divided: Division) -> list[Learned]:
-    return [adapt_block(divided, captured[1].train, CONFIG, block)[0] for block in range(BLOCKS)]
 
 
 def test_blocks_are_even_boxes() -> None:
@@ -136,15 +131,14 @@ def test_target_images_of_blocks_add_up_to_the_photograph(captured: tuple[Gaussi
     torch.testing.assert_close(asked, view.image / 255 - picture.clamp(0, 1), rtol=0, atol=BLOCKS / 255)
 
 
-def test_blocks_match_undivided_training(
-    captured: tuple[Gaussians, Scene], divided: Division, learned: list[Learned]
-) -> None:
+def test_blocks_match_undivided_training(captured: tuple[Gaussians, Scene], divided: Division) -> None:
     """Every image crosses all borders of a translucent cloud, which is the hardest case.
 
     benchmarks/blocks.py measures it on captures.
     """
     base, scene = captured
-    undivided, first = adapt(base, scene, CONFIG).gaussians, merge(divided, learned)
+    undivided = adapt(base, scene, CONFIG).gaussians
+    first = merge(divided, [adapt_block(divided, scene.train, CONFIG, k)[0] for k in range(BLOCKS)])
     whole = merge(divided, [adapt_block(divided, scene.train, CONFIG, k, after=first)[0] for k in range(BLOCKS)])
     models, dials = (divided.initial, undivided, whole), (1.0, 3.0, 5.0)
     for before, one, other in zip(*(evaluate(g, scene.test, dials) for g in models), strict=True):
@@ -160,13 +154,9 @@ def test_growth_is_drawn_in_the_context(divided: Division, captured: tuple[Gauss
     """Gaussians of other blocks as the first pass trained them, its own from the first pass on."""
     views, initial = captured[1].train, divided.initial
     small = divided.block == 1
-    initial = initial.replace(
-        sigma_d=torch.full_like(initial.sigma_d, 1e3), log_scales=initial.log_scales - 4 * small[:, None].float()
-    )
-    grown = [
-        initial.replace(growth_d=torch.where(small, exponent, initial.growth_d))
-        for exponent in (torch.tensor(0.0), torch.tensor(3.0))
-    ]
+    logs, sigma_d = initial.log_scales - 4 * small[:, None].float(), torch.full_like(initial.sigma_d, 1e3)
+    initial = initial.replace(sigma_d=sigma_d, log_scales=logs)
+    grown = [initial.replace(growth_d=torch.where(small, each, initial.growth_d)) for each in (0.0, 3.0)]
     few, many = (len(context_rows(divided, 0, views, after=each)) for each in grown)
     assert few < many
     assert torch.equal(*(context_rows(replace(divided, initial=each), 0, views) for each in grown))

@@ -1,7 +1,5 @@
 """The gate: training that harms s = 1 is undone."""
 
-from typing import Any
-
 import pytest
 import torch
 
@@ -12,7 +10,6 @@ from clod_adapter.initialization.importance import initialize
 from clod_adapter.render import render
 from clod_adapter.training.gate import decibels_below, split_views, squared_error
 from clod_adapter.training.loop import TrainingState, adapt
-from clod_adapter.training.state import Adapted
 from runs import config_of, states_of
 from scenes import assert_equal, capture, photograph, ring
 
@@ -23,11 +20,6 @@ Pair = tuple[Gaussians, Scene]
 def many() -> Pair:
     """Enough views that some are not trained on."""
     return capture(views=16)
-
-
-def run(pair: Pair, faster: float, **settings: Any) -> Adapted:
-    """Adapted with all learning rates of attributes multiplied."""
-    return adapt(*pair, config_of(iters=40, **settings).lighter(faster), progress=False)
 
 
 def lost(pair: Pair, result: Gaussians, begun: Gaussians) -> float:
@@ -48,7 +40,7 @@ def test_diverging_training_is_undone_and_resumes_to_the_same_bits(many: Pair) -
 
 def test_attributes_are_frozen_in_the_end(many: Pair) -> None:
     base = many[0]
-    result = run(many, 1e6)
+    result = adapt(*many, config_of(iters=40).lighter(1e6))
     assert result.watched is not None and result.watched.frozen
     assert all(torch.equal(getattr(result.gaussians, name), getattr(base, name)) for name in ATTRIBUTES)
     assert not torch.equal(result.gaussians.sigma_d, initialize(base, many[1].train, config_of()).sigma_d)

@@ -50,11 +50,8 @@ def test_sh_degree_losses_separate_used_from_unused_degrees() -> None:
     assert list(sh_degree_losses(with_bands(truth, 0, 0, 0), views, LIMIT)) == [(3, 0.0), (2, 0.0), (1, 0.0)]
 
 
-def hidden() -> tuple[Gaussians, Scene, torch.Tensor]:
-    """An opaque shell with Gaussians inside, some outside every image, some too faint, and others around it.
-
-    Also ``[N]`` bool: the Gaussians whose removal alone changes an image.
-    """
+def test_seen_gaussians_change_a_pixel_when_removed() -> None:
+    """Whichever views the error is from: a shell, Gaussians inside, outside every image, too faint, and around it."""
     base = gaussians(70, 1, 2, size=0.1)
     means, logs, logits = base.means, base.log_scales, base.opacity_logits
     around = 2 * math.pi * torch.arange(24) / 24
@@ -68,17 +65,11 @@ def hidden() -> tuple[Gaussians, Scene, torch.Tensor]:
         image = render(base, camera).image
         for row in range(70):
             matters[row] |= not torch.equal(image, render(base.select(torch.arange(70) != row), camera).image)
-    return base, Scene(views, ()), matters
-
-
-def test_seen_gaussians_change_a_pixel_when_removed() -> None:
-    """Whichever views the error is from."""
-    base, scene, matters = hidden()
     for first in (6, 2):
-        error = removal_error(base, scene.train[:first])
-        found = seen(base, scene.train[first:], error, 0)
+        error = removal_error(base, views[:first])
+        found = seen(base, views[first:], error, 0)
         assert found.tolist() == matters.tolist() and not found[24:46].any() and found[:24].all()
-    change, lost = largest_change(base, base.select(found), scene.train)
+    change, lost = largest_change(base, base.select(found), views)
     assert change < 1e-6 and abs(lost) < 1e-6  # all of them at once, too
     # One opaque all over: its alpha is clamped in every pixel and has no derivative, and the image is all its own.
     base.means[0], base.log_scales[0], base.opacity_logits[0] = 0.0, math.log(100.0), math.inf

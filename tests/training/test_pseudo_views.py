@@ -41,8 +41,7 @@ def test_each_step_renders_the_checkpoint_from_another_camera(blob: clod.Gaussia
     cameras = scenes.ring(3, 40, 30)
     (photograph,) = scenes.photograph(blob, cameras[:1])
     sampler = ViewSampler((*render_pseudo_views(blob, cameras).train, photograph), clod.AdaptConfig())
-    state = sampler.state()
-    drawn = [sampler.draw(k, 0.0).view for k in range(9)]
+    state, drawn = sampler.state(), [sampler.draw(k, 0.0).view for k in range(9)]
     assert sum(view is photograph for view in drawn) == 3
     for view in drawn:
         assert torch.equal(view.image, clod.render(blob, view.camera).pixels)
@@ -140,7 +139,7 @@ def test_a_scene_gets_as_many_cameras_as_show_it(monkeypatch: pytest.MonkeyPatch
     assert float((seen >= 0.5).float().mean()) > 0.9
 
 
-@pytest.mark.parametrize(("axis", "few"), [(0, False), (1, False), (2, True)])
+@pytest.mark.parametrize(("axis", "few"), [(0, False), (2, True)])
 def test_cameras_face_the_side_where_sh_was_trained(axis: int, few: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """Also where a sample of the Gaussians decides."""
     side = torch.eye(3)[axis]

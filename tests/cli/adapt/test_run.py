@@ -127,23 +127,18 @@ def test_report_agrees_with_the_files(clod: Any, capture: Any, dialled: Path) ->
     assert stored.machine == machine_name() and report["ply_bytes"] == dialled.stat().st_size
 
 
-def test_default_output_name_device_and_quiet(clod: Any, capture: Any, tmp_path: Path) -> None:
-    done = clod(capture.ply, "--images", capture.scene, "--iters", 0, "--device", "cpu", "--quiet", "--json")
-    assert done.code == 0 and names(tmp_path) == ["base_clod.json", "base_clod.ply", "base_clod.safetensors"]
-    assert done.err == "" and json.loads(done.out)["device"] == "cpu"
-
-
 def test_dial_of_the_checkpoint_is_continued(clod: Any, capture: Any, dialled: Path, tmp_path: Path) -> None:
     """Its growth is dropped with --growth off, which a note says; a dial without growth starts with exponents of 0."""
-    given = ("--images", capture.scene, "--max-sv", 4, "--json", "--out", "dial.ply", "--iters")
+    given = ("--images", capture.scene, "--device", "cpu", "--max-sv", 4, "--out", "dial.ply", "--json", "--quiet")
     for model, more, note, stored in (
-        (dialled, (2,), "sigma_d and growth_d", ["sigma_d", "growth_d"]),
-        (dialled, (0, "--growth", "off"), "sigma_d; its growth_d is dropped, as growth is off", ["sigma_d"]),
-        ("off.ply", (0,), "sigma_d", ["sigma_d", "growth_d"]),
+        (dialled, (), "sigma_d and growth_d", ["sigma_d", "growth_d"]),
+        (dialled, ("--growth", "off"), "sigma_d; its growth_d is dropped, as growth is off", ["sigma_d"]),
+        ("off.ply", (), "sigma_d", ["sigma_d", "growth_d"]),
     ):
-        done = clod(model, *given, *more)
+        done = clod(model, *given, "--iters", 0, *more)
         noted = f"{model} has a dial already: continuing from its {note}"
-        assert done.code == 0 and noted in json.loads(done.out)["notes"], done
+        report = json.loads(done.out)
+        assert done.code == 0 and done.err == "" and noted in report["notes"] and report["device"] == "cpu", done
         assert columns(tmp_path / "dial.ply")[-len(stored) :] == stored and rebuilt(clod, model, tmp_path)
         if "off" in more:
             assert clod_adapter.load_adapter("dial.safetensors").growth_d is None
