@@ -2,11 +2,12 @@
 
 import hashlib
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Sequence
+from contextlib import closing
 from typing import Any
 
 from clod_adapter._kernels.memory import release
+from clod_adapter.adapter import dial_tensors
 from clod_adapter.blocks.divide import Division, block_config, check_divisible, divide
 from clod_adapter.blocks.train import Learned, adapt_block, load_block, merge, save_block
 from clod_adapter.cameras import View
@@ -20,7 +21,7 @@ from clod_adapter.training.plan import Plan
 from clod_adapter.training.state import Adapted
 
 from ..shared.console import ProgressDisplay, duration
-from .listeners import Saver, fingerprint, settings_key
+from .listeners import Saver, settings_key
 from .prepare import Run, decide
 
 
@@ -32,7 +33,7 @@ def adapt_in_blocks(run: Run) -> tuple[Plan, Adapted]:
         photographs = scene_fingerprint(run.scene, meter)
     began, base = time.perf_counter(), run.base.gaussians
     views = usable_views(base, run.scene.train)
-    with _displayed(run) as display:
+    with closing(ProgressDisplay(run.console, run.stop)) as display:
         plan = decide(run, display)
         division = divide(plan.lean, views, plan.config, run.memory.blocks, total=len(plan.start), progress=display)
     release()
@@ -65,8 +66,8 @@ class Blocks:
         self, run: Run, config: AdaptConfig, division: Division, views: Sequence[View], photographs: str
     ) -> None:
         self.run, self.config, self.division, self.views = run, config, division, views
-        digest = hashlib.sha256(fingerprint(division.initial).encode())
-        for tensor in (division.block, division.seen):
+        digest = hashlib.sha256(f"{run.checkpoint()}, SH degree {division.initial.sh_degree}".encode())
+        for tensor in (*dial_tensors(division.initial).values(), division.block, division.seen):
             digest.update(tensor.cpu().numpy().data)
         self.key: dict[str, Any] = settings_key(config) | {
             "photographs": photographs, "number of blocks": division.count, "checkpoint": digest.hexdigest(),
@@ -88,7 +89,7 @@ class Blocks:
         checkpoint = f"{key['checkpoint']}, {name}"
         saver.identify(run.args.ply, "before", base_sha256=checkpoint, views_sha256=key["photographs"])
         with saver.rescuing("the same command"):
-            with _displayed(run, name) as display:
+            with closing(ProgressDisplay(run.console, run.stop, name)) as display:
                 learned, adapted = adapt_block(
                     division, self.views, self.config, block, after=before, progress=saver.saving(display),
                     resume=saver.state, cache=ImageCache(run.memory.cache) if run.memory else None,
@@ -106,10 +107,3 @@ class Blocks:
         saver.close(finished=True)
         run.console.say(f"{name}: {len(learned.rows):,} Gaussians, {learned.steps} steps, {duration(learned.seconds)}")
         return learned
-
-
-@contextmanager
-def _displayed(run: Run, training: str = Phase.TRAINING) -> Iterator[ProgressDisplay]:
-    display = ProgressDisplay(run.console, run.stop, training)
-    with run.stop.listening(), closing(display):
-        yield display

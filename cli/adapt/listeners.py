@@ -1,6 +1,5 @@
 """The saver of the training state, which also finds and checks the one to resume from."""
 
-import hashlib
 import sys
 import time
 from collections.abc import Iterator
@@ -12,7 +11,6 @@ from typing import Any
 from clod_adapter._support.version import package_version
 from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
-from clod_adapter.gaussians import Gaussians
 from clod_adapter.progress import Listener, Progress, Stopped
 from clod_adapter.training.state import StateRefused, TrainingState, load_state, save_state
 
@@ -29,15 +27,6 @@ SAVE_COST, MOST_COST = 0.015, 0.2  # shares of the time that saving may take, wi
 
 def settings_key(config: AdaptConfig) -> dict[str, Any]:
     return {"version": package_version(), "config": asdict(config)}
-
-
-def fingerprint(gaussians: Gaussians) -> str:
-    """SHA-256, hex, of the Gaussians as read, which depends on the options for reading."""
-    digest = hashlib.sha256(repr((gaussians.attenuation, gaussians.screen_filter)).encode())
-    for name, tensor in gaussians.tensors().items():
-        digest.update(f"{name} {tuple(tensor.shape)};".encode())
-        digest.update(tensor.detach().cpu().contiguous().flatten().numpy().data)
-    return digest.hexdigest()
 
 
 class Saver:
@@ -107,11 +96,7 @@ class Saver:
 
         def listen(now: Progress) -> bool:
             self.latest = now if now.state else None
-            try:
-                going = listener(now) is not False
-            except Exception:
-                self.keep()
-                raise
+            going = listener(now) is not False
             stopping = (not going or now.error) and not self.stop.aborted
             if stopping or (time.perf_counter() >= self.due and now.share < 1):
                 self.keep()

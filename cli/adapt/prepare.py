@@ -20,6 +20,7 @@ from clod_adapter.blocks.memory import IMAGES, MemoryEstimate, MemoryPlan, in_wo
 from clod_adapter.cameras import Scene, StoredView, View
 from clod_adapter.evaluation.evaluate import Row
 from clod_adapter.evaluation.robustness import scene_fingerprint
+from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.checkpoint import Checkpoint
 from clod_adapter.io.scene.load import ImageCache
 from clod_adapter.progress import Phase, Stopped
@@ -42,7 +43,7 @@ from ..shared.outputs import AdaptFiles
 from ..shared.pages import SNAPSHOT_VIEWS
 from ..shared.process import GracefulStop, launched
 from ..shared.settings import make_config
-from .listeners import Saver, fingerprint
+from .listeners import Saver
 
 LONG = 100  # steps of a run that is worth a forecast
 CHEAPER = 0.7  # measuring a dial value, of measuring the base
@@ -72,6 +73,7 @@ class Run:
         self.args, self.console, self.watch = args, Console(args.quiet), Stopwatch()
         self.stop = GracefulStop(aborts=launched().size == 1)  # launchers repeat signals
         self.config = make_config(args)
+        self.teacher = "checkpoint" if args.images is None else "photographs"
         self.outputs = AdaptFiles.of(args.ply, args.out)
         resume = args.resume and (not args.memory or self.outputs.state.exists())  # blocks have files of their own
         self.saver = Saver(self.outputs.state, self.config, self.console, self.stop, resume)
@@ -106,9 +108,13 @@ class Run:
         """Refuses the state of another run."""
         self.saver.identify(
             self.args.ply, self.args.images or "the pseudo views",
-            base_sha256=fingerprint(self.base.gaussians), views_sha256=scene_fingerprint(self.scene),
+            base_sha256=self.checkpoint(), views_sha256=scene_fingerprint(self.scene),
             overruled={"--with": sorted(self.args.keep_in), "--without": sorted(self.args.leave_out)},
         )  # fmt: skip
+
+    def checkpoint(self) -> str:
+        """Identifies the Gaussians, which depend on the options for reading too."""
+        return f"{self.base.fingerprint}, {self.base.gaussians.screen_filter}"
 
     def measure_base(self) -> None:
         """Measures the base on the held-out views."""
@@ -167,8 +173,8 @@ def forecast(run: Run, plan: Plan) -> None:
     peak = peak_bytes()
     if run.args.report:  # curves of seven states at three dial values, 15 pictures and the charts
         measuring += CHEAPER * (21 * run.base_seconds * min(SNAPSHOT_VIEWS / max(views, 1), 1) + 15 * frame) + 5
-        peak += 7 * sum(4 * t.numel() for name, t in plan.start.tensors().items() if name != "shN")
-    seconds = training + measuring + _row_bytes(base) * len(base.gaussians) / WRITING
+        peak += 7 * _bytes(plan.start.without_bands(0))
+    seconds = training + measuring + _bytes(base.gaussians) / WRITING
     minutes = f"{seconds:.0f} seconds" if seconds < 90 else f"{seconds / 60:.0f} minutes"
     memory = f", {in_words(peak)}" if peak else ""
     run.console.say(f"forecast: {minutes}{memory} ({steps:,} steps)")
@@ -191,28 +197,23 @@ def peak_bytes() -> int:
 
 
 def show_plan(decisions: Sequence[Decision], console: Console) -> None:
-    rows, others = list[tuple[str, str, str, str]](), list[str]()
-    for each in decisions:
-        option = f"--{'without' if each.verdict == 'kept' else 'with'} {each.name}" if each.name else ""
-        if each.verdict == NOT_NEEDED:
-            others.append(each.what)
-        else:
-            rows.append((each.what, each.verdict, each.measured, option))
+    rows = [(d.what, d.verdict, d.measured, d.name) for d in decisions if d.verdict != NOT_NEEDED]
     a, b, c = (max(map(len, column)) for column in list(zip(*rows, strict=True))[:3]) if rows else (0, 0, 0)
     console.say("plan: action, measured effect, option that overrides it; reasons in the report")
-    for what, verdict, effect, option in rows:
+    for what, verdict, effect, name in rows:
+        option = f"{'--without' if verdict == 'kept' else '--with'} {name}" if name else ""
         console.say(f"  {what:<{a}}  {verdict:<{b}}  {effect:>{c}}  {option}".rstrip())
-    if others:
+    if others := [each.what for each in decisions if each.verdict == NOT_NEEDED]:
         console.say(f"  does not apply: {', '.join(others)}")
 
 
 def plan_memory(base: Checkpoint, scene: Scene, limit: int, console: Console) -> MemoryPlan:
     views, gaussians = (*scene.train, *scene.test), base.gaussians
     pixels = [view.camera.width * view.camera.height for view in views]
-    attributes = sum(tensor.element_size() * tensor.numel() for tensor in gaussians.tensors().values())
+    row = _bytes(gaussians) // len(gaussians)
     made = sum(3 * size for view, size in zip(views, pixels, strict=True) if not isinstance(view, StoredView))
     needs = MemoryEstimate(
-        len(gaussians), math.ceil(attributes / len(gaussians)), _row_bytes(base),
+        len(gaussians), row, row if base.vertex is None else base.vertex.dtype.itemsize,
         images=3 * sum(pixels) - made, pixels=max(pixels), pictures=made,
     )  # fmt: skip
     plan = plan_for_limit(needs, limit)
@@ -226,11 +227,8 @@ def plan_memory(base: Checkpoint, scene: Scene, limit: int, console: Console) ->
     return plan
 
 
-def _row_bytes(base: Checkpoint) -> int:
-    """Bytes of a row of its file; 4 for each value where that is no PLY."""
-    if base.vertex is not None:
-        return base.vertex.dtype.itemsize
-    return sum(4 * tensor[:1].numel() for tensor in base.gaussians.tensors().values())
+def _bytes(gaussians: Gaussians) -> int:
+    return sum(4 * tensor.numel() for tensor in gaussians.tensors().values())
 
 
 def mapped(array: np.ndarray, folder: Path) -> np.ndarray:

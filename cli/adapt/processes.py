@@ -10,18 +10,14 @@ import os
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import torch
 
-from clod_adapter.cameras import Scene, View
-from clod_adapter.config import AdaptConfig
+from clod_adapter.cameras import Scene
 from clod_adapter.errors import ClodError
-from clod_adapter.gaussians import Gaussians
 from clod_adapter.progress import Stopped
-from clod_adapter.training.dial import TrainableSubset
 from clod_adapter.training.distributed import PATIENCE, ProcessGroup, ProcessLost, joined, require_distributed
 from clod_adapter.training.loop import adapt
 from clod_adapter.training.plan import Plan
@@ -29,26 +25,14 @@ from clod_adapter.training.pseudo_views import teachers_to
 from clod_adapter.training.state import Adapted, TrainingState
 
 from ..shared.console import ProgressDisplay
-from ..shared.process import GracefulStop, Launch, launched
+from ..shared.process import GracefulStop, launched
 
 BACKENDS = {"cpu": "gloo", "cuda": "nccl"}  # of torch.distributed, by device
 if TYPE_CHECKING:
     from torch.distributed.distributed_c10d import Store
 
-JOBS, OVER = "clod/jobs", "clod/over"  # keys in the store: the number of jobs, 0 or 1, and that none will come
+CALL = "clod/call"  # the key in the store by which the first process calls the others, to "train" or to "end"
 POLL_EVERY = 0.05  # seconds between checks for work
-
-
-@dataclass(frozen=True)
-class TrainingJob:
-    """What the others are sent: the arguments of ``adapt``, and the type of device that the first one trains on."""
-
-    base: Gaussians
-    views: tuple[View, ...]
-    config: AdaptConfig
-    state: TrainingState | None
-    subset: TrainableSubset
-    device: str
 
 
 @contextmanager
@@ -60,7 +44,7 @@ def leading() -> Iterator[None]:
         yield
     finally:
         with suppress(RuntimeError):  # the launcher has ended, which the others notice
-            store.set(OVER, "1")
+            store.set(CALL, "end")
 
 
 @contextmanager
@@ -73,17 +57,18 @@ def together(
         yield None
         return
     lean, config = plan.lean, plan.config
-    job = TrainingJob(lean, scene.train, config, state, plan.subset, lean.means.device.type)
+    device = lean.means.device.type
+    job = (lean, scene.train, config, state, plan.subset, device)  # what ``adapt`` is given, and where it is
     display.console.say(
-        f"{launch.size} processes ({BACKENDS[job.device]}): {config.batch} views a step, {config.steps:,} steps, "
+        f"{launch.size} processes ({BACKENDS[device]}): {config.batch} views a step, {config.steps:,} steps, "
         f"{config.batch * config.steps:,} views in all"
     )
-    _store().add(JOBS, 1)
+    _store().set(CALL, "train")
     try:
         if any(_store().check([_reason(rank)]) for rank in range(1, launch.size)):  # it would wait for ten minutes
             raise ProcessLost("a process of the group has ended")
         _use_threads(launch.local_size)
-        with joined(_job_store(), launch.rank, launch.size) as group:
+        with joined(_store(), launch.rank, launch.size) as group:
             group.broadcast(job)
             del job, lean
             yield group
@@ -98,11 +83,22 @@ def together(
 def take_part() -> None:
     """What a process that is not the first does: trains silently, if there is a job."""
     launch, stop = launched(), GracefulStop(aborts=False)
-    # A process that is lost is reported by the first one, or by the launcher.
     _use_threads(launch.local_size)
+    # A process that is lost is reported by the first one, or by the launcher.
     with stop.listening(), suppress(ProcessLost):
-        if _is_called(stop, launch.rank):
-            _train(launch, stop)
+        if not _is_called(stop, launch.rank):
+            return
+        with joined(_store(), launch.rank, launch.size) as group, _giving_reasons(launch.rank):
+            job: Any = group.broadcast(None)
+            base, views, config, state, subset, device = job
+            if device == "cuda":  # one for each process on this machine
+                if (gpus := torch.cuda.device_count()) < launch.local_size:
+                    raise ClodError(
+                        f"{launch.local_size} processes on a machine with {gpus} GPUs; start as many as there are"
+                    )
+                torch.cuda.set_device(launch.local_rank)
+            scene = Scene(teachers_to(views, device), ())
+            adapt(base.to(device), scene, config, stop.heeding(), state, subset=subset, group=group)
 
 
 def explain(lost: str) -> str:
@@ -117,19 +113,6 @@ def explain(lost: str) -> str:
 def hurried(adapted: Adapted) -> bool:
     """Whether the launcher ends the processes: after its signal, or a lost process, it waits for 30 seconds."""
     return adapted.interrupted and not adapted.failed and launched().size > 1
-
-
-def _train(launch: Launch, stop: GracefulStop) -> None:
-    with joined(_job_store(), launch.rank, launch.size) as group, _giving_reasons(launch.rank):
-        job: Any = group.broadcast(None)
-        if job.device == "cuda":  # one for each process on this machine
-            if (gpus := torch.cuda.device_count()) < launch.local_size:
-                raise ClodError(
-                    f"{launch.local_size} processes on a machine with {gpus} GPUs; start as many as there are"
-                )
-            torch.cuda.set_device(launch.local_rank)
-        base, scene = job.base.to(job.device), Scene(teachers_to(job.views, job.device), ())
-        adapt(base, scene, job.config, stop.heeding(), job.state, subset=job.subset, group=group)
 
 
 @contextmanager
@@ -149,16 +132,14 @@ def _is_called(stop: GracefulStop, rank: int) -> bool:
     """Waits for the job. Polls, because a wait of the store's own would delay signals."""
     store = _store()
     try:
-        while store.add(JOBS, 0) == 0:
-            if store.check([OVER]):
-                return False
+        while not store.check([CALL]):
             if stop.requests:
                 store.set(_reason(rank), f"process {rank}: ended by a signal")
-                return store.add(JOBS, 0) > 0  # the first one may have called before it could know
+                break
             time.sleep(POLL_EVERY)
+        return store.check([CALL]) and store.get(CALL) == b"train"  # it may have called before it could know
     except RuntimeError:  # the store has ended, and the first process with it
         return False
-    return True
 
 
 @lru_cache(maxsize=1)
@@ -172,12 +153,6 @@ def _store() -> Store:
     except (RuntimeError, ValueError) as error:
         raise ClodError(f"the processes cannot meet ({str(error).partition('. ')[0]}); use torchrun") from error
     return store
-
-
-def _job_store() -> Store:
-    from torch.distributed.distributed_c10d import PrefixStore
-
-    return PrefixStore("clod/job", _store())
 
 
 def _reason(rank: int) -> str:

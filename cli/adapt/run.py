@@ -2,6 +2,7 @@
 
 import argparse
 import shlex
+from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from typing import Any
@@ -34,23 +35,19 @@ LOST, ENOUGH = (0.1, 1.0), (33.0, 25.0)
 
 @dataclass(frozen=True)
 class Result:
-    """What is written: ``gaussians``, which are ``adapter`` applied to ``base``, of which ``--trim`` keeps a part."""
+    """What is written: ``gaussians``, which are ``adapter`` applied to ``base``, of which ``--trim`` keeps a part.
+
+    ``rows`` are of the dial, ``plain`` of a viewer that does not know it; some are missing if measuring was ``cut``.
+    """
 
     plan: Plan
     adapted: Adapted
     base: Checkpoint
     adapter: Adapter
     gaussians: Gaussians
-
-
-@dataclass(frozen=True)
-class Measurements:
-    """The rows of the base; of the result over the dial, and without it, as a viewer shows it that does not know it."""
-
-    base: list[Row]
-    rows: list[Row]
-    plain: list[Row]
-    interrupted: bool
+    rows: Sequence[Row] = ()
+    plain: Sequence[Row] = ()
+    cut: bool = True
 
 
 def adapt(args: argparse.Namespace) -> dict[str, Any]:
@@ -58,26 +55,22 @@ def adapt(args: argparse.Namespace) -> dict[str, Any]:
     run = Run(args)
     run.read()
     page = AdaptPage(run.base.gaussians, run.scene, run.config, run.console) if args.report else None
-    if run.memory is not None and run.memory.blocks > 1:
-        run.measure_base()
-        with run.stop.listening():  # until training has ended, so that a Ctrl-C loses nothing
-            result = make_result(run, *adapt_in_blocks(run))
-        return finish(run, result, page)
-    run.identify()
+    in_blocks = run.memory is not None and run.memory.blocks > 1
+    if not in_blocks:
+        run.identify()
     run.measure_base()
-    with run.stop.listening():
-        display = ProgressDisplay(run.console, run.stop)
-        plan = decide(run, display)
-        forecast(run, plan)
-        with run.saver.rescuing():
-            result = make_result(run, plan, train(run, plan, display, page))
+    with run.stop.listening(), run.saver.rescuing():  # until training has ended, so that a Ctrl-C loses nothing
+        result = make_result(run, *(adapt_in_blocks(run) if in_blocks else train(run, page)))
     with run.saver.rescuing():
         return finish(run, result, page)
 
 
-def train(run: Run, plan: Plan, display: ProgressDisplay, page: AdaptPage | None) -> Adapted:
-    """Trains as planned; returns the result for all Gaussians."""
+def train(run: Run, page: AdaptPage | None) -> tuple[Plan, Adapted]:
+    """Plans and trains; the result is of all Gaussians."""
     base, scene, saver = run.base.gaussians, run.scene, run.saver
+    display = ProgressDisplay(run.console, run.stop)
+    plan = decide(run, display)
+    forecast(run, plan)
 
     def show(now: Progress) -> bool:
         part = now.gaussians
@@ -94,7 +87,7 @@ def train(run: Run, plan: Plan, display: ProgressDisplay, page: AdaptPage | None
     how = "ended after" if adapted.failed else "interrupted after" if adapted.interrupted else "trained"
     run.console.say(f"{how} {adapted.steps} steps, {duration(adapted.seconds)}")
     release()
-    return adapted
+    return plan, adapted
 
 
 def make_result(run: Run, plan: Plan, adapted: Adapted) -> Result:
@@ -136,14 +129,14 @@ def finish(run: Run, result: Result, page: AdaptPage | None) -> dict[str, Any]:
     # After a Ctrl-C that ended training the next one aborts, as its message says.
     stop = GracefulStop(run.stop.aborts, run.stop.presses if interrupted else 0)
     with stop.listening():  # a first Ctrl-C ends the measurement, and lets the writing finish
-        measured = measure_result(run, result, stop)
-        report = write_result(run, result, measured)
-    complete = not interrupted and not measured.interrupted
+        result = measure_result(run, result, stop)
+        report = write_result(run, result)
+    complete = not interrupted and not result.cut
     run.saver.close(complete)
     for path in outputs.blocks() if complete else ():
         path.unlink(missing_ok=True)
         remove_leftovers(path)
-    if page and (measured.interrupted or stop.requests):
+    if page and (result.cut or stop.requests):
         console.say("interrupted: the page of --report was not written")
     elif page:  # after the report, which it changes
         path = outputs.ply.with_suffix(".html")
@@ -152,41 +145,41 @@ def finish(run: Run, result: Result, page: AdaptPage | None) -> dict[str, Any]:
         report["seconds"] |= {"page": round(run.watch.seconds["page"], 3)}  # beside the total, which the page has too
         report["forecast"] = against_forecast(run)
         write_report(outputs.report, report)
-    print_summary(run, measured, report["seconds"])
+    print_summary(run, result, report["seconds"])
     if "loss" in report:
         console.say(f"\nwarning: {report['loss']}")
     return report
 
 
-def measure_result(run: Run, result: Result, stop: GracefulStop) -> Measurements:
+def measure_result(run: Run, result: Result, stop: GracefulStop) -> Result:
     """Measures the result on the held-out views, unless the run is to end now.
 
     That is after a Ctrl-C that came when training was complete, and if the launcher ends the processes.
     """
-    views, console, base, plain = run.scene.test, run.console, run.base_rows, list[Row]()
+    views, console, plain = run.scene.test, run.console, list[Row]()
     if run.stop.requests > 0 and not result.adapted.interrupted or hurried(result.adapted):
-        return Measurements(base, [], [], interrupted=True)
+        return result
     detached = detach(result.gaussians)
     with run.watch.time("evaluate"):
         rows = measure(result.gaussians, views, report_dials(run.config.max_sv), console, stop)
         if not stop.requests:
             plain = measure(detached, views, [1.0], console, stop, "plain")
         if not stop.requests:
-            measured = [(run.base.gaussians, base), (result.gaussians, rows), (detached, plain)]
-            base, rows, plain = with_frame_times(measured, views, console, stop)
-    return Measurements(base, rows, plain, stop.requests > 0)
+            measured = [(run.base.gaussians, run.base_rows), (result.gaussians, rows), (detached, plain)]
+            run.base_rows, rows, plain = with_frame_times(measured, views, console, stop)
+    return replace(result, rows=rows, plain=plain, cut=stop.requests > 0)
 
 
-def write_result(run: Run, result: Result, measured: Measurements) -> dict[str, Any]:
+def write_result(run: Run, result: Result) -> dict[str, Any]:
     """Writes the three files, all before the first replaces that of an earlier run, and returns the report."""
     outputs, console, adapter, gaussians = run.outputs, run.console, result.adapter, result.gaussians
-    if measured.rows and not measured.interrupted:
+    if result.rows and not result.cut:
         try:
-            found = calibrate(measured.rows, gaussians, run.scene, teacher(run.args), result.base.origin)
+            found = calibrate(result.rows, gaussians, run.scene, run.teacher, result.base.origin)
             adapter = replace(adapter, calibration=found)
         except ClodError as error:
             console.say(f"the files have no calibration, so --fps and --psnr-drop will not work: {error}")
-    report = describe(run, result, measured)
+    report = describe(run, result)
     with (
         console.status(f"writing {outputs.ply} ..."),
         atomic_paths(outputs.adapter, outputs.ply, outputs.report) as (small, large, about),
@@ -200,18 +193,17 @@ def write_result(run: Run, result: Result, measured: Measurements) -> dict[str, 
     return report
 
 
-def describe(run: Run, result: Result, measured: Measurements) -> dict[str, Any]:
+def describe(run: Run, result: Result) -> dict[str, Any]:
     """The report, except the calibration and the sizes of the files."""
-    args, adapted, adapter, planning = run.args, result.adapted, result.adapter, result.plan.seconds
-    count, device = launched().size, result.gaussians.means.device
-    times = {
-        "plan": sum(planning.values()) - planning["start"], "start": adapted.start_seconds, "train": adapted.seconds,
-    }  # fmt: skip
-    if measured.interrupted:
+    args, adapted, adapter = run.args, result.adapted, result.adapter
+    times, count, device = result.plan.seconds, launched().size, result.gaussians.means.device
+    planning = sum(times.values()) - times["start"]
+    run.watch.seconds |= {"plan": planning, "start": adapted.start_seconds, "train": adapted.seconds}
+    if result.cut:
         run.console.note("the measurements were interrupted: only the dial values that were finished are reported")
     report = {
         "command": "adapt", "version": package_version(), "model": args.ply, "scene": args.images,
-        "teacher": teacher(args), "screen_filter": asdict(result.gaussians.screen_filter),
+        "teacher": run.teacher, "screen_filter": asdict(result.gaussians.screen_filter),
         "base_count": adapter.base_count, "config": adapter.config, "attenuation": asdict(adapter.attenuation),
         "steps": adapted.steps, "interrupted": adapted.interrupted, "machine": machine(),
         "processes": {
@@ -220,45 +212,39 @@ def describe(run: Run, result: Result, measured: Measurements) -> dict[str, Any]
         },
         "outputs": {name: str(path) for name, path in vars(run.outputs).items()},
         "sh_degree": result.gaussians.sh_degree, "device": str(device),
-        "seconds": {name: round(value, 3) for name, value in times.items()} | run.watch.report(),
-        "resumed_from": run.saver.state and run.saver.state.steps,
-        "alignment": run.alignment, "notes": run.console.notes, "base_rows": [row.as_dict() for row in measured.base],
-        "rows": [row.as_dict() for row in measured.rows],
-        "detached_row": measured.plain[0].as_dict() if measured.plain else None,
+        "seconds": run.watch.report(), "resumed_from": run.saver.state and run.saver.state.steps,
+        "alignment": run.alignment, "notes": run.console.notes, "base_rows": [row.as_dict() for row in run.base_rows],
+        "rows": [row.as_dict() for row in result.rows],
+        "detached_row": result.plain[0].as_dict() if result.plain else None,
         "watched": adapted.watched and asdict(adapted.watched), "plan": result.plan.as_dict(),
         "memory": run.memory and asdict(run.memory), "forecast": against_forecast(run),
     }  # fmt: skip
-    line, failed = ("", False) if report["interrupted"] else judge(measured, args.images is not None)
+    line, failed = ("", False) if report["interrupted"] else judge(run, result)
     failed = adapted.failed is not None or failed and not args.accept_loss
     return report | ({"loss": line} if line else {}) | ({"exit_code": 1} if failed else {})
 
 
-def judge(measured: Measurements, photographs: bool) -> tuple[str, bool]:
+def judge(run: Run, result: Result) -> tuple[str, bool]:
     """What is wrong with s = 1 and what to do, empty if nothing is; and whether the result has failed."""
-    full = [row.psnr for row in measured.rows if row.virtual_scale == 1]
-    if not full or not measured.base:
+    full = [row.psnr for row in result.rows if row.virtual_scale == 1]
+    if not full or not run.base_rows:
         return "", False
-    if photographs:
-        lost = measured.base[0].psnr - full[0]
+    if run.teacher == "photographs":
+        lost = run.base_rows[0].psnr - full[0]
         line = f"s = 1 is {lost:.2f} dB below the base on the held-out photographs"
-        bad, failed = not lost <= LOST[0], not lost <= LOST[1]
+        more, bad, failed = "", not lost <= LOST[0], not lost <= LOST[1]
     else:
         line = f"s = 1 has {full[0]:.2f} dB against the checkpoint's own renderings"
-        bad, failed = not full[0] >= ENOUGH[0], not full[0] >= ENOUGH[1]
-    more = "" if photographs else ", or give the photographs (--images)"
+        more, bad, failed = ", or give the photographs (--images)", not full[0] >= ENOUGH[0], not full[0] >= ENOUGH[1]
     return (f"{line}:\ntrain longer (--iters){more}, or keep the base for full quality" if bad else ""), failed
 
 
-def teacher(args: argparse.Namespace) -> str:
-    return "checkpoint" if args.images is None else "photographs"
-
-
-def print_summary(run: Run, measured: Measurements, taken: dict[str, float]) -> None:
+def print_summary(run: Run, result: Result, taken: dict[str, float]) -> None:
     args, outputs = run.args, run.outputs
-    if measured.rows:
-        marked = [("base", row) for row in measured.base] + by_dial(measured.rows)
-        print(f"\n{table(marked + [('plain', row) for row in measured.plain])}\n")
-        if measured.plain:
+    if result.rows:
+        marked = [("base", row) for row in run.base_rows] + by_dial(result.rows)
+        print(f"\n{table(marked + [('plain', row) for row in result.plain])}\n")
+        if result.plain:
             print(f"plain: {outputs.ply} in a viewer that does not know the dial\n")
     for path in vars(outputs).values():
         print(f"{size(path):>9}  {path}")
