@@ -33,21 +33,15 @@ class Saver:
     """Saves the training state of one run; finds that of an earlier one, of the same settings, with ``resume``.
 
     A file that is no training state is refused, and not replaced.
-
-    Attributes:
-        state: the one to resume from.
-        saved: the step that is in the file; None if the file is not of this run.
-        latest: the last progress that is not saved; it references everything that is trained.
-        due: when the next save is.
     """
 
     def __init__(self, path: Path, config: AdaptConfig, console: Console, stop: GracefulStop, resume: bool) -> None:
         self.path, self.console, self.stop = path, console, stop
         self.run_of = settings_key(config)
-        self.state: TrainingState | None = None
-        self.saved: int | None = None
-        self.latest: Progress | None = None
-        self.due, self.warned = 0.0, False
+        self.state: TrainingState | None = None  # the one to resume from
+        self.saved: int | None = None  # the step that is in the file; None if the file is not of this run
+        self.latest: Progress | None = None  # the last that is not saved; it references everything that is trained
+        self.due, self.warned = 0.0, False  # when the next save is, and whether one has failed
         if path.exists():
             found, self.then = load_state(path)
             if resume:

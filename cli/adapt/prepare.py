@@ -51,21 +51,17 @@ WRITING = 1e8  # bytes of a PLY per second, with everything that is written besi
 
 
 class Run:
-    """The arguments, the services that all steps use, and what ``read`` has found.
+    """The arguments, the services that all steps use, and what ``read`` and ``measure_base`` have found.
 
-    Attributes:
-        scene, config: without photographs or with too few, with pseudo views and lower learning rates.
-        alignment: the measurements of the alignment check; None without photographs.
-        memory: the plan for ``--memory``; None without the option.
-        base_rows: the base at dial value 1, none if nothing is held out; base_seconds: the time of measuring it.
+    Without photographs, or with too few, ``scene`` has pseudo views, and ``config`` lower learning rates.
     """
 
     base: Checkpoint
     scene: Scene
-    alignment: dict[str, Any] | None = None
-    memory: MemoryPlan | None = None
-    base_rows: list[Row]
-    base_seconds = 0.0
+    alignment: dict[str, Any] | None = None  # the measurements of the check; None without photographs
+    memory: MemoryPlan | None = None  # for --memory
+    base_rows: list[Row]  # at dial value 1; none if nothing is held out
+    base_seconds = 0.0  # of measuring it
     forecast: dict[str, Any] | None = None
     forecast_at = 0.0
 

@@ -1,7 +1,6 @@
 """``--memory``: a scene in blocks is trained in one process, also after a kill, an interrupt or an error."""
 
 import json
-import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -27,11 +26,6 @@ def in_blocks(*args: Any) -> MemoryPlan:
     return replace(plan_for_limit(*args), blocks=BLOCKS)
 
 
-@pytest.fixture
-def forced(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(prepare, "plan_for_limit", in_blocks)
-
-
 @pytest.fixture(scope="module")
 def given(capture: Any, tmp_path_factory: pytest.TempPathFactory) -> list[Any]:
     """Arguments; some opacities of the checkpoint are infinite, as in files in the wild."""
@@ -43,8 +37,9 @@ def given(capture: Any, tmp_path_factory: pytest.TempPathFactory) -> list[Any]:
 
 
 @pytest.fixture
-def adapt(clod: Callable[..., Any], given: list[Any]) -> Callable[..., Any]:
-    """Adapts with ``--memory``, in blocks with ``forced``."""
+def adapt(clod: Callable[..., Any], given: list[Any], monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
+    """Adapts in blocks."""
+    monkeypatch.setattr(prepare, "plan_for_limit", in_blocks)
     return lambda out, *more: clod(*given, "--memory", "8GB", "--out", out, *more)
 
 
@@ -85,7 +80,6 @@ def interrupt(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(listeners.Saver, "saving", listening)
 
 
-@pytest.mark.usefixtures("forced")
 @pytest.mark.parametrize(
     ("ended", "code", "said", "state", "steps"),
     [
@@ -109,30 +103,23 @@ def test_same_command_resumes_an_interrupted_block(
     finished = ["a.block1.pass1.safetensors"] if "block2" in state else []
     assert names(tmp_path) == sorted([*finished, state])
     for name in finished:
-        assert_others_are_refused(adapt, tmp_path / name, tmp_path / "a.block2.pass1.safetensors")
+        content, other = Path(name).read_bytes(), "a.block2.pass1.safetensors"
+        for file, data, more, message in (
+            (name, content, ["--seed", 1], "is of a run with another config; remove it, or give --out"),
+            (name, content, ["--with", "unseen"], "is of a run with another config; remove it"),
+            (other, content, [], "is of a run with another block"), (name, content[:-9], [], "is no block or is dam"),
+        ):  # fmt: skip
+            Path(file).write_bytes(data)
+            done = adapt("a.ply", *more)
+            assert done.code == 2 and f"{file}: {message}" in done.err, done
+            Path(other).unlink(missing_ok=True)
+        Path(name).write_bytes(content)
     done = adapt("a.ply")
     assert done.code == 0 and f"resuming {state} from step {steps}" in done.err, done
     assert ("block 1 of 3, pass 1" in done.err) == ("block1" in state)
     assert outputs(tmp_path, "a") == whole and names(tmp_path) == ["a.json", "a.ply", "a.safetensors"]
 
 
-def assert_others_are_refused(adapt: Any, first: Path, second: Path) -> None:
-    def refused(message: str, *more: object) -> None:
-        done = adapt("a.ply", *more)
-        assert done.code == 2 and message in done.err, done
-
-    content = first.read_bytes()
-    refused(f"{first.name}: is of a run with another config; remove it, or give --out", "--seed", 1)
-    refused(f"{first.name}: is of a run with another config; remove it", "--with", "unseen")
-    shutil.copy(first, second)
-    refused(f"{second.name}: is of a run with another block")
-    second.unlink()
-    first.write_bytes(content[:-9])
-    refused(f"{first.name}: is no block or is damaged")
-    first.write_bytes(content)
-
-
-@pytest.mark.usefixtures("forced")
 def test_blocks_follow_the_plan_of_the_whole(clod: Any, adapt: Any, given: list[Any], tmp_path: Path) -> None:
     """The same decisions; with --trim what is left out is not written; what is frozen is not tuned."""
     frozen = ["--without", "means", "--growth", "off", "--json"]
@@ -146,7 +133,6 @@ def test_blocks_follow_the_plan_of_the_whole(clod: Any, adapt: Any, given: list[
     assert kept is not None and len(few) == int(kept.sum()) < len(base) and torch.equal(few.means, base.means[kept])
 
 
-@pytest.mark.usefixtures("forced")
 def test_blocks_that_fail_or_are_held_are_reported(
     adapt: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -167,11 +153,11 @@ def test_blocks_that_fail_or_are_held_are_reported(
     assert clod_adapter.load(tmp_path / "a.ply").gaussians.sigma_d is not None
 
 
-def test_sufficient_memory_changes_nothing(clod: Any, adapt: Any, given: list[Any], tmp_path: Path) -> None:
+def test_sufficient_memory_changes_nothing(clod: Any, given: list[Any], tmp_path: Path) -> None:
     """Files of an earlier run in blocks are removed with the result."""
     assert clod(*given, "--out", "a.ply").code == 0
     (tmp_path / "[b].block1.pass1.safetensors").write_bytes((tmp_path / "a.safetensors").read_bytes())
-    done = adapt("[b].ply")
+    done = clod(*given, "--memory", "8GB", "--out", "[b].ply")
     assert done.code == 0 and "the whole scene at once" in done.err and "training" in done.err
     assert names(tmp_path) == [f"{name}.{kind}" for name in ("[b]", "a") for kind in ("json", "ply", "safetensors")]
     assert outputs(tmp_path, "a") == outputs(tmp_path, "[b]")

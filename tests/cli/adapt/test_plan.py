@@ -5,13 +5,11 @@ import re
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 
 import clod_adapter
 from clod_adapter.cli import adapt
-from clod_adapter.cli.adapt.prepare import mapped
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.training.plan import NAMES
 
@@ -91,10 +89,3 @@ def test_overrides(clod: Any, capture: Any, wasteful: Path, tmp_path: Path) -> N
 
 def test_options_name_the_items_of_the_plan() -> None:
     assert adapt.NAMES == NAMES
-
-
-def test_arrays_on_disk(tmp_path: Path) -> None:
-    array = np.arange(6.0)
-    there = mapped(array, tmp_path)
-    assert there is not array and (there == array).all() and not list(tmp_path.iterdir())
-    assert mapped(array, tmp_path / "absent") is array
