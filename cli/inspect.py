@@ -53,10 +53,9 @@ def lines_of(found: Inspection) -> list[str]:
         lines.append(_line("written by" if found.writer.startswith("clod-adapter") else "looks like", found.writer))
     lines += splat_lines(found.splat) if found.splat else []
     lines += tensor_lines(found.about) if found.about else []
-    warnings = [note.removeprefix(WARNING) for note in found.notes if note.startswith(WARNING)]
     lines += _block("anomaly", [anomaly.says for anomaly in found.anomalies]) + _block("excluded", found.left_out)
-    notes = [note for note in found.notes if not note.startswith(WARNING)]
-    return lines + _block("note", notes) + _block("warning", warnings)
+    lines += _block("note", [note for note in found.notes if not note.startswith(WARNING)])
+    return lines + _block("warning", [note.removeprefix(WARNING) for note in found.notes if note.startswith(WARNING)])
 
 
 def splat_lines(splat: Splat) -> list[str]:
