@@ -23,7 +23,6 @@ from runs import OUTPUTS, names
 from scenes import stripped
 
 TINY = ("--iters", 12, "--max-sv", 4, "--out", "dial.ply")
-EARLIER = "of an earlier run of clod_adapter"
 
 
 def columns(path: Path) -> list[str]:
@@ -176,6 +175,14 @@ def test_without_photographs(clod: Any, capture: Any, tmp_path: Path, monkeypatc
     assert rebuilt(clod, capture.ply, tmp_path) and report["calibration"]["against"] == "checkpoint"
     (note, *_) = json.loads(clod("export", "dial.ply", "--psnr-drop", 1, "-o", "plain.ply", "--json").out)["notes"]
     assert "without photographs, against renders of the checkpoint" in note
+
+
+def test_ci_banana(clod: Any, ci_banana: Path) -> None:
+    """A real capture."""
+    words = (ci_banana / "pretrained.ply", "--images", ci_banana / "images", "--iters", 5, "--out", "dial.ply")
+    report = json.loads(clod(*words, "--json").out)
+    assert report["base_count"] == 20_000 and report["base_rows"][0]["psnr"] == pytest.approx(25.81, abs=0.02)
+    assert report["rows"][-1]["kept_share"] < 0.3
 
 
 def test_unusual_inputs(clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
