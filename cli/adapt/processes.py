@@ -25,7 +25,7 @@ from clod_adapter.training.pseudo_views import teachers_to
 from clod_adapter.training.state import Adapted, TrainingState
 
 from ..shared.console import ProgressDisplay
-from ..shared.process import GracefulStop, launched
+from ..shared.process import GracefulStop, Launch, launched
 
 BACKENDS = {"cpu": "gloo", "cuda": "nccl"}  # of torch.distributed, by device
 if TYPE_CHECKING:
@@ -88,17 +88,27 @@ def take_part() -> None:
     with stop.listening(), suppress(ProcessLost):
         if not _is_called(stop, launch.rank):
             return
-        with joined(_store(), launch.rank, launch.size) as group, _giving_reasons(launch.rank):
-            job: Any = group.broadcast(None)
-            base, views, config, state, subset, device = job
-            if device == "cuda":  # one for each process on this machine
-                if (gpus := torch.cuda.device_count()) < launch.local_size:
-                    raise ClodError(
-                        f"{launch.local_size} processes on a machine with {gpus} GPUs; start as many as there are"
-                    )
-                torch.cuda.set_device(launch.local_rank)
-            scene = Scene(teachers_to(views, device), ())
-            adapt(base.to(device), scene, config, stop.heeding(), state, subset=subset, group=group)
+        with joined(_store(), launch.rank, launch.size) as group:
+            try:
+                _train(group, launch, stop)
+            except ProcessLost:
+                raise
+            except Exception as error:  # told before the others notice that this process has ended
+                with suppress(RuntimeError):
+                    said = str(error) or type(error).__name__
+                    _store().set(_reason(launch.rank), f"process {launch.rank}: {said}")
+                raise
+
+
+def _train(group: ProcessGroup, launch: Launch, stop: GracefulStop) -> None:
+    job: Any = group.broadcast(None)
+    base, views, config, state, subset, device = job
+    if device == "cuda":  # one for each process on this machine
+        if (gpus := torch.cuda.device_count()) < launch.local_size:
+            raise ClodError(f"{launch.local_size} processes on a machine with {gpus} GPUs; start as many as there are")
+        torch.cuda.set_device(launch.local_rank)
+    scene = Scene(teachers_to(views, device), ())
+    adapt(base.to(device), scene, config, stop.heeding(), state, subset=subset, group=group)
 
 
 def explain(lost: str) -> str:
@@ -113,19 +123,6 @@ def explain(lost: str) -> str:
 def hurried(adapted: Adapted) -> bool:
     """Whether the launcher ends the processes: after its signal, or a lost process, it waits for 30 seconds."""
     return adapted.interrupted and not adapted.failed and launched().size > 1
-
-
-@contextmanager
-def _giving_reasons(rank: int) -> Iterator[None]:
-    """Stores the error that ends this process, before the others notice that it has ended."""
-    try:
-        yield
-    except ProcessLost:
-        raise
-    except Exception as error:
-        with suppress(RuntimeError):
-            _store().set(_reason(rank), f"process {rank}: {str(error) or type(error).__name__}")
-        raise
 
 
 def _is_called(stop: GracefulStop, rank: int) -> bool:
