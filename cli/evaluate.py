@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from contextlib import suppress
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -97,13 +98,18 @@ def execute(args: Namespace) -> dict[str, Any]:
         if not stop.requests:
             (rows,) = measuring.with_frame_times([(model, rows)], scene.test, console, stop)
         print(measuring.table(measuring.by_dial(rows)))
-        if not stop.requests:
-            comparisons.measure(rows, base, dict(zip(args.against, others, strict=True)), args.popping)
+        with suppress(Stopped):
+            if base is not None:
+                comparisons.prune(base, rows)
+            if others:
+                comparisons.match(dict(zip(args.against, others, strict=True)), rows)
+            if args.popping:
+                comparisons.pop(max(row.virtual_scale for row in rows))
     print(comparisons.text(), end="")
     report: dict[str, Any] = {
         "command": "eval", "version": package_version(), "model": args.model, "scene": args.images,
         "base_count": len(model), "sh_degree": model.sh_degree, "views": len(scene.test),
-        "rows": [row.as_dict() for row in rows], "base": args.base, **comparisons.report(),
+        "rows": [row.as_dict() for row in rows], "base": args.base, **comparisons.report,
         "interrupted": stop.requests > 0, "attenuation": asdict(model.attenuation) if model.attenuation else None,
         "notes": console.notes, "machine": measuring.machine(), "device": str(model.means.device),
         "seconds": watch.report(),
@@ -113,41 +119,18 @@ def execute(args: Namespace) -> dict[str, Any]:
     return report
 
 
-@dataclass
 class Comparisons:
-    """Comparisons of a model; those that are finished.
+    """Comparisons of a model; those that are finished, in ``report`` for --json and as text."""
 
-    Attributes:
-        base_row: the unadapted base with all its Gaussians.
-        ranked: (row of the model, ranking, the base pruned by that ranking to the same count).
-        against: (file, its row, row of the model at the dial value with the same count).
-        popping: (what moves, how the image changes).
-    """
-
-    model: Gaussians
-    scene: Scene
-    console: Console
-    stop: GracefulStop
-    base_row: Row | None = None
-    ranked: list[tuple[Row, str, Row]] = field(default_factory=list)
-    against: list[tuple[str, Row, Row]] = field(default_factory=list)
-    popping: list[tuple[str, Popping]] = field(default_factory=list)
-
-    def measure(
-        self, rows: Sequence[Row], base: Gaussians | None, others: Mapping[str, Gaussians], popping: bool
-    ) -> None:
-        """Measures those asked for, until Ctrl-C: the base at the counts of ``rows``, others at their dial values."""
-        try:
-            if base is not None:
-                self.prune(base, rows)
-            if others:
-                self.match(others, rows)
-            if popping:
-                self.pop(max(row.virtual_scale for row in rows))
-        except Stopped:
-            return
+    def __init__(self, model: Gaussians, scene: Scene, console: Console, stop: GracefulStop) -> None:
+        self.model, self.scene, self.console, self.stop = model, scene, console, stop
+        self.report: dict[str, Any] = {"base_row": None, "ranked": [], "against": [], "popping": []}
+        self.pruned: list[tuple[str, Row]] = []
+        self.matched: list[tuple[str, Row]] = []
+        self.popping: list[tuple[str, Popping]] = []
 
     def prune(self, base: Gaussians, rows: Sequence[Row]) -> None:
+        """Measures the base with all its Gaussians, and pruned by two rankings to the counts of ``rows``."""
         from clod_adapter.cameras import spread
         from clod_adapter.initialization.importance import MOST_VIEWS, removal_error
 
@@ -158,27 +141,35 @@ class Comparisons:
         orders = {by: each.argsort(descending=True, stable=True) for by, each in values.items()}
         jobs = [(row, by, order) for row in rows for by, order in orders.items()]
         with self.console.meter("base") as meter:
-            self.base_row = self._row(base, 1.0, meter.part(0, len(jobs) + 1, "all"))
+            whole = self._row(base, 1.0, meter.part(0, len(jobs) + 1, "all"))
+            self.pruned, self.report["base_row"] = [("base", whole)], whole.as_dict()
             for i, (ours, by, order) in enumerate(jobs, 1):
                 row = self._row(base.select(order[: round(ours.kept)]), 1.0, meter.part(i, len(jobs) + 1, by))
-                self.ranked.append((ours, by, replace(row, kept_share=row.kept / len(base))))  # of the whole base
+                row = replace(row, kept_share=row.kept / len(base))  # of the whole base
+                model = (f"s={ours.virtual_scale:g}", ours)
+                self.pruned += [*([] if model in self.pruned else [model]), (by, row)]
+                self.report["ranked"].append({"virtual_scale": ours.virtual_scale, "by": by, "row": row.as_dict()})
 
     def match(self, others: Mapping[str, Gaussians], rows: Sequence[Row]) -> None:
+        """Measures files at the dial values of ``rows``, and the model at the same counts."""
         from clod_adapter.evaluation.budget import matching_dial, mean_kept
 
         cameras = [view.camera for view in self.scene.test]
         dials = [row.virtual_scale for row in rows]
-        jobs = [(path, g, s) for path, g in others.items() for s in (dials if g.sigma_d is not None else [1.0])]
+        named = zip(others.items(), labels(list(others)), strict=True)
+        jobs = [(*each, name, s) for each, name in named for s in (dials if each[1].sigma_d is not None else [1.0])]
         with self.console.meter("compare") as meter:
-            for i, (path, other, s) in enumerate(jobs):
+            for i, (path, other, name, s) in enumerate(jobs):
                 count = mean_kept(other, cameras, s)
                 same = matching_dial(self.model, cameras, count)
                 if abs((kept := mean_kept(self.model, cameras, same)) - count) > CLOSE * count:
                     more = f"{'at most' if kept < count else 'at least'} {kept:,.0f}"
                     self.console.note(f"{path} keeps {count:,.0f} Gaussians; the model is compared with {more}")
                 listener = meter.part(i, len(jobs), path)
-                theirs = self._row(other, s, listener)
-                self.against.append((path, theirs, self._row(self.model, same, listener)))
+                theirs, ours = self._row(other, s, listener), self._row(self.model, same, listener)
+                self.matched += [(name, theirs), (f"s={ours.virtual_scale:.4g}", ours)]
+                found = {"model": path, "label": name, "theirs": theirs.as_dict(), "ours": ours.as_dict()}
+                self.report["against"].append(found)
 
     def pop(self, max_sv: float) -> None:
         from clod_adapter.evaluation.popping import dial_popping, path_popping
@@ -200,6 +191,7 @@ class Comparisons:
             for i, (moved, sweep) in enumerate(jobs):
                 found = sweep(progress=self.stop.heeding(meter.part(i, len(jobs), moved)))
                 self.popping.append((moved, found))
+                self.report["popping"].append({"moved": moved, **found.as_dict()})
 
     def _row(self, gaussians: Gaussians, virtual_scale: float, listener: Listener) -> Row:
         from clod_adapter.evaluation.evaluate import evaluate
@@ -209,43 +201,14 @@ class Comparisons:
             raise Stopped("stopped within a comparison")
         return rows[0]
 
-    def _names(self) -> dict[str, str]:
-        files = list(dict.fromkeys(path for path, *_ in self.against))
-        return dict(zip(files, labels(files), strict=True))
-
-    def report(self) -> dict[str, Any]:
-        """For --json."""
-        names = self._names()
-        return {
-            "base_row": self.base_row and self.base_row.as_dict(),
-            "ranked": [
-                {"virtual_scale": ours.virtual_scale, "by": by, "row": row.as_dict()} for ours, by, row in self.ranked
-            ],
-            "against": [
-                {"model": path, "label": names[path], "theirs": theirs.as_dict(), "ours": ours.as_dict()}
-                for path, theirs, ours in self.against
-            ],
-            "popping": [{"moved": moved, **result.as_dict()} for moved, result in self.popping],
-        }
-
     def text(self) -> str:
         """For the console; empty without comparisons."""
         from .shared.measure import popping_table, table
 
-        parts: list[str] = []
-        if self.base_row:
-            rows = [("base", self.base_row)]
-            for ours, by, row in self.ranked:
-                model = (f"s={ours.virtual_scale:g}", ours)
-                rows += [*([] if model in rows else [model]), (by, row)]
-            parts.append(f"the unadapted base, pruned to the same counts by two rankings:\n{table(rows)}")
-        if self.against:
-            rows, names = [], self._names()
-            for path, theirs, ours in self.against:
-                rows += [(names[path], theirs), (f"s={ours.virtual_scale:.4g}", ours)]
-            parts.append(f"other files, each row followed by the dial value with the same count:\n{table(rows)}")
-        if self.popping:
-            parts.append(popping_table(self.popping))
+        pruned = "the unadapted base, pruned to the same counts by two rankings"
+        matched = "other files, each row followed by the dial value with the same count"
+        parts = [f"{title}:\n{table(rows)}" for title, rows in ((pruned, self.pruned), (matched, self.matched)) if rows]
+        parts += [popping_table(self.popping)] if self.popping else []
         return "".join(f"\n{part}\n" for part in parts)
 
 

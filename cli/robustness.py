@@ -29,10 +29,6 @@ if TYPE_CHECKING:
     from clod_adapter.cameras import Scene
     from clod_adapter.io.checkpoint import Checkpoint
 
-COLUMNS = (
-    "checkpoint", "max_sv", "within_range", "virtual_scale", "psnr", "ssim", "kept", "kept_share", "in_view", "frame_ms"
-)  # fmt: skip
-
 
 def add_arguments(parser: ArgumentParser) -> None:
     given = parser.add_argument_group("input")
@@ -62,9 +58,9 @@ def check(args: Namespace) -> None:
 
 def outputs(args: Namespace) -> Outputs:
     folder, cells = Path(args.out), Path(args.out) / "cells"
-    names = [cell_name(label, max_sv) for label in labels(args.ply) for max_sv in (None, *args.max_sv)]
     files = [*result_files(folder).values()]
-    files += [cells / f"{name}{suffix}" for name in names for suffix in (".json", ".safetensors")]
+    for label in labels(args.ply):
+        files += [path for max_sv in (None, *args.max_sv) for path in cell_files(cells, label, max_sv)]
     return Outputs(derived=files, folders=[folder, cells], inputs=args.ply, scene=args.images)
 
 
@@ -73,9 +69,10 @@ def result_files(folder: Path) -> dict[str, Path]:
     return {kind: folder / f"robustness.{kind}" for kind in ("png", "csv", "json")}
 
 
-def cell_name(label: str, max_sv: float | None) -> str:
-    """The name of a checkpoint's cell: at a range, or of the baseline for None."""
-    return f"{label}_base" if max_sv is None else f"{label}_sv{max_sv:g}"
+def cell_files(folder: Path, label: str, max_sv: float | None) -> tuple[Path, Path]:
+    """Rows and adapter of a checkpoint's cell: at a range, or of the baseline for None."""
+    name = f"{label}_base" if max_sv is None else f"{label}_sv{max_sv:g}"
+    return folder / f"{name}.json", folder / f"{name}.safetensors"
 
 
 @dataclass(frozen=True)
@@ -86,7 +83,8 @@ class Cell:
         label: names the checkpoint.
         points: dial values, or shares of the baseline, that are measured.
         scene_sha256: of its photographs.
-        folder: of all cells.
+        file: its rows, as JSON, which mark it as finished.
+        adapter_file: not of a baseline.
     """
 
     label: str
@@ -94,15 +92,12 @@ class Cell:
     config: AdaptConfig | None
     points: tuple[float, ...]
     scene_sha256: str
-    folder: Path
-
-    @property
-    def max_sv(self) -> float | None:
-        return self.config.max_sv if self.config else None
+    file: Path
+    adapter_file: Path
 
     @property
     def name(self) -> str:
-        return cell_name(self.label, self.max_sv)
+        return self.file.stem
 
     @property
     def key(self) -> dict[str, Any]:
@@ -114,20 +109,17 @@ class Cell:
             **({"screen_filter": repr(drawn)} if drawn != CLASSIC else {}),
         }  # fmt: skip
 
-    def file(self, suffix: str) -> Path:
-        return self.folder / f"{self.name}{suffix}"
-
     def read(self) -> dict[str, Any] | None:
         """The finished cell, or None if there is none with this key."""
         try:
-            found = json.loads(self.file(".json").read_text(encoding="utf-8"))
+            found = json.loads(self.file.read_text(encoding="utf-8"))
         except (OSError, ValueError):
             return None
         same = isinstance(found, dict) and found.get("key") == self.key
-        return found if same and (self.config is None or self.file(".safetensors").is_file()) else None
+        return found if same and (self.config is None or self.adapter_file.is_file()) else None
 
     def run(self, scene: Scene, progress: Listener) -> dict[str, Any]:
-        """Measures; writes the adapter and then the rows, which mark the cell as finished."""
+        """Measures; writes the adapter and then the rows."""
         from clod_adapter.evaluation.robustness import adapt_at_range, baseline
         from clod_adapter.io.adapter_file import save_adapter
 
@@ -141,16 +133,16 @@ class Cell:
                 base.gaussians, scene, self.config, self.points, fingerprint=base.fingerprint, origin=base.origin,
                 progress=progress,
             )  # fmt: skip
-        self.file(".json").unlink(missing_ok=True)
+        self.file.unlink(missing_ok=True)
         if result.adapter:
-            save_adapter(self.file(".safetensors"), result.adapter)
+            save_adapter(self.adapter_file, result.adapter)
         cell = {
-            "checkpoint": as_text(self.label), "max_sv": self.max_sv, "rows": result.rows,
-            "adapter": str(self.file(".safetensors")) if result.adapter else None,
+            "checkpoint": as_text(self.label), "max_sv": self.config and self.config.max_sv, "rows": result.rows,
+            "adapter": str(self.adapter_file) if result.adapter else None,
             "seconds": round(result.seconds, 3), "distribution": result.distribution, "machine": machine(),
             "key": self.key,
         }  # fmt: skip
-        write_report(self.file(".json"), cell)
+        write_report(self.file, cell)
         return cell
 
 
@@ -172,18 +164,26 @@ def execute(args: Namespace) -> dict[str, Any]:
     names, configs, sha256 = labels(args.ply), make_configs(args), scene_fingerprint(scene)
     # Every range is measured at the dial values of the widest one and at its own end.
     dials = tuple(sorted({*report_dials(configs[-1].max_sv), *(config.max_sv for config in configs)}))
-    cells = [
-        Cell(name, base, config, BASELINE_SHARES if config is None else dials, sha256, Path(args.out) / "cells")
-        for base, name in zip(checkpoints, names, strict=True) for config in (None, *configs)
-    ]  # fmt: skip
+    cells = list[Cell]()
+    for base, name in zip(checkpoints, names, strict=True):
+        for config in (None, *configs):
+            points, max_sv = (BASELINE_SHARES, None) if config is None else (dials, config.max_sv)
+            cells.append(Cell(name, base, config, points, sha256, *cell_files(Path(args.out) / "cells", name, max_sv)))
     found = {cell.name: done for cell in cells if (done := cell.read())}
     if found:
         console.say(f"{len(found)} of {len(cells)} cells are done already: {', '.join(found)}")
     with stop.listening():
-        interrupted = not run_cells(cells, found, scene, console, stop)
+        for k, cell in enumerate(cells, 1):
+            display = ProgressDisplay(console, stop, f"{cell.name} ({k}/{len(cells)}) training")
+            try:
+                with closing(display):
+                    found[cell.name] = found.get(cell.name) or cell.run(scene, display)
+            except Stopped:
+                console.say(f"{cell.name} was not finished; the same command continues with it")
+                break
         if not found:
             raise Stopped("stopped before the first cell was finished")
-        files = result_files(Path(args.out))
+        files, missing = result_files(Path(args.out)), [cell.name for cell in cells if cell.name not in found]
         report = {
             "command": "robustness", "version": package_version(), "scene": args.images,
             "checkpoints": [
@@ -191,29 +191,13 @@ def execute(args: Namespace) -> dict[str, Any]:
                 for label, each in zip(names, checkpoints, strict=True)
             ],
             "cells": [found[cell.name] for cell in cells if cell.name in found],
-            "missing": [cell.name for cell in cells if cell.name not in found],
-            "interrupted": interrupted, "notes": console.notes, "views": len(scene.test), "machine": machine(),
-            "seconds": watch.report(), "outputs": {k: str(v) for k, v in files.items()},
+            "missing": missing, "interrupted": bool(missing), "notes": console.notes, "views": len(scene.test),
+            "machine": machine(), "seconds": watch.report(), "outputs": {k: str(v) for k, v in files.items()},
         }  # fmt: skip
         write_results(report, files, Path(args.images).resolve().name)
     print_cells(report)
     print("\n" + "\n".join(map(str, files.values())) + f"\n\n{duration(watch.total())} in all")
     return report
-
-
-def run_cells(
-    cells: list[Cell], found: dict[str, dict[str, Any]], scene: Scene, console: Console, stop: GracefulStop
-) -> bool:
-    """Adds the cells that are not in ``found`` by name; False if Ctrl-C ended one."""
-    for k, cell in enumerate(cells, 1):
-        display = ProgressDisplay(console, stop, f"{cell.name} ({k}/{len(cells)}) training")
-        try:
-            with closing(display):
-                found[cell.name] = found.get(cell.name) or cell.run(scene, display)
-        except Stopped:
-            console.say(f"{cell.name} was not finished; the same command continues with it")
-            return False
-    return True
 
 
 def write_results(report: dict[str, Any], files: dict[str, Path], scene: str) -> None:
@@ -222,7 +206,7 @@ def write_results(report: dict[str, Any], files: dict[str, Path], scene: str) ->
     title = f"{as_text(scene)}: the dial after the fact, by range; mean of {report['views']} held-out photographs"
     robustness_figure(files["png"], report["cells"], title)
     with atomic_path(files["csv"]) as part, open(part, "w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, COLUMNS)
+        writer = csv.DictWriter(file, ["checkpoint", "max_sv", "within_range", *report["cells"][0]["rows"][0]])
         writer.writeheader()
         for cell in report["cells"]:
             name, limit = cell["checkpoint"], cell["max_sv"]

@@ -110,20 +110,19 @@ def table(marked: Sequence[tuple[str, Row]]) -> str:
     return "\n".join(lines)
 
 
+POPPING = """\
+popping: change of the image per step, in levels of 255 (RMS over the image,
+largest change of a pixel). Halving the step halves the largest change of a
+fade (0.5), but not that of a jump (1.0):
+  steps     mean  largest     at  / mean  halved   pixel  halved"""
+
+
 def popping_table(results: Sequence[tuple[str, Popping]]) -> str:
-    lines = [
-        "popping: change of the image per step, in levels of 255 (RMS over the image,",
-        "largest change of a pixel). Halving the step halves the largest change of a",
-        "fade (0.5), but not that of a jump (1.0):",
-        "  steps     mean  largest     at  / mean  halved   pixel  halved",
-    ]
+    text = POPPING
     for moved, p in results:
-        lines.append(moved)
-        lines.append(
-            f"  {p.steps:5}  {p.mean:7.4f}  {p.largest:7.4f}  {p.at:5.2f}  {p.ratio:6.1f}"
-            f"  {p.persistence:6.2f}  {p.pixel:6.1f}  {p.pixel_persistence:6.2f}"
-        )
-    return "\n".join(lines)
+        text += f"\n{moved}\n  {p.steps:5}  {p.mean:7.4f}  {p.largest:7.4f}  {p.at:5.2f}  {p.ratio:6.1f}"
+        text += f"  {p.persistence:6.2f}  {p.pixel:6.1f}  {p.pixel_persistence:6.2f}"
+    return text
 
 
 DIALS = (1.0, 2.0, 3.0, 5.0)
@@ -153,21 +152,18 @@ def with_frame_times(
 ) -> list[list[Row]]:
     """The rows of each model with frame times that can be compared; unchanged after a signal."""
     jobs = [(model, sorted({row.virtual_scale for row in rows})) for model, rows in measured]
-    unchanged = [rows for _, rows in measured]
-    if not any(unchanged):
-        return unchanged
+    found = [rows for _, rows in measured]
+    if not any(found):
+        return found
     try:
         with console.meter(Phase.FRAME_TIMES) as meter:
             times = time_frames(jobs, [view.camera for view in views], stop.heeding(meter))
     except Stopped:
-        return unchanged
-    for note in times.notes:
-        console.note(note)
-    taken = [dict(zip(dials, found, strict=True)) for (_, dials), found in zip(jobs, times.milliseconds, strict=True)]
-    return [
-        [replace(row, frame_ms=found[row.virtual_scale]) for row in rows]
-        for rows, found in zip(unchanged, taken, strict=True)
-    ]
+        return found
+    console.note(*times.notes)
+    for k, ((_, dials), taken) in enumerate(zip(jobs, times.milliseconds, strict=True)):
+        found[k] = [replace(row, frame_ms=taken[dials.index(row.virtual_scale)]) for row in found[k]]
+    return found
 
 
 BLOCK = 8  # pixels
@@ -200,8 +196,7 @@ def solve_dials(
         with console.meter("timing") as meter:
             times, notes = frame_times(model.gaussians, whole, progress=meter)
         (first, slow), (last, fast) = times[0], times[-1]
-        for note in (f"frames timed here: {slow:.1f} ms at s = {first:g}, {fast:.1f} ms at s = {last:g}", *notes):
-            console.note(note)
+        console.note(f"frames timed here: {slow:.1f} ms at s = {first:g}, {fast:.1f} ms at s = {last:g}", *notes)
     elif name != "keep" and calibration is None:
         why = next((note for note in model.notes if "calibration" in note), "")
         raise no_calibration(model.path, option, why)
