@@ -47,11 +47,8 @@ def check(args: Namespace) -> None:
     common.check_dials(args, args.model)
     check_readable(Path(args.model))
     common.check_scene(args.images)
-    check_folder(Path(args.out), Path(args.images))
-
-
-def check_folder(out: Path, scene: Path) -> None:
-    """Refuses an output folder in which images could replace photographs of the scene."""
+    # Images must not replace photographs of the scene.
+    out, scene = Path(args.out), Path(args.images)
     cameras = find_cameras(scene)
     places = [folder.resolve() for folder in (scene, cameras.parent, cameras.parent.parent)]
     folders = photograph_folders(scene, cameras)

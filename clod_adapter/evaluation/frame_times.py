@@ -51,22 +51,25 @@ def time_frames(models: Sequence[Model], cameras: Sequence[Camera], progress: Li
     """Times frames from at most three of the cameras, evenly spread; the first dial value of all is the slowest."""
     if not cameras:
         raise ClodError("there are no cameras to time frames from")
-    jobs = [(lean, s) for some, dials in models for lean in [some.without_empty_bands()] for s in dials]
+    jobs = list[tuple[Gaussians, float]]()
+    for some, dials in models:
+        lean = some.without_empty_bands()
+        jobs += [(lean, 1.0 if lean.sigma_d is None else s) for s in dials]
     slowest = _warm_up(*jobs[0], cameras[0])
     views = cameras[:: -(-len(cameras) // VIEWS)]
     if slowest * len(views) * len(jobs) > SECONDS / FEWEST:
         views = views[len(views) // 2 :][:1]
     began, passes = time.perf_counter(), list[list[float]]()
     while len(passes) < PASSES and (len(passes) < FEWEST or time.perf_counter() - began < SECONDS):
-        taken = [[_seconds(*job, view) for job in jobs] for view in views]
+        taken = [[timed_frame(lean, view, s)[1] for lean, s in jobs] for view in views]
         passes.append([1e3 * statistics.fmean(each) for each in zip(*taken, strict=True)])
         tell(progress, Phase.FRAME_TIMES, len(passes), PASSES)
     found, first = list[tuple[float, ...]](), 0
     for _, dials in models:
         found.append(tuple(settled([each[first : first + len(dials)] for each in passes])))
         first += len(dials)
-    spread = statistics.median(_spread(column) for column in zip(*passes, strict=True))
-    return FrameTimes(tuple(found), spread)
+    quartiles = [statistics.quantiles(column, n=4, method="inclusive") for column in zip(*passes, strict=True)]
+    return FrameTimes(tuple(found), statistics.median((high - low) / middle for low, middle, high in quartiles))
 
 
 def settled(passes: Sequence[Sequence[float]]) -> list[float]:
@@ -81,24 +84,15 @@ def settled(passes: Sequence[Sequence[float]]) -> list[float]:
     return [statistics.fmean(level) for level in levels for _ in level]
 
 
-def _spread(times: Sequence[float]) -> float:
-    low, middle, high = statistics.quantiles(times, n=4, method="inclusive")
-    return (high - low) / middle
-
-
 def _warm_up(gaussians: Gaussians, virtual_scale: float, camera: Camera) -> float:
     """Renders until the times are steady, with compiled functions and a raised clock rate; the last time, seconds."""
     began, before = time.perf_counter(), 0.0
     for _ in range(WARM_FRAMES):
-        taken = _seconds(gaussians, virtual_scale, camera)
+        taken = timed_frame(gaussians, camera, virtual_scale)[1]
         if abs(taken - before) <= STEADY * taken or time.perf_counter() - began > WARM_SECONDS:
             break
         before = taken
     return taken
-
-
-def _seconds(gaussians: Gaussians, virtual_scale: float, camera: Camera) -> float:
-    return timed_frame(gaussians, camera, 1.0 if gaussians.sigma_d is None else virtual_scale)[1]
 
 
 def timed_frame(gaussians: Gaussians, camera: Camera, virtual_scale: float) -> tuple[Rendering, float]:

@@ -9,13 +9,12 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from clod_adapter.adapter import Adapter, detach, extract
 from clod_adapter.cameras import Scene, View
 from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
-from clod_adapter.evaluation.evaluate import Row, evaluate
+from clod_adapter.evaluation.evaluate import evaluate
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.origin import NOWHERE, Origin
 from clod_adapter.progress import Listener, Phase, Stopped, tell, within
@@ -60,10 +59,8 @@ def adapt_at_range(
         raise Stopped(f"stopped at step {adapted.steps}")
     adapter = extract(base, adapted.gaussians, fingerprint=fingerprint, config=asdict(config), origin=origin)
     result = adapter.apply(base)
-    rows = _complete(evaluate(result, scene.test, virtual_scales, progress=progress), len(virtual_scales))
-    return CellResult(
-        [row.as_dict() for row in rows], distribution(result), adapter, adapted.start_seconds + adapted.seconds
-    )
+    rows = _rows(result, scene.test, virtual_scales, progress)
+    return CellResult(rows, distribution(result), adapter, adapted.start_seconds + adapted.seconds)
 
 
 def baseline(
@@ -79,29 +76,32 @@ def baseline(
     for k, share in enumerate(shares):
         pruned = base.select(order[: max(1, round(share * len(base)))].sort().values)  # in their own order
         part = within(progress, k * len(views), len(shares) * len(views))
-        (row,) = _complete(evaluate(pruned, views, [1.0], progress=part), 1)
-        rows.append(row.as_dict() | {"kept_share": len(pruned) / len(base)})
+        (row,) = _rows(pruned, views, [1.0], part)
+        rows.append(row | {"kept_share": len(pruned) / len(base)})
     return CellResult(rows, distribution(base))
 
 
-def _complete(rows: list[Row], count: int) -> list[Row]:
-    if len(rows) < count:
-        raise Stopped(f"stopped after {len(rows)} of {count} rows")
-    return rows
+def _rows(
+    gaussians: Gaussians, views: Sequence[View], virtual_scales: Sequence[float], progress: Listener | None
+) -> list[dict[str, float]]:
+    rows = evaluate(gaussians, views, virtual_scales, progress=progress)
+    if len(rows) < len(virtual_scales):
+        raise Stopped(f"stopped after {len(rows)} of {len(virtual_scales)} rows")
+    return [row.as_dict() for row in rows]
 
 
 def distribution(gaussians: Gaussians) -> dict[str, Any]:
     """Histograms with ``edges`` and ``shares``: ``opacity`` over [0, 1], and ``log10_sigma_d`` if there is a dial."""
-    found = {"opacity": _histogram(gaussians.opacities, OPACITY_EDGES)}
+    columns = {"opacity": (gaussians.opacities, OPACITY_EDGES)}
     if gaussians.sigma_d is not None:
-        found["log10_sigma_d"] = _histogram(gaussians.sigma_d.clamp(min=1e-30).log10(), LOG_SIGMA_EDGES)
+        columns["log10_sigma_d"] = gaussians.sigma_d.clamp(min=1e-30).log10(), LOG_SIGMA_EDGES
+    found = {}
+    for name, (values, edges) in columns.items():
+        inner = torch.tensor(edges[1:-1], dtype=torch.float32)
+        bins = torch.bucketize(values.detach().cpu().float(), inner, right=True)
+        counts = bins.bincount(minlength=len(edges) - 1)
+        found[name] = {"edges": list(edges), "shares": (counts / max(len(values), 1)).tolist()}
     return found
-
-
-def _histogram(values: Tensor, edges: Sequence[float]) -> dict[str, list[float]]:
-    inner = torch.tensor(edges[1:-1], dtype=torch.float32)
-    counts = torch.bincount(torch.bucketize(values.detach().cpu().float(), inner, right=True), minlength=len(edges) - 1)
-    return {"edges": list(edges), "shares": (counts / max(len(values), 1)).tolist()}
 
 
 def scene_fingerprint(scene: Scene, progress: Listener | None = None) -> str:
