@@ -19,7 +19,8 @@ def _cpu() -> Rasterizer:
 def _cuda() -> Rasterizer:
     from clod_adapter.rasterizers import cuda
 
-    cuda.require_gsplat()
+    if reason := cuda.unusable():
+        raise ClodError(f"no rasterizer for the GPU: {reason}; or use the CPU (--device cpu)")
     return Rasterizer(cuda.rasterize)
 
 

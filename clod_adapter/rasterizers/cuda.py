@@ -22,7 +22,6 @@ from torch.autograd.function import once_differentiable
 
 from clod_adapter.cameras import Camera
 from clod_adapter.config import CLASSIC, ScreenFilter
-from clod_adapter.errors import ClodError
 from clod_adapter.rasterizers.protocol import drawable, require_float32
 
 TILE = 16
@@ -51,12 +50,6 @@ def unusable() -> str | None:
             f"install nvcc of CUDA {torch.version.cuda}, https://developer.nvidia.com/cuda-toolkit-archive"
         )
     return None
-
-
-def require_gsplat() -> None:
-    """Raises ClodError if gsplat cannot render here."""
-    if reason := unusable():
-        raise ClodError(f"no rasterizer for the GPU: {reason}; or use the CPU (--device cpu)")
 
 
 def rasterize(
@@ -88,7 +81,10 @@ def _project(
     import gsplat
 
     means, quats, scales, opacities = geometry
-    viewmat, K, eye = _camera(camera, means)
+    # In one transfer to the device.
+    parts = (camera.viewmat.flatten(), camera.K.flatten(), camera.position)
+    flat = torch.cat([part.detach().to(means.dtype) for part in parts]).to(means.device, non_blocking=True)
+    viewmat, K, eye = flat[:16].view(1, 4, 4), flat[16:25].view(1, 3, 3), flat[25:]
     *found, radii, means2d, depths, conics, compensations = _call(
         gsplat.fully_fused_projection, means, None, quats, scales, viewmat, K, camera.width, camera.height,
         eps2d=screen_filter.variance, packed=True, near_plane=camera.near, far_plane=math.inf, radius_clip=0.0,
@@ -141,13 +137,6 @@ def _call(function: Callable[..., Any], *args: Any, **options: Any) -> Any:
     """The result of gsplat's function, without the options that the installed version does not have."""
     known = inspect.signature(function).parameters
     return function(*args, **{name: value for name, value in options.items() if name in known})
-
-
-def _camera(camera: Camera, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """View matrix ``[1, 4, 4]``, K ``[1, 3, 3]`` and centre ``[3]`` on the Gaussians' device, in one transfer."""
-    parts = (camera.viewmat.flatten(), camera.K.flatten(), camera.position)
-    flat = torch.cat([part.detach().to(like.dtype) for part in parts]).to(like.device, non_blocking=True)
-    return flat[:16].view(1, 4, 4), flat[16:25].view(1, 3, 3), flat[25:]
 
 
 class _Rows(Function):
