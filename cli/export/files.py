@@ -101,7 +101,13 @@ class Export:
         self.gaussians = self.model.gaussians
         if args.order:
             self.gaussians = self.gaussians.select(order_by_extinction(self.gaussians, self.cameras))
-        self.dials = self._solve()
+        baked, attenuation = self.camera is None and not self.page, self.gaussians.attenuation
+        dials = args.levels or solve_dials(args, self.model, self.cameras, self.console, baked=baked)
+        if dials and self.page:
+            dials = [initial_dial(dials[0], attenuation.max_sv if attenuation else None, self.console)]
+        elif dials:
+            dials = choose_dials(dials, attenuation, self.console)
+        self.dials: list[float] = dials or []
 
     def _find_cameras(self) -> tuple[Sequence[Camera | Viewpoint], str]:
         """The cameras of --camera, --images or the model's file, else placed ones; and what they are."""
@@ -125,13 +131,6 @@ class Export:
         placed = f"baked for {len(cameras)} placed ones; --images gives a better result"
         self.console.note(f"{model.path} stores no cameras: {placed}")
         return cameras, f"{len(cameras)} placed cameras"
-
-    def _solve(self) -> list[float]:
-        baked, attenuation = self.camera is None and not self.page, self.gaussians.attenuation
-        dials = self.args.levels or solve_dials(self.args, self.model, self.cameras, self.console, baked=baked)
-        if dials and self.page:
-            return [initial_dial(dials[0], attenuation.max_sv if attenuation else None, self.console)]
-        return choose_dials(dials, attenuation, self.console) if dials else []
 
     def note_losses(self) -> None:
         """Of columns, and of the screen-space filter where most readers do not find it."""

@@ -7,12 +7,12 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from contextlib import AbstractContextManager, contextmanager, redirect_stderr, redirect_stdout
 from types import FrameType
 from typing import Any, NamedTuple, TextIO
 
 from clod_adapter.errors import ClodError
-from clod_adapter.progress import Listener, Progress, Stopped
+from clod_adapter.progress import Listener, Stopped
 from clod_adapter.training.interrupts import ENDING, PRESSED
 
 
@@ -86,16 +86,10 @@ class GracefulStop:
 
     def heeding(self, display: Listener | None = None) -> Listener:
         """The listener that calls ``display`` and stops once a signal has arrived."""
+        return lambda now: (display is None or display(now) is not False) and self.requests == 0
 
-        def listen(now: Progress) -> bool:
-            return (display is None or display(now) is not False) and self.requests == 0
-
-        return listen
-
-    @contextmanager
-    def listening(self) -> Iterator[None]:
-        with _handled_by(self._request):
-            yield
+    def listening(self) -> AbstractContextManager[None]:
+        return _handled_by(self._request)
 
     def _request(self, number: int, frame: FrameType | None) -> None:
         self.requests += 1
@@ -115,11 +109,9 @@ def interrupt_as_stopped() -> Iterator[None]:
         raise Stopped("interrupted") from error
 
 
-@contextmanager
-def signals_as_interrupt() -> Iterator[None]:
+def signals_as_interrupt() -> AbstractContextManager[None]:
     """Within the block all raise KeyboardInterrupt. Enter it after importing pycolmap, which sets a handler."""
-    with _handled_by(signal.default_int_handler):
-        yield
+    return _handled_by(signal.default_int_handler)
 
 
 def listen_no_more() -> None:
