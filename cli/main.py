@@ -17,19 +17,10 @@ from clod_adapter.errors import ClodError
 from clod_adapter.progress import Stopped
 
 from . import adapt, apply, demo, doctor, evaluate, export, inspect, render, robustness, view
+from .shared import process
 from .shared.command import Parser, parser_of
 from .shared.console import Console
 from .shared.outputs import Outputs, claimed, jsonable
-from .shared.process import (
-    check_printed,
-    check_surroundings,
-    interrupt_as_stopped,
-    launched,
-    shortage,
-    signals_as_interrupt,
-    silence_but_first,
-    unbreakable_streams,
-)
 
 PROG = "clod-adapt"
 INTERRUPTED = 130  # exit code
@@ -58,9 +49,9 @@ WITHOUT_TORCH = (inspect, doctor)  # which load it where they need it
 def main(argv: list[str] | None = None) -> int:
     """Runs a command line; returns its exit code: 2 for bad input, 130 if interrupted without a result, 1 for a bug."""
     words = sys.argv[1:] if argv is None else argv
-    with unbreakable_streams():
+    with process.unbreakable_streams():
         try:
-            with silence_but_first():
+            with process.silence_but_first():
                 return _main(words)
         except Exception:
             traceback.print_exc()
@@ -79,7 +70,7 @@ def refuse(why: str, code: int, words: list[str]) -> int:
 def _main(words: list[str]) -> int:
     name = words[0] if words and words[0] in COMMANDS else ""
     try:
-        with interrupt_as_stopped():
+        with process.interrupt_as_stopped():
             if not words:
                 print(FIRST, end="")
                 return 0
@@ -92,7 +83,7 @@ def _main(words: list[str]) -> int:
     except Stopped:
         return refuse("interrupted", INTERRUPTED, words)
     except (MemoryError, RuntimeError, ImportError, OSError) as error:
-        if (line := shortage(error)) is not None:
+        if (line := process.shortage(error)) is not None:
             return refuse(line, 2, words)
         if not isinstance(error, OSError):
             raise
@@ -102,7 +93,7 @@ def _main(words: list[str]) -> int:
 
 def run_here(command: ModuleType, args: argparse.Namespace) -> int:
     """Runs a command and returns its exit code. Of several processes the first runs it; the others only train."""
-    launch = launched()
+    launch = process.launched()
     if launch.size == 1:
         return run(command, args)
     if command is not adapt:
@@ -110,7 +101,7 @@ def run_here(command: ModuleType, args: argparse.Namespace) -> int:
     from .adapt.processes import leading, take_part
 
     if launch.rank > 0:
-        with signals_as_interrupt():
+        with process.signals_as_interrupt():
             take_part()
         return 0
     with leading():
@@ -119,23 +110,23 @@ def run_here(command: ModuleType, args: argparse.Namespace) -> int:
 
 def run(command: ModuleType, args: argparse.Namespace) -> int:
     """Runs a command, prints its report with --json, and returns the report's exit code, or 0."""
-    check_surroundings()
+    process.check_surroundings()
     if args.json:
-        check_printed()
+        process.check_printed()
     if hasattr(command, "check"):
         command.check(args)
     outputs = command.outputs(args) if hasattr(command, "outputs") else Outputs()
-    with signals_as_interrupt(), claimed(outputs):
+    with process.signals_as_interrupt(), claimed(outputs):
         if command not in WITHOUT_TORCH:
             import_library(args.quiet)
         aside = io.StringIO() if args.quiet else sys.stderr
         # Again: pycolmap, imported just now, sets a handler.
-        with redirect_stdout(aside) if args.json else nullcontext(), signals_as_interrupt():
+        with redirect_stdout(aside) if args.json else nullcontext(), process.signals_as_interrupt():
             report = command.execute(args) or {}
     if args.json and report:
         print(json.dumps(jsonable(report), allow_nan=False))
     if args.json or (report and "outputs" not in report):
-        check_printed()
+        process.check_printed()
     return int(report.get("exit_code", 0))
 
 

@@ -24,17 +24,9 @@ from clod_adapter.render import render
 from clod_adapter.training.camera_placement import place_cameras
 from clod_adapter.viewer.page import write_viewer_page
 
+from ..shared import inputs
 from ..shared.command import given_budget, initial_dial
 from ..shared.console import Console, duration
-from ..shared.inputs import (
-    named,
-    on_device,
-    pick_device,
-    prepare_kernels,
-    read_cameras,
-    read_checkpoint,
-    with_filter,
-)
 from ..shared.measure import Stopwatch, choose_dials, solve_dials
 from ..shared.outputs import size
 from .names import FOLDERS, PAGE, STORE_FILTER, is_page, level_paths, suffix_of
@@ -86,16 +78,17 @@ class Export:
 
     def __init__(self, args: Namespace) -> None:
         self.args, self.page, self.console = args, is_page(args), Console(args.quiet)
-        self.model = with_filter(read_checkpoint(args.model, self.console, args.activated), args, self.console)
+        read = inputs.read_checkpoint(args.model, self.console, args.activated)
+        self.model = inputs.with_filter(read, args, self.console)
         if args.images is not None and args.fps:
-            self.model = on_device(self.model, pick_device(args.device, self.console))
+            self.model = inputs.on_device(self.model, inputs.pick_device(args.device, self.console))
         self.cameras: Sequence[Camera | Viewpoint] = ()
         self.about, self.views = "", list[Camera]()
         counts = given_budget(args) and not (self.page and args.psnr_drop)
         if args.order or args.levels or counts or (args.sv and not self.page):
             self.cameras, self.about = self._find_cameras()
         if self.page and args.images is not None:
-            self.views = read_cameras(self.model, args.images, self.console)
+            self.views = inputs.read_cameras(self.model, args.images, self.console)
         only = self.cameras[0] if args.camera is not None else None
         self.camera = only if isinstance(only, Camera) else None
         self.gaussians = self.model.gaussians
@@ -113,10 +106,10 @@ class Export:
         """The cameras of --camera, --images or the model's file, else placed ones; and what they are."""
         args, model = self.args, self.model
         if args.images is not None:
-            cameras = read_cameras(model, args.images, self.console, training=args.camera is None)
+            cameras = inputs.read_cameras(model, args.images, self.console, training=args.camera is None)
             if args.camera is None:
                 return cameras, f"{len(cameras)} training cameras"
-            found = named(cameras, args.camera, "--camera")
+            found = inputs.named(cameras, args.camera, "--camera")
             if len(found) > 1:
                 both = f"{found[0].name} and {found[1].name}"
                 raise ClodError(f"--camera: {args.camera!r} matches {both}; give the full name")
@@ -200,7 +193,7 @@ class Export:
         found = [gaussians for gaussians, _ in contents]
         counts = [len(gaussians) for gaussians in found]
         if self.args.folder == "--3dtiles":
-            prepare_kernels(self.console, found[0].means.device, training=False)
+            inputs.prepare_kernels(self.console, found[0].means.device, training=False)
             with self.console.meter("errors of levels") as meter:
                 errors = geometric_errors(found, looking(self.cameras), progress=meter)
             self.console.note(*write_tileset(index.parent, found, errors.tolist(), origin=self.model.origin))
@@ -216,7 +209,7 @@ class Export:
 
     def _write_page(self, path: Path, virtual_scale: float | None) -> None:
         """Notes the PSNR of its renders against those of the exact Gaussians."""
-        prepare_kernels(self.console, self.gaussians.means.device, training=False)
+        inputs.prepare_kernels(self.console, self.gaussians.means.device, training=False)
         shown, losses = write_viewer_page(
             path, self.model, cameras=self.views, virtual_scale=virtual_scale, exact=self.args.exact
         )
