@@ -84,24 +84,21 @@ def rendered(device: str, name: str, fix: str) -> Found:
     return True, f"{name}renders the reference image (RMS {error:.0e})", ""
 
 
-def outcome(name: str, check: Callable[[], Found]) -> dict[str, Any]:
-    """Name, whether it works, what was found, and a fix. Any error is a result: the code belongs to other projects."""
-    try:
-        with warnings.catch_warnings(), redirect_stdout(io.StringIO()):  # gsplat prints, torch warns
-            warnings.simplefilter("ignore")
-            ok, found, fix = check()
-    except Exception as error:
-        if isinstance(error.__cause__, KeyboardInterrupt):  # within the dispatching of a compiled function
-            raise
-        ok, found, fix = False, f"{type(error).__name__}: {first_line(error)}", ""
-    return {"name": name, "ok": ok, "found": found, "fix": fix}
-
-
 def execute(args: Namespace) -> dict[str, Any]:
     """Runs all checks; the report's exit code is 1 where nothing renders."""
-    with Console(args.quiet).status("checking ..."):
-        findings = [outcome(name, check) for name, check in CHECKS.items()]
-    draws = [found["name"] for found in findings if found["ok"] and found["name"] in RENDERERS]
+    findings = list[dict[str, Any]]()
+    with Console(args.quiet).status("checking ..."), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # torch's
+        for name, check in CHECKS.items():
+            try:
+                with redirect_stdout(io.StringIO()):  # gsplat prints
+                    ok, found, fix = check()
+            except Exception as error:  # any is a result: the code belongs to other projects
+                if isinstance(error.__cause__, KeyboardInterrupt):  # within the dispatching of a compiled function
+                    raise
+                ok, found, fix = False, f"{type(error).__name__}: {first_line(error)}", ""
+            findings.append({"name": name, "ok": ok, "found": found, "fix": fix})
+    draws = [each["name"] for each in findings if each["ok"] and each["name"] in RENDERERS]
     for each in findings:
         print(f"{each['name']:<9}{'ok' if each['ok'] else 'off':<5}{each['found']}")
         if each["fix"]:
