@@ -93,7 +93,11 @@ def _project(
     )  # fmt: skip
     ids = found[:3][-1]  # of cameras, Gaussians; 1.5.3 has batches before them, 1.6.0 also the bounds of each image
     harmonics = torch.cat([_Rows.apply(rows[ids], x) for x in (sh0, shN)], 1)
-    colors = _colors(_Rows.apply(ids, means), viewmat, eye, harmonics)
+    degree, centres = math.isqrt(harmonics.shape[1]) - 1, _Rows.apply(ids, means)
+    if "viewmats" in inspect.signature(gsplat.spherical_harmonics).parameters:  # 1.6.0 finds the directions itself
+        colors = 0.5 + gsplat.spherical_harmonics(degree, centres, viewmat, harmonics)[0]
+    else:
+        colors = 0.5 + gsplat.spherical_harmonics(degree, centres - eye, harmonics)
     shown = _Rows.apply(ids, opacities) * (1 if compensations is None else compensations)
     # Rows with values that are not finite are not drawn; the kernels would draw them opaque.
     sound = (means2d.sum(1) + conics.sum(1) + colors.sum(1) + shown).detach().isfinite()
@@ -102,16 +106,6 @@ def _project(
         "means2d": means2d.where(rows_of, 0), "conics": conics.where(rows_of, 0), "radii": radii, "depths": depths,
         "colors": colors.where(rows_of, 0).clamp(min=0), "opacities": shown.where(sound, 0),
     }  # fmt: skip
-
-
-def _colors(means: Tensor, viewmat: Tensor, eye: Tensor, coefficients: Tensor) -> Tensor:
-    """``[N, 3]``; gsplat 1.6.0 finds the directions from the camera itself, earlier versions take them."""
-    import gsplat
-
-    degree = math.isqrt(coefficients.shape[1]) - 1
-    if "viewmats" in inspect.signature(gsplat.spherical_harmonics).parameters:
-        return 0.5 + gsplat.spherical_harmonics(degree, means, viewmat, coefficients)[0]  # type: ignore[no-any-return]
-    return 0.5 + gsplat.spherical_harmonics(degree, means - eye, coefficients)  # type: ignore[no-any-return]
 
 
 def _blend(drawn: dict[str, Tensor], camera: Camera) -> tuple[Tensor, Tensor]:
