@@ -63,7 +63,6 @@ def compute(page: Any, source: str, statements: str, table: Sequence[Sequence[fl
 
 
 def find() -> str:
-    """Path of the Chromium that tests are run in; skips where there is none."""
     named = os.environ.get("CLOD_CHROMIUM")
     for name in (named,) if named else NAMES:
         if path := shutil.which(name):

@@ -109,14 +109,12 @@ def dialled(capture: Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def _write_inria(path: Path, gaussians: Gaussians) -> Path:
-    """A plain file as Inria's trainer writes it, normals included."""
     plain = gaussians.replace(sigma_d=None, attenuation=None)
     PlyData([PlyElement.describe(inria_rows(plain), "vertex")], byte_order="<").write(str(path))
     return path
 
 
 def _camera(angle: float) -> Camera:
-    """On the circle of radius 5, looking at the origin, y down."""
     viewmat = looking(-torch.tensor([math.sin(angle), 0.1, math.cos(angle)]))
     viewmat[:3, 3] = torch.tensor([0.0, 0.0, 5.0])
     return Camera(viewmat, torch.tensor([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]]), 64, 48)

@@ -170,7 +170,6 @@ def without_comments(path: Path, **columns: Any) -> Path:
 
 
 def with_columns(old: np.ndarray, **columns: Any) -> np.ndarray:
-    """The rows of a PLY with float columns added or changed."""
     added = [(name, "f4") for name in columns if name not in old.dtype.names]
     rows = np.zeros(len(old), old.dtype.descr + added)
     for name in rows.dtype.names or ():
@@ -179,7 +178,6 @@ def with_columns(old: np.ndarray, **columns: Any) -> np.ndarray:
 
 
 def change_glb(path: Path, change: Callable[[dict[str, Any]], object]) -> Path:
-    """Changes the JSON of a glTF binary file, in place."""
     data = path.read_bytes()
     size = struct.unpack_from("<I", data, 12)[0]
     gltf = json.loads(data[20 : 20 + size])

@@ -30,7 +30,6 @@ class Result(NamedTuple):
 
 
 def weights(camera: Camera) -> tuple[Tensor, Tensor]:
-    """Random weights of the pixels of image and alpha."""
     g, size = torch.Generator().manual_seed(0), (camera.height, camera.width)
     return torch.randn(*size, 3, generator=g), torch.randn(*size, generator=g)
 

@@ -79,7 +79,6 @@ def as_text(folder: Path) -> None:
 
 
 def model_of(folder: Path, kind: str, params: list[float], name: str = "a.png", cameras: int = 1, **size: int) -> None:
-    """Writes a model of one image with pycolmap."""
     size = size or {"width": 40, "height": 30}
     reconstruction = pycolmap.Reconstruction()
     for i in range(1, cameras + 1):

@@ -99,11 +99,9 @@ class Server:
         )  # fmt: skip
 
     def wait(self, pid: int) -> int:
-        """The exit code; the negative signal of a killed process."""
         return self.ask(wait=pid)
 
     def run(self, folder: Path, *words: object) -> tuple[int, str]:
-        """Exit code and output."""
         return self.wait(self.start(folder, *words)), log_of(folder)
 
 

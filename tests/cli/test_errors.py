@@ -78,7 +78,6 @@ def given(folder: Path, existing: str) -> Iterator[None]:
 
 
 def everything(folder: Path) -> dict[str, object]:
-    """The content of each file, and the target of each link."""
     files = [path for path in folder.rglob("*") if path.is_file()]
     return {str(path): (path.read_bytes(), path.is_symlink() and os.readlink(path)) for path in files}
 

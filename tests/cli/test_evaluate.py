@@ -21,7 +21,6 @@ ROW = {"virtual_scale", "psnr", "ssim", "kept", "kept_share", "in_view", "frame_
 
 
 def measured(clod: Any, *words: object) -> tuple[Any, str]:
-    """The report, and what was printed."""
     done = clod("eval", *words, "--json")
     assert done.code == 0 and done.out.count("\n") == 1, done
     return json.loads(done.out), done.err

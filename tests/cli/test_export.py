@@ -53,19 +53,16 @@ def tool(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPat
 
 
 def baked(path: Path | str, s: float) -> Any:
-    """A dial value of a file, baked for the cameras that the file stores."""
     model = load(path)
     assert model.viewpoints
     return clod_adapter.bake(model.gaussians, s, cameras=model.viewpoints)
 
 
 def files(folder: Path) -> list[str]:
-    """All files and folders in a folder, also hidden ones."""
     return sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
 
 
 def exported(clod: Any, *words: object) -> tuple[Any, str]:
-    """The report, and what was printed."""
     done = clod("export", *words, "--json")
     assert done.code == 0, done
     return json.loads(done.out), done.err
@@ -119,7 +116,6 @@ def test_names_of_cameras(clod: Any, capture: Any, dialled: Path) -> None:
 
 
 def test_levels(clod: Any, dialled: Path, tmp_path: Path) -> None:
-    """A file each, or one 3D Tiles set, whose errors are measured; all or none."""
     report, _ = exported(clod, dialled, "--levels", "1,2.5,4", "-o", "some.set.ply")
     names = ["some.set_s1.ply", "some.set_s2.5.ply", "some.set_s4.ply"]
     assert files(tmp_path) == names == [output["file"] for output in report["outputs"]]
@@ -137,7 +133,6 @@ def test_levels(clod: Any, dialled: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("suffix", [".ply", ".glb", ".splat"])
 def test_formats(clod: Any, dialled: Path, tmp_path: Path, suffix: str) -> None:
-    """The dial is kept where the format can; comments survive baking and another export."""
     model, kept = load(dialled), suffix != ".splat"
     report, err = exported(clod, dialled, "-o", f"x{suffix}", *(() if kept else ("--sv", 1)))
     (output,), again = report["outputs"], load(f"x{suffix}")
@@ -219,7 +214,6 @@ def test_sibr_reads_baked_files(clod: Any, tmp_path: Path) -> None:
 
 
 def test_splat_transform(clod: Any, dialled: Path, tmp_path: Path, tool: Any) -> None:
-    """A packed file, and a streaming set."""
     tool()
     report, err = exported(clod, dialled, "--sv", 4, "-o", "x.sog")
     assert " took " in err and "splat-transform rounds values and sorts the Gaussians" in report["notes"]
@@ -243,7 +237,6 @@ def test_splat_transform(clod: Any, dialled: Path, tmp_path: Path, tool: Any) ->
 def test_failure_of_the_tool_leaves_no_file(
     clod: Any, dialled: Path, tmp_path: Path, tool: Any, monkeypatch: Any
 ) -> None:
-    """An error, no end, an interruption, and no tool."""
     monkeypatch.setattr(splat_transform, "LIMIT_EACH", 0.0)
     monkeypatch.setenv("PYTHONIOENCODING", "utf-8")
     interrupt = "import os, signal, time; os.kill(os.getppid(), signal.SIGINT); time.sleep(60)"
@@ -297,6 +290,5 @@ def test_page_holds_the_splat_and_its_dial(clod: Any, dialled: Path, tmp_path: P
 
 
 def held_in(page: str, path: Path) -> Path:
-    """Writes the file that a page holds."""
     path.write_bytes(base64.b64decode(re.findall('id="clod-model">(.*?)</script>', page)[0]))
     return path

@@ -63,7 +63,6 @@ def assert_close(got: Tensor, want: list[Any], ulps: float | list[float], floor:
 
 @cache
 def reference(sigma: float, d: float, s: float, eps: float) -> tuple[Any, Any]:
-    """The logarithm of the factor, and its slope by sigma."""
     positive = max(mpmath.mpf(sigma), ZERO)
     v = positive**2 + mpmath.mpf(eps) / 2
     if d == 0 or v == 0:

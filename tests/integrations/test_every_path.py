@@ -29,7 +29,6 @@ Draw = Callable[[Checkpoint, pytest.MonkeyPatch], Tensor]
 
 
 def through_gsplat(checkpoint: Checkpoint, monkeypatch: pytest.MonkeyPatch) -> Tensor:
-    """gsplat's own arguments choose the screen filter."""
     pytest.importorskip("gsplat", reason="pip install gsplat==1.5.3")
     gsplat_in_torch.install(monkeypatch)
     from clod_adapter.integrations.gsplat import rasterization
@@ -45,7 +44,6 @@ def through_gsplat(checkpoint: Checkpoint, monkeypatch: pytest.MonkeyPatch) -> T
 
 
 def through_inria(checkpoint: Checkpoint, monkeypatch: pytest.MonkeyPatch) -> Tensor:
-    """The fork's own settings choose the screen filter."""
     g = checkpoint.gaussians
     name, settings = ("mip-splatting", {"kernel_size": 0.1}) if g.screen_filter == FILTERS["mip"] else (
         "inria 2024", {"antialiasing": g.screen_filter.compensate}

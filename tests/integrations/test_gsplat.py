@@ -25,7 +25,6 @@ WHOLE = AttenuationConfig(tau=0.02, max_sv=5.0)  # does not change an opacity ab
 
 @pytest.fixture(params=["cpu", "cuda"])
 def tools(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
-    """gsplat's function, ours, and their device."""
     gsplat = pytest.importorskip("gsplat", reason="pip install gsplat==1.5.3")
     if request.param == "cuda" and not torch.cuda.is_available():
         pytest.skip("no CUDA device")
@@ -37,7 +36,6 @@ def tools(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Si
 
 
 def takes(function: str, argument: str) -> bool:
-    """Whether the installed version's function has an argument."""
     import gsplat
 
     return argument in inspect.signature(getattr(gsplat, function)).parameters
@@ -118,7 +116,6 @@ def test_without_attenuation_results_are_gsplats(
 def test_attenuated_results_match_gsplat_per_camera(
     tools: SimpleNamespace, sigma_d: Tensor, cameras: int, packed: bool, cut: str, growing: str
 ) -> None:
-    """Images, alphas and all gradients, including those of the projected centres."""
     config = AttenuationConfig(tau=0.02, cut=cut, normalizer="max", max_sv=5.0)
     given, views = arguments(cameras, device=tools.device)
     if growing == "covars":

@@ -36,7 +36,6 @@ def arguments(name: str = "inria 2024") -> dict[str, Any]:
 
 
 def dial(growing: bool = True, normalizer: str = "scene") -> dict[str, Any]:
-    """The dial's arguments."""
     sigma_d, growth_d = torch.rand(2, N, generator=torch.Generator().manual_seed(7))
     settings = AttenuationConfig(scene_distance=5.0, normalizer=normalizer)
     growth = {"growth_d": (2 * growth_d - 0.6).requires_grad_()} if growing else {}

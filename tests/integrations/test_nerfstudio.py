@@ -36,7 +36,6 @@ N, WIDTH, HEIGHT, STEPS = 60, 32, 24, 16
 
 @pytest.fixture
 def nerfstudio(monkeypatch: pytest.MonkeyPatch) -> Any:
-    """The module of the method, with nerfstudio on the CPU."""
     pytest.importorskip("nerfstudio", reason="nerfstudio is not installed")
     monkeypatch.setenv("TORCHDYNAMO_DISABLE", "1")
     import torchmetrics.image.lpip
@@ -102,7 +101,6 @@ def write_splatfacto(config: Any, base: Gaussians, folder: Path) -> None:
 
 
 def trained(config: Any) -> Any:
-    """The trainer after what ns-train does."""
     trainer = config.setup(local_rank=0, world_size=1)
     config.save_config()
     trainer.setup()
@@ -176,7 +174,6 @@ def test_a_dial_is_trained_and_found_by_the_other_commands(
 
 
 def untrained(run: SimpleNamespace, folder: Path) -> Any:
-    """The dial before the first step."""
     config = configured(run.method, run.folder, folder)
     config.timestamp = "start"
     trainer = config.setup(local_rank=0, world_size=1)

@@ -20,13 +20,11 @@ PAGE = (ROOT / "docs" / "writing_a_renderer.md").read_text(encoding="utf-8")
 
 
 def my_opacity(opacity: float, sigma: float, d: float, scale: float, eps: float, tau: float, soft: bool) -> float:
-    """The package's opacity, in float32."""
     config = AttenuationConfig(eps=eps, tau=tau, cut="soft" if soft else "hard", max_sv=1)
     return float(attenuate(*torch.tensor([[opacity], [sigma], [d]]), scale, config, activated=True).drawn)
 
 
 def my_scale(growth: float, distance: float, scale: float, reach: float) -> float:
-    """The package's factor of the scales, in float32."""
     return float(growth_factors(*torch.tensor([[growth], [distance]]), scale, reach))
 
 

@@ -9,8 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from plyfile import PlyData
 
 from clod_adapter.adapter import detach, extract, with_dial
@@ -193,15 +191,6 @@ def test_dial_survives_a_rewrite_without_comments(tmp_path: Path, name: str, gro
     found = inspect(files[0])
     assert found.splat is not None and found.splat.dial is not None and found.splat.extra == ()
     assert growth or name != "paper" or any("read from columns: tau, cut, normalizer" in note for note in found.notes)
-
-
-@settings(deadline=None, max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(st.integers(1, 999_999))
-def test_numbers_of_columns_are_read_as_written(tmp_path: Path, digits: int) -> None:
-    """Up to six digits exactly."""
-    write(tmp_path / "a.ply", model(0, 5))
-    found = load(without_comments(tmp_path / "a.ply", clod_tau=float(f"{digits}e-6"))).gaussians.attenuation
-    assert found is not None and found.tau == float(f"{digits}e-6")
 
 
 def test_file_without_settings_has_a_note(tmp_path: Path) -> None:

@@ -18,7 +18,6 @@ FIELDS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 
 
 def leaves_of(some: Parameters) -> Parameters:
-    """Copies of the inputs, and a background, that require gradients."""
     return {name: value.clone().requires_grad_() for name, value in (some | {"background": BACKGROUND}).items()}
 
 

@@ -53,8 +53,6 @@ def show(tabs: Any) -> Iterator[Callable[..., Shown]]:
 
 @pytest.fixture
 def save(tmp_path: Path) -> Callable[..., Path]:
-    """Writes a model into the test's folder."""
-
     def write(gaussians: Gaussians, name: str = "model.ply") -> Path:
         clod_adapter.save(tmp_path / name, gaussians)
         return tmp_path / name
@@ -70,13 +68,11 @@ def gaussians() -> Gaussians:
 
 @pytest.fixture(scope="session")
 def plain(gaussians: Gaussians) -> Gaussians:
-    """The same without a dial."""
     return gaussians.replace(sigma_d=None, attenuation=None)
 
 
 @pytest.fixture(scope="session")
 def model(gaussians: Gaussians, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The file of ``gaussians``."""
     path = tmp_path_factory.mktemp("viewer") / "model.ply"
     clod_adapter.save(path, gaussians)
     return path
@@ -84,7 +80,6 @@ def model(gaussians: Gaussians, tmp_path_factory: pytest.TempPathFactory) -> Pat
 
 @pytest.fixture(scope="session")
 def tab_of_model(tabs: Any, model: Path) -> Iterator[Shown]:
-    """A tab with the file ``model``."""
     with serve(model) as url:
         shown = Shown(tabs.new_page())
         shown.page.set_viewport_size(SIZE)

@@ -110,7 +110,6 @@ def test_pointer_touch_and_wheel_move_the_camera(chromium: Any, show: Any, model
 
 
 def link(shown: Shown) -> str:
-    """The view's part of the link to it."""
     shown.page.keyboard.press("l")
     return str(shown.page.evaluate("location.hash"))
 

@@ -54,7 +54,6 @@ def test_ply_and_spz_are_shown_as_python_reads_them(
 
 
 def test_other_files_are_errors_and_the_picture_stays(shown: Shown, model: Path, tmp_path: Path) -> None:
-    """What only Python reads names the command."""
     data = model.read_bytes()
     write(tmp_path / "a.glb", clod_adapter.load(model).gaussians)
     header, _, _ = data.partition(b"end_header")

@@ -124,7 +124,6 @@ HAND = (
 
 
 def test_the_dial_by_hand_ends_it(simulated: Shown) -> None:
-    """So do the equation's switch and a link. R switches it."""
     shown = simulated
     for end in HAND:
         shown.run("(clod.setDial(1), clod.setEquation(true))")

@@ -1,7 +1,6 @@
 """The data of the page: one PLY layout for Gaussians from any file, or SPZ."""
 
 import dataclasses
-import json
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ import scenes
 from clod_adapter.calibration import Calibration, CalibrationRow
 from clod_adapter.config import FILTERS
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.viewer.page import Payload, page_config
+from clod_adapter.viewer.page import Payload
 
 MEASURED = Calibration((CalibrationRow(1.0, 30.5, 29.25, 0.9, 4.0),), 40, 2, 8, 6, "a machine")
 
@@ -49,12 +48,3 @@ def test_empty_sh_degrees_and_dropped_rows_are_left_out(capture: Any, tmp_path: 
     payload = Payload.of(checkpoint)
     assert b"f_rest" not in payload.header and len(payload.gaussians) == 39
     assert payload.name == "b\\xff.ply"
-
-
-def test_cameras_keep_all_digits_of_float32() -> None:
-    camera = scenes.ring(3, 20, 10)[1]
-    config = json.loads(json.dumps(page_config({"name": "a b.ply"}, None, [camera], 2.5)))
-    shown = config["cameras"][0]
-    assert (shown["name"], shown["width"], shown["height"], config["virtual_scale"]) == ("view_1.png", 20, 10, 2.5)
-    assert torch.equal(torch.tensor(shown["viewmat"]), camera.viewmat)
-    assert torch.equal(torch.tensor(shown["K"]), camera.K)

@@ -32,7 +32,6 @@ def running(responses: Mapping[str, Response]) -> Iterator[Server]:
 
 @contextmanager
 def asking(server: Server) -> Iterator[socket.socket]:
-    """A connection that has asked for the first page."""
     with socket.create_connection(("127.0.0.1", server.port)) as connection:
         connection.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
         yield connection
@@ -69,7 +68,6 @@ REQUESTS: tuple[tuple[str, str, str | None, int], ...] = (  # method, path, Host
 
 
 def test_responses(server: Server) -> None:
-    """And refusals: what is no page, other methods, and hosts that are not this machine."""
     assert server.socket.getsockname()[0] == "127.0.0.1" and server.url == f"http://127.0.0.1:{server.port}/"
     for method, path, host, wanted in REQUESTS:
         status, headers, body = request(server, path, method, **({} if host is None else {"Host": host}))

@@ -22,7 +22,6 @@ from shown import Shown, take
 
 
 def link(shown: Shown) -> dict[str, np.ndarray]:
-    """The numbers of the link to the present view."""
     shown.page.keyboard.press("l")
     parts = shown.page.evaluate("location.hash").lstrip("#").split("&")
     return {name: np.array([float(v) for v in text.split(",")]) for name, text in (part.split("=") for part in parts)}
@@ -84,7 +83,6 @@ FAST = "WebGL2RenderingContext.prototype.readPixels = () => {}"  # frames whose 
 
 
 def test_placed_cameras_are_levelled(show: Any, model: Path, tmp_path: Path) -> None:
-    """The dial begins at 0."""
     saved, viewmat = clod_adapter.load(model), scenes.looking(torch.tensor([1.0, 0.5, 0.5]))
     tilted = Camera(viewmat[[1, 0, 2, 3]] * torch.tensor([[-1.0], [1], [1], [1]]), torch.eye(3), 4, 3)
     place = viewpoint_of(tilted, saved.gaussians.means, saved.gaussians.attenuation)
