@@ -44,10 +44,7 @@ def test_distances_are_divided_by_the_configured_normalizer() -> None:
     unseen = torch.tensor([[0.0, 0.0, -52.0], [30.0, 0.0, -1.0], [0.0, 0.0, -1.995]])
     means = torch.cat([axis, unseen])
     distances = (means - torch.tensor([0.0, 0.0, -2.0])).norm(dim=1)
-    for kind, other, want in [
-        ("scene", {"scene_distance": 4.0}, 4.0),
-        ("max", {}, 10.0),
-    ]:
+    for kind, other, want in [("scene", {"scene_distance": 4.0}, 4.0), ("max", {}, 10.0)]:
         chosen = AttenuationConfig(normalizer=kind, **other)
         assert normalizing_distance(distances, means, camera, chosen).item() == want
         torch.testing.assert_close(normalized_distances(means, camera, chosen), distances / want)

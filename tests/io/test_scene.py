@@ -24,17 +24,7 @@ from clod_adapter.errors import ClodError
 from clod_adapter.io.scene.folder import scene_files
 from clod_adapter.io.scene.load import ImageCache, load_cameras, load_scene
 from clod_adapter.progress import Stopped
-from photographs import (
-    LENSES,
-    SIZE,
-    as_text,
-    camera,
-    model_of,
-    pixels,
-    psnr_of,
-    seen,
-    write_scene,
-)
+from photographs import LENSES, SIZE, as_text, camera, model_of, pixels, psnr_of, seen, write_scene
 
 
 @pytest.fixture(autouse=True)

@@ -18,18 +18,7 @@ from clod_adapter.errors import ClodError
 from clod_adapter.io.scene.colmap import write_model
 from clod_adapter.io.scene.load import load_cameras, load_scene
 from nerfstudio_frames import APPLIED, trained
-from photographs import (
-    INTRINSICS,
-    camera,
-    model_of,
-    pixels,
-    pose,
-    psnr_of,
-    seen,
-    to_world,
-    write_frames,
-    write_images,
-)
+from photographs import INTRINSICS, camera, model_of, pixels, pose, psnr_of, seen, to_world, write_frames, write_images
 
 
 def frame(i: int, **rest: Any) -> dict[str, Any]:

@@ -116,11 +116,7 @@ def test_the_dial_follows_a_load_that_is_switched_on_and_off(held: Shown) -> Non
     held.page.evaluate("document.getElementById('rate').value = 60")
 
 
-HAND = (
-    "document.getElementById('hold').click()",
-    "clod.setEquation(false)",
-    "location.hash = '#dial=3'",
-)
+HAND = ("document.getElementById('hold').click()", "clod.setEquation(false)", "location.hash = '#dial=3'")
 
 
 def test_the_dial_by_hand_ends_it(simulated: Shown) -> None:
