@@ -197,11 +197,6 @@ def needed(degree: int = 0) -> list[str]:
     return ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", *rest, "opacity", *shape]
 
 
-def plain_rows(count: int, *more: str) -> np.ndarray:
-    """Normal values in the columns of SH degree 0, and in more."""
-    return random_rows(count, [*needed(), *more])
-
-
 def random_rows(count: int, names: Sequence[str], seed: int = 0, types: dict[str, str] | None = None) -> np.ndarray:
     """Normal values in columns of float32 or of ``types``."""
     rng, rows = np.random.default_rng(seed), np.empty(count, [(name, (types or {}).get(name, "f4")) for name in names])

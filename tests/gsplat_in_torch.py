@@ -141,13 +141,8 @@ def _blend(table: list[Tensor], x: Tensor, y: Tensor) -> Tensor:
     centres, conics, opacities, colors = table
     dx, dy = x[..., None] - centres[:, 0], y[..., None] - centres[:, 1]
     a, b, c = conics.unbind(-1)
-    weights = _weights(opacities * torch.exp(-(0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy)))
-    return torch.cat([weights @ colors, weights.sum(-1, keepdim=True)], -1)
-
-
-def _weights(alpha: Tensor) -> Tensor:
-    """Weights of blending ``[..., N]`` from opacities at each pixel, in order of depth."""
-    alpha = alpha.clamp(max=ALPHA_MAX)
+    alpha = (opacities * torch.exp(-(0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy))).clamp(max=ALPHA_MAX)
     alpha = alpha * (alpha >= ALPHA_MIN)
     after = torch.cumprod(1 - alpha, -1)
-    return alpha * torch.cat([torch.ones_like(after[..., :1]), after[..., :-1]], -1) * (after > TRANSMITTANCE_MIN)
+    weights = alpha * torch.cat([torch.ones_like(after[..., :1]), after[..., :-1]], -1) * (after > TRANSMITTANCE_MIN)
+    return torch.cat([weights @ colors, weights.sum(-1, keepdim=True)], -1)

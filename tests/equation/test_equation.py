@@ -261,7 +261,7 @@ gaussian = st.tuples(st.floats(-30, 30, width=32), decay, st.floats(0, 1.5, widt
 
 
 @given(st.lists(gaussian, min_size=1, max_size=20), st.sampled_from(EPSILONS), st.sampled_from(TAUS[1:]))
-@settings(deadline=None, max_examples=50)
+@settings(deadline=None, max_examples=30)
 def test_kept_until_the_extinction_scale(data: list[tuple[float, ...]], eps: float, tau: float) -> None:
     inputs, chosen = torch.tensor(data, dtype=torch.float64).unbind(1), config(tau, eps)
     culled_at = extinction_scale(*inputs, chosen)

@@ -1,7 +1,6 @@
 """One adapted file looks the same through every path that draws it, and so do the files of viewers/kit."""
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -24,8 +23,6 @@ from clod_adapter.render import render
 DIAL = 3.0
 VIEW = scenes.camera(48, 32, off_centre=(0.5, 0.5))  # Inria's settings have no principal point
 KIT = Path(__file__).parents[2] / "viewers" / "kit"
-
-Draw = Callable[[Checkpoint, pytest.MonkeyPatch], Tensor]
 
 
 def through_gsplat(checkpoint: Checkpoint, monkeypatch: pytest.MonkeyPatch) -> Tensor:
@@ -70,9 +67,6 @@ def through_hook(checkpoint: Checkpoint, monkeypatch: pytest.MonkeyPatch) -> Ten
     return render(plain[keep], VIEW, rasterizer=Rasterizer(reference.rasterize)).image
 
 
-PATHS: tuple[Draw, ...] = (through_gsplat, through_inria, through_hook)
-
-
 def adapted() -> Gaussians:
     """60 Gaussians, of which a third is culled at the dial value, with growth of both signs."""
     some = scenes.dialled(60, 1, 3)
@@ -91,7 +85,7 @@ def test_paths_agree(screen_filter: str, tmp_path: Path, monkeypatch: pytest.Mon
     model = adapted().replace(screen_filter=FILTERS[screen_filter])
     clod.save(tmp_path / "adapted.ply", model)
     checkpoint = clod.load(tmp_path / "adapted.ply")
-    for draw in PATHS:
+    for draw in (through_gsplat, through_inria, through_hook):
         image = draw(checkpoint, monkeypatch)
         torch.testing.assert_close(image, wanted(model), rtol=1e-3, atol=1e-3)
     assert 20 < int(render(model, VIEW, DIAL).kept.sum()) < 50

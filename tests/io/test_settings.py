@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 from plyfile import PlyData
 
 from clod_adapter.adapter import detach, extract, with_dial
@@ -27,16 +29,13 @@ from formats import (
     CALIBRATION,
     change_setting,
     model,
-    plain_rows,
+    needed,
+    random_rows,
     splat_transform,
     without_comments,
     write_rows,
 )
 from scenes import gaussians
-
-KINDS = ["a.ply", "a.glb", "a.spz", "a.safetensors", "a.pt", "adapter.safetensors"]
-OTHER_FORMAT = ("clod-model", "clod-other"), ("clod-adapter", "clod-strange")
-OTHER = ScreenFilter(variance=0.123456789, compensate=True)
 
 
 def written(path: Path, screen_filter: ScreenFilter = CLASSIC) -> Path:
@@ -58,10 +57,10 @@ def read(path: Path) -> tuple[AttenuationConfig | None, ScreenFilter, Calibratio
     return base.gaussians.attenuation, base.gaussians.screen_filter, base.calibration, notes
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ["a.ply", "a.glb", "a.spz", "a.safetensors", "a.pt", "adapter.safetensors"])
 def test_every_format_uses_the_reader(tmp_path: Path, kind: str) -> None:
     path, ply = tmp_path / kind, kind == "a.ply"
-    for screen_filter in (CLASSIC, OTHER):
+    for screen_filter in (CLASSIC, ScreenFilter(variance=0.123456789, compensate=True)):
         assert read(written(path, screen_filter)) == (ATTENUATION, screen_filter, CALIBRATION, [])
     damage = f"{kind}: its settings are damaged .*MESSAGE.*; restore them, or export"
     with pytest.raises(ClodError, match=damage.replace("MESSAGE", "compensate is .*, it must be true or false")):
@@ -81,13 +80,16 @@ def test_every_format_uses_the_reader(tmp_path: Path, kind: str) -> None:
     if not ply:
         with pytest.raises(ClodError, match=f"{kind}: its format 9 is too new.*upgrade"):
             read(change_setting(written(path), "format_version", "3" if "adapter" in kind else "1", "9"))
-        with pytest.raises(ClodError, match=f"{kind}: is not an? .*'clod-(other|strange)'"):
-            read(change_setting(written(path), "", *OTHER_FORMAT["adapter" in kind]))
+        old, new = ("clod-adapter", "clod-strange") if "adapter" in kind else ("clod-model", "clod-other")
+        with pytest.raises(ClodError, match=f"{kind}: is not an? .*'{new}'"):
+            read(change_setting(written(path), "", old, new))
 
 
 def described(path: Path, *comments: str) -> Path:
     """A PLY with a dial and these settings."""
-    return write_rows(path, plain_rows(40, "sigma_d"), comments=[f"clod_adapter {comment}" for comment in comments])
+    return write_rows(
+        path, random_rows(40, [*needed(), "sigma_d"]), comments=[f"clod_adapter {comment}" for comment in comments]
+    )
 
 
 def test_damaged_settings_are_refused(tmp_path: Path) -> None:
@@ -143,7 +145,7 @@ def test_comments_of_other_programs(tmp_path: Path) -> None:
         (("Exported from Brush", "SplatRenderMode: mip"), "mip"), (("x", "SplatRenderMode: mip"), "on"),
         (("x", "antialiased 1"), "on"),
     ):  # fmt: skip
-        found = load(write_rows(tmp_path / "a.ply", plain_rows(40), comments=comments), activated="none")
+        found = load(write_rows(tmp_path / "a.ply", random_rows(40, needed()), comments=comments), activated="none")
         assert found.gaussians.screen_filter == FILTERS[name] and not found.filter_known
         for other in FILTERS.values():
             save(tmp_path / "b.ply", found.gaussians.replace(screen_filter=other), found)
@@ -191,6 +193,15 @@ def test_dial_survives_a_rewrite_without_comments(tmp_path: Path, name: str, gro
     found = inspect(files[0])
     assert found.splat is not None and found.splat.dial is not None and found.splat.extra == ()
     assert growth or name != "paper" or any("read from columns: tau, cut, normalizer" in note for note in found.notes)
+
+
+@settings(deadline=None, max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.integers(1, 999_999))
+def test_numbers_of_columns_are_read_as_written(tmp_path: Path, digits: int) -> None:
+    """Up to six digits exactly."""
+    write(tmp_path / "a.ply", model(0, 5))
+    found = load(without_comments(tmp_path / "a.ply", clod_tau=float(f"{digits}e-6"))).gaussians.attenuation
+    assert found is not None and found.tau == float(f"{digits}e-6")
 
 
 def test_file_without_settings_has_a_note(tmp_path: Path) -> None:

@@ -17,7 +17,6 @@ from PIL import Image
 from clod_adapter.errors import ClodError
 from clod_adapter.io.scene.colmap import write_model
 from clod_adapter.io.scene.load import load_cameras, load_scene
-from nerfstudio_frames import APPLIED, trained
 from photographs import INTRINSICS, camera, model_of, pixels, pose, psnr_of, seen, to_world, write_frames, write_images
 
 
@@ -199,6 +198,29 @@ def test_camera_without_a_size_is_left_out(tmp_path: Path) -> None:
 
 
 NAMES = [f"images/{i:03d}.png" for i in range(9)]
+APPLIED = {  # how nerfstudio turned COLMAP's world: today, and before
+    "today": [[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]],
+    "older": [[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]],
+}
+
+
+def trained(poses: np.ndarray, applied: Any, applied_scale: float = 1.0) -> tuple[np.ndarray, dict[str, Any]]:
+    """The poses that nerfstudio trains with, and what it writes into dataparser_transforms.json.
+
+    Its ``auto_orient_and_center_poses`` with its defaults, "up" and "poses".
+    """
+    centre, up = poses[:, :3, 3].mean(0), poses[:, :3, 1].mean(0)
+    up /= np.linalg.norm(up)
+    v, cosine = np.cross(up, [0, 0, 1.0]), up[2]
+    skew = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
+    rotation = np.eye(3) + skew + skew @ skew * ((1 - cosine) / (np.linalg.norm(v) ** 2 + 1e-8))
+    transform = np.concatenate([rotation, rotation @ -centre[:, None]], 1)
+    oriented = transform @ poses
+    scale = 1 / np.abs(oriented[:, :3, 3]).max()
+    oriented[:, :3, 3] *= scale
+    if applied is not None:
+        transform = transform @ np.vstack([applied, [0, 0, 0, 1.0]])
+    return oriented, {"transform": transform.tolist(), "scale": float(scale * applied_scale)}
 
 
 def in_colmap(count: int, seed: int) -> np.ndarray:

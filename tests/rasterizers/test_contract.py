@@ -17,21 +17,6 @@ from scenes import camera, scene
 FIELDS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 
 
-def leaves_of(some: Parameters) -> Parameters:
-    return {name: value.clone().requires_grad_() for name, value in (some | {"background": BACKGROUND}).items()}
-
-
-def total(image: Tensor, alpha: Tensor) -> Tensor:
-    """The weighted sum of an image that ``differentiate`` differentiates."""
-    v = weights(camera(alpha.shape[1], alpha.shape[0]))
-    return (image * v[0]).sum() + (alpha * v[1]).sum()
-
-
-def result_of(leaves: Parameters, image: Tensor, alpha: Tensor) -> Result:
-    slopes = torch.autograd.grad(total(image, alpha), leaves.values(), retain_graph=True)
-    return Result(image.detach(), alpha.detach(), dict(zip(leaves, slopes, strict=True)))
-
-
 def test_for_device(monkeypatch: pytest.MonkeyPatch) -> None:
     assert for_device(torch.device("cpu")) is cpu.RASTERIZER
     with pytest.raises(ClodError, match="no rasterizer for device meta"):
@@ -65,12 +50,14 @@ def test_several_forward_passes_keep_their_own_state(rasterize: Backend) -> None
     alone = [differentiate(rasterize, some, view, weights(view)) for some, view in cases]
     alive = []
     for some, view in cases:
-        leaves = leaves_of(some)
+        leaves = {name: value.clone().requires_grad_() for name, value in (some | {"background": BACKGROUND}).items()}
         alive.append((leaves, *rasterize(**leaves, camera=view)))
         differentiate(rasterize, *cases[0], weights(cases[0][1]))  # dropped
     rasterize(**cases[1][0], camera=cases[1][1], background=BACKGROUND)
     for k in (2, 1, 0, 0, 2):
-        assert_same(result_of(*alive[k]), alone[k], **rasterize.rounding)
+        leaves, image, alpha = alive[k]
+        slopes = torch.autograd.grad([image, alpha], leaves.values(), weights(cases[k][1]), retain_graph=True)
+        assert_same(Result(image, alpha, dict(zip(leaves, slopes, strict=True))), alone[k], **rasterize.rounding)
 
 
 def test_non_contiguous_tensors(rasterize: Backend) -> None:

@@ -65,7 +65,7 @@ def test_counts_around_sixteen(n: int) -> None:
     assert n < 33 or all(bool(slope.any()) for slope in slopes.values())
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(
     s=st.sampled_from([1.0, 1.7, 6.0, 40.0]), cut=st.sampled_from(["soft", "hard"]), eps=st.sampled_from([0.0, 1e-8]),
     tau=st.sampled_from([1e-6, 1 / 255, 0.02]), grows=st.booleans(), seed=st.integers(0, 99),

@@ -116,12 +116,9 @@ def test_the_dial_follows_a_load_that_is_switched_on_and_off(held: Shown) -> Non
     held.page.evaluate("document.getElementById('rate').value = 60")
 
 
-HAND = ("document.getElementById('hold').click()", "clod.setEquation(false)", "location.hash = '#dial=3'")
-
-
 def test_the_dial_by_hand_ends_it(simulated: Shown) -> None:
     shown = simulated
-    for end in HAND:
+    for end in ("document.getElementById('hold').click()", "clod.setEquation(false)", "location.hash = '#dial=3'"):
         shown.run("(clod.setDial(1), clod.setEquation(true))")
         shown.page.keyboard.press("r")
         assert shown.page.is_checked("#hold")

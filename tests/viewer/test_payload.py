@@ -14,8 +14,6 @@ from clod_adapter.config import FILTERS
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.viewer.page import Payload
 
-MEASURED = Calibration((CalibrationRow(1.0, 30.5, 29.25, 0.9, 4.0),), 40, 2, 8, 6, "a machine")
-
 
 def dialled(n: int = 40, degree: int = 1) -> Gaussians:
     return scenes.dialled(n, degree, 3, scene_distance=1.0).replace(screen_filter=FILTERS["mip"])
@@ -23,7 +21,8 @@ def dialled(n: int = 40, degree: int = 1) -> Gaussians:
 
 def test_bytes_are_a_plain_ply(tmp_path: Path) -> None:
     """In blocks; an opaque Gaussian, whose logit is infinite, has a finite one of the same opacity."""
-    gaussians, calibration = dialled(20_000, 2), dataclasses.replace(MEASURED, total=20_000)
+    gaussians = dialled(20_000, 2)
+    calibration = Calibration((CalibrationRow(1.0, 30.5, 29.25, 0.9, 4.0),), 20_000, 2, 8, 6, "a machine")
     gaussians = gaussians.replace(growth_d=torch.linspace(-1, 2, len(gaussians)))
     gaussians.opacity_logits[3] = torch.inf
     payload, file = Payload("a.ply", gaussians, calibration), tmp_path / "payload.ply"

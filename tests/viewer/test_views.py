@@ -79,16 +79,14 @@ def test_the_up_axis(shown: Shown, show: Any, save: Any, tmp_path: Path) -> None
     assert abs(link(with_cameras)["axes"][2]) < 1e-6
 
 
-FAST = "WebGL2RenderingContext.prototype.readPixels = () => {}"  # frames whose time is hardly more than 0
-
-
 def test_placed_cameras_are_levelled(show: Any, model: Path, tmp_path: Path) -> None:
     saved, viewmat = clod_adapter.load(model), scenes.looking(torch.tensor([1.0, 0.5, 0.5]))
     tilted = Camera(viewmat[[1, 0, 2, 3]] * torch.tensor([[-1.0], [1], [1], [1]]), torch.eye(3), 4, 3)
     place = viewpoint_of(tilted, saved.gaussians.means, saved.gaussians.attenuation)
     measured = Calibration((CalibrationRow(1.0, 9.0, 30.0, 0.9, 1.0),), 400, 1, 400, 300, "a", "checkpoint", (place,))
     write_viewer_page(tmp_path / "page.html", replace(saved, calibration=measured))
-    shown = show(url=(tmp_path / "page.html").as_uri(), script=FAST)
+    fast = "WebGL2RenderingContext.prototype.readPixels = () => {}"  # frames whose time is hardly more than 0
+    shown = show(url=(tmp_path / "page.html").as_uri(), script=fast)
     assert shown.text("#dial-value") == "all" and np.allclose(link(shown)["axes"][:3], viewmat[0, :3], atol=1e-4)
 
 
