@@ -17,21 +17,13 @@ from clod_adapter.rasterizers import cpu
 
 @dataclass(frozen=True)
 class Backend:
-    """A rasterizer with CPU tensors in and out, whatever its device and type.
+    """A rasterizer with CPU tensors in and out, whatever its device and type."""
 
-    Attributes:
-        module: name below ``clod_adapter.rasterizers``.
-        device: where it runs.
-        dtype: type of its inputs.
-        repeats: whether the same input gives the same bits; otherwise sums are rounded in no fixed order.
-        looser: factor on the tolerances; above 1 for float32 kernels with fast intrinsics.
-    """
-
-    module: str
+    module: str  # below clod_adapter.rasterizers
     device: str = "cpu"
-    dtype: torch.dtype = torch.float32
-    repeats: bool = True
-    looser: float = 1.0
+    dtype: torch.dtype = torch.float32  # of its inputs
+    repeats: bool = True  # the same input gives the same bits; otherwise sums are rounded in no fixed order
+    looser: float = 1.0  # factor on the tolerances; above 1 for float32 kernels with fast intrinsics
 
     def __call__(self, *args: Any, **kwargs: Any) -> tuple[Tensor, Tensor]:
         def place(x: Any) -> Any:

@@ -71,11 +71,8 @@ def find() -> str:
 
 
 @contextmanager
-def launch(*flags: str) -> Iterator[Any]:
-    """A Playwright browser with its own profile, closed at the end; skips where there is none.
-
-    Pages from ``file://`` and loopback are read as a user's browser reads them; ``flags`` are added to Chromium's.
-    """
+def launch() -> Iterator[Any]:
+    """A Playwright browser with its own profile; skips where there is none. Pages load as in a user's browser."""
     path = find()
     try:
         from playwright.sync_api import sync_playwright
@@ -84,7 +81,7 @@ def launch(*flags: str) -> Iterator[Any]:
     with sync_playwright() as playwright:
         # A test has root in many containers, where Chromium's sandbox refuses to start.
         chromium = playwright.chromium.launch(
-            executable_path=path, headless=True, chromium_sandbox=False, args=[*SOFTWARE, *flags]
+            executable_path=path, headless=True, chromium_sandbox=False, args=SOFTWARE
         )
         try:
             yield chromium

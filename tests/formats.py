@@ -29,11 +29,7 @@ ORIGIN = (5.1e5, -4096.0, 0.25)
 
 
 def model(degree: int = 3, count: int = 40, *, growth: bool = True) -> Gaussians:
-    """With a dial; opacity 1, very large, small and zero sigma_d, quaternions of length 1e-30 to 1e30.
-
-    Args:
-        growth: whether with growth_d, from -1 to 3, some 0.
-    """
+    """With extreme values: opacity 1, sigma_d of 0 to 1e9, quaternions of length 1e-14 to 1e14, growth_d of -1 to 3."""
     g = gaussians(count, degree, seed=degree)
     sigma = torch.rand(count, generator=torch.Generator().manual_seed(1)) * 4
     sigma[:4] = torch.tensor([1e9, 0.0, 1e-3, 65504.0])

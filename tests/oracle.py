@@ -48,10 +48,7 @@ def differentiate(
 
 
 def on_a_cut(scene: Parameters, camera: Camera, nudge: float, screen_filter: ScreenFilter) -> Tensor:
-    """``[H, W]`` bool: the reference's pixel changes when its cuts move by the relative ``nudge``.
-
-    Or has an alpha as near to the clamp, where the gradient stops.
-    """
+    """``[H, W]`` bool: pixels that change if the cuts move by ``nudge``, or have an alpha as near to the clamp."""
 
     def draw(patch: pytest.MonkeyPatch, **constants: object) -> Tensor:
         for name, value in constants.items():
@@ -73,10 +70,7 @@ def assert_agrees(
     rasterize: Splat, scene: Parameters, camera: Camera, *, image: float = IMAGE, gradient: float = GRADIENT,
     cut: float = ON_A_CUT, nudge: float = 1e-4, rows: Tensor | None = None, screen_filter: ScreenFilter = CLASSIC,
 ) -> None:  # fmt: skip
-    """Asserts agreement; with ``rows``, of the scene with the reference's picture of those rows alone.
-
-    The gradients of all other rows must then be 0.
-    """
+    """Asserts agreement; with ``rows``, with the picture of those alone, and gradients of 0 for the others."""
     looser = getattr(rasterize, "looser", 1.0)  # a backend in float32 with fast intrinsics
     image, gradient, cut, nudge = image * looser, gradient * looser, cut * looser**0.5, nudge * looser**0.5
     twin = {name: (value if rows is None else value[rows]).double() for name, value in scene.items()}

@@ -174,10 +174,7 @@ def pressing(real: Callable[..., Any], *numbers: int, at: int = 1) -> Callable[.
 
 
 def change_step(patch: pytest.MonkeyPatch, at: int, change: Callable[[Any], Any]) -> None:
-    """Replaces the gradients of the ``at``-th step from here by ``change`` of them, except in runs of one step.
-
-    Such a run prepares the kernels.
-    """
+    """Replaces the gradients of the ``at``-th step by ``change`` of them, not in the kernels' runs of one step."""
     real, steps = Trainer.gradient_sum, count(1)
 
     def changed(self: Trainer, *given: Any) -> Any:

@@ -88,7 +88,6 @@ def ring(count: int, width: int, height: int, *, radius: float = 4.0) -> list[Ca
 
 @torch.no_grad()
 def photograph(truth: Gaussians, cameras: list[Camera]) -> tuple[View, ...]:
-    """Views of ``truth`` as uint8 images."""
     return tuple(View(each, render(truth, each).pixels) for each in cameras)
 
 

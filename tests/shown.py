@@ -115,7 +115,6 @@ def message(shown: Shown, name: str) -> str:
 
 
 def fold(shown: Shown, open: bool) -> None:
-    """Shows the whole panel, in a tab that has room for it, or its upper part."""
     shown.page.set_viewport_size(TALL if open else SIZE)
     expanded = json.dumps(str(open).lower())
     script = f"fold => fold.getAttribute('aria-expanded') === {expanded} || fold.click()"

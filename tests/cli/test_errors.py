@@ -233,10 +233,7 @@ view base.ply --device-preset phone
 
 
 def test_help_errors_and_inspect_do_not_import_torch(folder: Path) -> None:
-    """``--help`` does not import numpy either: it takes 0.1 s of a core where nothing else runs.
-
-    Idle threads of OpenMP are set to wait before torch reads that.
-    """
+    """``--help`` not even numpy, which takes 0.1 s. Idle threads of OpenMP are set to wait before torch reads that."""
     lines = [line.split() for line in LIGHT.replace("\n", " | ").split(" | ") if line]
     lines += [["eval", f"bare{suffix}", "--images", "empty"] for suffix in WRITABLE]
     script = (

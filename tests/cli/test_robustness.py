@@ -69,10 +69,7 @@ def test_outputs_of_all_cells(run: Any, clod: Any, tmp_path: Path, monkeypatch: 
 
 @pytest.mark.usefixtures("blank_figure")
 def test_interrupted_unfinished_and_changed_cells(run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Finished cells stay; those without a file, or of other settings or checkpoints, are run again.
-
-    Nothing is written after an interrupt of the first one.
-    """
+    """Finished cells stay; unfinished and changed ones run again. An interrupt of the first one writes nothing."""
     folder = tmp_path / "robustness"
     with monkeypatch.context() as patch:
         patch.setattr(experiment, "baseline", pressing(experiment.baseline, signal.SIGINT))

@@ -66,11 +66,6 @@ def arguments(cameras: int, batch: tuple[int, ...] = (), device: str = "cpu") ->
     return given, {**matrices, "width": WIDTH, "height": HEIGHT}
 
 
-@pytest.fixture
-def sigma_d(tools: SimpleNamespace) -> Tensor:
-    return 0.2 + torch.rand(N, generator=torch.Generator().manual_seed(7)).to(tools.device)
-
-
 @pytest.mark.parametrize(
     ("cameras", "batch", "packed"), [(1, (), False), (3, (), True), (3, (2,), True), (3, (2,), False)]
 )
@@ -114,7 +109,7 @@ def test_without_attenuation_results_are_gsplats(
     [(1, True, "hard", ""), (3, True, "soft", "scales"), (3, False, "hard", "covars")],
 )
 def test_attenuated_results_match_gsplat_per_camera(
-    tools: SimpleNamespace, sigma_d: Tensor, cameras: int, packed: bool, cut: str, growing: str
+    tools: SimpleNamespace, cameras: int, packed: bool, cut: str, growing: str
 ) -> None:
     config = AttenuationConfig(tau=0.02, cut=cut, normalizer="max", max_sv=5.0)
     given, views = arguments(cameras, device=tools.device)
@@ -122,6 +117,7 @@ def test_attenuated_results_match_gsplat_per_camera(
         axes = torch.randn(N, 3, 3, generator=torch.Generator().manual_seed(5)).to(tools.device)
         given["covars"] = 0.02 * axes @ axes.mT + 0.01 * torch.eye(3, device=tools.device)
         given["quats"] = given["scales"] = None
+    sigma_d = 0.2 + torch.rand(N, generator=torch.Generator().manual_seed(7)).to(tools.device)
     dial = {"sigma_d": sigma_d} | ({"growth_d": 2 * sigma_d - 1} if growing else {})
     leaves = {**given, "viewmats": views.pop("viewmats"), **dial}
     leaves = {name: value.clone().requires_grad_() for name, value in leaves.items() if value is not None}
@@ -162,7 +158,7 @@ def test_attenuated_results_match_gsplat_per_camera(
         torch.testing.assert_close(getattr(points[0], kind), want, rtol=1e-3, atol=1e-4)
 
 
-def test_memory_is_released(tools: SimpleNamespace, sigma_d: Tensor) -> None:
+def test_memory_is_released(tools: SimpleNamespace) -> None:
     """Gradient hooks create no reference cycle, with or without a backward pass."""
     given, views = arguments(2, device=tools.device)
     given["means"].requires_grad_()
@@ -170,7 +166,7 @@ def test_memory_is_released(tools: SimpleNamespace, sigma_d: Tensor) -> None:
     gc.disable()
     try:
         for backward in (False, True):
-            colors, alphas, meta = tools.ours(**given, **views, sh_degree=1, sigma_d=sigma_d)
+            colors, alphas, meta = tools.ours(**given, **views, sh_degree=1, sigma_d=given["opacities"])
             points = weakref.ref(meta["means2d"])
             if backward:
                 colors.sum().backward()

@@ -24,7 +24,8 @@ CONFIG = AdaptConfig(max_sv=5.0)
 BASE = scenes.gaussians(N, 1, 0, size=0.15)
 
 
-def splatfacto() -> dict[str, Tensor]:
+@pytest.fixture
+def parameters() -> dict[str, Tensor]:
     """``BASE`` with the names and shapes of splatfacto's ``gauss_params``."""
     named = to_gsplat(BASE)
     named |= {"features_dc": named.pop("sh0")[:, 0], "features_rest": named.pop("shN")}
@@ -32,7 +33,7 @@ def splatfacto() -> dict[str, Tensor]:
     return {name: value.clone().requires_grad_() for name, value in named.items()}
 
 
-def test_parameters_are_shared() -> None:
+def test_parameters_are_shared(parameters: dict[str, Tensor]) -> None:
     """Those of gsplat's trainer, as tensors or arrays, and of splatfacto, whose colours are logits at SH degree 0."""
     splats = to_gsplat(BASE)
     assert list(splats) == ["means", "quats", "scales", "opacities", "sh0", "shN"]
@@ -41,7 +42,7 @@ def test_parameters_are_shared() -> None:
     scenes.assert_equal(from_gsplat({name: value.double().numpy() for name, value in splats.items()}), BASE)
     for name, value in BASE.tensors().items():
         assert getattr(again, name).data_ptr() == value.data_ptr(), name
-    named = splatfacto()
+    named = parameters
     scenes.assert_equal(from_gsplat(named), BASE)
     from_gsplat(named).opacities.sum().backward()
     assert named["opacities"].grad.shape == (N, 1)
@@ -71,11 +72,6 @@ def views() -> list[Any]:
 
 
 @pytest.fixture
-def parameters() -> dict[str, Tensor]:
-    return splatfacto()
-
-
-@pytest.fixture
 def dial(parameters: dict[str, Tensor], views: list[Any]) -> Dial:
     return new_dial(parameters, views, CONFIG, {})
 
@@ -88,10 +84,7 @@ def test_cameras_are_nerfstudios(views: list[Any]) -> None:
 
 
 def test_splatfacto_draws_what_render_draws(parameters: dict[str, Tensor], dial: Dial, views: list[Any]) -> None:
-    """Activated as splatfacto does. Culled rows are behind the camera, with gradient 0.
-
-    sigmoid(30) is 1 in float32, whose logit is infinite.
-    """
+    """Activated as it does: sigmoid(30) is 1 in float32, with an infinite logit. Culled rows are behind the camera."""
     parameters["opacities"].data[0], dial.log_sigma.data[0] = 30.0, 10.0
     camera, model = views[1].camera, dial.gaussians()
     plain = model.replace(sigma_d=None, growth_d=None, attenuation=None)

@@ -51,14 +51,11 @@ def test_separate_planes_and_32_bits_are_refused(tmp_path: Path) -> None:
 
 def test_transparency_is_laid_over_black(tmp_path: Path) -> None:
     alpha = np.where(GREY > 99, 255, 0).astype(np.uint8)
-    Image.fromarray(np.dstack([pixels(0), alpha])).save(tmp_path / "a.png")
-    got, notes = read(tmp_path / "a.png")
-    np.testing.assert_array_equal(got, pixels(0) * (GREY > 99)[..., None])
-    assert notes == ["have transparency: laid over black"]
-    Image.fromarray(np.dstack([pixels(0), np.full_like(GREY, 255)])).save(tmp_path / "a.png")
-    got, notes = read(tmp_path / "a.png")
-    np.testing.assert_array_equal(got, pixels(0))
-    assert notes == []
+    for layer, noted in ((alpha, ["have transparency: laid over black"]), (np.full_like(GREY, 255), [])):
+        Image.fromarray(np.dstack([pixels(0), layer])).save(tmp_path / "a.png")
+        got, notes = read(tmp_path / "a.png")
+        np.testing.assert_array_equal(got, pixels(0) * (layer > 0)[..., None])
+        assert notes == noted
     Image.fromarray(GREY).save(tmp_path / "a.png", transparency=int(GREY[0, 0]))
     got, notes = read(tmp_path / "a.png")
     assert got[0, 0].tolist() == [0, 0, 0] and len(notes) == 1
@@ -68,9 +65,8 @@ def test_transparency_is_laid_over_black(tmp_path: Path) -> None:
 def test_formats(tmp_path: Path, kind: str) -> None:
     """By content, whatever the name; MPO is a JPEG with further pictures, as phones write."""
     photograph = Image.fromarray(np.full((30, 40, 3), 99, np.uint8))
-    photograph.save(
-        tmp_path / "a.jpg", kind, **({"save_all": True, "append_images": [photograph]} if kind == "MPO" else {})
-    )
+    more = {"save_all": True, "append_images": [photograph]} if kind == "MPO" else {}
+    photograph.save(tmp_path / "a.jpg", kind, **more)
     got, notes = read(tmp_path / "a.jpg")
     assert np.abs(got.astype(int) - 99).max() <= 1 and notes == []
 

@@ -208,7 +208,8 @@ def test_positions_of_an_spz_use_the_available_bits(tmp_path: Path) -> None:
         assert (close - size)[9].abs().max() <= 0.04
 
 
-def test_row_of_a_splat(tmp_path: Path) -> None:
+def test_losses_of_a_splat(tmp_path: Path) -> None:
+    """Of a row, and of the file, where the largest come first."""
     g = detach(model(0)).select(torch.arange(1))
     assert len(write(tmp_path / "a.splat", g)) == 1
     data = (tmp_path / "a.splat").read_bytes()
@@ -220,10 +221,6 @@ def test_row_of_a_splat(tmp_path: Path) -> None:
     np.testing.assert_array_equal(levels[:4], [*color.round().int(), 255])
     quat = g.quats[0] / g.quats[0].norm()
     np.testing.assert_array_equal(levels[4:], (quat * 128 + 128).round().clamp(max=255))
-
-
-def test_losses_of_a_splat(tmp_path: Path) -> None:
-    """View-dependent colours, the origin, and the order: the largest come first."""
     g = detach(model(1, 300))
     notes = write(tmp_path / "a.splat", g, origin=ORIGIN)
     assert "8 bits" in notes[0] and "view-dependent" in notes[1] and "origin" in notes[2]

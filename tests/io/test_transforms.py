@@ -205,10 +205,7 @@ APPLIED = {  # how nerfstudio turned COLMAP's world: today, and before
 
 
 def trained(poses: np.ndarray, applied: Any, applied_scale: float = 1.0) -> tuple[np.ndarray, dict[str, Any]]:
-    """The poses that nerfstudio trains with, and what it writes into dataparser_transforms.json.
-
-    Its ``auto_orient_and_center_poses`` with its defaults, "up" and "poses".
-    """
+    """Poses after nerfstudio's ``auto_orient_and_center_poses`` by default, and its dataparser_transforms.json."""
     centre, up = poses[:, :3, 3].mean(0), poses[:, :3, 1].mean(0)
     up /= np.linalg.norm(up)
     v, cosine = np.cross(up, [0, 0, 1.0]), up[2]

@@ -115,10 +115,7 @@ def test_thousands_in_one_tile(rasterize: Splat) -> None:
     ids=str,
 )  # fmt: skip
 def test_screen_filters(rasterize: Splat, scales: Any, screen_filter: ScreenFilter) -> None:
-    """Sizes from a tenth of a pixel to several pixels, where the compensation is strong, medium and weak.
-
-    A needle has no area and is not drawn; the compensation of a disc seen from its edge is steep.
-    """
+    """From a tenth of a pixel to several; needles, which have no area and are not drawn, and discs from the edge."""
     view, image, cut = camera(70, 50), IMAGE, 0.04
     some = scene(200, 1, 11, size=scales if isinstance(scales, float) else 1.0)
     if isinstance(scales, tuple):

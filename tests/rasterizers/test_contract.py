@@ -41,10 +41,7 @@ def test_same_input_same_bits(rasterize: Backend) -> None:
 
 
 def test_several_forward_passes_keep_their_own_state(rasterize: Backend) -> None:
-    """Backward passes in any order and repeated give the results of separate passes.
-
-    Images and gradients are large enough for recycled memory.
-    """
+    """Backward passes in any order and repeated, with images and gradients large enough for recycled memory."""
     k, sizes = 1 if rasterize.stands_in else 3, [(300, (61, 45)), (500, (33, 70)), (150, (97, 31))]
     cases = [(scene(k**3 * n, 1, n, size=0.08 / k), camera(k * width, k * height)) for n, (width, height) in sizes]
     alone = [differentiate(rasterize, some, view, weights(view)) for some, view in cases]

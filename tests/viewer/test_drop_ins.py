@@ -92,10 +92,7 @@ def settled(page: Any) -> np.ndarray:
 
 
 def assert_the_wgsl_of_playcanvas_gives_the_equation(page: Any, about: dict[str, Any]) -> None:
-    """Of the engine's own WebGPU, software has too little: only its modifier runs here.
-
-    PlayCanvas turns ``uniform NAME: TYPE;`` into members of a struct, and defines loadClod.
-    """
+    """The modifier alone, as software lacks the engine's WebGPU; ``uniform NAME: TYPE;`` is a struct's member."""
     shown = clod_adapter.load(KIT / "kit.ply").gaussians
     camera = clod_adapter.Camera(torch.tensor(about["world_to_camera"]), torch.eye(3), 8, 8)
     columns = (shown.means, shown.opacities[:, None], shown.sigma_d[:, None], shown.growth_d[:, None])

@@ -97,9 +97,7 @@ def test_a_busy_page_gets_the_rest_later(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 def test_disconnected_and_closed(capfd: pytest.CaptureFixture[str]) -> None:
-    """A browser may end; closing waits for running responses: a thread that holds a tensor when the interpreter exits
-    would abort the process.
-    """
+    """Closing waits for running responses: a thread that holds a tensor as the interpreter exits aborts the process."""
     ended: list[int] = []
 
     def endless() -> Iterator[bytes]:
