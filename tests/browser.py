@@ -81,7 +81,7 @@ def launch() -> Iterator[Any]:
     with sync_playwright() as playwright:
         # A test has root in many containers, where Chromium's sandbox refuses to start.
         chromium = playwright.chromium.launch(
-            executable_path=path, headless=True, chromium_sandbox=False, args=SOFTWARE
+            executable_path=path, headless=True, chromium_sandbox=False, args=[*SOFTWARE]
         )
         try:
             yield chromium
