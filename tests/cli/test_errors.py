@@ -24,9 +24,6 @@ from clod_adapter.cli.main import COMMANDS, build_parser
 from clod_adapter.cli.shared.outputs import Outputs, claimed
 from clod_adapter.io.file_formats import FORMATS, WRITABLE, write
 
-POSE = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 5], [0, 0, 0, 1]]
-MESH = "ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nend_header\n"
-
 
 @pytest.fixture(scope="module")
 def folder(capture: Any, dialled: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -34,8 +31,9 @@ def folder(capture: Any, dialled: Path, tmp_path_factory: pytest.TempPathFactory
     there = tmp_path_factory.mktemp("work")
     shutil.copytree(capture.scene, there / "scene")
     shutil.copytree(capture.scene / "images", there / "nerf" / "images")
+    pose = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 5], [0, 0, 0, 1]]
     frames = [{"file_path": f"images/{k:03}", "mask_path": f"masks/{k:03}.png"} for k in range(10)]
-    content = {"fl_x": 60, "w": 64, "h": 48, "frames": [frame | {"transform_matrix": POSE} for frame in frames]}
+    content = {"fl_x": 60, "w": 64, "h": 48, "frames": [frame | {"transform_matrix": pose} for frame in frames]}
     (there / "nerf" / "transforms.json").write_text(json.dumps(content))
     (there / "nerf" / "masks").mkdir()
     (there / "nerf" / "masks" / "003.png").write_bytes(b"a mask")
@@ -48,7 +46,7 @@ def folder(capture: Any, dialled: Path, tmp_path_factory: pytest.TempPathFactory
     for name in ("text.ply", "a.hier"):
         (there / name).write_text("hello")
     (there / "cut.ply").write_bytes(capture.ply.read_bytes()[:-100])
-    (there / "mesh.ply").write_text(MESH)
+    (there / "mesh.ply").write_text("ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nend_header\n")
     for name in ("empty", "out/cells"):
         (there / name).mkdir(parents=True)
     os.mkfifo(there / "pipe.ply")

@@ -17,6 +17,7 @@ from clod_adapter.equation.distances import normalized_distances
 from clod_adapter.equation.growth import growth_distance, growth_factors
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import SH_C0, Gaussians
+from clod_adapter.integrations.splats import to_gsplat
 from clod_adapter.io.checkpoint import load, save
 from clod_adapter.io.file_formats import write
 from clod_adapter.io.values import half_turn
@@ -230,15 +231,11 @@ def test_losses_of_a_splat(tmp_path: Path) -> None:
     assert turned(again.quats, g.quats[rows]) < 0.02 and (weights[1:] <= weights[:-1] * (1 + 1e-5)).all()
 
 
-NAMES = {"scales": "log_scales", "opacities": "opacity_logits"}  # gsplat's, where they are not ours
-
-
 @pytest.mark.parametrize("degree", [0, 3])
 def test_checkpoint_of_gsplat(tmp_path: Path, degree: int) -> None:
     """Also with other number types and strides, other entries, and a row that is not finite."""
     g = gaussians(12, degree, 0)
-    values = {name: getattr(g, NAMES.get(name, name)).clone() for name in ("means", "quats", "scales", "opacities")}
-    values |= {"sh0": g.sh0, "shN": g.shN, "means": g.means.double(), "quats": g.quats.half().T.contiguous().T}
+    values = to_gsplat(g) | {"means": g.means.double(), "quats": g.quats.half().T.contiguous().T}
     values["scales"][3] = torch.nan
     splats = torch.nn.ParameterDict(values).state_dict()
     extra = {"app_module": torch.nn.Linear(2, 2).state_dict(), "optimizer": [torch.zeros(3)]}
@@ -246,8 +243,8 @@ def test_checkpoint_of_gsplat(tmp_path: Path, degree: int) -> None:
     base = load(tmp_path / "a.PT")
     assert base.gaussians.sh_degree == degree and base.gaussians.sigma_d is None and "normalised" in base.notes[1]
     assert "1 of 12 Gaussians dropped" in base.notes[0] and len(base.fingerprint) == 64
-    for name, tensor in values.items():
-        assert torch.equal(getattr(base.gaussians, NAMES.get(name, name)), tensor[torch.arange(12) != 3].float()), name
+    for name, tensor in to_gsplat(base.gaussians).items():
+        assert torch.equal(tensor, values[name][torch.arange(12) != 3].float()), name
     save(tmp_path / "out.ply", base.gaussians, base)
     again = load(tmp_path / "out.ply")
     assert again.gaussians == base.gaussians and again.vertex.dtype.names[3:6] == ("nx", "ny", "nz")

@@ -119,8 +119,7 @@ def test_records_beyond_the_file_are_refused(tmp_path: Path, file: str) -> None:
             load_scene(tmp_path)
 
 
-def write(path: Path, content: bytes) -> None:
-    path.write_bytes(content)
+write = Path.write_bytes
 
 
 @pytest.mark.parametrize(

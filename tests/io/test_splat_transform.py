@@ -86,7 +86,7 @@ def test_converted_files(tmp_path: Path, tool: Any, monkeypatch: pytest.MonkeyPa
     save(tmp_path / "plain.ply", was)
     seen, plain = repr(str(tmp_path / "seen")), repr(str(tmp_path / "plain.ply"))
     tool(ANSWERS, f"open({seen}, 'w').write(' '.join(words))", f"import shutil; shutil.copy({plain}, words[-1])")
-    for name in ("a.sog", "a.KSPLAT", "a.spz"):
+    for name in ("a.KSPLAT", "a.spz"):
         path = tmp_path / name
         path.write_bytes(b"NGSP, if it is an SPZ: of version 4")
         check_readable(path)
@@ -94,6 +94,7 @@ def test_converted_files(tmp_path: Path, tool: Any, monkeypatch: pytest.MonkeyPa
         found = load(path)
         assert torch.equal(found.gaussians.means, was.means) and "quantised" in found.notes[0]
         assert f" {path} " in (tmp_path / "seen").read_text()
+    (tmp_path / "a.sog").write_bytes(b"PK")
     tool(ANSWERS, "sys.stderr.write('  Error: not a zip\\n   at main\\n')", "sys.exit(1)")
     with pytest.raises(ClodError, match=r"a.sog: cannot be read \(.*failed: Error: not a zip\)"):
         load(tmp_path / "a.sog")
