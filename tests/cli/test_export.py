@@ -68,7 +68,6 @@ def exported(clod: Any, *words: object) -> tuple[Any, str]:
 
 
 def test_baking(clod: Any, capture: Any, dialled: Path, tmp_path: Path) -> None:
-    """For the cameras that the file stores, for those of a scene, for one of them, and for placed ones."""
     (report, err), want, plain = exported(clod, dialled, "--sv", 2, "-o", "x.ply"), baked(dialled, 2.0), load("x.ply")
     size = (tmp_path / "x.ply").stat().st_size
     assert report["outputs"] == [{"file": "x.ply", "virtual_scale": 2, "count": len(want), "bytes": size}]
@@ -168,7 +167,6 @@ def test_losses_are_noted(clod: Any, capture: Any, dialled: Path, tmp_path: Path
 
 
 def test_order_by_extinction(clod: Any, capture: Any, dialled: Path) -> None:
-    """For the stored cameras, of which a count is a prefix, and for one of a scene."""
     model, words = load(dialled), (dialled, "--order", "extinction")
     rows = clod_adapter.order_by_extinction(model.gaussians, model.viewpoints)
     report, _ = exported(clod, *words, "-o", "ordered.ply")

@@ -129,7 +129,6 @@ def test_the_entry_point_is_the_method(nerfstudio: Any) -> None:
 def test_a_dial_is_trained_and_found_by_the_other_commands(
     run: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Training, its checkpoint as ns-render and ns-viewer load it, ns-export's PLY, and training that goes on."""
     from nerfstudio.scripts.exporter import ExportGaussianSplat
     from nerfstudio.utils.eval_utils import eval_setup
     from nerfstudio.viewer.utils import parse_object

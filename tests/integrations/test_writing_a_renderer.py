@@ -29,7 +29,6 @@ def my_scale(growth: float, distance: float, scale: float, reach: float) -> floa
 
 
 def block(word: str) -> str:
-    """The page's Python block that contains a word."""
     (found,) = (text for text in re.findall(r"```python\n(.*?)```", PAGE, re.S) if word in text)
     return str(found)
 

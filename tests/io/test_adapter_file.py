@@ -59,7 +59,6 @@ def test_damaged_rows_of_a_trimmed_adapter_are_refused(tmp_path: Path) -> None:
 
 
 def stored(path: Path) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
-    """The document and the tensors of a file."""
     with safe_open(path, framework="pt") as file:
         return json.loads(file.metadata()["clod_adapter"]), {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
 

@@ -50,7 +50,6 @@ def test_file_appears_only_after_success(tmp_path: Path, monkeypatch: pytest.Mon
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(28, "No space left")])
 def test_failure_keeps_only_the_old_files(tmp_path: Path, error: BaseException) -> None:
-    """Of several files all appear, or none."""
     finals = tmp_path / "a", tmp_path / "out"
     with atomic_paths(*finals) as temporaries:
         for temporary in temporaries:

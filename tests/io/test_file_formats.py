@@ -41,7 +41,6 @@ def of(suffix: str, degree: int = 1, count: int = 40) -> Gaussians:
 
 
 def any_file(folder: Path, kind: str) -> Path:
-    """A small file of a kind that is read."""
     path, g = folder / f"a{kind}", of(kind, 0, 5) if kind in WRITABLE else model(0, 5)
     if kind == ".compressed.ply":
         return write_packed(path, gaussians(5, 1, 0))

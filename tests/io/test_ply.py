@@ -178,7 +178,6 @@ def test_trimmed_checkpoint_keeps_its_other_columns(tmp_path: Path, rows: list[i
 
 
 def test_other_formats_keep_what_the_base_says(tmp_path: Path) -> None:
-    """Its origin and its comments; the input is not overwritten, and losses are warnings."""
     some = model(1, 9)
     with pytest.warns(UserWarning, match="out.spz: quantised|out.spz: .*rounded"):
         save(tmp_path / "out.spz", some)

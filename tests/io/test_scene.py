@@ -35,7 +35,6 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def model(folder: Path, form: str, names: tuple[str, ...] = ("a.png", "sub/b.png")) -> Path:
-    """Images of one camera, and points that they see."""
     reconstruction = pycolmap.Reconstruction()
     lens = pycolmap.Camera(model="PINHOLE", params=[9, 9, 4, 3], camera_id=1, width=8, height=6)
     reconstruction.add_camera_with_trivial_rig(lens)
@@ -150,7 +149,6 @@ def test_without_pycolmap_the_error_says_where_it_is(monkeypatch: pytest.MonkeyP
 
 
 def test_missing_images_are_noted_or_refused(tmp_path: Path) -> None:
-    """The held-out images stay the same; more than half missing is an error."""
     names = sorted(write_scene(tmp_path, 18)[1])
     for name in names[2:11]:
         (tmp_path / "images" / name).unlink()

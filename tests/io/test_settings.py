@@ -86,7 +86,6 @@ def test_every_format_uses_the_reader(tmp_path: Path, kind: str) -> None:
 
 
 def described(path: Path, *comments: str) -> Path:
-    """A PLY with a dial and these settings."""
     return write_rows(
         path, random_rows(40, [*needed(), "sigma_d"]), comments=[f"clod_adapter {comment}" for comment in comments]
     )

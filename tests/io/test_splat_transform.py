@@ -63,7 +63,6 @@ def stand_in(*lines: str) -> SplatTransform:
 
 
 def test_run(tmp_path: Path) -> None:
-    """Its words, its time, and its error."""
     out, ticks = tmp_path / "out", list[float]()
     tool = stand_in("open(words[-1], 'w').write(' '.join(words[:-1]))", "time.sleep(0.5)")
     seconds = tool.run("a.ply", out, timeout=60, progress=ticks.append)

@@ -231,7 +231,6 @@ def turned(poses: np.ndarray, applied: Any) -> np.ndarray:
 
 
 def write_data(folder: Path, poses: np.ndarray, **rest: Any) -> None:
-    """Photographs, and a transforms.json of their poses."""
     frames = [{"file_path": name, "transform_matrix": p.tolist()} for name, p in zip(NAMES, poses, strict=False)]
     write_images(folder, NAMES[: len(poses)])
     write_frames(folder, frames, **INTRINSICS, **rest)

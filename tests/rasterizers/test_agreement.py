@@ -87,7 +87,6 @@ def test_axis_ratio_of_a_million(rasterize: Splat, scales: tuple[float, float, f
 
 @pytest.mark.parametrize(("axes", "length"), [(1, 1e-8), (3, 0.0), (3, 1e3), (1, 1e4)])
 def test_extreme_scales(rasterize: Splat, axes: int, length: float) -> None:
-    """With quaternions of any length."""
     if axes == 1 and length >= 100 and getattr(rasterize, "looser", 1.0) > 1:
         pytest.skip("gsplat takes the determinant in float32, where that of such a needle cancels")
     some = scene(100, 1, 5)
@@ -98,7 +97,6 @@ def test_extreme_scales(rasterize: Splat, axes: int, length: float) -> None:
 
 
 def test_thousands_in_one_tile(rasterize: Splat) -> None:
-    """20,000 faint Gaussians before 5x4 pixels, some of which end early."""
     some = scene(20_000, 1, 2, size=0.02)
     some["means"] *= 0.5
     some["opacities"] = some["opacities"] * 0.02 + 1 / 255

@@ -29,7 +29,6 @@ def test_for_device(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_same_input_same_bits(rasterize: Backend) -> None:
-    """Repeated calls and other numbers of threads give the same bits; the inputs are not changed."""
     view, some = camera(130, 97), scene(300 if rasterize.stands_in else 2000, 2, 1)
     given, results = {name: value.clone() for name, value in some.items()}, {}
     for count in (1, 1, 2, 2, 3):
@@ -111,7 +110,6 @@ def test_an_empty_view_is_the_background(rasterize: Backend, case: str) -> None:
 def assert_rows_are_skipped(
     rasterize: Backend, some: Parameters, gone: Tensor, screen_filter: ScreenFilter = CLASSIC
 ) -> None:
-    """Asserts that image and gradients are those of the scene without the rows ``gone``."""
     view, kept = camera(), {name: value[~gone] for name, value in some.items()}
     found, want = (
         differentiate(rasterize, each, view, weights(view), screen_filter=screen_filter) for each in (some, kept)
@@ -138,7 +136,6 @@ def test_invisible_rows_are_skipped(rasterize: Backend, case: str) -> None:
 
 @pytest.mark.parametrize("name", FIELDS)
 def test_rows_that_are_not_finite_are_skipped(rasterize: Backend, name: str) -> None:
-    """Whole rows and single elements, as in damaged files."""
     for columns, value in ((slice(None), math.nan), (0, math.inf), (0, -math.inf), (-1, math.nan)):
         some = scene(150, 2, 5)
         gone = torch.arange(150) % 11 == 3
@@ -149,7 +146,6 @@ def test_rows_that_are_not_finite_are_skipped(rasterize: Backend, name: str) -> 
 @pytest.mark.parametrize("screen_filter", ["off", "on"])
 @pytest.mark.parametrize("name", ["means", "scales", "quats", "opacities"])
 def test_extreme_rows_give_finite_results(rasterize: Backend, screen_filter: str, name: str) -> None:
-    """Images and gradients are finite for rows that float32 cannot project."""
     view = camera()
     for value, columns in ((1e10, 0), (1e20, -1), (-3e38, slice(None)), (3e38, 0), (math.inf, 0), (math.nan, 0)):
         some = scene(150, 2, 5, size=0.08 if screen_filter == "off" else 0.03)

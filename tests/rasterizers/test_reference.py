@@ -15,7 +15,6 @@ from scenes import camera, in_front
 
 
 def pixels_of(view: Camera, points: Tensor) -> Tensor:
-    """Pinhole projection of camera-space ``points [n, 3]``."""
     focal = view.K.double().diagonal()[:2]
     return focal * points[:, :2] / points[:, 2:] + view.K[:2, 2].double()
 
