@@ -77,19 +77,18 @@ def evaluate(
     render(gaussians, views[0].camera, max(dials))  # compiled and warm before the clock starts
     rows = list[Row]()
     for i, virtual_scale in enumerate(virtual_scales):
-        results, times = [], []
+        found = []
         for j, (view, rendering, seconds, scores) in enumerate(_compared(gaussians, views, dials[i])):
-            times.append(seconds * 1e3)
             inside = in_frustum(gaussians.means, view.camera)
-            results.append((*scores, int(rendering.kept.sum()), int((rendering.kept & inside).sum())))
+            found.append((seconds, *scores, int(rendering.kept.sum()), int((rendering.kept & inside).sum())))
             done = Progress(Phase.EVALUATION, i * len(views) + j + 1, len(virtual_scales) * len(views))
             stopped = progress is not None and progress(done) is False
             if stopped and j + 1 < len(views):
                 return rows
-        psnr, ssim, kept, in_view = (statistics.fmean(column) for column in zip(*results, strict=True))
-        share = kept / max(len(gaussians), 1)
-        frame_ms = statistics.median(times)
-        rows.append(Row(float(virtual_scale), psnr, ssim, kept, share, in_view, frame_ms))
+        times, *columns = zip(*found, strict=True)
+        psnr, ssim, kept, in_view = map(statistics.fmean, columns)
+        share, frame_ms = kept / max(len(gaussians), 1), 1e3 * statistics.median(times)
+        rows.append(Row(virtual_scale, psnr, ssim, kept, share, in_view, frame_ms))
         if stopped:
             break
     return rows

@@ -22,6 +22,7 @@ from clod_adapter.rasterizers.protocol import Rasterizer, behind, require_float3
 
 ACTIVATED = np.zeros(conventions.DIAL, np.float32)
 ACTIVATED[conventions.ACTIVATED] = 1
+NOTHING = torch.empty(0, dtype=torch.float32, device="cpu")  # no dial, or no growth
 FEW = 4096  # rows that one thread projects or lists in about a tenth of a millisecond
 
 
@@ -175,7 +176,7 @@ class _Compiled(Rasterizer):
             return super().draw(gaussians, camera, virtual_scale, background=background, seen_from=seen_from)
         check_dial(virtual_scale)
         g = gaussians
-        sigma_d, growth_d = (_nothing() if x is None else x.float() for x in (g.sigma_d, g.growth_d))
+        sigma_d, growth_d = (NOTHING if x is None else x.float() for x in (g.sigma_d, g.growth_d))
         require_float32("CPU", **(g.tensors() | {"sigma_d": sigma_d, "growth_d": growth_d, "background": background}))
         return _Picture.apply(  # type: ignore[no-any-return, no-untyped-call]
             g.means, g.quats, g.log_scales, g.opacity_logits, sigma_d, growth_d, g.sh0, g.shN, background, camera,
@@ -191,10 +192,6 @@ class _Compiled(Rasterizer):
         settings = camera_vector(camera, gaussians.screen_filter), _dial_vector(gaussians, camera, virtual_scale)
         threads.run(dial.mark_kept, workers_for(len(found)), *given, *settings, found)
         return torch.from_numpy(found).view(torch.bool)
-
-
-def _nothing() -> Tensor:
-    return torch.empty(0, dtype=torch.float32, device="cpu")
 
 
 def _dial_vector(gaussians: Gaussians, camera: Camera, virtual_scale: float) -> np.ndarray:
@@ -213,7 +210,7 @@ def rasterize(
         "CPU", means=means, quats=quats, scales=scales, opacities=opacities, sh0=sh0, shN=shN, background=background
     )
     return _Picture.apply(  # type: ignore[no-any-return, no-untyped-call]
-        means, quats, scales, opacities, _nothing(), _nothing(), sh0, shN, background, camera, screen_filter, ACTIVATED,
+        means, quats, scales, opacities, NOTHING, NOTHING, sh0, shN, background, camera, screen_filter, ACTIVATED,
         len(means),
     )  # fmt: skip
 
