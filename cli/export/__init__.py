@@ -106,25 +106,20 @@ def execute(args: Namespace) -> dict[str, Any]:
     return export(args)
 
 
-def format_table() -> str:
-    lines = []
-    for suffix, form in FORMATS.items():
-        first, *more = form.about
-        lines.append(f"  {suffix:<17}{'kept' if form.carries_sigma else '-':<6}{first}")
-        lines += [f"{'':25}{line}" for line in more]
-    return "\n".join(lines)
-
-
 SUMMARY = "Write a file for other tools: another format, or plain."
 DESCRIPTION = """\
 Write a model for other tools: in another format, with its dial if the format
 can store it, or with one dial value baked in.
 """
+TABLE = "\n".join(
+    f"  {suffix:<17}{'kept' if form.carries_sigma else '-':<6}" + f"\n{'':25}".join(form.about)
+    for suffix, form in FORMATS.items()
+)
 USAGE = "MODEL -o OUT [--sv S | --keep N | ... | --levels S,...]"
 EPILOG = f"""\
 formats, by the suffix of OUT:
   suffix           dial  values
-{format_table()}
+{TABLE}
 Without a dial value nothing is baked. Columns that Inria's layout does not have
 are dropped.
 

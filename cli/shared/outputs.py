@@ -175,11 +175,10 @@ def _inputs(outputs: Outputs) -> Iterator[tuple[Path, str]]:
 
 def _key(path: Path) -> tuple[int, int] | None:
     """Equal for two names of one file."""
-    try:
+    with suppress(OSError, ValueError):  # does not exist, or no valid name
         found = os.stat(path)
         return found.st_dev, found.st_ino
-    except (OSError, ValueError):  # does not exist, or no valid name
-        return None
+    return None
 
 
 def _is_ours(path: Path) -> bool:
