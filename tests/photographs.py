@@ -52,11 +52,11 @@ def write_scene(folder: Path, count: int = 10) -> tuple[list[Camera], list[str]]
     return cameras, names
 
 
-def write_images(folder: Path, names: Sequence[str], **size: int) -> None:
+def write_images(folder: Path, names: Sequence[str]) -> None:
     """The ``pixels`` of 0, 1, 2, ..."""
     for i, name in enumerate(names):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        Image.fromarray(pixels(i, **size)).save(folder / name)
+        Image.fromarray(pixels(i)).save(folder / name)
 
 
 def to_world(seed: int) -> list[list[float]]:
@@ -70,20 +70,11 @@ def write_frames(folder: Path, frames: list[Any], file: str = "transforms.json",
     return folder
 
 
-def as_text(folder: Path) -> None:
-    model = folder / "sparse" / "0"
-    reconstruction = pycolmap.Reconstruction(str(model))
-    for file in model.iterdir():
-        file.unlink()
-    reconstruction.write_text(str(model))
-
-
-def model_of(folder: Path, kind: str, params: list[float], name: str = "a.png", cameras: int = 1, **size: int) -> None:
-    size = size or {"width": 40, "height": 30}
+def model_of(folder: Path, kind: str, params: list[float], width: int = 40, height: int = 30) -> None:
     reconstruction = pycolmap.Reconstruction()
-    for i in range(1, cameras + 1):
-        reconstruction.add_camera_with_trivial_rig(pycolmap.Camera(model=kind, params=params, camera_id=i, **size))
-    image = pycolmap.Image(name=name, camera_id=1, image_id=1)
+    lens = pycolmap.Camera(model=kind, params=params, camera_id=1, width=width, height=height)
+    reconstruction.add_camera_with_trivial_rig(lens)
+    image = pycolmap.Image(name="a.png", camera_id=1, image_id=1)
     reconstruction.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
     (folder / "sparse" / "0").mkdir(parents=True)
     reconstruction.write_binary(str(folder / "sparse" / "0"))

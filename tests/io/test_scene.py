@@ -25,7 +25,7 @@ from clod_adapter.io.scene import colmap
 from clod_adapter.io.scene.folder import scene_files
 from clod_adapter.io.scene.load import ImageCache, load_cameras, load_scene
 from clod_adapter.progress import Stopped
-from photographs import LENSES, SIZE, as_text, camera, model_of, pixels, psnr_of, seen, write_scene
+from photographs import LENSES, SIZE, camera, model_of, pixels, psnr_of, seen, write_scene
 
 
 @pytest.fixture(autouse=True)
@@ -54,11 +54,12 @@ def model(folder: Path, form: str, names: tuple[str, ...] = ("a.png", "sub/b.png
 @pytest.mark.parametrize("form", ["binary", "text", "before rigs"])
 def test_scene_round_trips(tmp_path: Path, form: str) -> None:
     cameras, names = write_scene(tmp_path)
+    folder = tmp_path / "sparse" / "0"
     if form == "text":
-        as_text(tmp_path)
-    if form == "before rigs":
-        for name in ("rigs.bin", "frames.bin"):
-            (tmp_path / "sparse" / "0" / name).unlink()
+        pycolmap.Reconstruction(str(folder)).write_text(str(folder))
+    for pattern in {"text": ["*.bin"], "before rigs": ["rigs.bin", "frames.bin"]}.get(form, ()):
+        for file in folder.glob(pattern):
+            file.unlink()
     progress: list[tuple[int, int]] = []
     loaded = load_scene(str(tmp_path), progress=lambda now: progress.append((now.done, now.total)))
     assert loaded.notes == () and progress == [(k + 1, 10) for k in range(10)]
