@@ -17,7 +17,6 @@ import pytest
 import torch
 from filelock import FileLock
 from PIL import Image
-from plyfile import PlyData, PlyElement
 
 import browser
 import fake_gpu
@@ -32,7 +31,7 @@ from clod_adapter.io.formats.splat_transform import VARIABLE
 from clod_adapter.io.scene.colmap import write_model
 from clod_adapter.render import render
 from clod_adapter.training import pseudo_views
-from formats import inria_rows
+from formats import inria_rows, write_rows
 from runs import accepted
 from scenes import looking
 
@@ -110,8 +109,7 @@ def dialled(capture: Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def _write_inria(path: Path, gaussians: Gaussians) -> Path:
     plain = gaussians.replace(sigma_d=None, attenuation=None)
-    PlyData([PlyElement.describe(inria_rows(plain), "vertex")], byte_order="<").write(str(path))
-    return path
+    return write_rows(path, inria_rows(plain))
 
 
 def _camera(angle: float) -> Camera:

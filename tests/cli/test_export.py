@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from plyfile import PlyData, PlyElement
+from plyfile import PlyData
 
 import clod_adapter
 from clod_adapter.cli.shared.inputs import named
@@ -22,7 +22,7 @@ from clod_adapter.io.checkpoint import load, save
 from clod_adapter.io.formats import splat_transform
 from clod_adapter.io.ply_settings import write_comments
 from clod_adapter.io.settings import Metadata
-from formats import with_columns
+from formats import with_columns, write_rows
 from scenes import camera
 
 ONE, SET = ("--sv", 2, "-o", "x.sog"), ("--levels", "1,2", "--lod-meta", "-o", "out")
@@ -146,8 +146,7 @@ def test_losses_are_noted(clod: Any, capture: Any, dialled: Path, tmp_path: Path
     assert report["outputs"] == [{"file": "x.splat", "virtual_scale": None, "count": 300, "bytes": 300 * 32}]
     assert "view-dependent colour is dropped" in report["notes"]
     model, element = load(dialled), PlyData.read(str(dialled), mmap=False)["vertex"]
-    labelled = PlyElement.describe(with_columns(element.data, label=7), "vertex", comments=element.comments)
-    PlyData([labelled]).write(tmp_path / "labelled.ply")
+    write_rows(tmp_path / "labelled.ply", with_columns(element.data, label=7), comments=element.comments)
     report, _ = exported(clod, "labelled.ply", "-o", "x.ply")
     assert report["notes"] == ["columns dropped: label"] and load("x.ply").gaussians == model.gaussians
     save("hard.ply", model.gaussians.replace(attenuation=replace(model.gaussians.attenuation, tau=0.01, cut="hard")))
@@ -158,7 +157,7 @@ def test_losses_are_noted(clod: Any, capture: Any, dialled: Path, tmp_path: Path
     there = tuple(viewpoint.moved([437_000.0, 0, 0]) for viewpoint in model.calibration.viewpoints)
     calibration = replace(model.calibration, viewpoints=there)
     comments = write_comments(Metadata(model.gaussians.attenuation, calibration=calibration))
-    PlyData([PlyElement.describe(far, "vertex", comments=comments)]).write(tmp_path / "far.ply")
+    write_rows(tmp_path / "far.ply", far, comments=comments)
     report, _ = exported(clod, "far.ply", "--sv", 2, "-o", "x.ply")
     assert any("x, y and z are doubles" in note for note in report["notes"])
     again = load("x.ply")

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from plyfile import PlyData, PlyElement
+from plyfile import PlyData
 
 import clod_adapter
 import scenes
@@ -16,6 +16,7 @@ from clod_adapter.config import FILTERS
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.file_formats import write
 from clod_adapter.render import render
+from formats import write_rows
 from shown import Shown, assert_same, drop, message, take
 
 CAMERA = scenes.camera(320, 240)
@@ -36,9 +37,7 @@ def test_ply_and_spz_are_shown_as_python_reads_them(
     data, rows = (tmp_path / "usual.ply").read_bytes(), PlyData.read(tmp_path / "usual.ply", mmap=False)["vertex"]
     (tmp_path / "bare.ply").write_bytes(re.sub(rb"(?m)^comment .*\n", b"", data))
     doubles = rows.data.astype([(name, "f8") for name in rows.data.dtype.names])
-    PlyData([PlyElement.describe(doubles, "vertex", comments=rows.comments)], byte_order=">").write(
-        str(tmp_path / "doubles.ply")
-    )
+    write_rows(tmp_path / "doubles.ply", doubles, ">", rows.comments)
     write(tmp_path / "tag.ply", plain.replace(log_scales=plain.log_scales - 2.0))
     tagged = re.sub(rb"(?m)^comment clod_adapter .*\n", b"", (tmp_path / "tag.ply").read_bytes())
     (tmp_path / "tag.ply").write_bytes(tagged.replace(b"format", b"comment SplatRenderMode: mip\nformat", 1))
