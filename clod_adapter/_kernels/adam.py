@@ -8,7 +8,7 @@ from clod_adapter._kernels.elementary import vsqrt
 from clod_adapter._kernels.pointers import load_where, pointer, scratch, store_where
 from clod_adapter._kernels.simd import anywhere, fma, gt, load, splat
 
-ROOM = 16 * 72  # numbers of sixteen rows: at most the harmonics of degree 4
+ROOM = 16 * 72  # numbers of sixteen rows: at most the harmonics of degree 4, the highest that Gaussians have
 
 
 @kernel
@@ -29,15 +29,20 @@ def adam_rows(
     lengths, factors = scratch(float32, ROOM), scratch(float32, ROOM)
     parameter, first, second, gradient = pointer(parameter), pointer(first), pointer(second), pointer(gradient)
     for start in range(begin, end, 16):
+        stop, some = min(start + 16, end), False
+        for row in range(start, stop):
+            some |= mask[row]
+        if not some:
+            continue
         for k in range(16 * width):
             factors[k] = ZERO
-        for row in range(start, min(start + 16, end)):
-            chosen = mask[row]  # a factor, no branch: half of the predictions would fail
-            steps[row] += counted * chosen
-            count = min(steps[row], most)
-            length, factor = rate * units[each * row] * corrections[0, count], corrections[1, count] * float32(chosen)
-            for k in range(width * (row - start), width * (row - start + 1)):
-                lengths[k], factors[k] = length, factor
+        for row in range(start, stop):
+            if mask[row]:
+                steps[row] += counted
+                count = min(steps[row], most)
+                length, factor = rate * units[each * row] * corrections[0, count], corrections[1, count]
+                for k in range(width * (row - start), width * (row - start + 1)):
+                    lengths[k], factors[k] = length, factor
         for k in range(0, 16 * width, 16):
             factor, at = load(factors, k), width * start + k
             chosen = gt(factor, splat(ZERO))

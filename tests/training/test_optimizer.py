@@ -6,7 +6,7 @@ from torch import Tensor
 
 from clod_adapter.training.optimizer import RowAdam
 
-SHAPES = {"means": (3,), "quats": (4,), "opacity_logits": (), "sh0": (1, 3), "shN": (8, 3), "none": (0, 3)}
+SHAPES = {"means": (3,), "quats": (4,), "opacity_logits": (), "sh0": (1, 3), "shN": (24, 3), "none": (0, 3)}
 TENTHS = dict.fromkeys(SHAPES, 0.1)
 
 
