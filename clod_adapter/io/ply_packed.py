@@ -71,12 +71,15 @@ def unpack(path: Path, elements: Mapping[str, np.ndarray], degree: int) -> Array
     opacity = np.clip(opacity, 0.25 / 255, 254.75 / 255)  # so that no logit is infinite
     levels = np.arange(256, dtype=np.float32)
     steps = (np.where(levels == 0, 0, np.where(levels == 255, 1, (levels + 0.5) / 256)) - 0.5) * 8
-    harmonics = [steps[table[f"f_rest_{k}"]] for k in range(3 * bands)] if table is not None and bands else []
+    harmonics = np.empty((count, bands, 3), np.float32)
+    if table is not None:
+        for k in range(3 * bands):  # channel by channel
+            harmonics[:, k % bands, k // bands] = steps[table[f"f_rest_{k}"]]
     return {
         "means": means, "log_scales": log_scales, "sh0": (np.stack(colours, 1)[:, None] - 0.5) / SH_C0,
         "quats": np.ascontiguousarray(_rotations(packed["packed_rotation"]).T.astype(np.float32)),
         "opacity_logits": np.log(opacity / (1 - opacity)).astype(np.float32),
-        "shN": np.array(harmonics, np.float32).reshape(3, bands, count).transpose(2, 1, 0),  # channel by channel
+        "shN": harmonics,
     }  # fmt: skip
 
 

@@ -112,6 +112,7 @@ def _constant_settings(path: Path, vertex: np.ndarray) -> dict[str, Any]:
     found: dict[str, Any] = {n: there[n] for n in ("tau", "eps", "reference_distance") if n in there}
     found |= {"cut": "hard"} if there.get("hard_cut") else {}
     found |= {"normalizer": "max"} if there.get("max") else {}
+    found |= {"normalizer": "quantile"} if there.get("quantile") else {}  # of earlier versions; refused
     values: dict[str, Any] = {"attenuation": found}
     if "screen_variance" in there or "compensate" in there:
         variance = there.get("screen_variance", CLASSIC.variance)

@@ -44,7 +44,7 @@ def write_rows(path: Path, gaussians: Gaussians, metadata: Metadata, base: np.nd
     layout = inria_dtype(gaussians.sh_degree) if base is None else base.dtype
     gone = {FILTER, *((SIGMA, GROWTH) if dial else dial_columns(layout.names or ()))}  # growth_d alone is foreign
     own = [name for name in layout.names or () if name not in gone and not name.startswith(COLUMN)]
-    kinds = [(name, np.dtype("f8") if any(origin) and name in "xyz" else layout[name]) for name in own]
+    kinds = [(name, np.dtype("f8") if any(origin) and name in ("x", "y", "z") else layout[name]) for name in own]
     kind = np.dtype(kinds + [(name, np.dtype("f4")) for name in (*constants, *dial)])
     one = np.broadcast_to(np.zeros((), kind), len(gaussians))  # of which plyfile makes a header without the rows
     element = PlyElement.describe(one, "vertex", comments=write_comments(metadata))

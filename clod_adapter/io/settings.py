@@ -124,7 +124,8 @@ def _calibration(stored: Any, notes: list[str]) -> Calibration | None:
 
 
 def _note_unknown(stored: Mapping[str, Any], known: Any, notes: list[str]) -> None:
-    if unknown := [name for name in stored if name not in known]:
+    # quantile was a setting of a normalizer that is refused by its name.
+    if unknown := [name for name in stored if name not in (*known, "quantile")]:
         notes.append(f"settings unknown to this version ignored: {', '.join(map(repr, unknown))}")
 
 

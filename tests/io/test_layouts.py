@@ -245,6 +245,8 @@ def test_checkpoint_of_gsplat(tmp_path: Path, degree: int) -> None:
     assert "1 of 12 Gaussians dropped" in base.notes[0] and len(base.fingerprint) == 64
     for name, tensor in to_gsplat(base.gaussians).items():
         assert torch.equal(tensor, values[name][torch.arange(12) != 3].float()), name
+    write(tmp_path / "own.pt", base.gaussians)
+    assert torch.load(tmp_path / "own.pt")["step"] == 0  # which gsplat's trainer and viewer expect
     save(tmp_path / "out.ply", base.gaussians, base)
     again = load(tmp_path / "out.ply")
     assert again.gaussians == base.gaussians and again.vertex.dtype.names[3:6] == ("nx", "ny", "nz")
