@@ -106,6 +106,7 @@ ABORTED = f"--resume resumes from step {ITERS}, which is in {STATE}\nclod-adapt:
 MOMENTS = [  # where signals arrive, which, exit code, files, and the report's "interrupted" or the end of stderr
     ((plan, "sh_degree_losses"), [INT], 130, [], "clod-adapt: interrupted"),
     (SAVING, [signal.SIGUSR1] * 3, 0, BOTH, True),
+    (SAVING, [signal.SIGHUP] * 3, 0, BOTH, True),
     ((run, "extract"), [INT], 0, BOTH, False),
     ((run, "save_adapter"), [INT, TERM], 130, [STATE], ABORTED),
     ((run, "save"), [INT], 0, OUTPUTS, False),  # the files without the page

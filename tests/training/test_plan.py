@@ -11,6 +11,7 @@ from clod_adapter import Decision, Override, Plan, make_plan
 from clod_adapter.adapter import ATTRIBUTES, DIAL, with_dial
 from clod_adapter.cameras import Scene
 from clod_adapter.config import AdaptConfig
+from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.importance import initialize, removal_error
 from clod_adapter.render import render
@@ -126,6 +127,13 @@ def test_each_decision_can_be_overridden(visible: Pair, name: str) -> None:
     assert verdict == ("frozen" if name in RATES else "left out")
     assert {d.name for d in gone.decisions} == {"bands", "unseen", name}
     assert all(decision.why.startswith("as requested") for decision in gone.decisions if decision.name != "unseen")
+
+
+def test_impossible_overrides_are_refused() -> None:
+    with pytest.raises(ClodError, match=r"'colour' is not part of a plan; the names are bands, unseen, means"):
+        Override(keep=frozenset({"colour"}))
+    with pytest.raises(ClodError, match="'quats' is both kept and left out"):
+        Override(frozenset({"quats", "bands"}), frozenset({"quats"}))
 
 
 def test_unseen_gaussians_are_kept_where_another_dial_value_may_show_them(visible: Pair) -> None:

@@ -112,6 +112,7 @@ def test_states_of_other_runs_are_refused(
     Image.new("RGB", (64, 48)).save(tmp_path / "fewer" / "images" / "003.png")
     refused("is of another checkpoint than other.ply; use the", "other.ply", *words[1:])
     refused("is of other photographs than fewer; use the", words[0], "--images", "fewer", *TINY)
+    refused("is of another checkpoint than", *words, "--antialiasing", "on")
     refused("is of a run with other --with or --without, {'--with': [], ", *words, "--without", "quats")
     with monkeypatch.context() as patch:
         patch.setattr(listeners, "package_version", lambda: "0.0.7")
