@@ -61,19 +61,18 @@ class Gaussians:
         for field in dataclasses.fields(self):
             if isinstance(value := getattr(self, field.name), np.ndarray):
                 object.__setattr__(self, field.name, float_tensor(value))
-        n, bands = (
-            len(self.means),
-            next((k for k in self.shN.shape[1:2] if k + 1 in SH_COUNTS.values()), "0, 3, 8, 15 or 24"),
-        )
+        n = len(self.means)
         shapes = {
             "means": (n, 3), "quats": (n, 4), "log_scales": (n, 3), "opacity_logits": (n,), "sh0": (n, 1, 3),
-            "shN": (n, bands, 3), "sigma_d": (n,), "growth_d": (n,),
+            "sigma_d": (n,), "growth_d": (n,),
         }  # fmt: skip
         for name, value in self.tensors().items():
             require(value.is_floating_point(), f"Gaussians.{name}", value.dtype, "floating point: .float()")
             found = tuple(value.shape)
-            if found != shapes[name]:
+            if name != "shN" and found != shapes[name]:
                 raise ClodError(f"Gaussians.{name} has shape {found}, expected {shapes[name]}")
+            if name == "shN" and found not in [(n, count - 1, 3) for count in SH_COUNTS.values()]:
+                raise ClodError(f"Gaussians.shN has shape {found}, expected ({n}, K-1, 3) with K-1 in 0, 3, 8, 15, 24")
         if (self.sigma_d is None) != (self.attenuation is None):
             raise ClodError("Gaussians needs both sigma_d and attenuation, or neither")
         if self.growth_d is not None and self.sigma_d is None:

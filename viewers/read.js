@@ -77,7 +77,7 @@ export function readSettings(comments, constants = {}) {
   return settings;
 }
 
-/** The screen-space filter from comments, ours or another program's, or from columns; as in io/screen_filter.py. */
+/** The screen-space filter from comments, ours or another program's, or from columns; as in io/settings.py. */
 function readScreenFilter(comments, { clod_screen_variance, clod_compensate }, hasDial) {
   const written = entries(comments).findLast(([name]) => name === "screen_filter")?.[1];
   if (written) {

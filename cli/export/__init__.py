@@ -65,7 +65,8 @@ def check(args: Namespace) -> None:
          f"--images is used for baking, --order and {PAGE} only; add one of them, as in --sv 2"),
         (folder and out.suffix.lower() in (".json", *FORMATS),
          f"{out}: with {folder}, --out names the folder for {FOLDERS.get(folder)}, not a file"),
-        (folder and out.is_file(), f"{out}: is a file; with {folder}, --out must name a new folder"),
+        (folder and out.exists() and not out.is_dir(),
+         f"{out}: is a file; with {folder}, --out must name a new folder"),
         (folder and not out.name, f"{out}: is the current folder; --out must name a new one"),  # ".", never replaced
     )  # fmt: skip
     if args.images is not None:

@@ -153,7 +153,7 @@ def initial_dial(virtual_scale: float, max_sv: float | None, console: Console) -
 def given_budget(args: Namespace) -> tuple[str, str, list[float]] | None:
     """Name, option and values of the budget, or None without one."""
     if device := getattr(args, "device_preset", None):
-        return "keep", f"--device-preset {device}, --keep", [DEVICES[device]]
+        return "keep", f"--device-preset {device}", [DEVICES[device]]
     for name, *_ in OPTIONS:
         if getattr(args, name, None) is not None:
             return name, as_option(name), getattr(args, name)

@@ -1,9 +1,9 @@
 """A package whose names are imported on first use."""
 
 import ast
+import inspect
 import sys
 from importlib import import_module
-from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -11,7 +11,7 @@ from typing import Any
 def on_first_use(package: str) -> None:
     """Makes the names that the package's source imports from its submodules, for type checkers, its attributes."""
     module = sys.modules[package]
-    source = ast.parse(Path(str(module.__file__)).read_bytes())
+    source = ast.parse(inspect.getsource(module))
     imports = [node for node in ast.walk(source) if isinstance(node, ast.ImportFrom)]
     homes = {alias.name: str(node.module) for node in imports for alias in node.names}
     module.__dict__["_homes"] = {name: homes[name] for name in module.__all__}

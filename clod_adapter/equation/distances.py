@@ -70,10 +70,12 @@ def camera_unit(means: Tensor, camera: Camera, config: AttenuationConfig) -> flo
 
 
 def median_distance(means: Tensor, camera: Camera) -> float:
-    """Of the centres ``means [N, 3]`` in the image, or of all if there is none; world units."""
+    """Of the centres ``means [N, 3]`` in the image, or of all if there is none; world units, 1 for no centres."""
     inside = in_frustum(means, camera)
     distances = (means - camera.position.to(means)).norm(dim=1)
     visible = distances[inside] if bool(inside.any()) else distances
+    if not len(visible):
+        return 1.0
     return float(visible.median().clamp(min=torch.finfo(visible.dtype).tiny))
 
 

@@ -84,7 +84,7 @@ def write_page(
     tiles += [(f"s = {dial[k]['virtual_scale']:g}", dial[k]) for k in ends_and_middle]
     settings = {"model": report["model"], "scene": "none (synthetic views)" if own else report["scene"]}
     settings |= {"version": report["version"], **report["machine"], "device": report["device"]}
-    settings |= {f"{name}, seconds": value for name, value in report["seconds"].items()}
+    settings |= {f"{name}, seconds": f"{value:.1f}" for name, value in report["seconds"].items()}
     few = dict.fromkeys(round(k * (len(frames) - 1) / 3) for k in range(4)) if frames else ()
     height, width = frames[0].image.shape[:2] if frames else (1, 1)
     source = files("clod_adapter.report")
