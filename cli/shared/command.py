@@ -153,7 +153,7 @@ def initial_dial(virtual_scale: float, max_sv: float | None, console: Console) -
 def given_budget(args: Namespace) -> tuple[str, str, list[float]] | None:
     """Name, option and values of the budget, or None without one."""
     if device := getattr(args, "device_preset", None):
-        return "keep", f"--device-preset {device}", [DEVICES[device]]
+        return "keep", f"--device-preset {device}, --keep", [DEVICES[device]]
     for name, *_ in OPTIONS:
         if getattr(args, name, None) is not None:
             return name, as_option(name), getattr(args, name)
@@ -178,6 +178,7 @@ def check_dials(args: Namespace, model: str) -> None:
         if not 0 < value < math.inf:
             raise ClodError(f"{option} has {value:g}, it must be positive and finite")
     if name and not file_has_dial(Path(model)):
+        option = option.partition(",")[0]
         raise ClodError(f"{model}: has no sigma_d, which {option} needs; adapt it first: clod-adapt {model} ...")
     if name == "psnr_drop" and format_of(Path(model)) is PLY:
         from clod_adapter.io.ply import all_comments, read_head  # here: --help needs no plyfile
