@@ -39,8 +39,35 @@ if TYPE_CHECKING:
     from clod_adapter.training.camera_placement import place_cameras
     from clod_adapter.training.dial import Dial, TrainableSubset, attach
     from clod_adapter.training.loop import Adapted, adapt
-    from clod_adapter.training.plan import Decision, Override, Plan, make_plan
+    from clod_adapter.training.plan import Decision, Override, Plan
+    from clod_adapter.training.planner import make_plan
     from clod_adapter.training.pseudo_views import render_pseudo_views
+
+# Imported on first use: torch takes a second or two, which the command's --help and most of its errors do without.
+on_first_use(__name__, {
+    "adapter": ("Adapter", "detach", "extract", "with_dial"),
+    "evaluation.budget": ("DialValue", "dial_for"),
+    "calibration": ("Calibration",),
+    "cameras": ("Camera", "Scene", "View"),
+    "config": ("AdaptConfig", "AttenuationConfig", "ScreenFilter"),
+    "errors": ("ClodError",),
+    "evaluation.evaluate": ("evaluate",),
+    "bake": ("bake", "order_by_extinction"),
+    "gaussians": ("Gaussians",),
+    "hook": ("Hold", "Hook"),
+    "integrations.splats": ("from_gsplat", "to_gsplat"),
+    "io.adapter_file": ("load_adapter", "save_adapter"),
+    "io.scene.load": ("load_scene",),
+    "io.checkpoint": ("Checkpoint", "load", "save"),
+    "training.camera_placement": ("place_cameras",),
+    "training.pseudo_views": ("render_pseudo_views",),
+    "training.plan": ("Decision", "Override", "Plan"),
+    "training.planner": ("make_plan",),
+    "progress": ("Phase", "Progress", "Stopped"),
+    "render": ("Rendering", "render"),
+    "training.dial": ("Dial", "TrainableSubset", "attach"),
+    "training.loop": ("Adapted", "adapt"),
+})  # fmt: skip
 
 __all__ = [
     "AdaptConfig", "Adapted", "Adapter", "AttenuationConfig", "Calibration", "Camera", "Checkpoint", "ClodError",
@@ -49,6 +76,3 @@ __all__ = [
     "evaluate", "extract", "from_gsplat", "load", "load_adapter", "load_scene", "make_plan", "order_by_extinction",
     "place_cameras", "render", "render_pseudo_views", "save", "save_adapter", "to_gsplat", "with_dial",
 ]  # fmt: skip
-
-# Torch takes a second or two, which the command's --help and most of its errors do without.
-on_first_use(__name__)

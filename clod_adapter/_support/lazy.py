@@ -1,20 +1,16 @@
 """A package whose names are imported on first use."""
 
-import ast
-import inspect
 import sys
+from collections.abc import Mapping, Sequence
 from importlib import import_module
 from types import ModuleType
 from typing import Any
 
 
-def on_first_use(package: str) -> None:
-    """Makes the names that the package's source imports from its submodules, for type checkers, its attributes."""
+def on_first_use(package: str, names: Mapping[str, Sequence[str]]) -> None:
+    """Makes the names of each submodule attributes of the package that is being imported."""
     module = sys.modules[package]
-    source = ast.parse(inspect.getsource(module))
-    imports = [node for node in ast.walk(source) if isinstance(node, ast.ImportFrom)]
-    homes = {alias.name: str(node.module) for node in imports for alias in node.names}
-    module.__dict__["_homes"] = {name: homes[name] for name in module.__all__}
+    module.__dict__["_homes"] = {name: home for home, group in names.items() for name in group}
     module.__class__ = _Lazy
 
 
@@ -24,7 +20,7 @@ class _Lazy(ModuleType):
     def __getattr__(self, name: str) -> Any:
         if name not in self._homes:
             raise AttributeError(f"module {self.__name__!r} has no attribute {name!r}")
-        value = self.__dict__[name] = getattr(import_module(self._homes[name]), name)
+        value = self.__dict__[name] = getattr(import_module(f"{self.__name__}.{self._homes[name]}"), name)
         return value
 
     def __setattr__(self, name: str, value: Any) -> None:
