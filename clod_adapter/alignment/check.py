@@ -79,10 +79,30 @@ class Alignment:
 @torch.no_grad()
 def check_alignment(gaussians: Gaussians, views: Sequence[View]) -> Alignment:
     """Renders at most MOST_VIEWS of the views, evenly spread, at s = 1, and compares them with the photographs."""
-    views, rows = spread(views, MOST_VIEWS), []
+    views = spread(views, MOST_VIEWS)
     seen = torch.zeros(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
     for view in views:
         seen |= in_frustum(gaussians.means, view.camera)
+    in_view = float(seen.float().mean()) if len(seen) else 0.0
+    table = compare_renders(gaussians, views)
+    if not len(table):
+        return Alignment(0, in_view, *[math.nan] * 5)
+    error, over_white, constant, *_ = table.mean(0).tolist()
+    return Alignment(
+        views=len(table), in_view=in_view, psnr=_decibels(error), mean_colour_psnr=_decibels(constant),
+        white_psnr=_decibels(over_white), correlation=correlation(table),
+        explained=float((table[:, 0] < table[:, 2]).float().mean()),
+    )  # fmt: skip
+
+
+def compare_renders(gaussians: Gaussians, views: Sequence[View]) -> Tensor:
+    """``[n, 5]`` means over the pixels and channels of each photograph that is not of one colour.
+
+    Squared error of the render over black, over white, and of the photograph's mean colour; variance of the render;
+    covariance of render and photograph.
+    """
+    rows = []
+    for view in views:
         photograph = unit(view.image, gaussians.means)
         about = photograph - photograph.mean((0, 1))
         if float(about.square().mean().sqrt()) < FLAT:
@@ -93,16 +113,13 @@ def check_alignment(gaussians: Gaussians, views: Sequence[View]) -> Alignment:
         centred = black - black.mean((0, 1))
         errors = [(black - photograph).square(), (white - photograph).square(), about.square()]
         rows.append(torch.stack([each.mean() for each in (*errors, centred.square(), centred * about)]))
-    in_view = float(seen.float().mean()) if len(seen) else 0.0
-    if not rows:
-        return Alignment(0, in_view, *[math.nan] * 5)
-    table = torch.stack(rows)
-    error, over_white, constant, rendered, shared = table.mean(0).tolist()
-    return Alignment(
-        views=len(rows), in_view=in_view, psnr=_decibels(error), mean_colour_psnr=_decibels(constant),
-        white_psnr=_decibels(over_white), correlation=shared / math.sqrt(constant * rendered) if rendered > 0 else 0.0,
-        explained=float((table[:, 0] < table[:, 2]).float().mean()),
-    )  # fmt: skip
+    return torch.stack(rows) if rows else gaussians.means.new_empty(0, 5)
+
+
+def correlation(table: Tensor) -> float:
+    """Of renders and photographs in ``compare_renders``, in [-1, 1]; 0 without any."""
+    _, _, constant, rendered, shared = table.mean(0).tolist()
+    return shared / math.sqrt(constant * rendered) if rendered > 0 else 0.0
 
 
 def _decibels(error: float) -> float:

@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from clod_adapter.alignment.check import CLEAR, DOUBTFUL, Alignment, check_alignment
+from clod_adapter.alignment.check import CLEAR, DOUBTFUL, Alignment, check_alignment, compare_renders, correlation
 from clod_adapter.alignment.frames import Frame, focus_of, known_frames
 from clod_adapter.cameras import Camera, Scene, View, in_its_unit, spread
 from clod_adapter.gaussians import Gaussians
@@ -87,7 +87,7 @@ def _small(gaussians: Gaussians, views: Sequence[View], width: int, most: int) -
     if len(gaussians) > most:
         cover = F.logsigmoid(gaussians.opacity_logits) + gaussians.log_scales.topk(2, dim=1).values.sum(1)
         gaussians = gaussians.select(cover.topk(most).indices)
-    return lambda frame: check_alignment(gaussians, views_in(shrunk, frame)).correlation
+    return lambda frame: correlation(compare_renders(gaussians, views_in(shrunk, frame)))
 
 
 def _search(
