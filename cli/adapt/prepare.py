@@ -25,7 +25,8 @@ from clod_adapter.io.checkpoint import Checkpoint
 from clod_adapter.io.scene.load import ImageCache
 from clod_adapter.progress import Phase, Stopped
 from clod_adapter.training.loop import time_steps
-from clod_adapter.training.plan import NOT_NEEDED, Decision, Override, Plan, make_plan
+from clod_adapter.training.plan import NOT_NEEDED, Decision, Override, Plan
+from clod_adapter.training.planner import make_plan
 
 from ..shared.console import Console, ProgressDisplay
 from ..shared.inputs import (

@@ -25,7 +25,7 @@ from clod_adapter.initialization.importance import initialize, scene_distance
 from clod_adapter.progress import Phase, Progress, Stopped
 from clod_adapter.training.distributed import joined
 from clod_adapter.training.loop import TrainingState, adapt
-from clod_adapter.training.plan import make_plan
+from clod_adapter.training.planner import make_plan
 from runs import change_step, config_of, fail, states_of
 from scenes import assert_equal, capture, gaussians, photograph, ring
 

@@ -16,7 +16,8 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.importance import initialize, removal_error
 from clod_adapter.render import render
 from clod_adapter.training.dial import TrainableSubset
-from clod_adapter.training.plan import NAMES, NOT_NEEDED, RATES, largest_change, needed_share, seen, sh_degree_losses
+from clod_adapter.training.plan import NAMES, NOT_NEEDED, RATES, largest_change
+from clod_adapter.training.planner import needed_share, seen, sh_degree_losses
 from clod_adapter.training.state import TrainingState
 from runs import states_of
 from scenes import assert_equal, gaussians, photograph, ring, with_unseen
