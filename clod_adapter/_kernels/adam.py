@@ -47,12 +47,9 @@ def adam_rows(
             factor, at = load(factors, k), width * start + k
             chosen = gt(factor, splat(ZERO))
             if anywhere(chosen):
-                g, m, v = (
-                    load_where(chosen, gradient, at),
-                    load_where(chosen, first, at),
-                    load_where(chosen, second, at),
-                )
-                m, v = fma(beta1, m, rest1 * g), fma(beta2, v, rest2 * g * g)
+                g = load_where(chosen, gradient, at)
+                m = fma(beta1, load_where(chosen, first, at), rest1 * g)
+                v = fma(beta2, load_where(chosen, second, at), rest2 * g * g)
                 x = load_where(chosen, parameter, at) - load(lengths, k) * m / (vsqrt(v) * factor + epsilon)
                 store_where(chosen, first, at, m)
                 store_where(chosen, second, at, v)

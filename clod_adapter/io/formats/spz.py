@@ -183,10 +183,8 @@ def read(path: Path, data: bytes) -> Source:
     if dial:  # whose sigma_d is in units of the reference distance where that is large
         tensors: dict[str, Any] = {name: torch.from_numpy(array).float() for name, array in arrays.items()}
         gaussians = in_world_units(Gaussians(**tensors, attenuation=metadata.attenuation))
-        arrays[SIGMA], metadata = (
-            gaussians.tensors()[SIGMA].numpy(),
-            replace(metadata, attenuation=gaussians.attenuation),
-        )
+        arrays[SIGMA] = gaussians.tensors()[SIGMA].numpy()
+        metadata = replace(metadata, attenuation=gaussians.attenuation)
     antialiased = flags & ANTIALIASED and not (metadata.screen_filter or CLASSIC).compensate
     comments = (*metadata.about, TAG) if antialiased else metadata.about  # of another program, which states no variance
     return Source(arrays, metadata, (QUANTISED,), comments)
