@@ -51,9 +51,10 @@ def _quality(axes: Any, cells: Sequence[Mapping[str, Any]], key: str, colours: M
         if last is not None:
             label = s_1 if last == 1 else f"adapted, s in [1, {last:g}]"
             style = {"color": colours[last], "marker": "o", "label": label}
-        _plot(axes, [row for row in rows if last is None or row["virtual_scale"] <= last], key, style)
         if outside := [row for row in rows if last is not None and row["virtual_scale"] >= last]:
             _plot(axes, outside, key, style | {"linestyle": ":", "mfc": "white", "label": BEYOND})
+        # On top, as the end of the range is in both.
+        _plot(axes, [row for row in rows if last is None or row["virtual_scale"] <= last], key, style)
     axes.margins(x=0.06, y=0.12)
     label_log(axes.xaxis)
 
