@@ -10,7 +10,7 @@ from typing import Any
 def on_first_use(package: str, names: Mapping[str, Sequence[str]]) -> None:
     """Makes the names of each submodule attributes of the package that is being imported."""
     module = sys.modules[package]
-    module.__dict__["_homes"] = {name: home for home, group in names.items() for name in group}
+    module.__dict__["_homes"] = {name: f"{package}.{home}" for home, group in names.items() for name in group}
     module.__class__ = _Lazy
 
 
@@ -20,7 +20,7 @@ class _Lazy(ModuleType):
     def __getattr__(self, name: str) -> Any:
         if name not in self._homes:
             raise AttributeError(f"module {self.__name__!r} has no attribute {name!r}")
-        value = self.__dict__[name] = getattr(import_module(f"{self.__name__}.{self._homes[name]}"), name)
+        value = self.__dict__[name] = getattr(import_module(self._homes[name]), name)
         return value
 
     def __setattr__(self, name: str, value: Any) -> None:

@@ -13,7 +13,7 @@ import pytest
 import clod_adapter
 from clod_adapter.cli.adapt import listeners, run
 from clod_adapter.cli.shared import measure
-from clod_adapter.training import plan
+from clod_adapter.training import planner
 from clod_adapter.training.state import load_state
 from runs import OUTPUTS, STATE, Server, log_of, names, pressing, wait_for
 from scenes import stripped
@@ -104,7 +104,7 @@ INT, TERM = signal.SIGINT, signal.SIGTERM
 SAVING, BOTH = (listeners, "save_state"), sorted([*OUTPUTS, STATE])  # while training
 ABORTED = f"--resume resumes from step {ITERS}, which is in {STATE}\nclod-adapt: interrupted"
 MOMENTS = [  # where signals arrive, which, exit code, files, and the report's "interrupted" or the end of stderr
-    ((plan, "sh_degree_losses"), [INT], 130, [], "clod-adapt: interrupted"),
+    ((planner, "sh_degree_losses"), [INT], 130, [], "clod-adapt: interrupted"),
     (SAVING, [signal.SIGUSR1] * 3, 0, BOTH, True),
     (SAVING, [signal.SIGHUP] * 3, 0, BOTH, True),
     ((run, "extract"), [INT], 0, BOTH, False),
