@@ -12,7 +12,7 @@ import clod_adapter as clod
 from clod_adapter.config import SH_COUNTS
 from clod_adapter.gaussians import SH_C0, Gaussians
 from clod_adapter.io.atomic import atomic_path
-from clod_adapter.io.scene.colmap import write_model
+from models import write_model
 
 import numpy as np
 import torch

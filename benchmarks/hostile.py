@@ -32,7 +32,7 @@ from pathlib import Path
 
 import clod_adapter
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.io.scene.colmap import write_model
+from models import write_model
 
 # isort: split
 import torch

@@ -28,10 +28,10 @@ from clod_adapter.config import FILTERS
 from clod_adapter.evaluation import frame_times
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.formats.splat_transform import VARIABLE
-from clod_adapter.io.scene.colmap import write_model
 from clod_adapter.render import render
 from clod_adapter.training import pseudo_views
 from formats import inria_rows, write_rows
+from models import write_model
 from runs import accepted
 from scenes import looking
 

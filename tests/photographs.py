@@ -11,7 +11,7 @@ import torch
 from PIL import Image
 
 from clod_adapter.cameras import Camera
-from clod_adapter.io.scene.colmap import write_model
+from models import write_model
 
 SIZE = {"width": 160, "height": 120}
 INTRINSICS = {"fl_x": 30.0, "fl_y": 31.0, "cx": 19.25, "cy": 15.5, "w": 40, "h": 30}  # of a transforms file

@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from clod_adapter.errors import ClodError
-from clod_adapter.io.scene.colmap import write_model
 from clod_adapter.io.scene.load import load_cameras, load_scene
+from models import write_model
 from photographs import INTRINSICS, camera, model_of, pixels, pose, psnr_of, seen, to_world, write_frames, write_images
 
 

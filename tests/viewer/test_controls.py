@@ -11,7 +11,7 @@ import clod_adapter
 import scenes
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.file_formats import write
-from clod_adapter.io.scene.colmap import write_model
+from models import write_model
 from shown import TALL, Shown, drop, fold
 
 

@@ -16,8 +16,8 @@ from clod_adapter.calibration import Calibration, CalibrationRow
 from clod_adapter.cameras import Camera
 from clod_adapter.equation.distances import viewpoint_of
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.io.scene.colmap import write_model
 from clod_adapter.viewer.page import write_viewer_page
+from models import write_model
 from shown import Shown, take
 
 

@@ -1,4 +1,4 @@
-"""COLMAP models: posed images and points, read and written; damaged ones are refused before COLMAP reads them."""
+"""COLMAP models: posed images and points; damaged ones are refused before COLMAP reads them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from clod_adapter.cameras import Camera
 from clod_adapter.errors import ClodError
 from clod_adapter.io.file_formats import read_whole, refuse_long_numbers
 from clod_adapter.io.scene.folder import find_cameras, name_parts
@@ -98,40 +97,6 @@ def load_points(folder: str | Path, origin: Sequence[float] = NOWHERE) -> torch.
     model = find_cameras(Path(folder))
     points = pycolmap.Reconstruction(str(model)).points3D.values() if model.is_dir() else ()
     return torch.from_numpy(np.array([point.xyz for point in points], np.float64).reshape(-1, 3) - origin)
-
-
-def write_model(
-    folder: str | Path,
-    cameras: Sequence[Camera],
-    names: Sequence[str],
-    points: np.ndarray | None = None,
-    colors: np.ndarray | None = None,
-) -> None:
-    """Writes a binary COLMAP model of pinhole cameras to ``folder/sparse/0``.
-
-    ``points [M, 3]`` are black without ``colors [M, 3]`` uint8.
-    """
-    reconstruction = pycolmap.Reconstruction()
-    ids: dict[tuple[float, ...], int] = {}  # of cameras, which images of the same intrinsics and size share
-    for image_id, (camera, name) in enumerate(zip(cameras, names, strict=True), start=1):
-        K = camera.K.double().cpu()
-        params = (K[0, 0].item(), K[1, 1].item(), K[0, 2].item(), K[1, 2].item())
-        key = (camera.width, camera.height, *params)
-        if key not in ids:
-            ids[key] = len(ids) + 1
-            size = {"width": camera.width, "height": camera.height}
-            pinhole = pycolmap.Camera(model="PINHOLE", params=params, camera_id=ids[key], **size)
-            reconstruction.add_camera_with_trivial_rig(pinhole)
-        image = pycolmap.Image(name=name, camera_id=ids[key], image_id=image_id)
-        pose = pycolmap.Rigid3d(camera.viewmat[:3].double().cpu().numpy())
-        reconstruction.add_image_with_trivial_frame(image, pose)
-    xyz = np.zeros((0, 3)) if points is None else np.asarray(points, np.float64)
-    rgb = np.zeros(xyz.shape, np.uint8) if colors is None else np.asarray(colors, np.uint8)
-    for position, color in zip(xyz, rgb, strict=True):
-        reconstruction.add_point3D(position, pycolmap.Track(), color)
-    target = Path(folder) / "sparse" / "0"
-    target.mkdir(parents=True, exist_ok=True)
-    reconstruction.write_binary(str(target))
 
 
 def _posed_image(model: Path, image: pycolmap.Image) -> PosedImage:

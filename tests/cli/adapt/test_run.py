@@ -17,8 +17,8 @@ import clod_adapter
 from clod_adapter.cli.shared import inputs
 from clod_adapter.cli.shared.measure import machine_name
 from clod_adapter.config import AdaptConfig
-from clod_adapter.io.scene.colmap import write_model
 from clod_adapter.training import camera_placement, pseudo_views
+from models import write_model
 from runs import OUTPUTS, names
 from scenes import stripped
 

@@ -10,9 +10,9 @@ import torch
 from PIL import Image
 
 from clod_adapter.cameras import View
-from clod_adapter.io.scene.colmap import write_model
 from clod_adapter.io.scene.load import load_scene
 from clod_adapter.render import render
+from models import write_model
 
 FAST = ("--iters", 1, "--max-sv", 4)
 

@@ -1,0 +1,31 @@
+"""Writes COLMAP models of synthetic scenes, for the benchmarks and the tests."""
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from clod_adapter.cameras import Camera
+
+import numpy as np
+import pycolmap
+
+
+def write_model(
+    folder: Path,
+    cameras: Sequence[Camera],
+    names: Sequence[str],
+    points: Iterable[np.ndarray] = (),
+    colors: Iterable[np.ndarray] = (),
+) -> None:
+    """Writes a binary model of pinhole cameras to ``folder/sparse/0``; ``points [M, 3]``, ``colors [M, 3]`` uint8."""
+    model = pycolmap.Reconstruction()
+    for number, (camera, name) in enumerate(zip(cameras, names, strict=True), start=1):
+        params = camera.K.double()[[0, 1, 0, 1], [0, 1, 2, 2]].numpy()
+        size = {"width": camera.width, "height": camera.height}
+        model.add_camera_with_trivial_rig(pycolmap.Camera(model="PINHOLE", params=params, camera_id=number, **size))
+        image = pycolmap.Image(name=name, camera_id=number, image_id=number)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(camera.viewmat[:3].double().numpy()))
+    for position, color in zip(points, colors, strict=True):
+        model.add_point3D(position.astype(np.float64), pycolmap.Track(), color)
+    target = folder / "sparse" / "0"
+    target.mkdir(parents=True, exist_ok=True)
+    model.write_binary(str(target))
