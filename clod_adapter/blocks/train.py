@@ -24,13 +24,13 @@ from torch import Tensor
 from clod_adapter.blocks.divide import Division, block_config, block_target, context_rows, target_image
 from clod_adapter.cameras import Scene, View, spread
 from clod_adapter.config import AdaptConfig
-from clod_adapter.errors import ClodError
+from clod_adapter.errors import ClodError, refused_if_damaged
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.importance import MOST_VIEWS
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.file_formats import refuse_irregular
 from clod_adapter.io.scene.load import ImageCache
-from clod_adapter.io.tensor_file import read_tensors, refused_if_damaged, write_tensors
+from clod_adapter.io.tensor_file import read_tensors, write_tensors
 from clod_adapter.progress import Listener, Phase, tell
 from clod_adapter.training.dial import TrainableSubset
 from clod_adapter.training.loop import adapt

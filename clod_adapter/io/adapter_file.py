@@ -14,10 +14,10 @@ import torch
 
 from clod_adapter.adapter import Adapter, dial_tensors
 from clod_adapter.config import CLASSIC
-from clod_adapter.errors import ClodError
+from clod_adapter.errors import ClodError, refused_if_damaged
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.file_formats import KEY, read_whole
-from clod_adapter.io.settings import ADAPTER, DAMAGE, Metadata, damaged, document, parse_document, read_metadata
+from clod_adapter.io.settings import ADAPTER, DAMAGED, Metadata, document, parse_document, read_metadata
 from clod_adapter.io.tensor_file import parse_tensors, read_tensor_header, write_tensors
 
 
@@ -53,7 +53,7 @@ def load_adapter(path: str | Path) -> Adapter:
     tensors, metadata = parse_tensors(path, read_whole(path))
     about, settings = _description(path, metadata)
     assert settings.attenuation is not None
-    try:
+    with refused_if_damaged(path, "its tensors or settings are damaged", DAMAGED[1]):
         trimmed = about.get("trimmed", {})
         kept = _rows(tensors.pop("kept"), trimmed["base_count"]) if "kept" in tensors else None
         return Adapter(
@@ -71,10 +71,6 @@ def load_adapter(path: str | Path) -> Adapter:
             screen_filter=settings.screen_filter or CLASSIC,
             notes=settings.notes,
         )
-    except DAMAGE as error:
-        raise damaged(path, error) from error
-    except ClodError as error:
-        raise ClodError(f"{path}: {error}") from error
 
 
 def _description(path: Path, metadata: dict[str, str]) -> tuple[dict[str, Any], Metadata]:
@@ -82,9 +78,10 @@ def _description(path: Path, metadata: dict[str, str]) -> tuple[dict[str, Any], 
     if KEY not in metadata:
         raise ClodError(f"{path}: is a safetensors file but not an adapter; give a file that this package wrote")
     about = parse_document(path, metadata[KEY], ADAPTER)
-    for name, wanted in (("base_sha256", str), ("package_version", str), ("config", dict)):
-        if not isinstance(about.get(name), wanted):
-            raise damaged(path, TypeError(f"{name} is {about.get(name)!r:.40}, not a {wanted.__name__}"))
+    with refused_if_damaged(path, *DAMAGED):
+        for name, wanted in (("base_sha256", str), ("package_version", str), ("config", dict)):
+            if not isinstance(about[name], wanted):
+                raise TypeError(f"{name} is {about[name]!r:.40}, not a {wanted.__name__}")
     return about, read_metadata(path, about, dial=True)
 
 

@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from plyfile import PlyData, PlyElement, PlyListProperty, PlyParseError
+from plyfile import PlyData, PlyElement, PlyListProperty
 
 from clod_adapter.config import SH_COUNTS
-from clod_adapter.errors import ClodError
+from clod_adapter.errors import ClodError, refused_if_damaged
 from clod_adapter.io import file_formats
 from clod_adapter.io.ply_packed import NOTE, check_packed, is_packed, unpack
 from clod_adapter.io.ply_settings import ply_metadata
@@ -78,10 +78,8 @@ def _parse_head(path: Path, start: bytes) -> Head:
         )
     counts = re.findall(rb"(?m)^[ \t]*element[ \t]+\S+[ \t]+(\d{1,20})[ \t]*$", header)
     header = re.sub(rb"(?m)^([ \t]*element[ \t]+\S+[ \t]+)\d{1,20}[ \t]*$", rb"\g<1>0", header)
-    try:
+    with refused_if_damaged(path, "the PLY header is damaged", "export the file again"):
         ply = PlyData.read(io.BytesIO(header), mmap=False)
-    except Exception as error:  # plyfile raises ValueError and others besides its own errors
-        raise ClodError(f"{path}: the PLY header is damaged ({error}); export the file again") from error
     if len(counts) != len(ply.elements):
         raise ClodError(f"{path}: the PLY header is damaged (a row count is not a number); export the file again")
     return Head(ply, tuple(zip(ply, map(int, counts), strict=True)), end.end())
@@ -112,10 +110,8 @@ def read(path: Path, data: bytes) -> Source:
     head = _parse_head(path, data[:HEADER_LIMIT])
     degree = sh_degree_of(path, head.ply)
     _check_length(path, head, len(data))
-    try:
+    with refused_if_damaged(path):
         elements = _elements(data, head)
-    except (PlyParseError, ValueError, TypeError, MemoryError) as error:
-        raise ClodError(f"{path}: damaged or truncated ({error}); copy or export it again") from error
     comments = all_comments(head.ply)
     if is_packed(head.ply):
         metadata = ply_metadata(path, comments, dial=False)

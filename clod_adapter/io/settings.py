@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from clod_adapter._support.version import package_version
 from clod_adapter.calibration import Calibration
 from clod_adapter.config import CLASSIC, FILTERS, AttenuationConfig, ScreenFilter
-from clod_adapter.errors import ClodError
+from clod_adapter.errors import ClodError, refused_if_damaged
 from clod_adapter.origin import NOWHERE, Origin, parse_origin
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ KINDS = {
         3, "is not an adapter but {}; give what clod-adapt wrote beside its PLY; a 'clod-model' needs no adapter"
     ),
 }  # fmt: skip
-DAMAGE = (AttributeError, KeyError, OverflowError, RecursionError, TypeError, ValueError)
+DAMAGED = "its settings are damaged", "restore them, or export the file again"  # for ``refused_if_damaged``
 _INHERITED = 60_000  # bytes of history that an output inherits; a PLY header must have room for them
 _OVERHEAD = 9  # bytes of a PLY's comment besides its text
 
@@ -81,7 +81,7 @@ class Source(NamedTuple):
 def read_metadata(path: Path, values: Mapping[str, Any], *, dial: bool, described: bool = True) -> Metadata:
     """The settings in a mapping; of a file that has a sigma_d (``dial``) missing ones take their defaults."""
     notes: list[str] = []
-    try:
+    with refused_if_damaged(path, *DAMAGED):
         version = values.get("package_version", "")
         if not isinstance(version, str):
             raise TypeError(f"package_version is {version!r:.40}, not a string")
@@ -92,8 +92,6 @@ def read_metadata(path: Path, values: Mapping[str, Any], *, dial: bool, describe
             origin=parse_origin(values.get("origin", NOWHERE)), about=tuple(map(str, values.get("about", ()))),
             version=version, described=described, notes=tuple(notes),
         )  # fmt: skip
-    except (ClodError, *DAMAGE) as error:
-        raise damaged(path, error) from error
 
 
 def _attenuation(stored: Mapping[str, Any], described: bool, notes: list[str]) -> AttenuationConfig:
@@ -118,7 +116,7 @@ def _screen_filter(stored: Any, notes: list[str]) -> ScreenFilter:
 def _calibration(stored: Any, notes: list[str]) -> Calibration | None:
     try:
         return None if stored is None else Calibration.from_dict(stored)
-    except (ClodError, *DAMAGE) as error:
+    except (ClodError, AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
         notes.append(f"the calibration is unusable and ignored ({error!s:.80})")
         return None
 
@@ -127,12 +125,6 @@ def _note_unknown(stored: Mapping[str, Any], known: Any, notes: list[str]) -> No
     # quantile was a setting of a normalizer that is refused by its name.
     if unknown := [name for name in stored if name not in (*known, "quantile")]:
         notes.append(f"settings unknown to this version ignored: {', '.join(map(repr, unknown))}")
-
-
-def damaged(path: Path, error: Exception) -> ClodError:
-    """The error of a file with damaged settings, whatever the format."""
-    reason = str(error) if isinstance(error, ClodError) else repr(error)
-    return ClodError(f"{path}: its settings are damaged ({reason:.120}); restore them, or export the file again")
 
 
 def that_fit(lines: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -183,11 +175,9 @@ def parse_metadata(path: Path, text: str | bytes | dict[str, Any] | None, *, dia
 def parse_document(path: Path, text: str | bytes | dict[str, Any], kind: str) -> dict[str, Any]:
     """A document of this kind; refuses another kind, and a newer version."""
     version, wrong = KINDS[kind]
-    try:
+    with refused_if_damaged(path, *DAMAGED):
         values: dict[str, Any] = text if isinstance(text, dict) else json.loads(text)
         found, newer = values["format"], values["format"] == kind and values["format_version"] > version
-    except DAMAGE as error:
-        raise damaged(path, error) from error
     if found != kind:
         raise ClodError(f"{path}: {wrong.format(f'{found!r:.40}')}")
     if newer:

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from io import BufferedReader
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from safetensors import safe_open
 
-from clod_adapter.errors import ClodError
+from clod_adapter.errors import ClodError, refused_if_damaged
 from clod_adapter.io.file_formats import KEY, read_start, refuse_known
 from clod_adapter.io.settings import MODEL, Metadata, Source, document, parse_metadata
 from clod_adapter.io.values import SIGMA, arrays_of, dial_columns
@@ -83,20 +82,6 @@ def read_tensor_header(path: Path) -> tuple[list[str], dict[str, str]]:
 def _name_of(file: BufferedReader) -> str:
     """A name of an open file, in UTF-8 as safetensors takes it."""
     return str(file.name) if sys.platform == "win32" else f"/dev/fd/{file.fileno()}"
-
-
-@contextmanager
-def refused_if_damaged(path: Path, what: str, fix: str) -> Iterator[None]:
-    """Turns errors of reading a file, raised within, into a ClodError that names it: ``what``, and the ``fix``."""
-    try:
-        yield
-    except OSError as error:
-        raise ClodError(f"{path}: cannot be read ({error.strerror or error}); check the path") from error
-    except MemoryError:  # of a file that is whole
-        raise
-    except Exception as error:  # SafetensorError, and whatever a crafted file provokes
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise ClodError(f"{path}: {what} ({reason:.200}); {fix}") from error
 
 
 def write(path: Path, gaussians: Gaussians, metadata: Metadata) -> tuple[str, ...]:

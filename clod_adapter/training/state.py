@@ -9,11 +9,11 @@ from typing import Any
 from torch import Tensor
 
 from clod_adapter.config import AttenuationConfig
-from clod_adapter.errors import ClodError
+from clod_adapter.errors import ClodError, refused_if_damaged
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.file_formats import refuse_irregular
-from clod_adapter.io.tensor_file import read_tensors, refused_if_damaged, write_tensors
+from clod_adapter.io.tensor_file import read_tensors, write_tensors
 
 KEY = "clod_adapter_state"  # of the JSON document in the metadata of a file
 OTHER_RUN = "the training state is of other Gaussians, views or settings; use those it was saved with"

@@ -9,8 +9,7 @@ about z, and a translation where there is an origin. ``asset.extras.clod_adapter
 
 import json
 import struct
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,11 +18,11 @@ import numpy as np
 import torch
 
 from clod_adapter._support.version import package_version
-from clod_adapter.errors import ClodError
+from clod_adapter.errors import ClodError, refused_if_damaged
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io import values
 from clod_adapter.io.file_formats import KEY
-from clod_adapter.io.settings import DAMAGE, MODEL, Metadata, Source, document, parse_metadata
+from clod_adapter.io.settings import MODEL, Metadata, Source, document, parse_metadata
 from clod_adapter.io.values import GROWTH, SIGMA, arrays_of, dial_columns, half_turn
 from clod_adapter.origin import NOWHERE, Origin, origin_of
 
@@ -50,6 +49,7 @@ _ATTRIBUTES = {
     "opacity_logits": (f"{EXTENSION}:OPACITY", 1), "sh0": (harmonics(0)[0], 3),
 }  # fmt: skip
 _REMEDY = "export it again, as a .ply"
+_DAMAGED = "is damaged or no such .glb", _REMEDY
 IDENTITY = [0.0, 0.0, 0.0, 1.0]  # as xyzw
 _FAINTEST = -100.0  # logit of an opacity that float32 has rounded to 0
 
@@ -124,9 +124,9 @@ def write_points(
 
 def has_dial(path: Path) -> bool:
     """By the attributes of the primitive; the file is mapped, and its values are not read."""
-    with _one_line_errors(path):
-        gltf, _ = _chunks(np.memmap(path, np.uint8, "r").data)
-        (_, primitive), *_ = _find(gltf)
+    with refused_if_damaged(path, *_DAMAGED):
+        gltf, _ = _chunks(path, np.memmap(path, np.uint8, "r").data)
+        (_, primitive), *_ = _find(path, gltf)
         return DIAL[SIGMA] in primitive["attributes"]
 
 
@@ -136,18 +136,18 @@ def read(path: Path, data: bytes) -> Source:
     Under a node without a rotation the values are in glTF's own axes, and are turned here; files of this package have
     the half turn in the node and store the checkpoint's values.
     """
-    with _one_line_errors(path):
-        gltf, binary = _chunks(memoryview(data))
-        (mesh, primitive), *others = _find(gltf)
+    with refused_if_damaged(path, *_DAMAGED):
+        gltf, binary = _chunks(path, memoryview(data))
+        (mesh, primitive), *others = _find(path, gltf)
         there = primitive["attributes"]
         degree = max(k for k in range(DEGREE + 1) if harmonics(k)[-1] in there)
         names = _ATTRIBUTES | {name: (DIAL[name], 1) for name in dial_columns([n for n in DIAL if DIAL[n] in there])}
-        arrays = {key: _values(gltf, binary, there[name], width) for key, (name, width) in names.items()}
-        rest = [_values(gltf, binary, there[name], 3) for name in harmonics(degree)[1:]]
+        arrays = {key: _values(path, gltf, binary, there[name], width) for key, (name, width) in names.items()}
+        rest = [_values(path, gltf, binary, there[name], 3) for name in harmonics(degree)[1:]]
         if len({len(each) for each in (*arrays.values(), *rest)}) > 1:
-            raise ClodError(f"its attributes are of different lengths; {_REMEDY}")
+            raise ClodError(f"{path}: its attributes are of different lengths; {_REMEDY}")
         text = gltf["asset"].get("extras", {}).get(KEY)
-        turned, moved = _placed(gltf, mesh)
+        turned, moved = _placed(path, gltf, mesh)
     space = primitive["extensions"][EXTENSION].get("colorSpace", COLOR_SPACE)
     notes = [f"its colours are in {space!r:.40}, and taken as {COLOR_SPACE}"] if space != COLOR_SPACE else []
     notes += [f"{len(others)} more primitives with Gaussians in it are left out"] if others else []
@@ -162,57 +162,49 @@ def read(path: Path, data: bytes) -> Source:
     return Source(stored, metadata, tuple(notes), metadata.about)
 
 
-@contextmanager
-def _one_line_errors(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except ClodError as error:
-        raise ClodError(f"{path}: {error}") from error
-    except (*DAMAGE, IndexError) as error:
-        raise ClodError(f"{path}: is damaged or no such .glb ({error!r:.80}); {_REMEDY}") from error
-
-
-def _chunks(data: memoryview) -> tuple[dict[str, Any], memoryview]:
+def _chunks(path: Path, data: memoryview) -> tuple[dict[str, Any], memoryview]:
     """The JSON and the binary chunk."""
     version, length, size, kind = struct.unpack_from("<IIII", data, 4) if len(data) >= 20 else (0, 0, 0, 0)
     if version != 2 or kind != _JSON or max(length, 20 + size) > len(data):
-        raise ClodError("is truncated, or no glTF 2.0; copy or export it again")
+        raise ClodError(f"{path}: is truncated, or no glTF 2.0; copy or export it again")
     more = struct.unpack_from("<I", data, 20 + size)[0] if 28 + size <= length else 0
     binary = data[28 + size : 28 + size + more]
     if len(binary) < more:
-        raise ClodError("is truncated; copy or export it again")
+        raise ClodError(f"{path}: is truncated; copy or export it again")
     return json.loads(bytes(data[20 : 20 + size])), binary
 
 
-def _find(gltf: dict[str, Any]) -> list[tuple[int, dict[str, Any]]]:
+def _find(path: Path, gltf: dict[str, Any]) -> list[tuple[int, dict[str, Any]]]:
     """The primitives with Gaussians, at least one, each after the number of its mesh."""
     meshes = enumerate(gltf.get("meshes", []))
     found = [(number, primitive) for number, mesh in meshes for primitive in mesh["primitives"]]
     found = [(number, each) for number, each in found if EXTENSION in each.get("extensions", {})]
     if not found:
-        raise ClodError(f"has no Gaussians in it ({EXTENSION}), so it is a mesh; give a checkpoint of Gaussians")
+        raise ClodError(
+            f"{path}: has no Gaussians in it ({EXTENSION}), so it is a mesh; give a checkpoint of Gaussians"
+        )
     first = found[0][1]
     compressed = first["extensions"][EXTENSION].get("extensions")
     if compressed or any(name not in first["attributes"] for name, _ in _ATTRIBUTES.values()):
-        raise ClodError("its Gaussians are compressed, or have no spherical harmonics; export them as a .ply")
+        raise ClodError(f"{path}: its Gaussians are compressed, or have no spherical harmonics; export them as a .ply")
     return found
 
 
-def _values(gltf: dict[str, Any], binary: memoryview, number: int, width: int) -> np.ndarray:
+def _values(path: Path, gltf: dict[str, Any], binary: memoryview, number: int, width: int) -> np.ndarray:
     """``[N, width]`` float32, the values of an accessor; ``[N]`` where the width is 1."""
     accessor = gltf["accessors"][_whole(number)]
     if "sparse" in accessor or _WIDTHS[accessor["type"]] != width:
-        raise ClodError(f"an attribute is sparse or of type {accessor['type']!r:.20}; {_REMEDY}")
+        raise ClodError(f"{path}: an attribute is sparse or of type {accessor['type']!r:.20}; {_REMEDY}")
     kind = np.dtype(_KINDS[accessor["componentType"]])
     view = gltf["bufferViews"][_whole(accessor["bufferView"])]
     if _whole(view["buffer"]) or "uri" in gltf["buffers"][0] or view.get("extensions"):
-        raise ClodError(f"its data are compressed, or in another file; {_REMEDY}")
+        raise ClodError(f"{path}: its data are compressed, or in another file; {_REMEDY}")
     stride = _whole(view.get("byteStride", kind.itemsize * width))
     start, count = _whole(accessor.get("byteOffset", 0)), _whole(accessor["count"])
     data = binary[_whole(view.get("byteOffset", 0)) :][: _whole(view["byteLength"])]
     size = kind.itemsize * width
     if not count or stride < size or start + (count - 1) * stride + size > len(data):
-        raise ClodError("an attribute has no values, or more than the file; copy or export it again")
+        raise ClodError(f"{path}: an attribute has no values, or more than the file; copy or export it again")
     found = np.ndarray((count, width), kind, data, start, (stride, kind.itemsize)).astype(np.float32)
     if accessor.get("normalized") and kind.kind != "f":
         found = np.maximum(found / np.float32(np.iinfo(kind).max), -1)
@@ -225,7 +217,7 @@ def _whole(value: Any) -> int:
     return value
 
 
-def _placed(gltf: dict[str, Any], mesh: int) -> tuple[bool, Origin]:
+def _placed(path: Path, gltf: dict[str, Any], mesh: int) -> tuple[bool, Origin]:
     """Whether the node of the mesh makes the half turn, and its translation as an origin in the axes of checkpoints."""
     nodes: list[dict[str, Any]] = gltf.get("nodes", [])
     number = next((number for number, node in enumerate(nodes) if node.get("mesh") == mesh), -1)
@@ -235,10 +227,12 @@ def _placed(gltf: dict[str, Any], mesh: int) -> tuple[bool, Origin]:
     scale = [float(value) for value in node.get("scale", [1, 1, 1])]
     turned = np.allclose(np.abs(rotation), HALF_TURN)
     if below or "matrix" in node or scale != [1, 1, 1] or not (turned or np.allclose(np.abs(rotation), IDENTITY)):
-        raise ClodError("its node is scaled or turned, which is not undone here; apply the transform and export again")
+        raise ClodError(
+            f"{path}: its node is scaled or turned, which is not undone here; apply the transform and export again"
+        )
     x, y, z = (float(value) for value in node.get("translation", [0, 0, 0]))
     if not np.isfinite([x, y, z]).all():
-        raise ClodError("its node has a translation that is not finite; export it again")
+        raise ClodError(f"{path}: its node has a translation that is not finite; export it again")
     return turned, (0.0 - x, 0.0 - y, z)
 
 

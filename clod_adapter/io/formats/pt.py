@@ -9,7 +9,6 @@ from __future__ import annotations
 import io
 import pickletools
 import re
-import struct
 import warnings
 import zipfile
 from pathlib import Path
@@ -17,10 +16,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from clod_adapter.errors import ClodError
+from clod_adapter.errors import ClodError, refused_if_damaged
 from clod_adapter.io.file_formats import KEY, read_start, refuse
-from clod_adapter.io.settings import MODEL, Metadata, Source, damaged, document, parse_metadata
-from clod_adapter.io.tensor_file import refused_if_damaged
+from clod_adapter.io.settings import MODEL, Metadata, Source, document, parse_metadata
 from clod_adapter.io.values import SIGMA, arrays_of, dial_columns
 
 if TYPE_CHECKING:
@@ -28,7 +26,6 @@ if TYPE_CHECKING:
 
 FRAME = "gsplat's trainer may have normalised the coordinates; photographs must be in the same"
 _PICKLE_LIMIT = 1 << 20  # bytes; of a few tensors it has a few hundred
-_DAMAGE = zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, struct.error, ValueError, IndexError
 _PLAIN = r"collections OrderedDict|torch\._utils _rebuild_(tensor_v2|parameter)|torch \w+Storage"
 
 
@@ -39,27 +36,22 @@ def check(path: Path) -> None:
         raise ClodError(f"{path}: is a pickle in PyTorch's format before 1.6; load it and torch.save it again")
     if not start.startswith(b"PK"):
         refuse(path, start, "is no file of torch.save; export the checkpoint as a PLY")
-    try:
-        with zipfile.ZipFile(path) as archive:
-            entries = archive.infolist()
-            pickles = [entry for entry in entries if entry.filename.endswith("/data.pkl")]
-            stored = all(entry.compress_type == zipfile.ZIP_STORED for entry in entries)
-            whole = stored and sum(entry.file_size for entry in entries) <= path.stat().st_size
-            if not whole or len(pickles) != 1 or pickles[0].file_size > _PICKLE_LIMIT:
-                raise ClodError(f"{path}: is a zip archive that torch.save does not write; export a PLY instead")
-            # A pickle that names anything but what plain tensors need: ``weights_only`` runs no code either, but lets
-            # a hundred bytes of it ask for gigabytes.
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # of odd escapes in it
-                for opcode, argument, _ in pickletools.genops(archive.read(pickles[0])):
-                    named = opcode.name in ("GLOBAL", "INST", "STACK_GLOBAL")
-                    if named and not re.fullmatch(_PLAIN, str(argument)):
-                        what = f"holds {argument}, more than tensors, and is not unpickled"
-                        raise ClodError(f"{path}: {what}; export it as a PLY")
-    except OSError as error:
-        raise ClodError(f"{path}: cannot be read ({error.strerror}); check the path") from error
-    except _DAMAGE as error:
-        raise ClodError(f"{path}: is damaged or truncated ({error}); copy or export it again") from error
+    with refused_if_damaged(path), zipfile.ZipFile(path) as archive:
+        entries = archive.infolist()
+        pickles = [entry for entry in entries if entry.filename.endswith("/data.pkl")]
+        stored = all(entry.compress_type == zipfile.ZIP_STORED for entry in entries)
+        whole = stored and sum(entry.file_size for entry in entries) <= path.stat().st_size
+        if not whole or len(pickles) != 1 or pickles[0].file_size > _PICKLE_LIMIT:
+            raise ClodError(f"{path}: is a zip archive that torch.save does not write; export a PLY instead")
+        # A pickle that names anything but what plain tensors need: ``weights_only`` runs no code either, but lets a
+        # hundred bytes of it ask for gigabytes.
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of odd escapes in it
+            for opcode, argument, _ in pickletools.genops(archive.read(pickles[0])):
+                named = opcode.name in ("GLOBAL", "INST", "STACK_GLOBAL")
+                if named and not re.fullmatch(_PLAIN, str(argument)):
+                    what = f"holds {argument}, more than tensors, and is not unpickled"
+                    raise ClodError(f"{path}: {what}; export it as a PLY")
 
 
 def has_dial(path: Path) -> bool:
@@ -88,10 +80,7 @@ def read(path: Path, data: bytes) -> Source:
         )
     wanted = (*NAMES, *dial_columns(splats))
     arrays = {NAMES.get(name, name): _values(path, name, splats, len(data)) for name in wanted}
-    text = checkpoint.get(KEY)
-    if text is not None and not isinstance(text, str):
-        raise damaged(path, TypeError(f"a {type(text).__name__}, not text"))
-    metadata = parse_metadata(path, text, dial=SIGMA in arrays)
+    metadata = parse_metadata(path, checkpoint.get(KEY), dial=SIGMA in arrays)
     notes = () if metadata.described else (FRAME,)
     return Source(arrays, metadata, notes, metadata.about, not metadata.described)
 

@@ -30,12 +30,12 @@ import torch
 
 from clod_adapter.config import CLASSIC, SH_COUNTS
 from clod_adapter.equation.units import estimated_distance, in_world_units, known_distance, with_distance
-from clod_adapter.errors import ClodError
+from clod_adapter.errors import ClodError, refused_if_damaged
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io import values
 from clod_adapter.io.file_formats import NEW_SPZ, read_start, read_whole
 from clod_adapter.io.formats import splat_transform
-from clod_adapter.io.settings import DAMAGE, MODEL, TAG, Metadata, Source, damaged, document, parse_metadata
+from clod_adapter.io.settings import DAMAGED, MODEL, TAG, Metadata, Source, document, parse_metadata
 from clod_adapter.io.values import GROWTH, SIGMA, arrays_of, bytes_of, dial_columns, half_turn
 
 HEADER = struct.Struct("<IIIBBBB")  # magic, version, count, SH degree, fractional bits, flags, 0
@@ -193,10 +193,8 @@ def read(path: Path, data: bytes) -> Source:
 def _unpacked(path: Path, data: bytes) -> bytes:
     limit = max(_SMALL, _BOMB * len(data))
     gzip = zlib.decompressobj(wbits=31)
-    try:
+    with refused_if_damaged(path):
         unpacked = gzip.decompress(data, limit)
-    except zlib.error as error:
-        raise ClodError(f"{path}: is damaged ({error}); copy or export it again") from error
     if not gzip.eof or len(unpacked) < HEADER.size:
         raise ClodError(
             f"{path}: is truncated, or unpacks to more than {limit:,} bytes, which no Gaussians do; export it again"
@@ -219,11 +217,9 @@ def _ours(path: Path, body: bytes, count: int) -> tuple[dict[str, Any], dict[str
     """The JSON document of our record, and the columns of the dial if they are there."""
     length = struct.unpack_from("<I", body)[0] if len(body) >= 4 else 0
     text, halves = body[4 : 4 + length], body[4 + length :]
-    try:
+    with refused_if_damaged(path, *DAMAGED):
         stored = json.loads(text)
         names = stored.get(COLUMNS, [SIGMA])
-    except DAMAGE as error:
-        raise damaged(path, error) from error
     if names not in ([SIGMA], [SIGMA, GROWTH]) or len(halves) not in (0, 2 * count * len(names)):
         raise ClodError(f"{path}: its record of sigma_d is damaged; copy or export it again")
     table = np.frombuffer(halves, "<f2").astype(np.float32).reshape(-1, count)

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from clod_adapter.errors import ClodError
+from clod_adapter.errors import ClodError, refused_if_damaged
 from clod_adapter.io.file_formats import read_whole, refuse_long_numbers
 from clod_adapter.io.scene.folder import find_cameras, name_parts
 from clod_adapter.origin import NOWHERE
@@ -77,15 +77,12 @@ def check_posed(image: PosedImage, source: Path) -> PosedImage:
 def read_colmap(model: Path) -> tuple[list[PosedImage], list[str]]:
     """The registered images of a model, sorted by name, and notes."""
     _check_records(model)
-    try:
+    with refused_if_damaged(model, "COLMAP cannot read this model"):
         reconstruction = pycolmap.Reconstruction(str(model))
         images = sorted(reconstruction.images.values(), key=lambda image: image.name)
         for image in images:
             name_parts(image.name, model)
         posed = [_posed_image(model, image) for image in images if image.has_pose]
-    except (ValueError, OverflowError, IndexError, KeyError, RuntimeError, MemoryError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise ClodError(f"{model}: COLMAP cannot read this model ({reason:.200}); copy or export it again") from error
     if not posed:
         raise ClodError(f"{model}: the model has no registered image; run COLMAP's mapper again")
     unposed = len(images) - len(posed)

@@ -12,7 +12,7 @@ from pathlib import Path, PureWindowsPath
 from typing import Any
 
 from clod_adapter._support.text import as_text, file_name
-from clod_adapter.errors import ClodError
+from clod_adapter.errors import ClodError, refused_if_damaged
 from clod_adapter.io.file_formats import read_whole, refuse_long_numbers
 
 TRANSFORMS = ("transforms_train.json", "transforms.json")
@@ -141,10 +141,8 @@ def read_json(path: Path) -> dict[str, Any]:
         raise ClodError(f"{path}: is larger than {MAX_BYTES >> 20} MB, so it is no list of cameras; check the path")
     text = read_whole(path)
     refuse_long_numbers(path, text)
-    try:
+    with refused_if_damaged(path, "is no JSON or damaged", "export it again"):
         content = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise ClodError(f"{path}: is no JSON or damaged ({error!s:.200}); export it again") from error
     if not isinstance(content, dict):
         raise ClodError(f"{path}: is no JSON object; copy or export it again")
     return content

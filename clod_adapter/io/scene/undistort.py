@@ -12,7 +12,7 @@ import PIL
 import pycolmap
 from PIL import Image, PngImagePlugin
 
-from clod_adapter.errors import ClodError
+from clod_adapter.errors import ClodError, refused_if_damaged
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.scene.colmap import PosedImage
 from clod_adapter.io.scene.images import Photograph
@@ -22,13 +22,10 @@ _KEY = "clod-adapter"  # of the text in a cached PNG
 
 def undistort(path: Path, pixels: Image.Image, camera: pycolmap.Camera) -> tuple[Image.Image, pycolmap.Camera]:
     """As ``colmap image_undistorter`` by default: bilinear, the same focal length, cropped to have no blank pixel."""
-    try:
+    with refused_if_damaged(path, "COLMAP cannot undistort it", "check its camera's parameters"):
         bitmap, pinhole = pycolmap.undistort_image(
             pycolmap.UndistortCameraOptions(), pycolmap.Bitmap.from_array(np.asarray(pixels)), camera
         )
-    except (ValueError, RuntimeError) as error:
-        reason = str(error).splitlines()[0]
-        raise ClodError(f"{path}: COLMAP cannot undistort it ({reason}); check its camera's parameters") from error
     return Image.fromarray(bitmap.to_array()), pinhole
 
 
