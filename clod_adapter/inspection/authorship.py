@@ -3,9 +3,9 @@
 import re
 
 from clod_adapter.config import SH_COUNTS
-from clod_adapter.io.ply import MASK_COLUMNS, Head, all_comments, column_map, inria_dtype
+from clod_adapter.io.ply import MASK_COLUMNS, Head, all_comments
+from clod_adapter.io.ply_layout import COLUMN, PREFIX, column_map, inria_dtype
 from clod_adapter.io.ply_packed import is_packed
-from clod_adapter.io.ply_settings import COLUMN, PREFIX
 from clod_adapter.io.values import FILTER, dial_columns
 
 NERFSTUDIO = "nerfstudio's exporter, ns-export gaussian-splat"

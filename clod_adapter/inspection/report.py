@@ -15,9 +15,9 @@ from clod_adapter.errors import ClodError
 from clod_adapter.inspection.authorship import NERFSTUDIO, looks_like
 from clod_adapter.inspection.statistics import FAR, Spread, Values, values_of
 from clod_adapter.io.file_formats import read_source
-from clod_adapter.io.ply import MASK_COLUMNS, column_map
+from clod_adapter.io.ply import MASK_COLUMNS
+from clod_adapter.io.ply_layout import COLUMN, PREFIX, column_map
 from clod_adapter.io.ply_packed import is_packed
-from clod_adapter.io.ply_settings import COLUMN, PREFIX
 from clod_adapter.io.settings import ADAPTER, matching_calibration, stated_filter
 from clod_adapter.io.values import FILTER, choice_of, dial_columns, in_question, prepared
 from clod_adapter.origin import Origin

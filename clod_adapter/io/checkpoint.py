@@ -22,9 +22,7 @@ from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.hook import Hook
 from clod_adapter.io.file_formats import PLY, format_of, read_source, write
-from clod_adapter.io.ply import column_map
-from clod_adapter.io.ply_settings import PREFIX
-from clod_adapter.io.ply_write import write_rows
+from clod_adapter.io.ply_layout import PREFIX, column_map, write_rows
 from clod_adapter.io.settings import WARNING, matching_calibration, stated_filter, tagged, that_fit
 from clod_adapter.io.values import SIGMA, Activated, prepared
 from clod_adapter.origin import NOWHERE, Origin

@@ -1,4 +1,4 @@
-"""PLY files of Gaussians, by plyfile: names of columns, headers, and reading.
+"""PLY files of Gaussians, by plyfile: headers, and reading.
 
 Any property order, byte order or ascii; plain, or PlayCanvas's compressed layout (``ply_packed``).
 """
@@ -8,46 +8,22 @@ from __future__ import annotations
 import io
 import re
 import warnings
-from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from plyfile import PlyData, PlyElement, PlyListProperty
 
-from clod_adapter.config import SH_COUNTS
 from clod_adapter.errors import ClodError, refused_if_damaged
 from clod_adapter.io import file_formats
+from clod_adapter.io.ply_layout import column_map, ply_metadata
 from clod_adapter.io.ply_packed import NOTE, check_packed, is_packed, unpack
-from clod_adapter.io.ply_settings import ply_metadata
 from clod_adapter.io.settings import Source
 from clod_adapter.io.values import FILTER, GROWTH, MASKS, ROWS, SIGMA, Arrays, degree_of, dial_columns
 
 MASK_COLUMNS = ("masks_0", "masks_1")
 HEADER_LIMIT = 1 << 20  # bytes
 _LONGEST = 1 << 20  # characters of a row of text
-
-
-def column_map(sh_degree: int) -> dict[str, tuple[str, ...]]:
-    """The columns of each Gaussians attribute; ``f_rest_{c * (K-1) + k}`` is ``shN[:, k, c]``."""
-    bands = SH_COUNTS[sh_degree] - 1
-    return {
-        "means": ("x", "y", "z"),
-        "quats": tuple(f"rot_{i}" for i in range(4)),
-        "log_scales": tuple(f"scale_{i}" for i in range(3)),
-        "opacity_logits": ("opacity",),
-        "sh0": tuple(f"f_dc_{c}" for c in range(3)),
-        "shN": tuple(f"f_rest_{c * bands + k}" for k in range(bands) for c in range(3)),
-    }
-
-
-def inria_dtype(sh_degree: int, dial: Iterable[str] = ()) -> np.dtype:
-    """The rows that Inria's trainer writes, normals included, and the dial's columns."""
-    groups = column_map(sh_degree)
-    rest = (f"f_rest_{k}" for k in range(len(groups["shN"])))  # the map lists them by coefficient
-    names = [*groups["means"], "nx", "ny", "nz", *groups["sh0"], *rest]
-    names += [*groups["opacity_logits"], *groups["log_scales"], *groups["quats"], *dial]
-    return np.dtype([(name, "f4") for name in names])
 
 
 class Head(NamedTuple):

@@ -29,8 +29,7 @@ from clod_adapter.gaussians import OPAQUE, Gaussians
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.checkpoint import Checkpoint, load
 from clod_adapter.io.file_formats import write
-from clod_adapter.io.ply import inria_dtype
-from clod_adapter.io.ply_settings import write_comments
+from clod_adapter.io.ply_layout import inria_dtype, write_comments
 from clod_adapter.io.settings import Metadata
 from clod_adapter.io.values import dial_columns
 from clod_adapter.origin import NOWHERE, Origin

@@ -20,7 +20,7 @@ from clod_adapter.cli.shared.inputs import named
 from clod_adapter.errors import ClodError
 from clod_adapter.io.checkpoint import load, save
 from clod_adapter.io.formats import splat_transform
-from clod_adapter.io.ply_settings import write_comments
+from clod_adapter.io.ply_layout import write_comments
 from clod_adapter.io.settings import Metadata
 from formats import with_columns, write_rows
 from scenes import camera

@@ -5,7 +5,8 @@ import pytest
 from plyfile import PlyData, PlyElement
 
 from clod_adapter.inspection.authorship import looks_like
-from clod_adapter.io.ply import inria_dtype, read_head
+from clod_adapter.io.ply import read_head
+from clod_adapter.io.ply_layout import inria_dtype
 from formats import write_packed
 from scenes import gaussians
 

@@ -8,7 +8,7 @@ from clod_adapter.adapter import extract, with_dial
 from clod_adapter.config import FILTERS, AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.io.checkpoint import load, save
-from clod_adapter.io.ply import inria_dtype
+from clod_adapter.io.ply_layout import inria_dtype
 from formats import write_rows
 
 SCALES = ("scale_0", "scale_1", "scale_2")
