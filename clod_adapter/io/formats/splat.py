@@ -11,17 +11,8 @@ import numpy as np
 
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import SH_C0, Gaussians
+from clod_adapter.io import values
 from clod_adapter.io.settings import Metadata, Source
-from clod_adapter.io.values import (
-    arrays_of,
-    bytes_of,
-    colours_of,
-    logits_of_bytes,
-    logs_of,
-    normalized,
-    scales_of,
-    sigmoid,
-)
 
 QUANTISED = "quantised: colours, opacities and rotations in 8 bits, no view-dependent colour"
 _ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
@@ -29,16 +20,16 @@ _ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), (
 
 def write(path: Path, gaussians: Gaussians, metadata: Metadata) -> tuple[str, ...]:
     """Writes Gaussians without a dial, and no text."""
-    arrays = arrays_of(path, gaussians)
-    scales = scales_of(path, arrays["log_scales"])
-    opacities = sigmoid(arrays["opacity_logits"])
+    arrays = values.arrays_of(path, gaussians)
+    scales = values.scales_of(path, arrays["log_scales"])
+    opacities = values.sigmoid(arrays["opacity_logits"])
     # As logarithms, in which no volume is too small.
     with np.errstate(divide="ignore"):
         order = np.argsort(-(arrays["log_scales"].astype(np.float64).sum(1) + np.log(opacities)), kind="stable")
     rows = np.empty(len(gaussians), _ROW)
     rows["means"], rows["scales"] = arrays["means"], scales
-    rows["rgba"] = colours_of(arrays["sh0"], opacities)
-    rows["quats"] = bytes_of(128 * normalized(arrays["quats"]) + 128)
+    rows["rgba"] = values.colours_of(arrays["sh0"], opacities)
+    rows["quats"] = values.bytes_of(128 * values.normalized(arrays["quats"]) + 128)
     path.write_bytes(rows[order].tobytes())
     notes = ["colours, opacities and rotations are rounded to 8 bits, and the rows are in another order"]
     notes += ["view-dependent colour is dropped"] if arrays["shN"].any() else []
@@ -52,9 +43,9 @@ def read(path: Path, data: bytes) -> Source:
     rows = np.frombuffer(data, _ROW)
     rgba = rows["rgba"].astype(np.float32)
     arrays = {
-        "means": rows["means"].copy(), "log_scales": logs_of(rows["scales"]),
+        "means": rows["means"].copy(), "log_scales": values.logs_of(rows["scales"]),
         "quats": (rows["quats"].astype(np.float32) - 128) / 128,
-        "opacity_logits": logits_of_bytes(rows["rgba"][:, 3]), "shN": np.zeros((len(rows), 0, 3)),
+        "opacity_logits": values.logits_of_bytes(rows["rgba"][:, 3]), "shN": np.zeros((len(rows), 0, 3)),
         "sh0": ((rgba[:, None, :3] / 255) - 0.5) / SH_C0,
     }  # fmt: skip
     return Source(arrays, Metadata(), (QUANTISED,))

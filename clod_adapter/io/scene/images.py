@@ -1,14 +1,24 @@
-"""Photographs of the common formats, decoded to 8-bit RGB."""
+"""Photographs as pinhole cameras have them: decoded to 8-bit RGB, undistorted (cached) and scaled."""
 
+import hashlib
+import json
+import os
+import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext, suppress
+from copy import copy
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from PIL import Image, UnidentifiedImageError
+import PIL
+import pycolmap
+from PIL import Image, PngImagePlugin, UnidentifiedImageError
 
-from clod_adapter.errors import ClodError
+from clod_adapter._kernels.memory import release
+from clod_adapter.errors import ClodError, refused_if_damaged
+from clod_adapter.io.atomic import atomic_path
+from clod_adapter.io.scene.colmap import HUGE, PosedImage
 
 Note = tuple[str, str]
 """A change to a photograph, with {} for the part that differs between photographs, and that part."""
@@ -32,13 +42,12 @@ OTHERS = {
 LARGE = 1 << 26  # pixels; a larger photograph is reduced first
 BAND = 64  # rows of the reduced photograph that are made at a time
 REDUCED = f"have more than {LARGE / 1e6:.0f} million pixels, which takes long: reduced first"
-_TURNS = {
-    5: Image.Transpose.TRANSPOSE,
-    6: Image.Transpose.ROTATE_270,
-    7: Image.Transpose.TRANSVERSE,
-    8: Image.Transpose.ROTATE_90,
-}  # of EXIF orientations that swap width and height
+Turn = Image.Transpose
+_TURNS = {5: Turn.TRANSPOSE, 6: Turn.ROTATE_270, 7: Turn.TRANSVERSE, 8: Turn.ROTATE_90}  # of EXIF: sides are swapped
 _ORIENTATION, _BITS, _PLANES = 0x0112, 258, 284  # tags of EXIF and TIFF
+SCALED = "scaled {} (Pillow bicubic, as in Inria's code)"
+_ONE_LARGE = threading.Lock()  # of more than LARGE pixels one at a time
+_KEY = "clod-adapter"  # of the text in a cached PNG
 
 
 def read_image(path: Path, width: int, height: int, max_width: int) -> tuple[Image.Image, list[Note]]:
@@ -146,3 +155,88 @@ def _converted(source: Image.Image, deep: bool, notes: list[Note]) -> Image.Imag
         return rgba.convert("RGB")
     notes.append(("have transparency: laid over black", ""))
     return Image.alpha_composite(Image.new("RGBA", rgba.size, (0, 0, 0, 255)), rgba).convert("RGB")
+
+
+def photograph(image: PosedImage, path: Path, max_width: int, cache: Path | None) -> Photograph:
+    """The photograph of a pinhole camera, no wider than ``max_width``; an undistorted one is kept in ``cache``.
+
+    There it is a PNG named by a hash of what it was made from, which a later run reads.
+    """
+    if cache is None or image.is_pinhole:
+        return _made(image, path, max_width)
+    state, camera = path.stat(), image.camera
+    made_of = (
+        str(path.resolve()), state.st_size, state.st_mtime_ns, camera.model_name, camera.width, camera.height,
+        camera.params.tolist(), max_width, pycolmap.__version__, PIL.__version__,
+    )  # fmt: skip
+    file = cache / f"{hashlib.sha256(repr(made_of).encode()).hexdigest()[:32]}.png"
+    found = None
+    # Absent, or damaged: Pillow raises many kinds.
+    with suppress(Exception), Image.open(file, formats=["PNG"]) as source:
+        about = json.loads(source.info[_KEY])
+        notes = [(what, each) for what, each in about["notes"]]
+        found = Photograph(source.convert("RGB"), np.array(about["K"]), notes)
+    if found is None:
+        found = _made(image, path, max_width)
+        about = PngImagePlugin.PngInfo()
+        about.add_text(_KEY, json.dumps({"K": found.K.tolist(), "notes": found.notes}))
+        with atomic_path(file) as temporary:
+            found.pixels.save(temporary, pnginfo=about, compress_level=1)
+    lens = f"from {camera.model_name} into {cache}"
+    return found._replace(
+        notes=[*found.notes, ("undistorted {}, which may be deleted; the sources are untouched", lens)]
+    )
+
+
+def _made(image: PosedImage, path: Path, max_width: int) -> Photograph:
+    width, height = image_size(path)
+    large = width * height > LARGE
+    with _ONE_LARGE if large else nullcontext():
+        camera = copy(image.camera)
+        pixels, notes = read_image(path, camera.width, camera.height, max_width)
+        if pixels.size != (camera.width, camera.height):
+            sizes = f"{pixels.width}x{pixels.height} where the model has {camera.width}x{camera.height}"
+            notes.append(("are {}: intrinsics scaled", sizes))
+            # With pixel centres at +0.5, in COLMAP as here, the principal point scales like the focal length.
+            camera.rescale(*pixels.size)
+        if not image.is_pinhole:
+            pixels, camera = undistort(path, pixels, camera)
+        width, height = pixels.size
+        if width > max_width:
+            size = (max_width, max(1, int(height * max_width / width)))
+            pixels = pixels.resize(size, Image.Resampling.BICUBIC)
+            notes.append((SCALED, f"from {width}x{height} to {size[0]}x{size[1]}"))
+        if large:
+            release()  # or this thread keeps memory that the next one allocates again
+    K = np.array([[pixels.width / width], [pixels.height / height], [1.0]]) * camera.calibration_matrix()
+    if not 0 < min(K[0, 0], K[1, 1]) <= np.abs(K).max() < HUGE:
+        raise ClodError(f"{path}: its camera is not usable once undistorted; check the camera's parameters")
+    return Photograph(pixels, K, notes)
+
+
+def undistort(path: Path, pixels: Image.Image, camera: pycolmap.Camera) -> tuple[Image.Image, pycolmap.Camera]:
+    """As ``colmap image_undistorter`` by default: bilinear, the same focal length, cropped to have no blank pixel."""
+    with refused_if_damaged(path, "COLMAP cannot undistort it", "check its camera's parameters"):
+        bitmap, pinhole = pycolmap.undistort_image(
+            pycolmap.UndistortCameraOptions(), pycolmap.Bitmap.from_array(np.asarray(pixels)), camera
+        )
+    return Image.fromarray(bitmap.to_array()), pinhole
+
+
+def cache_folder(scene: Path) -> Path:
+    """The folder of a scene's undistorted photographs in ``$XDG_CACHE_HOME`` or ``~/.cache``; created if missing."""
+    try:
+        caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    except RuntimeError as error:
+        raise ClodError("no home folder to keep undistorted photographs in; set XDG_CACHE_HOME to a folder") from error
+    folder = caches / "clod-adapter" / "undistorted" / scene.resolve().name
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if not os.access(folder, os.W_OK | os.X_OK):
+            raise PermissionError(13, "Permission denied")
+    except OSError as error:
+        raise ClodError(
+            f"{folder}: undistorted photographs cannot be kept there ({error.strerror or error}); set XDG_CACHE_HOME "
+            "to a folder that can be written to"
+        ) from error
+    return folder

@@ -4,8 +4,7 @@ import threading
 import warnings
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Sequence
-from contextlib import closing, nullcontext
-from copy import copy
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 
@@ -14,21 +13,17 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from clod_adapter._kernels.memory import release
 from clod_adapter._support.workers import in_order
 from clod_adapter.cameras import Camera, Scene, StoredView, View, in_its_unit, spread, with_near_planes
 from clod_adapter.errors import ClodError
-from clod_adapter.io.scene.colmap import HUGE, TEST_EVERY, PosedImage, held_out, read_colmap
+from clod_adapter.io.scene.colmap import TEST_EVERY, PosedImage, held_out, read_colmap
 from clod_adapter.io.scene.folder import find_cameras, find_photographs
-from clod_adapter.io.scene.images import LARGE, REDUCED, Note, Photograph, image_size, read_image
+from clod_adapter.io.scene.images import REDUCED, SCALED, Note, cache_folder, photograph
 from clod_adapter.io.scene.transforms import in_trained_frame, read_transforms
-from clod_adapter.io.scene.undistort import cache_folder, kept, undistort
 from clod_adapter.origin import NOWHERE
 from clod_adapter.progress import Listener, Phase, tell
 
-SCALED = "scaled {} (Pillow bicubic, as in Inria's code)"
 MOST_AT_ONCE = 8  # photographs of full size in memory
-_ONE_LARGE = threading.Lock()  # of more than LARGE pixels one at a time
 
 
 class ImageCache:
@@ -36,30 +31,28 @@ class ImageCache:
 
     def __init__(self, limit: int) -> None:
         self.limit, self.held, self.reads = limit, 0, 0  # bytes, those in memory now, and photographs read again
-        self._images: OrderedDict[int, Tensor] = OrderedDict()
-        self._lock, self._count = threading.Lock(), 0
+        self._images: OrderedDict[Callable[[], Tensor], Tensor] = OrderedDict()
+        self._lock = threading.Lock()
 
     def store(self, view: View, read: Callable[[], Tensor]) -> View:
         """The view without its pixels, which are kept while there is room and else come from ``read``."""
-        with self._lock:
-            key, self._count = self._count, self._count + 1
-        self._keep(key, view.image)
-        return StoredView(view.camera, lambda: self._look(key, read))
+        self._keep(read, view.image)
+        return StoredView(view.camera, partial(self._look, read))
 
-    def _look(self, key: int, read: Callable[[], Tensor]) -> Tensor:
+    def _look(self, read: Callable[[], Tensor]) -> Tensor:
         with self._lock:
-            if (image := self._images.get(key)) is not None:
-                self._images.move_to_end(key)
+            if (image := self._images.get(read)) is not None:
+                self._images.move_to_end(read)
                 return image
             self.reads += 1
         image = read()
-        self._keep(key, image)
+        self._keep(read, image)
         return image
 
-    def _keep(self, key: int, image: Tensor) -> None:
+    def _keep(self, read: Callable[[], Tensor], image: Tensor) -> None:
         with self._lock:
-            if key not in self._images and image.nbytes <= self.limit:
-                self._images[key] = image
+            if read not in self._images and image.nbytes <= self.limit:
+                self._images[read] = image
                 self.held += image.nbytes
             while self.held > self.limit:
                 self.held -= self._images.popitem(last=False)[1].nbytes
@@ -207,39 +200,7 @@ def _summary(notes: Sequence[Note], total: int) -> list[str]:
 
 
 def _load_view(image: PosedImage, path: Path, cache: Path | None, max_width: int) -> tuple[View, list[Note]]:
-    if cache is None or image.is_pinhole:
-        pixels, K, notes = _photograph(image, path, max_width)
-    else:
-        pixels, K, notes = kept(cache, image, path, max_width, lambda: _photograph(image, path, max_width))
-        lens = f"from {image.camera.model_name} into {cache}"
-        notes = [*notes, ("undistorted {}, which may be deleted; the sources are untouched", lens)]
+    pixels, K, notes = photograph(image, path, max_width, cache)
     viewmat = torch.from_numpy(image.viewmat).float()
     camera = Camera(viewmat, torch.from_numpy(K).float(), pixels.width, pixels.height, image.name)
     return View(camera, torch.from_numpy(np.array(pixels))), notes
-
-
-def _photograph(image: PosedImage, path: Path, max_width: int) -> Photograph:
-    """The photograph as a pinhole camera has it, no wider than ``max_width``."""
-    width, height = image_size(path)
-    large = width * height > LARGE
-    with _ONE_LARGE if large else nullcontext():
-        camera = copy(image.camera)
-        pixels, notes = read_image(path, camera.width, camera.height, max_width)
-        if pixels.size != (camera.width, camera.height):
-            sizes = f"{pixels.width}x{pixels.height} where the model has {camera.width}x{camera.height}"
-            notes.append(("are {}: intrinsics scaled", sizes))
-            # With pixel centres at +0.5, in COLMAP as here, the principal point scales like the focal length.
-            camera.rescale(*pixels.size)
-        if not image.is_pinhole:
-            pixels, camera = undistort(path, pixels, camera)
-        width, height = pixels.size
-        if width > max_width:
-            size = (max_width, max(1, int(height * max_width / width)))
-            pixels = pixels.resize(size, Image.Resampling.BICUBIC)
-            notes.append((SCALED, f"from {width}x{height} to {size[0]}x{size[1]}"))
-        if large:
-            release()  # or this thread keeps memory that the next one allocates again
-    K = np.array([[pixels.width / width], [pixels.height / height], [1.0]]) * camera.calibration_matrix()
-    if not 0 < min(K[0, 0], K[1, 1]) <= np.abs(K).max() < HUGE:
-        raise ClodError(f"{path}: its camera is not usable once undistorted; check the camera's parameters")
-    return Photograph(pixels, K, notes)
