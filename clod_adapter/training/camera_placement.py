@@ -1,13 +1,12 @@
 """Cameras for a checkpoint without photographs, placed from its Gaussians alone.
 
-Two properties of the Gaussians tell where photographs looked. They are a pixel or two large in their nearest cameras,
-so the smallest ones give the distance of the cameras (``reach``), and a rendering full of large ones shows a place
-without photographs. And the higher SH degrees start at 0 and are changed only by photographs, so their contribution to
-the colour is strong in the directions from which a Gaussian was photographed.
+Two properties tell where photographs looked. Gaussians are a pixel or two large in their nearest cameras, so the
+smallest give the distance of the cameras (``reach``). And only photographs change the higher SH degrees from 0, so
+their colour is strong in the directions from which a Gaussian was photographed.
 
-Candidate cameras look at random Gaussians, preferably small opaque ones, from random directions. Each is scored by two
-small renderings (``_score``), and as many again are tried near the best. Of the good ones, cameras far from each other
-are chosen. The method needs no up direction, scene type or unit.
+Candidate cameras look at random Gaussians from random directions. Each is scored by two small renderings (``_score``),
+and as many again are tried near the best. Of the good ones, cameras far from each other are chosen. No up direction,
+scene type or unit is needed.
 """
 
 import itertools
@@ -93,7 +92,7 @@ class _Placement:
         self.few, self.growth = _sample(plain, usable, seed)
         self.zoom = 0.5 / math.tan(math.radians(field) / 2)  # the focal length in image widths
         # The distance, world units, at which the smallest tenth is at most SMALL_PIXELS pixels large.
-        sizes, means = _largest_scale(plain)[usable], plain.means[usable]
+        sizes, means = plain.scales.amax(1)[usable], plain.means[usable]
         footprint = _quantile(sizes, SMALL) * WIDTH * self.zoom / SMALL_PIXELS
         from_centre = (means - means.median(0).values).norm(dim=1)
         self.reach = min(footprint, FAR * _quantile(from_centre, 0.5)) or footprint
@@ -125,7 +124,7 @@ class _Placement:
         """Cameras towards rows, preferably small opaque ones, from uniform directions, at half to twice the reach."""
         means, random = self.few.means, partial(torch.rand, generator=self.generator)
         # torch.multinomial has a limit of 2^24 weights.
-        interest = self.weight * self.hidden / _largest_scale(self.few).clamp(min=1e-12)
+        interest = self.weight * self.hidden / self.few.scales.amax(1).clamp(min=1e-12)
         ends = interest.double().cumsum(0).cpu()  # cameras are placed on the CPU
         drawn = torch.searchsorted(ends, random(count, dtype=torch.float64) * ends[-1])
         targets = means[drawn.clamp(max=len(means) - 1).to(means.device)].cpu()
@@ -197,7 +196,7 @@ def _sample(gaussians: Gaussians, rows: Tensor, seed: int) -> tuple[Gaussians, T
     """
     if len(rows) <= SAMPLE:
         return gaussians.select(rows).without_empty_bands(), None
-    size = _largest_scale(gaussians)[rows].double().nan_to_num(0.0, 0.0)  # infinite ones are not drawn
+    size = gaussians.scales.amax(1)[rows].double().nan_to_num(0.0, 0.0)  # infinite ones are not drawn
     share = size * (SAMPLE / size.sum())
     for _ in range(ROUNDS):
         share = (share * (SAMPLE / share.sum())).clamp_(max=1)
@@ -219,7 +218,7 @@ def _score(gaussians: Gaussians, growth: Tensor | None, camera: Camera) -> float
         return -math.inf
     row = camera.viewmat[2].to(gaussians.means)
     depths = gaussians.means @ row[:3] + row[3]
-    pixels = _largest_scale(gaussians) * WIDTH / camera.width * camera.K[0, 0] / depths.clamp(min=1e-6)
+    pixels = gaussians.scales.amax(1) * WIDTH / camera.width * camera.K[0, 0] / depths.clamp(min=1e-6)
     shade = (pixels.clamp(1e-3, 1e4).log() + 7)[:, None, None].expand(-1, 1, 3)  # positive, as colours are
     plain = gaussians.replace(sh0=(shade - 0.5) / SH_C0, shN=gaussians.shN[:, :0])
     sizes, _ = splat(plain, gaussians.opacities, camera, growth=growth)
@@ -227,8 +226,3 @@ def _score(gaussians: Gaussians, growth: Tensor | None, camera: Camera) -> float
     empty = float((alpha < 0.9).float().mean())
     strength = float((bands - 0.5 * alpha[..., None]).abs().mean(2).sum()) / covered if gaussians.sh_degree else 1.0
     return math.log(strength + 1e-4) - 0.5 * size - 2 * empty
-
-
-def _largest_scale(gaussians: Gaussians) -> Tensor:
-    """``[N]`` the largest standard deviation, world units."""
-    return gaussians.scales.amax(1)
