@@ -1,15 +1,4 @@
-"""The method as a component of a training loop of one's own, for any rasterizer and optimizer.
-
-    dial = clod_adapter.attach(splats, cameras)
-    optimizer = torch.optim.Adam(dial.param_groups(splats=True), eps=1e-15)
-    for camera, photograph in loader:
-        s = dial.sample()
-        shown = dial(camera, s)
-        image = rasterize(opacities=shown.drawn, scales=scales * shown.growth[:, None], ...)
-        dial.loss(s, photometric_loss(image, photograph)).backward()
-        optimizer.step()
-        optimizer.zero_grad()
-    clod_adapter.save("dial.ply", dial.gaussians())
+"""The method as a component of a training loop of one's own (docs/python.md), for any rasterizer and optimizer.
 
 Initialization, dial values and objective are those of ``training.loop.adapt``, which drives a dial too, steps the kept
 rows alone, and averages the last steps. The number of splats is fixed: densify and prune before.
@@ -18,6 +7,7 @@ rows alone, and averages the last steps. The number of splats is fixed: densify 
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import torch
@@ -90,6 +80,7 @@ class Dial(nn.Module):
     schedule: ClassVar[Schedule] = OURS
     weight_slope: ClassVar[float] = 0.25
     measured: ClassVar[bool] = True  # by the plan, and by views that watch s = 1
+    initial = staticmethod(initialize)  # the Gaussians with the dial that training begins with
 
     typical: Tensor
     log_sigma: Tensor
@@ -107,6 +98,8 @@ class Dial(nn.Module):
         self._given = (splats,)  # a ParameterDict that is an attribute would be a part of the module
         self.part = subset or TrainableSubset(len(start))
         self.attenuation, self.config = start.attenuation, config.for_views(len(views))
+        curve = partial(target_share, count=self.part.trained, config=config, total=self.part.total)
+        self._target = self.part.target or curve
         self.register_parameter(self.decay, nn.Parameter(self.parameter_of(start.sigma_d)))
         growth_d = start.growth_d
         self.growth_d = None if growth_d is None else nn.Parameter(growth_d.detach().float().clamp(*GROWTH_RANGE))
@@ -115,14 +108,6 @@ class Dial(nn.Module):
         self.register_buffer("typical", typical, persistent=False)
         self._own_size = float(own_sizes(start.log_scales).median())
         self.sampler, self._sampled = ViewSampler((), config, start.attenuation.tau, self.schedule), 0
-
-    @classmethod
-    def initial(
-        cls, base: Gaussians, views: Sequence[View], config: AdaptConfig, progress: Listener | None = None,
-        error: Tensor | None = None,
-    ) -> Gaussians:  # fmt: skip
-        """The Gaussians with the dial that training begins with, as ``importance.initialize`` gives them."""
-        return initialize(base, views, config, progress, error)
 
     @staticmethod
     def sigma_of(parameter: Tensor) -> Tensor:
@@ -232,12 +217,6 @@ class Dial(nn.Module):
         """``[trained]`` the count term's gradient of ``log_sigma`` at one dial value, of the trained rows."""
         sigma, target, at = self.sigma_of(parameter), self._target(virtual_scale), (virtual_scale, self.attenuation)
         return count_gradient(self.typical, logits, sigma, *at, loss, self.config, target)
-
-    def _target(self, virtual_scale: float) -> TargetShare:
-        part = self.part
-        if part.target:
-            return part.target(virtual_scale)
-        return target_share(virtual_scale, part.trained, self.config, part.total)
 
     def target_share(self, virtual_scale: float) -> float:
         """The share of the splats that the target-count curve keeps at s, in (0, 1]; 1 below s = 1."""

@@ -6,19 +6,16 @@ rates that decay to a twentieth.
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import torch
 from torch import Tensor
-from torch.autograd import Function
-from torch.autograd.function import once_differentiable
 
 from clod_adapter.cameras import Camera, View, spread
 from clod_adapter.config import AdaptConfig
 from clod_adapter.equation.attenuation import Attenuated, conform, dial, log_threshold
 from clod_adapter.equation.units import in_world_units
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.initialization.importance import MOST_VIEWS, has_dial, scene_distance, with_growth
+from clod_adapter.initialization.importance import MOST_VIEWS, has_dial, initialize, scene_distance, with_growth
 from clod_adapter.progress import Listener
 from clod_adapter.training.dial import SIGMA_RANGE, Dial
 from clod_adapter.training.schedule import Schedule
@@ -51,14 +48,14 @@ class PaperDial(Dial):
     weight_slope = 0.5
     measured = False
 
-    @classmethod
+    @staticmethod
     def initial(
-        cls, base: Gaussians, views: Sequence[View], config: AdaptConfig, progress: Listener | None = None,
+        base: Gaussians, views: Sequence[View], config: AdaptConfig, progress: Listener | None = None,
         error: Tensor | None = None,
     ) -> Gaussians:  # fmt: skip
         """sigma_d = 1 in units of the largest distance in the frustum, a hard threshold; a dial it has is kept."""
         if has_dial(base):
-            return super().initial(base, views, config)
+            return initialize(base, views, config)
         distance = scene_distance(base, spread(views, MOST_VIEWS))
         attenuation = replace(config.attenuation(distance), cut="hard", normalizer="max")
         initial = base.replace(sigma_d=torch.ones_like(base.opacity_logits), attenuation=attenuation)
@@ -71,9 +68,6 @@ class PaperDial(Dial):
     @staticmethod
     def parameter_of(sigma_d: Tensor) -> Tensor:
         return sigma_d.detach().float().clamp(*SIGMA_RANGE)
-
-    def counts(self, virtual_scale: float, counted: float | None, loss: Tensor) -> list[tuple[float, Tensor]]:
-        return []
 
     def objective(self, loss: Tensor, shown: Gaussians, camera: Camera, virtual_scale: float) -> Tensor:
         if self.config.reg_weight > 0 and virtual_scale >= 1:
@@ -104,17 +98,7 @@ def soft_count(log_opacities: Tensor, virtual_scale: float, tau: float, temperat
     of the mean of ``sigmoid((log a'' - log(tau s)) / temperature)``, which is 0 at log a'' = -inf.
     """
     (log_opacities,) = conform(log_opacities=log_opacities)
-    return _SoftCount.apply(log_opacities, log_threshold(tau, virtual_scale), temperature)
-
-
-class _SoftCount(Function):
-    @staticmethod
-    def forward(ctx: Any, log_opacities: Tensor, threshold: float, temperature: float) -> Tensor:
-        ctx.save_for_backward(log_opacities)
-        ctx.settings = threshold, temperature
-        return (log_opacities > threshold).sum() / log_opacities.new_full((), max(len(log_opacities), 1))
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
-        return slope_of_sigmoid(ctx.saved_tensors[0], *ctx.settings).mul_(grad), None, None
+    fixed, threshold = log_opacities.detach(), log_threshold(tau, virtual_scale)
+    share = (fixed > threshold).sum() / fixed.new_full((), max(len(fixed), 1))
+    nothing = (log_opacities - fixed).nan_to_num()  # -inf less itself is NaN
+    return share + (nothing * slope_of_sigmoid(fixed, threshold, temperature)).sum()
