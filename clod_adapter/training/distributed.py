@@ -67,7 +67,7 @@ class ProcessGroup:
         kept = own.kept.to(torch.uint8)
         # All at once and in place. Sending only the rows kept, or one packed message, takes longer: on loopback a
         # million Gaussians take 80 ms, packed 150 ms, only the rows kept 300 ms.
-        with self._exchange():
+        with self._timed("exchanging"):
             under_way = [dist.all_reduce(kept, dist.ReduceOp.MAX, async_op=True)]
             under_way += [dist.all_reduce(gradient, async_op=True) for gradient in gradients.values()]
             for work in under_way:
@@ -80,7 +80,7 @@ class ProcessGroup:
         """The first process's value, with its tensors on the CPU; the argument of the others is ignored."""
         file = io.BytesIO()
         self._meet()
-        with self._exchange():
+        with self._timed("exchanging"):
             if self.rank == 0:
                 torch.save(value, file)
             size = torch.tensor([len(file.getbuffer())])
@@ -96,17 +96,15 @@ class ProcessGroup:
 
     def _meet(self, said: Tensor | None = None, how: str = "SUM") -> None:
         """Waits for all processes and reduces a few numbers, on the CPU: gloo reports a lost process at once."""
-        began = time.perf_counter()
-        with _losses():
+        with self._timed("waiting"):
             dist.all_reduce(torch.zeros(1, dtype=torch.float32) if said is None else said, getattr(dist.ReduceOp, how))
-        self.waiting += time.perf_counter() - began
 
     @contextmanager
-    def _exchange(self) -> Iterator[None]:
+    def _timed(self, name: str) -> Iterator[None]:
         began = time.perf_counter()
         with _losses():
             yield
-        self.exchanging += time.perf_counter() - began
+        setattr(self, name, getattr(self, name) + time.perf_counter() - began)
 
 
 def require_distributed() -> None:
