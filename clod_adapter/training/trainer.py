@@ -50,23 +50,23 @@ class Trainer:
         form = form_of(config)
         self.rates = learning_rates(config, form.decay)
         # A frozen attribute requests no gradient from the rasterizer.
-        tuned = [n for n in ATTRIBUTES if n != "opacity_logits" and self.rates[n] > 0 and getattr(start, n).numel()]
+        tuned = [n for n in ATTRIBUTES if n == "opacity_logits" or self.rates[n] > 0 and getattr(start, n).numel()]
         own: dict[str, Any] = {"dtype": torch.float32, "memory_format": torch.contiguous_format}
-        attributes: Any = {
-            name: getattr(start, name).detach().to(**own, copy=name in (*tuned, "opacity_logits"))
-            for name in ATTRIBUTES
-        }
+        attributes: Any = {name: getattr(start, name).detach().to(**own, copy=name in tuned) for name in ATTRIBUTES}
         splats = Gaussians(**attributes, screen_filter=start.screen_filter)
         self.dial = form(splats, start, views, config, subset)
         dials = {name: value.detach() for name, value in self.dial.named_parameters()}
-        self.parameters, self.stepped = attributes | dials, (*tuned, "opacity_logits", *dials)
+        self.parameters, self.stepped = attributes | dials, (*tuned, *dials)
         self.config, self.group, self.count = config, group, self.dial.part.trained
         self.sampler, self.screen_filter = self.dial.sampler, start.screen_filter
         self.sampler.views = views
-        self.unit = own_sizes(start.log_scales[: self.count])
         # Of culled Gaussians too the count term has a gradient.
-        everywhere = {self.dial.decay, *self.dial.everywhere}
-        self.optimizers = [self._optimizer(set(self.stepped) - everywhere), self._optimizer(everywhere)]
+        everywhere, parts = {self.dial.decay, *self.dial.everywhere}, {"kept": dict[str, Tensor](), "all": {}}
+        for name, value in self.trained().items():
+            parts["all" if name in everywhere else "kept"][name] = value
+        beta1, beta2 = BETA1**config.batch, BETA2**config.batch
+        units = {"means": own_sizes(start.log_scales[: self.count])}
+        self.optimizers = {rows: RowAdam(p, beta1=beta1, beta2=beta2, units=units) for rows, p in parts.items() if p}
         self.empty_sh: Tensor | None = None  # the whole shN of a base whose empty degrees were removed
         self.done, self.seconds, self.start_seconds, self.loss = 0, 0.0, 0.0, math.nan
         self.mean: dict[str, Tensor] = {}
@@ -159,14 +159,14 @@ class Trainer:
 
     def _update(self, found: GradientSum, share_done: float) -> None:
         """Moves the rows whose gradients are finite; none if the loss is not, without asking which."""
-        learned, rows = torch.as_tensor(found.loss).isfinite(), spoilt_rows(found.gradients)
-        self.held |= learned & rows
-        finite = rows.logical_not_().logical_and_(learned)
+        learned, spoilt = torch.as_tensor(found.loss).isfinite(), spoilt_rows(found.gradients)
+        self.held |= learned & spoilt
+        finite = spoilt.logical_not_().logical_and_(learned)
         rates = {name: rate * self.dial.schedule.lr_final**share_done for name, rate in self.rates.items()}
         rates = self.gate.weaken(rates) if self.gate else rates
-        for optimizer, rows in zip(self.optimizers, (found.kept.logical_and_(finite), finite), strict=True):
-            if optimizer:
-                optimizer.step(found.gradients, rows, rates)
+        moved = {"kept": found.kept.logical_and_(finite), "all": finite}
+        for rows, optimizer in self.optimizers.items():
+            optimizer.step(found.gradients, moved[rows], rates)
         self.dial.clamp()
 
     def state(self) -> TrainingState:
@@ -219,23 +219,17 @@ class Trainer:
         """Continues from these values of the trained rows, without moments and mean."""
         for name, own in self.trained().items():
             own.copy_(trained[name])
-        for optimizer in filter(None, self.optimizers):
+        for optimizer in self.optimizers.values():
             optimizer.forget()
         self.mean, self.averaged = {}, 0
-
-    def _optimizer(self, names: set[str]) -> RowAdam | None:
-        """Of these parameters; None without any."""
-        own, batch = {name: value for name, value in self.trained().items() if name in names}, self.config.batch
-        return RowAdam(own, beta1=BETA1**batch, beta2=BETA2**batch, units={"means": self.unit}) if own else None
 
     def _changing(self) -> dict[str, Tensor]:
         """All tensors that steps change, named as in ``TrainingState``."""
         found = {f"parameter.{name}": value for name, value in self.trained().items()}
-        for optimizer, rows in zip(self.optimizers, ("kept", "all"), strict=True):
-            if optimizer:
-                moments = optimizer.moments().items()
-                found |= {f"{kind}.{name}": value for kind, values in moments for name, value in values.items()}
-                found[f"steps.{rows}"] = optimizer.steps
+        for rows, optimizer in self.optimizers.items():
+            moments = optimizer.moments().items()
+            found |= {f"{kind}.{name}": value for kind, values in moments for name, value in values.items()}
+            found[f"steps.{rows}"] = optimizer.steps
         found |= {f"mean.{name}": value for name, value in self.mean.items()}
         if self.gate:
             found |= {f"good.{name}": value for name, value in self.gate.good.items()}
