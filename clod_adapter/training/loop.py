@@ -112,7 +112,7 @@ def time_steps(
         began = time.perf_counter()
         trainer.gate.finish()
         fixed += (len(CHECKS) + 1) * (time.perf_counter() - began)
-        trainer.gate.numbers[2] = len(CHECKS)
+        trainer.gate = None
     began = time.perf_counter()
     for k in range(steps):
         trainer.step((k + 0.5) / steps)
@@ -152,24 +152,22 @@ def _train(trainer: Trainer, progress: Listener | None) -> Adapted:
 
     def tell(error: str | None = None) -> bool:
         """Whether the listener wants training to go on."""
-        return progress is None or progress(_progress(trainer, trainer.seconds, error)) is not False
+        return progress is None or progress(_progress(trainer, error)) is not False
 
     with DeferredInterrupt() as interrupt:
         try:
             while True:
-                now = _progress(trainer, time.perf_counter() - began)
-                share = now.share
+                trainer.seconds = time.perf_counter() - began
+                share = _progress(trainer).share
                 if group:  # the clock of the first process decides for all
                     share, going = group.agree(share, going)
                 if share >= 1 or not going:
                     break
                 try:
                     trainer.step(share, began + (trainer.config.time_budget or math.inf))
-                except (ProcessLost, LossNotFinite):
-                    raise
-                except Exception as error:  # the listener can save the state
-                    if trainer.done > 0:
-                        tell(str(error) or type(error).__name__)
+                except Exception as error:
+                    if trainer.done > 0 and not isinstance(error, ProcessLost | LossNotFinite):
+                        tell(str(error) or type(error).__name__)  # the listener can save the state
                     raise
                 trainer.seconds = time.perf_counter() - began
                 interrupt.begin()  # from here on there is a result
@@ -186,16 +184,16 @@ def _train(trainer: Trainer, progress: Listener | None) -> Adapted:
         trainer.seconds = time.perf_counter() - began
         seen = trainer.gate.finish() if trainer.gate and not lost else None
         waited = (group.waiting - before[0], group.exchanging - before[1]) if group else (0.0, 0.0)
-        adapted = Adapted(
-            trainer.gaussians(), trainer.done, trainer.seconds, trainer.start_seconds, not going, lost, *waited,
-            failed, int(trainer.held.sum()), watched=seen,
-        )  # fmt: skip
-    return replace(adapted, interrupted=adapted.interrupted or interrupt.received, signalled=interrupt.received)
+        result = trainer.gaussians()
+    return Adapted(
+        result, trainer.done, trainer.seconds, trainer.start_seconds, not going or interrupt.received, lost, *waited,
+        failed, int(trainer.held.sum()), interrupt.received, seen,
+    )  # fmt: skip
 
 
-def _progress(trainer: Trainer, seconds: float, error: str | None = None) -> Progress:
-    budget = trainer.config.time_budget
+def _progress(trainer: Trainer, error: str | None = None) -> Progress:
+    used = trainer.seconds / (trainer.config.time_budget or math.inf)
     return Progress(
-        Phase.TRAINING, trainer.done, trainer.config.steps, seconds, seconds / budget if budget else 0.0, trainer.loss,
-        trainer.gaussians, trainer.state, error,
+        Phase.TRAINING, trainer.done, trainer.config.steps, trainer.seconds, used, trainer.loss, trainer.gaussians,
+        trainer.state, error,
     )  # fmt: skip
