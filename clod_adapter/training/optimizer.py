@@ -31,6 +31,7 @@ class RowAdam:
     """Adam (Kingma and Ba 2015) over named ``[N, ...]`` parameters, the same subset of their rows in a step.
 
     A row that is not stepped keeps its value and its moments; the bias correction counts a row's own ``steps``.
+    ``moments`` has the ``first`` and the ``second`` ones by parameter.
 
     Args:
         parameters: at least one; updated in place; float32, contiguous, as the leading rows of a larger tensor are.
@@ -45,26 +46,22 @@ class RowAdam:
         one = torch.ones(1, dtype=torch.float32)
         self._units = {name: (units or {}).get(name, one.to(p.device)) for name, p in parameters.items()}
         self.beta1, self.beta2, self.epsilon = beta1, beta2, epsilon
-        self._moments = {name: (torch.zeros_like(p), torch.zeros_like(p)) for name, p in parameters.items()}
+        self.moments = {
+            kind: {name: torch.zeros_like(p) for name, p in parameters.items()} for kind in ("first", "second")
+        }
         some = next(iter(parameters.values()))
         self.steps = torch.zeros(len(some), dtype=torch.int32, device=some.device)
         # After so many steps of its own a row's bias corrections are 1 in float32.
         last = math.ceil(-25 * math.log(2) / math.log(max(beta1, beta2)))
         count = np.arange(1, last + 2)
         corrections = 1 / (1 - beta1**count), 1 / np.sqrt(1 - beta2**count)
-        self._corrections = np.pad(np.stack(corrections), ((0, 0), (1, 0))).astype(np.float32)
-        self._table: Tensor | None = None  # the same, where the parameters are if that is not the CPU
-
-    def moments(self) -> dict[str, dict[str, Tensor]]:
-        """The ``first`` and ``second`` moments of each parameter, themselves."""
-        return {kind: {n: both[k] for n, both in self._moments.items()} for k, kind in enumerate(("first", "second"))}
+        table = np.pad(np.stack(corrections), ((0, 0), (1, 0))).astype(np.float32)
+        self._corrections = torch.from_numpy(table).to(some.device)
 
     def forget(self) -> None:
         """Sets all moments and counts of steps to 0."""
-        self.steps.zero_()
-        for moments in self._moments.values():
-            for moment in moments:
-                moment.zero_()
+        for tensor in (self.steps, *self.moments["first"].values(), *self.moments["second"].values()):
+            tensor.zero_()
 
     @torch.no_grad()
     def step(self, gradients: dict[str, Tensor], rows: Tensor, rates: dict[str, float]) -> None:
@@ -83,10 +80,10 @@ class RowAdam:
 
         jobs = list[tuple[Any, ...]]()
         for name, parameter in self.parameters.items():
-            tensors = (parameter, *self._moments[name], gradients[name].contiguous())
+            tensors = (parameter, *(each[name] for each in self.moments.values()), gradients[name].contiguous())
             flat = [x.view(len(x), math.prod(x.shape[1:])).numpy() for x in tensors]
             counted = 0 if jobs else 1
-            own = rows.numpy(), self.steps.numpy(), counted, self._corrections, self._units[name].numpy()
+            own = rows.numpy(), self.steps.numpy(), counted, self._corrections.numpy(), self._units[name].numpy()
             jobs.append((*flat, *own, rates[name]))
 
         def adam(worker: int, workers: int) -> None:
@@ -97,12 +94,10 @@ class RowAdam:
 
     def _step_plain(self, gradients: dict[str, Tensor], rows: Tensor, rates: dict[str, float]) -> None:
         """The plain twin of the fused step: all rows, without asking which (a GPU would have to answer first)."""
-        if self._table is None or self._table.device != rows.device:
-            self._table = torch.from_numpy(self._corrections).to(rows.device)
         self.steps.add_(rows)
-        length, correction = self._table[:, self.steps.clamp(max=self._table.shape[1] - 1)].unsqueeze(2)
+        length, correction = self._corrections[:, self.steps.clamp(max=self._corrections.shape[1] - 1)].unsqueeze(2)
         for name, parameter in self.parameters.items():
-            values = (parameter, *self._moments[name])
+            values = (parameter, *(each[name] for each in self.moments.values()))
             x, first, second = (each.view(len(each), math.prod(each.shape[1:])) for each in values)
             gradient, lengths = gradients[name].reshape(x.shape), length * self._units[name][:, None]
             m = self.beta1 * first + (1 - self.beta1) * gradient

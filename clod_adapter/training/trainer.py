@@ -200,9 +200,9 @@ class Trainer:
 
     def averages(self) -> dict[str, Tensor]:
         """The mean parameters, of all rows; none before there is a mean."""
-        rest = slice(self.count, None)
-        whole = all(len(self.parameters[name][rest]) == 0 for name in self.mean)
-        return self.mean if whole else {n: torch.cat([m, self.parameters[n][rest]]) for n, m in self.mean.items()}
+        if self.count == len(self.parameters["means"]):
+            return self.mean
+        return {name: torch.cat([mean, self.parameters[name][self.count :]]) for name, mean in self.mean.items()}
 
     def _assembled(self, parameters: dict[str, Tensor]) -> Gaussians:
         values: Any = {name: parameters[name] for name in ATTRIBUTES}
@@ -227,8 +227,8 @@ class Trainer:
         """All tensors that steps change, named as in ``TrainingState``."""
         found = {f"parameter.{name}": value for name, value in self.trained().items()}
         for rows, optimizer in self.optimizers.items():
-            moments = optimizer.moments().items()
-            found |= {f"{kind}.{name}": value for kind, values in moments for name, value in values.items()}
+            for kind, values in optimizer.moments.items():
+                found |= {f"{kind}.{name}": value for name, value in values.items()}
             found[f"steps.{rows}"] = optimizer.steps
         found |= {f"mean.{name}": value for name, value in self.mean.items()}
         if self.gate:
