@@ -136,9 +136,7 @@ def load_state(path: str | Path) -> tuple[TrainingState, dict[str, Any]]:
     with refused_if_damaged(path, "is not a training state or is damaged", "delete it to start over"):
         tensors, metadata = read_tensors(path)
         about = json.loads(metadata[KEY])
-        belongs, random = dict(about.pop("belongs")), dict(about.pop("random"))
-        attenuation = AttenuationConfig(**about.pop("attenuation"))
-        order = tuple(int(view) for view in about.pop("order"))
-        counts: Any = {name: int(about.pop(name)) for name in ("averaged", "steps")}
-        rest: Any = {name: float(value) for name, value in about.items()}
-        return TrainingState(tensors, attenuation, random, order, **counts, **rest), belongs
+        belongs, attenuation = dict(about.pop("belongs")), AttenuationConfig(**about.pop("attenuation"))
+        random, order = dict(about.pop("random")), tuple(map(int, about.pop("order")))
+        counts: Any = {name: (int if name in ("averaged", "steps") else float)(n) for name, n in about.items()}
+        return TrainingState(tensors, attenuation, random, order, **counts), belongs
