@@ -59,6 +59,11 @@ class Camera:
         K = self.K * self.K.new_tensor([[0.5], [0.5], [1.0]])
         return replace(self, K=K, width=self.width // 2, height=self.height // 2)
 
+    def resized(self, width: int, height: int) -> Camera:
+        """The same view with another width and height."""
+        shrink = self.K.new_tensor([[width / self.width], [height / self.height], [1.0]])
+        return replace(self, K=self.K * shrink, width=width, height=height)
+
     @property
     def halvable(self) -> bool:
         """Whether an image of half the size shows enough: at least SMALLEST pixels a side."""

@@ -151,5 +151,4 @@ def _shrunk(view: View, width: int) -> View:
         return view
     height = max(1, round(camera.height * width / camera.width))
     image = F.adaptive_avg_pool2d(view.image.permute(2, 0, 1).float(), (height, width)).permute(1, 2, 0)
-    K = camera.K * camera.K.new_tensor([[width / camera.width], [height / camera.height], [1.0]])
-    return View(replace(camera, K=K, width=width, height=height), image.round().to(torch.uint8))
+    return View(camera.resized(width, height), image.round().to(torch.uint8))

@@ -195,6 +195,4 @@ def coverage(gaussians: Gaussians, opacities: Tensor, camera: Camera, growth: Te
 
 def reduced(camera: Camera) -> Camera:
     """The same view with a SMALLER-th of the width and height, where shares of an image are as good."""
-    width, height = (max(size // SMALLER, 1) for size in (camera.width, camera.height))
-    shrink = camera.K.new_tensor([[width / camera.width], [height / camera.height], [1.0]])
-    return replace(camera, K=camera.K * shrink, width=width, height=height)
+    return camera.resized(*(max(size // SMALLER, 1) for size in (camera.width, camera.height)))

@@ -9,7 +9,7 @@ import base64
 import hashlib
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache, cached_property
 from importlib.resources import files
 from io import BytesIO
@@ -170,8 +170,7 @@ def _poster(gaussians: Gaussians, camera: Camera, virtual_scale: float) -> str:
     """An element with the view of a camera as a JPEG, for the time until the page has drawn its own."""
     scale = min(POSTER_SIDE / max(camera.width, camera.height), 1.0)
     width, height = (max(round(scale * side), 1) for side in (camera.width, camera.height))
-    K = camera.K * torch.tensor([[width / camera.width], [height / camera.height], [1.0]])
-    small = replace(camera, K=K, width=width, height=height)
+    small = camera.resized(width, height)
     dial = 1.0 if gaussians.sigma_d is None else virtual_scale
     image = Image.fromarray(render(gaussians, small, dial).pixels.cpu().numpy())
     buffer = BytesIO()
