@@ -138,19 +138,15 @@ def compare_filters(gaussians: Gaussians, views: Sequence[View], expected: str =
     views = spread(views, MOST_VIEWS)
     photographs = [unit(view.image, gaussians.means) for view in views]
     constant = fmean(float((image - image.mean((0, 1))).square().mean()) for image in photographs)
-    errors, psnr = dict[str, Tensor](), dict[str, Tensor]()
-    for name, each in FILTERS.items():
-        filtered = gaussians.replace(screen_filter=each)
-        pictures = [render(filtered, view.camera).image.clamp(0, 1) for view in views]
-        pairs = zip(pictures, photographs, strict=True)
-        errors[name] = torch.stack([(image - photograph).square().mean() for image, photograph in pairs])
-        psnr[name] = -10 * errors[name].clamp(min=1e-10).log10()
-    means = {name: float(each.mean()) for name, each in psnr.items()}
-    clear = [
-        name
-        for name in FILTERS
-        if float((psnr[name] - psnr[expected]).mean()) > CLEAR_FILTER
-        and float((psnr[name] > psnr[expected]).float().mean()) >= MOST
-        and float(errors[name].mean()) < constant * 10 ** (-DOUBTFUL / 10)
-    ]
-    return max(clear, key=means.__getitem__, default=expected), means
+
+    def errors(filtered: Gaussians) -> Tensor:
+        pairs = zip(photographs, views, strict=True)
+        return torch.stack([(render(filtered, v.camera).image.clamp(0, 1) - p).square().mean() for p, v in pairs])
+
+    error = torch.stack([errors(gaussians.replace(screen_filter=each)) for each in FILTERS.values()])
+    psnr, names = -10 * error.clamp(min=1e-10).log10(), list(FILTERS)
+    gained, means = psnr - psnr[names.index(expected)], psnr.mean(1)
+    clear = (gained.mean(1) > CLEAR_FILTER) & ((gained > 0).float().mean(1) >= MOST)
+    clear &= error.mean(1) < constant * 10 ** (-DOUBTFUL / 10)
+    best = names[int(means.where(clear, -math.inf).argmax())] if bool(clear.any()) else expected
+    return best, dict(zip(names, means.tolist(), strict=True))

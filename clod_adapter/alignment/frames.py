@@ -104,17 +104,14 @@ def focus_of(viewmats: Tensor, rounds: int = 1) -> Tensor:
 def _axes(viewmats: Tensor) -> Iterator[Frame]:
     """The 47 other signed permutations of the axes, including mirrored ones."""
     identity = torch.eye(3, dtype=viewmats.dtype)
-    for order in itertools.permutations(range(3)):
-        for signs in itertools.product((1.0, -1.0), repeat=3):
-            rotation = torch.diag(viewmats.new_tensor(signs)) @ identity[list(order)]
-            if rotation.equal(identity):
-                continue
-            names = ", ".join(("-" if sign < 0 else "") + "xyz"[axis] for sign, axis in zip(signs, order, strict=True))
-            mirrored = " (mirrored)" if torch.linalg.det(rotation) < 0 else ""
-            description = (
-                f"the cameras' x, y, z are the file's {names}{mirrored}: export the checkpoint without that rotation"
-            )
-            yield Frame(f"axes {names}", description, rotation, 1.0, viewmats.new_zeros(3))
+    for order, signs in itertools.product(itertools.permutations(range(3)), itertools.product((1.0, -1.0), repeat=3)):
+        rotation = torch.diag(viewmats.new_tensor(signs)) @ identity[list(order)]
+        if rotation.equal(identity):
+            continue
+        names = ", ".join(("-" if sign < 0 else "") + "xyz"[axis] for sign, axis in zip(signs, order, strict=True))
+        mirrored = " (mirrored)" if torch.linalg.det(rotation) < 0 else ""
+        text = f"the cameras' x, y, z are the file's {names}{mirrored}: export the checkpoint without that rotation"
+        yield Frame(f"axes {names}", text, rotation, 1.0, viewmats.new_zeros(3))
 
 
 def _nerfstudio(viewmats: Tensor) -> Iterator[Frame]:
