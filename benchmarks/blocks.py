@@ -58,7 +58,7 @@ def quality(args: Namespace) -> None:
         for count in args.blocks:
             division, after = divide(initialize(base, views, config), views, config, count), None
             for number in (1, 2):
-                parts = [adapt_block(division, views, config, k, after=after)[0] for k in range(count)]
+                parts = [adapt_block(division, views, config, k, after=after) for k in range(count)]
                 after = merge(division, parts)
                 row = {"blocks": count, "label": f"pass {number}", "steps": [part.steps for part in parts]}
                 append(FILE, {**about, **row, "rows": compare(after, whole, scene.test)})

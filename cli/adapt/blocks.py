@@ -90,19 +90,19 @@ class Blocks:
         saver.identify(run.args.ply, "before", base_sha256=checkpoint, views_sha256=key["photographs"])
         with saver.rescuing("the same command"):
             with closing(ProgressDisplay(run.console, run.stop, name)) as display:
-                learned, adapted = adapt_block(
+                learned = adapt_block(
                     division, self.views, self.config, block, after=before, progress=saver.saving(display),
                     resume=saver.state, cache=ImageCache(run.memory.cache) if run.memory else None,
                 )  # fmt: skip
             saver.keep()
             release()
-            if adapted.failed or not adapted.interrupted:
+            if learned.failed or not learned.interrupted:
                 save_block(path, learned, key)
-        if adapted.failed:
-            run.console.say(f"{name}: ended after step {adapted.steps}: {adapted.failed}")
-        elif adapted.interrupted:
+        if learned.failed:
+            run.console.say(f"{name}: ended after step {learned.steps}: {learned.failed}")
+        elif learned.interrupted:
             more = "" if saver.saved is None else "; the same command resumes it"
-            run.console.say(f"{name}: stopped after step {adapted.steps}{more}")
+            run.console.say(f"{name}: stopped after step {learned.steps}{more}")
             raise Stopped(f"stopped in {name}")
         saver.close(finished=True)
         run.console.say(f"{name}: {len(learned.rows):,} Gaussians, {learned.steps} steps, {duration(learned.seconds)}")

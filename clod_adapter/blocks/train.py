@@ -1,13 +1,10 @@
 """Adapting scenes that do not fit in memory: block by block, each with the views that see it, the rest frozen.
 
-In the first pass each block is trained against the *checkpoint* of the others: these are drawn without a dial at every
-dial value, which is what their own training aims at, and the block's target images are the photographs as far as its
-Gaussians cover them (``target_image``). (Trained against the others' initialization at the same dial value, each block
-brightens what all have faded: images were 8 to 11 dB worse.) In the second pass each block continues with the others at
-the dial, as the first pass trained them. Within a pass blocks are independent; their rows are then merged.
-
-The initialization is that of the whole scene. A block takes as many steps as an undivided run takes of the views that
-see it, and its target count is its share of the Gaussians that the initialization keeps (``block_target``).
+In the first pass each block is trained against the *checkpoint* of the others: these are drawn without a dial, which is
+what their own training aims at, and the target images are the photographs as far as the block covers them
+(``target_image``). (Against the others' initialization at the same dial value, each block brightens what all have
+faded: images were 8 to 11 dB worse.) In the second pass the others are at the dial, as the first pass trained them.
+Within a pass blocks are independent; their rows are then merged. The initialization is that of the whole scene.
 """
 
 import json
@@ -49,6 +46,7 @@ class Learned:
     seconds: float
     failed: str | None = None
     held: int = 0
+    interrupted: bool = False
 
 
 def adapt_block(
@@ -61,14 +59,13 @@ def adapt_block(
     progress: Listener | None = None,
     resume: TrainingState | None = None,
     cache: ImageCache | None = None,
-) -> tuple[Learned, Adapted]:
+) -> Learned:
     """One pass of training one block; the same arguments give the same bits on every machine of a kind."""
     scene = after or division.initial
     # Context and target images are of the placed cameras, so pseudo views stay there.
     rows, own = division.rows(block), [views[k].at(views[k].camera) for k in division.views(block)]
     if not own:
-        unseen = scene.select(rows)
-        return _learned(division, rows, Adapted(unseen, 0, 0.0, 0.0, interrupted=False))
+        return _learned(division, rows, Adapted(scene.select(rows), 0, 0.0, 0.0, interrupted=False))
     context = context_rows(division, block, own, after, progress)
     gaussians = scene.select(torch.cat([rows, context]))
     if after is None:
@@ -77,17 +74,16 @@ def adapt_block(
     target = block_target(division, block, cameras, config, first=after is None)
     settings, span = block_config(division, block, config, first=after is None)
     part = TrainableSubset(len(rows), after is None, target=target, cameras=cameras, span=span)
-    adapted = adapt(gaussians, Scene(tuple(own), ()), settings, progress, resume, subset=part)
-    return _learned(division, rows, adapted)
+    return _learned(division, rows, adapt(gaussians, Scene(tuple(own), ()), settings, progress, resume, subset=part))
 
 
-def _learned(division: Division, rows: Tensor, adapted: Adapted) -> tuple[Learned, Adapted]:
+def _learned(division: Division, rows: Tensor, adapted: Adapted) -> Learned:
     values = {name: value[: len(rows)] for name, value in adapted.gaussians.tensors().items()}
     changed = {
         name: value.clone() for name, value in values.items()
         if name == "sigma_d" or not torch.equal(value, getattr(division.initial, name)[rows])
     }  # fmt: skip
-    return Learned(rows, changed, adapted.steps, adapted.seconds, adapted.failed, adapted.held), adapted
+    return Learned(rows, changed, adapted.steps, adapted.seconds, adapted.failed, adapted.held, adapted.interrupted)
 
 
 def _with_target_images(

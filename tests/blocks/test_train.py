@@ -138,8 +138,8 @@ def test_blocks_match_undivided_training(captured: tuple[Gaussians, Scene], divi
     """
     base, scene = captured
     undivided = adapt(base, scene, CONFIG).gaussians
-    first = merge(divided, [adapt_block(divided, scene.train, CONFIG, k)[0] for k in range(BLOCKS)])
-    whole = merge(divided, [adapt_block(divided, scene.train, CONFIG, k, after=first)[0] for k in range(BLOCKS)])
+    first = merge(divided, [adapt_block(divided, scene.train, CONFIG, k) for k in range(BLOCKS)])
+    whole = merge(divided, [adapt_block(divided, scene.train, CONFIG, k, after=first) for k in range(BLOCKS)])
     models, dials = (divided.initial, undivided, whole), (1.0, 3.0, 5.0)
     for before, one, other in zip(*(evaluate(g, scene.test, dials) for g in models), strict=True):
         gained = (other.psnr - before.psnr) / (one.psnr - before.psnr)
