@@ -4,7 +4,6 @@ from argparse import ArgumentParser, Namespace
 from pathlib import Path
 from typing import Any
 
-from clod_adapter._support.version import package_version
 from clod_adapter.errors import ClodError
 from clod_adapter.io.file_formats import check_readable
 
@@ -52,13 +51,13 @@ def execute(args: Namespace) -> dict[str, Any]:
     dial = " and ".join(dial_tensors(adapted))
     print(f"wrote {args.out} ({size(Path(args.out))}): {len(adapted):,} Gaussians with {dial}")
     return {
-        "command": "apply", "version": package_version(), "base": args.base, "adapter": args.adapter,
+        "base": args.base, "adapter": args.adapter,
         "base_count": adapter.base_count, "changed": sorted(adapter.updates), "notes": console.notes,
         "outputs": {"ply": args.out},
     }  # fmt: skip
 
 
-SUMMARY = "Rebuild the adapted PLY from checkpoint and adapter."
+DESCRIPTION = "Rebuild the adapted PLY from checkpoint and adapter."
 USAGE = "BASE.ply ADAPTER.safetensors -o OUT.ply [--json]"
 EPILOG = """\
 OUT.ply equals the file that clod-adapt wrote, bit for bit. BASE.ply must be the

@@ -64,13 +64,9 @@ def execute(args: Namespace) -> dict[str, Any]:
     return report | {"command": "demo", "folder": str(folder), "pictures": {k: str(v) for k, v in pictures.items()}}
 
 
-SUMMARY = "Run everything on a built-in scene; nothing to download."
 DESCRIPTION = """\
-Run all steps on a scene that comes with the package.
-
-Unpacks photographs of a ray-traced gallery and a checkpoint that was trained
-on them to its end, adapts the checkpoint, measures the result and draws two
-pictures. Takes about a minute on two CPU cores.
+Run all steps on photographs of a ray-traced gallery and a checkpoint that was
+trained on them, which come with the package; about a minute on two CPU cores.
 """
 USAGE = "[--out DIR] [options]"
 EPILOG = """\

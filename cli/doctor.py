@@ -9,7 +9,6 @@ from functools import partial
 from typing import Any
 
 from clod_adapter._support.text import first_line
-from clod_adapter._support.version import package_version
 
 from .shared.console import Console
 from .view import find_browser
@@ -106,23 +105,18 @@ def execute(args: Namespace) -> dict[str, Any]:
     failed = "no rendering backend works: fix torch first, then the CPU backend"
     print(f"rendering and training backends: {', '.join(draws)}" if draws else failed)
     return {
-        "command": "doctor", "version": package_version(), "draws": draws, "exit_code": 0 if draws else 1,
+        "draws": draws, "exit_code": 0 if draws else 1,
         "findings": findings,
     }  # fmt: skip
 
 
-SUMMARY = "Check what renders here, and say how to fix the rest."
+DESCRIPTION = "Check what renders here, and say how to fix the rest."
 USAGE = "[--json] [--quiet]"
 EPILOG = """\
-Each line has a name, ok or off, the result, and after -> the fix.
-
-  torch          version, build and threads
-  cpu, gsplat    rendering on the CPU and on an NVIDIA GPU; ok means that the
-                 image of a test scene is the reference's
-  browser        for clod-adapt view; found, not opened
-
-Nothing is installed or downloaded. The first run compiles the CPU's kernels,
-and on a GPU gsplat's, which can take minutes.
+Each line has a name, ok or off, the result, and after -> the fix. Of cpu and
+gsplat, ok means that the image of a test scene is the reference's. Nothing is
+installed or downloaded. The first run compiles the CPU's kernels, and on a GPU
+gsplat's, which can take minutes.
 
 exit codes: 0 cpu or gsplat works; 1 neither does
 """

@@ -8,7 +8,6 @@ from dataclasses import astuple
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from clod_adapter._support.version import package_version
 from clod_adapter.io.file_formats import check_readable
 from clod_adapter.io.settings import WARNING
 
@@ -44,7 +43,7 @@ def execute(args: Namespace) -> dict[str, Any]:
 
     found = inspect(args.file)
     print("\n".join(lines_of(found)))
-    return {"command": "inspect", "version": package_version(), **found.as_dict()}
+    return {**found.as_dict()}
 
 
 def lines_of(found: Inspection) -> list[str]:
@@ -71,10 +70,8 @@ def splat_lines(splat: Splat) -> list[str]:
     rows = [*zip("xyz", v.position, strict=True), ("scale", v.scale), ("opacity", v.opacity)]
     rows += [(name, spread) for name, spread in (("sigma_d", v.sigma), ("growth_d", v.growth)) if spread is not None]
     lines += ["", *spread_table(rows), ""]
-    lines.append(
-        _line("shares", f"{v.fainter_than_tau:.1%} fainter than tau = {splat.tau:.3g}, "
-        f"{v.fainter_than_visible:.1%} than 1/255; {v.needles:.1%} needles")
-    )  # fmt: skip
+    faint = f"{v.fainter_than_tau:.1%} fainter than tau = {splat.tau:.3g}, {v.fainter_than_visible:.1%} than 1/255"
+    lines.append(_line("shares", f"{faint}; {v.needles:.1%} needles"))
     if splat.dial is None:
         return [*lines, _line("dial", "none: no sigma_d")]
     a = splat.dial.attenuation
@@ -124,9 +121,8 @@ def tensor_lines(about: dict[str, Any]) -> list[str]:
     columns = {name: Spread(**about[key]) for name, key in (("sigma_d", "sigma"), ("growth_d", "growth")) if about[key]}
     lines += ["", *spread_table([*columns.items()]), ""]
     a = about["attenuation"]
-    lines.append(
-        _line("dial", f"{' and '.join(columns)}, s = 1 to {a['max_sv']:g}, {a['cut']} culling at tau = {a['tau']:.3g}")
-    )
+    how = f"s = 1 to {a['max_sv']:g}, {a['cut']} culling at tau = {a['tau']:.3g}"
+    lines.append(_line("dial", f"{' and '.join(columns)}, {how}"))
     calibration = about["calibration"]
     return lines + calibration_lines(calibration and Calibration.from_dict(calibration))
 
@@ -140,11 +136,7 @@ def _line(name: str, says: str) -> str:
     return f"{name:<{WIDTH}}{''.join(c if c.isprintable() else ' ' for c in says)}"
 
 
-SUMMARY = "Print what a file is and what it contains."
-DESCRIPTION = """\
-Print what a file is, which program wrote it, what it contains, and what
-adapting it would exclude. Reads only.
-"""
+DESCRIPTION = "Print what a file is, who wrote it, what is in it, and what adapting excludes."
 USAGE = "FILE [--json]"
 EPILOG = """\
 FILE can be a PLY (also compressed), gsplat's .pt, an adapter or the state of an
@@ -152,14 +144,9 @@ interrupted run (.safetensors), any format of clod-adapt export, and, with
 splat-transform installed, .sog or .ksplat.
 
   looks like   a guess from comments and the order of properties
-  says         comments in the file, for example of a baked one
   needle       a Gaussian more than 10 times as long as its second axis
   tau          culling threshold of the opacity at s = 1: the file's own, or the
                one that adapting would use
-
---json also has all properties and numbers.
-
-exit codes: 0 read; 2 damaged or of another kind, one line on stderr
 
 examples:
   clod-adapt inspect garden.ply

@@ -16,7 +16,7 @@ from clod_adapter._support.version import package_version
 from clod_adapter.errors import ClodError
 from clod_adapter.progress import Stopped
 
-from . import adapt, apply, demo, doctor, evaluate, export, inspect, render, robustness, view
+from . import adapt
 from .shared import process
 from .shared.command import Parser, parser_of
 from .shared.console import Console
@@ -36,14 +36,21 @@ Give a trained 3D Gaussian splat a quality dial:
   {PROG} --help             all options and commands
 """
 
-# Each has SUMMARY, USAGE, EPILOG, and execute(args), which gives what --json prints, or None. It may have DESCRIPTION,
-# add_arguments(parser), check(args), and outputs(args), which is called after it. It imports torch within functions, so
-# that --help and the errors of check take no second. Adapting is the main command and has no name.
-COMMANDS: dict[str, ModuleType] = {
-    "view": view, "inspect": inspect, "eval": evaluate, "render": render, "export": export, "apply": apply,
-    "robustness": robustness, "demo": demo, "doctor": doctor,
-}  # fmt: skip
-WITHOUT_TORCH = (inspect, doctor)  # which load it where they need it
+# Each is a module, imported on first use, with DESCRIPTION, USAGE, EPILOG, and execute(args), which gives the rest of
+# what --json prints, or None. It may have add_arguments(parser), check(args), and outputs(args), which is called after
+# it. It imports torch within functions, so that --help and the errors of check take no second. Adapting has no name.
+COMMANDS = {
+    "view": "Look at a file in the browser, and turn its dial.",
+    "inspect": "Print what a file is and what it contains.",
+    "eval": "Measure quality, count and time at some dial values.",
+    "render": "Render a scene's cameras at some dial values to PNG.",
+    "export": "Write a file for other tools: another format, or plain.",
+    "apply": "Rebuild the adapted PLY from checkpoint and adapter.",
+    "robustness": "Adapt checkpoints at several ranges, and plot them.",
+    "demo": "Run everything on a built-in scene; nothing to download.",
+    "doctor": "Check what renders here, and say how to fix the rest.",
+}
+WITHOUT_TORCH = ("inspect", "doctor")  # which load it where they need it
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -77,7 +84,7 @@ def _main(words: list[str]) -> int:
             if not name and not os.path.exists(words[0]) and (near := get_close_matches(words[0], COMMANDS, 1, NEAR)):
                 raise ClodError(f"{words[0]}: no such file or command; did you mean {PROG} {near[0]}?")
             args = build_parser(name).parse_args(words[1:] if name else words)
-            return run_here(COMMANDS.get(name, adapt), args)
+            return run_here(name, args)
     except ClodError as error:
         return refuse(" ".join(str(error).splitlines()), 2, words)
     except Stopped:
@@ -91,12 +98,16 @@ def _main(words: list[str]) -> int:
         return refuse(f"{name}{error.strerror or error}; check the path and its permissions", 2, words)
 
 
-def run_here(command: ModuleType, args: argparse.Namespace) -> int:
+def command_of(name: str) -> ModuleType:
+    return import_module(f".{name}", __package__) if name else adapt
+
+
+def run_here(name: str, args: argparse.Namespace) -> int:
     """Runs a command and returns its exit code. Of several processes the first runs it; the others only train."""
     launch = process.launched()
     if launch.size == 1:
-        return run(command, args)
-    if command is not adapt:
+        return run(name, args)
+    if name:
         raise ClodError("only adapting takes several processes; run this command without torchrun")
     from .adapt.processes import leading, take_part
 
@@ -105,25 +116,27 @@ def run_here(command: ModuleType, args: argparse.Namespace) -> int:
             take_part()
         return 0
     with leading():
-        return run(command, args)
+        return run(name, args)
 
 
-def run(command: ModuleType, args: argparse.Namespace) -> int:
+def run(name: str, args: argparse.Namespace) -> int:
     """Runs a command, prints its report with --json, and returns the report's exit code, or 0."""
     process.check_surroundings()
+    command = command_of(name)
     if args.json:
         process.check_printed()
     if hasattr(command, "check"):
         command.check(args)
     outputs = command.outputs(args) if hasattr(command, "outputs") else Outputs()
     with process.signals_as_interrupt(), claimed(outputs):
-        if command not in WITHOUT_TORCH:
+        if name not in WITHOUT_TORCH:
             import_library(args.quiet)
         aside = io.StringIO() if args.quiet else sys.stderr
         # Again: pycolmap, imported just now, sets a handler.
         with redirect_stdout(aside) if args.json else nullcontext(), process.signals_as_interrupt():
             report = command.execute(args) or {}
     if args.json and report:
+        report = {"command": name or "adapt", "version": package_version()} | report
         print(json.dumps(jsonable(report), allow_nan=False))
     if args.json or (report and "outputs" not in report):
         process.check_printed()
@@ -138,12 +151,11 @@ def import_library(quiet: bool) -> None:
 
 
 def build_parser(name: str) -> Parser:
-    command = COMMANDS.get(name, adapt)
-    parser = parser_of(command, f"{PROG} {name}".strip())
+    parser = parser_of(command_of(name), f"{PROG} {name}".strip())
     if not name:
-        others = "\n".join(f"  {PROG} {word:<10} {other.SUMMARY}" for word, other in COMMANDS.items())
-        parser.epilog = f"other commands, each with its own --help:\n{others}\n\n{command.EPILOG}"
-        parser.general.add_argument("--version", action="version", version=f"{PROG} {package_version()}")
+        others = "\n".join(f"  {PROG} {word:<10} {summary}" for word, summary in COMMANDS.items())
+        parser.epilog = f"other commands, each with its own --help:\n{others}\n\n{adapt.EPILOG}"
+        parser.general.add_argument("--version", action="version")
     return parser
 
 

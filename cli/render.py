@@ -31,10 +31,8 @@ def add_arguments(parser: ArgumentParser) -> None:
     given = parser.add_argument_group("input")
     given.add_argument("model", metavar="MODEL.ply", help="an adapted file, or a plain one")
     common.add_reading(given)
-    given.add_argument(
-        "--views", metavar="NAME", nargs="+", default=["held-out"],
-        help="photographs whose cameras to render: names, all, or held-out (default)",
-    )  # fmt: skip
+    text = "photographs whose cameras to render: names, all, or held-out (default)"
+    given.add_argument("--views", metavar="NAME", nargs="+", default=["held-out"], help=text)
     dial = parser.add_argument_group("dial values, one of")
     common.add_dial_options(dial, "dial values (default: 1)", "(mean over the images)", several=True)
     output = parser.add_argument_group("output")
@@ -84,7 +82,7 @@ def execute(args: Namespace) -> dict[str, Any]:
         about = f"{kept:,.0f} of {len(gaussians):,} Gaussians, {error:.2f} dB, means over the images"
         print(f"  s = {dial:.5g}: {about}")
     return {
-        "command": "render", "version": package_version(), "model": args.model, "scene": args.images,
+        "model": args.model, "scene": args.images,
         "base_count": len(gaussians), "virtual_scales": dials, "pictures": pictures,
         "interrupted": len(pictures) < len(views), "notes": console.notes, "seconds": watch.report(),
         "outputs": {"folder": args.out},
@@ -138,12 +136,9 @@ def write_png(path: Path, pixels: Tensor) -> None:
         Image.fromarray(pixels.cpu().numpy()).save(temporary, pnginfo=about)
 
 
-SUMMARY = "Render a scene's cameras at some dial values to PNG."
 DESCRIPTION = """\
-Render the cameras of a scene's photographs at some dial values to PNG files.
-
-Each image has the name of its photograph and shows all dial values side by
-side, in the order given.
+Render the cameras of a scene's photographs to PNG files with their names: all
+dial values side by side, in the order given.
 """
 USAGE = "MODEL.ply --images DIR -o FOLDER [options]"
 EPILOG = """\
@@ -152,7 +147,6 @@ Ctrl-C finishes the image under way (exit code 0, "interrupted": true); a second
 one aborts.
 
 examples:
-  clod-adapt render garden_clod.ply --images garden -o out --sv 3
   clod-adapt render garden_clod.ply --images garden -o out --sv 1 2 5 --beside
   clod-adapt render garden_clod.ply --images garden -o out --views a.jpg --sv 2
 """

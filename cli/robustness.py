@@ -35,15 +35,11 @@ def add_arguments(parser: ArgumentParser) -> None:
     given.add_argument("ply", metavar="PLY", nargs="+", help="checkpoints of one scene; never modified")
     common.add_reading(given)
     output = parser.add_argument_group("output")
-    output.add_argument(
-        "-o", "--out", metavar="DIR", default="robustness",
-        help="output folder; resumed if it exists (default: robustness)",
-    )  # fmt: skip
+    text = "output folder; resumed if it exists (default: robustness)"
+    output.add_argument("-o", "--out", metavar="DIR", default="robustness", help=text)
     training = parser.add_argument_group("training")
-    training.add_argument(
-        "--max-sv", metavar="S", type=float, nargs="+", default=[1.0, 3.0, 5.0, 7.0],
-        help="largest dial value of each adaptation; 1 trains at full detail only (default: 1 3 5 7)",
-    )  # fmt: skip
+    text = "largest dial value of each adaptation; 1 trains at full detail only (default: 1 3 5 7)"
+    training.add_argument("--max-sv", metavar="S", type=float, nargs="+", default=[1.0, 3.0, 5.0, 7.0], help=text)
     add_settings(training, without=["max_sv"])
 
 
@@ -129,10 +125,8 @@ class Cell:
         if self.config is None:
             result = baseline(base.gaussians, scene.test, self.points, progress=progress)
         else:
-            result = adapt_at_range(
-                base.gaussians, scene, self.config, self.points, fingerprint=base.fingerprint, origin=base.origin,
-                progress=progress,
-            )  # fmt: skip
+            about: dict[str, Any] = {"fingerprint": base.fingerprint, "origin": base.origin, "progress": progress}
+            result = adapt_at_range(base.gaussians, scene, self.config, self.points, **about)
         self.file.unlink(missing_ok=True)
         if result.adapter:
             save_adapter(self.adapter_file, result.adapter)
@@ -229,13 +223,10 @@ def print_cells(report: dict[str, Any]) -> None:
         print(f"\nmissing: {', '.join(report['missing'])}; the same command continues")
 
 
-SUMMARY = "Adapt checkpoints at several ranges, and plot them."
 DESCRIPTION = """\
-Run the robustness experiment of CLoD-GS: checkpoints adapted at several ranges.
-
-Adapts each checkpoint at each --max-sv and measures all at the same dial values
-on the held-out photographs, also beyond the trained range. The baseline is the
-checkpoint itself, pruned to its most opaque Gaussians without tuning.
+Run the robustness experiment of CLoD-GS: adapt each checkpoint at each --max-sv
+and measure all at the same dial values, also beyond the trained range. The
+baseline is the checkpoint pruned to its most opaque Gaussians, not adapted.
 """
 USAGE = "PLY [PLY ...] --images DIR [options]"
 EPILOG = """\

@@ -30,18 +30,14 @@ IN_TERMINAL = ("lynx", "w3m", "links", "links2", "elinks", "www-browser")  # the
 
 def add_arguments(parser: ArgumentParser) -> None:
     given = parser.add_argument_group("input")
-    given.add_argument(
-        "models", metavar="MODEL.ply", nargs="+",
-        help="an adapted file, or a plain one, which has no dial; several, or a folder of them, to switch between",
-    )  # fmt: skip
+    text = "an adapted file, or a plain one, which has no dial; several, or a folder of them, to switch between"
+    given.add_argument("models", metavar="MODEL.ply", nargs="+", help=text)
     given.add_argument("--base", metavar="BASE.ply", help="the checkpoint, or another file, to compare with")
     common.add_reading(given, "scene folder, for its cameras only", photographs=False)
     page = parser.add_argument_group("page")
     initial: Any = page.add_mutually_exclusive_group()
-    initial.add_argument(
-        "--sv", metavar="S", type=float, nargs=1,
-        help="initial dial value (default: 1 with photographs, else everything; then it holds 30 frames per second)",
-    )  # fmt: skip
+    text = "initial dial value (default: 1 with photographs, else everything; then it holds 30 frames per second)"
+    initial.add_argument("--sv", metavar="S", type=float, nargs=1, help=text)
     common.add_device_preset(initial)
     page.add_argument("--port", metavar="P", type=int, default=0, help="port of the server (default: a free one)")
     page.add_argument("--no-browser", action="store_true", help="print the address only")
@@ -116,9 +112,8 @@ def make_page(args: Namespace, console: Console) -> tuple[dict[str, Any], dict[s
         drawn = model.gaussians.screen_filter
         base = replace(base, gaussians=base.gaussians.replace(screen_filter=drawn))
     cameras = read_cameras(model, args.images, console) if args.images else []
-    attenuation, opening = model.gaussians.attenuation, None
-    if dials := solve_dials(args, model, cameras or model.viewpoints, console):
-        opening = common.initial_dial(dials[0], attenuation.max_sv if attenuation else None, console)
+    dials = solve_dials(args, model, cameras or model.viewpoints, console)
+    opening = common.initial_dial(dials[0], model.gaussians.attenuation, console) if dials else None
     payloads = {MODEL if k == 0 else f"/files/{k}": Payload.of(each) for k, each in enumerate(models)}
     names = [payload.name for payload in payloads.values()]
     if len({*names}) < len(names):  # with their folders, to tell them apart
@@ -130,9 +125,8 @@ def make_page(args: Namespace, console: Console) -> tuple[dict[str, Any], dict[s
         base_entry = {"name": payloads[BASE].name, "href": BASE}
     shown, placed = cameras or model.cameras, model.placed and not cameras
     page = b"".join(document(page_config(entries[0], base_entry, shown, opening, entries[1:], placed)))
-    answers = {"/": Response("text/html; charset=utf-8", len(page), lambda: (page,), policy("'self'"))}
-    for path, payload in payloads.items():
-        answers[path] = Response("application/octet-stream", payload.size, payload.blocks)
+    answers = {path: Response("application/octet-stream", each.size, each.blocks) for path, each in payloads.items()}
+    answers["/"] = Response("text/html; charset=utf-8", len(page), lambda: (page,), policy("'self'"))
     return answers, {
         "command": "view", "version": package_version(), "model": files[0], "files": files, "base": args.base,
         "scene": args.images, "base_count": len(model.gaussians), "cameras": len(cameras), "notes": console.notes,
@@ -152,33 +146,24 @@ def find_browser() -> webbrowser.BaseBrowser | None:
     return webbrowser.BackgroundBrowser([browser.name, *browser.args])  # an editor's, whose end is not waited for
 
 
-SUMMARY = "Look at a file in the browser, and turn its dial."
 DESCRIPTION = """\
-Show a file in the browser, with its dial and a free camera.
-
-Serves a page on 127.0.0.1, prints the address, opens it in the browser, and
-runs until Ctrl-C.
+Show a file in the browser, with its dial and a free camera: a page is served on
+127.0.0.1 until Ctrl-C.
 """
 USAGE = "MODEL.ply ... [--base BASE.ply] [--images DIR] [options]"
 EPILOG = """\
 The page opens at s = 1 with photographs, else with everything shown, and holds
 30 frames per second by the dial if half of that is in reach; --sv sets a value
-that stays. It shows the Gaussians kept and the frame time, switches the
-attenuation on and off, and compares MODEL.ply with BASE.ply, or with itself
-without the dial, on the two sides of a line. Drop another file on the page to
-open it; --sv holds for it too, within its trained range. The address holds the
-view. With --images the page can jump between the scene's cameras. Several
-files, such as levels or variants, and a folder of files open with a list to
-switch between them; the view and the dial value stay.
+that stays. It compares MODEL.ply with BASE.ply, or with itself without the
+dial, on the two sides of a line, and with --images jumps between the scene's
+cameras. Drop another file on it to open that. The address holds the view.
 
 Other machines cannot reach the page, and it loads nothing from the network. To
 see it from another machine, forward the port (-t passes Ctrl-C on):
   ssh -t -L 8000:127.0.0.1:8000 HOST \\
       clod-adapt view MODEL.ply --no-browser --port 8000
 "clod-adapt export MODEL.ply -o page.html" writes the page to a file.
---device-preset opens it at the dial value whose count suits a device, by the
-cameras of --images or those stored in MODEL.ply.
-
+--device-preset takes the cameras of --images, or those stored in MODEL.ply.
 --json prints its object at the start: {"url": ..., ...}.
 
 exit codes: 0 ended by Ctrl-C or a signal; 2 bad input, or the port is in use

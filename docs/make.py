@@ -7,11 +7,9 @@ import argparse
 import shutil
 from itertools import groupby
 from pathlib import Path
-from types import ModuleType
 
 import clod_adapter
-from clod_adapter.cli import adapt
-from clod_adapter.cli.main import COMMANDS, PROG, build_parser
+from clod_adapter.cli.main import COMMANDS, PROG, build_parser, command_of
 from clod_adapter.config import AdaptConfig, AttenuationConfig, field_descriptions
 
 HERE = Path(__file__).resolve().parent
@@ -44,17 +42,16 @@ INTEGRATIONS = (
 def commands_page() -> str:
     """Usage, description, options and notes of each command, as in ``--help``."""
     parts = ["# Commands\n\nThe `--help` text of every command.\n"]
-    return "\n".join(parts + [command_section(name, each) for name, each in [("", adapt), *COMMANDS.items()]])
+    return "\n".join(parts + [command_section(name) for name in ("", *COMMANDS)])
 
 
-def command_section(name: str, command: ModuleType) -> str:
+def command_section(name: str) -> str:
     """The section of one command; the empty name is ``clod-adapt PLY``."""
-    title = f"{PROG} {name}".strip()
+    title, command = f"{PROG} {name}".strip(), command_of(name)
     rows = [option_row(action) for action in build_parser(name)._actions if action.dest != "help"]
     table = "\n".join(["| | |", "|---|---|", *rows])
     usage, notes = f"```text\n{title} {command.USAGE}\n```\n", f"```text\n{command.EPILOG.strip()}\n```\n"
-    about = getattr(command, "DESCRIPTION", command.SUMMARY).strip()
-    return f"## {title}\n\n{usage}\n{about}\n\n{table}\n\n{notes}"
+    return f"## {title}\n\n{usage}\n{command.DESCRIPTION.strip()}\n\n{table}\n\n{notes}"
 
 
 def option_row(action: argparse.Action) -> str:

@@ -38,7 +38,7 @@ ORDER: list[set[str]] = [
     {""},  # the package itself, whose __init__ re-exports from the rows above
     {"cli.shared"},
     {"cli.view"},
-    {"cli.adapt", "cli.apply", "cli.doctor", "cli.evaluate", "cli.export", "cli.inspect", "cli.render",
+    {"cli.adapt", "cli.apply", "cli.doctor", "cli.eval", "cli.export", "cli.inspect", "cli.render",
      "cli.robustness"},
     {"cli.demo"},  # runs adapt
     {"cli.main"},

@@ -19,34 +19,26 @@ NAMES = ("bands", "unseen", "means", "quats", "scales", "opacities", "sh0")
 
 def add_arguments(parser: ArgumentParser) -> None:
     given = parser.add_argument_group("input")
-    given.add_argument(
-        "ply", metavar="PLY",
-        help="checkpoint: a PLY in Inria's 3DGS layout, or another file that inspect reads; never modified",
-    )  # fmt: skip
-    add_reading(
-        given, "scene folder: images/ with a COLMAP model in sparse/0, or a transforms.json of nerfstudio or "
-        "instant-ngp (default: none, see below)",
-    )  # fmt: skip
+    text = "checkpoint: a PLY in Inria's 3DGS layout, or another file that inspect reads; never modified"
+    given.add_argument("ply", metavar="PLY", help=text)
+    scene = "images/ with a COLMAP model in sparse/0, or a transforms.json of nerfstudio or instant-ngp"
+    add_reading(given, f"scene folder: {scene} (default: none, see below)")
     output = parser.add_argument_group("output")
-    output.add_argument(
-        "-o", "--out", metavar="OUT.ply", help="output file (default: name of PLY with _clod, in the current folder)"
-    )
+    text = "output file (default: name of PLY with _clod, in the current folder)"
+    output.add_argument("-o", "--out", metavar="OUT.ply", help=text)
     output.add_argument("--report", action="store_true", help="also write a page, OUT.html, and its charts")
     training = parser.add_argument_group("training")
     add_settings(training)
     training.add_argument("--resume", action="store_true", help="continue the same command where it was interrupted")
-    training.add_argument(
-        "--accept-loss", action="store_true", help="exit code 0 even if s = 1 is far below the base (see exit codes)"
-    )
+    text = "exit code 0 even if s = 1 is far below the base (see exit codes)"
+    training.add_argument("--accept-loss", action="store_true", help=text)
     options = parser.add_argument_group("advanced")
-    options.add_argument(
-        "--with", dest="keep_in", metavar="NAME", nargs="+", action="extend", choices=NAMES, default=[],
-        help=f"train these whatever the plan measures: {', '.join(NAMES)}",
-    )  # fmt: skip
-    options.add_argument(
-        "--without", dest="leave_out", metavar="NAME", nargs="+", action="extend", choices=NAMES, default=[],
-        help="exclude or freeze these whatever the plan measures",
-    )  # fmt: skip
+    for option, dest, text in (
+        ("--with", "keep_in", f"train these whatever the plan measures: {', '.join(NAMES)}"),
+        ("--without", "leave_out", "exclude or freeze these whatever the plan measures"),
+    ):
+        several: Any = {"metavar": "NAME", "nargs": "+", "action": "extend", "choices": NAMES, "default": []}
+        options.add_argument(option, dest=dest, help=text, **several)
     options.add_argument("--trim", action="store_true", help="do not write the SH degrees and Gaussians excluded")
     options.add_argument("--memory", metavar="SIZE", help="memory limit, as in 8GB; larger scenes are split in blocks")
 
@@ -70,10 +62,8 @@ def outputs(args: Namespace) -> Outputs:
     page = page_files(files.ply.with_suffix(".html"), ["rendering", "adapting"]) if args.report else []
     named, default = ([], [files.ply]) if args.out is None else ([files.ply], [])
     blocks = files.blocks() if args.memory is not None else []
-    return Outputs(
-        named, [*default, files.adapter, files.report, files.state, *page, *blocks],
-        inputs=[args.ply], scene=args.images,
-    )  # fmt: skip
+    derived = [*default, files.adapter, files.report, files.state, *page, *blocks]
+    return Outputs(named, derived, inputs=[args.ply], scene=args.images)
 
 
 def execute(args: Namespace) -> dict[str, Any]:
@@ -82,14 +72,12 @@ def execute(args: Namespace) -> dict[str, Any]:
     return adapt(args)
 
 
-SUMMARY = "Give a trained 3D Gaussian splat a quality dial."
 DESCRIPTION = """\
 Give a trained 3D Gaussian splat a quality dial: one file for every budget.
 
 Learns two numbers per Gaussian: sigma_d, by which a renderer fades detail out
-with distance, and growth_d, by which the others grow into the gaps. Fine-tunes
-the other attributes. The dial s is set when rendering: s = 1 is full quality;
-at s about s^-1.5 of the Gaussians are drawn.
+with distance, and growth_d, by which the others grow into the gaps. The dial s
+is set when rendering: 1 is full quality; at s about s^-1.5 of them are drawn.
 """
 USAGE = "PLY [--images DIR] [--max-sv S] [--out OUT.ply] [options]"
 EPILOG = """\
@@ -112,14 +100,13 @@ interruption:
   Ctrl-C, SIGTERM, a closed terminal or the warning of a scheduler (SIGUSR1,
   SIGUSR2, SIGXCPU) ends training after the step and writes the result so far
   (exit code 0, "interrupted": true); a second Ctrl-C or SIGTERM aborts. The
-  state is saved in OUT.resume.safetensors about once a minute (2 % of the
-  time): after an interrupt, a crash or a full disk the same command with
-  --resume gives the same Gaussians, bit for bit (on as many threads).
+  state is saved about once a minute: after an interrupt, a crash or a full disk
+  the same command with --resume gives the same Gaussians, bit for bit.
 
 large scenes, several processes:
-  --memory 8GB trains a scene that does not fit in blocks, in two passes; after
-  an interrupt the same command continues. Processes of torchrun train together;
-  the result is that of one process with the same --batch, up to rounding.
+  --memory 8GB trains a scene that does not fit in blocks; after an interrupt
+  the same command continues. Processes of torchrun train together, with the
+  result of one process with the same --batch, up to rounding.
 
 exit codes: 0 written; 1 written, but a loss was not finite, or s = 1 is more
 than 1 dB below the base (without photographs: below 25 dB) and --accept-loss is
@@ -129,7 +116,6 @@ interrupted without a result
 examples:
   clod-adapt garden.ply --images garden --max-sv 5
   clod-adapt garden.ply --images garden --time-budget 120 --out out/dial.ply
-  clod-adapt garden.ply --images garden --quiet --json > report.json
   clod-adapt garden.ply --max-sv 5
   torchrun --nproc-per-node 8 -m clod_adapter garden.ply --images garden
 """

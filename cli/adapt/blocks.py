@@ -38,10 +38,7 @@ def adapt_in_blocks(run: Run) -> tuple[Plan, Adapted]:
         division = divide(plan.lean, views, plan.config, run.memory.blocks, total=len(plan.start), progress=display)
     release()
     start_seconds, counts = time.perf_counter() - began, [division.steps(k, plan.config) for k in range(division.count)]
-    run.console.say(
-        f"{division.count} blocks of {min(counts)} to {max(counts)} steps, {sum(counts)} in all (each takes "
-        f"{plan.config.steps} times its share of the views)"
-    )
+    run.console.say(f"{division.count} blocks of {min(counts)} to {max(counts)} steps, {sum(counts)} in all")
     blocks = Blocks(run, plan.config, division, views, photographs)
     failed, steps, seconds, held, merged = list[str](), 0, 0.0, 0, None
     for number in range(1, division.passes + 1):

@@ -59,10 +59,8 @@ def together(
     lean, config = plan.lean, plan.config
     device = lean.means.device.type
     job = (lean, scene.train, config, state, plan.subset, device)  # what ``adapt`` is given, and where it is
-    display.console.say(
-        f"{launch.size} processes ({BACKENDS[device]}): {config.batch} views a step, {config.steps:,} steps, "
-        f"{config.batch * config.steps:,} views in all"
-    )
+    each = f"{config.batch} views a step, {config.steps:,} steps"
+    display.console.say(f"{launch.size} processes ({BACKENDS[device]}): {each}")
     _store().set(CALL, "train")
     try:
         if any(_store().check([_reason(rank)]) for rank in range(1, launch.size)):  # it would wait for ten minutes

@@ -98,10 +98,9 @@ def make_result(run: Run, plan: Plan, adapted: Adapted) -> Result:
     if run.args.trim and plan.trims(gaussians):
         kept, degree = plan.kept, plan.sh_degree
     base = trimmed(run.base, kept, degree)
-    adapter = extract(
-        trim(gaussians, kept, degree), trim(adapted.gaussians, kept, degree), fingerprint=base.fingerprint,
-        config=asdict(run.config), origin=base.origin,
-    )  # fmt: skip
+    before, after = trim(gaussians, kept, degree), trim(adapted.gaussians, kept, degree)
+    about: dict[str, Any] = {"fingerprint": base.fingerprint, "config": asdict(run.config), "origin": base.origin}
+    adapter = extract(before, after, **about)
     adapter = replace(adapter, kept=kept, sh_degree=degree)
     note_training(run, adapter, adapted)
     return Result(plan, adapted, base, adapter, adapter.apply(gaussians))

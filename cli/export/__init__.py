@@ -107,11 +107,7 @@ def execute(args: Namespace) -> dict[str, Any]:
     return export(args)
 
 
-SUMMARY = "Write a file for other tools: another format, or plain."
-DESCRIPTION = """\
-Write a model for other tools: in another format, with its dial if the format
-can store it, or with one dial value baked in.
-"""
+DESCRIPTION = "Write a model for other tools, with its dial or with one dial value baked in."
 TABLE = "\n".join(
     f"  {suffix:<17}{'kept' if form.carries_sigma else '-':<6}" + f"\n{'':25}".join(form.about)
     for suffix, form in FORMATS.items()
@@ -126,14 +122,11 @@ are dropped.
 
 baking:
   A baked file has the Gaussians of one dial value, with fixed opacities and
-  grown scales. This is lossy; keep MODEL. The dial depends on the distance to
-  the camera; baking takes each Gaussian's mean distance to the training cameras
-  of --images, else to those stored in MODEL, else to 16 placed ones (at worst
-  0.5 dB lower). With --camera the file is exact at that camera.
-
-  --keep is exact: OUT has N Gaussians. --device-preset is --keep with the
-  number that viewers allow a device. --psnr-drop and --fps use the calibration
-  in MODEL; with --images, --fps times frames of MODEL on this machine.
+  grown scales. This is lossy; keep MODEL. Baking takes each Gaussian's mean
+  distance to the training cameras of --images, else to those stored in MODEL,
+  else to 16 placed ones. With --camera the file is exact at that camera.
+  --keep is exact. --psnr-drop and --fps use the calibration in MODEL; with
+  --images, --fps times frames of MODEL on this machine.
 
 levels and order:
   --levels 1,2,4,7 writes OUT_s1.ply, OUT_s2.ply and so on, all or none. With
@@ -145,13 +138,10 @@ other tools:
   SIBR reads a baked .ply of SH degree 1 to 3, and takes the degree from
   sh_degree in cfg_args next to the file.
   .html is the page of "clod-adapt view" in one file; --sv or a budget sets its
-  initial dial value. The PSNR of its rounded splat is measured and printed.
-  .sog, .compressed.ply and --lod-meta need splat-transform 3.7 with
-  Node 22, on the PATH or in CLOD_SPLAT_TRANSFORM. Without a GPU, 100,000
-  Gaussians take minutes for .sog.
+  initial dial value. .sog, .compressed.ply and --lod-meta need splat-transform
+  3.7 with Node 22, on the PATH or in CLOD_SPLAT_TRANSFORM.
 
 examples:
-  clod-adapt export garden_clod.ply --sv 2 -o garden_s2.ply
   clod-adapt export garden_clod.ply --keep 200000 -o garden_200k.ply
   clod-adapt export garden_clod.ply --images garden -o garden.html
   clod-adapt export garden_clod.ply --levels 1,2,4,7 --3dtiles -o garden_tiles

@@ -7,7 +7,6 @@ from statistics import fmean
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from clod_adapter._support.version import package_version
 from clod_adapter.bake import bake, order_by_extinction
 from clod_adapter.calibration import Viewpoint
 from clod_adapter.cameras import Camera, spread
@@ -47,7 +46,7 @@ def export(args: Namespace) -> dict[str, Any]:
         scales = "" if export.gaussians.growth_d is None else "; the scales include growth"
         print(f"{baked}; lossy: without the dial and the Gaussians culled at this dial value{scales}")
     return {
-        "command": "export", "version": package_version(), "model": args.model, "base_count": total,
+        "model": args.model, "base_count": total,
         "camera": camera.name if camera else None, "cameras": len(export.cameras), "order": args.order,
         "outputs": written, "notes": export.console.notes, "seconds": watch.report(),
     }  # fmt: skip
@@ -97,7 +96,7 @@ class Export:
         baked, attenuation = self.camera is None and not self.page, self.gaussians.attenuation
         dials = args.levels or solve_dials(args, self.model, self.cameras, self.console, baked=baked)
         if dials and self.page:
-            dials = [initial_dial(dials[0], attenuation.max_sv if attenuation else None, self.console)]
+            dials = [initial_dial(dials[0], attenuation, self.console)]
         elif dials:
             dials = choose_dials(dials, attenuation, self.console)
         self.dials: list[float] = dials or []
@@ -210,9 +209,8 @@ class Export:
     def _write_page(self, path: Path, virtual_scale: float | None) -> None:
         """Notes the PSNR of its renders against those of the exact Gaussians."""
         inputs.prepare_kernels(self.console, self.gaussians.means.device, training=False)
-        shown, losses = write_viewer_page(
-            path, self.model, cameras=self.views, virtual_scale=virtual_scale, exact=self.args.exact
-        )
+        how: dict[str, Any] = {"cameras": self.views, "virtual_scale": virtual_scale, "exact": self.args.exact}
+        shown, losses = write_viewer_page(path, self.model, **how)
         self.console.note(*losses)
         if self.args.exact:
             return

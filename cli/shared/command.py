@@ -9,7 +9,8 @@ from pathlib import Path
 from site import getuserbase
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from clod_adapter.config import DEVICES, FILTERS
+from clod_adapter._support.version import package_version
+from clod_adapter.config import DEVICES, FILTERS, AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.io.file_formats import PLY, file_has_dial, format_of
 from clod_adapter.io.scene.folder import find_cameras
@@ -25,10 +26,9 @@ if TYPE_CHECKING:
 
 def parser_of(command: Any, prog: str) -> Parser:
     """The parser, with the options that all commands have."""
-    about = getattr(command, "DESCRIPTION", command.SUMMARY)
     parser = Parser(
-        prog=prog, usage=f"{prog} {command.USAGE}", description=about, epilog=command.EPILOG, add_help=False,
-        formatter_class=RawDescriptionHelpFormatter, allow_abbrev=False,
+        prog=prog, usage=f"{prog} {command.USAGE}", description=command.DESCRIPTION, epilog=command.EPILOG,
+        formatter_class=RawDescriptionHelpFormatter, add_help=False, allow_abbrev=False,
     )  # fmt: skip
     if hasattr(command, "add_arguments"):
         command.add_arguments(parser)
@@ -56,6 +56,11 @@ class Parser(ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         raise ClodError(f"{message} (see {self.prog} --help)")
+
+    @property
+    def version(self) -> str:
+        """What --version prints."""
+        return f"{self.prog} {package_version()}"
 
     def exit(self, status: int = 0, message: str | None = None) -> NoReturn:
         """After --help and --version."""
@@ -141,13 +146,14 @@ def as_option(name: str) -> str:
     return f"--{name.replace('_', '-')}"
 
 
-def initial_dial(virtual_scale: float, max_sv: float | None, console: Console) -> float:
-    """The initial dial value of a page whose dial ends at ``max_sv``, None without a dial."""
-    if max_sv is None and virtual_scale > 1:
-        console.note(f"no sigma_d, so s = {virtual_scale:g} has no effect")
-    if max_sv is not None and virtual_scale > max_sv:
-        console.note(f"the page's dial ends at s = {max_sv:g}, the largest value trained for, and opens there")
-    return 1.0 if max_sv is None else min(virtual_scale, max_sv)
+def initial_dial(virtual_scale: float, dial: AttenuationConfig | None, console: Console) -> float:
+    """The initial dial value of a page."""
+    if dial is None:
+        console.note(*[f"no sigma_d, so s = {virtual_scale:g} has no effect"] * (virtual_scale > 1))
+        return 1.0
+    if virtual_scale > dial.max_sv:
+        console.note(f"the page's dial ends at s = {dial.max_sv:g}, the largest value trained for, and opens there")
+    return min(virtual_scale, dial.max_sv)
 
 
 def given_budget(args: Namespace) -> tuple[str, str, list[float]] | None:

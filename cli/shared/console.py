@@ -7,19 +7,28 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
-from typing import Any
-
-from tqdm import tqdm
+from functools import cache
+from typing import TYPE_CHECKING, Any
 
 from clod_adapter.io.settings import WARNING
 from clod_adapter.progress import Listener, Phase, Progress
 
 from .process import GracefulStop
 
-tqdm.monitor_interval = 0  # bars are updated at every step anyway, and its thread may fail to start
+if TYPE_CHECKING:
+    from tqdm import tqdm
+
 LINE_EVERY = 10.0  # seconds between progress lines if stderr is not a terminal
 TEXT = 36  # most characters of the text beside a bar, so that 80 columns have room for label, time and bar
 BAR_FORMAT = "{desc} {percentage:3.0f}%|{bar}| {remaining} left{postfix}"
+
+
+@cache
+def bars() -> type[tqdm[Any]]:
+    from tqdm import tqdm  # here: --help has no bar
+
+    tqdm.monitor_interval = 0  # bars are updated at every step anyway, and its thread may fail to start
+    return tqdm
 
 
 @dataclass(frozen=True)
@@ -31,7 +40,7 @@ class Console:
 
     def say(self, text: str) -> None:
         if not self.quiet:
-            tqdm.write(text, file=sys.stderr)  # print would overwrite a bar on this line
+            bars().write(text, file=sys.stderr)  # print would overwrite a bar on this line
             sys.stderr.flush()
 
     def note(self, *texts: str, of: str = "") -> None:
@@ -49,7 +58,7 @@ class Console:
         if self.quiet or not sys.stderr.isatty():
             yield lambda more: None
             return
-        with tqdm(bar_format="{desc}", desc=text, file=sys.stderr, leave=False, dynamic_ncols=True) as shown:
+        with bars()(bar_format="{desc}", desc=text, file=sys.stderr, leave=False, dynamic_ncols=True) as shown:
             yield shown.set_description_str
 
     def meter(self, label: str) -> closing[Meter]:
@@ -71,7 +80,7 @@ class Meter:
         self.label, self.initial = label, initial
         self.began = self.printed = time.perf_counter()
         if not self.console.quiet and sys.stderr.isatty():
-            self.bar = tqdm(
+            self.bar = bars()(
                 total=1.0, initial=initial, desc=label, bar_format=BAR_FORMAT, file=sys.stderr, leave=False, delay=0.5,
                 miniters=0, dynamic_ncols=True,
             )  # fmt: skip

@@ -51,8 +51,7 @@ def read_scene(folder: str, console: Console, origin: Origin, cache: ImageCache 
     camera = scene.train[0].camera
     size = f"{camera.width}x{camera.height}"
     console.say(f"{folder}: {len(scene.train)} photographs to train on, {len(scene.test)} held out, {size}")
-    for note in scene.notes:
-        console.note(note)
+    console.note(*scene.notes)
     return scene
 
 
@@ -69,8 +68,7 @@ def scene_to_train(
         with console.meter(Phase.PSEUDO_VIEWS) as meter:
             scene = render_pseudo_views(gaussians, cameras, progress=meter)
         config = config.lighter(LIGHTEST).for_views(len(scene.train), STEPS_PER_PLACED)
-    for note in scene.notes:
-        console.note(note)
+    console.note(*scene.notes)
     return scene, config
 
 
@@ -143,10 +141,8 @@ def with_filter(
             name, psnr = compare_filters(gaussians, views, expected := stored.name or "off")
         if name != expected:
             found = ", ".join(f"{psnr[each]:.2f} dB {WORDS[each]}" for each in (name, expected))
-            console.note(
-                f"{checkpoint.path}: by the photographs it was trained {WORDS[name]}: {found}; rendered so "
-                f"(--antialiasing {expected} overrides it)"
-            )
+            trained = f"{checkpoint.path}: by the photographs it was trained {WORDS[name]}: {found}"
+            console.note(f"{trained}; rendered so (--antialiasing {expected} overrides it)")
     elif name != "auto" and checkpoint.filter_known and FILTERS[name] != stored:
         had = f"the file has {stored.description}"
         console.note(f"{checkpoint.path}: rendered {WORDS[name]} (--antialiasing); {had}")
@@ -244,9 +240,7 @@ def align(
             raise ClodError(f"{message}; use --misaligned-ok to train anyway")
         console.note(f"warning: {message}")
     elif required and not found.views:
-        console.note(
-            f"warning: the photographs in {images} have a single colour each, on which the checkpoint is trained"
-        )
+        console.note(f"warning: the photographs in {images}, to train on, have a single colour each")
     elif required and found.margin < 0:
         console.note(
             f"warning: {ply} matches the photographs in {images}, but some differ more from it than from their own "
@@ -259,8 +253,7 @@ def read_cameras(model: Checkpoint, images: str, console: Console, *, training: 
     """``load_cameras``, moved into the model's frame, which few small photographs tell."""
     every, notes = load_cameras(images, model.origin)
     cameras = load_cameras(images, model.origin, training=True)[0] if training else every
-    for note in notes:
-        console.note(note)
+    console.note(*notes)
     try:
         scene = load_scene(images, origin=model.origin, max_width=SMALL, most=MOST_VIEWS)
     except ClodError:  # cameras alone will do
@@ -296,10 +289,8 @@ def mismatch(found: Alignment, guess: Guess | None) -> str:
     share = f"{found.in_view:.2g}" if 0 < found.in_view < 0.01 else f"{found.in_view:.0%}"
     facts = f"{share} of its Gaussians are in view"
     if found.views:
-        facts = (
-            f"renders of {found.views} views have a PSNR of {found.psnr:.1f} dB against the photographs, the mean "
-            f"colours of these {found.mean_colour_psnr:.1f} dB; {facts}"
-        )
+        mean = f"their mean colours {found.mean_colour_psnr:.1f} dB"
+        facts = f"renders have a PSNR of {found.psnr:.1f} dB against {found.views} photographs, {mean}; {facts}"
     if found.on_white:
         return (
             f"{facts}; over white the renders have {found.white_psnr:.1f} dB, but clod-adapt renders over black: give "

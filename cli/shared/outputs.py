@@ -157,9 +157,7 @@ def check_outputs(outputs: Outputs) -> None:
             raise ClodError(f"{taken[key]}: is {what}{other}, which is never overwritten; choose another output")
     for path in outputs.derived:
         if path.exists() and not _is_ours(path):
-            raise ClodError(
-                f"{path}: exists and is not known to be written by clod-adapt; move it, or choose another output"
-            )
+            raise ClodError(f"{path}: exists, and clod-adapt did not write it; move it, or choose another output")
 
 
 def _inputs(outputs: Outputs) -> Iterator[tuple[Path, str]]:

@@ -2,7 +2,6 @@
 
 import os
 import shutil
-import uuid
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -113,7 +112,7 @@ def _mark(final: Path) -> str:
 def _temporary(final: Path) -> Path:
     # A temporary of a temporary has the mark of the final file. Some writers choose their format by the suffix.
     mark = final.name[:14] if final.name.startswith(".tmp-") else _mark(final)
-    return final.parent / f"{mark}{uuid.uuid4().hex[:16]}{final.suffix}"
+    return final.parent / f"{mark}{os.urandom(8).hex()}{final.suffix}"
 
 
 def _remove(path: Path) -> None:

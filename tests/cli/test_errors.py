@@ -19,8 +19,7 @@ import pytest
 from PIL import Image
 
 import clod_adapter
-from clod_adapter.cli import adapt
-from clod_adapter.cli.main import COMMANDS, build_parser
+from clod_adapter.cli.main import COMMANDS, build_parser, command_of
 from clod_adapter.cli.shared.outputs import Outputs, claimed
 from clod_adapter.io.file_formats import FORMATS, WRITABLE, write
 
@@ -88,7 +87,7 @@ RENDER = "render dial.ply --images scene -o out"
 EXPORT = "export dial.ply --images scene -o"
 ROBUSTNESS = f"robustness base.ply {TINY} -o out"
 INPUT, BESIDE = "is an input file", "is the adapter, state or report of an input"
-FOREIGN = "exists and is not known to be written by clod-adapt; move it, or choose another output"
+FOREIGN = "exists, and clod-adapt did not write it; move it, or choose another output"
 
 ERRORS = [
     # Arguments, and inputs that are none.
@@ -108,7 +107,7 @@ ERRORS = [
     ("base.ply --images scene --memory 8", "--memory is '8'; give a number and its unit, as in 8GB"),
     ("base.ply --images scene --memory 100MB", "--memory is 100 MB, and 300 Gaussians take at least"),
     ("eval base.ply --images scene --against base.ply base.ply", "base.ply: is given twice"),
-    ("eval base.ply --images scene --base dial.ply", "has a dial .*; give --base the checkpoint.* --against$"),
+    ("eval base.ply --images scene --base dial.ply", "has a dial; give --base the checkpoint.* --against$"),
     ("eval base.ply --images scene --sv=-0.5 --json", "--sv has -0.5, it must be at least 0"),
     ("eval base.ply --images scene --sv 2 --keep 10", "--keep: not allowed with argument --sv"),
     ("eval bare.ply --images scene --psnr-drop 1", "bare.ply: --psnr-drop: there is no calibration .*; adapt it"),
@@ -185,7 +184,7 @@ def refused(clod: Any, folder: Path, said: str, line: str) -> None:
 def outputs_of(line: str) -> Outputs:
     words = line.split()
     name = words[0] if words[0] in COMMANDS else ""
-    return COMMANDS.get(name, adapt).outputs(build_parser(name).parse_args(words[1:] if name else words))
+    return command_of(name).outputs(build_parser(name).parse_args(words[1:] if name else words))
 
 
 @pytest.mark.parametrize(

@@ -39,16 +39,12 @@ def add_arguments(parser: ArgumentParser) -> None:
     default = "dial values from 1 (full quality) (default: 1 2 3 5 below the largest trained, and that)"
     common.add_dial_options(dial, default, "(mean over the held-out views)", several=True)
     measuring = parser.add_argument_group("measuring")
-    measuring.add_argument(
-        "--base", metavar="BASE.ply", help="also measure the checkpoint, pruned to the count of each row"
-    )
-    measuring.add_argument(
-        "--against", metavar="FILE.ply", nargs="+", default=[],
-        help="also measure other files, each beside MODEL.ply at the same number of Gaussians",
-    )  # fmt: skip
-    measuring.add_argument(
-        "--popping", action="store_true", help="also measure how evenly the image changes with the dial and the camera"
-    )
+    text = "also measure the checkpoint, pruned to the count of each row"
+    measuring.add_argument("--base", metavar="BASE.ply", help=text)
+    text = "also measure other files, each beside MODEL.ply at the same number of Gaussians"
+    measuring.add_argument("--against", metavar="FILE.ply", nargs="+", default=[], help=text)
+    text = "also measure how evenly the image changes with the dial and the camera"
+    measuring.add_argument("--popping", action="store_true", help=text)
     common.add_device(measuring, "render")
     output = parser.add_argument_group("output")
     output.add_argument("--report", metavar="OUT.html", help="also write a self-contained page, and its charts")
@@ -64,9 +60,7 @@ def check(args: Namespace) -> None:
     for path in paths(args):
         check_readable(Path(path))
     if args.base and file_has_dial(Path(args.base)):
-        raise ClodError(
-            f"{args.base}: has a dial (sigma_d); give --base the checkpoint that was adapted, or use --against"
-        )
+        raise ClodError(f"{args.base}: has a dial; give --base the checkpoint that was adapted, or use --against")
     common.check_scene(args.images)
 
 
@@ -106,7 +100,7 @@ def execute(args: Namespace) -> dict[str, Any]:
             if args.popping:
                 comparisons.pop(max(row.virtual_scale for row in rows))
     print(comparisons.text(), end="")
-    report: dict[str, Any] = {
+    report: dict[str, Any] = {  # the page has the first two as well
         "command": "eval", "version": package_version(), "model": args.model, "scene": args.images,
         "base_count": len(model), "sh_degree": model.sh_degree, "views": len(scene.test),
         "rows": [row.as_dict() for row in rows], "base": args.base, **comparisons.report,
@@ -179,9 +173,7 @@ class Comparisons:
             return
         test = [view.camera for view in self.scene.test]
         some = [test[(2 * k + 1) * len(test) // (2 * POPPING_VIEWS)] for k in range(min(POPPING_VIEWS, len(test)))]
-        jobs: list[tuple[str, Any]] = [
-            (f"dial, {camera.name}", partial(dial_popping, self.model, camera, max_sv)) for camera in some
-        ]
+        jobs: list[Any] = [(f"dial, {each.name}", partial(dial_popping, self.model, each, max_sv)) for each in some]
         ordered = sorted([*test, *(view.camera for view in self.scene.train)], key=lambda camera: camera.name)
         walk = ordered[max((len(ordered) - PATH_CAMERAS) // 2, 0) :][:PATH_CAMERAS]  # the middle of the capture
         if len(walk) > 1:
@@ -212,7 +204,6 @@ class Comparisons:
         return "".join(f"\n{part}\n" for part in parts)
 
 
-SUMMARY = "Measure quality, count and time at some dial values."
 DESCRIPTION = "Measure quality, Gaussians kept and frame time at several dial values."
 USAGE = "MODEL.ply --images DIR [--sv S [S ...]] [options]"
 EPILOG = f"""\
@@ -229,17 +220,13 @@ one Gaussian is removed). --against measures a file with a dial at every dial
 value, and MODEL.ply at as many Gaussians, or at s = 1.
 
 --popping turns the dial from 1 to the largest S in 200 equal ratios at two
-held-out cameras, and moves through five cameras in 200 steps at that S, where
-only the dial's changes count. Printed are the RMS change per step (of 255), the
-ratio of largest to mean (1 even, 200 a single jump), and the share of the
-largest left when the step is halved (0.5 a fade, 1.0 a jump).
+held-out cameras, and moves through five cameras in 200 steps at that S.
 
 Ctrl-C skips unfinished dial values (exit code 0, "interrupted": true; 130 if
 none is finished).
 
 examples:
   clod-adapt eval garden_clod.ply --images garden
-  clod-adapt eval garden_clod.ply --images garden --sv 1 4 --json > eval.json
   clod-adapt eval garden_clod.ply --images garden --base garden.ply --popping
   clod-adapt eval garden_clod.ply --images garden --against merged.ply cut.ply
   clod-adapt eval garden_clod.ply --images garden --keep 500000 200000
