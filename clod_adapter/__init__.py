@@ -12,7 +12,7 @@ import os
 import sys
 from typing import TYPE_CHECKING
 
-from clod_adapter._support.lazy import on_first_use
+from clod_adapter._support.lazy import Lazy
 
 if "torch" not in sys.modules:
     # GNU OpenMP's idle threads spin by default and take the cores from the splatting threads: measured at
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from clod_adapter.training.pseudo_views import render_pseudo_views
 
 # Imported on first use: torch takes a second or two, which the command's --help and most of its errors do without.
-on_first_use(__name__, {
+_homes = {name: f"{__name__}.{home}" for home, names in {
     "adapter": ("Adapter", "detach", "extract", "with_dial"),
     "evaluation.budget": ("DialValue", "dial_for"),
     "calibration": ("Calibration",),
@@ -67,7 +67,8 @@ on_first_use(__name__, {
     "render": ("Rendering", "render"),
     "training.dial": ("Dial", "TrainableSubset", "attach"),
     "training.loop": ("Adapted", "adapt"),
-})  # fmt: skip
+}.items() for name in names}  # fmt: skip
+sys.modules[__name__].__class__ = Lazy
 
 __all__ = [
     "AdaptConfig", "Adapted", "Adapter", "AttenuationConfig", "Calibration", "Camera", "Checkpoint", "ClodError",

@@ -1,20 +1,13 @@
 """A package whose names are imported on first use."""
 
-import sys
-from collections.abc import Mapping, Sequence
 from importlib import import_module
 from types import ModuleType
 from typing import Any
 
 
-def on_first_use(package: str, names: Mapping[str, Sequence[str]]) -> None:
-    """Makes the names of each submodule attributes of the package that is being imported."""
-    module = sys.modules[package]
-    module.__dict__["_homes"] = {name: f"{package}.{home}" for home, group in names.items() for name in group}
-    module.__class__ = _Lazy
+class Lazy(ModuleType):
+    """The class of such a package, whose ``_homes`` are the modules of its names."""
 
-
-class _Lazy(ModuleType):
     _homes: dict[str, str]
 
     def __getattr__(self, name: str) -> Any:
