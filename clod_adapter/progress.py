@@ -98,22 +98,16 @@ def shown(progress: Listener | Literal[False] | None) -> Iterator[Listener | Non
         return
     from tqdm import tqdm
 
-    bars: list[Any] = []
     phase: Phase | None = None
+    with tqdm(file=sys.stderr, leave=False, dynamic_ncols=True, delay=1e-9) as bar:  # not shown without a phase
 
-    def show(now: Progress) -> None:
-        nonlocal phase
-        if phase != now.phase:
-            phase = now.phase
-            for earlier in bars:
-                earlier.close()
-            bars.append(tqdm(total=now.total, desc=now.phase, file=sys.stderr, leave=False, dynamic_ncols=True))
-        if not math.isnan(now.loss):
-            bars[-1].set_postfix_str(f"loss {now.loss:.4f}", refresh=False)
-        bars[-1].update(round(now.share * now.total) - bars[-1].n)
+        def show(now: Progress) -> None:
+            nonlocal phase
+            bar.set_postfix_str("" if math.isnan(now.loss) else f"loss {now.loss:.4f}", refresh=False)
+            if phase != now.phase:
+                phase = now.phase
+                bar.set_description_str(now.phase, refresh=False)
+                bar.reset(now.total)
+            bar.update(round(now.share * now.total) - bar.n)
 
-    try:
         yield show
-    finally:
-        for bar in bars:
-            bar.close()
