@@ -1,7 +1,4 @@
-"""The calibration table: count, quality and frame time of an adapted file at each dial value. Stored in the file.
-
-It also has the positions of some training cameras, so that a dial value can be baked without the photographs.
-"""
+"""The calibration table of a file, stored in it, with cameras by which a dial value is baked without photographs."""
 
 from __future__ import annotations
 
@@ -20,8 +17,7 @@ MOST = 1000  # rows and viewpoints, and characters of the machine's name, for wh
 
 @dataclass(frozen=True)
 class CalibrationRow:
-    """Means over the held-out views at one dial value: Gaussians that are kept, PSNR in dB and SSIM against the images
-    that ``Calibration.against`` names, and the median milliseconds of a frame."""
+    """Means over the held-out views: Gaussians kept, PSNR in dB and SSIM, and the median milliseconds of a frame."""
 
     virtual_scale: float
     kept: float
@@ -73,7 +69,7 @@ class Viewpoint:
 
 @dataclass(frozen=True)
 class Calibration:
-    """Rows of ascending dial values, the first at s = 1, and the conditions of the measurement.
+    """Count, quality and frame time at ascending dial values, the first s = 1, and how they were measured.
 
     Attributes:
         rows: at least one.
@@ -98,6 +94,7 @@ class Calibration:
     viewpoints: tuple[Viewpoint, ...] = ()
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "viewpoints", tuple(self.viewpoints))
         dials = [row.virtual_scale for row in self.rows]
         if dials[:1] != [1] or any(b <= a for a, b in pairwise(dials)):
             raise ClodError(f"calibration has dial values {dials}, they must ascend from 1")
@@ -113,22 +110,15 @@ class Calibration:
             raise ClodError(f"calibration is against {self.against!r}, it must be one of {', '.join(AGAINST)}")
 
     @classmethod
-    def of(
-        cls,
-        rows: Iterable[Any],
-        *,
-        total: int,
-        views: int,
-        size: tuple[int, int],
-        machine: str,
-        against: str = "photographs",
-        viewpoints: Sequence[Viewpoint] = (),
-    ) -> Calibration:
-        """The table of an evaluation's rows (``evaluate.Row``) for images of ``size`` (width, height)."""
+    def of(cls, rows: Iterable[Any], *, size: tuple[int, int], machine: str, **others: Any) -> Calibration:
+        """The table of an evaluation's rows (``evaluate.Row``) for images of ``size`` (width, height).
+
+        Rows may be in any order, and the machine's name any text; the other fields are passed on.
+        """
         found = [CalibrationRow(*map(float, (r.virtual_scale, r.kept, r.psnr, r.ssim, r.frame_ms))) for r in rows]
         ascending = tuple({row.virtual_scale: row for row in sorted(found, key=lambda r: r.virtual_scale)}.values())
         name = _plain(machine.encode("ascii", "replace").decode()) or "unknown"
-        return cls(ascending, total, views, *size, name, against, tuple(viewpoints))
+        return cls(ascending, width=size[0], height=size[1], machine=name, **others)
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Calibration:
