@@ -123,10 +123,9 @@ class Cell:
 
         base = self.checkpoint
         if self.config is None:
-            result = baseline(base.gaussians, scene.test, self.points, progress=progress)
+            result = baseline(base.gaussians, scene.test, self.points, progress)
         else:
-            about: dict[str, Any] = {"fingerprint": base.fingerprint, "origin": base.origin, "progress": progress}
-            result = adapt_at_range(base.gaussians, scene, self.config, self.points, **about)
+            result = adapt_at_range(base, scene, self.config, self.points, progress)
         self.file.unlink(missing_ok=True)
         if result.adapter:
             save_adapter(self.adapter_file, result.adapter)

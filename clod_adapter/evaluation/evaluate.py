@@ -16,7 +16,7 @@ from clod_adapter.evaluation.frame_times import timed_frame
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.metrics import psnr_ssim
 from clod_adapter.progress import Listener, Phase, Progress
-from clod_adapter.render import Rendering, render
+from clod_adapter.render import render
 
 SCORED = 4  # views whose SSIM is computed at a time: each takes 83 bytes a pixel
 
@@ -78,26 +78,23 @@ def evaluate(
     rows = list[Row]()
     for i, virtual_scale in enumerate(virtual_scales):
         found = []
-        for j, (view, rendering, seconds, scores) in enumerate(_compared(gaussians, views, dials[i])):
-            inside = in_frustum(gaussians.means, view.camera)
-            found.append((seconds, *scores, int(rendering.kept.sum()), int((rendering.kept & inside).sum())))
-            done = Progress(Phase.EVALUATION, i * len(views) + j + 1, len(virtual_scales) * len(views))
+        for measured in _measured(gaussians, views, dials[i]):
+            found.append(measured)
+            done = Progress(Phase.EVALUATION, i * len(views) + len(found), len(virtual_scales) * len(views))
             stopped = progress is not None and progress(done) is False
-            if stopped and j + 1 < len(views):
+            if stopped and len(found) < len(views):
                 return rows
         times, *columns = zip(*found, strict=True)
         psnr, ssim, kept, in_view = map(statistics.fmean, columns)
         share, frame_ms = kept / max(len(gaussians), 1), 1e3 * statistics.median(times)
-        rows.append(Row(float(virtual_scale), psnr, ssim, kept, share, in_view, frame_ms))
+        rows.append(Row(virtual_scale, psnr, ssim, kept, share, in_view, frame_ms))
         if stopped:
             break
     return rows
 
 
-def _compared(
-    gaussians: Gaussians, views: Sequence[View], virtual_scale: float
-) -> Iterator[tuple[View, Rendering, float, tuple[float, float]]]:
-    """Each view with its rendering, the seconds that took, and its PSNR and SSIM; these of several views at a time."""
+def _measured(gaussians: Gaussians, views: Sequence[View], virtual_scale: float) -> Iterator[tuple[float, ...]]:
+    """For each view seconds, PSNR, SSIM, and Gaussians kept and in the image; PSNR and SSIM of several at a time."""
     workers = min(torch.get_num_threads(), SCORED)
     with ThreadPoolExecutor(workers) as pool:
         for first in range(0, len(views), workers):
@@ -105,4 +102,5 @@ def _compared(
             found = [timed_frame(gaussians, view.camera, virtual_scale) for view in some]
             scores = pool.map(psnr_ssim, [rendering.image for rendering, _ in found], [view.image for view in some])
             for view, (rendering, seconds), score in zip(some, found, scores, strict=True):
-                yield view, rendering, seconds, score
+                inside = rendering.kept & in_frustum(gaussians.means, view.camera)
+                yield seconds, *score, int(rendering.kept.sum()), int(inside.sum())

@@ -16,7 +16,7 @@ from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.evaluate import evaluate
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.origin import NOWHERE, Origin
+from clod_adapter.io.checkpoint import Checkpoint
 from clod_adapter.progress import Listener, Phase, Stopped, tell, within
 from clod_adapter.training.loop import adapt
 from clod_adapter.training.pseudo_views import PseudoView
@@ -38,45 +38,31 @@ class CellResult:
 
 
 def adapt_at_range(
-    base: Gaussians,
-    scene: Scene,
-    config: AdaptConfig,
-    virtual_scales: Sequence[float],
-    *,
-    fingerprint: str,
-    origin: Origin = NOWHERE,
-    progress: Listener | None = None,
+    file: Checkpoint, scene: Scene, config: AdaptConfig, virtual_scales: Sequence[float], progress: Listener
 ) -> CellResult:
-    """Adapts ``base`` at the range ``[1, config.max_sv]`` and measures dial values, also beyond it, on held-out views.
+    """Adapts ``file`` at the range ``[1, config.max_sv]`` and measures dial values, also beyond it, on held-out views.
 
-    ``fingerprint`` and ``origin`` are for the adapter. An incomplete adaptation is not a cell: it raises Stopped.
+    An incomplete adaptation is not a cell: it raises Stopped.
     """
-    base, config = detach(base), config.for_views(len(scene.train))
+    base, config = detach(file.gaussians), config.for_views(len(scene.train))
     adapted = adapt(base, scene, config, progress)
     if adapted.failed:
         raise ClodError(f"max_sv {config.max_sv:g}: {adapted.failed}; leave this range or checkpoint out")
     if adapted.interrupted:
         raise Stopped(f"stopped at step {adapted.steps}")
-    adapter = extract(base, adapted.gaussians, fingerprint=fingerprint, config=asdict(config), origin=origin)
+    adapter = extract(base, adapted.gaussians, fingerprint=file.fingerprint, config=asdict(config), origin=file.origin)
     result = adapter.apply(base)
     rows = _rows(result, scene.test, virtual_scales, progress)
     return CellResult(rows, distribution(result), adapter, adapted.start_seconds + adapted.seconds)
 
 
-def baseline(
-    base: Gaussians,
-    views: Sequence[View],
-    shares: Sequence[float] = BASELINE_SHARES,
-    *,
-    progress: Listener | None = None,
-) -> CellResult:
+def baseline(base: Gaussians, views: Sequence[View], shares: Sequence[float], progress: Listener) -> CellResult:
     """The unadapted base with only its most opaque Gaussians: one row per share."""
     base, rows = detach(base), []
     order = base.opacity_logits.argsort(descending=True, stable=True)
     for k, share in enumerate(shares):
         pruned = base.select(order[: max(1, round(share * len(base)))].sort().values)  # in their own order
-        part = within(progress, k * len(views), len(shares) * len(views))
-        (row,) = _rows(pruned, views, [1.0], part)
+        (row,) = _rows(pruned, views, [1.0], within(progress, k * len(views), len(shares) * len(views)))
         rows.append(row | {"kept_share": len(pruned) / len(base)})
     return CellResult(rows, distribution(base))
 
