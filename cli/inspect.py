@@ -58,20 +58,19 @@ def lines_of(found: Inspection) -> list[str]:
 
 
 def splat_lines(splat: Splat) -> list[str]:
-    v = splat.values
-    count = f"{v.count:,}" if v.count == v.total else f"{v.count:,} usable of {v.total:,}"
-    used = f", of which only {v.used_sh_degree} is used" if v.used_sh_degree < splat.sh_degree else ""
+    count = f"{splat.count:,}" if splat.count == splat.total else f"{splat.count:,} usable of {splat.total:,}"
+    used = f", of which only {splat.used_sh_degree} is used" if splat.used_sh_degree < splat.sh_degree else ""
     lines = [_line("Gaussians", count), _line("harmonics", f"degree {splat.sh_degree}{used}")]
     if splat.encoding:
         names = ", ".join(splat.extra[:6]) + (", ..." if len(splat.extra) > 6 else "")
         more = f", not read: {names}" if splat.extra else ""
         lines.append(_line("layout", f"{splat.encoding}, {len(splat.columns)} properties{more}"))
     lines += _block("says", [comment[:LONGEST] for comment in splat.comments])
-    rows = [*zip("xyz", v.position, strict=True), ("scale", v.scale), ("opacity", v.opacity)]
-    rows += [(name, spread) for name, spread in (("sigma_d", v.sigma), ("growth_d", v.growth)) if spread is not None]
+    rows = [*zip("xyz", splat.position, strict=True), ("scale", splat.scale), ("opacity", splat.opacity)]
+    rows += [(name, each) for name, each in (("sigma_d", splat.sigma), ("growth_d", splat.growth)) if each is not None]
     lines += ["", *spread_table(rows), ""]
-    faint = f"{v.fainter_than_tau:.1%} fainter than tau = {splat.tau:.3g}, {v.fainter_than_visible:.1%} than 1/255"
-    lines.append(_line("shares", f"{faint}; {v.needles:.1%} needles"))
+    faint = f"{splat.fainter_than_tau:.1%} fainter than tau = {splat.tau:.3g}"
+    lines.append(_line("shares", f"{faint}, {splat.fainter_than_visible:.1%} than 1/255; {splat.needles:.1%} needles"))
     if splat.dial is None:
         return [*lines, _line("dial", "none: no sigma_d")]
     a = splat.dial.attenuation

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import astuple, dataclass
+from typing import Any
 
 import numpy as np
 
@@ -55,8 +56,8 @@ class Values:
     growth: Spread | None
 
 
-def values_of(found: Prepared, tau: float) -> Values:
-    """The statistics of a file's rows, of which one is usable at least."""
+def values_of(found: Prepared, tau: float) -> dict[str, Any]:
+    """The fields of ``Values`` of a file's rows, of which one is usable at least."""
     keep = found.keep
     columns = {name: np.ascontiguousarray(array[keep].T) for name, array in found.arrays.items() if name != "shN"}
     means, logits = columns["means"], columns["opacity_logits"].astype(np.float64)
@@ -68,13 +69,12 @@ def values_of(found: Prepared, tau: float) -> Values:
     middle = np.array([[spread.median] for spread in position])
     distance = np.linalg.norm(means.astype(np.float64) - middle, axis=0)
     diagonal = float(np.linalg.norm([spread.high - spread.low for spread in position]))
-    x, y, z = (
-        Spread(*(value + by for value in astuple(each))) for each, by in zip(position, found.origin, strict=True)
-    )
+    moved = zip(position, found.origin, strict=True)
     same = means[:, np.lexsort(means)]
     used = [k + 1 for k in range(found.arrays["shN"].shape[1]) if found.arrays["shN"][:, k][keep].any()]
-    return Values(
-        total=len(keep), count=int(keep.sum()), dropped=found.dropped, position=(x, y, z),
+    return dict(
+        total=len(keep), count=int(keep.sum()), dropped=found.dropped,
+        position=tuple(Spread(*(value + by for value in astuple(each))) for each, by in moved),
         used_sh_degree=next(degree for degree, count in SH_COUNTS.items() if count > max(used, default=0)),
         scale=Spread.of(scales.ravel()), opacity=Spread.of(opacities),
         needles=float((scales[2] > NEEDLE * scales[1]).mean()), infinite_opacity=int(np.isposinf(logits).sum()),
