@@ -10,9 +10,9 @@ image = clod.render(result.gaussians, scene.test[0].camera, virtual_scale=3).ima
 
 import os
 import sys
-from typing import TYPE_CHECKING
-
-from clod_adapter._support.lazy import Lazy
+from importlib import import_module
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
 
 if "torch" not in sys.modules:
     # GNU OpenMP's idle threads spin by default and take the cores from the splatting threads: measured at
@@ -68,7 +68,25 @@ _homes = {name: f"{__name__}.{home}" for home, names in {
     "training.dial": ("Dial", "TrainableSubset", "attach"),
     "training.loop": ("Adapted", "adapt"),
 }.items() for name in names}  # fmt: skip
-sys.modules[__name__].__class__ = Lazy
+
+
+class _Lazy(ModuleType):
+    def __getattr__(self, name: str) -> Any:
+        if name not in _homes:
+            raise AttributeError(f"module {self.__name__!r} has no attribute {name!r}")
+        value = self.__dict__[name] = getattr(import_module(_homes[name]), name)
+        return value
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        # Importing a submodule binds its name in the package, where the function of that name (render) stands.
+        if not (name in _homes and isinstance(value, ModuleType)):
+            super().__setattr__(name, value)
+
+    def __dir__(self) -> list[str]:
+        return sorted({*_homes, *(name for name in self.__dict__ if name.startswith("__"))})
+
+
+sys.modules[__name__].__class__ = _Lazy
 
 __all__ = [
     "AdaptConfig", "Adapted", "Adapter", "AttenuationConfig", "Calibration", "Camera", "Checkpoint", "ClodError",
