@@ -6,10 +6,9 @@ import torch
 from torch import Tensor
 
 from clod_adapter.adapter import detach
-from clod_adapter.calibration import Viewpoint
 from clod_adapter.cameras import Camera
 from clod_adapter.equation.attenuation import Attenuated, dial
-from clod_adapter.equation.distances import typical_distance
+from clod_adapter.equation.distances import Place, typical_distance
 from clod_adapter.equation.extinction import extinction_scale
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import OPAQUE, Gaussians
@@ -22,11 +21,7 @@ FADED, GROWN = 0.75, 0.9
 
 @torch.no_grad()
 def bake(
-    gaussians: Gaussians,
-    virtual_scale: float,
-    camera: Camera | None = None,
-    *,
-    cameras: Sequence[Camera | Viewpoint] = (),
+    gaussians: Gaussians, virtual_scale: float, camera: Camera | None = None, *, cameras: Sequence[Place] = ()
 ) -> Gaussians:
     """The Gaussians that one dial value keeps, with the opacities and scales of that dial value and without a dial.
 
@@ -63,7 +58,7 @@ def bake(
 
 
 @torch.no_grad()
-def order_by_extinction(gaussians: Gaussians, cameras: Sequence[Camera | Viewpoint]) -> Tensor:
+def order_by_extinction(gaussians: Gaussians, cameras: Sequence[Place]) -> Tensor:
     """``[N]`` int64, the rows by descending extinction scale s*, for renderers that draw a prefix; ties stay in order.
 
     With ``gaussians.select(rows)`` the first n are the n that ``bake`` keeps for the cameras, up to the rounding of s*

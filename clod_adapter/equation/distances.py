@@ -4,7 +4,7 @@ For a camera with centre c, a Gaussian with centre mu and the normaliser's D (al
 
     d = |mu - c| / D
 
-A plain file and an order of rows have one distance for each Gaussian: the geometric mean over the known cameras v,
+A plain file and an order of rows have one for each Gaussian, the geometric mean over the known cameras v:
 ``d_i = exp(mean over v of log d_iv)``. A mean over the cameras that see it was no better.
 """
 
@@ -19,6 +19,7 @@ from clod_adapter.cameras import Camera
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
 
+Place = Camera | Viewpoint
 OUTLIER = 16.0  # times the median distance from the scene's centre: one camera that far away must not decide
 NEAREST = 1e-6  # lower bound of d in the geometric mean: a camera in a Gaussian's centre must not decide alone
 
@@ -102,7 +103,7 @@ def camera_of(viewpoint: Viewpoint, width: int, height: int, name: str = "") -> 
 
 
 @torch.no_grad()
-def typical_distance(means: Tensor, places: Sequence[Camera | Viewpoint], config: AttenuationConfig) -> Tensor:
+def typical_distance(means: Tensor, places: Sequence[Place], config: AttenuationConfig) -> Tensor:
     """``[N]`` d_i, without unit, >= 0: the distances from one place, or the geometric mean over several.
 
     Places more than OUTLIER times as far from the scene's centre as the median place, and as half of the Gaussians
@@ -118,7 +119,7 @@ def typical_distance(means: Tensor, places: Sequence[Camera | Viewpoint], config
     return (logs / len(places)).exp()
 
 
-def _without_outliers(means: Tensor, places: Sequence[Camera | Viewpoint]) -> Sequence[Camera | Viewpoint]:
+def _without_outliers(means: Tensor, places: Sequence[Place]) -> Sequence[Place]:
     if len(places) < 3:
         return places
     centre = means.median(0).values
@@ -127,13 +128,13 @@ def _without_outliers(means: Tensor, places: Sequence[Camera | Viewpoint]) -> Se
     return [place for place, distance in zip(places, away, strict=True) if bool(distance <= limit)]
 
 
-def _position(place: Camera | Viewpoint, means: Tensor) -> Tensor:
+def _position(place: Place, means: Tensor) -> Tensor:
     if isinstance(place, Camera):
         return place.position.to(means)
     return torch.tensor([place.x, place.y, place.z], dtype=means.dtype, device=means.device)
 
 
-def _from(place: Camera | Viewpoint, means: Tensor, config: AttenuationConfig) -> Tensor:
+def _from(place: Place, means: Tensor, config: AttenuationConfig) -> Tensor:
     if isinstance(place, Camera):
         return normalized_distances(means, place, config)
     return (means - _position(place, means)).norm(dim=1) / place.unit

@@ -1,15 +1,13 @@
 """Budgets: the dial value for a number of Gaussians, a PSNR drop, or a frame rate.
 
-- A count needs no measurement. For one camera, Gaussian i is kept iff s is below its extinction scale
-  ``s*_i`` (``extinction.extinction_scale``) and kept sets are nested, so the dial that keeps n lies between the n-th
-  and the (n+1)-th largest ``s*``. For the mean over V cameras the same holds for the pooled ``s*`` of all cameras
-  and for n V. Exact up to ties: Gaussians whose ``s*`` are equal in float32 are culled together.
+- A count needs no measurement. From one camera a Gaussian is kept iff s is below its extinction scale ``s*``
+  (``extinction.extinction_scale``), so the dial that keeps n lies between the n-th and the (n+1)-th largest ``s*``; for
+  the mean over V cameras, of the pooled ``s*`` and n V. Exact but for ``s*`` that are equal in float32.
 - PSNR is read from the calibration table that is stored with the file (``calibration.py``).
-- Frame rates depend on the machine, the image size and the load. With cameras some frames are timed; the table's times
-  are used only where they are passed in, or (``clod-adapt export``) where nothing can be timed.
+- Frame rates depend on the machine, the image size and the load: frames are timed, from cameras. The table's times are
+  used only where they are passed in, or (``clod-adapt export``) where nothing can be timed.
 
-A budget that s = 1 already meets is no error: the dial is 1, and a note says so. s = 1 keeps fewer Gaussians than the
-file has. No budget is met beyond ``max_sv``: the equation is defined there, but nothing was trained.
+A budget that s = 1 meets gives 1 and a note. None is met beyond ``max_sv``, where nothing was trained.
 """
 
 import math
@@ -21,11 +19,11 @@ from statistics import fmean
 import torch
 from torch import Tensor
 
-from clod_adapter.calibration import Calibration, Viewpoint, crossing
+from clod_adapter.calibration import Calibration, crossing
 from clod_adapter.cameras import Camera
 from clod_adapter.config import AttenuationConfig, require
 from clod_adapter.equation.attenuation import dial
-from clod_adapter.equation.distances import typical_distance
+from clod_adapter.equation.distances import Place, typical_distance
 from clod_adapter.equation.extinction import extinction_scale
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.frame_times import time_frames
@@ -54,7 +52,7 @@ def dial_for(
     keep: float | None = None,
     psnr_drop: float | None = None,
     fps: float | None = None,
-    cameras: Sequence[Camera | Viewpoint] = (),
+    cameras: Sequence[Place] = (),
     calibration: Calibration | None = None,
     baked: bool = False,
 ) -> DialValue:
@@ -139,7 +137,7 @@ def _for_psnr_drop(calibration: Calibration | None, drop: float) -> DialValue:
 
 @torch.no_grad()
 def _for_count(
-    gaussians: Gaussians, config: AttenuationConfig, cameras: Sequence[Camera | Viewpoint], baked: bool, keep: float
+    gaussians: Gaussians, config: AttenuationConfig, cameras: Sequence[Place], baked: bool, keep: float
 ) -> DialValue:
     """Of the Gaussians at the distances of each camera, or ``baked``: at one distance over all cameras."""
     views = [cameras] if baked or not cameras else [[camera] for camera in cameras]

@@ -1,19 +1,16 @@
-"""The errors of the levels of a tile set, by which a viewer of 3D Tiles chooses them: lengths.
+"""The errors of the levels of a tile set, lengths by which a viewer of 3D Tiles chooses them.
 
-It shows a tile where its ``geometricError`` g at distance d covers at most a number of pixels, 16 by default:
+It shows a tile whose ``geometricError`` g at distance d, with a focal length of f pixels, covers few enough of them:
 
-    g f / d <= 16
+    g f / d <= 16           3D Tiles 1.1 (OGC 22-025r4), "Geometric error"; CesiumJS's ``maximumScreenSpaceError``
 
-with f the focal length in pixels. Two images of which one is the other shifted by e pixels differ by about e times
-their slope. So level l is as far from the finest as a shift of
+An image that is shifted by e pixels changes by about e times its slope, so level l is off by e_l pixels:
 
     e_l = |I_l - I_0| / |dI_0|
 
-pixels, with ``|.|`` root mean squares over pixels and channels and ``dI_0`` the mean slope of the image along x and y.
-Seen from d this is the length ``e_l d / f``. Its mean over cameras, with d the median distance of the Gaussians in the
-image, is the error of the level. Times 16, the default of viewers allows a shift of one pixel.
-
-Source of the rule: 3D Tiles 1.1 (OGC 22-025r4), "Geometric error"; CesiumJS's ``maximumScreenSpaceError`` is 16.
+``|.|`` are root mean squares over pixels and channels, ``dI_0`` the mean slope of the finest level along x and y. The
+error is 16 times the mean over cameras of ``e_l d / f``, with d the median distance of the Gaussians in the image: it
+allows a shift of one pixel.
 """
 
 from collections.abc import Sequence
@@ -21,9 +18,8 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from clod_adapter.calibration import Viewpoint
 from clod_adapter.cameras import Camera, spread
-from clod_adapter.equation.distances import camera_of, median_distance
+from clod_adapter.equation.distances import Place, camera_of, median_distance
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.formats.tileset import ALLOWED
@@ -34,7 +30,7 @@ from clod_adapter.training.camera_placement import HEIGHT, WIDTH
 VIEWS = 16  # cameras that errors are measured from
 
 
-def looking(places: Sequence[Camera | Viewpoint]) -> list[Camera]:
+def looking(places: Sequence[Place]) -> list[Camera]:
     """The cameras, those of viewpoints in the size of placed ones; without viewpoints that have no direction."""
     known = [place for place in places if isinstance(place, Camera) or place.fov > 0]
     return [place if isinstance(place, Camera) else camera_of(place, WIDTH, HEIGHT) for place in known]
