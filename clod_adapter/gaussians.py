@@ -84,13 +84,15 @@ class Gaussians:
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Gaussians):
             return NotImplemented
-        pairs = [(getattr(self, field.name), getattr(other, field.name)) for field in dataclasses.fields(self)]
-        return all(
-            (a.device, a.dtype) == (b.device, b.dtype) and torch.equal(a, b)
-            if isinstance(a, Tensor) and isinstance(b, Tensor)
-            else a == b
-            for a, b in pairs
-        )
+        mine, theirs = self.tensors(), other.tensors()
+        if (mine.keys(), self.attenuation, self.screen_filter) != (
+            theirs.keys(),
+            other.attenuation,
+            other.screen_filter,
+        ):
+            return False
+        pairs = [(mine[name], theirs[name]) for name in mine]
+        return all((a.device, a.dtype) == (b.device, b.dtype) and torch.equal(a, b) for a, b in pairs)
 
     __hash__ = None  # type: ignore[assignment]
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from clod_adapter.cameras import Camera
-from clod_adapter.equation.attenuation import check_dial, dial, warn_of_no_dial
+from clod_adapter.equation.attenuation import dial, warn_of_no_dial
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.rasterizers import Rasterizer, for_device
@@ -33,10 +33,7 @@ class Rendering:
 
     @cached_property
     def kept(self) -> Tensor:
-        """``[N]`` bool, the Gaussians that the dial keeps; culled ones are neither sorted nor drawn.
-
-        Computed where it is first asked for, from the Gaussians as they are then: a frame does not need it.
-        """
+        """``[N]`` bool, the Gaussians that the dial keeps, computed when it is first asked for: a frame needs none."""
         return dial(self.gaussians, self.camera, self.virtual_scale).keep
 
     @property
@@ -81,7 +78,6 @@ def render(
     Raises:
         ClodError: the dial is negative or not finite.
     """
-    check_dial(virtual_scale)
     if gaussians.sigma_d is None:
         warn_of_no_dial(virtual_scale, "give the result of clod_adapter.adapt")
     chosen = rasterizer or for_device(gaussians.means.device)

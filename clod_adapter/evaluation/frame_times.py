@@ -1,14 +1,15 @@
 """Frame times of dial values, measured so that they can be compared: all of them in turn, several times.
 
-One pass renders every dial value of every model from every view, so a change of the clock rate or of the load meets all
-of them alike. The time of a dial value is the median over the passes, after a warm-up with the slowest one. Where it is
-above that of the dial value before it, which draws more, and the passes do not agree on that, both get their mean.
+One pass renders every dial value of every model from every view: a change of the clock rate or the load meets all. A
+time is the median over the passes, after a warm-up with the slowest dial value. Where it is above that of the dial
+value before it, which draws more, and the passes do not agree on that, both get their mean.
 """
 
 import statistics
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import accumulate, pairwise
 
 import torch
 
@@ -51,25 +52,21 @@ def time_frames(models: Sequence[Model], cameras: Sequence[Camera], progress: Li
     """Times frames from at most three of the cameras, evenly spread; the first dial value of all is the slowest."""
     if not cameras:
         raise ClodError("there are no cameras to time frames from")
-    jobs = list[tuple[Gaussians, float]]()
-    for some, dials in models:
-        lean = some.without_empty_bands()
-        jobs += [(lean, 1.0 if lean.sigma_d is None else s) for s in dials]
+    lean = [(model.without_empty_bands(), dials) for model, dials in models]
+    jobs = [(model, 1.0 if model.sigma_d is None else s) for model, dials in lean for s in dials]
     slowest = _warm_up(*jobs[0], cameras[0])
     views = cameras[:: -(-len(cameras) // VIEWS)]
     if slowest * len(views) * len(jobs) > SECONDS / FEWEST:
         views = views[len(views) // 2 :][:1]
     began, passes = time.perf_counter(), list[list[float]]()
     while len(passes) < PASSES and (len(passes) < FEWEST or time.perf_counter() - began < SECONDS):
-        taken = [[timed_frame(lean, view, s)[1] for lean, s in jobs] for view in views]
+        taken = [[timed_frame(model, view, s)[1] for model, s in jobs] for view in views]
         passes.append([1e3 * statistics.fmean(each) for each in zip(*taken, strict=True)])
         tell(progress, Phase.FRAME_TIMES, len(passes), PASSES)
-    found, first = list[tuple[float, ...]](), 0
-    for _, dials in models:
-        found.append(tuple(settled([each[first : first + len(dials)] for each in passes])))
-        first += len(dials)
+    ends = [0, *accumulate(len(dials) for _, dials in models)]
+    found = tuple(tuple(settled([each[first:end] for each in passes])) for first, end in pairwise(ends))
     quartiles = [statistics.quantiles(column, n=4, method="inclusive") for column in zip(*passes, strict=True)]
-    return FrameTimes(tuple(found), statistics.median((high - low) / middle for low, middle, high in quartiles))
+    return FrameTimes(found, statistics.median((high - low) / middle for low, middle, high in quartiles))
 
 
 def settled(passes: Sequence[Sequence[float]]) -> list[float]:
