@@ -1,7 +1,4 @@
-"""The adapter: what training adds to a checkpoint, small, exact and removable.
-
-A training run writes ``extract(...).apply(base)``: applied to the same base it gives the same Gaussians, bit for bit.
-"""
+"""The adapter: what training adds to a checkpoint, small, exact and removable. Training writes what it gives."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -26,7 +23,7 @@ DIAL = ("sigma_d", "growth_d")
 
 @dataclass(frozen=True)
 class Adapter:
-    """A learned dial and the light update of the other attributes.
+    """A learned dial and the light update of the other attributes; applied to its base it gives the result bit for bit.
 
     Attributes:
         sigma_d: ``[N]`` float32, finite.

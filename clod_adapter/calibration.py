@@ -63,8 +63,7 @@ class Viewpoint:
 
     def moved(self, by: Sequence[float]) -> Viewpoint:
         """A copy with its centre moved by ``by [3]``, world units."""
-        x, y, z = (value + step for value, step in zip((self.x, self.y, self.z), by, strict=True))
-        return replace(self, x=x, y=y, z=z)
+        return replace(self, x=self.x + by[0], y=self.y + by[1], z=self.z + by[2])
 
 
 @dataclass(frozen=True)
@@ -136,11 +135,7 @@ class Calibration:
 
 
 def crossing(dials: Sequence[float], values: Sequence[float], target: float) -> float | None:
-    """The smallest dial value from which ``values`` stay at most ``target``; None if the last one is above it.
-
-    Piecewise linear in log s for ascending ``dials``. A dip below the target does not count if the measured curve rises
-    above it again.
-    """
+    """The smallest dial value from which on ``values``, linear in log s, are at most ``target``; None if none is."""
     above = [k for k, value in enumerate(values) if value > target]
     if not above:
         return dials[0]

@@ -172,8 +172,7 @@ class Scene:
 def camera_extent(cameras: Sequence[Camera]) -> float:
     """1.1 times the largest distance of a camera from their mean, world units (3DGS's unit for position steps).
 
-    At most 3.3 times the median of these distances, unless that is 0, so that one distant camera does not enlarge the
-    extent. 0 for cameras in one place, such as one that turns on a tripod; distances within float32's rounding are 0.
+    At most 3.3 times their median, unless that is 0: one distant camera does not count. 0 for cameras in one place.
     """
     centres = torch.stack([camera.position for camera in cameras])
     distances = (centres - centres.mean(0)).norm(dim=1)
@@ -184,14 +183,11 @@ def camera_extent(cameras: Sequence[Camera]) -> float:
 
 def near_plane(extent: float) -> float:
     """Distance of the near plane, world units, > 0: NEAR, scaled by the extent of the cameras if that is below 1."""
-    return NEAR * min(extent, 1.0)
+    return NEAR * min(extent, 1.0)  # a scene in kilometres would lie in front of NEAR
 
 
 def with_near_planes(cameras: Sequence[Camera]) -> list[Camera]:
-    """All cameras of a scene, with the near plane of ``near_plane``.
-
-    A scene in kilometres would otherwise lie in front of the near plane. Cameras in one place keep theirs.
-    """
+    """All cameras of a scene, with the near plane of ``near_plane``; cameras in one place keep theirs."""
     extent = camera_extent(cameras) if cameras else 0.0
     return [replace(camera, near=near_plane(extent)) for camera in cameras] if extent else list(cameras)
 

@@ -1,7 +1,4 @@
-"""Settings of the equation, of the screen-space filter and of training, as frozen dataclasses.
-
-Each field's help is the option's help on the command line.
-"""
+"""Settings of the equation, the screen-space filter and training: frozen dataclasses, with the help of each option."""
 
 from __future__ import annotations
 

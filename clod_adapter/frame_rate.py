@@ -11,11 +11,10 @@ and the median of the 3 is e. Then
 
     log s = log s_1 + sign(e) min(max(|e| - 0.03, 0), log 1.1),    s clamped to [1, max_sv]
 
-The law needs no model of the renderer. A single slow frame has no influence; a dial at rest averages 20 frames; a dial
-in motion follows the newest 3. Where t = a + b s^-p, p from 0.2 to 1.5, and the load changes by 2, 4 or 1/3, t is
-within 10 % of T at most 15 frames later, or 4 frames after steps of 10 % can reach it; it ends within 3 % of T. With a
-noise of 20 % per frame the dial rests in most frames and changes by 0.6 % a frame on average. The viewer has the same
-law in JavaScript (viewers/frame_rate.js).
+A single slow frame has no influence; a dial at rest averages 20 frames, one in motion follows the newest 3. Where
+t = a + b s^-p, p from 0.2 to 1.5, and the load changes by 2, 4 or 1/3, t is within 10 % of T at most 15 frames later,
+or 4 frames after steps of 10 % can reach it; it ends within 3 % of T. With a noise of 20 % per frame the dial rests in
+most frames and changes by 0.6 % a frame on average. viewers/frame_rate.js has the same law.
 """
 
 import math

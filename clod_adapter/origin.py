@@ -17,10 +17,9 @@ FINEST = 2.0**-40  # of the distance from 0: the finest unit that an origin is r
 
 
 def origin_of(means: np.ndarray) -> Origin:
-    """The origin for the coordinates ``[N, 3]``, world units; 0 unless the scene is far from 0.
+    """The origin for the coordinates ``[N, 3]``, world units: the median, or 0 unless the scene is far from 0.
 
-    The median, rounded to multiples of a power of two near the spread (the middle 80 % along the widest axis), so that
-    subtracting it from float32 coordinates is exact.
+    Rounded to a power of two near the spread (the middle 80 % along the widest axis): subtracting it is exact then.
     """
     import numpy as np  # here: --help needs none
 

@@ -8,8 +8,8 @@ from typing import Any
 def as_text(name: str) -> str:
     """``name`` as text that UTF-8 can encode; valid text is unchanged.
 
-    Python decodes a byte of a file name that the locale cannot decode to a lone surrogate, U+DC80 to U+DCFF (PEP 383).
-    Such bytes become a character if they are valid UTF-8 together, else ``\\xff``; other surrogates become ``\\ud800``.
+    A lone surrogate of a byte of a file name (PEP 383) becomes a character if it is valid UTF-8 with its neighbours,
+    else ``\\xff``; other surrogates become ``\\ud800``.
     """
     try:
         data = name.encode("utf-8", "surrogateescape")

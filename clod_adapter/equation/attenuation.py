@@ -9,15 +9,13 @@ dial ``s`` (the paper's virtual distance scale)::
     g   = max(1, d s / r)^h                         factor of the scales of what is kept (``growth.py``)
 
 Sources: a'' is Eq. 2 (section 3.2) of "CLoD-GS: Continuous Level-of-Detail via 3D Gaussian Splatting", ICLR 2026, and
-the culling rule is the mask M_i of the same section. g is this project's.
+the culling rule is the mask M_i of the same section. g is this project's. Training and the paper have s >= 1; the
+equation holds from 0, where nothing is attenuated, culled or enlarged.
 
-Training and the paper have s >= 1. At s = 0 nothing is attenuated, culled or enlarged; between 0 and 1 the same
-equation holds.
-
-With the ``hard`` cut (the paper's) a kept Gaussian is drawn with opacity a'' and is culled at opacity ``tau s``, which
-pops. With the ``soft`` cut it is drawn with ``a'' min(1, 2 (a'' / (tau s) - 1))``: the opacity is a'' above 1.5 tau s
-and falls to 0 at the culling threshold. The same Gaussians are kept, and the image is continuous in dial and camera:
-per unit of ``log s`` or ``log d`` the drawn opacity changes by at most 4.3, namely by ``2 x (1.5 - 4 log x)`` with
+With the ``hard`` cut (the paper's) a kept Gaussian is drawn with a'' and culled at opacity ``tau s``, which pops. With
+the ``soft`` cut it is drawn with ``a'' min(1, 2 (a'' / (tau s) - 1))``, which is a'' above 1.5 tau s and 0 at the
+threshold. The same Gaussians are kept, and the image is continuous in dial and camera: per unit of ``log s`` or
+``log d`` the drawn opacity changes by at most 4.3, namely by ``2 x (1.5 - 4 log x)`` with
 ``x = min(1.5 tau s, e^(-5/8))`` or, where that is less, by 2/e.
 
 Tensors are ``[N]``, one entry per Gaussian, on one device. ``opacity_logits`` may be +-inf. Where ``sigma_d`` is +inf

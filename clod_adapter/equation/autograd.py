@@ -1,7 +1,4 @@
-"""The differentiable functions of the dial's equation: attenuation and the soft culling threshold.
-
-Equation and symbols are those of ``attenuation.py``.
-"""
+"""The differentiable functions of the dial's equation (``attenuation.py``): attenuation, and the soft cut."""
 
 from typing import Any
 

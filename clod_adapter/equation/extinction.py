@@ -1,7 +1,4 @@
-"""The extinction scale in closed form: the dial value s* at which a Gaussian is culled, and the sigma_d for a given s*.
-
-Equation and symbols are those of ``attenuation.py``.
-"""
+"""The dial value s* at which a Gaussian is culled, in closed form, and its inverse; symbols of ``attenuation.py``."""
 
 import torch
 import torch.nn.functional as F

@@ -5,15 +5,14 @@ For an exponent ``h`` (``growth_d``), a normalised distance ``d`` (``distances``
     m   = max(1, d s / r)          r: d at the median distance in the nearest training views
     g   = m^h                      factor of the three scales, in [e^-20, e^20]
 
-Opacity fades and scale grows by the same number ``d s``: a camera that moves away and a dial that is turned have the
-same effect. At s = 1 nothing changes nearer than r. The culling rule has no growth in it, so kept sets,
-counts and extinction scales are those of CLoD-GS's Eq. 2.
+Opacity fades and scale grows by ``d s``, so that moving away and turning the dial have the same effect. At s = 1
+nothing changes nearer than r. Culling has no growth in it: kept sets, counts and extinction scales are CLoD-GS's.
 
 Accuracy, measured against mpmath (benchmarks/stability_equation.py), in relative errors: g is within
 ``4 + 2 |h| (1 + log m)`` of finfo.eps, and its slope within ``2 / log m`` more.
 
 Source: this project, after stochastic simplification of aggregate detail (Cook, Halstead, Planck and Ryu, SIGGRAPH
-2007): where elements are removed at random, the others grow to preserve the area. Here the exponent is learned.
+2007), where the elements that remain grow to preserve the area. Here the exponent is learned.
 """
 
 import torch
@@ -21,11 +20,9 @@ from torch import Tensor
 
 from clod_adapter.config import AttenuationConfig
 
+# Of trained exponents. 3/4 preserves area where counts fall as s^-1.5; above 1 a Gaussian far away grows on the screen.
 GROWTH_RANGE = (-1.0, 3.0)
-"""Of trained exponents. Area is preserved at 3/4 where counts fall as s^-1.5; above 1 a Gaussian that moves away grows
-on the screen."""
-LOG_GROWTH_MAX = 20.0
-"""Of abs(log g)."""
+LOG_GROWTH_MAX = 20.0  # of abs(log g)
 
 
 def growth_distance(config: AttenuationConfig) -> float:

@@ -1,9 +1,8 @@
 """The unit of sigma_d: world units in results and files, the reference distance of the scene while it is trained.
 
 The attenuation factor, ``exp(-(d / D s)^2 / (2 sigma^2 + eps))``, is the same for another D' where
-``D'^2 (2 sigma'^2 + eps) = D^2 (2 sigma^2 + eps)``. In world units D is 1, and sigma_d alone determines how far a
-Gaussian is seen. Training divides by the reference distance, where growth begins: its range of sigma_d and its
-initialization are of the order of 1.
+``D'^2 (2 sigma'^2 + eps) = D^2 (2 sigma^2 + eps)``. In world units D is 1. Training has the distance where growth
+begins, so that sigma_d is of the order of 1.
 """
 
 from dataclasses import replace
@@ -64,10 +63,7 @@ def known_distance(config: AttenuationConfig) -> float:
 
 
 def nominal_distance(means: Tensor, config: AttenuationConfig) -> float:
-    """The normalised distance d of a viewpoint, for scenes without cameras; > 0.
-
-    ``known_distance`` over D, or where that is unknown ``estimated_distance`` over D; 1 for ``max``.
-    """
+    """The normalised distance d > 0 of a viewpoint of a scene without cameras: known or estimated; 1 for ``max``."""
     if config.normalizer != "scene":
         return 1.0
     return (known_distance(config) or estimated_distance(means)) / config.scene_distance

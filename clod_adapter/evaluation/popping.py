@@ -1,22 +1,19 @@
 """Popping: whether the image changes evenly or in jumps as the dial turns or the camera moves.
 
-Neighbouring steps k, k+1 of a sweep are compared *from one camera*, so that only the level of detail counts and not
-the motion of the camera. With ``I_c(k)`` the image, clamped to [0, 1], from camera c with the opacities and scales of
-step k, step k changes it by
+Neighbouring steps of a sweep are compared *from one camera*, so that the camera's own motion does not count. With
+``I_c(k)`` the image, clamped to [0, 1], from camera c with the opacities and scales of step k, step k changes it by
 
     delta_k = I_c(k+1) - I_c(k)      c the camera of step k+1
     change_k = 255 rms(delta_k)      root mean square over pixels and channels, in levels of 255
 
-A fade changes the image in proportion to the length of the step, a jump by a constant amount. Two numbers distinguish
-them:
+A fade changes the image in proportion to the length of the step, a jump by a constant amount:
 
-    ratio       = max change / mean change              1 if all steps are equal; a single switch within n steps
-                                                        gives n
+    ratio       = max change / mean change              1 if all steps are equal, n for one switch within n steps
     persistence = max change / max change over 2 steps  1/2 for a fade, 1 for a jump or a flicker, about 0.7 if many
                   (I_c(k+1) - I_c(k-1))                 small jumps at different places add up in every step
 
-so ``max change (2 - 1 / persistence)`` approximates the largest change in the limit of short steps. The jump of a
-single culled Gaussian hardly changes the root mean square, so the largest change of a pixel is measured too.
+``max change (2 - 1 / persistence)`` approximates the largest change in the limit of short steps. A single Gaussian
+hardly changes the root mean square, so the largest change of a pixel is measured too.
 """
 
 import math
@@ -115,10 +112,9 @@ def path_popping(
 
 
 def path(cameras: Sequence[Camera], steps: int) -> list[Camera]:
-    """``steps + 1`` cameras from the first to the last through all of them, at equal distances along the path.
+    """``steps + 1`` cameras at equal distances along the path through all of them, interpolated linearly and by slerp.
 
-    Centres are interpolated linearly and rotations by slerp. If no centre moves, each rotation takes the same number
-    of steps. Size and intrinsics are the first camera's.
+    If no centre moves, each rotation takes the same number of steps. Size and intrinsics are the first camera's.
     """
     require(steps >= 2, "steps", steps, "at least 2")
     if len(cameras) < 2:

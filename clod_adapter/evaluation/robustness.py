@@ -1,7 +1,4 @@
-"""The robustness experiment: checkpoints adapted at several ranges of the dial (CLoD-GS section 4.4).
-
-A cell is one checkpoint at one range, or its baseline. Cells are independent of each other.
-"""
+"""Cells of the robustness experiment: a checkpoint adapted at one range of the dial (CLoD-GS 4.4), or its baseline."""
 
 import hashlib
 from collections.abc import Sequence
@@ -40,10 +37,7 @@ class CellResult:
 def adapt_at_range(
     file: Checkpoint, scene: Scene, config: AdaptConfig, virtual_scales: Sequence[float], progress: Listener
 ) -> CellResult:
-    """Adapts ``file`` at the range ``[1, config.max_sv]`` and measures dial values, also beyond it, on held-out views.
-
-    An incomplete adaptation is not a cell: it raises Stopped.
-    """
+    """Adapts to ``[1, config.max_sv]``, and measures dial values, also beyond it; Stopped if that is not completed."""
     base, config = detach(file.gaussians), config.for_views(len(scene.train))
     adapted = adapt(base, scene, config, progress)
     if adapted.failed:
@@ -91,10 +85,7 @@ def distribution(gaussians: Gaussians) -> dict[str, Any]:
 
 
 def scene_fingerprint(scene: Scene, progress: Listener | None = None) -> str:
-    """SHA-256, hex, of the photographs' pixels, their cameras and the split; independent of their folder.
-
-    Of a pseudo view the camera alone: the checkpoint that it shows has a hash of its own.
-    """
+    """SHA-256, hex, of photographs' pixels, cameras and split; a pseudo view's pixels are those of its checkpoint."""
     digest, done = hashlib.sha256(), 0
     for views in (scene.train, scene.test):
         digest.update(f"{len(views)};".encode())
