@@ -123,6 +123,7 @@ export dial.ply -o plain.html
 """
 
 
+@pytest.mark.usefixtures("without_splat_transform")
 def test_commands_without_posix(capture: Any, tmp_path: Path) -> None:
     """Files that are open are not renamed or removed."""
     paths = {"base.ply": str(capture.ply), "scene": str(capture.scene)}

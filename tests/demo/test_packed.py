@@ -17,4 +17,4 @@ def test_scene_and_base_of_the_package(tmp_path: Path) -> None:
         gallery.unpack(capture, base)
     scene, checkpoint = load_scene(capture), load(base)
     assert (len(scene.train), len(scene.test), checkpoint.notes, scene.notes) == (70, 10, (), ())
-    assert evaluate(checkpoint.gaussians, scene.test, [0])[0].psnr > 30
+    assert evaluate(checkpoint.gaussians, scene.test[:2], [0])[0].psnr > 30

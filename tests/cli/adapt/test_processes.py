@@ -3,9 +3,6 @@
 import json
 import os
 import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +16,7 @@ from clod_adapter.cli.shared.settings import make_config
 from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.training.state import load_state
-from runs import STATE, Launched, Server, accepted, launch
+from runs import STATE, Launched, Server, launch, log_of
 
 TINY = ("--max-sv", 4, "--out", "dial.ply", "--batch", 2, "--iters", 12)
 LONG = (*TINY[:-1], 4000)  # does not end by itself
@@ -123,26 +120,28 @@ def test_bad_input_is_reported_once(server: Server, words: list[Any], tmp_path: 
         assert f"clod-adapt: error: {message}" in run.log(0) and run.log(1) == "" and not list(run.folder.iterdir())
 
 
-@pytest.mark.timeout(240)
-def test_torchrun_with_a_killed_process(words: list[Any], tmp_path: Path) -> None:
-    environment = {name: value for name, value in os.environ.items() if name != "OMP_NUM_THREADS"}
-    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
-    run = subprocess.Popen(
-        [*command, "-m", "clod_adapter", *accepted(words), *map(str, LONG), "--json"],
-        cwd=tmp_path, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-    )  # fmt: skip
-    until = time.monotonic() + 120
-    while not (tmp_path / STATE).exists():
-        assert time.monotonic() < until and run.poll() is None, run.communicate()[1]
-        time.sleep(0.01)
-    found = Path(f"/proc/{run.pid}/task/{run.pid}/children")
-    children = found.read_text() if found.exists() else pytest.skip("there is no /proc to tell the processes apart by")
-    (second,) = (pid for pid in children.split() if b"\0RANK=1\0" in Path(f"/proc/{pid}/environ").read_bytes())
-    os.kill(int(second), signal.SIGKILL)
-    out, err = run.communicate(timeout=100)
-    assert "a process of the group has ended" in err and err.count("2 processes (gloo)") == 1, err
-    report = Launched(None, tmp_path, [], None).report()
-    assert report["interrupted"] and json.loads(out)["steps"] == load_state(tmp_path / STATE)[0].steps
+AGENT = """
+from torch.distributed.launcher.api import LaunchConfig, elastic_launch
+from clod_adapter.training.trainer import Trainer
+real = Trainer.gradient_sum
+def pull(*arguments):
+    if os.environ['RANK'] == '1' and os.path.exists('dial.resume.safetensors'): os.kill(os.getpid(), signal.SIGKILL)
+    return real(*arguments)
+Trainer.gradient_sum = pull
+config = LaunchConfig(1, 1, 2, rdzv_backend='c10d', rdzv_endpoint='localhost:0', start_method='fork', max_restarts=0)
+elastic_launch(config, lambda: os._exit(main.main(about['words'])))()
+"""
+
+
+def test_torchrun_with_a_killed_process(server: Server, words: list[Any], tmp_path: Path) -> None:
+    """By torchrun's agent, which sends SIGTERM to the first process once the second is gone."""
+    folder = tmp_path / "run"
+    folder.mkdir()
+    assert server.wait(server.start(folder, *words, *LONG, before=AGENT, OMP_NUM_THREADS=1)) == 1
+    run = Launched(server, folder, [], None)
+    log, report = log_of(folder), run.report()
+    assert "a process of the group has ended" in log and log.count("2 processes (gloo)") == 1, log
+    assert report["interrupted"] and report["steps"] == load_state(folder / STATE)[0].steps
 
 
 AT = {"MASTER_ADDR": "localhost", "MASTER_PORT": "1"}
