@@ -110,16 +110,3 @@ def test_a_step_waits_for_the_device_once(there: Gaussians, monkeypatch: pytest.
         with waits() as found:
             trainer.step(share_done)
         assert [place for place in found if not place.startswith("rasterizers/")] == ["training/trainer.py:step"]
-
-
-def test_the_simulated_device_refuses_and_waits(there: Gaussians) -> None:
-    if there.means.is_cuda:
-        pytest.skip("a GPU")
-    means, own = there.means, there.means.cpu()
-    for wrong in (lambda: means + own, lambda: means.numpy(), lambda: own[means[:, 0] > 0]):
-        with pytest.raises((RuntimeError, TypeError)):
-            wrong()
-    with waits() as found:
-        assert float(means.sum()) and not bool(means[means > 1e9].any())
-        means.cpu(), own.to(means.device), own.to(means.device, non_blocking=True)
-    assert len(found) == 5 and torch.equal((means * torch.tensor(2.0)).cpu(), own * 2)

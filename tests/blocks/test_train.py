@@ -13,7 +13,6 @@ from clod_adapter.blocks.divide import (
     context_rows,
     divide,
     split,
-    target_image,
 )
 from clod_adapter.blocks.train import adapt_block, merge
 from clod_adapter.cameras import Scene
@@ -117,18 +116,6 @@ def test_target_shares_add_up_to_the_curve(divided: Division, captured: tuple[Ga
             for block, q in enumerate(asked):
                 loss = float(divided.seen[:, block].mean()) if first else 1.0
                 assert loss * q.weight / len(divided.rows(block)) == pytest.approx(1 / (share * count))
-
-
-def test_target_images_of_blocks_add_up_to_the_photograph(captured: tuple[Gaussians, Scene], divided: Division) -> None:
-    """The changes that the targets ask for add up to the error of the checkpoint."""
-    base, scene = captured
-    view, asked = scene.train[0], 0.0
-    picture = render(base, view.camera).image
-    for block in range(BLOCKS):
-        rows = divided.rows(block)
-        ordered = base.select(torch.cat([rows, (divided.block != block).nonzero()[:, 0]]))
-        asked = asked + target_image(ordered, len(rows), view) / 255 - picture.clamp(0, 1)
-    torch.testing.assert_close(asked, view.image / 255 - picture.clamp(0, 1), rtol=0, atol=BLOCKS / 255)
 
 
 def test_blocks_match_undivided_training(captured: tuple[Gaussians, Scene], divided: Division) -> None:

@@ -3,6 +3,7 @@
 import csv
 import json
 import re
+import shutil
 import signal
 from collections.abc import Callable
 from pathlib import Path
@@ -23,10 +24,11 @@ OUTPUTS = ["robustness.csv", "robustness.json", "robustness.png"]
 def run(clod: Any, capture: Any, tmp_path: Path) -> Callable[..., Any]:
     """Runs the command on two checkpoints, the second without the faintest Gaussians."""
     few = capture.gaussians.select(capture.gaussians.opacities > 0.5)
+    shutil.copytree(capture.scene, tmp_path / "scene")
     paths = (capture.write(tmp_path / "plain.ply", capture.gaussians), capture.write(tmp_path / "masked.ply", few))
 
     def start(*words: object) -> Any:
-        return clod("robustness", *paths, "--images", capture.scene, "--max-sv", 3, 1, "--iters", 6, *words)
+        return clod("robustness", *paths, "--images", "scene", "--max-sv", 3, 1, "--iters", 3, *words)
 
     return start
 
@@ -61,6 +63,10 @@ def test_outputs_of_all_cells(run: Any, clod: Any, tmp_path: Path, monkeypatch: 
     assert Image.open(folder / "robustness.png").size[0] > 2000
     assert clod("apply", "plain.ply", "robustness/cells/plain_sv3.safetensors", "-o", "x.ply").code == 0
     scene = clod_adapter.load_scene(report["scene"])
+    base, shares = clod_adapter.load("plain.ply").gaussians, experiment.BASELINE_SHARES
+    assert [row["kept"] for row in cells["plain", None]] == [round(300 * share) for share in shares]
+    few = base[base.opacities.argsort(descending=True)[: round(300 * shares[-1])]]
+    assert clod_adapter.evaluate(few, scene.test, [1.0])[0].psnr == pytest.approx(cells["plain", None][-1]["psnr"])
     (again,) = clod_adapter.evaluate(clod_adapter.load("x.ply").gaussians, scene.test, [3.0])
     assert again.psnr == cells["plain", 3][-1]["psnr"]
     lines = re.findall(r"^(\w+) \((\d)/6\) training +\d+%, .* left", done.err, re.M)
@@ -95,3 +101,6 @@ def test_interrupted_unfinished_and_changed_cells(run: Any, tmp_path: Path, monk
     Path("masked.ply").write_bytes(Path("plain.ply").read_bytes())
     other = run("--seed", 1)  # baselines do not depend on the seed
     assert "1 of 6 cells are done already: plain_base" in other.err
+    Image.new("RGB", (64, 48)).save(tmp_path / "scene" / "images" / "003.png")  # of a photograph that is trained on
+    monkeypatch.setattr(experiment, "baseline", pressing(experiment.baseline, signal.SIGINT))
+    assert run("--seed", 1).code == 130

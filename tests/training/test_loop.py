@@ -2,7 +2,6 @@
 
 import copy
 import math
-import re
 import sys
 from dataclasses import replace
 from types import ModuleType
@@ -26,7 +25,7 @@ from clod_adapter.progress import Phase, Progress, Stopped
 from clod_adapter.training.distributed import joined
 from clod_adapter.training.loop import TrainingState, adapt
 from clod_adapter.training.planner import make_plan
-from runs import change_step, config_of, fail, states_of
+from runs import change_step, config_of, states_of
 from scenes import assert_equal, capture, gaussians, photograph, ring
 
 Pair = tuple[Gaussians, Scene]
@@ -185,31 +184,6 @@ def test_a_row_with_a_nonfinite_gradient_is_not_stepped(captured: Pair, monkeypa
     first = initialize(base, scene.train, config).sigma_d
     moved = (seen[0].sigma_d / first - 1).abs() > 1e-5
     assert not moved[3:5].any() and moved.any() and (result.gaussians.sigma_d[3:5] != first[3:5]).all()
-
-
-def test_a_failed_step_ends_training_before_it(captured: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A loss that is not finite, or an error, which is raised; resuming gives the bits of an undisturbed run."""
-    config, told, states = config_of(iters=9), list[Progress](), dict[int, TrainingState]()
-    whole = adapt(*captured, config).gaussians
-
-    def watch(progress: Progress) -> None:
-        told.append(progress)
-        if progress.error:
-            states[progress.done] = copy.deepcopy(progress.state())
-
-    with monkeypatch.context() as patch:
-        change_step(patch, 5, lambda found: replace(found, loss=math.nan))
-        result = adapt(*captured, config, watch)
-    assert result.steps == 4 and result.interrupted and result.lost is None
-    assert re.fullmatch(r"the loss of step 5 is not finite \(view_\d.png\)", result.failed)
-    assert [p.done for p in told if p.state] == [1, 2, 3, 4, 4] and told[-1].error == result.failed
-    with monkeypatch.context() as patch:
-        change_step(patch, 7, fail)
-        with pytest.raises(ZeroDivisionError, match="of ours"):
-            adapt(*captured, config, watch)
-    assert [p.error for p in told[-2:]] == [None, "of ours"] and list(states) == [4, 6]
-    for state in states.values():
-        assert_equal(adapt(*captured, config, None, state).gaussians, whole)
 
 
 def test_growth_begins_at_the_median_distance_in_the_second_nearest_view(captured: Pair) -> None:

@@ -1,23 +1,18 @@
 """States of training and their files: resumed runs end with the same bits, and other states are refused."""
 
 import copy
-import math
-from dataclasses import replace
-from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 
 from clod_adapter.adapter import ATTRIBUTES, with_dial
 from clod_adapter.cameras import Scene
 from clod_adapter.config import AdaptConfig, AttenuationConfig
-from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.progress import Phase, Progress
 from clod_adapter.training.dial import TrainableSubset
 from clod_adapter.training.loop import adapt
-from clod_adapter.training.state import TrainingState, load_state, save_state
+from clod_adapter.training.state import TrainingState
 from runs import config_of, states_of
 from scenes import assert_equal
 
@@ -65,42 +60,3 @@ def test_untrained_rows_keep_their_units_when_resumed(captured: Pair, distance: 
     assert_equal(again.gaussians, whole.gaussians)
     rest = slice(len(base) // 2, None)
     torch.testing.assert_close(whole.gaussians.sigma_d[rest], base.sigma_d[rest] * distance)
-
-
-def test_a_state_of_another_run_is_refused(captured: Pair) -> None:
-    """The command's tests change its values."""
-    base, scene = captured
-    config, states = config_of(iters=2), dict[int, TrainingState]()
-    adapt(base, scene, config, states_of({1}, states))
-    few, fewer = base.select(torch.arange(len(base)) < 9), Scene(scene.train[:1], ())
-    for other in (
-        (few, scene, config), (base, fewer, config), (base, scene, replace(config, form="paper")),
-        (base, scene, replace(config, growth="off")),
-    ):  # fmt: skip
-        with pytest.raises(ClodError, match="of other Gaussians, views or settings"):
-            adapt(*other, None, states[1])
-    tensors = states[1].tensors | {"steps.kept": states[1].tensors["steps.kept"] - 2}
-    for changes in ({"tensors": tensors}, {"averaged": 9}, {"seconds": math.nan}, {"random": {}}):
-        with pytest.raises(ClodError, match="the training state.*; start over"):
-            adapt(base, scene, config, None, replace(states[1], **changes))
-
-
-def test_round_trip_keeps_every_bit(tmp_path: Path) -> None:
-    state = TrainingState(
-        tensors={
-            "parameter.means": torch.tensor([[-0.0, 1e-45, math.inf], [math.nan, 1 / 3, 2.0]]),
-            "steps.kept": torch.tensor([3, 7], dtype=torch.int32),
-            "mean.means": torch.zeros(3, 2).T,  # not contiguous
-        },
-        attenuation=AttenuationConfig(tau=0.01 + 0.02, scene_distance=1e-7),
-        random=np.random.default_rng(5).bit_generator.state,
-        order=(4, 0, 2), loss=0.1, averaged=2, steps=9, seconds=1 / 3, start_seconds=7.0,
-    )  # fmt: skip
-    belongs = {"config": {"seed": 2**63 - 1, "lr": 0.1}, "base": "abc"}
-    save_state(tmp_path / "state", state, belongs)
-    found, theirs = load_state(tmp_path / "state")
-    assert theirs == belongs and {**vars(found), "tensors": 0} == {**vars(state), "tensors": 0}
-    assert found.tensors.keys() == state.tensors.keys()
-    for name, value in state.tensors.items():
-        assert found.tensors[name].dtype == value.dtype
-        assert torch.equal(found.tensors[name].view(torch.int32), value.contiguous().view(torch.int32)), name
