@@ -1,4 +1,4 @@
-"""``clod-adapt demo``, with a few steps on the tests' own capture."""
+"""``clod-adapt demo``, with a few steps on the tests' own capture; the scene of the package, and its pictures."""
 
 import json
 import shutil
@@ -6,14 +6,21 @@ import signal
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from PIL import Image
 
 from clod_adapter import config
 from clod_adapter.cli.adapt import listeners
 from clod_adapter.cli.adapt import run as adapt_run
 from clod_adapter.demo import gallery
+from clod_adapter.evaluation.evaluate import evaluate
+from clod_adapter.io.checkpoint import load
+from clod_adapter.io.scene.load import load_scene
+from clod_adapter.report.page import Picture
 from runs import pressing
 
+pytest.importorskip("matplotlib")
 PICTURES = {"dial.png", "curve.png"}
 
 
@@ -22,7 +29,6 @@ def test_demo(clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.Monke
 
     A state that cannot be resumed is an error that does not name --resume, which the demo does not have.
     """
-    pytest.importorskip("matplotlib")
 
     def unpack(scene: Path, base: Path) -> None:
         shutil.copytree(capture.scene, scene, dirs_exist_ok=True)
@@ -56,3 +62,27 @@ def test_demo(clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.Monke
     done = clod("demo", "--out=-odd", "--json")
     assert done.code == 0 and json.loads(done.out)["pictures"] == {} and "no figures" in done.err
     assert not PICTURES & {path.name for path in folder.iterdir()}
+
+
+def test_scene_and_base_of_the_package(tmp_path: Path) -> None:
+    """The base is trained to its end, and packing it and the photographs cost little."""
+    files = [Path(gallery.__file__).with_name(name) for name in ("base.spz", "capture.zip")]
+    assert files[0].stat().st_size < 2e6 and sum(path.stat().st_size for path in files) < 3e6
+    capture, base = tmp_path / "capture", tmp_path / "base.ply"
+    for _ in range(2):  # what exists is left
+        gallery.unpack(capture, base)
+    scene, checkpoint = load_scene(capture), load(base)
+    assert (len(scene.train), len(scene.test), checkpoint.notes, scene.notes) == (70, 10, (), ())
+    assert evaluate(checkpoint.gaussians, scene.test[:2], [0])[0].psnr > 30
+
+
+def test_strip_shows_every_panel(tmp_path: Path) -> None:
+    colours = [(200, 30, 30), (30, 160, 30), (30, 30, 200)]
+    images = [np.full((30, 40, 3), colour, np.uint8) for colour in colours]
+    panels = [Picture(image / 255 if k == 1 else image, "s = 1", "29.0 dB") for k, image in enumerate(images)]
+    gallery.dial_strip(tmp_path / "strip.png", panels, "one view", crop=(10, 5, 16, 12))
+    picture = np.asarray(Image.open(tmp_path / "strip.png").convert("RGB"))
+    for k, colour in enumerate(colours):
+        third = picture[:, k * picture.shape[1] // 3 : (k + 1) * picture.shape[1] // 3]
+        assert (np.abs(third.astype(int) - colour).max(2) <= 1).mean() > 0.6
+    assert (picture[0] == 255).all() and picture.shape[0] > 2 * 12 / 16 * picture.shape[1] / 3

@@ -45,4 +45,5 @@ def test_adapter(clod: Any, dialled: Path) -> None:
     text, report = inspected(clod, dialled.with_suffix(".safetensors"))
     assert "an adapter" in text and "with SHA-256 " in text and "max_sv 4" in text and "\ngrowth_d " in text
     assert "\ndial         sigma_d and growth_d, s = 1 to 4" in text and len(report["about"]["growth"]) == 5
+    assert report["about"]["updates"]["means"] == "float16 [300, 3]"
     assert report["about"]["count"] == 300 and report["splat"] is None and report["about"]["config"]["iters"] == 12

@@ -1,8 +1,12 @@
-"""The command on a full disk, without permissions, and without what Windows and macOS lack."""
+"""The command on a full disk, without permissions, without what Windows and macOS lack, and with odd files.
+
+These have names that are not UTF-8, or are photographs that are none by their content.
+"""
 
 import json
 import os
 import shutil
+import struct
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -11,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from PIL import Image
 
 from runs import STATE, Server, log_of, names
 
@@ -134,3 +139,85 @@ def test_commands_without_posix(capture: Any, tmp_path: Path) -> None:
     assert done.returncode == 0, done.stdout + done.stderr
     assert {"dial.ply", "dial.json", "pictures", "plain.spz", "plain.html"} <= set(names(tmp_path))
     assert (tmp_path / "again.ply").read_bytes() == (tmp_path / "dial.ply").read_bytes()
+
+
+POSE = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 5], [0, 0, 0, 1]]
+ODD = "gr\udcfcn"  # Latin-1 for an umlaut, which is not UTF-8
+OF_ODD_NAMES = """
+ODD.ply --images ODD --iters 2 --max-sv 2 -o OUT.ply
+eval ODD_dial.ply --images ODD --sv 1 --report OUT.html
+render ODD_dial.ply --images ODD -o OUT
+export ODD_dial.ply -o OUT.html
+robustness ODD.ply --images ODD --iters 2 --max-sv 2 -o OUT
+"""
+
+
+@pytest.fixture(scope="module")
+def odd(capture: Any, dialled: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a scene, its checkpoint and a file with a dial; no name is UTF-8."""
+    folder = tmp_path_factory.mktemp("odd") / ODD
+    try:
+        folder.mkdir()
+    except OSError:
+        pytest.skip("the file system takes UTF-8 only")
+    shutil.copytree(capture.scene, folder / ODD)
+    shutil.copy(capture.ply, folder / f"{ODD}.ply")
+    for suffix in (".ply", ".safetensors"):
+        shutil.copy(dialled.with_suffix(suffix), folder / f"{ODD}_dial{suffix}")
+    return folder
+
+
+@pytest.mark.usefixtures("without_splat_transform", "blank_figure")
+@pytest.mark.parametrize("line", OF_ODD_NAMES.strip().splitlines())
+def test_names_that_are_not_utf8(clod: Any, odd: Path, tmp_path: Path, line: str) -> None:
+    words = [word.replace("ODD", str(odd / ODD)).replace("OUT", str(tmp_path / ODD)) for word in line.split()]
+    done = clod(*words, "--quiet", "--json")
+    assert done.code == 0 and "gr\\xfcn/gr\\xfcn" in json.dumps(json.loads(done.out)).replace("\\\\", "\\"), done
+    for path in tmp_path.glob("*.[hj][ts][mo][ln]"):  # pages and reports
+        assert "gr\\xfcn" in path.read_text("utf-8").replace("\\\\", "\\"), path
+
+
+def test_names_in_a_transforms_file(clod: Any, dialled: Path, tmp_path: Path) -> None:
+    """That of a photograph with an umlaut is the image's; one that is not UTF-8 is refused."""
+    scene = tmp_path / "scene"
+    (scene / "images").mkdir(parents=True)
+    for name in ("größe", "001", "002"):
+        Image.new("RGB", (64, 48)).save(scene / "images" / f"{name}.png")
+    for name, code in (("größe", 0), ("\ud800", 2)):
+        frames = [{"file_path": f"images/{each}.png", "transform_matrix": POSE} for each in (name, "001", "002")]
+        (scene / "transforms.json").write_text(json.dumps({"fl_x": 60, "w": 64, "h": 48, "frames": frames}))
+        done = clod("render", dialled, "--images", scene, "--views", "all", "-o", "out")
+        assert done.code == code and len(list((tmp_path / "out").rglob("größe.png"))) == 1, done
+    assert done.err.rstrip().endswith("is not UTF-8; rename the photograph, there too"), done
+
+
+HELPERS = (
+    "gs", "gswin32c", "gswin64c", "djpeg", "cjpeg", "ffmpeg", "convert", "magick", "gm", "display", "xv", "netpbm",
+)  # fmt: skip
+SIZE = (64, 48)  # the camera's
+CONTENT = {
+    "PostScript": b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 64 48\n%%EndComments\nshowpage\n%%EOF\n",
+    "PDF": b"%PDF-1.4\n1 0 obj\n<< /Type /Catalog >>\nendobj\n%%EOF\n",
+    "GIF": b"GIF89a" + struct.pack("<HH", *SIZE) + bytes(40),
+    "WMF": b"\xd7\xcd\xc6\x9a\0\0" + struct.pack("<4hHLH", 0, 0, *SIZE, 72, 0, 0) + b"\x01\x00\x09\x00" + bytes(100),
+    "PPM": b"P6 64 48 255\n" + bytes(3 * 64 * 48),
+}
+
+
+def test_photographs_that_are_none_start_no_program(
+    clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mark, tools, scene = tmp_path / "mark", tmp_path / "tools", tmp_path / "scene"
+    tools.mkdir()
+    for name in HELPERS:
+        (tools / name).write_text(f"#!/bin/sh\n: > '{mark}'\n")
+        (tools / name).chmod(0o755)
+    monkeypatch.setenv("PATH", str(tools), prepend=":")
+    shutil.copytree(capture.scene, scene)
+    for kind, content in CONTENT.items():
+        (scene / "images" / "001.png").write_bytes(content)
+        done = clod("eval", capture.ply, "--images", scene, "--quiet")
+        found = kind if kind in ("PostScript", "PDF", "GIF") else "damaged or none of PNG, JPEG, TIFF, WEBP, BMP"
+        why = f"images/001.png: cannot be decoded, is {found}; export it as JPEG or PNG\n"
+        assert not mark.exists(), kind
+        assert done.code == 2 and done.err.endswith(why) and done.err.count("\n") == 1, done
