@@ -10,9 +10,10 @@ from numba import float32, uint64
 
 from clod_adapter._kernels import conventions as c
 from clod_adapter._kernels.compiling import kernel, part
-from clod_adapter._kernels.elementary import exp2, lowest, set_spans, vabs, vceil, vfloor, vsqrt
-from clod_adapter._kernels.pointers import fetch_add, pointer, prefetch, scratch, store_sums
-from clod_adapter._kernels.simd import anywhere, both, but_not, eq, fma, ge, gt, load, select, splat, store, vmax, vmin
+from clod_adapter._kernels.elementary import exp2, lowest, set_spans, vabs
+from clod_adapter._kernels.pointers import count_up, pointer, prefetch, scratch, store_sums
+from clod_adapter._kernels.simd import anywhere, both, but_not, fma, ge, gt, load, select, splat, store, vmax, vmin
+from clod_adapter._kernels.tiles import spans
 
 BLOCK, ACROSS = 4, 16  # pixels of a block, and blocks of a tile
 BLOCKS = ACROSS * ACROSS
@@ -22,7 +23,6 @@ BLOCK_X = np.tile(np.arange(ACROSS, dtype=np.float32) * BLOCK, ACROSS)
 BLOCK_Y = np.repeat(np.arange(ACROSS, dtype=np.float32) * BLOCK, ACROSS)
 LANE_X = np.tile(np.arange(4, dtype=np.float32) + 0.5, 4)
 LANE_Y = np.repeat(np.arange(4, dtype=np.float32) + 0.5, 4)
-ROW_Y = np.arange(ACROSS, dtype=np.float32) * BLOCK + np.float32(0.5)  # centre of a block's first row of pixels
 LAST = float32(ACROSS - 1)
 
 
@@ -35,12 +35,9 @@ def start_tile(ox, oy, width, height, state, stride, live):
         x, y = ox + (block % ACROSS) * BLOCK, oy + (block // ACROSS) * BLOCK
         if x < width and y < height:
             live[block // 64] |= uint64(1) << uint64(block % 64)
-        if x + BLOCK <= width and y + BLOCK <= height:
-            store(state, block * stride, splat(float32(1)))
-        else:
-            for lane in range(16):
-                inside = x + lane % 4 < width and y + lane // 4 < height
-                state[block * stride + lane] = 1.0 if inside else -1.0
+        left, below = splat(float32(width - x)), splat(float32(height - y))
+        inside = both(gt(left, load(LANE_X, 0)), gt(below, load(LANE_Y, 0)))
+        store(state, block * stride, select(inside, splat(c.ONE), splat(-c.ONE)))
 
 
 @part
@@ -54,44 +51,38 @@ def none_set(words, at):
 
 @part
 def find_blocks(records, r, ox, oy, masks, at):
-    """Sets in ``masks[at : at + WORDS]`` the tile's blocks that the ellipse of the record at ``r`` touches.
-
-    The ellipse is where alpha reaches 1/255; see ``tiles.extent``, which this computes for all rows of blocks at once.
-    """
-    my, rx, b = splat(records[r + c.MY]), splat(records[r + c.RX]), splat(records[r + c.QB])
-    row = load(ROW_Y, 0) + splat(float32(oy))
-    top = vmax(row, splat(records[r + c.Y0] + c.HALF)) - my
-    bottom = vmin(row + splat(float32(BLOCK - 1)), splat(records[r + c.Y1] + c.HALF)) - my
-    tip = splat(-records[r + c.QB] / (records[r + c.QC] * float32(2)) * records[r + c.RX])
-    zero, half, det = splat(float32(0)), splat(c.HALF / records[r + c.QA]), splat(records[r + c.DET])
-    reach = splat(float32(4) * records[r + c.QA] * records[r + c.REACH])
-    right, left = vmin(vmax(tip, top), bottom), vmin(vmax(zero - tip, top), bottom)
-    wide = vsqrt(vmax(reach - det * right * right, zero))
-    x1 = select(eq(right, tip), rx, (wide - b * right) * half)
-    wide = vsqrt(vmax(reach - det * left * left, zero))
-    x0 = select(eq(left, zero - tip), zero - rx, (zero - wide - b * left) * half)
-    mx = splat(records[r + c.MX] - c.HALF)
-    low = vmax(vceil(mx + x0 - splat(c.SLACK)), splat(records[r + c.X0])) - splat(float32(ox))
-    high = vmin(vfloor(mx + x1 + splat(c.SLACK)), splat(records[r + c.X1])) - splat(float32(ox))
-    quarter = splat(float32(1 / BLOCK))
-    # Clamped before the cast to integers: values may be 1e10.
-    low = vmin(vmax(vfloor(low * quarter), zero), splat(LAST + float32(1)))
-    high = vmax(vmin(vfloor(high * quarter), splat(LAST)), splat(float32(-1)))
-    high = select(both(ge(bottom, top), ge(high, low)), high, splat(float32(-1)))
-    set_spans(masks, at, low, high)
+    """Sets in ``masks[at : at + WORDS]`` the tile's blocks that the ellipse of the record at ``r`` touches."""
+    low, high = spans(records, r, ox, oy, float32(BLOCK))
+    low = vmin(vmax(low, splat(c.ZERO)), splat(LAST + c.ONE))
+    set_spans(masks, at, low, vmax(vmin(high, splat(LAST)), splat(-c.ONE)))
 
 
 @part
 def spread(records, r, ox, oy):
-    """Of the record at ``r``: the exponent's ``-QA, -QB, -QC, LOG`` and the colour, the same in every lane.
-
-    And the offsets from its centre to the pixels of the tile's first block, along x and along y.
-    """
+    """Of the record at ``r``, the same in every lane: what ``meet`` takes, and the colour."""
     qa, qb, qc = splat(-records[r + c.QA]), splat(-records[r + c.QB]), splat(-records[r + c.QC])
-    red, green, blue = splat(records[r + c.RED]), splat(records[r + c.GREEN]), splat(records[r + c.BLUE])
     base_x = load(LANE_X, 0) + splat(float32(ox) - records[r + c.MX])
     base_y = load(LANE_Y, 0) + splat(float32(oy) - records[r + c.MY])
-    return qa, qb, qc, splat(records[r + c.LOG]), red, green, blue, base_x, base_y
+    shape = qa, qb, qc, splat(records[r + c.LOG]), base_x, base_y
+    return shape, splat(records[r + c.RED]), splat(records[r + c.GREEN]), splat(records[r + c.BLUE])
+
+
+@part
+def meet(shape, t, block):
+    """What a Gaussian does to the pixels of a block with transmittances ``t``.
+
+    ``shape`` is of its exponent ``-QA, -QB, -QC, LOG``, and the offsets from its centre to the pixels of the tile's
+    first block. Returns the pixels' offsets, alpha before and after its limit, the transmittance behind the Gaussian,
+    which pixels blend it, and which are finished by it.
+    """
+    qa, qb, qc, log, base_x, base_y = shape
+    dx, dy = base_x + splat(BLOCK_X[block]), base_y + splat(BLOCK_Y[block])
+    raw = exp2(fma(dx, fma(qa, dx, qb * dy), fma(qc * dy, dy, log)))
+    a = vmin(raw, splat(c.ALPHA_MAX))
+    mask = both(ge(a, splat(c.ALPHA_MIN)), gt(t, splat(c.ZERO)))
+    after = t - t * a
+    keep = both(mask, gt(after, splat(c.T_MIN)))
+    return dx, dy, raw, a, after, keep, but_not(mask, keep)
 
 
 @kernel
@@ -106,10 +97,10 @@ def blend(
     """
     count, tiles, records, entries = len(tiles), pointer(tiles), pointer(records), pointer(entries)
     offsets, background, image, alpha = pointer(offsets), pointer(background), pointer(image), pointer(alpha)
-    state, live, masks = pointer(room[worker]), scratch(uint64, WORDS), pointer(masks)
-    zero, threshold, most, least = splat(float32(0)), splat(c.ALPHA_MIN), splat(c.ALPHA_MAX), splat(c.T_MIN)
+    state, live, masks, cursor = pointer(room[worker]), scratch(uint64, WORDS), pointer(masks), pointer(cursor)
+    zero = splat(c.ZERO)
     while True:
-        turn = fetch_add(cursor, 1)
+        turn = count_up(cursor)
         if turn >= count:
             break
         tile = tiles[turn]
@@ -124,7 +115,7 @@ def blend(
                 break
             r = entries[entry] * c.RECORD
             prefetch(records, entries[min(entry + c.AHEAD, offsets[tile + 1] - 1)] * c.RECORD)
-            qa, qb, qc, log, red, green, blue, base_x, base_y = spread(records, r, ox, oy)
+            shape, red, green, blue = spread(records, r, ox, oy)
             find_blocks(records, r, ox, oy, masks, entry * WORDS)
             for word in range(WORDS):
                 bits = masks[entry * WORDS + word] & live[word]
@@ -134,12 +125,7 @@ def blend(
                     bits &= bits - uint64(1)
                     at = block * 64
                     t = load(state, at)
-                    dx, dy = base_x + splat(BLOCK_X[block]), base_y + splat(BLOCK_Y[block])
-                    a = vmin(exp2(fma(dx, fma(qa, dx, qb * dy), fma(qc * dy, dy, log))), most)
-                    mask = both(ge(a, threshold), gt(t, zero))
-                    after = t - t * a
-                    keep = both(mask, gt(after, least))
-                    done = but_not(mask, keep)
+                    _, _, _, a, after, keep, done = meet(shape, t, block)
                     weight = select(keep, t * a, zero)
                     store(state, at + 16, fma(weight, red, load(state, at + 16)))
                     store(state, at + 32, fma(weight, green, load(state, at + 32)))
@@ -214,11 +200,10 @@ def blend_gradient(
     count, tiles, records, entries = len(tiles), pointer(tiles), pointer(records), pointer(entries)
     entry_slots, offsets, pair_sums = pointer(entry_slots), pointer(offsets), pointer(pair_sums)
     image, alpha, v_image, v_alpha = pointer(image), pointer(alpha), pointer(v_image), pointer(v_alpha)
-    state, live, masks = pointer(room[worker]), scratch(uint64, WORDS), pointer(masks)
-    zero, one = splat(float32(0)), splat(float32(1))
-    threshold, most, least = splat(c.ALPHA_MIN), splat(c.ALPHA_MAX), splat(c.T_MIN)
+    state, live, masks, cursor = pointer(room[worker]), scratch(uint64, WORDS), pointer(masks), pointer(cursor)
+    zero, one, most = splat(c.ZERO), splat(c.ONE), splat(c.ALPHA_MAX)
     while True:
-        turn = fetch_add(cursor, 1)
+        turn = count_up(cursor)
         if turn >= count:
             break
         tile = tiles[turn]
@@ -236,7 +221,7 @@ def blend_gradient(
                 continue
             r = entries[entry] * c.RECORD
             prefetch(records, entries[min(entry + c.AHEAD, offsets[tile + 1] - 1)] * c.RECORD)
-            qa, qb, qc, log, red, green, blue, base_x, base_y = spread(records, r, ox, oy)
+            shape, red, green, blue = spread(records, r, ox, oy)
             s_r = s_g = s_b = s_0 = s_x = s_y = s_xx = s_xy = s_yy = zero
             for word in range(WORDS):
                 bits = masks[entry * WORDS + word]
@@ -245,13 +230,7 @@ def blend_gradient(
                     bits &= bits - uint64(1)
                     at = block * 80
                     t = load(state, at)
-                    dx, dy = base_x + splat(BLOCK_X[block]), base_y + splat(BLOCK_Y[block])
-                    raw = exp2(fma(dx, fma(qa, dx, qb * dy), fma(qc * dy, dy, log)))
-                    a = vmin(raw, most)
-                    mask = both(ge(a, threshold), gt(t, zero))
-                    after = t - t * a
-                    keep = both(mask, gt(after, least))
-                    done = but_not(mask, keep)
+                    dx, dy, raw, a, after, keep, done = meet(shape, t, block)
                     weight = select(keep, t * a, zero)
                     v_r, v_g, v_b = load(state, at + 32), load(state, at + 48), load(state, at + 64)
                     q = fma(v_r, red, fma(v_g, green, v_b * blue))

@@ -4,7 +4,6 @@ import math
 
 from llvmlite import ir
 from numba import types
-from numba.extending import intrinsic
 
 from clod_adapter._kernels.simd import INTEGERS, LANES, VECTOR, call_llvm, f32x16, llvm_function, mask16, operation
 
@@ -59,23 +58,17 @@ def bits_of(builder, mask):
     return builder.zext(builder.bitcast(mask, ir.IntType(LANES)), ir.IntType(64))
 
 
-@intrinsic
-def set_spans(typingctx, words, index, low, high):
+@operation(types.none, types.CPointer(types.uint64), types.int64, f32x16, f32x16)
+def set_spans(builder, words, index, low, high):
     """In the r-th of sixteen groups of sixteen bits from ``words[index]`` on, sets bits low[r] to high[r].
 
     Both are rounded towards zero; where high < low no bit is set.
     """
-
-    def codegen(context, builder, signature, args):
-        low, high = (builder.fptosi(x, INTEGERS) for x in args[2:])
-        bits = builder.sub(builder.shl(_constant(2), high), builder.shl(_constant(1), low))
-        bits = builder.select(builder.icmp_signed(">=", high, low), bits, _constant(0))
-        narrow = builder.trunc(bits, ir.VectorType(ir.IntType(16), LANES))
-        data = builder.gep(args[0], [args[1]])
-        builder.store(narrow, builder.bitcast(data, narrow.type.as_pointer()), align=8)
-        return context.get_dummy_value()
-
-    return types.none(words, types.intp, f32x16, f32x16), codegen
+    low, high = (builder.fptosi(x, INTEGERS) for x in (low, high))
+    bits = builder.sub(builder.shl(_constant(2), high), builder.shl(_constant(1), low))
+    bits = builder.select(builder.icmp_signed(">=", high, low), bits, _constant(0))
+    narrow = builder.trunc(bits, ir.VectorType(ir.IntType(16), LANES))
+    builder.store(narrow, builder.bitcast(builder.gep(words, [index]), narrow.type.as_pointer()), align=8)
 
 
 @operation(types.int64, types.uint64)

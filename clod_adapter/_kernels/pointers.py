@@ -1,11 +1,26 @@
 """Memory in kernels: pointers, stack memory, prefetching, atomics, and rows of a table, one lane per row."""
 
 from llvmlite import ir
-from numba import types
+from numba import float32, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from clod_adapter._kernels.simd import INTEGERS, LANES, VECTOR, call_llvm, data_of, f32x16
+from clod_adapter._kernels.compiling import part
+from clod_adapter._kernels.simd import (
+    INTEGERS,
+    LANES,
+    VECTOR,
+    call_llvm,
+    f32x16,
+    load,
+    mask16,
+    operation,
+    spread,
+    store,
+)
+
+I32, I64, NOTHING = ir.IntType(32), ir.IntType(64), ir.VoidType()
+FLOATS, NUMBERS, VECTORS = types.CPointer(float32), types.CPointer(types.int64), types.CPointer(f32x16)
 
 
 @intrinsic
@@ -35,59 +50,87 @@ def scratch(typingctx, kind, size):
     return types.CPointer(element)(kind, size), codegen
 
 
-@intrinsic
-def prefetch(typingctx, array, index):
-    """Prefetches the cache line of ``array[index]``."""
-
-    def codegen(context, builder, signature, args):
-        data = builder.gep(data_of(context, builder, signature.args[0], args[0]), [args[1]])
-        byte, i32 = ir.IntType(8).as_pointer(), ir.IntType(32)
-        arguments = [builder.bitcast(data, byte), *(ir.Constant(i32, v) for v in (0, 3, 1))]
-        call_llvm(builder, "llvm.prefetch.p0i8", ir.VoidType(), arguments)
-        return context.get_dummy_value()
-
-    return types.none(array, types.intp), codegen
+@operation(types.none, FLOATS, types.int64)
+def prefetch(builder, values, index):
+    """Prefetches the cache line of ``values[index]``."""
+    byte = builder.bitcast(builder.gep(values, [index]), ir.IntType(8).as_pointer())
+    call_llvm(builder, "llvm.prefetch.p0i8", NOTHING, [byte, *(ir.Constant(I32, v) for v in (0, 3, 1))])
 
 
-@intrinsic
-def fetch_add(typingctx, array, amount):
-    """Atomically adds to ``array[0]`` (int64) and returns its old value."""
-
-    def codegen(context, builder, signature, args):
-        data = data_of(context, builder, signature.args[0], args[0])
-        return builder.atomic_rmw("add", data, args[1], "monotonic")
-
-    return types.int64(array, types.int64), codegen
+@operation(types.int64, NUMBERS)
+def count_up(builder, counter):
+    """Atomically adds 1 to ``counter[0]`` and returns its old value."""
+    return builder.atomic_rmw("add", counter, ir.Constant(I64, 1), "monotonic")
 
 
-def _masked(builder, kind, address, mask, *values):
-    """LLVM's masked ``load`` or ``store`` of a vector."""
-    address, align = builder.bitcast(address, VECTOR.as_pointer()), ir.Constant(ir.IntType(32), 4)
-    if kind == "load":
-        empty = ir.Constant(VECTOR, [0.0] * LANES)
-        return call_llvm(builder, "llvm.masked.load.v16f32.p0v16f32", VECTOR, [address, align, mask, empty])
-    return call_llvm(builder, "llvm.masked.store.v16f32.p0v16f32", ir.VoidType(), [*values, address, align, mask])
+def _vector_at(builder, values, *indices):
+    """The address of sixteen floats, of which the sum of ``indices`` is the first."""
+    for index in indices:
+        values = builder.gep(values, [index])
+    return builder.bitcast(values, VECTOR.as_pointer())
 
 
-@intrinsic
-def load_where(typingctx, mask, array, index):
-    """``array[index : index + 16]`` where the mask is set, 0 elsewhere, which is not read."""
-
-    def codegen(context, builder, signature, args):
-        return _masked(builder, "load", builder.gep(args[1], [args[2]]), args[0])
-
-    return f32x16(mask, array, types.intp), codegen
+def _masked_load(builder, address, mask):
+    given = [address, ir.Constant(I32, 4), mask, ir.Constant(VECTOR, [0.0] * LANES)]
+    return call_llvm(builder, "llvm.masked.load.v16f32.p0v16f32", VECTOR, given)
 
 
-@intrinsic
-def store_where(typingctx, mask, array, index, value):
-    """``array[index : index + 16] = value`` where the mask is set."""
+def _masked_store(builder, address, mask, value):
+    given = [value, address, ir.Constant(I32, 4), mask]
+    call_llvm(builder, "llvm.masked.store.v16f32.p0v16f32", NOTHING, given)
 
-    def codegen(context, builder, signature, args):
-        _masked(builder, "store", builder.gep(args[1], [args[2]]), args[0], args[3])
-        return context.get_dummy_value()
 
-    return types.none(mask, array, types.intp, f32x16), codegen
+@operation(f32x16, mask16, FLOATS, types.int64)
+def load_where(builder, mask, values, index):
+    """``values[index : index + 16]`` where the mask is set, 0 elsewhere, which is not read."""
+    return _masked_load(builder, _vector_at(builder, values, index), mask)
+
+
+@operation(types.none, mask16, FLOATS, types.int64, f32x16)
+def store_where(builder, mask, values, index, vector):
+    """``values[index : index + 16] = vector`` where the mask is set."""
+    _masked_store(builder, _vector_at(builder, values, index), mask, vector)
+
+
+def _first(builder, count):
+    numbers = ir.Constant(INTEGERS, list(range(LANES)))
+    return builder.icmp_signed("<", numbers, spread(builder, builder.trunc(count, I32), INTEGERS))
+
+
+first_lanes = operation(mask16, types.int64)(_first)  # the first ``count`` of sixteen
+
+
+@part
+def load_some(values, index, count):
+    """The first ``count`` of ``values[index : index + 16]``, then 0; what is beyond is not read."""
+    return load(values, index) if count >= 16 else load_where(first_lanes(count), values, index)
+
+
+@part
+def store_some(values, index, count, vector):
+    """Stores the first ``count`` lanes."""
+    if count >= 16:
+        store(values, index, vector)
+    else:
+        store_where(first_lanes(count), values, index, vector)
+
+
+@part
+def gather(values, rows):
+    """``values[rows[lane]]`` in each lane."""
+    found = scratch(float32, 16)
+    for lane in range(16):
+        found[lane] = values[rows[lane]]
+    return load(found, 0)
+
+
+@part
+def scatter(values, rows, vector):
+    """The inverse of ``gather``; of rows that are listed twice the last is stored."""
+    given = scratch(float32, 16)
+    store(given, 0, vector)
+    for lane in range(16):
+        values[rows[lane]] = given[lane]
 
 
 def _transposed(builder, rows):
@@ -101,76 +144,57 @@ def _transposed(builder, rows):
     return rows
 
 
-def _row_access(builder, source, rows, width, first, count):
-    """Addresses of columns ``[first : first + count]`` of sixteen rows, and a mask of ``count`` lanes."""
-    i64, i32 = ir.IntType(64), ir.IntType(32)
-    addresses = []
-    for lane in range(LANES):
-        row = builder.load(builder.gep(rows, [ir.Constant(i32, lane)]))
-        index = builder.add(builder.mul(row, width), first)
-        addresses.append(builder.gep(source, [index]))
-    numbers = ir.Constant(ir.VectorType(i64, LANES), list(range(LANES)))
-    one = builder.insert_element(ir.Constant(numbers.type, ir.Undefined), count, ir.Constant(i32, 0))
-    many = builder.shuffle_vector(one, one, ir.Constant(INTEGERS, [0] * LANES))
-    return addresses, builder.icmp_signed("<", numbers, many)
+def _addresses(builder, table, rows, width, first):
+    """Of the columns of sixteen rows, from ``first`` on."""
+    numbers = [builder.load(builder.gep(rows, [ir.Constant(I32, lane)])) for lane in range(LANES)]
+    return [_vector_at(builder, table, builder.mul(row, width), first) for row in numbers]
 
 
-@intrinsic
-def load_rows(typingctx, source, rows, width, first, count, lanes, at):
+def _lanes(builder, lanes, at, count=LANES):
+    """The addresses of ``count`` vectors from ``lanes[at]`` on."""
+    return [builder.gep(lanes, [builder.add(at, ir.Constant(I64, k))]) for k in range(count)]
+
+
+@operation(types.none, FLOATS, NUMBERS, *[types.int64] * 3, VECTORS, types.int64)
+def load_rows(builder, source, rows, width, first, count, lanes, at):
     """``lanes[at + k]`` = column ``first + k`` of sixteen rows of ``source [*, width]``, for k < count <= 16.
 
-    ``rows`` points to their sixteen numbers (int64), ``lanes`` to vectors; those up to at + 15 are overwritten.
+    ``rows`` are their sixteen numbers. The vectors up to at + 15 are overwritten.
     """
-
-    def codegen(context, builder, signature, args):
-        source, rows, width, first, count, lanes, at = args
-        addresses, mask = _row_access(builder, source, rows, width, first, count)
-        found = [_masked(builder, "load", address, mask) for address in addresses]
-        for k, vector in enumerate(_transposed(builder, found)):
-            builder.store(vector, builder.gep(lanes, [builder.add(at, ir.Constant(ir.IntType(64), k))]), align=4)
-        return context.get_dummy_value()
-
-    i64 = types.int64
-    return types.none(source, types.CPointer(i64), i64, i64, i64, types.CPointer(f32x16), i64), codegen
+    mask = _first(builder, count)
+    found = [_masked_load(builder, address, mask) for address in _addresses(builder, source, rows, width, first)]
+    for vector, address in zip(_transposed(builder, found), _lanes(builder, lanes, at), strict=True):
+        builder.store(vector, address, align=4)
 
 
-@intrinsic
-def load_triples(typingctx, source, index, lanes):
-    """``lanes[k]`` = column k of sixteen consecutive rows of ``source [*, 3]``, whose first element is ``index``."""
-    offsets = [[3 * lane + k for lane in range(LANES)] for k in range(3)]
-
-    def codegen(context, builder, signature, args):
-        i64 = ir.IntType(64)
-        at = [builder.gep(args[0], [builder.add(args[1], ir.Constant(i64, LANES * k))]) for k in range(3)]
-        a, b, c = (builder.load(builder.bitcast(x, VECTOR.as_pointer()), align=4) for x in at)
-        for k, order in enumerate(offsets):
-            # Lanes of a and b first; those of c, from 32 on, take the places that are left.
-            two = builder.shuffle_vector(a, b, ir.Constant(INTEGERS, [min(o, 2 * LANES - 1) for o in order]))
-            rest = [lane if o < 2 * LANES else o - LANES for lane, o in enumerate(order)]
-            column = builder.shuffle_vector(two, c, ir.Constant(INTEGERS, rest))
-            builder.store(column, builder.gep(args[2], [ir.Constant(i64, k)]), align=4)
-        return context.get_dummy_value()
-
-    return types.none(source, types.int64, types.CPointer(f32x16)), codegen
-
-
-@intrinsic
-def store_rows(typingctx, destination, rows, width, first, count, lanes, at):
+@operation(types.none, FLOATS, NUMBERS, *[types.int64] * 3, VECTORS, types.int64)
+def store_rows(builder, destination, rows, width, first, count, lanes, at):
     """The inverse of ``load_rows``; of rows that are listed twice the last is stored."""
+    mask, found = _first(builder, count), [builder.load(x, align=4) for x in _lanes(builder, lanes, at)]
+    addresses = _addresses(builder, destination, rows, width, first)
+    for address, row in zip(addresses, _transposed(builder, found), strict=True):
+        _masked_store(builder, address, mask, row)
 
-    def codegen(context, builder, signature, args):
-        destination, rows, width, first, count, lanes, at = args
-        addresses, mask = _row_access(builder, destination, rows, width, first, count)
-        found = [
-            builder.load(builder.gep(lanes, [builder.add(at, ir.Constant(ir.IntType(64), k))]), align=4)
-            for k in range(LANES)
-        ]
-        for address, row in zip(addresses, _transposed(builder, found), strict=True):
-            _masked(builder, "store", address, mask, row)
-        return context.get_dummy_value()
 
-    i64 = types.int64
-    return types.none(destination, types.CPointer(i64), i64, i64, i64, types.CPointer(f32x16), i64), codegen
+@operation(types.none, VECTORS)
+def _split_triples(builder, lanes):
+    """Of sixteen triples in three vectors, makes vectors of the first, the second and the third ones."""
+    addresses = _lanes(builder, lanes, ir.Constant(I64, 0), 3)
+    a, b, c = (builder.load(x, align=4) for x in addresses)
+    for k, address in enumerate(addresses):
+        order = range(k, 3 * LANES, 3)
+        # Lanes of a and b first; those of c, from 32 on, take the places that are left.
+        two = builder.shuffle_vector(a, b, ir.Constant(INTEGERS, [min(o, 2 * LANES - 1) for o in order]))
+        rest = [lane if o < 2 * LANES else o - LANES for lane, o in enumerate(order)]
+        builder.store(builder.shuffle_vector(two, c, ir.Constant(INTEGERS, rest)), address, align=4)
+
+
+@part
+def load_triples(source, row, count, lanes):
+    """``lanes[k]`` = column k of ``count`` <= 16 consecutive rows of ``source [*, 3]``, then 0."""
+    for k in range(3):
+        lanes[k] = load_some(source, 3 * row + 16 * k, 3 * count - 16 * k)
+    _split_triples(lanes)
 
 
 def _pairwise(builder, vectors):
@@ -185,18 +209,8 @@ def _pairwise(builder, vectors):
     return vectors[0]
 
 
-@intrinsic
-def store_sums(typingctx, array, index, a, b, c, d, e, f, g, h, i):
-    """``array[index : index + 9]`` = the sums over the lanes of the nine vectors."""
-
-    def codegen(context, builder, signature, args):
-        sums = _pairwise(builder, list(args[2:]))
-        data = data_of(context, builder, signature.args[0], args[0])
-        pointer = builder.gep(data, [args[1]])
-        eight = builder.shuffle_vector(sums, sums, ir.Constant(ir.VectorType(ir.IntType(32), 8), list(range(8))))
-        builder.store(eight, builder.bitcast(pointer, eight.type.as_pointer()), align=4)
-        ninth = builder.extract_element(sums, ir.Constant(ir.IntType(32), 8))
-        builder.store(ninth, builder.gep(pointer, [ir.Constant(ir.IntType(64), 8)]))
-        return context.get_dummy_value()
-
-    return types.none(array, types.intp, *([f32x16] * 9)), codegen
+@operation(types.none, FLOATS, types.int64, *[f32x16] * 9)
+def store_sums(builder, values, index, *vectors):
+    """``values[index : index + 9]`` = the sums over the lanes of the nine vectors."""
+    nine = _first(builder, ir.Constant(I64, len(vectors)))
+    _masked_store(builder, _vector_at(builder, values, index), nine, _pairwise(builder, list(vectors)))

@@ -13,7 +13,7 @@ from clod_adapter._kernels.compiling import kernel, part
 from clod_adapter._kernels.conventions import RECORD, WORKSPACE
 from clod_adapter._kernels.dial import drawn, kept
 from clod_adapter._kernels.elementary import bits_of, log2, lowest, vceil, vfloor, vsqrt
-from clod_adapter._kernels.pointers import load_rows, pointer, scratch, store_rows
+from clod_adapter._kernels.pointers import first_lanes, load_rows, pointer, scratch, store_rows
 from clod_adapter._kernels.simd import both, f32x16, ge, gt, load, splat, vmax, vmin
 
 
@@ -127,8 +127,8 @@ def add_records(rows, filled, packed, spare, means, opacity, cam, w, records, de
     valid = covariance(cam, w)
     centres(means, rows, cam, centre)
     valid = both(valid, ge(load(centre, 32), splat(cam[c.NEAR])))  # in float32 too, not only in float64
-    bits = bits_of(both(valid, make_records(w, centre, opacity, cam, record)))
-    bits &= (uint64(1) << uint64(filled)) - uint64(1)
+    valid = both(valid, both(make_records(w, centre, opacity, cam, record), first_lanes(filled)))
+    bits = bits_of(valid)
     if bits == uint64(0):
         return packed
     for lane in range(16):
@@ -157,21 +157,11 @@ def project(
     sigma, growth, sh0, shN = pointer(sigma), pointer(growth), pointer(sh0), pointer(shN)
     cam, dial, records, depths, ids = pointer(cam), pointer(dial), pointer(records), pointer(depths), pointer(ids)
     w, rows, queue = scratch(f32x16, WORKSPACE), scratch(int64, 16), scratch(int64, 32)
-    last_means, last_opacities, last_sigma = scratch(float32, 48), scratch(float32, 16), scratch(float32, 16)
     i = packed = first
     queued = 0
     while i < last or queued > 0:
         while i < last and queued < 16:
-            if i + 16 <= n:
-                bits = kept(i, min(last - i, 16), means, opacities, sigma, cam, dial, dialled)
-            else:  # from a copy: no vector may reach beyond an array
-                for k in range(n - i):
-                    last_opacities[k] = opacities[i + k]
-                    if dialled:
-                        last_sigma[k] = sigma[i + k]
-                    for axis in range(3):
-                        last_means[3 * k + axis] = means[3 * (i + k) + axis]
-                bits = kept(0, last - i, last_means, last_opacities, last_sigma, cam, dial, dialled)
+            bits = kept(i, min(last - i, 16), means, opacities, sigma, cam, dial, dialled)
             while bits != uint64(0):
                 queue[queued] = i + lowest(bits)
                 queued += 1

@@ -146,13 +146,10 @@ def add_slots(pair_sums, slots, records, packed, lanes, sums, g):
         for slot in range(slots[2 * packed[lane]], slots[2 * packed[lane] + 1]):
             total = total + load(pair_sums, slot * c.PAIR)
         store(sums, 16 * lane, total)
-    load_rows(records, packed, c.RECORD, c.RED, 3, g, c.SUMS + c.PAIR)
-    red, green, blue = g[c.SUMS + c.PAIR], g[c.SUMS + c.PAIR + 1], g[c.SUMS + c.PAIR + 2]
     load_rows(sums, lanes, 16, 0, c.PAIR, g, c.SUMS)
-    # A colour clamped at 0 has no gradient.
-    g[c.SUMS] = select(gt(red, splat(c.ZERO)), g[c.SUMS], splat(c.ZERO))
-    g[c.SUMS + 1] = select(gt(green, splat(c.ZERO)), g[c.SUMS + 1], splat(c.ZERO))
-    g[c.SUMS + 2] = select(gt(blue, splat(c.ZERO)), g[c.SUMS + 2], splat(c.ZERO))
+    load_rows(records, packed, c.RECORD, c.RED, 3, g, c.SUMS + c.PAIR)
+    for k in range(3):  # a colour clamped at 0 has no gradient
+        g[c.SUMS + k] = select(gt(g[c.SUMS + c.PAIR + k], splat(c.ZERO)), g[c.SUMS + k], splat(c.ZERO))
 
 
 @kernel

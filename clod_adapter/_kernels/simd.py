@@ -6,19 +6,19 @@ index of the first lane; bounds are not checked.
 """
 
 import operator
+from inspect import Parameter, Signature
 
 from llvmlite import ir
-from numba import float32, types
+from numba import types
 from numba.core import cgutils
 from numba.core.typing.templates import AbstractTemplate, infer_global
 from numba.core.typing.templates import signature as typing_signature
 from numba.extending import intrinsic, lower_builtin, models, register_model
 
 LANES = 16
-ZERO = float32(0)
 VECTOR = ir.VectorType(ir.FloatType(), LANES)
 INTEGERS = ir.VectorType(ir.IntType(32), LANES)
-_mask = ir.VectorType(ir.IntType(1), LANES)
+MASK = ir.VectorType(ir.IntType(1), LANES)
 
 
 def _vector_type(name: str, llvm: ir.Type) -> types.Type:
@@ -32,7 +32,7 @@ def _vector_type(name: str, llvm: ir.Type) -> types.Type:
     return kind(name=name)
 
 
-f32x16, mask16 = _vector_type("F32x16", VECTOR), _vector_type("Mask16", _mask)
+f32x16, mask16 = _vector_type("F32x16", VECTOR), _vector_type("Mask16", MASK)
 
 
 def data_of(context, builder, kind, value):
@@ -71,12 +71,12 @@ def store(typingctx, array, index, value):
     return types.none(array, types.intp, f32x16), codegen
 
 
-def _spread(builder, value):
-    """Sixteen copies of a float; a vector as it is."""
-    if value.type == VECTOR:
+def spread(builder, value, kind=VECTOR):
+    """Sixteen copies of a number; a vector as it is."""
+    if value.type == kind:
         return value
-    one = builder.insert_element(ir.Constant(VECTOR, ir.Undefined), value, ir.Constant(ir.IntType(32), 0))
-    return builder.shuffle_vector(one, ir.Constant(VECTOR, ir.Undefined), ir.Constant(INTEGERS, [0] * LANES))
+    one = builder.insert_element(ir.Constant(kind, ir.Undefined), value, ir.Constant(ir.IntType(32), 0))
+    return builder.shuffle_vector(one, ir.Constant(kind, ir.Undefined), ir.Constant(INTEGERS, [0] * LANES))
 
 
 def _operators(name, kinds, flags, *operators):
@@ -89,7 +89,7 @@ def _operators(name, kinds, flags, *operators):
             return typing_signature(f32x16, *args) if tuple(args) in kinds else None
 
     def lower(context, builder, signature, args):
-        return getattr(builder, name)(*(_spread(builder, arg) for arg in args), flags=flags)
+        return getattr(builder, name)(*(spread(builder, arg) for arg in args), flags=flags)
 
     for each in operators:
         infer_global(each)(Typing)
@@ -107,15 +107,20 @@ _operators("fneg", ((f32x16,),), (), operator.neg)
 
 
 def operation(result, *kinds):
-    """Makes a function of a builder and one to three LLVM values an intrinsic from ``kinds`` to ``result``."""
+    """Makes a function of a builder and LLVM values an intrinsic from ``kinds`` to ``result``."""
 
     def intrinsic_of(build):
         def codegen(context, builder, signature, args):
-            return build(builder, *args)
+            found = build(builder, *args)
+            return context.get_dummy_value() if found is None else found
 
-        typed = result(*kinds), codegen
-        takes = (lambda ctx, a: typed), (lambda ctx, a, b: typed), (lambda ctx, a, b, c: typed)
-        return intrinsic(takes[len(kinds) - 1])
+        def typed(typingctx, *args):
+            return result(*kinds), codegen
+
+        names = [f"given_{k}" for k in range(1 + len(kinds))]
+        parameters = [Parameter(name, Parameter.POSITIONAL_OR_KEYWORD) for name in names]
+        typed.__signature__ = Signature(parameters)  # type: ignore[attr-defined]
+        return intrinsic(typed)
 
     return intrinsic_of
 
@@ -128,7 +133,7 @@ def llvm_function(name, count):
 
 
 # Sixteen copies of a float32.
-splat = operation(f32x16, types.float32)(_spread)
+splat = operation(f32x16, types.float32)(spread)
 # fmuladd fuses where the processor can and is two operations where it cannot.
 fma = llvm_function("fmuladd", 3)
 
@@ -151,7 +156,7 @@ def both(builder, a, b):
 @operation(mask16, mask16, mask16)
 def but_not(builder, a, b):
     """Lanes set in a and not in b."""
-    return builder.and_(a, builder.xor(b, ir.Constant(_mask, [1] * LANES)))
+    return builder.and_(a, builder.xor(b, ir.Constant(MASK, [1] * LANES)))
 
 
 @operation(types.boolean, mask16)

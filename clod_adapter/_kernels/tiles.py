@@ -1,42 +1,43 @@
 """Depth order and tile lists: which Gaussians each tile blends, front to back."""
 
-import math
-
 import numpy as np
 from numba import float32
 
 from clod_adapter._kernels import conventions as c
 from clod_adapter._kernels.compiling import kernel, part
-from clod_adapter._kernels.pointers import pointer, prefetch
+from clod_adapter._kernels.elementary import vceil, vfloor, vsqrt
+from clod_adapter._kernels.pointers import pointer, prefetch, scratch
+from clod_adapter._kernels.simd import both, eq, ge, load, select, splat, store, vmax, vmin
+
+ROWS = np.arange(16, dtype=np.float32)
 
 
 @part
-def within(value, otherwise, low, high):
-    """``value`` clamped and cast to int32, ``otherwise`` for NaN: an ellipse may extend over 1e10 pixels."""
-    return np.int32(otherwise if value != value else min(max(value, low), high))
+def spans(records, r, ox, oy, side):
+    """Columns of cells that the ellipse of the record at ``r`` touches in sixteen rows of cells.
 
-
-@part
-def extent(records, r, first, last):
-    """Columns the ellipse of the record at ``r`` covers between the pixel rows ``first`` and ``last``.
-
-    The ellipse is where alpha reaches 1/255. Between two rows it is widest at its own leftmost and
-    rightmost points where those lie between them, else on the nearer row.
+    Cells have ``side`` pixels a side, the first begins at (ox, oy). Returns the first and the last column of each row,
+    in lanes, 0 and -1 where it touches none. The ellipse is where alpha reaches 1/255. In a row of cells it is widest
+    at its own leftmost and rightmost points where those lie in it, else at the nearer edge.
     """
-    my, rx, b = records[r + c.MY], records[r + c.RX], records[r + c.QB]
-    top, bottom = float32(first) + c.HALF - my, float32(last) + c.HALF - my
-    tip = -b / (records[r + c.QC] * float32(2)) * rx
-    right, left = min(max(tip, top), bottom), min(max(-tip, top), bottom)
-    half = c.HALF / records[r + c.QA]
-    det = records[r + c.DET]  # 4 QA QC - QB^2, from the covariance, where it does not cancel
-    reach = float32(4) * records[r + c.QA] * records[r + c.REACH]
-    x1 = rx if right == tip else (-b * right + math.sqrt(max(float32(0), reach - det * right * right))) * half
-    x0 = -rx if left == -tip else (-b * left - math.sqrt(max(float32(0), reach - det * left * left))) * half
-    mx = records[r + c.MX]
-    return (
-        within(np.ceil(mx + x0 - c.HALF - c.SLACK), records[r + c.X0], records[r + c.X0], records[r + c.X1] + c.ONE),
-        within(np.floor(mx + x1 - c.HALF + c.SLACK), records[r + c.X1], records[r + c.X0] - c.ONE, records[r + c.X1]),
-    )
+    my, rx, b = splat(records[r + c.MY]), splat(records[r + c.RX]), splat(records[r + c.QB])
+    row = load(ROWS, 0) * side + (float32(oy) + c.HALF)
+    top = vmax(row, splat(records[r + c.Y0] + c.HALF)) - my
+    bottom = vmin(row + (side - c.ONE), splat(records[r + c.Y1] + c.HALF)) - my
+    tip = splat(-records[r + c.QB] / (records[r + c.QC] * c.TWO) * records[r + c.RX])
+    zero, half = splat(c.ZERO), splat(c.HALF / records[r + c.QA])
+    det = splat(records[r + c.DET])  # 4 QA QC - QB^2, from the covariance, where it does not cancel
+    reach = splat(float32(4) * records[r + c.QA] * records[r + c.REACH])
+    right, left = vmin(vmax(tip, top), bottom), vmin(vmax(zero - tip, top), bottom)
+    wide = vsqrt(vmax(reach - det * right * right, zero))
+    x1 = select(eq(right, tip), rx, (wide - b * right) * half)
+    wide = vsqrt(vmax(reach - det * left * left, zero))
+    x0 = select(eq(left, zero - tip), zero - rx, (zero - wide - b * left) * half)
+    mx = splat(records[r + c.MX] - c.HALF)
+    low = vmax(vceil(mx + x0 - c.SLACK), splat(records[r + c.X0])) - float32(ox)
+    high = vmin(vfloor(mx + x1 + c.SLACK), splat(records[r + c.X1])) - float32(ox)
+    touched, each = both(ge(bottom, top), ge(high, low)), splat(c.ONE / side)
+    return select(touched, vfloor(low * each), zero), select(touched, vfloor(high * each), splat(-c.ONE))
 
 
 @kernel
@@ -69,13 +70,20 @@ def depth_order(depths, counts, keys, order, keys_other, order_other):
 
 
 @part
-def tiles_across(records, r, ty, y0, y1):
-    """First and last column of tiles that the record at ``r`` touches in the tile row ``ty``; none: last < first."""
-    x0, x1 = np.int32(records[r + c.X0]), np.int32(records[r + c.X1])
-    if y0 // c.TILE == y1 // c.TILE and x0 // c.TILE == x1 // c.TILE:
-        return x0 // c.TILE, x1 // c.TILE
-    x0, x1 = extent(records, r, max(ty * c.TILE, y0), min(ty * c.TILE + c.TILE - 1, y1))
-    return (x0 // c.TILE, x1 // c.TILE) if x1 >= x0 else (np.int32(0), np.int32(-1))
+def tiles_across(records, r, ty, y0, y1, found):
+    """First and last column of tiles that the record at ``r`` touches in the tile row ``ty``; none: last < first.
+
+    ``found [32]`` keeps those of sixteen rows, for calls with ascending ``ty``.
+    """
+    first, last = np.int32(records[r + c.X0]) // c.TILE, np.int32(records[r + c.X1]) // c.TILE
+    lane = (ty - y0 // c.TILE) % 16
+    if first < last or y0 // c.TILE < y1 // c.TILE:
+        if lane == 0:
+            low, high = spans(records, r, 0, ty * c.TILE, float32(c.TILE))
+            store(found, 0, low)
+            store(found, 16, high)
+        first, last = np.int32(found[lane]), np.int32(found[16 + lane])
+    return first, last
 
 
 @kernel
@@ -84,13 +92,13 @@ def count_tiles(worker, workers, records, order, across, histogram, totals):
     histogram[worker, :] = 0
     first, last = len(order) * worker // workers, len(order) * (worker + 1) // workers
     tally, records, order = pointer(histogram[worker]), pointer(records), pointer(order)
-    total = 0
+    found, total = scratch(float32, 32), 0
     for j in range(first, last):
         prefetch(records, order[min(j + c.AHEAD, last - 1)] * c.RECORD)
         r = order[j] * c.RECORD
         y0, y1 = np.int32(records[r + c.Y0]), np.int32(records[r + c.Y1])
         for ty in range(y0 // c.TILE, y1 // c.TILE + 1):
-            low, high = tiles_across(records, r, ty, y0, y1)
+            low, high = tiles_across(records, r, ty, y0, y1, found)
             for tx in range(low, high + 1):
                 tally[ty * across + tx] += 1
             total += high + 1 - low
@@ -121,7 +129,7 @@ def fill_tiles(worker, workers, records, order, across, histogram, totals, slots
     first, last = len(order) * worker // workers, len(order) * (worker + 1) // workers
     cursor, records, order, slots = pointer(histogram[worker]), pointer(records), pointer(order), pointer(slots)
     entries, entry_slots = pointer(entries), pointer(entry_slots)
-    slot = totals[worker]
+    found, slot = scratch(float32, 32), totals[worker]
     for j in range(first, last):
         prefetch(records, order[min(j + c.AHEAD, last - 1)] * c.RECORD)
         p = order[j]
@@ -129,7 +137,7 @@ def fill_tiles(worker, workers, records, order, across, histogram, totals, slots
         y0, y1 = np.int32(records[r + c.Y0]), np.int32(records[r + c.Y1])
         slots[2 * p] = slot
         for ty in range(y0 // c.TILE, y1 // c.TILE + 1):
-            low, high = tiles_across(records, r, ty, y0, y1)
+            low, high = tiles_across(records, r, ty, y0, y1, found)
             for tx in range(low, high + 1):
                 at = cursor[ty * across + tx]
                 cursor[ty * across + tx] = at + 1
