@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from clod_adapter.evaluation.popping import Popping
     from clod_adapter.gaussians import Gaussians
 
+PRUNED = "the unadapted base, pruned to the same counts by two rankings"
+MATCHED = "other files, each row followed by the dial value with the same count"
 CLOSE = 0.01  # relative difference up to which two counts are equal
 POPPING_VIEWS = 2  # held-out views in which the dial is turned
 PATH_CAMERAS = 5  # neighbours by name, which are usually photographed one after the other
@@ -80,10 +82,8 @@ def execute(args: Namespace) -> dict[str, Any]:
     models, scene = read_inputs(args, paths(args), console, training=bool(args.base))
     model, *others = (each.gaussians for each in models)
     base = others.pop() if args.base else None
-    if model.sigma_d is None:
-        console.note(f"{args.model} has no sigma_d, so every dial value renders all of it")
     given = measuring.solve_dials(args, models[0], [view.camera for view in scene.test], console)
-    dials = measuring.choose_dials(given, model.attenuation, console)
+    dials = measuring.choose_dials(given, models[0], console)
     comparisons = Comparisons(model, scene, console, stop)
     with stop.listening():
         rows = measuring.measure(model, scene.test, dials, console, stop)
@@ -119,8 +119,7 @@ class Comparisons:
     def __init__(self, model: Gaussians, scene: Scene, console: Console, stop: GracefulStop) -> None:
         self.model, self.scene, self.console, self.stop = model, scene, console, stop
         self.report: dict[str, Any] = {"base_row": None, "ranked": [], "against": [], "popping": []}
-        self.pruned: list[tuple[str, Row]] = []
-        self.matched: list[tuple[str, Row]] = []
+        self.tables: dict[str, list[tuple[str, Row]]] = {}
         self.popping: list[tuple[str, Popping]] = []
 
     def prune(self, base: Gaussians, rows: Sequence[Row]) -> None:
@@ -136,12 +135,13 @@ class Comparisons:
         jobs = [(row, by, order) for row in rows for by, order in orders.items()]
         with self.console.meter("base") as meter:
             whole = self._row(base, 1.0, meter.part(0, len(jobs) + 1, "all"))
-            self.pruned, self.report["base_row"] = [("base", whole)], whole.as_dict()
+            table = self.tables[PRUNED] = [("base", whole)]
+            self.report["base_row"] = whole.as_dict()
             for i, (ours, by, order) in enumerate(jobs, 1):
                 row = self._row(base.select(order[: round(ours.kept)]), 1.0, meter.part(i, len(jobs) + 1, by))
                 row = replace(row, kept_share=row.kept / len(base))  # of the whole base
                 model = (f"s={ours.virtual_scale:g}", ours)
-                self.pruned += [*([] if model in self.pruned else [model]), (by, row)]
+                table += [*([] if model in table else [model]), (by, row)]
                 self.report["ranked"].append({"virtual_scale": ours.virtual_scale, "by": by, "row": row.as_dict()})
 
     def match(self, others: Mapping[str, Gaussians], rows: Sequence[Row]) -> None:
@@ -161,7 +161,7 @@ class Comparisons:
                     self.console.note(f"{path} keeps {count:,.0f} Gaussians; the model is compared with {more}")
                 listener = meter.part(i, len(jobs), path)
                 theirs, ours = self._row(other, s, listener), self._row(self.model, same, listener)
-                self.matched += [(name, theirs), (f"s={ours.virtual_scale:.4g}", ours)]
+                self.tables.setdefault(MATCHED, []).extend([(name, theirs), (f"s={ours.virtual_scale:.4g}", ours)])
                 found = {"model": path, "label": name, "theirs": theirs.as_dict(), "ours": ours.as_dict()}
                 self.report["against"].append(found)
 
@@ -197,9 +197,7 @@ class Comparisons:
         """For the console; empty without comparisons."""
         from .shared.measure import popping_table, table
 
-        pruned = "the unadapted base, pruned to the same counts by two rankings"
-        matched = "other files, each row followed by the dial value with the same count"
-        parts = [f"{title}:\n{table(rows)}" for title, rows in ((pruned, self.pruned), (matched, self.matched)) if rows]
+        parts = [f"{title}:\n{table(rows)}" for title, rows in self.tables.items()]
         parts += [popping_table(self.popping)] if self.popping else []
         return "".join(f"\n{part}\n" for part in parts)
 

@@ -71,9 +71,7 @@ def execute(args: Namespace) -> dict[str, Any]:
     images = [out / name for name in image_names(views)]
     check_outputs(Outputs(derived=images, folders=[out], inputs=[args.model], scene=args.images))
     solved = solve_dials(args, model, [view.camera for view in views], console)
-    dials = choose_dials(solved or [1.0], model.gaussians.attenuation, console)
-    if model.gaussians.sigma_d is None and max(dials) > 1:
-        console.note(f"{args.model} has no sigma_d, so every dial value renders all of it")
+    dials = choose_dials(solved or [1.0], model, console)
     gaussians = model.gaussians.without_empty_bands()
     pictures = write_images(gaussians, views, dials, args, console)
     print(f"wrote {len(pictures)} image{'s' * (len(pictures) != 1)} to {out}")

@@ -28,17 +28,9 @@ from clod_adapter.training.loop import time_steps
 from clod_adapter.training.plan import NOT_NEEDED, Decision, Override, Plan
 from clod_adapter.training.planner import make_plan
 
+from ..shared import inputs
 from ..shared.console import Console, ProgressDisplay
-from ..shared.inputs import (
-    align,
-    on_device,
-    pick_device,
-    prepare_kernels,
-    read_checkpoint,
-    read_scene,
-    scene_to_train,
-    with_filter,
-)
+from ..shared.inputs import prepare_kernels, read_checkpoint
 from ..shared.measure import Stopwatch, measure, report_dials
 from ..shared.outputs import AdaptFiles
 from ..shared.pages import SNAPSHOT_VIEWS
@@ -80,24 +72,24 @@ class Run:
         args, console, watch, views = self.args, self.console, self.watch, list[View]()
         cache = ImageCache(int(IMAGES * parse_size(args.memory))) if args.memory else None
         with watch.time("load"):
-            base = on_device(read_checkpoint(args.ply, console, args.activated), pick_device(args.device, console))
+            base = read_checkpoint(args.ply, console, args.activated, device=inputs.pick_device(args.device, console))
             if base.vertex is not None:  # only writing needs the file's rows
                 base = replace(base, vertex=mapped(base.vertex, self.outputs.ply.parent))
-            photographs = read_scene(args.images, console, base.origin, cache) if args.images else None
+            photographs = inputs.read_scene(args.images, console, base.origin, cache) if args.images else None
         device = base.gaussians.means.device
         with watch.time("kernels"):
             prepare_kernels(console, device)
         with watch.time("evaluate"):
             if photographs is not None:
                 required = not args.misaligned_ok
-                photographs, self.alignment = align(base, photographs, args.images, console, required=required)
+                photographs, self.alignment = inputs.align(base, photographs, args.images, console, required=required)
                 views = [*photographs.test, *photographs.train]
-            self.base = base = with_filter(base, args, console, views)
+            self.base = base = inputs.with_filter(base, args, console, views)
         if base.gaussians.screen_filter.compensate:
             with watch.time("kernels"):
                 prepare_kernels(console, device, screen_filter=base.gaussians.screen_filter)
         with watch.time("place" if photographs is None else "evaluate"):
-            self.scene, self.config = scene_to_train(base.gaussians, photographs, self.config, console)
+            self.scene, self.config = inputs.scene_to_train(base.gaussians, photographs, self.config, console)
         if args.memory:
             self.memory = plan_memory(base, self.scene, parse_size(args.memory), console)
 

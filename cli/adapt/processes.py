@@ -27,11 +27,12 @@ from clod_adapter.training.state import Adapted, TrainingState
 from ..shared.console import ProgressDisplay
 from ..shared.process import GracefulStop, Launch, launched
 
-BACKENDS = {"cpu": "gloo", "cuda": "nccl"}  # of torch.distributed, by device
 if TYPE_CHECKING:
     from torch.distributed.distributed_c10d import Store
 
-CALL = "clod/call"  # the key in the store by which the first process calls the others, to "train" or to "end"
+BACKENDS = {"cpu": "gloo", "cuda": "nccl"}  # of torch.distributed, by device
+# Keys in the store: by which the first process calls the others, to "train" or to "end"; and why a process has ended.
+CALL, REASON = "clod/call", "clod/reason{}"
 POLL_EVERY = 0.05  # seconds between checks for work
 
 
@@ -57,13 +58,12 @@ def together(
         yield None
         return
     lean, config = plan.lean, plan.config
-    device = lean.means.device.type
+    device, each = lean.means.device.type, f"{config.batch} views a step, {config.steps:,} steps"
     job = (lean, scene.train, config, state, plan.subset, device)  # what ``adapt`` is given, and where it is
-    each = f"{config.batch} views a step, {config.steps:,} steps"
     display.console.say(f"{launch.size} processes ({BACKENDS[device]}): {each}")
     _store().set(CALL, "train")
     try:
-        if any(_store().check([_reason(rank)]) for rank in range(1, launch.size)):  # it would wait for ten minutes
+        if any(_store().check([REASON.format(k)]) for k in range(1, launch.size)):  # it would wait for ten minutes
             raise ProcessLost("a process of the group has ended")
         _use_threads(launch.local_size)
         with joined(_store(), launch.rank, launch.size) as group:
@@ -94,7 +94,7 @@ def take_part() -> None:
             except Exception as error:  # told before the others notice that this process has ended
                 with suppress(RuntimeError):
                     said = str(error) or type(error).__name__
-                    _store().set(_reason(launch.rank), f"process {launch.rank}: {said}")
+                    _store().set(REASON.format(launch.rank), f"process {launch.rank}: {said}")
                 raise
 
 
@@ -111,10 +111,10 @@ def _train(group: ProcessGroup, launch: Launch, stop: GracefulStop) -> None:
 
 def explain(lost: str) -> str:
     """Why a process was lost, with the error that it reported, if any."""
-    said = []
+    said = list[str]()
     with suppress(RuntimeError):  # the launcher's store has ended too
-        for key in map(_reason, range(1, launched().size)):
-            said += [_store().get(key).decode()] if _store().check([key]) else []
+        keys = map(REASON.format, range(1, launched().size))
+        said = [_store().get(key).decode() for key in keys if _store().check([key])]
     return "; ".join([lost, *said])
 
 
@@ -129,7 +129,7 @@ def _is_called(stop: GracefulStop, rank: int) -> bool:
     try:
         while not store.check([CALL]):
             if stop.requests:
-                store.set(_reason(rank), f"process {rank}: ended by a signal")
+                store.set(REASON.format(rank), f"process {rank}: ended by a signal")
                 break
             time.sleep(POLL_EVERY)
         return store.check([CALL]) and store.get(CALL) == b"train"  # it may have called before it could know
@@ -148,10 +148,6 @@ def _store() -> Store:
     except (RuntimeError, ValueError) as error:
         raise ClodError(f"the processes cannot meet ({str(error).partition('. ')[0]}); use torchrun") from error
     return store
-
-
-def _reason(rank: int) -> str:
-    return f"clod/reason{rank}"
 
 
 def _use_threads(local_size: int) -> None:

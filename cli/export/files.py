@@ -77,10 +77,10 @@ class Export:
 
     def __init__(self, args: Namespace) -> None:
         self.args, self.page, self.console = args, is_page(args), Console(args.quiet)
-        read = inputs.read_checkpoint(args.model, self.console, args.activated)
+        times = args.images is not None and args.fps
+        device = inputs.pick_device(args.device, self.console) if times else inputs.CPU
+        read = inputs.read_checkpoint(args.model, self.console, args.activated, device=device)
         self.model = inputs.with_filter(read, args, self.console)
-        if args.images is not None and args.fps:
-            self.model = inputs.on_device(self.model, inputs.pick_device(args.device, self.console))
         self.cameras: Sequence[Camera | Viewpoint] = ()
         self.about, self.views = "", list[Camera]()
         counts = given_budget(args) and not (self.page and args.psnr_drop)
@@ -98,7 +98,7 @@ class Export:
         if dials and self.page:
             dials = [initial_dial(dials[0], attenuation, self.console)]
         elif dials:
-            dials = choose_dials(dials, attenuation, self.console)
+            dials = choose_dials(dials, self.model, self.console)
         self.dials: list[float] = dials or []
 
     def _find_cameras(self) -> tuple[Sequence[Camera | Viewpoint], str]:

@@ -31,10 +31,13 @@ from clod_adapter.training.pseudo_views import LIGHTEST, STEPS_PER_PLACED, add_p
 from .console import Console
 from .outputs import size
 
+CPU = torch.device("cpu")
+
 
 def read_checkpoint(
-    path: str, console: Console, activated: Activated | None = None, origin: Origin | None = None
-) -> Checkpoint:
+    path: str, console: Console, activated: Activated | None = None, origin: Origin | None = None,
+    device: torch.device = CPU,
+) -> Checkpoint:  # fmt: skip
     with console.status(f"reading {path} ({size(Path(path))}) ..."):
         checkpoint = load(path, activated=activated, origin=origin)
     gaussians = checkpoint.gaussians
@@ -42,7 +45,7 @@ def read_checkpoint(
     more = f", with {columns}" * bool(columns) + f", drawn with {drawn.description}" * (drawn != CLASSIC)
     console.say(f"{path}: {len(gaussians):,} Gaussians, SH degree {gaussians.sh_degree}{more}")
     console.note(*checkpoint.notes, of=path)
-    return checkpoint
+    return replace(checkpoint, gaussians=gaussians.to(device))
 
 
 def read_scene(folder: str, console: Console, origin: Origin, cache: ImageCache | None = None) -> Scene:
@@ -83,7 +86,7 @@ def read_inputs(
     device, found = pick_device(args.device, console), list[Checkpoint]()
     for path in paths:
         origin = found[0].origin if found else None
-        found.append(on_device(read_checkpoint(path, console, args.activated, origin), device))
+        found.append(read_checkpoint(path, console, args.activated, origin, device))
     scene = read_scene(args.images, console, found[0].origin)
     if held_out and not scene.test:
         raise ClodError(f"{args.images}: there are no held-out photographs to evaluate on; give at least two")
@@ -95,7 +98,7 @@ def read_inputs(
 def pick_device(name: str, console: Console) -> torch.device:
     """The device of ``--device``; prints why a GPU is not used. Without one that works, cuda is an error."""
     if name == "cpu" or (name == "auto" and not torch.cuda.is_available()):
-        return torch.device("cpu")
+        return CPU
     reason = no_gpu()
     if reason is None:
         device = torch.device("cuda", torch.cuda.current_device())
@@ -104,7 +107,7 @@ def pick_device(name: str, console: Console) -> torch.device:
     if name == "cuda":
         raise ClodError(f"--device cuda: {reason}; or use --device cpu")
     console.say(f"on the CPU, although there is a GPU: {reason}")
-    return torch.device("cpu")
+    return CPU
 
 
 def no_gpu() -> str | None:
@@ -118,10 +121,6 @@ def no_gpu() -> str | None:
     except (RuntimeError, AssertionError) as error:  # not supported by this torch, or in use
         return f"torch cannot compute on it ({first_line(error)}); clod-adapt doctor prints a fix"
     return unusable()
-
-
-def on_device(checkpoint: Checkpoint, device: torch.device) -> Checkpoint:
-    return replace(checkpoint, gaussians=checkpoint.gaussians.to(device))
 
 
 WORDS = {"off": "without antialiasing", "on": "with antialiasing", "mip": "with Mip-Splatting's antialiasing"}
@@ -175,9 +174,6 @@ def named(cameras: Sequence[Camera], name: str, option: str) -> list[Camera]:
         return found
     some = ", ".join(camera.name for camera in cameras[:3])
     raise ClodError(f"{option}: no photograph is named {name!r}; names are like {some}")
-
-
-CPU = torch.device("cpu")
 
 
 def prepare_kernels(

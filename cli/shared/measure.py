@@ -15,7 +15,6 @@ from torch.nn.functional import avg_pool2d
 
 from clod_adapter.calibration import Calibration, Viewpoint
 from clod_adapter.cameras import Camera, Scene, View, spread
-from clod_adapter.config import AttenuationConfig
 from clod_adapter.equation.distances import viewpoint_of
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.budget import dial_for, dial_for_times, frame_times
@@ -126,14 +125,15 @@ def popping_table(results: Sequence[tuple[str, Popping]]) -> str:
 DIALS = (1.0, 2.0, 3.0, 5.0)
 
 
-def choose_dials(given: list[float] | None, attenuation: AttenuationConfig | None, console: Console) -> list[float]:
-    """The dial values to measure; a note if they are outside the trained range."""
+def choose_dials(given: list[float] | None, model: Checkpoint, console: Console) -> list[float]:
+    """The dial values to measure; a note if they are outside the trained range, or there is no dial."""
+    attenuation = model.gaussians.attenuation
     trained = attenuation.max_sv if attenuation else None
-    if given is None:
-        return [s for s in DIALS if trained is None or s < trained] + ([trained] if trained else [])
-    if trained is not None and max(given) > trained:
-        console.note(f"trained up to s = {trained:g}; larger dial values were not trained")
-    return given
+    dials = given or [s for s in DIALS if trained is None or s < trained] + ([trained] if trained else [])
+    if max(dials) > (trained or 1):
+        untrained = f"trained up to s = {trained or 0:g}; larger dial values were not trained"
+        console.note(untrained if trained else f"{model.path} has no sigma_d, so every dial value renders all of it")
+    return dials
 
 
 def measure(
