@@ -16,7 +16,7 @@ from clod_adapter.adapter import Adapter, dial_tensors
 from clod_adapter.config import CLASSIC
 from clod_adapter.errors import ClodError, refused_if_damaged
 from clod_adapter.io.atomic import atomic_path
-from clod_adapter.io.file_formats import KEY, read_whole
+from clod_adapter.io.file_formats import KEY, read_bytes
 from clod_adapter.io.settings import ADAPTER, DAMAGED, Metadata, document, parse_document, read_metadata
 from clod_adapter.io.tensor_file import parse_tensors, read_tensor_header, write_tensors
 
@@ -50,7 +50,7 @@ def load_adapter(path: str | Path) -> Adapter:
         ClodError: the file cannot be read, is damaged, not an adapter, or of a newer format.
     """
     path = Path(path)
-    tensors, metadata = parse_tensors(path, read_whole(path))
+    tensors, metadata = parse_tensors(path, read_bytes(path))
     about, settings = _description(path, metadata)
     assert settings.attenuation is not None
     with refused_if_damaged(path, "its tensors or settings are damaged", DAMAGED[1]):

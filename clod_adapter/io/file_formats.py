@@ -12,7 +12,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 
-from clod_adapter.errors import ClodError
+from clod_adapter.errors import ClodError, refused_if_damaged
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.origin import NOWHERE, Origin
 
@@ -93,7 +93,7 @@ def check_written(path: Path) -> None:
 def read_source(path: Path) -> Source:
     """The content of a file in any format; every reader refuses, in one line, what is damaged or of another kind."""
     check_readable(path)
-    data = read_whole(path)  # once, and not mapped: another program may write the file meanwhile
+    data = read_bytes(path)  # once, and not mapped: another program may write the file meanwhile
     found: Source = _call(f"{format_of(path).module}.read", path, data)
     return found._replace(sha256=hashlib.sha256(data).hexdigest())
 
@@ -138,18 +138,19 @@ def write(
     return notes
 
 
+START = 64  # bytes that tell the kind of a file
 NEW_SPZ = b"NGSP"  # first bytes of version 4, which splat-transform reads; earlier versions are gzipped
 _START: dict[str, tuple[bytes, ...]] = {".glb": (b"glTF",), ".spz": (b"\x1f\x8b", NEW_SPZ)}
 
 
 def check_start(path: Path) -> None:
     """Refuses a file whose first bytes are not of its suffix's format."""
-    suffix, start = path.suffix.lower(), read_start(path)
+    suffix, start = path.suffix.lower(), read_bytes(path, START)
     refuse_known(path, start)
     if suffix in _START and not start.startswith(_START[suffix]):
         refuse(path, start, f"is not a {suffix} file by its first bytes; copy or export it again")
     if suffix == ".spz" and start.startswith(NEW_SPZ):
-        _call("formats.splat_transform.check", path, " of version 4")
+        _call("formats.splat_transform.check", path)
     if suffix == ".splat" and (path.stat().st_size % 32 or start.startswith(b"ply")):  # else any bytes are one
         refuse(path, start, "is not a .splat file, whose rows have 32 bytes; copy or export it again")
     if suffix == ".safetensors" and '"clod-adapter"' in _call("tensor_file.read_tensor_header", path)[1].get(KEY, ""):
@@ -205,19 +206,12 @@ def refuse_long_numbers(path: Path, text: bytes) -> None:
         raise ClodError(f"{path}: is damaged (a number of more than 1,000 digits); copy or export it again")
 
 
-def read_start(path: Path, size: int = 64) -> bytes:
-    """The first bytes of a file, at most ``size``; all with -1."""
-    try:
+def read_bytes(path: Path, most: int = -1) -> bytes:
+    """The bytes of a file, or its first ones."""
+    with refused_if_damaged(path, "cannot be read", "check the path"):  # ValueError: a name that holds a NUL
         refuse_irregular(path)
         with open(path, "rb") as file:
-            return file.read(size)
-    except (OSError, ValueError) as error:  # ValueError: a name that holds a NUL
-        raise ClodError(f"{path}: cannot be read ({getattr(error, 'strerror', error)}); check the path") from error
-
-
-def read_whole(path: Path) -> bytes:
-    """All bytes of a file."""
-    return read_start(path, -1)
+            return file.read(most)
 
 
 def refuse_known(path: Path, start: bytes) -> None:

@@ -36,7 +36,7 @@ class Head(NamedTuple):
 
 def read_head(path: Path) -> Head:
     """The header alone, so that a large mesh is refused without parsing its faces."""
-    return _parse_head(path, file_formats.read_start(path, HEADER_LIMIT))
+    return _parse_head(path, file_formats.read_bytes(path, HEADER_LIMIT))
 
 
 def _parse_head(path: Path, start: bytes) -> Head:
@@ -112,7 +112,7 @@ def _elements(data: bytes, head: Head) -> dict[str, np.ndarray]:
         if any(isinstance(each, PlyListProperty) for each in element.properties):
             break
         kind = np.dtype(element.dtype(head.ply.byte_order))
-        found[element.name] = _native(np.frombuffer(data, kind, count, at))
+        found[element.name] = np.frombuffer(data, kind, count, at)
         at += count * kind.itemsize
     if "vertex" not in found:
         lines = io.TextIOWrapper(io.BytesIO(data if head.ply.text else b""), "latin-1")  # CR ends a line too
@@ -120,12 +120,8 @@ def _elements(data: bytes, head: Head) -> dict[str, np.ndarray]:
             raise ValueError(f"a row of more than {_LONGEST:,} characters")  # which would be copied several times
         with warnings.catch_warnings(), np.errstate(over="ignore"):
             warnings.simplefilter("ignore")  # of text that is beyond float32's range
-            return {each.name: _native(each.data) for each in PlyData.read(io.BytesIO(data))}
-    return found
-
-
-def _native(rows: np.ndarray) -> np.ndarray:
-    return rows.astype(rows.dtype.newbyteorder("="), copy=False)
+            found = {each.name: each.data for each in PlyData.read(io.BytesIO(data))}
+    return {name: rows.astype(rows.dtype.newbyteorder("="), copy=False) for name, rows in found.items()}
 
 
 def _arrays(rows: np.ndarray, sh_degree: int) -> Arrays:

@@ -17,7 +17,7 @@ import numpy as np
 from safetensors import safe_open
 
 from clod_adapter.errors import ClodError, refused_if_damaged
-from clod_adapter.io.file_formats import KEY, read_start, refuse_known
+from clod_adapter.io.file_formats import KEY, START, read_bytes, refuse_known
 from clod_adapter.io.settings import MODEL, Metadata, Source, document, parse_metadata
 from clod_adapter.io.values import SIGMA, arrays_of, dial_columns
 
@@ -65,7 +65,7 @@ def parse_tensors(path: Path, data: bytes) -> tuple[dict[str, Tensor], dict[str,
     """The tensors and the metadata of an input file with these bytes."""
     from safetensors.torch import load  # here: a header is read without torch
 
-    refuse_known(path, data[:64])
+    refuse_known(path, data[:START])
     with refused_if_damaged(path, *_DAMAGED):
         tensors, head = load(data), data[8 : 8 + int.from_bytes(data[:8], "little")]
         return tensors, json.loads(head).get("__metadata__", {})
@@ -73,7 +73,7 @@ def parse_tensors(path: Path, data: bytes) -> tuple[dict[str, Tensor], dict[str,
 
 def read_tensor_header(path: Path) -> tuple[list[str], dict[str, str]]:
     """The names of the tensors and the metadata, without torch."""
-    refuse_known(path, read_start(path))
+    refuse_known(path, read_bytes(path, START))
     refused = refused_if_damaged(path, *_DAMAGED)
     with refused, open(path, "rb") as file, safe_open(_name_of(file), framework="np") as tensors:
         return list(tensors.keys()), tensors.metadata() or {}

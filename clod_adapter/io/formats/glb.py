@@ -164,14 +164,11 @@ def read(path: Path, data: bytes) -> Source:
 
 def _chunks(path: Path, data: memoryview) -> tuple[dict[str, Any], memoryview]:
     """The JSON and the binary chunk."""
-    version, length, size, kind = struct.unpack_from("<IIII", data, 4) if len(data) >= 20 else (0, 0, 0, 0)
-    if version != 2 or kind != _JSON or max(length, 20 + size) > len(data):
-        raise ClodError(f"{path}: is truncated, or no glTF 2.0; copy or export it again")
+    version, length, size, kind = struct.unpack_from("<IIII", data, 4)
     more = struct.unpack_from("<I", data, 20 + size)[0] if 28 + size <= length else 0
-    binary = data[28 + size : 28 + size + more]
-    if len(binary) < more:
-        raise ClodError(f"{path}: is truncated; copy or export it again")
-    return json.loads(bytes(data[20 : 20 + size])), binary
+    if version != 2 or kind != _JSON or max(length, 20 + size, 28 + size + more if more else 0) > len(data):
+        raise ClodError(f"{path}: is truncated, or no glTF 2.0; copy or export it again")
+    return json.loads(bytes(data[20 : 20 + size])), data[28 + size : 28 + size + more]
 
 
 def _find(path: Path, gltf: dict[str, Any]) -> list[tuple[int, dict[str, Any]]]:

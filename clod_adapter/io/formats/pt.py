@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from clod_adapter.errors import ClodError, refused_if_damaged
-from clod_adapter.io.file_formats import KEY, read_start, refuse
+from clod_adapter.io.file_formats import KEY, START, read_bytes, refuse
 from clod_adapter.io.settings import MODEL, Metadata, Source, document, parse_metadata
 from clod_adapter.io.values import SIGMA, arrays_of, dial_columns
 
@@ -31,7 +31,7 @@ _PLAIN = r"collections OrderedDict|torch\._utils _rebuild_(tensor_v2|parameter)|
 
 def check(path: Path) -> None:
     """Refuses, without torch, what is not a file of ``torch.save``, or would unpack to more than it is."""
-    start = read_start(path)
+    start = read_bytes(path, START)
     if start.startswith(b"\x80"):
         raise ClodError(f"{path}: is a pickle in PyTorch's format before 1.6; load it and torch.save it again")
     if not start.startswith(b"PK"):

@@ -20,7 +20,7 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 from clod_adapter.errors import ClodError
-from clod_adapter.io.file_formats import read_start, read_whole, refuse_known
+from clod_adapter.io.file_formats import START, read_bytes, refuse_known
 
 if TYPE_CHECKING:
     from clod_adapter.io.settings import Source
@@ -114,31 +114,32 @@ def time_limit(count: int) -> float:
     return LIMIT + LIMIT_EACH * count
 
 
-def check(path: Path, version: str = "") -> SplatTransform:
-    """The converter; refuses what cannot be converted here. ``version`` is of the format, where it is only one."""
-    refuse_known(path, read_start(path))
+def check(path: Path) -> SplatTransform:
+    """The converter; refuses what cannot be converted here."""
+    refuse_known(path, read_bytes(path, START))
     try:
         return SplatTransform.find()
     except ClodError as error:
+        version = " of version 4" if path.suffix.lower() == ".spz" else ""  # earlier ones are read here
         raise ClodError(
             f"{path}: {path.suffix}{version} is read through splat-transform ({error}); better still, adapt the PLY "
             "that it was made from"
         ) from error
 
 
-def read(path: Path, _: bytes, version: str = "") -> Source:
+def read(path: Path, _: bytes) -> Source:
     """The Gaussians of the PLY that splat-transform converts the file to."""
     from clod_adapter.io import ply  # here: check needs neither plyfile nor numpy
     from clod_adapter.io.settings import Metadata, Source
 
-    tool = check(path, version)
+    tool = check(path)
     with TemporaryDirectory() as folder:
         converted = Path(folder) / "converted.ply"
         try:
             tool.run(path, converted, timeout=LIMIT_CONVERT)
         except ClodError as error:
             raise ClodError(f"{path}: cannot be read ({error}); copy or export it again") from error
-        arrays = ply.read(converted, read_whole(converted)).arrays
+        arrays = ply.read(converted, read_bytes(converted)).arrays
     note = f"quantised: {path.suffix} stores positions, scales, rotations and colours in a few bits each"
     return Source(arrays, Metadata(), (note, f"read through splat-transform {tool.version}"))
 

@@ -33,7 +33,7 @@ from clod_adapter.equation.units import estimated_distance, in_world_units, know
 from clod_adapter.errors import ClodError, refused_if_damaged
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io import values
-from clod_adapter.io.file_formats import NEW_SPZ, read_start, read_whole
+from clod_adapter.io.file_formats import NEW_SPZ, START, read_bytes
 from clod_adapter.io.formats import splat_transform
 from clod_adapter.io.settings import DAMAGED, MODEL, TAG, Metadata, Source, document, parse_metadata
 from clod_adapter.io.values import GROWTH, SIGMA, arrays_of, bytes_of, dial_columns, half_turn
@@ -155,13 +155,13 @@ def _losses(arrays: dict[str, np.ndarray], bits: int, degree: int) -> tuple[str,
 
 def has_dial(path: Path) -> bool:
     """Reads all of the file, which is never much."""
-    return not read_start(path).startswith(NEW_SPZ) and SIGMA in read(path, read_whole(path)).arrays
+    return not read_bytes(path, START).startswith(NEW_SPZ) and SIGMA in read(path, read_bytes(path)).arrays
 
 
 def read(path: Path, data: bytes) -> Source:
     """Reads versions 2 and 3, SH degree 0 to 4; version 4 is converted by splat-transform."""
     if data.startswith(NEW_SPZ):
-        return splat_transform.read(path, data, " of version 4")
+        return splat_transform.read(path, data)
     data = _unpacked(path, data)
     magic, version, count, degree, bits, flags, _ = HEADER.unpack_from(data)
     if magic != MAGIC or version not in (2, 3) or degree not in SH_COUNTS or bits > 24 or count > MOST:

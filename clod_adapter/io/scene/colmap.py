@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from clod_adapter.errors import ClodError, refused_if_damaged
-from clod_adapter.io.file_formats import read_whole, refuse_long_numbers
+from clod_adapter.io.file_formats import read_bytes, refuse_long_numbers
 from clod_adapter.io.scene.folder import find_cameras, name_parts
 from clod_adapter.origin import NOWHERE
 
@@ -111,10 +111,10 @@ def _check_records(model: Path) -> None:
     for name, after in _RECORDS.items():
         path = model / name
         if (text := path.with_suffix(".txt")).exists():
-            refuse_long_numbers(text, read_whole(text))
+            refuse_long_numbers(text, read_bytes(text))
         if not path.exists():
             continue
-        data, at = read_whole(path), 8
+        data, at = read_bytes(path), 8
         try:
             for _ in range(struct.unpack_from("<Q", data)[0]):
                 at = after(data, at)

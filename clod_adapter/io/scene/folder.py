@@ -13,7 +13,7 @@ from typing import Any
 
 from clod_adapter._support.text import as_text, file_name
 from clod_adapter.errors import ClodError, refused_if_damaged
-from clod_adapter.io.file_formats import read_whole, refuse_long_numbers
+from clod_adapter.io.file_formats import read_bytes, refuse_long_numbers
 
 TRANSFORMS = ("transforms_train.json", "transforms.json")
 DATAPARSER = "dataparser_transforms.json"  # nerfstudio's: the frame it trained in
@@ -139,7 +139,7 @@ def read_json(path: Path) -> dict[str, Any]:
     """The object in a JSON file."""
     if path.is_file() and path.stat().st_size > MAX_BYTES:
         raise ClodError(f"{path}: is larger than {MAX_BYTES >> 20} MB, so it is no list of cameras; check the path")
-    text = read_whole(path)
+    text = read_bytes(path)
     refuse_long_numbers(path, text)
     with refused_if_damaged(path, "is no JSON or damaged", "export it again"):
         content = json.loads(text)
