@@ -16,7 +16,7 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.inspection.report import extra_columns
 from clod_adapter.io.atomic import atomic_path, atomic_paths
 from clod_adapter.io.file_formats import WRITABLE, write
-from clod_adapter.io.formats.splat_transform import SplatTransform, cutting_options, time_limit
+from clod_adapter.io.formats import splat_transform
 from clod_adapter.io.formats.tileset import write_tileset
 from clod_adapter.metrics import psnr
 from clod_adapter.render import render
@@ -198,7 +198,7 @@ class Export:
             self.console.note(*write_tileset(index.parent, found, errors.tolist(), origin=self.model.origin))
             return counts
         with TemporaryDirectory(dir=index.parent) as temporary:
-            words: list[str | Path] = [*cutting_options(sum(counts))]
+            words: list[str | Path] = [*splat_transform.cutting_options(sum(counts))]
             for k, (gaussians, about) in enumerate(contents):
                 source = Path(temporary) / f"{k}.ply"
                 write(source, gaussians, about)
@@ -221,9 +221,9 @@ class Export:
         self.console.note(f"{about}; --exact keeps all digits")
 
     def _transform(self, words: list[str | Path], out: Path, count: int) -> None:
-        tool, text = SplatTransform.find(), f"splat-transform packs {count:,} Gaussians"
+        tool, text = splat_transform.SplatTransform.find(), f"splat-transform packs {count:,} Gaussians"
         with self.console.status(f"{text} ...") as show:
-            limit = time_limit(count)
+            limit = splat_transform.LIMIT + splat_transform.LIMIT_EACH * count
             seconds = tool.run(*words, out, timeout=limit, progress=lambda s: show(f"{text}, {duration(s)} so far"))
         self.console.say(f"splat-transform {tool.version} took {duration(seconds)}")
         self.console.note("splat-transform rounds values and sorts the Gaussians")

@@ -170,7 +170,20 @@ def sh_degree_of(path: Path, header: PlyData) -> int:
         raise ClodError(f"{path}: has no vertex element (elements: {found}); give a splat in Inria's 3DGS layout")
     properties = header["vertex"].properties
     types = {p.name: "list" if isinstance(p, PlyListProperty) else p.val_dtype for p in properties}
-    _refuse_foreign(path, set(types))
+    if anchors := sorted(name for name in types if re.fullmatch(r"f_offset_\d+|f_anchor_feat_\d+", name)):
+        raise ClodError(
+            f"{path}: property {anchors[0]} is of a Scaffold-GS or Octree-GS file: anchors from which a network makes "
+            "Gaussians per view; use a checkpoint of 3DGS or of a method that keeps plain Gaussians"
+        )
+    if not types.keys() & {"f_dc_0", "scale_0"}:
+        raise ClodError(
+            f"{path}: properties f_dc_0 and scale_0 are missing, so this is a mesh or a point cloud; "
+            "give the point_cloud.ply that a 3DGS trainer writes"
+        )
+    if {"scale_0", "scale_1"} <= types.keys() and "scale_2" not in types:
+        raise ClodError(
+            f"{path}: property scale_2 is missing, so this is a 2DGS file of flat disks; use a 3DGS checkpoint"
+        )
     degree = degree_of(path, sum(re.fullmatch(r"f_rest_\d+", name) is not None for name in types))
     for name in (name for group in column_map(degree).values() for name in group):
         if name not in types:
@@ -180,20 +193,3 @@ def sh_degree_of(path: Path, header: PlyData) -> int:
     if lists := [name for name, kind in types.items() if kind == "list"]:
         raise ClodError(f"{path}: property {lists[0]} is a list, which splat viewers cannot read; remove it")
     return degree
-
-
-def _refuse_foreign(path: Path, names: set[str]) -> None:
-    if anchors := sorted(name for name in names if re.fullmatch(r"f_offset_\d+|f_anchor_feat_\d+", name)):
-        raise ClodError(
-            f"{path}: property {anchors[0]} is of a Scaffold-GS or Octree-GS file: anchors from which a network makes "
-            "Gaussians per view; use a checkpoint of 3DGS or of a method that keeps plain Gaussians"
-        )
-    if not names & {"f_dc_0", "scale_0"}:
-        raise ClodError(
-            f"{path}: properties f_dc_0 and scale_0 are missing, so this is a mesh or a point cloud; "
-            "give the point_cloud.ply that a 3DGS trainer writes"
-        )
-    if {"scale_0", "scale_1"} <= names and "scale_2" not in names:
-        raise ClodError(
-            f"{path}: property scale_2 is missing, so this is a 2DGS file of flat disks; use a 3DGS checkpoint"
-        )

@@ -33,7 +33,7 @@ HELP = (
     f"command in {VARIABLE}"
 )
 ASKING = 30.0  # seconds that a question about itself may take
-LIMIT, LIMIT_EACH = 600.0, 0.02  # seconds for a run, and per Gaussian; ten times what was measured
+LIMIT, LIMIT_EACH = 600.0, 0.02  # seconds after which a run has hung, and per Gaussian; ten times what was measured
 LIMIT_CONVERT = 1800.0  # seconds; five million Gaussians take about a minute
 TICK = 0.2  # seconds between two checks for its end
 # Without a GPU, where a round of SOG's clustering of spherical harmonics takes minutes, and its usual ten take an hour.
@@ -107,11 +107,6 @@ class SplatTransform:
         if process.returncode:
             raise ClodError(f"splat-transform {self.version} failed: {_reason(output)}")
         return time.perf_counter() - began
-
-
-def time_limit(count: int) -> float:
-    """Seconds after which a run over this many Gaussians has hung."""
-    return LIMIT + LIMIT_EACH * count
 
 
 def check(path: Path) -> SplatTransform:

@@ -233,7 +233,7 @@ def _unquantized(parts: list[np.ndarray], bits: int) -> dict[str, np.ndarray]:
     fixed = wide.view("<i4")[..., 0] >> 8  # with the sign
     return {
         "means": (fixed / 2.0**bits).astype(np.float32),
-        "quats": _smallest_three(quats) if quats.shape[1] == 4 else _first_three(quats / 127.5 - 1),
+        "quats": _rotations(quats),
         "log_scales": scales.astype(np.float32) / 16 - 10,
         "opacity_logits": values.logits_of_bytes(opacities[:, 0]),
         "sh0": ((colors.astype(np.float32) / 255 - 0.5) / COLOR)[:, None],
@@ -241,13 +241,11 @@ def _unquantized(parts: list[np.ndarray], bits: int) -> dict[str, np.ndarray]:
     }
 
 
-def _first_three(xyz: np.ndarray) -> np.ndarray:
-    """``[N, 4]`` wxyz of version 2, w >= 0."""
-    return np.concatenate([np.sqrt(np.maximum(0, 1 - (xyz**2).sum(1, keepdims=True))), xyz], 1)
-
-
-def _smallest_three(quats: np.ndarray) -> np.ndarray:
+def _rotations(quats: np.ndarray) -> np.ndarray:
     """``[N, 4]`` wxyz; the inverse of ``_packed_quats``."""
+    if quats.shape[1] == 3:  # version 2: w is not stored, and at least 0
+        xyz = quats / 127.5 - 1
+        return np.concatenate([np.sqrt(np.maximum(0, 1 - (xyz**2).sum(1, keepdims=True))), xyz], 1)
     packed = np.ascontiguousarray(quats).view("<u4")[:, 0]
     largest, xyzw = packed >> 30, np.zeros((len(packed), 4), np.float64)
     for axis in (3, 2, 1, 0):

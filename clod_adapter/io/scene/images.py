@@ -18,6 +18,7 @@ from PIL import Image, PngImagePlugin, UnidentifiedImageError
 from clod_adapter._kernels.memory import release
 from clod_adapter.errors import ClodError, refused_if_damaged
 from clod_adapter.io.atomic import atomic_path
+from clod_adapter.io.file_formats import read_bytes
 from clod_adapter.io.scene.colmap import HUGE, PosedImage
 
 Note = tuple[str, str]
@@ -101,20 +102,15 @@ def _opened(path: Path) -> Iterator[Image.Image]:
     except (ClodError, MemoryError):
         raise
     except UnidentifiedImageError as error:
-        raise ClodError(f"{path}: cannot be decoded, is {_kind(path)}; export it as JPEG or PNG") from error
+        start, unknown = read_bytes(path, 12), f"damaged or none of {', '.join(FORMATS)}"
+        kind = next((name for mark, name in OTHERS.items() if mark in start), unknown)
+        raise ClodError(f"{path}: cannot be decoded, is {kind}; export it as JPEG or PNG") from error
     except Image.DecompressionBombError as error:
         raise ClodError(f"{path}: has more than the 178 million pixels that are read; scale it down") from error
     except PermissionError as error:
         raise ClodError(f"{path}: cannot be read ({error.strerror}); check its permissions") from error
     except Exception as error:  # Pillow raises many kinds, some of its own, on damaged files
         raise ClodError(f"{path}: cannot be decoded ({error}); copy or export it again") from error
-
-
-def _kind(path: Path) -> str:
-    with open(path, "rb") as file:
-        start = file.read(12)
-    names = (name for mark, name in OTHERS.items() if mark in start)
-    return next(names, f"damaged or none of {', '.join(FORMATS)}")
 
 
 def _same_shape(size: tuple[int, int], width: int, height: int) -> bool:
@@ -183,9 +179,8 @@ def photograph(image: PosedImage, path: Path, max_width: int, cache: Path | None
         with atomic_path(file) as temporary:
             found.pixels.save(temporary, pnginfo=about, compress_level=1)
     lens = f"from {camera.model_name} into {cache}"
-    return found._replace(
-        notes=[*found.notes, ("undistorted {}, which may be deleted; the sources are untouched", lens)]
-    )
+    done = "undistorted {}, which may be deleted; the sources are untouched", lens
+    return found._replace(notes=[*found.notes, done])
 
 
 def _made(image: PosedImage, path: Path, max_width: int) -> Photograph:
@@ -200,7 +195,11 @@ def _made(image: PosedImage, path: Path, max_width: int) -> Photograph:
             # With pixel centres at +0.5, in COLMAP as here, the principal point scales like the focal length.
             camera.rescale(*pixels.size)
         if not image.is_pinhole:
-            pixels, camera = undistort(path, pixels, camera)
+            # As ``colmap image_undistorter`` by default: bilinear, the same focal length, and no blank pixel.
+            with refused_if_damaged(path, "COLMAP cannot undistort it", "check its camera's parameters"):
+                bitmap = pycolmap.Bitmap.from_array(np.asarray(pixels))
+                bitmap, camera = pycolmap.undistort_image(pycolmap.UndistortCameraOptions(), bitmap, camera)
+                pixels = Image.fromarray(bitmap.to_array())
         width, height = pixels.size
         if width > max_width:
             size = (max_width, max(1, int(height * max_width / width)))
@@ -212,15 +211,6 @@ def _made(image: PosedImage, path: Path, max_width: int) -> Photograph:
     if not 0 < min(K[0, 0], K[1, 1]) <= np.abs(K).max() < HUGE:
         raise ClodError(f"{path}: its camera is not usable once undistorted; check the camera's parameters")
     return Photograph(pixels, K, notes)
-
-
-def undistort(path: Path, pixels: Image.Image, camera: pycolmap.Camera) -> tuple[Image.Image, pycolmap.Camera]:
-    """As ``colmap image_undistorter`` by default: bilinear, the same focal length, cropped to have no blank pixel."""
-    with refused_if_damaged(path, "COLMAP cannot undistort it", "check its camera's parameters"):
-        bitmap, pinhole = pycolmap.undistort_image(
-            pycolmap.UndistortCameraOptions(), pycolmap.Bitmap.from_array(np.asarray(pixels)), camera
-        )
-    return Image.fromarray(bitmap.to_array()), pinhole
 
 
 def cache_folder(scene: Path) -> Path:

@@ -56,7 +56,9 @@ def _frames(path: Path, held_out: bool | None) -> tuple[list[PosedImage], list[s
     for number, frame in enumerate(frames):
         if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
             raise ClodError(f"{path}: frame {number} has no file_path; export the file again")
-        name = _name(path, frame["file_path"])
+        name = "/".join(name_parts(frame["file_path"], path))
+        # isfile, as it is False for what can be no path
+        name = next((name + end for end in ENDINGS if isfile(path.parent / file_name(name + end))), name)
         where = f"{path}: frame {name}"
         camera = _camera(where, path.parent / file_name(name), ChainMap(frame, content))
         pose, viewmat = read_pose(where, frame, "transform_matrix"), np.eye(4)
@@ -69,12 +71,6 @@ def _frames(path: Path, held_out: bool | None) -> tuple[list[PosedImage], list[s
     if any("mask_path" in frame for frame in frames):
         notes.append(f"the masks of {path.name} are not used")
     return images, notes
-
-
-def _name(path: Path, file_path: str) -> str:
-    name = "/".join(name_parts(file_path, path))
-    # isfile, as it is False for what can be no path
-    return next((name + ending for ending in ENDINGS if isfile(path.parent / file_name(name + ending))), name)
 
 
 def read_pose(where: object, values: Mapping[str, Any], key: str) -> np.ndarray:
@@ -133,10 +129,8 @@ def _focal(pixels: int, angle: float) -> float:
 def in_trained_frame(folder: Path, cameras: Path, images: list[PosedImage]) -> tuple[list[PosedImage], list[str]]:
     """The images in the frame that nerfstudio trained in, and a note; unchanged without its file in ``folder``.
 
-    nerfstudio rotates, moves and scales its cameras, trains in that frame and exports its splats in it. With
-    ``transform`` of dataparser_transforms.json the 3x4 matrix ``[R | t]`` and ``scale`` its number, a point ``x`` of
-    the world that the data came in (COLMAP's, where ``ns-process-data`` or the colmap dataparser turned it first) is in
-    that frame
+    nerfstudio rotates, moves and scales its cameras, and exports its splats in that frame. With ``transform``, the 3x4
+    matrix ``[R | t]``, and ``scale`` of dataparser_transforms.json, a point ``x`` of the world of its data is there
 
         x_trained = scale (R x + t)
 
@@ -145,8 +139,7 @@ def in_trained_frame(folder: Path, cameras: Path, images: list[PosedImage]) -> t
 
     Source: nerfstudio 1.1, ``base_dataparser.save_dataparser_transform`` and ``nerfstudio_dataparser``, which
     multiplies ``transform`` by the ``applied_transform`` of a transforms.json, and ``scale`` by its ``applied_scale``.
-
-    Those of a transforms file are taken out again, as its poses have them already.
+    These are taken out again, as the poses of that file have them already.
     """
     path = folder / DATAPARSER
     if not path.is_file():
