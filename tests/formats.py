@@ -20,12 +20,13 @@ from scipy.spatial.transform import Rotation
 
 from clod_adapter.calibration import Calibration, CalibrationRow
 from clod_adapter.config import SH_COUNTS, AttenuationConfig
-from clod_adapter.gaussians import SH_C0, Gaussians
+from clod_adapter.gaussians import Gaussians
 from scenes import gaussians
 
 ATTENUATION = AttenuationConfig(tau=0.02, cut="soft", reference_distance=3.217, max_sv=7.0)
 CALIBRATION = Calibration((CalibrationRow(1, 30, 29.1, 0.9, 2.5),), 40, 3, 64, 48, "a machine")
 ORIGIN = (5.1e5, -4096.0, 0.25)
+PACKED = Path(__file__).parent / "io" / "of_splat_transform" / "capture.compressed.ply"  # of the fixture ``capture``
 
 
 def model(degree: int = 3, count: int = 40, *, growth: bool = True) -> Gaussians:
@@ -41,18 +42,19 @@ def model(degree: int = 3, count: int = 40, *, growth: bool = True) -> Gaussians
     return g.replace(opacity_logits=logits, quats=quats, sigma_d=sigma, growth_d=growth_d, attenuation=ATTENUATION)
 
 
-def rotations(quats: torch.Tensor) -> Rotation:
-    return Rotation.from_quat(quats.double().roll(-1, 1).numpy())
+def axes_of(quats: torch.Tensor) -> torch.Tensor:
+    """``[N, 3, 3]`` float64, an axis in each column."""
+    return torch.from_numpy(Rotation.from_quat(quats.double().roll(-1, 1).numpy()).as_matrix())
 
 
 def turned(a: torch.Tensor, b: torch.Tensor) -> float:
-    """The largest angle between rotations, radians."""
-    return float((rotations(a).inv() * rotations(b)).magnitude().max())
+    """The sine of the largest angle between the axes of two ellipsoids, whose half turns are the same."""
+    return float(torch.linalg.cross(axes_of(a), axes_of(b), dim=1).norm(dim=1).max())
 
 
 def covariances(g: Gaussians) -> torch.Tensor:
     """``[N, 3, 3]`` float64, the same for every rotation that gives the same ellipsoid."""
-    axes = torch.from_numpy(rotations(g.quats).as_matrix()) * g.log_scales.double().exp()[:, None]
+    axes = axes_of(g.quats) * g.log_scales.double().exp()[:, None]
     return axes @ axes.mT
 
 
@@ -105,48 +107,6 @@ def change_setting(path: Path, name: str, old: str, new: str) -> Path:
     else:
         path.write_bytes(changed(path.read_bytes()))
     return path
-
-
-def write_packed(path: Path, g: Gaussians, *comments: str) -> Path:
-    """A compressed PLY, by the format's description: blocks of 256 in the order of the rows."""
-    chunks, shares, block = dict[str, np.ndarray](), list[np.ndarray](), np.arange(len(g)) // 256
-    rgb = 0.5 + SH_C0 * g.sh0[:, 0]
-    groups = (("x", "y", "z"), g.means), (("scale_x", "scale_y", "scale_z"), g.log_scales), (("r", "g", "b"), rgb)
-    for names, values in groups:
-        low, high = (end.reduceat(values.numpy(), np.arange(0, len(g), 256)) for end in (np.minimum, np.maximum))
-        for j, name in enumerate(names):
-            chunks |= {f"min_{name}": low[:, j], f"max_{name}": high[:, j]}
-        shares.append((values.numpy() - low[block]) / np.maximum(high - low, 1e-12)[block])
-    quats = torch.nn.functional.normalize(g.quats.double(), dim=1).numpy()
-    largest = np.abs(quats).argmax(1)
-    quats = quats * np.where(quats[np.arange(len(g)), largest] < 0, -1, 1)[:, None]
-    others = np.stack([np.delete(row, at) for row, at in zip(quats, largest, strict=True)])
-    packed = {
-        "position": _bits(shares[0], (11, 10, 11)), "scale": _bits(shares[1], (11, 10, 11)),
-        "color": _bits(np.concatenate([shares[2], g.opacities[:, None]], 1), (8, 8, 8, 8)),
-        "rotation": largest.astype(np.uint32) << 30 | _bits(others * np.sqrt(0.5) + 0.5, (10, 10, 10)),
-    }  # fmt: skip
-    flat = g.shN.numpy().transpose(0, 2, 1).reshape(len(g), -1)  # channel by channel
-    sh = {f"f_rest_{k}": np.clip((flat[:, k] / 8 + 0.5) * 256, 0, 255) for k in range(flat.shape[1])}
-    tables = ("chunk", chunks, "f4"), ("vertex", {f"packed_{k}": v for k, v in packed.items()}, "u4"), ("sh", sh, "u1")
-    elements = [PlyElement.describe(_table(columns, kind), name) for name, columns, kind in tables if columns]
-    PlyData(elements, byte_order="<", comments=comments).write(str(path))
-    return path
-
-
-def _table(columns: dict[str, np.ndarray], kind: str) -> np.ndarray:
-    rows = np.empty(len(next(iter(columns.values()))), [(name, kind) for name in columns])
-    for name, values in columns.items():
-        rows[name] = values
-    return rows
-
-
-def _bits(shares: np.ndarray, widths: tuple[int, ...]) -> np.ndarray:
-    packed = np.zeros(len(shares), np.uint32)
-    for values, width in zip(shares.T, widths, strict=True):
-        most = (1 << width) - 1
-        packed = packed << np.uint32(width) | np.clip(np.floor(values * most + 0.5), 0, most).astype(np.uint32)
-    return packed
 
 
 def write_rows(path: Path, rows: np.ndarray, order: str = "<", comments: Iterable[str] = ()) -> Path:
@@ -208,4 +168,4 @@ def inria_rows(g: Gaussians) -> np.ndarray:
     names = needed(g.sh_degree)
     columns = dict(zip([*names[:3], "nx", "ny", "nz", *names[3:]], np.concatenate(parts, 1).T, strict=True))
     columns |= {name: tensor.numpy() for name, tensor in g.tensors().items() if name in ("sigma_d", "growth_d")}
-    return _table(columns, "f4")
+    return with_columns(np.empty(len(g), [(name, "f4") for name in columns]), **columns)

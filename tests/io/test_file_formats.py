@@ -1,34 +1,28 @@
 """Checks that hold for every format: round trips, damaged files, refused models."""
 
 import gzip
+import shutil
 import zipfile
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from plyfile import PlyData
+from numpy.lib.recfunctions import repack_fields
+from plyfile import PlyData, PlyElement
 
+import scenes
 from clod_adapter.adapter import detach, extract
 from clod_adapter.errors import ClodError
-from clod_adapter.gaussians import Gaussians
+from clod_adapter.gaussians import SH_C0, Gaussians
 from clod_adapter.inspection.report import inspect
 from clod_adapter.io.adapter_file import load_adapter, save_adapter
 from clod_adapter.io.checkpoint import load, save
 from clod_adapter.io.file_formats import FORMATS, WRITABLE, check_readable, file_has_dial, write
-from formats import (
-    ATTENUATION,
-    CALIBRATION,
-    ORIGIN,
-    damaged,
-    model,
-    rows_by_place,
-    turned,
-    write_elements,
-    write_packed,
-)
-from scenes import gaussians
+from formats import ATTENUATION, CALIBRATION, ORIGIN, PACKED, damaged, model, rows_by_place, turned, write_elements
 
 ABOUT = "made in a test", "of two lines"
 DIAL = tuple(suffix for suffix in WRITABLE if FORMATS[suffix].carries_sigma)
@@ -40,10 +34,20 @@ def of(suffix: str, degree: int = 1, count: int = 40) -> Gaussians:
     return model(degree, count) if suffix in DIAL else detach(model(degree, count))
 
 
+# Largest differences of positions, log scales, opacities, sh0, shN and sigma_d, and the largest angle.
+EXACT = (0, 0, 0, 0, 0, 0, 1e-6)
+LOSSES = {
+    ".glb": (0, 2e-6, 1e-6, 0, 0, 0, 1e-6),
+    ".spz": (2.0**-20, 0.5001 / 16, 0.501 / 255, 0.51 / (0.15 * 255), 2.01 / 128, 2.0**-11, 5e-3),
+    ".spz of splat-transform": (2.0**-13, 0.5001 / 16, 0.501 / 255, 0.51 / (0.15 * 255), 8.6 / 128, 0, 5e-3),
+    ".compressed.ply": (4e-3, 2e-3, 0.51 / 255, 0.015, 4.1 / 128, 0, 9e-3),
+}
+
+
 def any_file(folder: Path, kind: str) -> Path:
     path, g = folder / f"a{kind}", of(kind, 0, 5) if kind in WRITABLE else model(0, 5)
     if kind == ".compressed.ply":
-        return write_packed(path, gaussians(5, 1, 0))
+        return Path(shutil.copy(PACKED, path))
     if kind == ".adapter.safetensors":
         save_adapter(path, extract(detach(g), g, fingerprint="ab", config={"steps": 3}))
         return path
@@ -53,26 +57,48 @@ def any_file(folder: Path, kind: str) -> Path:
     return path
 
 
-def same(suffix: str, g: Gaussians, again: Gaussians) -> None:
+def read(path: Path) -> None:
+    load_adapter(path) if "adapter" in path.name else load(path, activated="none")
+
+
+def same(kind: str, g: Gaussians, again: Gaussians) -> None:
     """To the precision of the format."""
-    loss = {".spz": (2.0**-20, 0.5001 / 16, 0.501 / 255, 0.51 / (0.15 * 255), 2.01 / 128, 5e-3, 2.0**-11)}.get(suffix)
-    means, scales, opacities, sh0, shN, angle, sigma = loss or (0, 1e-6, 1e-6, 0, 0, 1e-6, 0)
-    if suffix in (".pt", ".safetensors"):
-        scales = opacities = 0
+    *losses, sigma, angle = LOSSES.get(kind, EXACT)
     bands = again.shN.shape[1]
-    assert bands == (g.shN.shape[1] if suffix in (".ply", ".pt", ".safetensors") else min(g.shN.shape[1], 15))
-    for name, atol in (("means", means), ("log_scales", scales), ("opacities", opacities), ("sh0", sh0)):
-        rtol = 1e-6 if name == "log_scales" and scales else 0
-        torch.testing.assert_close(getattr(again, name), getattr(g, name), rtol=rtol, atol=atol)
-    near = g.shN[:, :bands].clamp(-1, 127 / 128) if loss else g.shN[:, :bands]
-    torch.testing.assert_close(again.shN, near, rtol=0, atol=shN)
+    assert bands == min(g.shN.shape[1], 24 if kind not in LOSSES else 15)
+    shN = g.shN[:, :bands].clamp(-1, 127 / 128) if "spz" in kind else g.shN[:, :bands]
+    wanted = {"means": g.means, "log_scales": g.log_scales, "opacities": g.opacities, "sh0": g.sh0, "shN": shN}
+    for (name, values), atol in zip(wanted.items(), losses, strict=True):
+        torch.testing.assert_close(getattr(again, name), values, rtol=0, atol=atol, msg=name)
     assert turned(again.quats, g.quats) <= angle
-    assert again.sigma_d is not None and g.sigma_d is not None
-    most = g.sigma_d.clamp(max=65504) if loss else g.sigma_d  # the largest float16
-    torch.testing.assert_close(again.sigma_d, most, rtol=sigma, atol=1e-6 * sigma)
-    assert (again.growth_d is None) == (g.growth_d is None)
-    if again.growth_d is not None:
-        torch.testing.assert_close(again.growth_d, g.growth_d, rtol=sigma, atol=1e-6 * sigma)
+    for name in ("sigma_d", "growth_d"):
+        found, wanted_dial = getattr(again, name), getattr(g, name)
+        assert (found is None) == (wanted_dial is None)
+        if found is not None:
+            most = wanted_dial.clamp(max=65504) if sigma else wanted_dial  # the largest float16
+            torch.testing.assert_close(found, most, rtol=sigma, atol=1e-6 * sigma)
+
+
+@pytest.mark.parametrize("kind", [".glb", ".spz of splat-transform", ".compressed.ply"])
+def test_files_of_splat_transform(capture: Any, kind: str) -> None:
+    """Of version 3.7: a .glb in glTF's axes under a node without a rotation; an .spz of version 3; two blocks."""
+    found = load(PACKED.with_name(f"capture{kind.split()[0]}"))
+    rows = rows_by_place(capture.gaussians.means.numpy(), found.gaussians.means.numpy())
+    same(kind, capture.gaussians, found.gaussians[torch.from_numpy(rows)])
+    assert found.gaussians.opacity_logits.isfinite().all() and not any(found.origin)
+    assert any("quantised" in note for note in found.notes) == (kind != ".glb")
+
+
+def test_an_older_compressed_ply(tmp_path: Path) -> None:
+    """Of SH degree 0; its colours are in [0, 1] and have no ranges."""
+    now, (chunks, vertex, _) = load(PACKED).gaussians, PlyData.read(str(PACKED), mmap=False).elements
+    ranges = [np.stack([chunks.data[f"{end}_{name}"] for name in "rgb"], 1).repeat(256, 0) for end in ("min", "max")]
+    older = chunks.data[[name for name in chunks.data.dtype.names if name[4:] not in "rgb"]]
+    write_elements(tmp_path / "a.ply", [PlyElement.describe(repack_fields(older), "chunk"), vertex])
+    found = load(tmp_path / "a.ply").gaussians
+    low, high = (torch.from_numpy(each[: len(now)]) for each in ranges)
+    torch.testing.assert_close((0.5 + SH_C0 * found.sh0[:, 0]) * (high - low) + low, 0.5 + SH_C0 * now.sh0[:, 0])
+    scenes.assert_equal(found.replace(sh0=now.sh0, shN=now.shN), now)
 
 
 @pytest.mark.parametrize(
@@ -159,16 +185,16 @@ def test_damage_raises_only_clod_error(tmp_path: Path, kind: str, data: st.DataO
     else:
         path.write_bytes(damaged(whole, data))
     try:
-        load_adapter(path) if "adapter" in kind else load(path, activated="none")
+        read(path)
     except ClodError as error:
         assert str(error).isprintable() and str(path) in str(error)
 
 
 def test_adapter_is_refused_as_model(tmp_path: Path) -> None:
     path = any_file(tmp_path, ".adapter.safetensors")
-    for read in (check_readable, load):
+    for opened in (check_readable, load):
         with pytest.raises(ClodError, match=f"{path}: is an adapter, not a model; clod-adapt apply BASE.ply"):
-            read(path)
+            opened(path)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -179,7 +205,7 @@ def test_truncation_is_refused(tmp_path: Path, kind: str) -> None:
     for size in (1, len(whole) // 2, len(whole) - least):
         path.write_bytes(whole[:size])
         with pytest.raises(ClodError, match=f"cut{kind}: "):
-            load_adapter(path) if "adapter" in kind else load(path)
+            read(path)
 
 
 def test_long_history_is_cut(tmp_path: Path) -> None:

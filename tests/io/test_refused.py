@@ -21,7 +21,7 @@ from safetensors.torch import load_file, save_file
 from clod_adapter.errors import ClodError
 from clod_adapter.io.checkpoint import load
 from clod_adapter.io.file_formats import FORMATS, check_readable, write
-from formats import change_glb, model, needed, random_rows, write_elements, write_packed, write_rows
+from formats import PACKED, change_glb, model, needed, random_rows, write_elements, write_rows
 from scenes import gaussians
 
 KHR = "KHR_gaussian_splatting"
@@ -164,11 +164,11 @@ def test_packed_ply(tmp_path: Path) -> None:
         (b"property uint packed_color", b"property int packed_color", "no packed_color of type u4"),
         (b"property uchar f_rest_4", b"property uchar f_rest_9", "no f_rest_4"),
         (b"property float min_r", b"property list uchar float min_r", "has a list"),
-        (b"element vertex 7", b"element vertex 6", "7 harmonics for 6 Gaussians|damaged"),
-        (b"element chunk 1", b"element chunk 0", "is damaged: 7 Gaussians need 1 chunks"),
-        (b"element vertex 7", b"element vertex 7000000", "is truncated"),
+        (b"element vertex 300", b"element vertex 299", "300 harmonics for 299 Gaussians|damaged"),
+        (b"element chunk 2", b"element chunk 1", "is damaged: 300 Gaussians need 2 chunks"),
+        (b"element vertex 300", b"element vertex 3000000", "is truncated"),
     ):
-        content = write_packed(tmp_path / "whole.ply", gaussians(7, 1, 0)).read_bytes()
+        content = PACKED.read_bytes()
         assert old in content
         refused(tmp_path, "a.ply", content.replace(old, new), f"({message})")
 

@@ -1,6 +1,7 @@
 """What commands read, in formats of other tools; their device; kernels, compiled before times are measured."""
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from clod_adapter.cli.shared import inputs
 from clod_adapter.cli.shared.console import Console
 from clod_adapter.cli.shared.inputs import pick_device, prepare_kernels
 from clod_adapter.errors import ClodError
-from formats import write_packed
+from formats import PACKED
 
 TINY = ("--iters", 2, "--max-sv", 4, "--out", "dial.ply")
 
@@ -47,7 +48,7 @@ def test_values_that_look_activated_need_the_option(clod: Any, capture: Any, tmp
 
 
 def test_a_compressed_file_is_adapted(clod: Any, capture: Any, tmp_path: Path) -> None:
-    write_packed(tmp_path / "base.compressed.ply", capture.gaussians)
+    shutil.copy(PACKED, tmp_path / "base.compressed.ply")
     done = clod("base.compressed.ply", "--images", capture.scene, *TINY)
     assert done.code == 0 and "note: base.compressed.ply: quantised" in done.err, done
     assert clod("apply", "base.compressed.ply", "dial.safetensors", "--out", "again.ply").code == 0
