@@ -70,14 +70,25 @@ def write_frames(folder: Path, frames: list[Any], file: str = "transforms.json",
     return folder
 
 
-def model_of(folder: Path, kind: str, params: list[float], width: int = 40, height: int = 30) -> None:
+def model_of(
+    folder: Path, kind: str, params: Sequence[float], width: int = 40, height: int = 30, *,
+    names: Sequence[str] = ("a.png",), form: str = "binary",
+) -> Path:  # fmt: skip
+    """The folder of a COLMAP model whose cameras are all at the origin and see two points."""
     reconstruction = pycolmap.Reconstruction()
     lens = pycolmap.Camera(model=kind, params=params, camera_id=1, width=width, height=height)
     reconstruction.add_camera_with_trivial_rig(lens)
-    image = pycolmap.Image(name="a.png", camera_id=1, image_id=1)
-    reconstruction.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
-    (folder / "sparse" / "0").mkdir(parents=True)
-    reconstruction.write_binary(str(folder / "sparse" / "0"))
+    for number, name in enumerate(names, start=1):
+        keypoints = [pycolmap.Point2D(np.array([k, number], float)) for k in range(2)]
+        image = pycolmap.Image(name=name, camera_id=1, image_id=number, points2D=keypoints)
+        reconstruction.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
+    for k in range(2):
+        track = pycolmap.Track([pycolmap.TrackElement(number, k) for number in range(1, len(names) + 1)])
+        reconstruction.add_point3D(np.array([k, 1, 5], float), track, np.zeros(3, np.uint8))
+    target = folder / "sparse" / "0"
+    target.mkdir(parents=True, exist_ok=True)
+    getattr(reconstruction, f"write_{form}")(str(target))
+    return target
 
 
 def seen(camera: pycolmap.Camera) -> np.ndarray:

@@ -3,21 +3,21 @@
 import json
 import math
 import os
+import shutil
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pycolmap
 import pytest
 import torch
-from hypothesis import HealthCheck, assume, given, settings
+from hypothesis import HealthCheck, assume, example, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
 from clod_adapter.errors import ClodError
 from clod_adapter.io.scene.load import load_cameras, load_scene
 from models import write_model
-from photographs import INTRINSICS, camera, model_of, pixels, pose, psnr_of, seen, to_world, write_frames, write_images
+from photographs import INTRINSICS, camera, model_of, pixels, pose, to_world, write_frames, write_images
 
 
 def frame(i: int, **rest: Any) -> dict[str, Any]:
@@ -89,17 +89,17 @@ ROUND = {"k1": 0.03, "k2": -0.01, "k3": 0.002, "k4": 0.001}
 def test_distorted_photographs_are_undistorted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, message: dict[str, Any], model: str, params: list[float]
 ) -> None:
+    """As those of a COLMAP model with the same lens."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    lens = pycolmap.Camera(model=model, width=160, height=120, params=[120, 122, 82, 58, *params])
-    shared = {"fl_x": 120, "fl_y": 122, "cx": 82, "cy": 58, "w": 160, "h": 120, **message}
-    scene = write_frames(tmp_path / "scene", [{"file_path": "a.png", "transform_matrix": to_world(0)}], **shared)
-    Image.fromarray(seen(lens)).save(scene / "a.png")
-    loaded = load_scene(scene)
-    view, K = loaded.train[0], loaded.train[0].camera.K
-    size = {"width": view.camera.width, "height": view.camera.height}
-    pinhole = pycolmap.Camera(model="PINHOLE", params=[K[0, 0], K[1, 1], K[0, 2], K[1, 2]], **size)
-    assert psnr_of(view.image.numpy(), seen(pinhole)) > 45
-    assert f"undistorted from {model} into" in loaded.notes[0]
+    size, views = {"fl_x": 120, "fl_y": 122, "cx": 82, "cy": 58, "w": 160, "h": 120}, []
+    write_frames(tmp_path / "a", [{"file_path": "a.png", "transform_matrix": to_world(0)}], **size, **message)
+    model_of(tmp_path / "b", model, [120, 122, 82, 58, *params], 160, 120)
+    for scene in (tmp_path / "a", tmp_path / "b"):
+        Image.fromarray(pixels(0, 160, 120)).save(scene / "a.png")
+        loaded = load_scene(scene)
+        views.append(loaded.train[0])
+        assert f"undistorted from {model} into" in loaded.notes[0]
+    assert torch.equal(views[0].image, views[1].image) and torch.equal(views[0].camera.K, views[1].camera.K)
 
 
 def test_colmap_model_takes_precedence(tmp_path: Path) -> None:
@@ -158,31 +158,23 @@ def changed(row: int, column: int, value: float) -> dict[str, Any]:
         ({"k4": 0.1}, "k4 of a camera that is no fisheye"),
         ({"camera_model": "EQUIRECTANGULAR"}, "camera_model 'EQUIRECTANGULAR' is not known"),
         ({"camera_model": {"a": 1}}, "camera_model .* is not known"),
+        *((content, "transforms.json: .*no JSON or damaged") for content in (
+            b"", b'{"frames": [', b"\xff\xfe\x00", b"[" * 100_000)),
+        (b'{"frames": ' + b"9" * 10_000 + b"}", "transforms.json: .*a number of more than 1,000 digits"),
+        (b"[]", "transforms.json: is no JSON object"), (b'{"frames": [3]}', "frame 0 has no file_path"),
+        *((content, "transforms.json: .*no list of frames") for content in (b'{"frames": []}', b'{"frames": {}}')),
+        (b"{", "transforms.json: is larger than 256 MB"),
     ],
 )  # fmt: skip
-def test_invalid_frame_is_named(tmp_path: Path, change: dict[str, Any], message: str) -> None:
-    write_frames(tmp_path, [{"file_path": "a.png", "transform_matrix": to_world(0), **INTRINSICS, **change}])
+def test_invalid_files_and_frames_are_refused(tmp_path: Path, change: dict[str, Any] | bytes, message: str) -> None:
+    if isinstance(change, bytes):
+        (tmp_path / "transforms.json").write_bytes(change)
+        os.truncate(tmp_path / "transforms.json", 300 * 2**20 if "256 MB" in message else len(change))
+    else:
+        write_frames(tmp_path, [{"file_path": "a.png", "transform_matrix": to_world(0), **INTRINSICS, **change}])
     with pytest.raises(ClodError, match=message) as caught:
         load_scene(tmp_path)
     assert str(caught.value).isprintable()
-
-
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        *((content, "no JSON or damaged") for content in (
-            b"", b'{"frames": [', b"\xff\xfe\x00", b"[" * 100_000)),
-        (b'{"frames": ' + b"9" * 10_000 + b"}", "a number of more than 1,000 digits"), (b"[]", "is no JSON object"),
-        *((content, "no list of frames") for content in (b'{"frames": []}', b'{"frames": {}}')),
-        (b'{"frames": [3]}', "frame 0 has no file_path"), (b"{", "is larger than 256 MB"),
-    ],
-)  # fmt: skip
-def test_damaged_file_is_refused(tmp_path: Path, content: bytes, message: str) -> None:
-    (tmp_path / "transforms.json").write_bytes(content)
-    if message.startswith("is larger"):
-        os.truncate(tmp_path / "transforms.json", 300 * 2**20)
-    with pytest.raises(ClodError, match=f"transforms.json: .*{message}"):
-        load_scene(tmp_path)
 
 
 def test_camera_without_a_size_is_left_out(tmp_path: Path) -> None:
@@ -225,51 +217,40 @@ def in_colmap(count: int, seed: int) -> np.ndarray:
     return np.array([to_world(seed + i) for i in range(count)])
 
 
-def turned(poses: np.ndarray, applied: Any) -> np.ndarray:
-    """The same as ns-process-data writes them into transforms.json."""
-    return np.vstack([applied, [0, 0, 0, 1.0]]) @ poses if applied is not None else poses
-
-
 def write_data(folder: Path, poses: np.ndarray, **rest: Any) -> None:
     frames = [{"file_path": name, "transform_matrix": p.tolist()} for name, p in zip(NAMES, poses, strict=False)]
     write_images(folder, NAMES[: len(poses)])
     write_frames(folder, frames, **INTRINSICS, **rest)
 
 
-def require_poses(folder: Path, want: np.ndarray) -> None:
-    """The loaded cameras are ``want [N, 3, 4]``, camera to world in OpenGL's axes, up to the unit of length."""
-    scene = load_scene(folder)
-    views = sorted((*scene.train, *scene.test), key=lambda view: view.camera.name)
+@settings(deadline=None, max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.sampled_from(["today", "older", "none"]), st.integers(0, 50), st.sampled_from([1.0, 0.25, None]))
+@example("today", 0, None)
+@example("older", 0, None)
+def test_cameras_of_nerfstudio(tmp_path: Path, turn: str, seed: int, applied_scale: float | None) -> None:
+    """Of its transforms.json; or, without a scale, of a COLMAP model, whose own world is turned."""
+    applied = APPLIED.get(turn)
+    poses = in_colmap(9, seed)
+    turned = poses if applied is None else np.vstack([applied, [0, 0, 0, 1.0]]) @ poses  # as ns-process-data
+    up = turned[:, :3, 1].mean(0)
+    assume(up[2] > -0.9 * np.linalg.norm(up))  # near half a turn nerfstudio's own matrix is no rotation
+    want, written = trained(turned, applied, applied_scale or 1.0)
+    shutil.rmtree(tmp_path / "scene", ignore_errors=True)
+    scene = tmp_path / "scene"
+    if applied_scale is None:
+        write_model(scene, [camera(seed + i) for i in range(9)], [Path(name).name for name in NAMES])
+        write_images(scene, NAMES)
+    else:
+        rest = {} if applied is None else {"applied_transform": applied}
+        write_data(scene, turned, **rest, **({} if applied_scale == 1 else {"applied_scale": applied_scale}))
+    (scene / "dataparser_transforms.json").write_text(json.dumps(written))
+    loaded = load_scene(scene)
+    views = sorted((*loaded.train, *loaded.test), key=lambda view: view.camera.name)
     found = torch.linalg.inv(torch.stack([view.camera.viewmat.double() for view in views])).numpy()
     np.testing.assert_allclose(found[:, :3, :3] * [1, -1, -1], want[:, :3, :3], atol=2e-5)
     np.testing.assert_allclose(found[:, :3, 3], want[:, :3, 3], atol=2e-5)
-    assert any("dataparser_transforms.json" in note for note in scene.notes)
-    assert not any("applied_transform" in note for note in scene.notes)
-
-
-@settings(deadline=None, max_examples=10, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(st.sampled_from(["today", "older", "none"]), st.integers(0, 50), st.sampled_from([1.0, 0.25]))
-def test_cameras_of_nerfstudio_data(tmp_path: Path, turn: str, seed: int, applied_scale: float) -> None:
-    applied = APPLIED.get(turn)
-    given_poses = turned(in_colmap(9, seed), applied)
-    up = given_poses[:, :3, 1].mean(0)
-    assume(up[2] > -0.9 * np.linalg.norm(up))  # near half a turn nerfstudio's own matrix is no rotation
-    want, written = trained(given_poses, applied, applied_scale)
-    rest = {} if applied is None else {"applied_transform": applied}
-    rest |= {"applied_scale": applied_scale} if applied_scale != 1 else {}
-    write_data(tmp_path, given_poses, **rest)
-    (tmp_path / "dataparser_transforms.json").write_text(json.dumps(written))
-    require_poses(tmp_path, want)
-
-
-@pytest.mark.parametrize("turn", ["today", "older"])
-def test_cameras_of_the_colmap_model(tmp_path: Path, turn: str) -> None:
-    """The colmap dataparser, or ns-process-data and its model: the world that is turned is COLMAP's."""
-    want, written = trained(turned(in_colmap(9, 0), APPLIED[turn]), APPLIED[turn])
-    write_model(tmp_path, [camera(i) for i in range(9)], [Path(name).name for name in NAMES])
-    write_images(tmp_path, NAMES)
-    (tmp_path / "dataparser_transforms.json").write_text(json.dumps(written))
-    require_poses(tmp_path, want)
+    assert any("dataparser_transforms.json" in note for note in loaded.notes)
+    assert not any("applied_transform" in note for note in loaded.notes)
 
 
 @pytest.mark.parametrize(

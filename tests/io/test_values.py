@@ -8,21 +8,17 @@ from clod_adapter.adapter import extract, with_dial
 from clod_adapter.config import FILTERS, AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.io.checkpoint import load, save
-from clod_adapter.io.ply_layout import inria_dtype
-from formats import write_rows
+from formats import needed, random_rows, write_rows
 
 SCALES = ("scale_0", "scale_1", "scale_2")
 
 
-def inria(count: int, extra: tuple[str, ...] = (), kind: str = "f4", seed: int = 0) -> np.ndarray:
+def inria(count: int, *extra: str) -> np.ndarray:
     """Rows as a trainer writes them: logits on both sides of 0, small scales."""
-    vertex = np.zeros(count, [(name, kind) for name in (*(inria_dtype(0).names or ()), *extra)])
-    rng = np.random.default_rng(seed)
-    for name in vertex.dtype.names:
-        vertex[name] = rng.normal(size=count)
-    vertex["opacity"] = rng.normal(size=count) * 3
+    vertex = random_rows(count, [*needed(), *extra])
+    vertex["opacity"] *= 3
     for name in SCALES:
-        vertex[name] = rng.normal(size=count) * 0.7 - 3
+        vertex[name] = vertex[name] * 0.7 - 3
     return vertex
 
 
@@ -64,53 +60,35 @@ def test_usual_values_need_no_option(tmp_path: Path) -> None:
         assert loaded.notes == () and ":" not in loaded.fingerprint
 
 
-def mip(count: int = 40) -> np.ndarray:
-    vertex = inria(count, ("filter_3D",))
-    vertex["filter_3D"] = np.exp(np.random.default_rng(1).normal(size=count) - 2.5)
-    return vertex
-
-
-def fused(vertex: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Scales and opacities as Mip-Splatting's renderer uses them, by its own formula, in float64."""
-    size = np.exp(np.stack([vertex[name].astype(np.float64) for name in SCALES], 1))
-    wide = size**2 + vertex["filter_3D"].astype(np.float64)[:, None] ** 2
-    opacity = 1 / (1 + np.exp(-vertex["opacity"].astype(np.float64)))
-    return np.sqrt(wide), opacity * np.sqrt((size**2).prod(1) / wide.prod(1))
-
-
-def test_mip_splatting_extreme_values(tmp_path: Path) -> None:
-    vertex = mip()
+def test_mip_splatting_is_fused(tmp_path: Path) -> None:
+    """By the formula of its renderer, here in float64; extreme values are finite."""
+    vertex, names = inria(40, "filter_3D"), [*needed()[:6], *needed()[-4:]]
+    vertex["filter_3D"] = np.exp(np.random.default_rng(1).normal(size=40) - 2.5)
     vertex["filter_3D"][:9] = 0, 1e30, 1e-30, 0.1, 0.1, 0.1, np.nan, np.inf, -0.1
     vertex["opacity"][3:6] = np.inf, 60, -90
     vertex["scale_0"][4], vertex["scale_1"][5] = -80, -200
+    size = np.exp(np.stack([vertex[name].astype(np.float64) for name in SCALES], 1))
+    wide = size**2 + vertex["filter_3D"].astype(np.float64)[:, None] ** 2
+    opacities = np.sqrt((size**2).prod(1) / wide.prod(1)) / (1 + np.exp(-vertex["opacity"].astype(np.float64)))
     base = load(write_rows(tmp_path / "in.ply", vertex))
-    g = base.gaussians
-    assert len(g) == len(vertex) - 2  # those with a filter that is not finite
+    g, kept = base.gaussians, np.isfinite(vertex["filter_3D"])
+    assert len(g) == 38 and g.screen_filter == FILTERS["mip"]
     assert g.opacity_logits.isfinite().all() and g.log_scales.isfinite().all()
     assert g.opacity_logits[0] == vertex["opacity"][0] and g.opacity_logits[2] == vertex["opacity"][2]
-    scales, opacities = fused(vertex)
-    np.testing.assert_allclose(g.scales[3], scales[3], rtol=2e-6)
-    np.testing.assert_allclose(g.opacities[3], opacities[3], rtol=2e-6)
+    usual = np.arange(40) != 1  # a filter of 1e30
+    np.testing.assert_allclose(g.scales[usual[kept]], np.sqrt(wide)[kept & usual], rtol=2e-6)
+    np.testing.assert_allclose(g.opacities[usual[kept]], opacities[kept & usual], rtol=2e-6, atol=1e-37)
     # In logs, where the opacity itself would be 0: a Gaussian thinner than float64 can square.
-    log = -90 - sum(np.log(scales[5]) - np.array([vertex[name][5] for name in SCALES], np.float64))
+    log = -90 - sum(np.log(wide[5]) / 2 - np.array([vertex[name][5] for name in SCALES], np.float64))
     np.testing.assert_allclose(g.opacity_logits[5], log, rtol=1e-6)
-
-
-def test_mip_splatting_is_fused(tmp_path: Path) -> None:
-    vertex = mip()
-    base = load(write_rows(tmp_path / "in.ply", vertex))
-    scales, opacities = fused(vertex)
-    assert base.gaussians.screen_filter == FILTERS["mip"]
-    np.testing.assert_allclose(base.gaussians.scales, scales, rtol=2e-6)
-    np.testing.assert_allclose(base.gaussians.opacities, opacities, rtol=2e-6)
-    assert base.comments == base.notes and "filter_3D is fused" in base.notes[0]
-    save(tmp_path / "out.ply", with_dial(base.gaussians, torch.rand(len(vertex)), AttenuationConfig()), base)
+    assert base.comments == base.notes[:1] and "filter_3D is fused" in base.comments[0]
+    save(tmp_path / "out.ply", with_dial(g, torch.rand(38), AttenuationConfig()), base)
     out = load(tmp_path / "out.ply")
-    assert "filter_3D" not in out.vertex.dtype.names and out.notes == () and base.notes[0] in out.comments
-    assert torch.equal(out.gaussians.log_scales, base.gaussians.log_scales)
-    assert torch.equal(out.gaussians.opacity_logits, base.gaussians.opacity_logits)
-    for name in set(inria_dtype(0).names or ()) - {*SCALES, "opacity"}:
-        np.testing.assert_array_equal(out.vertex[name], vertex[name])
+    assert "filter_3D" not in out.vertex.dtype.names and out.notes == () and base.comments[0] in out.comments
+    assert torch.equal(out.gaussians.log_scales, g.log_scales)
+    assert torch.equal(out.gaussians.opacity_logits, g.opacity_logits)
+    for name in names:
+        np.testing.assert_array_equal(out.vertex[name], vertex[name][kept])
 
 
 def test_activated_opacities_extreme_values(tmp_path: Path) -> None:
