@@ -20,15 +20,13 @@ from PIL import Image
 
 import browser
 import fake_gpu
-from clod_adapter.cameras import Camera
+from clod_adapter import Camera, Gaussians, render
 from clod_adapter.cli.main import main
 from clod_adapter.cli.shared.console import Console
 from clod_adapter.cli.shared.inputs import prepare_kernels
 from clod_adapter.config import FILTERS
 from clod_adapter.evaluation import frame_times
-from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.formats.splat_transform import VARIABLE
-from clod_adapter.render import render
 from clod_adapter.training import pseudo_views
 from formats import inria_rows, write_rows
 from models import write_model

@@ -6,19 +6,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from clod_adapter.adapter import detach, with_dial
+from clod_adapter import Gaussians, Hook, TrainableSubset, View, detach, dial_for, evaluate, render, with_dial
 from clod_adapter.bake import bake, order_by_extinction
 from clod_adapter.blocks.divide import block_target, context_rows, divide
-from clod_adapter.cameras import View
 from clod_adapter.config import AdaptConfig, AttenuationConfig
-from clod_adapter.evaluation.budget import dial_for
-from clod_adapter.evaluation.evaluate import evaluate
 from clod_adapter.evaluation.popping import dial_popping, path_popping
-from clod_adapter.gaussians import Gaussians
-from clod_adapter.hook import Hook
 from clod_adapter.initialization.importance import initialize
-from clod_adapter.render import render
-from clod_adapter.training.dial import TrainableSubset
 from clod_adapter.training.schedule import Sample
 from clod_adapter.training.trainer import Trainer
 from scenes import gaussians, photograph, ring

@@ -12,8 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from clod_adapter.cameras import Camera
-from clod_adapter.config import ScreenFilter
+from clod_adapter import Camera, ScreenFilter
 from clod_adapter.rasterizers.cpu import rasterize
 
 NEAREST = 0.2

@@ -16,8 +16,7 @@ import pytest
 import torch.distributed as dist
 
 import clod_adapter
-from clod_adapter.config import AdaptConfig
-from clod_adapter.progress import Progress
+from clod_adapter import AdaptConfig, Progress
 from clod_adapter.training.state import TrainingState
 from clod_adapter.training.trainer import Trainer
 

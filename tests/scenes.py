@@ -8,10 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from clod_adapter.cameras import Camera, Scene, View
-from clod_adapter.config import AttenuationConfig
-from clod_adapter.gaussians import Gaussians
-from clod_adapter.render import render
+from clod_adapter import AttenuationConfig, Camera, Gaussians, Scene, View, render
 
 
 def camera(

@@ -15,11 +15,10 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from clod_adapter.cameras import Camera
+from clod_adapter import Camera, Rendering
 from clod_adapter.cli.main import build_parser
 from clod_adapter.cli.shared.console import Console
 from clod_adapter.cli.view import make_page
-from clod_adapter.render import Rendering
 from clod_adapter.viewer.page import page_config
 from clod_adapter.viewer.server import Server
 

@@ -9,11 +9,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from clod_adapter import AttenuationConfig, ClodError, Gaussians
 from clod_adapter import adapter as adapters
 from clod_adapter.adapter import ATTRIBUTES, DIAL, SIGMA_MAX, Adapter, detach, trim, with_dial
-from clod_adapter.config import AttenuationConfig
-from clod_adapter.errors import ClodError
-from clod_adapter.gaussians import Gaussians
 
 CONFIG = AttenuationConfig(tau=0.01, reference_distance=3.5)
 extract = partial(adapters.extract, fingerprint="a" * 64, config={})

@@ -6,14 +6,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from clod_adapter.adapter import with_dial
-from clod_adapter.bake import bake, order_by_extinction
-from clod_adapter.config import AttenuationConfig
+from clod_adapter import AttenuationConfig, ClodError, Gaussians, bake, order_by_extinction, render, with_dial
 from clod_adapter.equation.attenuation import attenuate
 from clod_adapter.equation.distances import normalized_distances, viewpoint_of
-from clod_adapter.errors import ClodError
-from clod_adapter.gaussians import Gaussians
-from clod_adapter.render import render
 from scenes import camera, gaussians, ring
 
 CONFIG = AttenuationConfig(scene_distance=4.0)

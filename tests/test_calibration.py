@@ -9,14 +9,10 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from clod_adapter.adapter import extract, with_dial
+from clod_adapter import AttenuationConfig, ClodError, extract, load, load_adapter, save, save_adapter, with_dial
 from clod_adapter.calibration import Calibration, CalibrationRow, Viewpoint
-from clod_adapter.config import AttenuationConfig
 from clod_adapter.equation.distances import viewpoint_of
-from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.evaluate import Row
-from clod_adapter.io.adapter_file import load_adapter, save_adapter
-from clod_adapter.io.checkpoint import load, save
 from scenes import gaussians, ring
 
 number, positive = st.floats(-1e6, 1e6, allow_nan=False), st.floats(1e-9, 1e6)

@@ -5,10 +5,9 @@ import dataclasses
 import pytest
 import torch
 
+from clod_adapter import ClodError, render
 from clod_adapter.cameras import NEAR, Camera, Scene, View, camera_extent, in_its_unit
 from clod_adapter.config import CLASSIC
-from clod_adapter.errors import ClodError
-from clod_adapter.render import render
 from scenes import camera, gaussians, photograph, ring
 
 

@@ -13,12 +13,11 @@ import torch
 from torch import Tensor
 
 import gsplat_in_torch
-from clod_adapter import attach, from_gsplat, make_plan, place_cameras, render, render_pseudo_views, to_gsplat
+from clod_adapter import Scene, attach, from_gsplat, make_plan, place_cameras, render, render_pseudo_views, to_gsplat
 from clod_adapter.adapter import detach
 from clod_adapter.alignment.check import check_alignment
 from clod_adapter.blocks.divide import divide
 from clod_adapter.blocks.train import adapt_block, merge
-from clod_adapter.cameras import Scene
 from clod_adapter.evaluation.budget import frame_times, matching_dial
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.importance import for_training

@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from clod_adapter.config import AttenuationConfig
-from clod_adapter.errors import ClodError
-from clod_adapter.gaussians import Gaussians
+from clod_adapter import AttenuationConfig, ClodError, Gaussians
 from scenes import gaussians as some_gaussians
 
 CONFIG = AttenuationConfig()

@@ -9,10 +9,7 @@ import pytest
 import torch
 
 import clod_adapter
-from clod_adapter.config import AttenuationConfig
-from clod_adapter.errors import ClodError
-from clod_adapter.gaussians import Gaussians
-from clod_adapter.hook import Hook
+from clod_adapter import AttenuationConfig, ClodError, Gaussians, Hook
 from scenes import camera, gaussians
 
 N = 200

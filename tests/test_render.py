@@ -5,10 +5,8 @@ import math
 import pytest
 import torch
 
-from clod_adapter.adapter import detach, with_dial
-from clod_adapter.config import AttenuationConfig
+from clod_adapter import AttenuationConfig, ClodError, detach, with_dial
 from clod_adapter.equation.attenuation import dial
-from clod_adapter.errors import ClodError
 from clod_adapter.render import render, splat
 from scenes import camera, dialled, gaussians
 

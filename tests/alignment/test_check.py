@@ -10,14 +10,11 @@ import torch
 from torch import Tensor
 
 import scenes
+from clod_adapter import Gaussians, Scene, View, evaluate, render
 from clod_adapter.alignment.check import check_alignment, compare_filters
 from clod_adapter.alignment.frames import NERFSTUDIO_TURNS, into_file, known_frames
 from clod_adapter.alignment.search import guess_frame, scene_in
-from clod_adapter.cameras import Scene, View
 from clod_adapter.config import FILTERS
-from clod_adapter.evaluation.evaluate import evaluate
-from clod_adapter.gaussians import Gaussians
-from clod_adapter.render import render
 from scenes import gaussians, photograph, ring
 
 EYE = torch.eye(3, dtype=torch.float64)

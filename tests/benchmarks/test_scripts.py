@@ -14,10 +14,8 @@ import pytest
 import scaling
 import torch
 
-from clod_adapter.io.checkpoint import load
-from clod_adapter.io.scene.load import load_scene
+from clod_adapter import load, load_scene, render
 from clod_adapter.metrics import psnr
-from clod_adapter.render import render
 
 
 def test_surfaces_are_opaque() -> None:

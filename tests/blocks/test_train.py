@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from clod_adapter import AdaptConfig, ClodError, Gaussians, Scene, TrainableSubset, adapt, evaluate, render
 from clod_adapter.blocks.divide import (
     LEFT_OUT,
     Division,
@@ -15,15 +16,7 @@ from clod_adapter.blocks.divide import (
     split,
 )
 from clod_adapter.blocks.train import adapt_block, merge
-from clod_adapter.cameras import Scene
-from clod_adapter.config import AdaptConfig
-from clod_adapter.errors import ClodError
-from clod_adapter.evaluation.evaluate import evaluate
-from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.importance import initialize
-from clod_adapter.render import render
-from clod_adapter.training.dial import TrainableSubset
-from clod_adapter.training.loop import adapt
 from clod_adapter.training.state import TrainingState
 from clod_adapter.training.target_count import target_curve
 from runs import states_of

@@ -10,13 +10,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from clod_adapter import config
+from clod_adapter import config, evaluate, load, load_scene
 from clod_adapter.cli.adapt import listeners
 from clod_adapter.cli.adapt import run as adapt_run
 from clod_adapter.demo import gallery
-from clod_adapter.evaluation.evaluate import evaluate
-from clod_adapter.io.checkpoint import load
-from clod_adapter.io.scene.load import load_scene
 from clod_adapter.report.page import Picture
 from runs import pressing
 

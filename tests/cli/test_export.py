@@ -15,9 +15,8 @@ import torch
 from plyfile import PlyData
 
 import clod_adapter
+from clod_adapter import ClodError, load, save
 from clod_adapter.cli.shared.inputs import named
-from clod_adapter.errors import ClodError
-from clod_adapter.io.checkpoint import load, save
 from clod_adapter.io.formats import splat_transform
 from clod_adapter.io.ply_layout import write_comments
 from clod_adapter.io.settings import Metadata

@@ -7,9 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from clod_adapter.adapter import with_dial
-from clod_adapter.cameras import Camera
-from clod_adapter.config import AttenuationConfig
+from clod_adapter import AttenuationConfig, Camera, Gaussians, with_dial
 from clod_adapter.equation.attenuation import SIGMA_MAX, dial
 from clod_adapter.equation.distances import normalized_distances, normalizing_distance, typical_distance, viewpoint_of
 from clod_adapter.equation.units import (
@@ -19,7 +17,6 @@ from clod_adapter.equation.units import (
     nominal_distance,
     with_distance,
 )
-from clod_adapter.gaussians import Gaussians
 from scenes import camera, gaussians, ring
 
 CONFIG = AttenuationConfig(scene_distance=4.0)

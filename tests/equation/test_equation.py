@@ -12,11 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from clod_adapter.config import AttenuationConfig
+from clod_adapter import AttenuationConfig, ClodError
 from clod_adapter.equation.attenuation import FAINTEST, SIGMA_MAX, attenuate
 from clod_adapter.equation.extinction import extinction_scale, sigma_for_extinction
 from clod_adapter.equation.growth import LOG_GROWTH_MAX, growth_factors
-from clod_adapter.errors import ClodError
 from clod_adapter.training.paper import soft_count
 from scenes import camera
 

@@ -8,14 +8,9 @@ import torch
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
-from clod_adapter.adapter import with_dial
+from clod_adapter import AttenuationConfig, Camera, ClodError, Gaussians, dial_for, with_dial
 from clod_adapter.calibration import Calibration, CalibrationRow
-from clod_adapter.cameras import Camera
-from clod_adapter.config import AttenuationConfig
 from clod_adapter.equation.attenuation import dial
-from clod_adapter.errors import ClodError
-from clod_adapter.evaluation.budget import dial_for
-from clod_adapter.gaussians import Gaussians
 from scenes import gaussians, ring
 
 MAX_SV = 6.0

@@ -5,14 +5,8 @@ import math
 import pytest
 import torch
 
-from clod_adapter.adapter import with_dial
-from clod_adapter.cameras import View
-from clod_adapter.config import AttenuationConfig
-from clod_adapter.errors import ClodError
-from clod_adapter.evaluation.evaluate import evaluate
-from clod_adapter.gaussians import Gaussians
+from clod_adapter import AttenuationConfig, ClodError, Gaussians, View, evaluate, render, with_dial
 from clod_adapter.metrics import psnr_ssim
-from clod_adapter.render import render
 from scenes import camera, gaussians, in_front, photograph, ring
 
 

@@ -7,14 +7,9 @@ from typing import Any
 import pytest
 import torch
 
-from clod_adapter.adapter import with_dial
-from clod_adapter.cameras import Camera
-from clod_adapter.config import AttenuationConfig
-from clod_adapter.errors import ClodError
+from clod_adapter import AttenuationConfig, Camera, ClodError, Gaussians, Stopped, with_dial
 from clod_adapter.evaluation import frame_times
 from clod_adapter.evaluation.frame_times import PASSES, VIEWS, FrameTimes, settled, time_frames
-from clod_adapter.gaussians import Gaussians
-from clod_adapter.progress import Stopped
 from scenes import gaussians, ring
 
 DIALS = (1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 7.0)

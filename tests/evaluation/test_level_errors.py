@@ -3,12 +3,10 @@
 import pytest
 import torch
 
+from clod_adapter import AttenuationConfig, Camera, Gaussians
 from clod_adapter.calibration import Viewpoint
-from clod_adapter.cameras import Camera
-from clod_adapter.config import AttenuationConfig
 from clod_adapter.equation.distances import viewpoint_of
 from clod_adapter.evaluation.level_errors import geometric_errors, looking
-from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.formats.tileset import ALLOWED
 from scenes import gaussians
 

@@ -7,15 +7,10 @@ from itertools import product
 import pytest
 import torch
 
-from clod_adapter.adapter import with_dial
-from clod_adapter.cameras import Camera
-from clod_adapter.config import AdaptConfig, AttenuationConfig
+from clod_adapter import AdaptConfig, AttenuationConfig, Camera, ClodError, Gaussians, render, with_dial
 from clod_adapter.equation.distances import normalized_distances
 from clod_adapter.equation.extinction import sigma_for_extinction
-from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.popping import dial_popping, path, path_popping, sweep
-from clod_adapter.gaussians import Gaussians
-from clod_adapter.render import render
 from scenes import gaussians, ring
 
 

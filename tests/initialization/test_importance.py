@@ -6,13 +6,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from clod_adapter.cameras import View
-from clod_adapter.config import AdaptConfig, AttenuationConfig
+from clod_adapter import AdaptConfig, AttenuationConfig, ClodError, Gaussians, View
 from clod_adapter.equation.attenuation import attenuate
 from clod_adapter.equation.distances import typical_distance
 from clod_adapter.equation.extinction import extinction_scale
-from clod_adapter.errors import ClodError
-from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization import importance
 from clod_adapter.initialization.importance import (
     fitting_tau,

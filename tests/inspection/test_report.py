@@ -10,14 +10,11 @@ import torch
 from plyfile import PlyData, PlyElement
 
 import scenes
-from clod_adapter.adapter import with_dial
+from clod_adapter import AttenuationConfig, ClodError, load, save, with_dial
 from clod_adapter.cli.inspect import lines_of
 from clod_adapter.cli.shared.outputs import jsonable
-from clod_adapter.config import AttenuationConfig
-from clod_adapter.errors import ClodError
 from clod_adapter.inspection.authorship import looks_like
 from clod_adapter.inspection.report import Inspection, Splat, inspect
-from clod_adapter.io.checkpoint import load, save
 from clod_adapter.io.ply import read_head
 from clod_adapter.io.ply_layout import inria_dtype
 from clod_adapter.origin import NOWHERE

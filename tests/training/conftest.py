@@ -2,8 +2,7 @@
 
 import pytest
 
-from clod_adapter.cameras import Scene
-from clod_adapter.gaussians import Gaussians
+from clod_adapter import Gaussians, Scene
 from clod_adapter.initialization.importance import removal_error
 from scenes import capture, gaussians
 

@@ -8,11 +8,8 @@ import torch
 from torch import Tensor
 
 import clod_adapter as clod
-from clod_adapter.cameras import Scene
-from clod_adapter.config import AdaptConfig
+from clod_adapter import AdaptConfig, ClodError, Gaussians, Scene
 from clod_adapter.equation.attenuation import attenuate
-from clod_adapter.errors import ClodError
-from clod_adapter.gaussians import Gaussians
 from clod_adapter.losses import photometric_loss
 from clod_adapter.training.dial import SIGMA_RANGE, Dial, attach
 from clod_adapter.training.schedule import OURS, Sample

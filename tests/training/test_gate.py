@@ -3,11 +3,9 @@
 import pytest
 import torch
 
+from clod_adapter import Gaussians, Scene, render
 from clod_adapter.adapter import ATTRIBUTES
-from clod_adapter.cameras import Scene
-from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.importance import initialize
-from clod_adapter.render import render
 from clod_adapter.training.gate import decibels_below, split_views, squared_error
 from clod_adapter.training.loop import TrainingState, adapt
 from runs import config_of, states_of

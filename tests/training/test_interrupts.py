@@ -7,9 +7,7 @@ from typing import Any
 
 import pytest
 
-from clod_adapter import adapt
-from clod_adapter.config import AdaptConfig
-from clod_adapter.gaussians import Gaussians
+from clod_adapter import AdaptConfig, Gaussians, adapt
 from clod_adapter.training import trainer
 from clod_adapter.training.interrupts import DeferredInterrupt
 from runs import pressing

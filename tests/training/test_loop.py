@@ -12,19 +12,14 @@ import torch
 import torch.distributed as dist
 from torch.torch_version import TorchVersion
 
+from clod_adapter import ClodError, Gaussians, Phase, Progress, Scene, Stopped, evaluate, make_plan
 from clod_adapter.adapter import ATTRIBUTES, with_dial
-from clod_adapter.cameras import Scene
 from clod_adapter.config import AdaptConfig, AttenuationConfig
 from clod_adapter.equation.distances import in_frustum
 from clod_adapter.equation.units import with_distance
-from clod_adapter.errors import ClodError
-from clod_adapter.evaluation.evaluate import evaluate
-from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.importance import initialize, scene_distance
-from clod_adapter.progress import Phase, Progress, Stopped
 from clod_adapter.training.distributed import joined
 from clod_adapter.training.loop import TrainingState, adapt
-from clod_adapter.training.planner import make_plan
 from runs import change_step, config_of, states_of
 from scenes import assert_equal, capture, gaussians, photograph, ring
 

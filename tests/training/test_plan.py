@@ -7,14 +7,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from clod_adapter import Decision, Override, Plan, make_plan
+from clod_adapter import AdaptConfig, ClodError, Decision, Gaussians, Override, Plan, Scene, make_plan, render
 from clod_adapter.adapter import ATTRIBUTES, DIAL, with_dial
-from clod_adapter.cameras import Scene
-from clod_adapter.config import AdaptConfig
-from clod_adapter.errors import ClodError
-from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.importance import initialize, removal_error
-from clod_adapter.render import render
 from clod_adapter.training.dial import TrainableSubset
 from clod_adapter.training.plan import NAMES, NOT_NEEDED, largest_change
 from clod_adapter.training.planner import needed_share, seen

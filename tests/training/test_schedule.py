@@ -5,8 +5,7 @@ from dataclasses import replace
 
 import torch
 
-from clod_adapter.cameras import View
-from clod_adapter.config import AdaptConfig
+from clod_adapter import AdaptConfig, View
 from clod_adapter.training.paper import PaperSchedule
 from clod_adapter.training.schedule import OURS, Schedule, ViewSampler
 from scenes import capture

@@ -5,13 +5,8 @@ import copy
 import pytest
 import torch
 
+from clod_adapter import AdaptConfig, AttenuationConfig, Gaussians, Phase, Progress, Scene, TrainableSubset, adapt
 from clod_adapter.adapter import ATTRIBUTES, with_dial
-from clod_adapter.cameras import Scene
-from clod_adapter.config import AdaptConfig, AttenuationConfig
-from clod_adapter.gaussians import Gaussians
-from clod_adapter.progress import Phase, Progress
-from clod_adapter.training.dial import TrainableSubset
-from clod_adapter.training.loop import adapt
 from clod_adapter.training.state import TrainingState
 from runs import config_of, states_of
 from scenes import assert_equal

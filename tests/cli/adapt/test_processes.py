@@ -10,11 +10,10 @@ import pytest
 import torch
 
 import clod_adapter
+from clod_adapter import AdaptConfig, ClodError
 from clod_adapter.cli.main import build_parser
 from clod_adapter.cli.shared.process import Launch, launched
 from clod_adapter.cli.shared.settings import make_config
-from clod_adapter.config import AdaptConfig
-from clod_adapter.errors import ClodError
 from clod_adapter.training.state import load_state
 from runs import STATE, Launched, Server, launch, log_of
 

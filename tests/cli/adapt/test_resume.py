@@ -18,15 +18,12 @@ from PIL import Image
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
+from clod_adapter import AdaptConfig, ClodError, Phase, Progress, adapt
 from clod_adapter._support.version import package_version
 from clod_adapter.cli.adapt import listeners
 from clod_adapter.cli.adapt.listeners import Saver
 from clod_adapter.cli.shared.console import Console
 from clod_adapter.cli.shared.process import GracefulStop
-from clod_adapter.config import AdaptConfig
-from clod_adapter.errors import ClodError
-from clod_adapter.progress import Phase, Progress
-from clod_adapter.training.loop import adapt
 from clod_adapter.training.state import KEY
 from runs import OUTPUTS, STATE, change_step, fail, names, pressing
 from scenes import capture as small_capture

@@ -9,9 +9,7 @@ import pytest
 import torch
 from PIL import Image
 
-from clod_adapter.cameras import View
-from clod_adapter.io.scene.load import load_scene
-from clod_adapter.render import render
+from clod_adapter import View, load_scene, render
 from models import write_model
 
 FAST = ("--iters", 1, "--max-sv", 4)

@@ -8,10 +8,9 @@ from typing import Any
 
 import pytest
 
+from clod_adapter import AdaptConfig, adapt
 from clod_adapter.cli.shared import pages
 from clod_adapter.cli.shared.console import Console
-from clod_adapter.config import AdaptConfig
-from clod_adapter.training.loop import adapt
 from scenes import capture as small_capture
 
 pytest.importorskip("matplotlib")
