@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from clod_adapter import AttenuationConfig, ClodError, Gaussians
 from clod_adapter import adapter as adapters
-from clod_adapter.adapter import ATTRIBUTES, DIAL, SIGMA_MAX, Adapter, detach, trim, with_dial
+from clod_adapter.adapter import ATTRIBUTES, DIAL, SIGMA_MAX, Adapter, detach, with_dial
 
 CONFIG = AttenuationConfig(tau=0.01, reference_distance=3.5)
 extract = partial(adapters.extract, fingerprint="a" * 64, config={})
@@ -115,22 +115,6 @@ def test_other_input_is_refused() -> None:
     for message, call in refused.items():
         with pytest.raises(ClodError, match=message):
             call()
-
-
-@pytest.mark.parametrize("degree", [None, 1])
-def test_a_trimmed_result(degree: int | None) -> None:
-    base = gaussians(7, bands=8)
-    kept = torch.arange(7) % 2 == 0
-    less = trim(base, kept, degree)
-    adapted = adapt(less, ["means", "shN"])
-    adapter = replace(extract(less, adapted), kept=kept, sh_degree=degree)
-    assert len(less) == 4 and less.sh_degree == (degree or 2)
-    assert bits(adapter.apply(base)) == bits(replace(adapter, kept=None, sh_degree=None).apply(less))
-    with pytest.raises(ClodError, match="it has 4 Gaussians, the adapter 7"):
-        adapter.apply(less)
-    if degree:
-        with pytest.raises(ClodError, match="it has SH degree 0, the adapter 1"):
-            adapter.apply(base.without_bands(0))
 
 
 def test_arrays_become_tensors_and_repr_is_short() -> None:

@@ -9,7 +9,6 @@ import city
 import common
 import gpu
 import hostile
-import portability
 import pytest
 import scaling
 import torch
@@ -83,39 +82,3 @@ def test_hostile_surroundings(capture: Any) -> None:
     cases = [case for case in every if "--json >&-" in case.line or "cd gone" in case.line]
     found = {case.line: hostile.failures(case, inputs=Path(capture.ply).parent) for case in cases}
     assert len(found) >= 2 and not any(found.values()), found
-
-
-TESTS = """
-import locale, math, os, signal, tempfile
-import pytest
-
-IGNORED = signal.getsignal(signal.SIGINT) is signal.SIG_IGN
-BLOCKED = signal.pthread_sigmask(signal.SIG_BLOCK, []) == {signal.SIGINT, signal.SIGTERM}
-SPACED = " " in tempfile.gettempdir() and os.path.isdir(tempfile.gettempdir())
-ASCII = locale.getencoding() in ("ANSI_X3.4-1968", "US-ASCII", "646")
-MOVED = hasattr(math.exp, "__wrapped__")
-
-@pytest.mark.parametrize("name", ["ignored", "blocked", "spaced", "ascii", "moved"])
-def test_holds(name):
-    assert globals()[name.upper()]
-
-def test_skipped():
-    pytest.skip("always")
-
-@pytest.fixture
-def broken():
-    raise ValueError
-
-def test_error(broken):
-    pass
-"""
-
-
-def test_conditions_and_their_counts(tmp_path: Path) -> None:
-    """What else holds depends on where these tests themselves run."""
-    (tmp_path / "test_made.py").write_text(TESTS)
-    words = ["-p", "no:xdist", "-p", "no:cacheprovider"]
-    found = portability.run("blocked_signals+folders+libm_0", [str(tmp_path / "test_made.py")], words)
-    failed = {name.partition("::test_")[2] for name in found["failures"]}
-    assert "error" in failed and failed <= {"error", "holds[ignored]", "holds[ascii]"}
-    assert [found[key] for key in ("passed", "failed", "skipped")] == [6 - len(failed), len(failed), 1], found

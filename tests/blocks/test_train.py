@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from clod_adapter import AdaptConfig, ClodError, Gaussians, Scene, TrainableSubset, adapt, evaluate, render
+from clod_adapter import AdaptConfig, ClodError, Gaussians, Scene, adapt, evaluate, render
 from clod_adapter.blocks.divide import (
     LEFT_OUT,
     Division,
@@ -17,9 +17,7 @@ from clod_adapter.blocks.divide import (
 )
 from clod_adapter.blocks.train import adapt_block, merge
 from clod_adapter.initialization.importance import initialize
-from clod_adapter.training.state import TrainingState
 from clod_adapter.training.target_count import target_curve
-from runs import states_of
 from scenes import capture, gaussians
 
 CONFIG = AdaptConfig(iters=80)
@@ -56,7 +54,6 @@ def test_a_block_has_the_views_that_see_it(divided: Division) -> None:
     seen = torch.tensor([[0.5, 0.0], [0.3, 0.001], [0.2, 0.0], [0.0, 0.999]])
     division, config = replace(divided, seen=seen), replace(CONFIG, iters=120, time_budget=8.0, seed=2**63 - 1)
     assert division.views(0) == [0, 1, 2] and division.views(1) == [3]
-    assert division.steps(0, config) == 90 and division.steps(1, config) == 30
     passes = [block_config(division, k, config, first=first) for k in (0, 1) for first in (True, False)]
     assert [each.steps for each, _ in passes] == [68, 22, 22, 8]
     spans = [(0.0, 1 - 22 / 90), (1 - 22 / 90, 1.0), (0.0, 1 - 8 / 30), (1 - 8 / 30, 1.0)]
@@ -64,16 +61,6 @@ def test_a_block_has_the_views_that_see_it(divided: Division) -> None:
     assert sum(each.time_budget for each, _ in passes) == pytest.approx(8.0)
     assert len({config.seed, *(each.seed for each, _ in passes)}) == 5
     torch.testing.assert_close(divided.seen.sum(1), torch.ones(len(divided.seen)))
-
-
-@pytest.mark.parametrize(("span", "averaged"), [((0.0, 0.75), 4), ((0.75, 1.0), 16)], ids=["first", "second"])
-def test_the_last_fifth_of_the_schedule_so_far_is_averaged(
-    captured: tuple[Gaussians, Scene], span: tuple[float, float], averaged: int
-) -> None:
-    """In the first pass the last fifth of its own steps; in the second that of both passes' steps."""
-    states, part = dict[int, TrainingState](), TrainableSubset(len(captured[0]), span=span)
-    adapt(*captured, AdaptConfig(iters=20), states_of({20}, states), subset=part)
-    assert states[20].averaged == averaged
 
 
 def test_rows_left_out_of_the_context_are_not_needed(captured: tuple[Gaussians, Scene]) -> None:

@@ -16,12 +16,10 @@ from plyfile import PlyData
 
 import clod_adapter
 from clod_adapter import ClodError, load, save
-from clod_adapter.cli.shared.inputs import named
 from clod_adapter.io.formats import splat_transform
 from clod_adapter.io.ply_layout import write_comments
 from clod_adapter.io.settings import Metadata
 from formats import inria_rows, with_columns, write_rows
-from scenes import camera
 
 ONE, SET = ("--sv", 2, "-o", "x.sog"), ("--levels", "1,2", "--lod-meta", "-o", "out")
 TOOL = """
@@ -99,14 +97,6 @@ def test_baking(clod: Any, capture: Any, dialled: Path, tmp_path: Path) -> None:
     assert report["notes"] == ["old.ply stores no cameras: baked for 16 placed ones; --images gives a better result"]
     want = clod_adapter.bake(model, 2.0, cameras=clod_adapter.place_cameras(model, views=16))
     assert torch.equal(load("x.ply").gaussians.means, want.means)
-
-
-def test_names_of_cameras() -> None:
-    """With or without suffix; one of several photographs of that name needs more."""
-    names = ["a.jpg", "a.png", "images/b.jpg", "b.jpg"]
-    found = [replace(camera(), name=name) for name in names]
-    for name, want in {"a": names[:2], "a.png": ["a.png"], "b.jpg": ["b.jpg"], "images/b": ["images/b.jpg"]}.items():
-        assert [each.name for each in named(found, name, "--camera")] == want
 
 
 def test_levels(clod: Any, dialled: Path, tmp_path: Path) -> None:

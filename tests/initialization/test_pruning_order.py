@@ -6,7 +6,6 @@ from torch import Tensor
 
 from clod_adapter.config import AdaptConfig, AttenuationConfig
 from clod_adapter.equation.extinction import sigma_for_extinction
-from clod_adapter.equation.growth import growth_factors
 from clod_adapter.gaussians import SH_C0, Gaussians
 from clod_adapter.initialization.importance import initialize
 from clod_adapter.initialization.pruning_order import (
@@ -68,32 +67,6 @@ def test_coincident_gaussians_are_moved_apart() -> None:
 
 
 MAX_SV = 5.0
-
-
-def equal_ones(opacities: list[float], until: list[float]) -> tuple[Gaussians, Tensor]:
-    """Gaussians that differ in opacity and in the dial value at which each is culled, and their distances."""
-    count, config = len(opacities), AttenuationConfig(tau=1e-4, max_sv=MAX_SV)
-    some, d = gaussians(1, 0, 0).select(torch.zeros(count, dtype=torch.int64)), torch.full((count,), 0.9)
-    some = some.replace(opacity_logits=torch.tensor(opacities).logit())
-    sigma_d = sigma_for_extinction(some.opacity_logits, d, torch.tensor(until), config)
-    return some.replace(sigma_d=sigma_d, attenuation=config), d
-
-
-@pytest.mark.parametrize(
-    ("opacities", "until", "substitutes", "larger"),
-    [([0.25, 0.5], [2.0, 9.0], [1, 1], 1.5), ([0.5, 0.5], [9.0, 9.0], [1, 1], 1.0),
-     ([0.1] * 4 + [0.5], [2.0, 2.5, 3.0, 3.5, 9.0], [1, 2, 3, 4, 4], 1.8)],
-    ids=["half as opaque", "both are kept", "chain"],
-)  # fmt: skip
-def test_growth_preserves_the_area(
-    monkeypatch: pytest.MonkeyPatch, opacities: list[float], until: list[float], substitutes: list[int], larger: float
-) -> None:
-    """Fitted at the end of the dial alone, the remaining one has the area of all that it stands for."""
-    monkeypatch.setattr("clod_adapter.initialization.pruning_order.DIALS", 2)
-    some, d = equal_ones(opacities, until)
-    fitted = initial_growth(some, torch.tensor(substitutes), d) / SHARE
-    factor = growth_factors(fitted, d, MAX_SV, 1.0)[-1]
-    assert factor.square() == pytest.approx(larger, rel=1e-4) and not fitted[:-1].any()
 
 
 def test_exponents_are_in_range_and_0_without_descendants() -> None:

@@ -129,22 +129,6 @@ def test_degenerate_scenes(captured: Pair) -> None:
     assert not found.means.equal(base.means)
 
 
-@pytest.mark.parametrize(
-    ("config", "logit"),
-    [(config_of(iters=10), math.inf), (AdaptConfig.paper(iters=6), -math.inf)],
-    ids=["ours", "paper"],
-)
-def test_infinite_opacities_are_kept(captured: Pair, config: AdaptConfig, logit: float) -> None:
-    """Infinite logits are unchanged; all other values are finite and trained."""
-    base, scene = captured
-    logits = base.opacity_logits.clone()
-    logits[:9] = logit
-    found = adapt(base.replace(opacity_logits=logits), scene, config).gaussians
-    assert (found.opacity_logits[:9] == logit).all() and found.opacity_logits[9:].isfinite().all()
-    assert not torch.equal(found.opacity_logits[9:], logits[9:])
-    assert all(value.isfinite().all() for name, value in found.tensors().items() if name != "opacity_logits")
-
-
 def test_bad_inputs_are_refused(captured: Pair) -> None:
     base, scene = captured
     for run in (adapt, make_plan):

@@ -8,10 +8,7 @@ from typing import Any
 
 import pytest
 
-from clod_adapter import AdaptConfig, adapt
 from clod_adapter.cli.shared import pages
-from clod_adapter.cli.shared.console import Console
-from scenes import capture as small_capture
 
 pytest.importorskip("matplotlib")
 TINY = ("--iters", 16, "--max-sv", 4, "--out", "dial.ply", "--report")
@@ -38,6 +35,7 @@ def test_adapt(clod: Any, capture: Any, tmp_path: Path) -> None:
     for curve, dial in zip(curves, (1, 3, 4), strict=True):
         seconds = [point["seconds"] for point in curve["points"]]
         assert seconds == sorted(seconds) and len(seconds) == 5  # steps 1, 2, 4, 8 and 16, the end
+        assert len({point["psnr"] for point in curve["points"]}) == 5  # each of its own time
         (row,) = [row for row in report["rows"] if row["virtual_scale"] == dial]
         assert curve["points"][-1]["psnr"] == row["psnr"]
     trained = report["seconds"]["start"] + report["seconds"]["train"]
@@ -45,21 +43,6 @@ def test_adapt(clod: Any, capture: Any, tmp_path: Path) -> None:
     assert "change no pixel of" in text and "base.ply, a trained splat of 300 Gaussians" in text
     assert text.count("<svg") == 4
     assert text.count('data-name=""') == pages.FRAMES and text.count('data-name="base"') == 1
-
-
-def test_snapshots_do_not_change_with_the_training() -> None:
-    """A copy holds the values of its time, the higher SH degrees included where they are trained.
-
-    Without photographs the base is what the dial is compared with.
-    """
-    base, scene = small_capture()
-    for lr in (0.0, 1e-3):
-        page = pages.AdaptPage(base, scene, AdaptConfig(iters=4, lr_shN=lr), Console(quiet=True))
-        adapt(base, scene, page.config, page)
-        first, last = page.snapshots[0][1], page.snapshots[-1][1]
-        changed = {name for name, value in first.tensors().items() if not value.equal(last.tensors()[name])}
-        assert {"means", "sh0", "sigma_d", "opacity_logits"} <= changed and ("shN" in changed) == (lr > 0)
-    assert list(pages.pictures(last, base, scene.test, own=True)[1]) == ["base"]
 
 
 def test_eval(clod: Any, capture: Any, dialled: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
