@@ -170,15 +170,12 @@ def plausibility(arrays: Mapping[str, np.ndarray], config: AttenuationConfig) ->
     d = nominal_distance(means, config)
     kept = attenuate(logits, sigma_d, torch.full_like(sigma_d, d), 1.0, config).keep
     share = float(kept.double().mean())
-    reading = (
-        f"sigma_d in world units, tau {config.tau:g}, {config.cut} cut: keeps {share:.0%} at s = 1 from {d:.3g} away"
-    )
+    read = f"read as sigma_d in world units, tau {config.tau:g}, {config.cut} cut: keeps {share:.0%} at s = 1"
+    about = f"its dial is not described in the file; {read} from {d:.3g} away"
     if share < DOUBTFUL:
-        return [
-            f"{WARNING}its dial is not described in the file; read as {reading}, likely not what was adapted; give the "
-            "file as clod-adapt wrote it, before another tool rewrote or rescaled it"
-        ]
-    return [f"its dial is not described in the file; read as {reading}; not right if another tool rescaled it"]
+        remedy = "give the file as clod-adapt wrote it, before another tool rewrote or rescaled it"
+        return [f"{WARNING}{about}, likely not what was adapted; {remedy}"]
+    return [f"{about}; not right if another tool rescaled it"]
 
 
 def save(
@@ -221,8 +218,8 @@ def save(
                 "they came from"
             )
     writer = partial(write_rows, base=vertex) if format_of(path) is PLY else None
-    settings: dict[str, Any] = {"origin": origin, "calibration": calibration, "version": version or ""}
-    for note in write(path, gaussians, about, **settings, writer=writer):
+    notes = write(path, gaussians, about, origin=origin, calibration=calibration, version=version or "", writer=writer)
+    for note in notes:
         warnings.warn(f"{path}: {note}", stacklevel=2)
 
 

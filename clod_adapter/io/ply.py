@@ -34,13 +34,9 @@ class Head(NamedTuple):
     size: int  # bytes; the data starts there
 
 
-def read_head(path: Path) -> Head:
-    """The header alone, so that a large mesh is refused without parsing its faces."""
-    return _parse_head(path, file_formats.read_bytes(path, HEADER_LIMIT))
-
-
-def _parse_head(path: Path, start: bytes) -> Head:
-    """The header in the first ``HEADER_LIMIT`` bytes; allocates nothing for the rows that it states."""
+def read_head(path: Path, data: bytes | None = None) -> Head:
+    """The header of a file, or of its bytes, alone: nothing is parsed or allocated of the rows that it states."""
+    start = file_formats.read_bytes(path, HEADER_LIMIT) if data is None else data[:HEADER_LIMIT]
     if not re.match(rb"ply\r?\n|ply\r", start):
         file_formats.refuse(path, start)
     end = re.search(rb"[\r\n]end_header(\r?\n|\r)", start)
@@ -66,13 +62,8 @@ def all_comments(ply: PlyData) -> tuple[str, ...]:
     return (*ply.comments, *(comment for element in ply for comment in element.comments))
 
 
-def check(path: Path) -> None:
-    """Refuses, by its header, a file that is not a checkpoint."""
-    sh_degree_of(path, read_head(path).ply)
-
-
 def has_dial(path: Path) -> bool:
-    """Whether the header has a sigma_d; refuses damaged settings in it, and a file too short for its rows."""
+    """Whether the header has a sigma_d; refuses another kind, damaged settings, and too few bytes for its rows."""
     head = read_head(path)
     sh_degree_of(path, head.ply)
     _check_length(path, head, path.stat().st_size)
@@ -83,7 +74,7 @@ def has_dial(path: Path) -> bool:
 
 def read(path: Path, data: bytes) -> Source:
     """Reads a PLY; nothing is allocated for rows that its length does not have."""
-    head = _parse_head(path, data[:HEADER_LIMIT])
+    head = read_head(path, data)
     degree = sh_degree_of(path, head.ply)
     _check_length(path, head, len(data))
     with refused_if_damaged(path):

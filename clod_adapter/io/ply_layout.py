@@ -101,20 +101,16 @@ def _stored_settings(comments: Iterable[str]) -> dict[str, Any]:
     for name, *words in (line[len(PREFIX) :].split() or [""] for line in comments if line.startswith(PREFIX)):
         found.setdefault(name, []).append(words)
     values: dict[str, Any] = {FILTER: " ".join(found.pop(FILTER)[-1])} if FILTER in found else {}
-    records = _records(found.pop(ROW, []), CalibrationRow), _records(found.pop(VIEWPOINT, []), Viewpoint)
-    measured: dict[str, Any] = dict(zip(("rows", "viewpoints"), records, strict=True))
+    measured: dict[str, Any] = {
+        name: [dict(zip((field.name for field in fields(kind)), words, strict=False)) for words in found.pop(key, [])]
+        for name, key, kind in (("rows", ROW, CalibrationRow), ("viewpoints", VIEWPOINT, Viewpoint))
+    }
     settings = {name: " ".join(lines[-1]) for name, lines in found.items() if lines[-1]}
     extent = settings.pop(EXTENT, "").split(maxsplit=4)
     measured |= zip(("total", "views", "width", "height", "against"), extent, strict=False)
     measured |= {"machine": settings.pop(MACHINE)} if MACHINE in settings else {}
     values |= {"calibration": measured} if any(measured.values()) else {}
     return values | {"package_version": settings.pop("version", ""), DIAL: settings}
-
-
-def _records(lines: list[list[str]], kind: type) -> list[dict[str, str]]:
-    """The fields of each line, without those that are missing."""
-    names = [field.name for field in fields(kind)]
-    return [dict(zip(names, words, strict=False)) for words in lines]
 
 
 def constants_of(metadata: Metadata, *, growth: bool) -> dict[str, float]:

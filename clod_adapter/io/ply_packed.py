@@ -86,10 +86,9 @@ def unpack(path: Path, elements: Mapping[str, np.ndarray], degree: int) -> Array
 def _require(path: Path, header: PlyData, element: str, names: tuple[str, ...], kind: str) -> None:
     if element not in header:
         raise ClodError(f"{path}: is a compressed PLY without its element {element}; export it again")
-    properties = header[element].properties
-    if any(isinstance(p, PlyListProperty) for p in properties):
+    types = {p.name: "list" if isinstance(p, PlyListProperty) else p.val_dtype for p in header[element].properties}
+    if "list" in types.values():
         raise ClodError(f"{path}: element {element} of a compressed PLY has a list; export it again")
-    types = {p.name: p.val_dtype for p in properties}
     for name in names:
         if types.get(name) != kind:
             raise ClodError(

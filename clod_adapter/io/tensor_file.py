@@ -1,7 +1,7 @@
 """Safetensors files: tensors and metadata; and whole models as such files, every value unchanged.
 
 A model has the tensors of ``Gaussians`` by their names there, float32. The metadata key ``clod_adapter`` holds the JSON
-document (``metadata``), whose format distinguishes a model from an adapter.
+document (``settings.document``), whose format distinguishes a model from an adapter.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
 """glTF binary files with ``KHR_gaussian_splatting`` (Khronos, ratified 2026), with ``_SIGMA_D`` and ``_GROWTH_D``
 where there is a dial.
 
-One POINTS primitive, every attribute float32: activated opacities and scales, rotations of unit length as xyzw,
-spherical harmonics up to degree 3 with a VEC3 for each coefficient, and 8-bit ``COLOR_0`` for readers without the
-extension. The values are the checkpoint's: glTF's y is up and its x goes left, so the node has a half turn
-about z, and a translation where there is an origin. ``asset.extras.clod_adapter`` holds the document (``metadata``).
+One POINTS primitive, every attribute float32: activated opacities and scales, rotations of unit length as xyzw, a VEC3
+for each harmonic up to degree 3; and 8-bit ``COLOR_0`` for readers without the extension. The values are the
+checkpoint's: glTF's y is up and its x goes left, so the node has a half turn about z, and a translation where there is
+an origin. ``asset.extras.clod_adapter`` holds the document (``settings.document``).
 """
 
 import json

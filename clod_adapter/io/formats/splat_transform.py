@@ -1,7 +1,6 @@
 """Finds and runs splat-transform, PlayCanvas's converter of splat files: an optional tool that needs Node.
 
-It compresses to SOG and to compressed PLY, makes streaming sets of several levels, merges Gaussians, and reads what
-this package does not read itself.
+It compresses to SOG and compressed PLY, makes streaming sets, merges Gaussians, and reads what is not read here.
 """
 
 from __future__ import annotations
@@ -83,8 +82,7 @@ class SplatTransform:
     def run(self, *words: str | Path, timeout: float, progress: Callable[[float], None] | None = None) -> float:
         """Runs it with these words, replacing outputs; the seconds it took. An exception, as of Ctrl-C, ends the tool.
 
-        A Path is made absolute, so that it is read neither as an option nor as an address. ``progress`` is called now
-        and then with the seconds so far.
+        A Path is made absolute, to be no option and no address. ``progress`` is called with the seconds so far.
         """
         given = [str(word.absolute()) if isinstance(word, Path) else word for word in words]
         command = [*self.command, "-w", *(() if self.gpu else ON_CPU), *given]

@@ -5,9 +5,8 @@ buffer with the bytes of an SPZ file, attributes without data, and a node with a
 
 The root has the coarsest level of the whole scene. Its children are cells of at most LARGEST Gaussians of the finest
 level, each a chain of tiles from the next finer level to the finest; a tile replaces its parent (refine REPLACE).
-``geometricError`` of a tile is that of its level (``evaluation.level_errors``). That of the index is of showing
-nothing: viewers leave out the whole set where it covers at most ALLOWED pixels. It is ALLOWED diagonals of the root's
-box and the root's own error, so that a set is drawn until it is about one pixel large.
+``geometricError`` of a tile is that of its level (``evaluation.level_errors``). That of the index, of showing nothing,
+is ALLOWED diagonals of the root's box and the root's own error: a set is drawn until it is about one pixel large.
 
 Viewers turn glTF's y-up axes into z-up ones, (x, y, z) to (x, -z, y), after the node's half turn. So a point (x, y, z)
 of the model is at (-x, -z, -y) of the tile set, in which the bounding boxes are.
@@ -34,8 +33,7 @@ ALLOWED = 16.0  # pixels of screen-space error that viewers allow by default
 LARGEST = 1 << 18  # Gaussians of the finest level in a cell, unless they share one centre
 STRAY = 0.02  # share of the centres that may be outside of a tile's box, along each axis
 
-Rows = list[np.ndarray]
-"""Row numbers of each level."""
+Rows = list[np.ndarray]  # the row numbers of each level
 
 
 def write_tileset(

@@ -60,17 +60,14 @@ def check_posed(image: PosedImage, source: Path) -> PosedImage:
     """The image; refuses a camera or pose that is not finite, too large, or cannot become a pinhole."""
     camera = image.camera
     if not camera.is_perspective_pinhole() and not camera.is_perspective_fisheye():
-        raise ClodError(
-            f"{source}: image {image.name!r} has camera model {camera.model_name}, no perspective camera; cut "
-            "perspective views from it first"
-        )
+        what = f"has camera model {camera.model_name}, no perspective camera; cut perspective views from it first"
+        raise ClodError(f"{source}: image {image.name!r} {what}")
     focals = [camera.focal_length_x, camera.focal_length_y]
     numbers = np.concatenate([image.viewmat.ravel(), camera.params])
     sized = 0 < camera.width < HUGE and 0 < camera.height < HUGE
     if not sized or not (np.abs(numbers) < HUGE).all() or min(focals) <= 0:  # a comparison with NaN is false
-        raise ClodError(
-            f"{source}: image {image.name!r} has a camera or pose that is not usable; copy or export it again"
-        )
+        what = "has a camera or pose that is not usable; copy or export it again"
+        raise ClodError(f"{source}: image {image.name!r} {what}")
     return image
 
 

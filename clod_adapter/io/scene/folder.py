@@ -31,8 +31,8 @@ LONGEST_NAME, LONGEST_PART = 4000, 255  # characters of a path, bytes of one of 
 def find_cameras(folder: Path) -> Path:
     """The folder of a COLMAP model, or the transforms file of a scene.
 
-    A model is looked for in ``sparse/0``, ``sparse`` and ``folder`` itself; then ``transforms_train.json`` and
-    ``transforms.json`` there; then a model in the first two beside ``folder``, which may be the images' own.
+    Looked for in this order: a model in sparse/0, sparse and ``folder``; TRANSFORMS there; and a model in the first two
+    beside ``folder``, which may be the images' own.
     """
     beside = folder.resolve().parent / "sparse"
     files = [folder / name for name in TRANSFORMS]

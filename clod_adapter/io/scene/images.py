@@ -21,8 +21,7 @@ from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.file_formats import read_bytes
 from clod_adapter.io.scene.colmap import HUGE, PosedImage
 
-Note = tuple[str, str]
-"""A change to a photograph, with {} for the part that differs between photographs, and that part."""
+Note = tuple[str, str]  # a change to a photograph, with {} for what differs between photographs, and that
 
 
 class Photograph(NamedTuple):
@@ -217,13 +216,12 @@ def cache_folder(scene: Path) -> Path:
     """The folder of a scene's undistorted photographs in ``$XDG_CACHE_HOME`` or ``~/.cache``; created if missing."""
     try:
         caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    except RuntimeError as error:
-        raise ClodError("no home folder to keep undistorted photographs in; set XDG_CACHE_HOME to a folder") from error
-    folder = caches / "clod-adapter" / "undistorted" / scene.resolve().name
-    try:
+        folder = caches / "clod-adapter" / "undistorted" / scene.resolve().name
         folder.mkdir(parents=True, exist_ok=True)
         if not os.access(folder, os.W_OK | os.X_OK):
             raise PermissionError(13, "Permission denied")
+    except RuntimeError as error:
+        raise ClodError("no home folder to keep undistorted photographs in; set XDG_CACHE_HOME to a folder") from error
     except OSError as error:
         raise ClodError(
             f"{folder}: undistorted photographs cannot be kept there ({error.strerror or error}); set XDG_CACHE_HOME "

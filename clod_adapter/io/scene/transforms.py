@@ -3,6 +3,7 @@
 import math
 from collections import ChainMap
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import replace
 from os.path import isfile
 from pathlib import Path
@@ -38,10 +39,9 @@ def read_transforms(path: Path) -> tuple[list[PosedImage], list[str]]:
     Source: nerfstudio's documentation, "Data conventions"; instant-ngp's ``scripts/colmap2nerf.py``.
     """
     test = path.with_name(path.name.replace("train", "test"))
-    if test == path or not test.is_file():
-        images, notes = _frames(path, None)
-    else:
-        images, notes = _frames(path, False)
+    both = test != path and test.is_file()
+    images, notes = _frames(path, False if both else None)
+    if both:
         images += _frames(test, True)[0]
         notes.append(f"held out are the photographs of {test.name}")
     return sorted(images, key=lambda image: image.name), notes
@@ -75,10 +75,9 @@ def _frames(path: Path, held_out: bool | None) -> tuple[list[PosedImage], list[s
 
 def read_pose(where: object, values: Mapping[str, Any], key: str) -> np.ndarray:
     """``[4, 4]`` float64: the rotation nearest to the file's rounded one, and translation under ``key``, 3x4 or 4x4."""
-    try:
+    pose: np.ndarray = np.zeros(0)
+    with suppress(TypeError, ValueError, OverflowError):
         pose = np.array(values.get(key), np.float64)
-    except (TypeError, ValueError, OverflowError):
-        pose = np.zeros(0)
     if pose.shape not in ((4, 4), (3, 4)) or not np.isfinite(pose).all():
         raise ClodError(f"{where}: {key} is no 3x4 or 4x4 matrix of finite numbers; copy or export it again")
     whole, turn = np.vstack([pose[:3], [0.0, 0.0, 0.0, 1.0]]), pose[:3, :3]
@@ -94,10 +93,9 @@ def read_pose(where: object, values: Mapping[str, Any], key: str) -> np.ndarray:
 
 def _camera(where: str, photograph: Path, values: Mapping[str, Any]) -> pycolmap.Camera:
     def number(key: str, default: float) -> float:
-        try:
+        value = math.nan
+        with suppress(TypeError, ValueError, OverflowError):
             value = float(default if values.get(key) is None else values[key])
-        except (TypeError, ValueError, OverflowError):
-            value = math.nan
         if not abs(value) < 1e9:
             raise ClodError(f"{where}: {key} is no number below 1e9; export the file again")
         return value
