@@ -1,7 +1,7 @@
 """Checkpoints of gsplat's trainer, ``.pt``: the only format that is a pickle, of which only tensors are read.
 
-Files of this package have more tensors among the ``splats``, ``sigma_d`` and ``growth_d``, and the JSON document
-(``settings.document``) as a string under ``clod_adapter``. The trainer and its viewers read the tensors that they know, by name.
+Files of this package have ``sigma_d`` and ``growth_d`` among the ``splats`` too, and the JSON document as text under
+``clod_adapter`` (``settings.document``). The trainer and its viewers read the tensors that they know, by name.
 """
 
 from __future__ import annotations

@@ -5,14 +5,13 @@ and logarithms of scales in bytes, rotations in four bytes, spherical harmonics 
 (``load-spz.cc``) reads them. It writes harmonics with 5 bits at degree 1 and 4 above, rounding halves up; 6 bits,
 rounded to the nearest, take a third more space for 13 dB (docs/formats.md).
 
-Records of vendors follow the arrays, flagged in the header: type, length, bytes. Readers skip types that they do not
-know; most do not even read so far. Two are written:
+Records of vendors follow, flagged in the header: type, length, bytes; readers skip unknown types. Two are written:
 
 - Adobe's of the axes: a checkpoint's (x right, y down, z ahead). The format's own are OpenGL's, but the reference's
   ``ply_to_spz``, splat-transform, SuperSplat and gsply all leave those of the PLY: turned, it would be upside down;
-- ours, ``RECORD``: the length of the JSON document (``settings.document``) as uint32, the document, then the columns of the
-  dial as float16, to 5e-4: sigma_d, and growth_d where the document has ``"columns": ["sigma_d", "growth_d"]``. Larger
-  values become 65504. Of sigma_d that is no decay: it takes less than ``(d' s)^2 1.2e-10`` of an opacity.
+- ours, ``RECORD``: the length of the JSON document (``settings.document``) as uint32, the document, then the dial's
+  columns as float16, to 5e-4: sigma_d, and growth_d where the document has ``"columns": ["sigma_d", "growth_d"]``.
+  Larger values become 65504. Of sigma_d that is no decay: it takes less than ``(d' s)^2 1.2e-10`` of an opacity.
 """
 
 import json
