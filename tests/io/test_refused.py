@@ -9,6 +9,7 @@ import tracemalloc
 import zipfile
 from collections.abc import Callable
 from copy import copy
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,70 +17,18 @@ import numpy as np
 import pytest
 import torch
 from plyfile import PlyElement
-from safetensors.torch import load_file, save_file
+from safetensors.torch import save_file
 
 from clod_adapter.errors import ClodError
 from clod_adapter.io.checkpoint import load
 from clod_adapter.io.file_formats import FORMATS, check_readable, write
-from formats import PACKED, change_glb, model, needed, random_rows, write_elements, write_rows
+from formats import PACKED, change_glb, model, needed, random_rows, with_columns, write_elements, write_rows
 from scenes import gaussians
 
 KHR = "KHR_gaussian_splatting"
 LFS = b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 248\n"
-Content = bytes | np.ndarray | Callable[[Path], object] | None
-
-
-def refused(tmp_path: Path, name: str, content: Content, message: str) -> None:
-    path = tmp_path / name
-    if isinstance(content, bytes):
-        path.write_bytes(content)
-    elif content is not None:  # else the file is there
-        write_rows(path, content) if isinstance(content, np.ndarray) else content(path)
-    with pytest.raises(ClodError, match=f"{name}: .*{message}") as caught:
-        load(path)
-    assert str(caught.value).isprintable()
-
-
-def test_other_kinds_of_file(tmp_path: Path) -> None:
-    for name, content, message in (
-        ("a.ply", LFS, "Git LFS pointer.*git lfs pull"),
-        ("a.ply", b"\r\n<!DOCTYPE html><html>", "web page.*download the file itself"),
-        ("a.ply", b"<?xml version='1.0'?><Error>", "XML document"),
-        ("a.ply", gzip.compress(b"ply\n", mtime=0), "gzip.*gunzip"),
-        ("a.ply", b"NGSP", "an SPZ file; call it .spz"),
-        ("a.ply", b"glTF", "glTF model; call it .glb"),
-        ("a.ply", b"PK\x03\x04rest", "zip archive"),
-        ("a.ply", b"solid teapot", "is not a PLY file"),
-        ("a.spz", b"NGSP" + bytes(60), "(spz of version 4 is read through splat-transform|cannot be read)"),
-        ("a.spz", bytes(64), "not a .spz file by its first bytes"),
-        ("a.spz", b"glTF", "a glTF model; call it .glb"),
-        ("a.glb", b"ply\nformat ascii 1.0\n", "a PLY file; call it .ply"),
-        ("a.pt", bytes(64), "no file of torch.save"),
-        ("a.splat", bytes(63), "not a .splat file, whose rows have 32"),
-        ("a.splat", b"ply\n" + bytes(60), "is a PLY file; call it .ply"),
-        ("a.safetensors", bytes(64), "not a safetensors file, or damaged"),
-        ("a.lcc", bytes(64), "LCC.*splat-transform IN.lcc OUT.ply"),
-        ("a.hier", bytes(64), "Hierarchical-3DGS.*point_cloud.ply"),
-        ("a.ckpt", b"PK\x03\x04rest", "Nerfstudio.*ns-export gaussian-splat"),
-        ("chkpnt30000.pth", b"PK\x03\x04rest", "Inria.*point_cloud.ply"),
-        ("meta.json", b"{}", "SOG.*splat-transform"),
-    ):  # fmt: skip
-        refused(tmp_path, name, content, message)
-
-
-@pytest.mark.parametrize("suffix", FORMATS)
-def test_what_is_no_file_of_the_format(tmp_path: Path, suffix: str) -> None:
-    (tmp_path / f"folder{suffix}").mkdir()
-    os.mkfifo(tmp_path / f"pipe{suffix}")
-    for name, content in (("empty", b""), ("pointer", LFS), ("other", b"an unknown format")):
-        (tmp_path / f"{name}{suffix}").write_bytes(content)
-    for name, message in (
-        ("missing", "cannot be read .No such file"), ("folder", "cannot be read"), ("pipe", "not a regular file"),
-        ("empty", "is empty"), ("pointer", "is a Git LFS pointer"), ("other", ""),
-    ):  # fmt: skip
-        for read in (load,) if name == "other" else (check_readable, load):  # of some kinds splat-transform tells
-            with pytest.raises(ClodError, match=f"{name}{suffix}: .*{message}"):
-                read(tmp_path / f"{name}{suffix}")
+Content = bytes | np.ndarray | Callable[[Path], object]
+Table = tuple[tuple[str, Content, str], ...]  # name of the file, what it holds, the message after the name
 
 
 def rows(*names: str, count: int = 2, without: tuple[str, ...] = (), **types: str) -> np.ndarray:
@@ -87,10 +36,7 @@ def rows(*names: str, count: int = 2, without: tuple[str, ...] = (), **types: st
 
 
 def filled(name: str, value: float) -> np.ndarray:
-    table = rows(count=3)
-    for column in needed(1):
-        table[column] = value if column.startswith(name) else table[column]
-    return table
+    return with_columns(rows(count=3), **{column: value for column in needed(1) if column.startswith(name)})
 
 
 def with_a_list(path: Path) -> None:
@@ -99,97 +45,22 @@ def with_a_list(path: Path) -> None:
     write_rows(path, lists)
 
 
-def test_layouts_of_a_ply(tmp_path: Path) -> None:
-    for content, message in (
-        (rows("packed_position", "packed_rotation"), "compressed PLY without its element chunk"),
-        (rows(*needed(1), "f_offset_0", "f_anchor_feat_0"), "Scaffold-GS"),
-        (rows(without=("scale_2",)), "2DGS"),
-        (rows("x", "y", "z", "nx", "ny", "nz"), "mesh or a point cloud"),
-        *((rows(without=(name,)), f"property {name} is missing") for name in ("rot_3", "y")),
-        (rows(without=("f_rest_4",)), "8 f_rest"),
-        (rows(*needed(1), "f_rest_9", without=("f_rest_4",)), "property f_rest_4 is missing"),
-        (rows(x="i4"), "property x is not float"),
-        (rows(count=0), "no usable Gaussian"),
-        (filled("x", np.nan), "no usable Gaussian.*3 of 3"), (filled("rot", 0), "no usable Gaussian.*3 of 3"),
-        (lambda path: write_elements(path, [PlyElement.describe(rows(), "point")]), "no vertex element.*point"),
-        (with_a_list, "property bones is a list"),
-        (b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty float x\nelement face 999999999\n"
-         b"property list uchar int vertex_indices\nend_header\n", "mesh or a point cloud"),  # without reading its faces
-    ):  # fmt: skip
-        refused(tmp_path, "in.ply", content, message)
-
-
 def header(form: str, count: object, before: str = "", after: str = "") -> bytes:
     properties = "".join(f"property float {name}\n" for name in needed())
     return f"ply\nformat {form} 1.0\n{before}element vertex {count}\n{properties}{after}end_header\n".encode()
 
 
-LITTLE, BIG, GOOD = "binary_little_endian", "binary_big_endian", "1.0 " * 14 + "\n"
-COMMENTED = header("ascii", 0).replace(b"element", b"comment @\nelement")
-LIST = "property list uchar int a\n"
+def packed(old: bytes, new: bytes) -> bytes:
+    assert old in PACKED.read_bytes()
+    return PACKED.read_bytes().replace(old, new)
 
 
-def test_headers_and_rows_of_a_ply(tmp_path: Path) -> None:
-    """Nothing is allocated for what a header claims."""
-    for content, message in (
-        *((header(LITTLE, count) + bytes(300), "header is damaged")
-          for count in (-1, "nan", "0x10", "1_0", "9" * 21, "9" * 5000, "2.0", "+3", "")),
-        *((header("ascii", 3) + f"{GOOD}{bad}\n{GOOD}".encode(), "damaged or truncated")
-          for bad in ("1.0 " * 13, "1.0 " * 15, "1.0 " * 13 + "x", "1.0 " * 13 + "\u0661")),
-        (header(LITTLE, 1, f"element face 1\n{LIST}") + bytes(100), "no usable Gaussian"),  # lists before it are read
-        (COMMENTED.replace(b"@", b"\x1b[2J"), "not printable ASCII"),
-        (b"ply\nformat ascii 1.0\n" + b"comment x\n" * 200_000 + b"end_header\n", "no end"),
-        *((header(form, count) + b"0 " * 24, rf"is truncated.*claims {count} of vertex.*the file has")
-          for form, count in (("ascii", 1 << 31), (LITTLE, (1 << 64) - 1), (BIG, 10))),
-        # before the test's time limit, in which no loop counts that far
-        *((header(form, 1, before, after) + body, "")
-          for form, body, kind in (("ascii", GOOD.encode(), "property uchar a\n"), ("ascii", GOOD.encode(), LIST),
-                                   (LITTLE, bytes(56), ""), (BIG, bytes(56), LIST))
-          for other in [f"element a {1 << 40}\n{kind}"] for before, after in ((other, ""), ("", other))),
-        (header("ascii", 1) + b"0 " * 13 + b"1" * (1 << 23), "damaged or truncated .a row of more than"),
-    ):  # fmt: skip
-        (tmp_path / "whole.ply").write_bytes(header("ascii", 1) + GOOD.encode())
-        load(tmp_path / "whole.ply", activated="none")  # so that nothing is imported while it is measured
-        tracemalloc.start()
-        try:
-            refused(tmp_path, "in.ply", content, message)
-            assert tracemalloc.get_traced_memory()[1] < (24 << 20)
-        finally:
-            tracemalloc.stop()
+def glb(change: Callable[[dict[str, Any]], object]) -> Callable[[Path], object]:
+    def make(path: Path) -> None:
+        write(path, model(0, 5))
+        change_glb(path, change)
 
-
-def test_packed_ply(tmp_path: Path) -> None:
-    for old, new, message in (
-        (b"property float max_scale_y", b"property float max_scale_q", "no max_scale_y"),
-        (b"property uint packed_color", b"property int packed_color", "no packed_color of type u4"),
-        (b"property uchar f_rest_4", b"property uchar f_rest_9", "no f_rest_4"),
-        (b"property float min_r", b"property list uchar float min_r", "has a list"),
-        (b"element vertex 300", b"element vertex 299", "300 harmonics for 299 Gaussians|damaged"),
-        (b"element chunk 2", b"element chunk 1", "is damaged: 300 Gaussians need 2 chunks"),
-        (b"element vertex 300", b"element vertex 3000000", "is truncated"),
-    ):
-        content = PACKED.read_bytes()
-        assert old in content
-        refused(tmp_path, "a.ply", content.replace(old, new), f"({message})")
-
-
-def test_glb(tmp_path: Path) -> None:
-    for change, message in (
-        (lambda g: g["accessors"][0].update(count=1 << 60), "more than the file"),
-        (lambda g: g["accessors"][0].update(count=3), "of different lengths"),
-        (lambda g: g["accessors"][0].update(count=-1), "is no count"),
-        (lambda g: g["bufferViews"][0].update(byteStride=0), "more than the file"),
-        (lambda g: g["buffers"][0].update(uri="../secret"), "in another file"),
-        (lambda g: g["accessors"][0].update(sparse={}), "sparse"),
-        (lambda g: g["meshes"][0]["primitives"][0].pop("extensions"), "so it is a mesh"),
-        (lambda g: g["meshes"][0]["primitives"][0]["extensions"][KHR].update(extensions={"x": {}}), "compressed"),
-        (lambda g: g["nodes"][0].update(rotation=[0, 1, 0, 0]), "scaled or turned"),
-        (lambda g: g["nodes"].append({"children": [0]}), "scaled or turned"),
-        (lambda g: g.pop("accessors"), "damaged"),
-    ):
-        write(tmp_path / "a.glb", model(0, 5))
-        change_glb(tmp_path / "a.glb", change)
-        refused(tmp_path, "a.glb", None, message)
+    return make
 
 
 def claiming(count: int) -> bytes:
@@ -210,32 +81,15 @@ def with_record(columns: Any, values: int) -> Callable[[Path], object]:
     return make
 
 
-def test_spz(tmp_path: Path) -> None:
-    for content, message in (
-        (gzip.compress(bytes(1 << 26), mtime=0), "unpacks to more"), (claiming(9_999_999), "truncated"),
-        (claiming(1 << 31), "no SPZ file of version"), (claiming(0), "no Gaussians"),
-        (gzip.compress(b"short", mtime=0), "truncated"),
-        *((with_record(columns, values), "its record of sigma_d is damaged") for columns, values in (
-            (["sigma_d", "growth_d"], 40), (["sigma_d"], 80), (["growth_d", "sigma_d"], 80), (7, 40))),
-    ):  # fmt: skip
-        refused(tmp_path, "a.spz", content, message)
+def tensors(metadata: dict[str, str] | None = None, **changes: torch.Tensor | None) -> Callable[[Path], object]:
+    """A .safetensors of five Gaussians with some tensors changed or left out."""
+    about = {"clod_adapter": json.dumps({"format": "clod-model", "format_version": 1, "package_version": "0"})}
 
+    def make(path: Path) -> None:
+        kept = {name: tensor for name, tensor in (gaussians(5, 1, 0).tensors() | changes).items() if tensor is not None}
+        save_file(kept, path, about if metadata is None else metadata)
 
-def test_safetensors(tmp_path: Path) -> None:
-    for change, message in (
-        ({"means": torch.ones(4, 3)}, "quats has shape"),
-        ({"shN": torch.ones(5, 2, 3)}, "shN has 2 coefficients"),
-        ({"quats": torch.ones(5, 4, dtype=torch.int32)}, "not of floating-point"),
-        ({"quats": None}, "has no tensor 'quats'"),
-    ):
-        write(tmp_path / "whole.safetensors", gaussians(5, 1, 0))
-        tensors = {**load_file(tmp_path / "whole.safetensors"), **change}
-        kept = {name: tensor for name, tensor in tensors.items() if tensor is not None}
-        about = {"format": "clod-model", "format_version": 1, "package_version": "0"}
-        save_file(kept, tmp_path / "a.safetensors", {"clod_adapter": json.dumps(about)})
-        refused(tmp_path, "a.safetensors", None, message)
-    save_file(kept, tmp_path / "a.safetensors")
-    refused(tmp_path, "a.safetensors", None, "not a model of clod-adapter")
+    return make
 
 
 def splats(count: int = 12, **changes: Any) -> dict[str, Any]:
@@ -254,43 +108,179 @@ class Call:
         return self.what[0], self.what[1:]
 
 
-def test_pt(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    for checkpoint, message in (
-        ([1], "no dictionary 'splats'.*list"), ({"model": 1}, "no dictionary 'splats'.*'model'"),
-        ({"splats": [1]}, "no dictionary 'splats'"), ({"splats": {}}, "no 'means'"),
-        (splats(shN=None, features=torch.zeros(12, 32)), "no 'shN'; with appearance"),
-        (splats(quats=torch.zeros(11, 4)), "quats has shape .11, 4., expected .12, 4."),
-        (splats(means=torch.tensor(1.0)), "shape"), (splats(means=torch.zeros(12, 3).int()), "no plain tensor"),
-        (splats(means=torch.eye(3).to_sparse()), "more than tensors"), (splats(0), "it has 0 rows"),
-        (splats() | {"clod_adapter": 3}, "settings are damaged .*not int"),
-        (splats() | {"clod_adapter": "[" * 100_000}, "settings are damaged"),
-        (splats() | {"clod_adapter": '{"format": "clod-model"}'}, "settings are damaged"),
-        (splats(sigma_d=torch.ones(3)), "sigma_d has shape .3,., expected .12,."),
-        (splats(sigma_d=torch.ones(12), growth_d=torch.ones(3)), "growth_d has shape .3,."),
-        # claims that would allocate, and code, which is not run
-        (splats(means=torch.zeros(1).expand(1 << 40, 3)), "no plain tensor|more than tensors"),
-        (splats(means=torch.zeros(3, 3, device="meta")), "no plain tensor|more than tensors"),
-        (splats(means=Call(bytearray, 1 << 33)), "no plain tensor|more than tensors"),
-        (splats(means=Call(os.mkdir, "ran")), "more than tensors, and is not unpickled"),
-        (splats(means=Call(eval, "__import__('os').mkdir('ran')")), "more than tensors, and is not unpickled"),
-    ):  # fmt: skip
-        torch.save(checkpoint, "a.pt")
-        refused(tmp_path, "a.pt", None, message)
-    assert os.listdir(tmp_path) == ["a.pt"]
+def archive(kind: int, names: int) -> Callable[[Path], object]:
+    """A .pt packed again, with so many names of the same megabyte."""
 
-
-def test_pt_that_is_another_archive(tmp_path: Path) -> None:
-    """Compressed; many names of the same megabyte; and a pickle without an archive."""
-    buffer = io.BytesIO()
-    torch.save(splats(), buffer)
-    for name, kind in (("packed.pt", zipfile.ZIP_DEFLATED), ("many.pt", zipfile.ZIP_STORED)):
-        with zipfile.ZipFile(buffer) as old, zipfile.ZipFile(tmp_path / name, "w", kind) as new:
+    def make(path: Path) -> None:
+        torch.save(splats(), path)
+        buffer = io.BytesIO(path.read_bytes())
+        with zipfile.ZipFile(buffer) as old, zipfile.ZipFile(path, "w", kind) as new:
             for each in old.namelist():
                 new.writestr(each, old.read(each))
             new.writestr("a/data/99", bytes(1 << 20))
-            for k in range(100) if name == "many.pt" else ():
+            for k in range(names):
                 new.filelist.append(copy(new.getinfo("a/data/99")))
                 new.filelist[-1].filename = f"a/data/{k + 100}"
-        refused(tmp_path, name, (tmp_path / name).read_bytes(), "torch.save does not write")
-    refused(tmp_path, "old.pt", b"\x80\x04]\x94.", "format before 1.6")
+
+    return make
+
+
+LITTLE, BIG, GOOD = "binary_little_endian", "binary_big_endian", "1.0 " * 14 + "\n"
+COMMENTED = header("ascii", 0).replace(b"element", b"comment @\nelement")
+LIST = "property list uchar int a\n"
+OTHER_KINDS: Table = (
+    ("a.ply", LFS, "Git LFS pointer.*git lfs pull"),
+    ("a.ply", b"\r\n<!DOCTYPE html><html>", "web page.*download the file itself"),
+    ("a.ply", b"<?xml version='1.0'?><Error>", "XML document"),
+    ("a.ply", gzip.compress(b"ply\n", mtime=0), "gzip.*gunzip"),
+    ("a.ply", b"NGSP", "an SPZ file; call it .spz"),
+    ("a.ply", b"glTF", "glTF model; call it .glb"),
+    ("a.ply", b"PK\x03\x04rest", "zip archive"),
+    ("a.ply", b"solid teapot", "is not a PLY file"),
+    ("a.spz", b"NGSP" + bytes(60), "(spz of version 4 is read through splat-transform|cannot be read)"),
+    ("a.spz", bytes(64), "not a .spz file by its first bytes"),
+    ("a.spz", b"glTF", "a glTF model; call it .glb"),
+    ("a.glb", b"ply\nformat ascii 1.0\n", "a PLY file; call it .ply"),
+    ("a.pt", bytes(64), "no file of torch.save"),
+    ("a.splat", bytes(63), "not a .splat file, whose rows have 32"),
+    ("a.splat", b"ply\n" + bytes(60), "is a PLY file; call it .ply"),
+    ("a.safetensors", bytes(64), "not a safetensors file, or damaged"),
+    ("a.lcc", bytes(64), "LCC.*splat-transform IN.lcc OUT.ply"),
+    ("a.hier", bytes(64), "Hierarchical-3DGS.*point_cloud.ply"),
+    ("a.ckpt", b"PK\x03\x04rest", "Nerfstudio.*ns-export gaussian-splat"),
+    ("chkpnt30000.pth", b"PK\x03\x04rest", "Inria.*point_cloud.ply"),
+    ("meta.json", b"{}", "SOG.*splat-transform"),
+)  # fmt: skip
+OF_PLY: tuple[tuple[Content, str], ...] = (
+    (rows("packed_position", "packed_rotation"), "compressed PLY without its element chunk"),
+    (rows(*needed(1), "f_offset_0", "f_anchor_feat_0"), "Scaffold-GS"),
+    (rows(without=("scale_2",)), "2DGS"),
+    (rows("x", "y", "z", "nx", "ny", "nz"), "mesh or a point cloud"),
+    *((rows(without=(name,)), f"property {name} is missing") for name in ("rot_3", "y")),
+    (rows(without=("f_rest_4",)), "8 f_rest"),
+    (rows(*needed(1), "f_rest_9", without=("f_rest_4",)), "property f_rest_4 is missing"),
+    (rows(x="i4"), "property x is not float"),
+    (rows(count=0), "no usable Gaussian"),
+    (filled("x", np.nan), "no usable Gaussian.*3 of 3"), (filled("rot", 0), "no usable Gaussian.*3 of 3"),
+    (lambda path: write_elements(path, [PlyElement.describe(rows(), "point")]), "no vertex element.*point"),
+    (with_a_list, "property bones is a list"),
+    (b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty float x\nelement face 999999999\n"
+     b"property list uchar int vertex_indices\nend_header\n", "mesh or a point cloud"),  # without reading its faces
+    *((header(LITTLE, count) + bytes(300), "header is damaged")
+      for count in (-1, "nan", "0x10", "1_0", "9" * 21, "9" * 5000, "2.0", "+3", "")),
+    *((header("ascii", 3) + f"{GOOD}{bad}\n{GOOD}".encode(), "damaged or truncated")
+      for bad in ("1.0 " * 13, "1.0 " * 15, "1.0 " * 13 + "x", "1.0 " * 13 + "\u0661")),
+    (header(LITTLE, 1, f"element face 1\n{LIST}") + bytes(100), "no usable Gaussian"),  # lists before it are read
+    (COMMENTED.replace(b"@", b"\x1b[2J"), "not printable ASCII"),
+    (b"ply\nformat ascii 1.0\n" + b"comment x\n" * 200_000 + b"end_header\n", "no end"),
+    *((header(form, count) + b"0 " * 24, rf"is truncated.*claims {count} of vertex.*the file has")
+      for form, count in (("ascii", 1 << 31), (LITTLE, (1 << 64) - 1), (BIG, 10))),
+    # before the test's time limit, in which no loop counts that far
+    *((header(form, 1, before, after) + body, "")
+      for form, body, kind in (("ascii", GOOD.encode(), "property uchar a\n"), ("ascii", GOOD.encode(), LIST),
+                               (LITTLE, bytes(56), ""), (BIG, bytes(56), LIST))
+      for other in [f"element a {1 << 40}\n{kind}"] for before, after in ((other, ""), ("", other))),
+    (header("ascii", 1) + b"0 " * 13 + b"1" * (1 << 23), "damaged or truncated .a row of more than"),
+    (packed(b"property float max_scale_y", b"property float max_scale_q"), "no max_scale_y"),
+    (packed(b"property uint packed_color", b"property int packed_color"), "no packed_color of type u4"),
+    (packed(b"property uchar f_rest_4", b"property uchar f_rest_9"), "no f_rest_4"),
+    (packed(b"property float min_r", b"property list uchar float min_r"), "has a list"),
+    (packed(b"element vertex 300", b"element vertex 299"), "(300 harmonics for 299 Gaussians|damaged)"),
+    (packed(b"element chunk 2", b"element chunk 1"), "is damaged: 300 Gaussians need 2 chunks"),
+    (packed(b"element vertex 300", b"element vertex 3000000"), "is truncated"),
+)  # fmt: skip
+OF_GLB: tuple[tuple[Callable[[dict[str, Any]], object], str], ...] = (
+    (lambda g: g["accessors"][0].update(count=1 << 60), "more than the file"),
+    (lambda g: g["accessors"][0].update(count=3), "of different lengths"),
+    (lambda g: g["accessors"][0].update(count=-1), "is no count"),
+    (lambda g: g["bufferViews"][0].update(byteStride=0), "more than the file"),
+    (lambda g: g["buffers"][0].update(uri="../secret"), "in another file"),
+    (lambda g: g["accessors"][0].update(sparse={}), "sparse"),
+    (lambda g: g["meshes"][0]["primitives"][0].pop("extensions"), "so it is a mesh"),
+    (lambda g: g["meshes"][0]["primitives"][0]["extensions"][KHR].update(extensions={"x": {}}), "compressed"),
+    (lambda g: g["nodes"][0].update(rotation=[0, 1, 0, 0]), "scaled or turned"),
+    (lambda g: g["nodes"].append({"children": [0]}), "scaled or turned"),
+    (lambda g: g.pop("accessors"), "damaged"),
+)
+OF_SPZ: tuple[tuple[Content, str], ...] = (
+    (gzip.compress(bytes(1 << 26), mtime=0), "unpacks to more"), (claiming(9_999_999), "truncated"),
+    (claiming(1 << 31), "no SPZ file of version"), (claiming(0), "no Gaussians"),
+    (gzip.compress(b"short", mtime=0), "truncated"),
+    *((with_record(columns, values), "its record of sigma_d is damaged") for columns, values in (
+        (["sigma_d", "growth_d"], 40), (["sigma_d"], 80), (["growth_d", "sigma_d"], 80), (7, 40))),
+)  # fmt: skip
+OF_SAFETENSORS = (
+    (tensors(means=torch.ones(4, 3)), "quats has shape"), (tensors(shN=torch.ones(5, 2, 3)), "shN has 2 coefficients"),
+    (tensors(quats=torch.ones(5, 4, dtype=torch.int32)), "not of floating-point"),
+    (tensors(quats=None), "has no tensor 'quats'"), (tensors({}), "not a model of clod-adapter"),
+)  # fmt: skip
+OF_PT = (
+    ([1], "no dictionary 'splats'.*list"), ({"model": 1}, "no dictionary 'splats'.*'model'"),
+    ({"splats": [1]}, "no dictionary 'splats'"), ({"splats": {}}, "no 'means'"),
+    (splats(shN=None, features=torch.zeros(12, 32)), "no 'shN'; with appearance"),
+    (splats(quats=torch.zeros(11, 4)), "quats has shape .11, 4., expected .12, 4."),
+    (splats(means=torch.tensor(1.0)), "shape"), (splats(means=torch.zeros(12, 3).int()), "no plain tensor"),
+    (splats(means=torch.eye(3).to_sparse()), "more than tensors"), (splats(0), "it has 0 rows"),
+    (splats() | {"clod_adapter": 3}, "settings are damaged .*not int"),
+    (splats() | {"clod_adapter": "[" * 100_000}, "settings are damaged"),
+    (splats() | {"clod_adapter": '{"format": "clod-model"}'}, "settings are damaged"),
+    (splats(sigma_d=torch.ones(3)), "sigma_d has shape .3,., expected .12,."),
+    (splats(sigma_d=torch.ones(12), growth_d=torch.ones(3)), "growth_d has shape .3,."),
+    # claims that would allocate, and code, which is not run
+    (splats(means=torch.zeros(1).expand(1 << 40, 3)), "no plain tensor|more than tensors"),
+    (splats(means=torch.zeros(3, 3, device="meta")), "no plain tensor|more than tensors"),
+    (splats(means=Call(bytearray, 1 << 33)), "no plain tensor|more than tensors"),
+    (splats(means=Call(os.mkdir, "ran")), "more than tensors, and is not unpickled"),
+    (splats(means=Call(eval, "__import__('os').mkdir('ran')")), "more than tensors, and is not unpickled"),
+)  # fmt: skip
+REFUSED: Table = (
+    *OTHER_KINDS,
+    *(("in.ply", *each) for each in OF_PLY),
+    *(("a.glb", glb(change), message) for change, message in OF_GLB),
+    *(("a.spz", *each) for each in OF_SPZ),
+    *(("a.safetensors", *each) for each in OF_SAFETENSORS),
+    *(("a.pt", partial(torch.save, checkpoint), message) for checkpoint, message in OF_PT),
+    ("packed.pt", archive(zipfile.ZIP_DEFLATED, 0), "torch.save does not write"),
+    ("many.pt", archive(zipfile.ZIP_STORED, 100), "torch.save does not write"),
+    ("old.pt", b"\x80\x04]\x94.", "format before 1.6"),
+)
+
+
+@pytest.mark.parametrize("suffix", sorted({Path(name).suffix for name, _, _ in REFUSED}))
+def test_damaged_and_hostile_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str) -> None:
+    """In one printable line. Nothing is allocated for what a file claims, and none of its code runs."""
+    monkeypatch.chdir(tmp_path)
+    write_rows(tmp_path / "whole.ply", random_rows(9, needed()), "ascii")
+    load(tmp_path / "whole.ply", activated="none")  # so that nothing is imported while it is measured
+    for name, content, message in REFUSED:
+        if Path(name).suffix != suffix:
+            continue
+        path = tmp_path / name
+        if isinstance(content, bytes):
+            path.write_bytes(content)
+        else:
+            write_rows(path, content) if isinstance(content, np.ndarray) else content(path)
+        tracemalloc.start()
+        try:
+            with pytest.raises(ClodError, match=f"{name}: .*{message}") as caught:
+                load(path)
+            assert tracemalloc.get_traced_memory()[1] < (40 << 20), (name, message)
+        finally:
+            tracemalloc.stop()
+        assert str(caught.value).isprintable()
+    assert not (tmp_path / "ran").exists()
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_what_is_no_file_of_the_format(tmp_path: Path, suffix: str) -> None:
+    (tmp_path / f"folder{suffix}").mkdir()
+    os.mkfifo(tmp_path / f"pipe{suffix}")
+    for name, content in (("empty", b""), ("pointer", LFS), ("other", b"an unknown format")):
+        (tmp_path / f"{name}{suffix}").write_bytes(content)
+    for name, message in (
+        ("missing", "cannot be read .No such file"), ("folder", "cannot be read"), ("pipe", "not a regular file"),
+        ("empty", "is empty"), ("pointer", "is a Git LFS pointer"), ("other", ""),
+    ):  # fmt: skip
+        for read in (load,) if name == "other" else (check_readable, load):  # of some kinds splat-transform tells
+            with pytest.raises(ClodError, match=f"{name}{suffix}: .*{message}"):
+                read(tmp_path / f"{name}{suffix}")
