@@ -23,7 +23,6 @@ from .shared import command as common
 from .shared.console import Console, ProgressDisplay, duration
 from .shared.outputs import Outputs, labels, write_report
 from .shared.process import GracefulStop
-from .shared.settings import add_settings, make_configs
 
 if TYPE_CHECKING:
     from clod_adapter.cameras import Scene
@@ -40,12 +39,12 @@ def add_arguments(parser: ArgumentParser) -> None:
     training = parser.add_argument_group("training")
     text = "largest dial value of each adaptation; 1 trains at full detail only (default: 1 3 5 7)"
     training.add_argument("--max-sv", metavar="S", type=float, nargs="+", default=[1.0, 3.0, 5.0, 7.0], help=text)
-    add_settings(training, without=["max_sv"])
+    common.add_settings(training, without=["max_sv"])
 
 
 def check(args: Namespace) -> None:
     check_matplotlib()
-    make_configs(args)
+    common.make_configs(args)
     labels(args.ply)
     for path in args.ply:
         check_readable(Path(path))
@@ -154,7 +153,7 @@ def execute(args: Namespace) -> dict[str, Any]:
         if each.gaussians.sigma_d is not None:
             console.note(f"the dial of {each.path} is ignored")
         prepare_kernels(console, each.gaussians.means.device, screen_filter=each.gaussians.screen_filter)
-    names, configs, sha256 = labels(args.ply), make_configs(args), scene_fingerprint(scene)
+    names, configs, sha256 = labels(args.ply), common.make_configs(args), scene_fingerprint(scene)
     # Every range is measured at the dial values of the widest one and at its own end.
     dials = tuple(sorted({*report_dials(configs[-1].max_sv), *(config.max_sv for config in configs)}))
     cells = list[Cell]()

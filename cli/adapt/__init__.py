@@ -8,10 +8,9 @@ from clod_adapter.blocks.memory import parse_size
 from clod_adapter.errors import ClodError
 from clod_adapter.io.file_formats import check_readable
 
-from ..shared.command import add_reading, check_scene, page_files
+from ..shared.command import add_reading, add_settings, check_scene, make_config, page_files
 from ..shared.outputs import AdaptFiles, Outputs, check_ply_name
 from ..shared.process import launched
-from ..shared.settings import add_settings, make_config
 
 # As in clod_adapter.training.plan, which imports torch; a test compares the two.
 NAMES = ("bands", "unseen", "means", "quats", "scales", "opacities", "sh0")

@@ -14,10 +14,9 @@ from clod_adapter.errors import ClodError
 from clod_adapter.progress import Listener, Progress, Stopped
 from clod_adapter.training.state import StateRefused, TrainingState, load_state, save_state
 
-from ..shared.command import as_option
+from ..shared.command import SETTINGS, as_option
 from ..shared.console import Console
 from ..shared.process import GracefulStop
-from ..shared.settings import OPTIONS
 
 # Not "leave out --resume": the demo gives that option itself.
 ORIGINAL = "use the original arguments, or delete the file to start over"
@@ -62,7 +61,7 @@ class Saver:
         if not isinstance(then, dict) or then.keys() != now.keys():
             raise ClodError(f"{self.path}: is of other settings; {ORIGINAL}")
         if different := [name for name in now if now[name] != then[name]]:
-            given = {name: f"{as_option(name)} {then[name]}" for name in different if name in OPTIONS}
+            given = {name: f"{as_option(name)} {then[name]}" for name in different if name in SETTINGS}
             given |= {name: f"no {as_option(name)}" for name in given if then[name] is None}
             options = [given.get(name, "another --form") for name in different]
             raise ClodError(f"{self.path}: is of a run with {', '.join(dict.fromkeys(options))}; {ORIGINAL}")

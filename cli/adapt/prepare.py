@@ -29,13 +29,13 @@ from clod_adapter.training.plan import NOT_NEEDED, Decision, Override, Plan
 from clod_adapter.training.planner import make_plan
 
 from ..shared import inputs
+from ..shared.command import make_config
 from ..shared.console import Console, ProgressDisplay
 from ..shared.inputs import prepare_kernels, read_checkpoint
 from ..shared.measure import Stopwatch, measure, report_dials
 from ..shared.outputs import AdaptFiles
 from ..shared.pages import SNAPSHOT_VIEWS
 from ..shared.process import GracefulStop, launched
-from ..shared.settings import make_config
 from .listeners import Saver
 
 LONG = 100  # steps of a run that is worth a forecast

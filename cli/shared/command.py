@@ -4,24 +4,21 @@ from __future__ import annotations
 
 import math
 import sysconfig
-from argparse import ArgumentParser, Namespace, RawDescriptionHelpFormatter
+from argparse import ArgumentParser, Namespace, RawDescriptionHelpFormatter, _ActionsContainer  # a parser or its group
+from collections.abc import Sequence
 from pathlib import Path
 from site import getuserbase
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import Any, NoReturn
 
 from clod_adapter._support.version import package_version
-from clod_adapter.config import DEVICES, FILTERS, AttenuationConfig
+from clod_adapter.config import DEVICES, FILTERS, AdaptConfig, AttenuationConfig, field_descriptions
 from clod_adapter.errors import ClodError
 from clod_adapter.io.file_formats import PLY, file_has_dial, format_of
 from clod_adapter.io.scene.folder import find_cameras
 from clod_adapter.report.charts import chart_file, check_matplotlib
 
-from .process import check_printed
-
-if TYPE_CHECKING:
-    from argparse import _ActionsContainer  # a parser or one of its groups
-
-    from .console import Console
+from .console import Console
+from .process import check_printed, launched
 
 
 def parser_of(command: Any, prog: str) -> Parser:
@@ -79,8 +76,8 @@ def manual() -> Path | None:
     return next((page for folder in folders if (page := folder / "index.md").is_file()), None)
 
 
-# Budgets: name (as of budget.dial_for), metavar, type, help.
-OPTIONS: tuple[tuple[str, str, type, str], ...] = (
+# Name (as of budget.dial_for), metavar, type, help.
+BUDGET_OPTIONS: tuple[tuple[str, str, type, str], ...] = (
     ("keep", "N", int, "the dial value that keeps N Gaussians {where}"),
     ("fps", "F", float, "the dial value that renders F frames per second, by frame times {times}"),
     ("psnr_drop", "DB", float, "the dial value that loses DB decibels against s = 1, by the calibration"),
@@ -129,7 +126,7 @@ def add_dial_options(options: _ActionsContainer, sv_help: str, where: str, *, se
     group: Any = options.add_mutually_exclusive_group()
     count = "+" if several else 1
     group.add_argument("--sv", metavar="S", type=float, nargs=count, help=sv_help)
-    for name, metavar, kind, text in OPTIONS:
+    for name, metavar, kind, text in BUDGET_OPTIONS:
         shown = text.format(where=where, times=times)
         group.add_argument(as_option(name), metavar=metavar, type=kind, nargs=count, help=shown)
     if not several:
@@ -160,7 +157,7 @@ def given_budget(args: Namespace) -> tuple[str, str, list[float]] | None:
     """Name, option and values of the budget, or None without one."""
     if device := getattr(args, "device_preset", None):
         return "keep", f"--device-preset {device}, --keep", [DEVICES[device]]
-    for name, *_ in OPTIONS:
+    for name, *_ in BUDGET_OPTIONS:
         if getattr(args, name, None) is not None:
             return name, as_option(name), getattr(args, name)
     return None
@@ -200,3 +197,49 @@ def check_scene(folder: str) -> None:
     if not Path(folder).is_dir():
         raise ClodError(f"{folder}: is not a folder; give the one that holds images/ and sparse/0")
     find_cameras(Path(folder))
+
+
+# Training settings, by field of AdaptConfig: metavar, type, and what help says of a default that depends on another
+# option or on the scene.
+SETTINGS: dict[str, tuple[str, Any, str | None]] = {
+    "max_sv": ("S", float, None), "iters": ("N", int, ""), "batch": ("N", int, " (default: 1 per process)"),
+    "time_budget": ("SEC", float, None), "seed": ("N", int, None),
+    "growth": ("on|off", str, " (default: on, with --form paper off)"),
+}  # fmt: skip
+
+
+def add_settings(options: _ActionsContainer, without: Sequence[str] = ()) -> None:
+    """Adds the options except the fields in ``without``, which a command has in another form."""
+    helps, defaults = field_descriptions(AdaptConfig), AdaptConfig()
+    for name in [name for name in SETTINGS if name not in without]:
+        metavar, kind, shown = SETTINGS[name]
+        default = getattr(defaults, name) if shown is None else None
+        text = helps[name] + (shown or ("" if default is None else f" (default: {default:g})"))
+        options.add_argument(as_option(name), metavar=metavar, type=kind, default=default, help=text)
+    text = "training as measured here (ours) or as published (paper) (default: ours)"
+    options.add_argument("--form", choices=["ours", "paper"], default="ours", help=text)
+    text = "train even if the checkpoint does not match the photographs"
+    options.add_argument("--misaligned-ok", action="store_true", help=text)
+    add_device(options, "train and measure")
+
+
+def make_config(args: Namespace) -> AdaptConfig:
+    """The settings; the error of a value out of range names the option."""
+    make, size = AdaptConfig.paper if args.form == "paper" else AdaptConfig, launched().size
+    limit = 1 / make().tau
+    if args.max_sv >= limit:
+        raise ClodError(f"--max-sv is {args.max_sv:g}, it must be below {limit:g}, where every Gaussian is culled")
+    try:
+        given = {name: value for name in SETTINGS if (value := getattr(args, name)) is not None}
+        config = make(**{"batch": size} | given)
+    except ClodError as error:
+        name, _, rest = str(error).partition(" ")
+        raise ClodError(f"{as_option(name)} {rest}") from error
+    if config.batch < size:
+        raise ClodError(f"--batch is {config.batch}, it must be at least {size}: a view for each process")
+    return config
+
+
+def make_configs(args: Namespace) -> list[AdaptConfig]:
+    """One config per value of ``--max-sv``, ascending."""
+    return [make_config(Namespace(**vars(args) | {"max_sv": value})) for value in sorted(set(args.max_sv))]

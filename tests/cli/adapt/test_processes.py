@@ -12,8 +12,8 @@ import torch
 import clod_adapter
 from clod_adapter import AdaptConfig, ClodError
 from clod_adapter.cli.main import build_parser
+from clod_adapter.cli.shared.command import make_config
 from clod_adapter.cli.shared.process import Launch, launched
-from clod_adapter.cli.shared.settings import make_config
 from clod_adapter.training.state import load_state
 from runs import STATE, Launched, Server, launch, log_of
 
