@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from clod_adapter._support.version import package_version
 from clod_adapter.errors import ClodError
-from clod_adapter.io.file_formats import check_readable, file_has_dial
+from clod_adapter.io.file_formats import file_has_dial
 from clod_adapter.progress import Listener, Stopped
 
 from .shared import command as common
@@ -59,11 +59,9 @@ def paths(args: Namespace) -> list[str]:
 def check(args: Namespace) -> None:
     common.check_dials(args, args.model)
     labels(args.against)
-    for path in paths(args):
-        check_readable(Path(path))
+    common.check_inputs(args.images, *paths(args))
     if args.base and file_has_dial(Path(args.base)):
         raise ClodError(f"{args.base}: has a dial; give --base the checkpoint that was adapted, or use --against")
-    common.check_scene(args.images)
 
 
 def outputs(args: Namespace) -> Outputs:
@@ -89,8 +87,7 @@ def execute(args: Namespace) -> dict[str, Any]:
         rows = measuring.measure(model, scene.test, dials, console, stop)
         if not rows:
             raise Stopped("stopped before the first row")
-        if not stop.requests:
-            (rows,) = measuring.with_frame_times([(model, rows)], scene.test, console, stop)
+        (rows,) = measuring.with_frame_times([(model, rows)], scene.test, console, stop)
         print(measuring.table(measuring.by_dial(rows)))
         with suppress(Stopped):
             if base is not None:

@@ -106,9 +106,6 @@ def calibration_lines(calibration: Calibration | None) -> list[str]:
 
 
 def tensor_lines(about: dict[str, Any]) -> list[str]:
-    from clod_adapter.calibration import Calibration
-    from clod_adapter.inspection.statistics import Spread
-
     lines = [_line("Gaussians", f"{about['count']:,}")]
     if about["kind"] == "state":
         after = f"{about['steps']} steps in {duration(about['seconds'])}, loss {about['loss']:.4g}"
@@ -117,13 +114,12 @@ def tensor_lines(about: dict[str, Any]) -> list[str]:
     lines.append(_line("changes", ", ".join(f"{k} ({v})" for k, v in about["updates"].items()) or "only the dial"))
     settings = ", ".join(f"{key} {value}" for key, value in about["config"].items() if key in SETTINGS)
     lines.append(_line("trained with", settings or "unknown settings"))
-    columns = {name: Spread(**about[key]) for name, key in (("sigma_d", "sigma"), ("growth_d", "growth")) if about[key]}
+    columns = {name: about[key] for name, key in (("sigma_d", "sigma"), ("growth_d", "growth")) if about[key]}
     lines += ["", *spread_table([*columns.items()]), ""]
     a = about["attenuation"]
-    how = f"s = 1 to {a['max_sv']:g}, {a['cut']} culling at tau = {a['tau']:.3g}"
+    how = f"s = 1 to {a.max_sv:g}, {a.cut} culling at tau = {a.tau:.3g}"
     lines.append(_line("dial", f"{' and '.join(columns)}, {how}"))
-    calibration = about["calibration"]
-    return lines + calibration_lines(calibration and Calibration.from_dict(calibration))
+    return lines + calibration_lines(about["calibration"])
 
 
 def _block(name: str, says: Sequence[str]) -> list[str]:

@@ -130,7 +130,9 @@ def run(name: str, args: argparse.Namespace) -> int:
     outputs = command.outputs(args) if hasattr(command, "outputs") else Outputs()
     with process.signals_as_interrupt(), claimed(outputs):
         if name not in WITHOUT_TORCH:
-            import_library(args.quiet)
+            with Console(args.quiet).status("starting ..."):
+                for module in LIBRARY:
+                    import_module(module)
         aside = io.StringIO() if args.quiet else sys.stderr
         # Again: pycolmap, imported just now, sets a handler.
         with redirect_stdout(aside) if args.json else nullcontext(), process.signals_as_interrupt():
@@ -141,13 +143,6 @@ def run(name: str, args: argparse.Namespace) -> int:
     if args.json or (report and "outputs" not in report):
         process.check_printed()
     return int(report.get("exit_code", 0))
-
-
-def import_library(quiet: bool) -> None:
-    if not all(name in sys.modules for name in LIBRARY):
-        with Console(quiet).status("starting ..."):
-            for name in LIBRARY:
-                import_module(name)
 
 
 def build_parser(name: str) -> Parser:

@@ -12,7 +12,6 @@ from clod_adapter._support.text import file_name
 from clod_adapter._support.version import package_version
 from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import atomic_path
-from clod_adapter.io.file_formats import check_readable
 from clod_adapter.io.scene.folder import find_cameras, photograph_folders
 
 from .shared import command as common
@@ -43,8 +42,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def check(args: Namespace) -> None:
     common.check_dials(args, args.model)
-    check_readable(Path(args.model))
-    common.check_scene(args.images)
+    common.check_inputs(args.images, args.model)
     # Images must not replace photographs of the scene.
     out, scene = Path(args.out), Path(args.images)
     cameras = find_cameras(scene)
@@ -73,7 +71,7 @@ def execute(args: Namespace) -> dict[str, Any]:
     solved = solve_dials(args, model, [view.camera for view in views], console)
     dials = choose_dials(solved or [1.0], model, console)
     gaussians = model.gaussians.without_empty_bands()
-    pictures = write_images(gaussians, views, dials, args, console)
+    pictures = write_images(gaussians, [*zip(images, views, strict=True)], dials, args.beside, console)
     print(f"wrote {len(pictures)} image{'s' * (len(pictures) != 1)} to {out}")
     for k, dial in enumerate(dials):
         kept, error = (fmean(picture[key][k] for picture in pictures) for key in ("kept", "psnr"))
@@ -95,9 +93,9 @@ def image_names(views: Sequence[View]) -> list[Path]:
 
 
 def write_images(
-    gaussians: Gaussians, views: Sequence[View], dials: Sequence[float], args: Namespace, console: Console
+    gaussians: Gaussians, views: Sequence[tuple[Path, View]], dials: Sequence[float], beside: bool, console: Console
 ) -> list[dict[str, Any]]:
-    """Writes an image per view, until Ctrl-C: the dial values from left to right, after the photograph if asked for.
+    """Writes a file per view, until Ctrl-C: the dial values from left to right, after the photograph if asked for.
 
     Gives of each the view, the file, and per dial value the Gaussians kept, and PSNR (dB) against the photograph.
     """
@@ -106,17 +104,16 @@ def write_images(
     from clod_adapter.metrics import psnr
     from clod_adapter.render import render
 
-    written, stop, out = list[dict[str, Any]](), GracefulStop(), Path(args.out)
+    written, stop, plain = list[dict[str, Any]](), GracefulStop(), gaussians.sigma_d is None
     with console.meter("render") as meter, stop.listening():
-        for view, name in zip(views, image_names(views), strict=True):
-            plain = gaussians.sigma_d is None
+        for file, view in views:
             with torch.no_grad():
                 shown = [render(gaussians, view.camera, 1.0 if plain else dial) for dial in dials]
             panels = [rendering.pixels.cpu() for rendering in shown]
-            write_png(out / name, torch.cat([view.image, *panels] if args.beside else panels, dim=1))
+            write_png(file, torch.cat([view.image, *panels] if beside else panels, dim=1))
             kept = [int(rendering.kept.sum()) for rendering in shown]
             errors = [psnr(rendering.image, view.image) for rendering in shown]
-            written.append({"view": view.camera.name, "file": str(out / name), "kept": kept, "psnr": errors})
+            written.append({"view": view.camera.name, "file": str(file), "kept": kept, "psnr": errors})
             meter.update(len(written) / len(views), f"{len(written)}/{len(views)}")
             if stop.requests:
                 break

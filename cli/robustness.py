@@ -15,7 +15,6 @@ from clod_adapter._support.version import package_version
 from clod_adapter.config import CLASSIC, AdaptConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import atomic_path
-from clod_adapter.io.file_formats import check_readable
 from clod_adapter.progress import Listener, Stopped
 from clod_adapter.report.charts import check_matplotlib
 
@@ -27,6 +26,9 @@ from .shared.process import GracefulStop
 if TYPE_CHECKING:
     from clod_adapter.cameras import Scene
     from clod_adapter.io.checkpoint import Checkpoint
+
+
+ADAPTER = ".safetensors"  # suffix
 
 
 def add_arguments(parser: ArgumentParser) -> None:
@@ -46,16 +48,15 @@ def check(args: Namespace) -> None:
     check_matplotlib()
     common.make_configs(args)
     labels(args.ply)
-    for path in args.ply:
-        check_readable(Path(path))
-    common.check_scene(args.images)
+    common.check_inputs(args.images, *args.ply)
 
 
 def outputs(args: Namespace) -> Outputs:
     folder, cells = Path(args.out), Path(args.out) / "cells"
     files = [*result_files(folder).values()]
     for label in labels(args.ply):
-        files += [path for max_sv in (None, *args.max_sv) for path in cell_files(cells, label, max_sv)]
+        rows = [cell_file(cells, label, max_sv) for max_sv in (None, *args.max_sv)]
+        files += [*rows, *(path.with_suffix(ADAPTER) for path in rows)]
     return Outputs(derived=files, folders=[folder, cells], inputs=args.ply, scene=args.images)
 
 
@@ -64,10 +65,9 @@ def result_files(folder: Path) -> dict[str, Path]:
     return {kind: folder / f"robustness.{kind}" for kind in ("png", "csv", "json")}
 
 
-def cell_files(folder: Path, label: str, max_sv: float | None) -> tuple[Path, Path]:
-    """Rows and adapter of a checkpoint's cell: at a range, or of the baseline for None."""
-    name = f"{label}_base" if max_sv is None else f"{label}_sv{max_sv:g}"
-    return folder / f"{name}.json", folder / f"{name}.safetensors"
+def cell_file(folder: Path, label: str, max_sv: float | None) -> Path:
+    """The rows of a checkpoint's cell: at a range, or of the baseline for None. The adapter is beside them."""
+    return folder / (f"{label}_base.json" if max_sv is None else f"{label}_sv{max_sv:g}.json")
 
 
 @dataclass(frozen=True)
@@ -78,8 +78,7 @@ class Cell:
         label: names the checkpoint.
         points: dial values, or shares of the baseline, that are measured.
         scene_sha256: of its photographs.
-        file: its rows, as JSON, which mark it as finished.
-        adapter_file: not of a baseline.
+        file: its rows, as JSON, which mark it as finished; its adapter, which a baseline has not, is beside them.
     """
 
     label: str
@@ -88,11 +87,6 @@ class Cell:
     points: tuple[float, ...]
     scene_sha256: str
     file: Path
-    adapter_file: Path
-
-    @property
-    def name(self) -> str:
-        return self.file.stem
 
     @property
     def key(self) -> dict[str, Any]:
@@ -111,7 +105,7 @@ class Cell:
         except (OSError, ValueError):
             return None
         same = isinstance(found, dict) and found.get("key") == self.key
-        return found if same and (self.config is None or self.adapter_file.is_file()) else None
+        return found if same and (self.config is None or self.file.with_suffix(ADAPTER).is_file()) else None
 
     def run(self, scene: Scene, progress: Listener) -> dict[str, Any]:
         """Measures; writes the adapter and then the rows."""
@@ -120,17 +114,17 @@ class Cell:
 
         from .shared.measure import machine
 
-        base = self.checkpoint
+        base, adapter_file = self.checkpoint, self.file.with_suffix(ADAPTER)
         if self.config is None:
             result = baseline(base.gaussians, scene.test, self.points, progress)
         else:
             result = adapt_at_range(base, scene, self.config, self.points, progress)
         self.file.unlink(missing_ok=True)
         if result.adapter:
-            save_adapter(self.adapter_file, result.adapter)
+            save_adapter(adapter_file, result.adapter)
         cell = {
             "checkpoint": as_text(self.label), "max_sv": self.config and self.config.max_sv, "rows": result.rows,
-            "adapter": str(self.adapter_file) if result.adapter else None,
+            "adapter": str(adapter_file) if result.adapter else None,
             "seconds": round(result.seconds, 3), "distribution": result.distribution, "machine": machine(),
             "key": self.key,
         }  # fmt: skip
@@ -153,36 +147,37 @@ def execute(args: Namespace) -> dict[str, Any]:
         if each.gaussians.sigma_d is not None:
             console.note(f"the dial of {each.path} is ignored")
         prepare_kernels(console, each.gaussians.means.device, screen_filter=each.gaussians.screen_filter)
-    names, configs, sha256 = labels(args.ply), common.make_configs(args), scene_fingerprint(scene)
+    known, configs, sha256 = labels(args.ply), common.make_configs(args), scene_fingerprint(scene)
     # Every range is measured at the dial values of the widest one and at its own end.
     dials = tuple(sorted({*report_dials(configs[-1].max_sv), *(config.max_sv for config in configs)}))
-    cells = list[Cell]()
-    for base, name in zip(checkpoints, names, strict=True):
+    cells = dict[str, Cell]()
+    for base, name in zip(checkpoints, known, strict=True):
         for config in (None, *configs):
             points, max_sv = (BASELINE_SHARES, None) if config is None else (dials, config.max_sv)
-            cells.append(Cell(name, base, config, points, sha256, *cell_files(Path(args.out) / "cells", name, max_sv)))
-    found = {cell.name: done for cell in cells if (done := cell.read())}
+            file = cell_file(Path(args.out) / "cells", name, max_sv)
+            cells[file.stem] = Cell(name, base, config, points, sha256, file)
+    found = {name: done for name, cell in cells.items() if (done := cell.read())}
     if found:
         console.say(f"{len(found)} of {len(cells)} cells are done already: {', '.join(found)}")
     with stop.listening():
-        for k, cell in enumerate(cells, 1):
-            display = ProgressDisplay(console, stop, f"{cell.name} ({k}/{len(cells)}) training")
+        for k, (name, cell) in enumerate(cells.items(), 1):
+            display = ProgressDisplay(console, stop, f"{name} ({k}/{len(cells)}) training")
             try:
                 with closing(display):
-                    found[cell.name] = found.get(cell.name) or cell.run(scene, display)
+                    found[name] = found.get(name) or cell.run(scene, display)
             except Stopped:
-                console.say(f"{cell.name} was not finished; the same command continues with it")
+                console.say(f"{name} was not finished; the same command continues with it")
                 break
         if not found:
             raise Stopped("stopped before the first cell was finished")
-        files, missing = result_files(Path(args.out)), [cell.name for cell in cells if cell.name not in found]
+        files, missing = result_files(Path(args.out)), [name for name in cells if name not in found]
         report = {
             "command": "robustness", "version": package_version(), "scene": args.images,
             "checkpoints": [
                 {"checkpoint": label, "model": str(each.path), "count": len(each.gaussians), "sha256": each.fingerprint}
-                for label, each in zip(names, checkpoints, strict=True)
+                for label, each in zip(known, checkpoints, strict=True)
             ],
-            "cells": [found[cell.name] for cell in cells if cell.name in found],
+            "cells": [found[name] for name in cells if name in found],
             "missing": missing, "interrupted": bool(missing), "notes": console.notes, "views": len(scene.test),
             "machine": machine(), "seconds": watch.report(), "outputs": {k: str(v) for k, v in files.items()},
         }  # fmt: skip

@@ -67,11 +67,8 @@ def check(args: Namespace) -> None:
     if not 0 <= args.port < 1 << 16:
         raise ClodError(f"--port is {args.port}, it must be between 1 and 65535, or 0 for a free one")
     files = view_files(args.models)
-    for path in (*files, *([args.base] if args.base else [])):
-        check_readable(Path(path))
+    common.check_inputs(args.images, *files, *([args.base] if args.base else []))
     common.check_dials(args, files[0])
-    if args.images is not None:
-        common.check_scene(args.images)
 
 
 def execute(args: Namespace) -> None:

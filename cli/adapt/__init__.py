@@ -1,14 +1,12 @@
 """``clod-adapt``, the main command: its text, options and checks; ``run`` is in ``adapt.run``."""
 
 from argparse import ArgumentParser, Namespace
-from pathlib import Path
 from typing import Any
 
 from clod_adapter.blocks.memory import parse_size
 from clod_adapter.errors import ClodError
-from clod_adapter.io.file_formats import check_readable
 
-from ..shared.command import add_reading, add_settings, check_scene, make_config, page_files
+from ..shared.command import add_reading, add_settings, check_inputs, make_config, page_files
 from ..shared.outputs import AdaptFiles, Outputs, check_ply_name
 from ..shared.process import launched
 
@@ -50,9 +48,7 @@ def check(args: Namespace) -> None:
         parse_size(args.memory)
         if launched().size > 1:
             raise ClodError("--memory needs a single process: run without torchrun")
-    check_readable(Path(args.ply))
-    if args.images is not None:
-        check_scene(args.images)
+    check_inputs(args.images, args.ply)
 
 
 def outputs(args: Namespace) -> Outputs:

@@ -99,8 +99,7 @@ def make_result(run: Run, plan: Plan, adapted: Adapted) -> Result:
         kept, degree = plan.kept, plan.sh_degree
     base = trimmed(run.base, kept, degree)
     before, after = trim(gaussians, kept, degree), trim(adapted.gaussians, kept, degree)
-    about: dict[str, Any] = {"fingerprint": base.fingerprint, "config": asdict(run.config), "origin": base.origin}
-    adapter = extract(before, after, **about)
+    adapter = extract(before, after, fingerprint=base.fingerprint, config=asdict(run.config), origin=base.origin)
     adapter = replace(adapter, kept=kept, sh_degree=degree)
     note_training(run, adapter, adapted)
     return Result(plan, adapted, base, adapter, adapter.apply(gaussians))
@@ -155,17 +154,15 @@ def measure_result(run: Run, result: Result, stop: GracefulStop) -> Result:
 
     That is after a Ctrl-C that came when training was complete, and if the launcher ends the processes.
     """
-    views, console, plain = run.scene.test, run.console, list[Row]()
+    views, console = run.scene.test, run.console
     if run.stop.requests > 0 and not result.adapted.interrupted or hurried(result.adapted):
         return result
     detached = detach(result.gaussians)
     with run.watch.time("evaluate"):
         rows = measure(result.gaussians, views, report_dials(run.config.max_sv), console, stop)
-        if not stop.requests:
-            plain = measure(detached, views, [1.0], console, stop, "plain")
-        if not stop.requests:
-            measured = [(run.base.gaussians, run.base_rows), (result.gaussians, rows), (detached, plain)]
-            run.base_rows, rows, plain = with_frame_times(measured, views, console, stop)
+        plain = measure(detached, views, [1.0], console, stop, "plain")
+        measured = [(run.base.gaussians, run.base_rows), (result.gaussians, rows), (detached, plain)]
+        run.base_rows, rows, plain = with_frame_times(measured, views, console, stop)
     return replace(result, rows=rows, plain=plain, cut=stop.requests > 0)
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from clod_adapter.errors import ClodError
-from clod_adapter.io.file_formats import check_readable, file_has_dial
+from clod_adapter.io.file_formats import file_has_dial
 from clod_adapter.io.formats.splat_transform import SplatTransform
 
 from ..shared import command as common
@@ -69,11 +69,9 @@ def check(args: Namespace) -> None:
          f"{out}: is a file; with {folder}, --out must name a new folder"),
         (folder and not out.name, f"{out}: is the current folder; --out must name a new one"),  # ".", never replaced
     )  # fmt: skip
-    if args.images is not None:
-        common.check_scene(args.images)
     suffix = "" if folder else suffix_of(out)
     common.check_dials(args, args.model)
-    check_readable(Path(args.model))
+    common.check_inputs(args.images, args.model)
     dial, form = file_has_dial(Path(args.model)), FORMATS.get(suffix)
     others = ", ".join(other for other, each in FORMATS.items() if each.carries_sigma)
     refuse(

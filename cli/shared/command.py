@@ -13,7 +13,7 @@ from typing import Any, NoReturn
 from clod_adapter._support.version import package_version
 from clod_adapter.config import DEVICES, FILTERS, AdaptConfig, AttenuationConfig, field_descriptions
 from clod_adapter.errors import ClodError
-from clod_adapter.io.file_formats import PLY, file_has_dial, format_of
+from clod_adapter.io.file_formats import PLY, check_readable, file_has_dial, format_of
 from clod_adapter.io.scene.folder import find_cameras
 from clod_adapter.report.charts import chart_file, check_matplotlib
 
@@ -192,11 +192,14 @@ def check_dials(args: Namespace, model: str) -> None:
             raise no_calibration(Path(model), option)
 
 
-def check_scene(folder: str) -> None:
-    """Refuses anything but a folder with a COLMAP model or a transforms.json."""
-    if not Path(folder).is_dir():
-        raise ClodError(f"{folder}: is not a folder; give the one that holds images/ and sparse/0")
-    find_cameras(Path(folder))
+def check_inputs(scene: str | None, *paths: str) -> None:
+    """Refuses a file that is none to read, and a scene that is no folder with a COLMAP model or a transforms.json."""
+    for path in paths:
+        check_readable(Path(path))
+    if scene is not None and not Path(scene).is_dir():
+        raise ClodError(f"{scene}: is not a folder; give the one that holds images/ and sparse/0")
+    if scene is not None:
+        find_cameras(Path(scene))
 
 
 # Training settings, by field of AdaptConfig: metavar, type, and what help says of a default that depends on another

@@ -69,12 +69,13 @@ class Console:
 class Meter:
     """A listener: a bar on a terminal, otherwise a line now and then, with the time left."""
 
-    def __init__(self, console: Console, label: str, initial: float = 0.0) -> None:
-        self.console = console
-        self.bar: Any = None
-        self.begin(label, initial)
+    bar: Any = None
 
-    def begin(self, label: str, initial: float) -> None:
+    def __init__(self, console: Console, label: str) -> None:
+        self.console = console
+        self.begin(label)
+
+    def begin(self, label: str, initial: float = 0.0) -> None:
         """Begins a phase, of which the share ``initial`` was done before."""
         self.close()
         self.label, self.initial = label, initial
@@ -116,7 +117,6 @@ class ProgressDisplay(Meter):
     def __init__(self, console: Console, stop: GracefulStop, training: str = Phase.TRAINING) -> None:
         self.console, self.stop, self.training = console, stop, training
         self.phase: Phase | None = None
-        self.bar = None
 
     def __call__(self, now: Progress) -> bool:
         training = now.phase == Phase.TRAINING
@@ -138,6 +138,4 @@ def duration(seconds: float) -> str:
     """``0.4 s``, ``42 s``, ``2:05``, ``1:02:05``."""
     if seconds < 59.5:
         return f"{seconds:.1f} s" if seconds < 9.95 else f"{seconds:.0f} s"
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"
+    return bars().format_interval(round(seconds)).lstrip("0")

@@ -1,15 +1,17 @@
 """Dial values: solved from budgets, measured with progress, and shown in tables."""
 
-import argparse
 import os
 import platform
 import time
+from argparse import Namespace
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numba
+import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
@@ -46,10 +48,8 @@ class Stopwatch:
     def time(self, name: str) -> Iterator[None]:
         """Adds the time of the block to ``name``."""
         began = time.perf_counter()
-        try:
-            yield
-        finally:
-            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - began
+        yield
+        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - began
 
     def report(self) -> dict[str, float]:
         return {name: round(value, 3) for name, value in {**self.seconds, "total": self.total()}.items()}
@@ -59,19 +59,9 @@ class Stopwatch:
 
 
 def machine() -> dict[str, Any]:
-    import numba
-    import torch
-
     gpu = {"gpu": torch.cuda.get_device_name()} if torch.cuda.is_available() else {}
-    return {
-        **gpu,
-        "cpu": _cpu_name(),
-        "cores": os.cpu_count(),
-        "threads": torch.get_num_threads(),
-        "python": platform.python_version(),
-        "torch": torch.__version__,
-        "numba": numba.__version__,
-    }
+    versions = {"python": platform.python_version(), "torch": torch.__version__, "numba": numba.__version__}
+    return gpu | {"cpu": _cpu_name(), "cores": os.cpu_count(), "threads": torch.get_num_threads()} | versions
 
 
 def machine_name(device: str = "cpu") -> str:
@@ -140,9 +130,9 @@ def measure(
     gaussians: Gaussians, views: Sequence[View], dials: Sequence[float], console: Console, stop: GracefulStop,
     label: str = "measure",
 ) -> list[Row]:  # fmt: skip
-    """The rows of the dial values; those that were finished when ``stop`` has heard a signal, none without views."""
+    """The rows of the dial values; those that were finished when ``stop`` heard a signal, none without views."""
     with console.meter(label) as meter:
-        return evaluate(gaussians, views, dials, progress=stop.heeding(meter)) if views else []
+        return evaluate(gaussians, views, dials, progress=stop.heeding(meter)) if views and not stop.requests else []
 
 
 def with_frame_times(
@@ -151,7 +141,7 @@ def with_frame_times(
     """The rows of each model with frame times that can be compared; unchanged after a signal."""
     jobs = [(model, sorted({row.virtual_scale for row in rows})) for model, rows in measured]
     found = [rows for _, rows in measured]
-    if not any(found):
+    if stop.requests or not any(found):
         return found
     try:
         with console.meter(Phase.FRAME_TIMES) as meter:
@@ -169,12 +159,7 @@ VIEWPOINTS = 16  # most training cameras stored in a calibration: all 84 baked 0
 
 
 def solve_dials(
-    args: argparse.Namespace,
-    model: Checkpoint,
-    cameras: Sequence[Camera | Viewpoint],
-    console: Console,
-    *,
-    baked: bool = False,
+    args: Namespace, model: Checkpoint, cameras: Sequence[Camera | Viewpoint], console: Console, *, baked: bool = False
 ) -> list[float] | None:
     """The dial values of --sv or of a budget, None without either.
 

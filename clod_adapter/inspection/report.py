@@ -72,7 +72,7 @@ class Inspection:
     writer: str | None  # the program that probably wrote it
     notes: tuple[str, ...]  # of the reader
     splat: Splat | None = None
-    about: dict[str, Any] | None = None  # of an adapter or a training state, plain JSON
+    about: dict[str, Any] | None = None  # of an adapter or a training state
     anomalies: tuple[Anomaly, ...] = ()
     left_out: tuple[str, ...] = ()  # what adapting leaves out or does not change, one line each
 
@@ -185,18 +185,18 @@ def _inspect_tensors(path: Path) -> Inspection | None:
         count = next((len(t) for t in state.tensors.values() if t.ndim), 0)
         about = {
             "kind": "state", "writer": None, "count": count, "steps": state.steps, "seconds": state.seconds,
-            "loss": state.loss, "belongs": belongs, "attenuation": asdict(state.attenuation),
+            "loss": state.loss, "belongs": belongs, "attenuation": state.attenuation,
         }  # fmt: skip
         return Inspection(str(path), size, "the state of an interrupted run, for --resume", None, (), about=about)
     if KEY not in metadata or f'"{ADAPTER}"' not in metadata[KEY]:
         return None
     adapter = load_adapter(path)
     kinds = {name: f"{str(t.dtype).removeprefix('torch.')} {list(t.shape)}" for name, t in adapter.updates.items()}
-    growth = None if adapter.growth_d is None else asdict(Spread.of(adapter.growth_d.numpy()))
+    growth = None if adapter.growth_d is None else Spread.of(adapter.growth_d.numpy())
     writer, what = f"clod-adapter {adapter.version}", "an adapter: what clod-adapt learned, without its checkpoint"
     return Inspection(str(path), size, what, writer, adapter.notes, about={
         "kind": "adapter", "writer": writer, "count": len(adapter.sigma_d),
-        "base": adapter.base_fingerprint, "attenuation": asdict(adapter.attenuation), "config": adapter.config,
-        "updates": kinds, "origin": list(adapter.origin), "sigma": asdict(Spread.of(adapter.sigma_d.numpy())),
-        "growth": growth, "calibration": adapter.calibration and adapter.calibration.as_dict(),
+        "base": adapter.base_fingerprint, "attenuation": adapter.attenuation, "config": adapter.config,
+        "updates": kinds, "origin": list(adapter.origin), "sigma": Spread.of(adapter.sigma_d.numpy()),
+        "growth": growth, "calibration": adapter.calibration,
     })  # fmt: skip

@@ -37,7 +37,7 @@ def test_progress_lines_without_a_terminal(capsys: pytest.CaptureFixture[str], m
         for share, left, step in ((11, "1:20", 10), (22, "1:10", 20))
     ]
     now = 10.0  # the time left does not count the work of an earlier run
-    meter = Meter(Console(), "training", initial=0.5)
+    meter.begin("training", initial=0.5)
     meter.began = meter.printed = 0.0
     meter.update(0.6)
     assert capsys.readouterr().err == "training  60%, 40 s left\n"
