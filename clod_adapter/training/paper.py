@@ -18,20 +18,10 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.importance import MOST_VIEWS, has_dial, initialize, scene_distance, with_growth
 from clod_adapter.progress import Listener
 from clod_adapter.training.dial import SIGMA_RANGE, Dial
-from clod_adapter.training.schedule import Schedule
+from clod_adapter.training.schedule import PAPER
 from clod_adapter.training.target_count import slope_of_sigmoid
 
 SOFTNESS = 0.5  # of the sigmoid of the straight-through count, in log opacity
-
-
-class PaperSchedule(Schedule):
-    """One s ~ U(1, max_sv) a step, of whole photographs; no average of parameters."""
-
-    def __init__(self) -> None:
-        super().__init__(full=0.0, coarse=0.0, lr_final=0.05, average=0.0, rendered=1.0, counted=0.0)
-
-    def dial(self, place: float, share_done: float, end: float) -> float:
-        return 1 + (end - 1) * place
 
 
 class PaperDial(Dial):
@@ -44,7 +34,7 @@ class PaperDial(Dial):
     decay = "sigma"
     limits = SIGMA_RANGE
     everywhere = frozenset({"opacity_logits"})
-    schedule = PaperSchedule()
+    schedule = PAPER
     weight_slope = 0.5
     measured = False
 

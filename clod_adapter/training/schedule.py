@@ -26,19 +26,22 @@ class Schedule:
     average: float = 0.2  # share of the steps so far, at the end, whose parameters are averaged for the result
     rendered: float = 1.25  # times max_sv, the largest dial value of steps
     counted: float = 1.5  # and of counts
+    even: bool = False  # whether dial values are uniform, not log-uniform
 
     def dial(self, place: float, share_done: float, end: float) -> float:
-        """The dial value at ``place`` in [0, 1): 0, 1, or log-uniform from 1 to ``end``.
+        """The dial value at ``place`` in [0, 1): 0, 1, or from 1 to ``end``.
 
         Steps at s = 0 train what cameras nearer than the photographs see, and viewers that do not know the dial.
         """
         full = self.full * (1 - (1 - self.full_final) * share_done)
         if place < full:
             return 0.0 if place < UNATTENUATED * full else 1.0
-        return end ** ((place - full) / (1 - full))
+        return 1 + (end - 1) * place if self.even else end ** ((place - full) / (1 - full))
 
 
 OURS = Schedule()
+# One s ~ U(1, max_sv) a step, of whole photographs; no average of parameters.
+PAPER = Schedule(full=0.0, coarse=0.0, lr_final=0.05, average=0.0, rendered=1.0, counted=0.0, even=True)
 
 
 class Sample(NamedTuple):

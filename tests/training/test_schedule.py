@@ -6,8 +6,7 @@ from dataclasses import replace
 import torch
 
 from clod_adapter import AdaptConfig, View
-from clod_adapter.training.paper import PaperSchedule
-from clod_adapter.training.schedule import OURS, Schedule, ViewSampler
+from clod_adapter.training.schedule import OURS, PAPER, Schedule, ViewSampler
 from scenes import capture
 
 VIEWS = capture(n=20)[1].train
@@ -32,7 +31,7 @@ def test_dial_values_follow_the_schedule() -> None:
     for stretch in drawn(Schedule(full=0.25)).split(120):
         assert abs(int((stretch <= 1).sum()) - 30) <= 1 and abs(int((stretch == 0).sum()) - 7.5) <= 1
         assert_uniform(stretch[stretch > 1].log() / math.log(OURS.rendered * 4.0))
-    assert_uniform((drawn(PaperSchedule()) - 1) / 3)
+    assert_uniform((drawn(PAPER) - 1) / 3)
     assert abs(int((drawn(Schedule(full=0.5, full_final=0.5), 0.5) <= 1).sum()) - 0.375 * 480) <= 1
     assert ViewSampler(VIEWS, AdaptConfig(max_sv=1.0)).draw(0, 0.0)[1:] == (1.0, None, False)
     assert drawn(Schedule(full=0.0), tau=0.2).max() < (4 + 1 / 0.2) / 2  # at 5 nothing is kept
