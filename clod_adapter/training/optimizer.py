@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from clod_adapter.config import AdaptConfig
+from clod_adapter.integrations.splats import NAMES
 
 
 @dataclass
@@ -109,11 +110,8 @@ class RowAdam:
 
 def learning_rates(config: AdaptConfig, decay: str) -> dict[str, float]:
     """By parameter, for a batch; that of means is in units of ``own_sizes``."""
-    rates = {
-        "means": config.lr_means, "quats": config.lr_quats, "log_scales": config.lr_scales,
-        "opacity_logits": config.lr_opacities, "sh0": config.lr_sh0, "shN": config.lr_shN,
-        decay: config.lr_sigma, "growth_d": config.lr_growth,
-    }  # fmt: skip
+    rates = {ours: getattr(config, f"lr_{name}") for name, ours in NAMES.items()}
+    rates |= {decay: config.lr_sigma, "growth_d": config.lr_growth}
     return {name: rate * math.sqrt(config.batch) for name, rate in rates.items()}
 
 

@@ -21,9 +21,7 @@ from clod_adapter.training.distributed import ProcessGroup
 from clod_adapter.training.loop import Adapted, adapt
 from clod_adapter.training.state import TrainingState
 
-RATES = {
-    "means": "lr_means", "quats": "lr_quats", "scales": "lr_scales", "opacities": "lr_opacities", "sh0": "lr_sh0",
-}  # fmt: skip
+RATES = {name: f"lr_{name}" for name in ("means", "quats", "scales", "opacities", "sh0")}
 NAMES = ("bands", "unseen", *RATES)
 NOT_NEEDED = "not needed"  # the verdict on a step that does not apply to the scene
 
