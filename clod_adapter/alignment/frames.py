@@ -63,8 +63,8 @@ class Frame:
 
     def as_dict(self) -> dict[str, Any]:
         """The fields but ``description``, for reports."""
-        fields = {"name": self.name, "rotation": self.rotation.tolist(), "scale": self.scale}
-        return fields | {"offset": self.offset.tolist(), "inverted": self.inverted, "opengl": self.opengl}
+        fields = {name: value for name, value in vars(self).items() if name != "description"}
+        return fields | {"rotation": self.rotation.tolist(), "offset": self.offset.tolist()}
 
 
 def known_frames(viewmats: Tensor, points: Tensor | None = None) -> list[Frame]:

@@ -23,6 +23,7 @@ from clod_adapter.adapter import detach
 from clod_adapter.cameras import Camera, near_plane
 from clod_adapter.config import require
 from clod_adapter.errors import ClodError
+from clod_adapter.finite import spoilt_rows
 from clod_adapter.gaussians import SH_C0, Gaussians
 from clod_adapter.initialization.importance import coverage
 from clod_adapter.progress import Listener, Phase, tell
@@ -160,10 +161,8 @@ class _Placement:
 
 def _usable(gaussians: Gaussians) -> Tensor:
     """``[n]`` int64, the visible and finite Gaussians. An infinite opacity logit is a fully opaque Gaussian."""
-    rows = gaussians.opacities > VISIBLE
-    for values in gaussians.tensors().values():
-        if values.shape[1:].numel() and values is not gaussians.opacity_logits:
-            rows &= values.reshape(len(values), -1).isfinite().all(1)
+    others = {n: v for n, v in gaussians.tensors().items() if v.shape[1:].numel() and n != "opacity_logits"}
+    rows = (gaussians.opacities > VISIBLE) & ~spoilt_rows(others)
     if not rows.any():
         raise ClodError("no camera can be placed: the checkpoint has no Gaussian that is visible and finite")
     return rows.nonzero()[:, 0]
