@@ -23,10 +23,10 @@ from nerfstudio.viewer.viewer_elements import ViewerSlider
 from torch import Tensor
 from torch.nn import Parameter
 
-from clod_adapter.cameras import View
+from clod_adapter.cameras import Camera
 from clod_adapter.config import AdaptConfig, ScreenFilter
 from clod_adapter.errors import ClodError
-from clod_adapter.nerfstudio.splatfacto import chosen, new_dial, shown, state_of, view_of, write_ply
+from clod_adapter.nerfstudio.splatfacto import camera_of, chosen, new_dial, shown, state_of, write_ply
 from clod_adapter.training.dial import Dial
 from clod_adapter.training.schedule import OURS
 
@@ -75,11 +75,11 @@ class ClodSplatfactoModel(SplatfactoModel):  # type: ignore[misc]
         self.slider = ViewerSlider("Dial s", start, 1.0, max(self.config.max_sv, start), 0.01)
         self.virtual_scale = start
 
-    def attach(self, views: Sequence[View], saved: Mapping[str, Any]) -> None:
+    def attach(self, cameras: Sequence[Camera], saved: Mapping[str, Any]) -> None:
         """Gives the loaded Gaussians their dial, a saved or an initialized one (``new_dial``)."""
         own = self.config
         config = AdaptConfig(max_sv=own.max_sv, exponent=own.exponent, ssim_weight=own.ssim_lambda)
-        self.dial = new_dial(self.gauss_params, views, config, saved).to(self.device)
+        self.dial = new_dial(self.gauss_params, cameras, config, saved).to(self.device)
         groups = {group["name"] for group in self.dial.param_groups(splats=True) if group["lr"] > 0}
         for name, parameter in self.gauss_params.items():
             parameter.requires_grad_(name in groups)
@@ -100,7 +100,7 @@ class ClodSplatfactoModel(SplatfactoModel):  # type: ignore[misc]
         if self.dial is None or not isinstance(camera, Cameras):
             return super().get_outputs(camera)  # type: ignore[no-any-return]
         self.virtual_scale = self.dial.sample() if self.training else float(self.slider.value)
-        self._shown = shown(self.gauss_params, self.dial, view_of(camera).camera, self.virtual_scale)
+        self._shown = shown(self.gauss_params, self.dial, camera_of(camera), self.virtual_scale)
         try:
             return super().get_outputs(camera)  # type: ignore[no-any-return]
         finally:
@@ -131,7 +131,7 @@ class ClodPipeline(VanillaPipeline):  # type: ignore[misc]
         saved = {name.removeprefix(OWN): value for name, value in loaded_state.items() if name.startswith(OWN)}
         super().load_pipeline({name: value for name, value in loaded_state.items() if not name.startswith(OWN)}, step)
         cameras = self.datamanager.train_dataset.cameras
-        self.model.attach([view_of(cameras[i : i + 1]) for i in range(len(cameras))], saved)
+        self.model.attach([camera_of(cameras[i : i + 1]) for i in range(len(cameras))], saved)
         self._export_with_dial()
 
     def state_dict(self, *args: Any, **kwargs: Any) -> dict[str, Any]:

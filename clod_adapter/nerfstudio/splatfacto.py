@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from clod_adapter.cameras import Camera, StoredView, View
+from clod_adapter.cameras import Camera
 from clod_adapter.config import AdaptConfig, AttenuationConfig, ScreenFilter
 from clod_adapter.equation.attenuation import check_dial
 from clod_adapter.errors import ClodError
@@ -22,8 +22,8 @@ SETTINGS = "attenuation"
 NEARLY = 1e-6  # the logit of an opacity this close to 0 or 1 has no useful gradient
 
 
-def view_of(camera: Any) -> View:
-    """The first camera of nerfstudio's ``Cameras``, as a view without its photograph.
+def camera_of(camera: Any) -> Camera:
+    """The first camera of nerfstudio's ``Cameras``.
 
     nerfstudio's cameras look along -z with y up; ``camera_to_worlds`` is ``[..., 3, 4]``.
     """
@@ -35,8 +35,7 @@ def view_of(camera: Any) -> View:
         float(getattr(camera, name).flatten()[0]) for name in ("fx", "fy", "cx", "cy", "width", "height")
     )
     K = torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]], dtype=torch.float32)
-    found = Camera(viewmat, K, int(width), int(height))
-    return StoredView(found, lambda: torch.zeros(found.height, found.width, 3, dtype=torch.uint8))
+    return Camera(viewmat, K, int(width), int(height))
 
 
 def shown(parameters: Mapping[str, Tensor], dial: Dial, camera: Camera, virtual_scale: float) -> dict[str, Tensor]:
@@ -59,11 +58,11 @@ def shown(parameters: Mapping[str, Tensor], dial: Dial, camera: Camera, virtual_
 
 
 def new_dial(
-    parameters: Mapping[str, Tensor], views: Sequence[View], config: AdaptConfig, saved: Mapping[str, Any]
+    parameters: Mapping[str, Tensor], cameras: Sequence[Camera], config: AdaptConfig, saved: Mapping[str, Any]
 ) -> Dial:
     """The dial that ``saved`` describes (``state_of``), or an initialized one if it is empty."""
     if not saved:
-        return attach(parameters, views, config)
+        return attach(parameters, cameras, config)
     attenuation = AttenuationConfig(**saved[SETTINGS])
     if attenuation.max_sv != config.max_sv:
         raise ClodError(f"the dial was trained up to {attenuation.max_sv:g}; set --pipeline.model.max-sv to that")
@@ -71,7 +70,7 @@ def new_dial(
     start = from_gsplat({name: value.detach() for name, value in parameters.items()}).replace(
         sigma_d=tensors["log_sigma"].exp(), growth_d=tensors.get("growth_d"), attenuation=attenuation
     )
-    dial = Dial(parameters, start, views, config)
+    dial = Dial(parameters, start, cameras, config)
     dial.load_state_dict(tensors)
     return dial
 

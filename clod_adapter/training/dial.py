@@ -90,21 +90,21 @@ class Dial(nn.Module):
         def __call__(self, camera: Camera, virtual_scale: float) -> Attenuated: ...
 
     def __init__(
-        self, splats: Splats, start: Gaussians, views: Sequence[View], config: AdaptConfig,
+        self, splats: Splats, start: Gaussians, cameras: Sequence[Camera], config: AdaptConfig,
         subset: TrainableSubset | None = None,
     ) -> None:  # fmt: skip
         super().__init__()
         assert start.sigma_d is not None and start.attenuation is not None
         self._given = (splats,)  # a ParameterDict that is an attribute would be a part of the module
         self.part = subset or TrainableSubset(len(start))
-        self.attenuation, self.config = start.attenuation, config.for_views(len(views))
+        self.attenuation, self.config = start.attenuation, config.for_views(len(cameras))
         curve = partial(target_share, count=self.part.trained, config=config, total=self.part.total)
         self._target = self.part.target or curve
         self.register_parameter(self.decay, nn.Parameter(self.parameter_of(start.sigma_d)))
         growth_d = start.growth_d
         self.growth_d = None if growth_d is None else nn.Parameter(growth_d.detach().float().clamp(*GROWTH_RANGE))
-        cameras = self.part.cameras or [view.camera for view in spread(views, MOST_VIEWS)]
-        typical = typical_distance(start.means, cameras, start.attenuation)[: self.part.trained]
+        places = self.part.cameras or spread(cameras, MOST_VIEWS)
+        typical = typical_distance(start.means, places, start.attenuation)[: self.part.trained]
         self.register_buffer("typical", typical, persistent=False)
         self._own_size = float(own_sizes(start.log_scales).median())
         self.sampler, self._sampled = ViewSampler((), config, start.attenuation.tau, self.schedule), 0
@@ -273,7 +273,7 @@ def attach(
     views = usable_views(base, views)
     with shown(progress) as listener:
         start = for_training(initialize(base, views, config, listener), views, config)
-    return Dial(splats, start, views, config)
+    return Dial(splats, start, [view.camera for view in views], config)
 
 
 def require_trainable(base: Gaussians, scene: Scene, config: AdaptConfig, processes: int = 1) -> None:

@@ -54,7 +54,7 @@ class Trainer:
         own: dict[str, Any] = {"dtype": torch.float32, "memory_format": torch.contiguous_format}
         attributes: Any = {name: getattr(start, name).detach().to(**own, copy=name in tuned) for name in ATTRIBUTES}
         splats = Gaussians(**attributes, screen_filter=start.screen_filter)
-        self.dial = form(splats, start, views, config, subset)
+        self.dial = form(splats, start, [view.camera for view in views], config, subset)
         dials = {name: value.detach() for name, value in self.dial.named_parameters()}
         self.parameters, self.stepped = attributes | dials, (*tuned, *dials)
         self.config, self.group, self.count = config, group, self.dial.part.trained

@@ -15,7 +15,7 @@ from clod_adapter.config import FILTERS, AdaptConfig, ScreenFilter
 from clod_adapter.equation.units import in_world_units
 from clod_adapter.errors import ClodError
 from clod_adapter.integrations.splats import from_gsplat, to_gsplat
-from clod_adapter.nerfstudio.splatfacto import chosen, new_dial, shown, state_of, view_of, write_ply
+from clod_adapter.nerfstudio.splatfacto import camera_of, chosen, new_dial, shown, state_of, write_ply
 from clod_adapter.render import render
 from clod_adapter.training.dial import Dial
 
@@ -67,26 +67,26 @@ def cameras_of(view: Camera) -> SimpleNamespace:
 
 
 @pytest.fixture(scope="module")
-def views() -> list[Any]:
-    return [view_of(cameras_of(each)) for each in scenes.ring(6, WIDTH, HEIGHT)]
+def cameras() -> list[Camera]:
+    return [camera_of(cameras_of(each)) for each in scenes.ring(6, WIDTH, HEIGHT)]
 
 
 @pytest.fixture
-def dial(parameters: dict[str, Tensor], views: list[Any]) -> Dial:
-    return new_dial(parameters, views, CONFIG, {})
+def dial(parameters: dict[str, Tensor], cameras: list[Camera]) -> Dial:
+    return new_dial(parameters, cameras, CONFIG, {})
 
 
-def test_cameras_are_nerfstudios(views: list[Any]) -> None:
-    for view, want in zip(views, scenes.ring(6, WIDTH, HEIGHT), strict=True):
-        torch.testing.assert_close(view.camera.viewmat, want.viewmat)
-        torch.testing.assert_close(view.camera.K, want.K)
-        assert (view.camera.width, view.camera.height) == (WIDTH, HEIGHT)
+def test_cameras_are_nerfstudios(cameras: list[Camera]) -> None:
+    for camera, want in zip(cameras, scenes.ring(6, WIDTH, HEIGHT), strict=True):
+        torch.testing.assert_close(camera.viewmat, want.viewmat)
+        torch.testing.assert_close(camera.K, want.K)
+        assert (camera.width, camera.height) == (WIDTH, HEIGHT)
 
 
-def test_splatfacto_draws_what_render_draws(parameters: dict[str, Tensor], dial: Dial, views: list[Any]) -> None:
+def test_splatfacto_draws_what_render_draws(parameters: dict[str, Tensor], dial: Dial, cameras: list[Camera]) -> None:
     """Activated as it does: sigmoid(30) is 1 in float32, with an infinite logit. Culled rows are behind the camera."""
     parameters["opacities"].data[0], dial.log_sigma.data[0] = 30.0, 10.0
-    camera, model = views[1].camera, dial.gaussians()
+    camera, model = cameras[1], dial.gaussians()
     plain = model.replace(sigma_d=None, growth_d=None, attenuation=None)
     for scale in (1.0, 5.0):
         changed = shown(parameters, dial, camera, scale)
@@ -107,16 +107,16 @@ def test_splatfacto_draws_what_render_draws(parameters: dict[str, Tensor], dial:
 
 
 def test_a_saved_dial_is_the_same_dial(
-    parameters: dict[str, Tensor], dial: Dial, views: list[Any], tmp_path: Any
+    parameters: dict[str, Tensor], dial: Dial, cameras: list[Camera], tmp_path: Any
 ) -> None:
     """Its state is read without running code, as nerfstudio's commands read checkpoints with today's torch."""
     torch.save(state_of(dial), tmp_path / "dial.ckpt")
     state = torch.load(tmp_path / "dial.ckpt", weights_only=True)
-    again = new_dial(parameters, views, CONFIG, state)
+    again = new_dial(parameters, cameras, CONFIG, state)
     scenes.assert_equal(again.gaussians(), dial.gaussians())
     torch.testing.assert_close(again.typical, dial.typical)
     with pytest.raises(ClodError, match="trained up to 5; set --pipeline.model.max-sv"):
-        new_dial(parameters, views, AdaptConfig(max_sv=7.0), state)
+        new_dial(parameters, cameras, AdaptConfig(max_sv=7.0), state)
 
 
 def test_the_dial_value_of_the_commands(monkeypatch: pytest.MonkeyPatch) -> None:
