@@ -1,9 +1,8 @@
 """Checks before training that a checkpoint and the posed photographs share a world frame and a screen-space filter.
 
-The baseline predictor of a photograph is its mean colour, whose error is the photograph's variance. If the error of the
-renders at s = 1 is larger, the checkpoint nearly always has another position, other axes or another scale. Three other
-causes are told apart: views outside the checkpoint's coverage (by the share of explained views), another exposure (by
-the correlation, which ignores gain and offset) and another background (by a render over white).
+A checkpoint whose renders at s = 1 have a larger error than the photographs' mean colours nearly always has another
+position, other axes or another scale. Three other causes are told apart: views outside the checkpoint's coverage (by
+the share of explained views), another exposure (by the correlation) and another background (by a render over white).
 """
 
 import math

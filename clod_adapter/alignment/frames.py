@@ -1,8 +1,7 @@
 """Frames of checkpoints that differ from that of the cameras: swapped axes, inverted poses, normalized worlds.
 
-A frame is a similarity ``x_cameras = s R x_file + t``. The cameras are transformed into the frame of the file, not the
-Gaussians into that of the cameras, which is exact for spherical harmonics too. An image does not depend on the unit of
-length, so ``[R_c | t_c]`` becomes ``[R_c R | (R_c t + t_c) / s]``.
+A frame is a similarity ``x_cameras = s R x_file + t``. The cameras are transformed into the frame of the file, which is
+exact for spherical harmonics too: ``[R_c | t_c]`` becomes ``[R_c R | (R_c t + t_c) / s]``.
 """
 
 import itertools

@@ -1,7 +1,6 @@
 """The memory that adapting takes, and the number of blocks that keeps it below a limit.
 
-Bytes per Gaussian are measured, with the CPU rasterizer in float32; each is the peak of its phase. The context of a
-block depends on the cameras; a plan assumes that it is the whole scene.
+Bytes per Gaussian are measured peaks of the CPU rasterizer. The context of a block is assumed to be the whole scene.
 """
 
 import math

@@ -1,7 +1,6 @@
 """Several processes that train one set of Gaussians, on ``torch.distributed``.
 
-Each process holds all parameters, samples the same views from the same seed, and makes every step. Only the views of a
-batch are divided, and the gradients are summed before the step, so all processes hold the same parameters.
+All hold the same parameters, sample the same views, and make every step. Only the views of a batch are divided.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
-"""CLoD-GS's own training (section 3.3); those of its settings that are fields are in ``AdaptConfig.paper``.
+"""CLoD-GS's own training (section 3.3), with the settings of ``AdaptConfig.paper``.
 
-Not in the paper, chosen here: sigma_d initialized to 1, a straight-through count with a sigmoid SOFTNESS wide, learning
-rates that decay to a twentieth.
+Chosen here: sigma_d begins as 1, the count's sigmoid is SOFTNESS wide, learning rates decay to a twentieth.
 """
 
 from collections.abc import Sequence
@@ -82,10 +81,9 @@ def paper_count(
 
 
 def soft_count(log_opacities: Tensor, virtual_scale: float, tau: float, temperature: float) -> Tensor:
-    """0-d, the share of Gaussians kept, in [0, 1]: exact in the forward pass, soft in the backward pass.
+    """0-d, the share of Gaussians kept, in [0, 1]: the mean of ``log a'' > log(tau s)``; 0 for no Gaussians.
 
-    Forward: mean of ``log a'' > log(tau s)``; 0 for no Gaussians. Backward, straight through: the gradient
-    of the mean of ``sigmoid((log a'' - log(tau s)) / temperature)``, which is 0 at log a'' = -inf.
+    Its gradient is that of the mean of ``sigmoid((log a'' - log(tau s)) / temperature)``, 0 at log a'' = -inf.
     """
     (log_opacities,) = conform(log_opacities=log_opacities)
     fixed, threshold = log_opacities.detach(), log_threshold(tau, virtual_scale)

@@ -125,8 +125,7 @@ def _measured(
 ) -> tuple[Tensor, Tensor | None, AdaptConfig, list[Decision]]:  # fmt: skip
     """``[N]`` what removing each Gaussian costs, the rows to train (None for all), and the share kept at s = 1.
 
-    The views of the fold decide about the share: on the views that errors are from, Gaussians seem needless that others
-    need.
+    The fold decides about the share: on the views that errors are from, Gaussians seem needless that others need.
     """
     fold = spread(views, min(VIEWS, len(views) // 4))
     some = spread([view for view in views if view not in fold], MOST_VIEWS - len(fold))
