@@ -103,8 +103,7 @@ def test_a_step_waits_for_the_device_once(there: Gaussians, monkeypatch: pytest.
     views = views_of(there)[:1]
     moving = [PseudoView(view.camera, there, 1.0) for view in views]
     config = replace(CONFIG, batch=2)
-    trainer = Trainer(for_training(there, views, config), (*views, *moving), config)
-    trainer.step(0.0)  # moves Adam's table to the device
+    trainer = Trainer(for_training(there), (*views, *moving), config)
     for share_done in (0.1, 0.9):
         with waits() as found:
             trainer.step(share_done)

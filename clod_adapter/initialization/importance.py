@@ -47,7 +47,7 @@ def initialize(
     ``error`` is ``removal_error`` of these views and seed, where it is known.
     """
     if base.attenuation is not None and has_dial(base):
-        known = _reference_distance(base, views, config)
+        known = known_distance(base.attenuation) or scene_distance(base, spread(views, MOST_VIEWS))
         own = replace(base.attenuation, max_sv=config.max_sv, reference_distance=known)
         return in_world_units(with_growth(base.replace(attenuation=own), config, base.growth_d))
     views = spread(views, MOST_VIEWS)
@@ -74,18 +74,11 @@ def with_growth(initial: Gaussians, config: AdaptConfig, growth_d: Tensor | None
     return initial.replace(growth_d=torch.zeros_like(initial.opacity_logits) if growth_d is None else growth_d)
 
 
-def for_training(initial: Gaussians, views: Sequence[View], config: AdaptConfig) -> Gaussians:
-    """``initial`` with sigma_d in units of the reference distance, ``scene_distance`` where it is unknown."""
-    known = _reference_distance(initial, views, config)
+def for_training(initial: Gaussians) -> Gaussians:
+    """The result of ``initialize`` with sigma_d in units of the reference distance, which it has unless that is 1."""
     assert initial.attenuation is not None
-    own = replace(initial.attenuation, reference_distance=known)
-    return with_distance(initial.replace(attenuation=own), known)
-
-
-def _reference_distance(dialled: Gaussians, views: Sequence[View], config: AdaptConfig) -> float:
-    """Where growth begins, world units; ``scene_distance`` of the views where it is unknown."""
-    assert dialled.attenuation is not None
-    return known_distance(dialled.attenuation) or scene_distance(dialled, spread(views, MOST_VIEWS))
+    known = known_distance(initial.attenuation) or 1.0
+    return with_distance(initial.replace(attenuation=replace(initial.attenuation, reference_distance=known)), known)
 
 
 def has_dial(base: Gaussians) -> bool:

@@ -272,7 +272,7 @@ def attach(
     require_trainable(base, Scene(views, ()), config)
     views = usable_views(base, views)
     with shown(progress) as listener:
-        start = for_training(initialize(base, views, config, listener), views, config)
+        start = for_training(initialize(base, views, config, listener))
     return Dial(splats, start, [view.camera for view in views], config)
 
 

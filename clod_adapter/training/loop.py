@@ -132,7 +132,7 @@ def _initialized(
     group: ProcessGroup | None,
 ) -> Gaussians:  # fmt: skip
     """The Gaussians with the initial dial: of a group, which may round differently, the first process's."""
-    begun = for_training(form_of(config).initial(lean, views, config, progress), views, config)
+    begun = for_training(form_of(config).initial(lean, views, config, progress))
     found: Any = {name: getattr(begun, name) for name in ("sigma_d", "growth_d", "attenuation")}
     return lean.replace(**(group.broadcast(found) if group else found)).to(lean.means.device)
 
