@@ -14,11 +14,11 @@ from clod_adapter._support.version import package_version
 from clod_adapter.errors import ClodError
 from clod_adapter.io.file_formats import file_has_dial
 from clod_adapter.progress import Listener, Stopped
+from clod_adapter.training.interrupts import GracefulStop
 
 from .shared import command as common
 from .shared.console import Console
 from .shared.outputs import Outputs, labels
-from .shared.process import GracefulStop
 
 if TYPE_CHECKING:
     from clod_adapter.cameras import Scene

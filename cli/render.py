@@ -13,11 +13,11 @@ from clod_adapter._support.version import package_version
 from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.scene.folder import find_cameras, photograph_folders
+from clod_adapter.training.interrupts import GracefulStop
 
 from .shared import command as common
 from .shared.console import Console
 from .shared.outputs import Outputs, check_outputs, make_folder
-from .shared.process import GracefulStop
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -17,11 +17,11 @@ from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.progress import Listener, Stopped
 from clod_adapter.report.charts import check_matplotlib
+from clod_adapter.training.interrupts import GracefulStop
 
 from .shared import command as common
 from .shared.console import Console, ProgressDisplay, duration
 from .shared.outputs import Outputs, labels, write_report
-from .shared.process import GracefulStop
 
 if TYPE_CHECKING:
     from clod_adapter.cameras import Scene

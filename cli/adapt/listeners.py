@@ -12,11 +12,11 @@ from clod_adapter._support.version import package_version
 from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.progress import Listener, Progress, Stopped
+from clod_adapter.training.interrupts import GracefulStop
 from clod_adapter.training.state import StateRefused, TrainingState, load_state, save_state
 
 from ..shared.command import SETTINGS, as_option
 from ..shared.console import Console
-from ..shared.process import GracefulStop
 
 # Not "leave out --resume": the demo gives that option itself.
 ORIGINAL = "use the original arguments, or delete the file to start over"

@@ -24,6 +24,7 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.checkpoint import Checkpoint
 from clod_adapter.io.scene.load import ImageCache
 from clod_adapter.progress import Phase, Stopped
+from clod_adapter.training.interrupts import GracefulStop
 from clod_adapter.training.loop import time_steps
 from clod_adapter.training.plan import NOT_NEEDED, Decision, Override, Plan
 from clod_adapter.training.planner import make_plan
@@ -35,7 +36,7 @@ from ..shared.inputs import prepare_kernels, read_checkpoint
 from ..shared.measure import Stopwatch, measure, report_dials
 from ..shared.outputs import AdaptFiles
 from ..shared.pages import SNAPSHOT_VIEWS
-from ..shared.process import GracefulStop, launched
+from ..shared.process import launched
 from .listeners import Saver
 
 LONG = 100  # steps of a run that is worth a forecast

@@ -19,13 +19,14 @@ from clod_adapter.cameras import Scene
 from clod_adapter.errors import ClodError
 from clod_adapter.progress import Stopped
 from clod_adapter.training.distributed import PATIENCE, ProcessGroup, ProcessLost, joined, require_distributed
+from clod_adapter.training.interrupts import GracefulStop
 from clod_adapter.training.loop import adapt
 from clod_adapter.training.plan import Plan
 from clod_adapter.training.pseudo_views import teachers_to
 from clod_adapter.training.state import Adapted, TrainingState
 
 from ..shared.console import ProgressDisplay
-from ..shared.process import GracefulStop, Launch, launched
+from ..shared.process import Launch, launched
 
 if TYPE_CHECKING:
     from torch.distributed.distributed_c10d import Store

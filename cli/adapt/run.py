@@ -17,6 +17,7 @@ from clod_adapter.io.adapter_file import save_adapter
 from clod_adapter.io.atomic import atomic_paths, remove_leftovers
 from clod_adapter.io.checkpoint import Checkpoint, save, trimmed
 from clod_adapter.progress import Progress
+from clod_adapter.training.interrupts import GracefulStop
 from clod_adapter.training.plan import Plan
 from clod_adapter.training.state import Adapted
 
@@ -24,7 +25,7 @@ from ..shared.console import ProgressDisplay, duration
 from ..shared.measure import by_dial, calibrate, machine, measure, report_dials, table, with_frame_times
 from ..shared.outputs import size, write_report
 from ..shared.pages import AdaptPage
-from ..shared.process import GracefulStop, launched, listen_no_more
+from ..shared.process import launched, listen_no_more
 from .blocks import adapt_in_blocks
 from .prepare import Run, against_forecast, decide, forecast
 from .processes import BACKENDS, explain, hurried, together

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from clod_adapter.io.settings import WARNING
 from clod_adapter.progress import Listener, Phase, Progress
-
-from .process import GracefulStop
+from clod_adapter.training.interrupts import GracefulStop
 
 if TYPE_CHECKING:
     from tqdm import tqdm

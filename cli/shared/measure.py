@@ -27,11 +27,11 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.checkpoint import Checkpoint
 from clod_adapter.origin import Origin
 from clod_adapter.progress import Phase, Stopped
+from clod_adapter.training.interrupts import GracefulStop
 
 from .command import given_budget, no_calibration
 from .console import Console
 from .inputs import prepare_kernels
-from .process import GracefulStop
 
 # Round values, each about 1.4 times the last, or more between 1 and 5; max_sv < 1/tau = 50.
 REPORT_DIALS = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0, 10.0, 14.0, 20.0, 28.0, 40.0)

@@ -5,15 +5,13 @@ import io
 import os
 import signal
 import sys
-import threading
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, redirect_stderr, redirect_stdout
-from types import FrameType
 from typing import Any, NamedTuple, TextIO
 
 from clod_adapter.errors import ClodError
-from clod_adapter.progress import Listener, Stopped
-from clod_adapter.training.interrupts import ENDING, PRESSED
+from clod_adapter.progress import Stopped
+from clod_adapter.training.interrupts import ENDING, handled_by
 
 
 class Stream:
@@ -70,34 +68,6 @@ def check_printed() -> None:
         raise ClodError(f"stdout cannot be written ({error.strerror or error}), so the result is lost; open it")
 
 
-class GracefulStop:
-    """Counts signals. The first one requests a stop after the step under way.
-
-    The second Ctrl-C or SIGTERM raises KeyboardInterrupt, unless a launcher repeats them (``aborts``).
-    """
-
-    def __init__(self, aborts: bool = True, presses: int = 0) -> None:
-        self.requests, self.aborts, self.presses = 0, aborts, presses
-
-    @property
-    def aborted(self) -> bool:
-        """Whether the user does not want anything to be written."""
-        return self.aborts and self.presses > 1
-
-    def heeding(self, display: Listener | None = None) -> Listener:
-        """The listener that calls ``display`` and stops once a signal has arrived."""
-        return lambda now: (display is None or display(now) is not False) and self.requests == 0
-
-    def listening(self) -> AbstractContextManager[None]:
-        return _handled_by(self._request)
-
-    def _request(self, number: int, frame: FrameType | None) -> None:
-        self.requests += 1
-        self.presses += number in PRESSED
-        if self.aborted and number in PRESSED:
-            raise KeyboardInterrupt
-
-
 @contextmanager
 def interrupt_as_stopped() -> Iterator[None]:
     """Within the block Ctrl-C raises Stopped. From the dispatcher of a compiled function it comes as a SystemError."""
@@ -111,28 +81,13 @@ def interrupt_as_stopped() -> Iterator[None]:
 
 def signals_as_interrupt() -> AbstractContextManager[None]:
     """Within the block all raise KeyboardInterrupt. Enter it after importing pycolmap, which sets a handler."""
-    return _handled_by(signal.default_int_handler)
+    return handled_by(signal.default_int_handler)
 
 
 def listen_no_more() -> None:
     """Ignores all until the process ends, also after the blocks above."""
     for number in ENDING:
         signal.signal(number, signal.SIG_IGN)
-
-
-@contextmanager
-def _handled_by(handler: Callable[[int, FrameType | None], Any]) -> Iterator[None]:
-    if threading.current_thread() is not threading.main_thread():  # Python allows handlers only there
-        yield
-        return
-    heard = [n for n in ENDING if n == signal.SIGTERM or signal.getsignal(n) is not signal.SIG_IGN]
-    before = {number: signal.signal(number, handler) for number in heard}
-    try:
-        yield
-    finally:
-        for number, earlier in before.items():
-            if signal.getsignal(number) is handler:  # not after listen_no_more
-                signal.signal(number, earlier)
 
 
 # In RuntimeErrors (torch's allocators, Python's threads) and ImportErrors (the loader's).

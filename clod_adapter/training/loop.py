@@ -1,8 +1,10 @@
 """Adapting a trained checkpoint to virtual distance scaling: the training loop."""
 
 import math
+import signal
 import time
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 from typing import Any, Literal
 
@@ -19,7 +21,7 @@ from clod_adapter.progress import Listener, Phase, Progress, shown
 from clod_adapter.training.dial import TrainableSubset, require_trainable
 from clod_adapter.training.distributed import ProcessGroup, ProcessLost
 from clod_adapter.training.gate import CHECKS, split_views
-from clod_adapter.training.interrupts import DeferredInterrupt
+from clod_adapter.training.interrupts import GracefulStop
 from clod_adapter.training.paper import form_of
 from clod_adapter.training.state import Adapted, StateRefused, TrainingState
 from clod_adapter.training.trainer import Trainer
@@ -147,14 +149,14 @@ def _initialized_from(lean: Gaussians, resume: TrainingState, config: AdaptConfi
 def _train(trainer: Trainer, progress: Listener | None) -> Adapted:
     """Steps until the steps or the time budget are used up, or something ends training early."""
     group, lost, failed = trainer.group, None, None
-    began, going = time.perf_counter() - trainer.seconds, True
+    began, going, first, stop = time.perf_counter() - trainer.seconds, True, trainer.done + 1, GracefulStop()
     before = (group.waiting, group.exchanging) if group else (0.0, 0.0)
 
     def tell(error: str | None = None) -> bool:
         """Whether the listener wants training to go on."""
         return progress is None or progress(_progress(trainer, error)) is not False
 
-    with DeferredInterrupt() as interrupt:
+    with ExitStack() as block:
         try:
             while True:
                 trainer.seconds = time.perf_counter() - began
@@ -170,8 +172,9 @@ def _train(trainer: Trainer, progress: Listener | None) -> Adapted:
                         tell(str(error) or type(error).__name__)  # the listener can save the state
                     raise
                 trainer.seconds = time.perf_counter() - began
-                interrupt.begin()  # from here on there is a result
-                going = tell() and not interrupt.received
+                if trainer.done == first:  # from here on there is a result
+                    block.enter_context(stop.listening(in_place_of=signal.default_int_handler))
+                going = tell() and not stop.requests
         except ProcessLost as error:
             going, lost = False, str(error)
             tell(lost)
@@ -185,9 +188,10 @@ def _train(trainer: Trainer, progress: Listener | None) -> Adapted:
         seen = trainer.gate.finish() if trainer.gate and not lost else None
         waited = (group.waiting - before[0], group.exchanging - before[1]) if group else (0.0, 0.0)
         result = trainer.gaussians()
+    signalled = stop.requests > 0
     return Adapted(
-        result, trainer.done, trainer.seconds, trainer.start_seconds, not going or interrupt.received, lost, *waited,
-        failed, int(trainer.held.sum()), interrupt.received, seen,
+        result, trainer.done, trainer.seconds, trainer.start_seconds, not going or signalled, lost, *waited, failed,
+        int(trainer.held.sum()), signalled, seen,
     )  # fmt: skip
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from clod_adapter import AdaptConfig, Gaussians, adapt
 from clod_adapter.training import trainer
-from clod_adapter.training.interrupts import DeferredInterrupt
+from clod_adapter.training.interrupts import GracefulStop
 from runs import pressing
 from scenes import assert_equal, capture
 
@@ -40,21 +40,19 @@ def test_an_interrupt_within_the_update_completes_the_step(monkeypatch: pytest.M
 
 def test_a_second_interrupt_is_raised_at_once() -> None:
     """Not one of the signals that are repeated."""
-    before, deferred = signal.signal(signal.SIGHUP, signal.default_int_handler), 0
-    with pytest.raises(KeyboardInterrupt), DeferredInterrupt() as interrupt:
-        interrupt.begin()
+    before, deferred, stop = signal.signal(signal.SIGHUP, signal.default_int_handler), 0, GracefulStop()
+    with pytest.raises(KeyboardInterrupt), stop.listening(in_place_of=signal.default_int_handler):
         for number in (signal.SIGHUP, signal.SIGHUP, signal.SIGINT, signal.SIGHUP, signal.SIGINT):
             signal.raise_signal(number)
-            assert interrupt.received
+            assert stop.requests
             deferred += 1
     assert deferred == 4
     assert signal.getsignal(signal.SIGINT) is signal.signal(signal.SIGHUP, before) is signal.default_int_handler
 
 
 def test_other_handlers_are_not_affected() -> None:
-    heard: list[int] = []
+    heard, stop = list[int](), GracefulStop()
     signal.signal(signal.SIGINT, lambda number, frame: heard.append(number))
-    with DeferredInterrupt() as interrupt:
-        interrupt.begin()
+    with stop.listening(in_place_of=signal.default_int_handler):
         signal.raise_signal(signal.SIGINT)
-    assert heard == [signal.SIGINT] and not interrupt.received
+    assert heard == [signal.SIGINT] and not stop.requests

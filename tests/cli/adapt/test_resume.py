@@ -23,7 +23,7 @@ from clod_adapter._support.version import package_version
 from clod_adapter.cli.adapt import listeners
 from clod_adapter.cli.adapt.listeners import Saver
 from clod_adapter.cli.shared.console import Console
-from clod_adapter.cli.shared.process import GracefulStop
+from clod_adapter.training.interrupts import GracefulStop
 from clod_adapter.training.state import KEY
 from runs import OUTPUTS, STATE, change_step, fail, names, pressing
 from scenes import capture as small_capture
