@@ -47,11 +47,9 @@ def unpack(path: Path, elements: Mapping[str, np.ndarray], degree: int) -> Array
 
     chunks, packed, table = elements["chunk"], elements["vertex"], elements.get("sh")
     count, bands = len(packed), SH_COUNTS[degree] - 1
-    if len(chunks) * BLOCK < count:
-        raise ClodError(
-            f"{path}: is damaged: {count} Gaussians need {-(-count // BLOCK)} chunks, and it has {len(chunks)}; copy "
-            "or export it again"
-        )
+    if len(chunks) < (needed := -(-count // BLOCK)):
+        what = f"{count} Gaussians need {needed} chunks, and it has {len(chunks)}"
+        raise ClodError(f"{path}: is damaged: {what}; copy or export it again")
     if table is not None and len(table) != count:
         raise ClodError(f"{path}: is damaged: {len(table)} harmonics for {count} Gaussians; export it again")
 
@@ -89,11 +87,9 @@ def _require(path: Path, header: PlyData, element: str, names: tuple[str, ...], 
     types = {p.name: "list" if isinstance(p, PlyListProperty) else p.val_dtype for p in header[element].properties}
     if "list" in types.values():
         raise ClodError(f"{path}: element {element} of a compressed PLY has a list; export it again")
-    for name in names:
-        if types.get(name) != kind:
-            raise ClodError(
-                f"{path}: is a compressed PLY whose {element} has no {name} of type {kind}; export it again"
-            )
+    if absent := [name for name in names if types.get(name) != kind]:
+        what = f"is a compressed PLY whose {element} has no {absent[0]} of type {kind}"
+        raise ClodError(f"{path}: {what}; export it again")
 
 
 def _shares(bits: np.ndarray, widths: tuple[int, ...]) -> list[np.ndarray]:

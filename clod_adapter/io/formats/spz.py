@@ -193,9 +193,8 @@ def _unpacked(path: Path, data: bytes) -> bytes:
     with refused_if_damaged(path):
         unpacked = gzip.decompress(data, limit)
     if not gzip.eof or len(unpacked) < HEADER.size:
-        raise ClodError(
-            f"{path}: is truncated, or unpacks to more than {limit:,} bytes, which no Gaussians do; export it again"
-        )
+        what = f"is truncated, or unpacks to more than {limit:,} bytes, which no Gaussians do"
+        raise ClodError(f"{path}: {what}; export it again")
     return unpacked
 
 

@@ -171,15 +171,14 @@ def _load(
     cache = None if all(image.is_pinhole for image, _ in present) else cache_folder(folder)
     views, notes = list[View](), list[Note]()
     workers = min(MOST_AT_ONCE, max(2, torch.get_num_threads()))
-    with warnings.catch_warnings():
+    loads = [partial(_load_view, image, path, cache, max_width) for image, path in present]
+    with warnings.catch_warnings(), closing(in_order(loads, workers)) as found:
         # Large, but below the size at which it is refused: photographs are no attack.
         warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-        loads = [partial(_load_view, image, path, cache, max_width) for image, path in present]
-        with closing(in_order(loads, workers)) as found:
-            for (view, remarks), load in zip(found, loads, strict=True):
-                views.append(keep.store(view, partial(_again, load)) if keep else view)
-                notes += remarks
-                tell(progress, Phase.PHOTOGRAPHS, len(views), len(present))
+        for (view, remarks), load in zip(found, loads, strict=True):
+            views.append(keep.store(view, partial(_again, load)) if keep else view)
+            notes += remarks
+            tell(progress, Phase.PHOTOGRAPHS, len(views), len(present))
     return views, notes
 
 
