@@ -62,13 +62,13 @@ class _FusedLoss(torch.autograd.Function):
         l1, dssim = (1 - ssim_weight) / image.numel(), ssim_weight / image.numel()
         (height, width, _), workers = image.shape, threads.worker_count()
         shape = (3, height, kernels.stride(width))
-        x, y, similarities, *slopes = (recycled(shape).numpy() for _ in range(6))
+        x, y, *slopes = (recycled(shape).numpy() for _ in range(5))
         for plane in (x, y):
             plane[:, :, kernels.PAD + width :] = 0  # lanes beyond the image; margins of the other planes are not read
         sums, differences = np.zeros(workers), np.zeros(workers)
         gradient = torch.empty(height, width, 3, dtype=torch.float32, device="cpu")
         threads.run(kernels.to_planes, workers, image.detach().contiguous().numpy(), target.contiguous().numpy(), x, y)
-        threads.run(kernels.ssim_map, workers, x, y, width, similarities, *slopes, sums)
+        threads.run(kernels.ssim_slopes, workers, x, y, width, *slopes, sums)
         threads.run(kernels.loss_gradient, workers, x, y, width, *slopes, l1, dssim, gradient.numpy(), differences)
         ctx.save_for_backward(gradient)
         difference, similarity = float(differences.sum()), float(sums.sum())

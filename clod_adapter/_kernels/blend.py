@@ -87,8 +87,8 @@ def meet(shape, t, block):
 
 @kernel
 def blend(
-    worker, workers, records, entries, offsets, across, width, height, background, tiles, cursor, room, masks,
-    image, alpha,
+    worker, workers, records, entries, offsets, across, width, height, tiles, masks, cursor, room, background, image,
+    alpha,
 ):  # fmt: skip
     """Forward pass: writes ``image [H, W, 3]`` and ``alpha [H, W]``. An atomic cursor assigns ``tiles`` to workers.
 
@@ -188,8 +188,8 @@ def read_tile(ox, oy, width, height, image, alpha, v_image, v_alpha, state):
 
 @kernel
 def blend_gradient(
-    worker, workers, records, entries, entry_slots, offsets, across, width, height, image, alpha, v_image, v_alpha,
-    tiles, cursor, room, masks, shaped, colored, pair_sums,
+    worker, workers, records, entries, offsets, across, width, height, tiles, masks, cursor, room, entry_slots, image,
+    alpha, v_image, v_alpha, shaped, colored, pair_sums,
 ):  # fmt: skip
     """Backward pass: for each pair of Gaussian and tile the nine sums over pixels for the projection's gradient.
 

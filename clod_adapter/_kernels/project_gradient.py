@@ -119,23 +119,21 @@ def color_gradient(w, g, shN, rows, degree, cam, sh, basis, tuned, v_shN):
 
 
 @part
-def clear(values, first, last):
-    """Sets the elements from ``first`` up to ``last`` to 0."""
-    for k in range(first, last):
+def clear(values, first, last, width):
+    """Sets the rows from ``first`` up to ``last``, of ``width`` elements, to 0."""
+    for k in range(first * width, last * width):
         values[k] = c.ZERO
 
 
 @part
 def no_gradient(first, last, shaped, colored, terms, v_means, v_quats, v_scales, v_opacities, v_sh0, v_shN):
     """Sets the gradients of the rows from ``first`` up to ``last``, which are not visible, to 0."""
-    clear(v_opacities, first, last)
-    if shaped:
-        clear(v_means, 3 * first, 3 * last)
-        clear(v_quats, 4 * first, 4 * last)
-        clear(v_scales, 3 * first, 3 * last)
-    if colored:
-        clear(v_sh0, 3 * first, 3 * last)
-    clear(v_shN, 3 * terms * first, 3 * terms * last)
+    clear(v_opacities, first, last, 1)
+    clear(v_means, first, last, 3 * shaped)
+    clear(v_quats, first, last, 4 * shaped)
+    clear(v_scales, first, last, 3 * shaped)
+    clear(v_sh0, first, last, 3 * colored)
+    clear(v_shN, first, last, 3 * terms)
 
 
 @part
@@ -179,10 +177,8 @@ def project_gradient(
     v_sh0, v_shN = pointer(v_sh0), pointer(v_shN)
     while end > first and packed_ids[end - 1] >= trained:
         end -= 1
-    if dialled:
-        clear(v_sigma, first, last)
-    if grows:
-        clear(v_growth, first, last)
+    clear(v_sigma, first, last, int64(dialled))
+    clear(v_growth, first, last, int64(grows))
     done = first
     for start in range(first, end, 16):
         for lane in range(16):

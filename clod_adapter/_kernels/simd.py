@@ -146,17 +146,11 @@ eq = _compare(lambda builder, a, b: builder.fcmp_ordered("==", a, b))
 vmin = _extremum(lambda builder, a, b: builder.select(builder.fcmp_ordered("<", a, b), a, b))
 vmax = _extremum(lambda builder, a, b: builder.select(builder.fcmp_ordered(">", a, b), a, b))
 
-
-@operation(mask16, mask16, mask16)
-def both(builder, a, b):
-    """Lanes set in a and in b."""
-    return builder.and_(a, b)
-
-
-@operation(mask16, mask16, mask16)
-def but_not(builder, a, b):
-    """Lanes set in a and not in b."""
-    return builder.and_(a, builder.xor(b, ir.Constant(MASK, [1] * LANES)))
+_logic = operation(mask16, mask16, mask16)
+both = _logic(lambda builder, a, b: builder.and_(a, b))
+but_not = _logic(lambda builder, a, b: builder.and_(a, builder.not_(b)))
+# a where the mask is set, b elsewhere.
+select = operation(f32x16, mask16, *_pair)(lambda builder, mask, a, b: builder.select(mask, a, b))
 
 
 @operation(types.boolean, mask16)
@@ -164,9 +158,3 @@ def anywhere(builder, mask):
     """Whether any lane is set."""
     bits = builder.bitcast(mask, ir.IntType(LANES))
     return builder.icmp_unsigned("!=", bits, ir.Constant(ir.IntType(LANES), 0))
-
-
-@operation(f32x16, mask16, f32x16, f32x16)
-def select(builder, mask, a, b):
-    """a where the mask is set, b elsewhere."""
-    return builder.select(mask, a, b)

@@ -8,6 +8,7 @@ import numpy as np
 from numba import float32
 
 from clod_adapter._kernels.compiling import kernel, part
+from clod_adapter._kernels.pointers import pointer
 from clod_adapter._kernels.simd import fma, load, splat, store
 
 RADIUS, PAD = 5, 16
@@ -43,15 +44,11 @@ def blur_row(lines, line, length):
 
 
 @kernel
-def ssim_map(worker, workers, x, y, width, similarity, g_mean, g_square, g_product, sums):
-    """SSIM of each pixel into ``similarity``, and its derivatives by the blurred x, x^2 and x y.
-
-    The planes are flat. ``sums[worker]`` receives the sum of SSIM over the image's pixels.
-    """
+def ssim_slopes(worker, workers, x, y, width, g_mean, g_square, g_product, sums):
+    """Derivatives of each pixel's SSIM by the blurred x, x^2 and x y; ``sums[worker]``: sum of SSIM over the pixels."""
     channels, height, step = x.shape
-    x, y, similarity = x.reshape(-1), y.reshape(-1), similarity.reshape(-1)
-    g_mean, g_square, g_product = g_mean.reshape(-1), g_square.reshape(-1), g_product.reshape(-1)
-    lines, zero = np.zeros(5 * step, np.float32), splat(float32(0))
+    x, y, g_mean, g_square, g_product = pointer(x), pointer(y), pointer(g_mean), pointer(g_square), pointer(g_product)
+    lines, zero = np.zeros(6 * step, np.float32), splat(float32(0))
     c1, c2, two = splat(C1), splat(C2), splat(TWO)
     result = 0.0
     for task in range(channels * height * worker // workers, channels * height * (worker + 1) // workers):
@@ -79,12 +76,12 @@ def ssim_map(worker, workers, x, y, width, similarity, g_mean, g_square, g_produ
             inverse = float32(1) / (c * d)
             value = a * b * inverse
             where = task * step + at
-            store(similarity, where, value)
+            store(lines, 5 * step + at, value)
             store(g_mean, where, two * (my * (b - a) - value * mx * (d - c)) * inverse)
             store(g_square, where, zero - value * c * inverse)
             store(g_product, where, two * a * inverse)
         for column in range(width):
-            result += similarity[task * step + PAD + column]
+            result += lines[5 * step + PAD + column]
         # Lanes beyond the image must not contribute to the gradient.
         for column in range(task * step + PAD + width, (task + 1) * step - PAD):
             g_mean[column] = g_square[column] = g_product[column] = float32(0)
@@ -95,8 +92,7 @@ def ssim_map(worker, workers, x, y, width, similarity, g_mean, g_square, g_produ
 def loss_gradient(worker, workers, x, y, width, g_mean, g_square, g_product, l1, dssim, v_image, sums):
     """Gradient of ``l1 sum |x - y| - dssim sum SSIM`` by x, as ``[H, W, 3]``; ``sums[worker]``: sum of |x - y|."""
     channels, height, step = x.shape
-    x, y = x.reshape(-1), y.reshape(-1)
-    g_mean, g_square, g_product = g_mean.reshape(-1), g_square.reshape(-1), g_product.reshape(-1)
+    x, y, g_mean, g_square, g_product = pointer(x), pointer(y), pointer(g_mean), pointer(g_square), pointer(g_product)
     lines, out, zero = np.zeros(3 * step, np.float32), np.empty(step, np.float32), splat(float32(0))
     two, weight = splat(TWO), splat(float32(-dssim))
     result = 0.0

@@ -67,35 +67,31 @@ class Frame:
         self, arrays: list[np.ndarray], degree: int, camera: Camera, screen_filter: ScreenFilter, dial: np.ndarray
     ) -> None:
         n, workers = len(arrays[0]), workers_for(len(arrays[0]))
-        self.camera, self.workers = camera_vector(camera, screen_filter), threads.worker_count()
-        self.compensated = screen_filter.compensate or None
+        self.camera, self.compensated = camera_vector(camera, screen_filter), screen_filter.compensate or None
         self.records = recycled_array(((n + workers) * conventions.RECORD,), np.float32)
         self.packed_ids, self.counts = recycled_array((n,), np.int32), np.zeros(workers, np.int64)
         depths, packed = recycled_array((n,), np.float32), (self.packed_ids, self.counts)
         threads.run(project, workers, *arrays, degree, self.camera, dial, self.records, depths, *packed)
         keys, order, *others = (recycled_array((int(self.counts.sum()),), kind) for kind in (np.uint32, np.int32) * 2)
         order = tiles.depth_order(depths.view(np.uint32), self.counts, keys, order, *others)
-        self.width, self.height, self.across = camera.width, camera.height, -(-camera.width // conventions.TILE)
-        count, listing = self.across * -(-camera.height // conventions.TILE), workers_for(len(order))
-        histogram, totals = np.empty((listing, count), np.int64), np.empty(listing, np.int64)
-        self.offsets, self.slots = np.empty(count + 1, np.int64), recycled_array((2 * n,), np.int32)
-        given = self.records, order, self.across, histogram, totals
+        across, down = -(-camera.width // conventions.TILE), -(-camera.height // conventions.TILE)
+        offsets, listing = np.empty(across * down + 1, np.int64), workers_for(len(order))
+        histogram, totals = np.empty((listing, across * down), np.int64), np.empty(listing, np.int64)
+        given = self.records, order, across, histogram, totals
         threads.run(tiles.count_tiles, listing, *given)
-        total = tiles.tile_offsets(histogram, self.offsets, totals)
-        self.entries, self.entry_slots = recycled_array((total,), np.int32), recycled_array((total,), np.int32)
-        threads.run(tiles.fill_tiles, listing, *given, self.slots, self.entries, self.entry_slots)
+        total = tiles.tile_offsets(histogram, offsets, totals)
+        self.slots, entries = recycled_array((2 * n,), np.int32), recycled_array((total,), np.int32)
+        self.entry_slots = recycled_array((total,), np.int32)
+        threads.run(tiles.fill_tiles, listing, *given, self.slots, entries, self.entry_slots)
         # Longest lists first: no thread starts a long tile when the others are done.
-        self.tiles = np.argsort(-np.diff(self.offsets), kind="stable")
-        self.masks = recycled_array((total * blend.WORDS,), np.uint64)
+        order, masks = np.argsort(-np.diff(offsets), kind="stable"), recycled_array((total * blend.WORDS,), np.uint64)
+        self.workers, self.size, lists = threads.worker_count(), (camera.height, camera.width), (entries, offsets)
+        self.blended = self.records, *lists, across, camera.width, camera.height, order, masks
 
     def blend(self, background: np.ndarray) -> tuple[Tensor, Tensor]:
         """The image and its alpha."""
-        image, alpha = recycled((self.height, self.width, 3)), recycled((self.height, self.width))
-        threads.run(
-            blend.blend, self.workers, self.records, self.entries, self.offsets, self.across, self.width, self.height,
-            background, self.tiles, np.zeros(1, np.int64), self._room(blend.FORWARD_STATE), self.masks, image.numpy(),
-            alpha.numpy(),
-        )  # fmt: skip
+        image, alpha = recycled((*self.size, 3)), recycled(self.size)
+        self._run(blend.blend, blend.FORWARD_STATE, background, image.numpy(), alpha.numpy())
         return image, alpha
 
     def blend_gradient(
@@ -103,18 +99,15 @@ class Frame:
     ) -> np.ndarray:
         """The sums over pixels of each pair of Gaussian and tile, those of shape and colour if asked for."""
         # Reads of the last pair are sixteen floats wide too.
-        sums = recycled_array((len(self.entries) * conventions.PAIR + 16,), np.float32)
+        sums = recycled_array((len(self.entry_slots) * conventions.PAIR + 16,), np.float32)
         given = [x.contiguous().numpy() for x in (image, alpha, v_image, v_alpha)]
-        threads.run(
-            blend.blend_gradient, self.workers, self.records, self.entries, self.entry_slots, self.offsets,
-            self.across, self.width, self.height, *given, self.tiles, np.zeros(1, np.int64),
-            self._room(blend.BACKWARD_STATE), self.masks, shaped, colored, sums,
-        )  # fmt: skip
+        self._run(blend.blend_gradient, blend.BACKWARD_STATE, self.entry_slots, *given, shaped, colored, sums)
         return sums
 
-    def _room(self, size: int) -> np.ndarray:
-        """Scratch floats for each worker."""
-        return recycled_array((self.workers, size), np.float32)
+    def _run(self, kernel: Any, state: int, *own: Any) -> None:
+        """Runs a kernel over all tiles, with ``state`` floats of scratch for each worker."""
+        room = recycled_array((self.workers, state), np.float32)
+        threads.run(kernel, self.workers, *self.blended, np.zeros(1, np.int64), room, *own)
 
 
 def _arrays(tensors: Any) -> list[np.ndarray]:
