@@ -9,7 +9,7 @@ import io
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -67,16 +67,15 @@ def series_of(report: Mapping[str, Any]) -> list[Series]:
     base: list[Any] = report.get("base_rows") or [report.get("base_row")]
     plain_model = report.get("attenuation", {}) is None  # evaluation of a file without a dial
     model = Series("the file, no dial" if plain_model else "dial, one file", report.get("rows", []), not plain_model)
-    found, ranked, against = [model, Series(BASE, base)], dict[str, Any](), dict[str, Any]()
+    others = dict[tuple[str, bool], Any]()  # by label, and whether several rows are of one file
     for entry in report.get("ranked") or []:
-        ranked.setdefault(f"base pruned by {entry['by']}", []).append(entry["row"])
+        others.setdefault((f"base pruned by {entry['by']}", False), []).append(entry["row"])
     for entry in report.get("against") or []:
-        against.setdefault(entry["label"], []).append(entry["theirs"])
-    found += [Series(label, rows) for label, rows in ranked.items()]
-    found += [Series(label, rows, dial=len(rows) > 1) for label, rows in against.items()]
-    plain: list[Any] = [report.get("detached_row")]
-    found.append(Series("plain viewer, no dial", plain))
-    complete = [Series(s.label, [r for r in s.rows if r and r["psnr"] is not None], s.dial) for s in found]
+        others.setdefault((entry["label"], True), []).append(entry["theirs"])
+    found = [model, Series(BASE, base)]
+    found += [Series(label, rows, one and len(rows) > 1) for (label, one), rows in others.items()]
+    found.append(Series("plain viewer, no dial", [report.get("detached_row") or {}]))
+    complete = [replace(s, rows=[r for r in s.rows if r and r["psnr"] is not None]) for s in found]
     return [series for series in complete if series.rows]
 
 

@@ -18,18 +18,7 @@ from PIL import Image
 
 from clod_adapter._support.text import as_text, script_json
 from clod_adapter.io.atomic import atomic_paths
-from clod_adapter.report.charts import (
-    BASE,
-    SIZE,
-    Draw,
-    chart,
-    chart_file,
-    draw_rendering,
-    draw_training,
-    inline_svg,
-    save_figure,
-    series_of,
-)  # fmt: skip
+from clod_adapter.report import charts
 
 WIDEST = 1000  # pixels; wider pictures are scaled down
 QUALITY = 88  # of WebP
@@ -71,36 +60,35 @@ def write_page(
     """
     import jinja2
 
-    path, own, series = Path(path), own_teacher(report), series_of(report)
+    path, own, series = Path(path), own_teacher(report), charts.series_of(report)
     # Against its own renders, the base has only rounding errors, far below the range of the charts.
-    drawn = [one for one in series if not (own and one.label == BASE)]
-    charts: dict[str, Draw] = {"rendering": partial(draw_rendering, series=drawn)} if drawn else {}
+    drawn = [one for one in series if not (own and one.label == charts.BASE)]
+    draws: dict[str, charts.Draw] = {"rendering": partial(charts.draw_rendering, series=drawn)} if drawn else {}
     if training:
         base_psnr = None if own else training["base_psnr"]
-        charts["adapting"] = partial(draw_training, curves=training["curves"], base_psnr=base_psnr)
+        draws["adapting"] = partial(charts.draw_training, curves=training["curves"], base_psnr=base_psnr)
     dial = sorted(drawn[0].rows, key=lambda row: row["virtual_scale"]) if drawn and drawn[0].dial else []
+    tiles = [(one.label, one.rows[0]) for one in drawn if one.label == charts.BASE]
     ends_and_middle = dict.fromkeys((0, len(dial) // 2, len(dial) - 1)) if dial else ()
-    tiles = [(one.label, one.rows[0]) for one in drawn if one.label == BASE]
     tiles += [(f"s = {dial[k]['virtual_scale']:g}", dial[k]) for k in ends_and_middle]
     settings = {"model": report["model"], "scene": "none (synthetic views)" if own else report["scene"]}
     settings |= {"version": report["version"], **report["machine"], "device": report["device"]}
     settings |= {f"{name}, seconds": f"{value:.1f}" for name, value in report["seconds"].items()}
-    few = dict.fromkeys(round(k * (len(frames) - 1) / 3) for k in range(4)) if frames else ()
-    height, width = frames[0].image.shape[:2] if frames else (1, 1)
+    few = dict.fromkeys(round(k * (len(frames) - 1) / 3) for k in range(4))
+    strip = [*others.values(), *(frames[k] for k in few)] if frames else []
     source = files("clod_adapter.report")
     template, style, script = ((source / n).read_text("utf-8") for n in ("page.html", "style.css", "dial.js"))
     page = jinja2.Environment(autoescape=True).from_string(template).render(
         report=report, own=own, name=PurePath(report.get("outputs", {}).get("ply", report["model"])).name,
         model=PurePath(report["model"]).name, scene="" if own else PurePath(abspath(report["scene"])).name,
-        series=series, drawn=drawn, tiles=tiles, frames=frames, others=others, aspect=f"{width} / {height}",
-        strip=[*others.values(), *(frames[k] for k in few)] if few else [], training=training, settings=settings,
-        charts={name: partial(inline_svg, draw, name) for name, draw in charts.items()},
+        series=series, drawn=drawn, tiles=tiles, frames=frames, others=others, strip=strip, training=training,
+        settings=settings, charts={name: partial(charts.inline_svg, draw, name) for name, draw in draws.items()},
         data=script_json({"report": report, "training": training}), style=style, script=script,
     )  # fmt: skip
-    outputs = {name: chart_file(path, name) for name in charts}
+    outputs = {name: charts.chart_file(path, name) for name in draws}
     with atomic_paths(path, *outputs.values()) as (temporary, *pngs):
-        for png, draw in zip(pngs, charts.values(), strict=True):
-            with chart(draw, SIZE) as figure:
-                save_figure(figure, png)
+        for png, draw in zip(pngs, draws.values(), strict=True):
+            with charts.chart(draw, charts.SIZE) as figure:
+                charts.save_figure(figure, png)
         temporary.write_text(as_text(page), encoding="utf-8")
     return {"page": path, **outputs}

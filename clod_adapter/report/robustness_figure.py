@@ -10,6 +10,7 @@ from clod_adapter.report.charts import ORANGE, QUIET, label_log, new_figure, sav
 
 PANELS = ("PSNR (dB)", "SSIM", "opacity", "decay sigma_d (log scale)")
 BEYOND = "beyond the trained range"
+Styles = dict[float | None, dict[str, Any]]  # of lines, by the cells' ``max_sv``
 
 
 def robustness_figure(path: str | Path, cells: Sequence[Mapping[str, Any]], title: str) -> None:
@@ -22,15 +23,17 @@ def robustness_figure(path: str | Path, cells: Sequence[Mapping[str, Any]], titl
     with new_figure((13.2, 0.95 + 3.0 * len(names)), layout="constrained") as figure:
         import matplotlib
 
-        colours = {each: matplotlib.colormaps["Blues"](0.4 + 0.6 * k / len(ranges)) for k, each in enumerate(ranges, 1)}
+        styles: Styles = {None: {"color": ORANGE, "linestyle": "--"}}
+        for k, each in enumerate(ranges, 1):
+            styles[each] = {"color": matplotlib.colormaps["Blues"](0.4 + 0.6 * k / len(ranges))}
         figure.suptitle(title, fontsize=11.5, weight="bold", x=0.008, ha="left")
         grid = figure.subplots(len(names), 4, squeeze=False, width_ratios=[1.35, 1.35, 1, 1])
         for axes, name in zip(grid, names, strict=True):
             group = [cell for cell in cells if cell["checkpoint"] == name]
-            _quality(axes[0], group, "psnr", colours)
-            _quality(axes[1], group, "ssim", colours)
-            _distribution(axes[2], group, "opacity", colours)
-            _distribution(axes[3], group, "log10_sigma_d", colours)
+            _quality(axes[0], group, "psnr", styles)
+            _quality(axes[1], group, "ssim", styles)
+            _distribution(axes[2], group, "opacity", styles)
+            _distribution(axes[3], group, "log10_sigma_d", styles)
             axes[0].set_title(name, loc="left", fontsize=10, weight="bold")
             for panel, label in zip(axes[:2], PANELS, strict=False):
                 panel.set_ylabel(label)
@@ -42,16 +45,15 @@ def robustness_figure(path: str | Path, cells: Sequence[Mapping[str, Any]], titl
         save_figure(figure, path)
 
 
-def _quality(axes: Any, cells: Sequence[Mapping[str, Any]], key: str, colours: Mapping[float, Any]) -> None:
+def _quality(axes: Any, cells: Sequence[Mapping[str, Any]], key: str, styles: Styles) -> None:
     axes.set_xscale("log")
     for cell in cells:
         rows, last = [row for row in cell["rows"] if row[key] is not None], cell["max_sv"]
-        base, s_1 = "unadapted, pruned by opacity", "adapted at s = 1 only"
-        style = {"color": ORANGE, "marker": "D", "linestyle": "--", "label": base}
-        if last is not None:
-            label = s_1 if last == 1 else f"adapted, s in [1, {last:g}]"
-            style = {"color": colours[last], "marker": "o", "label": label}
-        if outside := [row for row in rows if last is not None and row["virtual_scale"] >= last]:
+        label = f"adapted, s in [1, {last:g}]" if last and last > 1 else "adapted at s = 1 only"
+        style = styles[last] | {"marker": "o", "label": label}
+        if last is None:
+            style |= {"marker": "D", "label": "unadapted, pruned by opacity"}
+        elif outside := [row for row in rows if row["virtual_scale"] >= last]:
             _plot(axes, outside, key, style | {"linestyle": ":", "mfc": "white", "label": BEYOND})
         # On top, as the end of the range is in both.
         _plot(axes, [row for row in rows if last is None or row["virtual_scale"] <= last], key, style)
@@ -64,13 +66,12 @@ def _plot(axes: Any, rows: Sequence[Mapping[str, Any]], key: str, style: Mapping
     axes.plot([x for x, _ in points], [y for _, y in points], linewidth=1.5, markersize=4, **style)
 
 
-def _distribution(axes: Any, cells: Sequence[Mapping[str, Any]], key: str, colours: Mapping[float, Any]) -> None:
+def _distribution(axes: Any, cells: Sequence[Mapping[str, Any]], key: str, styles: Styles) -> None:
     """Outlines of the histograms, in percent of the Gaussians per bin."""
     for cell in cells:
         if histogram := cell["distribution"].get(key):
-            heights, base = [100 * share for share in histogram["shares"]], cell["max_sv"] is None
-            style = {"color": ORANGE, "linestyle": "--"} if base else {"color": colours[cell["max_sv"]]}
-            axes.stairs(heights, histogram["edges"], linewidth=1.4, **style)
+            heights = [100 * share for share in histogram["shares"]]
+            axes.stairs(heights, histogram["edges"], linewidth=1.4, **styles[cell["max_sv"]])
     axes.set_ylabel("% of Gaussians per bin", color=QUIET, fontsize=8)
     if key == "opacity":
         axes.set_yscale("log")  # most are nearly transparent
