@@ -24,7 +24,7 @@ from torch import Tensor
 
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.hook import dropped_in
-from clod_adapter.integrations.gsplat_cameras import render
+from clod_adapter.integrations.gsplat_cameras import PER_ROW, render
 
 try:
     import gsplat
@@ -35,6 +35,7 @@ __all__ = ["rasterization", "rasterization_2dgs", "rasterization_2dgs_inria_wrap
 
 RenderMode = Literal["RGB", "d", "Ed", "D", "ED", "RGB-d", "RGB-Ed", "RGB+D", "RGB+ED"]
 CameraModel = Literal["pinhole", "ortho", "fisheye", "ftheta", "lidar"]
+DIAL = {"sigma_d": None, "virtual_scale": 1.0, "attenuation": None, "growth_d": None}
 Meta = dict[str, Any]
 Typed = TypeVar("Typed", bound=Callable[..., Any])
 
@@ -46,22 +47,15 @@ def _of_gsplat(typed: Typed) -> Typed:
     hide = not (name == "rasterization" and "opacities" in projection)  # else that projection culls opacity 0
 
     @functools.wraps(typed)
-    def dialled(
-        *args: Any,
-        sigma_d: Tensor | None = None,
-        virtual_scale: float = 1.0,
-        attenuation: AttenuationConfig | None = None,
-        growth_d: Tensor | None = None,
-        **kwargs: Any,
-    ) -> Any:
-        function = getattr(gsplat, name)
-        settings = dropped_in(sigma_d, virtual_scale, attenuation, growth_d)
+    def dialled(*args: Any, **kwargs: Any) -> Any:
+        function, own = getattr(gsplat, name), {each: kwargs.pop(each, default) for each, default in DIAL.items()}
+        settings = dropped_in(**own)
         if settings is None:
             return function(*args, **kwargs)
         bound = inspect.signature(function).bind(*args, **kwargs)
         bound.apply_defaults()
-        given = bound.arguments | bound.arguments.pop("kwargs", {}) | {"sigma_d": sigma_d, "growth_d": growth_d}
-        return render(function, given, virtual_scale, settings, hide)
+        given = bound.arguments | bound.arguments.pop("kwargs", {}) | {each: own[each] for each in PER_ROW}
+        return render(function, given, own["virtual_scale"], settings, hide)
 
     return dialled  # type: ignore[return-value]
 

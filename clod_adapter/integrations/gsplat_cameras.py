@@ -22,8 +22,8 @@ from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.hook import Hook
 
-DIAL = ("sigma_d", "growth_d")
-PER_GAUSSIAN = ("means", "quats", "scales", "opacities", "covars", *DIAL)
+PER_ROW = ("sigma_d", "growth_d")
+PER_GAUSSIAN = ("means", "quats", "scales", "opacities", "covars", *PER_ROW)
 PER_CAMERA = (
     "viewmats", "Ks", "backgrounds", "viewmats_rs", "radial_coeffs", "tangential_coeffs", "thin_prism_coeffs", "rays",
 )  # fmt: skip
@@ -40,7 +40,7 @@ def render(
     """
     if given.get("distributed"):
         raise ClodError("distributed=True shares one opacity among all cameras, a dial needs one each; set it to False")
-    for name in DIAL:
+    for name in PER_ROW:
         if given[name] is not None and given[name].shape != given["opacities"].shape:
             shapes = f"{name} is {tuple(given[name].shape)} and opacities {tuple(given['opacities'].shape)}"
             raise ClodError(f"{shapes}; both must be [..., N]")
@@ -58,7 +58,7 @@ def _one_camera(
         near=given["near_plane"],
     )  # fmt: skip
     arguments = dict(given)
-    sigma_d, growth_d = (arguments.pop(name) for name in DIAL)
+    sigma_d, growth_d = (arguments.pop(name) for name in PER_ROW)
     hook = Hook(sigma_d.flatten(), config, virtual_scale, None if growth_d is None else growth_d.flatten())
     opacities, means = given["opacities"], given["means"]
     shown = hook.attenuate(means.reshape(-1, 3), opacities.flatten(), camera)
