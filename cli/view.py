@@ -93,7 +93,7 @@ def execute(args: Namespace) -> None:
 
 def make_page(args: Namespace, console: Console) -> tuple[dict[str, Any], dict[str, Any]]:
     """The server's ``Response``s by path, and the report."""
-    from clod_adapter.viewer.page import Payload, document, page_config, policy
+    from clod_adapter.viewer.page import Payload, camera_entry, document, page_config, policy
     from clod_adapter.viewer.server import Response
 
     from .shared.inputs import read_cameras, read_checkpoint, with_filter
@@ -121,7 +121,8 @@ def make_page(args: Namespace, console: Console) -> tuple[dict[str, Any], dict[s
         payloads[BASE] = Payload.of(base)
         base_entry = {"name": payloads[BASE].name, "href": BASE}
     shown, placed = cameras or model.cameras, model.placed and not cameras
-    page = b"".join(document(page_config(entries[0], base_entry, shown, opening, entries[1:], placed)))
+    config = page_config(entries, base_entry, [camera_entry(each, placed) for each in shown], opening)
+    page = b"".join(document(config))
     answers = {path: Response("application/octet-stream", each.size, each.blocks) for path, each in payloads.items()}
     answers["/"] = Response("text/html; charset=utf-8", len(page), lambda: (page,), policy("'self'"))
     return answers, {

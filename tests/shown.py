@@ -19,7 +19,7 @@ from clod_adapter import Camera, Rendering
 from clod_adapter.cli.main import build_parser
 from clod_adapter.cli.shared.console import Console
 from clod_adapter.cli.view import make_page
-from clod_adapter.viewer.page import page_config
+from clod_adapter.viewer.page import camera_entry
 from clod_adapter.viewer.server import Server
 
 SIZE = {"width": 400, "height": 320}
@@ -66,8 +66,7 @@ class Shown:
         return str(self.page.inner_text(selector))
 
     def camera(self, camera: Camera) -> None:
-        entry = page_config({"name": ""}, None, [camera], 1.0)["cameras"][0]
-        self.run("clod.setCamera(given)", entry)
+        self.run("clod.setCamera(given)", camera_entry(camera))
 
     def picture(self) -> np.ndarray:
         """``[H, W, 3]`` uint8 of the splats alone at full resolution."""

@@ -41,6 +41,8 @@ ELEMENT = "clod-model"  # id of the elements with the splats
 PART = 3 << 24  # bytes of a script element, a multiple of 3; browsers limit strings to about 5e8
 POSTER_SIDE, POSTER_QUALITY = 512, 60  # of the picture shown while the page loads: pixels, and of JPEG
 
+Entry = Mapping[str, Any]
+
 
 @dataclass(frozen=True)
 class Payload:
@@ -107,32 +109,28 @@ def _along_curve(means: Tensor) -> Tensor:
     return torch.from_numpy(np.argsort(code, kind="stable")).to(means.device)
 
 
-def page_config(
-    model: Mapping[str, Any],
-    base: Mapping[str, Any] | None,
-    cameras: Sequence[Camera],
-    virtual_scale: float | None,
-    others: Sequence[Mapping[str, Any]] = (),
-    placed: bool = False,
-) -> dict[str, Any]:
-    """The page's configuration. ``model`` and ``base`` have a ``name``, and ``href`` or ``element`` for their data.
-
-    ``virtual_scale`` is the first dial value; None for 1 with photographs, else 0 (everything), and then what suits the
-    device. ``placed``: the cameras are not photographs'; the page levels them.
-    """
+def camera_entry(camera: Camera, placed: bool = False) -> Entry:
+    """A camera of the page's configuration. ``placed``: it is not a photograph's; the page levels it."""
 
     def digits(matrix: Tensor) -> list[list[float]]:
         return [[float(f"{value:.9g}") for value in row] for row in matrix.tolist()]  # full float32 precision
 
-    places = [
-        {
-            "name": each.name, "viewmat": digits(each.viewmat), "K": digits(each.K), "width": each.width,
-            "height": each.height, "near": each.near, "placed": placed,
-        }
-        for each in cameras
-    ]  # fmt: skip
     return {
-        "title": model["name"], "model": model, "base": base, "others": list(others), "cameras": places,
+        "name": camera.name, "viewmat": digits(camera.viewmat), "K": digits(camera.K), "width": camera.width,
+        "height": camera.height, "near": camera.near, "placed": placed,
+    }  # fmt: skip
+
+
+def page_config(
+    models: Sequence[Entry], base: Entry | None, cameras: Sequence[Entry], virtual_scale: float | None
+) -> Entry:
+    """The page's configuration. Models and ``base`` have a ``name``, and ``href`` or ``element`` for their data.
+
+    ``virtual_scale`` is the first dial value; None for 1 with photographs, else 0 (everything), and then what suits the
+    device.
+    """
+    return {
+        "title": models[0]["name"], "model": models[0], "base": base, "others": models[1:], "cameras": cameras,
         "virtual_scale": virtual_scale,
     }  # fmt: skip
 
@@ -151,11 +149,11 @@ def write_viewer_page(
     shows them, and a line for each loss.
     """
     shown, placed, payload = cameras or model.cameras, model.placed and not cameras, Payload.of(model)
-    config = page_config({"name": payload.name, "element": ELEMENT}, None, shown, virtual_scale, placed=placed)
+    entries = [camera_entry(each, placed) for each in shown]
+    config = page_config([{"name": payload.name, "element": ELEMENT}], None, entries, virtual_scale)
     with atomic_path(path) as temporary:
-        data, found, notes = b"", payload.gaussians, tuple[str, ...]()
         if exact:
-            data = b"".join(payload.blocks())
+            data, found, notes = b"".join(payload.blocks()), payload.gaussians, tuple[str, ...]()
         else:
             data, found, notes = payload.packed(f"{temporary}.spz")
         opening = virtual_scale if virtual_scale is not None else 0.0 if placed else 1.0

@@ -116,7 +116,7 @@ def test_a_page_shows_its_spz(show: Any, save: Any) -> None:
 
 def test_a_file_without_sigma_d_has_no_dial(show: Any, save: Any, plain: Gaussians) -> None:
     """The page shows the reason, and the file's name as text; a name does not end its element."""
-    config = b"".join(page.document(page.page_config({"name": f"</script>{NAME}"}, None, [], 1.0))).decode()
+    config = b"".join(page.document(page.page_config([{"name": f"</script>{NAME}"}], None, [], 1.0))).decode()
     assert json.loads(re.findall('id="clod-config">(.*?)</script>', config)[0])["title"] == f"</script>{NAME}"
     shown = show(save(plain, NAME))
     assert shown.text("#title") == NAME and shown.page.title() == NAME and shown.page.query_selector("img") is None
