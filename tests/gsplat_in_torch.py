@@ -1,13 +1,13 @@
 """gsplat's own ``rasterization`` without CUDA: its Python, with torch for its kernels.
 
-Slow: for a few dozen Gaussians on a few tiles. It follows the kernels of the installed version, 1.4.0 or 1.5.3: where
-the projection has opacities, rows below 1/255 are dropped in it and narrow by their opacity; packed rows, tiles and
-keys are in the kernels' order, and what the packed kernels cannot do (a background, gsplat's issue 764) is refused.
+Slow: for a few dozen Gaussians in small images, each of which counts as one tile. It follows the kernels of the
+installed version, 1.4.0 or 1.5.3: where the projection has opacities, rows below 1/255 are dropped in it and narrow by
+their opacity; packed rows and keys are in the kernels' order, and what the packed kernels cannot do (a background,
+gsplat's issue 764) is refused.
 """
 
 import inspect
-import itertools
-import math
+from itertools import pairwise
 from typing import Any
 
 import pytest
@@ -96,20 +96,11 @@ def isect_tiles(
     image_ids = camera_ids if image_ids is None else image_ids
     if image_ids is None:
         image_ids = torch.arange(n_images or n_cameras, device=depths.device).repeat_interleave(means2d.shape[-2])
-    if radii.dim() == depths.dim():
-        radii = radii[..., None].expand(*radii.shape, 2)
-    centre, reach, depth = means2d.reshape(-1, 2) / tile_size, radii.reshape(-1, 2) / tile_size, depths.flatten()
-    most = torch.tensor([tile_width, tile_height], device=depths.device)
-    low = torch.floor(centre - reach).long().clamp(min=torch.zeros_like(most), max=most)
-    high = torch.ceil(centre + reach).long().clamp(min=torch.zeros_like(most), max=most)
-    counts = (high - low).prod(-1) * (reach > 0).all(-1)
-    ids = torch.repeat_interleave(counts)
-    nth, across = torch.arange(len(ids), device=depths.device) - (counts.cumsum(0) - counts)[ids], (high - low)[ids, 0]
-    tiles = (low[ids, 1] + nth // across) * tile_width + low[ids, 0] + nth % across
+    shown = (radii > 0).reshape(depths.numel(), -1).all(-1)
     bits = (tile_width * tile_height).bit_length()
-    keys = (image_ids[ids] << 32 + bits) | (tiles << 32) | depth[ids].float().view(torch.int32).long()
+    keys = (image_ids[shown] << 32 + bits) | depths.flatten()[shown].float().view(torch.int32).long()
     keys, order = torch.sort(keys, stable=True)
-    return counts.int().reshape(depths.shape), keys, ids[order].int()
+    return shown.int().reshape(depths.shape), keys, shown.nonzero()[order, 0].int()
 
 
 def rasterize_to_pixels(
@@ -121,15 +112,10 @@ def rasterize_to_pixels(
         means2d.register_hook(lambda gradient: setattr(means2d, "absgrad", gradient.abs()))
     table = [means2d.reshape(-1, 2), conics.reshape(-1, 3), opacities.flatten(), colors.reshape(-1, colors.shape[-1])]
     images = isect_offsets.shape[:-2]
-    bounds = [*isect_offsets.flatten().tolist(), len(flatten_ids)]
-    canvas = means2d.new_zeros(math.prod(images), height, width, colors.shape[-1] + 1)
-    places = itertools.product(*map(range, (len(canvas), *isect_offsets.shape[-2:])))
-    for tile, (image, row, column) in enumerate(places):
-        ids = flatten_ids[bounds[tile] : bounds[tile + 1]].long()
-        top, left = row * tile_size, column * tile_size
-        part = canvas[image, top : top + tile_size, left : left + tile_size]
-        y, x = torch.meshgrid(*(torch.arange(n) + 0.5 for n in part.shape[:2]), indexing="ij")
-        part += _blend([values[ids] for values in table], (x + left).to(canvas), (y + top).to(canvas))
+    bounds = [*isect_offsets[..., 0, 0].flatten().tolist(), len(flatten_ids)]
+    y, x = torch.meshgrid(*(torch.arange(n) + 0.5 for n in (height, width)), indexing="ij")
+    rows = [flatten_ids[begin:end].long() for begin, end in pairwise(bounds)]
+    canvas = torch.stack([_blend([values[ids] for values in table], x.to(colors), y.to(colors)) for ids in rows])
     drawn, alphas = canvas[..., :-1], canvas[..., -1:]
     if backgrounds is not None:
         drawn = drawn + (1 - alphas) * backgrounds.reshape(len(canvas), 1, 1, -1)

@@ -51,16 +51,13 @@ def test_an_image_per_view(clod: Any, capture: Any, dialled: Path, tmp_path: Pat
 
 
 def test_notes(clod: Any, capture: Any, dialled: Path, tmp_path: Path) -> None:
-    """On a missing photograph, a dial value beyond the trained ones, and one of a plain file."""
+    """On a missing photograph, and a dial value beyond the trained ones."""
     shutil.copytree(capture.scene, tmp_path / "fewer")
     (tmp_path / "fewer" / "images" / "003.png").unlink()
     report, _ = rendered(clod, dialled, "--images", "fewer", "-o", "out", "--sv", 4.5)
     missing, beyond = report["notes"]
     assert "missing and left out (003.png)" in missing
     assert beyond == "trained up to s = 4; larger dial values were not trained"
-    report, err = rendered(clod, capture.ply, "--images", capture.scene, "-o", "out", "--sv", 1, 3)
-    assert f"{capture.ply} has no sigma_d, so every dial value renders all of it" in report["notes"]
-    assert report["pictures"][0]["kept"] == [300, 300] and "Warning" not in err
 
 
 @pytest.mark.parametrize("presses", [1, 2])

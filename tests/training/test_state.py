@@ -1,15 +1,20 @@
-"""States of training and their files: resumed runs end with the same bits, and other states are refused."""
+"""Resumed runs end with the same bits, also after a Ctrl-C within ``adapt``."""
 
 import copy
+import signal
+from collections.abc import Iterator
+from typing import Any
 
 import pytest
 import torch
 
 from clod_adapter import AdaptConfig, AttenuationConfig, Gaussians, Phase, Progress, Scene, TrainableSubset, adapt
 from clod_adapter.adapter import ATTRIBUTES, with_dial
+from clod_adapter.training import trainer
+from clod_adapter.training.interrupts import GracefulStop
 from clod_adapter.training.state import TrainingState
-from runs import config_of, states_of
-from scenes import assert_equal
+from runs import config_of, pressing, states_of
+from scenes import assert_equal, capture
 
 Pair = tuple[Gaussians, Scene]
 
@@ -55,3 +60,44 @@ def test_untrained_rows_keep_their_units_when_resumed(captured: Pair, distance: 
     assert_equal(again.gaussians, whole.gaussians)
     rest = slice(len(base) // 2, None)
     torch.testing.assert_close(whole.gaussians.sigma_d[rest], base.sigma_d[rest] * distance)
+
+
+CONFIG = AdaptConfig(iters=12, max_sv=3.0)
+SCENE = capture(60, views=4, width=16, height=12)
+
+
+@pytest.fixture(autouse=True)
+def default_handler() -> Iterator[None]:
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+def test_an_interrupt_within_the_update_completes_the_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The step is completed, and its state resumes to the same bits."""
+    whole, states = adapt(*SCENE, CONFIG).gaussians, list[Any]()
+    monkeypatch.setattr(trainer, "spoilt_rows", pressing(trainer.spoilt_rows, signal.SIGINT, at=5))
+    found = adapt(*SCENE, CONFIG, lambda now: states.append(now.state) if now.state else None)
+    assert found.interrupted and found.signalled and found.steps == 5
+    assert_equal(adapt(*SCENE, CONFIG, resume=states[-1]()).gaussians, whole)
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_a_second_interrupt_is_raised_at_once() -> None:
+    """Not one of the signals that are repeated."""
+    before, deferred, stop = signal.signal(signal.SIGHUP, signal.default_int_handler), 0, GracefulStop()
+    with pytest.raises(KeyboardInterrupt), stop.listening(in_place_of=signal.default_int_handler):
+        for number in (signal.SIGHUP, signal.SIGHUP, signal.SIGINT, signal.SIGHUP, signal.SIGINT):
+            signal.raise_signal(number)
+            assert stop.requests
+            deferred += 1
+    assert deferred == 4
+    assert signal.getsignal(signal.SIGINT) is signal.signal(signal.SIGHUP, before) is signal.default_int_handler
+
+
+def test_other_handlers_are_not_affected() -> None:
+    heard, stop = list[int](), GracefulStop()
+    signal.signal(signal.SIGINT, lambda number, frame: heard.append(number))
+    with stop.listening(in_place_of=signal.default_int_handler):
+        signal.raise_signal(signal.SIGINT)
+    assert heard == [signal.SIGINT] and not stop.requests

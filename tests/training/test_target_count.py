@@ -10,13 +10,7 @@ from torch import Tensor
 from clod_adapter.config import AdaptConfig, AttenuationConfig
 from clod_adapter.equation.attenuation import attenuate
 from clod_adapter.training.paper import paper_count, soft_count
-from clod_adapter.training.target_count import (
-    TEMPERATURE,
-    count_gradient,
-    count_slope,
-    target_curve,
-    target_share,
-)
+from clod_adapter.training.target_count import TEMPERATURE, count_gradient, count_slope, target_curve, target_share
 
 CONFIG = AdaptConfig(max_sv=6.0)
 ATTENUATION = CONFIG.attenuation(1.0)

@@ -17,7 +17,6 @@ import clod_adapter
 from clod_adapter.cli.shared import inputs
 from clod_adapter.cli.shared.measure import machine_name
 from clod_adapter.config import AdaptConfig
-from clod_adapter.training import camera_placement, pseudo_views
 from models import write_model
 from runs import OUTPUTS, names
 from scenes import stripped
@@ -159,8 +158,6 @@ def test_without_held_out_photographs(clod: Any, capture: Any, tmp_path: Path) -
 
 def test_without_photographs(clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The target images are renders of the base, rounded to bytes."""
-    monkeypatch.setattr(camera_placement, "WIDTH", 62)  # smaller and fewer, for speed
-    monkeypatch.setattr(camera_placement, "HEIGHT", 46)
     monkeypatch.setattr(inputs, "place_cameras", partial(inputs.place_cameras, views=16))
     done = clod(capture.ply, *TINY, "--json")
     report = json.loads(done.out)
@@ -185,9 +182,8 @@ def test_ci_banana(clod: Any, ci_banana: Path) -> None:
     assert report["rows"][-1]["kept_share"] < 0.3
 
 
-def test_unusual_inputs(clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unusual_inputs(clod: Any, capture: Any, tmp_path: Path) -> None:
     """Few photographs get pseudo views, faint Gaussians a lower tau; invisible ones cannot do without any."""
-    monkeypatch.setattr(pseudo_views, "ADDED", 8)
     shutil.copytree(capture.scene, tmp_path / "few")
     for name in sorted((tmp_path / "few" / "images").iterdir())[1:5]:
         name.unlink()

@@ -1,6 +1,8 @@
-"""What runs on the CPU runs on another device, with the same results and without waiting for it.
+"""Everything that uses a dial follows one function, and gives on another device what it gives on the CPU.
 
-On a GPU, if there is one; otherwise on a simulated one (``fake_gpu``), with torch in place of gsplat's kernels.
+Change the culling threshold or the growth of that function, and all of it follows. What runs on another device neither
+waits for it nor leaves it: a GPU, if there is one; otherwise a simulated one (``fake_gpu``), with torch in place of
+gsplat's kernels.
 """
 
 import importlib
@@ -18,14 +20,46 @@ from clod_adapter.adapter import detach
 from clod_adapter.alignment.check import check_alignment
 from clod_adapter.blocks.divide import divide
 from clod_adapter.blocks.train import adapt_block, merge
+from clod_adapter.equation import attenuation, growth
 from clod_adapter.evaluation.budget import frame_times, matching_dial
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.importance import for_training
 from clod_adapter.rasterizers import BACKENDS, Rasterizer, cpu, cuda
 from clod_adapter.training.pseudo_views import PseudoView
 from clod_adapter.training.trainer import Trainer
-from consumers import CAMERAS, CONFIG, CONSUMERS, DIAL, model_of, views_of
+from consumers import CAMERAS, CONFIG, CONSUMERS, DIAL, model_of, same, views_of
 from fake_gpu import fake_gpu, waits
+
+TAU, RAISED = 0.02, 0.2
+# Growth is no part of the culling rule, and none of the paper's form.
+WITHOUT_GROWTH = {"the paper's objective", "order_by_extinction", *(n for n in CONSUMERS if n.startswith("dial_for"))}
+
+
+@pytest.mark.parametrize("name", CONSUMERS)
+def test_everything_follows_the_culling_threshold(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A threshold of 10 tau s gives, to the bit, what a tenfold tau gives."""
+    consumer = CONSUMERS[name]
+    before, wanted = consumer(model_of(TAU)), consumer(model_of(RAISED))
+    assert not same(before, wanted)
+    # The function's own code, as an edit of its source would change it for whoever has imported it.
+    changed = (lambda tau, virtual_scale: (10 * tau) * virtual_scale).__code__
+    monkeypatch.setattr(attenuation.culling_threshold, "__code__", changed)
+    assert 10 * TAU == RAISED and same(consumer(model_of(TAU)), wanted)
+
+
+@pytest.mark.parametrize("name", CONSUMERS)
+def test_everything_grows_by_one_function(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Other factors change whatever draws, and nothing that counts or culls.
+
+    By the default ``draw``: the CPU's kernels override it (tests/rasterizers/test_dial.py compares the two).
+    """
+    monkeypatch.setitem(BACKENDS, "cpu", lambda: Rasterizer(cpu.rasterize))
+    consumer = CONSUMERS[name]
+    before = consumer(model_of(TAU))
+    changed = (lambda growth_d, d, s, r: (3 * growth_d.to(d)).exp()).__code__
+    monkeypatch.setattr(growth.growth_factors, "__code__", changed)
+    assert same(consumer(model_of(TAU)), before) == (name in WITHOUT_GROWTH)
+
 
 SHORT = replace(CONFIG, iters=1)
 
