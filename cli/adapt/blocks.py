@@ -8,7 +8,7 @@ from typing import Any
 
 from clod_adapter._kernels.memory import release
 from clod_adapter.adapter import dial_tensors
-from clod_adapter.blocks.divide import Division, block_config, check_divisible, divide
+from clod_adapter.blocks.divide import PASSES, Division, block_config, check_divisible, divide
 from clod_adapter.blocks.train import Learned, adapt_block, load_block, merge, save_block
 from clod_adapter.cameras import View
 from clod_adapter.config import AdaptConfig
@@ -41,7 +41,7 @@ def adapt_in_blocks(run: Run) -> tuple[Plan, Adapted]:
     run.console.say(f"{division.count} blocks of {min(counts)} to {max(counts)} steps, {sum(counts)} in all")
     blocks = Blocks(run, plan.config, division, views, photographs)
     failed, steps, seconds, held, merged = list[str](), 0, 0.0, 0, None
-    for number in range(1, division.passes + 1):
+    for number in range(1, PASSES + 1):
         results = [blocks.train(block, number, merged) for block in range(division.count)]
         merged = merge(division, results)
         steps += sum(result.steps for result in results)
@@ -71,7 +71,7 @@ class Blocks:
         }  # fmt: skip
 
     def name(self, block: int, number: int) -> str:
-        return f"block {block + 1} of {self.division.count}, pass {number} of {self.division.passes}"
+        return f"block {block + 1} of {self.division.count}, pass {number} of {PASSES}"
 
     def train(self, block: int, number: int, before: Gaussians | None) -> Learned:
         """Trains one block in one pass, the second from the result ``before``, unless its file exists."""

@@ -26,7 +26,7 @@ LEFT_OUT = 1e-3  # of an image, the share that the Gaussians left out of a block
 CONTEXT_VIEWS = 32  # most views that the context is chosen in
 BARE = 0.01  # of a pixel: where Gaussians cover less, blocks share the error by their sizes too
 DIALS = 9  # dial values, evenly spaced in log s, at which the Gaussians kept by the initialization are counted
-SECOND = 0.25  # of the steps, those of the second pass
+PASSES, SECOND = 2, 0.25  # over each block, and the share of the steps of the second
 LEAST_SEEN = 0.02  # of an image: a block that covers less has too small a part of the whole loss
 
 
@@ -47,11 +47,6 @@ class Division:
     @property
     def count(self) -> int:
         return self.seen.shape[1]
-
-    @property
-    def passes(self) -> int:
-        """Over each block; a single one needs no second."""
-        return 2 if self.count > 1 else 1
 
     def rows(self, block: int) -> Tensor:
         """``[n]`` int64, ascending: the rows of a block."""
@@ -217,7 +212,7 @@ def block_config(
     The second pass takes up the schedule where the first one ends.
     """
     steps = division.steps(block, config)
-    light = round(SECOND * steps) if division.passes > 1 else 0  # steps of the second pass
+    light = round(SECOND * steps)  # steps of the second pass
     every = sum(division.steps(other, config) for other in range(division.count))
     own, between = steps - light if first else light, 1 - light / max(steps, 1)
     seed = (config.seed + 1 + block + (0 if first else division.count)) % 2**63

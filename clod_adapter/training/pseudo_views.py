@@ -22,13 +22,12 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.importance import SMALLER, coverage, reduced
 from clod_adapter.progress import Listener, Phase, tell
 from clod_adapter.render import render
-from clod_adapter.training.camera_placement import SAMPLE, place_cameras
+from clod_adapter.training.camera_placement import COVERED, SAMPLE, place_cameras
 
 # Photographs are enough if there are MANY, or if TIMES of them show each part of at least SHOWN of the scene, as far as
 # CHECKED placed cameras see it. Otherwise ADDED pseudo views are added: up to half of them at the cameras of the
 # photographs, at most NEAR at each, from where they are moved WIDER; the others at placed cameras.
 MANY, SHOWN, TIMES, CHECKED, ADDED, NEAR, WIDER = 64, 0.97, 4, 24, 96, 4, 2.0
-COVERED = 0.5  # pixels that a Gaussian covers at least in a photograph that shows it
 TEST_EVERY = 8  # as with photographs
 STEPS_PER_PLACED = 5.5  # training steps for each placed camera, where there are no photographs
 # Of the learning rates of all but the dial, without photographs and with few: pseudo views show errors too.

@@ -102,8 +102,7 @@ class Trainer:
             self.sampler.restore(*before)
             raise
         self.loss = loss if math.isnan(self.loss) else 0.98 * self.loss + 0.02 * loss
-        # Of a part of the schedule, as of the whole: the last steps up to its end. The optimizer continues from the
-        # parameters, not from the mean.
+        # Of a part of the schedule, as of the whole. The optimizer continues from the parameters, not from the mean.
         if whole >= end * (1 - self.dial.schedule.average):
             self.averaged += 1
             add_to_mean(self.mean, self.trained(), self.averaged)
