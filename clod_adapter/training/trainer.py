@@ -172,11 +172,9 @@ class Trainer:
         """Everything that later steps depend on; its tensors are the trainer's own."""
         if self._updating:
             raise ClodError(f"step {self.done + 1} failed while it updated the parameters, so they cannot be saved")
-        random, order = self.sampler.state()
         return TrainingState(
-            tensors=self._changing(), attenuation=self.dial.attenuation, random=random, order=order,
-            loss=self.loss, averaged=self.averaged, steps=self.done, seconds=self.seconds,
-            start_seconds=self.start_seconds,
+            self._changing(), self.dial.attenuation, *self.sampler.state(), self.loss, self.averaged, self.done,
+            self.seconds, self.start_seconds,
         )  # fmt: skip
 
     def restore(self, state: TrainingState) -> None:
