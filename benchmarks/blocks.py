@@ -22,7 +22,7 @@ from city import write_city
 from clod_adapter.blocks.divide import divide
 from clod_adapter.blocks.train import adapt_block, merge
 from clod_adapter.initialization.importance import initialize, usable_views
-from clod_adapter.metrics import psnr
+from clod_adapter.losses import psnr
 from common import COMMAND, Process, Row, append, arguments, capture, checkpoint, photographs
 
 import torch

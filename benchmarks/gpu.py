@@ -26,7 +26,7 @@ from typing import Any
 import clod_adapter as clod
 from city import city, city_cameras, perturb
 from clod_adapter.equation.attenuation import dial
-from clod_adapter.metrics import psnr
+from clod_adapter.losses import psnr
 from clod_adapter.rasterizers import cuda, wait_for
 from clod_adapter.render import splat
 from common import ROOT, append, arguments, checkpoint, outcomes, photographs

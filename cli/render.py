@@ -101,7 +101,7 @@ def write_images(
     """
     import torch
 
-    from clod_adapter.metrics import psnr
+    from clod_adapter.losses import psnr
     from clod_adapter.render import render
 
     written, stop, plain = list[dict[str, Any]](), GracefulStop(), gaussians.sigma_d is None

@@ -9,7 +9,6 @@ from torch import Tensor
 from backends import torch_threads
 from clod_adapter import losses
 from clod_adapter.losses import photometric_loss
-from clod_adapter.metrics import psnr, psnr_ssim
 
 # Smaller than the window of 11, one larger, multiples of 16 and not.
 SIZES = [(1, 1), (3, 7), (11, 11), (12, 16), (33, 50), (17, 101)]
@@ -67,15 +66,14 @@ def test_training_and_report_metrics_agree(size: tuple[int, int], darker: int) -
     image, target = pair(*size)
     target = target // darker
     shown, photo = image.clamp(0, 1), target / 255
-    value, similarity = psnr_ssim(image.requires_grad_(), target)
-    assert value == psnr(image, target)
+    value, similarity = losses.psnr_ssim(image.requires_grad_(), target)
     assert value == pytest.approx(losses.psnr(image, target), rel=1e-6)
     fused = 1 - losses.photometric_loss(shown, target, 1.0).item()
     plain = losses.ssim_plain(shown.double(), photo.double()).item()
     assert similarity == pytest.approx(fused, abs=1e-5) and similarity == pytest.approx(plain, abs=1e-5)
 
 
-@pytest.mark.parametrize("function", [psnr, losses.psnr])
+@pytest.mark.parametrize("function", [losses.psnr, lambda *given: losses.psnr_ssim(*given)[0]])
 def test_psnr_of_known_images(function) -> None:
     black = torch.zeros(12, 12, 3, dtype=torch.uint8)
     assert function(torch.full((12, 12, 3), 0.5), black) == pytest.approx(20 * math.log10(2), abs=1e-6)
@@ -85,4 +83,4 @@ def test_psnr_of_known_images(function) -> None:
     assert math.isnan(function(image, black))
     stripes = torch.tensor([0, 255], dtype=torch.uint8).repeat(6, 3)[..., None].expand(6, 6, 3).contiguous()
     beyond = torch.where(stripes > 0, 7.0, -3.0)  # renders are clamped first
-    assert function(beyond, stripes) == math.inf and psnr_ssim(beyond, stripes)[1] == pytest.approx(1, abs=1e-6)
+    assert function(beyond, stripes) == math.inf and losses.psnr_ssim(beyond, stripes)[1] == pytest.approx(1, abs=1e-6)

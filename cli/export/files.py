@@ -18,7 +18,7 @@ from clod_adapter.io.atomic import atomic_path, atomic_paths
 from clod_adapter.io.file_formats import WRITABLE, write
 from clod_adapter.io.formats import splat_transform
 from clod_adapter.io.formats.tileset import write_tileset
-from clod_adapter.metrics import psnr
+from clod_adapter.losses import psnr
 from clod_adapter.render import render
 from clod_adapter.training.camera_placement import place_cameras
 from clod_adapter.viewer.page import write_viewer_page

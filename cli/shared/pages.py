@@ -12,7 +12,7 @@ from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.evaluate import evaluate
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.metrics import psnr
+from clod_adapter.losses import psnr
 from clod_adapter.progress import Phase, Progress, Stopped
 from clod_adapter.render import render
 from clod_adapter.report.page import Picture, own_teacher, write_page

@@ -14,7 +14,7 @@ from clod_adapter.equation.distances import in_frustum
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.frame_times import timed_frame
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.metrics import psnr_ssim
+from clod_adapter.losses import psnr_ssim
 from clod_adapter.progress import Listener, Phase, Progress
 from clod_adapter.render import render
 
@@ -27,7 +27,7 @@ class Row:
 
     Attributes:
         virtual_scale: the dial s.
-        psnr: dB; ssim: in [-1, 1] (``metrics.psnr_ssim``).
+        psnr: dB; ssim: in [-1, 1] (``losses.psnr_ssim``).
         kept: Gaussians the dial leaves in, of all; kept_share: that divided by all.
         in_view: kept Gaussians whose centre is in the image.
         frame_ms: median time of a frame, milliseconds; ``frame_times.time_frames`` has times to compare.

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from clod_adapter import AttenuationConfig, ClodError, Gaussians, View, evaluate, render, with_dial
-from clod_adapter.metrics import psnr_ssim
+from clod_adapter.losses import psnr_ssim
 from scenes import camera, gaussians, in_front, photograph, ring
 
 
