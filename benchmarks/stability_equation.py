@@ -11,9 +11,8 @@ from collections.abc import Callable
 from typing import Any
 
 from clod_adapter.config import AttenuationConfig
-from clod_adapter.equation.attenuation import SIGMA_MAX, attenuate
+from clod_adapter.equation.attenuation import LOG_GROWTH_MAX, SIGMA_MAX, attenuate
 from clod_adapter.equation.extinction import extinction_scale, sigma_for_extinction
-from clod_adapter.equation.growth import LOG_GROWTH_MAX
 from common import table
 
 import mpmath

@@ -28,8 +28,8 @@ class Adapter:
     Attributes:
         sigma_d: ``[N]`` float32, finite.
         attenuation: how sigma_d is to be read.
-        updates: for each Gaussians attribute that changed, in the attribute's shape, either the
-            difference from the base (float16) or the new values themselves (float32).
+        updates: of each attribute that changed, in its shape: the difference from the base (float16), or new values
+            (float32).
         base_fingerprint: SHA-256 of the checkpoint file it was trained on, hex.
         config: the training config, JSON-able, for the record.
         version: of the package that made it; it stands in the header of the PLY, which is so the same again.
@@ -96,8 +96,7 @@ class Adapter:
         """The adapted Gaussians: the base plus the differences in float32, and the dial.
 
         Args:
-            base: the Gaussians of the checkpoint the adapter was trained on, as ``load(path, origin=adapter.origin)``
-                gives them.
+            base: the Gaussians of the checkpoint it was trained on, as ``load(path, origin=adapter.origin)`` reads it.
             fingerprint: that checkpoint file's SHA-256; when given it must be the adapter's.
 
         Raises:

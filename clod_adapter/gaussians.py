@@ -38,8 +38,7 @@ class Gaussians:
         shN: ``[N, K-1, 3]`` spherical harmonics of degrees 1 and up, K in {1, 4, 9, 16, 25}.
         sigma_d: ``[N]`` distance decay of opacity, or None for a checkpoint without a dial.
         attenuation: settings of the equation that reads ``sigma_d``; None exactly if ``sigma_d`` is None.
-        growth_d: ``[N]`` exponent of the growth of the scales with distance and dial (``growth.py``), or None for no
-            growth. Needs a ``sigma_d``.
+        growth_d: ``[N]`` exponent of the growth of scales (``attenuation.growth_factors``), or None; needs a sigma_d.
         screen_filter: the filter for rendering, that of training.
 
     Raises:

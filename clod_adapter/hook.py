@@ -60,10 +60,10 @@ class Hook:
     ) -> tuple[Array, Array, Array]:  # fmt: skip
         """The opacities to draw with, the kept rows, and the factors of the scales.
 
-        Opacities are 0 for culled Gaussians; ``[N]`` bool are the kept ones (CLoD-GS Eq. 2, its mask). The factors are
-        ``[N]`` (``growth.growth_factors``); ones where the hook has no ``growth_d``. numpy in, numpy out; torch in,
-        torch out, on the means' device, differentiable in ``opacities``, ``sigma_d`` and ``growth_d``.
-        The camera's arguments may be numpy arrays or tensors.
+        Opacities are 0 for culled Gaussians; ``[N]`` bool are the kept ones (CLoD-GS Eq. 2, its mask). The factors
+        ``[N]`` (``attenuation.growth_factors``) are ones without a ``growth_d``. numpy in, numpy out; torch in, torch
+        out, on the means' device, differentiable in ``opacities``, ``sigma_d`` and ``growth_d``. The camera's arguments
+        may be numpy arrays or tensors.
 
         Args:
             means: ``[N, 3]`` world units.

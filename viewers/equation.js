@@ -35,12 +35,12 @@ function inFrustum(x, y, z, { rotation: r, fx, fy, cx, cy, width, height, near }
   return depth > near && u >= 0 && u < width * depth && v >= 0 && v < height * depth;
 }
 
-/** r, in units of D: the distance from which on scales grow (equation/growth.py). */
+/** r, in units of D: the distance from which on scales grow (equation/attenuation.py). */
 export function growthDistance({ normalizer, reference_distance: reference, scene_distance: unit }) {
   return normalizer === "scene" && reference ? reference / unit : 1;
 }
 
-/** The factor of the scales of a kept Gaussian (equation/growth.py). `magnification`: s d / r. */
+/** The factor of the scales of a kept Gaussian (equation/attenuation.py). `magnification`: s d / r. */
 export const growthFactor = (growth, magnification) =>
   Math.exp(Math.min(Math.max(growth * Math.log(Math.min(Math.max(magnification, 1), 3e38)), -20), 20));
 

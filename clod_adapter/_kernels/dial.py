@@ -1,4 +1,4 @@
-"""The dial's equation (``equation/attenuation.py``, ``equation/growth.py``) as the first part of the projection.
+"""The dial's equation (``equation/attenuation.py``) as the first part of the projection.
 
 ``kept`` reads the 20 bytes of a Gaussian that decide whether it is culled, sixteen consecutive ones at a time; what is
 culled costs nothing after that. What is kept gets its drawn opacity and its scales where these are projected. All in
@@ -16,7 +16,7 @@ from clod_adapter._kernels.simd import both, f32x16, ge, gt, select, splat, vmax
 
 LN2 = float32(0.6931471805599453)
 FARTHEST_EXPONENT = float32(126)  # of exp2
-LOG2_GROWTH_MAX = float32(20 * 1.4426950408889634)  # growth.LOG_GROWTH_MAX
+LOG2_GROWTH_MAX = float32(20 * 1.4426950408889634)  # attenuation.LOG_GROWTH_MAX
 NEARLY = float32(0.99)  # of the near plane: the projection decides exactly
 
 

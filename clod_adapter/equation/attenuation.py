@@ -6,11 +6,15 @@ dial ``s`` (the paper's virtual distance scale)::
     v   = relu(sigma)^2 + eps/2                     the variance of the decay
     a'' = a exp(-(d s)^2 / (2 v))                   attenuated opacity
     kept iff a'' > tau s                            compared as logarithms, which do not underflow
-    g   = max(1, d s / r)^h                         factor of the scales of what is kept (``growth.py``)
+    m   = max(1, d s / r)                           r: d at the median distance in the nearest training views
+    g   = m^h                                       factor of the scales of what is kept, in [e^-20, e^20]
 
 Sources: a'' is Eq. 2 (section 3.2) of "CLoD-GS: Continuous Level-of-Detail via 3D Gaussian Splatting", ICLR 2026, and
-the culling rule is the mask M_i of the same section. g is this project's. Training and the paper have s >= 1; the
-equation holds from 0, where nothing is attenuated, culled or enlarged.
+the culling rule is the mask M_i of the same section. Training and the paper have s >= 1; the equation holds from 0,
+where nothing is attenuated, culled or enlarged. g is this project's, after stochastic simplification of aggregate
+detail (Cook, Halstead, Planck and Ryu, SIGGRAPH 2007), where the elements that remain grow to preserve the area.
+Opacity fades and scale grows by ``d s``, so that moving away and turning the dial have the same effect; at s = 1
+nothing changes nearer than r.
 
 With the ``hard`` cut (the paper's) a kept Gaussian is drawn with a'' and culled at opacity ``tau s``, which pops. With
 the ``soft`` cut it is drawn with ``a'' min(1, 2 (a'' / (tau s) - 1))``, which is a'' above 1.5 tau s and 0 at the
@@ -25,7 +29,8 @@ computed in float32, and so are their results; otherwise the result has the inpu
 
 Accuracy, measured against mpmath (benchmarks/stability_equation.py), in relative errors: log a'' and its gradients are
 within ``4 finfo.eps``, and so are, from float32, a'' and its gradients where a'' is a normal number; from float64 these
-are within ``4 + 3 u`` of them, ``u = (d s)^2 / (2 v)``.
+are within ``4 + 3 u`` of them, ``u = (d s)^2 / (2 v)``. g is within ``4 + 2 |h| (1 + log m)`` of finfo.eps, its slope
+within ``2 / log m`` more.
 """
 
 import math
@@ -41,7 +46,6 @@ from clod_adapter.cameras import Camera
 from clod_adapter.config import AttenuationConfig, require
 from clod_adapter.equation.autograd import Attenuate, Fade
 from clod_adapter.equation.distances import normalized_distances
-from clod_adapter.equation.growth import growth_distance, growth_factors
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 
@@ -50,6 +54,10 @@ SIGMA_MAX = 1e9
 
 FAINTEST = 2.0**-126
 """The smallest normal float32: at s = 0 only what is fainter is culled, which no rasterizer draws."""
+
+# Of trained exponents. 3/4 preserves area where counts fall as s^-1.5; above 1 a Gaussian far away grows on the screen.
+GROWTH_RANGE = (-1.0, 3.0)
+LOG_GROWTH_MAX = 20.0  # of abs(log g)
 
 Scale = TypeVar("Scale", float, Tensor)
 
@@ -62,7 +70,7 @@ class Attenuated(NamedTuple):
         log_opacities: ``[N]`` log a'', in [-inf, 0]; meaningful where a'' underflows.
         keep: ``[N]`` bool, ``log a'' > log(tau s)``.
         drawn: ``[N]`` the rasterizer's input, in [0, 1]: a'' after the cut, above 0 exactly for kept Gaussians.
-        growth: ``[N]`` factor of the scales (``growth.growth_factors``); ones without a ``growth_d``.
+        growth: ``[N]`` factor of the scales (``growth_factors``); ones without a ``growth_d``.
     """
 
     opacities: Tensor
@@ -133,6 +141,25 @@ def dial(gaussians: Gaussians, seen_from: Camera | Tensor, virtual_scale: float)
         gaussians.opacity_logits, gaussians.sigma_d, where, virtual_scale, gaussians.attenuation,
         growth_d=gaussians.growth_d,
     )  # fmt: skip
+
+
+def growth_distance(config: AttenuationConfig) -> float:
+    """r: ``reference_distance`` in units of ``scene_distance``; 1 if it is unknown, or for other normalizers."""
+    if config.normalizer != "scene" or config.reference_distance == 0:
+        return 1.0
+    return config.reference_distance / config.scene_distance
+
+
+def growth_factors(growth_d: Tensor, d: Tensor, virtual_scale: float | Tensor, reach: float) -> Tensor:
+    """``[N]`` the factors g of the scales; exactly 1 where ``growth_d`` is 0 or ``d s <= r``.
+
+    Differentiable in ``growth_d [N]``, the finite exponents h: the slope is ``g log m``, and 0 where g is clamped.
+    Never NaN. The result has the dtype of ``d [N]``, float32 or float64. ``reach`` is r.
+    """
+    # d s is float64's: a dial beyond float32 times a distance of 0 would be NaN.
+    magnification = d.detach().double().mul(virtual_scale).div_(reach).clamp_(1, torch.finfo(d.dtype).max)
+    exponents = growth_d.to(d) * magnification.to(d.dtype).log_()
+    return exponents.clamp(-LOG_GROWTH_MAX, LOG_GROWTH_MAX).exp()
 
 
 def culling_threshold(tau: float, virtual_scale: Scale) -> Scale:

@@ -8,8 +8,8 @@ from torch import Tensor
 
 from clod_adapter._kernels import threads
 from clod_adapter.config import AttenuationConfig
+from clod_adapter.equation.attenuation import growth_distance, growth_factors
 from clod_adapter.equation.extinction import extinction_scale
-from clod_adapter.equation.growth import growth_distance, growth_factors
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import SH_C0, Gaussians
 from clod_adapter.progress import Listener, Phase, tell

@@ -14,9 +14,8 @@ from clod_adapter._kernels.project import project
 from clod_adapter._kernels.project_gradient import project_gradient
 from clod_adapter.cameras import Camera
 from clod_adapter.config import CLASSIC, AttenuationConfig, ScreenFilter
-from clod_adapter.equation.attenuation import FAINTEST, check_dial, culling_threshold, log_threshold
+from clod_adapter.equation.attenuation import FAINTEST, check_dial, culling_threshold, growth_distance, log_threshold
 from clod_adapter.equation.distances import camera_unit
-from clod_adapter.equation.growth import growth_distance
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.rasterizers.protocol import Rasterizer, behind, require_float32
 

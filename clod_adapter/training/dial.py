@@ -15,10 +15,9 @@ from torch import Tensor, nn
 
 from clod_adapter.cameras import Camera, Scene, StoredView, View, spread
 from clod_adapter.config import AdaptConfig
-from clod_adapter.equation.attenuation import SIGMA_MAX, Attenuated, attenuate
+from clod_adapter.equation.attenuation import GROWTH_RANGE, SIGMA_MAX, Attenuated, attenuate
 from clod_adapter.equation.attenuation import dial as dialled_by
 from clod_adapter.equation.distances import typical_distance
-from clod_adapter.equation.growth import GROWTH_RANGE
 from clod_adapter.errors import ClodError
 from clod_adapter.finite import require_finite
 from clod_adapter.gaussians import Gaussians

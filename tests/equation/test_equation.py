@@ -11,9 +11,8 @@ import torch
 from torch import Tensor
 
 from clod_adapter import AttenuationConfig, ClodError
-from clod_adapter.equation.attenuation import SIGMA_MAX, attenuate
+from clod_adapter.equation.attenuation import LOG_GROWTH_MAX, SIGMA_MAX, attenuate, growth_factors
 from clod_adapter.equation.extinction import extinction_scale, sigma_for_extinction
-from clod_adapter.equation.growth import LOG_GROWTH_MAX, growth_factors
 from clod_adapter.training.paper import soft_count
 from scenes import camera
 

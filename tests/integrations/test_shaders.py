@@ -11,8 +11,7 @@ import torch
 
 import browser
 from clod_adapter.config import AttenuationConfig
-from clod_adapter.equation.attenuation import attenuate
-from clod_adapter.equation.growth import growth_factors
+from clod_adapter.equation.attenuation import attenuate, growth_factors
 
 SHADERS = files("clod_adapter.integrations.shaders")
 STORED = json.loads(SHADERS.joinpath("golden.json").read_text(encoding="utf-8"))

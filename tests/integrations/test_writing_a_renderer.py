@@ -11,8 +11,7 @@ import torch
 import clod_adapter
 import scenes
 from clod_adapter.config import AttenuationConfig
-from clod_adapter.equation.attenuation import attenuate
-from clod_adapter.equation.growth import growth_factors
+from clod_adapter.equation.attenuation import attenuate, growth_factors
 from clod_adapter.hook import Hook
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -13,8 +13,8 @@ import torch
 
 from clod_adapter.adapter import detach
 from clod_adapter.config import AttenuationConfig
+from clod_adapter.equation.attenuation import growth_distance, growth_factors
 from clod_adapter.equation.distances import normalized_distances
-from clod_adapter.equation.growth import growth_distance, growth_factors
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import SH_C0, Gaussians
 from clod_adapter.integrations.splats import to_gsplat
