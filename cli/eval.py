@@ -180,7 +180,7 @@ class Comparisons:
             for i, (moved, sweep) in enumerate(jobs):
                 found = sweep(progress=self.stop.heeding(meter.part(i, len(jobs), moved)))
                 self.popping.append((moved, found))
-                self.report["popping"].append({"moved": moved, **found.as_dict()})
+                self.report["popping"].append({"moved": moved, **vars(found)})
 
     def _row(self, gaussians: Gaussians, virtual_scale: float, listener: Listener) -> Row:
         from clod_adapter.evaluation.evaluate import evaluate

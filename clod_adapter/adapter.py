@@ -28,8 +28,7 @@ class Adapter:
     Attributes:
         sigma_d: ``[N]`` float32, finite.
         attenuation: how sigma_d is to be read.
-        updates: of each attribute that changed, in its shape: the difference from the base (float16), or new values
-            (float32).
+        updates: of what changed, in its shape: differences from the base (float16), or new values (float32).
         base_fingerprint: SHA-256 of the checkpoint file it was trained on, hex.
         config: the training config, JSON-able, for the record.
         version: of the package that made it; it stands in the header of the PLY, which is so the same again.

@@ -171,8 +171,7 @@ class AdaptConfig:
     def paper(cls, **changes: Any) -> AdaptConfig:
         """The paper's form with its settings where it gives them, and the defaults elsewhere; then ``changes``.
 
-        CLoD-GS section 3.3: lambda 1, sigma_d itself trained at 1e-2. Chosen here: tau 1/255 (rasterizers have that),
-        half the default learning rates.
+        CLoD-GS section 3.3: lambda 1, sigma_d itself trained at 1e-2. Chosen here: tau 1/255, half the default rates.
         """
         own: dict[str, Any] = {
             "form": "paper", "iters": 1600, "tau": 1 / 255, "reg_weight": 1.0, "growth": "off", "lr_sigma": 1e-2,

@@ -62,19 +62,17 @@ class Hook:
 
         Opacities are 0 for culled Gaussians; ``[N]`` bool are the kept ones (CLoD-GS Eq. 2, its mask). The factors
         ``[N]`` (``attenuation.growth_factors``) are ones without a ``growth_d``. numpy in, numpy out; torch in, torch
-        out, on the means' device, differentiable in ``opacities``, ``sigma_d`` and ``growth_d``. The camera's arguments
-        may be numpy arrays or tensors.
+        out, on the means' device, differentiable in ``opacities``, ``sigma_d`` and ``growth_d``.
 
         Args:
             means: ``[N, 3]`` world units.
             opacities: ``[N]`` or ``[N, 1]`` activated, in [0, 1]; the result has its shape and dtype.
-            viewmat: ``[4, 4]`` world to camera, a rotation and a translation, OpenCV axes.
-            K: ``[3, 3]`` intrinsics in pixels. With ``width``, ``height`` and ``near`` it defines the frustum of the
-                normaliser ``max``; ``scene`` needs none of them.
+            viewmat: ``[4, 4]`` array or tensor, world to camera, a rotation and a translation, OpenCV axes.
+            K: ``[3, 3]`` likewise, intrinsics in pixels; with ``width``, ``height`` and ``near`` the frustum of the
+                normaliser ``max``. ``scene`` needs none of them.
 
         Raises:
-            ClodError: the shapes do not fit the hook or each other, means or opacities are integers, or a normaliser
-                that needs K has none.
+            ClodError: shapes do not fit the hook or each other, means or opacities are integers, or ``max`` has no K.
         """
         if K is None and self.attenuation.normalizer != "scene":
             raise ClodError(f"normalizer {self.attenuation.normalizer} needs K, width and height in the hook's call")

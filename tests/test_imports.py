@@ -23,7 +23,7 @@ ORDER: list[set[str]] = [
     {"_kernels", "cameras", "config"},
     {"calibration", "frame_rate", "gaussians", "losses"},
     {"equation"},
-    {"finite", "hook", "progress", "rasterizers"},
+    {"hook", "progress", "rasterizers"},
     {"adapter", "integrations", "render"},
     {"bake", "initialization"},
     {"io.atomic", "io.settings"},

@@ -13,8 +13,7 @@ Sources: a'' is Eq. 2 (section 3.2) of "CLoD-GS: Continuous Level-of-Detail via 
 the culling rule is the mask M_i of the same section. Training and the paper have s >= 1; the equation holds from 0,
 where nothing is attenuated, culled or enlarged. g is this project's, after stochastic simplification of aggregate
 detail (Cook, Halstead, Planck and Ryu, SIGGRAPH 2007), where the elements that remain grow to preserve the area.
-Opacity fades and scale grows by ``d s``, so that moving away and turning the dial have the same effect; at s = 1
-nothing changes nearer than r.
+Opacity and scale change by ``d s``: moving away and turning the dial have one effect; nearer than r / s nothing grows.
 
 With the ``hard`` cut (the paper's) a kept Gaussian is drawn with a'' and culled at opacity ``tau s``, which pops. With
 the ``soft`` cut it is drawn with ``a'' min(1, 2 (a'' / (tau s) - 1))``, which is a'' above 1.5 tau s and 0 at the

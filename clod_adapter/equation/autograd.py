@@ -55,8 +55,7 @@ class Attenuate(Function):
 class Fade(Function):
     """``a'' f`` with ``f = min(1, 2 (e^x - 1))`` and ``x = log a'' - log(tau s)``, 0 where x <= 0.
 
-    Uses the same difference as ``keep``, so that exactly the kept Gaussians are drawn. f's slope by x is ``f + 2``
-    where it is defined.
+    Uses the same difference as ``keep``, so that exactly the kept Gaussians are drawn. f's slope by x is ``f + 2``.
     """
 
     @staticmethod

@@ -75,9 +75,7 @@ def median_distance(means: Tensor, camera: Camera) -> float:
     inside = in_frustum(means, camera)
     distances = (means - camera.position.to(means)).norm(dim=1)
     visible = distances[inside] if bool(inside.any()) else distances
-    if not len(visible):
-        return 1.0
-    return float(visible.median().clamp(min=torch.finfo(visible.dtype).tiny))
+    return float(visible.median().clamp(min=torch.finfo(visible.dtype).tiny)) if len(visible) else 1.0
 
 
 def viewpoint_of(camera: Camera, means: Tensor, config: AttenuationConfig) -> Viewpoint:
@@ -106,8 +104,8 @@ def camera_of(viewpoint: Viewpoint, width: int, height: int, name: str = "") -> 
 def typical_distance(means: Tensor, places: Sequence[Place], config: AttenuationConfig) -> Tensor:
     """``[N]`` d_i, without unit, >= 0: the distances from one place, or the geometric mean over several.
 
-    Places more than OUTLIER times as far from the scene's centre as the median place, and as half of the Gaussians
-    are, do not count. ClodError where there is no place.
+    Places over OUTLIER times as far from the scene's centre as the median place and the median Gaussian do not count.
+    ClodError where there is no place.
     """
     if not places:
         raise ClodError("no camera is given, so there is no distance for the dial to fade by; give at least one")
@@ -129,9 +127,7 @@ def _without_outliers(means: Tensor, places: Sequence[Place]) -> Sequence[Place]
 
 
 def _position(place: Place, means: Tensor) -> Tensor:
-    if isinstance(place, Camera):
-        return place.position.to(means)
-    return torch.tensor([place.x, place.y, place.z], dtype=means.dtype, device=means.device)
+    return place.position.to(means) if isinstance(place, Camera) else means.new_tensor([place.x, place.y, place.z])
 
 
 def _from(place: Place, means: Tensor, config: AttenuationConfig) -> Tensor:

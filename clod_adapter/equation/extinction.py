@@ -29,8 +29,7 @@ def extinction_scale(opacity_logits: Tensor, sigma_d: Tensor, d: Tensor, config:
     upper = opacity_logits.sigmoid().div_(culling_threshold(config.tau, 1.0))
     log_ratio = ratio.log().clamp_(max=_LOG_HUGE)  # ratio is inf where the variance is 0
     w = _lambert_w_of_exp((F.logsigmoid(opacity_logits) - log_threshold(config.tau, 1.0) + log_ratio).mul_(2))
-    # The same value twice: e^{-W/2} = sqrt(W / z). The first does not cancel at small W, the second does not
-    # amplify W's error at large W.
+    # The same value twice: e^{-W/2} = sqrt(W / z). The first is accurate at small W, the second at large W.
     return torch.where(w < 1, upper * torch.exp(-0.5 * w), w.sqrt().div_(ratio))
 
 

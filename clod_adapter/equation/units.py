@@ -1,8 +1,7 @@
 """The unit of sigma_d: world units in results and files, the reference distance of the scene while it is trained.
 
 The attenuation factor, ``exp(-(d / D s)^2 / (2 sigma^2 + eps))``, is the same for another D' where
-``D'^2 (2 sigma'^2 + eps) = D^2 (2 sigma^2 + eps)``. In world units D is 1. Training has the distance where growth
-begins, so that sigma_d is of the order of 1.
+``D'^2 (2 sigma'^2 + eps) = D^2 (2 sigma^2 + eps)``. In world units D is 1; in training sigma_d is near 1.
 """
 
 from dataclasses import replace

@@ -61,8 +61,7 @@ def dial_for(
     Args:
         gaussians: with a dial.
         keep: largest number of Gaussians: in the view of one camera, or the mean over several.
-        psnr_drop: dB below the calibration's PSNR at s = 1. For this budget the result is the largest dial value before
-            the interpolated PSNR first falls below it.
+        psnr_drop: dB below the calibration's PSNR at s = 1; gives the largest dial value before PSNR first is lower.
         fps: frames per second. The times of a calibration are used as they are, whatever machine and image size they
             are from (``calibration.machine``, ``width``, ``height``); without one, ``cameras`` are timed.
         cameras: for ``keep`` and ``fps``; ``fps`` needs whole cameras to render from.

@@ -58,8 +58,7 @@ def evaluate(
     Args:
         gaussians: adapted or not; without ``sigma_d`` every dial value shows the base.
         views: one or several; virtual_scales: one dial value or several.
-        progress: called in ``Phase.EVALUATION`` after each view of each dial value. If it returns False, the rows of
-            the dial values that are complete are returned.
+        progress: called in ``Phase.EVALUATION`` after each view of each dial value; False returns the rows so far.
 
     Raises:
         ClodError: no views, no dial values, or one below 1 or not finite.

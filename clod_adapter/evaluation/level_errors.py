@@ -9,8 +9,7 @@ An image that is shifted by e pixels changes by about e times its slope, so leve
     e_l = |I_l - I_0| / |dI_0|
 
 ``|.|`` are root mean squares over pixels and channels, ``dI_0`` the mean slope of the finest level along x and y. The
-error is 16 times the mean over cameras of ``e_l d / f``, with d the median distance of the Gaussians in the image: it
-allows a shift of one pixel.
+error, 16 times the mean of ``e_l d / f`` over cameras, d the median distance in the image, allows a shift of one pixel.
 """
 
 from collections.abc import Sequence

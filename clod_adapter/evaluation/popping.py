@@ -18,9 +18,8 @@ hardly changes the root mean square, so the largest change of a pixel is measure
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 import torch
@@ -54,9 +53,6 @@ class Popping:
     pixel_at: float
     pixel_persistence: float
     changes: tuple[float, ...]
-
-    def as_dict(self) -> dict[str, Any]:
-        return asdict(self)
 
 
 @torch.no_grad()

@@ -14,8 +14,7 @@ from clod_adapter.equation.distances import median_distance, typical_distance
 from clod_adapter.equation.extinction import sigma_for_extinction
 from clod_adapter.equation.units import in_world_units, known_distance, with_distance
 from clod_adapter.errors import ClodError
-from clod_adapter.finite import bad_rows, largest_colour
-from clod_adapter.gaussians import SH_C0, Gaussians
+from clod_adapter.gaussians import SH_C0, Gaussians, bad_rows, largest_colour
 from clod_adapter.initialization.pruning_order import initial_growth, pruning_order
 from clod_adapter.progress import Listener, Phase, tell
 from clod_adapter.render import splat

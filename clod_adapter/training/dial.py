@@ -19,8 +19,7 @@ from clod_adapter.equation.attenuation import GROWTH_RANGE, SIGMA_MAX, Attenuate
 from clod_adapter.equation.attenuation import dial as dialled_by
 from clod_adapter.equation.distances import typical_distance
 from clod_adapter.errors import ClodError
-from clod_adapter.finite import require_finite
-from clod_adapter.gaussians import Gaussians
+from clod_adapter.gaussians import Gaussians, require_finite
 from clod_adapter.initialization.importance import MOST_VIEWS, for_training, initialize, usable_views
 from clod_adapter.integrations.splats import NAMES, from_gsplat
 from clod_adapter.progress import Listener, shown

@@ -14,8 +14,7 @@ from clod_adapter.cameras import Scene, View
 from clod_adapter.config import AdaptConfig
 from clod_adapter.equation.units import in_world_units, with_distance
 from clod_adapter.errors import ClodError
-from clod_adapter.finite import LossNotFinite, largest_colour
-from clod_adapter.gaussians import Gaussians
+from clod_adapter.gaussians import Gaussians, LossNotFinite, largest_colour
 from clod_adapter.initialization.importance import for_training, usable_views, with_growth
 from clod_adapter.progress import Listener, Phase, Progress, shown
 from clod_adapter.training.dial import TrainableSubset, require_trainable

@@ -15,8 +15,7 @@ from clod_adapter.cameras import Camera, View
 from clod_adapter.config import AdaptConfig
 from clod_adapter.equation.units import in_world_units
 from clod_adapter.errors import ClodError
-from clod_adapter.finite import LossNotFinite, require_finite, spoilt_rows
-from clod_adapter.gaussians import Gaussians
+from clod_adapter.gaussians import Gaussians, LossNotFinite, require_finite, spoilt_rows
 from clod_adapter.losses import photometric_loss
 from clod_adapter.rasterizers import for_device
 from clod_adapter.training.dial import TrainableSubset
