@@ -14,7 +14,7 @@ import scaling
 import torch
 
 from clod_adapter import load, load_scene, render
-from clod_adapter.metrics import psnr
+from clod_adapter.losses import psnr
 
 
 def test_surfaces_are_opaque() -> None:
