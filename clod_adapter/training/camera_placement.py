@@ -23,8 +23,7 @@ from clod_adapter.adapter import detach
 from clod_adapter.cameras import Camera, near_plane
 from clod_adapter.config import require
 from clod_adapter.errors import ClodError
-from clod_adapter.finite import spoilt_rows
-from clod_adapter.gaussians import SH_C0, Gaussians
+from clod_adapter.gaussians import SH_C0, Gaussians, spoilt_rows
 from clod_adapter.initialization.importance import coverage
 from clod_adapter.progress import Listener, Phase, tell
 from clod_adapter.render import splat
