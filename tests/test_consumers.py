@@ -20,7 +20,7 @@ from clod_adapter.adapter import detach
 from clod_adapter.alignment.check import check_alignment
 from clod_adapter.blocks.divide import divide
 from clod_adapter.blocks.train import adapt_block, merge
-from clod_adapter.equation import attenuation, growth
+from clod_adapter.equation import attenuation
 from clod_adapter.evaluation.budget import frame_times, matching_dial
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.importance import for_training
@@ -57,7 +57,7 @@ def test_everything_grows_by_one_function(name: str, monkeypatch: pytest.MonkeyP
     consumer = CONSUMERS[name]
     before = consumer(model_of(TAU))
     changed = (lambda growth_d, d, s, r: (3 * growth_d.to(d)).exp()).__code__
-    monkeypatch.setattr(growth.growth_factors, "__code__", changed)
+    monkeypatch.setattr(attenuation.growth_factors, "__code__", changed)
     assert same(consumer(model_of(TAU)), before) == (name in WITHOUT_GROWTH)
 
 
