@@ -9,7 +9,7 @@ import torch
 
 from clod_adapter import AttenuationConfig, Camera, ClodError, Gaussians, Stopped, with_dial
 from clod_adapter.evaluation import frame_times
-from clod_adapter.evaluation.frame_times import PASSES, VIEWS, FrameTimes, settled, time_frames
+from clod_adapter.evaluation.frame_times import PASSES, VIEWS, FrameTimes, time_frames
 from scenes import gaussians, ring
 
 DIALS = (1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 7.0)
@@ -69,15 +69,6 @@ def test_frames_are_interleaved_and_few_where_they_are_slow(clock: Clock) -> Non
     drawn = clock(lambda frame, s: 1.0)
     of_one()
     assert len({name for name, _ in drawn[2:]}) == 1 and 3 * 9 <= len(drawn) <= 3 * 9 + 3
-
-
-def test_noise_is_levelled_and_a_real_increase_is_not() -> None:
-    """The time of the third dial value is above that of the second in two passes of three."""
-    passes = [[9.0, 4.0, 5.0, 2.0], [9.0, 4.0, 3.5, 2.0], [9.0, 4.0, 5.0, 2.0]]
-    assert settled(passes) == [9.0, 4.5, 4.5, 2.0]
-    assert settled([[9.0, 4.0, 5.0, 2.0]] * 3) == [9.0, 4.0, 5.0, 2.0]
-    assert settled([[4.0, 4.1, 4.2, 4.0]] * 3) == pytest.approx([4.1, 4.1, 4.1, 4.0])  # by less than RISE
-    assert settled([[1.0]] * 3) == [1.0]
 
 
 def test_stopping_and_no_cameras() -> None:

@@ -13,7 +13,6 @@ from clod_adapter.equation.extinction import extinction_scale, sigma_for_extinct
 from clod_adapter.gaussians import SH_C0
 from clod_adapter.initialization import importance
 from clod_adapter.initialization.importance import (
-    fitting_tau,
     initialize,
     removal_error,
     sigma_from_importance,
@@ -104,19 +103,6 @@ def test_initialization_culls_in_the_pruning_order() -> None:
     order = pruning_order(some, error.sqrt() * some.opacities).position
     assert torch.equal(found[100:180], order.argsort()[100:180])
     assert not torch.equal(order.argsort()[100:180], error.argsort(stable=True)[100:180])
-
-
-def test_tau_is_lowered_for_faint_checkpoints_only() -> None:
-    config, error = AdaptConfig(max_sv=5.0), torch.rand(1000, generator=torch.Generator().manual_seed(0))
-    mixed, faint = torch.linspace(0.001, 0.99, 1000), torch.full((1000,), 0.01)
-    # Nearly all opacities below tau, a few far above: tau follows them, unless they have no effect at s = 1.
-    some = torch.where(torch.arange(1000) < 100, 0.9, 0.012)
-    for opacities, errors, tau in (
-        (mixed, error, config.tau), (faint, error, 0.01 / 5 / 1.5), (some, torch.ones(1000), 0.012 / 1.5),
-        (some, (some > 0.1).float(), config.tau), (faint, torch.zeros(1000), config.tau),
-    ):  # fmt: skip
-        assert fitting_tau(opacities, errors, config) == pytest.approx(tau, rel=1e-5)
-        assert fitting_tau(opacities, errors, AdaptConfig(tau=1e-8)) == 1e-8  # never raised
 
 
 def plainly(some: Gaussians, worth: Tensor) -> list[int]:

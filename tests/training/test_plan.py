@@ -12,7 +12,7 @@ from clod_adapter.adapter import ATTRIBUTES, DIAL, with_dial
 from clod_adapter.initialization.importance import initialize, removal_error
 from clod_adapter.training.dial import TrainableSubset
 from clod_adapter.training.plan import NAMES, NOT_NEEDED, largest_change
-from clod_adapter.training.planner import needed_share, seen
+from clod_adapter.training.planner import seen
 from clod_adapter.training.state import TrainingState
 from runs import states_of
 from scenes import assert_equal, gaussians, photograph, ring, with_unseen
@@ -52,18 +52,6 @@ def test_seen_gaussians_change_a_pixel_when_removed() -> None:
     views = photograph(base, ring(3, 40, 30))
     error = removal_error(base, views)
     assert error[0] == 0 and seen(base, views, error, seed=0)[0]
-
-
-def test_needed_share_is_that_of_the_visible_gaussians() -> None:
-    """A quarter is too faint to matter; the others are all needed, also against the base's own renderings."""
-    truth = gaussians(200, 2, 0)
-    base = truth.replace(opacity_logits=torch.where(torch.arange(200) < 50, -9.0, 2.0))
-    views = photograph(base, ring(4, 48, 36))
-    error = removal_error(base, views)
-    share, loss = needed_share(base, views, error, LIMIT)
-    assert 0.6 < share <= 0.76 and 0 <= loss < LIMIT and needed_share(base, views, error, 3.0)[0] < share
-    invisible = base.replace(opacity_logits=torch.full((200,), -9.0))
-    assert needed_share(invisible, views, error, LIMIT)[0] == 0.51
 
 
 def test_sh_degrees_are_kept_or_left_out(visible: Pair) -> None:

@@ -83,18 +83,6 @@ def test_an_interrupt_within_the_update_completes_the_step(monkeypatch: pytest.M
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
-def test_a_second_interrupt_is_raised_at_once() -> None:
-    """Not one of the signals that are repeated."""
-    before, deferred, stop = signal.signal(signal.SIGHUP, signal.default_int_handler), 0, GracefulStop()
-    with pytest.raises(KeyboardInterrupt), stop.listening(in_place_of=signal.default_int_handler):
-        for number in (signal.SIGHUP, signal.SIGHUP, signal.SIGINT, signal.SIGHUP, signal.SIGINT):
-            signal.raise_signal(number)
-            assert stop.requests
-            deferred += 1
-    assert deferred == 4
-    assert signal.getsignal(signal.SIGINT) is signal.signal(signal.SIGHUP, before) is signal.default_int_handler
-
-
 def test_other_handlers_are_not_affected() -> None:
     heard, stop = list[int](), GracefulStop()
     signal.signal(signal.SIGINT, lambda number, frame: heard.append(number))
