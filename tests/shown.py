@@ -73,6 +73,11 @@ class Shown:
         data = self.run("clod.capture()").partition(",")[2]
         return np.asarray(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB"))
 
+    def link(self) -> str:
+        """The state of the page, as the part of its address that L adds."""
+        self.page.keyboard.press("l")
+        return str(self.page.evaluate("location.hash"))
+
     def counts(self) -> dict[str, int]:
         return dict(self.page.evaluate("clod.whenDrawn().then(clod.counts)"))
 

@@ -109,11 +109,6 @@ def test_pointer_touch_and_wheel_move_the_camera(chromium: Any, show: Any, model
     assert np.array_equal(shown.picture(), fitted)
 
 
-def link(shown: Shown) -> str:
-    shown.page.keyboard.press("l")
-    return str(shown.page.evaluate("location.hash"))
-
-
 def test_files_and_cameras_are_listed(show: Any, gaussians: Gaussians, tmp_path: Path) -> None:
     """Switched by keys, lists and a link: view and base stay, and the dial value where the file has it."""
     second = gaussians.replace(sh0=-gaussians.sh0, attenuation=replace(gaussians.attenuation, max_sv=2.0))
@@ -125,14 +120,14 @@ def test_files_and_cameras_are_listed(show: Any, gaussians: Gaussians, tmp_path:
     words = [*(tmp_path / name for name in models), "--base", tmp_path / "a.ply", "--images", tmp_path, "--sv", 3]
     shown = show(*words, viewport=TALL)
     assert shown.page.locator("#files option").all_inner_texts() == list(models)
-    links = {"0.jpg": link(shown)}
+    links = {"0.jpg": shown.link()}
     for key, name in (("n", "1.jpg"), ("n", "2.jpg"), ("n", "0.jpg"), ("p", "2.jpg")):
         shown.page.keyboard.press(key)
         assert shown.page.input_value("#camera") == name
-        assert links.setdefault(name, link(shown)) == link(shown)
+        assert links.setdefault(name, shown.link()) == shown.link()
     assert len({*links.values()}) == 3
     shown.page.select_option("#camera", "1.jpg")
-    assert link(shown) == links["1.jpg"]
+    assert shown.link() == links["1.jpg"]
     shown.page.evaluate("document.activeElement.blur()")
     shown.page.keyboard.press("ArrowRight")
     assert shown.page.input_value("#camera") == "free view"
@@ -141,7 +136,7 @@ def test_files_and_cameras_are_listed(show: Any, gaussians: Gaussians, tmp_path:
     assert shown.text("#dial-value") == "s = 2.00"
     shown.run("clod.setWipe(0.4)")
     assert shown.text("#wipe-right") == "base · 400"
-    linked, of_second = link(shown), shown.picture()
+    linked, of_second = shown.link(), shown.picture()
     shown.run("clod.setWipe(null)")
     drop(shown, "dropped.ply", (tmp_path / "c.ply").read_bytes())
     shown.until("document.title === 'dropped.ply'")

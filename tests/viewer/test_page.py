@@ -21,7 +21,7 @@ from clod_adapter.calibration import Calibration, CalibrationRow
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.render import render
 from clod_adapter.viewer import page
-from shown import SIZE, Shown, assert_same, serve
+from shown import Shown, assert_same, serve
 
 VIEWER = Path(clod_adapter.__file__).parent / "viewer"
 NAME = "<img src=x onerror=clod=1><script>clod=1<!script>&amp;'\".ply"
@@ -64,29 +64,26 @@ def test_the_text_of_one_file(tmp_path: Path) -> None:
     assert '<img id="poster"' not in text  # no viewpoint is stored
 
 
-def test_one_exact_file_needs_no_network(
-    chromium: Any, shown: Shown, model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Large data are divided among several elements, because browsers limit the size of a text."""
+def test_the_exact_file_is_a_plain_ply(capture: Any, tmp_path: Path) -> None:
+    """In blocks of rows, without empty SH degrees and rows that were dropped."""
+    model = scenes.dialled(20_000, 3, 3, scene_distance=1.0)
+    model = model.replace(shN=model.shN.where(torch.arange(15)[:, None] < 8, 0))
+    model.means[7, 1] = torch.nan
+    capture.write(tmp_path / "a.ply", model)
+    loaded = clod_adapter.load(tmp_path / "a.ply")
+    payload = page.Payload.of(replace(loaded, path=Path("b\udcff.ply")))
+    (tmp_path / "payload.ply").write_bytes(b"".join(payload.blocks()))
+    assert (tmp_path / "payload.ply").stat().st_size == payload.size and payload.name == "b\\xff.ply"
+    read = clod_adapter.load(tmp_path / "payload.ply")
+    scenes.assert_equal(read.gaussians, loaded.gaussians.replace(shN=loaded.gaussians.shN[:, :8]))
+    assert {kind for kind, _ in read.vertex.dtype.fields.values()} == {np.dtype("<f4")}
+
+
+@pytest.mark.parametrize("exact", [False, True])
+def test_a_page_of_one_file(show: Any, save: Any, monkeypatch: pytest.MonkeyPatch, exact: bool) -> None:
+    """What Python reads of its SPZ or PLY, with growth, in units that float16 does not hold, and an opacity of 1; its
+    dB near its cameras only. Large data are divided among several elements, because browsers limit a text's size."""
     monkeypatch.setattr(page, "PART", 15_000)
-    loaded = clod_adapter.load(model)
-    out = tmp_path / "page.html"
-    page.write_viewer_page(out, loaded, cameras=scenes.ring(2, 320, 240), virtual_scale=2.0, exact=True)
-    assert out.read_text(encoding="utf-8").count('id="clod-model"') > 2
-    shown.run("clod.setDial(2)")
-    with chromium.new_context(viewport=SIZE, offline=True) as context:
-        alone = Shown(context.new_page()).ready(out.as_uri())
-        assert alone.page.query_selector("#poster") is None
-        for each in (shown, alone):
-            each.camera(scenes.camera(320, 240))
-        assert np.array_equal(shown.picture(), alone.picture()) and shown.counts() == alone.counts()
-        alone.run("clod.setWipe(0.5)")
-        assert alone.text("#wipe-right") == "dial off · 400" and alone.errors == []
-        assert [url for url in alone.asked if not url.startswith(("file:", "blob:", "data:"))] == []
-
-
-def test_a_page_shows_its_spz(show: Any, save: Any) -> None:
-    """What Python reads of it, with growth, in units that float16 does not hold; its dB near its cameras only."""
     size, model = 1000.0, scenes.dialled(1000, 3, 4, scene_distance=1.0, reference_distance=3.0)
     far = model.replace(
         means=size * model.means, log_scales=model.log_scales + float(np.log(size)), sigma_d=size * model.sigma_d,
@@ -95,15 +92,16 @@ def test_a_page_shows_its_spz(show: Any, save: Any) -> None:
     )  # fmt: skip
     path, row = save(far), CalibrationRow(1.0, 900.0, 31.5, 0.9, 4.0)
     calibrated = replace(clod_adapter.load(path), calibration=Calibration((row,), 1000, 2, 8, 6, "a machine"))
+    calibrated.gaussians.opacity_logits[3] = torch.inf
     camera = scenes.camera(320, 240)
     viewmat = camera.viewmat.clone()
     viewmat[:3, 3] *= size
     seen, out = replace(camera, viewmat=viewmat), path.with_suffix(".html")
-    read, _ = page.write_viewer_page(out, calibrated, cameras=[seen], virtual_scale=1.0)
+    read, _ = page.write_viewer_page(out, calibrated, cameras=[seen], virtual_scale=1.0, exact=exact)
+    assert out.read_text(encoding="utf-8").count('id="clod-model"') > 2
     shown = show(url=out.as_uri())
     assert shown.text("#quality") == "31.5 dB"
-    shown.page.keyboard.press("l")
-    here = shown.page.evaluate("location.hash")
+    here = shown.link()
     away = re.sub("eye=[^&]*", f"eye={40 * size},0,{-40 * size}", here)
     for view, quality in ((away, ""), (here, "31.5 dB")):
         shown.page.evaluate("hash => { location.hash = hash }", view)

@@ -22,8 +22,7 @@ from shown import Shown, take
 
 
 def link(shown: Shown) -> dict[str, np.ndarray]:
-    shown.page.keyboard.press("l")
-    parts = shown.page.evaluate("location.hash").lstrip("#").split("&")
+    parts = shown.link().lstrip("#").split("&")
     return {name: np.array([float(v) for v in text.split(",")]) for name, text in (part.split("=") for part in parts)}
 
 
