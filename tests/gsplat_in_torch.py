@@ -26,9 +26,8 @@ def install(monkeypatch: pytest.MonkeyPatch) -> None:
     def spherical_harmonics(degree: int, dirs: Tensor, coeffs: Tensor, masks: Tensor | None = None) -> Tensor:
         return _torch_impl._spherical_harmonics(degree, dirs, coeffs)
 
-    by_opacity = "opacities" in inspect.signature(gsplat.fully_fused_projection).parameters
     replaced: dict[str, Any] = {
-        "fully_fused_projection": fully_fused_projection if by_opacity else projection_without_opacities,
+        "fully_fused_projection": fully_fused_projection,
         "isect_tiles": isect_tiles,
         "isect_offset_encode": _torch_impl._isect_offset_encode,
         "rasterize_to_pixels": rasterize_to_pixels,
@@ -42,38 +41,10 @@ def install(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def fully_fused_projection(
     means: Tensor, covars: Tensor | None, quats: Tensor | None, scales: Tensor | None, viewmats: Tensor, Ks: Tensor,
-    width: int, height: int, *, packed: bool, opacities: Tensor, **options: Any,
+    width: int, height: int, *, eps2d: float, near_plane: float, far_plane: float, radius_clip: float, packed: bool,
+    sparse_grad: bool, calc_compensations: bool, camera_model: str, opacities: Tensor | None = None,
 ) -> tuple[Any, ...]:  # fmt: skip
-    radii, *values, compensations = _projection(means, covars, quats, scales, viewmats, Ks, width, height, **options)
-    shown = opacities[..., None, :] * (1 if compensations is None else compensations)
-    narrower = (2 * (shown / ALPHA_MIN).clamp(min=1).log()).sqrt() / 3.33
-    radii = torch.ceil(radii * narrower.clamp(max=1)[..., None]).int() * (shown >= ALPHA_MIN)[..., None].int()
-    if not packed:
-        return radii, *values, compensations
-    flat = radii.reshape(-1, *radii.shape[-3:])  # [B, C, N, 2]
-    ids = torch.nonzero((flat > 0).all(-1), as_tuple=True)
-    rows = [value.reshape(*flat.shape[:3], *value.shape[len(radii.shape) - 1 :])[ids] for value in (radii, *values)]
-    return *ids, *rows, None if compensations is None else compensations.reshape(flat.shape[:3])[ids]
-
-
-def projection_without_opacities(
-    means: Tensor, covars: Tensor | None, quats: Tensor | None, scales: Tensor | None, viewmats: Tensor, Ks: Tensor,
-    width: int, height: int, *, packed: bool, **options: Any,
-) -> tuple[Any, ...]:  # fmt: skip
-    """gsplat 1.4.0's: one radius for both directions, no batches."""
-    radii, *values = _projection(means, covars, quats, scales, viewmats, Ks, width, height, **options)
-    found = (radii.amax(-1) if radii.dim() == 3 else radii, *values)  # later torch code has two
-    if not packed:
-        return found
-    ids = torch.nonzero(found[0] > 0, as_tuple=True)
-    return *ids, *(None if value is None else value[ids] for value in found)
-
-
-def _projection(
-    means: Tensor, covars: Tensor | None, quats: Tensor | None, scales: Tensor | None, viewmats: Tensor, Ks: Tensor,
-    width: int, height: int, *, eps2d: float, near_plane: float, far_plane: float, radius_clip: float,
-    sparse_grad: bool, calc_compensations: bool, camera_model: str,
-) -> tuple[Any, ...]:  # fmt: skip
+    """Without opacities gsplat 1.4.0's: one radius for both directions, no batches."""
     from gsplat.cuda import _torch_impl
 
     if covars is None:
@@ -82,9 +53,24 @@ def _projection(
         covars, _ = _torch_impl._quat_scale_to_covar_preci(quats, scales, True, False, triu=False)
     else:
         covars = covars[..., [0, 1, 2, 1, 3, 4, 2, 4, 5]].unflatten(-1, (3, 3))  # from the upper triangle
-    return _torch_impl._fully_fused_projection(
+    radii, *values, compensations = _torch_impl._fully_fused_projection(
         means, covars, viewmats, Ks, width, height, eps2d, near_plane, far_plane, calc_compensations, camera_model
-    )  # type: ignore[no-any-return]
+    )
+    if opacities is None:
+        radii = radii.amax(-1) if radii.dim() == 3 else radii  # later torch code has two
+        seen = radii > 0
+    else:
+        shown = opacities[..., None, :] * (1 if compensations is None else compensations)
+        narrower = (2 * (shown / ALPHA_MIN).clamp(min=1).log()).sqrt() / 3.33
+        radii = torch.ceil(radii * narrower.clamp(max=1)[..., None]).int() * (shown >= ALPHA_MIN)[..., None].int()
+        seen = (radii > 0).all(-1)
+    found = radii, *values, compensations
+    if not packed:
+        return found
+    flat = seen if opacities is None else seen.reshape(-1, *seen.shape[-2:])  # [C, N], or [B, C, N]
+    ids = torch.nonzero(flat, as_tuple=True)
+    rows = (None if x is None else x.reshape(*flat.shape, *x.shape[seen.dim() :])[ids] for x in found)
+    return *ids, *rows
 
 
 @torch.no_grad()

@@ -79,12 +79,10 @@ def test_any_settings(grows: bool, s: float, seed: int, reference: float, mip: b
     assert_same(model, s)
 
 
-@pytest.mark.parametrize("frozen", [SHAPE, COLOUR, (*SHAPE, *COLOUR), ("sigma_d", "opacity_logits"), SHAPE[:3]])
-def test_frozen_attributes(frozen: tuple[str, ...]) -> None:
-    assert_same(dialled(120, 1, 4).replace(growth_d=torch.full((120,), 0.5)), 2.0, *frozen)
-
-
-def test_without_a_dial() -> None:
+def test_frozen_attributes_and_models_without_a_dial() -> None:
+    model = dialled(120, 1, 4).replace(growth_d=torch.full((120,), 0.5))
+    for frozen in (SHAPE, COLOUR, (*SHAPE, *COLOUR), ("sigma_d", "opacity_logits"), SHAPE[:3]):
+        assert_same(model, 2.0, *frozen)
     assert_same(gaussians(100, 2, 0), 3.0)
     assert_same(gaussians(100, 0, 0).replace(screen_filter=ScreenFilter(compensate=True)), 1.0)
 
@@ -126,10 +124,11 @@ def test_a_row_with_infinite_sigma_has_no_dial(rasterizer: Rasterizer) -> None:
         assert bool(rasterizer.kept(fixed, VIEW, 40.0).all())
 
 
-def test_distances_of_another_camera() -> None:
+def test_distances_of_another_camera_and_a_growth_that_is_not_finite() -> None:
     model, other = dialled(50, 0, 1), camera(45, 37, fov=70)
     found = [each.draw(model, VIEW, 2.0, seen_from=other)[0] for each in (KERNELS, COMPOSED)]
     assert torch.equal(*found)
+    assert KERNELS.draw(model.replace(growth_d=torch.full((50,), math.nan)), VIEW, 2.0)[1].sum() == 0
 
 
 def test_gradients_beyond_the_trained_rows_are_0() -> None:
@@ -138,8 +137,3 @@ def test_gradients_beyond_the_trained_rows_are_0() -> None:
     image, _ = KERNELS.draw(model.replace(**leaves), VIEW, 2.0, trained=40)
     for name, slope in zip(leaves, torch.autograd.grad(image.sum(), list(leaves.values())), strict=True):
         assert not slope[40:].any() and bool(slope[:40].any()) == bool(want[name][:40].any()), name
-
-
-def test_a_growth_that_is_not_finite_is_not_drawn() -> None:
-    model = dialled(50, 0, 1).replace(growth_d=torch.full((50,), math.nan))
-    assert KERNELS.draw(model, VIEW, 2.0)[1].sum() == 0
