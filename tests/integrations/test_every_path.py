@@ -1,7 +1,10 @@
-"""One adapted file looks the same through every path that draws it, and so do the files of viewers/kit."""
+"""One adapted file looks the same through every path that draws it, and so do the files of viewers/kit; the wrapper
+against stand-ins for five forks of Inria's rasterizer, called with the kept rows alone."""
 
 import json
 from pathlib import Path
+from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,10 +18,13 @@ import inria_forks
 import scenes
 from backends import fresh_copy
 from clod_adapter.config import FILTERS
+from clod_adapter.equation.attenuation import attenuate
+from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.checkpoint import Checkpoint
 from clod_adapter.rasterizers import Rasterizer, reference
 from clod_adapter.render import render
+from inria_forks import FORKS, settings_of
 
 DIAL = 3.0
 VIEW = scenes.camera(48, 32, off_centre=(0.5, 0.5))  # Inria's settings have no principal point
@@ -40,18 +46,33 @@ def through_gsplat(checkpoint: Checkpoint, monkeypatch: pytest.MonkeyPatch) -> T
     return images[0]
 
 
+def inria(monkeypatch: pytest.MonkeyPatch, installed: ModuleType | None) -> Any:
+    return fresh_copy(monkeypatch, "inria", "diff_gaussian_rasterization", installed)
+
+
+def arguments(g: Gaussians, fork: str = "inria 2024") -> dict[str, Any]:
+    """A fork's arguments by name, and those of the dial; floating-point tensors require gradients."""
+    given: dict[str, Any] = {
+        "means3D": g.means, "means2D": torch.zeros_like(g.means), "opacities": g.opacities[:, None],
+        "shs": torch.cat([g.sh0, g.shN], 1), "scales": g.scales, "rotations": torch.nn.functional.normalize(g.quats),
+        "sigma_d": g.sigma_d, "growth_d": g.growth_d,
+    }  # fmt: skip
+    given = {name: value.clone().requires_grad_() for name, value in given.items() if value is not None}
+    further = set(FORKS[fork][1].split()) - set(inria_forks.CALL.split())
+    given |= {name: torch.ones(len(g), 2) for name in further}
+    return given | {"attenuation": g.attenuation, "virtual_scale": DIAL}
+
+
 def through_inria(checkpoint: Checkpoint, monkeypatch: pytest.MonkeyPatch) -> Tensor:
     g = checkpoint.gaussians
     name, settings = ("mip-splatting", {"kernel_size": 0.1}) if g.screen_filter == FILTERS["mip"] else (
         "inria 2024", {"antialiasing": g.screen_filter.compensate}
     )  # fmt: skip
-    ours = fresh_copy(monkeypatch, "inria", "diff_gaussian_rasterization", inria_forks.module(name))
-    color, *_ = ours.GaussianRasterizer(inria_forks.settings_of(ours.GaussianRasterizationSettings, VIEW, **settings))(
-        means3D=g.means, means2D=torch.zeros_like(g.means), opacities=g.opacities[:, None],
-        shs=torch.cat([g.sh0, g.shN], 1), scales=g.scales, rotations=torch.nn.functional.normalize(g.quats),
-        sigma_d=g.sigma_d, growth_d=g.growth_d, attenuation=g.attenuation, virtual_scale=DIAL,
-    )  # fmt: skip
-    return color.permute(1, 2, 0)
+    ours = inria(monkeypatch, inria_forks.module(name))
+    color, *_ = ours.GaussianRasterizer(settings_of(ours.GaussianRasterizationSettings, VIEW, **settings))(
+        **arguments(g)
+    )
+    return color.permute(1, 2, 0).detach()
 
 
 def through_hook(checkpoint: Checkpoint, monkeypatch: pytest.MonkeyPatch) -> Tensor:
@@ -67,9 +88,9 @@ def through_hook(checkpoint: Checkpoint, monkeypatch: pytest.MonkeyPatch) -> Ten
     return render(plain[keep], VIEW, rasterizer=Rasterizer(reference.rasterize)).image
 
 
-def adapted() -> Gaussians:
+def adapted(**settings: Any) -> Gaussians:
     """60 Gaussians, of which a third is culled at the dial value, with growth of both signs."""
-    some = scenes.dialled(60, 1, 3)
+    some = scenes.dialled(60, 1, 3, **settings)
     values = torch.rand(60, generator=torch.Generator().manual_seed(5))
     return some.replace(means=some.means * torch.tensor([1, 1, 0.5]), growth_d=2 * values - 0.5)
 
@@ -108,3 +129,74 @@ def test_the_kit_is_what_the_library_draws_and_writes(suffix: str, levels: int) 
             assert int(shown.kept.sum()) == pytest.approx(frame["kept"], rel=0.005 if suffix == "spz" else 0)
             stored = np.asarray(Image.open(KIT / frame["picture"], formats=["PNG"]), np.float64)
             assert np.abs(shown.image.clamp(0, 1).numpy() * 255 - stored).max() < levels
+
+
+@pytest.mark.parametrize("name", FORKS)
+def test_kept_rows_are_drawn_as_by_the_fork(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also called by position. Without sigma_d, results are the fork's."""
+    fork, model = inria_forks.module(name), adapted(normalizer="max")
+    given = arguments(model if name != "w-pose" else model.replace(growth_d=None), name)
+    dial = {key: given.pop(key) for key in ("sigma_d", "growth_d", "attenuation", "virtual_scale") if key in given}
+    settings = settings_of(fork.GaussianRasterizationSettings, VIEW, bg=torch.tensor([0.2, 0.5, 0.1]))
+    theirs, module = fork.GaussianRasterizer(settings), inria(monkeypatch, fork)
+    ours = module.GaussianRasterizer(raster_settings=settings)
+    assert module.GaussianRasterizationSettings is fork.GaussianRasterizationSettings
+    for mine, want in zip(ours(**given), theirs(**given), strict=True):
+        assert torch.equal(mine, want)
+    logits, where = given["opacities"][:, 0].logit(), (given["means3D"], VIEW)
+    drawn = attenuate(logits, dial["sigma_d"], where, DIAL, dial["attenuation"], growth_d=dial.get("growth_d"))
+    keep = drawn.keep
+    assert 0 < int(keep.sum()) < 60
+    rows = {key: value[keep] for key, value in given.items()} | {"opacities": drawn.drawn[keep, None]}
+    want = theirs(**rows | {"scales": rows["scales"] * drawn.growth[keep, None]})
+    got = ours(**given, **dial)
+    assert torch.equal(ours(*map(given.get, FORKS[name][1].split()), **dial)[0], got[0])
+    for result, mine, of_fork in zip(FORKS[name][2].split(), got, want, strict=True):
+        if result in ("radii", "touched"):  # of all rows, 0 for culled ones
+            assert torch.equal(mine[keep], of_fork) and len(mine) == 60 and not mine[~keep].any()
+        elif result != "features":
+            torch.testing.assert_close(mine, of_fork, rtol=1e-5, atol=1e-5)
+    leaves = [each for each in (given | dial).values() if isinstance(each, Tensor) and each.requires_grad]
+    weights = torch.rand(got[0].shape, generator=torch.Generator().manual_seed(1))
+    slopes = [torch.autograd.grad((picture[0] * weights).sum(), leaves) for picture in (got, want)]
+    for leaf, mine, of_fork in zip(leaves, *slopes, strict=True):
+        assert mine.shape == leaf.shape and not mine[~keep].any()
+        torch.testing.assert_close(mine, of_fork, rtol=1e-3, atol=1e-4)
+    assert float(slopes[0][-1].abs().max()) > 0
+
+
+def test_culled_rows_are_invisible_to_a_fork_that_culls_at_zero(monkeypatch: pytest.MonkeyPatch) -> None:
+    """From many positions, since rounding moves a point at the camera's centre in front of it or behind it."""
+    monkeypatch.setattr(inria_forks, "NEAREST", 0.0)
+    fork = inria_forks.module("inria 2024")
+    given, ours = arguments(adapted().replace(sigma_d=torch.full((60,), 1e-3))), inria(monkeypatch, fork)
+    for view in scenes.ring(31, 48, 36):
+        assert not ours.GaussianRasterizer(settings_of(fork.GaussianRasterizationSettings, view))(**given)[1].any()
+
+
+def test_covariances_grow_by_the_square(monkeypatch: pytest.MonkeyPatch) -> None:
+    """``cov3D_precomp`` instead of scales and rotations, by name and by position."""
+    fork, given = inria_forks.module("inria 2024"), arguments(adapted())
+    ours = inria(monkeypatch, fork).GaussianRasterizer(settings_of(fork.GaussianRasterizationSettings, VIEW))
+    ours(**given)
+    growth = ours.given["scales"][:, 0] / given.pop("scales")[:, 0]
+    assert growth.min() < 0.9 and growth.max() > 1.1
+    given |= {"rotations": None, "cov3D_precomp": torch.rand(60, 6, generator=torch.Generator().manual_seed(3))}
+    words = inria_forks.CALL.split()
+    for values, names in (([], given), (map(given.get, words), {k: v for k, v in given.items() if k not in words})):
+        ours(*values, **names)
+        torch.testing.assert_close(ours.given["cov3D_precomp"], given["cov3D_precomp"] * growth[:, None].square())
+
+
+def test_bad_arguments_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    fork, short = inria_forks.module("inria 2024"), torch.ones(59)
+    for prefiltered, changed, message in (
+        (True, {}, "prefiltered is True.*set it to False"),
+        (None, {"sigma_d": short, "growth_d": None}, r"the dial is for 59 Gaussians, but means is \(60, 3\)"),
+        (None, {"growth_d": short}, r"sigma_d \(60,\), growth_d \(59,\)"),
+    ):
+        settings = settings_of(fork.GaussianRasterizationSettings, VIEW, prefiltered=prefiltered)
+        with pytest.raises(ClodError, match=message):
+            inria(monkeypatch, fork).GaussianRasterizer(settings)(**arguments(adapted()) | changed)
+    with pytest.raises(ImportError, match="pip install .*graphdeco-inria/diff-gaussian-rasterization"):
+        inria(monkeypatch, None)
