@@ -2,6 +2,7 @@
 
 import shlex
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -58,17 +59,14 @@ def test_find(tool: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Non
             SplatTransform.find()
 
 
-def stand_in(*lines: str) -> SplatTransform:
-    return SplatTransform((sys.executable, "-c", "\n".join([BEGIN, *lines])), "3.7.0")
-
-
-def test_run(tmp_path: Path) -> None:
+def test_run(tmp_path: Path, tool: Any) -> None:
     out, ticks = tmp_path / "out", list[float]()
-    tool = stand_in("open(words[-1], 'w').write(' '.join(words[:-1]))", "time.sleep(0.5)")
-    seconds = tool.run("a.ply", out, timeout=60, progress=ticks.append)
+    tool(ANSWERS, "open(words[-1], 'w').write(' '.join(words[:-1]))", "time.sleep(0.5)")
+    found = SplatTransform.find()
+    seconds = replace(found, gpu=False).run("a.ply", out, timeout=60, progress=ticks.append)
     assert out.read_text() == "-w -g cpu -i 1 a.ply" and 0.5 < seconds < 30
     assert len(ticks) > 1 and ticks == sorted(ticks) and ticks[-1] <= seconds
-    SplatTransform(tool.command, "3.7.0", gpu=True).run(Path("-a.ply"), out, timeout=60)
+    replace(found, gpu=True).run(Path("-a.ply"), out, timeout=60)
     assert out.read_text() == f"-w {Path.cwd() / '-a.ply'}"
     log = ["print('splat-transform v3.7.0')", "print('  \\u2717 Error: no room')", "print('    at f (x.mjs:1)')"]
     for lines, message in (
@@ -76,8 +74,9 @@ def test_run(tmp_path: Path) -> None:
         (["sys.stderr.write('first\\nlast\\n')", "sys.exit(3)"], "last"),
         (["sys.exit(1)"], "no output"),
     ):
-        with pytest.raises(ClodError, match=f"^splat-transform 3.7.0 failed: {message}$"):
-            stand_in(*lines).run(timeout=60)
+        tool(*lines)
+        with pytest.raises(ClodError, match=f"^splat-transform 3.7.2 failed: {message}$"):
+            found.run(timeout=60)
 
 
 def test_converted_files(tmp_path: Path, tool: Any, monkeypatch: pytest.MonkeyPatch) -> None:
