@@ -16,8 +16,8 @@ from .shared.outputs import size
 
 if TYPE_CHECKING:
     from clod_adapter.calibration import Calibration
-    from clod_adapter.inspection.report import Inspection, Splat
-    from clod_adapter.inspection.statistics import Spread
+    from clod_adapter.inspection.report import Inspection
+    from clod_adapter.inspection.statistics import Splat, Spread
 
 WIDTH = 13  # of the labels
 MOST_ROWS = 8  # of a calibration, including the first and last

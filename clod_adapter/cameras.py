@@ -117,12 +117,9 @@ class View:
 
 
 class StoredView(View):
-    """A view that reads its photograph on every access; a pickle or a deep copy is a plain View that holds it.
+    """A view that reads its photograph, by ``image``, on every access; a pickle or a copy is a View that holds it."""
 
-    ``image`` returns the pixels of ``View.image``, or is the pixels (``dataclasses.replace`` passes these).
-    """
-
-    def __init__(self, camera: Camera, image: Callable[[], Tensor] | Tensor) -> None:
+    def __init__(self, camera: Camera, image: Callable[[], Tensor] | Tensor) -> None:  # a Tensor from replace
         object.__setattr__(self, "camera", camera)
         object.__setattr__(self, "_read", (lambda: image) if isinstance(image, Tensor) else image)
 
@@ -153,8 +150,7 @@ class Scene:
         train: views for training.
         test: held-out views.
         notes: changes made to the images when they were read, one line each, for the report.
-        left_out: steps of reading that were skipped, each with the reason: ``("undistortion", "all 97 cameras are
-            pinholes")``. Empty for a scene that was not read from files.
+        left_out: skipped steps of reading, with their reasons: ``("undistortion", "all 97 cameras are pinholes")``.
     """
 
     train: tuple[View, ...]

@@ -45,10 +45,7 @@ class Rendering:
 def splat(
     gaussians: Gaussians, opacities: Tensor, camera: Camera, growth: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Image ``[H, W, 3]``, on black, and alpha ``[H, W]`` of the Gaussians without a dial.
-
-    Drawn with activated ``opacities [N]`` and scales times ``growth [N]``; ClodError if their shape is another.
-    """
+    """Image ``[H, W, 3]`` on black and alpha ``[H, W]``, of activated opacities ``[N]`` and scales times ``growth``."""
     if opacities.shape != (len(gaussians),):
         raise ClodError(f"opacities are {tuple(opacities.shape)} and must be ({len(gaussians)},)")
     scales = gaussians.scales if growth is None else gaussians.scales * growth[:, None]

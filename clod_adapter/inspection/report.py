@@ -10,17 +10,15 @@ from typing import Any
 
 import numpy as np
 
-from clod_adapter.calibration import Calibration
-from clod_adapter.config import SH_COUNTS, AdaptConfig, AttenuationConfig, ScreenFilter
+from clod_adapter.config import SH_COUNTS, AdaptConfig
 from clod_adapter.errors import ClodError
-from clod_adapter.inspection.statistics import FAR, Spread, Values, values_of
+from clod_adapter.inspection.statistics import FAR, Dial, Splat, Spread, values_of
 from clod_adapter.io.file_formats import read_source
 from clod_adapter.io.ply import MASK_COLUMNS, Head, all_comments
 from clod_adapter.io.ply_layout import COLUMN, PREFIX, column_map, inria_dtype
 from clod_adapter.io.ply_packed import is_packed
 from clod_adapter.io.settings import ADAPTER, matching_calibration, stated_filter
 from clod_adapter.io.values import FILTER, choice_of, dial_columns, in_question, prepared
-from clod_adapter.origin import Origin
 
 NORMALS = ("nx", "ny", "nz")
 NERFSTUDIO = "nerfstudio's exporter, ns-export gaussian-splat"
@@ -43,34 +41,6 @@ class Anomaly:
     kind: str  # one word, for scripts
     count: int  # of Gaussians or columns; 0 for the whole file
     says: str
-
-
-@dataclass(frozen=True)
-class Dial:
-    """The settings of a file with a dial."""
-
-    attenuation: AttenuationConfig
-    calibration: Calibration | None
-
-
-@dataclass(frozen=True)
-class Splat(Values):
-    """A file of Gaussians, and the statistics of its rows."""
-
-    sh_degree: int
-    encoding: str  # of a PLY
-    columns: tuple[tuple[str, str], ...]  # the properties of a PLY in its order, with their types
-    extra: tuple[str, ...]  # properties without a meaning here, copied to outputs unchanged
-    comments: tuple[str, ...]  # of the header, without ours
-    tau: float  # of ``fainter_than_tau``: the dial's, or the default of adapting
-    origin: Origin
-    dial: Dial | None
-    screen_filter: ScreenFilter
-
-    @property
-    def dial_columns(self) -> str:
-        """The columns of the dial, of a file that has one."""
-        return "sigma_d" if self.growth is None else "sigma_d and growth_d"
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from clod_adapter.config import SH_COUNTS
+from clod_adapter.calibration import Calibration
+from clod_adapter.config import SH_COUNTS, AttenuationConfig, ScreenFilter
 from clod_adapter.io.values import GROWTH, SIGMA, Prepared
+from clod_adapter.origin import Origin
 
 BULK = (0.01, 0.99)  # quantiles that bound the middle 98 %
 NEEDLE = 10.0  # a Gaussian this many times as long as its second axis
@@ -35,8 +37,16 @@ class Spread:
 
 
 @dataclass(frozen=True)
-class Values:
-    """Statistics of the usable rows."""
+class Dial:
+    """The settings of a file with a dial."""
+
+    attenuation: AttenuationConfig
+    calibration: Calibration | None
+
+
+@dataclass(frozen=True)
+class Splat:
+    """A file of Gaussians, and the statistics of its usable rows."""
 
     total: int  # rows of the file
     count: int  # usable ones
@@ -54,10 +64,24 @@ class Values:
     fainter_than_visible: float
     sigma: Spread | None
     growth: Spread | None
+    sh_degree: int
+    encoding: str  # of a PLY
+    columns: tuple[tuple[str, str], ...]  # the properties of a PLY in its order, with their types
+    extra: tuple[str, ...]  # properties without a meaning here, copied to outputs unchanged
+    comments: tuple[str, ...]  # of the header, without ours
+    tau: float  # of ``fainter_than_tau``: the dial's, or the default of adapting
+    origin: Origin
+    dial: Dial | None
+    screen_filter: ScreenFilter
+
+    @property
+    def dial_columns(self) -> str:
+        """The columns of the dial, of a file that has one."""
+        return "sigma_d" if self.growth is None else "sigma_d and growth_d"
 
 
 def values_of(found: Prepared, tau: float) -> dict[str, Any]:
-    """The fields of ``Values`` of a file's rows, of which one is usable at least."""
+    """The fields of ``Splat`` up to ``growth``, of a file's rows, of which one is usable at least."""
     keep = found.keep
     columns = {name: np.ascontiguousarray(array[keep].T) for name, array in found.arrays.items() if name != "shN"}
     means, logits = columns["means"], columns["opacity_logits"].astype(np.float64)

@@ -13,7 +13,8 @@ import scenes
 from clod_adapter import AttenuationConfig, ClodError, load, save, with_dial
 from clod_adapter.cli.inspect import lines_of
 from clod_adapter.cli.shared.outputs import jsonable
-from clod_adapter.inspection.report import Inspection, Splat, inspect, looks_like
+from clod_adapter.inspection.report import Inspection, inspect, looks_like
+from clod_adapter.inspection.statistics import Splat
 from clod_adapter.io.ply import read_head
 from clod_adapter.io.ply_layout import inria_dtype
 from clod_adapter.origin import NOWHERE
