@@ -51,9 +51,8 @@ def execute(args: Namespace) -> dict[str, Any]:
     dial = " and ".join(dial_tensors(adapted))
     print(f"wrote {args.out} ({size(Path(args.out))}): {len(adapted):,} Gaussians with {dial}")
     return {
-        "base": args.base, "adapter": args.adapter,
-        "base_count": adapter.base_count, "changed": sorted(adapter.updates), "notes": console.notes,
-        "outputs": {"ply": args.out},
+        "base": args.base, "adapter": args.adapter, "base_count": adapter.base_count,
+        "changed": sorted(adapter.updates), "notes": console.notes, "outputs": {"ply": args.out},
     }  # fmt: skip
 
 

@@ -104,10 +104,7 @@ def execute(args: Namespace) -> dict[str, Any]:
             print(f"    -> {each['fix']}")
     failed = "no rendering backend works: fix torch first, then the CPU backend"
     print(f"rendering and training backends: {', '.join(draws)}" if draws else failed)
-    return {
-        "draws": draws, "exit_code": 0 if draws else 1,
-        "findings": findings,
-    }  # fmt: skip
+    return {"draws": draws, "exit_code": 0 if draws else 1, "findings": findings}
 
 
 DESCRIPTION = "Check what renders here, and say how to fix the rest."

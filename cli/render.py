@@ -78,10 +78,9 @@ def execute(args: Namespace) -> dict[str, Any]:
         about = f"{kept:,.0f} of {len(gaussians):,} Gaussians, {error:.2f} dB, means over the images"
         print(f"  s = {dial:.5g}: {about}")
     return {
-        "model": args.model, "scene": args.images,
-        "base_count": len(gaussians), "virtual_scales": dials, "pictures": pictures,
-        "interrupted": len(pictures) < len(views), "notes": console.notes, "seconds": watch.report(),
-        "outputs": {"folder": args.out},
+        "model": args.model, "scene": args.images, "base_count": len(gaussians), "virtual_scales": dials,
+        "pictures": pictures, "interrupted": len(pictures) < len(views), "notes": console.notes,
+        "seconds": watch.report(), "outputs": {"folder": args.out},
     }  # fmt: skip
 
 

@@ -116,10 +116,8 @@ def make_page(args: Namespace, console: Console) -> tuple[dict[str, Any], dict[s
     if len({*names}) < len(names):  # with their folders, to tell them apart
         names = [as_text("/".join(Path(each.path).absolute().parts[-2:])) for each in models]
     entries = [{"name": name, "href": path} for name, path in zip(names, payloads, strict=True)]
-    base_entry = None
-    if base:
-        payloads[BASE] = Payload.of(base)
-        base_entry = {"name": payloads[BASE].name, "href": BASE}
+    payloads |= {BASE: Payload.of(base)} if base else {}
+    base_entry = {"name": payloads[BASE].name, "href": BASE} if base else None
     shown, placed = cameras or model.cameras, model.placed and not cameras
     config = page_config(entries, base_entry, [camera_entry(each, placed) for each in shown], opening)
     page = b"".join(document(config))

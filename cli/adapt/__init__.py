@@ -30,12 +30,11 @@ def add_arguments(parser: ArgumentParser) -> None:
     text = "exit code 0 even if s = 1 is far below the base (see exit codes)"
     training.add_argument("--accept-loss", action="store_true", help=text)
     options = parser.add_argument_group("advanced")
-    for option, dest, text in (
-        ("--with", "keep_in", f"train these whatever the plan measures: {', '.join(NAMES)}"),
-        ("--without", "leave_out", "exclude or freeze these whatever the plan measures"),
-    ):
-        several: Any = {"metavar": "NAME", "nargs": "+", "action": "extend", "choices": NAMES, "default": []}
-        options.add_argument(option, dest=dest, help=text, **several)
+    several: Any = {"metavar": "NAME", "nargs": "+", "action": "extend", "choices": NAMES, "default": []}
+    text = f"train these whatever the plan measures: {', '.join(NAMES)}"
+    options.add_argument("--with", dest="keep_in", help=text, **several)
+    text = "exclude or freeze these whatever the plan measures"
+    options.add_argument("--without", dest="leave_out", help=text, **several)
     options.add_argument("--trim", action="store_true", help="do not write the SH degrees and Gaussians excluded")
     options.add_argument("--memory", metavar="SIZE", help="memory limit, as in 8GB; larger scenes are split in blocks")
 

@@ -24,15 +24,16 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.checkpoint import Checkpoint
 from clod_adapter.io.scene.load import ImageCache
 from clod_adapter.progress import Phase, Stopped
+from clod_adapter.training.camera_placement import place_cameras
 from clod_adapter.training.interrupts import GracefulStop
 from clod_adapter.training.loop import time_steps
 from clod_adapter.training.plan import NOT_NEEDED, Decision, Override, Plan
 from clod_adapter.training.planner import make_plan
+from clod_adapter.training.pseudo_views import LIGHTEST, STEPS_PER_PLACED, add_pseudo_views, render_pseudo_views
 
 from ..shared import inputs
 from ..shared.command import make_config
 from ..shared.console import Console, ProgressDisplay
-from ..shared.inputs import prepare_kernels, read_checkpoint
 from ..shared.measure import Stopwatch, measure, report_dials
 from ..shared.outputs import AdaptFiles
 from ..shared.pages import SNAPSHOT_VIEWS
@@ -73,13 +74,13 @@ class Run:
         args, console, watch, views = self.args, self.console, self.watch, list[View]()
         cache = ImageCache(int(IMAGES * parse_size(args.memory))) if args.memory else None
         with watch.time("load"):
-            base = read_checkpoint(args.ply, console, args.activated, device=inputs.pick_device(args.device, console))
+            device = inputs.pick_device(args.device, console)
+            base = inputs.read_checkpoint(args.ply, console, args.activated, device=device)
             if base.vertex is not None:  # only writing needs the file's rows
                 base = replace(base, vertex=mapped(base.vertex, self.outputs.ply.parent))
             photographs = inputs.read_scene(args.images, console, base.origin, cache) if args.images else None
-        device = base.gaussians.means.device
         with watch.time("kernels"):
-            prepare_kernels(console, device)
+            inputs.prepare_kernels(console, device)
         with watch.time("evaluate"):
             if photographs is not None:
                 required = not args.misaligned_ok
@@ -88,11 +89,25 @@ class Run:
             self.base = base = inputs.with_filter(base, args, console, views)
         if base.gaussians.screen_filter.compensate:
             with watch.time("kernels"):
-                prepare_kernels(console, device, screen_filter=base.gaussians.screen_filter)
+                inputs.prepare_kernels(console, device, screen_filter=base.gaussians.screen_filter)
         with watch.time("place" if photographs is None else "evaluate"):
-            self.scene, self.config = inputs.scene_to_train(base.gaussians, photographs, self.config, console)
+            self.place(photographs)
         if args.memory:
             self.memory = plan_memory(base, self.scene, parse_size(args.memory), console)
+
+    def place(self, photographs: Scene | None) -> None:
+        """Adds pseudo views where photographs are few, and replaces them where there are none."""
+        gaussians, config, console = self.base.gaussians, self.config, self.console
+        with console.meter(Phase.CAMERAS) as meter:
+            if photographs is not None:
+                self.scene, self.config = add_pseudo_views(gaussians, photographs, config, meter)
+            else:
+                cameras = place_cameras(gaussians, seed=config.seed, progress=meter)
+        if photographs is None:
+            with console.meter(Phase.PSEUDO_VIEWS) as meter:
+                self.scene = render_pseudo_views(gaussians, cameras, progress=meter)
+            self.config = config.lighter(LIGHTEST).for_views(len(self.scene.train), STEPS_PER_PLACED)
+        console.note(*self.scene.notes)
 
     def identify(self) -> None:
         """Refuses the state of another run."""

@@ -69,11 +69,12 @@ class Export:
 
     Attributes:
         cameras: to bake for, empty where nothing is baked; ``about``: these cameras, in printable ASCII.
-        camera: the one of ``--camera``, for which the result is exact.
         views: cameras of the scene, for a page.
         gaussians: the model's, sorted with ``--order``.
         dials: the dial values that are baked, or the one at which a page opens; empty without any.
     """
+
+    camera: Camera | None = None  # of --camera, for which the result is exact
 
     def __init__(self, args: Namespace) -> None:
         self.args, self.page, self.console = args, is_page(args), Console(args.quiet)
@@ -81,15 +82,9 @@ class Export:
         device = inputs.pick_device(args.device, self.console) if times else inputs.CPU
         read = inputs.read_checkpoint(args.model, self.console, args.activated, device=device)
         self.model = inputs.with_filter(read, args, self.console)
-        self.cameras: Sequence[Camera | Viewpoint] = ()
-        self.about, self.views = "", list[Camera]()
-        counts = given_budget(args) and not (self.page and args.psnr_drop)
-        if args.order or args.levels or counts or (args.sv and not self.page):
-            self.cameras, self.about = self._find_cameras()
-        if self.page and args.images is not None:
-            self.views = inputs.read_cameras(self.model, args.images, self.console)
-        only = self.cameras[0] if args.camera is not None else None
-        self.camera = only if isinstance(only, Camera) else None
+        self.cameras, self.about = self._find_cameras()
+        reads = self.page and args.images is not None
+        self.views = inputs.read_cameras(self.model, args.images, self.console) if reads else []
         self.gaussians = self.model.gaussians
         if args.order:
             self.gaussians = self.gaussians.select(order_by_extinction(self.gaussians, self.cameras))
@@ -104,6 +99,9 @@ class Export:
     def _find_cameras(self) -> tuple[Sequence[Camera | Viewpoint], str]:
         """The cameras of --camera, --images or the model's file, else placed ones; and what they are."""
         args, model = self.args, self.model
+        counts = given_budget(args) and not (self.page and args.psnr_drop)
+        if not (args.order or args.levels or counts or (args.sv and not self.page)):
+            return (), ""
         if args.images is not None:
             cameras = inputs.read_cameras(model, args.images, self.console, training=args.camera is None)
             if args.camera is None:
@@ -112,6 +110,7 @@ class Export:
             if len(found) > 1:
                 both = f"{found[0].name} and {found[1].name}"
                 raise ClodError(f"--camera: {args.camera!r} matches {both}; give the full name")
+            self.camera = found[0]
             return found, "one camera"
         if model.viewpoints:
             return model.viewpoints, f"{len(model.viewpoints)} training cameras"

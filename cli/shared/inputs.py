@@ -3,6 +3,7 @@
 import argparse
 from collections.abc import Sequence
 from dataclasses import asdict, replace
+from functools import cache
 from pathlib import Path, PureWindowsPath
 from typing import Any
 
@@ -24,9 +25,7 @@ from clod_adapter.io.values import Activated, dial_columns
 from clod_adapter.origin import Origin
 from clod_adapter.progress import Phase, Stopped
 from clod_adapter.rasterizers.cuda import unusable
-from clod_adapter.training.camera_placement import place_cameras
 from clod_adapter.training.loop import adapt
-from clod_adapter.training.pseudo_views import LIGHTEST, STEPS_PER_PLACED, add_pseudo_views, render_pseudo_views
 
 from .console import Console
 from .outputs import size
@@ -56,23 +55,6 @@ def read_scene(folder: str, console: Console, origin: Origin, cache: ImageCache 
     console.say(f"{folder}: {len(scene.train)} photographs to train on, {len(scene.test)} held out, {size}")
     console.note(*scene.notes)
     return scene
-
-
-def scene_to_train(
-    gaussians: Gaussians, photographs: Scene | None, config: AdaptConfig, console: Console
-) -> tuple[Scene, AdaptConfig]:
-    """Adds pseudo views where photographs are few, and replaces them where there are none; and the settings for it."""
-    with console.meter(Phase.CAMERAS) as meter:
-        if photographs is not None:
-            scene, config = add_pseudo_views(gaussians, photographs, config, meter)
-        else:
-            cameras = place_cameras(gaussians, seed=config.seed, progress=meter)
-    if photographs is None:
-        with console.meter(Phase.PSEUDO_VIEWS) as meter:
-            scene = render_pseudo_views(gaussians, cameras, progress=meter)
-        config = config.lighter(LIGHTEST).for_views(len(scene.train), STEPS_PER_PLACED)
-    console.note(*scene.notes)
-    return scene, config
 
 
 def read_inputs(
@@ -204,12 +186,10 @@ class _Compiling(Listener):  # type: ignore[misc]
     """Says once that something is compiled."""
 
     def __init__(self, console: Console) -> None:
-        self.console, self.said = console, False
+        self.say_once = cache(console.say)
 
     def on_start(self, event: Event) -> None:
-        if not self.said:
-            self.said = True
-            self.console.say("compiling kernels (first run only, or without a writable NUMBA_CACHE_DIR) ...")
+        self.say_once("compiling kernels (first run only, or without a writable NUMBA_CACHE_DIR) ...")
 
     def on_end(self, event: Event) -> None:
         pass

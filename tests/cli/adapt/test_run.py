@@ -14,7 +14,7 @@ from PIL import Image
 from plyfile import PlyData
 
 import clod_adapter
-from clod_adapter.cli.shared import inputs
+from clod_adapter.cli.adapt import prepare
 from clod_adapter.cli.shared.measure import machine_name
 from clod_adapter.config import AdaptConfig
 from models import write_model
@@ -158,7 +158,7 @@ def test_without_held_out_photographs(clod: Any, capture: Any, tmp_path: Path) -
 
 def test_without_photographs(clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The target images are renders of the base, rounded to bytes."""
-    monkeypatch.setattr(inputs, "place_cameras", partial(inputs.place_cameras, views=16))
+    monkeypatch.setattr(prepare, "place_cameras", partial(prepare.place_cameras, views=16))
     done = clod(capture.ply, *TINY, "--json")
     report = json.loads(done.out)
     assert done.code == 0 and names(tmp_path) == OUTPUTS, done
