@@ -67,13 +67,11 @@ def rendered(device: str, name: str, fix: str) -> Found:
 
     normal = partial(torch.randn, generator=torch.Generator().manual_seed(7))
     scene: dict[str, Any] = {
-        "means": normal(60, 3).clamp(-1.5, 1.5), "quats": normal(60, 4), "scales": (0.5 * normal(60, 3) - 2).exp(),
-        "opacities": (1.5 * normal(60)).sigmoid().clamp(max=0.95), "sh0": normal(60, 1, 3),
-        "shN": 0.1 * normal(60, 3, 3), "background": torch.zeros(3),
+        "means": normal(60, 3).clamp(-1.5, 1.5) + torch.tensor([0.0, 0.0, 4.0]), "quats": normal(60, 4),
+        "scales": (0.5 * normal(60, 3) - 2).exp(), "opacities": (1.5 * normal(60)).sigmoid().clamp(max=0.95),
+        "sh0": normal(60, 1, 3), "shN": 0.1 * normal(60, 3, 3), "background": torch.zeros(3),
     }  # fmt: skip
-    viewmat = torch.eye(4)
-    viewmat[2, 3] = 4.0
-    camera = Camera(viewmat, torch.tensor([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]]), 64, 48)
+    camera = Camera(torch.eye(4), torch.tensor([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]]), 64, 48)
     want, _ = reference.rasterize(**scene, camera=camera)
     splat = for_device(torch.device(device)).splat
     image, _ = splat(**{name: value.to(device) for name, value in scene.items()}, camera=camera)

@@ -84,10 +84,8 @@ def splat_lines(splat: Splat) -> list[str]:
 
 def spread_table(rows: Sequence[tuple[str, Spread]]) -> list[str]:
     names = ("least", "1 %", "median", "99 %", "greatest")
-    lines = [" " * WIDTH + "".join(f"{name:>11}" for name in names)]
-    for name, spread in rows:
-        lines.append(f"{name:<{WIDTH}}" + "".join(f"{number:>11.4g}" for number in astuple(spread)))
-    return lines
+    lines = [_line("", "".join(f"{name:>11}" for name in names))]
+    return lines + [_line(name, "".join(f"{number:>11.4g}" for number in astuple(spread))) for name, spread in rows]
 
 
 def calibration_lines(calibration: Calibration | None) -> list[str]:
@@ -98,11 +96,9 @@ def calibration_lines(calibration: Calibration | None) -> list[str]:
     if len(rows) > MOST_ROWS:
         rows = [rows[round(k * (len(rows) - 1) / (MOST_ROWS - 1))] for k in range(MOST_ROWS)]
     lines = [_line("calibration", f"against {c.against}, {c.views} views of {c.width}x{c.height}, on {c.machine}")]
-    lines.append(" " * WIDTH + f"{'s':>6}{'Gaussians':>12}{'PSNR':>9}{'SSIM':>8}{'frame ms':>10}")
-    for row in rows:
-        numbers = f"{row.virtual_scale:>6.3g}{row.kept:>12,.0f}{row.psnr:>9.2f}{row.ssim:>8.3f}{row.frame_ms:>10.1f}"
-        lines.append(" " * WIDTH + numbers)
-    return lines
+    lines.append(_line("", f"{'s':>6}{'Gaussians':>12}{'PSNR':>9}{'SSIM':>8}{'frame ms':>10}"))
+    numbers = "{:>6.3g}{:>12,.0f}{:>9.2f}{:>8.3f}{:>10.1f}"
+    return lines + [_line("", numbers.format(*astuple(row))) for row in rows]
 
 
 def tensor_lines(about: dict[str, Any]) -> list[str]:

@@ -161,10 +161,7 @@ def decide(run: Run, display: ProgressDisplay) -> Plan:
 
 
 def forecast(run: Run, plan: Plan) -> None:
-    """Estimates seconds and peak memory of the rest of the run, from a few steps that are thrown away.
-
-    Not of runs that are too short, and not in several processes.
-    """
+    """Estimates time and peak memory of the rest of a run in one process, unless it is short, from a few steps."""
     config, views, base, state = plan.config, len(run.scene.test), run.base, run.saver.state
     steps = config.steps - (state.steps if state else 0)
     if steps < LONG or launched().size > 1:
@@ -237,10 +234,7 @@ def _bytes(gaussians: Gaussians) -> int:
 
 
 def mapped(array: np.ndarray, folder: Path) -> np.ndarray:
-    """The array in a mapped file without a name in ``folder``; itself where that cannot be written.
-
-    Room for the outputs remains: four times its size must be free.
-    """
+    """The array in a mapped file without a name in ``folder``; itself where four times its size are not free there."""
     try:
         if array.nbytes == 0 or shutil.disk_usage(folder).free < 4 * array.nbytes:
             return array

@@ -1,7 +1,6 @@
-"""Adapting in several processes: the first one runs the command, the others only train.
+"""Adapting in several processes: the first one reads, prints and writes.
 
-Only the first one reads files, prints and writes. The others wait for the training job that it sends them through the
-launcher's store, or until it says that there is none, and end after it.
+The others wait for its training job, or to be told in the launcher's store that there is none, and end after it.
 """
 
 from __future__ import annotations

@@ -5,6 +5,7 @@ import shlex
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from typing import Any
 
 from clod_adapter._kernels.memory import release
@@ -74,10 +75,8 @@ def train(run: Run, page: AdaptPage | None) -> tuple[Plan, Adapted]:
     forecast(run, plan)
 
     def show(now: Progress) -> bool:
-        part = now.gaussians
-        now = replace(now, gaussians=lambda: plan.whole(base, part())) if part else now
         if page:
-            page(now)
+            page(now, partial(plan.whole, base))
         return display(now)
 
     with closing(display), together(plan, scene, saver.state, display) as group:

@@ -40,7 +40,6 @@ class Console:
     def say(self, text: str) -> None:
         if not self.quiet:
             bars().write(text, file=sys.stderr)  # print would overwrite a bar on this line
-            sys.stderr.flush()
 
     def note(self, *texts: str, of: str = "") -> None:
         """Writes and keeps notes, or warnings if they begin so, on input or output, ``of`` this file."""

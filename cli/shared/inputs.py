@@ -61,10 +61,7 @@ def read_inputs(
     args: argparse.Namespace, paths: Sequence[str], console: Console, *, held_out: bool = True, training: bool = False,
     required: bool = False,
 ) -> tuple[list[Checkpoint], Scene]:  # fmt: skip
-    """Checkpoints, with their screen-space filters, and the photographs in the frame of the first one.
-
-    All coordinates are relative to its origin.
-    """
+    """Checkpoints, with their screen-space filters, and photographs, in the frame and origin of the first one."""
     device, found = pick_device(args.device, console), list[Checkpoint]()
     for path in paths:
         origin = found[0].origin if found else None
@@ -163,21 +160,17 @@ def prepare_kernels(
 ) -> None:
     """Evaluates, and with ``training`` adapts, a scene of one Gaussian, so that all kernels are compiled."""
     one = Gaussians(
-        torch.zeros(1, 3), torch.ones(1, 4), torch.zeros(1, 3), torch.zeros(1), torch.zeros(1, 1, 3),
+        torch.tensor([[0.0, 0.0, 2.0]]), torch.ones(1, 4), torch.zeros(1, 3), torch.zeros(1), torch.zeros(1, 1, 3),
         torch.zeros(1, 3, 3), screen_filter=screen_filter,
     ).to(device)  # fmt: skip
-    viewmat, K = torch.eye(4), torch.eye(3)
-    viewmat[2, 3] = 2.0
-    view = View(Camera(viewmat, K, 4, 4), torch.zeros(4, 4, 3, dtype=torch.uint8))
+    view = View(Camera(torch.eye(4), torch.eye(3), 4, 4), torch.zeros(4, 4, 3, dtype=torch.uint8))
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # after a Ctrl-C in one, each of several would compile on its own
     try:
         with install_listener("numba:compile", _Compiling(console)):
             evaluate(one, [view], [1.0])
-            if training:
-                adapted = adapt(one, Scene((view,), ()), AdaptConfig(iters=1), progress=False)
-                if adapted.interrupted:
-                    raise Stopped("stopped while the kernels were compiled")
+            if training and adapt(one, Scene((view,), ()), AdaptConfig(iters=1), progress=False).interrupted:
+                raise Stopped("stopped while the kernels were compiled")
     finally:
         torch.set_num_threads(threads)
 

@@ -125,7 +125,10 @@ def claimed(outputs: Outputs) -> Iterator[None]:
     check_outputs(outputs)
     with ExitStack() as stack:
         for folder in outputs.folders:
-            stack.enter_context(_made(folder))
+            for parent in (*reversed(folder.parents), folder):
+                if not parent.exists():
+                    stack.callback(_remove_empty, parent)
+            make_folder(folder)
         for folder in outputs.folders[:1]:
             stack.enter_context(output_lock(folder / "outputs", of=folder))
         for path in () if outputs.folders else outputs.files:
@@ -196,17 +199,9 @@ def _beginning(path: Path) -> bytes:
         return file.read(BEGINNING)
 
 
-@contextmanager
-def _made(folder: Path) -> Iterator[None]:
-    """In the body the folder exists; if it was made for it and stays empty, it is removed again."""
-    made = [each for each in (folder, *folder.parents) if not each.exists()]
-    make_folder(folder)
-    try:
-        yield
-    finally:
-        with suppress(OSError):  # it is not empty
-            for each in made:
-                each.rmdir()
+def _remove_empty(folder: Path) -> None:
+    with suppress(OSError):  # it is not empty, or could not be made
+        folder.rmdir()
 
 
 def make_folder(folder: Path) -> None:

@@ -55,13 +55,13 @@ class AdaptPage:
         self.snapshots: list[tuple[float, Gaussians]] = []  # seconds of the training, and the state then
         self.trained = 0.0
 
-    def __call__(self, now: Progress) -> None:
-        """A listener."""
+    def __call__(self, now: Progress, whole: Callable[[Gaussians], Gaussians]) -> None:
+        """Listens; ``whole`` is given the Gaussians that are trained, and returns all."""
         if now.phase == Phase.TRAINING and now.gaussians is not None:
             self.trained = now.seconds
             if self.due and now.share >= self.due[0]:
                 self.due = [share for share in self.due if share > now.share]
-                state = now.gaussians()
+                state = whole(now.gaussians())
                 fixed = {"shN": self.base.shN} if self.config.lr_shN == 0 else {}  # the largest, if it is not trained
                 changing = {name: value.clone() for name, value in state.tensors().items() if name not in fixed}
                 self.snapshots.append((now.seconds, state.replace(**changing, **fixed)))
