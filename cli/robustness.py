@@ -72,21 +72,14 @@ def cell_file(folder: Path, label: str, max_sv: float | None) -> Path:
 
 @dataclass(frozen=True)
 class Cell:
-    """One checkpoint at one range, or its baseline, where ``config`` is None; on disk.
+    """One checkpoint at one range, or its baseline, where ``config`` is None; on disk."""
 
-    Attributes:
-        label: names the checkpoint.
-        points: dial values, or shares of the baseline, that are measured.
-        scene_sha256: of its photographs.
-        file: its rows, as JSON, which mark it as finished; its adapter, which a baseline has not, is beside them.
-    """
-
-    label: str
+    label: str  # of the checkpoint
     checkpoint: Checkpoint
     config: AdaptConfig | None
-    points: tuple[float, ...]
-    scene_sha256: str
-    file: Path
+    points: tuple[float, ...]  # dial values, or shares of the baseline, that are measured
+    scene_sha256: str  # of the photographs
+    file: Path  # its rows, as JSON, which mark it as finished; the adapter, which a baseline has not, is beside them
 
     @property
     def key(self) -> dict[str, Any]:
@@ -147,15 +140,16 @@ def execute(args: Namespace) -> dict[str, Any]:
         if each.gaussians.sigma_d is not None:
             console.note(f"the dial of {each.path} is ignored")
         prepare_kernels(console, each.gaussians.means.device, screen_filter=each.gaussians.screen_filter)
-    known, configs, sha256 = labels(args.ply), common.make_configs(args), scene_fingerprint(scene)
+    bases = dict(zip(labels(args.ply), checkpoints, strict=True))
+    configs, sha256 = common.make_configs(args), scene_fingerprint(scene)
     # Every range is measured at the dial values of the widest one and at its own end.
     dials = tuple(sorted({*report_dials(configs[-1].max_sv), *(config.max_sv for config in configs)}))
     cells = dict[str, Cell]()
-    for base, name in zip(checkpoints, known, strict=True):
+    for label, base in bases.items():
         for config in (None, *configs):
             points, max_sv = (BASELINE_SHARES, None) if config is None else (dials, config.max_sv)
-            file = cell_file(Path(args.out) / "cells", name, max_sv)
-            cells[file.stem] = Cell(name, base, config, points, sha256, file)
+            file = cell_file(Path(args.out) / "cells", label, max_sv)
+            cells[file.stem] = Cell(label, base, config, points, sha256, file)
     found = {name: done for name, cell in cells.items() if (done := cell.read())}
     if found:
         console.say(f"{len(found)} of {len(cells)} cells are done already: {', '.join(found)}")
@@ -175,7 +169,7 @@ def execute(args: Namespace) -> dict[str, Any]:
             "command": "robustness", "version": package_version(), "scene": args.images,
             "checkpoints": [
                 {"checkpoint": label, "model": str(each.path), "count": len(each.gaussians), "sha256": each.fingerprint}
-                for label, each in zip(known, checkpoints, strict=True)
+                for label, each in bases.items()
             ],
             "cells": [found[name] for name in cells if name in found],
             "missing": missing, "interrupted": bool(missing), "notes": console.notes, "views": len(scene.test),

@@ -65,14 +65,7 @@ def line_of(output: dict[str, Any], total: int) -> str:
 
 
 class Export:
-    """A model as read, and how it is written.
-
-    Attributes:
-        cameras: to bake for, empty where nothing is baked; ``about``: these cameras, in printable ASCII.
-        views: cameras of the scene, for a page.
-        gaussians: the model's, sorted with ``--order``.
-        dials: the dial values that are baked, or the one at which a page opens; empty without any.
-    """
+    """A model as read, and how it is written."""
 
     camera: Camera | None = None  # of --camera, for which the result is exact
 
@@ -82,10 +75,10 @@ class Export:
         device = inputs.pick_device(args.device, self.console) if times else inputs.CPU
         read = inputs.read_checkpoint(args.model, self.console, args.activated, device=device)
         self.model = inputs.with_filter(read, args, self.console)
-        self.cameras, self.about = self._find_cameras()
-        reads = self.page and args.images is not None
+        self.cameras, self.about = self._find_cameras()  # to bake for, none where nothing is; and in printable ASCII
+        reads = self.page and args.images is not None  # cameras of the scene, for a page
         self.views = inputs.read_cameras(self.model, args.images, self.console) if reads else []
-        self.gaussians = self.model.gaussians
+        self.gaussians = self.model.gaussians  # sorted with --order
         if args.order:
             self.gaussians = self.gaussians.select(order_by_extinction(self.gaussians, self.cameras))
         baked, attenuation = self.camera is None and not self.page, self.gaussians.attenuation
@@ -94,7 +87,7 @@ class Export:
             dials = [initial_dial(dials[0], attenuation, self.console)]
         elif dials:
             dials = choose_dials(dials, self.model, self.console)
-        self.dials: list[float] = dials or []
+        self.dials: list[float] = dials or []  # which are baked, or the one at which a page opens
 
     def _find_cameras(self) -> tuple[Sequence[Camera | Viewpoint], str]:
         """The cameras of --camera, --images or the model's file, else placed ones; and what they are."""

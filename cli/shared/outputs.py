@@ -96,23 +96,14 @@ BEGINNING = 1 << 16  # bytes
 
 @dataclass(frozen=True)
 class Outputs:
-    """What a command writes, and what it reads.
+    """What a command writes, and what it reads."""
 
-    Attributes:
-        named: files named on the command line; existing ones are replaced.
-        derived: files whose names follow from these; existing ones are replaced if clod-adapt wrote them.
-        folders: made if missing. The first one is locked in place of the files, and contains all others.
-        whole: whether ``named`` is a new folder, not a file.
-        inputs: files named to be read.
-        scene: a scene folder, all of whose files are inputs (``scene_files``).
-    """
-
-    named: Sequence[Path] = ()
-    derived: Sequence[Path] = ()
-    folders: Sequence[Path] = ()
-    whole: bool = False
-    inputs: Sequence[str] = ()
-    scene: str | None = None
+    named: Sequence[Path] = ()  # files named on the command line; existing ones are replaced
+    derived: Sequence[Path] = ()  # files named after these; existing ones are replaced if clod-adapt wrote them
+    folders: Sequence[Path] = ()  # made if missing; the first is locked in place of the files, and contains the others
+    whole: bool = False  # whether ``named`` is a new folder, not a file
+    inputs: Sequence[str] = ()  # files named to be read
+    scene: str | None = None  # a scene folder, all of whose files are inputs (``scene_files``)
 
     @property
     def files(self) -> tuple[Path, ...]:
