@@ -13,14 +13,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-GSPLAT = (
-    "the checkpoint is in the normalized frame of gsplat's trainer: train with --no-normalize-world-space, or apply "
-    "the inverse of the parser's transform"
-)
-NERFSTUDIO = (
-    "the checkpoint is in the normalized frame of nerfstudio: copy dataparser_transforms.json, which ns-train writes "
-    "to the folder of config.yml, into the scene's folder"
-)
+GSPLAT = "the checkpoint is in gsplat's normalized frame: train with --no-normalize-world-space, or undo the transform"
+NERFSTUDIO = "the checkpoint is in nerfstudio's normalized frame: copy dataparser_transforms.json to the scene"
 # Rotations of COLMAP's world in nerfstudio's readers before normalization: none, the current one, the older one.
 NERFSTUDIO_TURNS = (
     ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),

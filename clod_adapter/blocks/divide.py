@@ -119,10 +119,7 @@ def divide(
 def check_divisible(config: AdaptConfig) -> None:
     """Raises ClodError for settings that need the whole scene at once."""
     if config.form == "paper":
-        raise ClodError(
-            "the paper's form cannot be trained in blocks: its count and its distances are of all Gaussians at once; "
-            "leave out --form paper, or --memory"
-        )
+        raise ClodError("the paper's form cannot be trained in blocks; leave out --form paper, or --memory")
 
 
 def context_rows(

@@ -54,10 +54,8 @@ def plan_for_limit(needs: MemoryEstimate, limit: int) -> MemoryPlan:
     for blocks in range(1, min(MOST_BLOCKS, max(needs.count, 1)) + 1):
         if (plan := _plan(needs, limit, blocks)).peak <= limit:
             return plan
-    raise ClodError(
-        f"--memory is {in_words(limit)}, and {needs.count:,} Gaussians take at least {in_words(least(needs))}, "
-        "however small the blocks; give that"
-    )
+    fewest = f"{needs.count:,} Gaussians take at least {in_words(least(needs))} in the smallest blocks"
+    raise ClodError(f"--memory is {in_words(limit)}, and {fewest}; give that")
 
 
 def least(needs: MemoryEstimate) -> int:

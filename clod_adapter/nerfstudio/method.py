@@ -191,10 +191,8 @@ class ClodTrainer(Trainer):  # type: ignore[misc]
     def _checkpoint(self) -> Path:
         folder, step = self.config.load_dir, self.config.load_step
         if folder is None and self.config.load_checkpoint is None:
-            raise ClodError(
-                "clod-splatfacto adapts a trained splatfacto: give its folder with --load-dir "
-                "outputs/SCENE/splatfacto/DATE/nerfstudio_models, or one file with --load-checkpoint"
-            )
+            where = "--load-dir outputs/SCENE/splatfacto/DATE/nerfstudio_models, or a file with --load-checkpoint"
+            raise ClodError(f"clod-splatfacto adapts a trained splatfacto: give its folder with {where}")
         if folder is None:
             return Path(self.config.load_checkpoint)
         found = sorted(Path(folder).glob("step-*.ckpt" if step is None else f"step-{step:09d}.ckpt"))

@@ -111,10 +111,8 @@ def require_distributed() -> None:
     if not dist.is_available():
         raise ClodError("this torch has no torch.distributed, so only one process can train: leave out torchrun")
     if torch.__version__ < OLDEST:
-        raise ClodError(
-            f"several processes need torch {OLDEST} or newer, and this is {torch.__version__}: "
-            "leave out torchrun, or pip install --upgrade torch"
-        )
+        fix = "leave out torchrun, or pip install --upgrade torch"
+        raise ClodError(f"several processes need torch {OLDEST} or newer, and this is {torch.__version__}: {fix}")
 
 
 @contextmanager
@@ -124,9 +122,8 @@ def joined(store: Store, rank: int, size: int) -> Iterator[ProcessGroup]:
         require_distributed()
     nccl = torch.cuda.is_available() and dist.is_nccl_available()
     with _losses(), _silent_stdout():
-        dist.init_process_group(
-            "cpu:gloo,cuda:nccl" if nccl else "gloo", store=store, rank=rank, world_size=size, timeout=PATIENCE
-        )
+        backend = "cpu:gloo,cuda:nccl" if nccl else "gloo"
+        dist.init_process_group(backend, store=store, rank=rank, world_size=size, timeout=PATIENCE)
     try:
         yield ProcessGroup()
     finally:

@@ -47,9 +47,8 @@ class RowAdam:
         one = torch.ones(1, dtype=torch.float32)
         self._units = {name: (units or {}).get(name, one.to(p.device)) for name, p in parameters.items()}
         self.beta1, self.beta2, self.epsilon = beta1, beta2, epsilon
-        self.moments = {
-            kind: {name: torch.zeros_like(p) for name, p in parameters.items()} for kind in ("first", "second")
-        }
+        kinds = ("first", "second")
+        self.moments = {kind: {name: torch.zeros_like(p) for name, p in parameters.items()} for kind in kinds}
         some = next(iter(parameters.values()))
         self.steps = torch.zeros(len(some), dtype=torch.int32, device=some.device)
         # After so many steps of its own a row's bias corrections are 1 in float32.

@@ -127,10 +127,8 @@ def add_pseudo_views(
     teacher = gaussians.without_empty_bands()  # one for all: it may be a copy
     near = _views(teacher, [view.camera for view in photographs], wider=WIDER)
     own = (*each * near, *_views(teacher, placed))
-    note = (
-        f"{few}: {len(own)} pseudo views, the checkpoint's own renderings, are added, and all "
-        "learning rates but the dial's are halved"
-    )
+    more = f"{len(own)} pseudo views, the checkpoint's own renderings, are added"
+    note = f"{few}: {more}, and all learning rates but the dial's are halved"
     return replace(scene, train=(*photographs, *own), notes=(*scene.notes, note)), config.lighter(LIGHTER)
 
 
