@@ -52,12 +52,6 @@ def log2(builder, x):
     return call_llvm(builder, "llvm.fmuladd.v16f32", VECTOR, [p, s, builder.sitofp(exponent, VECTOR)])
 
 
-@operation(types.uint64, mask16)
-def bits_of(builder, mask):
-    """The mask as the low sixteen bits of a uint64."""
-    return builder.zext(builder.bitcast(mask, ir.IntType(LANES)), ir.IntType(64))
-
-
 @operation(types.none, types.CPointer(types.uint64), types.int64, f32x16, f32x16)
 def set_spans(builder, words, index, low, high):
     """In the r-th of sixteen groups of sixteen bits from ``words[index]`` on, sets bits low[r] to high[r].
@@ -71,13 +65,11 @@ def set_spans(builder, words, index, low, high):
     builder.store(narrow, builder.bitcast(builder.gep(words, [index]), narrow.type.as_pointer()), align=8)
 
 
-@operation(types.int64, types.uint64)
-def lowest(builder, bits):
-    """Index of the lowest bit that is set in a uint64 other than 0."""
-    return call_llvm(builder, "llvm.cttz.i64", bits.type, [bits, ir.Constant(ir.IntType(1), 1)])
-
-
-@operation(types.int64, types.uint64)
-def ones(builder, bits):
-    """How many bits of a uint64 are set."""
-    return call_llvm(builder, "llvm.ctpop.i64", bits.type, [bits])
+# The mask as the low sixteen bits of a uint64.
+bits_of = operation(types.uint64, mask16)(
+    lambda builder, mask: builder.zext(builder.bitcast(mask, ir.IntType(LANES)), ir.IntType(64))
+)
+# Of a uint64: how many bits are set, and the index of the lowest that is, if any.
+_count = operation(types.int64, types.uint64)
+ones = _count(lambda builder, bits: builder.ctpop(bits))
+lowest = _count(lambda builder, bits: builder.cttz(bits, ir.Constant(ir.IntType(1), 1)))

@@ -87,25 +87,6 @@ def tiles_across(records, r, ty, y0, y1, found):
 
 
 @kernel
-def count_tiles(worker, workers, records, order, across, histogram, totals):
-    """Counts this worker's Gaussians per tile (its row of the histogram) and pairs of Gaussian and tile (its total)."""
-    histogram[worker, :] = 0
-    first, last = len(order) * worker // workers, len(order) * (worker + 1) // workers
-    tally, records, order = pointer(histogram[worker]), pointer(records), pointer(order)
-    found, total = scratch(float32, 32), 0
-    for j in range(first, last):
-        prefetch(records, order[min(j + c.AHEAD, last - 1)] * c.RECORD)
-        r = order[j] * c.RECORD
-        y0, y1 = np.int32(records[r + c.Y0]), np.int32(records[r + c.Y1])
-        for ty in range(y0 // c.TILE, y1 // c.TILE + 1):
-            low, high = tiles_across(records, r, ty, y0, y1, found)
-            for tx in range(low, high + 1):
-                tally[ty * across + tx] += 1
-            total += high + 1 - low
-    totals[worker] = total
-
-
-@kernel
 def tile_offsets(histogram, offsets, totals):
     """Turns the counts into offsets; returns the number of entries."""
     total = 0
@@ -121,27 +102,31 @@ def tile_offsets(histogram, offsets, totals):
 
 
 @kernel
-def fill_tiles(worker, workers, records, order, across, histogram, totals, slots, entries, entry_slots):
-    """Writes each tile's Gaussians in depth order, with the slot that receives the pair's gradient.
+def list_tiles(worker, workers, records, order, across, histogram, totals, slots, entries, entry_slots):
+    """Counts this worker's Gaussians per tile (its row of the histogram) and pairs of Gaussian and tile (its total).
 
-    ``slots[2 p]`` to ``slots[2 p + 1]`` are the slots of the record p.
+    With ``slots``, from the offsets that ``tile_offsets`` makes of these: writes each tile's Gaussians in depth order,
+    and the slot that receives the pair's gradient. ``slots[2 p]`` to ``slots[2 p + 1]`` are those of the record p.
     """
     first, last = len(order) * worker // workers, len(order) * (worker + 1) // workers
-    cursor, records, order, slots = pointer(histogram[worker]), pointer(records), pointer(order), pointer(slots)
-    entries, entry_slots = pointer(entries), pointer(entry_slots)
+    listed, cursor, records, order = len(slots) > 0, pointer(histogram[worker]), pointer(records), pointer(order)
+    slots, entries, entry_slots = pointer(slots), pointer(entries), pointer(entry_slots)
     found, slot = scratch(float32, 32), totals[worker]
     for j in range(first, last):
         prefetch(records, order[min(j + c.AHEAD, last - 1)] * c.RECORD)
         p = order[j]
         r = p * c.RECORD
         y0, y1 = np.int32(records[r + c.Y0]), np.int32(records[r + c.Y1])
-        slots[2 * p] = slot
+        if listed:
+            slots[2 * p] = slot
         for ty in range(y0 // c.TILE, y1 // c.TILE + 1):
             low, high = tiles_across(records, r, ty, y0, y1, found)
             for tx in range(low, high + 1):
                 at = cursor[ty * across + tx]
                 cursor[ty * across + tx] = at + 1
-                entries[at] = p
-                entry_slots[at] = slot
+                if listed:
+                    entries[at], entry_slots[at] = p, slot
                 slot += 1
-        slots[2 * p + 1] = slot
+        if listed:
+            slots[2 * p + 1] = slot
+    totals[worker] = slot

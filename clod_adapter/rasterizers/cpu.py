@@ -75,13 +75,13 @@ class Frame:
         order = tiles.depth_order(depths.view(np.uint32), self.counts, keys, order, *others)
         across, down = -(-camera.width // conventions.TILE), -(-camera.height // conventions.TILE)
         offsets, listing = np.empty(across * down + 1, np.int64), workers_for(len(order))
-        histogram, totals = np.empty((listing, across * down), np.int64), np.empty(listing, np.int64)
+        histogram, totals = np.zeros((listing, across * down), np.int64), np.zeros(listing, np.int64)
         given = self.records, order, across, histogram, totals
-        threads.run(tiles.count_tiles, listing, *given)
+        threads.run(tiles.list_tiles, listing, *given, *[np.empty(0, np.int32)] * 3)
         total = tiles.tile_offsets(histogram, offsets, totals)
         self.slots, entries = recycled_array((2 * n,), np.int32), recycled_array((total,), np.int32)
         self.entry_slots = recycled_array((total,), np.int32)
-        threads.run(tiles.fill_tiles, listing, *given, self.slots, entries, self.entry_slots)
+        threads.run(tiles.list_tiles, listing, *given, self.slots, entries, self.entry_slots)
         # Longest lists first: no thread starts a long tile when the others are done.
         order, masks = np.argsort(-np.diff(offsets), kind="stable"), recycled_array((total * blend.WORDS,), np.uint64)
         self.workers, self.size, lists = threads.worker_count(), (camera.height, camera.width), (entries, offsets)
