@@ -1,9 +1,8 @@
 """The dial's equation (``equation/attenuation.py``) as the first part of the projection.
 
-``kept`` reads the 20 bytes of a Gaussian that decide whether it is culled, sixteen consecutive ones at a time; what is
-culled costs nothing after that. What is kept gets its drawn opacity and its scales where these are projected. All in
-float32: of a few hundred thousand Gaussians, one at the culling threshold may be judged otherwise than by the equation,
-with an opacity of 0 there (soft cut). A row whose sigma is infinite has no dial and no cut.
+``kept`` reads the 20 bytes of a Gaussian that decide whether it is culled; what is culled costs nothing after that.
+All in float32: of a few hundred thousand Gaussians, one at the culling threshold may be judged otherwise than by the
+equation, with an opacity of 0 there (soft cut). A row whose sigma is infinite has no dial and no cut.
 """
 
 from numba import float32, uint64

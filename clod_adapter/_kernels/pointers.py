@@ -197,20 +197,13 @@ def load_triples(source, row, count, lanes):
     _split_triples(lanes)
 
 
-def _pairwise(builder, vectors):
-    """Adds neighbouring lanes of up to 16 vectors until one vector holds all their sums, in order."""
-    even, odd = range(0, 2 * LANES, 2), range(1, 2 * LANES, 2)
-    while len(vectors) > 1:
-        vectors = [*vectors, vectors[-1]] if len(vectors) % 2 else vectors
-        vectors = [
-            builder.fadd(*(builder.shuffle_vector(a, b, ir.Constant(INTEGERS, list(half))) for half in (even, odd)))
-            for a, b in zip(vectors[::2], vectors[1::2], strict=True)
-        ]
-    return vectors[0]
-
-
 @operation(types.none, FLOATS, types.int64, *[f32x16] * 9)
-def store_sums(builder, values, index, *vectors):
+def store_sums(builder, values, index, *given):
     """``values[index : index + 9]`` = the sums over the lanes of the nine vectors."""
-    nine = _first(builder, ir.Constant(I64, len(vectors)))
-    _masked_store(builder, _vector_at(builder, values, index), nine, _pairwise(builder, list(vectors)))
+    vectors, nine = list(given), _first(builder, ir.Constant(I64, len(given)))
+    halves = [ir.Constant(INTEGERS, list(range(k, 2 * LANES, 2))) for k in range(2)]
+    while len(vectors) > 1:  # adds neighbouring lanes until one vector holds all the sums, in order
+        vectors = [*vectors, vectors[-1]] if len(vectors) % 2 else vectors
+        pairs = zip(vectors[::2], vectors[1::2], strict=True)
+        vectors = [builder.fadd(*(builder.shuffle_vector(a, b, half) for half in halves)) for a, b in pairs]
+    _masked_store(builder, _vector_at(builder, values, index), nine, vectors[0])

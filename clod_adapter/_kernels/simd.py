@@ -1,8 +1,7 @@
 """Sixteen-lane float vectors for Numba, as LLVM vectors.
 
-Numba's loop vectoriser does not vectorise the splatting loops (aliasing, masks). LLVM lowers ``<16 x float>`` to one
-AVX-512, two AVX or four SSE/NEON registers. Loads and stores take a contiguous float32 array or a pointer, and the
-index of the first lane; bounds are not checked.
+LLVM lowers ``<16 x float>`` to one AVX-512, two AVX or four SSE/NEON registers. Loads and stores take a contiguous
+float32 array or a pointer, and the index of the first lane; bounds are not checked.
 """
 
 import operator
@@ -35,18 +34,14 @@ def _vector_type(name: str, llvm: ir.Type) -> types.Type:
 f32x16, mask16 = _vector_type("F32x16", VECTOR), _vector_type("Mask16", MASK)
 
 
-def data_of(context, builder, kind, value):
-    """The address of an array's elements; a pointer is returned unchanged."""
-    return value if isinstance(kind, types.CPointer) else context.make_array(kind)(context, builder, value).data
-
-
 def call_llvm(builder, name, result, arguments):
     kind = ir.FunctionType(result, [a.type for a in arguments])
     return builder.call(cgutils.get_or_insert_function(builder.module, kind, name), arguments)
 
 
 def _pointer(context, builder, kind, value, index):
-    return builder.bitcast(builder.gep(data_of(context, builder, kind, value), [index]), VECTOR.as_pointer())
+    data = value if isinstance(kind, types.CPointer) else context.make_array(kind)(context, builder, value).data
+    return builder.bitcast(builder.gep(data, [index]), VECTOR.as_pointer())
 
 
 @intrinsic

@@ -109,9 +109,8 @@ def rasterization(
 
     Raises:
         ClodError: the dial is negative, growth_d comes without attenuation, a tensor holds integers, sigma_d or
-            growth_d differs from opacities in shape, ``distributed`` is set,
-            with which the cameras of all processes share one opacity, or several cameras come with a tensor that none
-            of the known versions has.
+            growth_d differs from opacities in shape, ``distributed`` is set, with which the cameras of all processes
+            share one opacity, or several cameras come with a tensor that none of the known versions has.
         TypeError: an argument is missing, or the installed gsplat does not have it.
     """
     raise NotImplementedError

@@ -1,8 +1,7 @@
 """gsplat's functions with opacities and scales of one dial value: one call for each camera, joined in gsplat's form.
 
-Which arguments and results there are is read from the installed gsplat; the tests have the signatures of several
-versions. Rows of opacity 0 have to be culled before tiles and sorting. Where gsplat's projection does that by itself,
-nothing is moved; elsewhere culled centres move to a point behind the camera, where every version culls them by depth.
+Which arguments and results there are is read from the installed gsplat. Rows of opacity 0 have to be culled before
+tiles and sorting: where gsplat's projection does not do that, their centres move behind the camera.
 """
 
 import math

@@ -1,9 +1,8 @@
 """Splatting on an NVIDIA GPU by the kernels of gsplat 1.4.0 to 1.6.0, restricted to the rows that are drawn.
 
-gsplat's projection tests the opacity last, after all other work on a row, and packed mode does that work twice. So rows
-below 1/255, such as culled ones, are removed first; the geometry of the others is gathered once and projected in packed
-mode, and spherical harmonics (up to 300 bytes a row) only of rows that the projection finds in the image. Gradients of
-removed rows are 0. gsplat sums over pixels in no fixed order, so results repeat except for rounding.
+gsplat's projection tests the opacity last, and packed mode does all other work on a row twice. So rows below 1/255,
+such as culled ones, are removed first, and harmonics are gathered only of rows that the projection finds in the image.
+Gradients of removed rows are 0. gsplat sums over pixels in no fixed order, so results repeat except for rounding.
 """
 
 import contextlib

@@ -1,8 +1,7 @@
 """The viewer's page, for the server or as one file that includes the splats, and the data that it shows.
 
 The page loads nothing from other hosts: its Content-Security-Policy allows one script and one style, by their hashes,
-and connections to its own server only. Splats are PLY in one layout, whatever the file (ascii, big-endian, doubles,
-masks, .pt), or SPZ.
+and connections to its own server only. Splats are PLY in one layout, whatever the file, or SPZ.
 """
 
 import base64
