@@ -141,8 +141,7 @@ class Gaussians:
 
     def tensors(self) -> dict[str, Tensor]:
         """The tensor fields by name; without those that are None."""
-        values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
-        return {name: value for name, value in values.items() if isinstance(value, Tensor)}
+        return {f.name: each for f in dataclasses.fields(self) if isinstance(each := getattr(self, f.name), Tensor)}
 
     def replace(self, **changes: Tensor | AttenuationConfig | ScreenFilter | None) -> Gaussians:
         """A copy with the named fields replaced."""

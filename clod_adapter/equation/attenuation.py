@@ -85,10 +85,9 @@ def attenuate(
 ) -> Attenuated:  # fmt: skip
     """What is drawn of Gaussians at one dial value. Rendering, training, baking and renderers' hooks all call this.
 
-    ``a'' = a exp(-u)``, then the cut, differentiable, once, in ``opacities`` and ``sigma_d``; distances
-    are constants. Where the factor is exactly 1, a'' equals a bit for bit: with the hard cut a dial without effect
-    changes only Gaussians fainter than tau. Kept sets are nested: a Gaussian kept at s is kept at every smaller dial.
-    Without a ``sigma_d`` there is no dial: all Gaussians are kept and drawn with a.
+    ``a'' = a exp(-u)``, then the cut, differentiable, once, in ``opacities`` and ``sigma_d``, not in distances. Where
+    the factor is 1, a'' is a bit for bit: with the hard cut a dial without effect changes only what is fainter than
+    tau. A Gaussian kept at s is kept at every smaller dial. Without a ``sigma_d`` all are kept and drawn with a.
 
     Args:
         opacities: ``[N]`` logits. At a logit of +inf, a is 1 and its gradient 0.
@@ -96,8 +95,7 @@ def attenuate(
             the camera. Pass distances to use them for several dial values.
         virtual_scale: the dial s, >= 0.
         activated: ``opacities`` are a itself, in [0, 1], as rasterizers take them. The gradient is finite: at a = 1
-            it is that of the factor and the cut, as anywhere; at a = 0 that of a'' is the factor, and those of
-            ``log_opacities`` (-inf) and ``drawn`` are 0.
+            it is that of the factor and the cut, as anywhere; at a = 0 the factor for a'', and 0 for the others.
         growth_d: ``[N]`` exponents h of the growth of the scales, finite; None for no growth.
 
     Raises:

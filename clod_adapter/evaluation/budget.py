@@ -90,10 +90,7 @@ def dial_for(
 
 
 def dial_for_times(times: Sequence[tuple[float, float]], fps: float) -> DialValue:
-    """The smallest dial value from which frames take at most ``1000 / fps`` ms, linear in log s between the times.
-
-    ``times`` has dial values, ascending from 1, each with its milliseconds per frame.
-    """
+    """The smallest dial value from which frames take at most ``1000 / fps`` ms, by (dial value, ms) that ascend."""
     dials, taken = [s for s, _ in times], [ms for _, ms in times]
     found = crossing(dials, taken, 1e3 / fps)
     if found is None:
@@ -111,8 +108,6 @@ def frame_times(
 ) -> tuple[list[tuple[float, float]], list[str]]:
     """Measures milliseconds per frame at six dial values up to max_sv, in even steps of log s; and notes on that."""
     assert gaussians.attenuation is not None
-    if not cameras:
-        raise ClodError("frames a second need a calibration or cameras to time frames from")
     max_sv = gaussians.attenuation.max_sv
     virtual_scales = sorted({max_sv ** (k / (TIMED_DIALS - 1)) for k in range(TIMED_DIALS)})
     found = time_frames([(gaussians, virtual_scales)], cameras, progress)

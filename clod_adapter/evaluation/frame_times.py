@@ -51,7 +51,7 @@ class FrameTimes:
 def time_frames(models: Sequence[Model], cameras: Sequence[Camera], progress: Listener | None = None) -> FrameTimes:
     """Times frames from at most three of the cameras, evenly spread; the first dial value of all is the slowest."""
     if not cameras:
-        raise ClodError("there are no cameras to time frames from")
+        raise ClodError("frames a second need a calibration or cameras to time frames from")
     lean = [(model.without_empty_bands(), dials) for model, dials in models]
     jobs = [(model, 1.0 if model.sigma_d is None else s) for model, dials in lean for s in dials]
     slowest = _warm_up(*jobs[0], cameras[0])
