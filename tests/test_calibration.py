@@ -29,7 +29,7 @@ def tables(draw: st.DrawFn) -> Calibration:
     return Calibration.of(some, **about, viewpoints=places)
 
 
-@settings(deadline=None, max_examples=12, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(deadline=None, max_examples=6, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(tables())
 def test_round_trips(tmp_path: Path, calibration: Calibration) -> None:
     base = gaussians(4, 0, 0)
