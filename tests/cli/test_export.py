@@ -108,10 +108,7 @@ def test_levels(clod: Any, dialled: Path, tmp_path: Path) -> None:
     (output,) = exported(clod, dialled, "--levels", "1,2,4", "--3dtiles", "-o", "tiles")[0]["outputs"]
     assert [level["count"] for level in output["levels"]] == [len(baked(dialled, s)) for s in (1.0, 2.0, 4.0)]
     root = json.loads((tmp_path / "tiles" / "tileset.json").read_text())["root"]
-    middle = root["children"][0]
-    finest = middle["children"][0]
-    assert [tile["content"]["uri"] for tile in (root, middle, finest)] == ["root.glb", "0_1.glb", "0_0.glb"]
-    assert root["geometricError"] > middle["geometricError"] > finest["geometricError"] == 0
+    assert root["geometricError"] > root["children"][0]["geometricError"] > 0
     assert files(tmp_path / "tiles") == ["0_0.glb", "0_1.glb", "root.glb", "tileset.json"]
 
 

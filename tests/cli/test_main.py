@@ -1,17 +1,23 @@
-"""``cli/main.py``: exit codes, pipes, errors of every kind, and ``--help``."""
+"""``cli/main.py``: exit codes, pipes, errors of every kind, ``--help``, and progress; ``clod-adapt doctor``."""
 
+import io
 import json
 import re
 import subprocess
 import sys
+import webbrowser
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
 
+from clod_adapter import rasterizers
 from clod_adapter._support.version import package_version
 from clod_adapter.cli.main import COMMANDS
+from clod_adapter.cli.shared.console import Console, Meter, duration
+from clod_adapter.rasterizers import reference
 
 CAUSED = SystemError("returned a result with an exception set")  # as numba hands on a Ctrl-C
 CAUSED.__cause__ = KeyboardInterrupt()
@@ -84,3 +90,95 @@ def test_help(clod: Any, command: str, monkeypatch: pytest.MonkeyPatch) -> None:
     if not command:
         assert all(f"clod-adapt {other}" in done.out for other in COMMANDS)
         assert clod("--version").out.split() == ["clod-adapt", package_version()]
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def test_bar_fits_the_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "stderr", terminal := Terminal())
+    monkeypatch.setattr("tqdm.std._screen_shape_wrapper", lambda: lambda file: (30, 24))
+    with Console().meter("training") as meter:
+        meter.bar.delay = meter.bar.mininterval = 0
+        for step in range(1, 5):
+            meter.update(step / 4, f"{step}/4, s=1 25.81 dB 100%, s=5 21.02 dB 9%")
+    lines = terminal.getvalue().split("\r")
+    assert any("50%" in line for line in lines) and max(map(len, lines)) <= 30
+    assert "\n" not in terminal.getvalue() and not lines[-1].strip()  # cleared at the end
+
+
+def test_progress_lines_without_a_terminal(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    now = 0.0
+    monkeypatch.setattr("clod_adapter.cli.shared.console.time", SimpleNamespace(perf_counter=lambda: now))
+    meter = Meter(Console(), "training")
+    for now in range(1, 21):
+        meter.update(now / 90, f"step {now} of a checkpoint of a very long name")
+    assert capsys.readouterr().err.splitlines() == [
+        f"training  {share}%, {left} left, step {step} of a checkpoint of a very..."
+        for share, left, step in ((11, "1:20", 10), (22, "1:10", 20))
+    ]
+    now = 10.0  # the time left does not count the work of an earlier run
+    meter.begin("training", initial=0.5)
+    meter.began = meter.printed = 0.0
+    meter.update(0.6)
+    assert capsys.readouterr().err == "training  60%, 40 s left\n"
+
+
+def test_status_and_quiet(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A status is shown on a terminal, until the block ends."""
+    for quiet, stream in ((False, Terminal()), (True, Terminal()), (False, io.StringIO())):
+        monkeypatch.setattr(sys, "stderr", stream)
+        console = Console(quiet)
+        with pytest.raises(KeyboardInterrupt), console.status("reading a file ..."):
+            assert ("\rreading a file ..." in stream.getvalue()) == (stream.isatty() and not quiet)
+            raise KeyboardInterrupt
+        assert not stream.getvalue().split("\r")[-1].strip() and "\n" not in stream.getvalue()
+        console.say("a line")
+        assert stream.getvalue().endswith("a line\n") != quiet
+
+
+def test_duration() -> None:
+    for seconds, text in ((0.04, "0.0 s"), (9.96, "10 s"), (59.7, "1:00"), (125, "2:05"), (3725, "1:02:05")):
+        assert duration(seconds) == text
+
+
+NAMES = ["torch", "cpu", "gsplat", "browser"]
+
+
+def test_lines_of_this_machine(clod: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    for browser, ok in ((webbrowser.GenericBrowser("lynx"), "off "), (webbrowser.BackgroundBrowser("firefox"), "ok ")):
+        monkeypatch.setattr(webbrowser, "get", lambda browser=browser: browser)
+        done = clod("doctor")
+        *lines, last = done.out.replace("\n    -> ", "  -> ").splitlines()
+        assert done.code == 0 and [line.split()[0] for line in lines] == NAMES and lines[3][9:].startswith(ok), done
+        assert all((line[9:12] == "ok ") != (" -> " in line) for line in lines)  # what fails has its fix
+    assert lines[1].startswith("cpu      ok   renders the reference image (RMS ")
+    assert last.startswith("rendering and training backends: cpu")
+
+
+def test_json_without_torch() -> None:
+    """Run as a module, as by torchrun."""
+    code = "import sys, runpy; sys.modules['torch'] = None; sys.argv = ['clod-adapt', 'doctor', '--json']\n"
+    code += "runpy.run_module('clod_adapter', run_name='__main__')"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    report = json.loads(done.stdout)
+    assert set(report) == {"command", "version", "draws", "exit_code", "findings"} and report["draws"] == []
+    assert done.returncode == report["exit_code"] == 1 and "Traceback" not in done.stderr, done.stderr
+    found = {each["name"]: each for each in report["findings"]}
+    assert [*found] == NAMES and found["torch"]["fix"].startswith("pip install") and not found["cpu"]["ok"]
+    assert done.stderr.splitlines()[-1] == "no rendering backend works: fix torch first, then the CPU backend"
+
+
+@pytest.mark.parametrize("change", ["roll", "nan"])
+def test_a_wrong_image_is_reported(clod: Any, monkeypatch: pytest.MonkeyPatch, change: str) -> None:
+    def rasterize(**given: Any) -> tuple[torch.Tensor, torch.Tensor]:
+        image, alpha = reference.rasterize(**given)
+        return {"roll": image.roll(1, 1), "nan": image * torch.nan}[change], alpha
+
+    monkeypatch.setitem(rasterizers.BACKENDS, "cpu", lambda: rasterizers.Rasterizer(rasterize))
+    done = clod("doctor", "--json", "--quiet")
+    found = {found["name"]: found for found in json.loads(done.out)["findings"]}
+    assert done.code == 1 and not found["cpu"]["ok"] and found["torch"]["ok"]
+    assert found["cpu"]["found"].startswith("renders another image than the reference")

@@ -6,9 +6,7 @@ import pytest
 import torch
 
 from clod_adapter import AttenuationConfig, Camera, ClodError, Gaussians, View, evaluate, render, with_dial
-from clod_adapter.calibration import Viewpoint
-from clod_adapter.equation.distances import viewpoint_of
-from clod_adapter.evaluation.level_errors import geometric_errors, looking
+from clod_adapter.evaluation.level_errors import geometric_errors
 from clod_adapter.io.formats.tileset import ALLOWED
 from clod_adapter.losses import psnr_ssim
 from scenes import camera, gaussians, in_front, photograph, ring
@@ -91,10 +89,3 @@ def test_errors_ascend_and_grow_with_what_is_missing() -> None:
     half, few = finest[order[:20]], finest[order[:5]]
     errors = geometric_errors([finest, half, few, half], [view(), view()])
     assert 0 == errors[0] < errors[1] < errors[2] == errors[3]
-
-
-def test_viewpoints_look_where_their_cameras_did() -> None:
-    place = viewpoint_of(view(), smooth().means, AttenuationConfig())
-    same, placed = looking([view(), place, Viewpoint(1.0, 2.0, -3.0, 1.0)])  # the last one has no direction
-    assert torch.allclose(placed.viewmat, same.viewmat, atol=1e-6)
-    assert placed.K[1, 1] / placed.height == pytest.approx(same.K[1, 1] / same.height)

@@ -1,12 +1,19 @@
-"""The result of adapting does not depend on unit, place and direction of a scene, nor on what is far from it."""
+"""The result of adapting depends neither on unit, place and direction of a scene, nor on what is far from it, nor on
+what the caller has set of torch.
+"""
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
+from torch import Tensor
 
+import clod_adapter as clod
 from clod_adapter import AdaptConfig, AttenuationConfig, Gaussians, Scene, View, evaluate, make_plan
 from clod_adapter.cameras import in_its_unit
 from clod_adapter.equation.distances import typical_distance
@@ -73,3 +80,36 @@ def test_a_far_camera_changes_no_length(pair: Pair) -> None:
     assert reaches(base, cameras)[: len(usual)] == pytest.approx(reaches(base, usual), rel=0.1)
     found, wanted = (typical_distance(base.means, each, AttenuationConfig()).median() for each in (cameras, usual))
     assert float(found) == pytest.approx(float(wanted), rel=0.05)
+
+
+def session_of(capture: Any) -> tuple[list[Tensor], str]:
+    """Of a session from files to a baked dial value."""
+    base, scene = clod.load(capture.ply).gaussians, clod.load_scene(capture.scene)
+    adapted = clod.adapt(base, scene, clod.AdaptConfig(iters=4, max_sv=3), progress=False).gaussians
+    cameras = [view.camera for view in scene.train]
+    image = clod.render(adapted, cameras[0], virtual_scale=2).image
+    attached = clod.attach(base, cameras)
+    (row,) = clod.evaluate(adapted, scene.test, [2.0])
+    plan = clod.make_plan(base, scene)
+    baked = clod.bake(adapted, 2, cameras=cameras)
+    dialled = [attached.sigma_d, clod.place_cameras(base, views=2)[0].viewmat, *baked.tensors().values()]
+    return [*adapted.tensors().values(), image, *dialled], repr((plan.decisions, row.psnr, row.kept))
+
+
+@contextmanager
+def doubles() -> Iterator[None]:
+    torch.set_default_dtype(torch.float64)
+    try:
+        yield
+    finally:
+        torch.set_default_dtype(torch.float32)
+
+
+def test_results_do_not_depend_on_torchs_modes(capture: Any) -> None:
+    tensors, texts = session_of(capture)
+    for mode in (torch.inference_mode(), doubles()):
+        with mode:
+            found, said = session_of(capture)
+        assert said == texts, mode
+        for one, other in zip(found, tensors, strict=True):
+            assert one.dtype == other.dtype and torch.equal(one, other), mode
