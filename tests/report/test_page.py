@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 from clod_adapter.errors import ClodError
-from clod_adapter.report.charts import Series, draw_rendering, draw_training, new_figure, series_of
+from clod_adapter.report.charts import Series, draw_rendering, new_figure, series_of
 from clod_adapter.report.page import Picture, write_page
 
 pytest.importorskip("matplotlib")
@@ -99,11 +99,6 @@ def test_charts() -> None:
         for tick, label in zip(left.get_yticks(), left.get_yticklabels(), strict=True):
             assert float(label.get_text()) == pytest.approx(1e3 * 10 ** (-tick / 10), rel=0.01)
         assert len(left.get_yticks()) >= 3
-    with new_figure((6, 4)) as figure:
-        points = [{"seconds": 2.0**k, "psnr": 20.0 + k} for k in range(6)]
-        draw_training(figure.subplots(), [{"label": "s = 1", "points": points}], 29.0)
-        curve, base = figure.axes[0].get_lines()
-        assert curve.get_xdata().tolist() == [1, 2, 4, 8, 16, 32] and base.get_ydata() == [29.0, 29.0]
 
 
 def test_series_of_reports() -> None:

@@ -37,18 +37,15 @@ def test_images_are_renders_of_the_checkpoint(blob: clod.Gaussians) -> None:
 
 
 def test_each_step_renders_the_checkpoint_from_another_camera(blob: clod.Gaussians) -> None:
-    """Reproducible from a state; a photograph stays where it is."""
+    """A photograph stays where it is."""
     cameras = scenes.ring(3, 40, 30)
     (photograph,) = scenes.photograph(blob, cameras[:1])
     sampler = ViewSampler((*render_pseudo_views(blob, cameras).train, photograph), clod.AdaptConfig())
-    state, drawn = sampler.state(), [sampler.draw(k, 0.0).view for k in range(9)]
+    drawn = [sampler.draw(k, 0.0).view for k in range(9)]
     assert sum(view is photograph for view in drawn) == 3
     for view in drawn:
         assert torch.equal(view.image, clod.render(blob, view.camera).pixels)
         assert view is photograph or all(not torch.equal(view.camera.viewmat, camera.viewmat) for camera in cameras)
-    sampler.restore(*state)
-    again = [sampler.draw(k, 0.0).view for k in range(9)]
-    assert all(torch.equal(a.camera.viewmat, b.camera.viewmat) for a, b in zip(drawn, again, strict=True))
 
 
 def test_photographs_that_show_too_little_get_pseudo_views(
