@@ -178,18 +178,16 @@ class LossNotFinite(Exception):
 
 def bad_rows(values: Tensor) -> Tensor | None:
     """``[N]`` bool, the rows of ``values [N, ...]`` with a value that is not finite; None if there is none."""
-    if bool(values.sum().isfinite()):  # one pass without extra memory
-        return None
     bad = spoilt_rows({"": values})
     return bad if bool(bad.any()) else None
 
 
 def spoilt_rows(gradients: dict[str, Tensor]) -> Tensor:
     """``[N]`` bool, the rows that are bad in any of the gradients ``[N, ...]``."""
-    tensors = list(gradients.values())
+    tensors = list(gradients.values())  # their sums take one pass without extra memory
     if tensors[0].device.type == "cpu" and all(bool(tensor.sum().isfinite()) for tensor in tensors):
         return torch.zeros(len(tensors[0]), dtype=torch.bool)  # a GPU is not asked: the host would wait for its answer
-    return torch.stack([~tensor.isfinite().reshape(len(tensor), -1).all(1) for tensor in tensors]).any(0)
+    return torch.stack([~each.isfinite().reshape(len(each), each.shape[1:].numel()).all(1) for each in tensors]).any(0)
 
 
 def require_finite(gaussians: Gaussians, what: str, remedy: str) -> None:

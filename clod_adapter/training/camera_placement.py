@@ -160,7 +160,7 @@ class _Placement:
 
 def _usable(gaussians: Gaussians) -> Tensor:
     """``[n]`` int64, the visible and finite Gaussians. An infinite opacity logit is a fully opaque Gaussian."""
-    others = {n: v for n, v in gaussians.tensors().items() if v.shape[1:].numel() and n != "opacity_logits"}
+    others = {n: v for n, v in gaussians.tensors().items() if n != "opacity_logits"}
     rows = (gaussians.opacities > VISIBLE) & ~spoilt_rows(others)
     if not rows.any():
         raise ClodError("no camera can be placed: the checkpoint has no Gaussian that is visible and finite")
