@@ -35,9 +35,8 @@ def kernel(function: Callable[..., Any]) -> Any:
 class _CacheFile(IndexDataCacheFile):  # type: ignore[misc]
     """Compiled variants, each in a file named by a hash of all that its code depends on and written atomically.
 
-    Numba's cache has an index and numbered files, which are reused when the sources change, and writes the index first.
-    Between the two writes other processes load old code; two processes that add a variant choose the same number; a
-    truncated file stays an error.
+    Numba's own writes an index and then a numbered file: in between other processes load old code, two processes may
+    choose the same number, and a truncated file stays an error.
     """
 
     def _name(self, key: Any) -> str:

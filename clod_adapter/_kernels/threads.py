@@ -1,8 +1,4 @@
-"""Runs compiled kernels on several cores from plain Python threads.
-
-Kernels are compiled with ``nogil=True`` and take ``(worker, workers, *arguments)``. Python threads avoid a second
-OpenMP runtime, which would compete with torch's.
-"""
+"""Runs compiled kernels on several cores, from plain Python threads: another OpenMP runtime would slow torch's down."""
 
 import threading
 from collections.abc import Callable, Iterator

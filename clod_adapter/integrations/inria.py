@@ -6,10 +6,9 @@ color, radii, *others = GaussianRasterizer(raster_settings)(
     sigma_d=model.sigma_d, growth_d=model.growth_d, attenuation=model.attenuation, virtual_scale=3,
 )
 
-Forks differ in settings, further arguments and results; this class is derived from the installed one and passes all of
-them on. Culled Gaussians get opacity 0 and a position just behind the camera's centre, where every fork culls them
-first, by depth (0.2 or a changed near plane) or, for panoramas, by distance. They cost as much as a Gaussian out of
-view, which opacity 0 alone would not achieve. All rows keep their places: radii are 0, and gradients keep their shapes.
+Forks differ in settings, further arguments and results, which all are passed on. Culled Gaussians get opacity 0 and a
+position just behind the camera's centre, where every fork culls them first, by depth or, for panoramas, by distance:
+they cost as much as a Gaussian out of view. All rows keep their places, with radii of 0.
 """
 
 import inspect
