@@ -37,7 +37,7 @@ from torch import Tensor
 CHECKS = ("tests", "plush", "city")
 DIALS = (1.0, 3.0, 7.0)
 TESTS = (
-    "tests/rasterizers", "tests/integrations/test_gsplat.py", "tests/test_devices.py",
+    "tests/rasterizers", "tests/integrations/test_gsplat.py", "tests/test_consumers.py",
     "tests/training/test_optimizer.py",
 )  # fmt: skip
 
