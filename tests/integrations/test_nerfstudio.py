@@ -12,7 +12,6 @@ gsplat's kernels are torch (``gsplat_in_torch``); open3d, pymeshlab and the weig
 
 import copy
 import importlib
-import json
 import sys
 import tomllib
 from pathlib import Path
@@ -28,7 +27,9 @@ import scenes
 from clod_adapter import load
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
+from clod_adapter.integrations.splats import to_gsplat
 from clod_adapter.render import render
+from photographs import write_frames
 
 ROOT = Path(__file__).parents[2]
 N, WIDTH, HEIGHT, STEPS = 60, 32, 24, 16
@@ -55,12 +56,10 @@ def write_capture(folder: Path) -> Gaussians:
     for view in (*scene.train, *scene.test):
         Image.fromarray(view.image.numpy()).save(folder / view.camera.name)
         pose = torch.linalg.inv(view.camera.viewmat) * torch.tensor([1.0, -1.0, -1.0, 1.0])
-        K = view.camera.K
-        intrinsics = {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
-        frame = {name: float(value) for name, value in intrinsics.items()}
-        frames.append({"file_path": view.camera.name, "transform_matrix": pose.tolist(), **frame})
-    size = {"w": WIDTH, "h": HEIGHT, "camera_model": "OPENCV"}
-    (folder / "transforms.json").write_text(json.dumps({**size, "frames": frames}))
+        fl_x, _, cx, _, fl_y, cy, *_ = view.camera.K.flatten().tolist()
+        frame = {"file_path": view.camera.name, "transform_matrix": pose.tolist()}
+        frames.append(frame | {"fl_x": fl_x, "fl_y": fl_y, "cx": cx, "cy": cy})
+    write_frames(folder, frames, w=WIDTH, h=HEIGHT, camera_model="OPENCV")
     return base
 
 
@@ -89,11 +88,9 @@ def write_splatfacto(config: Any, base: Gaussians, folder: Path) -> None:
     own = config.pipeline
     model = SplatfactoModelConfig(random_init=True, num_random=10, sh_degree=1)
     pipeline = VanillaPipelineConfig(datamanager=own.datamanager, model=model).setup(device="cpu", test_mode="val")
-    values = {
-        "means": base.means, "scales": base.log_scales, "quats": base.quats, "features_dc": base.sh0[:, 0],
-        "features_rest": base.shN, "opacities": base.opacity_logits[:, None],
-    }  # fmt: skip
-    for name, value in values.items():
+    values = to_gsplat(base)
+    values |= {"features_dc": values.pop("sh0")[:, 0], "features_rest": values.pop("shN")}
+    for name, value in (values | {"opacities": values["opacities"][:, None]}).items():
         pipeline.model.gauss_params[name] = torch.nn.Parameter(value.clone())
     folder.mkdir()
     state = {"step": 29999, "pipeline": pipeline.state_dict(), "optimizers": {}, "schedulers": {}, "scalers": {}}
@@ -139,7 +136,7 @@ def test_a_dial_is_trained_and_found_by_the_other_commands(
         "means", "scales", "quats", "features_dc", "opacities", "log_sigma", "growth_d"
     }  # fmt: skip
     assert not torch.equal(model.means, run.base.means) and torch.equal(model.features_rest, run.base.shN)
-    start = untrained(run, run.folder / "splatfacto")
+    start = resumed(run, run.folder / "splatfacto", "start").pipeline.model.dial
     assert float((model.dial.log_sigma - start.log_sigma).abs().mean()) > 0.05
 
     written = run.config.get_base_dir() / "config.yml"
@@ -164,20 +161,18 @@ def test_a_dial_is_trained_and_found_by_the_other_commands(
     for name, value in exported.tensors().items():
         torch.testing.assert_close(value, own.tensors()[name][~faint].detach(), rtol=1e-6, atol=1e-6)
 
-    again = configured(run.method, run.folder, run.config.get_checkpoint_dir())
-    again.timestamp = "again"
-    trainer = again.setup(local_rank=0, world_size=1)
-    trainer.setup()
+    trainer = resumed(run, run.config.get_checkpoint_dir(), "again")
     assert trainer._start_step == STEPS and torch.equal(trainer.pipeline.model.dial.log_sigma, model.dial.log_sigma)
     assert trainer.optimizers.optimizers["log_sigma"].state_dict()["state"][0]["step"] == STEPS
 
 
-def untrained(run: SimpleNamespace, folder: Path) -> Any:
+def resumed(run: SimpleNamespace, folder: Path, name: str) -> Any:
+    """A trainer that starts from this folder's checkpoint."""
     config = configured(run.method, run.folder, folder)
-    config.timestamp = "start"
+    config.timestamp = name
     trainer = config.setup(local_rank=0, world_size=1)
     trainer.setup()
-    return trainer.pipeline.model.dial
+    return trainer
 
 
 def test_without_a_checkpoint_the_command_says_what_it_needs(nerfstudio: Any, tmp_path: Path) -> None:

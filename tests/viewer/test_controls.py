@@ -40,17 +40,6 @@ def test_keys_move_the_dial(shown: Shown) -> None:
     assert shown.text("#dial-value") == "s = 2.00"
 
 
-def test_keys_do_not_act_while_a_count_is_typed(shown: Shown) -> None:
-    fold(shown, True)
-    before = shown.picture()
-    shown.page.focus("#target")
-    shown.page.keyboard.type("wasdech0")
-    assert shown.page.input_value("#target") == "wasdech0" and np.array_equal(shown.picture(), before)
-    shown.page.focus("#dial")
-    shown.page.keyboard.press("w")
-    assert not np.array_equal(shown.picture(), before)
-
-
 def target(shown: Shown, text: str) -> str:
     """The page's note after a count is entered."""
     shown.page.fill("#target", text)
@@ -61,11 +50,15 @@ def target(shown: Shown, text: str) -> str:
 
 
 def test_the_count_box(shown: Shown, gaussians: Gaussians) -> None:
-    """A count sets the dial value of ``dial_for``; its note ends with the state that it is about."""
+    """A count sets the dial value of ``dial_for``; its note ends with the state that it is about. Keys wait."""
     camera = scenes.camera(320, 240)
     wanted = clod_adapter.dial_for(gaussians, keep=150, cameras=[camera]).virtual_scale
     fold(shown, True)
     shown.camera(camera)
+    before = shown.picture()
+    shown.page.focus("#target")
+    shown.page.keyboard.type("wasdech0")
+    assert shown.page.input_value("#target") == "wasdech0" and np.array_equal(shown.picture(), before)
     for text in ("0", "1.5", "many"):
         assert "Enter a number of Gaussians" in target(shown, text) and shown.text("#dial-value") == "s = 1.00"
     assert "keeps" in target(shown, "1,000,000")

@@ -166,8 +166,10 @@ def test_pictures_and_videos_are_saved(shown: Shown) -> None:
     assert np.array_equal(saved, picture)
     record = "document.getElementById('record').click()"
     shown.page.evaluate(record)
-    shown.page.wait_for_timeout(500)
-    assert shown.page.text_content("#record") == "Stop recording"
+    shown.until("document.getElementById('record').textContent === 'Stop recording'")
+    for s in (3, 4, 5):  # pictures for the encoder
+        shown.run("clod.setDial(given)", s)
+        shown.page.wait_for_timeout(100)
     with shown.page.expect_download() as download:
         shown.page.evaluate(record)
     data = Path(download.value.path()).read_bytes()
