@@ -166,10 +166,8 @@ def test_pictures_and_videos_are_saved(shown: Shown) -> None:
     assert np.array_equal(saved, picture)
     record = "document.getElementById('record').click()"
     shown.page.evaluate(record)
-    shown.until("document.getElementById('record').textContent === 'Stop recording'")
-    for s in (3, 4, 5):  # pictures for the encoder
-        shown.run("clod.setDial(given)", s)
-        shown.page.wait_for_timeout(100)
+    shown.page.wait_for_timeout(1000)  # an encoder on a busy machine has no picture sooner
+    assert shown.page.text_content("#record") == "Stop recording"
     with shown.page.expect_download() as download:
         shown.page.evaluate(record)
     data = Path(download.value.path()).read_bytes()
