@@ -119,10 +119,13 @@ def in_question(arrays: Mapping[str, np.ndarray]) -> dict[str, tuple[float, floa
     # At most half of the values above 1: not true of logits whose faint ones were pruned.
     faint = {"opacity": (opacity[:, None], _FAINTEST)} if 2 * np.count_nonzero(opacity > 1) <= len(opacity) else {}
     for name, (values, least) in {**faint, "scales": (arrays["log_scales"], 0.0)}.items():
-        finite = np.isfinite(values).all(1)
-        low = float(np.min(values, where=finite[:, None], initial=np.inf))
-        high = float(np.max(values, where=finite[:, None], initial=-np.inf))
-        if finite.sum() >= _FEW and low >= least and (low < high or high == 1):
+        low, high, count = np.inf, -np.inf, 0
+        for start in range(0, len(values), ROWS):
+            block = values[start : start + ROWS]
+            block = block[np.isfinite(block).all(1)]
+            low, high = float(block.min(initial=low)), float(block.max(initial=high))
+            count += len(block)
+        if count >= _FEW and low >= least and (low < high or high == 1):
             found[name] = low, high
     return found
 
