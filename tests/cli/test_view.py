@@ -98,7 +98,6 @@ def test_interrupts_and_browsers(clod: Any, capture: Any, monkeypatch: pytest.Mo
     monkeypatch.setattr(webbrowser, "get", Browser)
     done = clod("view", capture.ply, "--quiet")
     assert (done.code, done.err) == (0, "") and done.out == f"{opened[0]}  (Ctrl-C ends)\n"
-    monkeypatch.delenv("BROWSER", raising=False)
     monkeypatch.setenv("BROWSER", "editor")  # a program whose end is not waited for
     monkeypatch.setattr(webbrowser, "get", lambda: webbrowser.GenericBrowser("editor"))
     assert isinstance(view.find_browser(), webbrowser.BackgroundBrowser)

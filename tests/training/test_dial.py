@@ -28,9 +28,9 @@ def trainable(base: Gaussians, form: str = "gsplat") -> torch.nn.ParameterDict:
     return torch.nn.ParameterDict({name: torch.nn.Parameter(value.clone()) for name, value in named.items()})
 
 
-def loss_of(dial: Dial, scene: Scene, s: float, view: int = 0) -> Tensor:
-    image = clod.render(dial.gaussians(), scene.train[view].camera, s).image
-    return photometric_loss(image, scene.train[view].image, dial.config.ssim_weight)
+def loss_of(dial: Dial, scene: Scene, s: float) -> Tensor:
+    image = clod.render(dial.gaussians(), scene.train[0].camera, s).image
+    return photometric_loss(image, scene.train[0].image, dial.config.ssim_weight)
 
 
 def test_the_objective_is_that_of_adapt(captured: Pair) -> None:
