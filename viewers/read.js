@@ -25,7 +25,7 @@ export async function readGaussians(bytes) {
   throw new Error(bytes.length ? "it is neither .ply nor .spz" : "it is empty");
 }
 
-/** The values of the clod_* columns, the same in all rows (io/ply_settings.py); `first(name)`: of the first row. */
+/** The values of the clod_* columns, the same in all rows (io/ply_layout.py); `first(name)`: of the first row. */
 export const constantsOf = (names, first) =>
   Object.fromEntries(names.filter((name) => name.startsWith("clod_")).map((name) => [name, Math.fround(first(name))]));
 
@@ -65,7 +65,7 @@ function readPly(bytes) {
   };
 }
 
-/** The dial's settings from the comments (io/ply_settings.py), else from `constants` (clod_* columns), else defaults. */
+/** The dial's settings from the comments (io/ply_layout.py), else from `constants` (clod_* columns), else defaults. */
 export function readSettings(comments, constants = {}) {
   const settings = { ...DEFAULTS };
   for (const name of Object.keys(DEFAULTS)) settings[name] = constants[`clod_${name}`] ?? settings[name];
