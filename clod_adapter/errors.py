@@ -31,10 +31,10 @@ def refused_if_damaged(
         yield
     except MemoryError:
         raise
-    except OSError as error:
-        raise ClodError(f"{path}: cannot be read ({error.strerror or error}); check the path") from error
     except Exception as error:  # of libraries, and whatever a crafted file provokes
         if isinstance(error, ClodError) and str(error).startswith(str(ClodError(f"{path}: "))):
             raise
+        if isinstance(error, OSError) and error.errno:  # libraries raise it without one for what a file contains
+            raise ClodError(f"{path}: cannot be read ({error.strerror}); check the path and its permissions") from error
         reason = f"no {error}" if isinstance(error, KeyError) else first_line(error)
         raise ClodError(f"{path}: {what} ({reason:.200}); {fix}") from error

@@ -18,6 +18,7 @@ from clod_adapter.io.atomic import atomic_path, atomic_paths
 from clod_adapter.io.file_formats import WRITABLE, write
 from clod_adapter.io.formats import splat_transform
 from clod_adapter.io.formats.tileset import write_tileset
+from clod_adapter.io.settings import Metadata
 from clod_adapter.losses import psnr
 from clod_adapter.render import render
 from clod_adapter.training.camera_placement import place_cameras
@@ -168,12 +169,12 @@ class Export:
         if suffix not in WRITABLE:
             with TemporaryDirectory(dir=path.parent, prefix=".tmp-") as folder:
                 source, packed = Path(folder) / "plain.ply", Path(folder) / f"packed{suffix}"  # suffix: the format
-                write(source, gaussians, about)
+                write(source, gaussians, Metadata(about=about))
                 self._transform([source], packed, len(gaussians))
                 packed.replace(path)
             return len(gaussians)
-        calibration = self.model.calibration if virtual_scale is None else None
-        self.console.note(*write(path, gaussians, about, origin=self.model.origin, calibration=calibration))
+        stored = self.model.calibration if virtual_scale is None else None
+        self.console.note(*write(path, gaussians, Metadata(calibration=stored, origin=self.model.origin, about=about)))
         if suffix == ".ply" and any(self.model.origin):
             self.console.note("x, y and z are doubles, which SIBR and some other readers misread")
         return len(gaussians)
@@ -193,7 +194,7 @@ class Export:
             words: list[str | Path] = [*splat_transform.cutting_options(sum(counts))]
             for k, (gaussians, about) in enumerate(contents):
                 source = Path(temporary) / f"{k}.ply"
-                write(source, gaussians, about)
+                write(source, gaussians, Metadata(about=about))
                 words += [source, "-l", str(k)]
             self._transform(words, index, sum(counts))
         return counts

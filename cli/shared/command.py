@@ -184,11 +184,10 @@ def check_dials(args: Namespace, model: str) -> None:
         option = option.partition(",")[0]
         raise ClodError(f"{model}: has no sigma_d, which {option} needs; adapt it first: clod-adapt {model} ...")
     if name == "psnr_drop" and format_of(Path(model)) is PLY:
-        from clod_adapter.io.ply import all_comments, read_head  # here: --help needs no plyfile
+        from clod_adapter.io.ply import read_head  # here: --help needs no plyfile
         from clod_adapter.io.ply_layout import PREFIX
 
-        comments = all_comments(read_head(Path(model)).ply)
-        if not any(comment.startswith(f"{PREFIX}calibrated ") for comment in comments):
+        if not any(comment.startswith(f"{PREFIX}calibrated ") for comment in read_head(Path(model)).comments):
             raise no_calibration(Path(model), option)
 
 

@@ -11,10 +11,9 @@ from typing import Any
 import numpy as np
 
 from clod_adapter.config import SH_COUNTS, AdaptConfig
-from clod_adapter.errors import ClodError
 from clod_adapter.inspection.statistics import FAR, Dial, Splat, Spread, values_of
 from clod_adapter.io.file_formats import read_source
-from clod_adapter.io.ply import MASK_COLUMNS, Head, all_comments
+from clod_adapter.io.ply import MASK_COLUMNS, Head
 from clod_adapter.io.ply_layout import COLUMN, PREFIX, column_map, inria_dtype
 from clod_adapter.io.ply_packed import is_packed
 from clod_adapter.io.settings import ADAPTER, matching_calibration, stated_filter
@@ -72,8 +71,6 @@ def inspect(path: str | Path) -> Inspection:
     metadata, head, notes = source.metadata, source.head, [*source.notes, *source.metadata.notes]
     questions = in_question(source.arrays) if source.activation_unknown else {}
     rows = prepared(path, source.arrays, choice_of(questions), metadata.origin, None)
-    if not rows.keep.any():
-        raise ClodError(f"{path}: no usable Gaussian in it, of {len(rows.keep)} rows; export it again")
     tau = metadata.attenuation.tau if metadata.attenuation else AdaptConfig().tau
     values, dial = values_of(rows, tau), None
     if metadata.attenuation is not None:
@@ -112,7 +109,7 @@ def inspect(path: str | Path) -> Inspection:
 def looks_like(head: Head) -> str | None:
     """The program that probably wrote a PLY with this header; None where it is not a known one."""
     for pattern, who in COMMENTS:
-        for comment in all_comments(head.ply):
+        for comment in head.comments:
             if found := re.fullmatch(pattern, comment.strip()):
                 return who.format(*found.groups())
     if is_packed(head.ply):

@@ -54,8 +54,12 @@ def load_adapter(path: str | Path) -> Adapter:
     about, settings = _description(path, metadata)
     assert settings.attenuation is not None
     with refused_if_damaged(path, "its tensors or settings are damaged", DAMAGED[1]):
-        trimmed = about.get("trimmed", {})
-        kept = _rows(tensors.pop("kept"), trimmed["base_count"]) if "kept" in tensors else None
+        trimmed, kept = about.get("trimmed", {}), None
+        if "kept" in tensors:
+            packed, count = tensors.pop("kept"), trimmed["base_count"]
+            if len(packed) != -(-count // 8):
+                raise ValueError(f"kept has {len(packed)} bytes for {count} rows")
+            kept = torch.from_numpy(np.unpackbits(packed.numpy(), count=count).astype(bool))
         return Adapter(
             sigma_d=tensors.pop("sigma_d"),
             growth_d=tensors.pop("growth_d", None),
@@ -83,10 +87,3 @@ def _description(path: Path, metadata: dict[str, str]) -> tuple[dict[str, Any], 
             if not isinstance(about[name], wanted):
                 raise TypeError(f"{name} is {about[name]!r:.40}, not a {wanted.__name__}")
     return about, read_metadata(path, about, dial=True)
-
-
-def _rows(packed: torch.Tensor, count: int) -> torch.Tensor:
-    """``[count]`` bool of one bit per row."""
-    if packed.dtype != torch.uint8 or len(packed) != -(-count // 8):
-        raise ValueError(f"kept has {len(packed)} bytes for {count} rows")
-    return torch.from_numpy(np.unpackbits(packed.numpy(), count=count).astype(bool))

@@ -23,7 +23,7 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.hook import Hook
 from clod_adapter.io.file_formats import PLY, format_of, read_source, write
 from clod_adapter.io.ply_layout import PREFIX, column_map, write_rows
-from clod_adapter.io.settings import WARNING, matching_calibration, stated_filter, tagged, that_fit
+from clod_adapter.io.settings import WARNING, Metadata, matching_calibration, stated_filter, tagged, that_fit
 from clod_adapter.io.values import SIGMA, Activated, prepared
 from clod_adapter.origin import NOWHERE, Origin
 
@@ -127,8 +127,6 @@ def load(path: str | Path, *, activated: Activated | None = None, origin: Origin
     found = prepared(path, source.arrays, known, metadata.origin, origin)
     arrays, rows, total = found.arrays, source.rows, len(found.keep)
     dropped = [f"{lost} of {total} Gaussians dropped: {reason}" for reason, lost in found.dropped.items()]
-    if not found.keep.any():
-        raise ClodError(f"{path}: no usable Gaussian in it ({'; '.join(dropped)}); export it again")
     if not found.keep.all():
         arrays = {name: array[found.keep] for name, array in arrays.items()}
         rows = None if rows is None else rows[found.keep]
@@ -208,18 +206,15 @@ def save(
     """
     path = Path(path)
     about, origin, vertex = (base.comments, base.origin, base.vertex) if base else ((), NOWHERE, None)
+    metadata = Metadata(calibration=calibration, origin=origin, about=about, version=version or "")
     if base is not None:
         if path.is_file() and base.path.is_file() and path.samefile(base.path):
             raise ClodError(f"{path}: is the input file, which is never overwritten; choose another output")
         if len(gaussians) != len(base.gaussians) or gaussians.sh_degree != base.gaussians.sh_degree:
-            raise ClodError(
-                f"{path}: {len(gaussians)} Gaussians of SH degree {gaussians.sh_degree} do not fit their base "
-                f"{base.path} ({len(base.gaussians)} of degree {base.gaussians.sh_degree}); save with the checkpoint "
-                "they came from"
-            )
+            what = f"Gaussians ({gaussians.summary}) do not fit their base {base.path} ({base.gaussians.summary})"
+            raise ClodError(f"{path}: {what}; save with the checkpoint they came from")
     writer = partial(write_rows, base=vertex) if format_of(path) is PLY else None
-    notes = write(path, gaussians, about, origin=origin, calibration=calibration, version=version or "", writer=writer)
-    for note in notes:
+    for note in write(path, gaussians, metadata, writer=writer):
         warnings.warn(f"{path}: {note}", stacklevel=2)
 
 

@@ -7,19 +7,21 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn
 
 from clod_adapter.errors import ClodError, refused_if_damaged
 from clod_adapter.io.atomic import atomic_path
-from clod_adapter.origin import NOWHERE, Origin
+from clod_adapter.io.settings import Metadata, Source
 
 if TYPE_CHECKING:
-    from clod_adapter.calibration import Calibration
     from clod_adapter.gaussians import Gaussians
-    from clod_adapter.io.settings import Source
+
+Writer = Callable[..., tuple[str, ...]]
 
 
 class Format(NamedTuple):
@@ -99,22 +101,12 @@ def read_source(path: Path) -> Source:
 
 
 def write(
-    path: str | Path,
-    gaussians: Gaussians,
-    about: Sequence[str] = (),
-    *,
-    origin: Origin = NOWHERE,
-    calibration: Calibration | None = None,
-    version: str = "",
-    writer: Callable[..., tuple[str, ...]] | None = None,
+    path: str | Path, gaussians: Gaussians, metadata: Metadata | None = None, *, writer: Writer | None = None
 ) -> tuple[str, ...]:
     """Writes Gaussians in the format of the name's suffix, whole or not at all, sigma_d in world units.
 
     Args:
-        about: lines on their history, printable ASCII, for formats that store text.
-        origin: what their means are relative to (``Checkpoint.origin``), world units.
-        calibration: of these Gaussians, for formats that store text.
-        version: of the package that made the values, by default the running one.
+        metadata: of these Gaussians; their dial and screen-space filter are taken from themselves.
         writer: instead of the format's ``write``.
 
     Returns:
@@ -127,13 +119,12 @@ def write(
     if gaussians.sigma_d is not None and not form.carries_sigma:
         raise ClodError(f"{path}: {Path(path).suffix} has no room for a dial; choose a dial value to bake")
     from clod_adapter.equation.units import in_world_units  # here: the table needs no torch
-    from clod_adapter.io.settings import Metadata
 
     g = in_world_units(gaussians)
-    metadata = Metadata(g.attenuation, g.screen_filter, calibration, origin, tuple(about), version)
+    stored = replace(metadata or Metadata(), attenuation=g.attenuation, screen_filter=g.screen_filter)
     with atomic_path(path) as temporary:
-        given = temporary, g, metadata
-        notes: tuple[str, ...] = writer(*given) if writer else _call(f"{form.writer or form.module}.write", *given)
+        writer = writer or partial(_call, f"{form.writer or form.module}.write")
+        notes = writer(temporary, g, stored)
         check_written(temporary)
     return notes
 
@@ -163,27 +154,19 @@ def _call(function: str, *args: Any) -> Any:
 
 
 _CONVERT = "convert it: splat-transform IN{suffix} OUT.ply; better still, adapt the PLY that it was made from"
-_PAGE = "a web page, which clod-adapt export wrote to be opened in a browser, or a download went wrong"
 _DOWNLOAD = "download the file itself"
 # First bytes (after white space) that are never those of a splat, what the file is, and the remedy.
 CONTENTS = (
     (b"version https://git-lfs", "a Git LFS pointer, not the file it stands for", "fetch that: git lfs pull"),
-    (b"<!doctype html", _PAGE, _DOWNLOAD),
-    (b"<html", _PAGE, _DOWNLOAD),
+    ((b"<!doctype html", b"<html"), "a web page, of clod-adapt export or of a failed download", _DOWNLOAD),
     (b"<?xml", "an XML document, perhaps an error that a server sent", _DOWNLOAD),
 )
 # The same by suffix, or else by first bytes, of other formats.
 OTHERS: dict[str | bytes, tuple[str, str]] = {
     ".lcc": ("an LCC file, compressed for delivery", _CONVERT),
     ".hier": ("a Hierarchical-3DGS tree", "use the chunk's point_cloud.ply that the tree was built from"),
-    ".ckpt": (
-        "a training checkpoint, as Nerfstudio writes it",
-        "export a PLY: ns-export gaussian-splat --load-config CONFIG.yml --output-dir OUT",
-    ),
-    ".pth": (
-        "a trainer's own checkpoint, as Inria's code writes it to resume from",
-        "use the point_cloud/iteration_N/point_cloud.ply beside it",
-    ),
+    ".ckpt": ("a checkpoint of Nerfstudio", "use ns-export gaussian-splat --load-config CONFIG.yml --output-dir OUT"),
+    ".pth": ("a trainer's checkpoint, such as Inria's", "use the point_cloud/iteration_N/point_cloud.ply beside it"),
     ".json": ("a JSON document; of an unbundled SOG it is the table of contents", _CONVERT),
     b"\x1f\x8b": ("compressed with gzip", "unpack it first: gunzip"),
     b"PK\x03\x04": ("a zip archive", "unpack it first; a gsplat checkpoint must be called .pt to be read as one"),
@@ -224,9 +207,7 @@ def refuse_known(path: Path, start: bytes) -> None:
             raise ClodError(f"{path}: is {what}; {remedy}")
 
 
-def refuse(
-    path: Path, start: bytes, otherwise: str = "is not a PLY file; convert it to a .ply in Inria's 3DGS layout first"
-) -> NoReturn:
+def refuse(path: Path, start: bytes, otherwise: str) -> NoReturn:
     """Refuses a file, with its kind by the tables, or else with the message ``otherwise``."""
     refuse_known(path, start)
     suffix = path.suffix.lower()

@@ -32,34 +32,29 @@ class Head(NamedTuple):
     ply: PlyData  # elements, properties and comments; every element has 0 rows
     elements: tuple[tuple[PlyElement, int], ...]  # each with the number of rows that the header states
     size: int  # bytes; the data starts there
+    comments: tuple[str, ...]  # the file's, then each element's
 
 
 def read_head(path: Path, data: bytes | None = None) -> Head:
     """The header of a file, or of its bytes, alone: nothing is parsed or allocated of the rows that it states."""
     start = file_formats.read_bytes(path, HEADER_LIMIT) if data is None else data[:HEADER_LIMIT]
     if not re.match(rb"ply\r?\n|ply\r", start):
-        file_formats.refuse(path, start)
+        file_formats.refuse(path, start, "is not a PLY file; convert it to a .ply in Inria's 3DGS layout first")
     end = re.search(rb"[\r\n]end_header(\r?\n|\r)", start)
     if end is None:
         most = f" in its first {HEADER_LIMIT:,} bytes" if len(start) >= HEADER_LIMIT else ""
         raise ClodError(f"{path}: the PLY header has no end{most}, so the file is truncated; copy or export it again")
     header = re.sub(rb"\r\n?", b"\n", start[: end.end()])
     if re.search(rb"[^\t\n\x20-\x7e]", header):
-        raise ClodError(
-            f"{path}: the PLY header holds a character that is not printable ASCII; remove it from the comments"
-        )
+        raise ClodError(f"{path}: the PLY header has text that is not printable ASCII; remove that from the comments")
     counts = re.findall(rb"(?m)^[ \t]*element[ \t]+\S+[ \t]+(\d{1,20})[ \t]*$", header)
     header = re.sub(rb"(?m)^([ \t]*element[ \t]+\S+[ \t]+)\d{1,20}[ \t]*$", rb"\g<1>0", header)
     with refused_if_damaged(path, "the PLY header is damaged", "export the file again"):
         ply = PlyData.read(io.BytesIO(header), mmap=False)
     if len(counts) != len(ply.elements):
         raise ClodError(f"{path}: the PLY header is damaged (a row count is not a number); export the file again")
-    return Head(ply, tuple(zip(ply, map(int, counts), strict=True)), end.end())
-
-
-def all_comments(ply: PlyData) -> tuple[str, ...]:
-    """All comments of the header: the file's, then each element's."""
-    return (*ply.comments, *(comment for element in ply for comment in element.comments))
+    comments = *ply.comments, *(comment for element in ply for comment in element.comments)
+    return Head(ply, tuple(zip(ply, map(int, counts), strict=True)), end.end(), comments)
 
 
 def has_dial(path: Path) -> bool:
@@ -68,7 +63,7 @@ def has_dial(path: Path) -> bool:
     sh_degree_of(path, head.ply)
     _check_length(path, head, path.stat().st_size)
     dial = SIGMA in {column.name for column in head.ply["vertex"].properties}
-    ply_metadata(path, all_comments(head.ply), dial=dial)
+    ply_metadata(path, head.comments, dial=dial)
     return dial
 
 
@@ -79,17 +74,16 @@ def read(path: Path, data: bytes) -> Source:
     _check_length(path, head, len(data))
     with refused_if_damaged(path):
         elements = _elements(data, head)
-    comments = all_comments(head.ply)
     if is_packed(head.ply):
-        metadata = ply_metadata(path, comments, dial=False)
-        return Source(unpack(path, elements, degree), metadata, (NOTE,), comments, head=head)
+        metadata = ply_metadata(path, head.comments, dial=False)
+        return Source(unpack(path, elements, degree), metadata, (NOTE,), head.comments, head=head)
     rows = elements["vertex"]
     arrays = _arrays(rows, degree)
-    metadata = ply_metadata(path, comments, rows, dial=SIGMA in arrays)
+    metadata = ply_metadata(path, head.comments, rows, dial=SIGMA in arrays)
     parts = [f"element {element.name}" for element in head.ply if element.name != "vertex"]
     parts += ["obj_info"] if head.ply.obj_info else []
     notes = (f"not carried over to outputs: {', '.join(parts)}",) if parts else ()
-    return Source(arrays, metadata, notes, comments, not metadata.described, rows, head)
+    return Source(arrays, metadata, notes, head.comments, not metadata.described, rows, head)
 
 
 def _elements(data: bytes, head: Head) -> dict[str, np.ndarray]:
@@ -146,10 +140,8 @@ def _check_length(path: Path, head: Head, length: int) -> None:
         least += count * (max(1, 2 * len(kinds)) if text else sum(np.dtype(kind).itemsize for kind in kinds))
     if least > length:
         rows = ", ".join(f"{count} of {element.name}" for element, count in head.elements)
-        raise ClodError(
-            f"{path}: is truncated, or its header is damaged: it claims {rows}, which take at least {least} bytes, "
-            f"and the file has {length}; copy or export it again"
-        )
+        what = f"is truncated or damaged: its header claims {rows}, {least} bytes or more, and the file has {length}"
+        raise ClodError(f"{path}: {what}; copy or export it again")
 
 
 def sh_degree_of(path: Path, header: PlyData) -> int:
@@ -162,19 +154,13 @@ def sh_degree_of(path: Path, header: PlyData) -> int:
     properties = header["vertex"].properties
     types = {p.name: "list" if isinstance(p, PlyListProperty) else p.val_dtype for p in properties}
     if anchors := sorted(name for name in types if re.fullmatch(r"f_offset_\d+|f_anchor_feat_\d+", name)):
-        raise ClodError(
-            f"{path}: property {anchors[0]} is of a Scaffold-GS or Octree-GS file: anchors from which a network makes "
-            "Gaussians per view; use a checkpoint of 3DGS or of a method that keeps plain Gaussians"
-        )
+        what = f"property {anchors[0]} is of Scaffold-GS or Octree-GS, where a network makes Gaussians for each view"
+        raise ClodError(f"{path}: {what}; use a checkpoint of 3DGS or of a method that keeps plain Gaussians")
     if not types.keys() & {"f_dc_0", "scale_0"}:
-        raise ClodError(
-            f"{path}: properties f_dc_0 and scale_0 are missing, so this is a mesh or a point cloud; "
-            "give the point_cloud.ply that a 3DGS trainer writes"
-        )
+        what = "properties f_dc_0 and scale_0 are missing, so this is a mesh or a point cloud"
+        raise ClodError(f"{path}: {what}; give the point_cloud.ply that a 3DGS trainer writes")
     if {"scale_0", "scale_1"} <= types.keys() and "scale_2" not in types:
-        raise ClodError(
-            f"{path}: property scale_2 is missing, so this is a 2DGS file of flat disks; use a 3DGS checkpoint"
-        )
+        raise ClodError(f"{path}: has no property scale_2, so this is a 2DGS file of flat disks; use a 3DGS checkpoint")
     degree = degree_of(path, sum(re.fullmatch(r"f_rest_\d+", name) is not None for name in types))
     for name in (name for group in column_map(degree).values() for name in group):
         if name not in types:

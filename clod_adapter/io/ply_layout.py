@@ -100,7 +100,9 @@ def _stored_settings(comments: Iterable[str]) -> dict[str, Any]:
     found: dict[str, list[list[str]]] = {}
     for name, *words in (line[len(PREFIX) :].split() or [""] for line in comments if line.startswith(PREFIX)):
         found.setdefault(name, []).append(words)
-    values: dict[str, Any] = {FILTER: " ".join(found.pop(FILTER)[-1])} if FILTER in found else {}
+    values = dict[str, Any]()
+    if FILTER in found:
+        values[FILTER] = dict(zip(_USUAL[FILTER], found.pop(FILTER)[-1], strict=False))
     measured: dict[str, Any] = {
         name: [dict(zip((field.name for field in fields(kind)), words, strict=False)) for words in found.pop(key, [])]
         for name, key, kind in (("rows", ROW, CalibrationRow), ("viewpoints", VIEWPOINT, Viewpoint))
@@ -133,10 +135,8 @@ def _constant_settings(path: Path, vertex: np.ndarray) -> dict[str, Any]:
         if COLUMN + name in there:
             column = vertex[COLUMN + name]
             if not (column == column[0]).all():
-                raise ClodError(
-                    f"{path}: property {COLUMN}{name} must be one value for all rows and has several, so files of "
-                    "different settings were merged; give one of them"
-                )
+                what = f"property {COLUMN}{name} must be one value for all rows and has several"
+                raise ClodError(f"{path}: {what}, so files of different settings were merged; give one of them")
             if word is None or column[0]:
                 found[group][field] = _simplest(column[0]) if word is None else word
     return {DIAL: found[DIAL]} | ({FILTER: _USUAL[FILTER] | found[FILTER]} if found[FILTER] else {})

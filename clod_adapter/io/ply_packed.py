@@ -88,8 +88,7 @@ def _require(path: Path, header: PlyData, element: str, names: tuple[str, ...], 
     if "list" in types.values():
         raise ClodError(f"{path}: element {element} of a compressed PLY has a list; export it again")
     if absent := [name for name in names if types.get(name) != kind]:
-        what = f"is a compressed PLY whose {element} has no {absent[0]} of type {kind}"
-        raise ClodError(f"{path}: {what}; export it again")
+        raise ClodError(f"{path}: is a compressed PLY, whose {element} has no {absent[0]} of type {kind}; export again")
 
 
 def _shares(bits: np.ndarray, widths: tuple[int, ...]) -> list[np.ndarray]:

@@ -3,7 +3,7 @@
 Each format gives the same mapping of names to values, whose numbers may be text::
 
     attenuation    the fields of AttenuationConfig
-    screen_filter  the fields of ScreenFilter, or the words "variance compensate"
+    screen_filter  the fields of ScreenFilter
     calibration    as Calibration.as_dict
     origin         [x, y, z]
     about          lines of text
@@ -38,10 +38,8 @@ MODEL, ADAPTER = "clod-model", "clod-adapter"
 # Of the kinds of documents: the version of the format, and the message for another kind.
 KINDS = {
     MODEL: (1, "is not a model but {}; clod-adapt apply makes one of an adapter"),
-    ADAPTER: (
-        3, "is not an adapter but {}; give what clod-adapt wrote beside its PLY; a 'clod-model' needs no adapter"
-    ),
-}  # fmt: skip
+    ADAPTER: (3, "is not an adapter but {}; give what clod-adapt wrote beside its PLY; a 'clod-model' needs none"),
+}
 DAMAGED = "its settings are damaged", "restore them, or export the file again"  # for ``refused_if_damaged``
 _INHERITED = 60_000  # bytes of history that an output inherits; a PLY header must have room for them
 _OVERHEAD = 9  # bytes of a PLY's comment besides its text
@@ -106,8 +104,6 @@ def _attenuation(stored: Mapping[str, Any], described: bool, notes: list[str]) -
 
 
 def _screen_filter(stored: Any, notes: list[str]) -> ScreenFilter:
-    if isinstance(stored, str):
-        stored = dict(zip(("variance", "compensate"), stored.split(), strict=True))
     compensate = {"True": True, "False": False}.get(stored["compensate"], stored["compensate"])
     _note_unknown(stored, ("variance", "compensate"), notes)
     return ScreenFilter(variance=float(stored["variance"]), compensate=compensate)

@@ -59,7 +59,7 @@ class Prepared(NamedTuple):
 def prepared(
     path: Path, arrays: Mapping[str, np.ndarray], activated: Activated | None, at: Origin, origin: Origin | None
 ) -> Prepared:
-    """The values of ``Source.arrays``, whose means are relative to ``at``, as ``Gaussians`` take them.
+    """The values of ``Source.arrays``, whose means are relative to ``at``, as ``Gaussians`` take them: one at least.
 
     Args:
         activated: which values are activated, where their range allows both; None to refuse then.
@@ -74,14 +74,15 @@ def prepared(
             raise ClodError(f"{path}: {name} has shape {array.shape}, expected {shape}; export it again")
     if bands[0] + 1 not in SH_COUNTS.values():
         raise ClodError(f"{path}: shN has {bands[0]} coefficients, which fit no SH degree; export it again")
-    if count == (0,):
-        raise ClodError(f"{path}: no usable Gaussian in it (it has 0 rows); export it again")
     narrow = {name: np.ascontiguousarray(array, np.float32) for name, array in arrays.items() if name != "means"}
     values, was, changes = _as_logits(path, {**arrays, **narrow}, activated)
     if origin is None:
         origin = at if any(at) else origin_of(values["means"])
     values["means"] = np.ascontiguousarray(relative(values["means"], at, origin))
     keep, dropped = _usable(values)
+    if not keep.any():
+        why = "; ".join(dropped) or "it is empty"
+        raise ClodError(f"{path}: no usable Gaussian in it, of {len(keep)} rows ({why}); export it again")
     values.pop(MASKS, None)
     return Prepared(values, keep, origin, was, changes, dropped)
 
@@ -93,11 +94,9 @@ def _as_logits(path: Path, arrays: Arrays, activated: Activated | None) -> tuple
     found = in_question(arrays) if activated != "none" else {}
     if found and activated is None:
         ranges = " and ".join(f"{name} from {low:.4g} to {high:.4g}" for name, (low, high) in found.items())
-        raise ClodError(
-            f"{path}: has {ranges}, which looks like activated values where a 3DGS file has logits (opacity) and "
-            f"logarithms (scales); if they are, give --activated {choice_of(found)}, if not, --activated none "
-            "(activated= in Python)"
-        )
+        what = f"has {ranges}, which looks activated where a 3DGS file has logits (opacity) and logarithms (scales)"
+        fix = f"give --activated {choice_of(found)}, if not, --activated none (activated= in Python)"
+        raise ClodError(f"{path}: {what}; if it is, {fix}")
     taken, notes = [name for name in found if activated in (name, "both")], list[str]()
     if "opacity" in taken:
         opacity = np.abs(arrays["opacity_logits"].astype(np.float64))  # the absolute value is Taming-3DGS's activation
@@ -185,10 +184,8 @@ def _rotated(quats: np.ndarray) -> np.ndarray:
 
 def arrays_of(path: Path, gaussians: Gaussians) -> Arrays:
     """The float32 arrays of ``Gaussians.tensors``; refuses values that ``load`` would drop."""
-    arrays = {
-        name: np.ascontiguousarray(tensor.detach().float().cpu().numpy())
-        for name, tensor in gaussians.tensors().items()
-    }
+    tensors = gaussians.tensors()
+    arrays = {name: tensor.detach().float().cpu().contiguous().numpy() for name, tensor in tensors.items()}
     for name, array in arrays.items():
         if not _finite(name, array).all():
             raise ClodError(f"{path}: {name} holds a value that is not finite; drop such rows first, as load does")

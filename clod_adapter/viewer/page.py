@@ -92,7 +92,7 @@ class Payload:
         """
         rows = _along_curve(self.gaussians.means)
         try:
-            notes = write(file, self.gaussians.select(rows), origin=self.origin, calibration=self.calibration)
+            notes = write(file, self.gaussians.select(rows), Metadata(calibration=self.calibration, origin=self.origin))
             found = load(file, origin=self.origin).gaussians.to(self.gaussians.means.device)
             return Path(file).read_bytes(), found, notes
         finally:

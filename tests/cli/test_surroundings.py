@@ -94,7 +94,7 @@ NO_ROOT = "" if os.geteuid() else "import ctypes; assert ctypes.CDLL(None).unsha
     ("path", "mode", "said"),
     [
         ("base.ply", 0, "base.ply: cannot be read (Permission denied); check the path"),
-        ("scene/images/001.png", 0, "001.png: cannot be read (Permission denied); check its permissions"),
+        ("scene/images/001.png", 0, "001.png: cannot be read (Permission denied); check the path and its permissions"),
         ("scene/images", 0, "scene/images: cannot be read; check its permissions"),
         ("out", 0o555, "out/dial.ply: folder out is not writable; choose another or change its permissions"),
         ("out/dial.ply", 0o444, "dial.ply: is write-protected; choose another output, or chmod u+w"),

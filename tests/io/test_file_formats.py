@@ -22,6 +22,7 @@ from clod_adapter.inspection.report import inspect
 from clod_adapter.io.adapter_file import load_adapter, save_adapter
 from clod_adapter.io.checkpoint import load, save
 from clod_adapter.io.file_formats import FORMATS, WRITABLE, check_readable, file_has_dial, write
+from clod_adapter.io.settings import Metadata
 from formats import ATTENUATION, CALIBRATION, ORIGIN, PACKED, damaged, model, rows_by_place, turned, write_elements
 
 ABOUT = "made in a test", "of two lines"
@@ -51,7 +52,7 @@ def any_file(folder: Path, kind: str) -> Path:
     if kind == ".adapter.safetensors":
         save_adapter(path, extract(detach(g), g, fingerprint="ab", config={"steps": 3}))
         return path
-    write(path, g, calibration=CALIBRATION if g.sigma_d is not None else None)
+    write(path, g, Metadata(calibration=CALIBRATION if g.sigma_d is not None else None))
     if kind in (".ascii.ply", ".big.ply"):
         write_elements(path, PlyData.read(str(path), mmap=False).elements, "ascii" if kind == ".ascii.ply" else ">")
     return path
@@ -108,7 +109,7 @@ def test_an_older_compressed_ply(tmp_path: Path) -> None:
 def test_dial_round_trips(tmp_path: Path, suffix: str, degree: int, far: bool, growth: bool) -> None:
     g, origin = model(degree, growth=growth), ORIGIN if far else (0.0, 0.0, 0.0)
     path = tmp_path / f"a{suffix.upper()}"
-    notes = write(path, g, ABOUT, origin=origin, calibration=CALIBRATION)
+    notes = write(path, g, Metadata(calibration=CALIBRATION, origin=origin, about=ABOUT))
     assert ("above degree 3" in " ".join(notes)) == (degree == 4 and suffix in (".glb", ".spz"))
     check_readable(path)
     assert file_has_dial(path)
@@ -119,7 +120,7 @@ def test_dial_round_trips(tmp_path: Path, suffix: str, degree: int, far: bool, g
     known = ("quantised", "opacity = +inf", "far from 0")
     assert not [note for note in found.notes if not any(part in note for part in known)]
     assert any("far from 0: read relative to (510000, -4096, 0.25)" in note for note in found.notes) == far
-    write(tmp_path / f"b{suffix}", g, ABOUT, origin=origin, calibration=CALIBRATION)
+    write(tmp_path / f"b{suffix}", g, Metadata(calibration=CALIBRATION, origin=origin, about=ABOUT))
     assert path.read_bytes() == (tmp_path / f"b{suffix}").read_bytes()
     seen = inspect(path)
     assert seen.splat is not None and seen.splat.dial is not None and seen.splat.dial.calibration == CALIBRATION
@@ -220,7 +221,7 @@ def test_long_history_is_cut(tmp_path: Path) -> None:
     assert found.comments[-1] == "last" and set(found.comments[:9]) == {"x" * 1000}
     save(tmp_path / "b.ply", found.gaussians, found)
     for suffix in WRITABLE:
-        write(tmp_path / f"c{suffix}", found.gaussians, found.comments, calibration=CALIBRATION)
+        write(tmp_path / f"c{suffix}", found.gaussians, Metadata(calibration=CALIBRATION, about=found.comments))
     for path in tmp_path.glob("[bc].*"):
         again = load(path)
         assert again.comments == (() if path.suffix == ".splat" else found.comments), path
@@ -230,12 +231,12 @@ def test_long_history_is_cut(tmp_path: Path) -> None:
 def test_what_cannot_be_read_again_is_not_written(tmp_path: Path) -> None:
     (tmp_path / "a.ply").write_bytes(b"earlier")
     with pytest.raises(ClodError, match=f"^{tmp_path}/a.ply: is not written, because it could not be read again: "):
-        write(tmp_path / "a.ply", model(0), ["x" * 1000] * 1100)
+        write(tmp_path / "a.ply", model(0), Metadata(about=("x" * 1000,) * 1100))
     assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"earlier"]
 
 
 def test_text_is_made_ascii_and_infinite_opacity_finite(tmp_path: Path) -> None:
-    write(tmp_path / "a.safetensors", model(0), ("caf\u00e9", "clod_adapter tau 0.5"))
+    write(tmp_path / "a.safetensors", model(0), Metadata(about=("caf\u00e9", "clod_adapter tau 0.5")))
     found = load(tmp_path / "a.safetensors")
     assert found.comments == ("caf?",) and found.gaussians.attenuation == ATTENUATION
     (note,) = write(tmp_path / "a.ply", model())

@@ -20,6 +20,7 @@ from clod_adapter.gaussians import SH_C0, Gaussians
 from clod_adapter.integrations.splats import to_gsplat
 from clod_adapter.io.checkpoint import load, save
 from clod_adapter.io.file_formats import write
+from clod_adapter.io.settings import Metadata
 from clod_adapter.origin import NOWHERE
 from clod_adapter.rasterizers.reference import sh_basis
 from formats import ATTENUATION, ORIGIN, change_glb, covariances, model, rows_by_place, splat_transform, turned
@@ -31,7 +32,7 @@ KHR = "KHR_gaussian_splatting"
 def test_glb_in_pygltflib(tmp_path: Path) -> None:
     pygltflib = pytest.importorskip("pygltflib", reason="pygltflib is not installed")
     g = model(3)
-    write(tmp_path / "a.glb", g, origin=ORIGIN)
+    write(tmp_path / "a.glb", g, Metadata(origin=ORIGIN))
     gltf = pygltflib.GLTF2().load(str(tmp_path / "a.glb"))
     (mesh,), (node,) = gltf.meshes, gltf.nodes
     (primitive,) = mesh.primitives
@@ -68,7 +69,7 @@ def test_glb_in_pygltflib(tmp_path: Path) -> None:
 
 def test_glb_of_another_program(tmp_path: Path) -> None:
     """Interleaved, in short integers, moved, without metadata: sigma_d then has the default settings."""
-    write(tmp_path / "a.glb", model(0, 5), origin=ORIGIN)
+    write(tmp_path / "a.glb", model(0, 5), Metadata(origin=ORIGIN))
     path = change_glb(tmp_path / "a.glb", lambda g: g["asset"].pop("extras"))
     found = load(path)
     assert found.origin == ORIGIN and found.gaussians.attenuation == AttenuationConfig()
@@ -211,7 +212,7 @@ def test_losses_of_a_splat(tmp_path: Path) -> None:
     quat = g.quats[0] / g.quats[0].norm()
     np.testing.assert_array_equal(levels[4:], (quat * 128 + 128).round().clamp(max=255))
     g = detach(model(1, 300))
-    notes = write(tmp_path / "a.splat", g, origin=ORIGIN)
+    notes = write(tmp_path / "a.splat", g, Metadata(origin=ORIGIN))
     assert "8 bits" in notes[0] and "view-dependent" in notes[1] and "origin" in notes[2]
     again = load(tmp_path / "a.splat").gaussians
     rows = rows_by_place(again.means.numpy(), g.means.numpy())

@@ -162,7 +162,7 @@ OF_PLY: tuple[tuple[Content, str], ...] = (
     (rows(*needed(1), "f_rest_9", without=("f_rest_4",)), "property f_rest_4 is missing"),
     (rows(x="i4"), "property x is not float"),
     (rows(count=0), "no usable Gaussian"),
-    (filled("x", np.nan), "no usable Gaussian.*3 of 3"), (filled("rot", 0), "no usable Gaussian.*3 of 3"),
+    (filled("x", np.nan), "no usable Gaussian.*of 3 rows"), (filled("rot", 0), "no usable Gaussian.*of 3 rows"),
     (lambda path: write_elements(path, [PlyElement.describe(rows(), "point")]), "no vertex element.*point"),
     (with_a_list, "property bones is a list"),
     (b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty float x\nelement face 999999999\n"
@@ -221,7 +221,7 @@ OF_PT = (
     (splats(shN=None, features=torch.zeros(12, 32)), "no 'shN'; with appearance"),
     (splats(quats=torch.zeros(11, 4)), "quats has shape .11, 4., expected .12, 4."),
     (splats(means=torch.tensor(1.0)), "shape"), (splats(means=torch.zeros(12, 3).int()), "no plain tensor"),
-    (splats(means=torch.eye(3).to_sparse()), "more than tensors"), (splats(0), "it has 0 rows"),
+    (splats(means=torch.eye(3).to_sparse()), "more than tensors"), (splats(0), "of 0 rows"),
     (splats() | {"clod_adapter": 3}, "settings are damaged .*not int"),
     (splats() | {"clod_adapter": "[" * 100_000}, "settings are damaged"),
     (splats() | {"clod_adapter": '{"format": "clod-model"}'}, "settings are damaged"),

@@ -21,6 +21,7 @@ from clod_adapter.inspection.report import inspect
 from clod_adapter.io.adapter_file import load_adapter, save_adapter
 from clod_adapter.io.checkpoint import load, save
 from clod_adapter.io.file_formats import write
+from clod_adapter.io.settings import Metadata
 from formats import (
     ATTENUATION,
     CALIBRATION,
@@ -41,7 +42,7 @@ def written(path: Path, screen_filter: ScreenFilter = CLASSIC) -> Path:
         adapter = extract(detach(g), g.replace(growth_d=None), fingerprint="0", config={})
         save_adapter(path, replace(adapter, calibration=CALIBRATION))
     else:
-        write(path, g, calibration=CALIBRATION)
+        write(path, g, Metadata(calibration=CALIBRATION))
     return path
 
 
@@ -92,7 +93,7 @@ def test_damaged_settings_are_refused(tmp_path: Path) -> None:
     for comment, message in (
         ("tau banana", "could not convert string to float: 'banana'"), ("tau 0.4", "tau is 0.4, .*max_sv"),
         ("normalizer mean", "normalizer is mean, it must be one of"), ("scene_distance nan", "scene_distance is nan"),
-        ("screen_filter 0.3", "zip"), ("screen_filter -1 True", "variance is -1.0, it must be between"),
+        ("screen_filter 0.3", "no 'compensate'"), ("screen_filter -1 True", "variance is -1.0, it must be between"),
     ):  # fmt: skip
         with pytest.raises(ClodError, match=f"a.ply: its settings are damaged .*{message}.*; restore them, or export"):
             load(described(tmp_path / "a.ply", "max_sv 5", comment))

@@ -152,7 +152,7 @@ def changed(row: int, column: int, value: float) -> dict[str, Any]:
             (0, 0, 1e200), (0, 0, 1.1), (1, 1, -1), (3, 0, 1))),
         *(({"fl_x": value}, "fl_x is no number") for value in ("wide", math.inf)),
         *((change, "neither fl_x nor camera_angle_x") for change in ({"fl_x": -30}, {"fl_x": 0, "camera_angle_x": 4})),
-        ({"w": 1e30}, "w is no number below"),
+        ({"w": 1e30}, "w is no number between"),
         ({"cx": [1]}, "cx is no number"),
         ({"k1": math.nan}, "k1 is no number"),
         ({"k4": 0.1}, "k4 of a camera that is no fisheye"),
@@ -260,8 +260,8 @@ def test_cameras_of_nerfstudio(tmp_path: Path, turn: str, seed: int, applied_sca
         ("{}", "transform is no 3x4 or 4x4 matrix"),
         ('{"transform": [[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0]]}', "transform is no rotation"),
         ('{"transform": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, -1, 0]]}', "transform is no rotation"),
-        *((f'{{"transform": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]], "scale": {scale}}}', f"scale is {message}")
-          for scale, message in (("0", "0"), ("NaN", "nan"), ("[1]", ""))),
+        *((f'{{"transform": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]], "scale": {scale}}}', "scale is no number")
+          for scale in ("0", "NaN", "[1]")),
     ],
 )  # fmt: skip
 def test_damaged_frame_of_nerfstudio_is_refused(tmp_path: Path, content: str, message: str) -> None:

@@ -177,8 +177,7 @@ def _find(path: Path, gltf: dict[str, Any]) -> list[tuple[int, dict[str, Any]]]:
     found = [(number, primitive) for number, mesh in meshes for primitive in mesh["primitives"]]
     found = [(number, each) for number, each in found if EXTENSION in each.get("extensions", {})]
     if not found:
-        what = f"has no Gaussians in it ({EXTENSION}), so it is a mesh"
-        raise ClodError(f"{path}: {what}; give a checkpoint of Gaussians")
+        raise ClodError(f"{path}: has no Gaussians ({EXTENSION}), so it is a mesh; give a checkpoint of Gaussians")
     first = found[0][1]
     compressed = first["extensions"][EXTENSION].get("extensions")
     if compressed or any(name not in first["attributes"] for name, _ in _ATTRIBUTES.values()):
@@ -223,8 +222,7 @@ def _placed(path: Path, gltf: dict[str, Any], mesh: int) -> tuple[bool, Origin]:
     scale = [float(value) for value in node.get("scale", [1, 1, 1])]
     turned = np.allclose(np.abs(rotation), HALF_TURN)
     if below or "matrix" in node or scale != [1, 1, 1] or not (turned or np.allclose(np.abs(rotation), IDENTITY)):
-        what = "its node is scaled or turned, which is not undone here"
-        raise ClodError(f"{path}: {what}; apply the transform and export again")
+        raise ClodError(f"{path}: its node is scaled or turned, which is not undone; apply that and export it again")
     x, y, z = (float(value) for value in node.get("translation", [0, 0, 0]))
     if not np.isfinite([x, y, z]).all():
         raise ClodError(f"{path}: its node has a translation that is not finite; export it again")

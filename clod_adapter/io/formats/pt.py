@@ -50,8 +50,7 @@ def check(path: Path) -> None:
             for opcode, argument, _ in pickletools.genops(archive.read(pickles[0])):
                 named = opcode.name in ("GLOBAL", "INST", "STACK_GLOBAL")
                 if named and not re.fullmatch(_PLAIN, str(argument)):
-                    what = f"holds {argument}, more than tensors, and is not unpickled"
-                    raise ClodError(f"{path}: {what}; export it as a PLY")
+                    raise ClodError(f"{path}: holds {argument}, more than tensors, and is not unpickled; export a PLY")
 
 
 def has_dial(path: Path) -> bool:
@@ -75,9 +74,7 @@ def read(path: Path, data: bytes) -> Source:
     if isinstance(checkpoint, dict):
         found, splats = ", ".join(map(repr, list(checkpoint)[:5])), checkpoint.get("splats")
     if not isinstance(splats, dict):
-        raise ClodError(
-            f"{path}: has no dictionary 'splats', as gsplat's trainer writes (but {found}); export it as a PLY"
-        )
+        raise ClodError(f"{path}: has no dictionary 'splats', as gsplat's trainer writes (but {found}); export a PLY")
     wanted = (*NAMES, *dial_columns(splats))
     arrays = {NAMES.get(name, name): _values(path, name, splats, len(data)) for name in wanted}
     metadata = parse_metadata(path, checkpoint.get(KEY), dial=SIGMA in arrays)

@@ -27,10 +27,8 @@ if TYPE_CHECKING:
 VARIABLE = "CLOD_SPLAT_TRANSFORM"
 NEEDED = (3, 7)
 INSTALL = "npm install node@22 @playcanvas/splat-transform@3.7"
-HELP = (
-    f"in a folder of its own: {INSTALL}; then PATH=FOLDER/node_modules/node/bin:FOLDER/node_modules/.bin:$PATH, or the "
-    f"command in {VARIABLE}"
-)
+_PATH = "PATH=FOLDER/node_modules/node/bin:FOLDER/node_modules/.bin:$PATH"
+HELP = f"in a folder of its own: {INSTALL}; then {_PATH}, or the command in {VARIABLE}"
 ASKING = 30.0  # seconds that a question about itself may take
 LIMIT, LIMIT_EACH = 600.0, 0.02  # seconds after which a run has hung, and per Gaussian; ten times what was measured
 LIMIT_CONVERT = 1800.0  # seconds; five million Gaussians take about a minute
@@ -102,8 +100,11 @@ class SplatTransform:
             process.kill()
             process.communicate()
             raise
-        if process.returncode:
-            raise ClodError(f"splat-transform {self.version} failed: {_reason(output)}")
+        if process.returncode:  # the line with the error, or the last one; without the stack trace and the duration
+            lines = [line.strip(" \t✗·▸") for line in output.splitlines()]
+            lines = [line for line in lines if line and not line.startswith(("at ", "failed in "))]
+            reason = ([line for line in lines if "Error" in line] or lines or ["no output"])[-1]
+            raise ClodError(f"splat-transform {self.version} failed: {reason}")
         return time.perf_counter() - began
 
 
@@ -114,10 +115,8 @@ def check(path: Path) -> SplatTransform:
         return SplatTransform.find()
     except ClodError as error:
         version = " of version 4" if path.suffix.lower() == ".spz" else ""  # earlier ones are read here
-        raise ClodError(
-            f"{path}: {path.suffix}{version} is read through splat-transform ({error}); better still, adapt the PLY "
-            "that it was made from"
-        ) from error
+        what = f"{path.suffix}{version} is read through splat-transform ({error})"
+        raise ClodError(f"{path}: {what}; better still, adapt the PLY that it was made from") from error
 
 
 def read(path: Path, _: bytes) -> Source:
@@ -143,10 +142,3 @@ def _ask(command: tuple[str, ...], question: str) -> str:
         done = subprocess.run([*command, question], **_TEXT, timeout=ASKING)
         return str(done.stdout)
     return ""
-
-
-def _reason(output: str) -> str:
-    """The line with the error, or the last one; without the stack trace and the duration."""
-    lines = [line.strip(" \t✗·▸") for line in output.splitlines()]
-    lines = [line for line in lines if line and not line.startswith(("at ", "failed in "))]
-    return ([line for line in lines if "Error" in line] or lines or ["no output"])[-1]

@@ -68,10 +68,8 @@ def write(path: Path, gaussians: Gaussians, metadata: Metadata) -> tuple[str, ..
         gaussians = with_distance(gaussians, distance) if distance > _FAR else gaussians
     arrays, bits, moved = _nearer(arrays_of(path, gaussians))
     if len(gaussians) > MOST or bits < 1:
-        raise ClodError(
-            f"{path}: an .spz holds at most {MOST:,} Gaussians within 4,000,000 of 0, these are {len(gaussians):,} "
-            f"within {float(gaussians.means.abs().max()):.4g}; keep fewer or write a .ply"
-        )
+        these = f"these are {len(gaussians):,} within {float(gaussians.means.abs().max()):.4g}"
+        raise ClodError(f"{path}: has room for {MOST:,} Gaussians within 4,000,000 of 0, {these}; write a .ply")
     degree = min(gaussians.sh_degree, DEGREE)
     flags = EXTENDED | (ANTIALIASED if gaussians.screen_filter.compensate else 0)
     header = HEADER.pack(MAGIC, VERSION, len(gaussians), degree, bits, flags, 0)
@@ -193,8 +191,7 @@ def _unpacked(path: Path, data: bytes) -> bytes:
     with refused_if_damaged(path):
         unpacked = gzip.decompress(data, limit)
     if not gzip.eof or len(unpacked) < HEADER.size:
-        what = f"is truncated, or unpacks to more than {limit:,} bytes, which no Gaussians do"
-        raise ClodError(f"{path}: {what}; export it again")
+        raise ClodError(f"{path}: is truncated, or unpacks to more than {limit:,} bytes, as no splat; export it again")
     return unpacked
 
 

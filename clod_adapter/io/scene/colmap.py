@@ -19,10 +19,8 @@ from clod_adapter.origin import NOWHERE
 try:
     import pycolmap
 except ModuleNotFoundError as error:
-    raise ClodError(
-        "cameras and photographs are read with pycolmap, which is not installed: pip install pycolmap; on arm64 Linux "
-        "conda install -c conda-forge pycolmap"
-    ) from error
+    fix = "pip install pycolmap; on arm64 Linux conda install -c conda-forge pycolmap"
+    raise ClodError(f"cameras and photographs are read with pycolmap, which is not installed: {fix}") from error
 
 TEST_EVERY = 8  # one view in this many is held out
 HUGE = 1e9  # world units and pixels; larger values are damage, and may not fit float32
@@ -62,12 +60,10 @@ def check_posed(image: PosedImage, source: Path) -> PosedImage:
     if not camera.is_perspective_pinhole() and not camera.is_perspective_fisheye():
         what = f"has camera model {camera.model_name}, no perspective camera; cut perspective views from it first"
         raise ClodError(f"{source}: image {image.name!r} {what}")
-    focals = [camera.focal_length_x, camera.focal_length_y]
-    numbers = np.concatenate([image.viewmat.ravel(), camera.params])
-    sized = 0 < camera.width < HUGE and 0 < camera.height < HUGE
-    if not sized or not (np.abs(numbers) < HUGE).all() or min(focals) <= 0:  # a comparison with NaN is false
-        what = "has a camera or pose that is not usable; copy or export it again"
-        raise ClodError(f"{source}: image {image.name!r} {what}")
+    lengths = [camera.focal_length_x, camera.focal_length_y, camera.width, camera.height]
+    numbers = np.abs([*image.viewmat.ravel(), *camera.params, *lengths])
+    if not (numbers < HUGE).all() or min(lengths) <= 0:  # a comparison with NaN is false
+        raise ClodError(f"{source}: image {image.name!r} has a camera or pose that is not usable; export it again")
     return image
 
 

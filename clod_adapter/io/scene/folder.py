@@ -39,27 +39,22 @@ def find_cameras(folder: Path) -> Path:
     for each in (folder / "sparse" / "0", folder / "sparse", folder, *files, beside / "0", beside):
         if each.is_file() if each in files else _is_model(each):
             return each
-    raise ClodError(
-        f"{folder}: no COLMAP model (cameras, images, points3D as .bin or .txt) in sparse/0, sparse or the folder "
-        "itself, and no transforms.json; give the folder that holds images/ and sparse/0, or transforms.json"
-    )
+    what = "no COLMAP model (cameras, images, points3D; .bin or .txt) in it, sparse or sparse/0, and no transforms.json"
+    raise ClodError(f"{folder}: {what}; give the folder that holds images/ and sparse/0, or transforms.json")
 
 
 def _is_model(folder: Path) -> bool:
-    return any(
-        all((folder / f"{name}.{suffix}").is_file() for name in ("cameras", "images", "points3D"))
-        for suffix in ("bin", "txt")
-    )
+    names = "cameras", "images", "points3D"
+    return any(all((folder / f"{name}.{suffix}").is_file() for name in names) for suffix in ("bin", "txt"))
 
 
 def photograph_folders(folder: Path, cameras: Path) -> list[Path]:
     """Where the photographs of ``find_cameras(folder)`` may be, the likeliest first."""
     if cameras.is_file():
         return [cameras.parent]
-    likely = [folder / "images", folder, cameras.parent / "images", cameras.parent.parent / "images"]
-    return likely + [
-        base / name for name in (*SMALLER, RAW) for base in (folder, cameras.parent, cameras.parent.parent)
-    ]
+    bases = folder, cameras.parent, cameras.parent.parent
+    named = [base / name for name in ("images", *SMALLER, RAW) for base in bases]
+    return [named[0], folder, *named[1:]]
 
 
 def find_photographs(
@@ -82,16 +77,14 @@ def find_photographs(
         notes.append(f"the photographs are those in {root.name}, as there are more than in images")
     missing = [as_text(str(Path(*each))) for each, path in zip(parts, paths, strict=True) if path is None]
     if missing:
-        what = f"({', '.join(missing[:3])}{', ...' if len(missing) > 3 else ''})"
+        some = f"({', '.join(missing[:3])}{', ...' if len(missing) > 3 else ''})"
         if root.is_dir() and not os.access(root, os.X_OK):
             raise ClodError(f"{root}: cannot be read; check its permissions")
         if len(missing) > MISSING * len(names):
             lists = cameras.name if cameras.is_file() else "the model"
-            raise ClodError(
-                f"{root}: {len(missing)} of {len(names)} images of {lists} are missing {what}, more than half; put "
-                "them there under these names"
-            )
-        notes.append(f"{len(missing)} of {len(names)} photographs are missing and left out {what}")
+            what = f"{len(missing)} of {len(names)} images of {lists} are missing {some}, more than half"
+            raise ClodError(f"{root}: {what}; put them there under these names")
+        notes.append(f"{len(missing)} of {len(names)} photographs are missing and left out {some}")
     return paths, notes
 
 

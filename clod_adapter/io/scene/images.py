@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext, suppress
 from copy import copy
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import PIL
@@ -22,15 +22,8 @@ from clod_adapter.io.file_formats import read_bytes
 from clod_adapter.io.scene.colmap import HUGE, PosedImage
 
 Note = tuple[str, str]  # a change to a photograph, with {} for what differs between photographs, and that
-
-
-class Photograph(NamedTuple):
-    """A photograph of a pinhole camera."""
-
-    pixels: Image.Image  # 8-bit RGB, at the size that is used
-    K: np.ndarray  # ``[3, 3]`` the intrinsics of that camera
-    notes: list[Note]  # on the changes
-
+# Of a pinhole camera: 8-bit RGB at the size that is used, ``[3, 3]`` the intrinsics, and the changes.
+Photograph = tuple[Image.Image, np.ndarray, list[Note]]
 
 # Pillow opens files by content, and starts another program for some (PostScript). JPEG includes the MPO of phones.
 FORMATS = ("PNG", "JPEG", "TIFF", "WEBP", "BMP")
@@ -71,10 +64,8 @@ def read_image(path: Path, width: int, height: int, max_width: int) -> tuple[Ima
         turn = _TURNS.get(source.getexif().get(_ORIENTATION, 1)) if turned else None
         shape = size if turn is None else size[::-1]
         if not _same_shape(shape, width, height):
-            raise ClodError(
-                f"{path}: is {shape[0]}x{shape[1]}, its camera {width}x{height}, another shape; "
-                "give the images the model was made from"
-            )
+            what = f"is {shape[0]}x{shape[1]}, its camera {width}x{height}, another shape"
+            raise ClodError(f"{path}: {what}; give the images the model was made from")
         factor = max(1, shape[0] // (2 * max_width)) if size[0] * size[1] > LARGE else 1
         if factor > 1:
             source.draft(source.mode, (size[0] // factor, size[1] // factor))  # of JPEG alone
@@ -95,21 +86,16 @@ def image_size(path: Path) -> tuple[int, int]:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Image.Image]:
-    try:
-        with Image.open(path, formats=FORMATS) as source:
-            yield source
-    except (ClodError, MemoryError):
-        raise
-    except UnidentifiedImageError as error:
-        start, unknown = read_bytes(path, 12), f"damaged or none of {', '.join(FORMATS)}"
-        kind = next((name for mark, name in OTHERS.items() if mark in start), unknown)
-        raise ClodError(f"{path}: cannot be decoded, is {kind}; export it as JPEG or PNG") from error
-    except Image.DecompressionBombError as error:
-        raise ClodError(f"{path}: has more than the 178 million pixels that are read; scale it down") from error
-    except PermissionError as error:
-        raise ClodError(f"{path}: cannot be read ({error.strerror}); check its permissions") from error
-    except Exception as error:  # Pillow raises many kinds, some of its own, on damaged files
-        raise ClodError(f"{path}: cannot be decoded ({error}); copy or export it again") from error
+    with refused_if_damaged(path, "cannot be decoded"):
+        try:
+            with Image.open(path, formats=FORMATS) as source:
+                yield source
+        except UnidentifiedImageError as error:
+            start, unknown = read_bytes(path, 12), f"damaged or none of {', '.join(FORMATS)}"
+            kind = next((name for mark, name in OTHERS.items() if mark in start), unknown)
+            raise ClodError(f"{path}: cannot be decoded, is {kind}; export it as JPEG or PNG") from error
+        except Image.DecompressionBombError as error:
+            raise ClodError(f"{path}: has more than the 178 million pixels that are read; scale it down") from error
 
 
 def _same_shape(size: tuple[int, int], width: int, height: int) -> bool:
@@ -165,21 +151,20 @@ def photograph(image: PosedImage, path: Path, max_width: int, cache: Path | None
         camera.params.tolist(), max_width, pycolmap.__version__, PIL.__version__,
     )  # fmt: skip
     file = cache / f"{hashlib.sha256(repr(made_of).encode()).hexdigest()[:32]}.png"
-    found = None
+    pixels: Image.Image | None = None
     # Absent, or damaged: Pillow raises many kinds.
     with suppress(Exception), Image.open(file, formats=["PNG"]) as source:
         about = json.loads(source.info[_KEY])
-        notes = [(what, each) for what, each in about["notes"]]
-        found = Photograph(source.convert("RGB"), np.array(about["K"]), notes)
-    if found is None:
-        found = _made(image, path, max_width)
+        K, notes = np.array(about["K"]), [(what, each) for what, each in about["notes"]]
+        pixels = source.convert("RGB")
+    if pixels is None:
+        pixels, K, notes = _made(image, path, max_width)
         about = PngImagePlugin.PngInfo()
-        about.add_text(_KEY, json.dumps({"K": found.K.tolist(), "notes": found.notes}))
+        about.add_text(_KEY, json.dumps({"K": K.tolist(), "notes": notes}))
         with atomic_path(file) as temporary:
-            found.pixels.save(temporary, pnginfo=about, compress_level=1)
+            pixels.save(temporary, pnginfo=about, compress_level=1)
     lens = f"from {camera.model_name} into {cache}"
-    done = "undistorted {}, which may be deleted; the sources are untouched", lens
-    return found._replace(notes=[*found.notes, done])
+    return pixels, K, [*notes, ("undistorted {}, which may be deleted; the sources are untouched", lens)]
 
 
 def _made(image: PosedImage, path: Path, max_width: int) -> Photograph:
@@ -209,7 +194,7 @@ def _made(image: PosedImage, path: Path, max_width: int) -> Photograph:
     K = np.array([[pixels.width / width], [pixels.height / height], [1.0]]) * camera.calibration_matrix()
     if not 0 < min(K[0, 0], K[1, 1]) <= np.abs(K).max() < HUGE:
         raise ClodError(f"{path}: its camera is not usable once undistorted; check the camera's parameters")
-    return Photograph(pixels, K, notes)
+    return pixels, K, notes
 
 
 def cache_folder(scene: Path) -> Path:
@@ -223,8 +208,6 @@ def cache_folder(scene: Path) -> Path:
     except RuntimeError as error:
         raise ClodError("no home folder to keep undistorted photographs in; set XDG_CACHE_HOME to a folder") from error
     except OSError as error:
-        raise ClodError(
-            f"{folder}: undistorted photographs cannot be kept there ({error.strerror or error}); set XDG_CACHE_HOME "
-            "to a folder that can be written to"
-        ) from error
+        what = f"undistorted photographs cannot be kept there ({error.strerror or error})"
+        raise ClodError(f"{folder}: {what}; set XDG_CACHE_HOME to a folder that can be written to") from error
     return folder

@@ -24,6 +24,7 @@ from clod_adapter.origin import NOWHERE
 from clod_adapter.progress import Listener, Phase, tell
 
 MOST_AT_ONCE = 8  # photographs of full size in memory
+Load = Callable[[], tuple[View, list[Note]]]
 
 
 class ImageCache:
@@ -113,12 +114,15 @@ def load_scene(
     testing = held_out(images, test_every)
     if not any(image.name not in testing for image, _ in present):
         raise ClodError(f"{folder}: has no photograph to train on, as all that are there are held out; add more")
-    present = [(image.relative_to(origin), path) for image, path in spread(present, most or len(present))]
-    views, done = _load(present, folder, max_width, progress, cache)
+    chosen = spread(present, most or len(present))
+    pinholes = all(image.is_pinhole for image, _ in chosen)
+    undistorted = None if pinholes else cache_folder(folder)
+    loads = [partial(_load_view, image.relative_to(origin), path, undistorted, max_width) for image, path in chosen]
+    views, done = _load(loads, progress, cache)
     train = tuple(view for view in views if view.camera.name not in testing)
     test = tuple(view for view in views if view.camera.name in testing)
     left_out = list[tuple[str, str]]()
-    if all(image.is_pinhole for image, _ in present):
+    if pinholes:
         left_out.append(("undistortion", f"all {len(views)} cameras are pinholes"))
     if not any(what in (REDUCED, SCALED) for what, _ in done):
         left_out.append(("scaling", f"all {len(views)} photographs are used at full resolution"))
@@ -147,7 +151,7 @@ def load_cameras(
         notes.append(f"{unsized} of {len(images)} cameras left out: neither {source.name} nor a photograph has a size")
     if not cameras:
         raise ClodError(
-            f"{source}: has no size of a photograph, and no photograph is there; put them beside it, or w and h into it"
+            f"{source}: has no size of a photograph, and none is there; put them beside it, or w and h in it"
         )
     return [camera for camera in with_near_planes(cameras) if camera.name not in testing], notes
 
@@ -160,29 +164,21 @@ def _posed(folder: Path) -> tuple[Path, list[PosedImage], list[str]]:
     return cameras, images, notes + more
 
 
-def _load(
-    present: Sequence[tuple[PosedImage, Path]],
-    folder: Path,
-    max_width: int,
-    progress: Listener | None,
-    keep: ImageCache | None,
-) -> tuple[list[View], list[Note]]:
+def _load(loads: Sequence[Load], progress: Listener | None, keep: ImageCache | None) -> tuple[list[View], list[Note]]:
     """The views of the images, and notes. Each worker holds one photograph of full size at a time."""
-    cache = None if all(image.is_pinhole for image, _ in present) else cache_folder(folder)
     views, notes = list[View](), list[Note]()
     workers = min(MOST_AT_ONCE, max(2, torch.get_num_threads()))
-    loads = [partial(_load_view, image, path, cache, max_width) for image, path in present]
     with warnings.catch_warnings(), closing(in_order(loads, workers)) as found:
         # Large, but below the size at which it is refused: photographs are no attack.
         warnings.simplefilter("ignore", Image.DecompressionBombWarning)
         for (view, remarks), load in zip(found, loads, strict=True):
             views.append(keep.store(view, partial(_again, load)) if keep else view)
             notes += remarks
-            tell(progress, Phase.PHOTOGRAPHS, len(views), len(present))
+            tell(progress, Phase.PHOTOGRAPHS, len(views), len(loads))
     return views, notes
 
 
-def _again(load: Callable[[], tuple[View, list[Note]]]) -> torch.Tensor:
+def _again(load: Load) -> Tensor:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", Image.DecompressionBombWarning)
         return load()[0].image

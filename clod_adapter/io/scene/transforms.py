@@ -5,6 +5,7 @@ from collections import ChainMap
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from os.path import isfile
 from pathlib import Path
 from typing import Any
@@ -91,15 +92,17 @@ def read_pose(where: object, values: Mapping[str, Any], key: str) -> np.ndarray:
     return whole
 
 
-def _camera(where: str, photograph: Path, values: Mapping[str, Any]) -> pycolmap.Camera:
-    def number(key: str, default: float) -> float:
-        value = math.nan
-        with suppress(TypeError, ValueError, OverflowError):
-            value = float(default if values.get(key) is None else values[key])
-        if not abs(value) < 1e9:
-            raise ClodError(f"{where}: {key} is no number below 1e9; export the file again")
-        return value
+def _number(where: object, values: Mapping[str, Any], key: str, default: float, above: float = -HUGE) -> float:
+    value = math.nan
+    with suppress(TypeError, ValueError, OverflowError):
+        value = float(default if values.get(key) is None else values[key])
+    if not above < value < HUGE:
+        raise ClodError(f"{where}: {key} is no number between {above:g} and {HUGE:g}; export the file again")
+    return value
 
+
+def _camera(where: str, photograph: Path, values: Mapping[str, Any]) -> pycolmap.Camera:
+    number = partial(_number, where, values)
     width, height = (int(number(key, 0)) for key in ("w", "h"))
     if width < 1 or height < 1:  # that of a missing photograph does not matter
         width, height = image_size(photograph) if isfile(photograph) else (1, 1)
@@ -143,13 +146,12 @@ def in_trained_frame(folder: Path, cameras: Path, images: list[PosedImage]) -> t
     if not path.is_file():
         return images, []
     values = read_json(path)
-    pose, scale = read_pose(path, values, "transform"), _number(path, values.get("scale", 1.0), "scale")
+    pose, scale = read_pose(path, values, "transform"), _number(path, values, "scale", 1.0, 1 / HUGE)
     if cameras.is_file():
         applied = read_json(cameras)
         if applied.get("applied_transform") is not None:
             pose = pose @ np.linalg.inv(read_pose(cameras, applied, "applied_transform"))
-        if applied.get("applied_scale") is not None:
-            scale /= _number(cameras, applied["applied_scale"], "applied_scale")
+        scale /= _number(cameras, applied, "applied_scale", 1.0, 1 / HUGE)
     back, brought = np.linalg.inv(pose), []
     for image in images:
         viewmat = image.viewmat @ back
@@ -157,9 +159,3 @@ def in_trained_frame(folder: Path, cameras: Path, images: list[PosedImage]) -> t
         brought.append(check_posed(replace(image, viewmat=viewmat), cameras))
     note = f"the cameras are brought into the frame of {DATAPARSER}: the splat must be what nerfstudio exported"
     return brought, [note]
-
-
-def _number(path: Path, value: Any, key: str) -> float:
-    if not isinstance(value, int | float) or isinstance(value, bool) or not 1 / HUGE < value < HUGE:
-        raise ClodError(f"{path}: {key} is {value!r:.40}, it must be a positive number; copy or export it again")
-    return float(value)
