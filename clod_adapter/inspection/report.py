@@ -17,7 +17,7 @@ from clod_adapter.io.ply import MASK_COLUMNS, Head
 from clod_adapter.io.ply_layout import COLUMN, PREFIX, column_map, inria_dtype
 from clod_adapter.io.ply_packed import is_packed
 from clod_adapter.io.settings import ADAPTER, matching_calibration, stated_filter
-from clod_adapter.io.values import FILTER, choice_of, dial_columns, in_question, prepared
+from clod_adapter.io.values import FILTER_3D, choice_of, dial_columns, in_question, prepared
 
 NORMALS = ("nx", "ny", "nz")
 NERFSTUDIO = "nerfstudio's exporter, ns-export gaussian-splat"
@@ -117,7 +117,7 @@ def looks_like(head: Head) -> str | None:
     names = [p.name for p in head.ply["vertex"].properties] if "vertex" in head.ply else []
     if set(MASK_COLUMNS) <= set(names):
         return "MaskGaussian's trainer, an early version"
-    if FILTER in names:
+    if FILTER_3D in names:
         return "Mip-Splatting's trainer"
     plain = [name for name in names if name not in dial_columns(names) and not name.startswith(COLUMN)]
     rest = sum(name.startswith("f_rest_") for name in names)
@@ -136,7 +136,7 @@ def looks_like(head: Head) -> str | None:
 def extra_columns(names: Sequence[str], sh_degree: int) -> tuple[str, ...]:
     """The properties of a PLY without a meaning here."""
     known = {name for group in column_map(sh_degree).values() for name in group}
-    known |= {*NORMALS, *dial_columns(names), *MASK_COLUMNS, FILTER}
+    known |= {*NORMALS, *dial_columns(names), *MASK_COLUMNS, FILTER_3D}
     return tuple(name for name in names if name not in known and not name.startswith(COLUMN))
 
 
@@ -166,7 +166,7 @@ def left_out_of(splat: Splat, notes: Sequence[str], changes: Sequence[str]) -> t
     if gone := splat.total - splat.count:
         lines.append(f"{gone:,} of {splat.total:,} rows, which are not usable")
     lines += [note.removeprefix("not carried over to outputs: ") for note in notes if "carried over" in note]
-    if any(name == FILTER for name, _ in splat.columns):
+    if any(name == FILTER_3D for name, _ in splat.columns):
         lines.append("filter_3D, which is merged into scale and opacity")
     if splat.sh_degree > used:
         lines.append(f"harmonics above degree {used}, which are 0: skipped in training, kept in the output")

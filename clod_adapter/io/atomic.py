@@ -69,17 +69,15 @@ def output_lock(final: Path, *, of: Path | None = None) -> Iterator[None]:
     from filelock import FileLock, Timeout  # here: --help needs no lock
 
     path = final.parent / f"{_mark(final.with_name(final.name.casefold()))}lock"  # some file systems ignore case
-    lock, busy = FileLock(path, timeout=0), "another run is writing it; wait for that, or choose another name"
+    lock, name = FileLock(path, timeout=0), of or final
     try:
         lock.acquire()
-    except Timeout as error:
-        # Also raised where no file can be made.
-        why = busy if path.exists() else "cannot be written; check the path"
-        raise ClodError(f"{of or final}: {why}") from error
-    except (OSError, NotImplementedError) as error:  # no locks here
-        if isinstance(error, PermissionError) and os.path.exists(path):  # the run of another user
-            raise ClodError(f"{of or final}: {busy}") from error
-        with suppress(OSError):
+    except (OSError, NotImplementedError) as error:
+        if isinstance(error, Timeout | PermissionError) and os.path.exists(path):  # the latter: a run of another user
+            raise ClodError(f"{name}: another run is writing it; wait for that, or choose another name") from error
+        if isinstance(error, Timeout):  # raised too where no file can be made
+            raise ClodError(f"{name}: cannot be written; check the path") from error
+        with suppress(OSError):  # no locks here
             path.unlink()
     try:
         yield

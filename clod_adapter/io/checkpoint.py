@@ -123,16 +123,15 @@ def load(path: str | Path, *, activated: Activated | None = None, origin: Origin
     path = Path(path)
     source = read_source(path)
     metadata, dial = source.metadata, SIGMA in source.arrays
-    known = "none" if not source.activation_unknown else activated
-    found = prepared(path, source.arrays, known, metadata.origin, origin)
+    found = prepared(path, source.arrays, activated if source.activation_unknown else "none", metadata.origin, origin)
     arrays, rows, total = found.arrays, source.rows, len(found.keep)
-    dropped = [f"{lost} of {total} Gaussians dropped: {reason}" for reason, lost in found.dropped.items()]
     if not found.keep.all():
         arrays = {name: array[found.keep] for name, array in arrays.items()}
         rows = None if rows is None else rows[found.keep]
     screen_filter = stated_filter(source)
     tensors: dict[str, Any] = {name: torch.from_numpy(array) for name, array in arrays.items()}
     gaussians = Gaussians(**tensors, attenuation=metadata.attenuation if dial else None, screen_filter=screen_filter)
+    dropped = [f"{lost} of {total} Gaussians dropped: {reason}" for reason, lost in found.dropped.items()]
     notes = [*found.changes, *dropped]
     if opaque := np.count_nonzero(arrays["opacity_logits"] == np.inf):
         notes.append(f"{opaque} Gaussians have opacity = +inf and are taken as fully opaque")

@@ -36,14 +36,13 @@ class Format(NamedTuple):
     carries_sigma: bool = False  # whether the dial is written: sigma_d, growth_d and their settings
     about: tuple[str, ...] = ()  # where it is written, the precision of its values; lines of at most 54 letters
     ordered: bool = True  # whether the rows keep their order
-    writer: str = ""  # the module with ``write``, where it is another
 
 
 KEY = "clod_adapter"  # of the JSON document in formats other than PLY
 _GLB = "float32, SH degree up to 3", "(KHR_gaussian_splatting, _SIGMA_D, _GROWTH_D)"
 _SPZ = ("6 to 24 bits, SH degree up to 3, the dial 16-bit floats",)
 _CONVERTED = Format("formats.splat_transform", "formats.splat_transform.check")
-PLY = Format("ply", "ply.has_dial", carries_sigma=True, about=("exact; baked, in Inria's layout",), writer="ply_layout")
+PLY = Format("ply", "ply.has_dial", carries_sigma=True, about=("exact; baked, in Inria's layout",))
 FORMATS = {
     ".ply": PLY,
     ".glb": Format("formats.glb", carries_sigma=True, about=_GLB),
@@ -79,8 +78,7 @@ def check_suffix(path: Path) -> None:
     if path.name.lower().endswith((".sog", ".compressed.ply")):
         raise ClodError(f"{path}: is written by clod-adapt export alone: save a .ply, then clod-adapt export it")
     if path.suffix.lower() not in WRITABLE:
-        found = path.suffix or "no suffix"
-        raise ClodError(f"{path}: {found} is no format to write; choose one of {', '.join(WRITABLE)}")
+        raise ClodError(f"{path}: {path.suffix or 'no suffix'} is no format to write; choose of {', '.join(WRITABLE)}")
 
 
 def check_written(path: Path) -> None:
@@ -123,8 +121,7 @@ def write(
     g = in_world_units(gaussians)
     stored = replace(metadata or Metadata(), attenuation=g.attenuation, screen_filter=g.screen_filter)
     with atomic_path(path) as temporary:
-        writer = writer or partial(_call, f"{form.writer or form.module}.write")
-        notes = writer(temporary, g, stored)
+        notes: tuple[str, ...] = (writer or partial(_call, f"{form.module}.write"))(temporary, g, stored)
         check_written(temporary)
     return notes
 

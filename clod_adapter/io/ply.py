@@ -17,9 +17,10 @@ from plyfile import PlyData, PlyElement, PlyListProperty
 from clod_adapter.errors import ClodError, refused_if_damaged
 from clod_adapter.io import file_formats
 from clod_adapter.io.ply_layout import column_map, ply_metadata
+from clod_adapter.io.ply_layout import write as write
 from clod_adapter.io.ply_packed import NOTE, check_packed, is_packed, unpack
 from clod_adapter.io.settings import Source
-from clod_adapter.io.values import FILTER, GROWTH, MASKS, ROWS, SIGMA, Arrays, degree_of, dial_columns
+from clod_adapter.io.values import FILTER_3D, GROWTH, MASKS, ROWS, SIGMA, Arrays, degree_of, dial_columns
 
 MASK_COLUMNS = ("masks_0", "masks_1")
 HEADER_LIMIT = 1 << 20  # bytes
@@ -114,7 +115,7 @@ def _arrays(rows: np.ndarray, sh_degree: int) -> Arrays:
     names = rows.dtype.names or ()
     groups = column_map(sh_degree) | dial_columns(names)
     groups |= {MASKS: MASK_COLUMNS} if set(MASK_COLUMNS) <= set(names) else {}
-    groups |= {FILTER: (FILTER,)} if FILTER in names else {}
+    groups |= {FILTER_3D: (FILTER_3D,)} if FILTER_3D in names else {}
     kinds = {"means": np.float64} if "f8" in {rows.dtype[name].str[1:] for name in "xyz"} else {}
     found = {key: np.empty((len(rows), len(group)), kinds.get(key, np.float32)) for key, group in groups.items()}
     with np.errstate(over="ignore", invalid="ignore"):  # invalid: a NaN that signals
@@ -163,10 +164,9 @@ def sh_degree_of(path: Path, header: PlyData) -> int:
         raise ClodError(f"{path}: has no property scale_2, so this is a 2DGS file of flat disks; use a 3DGS checkpoint")
     degree = degree_of(path, sum(re.fullmatch(r"f_rest_\d+", name) is not None for name in types))
     for name in (name for group in column_map(degree).values() for name in group):
-        if name not in types:
-            raise ClodError(f"{path}: property {name} is missing; export the file again in Inria's 3DGS layout")
-        if types[name] not in ("f4", "f8"):
-            raise ClodError(f"{path}: property {name} is not float or double; export the file again with float columns")
+        if types.get(name) not in ("f4", "f8"):
+            what = "is not float or double" if name in types else "is missing"
+            raise ClodError(f"{path}: property {name} {what}; export the file again in Inria's 3DGS layout")
     if lists := [name for name, kind in types.items() if kind == "list"]:
         raise ClodError(f"{path}: property {lists[0]} is a list, which splat viewers cannot read; remove it")
     return degree

@@ -21,8 +21,7 @@ from clod_adapter.calibration import CalibrationRow, Viewpoint
 from clod_adapter.config import CLASSIC, SH_COUNTS, AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.io.settings import FILTER, Metadata, read_metadata, tagged
-from clod_adapter.io.values import FILTER as FILTER_3D
-from clod_adapter.io.values import GROWTH, ROWS, SIGMA, arrays_of, dial_columns
+from clod_adapter.io.values import FILTER_3D, GROWTH, ROWS, SIGMA, arrays_of, dial_columns
 
 if TYPE_CHECKING:
     from clod_adapter.gaussians import Gaussians

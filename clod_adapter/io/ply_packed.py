@@ -48,8 +48,7 @@ def unpack(path: Path, elements: Mapping[str, np.ndarray], degree: int) -> Array
     chunks, packed, table = elements["chunk"], elements["vertex"], elements.get("sh")
     count, bands = len(packed), SH_COUNTS[degree] - 1
     if len(chunks) < (needed := -(-count // BLOCK)):
-        what = f"{count} Gaussians need {needed} chunks, and it has {len(chunks)}"
-        raise ClodError(f"{path}: is damaged: {what}; copy or export it again")
+        raise ClodError(f"{path}: is damaged: {count} Gaussians need {needed} chunks, not {len(chunks)}; copy it again")
     if table is not None and len(table) != count:
         raise ClodError(f"{path}: is damaged: {len(table)} harmonics for {count} Gaussians; export it again")
 

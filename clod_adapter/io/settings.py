@@ -130,10 +130,9 @@ def that_fit(lines: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
         if len(line) + _OVERHEAD <= room:
             kept.append(line)
             room -= len(line) + _OVERHEAD
-    if len(kept) == len(lines):
-        return tuple(lines), ()
-    note = f"{len(lines) - len(kept)} of {len(lines)} comments are not carried over to outputs, which have room for "
-    return tuple(reversed(kept)), (f"{note}{_INHERITED:,} characters",)
+    gone = len(lines) - len(kept)
+    note = f"{gone} of {len(lines)} comments are not carried over to outputs, which hold {_INHERITED:,} characters"
+    return tuple(reversed(kept)), (note,) * (gone > 0)
 
 
 def matching_calibration(metadata: Metadata, count: int) -> tuple[Calibration | None, list[str]]:
@@ -186,7 +185,6 @@ def parse_document(path: Path, text: str | bytes | dict[str, Any], kind: str) ->
 TAG = "SplatRenderMode: mip"
 _ANTIALIASED = r"(?i)\s*(splatrendermode:\s*mip|antialiased 1)\s*"
 _EITHER = r"(?i)\s*(splatrendermode:\s*\S*|antialiased [01])\s*"
-_BRUSH = "Exported from Brush"
 
 
 def is_antialiased(comments: Iterable[str]) -> bool:
@@ -209,6 +207,6 @@ def stated_filter(source: Source) -> ScreenFilter:
         return metadata.screen_filter
     if "sigma_d" in source.arrays or (metadata.described and source.head is None):
         return CLASSIC
-    if "filter_3D" in source.arrays or (compensated and _BRUSH in source.comments):
+    if "filter_3D" in source.arrays or (compensated and "Exported from Brush" in source.comments):
         return FILTERS["mip"]
     return FILTERS["on" if compensated else "off"]

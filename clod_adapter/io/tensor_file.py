@@ -13,7 +13,6 @@ from io import BufferedReader
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 from safetensors import safe_open
 
 from clod_adapter.errors import ClodError, refused_if_damaged
@@ -29,16 +28,13 @@ if TYPE_CHECKING:
 _DAMAGED = "is not a safetensors file, or damaged", "copy or export it again"
 
 
-def write_tensors(path: Path, tensors: Mapping[str, Tensor | np.ndarray], metadata: Mapping[str, str]) -> None:
+def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> None:
     """Writes a file, the widest types first.
 
     safetensors' ``save`` holds all of it in memory; ``save_file`` takes names in UTF-8 only, and makes files that only
     their owner can read.
     """
-    arrays = {
-        name: tensor if isinstance(tensor, np.ndarray) else tensor.detach().cpu().contiguous().numpy()
-        for name, tensor in tensors.items()
-    }
+    arrays = {name: tensor.detach().cpu().contiguous().numpy() for name, tensor in tensors.items()}
     header, at = dict[str, Any](__metadata__=dict(metadata)), 0
     names = sorted(arrays, key=lambda name: (-arrays[name].itemsize, name))
     for name in names:
@@ -86,7 +82,9 @@ def _name_of(file: BufferedReader) -> str:
 
 def write(path: Path, gaussians: Gaussians, metadata: Metadata) -> tuple[str, ...]:
     """Writes every value unchanged."""
-    write_tensors(path, arrays_of(path, gaussians), {KEY: document(MODEL, metadata)})
+    arrays_of(path, gaussians)  # refuses rows that load would drop
+    tensors = {name: tensor.float() for name, tensor in gaussians.tensors().items()}
+    write_tensors(path, tensors, {KEY: document(MODEL, metadata)})
     return ()
 
 

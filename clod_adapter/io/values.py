@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 Activated = Literal["none", "opacity", "scales", "both"]
 Arrays = dict[str, np.ndarray]
-SIGMA, GROWTH, FILTER, MASKS = "sigma_d", "growth_d", "filter_3D", "masks"
+SIGMA, GROWTH, FILTER_3D, MASKS = "sigma_d", "growth_d", "filter_3D", "masks"
 _UNROTATED = "rotation is zero or not of a usable length"
 ROWS = 4096  # in a block, which stays in the processor's cache
 _FEW = 10  # Gaussians; fewer may have any range
@@ -65,15 +65,15 @@ def prepared(
         activated: which values are activated, where their range allows both; None to refuse then.
         origin: what the means are to be relative to; None for ``at``, or what ``origin_of`` finds where that is 0.
     """
-    count, bands = arrays["means"].shape[:1], arrays["shN"].shape[1:2]
+    count, rest = arrays["means"].shape[:1], arrays["shN"].shape[1:2]
     shapes: dict[str, tuple[int, ...]] = {
-        "means": (3,), "quats": (4,), "log_scales": (3,), "sh0": (1, 3), "shN": (*bands, 3), MASKS: (2,), FILTER: (1,)
+        "means": (3,), "quats": (4,), "log_scales": (3,), "sh0": (1, 3), "shN": (*rest, 3), MASKS: (2,), FILTER_3D: (1,)
     }  # fmt: skip
     for name, array in arrays.items():
         if array.shape != (shape := (*count, *shapes.get(name, ()))):
             raise ClodError(f"{path}: {name} has shape {array.shape}, expected {shape}; export it again")
-    if bands[0] + 1 not in SH_COUNTS.values():
-        raise ClodError(f"{path}: shN has {bands[0]} coefficients, which fit no SH degree; export it again")
+    if rest[0] + 1 not in SH_COUNTS.values():
+        raise ClodError(f"{path}: shN has {rest[0]} coefficients, which fit no SH degree; export it again")
     narrow = {name: np.ascontiguousarray(array, np.float32) for name, array in arrays.items() if name != "means"}
     values, was, changes = _as_logits(path, {**arrays, **narrow}, activated)
     if origin is None:
@@ -106,8 +106,8 @@ def _as_logits(path: Path, arrays: Arrays, activated: Activated | None) -> tuple
     if "scales" in taken:
         arrays["log_scales"] = logs_of(arrays["log_scales"]).astype(np.float32)
         notes.append("scales taken as activated, and stored as logarithms")
-    if FILTER in arrays:
-        arrays["log_scales"], arrays["opacity_logits"] = _fused(arrays, arrays.pop(FILTER))
+    if FILTER_3D in arrays:
+        arrays["log_scales"], arrays["opacity_logits"] = _fused(arrays, arrays.pop(FILTER_3D))
         notes.append("Mip-Splatting's filter_3D is fused into scale and opacity, and left out of outputs")
     return arrays, choice_of(taken), notes
 

@@ -21,13 +21,12 @@ _ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), (
 def write(path: Path, gaussians: Gaussians, metadata: Metadata) -> tuple[str, ...]:
     """Writes Gaussians without a dial, and no text."""
     arrays = values.arrays_of(path, gaussians)
-    scales = values.scales_of(path, arrays["log_scales"])
     opacities = values.sigmoid(arrays["opacity_logits"])
     # As logarithms, in which no volume is too small.
     with np.errstate(divide="ignore"):
         order = np.argsort(-(arrays["log_scales"].astype(np.float64).sum(1) + np.log(opacities)), kind="stable")
     rows = np.empty(len(gaussians), _ROW)
-    rows["means"], rows["scales"] = arrays["means"], scales
+    rows["means"], rows["scales"] = arrays["means"], values.scales_of(path, arrays["log_scales"])
     rows["rgba"] = values.colours_of(arrays["sh0"], opacities)
     rows["quats"] = values.bytes_of(128 * values.normalized(arrays["quats"]) + 128)
     path.write_bytes(rows[order].tobytes())

@@ -139,6 +139,5 @@ def read(path: Path, _: bytes) -> Source:
 def _ask(command: tuple[str, ...], question: str) -> str:
     """Its output for an option that asks about it; empty where it does not run."""
     with suppress(OSError, subprocess.TimeoutExpired):
-        done = subprocess.run([*command, question], **_TEXT, timeout=ASKING)
-        return str(done.stdout)
+        return str(subprocess.run([*command, question], **_TEXT, timeout=ASKING).stdout)
     return ""

@@ -108,13 +108,11 @@ def _check_records(model: Path) -> None:
         if not path.exists():
             continue
         data, at = read_bytes(path), 8
-        try:
-            for _ in range(struct.unpack_from("<Q", data)[0]):
+        with refused_if_damaged(path, "is truncated or damaged", "copy or export the model again"):
+            for _ in range(_count(data, 0)):
                 at = after(data, at)
-        except (struct.error, ValueError, OverflowError):
-            at = len(data) + 1
-        if at > len(data):
-            raise ClodError(f"{path}: is truncated or damaged; copy or export the model again")
+            if at > len(data):
+                raise ValueError(f"its records end at byte {at} of {len(data)}")
 
 
 def _count(data: bytes, at: int) -> int:

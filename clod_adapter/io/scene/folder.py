@@ -69,9 +69,8 @@ def find_photographs(
     if twice := [name for name, count in Counter(names).items() if count > 1]:
         raise ClodError(f"{cameras}: has image {twice[0]} more than once; export it again")
     roots = [each for each in photograph_folders(folder, cameras) if raw or each.name != RAW or each == folder]
-    found = [[path if isfile(path := root.joinpath(*each)) else None for each in parts] for root in roots]
-    paths = min(found, key=lambda candidates: candidates.count(None))
-    root = roots[found.index(paths)]
+    found = [([path if isfile(path := root.joinpath(*each)) else None for each in parts], root) for root in roots]
+    paths, root = min(found, key=lambda candidates: candidates[0].count(None))
     notes = []
     if root.name in (*SMALLER, RAW) and root != folder:
         notes.append(f"the photographs are those in {root.name}, as there are more than in images")

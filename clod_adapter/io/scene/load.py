@@ -140,13 +140,8 @@ def load_cameras(
     folder = Path(folder)
     source, images, notes = _posed(folder)
     testing = held_out(images, TEST_EVERY) if training else set()
-    cameras = []
-    for image in images:
-        pinhole = image.camera
-        if min(pinhole.width, pinhole.height) > 1:
-            viewmat = torch.from_numpy(image.relative_to(origin).viewmat).float()
-            K = torch.from_numpy(pinhole.calibration_matrix()).float()
-            cameras.append(Camera(viewmat, K, pinhole.width, pinhole.height, image.name))
+    sized = [image.relative_to(origin) for image in images if min(image.camera.width, image.camera.height) > 1]
+    cameras = [_pinhole(one, one.camera.calibration_matrix(), one.camera.width, one.camera.height) for one in sized]
     if unsized := len(images) - len(cameras):
         notes.append(f"{unsized} of {len(images)} cameras left out: neither {source.name} nor a photograph has a size")
     if not cameras:
@@ -196,6 +191,8 @@ def _summary(notes: Sequence[Note], total: int) -> list[str]:
 
 def _load_view(image: PosedImage, path: Path, cache: Path | None, max_width: int) -> tuple[View, list[Note]]:
     pixels, K, notes = photograph(image, path, max_width, cache)
-    viewmat = torch.from_numpy(image.viewmat).float()
-    camera = Camera(viewmat, torch.from_numpy(K).float(), pixels.width, pixels.height, image.name)
-    return View(camera, torch.from_numpy(np.array(pixels))), notes
+    return View(_pinhole(image, K, *pixels.size), torch.from_numpy(np.array(pixels))), notes
+
+
+def _pinhole(image: PosedImage, K: np.ndarray, width: int, height: int) -> Camera:
+    return Camera(torch.from_numpy(image.viewmat).float(), torch.from_numpy(K).float(), width, height, image.name)
