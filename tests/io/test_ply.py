@@ -42,7 +42,7 @@ def files(draw: st.DrawFn) -> tuple[np.ndarray, str, int]:
     return vertex, draw(st.sampled_from(["<", ">", "ascii"])), degree
 
 
-@settings(deadline=None, max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(deadline=None, max_examples=20, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(files(), st.integers(0, 1000))
 def test_every_layout_round_trips(tmp_path: Path, file: tuple[np.ndarray, str, int], seed: int) -> None:
     """Bit for bit, but for values that change; growth_d without sigma_d is a column like others."""
@@ -185,8 +185,6 @@ def test_other_formats_keep_what_the_base_says(tmp_path: Path) -> None:
     torch.testing.assert_close(again.gaussians.means, some.means)
     with pytest.raises(ClodError, match="never overwritten"):
         save(tmp_path / "out.pt", again.gaussians, again)
-    with pytest.raises(ClodError, match="no room for a dial"):
-        save(tmp_path / "out.splat", some)
     assert repr(again) == f"Checkpoint('{tmp_path}/out.pt', 9, SH degree 1, dial to 7 with growth)"
 
 

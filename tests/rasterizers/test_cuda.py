@@ -62,11 +62,11 @@ def kernel(name: str, version: str, given: dict[str, Any]) -> Any:
         eye = -viewmats[0, :3, :3].mT @ viewmats[0, :3, 3]
         return _torch_impl._spherical_harmonics(degree, means - eye, coefficients)[None]
     if name == "fully_fused_projection":
-        batches, *found = kernels.fully_fused_projection(**given)
-        if "opacities" not in given or version in ("1.5.0", "1.5.2"):
-            return found if "opacities" in given else (batches, *found)
-        bounds = [torch.tensor([0, len(batches)], dtype=torch.int32)] if version == "1.6.0" else []
-        return batches, *found[:2], *bounds, *found[2:]
+        found = kernels.fully_fused_projection(**given)
+        if version in ("1.4.0", "1.5.0", "1.5.2"):
+            return found if version == "1.4.0" else found[1:]
+        bounds = [torch.tensor([0, len(found[0])], dtype=torch.int32)] if version == "1.6.0" else []
+        return *found[:3], *bounds, *found[3:]
     if name == "isect_tiles":
         return kernels.isect_tiles(**{key: given[key] for key in given if key not in ("sort", "conics", "opacities")})
     if name == "isect_offset_encode":
