@@ -207,8 +207,7 @@ def refuse_known(path: Path, start: bytes) -> None:
 def refuse(path: Path, start: bytes, otherwise: str) -> NoReturn:
     """Refuses a file, with its kind by the tables, or else with the message ``otherwise``."""
     refuse_known(path, start)
-    suffix = path.suffix.lower()
     for key, (what, remedy) in OTHERS.items():
-        if key == suffix or (isinstance(key, bytes) and start.startswith(key)):
+        if key == path.suffix.lower() or (isinstance(key, bytes) and start.startswith(key)):
             raise ClodError(f"{path}: is {what}; {remedy.format(suffix=path.suffix)}")
     raise ClodError(f"{path}: {otherwise}")

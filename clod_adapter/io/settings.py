@@ -1,13 +1,8 @@
 """Settings that travel with a file: one reader for PLY comments, PLY columns and JSON documents.
 
-Each format gives the same mapping of names to values, whose numbers may be text::
-
-    attenuation    the fields of AttenuationConfig
-    screen_filter  the fields of ScreenFilter
-    calibration    as Calibration.as_dict
-    origin         [x, y, z]
-    about          lines of text
-    package_version
+Each format gives the same mapping, whose numbers may be text: ``attenuation`` and ``screen_filter`` to the fields of
+their classes, ``calibration`` as Calibration.as_dict, ``origin`` to [x, y, z], ``about`` to lines of text, and
+``package_version``.
 
 Formats other than PLY store it as a JSON document under the key ``clod_adapter`` (``file_formats.KEY``). An unknown
 field is ignored with a note, a damaged setting is refused, and a damaged calibration, which rendering does not need, is
@@ -132,7 +127,7 @@ def that_fit(lines: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
             room -= len(line) + _OVERHEAD
     gone = len(lines) - len(kept)
     note = f"{gone} of {len(lines)} comments are not carried over to outputs, which hold {_INHERITED:,} characters"
-    return tuple(reversed(kept)), (note,) * (gone > 0)
+    return tuple(reversed(kept)), (note,) if gone else ()
 
 
 def matching_calibration(metadata: Metadata, count: int) -> tuple[Calibration | None, list[str]]:

@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 Activated = Literal["none", "opacity", "scales", "both"]
 Arrays = dict[str, np.ndarray]
 SIGMA, GROWTH, FILTER_3D, MASKS = "sigma_d", "growth_d", "filter_3D", "masks"
-_UNROTATED = "rotation is zero or not of a usable length"
 ROWS = 4096  # in a block, which stays in the processor's cache
 _FEW = 10  # Gaussians; fewer may have any range
 _FAINTEST = -0.1  # logit of 0.475; trainers keep fainter Gaussians, and files of |a| reach just below 0
@@ -150,47 +149,34 @@ def _fused(arrays: Arrays, filter_3d: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 def _usable(arrays: Arrays) -> tuple[np.ndarray, dict[str, int]]:
     """``[N]`` bool, the Gaussians that can be drawn, and the number of the others by the first rule that they break."""
-    keep = np.ones(len(arrays["means"]), bool)
-    dropped = dict.fromkeys(("MaskGaussian existence probability below 0.5", "a value is not finite", _UNROTATED), 0)
+    from clod_adapter._kernels import QUAT_MAX, QUAT_MIN  # here: a header is checked without numba
+
+    keep, unlikely = np.ones(len(arrays["means"]), bool), "MaskGaussian existence probability below 0.5"
+    dropped = dict.fromkeys((unlikely, "a value is not finite", "rotation is zero or not of a usable length"), 0)
     for start in range(0, len(keep), ROWS):
         block = {name: values[start : start + ROWS] for name, values in arrays.items()}
         exists, finite = np.ones((2, len(block["means"])), bool)
         if MASKS in block:  # sigmoid(first - second) >= 0.5; NaN is for the next rule
             exists = ~(block[MASKS][:, 0] < block[MASKS][:, 1])
         for name, values in block.items():
-            usable = _finite(name, values)
+            usable = np.isfinite(values) | (values == np.inf) if name == "opacity_logits" else np.isfinite(values)
             if not usable.all():  # which is far faster than by rows
                 finite &= usable.reshape(len(usable), -1).all(1)
-        kept = keep[start : start + ROWS]
-        for reason, rule in zip(dropped, (exists, finite, _rotated(block["quats"])), strict=True):
+        with np.errstate(over="ignore", invalid="ignore"):
+            length = np.sqrt(np.square(block["quats"]).sum(1))  # that rasterizers divide by
+        kept, rotated = keep[start : start + ROWS], (length >= QUAT_MIN) & (length <= QUAT_MAX)
+        for reason, rule in zip(dropped, (exists, finite, rotated), strict=True):
             dropped[reason] += int((kept & ~rule).sum())
             kept &= rule
     return keep, {reason: lost for reason, lost in dropped.items() if lost}
-
-
-def _finite(name: str, values: np.ndarray) -> np.ndarray:
-    """Whether values are finite, or the +inf of a full opacity."""
-    return np.isfinite(values) | (values == np.inf) if name == "opacity_logits" else np.isfinite(values)
-
-
-def _rotated(quats: np.ndarray) -> np.ndarray:
-    """``[N]`` bool, whether the quaternions ``[N, 4]`` float32 have a length that rasterizers can divide by."""
-    from clod_adapter._kernels import QUAT_MAX, QUAT_MIN  # here: a header is checked without numba
-
-    with np.errstate(over="ignore", invalid="ignore"):
-        length = np.sqrt(np.square(quats).sum(1))
-    return (length >= QUAT_MIN) & (length <= QUAT_MAX)
 
 
 def arrays_of(path: Path, gaussians: Gaussians) -> Arrays:
     """The float32 arrays of ``Gaussians.tensors``; refuses values that ``load`` would drop."""
     tensors = gaussians.tensors()
     arrays = {name: tensor.detach().float().cpu().contiguous().numpy() for name, tensor in tensors.items()}
-    for name, array in arrays.items():
-        if not _finite(name, array).all():
-            raise ClodError(f"{path}: {name} holds a value that is not finite; drop such rows first, as load does")
-    if not _rotated(arrays["quats"]).all():
-        raise ClodError(f"{path}: a {_UNROTATED}; drop such rows first, as load does")
+    if dropped := _usable(arrays)[1]:
+        raise ClodError(f"{path}: {', '.join(dropped)}; drop such rows first, as load does")
     return arrays
 
 

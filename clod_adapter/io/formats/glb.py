@@ -68,9 +68,6 @@ def write(path: Path, gaussians: Gaussians, metadata: Metadata) -> tuple[str, ..
     }
     columns |= {name: np.ascontiguousarray(arrays["shN"][:, k]) for k, name in enumerate(harmonics(degree)[1:])}
     columns |= {DIAL[name]: arrays[name] for name in dial_columns(arrays)}
-    size = sum(array.nbytes for array in columns.values())
-    if size >= _LIMIT - (1 << 20):
-        raise ClodError(f"{path}: {size:,} bytes are more than a .glb can hold; keep fewer Gaussians or write a .ply")
     accessors, views, offset = dict[str, dict[str, Any]](), list[dict[str, Any]](), 0
     for name, array in columns.items():
         kind = "SCALAR" if array.ndim == 1 else f"VEC{array.shape[1]}"
@@ -105,6 +102,8 @@ def write_points(
     }  # fmt: skip
     attributes, used = {name: index for index, name in enumerate(accessors)}, [EXTENSION, *(extensions or {})]
     size = sum(memoryview(part).nbytes for part in parts)
+    if size >= _LIMIT - (1 << 20):
+        raise ClodError(f"{path}: {size:,} bytes are more than a .glb can hold; keep fewer Gaussians or write a .ply")
     gltf = {
         "asset": {"version": "2.0", "generator": f"clod-adapter {package_version()}", **asset},
         "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0, **node}],

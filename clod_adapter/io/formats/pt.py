@@ -78,8 +78,7 @@ def read(path: Path, data: bytes) -> Source:
     wanted = (*NAMES, *dial_columns(splats))
     arrays = {NAMES.get(name, name): _values(path, name, splats, len(data)) for name in wanted}
     metadata = parse_metadata(path, checkpoint.get(KEY), dial=SIGMA in arrays)
-    notes = () if metadata.described else (FRAME,)
-    return Source(arrays, metadata, notes, metadata.about, not metadata.described)
+    return Source(arrays, metadata, () if metadata.described else (FRAME,), metadata.about, not metadata.described)
 
 
 def _values(path: Path, name: str, splats: dict[str, Any], size: int) -> np.ndarray:

@@ -40,11 +40,10 @@ def read(path: Path, data: bytes) -> Source:
     if not data or len(data) % _ROW.itemsize:
         raise ClodError(f"{path}: {len(data)} bytes are not a .splat file, whose rows have 32; copy or export it again")
     rows = np.frombuffer(data, _ROW)
-    rgba = rows["rgba"].astype(np.float32)
     arrays = {
         "means": rows["means"].copy(), "log_scales": values.logs_of(rows["scales"]),
         "quats": (rows["quats"].astype(np.float32) - 128) / 128,
         "opacity_logits": values.logits_of_bytes(rows["rgba"][:, 3]), "shN": np.zeros((len(rows), 0, 3)),
-        "sh0": ((rgba[:, None, :3] / 255) - 0.5) / SH_C0,
+        "sh0": ((rows["rgba"][:, None, :3].astype(np.float32) / 255) - 0.5) / SH_C0,
     }  # fmt: skip
     return Source(arrays, Metadata(), (QUANTISED,))

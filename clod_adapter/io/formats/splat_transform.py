@@ -83,9 +83,8 @@ class SplatTransform:
         A Path is made absolute, to be no option and no address. ``progress`` is called with the seconds so far.
         """
         given = [str(word.absolute()) if isinstance(word, Path) else word for word in words]
-        command = [*self.command, "-w", *(() if self.gpu else ON_CPU), *given]
         began = time.perf_counter()
-        process = subprocess.Popen(command, **_TEXT)
+        process = subprocess.Popen([*self.command, "-w", *(() if self.gpu else ON_CPU), *given], **_TEXT)
         try:
             output = None
             while output is None:

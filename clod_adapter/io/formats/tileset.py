@@ -53,8 +53,7 @@ def write_tileset(
         box = {"box": _box(centres, rows, origin)}
         found: dict[str, Any] = {"boundingVolume": box, "geometricError": errors[level]}
         if len(rows[level]):
-            gaussians = levels[level].select(torch.from_numpy(rows[level]))
-            notes.extend(write_tile(folder / name, gaussians, origin))
+            notes.extend(write_tile(folder / name, levels[level].select(torch.from_numpy(rows[level])), origin))
             found["content"] = {"uri": name}
         return found | ({"children": children} if children else {})
 
