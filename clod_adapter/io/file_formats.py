@@ -78,7 +78,8 @@ def check_suffix(path: Path) -> None:
     if path.name.lower().endswith((".sog", ".compressed.ply")):
         raise ClodError(f"{path}: is written by clod-adapt export alone: save a .ply, then clod-adapt export it")
     if path.suffix.lower() not in WRITABLE:
-        raise ClodError(f"{path}: {path.suffix or 'no suffix'} is no format to write; choose of {', '.join(WRITABLE)}")
+        found = path.suffix or "no suffix"
+        raise ClodError(f"{path}: {found} is no format to write; choose one of {', '.join(WRITABLE)}")
 
 
 def check_written(path: Path) -> None:
@@ -101,14 +102,9 @@ def read_source(path: Path) -> Source:
 def write(
     path: str | Path, gaussians: Gaussians, metadata: Metadata | None = None, *, writer: Writer | None = None
 ) -> tuple[str, ...]:
-    """Writes Gaussians in the format of the name's suffix, whole or not at all, sigma_d in world units.
+    """Writes Gaussians in the format of the suffix, whole or not at all, sigma_d in world units; a line for each loss.
 
-    Args:
-        metadata: of these Gaussians; their dial and screen-space filter are taken from themselves.
-        writer: instead of the format's ``write``.
-
-    Returns:
-        One line for each loss.
+    ``metadata`` lacks their dial and screen-space filter; ``writer`` replaces the format's ``write``.
     """
     check_suffix(Path(path))
     form = format_of(Path(path))

@@ -172,9 +172,8 @@ def _chunks(path: Path, data: memoryview) -> tuple[dict[str, Any], memoryview]:
 
 def _find(path: Path, gltf: dict[str, Any]) -> list[tuple[int, dict[str, Any]]]:
     """The primitives with Gaussians, at least one, each after the number of its mesh."""
-    meshes = enumerate(gltf.get("meshes", []))
-    found = [(number, primitive) for number, mesh in meshes for primitive in mesh["primitives"]]
-    found = [(number, each) for number, each in found if EXTENSION in each.get("extensions", {})]
+    every = ((number, each) for number, mesh in enumerate(gltf.get("meshes", [])) for each in mesh["primitives"])
+    found = [(number, each) for number, each in every if EXTENSION in each.get("extensions", {})]
     if not found:
         raise ClodError(f"{path}: has no Gaussians ({EXTENSION}), so it is a mesh; give a checkpoint of Gaussians")
     first = found[0][1]
