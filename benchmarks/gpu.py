@@ -38,7 +38,7 @@ CHECKS = ("tests", "plush", "city")
 DIALS = (1.0, 3.0, 7.0)
 TESTS = (
     "tests/rasterizers", "tests/integrations/test_gsplat.py", "tests/test_consumers.py",
-    "tests/training/test_optimizer.py",
+    "tests/training/test_step.py",
 )  # fmt: skip
 
 

@@ -1,16 +1,25 @@
-"""Rendering with and without a dial; baking for one camera and for several, and the order of rows by extinction."""
+"""Rendering with and without a dial, baking, the order by extinction; calls that would draw or store something else."""
 
 import math
+import warnings
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 
-from clod_adapter import AttenuationConfig, ClodError, Gaussians, bake, detach, order_by_extinction, render, with_dial
+import gsplat_versions
+import inria_forks
+from backends import fresh_copy
+from clod_adapter import AttenuationConfig, ClodError, Gaussians, Hook, bake, order_by_extinction, render, save
+from clod_adapter.adapter import detach, with_dial
 from clod_adapter.equation.attenuation import attenuate, dial
 from clod_adapter.equation.distances import normalized_distances, viewpoint_of
 from clod_adapter.render import splat
-from scenes import camera, dialled, gaussians, ring
+from scenes import camera, dialled, gaussians, ring, scene
 
 FAINTEST = {"tau": 1 / 255, "cut": "hard"}  # what this drops, the rasterizer skips
 CONFIG = AttenuationConfig(**FAINTEST, scene_distance=3.0)
@@ -109,3 +118,80 @@ def test_bad_arguments_are_refused() -> None:
     }.items():
         with pytest.raises(ClodError, match=message):
             call()
+
+
+N, VIEW, DEFAULTS = 20, camera(24, 18), AttenuationConfig()
+MODEL = with_dial(gaussians(N, 1, 0), torch.ones(N), DEFAULTS, torch.ones(N))
+HOOK, WHOLE = Hook(MODEL.sigma_d, DEFAULTS, 2.0, MODEL.growth_d), torch.ones(N, dtype=torch.int64)
+Drawing = Callable[..., Any]
+
+
+@pytest.fixture
+def draws(monkeypatch: pytest.MonkeyPatch) -> dict[str, Drawing]:
+    """The drop-ins for gsplat and for Inria's rasterizer, and the renderer, called with arguments of the dial alone."""
+    given = {**scene(N, 1, 0), "opacities": MODEL.opacities}
+    colors, points = torch.cat([given.pop("sh0"), given.pop("shN")], 1), given["means"]
+    ours = fresh_copy(monkeypatch, "gsplat", "gsplat", gsplat_versions.module("1.5.3")).rasterization
+    fork = inria_forks.module("inria 2024")
+    of_inria = fresh_copy(monkeypatch, "inria", "diff_gaussian_rasterization", fork).GaussianRasterizer(
+        inria_forks.settings_of(fork.GaussianRasterizationSettings, VIEW)
+    )
+    views = {"viewmats": VIEW.viewmat[None], "Ks": VIEW.K[None], "width": VIEW.width, "height": VIEW.height}
+    rows = {"shs": colors, "scales": given["scales"], "rotations": given["quats"]}
+    return {
+        "gsplat": lambda **dial: ours(**{**given, "colors": colors, "sh_degree": 1} | views | dial),
+        "inria": lambda **dial: of_inria(
+            **{"means3D": points, "means2D": 0 * points, "opacities": given["opacities"][:, None], **rows} | dial
+        ),
+        "render": lambda **dial: render(gaussians(N, 1, 0), VIEW, **dial),
+    }
+
+
+@pytest.mark.parametrize("name", ["gsplat", "inria", "render"])
+def test_a_dial_value_without_a_dial_is_warned_of(draws: dict[str, Drawing], name: str) -> None:
+    with pytest.warns(
+        UserWarning, match="virtual_scale is 3, but there is no sigma_d: all .* drawn as they are"
+    ) as told:
+        draws[name](virtual_scale=3)
+    assert name == "inria" or told[0].filename == __file__  # torch calls Inria's
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        draws[name]()
+
+
+@pytest.mark.parametrize("name", ["gsplat", "inria"])
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"growth_d": MODEL.growth_d, "sigma_d": MODEL.sigma_d}, "growth_d needs sigma_d and attenuation"),
+        ({"growth_d": MODEL.growth_d, "attenuation": DEFAULTS}, "growth_d needs sigma_d and attenuation"),
+        ({"virtual_scale": -1}, "virtual_scale is -1, it must be at least 0"),
+        ({"sigma_d": MODEL.sigma_d, "opacities": WHOLE}, "opacities is torch.int64, it must be floating point"),
+        ({"sigma_d": WHOLE}, "sigma_d is torch.int64, it must be floating point"),
+    ],
+)
+def test_drop_ins_refuse(draws: dict[str, Drawing], name: str, given: dict[str, Any], message: str) -> None:
+    with pytest.raises(ClodError, match=message):
+        draws[name](**given)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: MODEL.replace(means=MODEL.means.long()), "Gaussians.means is torch.int64, it must be floating point"),
+        (lambda: MODEL.replace(opacity_logits=WHOLE), "Gaussians.opacity_logits is torch.int64"),
+        (lambda: HOOK(MODEL.means, WHOLE, VIEW.viewmat), "opacities is torch.int64"),
+        (lambda: HOOK(MODEL.means.long().numpy(), MODEL.opacities.numpy(), VIEW.viewmat), "means is torch.int64"),
+        *((partial(save, name, MODEL), f"{name}: {message}") for name, message in (
+            ("x.foo", ".foo is no format to write; choose one of .ply, .glb, "), ("x", "no suffix is no format"),
+            ("x.ksplat", ".ksplat is no format"), ("x.sog", "is written by clod-adapt export alone: save a .ply"),
+        )),
+    ],
+)  # fmt: skip
+def test_calls_are_refused(
+    call: Callable[[], Any], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ClodError, match=message):
+        call()
+    assert not list(tmp_path.iterdir())

@@ -1,29 +1,163 @@
-"""The pages agree with the code and the results, install lines work, and the site has no broken link.
-
-Fields are explained, and tables match the rows. Install lines work before a release too: they name other packages, or a
-checkout. The pages are installed. The site fetches nothing from other hosts, and its reference covers the code.
-"""
+"""Every command in the documentation parses, and runs unless its block states a reason; the pages agree with the code
+and the results, install lines work before a release too, and the site fetches nothing from other hosts."""
 
 import csv
 import json
 import re
 import runpy
+import shlex
+import shutil
 import sys
 import sysconfig
+import textwrap
 import tomllib
 from collections.abc import Iterator
+from contextlib import redirect_stdout
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
 import pytest
 from click.testing import CliRunner
 
 import clod_adapter
 from clod_adapter.cli import adapt
-from clod_adapter.cli.main import COMMANDS, main
+from clod_adapter.cli.main import COMMANDS, build_parser, main
 from clod_adapter.cli.shared import command
-from fences import FENCE, PAGES, ROOT
+from clod_adapter.config import AdaptConfig
+from formats import without_comments
+from runs import accepted
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = [ROOT / "README.md", ROOT / "examples" / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+FENCE = re.compile(r"^( *)(`{3,})(\w*)\n(.*?)^\1\2 *$", re.DOTALL | re.MULTILINE)
+
+
+class Block(NamedTuple):
+    """A fenced block; ``reason`` is that of ``<!-- not run: REASON -->`` above it, and empty if it is run."""
+
+    place: str
+    language: str  # of the fence; ``sh`` for the README's, which have none
+    text: str
+    reason: str
+
+    def commands(self) -> list[list[str]]:
+        """The words of each line of a shell block, without comments, continued lines put together."""
+        lines = self.text.replace("\\\n", " ").splitlines() if self.language in ("sh", "console") else []
+        return [words for line in lines if (words := shlex.split(line.removeprefix("$ "), comments=True))]
+
+
+def blocks(page: Path) -> list[Block]:
+    text = page.read_text(encoding="utf-8")
+    found = []
+    for match in FENCE.finditer(text):
+        marker = re.search(r"<!-- not run: ([^>]+?) -->\s*\Z", text[: match.start()])
+        language = match[3] or ("sh" if page.name == "README.md" else "")
+        place = f"{page.relative_to(ROOT)}:{text.count(chr(10), 0, match.start()) + 1}"
+        found.append(Block(place, language, textwrap.dedent(match[4]), marker[1] if marker else ""))
+    return found
+
+
+def spoken(page: Path, program: str) -> list[str]:
+    """Complete commands of a program with options, within sentences and in indented blocks."""
+    text = FENCE.sub("", page.read_text(encoding="utf-8"))
+    spans = [" ".join(span.split()) for span in re.findall(r"`([^`]+)`", text)]
+    lines = [line.strip() for line in text.splitlines() if line.startswith("    ")]
+    said = [each.partition("  #")[0].strip() for each in [*spans, *lines] if each.startswith(f"{program} ")]
+    return [each for each in said if " -" in each and "..." not in each]
+
+
+@pytest.fixture(scope="session")
+def desk(capture: Any, dialled: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """``scene/``, ``pretrained.ply``, ``pretrained_mask.ply`` (MaskGaussian's old layout), ``pretrained_clod.*``, and
+    ``demo/`` with the demo's file names."""
+    folder = tmp_path_factory.mktemp("desk")
+    shutil.copytree(capture.scene, folder / "scene")
+    shutil.copyfile(capture.ply, folder / "pretrained.ply")
+    masks = {"masks_0": np.where(np.arange(len(capture.gaussians)) % 10 == 0, -4, 4), "masks_1": 0}
+    without_comments(folder / "pretrained.ply", **masks).rename(folder / "pretrained_mask.ply")
+    for suffix in (".ply", ".safetensors", ".json"):
+        shutil.copyfile(dialled.with_suffix(suffix), folder / f"pretrained_clod{suffix}")
+    shutil.copytree(capture.scene, folder / "demo" / "capture")
+    shutil.copyfile(capture.ply, folder / "demo" / "base.ply")
+    shutil.copyfile(dialled, folder / "demo" / "gallery.ply")
+    return folder
+
+
+IDS = [str(page.relative_to(ROOT)) for page in PAGES]
+LANGUAGES = {"sh", "console", "python", "text", "json", "glsl", "wgsl", "html", "css", "js"}
+STEPS = 20  # of a training that the pages run, at most
+# Commands that are not run: two change the environment that the tests run in, and one takes a minute (test_demo.py).
+SKIPPED = ("pip", "make", "clod-adapt demo")
+
+
+@pytest.mark.usefixtures("without_splat_transform")
+@pytest.mark.parametrize("page", PAGES, ids=IDS)
+def test_blocks_run_in_the_order_of_the_page(page: Path, desk: Path, tmp_path: Path, monkeypatch: Any) -> None:
+    """Training is shortened."""
+    shutil.copytree(desk, tmp_path, dirs_exist_ok=True)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(clod_adapter, "AdaptConfig", short)
+    names: dict[str, Any] = {"__name__": "__main__"}
+    for block in blocks(page):
+        assert block.language in LANGUAGES, f"{block.place}: {block.language or 'no language'}; text is not run"
+        if block.reason:
+            continue
+        try:
+            if block.language == "python":
+                exec(compile(block.text, block.place, "exec"), names)
+            for words in block.commands():
+                if not " ".join(words).startswith(SKIPPED):
+                    monkeypatch.setattr(sys, "argv", words[1:])
+                    run(words)
+        except (Exception, SystemExit) as error:
+            pytest.fail(f"{block.place}: {error}")
+
+
+def short(**settings: Any) -> AdaptConfig:
+    """Settings of a Python block."""
+    config = AdaptConfig(**settings)
+    return replace(config, iters=min(config.steps, STEPS))
+
+
+def run(words: list[str]) -> None:
+    """Runs a command of a shell block in the current folder."""
+    words, out = (words[:-2], Path(words[-1])) if ">" in words else (words, Path("said.txt"))
+    assert words[0] in ("clod-adapt", "python"), f"{words[0]}: not known; mark the block with <!-- not run: REASON -->"
+    with out.open("w", encoding="utf-8") as stream, redirect_stdout(stream):
+        if words[0] == "python":
+            runpy.run_path(str(ROOT / words[1]), run_name="__main__")
+            return
+        if words[1] not in COMMANDS or words[1] == "robustness":
+            at = words.index("--iters") if "--iters" in words else len(words)
+            steps = min([STEPS, *map(int, words[at + 1 : at + 2])])
+            words = [*words[:at], "--iters", str(steps), *words[at + 2 :]]
+        code = main(accepted(words[1:]))
+    assert code == 0, f"{words}: exit code {code}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=IDS)
+def test_named_options_exist(page: Path) -> None:
+    """Also of commands that are not run; each reason for not running a block stands above it."""
+    written, text = blocks(page), page.read_text(encoding="utf-8")
+    said = [command.split() for command in spoken(page, "clod-adapt")]
+    for words in [*said, *(words for block in written for words in block.commands())]:
+        if words[0] == "clod-adapt":
+            words = words[1 : words.index(">")] if ">" in words else words[1:]
+            name = words[0] if words and words[0] in COMMANDS else ""
+            build_parser(name).parse_args(words[1:] if name else words)
+    shared = (ROOT / "benchmarks" / "common.py").read_text(encoding="utf-8")
+    for line in spoken(page, "python benchmarks/"):
+        script, *words = line.split()[1:]
+        source = (ROOT / script).read_text(encoding="utf-8") + shared
+        for option in re.findall(r"--[a-z][a-z-]*", " ".join(words)):
+            assert f'"{option}"' in source, f"{page.name}: {line}: no {option}"
+    for block in written:
+        assert not block.reason or len(block.reason.split()) >= 3, f"{block.place}: {block.reason}"
+    assert text.count("<!-- not run:") == sum(bool(block.reason) for block in written), page.name
+
 
 DOCS, RESULTS = ROOT / "docs", ROOT / "benchmarks" / "results"
 

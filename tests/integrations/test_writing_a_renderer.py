@@ -1,18 +1,108 @@
-"""The code and the defaults in docs/writing_a_renderer.md."""
+"""For authors of renderers: the page docs/writing_a_renderer.md, and the golden values of the shader functions."""
 
+import json
 import re
+from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import fields
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 
+import browser
 import clod_adapter
 import scenes
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.equation.attenuation import attenuate, growth_factors
 from clod_adapter.hook import Hook
+
+SHADERS = files("clod_adapter.integrations.shaders")
+STORED = json.loads(SHADERS.joinpath("golden.json").read_text(encoding="utf-8"))
+CALLS = {  # the golden rows of each function, and its call
+    "rows": "clodOpacity(a.x, a.y, a.z, a.w, b.x, b.y, b.z > 0.5)",
+    "scale_rows": "clodScale(a.x, a.y, a.z, a.w)",
+}
+
+# One vertex a row, its result caught by transform feedback.
+WEBGL = """([source, call, rows]) => {
+  const gl = document.createElement("canvas").getContext("webgl2"), program = gl.createProgram();
+  const vertex = `in vec4 a; in vec3 b; out float drawn;\n${source}\nvoid main() { drawn = ${call}; }`;
+  for (const [type, text] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, "void main() {}"]]) {
+    const shader = gl.createShader(type);
+    gl.shaderSource(shader, "#version 300 es\\nprecision highp float;\\n" + text);
+    gl.compileShader(shader);
+    gl.attachShader(program, shader);
+  }
+  gl.bindAttribLocation(program, 0, "a");
+  gl.bindAttribLocation(program, 1, "b");
+  gl.transformFeedbackVaryings(program, ["drawn"], gl.SEPARATE_ATTRIBS);
+  gl.linkProgram(program);
+  const log = gl.getAttachedShaders(program).map((shader) => gl.getShaderInfoLog(shader)).join();
+  if (!gl.getProgramParameter(program, gl.LINK_STATUS)) throw new Error(log);
+  gl.useProgram(program);
+  gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
+  gl.bufferData(gl.ARRAY_BUFFER, new Float32Array(rows.flat()), gl.STATIC_DRAW);
+  for (const [at, size] of [[0, 4], [1, 3]]) {
+    gl.enableVertexAttribArray(at);
+    gl.vertexAttribPointer(at, size, gl.FLOAT, false, 28, 16 * at);
+  }
+  gl.bindBufferBase(gl.TRANSFORM_FEEDBACK_BUFFER, 0, gl.createBuffer());
+  gl.bufferData(gl.TRANSFORM_FEEDBACK_BUFFER, 4 * rows.length, gl.STREAM_READ);
+  gl.enable(gl.RASTERIZER_DISCARD);
+  gl.beginTransformFeedback(gl.POINTS);
+  gl.drawArrays(gl.POINTS, 0, rows.length);
+  gl.endTransformFeedback();
+  const drawn = new Float32Array(rows.length);
+  gl.getBufferSubData(gl.TRANSFORM_FEEDBACK_BUFFER, 0, drawn);
+  if (gl.getError()) throw new Error("WebGL reports an error");
+  return Array.from(drawn);
+}"""
+
+
+def run(page: Any, shader: str, table: str) -> list[float]:
+    """The shader's result for every golden row of a table; rows are padded to seven inputs."""
+    source = SHADERS.joinpath(shader).read_text(encoding="utf-8")
+    inputs = len(STORED[table.replace("rows", "columns")]) - (2 if table == "rows" else 1)
+    rows = [[*map(float, row[:inputs]), *[0.0] * (7 - inputs)] for row in STORED[table]]
+    if shader.endswith("glsl"):
+        return list(page.evaluate(WEBGL, [source, CALLS[table], rows]))
+    inputs_of = "let a = vec4f(rows[at], rows[at + 1], rows[at + 2], rows[at + 3]);"
+    inputs_of += "let b = vec3f(rows[at + 4], rows[at + 5], rows[at + 6]);"
+    return [row[0] for row in browser.compute(page, source, f"{inputs_of} rows[at] = {CALLS[table]};", rows)]
+
+
+@pytest.fixture(scope="module")
+def page(chromium: Any) -> Iterator[Any]:
+    """A page from a secure place, as WebGPU needs it; nothing is fetched."""
+    with closing(chromium.new_page()) as page:
+        page.route("**/*", lambda route: route.fulfill(body="<!doctype html>", content_type="text/html"))
+        page.goto("http://127.0.0.1/")
+        yield page
+
+
+@pytest.mark.parametrize("shader", ["attenuation.glsl", "attenuation.wgsl"])
+def test_shaders_match_the_golden_values(page: Any, shader: str) -> None:
+    for got, row in zip(run(page, shader, "rows"), STORED["rows"], strict=True):
+        *_, faded, want = row
+        assert abs(got - want) <= STORED["tolerance"] * faded and (want > 0 or got == 0), (row, got)
+    for got, row in zip(run(page, shader, "scale_rows"), STORED["scale_rows"], strict=True):
+        assert abs(got - row[-1]) <= STORED["tolerance"] * row[-1], (row, got)
+
+
+def test_golden_values_match_the_equation() -> None:
+    """In float64, equal to rounding, since exp differs between processors."""
+    for opacity, sigma, distance, scale, eps, tau, soft, *want in STORED["rows"]:
+        config = AttenuationConfig(tau=tau, eps=eps, cut="soft" if soft else "hard", max_sv=1)
+        values = torch.tensor([[opacity], [sigma], [distance]], dtype=torch.float64)
+        found = attenuate(*values, scale, config, activated=True)
+        assert [float(found.opacities), float(found.drawn)] == pytest.approx(want, rel=1e-12, abs=1e-300)
+    for growth, distance, scale, reach, factor in STORED["scale_rows"]:
+        growth_d, d = torch.tensor([[growth], [distance]], dtype=torch.float64)
+        assert float(growth_factors(growth_d, d, scale, reach)) == pytest.approx(factor, rel=1e-12, abs=1e-300)
+
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = (ROOT / "docs" / "writing_a_renderer.md").read_text(encoding="utf-8")

@@ -1,4 +1,4 @@
-"""Outputs appear whole or not at all, and of two runs one writes."""
+"""Outputs appear whole or not at all, and of two runs one writes; names of files as text."""
 
 import os
 import stat
@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from clod_adapter._support.text import as_text, file_name
 from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import atomic_path, atomic_paths, output_lock, remove_leftovers
 
@@ -114,3 +115,22 @@ def test_lock_keeps_other_processes_out_until_its_own_is_killed(tmp_path: Path) 
     with output_lock(final):
         assert len(os.listdir(tmp_path)) == 1
     assert os.listdir(tmp_path) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("garden.ply", "garden.ply"),
+        ("gärten/日本.ply", "gärten/日本.ply"),
+        ("\udcc3\udca4.ply", "ä.ply"),  # under an ASCII locale
+        ("a\udcff.ply", "a\\xff.ply"),
+        ("ä\udcff\ud800.ply", "ä\\udcff\\ud800.ply"),
+    ],
+)
+def test_names_as_text(name: str, text: str) -> None:
+    assert as_text(name) == text and text.encode()
+
+
+def test_names_on_disk_and_in_errors() -> None:
+    assert os.fsencode(file_name("gärten/日本.ply")) == "gärten/日本.ply".encode()
+    assert str(ClodError("a\udcff.ply: is damaged\x1b[2J")) == "a\\xff.ply: is damaged [2J"

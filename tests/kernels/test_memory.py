@@ -1,10 +1,16 @@
-"""Recycled memory is not reused while a tensor, an array or an alias of it is alive, and then it is."""
+"""Threads of kernels and files, recycled memory, the cache of compiled kernels, and their failures."""
 
 import gc
+import os
+import subprocess
 import sys
+import threading
+import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,7 +18,47 @@ import pytest
 import torch
 from torch import Tensor
 
+from clod_adapter._kernels import threads
 from clod_adapter._kernels.memory import IDLE, recycled, recycled_array, release
+from clod_adapter._support.workers import in_order, shared
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def test_disabled_compilation_is_an_error(capture: Any, tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "clod_adapter", str(capture.ply), "--out", str(tmp_path / "dial.ply")]
+    environment = os.environ | {"NUMBA_DISABLE_JIT": "1"}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 2 and os.listdir(tmp_path) == []
+    last = done.stderr.splitlines()[-1]
+    assert last == "clod-adapt: error: NUMBA_DISABLE_JIT is set, and the kernels run compiled only; unset it"
+
+
+def test_cache_survives_full_disks_and_processes_killed_while_writing(tmp_path: Path) -> None:
+    """A process prints the result of a kernel for ``[1.0]``, 1 + its version, of which the stamp tells."""
+
+    def printed(version: int, before: str = "") -> str:
+        (tmp_path / "sums.py").write_text(
+            "from clod_adapter._kernels import compiling\n"
+            f"VERSION, compiling._STAMP = {version}.0, '{version}'\n"
+            "@compiling.kernel\n"
+            "def f(x):\n"
+            "    return x[0] + VERSION\n"
+        )
+        os.utime(tmp_path / "sums.py", (0, 0))  # Numba's own stamp of the file
+        code = f"import sums, os, numpy\n{before}\nprint(sums.f(numpy.ones(1)))"
+        paths = map(str, (tmp_path, os.environ.get("PYTHONPATH", ""), ROOT))
+        environment = os.environ | {
+            "NUMBA_CACHE_DIR": str(tmp_path / "cache"), "PYTHONDONTWRITEBYTECODE": "1",
+            "PYTHONPATH": os.pathsep.join(paths),
+        }  # fmt: skip
+        done = subprocess.run([sys.executable, "-c", code], env=environment, text=True, stdout=-1, check=False)
+        return done.stdout.strip()
+
+    assert printed(1) == "2.0"
+    assert printed(5, "os.replace = lambda *a: os._exit(9)") == ""
+    assert printed(5, "def full(*_): raise OSError(28, 'No space left on device')\nos.replace = full") == "6.0"
+
 
 SHAPE = (120, 160, 3)
 HOLDERS: dict[str, Callable[[Tensor], Any]] = {
@@ -78,3 +124,47 @@ def test_threads_never_get_the_same_memory() -> None:
             list(pool.map(work, range(4)))
     finally:
         sys.setswitchinterval(before)
+
+
+def test_results_come_in_order() -> None:
+    def late(number: int) -> tuple[int, int]:
+        time.sleep(0.01 * (number % 3))
+        return number, threading.get_ident()
+
+    found = list(in_order([partial(late, number) for number in range(20)], 3))
+    assert [number for number, _ in found] == list(range(20)) and len({thread for _, thread in found}) == 3
+    assert list(in_order([], 3)) == []
+
+
+def test_an_error_is_raised_after_started_calls_end() -> None:
+    done, asked = [], []
+
+    def call(number: int) -> None:
+        if number == 1:
+            raise ValueError("one")
+        time.sleep(0.05)
+        done.append(number)
+
+    with pytest.raises(ValueError, match="one"):
+        list(in_order((asked.append(k) or partial(call, k) for k in range(100)), 2))
+    assert set(done) <= set(asked) - {1} and len(asked) < 10
+    count = len(done)
+    time.sleep(0.1)
+    assert len(done) == count
+
+
+def test_kernels_run_again_after_threads_were_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    def kernel(worker: int, count: int, out: torch.Tensor) -> None:
+        out[worker] = count
+
+    def refuse(_: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    shared.cache_clear()
+    with monkeypatch.context() as patch:
+        patch.setattr(threading.Thread, "start", refuse)
+        for run in (lambda: threads.run(kernel, 3, torch.zeros(3)), lambda: list(in_order([int], 2))):
+            with pytest.raises(MemoryError, match="a thread cannot be started: too little memory"):
+                run()
+    threads.run(kernel, 3, out := torch.zeros(3))
+    assert out.tolist() == [3, 3, 3]

@@ -1,4 +1,4 @@
-"""Compiled functions against plain ones in float64: the elementary functions, and the count term."""
+"""Compiled functions against plain ones in float64: the elementary functions, the count term, the losses."""
 
 import math
 
@@ -8,11 +8,14 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numba import njit
+from torch import Tensor
 
 from backends import torch_threads
+from clod_adapter import losses
 from clod_adapter._kernels.elementary import exp2, log2
 from clod_adapter._kernels.simd import load, store
 from clod_adapter.config import AdaptConfig, AttenuationConfig
+from clod_adapter.losses import photometric_loss
 from clod_adapter.training.target_count import TargetShare, count_gradient
 
 CONFIG = AdaptConfig(max_sv=7.0)
@@ -63,3 +66,79 @@ def test_errors_of_exp2_and_log2() -> None:
         elementary(function, x, found)
         errors, units = np.abs(found - want), np.spacing(np.abs(want).astype(np.float32))
         assert (errors / want < 3e-7).all() if function == 0 else (errors - 1.5 * units < 1e-7).all()
+
+
+# Smaller than the window of 11, one larger, multiples of 16 and not.
+SIZES = [(1, 1), (3, 7), (11, 11), (12, 16), (33, 50), (17, 101)]
+
+
+def pair(height: int, width: int, seed: int = 0) -> tuple[Tensor, Tensor]:
+    """A smooth photograph with black and white parts, and a render of it that also leaves [0, 1]."""
+    g = torch.Generator().manual_seed(seed)
+    y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    waves = torch.sin(x[..., None] / torch.tensor([3.0, 5.0, 9.0]) + y[..., None] / 4)
+    clean = (0.5 + 0.8 * waves).clamp(0, 1)
+    target = (clean * 255).round().to(torch.uint8)
+    image = clean + 0.1 * torch.randn(height, width, 3, generator=g)
+    image[:, : width // 4] = clean[:, : width // 4].round()  # exactly the photograph where it is black
+    return image, target
+
+
+def value_and_gradient(function, image: Tensor, target: Tensor, weight: float) -> tuple[Tensor, Tensor]:
+    leaf = image.clone().requires_grad_()
+    loss = function(leaf, target, weight)
+    (gradient,) = torch.autograd.grad(loss, leaf)
+    return loss.detach(), gradient
+
+
+@pytest.mark.parametrize(("size", "weight"), [(size, (0.0, 0.2, 1.0)[k % 3]) for k, size in enumerate(SIZES)])
+def test_fused_loss_matches_the_plain_loss(size: tuple[int, int], weight: float) -> None:
+    """In float32, against float64: the value within 2e-6, the gradient within 1e-4 of its length."""
+    image, target = pair(*size)
+    loss, gradient = value_and_gradient(photometric_loss, image, target, weight)
+    want, expected = value_and_gradient(photometric_loss, image.double(), target, weight)
+    assert loss.dtype == torch.float32 and loss.shape == () and gradient.shape == image.shape
+    assert abs(loss.item() - want.item()) <= 2e-6
+    # |x| has no slope at 0, where float32 may see a difference that float64 does not.
+    clear = ((image.double() - target.double() / 255).abs() > 1e-6) | (image == 0)
+    error = (gradient.double() - expected)[clear].norm().item()
+    assert error <= 1e-4 * expected.norm().item()
+
+
+def test_threads_and_strides_change_nothing() -> None:
+    image, target = pair(33, 50)
+    want = value_and_gradient(photometric_loss, image, target, 0.2)
+    for count in (1, 3):
+        with torch_threads(count):
+            loss, gradient = value_and_gradient(photometric_loss, image, target, 0.2)
+        torch.testing.assert_close(loss, want[0], rtol=1e-6, atol=0)
+        assert torch.equal(gradient, want[1])
+    wide, turned = torch.stack([image, image * 0], -1)[..., 0], target.transpose(0, 1).contiguous().transpose(0, 1)
+    assert all(map(torch.equal, value_and_gradient(photometric_loss, wide, turned, 0.2), want))
+    _, scaled = value_and_gradient(lambda *a: 8 * photometric_loss(*a), image, target, 0.2)
+    assert torch.equal(scaled, 8 * want[1])
+
+
+@pytest.mark.parametrize(("size", "darker"), [(size, (1, 40)[k % 2]) for k, size in enumerate(SIZES)])
+def test_training_and_report_metrics_agree(size: tuple[int, int], darker: int) -> None:
+    image, target = pair(*size)
+    target = target // darker
+    shown, photo = image.clamp(0, 1), target / 255
+    value, similarity = losses.psnr_ssim(image.requires_grad_(), target)
+    assert value == pytest.approx(losses.psnr(image, target), rel=1e-6)
+    fused = 1 - losses.photometric_loss(shown, target, 1.0).item()
+    plain = losses.ssim_plain(shown.double(), photo.double()).item()
+    assert similarity == pytest.approx(fused, abs=1e-5) and similarity == pytest.approx(plain, abs=1e-5)
+
+
+@pytest.mark.parametrize("function", [losses.psnr, lambda *given: losses.psnr_ssim(*given)[0]])
+def test_psnr_of_known_images(function) -> None:
+    black = torch.zeros(12, 12, 3, dtype=torch.uint8)
+    assert function(torch.full((12, 12, 3), 0.5), black) == pytest.approx(20 * math.log10(2), abs=1e-6)
+    image = torch.zeros(12, 12, 3)
+    assert function(image, black) == math.inf
+    image[3, 4, 1] = math.nan
+    assert math.isnan(function(image, black))
+    stripes = torch.tensor([0, 255], dtype=torch.uint8).repeat(6, 3)[..., None].expand(6, 6, 3).contiguous()
+    beyond = torch.where(stripes > 0, 7.0, -3.0)  # renders are clamped first
+    assert function(beyond, stripes) == math.inf and losses.psnr_ssim(beyond, stripes)[1] == pytest.approx(1, abs=1e-6)

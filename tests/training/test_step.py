@@ -1,0 +1,210 @@
+"""What a step is made of: views and dial values of the schedule, the target-count curve, and Adam on some rows."""
+
+import dataclasses
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from clod_adapter import View
+from clod_adapter.config import AdaptConfig, AttenuationConfig
+from clod_adapter.equation.attenuation import attenuate
+from clod_adapter.training.optimizer import RowAdam
+from clod_adapter.training.paper import paper_count, soft_count
+from clod_adapter.training.schedule import OURS, PAPER, Schedule, ViewSampler
+from clod_adapter.training.target_count import TEMPERATURE, count_gradient, count_slope, target_curve, target_share
+from scenes import capture
+
+VIEWS = capture(n=20)[1].train
+
+
+def assert_uniform(values: torch.Tensor) -> None:
+    """In [0, 1], and more evenly than random numbers would be."""
+    values = values.sort().values.double()
+    assert (values - torch.linspace(0, 1, len(values))).abs().max() < 3 / len(values)
+
+
+def test_dial_values_follow_the_schedule() -> None:
+    """1, or 0, in a falling share of the steps, else (log-)uniform from 1 on; in every stretch."""
+
+    def drawn(schedule: Schedule, share_done: float = 0.0, tau: float | None = None) -> torch.Tensor:
+        sampler = ViewSampler(VIEWS, AdaptConfig(max_sv=4.0), tau, schedule)
+        samples = [sampler.draw(k, share_done) for k in range(480)]
+        names = [sample.view.camera.name for sample in samples]  # each view once a round
+        assert all(len({*names[k : k + len(VIEWS)]}) == len(VIEWS) for k in range(0, 480, len(VIEWS)))
+        return torch.tensor([sample.dial for sample in samples], dtype=torch.float64)
+
+    for stretch in drawn(Schedule(full=0.25)).split(120):
+        assert abs(int((stretch <= 1).sum()) - 30) <= 1 and abs(int((stretch == 0).sum()) - 7.5) <= 1
+        assert_uniform(stretch[stretch > 1].log() / math.log(OURS.rendered * 4.0))
+    assert_uniform((drawn(PAPER) - 1) / 3)
+    assert abs(int((drawn(Schedule(full=0.5, full_final=0.5), 0.5) <= 1).sum()) - 0.375 * 480) <= 1
+    assert ViewSampler(VIEWS, AdaptConfig(max_sv=1.0)).draw(0, 0.0)[1:] == (1.0, None, False)
+    assert drawn(Schedule(full=0.0), tau=0.2).max() < (4 + 1 / 0.2) / 2  # at 5 nothing is kept
+
+
+def test_first_steps_have_photographs_of_half_the_size() -> None:
+    """Unless these would be small, or the step is at s = 1."""
+    camera = replace(VIEWS[0].camera, width=301, height=258, K=torch.tensor([[90.0, 0, 150], [0, 90, 129], [0, 0, 1]]))
+    image = torch.randint(256, (258, 301, 3), generator=torch.Generator().manual_seed(0)).byte()
+    large, small = View(camera, image), View(replace(camera, height=255), image[:255])
+    cases = ((large, 0.49, 0.0, True), (large, 0.5, 0.0, False), (small, 0.0, 0.0, False), (large, 0.0, 1.0, False))
+    for view, share_done, full, expected in cases:
+        schedule = Schedule(coarse=0.5, full=full)
+        sample = ViewSampler((view,), AdaptConfig(), None, schedule).draw(0, share_done)
+        assert sample.halved == expected and (sample.view is view) != expected
+
+
+CONFIG = AdaptConfig(max_sv=6.0)
+ATTENUATION = CONFIG.attenuation(1.0)
+N = 2000
+
+
+def some(seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
+    """Opacity logits, log sigma_d and normalised distances."""
+    generator = torch.Generator().manual_seed(seed)
+    logits, log_sigma, d = (torch.randn(N, generator=generator) for _ in range(3))
+    return 2 * logits + 1, log_sigma * 0.8, (0.3 * d).exp()
+
+
+def gradient(logits: Tensor, log_sigma: Tensor, d: Tensor, s: float, **changes: float) -> Tensor:
+    config = dataclasses.replace(CONFIG, **changes)
+    return count_gradient(d, logits, log_sigma.exp(), s, ATTENUATION, 0.1, config, target_share(s, N, config))
+
+
+def test_count_gradient_penalises_excess_and_deficit() -> None:
+    """The gradient is that of the squared excess; it is 0 for a single remaining Gaussian."""
+    logits, log_sigma, d = some()
+    many, few = log_sigma + 3, log_sigma - 2
+    for s in (1.5, 6.0):
+        dialled = attenuate(logits, log_sigma.exp(), d, s, ATTENUATION)
+        slope = count_slope(logits, dialled.log_opacities, s, ATTENUATION.tau, TEMPERATURE)
+        share = target_curve(s, CONFIG.share, CONFIG.exponent)
+        excess = float(dialled.keep.float().mean()) / share - 1
+        want = 0.1 * 2 * CONFIG.reg_weight * excess / share * slope
+        torch.testing.assert_close(gradient(logits, log_sigma, d, s), want)
+        assert gradient(logits, many, d, s).max() > 0 >= -gradient(logits, many, d, s).min()
+        assert gradient(logits, few, d, s).min() < 0 and gradient(logits, few, d, s).max() <= 0
+        assert (gradient(logits, log_sigma, d, s, reg_weight=0.0) == 0).all()
+    one, target = torch.ones(1), target_share(5.0, 1, CONFIG)
+    assert attenuate(4 * one, 5 * one, one, 5.0, ATTENUATION).keep.all()
+    assert count_gradient(one, 4 * one, 5 * one, 5.0, ATTENUATION, 1.0, CONFIG, target).item() == 0
+    # Where a'' is 0 at every dial value nothing else has a slope: at the floor that training has, and at 0.
+    for gone in (-9.2, -100.0):
+        assert (gradient(logits, torch.full((N,), gone), d, 2.0) < 0).all()
+    mixed = torch.where(torch.arange(N) % 2 == 0, 5.0, -9.2)  # half are kept, where the curve at s = 6 has 7 %
+    assert (gradient(logits, mixed, d, 6.0) >= 0).all() and (gradient(logits, mixed, d, 6.0)[1::2] < 1e-20).all()
+
+
+def test_count_slope_is_that_of_the_soft_count() -> None:
+    """Where 2 u > 1; below, 2 u counts as 1, so that Gaussians without attenuation have a gradient."""
+    tau, s, temperature = 0.02, 2.0, 0.5
+    logits = torch.linspace(-5, 5, 200, dtype=torch.float64)
+    d, log_sigma = torch.linspace(0.1, 1, 200, dtype=torch.float64), torch.linspace(-1, 2, 200, dtype=torch.float64)
+    log_sigma = log_sigma[torch.randperm(200, generator=torch.Generator().manual_seed(0))].requires_grad_()
+    out = attenuate(logits, log_sigma.exp(), d, s, AttenuationConfig(tau=tau, eps=0.0))
+    (want,) = torch.autograd.grad(soft_count(out.log_opacities, s, tau, temperature), log_sigma)
+    logs = out.log_opacities.detach()
+    got = count_slope(logits, logs, s, tau, temperature)
+    touched = 2 * (torch.nn.functional.logsigmoid(logits) - logs)
+    assert 20 < int((touched > 1).sum()) < 180
+    torch.testing.assert_close(got[touched > 1], want[touched > 1])
+    q = torch.sigmoid((logs - math.log(tau * s)) / temperature)
+    torch.testing.assert_close(got[touched <= 1], (q * (1 - q) / (temperature * 200))[touched <= 1])
+
+
+@pytest.mark.parametrize("form", ["ours", "paper"])
+def test_shares_count_gaussians_that_are_left_out(form: str) -> None:
+    """Gaussians left out because they are never drawn count as culled."""
+    logits, log_sigma, d = some()
+    logits[40:65], found, s = -40.0, [], 3.0
+    for count, total in ((65, None), (40, 65)):
+        sigma = log_sigma[:count].exp().requires_grad_()
+        dialled = attenuate(logits[:count], sigma, 0.1 * d[:count], s, ATTENUATION)
+        if form == "paper":
+            paper_count(dialled, s, ATTENUATION.tau, CONFIG, total).backward()
+            found.append(sigma.grad[:40])
+        else:
+            given = 0.1 * d[:count], logits[:count], sigma, s, ATTENUATION
+            found.append(count_gradient(*given, 0.3, CONFIG, target_share(s, count, CONFIG, total))[:40])
+    assert found[0].abs().max() > 0 and torch.allclose(*found, rtol=1e-5, atol=0)
+
+
+SHAPES = {"means": (3,), "quats": (4,), "opacity_logits": (), "sh0": (1, 3), "shN": (24, 3), "none": (0, 3)}
+TENTHS = dict.fromkeys(SHAPES, 0.1)
+
+
+class PlainRowAdam(RowAdam):
+    """RowAdam without the fused kernel."""
+
+    def _step_fused(self, gradients: dict[str, Tensor], rows: Tensor, rates: dict[str, float]) -> None:
+        self._step_plain(gradients, rows, rates)
+
+
+def parameters(n: int, seed: int = 0) -> dict[str, Tensor]:
+    g = torch.Generator().manual_seed(seed)
+    return {name: torch.randn(n, *shape, generator=g) for name, shape in SHAPES.items()}
+
+
+def gradients(n: int, seed: int) -> dict[str, Tensor]:
+    """Gradients over many orders of magnitude, with some zeros."""
+    g = torch.Generator().manual_seed(seed)
+    out = {}
+    for name, shape in SHAPES.items():
+        size = 10 ** (8 * torch.rand(n, *[1] * len(shape), generator=g) - 6)
+        out[name] = torch.randn(n, *shape, generator=g) * size * (torch.rand(n, *shape, generator=g) > 0.1)
+    return out
+
+
+def everything(n: int) -> Tensor:
+    return torch.ones(n, dtype=torch.bool)
+
+
+@pytest.mark.parametrize("kind", [RowAdam, PlainRowAdam])
+@pytest.mark.parametrize(
+    ("steps", "beta1", "beta2", "epsilon"), [(12, 0.9, 0.999, 1e-15), (90, 0.5, 0.8, 1e-2)],
+    ids=["defaults", "past the last bias correction that is stored, the 79th"],
+)  # fmt: skip
+def test_all_rows_match_torch_adam(
+    kind: type[RowAdam], steps: int, beta1: float, beta2: float, epsilon: float, n: int = 57
+) -> None:
+    """In units: the rates of rows are multiplied by them."""
+    ours, theirs = parameters(n), {name: p.requires_grad_() for name, p in parameters(n).items()}
+    units = torch.linspace(0.1, 2, n)
+    optimizer = kind(ours, beta1=beta1, beta2=beta2, epsilon=epsilon, units={"means": units})
+    adam = torch.optim.Adam(theirs.values(), lr=0.02, betas=(beta1, beta2), eps=epsilon)
+    for step in range(steps):
+        optimizer.step(gradients(n, step), everything(n), dict.fromkeys(SHAPES, 0.02))
+        for name, gradient in gradients(n, step).items():
+            theirs[name].grad = gradient
+        adam.step()
+    close = {"rtol": 1e-5, "atol": 1e-5} if steps > 12 else {"rtol": 2e-6, "atol": 2e-6}
+    for name, start in parameters(n).items():
+        moved = (theirs[name] - start).detach() * (units[:, None] if name == "means" else 1)
+        torch.testing.assert_close(ours[name], start + moved, **close)
+
+
+@pytest.mark.parametrize("kind", [RowAdam, PlainRowAdam])
+@pytest.mark.parametrize(("more", "filler"), [(0, torch.inf), (11, torch.nan)])
+def test_only_selected_rows_are_stepped(kind: type[RowAdam], more: int, filler: float, n: int = 40) -> None:
+    """Other rows keep every bit, and their gradients are ignored; so do rows behind a leading part."""
+    larger, alone = parameters(n + more), {name: value[:n] for name, value in parameters(n + more).items()}
+    larger["means"][5] = torch.nan
+    before = {name: value.clone().view(torch.int32) for name, value in larger.items()}
+    rows = torch.zeros(n, dtype=torch.bool)
+    rows[[31, 2, 17]] = True
+    own = {name: value[rows].clone() for name, value in alone.items()}
+    optimizers = kind({name: value[:n] for name, value in larger.items()}), kind(own)
+    for step in range(3):
+        given = {name: gradient + 1 for name, gradient in gradients(n, step).items()}
+        optimizers[1].step({name: value[rows] for name, value in given.items()}, everything(3), TENTHS)
+        for value in given.values():
+            value[~rows] = filler
+        optimizers[0].step(given, rows, TENTHS)
+        optimizers[0].step(given, torch.zeros_like(rows), TENTHS)  # of no rows
+    for name, value in larger.items():
+        bits, others = value.view(torch.int32), torch.cat([~rows, torch.ones(more, dtype=torch.bool)])
+        assert torch.equal(bits[others], before[name][others]), name  # in place
+        assert (bits[~others] != before[name][~others]).all() and torch.equal(value[~others], own[name]), name
