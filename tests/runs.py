@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 import torch.distributed as dist
@@ -19,9 +20,11 @@ import clod_adapter
 from clod_adapter import AdaptConfig, Progress
 from clod_adapter.training.state import TrainingState
 from clod_adapter.training.trainer import Trainer
+from scenes import stripped
 
 OUTPUTS = ["dial.json", "dial.ply", "dial.safetensors"]
 STATE = "dial.resume.safetensors"
+fail = Mock(side_effect=ZeroDivisionError("of ours"))
 
 # Imports everything once; a line on stdin starts a process, or asks whether or how one ended.
 SERVER = """
@@ -149,15 +152,23 @@ def log_of(folder: Path, rank: object = "") -> str:
     return Path(f"{folder}{rank}.log").read_text()
 
 
-def wait_for(path: Path) -> None:
+def results(folder: Path, name: str = "dial") -> dict[str, bytes]:
+    """The PLY and the adapter, without measured times."""
+    return {suffix: stripped((folder / f"{name}{suffix}").read_bytes()) for suffix in (".ply", ".safetensors")}
+
+
+def rebuilt(clod: Callable[..., Any], base: object, *more: str) -> bool:
+    """Whether ``apply`` gives ``dial.ply`` from its adapter, bit for bit."""
+    clod("apply", base, "dial.safetensors -o same.ply", *more)
+    return Path("same.ply").read_bytes() == Path("dial.ply").read_bytes()
+
+
+def wait_for(path: Path, text: str = "") -> None:
+    """Until the file exists and has this text."""
     until = time.monotonic() + 60
-    while not path.exists():
+    while not path.exists() or (text and text not in path.read_text()):
         assert time.monotonic() < until, f"{path} did not appear"
         time.sleep(0.002)
-
-
-def fail(*_: Any, **__: Any) -> Any:
-    raise ZeroDivisionError("of ours")
 
 
 def pressing(real: Callable[..., Any], *numbers: int, at: int = 1) -> Callable[..., Any]:

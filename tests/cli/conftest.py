@@ -1,11 +1,13 @@
 """Runs the command, in its own process or, faster, in this one."""
 
 import io
+import json
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import redirect_stderr, redirect_stdout
+from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import pytest
 
@@ -40,39 +42,48 @@ def shorter(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 class Done(NamedTuple):
-    code: int
+    """What a run printed."""
+
     out: str
     err: str
 
-
-def command(*words: object, accept: bool = True) -> Done:
-    """Runs ``clod-adapt`` with these words in this process; adapting ``accept``s its loss (``runs.accepted``)."""
-    out, err = io.StringIO(), io.StringIO()
-    with redirect_stdout(out), redirect_stderr(err):
-        try:
-            code = main(accepted(words) if accept else [str(word) for word in words])
-        except SystemExit as done:  # argparse, for --help
-            code = int(done.code or 0)
-    return Done(code, out.getvalue(), err.getvalue())
-
-
-@pytest.fixture
-def clod(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Done]:
-    """``command`` with the test's folder as the current one."""
-    monkeypatch.chdir(tmp_path)
-    return command
+    @property
+    def report(self) -> Any:
+        """The object of ``--json``."""
+        return json.loads(self.out)
 
 
 @pytest.fixture(scope="session")
-def run_in() -> Callable[..., Done]:
-    """``command`` in a folder, for fixtures that several tests share."""
+def run_in(capture: Any, dialled: Path) -> Callable[..., Done]:
+    """Runs ``clod-adapt`` in a folder, in this process, to the exit code ``code``; it ``accept``s its loss.
 
-    def run(folder: Path, *words: object, accept: bool = True) -> Done:
-        with pytest.MonkeyPatch.context() as patch:
+    Text is split into words, of which BASE, SCENE, DIAL and ADAPTER are the shared files.
+    """
+    places = (capture.ply, capture.scene, dialled, dialled.with_suffix(".safetensors"))
+    shared = dict(zip(("BASE", "SCENE", "DIAL", "ADAPTER"), places, strict=True))
+
+    def run(folder: Path, *words: object, code: int = 0, accept: bool = True) -> Done:
+        out, err = io.StringIO(), io.StringIO()
+        parts = [part for word in words for part in (word.split() if isinstance(word, str) else [word])]
+        given = [str(shared.get(part, part)) for part in parts]
+        with pytest.MonkeyPatch.context() as patch, redirect_stdout(out), redirect_stderr(err):
             patch.chdir(folder)
-            return command(*words, accept=accept)
+            try:
+                found = main(accepted(given) if accept else given)
+            except SystemExit as ended:  # argparse, for --help
+                found = int(ended.code or 0)
+        done = Done(out.getvalue(), err.getvalue())
+        assert found == code, done
+        return done
 
     return run
+
+
+@pytest.fixture
+def clod(run_in: Callable[..., Done], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Done]:
+    """``run_in`` with the test's folder, which is the current one."""
+    monkeypatch.chdir(tmp_path)
+    return partial(run_in, tmp_path)
 
 
 @pytest.fixture

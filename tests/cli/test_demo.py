@@ -1,6 +1,5 @@
 """``clod-adapt demo``, with a few steps on the tests' own capture; the scene of the package, and its pictures."""
 
-import json
 import shutil
 import signal
 from pathlib import Path
@@ -40,24 +39,23 @@ def test_demo(clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.Monke
     state = folder / "gallery.resume.safetensors"
     with monkeypatch.context() as patch:
         patch.setattr(listeners, "save_state", pressing(listeners.save_state, signal.SIGINT, signal.SIGTERM, at=2))
-        assert clod("demo", "--out=-odd").code == 130
+        clod("demo --out=-odd", code=130)
     with monkeypatch.context() as patch:
         patch.setattr(listeners, "package_version", lambda: "0.0.7")
-        done = clod("demo", "--out=-odd")
-    assert done.code == 2 and f"{state.relative_to(tmp_path)}: is of " in done.err, done
-    assert "delete it to start over" in done.err and "--resume" not in done.err and state.exists()
-    done = clod("demo", "--out=-odd", "--json")
-    assert done.code == 0 and json.loads(done.out)["resumed_from"] == 1 and not state.exists(), done
-    done = clod("demo", "--out=-odd")
-    assert f"everything is in {folder}" in done.out and "clod-adapt YOURS.ply" in done.out and done.code == 0, done
-    found = json.loads(clod("demo", "--out=-odd", "--quiet", "--json").out)
+        done = clod("demo --out=-odd", code=2)
+    assert f"{state.relative_to(tmp_path)}: is of " in done.err and "delete it to start over" in done.err, done
+    assert "--resume" not in done.err and state.exists()
+    assert clod("demo --out=-odd --json").report["resumed_from"] == 1 and not state.exists()
+    done = clod("demo --out=-odd")
+    assert f"everything is in {folder}" in done.out and "clod-adapt YOURS.ply" in done.out, done
+    found = clod("demo --out=-odd --quiet --json").report
     assert found["command"] == "demo" and found["folder"] == "-odd" and found["scene"] == "-odd/capture"
     assert found["pictures"] == {"dial": "-odd/dial.png", "curve": "-odd/curve.png"} and found["config"]["max_sv"] == 5
     made = {path.name for path in folder.iterdir()}
     assert made == {"capture", "base.ply", "gallery.ply", "gallery.safetensors", "gallery.json", *PICTURES}
     monkeypatch.setattr(adapt_run, "extract", pressing(adapt_run.extract, signal.SIGINT))  # nothing is measured
-    done = clod("demo", "--out=-odd", "--json")
-    assert done.code == 0 and json.loads(done.out)["pictures"] == {} and "no figures" in done.err
+    done = clod("demo --out=-odd --json")
+    assert done.report["pictures"] == {} and "no figures" in done.err
     assert not PICTURES & {path.name for path in folder.iterdir()}
 
 

@@ -6,7 +6,6 @@ One table for all commands: what is typed, what the line says, and the files tha
 import json
 import os
 import re
-import shlex
 import shutil
 import subprocess
 import sys
@@ -93,6 +92,7 @@ ERRORS = [
     # Arguments, and inputs that are none.
     ("--quiet", "arguments are required: PLY .*--help"),
     ("veiw base.ply", "veiw: no such file or command; did you mean clod-adapt view"),
+    ("veiw", "veiw: (?!.*did you mean)", "veiw"),
     ("missing.ply --images scene", "missing.ply: .*No such file.*check the path"),
     ("cut.ply --images scene", "cut.ply: .*truncated.*again"),
     ("a.hier --out x.ply", "Hierarchical-3DGS"),
@@ -163,21 +163,19 @@ ERRORS = [
 
 
 @pytest.mark.parametrize(("line", "said", "existing"), [(*row, "")[:3] for row in ERRORS])
-def test_errors(clod: Any, folder: Path, monkeypatch: pytest.MonkeyPatch, line: str, said: str, existing: str) -> None:
+def test_errors(run_in: Any, folder: Path, line: str, said: str, existing: str) -> None:
     """The line is the last one of stderr; with --json also the one object on stdout."""
-    monkeypatch.chdir(folder)
     with given(folder, existing):
-        refused(clod, folder, said, line)
+        refused(run_in, folder, said, line)
 
 
-def refused(clod: Any, folder: Path, said: str, line: str) -> None:
+def refused(run_in: Any, folder: Path, said: str, line: str) -> None:
     before = everything(folder)
-    done = clod(*shlex.split(line))
-    errors = [each for each in done.err.splitlines() if "error" in each]
-    assert done.code == 2 and len(errors) == 1 and errors[0] == done.err.splitlines()[-1], done
-    why = errors[0].removeprefix("clod-adapt: error: ")
-    assert why != errors[0] and re.search(said, why), done
-    assert (json.loads(done.out) == {"error": why, "code": 2}) if "--json" in line else done.out == "", done
+    done = run_in(folder, line, code=2)
+    (error,) = (each for each in done.err.splitlines() if "error" in each)
+    why = error.removeprefix("clod-adapt: error: ")
+    assert done.err.endswith(f"{error}\n") and why != error and re.search(said, why), done
+    assert (done.report == {"error": why, "code": 2}) if "--json" in line else done.out == "", done
     assert everything(folder) == before
 
 
@@ -196,29 +194,28 @@ def outputs_of(line: str) -> Outputs:
         (RENDER, RENDER, "out"), ("export dial.ply -o two.ply", "export dial.ply -o two.spz", ""),
     ],
 )  # fmt: skip
-def test_two_runs_at_once(
-    clod: Any, folder: Path, monkeypatch: pytest.MonkeyPatch, first: str, second: str, said: str
-) -> None:
+def test_two_runs_at_once(run_in: Any, folder: Path, monkeypatch: Any, first: str, second: str, said: str) -> None:
     monkeypatch.chdir(folder)
     with claimed(outputs_of(first)):
         if said:
-            refused(clod, folder, rf"^{said}: another run is writing it; wait for that", second)
+            refused(run_in, folder, rf"^{said}: another run is writing it; wait for that", second)
         else:
             with claimed(outputs_of(second)):
                 pass
 
 
-def test_earlier_outputs_are_replaced(clod: Any, capture: Any, dialled: Path, tmp_path: Path) -> None:
+def test_earlier_outputs_are_replaced(clod: Any, dialled: Path, tmp_path: Path) -> None:
     """And a foreign file, if the command line names it."""
     for suffix in (".safetensors", ".json"):
         shutil.copy(dialled.with_suffix(suffix), tmp_path / f"out{suffix}")
     (tmp_path / "out.ply").write_bytes(b"foreign, but named")
-    export = f"export {dialled} -o x"
-    for line in (
-        f"{capture.ply} --images SCENE --iters 2 --max-sv 2 -o out.ply",
-        *[f"render {dialled} --images SCENE -o pictures", f"{export}.safetensors", f"{export}.spz --levels 1,2"] * 2,
-    ):
-        assert (done := clod(*line.replace("SCENE", str(capture.scene)).split(), "--quiet")).code == 0, done
+    twice = (
+        "render DIAL --images SCENE -o pictures",
+        "export DIAL -o x.safetensors",
+        "export DIAL -o x.spz --levels 1,2",
+    )
+    for line in ("BASE --images SCENE --iters 2 --max-sv 2 -o out.ply", *twice, *twice):
+        clod(line, "--quiet")
 
 
 LIGHT = """

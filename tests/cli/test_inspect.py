@@ -5,16 +5,10 @@ from pathlib import Path
 from typing import Any
 
 
-def inspected(clod: Any, path: Path) -> tuple[str, Any]:
-    """The text and the JSON."""
-    text, told = clod("inspect", path), clod("inspect", path, "--json")
-    assert (text.code, text.err, told.code, told.err) == (0, "", 0, ""), (text, told)
-    return text.out, json.loads(told.out)
-
-
 def test_a_plain_file_fits_on_a_screen(clod: Any, capture: Any) -> None:
-    lines = inspected(clod, capture.ply)[0].splitlines()
-    assert len(lines) <= 24 and all(len(line) <= 120 for line in lines[1:])
+    done = clod("inspect BASE")
+    lines = done.out.splitlines()
+    assert len(lines) <= 24 and all(len(line) <= 120 for line in lines[1:]) and done.err == ""
     assert lines[0].startswith(f"{capture.ply} (") and lines[2].startswith("looks like   Inria's trainer")
     assert lines[3] == "Gaussians    300" and "dial         none: no sigma_d" in lines
     at = next(k for k, line in enumerate(lines) if line.split() == ["least", "1", "%", "median", "99", "%", "greatest"])
@@ -22,8 +16,8 @@ def test_a_plain_file_fits_on_a_screen(clod: Any, capture: Any) -> None:
     assert len({len(line) for line in lines[at : at + 6]}) == 1
 
 
-def test_a_dial_and_its_calibration(clod: Any, dialled: Path, tmp_path: Path) -> None:
-    text, report = inspected(clod, dialled)
+def test_a_dial_and_its_calibration(clod: Any, dialled: Path) -> None:
+    text, report = clod("inspect DIAL").out, clod("inspect DIAL --json").report
     lines = text.splitlines()
     assert "written by   clod-adapter" in text and "s = 1 to 4, soft culling" in text and len(lines) <= 32
     at = next(k for k, line in enumerate(lines) if "Gaussians" in line and "PSNR" in line)
@@ -36,13 +30,13 @@ def test_a_dial_and_its_calibration(clod: Any, dialled: Path, tmp_path: Path) ->
     assert splat["dial"]["attenuation"]["max_sv"] == 4 and len(splat["position"]) == 3
     told = json.loads(dialled.with_suffix(".json").read_text())
     assert splat["dial"]["calibration"] == told["calibration"]
-    assert clod("export", dialled, "--sv", 2, "-o", "baked.ply").code == 0
+    clod("export DIAL --sv 2 -o baked.ply")
     says = "\nsays         baked at s = 2 by clod-adapter for 8 training cameras\n"
-    assert says in inspected(clod, tmp_path / "baked.ply")[0]
+    assert says in clod("inspect baked.ply").out
 
 
-def test_adapter(clod: Any, dialled: Path) -> None:
-    text, report = inspected(clod, dialled.with_suffix(".safetensors"))
+def test_adapter(clod: Any) -> None:
+    text, report = clod("inspect ADAPTER").out, clod("inspect ADAPTER --json").report
     assert "an adapter" in text and "with SHA-256 " in text and "max_sv 4" in text and "\ngrowth_d " in text
     assert "\ndial         sigma_d and growth_d, s = 1 to 4" in text and len(report["about"]["growth"]) == 5
     assert report["about"]["updates"]["means"] == "float16 [300, 3]"

@@ -15,8 +15,7 @@ from clod_adapter.cli.adapt import listeners, run
 from clod_adapter.cli.shared import measure
 from clod_adapter.training import planner
 from clod_adapter.training.state import load_state
-from runs import OUTPUTS, STATE, Server, log_of, names, pressing, wait_for
-from scenes import stripped
+from runs import OUTPUTS, STATE, Server, log_of, names, pressing, results, wait_for
 
 ITERS = 24
 
@@ -51,8 +50,7 @@ def assert_whole(folder: Path) -> None:
 def assert_same(folder: Path, want: Path) -> None:
     """The same bits, except measured times, and no other files."""
     assert names(folder) == OUTPUTS, log_of(folder)
-    for name in OUTPUTS[1:]:
-        assert stripped((folder / name).read_bytes()) == stripped((want / name).read_bytes()), name
+    assert results(folder) == results(want)
     found, wanted = (json.loads((path / "dial.json").read_text()) for path in (folder, want))
     assert [row["psnr"] for row in found["rows"]] == [row["psnr"] for row in wanted["rows"]]
     assert found["steps"] == wanted["steps"] and not found["interrupted"]
@@ -83,8 +81,7 @@ def test_one_interrupt_of_training_writes_the_result_so_far(
     wait_for(tmp_path / STATE)
     os.kill(child, signal.SIGSTOP)
     before = contents(tmp_path / STATE)
-    done = clod(*words, "--resume")
-    assert done.code == 2 and "dial.ply: another run is writing it; wait" in done.err, done
+    assert "dial.ply: another run is writing it; wait" in clod(*words, "--resume", code=2).err
     assert contents(tmp_path / STATE) == before
     os.kill(child, signal.SIGINT)
     os.kill(child, signal.SIGCONT)
@@ -120,12 +117,11 @@ def test_signals_at_a_moment(
 ) -> None:  # fmt: skip
     """Warnings may be repeated, as launchers do; a second Ctrl-C or SIGTERM aborts."""
     monkeypatch.setattr(*place, pressing(getattr(*place), *numbers))
-    done = clod(*words, "--json", *(["--report"] if files == OUTPUTS else []))
-    assert done.code == code and names(tmp_path) == files, done
+    done = clod(*words, "--json --report" if files == OUTPUTS else "--json", code=code)
+    assert names(tmp_path) == files, done
     if code == 0:
-        report = json.loads(done.out)
-        assert report["interrupted"] == said and "page" not in report["outputs"]
-        assert bool(report["rows"]) == bool(report["calibration"]) == (place[1] != "extract")
+        assert done.report["interrupted"] == said and "page" not in done.report["outputs"]
+        assert bool(done.report["rows"]) == bool(done.report["calibration"]) == (place[1] != "extract")
     else:
         assert done.err.rstrip().endswith(str(said)), done
     assert signal.getsignal(INT) is signal.default_int_handler and signal.getsignal(TERM) is signal.SIG_DFL
@@ -137,15 +133,13 @@ def test_ignored_signals(clod: Any, words: list[Any], monkeypatch: pytest.Monkey
     monkeypatch.setattr(*SAVING, pressing(listeners.save_state, number))
     before = signal.signal(number, signal.SIG_IGN)
     try:
-        assert json.loads(clod(*words, "--json").out)["interrupted"] == (number == TERM)
+        assert clod(*words, "--json").report["interrupted"] == (number == TERM)
         assert signal.getsignal(number) is signal.SIG_IGN
     finally:
         signal.signal(number, before)
 
 
-def test_interrupts_of_the_measurement(
-    clod: Any, words: list[Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_interrupts_of_the_measurement(clod: Any, words: list[Any], tmp_path: Path, monkeypatch: Any) -> None:
     """The first one keeps the finished rows; one after an interrupt of training aborts, as its message says."""
     real = measure.evaluate
 
@@ -154,14 +148,14 @@ def test_interrupts_of_the_measurement(
         return real(gaussians, views, dials, progress=pressed if len(dials) == 5 else progress, **rest)
 
     monkeypatch.setattr(measure, "evaluate", evaluate)
-    report = json.loads((done := clod(*words, "--json")).out)
-    assert done.code == 0 and [row["virtual_scale"] for row in report["rows"]] == [1, 1.5, 2]
+    report = (done := clod(*words, "--json")).report
+    assert [row["virtual_scale"] for row in report["rows"]] == [1, 1.5, 2]
     assert "measurements were interrupted" in report["notes"][0] in done.err and report["interrupted"] is False
     assert report["calibration"] is None and clod_adapter.load(tmp_path / "dial.ply").calibration is None
     assert names(tmp_path) == BOTH
     monkeypatch.setattr(*SAVING, pressing(listeners.save_state, INT))
-    done = clod(*words)
-    assert done.code == 130 and "Ctrl-C again aborts without writing" in done.err and "interrupted after" in done.err
+    done = clod(*words, code=130)
+    assert "Ctrl-C again aborts without writing" in done.err and "interrupted after" in done.err
 
 
 def test_closed_terminal_does_not_end_the_writing(server: Server, words: list[Any], tmp_path: Path) -> None:

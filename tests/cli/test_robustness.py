@@ -6,6 +6,7 @@ import re
 import shutil
 import signal
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from PIL import Image
 
 import clod_adapter
 from clod_adapter.evaluation import robustness as experiment
-from runs import pressing
+from runs import names, pressing
 
 pytest.importorskip("matplotlib")
 OUTPUTS = ["robustness.csv", "robustness.json", "robustness.png"]
@@ -23,14 +24,10 @@ OUTPUTS = ["robustness.csv", "robustness.json", "robustness.png"]
 @pytest.fixture
 def run(clod: Any, capture: Any, tmp_path: Path) -> Callable[..., Any]:
     """Runs the command on two checkpoints, the second without the faintest Gaussians."""
-    few = capture.gaussians.select(capture.gaussians.opacities > 0.5)
     shutil.copytree(capture.scene, tmp_path / "scene")
-    paths = (capture.write(tmp_path / "plain.ply", capture.gaussians), capture.write(tmp_path / "masked.ply", few))
-
-    def start(*words: object) -> Any:
-        return clod("robustness", *paths, "--images", "scene", "--max-sv", 3, 1, "--iters", 3, *words)
-
-    return start
+    capture.write(tmp_path / "plain.ply", capture.gaussians)
+    capture.write(tmp_path / "masked.ply", capture.gaussians.select(capture.gaussians.opacities > 0.5))
+    return partial(clod, "robustness plain.ply masked.ply --images scene --max-sv 3 1 --iters 3")
 
 
 def stamps(folder: Path) -> dict[str, int]:
@@ -40,10 +37,8 @@ def stamps(folder: Path) -> dict[str, int]:
 def test_outputs_of_all_cells(run: Any, clod: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("clod_adapter.cli.shared.console.LINE_EVERY", 0)
     done = run("--json")
-    assert done.code == 0, done.err
-    folder = tmp_path / "robustness"
-    assert sorted(p.name for p in folder.iterdir()) == ["cells", *OUTPUTS]
-    report = json.loads(done.out)
+    report, folder = done.report, tmp_path / "robustness"
+    assert names(folder) == ["cells", *OUTPUTS]
     assert report == json.loads((folder / "robustness.json").read_text())
     cells = {(cell["checkpoint"], cell["max_sv"]): cell["rows"] for cell in report["cells"]}
     assert list(cells) == [(name, max_sv) for name in ("plain", "masked") for max_sv in (None, 1, 3)]
@@ -61,7 +56,7 @@ def test_outputs_of_all_cells(run: Any, clod: Any, tmp_path: Path, monkeypatch: 
         found = cells["masked", None if max_sv == "base" else float(max_sv)]
         assert [float(row["psnr"]) for row in rows] == [row["psnr"] for row in found]
     assert Image.open(folder / "robustness.png").size[0] > 2000
-    assert clod("apply", "plain.ply", "robustness/cells/plain_sv3.safetensors", "-o", "x.ply").code == 0
+    clod("apply plain.ply robustness/cells/plain_sv3.safetensors -o x.ply")
     scene = clod_adapter.load_scene(report["scene"])
     base, shares = clod_adapter.load("plain.ply").gaussians, experiment.BASELINE_SHARES
     assert [row["kept"] for row in cells["plain", None]] == [round(300 * share) for share in shares]
@@ -79,28 +74,25 @@ def test_interrupted_unfinished_and_changed_cells(run: Any, tmp_path: Path, monk
     folder = tmp_path / "robustness"
     with monkeypatch.context() as patch:
         patch.setattr(experiment, "baseline", pressing(experiment.baseline, signal.SIGINT))
-        assert run().code == 130 and not folder.exists()
+        run(code=130)
+    assert not folder.exists()
     with monkeypatch.context() as patch:
         patch.setattr(experiment, "adapt_at_range", pressing(experiment.adapt_at_range, signal.SIGINT, at=2))
-        done = run("--json")
-    report = json.loads(done.out)
-    assert done.code == 0 and report["interrupted"] and "plain_sv3 was not finished" in done.err
+        report = (done := run("--json")).report
+    assert report["interrupted"] and "plain_sv3 was not finished" in done.err
     assert [cell["max_sv"] for cell in report["cells"]] == [None, 1]
     assert report["missing"] == ["plain_sv3", "masked_base", "masked_sv1", "masked_sv3"]
     assert all((folder / name).exists() for name in OUTPUTS)
-    done = run("--json", "--quiet")
-    finished = json.loads(done.out)
+    finished = (done := run("--json --quiet")).report
     assert finished["missing"] == [] and finished["cells"][:2] == report["cells"] and done.err == ""
     before = stamps(folder)
     assert len(before) == 10
     (folder / "cells" / "masked_sv1.safetensors").unlink()
-    again = run()
-    assert again.code == 0 and "5 of 6 cells are done already" in again.err
+    assert "5 of 6 cells are done already" in run().err
     changed = {name for name, stamp in stamps(folder).items() if stamp != before.get(name)}
     assert changed == {"masked_sv1.safetensors", "masked_sv1.json"}
-    Path("masked.ply").write_bytes(Path("plain.ply").read_bytes())
-    other = run("--seed", 1)  # baselines do not depend on the seed
-    assert "1 of 6 cells are done already: plain_base" in other.err
+    shutil.copy("plain.ply", "masked.ply")
+    assert "1 of 6 cells are done already: plain_base" in run("--seed 1").err  # baselines do not depend on the seed
     Image.new("RGB", (64, 48)).save(tmp_path / "scene" / "images" / "003.png")  # of a photograph that is trained on
     monkeypatch.setattr(experiment, "baseline", pressing(experiment.baseline, signal.SIGINT))
-    assert run("--seed", 1).code == 130
+    run("--seed 1", code=130)

@@ -63,13 +63,13 @@ def test_instant_ngp_file(tmp_path: Path) -> None:
     """Angles in place of focal lengths; one focal length for both axes; JPEGs under names without an extension."""
     angles = {"camera_angle_x": 1.0, "camera_angle_y": 0.8}
     one = write_frames(tmp_path / "one", [frame(0)], aabb_scale=16, w=40, h=30, **angles)
-    two = write_frames(tmp_path / "two", [frame(0), {**frame(1), "file_path": "images/b.001"}], fl_x=30.0, scale=0.3)
+    two = write_frames(tmp_path / "two", [frame(0), {**frame(1), "file_path": "images/ä.001"}], fl_x=30.0, scale=0.3)
     write_images(one, ["images/000.png"])
-    write_images(two, ["images/000.png", "images/b.001.jpg"])
+    write_images(two, ["images/000.png", "images/ä.001.jpg"])
     K = load_scene(one).train[0].camera.K
     torch.testing.assert_close(K.diag()[:2], torch.tensor([20 / math.tan(0.5), 15 / math.tan(0.4)]))
     view = load_scene(two).train[0]
-    assert view.camera.name == "images/b.001.jpg"
+    assert view.camera.name == "images/ä.001.jpg"
     assert view.camera.K.tolist() == [[30, 0, 20], [0, 30, 15], [0, 0, 1]]
 
 

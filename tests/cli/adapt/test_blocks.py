@@ -1,8 +1,8 @@
 """``--memory``: a scene in blocks is trained in one process, also after a kill, an interrupt or an error."""
 
-import json
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +14,10 @@ from clod_adapter.adapter import ATTRIBUTES
 from clod_adapter.blocks.memory import MemoryPlan, plan_for_limit
 from clod_adapter.cli.adapt import listeners, prepare
 from clod_adapter.progress import Phase, Progress
-from runs import change_step, fail, names
-from scenes import stripped
+from runs import change_step, fail, names, results
 
 BLOCKS = 3
-TINY = ("--iters", 9, "--max-sv", 3, "--antialiasing", "off")
+TINY = "--images SCENE --iters 9 --max-sv 3 --antialiasing off"
 
 
 def in_blocks(*args: Any) -> MemoryPlan:
@@ -27,34 +26,29 @@ def in_blocks(*args: Any) -> MemoryPlan:
 
 
 @pytest.fixture(scope="module")
-def given(capture: Any, tmp_path_factory: pytest.TempPathFactory) -> list[Any]:
-    """Arguments; some opacities of the checkpoint are infinite, as in files in the wild."""
+def opaque(capture: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A checkpoint with some infinite opacities, as files in the wild have."""
     logits = capture.gaussians.opacity_logits.clone()
     logits[::7] = float("inf")
     path = tmp_path_factory.mktemp("opaque") / "opaque.ply"
-    capture.write(path, capture.gaussians.replace(opacity_logits=logits))
-    return [path, "--images", capture.scene, *TINY]
+    return Path(capture.write(path, capture.gaussians.replace(opacity_logits=logits)))
 
 
 @pytest.fixture
-def adapt(clod: Callable[..., Any], given: list[Any], monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
+def adapt(clod: Callable[..., Any], opaque: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
     """Adapts in blocks."""
     monkeypatch.setattr(prepare, "plan_for_limit", in_blocks)
-    return lambda out, *more: clod(*given, "--memory", "8GB", "--out", out, *more)
-
-
-def outputs(folder: Path, name: str) -> dict[str, bytes]:
-    return {suffix: stripped((folder / f"{name}{suffix}").read_bytes()) for suffix in (".ply", ".safetensors")}
+    return partial(clod, opaque, TINY, "--memory 8GB --out")
 
 
 @pytest.fixture(scope="module")
-def whole(given: list[Any], run_in: Any, tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+def whole(opaque: Path, run_in: Any, tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
     """The files of an uninterrupted run."""
     folder = tmp_path_factory.mktemp("whole")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(prepare, "plan_for_limit", in_blocks)
-        done = run_in(folder, *given, "--memory", "8GB", "--out", "one.ply", "--json")
-    report = json.loads(done.out)
+        done = run_in(folder, opaque, TINY, "--memory 8GB --out one.ply --json")
+    report = done.report
     assert report["memory"]["blocks"] == BLOCKS and report["steps"] == 26 and len(report["rows"]) > 2
     left_out = next(each for each in report["plan"]["decisions"] if each["name"] == "unseen")["number"]
     trained = (300 - int(left_out)) // BLOCKS
@@ -63,7 +57,7 @@ def whole(given: list[Any], run_in: Any, tmp_path_factory: pytest.TempPathFactor
     logits = clod_adapter.load(folder / "one.ply").gaussians.opacity_logits
     assert torch.equal(logits.isinf(), torch.arange(300) % 7 == 0) and not logits.isnan().any()
     assert names(folder) == ["one.json", "one.ply", "one.safetensors"]
-    return outputs(folder, "one")
+    return results(folder, "one")
 
 
 def interrupt(patch: pytest.MonkeyPatch) -> None:
@@ -98,44 +92,42 @@ def test_same_command_resumes_an_interrupted_block(
     """
     with pytest.MonkeyPatch.context() as patch:
         ended(patch)
-        done = adapt("a.ply", *(["--quiet"] if code == 1 else []))
-    assert done.code == code and said in done.err, done
+        done = adapt("a.ply", "--quiet" if code == 1 else "", code=code)
+    assert said in done.err, done
     finished = ["a.block1.pass1.safetensors"] if "block2" in state else []
     assert names(tmp_path) == sorted([*finished, state])
     for name in finished:
         content, other = Path(name).read_bytes(), "a.block2.pass1.safetensors"
         for file, data, more, message in (
-            (name, content, ["--seed", 1], "is of a run with another config; remove it, or give --out"),
-            (name, content, ["--with", "unseen"], "is of a run with another config; remove it"),
-            (other, content, [], "is of a run with another block"), (name, content[:-9], [], "is no block or is dam"),
-        ):  # fmt: skip
+            (name, content, "--seed 1", "is of a run with another config; remove it, or give --out"),
+            (name, content, "--with unseen", "is of a run with another config; remove it"),
+            (other, content, "", "is of a run with another block"),
+            (name, content[:-9], "", "is no block or is dam"),
+        ):
             Path(file).write_bytes(data)
-            done = adapt("a.ply", *more)
-            assert done.code == 2 and f"{file}: {message}" in done.err, done
+            assert f"{file}: {message}" in adapt("a.ply", more, code=2).err
             Path(other).unlink(missing_ok=True)
         Path(name).write_bytes(content)
     done = adapt("a.ply")
-    assert done.code == 0 and f"resuming {state} from step {steps}" in done.err, done
+    assert f"resuming {state} from step {steps}" in done.err, done
     assert ("block 1 of 3, pass 1" in done.err) == ("block1" in state)
-    assert outputs(tmp_path, "a") == whole and names(tmp_path) == ["a.json", "a.ply", "a.safetensors"]
+    assert results(tmp_path, "a") == whole and names(tmp_path) == ["a.json", "a.ply", "a.safetensors"]
 
 
-def test_blocks_follow_the_plan_of_the_whole(clod: Any, adapt: Any, given: list[Any], tmp_path: Path) -> None:
+def test_blocks_follow_the_plan_of_the_whole(clod: Any, adapt: Any, opaque: Path) -> None:
     """The same decisions; with --trim what is left out is not written; what is frozen is not tuned."""
-    frozen = ["--without", "means", "--growth", "off", "--json"]
-    runs = [clod(*given, "--out", "a.ply", *frozen), adapt("c.ply", *frozen, "--trim")]
-    plans = [json.loads(done.out)["plan"]["decisions"] for done in runs]
+    frozen = "--without means --growth off --json"
+    runs = (clod(opaque, TINY, "--out a.ply", frozen), adapt("c.ply", frozen, "--trim"))
+    plans = [done.report["plan"]["decisions"] for done in runs]
     assert any((each["what"], each["verdict"]) == ("means", "frozen") for each in plans[0])
     assert plans[1][:-1] == plans[0] and plans[1][-1]["verdict"] == "trimmed"
-    base, few = (clod_adapter.load(path).gaussians for path in (given[0], tmp_path / "c.ply"))
-    kept = clod_adapter.load_adapter(tmp_path / "c.safetensors").kept
+    base, few = (clod_adapter.load(path).gaussians for path in (opaque, "c.ply"))
+    kept = clod_adapter.load_adapter("c.safetensors").kept
     assert set(few.tensors()) == {*ATTRIBUTES, "sigma_d"}
     assert kept is not None and len(few) == int(kept.sum()) < len(base) and torch.equal(few.means, base.means[kept])
 
 
-def test_blocks_that_fail_or_are_held_are_reported(
-    adapt: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_blocks_that_fail_or_are_held_are_reported(adapt: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """A block whose loss is not finite ends early; all that was learned is written, with exit code 1."""
 
     def spoil(found: Any) -> Any:
@@ -144,20 +136,19 @@ def test_blocks_that_fail_or_are_held_are_reported(
 
     change_step(monkeypatch, 2, spoil)
     change_step(monkeypatch, 3, lambda found: replace(found, loss=float("nan")))
-    done = adapt("a.ply", "--json")
-    report = json.loads(done.out)
+    report = (done := adapt("a.ply --json", code=1)).report
     note = "block 1 of 3, pass 1 of 2: the loss of step 3 is not finite"
-    assert done.code == 1 and any(note in each for each in report["notes"]) and len(report["rows"]) > 2, done
+    assert any(note in each for each in report["notes"]) and len(report["rows"]) > 2, done
     assert "block 1 of 3, pass 1 of 2: ended after step 2: the loss of step 3" in done.err
     assert "1 Gaussians were not moved by some steps" in done.err
-    assert clod_adapter.load(tmp_path / "a.ply").gaussians.sigma_d is not None
+    assert clod_adapter.load("a.ply").gaussians.sigma_d is not None
 
 
-def test_sufficient_memory_changes_nothing(clod: Any, given: list[Any], tmp_path: Path) -> None:
+def test_sufficient_memory_changes_nothing(clod: Any, opaque: Path, tmp_path: Path) -> None:
     """Files of an earlier run in blocks are removed with the result."""
-    assert clod(*given, "--out", "a.ply").code == 0
+    clod(opaque, TINY, "--out a.ply")
     (tmp_path / "[b].block1.pass1.safetensors").write_bytes((tmp_path / "a.safetensors").read_bytes())
-    done = clod(*given, "--memory", "8GB", "--out", "[b].ply")
-    assert done.code == 0 and "the whole scene at once" in done.err and "training" in done.err
+    done = clod(opaque, TINY, "--memory 8GB --out [b].ply")
+    assert "the whole scene at once" in done.err and "training" in done.err
     assert names(tmp_path) == [f"{name}.{kind}" for name in ("[b]", "a") for kind in ("json", "ply", "safetensors")]
-    assert outputs(tmp_path, "a") == outputs(tmp_path, "[b]")
+    assert results(tmp_path, "a") == results(tmp_path, "[b]")

@@ -9,6 +9,7 @@ from dataclasses import replace
 from functools import reduce
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -25,9 +26,8 @@ from clod_adapter.cli.adapt.listeners import Saver
 from clod_adapter.cli.shared.console import Console
 from clod_adapter.training.interrupts import GracefulStop
 from clod_adapter.training.state import KEY
-from runs import OUTPUTS, STATE, change_step, fail, names, pressing
+from runs import OUTPUTS, STATE, change_step, fail, names, pressing, results
 from scenes import capture as small_capture
-from scenes import stripped
 
 CONFIG, QUIET = AdaptConfig(iters=3, max_sv=3.0), Console(quiet=True)
 HASHES = {"base_sha256": "of the base", "views_sha256": "of the views", "overruled": {"--with": ["means"]}}
@@ -80,74 +80,66 @@ def test_damaged_states_are_refused_or_harmless(state: Any, data: Any) -> None:
         assert all(value.isfinite().all() for value in found.values()), about
 
 
-TINY = ("--iters", 12, "--max-sv", 4, "--out", "dial.ply")
+TINY = "--iters 12 --max-sv 4 --out dial.ply"
+ADAPT = f"BASE --images SCENE {TINY}"
 
 
 def test_states_of_other_runs_are_refused(
     clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of other settings, inputs or versions, or damaged; of the same inputs with other names they are not."""
-    words = [capture.ply, "--images", capture.scene, *TINY]
 
-    def refused(message: str, *words: object) -> None:
-        done = clod(*words, "--resume")
-        assert done.code == 2 and f"error: {STATE}: {message}" in done.err, done
+    def refused(message: str, *words: str) -> None:
+        assert f"error: {STATE}: {message}" in clod(*words, code=2).err
 
     with monkeypatch.context() as patch:  # the second save is aborted
         patch.setattr(listeners, "save_state", pressing(listeners.save_state, signal.SIGINT, signal.SIGTERM, at=2))
-        assert clod(*words).code == 130
+        clod(ADAPT, code=130)
     state = (tmp_path / STATE).read_bytes()
-    for changes, message in (
-        (("--iters", 13), "is of a run with --iters 12; use the original arguments"),
-        (("--seed", 5, "--time-budget", 9), "is of a run with no --time-budget, --seed 0; use"),
-        (("--form", "paper"), "is of a run with another --form"),
-        (("--growth", "off"), "is of a run with --growth on; use"),
-    ):
-        refused(message, *words, *changes)
     capture.write(tmp_path / "other.ply", capture.gaussians.select(torch.arange(300) < 299))
-    shutil.copytree(capture.scene, tmp_path / "fewer")
+    for scene in ("fewer", "moved"):
+        shutil.copytree(capture.scene, tmp_path / scene)
     Image.new("RGB", (64, 48)).save(tmp_path / "fewer" / "images" / "003.png")
-    refused("is of another checkpoint than other.ply; use the", "other.ply", *words[1:])
-    refused("is of other photographs than fewer; use the", words[0], "--images", "fewer", *TINY)
-    refused("is of another checkpoint than", *words, "--antialiasing", "on")
-    refused("is of a run with other --with or --without, {'--with': [], ", *words, "--without", "quats")
+    for words, message in (
+        (f"{ADAPT} --iters 13", "is of a run with --iters 12; use the original arguments"),
+        (f"{ADAPT} --seed 5 --time-budget 9", "is of a run with no --time-budget, --seed 0; use"),
+        (f"{ADAPT} --form paper", "is of a run with another --form"),
+        (f"{ADAPT} --growth off", "is of a run with --growth on; use"),
+        (f"{ADAPT} --antialiasing on", "is of another checkpoint than"),
+        (f"{ADAPT} --without quats", "is of a run with other --with or --without, {'--with': [], "),
+        (f"other.ply --images SCENE {TINY}", "is of another checkpoint than other.ply; use the"),
+        (f"BASE --images fewer {TINY}", "is of other photographs than fewer; use the"),
+    ):
+        refused(message, words, "--resume")
     with monkeypatch.context() as patch:
         patch.setattr(listeners, "package_version", lambda: "0.0.7")
-        refused(f"is of version {package_version()} of this package, not 0.0.7", *words)
+        refused(f"is of version {package_version()} of this package, not 0.0.7", ADAPT, "--resume")
     (tmp_path / STATE).write_bytes(state[:-9])
-    refused("is not a training state or is damaged", *words)
-    done = clod(*words)  # nor is a file of another kind, such as an adapter, replaced
-    assert done.code == 2 and f"error: {STATE}: is not a training state or is damaged" in done.err
+    for more in ("--resume", ""):  # nor is a file of another kind, such as an adapter, replaced
+        refused("is not a training state or is damaged", ADAPT, more)
     (tmp_path / STATE).write_bytes(state)
     shutil.copy(capture.ply, tmp_path / "moved.ply")
-    shutil.copytree(capture.scene, tmp_path / "moved")
-    done = clod("moved.ply", "--images", "moved", *TINY, "--resume")
-    assert done.code == 0 and f"resuming {STATE} from step 1" in done.err, done
+    assert f"resuming {STATE} from step 1" in clod(f"moved.ply --images moved {TINY} --resume").err
 
 
 def test_without_a_state_or_resume_training_starts_over(
-    clod: Any, capture: Any, tmp_path: Path, state: Any, monkeypatch: pytest.MonkeyPatch
+    clod: Any, tmp_path: Path, state: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """An earlier state stays until a new one replaces it; a state that cannot be saved costs nothing else."""
-    words = [capture.ply, "--images", capture.scene, *TINY]
-    done = clod(*words, "--resume", "--json")
-    assert done.code == 0 and f"there is no {STATE} to resume from: starting from the beginning" in done.err
-    assert json.loads(done.out)["resumed_from"] is None and names(tmp_path) == OUTPUTS
+    done = clod(ADAPT, "--resume --json")
+    assert f"there is no {STATE} to resume from: starting from the beginning" in done.err
+    assert done.report["resumed_from"] is None and names(tmp_path) == OUTPUTS
     save_file(state[2], tmp_path / STATE, {KEY: json.dumps(state[3])})
     before = (tmp_path / STATE).read_bytes()
-
-    def full(path: Path, *_: Any) -> None:
-        raise ClodError(f"{path}: cannot be written: No space left on device")
-
+    full = Mock(side_effect=ClodError(f"{STATE}: cannot be written: No space left on device"))
     with monkeypatch.context() as patch:
-        patch.setattr(listeners, "save_state", full)
-        patch.setattr(listeners, "SAVE_EVERY", 0.0)
-        patch.setattr(listeners, "SAVE_COST", 1e9)
-        done = clod(*words, "--seed", 4)
-    assert done.code == 0 and done.err.count(f"will not find it: {STATE}: cannot be written: No space") == 1
+        for name, value in (("save_state", full), ("SAVE_EVERY", 0.0), ("SAVE_COST", 1e9)):
+            patch.setattr(listeners, name, value)
+        done = clod(ADAPT, "--seed 4")
+    assert done.err.count(f"will not find it: {STATE}: cannot be written: No space") == 1
     assert names(tmp_path) == sorted([*OUTPUTS, STATE]) and (tmp_path / STATE).read_bytes() == before
-    done = clod(*words, "--seed", 4)
-    assert done.code == 0 and f"{STATE} has step 2 of an interrupted run" in done.err and names(tmp_path) == OUTPUTS
+    done = clod(ADAPT, "--seed 4")
+    assert f"{STATE} has step 2 of an interrupted run" in done.err and names(tmp_path) == OUTPUTS
 
 
 @pytest.mark.parametrize(
@@ -179,23 +171,16 @@ def test_the_state_is_recent_and_saving_takes_a_small_share_of_the_time(
     [(fail, [STATE]), (lambda found: replace(found, loss=math.nan), sorted([*OUTPUTS, STATE]))],
     ids=["step", "loss"],
 )
-def test_resuming_after_an_error(
-    clod: Any, capture: Any, dialled: Path, tmp_path: Path, change: Any, files: list[str]
-) -> None:
+def test_resuming_after_an_error(clod: Any, dialled: Path, tmp_path: Path, change: Any, files: list[str]) -> None:
     """The same command with --resume then writes the files of a run without an error."""
-    words = [capture.ply, "--images", capture.scene, *TINY]
     with pytest.MonkeyPatch.context() as patch:
         change_step(patch, 6, change)
-        done = clod(*words, "--quiet" if change is fail else "--json")
-    assert done.code == 1 and names(tmp_path) == files, done
-    assert f"--resume resumes from step 5, which is in {STATE}\n" in done.err
+        done = clod(ADAPT, "--quiet" if change is fail else "--json", code=1)
+    assert names(tmp_path) == files and f"--resume resumes from step 5, which is in {STATE}\n" in done.err, done
     assert ("please report it" in done.err) == ("ZeroDivisionError: of ours" in done.err) == (change is fail)
     if change is not fail:
-        report = json.loads(done.out)
+        report = done.report
         assert report["interrupted"] and report["steps"] == 5 and len(report["rows"]) > 2
         assert any("the result so far is written: the loss of step 6 is not finite" in n for n in report["notes"])
-    done = clod(*words, "--resume")
-    assert done.code == 0 and f"resuming {STATE} from step 5" in done.err, done
-    assert names(tmp_path) == OUTPUTS
-    for suffix in (".ply", ".safetensors"):
-        assert stripped((tmp_path / f"dial{suffix}").read_bytes()) == stripped(dialled.with_suffix(suffix).read_bytes())
+    assert f"resuming {STATE} from step 5" in clod(ADAPT, "--resume").err
+    assert names(tmp_path) == OUTPUTS and results(tmp_path) == results(dialled.parent)

@@ -1,6 +1,5 @@
 """Checkpoints that do not match the photographs: errors, warnings, report."""
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,8 +10,9 @@ from PIL import Image
 
 from clod_adapter import View, load_scene, render
 from models import write_model
+from runs import names
 
-FAST = ("--iters", 1, "--max-sv", 4)
+FAST = "--iters 1 --max-sv 4"
 
 
 def scene_of(capture: Any, folder: Path, shown: Callable[[View], Image.Image], count: int = 9) -> Path:
@@ -35,13 +35,11 @@ def turned(capture: Any, tmp_path: Path) -> Path:
     return capture.write(tmp_path / "turned.ply", g.replace(means=means, quats=quats, shN=0 * g.shN))
 
 
-def test_cameras_are_moved_into_another_frame_in_every_command(
-    clod: Any, capture: Any, turned: Path, tmp_path: Path
-) -> None:
-    done = clod(turned, "--images", capture.scene, *FAST, "-o", "adapted.ply", "--json")
+def test_cameras_are_moved_into_another_frame_in_every_command(clod: Any, capture: Any, turned: Path) -> None:
+    done = clod(turned, "--images SCENE", FAST, "-o adapted.ply --json")
     said = f"the cameras are moved into the frame of {turned} (axes x, -y, -z): renders have"
-    report = json.loads(done.out)
-    assert done.code == 0 and done.err.count(said) == 1 and any(said in note for note in report["notes"]), done
+    report = done.report
+    assert done.err.count(said) == 1 and any(said in note for note in report["notes"]), done
     found, frame = report["alignment"], report["alignment"]["frame"]
     assert frame["psnr"] > found["mean_colour_psnr"] + 6 > found["psnr"] + 6
     # The stored viewpoints are training cameras in the file's frame, x_cameras = scale R x_file + offset.
@@ -50,24 +48,23 @@ def test_cameras_are_moved_into_another_frame_in_every_command(
     back = frame["scale"] * centres @ rotation.T + offset
     poses = torch.stack([torch.linalg.inv(view.camera.viewmat) for view in load_scene(capture.scene).train])
     assert torch.cdist(back, poses[:, :3, 3]).min(1).values.max() < 1e-3
-    again = clod("eval", "adapted.ply", "--images", capture.scene, "--json")
-    assert again.code == 0 and "(axes x, -y, -z)" in again.err
-    assert json.loads(again.out)["rows"][0]["psnr"] == pytest.approx(report["rows"][0]["psnr"], abs=0.01)
-    done = clod("export", "adapted.ply", "--images", capture.scene, "--sv", 2, "-o", "baked.ply")
-    assert done.code == 0 and "(axes x, -y, -z)" in done.err, done
+    again = clod("eval adapted.ply --images SCENE --json")
+    assert "(axes x, -y, -z)" in again.err
+    assert again.report["rows"][0]["psnr"] == pytest.approx(report["rows"][0]["psnr"], abs=0.01)
+    assert "(axes x, -y, -z)" in clod("export adapted.ply --images SCENE --sv 2 -o baked.ply").err
 
 
 def test_another_scene_is_refused_and_nothing_is_written(clod: Any, capture: Any, turned: Path, tmp_path: Path) -> None:
     random, scene = torch.Generator().manual_seed(2), scene_of(capture, tmp_path / "scene", photograph, 2)
     means, sh0 = (torch.randn(shape, generator=random) for shape in ((300, 3), (300, 1, 3)))
     lost = capture.write(tmp_path / "lost.ply", capture.gaussians.replace(means=means + 1e4, sh0=sh0))
-    before = sorted(tmp_path.iterdir())
-    done = clod(lost, "--images", scene, *FAST)
-    assert done.code == 2 and f"error: {lost}: does not match {scene}" in done.err, done
-    assert "are in view" in done.err and "--misaligned-ok" in done.err.splitlines()[-1]
-    done = clod("robustness", capture.ply, turned, "--images", capture.scene, *FAST)
-    assert done.code == 2 and f"error: {turned}: in another frame than {capture.ply}" in done.err, done
-    assert sorted(tmp_path.iterdir()) == before
+    before = names(tmp_path)
+    done = clod(lost, "--images", scene, FAST, code=2)
+    assert f"error: {lost}: does not match {scene}" in done.err and "are in view" in done.err, done
+    assert "--misaligned-ok" in done.err.splitlines()[-1]
+    done = clod("robustness BASE", turned, "--images SCENE", FAST, code=2)
+    assert f"error: {turned}: in another frame than {capture.ply}" in done.err, done
+    assert names(tmp_path) == before
 
 
 def photograph(view: View, share: float = 1.0) -> Image.Image:
@@ -81,17 +78,17 @@ def test_white_background_is_refused_unless_allowed(clod: Any, capture: Any, tmp
     def over_white(view: View) -> Image.Image:
         return Image.fromarray(render(few, view.camera, background=torch.ones(3)).pixels.numpy())
 
-    words = (ply, "--images", scene_of(capture, tmp_path / "white", over_white), *FAST)
-    done = clod(*words)
-    assert done.code == 2 and "over white the renders have" in done.err and "transparent background" in done.err, done
-    done = clod(*words, "--misaligned-ok", "--json")
-    assert done.code == 0 and f"warning: {ply}: does not match" in done.err and "to train anyway" not in done.err, done
-    report = json.loads(done.out)
-    assert any(note.startswith("warning: ") for note in report["notes"]) and report["alignment"]["frame"] is None
+    words = (ply, "--images", scene_of(capture, tmp_path / "white", over_white), FAST)
+    done = clod(*words, code=2)
+    assert "over white the renders have" in done.err and "transparent background" in done.err, done
+    done = clod(*words, "--misaligned-ok --json")
+    assert f"warning: {ply}: does not match" in done.err and "to train anyway" not in done.err, done
+    notes, alignment = done.report["notes"], done.report["alignment"]
+    assert any(note.startswith("warning: ") for note in notes) and alignment["frame"] is None
 
 
 @pytest.mark.parametrize(("said", "share"), [("another exposure", 0.2), ("have a single colour each", 0)])
 def test_other_photographs_have_a_warning(clod: Any, capture: Any, tmp_path: Path, said: str, share: float) -> None:
-    scene = scene_of(capture, tmp_path / "scene", lambda view: photograph(view, share))
-    done = clod(capture.ply, "--images", scene, *FAST, "--json")
-    assert done.code == 0 and said in done.err and said in json.loads(done.out)["notes"][0], done
+    scene_of(capture, tmp_path / "scene", lambda view: photograph(view, share))
+    done = clod("BASE --images scene", FAST, "--json")
+    assert said in done.err and said in done.report["notes"][0], done

@@ -1,9 +1,9 @@
 """What commands read, in formats of other tools; their device; kernels, compiled before times are measured."""
 
-import json
 import shutil
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -17,42 +17,32 @@ from clod_adapter.cli.shared.console import Console
 from clod_adapter.cli.shared.inputs import pick_device, prepare_kernels
 from clod_adapter.errors import ClodError
 from formats import PACKED
+from runs import names, rebuilt
 
-TINY = ("--iters", 2, "--max-sv", 4, "--out", "dial.ply")
-
-
-def activated(source: Path, path: Path) -> Path:
-    """The same splat with activated opacities and scales."""
-    ply = PlyData.read(str(source), mmap=False)
-    vertex = ply["vertex"].data
-    vertex["opacity"] = 1 / (1 + np.exp(-vertex["opacity"].astype(np.float64)))
-    for name in ("scale_0", "scale_1", "scale_2"):
-        vertex[name] = np.exp(vertex[name])
-    ply.write(str(path))
-    return path
+TINY = "--images SCENE --iters 2 --max-sv 4 --out dial.ply"
 
 
 def test_values_that_look_activated_need_the_option(clod: Any, capture: Any, tmp_path: Path) -> None:
     """It is for the checkpoint, not for the adapted file. With the right option the renders match."""
-    path, images = activated(capture.ply, tmp_path / "in.ply"), ("--images", capture.scene)
-    done = clod(path, *images, *TINY)
-    assert done.code == 2 and "--activated both" in done.err.splitlines()[-1], done
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["in.ply"]
-    done = clod(path, *images, *TINY, "--activated", "both")
-    assert done.code == 0 and "opacity taken as activated" in done.err, done
-    done = clod("apply", path, "dial.safetensors", "--out", "again.ply", "--activated", "both", "--json")
-    assert done.code == 0 and "opacity taken as activated" in json.loads(done.out)["notes"][0], done
-    assert (tmp_path / "again.ply").read_bytes() == (tmp_path / "dial.ply").read_bytes()
-    done = clod("eval", "dial.ply", *images, "--sv", 1, "--base", path, "--activated", "both", "--json")
-    assert done.code == 0 and json.loads(done.out)["base_row"]["psnr"] > 40, done
+    ply = PlyData.read(str(capture.ply), mmap=False)
+    vertex = ply["vertex"].data
+    vertex["opacity"] = 1 / (1 + np.exp(-vertex["opacity"].astype(np.float64)))
+    for name in ("scale_0", "scale_1", "scale_2"):
+        vertex[name] = np.exp(vertex[name])
+    ply.write(str(tmp_path / "in.ply"))
+    assert "--activated both" in clod("in.ply", TINY, code=2).err.splitlines()[-1] and names(tmp_path) == ["in.ply"]
+    assert "opacity taken as activated" in clod("in.ply", TINY, "--activated both").err
+    assert rebuilt(clod, "in.ply", "--activated both")
+    (note, *_) = clod("apply in.ply dial.safetensors --out x.ply --activated both --json").report["notes"]
+    assert "opacity taken as activated" in note
+    report = clod("eval dial.ply --images SCENE --sv 1 --base in.ply --activated both --json").report
+    assert report["base_row"]["psnr"] > 40
 
 
-def test_a_compressed_file_is_adapted(clod: Any, capture: Any, tmp_path: Path) -> None:
+def test_a_compressed_file_is_adapted(clod: Any, tmp_path: Path) -> None:
     shutil.copy(PACKED, tmp_path / "base.compressed.ply")
-    done = clod("base.compressed.ply", "--images", capture.scene, *TINY)
-    assert done.code == 0 and "note: base.compressed.ply: quantised" in done.err, done
-    assert clod("apply", "base.compressed.ply", "dial.safetensors", "--out", "again.ply").code == 0
-    assert (tmp_path / "again.ply").read_bytes() == (tmp_path / "dial.ply").read_bytes()
+    assert "note: base.compressed.ply: quantised" in clod("base.compressed.ply", TINY).err
+    assert rebuilt(clod, "base.compressed.ply")
 
 
 def test_devices(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
@@ -71,7 +61,7 @@ def test_devices(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[
     for name, value in (("is_available", True), ("current_device", 0), ("get_device_name", "NVIDIA Test 1")):
         monkeypatch.setattr(torch.cuda, name, lambda *_, value=value: value)
     with monkeypatch.context() as patch:  # torch has no code for its compute capability: the first operation fails
-        patch.setattr(torch, "ones", fail)
+        patch.setattr(torch, "ones", Mock(side_effect=RuntimeError("CUDA error: no kernel image is available")))
         refused(r"torch cannot compute on it .*doctor")
     monkeypatch.setattr(torch, "ones", lambda *_, **__: torch.zeros(1))
     monkeypatch.setattr(inputs, "unusable", lambda: None)
@@ -82,10 +72,6 @@ def test_devices(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[
     assert pick_device("auto", Console()) == torch.device("cpu")
     assert "on the CPU, although there is a GPU: gsplat is absent: pip install" in capsys.readouterr().err
     refused("gsplat is absent: pip install gsplat==1.5.3")
-
-
-def fail(*_: Any, **__: Any) -> None:
-    raise RuntimeError("CUDA error: no kernel image is available for execution on the device")
 
 
 class Compiled(Listener):

@@ -11,7 +11,7 @@ import pytest
 from clod_adapter.cli.shared import pages
 
 pytest.importorskip("matplotlib")
-TINY = ("--iters", 16, "--max-sv", 4, "--out", "dial.ply", "--report")
+ADAPT = "BASE --images SCENE --iters 16 --max-sv 4 --out dial.ply --report"
 
 
 def page_of(path: Path) -> tuple[str, dict[str, Any]]:
@@ -22,10 +22,8 @@ def page_of(path: Path) -> tuple[str, dict[str, Any]]:
     return text, json.loads(found[1])
 
 
-def test_adapt(clod: Any, capture: Any, tmp_path: Path) -> None:
-    done = clod(capture.ply, "--images", capture.scene, *TINY, "--json")
-    assert done.code == 0, done
-    report = json.loads(done.out)
+def test_adapt(clod: Any, tmp_path: Path) -> None:
+    report = clod(ADAPT, "--json").report
     files = {"page": "dial.html", "rendering": "dial_rendering.png", "adapting": "dial_adapting.png"}
     assert report["outputs"].items() >= files.items() and all((tmp_path / f).is_file() for f in files.values())
     text, page = page_of(tmp_path / "dial.html")
@@ -45,14 +43,12 @@ def test_adapt(clod: Any, capture: Any, tmp_path: Path) -> None:
     assert text.count('data-name=""') == pages.FRAMES and text.count('data-name="base"') == 1
 
 
-def test_eval(clod: Any, capture: Any, dialled: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_eval(clod: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without matplotlib the page is refused before any work."""
-    done = clod("eval", dialled, "--images", capture.scene, "--report", "look.html", "--json", "--base", capture.ply)
-    report = json.loads(done.out)
-    assert done.code == 0 and report["outputs"] == {"page": "look.html", "rendering": "look_rendering.png"}, done
+    report = clod("eval DIAL --images SCENE --report look.html --json --base BASE").report
+    assert report["outputs"] == {"page": "look.html", "rendering": "look_rendering.png"}
     text, page = page_of(tmp_path / "look.html")
     assert page["report"]["rows"] == report["rows"] and page["training"] is None
     assert 'data-name="base"' in text and "hold for base" in text
     monkeypatch.setitem(sys.modules, "matplotlib", None)
-    done = clod(capture.ply, *TINY, "--images", capture.scene)
-    assert done.code == 2 and "pip install matplotlib" in done.err
+    assert "pip install matplotlib" in clod(ADAPT, code=2).err
