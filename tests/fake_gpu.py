@@ -114,10 +114,8 @@ class _Functions(TorchFunctionMode):
 
 @lru_cache(maxsize=1)
 def register() -> bool:
-    """Whether this torch has devices written in Python; registers this one, unless there is a real GPU.
-
-    It must precede the first backward pass, when autograd starts a thread per device, and takes this one for its own.
-    """
+    """Whether this torch has devices written in Python; registers this one, unless there is a real GPU: before the
+    first backward pass, when autograd starts a thread per device."""
     if torch.cuda.is_available():
         return True
     try:

@@ -18,8 +18,8 @@ ALPHA_MIN, ALPHA_MAX, TRANSMITTANCE_MIN = 1 / 255, 0.999, 1e-4
 
 
 def install(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Replaces the kernels in gsplat and its rendering module."""
-    import gsplat
+    """Replaces the kernels in gsplat and its rendering module; skips the test where there is no gsplat."""
+    gsplat = pytest.importorskip("gsplat", reason="pip install gsplat==1.5.3")
     from gsplat import rendering
     from gsplat.cuda import _torch_impl
 

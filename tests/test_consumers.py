@@ -1,9 +1,5 @@
-"""Everything that uses a dial follows one function, and gives on another device what it gives on the CPU.
-
-Change the culling threshold or the growth of that function, and all of it follows. What runs on another device neither
-waits for it nor leaves it: a GPU, if there is one; otherwise a simulated one (``fake_gpu``), with torch in place of
-gsplat's kernels.
-"""
+"""Everything that uses a dial follows the culling threshold and growth of one function, and gives on another device,
+which it neither waits for nor leaves, what it gives on the CPU: a GPU, or else a simulated one (``fake_gpu``)."""
 
 import importlib
 from collections.abc import Callable, Iterator
@@ -139,10 +135,7 @@ def test_everything_follows_the_culling_threshold(name: str, monkeypatch: pytest
 
 @pytest.mark.parametrize("name", CONSUMERS)
 def test_everything_grows_by_one_function(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Other factors change whatever draws, and nothing that counts or culls.
-
-    By the default ``draw``: the CPU's kernels override it (tests/rasterizers/test_dial.py compares the two).
-    """
+    """Other factors change whatever draws by the default ``draw`` (tests/rasterizers/test_dial.py), and no count."""
     monkeypatch.setitem(BACKENDS, "cpu", lambda: Rasterizer(cpu.rasterize))
     consumer = CONSUMERS[name]
     before = consumer(model_of(TAU))

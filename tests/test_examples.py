@@ -36,10 +36,9 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureF
 
 def test_training_and_rendering(run: Any, capture: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """Pictures by the library, by gsplat, with torch in place of its kernels, and by a renderer of one's own."""
-    pytest.importorskip("gsplat", reason="pip install gsplat==1.5.3")
+    gsplat_in_torch.install(monkeypatch)
     printed = run(1, capture.ply, capture.scene, "dial.ply")
     assert "dial 5:" in printed and clod_adapter.load("dial.ply").gaussians.sigma_d is not None
-    gsplat_in_torch.install(monkeypatch)
 
     def by_gsplat() -> str:
         runpy.run_path(str(EXAMPLES[3]))["main"]("dial.ply", str(capture.scene), "cpu")
@@ -86,7 +85,6 @@ def test_a_loop_of_gsplat_trains_a_dial(
     capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """With torch in place of its kernels; in at most 20 lines more than the loop has without a dial."""
-    pytest.importorskip("gsplat", reason="pip install gsplat==1.5.3")
     gsplat_in_torch.install(monkeypatch)
     torch.manual_seed(0)  # the order of the views
     source = EXAMPLES[7].read_text(encoding="utf-8")

@@ -140,10 +140,7 @@ class Renderer:
 @pytest.mark.parametrize("load", [2.0, 4.0, 1 / 3])
 @pytest.mark.parametrize("outliers", [False, True])
 def test_the_time_is_within_10_percent_after_a_change(load: float, outliers: bool) -> None:
-    """After at most 22 frames: 4, and 18 steps of 10 % from one end of the dial to the other.
-
-    It stays there; without outliers, it never turns back.
-    """
+    """After at most 22 frames: 4, and 18 steps of 10 % from end to end; without outliers, it never turns back."""
     for exponent, fixed in product(EXPONENTS, FIXED):
         renderer = Renderer(exponent, fixed, start=2.0 if load > 1 else 5.0)
         loads = [1.0] * BEFORE + [load] * AFTER

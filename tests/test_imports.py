@@ -135,10 +135,7 @@ assert not hasattr(clod, "nonsense")
 
 
 def test_imports_are_light_and_on_first_use() -> None:
-    """Hook and drop-ins need torch and numpy alone, so that they work in a training's environment.
-
-    Functions stay functions where a submodule has the same name.
-    """
+    """Hook and drop-ins need torch and numpy alone; functions stay functions beside submodules of the same name."""
     done = subprocess.run([sys.executable, "-c", STEPS], cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
 

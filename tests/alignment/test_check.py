@@ -29,7 +29,6 @@ def pair() -> tuple[Gaussians, list[View]]:
 
 
 def posed(views: Sequence[View], change: Callable[[Tensor], Tensor]) -> list[View]:
-    """The views with other poses."""
     return [
         View(replace(view.camera, viewmat=change(view.camera.viewmat).to(view.camera.viewmat)), view.image)
         for view in views
@@ -122,10 +121,7 @@ def test_frames_of_trainers(pair: tuple[Gaussians, list[View]]) -> None:
 
 
 def seen_with(name: str, views: int = 5) -> tuple[Gaussians, tuple[View, ...]]:
-    """A checkpoint that does not name its filter, and photographs of it drawn with ``name``.
-
-    Its Gaussians are at most a pixel wide in images of 48 pixels, where filters differ.
-    """
+    """A checkpoint that names no filter, and photographs of it drawn with ``name``: of Gaussians of a pixel at most."""
     fine = gaussians(1500, 0, 0, size=0.025)
     noisy = fine.sh0 + 0.1 * torch.randn(fine.sh0.shape, generator=torch.Generator().manual_seed(1))
     return fine.replace(sh0=noisy), photograph(fine.replace(screen_filter=FILTERS[name]), ring(views, 48, 36))

@@ -100,10 +100,7 @@ def test_rows_left_out_of_the_context_are_not_needed(captured: tuple[Gaussians, 
 
 
 def test_target_shares_add_up_to_the_curve(divided: Division, captured: tuple[Gaussians, Scene]) -> None:
-    """Weighted with its mean share of the loss, each Gaussian is penalised as in an undivided run.
-
-    The curve is of all Gaussians, also of those that a plan leaves out.
-    """
+    """Weighted with its share of the loss, each is penalised as in an undivided run, those left out by a plan too."""
     cameras, count = [view.camera for view in captured[1].train], len(captured[0]) + 100
     division = replace(divided, total=count)
     for first in (True, False):
@@ -119,10 +116,7 @@ def test_target_shares_add_up_to_the_curve(divided: Division, captured: tuple[Ga
 
 
 def test_blocks_match_undivided_training(captured: tuple[Gaussians, Scene], divided: Division) -> None:
-    """Every image crosses all borders of a translucent cloud, which is the hardest case.
-
-    benchmarks/blocks.py measures it on captures.
-    """
+    """Every image crosses all borders of a translucent cloud, the hardest case (captures: benchmarks/blocks.py)."""
     base, scene = captured
     undivided = adapt(base, scene, CONFIG).gaussians
     first = merge(divided, [adapt_block(divided, scene.train, CONFIG, k) for k in range(BLOCKS)])

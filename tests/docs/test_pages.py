@@ -117,13 +117,11 @@ def test_blocks_run_in_the_order_of_the_page(page: Path, desk: Path, tmp_path: P
 
 
 def short(**settings: Any) -> AdaptConfig:
-    """Settings of a Python block."""
     config = AdaptConfig(**settings)
     return replace(config, iters=min(config.steps, STEPS))
 
 
 def run(words: list[str]) -> None:
-    """Runs a command of a shell block in the current folder."""
     words, out = (words[:-2], Path(words[-1])) if ">" in words else (words, Path("said.txt"))
     assert words[0] in ("clod-adapt", "python"), f"{words[0]}: not known; mark the block with <!-- not run: REASON -->"
     with out.open("w", encoding="utf-8") as stream, redirect_stdout(stream):

@@ -11,23 +11,9 @@ from clod_adapter.equation.attenuation import attenuate
 from clod_adapter.equation.distances import typical_distance
 from clod_adapter.equation.extinction import extinction_scale, sigma_for_extinction
 from clod_adapter.gaussians import SH_C0
-from clod_adapter.initialization import importance
-from clod_adapter.initialization.importance import (
-    initialize,
-    removal_error,
-    sigma_from_importance,
-    usable_views,
-)
-from clod_adapter.initialization.pruning_order import (
-    APART,
-    COLOUR_FLOOR,
-    MOST,
-    NEIGHBOURS,
-    REMOVED,
-    SHARE,
-    initial_growth,
-    pruning_order,
-)
+from clod_adapter.initialization import pruning_order as pruning
+from clod_adapter.initialization.importance import initialize, removal_error, sigma_from_importance, usable_views
+from clod_adapter.initialization.pruning_order import APART, COLOUR_FLOOR, MOST, NEIGHBOURS, REMOVED, SHARE
 from clod_adapter.render import splat
 from scenes import gaussians, photograph, ring
 
@@ -36,20 +22,14 @@ REVERSED = torch.diag(torch.tensor([-1.0, 1, -1, 1]))  # looks the other way
 
 
 def changes(some: Gaussians, view: View) -> Tensor:
-    """``[N, pixels]``: what removing each Gaussian alone does to the image.
-
-    The image is linear in each opacity where nothing is clamped and no pixel ends.
-    """
+    """``[N, pixels]`` of removing each Gaussian alone; an image is linear in each opacity where nothing is clamped."""
     whole, _ = splat(some, some.opacities, view.camera)
     without = some.opacities.repeat(len(some), 1).fill_diagonal_(0)
     return torch.stack([(splat(some, each, view.camera)[0] - whole).flatten() for each in without]).double()
 
 
 def test_removal_error_is_unbiased(draws: int = 100) -> None:
-    """The mean over many draws is within 5 standard deviations of the exact error.
-
-    With random signs z, ``(sum_p z_p v_p)^2`` has the mean |v|^2 and the variance 2 (|v|^4 - sum v^4).
-    """
+    """To 5 standard deviations: with random signs z, ``(sum z v)^2`` has mean |v|^2, variance 2 (|v|^4 - sum v^4)."""
     some = gaussians(15, 1, 0, size=0.4)
     some = some.replace(opacity_logits=(0.02 + 0.3 * some.opacities).logit())
     views = photograph(some, ring(3, 16, 12))
@@ -97,10 +77,10 @@ def test_initialization_culls_in_the_pruning_order() -> None:
     """In which one that a neighbour replaces goes earlier than by its removal error alone."""
     some = gaussians(200, 0, 0)
     views = photograph(some, ring(3, 20, 16))
-    error, dialled = removal_error(some, views, seed=0), importance.initialize(some, views, AdaptConfig())
+    error, dialled = removal_error(some, views, seed=0), initialize(some, views, AdaptConfig())
     d = typical_distance(some.means, [view.camera for view in views], dialled.attenuation)
     found = extinction_scale(dialled.opacity_logits, dialled.sigma_d, d, dialled.attenuation).argsort()
-    order = pruning_order(some, error.sqrt() * some.opacities).position
+    order = pruning.pruning_order(some, error.sqrt() * some.opacities).position
     assert torch.equal(found[100:180], order.argsort()[100:180])
     assert not torch.equal(order.argsort()[100:180], error.argsort(stable=True)[100:180])
 
@@ -134,7 +114,7 @@ def plainly(some: Gaussians, worth: Tensor) -> list[int]:
 def test_order_matches_the_plain_implementation(n: int, seed: int) -> None:
     some, seen = gaussians(n, 1, seed), []
     worth = torch.rand(n, generator=torch.Generator().manual_seed(seed))
-    order = pruning_order(some, worth, lambda now: seen.append((now.done, now.total))).position
+    order = pruning.pruning_order(some, worth, lambda now: seen.append((now.done, now.total))).position
     assert order.argsort().tolist() == plainly(some, worth), f"n {n}, seed {seed}"
     assert n < 60 or (seen == sorted(seen) and 0 < seen[0][0] < 30 and seen[-1] == (60, 60))
 
@@ -146,7 +126,7 @@ def test_coincident_gaussians_are_moved_apart() -> None:
     # Of no worth and no size at all: ties, and nothing to divide by.
     for one in (alike, alike.replace(log_scales=torch.full((2000, 3), -400.0))):
         seen.clear()
-        order = pruning_order(one, torch.zeros(2000), lambda now: seen.append((now.done, now.total))).position
+        order = pruning.pruning_order(one, torch.zeros(2000), lambda now: seen.append((now.done, now.total))).position
         assert order.sort().values.equal(torch.arange(2000)) and len(seen) < 300
 
 
@@ -155,10 +135,10 @@ MAX_SV = 5.0
 
 def test_exponents_are_in_range_and_0_without_descendants() -> None:
     some, d = gaussians(400, 0, 0), torch.full((400,), 0.9)
-    order = pruning_order(some, torch.rand(400, generator=torch.Generator().manual_seed(0)))
+    order = pruning.pruning_order(some, torch.rand(400, generator=torch.Generator().manual_seed(0)))
     config = AttenuationConfig(tau=1e-6, max_sv=MAX_SV)
     sigma_d = sigma_for_extinction(some.opacity_logits, d, 1 + 9 * (order.position + 1) / 400, config)
-    found = initial_growth(some.replace(sigma_d=sigma_d, attenuation=config), order.substitute, d)
+    found = pruning.initial_growth(some.replace(sigma_d=sigma_d, attenuation=config), order.substitute, d)
     alone = torch.ones(400, dtype=torch.bool)
     alone[order.substitute[order.substitute != torch.arange(400)]] = False
     assert found.dtype == torch.float32 and found.min() >= 0 and found.max() <= MOST * SHARE

@@ -32,7 +32,6 @@ KIT = Path(__file__).parents[2] / "viewers" / "kit"
 
 
 def through_gsplat(checkpoint: Checkpoint, monkeypatch: pytest.MonkeyPatch) -> Tensor:
-    pytest.importorskip("gsplat", reason="pip install gsplat==1.5.3")
     gsplat_in_torch.install(monkeypatch)
     from clod_adapter.integrations.gsplat import rasterization
 
@@ -118,7 +117,6 @@ def test_paths_agree(screen_filter: str, tmp_path: Path, monkeypatch: pytest.Mon
 
 @pytest.mark.parametrize(("suffix", "levels"), [("ply", 1), ("glb", 1), ("spz", 12)])
 def test_the_kit_is_what_the_library_draws_and_writes(suffix: str, levels: int) -> None:
-    """The files that authors of renderers test with."""
     gaussians = clod.load(KIT / f"kit.{suffix}").gaussians
     for about in json.loads((KIT / "cameras.json").read_text(encoding="utf-8"))["cameras"]:
         width, height, focal = about["width"], about["height"], about["focal"]

@@ -81,7 +81,6 @@ def configured(method: Any, folder: Path, load_dir: Path) -> Any:
 
 
 def write_splatfacto(config: Any, base: Gaussians, folder: Path) -> None:
-    """The checkpoint of a splatfacto whose Gaussians are ``base``."""
     from nerfstudio.models.splatfacto import SplatfactoModelConfig
     from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 
@@ -107,7 +106,6 @@ def trained(config: Any) -> Any:
 
 @pytest.fixture
 def run(nerfstudio: Any, tmp_path: Path) -> SimpleNamespace:
-    """A dial trained on a splatfacto checkpoint."""
     base = write_capture(tmp_path)
     config = configured(nerfstudio.method, tmp_path, tmp_path / "splatfacto")
     write_splatfacto(config, base, tmp_path / "splatfacto")

@@ -31,7 +31,6 @@ KINDS = (*WRITABLE, ".ascii.ply", ".big.ply", ".compressed.ply", ".adapter.safet
 
 
 def of(suffix: str, degree: int = 1, count: int = 40) -> Gaussians:
-    """A model that the format carries."""
     return model(degree, count) if suffix in DIAL else detach(model(degree, count))
 
 

@@ -12,15 +12,7 @@ import scenes
 from clod_adapter.initialization.importance import coverage
 from clod_adapter.training import camera_placement, pseudo_views
 from clod_adapter.training.camera_placement import FIELD, HEIGHT, WIDTH, place_cameras
-from clod_adapter.training.pseudo_views import (
-    FARTHER,
-    MOVED,
-    TURNED,
-    ZOOMED,
-    PseudoView,
-    add_pseudo_views,
-    render_pseudo_views,
-)
+from clod_adapter.training.pseudo_views import FARTHER, MOVED, PseudoView, add_pseudo_views, render_pseudo_views
 from clod_adapter.training.schedule import ViewSampler
 
 
@@ -82,19 +74,16 @@ def test_moved_cameras_have_the_documented_offsets(blob: clod.Gaussians) -> None
     steps = torch.stack([each.viewmat.double() @ camera.viewmat.double().inverse() for each in near])
     assert steps[:, :3, 3].std(0).tolist() == pytest.approx([MOVED * 3.0] * 3, rel=0.2)
     angles = ((steps.diagonal(dim1=1, dim2=2).sum(1) - 2) / 2).clamp(-1, 1).acos()
-    assert angles.square().mean().sqrt() == pytest.approx(TURNED * 3**0.5, rel=0.2)
+    assert angles.square().mean().sqrt() == pytest.approx(pseudo_views.TURNED * 3**0.5, rel=0.2)
     zooms = torch.stack([each.K / camera.K for each in near])[:, [0, 1], [0, 1]].log()
-    assert torch.equal(zooms[:, 0], zooms[:, 1]) and 0.9 * ZOOMED < zooms.abs().max() <= 1.001 * ZOOMED
+    assert torch.equal(zooms[:, 0], zooms[:, 1]) and 0.9 < zooms.abs().max() / pseudo_views.ZOOMED <= 1.001
     eyes = torch.stack([each.position for each in back])
     behind = (camera.position - eyes) @ camera.viewmat[2, :3] / 3.0
     assert behind.min() > -6 * MOVED and FARTHER / 2 < behind.max() < FARTHER - 1 + 6 * MOVED
 
 
 def ball(n: int, seen_from: Tensor) -> clod.Gaussians:
-    """An opaque sphere of small discs and a far floater, with SH degree 1 strong towards ``seen_from`` alone.
-
-    As after training. Degree 1 is odd in the direction: it is 0 on the half that is not seen.
-    """
+    """An opaque sphere of small discs and a far floater; SH degree 1, as after training, on the seen half alone."""
     k = torch.arange(n) + 0.5
     z, turn = 1 - 2 * k / n, math.pi * (1 + 5**0.5) * k
     means = torch.stack([(1 - z * z).sqrt() * turn.cos(), (1 - z * z).sqrt() * turn.sin(), z], 1)

@@ -82,7 +82,6 @@ def default_handler() -> Iterator[None]:
 
 
 def test_an_interrupt_within_the_update_completes_the_step(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The step is completed, and its state resumes to the same bits."""
     given = *capture(60, views=4, width=16, height=12), AdaptConfig(iters=12, max_sv=3.0)
     whole, states = adapt(*given).gaussians, list[Any]()
     monkeypatch.setattr(trainer, "spoilt_rows", pressing(trainer.spoilt_rows, signal.SIGINT, at=5))
@@ -140,10 +139,7 @@ def placed(base: Gaussians, scene: Scene, scale: float, shift: float) -> Pair:
 
 
 def test_unit_direction_and_place(pair: Pair) -> None:
-    """Within the noise of roundings, which is larger in a scene as small as this.
-
-    Files store float32: loading moves the origin of a scene that is farther away (``Checkpoint.origin``).
-    """
+    """Within the noise of roundings, large in a scene so small; farther away, ``Checkpoint.origin`` is for float32."""
     found, wanted = results(*placed(*pair, 1024.0, 1024.0 * 100)), results(*pair)
     for (psnr, kept), (other, share) in zip(found, wanted, strict=True):
         assert psnr == pytest.approx(other, abs=0.5) and kept == pytest.approx(share, abs=0.02), (found, wanted)

@@ -117,7 +117,6 @@ def test_count_slope_is_that_of_the_soft_count() -> None:
 
 @pytest.mark.parametrize("form", ["ours", "paper"])
 def test_shares_count_gaussians_that_are_left_out(form: str) -> None:
-    """Gaussians left out because they are never drawn count as culled."""
     logits, log_sigma, d = some()
     logits[40:65], found, s = -40.0, [], 3.0
     for count, total in ((65, None), (40, 65)):
