@@ -72,12 +72,7 @@ for line in sys.stdin:
 def accepted(words: Sequence[object]) -> list[str]:
     """The words of a command, as text; adapting, which takes few steps here, accepts its loss."""
     found = [str(word) for word in words]
-    adapts = (
-        bool(found)
-        and Path(found[0]).suffix in (".ply", ".pt", ".spz", ".glb", ".splat", ".safetensors")
-        and "--help" not in found
-    )
-    return [*found, "--accept-loss"] if adapts else found
+    return [*found, "--accept-loss"] if found and Path(found[0]).suffix and "--help" not in found else found
 
 
 class Server:

@@ -53,17 +53,13 @@ def folder(capture: Any, dialled: Path, tmp_path_factory: pytest.TempPathFactory
 
 @contextmanager
 def given(folder: Path, existing: str) -> Iterator[None]:
-    """A file of each word: ``NAME`` is foreign, ``NAME=FILE`` a copy, ``NAME>FILE`` and ``NAME~FILE`` links."""
+    """A file of each word: ``NAME`` is foreign, ``NAME>FILE`` a symbolic link, ``NAME~FILE`` a hard one."""
     made = []
     for word in existing.split():
-        name, kind, target = re.fullmatch(r"([^=>~]+)([=>~]?)(.*)", word).groups()  # type: ignore[union-attr]
+        name, kind, target = re.fullmatch(r"([^>~]+)([>~]?)(.*)", word).groups()  # type: ignore[union-attr]
         made.append(path := folder / name)
-        if kind == "=":
-            shutil.copy(folder / target, path)
-        elif kind == ">":
-            path.symlink_to(folder / target)
-        elif kind == "~":
-            os.link(folder / target, path)
+        if kind:
+            (path.symlink_to if kind == ">" else path.hardlink_to)(folder / target)
         elif name.endswith(".png"):
             Image.new("RGB", (4, 4)).save(path)
         else:

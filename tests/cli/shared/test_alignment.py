@@ -1,4 +1,4 @@
-"""Checkpoints that do not match the photographs: errors, warnings, report."""
+"""Checkpoints that do not match the photographs; ``--antialiasing``: stored, detected or requested."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -8,21 +8,26 @@ import pytest
 import torch
 from PIL import Image
 
+import clod_adapter
 from clod_adapter import View, load_scene, render
+from clod_adapter.cli.main import build_parser
+from clod_adapter.cli.shared.console import Console
+from clod_adapter.cli.view import make_page
+from clod_adapter.config import FILTERS
 from models import write_model
-from runs import names
+from runs import names, rebuilt
 
 FAST = "--iters 1 --max-sv 4"
 
 
-def scene_of(capture: Any, folder: Path, shown: Callable[[View], Image.Image], count: int = 9) -> Path:
-    """The first of the capture's cameras with other photographs."""
+def scene_of(capture: Any, folder: Path, shown: Callable[[View], torch.Tensor], count: int = 9) -> Path:
+    """The first of the capture's cameras with other photographs, which ``shown`` gives as pixels."""
     scene = load_scene(capture.scene)
     views = [*scene.test, *scene.train][:count]
     write_model(folder, [view.camera for view in views], [view.camera.name for view in views])
     (folder / "images").mkdir()
     for view in views:
-        shown(view).save(folder / "images" / view.camera.name)
+        Image.fromarray(shown(view).numpy()).save(folder / "images" / view.camera.name)
     return folder
 
 
@@ -55,7 +60,7 @@ def test_cameras_are_moved_into_another_frame_in_every_command(clod: Any, captur
 
 
 def test_another_scene_is_refused_and_nothing_is_written(clod: Any, capture: Any, turned: Path, tmp_path: Path) -> None:
-    random, scene = torch.Generator().manual_seed(2), scene_of(capture, tmp_path / "scene", photograph, 2)
+    random, scene = torch.Generator().manual_seed(2), scene_of(capture, tmp_path / "scene", lambda view: view.image, 2)
     means, sh0 = (torch.randn(shape, generator=random) for shape in ((300, 3), (300, 1, 3)))
     lost = capture.write(tmp_path / "lost.ply", capture.gaussians.replace(means=means + 1e4, sh0=sh0))
     before = names(tmp_path)
@@ -67,16 +72,12 @@ def test_another_scene_is_refused_and_nothing_is_written(clod: Any, capture: Any
     assert names(tmp_path) == before
 
 
-def photograph(view: View, share: float = 1.0) -> Image.Image:
-    return Image.fromarray((share * view.image).byte().numpy())
-
-
 def test_white_background_is_refused_unless_allowed(clod: Any, capture: Any, tmp_path: Path) -> None:
     few = capture.gaussians.select(torch.arange(300) < 40)  # so that there is a background
     ply = capture.write(tmp_path / "few.ply", few)
 
-    def over_white(view: View) -> Image.Image:
-        return Image.fromarray(render(few, view.camera, background=torch.ones(3)).pixels.numpy())
+    def over_white(view: View) -> torch.Tensor:
+        return render(few, view.camera, background=torch.ones(3)).pixels
 
     words = (ply, "--images", scene_of(capture, tmp_path / "white", over_white), FAST)
     done = clod(*words, code=2)
@@ -89,6 +90,69 @@ def test_white_background_is_refused_unless_allowed(clod: Any, capture: Any, tmp
 
 @pytest.mark.parametrize(("said", "share"), [("another exposure", 0.2), ("have a single colour each", 0)])
 def test_other_photographs_have_a_warning(clod: Any, capture: Any, tmp_path: Path, said: str, share: float) -> None:
-    scene_of(capture, tmp_path / "scene", lambda view: photograph(view, share))
+    scene_of(capture, tmp_path / "scene", lambda view: (share * view.image).byte())
     done = clod("BASE --images scene", FAST, "--json")
     assert said in done.err and said in done.report["notes"][0], done
+
+
+FAST = "--iters 3 --max-sv 4 --out dial.ply --json"
+
+
+@pytest.fixture(scope="module")
+def trained(capture: Any, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """A checkpoint of small Gaussians without metadata on antialiasing, and antialiased photographs."""
+    folder = tmp_path_factory.mktemp("antialiased")
+    small = capture.gaussians.replace(log_scales=capture.gaussians.log_scales - 0.8)
+    shown = small.replace(screen_filter=FILTERS["on"])
+    scene = scene_of(capture, folder / "scene", lambda view: render(shown, view.camera).pixels, 10)
+    return capture.write(folder / "base.ply", small), scene
+
+
+def test_adapting_detects_and_stores_the_filter(clod: Any, trained: tuple[Path, Path], tmp_path: Path) -> None:
+    """The viewer draws the base with the filter of the model, without photographs and metadata in the base's file."""
+    ply, scene = trained
+    report = (done := clod(ply, "--images", scene, FAST)).report
+    assert "trained with antialiasing: " in done.err and "--antialiasing off overrides" in done.err
+    (note,) = [note for note in report["notes"] if "antialiasing" in note]
+    assert note in done.err and report["screen_filter"] == {"variance": 0.3, "compensate": True}
+    assert report["base_rows"][0]["psnr"] > 45  # the photographs are its renders, rounded to bytes
+    found = clod_adapter.load("dial.ply")
+    assert found.gaussians.screen_filter == FILTERS["on"] and found.filter_known
+    assert clod_adapter.load_adapter("dial.safetensors").screen_filter == FILTERS["on"] and rebuilt(clod, ply)
+    for more, want in ((), FILTERS["on"]), (("--antialiasing", "off"), FILTERS["off"]):
+        words = ["dial.ply", "--base", str(ply), *more]
+        answers, _ = make_page(build_parser("view").parse_args(words), Console(quiet=True))
+        for name in ("model", "base"):
+            (tmp_path / "served.ply").write_bytes(b"".join(answers[f"/files/{name}"].blocks()))
+            assert clod_adapter.load(tmp_path / "served.ply").gaussians.screen_filter == want
+
+
+def test_eval_and_render_use_the_detected_filter(clod: Any, trained: tuple[Path, Path]) -> None:
+    ply, scene = trained
+    found = {}
+    for more in ("", "--antialiasing off"):
+        words = (ply, "--images", scene, "--json", more)
+        report = clod("eval", *words, "--sv 1 --against", ply, "--base", ply).report
+        drawn = clod("render", *words, "-o pictures").report
+        psnr = [report["rows"][0]["psnr"], report["base_row"]["psnr"], report["against"][0]["theirs"]["psnr"]]
+        found[more] = [*psnr, drawn["pictures"][0]["psnr"][0]]
+        for each in (report, drawn):
+            assert any("was trained with antialiasing" in note for note in each["notes"]) == (more == ""), each["notes"]
+    assert min(found[""]) > 45 > 35 > max(found["--antialiasing off"]), found
+
+
+def test_option_overrides_the_file(clod: Any, trained: tuple[Path, Path]) -> None:
+    """The result of adapting stores the filter of the option; a note names an override of it."""
+    ply, scene = trained
+    assert "by the photographs" not in clod(ply, "--images", scene, FAST, "--antialiasing mip").err
+    told = clod("eval dial.ply --images", scene, "--sv 1 --json --antialiasing off")
+    (note,) = [note for note in told.report["notes"] if "(--antialiasing)" in note]
+    assert "the file has 0.1 px^2 of blur, opacities compensated" in note and note in told.err
+
+
+def test_exports_store_the_filter_or_note_its_loss(clod: Any, trained: tuple[Path, Path]) -> None:
+    for out, stores, notes in (("a.ply", True, True), ("a.spz", True, False), ("a.splat", False, True)):
+        done = clod("export", trained[0], "--antialiasing on --json -o", out)
+        found = [note for note in done.report["notes"] if "trained antialiased" in note]
+        assert bool(found) == notes and all(note in done.err for note in found), done
+        assert not stores or clod_adapter.load(out).gaussians.screen_filter == FILTERS["on"]

@@ -1,6 +1,9 @@
-"""What commands read, in formats of other tools; their device; kernels, compiled before times are measured."""
+"""Inputs in formats of other tools; devices; kernels, compiled before times are measured; the pages of ``--report``."""
 
+import json
+import re
 import shutil
+import sys
 from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
@@ -8,11 +11,11 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 import torch
-from numba.core.event import Event, Listener, install_listener
+from numba.core.event import install_recorder
 from plyfile import PlyData
 
 import clod_adapter
-from clod_adapter.cli.shared import inputs
+from clod_adapter.cli.shared import inputs, pages
 from clod_adapter.cli.shared.console import Console
 from clod_adapter.cli.shared.inputs import pick_device, prepare_kernels
 from clod_adapter.errors import ClodError
@@ -74,25 +77,58 @@ def test_devices(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[
     refused("gsplat is absent: pip install gsplat==1.5.3")
 
 
-class Compiled(Listener):
-    def __init__(self) -> None:
-        self.names = list[str]()
-
-    def on_start(self, event: Event) -> None:
-        self.names.append(str(event.data["dispatcher"]))
-
-    def on_end(self, event: Event) -> None:
-        pass
-
-
 def test_adapting_compiles_nothing_more(capture: Any, capsys: pytest.CaptureFixture[str]) -> None:
     """For any SH degree; without compiling nothing is printed."""
     base, scene = capture.gaussians, clod_adapter.load_scene(capture.scene)
     prepare_kernels(Console(quiet=True))
-    with install_listener("numba:compile", compiled := Compiled()):
+    with install_recorder("numba:compile") as compiled:
         prepare_kernels(Console())
         for bands in (0, 3):
             base = base.replace(shN=base.shN[:, :bands])
             result = clod_adapter.adapt(base, scene, clod_adapter.AdaptConfig(iters=2)).gaussians
             clod_adapter.evaluate(result, scene.test, [1.0, 3.0])
-    assert capsys.readouterr().err == "" and compiled.names == []
+    assert capsys.readouterr().err == "" and compiled.buffer == []
+
+
+ADAPT = "BASE --images SCENE --iters 16 --max-sv 4 --out dial.ply --report"
+
+
+def page_of(path: Path) -> tuple[str, dict[str, Any]]:
+    """Its text, and the data in it."""
+    text = path.read_text(encoding="utf-8")
+    found = re.search(r'id="data">(.*?)</script>', text, re.S)
+    assert found
+    return text, json.loads(found[1])
+
+
+def test_adapt(clod: Any, tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    report = clod(ADAPT, "--json").report
+    files = {"page": "dial.html", "rendering": "dial_rendering.png", "adapting": "dial_adapting.png"}
+    assert report["outputs"].items() >= files.items() and all((tmp_path / f).is_file() for f in files.values())
+    text, page = page_of(tmp_path / "dial.html")
+    assert all(page["report"][name] == report[name] for name in ("rows", "base_rows", "plan"))
+    curves = page["training"]["curves"]
+    assert [curve["label"] for curve in curves] == ["s = 1", "s = 3", "s = 4"]
+    rows = {row["virtual_scale"]: row for row in report["rows"]}
+    for curve, dial in zip(curves, (1, 3, 4), strict=True):
+        seconds, psnr = ([point[name] for point in curve["points"]] for name in ("seconds", "psnr"))
+        assert seconds == sorted(seconds) and len(seconds) == 5  # steps 1, 2, 4, 8 and 16, the end
+        assert len(set(psnr)) == 5 and psnr[-1] == rows[dial]["psnr"]  # each of its own time
+    trained = report["seconds"]["start"] + report["seconds"]["train"]
+    assert curves[0]["points"][-1]["seconds"] == pytest.approx(trained, abs=0.05)
+    assert "change no pixel of" in text and "base.ply, a trained splat of 300 Gaussians" in text
+    assert text.count("<svg") == 4
+    assert text.count('data-name=""') == pages.FRAMES and text.count('data-name="base"') == 1
+
+
+def test_eval(clod: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without matplotlib the page is refused before any work."""
+    pytest.importorskip("matplotlib")
+    report = clod("eval DIAL --images SCENE --report look.html --json --base BASE").report
+    assert report["outputs"] == {"page": "look.html", "rendering": "look_rendering.png"}
+    text, page = page_of(tmp_path / "look.html")
+    assert page["report"]["rows"] == report["rows"] and page["training"] is None
+    assert 'data-name="base"' in text and "hold for base" in text
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    assert "pip install matplotlib" in clod(ADAPT, code=2).err
