@@ -16,11 +16,11 @@ from typing import Any, NoReturn
 import pytest
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
-SOFTWARE = (
+SOFTWARE = [
     "--use-angle=swiftshader", "--enable-unsafe-swiftshader",  # WebGL
     "--enable-unsafe-webgpu", "--use-webgpu-adapter=swiftshader", "--enable-features=Vulkan",  # WebGPU
     "--disable-background-networking",
-)  # fmt: skip
+]  # fmt: skip
 
 # Runs WGSL statements on each row of a table, in place: `rows[at]` is the row's first number. One invocation a row.
 COMPUTE = """async ([source, statements, table]) => {
@@ -80,9 +80,7 @@ def launch() -> Iterator[Any]:
         missing("Playwright is not installed: pip install playwright")
     with sync_playwright() as playwright:
         # A test has root in many containers, where Chromium's sandbox refuses to start.
-        chromium = playwright.chromium.launch(
-            executable_path=path, headless=True, chromium_sandbox=False, args=[*SOFTWARE]
-        )
+        chromium = playwright.chromium.launch(executable_path=path, chromium_sandbox=False, args=SOFTWARE)
         try:
             yield chromium
         finally:

@@ -20,7 +20,7 @@ from PIL import Image
 
 import browser
 import fake_gpu
-from clod_adapter import Camera, Gaussians, render
+from clod_adapter import Camera, Gaussians, Scene, render
 from clod_adapter.cli.main import main
 from clod_adapter.cli.shared.console import Console
 from clod_adapter.cli.shared.inputs import prepare_kernels
@@ -31,6 +31,7 @@ from clod_adapter.training import pseudo_views
 from formats import inria_rows, write_rows
 from models import write_model
 from runs import accepted
+from scenes import capture as perturbed
 from scenes import looking
 
 fake_gpu.register()
@@ -94,6 +95,11 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
     for camera, name in zip(cameras, names, strict=True):
         Image.fromarray(render(gaussians, camera).pixels.numpy()).save(scene / "images" / name)
     return Capture(scene, _write_inria(folder / "base.ply", gaussians), gaussians, _write_inria)
+
+
+@pytest.fixture(scope="module")
+def captured() -> tuple[Gaussians, Scene]:
+    return perturbed()
 
 
 @pytest.fixture(scope="session")

@@ -76,9 +76,8 @@ def splat_transform(*arguments: str | Path) -> None:
     command = os.environ.get("CLOD_SPLAT_TRANSFORM") or shutil.which("splat-transform")
     if command is None:
         pytest.skip("splat-transform is not on PATH, and CLOD_SPLAT_TRANSFORM is not set")
-    done = subprocess.run(
-        [*command.split(), "-q", "-w", *map(str, arguments)], capture_output=True, text=True, timeout=100
-    )
+    words = [*command.split(), "-q", "-w", *map(str, arguments)]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=100)
     assert done.returncode == 0, done.stdout + done.stderr
 
 

@@ -48,9 +48,8 @@ def module(name: str) -> Any:
             return tuple(drawn[result] for result in results.split())
 
     forward: Any = GaussianRasterizer.forward
-    forward.__signature__ = Signature(
-        [Parameter(each, Parameter.POSITIONAL_OR_KEYWORD, default=None) for each in ("self", *call.split())]
-    )
+    parameters = [Parameter(each, Parameter.POSITIONAL_OR_KEYWORD, default=None) for each in ("self", *call.split())]
+    forward.__signature__ = Signature(parameters)
     made: Any = ModuleType("diff_gaussian_rasterization")
     made.GaussianRasterizer = GaussianRasterizer
     made.GaussianRasterizationSettings = namedtuple("GaussianRasterizationSettings", f"{SETTINGS} {settings}")
@@ -80,9 +79,8 @@ def _draw(settings: Any, given: dict[str, Any]) -> dict[str, Any]:
     kernel = getattr(settings, "kernel_size", None)
     compensate = bool(kernel or getattr(settings, "antialiasing", None))
     screen_filter = ScreenFilter(variance=kernel or 0.3, compensate=compensate)
-    means, quats, scales, opacities, shs = (
-        given[name][seen] for name in ("means3D", "rotations", "scales", "opacities", "shs")
-    )
+    names = ("means3D", "rotations", "scales", "opacities", "shs")
+    means, quats, scales, opacities, shs = (given[name][seen] for name in names)
     image, alpha = rasterize(
         means, quats, scales, opacities[:, 0], shs[:, :1], shs[:, 1:], screen_filter=screen_filter,
         camera=Camera(settings.viewmatrix.T, K, width, height), background=settings.bg,

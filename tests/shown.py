@@ -48,9 +48,8 @@ class Shown:
         return self
 
     def run(self, script: str, *arguments: object) -> Any:
-        return self.page.evaluate(
-            f"async (given) => {{ const r = await {script}; await clod.whenDrawn(); return r }}", *arguments
-        )
+        waiting = f"async (given) => {{ const r = await {script}; await clod.whenDrawn(); return r }}"
+        return self.page.evaluate(waiting, *arguments)
 
     def until(self, condition: str) -> None:
         """Waits until it holds. Not Playwright's wait_for_function, which the page's policy forbids to evaluate."""

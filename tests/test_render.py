@@ -133,9 +133,8 @@ def draws(monkeypatch: pytest.MonkeyPatch) -> dict[str, Drawing]:
     colors, points = torch.cat([given.pop("sh0"), given.pop("shN")], 1), given["means"]
     ours = fresh_copy(monkeypatch, "gsplat", "gsplat", gsplat_versions.module("1.5.3")).rasterization
     fork = inria_forks.module("inria 2024")
-    of_inria = fresh_copy(monkeypatch, "inria", "diff_gaussian_rasterization", fork).GaussianRasterizer(
-        inria_forks.settings_of(fork.GaussianRasterizationSettings, VIEW)
-    )
+    inria = fresh_copy(monkeypatch, "inria", "diff_gaussian_rasterization", fork)
+    of_inria = inria.GaussianRasterizer(inria_forks.settings_of(fork.GaussianRasterizationSettings, VIEW))
     views = {"viewmats": VIEW.viewmat[None], "Ks": VIEW.K[None], "width": VIEW.width, "height": VIEW.height}
     rows = {"shs": colors, "scales": given["scales"], "rotations": given["quats"]}
     return {
@@ -149,9 +148,8 @@ def draws(monkeypatch: pytest.MonkeyPatch) -> dict[str, Drawing]:
 
 @pytest.mark.parametrize("name", ["gsplat", "inria", "render"])
 def test_a_dial_value_without_a_dial_is_warned_of(draws: dict[str, Drawing], name: str) -> None:
-    with pytest.warns(
-        UserWarning, match="virtual_scale is 3, but there is no sigma_d: all .* drawn as they are"
-    ) as told:
+    message = "virtual_scale is 3, but there is no sigma_d: all .* drawn as they are"
+    with pytest.warns(UserWarning, match=message) as told:
         draws[name](virtual_scale=3)
     assert name == "inria" or told[0].filename == __file__  # torch calls Inria's
     with warnings.catch_warnings():

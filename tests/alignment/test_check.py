@@ -29,10 +29,7 @@ def pair() -> tuple[Gaussians, list[View]]:
 
 
 def posed(views: Sequence[View], change: Callable[[Tensor], Tensor]) -> list[View]:
-    return [
-        View(replace(view.camera, viewmat=change(view.camera.viewmat).to(view.camera.viewmat)), view.image)
-        for view in views
-    ]
+    return [View(replace(view.camera, viewmat=change(view.camera.viewmat).float()), view.image) for view in views]
 
 
 def in_world(views: Sequence[View], scale: float, rotation: Tensor, offset: Tensor) -> list[View]:

@@ -13,7 +13,7 @@ from clod_adapter.blocks.memory import MOST_BLOCKS, MemoryEstimate, least, parse
 from clod_adapter.blocks.train import adapt_block, merge
 from clod_adapter.initialization.importance import initialize
 from clod_adapter.training.target_count import target_curve
-from scenes import capture, gaussians
+from scenes import gaussians
 
 SIZES = {
     "8GB": 8 * 10**9, "8 gb": 8 * 10**9, "8G": 8 * 10**9, "500MB": 5 * 10**8, "0.5GB": 5 * 10**8, ".5G": 5 * 10**8,
@@ -42,11 +42,6 @@ def test_least_memory_is_the_smallest_that_suffices(count: int, attributes: int,
 
 CONFIG = AdaptConfig(iters=80)
 BLOCKS = 4
-
-
-@pytest.fixture(scope="module")
-def captured() -> tuple[Gaussians, Scene]:
-    return capture()
 
 
 @pytest.fixture(scope="module")

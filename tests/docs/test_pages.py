@@ -213,9 +213,7 @@ def test_qualities_in_tables_are_measured() -> None:
         found |= {each for line in file.read_text(encoding="utf-8").splitlines() for each in measured(json.loads(line))}
     with (RESULTS / "robustness.csv").open(encoding="utf-8") as stream:
         found |= set(measured(list(csv.DictReader(stream))))
-    cells = [
-        cell for page in ("method.md", "performance.md") for table in tables(page) for row in table for cell in row
-    ]
+    cells = [cell for page in ("method.md", "performance.md") for rows in tables(page) for row in rows for cell in row]
     told = [cell.replace(" %", "%") for cell in cells if re.fullmatch(r"\d\d\.\d\d( @ \d+ ?%)?", cell)]
     assert len(told) > 50 and not {*told} - found
 

@@ -8,15 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from clod_adapter import AttenuationConfig, Camera, Gaussians, with_dial
+from clod_adapter.equation import units
 from clod_adapter.equation.attenuation import SIGMA_MAX, dial
 from clod_adapter.equation.distances import normalized_distances, normalizing_distance, typical_distance, viewpoint_of
-from clod_adapter.equation.units import (
-    estimated_distance,
-    in_world_units,
-    known_distance,
-    nominal_distance,
-    with_distance,
-)
+from clod_adapter.equation.units import in_world_units, nominal_distance, with_distance
 from scenes import camera, gaussians, ring
 
 CONFIG = AttenuationConfig(scene_distance=4.0)
@@ -86,7 +81,7 @@ def test_changing_the_unit_keeps_the_dial(distance: float, eps: float, s: float,
     some = some.replace(sigma_d=some.sigma_d.double(), means=some.means.double(), growth_d=torch.linspace(-1, 3, 400))
     other = with_distance(some, distance)
     assert other.attenuation is not None and other.attenuation.scene_distance == distance
-    assert known_distance(other.attenuation) == (known or 3.7)
+    assert units.known_distance(other.attenuation) == (known or 3.7)
     found, want = (dial(each, camera(), s) for each in (other, some))
     # Where the unit grows a little, eps alone may fade less than a tiny sigma did: sigma' would have to be imaginary.
     possible = other.sigma_d > 0
@@ -109,7 +104,7 @@ def test_special_values_and_other_normalizers_keep_sigma() -> None:
 def test_nominal_distance_is_that_of_the_training_views() -> None:
     means = gaussians(500, 0, 1).means
     config = AttenuationConfig()
-    assert nominal_distance(means, config) == estimated_distance(means)
+    assert nominal_distance(means, config) == units.estimated_distance(means)
     assert nominal_distance(means, replace(config, reference_distance=2.5)) == 2.5
     assert nominal_distance(means, replace(config, scene_distance=4.0)) == 1.0  # as earlier versions wrote
     assert nominal_distance(means, replace(config, scene_distance=4.0, reference_distance=2.0)) == 0.5

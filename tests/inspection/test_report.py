@@ -19,7 +19,7 @@ from clod_adapter.io.ply import read_head
 from clod_adapter.io.ply_layout import inria_dtype
 from clod_adapter.origin import NOWHERE
 from clod_adapter.training.state import TrainingState, save_state
-from formats import CALIBRATION, PACKED, inria_rows, with_columns
+from formats import CALIBRATION, PACKED, inria_rows, with_columns, write_rows
 
 ATTENUATION = AttenuationConfig(tau=0.01, max_sv=6.0, cut="soft", reference_distance=3.5)
 
@@ -28,11 +28,6 @@ def table(n: int = 300, degree: int = 1, seed: int = 0) -> np.ndarray:
     """Rows in Inria's layout, with unit quaternions and nonzero values in every column."""
     g = scenes.gaussians(n, degree, seed)
     return inria_rows(g.replace(quats=torch.nn.functional.normalize(g.quats)))
-
-
-def write(path: Path, vertex: np.ndarray, *, comments: tuple[str, ...] = ()) -> Path:
-    PlyData([PlyElement.describe(vertex, "vertex", comments=list(comments))], byte_order="<").write(str(path))
-    return path
 
 
 def seen(path: Path) -> tuple[Inspection, Splat]:
@@ -49,7 +44,7 @@ def kinds(found: Inspection) -> dict[str, int]:
 
 def test_a_plain_file(tmp_path: Path) -> None:
     vertex = table()
-    found, splat = seen(write(tmp_path / "a.ply", vertex))
+    found, splat = seen(write_rows(tmp_path / "a.ply", vertex))
     v = splat
     assert (v.total, v.count, v.dropped, splat.sh_degree, v.used_sh_degree) == (300, 300, {}, 1, 1)
     assert found.what == "a splat, PLY" and "Inria" in (found.writer or "") and splat.dial is None
@@ -73,7 +68,7 @@ def test_empty_sh_degrees_are_those_that_adapting_skips(tmp_path: Path, degree: 
     for name in vertex.dtype.names or ():
         if name.startswith("f_rest_") and int(name[7:]) % bands >= (used + 1) ** 2 - 1:
             vertex[name] = 0
-    found, splat = seen(write(tmp_path / "a.ply", vertex))
+    found, splat = seen(write_rows(tmp_path / "a.ply", vertex))
     lean = load(tmp_path / "a.ply").gaussians.without_empty_bands()
     assert splat.used_sh_degree == lean.sh_degree == used
     assert any("skipped in training" in line for line in found.left_out) == (used < degree)
@@ -86,7 +81,7 @@ def test_dropped_rows_are_those_that_load_drops(tmp_path: Path) -> None:
     vertex["opacity"][5] = np.inf
     for k in range(4):
         vertex[f"rot_{k}"][:2] = 0
-    v, base = seen(write(tmp_path / "a.ply", vertex))[1], load(tmp_path / "a.ply")
+    v, base = seen(write_rows(tmp_path / "a.ply", vertex))[1], load(tmp_path / "a.ply")
     assert v.count == len(base.gaussians) < 38 and v.total == 40
     notes = [note for note in base.notes if "dropped" in note]
     assert notes == [f"{gone} of 40 Gaussians dropped: {reason}" for reason, gone in v.dropped.items()]
@@ -102,21 +97,21 @@ def test_anomalies_are_counted(tmp_path: Path) -> None:
         vertex[name][20] = 1e4
     vertex["scale_1"][30:32] = 9.0
     labelled = with_columns(vertex, label=1)
-    found, splat = seen(write(tmp_path / "a.ply", labelled, comments=("SplatRenderMode: mip",)))
+    found, splat = seen(write_rows(tmp_path / "a.ply", labelled, comments=("SplatRenderMode: mip",)))
     assert kinds(found) == {"infinite_opacity": 3, "doubles": 4, "far": 1, "giant": 2, "antialiased": 0}
     assert splat.extra == ("label",) and any("label" in line for line in found.left_out)
     vertex["x"], vertex["y"], vertex["z"] = np.where(np.arange(600) % 2, -0.0, 0.0), 0, 1.5  # -0 is 0
-    v = seen(write(tmp_path / "b.ply", vertex))[1]
+    v = seen(write_rows(tmp_path / "b.ply", vertex))[1]
     assert v.doubles == 599 and v.far == v.giant == 0
     vertex["x"] = np.nan
     with pytest.raises(ClodError, match="c.ply: no usable Gaussian in it, of 600 rows"):
-        inspect(write(tmp_path / "c.ply", vertex))
+        inspect(write_rows(tmp_path / "c.ply", vertex))
 
 
 def test_values_that_look_activated_are_read_as_activated(tmp_path: Path) -> None:
     vertex = table()
     opacity = vertex["opacity"] = 1 / (1 + np.exp(-vertex["opacity"]))
-    found, splat = seen(write(tmp_path / "a.ply", vertex))
+    found, splat = seen(write_rows(tmp_path / "a.ply", vertex))
     assert [o.kind for o in found.anomalies] == ["activated"] and "--activated opacity" in found.anomalies[0].says
     assert splat.opacity.median == pytest.approx(np.median(opacity), rel=1e-5)
 
@@ -124,13 +119,13 @@ def test_values_that_look_activated_are_read_as_activated(tmp_path: Path) -> Non
 def test_other_trainers_encodings_and_coordinates(tmp_path: Path) -> None:
     vertex = table()
     masked = with_columns(vertex, masks_0=0, masks_1=np.arange(300) < 100)
-    assert seen(write(tmp_path / "m.ply", masked))[1].count == 200
-    found, splat = seen(write(tmp_path / "f.ply", with_columns(vertex, filter_3D=0.5)))
+    assert seen(write_rows(tmp_path / "m.ply", masked))[1].count == 200
+    found, splat = seen(write_rows(tmp_path / "f.ply", with_columns(vertex, filter_3D=0.5)))
     assert splat.scale.least >= 0.5 and splat.extra == ()
     assert any("filter_3D" in line for line in found.left_out)
     wide = vertex.astype([(name, "f8" if name in "xyz" else "f4") for name in vertex.dtype.names or ()])
     wide["y"] += 4_500_000.0
-    found, splat = seen(write(tmp_path / "a.ply", wide, comments=("Generated by Nerstudio 1.1.5",)))
+    found, splat = seen(write_rows(tmp_path / "a.ply", wide, comments=("Generated by Nerstudio 1.1.5",)))
     assert "dataparser_transforms.json" in found.notes[0] and "far_from_0" in kinds(found)
     assert splat.origin == load(tmp_path / "a.ply").origin and splat.doubles == 0
     assert splat.position[1].median == pytest.approx(np.median(wide["y"]), abs=1e-6)
@@ -156,7 +151,7 @@ def test_a_dial(tmp_path: Path) -> None:
     rows = [line.split() for line in lines_of(found) if line.startswith("growth_d")]
     assert rows == [["growth_d", "-1", "-0.96", "1", "2.96", "3"]]
     # Another tool's column of the same name, which is no growth without a sigma_d.
-    _, splat = seen(write(tmp_path / "c.ply", with_columns(table(), growth_d=0.5)))
+    _, splat = seen(write_rows(tmp_path / "c.ply", with_columns(table(), growth_d=0.5)))
     assert splat.growth is None and splat.extra == ("growth_d",)
 
 
@@ -196,9 +191,8 @@ UNKNOWN = ("by hand", "Vertical axis: y")
     ],
 )
 def test_writers(tmp_path: Path, names: list[str], comments: tuple[str, ...], says: str) -> None:
-    element = PlyElement.describe(np.zeros(1, [(name, "f4") for name in names]), "vertex", comments=list(comments))
-    PlyData([element], byte_order="<").write(str(tmp_path / "a.ply"))
-    assert str(looks_like(read_head(tmp_path / "a.ply"))).startswith(says)
+    path = write_rows(tmp_path / "a.ply", np.zeros(1, [(name, "f4") for name in names]), comments=comments)
+    assert str(looks_like(read_head(path))).startswith(says)
 
 
 def test_writers_of_packed_files(tmp_path: Path) -> None:

@@ -68,10 +68,8 @@ def through_inria(checkpoint: Checkpoint, monkeypatch: pytest.MonkeyPatch) -> Te
         "inria 2024", {"antialiasing": g.screen_filter.compensate}
     )  # fmt: skip
     ours = inria(monkeypatch, inria_forks.module(name))
-    color, *_ = ours.GaussianRasterizer(settings_of(ours.GaussianRasterizationSettings, VIEW, **settings))(
-        **arguments(g)
-    )
-    return color.permute(1, 2, 0).detach()
+    rasterizer = ours.GaussianRasterizer(settings_of(ours.GaussianRasterizationSettings, VIEW, **settings))
+    return rasterizer(**arguments(g))[0].permute(1, 2, 0).detach()
 
 
 def through_hook(checkpoint: Checkpoint, monkeypatch: pytest.MonkeyPatch) -> Tensor:

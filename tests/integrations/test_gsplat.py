@@ -56,9 +56,7 @@ def arguments(cameras: int, batch: tuple[int, ...] = (), device: str = "cpu") ->
     """Arguments of the Gaussians, with colours of SH degree 1, and of the cameras, with batch dimensions."""
     copies = [scene(N, 1, seed, size=0.2) for seed in range(math.prod(batch))]
     parts = [each | {"colors": torch.cat([each.pop("sh0"), each.pop("shN")], 1)} for each in copies]
-    given = {
-        name: torch.stack([part[name] for part in parts]).reshape(*batch, *parts[0][name].shape) for name in parts[0]
-    }
+    given = {key: torch.stack([part[key] for part in parts]).reshape(*batch, *x.shape) for key, x in parts[0].items()}
     views = ring(cameras * len(copies), WIDTH, HEIGHT) if cameras > 1 else [camera(WIDTH, HEIGHT)]
     given |= {"viewmats": torch.stack([view.viewmat for view in views]), "Ks": torch.stack([view.K for view in views])}
     given = {name: value.to(device) for name, value in given.items()}

@@ -91,9 +91,8 @@ def test_splatfacto_draws_what_render_draws(parameters: dict[str, Tensor], dial:
     for scale in (1.0, 5.0):
         changed = shown(parameters, dial, camera, scale)
         assert all(value.shape == parameters[name].shape for name, value in changed.items())
-        drawn = plain.replace(
-            means=changed["means"], log_scales=changed["scales"], opacity_logits=changed["opacities"][:, 0].nan_to_num()
-        )
+        logits = changed["opacities"][:, 0].nan_to_num()
+        drawn = plain.replace(means=changed["means"], log_scales=changed["scales"], opacity_logits=logits)
         torch.testing.assert_close(render(drawn, camera).image, render(model, camera, scale).image, rtol=0, atol=1e-5)
     keep = dial(camera, 5.0).keep
     assert 0 < int(keep.sum()) < N

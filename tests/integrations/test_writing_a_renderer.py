@@ -92,29 +92,26 @@ def test_shaders_match_the_golden_values(page: Any, shader: str) -> None:
         assert abs(got - row[-1]) <= STORED["tolerance"] * row[-1], (row, got)
 
 
+def attenuated(opacity: float, sigma: float, d: float, scale: float, eps: float, tau: float, soft: bool) -> Any:
+    config = AttenuationConfig(eps=eps, tau=tau, cut="soft" if soft else "hard", max_sv=1)
+    return attenuate(*torch.tensor([[opacity], [sigma], [d]], dtype=torch.float64), scale, config, activated=True)
+
+
+def my_scale(growth: float, distance: float, scale: float, reach: float) -> float:
+    return float(growth_factors(*torch.tensor([[growth], [distance]], dtype=torch.float64), scale, reach))
+
+
 def test_golden_values_match_the_equation() -> None:
     """In float64, equal to rounding, since exp differs between processors."""
-    for opacity, sigma, distance, scale, eps, tau, soft, *want in STORED["rows"]:
-        config = AttenuationConfig(tau=tau, eps=eps, cut="soft" if soft else "hard", max_sv=1)
-        values = torch.tensor([[opacity], [sigma], [distance]], dtype=torch.float64)
-        found = attenuate(*values, scale, config, activated=True)
+    for *row, faded, drawn in STORED["rows"]:
+        found, want = attenuated(*row), (faded, drawn)
         assert [float(found.opacities), float(found.drawn)] == pytest.approx(want, rel=1e-12, abs=1e-300)
-    for growth, distance, scale, reach, factor in STORED["scale_rows"]:
-        growth_d, d = torch.tensor([[growth], [distance]], dtype=torch.float64)
-        assert float(growth_factors(growth_d, d, scale, reach)) == pytest.approx(factor, rel=1e-12, abs=1e-300)
+    for *row, factor in STORED["scale_rows"]:
+        assert my_scale(*row) == pytest.approx(factor, rel=1e-12, abs=1e-300)
 
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = (ROOT / "docs" / "writing_a_renderer.md").read_text(encoding="utf-8")
-
-
-def my_opacity(opacity: float, sigma: float, d: float, scale: float, eps: float, tau: float, soft: bool) -> float:
-    config = AttenuationConfig(eps=eps, tau=tau, cut="soft" if soft else "hard", max_sv=1)
-    return float(attenuate(*torch.tensor([[opacity], [sigma], [d]]), scale, config, activated=True).drawn)
-
-
-def my_scale(growth: float, distance: float, scale: float, reach: float) -> float:
-    return float(growth_factors(*torch.tensor([[growth], [distance]]), scale, reach))
 
 
 def block(word: str) -> str:
@@ -125,11 +122,10 @@ def block(word: str) -> str:
 def test_the_code_of_the_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The golden loop, which refuses functions that are off; the hook; and a held frame time, with 20 ms a frame."""
     monkeypatch.chdir(tmp_path)
-    adapted = scenes.dialled(300, 1, 3, scene_distance=1.0, reference_distance=5.0).replace(
-        growth_d=torch.linspace(0, 1, 300)
-    )
+    adapted = scenes.dialled(300, 1, 3, scene_distance=1.0, reference_distance=5.0)
+    adapted = adapted.replace(growth_d=torch.linspace(0, 1, 300))
     clod_adapter.save("model.ply", adapted)
-    own = {"my_opacity": my_opacity, "my_scale": my_scale}
+    own = {"my_opacity": lambda *row: float(attenuated(*row).drawn), "my_scale": my_scale}
     exec(block("golden"), dict(own))
     for name, function in own.items():
         with pytest.raises(AssertionError):

@@ -1,7 +1,6 @@
 """Scenes as ``load_scene`` gives them: COLMAP models, photographs that are missing or distorted, what is held out."""
 
 import importlib
-import json
 import math
 import os
 import shutil
@@ -19,7 +18,6 @@ import torch
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
-from clod_adapter._support.text import file_name
 from clod_adapter.cameras import StoredView, View
 from clod_adapter.errors import ClodError
 from clod_adapter.io.scene import colmap
@@ -208,8 +206,7 @@ def ideal(view: View, across: float = 0.0, down: float = 0.0) -> np.ndarray:
 
 @pytest.mark.parametrize("kind", LENSES)
 def test_undistorted_image_is_that_of_the_pinhole_camera(tmp_path: Path, cache: Path, kind: str) -> None:
-    scene = capture_of(tmp_path / "scene", kind, LENSES[kind])
-    loaded = load_scene(scene)
+    loaded = load_scene(capture_of(tmp_path / "scene", kind, LENSES[kind]))
     view = loaded.train[0]
     right = psnr_of(view.image.numpy(), ideal(view))
     shifted = [psnr_of(view.image.numpy(), ideal(view, *by)) for by in ((0.1, 0), (-0.1, 0), (0, 0.1), (0, -0.1))]
@@ -294,26 +291,11 @@ def test_files_of_a_colmap_scene(tmp_path: Path) -> None:
     assert {"cam/sub/001.png", "cam_2/sub/001.png", "masks/a.png"} <= there(tmp_path)
 
 
-def test_files_of_transforms_scenes(tmp_path: Path) -> None:
-    train = {"frames": [{"file_path": "./train/r_0", "mask_path": "masks/0.png"}, {"file_path": "rgb\\ü.jpg"}, 7]}
-    test = {"frames": [{"file_path": "test/r_0.png", "depth_file_path": "depth/0.tif"}, {"file_path": "a\0\ud800"}]}
-    (tmp_path / "transforms_train.json").write_text(json.dumps(train))
-    (tmp_path / "transforms_test.json").write_text(json.dumps(test))
-    (tmp_path / "transforms.json").write_text("no JSON")
-    names = [*map(file_name, ["train/r_0.png", "rgb/ü.jpg", "masks/0.png", "test/r_0.png", "depth/0.tif"])]
-    for name in [*names, "train/r_1.png"]:
-        (tmp_path / name).parent.mkdir(exist_ok=True)
-        (tmp_path / name).write_bytes(b"")
-    assert there(tmp_path) == {*names, "transforms.json", "transforms_train.json", "transforms_test.json"}
-
-
-ONE = 64 * 48 * 3
-
-
 def test_cached_scene_equals_the_scene(capture: Any, tmp_path: Path) -> None:
     """The most recently used photographs are kept, as many as fit."""
     shutil.copytree(capture.scene, tmp_path / "scene")
-    whole, cache = load_scene(capture.scene), ImageCache(2 * ONE + ONE // 2)
+    size, whole = 64 * 48 * 3, load_scene(capture.scene)
+    cache = ImageCache(2 * size + size // 2)
     stored = load_scene(tmp_path / "scene", cache=cache)
     assert stored.notes == whole.notes
     for one, other in zip((*whole.train, *whole.test), (*stored.train, *stored.test), strict=True):
@@ -327,11 +309,11 @@ def test_cached_scene_equals_the_scene(capture: Any, tmp_path: Path) -> None:
     reads = []
     for k in (2, 3, 2, 0, 2, 3, 1):  # 0 takes the place of 3, 3 that of 0, and 1 that of 2
         before = cache.reads
-        assert same(k) and cache.held == 2 * ONE
+        assert same(k) and cache.held == 2 * size
         reads.append(cache.reads - before)
     assert reads == [1, 1, 0, 1, 0, 1, 1]
     with ThreadPoolExecutor(8) as pool:
-        assert all(pool.map(same, [k % 4 for k in range(400)])) and cache.held == 2 * ONE
+        assert all(pool.map(same, [k % 4 for k in range(400)])) and cache.held == 2 * size
     for path in (tmp_path / "scene" / "images").iterdir():
         Image.new("RGB", (32, 24)).save(path)
     with pytest.raises(ClodError, match=r"view '006.png': image must be uint8 of shape \(48, 64, 3\)"):

@@ -84,9 +84,8 @@ def test_every_format_uses_the_reader(tmp_path: Path, kind: str) -> None:
 
 
 def described(path: Path, *comments: str) -> Path:
-    return write_rows(
-        path, random_rows(40, [*needed(), "sigma_d"]), comments=[f"clod_adapter {comment}" for comment in comments]
-    )
+    rows = random_rows(40, [*needed(), "sigma_d"])
+    return write_rows(path, rows, comments=[f"clod_adapter {comment}" for comment in comments])
 
 
 def test_damaged_settings_are_refused(tmp_path: Path) -> None:

@@ -14,7 +14,9 @@ from hypothesis import HealthCheck, assume, example, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
+from clod_adapter._support.text import file_name
 from clod_adapter.errors import ClodError
+from clod_adapter.io.scene.folder import scene_files
 from clod_adapter.io.scene.load import load_cameras, load_scene
 from models import write_model
 from photographs import INTRINSICS, camera, model_of, pixels, pose, to_world, write_frames, write_images
@@ -187,6 +189,20 @@ def test_camera_without_a_size_is_left_out(tmp_path: Path) -> None:
     write_frames(tmp_path, frames[:1], camera_angle_x=1.0)
     with pytest.raises(ClodError, match="transforms.json: has no size of a photograph.*put them beside it, or w"):
         load_cameras(tmp_path)
+
+
+def test_files_of_transforms_scenes(tmp_path: Path) -> None:
+    train = {"frames": [{"file_path": "./train/r_0", "mask_path": "masks/0.png"}, {"file_path": "rgb\\ü.jpg"}, 7]}
+    test = {"frames": [{"file_path": "test/r_0.png", "depth_file_path": "depth/0.tif"}, {"file_path": "a\0\ud800"}]}
+    (tmp_path / "transforms_train.json").write_text(json.dumps(train))
+    (tmp_path / "transforms_test.json").write_text(json.dumps(test))
+    (tmp_path / "transforms.json").write_text("no JSON")
+    names = [*map(file_name, ["train/r_0.png", "rgb/ü.jpg", "masks/0.png", "test/r_0.png", "depth/0.tif"])]
+    for name in [*names, "train/r_1.png"]:
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(b"")
+    found = {str(path.relative_to(tmp_path)) for path in scene_files(tmp_path) if path.is_file()}
+    assert found == {*names, "transforms.json", "transforms_train.json", "transforms_test.json"}
 
 
 NAMES = [f"images/{i:03d}.png" for i in range(9)]

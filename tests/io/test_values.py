@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from plyfile import PlyData, PlyElement
+from plyfile import PlyData
 
 import clod_adapter as clod
 from clod_adapter.adapter import extract, with_dial
@@ -135,8 +135,7 @@ def moved(path: Path, out: Path, kind: str) -> Path:
     new = old.astype([(name, kind if name in "xyz" else old.dtype[name]) for name in old.dtype.names])
     for axis, by in zip("xyz", UTM, strict=True):
         new[axis] = old[axis].astype("f8") + by
-    PlyData([PlyElement.describe(new, "vertex")], byte_order="<").write(str(out))
-    return out
+    return write_rows(out, new)
 
 
 def test_only_distant_scenes_have_an_origin() -> None:

@@ -129,11 +129,9 @@ def test_invisible_rows_and_those_that_are_not_finite_are_skipped(rasterize: Bac
             some["quats"][gone] *= 0 if case.startswith("zero") else 1e-16
         else:
             some["scales"][gone] *= 1e-3  # a thousandth of a pixel: the compensation is 1e-5 and less
-        screen_filter = FILTERS["on" if case.startswith("compensated") else "off"]
-        found, want = (
-            differentiate(rasterize, each, view, weights(view), screen_filter=screen_filter)
-            for each in (some, {name: value[~gone] for name, value in some.items()})
-        )
+        chosen = FILTERS["on" if case.startswith("compensated") else "off"]
+        kept = {name: value[~gone] for name, value in some.items()}
+        found, want = (differentiate(rasterize, each, view, weights(view), chosen) for each in (some, kept))
         for name in FIELDS:
             assert (found.gradients[name][gone] == 0).all(), name
             found.gradients[name] = found.gradients[name][~gone]
@@ -219,10 +217,8 @@ def test_every_version_draws_the_same(monkeypatch: pytest.MonkeyPatch, version: 
 
     def drawn() -> list[Tensor]:
         some = {name: x.double().requires_grad_() for name, x in scene(120, 2, 3).items()}
-        background = torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64)
-        image, alpha = cuda.rasterize(
-            **some, camera=camera(40, 30), background=background, screen_filter=FILTERS["mip"]
-        )
+        behind = torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64)
+        image, alpha = cuda.rasterize(**some, camera=camera(40, 30), background=behind, screen_filter=FILTERS["mip"])
         image.square().mean().backward()
         return [image.detach(), alpha.detach(), *(x.grad for x in some.values() if x.grad is not None)]
 

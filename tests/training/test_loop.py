@@ -217,9 +217,6 @@ def test_several_processes_need_a_torch_that_does_not_hang(monkeypatch: pytest.M
         joined(dist.HashStore(), 0, 2).__enter__()
 
 
-Pair = tuple[Gaussians, Scene]
-
-
 @pytest.fixture(scope="module")
 def many() -> Pair:
     """Enough views that some are not trained on."""

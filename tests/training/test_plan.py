@@ -22,6 +22,13 @@ CONFIG = AdaptConfig(iters=20, max_sv=4.0, start_share=0.62)
 ALL, LIMIT = frozenset(NAMES), 0.02
 
 
+@pytest.fixture(scope="module")
+def visible(captured: Pair) -> Pair:
+    """A capture without unseen Gaussians."""
+    base, scene = captured
+    return base.select(removal_error(base, scene.train) > 0), scene
+
+
 def verdicts(plan: Plan) -> dict[str, str]:
     return {decision.what: decision.verdict for decision in plan.decisions}
 

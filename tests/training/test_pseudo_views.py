@@ -16,6 +16,11 @@ from clod_adapter.training.pseudo_views import FARTHER, MOVED, PseudoView, add_p
 from clod_adapter.training.schedule import ViewSampler
 
 
+@pytest.fixture(scope="module")
+def blob() -> clod.Gaussians:
+    return scenes.gaussians(400, 1, 0, size=0.05)
+
+
 def test_images_are_renders_of_the_checkpoint(blob: clod.Gaussians) -> None:
     """Renders of a file with a dial are at s = 1."""
     cameras, told = scenes.ring(9, 40, 30), []
@@ -67,10 +72,8 @@ def test_photographs_that_show_too_little_get_pseudo_views(
 
 def test_moved_cameras_have_the_documented_offsets(blob: clod.Gaussians) -> None:
     """Of position, direction and focal length; some step back along their direction of view, up to FARTHER reaches."""
-    camera, random = scenes.ring(1, 40, 30)[0], np.random.default_rng(0)
-    near, back = (
-        [PseudoView(camera, blob, 3.0, share).moved(random).camera for _ in range(500)] for share in (0.0, 1.0)
-    )
+    camera, rng = scenes.ring(1, 40, 30)[0], np.random.default_rng(0)
+    near, back = ([PseudoView(camera, blob, 3.0, far).moved(rng).camera for _ in range(500)] for far in (0.0, 1.0))
     steps = torch.stack([each.viewmat.double() @ camera.viewmat.double().inverse() for each in near])
     assert steps[:, :3, 3].std(0).tolist() == pytest.approx([MOVED * 3.0] * 3, rel=0.2)
     angles = ((steps.diagonal(dim1=1, dim2=2).sum(1) - 2) / 2).clamp(-1, 1).acos()

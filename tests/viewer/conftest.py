@@ -29,12 +29,7 @@ def show(tabs: Any) -> Iterator[Callable[..., Shown]]:
         opened: list[tuple[Shown, str]] = []
 
         def start(
-            *words: object,
-            url: str = "",
-            address: str = "",
-            viewport: Any = SIZE,
-            context: Any = tabs,
-            script: str = "",
+            *words: object, url: str = "", state: str = "", viewport: Any = SIZE, context: Any = tabs, script: str = ""
         ) -> Shown:
             url = url or stack.enter_context(serve(*words))
             shown = Shown(context.new_page())
@@ -42,7 +37,7 @@ def show(tabs: Any) -> Iterator[Callable[..., Shown]]:
             shown.page.set_viewport_size(viewport)
             shown.page.add_init_script(script)
             opened.append((shown, url))
-            return shown.ready(url + address)
+            return shown.ready(url + state)
 
         yield start
         for shown, url in opened:

@@ -145,7 +145,7 @@ def test_files_and_cameras_are_listed(show: Any, gaussians: Gaussians, tmp_path:
     shown.page.keyboard.press("1")
     shown.until("document.title === 'a.ply'")
     assert shown.text("#compare-with") == "Compare with the base"
-    opened = show(*words, address=linked, viewport=TALL)
+    opened = show(*words, state=linked, viewport=TALL)
     assert opened.page.title() == "b.glb" and not differ(opened.picture(), of_second)
 
 
