@@ -20,7 +20,7 @@ from PIL import Image
 
 import browser
 import fake_gpu
-from clod_adapter import Camera, Gaussians, Scene, render
+from clod_adapter import Camera, Gaussians, Scene, detach, render
 from clod_adapter.cli.main import main
 from clod_adapter.cli.shared.console import Console
 from clod_adapter.cli.shared.inputs import prepare_kernels
@@ -112,8 +112,7 @@ def dialled(capture: Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def _write_inria(path: Path, gaussians: Gaussians) -> Path:
-    plain = gaussians.replace(sigma_d=None, attenuation=None)
-    return write_rows(path, inria_rows(plain))
+    return write_rows(path, inria_rows(detach(gaussians)))
 
 
 def _camera(angle: float) -> Camera:

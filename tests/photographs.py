@@ -97,7 +97,3 @@ def seen(camera: pycolmap.Camera) -> np.ndarray:
     u, v = camera.cam_from_img(np.stack([across.ravel(), down.ravel()], axis=1)).T
     waves = [np.sin(5 * u + v), np.sin(5 * v - 2 * u), np.sin(4 * (u + v) + 1)]
     return np.rint(127.5 + 120 * np.stack(waves, axis=1)).astype(np.uint8).reshape(camera.height, camera.width, 3)
-
-
-def psnr_of(picture: np.ndarray, other: np.ndarray) -> float:
-    return float(-10 * np.log10(np.square((picture.astype(float) - other) / 255).mean() + 1e-9))

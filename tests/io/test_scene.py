@@ -17,6 +17,7 @@ import pytest
 import torch
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
+from skimage.metrics import peak_signal_noise_ratio as psnr_of
 
 from clod_adapter.cameras import StoredView, View
 from clod_adapter.errors import ClodError
@@ -24,7 +25,7 @@ from clod_adapter.io.scene import colmap
 from clod_adapter.io.scene.folder import scene_files
 from clod_adapter.io.scene.load import ImageCache, load_cameras, load_scene
 from clod_adapter.progress import Stopped
-from photographs import LENSES, SIZE, camera, model_of, pixels, psnr_of, seen, write_scene
+from photographs import LENSES, SIZE, camera, model_of, pixels, seen, write_scene
 
 
 @pytest.fixture(autouse=True)
