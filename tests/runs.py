@@ -7,7 +7,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -102,14 +101,24 @@ class Server:
         return self.wait(self.start(folder, *words)), log_of(folder)
 
 
-@dataclass
 class Launched:
-    """Processes started as torchrun starts them."""
+    """``size`` processes started as by torchrun; ``before`` is code that some run first; until file ``wait`` exists."""
 
-    server: Server
-    folder: Path
-    pids: list[int]
-    store: Any  # has to exist as long as the processes
+    def __init__(
+        self, server: Server, folder: Path, *words: object, size: int = 2, before: Any = None, wait: str = ""
+    ) -> None:
+        folder.mkdir(exist_ok=True)
+        self.server, self.folder = server, folder
+        self.store = dist.TCPStore("localhost", 0, is_master=True, wait_for_workers=False)
+        told = {
+            "WORLD_SIZE": size, "LOCAL_WORLD_SIZE": size, "MASTER_ADDR": "localhost", "MASTER_PORT": self.store.port,
+            "TORCHELASTIC_USE_AGENT_STORE": True, "TORCHELASTIC_RESTART_COUNT": 0,
+        }  # fmt: skip
+        self.pids = [
+            server.start(folder, *words, rank=k, before=(before or {}).get(k, ""), RANK=k, LOCAL_RANK=k, **told)
+            for k in range(size)
+        ]
+        wait_for(folder / wait)
 
     def log(self, rank: int) -> str:
         return log_of(self.folder, rank)
@@ -122,21 +131,6 @@ class Launched:
         assert clod_adapter.load(self.folder / "dial.ply").gaussians.sigma_d is not None
         clod_adapter.load_adapter(self.folder / "dial.safetensors")
         return json.loads((self.folder / "dial.json").read_text())
-
-
-def launch(server: Server, folder: Path, *words: object, size: int = 2, before: Any = None, wait: Any = "") -> Launched:
-    """Starts ``size`` processes; ``before`` is code that one of them runs first; returns once file ``wait`` exists."""
-    folder.mkdir(exist_ok=True)
-    store = dist.TCPStore("localhost", 0, is_master=True, wait_for_workers=False)
-    pids = []
-    for rank in range(size):
-        told = {
-            "RANK": rank, "WORLD_SIZE": size, "LOCAL_RANK": rank, "LOCAL_WORLD_SIZE": size, "MASTER_ADDR": "localhost",
-            "MASTER_PORT": store.port, "TORCHELASTIC_USE_AGENT_STORE": True, "TORCHELASTIC_RESTART_COUNT": 0,
-        }  # fmt: skip
-        pids.append(server.start(folder, *words, rank=rank, before=(before or {}).get(rank, ""), **told))
-    wait_for(folder / wait)
-    return Launched(server, folder, pids, store)
 
 
 def names(folder: Path) -> list[str]:

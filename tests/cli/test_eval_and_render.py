@@ -1,7 +1,6 @@
 """``clod-adapt eval``: rows, comparisons, popping, budgets, as of export; ``render``: images, views, interrupts."""
 
 import re
-import shutil
 import signal
 from collections.abc import Sequence
 from dataclasses import replace
@@ -203,15 +202,6 @@ def test_an_image_per_view(clod: Any, capture: Any, dialled: Path, tmp_path: Pat
     report = clod(RENDER, "all --views all").report
     assert [p["view"] for p in report["pictures"]] == [f"{k:03}.png" for k in range(10)]
     assert report["virtual_scales"] == [1] and len(list((tmp_path / "all").iterdir())) == 10
-
-
-def test_notes(clod: Any, capture: Any, tmp_path: Path) -> None:
-    """On a missing photograph, and a dial value beyond the trained ones."""
-    shutil.copytree(capture.scene, tmp_path / "fewer")
-    (tmp_path / "fewer" / "images" / "003.png").unlink()
-    missing, beyond = clod("render DIAL --images fewer --json -o out --sv 4.5").report["notes"]
-    assert "missing and left out (003.png)" in missing
-    assert beyond == "trained up to s = 4; larger dial values were not trained"
 
 
 @pytest.mark.parametrize("presses", [1, 2])

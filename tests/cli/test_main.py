@@ -48,11 +48,6 @@ def test_errors_of_the_work(clod: Any, monkeypatch: Any, error: BaseException, c
     assert code != 1 or str(error) in lines[-2]
 
 
-def test_without_arguments_it_says_what_to_do(clod: Any) -> None:
-    done = clod()
-    assert done.err == "" and done.out.count("\n") == 5 and "clod-adapt PLY --images DIR" in done.out
-
-
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="Linux has this device")
 @pytest.mark.parametrize("words", ["inspect PLY --json", "--help"])
 def test_results_that_cannot_be_printed_are_an_error(capture: Any, words: str) -> None:
@@ -79,6 +74,7 @@ def test_help(clod: Any, command: str, monkeypatch: pytest.MonkeyPatch) -> None:
     assert not {"positional arguments", "options"} & set(titles)
     if not command:
         assert all(f"clod-adapt {other}" in done.out for other in COMMANDS)
+        assert (first := clod()).out.count("\n") == 5 and "clod-adapt PLY --images DIR" in first.out and first.err == ""
         assert clod("--version").out.split() == ["clod-adapt", package_version()]
 
 
@@ -114,6 +110,8 @@ def test_progress_lines_without_a_terminal(capsys: pytest.CaptureFixture[str], m
     meter.began = meter.printed = 0.0
     meter.update(0.6)
     assert capsys.readouterr().err == "training  60%, 40 s left\n"
+    for seconds, text in ((0.04, "0.0 s"), (9.96, "10 s"), (59.7, "1:00"), (125, "2:05"), (3725, "1:02:05")):
+        assert duration(seconds) == text
 
 
 def test_status_and_quiet(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -127,11 +125,6 @@ def test_status_and_quiet(monkeypatch: pytest.MonkeyPatch) -> None:
         assert not stream.getvalue().split("\r")[-1].strip() and "\n" not in stream.getvalue()
         console.say("a line")
         assert stream.getvalue().endswith("a line\n") != quiet
-
-
-def test_duration() -> None:
-    for seconds, text in ((0.04, "0.0 s"), (9.96, "10 s"), (59.7, "1:00"), (125, "2:05"), (3725, "1:02:05")):
-        assert duration(seconds) == text
 
 
 NAMES = ["torch", "cpu", "gsplat", "browser"]

@@ -23,8 +23,6 @@ if sys.platform == "win32":
     pytest.skip("limits are those of POSIX", allow_module_level=True)
 import resource
 
-EXPORT_LEVELS = "export DIAL --levels 1,4,9 -o x.ply"  # the last file fits, and the first does not
-
 
 @contextmanager
 def room(size: int) -> Iterator[None]:
@@ -69,11 +67,14 @@ def test_full_disk_while_adapting(clod: Any, dialled: Path, tmp_path: Path) -> N
 @pytest.mark.parametrize(
     ("size", "line"),
     [
-        (2000, "export DIAL -o x.ply"), (2000, "export DIAL -o x.html"), (20000, EXPORT_LEVELS),
-        (1000, "render DIAL --images SCENE -o pictures"), (1000, "apply BASE ADAPTER -o x.ply"),
+        (2000, "export DIAL -o x.ply"),
+        (2000, "export DIAL -o x.html"),
+        (20000, "export DIAL --levels 1,4,9 -o x.ply"),  # the last file fits, and the first does not
+        (1000, "render DIAL --images SCENE -o pictures"),
+        (1000, "apply BASE ADAPTER -o x.ply"),
         (1000, "robustness BASE --images SCENE --iters 0 --max-sv 2 -o out"),
     ],
-)  # fmt: skip
+)
 def test_full_disk(clod: Any, tmp_path: Path, size: int, line: str) -> None:
     (tmp_path / "x.html").write_bytes(b"earlier")
     with room(size):
@@ -96,9 +97,7 @@ NO_ROOT = "" if os.geteuid() else "import ctypes; assert ctypes.CDLL(None).unsha
         (f"out/{STATE}", 0, f"{STATE}: is write-protected; choose another output, or chmod u+w"),
     ],
 )
-def test_files_without_permission(
-    server: Server, capture: Any, tmp_path: Path, path: str, mode: int, said: str
-) -> None:
+def test_without_permission(server: Server, capture: Any, tmp_path: Path, path: str, mode: int, said: str) -> None:
     """As of another user: one line, before any work."""
     shutil.copytree(capture.scene.parent, tmp_path, dirs_exist_ok=True)
     (tmp_path / "out").mkdir()
@@ -136,39 +135,32 @@ def test_commands_without_posix(capture: Any, tmp_path: Path) -> None:
     assert (tmp_path / "again.ply").read_bytes() == (tmp_path / "dial.ply").read_bytes()
 
 
-POSE = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 5], [0, 0, 0, 1]]
 ODD = "gr\udcfcn"  # Latin-1 for an umlaut, which is not UTF-8
 OF_ODD_NAMES = """
 ODD.ply --images ODD --iters 2 --max-sv 2 -o OUT.ply
 eval ODD_dial.ply --images ODD --sv 1 --report OUT.html
 render ODD_dial.ply --images ODD -o OUT
-export ODD_dial.ply -o OUT.html
-robustness ODD.ply --images ODD --iters 2 --max-sv 2 -o OUT
+export ODD_dial.ply -o OUT_page.html
+robustness ODD.ply --images ODD --iters 2 --max-sv 2 -o OUT_cells
 """
 
 
-@pytest.fixture(scope="module")
-def odd(capture: Any, dialled: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a scene, its checkpoint and a file with a dial; no name is UTF-8."""
-    folder = tmp_path_factory.mktemp("odd") / ODD
+@pytest.mark.usefixtures("without_splat_transform", "blank_figure")
+def test_names_that_are_not_utf8(clod: Any, capture: Any, dialled: Path, tmp_path: Path) -> None:
+    """Of a scene, its checkpoint and a file with a dial, their folder, and all outputs."""
+    folder = tmp_path / ODD
     try:
-        folder.mkdir()
+        (folder / "out").mkdir(parents=True)
     except OSError:
         pytest.skip("the file system takes UTF-8 only")
     shutil.copytree(capture.scene, folder / ODD)
-    shutil.copy(capture.ply, folder / f"{ODD}.ply")
-    for suffix in (".ply", ".safetensors"):
-        shutil.copy(dialled.with_suffix(suffix), folder / f"{ODD}_dial{suffix}")
-    return folder
-
-
-@pytest.mark.usefixtures("without_splat_transform", "blank_figure")
-@pytest.mark.parametrize("line", OF_ODD_NAMES.strip().splitlines())
-def test_names_that_are_not_utf8(clod: Any, odd: Path, tmp_path: Path, line: str) -> None:
-    words = [word.replace("ODD", str(odd / ODD)).replace("OUT", str(tmp_path / ODD)) for word in line.split()]
-    done = clod(*words, "--quiet --json")
-    assert "gr\\xfcn/gr\\xfcn" in json.dumps(done.report).replace("\\\\", "\\"), done
-    for path in tmp_path.glob("*.[hj][ts][mo][ln]"):  # pages and reports
+    for file, name in ((capture.ply, ".ply"), (dialled, "_dial.ply")):
+        shutil.copy(file, folder / f"{ODD}{name}")
+    for line in OF_ODD_NAMES.strip().splitlines():
+        words = line.replace("ODD", str(folder / ODD)).replace("OUT", str(folder / "out" / ODD))
+        done = clod(words, "--quiet --json")
+        assert "gr\\xfcn/gr\\xfcn" in json.dumps(done.report).replace("\\\\", "\\"), done
+    for path in folder.glob("out/*.[hj][ts][mo][ln]"):  # pages and reports
         assert "gr\\xfcn" in path.read_text("utf-8").replace("\\\\", "\\"), path
 
 

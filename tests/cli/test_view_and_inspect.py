@@ -51,10 +51,7 @@ def test_serves_until_it_is_interrupted(server: Server, capture: Any, dialled: P
 
 
 def test_dial_values_and_files_of_a_page(capture: Any, dialled: Path, tmp_path: Path, capsys: Any) -> None:
-    """Dial values beyond the page's are noted.
-
-    Of a folder it has the splats by name, numbers by value; files with the same name have the names of their folders.
-    """
+    """Of a folder the splats by name, numbers by value; files of one name have those of their folders. With notes."""
 
     def page_of(*words: object) -> tuple[Any, Any, Any]:
         args = build_parser("view").parse_args([*map(str, words)])
@@ -113,26 +110,24 @@ def test_a_plain_file_fits_on_a_screen(clod: Any, capture: Any) -> None:
 
 def test_a_dial_and_its_calibration(clod: Any, dialled: Path) -> None:
     text, report = clod("inspect DIAL").out, clod("inspect DIAL --json").report
-    lines = text.splitlines()
+    lines, splat = text.splitlines(), report["splat"]
     assert "written by   clod-adapter" in text and "s = 1 to 4, soft culling" in text and len(lines) <= 32
     at = next(k for k, line in enumerate(lines) if "Gaussians" in line and "PSNR" in line)
-    table = [line.split() for line in lines[at + 1 : at + 8]]
-    assert [row[0] for row in (table[0], table[-1])] == ["1", "4"] and all(len(row) == 5 for row in table)
-    splat = report["splat"]
+    first, *_, last = table = [line.split() for line in lines[at + 1 : at + 8]]
+    assert (first[0], last[0]) == ("1", "4") and all(len(row) == 5 for row in table)
     assert report["command"] == "inspect" and report["path"] == str(dialled)
     assert splat["count"] == splat["total"] == 300 and splat["columns"][-1] == ["growth_d", "float32"]
     assert {"least", "low", "median", "high", "greatest"} == set(splat["sigma"]) == set(splat["growth"])
     assert splat["dial"]["attenuation"]["max_sv"] == 4 and len(splat["position"]) == 3
     told = json.loads(dialled.with_suffix(".json").read_text())
     assert splat["dial"]["calibration"] == told["calibration"]
-    clod("export DIAL --sv 2 -o baked.ply")
-    says = "\nsays         baked at s = 2 by clod-adapter for 8 training cameras\n"
-    assert says in clod("inspect baked.ply").out
+    clod("export DIAL --sv 2 -o x.ply")
+    assert "\nsays         baked at s = 2 by clod-adapter for 8 training cameras\n" in clod("inspect x.ply").out
 
 
 def test_adapter(clod: Any) -> None:
-    text, report = clod("inspect ADAPTER").out, clod("inspect ADAPTER --json").report
+    text, about = clod("inspect ADAPTER").out, clod("inspect ADAPTER --json").report["about"]
     assert "an adapter" in text and "with SHA-256 " in text and "max_sv 4" in text and "\ngrowth_d " in text
-    assert "\ndial         sigma_d and growth_d, s = 1 to 4" in text and len(report["about"]["growth"]) == 5
-    assert report["about"]["updates"]["means"] == "float16 [300, 3]"
-    assert report["about"]["count"] == 300 and report["splat"] is None and report["about"]["config"]["iters"] == 12
+    assert "\ndial         sigma_d and growth_d, s = 1 to 4" in text and len(about["growth"]) == 5
+    assert about["updates"]["means"] == "float16 [300, 3]"
+    assert about["count"] == 300 and about["config"]["iters"] == 12

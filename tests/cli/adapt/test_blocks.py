@@ -1,5 +1,6 @@
 """``--memory``: a scene in blocks is trained in one process, also after a kill, an interrupt or an error."""
 
+import signal
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -12,8 +13,7 @@ import torch
 import clod_adapter
 from clod_adapter.adapter import ATTRIBUTES
 from clod_adapter.blocks.memory import MemoryPlan, plan_for_limit
-from clod_adapter.cli.adapt import listeners, prepare
-from clod_adapter.progress import Phase, Progress
+from clod_adapter.cli.adapt import prepare
 from runs import change_step, fail, names, results
 
 BLOCKS = 3
@@ -60,42 +60,42 @@ def whole(opaque: Path, run_in: Any, tmp_path_factory: pytest.TempPathFactory) -
     return results(folder, "one")
 
 
-def interrupt(patch: pytest.MonkeyPatch) -> None:
-    """After the third step of the second block."""
-    saving = listeners.Saver.saving
-
-    def listening(self: Any, listener: Any) -> Any:
-        def listen(now: Progress) -> Any:
-            self.stop.requests += now.phase == Phase.TRAINING and now.done == 3 and "block2.pass1" in str(self.path)
-            return listener(now)
-
-        return saving(self, listen)
-
-    patch.setattr(listeners.Saver, "saving", listening)
+def press(found: Any) -> Any:
+    signal.raise_signal(signal.SIGINT)
+    return found
 
 
 @pytest.mark.parametrize(
-    ("ended", "code", "said", "state", "steps"),
+    ("at", "change", "code", "said", "block", "steps"),
     [
-        (interrupt, 130, "pass 1 of 2: stopped after step 3; the same command", "a.block2.pass1.resume.safetensors", 3),
-        (lambda patch: change_step(patch, 6, fail), 1, "the same command resumes from step 5, which is in "
-         "a.block1.pass1.resume.safetensors\n", "a.block1.pass1.resume.safetensors", 5),
+        (10, press, 130, "pass 1 of 2: stopped after step 3; the same command", "block2", 3),
+        (
+            6,
+            fail,
+            1,
+            "the same command resumes from step 5, which is in a.block1.pass1.resume.safetensors\n",
+            "block1",
+            5,
+        ),
     ],
-    ids=["ctrl-c", "error"],
-)  # fmt: skip
+)
 def test_same_command_resumes_an_interrupted_block(
-    adapt: Any, whole: dict[str, bytes], tmp_path: Path, ended: Any, code: int, said: str, state: str, steps: int
+    adapt: Any,
+    whole: dict[str, bytes],
+    tmp_path: Path,
+    at: int,
+    change: Any,
+    code: int,
+    said: str,
+    block: str,
+    steps: int,
 ) -> None:
-    """Finished blocks are kept, the interrupted one is resumed, and the files are the same.
-
-    Until then files of another run, of another block, or damaged ones are refused, and stay.
-    """
+    """And keeps finished blocks, with the same files. Files of another run or block, or damaged ones, are refused."""
     with pytest.MonkeyPatch.context() as patch:
-        ended(patch)
+        change_step(patch, at, change)
         done = adapt("a.ply", "--quiet" if code == 1 else "", code=code)
-    assert said in done.err, done
-    finished = ["a.block1.pass1.safetensors"] if "block2" in state else []
-    assert names(tmp_path) == sorted([*finished, state])
+    state, finished = f"a.{block}.pass1.resume.safetensors", ["a.block1.pass1.safetensors"] if block == "block2" else []
+    assert said in done.err and names(tmp_path) == sorted([*finished, state]), done
     for name in finished:
         content, other = Path(name).read_bytes(), "a.block2.pass1.safetensors"
         for file, data, more, message in (
@@ -110,7 +110,7 @@ def test_same_command_resumes_an_interrupted_block(
         Path(name).write_bytes(content)
     done = adapt("a.ply")
     assert f"resuming {state} from step {steps}" in done.err, done
-    assert ("block 1 of 3, pass 1" in done.err) == ("block1" in state)
+    assert ("block 1 of 3, pass 1" in done.err) == (block == "block1")
     assert results(tmp_path, "a") == whole and names(tmp_path) == ["a.json", "a.ply", "a.safetensors"]
 
 

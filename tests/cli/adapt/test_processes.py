@@ -15,7 +15,7 @@ from clod_adapter.cli.main import build_parser
 from clod_adapter.cli.shared.command import make_config
 from clod_adapter.cli.shared.process import Launch, launched
 from clod_adapter.training.state import load_state
-from runs import STATE, Launched, Server, launch, log_of
+from runs import STATE, Launched, Server, log_of
 
 TINY = ("--max-sv", 4, "--out", "dial.ply", "--batch", 2, "--iters", 12)
 LONG = (*TINY[:-1], 4000)  # does not end by itself
@@ -29,7 +29,7 @@ def words(capture: Any) -> list[Any]:
 def test_time_budget_ends_all_after_the_same_step(server: Server, words: list[Any], tmp_path: Path) -> None:
     """By the clock of the first process; that of the second is far ahead."""
     ahead = "import clod_adapter.training.loop as t; at = t.time.perf_counter; t.time.perf_counter = lambda: 1e3 * at()"
-    run = launch(server, tmp_path / "run", *words, *LONG, "--time-budget", 0.3, before={1: ahead})
+    run = Launched(server, tmp_path / "run", *words, *LONG, "--time-budget", 0.3, before={1: ahead})
     assert run.wait() == [0, 0], run.log(0)
     assert 1 <= run.report()["steps"] < 4000 and not run.report()["interrupted"]
 
@@ -47,14 +47,13 @@ def test_signals_of_the_launcher_do_not_end_the_writing(server: Server, words: l
         "for name in ('save_adapter', 'print_summary'): setattr(run, name, pressing(getattr(run, name)))\n"
         "main.json = argparse.Namespace(dumps=pressing(json.dumps))"
     )
-    run = launch(server, tmp_path / "run", *words, *LONG, "--quiet", "--json", before={0: pressed}, wait=STATE)
+    run = Launched(server, tmp_path / "run", *words, *LONG, "--quiet", "--json", before={0: pressed}, wait=STATE)
     os.kill(run.pids[1], signal.SIGKILL)
     assert run.wait() == [0, -signal.SIGKILL], run.log(0)
     report = run.report()
     assert json.loads(run.log(0))["steps"] == report["steps"] == load_state(run.folder / STATE)[0].steps > 0
     assert report["interrupted"] and report["rows"] == []
-    said = f"training ended at step {report['steps']}: a process of the group has ended"
-    assert any(said in note for note in report["notes"])
+    assert f"training ended at step {report['steps']}: a process of the group has ended" in str(report["notes"])
 
 
 BREAK = """
@@ -70,13 +69,13 @@ Trainer.gradient_sum = pull
 
 def test_two_give_the_result_of_one(server: Server, words: list[Any], tmp_path: Path) -> None:
     """Within the rounding of sums in another order, also resumed after an error of the second process in a step."""
-    alone = launch(server, tmp_path / "alone", *words, *TINY, size=1)
-    run = launch(server, tmp_path / "run", *words, *TINY, before={1: BREAK})
+    alone = Launched(server, tmp_path / "alone", *words, *TINY, size=1)
+    run = Launched(server, tmp_path / "run", *words, *TINY, before={1: BREAK})
     assert run.wait() == [0, 2], run.log(0)
     report = run.report()
     assert report["steps"] == 4 and report["interrupted"] and run.log(1) == "", run.log(0)
     assert "; process 1: no room for this view" in run.log(0) and load_state(run.folder / STATE)[0].steps == 4
-    again = launch(server, run.folder, *words, *TINY, "--resume")
+    again = Launched(server, run.folder, *words, *TINY, "--resume")
     assert again.wait() == [0, 0] and alone.wait() == [0], again.log(0) + again.log(1) + alone.log(0)
     report, want = again.report(), alone.report()
     assert report["processes"].items() >= {"count": 2, "backend": "gloo", "batch": 2}.items()
@@ -94,14 +93,14 @@ def test_two_give_the_result_of_one(server: Server, words: list[Any], tmp_path: 
 def test_process_lost_before_the_first_step(server: Server, words: list[Any], tmp_path: Path) -> None:
     """Nothing is written."""
     lost = "def adapt(*_, **__): raise MemoryError('no room')\nprocesses.adapt = adapt"
-    run = launch(server, tmp_path / "run", *words, *TINY, before={1: lost})
+    run = Launched(server, tmp_path / "run", *words, *TINY, before={1: lost})
     assert run.wait() == [2, 2] and run.log(1) == "" and list(run.folder.iterdir()) == [], run.log(0)
     log = run.log(0)
     assert log.count("error:") == 1 and "; process 1: no room; this was before the first step, so start again\n" in log
 
 
 def test_interrupt_stops_all_after_the_same_step(server: Server, words: list[Any], tmp_path: Path) -> None:
-    run = launch(server, tmp_path / "run", *words, *LONG, wait=STATE)
+    run = Launched(server, tmp_path / "run", *words, *LONG, wait=STATE)
     os.kill(run.pids[1], signal.SIGINT)  # either process
     assert run.wait() == [0, 0], run.log(0)
     report = run.report()
@@ -114,7 +113,7 @@ def test_bad_input_is_reported_once(server: Server, words: list[Any], tmp_path: 
         ([*words, "--batch", 1], "--batch is 1, it must be at least 2: a view for each process"),
         (["eval", "nowhere.ply", "--images", "scene"], "only adapting takes several processes"),
     ):
-        run = launch(server, tmp_path / "run", *given)
+        run = Launched(server, tmp_path / "run", *given)
         assert run.wait()[0] == 2 and run.log(0).count("\n") == 1, run.log(0)
         assert f"clod-adapt: error: {message}" in run.log(0) and run.log(1) == "" and not list(run.folder.iterdir())
 
@@ -137,30 +136,27 @@ def test_torchrun_with_a_killed_process(server: Server, words: list[Any], tmp_pa
     folder = tmp_path / "run"
     folder.mkdir()
     assert server.wait(server.start(folder, *words, *LONG, before=AGENT, OMP_NUM_THREADS=1)) == 1
-    run = Launched(server, folder, [], None)
+    run = Launched(server, folder, size=0)
     log, report = log_of(folder), run.report()
     assert "a process of the group has ended" in log and log.count("2 processes (gloo)") == 1, log
     assert report["interrupted"] and report["steps"] == load_state(folder / STATE)[0].steps
 
 
-AT = {"MASTER_ADDR": "localhost", "MASTER_PORT": "1"}
-
-
 def test_rank_and_default_steps_from_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
     """Any number of processes takes the same number of views by default."""
-    monkeypatch.setenv("WORLD_SIZE", "4")
-    monkeypatch.setenv("RANK", "1")
-    assert launched() == Launch()  # without an address
-    for name, value in AT.items():
-        monkeypatch.setenv(name, value)
-    assert launched() == Launch(1, 4, 0, 1)
+
+    def launch_of(rank: str, size: int = 4, **address: str) -> Launch:
+        for name, value in {"RANK": rank, "WORLD_SIZE": size, **address}.items():
+            monkeypatch.setenv(name, str(value))
+        return launched()
+
+    assert launch_of("1") == Launch()
+    assert launch_of("1", MASTER_ADDR="localhost", MASTER_PORT="1") == Launch(1, 4, 0, 1)
     for rank in ("4", "-1", "one"):
-        monkeypatch.setenv("RANK", rank)
         with pytest.raises(ClodError, match="inconsistent .*; start the processes with torchrun"):
-            launched()
-    monkeypatch.setenv("RANK", "0")
+            launch_of(rank)
     steps = AdaptConfig().steps
     for words, size, want in (((), 1, (1, steps)), ((), 4, (4, round(steps / 4))), (("--iters", "100"), 4, (4, 100))):
-        monkeypatch.setenv("WORLD_SIZE", str(size))
+        launch_of("0", size)
         config = make_config(build_parser("").parse_args(["x.ply", *words]))
         assert (config.batch, config.for_views(1).iters) == want, words

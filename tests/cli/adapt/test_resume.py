@@ -84,9 +84,7 @@ TINY = "--iters 12 --max-sv 4 --out dial.ply"
 ADAPT = f"BASE --images SCENE {TINY}"
 
 
-def test_states_of_other_runs_are_refused(
-    clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_states_of_other_runs_are_refused(clod: Any, capture: Any, tmp_path: Path, monkeypatch: Any) -> None:
     """Of other settings, inputs or versions, or damaged; of the same inputs with other names they are not."""
 
     def refused(message: str, *words: str) -> None:
@@ -122,9 +120,7 @@ def test_states_of_other_runs_are_refused(
     assert f"resuming {STATE} from step 1" in clod(f"moved.ply --images moved {TINY} --resume").err
 
 
-def test_without_a_state_or_resume_training_starts_over(
-    clod: Any, tmp_path: Path, state: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_a_state_training_starts_over(clod: Any, tmp_path: Path, state: Any, monkeypatch: Any) -> None:
     """An earlier state stays until a new one replaces it; a state that cannot be saved costs nothing else."""
     done = clod(ADAPT, "--resume --json")
     assert f"there is no {STATE} to resume from: starting from the beginning" in done.err
@@ -146,24 +142,25 @@ def test_without_a_state_or_resume_training_starts_over(
     ("step", "save", "oldest", "share"), [(0.1, 0.1, 15.0, 0.015), (25.0, 3.0, 80.0, 0.15), (1.0, 30.0, 220.0, 0.2)]
 )
 def test_the_state_is_recent_and_saving_takes_a_small_share_of_the_time(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: float, save: float, oldest: float, share: float
+    monkeypatch: pytest.MonkeyPatch, step: float, save: float, oldest: float, share: float
 ) -> None:
     """Seconds of a step and of a save; the largest age of the state, unless a save takes very long, and the share."""
-    clock, saved, ages = [0.0], [0.0], [0.0]
-    monkeypatch.setattr("clod_adapter.cli.adapt.listeners.time.perf_counter", lambda: clock[0])
+    clock, saved, ages = 0.0, [0.0], [0.0]
 
     def save_state(path: Path, state: float, run_of: Any) -> None:
-        clock[0] += save
-        ages.append(clock[0] - saved[-1])  # of the file that is replaced now
+        nonlocal clock
+        clock += save
+        ages.append(clock - saved[-1])  # of the file that is replaced now
         saved.append(state)
 
-    monkeypatch.setattr("clod_adapter.cli.adapt.listeners.save_state", save_state)
-    follow = Saver(tmp_path / STATE, CONFIG, QUIET, GracefulStop(), resume=False).saving(lambda progress: None)
+    monkeypatch.setattr("clod_adapter.cli.adapt.listeners.time.perf_counter", lambda: clock)
+    monkeypatch.setattr(listeners, "save_state", save_state)
+    follow = Saver(Path(STATE), CONFIG, QUIET, GracefulStop(), resume=False).saving(lambda progress: None)
     for done in range(1, 601):
-        clock[0] += step
-        follow(Progress(Phase.TRAINING, done, 600, clock[0], state=lambda: clock[0]))
+        clock += step
+        follow(Progress(Phase.TRAINING, done, 600, clock, state=lambda now=clock: now))
     assert saved[1] == step and len(saved) > 4
-    assert max(ages[2:]) <= oldest and save * (len(saved) - 1) / clock[0] <= share
+    assert max(ages[2:]) <= oldest and save * (len(saved) - 1) / clock <= share
 
 
 @pytest.mark.parametrize(
