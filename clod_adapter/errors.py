@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from errno import EINVAL
 from pathlib import Path
 
 from clod_adapter._support.text import as_text, first_line
@@ -34,7 +35,8 @@ def refused_if_damaged(
     except Exception as error:  # of libraries, and whatever a crafted file provokes
         if isinstance(error, ClodError) and str(error).startswith(str(ClodError(f"{path}: "))):
             raise
-        if isinstance(error, OSError) and error.errno:  # libraries raise it without one for what a file contains
+        # Of what a file contains libraries raise it without a number, or with that of a seek to nowhere.
+        if isinstance(error, OSError) and error.errno not in (None, EINVAL):
             raise ClodError(f"{path}: cannot be read ({error.strerror}); check the path and its permissions") from error
         reason = f"no {error}" if isinstance(error, KeyError) else first_line(error)
         raise ClodError(f"{path}: {what} ({reason:.200}); {fix}") from error

@@ -84,7 +84,8 @@ outputs (existing files are replaced):
   OUT.html, OUT_rendering.png, OUT_adapting.png
                    with --report: a self-contained page and its charts; needs
                    matplotlib (pip install matplotlib)
-The same seed gives the same Gaussians, bit for bit.
+The same seed gives the same Gaussians, bit for bit, on as many threads; so does
+a run that was resumed.
 
 without --images:
   Cameras are placed, and the checkpoint itself renders the target images: all
@@ -94,8 +95,8 @@ interruption:
   Ctrl-C, SIGTERM, a closed terminal or the warning of a scheduler (SIGUSR1,
   SIGUSR2, SIGXCPU) ends training after the step and writes the result so far
   (exit code 0, "interrupted": true); a second Ctrl-C or SIGTERM aborts. The
-  state is saved about once a minute: after an interrupt, a crash or a full disk
-  the same command with --resume gives the same Gaussians, bit for bit.
+  state is saved in OUT.resume.safetensors about once a minute: after that, a
+  crash or a full disk the same command with --resume gives the same Gaussians.
 
 large scenes, several processes:
   --memory 8GB trains a scene that does not fit in blocks; after an interrupt

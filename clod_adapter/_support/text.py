@@ -24,8 +24,8 @@ def file_name(text: str) -> str:
 
 
 def first_line(error: BaseException) -> str:
-    """The first line of an error's message that is not blank."""
-    return next((line.strip() for line in str(error).splitlines() if line.strip()), "no message")
+    """The first line of an error's message that is not blank, or its type."""
+    return next((line.strip() for line in str(error).splitlines() if line.strip()), type(error).__name__)
 
 
 def script_json(value: Any) -> str:

@@ -59,7 +59,8 @@ class Inspection:
     def as_dict(self) -> dict[str, Any]:
         """Plain JSON."""
         found = asdict(self)
-        return {**found, "oddities": found.pop("anomalies")}
+        found["oddities"] = found.pop("anomalies")
+        return found
 
 
 def inspect(path: str | Path) -> Inspection:
@@ -184,7 +185,7 @@ def _inspect_tensors(path: Path) -> Inspection | None:
     from clod_adapter.training.state import KEY as STATE_KEY
     from clod_adapter.training.state import load_state
 
-    size, metadata = path.stat().st_size, read_tensor_header(path)[1]
+    metadata, size = read_tensor_header(path)[1], path.stat().st_size
     if STATE_KEY in metadata:
         state, belongs = load_state(path)
         count = next((len(t) for t in state.tensors.values() if t.ndim), 0)

@@ -32,7 +32,7 @@ class Format(NamedTuple):
     """
 
     module: str = ""  # under ``clod_adapter.io``, imported when it is used
-    check: str = "file_formats.check_start"  # refuses, by the first bytes and without torch, a file of another format
+    check: str = "file_formats.check_start"  # refuses, without torch, a file of another format
     carries_sigma: bool = False  # whether the dial is written: sigma_d, growth_d and their settings
     about: tuple[str, ...] = ()  # where it is written, the precision of its values; lines of at most 54 letters
     ordered: bool = True  # whether the rows keep their order

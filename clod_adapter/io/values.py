@@ -176,7 +176,8 @@ def arrays_of(path: Path, gaussians: Gaussians) -> Arrays:
     tensors = gaussians.tensors()
     arrays = {name: tensor.detach().float().cpu().contiguous().numpy() for name, tensor in tensors.items()}
     if dropped := _usable(arrays)[1]:
-        raise ClodError(f"{path}: {', '.join(dropped)}; drop such rows first, as load does")
+        spoilt = [name for name, array in arrays.items() if not np.isfinite(array).all()] or ["quats"]
+        raise ClodError(f"{path}: {', '.join(spoilt)}: {', '.join(dropped)}; drop such rows first, as load does")
     return arrays
 
 

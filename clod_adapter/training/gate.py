@@ -18,6 +18,7 @@ FEW, EVERY, MOST = 8, 24, 4  # of fewer than FEW views all are watched and train
 WORSE, RUINED = 1.0, 4.0  # dB that s = 1 may fall below its best, until the next check, and at all
 HALVINGS = 3  # of the learning rates; the next time the attributes are frozen
 CHECKS = (0.0, 0.02, 0.05, *(k / 10 for k in range(1, 10)))  # of the steps or the time budget
+EXACT = 1e-12  # mean squared error that none is taken for: its logarithm is finite
 ERROR_FLOOR = 1e-3  # mean squared error of a render at 30 dB
 
 
@@ -49,7 +50,7 @@ def decibels_below(errors: Sequence[float], base: Sequence[float]) -> float:
     Against its own renderings a checkpoint has no error, and every difference would be infinite.
     """
     pairs = [(e, b, max(ERROR_FLOOR - b, 0.0)) for e, b in zip(errors, base, strict=True)]
-    return fmean(10 * math.log10((e + floor) / (b + floor)) for e, b, floor in pairs)
+    return fmean(10 * math.log10(max(e + floor, EXACT) / (b + floor)) for e, b, floor in pairs)
 
 
 def squared_error(image: Tensor, view: View) -> float:

@@ -116,6 +116,7 @@ def test_a_dial_and_its_calibration(clod: Any, dialled: Path) -> None:
     first, *_, last = table = [line.split() for line in lines[at + 1 : at + 8]]
     assert (first[0], last[0]) == ("1", "4") and all(len(row) == 5 for row in table)
     assert report["command"] == "inspect" and report["path"] == str(dialled)
+    assert report["oddities"] == [] and "anomalies" not in report
     assert splat["count"] == splat["total"] == 300 and splat["columns"][-1] == ["growth_d", "float32"]
     assert {"least", "low", "median", "high", "greatest"} == set(splat["sigma"]) == set(splat["growth"])
     assert splat["dial"]["attenuation"]["max_sv"] == 4 and len(splat["position"]) == 3

@@ -163,9 +163,10 @@ def read(path: Path, data: bytes) -> Source:
 
 def _chunks(path: Path, data: memoryview) -> tuple[dict[str, Any], memoryview]:
     """The JSON and the binary chunk."""
-    version, length, size, kind = struct.unpack_from("<IIII", data, 4)
-    more = struct.unpack_from("<I", data, 20 + size)[0] if 28 + size <= length else 0
-    if version != 2 or kind != _JSON or max(length, 20 + size, 28 + size + more if more else 0) > len(data):
+    version, length, size, kind = struct.unpack_from("<IIII", data, 4) if len(data) >= 20 else (0, 0, 0, 0)
+    whole = version == 2 and kind == _JSON and max(length, 20 + size) <= len(data)
+    more = struct.unpack_from("<I", data, 20 + size)[0] if whole and 28 + size <= length else 0
+    if not whole or (more and 28 + size + more > len(data)):
         raise ClodError(f"{path}: is truncated, or no glTF 2.0; copy or export it again")
     return json.loads(bytes(data[20 : 20 + size])), data[28 + size : 28 + size + more]
 

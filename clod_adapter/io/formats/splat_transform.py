@@ -18,7 +18,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
-from clod_adapter.errors import ClodError, refused_if_damaged
+from clod_adapter.errors import ClodError
 from clod_adapter.io.file_formats import START, read_bytes, refuse_known
 
 if TYPE_CHECKING:
@@ -126,8 +126,10 @@ def read(path: Path, _: bytes) -> Source:
     tool = check(path)
     with TemporaryDirectory() as folder:
         converted = Path(folder) / "converted.ply"
-        with refused_if_damaged(path, "cannot be read"):
+        try:
             tool.run(path, converted, timeout=LIMIT_CONVERT)
+        except ClodError as error:
+            raise ClodError(f"{path}: cannot be read ({error}); copy or export it again") from error
         arrays = ply.read(converted, read_bytes(converted)).arrays
     note = f"quantised: {path.suffix} stores positions, scales, rotations and colours in a few bits each"
     return Source(arrays, Metadata(), (note, f"read through splat-transform {tool.version}"))

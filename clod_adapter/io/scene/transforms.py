@@ -93,11 +93,12 @@ def read_pose(where: object, values: Mapping[str, Any], key: str) -> np.ndarray:
 
 
 def _number(where: object, values: Mapping[str, Any], key: str, default: float, above: float = -HUGE) -> float:
-    value = math.nan
+    given, value = default if values.get(key) is None else values[key], math.nan
     with suppress(TypeError, ValueError, OverflowError):
-        value = float(default if values.get(key) is None else values[key])
-    if not above < value < HUGE:
-        raise ClodError(f"{where}: {key} is no number between {above:g} and {HUGE:g}; export the file again")
+        value = float(given)
+    if isinstance(given, bool) or not above < value < HUGE:
+        what = f"{key} is no number between {above:g} and {HUGE:g}, but {given!r:.40}"
+        raise ClodError(f"{where}: {what}; copy or export the file again")
     return value
 
 
