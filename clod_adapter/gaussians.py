@@ -186,7 +186,8 @@ def spoilt_rows(gradients: dict[str, Tensor]) -> Tensor:
     """``[N]`` bool, the rows that are bad in any of the gradients ``[N, ...]``."""
     tensors = list(gradients.values())  # their sums take one pass without extra memory
     if tensors[0].device.type == "cpu" and all(bool(tensor.sum().isfinite()) for tensor in tensors):
-        return torch.zeros(len(tensors[0]), dtype=torch.bool)  # a GPU is not asked: the host would wait for its answer
+        # A GPU is not asked: the host would wait for its answer.
+        return torch.zeros(len(tensors[0]), dtype=torch.bool, device="cpu")
     return torch.stack([~each.isfinite().reshape(len(each), each.shape[1:].numel()).all(1) for each in tensors]).any(0)
 
 

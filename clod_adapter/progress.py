@@ -107,6 +107,7 @@ def shown(progress: Listener | Literal[False] | None) -> Iterator[Listener | Non
             if phase != now.phase:
                 phase = now.phase
                 bar.set_description_str(now.phase, refresh=False)
+                bar.miniters = 0  # what it has learned of faster steps would let it stand still
                 bar.reset(now.total)
             bar.update(round(now.share * now.total) - bar.n)
 

@@ -34,10 +34,11 @@ def spans(records, r, ox, oy, side):
     wide = vsqrt(vmax(reach - det * left * left, zero))
     x0 = select(eq(left, zero - tip), zero - rx, (zero - wide - b * left) * half)
     mx = splat(records[r + c.MX] - c.HALF)
-    low = vmax(vceil(mx + x0 - c.SLACK), splat(records[r + c.X0])) - float32(ox)
-    high = vmin(vfloor(mx + x1 + c.SLACK), splat(records[r + c.X1])) - float32(ox)
-    touched, each = both(ge(bottom, top), ge(high, low)), splat(c.ONE / side)
-    return select(touched, vfloor(low * each), zero), select(touched, vfloor(high * each), splat(-c.ONE))
+    each = splat(c.ONE / side)
+    low = vfloor((vmax(vceil(mx + x0 - c.SLACK), splat(records[r + c.X0])) - float32(ox)) * each)
+    high = vfloor((vmin(vfloor(mx + x1 + c.SLACK), splat(records[r + c.X1])) - float32(ox)) * each)
+    touched = both(ge(bottom, top), ge(high, low))  # of cells: the columns of a needle may have crossed by rounding
+    return select(touched, low, zero), select(touched, high, splat(-c.ONE))
 
 
 @kernel

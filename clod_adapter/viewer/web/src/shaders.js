@@ -6,7 +6,7 @@ import { WIDTH } from "./gpu.js";
 /** By SH degree: texels per Gaussian, of 8 float16 values each, for the coefficients of degrees 1 and up. */
 export const SH_TEXELS = [0, 2, 3, 6, 9];
 
-// The harmonics of degrees 1 and up, in the order and signs of 3DGS, as in clod_adapter/_kernels/sh.py.
+// The harmonics of degrees 1 and up, in the order and signs of 3DGS, as in clod_adapter/_kernels/colors.py.
 const TERMS = [
   "-0.4886025119029199 * y", "0.4886025119029199 * z", "-0.4886025119029199 * x",
   "1.0925484305920792 * xy", "-1.0925484305920792 * yz", "0.31539156525252005 * (2.0 * zz - xx - yy)",
