@@ -97,8 +97,10 @@ class Server:
     def wait(self, pid: int) -> int:
         return self.ask(wait=pid)
 
-    def run(self, folder: Path, *words: object) -> tuple[int, str]:
-        return self.wait(self.start(folder, *words)), log_of(folder)
+    def run(self, folder: Path, *words: object) -> str:
+        """What was printed."""
+        assert self.wait(self.start(folder, *words)) == 0, log_of(folder)
+        return log_of(folder)
 
 
 class Launched:
@@ -139,6 +141,10 @@ def names(folder: Path) -> list[str]:
 
 def log_of(folder: Path, rank: object = "") -> str:
     return Path(f"{folder}{rank}.log").read_text()
+
+
+def contents(*roots: Path) -> dict[Path, bytes]:
+    return {file: file.read_bytes() for root in roots for file in (root, *root.rglob("*")) if file.is_file()}
 
 
 def results(folder: Path, name: str = "dial") -> dict[str, bytes]:

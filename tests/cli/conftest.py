@@ -33,12 +33,11 @@ def signals_arrive() -> Iterator[None]:
 @pytest.fixture(autouse=True)
 def shorter(monkeypatch: pytest.MonkeyPatch) -> None:
     """Cameras are placed for small images, few are added, and the search for another frame gives up early."""
-    for module, changes in (
-        (camera_placement, {"WIDTH": 62, "HEIGHT": 46}), (pseudo_views, {"ADDED": 8}),
-        (search, {"SCALES": [1.0], "MOST_TRIALS": 8}),
-    ):  # fmt: skip
-        for name, value in changes.items():
-            monkeypatch.setattr(module, name, value)
+    monkeypatch.setattr(camera_placement, "WIDTH", 62)
+    monkeypatch.setattr(camera_placement, "HEIGHT", 46)
+    monkeypatch.setattr(pseudo_views, "ADDED", 8)
+    monkeypatch.setattr(search, "SCALES", [1.0])
+    monkeypatch.setattr(search, "MOST_TRIALS", 8)
 
 
 class Done(NamedTuple):

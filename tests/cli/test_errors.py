@@ -21,6 +21,7 @@ import clod_adapter
 from clod_adapter.cli.main import COMMANDS, build_parser, command_of
 from clod_adapter.cli.shared.outputs import Outputs, claimed
 from clod_adapter.io.file_formats import FORMATS, WRITABLE, write
+from runs import contents
 
 
 @pytest.fixture(scope="module")
@@ -66,11 +67,6 @@ def given(folder: Path, existing: str) -> Iterator[None]:
     yield
     for path in made:
         path.unlink()
-
-
-def everything(folder: Path) -> dict[str, object]:
-    files = [path for path in folder.rglob("*") if path.is_file()]
-    return {str(path): (path.read_bytes(), path.is_symlink() and os.readlink(path)) for path in files}
 
 
 TINY = "--images scene --iters 2 --max-sv 2"
@@ -162,13 +158,13 @@ def test_errors(run_in: Any, folder: Path, line: str, said: str, existing: str) 
 
 
 def refused(run_in: Any, folder: Path, said: str, line: str) -> None:
-    before = everything(folder)
+    before = contents(folder)
     done = run_in(folder, line, code=2)
     (error,) = (each for each in done.err.splitlines() if "error" in each)
     why = error.removeprefix("clod-adapt: error: ")
     assert done.err.endswith(f"{error}\n") and why != error and re.search(said, why), done
     assert (done.report == {"error": why, "code": 2}) if "--json" in line else done.out == "", done
-    assert everything(folder) == before
+    assert contents(folder) == before
 
 
 def outputs_of(line: str) -> Outputs:

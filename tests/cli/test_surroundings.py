@@ -17,7 +17,7 @@ from unittest.mock import Mock
 
 import pytest
 
-from runs import STATE, Server, log_of, names
+from runs import STATE, Server, contents, log_of, names
 
 if sys.platform == "win32":
     pytest.skip("limits are those of POSIX", allow_module_level=True)
@@ -35,10 +35,6 @@ def room(size: int) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
-def held(folder: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-
-
 def assert_one_error(done: Any) -> None:
     (error,) = (line for line in done.err.splitlines() if line.startswith("clod-adapt: error: "))
     assert "cannot be written" in error and done.out == "", done
@@ -48,19 +44,19 @@ def test_full_disk_while_adapting(clod: Any, dialled: Path, tmp_path: Path) -> N
     """One line, and unchanged files of an earlier run. Without room for the page the others are complete."""
     words = "BASE --images SCENE --iters 2 --max-sv 2 -o dial.ply"
     shutil.copytree(dialled.parent, tmp_path, dirs_exist_ok=True)
-    earlier = held(tmp_path)
-    report, adapter, ply = (len(earlier[f"dial.{suffix}"]) for suffix in ("json", "safetensors", "ply"))
+    earlier = contents(tmp_path)
+    report, adapter, ply = (len(earlier[tmp_path / f"dial.{suffix}"]) for suffix in ("json", "safetensors", "ply"))
     assert report < adapter < ply
     for size in (report // 2, (adapter + ply) // 2):
         with room(size):
             assert_one_error(clod(words, code=2))
-        assert held(tmp_path) == earlier
+        assert contents(tmp_path) == earlier
     with room(ply + 5000):
         report = (done := clod(words, "--report --json")).report
     assert "the page was not written: " in done.err and "page" not in report["outputs"]
     assert report["rows"] and report["seconds"]["page"] > 0 and "the page was not" in report["notes"][-1]
     assert report == json.loads((tmp_path / "dial.json").read_text())
-    now = held(tmp_path)
+    now = contents(tmp_path)
     assert now.keys() == earlier.keys() and not any(now[name] == earlier[name] for name in now)
 
 
@@ -79,7 +75,7 @@ def test_full_disk(clod: Any, tmp_path: Path, size: int, line: str) -> None:
     (tmp_path / "x.html").write_bytes(b"earlier")
     with room(size):
         assert_one_error(clod(line, code=2))
-    assert held(tmp_path) == {"x.html": b"earlier"}
+    assert contents(tmp_path) == {tmp_path / "x.html": b"earlier"}
 
 
 # Root gives up its rights by entering a user namespace; it may read nothing there that its owner may not.

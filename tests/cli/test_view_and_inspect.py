@@ -77,16 +77,9 @@ def test_dial_values_and_files_of_a_page(capture: Any, dialled: Path, tmp_path: 
 
 def test_interrupts_and_browsers(clod: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """One that opens a window is opened; an interrupt right after the address ends the command as usual."""
-    opened = []
-
-    class Browser(webbrowser.BaseBrowser):
-        def open(self, url: str, new: int = 0, autoraise: bool = True) -> bool:
-            opened.append(url)
-            raise KeyboardInterrupt
-
-    monkeypatch.setattr(webbrowser, "get", Browser)
-    done = clod("view BASE --quiet")
-    assert done == (f"{opened[0]}  (Ctrl-C ends)\n", "")
+    browser = Mock(spec=webbrowser.BaseBrowser, **{"open.side_effect": KeyboardInterrupt})
+    monkeypatch.setattr(webbrowser, "get", lambda: browser)
+    assert clod("view BASE --quiet") == (f"{browser.open.call_args[0][0]}  (Ctrl-C ends)\n", "")
     monkeypatch.setenv("BROWSER", "editor")  # a program whose end is not waited for
     monkeypatch.setattr(webbrowser, "get", lambda: webbrowser.GenericBrowser("editor"))
     assert isinstance(view.find_browser(), webbrowser.BackgroundBrowser)

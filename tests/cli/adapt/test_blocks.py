@@ -66,34 +66,19 @@ def press(found: Any) -> Any:
 
 
 @pytest.mark.parametrize(
-    ("at", "change", "code", "said", "block", "steps"),
+    ("at", "change", "said", "block", "steps"),
     [
-        (10, press, 130, "pass 1 of 2: stopped after step 3; the same command", "block2", 3),
-        (
-            6,
-            fail,
-            1,
-            "the same command resumes from step 5, which is in a.block1.pass1.resume.safetensors\n",
-            "block1",
-            5,
-        ),
+        (10, press, "pass 1 of 2: stopped after step 3; the same command", "block2", 3),
+        (6, fail, "the same command resumes from step 5, which is in a.block1.pass1.resume.safetensors", "block1", 5),
     ],
 )
 def test_same_command_resumes_an_interrupted_block(
-    adapt: Any,
-    whole: dict[str, bytes],
-    tmp_path: Path,
-    at: int,
-    change: Any,
-    code: int,
-    said: str,
-    block: str,
-    steps: int,
+    adapt: Any, whole: dict[str, bytes], tmp_path: Path, at: int, change: Any, said: str, block: str, steps: int
 ) -> None:
     """And keeps finished blocks, with the same files. Files of another run or block, or damaged ones, are refused."""
     with pytest.MonkeyPatch.context() as patch:
         change_step(patch, at, change)
-        done = adapt("a.ply", "--quiet" if code == 1 else "", code=code)
+        done = adapt("a.ply --quiet", code=1) if change is fail else adapt("a.ply", code=130)
     state, finished = f"a.{block}.pass1.resume.safetensors", ["a.block1.pass1.safetensors"] if block == "block2" else []
     assert said in done.err and names(tmp_path) == sorted([*finished, state]), done
     for name in finished:
