@@ -168,8 +168,8 @@ def test_device_presets_are_counts(clod: Any, capture: Any, dialled: Path, monke
     assert report["outputs"][0]["count"] == 200 == len(load("few.ply").gaussians)
     (note,) = [note for note in report["notes"] if "preset" in note]
     assert note.startswith("--device-preset quest3, --keep 200: s = ")
-    words = [str(dialled), "--images", str(capture.scene), "--device-preset", "quest3"]
-    answers, report = view.make_page(build_parser("view").parse_args(words), view.Console(True))
+    args = build_parser("view").parse_args(f"{dialled} --images {capture.scene} --device-preset quest3".split())
+    answers, report = view.make_page(args, view.Console(True))
     page = b"".join(answers["/"].blocks()).decode()
     opening = float(re.findall(r'"virtual_scale": ([\d.]+)}', page)[-1])
     model, scene = load(dialled).gaussians, clod_adapter.load_scene(capture.scene)

@@ -106,9 +106,8 @@ MOMENTS = [  # where signals arrive, which, exit code, files, and the report's "
 
 @pytest.mark.parametrize(("place", "numbers", "code", "files", "said"), MOMENTS)
 def test_signals_at_a_moment(
-    clod: Any, words: list[Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, place: tuple[Any, str],
-    numbers: list[int], code: int, files: list[str], said: bool | str,
-) -> None:  # fmt: skip
+    clod: Any, words: Any, tmp_path: Path, monkeypatch: Any, place: Any, numbers: Any, code: int, files: Any, said: Any
+) -> None:
     """Warnings may be repeated, as launchers do; a second Ctrl-C or SIGTERM aborts."""
     monkeypatch.setattr(*place, pressing(getattr(*place), *numbers))
     done = clod(*words, "--json --report" if files == OUTPUTS else "--json", code=code)
@@ -117,7 +116,7 @@ def test_signals_at_a_moment(
         assert done.report["interrupted"] == said and "page" not in done.report["outputs"]
         assert bool(done.report["rows"]) == bool(done.report["calibration"]) == (place[1] != "extract")
     else:
-        assert done.err.rstrip().endswith(str(said)), done
+        assert done.err.rstrip().endswith(said), done
     assert signal.getsignal(INT) is signal.default_int_handler and signal.getsignal(TERM) is signal.SIG_DFL
 
 

@@ -17,7 +17,6 @@ from clod_adapter.cli import adapt
 from clod_adapter.cli.adapt import prepare
 from clod_adapter.cli.shared.measure import machine_name
 from clod_adapter.config import AdaptConfig
-from clod_adapter.gaussians import Gaussians
 from clod_adapter.training.plan import NAMES
 from models import write_model
 from runs import OUTPUTS, names, rebuilt, results
@@ -84,11 +83,7 @@ def test_prints_progress_a_table_and_the_next_commands(adapted: tuple[Path, Any]
     assert [shlex.split(line) for line in images] == [shlex.split(f"clod-adapt eval dial.ply {scene} --sv 1 4")]
     assert "300 Gaussians, SH degree 1" in done.err and "8 photographs to train on, 2 held out, 64x48" in done.err
     assert "trained 12 steps" in done.err and "\r" not in done.err
-    for line in (
-        r"training   8%, \d.* left, 1/12",
-        r"importance  50%, \d.* left, \d+/\d+",
-        r"base: \d+\.\d\d dB on .*",
-    ):
+    for line in (r"training   8%, \d.* left, 1/12", r"importance  50%, \d.* left, \d+/\d+", r"base: [\d.]+ dB on .*"):
         assert re.search(f"^{line}$", done.err, re.M), done
 
 
@@ -194,12 +189,11 @@ SHORT = "--images SCENE --iters 24 --max-sv 4 --out dial.ply --json"
 @pytest.fixture
 def wasteful(capture: Any, tmp_path: Path) -> Path:
     """The capture's checkpoint with a degree that does nothing, and 50 Gaussians that no camera sees among the rest."""
-    base: Gaussians = capture.gaussians
+    base = capture.gaussians
     far = base.select(torch.arange(50)).replace(means=base.means[:50] + torch.tensor([0.0, 90.0, 0.0]))
     values = {name: torch.cat([far.tensors()[name], value]) for name, value in base.tensors().items()}
     values["shN"] = torch.cat([values["shN"], 1e-5 * torch.ones(350, 5, 3)], 1)
-    (tmp_path / "in").mkdir()
-    return Path(capture.write(tmp_path / "in" / "wasteful.ply", base.replace(**values)))
+    return Path(capture.write(tmp_path / "wasteful.ply", base.replace(**values)))
 
 
 def decisions(done: Any) -> dict[str, dict[str, Any]]:

@@ -17,7 +17,7 @@ from clod_adapter.config import FILTERS
 from models import write_model
 from runs import names, rebuilt
 
-FAST = "--iters 1 --max-sv 4"
+FAST = "--iters 3 --max-sv 4 --out dial.ply --json"
 
 
 def scene_of(capture: Any, folder: Path, shown: Callable[[View], torch.Tensor], count: int = 9) -> Path:
@@ -41,7 +41,7 @@ def turned(capture: Any, tmp_path: Path) -> Path:
 
 
 def test_cameras_are_moved_into_another_frame_in_every_command(clod: Any, capture: Any, turned: Path) -> None:
-    done = clod(turned, "--images SCENE", FAST, "-o adapted.ply --json")
+    done = clod(turned, "--images SCENE", FAST)
     said = f"the cameras are moved into the frame of {turned} (axes x, -y, -z): renders have"
     report = done.report
     assert done.err.count(said) == 1 and any(said in note for note in report["notes"]), done
@@ -53,10 +53,10 @@ def test_cameras_are_moved_into_another_frame_in_every_command(clod: Any, captur
     back = frame["scale"] * centres @ rotation.T + offset
     poses = torch.stack([torch.linalg.inv(view.camera.viewmat) for view in load_scene(capture.scene).train])
     assert torch.cdist(back, poses[:, :3, 3]).min(1).values.max() < 1e-3
-    again = clod("eval adapted.ply --images SCENE --json")
+    again = clod("eval dial.ply --images SCENE --json")
     assert "(axes x, -y, -z)" in again.err
     assert again.report["rows"][0]["psnr"] == pytest.approx(report["rows"][0]["psnr"], abs=0.01)
-    assert "(axes x, -y, -z)" in clod("export adapted.ply --images SCENE --sv 2 -o baked.ply").err
+    assert "(axes x, -y, -z)" in clod("export dial.ply --images SCENE --sv 2 -o baked.ply").err
 
 
 def test_another_scene_is_refused_and_nothing_is_written(clod: Any, capture: Any, turned: Path, tmp_path: Path) -> None:
@@ -82,7 +82,7 @@ def test_white_background_is_refused_unless_allowed(clod: Any, capture: Any, tmp
     words = (ply, "--images", scene_of(capture, tmp_path / "white", over_white), FAST)
     done = clod(*words, code=2)
     assert "over white the renders have" in done.err and "transparent background" in done.err, done
-    done = clod(*words, "--misaligned-ok --json")
+    done = clod(*words, "--misaligned-ok")
     assert f"warning: {ply}: does not match" in done.err and "to train anyway" not in done.err, done
     notes, alignment = done.report["notes"], done.report["alignment"]
     assert any(note.startswith("warning: ") for note in notes) and alignment["frame"] is None
@@ -91,11 +91,8 @@ def test_white_background_is_refused_unless_allowed(clod: Any, capture: Any, tmp
 @pytest.mark.parametrize(("said", "share"), [("another exposure", 0.2), ("have a single colour each", 0)])
 def test_other_photographs_have_a_warning(clod: Any, capture: Any, tmp_path: Path, said: str, share: float) -> None:
     scene_of(capture, tmp_path / "scene", lambda view: (share * view.image).byte())
-    done = clod("BASE --images scene", FAST, "--json")
+    done = clod("BASE --images scene", FAST)
     assert said in done.err and said in done.report["notes"][0], done
-
-
-FAST = "--iters 3 --max-sv 4 --out dial.ply --json"
 
 
 @pytest.fixture(scope="module")
