@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import clod_adapter as clod
-from clod_adapter.demo.gallery import CROP, VIEW, dial_strip, measured
+from clod_adapter.demo import CROP, VIEW, dial_strip, measured
 from clod_adapter.evaluation.budget import matching_dial
 from clod_adapter.io.atomic import atomic_path
 from common import ROOT, arguments

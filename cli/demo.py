@@ -33,7 +33,7 @@ def outputs(args: Namespace) -> Outputs:
 
 
 def execute(args: Namespace) -> dict[str, Any]:
-    from clod_adapter.demo.gallery import draw, unpack
+    from clod_adapter.demo import draw, unpack
 
     from .shared.inputs import prepare_kernels
     from .shared.measure import Stopwatch

@@ -10,11 +10,10 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from clod_adapter._support.version import package_version
+from clod_adapter._support.text import package_version
 from clod_adapter.errors import ClodError
 from clod_adapter.io.file_formats import file_has_dial
-from clod_adapter.progress import Listener, Stopped
-from clod_adapter.training.interrupts import GracefulStop
+from clod_adapter.progress import GracefulStop, Listener, Stopped
 
 from .shared import command as common
 from .shared.console import Console

@@ -8,12 +8,11 @@ from pathlib import Path, PureWindowsPath
 from statistics import fmean
 from typing import TYPE_CHECKING, Any
 
-from clod_adapter._support.text import file_name
-from clod_adapter._support.version import package_version
+from clod_adapter._support.text import file_name, package_version
 from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.scene.folder import find_cameras, photograph_folders
-from clod_adapter.training.interrupts import GracefulStop
+from clod_adapter.progress import GracefulStop
 
 from .shared import command as common
 from .shared.console import Console

@@ -10,14 +10,12 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from clod_adapter._support.text import as_text
-from clod_adapter._support.version import package_version
+from clod_adapter._support.text import as_text, package_version
 from clod_adapter.config import CLASSIC, AdaptConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import atomic_path
-from clod_adapter.progress import Listener, Stopped
+from clod_adapter.progress import GracefulStop, Listener, Stopped
 from clod_adapter.report.charts import check_matplotlib
-from clod_adapter.training.interrupts import GracefulStop
 
 from .shared import command as common
 from .shared.console import Console, ProgressDisplay, duration

@@ -13,8 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from clod_adapter._support.text import as_text
-from clod_adapter._support.version import package_version
+from clod_adapter._support.text import as_text, package_version
 from clod_adapter.errors import ClodError
 from clod_adapter.io.file_formats import FORMATS, check_readable
 from clod_adapter.progress import Stopped

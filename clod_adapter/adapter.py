@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from clod_adapter._support.arrays import tensor_of
-from clod_adapter._support.version import package_version
+from clod_adapter._support.text import package_version
 from clod_adapter.calibration import Calibration
 from clod_adapter.config import CLASSIC, SH_COUNTS, AttenuationConfig, ScreenFilter, require
 from clod_adapter.equation.attenuation import SIGMA_MAX

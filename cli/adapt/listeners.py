@@ -8,11 +8,10 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from clod_adapter._support.version import package_version
+from clod_adapter._support.text import package_version
 from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
-from clod_adapter.progress import Listener, Progress, Stopped
-from clod_adapter.training.interrupts import GracefulStop
+from clod_adapter.progress import GracefulStop, Listener, Progress, Stopped
 from clod_adapter.training.state import StateRefused, TrainingState, load_state, save_state
 
 from ..shared.command import SETTINGS, as_option

@@ -23,9 +23,8 @@ from clod_adapter.evaluation.robustness import scene_fingerprint
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.checkpoint import Checkpoint
 from clod_adapter.io.scene.load import ImageCache
-from clod_adapter.progress import Phase, Stopped
+from clod_adapter.progress import GracefulStop, Phase, Stopped
 from clod_adapter.training.camera_placement import place_cameras
-from clod_adapter.training.interrupts import GracefulStop
 from clod_adapter.training.loop import time_steps
 from clod_adapter.training.plan import NOT_NEEDED, Decision, Override, Plan
 from clod_adapter.training.planner import make_plan

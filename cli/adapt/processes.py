@@ -16,9 +16,8 @@ import torch
 
 from clod_adapter.cameras import Scene
 from clod_adapter.errors import ClodError
-from clod_adapter.progress import Stopped
+from clod_adapter.progress import GracefulStop, Stopped
 from clod_adapter.training.distributed import PATIENCE, ProcessGroup, ProcessLost, joined, require_distributed
-from clod_adapter.training.interrupts import GracefulStop
 from clod_adapter.training.loop import adapt
 from clod_adapter.training.plan import Plan
 from clod_adapter.training.pseudo_views import teachers_to

@@ -9,7 +9,7 @@ from functools import partial
 from typing import Any
 
 from clod_adapter._kernels.memory import release
-from clod_adapter._support.version import package_version
+from clod_adapter._support.text import package_version
 from clod_adapter.adapter import Adapter, detach, extract, trim
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.evaluate import Row
@@ -17,8 +17,7 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.adapter_file import save_adapter
 from clod_adapter.io.atomic import atomic_paths, remove_leftovers
 from clod_adapter.io.checkpoint import Checkpoint, save, trimmed
-from clod_adapter.progress import Progress
-from clod_adapter.training.interrupts import GracefulStop
+from clod_adapter.progress import GracefulStop, Progress
 from clod_adapter.training.plan import Plan
 from clod_adapter.training.state import Adapted
 

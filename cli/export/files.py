@@ -11,7 +11,7 @@ from clod_adapter.bake import bake, order_by_extinction
 from clod_adapter.calibration import Viewpoint
 from clod_adapter.cameras import Camera, spread
 from clod_adapter.errors import ClodError
-from clod_adapter.evaluation.level_errors import geometric_errors, looking
+from clod_adapter.evaluation.evaluate import geometric_errors, looking
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.inspection.report import extra_columns
 from clod_adapter.io.atomic import atomic_path, atomic_paths

@@ -10,7 +10,7 @@ from pathlib import Path
 from site import getuserbase
 from typing import Any, NoReturn
 
-from clod_adapter._support.version import package_version
+from clod_adapter._support.text import package_version
 from clod_adapter.config import DEVICES, FILTERS, AdaptConfig, AttenuationConfig, field_descriptions
 from clod_adapter.errors import ClodError
 from clod_adapter.io.file_formats import PLY, check_readable, file_has_dial, format_of

@@ -11,8 +11,7 @@ from functools import cache
 from typing import TYPE_CHECKING, Any
 
 from clod_adapter.io.settings import WARNING
-from clod_adapter.progress import Listener, Phase, Progress
-from clod_adapter.training.interrupts import GracefulStop
+from clod_adapter.progress import GracefulStop, Listener, Phase, Progress
 
 if TYPE_CHECKING:
     from tqdm import tqdm

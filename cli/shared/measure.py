@@ -26,8 +26,7 @@ from clod_adapter.evaluation.popping import Popping
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.checkpoint import Checkpoint
 from clod_adapter.origin import Origin
-from clod_adapter.progress import Phase, Stopped
-from clod_adapter.training.interrupts import GracefulStop
+from clod_adapter.progress import GracefulStop, Phase, Stopped
 
 from .command import given_budget, no_calibration
 from .console import Console

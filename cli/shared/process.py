@@ -10,8 +10,7 @@ from contextlib import AbstractContextManager, contextmanager, redirect_stderr, 
 from typing import Any, NamedTuple, TextIO
 
 from clod_adapter.errors import ClodError
-from clod_adapter.progress import Stopped
-from clod_adapter.training.interrupts import ENDING, handled_by
+from clod_adapter.progress import ENDING, Stopped, handled_by
 
 
 class Stream:

@@ -1,4 +1,4 @@
-"""File names as text for outputs: to the system a name is bytes, which need not be valid text."""
+"""Text for outputs: file names, which to the system are bytes and need not be text; messages; the version."""
 
 import json
 import os
@@ -31,3 +31,13 @@ def first_line(error: BaseException) -> str:
 def script_json(value: Any) -> str:
     """JSON without <, so that no text in it can end an HTML script element, or begin a comment in it."""
     return json.dumps(value, allow_nan=False, ensure_ascii=False).replace("<", "\\u003c")
+
+
+def package_version() -> str:
+    """The installed version, or "0" when run from a checkout that is not installed."""
+    from importlib import metadata  # here: it takes as long as the rest of --help
+
+    try:
+        return metadata.version("clod-adapter")
+    except metadata.PackageNotFoundError:
+        return "0"

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from plyfile import PlyData, PlyElement
 
-from clod_adapter._support.version import package_version
+from clod_adapter._support.text import package_version
 from clod_adapter.calibration import CalibrationRow, Viewpoint
 from clod_adapter.config import CLASSIC, SH_COUNTS, AttenuationConfig
 from clod_adapter.errors import ClodError

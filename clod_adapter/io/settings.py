@@ -18,7 +18,7 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from clod_adapter._support.version import package_version
+from clod_adapter._support.text import package_version
 from clod_adapter.calibration import Calibration
 from clod_adapter.config import CLASSIC, FILTERS, AttenuationConfig, ScreenFilter
 from clod_adapter.errors import ClodError, refused_if_damaged

@@ -16,11 +16,10 @@ from clod_adapter.equation.units import in_world_units, with_distance
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians, LossNotFinite, largest_colour
 from clod_adapter.initialization.importance import for_training, usable_views, with_growth
-from clod_adapter.progress import Listener, Phase, Progress, shown
+from clod_adapter.progress import GracefulStop, Listener, Phase, Progress, shown
 from clod_adapter.training.dial import TrainableSubset, require_trainable
 from clod_adapter.training.distributed import ProcessGroup, ProcessLost
 from clod_adapter.training.gate import CHECKS, split_views
-from clod_adapter.training.interrupts import GracefulStop
 from clod_adapter.training.paper import form_of
 from clod_adapter.training.state import Adapted, StateRefused, TrainingState
 from clod_adapter.training.trainer import Trainer

@@ -13,8 +13,8 @@ import pytest
 
 from clod_adapter.alignment import search
 from clod_adapter.cli.main import main
+from clod_adapter.progress import ENDING
 from clod_adapter.training import camera_placement, pseudo_views
-from clod_adapter.training.interrupts import ENDING
 from runs import Server, accepted
 
 

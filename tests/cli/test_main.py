@@ -15,7 +15,7 @@ import pytest
 import torch
 
 from clod_adapter import rasterizers
-from clod_adapter._support.version import package_version
+from clod_adapter._support.text import package_version
 from clod_adapter.cli.main import COMMANDS
 from clod_adapter.cli.shared.console import Console, Meter, duration
 from clod_adapter.rasterizers import reference

@@ -16,9 +16,9 @@ from PIL import Image
 
 import clod_adapter
 from clod_adapter import config, evaluate, load, load_scene
+from clod_adapter import demo as gallery
 from clod_adapter.cli.adapt import listeners
 from clod_adapter.cli.adapt import run as adapt_run
-from clod_adapter.demo import gallery
 from clod_adapter.evaluation import robustness as experiment
 from clod_adapter.report.page import Picture
 from runs import names, pressing

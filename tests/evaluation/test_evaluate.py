@@ -16,8 +16,8 @@ from clod_adapter.adapter import with_dial
 from clod_adapter.calibration import Calibration, CalibrationRow
 from clod_adapter.equation.attenuation import dial
 from clod_adapter.evaluation import frame_times
+from clod_adapter.evaluation.evaluate import geometric_errors
 from clod_adapter.evaluation.frame_times import PASSES, VIEWS, FrameTimes, time_frames
-from clod_adapter.evaluation.level_errors import geometric_errors
 from clod_adapter.io.formats.tileset import ALLOWED
 from clod_adapter.losses import psnr_ssim
 from scenes import camera, gaussians, in_front, photograph, ring

@@ -20,9 +20,8 @@ from clod_adapter.adapter import ATTRIBUTES, with_dial
 from clod_adapter.cameras import in_its_unit
 from clod_adapter.equation.distances import typical_distance
 from clod_adapter.initialization.importance import scene_distance
-from clod_adapter.progress import Phase, Progress
+from clod_adapter.progress import GracefulStop, Phase, Progress
 from clod_adapter.training import trainer
-from clod_adapter.training.interrupts import GracefulStop
 from clod_adapter.training.pseudo_views import reaches
 from clod_adapter.training.state import TrainingState
 from runs import config_of, pressing, states_of

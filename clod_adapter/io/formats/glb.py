@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from clod_adapter._support.version import package_version
+from clod_adapter._support.text import package_version
 from clod_adapter.errors import ClodError, refused_if_damaged
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io import values

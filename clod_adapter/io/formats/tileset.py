@@ -5,7 +5,7 @@ buffer with the bytes of an SPZ file, attributes without data, and a node with a
 
 The root has the coarsest level of the whole scene. Its children are cells of at most LARGEST Gaussians of the finest
 level, each a chain of tiles from the next finer level to the finest; a tile replaces its parent (refine REPLACE).
-``geometricError`` of a tile is that of its level (``evaluation.level_errors``). That of the index, of showing nothing,
+``geometricError`` of a tile is that of its level (``geometric_errors``). That of the index, of showing nothing,
 is ALLOWED diagonals of the root's box and the root's own error: a set is drawn until it is about one pixel large.
 
 Viewers turn glTF's y-up axes into z-up ones, (x, y, z) to (x, -z, y), after the node's half turn. So a point (x, y, z)
@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from clod_adapter._support.version import package_version
+from clod_adapter._support.text import package_version
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.formats import spz
 from clod_adapter.io.formats.glb import DEGREE, EXTENSION, harmonics, write_points

@@ -20,11 +20,11 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 from clod_adapter import AdaptConfig, ClodError, Phase, Progress, adapt
-from clod_adapter._support.version import package_version
+from clod_adapter._support.text import package_version
 from clod_adapter.cli.adapt import listeners
 from clod_adapter.cli.adapt.listeners import Saver
 from clod_adapter.cli.shared.console import Console
-from clod_adapter.training.interrupts import GracefulStop
+from clod_adapter.progress import GracefulStop
 from clod_adapter.training.state import KEY
 from runs import OUTPUTS, STATE, change_step, fail, names, pressing, results
 from scenes import capture as small_capture
