@@ -25,14 +25,13 @@ OUTPUTS = ["dial.json", "dial.ply", "dial.safetensors"]
 STATE = "dial.resume.safetensors"
 fail = Mock(side_effect=ZeroDivisionError("of ours"))
 
-# Imports everything once; a line on stdin starts a process, or asks whether or how one ended.
+# Imports everything once; a line on stdin starts a process, or asks how one ended.
 SERVER = """
 import json, os, signal, sys, tempfile
 import torch
 torch.set_num_threads(1)  # a process that forks must have no threads
 from clod_adapter.cli import main
 from clod_adapter.cli.adapt import listeners, processes
-from clod_adapter.cli.adapt import run as adapt
 from clod_adapter.cli.shared.console import Console
 from clod_adapter.cli.shared.inputs import prepare_kernels
 from clod_adapter.training import pseudo_views
@@ -41,9 +40,6 @@ prepare_kernels(Console(quiet=True))
 print("ready", flush=True)
 for line in sys.stdin:
     about = json.loads(line)
-    if "ended" in about:
-        print(int(os.waitid(os.P_PID, about["ended"], os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None), flush=True)
-        continue
     if "wait" in about:
         print(os.waitstatus_to_exitcode(os.waitpid(about["wait"], 0)[1]), flush=True)
         continue

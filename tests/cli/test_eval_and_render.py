@@ -74,7 +74,9 @@ def test_base_by_rank_and_popping(clod: Any, capture: Any) -> None:
 
 def test_against_at_matched_counts(clod: Any, capture: Any, dialled: Path, tmp_path: Path) -> None:
     """Files of one name have their folders as labels."""
-    count = sum(row.kept for row in (stored(dialled).rows[0], stored(dialled).rows[-1])) // 2  # within the dial's reach
+    count = (
+        sum(row.kept for row in (load(dialled).calibration.rows[0], load(dialled).calibration.rows[-1])) // 2
+    )  # within the dial's reach
     for name, size in (("a", int(count)), ("b", 300)):
         (tmp_path / name).mkdir()
         capture.write(tmp_path / name / "cloud.ply", capture.gaussians.select(torch.arange(size)))
@@ -109,7 +111,7 @@ def test_frames_are_timed_together(clod: Any, monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(frame_times, "NOISY", 0.2)
     report = (done := clod("BASE --images SCENE --iters 2 --max-sv 4 --out dial.ply --json")).report
     assert seen == [[300, 300, 300]]
-    assert [row.frame_ms * row.virtual_scale for row in stored("dial.ply").rows] == pytest.approx([2000] * 5)
+    assert [row.frame_ms * row.virtual_scale for row in load("dial.ply").calibration.rows] == pytest.approx([2000] * 5)
     assert (report["base_rows"][0]["frame_ms"], report["detached_row"]["frame_ms"]) == (1000, 3000)
     assert any("frame times are rough: they varied by 50%" in note for note in report["notes"])
     assert done.err.count("frame times are rough") == 1
@@ -117,15 +119,9 @@ def test_frames_are_timed_together(clod: Any, monkeypatch: pytest.MonkeyPatch) -
     assert [(row["virtual_scale"], round(row["frame_ms"])) for row in rows] == [(3, 333), (1, 1000)]
 
 
-def stored(path: Path | str) -> clod_adapter.Calibration:
-    calibration = load(path).calibration
-    assert calibration is not None
-    return calibration
-
-
 def test_eval_at_a_budget(clod: Any, dialled: Path) -> None:
     """Within the range, at s = 1 if that is enough; a psnr drop out of reach gives the range's end; with notes."""
-    rows = stored(dialled).rows
+    rows = load(dialled).calibration.rows
     middle, drop = round(rows[0].kept * 0.4 + rows[-1].kept * 0.6), rows[0].psnr - rows[2].psnr
     report = clod(EVAL, "--keep", middle, 300).report
     found, whole = report["rows"]
@@ -147,7 +143,7 @@ def test_eval_at_a_budget(clod: Any, dialled: Path) -> None:
 
 
 def test_baking_to_a_budget(clod: Any, dialled: Path) -> None:
-    model, table = load(dialled), stored(dialled)
+    model, table = load(dialled), load(dialled).calibration
     rows = tuple(replace(row, frame_ms=8 / row.virtual_scale) for row in table.rows)
     elsewhere = replace(table, rows=rows, machine="another", width=640, height=480)
     save("there.ply", model.gaussians, model, calibration=elsewhere)

@@ -32,11 +32,10 @@ from scenes import capture as small_capture
 CONFIG, QUIET = AdaptConfig(iters=3, max_sv=3.0), Console(quiet=True)
 HASHES = {"base_sha256": "of the base", "views_sha256": "of the views", "overruled": {"--with": ["means"]}}
 VALUES = [None, True, "", [[]], {"a": []}, [1, 2], 5, 0.5, 2**31, 2**64, -1, 10**400, 1e308, math.inf, math.nan]
-Scene = tuple[Any, Any]
 
 
 @pytest.fixture(scope="module")
-def state(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Scene, dict[str, torch.Tensor], Any]:
+def state(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Any, dict[str, torch.Tensor], Any]:
     """The file of a state after two of three steps, the base and scene, and what is in it."""
     path, pair = tmp_path_factory.mktemp("saved") / STATE, small_capture(40, views=4, width=16, height=12)
     saver = Saver(path, CONFIG, QUIET, GracefulStop(), resume=False)

@@ -96,9 +96,7 @@ ADAPT = "BASE --images SCENE --iters 16 --max-sv 4 --out dial.ply --report"
 def page_of(path: Path) -> tuple[str, dict[str, Any]]:
     """Its text, and the data in it."""
     text = path.read_text(encoding="utf-8")
-    found = re.search(r'id="data">(.*?)</script>', text, re.S)
-    assert found
-    return text, json.loads(found[1])
+    return text, json.loads(re.findall(r'id="data">(.*?)</script>', text, re.S)[0])
 
 
 def test_adapt(clod: Any, tmp_path: Path) -> None:
