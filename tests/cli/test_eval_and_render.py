@@ -74,9 +74,7 @@ def test_base_by_rank_and_popping(clod: Any, capture: Any) -> None:
 
 def test_against_at_matched_counts(clod: Any, capture: Any, dialled: Path, tmp_path: Path) -> None:
     """Files of one name have their folders as labels."""
-    count = (
-        sum(row.kept for row in (load(dialled).calibration.rows[0], load(dialled).calibration.rows[-1])) // 2
-    )  # within the dial's reach
+    count = sum(row.kept for row in load(dialled).calibration.rows[::4]) // 2  # within the dial's reach
     for name, size in (("a", int(count)), ("b", 300)):
         (tmp_path / name).mkdir()
         capture.write(tmp_path / name / "cloud.ply", capture.gaussians.select(torch.arange(size)))

@@ -108,7 +108,7 @@ PICTURES = {"dial.png", "curve.png"}
 
 
 def test_demo(clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It names its files and the next command, resumes without naming --resume, and reports no figure it did not draw."""
+    """It names its files and the next command, resumes without naming --resume, and reports no figure not drawn."""
 
     def unpack(scene: Path, base: Path) -> None:
         shutil.copytree(capture.scene, scene, dirs_exist_ok=True)
