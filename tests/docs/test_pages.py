@@ -89,7 +89,7 @@ def desk(capture: Any, dialled: Path, tmp_path_factory: pytest.TempPathFactory) 
 IDS = [str(page.relative_to(ROOT)) for page in PAGES]
 LANGUAGES = {"sh", "console", "python", "text", "json", "glsl", "wgsl", "html", "css", "js"}
 STEPS = 20  # of a training that the pages run, at most
-# Commands that are not run: two change the environment that the tests run in, and one takes a minute (test_demo.py).
+# Commands that are not run: two change the environment that the tests run in, and one, the demo, takes a minute.
 SKIPPED = ("pip", "make", "clod-adapt demo")
 
 
