@@ -57,7 +57,7 @@ async function open(name, read, present) {
     const found = await read();
     if (number !== asked) return;
     ui.showMessage(null);
-    present(found);
+    await present(found);
     await stage.whenDrawn();
   } catch (error) {
     if (number === asked) ui.showMessage(error.message);
@@ -87,14 +87,14 @@ export const load = (blob, name) => open(name, () => readFile(blob, name), (read
 /** Opens one of the page's files: in the same view and at the same dial value, unless another scene is there. */
 export async function openEntry(number) {
   const entry = viewer.files[number], base = stage.base ? null : config.base, isFirst = !stage.model;
-  await open(entry.name, () => Promise.all([fetchModel(entry), base && fetchModel(base)]), ([read, readBase]) => {
+  await open(entry.name, () => Promise.all([fetchModel(entry), base && fetchModel(base)]), async ([read, readBase]) => {
     if (isFirst || viewer.file === null) show(read, readBase, config.cameras);
     else stage.show(read, readBase ?? undefined);
     viewer.file = number;
     ui.showName(entry.name, number);
     if (read.settings) state.dial = ui.clampDial(state.dial);
     ui.changed();
-    if (isFirst && location.hash) applyLink();
+    if (isFirst && location.hash) await applyLink();
   });
 }
 
