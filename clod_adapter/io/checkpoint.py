@@ -133,7 +133,8 @@ def load(path: str | Path, *, activated: Activated | None = None, origin: Origin
     gaussians = Gaussians(**tensors, attenuation=metadata.attenuation if dial else None, screen_filter=screen_filter)
     dropped = [f"{lost} of {total} Gaussians dropped: {reason}" for reason, lost in found.dropped.items()]
     notes = [*found.changes, *dropped]
-    if opaque := np.count_nonzero(arrays["opacity_logits"] == np.inf):
+    if arrays["opacity_logits"].max() == np.inf:  # else no mask is made
+        opaque = np.count_nonzero(arrays["opacity_logits"] == np.inf)
         notes.append(f"{opaque} Gaussians have opacity = +inf and are taken as fully opaque")
     if any(found.origin):
         where = ", ".join(f"{value:.10g}" for value in found.origin)
