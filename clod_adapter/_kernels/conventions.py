@@ -22,11 +22,6 @@ FX, FY, CX, CY, WIDTH, HEIGHT, LOW_X, HIGH_X, LOW_Y, HIGH_Y, EYE = range(16, 27)
 NEAR, BLUR, COMPENSATE = range(EYE + 3, EYE + 6)
 CAMERA = COMPENSATE + 1
 
-# A dial: s / D and s / (D r), in 1 / world units, half the equation's eps, the culling threshold, its logarithm, 1 for
-# the soft cut, and 1 where scales and opacities are activated and there is no dial.
-RATE, GROWTH_RATE, HALF_EPS, THRESHOLD, LOG_THRESHOLD, SOFT, ACTIVATED = range(7)
-DIAL = ACTIVATED + 1
-
 # The workspace of sixteen Gaussians: vectors with one lane per Gaussian. As stored: mean (3), quaternion (4), scales
 # (3). Then camera point (3), rotation (9), U = J R_view (6), P = U R S (6), blurred covariance (3), its determinant,
 # unit quaternion (4), 1 / |quaternion|, determinant of P P^T.

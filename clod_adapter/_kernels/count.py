@@ -3,8 +3,8 @@
 from numba import float32
 
 from clod_adapter._kernels.compiling import kernel, part
-from clod_adapter._kernels.conventions import LOG2E, LOG_THRESHOLD, ONE, TWO, ZERO
-from clod_adapter._kernels.dial import LN2, exponent, reciprocal_opacity
+from clod_adapter._kernels.conventions import LOG2E, ONE, TWO, ZERO
+from clod_adapter._kernels.dial import LN2, LOG_THRESHOLD, exponent, reciprocal_opacity
 from clod_adapter._kernels.elementary import bits_of, exp2, log2, ones, vabs
 from clod_adapter._kernels.pointers import first_lanes, load_some, pointer, store_some
 from clod_adapter._kernels.simd import both, gt, select, splat, vmax

@@ -13,6 +13,11 @@ from clod_adapter._kernels.elementary import bits_of, exp2, log2, vabs, vsqrt
 from clod_adapter._kernels.pointers import first_lanes, gather, load_some, load_triples, pointer, scatter, scratch
 from clod_adapter._kernels.simd import both, f32x16, ge, gt, select, splat, vmax, vmin
 
+# A dial: s / D and s / (D r), in 1 / world units, half the equation's eps, the culling threshold, its logarithm, 1 for
+# the soft cut, and 1 where scales and opacities are activated and there is no dial.
+RATE, GROWTH_RATE, HALF_EPS, THRESHOLD, LOG_THRESHOLD, SOFT, ACTIVATED = range(7)
+DIAL = ACTIVATED + 1
+
 LN2 = float32(0.6931471805599453)
 FARTHEST_EXPONENT = float32(126)  # of exp2
 LOG2_GROWTH_MAX = float32(20 * 1.4426950408889634)  # attenuation.LOG_GROWTH_MAX
@@ -30,7 +35,7 @@ def distance(x, y, z, cam):
 def exponent(d, sigma, dial):
     """``u = (d s)^2 / (2 v)``; 0 where d is 0."""
     sigma = vmax(sigma, splat(c.ZERO))
-    ratio = d * dial[c.RATE] / vsqrt(sigma * sigma + dial[c.HALF_EPS])
+    ratio = d * dial[RATE] / vsqrt(sigma * sigma + dial[HALF_EPS])
     return select(gt(d, splat(c.ZERO)), c.HALF * ratio * ratio, splat(c.ZERO))
 
 
@@ -45,7 +50,7 @@ def survives(w, logit, decay, cam, dial):
     """Which of sixteen rows with centres ``w[:3]`` the dial keeps."""
     u = exponent(distance(w[0], w[1], w[2], cam), decay, dial)
     log_opacity = -(LN2 * log2(reciprocal_opacity(logit))) - u
-    return gt(select(gt(splat(c.HUGE), decay), log_opacity, splat(c.ZERO)), splat(dial[c.LOG_THRESHOLD]))
+    return gt(select(gt(splat(c.HUGE), decay), log_opacity, splat(c.ZERO)), splat(dial[LOG_THRESHOLD]))
 
 
 @part
@@ -55,7 +60,7 @@ def kept(at, many, means, opacities, sigma, cam, dial, dialled):
     Activated opacities are 1/255 at least.
     """
     opacity = load_some(opacities, at, many)
-    if dial[c.ACTIVATED] > c.ZERO:
+    if dial[ACTIVATED] > c.ZERO:
         shown = both(ge(opacity, splat(c.ALPHA_MIN)), gt(splat(c.HUGE), opacity))
     else:
         w = scratch(f32x16, 3)
@@ -88,18 +93,18 @@ def drawn(rows, opacities, sigma, growth, cam, dial, dialled, grows, w):
     Activated ones stay as they are.
     """
     opacity, size = gather(opacities, rows), splat(c.ZERO)
-    if dial[c.ACTIVATED] > c.ZERO:
+    if dial[ACTIVATED] > c.ZERO:
         return opacity
     opacity = c.ONE / reciprocal_opacity(opacity)
     if dialled:
         d, decay = distance(w[c.MEAN], w[c.MEAN + 1], w[c.MEAN + 2], cam), gather(sigma, rows)
         opacity = opacity * exp2(-(c.LOG2E * exponent(d, decay, dial)))
-        if dial[c.SOFT] > c.ZERO:
-            fade = c.TWO * (opacity / splat(dial[c.THRESHOLD])) - c.TWO
+        if dial[SOFT] > c.ZERO:
+            fade = c.TWO * (opacity / splat(dial[THRESHOLD])) - c.TWO
             fade = select(gt(splat(c.HUGE), decay), vmin(vmax(fade, splat(c.ZERO)), splat(c.ONE)), splat(c.ONE))
             opacity = opacity * fade
         if grows:
-            size = gather(growth, rows) * log2(vmax(d * dial[c.GROWTH_RATE], splat(c.ONE)))
+            size = gather(growth, rows) * log2(vmax(d * dial[GROWTH_RATE], splat(c.ONE)))
             size = vmin(splat(LOG2_GROWTH_MAX), vmax(splat(-LOG2_GROWTH_MAX), size))  # NaN stays, and is not drawn
     for k in range(c.SCALE, c.SCALE + 3):
         w[k] = exp2(vmin(w[k] * c.LOG2E + size, splat(FARTHEST_EXPONENT)))
@@ -122,7 +127,7 @@ def dial_gradient(rows, given, cam, dial, dialled, grows, shaped, w, g):
     """
     opacities, sigma, growth, v_opacities, v_sigma, v_growth = given
     opacity = gather(opacities, rows)
-    if dial[c.ACTIVATED] > c.ZERO:
+    if dial[ACTIVATED] > c.ZERO:
         scatter(v_opacities, rows, g[c.SUMS + 3] / opacity)
         return
     odds = exp2(vmin(-opacity * c.LOG2E, splat(FARTHEST_EXPONENT)))  # (1 - a) / a
@@ -133,15 +138,15 @@ def dial_gradient(rows, given, cam, dial, dialled, grows, shaped, w, g):
     if dialled:
         decay, d = vmax(gather(sigma, rows), splat(c.ZERO)), distance(w[c.MEAN], w[c.MEAN + 1], w[c.MEAN + 2], cam)
         u = exponent(d, decay, dial)
-        if dial[c.SOFT] > c.ZERO:
+        if dial[SOFT] > c.ZERO:
             attenuated = exp2(-(c.LOG2E * u)) / (c.ONE + odds)
-            fade = c.TWO * (attenuated / splat(dial[c.THRESHOLD])) - c.TWO
+            fade = c.TWO * (attenuated / splat(dial[THRESHOLD])) - c.TWO
             fading = both(both(gt(fade, splat(c.ZERO)), gt(splat(c.ONE), fade)), gt(splat(c.HUGE), decay))
             total = total * select(fading, c.TWO + c.TWO / fade, splat(c.ONE))
-        slope = select(gt(u, splat(c.ZERO)), c.TWO * u * decay / (decay * decay + dial[c.HALF_EPS]), splat(c.ZERO))
+        slope = select(gt(u, splat(c.ZERO)), c.TWO * u * decay / (decay * decay + dial[HALF_EPS]), splat(c.ZERO))
         scatter(v_sigma, rows, total * slope)
         if grows and shaped:
-            magnification = log2(vmax(d * dial[c.GROWTH_RATE], splat(c.ONE)))
+            magnification = log2(vmax(d * dial[GROWTH_RATE], splat(c.ONE)))
             inside = gt(splat(LOG2_GROWTH_MAX), vabs(gather(growth, rows) * magnification))
             size = LN2 * magnification * (g[c.V_SCALE] + g[c.V_SCALE + 1] + g[c.V_SCALE + 2])
             scatter(v_growth, rows, select(inside, size, splat(c.ZERO)))

@@ -19,8 +19,8 @@ from clod_adapter.equation.distances import camera_unit
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.rasterizers.protocol import Rasterizer, behind, require_float32
 
-ACTIVATED = np.zeros(conventions.DIAL, np.float32)
-ACTIVATED[conventions.ACTIVATED] = 1
+ACTIVATED = np.zeros(dial.DIAL, np.float32)
+ACTIVATED[dial.ACTIVATED] = 1
 NOTHING = torch.empty(0, dtype=torch.float32, device="cpu")  # no dial, or no growth
 FEW = 4096  # rows that one thread projects or lists in about a tenth of a millisecond
 
@@ -43,11 +43,11 @@ def camera_vector(camera: Camera, screen_filter: ScreenFilter = CLASSIC) -> np.n
 
 def dial_vector(config: AttenuationConfig, virtual_scale: float, unit: float = 1.0) -> np.ndarray:
     """A dial value in the layout of the kernels, for distances in multiples of ``unit``."""
-    out, rate = np.zeros(conventions.DIAL, np.float32), virtual_scale / unit
-    out[conventions.RATE], out[conventions.GROWTH_RATE] = rate, rate / growth_distance(config)
-    out[conventions.HALF_EPS], out[conventions.SOFT] = config.eps / 2, config.cut == "soft"
-    out[conventions.THRESHOLD] = max(culling_threshold(config.tau, virtual_scale), FAINTEST)
-    out[conventions.LOG_THRESHOLD] = log_threshold(config.tau, virtual_scale)
+    out, rate = np.zeros(dial.DIAL, np.float32), virtual_scale / unit
+    out[dial.RATE], out[dial.GROWTH_RATE] = rate, rate / growth_distance(config)
+    out[dial.HALF_EPS], out[dial.SOFT] = config.eps / 2, config.cut == "soft"
+    out[dial.THRESHOLD] = max(culling_threshold(config.tau, virtual_scale), FAINTEST)
+    out[dial.LOG_THRESHOLD] = log_threshold(config.tau, virtual_scale)
     return out
 
 
@@ -189,7 +189,7 @@ class _Compiled(Rasterizer):
 def _dial_vector(gaussians: Gaussians, camera: Camera, virtual_scale: float) -> np.ndarray:
     config = gaussians.attenuation
     if config is None:
-        return np.zeros(conventions.DIAL, np.float32)
+        return np.zeros(dial.DIAL, np.float32)
     return dial_vector(config, virtual_scale, camera_unit(gaussians.means, camera, config))
 
 
