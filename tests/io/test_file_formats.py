@@ -38,8 +38,9 @@ def of(suffix: str, degree: int = 1, count: int = 40) -> Gaussians:
 EXACT = (0, 0, 0, 0, 0, 0, 1e-6)
 LOSSES = {
     ".glb": (0, 2e-6, 1e-6, 0, 0, 0, 1e-6),
+    ".glb of splat-transform": (*[1e-5] * 5, 0, 1e-5),  # stored: the fixture has other last bits on other processors
     ".spz": (2.0**-20, 0.5001 / 16, 0.501 / 255, 0.51 / (0.15 * 255), 2.01 / 128, 2.0**-11, 5e-3),
-    ".spz of splat-transform": (2.0**-13, 0.5001 / 16, 0.501 / 255, 0.51 / (0.15 * 255), 8.6 / 128, 0, 5e-3),
+    ".spz of splat-transform": (1.25e-4, 0.5001 / 16, 0.501 / 255, 0.51 / (0.15 * 255), 8.6 / 128, 0, 5e-3),
     ".compressed.ply": (4e-3, 2e-3, 0.51 / 255, 0.015, 4.1 / 128, 0, 9e-3),
 }
 
@@ -79,14 +80,14 @@ def same(kind: str, g: Gaussians, again: Gaussians) -> None:
             torch.testing.assert_close(found, most, rtol=sigma, atol=1e-6 * sigma)
 
 
-@pytest.mark.parametrize("kind", [".glb", ".spz of splat-transform", ".compressed.ply"])
+@pytest.mark.parametrize("kind", [".glb of splat-transform", ".spz of splat-transform", ".compressed.ply"])
 def test_files_of_splat_transform(capture: Any, kind: str) -> None:
     """Of version 3.7: a .glb in glTF's axes under a node without a rotation; an .spz of version 3; two blocks."""
     found = load(PACKED.with_name(f"capture{kind.split()[0]}"))
     rows = rows_by_place(capture.gaussians.means.numpy(), found.gaussians.means.numpy())
     same(kind, capture.gaussians, found.gaussians[torch.from_numpy(rows)])
     assert found.gaussians.opacity_logits.isfinite().all() and not any(found.origin)
-    assert any("quantised" in note for note in found.notes) == (kind != ".glb")
+    assert any("quantised" in note for note in found.notes) == (".glb" not in kind)
 
 
 def test_an_older_compressed_ply(tmp_path: Path) -> None:
