@@ -2,10 +2,11 @@
 
     python benchmarks/faults.py --record            # all of faults/*.toml
     python benchmarks/faults.py io kernels/sign     # one file of them, one fault
+    python benchmarks/faults.py --check             # whether each still applies, without a run
 
 A fault is one replaced text in one file: ``name``, ``file``, ``before`` (occurs once), ``after``, and ``tests``, the
 paths that run. With ``--whole`` the whole suite runs where these pass, minutes each. The exit code is 1 where a fault
-was not caught, and where a ``before`` does not occur once.
+was not caught, and, before any run, where a ``before`` does not occur once.
 """
 
 import os
@@ -35,6 +36,17 @@ def faults(words: Sequence[str]) -> Iterator[tuple[str, dict[str, Any]]]:
                 yield name, entry
 
 
+def misfits(words: Sequence[str]) -> list[str]:
+    """A line for each of the faults that no longer applies."""
+    found = []
+    for name, entry in faults(words):
+        path = ROOT / entry["file"]
+        count = path.read_text(encoding="utf-8").count(entry["before"]) if path.exists() else 0
+        if count != 1:
+            found.append(f"{name}: its 'before' occurs {count} times in {entry['file']}, not once")
+    return found
+
+
 def first_failure(copy: Path, tests: Sequence[str]) -> tuple[str, str]:
     """The first test that fails in the copy, or the run's error, empty where all pass; and pytest's last line."""
     options = ["-x", "-q", "-p", "no:cacheprovider", "--numprocesses=0", "-o", "timeout=900"]  # kernels are compiled
@@ -50,10 +62,6 @@ def run(copy: Path, entry: dict[str, Any], whole: bool) -> tuple[str, str]:
     """What catches the fault, and the counts, as by ``first_failure``."""
     path = copy / entry["file"]
     text = path.read_text(encoding="utf-8")
-    if text.count(entry["before"]) != 1:
-        raise SystemExit(
-            f"{entry['file']}: 'before' of {entry['name']} occurs {text.count(entry['before'])} times, not 1"
-        )
     path.write_text(text.replace(entry["before"], entry["after"]), encoding="utf-8")
     try:
         found = first_failure(copy, entry["tests"])
@@ -66,7 +74,10 @@ def main() -> None:
     parser = arguments(__doc__, record=FILE)
     parser.add_argument("faults", nargs="*", help="ROOM or ROOM/NAME; default: all")
     parser.add_argument("--whole", action="store_true", help="run the whole suite where the fault's own tests pass")
+    parser.add_argument("--check", action="store_true", help="only check that each fault applies")
     args = parser.parse_args()
+    if (wrong := misfits(args.faults)) or args.check:
+        sys.exit("\n".join(wrong) or 0)
     missed = 0
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder) / ROOT.name

@@ -14,7 +14,7 @@ earlier run.
 
 import json
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -55,7 +55,8 @@ def compared(finest: Path, levels: list[Path], adapted: Path | None, truth: Path
     views = [clod.View(camera, supersampled(shown, camera, SAMPLES if truth else 1)) for camera in cameras]
     out, images = adapted or folder / "adapted.ply", list[object]()
     if truth:
-        images = ["--images", write_photographs(shown, folder / "photographs")]
+        placed = clod.place_cameras(shown, views=PHOTOGRAPHS, seed=SEED + 1)
+        images = ["--images", write_photographs(shown, placed, folder / "photographs")]
         (row,) = clod.evaluate(base, views, [1.0])
         yield {"method": "base", "level": "all", "gaussians": len(base), "share": 1.0, "psnr": row.psnr}
     if adapted is None:
@@ -94,11 +95,11 @@ def supersampled(shown: clod.Gaussians, camera: clod.Camera, samples: int) -> to
     return (255 * image).round().to(torch.uint8)
 
 
-def write_photographs(shown: clod.Gaussians, folder: Path) -> Path:
-    """A folder of PHOTOGRAPHS from placed cameras, with their transforms.json."""
+def write_photographs(shown: clod.Gaussians, cameras: Sequence[clod.Camera], folder: Path) -> Path:
+    """A folder of photographs with their transforms.json."""
     (folder / "images").mkdir(parents=True)
     frames = []
-    for k, camera in enumerate(clod.place_cameras(shown, views=PHOTOGRAPHS, seed=SEED + 1)):
+    for k, camera in enumerate(cameras):
         name = f"images/{k:04}.png"
         Image.fromarray(supersampled(shown, camera, SAMPLES).numpy()).save(folder / name)
         pose = torch.linalg.inv(camera.viewmat.double()) @ torch.diag(torch.tensor([1.0, -1, -1, 1])).double()

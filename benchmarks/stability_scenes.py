@@ -157,19 +157,14 @@ CASES: dict[str, Change] = {
     "black images": black,
     "two cameras at one place": lambda base, scene: Case(base, Scene((*scene.train, scene.train[0]), scene.test)),
     "max_sv 1": partial(Case, settings={"max_sv": 1.0}),
-    "max_sv 100, tau 0.004": partial(Case, settings={"max_sv": 100.0, "tau": 0.004}),
-    "max_sv 100, tau 0.004, 1,500 steps": partial(Case, settings={"max_sv": 100.0, "tau": 0.004, "iters": 1500}),
+    "max_sv 100": partial(Case, settings={"max_sv": 100.0}),
+    "max_sv 100, 1,500 steps": partial(Case, settings={"max_sv": 100.0, "iters": 1500}),
 }
 
 
 def measure() -> list[dict[str, Any]]:
     base, scene = checkpoint(CAPTURE).gaussians, photographs(CAPTURE)
-    rows = [run(name, make(base, scene)) for name, make in CASES.items()]
-    try:  # settings that cannot work
-        clod.AdaptConfig(max_sv=100.0)
-    except clod.ClodError as error:
-        return [*rows, {"part": "scenes", "case": "max_sv 100 with the default tau", "error": str(error)}]
-    raise AssertionError("max_sv 100 with the default tau was not refused")
+    return [run(name, make(base, scene)) for name, make in CASES.items()]
 
 
 def run(name: str, case: Case) -> dict[str, Any]:
@@ -184,10 +179,8 @@ def run(name: str, case: Case) -> dict[str, Any]:
     finite = all(
         bool(clod.render(result, view.camera, s).image.isfinite().all()) for view in case.scene.test[:1] for s in dials
     ) and all(bool(tensor.isfinite().all()) for tensor in result.tensors().values())
-    attenuation = result.attenuation
-    assert attenuation is not None
     return {
-        "part": "scenes", "case": name, "finite": finite, "base_psnr": base_psnr, "tau": attenuation.tau,
+        "part": "scenes", "case": name, "finite": finite, "base_psnr": base_psnr,
         "rows": [{"virtual_scale": r.virtual_scale, "psnr": r.psnr, "kept_share": r.kept_share} for r in rows],
         "holds": finite and rows[0].psnr >= base_psnr - ALLOWED, "seconds": round(seconds, 1),
     }  # fmt: skip
@@ -195,10 +188,10 @@ def run(name: str, case: Case) -> dict[str, Any]:
 
 def tables(rows: list[dict[str, Any]]) -> str:
     """PSNR @ share kept at both ends of the dial, and which cases hold."""
-    lines, refused = [], [f"{row['case']}: `{row['error']}`" for row in rows if "error" in row]
-    for row in (row for row in rows if "error" not in row):
+    lines = []
+    for row in rows:
         ends = [f"{r['psnr']:.2f} @ {r['kept_share']:.0%}" for r in (row["rows"][0], row["rows"][-1])]
         marks = ["yes" if row[key] else "**no**" for key in ("finite", "holds")]
         lines.append([row["case"], f"{row['base_psnr']:.2f}", *ends, *marks, row["seconds"]])
     found = table(["scene", "base", "s = 1", "far end", "finite", "holds", "seconds"], lines)
-    return "\n\n".join([found, f"{sum(line[5] == 'yes' for line in lines)} of {len(lines)} hold", *refused])
+    return f"{found}\n\n{sum(line[5] == 'yes' for line in lines)} of {len(lines)} hold"

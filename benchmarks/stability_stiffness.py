@@ -1,12 +1,11 @@
 """Stiffness: optimizers, parameters and learning rates on values of sigma_d that span eight decades.
 
-The slope of the equation goes as 1/sigma_d. Gaussians at distances over eight decades have a known sigma_d that meets
-the target-count curve; training starts up to four decades off and minimises the mean square difference of the drawn
-opacities from the right ones, and the count term, with the package's schedule and mean of the last steps. Every
-optimizer gets the same gradients.
+The slope of the equation goes as 1/sigma_d, and is 0 beyond the reach. Gaussians at distances over eight decades have a
+known sigma_d that meets the target-count curve; training starts up to four decades off and minimises the mean square
+difference of the drawn opacities from the right ones, and the count term, with the package's schedule and mean of the
+last steps. Every optimizer gets the same gradients, and RowAdam's epsilon, which is that of 3DGS.
 
-``stuck``: a quarter each begins at 0, ten thousand times too small, as much too large, and at SIGMA_MAX. A Gaussian is
-stuck if no dial value gives it a gradient, before and after 100 steps.
+``stuck``: a quarter each begins at one of STARTS. A Gaussian is stuck if no dial value gives it a gradient.
 """
 
 import math
@@ -20,7 +19,7 @@ from typing import Any
 import clod_adapter as clod
 from clod_adapter._kernels.threads import torch_on_one_thread
 from clod_adapter.equation.attenuation import SIGMA_MAX, attenuate
-from clod_adapter.initialization.importance import sigma_from_importance
+from clod_adapter.initialization.importance import extinction_from_rank
 from clod_adapter.report.charts import BLUE, GREEN, ORANGE, PURPLE, QUIET, label_log, new_figure, save_figure
 from clod_adapter.training.dial import SIGMA_RANGE, Dial
 from clod_adapter.training.optimizer import RowAdam
@@ -36,7 +35,8 @@ CONFIG = clod.AdaptConfig(growth="off")
 DIALS = tuple(CONFIG.max_sv ** (k / 11) for k in range(12))
 RATES = tuple(10 ** (k / 2) for k in range(-8, 1))  # 1e-4 to 1 in half decades
 WRONG = 4.0  # decades, each way
-STEPS, LENGTHS, STUCK_STEPS = 600, (30, 100, 300, 1000), 100
+STEPS, LENGTHS = 600, (30, 100, 300, 1000)
+STARTS = ("0", "1e4 times too small", "1e4 times too large", "SIGMA_MAX")
 CONVERGED = 0.25  # of the start's error
 Stepper = Callable[[list[Tensor], list[float]], None]
 
@@ -66,11 +66,11 @@ def _row_adam(runs: list[Tensor]) -> Stepper:
 # AdamW is left out: its decay pulls sigma_d towards 0 (log sigma_d: 1), which nothing about a dial asks for.
 OPTIMIZERS: dict[str, tuple[Callable[[list[Tensor]], Stepper], str]] = {
     "RowAdam": (_row_adam, BLUE),
-    "Adam": (_torch_optimizer(torch.optim.Adam), GREEN),
-    "AMSGrad": (_torch_optimizer(torch.optim.Adam, amsgrad=True), "#3aa6a0"),
-    "NAdam": (_torch_optimizer(torch.optim.NAdam), "#8fb339"),
-    "RMSprop": (_torch_optimizer(torch.optim.RMSprop), PURPLE),
-    "Adagrad": (_torch_optimizer(torch.optim.Adagrad), ORANGE),
+    "Adam": (_torch_optimizer(torch.optim.Adam, eps=1e-15), GREEN),
+    "AMSGrad": (_torch_optimizer(torch.optim.Adam, eps=1e-15, amsgrad=True), "#3aa6a0"),
+    "NAdam": (_torch_optimizer(torch.optim.NAdam, eps=1e-15), "#8fb339"),
+    "RMSprop": (_torch_optimizer(torch.optim.RMSprop, eps=1e-15), PURPLE),
+    "Adagrad": (_torch_optimizer(torch.optim.Adagrad, eps=1e-15), ORANGE),
     "SGD, momentum 0.9": (_torch_optimizer(torch.optim.SGD, momentum=0.9), QUIET),
 }
 
@@ -100,12 +100,8 @@ def problem(n: int = 192) -> Problem:
     draw = torch.Generator().manual_seed(0)
     distances = 10 ** torch.empty(n).uniform_(-3, 5, generator=draw)
     logits = torch.empty(n).uniform_(0.3, 0.99, generator=draw).logit()
-    flat, rank = torch.zeros(n, 3), torch.rand(4 * n, generator=draw)[3 * n :]
-    some = clod.Gaussians(flat, torch.ones(n, 4), flat, logits, torch.zeros(n, 1, 3), torch.zeros(n, 0, 3))
-    right = sigma_from_importance(
-        some, rank, distances, CONFIG.attenuation(1.0), share=CONFIG.share,
-        exponent=CONFIG.exponent,
-    ).clamp(max=1e6)  # fmt: skip
+    rank = torch.randperm(n, generator=draw)
+    right = distances * extinction_from_rank(rank, CONFIG)
     off = torch.empty(n).uniform_(-WRONG, WRONG, generator=torch.Generator().manual_seed(1))
     return Problem(logits, distances, right, right * 10**off, drawn(logits, right, distances))
 
@@ -146,17 +142,18 @@ def gradients(task: Problem, x: Tensor, log: bool, dials: Sequence[int], count: 
         total = total + weight * losses.sum()
         for run, loss in enumerate((weight * losses.detach()).tolist() if count else []):
             own, target = sigma.detach()[run * n : (run + 1) * n], target_share(s, n, CONFIG)
-            pull[run] += count_gradient(task.distances, task.logits, own, s, settings, loss, CONFIG, target)
+            pull[run] += count_gradient(task.distances, own, s, loss, CONFIG, target)
     (gradient,) = torch.autograd.grad(total, leaf)
     return gradient + (pull if log else pull / x.detach())
 
 
-def stuck(task: Problem, sigma: Tensor, log: bool, count: bool) -> int:
-    """Gaussians that are drawn wrongly somewhere, and get no gradient at any dial value."""
-    x = sigma.clamp(min=SIGMA_RANGE[0]).log() if log else sigma
-    moved = sum(gradients(task, x[None].clone(), log, (k,), count)[0].abs() for k in range(len(DIALS)))
+def stuck(task: Problem, log: bool, count: bool) -> Tensor:
+    """``[N]`` bool, Gaussians that are drawn wrongly at first, and get no gradient at any dial value."""
+    sigma = task.start.clamp(*SIGMA_RANGE)
+    x = (sigma.log() if log else sigma)[None]
+    moved = torch.stack([gradients(task, x.clone(), log, (k,), count)[0] for k in range(len(DIALS))]).any(0)
     wrong = (drawn(task.logits, sigma, task.distances) - task.wanted).abs().amax(0) > 0.01
-    return int((wrong & (torch.as_tensor(moved) == 0)).sum())
+    return wrong & ~moved
 
 
 def measure() -> list[dict[str, Any]]:
@@ -171,14 +168,13 @@ def measure() -> list[dict[str, Any]]:
             (sigma,), seconds = fit(task, optimizer, log, (best,), steps)
             rows.append(own | {"rate": best, "steps": steps, "error": task.error(sigma), "seconds": seconds})
     rows.append({"part": "stiffness", "what": "start", "error": task.error(task.start)})
-    n = torch.arange(len(task.right))
+    kind = torch.arange(len(task.right)) % len(STARTS)
     ends = torch.stack([task.right * 0, task.right / 1e4, task.right * 1e4, torch.full_like(task.right, SIGMA_MAX)])
-    bad = replace(task, start=ends[n % 4, n])
+    bad = replace(task, start=ends.gather(0, kind[None])[0])
     for log, count in ((False, False), (True, False), (True, True)):
         name = f"{'log' if log else 'linear'} sigma_d{', count term (default)' if count else ''}"
-        (after,), _ = fit(bad, "RowAdam", log, (CONFIG.lr_sigma,), STUCK_STEPS, count)
-        counts = [stuck(bad, sigma, log, count) for sigma in (bad.start, after)]
-        rows.append({"part": "stiffness", "what": "stuck", "method": name, "of": len(n), "counts": counts})
+        counts = kind[stuck(bad, log, count)].bincount(minlength=len(STARTS)).tolist()
+        rows.append({"part": "stiffness", "what": "stuck", "method": name, "of": len(kind), "counts": counts})
     return rows
 
 
@@ -202,10 +198,11 @@ def tables(rows: list[dict[str, Any]]) -> str:
         span = " to ".join(dict.fromkeys((good[0], good[-1]))) if good else "none"
         lines.append([*key, f"{best['error']:.3f}", f"{best['rate']:.2g}", span, first])
     heads = ["optimizer", "sigma_d", "best error", "at", "learning rates that converge", "seconds to it"]
-    left = [[row["method"], *(f"{k} of {row['of']}" for k in row["counts"])] for row in rows if row["what"] == "stuck"]
+    left = [[row["method"], *row["counts"]] for row in rows if row["what"] == "stuck"]
+    (each,) = {row["of"] // len(STARTS) for row in rows if row["what"] == "stuck"}
     return "\n\n".join([
         table(heads, lines), f"RMS error at the start: {start:.2f}",
-        table(["Gaussians without a gradient", "at the start", f"after {STUCK_STEPS} steps"], left),
+        table([f"without a gradient, of {each} that begin at", *STARTS], left),
     ])  # fmt: skip
 
 

@@ -16,6 +16,7 @@ from .shared.outputs import size
 
 if TYPE_CHECKING:
     from clod_adapter.calibration import Calibration
+    from clod_adapter.config import AttenuationConfig
     from clod_adapter.inspection.report import Inspection
     from clod_adapter.inspection.statistics import Splat, Spread
 
@@ -23,7 +24,7 @@ WIDTH = 13  # of the labels
 MOST_ROWS = 8  # of a calibration, including the first and last
 MOST_LINES = 6  # under one label
 LONGEST = 100  # characters of a comment
-SETTINGS = ("max_sv", "iters", "seed", "tau", "cut")  # of the training settings, those shown
+SETTINGS = ("max_sv", "iters", "seed", "form")  # of the training settings, those shown
 
 
 def add_arguments(parser: ArgumentParser) -> None:
@@ -69,16 +70,11 @@ def splat_lines(splat: Splat) -> list[str]:
     rows = [*zip("xyz", splat.position, strict=True), ("scale", splat.scale), ("opacity", splat.opacity)]
     rows += [(name, each) for name, each in (("sigma_d", splat.sigma), ("growth_d", splat.growth)) if each is not None]
     lines += ["", *spread_table(rows), ""]
-    faint = f"{splat.fainter_than_tau:.1%} fainter than tau = {splat.tau:.3g}"
-    lines.append(_line("shares", f"{faint}, {splat.fainter_than_visible:.1%} than 1/255; {splat.needles:.1%} needles"))
+    faint = f"{splat.fainter_than_visible:.1%} fainter than 1/255"
+    lines.append(_line("shares", f"{faint}; {splat.needles:.1%} needles"))
     if splat.dial is None:
         return [*lines, _line("dial", "none: no sigma_d")]
-    a = splat.dial.attenuation
-    unit = f"over each view's {a.normalizer}"
-    if a.normalizer == "scene":
-        unit = "in world units" if a.scene_distance == 1 else f"over {a.scene_distance:.4g}"
-    how = f"s = 1 to {a.max_sv:g}, {a.cut} culling at tau, distances {unit}"
-    lines.append(_line("dial", f"{splat.dial_columns}, {how}"))
+    lines.append(_line("dial", f"{splat.dial_columns}, {_settings(splat.dial.attenuation)}"))
     return lines + calibration_lines(splat.dial.calibration)
 
 
@@ -112,10 +108,14 @@ def tensor_lines(about: dict[str, Any]) -> list[str]:
     lines.append(_line("trained with", settings or "unknown settings"))
     columns = {name: about[key] for name, key in (("sigma_d", "sigma"), ("growth_d", "growth")) if about[key]}
     lines += ["", *spread_table([*columns.items()]), ""]
-    a = about["attenuation"]
-    how = f"s = 1 to {a.max_sv:g}, {a.cut} culling at tau = {a.tau:.3g}"
-    lines.append(_line("dial", f"{' and '.join(columns)}, {how}"))
+    lines.append(_line("dial", f"{' and '.join(columns)}, {_settings(about['attenuation'])}"))
     return lines + calibration_lines(about["calibration"])
+
+
+def _settings(attenuation: AttenuationConfig) -> str:
+    """The settings of a dial in words."""
+    form = "the paper's form" if attenuation.form == "paper" else "distances in world units"
+    return f"s = 1 to {attenuation.max_sv:g}, {form}"
 
 
 def _block(name: str, says: Sequence[str]) -> list[str]:
@@ -136,8 +136,6 @@ splat-transform installed, .sog or .ksplat.
 
   looks like   a guess from comments and the order of properties
   needle       a Gaussian more than 10 times as long as its second axis
-  tau          culling threshold of the opacity at s = 1: the file's own, or the
-               one that adapting would use
 
 examples:
   clod-adapt inspect garden.ply

@@ -170,15 +170,14 @@ def with_dial(
 ) -> Gaussians:  # fmt: skip
     """The Gaussians with this dial alone, by the default settings; without ``sigma_d`` one that changes nothing.
 
-    That is SIGMA_MAX, and unless told otherwise a hard cut at 1/255, below which rasterizers draw nothing anyway. Its
-    gradient is 0: for a dial that a training loop learns, see ``attach``.
+    That is SIGMA_MAX, whose gradient is 0: for a dial that a training loop learns, see ``attach``.
 
     Args:
         sigma_d: ``[N]`` world units; growth_d: ``[N]`` exponents, or None for no growth.
     """
     if sigma_d is None:
         sigma_d = torch.full_like(gaussians.opacity_logits, SIGMA_MAX, dtype=torch.float32)
-        attenuation = attenuation or AttenuationConfig(tau=1 / 255, cut="hard")
+        attenuation = attenuation or AttenuationConfig()
     return gaussians.replace(sigma_d=sigma_d, growth_d=growth_d, attenuation=attenuation or AttenuationConfig())
 
 

@@ -9,7 +9,6 @@ from clod_adapter.adapter import detach
 from clod_adapter.cameras import Camera
 from clod_adapter.equation.attenuation import Attenuated, dial
 from clod_adapter.equation.distances import Place, typical_distance
-from clod_adapter.equation.extinction import extinction_scale
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import OPAQUE, Gaussians
 
@@ -56,24 +55,25 @@ def bake(
 
 @torch.no_grad()
 def order_by_extinction(gaussians: Gaussians, cameras: Sequence[Place]) -> Tensor:
-    """``[N]`` int64, the rows by descending extinction scale s*, for renderers that draw a prefix; ties stay in order.
+    """``[N]`` int64, the rows by descending extinction scale ``sigma_d / d``, for renderers that draw a prefix.
 
-    With ``gaussians.select(rows)`` the first n are those that ``bake`` keeps for the cameras, up to the rounding of s*.
+    Ties stay in order. With ``gaussians.select(rows)`` the first n are those that ``bake`` keeps for the cameras.
 
     Raises:
         ClodError: no dial, or no camera.
     """
     if gaussians.sigma_d is None or gaussians.attenuation is None:
         raise ClodError("the Gaussians have no sigma_d, so there is no pruning order")
+    if gaussians.attenuation.form == "paper":
+        raise ClodError("in the paper's form rows have no order: the cut depends on opacity; adapt with --form ours")
     distances = typical_distance(gaussians.means, cameras, gaussians.attenuation)
-    scales = extinction_scale(gaussians.opacity_logits, gaussians.sigma_d, distances, gaussians.attenuation)
-    return scales.argsort(descending=True, stable=True)
+    return (gaussians.sigma_d / distances).nan_to_num(nan=torch.inf).argsort(descending=True, stable=True)
 
 
 def _logits_drawn(shown: Attenuated, logits: Tensor) -> Tensor:
     """``[N]`` the logits of the drawn opacities; bit for bit ``logits`` where these are equal."""
-    # From log a'', and by expm1 and not 1 - o, which cancels where o is near 1; the cut's factor is 1 for most.
-    drawn = shown.log_opacities + (shown.drawn / shown.opacities).log()
+    # By the fade's logarithm, and by expm1 and not 1 - o, which cancels where o is near 1.
+    drawn = torch.nn.functional.logsigmoid(logits) + (shown.drawn / logits.sigmoid()).log()
     baked = (drawn - torch.log(-torch.expm1(drawn))).clamp(max=OPAQUE)
     same = (drawn == torch.nn.functional.logsigmoid(logits)) & logits.isfinite()
     return torch.where(same, logits, baked.to(logits))

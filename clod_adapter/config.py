@@ -8,8 +8,6 @@ from typing import Any
 
 from clod_adapter.errors import ClodError
 
-NORMALIZERS = ("max", "scene")
-CUTS = ("hard", "soft")
 FORMS = ("ours", "paper")
 GROWTHS = ("on", "off")
 FARTHEST = 3e38  # world units: a float32, as which distances are divided by it
@@ -34,38 +32,27 @@ def require(ok: bool, name: str, value: object, what: str) -> None:
 class AttenuationConfig:
     """Settings of the equation that reads ``sigma_d``. Stored in the file; the defaults are those of adapting.
 
-    A Gaussian is culled unless its attenuated opacity exceeds the culling threshold ``tau * virtual_scale``. A hard
-    threshold, the paper's, keeps that opacity; a soft one fades it to 0 at the threshold (``attenuation.attenuate``).
-    The normalizer D turns a distance into the ``d'`` of the equation:
-
-    - ``scene``: the constant ``scene_distance`` for every view; 1 in files, where sigma_d is in world units;
-    - ``max``: the largest of the distances of the Gaussians in the view frustum, the paper's form.
+    The form ``ours`` (``attenuation.attenuate``) has distances in units of ``scene_distance``, which is 1 in files:
+    sigma_d is a length of the scene. The form ``paper`` (``equation/paper.py``) has them as a share of the largest
+    distance in the view.
 
     Raises:
         ClodError: a field is out of range.
     """
 
-    tau: float = option(0.02, "culling threshold on opacity at s = 1; rasterizers drop opacities below 1/255 anyway")
-    cut: str = option("soft", "culling threshold: hard (opacity drops to 0 at tau s, the paper's) or soft (fades to 0)")
-    eps: float = option(1e-8, "the paper's epsilon, added to 2 sigma_d^2; defines sigma_d = 0")
-    normalizer: str = option("scene", "divisor D of distances: scene or max")
-    scene_distance: float = option(1.0, "D in world units (normalizer scene); files have 1, sigma_d in world units")
+    form: str = option("ours", "equation of the dial: ours, or the paper's")
+    scene_distance: float = option(1.0, "unit of distances, world units; files have 1, sigma_d in world units")
     reference_distance: float = option(
         0.0, "median distance in the nearest training views, world units, from which on scales grow; 0 if unknown"
     )
     max_sv: float = option(5.0, "largest dial value of training")
 
     def __post_init__(self) -> None:
-        require(0 < self.tau < 1, "tau", self.tau, "between 0 and 1")
-        require(self.cut in CUTS, "cut", self.cut, f"one of {', '.join(CUTS)}")
-        require(0 <= self.eps < 1, "eps", self.eps, "at least 0 and below 1")
-        require(self.normalizer in NORMALIZERS, "normalizer", self.normalizer, f"one of {', '.join(NORMALIZERS)}")
+        require(self.form in FORMS, "form", self.form, f"one of {', '.join(FORMS)}")
         distance, reference = self.scene_distance, self.reference_distance
         require(0 < distance < FARTHEST, "scene_distance", distance, f"above 0 and below {FARTHEST:g}")
         require(0 <= reference < FARTHEST, "reference_distance", reference, f"at least 0 and below {FARTHEST:g}")
         require(1 <= self.max_sv < math.inf, "max_sv", self.max_sv, "at least 1 and finite")
-        all_culled = f"below 1/max_sv = {1 / self.max_sv:.3g}, or every Gaussian is culled at max_sv"
-        require(self.tau * self.max_sv < 1, "tau", self.tau, all_culled)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -131,14 +118,13 @@ class AdaptConfig:
         None, "stop training after this many seconds; schedules are scaled to it (default: no limit)"
     )
     seed: int = option(0, "seed of the view order, the dial values and the importance estimate")
-    tau: float = option(0.02, "culling threshold on opacity at s = 1; lowered automatically for faint checkpoints")
     start_share: float | None = option(
         None, "share of Gaussians to keep at s = 1 (default: as the plan measures; 0.62 without a plan)"
     )
     exponent: float = option(1.5, "target-count curve: the target share of Gaussians at s is s^-exponent")
-    reg_weight: float = option(0.75, "weight of the count loss (the paper's lambda_reg)")
+    reg_weight: float = option(1.0, "weight of the count loss (the paper's lambda_reg)")
     ssim_weight: float = option(0.2, "weight w of 1 - SSIM; L1 has 1 - w")
-    lr_sigma: float = option(0.1, "learning rate of log sigma_d: its largest relative change per step")
+    lr_sigma: float = option(0.05, "learning rate of log sigma_d: its largest relative change per step")
     growth: str = option("on", "growth of the Gaussians that remain, by a growth_d beside sigma_d: on or off")
     lr_growth: float = option(1.2e-2, "learning rate of growth_d")
     lr_means: float = option(0.06, "learning rate of means, times the Gaussian's own size")
@@ -165,16 +151,15 @@ class AdaptConfig:
         for name in ("sigma", "growth", "means", "quats", "scales", "opacities", "sh0", "shN"):
             rate = getattr(self, f"lr_{name}")  # larger ones overflow float32 in the end
             require(0 <= rate <= 1e6, f"lr_{name}", rate, "between 0 and 1e6")
-        self.attenuation(1.0)  # checks the rest
 
     @classmethod
     def paper(cls, **changes: Any) -> AdaptConfig:
         """The paper's form with its settings where it gives them, and the defaults elsewhere; then ``changes``.
 
-        CLoD-GS section 3.3: lambda 1, sigma_d itself trained at 1e-2. Chosen here: tau 1/255, half the default rates.
+        CLoD-GS section 3.3: lambda 1, sigma_d itself trained at 1e-2. Chosen here: half the default rates.
         """
         own: dict[str, Any] = {
-            "form": "paper", "iters": 1600, "tau": 1 / 255, "reg_weight": 1.0, "growth": "off", "lr_sigma": 1e-2,
+            "form": "paper", "iters": 1600, "reg_weight": 1.0, "growth": "off", "lr_sigma": 1e-2,
             "lr_means": 0.03, "lr_quats": 8e-4, "lr_scales": 8e-3, "lr_opacities": 5e-2, "lr_sh0": 2e-3,
         }  # fmt: skip
         return cls(**{**own, **changes})
@@ -202,7 +187,7 @@ class AdaptConfig:
 
     def attenuation(self, scene_distance: float) -> AttenuationConfig:
         """Settings of the equation in training; files have them in world units (``units.in_world_units``)."""
-        return AttenuationConfig(tau=self.tau, scene_distance=scene_distance, max_sv=self.max_sv)
+        return AttenuationConfig(form=self.form, scene_distance=scene_distance, max_sv=self.max_sv)
 
 
 def field_descriptions(config: Any) -> dict[str, str]:

@@ -60,7 +60,7 @@ class Hook:
     ) -> tuple[Array, Array, Array]:  # fmt: skip
         """The opacities to draw with, the kept rows, and the factors of the scales.
 
-        Opacities are 0 for culled Gaussians; ``[N]`` bool are the kept ones (CLoD-GS Eq. 2, its mask). The factors
+        Opacities are 0 for culled Gaussians; ``[N]`` bool are the kept ones. The factors
         ``[N]`` (``attenuation.growth_factors``) are ones without a ``growth_d``. numpy in, numpy out; torch in, torch
         out, on the means' device, differentiable in ``opacities``, ``sigma_d`` and ``growth_d``.
 
@@ -68,14 +68,15 @@ class Hook:
             means: ``[N, 3]`` world units.
             opacities: ``[N]`` or ``[N, 1]`` activated, in [0, 1]; the result has its shape and dtype.
             viewmat: ``[4, 4]`` array or tensor, world to camera, a rotation and a translation, OpenCV axes.
-            K: ``[3, 3]`` likewise, intrinsics in pixels; with ``width``, ``height`` and ``near`` the frustum of the
-                normaliser ``max``. ``scene`` needs none of them.
+            K: ``[3, 3]`` likewise, intrinsics in pixels; with ``width``, ``height`` and ``near`` the frustum, which the
+                paper's form needs.
 
         Raises:
-            ClodError: shapes do not fit the hook or each other, means or opacities are integers, or ``max`` has no K.
+            ClodError: shapes do not fit the hook or each other, means or opacities are integers, or K is missing in the
+                paper's form.
         """
-        if K is None and self.attenuation.normalizer != "scene":
-            raise ClodError(f"normalizer {self.attenuation.normalizer} needs K, width and height in the hook's call")
+        if K is None and self.attenuation.form == "paper":
+            raise ClodError("the paper's form needs K, width and height in the hook's call")
         camera = Camera(_matrix(viewmat), _matrix(np.eye(3) if K is None else K), width, height, near=near)
         shown = tensor_of(opacities)
         result = self.attenuate(tensor_of(means), shown, camera)

@@ -24,6 +24,7 @@ class Backend:
     dtype: torch.dtype = torch.float32  # of its inputs
     repeats: bool = True  # the same input gives the same bits; otherwise sums are rounded in no fixed order
     looser: float = 1.0  # factor on the tolerances; above 1 for float32 kernels with fast intrinsics
+    drops_last: bool = False  # leaves out the Gaussian that ends a pixel, as gsplat does
 
     def __call__(self, *args: Any, **kwargs: Any) -> tuple[Tensor, Tensor]:
         def place(x: Any) -> Any:
@@ -47,8 +48,8 @@ class Backend:
 # gsplat's kernels are CUDA's alone. In torch, in float64, what is around them answers for every digit.
 BACKENDS = {
     "cpu": Backend("cpu"),
-    "cuda, gsplat in torch": Backend("cuda", dtype=torch.float64),
-    "cuda": Backend("cuda", "cuda", repeats=False, looser=50.0),
+    "cuda, gsplat in torch": Backend("cuda", dtype=torch.float64, drops_last=True),
+    "cuda": Backend("cuda", "cuda", repeats=False, looser=50.0, drops_last=True),
 }
 
 

@@ -36,7 +36,7 @@ from scenes import looking
 
 fake_gpu.register()
 frame_times.NOISY = math.inf  # whether a note is given depends on the load
-pseudo_views.MANY = 8  # the tests' captures of eight show too little by the measure of real ones
+pseudo_views.MANY = 8  # the tests' captures have eight, which are few by the measure of real ones
 
 
 def pytest_sessionstart(session: pytest.Session) -> None:

@@ -23,7 +23,7 @@ from clod_adapter.config import SH_COUNTS, AttenuationConfig
 from clod_adapter.gaussians import Gaussians
 from scenes import gaussians
 
-ATTENUATION = AttenuationConfig(tau=0.02, cut="soft", reference_distance=3.217, max_sv=7.0)
+ATTENUATION = AttenuationConfig(reference_distance=3.217, max_sv=7.0)
 CALIBRATION = Calibration((CalibrationRow(1, 30, 29.1, 0.9, 2.5),), 40, 3, 64, 48, "a machine")
 ORIGIN = (5.1e5, -4096.0, 0.25)
 PACKED = Path(__file__).parent / "io" / "of_splat_transform" / "capture.compressed.ply"  # of the fixture ``capture``

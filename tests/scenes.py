@@ -52,10 +52,10 @@ def gaussians(n: int, degree: int, seed: int, *, size: float = 0.08) -> Gaussian
 
 
 def dialled(n: int, degree: int, seed: int, **settings: Any) -> Gaussians:
-    """Gaussians with a sigma_d log-normal around e, 0 in every 50th row, and soft culling."""
+    """Gaussians with a sigma_d log-normal around e, and 0 in every 50th row."""
     sigma_d = (torch.randn(n, generator=torch.Generator().manual_seed(seed + 1)) + 1).exp()
     sigma_d[::50] = 0.0
-    attenuation = AttenuationConfig(**{"tau": 0.02, "cut": "soft", "scene_distance": 3.0} | settings)
+    attenuation = AttenuationConfig(**{"scene_distance": 3.0} | settings)
     return gaussians(n, degree, seed).replace(sigma_d=sigma_d, attenuation=attenuation)
 
 

@@ -22,8 +22,8 @@ N = 200
 def adapted(**settings: Any) -> Gaussians:
     plain = gaussians(N, 1, 0)
     sigma_d, growth_d = torch.rand(2, N, generator=torch.Generator().manual_seed(1)) * 1.5
-    values = {"tau": 0.02, "scene_distance": 3.0, "max_sv": 5.0}
-    return plain.replace(sigma_d=sigma_d, growth_d=growth_d - 0.5, attenuation=AttenuationConfig(**(values | settings)))
+    attenuation = AttenuationConfig(scene_distance=3.0, **settings)
+    return plain.replace(sigma_d=sigma_d, growth_d=growth_d - 0.5, attenuation=attenuation)
 
 
 def hook_of(model: Gaussians, virtual_scale: float = 3.0) -> Hook:
@@ -32,7 +32,7 @@ def hook_of(model: Gaussians, virtual_scale: float = 3.0) -> Hook:
 
 def test_mixed_and_strided_arrays_are_accepted() -> None:
     """Mixed numpy and torch, integers, negative strides, the other byte order, and lists."""
-    model, size = adapted(normalizer="max"), (64, 48)
+    model, size = adapted(form="paper"), (64, 48)
     means, a, K = model.means.numpy(), model.opacities.numpy(), camera().K.numpy()
     pose = np.array([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 2], [0, 0, 0, 1]])
     hook = hook_of(model)
@@ -65,8 +65,8 @@ def test_gradients_reach_opacities_sigma_d_and_growth_d_only() -> None:
 
 
 def test_bad_arguments_are_refused(tmp_path: Path) -> None:
-    model, view = adapted(normalizer="max"), camera()
-    with pytest.raises(ClodError, match="normalizer max needs K, width and height"):
+    model, view = adapted(form="paper"), camera()
+    with pytest.raises(ClodError, match="the paper's form needs K, width and height"):
         hook_of(model)(model.means, model.opacities, view.viewmat)
     with pytest.raises(ClodError, match=r"for 200 Gaussians, but means is \(199, 3\)"):
         hook_of(model)(model.means[1:], model.opacities, view.viewmat, view.K, 64, 48)

@@ -1,19 +1,18 @@
 // The dial of an adapted file, without a viewer: what the file says, and what turns it.
-import { countKept, dialForCount, growthDistance, prepare } from "./equation.js";
+import { countKept, dialForCount, extinctionScales, growthStart } from "./equation.js";
 import { createHold } from "./frame_rate.js";
 import { readGaussians } from "./read.js";
 
-/** Reads the dial of an adapted PLY or SPZ (bytes): {count, means, opacityLogits, sigma, growth, settings}. */
+/** Reads the dial of an adapted PLY or SPZ (bytes): {count, means, sigma, growth, settings}. */
 export async function readDial(bytes) {
   const data = new Uint8Array(bytes.buffer ?? bytes, bytes.byteOffset ?? 0, bytes.byteLength);
-  const { count, means, opacityLogits, sigmaD: sigma, growthD: growth, settings } = await readGaussians(data);
-  return checked({ count, means, opacityLogits, sigma, growth, settings });
+  const { count, means, sigmaD: sigma, growthD: growth, settings } = await readGaussians(data);
+  return checked({ count, means, sigma, growth, settings });
 }
 
-/** `dial` if a viewer can show it: it has sigma_d, and distances whose unit does not depend on the view. */
+/** `dial`, if it has a sigma_d. */
 export function checked(dial) {
   if (!dial.sigma) throw new Error("the file has no sigma_d, so no dial; adapt it with clod-adapt");
-  if (dial.settings.normalizer !== "scene") throw new Error(`the normalizer ${dial.settings.normalizer} depends on the view; adapt with --normalizer scene`);
   return { ...dial, growth: dial.growth ?? new Float32Array(dial.count) };
 }
 
@@ -26,8 +25,7 @@ export function texels({ count, sigma, growth }, length) {
 
 /** The equation's constants as arguments of the shaders, in a shader's own syntax. */
 export function constants({ settings }) {
-  const number = (value) => value.toExponential(8), distance = number(settings.scene_distance);
-  return { eps: number(settings.eps), tau: number(settings.tau), soft: String(settings.cut === "soft"), distance, reach: number(growthDistance(settings)) };
+  return { distance: settings.scene_distance.toExponential(8), start: growthStart(settings).toExponential(8) };
 }
 
 /** Turns the dial of a model in a viewer. `eye()`: the camera in the file's coordinates; `show(s)`: draws with s;
@@ -43,11 +41,11 @@ export class Dial {
   // The public methods are described in types.d.ts.
   set(value) {
     this.#hold = null;
-    this.#turn(typeof value === "number" ? value : dialForCount((s) => this.#count(s), value.keep, this.file.settings.max_sv).dial);
+    this.#turn(typeof value === "number" ? value : dialForCount(this.#scales(), value.keep, this.file.settings.max_sv));
   }
 
   get kept() {
-    return this.#count(this.s);
+    return countKept(this.#scales(), this.s);
   }
 
   hold(fps) {
@@ -68,9 +66,8 @@ export class Dial {
     if (s !== this.s) this.show((this.s = s));
   }
 
-  #count(s) {
-    const { means, opacityLogits, sigma, settings } = this.file;
-    this.prepared ??= prepare(opacityLogits, sigma, settings.eps);
-    return countKept(means, this.prepared, settings.tau, this.eye(), settings.scene_distance, s);
+  #scales() {
+    const { means, sigma, settings } = this.file;
+    return extinctionScales(means, sigma, this.eye(), settings.scene_distance);
   }
 }

@@ -41,12 +41,12 @@ function fileOf(data) {
   for (let i = 0; i < count; i++) means.set([x[i], y[i], z[i]], 3 * i);
   const names = data.getElement("vertex").properties.map(({ name }) => name);
   const settings = readSettings(data.comments ?? [], constantsOf(names, (name) => column(name)[0]));
-  return checked({ count, means, opacityLogits: column("opacity"), sigma: column("sigma_d"), growth: column("growth_d"), settings });
+  return checked({ count, means, sigma: column("sigma_d"), growth: column("growth_d"), settings });
 }
 
 /** The modifier for `gsplat.setWorkBufferModifier`. */
 export function modifier(file) {
-  const { distance, eps, tau, soft, reach } = constants(file);
+  const { distance, start } = constants(file);
   return {
     glsl: `${glsl}
       uniform vec3 uClodEye;
@@ -54,10 +54,10 @@ export function modifier(file) {
       float clodDistance(vec3 center) { return length(center - uClodEye) * uClodScale.y / ${distance}; }
       void modifySplatCenter(inout vec3 center) {}
       void modifySplatRotationScale(vec3 original, vec3 center, inout vec4 rotation, inout vec3 scale) {
-        scale *= clodScale(loadClod().g, clodDistance(center), uClodScale.x, ${reach});
+        scale *= clodScale(loadClod().g, clodDistance(center), uClodScale.x, ${start});
       }
       void modifySplatColor(vec3 center, inout vec4 color) {
-        color.a = clodOpacity(color.a, loadClod().r, clodDistance(center), uClodScale.x, ${eps}, ${tau}, ${soft});
+        color.a = clodOpacity(color.a, loadClod().r, clodDistance(center), uClodScale.x);
       }`,
     wgsl: `${wgsl}
       uniform uClodEye: vec3f;
@@ -65,10 +65,10 @@ export function modifier(file) {
       fn clodDistance(center: vec3f) -> f32 { return length(center - uniform.uClodEye) * uniform.uClodScale.y / ${distance}; }
       fn modifySplatCenter(center: ptr<function, vec3f>) {}
       fn modifySplatRotationScale(original: vec3f, center: vec3f, rotation: ptr<function, vec4f>, scale: ptr<function, vec3f>) {
-        *scale = *scale * clodScale(loadClod().g, clodDistance(center), uniform.uClodScale.x, ${reach});
+        *scale = *scale * clodScale(loadClod().g, clodDistance(center), uniform.uClodScale.x, ${start});
       }
       fn modifySplatColor(center: vec3f, color: ptr<function, vec4f>) {
-        (*color).a = clodOpacity((*color).a, loadClod().r, clodDistance(center), uniform.uClodScale.x, ${eps}, ${tau}, ${soft});
+        (*color).a = clodOpacity((*color).a, loadClod().r, clodDistance(center), uniform.uClodScale.x);
       }`,
   };
 }

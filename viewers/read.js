@@ -1,9 +1,8 @@
 // Reads what a browser gets: binary PLY and SPZ. Python converts every other format.
 import { readSpz } from "./spz.js";
 
-const DEFAULTS = {
-  tau: 0.02, cut: "soft", eps: 1e-8, normalizer: "scene", scene_distance: 1, reference_distance: 0, max_sv: 5,
-};
+const DEFAULTS = { form: "ours", scene_distance: 1, reference_distance: 0, max_sv: 5 };
+const EARLIER = ["tau", "eps", "cut", "normalizer", "hard_cut", "max"]; // of an earlier form of the dial
 const TYPES = { // the other names are those of DataView, in lower case
   char: "Int8", uchar: "Uint8", short: "Int16", ushort: "Uint16", int: "Int32", uint: "Uint32", float: "Float32", double: "Float64",
 };
@@ -17,7 +16,10 @@ export async function readGaussians(bytes) {
   try {
     const magic = String.fromCharCode(...bytes.subarray(0, 3));
     if (magic === "ply") return readPly(bytes);
-    if (magic.startsWith("\x1f\x8b")) return await readSpz(bytes);
+    if (magic.startsWith("\x1f\x8b")) {
+      const { attenuation, ...read } = await readSpz(bytes);
+      return { ...read, settings: attenuation && settingsOf(attenuation) };
+    }
   } catch (error) {
     if (error.constructor === Error) throw error;
     throw new Error("it is damaged or too large for this browser; copy or export it again", { cause: error });
@@ -25,9 +27,11 @@ export async function readGaussians(bytes) {
   throw new Error(bytes.length ? "it is neither .ply nor .spz" : "it is empty");
 }
 
-/** The values of the clod_* columns, the same in all rows (io/ply_layout.py); `first(name)`: of the first row. */
-export const constantsOf = (names, first) =>
-  Object.fromEntries(names.filter((name) => name.startsWith("clod_")).map((name) => [name, Math.fround(first(name))]));
+/** By NAME the values of the columns clod_NAME, the same in all rows (io/ply_layout.py); `first(name)`: of the first row. */
+export function constantsOf(names, first) {
+  const ours = names.filter((name) => name.startsWith("clod_"));
+  return Object.fromEntries(ours.map((name) => [name.slice(5), Math.fround(first(name))]));
+}
 
 /** The Gaussians of a binary PLY in Inria's layout, with columns of any order and type. */
 function readPly(bytes) {
@@ -65,26 +69,30 @@ function readPly(bytes) {
   };
 }
 
-/** The dial's settings from the comments (io/ply_layout.py), else from `constants` (clod_* columns), else defaults. */
-export function readSettings(comments, constants = {}) {
+/** The dial's settings from the comments (io/ply_layout.py), else from `constants` (constantsOf), else defaults. */
+export const readSettings = (comments, constants = {}) =>
+  settingsOf({ ...constants, ...(constants.paper && { form: "paper" }), ...Object.fromEntries(entries(comments)) });
+
+/** The dial's settings from those that are stored, numbers perhaps as text. */
+function settingsOf(stored) {
+  const isEarlier = EARLIER.some((name) => name in stored);
+  if (isEarlier) throw new Error("its dial is of an earlier form; adapt its checkpoint again");
   const settings = { ...DEFAULTS };
-  for (const name of Object.keys(DEFAULTS)) settings[name] = constants[`clod_${name}`] ?? settings[name];
-  if (constants.clod_hard_cut) settings.cut = "hard";
-  if (constants.clod_max) settings.normalizer = "max";
-  for (const [name, value] of entries(comments)) {
-    if (name in DEFAULTS) settings[name] = typeof DEFAULTS[name] === "number" ? Number(value) : value;
+  for (const [name, usual] of Object.entries(DEFAULTS)) {
+    if (name in stored) settings[name] = typeof usual === "number" ? Number(stored[name]) : stored[name];
   }
-  return settings;
+  if (settings.form === "ours") return settings;
+  throw new Error("its dial is of the paper's form, which viewers do not draw; adapt it without --form paper");
 }
 
 /** The screen-space filter from comments, ours or another program's, or from columns; as in io/settings.py. */
-function readScreenFilter(comments, { clod_screen_variance, clod_compensate }, hasDial) {
+function readScreenFilter(comments, { screen_variance: width, compensate: compensated }, hasDial) {
   const written = entries(comments).findLast(([name]) => name === "screen_filter")?.[1];
   if (written) {
     const [variance, compensate] = written.split(" ");
     return { variance: Number(variance), compensate: compensate === "True" };
   }
-  if (clod_screen_variance || clod_compensate) return { variance: clod_screen_variance ?? 0.3, compensate: Boolean(clod_compensate) };
+  if (width || compensated) return { variance: width ?? 0.3, compensate: Boolean(compensated) };
   // A dial was trained with the default filter, unless the file names another.
   const compensate = !hasDial && comments.some((comment) => /^\s*(splatrendermode:\s*mip|antialiased 1)\s*$/i.test(comment));
   return { variance: compensate && comments.includes("Exported from Brush") ? 0.1 : 0.3, compensate };

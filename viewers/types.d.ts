@@ -2,10 +2,9 @@
 export interface DialFile {
   count: number;
   means: Float32Array;
-  opacityLogits: Float32Array;
   sigma: Float32Array;
   growth: Float32Array;
-  settings: Record<string, number | string>;
+  settings: { form: string; scene_distance: number; reference_distance: number; max_sv: number };
 }
 
 /** Reads an adapted PLY (binary) or SPZ (versions 2 and 3). */

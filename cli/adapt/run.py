@@ -100,14 +100,12 @@ def make_result(run: Run, plan: Plan, adapted: Adapted) -> Result:
     before, after = trim(gaussians, kept, degree), trim(adapted.gaussians, kept, degree)
     adapter = extract(before, after, fingerprint=base.fingerprint, config=asdict(run.config), origin=base.origin)
     adapter = replace(adapter, kept=kept, sh_degree=degree)
-    note_training(run, adapter, adapted)
+    note_training(run, adapted)
     return Result(plan, adapted, base, adapter, adapter.apply(gaussians))
 
 
-def note_training(run: Run, adapter: Adapter, adapted: Adapted) -> None:
-    note, tau = run.console.note, adapter.attenuation.tau
-    if run.base.gaussians.sigma_d is None and tau < run.config.tau:
-        note(f"tau is {tau:.2g} instead of {run.config.tau:g}, because the Gaussians are faint")
+def note_training(run: Run, adapted: Adapted) -> None:
+    note = run.console.note
     if adapted.lost:
         note(f"training ended at step {adapted.steps}: {explain(adapted.lost)}")
     if adapted.failed:

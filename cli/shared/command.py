@@ -228,9 +228,6 @@ def add_settings(options: _ActionsContainer, without: Sequence[str] = ()) -> Non
 def make_config(args: Namespace) -> AdaptConfig:
     """The settings; the error of a value out of range names the option."""
     make, size = AdaptConfig.paper if args.form == "paper" else AdaptConfig, launched().size
-    limit = 1 / make().tau
-    if args.max_sv >= limit:
-        raise ClodError(f"--max-sv is {args.max_sv:g}, it must be below {limit:g}, where every Gaussian is culled")
     try:
         given = {name: value for name in SETTINGS if (value := getattr(args, name)) is not None}
         config = make(**{"batch": size} | given)

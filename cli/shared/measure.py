@@ -32,7 +32,7 @@ from .command import given_budget, no_calibration
 from .console import Console
 from .inputs import prepare_kernels
 
-# Round values, each about 1.4 times the last, or more between 1 and 5; max_sv < 1/tau = 50.
+# Round values, each about 1.4 times the last, or more between 1 and 5.
 REPORT_DIALS = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0, 10.0, 14.0, 20.0, 28.0, 40.0)
 
 

@@ -3,42 +3,45 @@
 from numba import float32
 
 from clod_adapter._kernels.compiling import kernel, part
-from clod_adapter._kernels.conventions import LOG2E, ONE, TWO, ZERO
-from clod_adapter._kernels.dial import LN2, LOG_THRESHOLD, exponent, reciprocal_opacity
-from clod_adapter._kernels.elementary import bits_of, exp2, log2, ones, vabs
+from clod_adapter._kernels.conventions import ONE
+from clod_adapter._kernels.dial import squared_reach, survives
+from clod_adapter._kernels.elementary import bits_of, ones
 from clod_adapter._kernels.pointers import first_lanes, load_some, pointer, store_some
-from clod_adapter._kernels.simd import both, gt, select, splat, vmax
+from clod_adapter._kernels.simd import both, gt, select, splat, vmax, vmin
+
+DOUBLINGS = 5  # of the exponent 1 of t: 2^5 is target_count.SHARPNESS
 
 
 @part
-def load_logs(i, many, logits, sigma, d, dial):
-    """log a'' less the threshold's, and u, of at most sixteen of ``many`` rows from ``i`` on."""
-    u = exponent(load_some(d, i, many), load_some(sigma, i, many), dial)
-    return -(LN2 * log2(reciprocal_opacity(load_some(logits, i, many)))) - u - splat(dial[LOG_THRESHOLD]), u
+def load_squares(i, many, sigma, d, dial2):
+    """``sigma`` and (d s)^2 of at most sixteen of ``many`` rows from ``i`` on; ``dial2`` is s^2."""
+    d = load_some(d, i, many)
+    return load_some(sigma, i, many), d * d * dial2
 
 
 @kernel
-def count_kept(worker, workers, logits, sigma, d, dial, counts):
+def count_kept(worker, workers, sigma, d, dial2, counts):
     """``counts[worker]``: how many of this worker's rows are kept at the distances ``d [N]``."""
-    first, last = len(logits) * worker // workers, len(logits) * (worker + 1) // workers
-    logits, sigma, d, dial, total = pointer(logits), pointer(sigma), pointer(d), pointer(dial), 0
+    first, last = len(sigma) * worker // workers, len(sigma) * (worker + 1) // workers
+    sigma, d, square, total = pointer(sigma), pointer(d), float32(dial2), 0
     for i in range(first, last, 16):
-        log, _ = load_logs(i, last - i, logits, sigma, d, dial)
-        total += ones(bits_of(both(gt(log, splat(ZERO)), first_lanes(last - i))))
+        reach, far2 = load_squares(i, last - i, sigma, d, square)
+        total += ones(bits_of(both(survives(reach, far2), first_lanes(last - i))))
     counts[worker] = total
 
 
 @kernel
-def count_slope(worker, workers, logits, sigma, d, dial, temperature, lift, penalty, out):
-    """``out [N]``: ``penalty q (1 - q) max(2 u, 1)``; where a row is culled, at least ``penalty lift``.
-
-    ``q = sigmoid((log a'' - log(tau s)) / temperature)``.
-    """
-    first, last = len(logits) * worker // workers, len(logits) * (worker + 1) // workers
-    logits, sigma, d, dial, out = pointer(logits), pointer(sigma), pointer(d), pointer(dial), pointer(out)
-    factor, least, scale = float32(LOG2E / temperature), float32(lift), float32(penalty)
+def count_slope(worker, workers, sigma, d, dial2, lift, penalty, out):
+    """``out [N]``: ``penalty w / (1 + w)^2``, ``w = min(t, 1/t)^(2^DOUBLINGS)``; where a row is culled, at least
+    ``penalty lift``."""
+    first, last = len(sigma) * worker // workers, len(sigma) * (worker + 1) // workers
+    sigma, d, out = pointer(sigma), pointer(d), pointer(out)
+    square, least, scale = float32(dial2), float32(lift), float32(penalty)
     for i in range(first, last, 16):
-        log, u = load_logs(i, last - i, logits, sigma, d, dial)
-        odds = exp2(-(vabs(log) * factor))
-        slope = odds / ((ONE + odds) * (ONE + odds)) * vmax(TWO * u, splat(ONE))
-        store_some(out, i, last - i, scale * select(gt(log, splat(ZERO)), slope, vmax(slope, splat(least))))
+        reach, far2 = load_squares(i, last - i, sigma, d, square)
+        reach2 = squared_reach(reach, far2)
+        odds = vmin(far2 / reach2, reach2 / far2)
+        for _ in range(DOUBLINGS - 1):
+            odds = odds * odds
+        slope = odds / ((ONE + odds) * (ONE + odds))
+        store_some(out, i, last - i, scale * select(gt(reach2, far2), slope, vmax(slope, splat(least))))

@@ -1,42 +1,53 @@
 """The dial's equation (``equation/attenuation.py``) as the first part of the projection.
 
-``kept`` reads the 20 bytes of a Gaussian that decide whether it is culled; what is culled costs nothing after that.
-All in float32: of a few hundred thousand Gaussians, one at the culling threshold may be judged otherwise than by the
-equation, with an opacity of 0 there (soft cut). A row whose sigma is infinite has no dial and no cut.
+``kept`` reads the 16 bytes of a Gaussian that decide whether it is culled, its centre and its reach; what is culled
+costs nothing after that. All in float32: of a few hundred thousand Gaussians, one at its end may be judged otherwise
+than by the equation, with an opacity of 0 there.
 """
 
 from numba import float32, uint64
 
 from clod_adapter._kernels import conventions as c
 from clod_adapter._kernels.compiling import kernel, part
-from clod_adapter._kernels.elementary import bits_of, exp2, log2, vabs, vsqrt
+from clod_adapter._kernels.elementary import bits_of, exp2, log2, vabs
 from clod_adapter._kernels.pointers import first_lanes, gather, load_some, load_triples, pointer, scatter, scratch
 from clod_adapter._kernels.simd import both, f32x16, ge, gt, select, splat, vmax, vmin
 
-# A dial: s / D and s / (D r), in 1 / world units, half the equation's eps, the culling threshold, its logarithm, 1 for
-# the soft cut, and 1 where scales and opacities are activated and there is no dial.
-RATE, GROWTH_RATE, HALF_EPS, THRESHOLD, LOG_THRESHOLD, SOFT, ACTIVATED = range(7)
+# A dial: (s / D)^2 and (s / (D r))^2, in 1 / world units^2, and 1 where scales and opacities are activated and there is
+# no dial.
+RATE2, GROWTH_RATE2, ACTIVATED = range(3)
 DIAL = ACTIVATED + 1
 
-LN2 = float32(0.6931471805599453)
+LN2, FOUR = float32(0.6931471805599453), float32(4)
 FARTHEST_EXPONENT = float32(126)  # of exp2
 LOG2_GROWTH_MAX = float32(20 * 1.4426950408889634)  # attenuation.LOG_GROWTH_MAX
 NEARLY = float32(0.99)  # of the near plane: the projection decides exactly
 
 
 @part
-def distance(x, y, z, cam):
-    """From the camera's centre, world units."""
-    dx, dy, dz = x - cam[c.EYE], y - cam[c.EYE + 1], z - cam[c.EYE + 2]
-    return vsqrt(dx * dx + dy * dy + dz * dz)
+def squared_distance(w, cam):
+    """From the camera's centre to the centres ``w[:3]``, world units^2."""
+    dx, dy, dz = w[0] - cam[c.EYE], w[1] - cam[c.EYE + 1], w[2] - cam[c.EYE + 2]
+    return dx * dx + dy * dy + dz * dz
 
 
 @part
-def exponent(d, sigma, dial):
-    """``u = (d s)^2 / (2 v)``; 0 where d is 0."""
+def squared_reach(sigma, far2):
+    """``R^2``; 1 where d s, of which ``far2`` is the square, is 0."""
     sigma = vmax(sigma, splat(c.ZERO))
-    ratio = d * dial[RATE] / vsqrt(sigma * sigma + dial[HALF_EPS])
-    return select(gt(d, splat(c.ZERO)), c.HALF * ratio * ratio, splat(c.ZERO))
+    return select(gt(far2, splat(c.ZERO)), sigma * sigma, splat(c.ONE))
+
+
+@part
+def survives(sigma, far2):
+    """Which of sixteen rows the dial keeps."""
+    return gt(squared_reach(sigma, far2), far2)
+
+
+@part
+def squared_share(sigma, far2):
+    """``t^2``, at most 1."""
+    return vmin(far2 / squared_reach(sigma, far2), splat(c.ONE))
 
 
 @part
@@ -46,21 +57,13 @@ def reciprocal_opacity(logit):
 
 
 @part
-def survives(w, logit, decay, cam, dial):
-    """Which of sixteen rows with centres ``w[:3]`` the dial keeps."""
-    u = exponent(distance(w[0], w[1], w[2], cam), decay, dial)
-    log_opacity = -(LN2 * log2(reciprocal_opacity(logit))) - u
-    return gt(select(gt(splat(c.HUGE), decay), log_opacity, splat(c.ZERO)), splat(dial[LOG_THRESHOLD]))
-
-
-@part
 def kept(at, many, means, opacities, sigma, cam, dial, dialled):
     """The bits of those of ``many`` <= 16 rows from ``at`` on that are in front of the camera and not culled.
 
     Activated opacities are 1/255 at least.
     """
-    opacity = load_some(opacities, at, many)
     if dial[ACTIVATED] > c.ZERO:
+        opacity = load_some(opacities, at, many)
         shown = both(ge(opacity, splat(c.ALPHA_MIN)), gt(splat(c.HUGE), opacity))
     else:
         w = scratch(f32x16, 3)
@@ -68,20 +71,20 @@ def kept(at, many, means, opacities, sigma, cam, dial, dialled):
         depth = cam[8] * w[0] + cam[9] * w[1] + cam[10] * w[2] + cam[11]
         shown = ge(depth, splat(NEARLY * cam[c.NEAR]))
         if dialled:
-            shown = both(shown, survives(w, opacity, load_some(sigma, at, many), cam, dial))
+            shown = both(shown, survives(load_some(sigma, at, many), squared_distance(w, cam) * dial[RATE2]))
     return bits_of(both(shown, first_lanes(many)))
 
 
 @kernel
-def mark_kept(worker, workers, means, logits, sigma, cam, dial, out):
+def mark_kept(worker, workers, means, sigma, cam, dial, out):
     """``out [N]`` uint8: 1 for rows that the dial keeps, in front of the camera or not."""
-    first, last = len(logits) * worker // workers, len(logits) * (worker + 1) // workers
-    means, logits, sigma, out = pointer(means), pointer(logits), pointer(sigma), pointer(out)
+    first, last = len(sigma) * worker // workers, len(sigma) * (worker + 1) // workers
+    means, sigma, out = pointer(means), pointer(sigma), pointer(out)
     cam, dial, w = pointer(cam), pointer(dial), scratch(f32x16, 3)
     for i in range(first, last, 16):
         many = min(last - i, 16)
         load_triples(means, i, many, w)
-        bits = bits_of(survives(w, load_some(logits, i, many), load_some(sigma, i, many), cam, dial))
+        bits = bits_of(survives(load_some(sigma, i, many), squared_distance(w, cam) * dial[RATE2]))
         for lane in range(many):
             out[i + lane] = (bits >> uint64(lane)) & uint64(1)
 
@@ -97,14 +100,11 @@ def drawn(rows, opacities, sigma, growth, cam, dial, dialled, grows, w):
         return opacity
     opacity = c.ONE / reciprocal_opacity(opacity)
     if dialled:
-        d, decay = distance(w[c.MEAN], w[c.MEAN + 1], w[c.MEAN + 2], cam), gather(sigma, rows)
-        opacity = opacity * exp2(-(c.LOG2E * exponent(d, decay, dial)))
-        if dial[SOFT] > c.ZERO:
-            fade = c.TWO * (opacity / splat(dial[THRESHOLD])) - c.TWO
-            fade = select(gt(splat(c.HUGE), decay), vmin(vmax(fade, splat(c.ZERO)), splat(c.ONE)), splat(c.ONE))
-            opacity = opacity * fade
+        distance2 = squared_distance(w, cam)
+        share2 = squared_share(gather(sigma, rows), distance2 * dial[RATE2])
+        opacity = opacity * (c.ONE - share2 * share2)
         if grows:
-            size = gather(growth, rows) * log2(vmax(d * dial[GROWTH_RATE], splat(c.ONE)))
+            size = gather(growth, rows) * log2_magnification(distance2, dial)
             size = vmin(splat(LOG2_GROWTH_MAX), vmax(splat(-LOG2_GROWTH_MAX), size))  # NaN stays, and is not drawn
     for k in range(c.SCALE, c.SCALE + 3):
         w[k] = exp2(vmin(w[k] * c.LOG2E + size, splat(FARTHEST_EXPONENT)))
@@ -112,16 +112,21 @@ def drawn(rows, opacities, sigma, growth, cam, dial, dialled, grows, w):
 
 
 @part
+def log2_magnification(distance2, dial):
+    """``log2 m``, of squared distances in world units^2."""
+    return c.HALF * log2(vmax(distance2 * dial[GROWTH_RATE2], splat(c.ONE)))
+
+
+@part
 def dial_gradient(rows, given, cam, dial, dialled, grows, shaped, w, g):
     """Gradients of logit, sigma and growth of sixteen rows; makes those of the scales in ``g`` of their logarithms.
 
-    With w the gradient of log a'' and f the factor of the cut (``equation/attenuation.py``), per Gaussian::
+    With w the gradient of the logarithm of the drawn opacity (``equation/attenuation.py``), per Gaussian::
 
-        w            = dL/dlog(drawn) (1 + (f + 2) / f where 0 < f < 1)     f's slope by log a'' is f + 2
         dL/dlogit    = w sigmoid(-logit)
-        dL/dsigma    = w 2 u sigma / v                                      distances are constants
+        dL/dsigma    = w 4 t^4 / ((1 - t^4) sigma)      distances are constants
         dL/dlogscale = dL/dscale scale
-        dL/dgrowth   = sum of dL/dlogscale, times log m                     0 where the growth is clamped
+        dL/dgrowth   = sum of dL/dlogscale, times log m         0 where the growth is clamped
 
     Of activated ones, that of the opacity alone. ``given`` are the three, and where their gradients go.
     """
@@ -136,17 +141,14 @@ def dial_gradient(rows, given, cam, dial, dialled, grows, shaped, w, g):
         for k in range(c.V_SCALE, c.V_SCALE + 3):
             g[k] = g[k] * w[c.SCALE + k - c.V_SCALE]
     if dialled:
-        decay, d = vmax(gather(sigma, rows), splat(c.ZERO)), distance(w[c.MEAN], w[c.MEAN + 1], w[c.MEAN + 2], cam)
-        u = exponent(d, decay, dial)
-        if dial[SOFT] > c.ZERO:
-            attenuated = exp2(-(c.LOG2E * u)) / (c.ONE + odds)
-            fade = c.TWO * (attenuated / splat(dial[THRESHOLD])) - c.TWO
-            fading = both(both(gt(fade, splat(c.ZERO)), gt(splat(c.ONE), fade)), gt(splat(c.HUGE), decay))
-            total = total * select(fading, c.TWO + c.TWO / fade, splat(c.ONE))
-        slope = select(gt(u, splat(c.ZERO)), c.TWO * u * decay / (decay * decay + dial[HALF_EPS]), splat(c.ZERO))
-        scatter(v_sigma, rows, total * slope)
+        reach, distance2 = gather(sigma, rows), squared_distance(w, cam)
+        share2 = squared_share(reach, distance2 * dial[RATE2])
+        share4 = share2 * share2
+        fading = both(gt(share4, splat(c.ZERO)), gt(splat(c.ONE), share4))
+        slope = FOUR * share4 / ((c.ONE - share4) * reach)
+        scatter(v_sigma, rows, select(fading, total * slope, splat(c.ZERO)))
         if grows and shaped:
-            magnification = log2(vmax(d * dial[GROWTH_RATE], splat(c.ONE)))
+            magnification = log2_magnification(distance2, dial)
             inside = gt(splat(LOG2_GROWTH_MAX), vabs(gather(growth, rows) * magnification))
             size = LN2 * magnification * (g[c.V_SCALE] + g[c.V_SCALE + 1] + g[c.V_SCALE + 2])
             scatter(v_growth, rows, select(inside, size, splat(c.ZERO)))

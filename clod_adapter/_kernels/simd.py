@@ -143,7 +143,6 @@ vmax = _extremum(lambda builder, a, b: builder.select(builder.fcmp_ordered(">", 
 
 _logic = operation(mask16, mask16, mask16)
 both = _logic(lambda builder, a, b: builder.and_(a, b))
-but_not = _logic(lambda builder, a, b: builder.and_(a, builder.not_(b)))
 # a where the mask is set, b elsewhere.
 select = operation(f32x16, mask16, *_pair)(lambda builder, mask, a, b: builder.select(mask, a, b))
 

@@ -103,10 +103,10 @@ def divide(
     """Splits the initialized scene, or as much of it as a plan trains, into ``count`` blocks."""
     check_divisible(config)
     assert initial.attenuation is not None
-    if initial.attenuation.normalizer != "scene":
+    if initial.attenuation.form == "paper":
         raise ClodError(
-            f"the checkpoint's dial has the normaliser {initial.attenuation.normalizer}, whose distances depend on all "
-            "Gaussians in view: it cannot be trained in blocks; adapt it whole"
+            "the checkpoint's dial has the paper's form, whose distances depend on all Gaussians in view: it cannot be "
+            "trained in blocks; adapt it whole"
         )
     block, seen = split(initial.means, count), torch.empty(len(views), count, dtype=torch.float32)
     for k, view in enumerate(views):

@@ -1,81 +1,69 @@
 """The dial's equation, and the one function that turns Gaussians, a camera and a dial value into what is drawn.
 
-For activated opacity ``a``, decay ``sigma``, growth exponent ``h``, normalised distance ``d`` (``distances.py``) and
-dial ``s`` (the paper's virtual distance scale)::
+For activated opacity ``a``, reach ``R = sigma_d``, growth exponent ``h``, normalised distance ``d``
+(``distances.py``) and dial ``s`` (the paper's virtual distance scale)::
 
-    v   = relu(sigma)^2 + eps/2                     the variance of the decay
-    a'' = a exp(-(d s)^2 / (2 v))                   attenuated opacity
-    kept iff a'' > tau s                            compared as logarithms, which do not underflow
-    m   = max(1, d s / r)                           r: d at the median distance in the nearest training views
-    g   = m^h                                       factor of the scales of what is kept, in [e^-20, e^20]
+    t = d s / R                    0 where d s is 0
+    kept iff t < 1
+    f = 1 - t^4                    fade; a f is drawn
+    m = max(1, d s / r)            r: d at the median distance in the nearest training views
+    g = m^h                        factor of the scales of what is kept, in [e^-20, e^20]
 
-Sources: a'' is Eq. 2 (section 3.2) of "CLoD-GS: Continuous Level-of-Detail via 3D Gaussian Splatting", ICLR 2026, and
-the culling rule is the mask M_i of the same section. Training and the paper have s >= 1; the equation holds from 0,
-where nothing is attenuated, culled or enlarged. g is this project's, after stochastic simplification of aggregate
-detail (Cook, Halstead, Planck and Ryu, SIGGRAPH 2007), where the elements that remain grow to preserve the area.
-Opacity and scale change by ``d s``: moving away and turning the dial have one effect; nearer than r / s nothing grows.
+Every Gaussian has a reach: the distance, at s = 1, at which it ends. At the dial value s it ends at R / s: moving away
+and turning the dial are one effect, and the kept sets are nested in both. Opacity has no part in the cut. At s = 0
+everything is drawn as it is stored, and so is a Gaussian with an infinite ``sigma_d``.
 
-With the ``hard`` cut (the paper's) a kept Gaussian is drawn with a'' and culled at opacity ``tau s``, which pops. With
-the ``soft`` cut it is drawn with ``a'' min(1, 2 (a'' / (tau s) - 1))``, which is a'' above 1.5 tau s and 0 at the
-threshold. The same Gaussians are kept, and the image is continuous in dial and camera: per unit of ``log s`` or
-``log d`` the drawn opacity changes by at most 4.3, namely by ``2 x (1.5 - 4 log x)`` with
-``x = min(1.5 tau s, e^(-5/8))`` or, where that is less, by 2/e.
+Opacity reaches 0 continuously: per unit of ``log s`` or ``log d`` the drawn opacity changes by at most ``4 a``, as
+``df / dlog t = -4 t^4``. Nearer than r / s nothing grows.
 
-Tensors are ``[N]``, one entry per Gaussian, on one device. ``opacity_logits`` may be +-inf. Where ``sigma_d`` is +inf
-there is no dial and no cut: the Gaussian is kept and drawn with a. Distances are finite and >= 0; in float64, which has
-no wider type to square them in, neither they nor a finite ``sigma_d`` nor d s exceed 1e150. Half-precision inputs are
-computed in float32, and so are their results; otherwise the result has the inputs' common dtype.
+Sources: decay and culling by distance and dial follow "CLoD-GS: Continuous Level-of-Detail via 3D Gaussian Splatting",
+ICLR 2026, whose own form, with an exponential and an absolute threshold, is ``paper.py`` (``AttenuationConfig.form``).
+g is this project's, after stochastic simplification of aggregate detail (Cook, Halstead, Planck and Ryu, SIGGRAPH
+2007), where the elements that remain grow to preserve the area.
 
-Accuracy, measured against mpmath (benchmarks/stability_equation.py), in relative errors: log a'' and its gradients are
-within ``4 finfo.eps``, and so are, from float32, a'' and its gradients where a'' is a normal number; from float64 these
-are within ``4 + 3 u`` of them, ``u = (d s)^2 / (2 v)``. g is within ``4 + 2 |h| (1 + log m)`` of finfo.eps, its slope
-within ``2 / log m`` more.
+Tensors are ``[N]``, one entry per Gaussian, on one device. ``opacity_logits`` may be +-inf. Distances are finite and
+>= 0. Half-precision inputs are computed in float32, and so are their results; otherwise the result has the inputs'
+common dtype. The fade is computed in float64.
+
+Accuracy, measured against mpmath (benchmarks/stability_equation.py), as relative errors: drawn opacities are within
+``2 finfo.eps + 2^-52 / (1 - t)``, and so is their gradient by a logit as a share of them; that by sigma_d is within
+``6 finfo.eps``. g is within ``4 + 2 |h| (1 + log m)`` of finfo.eps, its slope within ``2 / log m`` more.
 """
 
 import math
 import warnings
 from functools import reduce
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from clod_adapter.cameras import Camera
 from clod_adapter.config import AttenuationConfig, require
-from clod_adapter.equation.autograd import Attenuate, Fade
 from clod_adapter.equation.distances import normalized_distances
+from clod_adapter.equation.paper import paper_fade
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 
 SIGMA_MAX = 1e9
-"""Stands for an infinite sigma_d. The factor is exactly 1 for d s < 2e5 in float32, d s < 10 in float64."""
-
-FAINTEST = 2.0**-126
-"""The smallest normal float32: at s = 0 only what is fainter is culled, which no rasterizer draws."""
+"""Stands for an infinite sigma_d: f is exactly 1 for d s < 1e7 in float32, d s < 8e4 in float64."""
 
 # Of trained exponents. 3/4 preserves area where counts fall as s^-1.5; above 1 a Gaussian far away grows on the screen.
 GROWTH_RANGE = (-1.0, 3.0)
 LOG_GROWTH_MAX = 20.0  # of abs(log g)
 
-Scale = TypeVar("Scale", float, Tensor)
-
 
 class Attenuated(NamedTuple):
-    """The opacities at one dial value, and the growth of the scales.
+    """What is drawn at one dial value.
 
     Attributes:
-        opacities: ``[N]`` a'', in [0, 1].
-        log_opacities: ``[N]`` log a'', in [-inf, 0]; meaningful where a'' underflows.
-        keep: ``[N]`` bool, ``log a'' > log(tau s)``.
-        drawn: ``[N]`` the rasterizer's input, in [0, 1]: a'' after the cut, above 0 exactly for kept Gaussians.
+        drawn: ``[N]`` opacities ``a f``, the rasterizer's input, in [0, 1]; 0 where the Gaussian is culled.
+        keep: ``[N]`` bool, the Gaussians that are not culled.
         growth: ``[N]`` factor of the scales (``growth_factors``); ones without a ``growth_d``.
     """
 
-    opacities: Tensor
-    log_opacities: Tensor
-    keep: Tensor
     drawn: Tensor
+    keep: Tensor
     growth: Tensor
 
 
@@ -85,17 +73,15 @@ def attenuate(
 ) -> Attenuated:  # fmt: skip
     """What is drawn of Gaussians at one dial value. Rendering, training, baking and renderers' hooks all call this.
 
-    ``a'' = a exp(-u)``, then the cut, differentiable, once, in ``opacities`` and ``sigma_d``, not in distances. Where
-    the factor is 1, a'' is a bit for bit: with the hard cut a dial without effect changes only what is fainter than
-    tau. A Gaussian kept at s is kept at every smaller dial. Without a ``sigma_d`` all are kept and drawn with a.
+    Differentiable in ``opacities``, ``sigma_d`` and ``growth_d``, not in distances. Without a ``sigma_d`` all are kept
+    and drawn with a. A Gaussian kept at s is kept at every smaller dial.
 
     Args:
-        opacities: ``[N]`` logits. At a logit of +inf, a is 1 and its gradient 0.
+        opacities: ``[N]`` logits.
         seen_from: ``[N]`` distances d (``distances.normalized_distances``), or the centres ``[N, 3]``, world units, and
             the camera. Pass distances to use them for several dial values.
         virtual_scale: the dial s, >= 0.
-        activated: ``opacities`` are a itself, in [0, 1], as rasterizers take them. The gradient is finite: at a = 1
-            it is that of the factor and the cut, as anywhere; at a = 0 the factor for a'', and 0 for the others.
+        activated: ``opacities`` are a itself, in [0, 1], as rasterizers take them.
         growth_d: ``[N]`` exponents h of the growth of the scales, finite; None for no growth.
 
     Raises:
@@ -105,9 +91,7 @@ def attenuate(
     virtual_scale = float(virtual_scale)  # of a numpy array
     if sigma_d is None or config is None:
         shown = opacities if activated else opacities.sigmoid()
-        keep = torch.ones_like(shown, dtype=torch.bool)
-        logs = opacities.log() if activated else F.logsigmoid(opacities)
-        return Attenuated(shown, logs, keep, shown, torch.ones_like(shown))
+        return Attenuated(shown, torch.ones_like(shown, dtype=torch.bool), torch.ones_like(shown))
     d = normalized_distances(*seen_from, config) if isinstance(seen_from, tuple) else seen_from
     named = {"opacities" if activated else "opacity_logits": opacities, "sigma_d": sigma_d, "d": d}
     opacities, sigma, d = conform(**named)
@@ -116,19 +100,21 @@ def attenuate(
     else:
         conform(sigma_d=sigma_d, growth_d=growth_d)
         growth = growth_factors(growth_d, d, virtual_scale, growth_distance(config))
-    logits = torch.full_like(opacities, math.inf) if activated else opacities
-    faded, log_opacities = Attenuate.apply(logits, sigma, d.detach(), virtual_scale, config.eps)
-    if activated:
-        nothing = opacities <= 0
-        logs = opacities.masked_fill(nothing, 1).log().masked_fill(nothing, -math.inf)  # no slope, rather than 1 / 0
-        faded, log_opacities = opacities * faded, logs + log_opacities
-    threshold, undialled = log_threshold(config.tau, virtual_scale), sigma.detach() == math.inf
-    keep = (log_opacities.detach() > threshold) | undialled
-    if config.cut == "hard":
-        drawn = faded * keep.to(faded)  # five times as fast as where
+    shown = opacities if activated else opacities.sigmoid()
+    far = d.detach().double() * virtual_scale
+    if config.form == "paper":
+        fade, keep = paper_fade(shown, sigma, far, virtual_scale)
     else:
-        drawn = torch.where(undialled, faded, Fade.apply(faded, log_opacities, threshold))
-    return Attenuated(faded, log_opacities, keep, drawn, growth)
+        fade, keep = reach_fade(sigma, far)
+    return Attenuated(shown * fade.to(shown), keep, growth)
+
+
+def reach_fade(sigma_d: Tensor, far: Tensor) -> tuple[Tensor, Tensor]:
+    """The fade f, float64, differentiable in ``sigma_d``, and which Gaussians are kept; ``far`` is d s, float64."""
+    keep = (far < sigma_d) | (far == 0)
+    fades = keep & (far > 0)
+    t = torch.where(keep, far, 1) / sigma_d.double().where(fades, 1)  # 1 / 1 where it is culled, without a gradient
+    return 1 - t.square().square(), keep  # as a product, the slope of a small t would cancel
 
 
 def dial(gaussians: Gaussians, seen_from: Camera | Tensor, virtual_scale: float) -> Attenuated:
@@ -141,8 +127,8 @@ def dial(gaussians: Gaussians, seen_from: Camera | Tensor, virtual_scale: float)
 
 
 def growth_distance(config: AttenuationConfig) -> float:
-    """r: ``reference_distance`` in units of ``scene_distance``; 1 if it is unknown, or for other normalizers."""
-    if config.normalizer != "scene" or config.reference_distance == 0:
+    """r: ``reference_distance`` in units of ``scene_distance``; 1 if it is unknown, or in the paper's form."""
+    if config.form == "paper" or config.reference_distance == 0:
         return 1.0
     return config.reference_distance / config.scene_distance
 
@@ -157,16 +143,6 @@ def growth_factors(growth_d: Tensor, d: Tensor, virtual_scale: float | Tensor, r
     magnification = d.detach().double().mul(virtual_scale).div_(reach).clamp_(1, torch.finfo(d.dtype).max)
     exponents = growth_d.to(d) * magnification.to(d.dtype).log_()
     return exponents.clamp(-LOG_GROWTH_MAX, LOG_GROWTH_MAX).exp()
-
-
-def culling_threshold(tau: float, virtual_scale: Scale) -> Scale:
-    """``tau s``: a Gaussian whose attenuated opacity is not above this is culled. The only definition."""
-    return tau * virtual_scale
-
-
-def log_threshold(tau: float, virtual_scale: float) -> float:
-    """Logarithm of ``culling_threshold``; log a'' must exceed it. At least that of FAINTEST, for s = 0."""
-    return math.log(max(culling_threshold(tau, virtual_scale), FAINTEST))
 
 
 def check_dial(virtual_scale: float) -> None:

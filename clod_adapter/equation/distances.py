@@ -1,6 +1,6 @@
 """The normalised distance d of the dial's equation: of one camera, and one for each Gaussian over several cameras.
 
-For a camera with centre c, a Gaussian with centre mu and the normaliser's D (all in world units)::
+For a camera with centre c, a Gaussian with centre mu and the unit D (all in world units)::
 
     d = |mu - c| / D
 
@@ -40,14 +40,13 @@ def normalized_distances(means: Tensor, camera: Camera, config: AttenuationConfi
 
 @torch.no_grad()
 def normalizing_distance(distances: Tensor, means: Tensor, camera: Camera, config: AttenuationConfig) -> Tensor:
-    """0-d, the D of ``config.normalizer``, world units, > 0.
+    """0-d, D, world units, > 0: ``config.scene_distance``, in the paper's form the largest distance in the view.
 
-    ``scene`` is ``config.scene_distance``. ``max`` (the paper's) is taken over the Gaussians whose centre projects into
-    the image from beyond the near plane, or over all Gaussians where there is none. D is at least the smallest normal
-    number, so that 0 / D is 0, and 1 where there are no Gaussians.
+    That is taken over the Gaussians whose centre projects into the image from beyond the near plane, or over all where
+    there is none. It is at least the smallest normal number, so that 0 / D is 0, and 1 where there are no Gaussians.
     """
-    if config.normalizer == "scene" or len(distances) == 0:
-        value = config.scene_distance if config.normalizer == "scene" else 1.0
+    if config.form == "ours" or len(distances) == 0:
+        value = config.scene_distance if config.form == "ours" else 1.0
         return torch.full((), value, dtype=distances.dtype, device=distances.device)
     inside = in_frustum(means, camera)
     # Without a selection, for whose size the host would wait for a GPU.
@@ -64,7 +63,7 @@ def in_frustum(means: Tensor, camera: Camera) -> Tensor:
 @torch.no_grad()
 def camera_unit(means: Tensor, camera: Camera, config: AttenuationConfig) -> float:
     """``normalizing_distance`` of one camera and centres ``means [N, 3]``, world units, as a number to store."""
-    if config.normalizer == "scene":
+    if config.form == "ours":
         return config.scene_distance
     distances = (means - camera.position.to(means)).norm(dim=1)
     return float(normalizing_distance(distances, means, camera, config))

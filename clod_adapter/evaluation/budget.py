@@ -1,8 +1,8 @@
 """Budgets: the dial value for a number of Gaussians, a PSNR drop, or a frame rate.
 
-- A count needs no measurement. From one camera a Gaussian is kept iff s is below its extinction scale ``s*``
-  (``extinction.extinction_scale``), so the dial that keeps n lies between the n-th and the (n+1)-th largest ``s*``; for
-  the mean over V cameras, of the pooled ``s*`` and n V. Exact but for ``s*`` that are equal in float32.
+- A count needs no measurement. From one camera a Gaussian is kept iff s is below its extinction scale ``sigma_d / d``,
+  so the dial that keeps n lies between the n-th and the (n+1)-th largest; for the mean over V cameras, of the pooled
+  scales and n V. Exact but for scales that are equal in float32.
 - PSNR is read from the calibration table that is stored with the file (``calibration.py``).
 - Frame rates depend on the machine, the image size and the load: frames are timed, from cameras. The table's times are
   used only where they are passed in, or (``clod-adapt export``) where nothing can be timed.
@@ -24,13 +24,13 @@ from clod_adapter.cameras import Camera
 from clod_adapter.config import AttenuationConfig, require
 from clod_adapter.equation.attenuation import dial
 from clod_adapter.equation.distances import Place, typical_distance
-from clod_adapter.equation.extinction import extinction_scale
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.frame_times import time_frames
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.progress import Listener
 
 TIMED_DIALS = 6
+ROUNDING = 1e-5  # of extinction scales in float32, generously
 
 
 @dataclass(frozen=True)
@@ -144,7 +144,6 @@ def _for_count(
     def count(virtual_scale: float) -> int:
         return sum(int(dial(gaussians, distances(k), virtual_scale).keep.sum()) for k in range(len(views)))
 
-    # Counts come from renderings, not from the roots: these differ by rounding.
     most, fewest = count(1.0), count(largest)
     if wanted >= most:
         note = f"s = 1 keeps {most / len(views):,.0f} of {len(gaussians):,} already" if wanted > most else ""
@@ -154,24 +153,14 @@ def _for_count(
             f"{keep:,.0f} Gaussians are out of reach: at s = {largest:g}, the largest dial value it was trained for, "
             f"{fewest / len(views):,.0f} are kept"
         )
-    assert gaussians.sigma_d is not None
-    pools = []
-    for k in range(len(views)):
-        scales = extinction_scale(gaussians.opacity_logits, gaussians.sigma_d, distances(k), config)
-        pools.append(scales[(scales > 1) & (scales <= largest)])
-    pooled = torch.cat(pools)
-    remaining = min(max(wanted - fewest, 0), len(pooled))  # of those culled within the range of the dial
-    upper = float(pooled.kthvalue(len(pooled) - remaining + 1).values) if remaining > 0 else largest
-    lower = float(pooled.kthvalue(len(pooled) - remaining).values) if remaining < len(pooled) else 1.0
-    guess = math.sqrt(lower * upper)
-    if count(guess) == wanted:
-        return DialValue(guess)
-    # Near it, where ties prevent the count: the smallest dial value that keeps fewer.
-    low, high = max(guess * (1 - 1e-4), 1.0), min(guess * (1 + 1e-4), largest)
-    if count(low) <= wanted:
-        low = 1.0
-    if count(high) > wanted:
-        high = largest
+    low, high = 1.0, largest
+    if config.form == "ours":  # the kept number of all views is a rank of the extinction scales
+        assert gaussians.sigma_d is not None
+        pooled = torch.cat([gaussians.sigma_d / distances(k) for k in range(len(views))]).nan_to_num_(nan=math.inf)
+        guess = float(pooled.kthvalue(len(pooled) - wanted).values)  # of the first one that is culled
+        near = [max(guess * (1 - ROUNDING), low), min(guess * (1 + ROUNDING), high)]
+        low = near[0] if count(near[0]) > wanted else low
+        high = near[1] if count(near[1]) <= wanted else high
     while high / low > 1 + 1e-9:
         middle = math.sqrt(low * high)
         low, high = (low, middle) if count(middle) <= wanted else (middle, high)

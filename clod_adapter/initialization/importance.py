@@ -8,10 +8,9 @@ import torch
 from torch import Tensor
 
 from clod_adapter.cameras import Camera, View, spread
-from clod_adapter.config import AdaptConfig, AttenuationConfig
+from clod_adapter.config import AdaptConfig
 from clod_adapter.equation.attenuation import SIGMA_MAX
 from clod_adapter.equation.distances import median_distance, typical_distance
-from clod_adapter.equation.extinction import sigma_for_extinction
 from clod_adapter.equation.units import in_world_units, known_distance, with_distance
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import SH_C0, Gaussians, bad_rows, largest_colour
@@ -19,18 +18,10 @@ from clod_adapter.initialization.pruning_order import initial_growth, pruning_or
 from clod_adapter.progress import Listener, Phase, tell
 from clod_adapter.render import splat
 
-# With a sigma_d beyond this many times the distance times the largest dial value, opacity and gradient change by less
-# than a thousandth there: such a sigma would never change in training.
-WIDEST = 22.0
 # Most views that are rendered: twice as many changed the trained result by 0.01 to 0.04 dB (docs/performance.md).
 MOST_VIEWS = 64
-# Culling would ruin a faint checkpoint. Tau is lowered until the Gaussians that it affects by their opacity alone have
-# at most this share of the removal error at s = 1.
-FAINT_SHARE = 0.05
-TAU_MIN = 1e-6
 SMALLER = 4  # downscaling of ``reduced``
 NEAREST = 0.05  # share of the views that may be nearer than where growth begins
-FADING = 1.5  # times the culling threshold: below, the soft cut reduces the opacity (attenuation)
 
 
 def initialize(
@@ -46,6 +37,8 @@ def initialize(
     ``error`` is ``removal_error`` of these views and seed, where it is known.
     """
     if base.attenuation is not None and has_dial(base):
+        if base.attenuation.form != config.form:
+            raise ClodError(f"its dial has the form {base.attenuation.form}; adapt with the same, or give a plain file")
         known = known_distance(base.attenuation) or scene_distance(base, spread(views, MOST_VIEWS))
         own = replace(base.attenuation, max_sv=config.max_sv, reference_distance=known)
         return in_world_units(with_growth(base.replace(attenuation=own), config, base.growth_d))
@@ -53,14 +46,10 @@ def initialize(
     attenuation = config.attenuation(scene_distance(base, views))
     if error is None:
         error = removal_error(base, views, seed=config.seed, progress=progress)
-    attenuation = replace(attenuation, tau=fitting_tau(base.opacities, error, config))
     pruned = pruning_order(base, error.sqrt() * base.opacities, progress)
     distances = typical_distance(base.means, [view.camera for view in views], attenuation)
-    sigma = sigma_from_importance(
-        base, pruned.position, distances, attenuation, share=config.share, exponent=config.exponent
-    )
-    sigma = sigma.minimum(WIDEST * config.max_sv * distances)
-    initial = base.replace(sigma_d=sigma, attenuation=attenuation)
+    sigma_d = distances * extinction_from_rank(pruned.position.max() - pruned.position, config)
+    initial = base.replace(sigma_d=sigma_d, attenuation=attenuation)
     # Training that begins with this growth ends 0.1 to 0.2 dB lower than from 0 (docs/method.md).
     fitted = initial_growth(initial, pruned.substitute, distances) if config.iters == 0 else None
     return in_world_units(with_growth(initial, config, fitted))
@@ -101,23 +90,6 @@ def usable_views(base: Gaussians, views: Sequence[View]) -> tuple[View, ...]:
     return tuple(found)
 
 
-def fitting_tau(opacities: Tensor, error: Tensor, config: AdaptConfig) -> float:
-    """``config.tau``, or less for a faint checkpoint, to no less than TAU_MIN; six digits, which a float32 holds.
-
-    At most 1/FADING of the opacity below which lies FAINT_SHARE of all removal error; and so low that as many Gaussians
-    as the target-count curve has at ``max_sv`` exceed the threshold there.
-    """
-    ordered, order = opacities.sort()
-    lost = error[order].double().cumsum(0)
-    if not lost[-1] > 0:
-        return config.tau
-    faint = float(ordered[int((lost < FAINT_SHARE * lost[-1]).sum())])
-    wanted = max(round(len(ordered) * config.max_sv**-config.exponent), 1)
-    opaque = float(ordered[-wanted]) / config.max_sv
-    lowered = min(max(faint / FADING, TAU_MIN), max(opaque / FADING, TAU_MIN))
-    return min(config.tau, float(f"{lowered:.6g}"))
-
-
 def scene_distance(base: Gaussians, views: Sequence[View]) -> float:
     """D of the scene normaliser, world units: the median distance in the frustum, of the nearest views.
 
@@ -155,25 +127,15 @@ def removal_error(
     return total / max(len(views), 1)
 
 
-def sigma_from_importance(
-    gaussians: Gaussians,
-    importance: Tensor,
-    distances: Tensor,
-    config: AttenuationConfig,
-    *,
-    share: float,
-    exponent: float,
-) -> Tensor:
-    """``[N]`` the sigma_d with which the share kept follows the target-count curve before any training.
+def extinction_from_rank(rank: Tensor, config: AdaptConfig) -> Tensor:
+    """``[N]`` the dial values at which Gaussians are culled, so that counts follow the target-count curve.
 
-    The Gaussian at rank fraction r by importance (0 the most important) is culled at the dial value where
-    ``target_count.target_curve`` falls to r. Ranks beyond ``share`` are culled before s = 1.
+    The Gaussian of ``rank`` (0 the most important, integers below N) is culled where ``target_count.target_curve``
+    falls to its share of the ranks. Ranks beyond ``config.share`` are culled before s = 1.
     """
-    rank, order = torch.empty_like(distances), importance.argsort(descending=True, stable=True)
-    rank[order] = (torch.arange(len(rank), dtype=rank.dtype, device=rank.device) + 0.5) / len(rank)
-    power = (1 / rank + (rank**-2 - 4 * (1 / share - 1)).clamp(min=0).sqrt()) / 2
-    extinction = torch.where(rank <= share, power ** (1 / exponent), share / rank)
-    return sigma_for_extinction(gaussians.opacity_logits, distances, extinction, config)
+    share = (rank.double() + 0.5) / len(rank)
+    power = (1 / share + (share**-2 - 4 * (1 / config.share - 1)).clamp(min=0).sqrt()) / 2
+    return torch.where(share <= config.share, power ** (1 / config.exponent), config.share / share).float()
 
 
 def coverage(gaussians: Gaussians, opacities: Tensor, camera: Camera, growth: Tensor | None = None) -> Tensor:

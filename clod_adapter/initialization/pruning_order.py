@@ -9,7 +9,6 @@ from torch import Tensor
 from clod_adapter._kernels import threads
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.equation.attenuation import growth_distance, growth_factors
-from clod_adapter.equation.extinction import extinction_scale
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import SH_C0, Gaussians
 from clod_adapter.progress import Listener, Phase, tell
@@ -140,7 +139,7 @@ def initial_growth(gaussians: Gaussians, substitutes: Tensor, distances: Tensor)
     assert config is not None and gaussians.sigma_d is not None
     scales = gaussians.log_scales.double().sort(1).values
     area = gaussians.opacities.double() * (scales[:, 1] + scales[:, 2]).exp()
-    extinction = extinction_scale(gaussians.opacity_logits, gaussians.sigma_d, distances, config)
+    extinction = gaussians.sigma_d / distances
     total, weight = torch.zeros_like(area), torch.zeros_like(area)
     for k in range(1, DIALS):
         s = config.max_sv ** (k / (DIALS - 1))

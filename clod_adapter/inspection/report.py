@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from clod_adapter.config import SH_COUNTS, AdaptConfig
+from clod_adapter.config import SH_COUNTS
 from clod_adapter.inspection.statistics import FAR, Dial, Splat, Spread, values_of
 from clod_adapter.io.file_formats import read_source
 from clod_adapter.io.ply import MASK_COLUMNS, Head
@@ -72,15 +72,14 @@ def inspect(path: str | Path) -> Inspection:
     metadata, head, notes = source.metadata, source.head, [*source.notes, *source.metadata.notes]
     questions = in_question(source.arrays) if source.activation_unknown else {}
     rows = prepared(path, source.arrays, choice_of(questions), metadata.origin, None)
-    tau = metadata.attenuation.tau if metadata.attenuation else AdaptConfig().tau
-    values, dial = values_of(rows, tau), None
+    values, dial = values_of(rows), None
     if metadata.attenuation is not None:
         calibration, mismatch = matching_calibration(metadata, values["count"])
         dial = Dial(metadata.attenuation, calibration)
         if not metadata.described:
             from clod_adapter.io.checkpoint import plausibility  # here: other files are inspected without torch
 
-            part = {name: rows.arrays[name][rows.keep] for name in ("means", "opacity_logits", "sigma_d")}
+            part = {name: rows.arrays[name][rows.keep] for name in ("means", "sigma_d")}
             notes += plausibility(part, metadata.attenuation)
         notes += mismatch
     degree, encoding = next(d for d, n in SH_COUNTS.items() if n == rows.arrays["shN"].shape[1] + 1), ""
@@ -92,7 +91,7 @@ def inspect(path: str | Path) -> Inspection:
     splat = Splat(
         **values, sh_degree=degree, encoding=encoding, columns=columns,
         extra=() if head and is_packed(head.ply) else extra_columns([name for name, _ in columns], degree),
-        comments=tuple(comment for comment in source.comments if not comment.startswith(PREFIX)), tau=tau,
+        comments=tuple(comment for comment in source.comments if not comment.startswith(PREFIX)),
         origin=rows.origin, dial=dial, screen_filter=stated_filter(source),
     )  # fmt: skip
     writer = looks_like(head) if head else f"clod-adapter {metadata.version}" if metadata.version else None

@@ -60,8 +60,7 @@ class Splat:
     doubles: int  # rows that stand exactly where an earlier one does
     far: int  # FAR times as far from the median position as nine tenths are
     giant: int  # largest standard deviation over half the diagonal of the middle 98 %
-    fainter_than_tau: float  # shares
-    fainter_than_visible: float
+    fainter_than_visible: float  # share
     sigma: Spread | None
     growth: Spread | None
     sh_degree: int
@@ -69,7 +68,6 @@ class Splat:
     columns: tuple[tuple[str, str], ...]  # the properties of a PLY in its order, with their types
     extra: tuple[str, ...]  # properties without a meaning here, copied to outputs unchanged
     comments: tuple[str, ...]  # of the header, without ours
-    tau: float  # of ``fainter_than_tau``: the dial's, or the default of adapting
     origin: Origin
     dial: Dial | None
     screen_filter: ScreenFilter
@@ -80,7 +78,7 @@ class Splat:
         return "sigma_d" if self.growth is None else "sigma_d and growth_d"
 
 
-def values_of(found: Prepared, tau: float) -> dict[str, Any]:
+def values_of(found: Prepared) -> dict[str, Any]:
     """The fields of ``Splat`` up to ``growth``, of a file's rows, of which one is usable at least."""
     keep = found.keep
     columns = {name: np.ascontiguousarray(array[keep].T) for name, array in found.arrays.items() if name != "shN"}
@@ -105,7 +103,7 @@ def values_of(found: Prepared, tau: float) -> dict[str, Any]:
         doubles=int((same[:, 1:] == same[:, :-1]).all(0).sum()),
         far=int((distance > FAR * np.quantile(distance, 0.9)).sum()),
         giant=int((scales[2] > diagonal / 2).sum()) if diagonal > 0 else 0,
-        fainter_than_tau=float((opacities < tau).mean()), fainter_than_visible=float((opacities < FAINT).mean()),
+        fainter_than_visible=float((opacities < FAINT).mean()),
         sigma=Spread.of(columns[SIGMA]) if SIGMA in columns else None,
         growth=Spread.of(columns[GROWTH]) if GROWTH in columns else None,
     )  # fmt: skip

@@ -90,8 +90,8 @@ def rasterization(
     ``rasterize_mode="antialiased"`` its compensation of opacities.
 
     Distances are from the centre of ``viewmats`` for every camera model: Gaussians fade as an orthographic camera moves
-    back; for a rolling shutter it is the first pose. The normalizer ``max`` takes the frustum of a pinhole camera with
-    these ``Ks``; ``scene``, the default, needs none.
+    back; for a rolling shutter it is the first pose. The paper's form takes the frustum of a pinhole camera with
+    these ``Ks``.
 
     Args:
         sigma_d: ``[..., N]`` like ``opacities``; None calls gsplat's function unchanged, with a warning if

@@ -15,7 +15,7 @@ from clod_adapter.adapter import trim
 from clod_adapter.calibration import Calibration, Viewpoint
 from clod_adapter.cameras import Camera, with_near_planes
 from clod_adapter.config import AttenuationConfig
-from clod_adapter.equation.attenuation import attenuate
+from clod_adapter.equation.attenuation import reach_fade
 from clod_adapter.equation.distances import camera_of
 from clod_adapter.equation.units import nominal_distance
 from clod_adapter.errors import ClodError
@@ -159,16 +159,16 @@ def load(path: str | Path, *, activated: Activated | None = None, origin: Origin
 def plausibility(arrays: Mapping[str, np.ndarray], config: AttenuationConfig) -> list[str]:
     """Of a dial without settings, a line with the share that it keeps at s = 1 from the nominal distance.
 
-    A warning where that is too small, as of a file whose positions were enlarged. Nothing for normalisers other than
-    ``scene``, which are invariant to scale.
+    A warning where that is too small, as of a file whose positions were enlarged. Nothing for the paper's form, which
+    is invariant to scale.
     """
-    if config.normalizer != "scene":
+    if config.form == "paper":
         return []
-    means, logits, sigma_d = (torch.from_numpy(arrays[name]) for name in ("means", "opacity_logits", SIGMA))
+    means, sigma_d = (torch.from_numpy(arrays[name]) for name in ("means", SIGMA))
     d = nominal_distance(means, config)
-    kept = attenuate(logits, sigma_d, torch.full_like(sigma_d, d), 1.0, config).keep
+    kept = reach_fade(sigma_d, torch.full_like(sigma_d, d, dtype=torch.float64))[1]
     share = float(kept.double().mean())
-    read = f"read as sigma_d in world units, tau {config.tau:g}, {config.cut} cut: keeps {share:.0%} at s = 1"
+    read = f"read as sigma_d in world units: keeps {share:.0%} at s = 1"
     about = f"its dial is not described in the file; {read} from {d:.3g} away"
     if share < DOUBTFUL:
         remedy = "give the file as clod-adapt wrote it, before another tool rewrote or rescaled it"

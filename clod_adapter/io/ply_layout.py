@@ -20,7 +20,7 @@ from clod_adapter._support.text import package_version
 from clod_adapter.calibration import CalibrationRow, Viewpoint
 from clod_adapter.config import CLASSIC, SH_COUNTS, AttenuationConfig
 from clod_adapter.errors import ClodError
-from clod_adapter.io.settings import FILTER, Metadata, read_metadata, tagged
+from clod_adapter.io.settings import EARLIER_FORM, FILTER, Metadata, read_metadata, tagged
 from clod_adapter.io.values import FILTER_3D, GROWTH, ROWS, SIGMA, arrays_of, dial_columns
 
 if TYPE_CHECKING:
@@ -33,11 +33,10 @@ MACHINE, EXTENT, ROW, VIEWPOINT = "calibrated_on", "calibrated_with", "calibrate
 DIAL = "attenuation"
 # Of the columns of settings: group, field, and what a column of 1 stands for where the setting is no number.
 _SETTINGS: dict[str, tuple[str, str, Any]] = {
-    "tau": (DIAL, "tau", None), "eps": (DIAL, "eps", None), "hard_cut": (DIAL, "cut", "hard"),
-    "reference_distance": (DIAL, "reference_distance", None), "max": (DIAL, "normalizer", "max"),
-    "quantile": (DIAL, "normalizer", "quantile"),  # of earlier versions; refused
+    "reference_distance": (DIAL, "reference_distance", None), "paper": (DIAL, "form", "paper"),
     "screen_variance": (FILTER, "variance", None), "compensate": (FILTER, "compensate", True),
 }  # fmt: skip
+_EARLIER = {"clod_tau", "clod_eps", "clod_hard_cut", "clod_max", "clod_quantile"}  # of ``settings.EARLIER``
 _USUAL = {DIAL: asdict(AttenuationConfig()), FILTER: asdict(CLASSIC)}
 _INSTEAD = {SIGMA: "use a large number for no decay", GROWTH: "use 0 for no growth"}
 
@@ -79,7 +78,7 @@ def ply_metadata(path: Path, comments: tuple[str, ...], rows: np.ndarray | None 
 def write_comments(metadata: Metadata) -> list[str]:
     """The comments of an output: its lines of history, then the settings, without other settings among the lines.
 
-    One comment per setting, as ``clod_adapter tau 0.00392156862745098``: the shortest decimal that gives the same
+    One comment per setting, as ``clod_adapter reference_distance 3.2``: the shortest decimal that gives the same
     double. Some readers do not take long comments, so each row of the calibration has its own.
     """
     dial, screen_filter, c = metadata.attenuation, metadata.screen_filter or CLASSIC, metadata.calibration
@@ -130,6 +129,8 @@ def _constant_settings(path: Path, vertex: np.ndarray) -> dict[str, Any]:
     """The settings in the columns, as ``settings.read_metadata`` takes them; the inverse of ``constants_of``."""
     found: dict[str, dict[str, Any]] = {DIAL: {}, FILTER: {}}
     there = (vertex.dtype.names or ()) if len(vertex) else ()
+    if _EARLIER & {*there}:
+        raise ClodError(f"{path}: {EARLIER_FORM}")
     for name, (group, field, word) in _SETTINGS.items():
         if COLUMN + name in there:
             column = vertex[COLUMN + name]
@@ -137,21 +138,9 @@ def _constant_settings(path: Path, vertex: np.ndarray) -> dict[str, Any]:
                 what = f"property {COLUMN}{name} must be one value for all rows and has several"
                 raise ClodError(f"{path}: {what}, so files of different settings were merged; give one of them")
             if word is None or column[0]:
-                found[group][field] = _simplest(column[0]) if word is None else word
+                # The shortest decimal of a float32, which is the number that was written.
+                found[group][field] = float(str(np.float32(column[0]))) if word is None else word
     return {DIAL: found[DIAL]} | ({FILTER: _USUAL[FILTER] | found[FILTER]} if found[FILTER] else {})
-
-
-def _simplest(value: Any) -> float:
-    """The simplest number that float32 rounds to ``value``, which is the number that was written.
-
-    The shortest decimal; where that has more than six digits, 1/n if that is one for a whole n (1/255).
-    """
-    narrow = np.float32(value)
-    shortest = float(str(narrow))
-    if np.float32(f"{shortest:.6g}") == narrow or not 0 < shortest < 1:  # six digits, which every float32 holds
-        return shortest
-    fraction = 1 / round(1 / shortest)
-    return fraction if np.float32(fraction) == narrow else shortest
 
 
 def write(path: Path, gaussians: Gaussians, metadata: Metadata) -> tuple[str, ...]:

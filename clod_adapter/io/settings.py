@@ -36,6 +36,9 @@ KINDS = {
     ADAPTER: (3, "is not an adapter but {}; give what clod-adapt wrote beside its PLY; a 'clod-model' needs none"),
 }
 DAMAGED = "its settings are damaged", "restore them, or export the file again"  # for ``refused_if_damaged``
+# Settings of a dial before every Gaussian had a reach.
+EARLIER = {"tau", "eps", "cut", "normalizer"}
+EARLIER_FORM = "its dial is of an earlier form, which is not read any more; adapt its checkpoint again with clod-adapt"
 _INHERITED = 60_000  # bytes of history that an output inherits; a PLY header must have room for them
 _OVERHEAD = 9  # bytes of a PLY's comment besides its text
 
@@ -79,7 +82,7 @@ def read_metadata(path: Path, values: Mapping[str, Any], *, dial: bool, describe
         if not isinstance(version, str):
             raise TypeError(f"package_version is {version!r:.40}, not a string")
         return Metadata(
-            attenuation=_attenuation(values.get("attenuation", {}), described, notes) if dial else None,
+            attenuation=_attenuation(path, values.get("attenuation", {}), described, notes) if dial else None,
             screen_filter=_screen_filter(values[FILTER], notes) if FILTER in values else None,
             calibration=_calibration(values.get("calibration"), notes),
             origin=parse_origin(values.get("origin", NOWHERE)), about=tuple(map(str, values.get("about", ()))),
@@ -87,11 +90,11 @@ def read_metadata(path: Path, values: Mapping[str, Any], *, dial: bool, describe
         )  # fmt: skip
 
 
-def _attenuation(stored: Mapping[str, Any], described: bool, notes: list[str]) -> AttenuationConfig:
+def _attenuation(path: Path, stored: Mapping[str, Any], described: bool, notes: list[str]) -> AttenuationConfig:
+    if EARLIER & stored.keys():
+        raise ClodError(f"{path}: {EARLIER_FORM}")
     kinds: dict[str, Any] = {field.name: type(field.default) for field in fields(AttenuationConfig)}
     values = {name: kind(stored[name]) for name, kind in kinds.items() if name in stored}
-    if "max_sv" not in values and values.get("tau", 0.0) * AttenuationConfig().max_sv >= 1:
-        values["max_sv"] = max(0.99 / values["tau"], 1.0)  # the largest that this tau allows
     _note_unknown(stored, kinds, notes)
     if missing := [name for name in kinds if name not in stored] * described:
         notes.append(f"settings that are missing have their defaults: {', '.join(missing)}")
@@ -113,8 +116,7 @@ def _calibration(stored: Any, notes: list[str]) -> Calibration | None:
 
 
 def _note_unknown(stored: Mapping[str, Any], known: Any, notes: list[str]) -> None:
-    # quantile was a setting of a normalizer that is refused by its name.
-    if unknown := [name for name in stored if name not in (*known, "quantile")]:
+    if unknown := [name for name in stored if name not in known]:
         notes.append(f"settings unknown to this version ignored: {', '.join(map(repr, unknown))}")
 
 

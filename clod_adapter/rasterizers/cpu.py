@@ -14,8 +14,7 @@ from clod_adapter._kernels.project import project
 from clod_adapter._kernels.project_gradient import project_gradient
 from clod_adapter.cameras import Camera
 from clod_adapter.config import CLASSIC, AttenuationConfig, ScreenFilter
-from clod_adapter.equation.attenuation import FAINTEST, check_dial, culling_threshold, growth_distance, log_threshold
-from clod_adapter.equation.distances import camera_unit
+from clod_adapter.equation.attenuation import check_dial, growth_distance
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.rasterizers.protocol import Rasterizer, behind, require_float32
 
@@ -41,13 +40,10 @@ def camera_vector(camera: Camera, screen_filter: ScreenFilter = CLASSIC) -> np.n
     return out
 
 
-def dial_vector(config: AttenuationConfig, virtual_scale: float, unit: float = 1.0) -> np.ndarray:
-    """A dial value in the layout of the kernels, for distances in multiples of ``unit``."""
-    out, rate = np.zeros(dial.DIAL, np.float32), virtual_scale / unit
-    out[dial.RATE], out[dial.GROWTH_RATE] = rate, rate / growth_distance(config)
-    out[dial.HALF_EPS], out[dial.SOFT] = config.eps / 2, config.cut == "soft"
-    out[dial.THRESHOLD] = max(culling_threshold(config.tau, virtual_scale), FAINTEST)
-    out[dial.LOG_THRESHOLD] = log_threshold(config.tau, virtual_scale)
+def dial_vector(config: AttenuationConfig, virtual_scale: float) -> np.ndarray:
+    """A dial value in the layout of the kernels."""
+    out, rate = np.zeros(dial.DIAL, np.float32), virtual_scale / config.scene_distance
+    out[dial.RATE2], out[dial.GROWTH_RATE2] = rate**2, (rate / growth_distance(config)) ** 2
     return out
 
 
@@ -164,7 +160,7 @@ class _Compiled(Rasterizer):
         background: Tensor | np.ndarray | None = None, seen_from: Camera | None = None, trained: int | None = None,
     ) -> tuple[Tensor, Tensor]:  # fmt: skip
         background = behind(gaussians, background)
-        if seen_from is not None:
+        if seen_from is not None or _composed(gaussians):
             return super().draw(gaussians, camera, virtual_scale, background=background, seen_from=seen_from)
         check_dial(virtual_scale)
         g = gaussians
@@ -172,25 +168,28 @@ class _Compiled(Rasterizer):
         require_float32("CPU", **(g.tensors() | {"sigma_d": sigma_d, "growth_d": growth_d, "background": background}))
         return _Picture.apply(  # type: ignore[no-any-return, no-untyped-call]
             g.means, g.quats, g.log_scales, g.opacity_logits, sigma_d, growth_d, g.sh0, g.shN, background, camera,
-            g.screen_filter, _dial_vector(g, camera, virtual_scale), len(g) if trained is None else trained,
+            g.screen_filter, _dial_vector(g, virtual_scale), len(g) if trained is None else trained,
         )  # fmt: skip
 
     @torch.no_grad()
     def kept(self, gaussians: Gaussians, camera: Camera, virtual_scale: float) -> Tensor:
-        if gaussians.sigma_d is None or gaussians.means.dtype != torch.float32:
+        if gaussians.sigma_d is None or gaussians.means.dtype != torch.float32 or _composed(gaussians):
             return super().kept(gaussians, camera, virtual_scale)
         found = np.empty(len(gaussians), np.uint8)
-        given = _arrays((gaussians.means, gaussians.opacity_logits, gaussians.sigma_d.float()))
-        settings = camera_vector(camera, gaussians.screen_filter), _dial_vector(gaussians, camera, virtual_scale)
+        given = _arrays((gaussians.means, gaussians.sigma_d.float()))
+        settings = camera_vector(camera, gaussians.screen_filter), _dial_vector(gaussians, virtual_scale)
         threads.run(dial.mark_kept, workers_for(len(found)), *given, *settings, found)
         return torch.from_numpy(found).view(torch.bool)
 
 
-def _dial_vector(gaussians: Gaussians, camera: Camera, virtual_scale: float) -> np.ndarray:
+def _composed(gaussians: Gaussians) -> bool:
+    """Whether the dial is composed with ``rasterize``, as the paper's form is: it has no kernels."""
+    return gaussians.attenuation is not None and gaussians.attenuation.form == "paper"
+
+
+def _dial_vector(gaussians: Gaussians, virtual_scale: float) -> np.ndarray:
     config = gaussians.attenuation
-    if config is None:
-        return np.zeros(dial.DIAL, np.float32)
-    return dial_vector(config, virtual_scale, camera_unit(gaussians.means, camera, config))
+    return np.zeros(dial.DIAL, np.float32) if config is None else dial_vector(config, virtual_scale)
 
 
 def rasterize(

@@ -2,7 +2,8 @@
 
 gsplat's projection tests the opacity last, and packed mode does all other work on a row twice. So rows below 1/255,
 such as culled ones, are removed first, and harmonics are gathered only of rows that the projection finds in the image.
-Gradients of removed rows are 0. gsplat sums over pixels in no fixed order, so results repeat except for rounding.
+Gradients of removed rows are 0. gsplat sums over pixels in no fixed order, so results repeat except for rounding. It
+leaves out the Gaussian that ends a pixel, which the CPU's kernels draw (``_kernels/blend.py``).
 """
 
 import contextlib

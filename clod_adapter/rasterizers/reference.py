@@ -2,7 +2,7 @@
 
 Any device, any float type, slow. Same conventions as the fast backends: pixel centres at +0.5,
 the screen-space filter, the camera's near plane, alpha clamped to 0.999 and dropped below 1/255, a pixel ends
-before its transmittance would fall to 1e-4.
+with the Gaussian at which its transmittance falls to 1e-4.
 """
 
 import torch
@@ -86,8 +86,7 @@ def blend(alphas: Tensor) -> tuple[Tensor, Tensor]:
     """Front-to-back weights ``[pixels, n]`` and the remaining transmittance ``[pixels]``."""
     through = torch.cumprod(1 - alphas, 1)
     before = torch.cat([torch.ones_like(through[:, :1]), through[:, :-1]], 1)
-    alive = (through > T_MIN) | (alphas == 0) & (before > T_MIN)
-    alive = torch.cummin(alive.to(torch.int8), 1).values.bool()
+    alive = before > T_MIN
     weights = torch.where(alive, alphas * before, 0)
     return weights, torch.where(alive, 1 - alphas, 1).prod(1)
 

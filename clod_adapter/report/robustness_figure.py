@@ -8,7 +8,7 @@ from typing import Any
 
 from clod_adapter.report.charts import ORANGE, QUIET, label_log, new_figure, save_figure
 
-PANELS = ("PSNR (dB)", "SSIM", "opacity", "decay sigma_d (log scale)")
+PANELS = ("PSNR (dB)", "SSIM", "opacity", "reach sigma_d (log scale)")
 BEYOND = "beyond the trained range"
 Styles = dict[float | None, dict[str, Any]]  # of lines, by the cells' ``max_sv``
 

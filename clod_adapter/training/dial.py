@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from clod_adapter.cameras import Camera, Scene, StoredView, View, spread
 from clod_adapter.config import AdaptConfig
-from clod_adapter.equation.attenuation import GROWTH_RANGE, SIGMA_MAX, Attenuated, attenuate
+from clod_adapter.equation.attenuation import GROWTH_RANGE, SIGMA_MAX, Attenuated, reach_fade
 from clod_adapter.equation.attenuation import dial as dialled_by
 from clod_adapter.equation.distances import typical_distance
 from clod_adapter.errors import ClodError
@@ -105,7 +105,7 @@ class Dial(nn.Module):
         typical = typical_distance(start.means, places, start.attenuation)[: self.part.trained]
         self.register_buffer("typical", typical, persistent=False)
         self._own_size = float(own_sizes(start.log_scales).median())
-        self.sampler, self._sampled = ViewSampler((), config, start.attenuation.tau, self.schedule), 0
+        self.sampler, self._sampled = ViewSampler((), config, self.schedule), 0
 
     @staticmethod
     def sigma_of(parameter: Tensor) -> Tensor:
@@ -202,19 +202,18 @@ class Dial(nn.Module):
         """
         if virtual_scale < 1:
             return self.log_sigma.new_zeros(())
-        logits, sigma = self.gaussians().opacity_logits.detach(), self.sigma_d.detach()
         loss = torch.as_tensor(rendering_loss).detach().double()
-        gradient = self.count_gradient(logits, self.log_sigma.detach(), virtual_scale, loss)
-        dialled = attenuate(logits, sigma, self.typical, virtual_scale, self.attenuation)
-        eta = dialled.keep.sum() / len(logits)
+        gradient = self.count_gradient(self.log_sigma.detach(), virtual_scale, loss)
+        sigma = self.sigma_d.detach()
+        eta = reach_fade(sigma, self.typical.double() * virtual_scale)[1].sum() / len(sigma)
         value = loss * self.config.reg_weight * (eta / self.target_share(virtual_scale) - 1) ** 2
         return value.to(sigma) + ((self.log_sigma - self.log_sigma.detach()) * gradient).sum()
 
     @torch.no_grad()
-    def count_gradient(self, logits: Tensor, parameter: Tensor, virtual_scale: float, loss: Tensor) -> Tensor:
+    def count_gradient(self, parameter: Tensor, virtual_scale: float, loss: Tensor) -> Tensor:
         """``[trained]`` the count term's gradient of ``log_sigma`` at one dial value, of the trained rows."""
-        sigma, target, at = self.sigma_of(parameter), self._target(virtual_scale), (virtual_scale, self.attenuation)
-        return count_gradient(self.typical, logits, sigma, *at, loss, self.config, target)
+        sigma, target = self.sigma_of(parameter), self._target(virtual_scale)
+        return count_gradient(self.typical, sigma, virtual_scale, loss, self.config, target)
 
     def target_share(self, virtual_scale: float) -> float:
         """The share of the splats that the target-count curve keeps at s, in (0, 1]; 1 below s = 1."""

@@ -4,21 +4,20 @@ Chosen here: sigma_d begins as 1, the count's sigmoid is SOFTNESS wide, learning
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from clod_adapter.cameras import Camera, View, spread
 from clod_adapter.config import AdaptConfig
-from clod_adapter.equation.attenuation import Attenuated, conform, dial, log_threshold
+from clod_adapter.equation.distances import normalized_distances
+from clod_adapter.equation.paper import soft_count
 from clod_adapter.equation.units import in_world_units
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.importance import MOST_VIEWS, has_dial, initialize, scene_distance, with_growth
 from clod_adapter.progress import Listener
 from clod_adapter.training.dial import SIGMA_RANGE, Dial
 from clod_adapter.training.schedule import PAPER
-from clod_adapter.training.target_count import slope_of_sigmoid
 
 SOFTNESS = 0.5  # of the sigmoid of the straight-through count, in log opacity
 
@@ -42,11 +41,11 @@ class PaperDial(Dial):
         base: Gaussians, views: Sequence[View], config: AdaptConfig, progress: Listener | None = None,
         error: Tensor | None = None,
     ) -> Gaussians:  # fmt: skip
-        """sigma_d = 1 in units of the largest distance in the frustum, a hard threshold; a dial it has is kept."""
+        """sigma_d = 1 in units of the largest distance in the frustum, no dial of its own; a dial it has is kept."""
         if has_dial(base):
             return initialize(base, views, config)
         distance = scene_distance(base, spread(views, MOST_VIEWS))
-        attenuation = replace(config.attenuation(distance), cut="hard", normalizer="max")
+        attenuation = config.attenuation(distance)
         initial = base.replace(sigma_d=torch.ones_like(base.opacity_logits), attenuation=attenuation)
         return in_world_units(with_growth(initial, config))
 
@@ -60,33 +59,19 @@ class PaperDial(Dial):
 
     def objective(self, loss: Tensor, shown: Gaussians, camera: Camera, virtual_scale: float) -> Tensor:
         if self.config.reg_weight > 0 and virtual_scale >= 1:
-            dialled = dial(shown, camera, virtual_scale)
-            loss = loss + paper_count(dialled, virtual_scale, self.attenuation.tau, self.config, self.part.total)
+            loss = loss + self.count_term(shown, camera, virtual_scale)
         return self.weight(virtual_scale) * loss
+
+    def count_term(self, shown: Gaussians, camera: Camera, virtual_scale: float) -> Tensor:
+        """0-d, ``lambda L_reg``."""
+        assert shown.sigma_d is not None
+        far = normalized_distances(shown.means, camera, self.attenuation).double() * virtual_scale
+        count = soft_count(shown.opacity_logits, shown.sigma_d, far, virtual_scale, SOFTNESS)
+        count = count * (len(shown) / (self.part.total or len(shown)))
+        excess = (count - virtual_scale**-self.config.exponent).clamp(min=0)
+        return self.config.reg_weight * (virtual_scale - 1) ** 2 * excess**2
 
 
 def form_of(config: AdaptConfig) -> type[Dial]:
     """The dial of a form of training."""
     return PaperDial if config.form == "paper" else Dial
-
-
-def paper_count(
-    dialled: Attenuated, virtual_scale: float, tau: float, config: AdaptConfig, total: int | None = None
-) -> Tensor:
-    """0-d, the paper's ``lambda L_reg = lambda (s - 1)^2 relu(eta - s^-p)^2``; eta is ``soft_count``, of ``total``."""
-    count = soft_count(dialled.log_opacities, virtual_scale, tau, SOFTNESS)
-    count = count * (len(dialled.log_opacities) / (total or len(dialled.log_opacities)))
-    excess = (count - virtual_scale**-config.exponent).clamp(min=0)
-    return config.reg_weight * (virtual_scale - 1) ** 2 * excess**2
-
-
-def soft_count(log_opacities: Tensor, virtual_scale: float, tau: float, temperature: float) -> Tensor:
-    """0-d, the share of Gaussians kept, in [0, 1]: the mean of ``log a'' > log(tau s)``; 0 for no Gaussians.
-
-    Its gradient is that of the mean of ``sigmoid((log a'' - log(tau s)) / temperature)``, 0 at log a'' = -inf.
-    """
-    (log_opacities,) = conform(log_opacities=log_opacities)
-    fixed, threshold = log_opacities.detach(), log_threshold(tau, virtual_scale)
-    share = (fixed > threshold).sum() / fixed.new_full((), max(len(fixed), 1))
-    nothing = (log_opacities - fixed).nan_to_num()  # -inf less itself is NaN
-    return share + (nothing * slope_of_sigmoid(fixed, threshold, temperature)).sum()

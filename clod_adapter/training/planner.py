@@ -1,5 +1,6 @@
 """Making a plan: before training, measures what the scene does not need."""
 
+import math
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -12,6 +13,7 @@ from torch import Tensor
 
 from clod_adapter.cameras import Scene, View, spread
 from clod_adapter.config import AdaptConfig
+from clod_adapter.equation.distances import normalized_distances
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.importance import MOST_VIEWS, has_dial, removal_error
 from clod_adapter.losses import psnr
@@ -31,6 +33,7 @@ SHARE_LIMIT = 0.03
 LIMIT = 0.02  # dB: SH degrees and Gaussians are left out if the PSNR of the training views changes by less without them
 VIEWS = 8  # evenly spread training views on which that is measured
 REQUESTED = "as requested, not measured"
+FEW = 0.02  # share of the Gaussians that the farthest views and the smallest budgets have
 
 
 @torch.inference_mode(False)
@@ -69,6 +72,7 @@ def make_plan(
         decisions += found
     with _timed(seconds, "start"):
         initial = form_of(config).initial(few, views, config, progress, error)
+    decisions += _far_end(initial, views, config)
     frozen = [name for name in RATES if name in override.leave_out]
     decisions += [Decision(name, "frozen", None, "", REQUESTED, name) for name in frozen]
     decisions += [Decision(item, NOT_NEEDED, None, "", why) for item, why in scene.left_out]
@@ -155,6 +159,22 @@ def _measured(
         decisions.append(Decision(f"{share:.0%} of the Gaussians at s = 1", "kept", loss, "dB", why))
         config = replace(config, start_share=share)
     return error, kept, config, decisions
+
+
+def _far_end(initial: Gaussians, views: Sequence[View], config: AdaptConfig) -> list[Decision]:
+    """The share of the Gaussians that the largest dial value will keep, and the one that would keep FEW."""
+    if config.form == "paper" or config.max_sv == 1:
+        return []
+    assert initial.sigma_d is not None and initial.attenuation is not None
+    cameras = [view.camera for view in spread(views, VIEWS)]
+    distances = [normalized_distances(initial.means, camera, initial.attenuation) for camera in cameras]
+    extinction = torch.cat([initial.sigma_d / d for d in distances])
+    kept = float((extinction > config.max_sv).double().mean())
+    reached = f"{kept:.0%} at s = {config.max_sv:g}"
+    if kept > FEW:
+        farther = float(extinction.kthvalue(max(round((1 - FEW) * len(extinction)), 1)).values)
+        reached += f", {FEW:.0%} with --max-sv {math.ceil(farther)}"
+    return [Decision(reached, "kept", None, "", "in the mean of the training views, before training")]
 
 
 def supposed_error(gaussians: Gaussians, error: Tensor, shown: Tensor) -> Tensor:

@@ -5,29 +5,24 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial, reduce
 from statistics import median
 from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
-from clod_adapter.adapter import detach
 from clod_adapter.cameras import Camera, Scene, StoredView, View
 from clod_adapter.config import AdaptConfig
 from clod_adapter.equation.distances import median_distance
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.initialization.importance import SMALLER, coverage, reduced
 from clod_adapter.progress import Listener, Phase, tell
 from clod_adapter.render import render
-from clod_adapter.training.camera_placement import COVERED, SAMPLE, place_cameras
+from clod_adapter.training.camera_placement import SAMPLE, place_cameras
 
-# Photographs are enough if there are MANY, or if TIMES of them show each part of at least SHOWN of the scene, as far as
-# CHECKED placed cameras see it. Otherwise ADDED pseudo views are added: up to half of them at the cameras of the
-# photographs, at most NEAR at each, from where they are moved WIDER; the others at placed cameras.
-MANY, SHOWN, TIMES, CHECKED, ADDED, NEAR, WIDER = 64, 0.97, 4, 24, 96, 4, 2.0
+# To fewer than MANY photographs ADDED pseudo views are added: up to half of them at the cameras of the photographs, at
+# most NEAR at each, from where they are moved WIDER; the others at placed cameras.
+MANY, ADDED, NEAR, WIDER = 64, 96, 4, 2.0
 TEST_EVERY = 8  # as with photographs
 STEPS_PER_PLACED = 5.5  # training steps for each placed camera, where there are no photographs
 # Of the learning rates of all but the dial, without photographs and with few: pseudo views show errors too.
@@ -103,32 +98,30 @@ def render_pseudo_views(gaussians: Gaussians, cameras: Sequence[Camera], *, prog
 def add_pseudo_views(
     gaussians: Gaussians, scene: Scene, config: AdaptConfig, progress: Listener | None = None
 ) -> tuple[Scene, AdaptConfig]:
-    """Adds ADDED pseudo views, and halves all learning rates but the dial's, if photographs show too little.
+    """Adds ADDED pseudo views, and lowers all learning rates but the dial's, where there are few photographs.
 
-    Where they show enough, pseudo views harm more than they help: they contain the errors of the checkpoint and have
-    other distances (docs/method.md).
+    They hold what the photographs do not show: fine-tuned on 33 photographs alone a checkpoint lost 0.8 dB on others.
     """
     photographs = scene.train
     if not 0 < len(photographs) < MANY:
         return scene, config
-    place = partial(place_cameras, gaussians, seed=config.seed, field=_field(photographs[0].camera), progress=progress)
+    each = max(min(NEAR, ADDED // 2 // len(photographs)), 1)
     few = f"only {len(photographs)} photographs to train on"
     try:
-        if len(photographs) >= TIMES:
-            share = shown(gaussians, photographs, place(views=CHECKED))
-            if share >= SHOWN:
-                return scene, config
-            few = f"the {len(photographs)} photographs to train on show only {share:.0%} of the scene {TIMES} times"
-        each = max(min(NEAR, ADDED // 2 // len(photographs)), 1)
-        placed = place(views=max(ADDED - each * len(photographs), ADDED // 2))
+        placed = place_cameras(
+            gaussians,
+            views=max(ADDED - each * len(photographs), ADDED // 2),
+            seed=config.seed,
+            field=_field(photographs[0].camera),
+            progress=progress,
+        )
     except ClodError as error:
-        note = f"{len(photographs)} photographs to train on may be too few, and no pseudo views can be added: {error}"
+        note = f"{few} may be too few, and no pseudo views can be added: {error}"
         return replace(scene, notes=(*scene.notes, note)), config
     teacher = gaussians.without_empty_bands()  # one for all: it may be a copy
     near = _views(teacher, [view.camera for view in photographs], wider=WIDER)
     own = (*each * near, *_views(teacher, placed))
-    more = f"{len(own)} pseudo views, the checkpoint's own renderings, are added"
-    note = f"{few}: {more}, and all learning rates but the dial's are halved"
+    note = f"{few}: {len(own)} pseudo views, the checkpoint's own renderings, are added, and learning rates are lower"
     return replace(scene, train=(*photographs, *own), notes=(*scene.notes, note)), config.lighter(LIGHTER)
 
 
@@ -158,20 +151,6 @@ def teachers_to(views: Sequence[View], device: str) -> tuple[View, ...]:
         PseudoView(view.camera, there[id(view.teacher)], view.reach, view.backed)
         if isinstance(view, PseudoView) else view for view in views
     )  # fmt: skip
-
-
-def shown(gaussians: Gaussians, photographs: Sequence[View], cameras: Sequence[Camera]) -> float:
-    """The share of what ``cameras`` see, by covered pixels, that at least TIMES of the photographs show."""
-
-    def covered(camera: Camera) -> Tensor:
-        return coverage(plain, plain.opacities, reduced(camera)).double()
-
-    plain, least = detach(gaussians), COVERED / SMALLER**2
-    times = torch.zeros_like(gaussians.opacity_logits, dtype=torch.int32)
-    for view in photographs:
-        times += covered(view.camera) > least
-    seen = reduce(torch.add, map(covered, cameras))
-    return float(seen[times >= TIMES].sum() / seen.sum().clamp(min=1e-9))
 
 
 def _field(camera: Camera) -> float:

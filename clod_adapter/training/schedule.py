@@ -24,7 +24,8 @@ class Schedule:
     coarse: float = 0.9  # share of the training in which steps beyond s = 1 have photographs of half the size
     lr_final: float = 0.1  # final learning rates as a share of the first ones, between which they decay exponentially
     average: float = 0.2  # share of the steps so far, at the end, whose parameters are averaged for the result
-    rendered: float = 1.25  # times max_sv, the largest dial value of steps
+    # Times max_sv, the largest dial value of steps: quality and counts do not break off at max_sv.
+    rendered: float = 1.25
     counted: float = 1.5  # and of counts
     even: bool = False  # whether dial values are uniform, not log-uniform
 
@@ -56,14 +57,11 @@ class Sample(NamedTuple):
 class ViewSampler:
     """Samples views and dial values from ``config.seed``; the same in every process.
 
-    ``order`` has the numbers of the remaining views of this round, the next one last. ``tau`` is by default the
-    config's.
+    ``order`` has the numbers of the remaining views of this round, the next one last.
     """
 
-    def __init__(
-        self, views: tuple[View, ...], config: AdaptConfig, tau: float | None = None, schedule: Schedule = OURS
-    ) -> None:
-        self.views, self.max_sv, self.tau, self.schedule = views, config.max_sv, tau or config.tau, schedule
+    def __init__(self, views: tuple[View, ...], config: AdaptConfig, schedule: Schedule = OURS) -> None:
+        self.views, self.max_sv, self.schedule = views, config.max_sv, schedule
         self.random = np.random.default_rng(config.seed)
         self.order: list[int] = []
         self.offset = self.random.random()
@@ -84,7 +82,7 @@ class ViewSampler:
         """A log-uniform dial value that Gaussians are only counted at; None with a single dial value."""
         if self.max_sv == 1 or self.schedule.counted == 0:
             return None
-        return self.beyond(self.schedule.counted) ** self.random.random()
+        return (self.schedule.counted * self.max_sv) ** self.random.random()
 
     def dial(self, number: int, share_done: float) -> float:
         """The dial value of a step, by ``Schedule.dial``; with max_sv 1 there is one.
@@ -95,14 +93,7 @@ class ViewSampler:
         if self.max_sv == 1:
             return 1.0
         place = (self.offset + number * GOLDEN) % 1
-        return self.schedule.dial(place, share_done, self.beyond(self.schedule.rendered))
-
-    def beyond(self, factor: float) -> float:
-        """A dial value beyond max_sv: ``factor`` times as large, at most halfway to 1/tau, where all are culled.
-
-        Training goes on there, so that quality and counts do not break off at max_sv.
-        """
-        return max(min(factor * self.max_sv, (self.max_sv + 1 / self.tau) / 2), self.max_sv)
+        return self.schedule.dial(place, share_done, self.schedule.rendered * self.max_sv)
 
     def state(self) -> tuple[dict[str, Any], tuple[int, ...]]:
         """Everything that later samples depend on: the generator's state, and the order."""

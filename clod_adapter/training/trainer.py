@@ -130,9 +130,9 @@ class Trainer:
         found = torch.autograd.grad(total, [leaves[name] for name in self.stepped])
         gradients = {name: gradient[first] for name, gradient in zip(self.stepped, found, strict=True)}
         plain, decay = loss.detach().double(), self.dial.decay
-        logits, parameter = (self.parameters[name][first] for name in ("opacity_logits", decay))
+        parameter = self.parameters[decay][first]
         for at, weighted in self.dial.counts(s, counted, plain):
-            gradients[decay] = gradients[decay] + self.dial.count_gradient(logits, parameter, at, weighted)
+            gradients[decay] = gradients[decay] + self.dial.count_gradient(parameter, at, weighted)
         return GradientSum(gradients, kept, plain)
 
     def image(self, parameters: dict[str, Tensor] | None, camera: Camera, halved: bool) -> Tensor:

@@ -24,6 +24,7 @@ from torch import Tensor
 from clod_adapter._support.text import as_text, script_json
 from clod_adapter.calibration import Calibration
 from clod_adapter.cameras import Camera
+from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import OPAQUE, Gaussians
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.checkpoint import Checkpoint, load
@@ -55,6 +56,11 @@ class Payload:
     @classmethod
     def of(cls, checkpoint: Checkpoint) -> "Payload":
         gaussians = checkpoint.gaussians.without_empty_bands()
+        if gaussians.attenuation is not None and gaussians.attenuation.form == "paper":
+            raise ClodError(
+                f"{checkpoint.path}: its dial is of the paper's form, which viewers do not draw; adapt it without "
+                "--form paper"
+            )
         return cls(as_text(checkpoint.path.name), gaussians, checkpoint.calibration, checkpoint.origin)
 
     @cached_property

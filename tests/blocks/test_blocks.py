@@ -143,6 +143,6 @@ def test_settings_that_need_all_gaussians_are_refused(captured: tuple[Gaussians,
     begun = initialize(base, scene.train, CONFIG)
     with pytest.raises(ClodError, match="the paper's form cannot be trained in blocks"):
         divide(begun, scene.train, AdaptConfig.paper(), 2)
-    dialled = begun.replace(attenuation=replace(begun.attenuation, normalizer="max"))
-    with pytest.raises(ClodError, match="normaliser max"):
+    dialled = begun.replace(attenuation=replace(begun.attenuation, form="paper"))
+    with pytest.raises(ClodError, match="dial has the paper's form"):
         divide(dialled, scene.train, CONFIG, 2)

@@ -88,7 +88,6 @@ ERRORS = [
     ("cut.ply --images scene", "cut.ply: .*truncated.*again"),
     ("base.ply --images empty", "empty: no COLMAP model.*, and no transforms.json; give the folder"),
     ("base.ply --images scene --max-sv 0.5", "--max-sv is 0.5, it must be at least 1"),
-    ("base.ply --images scene --max-sv 300", "--max-sv is 300, it must be below 50"),
     ("base.ply --images scene --with quats --without sh0 quats", "--with and --without both name quats"),
     ("base.ply --images scene --out nowhere/x.ply", "nowhere/x.ply: folder nowhere does not exist; create"),
     ("base.ply --images scene --out x.compressed.ply", "x.compressed.ply: is written by clod-adapt export alone"),

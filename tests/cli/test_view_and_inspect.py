@@ -104,7 +104,7 @@ def test_a_plain_file_fits_on_a_screen(clod: Any, capture: Any) -> None:
 def test_a_dial_and_its_calibration(clod: Any, dialled: Path) -> None:
     text, report = clod("inspect DIAL").out, clod("inspect DIAL --json").report
     lines, splat = text.splitlines(), report["splat"]
-    assert "written by   clod-adapter" in text and "s = 1 to 4, soft culling" in text and len(lines) <= 32
+    assert "written by   clod-adapter" in text and "s = 1 to 4, distances in world units" in text and len(lines) <= 32
     at = next(k for k, line in enumerate(lines) if "Gaussians" in line and "PSNR" in line)
     first, *_, last = table = [line.split() for line in lines[at + 1 : at + 8]]
     assert (first[0], last[0]) == ("1", "4") and all(len(row) == 5 for row in table)

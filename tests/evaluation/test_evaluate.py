@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from clod_adapter import AttenuationConfig, Camera, ClodError, Gaussians, Stopped, View, dial_for, evaluate, render
 from clod_adapter.adapter import with_dial
 from clod_adapter.calibration import Calibration, CalibrationRow
+from clod_adapter.config import FORMS
 from clod_adapter.equation.attenuation import dial
 from clod_adapter.evaluation import frame_times
 from clod_adapter.evaluation.evaluate import geometric_errors
@@ -24,16 +25,15 @@ from scenes import camera, gaussians, in_front, photograph, ring
 
 
 def row_of_four() -> Gaussians:
-    """Four Gaussians at camera depths 1, 2, 4 and 8, the last far outside the image; sigma_d is 1."""
+    """Four Gaussians at camera depths 1, 2, 4 and 8, the last far outside the image; each has a reach of 3."""
     means = in_front(camera(), torch.tensor([[0.0, 0, 1], [0, 0, 2], [0, 0, 4], [80, 0, 8]]))
     some = gaussians(4, 0, 0).replace(means=means, opacity_logits=torch.full((4,), 2.0))
-    return with_dial(some, torch.ones(4), AttenuationConfig(tau=0.01, eps=0.0))
+    return with_dial(some, torch.full((4,), 3.0), AttenuationConfig())
 
 
-def test_counts_follow_the_culling_threshold() -> None:
-    """Kept iff ``log a - (d s)^2 / 2 > log(tau s)`` with log a = -0.127: at s = 1 the two nearer than 3."""
+def test_counts_follow_the_reach() -> None:
     view = View(camera(), torch.zeros(45, 61, 3, dtype=torch.uint8))
-    rows = evaluate(row_of_four(), [view, view], [1.0, 1.5, 3.0])
+    rows = evaluate(row_of_four(), [view, view], [1.0, 1.6, 4.0])
     assert [row.kept for row in rows] == [2, 1, 0]
     assert [row.kept_share for row in rows] == [0.5, 0.25, 0]
     assert [row.in_view for row in rows] == [2, 1, 0]
@@ -166,11 +166,11 @@ def test_a_listener_stops_the_timing() -> None:
 MAX_SV = 6.0
 
 
-def adapted(n: int, seed: int, normalizer: str = "scene") -> Gaussians:
+def adapted(n: int, seed: int, form: str = "ours") -> Gaussians:
     """Gaussians that are culled at dial values within, below and above the range."""
     generator = torch.Generator().manual_seed(seed)
     sigma = (torch.randn(n, generator=generator) * 0.8 + 0.4).exp()
-    attenuation = AttenuationConfig(max_sv=MAX_SV, normalizer=normalizer, scene_distance=5.0)
+    attenuation = AttenuationConfig(form=form, max_sv=MAX_SV, scene_distance=5.0)
     return with_dial(gaussians(n, 0, seed), sigma, attenuation)
 
 
@@ -179,13 +179,13 @@ def kept(some: Gaussians, cameras: Sequence[Camera], s: float) -> int:
 
 
 @settings(deadline=None, max_examples=30)
-@example(n=2, seed=2, views=5, share=0.25, normalizer="max")  # one Gaussian is at distance 1 in three views
+@example(n=2, seed=2, views=5, share=0.25, form="paper")  # one Gaussian is at distance 1 in three views
 @given(
     n=st.integers(2, 3000), seed=st.integers(0, 10**6), views=st.integers(1, 5), share=st.floats(0, 1),
-    normalizer=st.sampled_from(["scene", "max"]),
+    form=st.sampled_from(FORMS),
 )  # fmt: skip
-def test_counts_are_exact_up_to_ties(n: int, seed: int, views: int, share: float, normalizer: str) -> None:
-    some, cameras = adapted(n, seed, normalizer), ring(views, 48, 36)
+def test_counts_are_exact_up_to_ties(n: int, seed: int, views: int, share: float, form: str) -> None:
+    some, cameras = adapted(n, seed, form), ring(views, 48, 36)
     most, fewest = kept(some, cameras, 1.0), kept(some, cameras, MAX_SV)
     wanted = fewest + round(share * (most - fewest))
     assume(wanted > 0)
@@ -195,8 +195,8 @@ def test_counts_are_exact_up_to_ties(n: int, seed: int, views: int, share: float
     # At most what was asked for; and where it is less, more would stay at the next smaller dial value in float32.
     assert found <= wanted, (seed, found, wanted)
     assert found == wanted or kept(some, cameras, solved.virtual_scale * (1 - 1e-6)) > wanted, (seed, found, wanted)
-    # The Gaussian whose distance is the unit is at distance 1, and its s* is the same in each view where it is that.
-    ties = 0 if normalizer == "scene" else views - 1
+    # The Gaussian whose distance is the unit is at distance 1, and ends at the same s in each view where it is that.
+    ties = 0 if form == "ours" else views - 1
     assert wanted - found <= max(1, 0.001 * wanted) + ties, (seed, found, wanted)
 
 

@@ -7,17 +7,15 @@ import torch
 from torch import Tensor
 
 from clod_adapter import AdaptConfig, AttenuationConfig, ClodError, Gaussians, View
-from clod_adapter.equation.attenuation import attenuate
+from clod_adapter.equation.attenuation import dial
 from clod_adapter.equation.distances import typical_distance
-from clod_adapter.equation.extinction import extinction_scale, sigma_for_extinction
 from clod_adapter.gaussians import SH_C0
 from clod_adapter.initialization import pruning_order as pruning
-from clod_adapter.initialization.importance import initialize, removal_error, sigma_from_importance, usable_views
+from clod_adapter.initialization.importance import initialize, removal_error, usable_views
 from clod_adapter.initialization.pruning_order import APART, COLOUR_FLOOR, MOST, NEIGHBOURS, REMOVED, SHARE
 from clod_adapter.render import splat
 from scenes import gaussians, photograph, ring
 
-CONFIG = AttenuationConfig(tau=1 / 255, cut="hard", scene_distance=4.0)
 REVERSED = torch.diag(torch.tensor([-1.0, 1, -1, 1]))  # looks the other way
 
 
@@ -58,28 +56,32 @@ def test_removal_error_depends_on_the_seed_alone() -> None:
         usable_views(gaussians(20, 0, 0), [blind])
 
 
+def dialled(n: int, **settings: float) -> tuple[Gaussians, tuple[View, ...]]:
+    """An initialized dial, and the views that it is from."""
+    views = photograph(gaussians(n, 0, 0), ring(3, 20, 16))
+    return initialize(gaussians(n, 0, 0), views, AdaptConfig(**settings)), views
+
+
+def distances_of(some: Gaussians, views: tuple[View, ...]) -> Tensor:
+    assert some.attenuation is not None
+    return typical_distance(some.means, [view.camera for view in views], some.attenuation)
+
+
 @pytest.mark.parametrize(("share", "exponent"), [(0.51, 1.5), (0.8, 2.5), (1.0, 1.5)])
 def test_kept_shares_follow_the_target_curve(share: float, exponent: float, n: int = 1000) -> None:
     """At the distances of the initialization, ``1 / (s^p + (1/share - 1) s^-p)``, to one Gaussian."""
-    g = torch.Generator().manual_seed(0)
-    some = gaussians(n, 0, 0).replace(opacity_logits=2 * torch.rand(n, generator=g))  # lasting until s = 127
-    importance, distances = torch.rand(n, generator=g), 0.1 + torch.rand(n, generator=g)
-    sigma = sigma_from_importance(some, importance, distances, CONFIG, share=share, exponent=exponent)
+    some, views = dialled(n, start_share=share, exponent=exponent)
     for s in (1.0, 1.2, 1.7, 2.0, 3.0, 5.0, 7.0, 20.0):
-        kept = attenuate(some.opacity_logits, sigma, distances, s, CONFIG).keep
+        kept = dial(some, distances_of(some, views), s).keep
         want = 1 / (s**exponent + (1 / share - 1) * s**-exponent)
         assert abs(kept.sum().item() - n * want) <= 1, f"s {s}"
-        if kept.any() and not kept.all():
-            assert importance[kept].min() > importance[~kept].max(), f"s {s}"
 
 
 def test_initialization_culls_in_the_pruning_order() -> None:
     """In which one that a neighbour replaces goes earlier than by its removal error alone."""
-    some = gaussians(200, 0, 0)
-    views = photograph(some, ring(3, 20, 16))
-    error, dialled = removal_error(some, views, seed=0), initialize(some, views, AdaptConfig())
-    d = typical_distance(some.means, [view.camera for view in views], dialled.attenuation)
-    found = extinction_scale(dialled.opacity_logits, dialled.sigma_d, d, dialled.attenuation).argsort()
+    some, views = dialled(200)
+    assert some.sigma_d is not None
+    error, found = removal_error(some, views, seed=0), (some.sigma_d / distances_of(some, views)).argsort()
     order = pruning.pruning_order(some, error.sqrt() * some.opacities).position
     assert torch.equal(found[100:180], order.argsort()[100:180])
     assert not torch.equal(order.argsort()[100:180], error.argsort(stable=True)[100:180])
@@ -136,8 +138,7 @@ MAX_SV = 5.0
 def test_exponents_are_in_range_and_0_without_descendants() -> None:
     some, d = gaussians(400, 0, 0), torch.full((400,), 0.9)
     order = pruning.pruning_order(some, torch.rand(400, generator=torch.Generator().manual_seed(0)))
-    config = AttenuationConfig(tau=1e-6, max_sv=MAX_SV)
-    sigma_d = sigma_for_extinction(some.opacity_logits, d, 1 + 9 * (order.position + 1) / 400, config)
+    config, sigma_d = AttenuationConfig(max_sv=MAX_SV), d * (1 + 9 * (order.position + 1) / 400)
     found = pruning.initial_growth(some.replace(sigma_d=sigma_d, attenuation=config), order.substitute, d)
     alone = torch.ones(400, dtype=torch.bool)
     alone[order.substitute[order.substitute != torch.arange(400)]] = False
@@ -146,3 +147,11 @@ def test_exponents_are_in_range_and_0_without_descendants() -> None:
     for iters in (0, 1):  # growth begins with 0 where it is trained
         grown = initialize(some, photograph(some, ring(2, 16, 12)), AdaptConfig(iters=iters)).growth_d
         assert bool(grown.any()) == (iters == 0)
+
+
+def test_a_dial_of_another_form_is_refused() -> None:
+    """Its numbers mean something else."""
+    some = gaussians(20, 0, 0)
+    adapted = initialize(some, photograph(some, ring(2, 16, 12)), AdaptConfig(iters=1))
+    with pytest.raises(ClodError, match="has the form ours; adapt with the same"):
+        initialize(adapted, photograph(some, ring(2, 16, 12)), AdaptConfig.paper())

@@ -89,7 +89,9 @@ def adapted(**settings: Any) -> Gaussians:
     """60 Gaussians, of which a third is culled at the dial value, with growth of both signs."""
     some = scenes.dialled(60, 1, 3, **settings)
     values = torch.rand(60, generator=torch.Generator().manual_seed(5))
-    return some.replace(means=some.means * torch.tensor([1, 1, 0.5]), growth_d=2 * values - 0.5)
+    return some.replace(
+        means=some.means * torch.tensor([1, 1, 0.5]), sigma_d=2 * some.sigma_d, growth_d=2 * values - 0.5
+    )
 
 
 def wanted(gaussians: Gaussians) -> Tensor:
@@ -130,7 +132,7 @@ def test_the_kit_is_what_the_library_draws_and_writes(suffix: str, levels: int) 
 @pytest.mark.parametrize("name", FORKS)
 def test_kept_rows_are_drawn_as_by_the_fork(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Also called by position. Without sigma_d, results are the fork's."""
-    fork, model = inria_forks.module(name), adapted(normalizer="max")
+    fork, model = inria_forks.module(name), adapted(form="paper")
     given = arguments(model if name != "w-pose" else model.replace(growth_d=None), name)
     dial = {key: given.pop(key) for key in ("sigma_d", "growth_d", "attenuation", "virtual_scale") if key in given}
     settings = settings_of(fork.GaussianRasterizationSettings, VIEW, bg=torch.tensor([0.2, 0.5, 0.1]))

@@ -18,7 +18,7 @@ from gsplat_versions import FUNCTIONS
 
 N, WIDTH, HEIGHT, CAMERAS = 5, 20, 12, 3
 VERSIONS = gsplat_versions.signatures()
-WHOLE = AttenuationConfig(tau=0.02, max_sv=5.0)
+WHOLE = AttenuationConfig()
 OF_SCENE = {"means": (N, 3), "quats": (N, 4), "scales": (N, 3), "opacities": (N,), "covars": (N, 3, 3)}
 OF_CAMERA = {
     "viewmats": (4, 4), "Ks": (3, 3), "backgrounds": (3,), "viewmats_rs": (4, 4), "radial_coeffs": (6,),

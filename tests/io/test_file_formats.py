@@ -236,7 +236,7 @@ def test_what_cannot_be_read_again_is_not_written(tmp_path: Path) -> None:
 
 
 def test_text_is_made_ascii_and_infinite_opacity_finite(tmp_path: Path) -> None:
-    write(tmp_path / "a.safetensors", model(0), Metadata(about=("caf\u00e9", "clod_adapter tau 0.5")))
+    write(tmp_path / "a.safetensors", model(0), Metadata(about=("caf\u00e9", "clod_adapter max_sv 2")))
     found = load(tmp_path / "a.safetensors")
     assert found.comments == ("caf?",) and found.gaussians.attenuation == ATTENUATION
     (note,) = write(tmp_path / "a.ply", model())

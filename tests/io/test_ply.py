@@ -15,7 +15,7 @@ from clod_adapter.errors import ClodError
 from clod_adapter.io.checkpoint import Checkpoint, load, save, trimmed
 from formats import model, needed, random_rows, write_elements, write_rows
 
-CONFIG = AttenuationConfig(tau=0.02, eps=1e-7, normalizer="max", max_sv=7.0)
+CONFIG = AttenuationConfig(form="paper", max_sv=7.0)
 
 
 def read_back(path: Path) -> tuple[list[str], np.ndarray]:
@@ -72,7 +72,7 @@ def test_every_layout_round_trips(tmp_path: Path, file: tuple[np.ndarray, str, i
     save(out, tuned.replace(means=changes["means"].requires_grad_(), sigma_d=sigma_d.double().requires_grad_()), base)
     _, rows = read_back(out)
     own = [name for name in vertex.dtype.names if name != "growth_d"]
-    added = ["clod_eps", "clod_max", "sigma_d"]  # of CONFIG, what is not the default, but for max_sv
+    added = ["clod_paper", "sigma_d"]  # of CONFIG, what is not the default, but for max_sv
     added += ["growth_d"] if growth_d is not None else []
     assert list(rows.dtype.names) == own + added and {rows.dtype[name].str for name in added} == {"<f4"}
     for name in own:
@@ -92,16 +92,16 @@ def test_every_layout_round_trips(tmp_path: Path, file: tuple[np.ndarray, str, i
 
 def test_header_of_an_extended_file(tmp_path: Path) -> None:
     vertex = random_rows(2, ["sigma_d", *needed(0)])
-    comments = ("a photo", "clod_adapter tau 0.125", "clod_adapter odd 1")
+    comments = ("a photo", "clod_adapter max_sv 4.125", "clod_adapter odd 1")
     base = load(write_rows(tmp_path / "in.ply", vertex, comments=comments))
-    assert base.gaussians.attenuation == AttenuationConfig(tau=0.125)
-    config = dataclasses.replace(CONFIG, reference_distance=np.float64(1) / 3, max_sv=3, tau=np.float32(0.01))
+    assert base.gaussians.attenuation == AttenuationConfig(max_sv=4.125)
+    config = dataclasses.replace(CONFIG, reference_distance=np.float32(0.01), max_sv=3)
     save(tmp_path / "out.ply", base.gaussians.replace(attenuation=config), base, version="7.8.9")
     assert load(tmp_path / "out.ply").gaussians.attenuation == config
     lines, rows = read_back(tmp_path / "out.ply")
     assert lines[:4] == ["ply", "format binary_little_endian 1.0", "element vertex 2", "comment a photo"]
-    assert sum("clod_adapter tau" in line for line in lines) == 1 and not any("odd" in line for line in lines)
-    for line in (f"tau {float(config.tau)!r}", "normalizer max", "version 7.8.9"):
+    assert sum("clod_adapter max_sv" in line for line in lines) == 1 and not any("odd" in line for line in lines)
+    for line in (f"reference_distance {float(config.reference_distance)!r}", "form paper", "version 7.8.9"):
         assert f"comment clod_adapter {line}" in lines
     assert lines[-1] == "property float sigma_d" and sorted(rows.dtype.names) == sorted({*rows.dtype.names})
 

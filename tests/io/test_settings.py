@@ -2,19 +2,22 @@
 drop comments; the screen-space filter as other programs state it."""
 
 import gzip
+import json
 import re
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from plyfile import PlyData
+from safetensors.torch import load_file, save_file
 
 from clod_adapter.adapter import detach, extract, with_dial
 from clod_adapter.calibration import Calibration
 from clod_adapter.config import CLASSIC, FILTERS, AttenuationConfig, ScreenFilter
-from clod_adapter.equation.extinction import sigma_for_extinction
 from clod_adapter.equation.units import estimated_distance, in_world_units
 from clod_adapter.errors import ClodError
 from clod_adapter.inspection.report import inspect
@@ -22,6 +25,7 @@ from clod_adapter.io.adapter_file import load_adapter, save_adapter
 from clod_adapter.io.checkpoint import load, save
 from clod_adapter.io.file_formats import write
 from clod_adapter.io.settings import Metadata
+from clod_adapter.io.tensor_file import read_tensor_header
 from formats import (
     ATTENUATION,
     CALIBRATION,
@@ -29,7 +33,6 @@ from formats import (
     model,
     needed,
     random_rows,
-    splat_transform,
     without_comments,
     write_rows,
 )
@@ -63,8 +66,8 @@ def test_every_format_uses_the_reader(tmp_path: Path, kind: str) -> None:
     damage = f"{kind}: its settings are damaged .*MESSAGE.*; restore them, or export"
     with pytest.raises(ClodError, match=damage.replace("MESSAGE", "compensate is .*, it must be true or false")):
         read(change_setting(path, *(("0.123456789", "True", "Yess") if ply else ("compensate", "true", "7e+2"))))
-    with pytest.raises(ClodError, match=damage.replace("MESSAGE", "tau is 7.02, it must be between 0 and 1")):
-        read(change_setting(written(path), "tau", "0.02", "7.02"))
+    with pytest.raises(ClodError, match=damage.replace("MESSAGE", "reference_distance is -3.21, it must be")):
+        read(change_setting(written(path), "reference_distance", "3.217", "-3.21"))
     notes = ["settings unknown to this version ignored: 'max_sx'"]
     notes += ["settings that are missing have their defaults: max_sv"]
     wanted = replace(ATTENUATION, max_sv=5.0), CLASSIC, CALIBRATION, notes
@@ -90,15 +93,32 @@ def described(path: Path, *comments: str) -> Path:
 
 def test_damaged_settings_are_refused(tmp_path: Path) -> None:
     for comment, message in (
-        ("tau banana", "could not convert string to float: 'banana'"), ("tau 0.4", "tau is 0.4, .*max_sv"),
-        ("normalizer mean", "normalizer is mean, it must be one of"), ("scene_distance nan", "scene_distance is nan"),
+        ("max_sv banana", "could not convert string to float: 'banana'"), ("form theirs", "form is theirs, it must be"),
+        ("max_sv 0.4", "max_sv is 0.4, it must be"), ("scene_distance nan", "scene_distance is nan"),
         ("screen_filter 0.3", "no 'compensate'"), ("screen_filter -1 True", "variance is -1.0, it must be between"),
     ):  # fmt: skip
         with pytest.raises(ClodError, match=f"a.ply: its settings are damaged .*{message}.*; restore them, or export"):
             load(described(tmp_path / "a.ply", "max_sv 5", comment))
-    for tau in (0.19, 0.2, 0.98):  # an unknown range fits tau
-        found = load(described(tmp_path / "a.ply", f"tau {tau}"), activated="none").gaussians.attenuation
-        assert found is not None and found.tau == tau and found.max_sv >= 1 and (found.max_sv == 5) == (tau < 0.2)
+
+
+def with_a_cut(path: Path) -> Path:
+    """A safetensors file whose JSON has a setting of the earlier form."""
+    about = json.loads(read_tensor_header(written(path))[1]["clod_adapter"])
+    about["attenuation"]["cut"] = "soft"
+    save_file(load_file(path), path, {"clod_adapter": json.dumps(about)})
+    return path
+
+
+def test_a_dial_of_the_earlier_form_is_refused(tmp_path: Path) -> None:
+    """By a comment, by a column where comments were dropped, and by JSON."""
+    made: list[Callable[[], Path]] = [partial(described, tmp_path / "a.ply", "tau 0.02", "max_sv 5")]
+    made += [partial(with_a_cut, tmp_path / name) for name in ("a.safetensors", "adapter.safetensors")]
+    for name, value in {"tau": 0.01, "eps": 1e-7, "hard_cut": 1, "max": 1}.items():
+        made.append(partial(without_comments, written(tmp_path / "b.ply"), **{f"clod_{name}": value}))
+    for make in made:
+        path = make()
+        with pytest.raises(ClodError, match=f"^{path}: its dial is of an earlier form.*; adapt its checkpoint again"):
+            read(path)
 
 
 @pytest.mark.parametrize("screen_filter", [*FILTERS.values(), ScreenFilter(variance=0.123, compensate=True)], ids=str)
@@ -126,8 +146,8 @@ def test_columns_of_other_programs_and_damaged_columns(tmp_path: Path) -> None:
     write(tmp_path / "a.ply", model(1))
     for columns, message in (
         ({"clod_screen_variance": -1.0}, r"rewritten.ply: its settings are damaged \(variance is -1.0"),
-        ({"clod_tau": np.nan}, "clod_tau"),
-        ({"clod_tau": np.arange(1, 41) / 100}, "property clod_tau must be one value for all rows and has several"),
+        ({"clod_reference_distance": np.nan}, "clod_reference_distance"),
+        ({"clod_paper": np.arange(40) % 2}, "property clod_paper must be one value for all rows and has several"),
     ):
         with pytest.raises(ClodError, match=message):
             load(without_comments(tmp_path / "a.ply", **columns))
@@ -152,10 +172,8 @@ def test_comments_of_other_programs(tmp_path: Path) -> None:
 
 USUAL = AttenuationConfig(reference_distance=3.0)
 EACH = {
-    "usual": USUAL, "faint": replace(USUAL, tau=1.23457e-05), "large tau": replace(USUAL, tau=0.400007, max_sv=2.0),
-    "paper": AttenuationConfig(tau=1 / 255, cut="hard", normalizer="max", reference_distance=0.123456789),
-    "no eps": replace(USUAL, eps=0.0), "unit": replace(USUAL, scene_distance=7.0),
-    "no reach": replace(USUAL, normalizer="max", reference_distance=0.0, eps=1e-6),
+    "usual": USUAL, "unit": replace(USUAL, scene_distance=7.0), "no reference": AttenuationConfig(max_sv=2.0),
+    "paper": AttenuationConfig(form="paper", reference_distance=0.123456789),
 }  # fmt: skip
 
 
@@ -168,38 +186,31 @@ def test_dial_survives_a_rewrite_without_comments(tmp_path: Path, name: str, gro
     assert name == "unit" or load(tmp_path / "a.ply").gaussians.attenuation == config
     names = PlyData.read(str(tmp_path / "a.ply"))["vertex"].data.dtype.names
     assert names[-2:] == ("sigma_d", "growth_d") if growth else names[-1] == "sigma_d"
-    assert (name in ("usual", "unit") and not growth) == ("clod_" not in " ".join(names))
-    files = [without_comments(tmp_path / "a.ply")]
-    if name == "paper":
-        splat_transform(tmp_path / "a.ply", tmp_path / "b.ply")
-        files.append(tmp_path / "b.ply")
-    for path in files:
-        again, wanted = load(path).gaussians, in_world_units(g)
-        assert again.attenuation is not None and wanted.attenuation is not None
-        assert again == wanted.replace(attenuation=again.attenuation)
-        for field in ("tau", "cut", "eps", "normalizer"):
-            assert getattr(again.attenuation, field) == getattr(wanted.attenuation, field)
-        reach = wanted.attenuation.reference_distance if growth else 0
-        assert again.attenuation.reference_distance == pytest.approx(reach, rel=1e-6)
-    found = inspect(files[0])
+    assert (name == "paper" or (growth and name != "no reference")) == ("clod_" in " ".join(names))
+    path = without_comments(tmp_path / "a.ply")
+    again, wanted = load(path).gaussians, in_world_units(g)
+    assert again.attenuation is not None and wanted.attenuation is not None
+    assert again == wanted.replace(attenuation=again.attenuation) and again.attenuation.form == config.form
+    reference = wanted.attenuation.reference_distance if growth else 0
+    assert again.attenuation.reference_distance == pytest.approx(reference, rel=1e-6)
+    found = inspect(path)
     assert found.splat is not None and found.splat.dial is not None and found.splat.extra == ()
-    assert growth or name != "paper" or any("read from columns: tau, cut, normalizer" in note for note in found.notes)
+    assert growth or name != "paper" or any("read from columns: form" in note for note in found.notes)
 
 
 def test_file_without_settings_has_a_note(tmp_path: Path) -> None:
     """The file keeps six tenths at s = 1 from its reference distance; sigma_d is multiplied by ``factor``."""
     for factor, begin, parts in (
-        (1.0, "its dial is not", ["world units, tau 0.02, soft cut: keeps 60% at s = 1"]),
+        (1.0, "its dial is not", ["world units: keeps 60% at s = 1"]),
         (0.05, "warning: ", ["keeps 0% at s = 1", "likely not what was adapted"]),
     ):
-        config, path, some = AttenuationConfig(), tmp_path / "a.ply", gaussians(500, 0, 1)
-        some = some.replace(means=10 * some.means, opacity_logits=some.opacity_logits.clamp(min=-2))
-        d = torch.full((500,), estimated_distance(some.means))
-        sigma = sigma_for_extinction(some.opacity_logits, d, torch.linspace(0.5, 1.75, 500), config)
-        save(path, with_dial(some, factor * sigma, config))
+        path, some = tmp_path / "a.ply", gaussians(500, 0, 1)
+        some = some.replace(means=10 * some.means)
+        sigma_d = estimated_distance(some.means) * torch.linspace(0.5, 1.75, 500)
+        save(path, with_dial(some, factor * sigma_d))
         assert load(path).notes == () and inspect(path).notes == ()
         base = load(without_comments(path))
-        assert base.gaussians.attenuation == config
+        assert base.gaussians.attenuation == AttenuationConfig()
         for notes in (base.notes, inspect(path.with_name("rewritten.ply")).notes):
             (note,) = notes
             assert note.startswith(begin) and all(part in note for part in parts)

@@ -35,7 +35,6 @@ def drawn(some: Parameters, view: Camera, screen_filter: ScreenFilter) -> tuple[
     means, quats, scales, opacities, sh0, shN = (x.double().numpy() for x in some.values())
     y, x = np.mgrid[: view.height, : view.width] + 0.5
     image, through = np.zeros((view.height, view.width, 3)), np.ones((view.height, view.width))
-    ended = np.zeros_like(through, bool)
 
     def pixel(point: np.ndarray) -> np.ndarray:
         return (K @ point)[:2] / point[2]
@@ -51,8 +50,7 @@ def drawn(some: Parameters, view: Camera, screen_filter: ScreenFilter) -> tuple[
         power = -0.5 * np.einsum("hwi,ij,hwj->hw", offsets, np.linalg.inv(covariance), offsets)
         alpha = np.minimum(opacities[i] * shown * np.exp(power), 0.999)
         alpha[alpha < 1 / 255] = 0
-        ended |= through * (1 - alpha) <= 1e-4
-        alpha[ended] = 0
+        alpha[through <= 1e-4] = 0
         direction = means[i] - eye
         basis = harmonics(direction / np.linalg.norm(direction))[: 1 + len(shN[i])]
         color = np.maximum(0.5 + basis @ np.concatenate([sh0[i], shN[i]]), 0)

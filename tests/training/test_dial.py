@@ -95,7 +95,7 @@ def test_what_does_not_fit_is_refused(captured: Pair) -> None:
     for call, message in (
         (lambda: attach(base, scene, form="paper"), "call adapt"), (lambda: attach(base, []), "no training views"),
         (lambda: attach({"means": base.means}, scene), "needs quats, scales, opacities, sh0 too, it has means"),
-        (lambda: dial.loss(1.0, torch.tensor(1.0)), "5 splats now, but the dial is for 300"),
+        (dial.gaussians, "5 splats now, but the dial is for 300"),
     ):  # fmt: skip
         with pytest.raises(ClodError, match=message):
             call()

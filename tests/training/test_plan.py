@@ -2,7 +2,9 @@
 
 import json
 import math
+import re
 from dataclasses import replace
+from statistics import fmean
 
 import pytest
 import torch
@@ -64,7 +66,8 @@ def test_seen_gaussians_change_a_pixel_when_removed() -> None:
 def test_sh_degrees_are_kept_or_left_out(visible: Pair) -> None:
     base, scene = visible
     plan = make_plan(base, scene, CONFIG)
-    assert verdicts(plan) == {"SH degree 1": "kept", "unseen Gaussians": "kept"} and plan.sh_degree == 1
+    assert list(verdicts(plan).items())[:2] == [("SH degree 1", "kept"), ("unseen Gaussians", "kept")]
+    assert plan.sh_degree == 1 and plan.kept is None
     faint = base.replace(shN=1e-5 * base.shN)
     plan = make_plan(faint, scene, CONFIG)
     assert verdicts(plan)["SH degree 1"] == "left out" and plan.sh_degree == 0
@@ -87,6 +90,18 @@ def test_share_at_full_quality_is_measured(visible: Pair) -> None:
     (decision,) = (one for one in plan.decisions if "at s = 1" in one.what)
     share = plan.config.start_share
     assert share is not None and decision.what == f"{share:.0%} of the Gaussians at s = 1" and decision.number < 0.03
+
+
+def test_the_far_end_is_told(visible: Pair) -> None:
+    """The share that the start keeps at max_sv, and the max_sv at which few are kept."""
+    plan = make_plan(*visible, CONFIG)
+    (told,) = (f"{one.what} {one.why}" for one in plan.decisions if "at s = 4" in one.what)
+    kept, few, farther = map(int, re.search(r"(\d+)% at .*?(\d+)% with --max-sv (\d+)", told).groups())
+
+    def percent(s: float) -> float:
+        return 100 * fmean(float(render(plan.start, view.camera, s).kept.double().mean()) for view in visible[1].train)
+
+    assert percent(4.0) == pytest.approx(kept, abs=0.51) and percent(farther) <= few < percent(farther - 1)
 
 
 def test_impossible_overrides_are_refused() -> None:

@@ -44,7 +44,7 @@ def test_a_resumed_run_ends_with_the_same_bits(captured: Pair, form: str) -> Non
     if form == "sigma_d alone":
         base = base.replace(shN=torch.zeros_like(base.shN))
     if form == "paper":
-        base = with_dial(base, torch.full((len(base),), 1.5), AttenuationConfig(scene_distance=4.0, max_sv=3.0))
+        base = with_dial(base, torch.full((len(base),), 1.5), AttenuationConfig(form="paper", max_sv=3.0))
     config, states = config_of(**{"iters": 12, **RESUMED[form]}), dict[int, TrainingState]()
     whole = adapt(base, scene, config, states_of({1, 6, 10, 11}, states))
     if form == "sigma_d alone":

@@ -1,6 +1,5 @@
 """What a step is made of: views and dial values of the schedule, the target-count curve, and Adam on some rows."""
 
-import dataclasses
 import math
 from dataclasses import replace
 
@@ -8,14 +7,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from clod_adapter import View
-from clod_adapter.config import AdaptConfig, AttenuationConfig
-from clod_adapter.equation.attenuation import attenuate
+from clod_adapter import AttenuationConfig, View
+from clod_adapter.config import AdaptConfig
+from clod_adapter.training.dial import TrainableSubset
 from clod_adapter.training.optimizer import RowAdam
-from clod_adapter.training.paper import paper_count, soft_count
+from clod_adapter.training.paper import PaperDial
 from clod_adapter.training.schedule import OURS, PAPER, Schedule, ViewSampler
-from clod_adapter.training.target_count import TEMPERATURE, count_gradient, count_slope, target_curve, target_share
-from scenes import capture
+from clod_adapter.training.target_count import SHARPNESS, count_gradient, count_slope, target_curve, target_share
+from scenes import camera, capture, gaussians
 
 VIEWS = capture(n=20)[1].train
 
@@ -29,8 +28,8 @@ def assert_uniform(values: torch.Tensor) -> None:
 def test_dial_values_follow_the_schedule() -> None:
     """1, or 0, in a falling share of the steps, else (log-)uniform from 1 on; in every stretch."""
 
-    def drawn(schedule: Schedule, share_done: float = 0.0, tau: float | None = None) -> torch.Tensor:
-        sampler = ViewSampler(VIEWS, AdaptConfig(max_sv=4.0), tau, schedule)
+    def drawn(schedule: Schedule, share_done: float = 0.0) -> torch.Tensor:
+        sampler = ViewSampler(VIEWS, AdaptConfig(max_sv=4.0), schedule)
         samples = [sampler.draw(k, share_done) for k in range(480)]
         names = [sample.view.camera.name for sample in samples]  # each view once a round
         assert all(len({*names[k : k + len(VIEWS)]}) == len(VIEWS) for k in range(0, 480, len(VIEWS)))
@@ -42,92 +41,85 @@ def test_dial_values_follow_the_schedule() -> None:
     assert_uniform((drawn(PAPER) - 1) / 3)
     assert abs(int((drawn(Schedule(full=0.5, full_final=0.5), 0.5) <= 1).sum()) - 0.375 * 480) <= 1
     assert ViewSampler(VIEWS, AdaptConfig(max_sv=1.0)).draw(0, 0.0)[1:] == (1.0, None, False)
-    assert drawn(Schedule(full=0.0), tau=0.2).max() < (4 + 1 / 0.2) / 2  # at 5 nothing is kept
 
 
 def test_first_steps_have_photographs_of_half_the_size() -> None:
     """Unless these would be small, or the step is at s = 1."""
-    camera = replace(VIEWS[0].camera, width=301, height=258, K=torch.tensor([[90.0, 0, 150], [0, 90, 129], [0, 0, 1]]))
+    whole = replace(VIEWS[0].camera, width=301, height=258, K=torch.tensor([[90.0, 0, 150], [0, 90, 129], [0, 0, 1]]))
     image = torch.randint(256, (258, 301, 3), generator=torch.Generator().manual_seed(0)).byte()
-    large, small = View(camera, image), View(replace(camera, height=255), image[:255])
+    large, small = View(whole, image), View(replace(whole, height=255), image[:255])
     cases = ((large, 0.49, 0.0, True), (large, 0.5, 0.0, False), (small, 0.0, 0.0, False), (large, 0.0, 1.0, False))
     for view, share_done, full, expected in cases:
         schedule = Schedule(coarse=0.5, full=full)
-        sample = ViewSampler((view,), AdaptConfig(), None, schedule).draw(0, share_done)
+        sample = ViewSampler((view,), AdaptConfig(), schedule).draw(0, share_done)
         assert sample.halved == expected and (sample.view is view) != expected
 
 
 CONFIG = AdaptConfig(max_sv=6.0)
-ATTENUATION = CONFIG.attenuation(1.0)
 N = 2000
 
 
-def some(seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
-    """Opacity logits, log sigma_d and normalised distances."""
-    generator = torch.Generator().manual_seed(seed)
-    logits, log_sigma, d = (torch.randn(N, generator=generator) for _ in range(3))
-    return 2 * logits + 1, log_sigma * 0.8, (0.3 * d).exp()
+def some() -> tuple[Tensor, Tensor]:
+    """log sigma_d and normalised distances."""
+    log_sigma, d = torch.randn(2, N, generator=torch.Generator().manual_seed(0))
+    return 1 + 0.8 * log_sigma, (0.3 * d).exp()
 
 
-def gradient(logits: Tensor, log_sigma: Tensor, d: Tensor, s: float, **changes: float) -> Tensor:
-    config = dataclasses.replace(CONFIG, **changes)
-    return count_gradient(d, logits, log_sigma.exp(), s, ATTENUATION, 0.1, config, target_share(s, N, config))
+def gradient(log_sigma: Tensor, d: Tensor, s: float, **changes: float) -> Tensor:
+    config = replace(CONFIG, **changes)
+    return count_gradient(d, log_sigma.exp(), s, 0.1, config, target_share(s, N, config))
 
 
 def test_count_gradient_penalises_excess_and_deficit() -> None:
     """The gradient is that of the squared excess; it is 0 for a single remaining Gaussian."""
-    logits, log_sigma, d = some()
-    many, few = log_sigma + 3, log_sigma - 2
+    log_sigma, d = some()
     for s in (1.5, 6.0):
-        dialled = attenuate(logits, log_sigma.exp(), d, s, ATTENUATION)
-        slope = count_slope(logits, dialled.log_opacities, s, ATTENUATION.tau, TEMPERATURE)
         share = target_curve(s, CONFIG.share, CONFIG.exponent)
-        excess = float(dialled.keep.float().mean()) / share - 1
-        want = 0.1 * 2 * CONFIG.reg_weight * excess / share * slope
-        torch.testing.assert_close(gradient(logits, log_sigma, d, s), want)
-        assert gradient(logits, many, d, s).max() > 0 >= -gradient(logits, many, d, s).min()
-        assert gradient(logits, few, d, s).min() < 0 and gradient(logits, few, d, s).max() <= 0
-        assert (gradient(logits, log_sigma, d, s, reg_weight=0.0) == 0).all()
-    one, target = torch.ones(1), target_share(5.0, 1, CONFIG)
-    assert attenuate(4 * one, 5 * one, one, 5.0, ATTENUATION).keep.all()
-    assert count_gradient(one, 4 * one, 5 * one, 5.0, ATTENUATION, 1.0, CONFIG, target).item() == 0
-    # Where a'' is 0 at every dial value nothing else has a slope: at the floor that training has, and at 0.
-    for gone in (-9.2, -100.0):
-        assert (gradient(logits, torch.full((N,), gone), d, 2.0) < 0).all()
+        excess = float((d * s < log_sigma.exp()).float().mean()) / share - 1
+        want = 0.1 * 2 * CONFIG.reg_weight * excess / share * count_slope(d * s, log_sigma.exp())
+        assert excess > 0.1
+        torch.testing.assert_close(gradient(log_sigma, d, s), want, rtol=1e-4, atol=1e-9)
+        few = gradient(log_sigma - 3, d, s)
+        assert few.max() <= 0 and (few[d * s > (log_sigma - 3).exp()] < 0).all()
+        assert (gradient(log_sigma, d, s, reg_weight=0.0) == 0).all()
+    one = torch.ones(1)
+    assert count_gradient(one, 6 * one, 5.0, 1.0, CONFIG, target_share(5.0, 1, CONFIG)).item() == 0
+    for gone in (-9.2, -100.0):  # where none is near its reach: at the floor that training has, and at 0
+        assert (gradient(torch.full((N,), gone), d, 2.0) < 0).all()
     mixed = torch.where(torch.arange(N) % 2 == 0, 5.0, -9.2)  # half are kept, where the curve at s = 6 has 7 %
-    assert (gradient(logits, mixed, d, 6.0) >= 0).all() and (gradient(logits, mixed, d, 6.0)[1::2] < 1e-20).all()
+    assert (gradient(mixed, d, 6.0) >= 0).all() and (gradient(mixed, d, 6.0)[1::2] < 1e-20).all()
 
 
-def test_count_slope_is_that_of_the_soft_count() -> None:
-    """Where 2 u > 1; below, 2 u counts as 1, so that Gaussians without attenuation have a gradient."""
-    tau, s, temperature = 0.02, 2.0, 0.5
-    logits = torch.linspace(-5, 5, 200, dtype=torch.float64)
-    d, log_sigma = torch.linspace(0.1, 1, 200, dtype=torch.float64), torch.linspace(-1, 2, 200, dtype=torch.float64)
-    log_sigma = log_sigma[torch.randperm(200, generator=torch.Generator().manual_seed(0))].requires_grad_()
-    out = attenuate(logits, log_sigma.exp(), d, s, AttenuationConfig(tau=tau, eps=0.0))
-    (want,) = torch.autograd.grad(soft_count(out.log_opacities, s, tau, temperature), log_sigma)
-    logs = out.log_opacities.detach()
-    got = count_slope(logits, logs, s, tau, temperature)
-    touched = 2 * (torch.nn.functional.logsigmoid(logits) - logs)
-    assert 20 < int((touched > 1).sum()) < 180
-    torch.testing.assert_close(got[touched > 1], want[touched > 1])
-    q = torch.sigmoid((logs - math.log(tau * s)) / temperature)
-    torch.testing.assert_close(got[touched <= 1], (q * (1 - q) / (temperature * 200))[touched <= 1])
+def test_count_slope_is_that_of_a_soft_count() -> None:
+    log_sigma, d = (x.double() for x in some())
+    soft = 1 / (1 + (2 * d / log_sigma.requires_grad_().exp()) ** SHARPNESS)
+    (want,) = torch.autograd.grad(soft.mean(), log_sigma)
+    assert (want > 0.1 * want.max()).sum() > 100
+    torch.testing.assert_close(count_slope(2 * d, log_sigma.detach().exp()), want)
+    assert (count_slope(d, 0 * d) == 0).all()
+
+
+def papers_gradient(count: int, total: int | None, s: float) -> Tensor:
+    """Of the opacities, by the paper's count term; those beyond 40 are culled."""
+    some = gaussians(65, 0, 0).replace(sigma_d=torch.ones(65), attenuation=AttenuationConfig(form="paper"))
+    some.opacity_logits[40:] = -40.0
+    some.means[40:] = some.means[0]  # so that the largest distance is one of the others'
+    shown = some.select(torch.arange(count)).replace(opacity_logits=some.opacity_logits[:count].requires_grad_())
+    dial = PaperDial(shown, shown, [camera()], AdaptConfig.paper(), TrainableSubset(count, total=total))
+    dial.objective(torch.zeros(()), shown, camera(), s).backward()
+    return shown.opacity_logits.grad[:40]
 
 
 @pytest.mark.parametrize("form", ["ours", "paper"])
 def test_shares_count_gaussians_that_are_left_out(form: str) -> None:
-    logits, log_sigma, d = some()
-    logits[40:65], found, s = -40.0, [], 3.0
+    (log_sigma, d), found, s = some(), [], 3.0
+    log_sigma[40:65] = -9.2
     for count, total in ((65, None), (40, 65)):
-        sigma = log_sigma[:count].exp().requires_grad_()
-        dialled = attenuate(logits[:count], sigma, 0.1 * d[:count], s, ATTENUATION)
         if form == "paper":
-            paper_count(dialled, s, ATTENUATION.tau, CONFIG, total).backward()
-            found.append(sigma.grad[:40])
+            found.append(papers_gradient(count, total, s))
         else:
-            given = 0.1 * d[:count], logits[:count], sigma, s, ATTENUATION
-            found.append(count_gradient(*given, 0.3, CONFIG, target_share(s, count, CONFIG, total))[:40])
+            given = d[:count], log_sigma[:count].exp(), s, 0.3, CONFIG
+            found.append(count_gradient(*given, target_share(s, count, CONFIG, total))[:40])
     assert found[0].abs().max() > 0 and torch.allclose(*found, rtol=1e-5, atol=0)
 
 

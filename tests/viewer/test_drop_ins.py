@@ -152,9 +152,13 @@ def test_the_dial_is_as_exact_as_the_viewer(tabs: Any, viewer: str, suffix: str,
         page.evaluate("dial.set(2)")
         page.wait_for_timeout(200)
         assert page.evaluate("dial.s") == 2
-        clod_adapter.save(tmp_path / "plain.ply", scenes.gaussians(50, 0, 7))
-        plain = list((tmp_path / "plain.ply").read_bytes())
         script = "import('/viewers/dial.js').then((m) => m.readDial(Uint8Array.from(given))).catch(String)"
-        assert "the file has no sigma_d, so no dial; adapt it with" in page.evaluate(f"(given) => {script}", plain)
+        for model, error in (
+            (scenes.gaussians(50, 0, 7), "the file has no sigma_d, so no dial; adapt it with"),
+            (scenes.dialled(50, 0, 7, form="paper"), "the paper's form, which viewers do not draw"),
+        ):
+            clod_adapter.save(tmp_path / "refused.ply", model)
+            data = list((tmp_path / "refused.ply").read_bytes())
+            assert error in page.evaluate(f"(given) => {script}", data)
         if viewer == "playcanvas":
             assert_the_wgsl_of_playcanvas_gives_the_equation(page, about)

@@ -88,7 +88,7 @@ def test_a_page_of_one_file(show: Any, save: Any, monkeypatch: pytest.MonkeyPatc
     far = model.replace(
         means=size * model.means, log_scales=model.log_scales + float(np.log(size)), sigma_d=size * model.sigma_d,
         growth_d=torch.linspace(-0.5, 1, 1000),
-        attenuation=replace(model.attenuation, reference_distance=3 * size, eps=size**2 * model.attenuation.eps),
+        attenuation=replace(model.attenuation, reference_distance=3 * size),
     )  # fmt: skip
     path, row = save(far), CalibrationRow(1.0, 900.0, 31.5, 0.9, 4.0)
     calibrated = replace(clod_adapter.load(path), calibration=Calibration((row,), 1000, 2, 8, 6, "a machine"))

@@ -16,9 +16,11 @@ import clod_adapter
 import scenes
 from clod_adapter.cameras import Camera
 from clod_adapter.config import FILTERS, ScreenFilter
+from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.file_formats import write
 from clod_adapter.render import render
+from clod_adapter.viewer.page import Payload
 from formats import write_rows
 from shown import TALL, Shown, assert_alike, assert_same, drop, message, take
 
@@ -47,12 +49,9 @@ def small(size: float) -> tuple[Gaussians, tuple[float, ...], Camera]:
 # Model, dial values and camera; each differs from the others in what is named.
 CASES: dict[str, tuple[Gaussians, tuple[float, ...], Camera]] = {
     "degree 3": (scenes.dialled(500, 3, 7), (1.0, 3.0), VIEW),
-    "hard, view's unit, compensated": (
-        finer(scenes.dialled(500, 1, 7, cut="hard", normalizer="max"), 2, screen_filter=FILTERS["on"]), (2.0,), VIEW
-    ),
-    "eps, wide blur": (
-        finer(scenes.dialled(500, 1, 7, tau=0.05, eps=0.5, scene_distance=2.0), 2, screen_filter=WIDE),
-        (2.0,), VIEW,
+    "compensated": (finer(scenes.dialled(500, 1, 7), 2, screen_filter=FILTERS["on"]), (2.0,), VIEW),
+    "another unit, wide blur": (
+        finer(scenes.dialled(500, 1, 7, scene_distance=2.0), 2, screen_filter=WIDE), (2.0,), VIEW
     ),
     "growth": (
         grown(1500, 0, 1.5, 1, max_sv=10.0, reference_distance=4.5), (1.0, 8.0), scenes.camera(320, 240, fov=40)
@@ -72,7 +71,7 @@ def test_the_picture_and_the_count(shown: Shown, save: Any, name: str) -> None:
     for s in dials:
         shown.run("clod.setDial(given)", s)
         assert_same(shown, render(model, camera, s))
-        if name in ("growth", "eps, wide blur"):  # the measure tells them from models without it
+        if name in ("growth", "another unit, wide blur"):  # the measure tells them from models without it
             other = model.replace(growth_d=None, screen_filter=FILTERS["off"])
             with pytest.raises(AssertionError):
                 assert_alike(shown.picture(), render(other, camera, s).pixels.numpy())
@@ -152,6 +151,27 @@ def test_other_files_are_errors_and_the_picture_stays(shown: Shown, model: Path,
         drop(shown, name, content)
         assert error.format(name) in message(shown, name) and shown.text("#title") == "model.ply", name
     assert np.array_equal(shown.picture(), before)
+
+
+def test_other_forms_of_the_dial_are_refused_with_a_remedy(shown: Shown, model: Path, tmp_path: Path) -> None:
+    """The paper's, and that of files from before every Gaussian had a reach; by comments, columns and documents."""
+    loaded = clod_adapter.load(model)
+    paper = replace(loaded.gaussians.attenuation, form="paper")
+    write(tmp_path / "paper.spz", loaded.gaussians.replace(attenuation=paper))
+    ours, column, data = b"comment clod_adapter form ours\n", b"property float nx\n", model.read_bytes()
+    assert ours in data and column in data
+    of_paper, earlier = "without --form paper", "its dial is of an earlier form; adapt its checkpoint again"
+    for name, content, error in (
+        ("paper.spz", (tmp_path / "paper.spz").read_bytes(), of_paper),
+        ("paper.ply", data.replace(ours, b"comment clod_adapter form paper\n"), of_paper),
+        ("column.ply", data.replace(ours, b"").replace(column, b"property float clod_tau\n"), earlier),
+        ("comment.ply", data.replace(ours, b"comment clod_adapter cut soft\n"), earlier),
+    ):
+        drop(shown, name, content)
+        said = message(shown, name)
+        assert error in said and "opens every format" not in said, (name, said)
+    with pytest.raises(ClodError, match="the paper's form, which viewers do not draw; adapt it without --form paper"):
+        Payload.of(replace(loaded, gaussians=loaded.gaussians.replace(attenuation=paper)))
 
 
 def test_the_last_of_two_dropped_files_is_shown(show: Any, save: Any, model: Path, gaussians: Gaussians) -> None:

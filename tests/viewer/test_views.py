@@ -59,7 +59,7 @@ def target(shown: Shown, text: str) -> str:
 def test_the_count_box(shown: Shown, gaussians: Gaussians) -> None:
     """A count sets the dial value of ``dial_for``; its note ends with the state that it is about. Keys wait."""
     camera = scenes.camera(320, 240)
-    wanted = clod_adapter.dial_for(gaussians, keep=150, cameras=[camera]).virtual_scale
+    wanted = clod_adapter.dial_for(gaussians, keep=280, cameras=[camera]).virtual_scale
     fold(shown, True)
     shown.camera(camera)
     before = shown.picture()
@@ -70,11 +70,11 @@ def test_the_count_box(shown: Shown, gaussians: Gaussians) -> None:
         assert "Enter a number of Gaussians" in target(shown, text) and shown.text("#dial-value") == "s = 1.00"
     assert "keeps" in target(shown, "1,000,000")
     shown.run("clod.setEquation(false)")
-    assert "keeps 150 in this view" in target(shown, "150")
-    assert shown.counts()["kept"] == 150 and shown.page.is_checked("#equation")
+    assert "keeps 280 in this view" in target(shown, "280")
+    assert shown.counts()["kept"] == 280 and shown.page.is_checked("#equation")
     assert float(shown.text("#dial-value").removeprefix("s = ")) == pytest.approx(wanted, rel=0.02)
     for change in ("]", "ArrowLeft"):
-        assert "keeps" in target(shown, "150")
+        assert "keeps" in target(shown, "280")
         shown.page.evaluate("document.activeElement.blur()")
         shown.page.keyboard.press(change)
         assert shown.text("#target-note") == "", change

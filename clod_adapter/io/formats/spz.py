@@ -63,7 +63,7 @@ def write(path: Path, gaussians: Gaussians, metadata: Metadata) -> tuple[str, ..
     distance, as many checkpoints have them, would leave the rest too few: see ``_nearer``.
     """
     config = gaussians.attenuation
-    if config is not None and config.normalizer == "scene":  # in world units float16 would cut a large sigma_d off
+    if config is not None and config.form == "ours":  # in world units float16 would cut a large sigma_d off
         distance = known_distance(config) or estimated_distance(gaussians.means)
         gaussians = with_distance(gaussians, distance) if distance > _FAR else gaussians
     arrays, bits, moved = _nearer(arrays_of(path, gaussians))

@@ -132,6 +132,7 @@ def test_without_held_out_photographs(clod: Any, capture: Any, tmp_path: Path) -
 def test_without_photographs(clod: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The target images are renders of the base, rounded to bytes."""
     monkeypatch.setattr(prepare, "place_cameras", partial(prepare.place_cameras, views=16))
+    monkeypatch.setattr("clod_adapter.cli.adapt.run.ENOUGH", (50.0, 25.0))  # dB, more than the result has
     done = clod("BASE", TINY, "--json")
     report = done.report
     assert report["scene"] is None and report["teacher"] == "checkpoint" and report["seconds"]["place"] > 0
@@ -160,7 +161,7 @@ def test_ci_banana(clod: Any, ci_banana: Path) -> None:
 
 
 def test_unusual_inputs(clod: Any, capture: Any, tmp_path: Path) -> None:
-    """Few photographs get pseudo views, faint Gaussians a lower tau; invisible ones cannot do without any."""
+    """Few photographs get pseudo views; invisible Gaussians cannot do without any."""
     shutil.copytree(capture.scene, tmp_path / "few")
     for k in range(1, 5):
         (tmp_path / "few" / "images" / f"{k:03}.png").unlink()
@@ -169,12 +170,8 @@ def test_unusual_inputs(clod: Any, capture: Any, tmp_path: Path) -> None:
     assert any("4 of 10 photographs are missing and left out (001.png, " in note for note in report["notes"])
     assert report["config"]["lr_means"] == AdaptConfig().lr_means / 2
     assert report["config"]["lr_sigma"] == AdaptConfig().lr_sigma
-    logits = torch.full_like(capture.gaussians.opacity_logits, -4.6)
-    capture.write(tmp_path / "faint.ply", capture.gaussians.replace(opacity_logits=logits))
-    report = clod("faint.ply --images SCENE --iters 2 --out dial.ply --json --misaligned-ok").report
-    assert report["attenuation"]["tau"] < 0.003 and report["config"]["tau"] == 0.02
-    assert any("the Gaussians are faint" in note for note in report["notes"])
-    capture.write(tmp_path / "none.ply", capture.gaussians.replace(opacity_logits=logits - 16))
+    logits = torch.full_like(capture.gaussians.opacity_logits, -20.6)
+    capture.write(tmp_path / "none.ply", capture.gaussians.replace(opacity_logits=logits))
     done = clod("none.ply --out dial.ply --quiet", code=2)
     assert done.err.count("\n") == 1 and "no camera can be placed" in done.err
 

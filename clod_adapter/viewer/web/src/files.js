@@ -29,7 +29,7 @@ async function readFile(blob, name) {
   const failed = (message) => { throw new Error(`${name}: ${message}`); };
   const bytes = await blob.arrayBuffer().catch(() => failed("the browser cannot read it: it is a folder or too large"));
   const read = await readGaussians(new Uint8Array(bytes)).catch(({ message }) =>
-    failed(/again$/.test(message) ? message : `${message}; clod-adapt view ${name} opens every format`));
+    failed(/(again|paper)$/.test(message) ? message : `${message}; clod-adapt view ${name} opens every format`));
   return { ...read, name };
 }
 

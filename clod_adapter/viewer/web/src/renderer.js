@@ -1,5 +1,5 @@
 // Draws models: a pass projects each Gaussian to a texel, another draws a quad each, farthest first, into half floats.
-import { growthDistance } from "../../../../viewers/equation.js";
+import { growthStart } from "../../../../viewers/equation.js";
 import { timed } from "../../../../viewers/frame_rate.js";
 import { WIDTH, heightOf, program, set, target, texture } from "./gpu.js";
 import { copyVertex, copyFragment, projectFragment, splatFragment, splatVertex } from "./shaders.js";
@@ -13,7 +13,7 @@ export function createRenderer(canvas) {
   const image = target(gl, 1, gl.RGBA16F, gl.RGBA, gl.HALF_FLOAT);
 
   function project({ side, model, dial, attenuated }, { rotation, eye, fx, fy, cx, cy, width, height, near }) {
-    const { records, sh, screenFilter, attenuation, degree, count } = model, { eps = 0, tau = 0, cut } = attenuation ?? {};
+    const { records, sh, screenFilter, degree, count } = model, attenuation = model.attenuation ?? { scene_distance: 1 };
     const { handle, uniforms } = (projectors[degree] ??= program(gl, copyVertex, projectFragment(degree)));
     projected.resize(WIDTH, Math.max(heightOf(count), projected.height));
     gl.bindFramebuffer(gl.FRAMEBUFFER, projected.handle);
@@ -23,7 +23,7 @@ export function createRenderer(canvas) {
     gl.uniformMatrix3fv(uniforms.view, true, rotation);
     set(gl, uniforms, {
       eye, pinhole: [fx, fy, cx, cy], size: [width, height, near], blur: screenFilter.variance, compensate: screenFilter.compensate,
-      attenuated, dial, distance_unit: side.distance, reach: growthDistance(attenuation ?? {}), eps, tau, soft: cut === "soft",
+      attenuated, dial, distance_unit: attenuation.scene_distance, start: growthStart(attenuation),
     }, { order: side.order, records, sh });
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }

@@ -50,8 +50,8 @@ uniform mat3 view;           // world to camera, OpenCV axes
 uniform vec3 eye;
 uniform vec4 pinhole;        // fx, fy, cx, cy
 uniform vec3 size;           // width, height, near
-uniform bool attenuated, soft;
-uniform float dial, distance_unit, reach, eps, tau;
+uniform bool attenuated;
+uniform float dial, distance_unit, start;
 uniform float blur;          // px^2 that the screen-space filter adds to covariances
 uniform bool compensate;     // whether opacities are scaled by the ratio of the areas without and with the filter
 // Bits of floats, because every WebGL2 device renders to integers. footprint: centre, major half-axis; conic: conic, length
@@ -71,9 +71,9 @@ void main() {
   vec3 ray = mean.xyz - eye, point = view * ray;
   if (!(point.z >= size.z)) return;
   float opacity = mean.w, distance = length(ray) / distance_unit;
-  if (attenuated) opacity = clodOpacity(opacity, shape.w, distance, dial, eps, tau, soft);
+  if (attenuated) opacity = clodOpacity(opacity, shape.w, distance, dial);
   vec4 tint = texelFetch(records, texelAt(record + 3), 0);
-  if (attenuated) shape.xyz *= clodScale(tint.a, distance, dial, reach);
+  if (attenuated) shape.xyz *= clodScale(tint.a, distance, dial, start);
 
   vec2 margin = 0.15 * size.xy / pinhole.xy;
   vec2 slope = clamp(point.xy / point.z, -pinhole.zw / pinhole.xy - margin, (size.xy - pinhole.zw) / pinhole.xy + margin);

@@ -18,7 +18,7 @@ export function show(read, readBase) {
   for (const old of [model, base]) if (old !== nextBase) old?.destroy();
   [model, base] = [next, nextBase];
   for (const side of sides) renderer.release(side);
-  sides = [0, 1].map(() => ({ model: null, order: null, drawn: 0, kept: 0, distance: 1, version: -1, busy: false }));
+  sides = [0, 1].map(() => ({ model: null, order: null, drawn: 0, kept: 0, version: -1, busy: false }));
   change();
 }
 

@@ -1,0 +1,134 @@
+"""Near to far: from a door in a made-up town to a hundred times as far, by the dial at s = 1 and by its base.
+
+    python benchmarks/walk.py --record     # adds a row to results/walk.jsonl
+    python benchmarks/walk.py --table      # the last row as a Markdown table
+
+The town is ``city.py``'s, and the checkpoint the perturbed town, tuned on photographs from the streets, from the air
+and from as far as the walk; both are kept in ``benchmarks/cache``. The default command adapts it to these photographs.
+Every frame is compared with the supersampled, unperturbed town.
+"""
+
+import json
+import math
+import tempfile
+from pathlib import Path
+from statistics import fmean
+
+import clod_adapter as clod
+from city import HOUSE, PITCH, SKY, city, city_cameras, look_at, lots, perturb
+from clod_adapter.config import FILTERS
+from clod_adapter.io.atomic import atomic_path
+from common import CACHE, COMMAND, Process, Row, append, arguments, stored, table
+from large import SAMPLES, supersampled, write_photographs
+from tuning import Tuning, tune
+
+import numpy as np
+
+FILE = "walk.jsonl"
+COUNT = 80_000
+DISTANCES = [round(4 * 100 ** (k / 24), 2) for k in range(25)]  # metres from the door
+EYE = 1.7  # metres above the ground at the door
+RISE = 30.0  # degrees of elevation at the last frame
+SKY_RADIUS = 1000.0  # metres; a small town's own sky would hide it from afar
+SIZE = (480, 320)
+PHOTOGRAPHS = 96
+STEPS = 400  # of tuning
+BANDS = {"within 12 m": 12.0, "12 to 40 m": 40.0, "40 to 120 m": 120.0, "beyond": math.inf}
+
+
+def main() -> None:
+    parser = arguments(__doc__, table=lambda: print(*map(summary, stored(FILE)[-1:])), record=FILE)
+    parser.add_argument("--count", type=int, default=COUNT, help=f"Gaussians of the town (default: {COUNT})")
+    args = parser.parse_args()
+    row = measure(args.count)
+    if args.record:
+        append(FILE, row)
+    print(summary(row))
+
+
+def measure(count: int) -> Row:
+    folder = made(count)
+    truth = town(count)
+    with tempfile.TemporaryDirectory() as place:
+        out = Path(place) / "dial.ply"
+        run = Process([*COMMAND, folder / "base.ply", "--images", folder, "--out", out, "--json", "--accept-loss"])
+        shown = {"base": clod.load(folder / "base.ply").gaussians, "dial": clod.load(out).gaussians}
+    row: Row = {"benchmark": "walk", "count": count, "steps": json.loads(run.out)["steps"], **run.cost()}
+    row |= {"distances": DISTANCES, "base": [], "dial": []}
+    for distance in DISTANCES:
+        camera = walker(count, distance)
+        view = clod.View(camera, supersampled(truth, camera, SAMPLES))
+        for name, gaussians in shown.items():
+            (found,) = clod.evaluate(gaussians, view, 1.0)
+            row[name].append({"psnr": round(found.psnr, 3), "in_view": found.in_view})
+    return row
+
+
+def town(count: int) -> clod.Gaussians:
+    """The truth, with a sky that is farther away than the walk."""
+    truth = city(count).replace(screen_filter=FILTERS["on"])
+    sky = slice(count - round(SKY * count), count)
+    farther = SKY_RADIUS / (3 * lots(count) * PITCH)
+    truth.means[sky] *= farther
+    truth.log_scales[sky] += math.log(farther)
+    return truth
+
+
+def made(count: int) -> Path:
+    """A folder of photographs with their checkpoint, ``base.ply``, made now if it is not in the cache."""
+    folder = CACHE / f"walk-{count}"
+    if not folder.exists():
+        CACHE.mkdir(parents=True, exist_ok=True)
+        truth = town(count)
+        with atomic_path(folder) as part:
+            write_photographs(truth, photographers(count), part)
+            tuned, _ = tune(perturb(truth), clod.load_scene(part).train, Tuning(iters=STEPS))
+            clod.save(part / "base.ply", tuned)
+    return folder
+
+
+def photographers(count: int) -> list[clod.Camera]:
+    """A third each in the streets, in the air, and on all sides as far away as the walk."""
+    third = PHOTOGRAPHS // 3
+    random = np.random.default_rng(2)
+    found = city_cameras(PHOTOGRAPHS - third, *SIZE, count=count)
+    for _ in range(third):
+        turn = random.uniform(0, 2 * math.pi)
+        rise = math.radians(random.uniform(15, 40))
+        away = DISTANCES[-1] * math.exp(random.uniform(math.log(0.3), 0.1))
+        direction = np.array([math.cos(rise) * math.cos(turn), -math.sin(rise), math.cos(rise) * math.sin(turn)])
+        found.append(look_at(away * direction, np.zeros(3), *SIZE, "far"))
+    random.shuffle(found)  # every 8th is held out
+    return found
+
+
+def walker(count: int, distance: float) -> clod.Camera:
+    """From a door in the middle of the town into its street, then along that and up; always facing the door."""
+    across = (PITCH - HOUSE) / 2  # to the middle of the street, which runs along z
+    odd = lots(count) % 2
+    door = np.array([odd * PITCH / 2 - across, -EYE, (odd - 1) * PITCH / 2])
+    share = math.log(distance / DISTANCES[0]) / math.log(DISTANCES[-1] / DISTANCES[0])
+    up = distance * math.sin(math.radians(RISE * share))
+    side = min(0.8 * distance, across)
+    eye = door + np.array([side, -up, -math.sqrt(distance**2 - up**2 - side**2)])
+    return look_at(eye, door, *SIZE, f"{distance:g} m")
+
+
+def summary(row: Row) -> str:
+    """A Markdown table by band of distance, means over its frames."""
+    lines = []
+    nearest = 0.0
+    for name, farthest in BANDS.items():
+        inside = [k for k, distance in enumerate(row["distances"]) if nearest < distance <= farthest]
+        base = [row["base"][k] for k in inside]
+        dial = [row["dial"][k] for k in inside]
+        psnr = fmean(each["psnr"] for each in base)
+        gain = fmean(each["psnr"] for each in dial) - psnr
+        share = sum(each["in_view"] for each in dial) / sum(each["in_view"] for each in base)
+        lines.append([name, f"{psnr:.2f}", f"{gain:+.2f}", f"{share:.0%}"])
+        nearest = farthest
+    return table(["from the door", "base, dB", "dial, dB against it", "Gaussians in view"], lines, 1)
+
+
+if __name__ == "__main__":
+    main()
