@@ -23,7 +23,7 @@ import pycolmap
 
 FILE = "converged.jsonl"
 DIALS = (1.0, 2.0, 5.0)
-ITERS, FINAL = 3000, 0.01
+ITERS, FINAL = 1500, 0.01
 
 
 def main() -> None:

@@ -1,15 +1,16 @@
 """A large scene against what its user would take instead: PSNR at equal numbers of Gaussians.
 
-    python benchmarks/large.py FINEST.ply --levels LEVEL.ply ... --record              # without photographs
+    python benchmarks/large.py FINEST.ply --record                                     # without photographs
+    python benchmarks/large.py FINEST.ply --levels LEVEL.ply ... --record              # and with an author's levels
     python benchmarks/large.py LEVEL.ply --levels COARSER.ply ... --truth FINEST.ply --record
     python benchmarks/large.py --table
 
-FINEST is adapted without options (max_sv 5). ``levels`` are the coarser ones that its author ships. splat-transform
-(``make peers``) decimates FINEST to the same counts, uniformly and adaptively, and ``export --lod-meta`` writes a
-streaming set of the adapted file with about these counts, which splat-transform reads back. PSNR is the mean over
-VIEWS cameras that training does not use, against renders of FINEST. With ``--truth`` a coarser level is the
-checkpoint, and PHOTOGRAPHS supersampled renders of the finest one are its photographs. ``--adapted`` takes a file of an
-earlier run.
+FINEST is adapted without options (max_sv 5). ``levels`` are the coarser ones that its author ships; without them counts
+are SHARES of FINEST. splat-transform (``make peers``) decimates FINEST to the same counts, in both its ways, and
+``export --lod-meta`` writes a streaming set of the adapted file with about these counts, which splat-transform reads.
+PSNR is the mean over VIEWS cameras that training does not use, against renders of FINEST, at s = 0 too: there it says
+how far training moved what near views show. With ``--truth`` a coarser level is the checkpoint, and PHOTOGRAPHS
+supersampled renders of the finest one are its photographs. ``--adapted`` takes a file of an earlier run.
 """
 
 import json
@@ -27,6 +28,7 @@ import torch
 from PIL import Image
 
 FILE, VIEWS, SEED, LONGEST = "large.jsonl", 16, 77, 40.0
+SHARES = (0.4, 0.18, 0.08)
 PHOTOGRAPHS, SAMPLES = 128, 2  # every 8th is held out; samples along each side of a pixel
 OTHERS = {"decimated": "--decimate", "decimated adaptively": "--decimate-adaptive"}
 
@@ -34,7 +36,7 @@ OTHERS = {"decimated": "--decimate", "decimated adaptively": "--decimate-adaptiv
 def main() -> None:
     parser = arguments(__doc__, table=print_table, record=FILE)
     parser.add_argument("finest", type=Path)
-    parser.add_argument("--levels", nargs="+", type=Path, required=True)
+    parser.add_argument("--levels", nargs="+", type=Path, default=[])
     parser.add_argument("--adapted", type=Path, help="the file of an earlier run, which is not run again")
     parser.add_argument("--truth", type=Path, help="what photographs show; without it there are none")
     args = parser.parse_args()
@@ -67,23 +69,28 @@ def compared(finest: Path, levels: list[Path], adapted: Path | None, truth: Path
     dial = clod.load(out).gaussians
     assert dial.attenuation is not None
     longer = dial.replace(attenuation=replace(dial.attenuation, max_sv=LONGEST))  # beyond what was trained
-    counts = [len(clod.load(level).gaussians) for level in levels]
+    counts = {level.stem: len(clod.load(level).gaussians) for level in levels}
+    counts = counts or {f"{share:.0%}": round(share * len(base)) for share in SHARES}
+    (row,) = clod.evaluate(clod.detach(dial), views, [1.0])
+    yield {"method": "dial", "level": "s = 0", "gaussians": len(base), "share": 1.0, "psnr": row.psnr}
     for label, s in (("s = 1", 1.0), ("s = 2", 2.0), ("s = 5", 5.0)):
         (row,) = clod.evaluate(dial, views, [s])
         yield {"method": "dial", "level": label, "gaussians": row.kept, "share": row.kept_share, "psnr": row.psnr}
-    for count, level in zip(counts, levels, strict=True):
+    for level, count in counts.items():
         share = count / len(base)
         (row,) = clod.evaluate(dial, views, [matching_dial(longer, cameras, count)])
-        yield {"method": "dial", "level": level.stem, "gaussians": row.kept, "share": row.kept_share, "psnr": row.psnr}
-        for name, file in rivals(finest, level, count, folder):
+        yield {"method": "dial", "level": level, "gaussians": row.kept, "share": row.kept_share, "psnr": row.psnr}
+        authors = [each for each in levels if each.stem == level]
+        for name, file in rivals(finest, count, folder, authors):
             if file is None:
-                yield {"method": name, "level": level.stem, "failed": "needs a GPU at this size"}
+                yield {"method": name, "level": level, "failed": "needs a GPU at this size"}
                 continue
             found = clod.load(file).gaussians
             (row,) = clod.evaluate(found, views, [1.0])
-            yield {"method": name, "level": level.stem, "gaussians": len(found), "share": share, "psnr": row.psnr}
+            yield {"method": name, "level": level, "gaussians": len(found), "share": share, "psnr": row.psnr}
     if len(counts) > 1:  # a streaming set has several levels
-        yield from streamed(out, [matching_dial(dial, cameras, count) for count in counts], views, len(base), folder)
+        dials = [matching_dial(dial, cameras, count) for count in counts.values()]
+        yield from streamed(out, dials, views, len(base), folder)
 
 
 @torch.no_grad()
@@ -110,9 +117,9 @@ def write_photographs(shown: clod.Gaussians, cameras: Sequence[clod.Camera], fol
     return folder
 
 
-def rivals(finest: Path, level: Path, count: int, folder: Path) -> Iterator[tuple[str, Path | None]]:
-    """The author's level, and FINEST in ``count`` Gaussians by splat-transform; None where that fails."""
-    yield "author", level
+def rivals(finest: Path, count: int, folder: Path, authors: list[Path]) -> Iterator[tuple[str, Path | None]]:
+    """The author's level, if any, and FINEST in ``count`` Gaussians by splat-transform; None where that fails."""
+    yield from (("author", level) for level in authors)
     for name, option in OTHERS.items():
         out = folder / "decimated.ply"
         out.unlink(missing_ok=True)
