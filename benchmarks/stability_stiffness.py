@@ -19,7 +19,7 @@ from typing import Any
 import clod_adapter as clod
 from clod_adapter._kernels.threads import torch_on_one_thread
 from clod_adapter.equation.attenuation import SIGMA_MAX, attenuate
-from clod_adapter.initialization.importance import extinction_from_rank
+from clod_adapter.initialization.importance import WIDEST, extinction_from_rank
 from clod_adapter.report.charts import BLUE, GREEN, ORANGE, PURPLE, QUIET, label_log, new_figure, save_figure
 from clod_adapter.training.dial import SIGMA_RANGE, Dial
 from clod_adapter.training.optimizer import RowAdam
@@ -101,7 +101,7 @@ def problem(n: int = 192) -> Problem:
     distances = 10 ** torch.empty(n).uniform_(-3, 5, generator=draw)
     logits = torch.empty(n).uniform_(0.3, 0.99, generator=draw).logit()
     rank = torch.randperm(n, generator=draw)
-    right = distances * extinction_from_rank(rank, CONFIG)
+    right = distances * extinction_from_rank(rank, CONFIG).clamp(max=WIDEST * CONFIG.max_sv)
     off = torch.empty(n).uniform_(-WRONG, WRONG, generator=torch.Generator().manual_seed(1))
     return Problem(logits, distances, right, right * 10**off, drawn(logits, right, distances))
 

@@ -177,7 +177,6 @@ def with_dial(
     """
     if sigma_d is None:
         sigma_d = torch.full_like(gaussians.opacity_logits, SIGMA_MAX, dtype=torch.float32)
-        attenuation = attenuation or AttenuationConfig()
     return gaussians.replace(sigma_d=sigma_d, growth_d=growth_d, attenuation=attenuation or AttenuationConfig())
 
 

@@ -57,23 +57,26 @@ def bake(
 def order_by_extinction(gaussians: Gaussians, cameras: Sequence[Place]) -> Tensor:
     """``[N]`` int64, the rows by descending extinction scale ``sigma_d / d``, for renderers that draw a prefix.
 
-    Ties stay in order. With ``gaussians.select(rows)`` the first n are those that ``bake`` keeps for the cameras.
+    Ties stay in order; where d is 0 it is infinite. With ``gaussians.select(rows)`` the first n are those that ``bake``
+    keeps for the cameras.
 
     Raises:
-        ClodError: no dial, or no camera.
+        ClodError: no dial, no camera, or the paper's form.
     """
     if gaussians.sigma_d is None or gaussians.attenuation is None:
         raise ClodError("the Gaussians have no sigma_d, so there is no pruning order")
     if gaussians.attenuation.form == "paper":
         raise ClodError("in the paper's form rows have no order: the cut depends on opacity; adapt with --form ours")
     distances = typical_distance(gaussians.means, cameras, gaussians.attenuation)
-    return (gaussians.sigma_d / distances).nan_to_num(nan=torch.inf).argsort(descending=True, stable=True)
+    scales = torch.where(distances > 0, gaussians.sigma_d.double() / distances, torch.inf)
+    return scales.argsort(descending=True, stable=True)
 
 
 def _logits_drawn(shown: Attenuated, logits: Tensor) -> Tensor:
     """``[N]`` the logits of the drawn opacities; bit for bit ``logits`` where these are equal."""
     # By the fade's logarithm, and by expm1 and not 1 - o, which cancels where o is near 1.
-    drawn = torch.nn.functional.logsigmoid(logits) + (shown.drawn / logits.sigmoid()).log()
+    opacities, stored = logits.sigmoid(), torch.nn.functional.logsigmoid(logits)
+    drawn = stored + torch.where(opacities > 0, shown.drawn / opacities, 1).log()
     baked = (drawn - torch.log(-torch.expm1(drawn))).clamp(max=OPAQUE)
-    same = (drawn == torch.nn.functional.logsigmoid(logits)) & logits.isfinite()
+    same = (drawn == stored) & logits.isfinite()
     return torch.where(same, logits, baked.to(logits))

@@ -11,6 +11,7 @@ from clod_adapter.errors import ClodError
 FORMS = ("ours", "paper")
 GROWTHS = ("on", "off")
 FARTHEST = 3e38  # world units: a float32, as which distances are divided by it
+LONGEST = 1e6  # dial value of training: its powers stay finite
 STEPS, STEPS_PER_VIEW = 900, 8.5  # of training, by default, with one view a step
 # Gaussians that viewers draw at most on a device, by their makers; docs/formats.md has the sources.
 DEVICES = {"quest3": 500_000, "phone": 1_000_000, "laptop": 2_000_000, "desktop": 4_000_000}
@@ -138,6 +139,7 @@ class AdaptConfig:
         for name, value in vars(self).items():
             require(not isinstance(value, float) or math.isfinite(value), name, value, "finite")
         require(self.max_sv >= 1, "max_sv", self.max_sv, "at least 1")
+        require(self.max_sv <= LONGEST, "max_sv", self.max_sv, f"at most {LONGEST:g}")
         require(self.iters is None or self.iters >= 0, "iters", self.iters, "at least 0")
         require(1 <= self.batch <= 4096, "batch", self.batch, "between 1 and 4096")
         require(0 <= self.seed < 2**63, "seed", self.seed, "at least 0 and below 2^63")

@@ -23,7 +23,7 @@ OPAQUE = 20.0
 
 @dataclass(frozen=True, eq=False)
 class Gaussians:
-    """N Gaussians with the parameters that checkpoints store, and, once adapted, their distance decay.
+    """N Gaussians with the parameters that checkpoints store, and, once adapted, their dial.
 
     Fields may be given as numpy arrays, which become float32 tensors. ``gaussians[:100]``, ``gaussians[mask]`` and
     ``gaussians[indices]`` are the Gaussians of these rows. ``a == b`` is whether all fields are equal, bit for bit but
@@ -36,7 +36,7 @@ class Gaussians:
         opacity_logits: ``[N]``; the opacity is their sigmoid. +inf means fully opaque.
         sh0: ``[N, 1, 3]`` degree-0 spherical harmonics.
         shN: ``[N, K-1, 3]`` spherical harmonics of degrees 1 and up, K in {1, 4, 9, 16, 25}.
-        sigma_d: ``[N]`` distance decay of opacity, or None for a checkpoint without a dial.
+        sigma_d: ``[N]`` reaches, the distances at which they end, or None for a checkpoint without a dial.
         attenuation: settings of the equation that reads ``sigma_d``; None exactly if ``sigma_d`` is None.
         growth_d: ``[N]`` exponent of the growth of scales (``attenuation.growth_factors``), or None; needs a sigma_d.
         screen_filter: the filter for rendering, that of training.

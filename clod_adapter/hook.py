@@ -60,9 +60,9 @@ class Hook:
     ) -> tuple[Array, Array, Array]:  # fmt: skip
         """The opacities to draw with, the kept rows, and the factors of the scales.
 
-        Opacities are 0 for culled Gaussians; ``[N]`` bool are the kept ones. The factors
-        ``[N]`` (``attenuation.growth_factors``) are ones without a ``growth_d``. numpy in, numpy out; torch in, torch
-        out, on the means' device, differentiable in ``opacities``, ``sigma_d`` and ``growth_d``.
+        Opacities are 0 for culled Gaussians; ``[N]`` bool are the kept ones. The factors ``[N]``
+        (``attenuation.growth_factors``) are ones without a ``growth_d``. numpy in, numpy out; torch in, torch out, on
+        the means' device, differentiable in ``opacities``, ``sigma_d`` and ``growth_d``.
 
         Args:
             means: ``[N, 3]`` world units.

@@ -148,7 +148,7 @@ def project(
     """Writes records, depths and row numbers of this worker's visible Gaussians, packed from its first row.
 
     Scales and opacities are logarithms and logits as stored, drawn at the ``dial``, or activated ones. Where ``sigma``
-    or ``growth`` is empty, there is no decay, or no growth. After its N records, ``records`` has a spare one for each
+    or ``growth`` is empty, there is no dial, or no growth. After its N records, ``records`` has a spare one for each
     worker.
     """
     n, spare, dialled, grows = len(opacities), len(opacities) + worker, len(sigma) > 0, len(growth) > 0

@@ -133,14 +133,14 @@ def growth_distance(config: AttenuationConfig) -> float:
     return config.reference_distance / config.scene_distance
 
 
-def growth_factors(growth_d: Tensor, d: Tensor, virtual_scale: float | Tensor, reach: float) -> Tensor:
+def growth_factors(growth_d: Tensor, d: Tensor, virtual_scale: float | Tensor, start: float) -> Tensor:
     """``[N]`` the factors g of the scales; exactly 1 where ``growth_d`` is 0 or ``d s <= r``.
 
     Differentiable in ``growth_d [N]``, the finite exponents h: the slope is ``g log m``, and 0 where g is clamped.
-    Never NaN. The result has the dtype of ``d [N]``, float32 or float64. ``reach`` is r.
+    Never NaN. The result has the dtype of ``d [N]``, float32 or float64. ``start`` is r.
     """
     # d s is float64's: a dial beyond float32 times a distance of 0 would be NaN.
-    magnification = d.detach().double().mul(virtual_scale).div_(reach).clamp_(1, torch.finfo(d.dtype).max)
+    magnification = d.detach().double().mul(virtual_scale).div_(start).clamp_(1, torch.finfo(d.dtype).max)
     exponents = growth_d.to(d) * magnification.to(d.dtype).log_()
     return exponents.clamp(-LOG_GROWTH_MAX, LOG_GROWTH_MAX).exp()
 

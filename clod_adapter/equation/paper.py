@@ -8,7 +8,8 @@ With distances d as a share of the largest in the view, decay ``sigma``, opacity
 The paper gives neither EPS nor TAU. TAU is the opacity below which rasterizers draw nothing.
 """
 
-import torch
+import math
+
 import torch.nn.functional as F
 from torch import Tensor
 
@@ -32,6 +33,6 @@ def soft_count(opacity_logits: Tensor, sigma_d: Tensor, far: Tensor, virtual_sca
 
     Its gradient is that of the mean of ``sigmoid((log a'' - log(TAU s)) / width)``, straight through.
     """
-    margin = F.logsigmoid(opacity_logits.double()) - decay(sigma_d, far) - torch.tensor(TAU * virtual_scale).log()
+    margin = F.logsigmoid(opacity_logits.double()) - decay(sigma_d, far) - math.log(TAU * virtual_scale)
     soft = (margin / width).sigmoid()
     return ((margin.detach() > 0).double() + soft - soft.detach()).sum() / max(len(margin), 1)

@@ -44,7 +44,7 @@ def in_world_units(gaussians: Gaussians) -> Gaussians:
 
 
 def known_distance(config: AttenuationConfig) -> float:
-    """World units: ``reference_distance``, else a D other than 1, as older versions wrote; 0 where both are unknown."""
+    """World units: ``reference_distance``, else a D other than 1, as in training; 0 where both are unknown."""
     return config.reference_distance or (config.scene_distance if config.scene_distance != 1 else 0.0)
 
 

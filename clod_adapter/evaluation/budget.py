@@ -2,7 +2,7 @@
 
 - A count needs no measurement. From one camera a Gaussian is kept iff s is below its extinction scale ``sigma_d / d``,
   so the dial that keeps n lies between the n-th and the (n+1)-th largest; for the mean over V cameras, of the pooled
-  scales and n V. Exact but for scales that are equal in float32.
+  scales and n V. Exact but for scales that are equal.
 - PSNR is read from the calibration table that is stored with the file (``calibration.py``).
 - Frame rates depend on the machine, the image size and the load: frames are timed, from cameras. The table's times are
   used only where they are passed in, or (``clod-adapt export``) where nothing can be timed.
@@ -30,7 +30,7 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.progress import Listener
 
 TIMED_DIALS = 6
-ROUNDING = 1e-5  # of extinction scales in float32, generously
+ROUNDING = 1e-15  # of extinction scales and products d s in float64
 
 
 @dataclass(frozen=True)
@@ -153,14 +153,16 @@ def _for_count(
             f"{keep:,.0f} Gaussians are out of reach: at s = {largest:g}, the largest dial value it was trained for, "
             f"{fewest / len(views):,.0f} are kept"
         )
-    low, high = 1.0, largest
-    if config.form == "ours":  # the kept number of all views is a rank of the extinction scales
+    if config.form == "ours":
         assert gaussians.sigma_d is not None
-        pooled = torch.cat([gaussians.sigma_d / distances(k) for k in range(len(views))]).nan_to_num_(nan=math.inf)
-        guess = float(pooled.kthvalue(len(pooled) - wanted).values)  # of the first one that is culled
-        near = [max(guess * (1 - ROUNDING), low), min(guess * (1 + ROUNDING), high)]
-        low = near[0] if count(near[0]) > wanted else low
-        high = near[1] if count(near[1]) <= wanted else high
+        pools = []  # of those that are culled within the range of the dial
+        for k in range(len(views)):
+            own = dial(gaussians, distances(k), 1.0).keep & ~dial(gaussians, distances(k), largest).keep
+            pools.append(gaussians.sigma_d[own].double() / distances(k)[own])
+        pooled = torch.cat(pools)
+        first = float(pooled.kthvalue(len(pooled) - (wanted - fewest)).values)  # that is to be culled
+        return DialValue(min(first * (1 + ROUNDING), largest))
+    low, high = 1.0, largest
     while high / low > 1 + 1e-9:
         middle = math.sqrt(low * high)
         low, high = (low, middle) if count(middle) <= wanted else (middle, high)

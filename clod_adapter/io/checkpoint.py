@@ -90,7 +90,7 @@ class Checkpoint:
         """The dial for a renderer that has these Gaussians: attenuated opacities, and factors of the scales.
 
         Raises:
-            ClodError: the file has no sigma_d, or the dial is below 1 or not finite.
+            ClodError: the file has no sigma_d, or the dial is negative or not finite.
         """
         own = self.gaussians
         if own.sigma_d is None or own.attenuation is None:

@@ -38,7 +38,7 @@ _SETTINGS: dict[str, tuple[str, str, Any]] = {
 }  # fmt: skip
 _EARLIER = {"clod_tau", "clod_eps", "clod_hard_cut", "clod_max", "clod_quantile"}  # of ``settings.EARLIER``
 _USUAL = {DIAL: asdict(AttenuationConfig()), FILTER: asdict(CLASSIC)}
-_INSTEAD = {SIGMA: "use a large number for no decay", GROWTH: "use 0 for no growth"}
+_INSTEAD = {SIGMA: "use a large number for no end", GROWTH: "use 0 for no growth"}
 
 
 def column_map(sh_degree: int) -> dict[str, tuple[str, ...]]:

@@ -22,6 +22,7 @@ ACTIVATED = np.zeros(dial.DIAL, np.float32)
 ACTIVATED[dial.ACTIVATED] = 1
 NOTHING = torch.empty(0, dtype=torch.float32, device="cpu")  # no dial, or no growth
 FEW = 4096  # rows that one thread projects or lists in about a tenth of a millisecond
+FASTEST = 1e18  # rate of a dial, whose square float32 holds
 
 
 def camera_vector(camera: Camera, screen_filter: ScreenFilter = CLASSIC) -> np.ndarray:
@@ -43,7 +44,8 @@ def camera_vector(camera: Camera, screen_filter: ScreenFilter = CLASSIC) -> np.n
 def dial_vector(config: AttenuationConfig, virtual_scale: float) -> np.ndarray:
     """A dial value in the layout of the kernels."""
     out, rate = np.zeros(dial.DIAL, np.float32), virtual_scale / config.scene_distance
-    out[dial.RATE2], out[dial.GROWTH_RATE2] = rate**2, (rate / growth_distance(config)) ** 2
+    out[dial.RATE2] = min(rate, FASTEST) ** 2
+    out[dial.GROWTH_RATE2] = min(rate / growth_distance(config), FASTEST) ** 2
     return out
 
 

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from clod_adapter.cameras import Scene, View, spread
-from clod_adapter.config import AdaptConfig
+from clod_adapter.config import LONGEST, AdaptConfig
 from clod_adapter.equation.distances import normalized_distances
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.importance import MOST_VIEWS, has_dial, removal_error
@@ -171,8 +171,8 @@ def _far_end(initial: Gaussians, views: Sequence[View], config: AdaptConfig) -> 
     extinction = torch.cat([initial.sigma_d / d for d in distances])
     kept = float((extinction > config.max_sv).double().mean())
     reached = f"{kept:.0%} at s = {config.max_sv:g}"
-    if kept > FEW:
-        farther = float(extinction.kthvalue(max(round((1 - FEW) * len(extinction)), 1)).values)
+    farther = float(extinction.kthvalue(max(round((1 - FEW) * len(extinction)), 1)).values)
+    if config.max_sv < farther < LONGEST:
         reached += f", {FEW:.0%} with --max-sv {math.ceil(farther)}"
     return [Decision(reached, "kept", None, "", "in the mean of the training views, before training")]
 

@@ -11,7 +11,7 @@ Records of vendors follow, flagged in the header: type, length, bytes; readers s
   ``ply_to_spz``, splat-transform, SuperSplat and gsply all leave those of the PLY: turned, it would be upside down;
 - ours, ``RECORD``: the length of the JSON document (``settings.document``) as uint32, the document, then the dial's
   columns as float16, to 5e-4: sigma_d, and growth_d where the document has ``"columns": ["sigma_d", "growth_d"]``.
-  Larger values become 65504. Of sigma_d that is no decay: it takes less than ``(d' s)^2 1.2e-10`` of an opacity.
+  Larger values become 65504. Of sigma_d that is no end in practice: ``(d s / 65504)^4`` of an opacity is gone.
 """
 
 import json
