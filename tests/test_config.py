@@ -22,7 +22,8 @@ BOTH = {"form": ["theirs"], "max_sv": [0.99, math.inf, math.nan]}
 RATES = ("sigma", "growth", "means", "quats", "scales", "opacities", "sh0", "shN")
 TABLES: dict[type, dict[str, list[Any]]] = {
     AdaptConfig: BOTH | {
-        "max_sv": [*BOTH["max_sv"], 1e7], "iters": [-1], "time_budget": [0.0, math.nan], "start_share": [0.5, 1.01], "exponent": [0.0, math.inf],
+        "max_sv": [*BOTH["max_sv"], 1e7],
+        "iters": [-1], "time_budget": [0.0, math.nan], "start_share": [0.5, 1.01], "exponent": [0.0, math.inf],
         "reg_weight": [-1.0, math.nan], "ssim_weight": [-0.1, 1.1], "growth": ["yes"],
         "batch": [0, 4097], "seed": [-1, 2**63], **{f"lr_{name}": [-1e-9, 1.1e6, math.nan] for name in RATES},
     },

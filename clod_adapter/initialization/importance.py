@@ -19,7 +19,7 @@ from clod_adapter.progress import Listener, Phase, tell
 from clod_adapter.render import splat
 
 # Times the largest dial value, the largest extinction scale: beyond, a reach has no gradient in training, and would
-# never change. Without this limit bonsai146 loses 0.4 dB at 12 % of its Gaussians.
+# never change.
 WIDEST = 4.0
 # Most views that are rendered: twice as many changed the trained result by 0.01 to 0.04 dB (docs/performance.md).
 MOST_VIEWS = 64
