@@ -16,6 +16,7 @@ from clod_adapter.training.state import Watched
 
 FEW, EVERY, MOST = 8, 24, 4  # of fewer than FEW views all are watched and trained on; else one of EVERY, 2 to MOST
 WORSE, RUINED = 1.0, 4.0  # dB that s = 1 may fall below its best, until the next check, and at all
+SETTLED = 0.7  # share of the training before which only RUINED counts: what large steps cost, smaller ones regain
 HALVINGS = 3  # of the learning rates; the next time the attributes are frozen
 CHECKS = (0.0, 0.02, 0.05, *(k / 10 for k in range(1, 10)))  # of the steps or the time budget
 EXACT = 1e-12  # mean squared error that none is taken for: its logarithm is finite
@@ -61,9 +62,10 @@ def squared_error(image: Tensor, view: View) -> float:
 class Gate:
     """Measures s = 1 against the base, from the first steps on, in images of half the size (not small ones).
 
-    If s = 1 is more than WORSE below its best in two checks, and not recovering, the parameters return to the last
-    state that was not, Adam's moments are forgotten, and the learning rates are halved; after HALVINGS of these the
-    attributes are frozen. The first steps always cost some tenths that the next ones gain.
+    If s = 1 is RUINED below its best, or from SETTLED on more than WORSE in two checks, and not recovering, the
+    parameters return to the last state that was not, Adam's moments are forgotten, and the learning rates are halved;
+    after HALVINGS of these the attributes are frozen. A return to an early state costs the far end of the dial half a
+    decibel, so what large steps at first cost is no reason for one.
     """
 
     def __init__(self, trainer: Any, views: Sequence[View], trained_on: bool) -> None:  # training.trainer.Trainer
@@ -89,7 +91,7 @@ class Gate:
             self.numbers[0] = min(best, loss)
             for name, value in self.trainer.trained().items():
                 self.good[name].copy_(value)
-        elif not loss <= best + RUINED or best + WORSE < last <= loss:  # the first also if it is NaN
+        elif not loss <= best + RUINED or (share_done >= SETTLED and best + WORSE < last <= loss):  # or NaN
             self.numbers[1] += 1
             self.numbers[3] = best
             self.trainer.return_to(self.good)
