@@ -113,7 +113,7 @@ def adapt_plush(device: torch.device, size: Size, small: bool) -> list[dict[str,
         rows.append({
             "on": place.type, "scene": "synthetic" if small else "plush_half", "config": asdict(config),
             "count": len(own), "start_seconds": round(adapted.start_seconds, 2),
-            "train_seconds": round(adapted.seconds, 2), "peak_bytes": peak(place), "base": base_row.as_dict(),
+            "train_seconds": round(adapted.seconds, 3), "peak_bytes": peak(place), "base": base_row.as_dict(),
             "rows": [row.as_dict() for row in found],
         })  # fmt: skip
     return rows
@@ -128,7 +128,7 @@ def measure_city(device: torch.device, size: Size) -> list[dict[str, Any]]:
     wait_for(device)
     rows: list[dict[str, Any]] = [{
         "what": "adapt", "config": asdict(config), "start_seconds": round(adapted.start_seconds, 2),
-        "train_seconds": round(adapted.seconds, 2), "peak_bytes": peak(device),
+        "train_seconds": round(adapted.seconds, 3), "peak_bytes": peak(device),
         "base_bytes": sum(x.nbytes for x in base.tensors().values()),
     }]  # fmt: skip
     del base

@@ -13,7 +13,7 @@ from dataclasses import asdict
 
 import clod_adapter as clod
 from adapt import at_shares
-from clod_adapter.training.pseudo_views import LIGHTEST, STEPS_PER_PLACED, add_pseudo_views, render_pseudo_views
+from clod_adapter.training.pseudo_views import add_pseudo_views, render_pseudo_views
 from common import append, arguments, checkpoint, stored, table
 from common import photographs as photographs_of
 
@@ -44,7 +44,6 @@ def run(scene: str, kind: str, config: clod.AdaptConfig, few: int | None) -> Non
     began, views = time.perf_counter(), photographs
     if kind == "placed":
         views = render_pseudo_views(base, clod.place_cameras(base, seed=config.seed))
-        config = config.lighter(LIGHTEST).for_views(len(views.train), STEPS_PER_PLACED)  # as the command does
     if kind == "complemented":
         views, config = add_pseudo_views(base, photographs, config)
     seconds = time.perf_counter() - began

@@ -98,7 +98,7 @@ def execute(args: Namespace) -> dict[str, Any]:
     print(comparisons.text(), end="")
     report: dict[str, Any] = {  # the page has the first two as well
         "command": "eval", "version": package_version(), "model": args.model, "scene": args.images,
-        "base_count": len(model), "sh_degree": model.sh_degree, "views": len(scene.test),
+        "base_count": model.whole, "sh_degree": model.sh_degree, "views": len(scene.test),
         "rows": [row.as_dict() for row in rows], "base": args.base, **comparisons.report,
         "interrupted": stop.requests > 0, "attenuation": asdict(model.attenuation) if model.attenuation else None,
         "notes": console.notes, "machine": measuring.machine(), "device": str(model.means.device),

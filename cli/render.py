@@ -74,10 +74,10 @@ def execute(args: Namespace) -> dict[str, Any]:
     print(f"wrote {len(pictures)} image{'s' * (len(pictures) != 1)} to {out}")
     for k, dial in enumerate(dials):
         kept, error = (fmean(picture[key][k] for picture in pictures) for key in ("kept", "psnr"))
-        about = f"{kept:,.0f} of {len(gaussians):,} Gaussians, {error:.2f} dB, means over the images"
+        about = f"{kept:,.0f} of {gaussians.whole:,} Gaussians, {error:.2f} dB, means over the images"
         print(f"  s = {dial:.5g}: {about}")
     return {
-        "model": args.model, "scene": args.images, "base_count": len(gaussians), "virtual_scales": dials,
+        "model": args.model, "scene": args.images, "base_count": gaussians.whole, "virtual_scales": dials,
         "pictures": pictures, "interrupted": len(pictures) < len(views), "notes": console.notes,
         "seconds": watch.report(), "outputs": {"folder": args.out},
     }  # fmt: skip

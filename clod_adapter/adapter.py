@@ -13,7 +13,7 @@ from clod_adapter.config import CLASSIC, SH_COUNTS, AttenuationConfig, ScreenFil
 from clod_adapter.equation.attenuation import SIGMA_MAX
 from clod_adapter.equation.units import in_world_units
 from clod_adapter.errors import ClodError
-from clod_adapter.gaussians import Gaussians
+from clod_adapter.gaussians import Gaussians, with_near
 from clod_adapter.origin import NOWHERE, Origin
 
 HALF_ERROR = 2e-3  # the rounding that a difference may suffer, as a share of the largest
@@ -38,6 +38,7 @@ class Adapter:
         sh_degree: of a result with fewer SH bands than its base. None for the base's.
         screen_filter: that it was trained with, and the result is drawn with.
         growth_d: ``[N]`` float32, finite, exponents of the growth of the scales. None for no growth.
+        added: the ATTRIBUTES of far Gaussians, float32, which follow the base's. None without; else updates are empty.
         notes: of reading its file: settings that were ignored or filled in.
 
     Raises:
@@ -56,13 +57,16 @@ class Adapter:
     sh_degree: int | None = None
     screen_filter: ScreenFilter = CLASSIC
     growth_d: Tensor | None = None
+    added: dict[str, Tensor] = field(default_factory=dict)
     notes: tuple[str, ...] = field(default=(), compare=False)
 
     def __post_init__(self) -> None:
         for name in (*DIAL, "kept"):
             if (column := getattr(self, name)) is not None:
                 object.__setattr__(self, name, tensor_of(column))
-        object.__setattr__(self, "updates", {name: tensor_of(update) for name, update in self.updates.items()})
+        for name in ("updates", "added"):
+            tensors = {key: tensor_of(value) for key, value in getattr(self, name).items()}
+            object.__setattr__(self, name, tensors)
         count = self.sigma_d.numel()
         for name, column in dial_tensors(self).items():
             sound = column.shape == (count,) and column.dtype == torch.float32
@@ -76,6 +80,11 @@ class Adapter:
                 raise ClodError(f"Adapter.updates has {name!r}, it may have {', '.join(ATTRIBUTES)}")
             sound = update.dtype in (torch.float16, torch.float32) and update.shape[:1] == self.sigma_d.shape
             require(sound, f"Adapter.updates[{name!r}]", _kind(update), f"float16 or float32 of {count} rows")
+        if self.added:
+            attributes: Any = self.added
+            far = Gaussians(**attributes)  # checks names and shapes
+            fits = not self.updates and self.kept is None and len(far) < count
+            require(fits, "Adapter.added", f"of {len(far)} of {count} rows", "of fewer, without updates and kept rows")
         if (kept := self.kept) is not None:
             sound = kept.dim() == 1 and kept.dtype == torch.bool and int(kept.sum()) == count
             require(sound, "Adapter.kept", _kind(kept), f"bool with {count} set")
@@ -89,7 +98,8 @@ class Adapter:
     @property
     def base_count(self) -> int:
         """How many Gaussians the base has."""
-        return len(self.sigma_d if self.kept is None else self.kept)
+        added = len(self.added["means"]) if self.added else 0
+        return len(self.sigma_d if self.kept is None else self.kept) - added
 
     def apply(self, base: Gaussians, fingerprint: str | None = None) -> Gaussians:
         """The adapted Gaussians: the base plus the differences in float32, and the dial.
@@ -120,8 +130,14 @@ class Adapter:
             if update.dtype == torch.float16:  # old, not old + 0, where nothing changed: that would turn -0 into 0
                 update = torch.where(update == 0, old, old + update.float())
             changes[name] = update
-        changes |= {name: column.to(base.means.device) for name, column in dial_tensors(self).items()}
-        return detach(base).replace(**changes, attenuation=self.attenuation, screen_filter=self.screen_filter)
+        plain = base.replace(sigma_d=None, growth_d=None, attenuation=None)
+        columns = {name: x.to(base.means.device) for name, x in dial_tensors(self).items()}
+        if self.added:
+            far: Any = {name: x.to(base.means.device) for name, x in self.added.items()}
+            far |= {name: column[len(base) :] for name, column in columns.items()}
+            return with_near(plain, Gaussians(**far, attenuation=self.attenuation, screen_filter=self.screen_filter))
+        changes |= columns
+        return plain.replace(**changes, attenuation=self.attenuation, screen_filter=self.screen_filter)
 
 
 def dial_tensors(owner: Adapter | Gaussians) -> dict[str, Tensor]:
@@ -150,9 +166,12 @@ def extract(
     adapted = in_world_units(adapted)
     if adapted.attenuation is None:
         raise ClodError("the adapted Gaussians have no sigma_d, and so no dial; give the result of adapt")
-    updates = dict[str, Tensor]()
+    updates, added, near = dict[str, Tensor](), dict[str, Tensor](), adapted
+    if adapted.near is not None and base.near is None:
+        near, far = (adapted.select(rows) for rows in (adapted.near, ~adapted.near))
+        added = {name: getattr(far, name).detach().float().cpu().clone() for name in ATTRIBUTES}
     for name in ATTRIBUTES:
-        old, new = getattr(base, name).detach().float(), getattr(adapted, name).detach().float()
+        old, new = getattr(base, name).detach().float(), getattr(near, name).detach().float()
         if old.shape != new.shape:
             raise ClodError(f"{name} is {_kind(new)}, in the base {_kind(old)}; give the Gaussians that were adapted")
         if not torch.equal(old, new):
@@ -160,7 +179,7 @@ def extract(
     columns: Any = {name: x.detach().float().cpu().clone() for name, x in dial_tensors(adapted).items()}
     return Adapter(
         **columns, attenuation=adapted.attenuation, updates=updates, base_fingerprint=fingerprint, config=dict(config),
-        origin=origin, screen_filter=adapted.screen_filter,
+        origin=origin, screen_filter=adapted.screen_filter, added=added,
     )  # fmt: skip
 
 
@@ -181,7 +200,8 @@ def with_dial(
 
 
 def detach(gaussians: Gaussians) -> Gaussians:
-    """The Gaussians without their dial; the other attributes stay as they are."""
+    """The Gaussians without their dial, as s = 0 shows them: the near ones, if others take over from these."""
+    gaussians = gaussians if gaussians.near is None else gaussians.select(gaussians.near)
     return gaussians.replace(sigma_d=None, growth_d=None, attenuation=None)
 
 

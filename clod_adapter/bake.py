@@ -1,13 +1,14 @@
 """Plain Gaussians from adapted ones: one dial value baked into the opacities; and rows in the order of the dial."""
 
+import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from clod_adapter.adapter import detach
 from clod_adapter.cameras import Camera
-from clod_adapter.equation.attenuation import Attenuated, dial
+from clod_adapter.equation.attenuation import TAKEOVER, Attenuated, dial
 from clod_adapter.equation.distances import Place, typical_distance
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import OPAQUE, Gaussians
@@ -46,11 +47,14 @@ def bake(
     if not dialled.keep.any():
         raise ClodError(f"no Gaussian is kept at s = {virtual_scale:g}; bake a smaller s")
     shown = dialled if camera else dial(gaussians, distances, virtual_scale**FADED)
+    if gaussians.near is not None and not camera:
+        dialled, shown = _switched(gaussians, distances, virtual_scale)
     baked = {"opacity_logits": _logits_drawn(shown, gaussians.opacity_logits)}
     if gaussians.growth_d is not None:
         growth = (dialled if camera else dial(gaussians, distances, virtual_scale**GROWN)).growth
         baked["log_scales"] = gaussians.log_scales + growth.log()[:, None]
-    return detach(gaussians.replace(**baked)).select(dialled.keep)
+    plain = gaussians.replace(**baked, sigma_d=None, growth_d=None, attenuation=None)
+    return plain.select(dialled.keep)
 
 
 @torch.no_grad()
@@ -65,11 +69,33 @@ def order_by_extinction(gaussians: Gaussians, cameras: Sequence[Place]) -> Tenso
     """
     if gaussians.sigma_d is None or gaussians.attenuation is None:
         raise ClodError("the Gaussians have no sigma_d, so there is no pruning order")
+    if gaussians.near is not None:
+        raise ClodError("near and far Gaussians have no order: far ones begin where near ones end; bake dial values")
     if gaussians.attenuation.form == "paper":
         raise ClodError("in the paper's form rows have no order: the cut depends on opacity; adapt with --form ours")
     distances = typical_distance(gaussians.means, cameras, gaussians.attenuation)
     scales = torch.where(distances > 0, gaussians.sigma_d.double() / distances, torch.inf)
     return scales.argsort(descending=True, stable=True)
+
+
+def baked_rows(gaussians: Gaussians, distances: Tensor, virtual_scale: float) -> Tensor:
+    """``[N]`` bool, those that ``bake`` keeps at distances ``[N]`` over several cameras."""
+    if gaussians.near is None:
+        return dial(gaussians, distances, virtual_scale).keep
+    return _switched(gaussians, distances, virtual_scale)[0].keep
+
+
+def _switched(gaussians: Gaussians, distances: Tensor, virtual_scale: float) -> tuple[Attenuated, Attenuated]:
+    """What is kept, and what is drawn of it, if far Gaussians take over from near ones at once, in the middle."""
+    assert gaussians.near is not None and gaussians.attenuation is not None and gaussians.sigma_d is not None
+    middle = math.sqrt(1 - 0.5 / TAKEOVER) * gaussians.attenuation.near_distance / gaussians.attenuation.scene_distance
+    near, far = gaussians.near, distances * virtual_scale >= middle
+    whole = gaussians.replace(
+        sigma_d=gaussians.sigma_d.masked_fill(near, math.inf),
+        attenuation=replace(gaussians.attenuation, near_distance=0.0),
+    )
+    dialled, shown = (dial(whole, distances, s) for s in (virtual_scale, virtual_scale**FADED))
+    return dialled._replace(keep=dialled.keep & (near != far)), shown
 
 
 def _logits_drawn(shown: Attenuated, logits: Tensor) -> Tensor:

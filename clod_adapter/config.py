@@ -13,6 +13,7 @@ GROWTHS = ("on", "off")
 FARTHEST = 3e38  # world units: a float32, as which distances are divided by it
 LONGEST = 1e6  # dial value of training: its powers stay finite
 STEPS, STEPS_PER_VIEW = 900, 8.5  # of training, by default, with one view a step
+FAR_STEPS, FAR_STEPS_PER_VIEW = 2500, 24.0  # the same of far Gaussians alone
 # Gaussians that viewers draw at most on a device, by their makers; docs/formats.md has the sources.
 DEVICES = {"quest3": 500_000, "phone": 1_000_000, "laptop": 2_000_000, "desktop": 4_000_000}
 SH_COUNTS = {0: 1, 1: 4, 2: 9, 3: 16, 4: 25}  # spherical harmonics of each degree
@@ -47,6 +48,9 @@ class AttenuationConfig:
         0.0, "median distance in the nearest training views, world units, from which on scales grow; 0 if unknown"
     )
     max_sv: float = option(5.0, "largest dial value of training")
+    near_distance: float = option(
+        0.0, "distance at s = 1, world units, at which far Gaussians take over from near ones; 0 without near ones"
+    )
 
     def __post_init__(self) -> None:
         require(self.form in FORMS, "form", self.form, f"one of {', '.join(FORMS)}")
@@ -54,6 +58,8 @@ class AttenuationConfig:
         require(0 < distance < FARTHEST, "scene_distance", distance, f"above 0 and below {FARTHEST:g}")
         require(0 <= reference < FARTHEST, "reference_distance", reference, f"at least 0 and below {FARTHEST:g}")
         require(1 <= self.max_sv < math.inf, "max_sv", self.max_sv, "at least 1 and finite")
+        near = self.near_distance
+        require(0 <= near < FARTHEST, "near_distance", near, f"at least 0 and below {FARTHEST:g}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,7 +118,7 @@ class AdaptConfig:
     form: str = option("ours", "training as measured here (ours) or as published (paper); AdaptConfig.paper sets it")
     max_sv: float = option(5.0, "largest dial value to train for")
     iters: int | None = option(
-        None, f"training steps (default: {STEPS}, or {STEPS_PER_VIEW:g} for each training view if that is more)"
+        None, f"training steps (default: {FAR_STEPS}, or {FAR_STEPS_PER_VIEW:g} for each training view if that is more)"
     )
     batch: int = option(1, "views per step; learning rates scale with its square root")
     time_budget: float | None = option(
@@ -176,11 +182,15 @@ class AdaptConfig:
         """``iters``, or the default for few training views."""
         return self.iters if self.iters is not None else self.for_views(0).steps
 
-    def for_views(self, views: int, each: float = STEPS_PER_VIEW) -> AdaptConfig:
-        """A copy whose ``iters`` is set, by the number of training views and the batch where it is not."""
+    def for_views(self, views: int, far: bool = False) -> AdaptConfig:
+        """A copy whose ``iters`` is set, by the number of training views and the batch where it is not.
+
+        ``far``: of training far Gaussians alone, whose steps take a third of the time.
+        """
         if self.iters is not None:
             return self
-        return replace(self, iters=max(round(max(STEPS, each * views) / self.batch), 1))
+        least, each = (FAR_STEPS, FAR_STEPS_PER_VIEW) if far else (STEPS, STEPS_PER_VIEW)
+        return replace(self, iters=max(round(max(least, each * views) / self.batch), 1))
 
     def lighter(self, share: float) -> AdaptConfig:
         """A copy with the learning rates of all attributes but sigma_d multiplied by ``share``."""

@@ -80,6 +80,18 @@ class Gaussians:
     def __len__(self) -> int:
         return self.means.shape[0]
 
+    @property
+    def near(self) -> Tensor | None:
+        """``[N]`` bool: the checkpoint's own, without a reach, if there are others that take over; None if not."""
+        if self.sigma_d is None or self.attenuation is None or self.attenuation.near_distance == 0:
+            return None
+        return self.sigma_d <= 0
+
+    @property
+    def whole(self) -> int:
+        """How many are drawn at s = 0: all, or the near ones. Shares of what is kept are shares of these."""
+        return len(self) if self.near is None else int(self.near.sum())
+
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Gaussians):
             return NotImplemented
@@ -123,7 +135,8 @@ class Gaussians:
         dial = "no dial"
         if self.attenuation is not None:
             dial = f"dial to {self.attenuation.max_sv:g}{'' if self.growth_d is None else ' with growth'}"
-        return f"{len(self):,}, SH degree {self.sh_degree}, {dial}"
+        count = f"{len(self):,}" if self.near is None else f"{self.whole:,} and {len(self) - self.whole:,} far"
+        return f"{count}, SH degree {self.sh_degree}, {dial}"
 
     @property
     def sh_degree(self) -> int:
@@ -209,3 +222,17 @@ def largest_colour(gaussians: Gaussians) -> str:
     name = max(rows, key=lambda each: float(rows[each].max()))
     value, row = rows[name].max(0)
     return f"the largest {name} is {float(value):.3g}, in row {int(row)}: leave out such rows"
+
+
+def with_near(near: Gaussians, far: Gaussians) -> Gaussians:
+    """The near Gaussians, whose own dial plays no part, and after them far ones, whose dial has a near_distance.
+
+    The result has the SH degree of ``near``, which is that of ``far`` or a higher one.
+    """
+    own = {name: value for name, value in near.tensors().items() if name not in ("sigma_d", "growth_d")}
+    theirs = far.tensors()
+    rest = own["shN"].new_zeros(len(far), *own["shN"].shape[1:])
+    rest[:, : far.shN.shape[1]] = far.shN
+    own |= {name: near.means.new_zeros(len(near)) for name in theirs.keys() - own.keys()}
+    theirs["shN"] = rest
+    return far.replace(**{name: torch.cat([value, theirs[name].to(value)]) for name, value in own.items()})

@@ -34,6 +34,7 @@ class Phase(str, Enum):
     FINGERPRINT = "photographs' hash"
     SH_DEGREES = "SH degrees"
     IMPORTANCE = "importance"
+    MERGING = "merging"
     PRUNING_ORDER = "pruning order"
     TRIMMING = "effect of trimming"
     COVERAGE = "block coverage"

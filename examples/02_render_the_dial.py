@@ -26,7 +26,7 @@ def main(model: str, folder: str | None = None) -> None:
         rendering = clod.render(gaussians, camera, virtual_scale)
         name = f"{Path(model).stem}_sv{virtual_scale}.png"
         Image.fromarray(rendering.pixels.numpy()).save(name)
-        print(f"wrote {name}: {int(rendering.kept.sum()):,} of {len(gaussians):,} Gaussians")
+        print(f"wrote {name}: {int(rendering.kept.sum()):,} of {gaussians.whole:,} Gaussians")
 
 
 def camera_facing(gaussians: clod.Gaussians, width: int = 320, height: int = 240) -> clod.Camera:

@@ -38,7 +38,7 @@ def main(model: str, folder: str, device: str = "cuda") -> None:
         name = f"{Path(model).stem}_gsplat_sv{virtual_scale}.png"
         Image.fromarray((images[0].clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()).save(name)
         drawn = len(meta["gaussian_ids"]) / len(cameras)  # ids of the file's rows, as far as they are in sight
-        print(f"wrote {name}: {drawn:,.0f} of {len(g):,} Gaussians a camera")
+        print(f"wrote {name}: {drawn:,.0f} of {g.whole:,} Gaussians a camera")
 
 
 if __name__ == "__main__":

@@ -30,7 +30,7 @@ def main(model: str) -> None:
         picture = dots(means[keep] @ viewmat[:3, :3].T + viewmat[:3, 3], drawn[keep], colors[keep], K)
         name = f"{Path(model).stem}_dots_sv{virtual_scale}.png"
         Image.fromarray((picture * 255).round().astype(np.uint8)).save(name)
-        print(f"wrote {name}: {keep.sum():,} of {len(keep):,} Gaussians")
+        print(f"wrote {name}: {keep.sum():,} of {gaussians.whole:,} Gaussians")
 
 
 def dots(seen: np.ndarray, opacities: np.ndarray, colors: np.ndarray, K: np.ndarray) -> np.ndarray:

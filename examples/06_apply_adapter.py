@@ -20,7 +20,8 @@ def main(checkpoint: str, adapter_file: str, out: str = "again.ply") -> None:
 
     # Attach. The fingerprint is the SHA-256 of the file, so that another checkpoint is refused.
     adapted = adapter.apply(before, base.fingerprint)
-    print(f"changed: {', '.join(['sigma_d', *adapter.updates])}")
+    changed = ["sigma_d", *adapter.updates, *(["far Gaussians"] if adapter.added else [])]
+    print(f"changed: {', '.join(changed)}")
 
     # Save. Everything but the base is in the small file; the large one is made again from it, the same bytes each time.
     clod.save(out, adapted, base, version=adapter.version, calibration=adapter.calibration)
@@ -32,7 +33,7 @@ def main(checkpoint: str, adapter_file: str, out: str = "again.ply") -> None:
     for name in adapter.updates:
         assert torch.equal(getattr(untouched, name), getattr(before, name))
         assert torch.equal(getattr(plain, name), getattr(adapted, name))
-    print(f"without the adapter: {checkpoint}, bit for bit; without the dial alone: {len(plain):,} tuned Gaussians")
+    print(f"without the adapter: {checkpoint}, bit for bit; without the dial alone: {len(plain):,} Gaussians")
 
 
 if __name__ == "__main__":

@@ -212,13 +212,13 @@ def test_training_stays_there(there: Gaussians, monkeypatch: pytest.MonkeyPatch)
     scene = Scene(views, ())
     plan = make_plan(plain, scene, SHORT)
     whole = plan.whole(plain, plan.adapt(scene).gaussians)
-    division = divide(plan.start, views, SHORT, 2)
+    division = divide(make_plan(plain, scene, SHORT, far=False).start, views, SHORT, 2)
     merged = merge(division, [adapt_block(division, views, SHORT, block) for block in range(2)])
-    for result in (whole, merged):
-        assert not torch.equal(result.means.cpu(), plain.means.cpu()[: len(result)])
+    for result, before in ((whole, plan.start), (merged, plain)):
+        assert not torch.equal(result.means.cpu(), before.means.cpu())
         assert all(x.device == plain.means.device and bool(x.isfinite().all()) for x in result.tensors().values())
     monkeypatch.setattr(importlib.import_module("clod_adapter.evaluation.frame_times"), "PASSES", 2)
-    assert len(whole) == len(plain) and all(taken > 0 for _, taken in frame_times(there, CAMERAS[:1])[0])
+    assert whole.whole == len(plain) and all(taken > 0 for _, taken in frame_times(there, CAMERAS[:1])[0])
 
 
 def test_a_step_waits_for_the_device_once(there: Gaussians, monkeypatch: pytest.MonkeyPatch) -> None:

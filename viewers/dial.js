@@ -1,5 +1,5 @@
 // The dial of an adapted file, without a viewer: what the file says, and what turns it.
-import { countKept, dialForCount, extinctionScales, growthStart } from "./equation.js";
+import { bandsOf, countKept, dialForCount, growthStart } from "./equation.js";
 import { createHold } from "./frame_rate.js";
 import { readGaussians } from "./read.js";
 
@@ -25,7 +25,10 @@ export function texels({ count, sigma, growth }, length) {
 
 /** The equation's constants as arguments of the shaders, in a shader's own syntax. */
 export function constants({ settings }) {
-  return { distance: settings.scene_distance.toExponential(8), start: growthStart(settings).toExponential(8) };
+  const near = settings.near_distance / settings.scene_distance;
+  return {
+    distance: settings.scene_distance.toExponential(8), start: growthStart(settings).toExponential(8), near: near.toExponential(8),
+  };
 }
 
 /** Turns the dial of a model in a viewer. `eye()`: the camera in the file's coordinates; `show(s)`: draws with s;
@@ -41,11 +44,11 @@ export class Dial {
   // The public methods are described in types.d.ts.
   set(value) {
     this.#hold = null;
-    this.#turn(typeof value === "number" ? value : dialForCount(this.#scales(), value.keep, this.file.settings.max_sv));
+    this.#turn(typeof value === "number" ? value : dialForCount(this.#bands(), value.keep, this.file.settings.max_sv));
   }
 
   get kept() {
-    return countKept(this.#scales(), this.s);
+    return countKept(this.#bands(), this.s);
   }
 
   hold(fps) {
@@ -66,8 +69,8 @@ export class Dial {
     if (s !== this.s) this.show((this.s = s));
   }
 
-  #scales() {
+  #bands() {
     const { means, sigma, settings } = this.file;
-    return extinctionScales(means, sigma, this.eye(), settings.scene_distance);
+    return bandsOf(means, sigma, this.eye(), settings);
   }
 }

@@ -1,27 +1,50 @@
-// The dial's equation in float64, as in clod_adapter/equation/attenuation.py. At the dial value s a Gaussian is kept
-// iff d s < sigma_d or d s = 0, with d = |mean - eye| / D: below its extinction scale sigma_d / d.
+// The dial's equation in float64, as in clod_adapter/equation/attenuation.py. A Gaussian is kept at the dial values of a
+// band: from `begin`, which is 0 for all but far Gaussians, to `end`, where its reach, or near_distance, is d s.
 
-/** The extinction scale of a Gaussian at a squared distance, world units^2; `unit` is D. */
-export const extinctionScale = (sigma, squared, unit) =>
-  squared === 0 ? Infinity : (Math.max(sigma, 0) * unit) / Math.sqrt(squared);
+const BEGIN = Math.sqrt(0.8); // far Gaussians begin at this share of near_distance
 
-/** Whether a dial value keeps a Gaussian with this extinction scale. */
-export const isKept = (scale, dial) => dial < scale || dial === 0;
+/** The dial value from which on a Gaussian is kept at a squared distance, world units^2. */
+export const beginOf = (sigma, squared, { near_distance: near = 0 }) =>
+  near > 0 && sigma > 0 ? (BEGIN * near) / Math.sqrt(squared) : 0;
 
-/** The extinction scales of all Gaussians, seen from an eye. */
-export function extinctionScales(means, sigma, eye, unit) {
-  return Float64Array.from(sigma, (reach, i) => {
-    const at = 3 * i, x = means[at] - eye[0], y = means[at + 1] - eye[1], z = means[at + 2] - eye[2];
-    return extinctionScale(reach, x * x + y * y + z * z, unit);
-  });
+/** Its extinction scale, up to which it is kept. */
+export function endOf(sigma, squared, { near_distance: near = 0, scene_distance: unit }) {
+  const reach = near > 0 && sigma <= 0 ? near : Math.max(sigma, 0) * unit;
+  return squared === 0 ? Infinity : reach / Math.sqrt(squared);
 }
 
-export const countKept = (scales, dial) => scales.reduce((kept, scale) => kept + isKept(scale, dial), 0);
+/** Whether a dial value keeps a Gaussian with this band. */
+export const isKept = (begin, end, dial) => (begin === 0 ? dial < end || dial === 0 : begin < dial && dial < end);
+
+/** How many are drawn at s = 0: all, or the near ones. */
+export const wholeCount = (count, sigma, { near_distance: near = 0 }) =>
+  near > 0 ? sigma.reduce((whole, reach) => whole + (reach <= 0), 0) : count;
+
+/** The bands of all Gaussians, {begins, ends}, seen from an eye. */
+export function bandsOf(means, sigma, eye, settings) {
+  const begins = new Float64Array(sigma.length), ends = new Float64Array(sigma.length);
+  for (let i = 0, at = 0; i < sigma.length; i++, at += 3) {
+    const x = means[at] - eye[0], y = means[at + 1] - eye[1], z = means[at + 2] - eye[2], squared = x * x + y * y + z * z;
+    begins[i] = beginOf(sigma[i], squared, settings);
+    ends[i] = endOf(sigma[i], squared, settings);
+  }
+  return { begins, ends };
+}
+
+export const countKept = ({ begins, ends }, dial) =>
+  ends.reduce((kept, end, i) => kept + isKept(begins[i], end, dial), 0);
 
 /** The smallest dial value in [1, largest] that keeps at most `target` Gaussians, else the largest one. */
-export function dialForCount(scales, target, largest) {
-  const firstToGo = scales.toSorted().at(-1 - target) ?? 1;
-  return Math.min(Math.max(firstToGo, 1), largest);
+export function dialForCount(bands, target, largest) {
+  if (countKept(bands, 1) <= target) return 1;
+  if (bands.begins.every((begin) => begin === 0)) return Math.min(bands.ends.toSorted().at(-1 - target), largest);
+  let low = 1, high = largest; // where far Gaussians begin as near ones end, the count has no such order
+  while (high / low > 1 + 1e-9) {
+    const middle = Math.sqrt(low * high);
+    if (countKept(bands, middle) > target) low = middle;
+    else high = middle;
+  }
+  return high;
 }
 
 /** r, in units of D: the distance from which on scales grow. */

@@ -46,7 +46,7 @@ function fileOf(data) {
 
 /** The modifier for `gsplat.setWorkBufferModifier`. */
 export function modifier(file) {
-  const { distance, start } = constants(file);
+  const { distance, start, near } = constants(file);
   return {
     glsl: `${glsl}
       uniform vec3 uClodEye;
@@ -57,7 +57,7 @@ export function modifier(file) {
         scale *= clodScale(loadClod().g, clodDistance(center), uClodScale.x, ${start});
       }
       void modifySplatColor(vec3 center, inout vec4 color) {
-        color.a = clodOpacity(color.a, loadClod().r, clodDistance(center), uClodScale.x);
+        color.a = clodOpacity(color.a, loadClod().r, clodDistance(center), uClodScale.x, ${near});
       }`,
     wgsl: `${wgsl}
       uniform uClodEye: vec3f;
@@ -68,7 +68,7 @@ export function modifier(file) {
         *scale = *scale * clodScale(loadClod().g, clodDistance(center), uniform.uClodScale.x, ${start});
       }
       fn modifySplatColor(center: vec3f, color: ptr<function, vec4f>) {
-        (*color).a = clodOpacity((*color).a, loadClod().r, clodDistance(center), uniform.uClodScale.x);
+        (*color).a = clodOpacity((*color).a, loadClod().r, clodDistance(center), uniform.uClodScale.x, ${near});
       }`,
   };
 }

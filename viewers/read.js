@@ -1,7 +1,7 @@
 // Reads what a browser gets: binary PLY and SPZ. Python converts every other format.
 import { readSpz } from "./spz.js";
 
-const DEFAULTS = { form: "ours", scene_distance: 1, reference_distance: 0, max_sv: 5 };
+const DEFAULTS = { form: "ours", scene_distance: 1, reference_distance: 0, max_sv: 5, near_distance: 0 };
 const EARLIER = ["tau", "eps", "cut", "normalizer", "hard_cut", "max"]; // of an earlier form of the dial
 const TYPES = { // the other names are those of DataView, in lower case
   char: "Int8", uchar: "Uint8", short: "Int16", ushort: "Uint16", int: "Int32", uint: "Uint32", float: "Float32", double: "Float64",
@@ -15,16 +15,23 @@ const CONVERTED = /^property \w+ (packed_|masks_|filter_3D|f_anchor_feat)|^eleme
 export async function readGaussians(bytes) {
   try {
     const magic = String.fromCharCode(...bytes.subarray(0, 3));
-    if (magic === "ply") return readPly(bytes);
+    if (magic === "ply") return revealed(readPly(bytes));
     if (magic.startsWith("\x1f\x8b")) {
       const { attenuation, ...read } = await readSpz(bytes);
-      return { ...read, settings: attenuation && settingsOf(attenuation) };
+      return revealed({ ...read, settings: attenuation && settingsOf(attenuation) });
     }
   } catch (error) {
     if (error.constructor === Error) throw error;
     throw new Error("it is damaged or too large for this browser; copy or export it again", { cause: error });
   }
   throw new Error(bytes.length ? "it is neither .ply nor .spz" : "it is empty");
+}
+
+/** With the opacities of far Gaussians, which the file hides from viewers without the dial. */
+function revealed({ opacityD, ...read }) {
+  const { opacityLogits, sigmaD } = read;
+  if (opacityD) sigmaD.forEach((sigma, i) => sigma > 0 && (opacityLogits[i] = opacityD[i]));
+  return read;
 }
 
 /** By NAME the values of the columns clod_NAME, the same in all rows (io/ply_layout.py); `first(name)`: of the first row. */
@@ -64,6 +71,7 @@ function readPly(bytes) {
   return {
     count, degree, means: read("x", "y", "z"), quats: numbered("rot", 4), logScales: numbered("scale", 3),
     opacityLogits: read("opacity"), sh0: numbered("f_dc", 3), shN: read(...rest), sigmaD: hasDial ? read("sigma_d") : null,
+    opacityD: hasDial && columns.has("opacity_d") ? read("opacity_d") : null,
     growthD: hasDial && columns.has("growth_d") ? read("growth_d") : null, settings: hasDial ? readSettings(comments, constants) : null,
     screenFilter: readScreenFilter(comments, constants, hasDial), calibration: readCalibration(comments, count),
   };

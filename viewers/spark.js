@@ -30,7 +30,7 @@ export async function attach(mesh, bytes, renderer) {
 }
 
 function attenuated(file) {
-  const { distance, start } = constants(file);
+  const { distance, start, near } = constants(file);
   return new dyno.Dyno({
     inTypes: { gsplat: dyno.Gsplat, columns: "sampler2D", s: "float", eye: "vec3" },
     outTypes: { gsplat: dyno.Gsplat },
@@ -40,7 +40,7 @@ function attenuated(file) {
       if (isGsplatActive(${outputs.gsplat}.flags)) {
         vec2 column = texelFetch(${inputs.columns}, ivec2(${outputs.gsplat}.index % ${WIDTH}, ${outputs.gsplat}.index / ${WIDTH}), 0).rg;
         float d = length(${outputs.gsplat}.center - ${inputs.eye}) / ${distance};
-        ${outputs.gsplat}.rgba.a = clodOpacity(${outputs.gsplat}.rgba.a, column.r, d, ${inputs.s});
+        ${outputs.gsplat}.rgba.a = clodOpacity(${outputs.gsplat}.rgba.a, column.r, d, ${inputs.s}, ${near});
         ${outputs.gsplat}.scales *= clodScale(column.g, d, ${inputs.s}, ${start});
         if (${outputs.gsplat}.rgba.a == 0.0) ${outputs.gsplat}.flags = 0u;
       }

@@ -25,10 +25,11 @@ from clod_adapter.io.checkpoint import Checkpoint
 from clod_adapter.io.scene.load import ImageCache
 from clod_adapter.progress import GracefulStop, Phase, Stopped
 from clod_adapter.training.camera_placement import place_cameras
+from clod_adapter.training.far import takes_over
 from clod_adapter.training.loop import time_steps
 from clod_adapter.training.plan import NOT_NEEDED, Decision, Override, Plan
 from clod_adapter.training.planner import make_plan
-from clod_adapter.training.pseudo_views import LIGHTEST, STEPS_PER_PLACED, add_pseudo_views, render_pseudo_views
+from clod_adapter.training.pseudo_views import LIGHTEST, add_pseudo_views, render_pseudo_views
 
 from ..shared import inputs
 from ..shared.command import make_config
@@ -54,6 +55,7 @@ class Run:
     scene: Scene
     alignment: dict[str, Any] | None = None  # the measurements of the check; None without photographs
     memory: MemoryPlan | None = None  # for --memory
+    far = False  # whether far Gaussians are added
     base_rows: list[Row]  # at dial value 1; none if nothing is held out
     base_seconds = 0.0  # of measuring it
     forecast: dict[str, Any] | None = None
@@ -93,6 +95,15 @@ class Run:
             self.place(photographs)
         if args.memory:
             self.memory = plan_memory(base, self.scene, parse_size(args.memory), console)
+        self.far = not self.in_blocks and takes_over(base.gaussians, self.config)
+        if not self.far and photographs is None:
+            self.config = self.config.lighter(LIGHTEST)
+        far = self.far or base.gaussians.near is not None
+        self.config = self.config.for_views(len(self.scene.train), far)
+
+    @property
+    def in_blocks(self) -> bool:
+        return self.memory is not None and self.memory.blocks > 1
 
     def place(self, photographs: Scene | None) -> None:
         """Adds pseudo views where photographs are few, and replaces them where there are none."""
@@ -105,7 +116,6 @@ class Run:
         if photographs is None:
             with console.meter(Phase.PSEUDO_VIEWS) as meter:
                 self.scene = render_pseudo_views(gaussians, cameras, progress=meter)
-            self.config = config.lighter(LIGHTEST).for_views(len(self.scene.train), STEPS_PER_PLACED)
         console.note(*self.scene.notes)
 
     def identify(self) -> None:
@@ -143,7 +153,7 @@ def decide(run: Run, display: ProgressDisplay) -> Plan:
     """Makes the plan, with the effect of ``--trim``, and prints it."""
     args, console, base = run.args, run.console, run.base.gaussians
     override = Override(frozenset(args.keep_in), frozenset(args.leave_out))
-    plan = make_plan(base, run.scene, run.config, override, display)
+    plan = make_plan(base, run.scene, run.config, override, display, far=run.far)
     display.close()
     release()  # of looking at all Gaussians, before only those that are kept are trained
     if args.trim and plan.trims(base):

@@ -56,12 +56,11 @@ def adapt(args: argparse.Namespace) -> dict[str, Any]:
     run = Run(args)
     run.read()
     page = AdaptPage(run.base.gaussians, run.scene, run.config, run.console) if args.report else None
-    in_blocks = run.memory is not None and run.memory.blocks > 1
-    if not in_blocks:
+    if not run.in_blocks:
         run.identify()
     run.measure_base()
     with run.stop.listening(), run.saver.rescuing():  # until training has ended, so that a Ctrl-C loses nothing
-        result = make_result(run, *(adapt_in_blocks(run) if in_blocks else train(run, page)))
+        result = make_result(run, *(adapt_in_blocks(run) if run.in_blocks else train(run, page)))
     with run.saver.rescuing():
         return finish(run, result, page)
 

@@ -39,7 +39,7 @@ def export(args: Namespace) -> dict[str, Any]:
     """Reads, bakes and writes; prints what was written, and returns the report."""
     watch, export = Stopwatch(), Export(args)
     export.note_losses()
-    total, camera, written = len(export.gaussians), export.camera, export.write()
+    total, camera, written = export.gaussians.whole, export.camera, export.write()
     for output in written:
         print(line_of(output, total))
     if export.dials and not export.page:
@@ -164,7 +164,7 @@ class Export:
         """Writes a file, with notes on losses of the format; its number of Gaussians."""
         if suffix == PAGE:
             self._write_page(path, virtual_scale)
-            return len(self.gaussians)
+            return self.gaussians.whole
         gaussians, about = self._content(virtual_scale)
         if suffix not in WRITABLE:
             with TemporaryDirectory(dir=path.parent, prefix=".tmp-") as folder:
@@ -177,7 +177,7 @@ class Export:
         self.console.note(*write(path, gaussians, Metadata(calibration=stored, origin=self.model.origin, about=about)))
         if suffix == ".ply" and any(self.model.origin):
             self.console.note("x, y and z are doubles, which SIBR and some other readers misread")
-        return len(gaussians)
+        return gaussians.whole
 
     def _write_set(self, index: Path) -> list[int]:
         """Writes a streaming or 3D Tiles set to the folder of ``index``; the number of Gaussians per level."""

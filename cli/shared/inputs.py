@@ -42,7 +42,8 @@ def read_checkpoint(
     gaussians = checkpoint.gaussians
     columns, drawn = " and ".join(dial_columns(gaussians.tensors())), gaussians.screen_filter
     more = f", with {columns}" * bool(columns) + f", drawn with {drawn.description}" * (drawn != CLASSIC)
-    console.say(f"{path}: {len(gaussians):,} Gaussians, SH degree {gaussians.sh_degree}{more}")
+    far = f" and {len(gaussians) - gaussians.whole:,} far" if gaussians.near is not None else ""
+    console.say(f"{path}: {gaussians.whole:,}{far} Gaussians, SH degree {gaussians.sh_degree}{more}")
     console.note(*checkpoint.notes, of=path)
     return replace(checkpoint, gaussians=gaussians.to(device))
 

@@ -62,7 +62,8 @@ class AdaptPage:
             if self.due and now.share >= self.due[0]:
                 self.due = [share for share in self.due if share > now.share]
                 state = whole(now.gaussians())
-                fixed = {"shN": self.base.shN} if self.config.lr_shN == 0 else {}  # the largest, if it is not trained
+                # The largest, if it is not trained; far Gaussians have their own.
+                fixed = {"shN": self.base.shN} if len(state) == len(self.base) and self.config.lr_shN == 0 else {}
                 changing = {name: value.clone() for name, value in state.tensors().items() if name not in fixed}
                 self.snapshots.append((now.seconds, state.replace(**changing, **fixed)))
 
@@ -111,5 +112,5 @@ def pictures(
 def _rendered(gaussians: Gaussians, view: View, virtual_scale: float, title: str) -> Picture:
     rendering = render(gaussians, view.camera, virtual_scale)
     kept, error = int(rendering.kept.sum()), psnr(rendering.image, view.image)
-    detail = f"{error:.2f} dB on this view, {kept:,} Gaussians ({kept / max(len(gaussians), 1):.0%})"
+    detail = f"{error:.2f} dB on this view, {kept:,} Gaussians ({kept / max(gaussians.whole, 1):.0%})"
     return Picture(rendering.image.cpu().numpy(), title, detail)

@@ -26,7 +26,7 @@ def count_kept(worker, workers, sigma, d, dial2, counts):
     sigma, d, square, total = pointer(sigma), pointer(d), float32(dial2), 0
     for i in range(first, last, 16):
         reach, far2 = load_squares(i, last - i, sigma, d, square)
-        total += ones(bits_of(both(survives(reach, far2), first_lanes(last - i))))
+        total += ones(bits_of(both(survives(reach, far2, float32(0)), first_lanes(last - i))))
     counts[worker] = total
 
 

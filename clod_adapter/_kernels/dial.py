@@ -13,12 +13,12 @@ from clod_adapter._kernels.elementary import bits_of, exp2, log2, vabs
 from clod_adapter._kernels.pointers import first_lanes, gather, load_some, load_triples, pointer, scatter, scratch
 from clod_adapter._kernels.simd import both, f32x16, ge, gt, select, splat, vmax, vmin
 
-# A dial: (s / D)^2 and (s / (D r))^2, in 1 / world units^2, and 1 where scales and opacities are activated and there is
-# no dial.
-RATE2, GROWTH_RATE2, ACTIVATED = range(3)
+# A dial: (s / D)^2 and (s / (D r))^2, in 1 / world units^2, 1 / H^2 (0 without near Gaussians), and 1 where scales and
+# opacities are activated and there is no dial.
+RATE2, GROWTH_RATE2, NEAR2, ACTIVATED = range(4)
 DIAL = ACTIVATED + 1
 
-LN2, FOUR = float32(0.6931471805599453), float32(4)
+LN2, FOUR, TAKEOVER = float32(0.6931471805599453), float32(4), float32(5)  # attenuation.TAKEOVER
 FARTHEST_EXPONENT = float32(126)  # of exp2
 LOG2_GROWTH_MAX = float32(20 * 1.4426950408889634)  # attenuation.LOG_GROWTH_MAX
 NEARLY = float32(0.99)  # of the near plane: the projection decides exactly
@@ -39,9 +39,20 @@ def squared_reach(sigma, far2):
 
 
 @part
-def survives(sigma, far2):
+def takeover(far2, near2):
+    """w, before it is clamped to [0, 1]."""
+    return far2 * near2 * TAKEOVER - (TAKEOVER - c.ONE)
+
+
+@part
+def survives(sigma, far2, near2):
     """Which of sixteen rows the dial keeps."""
-    return gt(squared_reach(sigma, far2), far2)
+    end2 = squared_reach(sigma, far2)
+    if near2 > c.ZERO:
+        far = gt(sigma, splat(c.ZERO))
+        begun = select(far, takeover(far2, near2), splat(c.ONE))
+        return both(gt(begun, splat(c.ZERO)), gt(select(far, end2, splat(c.ONE / near2)), far2))
+    return gt(end2, far2)
 
 
 @part
@@ -71,7 +82,8 @@ def kept(at, many, means, opacities, sigma, cam, dial, dialled):
         depth = cam[8] * w[0] + cam[9] * w[1] + cam[10] * w[2] + cam[11]
         shown = ge(depth, splat(NEARLY * cam[c.NEAR]))
         if dialled:
-            shown = both(shown, survives(load_some(sigma, at, many), squared_distance(w, cam) * dial[RATE2]))
+            far2 = squared_distance(w, cam) * dial[RATE2]
+            shown = both(shown, survives(load_some(sigma, at, many), far2, dial[NEAR2]))
     return bits_of(both(shown, first_lanes(many)))
 
 
@@ -84,7 +96,8 @@ def mark_kept(worker, workers, means, sigma, cam, dial, out):
     for i in range(first, last, 16):
         many = min(last - i, 16)
         load_triples(means, i, many, w)
-        bits = bits_of(survives(load_some(sigma, i, many), squared_distance(w, cam) * dial[RATE2]))
+        far2 = squared_distance(w, cam) * dial[RATE2]
+        bits = bits_of(survives(load_some(sigma, i, many), far2, dial[NEAR2]))
         for lane in range(many):
             out[i + lane] = (bits >> uint64(lane)) & uint64(1)
 
@@ -101,8 +114,13 @@ def drawn(rows, opacities, sigma, growth, cam, dial, dialled, grows, w):
     opacity = c.ONE / reciprocal_opacity(opacity)
     if dialled:
         distance2 = squared_distance(w, cam)
-        share2 = squared_share(gather(sigma, rows), distance2 * dial[RATE2])
-        opacity = opacity * (c.ONE - share2 * share2)
+        reach, far2 = gather(sigma, rows), distance2 * dial[RATE2]
+        share2 = squared_share(reach, far2)
+        fade = c.ONE - share2 * share2
+        if dial[NEAR2] > c.ZERO:
+            taken = vmin(splat(c.ONE), vmax(splat(c.ZERO), takeover(far2, dial[NEAR2])))
+            fade = select(gt(reach, splat(c.ZERO)), fade * taken, c.ONE - taken)
+        opacity = opacity * fade
         if grows:
             size = gather(growth, rows) * log2_magnification(distance2, dial)
             size = vmin(splat(LOG2_GROWTH_MAX), vmax(splat(-LOG2_GROWTH_MAX), size))  # NaN stays, and is not drawn

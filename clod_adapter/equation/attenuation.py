@@ -13,8 +13,18 @@ Every Gaussian has a reach: the distance, at s = 1, at which it ends. At the dia
 and turning the dial are one effect, and the kept sets are nested in both. Opacity has no part in the cut. At s = 0
 everything is drawn as it is stored, and so is a Gaussian with an infinite ``sigma_d``.
 
+With a ``near_distance`` H, Gaussians of two kinds are in one file: near ones, the checkpoint's own, whose ``sigma_d``
+is 0, and fewer far ones, which take over from them in a narrow zone. With ``x = d s / H``, in one unit::
+
+    w = min(max(5 x^2 - 4, 0), 1)
+    near    kept iff x < 1;               a (1 - w) is drawn
+    far     kept iff w > 0 and t < 1;     a w f is drawn
+
+So at s = 0, and nearer than ``0.89 H / s``, the picture is the checkpoint's, bit for bit. Kept sets are nested within
+each kind.
+
 Opacity reaches 0 continuously: per unit of ``log s`` or ``log d`` the drawn opacity changes by at most ``4 a``, as
-``df / dlog t = -4 t^4``. Nearer than r / s nothing grows.
+``df / dlog t = -4 t^4``; within the zone by at most ``10 a`` more. Nearer than r / s nothing grows.
 
 Sources: decay and culling by distance and dial follow "CLoD-GS: Continuous Level-of-Detail via 3D Gaussian Splatting",
 ICLR 2026, whose own form, with an exponential and an absolute threshold, is ``paper.py`` (``AttenuationConfig.form``).
@@ -51,6 +61,7 @@ SIGMA_MAX = 1e9
 # Of trained exponents. 3/4 preserves area where counts fall as s^-1.5; above 1 a Gaussian far away grows on the screen.
 GROWTH_RANGE = (-1.0, 3.0)
 LOG_GROWTH_MAX = 20.0  # of abs(log g)
+TAKEOVER = 5.0  # far Gaussians begin at sqrt(1 - 1/5) H
 
 
 class Attenuated(NamedTuple):
@@ -105,16 +116,29 @@ def attenuate(
     if config.form == "paper":
         fade, keep = paper_fade(shown, sigma, far, virtual_scale)
     else:
-        fade, keep = reach_fade(sigma, far)
+        fade, keep = reach_fade(sigma, far, config.near_distance / config.scene_distance)
     return Attenuated(shown * fade.to(shown), keep, growth)
 
 
-def reach_fade(sigma_d: Tensor, far: Tensor) -> tuple[Tensor, Tensor]:
-    """The fade f, float64, differentiable in ``sigma_d``, and which Gaussians are kept; ``far`` is d s, float64."""
+def reach_fade(sigma_d: Tensor, far: Tensor, near: float = 0.0) -> tuple[Tensor, Tensor]:
+    """The fade f, float64, differentiable in ``sigma_d``, and which Gaussians are kept; ``far`` is d s, float64.
+
+    ``near``: H, in the unit of ``far``; 0 where there are no near Gaussians.
+    """
     keep = (far < sigma_d) | (far == 0)
     fades = keep & (far > 0)
     t = torch.where(keep, far, 1) / sigma_d.double().where(fades, 1)  # 1 / 1 where it is culled, without a gradient
-    return 1 - t.square().square(), keep  # as a product, the slope of a small t would cancel
+    fade = 1 - t.square().square()  # as a product, the slope of a small t would cancel
+    if near == 0:
+        return fade, keep
+    taken_over, is_near = takeover(far, near), sigma_d <= 0
+    keep = torch.where(is_near, far < near, keep & (taken_over > 0))
+    return torch.where(is_near, 1 - taken_over, fade * taken_over), keep
+
+
+def takeover(far: Tensor, near: float) -> Tensor:
+    """w, in [0, 1]: how far the far Gaussians have taken over from the near ones at d s = ``far``."""
+    return ((far / near).square() * TAKEOVER - (TAKEOVER - 1)).clamp(0, 1)
 
 
 def dial(gaussians: Gaussians, seen_from: Camera | Tensor, virtual_scale: float) -> Attenuated:

@@ -19,6 +19,7 @@ from statistics import fmean
 import torch
 from torch import Tensor
 
+from clod_adapter.bake import baked_rows
 from clod_adapter.calibration import Calibration, crossing
 from clod_adapter.cameras import Camera
 from clod_adapter.config import AttenuationConfig, require
@@ -142,18 +143,20 @@ def _for_count(
         return typical_distance(gaussians.means, views[k], config)
 
     def count(virtual_scale: float) -> int:
+        if baked:
+            return int(baked_rows(gaussians, distances(0), virtual_scale).sum())
         return sum(int(dial(gaussians, distances(k), virtual_scale).keep.sum()) for k in range(len(views)))
 
     most, fewest = count(1.0), count(largest)
     if wanted >= most:
-        note = f"s = 1 keeps {most / len(views):,.0f} of {len(gaussians):,} already" if wanted > most else ""
+        note = f"s = 1 keeps {most / len(views):,.0f} of {gaussians.whole:,} already" if wanted > most else ""
         return DialValue(1.0, note)
     if wanted < fewest:
         raise ClodError(
             f"{keep:,.0f} Gaussians are out of reach: at s = {largest:g}, the largest dial value it was trained for, "
             f"{fewest / len(views):,.0f} are kept"
         )
-    if config.form == "ours":
+    if config.form == "ours" and gaussians.near is None:
         assert gaussians.sigma_d is not None
         pools = []  # of those that are culled within the range of the dial
         for k in range(len(views)):

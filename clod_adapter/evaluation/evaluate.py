@@ -88,7 +88,7 @@ def evaluate(
                 return rows
         times, *columns = zip(*found, strict=True)
         psnr, ssim, kept, in_view = map(statistics.fmean, columns)
-        share, frame_ms = kept / max(len(gaussians), 1), 1e3 * statistics.median(times)
+        share, frame_ms = kept / max(gaussians.whole, 1), 1e3 * statistics.median(times)
         rows.append(Row(virtual_scale, psnr, ssim, kept, share, in_view, frame_ms))
         if stopped:
             break

@@ -131,13 +131,13 @@ def removal_error(
     return total / max(len(views), 1)
 
 
-def extinction_from_rank(rank: Tensor, config: AdaptConfig) -> Tensor:
+def extinction_from_rank(rank: Tensor, config: AdaptConfig, total: int | None = None) -> Tensor:
     """``[N]`` the dial values at which Gaussians are culled, so that counts follow the target-count curve.
 
     The Gaussian of ``rank`` (0 the most important, integers below N) is culled where ``target_count.target_curve``
-    falls to its share of the ranks. Ranks beyond ``config.share`` are culled before s = 1.
+    falls to its share of the ranks, or of ``total``. Ranks beyond ``config.share`` are culled before s = 1.
     """
-    share = (rank.double() + 0.5) / len(rank)
+    share = (rank.double() + 0.5) / (total or len(rank))
     power = (1 / share + (share**-2 - 4 * (1 / config.share - 1)).clamp(min=0).sqrt()) / 2
     return torch.where(share <= config.share, power ** (1 / config.exponent), config.share / share).float()
 

@@ -1,7 +1,8 @@
 """Adapters as safetensors files: tensors, and one JSON document.
 
 Tensors: ``sigma_d`` float32, with growth also ``growth_d`` float32, and each update under the name of its attribute:
-float16 for a difference from the base, float32 for new values. Where the result has fewer rows than the base also
+float16 for a difference from the base, float32 for new values. Far Gaussians' attributes have names that begin with
+``far.``. Where the result has fewer rows than the base also
 ``kept``, uint8: one bit per row of the base, the first row the highest bit. The JSON is stored under the metadata key
 ``clod_adapter``, keys sorted: equal adapters give equal files.
 """
@@ -20,6 +21,8 @@ from clod_adapter.io.file_formats import KEY, read_bytes
 from clod_adapter.io.settings import ADAPTER, DAMAGED, Metadata, document, parse_document, read_metadata
 from clod_adapter.io.tensor_file import parse_tensors, read_tensor_header, write_tensors
 
+ADDED = "far."
+
 
 def save_adapter(path: str | Path, adapter: Adapter) -> None:
     """Writes an adapter; loading it gives the same tensors and settings, bit for bit.
@@ -28,6 +31,7 @@ def save_adapter(path: str | Path, adapter: Adapter) -> None:
         ClodError: its config is not plain JSON, or the file cannot be written.
     """
     a, tensors = adapter, {**dial_tensors(adapter), **adapter.updates}
+    tensors |= {ADDED + name: tensor for name, tensor in a.added.items()}
     settings = Metadata(a.attenuation, a.screen_filter, a.calibration, a.origin, version=a.version)
     about: dict[str, Any] = {"base_sha256": a.base_fingerprint, "config": a.config}
     if a.kept is not None or a.sh_degree is not None:
@@ -60,7 +64,9 @@ def load_adapter(path: str | Path) -> Adapter:
             if len(packed) != -(-count // 8):
                 raise ValueError(f"kept has {len(packed)} bytes for {count} rows")
             kept = torch.from_numpy(np.unpackbits(packed.numpy(), count=count).astype(bool))
+        added = {name.removeprefix(ADDED): tensors.pop(name) for name in [*tensors] if name.startswith(ADDED)}
         return Adapter(
+            added=added,
             sigma_d=tensors.pop("sigma_d"),
             growth_d=tensors.pop("growth_d", None),
             attenuation=settings.attenuation,

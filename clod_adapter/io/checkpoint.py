@@ -189,8 +189,8 @@ def save(
     A PLY is an extended file: the base's columns, then ``sigma_d`` and ``growth_d``. Without a base the columns are
     those of Inria's layout. What another format loses is a warning.
 
-    Row ``i`` of ``gaussians`` is row ``i`` of ``base``. Columns keep name, order and type; a value is
-    overwritten only where it differs from the base's float32 reading, so what was not tuned stays
+    Row ``i`` of ``gaussians`` is row ``i`` of ``base``, after which far Gaussians follow. Columns keep name, order and
+    type; a value is overwritten only where it differs from the base's float32 reading, so what was not tuned stays
     byte-equal. Where the base has an origin, x, y and z are written as double. sigma_d is written in world units
     (``units.in_world_units``). The settings follow the element line as comments, and those that are not the defaults
     are stored in columns too. Without a sigma_d a plain file results.
@@ -210,7 +210,10 @@ def save(
     if base is not None:
         if path.is_file() and base.path.is_file() and path.samefile(base.path):
             raise ClodError(f"{path}: is the input file, which is never overwritten; choose another output")
-        if len(gaussians) != len(base.gaussians) or gaussians.sh_degree != base.gaussians.sh_degree:
+        if (
+            len(base.gaussians) not in (len(gaussians), gaussians.whole)
+            or gaussians.sh_degree != base.gaussians.sh_degree
+        ):
             what = f"Gaussians ({gaussians.summary}) do not fit their base {base.path} ({base.gaussians.summary})"
             raise ClodError(f"{path}: {what}; save with the checkpoint they came from")
     writer = partial(write_rows, base=vertex) if format_of(path) is PLY else None

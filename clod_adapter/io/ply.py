@@ -20,7 +20,7 @@ from clod_adapter.io.ply_layout import column_map, ply_metadata
 from clod_adapter.io.ply_layout import write as write
 from clod_adapter.io.ply_packed import NOTE, check_packed, is_packed, unpack
 from clod_adapter.io.settings import Source
-from clod_adapter.io.values import FILTER_3D, GROWTH, MASKS, ROWS, SIGMA, Arrays, degree_of, dial_columns
+from clod_adapter.io.values import FILTER_3D, GROWTH, MASKS, OPACITY, ROWS, SIGMA, Arrays, degree_of, dial_columns
 
 MASK_COLUMNS = ("masks_0", "masks_1")
 HEADER_LIMIT = 1 << 20  # bytes
@@ -125,7 +125,7 @@ def _arrays(rows: np.ndarray, sh_degree: int) -> Arrays:
                 target = found[key][start : start + ROWS]
                 for column, name in enumerate(group):
                     target[:, column] = block[name]
-    for name in ("opacity_logits", SIGMA, GROWTH):
+    for name in ("opacity_logits", SIGMA, GROWTH, OPACITY):
         if name in found:
             found[name] = found[name][:, 0]
     return found | {name: found[name].reshape(len(rows), len(groups[name]) // 3, 3) for name in ("sh0", "shN")}

@@ -21,7 +21,7 @@ from clod_adapter.calibration import CalibrationRow, Viewpoint
 from clod_adapter.config import CLASSIC, SH_COUNTS, AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.io.settings import EARLIER_FORM, FILTER, Metadata, read_metadata, tagged
-from clod_adapter.io.values import FILTER_3D, GROWTH, ROWS, SIGMA, arrays_of, dial_columns
+from clod_adapter.io.values import FILTER_3D, GROWTH, INVISIBLE, OPACITY, ROWS, SIGMA, arrays_of, dial_columns
 
 if TYPE_CHECKING:
     from clod_adapter.gaussians import Gaussians
@@ -33,7 +33,8 @@ MACHINE, EXTENT, ROW, VIEWPOINT = "calibrated_on", "calibrated_with", "calibrate
 DIAL = "attenuation"
 # Of the columns of settings: group, field, and what a column of 1 stands for where the setting is no number.
 _SETTINGS: dict[str, tuple[str, str, Any]] = {
-    "reference_distance": (DIAL, "reference_distance", None), "paper": (DIAL, "form", "paper"),
+    "reference_distance": (DIAL, "reference_distance", None), "near_distance": (DIAL, "near_distance", None),
+    "paper": (DIAL, "form", "paper"),
     "screen_variance": (FILTER, "variance", None), "compensate": (FILTER, "compensate", True),
 }  # fmt: skip
 _EARLIER = {"clod_tau", "clod_eps", "clod_hard_cut", "clod_max", "clod_quantile"}  # of ``settings.EARLIER``
@@ -160,12 +161,18 @@ def write_rows(path: Path, gaussians: Gaussians, metadata: Metadata, base: np.nd
     A column of the base is overwritten where the new value is not the one that was read.
 
     Args:
-        base: ``[N]`` rows of the file that ``gaussians`` come from; None for Inria's layout.
+        base: ``[N]`` rows of the file that the first N Gaussians come from; None for Inria's layout. The others are
+            far Gaussians (``values.OPACITY``), whose other columns are 0.
     """
     tensors, origin = {name: tensor.detach() for name, tensor in gaussians.tensors().items()}, metadata.origin
+    if gaussians.near is not None:
+        logits = tensors["opacity_logits"]
+        tensors["opacity_logits"] = logits.masked_fill(~gaussians.near, INVISIBLE)
+        tensors[OPACITY] = logits.masked_fill(gaussians.near, 0.0)
     constants, dial = constants_of(metadata, growth=gaussians.growth_d is not None), dial_columns(tensors)
     layout = inria_dtype(gaussians.sh_degree) if base is None else base.dtype
-    gone = {FILTER_3D, *((SIGMA, GROWTH) if dial else dial_columns(layout.names or ()))}  # growth_d alone is foreign
+    # growth_d alone is foreign
+    gone = {FILTER_3D, *((SIGMA, GROWTH, OPACITY) if dial else dial_columns(layout.names or ()))}
     own = [name for name in layout.names or () if name not in gone and not name.startswith(COLUMN)]
     kinds = [(name, np.dtype("f8") if any(origin) and name in ("x", "y", "z") else layout[name]) for name in own]
     kind = np.dtype(kinds + [(name, np.dtype("f4")) for name in (*constants, *dial)])
@@ -176,8 +183,9 @@ def write_rows(path: Path, gaussians: Gaussians, metadata: Metadata, base: np.nd
         for start in range(0, len(gaussians), ROWS):
             part = slice(start, start + ROWS)
             block = np.zeros(len(gaussians.means[part]), kind)
-            for name in own if base is not None else ():
-                block[name] = base[part][name]  # type: ignore[index]
+            given = block[:0] if base is None else base[part]
+            for name in own if len(given) else ():
+                block[name][: len(given)] = given[name]
             for name, value in constants.items():
                 block[name] = value
             for attribute, group in (column_map(gaussians.sh_degree) | dial).items():

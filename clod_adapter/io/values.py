@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 Activated = Literal["none", "opacity", "scales", "both"]
 Arrays = dict[str, np.ndarray]
 SIGMA, GROWTH, FILTER_3D, MASKS = "sigma_d", "growth_d", "filter_3D", "masks"
+OPACITY = "opacity_d"  # of far Gaussians, whose ``opacity`` is INVISIBLE: without the dial near ones alone are drawn
+INVISIBLE = -20.0  # logit
 ROWS = 4096  # in a block, which stays in the processor's cache
 _FEW = 10  # Gaussians; fewer may have any range
 _FAINTEST = -0.1  # logit of 0.475; trainers keep fainter Gaussians, and files of |a| reach just below 0
@@ -32,7 +34,7 @@ _SH_C0 = 0.28209479177387814  # gaussians.SH_C0, without torch
 
 def dial_columns(names: Container[str]) -> dict[str, tuple[str, ...]]:
     """The dial's columns among ``names``, by attribute; growth_d without a sigma_d is another tool's."""
-    return {name: (name,) for name in (SIGMA, GROWTH) if name in names} if SIGMA in names else {}
+    return {name: (name,) for name in (SIGMA, GROWTH, OPACITY) if name in names} if SIGMA in names else {}
 
 
 def degree_of(path: Path, rest: int) -> int:
@@ -73,6 +75,10 @@ def prepared(
             raise ClodError(f"{path}: {name} has shape {array.shape}, expected {shape}; export it again")
     if rest[0] + 1 not in SH_COUNTS.values():
         raise ClodError(f"{path}: shN has {rest[0]} coefficients, which fit no SH degree; export it again")
+    if OPACITY in arrays:
+        far = arrays[SIGMA] > 0
+        shown = {"opacity_logits": np.where(far, arrays[OPACITY], arrays["opacity_logits"])}
+        arrays = {name: array for name, array in arrays.items() if name != OPACITY} | shown
     narrow = {name: np.ascontiguousarray(array, np.float32) for name, array in arrays.items() if name != "means"}
     values, was, changes = _as_logits(path, {**arrays, **narrow}, activated)
     if origin is None:
@@ -172,12 +178,16 @@ def _usable(arrays: Arrays) -> tuple[np.ndarray, dict[str, int]]:
 
 
 def arrays_of(path: Path, gaussians: Gaussians) -> Arrays:
-    """The float32 arrays of ``Gaussians.tensors``; refuses values that ``load`` would drop."""
+    """The float32 arrays of ``Gaussians.tensors``, far ones hidden; refuses values that ``load`` would drop."""
     tensors = gaussians.tensors()
     arrays = {name: tensor.detach().float().cpu().contiguous().numpy() for name, tensor in tensors.items()}
     if dropped := _usable(arrays)[1]:
         spoilt = [name for name, array in arrays.items() if not np.isfinite(array).all()] or ["quats"]
         raise ClodError(f"{path}: {', '.join(spoilt)}: {', '.join(dropped)}; drop such rows first, as load does")
+    if gaussians.near is not None:
+        near, logits = gaussians.near.cpu().numpy(), arrays["opacity_logits"]
+        arrays["opacity_logits"] = np.where(near, logits, np.float32(INVISIBLE))
+        arrays[OPACITY] = np.where(near, np.float32(0), logits)
     return arrays
 
 

@@ -24,7 +24,7 @@ from clod_adapter.initialization.importance import MOST_VIEWS, for_training, ini
 from clod_adapter.integrations.splats import NAMES, from_gsplat
 from clod_adapter.progress import Listener, shown
 from clod_adapter.training.optimizer import learning_rates, own_sizes
-from clod_adapter.training.schedule import OURS, Schedule, ViewSampler
+from clod_adapter.training.schedule import FAR, OURS, Schedule, ViewSampler
 from clod_adapter.training.target_count import TargetShare, count_gradient, target_share
 
 ATTRIBUTE_OF = {**NAMES, "features_dc": "sh0", "features_rest": "shN"}
@@ -75,7 +75,7 @@ class Dial(nn.Module):
     decay: ClassVar[str] = "log_sigma"
     everywhere: ClassVar[frozenset[str]] = frozenset()
     limits: ClassVar[tuple[float, float]] = (math.log(SIGMA_RANGE[0]), math.log(SIGMA_RANGE[1]))
-    schedule: ClassVar[Schedule] = OURS
+    schedule: Schedule = OURS
     weight_slope: ClassVar[float] = 0.25
     measured: ClassVar[bool] = True  # by the plan, and by views that watch s = 1
     initial = staticmethod(initialize)  # the Gaussians with the dial that training begins with
@@ -96,6 +96,8 @@ class Dial(nn.Module):
         self._given = (splats,)  # a ParameterDict that is an attribute would be a part of the module
         self.part = subset or TrainableSubset(len(start))
         self.attenuation, self.config = start.attenuation, config.for_views(len(cameras))
+        if start.near is not None:  # of which those that are left are a share of the near ones
+            self.schedule, config = FAR, replace(config, start_share=1.0)
         curve = partial(target_share, count=self.part.trained, config=config, total=self.part.total)
         self._target = self.part.target or curve
         self.register_parameter(self.decay, nn.Parameter(self.parameter_of(start.sigma_d)))
@@ -114,7 +116,8 @@ class Dial(nn.Module):
 
     @staticmethod
     def parameter_of(sigma_d: Tensor) -> Tensor:
-        return sigma_d.detach().float().clamp(*SIGMA_RANGE).log()
+        sigma = sigma_d.detach().float()
+        return torch.where(sigma > 0, sigma.clamp(*SIGMA_RANGE).log(), -math.inf)
 
     def __repr__(self) -> str:
         return f"Dial({len(self.typical):,} Gaussians, s from 1 to {self.config.max_sv:g}, {self.typical.device})"
@@ -236,7 +239,7 @@ class Dial(nn.Module):
     @torch.no_grad()
     def clamp(self) -> None:
         """Keeps the parameters in their ranges."""
-        getattr(self, self.decay).clamp_(*self.limits)
+        getattr(self, self.decay)[: self.part.trained].clamp_(*self.limits)
         if self.growth_d is not None:
             self.growth_d.clamp_(*GROWTH_RANGE)
 

@@ -19,6 +19,7 @@ from clod_adapter.initialization.importance import for_training, usable_views, w
 from clod_adapter.progress import GracefulStop, Listener, Phase, Progress, shown
 from clod_adapter.training.dial import TrainableSubset, require_trainable
 from clod_adapter.training.distributed import ProcessGroup, ProcessLost
+from clod_adapter.training.far import takes_over, with_far
 from clod_adapter.training.gate import CHECKS, split_views
 from clod_adapter.training.paper import form_of
 from clod_adapter.training.state import Adapted, StateRefused, TrainingState
@@ -46,7 +47,8 @@ def adapt(
     to minimise ``w_s L_render(s)``, where L_render is ``losses.photometric_loss`` and ``w_s`` is ``Dial.weight``.
     ``target_count.count_gradient`` moves sigma_d so that the share of Gaussians kept at their typical distances follows
     the target-count curve. The result is the mean of the parameters over the last fifth of the steps, in world units.
-    A base that has a sigma_d is continued from. ``AdaptConfig.paper`` gives CLoD-GS's own training instead.
+    Far Gaussians are added and trained, and those of the base stay as they are (``training/far.py``). A base that has a
+    dial is continued from, with what it has. ``AdaptConfig.paper`` gives CLoD-GS's own training.
 
     Training ends early, and returns the result so far with ``Adapted.interrupted``, in these cases. After the
     last one ``progress`` is called once more, with ``Progress.error``.
@@ -76,15 +78,17 @@ def adapt(
             views a step than processes, or a process was lost before the first step.
         Stopped: ``progress`` returned False before training.
     """
-    config = replace(config or AdaptConfig(), **settings).for_views(len(scene.train))
+    config = replace(config or AdaptConfig(), **settings)
+    far = subset is None and takes_over(base, config)
+    config = config.for_views(len(scene.train), far or base.near is not None)
     require_trainable(base, scene, config, group.size if group else 1)
     began = time.perf_counter()
     # Empty higher SH degrees that are not tuned stay empty, so they are not rendered.
     lean = base if config.lr_shN > 0 else base.without_empty_bands()
-    views, watched = training_views(base, scene.train, config)
+    views, watched = training_views(lean, scene.train, config, far)
     with shown(False if progress is None and group and group.rank else progress) as listener:
-        if resume is None:
-            begun = _initialized(lean, views, config, listener, group)
+        if resume is None or far:  # merging again gives the same Gaussians
+            begun = _initialized(lean, views, config, listener, group, far)
         else:
             begun = _initialized_from(lean, resume, config)
         trainer = Trainer(begun, views, config, subset, group, watched)
@@ -105,7 +109,7 @@ def time_steps(
     """Seconds of a step of ``adapt``, as the mean of ``steps`` over the schedule, and of all beside the steps."""
     began = time.perf_counter()
     views, watched = training_views(base, scene.train, config)
-    trainer = Trainer(_initialized(base, views, config, None, None), views, config, subset, None, watched)
+    trainer = Trainer(_initialized(base, views, config), views, config, subset, None, watched)
     fixed = time.perf_counter() - began
     trainer.step(0.0)  # allocates memory
     if trainer.gate:
@@ -120,21 +124,30 @@ def time_steps(
 
 
 def training_views(
-    base: Gaussians, views: Sequence[View], config: AdaptConfig
+    base: Gaussians, views: Sequence[View], config: AdaptConfig, far: bool = False
 ) -> tuple[tuple[View, ...], tuple[View, ...]]:
-    """The usable views to train on, and those that watch s = 1 (``gate.Gate``); none watch the paper's objective."""
+    """The usable views to train on, and those that watch s = 1 (``gate.Gate``).
+
+    None watch the paper's objective, or near Gaussians, which do not change (``far``: those that base will be).
+    """
     usable = usable_views(base, views)
-    return split_views(usable) if form_of(config).measured else (usable, ())
+    watched = form_of(config).measured and base.near is None and not far
+    return split_views(usable) if watched else (usable, ())
 
 
 def _initialized(
-    lean: Gaussians, views: tuple[View, ...], config: AdaptConfig, progress: Listener | None,
-    group: ProcessGroup | None,
+    lean: Gaussians, views: tuple[View, ...], config: AdaptConfig, progress: Listener | None = None,
+    group: ProcessGroup | None = None, far: bool = False,
 ) -> Gaussians:  # fmt: skip
     """The Gaussians with the initial dial: of a group, which may round differently, the first process's."""
-    begun = for_training(form_of(config).initial(lean, views, config, progress))
-    found: Any = {name: getattr(begun, name) for name in ("sigma_d", "growth_d", "attenuation")}
-    return lean.replace(**(group.broadcast(found) if group else found)).to(lean.means.device)
+    if far:
+        begun = for_training(with_far(lean, views, config, progress))
+        names = [*begun.tensors(), "attenuation"]  # merging, too, depends on rounding
+    else:
+        begun = for_training(form_of(config).initial(lean, views, config, progress))
+        names = ["sigma_d", "growth_d", "attenuation"]
+    found: Any = {name: getattr(begun, name) for name in names}
+    return begun.replace(**(group.broadcast(found) if group else found)).to(lean.means.device)
 
 
 def _initialized_from(lean: Gaussians, resume: TrainingState, config: AdaptConfig) -> Gaussians:

@@ -12,7 +12,7 @@ from clod_adapter.adapter import trim, with_dial
 from clod_adapter.cameras import Scene, View
 from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
-from clod_adapter.gaussians import Gaussians
+from clod_adapter.gaussians import Gaussians, with_near
 from clod_adapter.losses import psnr
 from clod_adapter.progress import Listener, Phase, tell, within
 from clod_adapter.render import render
@@ -79,7 +79,8 @@ class Plan:
 
     Attributes:
         decisions: one for each part of the checkpoint.
-        start: all rows of the base with the initial dial, without the SH degrees that are left out.
+        start: all rows of the base with the initial dial, and far ones that are added, without the SH degrees that are
+            left out.
         kept: ``[N]`` bool, the rows that are trained; None for all.
         sh_degree: the SH degree that is trained.
         config: with learning rate 0 for frozen attributes.
@@ -99,8 +100,10 @@ class Plan:
         return trim(self.start, self.kept, None)
 
     @property
-    def subset(self) -> TrainableSubset:
+    def subset(self) -> TrainableSubset | None:
         """For ``loop.adapt`` of ``lean``: the target counts remain shares of all Gaussians."""
+        if self.start.near is not None:
+            return None
         return TrainableSubset(len(self.start) if self.kept is None else int(self.kept.sum()), total=len(self.start))
 
     def adapt(
@@ -121,6 +124,8 @@ class Plan:
         """
         if not self.trims(base):
             return lean
+        if lean.near is not None:
+            return with_near(base, lean.select(~lean.near))
         rows = slice(None) if self.kept is None else self.kept
         values = with_dial(base, self.start.sigma_d, lean.attenuation, self.start.growth_d).tensors()
         for name, new in lean.tensors().items():

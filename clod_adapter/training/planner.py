@@ -1,6 +1,5 @@
 """Making a plan: before training, measures what the scene does not need."""
 
-import math
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -12,7 +11,8 @@ import torch
 from torch import Tensor
 
 from clod_adapter.cameras import Scene, View, spread
-from clod_adapter.config import LONGEST, AdaptConfig
+from clod_adapter.config import AdaptConfig
+from clod_adapter.equation.attenuation import dial
 from clod_adapter.equation.distances import normalized_distances
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.initialization.importance import MOST_VIEWS, has_dial, removal_error
@@ -21,6 +21,7 @@ from clod_adapter.progress import Listener, Phase, tell, within
 from clod_adapter.rasterizers import ALPHA_MAX
 from clod_adapter.render import render, splat
 from clod_adapter.training.dial import require_trainable
+from clod_adapter.training.far import takes_over, with_far
 from clod_adapter.training.gate import decibels_below, squared_error
 from clod_adapter.training.loop import training_views
 from clod_adapter.training.paper import form_of
@@ -34,6 +35,7 @@ LIMIT = 0.02  # dB: SH degrees and Gaussians are left out if the PSNR of the tra
 VIEWS = 8  # evenly spread training views on which that is measured
 REQUESTED = "as requested, not measured"
 FEW = 0.02  # share of the Gaussians that the farthest views and the smallest budgets have
+FARTHER, FARTHEST = 1.1, 100.0  # step and end of the search for the dial value with that share
 
 
 @torch.inference_mode(False)
@@ -44,6 +46,8 @@ def make_plan(
     config: AdaptConfig | None = None,
     override: Override | None = None,
     progress: Listener | None = None,
+    *,
+    far: bool = True,
 ) -> Plan:
     """Measures what the training views of ``scene`` need of ``base``, and computes the initial sigma_d.
 
@@ -51,15 +55,18 @@ def make_plan(
 
     Args:
         override: fixed decisions, which are not measured, except which Gaussians are unseen.
+        far: whether far Gaussians may be added (``far.with_far``); blocks have none.
         progress: called in ``Phase.SH_DEGREES``, ``IMPORTANCE`` and ``PRUNING_ORDER``.
 
     Raises:
         ClodError: as ``loop.adapt``.
         Stopped: ``progress`` returned False.
     """
-    config, override = (config or AdaptConfig()).for_views(len(scene.train)), override or Override()
+    config, override = config or AdaptConfig(), override or Override()
+    far = far and takes_over(base, config)
+    config = config.for_views(len(scene.train), far or base.near is not None)
     require_trainable(base, scene, config)
-    views, watched = training_views(base, scene.train, config)
+    views, watched = training_views(base, scene.train, config, far)
     placed = all(isinstance(view, PseudoView) for view in scene.train)  # there are no photographs
     seconds, kept, error = dict[str, float](), None, None
     with _timed(seconds, "bands"):
@@ -68,10 +75,14 @@ def make_plan(
     if reason := _not_measured(base, config, override):
         decisions.append(Decision("unseen Gaussians", "kept", None, "", reason, "unseen"))
     else:
-        error, kept, config, found = _measured(few, views, watched, config, placed, seconds, progress)
+        error, kept, config, found = _measured(few, views, watched, config, placed, far, seconds, progress)
         decisions += found
     with _timed(seconds, "start"):
-        initial = form_of(config).initial(few, views, config, progress, error)
+        begin = with_far if far else form_of(config).initial
+        initial = begin(few, views, config, progress, error)
+    if far:
+        added, why = float(len(initial) - initial.whole), "far Gaussians stand for those that stay as they are near"
+        decisions.append(Decision("far Gaussians", "added", added, "", f"{why} by"))
     decisions += _far_end(initial, views, config)
     frozen = [name for name in RATES if name in override.leave_out]
     decisions += [Decision(name, "frozen", None, "", REQUESTED, name) for name in frozen]
@@ -124,7 +135,7 @@ def _not_measured(base: Gaussians, config: AdaptConfig, override: Override) -> s
 
 
 def _measured(
-    few: Gaussians, views: Sequence[View], watched: Sequence[View], config: AdaptConfig, placed: bool,
+    few: Gaussians, views: Sequence[View], watched: Sequence[View], config: AdaptConfig, placed: bool, far: bool,
     seconds: dict[str, float], progress: Listener | None,
 ) -> tuple[Tensor, Tensor | None, AdaptConfig, list[Decision]]:  # fmt: skip
     """``[N]`` what removing each Gaussian costs, the rows to train (None for all), and the share kept at s = 1.
@@ -147,11 +158,15 @@ def _measured(
     if placed:  # a Gaussian that no placed camera shows is as important as others of its opacity and size
         error, elsewhere = (supposed_error(few, found, shown) for found in (error, elsewhere))
         why += ", which do not show everything"
-    kept = None if placed or gone in (0, len(few)) else shown  # in an invisible checkpoint no row can be preferred
-    verdict, effect = ("kept", float(gone) if placed else 0.0) if kept is None else ("left out", float(gone))
-    name = "unseen" if placed or kept is not None else ""
+    if far:
+        why += "; near Gaussians stay"
+    kept = (
+        None if placed or far or gone in (0, len(few)) else shown
+    )  # in an invisible checkpoint no row can be preferred
+    verdict, effect = ("kept", float(gone) if placed or far else 0.0) if kept is None else ("left out", float(gone))
+    name = "unseen" if (placed or kept is not None) and not far else ""
     decisions = [Decision("unseen Gaussians", verdict, effect, "", why, name)]
-    if config.start_share is None and config.max_sv != 1:
+    if config.start_share is None and config.max_sv != 1 and not far:
         fold = fold or some[:VIEWS]
         with _timed(seconds, "share"):
             share, loss = needed_share(few, fold, elsewhere, SHARE_LIMIT)
@@ -165,15 +180,19 @@ def _far_end(initial: Gaussians, views: Sequence[View], config: AdaptConfig) -> 
     """The share of the Gaussians that the largest dial value will keep, and the one that would keep FEW."""
     if config.form == "paper" or config.max_sv == 1:
         return []
-    assert initial.sigma_d is not None and initial.attenuation is not None
+    assert initial.attenuation is not None
     cameras = [view.camera for view in spread(views, VIEWS)]
     distances = [normalized_distances(initial.means, camera, initial.attenuation) for camera in cameras]
-    extinction = torch.cat([initial.sigma_d / d for d in distances])
-    kept = float((extinction > config.max_sv).double().mean())
-    reached = f"{kept:.0%} at s = {config.max_sv:g}"
-    farther = float(extinction.kthvalue(max(round((1 - FEW) * len(extinction)), 1)).values)
-    if config.max_sv < farther < LONGEST:
-        reached += f", {FEW:.0%} with --max-sv {math.ceil(farther)}"
+
+    def share(s: float) -> float:
+        return fmean(int(dial(initial, d, s).keep.sum()) for d in distances) / initial.whole
+
+    reached = f"{share(config.max_sv):.0%} at s = {config.max_sv:g}"
+    farther = config.max_sv
+    while share(farther) > FEW and farther < FARTHEST:
+        farther *= FARTHER
+    if config.max_sv < farther < FARTHEST:
+        reached += f", {FEW:.0%} with --max-sv {farther:.2g}"
     return [Decision(reached, "kept", None, "", "in the mean of the training views, before training")]
 
 

@@ -24,7 +24,6 @@ from clod_adapter.training.camera_placement import SAMPLE, place_cameras
 # most NEAR at each, from where they are moved WIDER; the others at placed cameras.
 MANY, ADDED, NEAR, WIDER = 64, 96, 4, 2.0
 TEST_EVERY = 8  # as with photographs
-STEPS_PER_PLACED = 5.5  # training steps for each placed camera, where there are no photographs
 # Of the learning rates of all but the dial, without photographs and with few: pseudo views show errors too.
 LIGHTEST, LIGHTER = 0.25, 0.5
 # Standard deviations of the random offset of a camera, of its distance to the scene, and of its direction, radians; and

@@ -1,6 +1,6 @@
 """The schedule of a training: which view a step renders, at which dial value and size, and how far it moves."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -41,6 +41,7 @@ class Schedule:
 
 
 OURS = Schedule()
+FAR = replace(OURS, full=0.0)  # of far Gaussians: near ones, which s = 0 shows, are not trained
 # One s ~ U(1, max_sv) a step, of whole photographs; no average of parameters.
 PAPER = Schedule(full=0.0, coarse=0.0, lr_final=0.05, average=0.0, rendered=1.0, counted=0.0, even=True)
 

@@ -40,7 +40,8 @@ def target_curve(virtual_scale: float, share: float, exponent: float) -> float:
 def target_share(virtual_scale: float, count: int, config: AdaptConfig, total: int | None = None) -> TargetShare:
     """The target of ``count`` of ``total`` Gaussians (all if None): ``target_curve``, but at least one Gaussian."""
     total = total or max(count, 1)
-    share = max(target_curve(virtual_scale, config.share, config.exponent), 1 / total) * (total / max(count, 1))
+    share = max(target_curve(virtual_scale, config.share, config.exponent), 1 / total)
+    share = min(share * (total / max(count, 1)), 1.0)
     return TargetShare(share, 1 / share)
 
 

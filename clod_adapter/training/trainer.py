@@ -46,6 +46,11 @@ class Trainer:
         self, start: Gaussians, views: tuple[View, ...], config: AdaptConfig, subset: TrainableSubset | None = None,
         group: ProcessGroup | None = None, watched: tuple[View, ...] = (),
     ) -> None:  # fmt: skip
+        self.order: Tensor | None = None  # of the result's rows, where far ones come first in training
+        if start.near is not None and subset is None:
+            far_first = start.near.int().argsort(stable=True)
+            subset = TrainableSubset(len(start) - start.whole, total=start.whole)
+            self.order, start = far_first.argsort(), start.select(far_first)
         form = form_of(config)
         self.rates = learning_rates(config, form.decay)
         # A frozen attribute requests no gradient from the rasterizer.
@@ -192,7 +197,11 @@ class Trainer:
     def gaussians(self) -> Gaussians:
         """The result so far, in world units: the mean where there is one, else the parameters."""
         found = self._assembled(self.parameters | self.averages())
-        return in_world_units(found if self.empty_sh is None else found.replace(shN=self.empty_sh))
+        found = found if self.order is None else found.select(self.order)
+        if self.empty_sh is not None:
+            added = self.empty_sh.new_zeros(len(found) - len(self.empty_sh), *self.empty_sh.shape[1:])  # far ones
+            found = found.replace(shN=torch.cat([self.empty_sh, added]))
+        return in_world_units(found)
 
     def averages(self) -> dict[str, Tensor]:
         """The mean parameters, of all rows; none before there is a mean."""

@@ -108,7 +108,7 @@ def test_frames_are_timed_together(clod: Any, monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(measure, "time_frames", times)
     monkeypatch.setattr(frame_times, "NOISY", 0.2)
     report = (done := clod("BASE --images SCENE --iters 2 --max-sv 4 --out dial.ply --json")).report
-    assert seen == [[300, 300, 300]]
+    assert seen == [[300, 420, 300]]
     assert [row.frame_ms * row.virtual_scale for row in load("dial.ply").calibration.rows] == pytest.approx([2000] * 5)
     assert (report["base_rows"][0]["frame_ms"], report["detached_row"]["frame_ms"]) == (1000, 3000)
     assert any("frame times are rough: they varied by 50%" in note for note in report["notes"])
@@ -157,18 +157,18 @@ def test_baking_to_a_budget(clod: Any, dialled: Path) -> None:
 def test_device_presets_are_counts(clod: Any, capture: Any, dialled: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """For export the count of the file, for view and a page the dial value that they open at."""
     assert [*DEVICES] == ["quest3", "phone", "laptop", "desktop"] and sorted(DEVICES.values()) == [*DEVICES.values()]
-    monkeypatch.setitem(DEVICES, "quest3", 200)
+    monkeypatch.setitem(DEVICES, "quest3", 120)
     report = clod("export DIAL --device-preset quest3 -o few.ply --json").report
-    assert report["outputs"][0]["count"] == 200 == len(load("few.ply").gaussians)
+    assert 115 <= report["outputs"][0]["count"] == len(load("few.ply").gaussians) <= 120
     (note,) = [note for note in report["notes"] if "preset" in note]
-    assert note.startswith("--device-preset quest3, --keep 200: s = ")
+    assert note.startswith("--device-preset quest3, --keep 120: s = ")
     args = build_parser("view").parse_args(f"{dialled} --images {capture.scene} --device-preset quest3".split())
     answers, report = view.make_page(args, view.Console(True))
     page = b"".join(answers["/"].blocks()).decode()
     opening = float(re.findall(r'"virtual_scale": ([\d.]+)}', page)[-1])
     model, scene = load(dialled).gaussians, clod_adapter.load_scene(capture.scene)
     kept = [int(clod_adapter.render(model, each.camera, opening).kept.sum()) for each in scene.train + scene.test]
-    assert sum(kept) / len(kept) == pytest.approx(200, abs=1) and any("quest3" in note for note in report["notes"])
+    assert sum(kept) / len(kept) == pytest.approx(120, abs=3) and any("quest3" in note for note in report["notes"])
 
 
 RENDER = "render DIAL --images SCENE --json -o"

@@ -50,7 +50,8 @@ def test_full_disk_while_adapting(clod: Any, dialled: Path, tmp_path: Path) -> N
     for size in (report // 2, (adapter + ply) // 2):
         with room(size):
             assert_one_error(clod(words, code=2))
-        assert contents(tmp_path) == earlier
+        assert contents(tmp_path).items() >= earlier.items()  # the state may have room
+        (tmp_path / STATE).unlink(missing_ok=True)
     with room(ply + 5000):
         report = (done := clod(words, "--report --json")).report
     assert "the page was not written: " in done.err and "page" not in report["outputs"]
@@ -65,7 +66,7 @@ def test_full_disk_while_adapting(clod: Any, dialled: Path, tmp_path: Path) -> N
     [
         (2000, "export DIAL -o x.ply"),
         (2000, "export DIAL -o x.html"),
-        (20000, "export DIAL --levels 1,4,9 -o x.ply"),  # the last file fits, and the first does not
+        (12000, "export DIAL --levels 1,4,9 -o x.ply"),  # the last file fits, and the first does not
         (1000, "render DIAL --images SCENE -o pictures"),
         (1000, "apply BASE ADAPTER -o x.ply"),
         (1000, "robustness BASE --images SCENE --iters 0 --max-sv 2 -o out"),

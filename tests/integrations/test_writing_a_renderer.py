@@ -22,7 +22,8 @@ from clod_adapter.hook import Hook
 SHADERS = files("clod_adapter.integrations.shaders")
 STORED = json.loads(SHADERS.joinpath("golden.json").read_text(encoding="utf-8"))
 CALLS = {  # the golden rows of each function, and its call
-    "rows": "clodOpacity(a.x, a.y, a.z, a.w)",
+    "rows": "clodOpacity(a.x, a.y, a.z, a.w, 0.0)",
+    "near_rows": f"clodOpacity(a.x, a.y, a.z, a.w, {STORED['near_distance']:.8f})",
     "scale_rows": "clodScale(a.x, a.y, a.z, a.w)",
 }
 
@@ -79,16 +80,17 @@ def page(chromium: Any) -> Iterator[Any]:
 
 @pytest.mark.parametrize("shader", ["attenuation.glsl", "attenuation.wgsl"])
 def test_shaders_match_the_golden_values(page: Any, shader: str) -> None:
-    for got, row in zip(run(page, shader, "rows"), STORED["rows"], strict=True):
-        opacity, *_, want = row
-        assert abs(got - want) <= STORED["tolerance"] * opacity and (want > 0 or got == 0), (row, got)
+    for table in ("rows", "near_rows"):
+        for got, row in zip(run(page, shader, table), STORED[table], strict=True):
+            opacity, *_, want = row
+            assert abs(got - want) <= STORED["tolerance"] * opacity and (want > 0 or got == 0), (row, got)
     for got, row in zip(run(page, shader, "scale_rows"), STORED["scale_rows"], strict=True):
         assert abs(got - row[-1]) <= STORED["tolerance"] * row[-1], (row, got)
 
 
-def my_opacity(opacity: float, sigma: float, distance: float, scale: float) -> float:
+def my_opacity(opacity: float, sigma: float, distance: float, scale: float, near: float = 0.0) -> float:
     row = torch.tensor([[opacity], [sigma], [distance]], dtype=torch.float64)
-    return float(attenuate(*row, scale, AttenuationConfig(), activated=True).drawn)
+    return float(attenuate(*row, scale, AttenuationConfig(near_distance=near), activated=True).drawn)
 
 
 def my_scale(growth: float, distance: float, scale: float, start: float) -> float:
@@ -98,8 +100,9 @@ def my_scale(growth: float, distance: float, scale: float, start: float) -> floa
 def test_golden_values_match_the_equation() -> None:
     """The inputs are usual, extreme and near the end of the reach, all exact in float32; the last columns are the
     equation's in float64, equal to rounding, since exp differs between processors."""
-    for *row, drawn in STORED["rows"]:
-        assert my_opacity(*row) == pytest.approx(drawn, rel=1e-12, abs=1e-300)
+    for table, near in (("rows", 0.0), ("near_rows", STORED["near_distance"])):
+        for *row, drawn in STORED[table]:
+            assert my_opacity(*row, near) == pytest.approx(drawn, rel=1e-12, abs=1e-300)
     for *row, factor in STORED["scale_rows"]:
         assert my_scale(*row) == pytest.approx(factor, rel=1e-12, abs=1e-300)
 

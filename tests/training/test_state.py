@@ -48,14 +48,16 @@ def test_a_resumed_run_ends_with_the_same_bits(captured: Pair, form: str) -> Non
     config, states = config_of(**{"iters": 12, **RESUMED[form]}), dict[int, TrainingState]()
     whole = adapt(base, scene, config, states_of({1, 6, 10, 11}, states))
     if form == "sigma_d alone":
-        assert all(torch.equal(getattr(whole.gaussians, name), getattr(base, name)) for name in ATTRIBUTES)
+        start = adapt(base, scene, replace(config, iters=0)).gaussians
+        assert all(torch.equal(getattr(whole.gaussians, name), getattr(start, name)) for name in ATTRIBUTES)
     seen: list[Progress] = []
     for steps, state in states.items():
         again = adapt(base, scene, config, seen.append, copy.deepcopy(state))
         assert_equal(again.gaussians, whole.gaussians)
         assert (again.steps, again.interrupted, again.start_seconds) == (12, False, whole.start_seconds), steps
         assert again.seconds > state.seconds
-    assert {p.phase for p in seen} == {Phase.TRAINING} and [p.done for p in seen[:11]] == list(range(2, 13))
+    done = [p.done for p in seen if p.phase == Phase.TRAINING]
+    assert done[:11] == list(range(2, 13))
 
 
 @pytest.mark.parametrize("distance", [1.0, 4.0])

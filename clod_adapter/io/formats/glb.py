@@ -23,11 +23,11 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.io import values
 from clod_adapter.io.file_formats import KEY
 from clod_adapter.io.settings import MODEL, Metadata, Source, document, parse_metadata
-from clod_adapter.io.values import GROWTH, SIGMA, arrays_of, dial_columns, half_turn
+from clod_adapter.io.values import GROWTH, OPACITY, SIGMA, arrays_of, dial_columns, half_turn
 from clod_adapter.origin import NOWHERE, Origin, origin_of
 
 EXTENSION = "KHR_gaussian_splatting"
-DIAL = {SIGMA: "_SIGMA_D", GROWTH: "_GROWTH_D"}
+DIAL = {SIGMA: "_SIGMA_D", GROWTH: "_GROWTH_D", OPACITY: "_OPACITY_D"}
 COLOR_SPACE = "srgb_rec709_display"
 DEGREE = 3  # the highest that the extension has
 HALF_TURN = [0.0, 0.0, 1.0, 0.0]  # about z, as xyzw: x right, y down becomes x left, y up; as splat-transform has it

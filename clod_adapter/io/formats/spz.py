@@ -10,7 +10,7 @@ Records of vendors follow, flagged in the header: type, length, bytes; readers s
 - Adobe's of the axes: a checkpoint's (x right, y down, z ahead). The format's own are OpenGL's, but the reference's
   ``ply_to_spz``, splat-transform, SuperSplat and gsply all leave those of the PLY: turned, it would be upside down;
 - ours, ``RECORD``: the length of the JSON document (``settings.document``) as uint32, the document, then the dial's
-  columns as float16, to 5e-4: sigma_d, and growth_d where the document has ``"columns": ["sigma_d", "growth_d"]``.
+  columns as float16, to 5e-4: sigma_d, or those that the document names as ``"columns": ["sigma_d", "growth_d"]``.
   Larger values become 65504. Of sigma_d that is no end in practice: ``(d s / 65504)^4`` of an opacity is gone.
 """
 
@@ -33,7 +33,7 @@ from clod_adapter.io import values
 from clod_adapter.io.file_formats import NEW_SPZ, START, read_bytes
 from clod_adapter.io.formats import splat_transform
 from clod_adapter.io.settings import DAMAGED, MODEL, TAG, Metadata, Source, document, parse_metadata
-from clod_adapter.io.values import GROWTH, SIGMA, arrays_of, bytes_of, dial_columns, half_turn
+from clod_adapter.io.values import GROWTH, OPACITY, SIGMA, arrays_of, bytes_of, dial_columns, half_turn
 
 HEADER = struct.Struct("<IIIBBBB")  # magic, version, count, SH degree, fractional bits, flags, 0
 MAGIC, VERSION = 0x5053474E, 3
@@ -53,6 +53,7 @@ QUANTISED = "quantised: positions in 24 bits, scales, opacities and harmonics in
 _BOMB = 64  # times its size that a file may unpack to; Gaussians that differ at all come to 10
 _CONVERT = "convert it: splat-transform IN.spz OUT.ply"
 _TURNS = {RDF: "", 4: "x", 7: "z"}  # right, up, back; left, up, forward
+_NAMED = ([SIGMA], [SIGMA, GROWTH], [SIGMA, OPACITY], [SIGMA, GROWTH, OPACITY])
 _SMALL = 1 << 24  # bytes that any file may
 
 
@@ -77,7 +78,7 @@ def write(path: Path, gaussians: Gaussians, metadata: Metadata) -> tuple[str, ..
     metadata = replace(metadata, attenuation=gaussians.attenuation)
     if metadata != Metadata(screen_filter=CLASSIC):
         columns = list(dial_columns(arrays))
-        named = {COLUMNS: columns} if GROWTH in columns else {}  # sigma_d alone needs no name
+        named = {COLUMNS: columns} if len(columns) > 1 else {}  # sigma_d alone needs no name
         text = document(MODEL, metadata, **named).encode()
         halves = b"".join(np.clip(arrays[name], -_MOST, _MOST).astype("<f2").tobytes() for name in columns)
         parts.append(struct.pack("<III", RECORD, 4 + len(text) + len(halves), len(text)) + text + halves)
@@ -176,7 +177,8 @@ def read(path: Path, data: bytes) -> Source:
     arrays = _unquantized(parts, bits)
     arrays = (half_turn(arrays, _TURNS[axes]) if _TURNS[axes] else arrays) | dial
     if dial:  # whose sigma_d is in units of the reference distance where that is large
-        tensors: dict[str, Any] = {name: torch.from_numpy(array).float() for name, array in arrays.items()}
+        own = {name: array for name, array in arrays.items() if name != OPACITY}
+        tensors: dict[str, Any] = {name: torch.from_numpy(array).float() for name, array in own.items()}
         gaussians = in_world_units(Gaussians(**tensors, attenuation=metadata.attenuation))
         arrays[SIGMA] = gaussians.tensors()[SIGMA].numpy()
         metadata = replace(metadata, attenuation=gaussians.attenuation)
@@ -213,7 +215,7 @@ def _ours(path: Path, body: bytes, count: int) -> tuple[dict[str, Any], dict[str
     with refused_if_damaged(path, *DAMAGED):
         stored = json.loads(text)
         names = stored.get(COLUMNS, [SIGMA])
-    if names not in ([SIGMA], [SIGMA, GROWTH]) or len(halves) not in (0, 2 * count * len(names)):
+    if names not in _NAMED or len(halves) not in (0, 2 * count * len(names)):
         raise ClodError(f"{path}: its record of sigma_d is damaged; copy or export it again")
     table = np.frombuffer(halves, "<f2").astype(np.float32).reshape(-1, count)
     return stored, dict(zip(names, table, strict=False))  # no rows without a dial

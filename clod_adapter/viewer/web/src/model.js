@@ -1,4 +1,5 @@
 // A splat on the GPU, and the worker that culls and sorts its Gaussians.
+import { wholeCount } from "../../../../viewers/equation.js";
 import { WIDTH, dataTexture } from "./gpu.js";
 import { SH_TEXELS } from "./shaders.js";
 import { add, cross, dot, scaled, unit } from "./vector.js";
@@ -14,9 +15,10 @@ export function createModel(gl, read) {
   const { records, sh } = upload(gl, read), extent = extentOf(read), worker = startWorker();
   const scales = Float32Array.from({ length: count }, (_, i) => Math.exp(Math.max(s[3 * i], s[3 * i + 1], s[3 * i + 2])));
   const blur = screenFilter.variance, attenuation = settings, maxDial = settings?.max_sv ?? 1;
+  const whole = settings ? wholeCount(count, sigmaD, settings) : count;
   worker.request("model", { means, scales, sigmaD, growthD, attenuation, blur }, [means.buffer, scales.buffer]);
   return {
-    name, attenuation, maxDial, screenFilter, calibration, count, degree, records, sh, extent,
+    name, attenuation, maxDial, screenFilter, calibration, count, degree, records, sh, extent, whole,
     /** {rows, drawn, kept}: the rows to draw, farthest first. */
     order: (shown) => worker.request("order", shown),
     dialFor: (view, target) => worker.request("dialFor", { view, target, maxDial }),

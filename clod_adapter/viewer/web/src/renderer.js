@@ -24,6 +24,7 @@ export function createRenderer(canvas) {
     set(gl, uniforms, {
       eye, pinhole: [fx, fy, cx, cy], size: [width, height, near], blur: screenFilter.variance, compensate: screenFilter.compensate,
       attenuated, dial, distance_unit: attenuation.scene_distance, start: growthStart(attenuation),
+      near_distance: (attenuation.near_distance ?? 0) / attenuation.scene_distance,
     }, { order: side.order, records, sh });
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }

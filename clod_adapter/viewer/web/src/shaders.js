@@ -51,7 +51,7 @@ uniform vec3 eye;
 uniform vec4 pinhole;        // fx, fy, cx, cy
 uniform vec3 size;           // width, height, near
 uniform bool attenuated;
-uniform float dial, distance_unit, start;
+uniform float dial, distance_unit, start, near_distance;
 uniform float blur;          // px^2 that the screen-space filter adds to covariances
 uniform bool compensate;     // whether opacities are scaled by the ratio of the areas without and with the filter
 // Bits of floats, because every WebGL2 device renders to integers. footprint: centre, major half-axis; conic: conic, length
@@ -71,7 +71,7 @@ void main() {
   vec3 ray = mean.xyz - eye, point = view * ray;
   if (!(point.z >= size.z)) return;
   float opacity = mean.w, distance = length(ray) / distance_unit;
-  if (attenuated) opacity = clodOpacity(opacity, shape.w, distance, dial);
+  if (attenuated) opacity = clodOpacity(opacity, shape.w, distance, dial, near_distance);
   vec4 tint = texelFetch(records, texelAt(record + 3), 0);
   if (attenuated) shape.xyz *= clodScale(tint.a, distance, dial, start);
 

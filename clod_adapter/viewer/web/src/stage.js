@@ -112,7 +112,7 @@ export function setHold(fps) {
 }
 
 /** Of the left side, 0, or the right one. */
-export const counts = (k = 0) => ({ total: [model, base ?? model][k]?.count ?? 0, kept: sides[k]?.kept ?? 0 });
+export const counts = (k = 0) => ({ total: [model, base ?? model][k]?.whole ?? 0, kept: sides[k]?.kept ?? 0 });
 
 /** Resolves once the current state is drawn, and a held frame rate has settled. */
 export const whenDrawn = () =>

@@ -1,6 +1,6 @@
 // The worker of a model: culls the Gaussians for each camera and dial value, and sorts the others in the picture by depth.
 import {
-  countKept, dialForCount, extinctionScale, extinctionScales, growthFactor, growthStart, isKept,
+  bandsOf, beginOf, countKept, dialForCount, endOf, growthFactor, growthStart, isKept,
 } from "../../../../viewers/equation.js";
 
 const WIDTH = 2048; // texels per row of a texture (gpu.js)
@@ -18,9 +18,8 @@ const jobs = {
   order: ({ view, dial, attenuated }) => cullAndSort(view, attenuated ? dial : null), // null: without the equation
 
   dialFor({ view, target, maxDial }) {
-    const extinctions = extinctionScales(means, sigmaD, view.eye, attenuation.scene_distance);
-    const dial = dialForCount(extinctions, target, maxDial);
-    return { dial, kept: countKept(extinctions, dial) };
+    const bands = bandsOf(means, sigmaD, view.eye, attenuation), dial = dialForCount(bands, target, maxDial);
+    return { dial, kept: countKept(bands, dial) };
   },
 };
 
@@ -32,11 +31,11 @@ function cullAndSort({ rotation: r, eye, near, fx, fy, cx, cy, width, height }, 
   const border = (focal, centre, size) => (Math.max(centre, size - centre) + MARGIN * size + RADIUS * Math.sqrt(blur)) / focal;
   const reach = (focal, centre, size) => RADIUS * Math.hypot(1, (Math.max(centre, size - centre) + 0.15 * size) / focal);
   const bx = border(fx, cx, width), by = border(fy, cy, height), sx = reach(fx, cx, width), sy = reach(fy, cy, height);
-  const unit = attenuation?.scene_distance;
+  const hides = attenuation?.near_distance > 0; // without the equation, far Gaussians
   let kept = 0, drawn = 0;
   for (let i = 0, at = 0; at < means.length; i++, at += 3) {
     const x = means[at] - ex, y = means[at + 1] - ey, z = means[at + 2] - ez;
-    if (dial !== null && !isKept(extinctionScale(sigmaD[i], x * x + y * y + z * z, unit), dial)) continue;
+    if (!(dial === null ? !hides || sigmaD[i] <= 0 : keeps(sigmaD[i], x * x + y * y + z * z, dial))) continue;
     kept++;
     depth[0] = r[6] * x + r[7] * y + r[8] * z;
     if (!(depth[0] >= near)) continue;
@@ -51,6 +50,8 @@ function cullAndSort({ rotation: r, eye, near, fx, fy, cx, cy, width, height }, 
   radixPass(scratchRows, drawn, 16, scratchKeys, keys, rows);
   return { rows, kept, drawn };
 }
+
+const keeps = (sigma, squared, dial) => isKept(beginOf(sigma, squared, attenuation), endOf(sigma, squared, attenuation), dial);
 
 function growthOf(i, far, dial) {
   if (dial === null || !(growthD?.[i] > 0)) return 1; // or less, where it shrinks

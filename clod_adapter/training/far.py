@@ -1,0 +1,69 @@
+"""Far Gaussians: fewer, merged ones, which take over from the checkpoint's own where these are far away.
+
+Without photographs the checkpoint is the truth, and what training changes is loss where nothing is left out. So its own
+Gaussians stay as they are, and are drawn up to ``near_distance``; from there on far Gaussians are, which start as
+merged ones (``initialization/merging.py``) and are trained for their own distances alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from clod_adapter.cameras import View, spread
+from clod_adapter.config import AdaptConfig
+from clod_adapter.equation.distances import normalized_distances, typical_distance
+from clod_adapter.equation.units import in_world_units
+from clod_adapter.gaussians import Gaussians, with_near
+from clod_adapter.initialization.importance import (
+    MOST_VIEWS,
+    WIDEST,
+    extinction_from_rank,
+    has_dial,
+    removal_error,
+    scene_distance,
+)
+from clod_adapter.initialization.merging import merge
+from clod_adapter.initialization.pruning_order import pruning_order
+from clod_adapter.progress import Listener
+
+SHARE = 0.4  # of the number of near Gaussians
+NEARER = 0.5  # share of the distances in all views that are below near_distance
+LONGER = 1.2  # times near_distance, the smallest reach
+SAMPLE = 20_000  # Gaussians whose distances tell near_distance
+
+
+def takes_over(base: Gaussians, config: AdaptConfig) -> bool:
+    """Whether training adds far Gaussians: for a dial of our form with a range, if the base has none yet."""
+    return config.form == "ours" and config.max_sv > 1 and not has_dial(base)
+
+
+def with_far(
+    base: Gaussians, views: Sequence[View], config: AdaptConfig, progress: Listener | None = None,
+    error: Tensor | None = None,
+) -> Gaussians:  # fmt: skip
+    """The base's Gaussians as near ones, and after them far ones with an initial reach; in world units.
+
+    A far Gaussian ends where the number of those that matter more is the target count; its importance is measured as
+    ``importance.initialize`` does. ``error`` is ``removal_error`` of the base, where it is known.
+    """
+    views = spread(views, MOST_VIEWS)
+    cameras = [view.camera for view in views]
+    attenuation = config.attenuation(scene_distance(base, views))
+    some = base.means[:: len(base) // SAMPLE + 1]
+    distances = torch.cat([normalized_distances(some, camera, attenuation) for camera in cameras])
+    near = float(distances.kthvalue(max(round(NEARER * len(distances)), 1)).values)
+    if error is None:
+        error = removal_error(base, views, seed=config.seed, progress=progress)
+    far = merge(base, error.sqrt() * base.opacities, max(round(SHARE * len(base)), 1), progress)
+    error = removal_error(far, views, seed=config.seed, progress=progress)
+    pruned = pruning_order(far, error.sqrt() * far.opacities, progress)
+    rank = pruned.position.max() - pruned.position
+    scales = extinction_from_rank(rank, replace(config, start_share=1.0), len(base)).clamp(max=WIDEST * config.max_sv)
+    reach = (typical_distance(far.means, cameras, attenuation) * scales).clamp(min=LONGER * near)
+    growth_d = torch.zeros_like(reach) if config.growth == "on" else None
+    attenuation = replace(attenuation, near_distance=near * attenuation.scene_distance)
+    return in_world_units(with_near(base, far.replace(sigma_d=reach, growth_d=growth_d, attenuation=attenuation)))
