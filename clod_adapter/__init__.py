@@ -21,7 +21,7 @@ if "torch" not in sys.modules:
 
 if TYPE_CHECKING:
     from clod_adapter.adapter import Adapter, detach, extract, with_dial
-    from clod_adapter.bake import bake, order_by_extinction
+    from clod_adapter.bake import bake, bake_levels, order_by_extinction
     from clod_adapter.calibration import Calibration
     from clod_adapter.cameras import Camera, Scene, View
     from clod_adapter.config import AdaptConfig, AttenuationConfig, ScreenFilter
@@ -52,7 +52,7 @@ _homes = {name: f"{__name__}.{home}" for home, names in {
     "config": ("AdaptConfig", "AttenuationConfig", "ScreenFilter"),
     "errors": ("ClodError",),
     "evaluation.evaluate": ("evaluate",),
-    "bake": ("bake", "order_by_extinction"),
+    "bake": ("bake", "bake_levels", "order_by_extinction"),
     "gaussians": ("Gaussians",),
     "hook": ("Hold", "Hook"),
     "integrations.splats": ("from_gsplat", "to_gsplat"),
@@ -91,7 +91,8 @@ sys.modules[__name__].__class__ = _Lazy
 __all__ = [
     "AdaptConfig", "Adapted", "Adapter", "AttenuationConfig", "Calibration", "Camera", "Checkpoint", "ClodError",
     "Decision", "Dial", "DialValue", "Gaussians", "Hold", "Hook", "Override", "Phase", "Plan", "Progress", "Rendering",
-    "Scene", "ScreenFilter", "Stopped", "TrainableSubset", "View", "adapt", "attach", "bake", "detach", "dial_for",
-    "evaluate", "extract", "from_gsplat", "load", "load_adapter", "load_scene", "make_plan", "order_by_extinction",
-    "place_cameras", "render", "render_pseudo_views", "save", "save_adapter", "to_gsplat", "with_dial",
+    "Scene", "ScreenFilter", "Stopped", "TrainableSubset", "View", "adapt", "attach", "bake", "bake_levels", "detach",
+    "dial_for", "evaluate", "extract", "from_gsplat", "load", "load_adapter", "load_scene", "make_plan",
+    "order_by_extinction", "place_cameras", "render", "render_pseudo_views", "save", "save_adapter", "to_gsplat",
+    "with_dial",
 ]  # fmt: skip

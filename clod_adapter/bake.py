@@ -3,11 +3,13 @@
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from clod_adapter.cameras import Camera
+from clod_adapter.config import require
 from clod_adapter.equation.attenuation import TAKEOVER, Attenuated, dial
 from clod_adapter.equation.distances import Place, typical_distance
 from clod_adapter.errors import ClodError
@@ -17,6 +19,8 @@ from clod_adapter.gaussians import OPAQUE, Gaussians
 # photographs of FADED 0, 0.5, 0.75 and 1, and then of seven GROWN from 0 to 1.25. At equal counts the file is never
 # below the dial by more than 0.05 dB, and up to 0.65 dB above it.
 FADED, GROWN = 0.75, 0.9
+MULTIPLIER, MOST = 3.0, 100.0  # of the distances at which levels begin: PlayCanvas's default, and the largest
+FEWEST, LEVELS = 0.01, 16  # share of the Gaussians in the coarsest level, and the largest number of levels
 
 
 @torch.no_grad()
@@ -46,15 +50,60 @@ def bake(
     dialled = dial(gaussians, distances, virtual_scale)
     if not dialled.keep.any():
         raise ClodError(f"no Gaussian is kept at s = {virtual_scale:g}; bake a smaller s")
-    shown = dialled if camera else dial(gaussians, distances, virtual_scale**FADED)
-    if gaussians.near is not None and not camera:
+    if camera:
+        return _plain(gaussians, dialled, dialled, dialled)
+    shown, grown = (dial(gaussians, distances, virtual_scale**share) for share in (FADED, GROWN))
+    if gaussians.near is not None:
         dialled, shown = _switched(gaussians, distances, virtual_scale)
+    return _plain(gaussians, dialled, shown, grown)
+
+
+class Level(NamedTuple):
+    """Plain Gaussians, and the distance in world units from which on they are drawn."""
+
+    begins: float
+    gaussians: Gaussians
+
+
+@torch.no_grad()
+def bake_levels(gaussians: Gaussians, multiplier: float = MULTIPLIER) -> list[Level]:
+    """Levels for viewers that draw each in a band of distances, the finest first.
+
+    The finest is what s = 0 draws: with near and far Gaussians the checkpoint, bit for bit. Level k >= 1 is for the
+    distances from ``H m^(k - 1)`` to ``H m^k``, with m the multiplier and H the ``near_distance``, or else the median
+    reach. It has the Gaussians whose reach is beyond the middle of its band, ``H m^(k - 1/2)``, with the opacities of
+    its beginning and the scales of its middle. The last level has at least FEWEST of the Gaussians.
+
+    Raises:
+        ClodError: no dial, the paper's form, whose distances depend on the view, or a multiplier that is not above 1.
+    """
+    attenuation = gaussians.attenuation
+    if gaussians.sigma_d is None or attenuation is None or attenuation.form == "paper":
+        raise ClodError("levels for bands of distance need a dial of the form ours; adapt with --form ours")
+    require(1 < multiplier <= MOST, "multiplier", multiplier, f"above 1 and at most {MOST:g}")
+
+    def seen_from(distance: float) -> Attenuated:
+        away = torch.full_like(gaussians.means[:, 0], distance / attenuation.scene_distance)
+        return dial(gaussians, away, 1.0)
+
+    stored = seen_from(0.0)
+    levels = [Level(0.0, _plain(gaussians, stored, stored, stored))]
+    begins = attenuation.near_distance or float(gaussians.sigma_d.median()) * attenuation.scene_distance
+    while len(levels) < LEVELS:
+        middle = seen_from(begins * math.sqrt(multiplier))
+        if int(middle.keep.sum()) < max(FEWEST * gaussians.whole, 1):
+            break
+        levels.append(Level(begins, _plain(gaussians, middle, seen_from(begins), middle)))
+        begins *= multiplier
+    return levels
+
+
+def _plain(gaussians: Gaussians, kept: Attenuated, shown: Attenuated, grown: Attenuated) -> Gaussians:
+    """Those that are kept, with the opacities that are shown and the scales that are grown, without a dial."""
     baked = {"opacity_logits": _logits_drawn(shown, gaussians.opacity_logits)}
     if gaussians.growth_d is not None:
-        growth = (dialled if camera else dial(gaussians, distances, virtual_scale**GROWN)).growth
-        baked["log_scales"] = gaussians.log_scales + growth.log()[:, None]
-    plain = gaussians.replace(**baked, sigma_d=None, growth_d=None, attenuation=None)
-    return plain.select(dialled.keep)
+        baked["log_scales"] = gaussians.log_scales + grown.growth.log()[:, None]
+    return gaussians.replace(**baked, sigma_d=None, growth_d=None, attenuation=None).select(kept.keep)
 
 
 @torch.no_grad()

@@ -44,7 +44,6 @@ class Phase(str, Enum):
     EVALUATION = "evaluation"
     FRAME_TIMES = "frame times"
     POPPING = "popping"
-    LEVELS = "errors of levels"
 
 
 @dataclass(frozen=True)

@@ -76,7 +76,7 @@ def test_budgets(run: Any, dialled: Path, capture: Any) -> None:
     assert len(printed) == 9 and all(line.startswith(name) for line, name in zip(printed, names, strict=True))
     found = [float(line.partition("s = ")[2].split()[0]) for line in (printed[0], *printed[3:6])]
     assert 1 < found[0] < 4 and 1 < found[1] <= found[2] <= found[3] <= 4
-    assert "out of reach: at s = 4" in printed[2]  # a tenth is less than the far end keeps, and that is said
+    assert "(beyond s = 4, " in printed[2]  # a tenth is less than the far end keeps, and that is said
 
 
 def test_adapter_is_applied_and_removed(run: Any, dialled: Path, capture: Any, tmp_path: Path) -> None:

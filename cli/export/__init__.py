@@ -14,6 +14,7 @@ from ..shared import command as common
 from ..shared.outputs import Outputs
 from .names import FOLDERS, FORMATS, PACKED, PAGE, is_page, level_paths, suffix_of
 
+MULTIPLIER = 3.0  # of distances, PlayCanvas's default
 DIGITS = 6  # significant digits of a level, all of them in its file's name
 
 
@@ -41,8 +42,10 @@ def add_arguments(parser: ArgumentParser) -> None:
     output.add_argument("-o", "--out", metavar="OUT", required=True, help="output file; its suffix is the format")
     sets = output.add_mutually_exclusive_group()
     for option, form in (("--lod-meta", "streaming set for PlayCanvas's viewers"), ("--3dtiles", "3D Tiles set")):
-        text = f"write the levels as one {form}, in the new folder OUT"
+        text = f"write a {form}, a level for each band of distance, to the new folder OUT"
         sets.add_argument(option, dest="folder", action="store_const", const=option, help=text)
+    text = "ratio of the distances at which two levels begin, as set in the viewer"
+    output.add_argument("--multiplier", metavar="M", type=float, default=MULTIPLIER, help=f"{text} (default: 3)")
     output.add_argument("--order", choices=["extinction"], help="put first the Gaussians that are culled last")
     output.add_argument("--exact", action="store_true", help="an .html page with float32 values: eight times the size")
     common.add_device(output, "time frames for --fps with --images")
@@ -52,8 +55,9 @@ def check(args: Namespace) -> None:
     bakes = args.sv is not None or common.given_budget(args) is not None or bool(args.levels)
     page, folder, out = is_page(args), args.folder, Path(args.out)
     refuse(
-        (folder and len(args.levels or ()) < 2,
-         f"{folder} needs several levels; give them, as in --levels 1,2,4,7"),
+        (folder and bakes,
+         f"{folder} has a level for each band of distance, no dial value; remove --levels, --sv or the budget"),
+        (args.multiplier != MULTIPLIER and not folder, f"--multiplier is for {' and '.join(FOLDERS)}; add one of them"),
         (folder and args.order, f"{folder} sorts the Gaussians itself; remove --order"),
         (args.camera is not None and args.images is None,
          "--camera needs the scene of the photograph; give --images too"),
@@ -76,6 +80,7 @@ def check(args: Namespace) -> None:
     others = ", ".join(other for other, each in FORMATS.items() if each.carries_sigma)
     refuse(
         (bakes and not dial, f"{args.model}: has no sigma_d, so no dial value can be baked; export it without one"),
+        (folder and not dial, f"{args.model}: has no sigma_d, so there are no levels; adapt it first"),
         (args.order and not dial, f"{args.model}: has no sigma_d to order its Gaussians by; adapt it first"),
         (dial and not bakes and form and not form.carries_sigma,
          f"{out}: {suffix} cannot store a dial; choose a dial value to bake, as in --sv 1, or another format "
@@ -127,8 +132,11 @@ baking:
   --images, --fps times frames of MODEL on this machine.
 
 levels and order:
-  --levels 1,2,4,7 writes OUT_s1.ply, OUT_s2.ply and so on, all or none. With
-  --lod-meta, or --3dtiles for CesiumJS, OUT is a new folder.
+  --levels 1,2,4,7 writes OUT_s1.ply, OUT_s2.ply and so on, all or none.
+  --lod-meta, and --3dtiles for CesiumJS, make OUT a new folder with a set of
+  levels. The finest is the checkpoint; each other one is baked for a band of
+  distances M times as far as the one before, and the last one has at least 1 %
+  of the Gaussians. A viewer draws each part of a scene at the level of its band.
   --order extinction is for renderers that draw the first n rows: for any n
   these are the rows of --keep n. They pop where the dial fades.
 
@@ -142,6 +150,6 @@ other tools:
 examples:
   clod-adapt export garden_clod.ply --keep 200000 -o garden_200k.ply
   clod-adapt export garden_clod.ply --images garden -o garden.html
-  clod-adapt export garden_clod.ply --levels 1,2,4,7 --3dtiles -o garden_tiles
+  clod-adapt export garden_clod.ply --3dtiles -o garden_tiles
   clod-adapt export garden_clod.ply --order extinction -o sorted.ply
 """

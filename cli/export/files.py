@@ -7,11 +7,10 @@ from statistics import fmean
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from clod_adapter.bake import bake, order_by_extinction
+from clod_adapter.bake import Level, bake, bake_levels, order_by_extinction
 from clod_adapter.calibration import Viewpoint
 from clod_adapter.cameras import Camera, spread
 from clod_adapter.errors import ClodError
-from clod_adapter.evaluation.evaluate import geometric_errors, looking
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.inspection.report import extra_columns
 from clod_adapter.io.atomic import atomic_path, atomic_paths
@@ -32,6 +31,12 @@ from ..shared.outputs import size
 from .names import FOLDERS, PAGE, STORE_FILTER, is_page, level_paths, suffix_of
 
 PLACED = 16  # cameras placed where none are known
+SETTINGS = {
+    "--lod-meta": "in PlayCanvas: lodBaseDistance = {begins:.4g}, lodMultiplier = {multiplier:g}, and a splatBudget "
+    "below the finest level's number; within the budget it draws that level everywhere",
+    "--3dtiles": "in CesiumJS with maximumScreenSpaceError = 16, its default, level 1 begins at {begins:.4g} on a "
+    "screen of 1,080 lines",
+}
 COMPARED = 4  # views on which a page is compared with the exact values
 
 
@@ -42,6 +47,8 @@ def export(args: Namespace) -> dict[str, Any]:
     total, camera, written = export.gaussians.whole, export.camera, export.write()
     for output in written:
         print(line_of(output, total))
+        if args.folder and len(output["levels"]) > 1:
+            print(SETTINGS[args.folder].format(begins=output["levels"][1]["begins"], multiplier=args.multiplier))
     if export.dials and not export.page:
         baked = f"exact at the camera of {camera.name} only" if camera else f"baked for {export.about}"
         scales = "" if export.gaussians.growth_d is None else "; the scales include growth"
@@ -57,8 +64,8 @@ def line_of(output: dict[str, Any], total: int) -> str:
     """What was written, in a line, of a model of ``total`` Gaussians."""
     line = f"wrote {output['file']} ({size(output['bytes'])}): {output['count']:,}"
     if levels := output.get("levels"):
-        shown = ", ".join(f"{level['count']:,} at s = {level['virtual_scale']:.5g}" for level in levels)
-        return f"{line} Gaussians in {len(levels)} levels, {shown}"
+        shown = ", ".join(f"{level['count']:,} from {level['begins']:.3g}" for level in levels)
+        return f"{line} Gaussians in {len(levels)} levels, by distance: {shown}"
     if output["virtual_scale"] is None:
         return f"{line} Gaussians"
     about = "Gaussians, initial dial value" if output["file"].lower().endswith(PAGE) else f"of {total:,} Gaussians,"
@@ -135,9 +142,10 @@ class Export:
         if option := self.args.folder:
             with atomic_path(out) as folder:
                 folder.mkdir()
-                counts = self._write_set(folder / FOLDERS[option])
+                found = self._write_set(folder / FOLDERS[option])
                 taken = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
-            levels = [{"virtual_scale": dial, "count": n} for dial, n in zip(self.dials, counts, strict=True)]
+            levels = [{"begins": level.begins, "count": len(level.gaussians)} for level in found]
+            counts = [level["count"] for level in levels]
             return [{"file": str(out / FOLDERS[option]), "levels": levels, "count": sum(counts), "bytes": taken}]
         paths = level_paths(out, self.args.levels) if self.args.levels else [out]
         dials: Sequence[float | None] = self.dials or [None]
@@ -179,25 +187,21 @@ class Export:
             self.console.note("x, y and z are doubles, which SIBR and some other readers misread")
         return gaussians.whole
 
-    def _write_set(self, index: Path) -> list[int]:
-        """Writes a streaming or 3D Tiles set to the folder of ``index``; the number of Gaussians per level."""
-        contents = [self._content(level) for level in self.dials]
-        found = [gaussians for gaussians, _ in contents]
-        counts = [len(gaussians) for gaussians in found]
+    def _write_set(self, index: Path) -> list[Level]:
+        """Writes a streaming or 3D Tiles set to the folder of ``index``; its levels."""
+        levels = bake_levels(self.gaussians, self.args.multiplier)
         if self.args.folder == "--3dtiles":
-            inputs.prepare_kernels(self.console, found[0].means.device, training=False)
-            with self.console.meter("errors of levels") as meter:
-                errors = geometric_errors(found, looking(self.cameras), progress=meter)
-            self.console.note(*write_tileset(index.parent, found, errors.tolist(), origin=self.model.origin))
-            return counts
+            self.console.note(*write_tileset(index.parent, levels, origin=self.model.origin))
+            return levels
+        total = sum(len(level.gaussians) for level in levels)
         with TemporaryDirectory(dir=index.parent) as temporary:
-            words: list[str | Path] = [*splat_transform.cutting_options(sum(counts))]
-            for k, (gaussians, about) in enumerate(contents):
+            words: list[str | Path] = [*splat_transform.cutting_options(total)]
+            for k, level in enumerate(levels):
                 source = Path(temporary) / f"{k}.ply"
-                write(source, gaussians, Metadata(about=about))
+                write(source, level.gaussians, Metadata(about=self.model.comments))
                 words += [source, "-l", str(k)]
-            self._transform(words, index, sum(counts))
-        return counts
+            self._transform(words, index, total)
+        return levels
 
     def _write_page(self, path: Path, virtual_scale: float | None) -> None:
         """Notes the PSNR of its renders against those of the exact Gaussians."""

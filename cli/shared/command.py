@@ -88,7 +88,8 @@ budgets, each solved for a dial value:
   --psnr-drop  from the calibration in the file's header
   --fps        times some frames first; depends on machine, image size and load
 If s = 1 meets the budget, or the largest trained dial value loses less than DB,
-that is the result. A count or frame rate that is out of reach is an error.
+that is the result. A count below the trained range is met with a note; a frame
+rate that is out of reach is an error.
 """
 
 

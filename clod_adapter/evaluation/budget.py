@@ -7,7 +7,8 @@
 - Frame rates depend on the machine, the image size and the load: frames are timed, from cameras. The table's times are
   used only where they are passed in, or (``clod-adapt export``) where nothing can be timed.
 
-A budget that s = 1 meets gives 1 and a note. None is met beyond ``max_sv``, where nothing was trained.
+A budget that s = 1 meets gives 1 and a note. Only a count is met beyond ``max_sv``, where nothing was trained, with a
+note.
 """
 
 import math
@@ -31,6 +32,7 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.progress import Listener
 
 TIMED_DIALS = 6
+BEYOND = 1e6  # times max_sv, where the search for a count ends
 ROUNDING = 1e-15  # of extinction scales and products d s in float64
 
 
@@ -39,8 +41,8 @@ class DialValue:
     """The dial value that meets a budget.
 
     Attributes:
-        virtual_scale: the dial s, in [1, max_sv].
-        note: one line where the budget has no effect, else empty.
+        virtual_scale: the dial s, at least 1.
+        note: one line where the budget has no effect, or is met beyond max_sv alone; else empty.
     """
 
     virtual_scale: float
@@ -71,7 +73,7 @@ def dial_for(
 
     Raises:
         ClodError: not exactly one budget, a budget that is not positive, no dial, no data for the budget, or one that
-            the largest trained dial value does not reach; the message gives its value there.
+            no dial value reaches, or of a frame rate the largest trained one; the message gives its value there.
     """
     budgets = {"keep": keep, "psnr_drop": psnr_drop, "fps": fps}
     given = {name: value for name, value in budgets.items() if value is not None}
@@ -151,11 +153,15 @@ def _for_count(
     if wanted >= most:
         note = f"s = 1 keeps {most / len(views):,.0f} of {gaussians.whole:,} already" if wanted > most else ""
         return DialValue(1.0, note)
+    note = ""
     if wanted < fewest:
-        raise ClodError(
-            f"{keep:,.0f} Gaussians are out of reach: at s = {largest:g}, the largest dial value it was trained for, "
-            f"{fewest / len(views):,.0f} are kept"
-        )
+        note = f"beyond s = {largest:g}, the largest dial value it was trained for"
+        while fewest > wanted and largest < BEYOND * config.max_sv:
+            largest *= 2
+            fewest = count(largest)
+        if fewest > wanted:
+            remain = f"{fewest / len(views):,.0f} remain at any dial value"
+            raise ClodError(f"{keep:,.0f} Gaussians are out of reach: {remain}")
     if config.form == "ours" and gaussians.near is None:
         assert gaussians.sigma_d is not None
         pools = []  # of those that are culled within the range of the dial
@@ -164,12 +170,12 @@ def _for_count(
             pools.append(gaussians.sigma_d[own].double() / distances(k)[own])
         pooled = torch.cat(pools)
         first = float(pooled.kthvalue(len(pooled) - (wanted - fewest)).values)  # that is to be culled
-        return DialValue(min(first * (1 + ROUNDING), largest))
+        return DialValue(min(first * (1 + ROUNDING), largest), note)
     low, high = 1.0, largest
     while high / low > 1 + 1e-9:
         middle = math.sqrt(low * high)
         low, high = (low, middle) if count(middle) <= wanted else (middle, high)
-    return DialValue(high)
+    return DialValue(high, note)
 
 
 @torch.no_grad()
@@ -183,6 +189,7 @@ def matching_dial(gaussians: Gaussians, cameras: Sequence[Camera], count: float)
     if gaussians.attenuation is None:
         return 1.0
     try:
-        return dial_for(gaussians, keep=max(count, 1), cameras=cameras).virtual_scale
+        solved = dial_for(gaussians, keep=max(count, 1), cameras=cameras)
+        return min(solved.virtual_scale, gaussians.attenuation.max_sv)
     except ClodError:  # out of reach
         return gaussians.attenuation.max_sv

@@ -8,17 +8,15 @@ from dataclasses import asdict, dataclass
 import numpy as np
 import torch
 
-from clod_adapter.cameras import Camera, View, spread
+from clod_adapter.cameras import View
 from clod_adapter.equation.attenuation import check_dial
-from clod_adapter.equation.distances import Place, camera_of, in_frustum, median_distance
+from clod_adapter.equation.distances import in_frustum
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.frame_times import timed_frame
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.io.formats.tileset import ALLOWED
 from clod_adapter.losses import psnr_ssim
-from clod_adapter.progress import Listener, Phase, Progress, tell
+from clod_adapter.progress import Listener, Phase, Progress
 from clod_adapter.render import render
-from clod_adapter.training.camera_placement import HEIGHT, WIDTH
 
 VIEWS = 16  # cameras that errors of levels are measured from
 SCORED = 4  # views whose SSIM is computed at a time: each takes 83 bytes a pixel
@@ -106,41 +104,3 @@ def _measured(gaussians: Gaussians, views: Sequence[View], virtual_scale: float)
             for view, (rendering, seconds), score in zip(some, found, scores, strict=True):
                 inside = rendering.kept & in_frustum(gaussians.means, view.camera)
                 yield seconds, *score, int(rendering.kept.sum()), int(inside.sum())
-
-
-def looking(places: Sequence[Place]) -> list[Camera]:
-    """The cameras, those of viewpoints in the size of placed ones; without viewpoints that have no direction."""
-    known = [place for place in places if isinstance(place, Camera) or place.fov > 0]
-    return [place if isinstance(place, Camera) else camera_of(place, WIDTH, HEIGHT) for place in known]
-
-
-@torch.no_grad()
-def geometric_errors(
-    levels: Sequence[Gaussians], cameras: Sequence[Camera], *, progress: Listener | None = None
-) -> np.ndarray:
-    """``[L]`` float64, world units, ascending from 0, the ``geometricError`` of levels without a dial, finest first.
-
-    A viewer of 3D Tiles shows a tile whose error g at distance d, with a focal length of f pixels, covers few enough::
-
-        g f / d <= 16           3D Tiles 1.1 (OGC 22-025r4), "Geometric error"; CesiumJS's ``maximumScreenSpaceError``
-
-    An image that is shifted by e pixels changes by about e times its slope, so level l is off by e_l pixels::
-
-        e_l = |I_l - I_0| / |dI_0|
-
-    ``|.|`` are root mean squares over pixels and channels, ``dI_0`` the mean slope of the finest level along x and y.
-    The error is 16 times the mean of ``e_l d / f`` over cameras, d the median distance in the image: it allows a shift
-    of one pixel.
-    """
-    if not cameras:
-        raise ClodError("the cameras of the file have no direction to measure its levels in; give --images")
-    picked = spread(cameras, VIEWS)
-    found = np.zeros((len(picked), len(levels)))
-    for done, view in enumerate(picked):
-        images = [render(level, view).image.clamp(0, 1) for level in levels]
-        across, down = (images[0].diff(dim=dim).square().mean() for dim in (1, 0))
-        slope = max(float(((across + down) / 2).sqrt()), 1e-6)
-        length = median_distance(levels[0].means, view) / float(view.K[0, 0])
-        found[done] = [length / slope * float((image - images[0]).square().mean().sqrt()) for image in images]
-        tell(progress, Phase.LEVELS, done + 1, len(picked))
-    return ALLOWED * np.maximum.accumulate(found.mean(0))  # type: ignore[no-any-return]

@@ -98,11 +98,23 @@ def test_levels(clod: Any, dialled: Path, tmp_path: Path) -> None:
     names = ["some.set_s1.ply", "some.set_s2.5.ply", "some.set_s4.ply"]
     assert files(tmp_path) == names == [output["file"] for output in outputs]
     assert [load(name).gaussians for name in names] == [baked(dialled, s) for s in (1.0, 2.5, 4.0)]
-    (output,) = clod(EXPORT, "--levels 1,2,4 --3dtiles -o tiles").report["outputs"]
-    assert [level["count"] for level in output["levels"]] == [len(baked(dialled, s)) for s in (1.0, 2.0, 4.0)]
+
+
+def test_sets_have_a_level_for_each_band_of_distances(clod: Any, dialled: Path, tmp_path: Path) -> None:
+    """The finest is the checkpoint; in others are those that reach the middle of the band, as large as there."""
+    done = clod(EXPORT, "--3dtiles --multiplier 2 -o tiles")
+    (output,), model = done.report["outputs"], load(dialled).gaussians
+    counts, begins = ([level[name] for level in output["levels"]] for name in ("count", "begins"))
+    near = model.attenuation.near_distance
+    assert begins[:3] == [0.0, near, 2 * near] and f"level 1 begins at {near:.4g}" in done.err
+    assert counts[0] == model.whole and counts == sorted(counts, reverse=True) and counts[-1] >= 0.01 * model.whole
+    levels = clod_adapter.bake_levels(model, 2.0)
+    assert levels[0].gaussians == clod_adapter.detach(model)
+    for k, level in enumerate(levels[1:], 1):
+        reached = model.sigma_d > near * 2 ** (k - 0.5)
+        assert torch.equal(level.gaussians.means, model.means[reached]) and len(level.gaussians) == counts[k]
     root = json.loads((tmp_path / "tiles" / "tileset.json").read_text())["root"]
-    assert root["geometricError"] > root["children"][0]["geometricError"] > 0
-    assert files(tmp_path / "tiles") == ["0_0.glb", "0_1.glb", "root.glb", "tileset.json"]
+    assert root["geometricError"] > root["children"][0]["geometricError"] >= 0
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".glb", ".splat"])
@@ -171,15 +183,16 @@ def test_splat_transform(clod: Any, dialled: Path, tmp_path: Path, tool: Any) ->
     assert said["sizes"][0] > 92 * done.report["outputs"][0]["count"]
     tool("(out.parent / '0_0').mkdir(); (out.parent / '0_0' / 'a.webp').write_text('1234')")
     (tmp_path / "-o").mkdir()  # empty; not an option of the tool
-    (output,) = clod(EXPORT, "--levels 1,2,4 --lod-meta --out=-o").report["outputs"]
-    counts = [len(baked(dialled, s)) for s in (1.0, 2.0, 4.0)]
-    levels = [{"virtual_scale": s, "count": n} for s, n in zip((1, 2, 4), counts, strict=True)]
-    assert output["levels"] == levels and output["count"] == sum(counts)
+    (output,) = clod(EXPORT, "--lod-meta --out=-o").report["outputs"]
+    levels = clod_adapter.bake_levels(load(dialled).gaussians)
+    counts = [len(level.gaussians) for level in levels]
+    assert [level["count"] for level in output["levels"]] == counts and output["count"] == sum(counts)
     assert files(tmp_path / "-o") == ["0_0", "0_0/a.webp", "lod-meta.json"]
     text = Path(output["file"]).read_text()
     words = json.loads(text)["words"][5:]
     assert output["bytes"] == len(text) + 4 and words[:4] == ["--lod-chunk-extent", "0", "--lod-chunk-min", "8"]
-    assert words[5::3] == ["-l"] * 3 and words[6::3] == ["0", "1", "2"] and words[-1].endswith("/lod-meta.json")
+    assert words[5::3] == ["-l"] * len(levels) and words[6::3] == [str(k) for k in range(len(levels))]
+    assert words[-1].endswith("/lod-meta.json")
 
 
 def test_failure_of_the_tool_leaves_no_file(clod: Any, tmp_path: Path, tool: Any, monkeypatch: Any) -> None:
@@ -187,7 +200,7 @@ def test_failure_of_the_tool_leaves_no_file(clod: Any, tmp_path: Path, tool: Any
     interrupt = "import os, signal, time; os.kill(os.getppid(), signal.SIGINT); time.sleep(60)"
     for words, behave, limit, code, said in (
         ("--sv 2 -o x.sog", "import time; time.sleep(60)", 0.5, 2, "was ended, it took longer than 0 s\n"),
-        ("--levels 1,2 --lod-meta -o out", interrupt, 60.0, 130, "interrupted\n"),
+        ("--lod-meta -o out", interrupt, 60.0, 130, "interrupted\n"),
     ):
         monkeypatch.setattr(splat_transform, "LIMIT", limit)
         tool(behave)
@@ -200,9 +213,10 @@ def test_the_real_tool(clod: Any, dialled: Path, tmp_path: Path) -> None:
         splat_transform.SplatTransform.find()
     except ClodError as error:
         pytest.skip(str(error))
-    clod("export DIAL --levels 1,4 --lod-meta -o out")
+    clod("export DIAL --lod-meta --multiplier 2 -o out")
     meta = json.loads((tmp_path / "out" / "lod-meta.json").read_text())
-    assert meta["counts"] == [len(baked(dialled, s)) for s in (1.0, 4.0)] and meta["lodLevels"] == 2
+    levels = clod_adapter.bake_levels(load(dialled).gaussians, 2.0)
+    assert meta["counts"] == [len(level.gaussians) for level in levels] and meta["lodLevels"] == len(levels)
     assert all((tmp_path / "out" / name).is_file() for name in meta["filenames"])
     assert not [name for name in files(tmp_path) if "tmp" in name]
 

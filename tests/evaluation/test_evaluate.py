@@ -1,5 +1,5 @@
-"""Rows of an evaluation, by hand and of an unadapted file; errors of levels: lengths by which a picture shifts; frame
-times on a simulated clock; budgets: solved dial values keep the counts asked for, and interpolate known curves."""
+"""Rows of an evaluation, by hand and of an unadapted file; frame times on a simulated clock; budgets: solved
+dial values keep the counts asked for, and interpolate known curves."""
 
 import math
 import random
@@ -17,9 +17,7 @@ from clod_adapter.calibration import Calibration, CalibrationRow
 from clod_adapter.config import FORMS
 from clod_adapter.equation.attenuation import dial
 from clod_adapter.evaluation import frame_times
-from clod_adapter.evaluation.evaluate import geometric_errors
 from clod_adapter.evaluation.frame_times import PASSES, VIEWS, FrameTimes, time_frames
-from clod_adapter.io.formats.tileset import ALLOWED
 from clod_adapter.losses import psnr_ssim
 from scenes import camera, gaussians, in_front, photograph, ring
 
@@ -69,37 +67,6 @@ def test_bad_calls_are_named() -> None:
     ):
         with pytest.raises(ClodError, match=message):
             evaluate(row_of_four(), held_out, dials)
-
-
-WIDTH, HEIGHT, FOCAL, DISTANCE = 96, 72, 90.0, 6.0
-
-
-def smooth() -> Gaussians:
-    """Wide Gaussians at one distance, so that a shift of the image is the same everywhere."""
-    found = gaussians(40, 0, 3, size=0.3)
-    means = found.means * torch.tensor([0.7, 0.5, 0.0]) + torch.tensor([0.0, 0.0, DISTANCE])
-    return found.replace(means=means, opacity_logits=found.opacity_logits.clamp(-1, 2))
-
-
-def view() -> Camera:
-    K = torch.tensor([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
-    return Camera(torch.eye(4), K, WIDTH, HEIGHT)
-
-
-def test_a_shift_has_its_own_length() -> None:
-    """Moved across by 0.4 pixels, seen from so far: pixels d / f, times what viewers allow."""
-    finest, length = smooth(), 0.4 * DISTANCE / FOCAL
-    moved = finest.replace(means=finest.means + torch.tensor([length, length, 0.0]) / 2**0.5)
-    assert geometric_errors([finest, moved], [view()]) == pytest.approx([0, ALLOWED * length], rel=0.15)
-
-
-def test_errors_ascend_and_grow_with_what_is_missing() -> None:
-    """A level that happens to be nearer to the finest than the level before has that one's error."""
-    finest = smooth()
-    order = finest.opacity_logits.argsort(descending=True)
-    half, few = finest[order[:20]], finest[order[:5]]
-    errors = geometric_errors([finest, half, few, half], [view(), view()])
-    assert 0 == errors[0] < errors[1] < errors[2] == errors[3]
 
 
 DIALS = (1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 7.0)
@@ -181,17 +148,17 @@ def kept(some: Gaussians, cameras: Sequence[Camera], s: float) -> int:
 @settings(deadline=None, max_examples=30)
 @example(n=2, seed=2, views=5, share=0.25, form="paper")  # one Gaussian is at distance 1 in three views
 @given(
-    n=st.integers(2, 3000), seed=st.integers(0, 10**6), views=st.integers(1, 5), share=st.floats(0, 1),
+    n=st.integers(2, 3000), seed=st.integers(0, 10**6), views=st.integers(1, 5), share=st.floats(-1, 1),
     form=st.sampled_from(FORMS),
 )  # fmt: skip
 def test_counts_are_exact_up_to_ties(n: int, seed: int, views: int, share: float, form: str) -> None:
     some, cameras = adapted(n, seed, form), ring(views, 48, 36)
     most, fewest = kept(some, cameras, 1.0), kept(some, cameras, MAX_SV)
-    wanted = fewest + round(share * (most - fewest))
-    assume(wanted > 0)
+    wanted = fewest + round(share * (most - fewest if share > 0 else fewest))
+    assume(wanted >= views)
     solved = dial_for(some, keep=wanted / views, cameras=cameras)
     found = kept(some, cameras, solved.virtual_scale)
-    assert 1 <= solved.virtual_scale <= MAX_SV and solved.note == ""
+    assert solved.virtual_scale >= 1 and (solved.virtual_scale <= MAX_SV) == (solved.note == "") == (wanted >= fewest)
     # At most what was asked for; and where it is less, more would stay at the next smaller dial value in float32.
     assert found <= wanted, (seed, found, wanted)
     assert found == wanted or kept(some, cameras, solved.virtual_scale * (1 - 1e-6)) > wanted, (seed, found, wanted)

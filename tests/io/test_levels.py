@@ -16,7 +16,7 @@ from clod_adapter.io.formats import tileset
 from clod_adapter.io.formats.tileset import TILESET, write_tileset
 from clod_adapter.origin import NOWHERE
 
-ERRORS = [0.0, 0.25, 1.0]
+BEGINS = [0.0, 0.25, 1.0]
 
 
 def levels(n: int = 400) -> list[Gaussians]:
@@ -45,7 +45,7 @@ def test_index_and_tiles(tmp_path: Path) -> None:
     """Properties and ranges of tileset.schema.json and tile.schema.json of 3D Tiles 1.1; one chain of levels, coarsest
     first; errors descend; what is packed is what was given."""
     given = levels()
-    notes = write_tileset(tmp_path, given, ERRORS, origin=NOWHERE)
+    notes = write_tileset(tmp_path, [*zip(BEGINS, given, strict=True)], origin=NOWHERE)
     assert any("rounded" in note for note in notes)
     index = json.loads((tmp_path / TILESET).read_text())
     assert set(index) <= {"asset", "extensionsUsed", "extensions", "geometricError", "root"}
@@ -54,7 +54,8 @@ def test_index_and_tiles(tmp_path: Path) -> None:
     required = index["extensions"]["3DTILES_content_gltf"]["extensionsRequired"]
     assert required == ["KHR_gaussian_splatting", "KHR_gaussian_splatting_compression_spz_2"]
     chain = [tile for _, tile in tiles_of(index["root"])]
-    assert [tile["geometricError"] for tile in chain] == ERRORS[::-1] and index["geometricError"] >= ERRORS[-1]
+    begins = [tile["geometricError"] * 935 / 16 for tile in chain]  # on a screen of 1,080 lines, 60 degrees high
+    assert begins == pytest.approx(BEGINS[::-1]) and index["geometricError"] >= chain[0]["geometricError"]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["0_0.glb", "0_1.glb", "root.glb", TILESET]
     for tile, want in zip(chain, given[::-1], strict=True):
         assert set(tile) - {"content", "children", "refine"} == {"boundingVolume", "geometricError"}
@@ -74,7 +75,7 @@ def test_a_set_is_drawn_until_it_is_a_pixel(tmp_path: Path) -> None:
     """Viewers draw nothing where the index's error covers at most 16 pixels, whatever the levels' errors."""
     for size in (0.02, 500.0):
         given = [level.replace(means=level.means * size) for level in levels()]
-        write_tileset(tmp_path, given, [0.0, 1e-6, 2e-6], origin=NOWHERE)
+        write_tileset(tmp_path, [*zip((0.0, 1e-6, 2e-6), given, strict=True)], origin=NOWHERE)
         index = json.loads((tmp_path / TILESET).read_text())
         halves = np.diag(np.reshape(index["root"]["boundingVolume"]["box"], (4, 3))[1:])
         pixels = 2 * float(np.linalg.norm(halves)) * 16 / index["geometricError"]  # of the box, where that error is 16
@@ -85,7 +86,7 @@ def test_boxes_are_where_viewers_place_the_gaussians(tmp_path: Path) -> None:
     """The node's matrix, then glTF's y-up axes into z-up ones, with a large origin; floaters are left out."""
     given = [level.replace(means=level.means * torch.tensor([3.0, 1.0, 0.5])) for level in levels()]
     given[0].means[0] = 1e4
-    write_tileset(tmp_path, given, ERRORS, origin=(1000.0, -2000.0, 50.0))
+    write_tileset(tmp_path, [*zip(BEGINS, given, strict=True)], origin=(1000.0, -2000.0, 50.0))
     root = json.loads((tmp_path / TILESET).read_text())["root"]
     gltf, _ = read_tile(tmp_path / "0_0.glb", tmp_path)
     matrix = np.array(gltf["nodes"][0]["matrix"], float).reshape(4, 4).T
@@ -101,7 +102,7 @@ def test_cells_hold_every_gaussian_once(tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.setattr(tileset, "LARGEST", 60)
     given = levels()
     given[0].means[:100] = given[0].means[0]  # more in one place than a cell holds
-    write_tileset(tmp_path, given, ERRORS, origin=NOWHERE)
+    write_tileset(tmp_path, [*zip(BEGINS, given, strict=True)], origin=NOWHERE)
     root = json.loads((tmp_path / TILESET).read_text())["root"]
     assert len(root["children"]) >= 6
     for level, want in enumerate(given[:2]):

@@ -5,8 +5,10 @@ buffer with the bytes of an SPZ file, attributes without data, and a node with a
 
 The root has the coarsest level of the whole scene. Its children are cells of at most LARGEST Gaussians of the finest
 level, each a chain of tiles from the next finer level to the finest; a tile replaces its parent (refine REPLACE).
-``geometricError`` of a tile is that of its level (``geometric_errors``). That of the index, of showing nothing,
-is ALLOWED diagonals of the root's box and the root's own error: a set is drawn until it is about one pixel large.
+A tile with ``geometricError`` g is shown from the distance ``g f / ALLOWED`` on, with a focal length of f pixels (OGC
+22-025r4, "Geometric error"). So g is ALLOWED / FOCAL times the distance at which its level begins. That of the index,
+of showing nothing, is ALLOWED diagonals of the root's box and the root's own error: a set is drawn until it is about
+one pixel large.
 
 Viewers turn glTF's y-up axes into z-up ones, (x, y, z) to (x, -z, y), after the node's half turn. So a point (x, y, z)
 of the model is at (-x, -z, -y) of the tile set, in which the bounding boxes are.
@@ -30,30 +32,29 @@ from clod_adapter.origin import Origin
 TILESET = "tileset.json"
 SPZ = "KHR_gaussian_splatting_compression_spz_2"
 ALLOWED = 16.0  # pixels of screen-space error that viewers allow by default
+FOCAL = 935.0  # pixels, of a view 60 degrees and 1,080 pixels high
 LARGEST = 1 << 18  # Gaussians of the finest level in a cell, unless they share one centre
 STRAY = 0.02  # share of the centres that may be outside of a tile's box, along each axis
 
 Rows = list[np.ndarray]  # the row numbers of each level
 
 
-def write_tileset(
-    folder: Path, levels: Sequence[Gaussians], errors: Sequence[float], *, origin: Origin
-) -> tuple[str, ...]:
+def write_tileset(folder: Path, levels: Sequence[tuple[float, Gaussians]], *, origin: Origin) -> tuple[str, ...]:
     """Writes ``tileset.json`` and its tiles to an existing folder; what the files do not store.
 
     Args:
-        levels: without a dial, the finest first, at least two.
-        errors: ``geometricError`` of each level, world units; 0 for the finest, ascending.
+        levels: distance in world units at which each begins, and its Gaussians, without a dial; the finest first.
     """
-    notes: list[str] = []
-    centres = [level.means.cpu().double().numpy() for level in levels]
+    notes, errors = list[str](), [ALLOWED / FOCAL * begins for begins, _ in levels]
+    detail = [gaussians for _, gaussians in levels]
+    centres = [level.means.cpu().double().numpy() for level in detail]
 
     def tile(level: int, rows: Rows, name: str, children: list[dict[str, Any]]) -> dict[str, Any]:
         """A tile and its file; without one where it has no Gaussians."""
         box = {"box": _box(centres, rows, origin)}
         found: dict[str, Any] = {"boundingVolume": box, "geometricError": errors[level]}
         if len(rows[level]):
-            notes.extend(write_tile(folder / name, levels[level].select(torch.from_numpy(rows[level])), origin))
+            notes.extend(write_tile(folder / name, detail[level].select(torch.from_numpy(rows[level])), origin))
             found["content"] = {"uri": name}
         return found | ({"children": children} if children else {})
 

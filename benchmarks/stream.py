@@ -1,0 +1,215 @@
+"""The dial against streamed sets of levels, both drawn as a viewer draws them: PSNR at equal budgets.
+
+    python benchmarks/stream.py SCENE.ply --record                                # without photographs
+    python benchmarks/stream.py SCENE.ply --author LEVEL.ply ... --record         # and the levels that its author ships
+    python benchmarks/stream.py SCENE.ply --images FOLDER --record                # with photographs
+    python benchmarks/stream.py --table
+
+SCENE is adapted without options. Its rivals are sets whose finest level is SCENE itself: halved again and again by
+splat-transform (``make peers``) in both its ways, and the author's own. ``export --lod-meta`` of the adapted file is
+drawn too. A set is drawn by the rule of PlayCanvas 2.23 (gsplat-octree-instance.js, gsplat-budget-balancer.js): a
+node's distance is that of the nearest point of its box; level b >= 1 begins at K multiplier^(b - 1); in each frame one
+K for all nodes is such that their counts, in view or not, meet the budget. A set has the multiplier of MULTIPLIERS that
+is best for it. The dial has the value that keeps as many Gaussians in that frame. PSNR is that of the mean squared
+error over VIEWS placed cameras, against renders of SCENE, or over held-out photographs.
+"""
+
+import json
+import math
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import clod_adapter as clod
+from common import COMMAND, Process, Row, append, arguments, stored, table
+from tuning import TIMEOUT, find_tool
+
+import numpy as np
+import torch
+
+FILE, VIEWS, SEED = "stream.jsonl", 16, 77
+BUDGETS, MULTIPLIERS = (0.4, 0.18, 0.08, 0.04), (1.6, 2.0, 3.0)
+LEAF, HALVED = 8192, 6  # Gaussians of a node; times that SCENE is halved
+SETS = {"halved": "--decimate", "halved adaptively": "--decimate-adaptive"}
+
+
+def main() -> None:
+    parser = arguments(__doc__, table=print_table, record=FILE)
+    parser.add_argument("scene", type=Path)
+    parser.add_argument("--author", nargs="+", type=Path, default=[], help="coarser levels, the finest first")
+    parser.add_argument("--images", type=Path, help="photographs; without it there are none")
+    parser.add_argument("--adapted", type=Path, help="the file of an earlier run, which is not run again")
+    parser.add_argument("--only-dial", action="store_true", help="draw no sets")
+    args = parser.parse_args()
+    with tempfile.TemporaryDirectory() as temporary:
+        for row in compared(args.scene, args.author, args.images, args.adapted, args.only_dial, Path(temporary)):
+            row = {"benchmark": "stream", "scene": args.scene.stem, **row}
+            if args.images:
+                row["scene"] = f"{args.images.name}"
+            if args.record:
+                append(FILE, row)
+            else:
+                print(json.dumps(row), flush=True)
+
+
+def compared(
+    scene: Path, author: list[Path], images: Path | None, adapted: Path | None, only_dial: bool, folder: Path
+) -> Iterator[Row]:
+    """The rows: the run, the dial at 1, 2 and 5, and then each method at each budget."""
+    base, out = clod.load(scene).gaussians, adapted or folder / "adapted.ply"
+    if images:
+        views = list(clod.load_scene(images).test)
+    else:
+        cameras = clod.place_cameras(base, views=VIEWS, seed=SEED)
+        with torch.no_grad():
+            views = [clod.View(camera, clod.render(base, camera).pixels) for camera in cameras]
+    if adapted is None:
+        words = ["--images", images] if images else []
+        run = Process([*COMMAND, scene, *words, "--out", out, "--json", "--accept-loss"])
+        yield {"method": "run", "steps": json.loads(run.out)["steps"], **run.cost()}
+    dial = clod.load(out).gaussians
+    for s in (0.0, 1.0, 2.0, 5.0):
+        (row,) = clod.evaluate(clod.detach(dial) if s == 0 else dial, views, [max(s, 1.0)])
+        yield {"method": "dial", "level": f"s = {s:g}", "share": row.kept / len(base), "psnr": row.psnr}
+    shown = Dial(dial)
+    for budget in BUDGETS:
+        yield {"method": "dial", **measured(shown, views, budget, len(base))}
+    if only_dial:
+        return
+    frames, sets = Frames(base), dict[str, dict[float, list[Path]]]()
+    for name, option in SETS.items():
+        sets[name] = dict.fromkeys(MULTIPLIERS, [scene, *halved(scene, option, folder / name)])
+    if author:
+        sets["author"] = dict.fromkeys(MULTIPLIERS, [scene, *author])
+    sets["lod-meta"] = {each: own_levels(out, each, folder / f"own{each:g}") for each in MULTIPLIERS}
+    for name, files in sets.items():
+        found = dict[str, Row]()
+        for multiplier, levels in files.items():
+            drawn = Levels([clod.load(file).gaussians for file in levels], multiplier, frames)
+            for budget in BUDGETS:
+                row = {"method": name, **measured(drawn, views, budget, len(base)), "multiplier": multiplier}
+                found[row["level"]] = max(row, found.get(row["level"], row), key=lambda each: each["psnr"])
+        yield from found.values()
+
+
+def measured(shown: "Dial | Levels", views: Sequence[clod.View], budget: float, whole: int) -> Row:
+    """PSNR over the views, and the mean share drawn."""
+    errors, counts = list[float](), list[int]()
+    for view in views:
+        gaussians, s, count = shown.frame(view.camera, round(budget * whole))
+        with torch.no_grad():
+            image = clod.render(gaussians, view.camera, virtual_scale=s).image.clamp(0, 1)
+        errors.append(float((image - view.image / 255).square().mean()))
+        counts.append(count)
+    psnr = -10 * math.log10(float(np.mean(errors)))
+    return {"level": f"{budget:.0%}", "share": float(np.mean(counts)) / whole, "psnr": psnr}
+
+
+@dataclass
+class Dial:
+    gaussians: clod.Gaussians
+
+    def frame(self, camera: clod.Camera, count: int) -> tuple[clod.Gaussians, float, int]:
+        """What is drawn of about ``count`` Gaussians, the dial value, and their exact number."""
+        s = clod.dial_for(self.gaussians, keep=count, cameras=[camera]).virtual_scale
+        return self.gaussians, s, int(clod.render(self.gaussians, camera, virtual_scale=s).kept.sum())
+
+
+class Frames:
+    """The nodes of a scene: a k-d tree of the checkpoint's centres, the same for every set."""
+
+    def __init__(self, base: clod.Gaussians) -> None:
+        self.means, self.leaves = base.means.numpy(), list[np.ndarray]()
+        self.tree = self._cut(np.arange(len(base)))
+        boxes = [self.means[rows] for rows in self.leaves]
+        self.low, self.high = np.stack([box.min(0) for box in boxes]), np.stack([box.max(0) for box in boxes])
+
+    def _cut(self, rows: np.ndarray) -> object:
+        points = self.means[rows]
+        axis = int(np.argmax(np.ptp(points, axis=0)))
+        at = float(np.median(points[:, axis]))
+        low = points[:, axis] <= at
+        if len(rows) <= LEAF or low.all():
+            self.leaves.append(rows)
+            return len(self.leaves) - 1
+        return axis, at, self._cut(rows[low]), self._cut(rows[~low])
+
+    def nodes(self, means: np.ndarray) -> np.ndarray:
+        """``[N]`` the leaf of each centre."""
+        found, todo = np.empty(len(means), np.int64), [(self.tree, np.arange(len(means)))]
+        while todo:
+            node, rows = todo.pop()
+            if isinstance(node, tuple):
+                axis, at, below, above = node
+                low = means[rows, axis] <= at
+                todo += [(below, rows[low]), (above, rows[~low])]
+            else:
+                found[rows] = node
+        return found
+
+    def distances(self, camera: clod.Camera) -> np.ndarray:
+        eye = camera.position.double().numpy()
+        return np.linalg.norm(np.clip(eye, self.low, self.high) - eye, axis=1)
+
+
+class Levels:
+    """A set of levels, the finest first."""
+
+    def __init__(self, levels: list[clod.Gaussians], multiplier: float, frames: Frames) -> None:
+        self.levels, self.step, self.frames = levels, math.log(multiplier), frames
+        self.nodes = [frames.nodes(level.means.numpy()) for level in levels]
+        self.counts = np.stack([np.bincount(nodes, minlength=len(frames.leaves)) for nodes in self.nodes])
+
+    def frame(self, camera: clod.Camera, count: int) -> tuple[clod.Gaussians, float, int]:
+        """As ``Dial.frame``."""
+        distances, every = self.frames.distances(camera), np.arange(len(self.frames.leaves))
+
+        def chosen(K: float) -> np.ndarray:
+            bands = np.floor(np.log(np.maximum(distances, 1e-9) / K) / self.step).astype(int) + 1
+            return np.clip(bands, 0, len(self.levels) - 1)
+
+        low, high = 1e-5, 1e7
+        for _ in range(60):
+            K = math.sqrt(low * high)
+            low, high = (low, K) if self.counts[chosen(K), every].sum() > count else (K, high)
+        level = chosen(low)
+        shown = [torch.from_numpy(level[nodes] == k) for k, nodes in enumerate(self.nodes)]
+        parts = [gaussians.select(rows) for gaussians, rows in zip(self.levels, shown, strict=True)]
+        joined = {name: torch.cat([part.tensors()[name] for part in parts]) for name in parts[0].tensors()}
+        return parts[0].replace(**joined), 1.0, int(self.counts[level, every].sum())
+
+
+def halved(scene: Path, option: str, folder: Path) -> list[Path]:
+    """SCENE halved HALVED times, the finest first."""
+    folder.mkdir()
+    files, count = [scene], len(clod.load(scene).gaussians)
+    for k in range(1, HALVED + 1):
+        files.append(folder / f"{k}.ply")
+        find_tool().run("-q", files[-2], option, str(count >> k), files[-1], timeout=TIMEOUT)
+    return files[1:]
+
+
+def own_levels(adapted: Path, multiplier: float, folder: Path) -> list[Path]:
+    """The levels of ``export --lod-meta``, as splat-transform reads them."""
+    Process([*COMMAND, "export", adapted, "--lod-meta", "--multiplier", multiplier, "--out", folder])
+    meta, files = folder / "lod-meta.json", list[Path]()
+    for level in range(int(json.loads(meta.read_text("utf-8"))["lodLevels"])):
+        files.append(folder / f"level{level}.ply")
+        find_tool().run("-q", meta, "-L", str(level), files[-1], timeout=TIMEOUT)
+    return files
+
+
+def print_table() -> None:
+    """The last row of each method and budget."""
+    last = {(row["scene"], row["method"], row.get("level")): row for row in stored(FILE)}
+    methods = dict.fromkeys((row["scene"], row["method"]) for row in last.values() if "psnr" in row)
+    lines = []
+    for scene, method in methods:
+        cells = [last.get((scene, method, f"{budget:.0%}")) for budget in BUDGETS]
+        lines.append([scene, method, *(f"{cell['psnr']:.1f}" if cell else "" for cell in cells)])
+    print(table(["scene", "method", *(f"{budget:.0%}" for budget in BUDGETS)], lines))
+
+
+if __name__ == "__main__":
+    main()
