@@ -76,7 +76,7 @@ def run(folder: Path, *, record: bool) -> None:
     row: Row = {
         "benchmark": "converged", "name": folder.name, "photographs": len(scene.train), "held_out": len(scene.test),
         "gaussians": len(base.gaussians), "base": report["base_rows"][0], "rows": [each.as_dict() for each in rows],
-        "steps": report["steps"], "seconds": round(process.seconds, 1), "watched": report["watched"],
+        "steps": report["steps"], "seconds": round(process.seconds, 1),
     }  # fmt: skip
     if record:
         append(FILE, row)

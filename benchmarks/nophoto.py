@@ -45,7 +45,7 @@ def run(scene: str, kind: str, config: clod.AdaptConfig, few: int | None) -> Non
     if kind == "placed":
         views = render_pseudo_views(base, clod.place_cameras(base, seed=config.seed))
     if kind == "complemented":
-        views, config = add_pseudo_views(base, photographs, config)
+        views = add_pseudo_views(base, photographs, config.seed)
     seconds = time.perf_counter() - began
     plan = clod.make_plan(base, views, config)
     adapted = plan.adapt(views)

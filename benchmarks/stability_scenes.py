@@ -169,7 +169,7 @@ def measure() -> list[dict[str, Any]]:
 
 def run(name: str, case: Case) -> dict[str, Any]:
     started = time.perf_counter()
-    scene, config = add_pseudo_views(case.base, case.scene, clod.AdaptConfig(**{"iters": STEPS, **case.settings}))
+    scene, config = add_pseudo_views(case.base, case.scene), clod.AdaptConfig(**{"iters": STEPS, **case.settings})
     adapted = clod.adapt(case.base, scene, config)
     seconds = time.perf_counter() - started
     result = clod.extract(case.base, adapted.gaussians, fingerprint="", config={}).apply(case.base)

@@ -11,6 +11,8 @@ Every frame is compared with the supersampled, unperturbed town.
 import json
 import math
 import tempfile
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from statistics import fmean
 
@@ -19,10 +21,11 @@ from city import HOUSE, PITCH, SKY, city, city_cameras, look_at, lots, perturb
 from clod_adapter.config import FILTERS
 from clod_adapter.io.atomic import atomic_path
 from common import CACHE, COMMAND, Process, Row, append, arguments, stored, table
-from large import SAMPLES, supersampled, write_photographs
 from tuning import Tuning, tune
 
 import numpy as np
+import torch
+from PIL import Image
 
 FILE = "walk.jsonl"
 COUNT = 80_000
@@ -33,6 +36,7 @@ SKY_RADIUS = 1000.0  # metres; a small town's own sky would hide it from afar
 SIZE = (480, 320)
 PHOTOGRAPHS = 96
 STEPS = 400  # of tuning
+SAMPLES = 2  # along each side of a pixel of a photograph
 BANDS = {"within 12 m": 12.0, "12 to 40 m": 40.0, "40 to 120 m": 120.0, "beyond": math.inf}
 
 
@@ -128,6 +132,30 @@ def summary(row: Row) -> str:
         lines.append([name, f"{psnr:.2f}", f"{gain:+.2f}", f"{share:.0%}"])
         nearest = farthest
     return table(["from the door", "base, dB", "dial, dB against it", "Gaussians in view"], lines, 1)
+
+
+@torch.no_grad()
+def supersampled(shown: clod.Gaussians, camera: clod.Camera, samples: int) -> torch.Tensor:
+    """``[H, W, 3]`` uint8, a render with ``samples`` by ``samples`` samples in a pixel."""
+    K = camera.K * torch.tensor([[samples], [samples], [1.0]])
+    image = clod.render(shown, replace(camera, K=K, width=samples * camera.width, height=samples * camera.height)).image
+    image = image.clamp(0, 1).reshape(camera.height, samples, camera.width, samples, 3).mean((1, 3))
+    return (255 * image).round().to(torch.uint8)
+
+
+def write_photographs(shown: clod.Gaussians, cameras: Sequence[clod.Camera], folder: Path) -> Path:
+    """A folder of photographs with their transforms.json."""
+    (folder / "images").mkdir(parents=True)
+    frames = []
+    for k, camera in enumerate(cameras):
+        name = f"images/{k:04}.png"
+        Image.fromarray(supersampled(shown, camera, SAMPLES).numpy()).save(folder / name)
+        pose = torch.linalg.inv(camera.viewmat.double()) @ torch.diag(torch.tensor([1.0, -1, -1, 1])).double()
+        K = camera.K.tolist()
+        size = {"fl_x": K[0][0], "fl_y": K[1][1], "cx": K[0][2], "cy": K[1][2], "w": camera.width, "h": camera.height}
+        frames.append({"file_path": name, "transform_matrix": pose.tolist(), **size})
+    (folder / "transforms.json").write_text(json.dumps({"frames": frames}), "utf-8")
+    return folder
 
 
 if __name__ == "__main__":

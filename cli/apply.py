@@ -35,7 +35,7 @@ def outputs(args: Namespace) -> Outputs:
 def execute(args: Namespace) -> dict[str, Any]:
     from clod_adapter.adapter import dial_tensors
     from clod_adapter.io.adapter_file import load_adapter
-    from clod_adapter.io.checkpoint import save, trimmed
+    from clod_adapter.io.checkpoint import save
 
     from .shared.inputs import read_checkpoint
 
@@ -46,8 +46,7 @@ def execute(args: Namespace) -> dict[str, Any]:
         adapted = adapter.apply(base.gaussians, base.fingerprint)
     except ClodError as error:
         raise ClodError(f"{args.base}: {error}") from error
-    rows = trimmed(base, adapter.kept, adapter.sh_degree)
-    save(args.out, adapted, rows, version=adapter.version, calibration=adapter.calibration)
+    save(args.out, adapted, base, version=adapter.version, calibration=adapter.calibration)
     dial = " and ".join(dial_tensors(adapted))
     print(f"wrote {args.out} ({size(Path(args.out))}): {len(adapted):,} Gaussians with {dial}")
     return {

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from clod_adapter.progress import Phase, Progress, Stopped
     from clod_adapter.render import Rendering, render
     from clod_adapter.training.camera_placement import place_cameras
-    from clod_adapter.training.dial import Dial, TrainableSubset, attach
+    from clod_adapter.training.dial import Dial, attach
     from clod_adapter.training.loop import Adapted, adapt
     from clod_adapter.training.plan import Decision, Override, Plan
     from clod_adapter.training.planner import make_plan
@@ -65,7 +65,7 @@ _homes = {name: f"{__name__}.{home}" for home, names in {
     "training.planner": ("make_plan",),
     "progress": ("Phase", "Progress", "Stopped"),
     "render": ("Rendering", "render"),
-    "training.dial": ("Dial", "TrainableSubset", "attach"),
+    "training.dial": ("Dial", "attach"),
     "training.loop": ("Adapted", "adapt"),
 }.items() for name in names}  # fmt: skip
 
@@ -91,7 +91,7 @@ sys.modules[__name__].__class__ = _Lazy
 __all__ = [
     "AdaptConfig", "Adapted", "Adapter", "AttenuationConfig", "Calibration", "Camera", "Checkpoint", "ClodError",
     "Decision", "Dial", "DialValue", "Gaussians", "Hold", "Hook", "Override", "Phase", "Plan", "Progress", "Rendering",
-    "Scene", "ScreenFilter", "Stopped", "TrainableSubset", "View", "adapt", "attach", "bake", "bake_levels", "detach",
+    "Scene", "ScreenFilter", "Stopped", "View", "adapt", "attach", "bake", "bake_levels", "detach",
     "dial_for", "evaluate", "extract", "from_gsplat", "load", "load_adapter", "load_scene", "make_plan",
     "order_by_extinction", "place_cameras", "render", "render_pseudo_views", "save", "save_adapter", "to_gsplat",
     "with_dial",

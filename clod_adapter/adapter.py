@@ -9,7 +9,7 @@ from torch import Tensor
 from clod_adapter._support.arrays import tensor_of
 from clod_adapter._support.text import package_version
 from clod_adapter.calibration import Calibration
-from clod_adapter.config import CLASSIC, SH_COUNTS, AttenuationConfig, ScreenFilter, require
+from clod_adapter.config import CLASSIC, AttenuationConfig, ScreenFilter, require
 from clod_adapter.equation.attenuation import SIGMA_MAX
 from clod_adapter.equation.units import in_world_units
 from clod_adapter.errors import ClodError
@@ -34,8 +34,6 @@ class Adapter:
         version: of the package that made it; it stands in the header of the PLY, which is so the same again.
         calibration: what the result's dial values keep, cost and take, where that was measured; in the header too.
         origin: ``[3]`` what the base's means were relative to, world units (``Checkpoint.origin``).
-        kept: of a result with fewer rows than its base, ``[base_count]`` bool: the rows that it has. None for all.
-        sh_degree: of a result with fewer SH bands than its base. None for the base's.
         screen_filter: that it was trained with, and the result is drawn with.
         growth_d: ``[N]`` float32, finite, exponents of the growth of the scales. None for no growth.
         added: the ATTRIBUTES of far Gaussians, float32, which follow the base's. None without; else updates are empty.
@@ -53,15 +51,13 @@ class Adapter:
     version: str = field(default_factory=package_version)
     calibration: Calibration | None = None
     origin: Origin = NOWHERE
-    kept: Tensor | None = None
-    sh_degree: int | None = None
     screen_filter: ScreenFilter = CLASSIC
     growth_d: Tensor | None = None
     added: dict[str, Tensor] = field(default_factory=dict)
     notes: tuple[str, ...] = field(default=(), compare=False)
 
     def __post_init__(self) -> None:
-        for name in (*DIAL, "kept"):
+        for name in DIAL:
             if (column := getattr(self, name)) is not None:
                 object.__setattr__(self, name, tensor_of(column))
         for name in ("updates", "added"):
@@ -83,13 +79,8 @@ class Adapter:
         if self.added:
             attributes: Any = self.added
             far = Gaussians(**attributes)  # checks names and shapes
-            fits = not self.updates and self.kept is None and len(far) < count
-            require(fits, "Adapter.added", f"of {len(far)} of {count} rows", "of fewer, without updates and kept rows")
-        if (kept := self.kept) is not None:
-            sound = kept.dim() == 1 and kept.dtype == torch.bool and int(kept.sum()) == count
-            require(sound, "Adapter.kept", _kind(kept), f"bool with {count} set")
-        degrees = ", ".join(map(str, SH_COUNTS))
-        require(self.sh_degree in (None, *SH_COUNTS), "Adapter.sh_degree", repr(self.sh_degree), f"one of {degrees}")
+            fits = not self.updates and len(far) < count
+            require(fits, "Adapter.added", f"of {len(far)} of {count} rows", "of fewer, without updates")
 
     def __repr__(self) -> str:
         dial = f"dial to {self.attenuation.max_sv:g}{'' if self.growth_d is None else ' with growth'}"
@@ -98,8 +89,7 @@ class Adapter:
     @property
     def base_count(self) -> int:
         """How many Gaussians the base has."""
-        added = len(self.added["means"]) if self.added else 0
-        return len(self.sigma_d if self.kept is None else self.kept) - added
+        return len(self.sigma_d) - (len(self.added["means"]) if self.added else 0)
 
     def apply(self, base: Gaussians, fingerprint: str | None = None) -> Gaussians:
         """The adapted Gaussians: the base plus the differences in float32, and the dial.
@@ -116,11 +106,8 @@ class Adapter:
             other = f"its SHA-256 is {fingerprint[:12]}..., the adapter was trained on {self.base_fingerprint[:12]}..."
         elif len(base) != self.base_count:
             other = f"it has {len(base)} Gaussians, the adapter {self.base_count}"
-        elif self.sh_degree is not None and base.sh_degree < self.sh_degree:
-            other = f"it has SH degree {base.sh_degree}, the adapter {self.sh_degree}"
         if other:
             raise ClodError(f"a different base was given: {other}; give the checkpoint it was trained on")
-        base = trim(base, self.kept, self.sh_degree)
         changes: dict[str, Tensor] = {}
         for name, update in self.updates.items():
             old = getattr(base, name)
@@ -143,12 +130,6 @@ class Adapter:
 def dial_tensors(owner: Adapter | Gaussians) -> dict[str, Tensor]:
     """The columns of DIAL that it has, by name."""
     return {name: column for name in DIAL if (column := getattr(owner, name)) is not None}
-
-
-def trim(gaussians: Gaussians, kept: Tensor | None, sh_degree: int | None) -> Gaussians:
-    """Only the rows that are ``kept`` (bool ``[N]``) and the SH bands up to ``sh_degree``; None leaves all."""
-    rows = gaussians if kept is None else gaussians.select(kept.to(gaussians.means.device))
-    return rows if sh_degree is None else rows.without_bands(sh_degree)
 
 
 def extract(

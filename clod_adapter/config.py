@@ -12,8 +12,7 @@ FORMS = ("ours", "paper")
 GROWTHS = ("on", "off")
 FARTHEST = 3e38  # world units: a float32, as which distances are divided by it
 LONGEST = 1e6  # dial value of training: its powers stay finite
-STEPS, STEPS_PER_VIEW = 900, 8.5  # of training, by default, with one view a step
-FAR_STEPS, FAR_STEPS_PER_VIEW = 2500, 24.0  # the same of far Gaussians alone
+STEPS, STEPS_PER_VIEW = 2500, 24.0  # of training, by default, with one view a step
 # Gaussians that viewers draw at most on a device, by their makers; docs/formats.md has the sources.
 DEVICES = {"quest3": 500_000, "phone": 1_000_000, "laptop": 2_000_000, "desktop": 4_000_000}
 SH_COUNTS = {0: 1, 1: 4, 2: 9, 3: 16, 4: 25}  # spherical harmonics of each degree
@@ -118,7 +117,7 @@ class AdaptConfig:
     form: str = option("ours", "training as measured here (ours) or as published (paper); AdaptConfig.paper sets it")
     max_sv: float = option(5.0, "largest dial value to train for")
     iters: int | None = option(
-        None, f"training steps (default: {FAR_STEPS}, or {FAR_STEPS_PER_VIEW:g} for each training view if that is more)"
+        None, f"training steps (default: {STEPS}, or {STEPS_PER_VIEW:g} for each training view if that is more)"
     )
     batch: int = option(1, "views per step; learning rates scale with its square root")
     time_budget: float | None = option(
@@ -126,7 +125,7 @@ class AdaptConfig:
     )
     seed: int = option(0, "seed of the view order, the dial values and the importance estimate")
     start_share: float | None = option(
-        None, "share of Gaussians to keep at s = 1 (default: as the plan measures; 0.62 without a plan)"
+        None, "share of Gaussians to keep at s = 1 where there are no far ones (default: 0.62)"
     )
     exponent: float = option(1.5, "target-count curve: the target share of Gaussians at s is s^-exponent")
     reg_weight: float = option(1.0, "weight of the count loss (the paper's lambda_reg)")
@@ -182,20 +181,11 @@ class AdaptConfig:
         """``iters``, or the default for few training views."""
         return self.iters if self.iters is not None else self.for_views(0).steps
 
-    def for_views(self, views: int, far: bool = False) -> AdaptConfig:
-        """A copy whose ``iters`` is set, by the number of training views and the batch where it is not.
-
-        ``far``: of training far Gaussians alone, whose steps take a third of the time.
-        """
+    def for_views(self, views: int) -> AdaptConfig:
+        """A copy whose ``iters`` is set, by the number of training views and the batch where it is not."""
         if self.iters is not None:
             return self
-        least, each = (FAR_STEPS, FAR_STEPS_PER_VIEW) if far else (STEPS, STEPS_PER_VIEW)
-        return replace(self, iters=max(round(max(least, each * views) / self.batch), 1))
-
-    def lighter(self, share: float) -> AdaptConfig:
-        """A copy with the learning rates of all attributes but sigma_d multiplied by ``share``."""
-        names = ("lr_means", "lr_quats", "lr_scales", "lr_opacities", "lr_sh0", "lr_shN")
-        return replace(self, **{name: share * getattr(self, name) for name in names})
+        return replace(self, iters=max(round(max(STEPS, STEPS_PER_VIEW * views) / self.batch), 1))
 
     def attenuation(self, scene_distance: float) -> AttenuationConfig:
         """Settings of the equation in training; files have them in world units (``units.in_world_units``)."""

@@ -11,19 +11,17 @@ import torch
 from torch import Tensor
 
 import gsplat_in_torch
-from clod_adapter import Hook, Scene, TrainableSubset, View, attach, dial_for, evaluate, make_plan, render
+from clod_adapter import Hook, Scene, View, attach, dial_for, evaluate, make_plan, render
 from clod_adapter.adapter import detach, with_dial
 from clod_adapter.alignment.check import check_alignment
 from clod_adapter.bake import bake, order_by_extinction
-from clod_adapter.blocks.divide import block_target, context_rows, divide
-from clod_adapter.blocks.train import adapt_block, merge
 from clod_adapter.config import AdaptConfig, AttenuationConfig
 from clod_adapter.equation import attenuation
 from clod_adapter.equation.units import in_world_units
 from clod_adapter.evaluation.budget import frame_times, matching_dial
 from clod_adapter.evaluation.popping import dial_popping, path_popping
-from clod_adapter.gaussians import Gaussians
-from clod_adapter.initialization.importance import for_training, initialize
+from clod_adapter.gaussians import Gaussians, with_near
+from clod_adapter.initialization.importance import for_training
 from clod_adapter.integrations.splats import from_gsplat, to_gsplat
 from clod_adapter.rasterizers import BACKENDS, Rasterizer, cpu, cuda
 from clod_adapter.training.camera_placement import place_cameras
@@ -58,9 +56,9 @@ def evaluation(model: Gaussians) -> list[Any]:
     return [value for row in rows for value in (row.psnr, row.ssim, row.kept, row.in_view)]
 
 
-def objective(config: AdaptConfig, trained: int = N, **part: Any) -> Callable[[Gaussians], list[Any]]:
+def objective(config: AdaptConfig) -> Callable[[Gaussians], list[Any]]:
     def gradients(model: Gaussians) -> list[Any]:
-        run = Trainer(model, views_of(model), config, TrainableSubset(trained, **part))
+        run = Trainer(model, views_of(model), config)
         found = run.gradient_sum([Sample(views_of(model)[0], DIAL, 3.0)])
         return [found.loss, found.kept, *found.gradients.values()]
 
@@ -71,6 +69,12 @@ def papers_objective(model: Gaussians) -> list[Any]:
     assert model.attenuation is not None
     paper = model.replace(growth_d=None, attenuation=replace(model.attenuation, form="paper"))
     return objective(AdaptConfig.paper(max_sv=4.0))(paper)
+
+
+def objective_of_far_ones(model: Gaussians) -> list[Any]:
+    assert model.attenuation is not None
+    far = model.replace(attenuation=replace(model.attenuation, near_distance=5.0))
+    return objective(CONFIG)(with_near(detach(model), far))
 
 
 def budget(**given: Any) -> Callable[[Gaussians], list[Any]]:
@@ -87,14 +91,6 @@ def hook(model: Gaussians) -> list[Any]:
     return list(dialled(model.means, model.opacities, CAMERAS[0].viewmat))
 
 
-def blocks(model: Gaussians) -> list[Any]:
-    """A block's context, and its target share."""
-    views = views_of(model)
-    division = divide(initialize(model, views, CONFIG), views, CONFIG, 2)
-    share = block_target(division, 0, CAMERAS, CONFIG, first=False)(DIAL)
-    return [*(context_rows(division, 0, views, after).double().mean() for after in (None, model)), *share]
-
-
 def popping(model: Gaussians) -> list[Any]:
     return [dial_popping(model, CAMERAS[0], DIAL, steps=2).mean, path_popping(model, CAMERAS[:2], DIAL, steps=2).mean]
 
@@ -103,7 +99,7 @@ CONSUMERS: dict[str, Callable[[Gaussians], list[Any]]] = {
     "render": rendering,
     "evaluate": evaluation,
     "objective": objective(CONFIG),
-    "objective of a block": objective(CONFIG, trained=N // 2, full_context=True),
+    "objective of far Gaussians": objective_of_far_ones,
     "dial_for one camera": budget(cameras=CAMERAS[:1]),
     "dial_for several cameras": budget(cameras=CAMERAS),
     "dial_for a baked file": budget(cameras=CAMERAS, baked=True),
@@ -111,7 +107,6 @@ CONSUMERS: dict[str, Callable[[Gaussians], list[Any]]] = {
     "bake for several cameras": baked(cameras=CAMERAS),
     "Hook": hook,
     "popping": popping,
-    "blocks": blocks,
     "order_by_extinction": lambda model: [order_by_extinction(model, CAMERAS)],
 }
 
@@ -153,7 +148,7 @@ def test_everything_grows_by_one_function(name: str, monkeypatch: pytest.MonkeyP
     assert same(consumer(model_of()), before) == (name in WITHOUT_GROWTH)
 
 
-SHORT = replace(CONFIG, iters=1).lighter(0.1)  # a step that the gate does not undo
+SHORT = replace(CONFIG, iters=1)
 
 
 def on_the_cpu(*given: Any) -> tuple[Tensor, ...]:
@@ -207,16 +202,13 @@ def test_results_are_there_and_those_of_the_cpu(there: Gaussians, name: str, mon
 
 
 def test_training_stays_there(there: Gaussians, monkeypatch: pytest.MonkeyPatch) -> None:
-    """By a plan, whose left-out parts are restored, and in blocks."""
+    """By a plan, whose left-out parts are restored."""
     plain, views = detach(there), views_of(there)[:1]
     scene = Scene(views, ())
     plan = make_plan(plain, scene, SHORT)
     whole = plan.whole(plain, plan.adapt(scene).gaussians)
-    division = divide(make_plan(plain, scene, SHORT, far=False).start, views, SHORT, 2)
-    merged = merge(division, [adapt_block(division, views, SHORT, block) for block in range(2)])
-    for result, before in ((whole, plan.start), (merged, plain)):
-        assert not torch.equal(result.means.cpu(), before.means.cpu())
-        assert all(x.device == plain.means.device and bool(x.isfinite().all()) for x in result.tensors().values())
+    assert not torch.equal(whole.means.cpu(), plan.start.means.cpu())
+    assert all(x.device == plain.means.device and bool(x.isfinite().all()) for x in whole.tensors().values())
     monkeypatch.setattr(importlib.import_module("clod_adapter.evaluation.frame_times"), "PASSES", 2)
     assert whole.whole == len(plain) and all(taken > 0 for _, taken in frame_times(there, CAMERAS[:1])[0])
 

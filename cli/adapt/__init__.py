@@ -3,15 +3,13 @@
 from argparse import ArgumentParser, Namespace
 from typing import Any
 
-from clod_adapter.blocks.memory import parse_size
 from clod_adapter.errors import ClodError
 
 from ..shared.command import add_reading, add_settings, check_inputs, make_config, page_files
 from ..shared.outputs import AdaptFiles, Outputs, check_ply_name
-from ..shared.process import launched
 
 # As in clod_adapter.training.plan, which imports torch; a test compares the two.
-NAMES = ("bands", "unseen", "means", "quats", "scales", "opacities", "sh0")
+NAMES = ("bands", "means", "quats", "scales", "opacities", "sh0")
 
 
 def add_arguments(parser: ArgumentParser) -> None:
@@ -35,18 +33,12 @@ def add_arguments(parser: ArgumentParser) -> None:
     options.add_argument("--with", dest="keep_in", help=text, **several)
     text = "exclude or freeze these whatever the plan measures"
     options.add_argument("--without", dest="leave_out", help=text, **several)
-    options.add_argument("--trim", action="store_true", help="do not write the SH degrees and Gaussians excluded")
-    options.add_argument("--memory", metavar="SIZE", help="memory limit, as in 8GB; larger scenes are split in blocks")
 
 
 def check(args: Namespace) -> None:
     make_config(args)
     if both := sorted(set(args.keep_in) & set(args.leave_out)):
         raise ClodError(f"--with and --without both name {', '.join(both)}; give each to one of them")
-    if args.memory is not None:
-        parse_size(args.memory)
-        if launched().size > 1:
-            raise ClodError("--memory needs a single process: run without torchrun")
     check_inputs(args.images, args.ply)
 
 
@@ -55,8 +47,7 @@ def outputs(args: Namespace) -> Outputs:
     check_ply_name(files.ply, "--out")
     page = page_files(files.ply.with_suffix(".html"), ["rendering", "adapting"]) if args.report else []
     named, default = ([], [files.ply]) if args.out is None else ([files.ply], [])
-    blocks = files.blocks() if args.memory is not None else []
-    derived = [*default, files.adapter, files.report, files.state, *page, *blocks]
+    derived = [*default, files.adapter, files.report, files.state, *page]
     return Outputs(named, derived, inputs=[args.ply], scene=args.images)
 
 
@@ -98,10 +89,9 @@ interruption:
   state is saved in OUT.resume.safetensors about once a minute: after that, a
   crash or a full disk the same command with --resume gives the same Gaussians.
 
-large scenes, several processes:
-  --memory 8GB trains a scene that does not fit in blocks; after an interrupt
-  the same command continues. Processes of torchrun train together, with the
-  result of one process with the same --batch, up to rounding.
+several processes:
+  Processes of torchrun train together, with the result of one process with the
+  same --batch, up to rounding.
 
 exit codes: 0 written; 1 written, but a loss was not finite, or s = 1 is more
 than 1 dB below the base (without photographs: below 25 dB) and --accept-loss is

@@ -1,4 +1,4 @@
-"""A run of ``clod-adapt`` before its training: the arguments, what is read, the memory plan and the training plan."""
+"""A run of ``clod-adapt`` before its training: the arguments, what is read, and the training plan."""
 
 import argparse
 import math
@@ -12,24 +12,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from clod_adapter._kernels.memory import release
 from clod_adapter.adapter import dial_tensors
-from clod_adapter.blocks.memory import IMAGES, MemoryEstimate, MemoryPlan, in_words, parse_size, plan_for_limit
-from clod_adapter.cameras import Scene, StoredView, View
+from clod_adapter.cameras import Scene, View
 from clod_adapter.evaluation.evaluate import Row
 from clod_adapter.evaluation.robustness import scene_fingerprint
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.checkpoint import Checkpoint
-from clod_adapter.io.scene.load import ImageCache
 from clod_adapter.progress import GracefulStop, Phase, Stopped
 from clod_adapter.training.camera_placement import place_cameras
-from clod_adapter.training.far import takes_over
 from clod_adapter.training.loop import time_steps
 from clod_adapter.training.plan import NOT_NEEDED, Decision, Override, Plan
 from clod_adapter.training.planner import make_plan
-from clod_adapter.training.pseudo_views import LIGHTEST, add_pseudo_views, render_pseudo_views
+from clod_adapter.training.pseudo_views import add_pseudo_views, render_pseudo_views
 
 from ..shared import inputs
 from ..shared.command import make_config
@@ -48,14 +44,12 @@ WRITING = 1e8  # bytes of a PLY per second, with everything that is written besi
 class Run:
     """The arguments, the services that all steps use, and what ``read`` and ``measure_base`` have found.
 
-    Without photographs, or with too few, ``scene`` has pseudo views, and ``config`` lower learning rates.
+    Without photographs, or with too few, ``scene`` has pseudo views.
     """
 
     base: Checkpoint
     scene: Scene
     alignment: dict[str, Any] | None = None  # the measurements of the check; None without photographs
-    memory: MemoryPlan | None = None  # for --memory
-    far = False  # whether far Gaussians are added
     base_rows: list[Row]  # at dial value 1; none if nothing is held out
     base_seconds = 0.0  # of measuring it
     forecast: dict[str, Any] | None = None
@@ -67,19 +61,17 @@ class Run:
         self.config = make_config(args)
         self.teacher = "checkpoint" if args.images is None else "photographs"
         self.outputs = AdaptFiles.of(args.ply, args.out)
-        resume = args.resume and (not args.memory or self.outputs.state.exists())  # blocks have files of their own
-        self.saver = Saver(self.outputs.state, self.config, self.console, self.stop, resume)
+        self.saver = Saver(self.outputs.state, self.config, self.console, self.stop, args.resume)
 
     def read(self) -> None:
         """Reads checkpoint and photographs, or places cameras."""
         args, console, watch, views = self.args, self.console, self.watch, list[View]()
-        cache = ImageCache(int(IMAGES * parse_size(args.memory))) if args.memory else None
         with watch.time("load"):
             device = inputs.pick_device(args.device, console)
             base = inputs.read_checkpoint(args.ply, console, args.activated, device=device)
             if base.vertex is not None:  # only writing needs the file's rows
                 base = replace(base, vertex=mapped(base.vertex, self.outputs.ply.parent))
-            photographs = inputs.read_scene(args.images, console, base.origin, cache) if args.images else None
+            photographs = inputs.read_scene(args.images, console, base.origin) if args.images else None
         with watch.time("kernels"):
             inputs.prepare_kernels(console, device)
         with watch.time("evaluate"):
@@ -93,24 +85,14 @@ class Run:
                 inputs.prepare_kernels(console, device, screen_filter=base.gaussians.screen_filter)
         with watch.time("place" if photographs is None else "evaluate"):
             self.place(photographs)
-        if args.memory:
-            self.memory = plan_memory(base, self.scene, parse_size(args.memory), console)
-        self.far = not self.in_blocks and takes_over(base.gaussians, self.config)
-        if not self.far and photographs is None:
-            self.config = self.config.lighter(LIGHTEST)
-        far = self.far or base.gaussians.near is not None
-        self.config = self.config.for_views(len(self.scene.train), far)
-
-    @property
-    def in_blocks(self) -> bool:
-        return self.memory is not None and self.memory.blocks > 1
+        self.config = self.config.for_views(len(self.scene.train))
 
     def place(self, photographs: Scene | None) -> None:
         """Adds pseudo views where photographs are few, and replaces them where there are none."""
         gaussians, config, console = self.base.gaussians, self.config, self.console
         with console.meter(Phase.CAMERAS) as meter:
             if photographs is not None:
-                self.scene, self.config = add_pseudo_views(gaussians, photographs, config, meter)
+                self.scene = add_pseudo_views(gaussians, photographs, config.seed, meter)
             else:
                 cameras = place_cameras(gaussians, seed=config.seed, progress=meter)
         if photographs is None:
@@ -150,22 +132,13 @@ class Run:
 
 
 def decide(run: Run, display: ProgressDisplay) -> Plan:
-    """Makes the plan, with the effect of ``--trim``, and prints it."""
+    """Makes the plan, and prints it."""
     args, console, base = run.args, run.console, run.base.gaussians
     override = Override(frozenset(args.keep_in), frozenset(args.leave_out))
-    plan = make_plan(base, run.scene, run.config, override, display, far=run.far)
+    plan = make_plan(base, run.scene, run.config, override, display)
     display.close()
-    release()  # of looking at all Gaussians, before only those that are kept are trained
-    if args.trim and plan.trims(base):
-        began = time.perf_counter()
-        with console.meter(Phase.TRIMMING) as meter:
-            effect = plan.trimming_effect(base, run.scene, meter)
-        seconds = plan.seconds | {"trim": time.perf_counter() - began}
-        plan = replace(plan, decisions=(*plan.decisions, effect), seconds=seconds)
+    release()
     show_plan(plan.decisions, console)
-    for tensor in base.tensors().values() if plan.kept is not None else ():  # what is trained is a copy
-        if tensor.device.type == "cpu" and tensor.numel():
-            tensor.data = torch.from_numpy(mapped(tensor.numpy(), run.outputs.ply.parent))
     return plan
 
 
@@ -176,7 +149,7 @@ def forecast(run: Run, plan: Plan) -> None:
     if steps < LONG or launched().size > 1:
         return
     with run.console.status("timing a few steps ..."):
-        each, fixed = time_steps(plan.lean, run.scene, config, min(max(steps // 40, 16), 24), plan.subset)
+        each, fixed = time_steps(plan.start, run.scene, config, min(max(steps // 40, 16), 24))
     release()
     training = fixed + min(1.02 * steps * each, config.time_budget or math.inf)  # with saving the state
     dials, frame = len(report_dials(config.max_sv)) + 1, run.base_rows[0].frame_ms / 1e3 if run.base_rows else 0.0
@@ -218,24 +191,9 @@ def show_plan(decisions: Sequence[Decision], console: Console) -> None:
         console.say(f"  does not apply: {', '.join(others)}")
 
 
-def plan_memory(base: Checkpoint, scene: Scene, limit: int, console: Console) -> MemoryPlan:
-    views, gaussians = (*scene.train, *scene.test), base.gaussians
-    pixels = [view.camera.width * view.camera.height for view in views]
-    row = _bytes(gaussians) // len(gaussians)
-    made = sum(3 * size for view, size in zip(views, pixels, strict=True) if not isinstance(view, StoredView))
-    needs = MemoryEstimate(
-        len(gaussians), row, row if base.vertex is None else base.vertex.dtype.itemsize,
-        images=3 * sum(pixels) - made, pixels=max(pixels), pictures=made,
-    )  # fmt: skip
-    plan = plan_for_limit(needs, limit)
-    how = "the whole scene at once" if plan.blocks == 1 else f"in {plan.blocks} blocks"
-    console.say(f"memory: {in_words(plan.peak)} of {in_words(plan.limit)}, {how}; peaks, including the program itself:")
-    for name, what in (
-        ("base", "reading the checkpoint"), ("start", "initialization of the whole scene"), ("train", "training"),
-        ("write", "writing"), ("cache", "of it for photographs"),
-    ):  # fmt: skip
-        console.say(f"  {in_words(getattr(plan, name)):>8}  {what}")
-    return plan
+def in_words(count: float) -> str:
+    """``3.14 GB``, ``500 MB``, ``1234.5 GB``."""
+    return f"{round(count / 1e9, 2):g} GB" if count >= 1e9 else f"{count / 1e6:.0f} MB"
 
 
 def _bytes(gaussians: Gaussians) -> int:

@@ -56,9 +56,9 @@ def together(
     if launch.size == 1:
         yield None
         return
-    lean, config = plan.lean, plan.config
-    device, each = lean.means.device.type, f"{config.batch} views a step, {config.steps:,} steps"
-    job = (lean, scene.train, config, state, plan.subset, device)  # what ``adapt`` is given, and where it is
+    start, config = plan.start, plan.config
+    device, each = start.means.device.type, f"{config.batch} views a step, {config.steps:,} steps"
+    job = (start, scene.train, config, state, device)  # what ``adapt`` is given, and where it is
     display.console.say(f"{launch.size} processes ({BACKENDS[device]}): {each}")
     _store().set(CALL, "train")
     try:
@@ -67,7 +67,7 @@ def together(
         _use_threads(launch.local_size)
         with joined(_store(), launch.rank, launch.size) as group:
             group.broadcast(job)
-            del job, lean
+            del job, start
             yield group
     except ProcessLost as error:
         if display.stop.requests:
@@ -99,13 +99,13 @@ def take_part() -> None:
 
 def _train(group: ProcessGroup, launch: Launch, stop: GracefulStop) -> None:
     job: Any = group.broadcast(None)
-    base, views, config, state, subset, device = job
+    start, views, config, state, device = job
     if device == "cuda":  # one for each process on this machine
         if (gpus := torch.cuda.device_count()) < launch.local_size:
             raise ClodError(f"{launch.local_size} processes on a machine with {gpus} GPUs; start as many as there are")
         torch.cuda.set_device(launch.local_rank)
     scene = Scene(teachers_to(views, device), ())
-    adapt(base.to(device), scene, config, stop.heeding(), state, subset=subset, group=group)
+    adapt(start.to(device), scene, config, stop.heeding(), state, group=group)
 
 
 def explain(lost: str) -> str:

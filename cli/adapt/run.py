@@ -10,13 +10,13 @@ from typing import Any
 
 from clod_adapter._kernels.memory import release
 from clod_adapter._support.text import package_version
-from clod_adapter.adapter import Adapter, detach, extract, trim
+from clod_adapter.adapter import Adapter, detach, extract
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.evaluate import Row
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.adapter_file import save_adapter
-from clod_adapter.io.atomic import atomic_paths, remove_leftovers
-from clod_adapter.io.checkpoint import Checkpoint, save, trimmed
+from clod_adapter.io.atomic import atomic_paths
+from clod_adapter.io.checkpoint import save
 from clod_adapter.progress import GracefulStop, Progress
 from clod_adapter.training.plan import Plan
 from clod_adapter.training.state import Adapted
@@ -26,7 +26,6 @@ from ..shared.measure import by_dial, calibrate, machine, measure, report_dials,
 from ..shared.outputs import size, write_report
 from ..shared.pages import AdaptPage
 from ..shared.process import launched, listen_no_more
-from .blocks import adapt_in_blocks
 from .prepare import Run, against_forecast, decide, forecast
 from .processes import BACKENDS, explain, hurried, together
 
@@ -36,14 +35,13 @@ LOST, ENOUGH = (0.1, 1.0), (33.0, 25.0)
 
 @dataclass(frozen=True)
 class Result:
-    """What is written: ``gaussians``, which are ``adapter`` applied to ``base``, of which ``--trim`` keeps a part.
+    """What is written: ``gaussians``, which are ``adapter`` applied to the base.
 
     ``rows`` are of the dial, ``plain`` of a viewer that does not know it; some are missing if measuring was ``cut``.
     """
 
     plan: Plan
     adapted: Adapted
-    base: Checkpoint
     adapter: Adapter
     gaussians: Gaussians
     rows: Sequence[Row] = ()
@@ -56,11 +54,10 @@ def adapt(args: argparse.Namespace) -> dict[str, Any]:
     run = Run(args)
     run.read()
     page = AdaptPage(run.base.gaussians, run.scene, run.config, run.console) if args.report else None
-    if not run.in_blocks:
-        run.identify()
+    run.identify()
     run.measure_base()
     with run.stop.listening(), run.saver.rescuing():  # until training has ended, so that a Ctrl-C loses nothing
-        result = make_result(run, *(adapt_in_blocks(run) if run.in_blocks else train(run, page)))
+        result = make_result(run, *train(run, page))
     with run.saver.rescuing():
         return finish(run, result, page)
 
@@ -92,15 +89,12 @@ def make_result(run: Run, plan: Plan, adapted: Adapted) -> Result:
     """Extracts the adapter, and applies it to the base."""
     if hurried(adapted):
         listen_no_more()
-    gaussians, kept, degree = run.base.gaussians, None, None
-    if run.args.trim and plan.trims(gaussians):
-        kept, degree = plan.kept, plan.sh_degree
-    base = trimmed(run.base, kept, degree)
-    before, after = trim(gaussians, kept, degree), trim(adapted.gaussians, kept, degree)
-    adapter = extract(before, after, fingerprint=base.fingerprint, config=asdict(run.config), origin=base.origin)
-    adapter = replace(adapter, kept=kept, sh_degree=degree)
+    base, found = run.base, adapted.gaussians
+    adapter = extract(
+        base.gaussians, found, fingerprint=base.fingerprint, config=asdict(run.config), origin=base.origin
+    )
     note_training(run, adapted)
-    return Result(plan, adapted, base, adapter, adapter.apply(gaussians))
+    return Result(plan, adapted, adapter, adapter.apply(base.gaussians))
 
 
 def note_training(run: Run, adapted: Adapted) -> None:
@@ -109,10 +103,6 @@ def note_training(run: Run, adapted: Adapted) -> None:
         note(f"training ended at step {adapted.steps}: {explain(adapted.lost)}")
     if adapted.failed:
         note(f"training ended early, and the result so far is written: {adapted.failed}")
-    if adapted.watched and (times := adapted.watched.rollbacks):
-        what = "attributes were frozen in the end" if adapted.watched.frozen else "learning rates were halved"
-        back = f"training made s = 1 worse on watched views and returned to an earlier state {times} times"
-        note(f"{back}: {what}; the views watched are not trained on")
     if adapted.held:
         note(f"{adapted.held:,} Gaussians were not moved by some steps: their gradients were not finite")
 
@@ -127,9 +117,6 @@ def finish(run: Run, result: Result, page: AdaptPage | None) -> dict[str, Any]:
         report = write_result(run, result)
     complete = not interrupted and not result.cut
     run.saver.close(complete)
-    for path in outputs.blocks() if complete else ():
-        path.unlink(missing_ok=True)
-        remove_leftovers(path)
     if page and (result.cut or stop.requests):
         console.say("interrupted: the page of --report was not written")
     elif page:  # after the report, which it changes
@@ -167,7 +154,7 @@ def write_result(run: Run, result: Result) -> dict[str, Any]:
     outputs, console, adapter, gaussians = run.outputs, run.console, result.adapter, result.gaussians
     if result.rows and not result.cut:
         try:
-            found = calibrate(result.rows, gaussians, run.scene, run.teacher, result.base.origin)
+            found = calibrate(result.rows, gaussians, run.scene, run.teacher, run.base.origin)
             adapter = replace(adapter, calibration=found)
         except ClodError as error:
             console.say(f"the files have no calibration, so --fps and --psnr-drop will not work: {error}")
@@ -177,7 +164,7 @@ def write_result(run: Run, result: Result) -> dict[str, Any]:
         atomic_paths(outputs.adapter, outputs.ply, outputs.report) as (small, large, about),
     ):
         save_adapter(small, adapter)
-        save(large, gaussians, result.base, version=adapter.version, calibration=adapter.calibration)
+        save(large, gaussians, run.base, version=adapter.version, calibration=adapter.calibration)
         report["calibration"] = adapter.calibration and adapter.calibration.as_dict()
         report |= {"adapter_bytes": small.stat().st_size, "ply_bytes": large.stat().st_size}
         write_report(about, report)
@@ -208,8 +195,7 @@ def describe(run: Run, result: Result) -> dict[str, Any]:
         "alignment": run.alignment, "notes": run.console.notes, "base_rows": [row.as_dict() for row in run.base_rows],
         "rows": [row.as_dict() for row in result.rows],
         "detached_row": result.plain[0].as_dict() if result.plain else None,
-        "watched": adapted.watched and asdict(adapted.watched), "plan": result.plan.as_dict(),
-        "memory": run.memory and asdict(run.memory), "forecast": against_forecast(run),
+        "plan": result.plan.as_dict(), "forecast": against_forecast(run),
     }  # fmt: skip
     line, failed = ("", False) if report["interrupted"] else judge(run, result)
     failed = adapted.failed is not None or failed and not args.accept_loss

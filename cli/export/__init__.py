@@ -136,7 +136,7 @@ levels and order:
   --lod-meta, and --3dtiles for CesiumJS, make OUT a new folder with a set of
   levels. The finest is the checkpoint; each other one is baked for a band of
   distances M times as far as the one before, and the last one has at least 1 %
-  of the Gaussians. A viewer draws each part of a scene at the level of its band.
+  of the Gaussians. Viewers draw each part of a scene at the level of its band.
   --order extinction is for renderers that draw the first n rows: for any n
   these are the rows of --keep n. They pop where the dial fades.
 

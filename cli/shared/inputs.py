@@ -20,7 +20,7 @@ from clod_adapter.evaluation.evaluate import evaluate
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.checkpoint import Checkpoint, load
 from clod_adapter.io.scene.colmap import load_points
-from clod_adapter.io.scene.load import ImageCache, load_cameras, load_scene
+from clod_adapter.io.scene.load import load_cameras, load_scene
 from clod_adapter.io.values import Activated, dial_columns
 from clod_adapter.origin import Origin
 from clod_adapter.progress import Phase, Stopped
@@ -48,9 +48,9 @@ def read_checkpoint(
     return replace(checkpoint, gaussians=gaussians.to(device))
 
 
-def read_scene(folder: str, console: Console, origin: Origin, cache: ImageCache | None = None) -> Scene:
+def read_scene(folder: str, console: Console, origin: Origin) -> Scene:
     with console.meter(Phase.PHOTOGRAPHS) as meter:
-        scene = load_scene(folder, origin=origin, progress=meter, cache=cache)
+        scene = load_scene(folder, origin=origin, progress=meter)
     camera = scene.train[0].camera
     size = f"{camera.width}x{camera.height}"
     console.say(f"{folder}: {len(scene.train)} photographs to train on, {len(scene.test)} held out, {size}")

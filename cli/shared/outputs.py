@@ -9,7 +9,6 @@ import re
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
-from glob import escape
 from pathlib import Path
 from typing import Any
 
@@ -37,10 +36,6 @@ class AdaptFiles:
     def state(self) -> Path:
         """The state for ``--resume``; exists only until the run is finished."""
         return self.ply.with_suffix(".resume.safetensors")
-
-    def blocks(self) -> list[Path]:
-        """Existing files of an unfinished run in blocks (``adapt.blocks``)."""
-        return list(self.ply.parent.glob(f"{escape(self.ply.stem)}.block*.pass*.safetensors"))
 
 
 def check_ply_name(path: Path, option: str) -> None:

@@ -23,7 +23,6 @@ from clod_adapter.render import splat
 WIDEST = 4.0
 # Most views that are rendered: twice as many changed the trained result by 0.01 to 0.04 dB (docs/performance.md).
 MOST_VIEWS = 64
-SMALLER = 4  # downscaling of ``reduced``
 NEAREST = 0.05  # share of the views that may be nearer than where growth begins
 
 
@@ -149,8 +148,3 @@ def coverage(gaussians: Gaussians, opacities: Tensor, camera: Camera, growth: Te
     image, _ = splat(plain, opacities, camera, growth=growth)
     (gradient,) = torch.autograd.grad(image[..., 0].sum(), grey)
     return gradient[:, 0, 0] / SH_C0
-
-
-def reduced(camera: Camera) -> Camera:
-    """The same view with a SMALLER-th of the width and height, where shares of an image are as good."""
-    return camera.resized(*(max(size // SMALLER, 1) for size in (camera.width, camera.height)))

@@ -2,16 +2,11 @@
 
 Tensors: ``sigma_d`` float32, with growth also ``growth_d`` float32, and each update under the name of its attribute:
 float16 for a difference from the base, float32 for new values. Far Gaussians' attributes have names that begin with
-``far.``. Where the result has fewer rows than the base also
-``kept``, uint8: one bit per row of the base, the first row the highest bit. The JSON is stored under the metadata key
-``clod_adapter``, keys sorted: equal adapters give equal files.
+``far.``. The JSON is stored under the metadata key ``clod_adapter``, keys sorted: equal adapters give equal files.
 """
 
 from pathlib import Path
 from typing import Any
-
-import numpy as np
-import torch
 
 from clod_adapter.adapter import Adapter, dial_tensors
 from clod_adapter.config import CLASSIC
@@ -34,10 +29,6 @@ def save_adapter(path: str | Path, adapter: Adapter) -> None:
     tensors |= {ADDED + name: tensor for name, tensor in a.added.items()}
     settings = Metadata(a.attenuation, a.screen_filter, a.calibration, a.origin, version=a.version)
     about: dict[str, Any] = {"base_sha256": a.base_fingerprint, "config": a.config}
-    if a.kept is not None or a.sh_degree is not None:
-        about["trimmed"] = {"base_count": a.base_count, "sh_degree": a.sh_degree}
-    if a.kept is not None:
-        tensors["kept"] = torch.from_numpy(np.packbits(a.kept.cpu().numpy()))
     try:
         text = document(ADAPTER, settings, **about)
     except (TypeError, ValueError) as error:
@@ -58,12 +49,6 @@ def load_adapter(path: str | Path) -> Adapter:
     about, settings = _description(path, metadata)
     assert settings.attenuation is not None
     with refused_if_damaged(path, "its tensors or settings are damaged", DAMAGED[1]):
-        trimmed, kept = about.get("trimmed", {}), None
-        if "kept" in tensors:
-            packed, count = tensors.pop("kept"), trimmed["base_count"]
-            if len(packed) != -(-count // 8):
-                raise ValueError(f"kept has {len(packed)} bytes for {count} rows")
-            kept = torch.from_numpy(np.unpackbits(packed.numpy(), count=count).astype(bool))
         added = {name.removeprefix(ADDED): tensors.pop(name) for name in [*tensors] if name.startswith(ADDED)}
         return Adapter(
             added=added,
@@ -76,8 +61,6 @@ def load_adapter(path: str | Path) -> Adapter:
             version=settings.version,
             calibration=settings.calibration,
             origin=settings.origin,
-            kept=kept,
-            sh_degree=trimmed.get("sh_degree"),
             screen_filter=settings.screen_filter or CLASSIC,
             notes=settings.notes,
         )

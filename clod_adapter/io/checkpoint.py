@@ -2,16 +2,14 @@
 
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
-from clod_adapter.adapter import trim
 from clod_adapter.calibration import Calibration, Viewpoint
 from clod_adapter.cameras import Camera, with_near_planes
 from clod_adapter.config import AttenuationConfig
@@ -22,7 +20,7 @@ from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.hook import Hook
 from clod_adapter.io.file_formats import PLY, format_of, read_source, write
-from clod_adapter.io.ply_layout import PREFIX, column_map, write_rows
+from clod_adapter.io.ply_layout import PREFIX, write_rows
 from clod_adapter.io.settings import WARNING, Metadata, matching_calibration, stated_filter, tagged, that_fit
 from clod_adapter.io.values import SIGMA, Activated, prepared
 from clod_adapter.origin import NOWHERE, Origin
@@ -219,25 +217,3 @@ def save(
     writer = partial(write_rows, base=vertex) if format_of(path) is PLY else None
     for note in write(path, gaussians, metadata, writer=writer):
         warnings.warn(f"{path}: {note}", stacklevel=2)
-
-
-def trimmed(checkpoint: Checkpoint, kept: Tensor | None, sh_degree: int | None) -> Checkpoint:
-    """The checkpoint with the rows ``kept [N]`` and a lower SH degree, None for all; other columns are unchanged.
-
-    ``f_rest_*`` are numbered channel by channel, so with a lower degree values move between columns.
-    """
-    if kept is None and sh_degree is None:
-        return checkpoint
-    gaussians, vertex = trim(checkpoint.gaussians, kept, sh_degree), checkpoint.vertex
-    if vertex is None:
-        return replace(checkpoint, gaussians=gaussians)
-    vertex = vertex if kept is None else vertex[kept.cpu().numpy()]
-    before, after = (column_map(g.sh_degree)["shN"] for g in (checkpoint.gaussians, gaussians))
-    if before != after:
-        gone = set(before) - set(after)
-        fewer = np.empty(len(vertex), [(n, vertex.dtype[n]) for n in vertex.dtype.names or () if n not in gone])
-        source = dict(zip(after, before, strict=False))  # both list coefficient by coefficient
-        for name in fewer.dtype.names or ():
-            fewer[name] = vertex[source.get(name, name)]
-        vertex = fewer
-    return replace(checkpoint, gaussians=gaussians, vertex=vertex)

@@ -5,8 +5,8 @@ rows alone, and averages the last steps. The number of splats is fixed: densify 
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
@@ -23,37 +23,16 @@ from clod_adapter.gaussians import Gaussians, require_finite
 from clod_adapter.initialization.importance import MOST_VIEWS, for_training, initialize, usable_views
 from clod_adapter.integrations.splats import NAMES, from_gsplat
 from clod_adapter.progress import Listener, shown
+from clod_adapter.training.far import with_far
 from clod_adapter.training.optimizer import learning_rates, own_sizes
 from clod_adapter.training.schedule import FAR, OURS, Schedule, ViewSampler
-from clod_adapter.training.target_count import TargetShare, count_gradient, target_share
+from clod_adapter.training.target_count import count_gradient, target_share
 
 ATTRIBUTE_OF = {**NAMES, "features_dc": "sh0", "features_rest": "shN"}
 # Sigma stays where the equation still resolves it; below, a Gaussian would be culled for good.
 SIGMA_RANGE = (1e-4, SIGMA_MAX)
 
 Splats = Gaussians | Mapping[str, Tensor]
-
-
-@dataclass(frozen=True)
-class TrainableSubset:
-    """The trained Gaussians, where these are not the whole scene.
-
-    Attributes:
-        trained: number of trained rows, the first ones; the others are the context: drawn, but not trained.
-        full_context: draw the context without a dial, instead of at the dial value of the trained rows.
-        total: number of Gaussians that the target-count curve is a share of, where that is more than ``trained``
-            (``target_count.target_share``).
-        target: returns the count term's target at a dial value, in place of the target-count curve's.
-        cameras: the whole scene's, which typical distances are from. By default those of the views.
-        span: the shares of a whole training's schedule at which this training begins and ends.
-    """
-
-    trained: int
-    full_context: bool = False
-    total: int | None = None
-    target: Callable[[float], TargetShare] | None = None
-    cameras: Sequence[Camera] | None = None
-    span: tuple[float, float] = (0.0, 1.0)
 
 
 class Dial(nn.Module):
@@ -77,8 +56,7 @@ class Dial(nn.Module):
     limits: ClassVar[tuple[float, float]] = (math.log(SIGMA_RANGE[0]), math.log(SIGMA_RANGE[1]))
     schedule: Schedule = OURS
     weight_slope: ClassVar[float] = 0.25
-    measured: ClassVar[bool] = True  # by the plan, and by views that watch s = 1
-    initial = staticmethod(initialize)  # the Gaussians with the dial that training begins with
+    begin = staticmethod(with_far)  # the Gaussians that training begins with, with their dial
 
     typical: Tensor
     log_sigma: Tensor
@@ -87,24 +65,21 @@ class Dial(nn.Module):
 
         def __call__(self, camera: Camera, virtual_scale: float) -> Attenuated: ...
 
-    def __init__(
-        self, splats: Splats, start: Gaussians, cameras: Sequence[Camera], config: AdaptConfig,
-        subset: TrainableSubset | None = None,
-    ) -> None:  # fmt: skip
+    def __init__(self, splats: Splats, start: Gaussians, cameras: Sequence[Camera], config: AdaptConfig) -> None:
         super().__init__()
         assert start.sigma_d is not None and start.attenuation is not None
         self._given = (splats,)  # a ParameterDict that is an attribute would be a part of the module
-        self.part = subset or TrainableSubset(len(start))
+        # Far Gaussians come first: they alone are trained, and their target counts are shares of the near ones' number.
+        self.trained, self.total = len(start), len(start)
         self.attenuation, self.config = start.attenuation, config.for_views(len(cameras))
-        if start.near is not None:  # of which those that are left are a share of the near ones
+        if start.near is not None:
             self.schedule, config = FAR, replace(config, start_share=1.0)
-        curve = partial(target_share, count=self.part.trained, config=config, total=self.part.total)
-        self._target = self.part.target or curve
+            self.trained, self.total = len(start) - start.whole, start.whole
+        self._target = partial(target_share, count=self.trained, config=config, total=self.total)
         self.register_parameter(self.decay, nn.Parameter(self.parameter_of(start.sigma_d)))
         growth_d = start.growth_d
         self.growth_d = None if growth_d is None else nn.Parameter(growth_d.detach().float().clamp(*GROWTH_RANGE))
-        places = self.part.cameras or spread(cameras, MOST_VIEWS)
-        typical = typical_distance(start.means, places, start.attenuation)[: self.part.trained]
+        typical = typical_distance(start.means, spread(cameras, MOST_VIEWS), start.attenuation)[: self.trained]
         self.register_buffer("typical", typical, persistent=False)
         self._own_size = float(own_sizes(start.log_scales).median())
         self.sampler, self._sampled = ViewSampler((), config, self.schedule), 0
@@ -239,7 +214,7 @@ class Dial(nn.Module):
     @torch.no_grad()
     def clamp(self) -> None:
         """Keeps the parameters in their ranges."""
-        getattr(self, self.decay)[: self.part.trained].clamp_(*self.limits)
+        getattr(self, self.decay)[: self.trained].clamp_(*self.limits)
         if self.growth_d is not None:
             self.growth_d.clamp_(*GROWTH_RANGE)
 

@@ -17,47 +17,56 @@ from clod_adapter.cameras import View, spread
 from clod_adapter.config import AdaptConfig
 from clod_adapter.equation.distances import normalized_distances, typical_distance
 from clod_adapter.equation.units import in_world_units
+from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians, with_near
 from clod_adapter.initialization.importance import (
     MOST_VIEWS,
     WIDEST,
     extinction_from_rank,
     has_dial,
+    initialize,
     removal_error,
     scene_distance,
 )
 from clod_adapter.initialization.merging import merge
 from clod_adapter.initialization.pruning_order import pruning_order
 from clod_adapter.progress import Listener
+from clod_adapter.rasterizers import ALPHA_MAX
+from clod_adapter.training.pseudo_views import PseudoView
 
 SHARE = 0.4  # of the number of near Gaussians
 NEARER = 0.5  # share of the distances in all views that are below near_distance
 LONGER = 1.2  # times near_distance, the smallest reach
 SAMPLE = 20_000  # Gaussians whose distances tell near_distance
-
-
-def takes_over(base: Gaussians, config: AdaptConfig) -> bool:
-    """Whether training adds far Gaussians: for a dial of our form with a range, if the base has none yet."""
-    return config.form == "ours" and config.max_sv > 1 and not has_dial(base)
+WITHOUT_FAR = (
+    "the checkpoint's dial has no far Gaussians, as of a training loop or the paper's form; adapt a plain file"
+)
 
 
 def with_far(
-    base: Gaussians, views: Sequence[View], config: AdaptConfig, progress: Listener | None = None,
-    error: Tensor | None = None,
-) -> Gaussians:  # fmt: skip
+    base: Gaussians, views: Sequence[View], config: AdaptConfig, progress: Listener | None = None
+) -> Gaussians:
     """The base's Gaussians as near ones, and after them far ones with an initial reach; in world units.
 
     A far Gaussian ends where the number of those that matter more is the target count; its importance is measured as
-    ``importance.initialize`` does. ``error`` is ``removal_error`` of the base, where it is known.
+    ``importance.initialize`` does. Near and far Gaussians that the base already has are continued from.
+
+    Raises:
+        ClodError: the base has a dial without far Gaussians.
     """
+    if base.near is not None:
+        return initialize(base, views, config)
+    if has_dial(base):
+        raise ClodError(WITHOUT_FAR)
     views = spread(views, MOST_VIEWS)
     cameras = [view.camera for view in views]
     attenuation = config.attenuation(scene_distance(base, views))
     some = base.means[:: len(base) // SAMPLE + 1]
     distances = torch.cat([normalized_distances(some, camera, attenuation) for camera in cameras])
     near = float(distances.kthvalue(max(round(NEARER * len(distances)), 1)).values)
-    if error is None:
-        error = removal_error(base, views, seed=config.seed, progress=progress)
+    error = removal_error(base, views, seed=config.seed, progress=progress)
+    if all(isinstance(view, PseudoView) for view in views):  # placed cameras do not show everything
+        error = supposed_error(base, error)
     far = merge(base, error.sqrt() * base.opacities, max(round(SHARE * len(base)), 1), progress)
     error = removal_error(far, views, seed=config.seed, progress=progress)
     pruned = pruning_order(far, error.sqrt() * far.opacities, progress)
@@ -67,3 +76,17 @@ def with_far(
     growth_d = torch.zeros_like(reach) if config.growth == "on" else None
     attenuation = replace(attenuation, near_distance=near * attenuation.scene_distance)
     return in_world_units(with_near(base, far.replace(sigma_d=reach, growth_d=growth_d, attenuation=attenuation)))
+
+
+def supposed_error(gaussians: Gaussians, error: Tensor) -> Tensor:
+    """``[N]`` the error; of one that no view shows that of a shown one of equal ``opacity^2 area``, in the median.
+
+    Rasterizers clamp alpha, where it has no derivative: Gaussians that opaque count as shown.
+    """
+    shown = (error > 0) | (gaussians.opacities > ALPHA_MAX)
+    area = gaussians.log_scales.sum(1) - gaussians.log_scales.amin(1)
+    expected = gaussians.opacities.square() * (area - area.median()).clamp(-30, 30).exp()
+    measured = shown & (error > 0)
+    if not bool(measured.any()):
+        return error
+    return torch.where(shown, error, expected * (error[measured] / expected[measured]).median())

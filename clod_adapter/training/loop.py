@@ -3,7 +3,6 @@
 import math
 import signal
 import time
-from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from typing import Any, Literal
@@ -12,15 +11,12 @@ import torch
 
 from clod_adapter.cameras import Scene, View
 from clod_adapter.config import AdaptConfig
-from clod_adapter.equation.units import in_world_units, with_distance
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians, LossNotFinite, largest_colour
-from clod_adapter.initialization.importance import for_training, usable_views, with_growth
+from clod_adapter.initialization.importance import for_training, usable_views
 from clod_adapter.progress import GracefulStop, Listener, Phase, Progress, shown
-from clod_adapter.training.dial import TrainableSubset, require_trainable
+from clod_adapter.training.dial import require_trainable
 from clod_adapter.training.distributed import ProcessGroup, ProcessLost
-from clod_adapter.training.far import takes_over, with_far
-from clod_adapter.training.gate import CHECKS, split_views
 from clod_adapter.training.paper import form_of
 from clod_adapter.training.state import Adapted, StateRefused, TrainingState
 from clod_adapter.training.trainer import Trainer
@@ -37,7 +33,6 @@ def adapt(
     progress: Listener | Literal[False] | None = None,
     resume: TrainingState | None = None,
     *,
-    subset: TrainableSubset | None = None,
     group: ProcessGroup | None = None,
     **settings: Any,
 ) -> Adapted:
@@ -47,8 +42,8 @@ def adapt(
     to minimise ``w_s L_render(s)``, where L_render is ``losses.photometric_loss`` and ``w_s`` is ``Dial.weight``.
     ``target_count.count_gradient`` moves sigma_d so that the share of Gaussians kept at their typical distances follows
     the target-count curve. The result is the mean of the parameters over the last fifth of the steps, in world units.
-    Far Gaussians are added and trained, and those of the base stay as they are (``training/far.py``). A base that has a
-    dial is continued from, with what it has. ``AdaptConfig.paper`` gives CLoD-GS's own training.
+    Far Gaussians are added and trained, and those of the base stay as they are (``training/far.py``); a base that has
+    far Gaussians is continued from. ``AdaptConfig.paper`` gives CLoD-GS's own training.
 
     Training ends early, and returns the result so far with ``Adapted.interrupted``, in these cases. After the
     last one ``progress`` is called once more, with ``Progress.error``.
@@ -67,7 +62,6 @@ def adapt(
             default a progress bar, where stderr is a terminal or a notebook's; False for none.
         resume: ``Progress.state`` of an earlier call with the same base, views and config. With as many threads and
             processes the result has the same bits as an uninterrupted run. A time budget includes the earlier call.
-        subset: what is trained, if that is not all of ``base``, or ``base`` is not the whole scene.
         group: the processes that train together, given the same arguments except ``progress``. Each computes its
             share of a step's views. All have the same result: that of one process, except for rounding.
         settings: fields of ``AdaptConfig`` that replace those of ``config``: ``adapt(base, scene, max_sv=7)``.
@@ -79,19 +73,15 @@ def adapt(
         Stopped: ``progress`` returned False before training.
     """
     config = replace(config or AdaptConfig(), **settings)
-    far = subset is None and takes_over(base, config)
-    config = config.for_views(len(scene.train), far or base.near is not None)
+    config = config.for_views(len(scene.train))
     require_trainable(base, scene, config, group.size if group else 1)
     began = time.perf_counter()
     # Empty higher SH degrees that are not tuned stay empty, so they are not rendered.
     lean = base if config.lr_shN > 0 else base.without_empty_bands()
-    views, watched = training_views(lean, scene.train, config, far)
+    views = usable_views(lean, scene.train)
     with shown(False if progress is None and group and group.rank else progress) as listener:
-        if resume is None or far:  # merging again gives the same Gaussians
-            begun = _initialized(lean, views, config, listener, group, far)
-        else:
-            begun = _initialized_from(lean, resume, config)
-        trainer = Trainer(begun, views, config, subset, group, watched)
+        begun = _initialized(lean, views, config, listener, group)  # of a resumed run too: the same again
+        trainer = Trainer(begun, views, config, group)
         trainer.empty_sh = None if lean is base else base.shN.clone()
         trainer.start_seconds = time.perf_counter() - began
         if resume is not None:
@@ -103,58 +93,27 @@ def adapt(
         return _train(trainer, listener)
 
 
-def time_steps(
-    base: Gaussians, scene: Scene, config: AdaptConfig, steps: int, subset: TrainableSubset | None = None
-) -> tuple[float, float]:
+def time_steps(start: Gaussians, scene: Scene, config: AdaptConfig, steps: int) -> tuple[float, float]:
     """Seconds of a step of ``adapt``, as the mean of ``steps`` over the schedule, and of all beside the steps."""
     began = time.perf_counter()
-    views, watched = training_views(base, scene.train, config)
-    trainer = Trainer(_initialized(base, views, config), views, config, subset, None, watched)
+    views = usable_views(start, scene.train)
+    trainer = Trainer(_initialized(start, views, config), views, config)
     fixed = time.perf_counter() - began
     trainer.step(0.0)  # allocates memory
-    if trainer.gate:
-        began = time.perf_counter()
-        trainer.gate.finish()
-        fixed += (len(CHECKS) + 1) * (time.perf_counter() - began)
-        trainer.gate = None
     began = time.perf_counter()
     for k in range(steps):
         trainer.step((k + 0.5) / steps)
     return (time.perf_counter() - began) / steps, fixed
 
 
-def training_views(
-    base: Gaussians, views: Sequence[View], config: AdaptConfig, far: bool = False
-) -> tuple[tuple[View, ...], tuple[View, ...]]:
-    """The usable views to train on, and those that watch s = 1 (``gate.Gate``).
-
-    None watch the paper's objective, or near Gaussians, which do not change (``far``: those that base will be).
-    """
-    usable = usable_views(base, views)
-    watched = form_of(config).measured and base.near is None and not far
-    return split_views(usable) if watched else (usable, ())
-
-
 def _initialized(
     lean: Gaussians, views: tuple[View, ...], config: AdaptConfig, progress: Listener | None = None,
-    group: ProcessGroup | None = None, far: bool = False,
+    group: ProcessGroup | None = None,
 ) -> Gaussians:  # fmt: skip
-    """The Gaussians with the initial dial: of a group, which may round differently, the first process's."""
-    if far:
-        begun = for_training(with_far(lean, views, config, progress))
-        names = [*begun.tensors(), "attenuation"]  # merging, too, depends on rounding
-    else:
-        begun = for_training(form_of(config).initial(lean, views, config, progress))
-        names = ["sigma_d", "growth_d", "attenuation"]
-    found: Any = {name: getattr(begun, name) for name in names}
+    """What training begins with: of a group, which may round differently, the first process's."""
+    begun = for_training(form_of(config).begin(lean, views, config, progress))
+    found: Any = {name: getattr(begun, name) for name in (*begun.tensors(), "attenuation")}
     return begun.replace(**(group.broadcast(found) if group else found)).to(lean.means.device)
-
-
-def _initialized_from(lean: Gaussians, resume: TrainingState, config: AdaptConfig) -> Gaussians:
-    """The Gaussians with the dial of rows that are rendered only; the state has that of the trained rows."""
-    dialled = with_distance(in_world_units(lean), resume.attenuation.scene_distance)  # rounded as in the first call
-    sigma_d = torch.ones_like(lean.opacity_logits) if lean.sigma_d is None else dialled.sigma_d
-    return with_growth(lean.replace(sigma_d=sigma_d, attenuation=resume.attenuation), config, lean.growth_d)
 
 
 def _train(trainer: Trainer, progress: Listener | None) -> Adapted:
@@ -196,13 +155,12 @@ def _train(trainer: Trainer, progress: Listener | None) -> Adapted:
             going, failed = False, str(error)
             tell(failed)
         trainer.seconds = time.perf_counter() - began
-        seen = trainer.gate.finish() if trainer.gate and not lost else None
         waited = (group.waiting - before[0], group.exchanging - before[1]) if group else (0.0, 0.0)
         result = trainer.gaussians()
     signalled = stop.requests > 0
     return Adapted(
         result, trainer.done, trainer.seconds, trainer.start_seconds, not going or signalled, lost, *waited, failed,
-        int(trainer.held.sum()), signalled, seen,
+        int(trainer.held.sum()), signalled,
     )  # fmt: skip
 
 

@@ -58,11 +58,6 @@ class RowAdam:
         table = np.pad(np.stack(corrections), ((0, 0), (1, 0))).astype(np.float32)
         self._corrections = torch.from_numpy(table).to(some.device)
 
-    def forget(self) -> None:
-        """Sets all moments and counts of steps to 0."""
-        for tensor in (self.steps, *self.moments["first"].values(), *self.moments["second"].values()):
-            tensor.zero_()
-
     @torch.no_grad()
     def step(self, gradients: dict[str, Tensor], rows: Tensor, rates: dict[str, float]) -> None:
         """Steps all parameters, each at its rate, where ``rows`` (bool ``[N]``) is set.

@@ -34,13 +34,11 @@ class PaperDial(Dial):
     everywhere = frozenset({"opacity_logits"})
     schedule = PAPER
     weight_slope = 0.5
-    measured = False
 
     @staticmethod
-    def initial(
-        base: Gaussians, views: Sequence[View], config: AdaptConfig, progress: Listener | None = None,
-        error: Tensor | None = None,
-    ) -> Gaussians:  # fmt: skip
+    def begin(
+        base: Gaussians, views: Sequence[View], config: AdaptConfig, progress: Listener | None = None
+    ) -> Gaussians:
         """sigma_d = 1 in units of the largest distance in the frustum, no dial of its own; a dial it has is kept."""
         if has_dial(base):
             return initialize(base, views, config)
@@ -67,7 +65,6 @@ class PaperDial(Dial):
         assert shown.sigma_d is not None
         far = normalized_distances(shown.means, camera, self.attenuation).double() * virtual_scale
         count = soft_count(shown.opacity_logits, shown.sigma_d, far, virtual_scale, SOFTNESS)
-        count = count * (len(shown) / (self.part.total or len(shown)))
         excess = (count - virtual_scale**-self.config.exponent).clamp(min=0)
         return self.config.reg_weight * (virtual_scale - 1) ** 2 * excess**2
 

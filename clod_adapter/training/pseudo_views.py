@@ -12,7 +12,6 @@ import numpy as np
 import torch
 
 from clod_adapter.cameras import Camera, Scene, StoredView, View
-from clod_adapter.config import AdaptConfig
 from clod_adapter.equation.distances import median_distance
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
@@ -24,8 +23,6 @@ from clod_adapter.training.camera_placement import SAMPLE, place_cameras
 # most NEAR at each, from where they are moved WIDER; the others at placed cameras.
 MANY, ADDED, NEAR, WIDER = 64, 96, 4, 2.0
 TEST_EVERY = 8  # as with photographs
-# Of the learning rates of all but the dial, without photographs and with few: pseudo views show errors too.
-LIGHTEST, LIGHTER = 0.25, 0.5
 # Standard deviations of the random offset of a camera, of its distance to the scene, and of its direction, radians; and
 # the largest change of log focal length.
 MOVED, TURNED, ZOOMED = 0.1, 0.05, 0.15
@@ -72,8 +69,7 @@ def render_pseudo_views(gaussians: Gaussians, cameras: Sequence[Camera], *, prog
     """A scene of ``cameras`` with the checkpoint's own renderings as photographs; every 8th is held out.
 
     Those to train on are rendered when they are read, and training renders each from a camera near it instead
-    (``PseudoView.moved``); ``view.at(view.camera)`` stays where it is. ``clod-adapt`` also multiplies the learning
-    rates of all but the dial by LIGHTEST (``AdaptConfig.lighter``).
+    (``PseudoView.moved``); ``view.at(view.camera)`` stays where it is.
 
     Args:
         gaussians: the teacher, rendered at s = 1.
@@ -94,34 +90,32 @@ def render_pseudo_views(gaussians: Gaussians, cameras: Sequence[Camera], *, prog
     return Scene(train, tuple(test), (note,))
 
 
-def add_pseudo_views(
-    gaussians: Gaussians, scene: Scene, config: AdaptConfig, progress: Listener | None = None
-) -> tuple[Scene, AdaptConfig]:
-    """Adds ADDED pseudo views, and lowers all learning rates but the dial's, where there are few photographs.
+def add_pseudo_views(gaussians: Gaussians, scene: Scene, seed: int = 0, progress: Listener | None = None) -> Scene:
+    """Adds ADDED pseudo views where there are few photographs.
 
     They hold what the photographs do not show: fine-tuned on 33 photographs alone a checkpoint lost 0.8 dB on others.
     """
     photographs = scene.train
     if not 0 < len(photographs) < MANY:
-        return scene, config
+        return scene
     each = max(min(NEAR, ADDED // 2 // len(photographs)), 1)
     few = f"only {len(photographs)} photographs to train on"
     try:
         placed = place_cameras(
             gaussians,
             views=max(ADDED - each * len(photographs), ADDED // 2),
-            seed=config.seed,
+            seed=seed,
             field=_field(photographs[0].camera),
             progress=progress,
         )
     except ClodError as error:
         note = f"{few} may be too few, and no pseudo views can be added: {error}"
-        return replace(scene, notes=(*scene.notes, note)), config
+        return replace(scene, notes=(*scene.notes, note))
     teacher = gaussians.without_empty_bands()  # one for all: it may be a copy
     near = _views(teacher, [view.camera for view in photographs], wider=WIDER)
     own = (*each * near, *_views(teacher, placed))
-    note = f"{few}: {len(own)} pseudo views, the checkpoint's own renderings, are added, and learning rates are lower"
-    return replace(scene, train=(*photographs, *own), notes=(*scene.notes, note)), config.lighter(LIGHTER)
+    note = f"{few}: {len(own)} pseudo views, the checkpoint's own renderings, are added"
+    return replace(scene, train=(*photographs, *own), notes=(*scene.notes, note))
 
 
 def _views(

@@ -31,7 +31,6 @@ class TrainingState:
         tensors: by kind and name, as in ``parameter.means``: of each trained attribute its ``parameter``, Adam's
             ``first`` and ``second`` moment, and the ``mean`` if there is one. float32. ``steps.kept`` and ``steps.all``
             count Adam's steps of each row of parameters that move where the dial keeps the row, or always; int32.
-            ``good`` and ``gate.checks`` are the gate's.
         random, order: of ``schedule.ViewSampler``.
         loss: its running mean; averaged: the number of steps in the mean.
         steps, seconds: of training; start_seconds: before it.
@@ -64,25 +63,12 @@ class TrainingState:
                 sound = (values >= 0) & (values <= self.steps)
             elif kind == "second":
                 sound = values >= 0  # and not NaN
-            elif kind == "gate":
-                sound = values.isfinite() & (values >= values.new_tensor([-math.inf, 0, 0, -math.inf]))
             elif kind == "first":  # Adam's is at most 7.3 times the root of the second
                 sound = values.abs() <= 10 * self.tensors[f"second.{attribute}"].sqrt() + 1e-15
             else:  # an infinite opacity does not change
                 sound = values.isfinite() | (values == own[f"parameter.{attribute}"])
             if not bool(sound.all()):
                 raise StateRefused(f"the training state has impossible values of {name}; start over")
-
-
-@dataclass(frozen=True)
-class Watched:
-    """What the gate (``gate.Gate``) measured and did."""
-
-    views: int  # number of watched ones
-    trained_on: bool  # whether training used them too, as there are few
-    loss: float  # dB that s = 1 of the result is below the base there (``gate.decibels_below``)
-    rollbacks: int  # how often training returned to an earlier state, with half the learning rates
-    frozen: bool  # whether the attributes were frozen in the end
 
 
 @dataclass(frozen=True)
@@ -99,7 +85,6 @@ class Adapted:
         waiting, exchanging: seconds of this call spent waiting for and exchanging with other processes.
         held: the number of Gaussians that some step of this call did not move because their gradient was not finite.
         signalled: a Ctrl-C, or another signal with Python's own handler, arrived.
-        watched: the gate's measurement; None with the paper's objective, or if a process was lost.
     """
 
     gaussians: Gaussians
@@ -113,7 +98,6 @@ class Adapted:
     failed: str | None = None
     held: int = 0
     signalled: bool = False
-    watched: Watched | None = None
 
     def __repr__(self) -> str:
         ended = ", interrupted" if self.interrupted else ""

@@ -6,21 +6,18 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from clod_adapter._kernels.threads import torch_on_one_thread
-from clod_adapter.adapter import ATTRIBUTES, detach
-from clod_adapter.cameras import Camera, View
+from clod_adapter.adapter import ATTRIBUTES
+from clod_adapter.cameras import View
 from clod_adapter.config import AdaptConfig
 from clod_adapter.equation.units import in_world_units
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians, LossNotFinite, require_finite, spoilt_rows
 from clod_adapter.losses import photometric_loss
 from clod_adapter.rasterizers import for_device
-from clod_adapter.training.dial import TrainableSubset
 from clod_adapter.training.distributed import ProcessGroup
-from clod_adapter.training.gate import Gate
 from clod_adapter.training.optimizer import GradientSum, RowAdam, add_to_mean, learning_rates, own_sizes
 from clod_adapter.training.paper import form_of
 from clod_adapter.training.schedule import Sample
@@ -43,13 +40,11 @@ class Trainer:
     """
 
     def __init__(
-        self, start: Gaussians, views: tuple[View, ...], config: AdaptConfig, subset: TrainableSubset | None = None,
-        group: ProcessGroup | None = None, watched: tuple[View, ...] = (),
-    ) -> None:  # fmt: skip
+        self, start: Gaussians, views: tuple[View, ...], config: AdaptConfig, group: ProcessGroup | None = None
+    ) -> None:
         self.order: Tensor | None = None  # of the result's rows, where far ones come first in training
-        if start.near is not None and subset is None:
+        if start.near is not None:
             far_first = start.near.int().argsort(stable=True)
-            subset = TrainableSubset(len(start) - start.whole, total=start.whole)
             self.order, start = far_first.argsort(), start.select(far_first)
         form = form_of(config)
         self.rates = learning_rates(config, form.decay)
@@ -58,10 +53,10 @@ class Trainer:
         own: dict[str, Any] = {"dtype": torch.float32, "memory_format": torch.contiguous_format}
         attributes: Any = {name: getattr(start, name).detach().to(**own, copy=name in tuned) for name in ATTRIBUTES}
         splats = Gaussians(**attributes, screen_filter=start.screen_filter)
-        self.dial = form(splats, start, [view.camera for view in views], config, subset)
+        self.dial = form(splats, start, [view.camera for view in views], config)
         dials = {name: value.detach() for name, value in self.dial.named_parameters()}
         self.parameters, self.stepped = attributes | dials, (*tuned, *dials)
-        self.config, self.group, self.count = config, group, self.dial.part.trained
+        self.config, self.group, self.count = config, group, self.dial.trained
         self.sampler, self.screen_filter = self.dial.sampler, start.screen_filter
         self.sampler.views = views
         # Of culled Gaussians too the count term has a gradient.
@@ -77,7 +72,6 @@ class Trainer:
         self.averaged = 0
         self.held = torch.zeros(self.count, dtype=torch.bool, device=start.means.device)
         self._updating = False
-        self.gate = Gate(self, watched, bool(set(map(id, watched)) & set(map(id, views)))) if watched else None
 
     @torch_on_one_thread()
     def step(self, share_done: float, until: float = math.inf) -> None:
@@ -85,18 +79,15 @@ class Trainer:
 
         Nothing has changed after LossNotFinite, or an error of the rasterizer. A view is not begun after ``until``.
         """
-        if self.gate:
-            self.gate.check(share_done)
-        before, (begin, end) = self.sampler.state(), self.dial.part.span
-        whole = begin + share_done * (end - begin)
+        before = self.sampler.state()
         numbers = range(self.done * self.config.batch, (self.done + 1) * self.config.batch)
-        samples = [self.sampler.draw(number, whole) for number in numbers]
+        samples = [self.sampler.draw(number, share_done) for number in numbers]
         try:  # if it fails, the next step samples the same views again
             own = self.group.share(samples) if self.group else samples
             found = self.gradient_sum(own, until)
             found = self.group.sum(found) if self.group else found
             self._updating = True
-            self._update(found, whole)
+            self._update(found, share_done)
             loss = float(found.loss) / found.views  # the host waits for a GPU, as else only gsplat does
             if not math.isfinite(loss):
                 self._updating = False
@@ -106,8 +97,8 @@ class Trainer:
             self.sampler.restore(*before)
             raise
         self.loss = loss if math.isnan(self.loss) else 0.98 * self.loss + 0.02 * loss
-        # Of a part of the schedule, as of the whole. The optimizer continues from the parameters, not from the mean.
-        if whole >= end * (1 - self.dial.schedule.average):
+        # The optimizer continues from the parameters, not from the mean.
+        if share_done >= 1 - self.dial.schedule.average:
             self.averaged += 1
             add_to_mean(self.mean, self.trained(), self.averaged)
         self.done += 1
@@ -140,25 +131,10 @@ class Trainer:
             gradients[decay] = gradients[decay] + self.dial.count_gradient(parameter, at, weighted)
         return GradientSum(gradients, kept, plain)
 
-    def image(self, parameters: dict[str, Tensor] | None, camera: Camera, halved: bool) -> Tensor:
-        """The image ``[H, W, 3]`` of the parameters at s = 1, or of the present ones without a dial.
-
-        ``halved`` if the camera is for images of half the size.
-        """
-        shown = self._shown(self.parameters if parameters is None else parameters, halved)
-        shown = detach(shown) if parameters is None else shown
-        return for_device(shown.means.device).draw(shown, camera, 1.0, trained=self.count)[0]
-
-    def _shown(self, parameters: dict[str, Tensor], halved: bool = False) -> Gaussians:
+    def _shown(self, parameters: dict[str, Tensor], halved: bool) -> Gaussians:
         """Gaussians of these parameters, as they are drawn."""
         found = self._assembled(parameters)
-        found = found.replace(screen_filter=self.screen_filter.halved()) if halved else found
-        if not self.dial.part.full_context:
-            return found
-        assert found.sigma_d is not None
-        context = (0, len(found) - self.count)
-        growth_d = None if found.growth_d is None else F.pad(found.growth_d[: self.count], context)
-        return found.replace(sigma_d=F.pad(found.sigma_d[: self.count], context, value=math.inf), growth_d=growth_d)
+        return found.replace(screen_filter=self.screen_filter.halved()) if halved else found
 
     def _update(self, found: GradientSum, share_done: float) -> None:
         """Moves the rows whose gradients are finite; none if the loss is not, without asking which."""
@@ -166,7 +142,6 @@ class Trainer:
         self.held |= learned & spoilt
         finite = spoilt.logical_not_().logical_and_(learned)
         rates = {name: rate * self.dial.schedule.lr_final**share_done for name, rate in self.rates.items()}
-        rates = self.gate.weaken(rates) if self.gate else rates
         moved = {"kept": found.kept.logical_and_(finite), "all": finite}
         for rows, optimizer in self.optimizers.items():
             optimizer.step(found.gradients, moved[rows], rates)
@@ -220,14 +195,6 @@ class Trainer:
         """Views of the rows of the parameters that steps change."""
         return {name: self.parameters[name][: self.count] for name in self.stepped}
 
-    def return_to(self, trained: dict[str, Tensor]) -> None:
-        """Continues from these values of the trained rows, without moments and mean."""
-        for name, own in self.trained().items():
-            own.copy_(trained[name])
-        for optimizer in self.optimizers.values():
-            optimizer.forget()
-        self.mean, self.averaged = {}, 0
-
     def _changing(self) -> dict[str, Tensor]:
         """All tensors that steps change, named as in ``TrainingState``."""
         found = {f"parameter.{name}": value for name, value in self.trained().items()}
@@ -236,7 +203,4 @@ class Trainer:
                 found |= {f"{kind}.{name}": value for name, value in values.items()}
             found[f"steps.{rows}"] = optimizer.steps
         found |= {f"mean.{name}": value for name, value in self.mean.items()}
-        if self.gate:
-            found |= {f"good.{name}": value for name, value in self.gate.good.items()}
-            found["gate.checks"] = self.gate.numbers
         return found

@@ -71,7 +71,6 @@ def given(folder: Path, existing: str) -> Iterator[None]:
 
 TINY = "--images scene --iters 2 --max-sv 2"
 ADAPTED = f"base.ply {TINY} --report -o out/dial.ply"
-BLOCKS = f"{TINY} --memory 8GB -o x.ply"
 EVAL = "eval dial.ply --images nerf --base base.ply --against base.ply --report page.html"
 RENDER = "render dial.ply --images scene -o out"
 EXPORT = "export dial.ply --images scene -o"
@@ -91,8 +90,6 @@ ERRORS = [
     ("base.ply --images scene --with quats --without sh0 quats", "--with and --without both name quats"),
     ("base.ply --images scene --out nowhere/x.ply", "nowhere/x.ply: folder nowhere does not exist; create"),
     ("base.ply --images scene --out x.compressed.ply", "x.compressed.ply: is written by clod-adapt export alone"),
-    ("base.ply --images scene --memory 8", "--memory is '8'; give a number and its unit, as in 8GB"),
-    ("base.ply --images scene --memory 100MB", "--memory is 100 MB, and 300 Gaussians take at least"),
     ("eval base.ply --images scene --against base.ply base.ply", "base.ply: is given twice"),
     ("eval base.ply --images scene --base dial.ply", "has a dial; give --base the checkpoint.* --against$"),
     ("eval base.ply --images scene --sv=-0.5 --json", "--sv has -0.5, it must be at least 0"),
@@ -128,7 +125,6 @@ ERRORS = [
     (ADAPTED, rf"out/dial.ply: {INPUT} \(base.ply\), which is never overwritten", "out/dial.ply~base.ply"),
     (ADAPTED, rf"out/dial.safetensors: {INPUT} \(scene", "out/dial.safetensors>scene/images/004.png"),
     ("base.ply --images nerf --max-sv 2 -o nerf/transforms.ply", f"nerf/transforms.json: {INPUT}, which"),
-    (f"dial.ply {BLOCKS}", f"x.block1.pass1.safetensors: {INPUT}", "x.block1.pass1.safetensors>dial.ply"),
     (EVAL, rf"page.html: {INPUT} \(nerf", "page.html~nerf/masks/003.png"),
     (RENDER, rf"out/008.png: {INPUT} \(scene", "out/008.png>scene/images/000.png"),
     (f"{EXPORT} x.ply --levels 1,2", rf"x_s2.ply: {INPUT} \(scene", "x_s2.ply~scene/images/000.png"),
@@ -141,7 +137,6 @@ ERRORS = [
     (f"base.ply {TINY} -o out.ply", f"out.json: {FOREIGN}", "out.json"),
     (f"base.ply {TINY} --report -o out.ply", f"out_rendering.png: {FOREIGN}", "out_rendering.png"),
     (f"base.ply {TINY}", f"base_clod.ply: {FOREIGN}", "base_clod.ply"),
-    (f"base.ply {BLOCKS}", f"x.block1.pass1.safetensors: {FOREIGN}", "x.block1.pass1.safetensors"),
     (f"{EXPORT} x.spz --levels 1,2", f"x_s1.spz: {FOREIGN}", "x_s1.spz"),
     ("export dial.ply -o nerf --3dtiles", "nerf: is a folder that is not empty"),
     (ROBUSTNESS, f"out/cells/base_sv2.safetensors: {FOREIGN}", "out/cells/base_sv2.safetensors"),

@@ -116,8 +116,8 @@ def test_demo(clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.Monke
 
     monkeypatch.setattr(gallery, "unpack", unpack)  # the tests' own capture, a few steps, and empty pictures
     monkeypatch.setattr(gallery, "draw", lambda *given: [path.write_bytes(b"") for path in given[-1].values()])
-    monkeypatch.setattr(config, "FAR_STEPS", 2)
-    monkeypatch.setattr(config, "FAR_STEPS_PER_VIEW", 0)
+    monkeypatch.setattr(config, "STEPS", 2)
+    monkeypatch.setattr(config, "STEPS_PER_VIEW", 0)
     monkeypatch.setattr(adapt_run, "LOST", (99.0, 99.0))  # two steps cannot keep full quality
     folder, state = tmp_path / "-odd", Path("-odd/gallery.resume.safetensors")
     with monkeypatch.context() as patch:

@@ -9,10 +9,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from plyfile import PlyElement
 
-from clod_adapter.adapter import trim
 from clod_adapter.config import SH_COUNTS, AttenuationConfig
 from clod_adapter.errors import ClodError
-from clod_adapter.io.checkpoint import Checkpoint, load, save, trimmed
+from clod_adapter.io.checkpoint import Checkpoint, load, save
 from formats import model, needed, random_rows, write_elements, write_rows
 
 CONFIG = AttenuationConfig(form="paper", max_sv=7.0)
@@ -156,22 +155,6 @@ def test_refused_saves(tmp_path: Path) -> None:
     with pytest.raises(ClodError, match="out.ply: there are no Gaussians"):
         save(out, g.select(torch.zeros(3, dtype=torch.bool)))
     assert list(tmp_path.iterdir()) == [tmp_path / "in.ply"]
-
-
-@pytest.mark.parametrize(("rows", "degree"), [(None, 1), ([1, 4, 8], 0)])
-def test_trimmed_checkpoint_keeps_its_other_columns(tmp_path: Path, rows: list[int] | None, degree: int | None) -> None:
-    table = random_rows(9, ["label", *reversed(needed(2))], types={"label": "u1"})
-    checkpoint = load(write_rows(tmp_path / "a.ply", table))
-    kept = None if rows is None else torch.isin(torch.arange(9), torch.tensor(rows))
-    less = trimmed(checkpoint, kept, degree)
-    save(tmp_path / "less.ply", less.gaussians, less)
-    found = load(tmp_path / "less.ply")
-    assert found.gaussians == trim(checkpoint.gaussians, kept, degree)
-    assert found.vertex["label"].tolist() == checkpoint.vertex["label"][rows or slice(None)].tolist()
-    names = [name for name in checkpoint.vertex.dtype.names if name in found.vertex.dtype.names]
-    assert list(found.vertex.dtype.names) == names  # in the order of the file
-    assert less.fingerprint == checkpoint.fingerprint
-    assert trimmed(checkpoint, None, None) is checkpoint
 
 
 def test_other_formats_keep_what_the_base_says(tmp_path: Path) -> None:

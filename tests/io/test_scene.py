@@ -6,8 +6,6 @@ import os
 import shutil
 import sys
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +17,11 @@ from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 from skimage.metrics import peak_signal_noise_ratio as psnr_of
 
-from clod_adapter.cameras import StoredView, View
+from clod_adapter.cameras import View
 from clod_adapter.errors import ClodError
 from clod_adapter.io.scene import colmap
 from clod_adapter.io.scene.folder import scene_files
-from clod_adapter.io.scene.load import ImageCache, load_cameras, load_scene
+from clod_adapter.io.scene.load import load_cameras, load_scene
 from clod_adapter.progress import Stopped
 from photographs import LENSES, SIZE, camera, model_of, pixels, seen, write_scene
 
@@ -290,32 +288,3 @@ def test_files_of_a_colmap_scene(tmp_path: Path) -> None:
     (tmp_path / "masks").mkdir()
     (tmp_path / "masks" / "a.png").write_bytes(b"")
     assert {"cam/sub/001.png", "cam_2/sub/001.png", "masks/a.png"} <= there(tmp_path)
-
-
-def test_cached_scene_equals_the_scene(capture: Any, tmp_path: Path) -> None:
-    """The most recently used photographs are kept, as many as fit."""
-    shutil.copytree(capture.scene, tmp_path / "scene")
-    size, whole = 64 * 48 * 3, load_scene(capture.scene)
-    cache = ImageCache(2 * size + size // 2)
-    stored = load_scene(tmp_path / "scene", cache=cache)
-    assert stored.notes == whole.notes
-    for one, other in zip((*whole.train, *whole.test), (*stored.train, *stored.test), strict=True):
-        assert isinstance(other, StoredView) and one.camera.name == other.camera.name
-        moved = other.at(replace(other.camera, near=0.5))
-        assert torch.equal(moved.image, one.image) and moved.camera.near == 0.5
-
-    def same(k: int) -> bool:
-        return torch.equal(stored.train[k].image, whole.train[k].image)
-
-    reads = []
-    for k in (2, 3, 2, 0, 2, 3, 1):  # 0 takes the place of 3, 3 that of 0, and 1 that of 2
-        before = cache.reads
-        assert same(k) and cache.held == 2 * size
-        reads.append(cache.reads - before)
-    assert reads == [1, 1, 0, 1, 0, 1, 1]
-    with ThreadPoolExecutor(8) as pool:
-        assert all(pool.map(same, [k % 4 for k in range(400)])) and cache.held == 2 * size
-    for path in (tmp_path / "scene" / "images").iterdir():
-        Image.new("RGB", (32, 24)).save(path)
-    with pytest.raises(ClodError, match=r"view '006.png': image must be uint8 of shape \(48, 64, 3\)"):
-        _ = stored.train[5].image

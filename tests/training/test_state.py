@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 import clod_adapter as clod
-from clod_adapter import AdaptConfig, AttenuationConfig, Gaussians, Scene, TrainableSubset, View, adapt, evaluate
+from clod_adapter import AdaptConfig, AttenuationConfig, Gaussians, Scene, View, adapt, evaluate
 from clod_adapter.adapter import ATTRIBUTES, with_dial
 from clod_adapter.cameras import in_its_unit
 from clod_adapter.equation.distances import typical_distance
@@ -58,21 +58,6 @@ def test_a_resumed_run_ends_with_the_same_bits(captured: Pair, form: str) -> Non
         assert again.seconds > state.seconds
     done = [p.done for p in seen if p.phase == Phase.TRAINING]
     assert done[:11] == list(range(2, 13))
-
-
-@pytest.mark.parametrize("distance", [1.0, 4.0])
-def test_untrained_rows_keep_their_units_when_resumed(captured: Pair, distance: float) -> None:
-    """Their dial is not in the state, but the base's, sigma_d in its unit, growth 0 where it has none."""
-    base, scene = captured
-    settings = AttenuationConfig(scene_distance=distance, reference_distance=4.0)
-    growth_d = torch.linspace(-0.5, 1, len(base)) if distance == 1 else None
-    base = with_dial(base, torch.linspace(0.3, 3, len(base)) * 4 / distance, settings, growth_d)
-    part, states = TrainableSubset(len(base) // 2), dict[int, TrainingState]()
-    whole = adapt(base, scene, config_of(iters=4), states_of({2}, states), subset=part)
-    again = adapt(base, scene, config_of(iters=4), None, states[2], subset=part)
-    assert_equal(again.gaussians, whole.gaussians)
-    rest = slice(len(base) // 2, None)
-    torch.testing.assert_close(whole.gaussians.sigma_d[rest], base.sigma_d[rest] * distance)
 
 
 @pytest.fixture(autouse=True)

@@ -7,14 +7,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from clod_adapter import AttenuationConfig, View
+from clod_adapter import View
 from clod_adapter.config import AdaptConfig
-from clod_adapter.training.dial import TrainableSubset
 from clod_adapter.training.optimizer import RowAdam
-from clod_adapter.training.paper import PaperDial
 from clod_adapter.training.schedule import OURS, PAPER, Schedule, ViewSampler
 from clod_adapter.training.target_count import SHARPNESS, count_gradient, count_slope, target_curve, target_share
-from scenes import camera, capture, gaussians
+from scenes import capture
 
 VIEWS = capture(n=20)[1].train
 
@@ -99,27 +97,13 @@ def test_count_slope_is_that_of_a_soft_count() -> None:
     assert (count_slope(d, 0 * d) == 0).all()
 
 
-def papers_gradient(count: int, total: int | None, s: float) -> Tensor:
-    """Of the opacities, by the paper's count term; those beyond 40 are culled."""
-    some = gaussians(65, 0, 0).replace(sigma_d=torch.ones(65), attenuation=AttenuationConfig(form="paper"))
-    some.opacity_logits[40:] = -40.0
-    some.means[40:] = some.means[0]  # so that the largest distance is one of the others'
-    shown = some.select(torch.arange(count)).replace(opacity_logits=some.opacity_logits[:count].requires_grad_())
-    dial = PaperDial(shown, shown, [camera()], AdaptConfig.paper(), TrainableSubset(count, total=total))
-    dial.objective(torch.zeros(()), shown, camera(), s).backward()
-    return shown.opacity_logits.grad[:40]
-
-
-@pytest.mark.parametrize("form", ["ours", "paper"])
-def test_shares_count_gaussians_that_are_left_out(form: str) -> None:
+def test_shares_are_of_all_gaussians() -> None:
+    """Where far ones alone are counted: as if the others, which are culled, were counted too."""
     (log_sigma, d), found, s = some(), [], 3.0
     log_sigma[40:65] = -9.2
     for count, total in ((65, None), (40, 65)):
-        if form == "paper":
-            found.append(papers_gradient(count, total, s))
-        else:
-            given = d[:count], log_sigma[:count].exp(), s, 0.3, CONFIG
-            found.append(count_gradient(*given, target_share(s, count, CONFIG, total))[:40])
+        given = d[:count], log_sigma[:count].exp(), s, 0.3, CONFIG
+        found.append(count_gradient(*given, target_share(s, count, CONFIG, total))[:40])
     assert found[0].abs().max() > 0 and torch.allclose(*found, rtol=1e-5, atol=0)
 
 

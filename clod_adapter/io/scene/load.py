@@ -1,8 +1,7 @@
 """Reads posed photographs, or their cameras alone, from a COLMAP model or a transforms file."""
 
-import threading
 import warnings
-from collections import Counter, OrderedDict
+from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from functools import partial
@@ -11,10 +10,9 @@ from pathlib import Path
 import numpy as np
 import torch
 from PIL import Image
-from torch import Tensor
 
 from clod_adapter._support.workers import in_order
-from clod_adapter.cameras import Camera, Scene, StoredView, View, in_its_unit, spread, with_near_planes
+from clod_adapter.cameras import Camera, Scene, View, in_its_unit, spread, with_near_planes
 from clod_adapter.errors import ClodError
 from clod_adapter.io.scene.colmap import TEST_EVERY, PosedImage, held_out, read_colmap
 from clod_adapter.io.scene.folder import find_cameras, find_photographs
@@ -27,38 +25,6 @@ MOST_AT_ONCE = 8  # photographs of full size in memory
 Load = Callable[[], tuple[View, list[Note]]]
 
 
-class ImageCache:
-    """Pixels of photographs, least recently used dropped first, of at most ``limit`` bytes in total."""
-
-    def __init__(self, limit: int) -> None:
-        self.limit, self.held, self.reads = limit, 0, 0  # bytes, those in memory now, and photographs read again
-        self._images: OrderedDict[Callable[[], Tensor], Tensor] = OrderedDict()
-        self._lock = threading.Lock()
-
-    def store(self, view: View, read: Callable[[], Tensor]) -> View:
-        """The view without its pixels, which are kept while there is room and else come from ``read``."""
-        self._keep(read, view.image)
-        return StoredView(view.camera, partial(self._look, read))
-
-    def _look(self, read: Callable[[], Tensor]) -> Tensor:
-        with self._lock:
-            if (image := self._images.get(read)) is not None:
-                self._images.move_to_end(read)
-                return image
-            self.reads += 1
-        image = read()
-        self._keep(read, image)
-        return image
-
-    def _keep(self, read: Callable[[], Tensor], image: Tensor) -> None:
-        with self._lock:
-            if read not in self._images and image.nbytes <= self.limit:
-                self._images[read] = image
-                self.held += image.nbytes
-            while self.held > self.limit:
-                self.held -= self._images.popitem(last=False)[1].nbytes
-
-
 @torch.inference_mode(False)  # training takes no inference tensors
 def load_scene(
     folder: str | Path,
@@ -68,7 +34,6 @@ def load_scene(
     most: int | None = None,
     origin: Sequence[float] = NOWHERE,
     progress: Listener | None = None,
-    cache: ImageCache | None = None,
 ) -> Scene:
     """Reads posed photographs: a COLMAP model (binary or text, any version) or a transforms.json, and its images.
 
@@ -95,7 +60,6 @@ def load_scene(
         most: reads at most so many photographs, evenly spread.
         origin: ``[3]`` what the cameras' world is to be relative to, in its units: ``Checkpoint.origin``.
         progress: called in ``Phase.PHOTOGRAPHS`` after each image.
-        cache: keeps the photographs, where not all are to be in memory; they are then read again when looked at.
 
     Raises:
         ClodError: no usable cameras; images that are damaged, of another shape than their camera, or named outside
@@ -118,7 +82,7 @@ def load_scene(
     pinholes = all(image.is_pinhole for image, _ in chosen)
     undistorted = None if pinholes else cache_folder(folder)
     loads = [partial(_load_view, image.relative_to(origin), path, undistorted, max_width) for image, path in chosen]
-    views, done = _load(loads, progress, cache)
+    views, done = _load(loads, progress)
     train = tuple(view for view in views if view.camera.name not in testing)
     test = tuple(view for view in views if view.camera.name in testing)
     left_out = list[tuple[str, str]]()
@@ -159,24 +123,18 @@ def _posed(folder: Path) -> tuple[Path, list[PosedImage], list[str]]:
     return cameras, images, notes + more
 
 
-def _load(loads: Sequence[Load], progress: Listener | None, keep: ImageCache | None) -> tuple[list[View], list[Note]]:
+def _load(loads: Sequence[Load], progress: Listener | None) -> tuple[list[View], list[Note]]:
     """The views of the images, and notes. Each worker holds one photograph of full size at a time."""
     views, notes = list[View](), list[Note]()
     workers = min(MOST_AT_ONCE, max(2, torch.get_num_threads()))
     with warnings.catch_warnings(), closing(in_order(loads, workers)) as found:
         # Large, but below the size at which it is refused: photographs are no attack.
         warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-        for (view, remarks), load in zip(found, loads, strict=True):
-            views.append(keep.store(view, partial(_again, load)) if keep else view)
+        for view, remarks in found:
+            views.append(view)
             notes += remarks
             tell(progress, Phase.PHOTOGRAPHS, len(views), len(loads))
     return views, notes
-
-
-def _again(load: Load) -> Tensor:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-        return load()[0].image
 
 
 def _summary(notes: Sequence[Note], total: int) -> list[str]:

@@ -115,7 +115,7 @@ def test_adapt(clod: Any, tmp_path: Path) -> None:
         assert len(set(psnr)) == 5 and psnr[-1] == rows[dial]["psnr"]  # each of its own time
     trained = report["seconds"]["start"] + report["seconds"]["train"]
     assert curves[0]["points"][-1]["seconds"] == pytest.approx(trained, abs=0.05)
-    assert "change no pixel of" in text and "base.ply, a trained splat of 300 Gaussians" in text
+    assert "take over in the distance" in text and "base.ply, a trained splat of 300 Gaussians" in text
     assert text.count("<svg") == 4
     assert text.count('data-name=""') == pages.FRAMES and text.count('data-name="base"') == 1
 
