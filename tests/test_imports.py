@@ -25,7 +25,7 @@ ORDER: list[set[str]] = [
     {"equation"},
     {"hook", "progress", "rasterizers"},
     {"adapter", "integrations", "render"},
-    {"bake", "initialization"},
+    {"bake", "harmonics", "initialization"},
     {"io.atomic", "io.settings"},
     {"io.file_formats", "io.values"},
     {"io.ply_layout", "io.ply_packed", "io.scene", "io.tensor_file"},
@@ -33,7 +33,7 @@ ORDER: list[set[str]] = [
     {"io.checkpoint", "io.formats"},
     {"io.adapter_file"},
     {"alignment", "report", "training", "viewer"},
-    {"blocks", "evaluation", "inspection", "nerfstudio"},
+    {"evaluation", "inspection", "nerfstudio"},
     {"demo"},
     {""},  # the package itself, whose __init__ re-exports from the rows above
     {"cli.shared"},

@@ -46,6 +46,8 @@ def add_arguments(parser: ArgumentParser) -> None:
         sets.add_argument(option, dest="folder", action="store_const", const=option, help=text)
     text = "ratio of the distances at which two levels begin, as set in the viewer"
     output.add_argument("--multiplier", metavar="M", type=float, default=MULTIPLIER, help=f"{text} (default: 3)")
+    text = "fit the view-dependent colours to this SH degree, 0 to 3: most of a file's bytes"
+    output.add_argument("--sh-degree", metavar="N", type=int, choices=range(4), help=text)
     output.add_argument("--order", choices=["extinction"], help="put first the Gaussians that are culled last")
     output.add_argument("--exact", action="store_true", help="an .html page with float32 values: eight times the size")
     common.add_device(output, "time frames for --fps with --images")
@@ -65,8 +67,8 @@ def check(args: Namespace) -> None:
          f"a {PAGE} page contains the whole dial; remove --levels, --camera and --order"),
         (args.camera is not None and not bakes, "--camera needs a dial value to bake; give one, as in --sv 2"),
         (args.exact and not page, f"--exact is for {PAGE} pages; another format has its own precision: remove it"),
-        (args.images is not None and not (bakes or args.order or page),
-         f"--images is used for baking, --order and {PAGE} only; add one of them, as in --sv 2"),
+        (args.images is not None and not (bakes or args.order or page or args.sh_degree is not None),
+         f"--images is used for baking, --sh-degree, --order and {PAGE} only; add one of them, as in --sv 2"),
         (folder and out.suffix.lower() in (".json", *FORMATS),
          f"{out}: with {folder}, --out names the folder for {FOLDERS.get(folder)}, not a file"),
         (folder and out.exists() and not out.is_dir(),
@@ -139,6 +141,11 @@ levels and order:
   of the Gaussians. Viewers draw each part of a scene at the level of its band.
   --order extinction is for renderers that draw the first n rows: for any n
   these are the rows of --keep n. They pop where the dial fades.
+
+SH degree:
+  --sh-degree 1 saves 144 of 248 bytes for each Gaussian of degree 3 in a .ply.
+  The degrees that remain are fitted to the colours that the cameras see, by
+  least squares; a note has the PSNR against the file as it was.
 
 other tools:
   SIBR reads a baked .ply of SH degree 1 to 3, and takes the degree from

@@ -2,6 +2,7 @@
 
 from argparse import Namespace
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from statistics import fmean
 from tempfile import TemporaryDirectory
@@ -12,6 +13,7 @@ from clod_adapter.calibration import Viewpoint
 from clod_adapter.cameras import Camera, spread
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
+from clod_adapter.harmonics import with_sh_degree
 from clod_adapter.inspection.report import extra_columns
 from clod_adapter.io.atomic import atomic_path, atomic_paths
 from clod_adapter.io.file_formats import WRITABLE, write
@@ -83,9 +85,11 @@ class Export:
         device = inputs.pick_device(args.device, self.console) if times else inputs.CPU
         read = inputs.read_checkpoint(args.model, self.console, args.activated, device=device)
         self.model = inputs.with_filter(read, args, self.console)
-        self.cameras, self.about = self._find_cameras()  # to bake for, none where nothing is; and in printable ASCII
+        self.cameras, self.about = self._find_cameras()  # to bake or fit for, none where nothing is; in printable ASCII
         reads = self.page and args.images is not None  # cameras of the scene, for a page
         self.views = inputs.read_cameras(self.model, args.images, self.console) if reads else []
+        if args.sh_degree is not None:
+            self._reduce_sh_degree(args.sh_degree)
         self.gaussians = self.model.gaussians  # sorted with --order
         if args.order:
             self.gaussians = self.gaussians.select(order_by_extinction(self.gaussians, self.cameras))
@@ -101,7 +105,7 @@ class Export:
         """The cameras of --camera, --images or the model's file, else placed ones; and what they are."""
         args, model = self.args, self.model
         counts = given_budget(args) and not (self.page and args.psnr_drop)
-        if not (args.order or args.levels or counts or (args.sv and not self.page)):
+        if not (args.order or args.levels or counts or args.sh_degree is not None or (args.sv and not self.page)):
             return (), ""
         if args.images is not None:
             cameras = inputs.read_cameras(model, args.images, self.console, training=args.camera is None)
@@ -123,6 +127,25 @@ class Export:
         placed = f"baked for {len(cameras)} placed ones; --images gives a better result"
         self.console.note(f"{model.path} stores no cameras: {placed}")
         return cameras, f"{len(cameras)} placed cameras"
+
+    def _reduce_sh_degree(self, sh_degree: int) -> None:
+        """Replaces the model's Gaussians, with a note on what that changes."""
+        before, cameras = self.model.gaussians, self.cameras
+        after = with_sh_degree(before, sh_degree, cameras)
+        if after is before:
+            self.console.note(f"--sh-degree {sh_degree}: the file has degree {before.sh_degree}, and stays as it is")
+            return
+        inputs.prepare_kernels(self.console, before.means.device, training=False)
+        found = self._agreement(after, before)
+        about = f"--sh-degree {sh_degree}: renders have a PSNR of {found:.1f} dB against those with degree"
+        self.console.note(f"{about} {before.sh_degree} (fitted to {self.about})")
+        self.model = replace(self.model, gaussians=after, vertex=None)
+
+    def _agreement(self, shown: Gaussians, exact: Gaussians) -> float:
+        """PSNR in dB of renders of the first against those of the second, in the mean over COMPARED views."""
+        known = self.views or [camera for camera in self.cameras if isinstance(camera, Camera)]
+        views = spread(known or self.model.cameras or place_cameras(exact, views=COMPARED), COMPARED)
+        return fmean(psnr(render(shown, each).image, render(exact, each).pixels) for each in views)
 
     def note_losses(self) -> None:
         """Of columns, and of the screen-space filter where most readers do not find it."""
@@ -211,10 +234,9 @@ class Export:
         self.console.note(*losses)
         if self.args.exact:
             return
-        views = spread(self.views or self.model.cameras or place_cameras(self.gaussians, views=COMPARED), COMPARED)
         with self.console.status("comparing with the exact values ..."):
-            found = fmean(psnr(render(shown, each).image, render(self.gaussians, each).pixels) for each in views)
-        about = f"renders of the page have a PSNR of {found:.1f} dB against the exact file ({len(views)} views, s = 1)"
+            found = self._agreement(shown, self.gaussians)
+        about = f"renders of the page have a PSNR of {found:.1f} dB against the exact file (s = 1)"
         self.console.note(f"{about}; --exact keeps all digits")
 
     def _transform(self, words: list[str | Path], out: Path, count: int) -> None:

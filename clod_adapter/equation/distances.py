@@ -120,16 +120,16 @@ def _without_outliers(means: Tensor, places: Sequence[Place]) -> Sequence[Place]
     if len(places) < 3:
         return places
     centre = means.median(0).values
-    away = torch.stack([(_position(place, means) - centre).norm() for place in places])
+    away = torch.stack([(position_of(place, means) - centre).norm() for place in places])
     limit = OUTLIER * torch.maximum(away.median(), (means - centre).norm(dim=1).median())
     return [place for place, distance in zip(places, away, strict=True) if bool(distance <= limit)]
 
 
-def _position(place: Place, means: Tensor) -> Tensor:
+def position_of(place: Place, means: Tensor) -> Tensor:
     return place.position.to(means) if isinstance(place, Camera) else means.new_tensor([place.x, place.y, place.z])
 
 
 def _from(place: Place, means: Tensor, config: AttenuationConfig) -> Tensor:
     if isinstance(place, Camera):
         return normalized_distances(means, place, config)
-    return (means - _position(place, means)).norm(dim=1) / place.unit
+    return (means - position_of(place, means)).norm(dim=1) / place.unit
