@@ -41,7 +41,9 @@ class Schedule:
 
 
 OURS = Schedule()
-FAR = replace(OURS, full=0.0)  # of far Gaussians: near ones, which s = 0 shows, are not trained
+# Of far Gaussians: near ones, which s = 0 shows, are not trained. With coarse 0.9 images at a tenth lose 0.4 dB on the
+# demo, whose photographs are exact, and gain 0.04 dB on plush_half, at less SSIM.
+FAR = replace(OURS, full=0.0, coarse=0.5)
 # One s ~ U(1, max_sv) a step, of whole photographs; no average of parameters.
 PAPER = Schedule(full=0.0, coarse=0.0, lr_final=0.05, average=0.0, rendered=1.0, counted=0.0, even=True)
 
