@@ -113,7 +113,7 @@ ERRORS = [
     ("export bare.ply -o lod-meta.json --lod-meta", "--out names the folder for lod-meta.json"),
     ("export bare.ply -o . --lod-meta", ".: is the current folder; --out must name a new one"),
     ("export bare.ply -o x.ply --sv 2 --camera 003", "--camera needs the scene of the photograph"),
-    ("export bare.ply -o x.ply --images scene", "--images is used for baking, --order and .html"),
+    ("export bare.ply -o x.ply --images scene", "--images is used for baking, --sh-degree, --order and .html"),
     ("apply bare.ply dial.safetensors -o x.ply", "bare.ply: a different base was given"),
     ("apply base.ply dial.safetensors -o pipe.ply", "pipe.ply: is no regular file"),
     ("view empty", "empty: has no splat in it; give the file"),
