@@ -46,7 +46,7 @@ def main() -> None:
         for row in compared(args.scene, args.author, args.images, args.adapted, args.only_dial, Path(temporary)):
             row = {"benchmark": "stream", "scene": args.scene.stem, **row}
             if args.images:
-                row["scene"] = f"{args.images.name}"
+                row["scene"] = args.images.name
             if args.record:
                 append(FILE, row)
             else:

@@ -61,7 +61,7 @@ def measure(count: int) -> Row:
     row |= {"distances": DISTANCES, "base": [], "dial": []}
     for distance in DISTANCES:
         camera = walker(count, distance)
-        view = clod.View(camera, supersampled(truth, camera, SAMPLES))
+        view = clod.View(camera, supersampled(truth, camera))
         for name, gaussians in shown.items():
             (found,) = clod.evaluate(gaussians, view, 1.0)
             row[name].append({"psnr": round(found.psnr, 3), "in_view": found.in_view})
@@ -135,11 +135,11 @@ def summary(row: Row) -> str:
 
 
 @torch.no_grad()
-def supersampled(shown: clod.Gaussians, camera: clod.Camera, samples: int) -> torch.Tensor:
-    """``[H, W, 3]`` uint8, a render with ``samples`` by ``samples`` samples in a pixel."""
-    K = camera.K * torch.tensor([[samples], [samples], [1.0]])
-    image = clod.render(shown, replace(camera, K=K, width=samples * camera.width, height=samples * camera.height)).image
-    image = image.clamp(0, 1).reshape(camera.height, samples, camera.width, samples, 3).mean((1, 3))
+def supersampled(shown: clod.Gaussians, camera: clod.Camera) -> torch.Tensor:
+    """``[H, W, 3]`` uint8, a render with SAMPLES by SAMPLES samples in a pixel."""
+    K = camera.K * torch.tensor([[SAMPLES], [SAMPLES], [1.0]])
+    image = clod.render(shown, replace(camera, K=K, width=SAMPLES * camera.width, height=SAMPLES * camera.height)).image
+    image = image.clamp(0, 1).reshape(camera.height, SAMPLES, camera.width, SAMPLES, 3).mean((1, 3))
     return (255 * image).round().to(torch.uint8)
 
 
@@ -149,7 +149,7 @@ def write_photographs(shown: clod.Gaussians, cameras: Sequence[clod.Camera], fol
     frames = []
     for k, camera in enumerate(cameras):
         name = f"images/{k:04}.png"
-        Image.fromarray(supersampled(shown, camera, SAMPLES).numpy()).save(folder / name)
+        Image.fromarray(supersampled(shown, camera).numpy()).save(folder / name)
         pose = torch.linalg.inv(camera.viewmat.double()) @ torch.diag(torch.tensor([1.0, -1, -1, 1])).double()
         K = camera.K.tolist()
         size = {"fl_x": K[0][0], "fl_y": K[1][1], "cx": K[0][2], "cy": K[1][2], "w": camera.width, "h": camera.height}

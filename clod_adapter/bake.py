@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from clod_adapter.cameras import Camera
-from clod_adapter.config import require
+from clod_adapter.config import MULTIPLIER, require
 from clod_adapter.equation.attenuation import TAKEOVER, Attenuated, dial
 from clod_adapter.equation.distances import Place, typical_distance
 from clod_adapter.errors import ClodError
@@ -19,7 +19,7 @@ from clod_adapter.gaussians import OPAQUE, Gaussians
 # photographs of FADED 0, 0.5, 0.75 and 1, and then of seven GROWN from 0 to 1.25. At equal counts the file is never
 # below the dial by more than 0.05 dB, and up to 0.65 dB above it.
 FADED, GROWN = 0.75, 0.9
-MULTIPLIER, MOST = 3.0, 100.0  # of the distances at which levels begin: PlayCanvas's default, and the largest
+MOST = 100.0  # multiplier of the distances at which levels begin
 FEWEST, LEVELS = 0.01, 16  # share of the Gaussians in the coarsest level, and the largest number of levels
 
 
@@ -47,15 +47,14 @@ def bake(
     if (camera is None) == (not cameras):
         raise ClodError("bake needs either camera or cameras; load(path).viewpoints are those stored with the file")
     distances = typical_distance(gaussians.means, [camera] if camera else cameras, gaussians.attenuation)
-    dialled = dial(gaussians, distances, virtual_scale)
-    if not dialled.keep.any():
-        raise ClodError(f"no Gaussian is kept at s = {virtual_scale:g}; bake a smaller s")
     if camera:
-        return _plain(gaussians, dialled, dialled, dialled)
-    shown, grown = (dial(gaussians, distances, virtual_scale**share) for share in (FADED, GROWN))
-    if gaussians.near is not None:
-        dialled, shown = _switched(gaussians, distances, virtual_scale)
-    return _plain(gaussians, dialled, shown, grown)
+        kept = shown = grown = dial(gaussians, distances, virtual_scale)
+    else:
+        kept, shown = _of_several(gaussians, distances, virtual_scale)
+        grown = dial(gaussians, distances, virtual_scale**GROWN)
+    if not kept.keep.any():
+        raise ClodError(f"no Gaussian is kept at s = {virtual_scale:g}; bake a smaller s")
+    return _plain(gaussians, kept, shown, grown)
 
 
 class Level(NamedTuple):
@@ -129,22 +128,25 @@ def order_by_extinction(gaussians: Gaussians, cameras: Sequence[Place]) -> Tenso
 
 def baked_rows(gaussians: Gaussians, distances: Tensor, virtual_scale: float) -> Tensor:
     """``[N]`` bool, those that ``bake`` keeps at distances ``[N]`` over several cameras."""
-    if gaussians.near is None:
-        return dial(gaussians, distances, virtual_scale).keep
-    return _switched(gaussians, distances, virtual_scale)[0].keep
+    return _of_several(gaussians, distances, virtual_scale)[0].keep
 
 
-def _switched(gaussians: Gaussians, distances: Tensor, virtual_scale: float) -> tuple[Attenuated, Attenuated]:
-    """What is kept, and what is drawn of it, if far Gaussians take over from near ones at once, in the middle."""
-    assert gaussians.near is not None and gaussians.attenuation is not None and gaussians.sigma_d is not None
-    middle = math.sqrt(1 - 0.5 / TAKEOVER) * gaussians.attenuation.near_distance / gaussians.attenuation.scene_distance
-    near, far = gaussians.near, distances * virtual_scale >= middle
-    whole = gaussians.replace(
-        sigma_d=gaussians.sigma_d.masked_fill(near, math.inf),
-        attenuation=replace(gaussians.attenuation, near_distance=0.0),
-    )
-    dialled, shown = (dial(whole, distances, s) for s in (virtual_scale, virtual_scale**FADED))
-    return dialled._replace(keep=dialled.keep & (near != far)), shown
+def _of_several(gaussians: Gaussians, distances: Tensor, virtual_scale: float) -> tuple[Attenuated, Attenuated]:
+    """What is kept over several cameras, and what is drawn of it.
+
+    Far Gaussians take over from near ones at once, in the middle of their zone.
+    """
+    near, attenuation, whole = gaussians.near, gaussians.attenuation, gaussians
+    if near is not None:  # which do not end by themselves
+        assert attenuation is not None and gaussians.sigma_d is not None
+        sigma_d = gaussians.sigma_d.masked_fill(near, math.inf)
+        whole = gaussians.replace(sigma_d=sigma_d, attenuation=replace(attenuation, near_distance=0.0))
+    kept, shown = (dial(whole, distances, s) for s in (virtual_scale, virtual_scale**FADED))
+    if near is not None:
+        assert attenuation is not None
+        middle = math.sqrt(1 - 0.5 / TAKEOVER) * attenuation.near_distance / attenuation.scene_distance
+        kept = kept._replace(keep=kept.keep & (near != (distances * virtual_scale >= middle)))
+    return kept, shown
 
 
 def _logits_drawn(shown: Attenuated, logits: Tensor) -> Tensor:

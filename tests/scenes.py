@@ -117,11 +117,3 @@ def stripped(data: bytes) -> bytes:
         return re.sub(rb"(?m)^(comment clod_adapter calibrated .*) \S+$", rb"\1", data)
     text = re.sub(rb'\\"frame_ms\\": [0-9.e-]+', b"", data[8:])
     return text.replace(b" ", b"")  # the header is padded with spaces to a whole number of words
-
-
-def with_unseen(base: Gaussians, count: int = 40) -> tuple[Gaussians, Tensor]:
-    """``base`` mixed with ``count`` Gaussians outside every image, and ``[N]`` bool: the rows of ``base``."""
-    far = base.select(torch.arange(count)).replace(means=base.means[:count] + torch.tensor([0.0, 90.0, 0.0]))
-    order = torch.randperm(len(base) + count, generator=torch.Generator().manual_seed(4))
-    values = {name: torch.cat([value, far.tensors()[name]])[order] for name, value in base.tensors().items()}
-    return base.replace(**values), order < len(base)

@@ -6,6 +6,7 @@ from math import inf
 from pathlib import Path
 from typing import Any
 
+from clod_adapter.config import MULTIPLIER
 from clod_adapter.errors import ClodError
 from clod_adapter.io.file_formats import file_has_dial
 from clod_adapter.io.formats.splat_transform import SplatTransform
@@ -14,7 +15,6 @@ from ..shared import command as common
 from ..shared.outputs import Outputs
 from .names import FOLDERS, FORMATS, PACKED, PAGE, is_page, level_paths, suffix_of
 
-MULTIPLIER = 3.0  # of distances, PlayCanvas's default
 DIGITS = 6  # significant digits of a level, all of them in its file's name
 
 
@@ -44,8 +44,8 @@ def add_arguments(parser: ArgumentParser) -> None:
     for option, form in (("--lod-meta", "streaming set for PlayCanvas's viewers"), ("--3dtiles", "3D Tiles set")):
         text = f"write a {form}, a level for each band of distance, to the new folder OUT"
         sets.add_argument(option, dest="folder", action="store_const", const=option, help=text)
-    text = "ratio of the distances at which two levels begin, as set in the viewer"
-    output.add_argument("--multiplier", metavar="M", type=float, default=MULTIPLIER, help=f"{text} (default: 3)")
+    text = f"ratio of the distances at which two levels begin, as set in the viewer (default: {MULTIPLIER:g})"
+    output.add_argument("--multiplier", metavar="M", type=float, default=MULTIPLIER, help=text)
     text = "fit the view-dependent colours to this SH degree, 0 to 3: most of a file's bytes"
     output.add_argument("--sh-degree", metavar="N", type=int, choices=range(4), help=text)
     output.add_argument("--order", choices=["extinction"], help="put first the Gaussians that are culled last")

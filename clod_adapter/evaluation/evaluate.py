@@ -18,7 +18,6 @@ from clod_adapter.losses import psnr_ssim
 from clod_adapter.progress import Listener, Phase, Progress
 from clod_adapter.render import render
 
-VIEWS = 16  # cameras that errors of levels are measured from
 SCORED = 4  # views whose SSIM is computed at a time: each takes 83 bytes a pixel
 
 

@@ -14,7 +14,7 @@ from clod_adapter.equation.distances import median_distance, typical_distance
 from clod_adapter.equation.units import in_world_units, known_distance, with_distance
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import SH_C0, Gaussians, bad_rows, largest_colour
-from clod_adapter.initialization.pruning_order import initial_growth, pruning_order
+from clod_adapter.initialization.pruning_order import PruningOrder, initial_growth, pruning_order
 from clod_adapter.progress import Listener, Phase, tell
 from clod_adapter.render import splat
 
@@ -31,12 +31,10 @@ def initialize(
     views: Sequence[View],
     config: AdaptConfig,
     progress: Listener | None = None,
-    error: Tensor | None = None,
 ) -> Gaussians:
     """The Gaussians with an initial sigma_d, in world units, and growth_d, from up to MOST_VIEWS evenly spread views.
 
     A dial that ``base`` already has, with any effect, is kept with its own settings except the config's ``max_sv``.
-    ``error`` is ``removal_error`` of these views and seed, where it is known.
     """
     if base.attenuation is not None and has_dial(base):
         if base.attenuation.form != config.form:
@@ -46,16 +44,23 @@ def initialize(
         return in_world_units(with_growth(base.replace(attenuation=own), config, base.growth_d))
     views = spread(views, MOST_VIEWS)
     attenuation = config.attenuation(scene_distance(base, views))
-    if error is None:
-        error = removal_error(base, views, seed=config.seed, progress=progress)
-    pruned = pruning_order(base, error.sqrt() * base.opacities, progress)
+    pruned = pruning_order(base, importance(base, views, config, progress), progress)
     distances = typical_distance(base.means, [view.camera for view in views], attenuation)
-    scales = extinction_from_rank(pruned.position.max() - pruned.position, config)
-    sigma_d = distances * scales.clamp(max=WIDEST * config.max_sv)
-    initial = base.replace(sigma_d=sigma_d, attenuation=attenuation)
+    initial = base.replace(sigma_d=reach_of(pruned, distances, config), attenuation=attenuation)
     # Training that begins with this growth ends 0.1 to 0.2 dB lower than from 0 (docs/method.md).
     fitted = initial_growth(initial, pruned.substitute, distances) if config.iters == 0 else None
     return in_world_units(with_growth(initial, config, fitted))
+
+
+def importance(base: Gaussians, views: Sequence[View], config: AdaptConfig, progress: Listener | None = None) -> Tensor:
+    """``[N]`` what each Gaussian matters to the pictures: the root of its ``removal_error``, times its opacity."""
+    return removal_error(base, views, seed=config.seed, progress=progress).sqrt() * base.opacities
+
+
+def reach_of(pruned: PruningOrder, distances: Tensor, config: AdaptConfig, total: int | None = None) -> Tensor:
+    """``[N]`` sigma_d, in the unit of the typical ``distances [N]``; ``total`` as for ``extinction_from_rank``."""
+    scales = extinction_from_rank(pruned.position.max() - pruned.position, config, total)
+    return distances * scales.clamp(max=WIDEST * config.max_sv)
 
 
 def with_growth(initial: Gaussians, config: AdaptConfig, growth_d: Tensor | None = None) -> Gaussians:

@@ -19,8 +19,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from clod_adapter._kernels import threads
 from clod_adapter.gaussians import Gaussians
+from clod_adapter.initialization.neighbours import nearest, without_crowds
 from clod_adapter.progress import Listener, Phase, tell
 
 NEIGHBOURS = 12
@@ -124,7 +124,7 @@ def _groups(mixture: Mixture, weights: np.ndarray, count: int) -> np.ndarray:
 
 def _cheapest(mixture: Mixture, weights: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Pairs of neighbours without a common one: the cheapest of both each, by rising cost, then of what remains."""
-    i, j = _neighbours(mixture.means)
+    i, j = _neighbours(mixture)
     weight = np.sqrt(weights[i] * weights[j] / np.maximum(weights[i] + weights[j], np.finfo(float).tiny))
     order = np.argsort((_cost(mixture, i, j) + LEAST) * weight, kind="stable")
     i, j = i[order], j[order]
@@ -140,15 +140,14 @@ def _cheapest(mixture: Mixture, weights: np.ndarray) -> Iterator[tuple[np.ndarra
         i, j = i[left], j[left]
 
 
-def _neighbours(means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _neighbours(mixture: Mixture) -> tuple[np.ndarray, np.ndarray]:
     """Each pair of a Gaussian and one of its NEIGHBOURS nearest once, the smaller number first."""
-    from scipy.spatial import cKDTree  # only here: it takes a fifth of a second to import
-
-    count = len(means)
-    near = cKDTree(means).query(means, min(NEIGHBOURS + 1, count), workers=threads.worker_count())[1]
-    pairs = np.stack([np.repeat(np.arange(count), near.shape[1]), near.ravel()])
-    low, high = pairs.min(0), pairs.max(0)
-    return np.divmod(np.unique((low * count + high)[low < high]), count)
+    sizes = np.sqrt(mixture.covariances[:, :3].max(1))
+    pairs = []
+    for rows, _, near in nearest(without_crowds(mixture.means, sizes), NEIGHBOURS):
+        low, high = np.minimum(rows[:, None], near), np.maximum(rows[:, None], near)
+        pairs.append((low * len(mixture) + high)[low < high])
+    return np.divmod(np.unique(np.concatenate(pairs)), len(mixture))
 
 
 def _cost(mixture: Mixture, first: np.ndarray, second: np.ndarray) -> np.ndarray:

@@ -6,11 +6,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from clod_adapter._kernels import threads
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.equation.attenuation import growth_distance, growth_factors
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import SH_C0, Gaussians
+from clod_adapter.initialization.neighbours import nearest, without_crowds
 from clod_adapter.progress import Listener, Phase, tell
 
 NEIGHBOURS = 8
@@ -19,13 +19,10 @@ COLOUR_FLOOR = 0.03  # smallest difference of colours (of 1) that counts
 APART = 0.05  # weight of the distance, relative to a squared difference of colours
 DIFFERENT = 1e12  # dissimilarity for colours or sizes that are not finite
 STUCK = 0.02  # of the remaining: if a round removes fewer, it removes the cheapest REMOVED without conditions
-ROWS = 1 << 17  # rows whose neighbours are in memory at a time
-BLOCK = 1 << 13  # rows of these that are compared at a time: three times as fast as it fits in cache
+BLOCK = 1 << 13  # rows that are compared at a time: three times as fast as it fits in cache
 DIALS = 24  # dial values of the fit of growth, evenly spaced in log s
 MOST = 1.0  # of its exponents before SHARE
 SHARE = 0.65  # of the fitted exponents that is used; 0.5 and 0.8 are no better at any share
-CROWD = 64  # Gaussians with equal centres, from which on these are displaced,
-JITTER = 1e-6  # by this share of their size: a k-d tree cannot split equal points, and compares each with all others
 
 
 class PruningOrder(NamedTuple):
@@ -54,7 +51,7 @@ def pruning_order(gaussians: Gaussians, importance: Tensor, progress: Listener |
     colours = 0.5 + SH_C0 * gaussians.sh0.detach()[:, 0].double().cpu().numpy()
     sizes = gaussians.log_scales.detach().double().exp().amax(1).cpu().numpy() if count else np.empty(0)
     weights, order = importance.detach().double().cpu().numpy().copy(), np.empty(count, np.int64)
-    centres = _without_crowds(gaussians.means.detach().double().cpu().numpy(), sizes)
+    centres = without_crowds(gaussians.means.detach().double().cpu().numpy(), sizes)
     favoured, left, gone = np.arange(count), np.arange(count), 0
     while len(left) > 1:
         substitute, difference = _substitutes(centres[left], colours[left], sizes[left])
@@ -68,15 +65,6 @@ def pruning_order(gaussians: Gaussians, importance: Tensor, progress: Listener |
     order[left] = gone
     tell(progress, Phase.PRUNING_ORDER, count, count)
     return PruningOrder(*(torch.from_numpy(rows).to(importance.device) for rows in (order, favoured)))
-
-
-def _without_crowds(centres: np.ndarray, sizes: np.ndarray) -> np.ndarray:
-    """The centres, displaced by JITTER where too many may be equal."""
-    x = np.sort(centres[:, 0])
-    if not (x[CROWD:] == x[:-CROWD]).any():
-        return centres
-    shifts = np.random.default_rng(0).uniform(-JITTER, JITTER, centres.shape)
-    return centres + np.nan_to_num(sizes, posinf=0.0)[:, None] * shifts
 
 
 def _removed(cost: np.ndarray, substitute: np.ndarray) -> np.ndarray:
@@ -95,13 +83,9 @@ def _removed(cost: np.ndarray, substitute: np.ndarray) -> np.ndarray:
 
 def _substitutes(centres: np.ndarray, colours: np.ndarray, sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The most similar neighbour of each, and its dissimilarity."""
-    from scipy.spatial import cKDTree  # only here: it takes a fifth of a second to import
-
-    tree, substitute, difference = cKDTree(centres), np.empty(len(centres), np.int64), np.empty(len(centres))
+    substitute, difference = np.empty(len(centres), np.int64), np.empty(len(centres))
     channels = np.ascontiguousarray(colours.T)
-    # In the tree's order, in which successive rows are neighbours: a third of the time for a file in random order.
-    for part in np.array_split(tree.indices, -(-len(centres) // ROWS)):
-        apart, near = tree.query(centres[part], min(NEIGHBOURS + 1, len(centres)), workers=threads.worker_count())
+    for part, apart, near in nearest(centres, NEIGHBOURS):
         for at in range(0, len(part), BLOCK):
             rows, these = part[at : at + BLOCK], slice(at, at + BLOCK)
             substitute[rows], difference[rows] = _most_similar(rows, near[these].T, apart[these].T, channels, sizes)

@@ -21,7 +21,7 @@ from clod_adapter.calibration import CalibrationRow, Viewpoint
 from clod_adapter.config import CLASSIC, SH_COUNTS, AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.io.settings import EARLIER_FORM, FILTER, Metadata, read_metadata, tagged
-from clod_adapter.io.values import FILTER_3D, GROWTH, INVISIBLE, OPACITY, ROWS, SIGMA, arrays_of, dial_columns
+from clod_adapter.io.values import FILTER_3D, GROWTH, OPACITY, ROWS, SIGMA, arrays_of, dial_columns, hidden
 
 if TYPE_CHECKING:
     from clod_adapter.gaussians import Gaussians
@@ -164,11 +164,7 @@ def write_rows(path: Path, gaussians: Gaussians, metadata: Metadata, base: np.nd
         base: ``[N]`` rows of the file that the first N Gaussians come from; None for Inria's layout. The others are
             far Gaussians (``values.OPACITY``), whose other columns are 0.
     """
-    tensors, origin = {name: tensor.detach() for name, tensor in gaussians.tensors().items()}, metadata.origin
-    if gaussians.near is not None:
-        logits = tensors["opacity_logits"]
-        tensors["opacity_logits"] = logits.masked_fill(~gaussians.near, INVISIBLE)
-        tensors[OPACITY] = logits.masked_fill(gaussians.near, 0.0)
+    tensors, origin = hidden(gaussians), metadata.origin
     constants, dial = constants_of(metadata, growth=gaussians.growth_d is not None), dial_columns(tensors)
     layout = inria_dtype(gaussians.sh_degree) if base is None else base.dtype
     # growth_d alone is foreign

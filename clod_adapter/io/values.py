@@ -17,6 +17,8 @@ from clod_adapter.errors import ClodError
 from clod_adapter.origin import Origin, origin_of, relative
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from clod_adapter.gaussians import Gaussians
 
 Activated = Literal["none", "opacity", "scales", "both"]
@@ -177,18 +179,27 @@ def _usable(arrays: Arrays) -> tuple[np.ndarray, dict[str, int]]:
     return keep, {reason: lost for reason, lost in dropped.items() if lost}
 
 
+def hidden(gaussians: Gaussians) -> dict[str, Tensor]:
+    """``Gaussians.tensors`` as files store them: far ones are INVISIBLE, and OPACITY has their own logits."""
+    tensors, near = {name: tensor.detach() for name, tensor in gaussians.tensors().items()}, gaussians.near
+    if near is not None:
+        logits = tensors["opacity_logits"]
+        tensors["opacity_logits"] = logits.masked_fill(~near, INVISIBLE)
+        tensors[OPACITY] = logits.masked_fill(near, 0.0)
+    return tensors
+
+
 def arrays_of(path: Path, gaussians: Gaussians) -> Arrays:
-    """The float32 arrays of ``Gaussians.tensors``, far ones hidden; refuses values that ``load`` would drop."""
-    tensors = gaussians.tensors()
-    arrays = {name: tensor.detach().float().cpu().contiguous().numpy() for name, tensor in tensors.items()}
+    """The float32 arrays of ``hidden``; refuses values that ``load`` would drop."""
+    arrays = _on_the_host(gaussians.tensors())
     if dropped := _usable(arrays)[1]:
         spoilt = [name for name, array in arrays.items() if not np.isfinite(array).all()] or ["quats"]
         raise ClodError(f"{path}: {', '.join(spoilt)}: {', '.join(dropped)}; drop such rows first, as load does")
-    if gaussians.near is not None:
-        near, logits = gaussians.near.cpu().numpy(), arrays["opacity_logits"]
-        arrays["opacity_logits"] = np.where(near, logits, np.float32(INVISIBLE))
-        arrays[OPACITY] = np.where(near, np.float32(0), logits)
-    return arrays
+    return _on_the_host(hidden(gaussians))  # without copies, on a CPU
+
+
+def _on_the_host(tensors: Mapping[str, Tensor]) -> Arrays:
+    return {name: tensor.detach().float().cpu().contiguous().numpy() for name, tensor in tensors.items()}
 
 
 def half_turn(arrays: Mapping[str, np.ndarray], axis: str) -> dict[str, np.ndarray]:

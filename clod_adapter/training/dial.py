@@ -195,7 +195,7 @@ class Dial(nn.Module):
 
     def target_share(self, virtual_scale: float) -> float:
         """The share of the splats that the target-count curve keeps at s, in (0, 1]; 1 below s = 1."""
-        return self._target(virtual_scale).share
+        return self._target(virtual_scale)
 
     def gaussians(self) -> Gaussians:
         """The splats with this dial, for ``render`` in the loop and ``save`` after it: gradients reach both.

@@ -21,12 +21,13 @@ from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians, with_near
 from clod_adapter.initialization.importance import (
     MOST_VIEWS,
-    WIDEST,
-    extinction_from_rank,
     has_dial,
+    importance,
     initialize,
+    reach_of,
     removal_error,
     scene_distance,
+    with_growth,
 )
 from clod_adapter.initialization.merging import merge
 from clod_adapter.initialization.pruning_order import pruning_order
@@ -68,14 +69,12 @@ def with_far(
     if all(isinstance(view, PseudoView) for view in views):  # placed cameras do not show everything
         error = supposed_error(base, error)
     far = merge(base, error.sqrt() * base.opacities, max(round(SHARE * len(base)), 1), progress)
-    error = removal_error(far, views, seed=config.seed, progress=progress)
-    pruned = pruning_order(far, error.sqrt() * far.opacities, progress)
-    rank = pruned.position.max() - pruned.position
-    scales = extinction_from_rank(rank, replace(config, start_share=1.0), len(base)).clamp(max=WIDEST * config.max_sv)
-    reach = (typical_distance(far.means, cameras, attenuation) * scales).clamp(min=LONGER * near)
-    growth_d = torch.zeros_like(reach) if config.growth == "on" else None
+    pruned = pruning_order(far, importance(far, views, config, progress), progress)
+    distances = typical_distance(far.means, cameras, attenuation)
+    reach = reach_of(pruned, distances, replace(config, start_share=1.0), len(base)).clamp(min=LONGER * near)
     attenuation = replace(attenuation, near_distance=near * attenuation.scene_distance)
-    return in_world_units(with_near(base, far.replace(sigma_d=reach, growth_d=growth_d, attenuation=attenuation)))
+    far = with_growth(far.replace(sigma_d=reach, attenuation=attenuation), config)
+    return in_world_units(with_near(base, far))
 
 
 def supposed_error(gaussians: Gaussians, error: Tensor) -> Tensor:

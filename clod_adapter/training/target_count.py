@@ -1,7 +1,5 @@
 """The target-count curve: the share of Gaussians to keep at each dial value, and the loss term that enforces it."""
 
-from typing import NamedTuple
-
 import numpy as np
 import torch
 from torch import Tensor
@@ -13,16 +11,6 @@ SHARPNESS = 32  # of the soft count: the exponent of t
 # a Gaussian's is 0, and so is the image's gradient: no step would bring such a sigma back.
 LIFT = 1e-3
 Number = float | Tensor
-
-
-class TargetShare(NamedTuple):
-    """The share > 0 of some Gaussians to keep at one dial value, and the weight of a relative deviation from it.
-
-    The weight is ``1 / share`` where these are all Gaussians of the scene.
-    """
-
-    share: float
-    weight: float
 
 
 def target_curve(virtual_scale: float, share: float, exponent: float) -> float:
@@ -37,17 +25,16 @@ def target_curve(virtual_scale: float, share: float, exponent: float) -> float:
     return 1 / (power + (1 / share - 1) / power)
 
 
-def target_share(virtual_scale: float, count: int, config: AdaptConfig, total: int | None = None) -> TargetShare:
-    """The target of ``count`` of ``total`` Gaussians (all if None): ``target_curve``, but at least one Gaussian."""
+def target_share(virtual_scale: float, count: int, config: AdaptConfig, total: int | None = None) -> float:
+    """The share to keep of ``count`` of ``total`` Gaussians (all if None): ``target_curve``, but at least one."""
     total = total or max(count, 1)
     share = max(target_curve(virtual_scale, config.share, config.exponent), 1 / total)
-    share = min(share * (total / max(count, 1)), 1.0)
-    return TargetShare(share, 1 / share)
+    return min(share * (total / max(count, 1)), 1.0)
 
 
 @torch.no_grad()
 def count_gradient(
-    distances: Tensor, sigma_d: Tensor, virtual_scale: float, loss: Number, config: AdaptConfig, target: TargetShare
+    distances: Tensor, sigma_d: Tensor, virtual_scale: float, loss: Number, config: AdaptConfig, target: float
 ) -> Tensor:
     """``[N]`` the count term's gradient of log sigma_d at one dial value.
 
@@ -79,9 +66,9 @@ def count_gradient(
     return out
 
 
-def _penalty(eta: Number, target: TargetShare, loss: Number, config: AdaptConfig) -> Number:
+def _penalty(eta: Number, target: float, loss: Number, config: AdaptConfig) -> Number:
     """The derivative of ``loss reg_weight (eta / target - 1)^2`` by the share eta."""
-    return 2 * loss * config.reg_weight * (eta / target.share - 1) * target.weight
+    return 2 * loss * config.reg_weight * (eta / target - 1) / target
 
 
 def count_slope(far: Tensor, sigma_d: Tensor) -> Tensor:

@@ -17,7 +17,7 @@ from clod_adapter._kernels.elementary import exp2, log2
 from clod_adapter._kernels.simd import load, store
 from clod_adapter.config import AdaptConfig
 from clod_adapter.losses import photometric_loss
-from clod_adapter.training.target_count import TargetShare, count_gradient
+from clod_adapter.training.target_count import count_gradient
 
 CONFIG = AdaptConfig(max_sv=7.0)
 
@@ -28,12 +28,12 @@ CONFIG = AdaptConfig(max_sv=7.0)
     share=st.sampled_from([0.02, 0.4, 1.0]), workers=st.sampled_from([1, 3]),
 )  # fmt: skip
 def test_both_forms_of_the_count_term_agree(n: int, s: float, seed: int, share: float, workers: int) -> None:
-    random, target = torch.Generator().manual_seed(seed), TargetShare(share, 1 / share)
+    random = torch.Generator().manual_seed(seed)
     d = 2 * torch.rand(n, generator=random)
     sigma = s * d * (torch.randn(n, generator=random) / 4).exp()
     with torch_threads(workers):
-        got = count_gradient(d, sigma, s, 0.1, CONFIG, target)
-    want = count_gradient(d.double(), sigma.double(), s, 0.1, CONFIG, target)
+        got = count_gradient(d, sigma, s, 0.1, CONFIG, share)
+    want = count_gradient(d.double(), sigma.double(), s, 0.1, CONFIG, share)
     torch.testing.assert_close(got.double(), want, rtol=1e-4, atol=1e-6 * max(float(want.abs().max()), 1e-9))
     assert n < 33 or want.any()
 
@@ -42,7 +42,7 @@ def test_the_count_term_of_extreme_values_is_finite() -> None:
     edges = torch.tensor([0.0, 1e-30, 1e-6, 1.0, 1e6, 1e9]), torch.tensor([-1.0, 0.0, 1e-30, 1e-4, 1.0, 1e9, math.inf])
     for dtype, share in product((torch.float32, torch.float64), (0.01, 1.0)):
         d, sigma = torch.cartesian_prod(*(edge.to(dtype) for edge in edges)).unbind(1)
-        found = count_gradient(d, sigma, 3.0, 0.1, CONFIG, TargetShare(share, 1.0))
+        found = count_gradient(d, sigma, 3.0, 0.1, CONFIG, share)
         assert found.isfinite().all() and found.any()
 
 

@@ -53,7 +53,6 @@ QUANTISED = "quantised: positions in 24 bits, scales, opacities and harmonics in
 _BOMB = 64  # times its size that a file may unpack to; Gaussians that differ at all come to 10
 _CONVERT = "convert it: splat-transform IN.spz OUT.ply"
 _TURNS = {RDF: "", 4: "x", 7: "z"}  # right, up, back; left, up, forward
-_NAMED = ([SIGMA], [SIGMA, GROWTH], [SIGMA, OPACITY], [SIGMA, GROWTH, OPACITY])
 _SMALL = 1 << 24  # bytes that any file may
 
 
@@ -215,7 +214,8 @@ def _ours(path: Path, body: bytes, count: int) -> tuple[dict[str, Any], dict[str
     with refused_if_damaged(path, *DAMAGED):
         stored = json.loads(text)
         names = stored.get(COLUMNS, [SIGMA])
-    if names not in _NAMED or len(halves) not in (0, 2 * count * len(names)):
+        known = list(dial_columns(names)) if isinstance(names, list) else []
+    if not known or names != known or len(halves) not in (0, 2 * count * len(names)):
         raise ClodError(f"{path}: its record of sigma_d is damaged; copy or export it again")
     table = np.frombuffer(halves, "<f2").astype(np.float32).reshape(-1, count)
     return stored, dict(zip(names, table, strict=False))  # no rows without a dial
