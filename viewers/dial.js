@@ -3,11 +3,11 @@ import { bandsOf, countKept, dialForCount, growthStart } from "./equation.js";
 import { createHold } from "./frame_rate.js";
 import { readGaussians } from "./read.js";
 
-/** Reads the dial of an adapted PLY or SPZ (bytes): {count, means, sigma, growth, settings}. */
+/** Reads the dial of an adapted PLY or SPZ (bytes): {count, means, logits, sigma, growth, settings}. */
 export async function readDial(bytes) {
   const data = new Uint8Array(bytes.buffer ?? bytes, bytes.byteOffset ?? 0, bytes.byteLength);
-  const { count, means, sigmaD: sigma, growthD: growth, settings } = await readGaussians(data);
-  return checked({ count, means, sigma, growth, settings });
+  const { count, means, opacityLogits: logits, sigmaD: sigma, growthD: growth, settings } = await readGaussians(data);
+  return checked({ count, means, logits, sigma, growth, settings });
 }
 
 /** `dial`, if it has a sigma_d. */
@@ -16,10 +16,12 @@ export function checked(dial) {
   return { ...dial, growth: dial.growth ?? new Float32Array(dial.count) };
 }
 
-/** The two columns of a Gaussian as texels of an RG32F texture. */
-export function texels({ count, sigma, growth }, length) {
-  const data = new Float32Array(length);
-  for (let i = 0; i < count; i++) data.set([sigma[i], growth[i]], 2 * i);
+/** A Gaussian's columns as texels of an RGBA32F texture; of far ones, which the engine hides, the opacity as alpha. */
+export function texels({ count, logits, sigma, growth, settings }, length) {
+  const data = new Float32Array(length), both = settings.near_distance > 0;
+  for (let i = 0; i < count; i++) {
+    data.set([sigma[i], growth[i], 0, both && sigma[i] > 0 ? 1 / (1 + Math.exp(-logits[i])) : 0], 4 * i);
+  }
   return data;
 }
 

@@ -1,16 +1,16 @@
 // The dial in PlayCanvas, and so in SuperSplat's engine: a work buffer modifier with the library's GLSL or WGSL.
-import { PIXELFORMAT_RG32F, Vec3, WORKBUFFER_UPDATE_ONCE } from "playcanvas";
+import { PIXELFORMAT_RGBA32F, Vec3, WORKBUFFER_UPDATE_ONCE } from "playcanvas";
 import { Dial, checked, constants, texels } from "./dial.js";
 import { timed } from "./frame_rate.js";
-import { constantsOf, readSettings } from "./read.js";
+import { constantsOf, readSettings, revealed } from "./read.js";
 import { glsl, wgsl } from "./shaders.js";
 
 /** Attaches the dial of an adapted PLY to an entity with its gsplat; distances are from `camera`, an entity. */
 export function attach(app, entity, camera) {
   const { gsplat } = entity, { resource } = gsplat, file = fileOf(resource.gsplatData);
-  resource.format.addExtraStreams([{ name: "clod", format: PIXELFORMAT_RG32F }]);
+  resource.format.addExtraStreams([{ name: "clod", format: PIXELFORMAT_RGBA32F }]);
   const texture = resource.getTexture("clod");
-  texture.lock().set(texels(file, 2 * texture.width * texture.height));
+  texture.lock().set(texels(file, 4 * texture.width * texture.height));
   texture.unlock();
   gsplat.setWorkBufferModifier(modifier(file));
   const world = () => camera.getPosition(), place = new Vec3();
@@ -41,7 +41,9 @@ function fileOf(data) {
   for (let i = 0; i < count; i++) means.set([x[i], y[i], z[i]], 3 * i);
   const names = data.getElement("vertex").properties.map(({ name }) => name);
   const settings = readSettings(data.comments ?? [], constantsOf(names, (name) => column(name)[0]));
-  return checked({ count, means, sigma: column("sigma_d"), growth: column("growth_d"), settings });
+  const given = { opacityLogits: Float32Array.from(column("opacity")), sigmaD: column("sigma_d"), opacityD: column("opacity_d") };
+  const { opacityLogits: logits, sigmaD: sigma } = revealed(given);
+  return checked({ count, means, logits, sigma, growth: column("growth_d"), settings });
 }
 
 /** The modifier for `gsplat.setWorkBufferModifier`. */
@@ -57,7 +59,8 @@ export function modifier(file) {
         scale *= clodScale(loadClod().g, clodDistance(center), uClodScale.x, ${start});
       }
       void modifySplatColor(vec3 center, inout vec4 color) {
-        color.a = clodOpacity(color.a, loadClod().r, clodDistance(center), uClodScale.x, ${near});
+        vec4 column = loadClod();
+        color.a = clodOpacity(column.a > 0.0 ? column.a : color.a, column.r, clodDistance(center), uClodScale.x, ${near});
       }`,
     wgsl: `${wgsl}
       uniform uClodEye: vec3f;
@@ -68,7 +71,8 @@ export function modifier(file) {
         *scale = *scale * clodScale(loadClod().g, clodDistance(center), uniform.uClodScale.x, ${start});
       }
       fn modifySplatColor(center: vec3f, color: ptr<function, vec4f>) {
-        (*color).a = clodOpacity((*color).a, loadClod().r, clodDistance(center), uniform.uClodScale.x, ${near});
+        let column = loadClod();
+        (*color).a = clodOpacity(select((*color).a, column.a, column.a > 0.0), column.r, clodDistance(center), uniform.uClodScale.x, ${near});
       }`,
   };
 }

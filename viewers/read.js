@@ -28,7 +28,7 @@ export async function readGaussians(bytes) {
 }
 
 /** With the opacities of far Gaussians, which the file hides from viewers without the dial. */
-function revealed({ opacityD, ...read }) {
+export function revealed({ opacityD, ...read }) {
   const { opacityLogits, sigmaD } = read;
   if (opacityD) sigmaD.forEach((sigma, i) => sigma > 0 && (opacityLogits[i] = opacityD[i]));
   return read;

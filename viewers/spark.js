@@ -1,6 +1,6 @@
 // The dial in Spark (three.js): mesh.objectModifiers, with the library's GLSL.
 import { dyno } from "@sparkjsdev/spark";
-import { DataTexture, FloatType, RGFormat } from "three";
+import { DataTexture, FloatType, RGBAFormat } from "three";
 import { Dial, constants, readDial, texels } from "./dial.js";
 import { glsl } from "./shaders.js";
 import { timed } from "./frame_rate.js";
@@ -12,7 +12,7 @@ export async function attach(mesh, bytes, renderer) {
   const [file] = await Promise.all([readDial(bytes), mesh.initialized]);
   if (mesh.splats.getNumSplats() !== file.count) throw new Error(`the mesh has not the ${file.count} splats of the file; load it without lod`);
   const height = Math.ceil(file.count / WIDTH);
-  const texture = new DataTexture(texels(file, 2 * WIDTH * height), WIDTH, height, RGFormat, FloatType);
+  const texture = new DataTexture(texels(file, 4 * WIDTH * height), WIDTH, height, RGBAFormat, FloatType);
   texture.needsUpdate = true;
   const columns = new dyno.DynoSampler2D({ key: "clodColumns", value: texture }), s = dyno.dynoFloat(1, "clodScale");
   const eye = mesh.context.viewToObject.translate;
@@ -38,9 +38,9 @@ function attenuated(file) {
     statements: ({ inputs, outputs }) => dyno.unindentLines(`
       ${outputs.gsplat} = ${inputs.gsplat};
       if (isGsplatActive(${outputs.gsplat}.flags)) {
-        vec2 column = texelFetch(${inputs.columns}, ivec2(${outputs.gsplat}.index % ${WIDTH}, ${outputs.gsplat}.index / ${WIDTH}), 0).rg;
+        vec4 column = texelFetch(${inputs.columns}, ivec2(${outputs.gsplat}.index % ${WIDTH}, ${outputs.gsplat}.index / ${WIDTH}), 0);
         float d = length(${outputs.gsplat}.center - ${inputs.eye}) / ${distance};
-        ${outputs.gsplat}.rgba.a = clodOpacity(${outputs.gsplat}.rgba.a, column.r, d, ${inputs.s}, ${near});
+        ${outputs.gsplat}.rgba.a = clodOpacity(column.a > 0.0 ? column.a : ${outputs.gsplat}.rgba.a, column.r, d, ${inputs.s}, ${near});
         ${outputs.gsplat}.scales *= clodScale(column.g, d, ${inputs.s}, ${start});
         if (${outputs.gsplat}.rgba.a == 0.0) ${outputs.gsplat}.flags = 0u;
       }

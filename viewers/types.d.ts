@@ -2,9 +2,11 @@
 export interface DialFile {
   count: number;
   means: Float32Array;
+  /** Opacity logits; of far Gaussians their own, not the ones that hide them. */
+  logits: Float32Array;
   sigma: Float32Array;
   growth: Float32Array;
-  settings: { form: string; scene_distance: number; reference_distance: number; max_sv: number };
+  settings: { form: string; scene_distance: number; reference_distance: number; max_sv: number; near_distance: number };
 }
 
 /** Reads an adapted PLY (binary) or SPZ (versions 2 and 3). */

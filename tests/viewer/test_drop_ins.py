@@ -100,8 +100,9 @@ def assert_the_wgsl_of_playcanvas_gives_the_equation(page: Any, about: dict[str,
     rows, eye = torch.cat(columns, 1)[::20].tolist(), ", ".join(map(str, camera.position.tolist()))
     statements = """
         let center = vec3f(rows[at], rows[at + 1], rows[at + 2]);
-        clod = vec2f(rows[at + 4], rows[at + 5]);
-        var color = vec4f(0, 0, 0, rows[at + 3]);
+        let far = rows[at + 4] > 0.0;  // whose opacity the engine does not know
+        clod = vec4f(rows[at + 4], rows[at + 5], 0.0, select(0.0, rows[at + 3], far));
+        var color = vec4f(0, 0, 0, select(rows[at + 3], 0.0, far));
         var rotation = vec4f(0, 0, 0, 1);
         var scale = vec3f(1);
         modifySplatRotationScale(center, center, &rotation, &scale);
@@ -116,8 +117,8 @@ def assert_the_wgsl_of_playcanvas_gives_the_equation(page: Any, about: dict[str,
         source = f"""
             struct Uniforms {{ {", ".join(members)} }}
             const given = Uniforms(vec3f({eye}), vec2f({s}, 1));
-            var<private> clod: vec2f;
-            fn loadClod() -> vec2f {{ return clod; }}
+            var<private> clod: vec4f;
+            fn loadClod() -> vec4f {{ return clod; }}
             {body}"""
         alpha, scale = torch.tensor(browser.compute(page, source, statements, rows))[:, :2].T
         want = attenuate(
