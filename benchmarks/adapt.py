@@ -66,7 +66,7 @@ def at_shares(model: clod.Gaussians, views: Sequence[clod.View]) -> list[dict[st
     found = []
     for share in SHARES:
         try:
-            solved = clod.dial_for(model, keep=share * len(model), cameras=[view.camera for view in views])
+            solved = clod.dial_for(model, keep=share * model.whole, cameras=[view.camera for view in views])
         except clod.ClodError:
             continue  # out of the dial's reach
         if not solved.note:

@@ -11,7 +11,6 @@ from clod_adapter.errors import ClodError
 from clod_adapter.training.pseudo_views import PseudoView
 from clod_adapter.training.state import OTHER_RUN
 
-UNATTENUATED = 0.25  # of the steps at s = 1: at s = 0 instead, where every Gaussian is as it is stored
 GOLDEN = (5**0.5 - 1) / 2
 
 
@@ -19,7 +18,8 @@ GOLDEN = (5**0.5 - 1) / 2
 class Schedule:
     """What changes over a training; docs/method.md has the measurements."""
 
-    full: float = 0.5  # share of the steps at s = 1 at first, a quarter of these at s = 0
+    full: float = 0.5  # share of the steps at s = 0 and s = 1 at first
+    unattenuated: float = 0.25  # of these: at s = 0, where every Gaussian is as it is stored
     full_final: float = 0.4  # of itself, to which that falls linearly: s = 1 is learned before the far end
     coarse: float = 0.9  # share of the training in which steps beyond s = 1 have photographs of half the size
     lr_final: float = 0.1  # final learning rates as a share of the first ones, between which they decay exponentially
@@ -36,14 +36,14 @@ class Schedule:
         """
         full = self.full * (1 - (1 - self.full_final) * share_done)
         if place < full:
-            return 0.0 if place < UNATTENUATED * full else 1.0
+            return 0.0 if place < self.unattenuated * full else 1.0
         return 1 + (end - 1) * place if self.even else end ** ((place - full) / (1 - full))
 
 
 OURS = Schedule()
 # Of far Gaussians: near ones, which s = 0 shows, are not trained. With coarse 0.9 images at a tenth lose 0.4 dB on the
 # demo, whose photographs are exact, and gain 0.04 dB on plush_half, at less SSIM.
-FAR = replace(OURS, full=0.0, coarse=0.5)
+FAR = replace(OURS, full=0.33, unattenuated=0.0, coarse=0.5)
 # One s ~ U(1, max_sv) a step, of whole photographs; no average of parameters.
 PAPER = Schedule(full=0.0, coarse=0.0, lr_final=0.05, average=0.0, rendered=1.0, counted=0.0, even=True)
 

@@ -1,0 +1,94 @@
+"""Choices of the method against their alternatives: PSNR at equal shares of the Gaussians, one change at a time.
+
+    python benchmarks/choices.py plush_half bonsai146 --names SHARE NEARER full
+    python benchmarks/choices.py SCENE.ply --names PLACED_SHARE PLACED_NEARER      # without photographs
+    python benchmarks/choices.py --table                                           # the rows as a Markdown table
+
+A scene is a folder of the shared data, or a file, whose placed cameras and renders are used. Each run adds one row to
+``results/choices.jsonl``; "default" changes nothing. A choice is a constant of ``training/far.py``, a field of
+``schedule.FAR``, or a field of ``AdaptConfig``.
+"""
+
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import clod_adapter as clod
+from adapt import SHARES, at_shares
+from clod_adapter.training import dial, far
+from clod_adapter.training.pseudo_views import render_pseudo_views
+from clod_adapter.training.schedule import FAR, Schedule
+from common import Row, append, arguments, checkpoint, photographs, stored, table
+from stream import SEED, VIEWS
+
+FILE, MAX_SV = "choices.jsonl", 7.0  # of captures, as adapt.jsonl has them
+ALTERNATIVES: dict[str, tuple[Any, ...]] = {
+    "SHARE": (0.4, 0.6), "NEARER": (0.3, 0.5), "PLACED_SHARE": (0.8,), "PLACED_NEARER": (0.05, 0.2), "LONGER": (1.0,),
+    "full": (0.0, 0.5), "coarse": (0.0, 0.9), "average": (0.0,), "growth": ("off",), "reg_weight": (0.5, 2.0),
+    "lr_sigma": (0.025, 0.1), "lr_growth": (0.006, 0.024), "lr_opacities": (0.05, 0.2), "lr_means": (0.03, 0.12),
+}  # fmt: skip
+
+
+def main() -> None:
+    parser = arguments(__doc__, table=print_table)
+    parser.add_argument("scenes", nargs="*")
+    parser.add_argument("--names", nargs="+", choices=ALTERNATIVES, default=list(ALTERNATIVES))
+    args = parser.parse_args()
+    for scene in args.scenes:
+        base, views = opened(scene)
+        measure(scene, base, views, "default", None)
+        for name in args.names:
+            for value in ALTERNATIVES[name]:
+                measure(scene, base, views, name, value)
+
+
+def opened(scene: str) -> tuple[clod.Gaussians, clod.Scene]:
+    """The checkpoint and the views to train and to measure on."""
+    if not scene.endswith(".ply"):
+        return checkpoint(scene).gaussians, photographs(scene)
+    base = clod.load(scene).gaussians
+    test = render_pseudo_views(base, clod.place_cameras(base, views=VIEWS, seed=SEED)).train
+    return base, clod.Scene(render_pseudo_views(base, clod.place_cameras(base)).train, test)
+
+
+def measure(scene: str, base: clod.Gaussians, views: clod.Scene, name: str, value: Any) -> None:
+    """Adapts with one change, and adds the row."""
+    settings: dict[str, Any] = {} if scene.endswith(".ply") else {"max_sv": MAX_SV}
+    defaults = {each: getattr(far, each) for each in ALTERNATIVES if hasattr(far, each)}
+    try:
+        if name in defaults:
+            setattr(far, name, value)
+        elif name in {each.name for each in fields(Schedule)}:
+            dial.FAR = replace(FAR, **{name: value})
+        elif name != "default":
+            settings[name] = value
+        plan = clod.make_plan(base, views, clod.AdaptConfig(**settings))
+        adapted = plan.adapt(views)
+    finally:
+        dial.FAR = FAR
+        for each, default in defaults.items():
+            setattr(far, each, default)
+    result = plan.whole(base, adapted.gaussians)
+    append(FILE, {
+        "benchmark": "choices", "scene": Path(scene).stem, "choice": name, "value": value, "steps": adapted.steps,
+        "full": clod.evaluate(result, views.test, [1.0])[0].as_dict(), "at_shares": at_shares(result, views.test),
+        "seconds": round(sum(plan.seconds.values()) + adapted.start_seconds + adapted.seconds, 1),
+    })  # fmt: skip
+
+
+def print_table() -> None:
+    """The last row of each scene, choice and value."""
+    last = {(row["scene"], row["choice"], row["value"]): row for row in stored(FILE)}
+    heads = ["scene", "choice", "s = 1", *(f"{share:.0%}" for share in SHARES)]
+    print(table(heads, map(cells, last.values())))
+
+
+def cells(row: Row) -> list[str]:
+    choice = row["choice"] if row["value"] is None else f"{row['choice']} = {row['value']}"
+    found = {each["share"]: f"{each['psnr']:.2f}" for each in row["at_shares"]}
+    full = f"{row['full']['psnr']:.2f} @ {row['full']['kept_share']:.0%}"
+    return [row["scene"], choice, full, *(found.get(share, "") for share in SHARES)]
+
+
+if __name__ == "__main__":
+    main()
