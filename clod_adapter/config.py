@@ -13,6 +13,7 @@ GROWTHS = ("on", "off")
 FARTHEST = 3e38  # world units: a float32, as which distances are divided by it
 LONGEST = 1e6  # dial value of training: its powers stay finite
 STEPS, STEPS_PER_VIEW = 2500, 24.0  # of training, by default, with one view a step
+PLACED_MAX_SV = 8.0  # without photographs, by default: the budgets of viewers of large scenes lie there
 MULTIPLIER = 3.0  # of the distances at which levels of a set begin: PlayCanvas's default
 # Gaussians that viewers draw at most on a device, by their makers; docs/formats.md has the sources.
 DEVICES = {"quest3": 500_000, "phone": 1_000_000, "laptop": 2_000_000, "desktop": 4_000_000}

@@ -21,7 +21,7 @@ def main(model: str, folder: str) -> None:
     scene = clod.load_scene(folder, origin=checkpoint.origin)
     cameras = [view.camera for view in scene.test or scene.train]
     for share in SHARES:
-        show(f"{share:.0%} of the Gaussians", gaussians, keep=share * len(gaussians), cameras=cameras)
+        show(f"{share:.0%} of the Gaussians", gaussians, keep=share * gaussians.whole, cameras=cameras)
     for drop in DROPS:
         show(f"{drop:g} dB given up", gaussians, psnr_drop=drop, calibration=checkpoint.calibration)
     for rate in RATES:

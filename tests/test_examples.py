@@ -75,7 +75,7 @@ def test_budgets(run: Any, dialled: Path, capture: Any) -> None:
     names = ["50% of", "25% of", "10% of", "0.1 dB", "0.5 dB", "1 dB", "10 frames", "30 frames", "60 frames"]
     assert len(printed) == 9 and all(line.startswith(name) for line, name in zip(printed, names, strict=True))
     found = [float(line.partition("s = ")[2].split()[0]) for line in (printed[0], *printed[3:6])]
-    assert 1 < found[0] < 4 and 1 < found[1] <= found[2] <= found[3] <= 4
+    assert 1 < found[0] < 4 and 1 <= found[1] <= found[2] <= found[3] <= 4
     assert "(beyond s = 4, " in printed[2]  # a tenth is less than the far end keeps, and that is said
 
 

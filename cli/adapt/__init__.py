@@ -101,6 +101,6 @@ interrupted without a result
 examples:
   clod-adapt garden.ply --images garden --max-sv 5
   clod-adapt garden.ply --images garden --time-budget 120 --out out/dial.ply
-  clod-adapt garden.ply --max-sv 5
+  clod-adapt garden.ply
   torchrun --nproc-per-node 8 -m clod_adapter garden.ply --images garden
 """

@@ -214,7 +214,7 @@ def judge(run: Run, result: Result) -> tuple[str, bool]:
     else:
         line = f"s = 1 has {full[0]:.2f} dB against the checkpoint's own renderings"
         more, bad, failed = ", or give the photographs (--images)", not full[0] >= ENOUGH[0], not full[0] >= ENOUGH[1]
-    return (f"{line}:\ntrain longer (--iters){more}, or keep the base for full quality" if bad else ""), failed
+    return (f"{line}:\ntrain longer (--iters){more}, or show s = 0, which is the base" if bad else ""), failed
 
 
 def print_summary(run: Run, result: Result, taken: dict[str, float]) -> None:
@@ -232,5 +232,5 @@ def print_summary(run: Run, result: Result, taken: dict[str, float]) -> None:
     images = [] if args.images is None else [f"--images {shlex.quote(args.images)}"]
     print("  clod-adapt view", model, f"--base {shlex.quote(args.ply)}", *images)
     if images:
-        sv = " ".join(f"{s:g}" for s in sorted({1.0, args.max_sv}))
+        sv = " ".join(f"{s:g}" for s in sorted({1.0, run.config.max_sv}))
         print("  clod-adapt eval", model, *images, f"--sv {sv}")

@@ -11,7 +11,7 @@ from site import getuserbase
 from typing import Any, NoReturn
 
 from clod_adapter._support.text import package_version
-from clod_adapter.config import DEVICES, FILTERS, AdaptConfig, AttenuationConfig, field_descriptions
+from clod_adapter.config import DEVICES, FILTERS, PLACED_MAX_SV, AdaptConfig, AttenuationConfig, field_descriptions
 from clod_adapter.errors import ClodError
 from clod_adapter.io.file_formats import PLY, check_readable, file_has_dial, format_of
 from clod_adapter.io.scene.folder import find_cameras
@@ -205,8 +205,8 @@ def check_inputs(scene: str | None, *paths: str) -> None:
 # Training settings, by field of AdaptConfig: metavar, type, and what help says of a default that depends on another
 # option or on the scene.
 SETTINGS: dict[str, tuple[str, Any, str | None]] = {
-    "max_sv": ("S", float, None), "iters": ("N", int, ""), "batch": ("N", int, " (default: 1 per process)"),
-    "time_budget": ("SEC", float, None), "seed": ("N", int, None),
+    "max_sv": ("S", float, f" (default: 5, without photographs {PLACED_MAX_SV:g})"), "iters": ("N", int, ""),
+    "batch": ("N", int, " (default: 1 per process)"), "time_budget": ("SEC", float, None), "seed": ("N", int, None),
     "growth": ("on|off", str, " (default: on, with --form paper off)"),
 }  # fmt: skip
 
@@ -231,6 +231,8 @@ def make_config(args: Namespace) -> AdaptConfig:
     make, size = AdaptConfig.paper if args.form == "paper" else AdaptConfig, launched().size
     try:
         given = {name: value for name in SETTINGS if (value := getattr(args, name)) is not None}
+        if args.images is None:
+            given.setdefault("max_sv", PLACED_MAX_SV)
         config = make(**{"batch": size} | given)
     except ClodError as error:
         name, _, rest = str(error).partition(" ")

@@ -108,7 +108,7 @@ def test_frames_are_timed_together(clod: Any, monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(measure, "time_frames", times)
     monkeypatch.setattr(frame_times, "NOISY", 0.2)
     report = (done := clod("BASE --images SCENE --iters 2 --max-sv 4 --out dial.ply --json")).report
-    assert seen == [[300, 420, 300]]
+    assert seen == [[300, 540, 300]]
     assert [row.frame_ms * row.virtual_scale for row in load("dial.ply").calibration.rows] == pytest.approx([2000] * 5)
     assert (report["base_rows"][0]["frame_ms"], report["detached_row"]["frame_ms"]) == (1000, 3000)
     assert any("frame times are rough: they varied by 50%" in note for note in report["notes"])

@@ -110,7 +110,7 @@ def test_a_dial_and_its_calibration(clod: Any, dialled: Path) -> None:
     assert (first[0], last[0]) == ("1", "4") and all(len(row) == 5 for row in table)
     assert report["command"] == "inspect" and report["path"] == str(dialled)
     assert report["oddities"] == [] and "anomalies" not in report
-    assert splat["count"] == splat["total"] == 420 and splat["columns"][-1] == ["opacity_d", "float32"]
+    assert splat["count"] == splat["total"] == 540 and splat["columns"][-1] == ["opacity_d", "float32"]
     assert {"least", "low", "median", "high", "greatest"} == set(splat["sigma"]) == set(splat["growth"])
     assert splat["dial"]["attenuation"]["max_sv"] == 4 and len(splat["position"]) == 3
     told = json.loads(dialled.with_suffix(".json").read_text())
@@ -124,4 +124,4 @@ def test_adapter(clod: Any) -> None:
     assert "an adapter" in text and "with SHA-256 " in text and "max_sv 4" in text and "\ngrowth_d " in text
     assert "\ndial         sigma_d and growth_d, s = 1 to 4" in text and len(about["growth"]) == 5
     assert about["updates"] == {}
-    assert about["count"] == 420 and about["config"]["iters"] == 12
+    assert about["count"] == 540 and about["config"]["iters"] == 12

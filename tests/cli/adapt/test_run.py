@@ -69,7 +69,7 @@ def test_writes_three_files(adapted: tuple[Path, Any], capture: Any, dialled: Pa
     assert stored.as_dict() == report["calibration"] and stored.machine == machine_name()
     for row, measured in zip(stored.rows, report["rows"], strict=True):
         assert vars(row).items() <= measured.items()
-    assert (stored.total, stored.views, stored.width, stored.height) == (420, 2, 64, 48)
+    assert (stored.total, stored.views, stored.width, stored.height) == (540, 2, 64, 48)
 
 
 def test_prints_progress_a_table_next_commands_and_a_loss(adapted: tuple[Path, Any], capture: Any) -> None:
@@ -203,10 +203,10 @@ def test_the_plan_is_printed_and_stored(clod: Any, wasteful: Path) -> None:
     assert not {"exposure", "alpha", "masks"} & set(table), done  # of which the scene has none
     assert not {"means", "quats", "scales", "opacities", "sh0"} & set(table), done  # listed only if frozen
     stored, seconds = decisions(done), done.report["plan"]["seconds"]
-    assert list(stored) == [*table, "undistortion", "scaling"] and stored["far Gaussians"]["number"] == 140
+    assert list(stored) == [*table, "undistortion", "scaling"] and stored["far Gaussians"]["number"] == 280
     assert set(seconds) == {"bands", "start"} and done.report["seconds"]["plan"] > 0
     base, whole = (clod_adapter.load(path).gaussians for path in (wasteful, "dial.ply"))
-    assert (whole.whole, len(whole)) == (350, 490) and clod_adapter.detach(whole) == base
+    assert (whole.whole, len(whole)) == (350, 630) and clod_adapter.detach(whole) == base
     assert rebuilt(clod, wasteful)
 
 
@@ -220,4 +220,4 @@ def test_overrides(clod: Any, wasteful: Path) -> None:
     assert others == {"means": "frozen", "quats": "frozen"}
     assert re.search(r"^  quats +frozen +- +--with quats$", done.err, re.M), done
     adapter = clod_adapter.load_adapter("dial.safetensors")
-    assert not adapter.updates and len(adapter.added["means"]) == 140
+    assert not adapter.updates and len(adapter.added["means"]) == 280
