@@ -20,10 +20,12 @@ from skimage.metrics import peak_signal_noise_ratio as psnr_of
 from clod_adapter.cameras import View
 from clod_adapter.errors import ClodError
 from clod_adapter.io.scene import colmap
+from clod_adapter.io.scene.colmap import load_points
 from clod_adapter.io.scene.folder import scene_files
 from clod_adapter.io.scene.load import load_cameras, load_scene
 from clod_adapter.progress import Stopped
-from photographs import LENSES, SIZE, camera, model_of, pixels, seen, write_scene
+from models import write_model
+from photographs import LENSES, SIZE, camera, model_of, pixels, seen, write_images, write_scene
 
 
 @pytest.fixture(autouse=True)
@@ -92,16 +94,15 @@ def test_model_and_images_are_found_in_other_folders(tmp_path: Path) -> None:
         load_scene(tmp_path / "images" / "deeper")
 
 
-@pytest.mark.parametrize("file", ["cameras", "images", "points3D", "rigs", "frames"])
+@pytest.mark.parametrize("file", ["cameras", "images", "points3D"])
 def test_records_beyond_the_file_are_refused(tmp_path: Path, file: str) -> None:
-    """Handed to COLMAP as it is, a cut points3D.bin makes it allocate until memory runs out."""
     path = model_of(tmp_path, **PINHOLES) / f"{file}.bin"
     data = path.read_bytes()
     counts = [count.to_bytes(8, "little") + data[8:] for count in (1 << 31, (1 << 64) - 1)]
     for content in (*counts, b"", data[: len(data) // 2], data[:-1]):
         path.write_bytes(content)
         with pytest.raises(ClodError, match=f"{file}.bin: is truncated or damaged"):
-            load_scene(tmp_path)
+            (load_points if file == "points3D" else load_scene)(tmp_path)
 
 
 write = Path.write_bytes
@@ -110,16 +111,16 @@ write = Path.write_bytes
 @pytest.mark.parametrize(
     ("form", "change", "message"),
     [
-        ("text", lambda at: write(at / "images.txt", b"1 nonsense\n\n"), "COLMAP cannot read this model"),
+        ("text", lambda at: write(at / "images.txt", b"\n1 nonsense\n"),
+         "images.txt: is truncated or damaged .line 2 is neither an image"),
+        ("text", lambda at: write(at / "cameras.txt", b"2 PINHOLE 40 30 33 33 20 15\n"), "camera 1, .*not in cameras"),
+        ("text", lambda at: write(at / "cameras.txt", b"1 PINHOLE 40 30 33 33 20\n"), "camera 1 has 3 parameters"),
         ("text", lambda at: write(at / "cameras.txt", b"1 PINHOLE 40 30 %b 33 20 15\n" % (b"1" * 10_000)),
          "cameras.txt: .*a number of more than 1,000 digits"),
         ("text", lambda at: write(at / "images.txt", (at / "images.txt").read_bytes().replace(b"sub/b.png", b"a.png")),
          "has image a.png more than once"),
-        ("text", lambda at: os.mkfifo(at / "rigs.bin"), "rigs.bin: .*not a regular file"),
-        # COLMAP reads a quaternion of zeros as no rotation
-        ("binary", lambda at: [write(at / name, (data := (at / name).read_bytes())[:k] + bytes(32) + data[k + 32 :])
-                               for name, k in (("images.bin", 12), ("frames.bin", 16))],
-         "image 'a.png' has a camera or pose that is not usable"),
+        *(("text", lambda at, w=w: write(at / "images.txt", b"1 %b 0 0 0 0 0 0 1 a.png\n" % w), "has no rotation")
+          for w in (b"0", b"nan")),
         *(("binary", lambda at, lens=lens: model_of(at.parents[1], *lens, **SIZE), f"image 'a.png' has .*{message}")
           for *lens, message in (
               ("EQUIRECTANGULAR", [160, 120], "EQUIRECTANGULAR, no perspective camera"),
@@ -131,6 +132,32 @@ def test_unusable_models_are_refused(tmp_path: Path, form: str, change: Callable
     change(model_of(tmp_path, **PINHOLES, form=form))
     with pytest.raises(ClodError, match=message):
         load_scene(tmp_path)
+
+
+def test_text_models_of_other_programs(tmp_path: Path) -> None:
+    """Without blank lines or points, with names that have spaces and quaternions of any length."""
+    write_model(tmp_path, [camera(0), camera(1), camera(2)], names := ["a b.png", "c.png", "d  e 2.png"])
+    write_images(tmp_path / "images", names)
+    folder = tmp_path / "sparse" / "0"
+    pycolmap.Reconstruction(str(folder)).write_text(str(folder))
+    for file in (*folder.glob("*.bin"), folder / "points3D.txt", folder / "rigs.txt", folder / "frames.txt"):
+        file.unlink()
+    file, header, images = folder / "images.txt", list[str](), list[str]()
+    for line in file.read_text().splitlines():
+        if line.startswith("#"):
+            header.append(line)
+        elif line:
+            number, *quat, rest = line.split(maxsplit=5)
+            images.append(" ".join([number, *(str(1.02 * float(value)) for value in quat), rest]))
+    for end in ("\n", "\n\n", "\n1.5 2.5 -1 3 4 7\n", "\r\n\r\n"):
+        file.write_text("\n".join(header) + "\n" + end.join(images))
+        loaded = load_scene(tmp_path)
+        assert loaded.notes == () and len(load_points(tmp_path)) == 0
+        for view in (*loaded.train, *loaded.test):
+            viewmat = camera(names.index(view.camera.name)).viewmat
+            torch.testing.assert_close(view.camera.viewmat, viewmat, atol=1e-6, rtol=0)
+    file.write_text("\n".join([*header, *images[1:]]))
+    assert load_scene(tmp_path).notes == ("images.txt has 2 images, but its header says 3: it may be incomplete",)
 
 
 def test_without_pycolmap_the_error_says_where_it_is(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,19 +1,24 @@
-"""COLMAP models: posed images and points; damaged ones are refused before COLMAP reads them."""
+"""COLMAP models: posed images and points, from binary or text files.
+
+Source: COLMAP's documentation, "Output Format".
+"""
 
 from __future__ import annotations
 
+import re
 import struct
-from collections.abc import Sequence
-from copy import copy
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 
 from clod_adapter.errors import ClodError, refused_if_damaged
 from clod_adapter.io.file_formats import read_bytes, refuse_long_numbers
-from clod_adapter.io.scene.folder import find_cameras, name_parts
+from clod_adapter.io.scene.folder import FORMS, find_cameras, form_of, name_parts
 from clod_adapter.origin import NOWHERE
 
 try:
@@ -23,6 +28,8 @@ except ModuleNotFoundError as error:
     raise ClodError(f"cameras and photographs are read with pycolmap, which is not installed: {fix}") from error
 
 TEST_EVERY = 8  # one view in this many is held out
+DAMAGED = "is truncated or damaged"
+START = 4096  # bytes of a text file that hold its header
 HUGE = 1e9  # world units and pixels; larger values are damage, and may not fit float32
 
 
@@ -47,6 +54,15 @@ class PosedImage:
         return replace(self, viewmat=viewmat)
 
 
+class Image(NamedTuple):
+    """An image as a model's file has it."""
+
+    name: str
+    quat: Sequence[float]  # w first, of any length; world to camera
+    translation: Sequence[float]
+    camera: int  # its number
+
+
 def held_out(images: Sequence[PosedImage], test_every: int) -> set[str]:
     """Names of the test images: those that the scene marks, else the 0th and every ``test_every``-th of several."""
     if any(image.held_out is not None for image in images):
@@ -68,79 +84,134 @@ def check_posed(image: PosedImage, source: Path) -> PosedImage:
 
 
 def read_colmap(model: Path) -> tuple[list[PosedImage], list[str]]:
-    """The registered images of a model, sorted by name, and notes."""
-    _check_records(model)
-    with refused_if_damaged(model, "COLMAP cannot read this model"):
-        reconstruction = pycolmap.Reconstruction(str(model))
-        images = sorted(reconstruction.images.values(), key=lambda image: image.name)
-        for image in images:
-            name_parts(image.name, model)
-        posed = [_posed_image(model, image) for image in images if image.has_pose]
+    """The images of a model, sorted by name, and notes."""
+    form = form_of(model)
+    path = model / f"images{form}"
+    cameras = _cameras(model / f"cameras{form}")
+    with refused_if_damaged(path, DAMAGED):
+        records = sorted((_images if form == ".bin" else _images_in_text)(path))
+        stated = re.search(rb"^# *Number of images: *(\d+)", read_bytes(path, START), re.MULTILINE)
+    posed = []
+    for name, quat, translation, camera in records:
+        name_parts(name, path)
+        if camera not in cameras:
+            raise ClodError(f"{path}: image {name!r} has camera {camera}, which is not in cameras{form}; export both")
+        viewmat = np.eye(4)
+        with refused_if_damaged(path, f"image {name!r} has no rotation"):
+            viewmat[:3, :3] = Rotation.from_quat(np.roll(quat, -1)).as_matrix()  # of any length; scipy has w last
+        viewmat[:3, 3] = translation
+        posed.append(check_posed(PosedImage(name, viewmat, cameras[camera]), model))
     if not posed:
         raise ClodError(f"{model}: the model has no registered image; run COLMAP's mapper again")
-    unposed = len(images) - len(posed)
-    return posed, [f"{unposed} images of the model have no pose and are left out"] if unposed else []
+    if stated is None or int(stated[1]) == len(posed):
+        return posed, []
+    return posed, [f"{path.name} has {len(posed)} images, but its header says {int(stated[1])}: it may be incomplete"]
 
 
 def load_points(folder: str | Path, origin: Sequence[float] = NOWHERE) -> torch.Tensor:
     """``[M, 3]`` float64, the points of the scene's COLMAP model less ``origin``; none without a model."""
-    model = find_cameras(Path(folder))
-    points = pycolmap.Reconstruction(str(model)).points3D.values() if model.is_dir() else ()
-    return torch.from_numpy(np.array([point.xyz for point in points], np.float64).reshape(-1, 3) - origin)
+    model, points = find_cameras(Path(folder)), list[Sequence[float]]()
+    path = next((file for form in FORMS if (file := model / f"points3D{form}").is_file()), None)
+    if path is not None:
+        with refused_if_damaged(path, DAMAGED):
+            points += (_points if path.suffix == ".bin" else _points_in_text)(path)
+    return torch.from_numpy(np.array(points, np.float64).reshape(-1, 3) - origin)
 
 
-def _posed_image(model: Path, image: pycolmap.Image) -> PosedImage:
-    assert image.camera is not None  # a Reconstruction gives every image its camera
-    pose = image.cam_from_world()
-    viewmat = np.vstack([pose.matrix(), [0, 0, 0, 1]])
-    if hasattr(pose, "rotation") and not np.linalg.norm(pose.rotation.quat) > 0.5:
-        viewmat[:3, :3] = np.nan  # pycolmap takes a quaternion of no length for no rotation
-    # A copy, as the image's own is part of the whole reconstruction and keeps it in memory.
-    return check_posed(PosedImage(image.name, viewmat, copy(image.camera)), model)
+def _cameras(path: Path) -> dict[int, pycolmap.Camera]:
+    cameras = {}
+    with refused_if_damaged(path, DAMAGED):
+        for camera, params in (_camera_records if path.suffix == ".bin" else _cameras_in_text)(path):
+            if len(params) != len(camera.params):
+                raise ValueError(f"camera {camera.camera_id} has {len(params)} parameters")
+            camera.params = params
+            cameras[camera.camera_id] = camera
+    return cameras
 
 
-def _check_records(model: Path) -> None:
-    """Refuses long numbers and cut binary records, as COLMAP reads past the end of these until memory runs out."""
-    for name, after in _RECORDS.items():
-        path = model / name
-        if (text := path.with_suffix(".txt")).exists():
-            refuse_long_numbers(text, read_bytes(text))
-        if not path.exists():
+class _Records:
+    """The values of a binary file, from its start on; COLMAP's own reader reads past the end of a cut one."""
+
+    def __init__(self, path: Path) -> None:
+        self.data, self.at = read_bytes(path), 0
+
+    def take(self, layout: str) -> tuple[Any, ...]:
+        values = struct.unpack_from(f"<{layout}", self.data, self.at)
+        self.at += struct.calcsize(f"<{layout}")
+        return values
+
+    def take_name(self) -> str:
+        start, end = self.at, self.data.index(b"\0", self.at)
+        self.at = end + 1
+        return self.data[start:end].decode("utf-8", "surrogateescape")
+
+    def skip(self, size: int) -> None:
+        self.at += size
+        if self.at > len(self.data):
+            raise ValueError(f"a record ends at byte {self.at} of {len(self.data)}")
+
+
+def _camera_records(path: Path) -> Iterator[tuple[pycolmap.Camera, list[float]]]:
+    records = _Records(path)
+    for _ in range(*records.take("Q")):
+        number, kind, width, height = records.take("IiQQ")
+        camera = pycolmap.Camera.create_from_model_id(number, pycolmap.CameraModelId(kind), 1.0, width, height)
+        yield camera, list(records.take(f"{len(camera.params)}d"))
+
+
+def _images(path: Path) -> Iterator[Image]:
+    records = _Records(path)
+    for _ in range(*records.take("Q")):
+        _, *pose, camera = records.take("I7dI")
+        yield Image(records.take_name(), pose[:4], pose[4:], camera)
+        records.skip(24 * records.take("Q")[0])  # keypoints
+
+
+def _points(path: Path) -> Iterator[Sequence[float]]:
+    records = _Records(path)
+    for _ in range(*records.take("Q")):
+        _, x, y, z, *_, observations = records.take("Q3d3BdQ")  # id, position, colour, error
+        yield x, y, z
+        records.skip(8 * observations)
+
+
+def _lines(path: Path) -> Iterator[tuple[int, bytes]]:
+    """Number and content of the lines that are neither blank nor comments."""
+    text = read_bytes(path)
+    refuse_long_numbers(path, text)
+    for number, line in enumerate(map(bytes.strip, text.splitlines()), start=1):
+        if line and not line.startswith(b"#"):
+            yield number, line
+
+
+def _cameras_in_text(path: Path) -> Iterator[tuple[pycolmap.Camera, list[float]]]:
+    for _, line in _lines(path):
+        number, kind, width, height, *params = line.split()
+        camera = pycolmap.Camera.create_from_model_name(int(number), kind.decode(), 1.0, int(width), int(height))
+        yield camera, [float(value) for value in params]
+
+
+def _images_in_text(path: Path) -> Iterator[Image]:
+    """An image's line is followed by one of its keypoints, which is blank or missing where there are none."""
+    may_be_keypoints = False
+    for number, line in _lines(path):
+        if may_be_keypoints and _is_keypoints(line):
+            may_be_keypoints = False
             continue
-        data, at = read_bytes(path), 8
-        with refused_if_damaged(path, "is truncated or damaged", "copy or export the model again"):
-            for _ in range(_count(data, 0)):
-                at = after(data, at)
-            if at > len(data):
-                raise ValueError(f"its records end at byte {at} of {len(data)}")
+        fields = line.split(maxsplit=9)  # a name may have spaces
+        if len(fields) < 10:
+            raise ValueError(f"line {number} is neither an image with its camera and name nor keypoints of one")
+        pose = [float(value) for value in fields[1:8]]
+        yield Image(fields[9].decode("utf-8", "surrogateescape"), pose[:4], pose[4:], int(fields[8]))
+        may_be_keypoints = True
 
 
-def _count(data: bytes, at: int) -> int:
-    return struct.unpack_from("<Q", data, at)[0]
+def _is_keypoints(line: bytes) -> bool:
+    """Whether the line has x, y and the number of a point, -1 for none, of each keypoint."""
+    fields = line.split()
+    return len(fields) % 3 == 0 and fields[-1].removeprefix(b"-").isdigit()
 
 
-def _camera_end(data: bytes, at: int) -> int:
-    model = pycolmap.CameraModelId(struct.unpack_from("<i", data, at + 4)[0])
-    parameters = pycolmap.Camera.create_from_model_id(1, model, 1.0, 1, 1).params  # ValueError: no such model
-    return at + 24 + 8 * len(parameters)  # id, model, width, height, parameters
-
-
-def _rig_end(data: bytes, at: int) -> int:
-    sensors = struct.unpack_from("<I", data, at + 4)[0]
-    at += 16 if sensors else 8  # id, count, the reference sensor
-    for _ in range(sensors - 1):
-        at += 65 if struct.unpack_from("<?", data, at + 8)[0] else 9  # sensor, whether it has a pose, the pose
-    return at
-
-
-# Where the record that starts at a position ends, by file.
-_RECORDS = {
-    "cameras.bin": _camera_end,
-    "rigs.bin": _rig_end,
-    # id, rotation, translation, camera id, name, keypoints
-    "images.bin": lambda data, at: (end := data.index(b"\0", at + 64) + 1) + 8 + 24 * _count(data, end),
-    # id, position, colour, error, track
-    "points3D.bin": lambda data, at: at + 51 + 8 * _count(data, at + 43),
-    # id, rig id, rotation, translation, members (the count has 32 bits here)
-    "frames.bin": lambda data, at: at + 68 + 16 * struct.unpack_from("<I", data, at + 64)[0],
-}
+def _points_in_text(path: Path) -> Iterator[Sequence[float]]:
+    for _, line in _lines(path):
+        yield [float(value) for value in line.split(maxsplit=4)[1:4]]

@@ -18,6 +18,7 @@ from clod_adapter.io.file_formats import read_bytes, refuse_long_numbers
 TRANSFORMS = ("transforms_train.json", "transforms.json")
 DATAPARSER = "dataparser_transforms.json"  # nerfstudio's: the frame it trained in
 DESCRIPTIONS = (*TRANSFORMS, "transforms_test.json", "transforms_val.json", DATAPARSER)
+FORMS = (".bin", ".txt")  # of the files of a COLMAP model, the preferred first
 PATHS = ("file_path", "mask_path", "depth_file_path")  # of a frame
 PHOTOGRAPHS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp")
 ENDINGS = ("", ".png", ".jpg", ".jpeg")  # that the path of a frame may omit
@@ -37,15 +38,17 @@ def find_cameras(folder: Path) -> Path:
     beside = folder.resolve().parent / "sparse"
     files = [folder / name for name in TRANSFORMS]
     for each in (folder / "sparse" / "0", folder / "sparse", folder, *files, beside / "0", beside):
-        if each.is_file() if each in files else _is_model(each):
+        if each.is_file() if each in files else form_of(each):
             return each
-    what = "no COLMAP model (cameras, images, points3D; .bin or .txt) in it, sparse or sparse/0, and no transforms.json"
+    what = "no COLMAP model (cameras, images; .bin or .txt) in it, sparse or sparse/0, and no transforms.json"
     raise ClodError(f"{folder}: {what}; give the folder that holds images/ and sparse/0, or transforms.json")
 
 
-def _is_model(folder: Path) -> bool:
-    names = "cameras", "images", "points3D"
-    return any(all((folder / f"{name}.{suffix}").is_file() for name in names) for suffix in ("bin", "txt"))
+def form_of(folder: Path) -> str:
+    """Which of FORMS a folder's COLMAP model has, empty without one; trainers need no points."""
+    return next(
+        (form for form in FORMS if all((folder / f"{name}{form}").is_file() for name in ("cameras", "images"))), ""
+    )
 
 
 def photograph_folders(folder: Path, cameras: Path) -> list[Path]:
