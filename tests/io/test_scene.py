@@ -79,6 +79,20 @@ def test_train_and_test_split(tmp_path: Path) -> None:
         load_scene(tmp_path / "10", progress=lambda now: False)
 
 
+def test_split_of_the_scene_is_used(tmp_path: Path) -> None:
+    names = sorted(write_scene(tmp_path, 10)[1])
+    for listed, note in (
+        ([names[2], names[9], "other.png"], "held out are 2 photographs, those of test.txt"),
+        (["other.png"], "test.txt holds out none of the photographs and is not used"),
+        (names, "test.txt holds out all of the photographs and is not used"),
+    ):
+        (tmp_path / "sparse" / "0" / "test.txt").write_text("\n".join(listed) + "\n")
+        loaded, cameras = load_scene(tmp_path), load_cameras(tmp_path, training=True)[0]
+        held_out = [view.camera.name for view in loaded.test]
+        assert loaded.notes == (note,) and held_out == (listed[:2] if len(listed) == 3 else [names[0], names[8]])
+        assert [camera.name for camera in cameras] == [name for name in names if name not in held_out]
+
+
 def test_model_and_images_are_found_in_other_folders(tmp_path: Path) -> None:
     write_scene(tmp_path, 2)
     folder = tmp_path / "sparse" / "0"

@@ -61,6 +61,22 @@ def test_blender_files(tmp_path: Path) -> None:
     assert ([view.camera.name for view in loaded.test], len(loaded.train)) == (["train/r_0.png"], 2)
 
 
+def test_lists_of_nerfstudio_are_its_split(tmp_path: Path) -> None:
+    """What it does not train on is held out, in a list or in none; paths without an extension as in the frames."""
+    names = [f"./images/{i}" for i in range(6)]
+    frames = [{"file_path": name, "transform_matrix": to_world(i)} for i, name in enumerate(names)]
+    write_images(tmp_path, [f"{name}.png" for name in names])
+    both = {"val_filenames": names[1:2], "test_filenames": names[4:5]}
+    for lists, want in (({"train_filenames": names[2:], **both}, [0, 1]), (both, [1, 4])):
+        write_frames(tmp_path, frames, **INTRINSICS, **lists)
+        loaded = load_scene(tmp_path)
+        assert [view.camera.name for view in loaded.test] == [f"images/{i}.png" for i in want]
+        assert loaded.notes == ("held out are 2 photographs, those of the lists of transforms.json",)
+    write_frames(tmp_path, frames, **INTRINSICS, test_filenames=[3])
+    with pytest.raises(ClodError, match="transforms.json: test_filenames is no list of file names"):
+        load_scene(tmp_path)
+
+
 def test_instant_ngp_file(tmp_path: Path) -> None:
     """Angles in place of focal lengths; one focal length for both axes; JPEGs under names without an extension."""
     angles = {"camera_angle_x": 1.0, "camera_angle_y": 0.8}

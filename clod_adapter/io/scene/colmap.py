@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Sequence, Set
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -30,6 +30,7 @@ except ModuleNotFoundError as error:
 TEST_EVERY = 8  # one view in this many is held out
 DAMAGED = "is truncated or damaged"
 START = 4096  # bytes of a text file that hold its header
+SPLIT = "test.txt"  # beside a model, the names of its test images, as Inria's and Hierarchical-3DGS's code has it
 HUGE = 1e9  # world units and pixels; larger values are damage, and may not fit float32
 
 
@@ -70,6 +71,16 @@ def held_out(images: Sequence[PosedImage], test_every: int) -> set[str]:
     return {image.name for image in images[::test_every]} if len(images) > 1 else set()
 
 
+def marked(images: list[PosedImage], testing: Set[str], source: str) -> tuple[list[PosedImage], list[str]]:
+    """The images, those of these names held out, and a note; unchanged where the names are those of all or none."""
+    count = sum(image.name in testing for image in images)
+    if not 0 < count < len(images):
+        some = "all" if count else "none"
+        return images, [f"{source} holds out {some} of the photographs and is not used"]
+    note = f"held out are {count} photographs, those of {source}"
+    return [replace(image, held_out=image.name in testing) for image in images], [note]
+
+
 def check_posed(image: PosedImage, source: Path) -> PosedImage:
     """The image; refuses a camera or pose that is not finite, too large, or cannot become a pinhole."""
     camera = image.camera
@@ -103,9 +114,14 @@ def read_colmap(model: Path) -> tuple[list[PosedImage], list[str]]:
         posed.append(check_posed(PosedImage(name, viewmat, cameras[camera]), model))
     if not posed:
         raise ClodError(f"{model}: the model has no registered image; run COLMAP's mapper again")
-    if stated is None or int(stated[1]) == len(posed):
-        return posed, []
-    return posed, [f"{path.name} has {len(posed)} images, but its header says {int(stated[1])}: it may be incomplete"]
+    notes = []
+    if stated is not None and int(stated[1]) != len(posed):
+        notes.append(f"{path.name} has {len(posed)} images, but its header says {int(stated[1])}: it may be incomplete")
+    if (split := model / SPLIT).is_file():
+        lines = read_bytes(split).decode("utf-8-sig", "surrogateescape").splitlines()
+        posed, more = marked(posed, {line.strip() for line in lines}, SPLIT)
+        notes += more
+    return posed, notes
 
 
 def load_points(folder: str | Path, origin: Sequence[float] = NOWHERE) -> torch.Tensor:

@@ -2,7 +2,7 @@
 
 import math
 from collections import ChainMap
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -15,12 +15,14 @@ import pycolmap
 
 from clod_adapter._support.text import file_name
 from clod_adapter.errors import ClodError
-from clod_adapter.io.scene.colmap import HUGE, PosedImage, check_posed
+from clod_adapter.io.scene.colmap import HUGE, PosedImage, check_posed, marked
 from clod_adapter.io.scene.folder import DATAPARSER, ENDINGS, name_parts, read_json
 from clod_adapter.io.scene.images import image_size
 
 FISHEYE = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 PERSPECTIVE = ("", "SIMPLE_PINHOLE", "PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+
+LISTS = ("train_filenames", "val_filenames", "test_filenames")  # nerfstudio's, in its transforms.json
 
 
 def read_transforms(path: Path) -> tuple[list[PosedImage], list[str]]:
@@ -35,7 +37,8 @@ def read_transforms(path: Path) -> tuple[list[PosedImage], list[str]]:
     A ``file_path`` without an extension gets .png, .jpg or .jpeg, the first that is there.
 
     The frames of ``transforms_train.json`` are for training and those of ``transforms_test.json`` beside it, where
-    it is there, are held out.
+    it is there, are held out; else those that the lists ``train_filenames``, ``val_filenames`` and ``test_filenames``
+    of one file hold out.
 
     Source: nerfstudio's documentation, "Data conventions"; instant-ngp's ``scripts/colmap2nerf.py``.
     """
@@ -53,25 +56,42 @@ def _frames(path: Path, held_out: bool | None) -> tuple[list[PosedImage], list[s
     frames = content.get("frames")
     if not isinstance(frames, list) or not frames:
         raise ClodError(f"{path}: has no list of frames; give nerfstudio's or instant-ngp's transforms.json")
-    images = []
+    images, testing, is_test = [], set(), _split(path, content)
     for number, frame in enumerate(frames):
         if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
             raise ClodError(f"{path}: frame {number} has no file_path; export the file again")
-        name = "/".join(name_parts(frame["file_path"], path))
+        listed = "/".join(name_parts(frame["file_path"], path))
         # isfile, as it is False for what can be no path
-        name = next((name + end for end in ENDINGS if isfile(path.parent / file_name(name + end))), name)
+        name = next((listed + end for end in ENDINGS if isfile(path.parent / file_name(listed + end))), listed)
+        if is_test and is_test(listed):
+            testing.add(name)
         where = f"{path}: frame {name}"
         camera = _camera(where, path.parent / file_name(name), ChainMap(frame, content))
         pose, viewmat = read_pose(where, frame, "transform_matrix"), np.eye(4)
         viewmat[:3, :3] = (pose[:3, :3] @ np.diag([1.0, -1.0, -1.0])).T
         viewmat[:3, 3] = -viewmat[:3, :3] @ pose[:3, 3]
         images.append(check_posed(PosedImage(name, viewmat, camera, held_out), path))
-    notes = []
+    notes = list[str]()
+    if is_test and held_out is None:
+        images, notes = marked(images, testing, f"the lists of {path.name}")
     if "applied_transform" in content and not path.with_name(DATAPARSER).is_file():
         notes.append(f"{path.name} turned COLMAP's world (applied_transform): a checkpoint of the turned one is needed")
     if any("mask_path" in frame for frame in frames):
         notes.append(f"the masks of {path.name} are not used")
     return images, notes
+
+
+def _split(path: Path, content: Mapping[str, Any]) -> Callable[[str], bool] | None:
+    """Whether nerfstudio's lists hold out a photograph: it does not train on it; None without lists."""
+    lists = {}
+    for key in LISTS:
+        if (given := content.get(key)) is not None:
+            if not isinstance(given, list) or not all(isinstance(name, str) for name in given):
+                raise ClodError(f"{path}: {key} is no list of file names; correct or remove it")
+            lists[key] = {"/".join(name_parts(name, path)) for name in given}
+    if "train_filenames" in lists:
+        return lambda name: name not in lists["train_filenames"]
+    return (lambda name: any(name in names for names in lists.values())) if lists else None
 
 
 def read_pose(where: object, values: Mapping[str, Any], key: str) -> np.ndarray:
