@@ -215,6 +215,22 @@ def test_smaller_copies_replace_missing_images(tmp_path: Path) -> None:
         load_scene(tmp_path)
 
 
+def test_photographs_of_another_suffix_or_case_are_found(tmp_path: Path) -> None:
+    """One for each name: of two that differ in nothing else, or are claimed by two names, none is taken."""
+    names = ["a.JPG", "b.png", "C/c.png", "d.png", "d.jpg", "e.png", "f.png"]
+    write_model(tmp_path, [camera(i) for i in range(7)], names)
+    write_images(tmp_path / "images", ["A.png", "b.PNG", "C/c.tif", "d.webp", "e.jpg", "e.bmp", "f.png"])
+    loaded = load_scene(tmp_path)
+    found = sorted([*loaded.train, *loaded.test], key=lambda view: view.camera.name)
+    assert [view.camera.name for view in found] == ["C/c.png", "a.JPG", "b.png", "f.png"]
+    for view, seed in zip(found, (2, 0, 1, 6), strict=True):
+        np.testing.assert_array_equal(view.image, pixels(seed))
+    assert loaded.notes == (
+        "3 of 7 photographs have another suffix or case, such as c.tif in images",
+        "3 of 7 photographs are missing and left out (d.jpg, d.png, e.png)",
+    )
+
+
 def test_wide_images_are_scaled_with_their_intrinsics(tmp_path: Path) -> None:
     write_scene(tmp_path, 3)
     loaded = load_scene(tmp_path, max_width=15)

@@ -91,6 +91,15 @@ def test_instant_ngp_file(tmp_path: Path) -> None:
     assert view.camera.K.tolist() == [[30, 0, 20], [0, 30, 15], [0, 0, 1]]
 
 
+def test_size_of_a_photograph_of_another_suffix(tmp_path: Path) -> None:
+    frames = [{"file_path": name, "transform_matrix": to_world(0)} for name in ("a.jpg", "b")]
+    write_frames(tmp_path, frames, fl_x=30.0)
+    write_images(tmp_path, ["a.png", "b.WEBP"])
+    loaded = load_scene(tmp_path)
+    assert (loaded.train[0].camera.width, loaded.test[0].camera.width) == (40, 40)
+    assert loaded.notes == (f"2 of 2 photographs have another suffix or case, such as a.png in {tmp_path.name}",)
+
+
 LENS = {"k1": -0.15, "k2": 0.05, "p1": 0.004, "p2": -0.003}
 ROUND = {"k1": 0.03, "k2": -0.01, "k3": 0.002, "k4": 0.001}
 

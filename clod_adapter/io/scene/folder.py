@@ -5,7 +5,7 @@ Needs neither pycolmap nor torch, so that a wrong folder is refused before they 
 
 import json
 import os
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from os.path import isfile
 from pathlib import Path, PureWindowsPath
@@ -68,13 +68,16 @@ def find_photographs(
     All are from the one of ``photograph_folders`` that has most of them; ``input`` is one of these only with ``raw``:
     where the cameras are pinholes, Inria's code made them together with other photographs.
     """
-    parts = [tuple(map(file_name, name_parts(name, cameras))) for name in names]
+    parts = [name_parts(name, cameras) for name in names]
     if twice := [name for name, count in Counter(names).items() if count > 1]:
         raise ClodError(f"{cameras}: has image {twice[0]} more than once; export it again")
     roots = [each for each in photograph_folders(folder, cameras) if raw or each.name != RAW or each == folder]
-    found = [([path if isfile(path := root.joinpath(*each)) else None for each in parts], root) for root in roots]
-    paths, root = min(found, key=lambda candidates: candidates[0].count(None))
+    found = [(*find_files(root, parts), root) for root in roots]
+    paths, others, root = min(found, key=lambda candidates: (candidates[0].count(None), len(candidates[1])))
     notes = []
+    if others:
+        example = as_text(f"{others[0].name} in {root.name}")
+        notes.append(f"{len(others)} of {len(names)} photographs have another suffix or case, such as {example}")
     if root.name in (*SMALLER, RAW) and root != folder:
         notes.append(f"the photographs are those in {root.name}, as there are more than in images")
     missing = [as_text(str(Path(*each))) for each, path in zip(parts, paths, strict=True) if path is None]
@@ -88,6 +91,28 @@ def find_photographs(
             raise ClodError(f"{root}: {what}; put them there under these names")
         notes.append(f"{len(missing)} of {len(names)} photographs are missing and left out {some}")
     return paths, notes
+
+
+def find_files(root: Path, parts: Sequence[tuple[str, ...]]) -> tuple[list[Path | None], list[Path]]:
+    """The files of these names, and which of them have another suffix or case.
+
+    In place of a missing one that is the only photograph of the same name otherwise, if no other name stands for it.
+    """
+    named = [root.joinpath(*map(file_name, each)) for each in parts]
+    missing = [path for path in named if not isfile(path)]
+    there = defaultdict[Path, list[Path]](list)
+    for folder in {path.parent for path in missing}:
+        for path in folder.glob("*"):
+            if path.suffix.lower() in PHOTOGRAPHS:
+                there[_without_suffix(path)].append(path)
+    count = Counter(map(_without_suffix, named))
+    others = {path: there[key][0] for path in missing if len(there[key := _without_suffix(path)]) == count[key] == 1}
+    absent = set(missing) - set(others)
+    return [None if path in absent else others.get(path, path) for path in named], list(others.values())
+
+
+def _without_suffix(path: Path) -> Path:
+    return path.with_name(path.stem.casefold())
 
 
 def name_parts(name: str, cameras: Path) -> tuple[str, ...]:

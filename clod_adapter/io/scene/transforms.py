@@ -16,7 +16,7 @@ import pycolmap
 from clod_adapter._support.text import file_name
 from clod_adapter.errors import ClodError
 from clod_adapter.io.scene.colmap import HUGE, PosedImage, check_posed, marked
-from clod_adapter.io.scene.folder import DATAPARSER, ENDINGS, name_parts, read_json
+from clod_adapter.io.scene.folder import DATAPARSER, ENDINGS, find_files, name_parts, read_json
 from clod_adapter.io.scene.images import image_size
 
 FISHEYE = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
@@ -56,17 +56,21 @@ def _frames(path: Path, held_out: bool | None) -> tuple[list[PosedImage], list[s
     frames = content.get("frames")
     if not isinstance(frames, list) or not frames:
         raise ClodError(f"{path}: has no list of frames; give nerfstudio's or instant-ngp's transforms.json")
-    images, testing, is_test = [], set(), _split(path, content)
+    listed = []
     for number, frame in enumerate(frames):
         if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
             raise ClodError(f"{path}: frame {number} has no file_path; export the file again")
-        listed = "/".join(name_parts(frame["file_path"], path))
-        # isfile, as it is False for what can be no path
-        name = next((listed + end for end in ENDINGS if isfile(path.parent / file_name(listed + end))), listed)
-        if is_test and is_test(listed):
-            testing.add(name)
+        listed.append("/".join(name_parts(frame["file_path"], path)))
+    # isfile, as it is False for what can be no path
+    names = [
+        next((each + end for end in ENDINGS if isfile(path.parent / file_name(each + end))), each) for each in listed
+    ]
+    files, _ = find_files(path.parent, [name_parts(name, path) for name in names])
+    images, is_test = [], _split(path, content)
+    testing = {name for each, name in zip(listed, names, strict=True) if is_test and is_test(each)}
+    for frame, name, file in zip(frames, names, files, strict=True):
         where = f"{path}: frame {name}"
-        camera = _camera(where, path.parent / file_name(name), ChainMap(frame, content))
+        camera = _camera(where, file, ChainMap(frame, content))
         pose, viewmat = read_pose(where, frame, "transform_matrix"), np.eye(4)
         viewmat[:3, :3] = (pose[:3, :3] @ np.diag([1.0, -1.0, -1.0])).T
         viewmat[:3, 3] = -viewmat[:3, :3] @ pose[:3, 3]
@@ -122,11 +126,11 @@ def _number(where: object, values: Mapping[str, Any], key: str, default: float, 
     return value
 
 
-def _camera(where: str, photograph: Path, values: Mapping[str, Any]) -> pycolmap.Camera:
+def _camera(where: str, photograph: Path | None, values: Mapping[str, Any]) -> pycolmap.Camera:
     number = partial(_number, where, values)
     width, height = (int(number(key, 0)) for key in ("w", "h"))
     if width < 1 or height < 1:  # that of a missing photograph does not matter
-        width, height = image_size(photograph) if isfile(photograph) else (1, 1)
+        width, height = image_size(photograph) if photograph else (1, 1)
     fx = number("fl_x", 0) or _focal(width, number("camera_angle_x", 0))
     if fx <= 0:
         raise ClodError(f"{where}: has neither fl_x nor camera_angle_x above 0; export the file again")
