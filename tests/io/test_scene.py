@@ -108,6 +108,26 @@ def test_model_and_images_are_found_in_other_folders(tmp_path: Path) -> None:
         load_scene(tmp_path / "images" / "deeper")
 
 
+def test_other_models_are_found_and_noted(tmp_path: Path) -> None:
+    """nerfstudio's folder; and the parts that COLMAP makes of photographs which it cannot join."""
+    names, sparse = write_scene(tmp_path, 3)[1], tmp_path / "sparse"
+    (sparse / "0").rename(sparse / "10")
+    assert (loaded := load_scene(tmp_path)).notes == () and len(loaded.train) == 2
+    (tmp_path / "colmap").mkdir()
+    sparse.rename(tmp_path / "colmap" / "sparse")
+    assert len(load_scene(tmp_path).train) == 2
+    shutil.move(tmp_path / "colmap" / "sparse", sparse)
+    write_model(tmp_path, [camera(0), camera(1)], names[:2])
+    (sparse / "0").rename(sparse / "2")
+    (note,) = (loaded := load_scene(tmp_path)).notes
+    assert len(loaded.train) == 1 and note.startswith(
+        f"{sparse / '10'} is another model, of 3 images: give this folder"
+    )
+    assert (loaded := load_scene(sparse / "10")).notes == () and len(loaded.train) == 2
+    (sparse / "10" / "images.bin").write_bytes(b"damaged")
+    assert load_scene(tmp_path).notes == ()
+
+
 @pytest.mark.parametrize("file", ["cameras", "images", "points3D"])
 def test_records_beyond_the_file_are_refused(tmp_path: Path, file: str) -> None:
     path = model_of(tmp_path, **PINHOLES) / f"{file}.bin"

@@ -32,16 +32,21 @@ LONGEST_NAME, LONGEST_PART = 4000, 255  # characters of a path, bytes of one of 
 def find_cameras(folder: Path) -> Path:
     """The folder of a COLMAP model, or the transforms file of a scene.
 
-    Looked for in this order: a model in sparse/0, sparse and ``folder``; TRANSFORMS there; and a model in the first two
-    beside ``folder``, which may be the images' own.
+    Looked for in this order: a model in sparse/0, sparse/1, ..., sparse and ``folder``; TRANSFORMS there; nerfstudio's
+    colmap/sparse/0; and a model in sparse beside ``folder``, which may be the images' own.
     """
-    beside = folder.resolve().parent / "sparse"
-    files = [folder / name for name in TRANSFORMS]
-    for each in (folder / "sparse" / "0", folder / "sparse", folder, *files, beside / "0", beside):
-        if each.is_file() if each in files else form_of(each):
-            return each
+    files = [folder / name for name in TRANSFORMS if (folder / name).is_file()]
+    own, beside = models_in(folder / "sparse"), models_in(folder.resolve().parent / "sparse")
+    for each in (*own, *models_in(folder), *files, *models_in(folder / "colmap" / "sparse"), *beside):
+        return each
     what = "no COLMAP model (cameras, images; .bin or .txt) in it, sparse or sparse/0, and no transforms.json"
     raise ClodError(f"{folder}: {what}; give the folder that holds images/ and sparse/0, or transforms.json")
+
+
+def models_in(folder: Path) -> list[Path]:
+    """COLMAP's models in the numbered folders of this one, by number, and in itself."""
+    numbered = sorted((each for each in folder.glob("*") if each.name.isdecimal()), key=lambda each: int(each.name))
+    return [each for each in (*numbered, folder) if form_of(each)]
 
 
 def form_of(folder: Path) -> str:

@@ -3,7 +3,7 @@
 import warnings
 from collections import Counter
 from collections.abc import Callable, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from functools import partial
 from pathlib import Path
 
@@ -15,7 +15,7 @@ from clod_adapter._support.workers import in_order
 from clod_adapter.cameras import Camera, Scene, View, in_its_unit, spread, with_near_planes
 from clod_adapter.errors import ClodError
 from clod_adapter.io.scene.colmap import TEST_EVERY, PosedImage, held_out, read_colmap
-from clod_adapter.io.scene.folder import find_cameras, find_photographs
+from clod_adapter.io.scene.folder import find_cameras, find_photographs, models_in
 from clod_adapter.io.scene.images import REDUCED, SCALED, Note, cache_folder, photograph
 from clod_adapter.io.scene.transforms import in_trained_frame, read_transforms
 from clod_adapter.origin import NOWHERE
@@ -119,8 +119,23 @@ def _posed(folder: Path) -> tuple[Path, list[PosedImage], list[str]]:
     """The model or transforms file, its images, and notes."""
     cameras = find_cameras(folder)
     images, notes = (read_transforms if cameras.is_file() else read_colmap)(cameras)
+    if cameras.is_dir() and cameras != folder:
+        notes += _other_models(cameras)
     images, more = in_trained_frame(folder, cameras, images)
     return cameras, images, notes + more
+
+
+def _other_models(model: Path) -> list[str]:
+    """A note for each model beside this one, of photographs that COLMAP could not join to its own."""
+    notes = []
+    for other in models_in(model.parent):
+        with suppress(ClodError):  # a damaged one is no choice
+            if other != model:
+                count = len(read_colmap(other)[0])
+                notes.append(
+                    f"{other} is another model, of {count} images: give this folder if the checkpoint is of it"
+                )
+    return notes
 
 
 def _load(loads: Sequence[Load], progress: Listener | None) -> tuple[list[View], list[Note]]:
