@@ -215,6 +215,16 @@ def test_missing_images_are_noted_or_refused(tmp_path: Path) -> None:
         load_scene(tmp_path)
 
 
+def test_masks_are_noted(tmp_path: Path) -> None:
+    write_scene(tmp_path, 2)
+    write_images(tmp_path / "masks", ["sub/001.png.png", "sub/002.png.png"])
+    note = (
+        f"the masks in {tmp_path / 'masks'} are not used: where the checkpoint is empty under them, put them into the"
+    )
+    for folder in (tmp_path, tmp_path / "sparse" / "0"):
+        assert load_scene(folder).notes == (f"{note} photographs' alpha channel",)
+
+
 def test_smaller_copies_replace_missing_images(tmp_path: Path) -> None:
     write_scene(tmp_path, 3)
     (tmp_path / "images").rename(tmp_path / "images_2")

@@ -16,7 +16,7 @@ from PIL import Image
 
 from clod_adapter._support.text import file_name
 from clod_adapter.errors import ClodError
-from clod_adapter.io.scene.folder import scene_files
+from clod_adapter.io.scene.folder import UNUSED, scene_files
 from clod_adapter.io.scene.load import load_cameras, load_scene
 from models import write_model
 from photographs import INTRINSICS, camera, model_of, pixels, pose, to_world, write_frames, write_images
@@ -146,7 +146,7 @@ def test_missing_photographs_and_unused_entries_are_noted(tmp_path: Path) -> Non
     write_images(tmp_path, [f"images/{i:03d}.png" for i in range(10) if i != 3])
     assert load_scene(tmp_path).notes == (
         "transforms.json turned COLMAP's world (applied_transform): a checkpoint of the turned one is needed",
-        "the masks of transforms.json are not used",
+        f"the masks of transforms.json are {UNUSED}",
         "1 of 10 photographs are missing and left out (images/003.png)",
     )
     for i in range(4, 9):

@@ -25,6 +25,8 @@ ENDINGS = ("", ".png", ".jpg", ".jpeg")  # that the path of a frame may omit
 MAX_BYTES = 256 * 2**20  # a hundred thousand frames have a tenth of that
 SMALLER = ("images_2", "images_4", "images_8")  # copies at a part of the size, as Mip-NeRF 360 and Inria's code have
 RAW = "input"  # Inria's name for the photographs before they are undistorted into images
+MASKS = ("masks", "mask")
+UNUSED = "not used: where the checkpoint is empty under them, put them into the photographs' alpha channel"  # of masks
 MISSING = 0.5  # the share of photographs that may be missing
 LONGEST_NAME, LONGEST_PART = 4000, 255  # characters of a path, bytes of one of its parts
 
@@ -85,6 +87,9 @@ def find_photographs(
         notes.append(f"{len(others)} of {len(names)} photographs have another suffix or case, such as {example}")
     if root.name in (*SMALLER, RAW) and root != folder:
         notes.append(f"the photographs are those in {root.name}, as there are more than in images")
+    bases = dict.fromkeys((folder, root.parent)) if cameras.is_dir() and root != folder else ()
+    masks = [each for base in bases for name in MASKS if any((each := base / name).glob("*"))]
+    notes += [f"the masks in {each} are {UNUSED}" for each in masks]
     missing = [as_text(str(Path(*each))) for each, path in zip(parts, paths, strict=True) if path is None]
     if missing:
         some = f"({', '.join(missing[:3])}{', ...' if len(missing) > 3 else ''})"

@@ -16,7 +16,7 @@ import pycolmap
 from clod_adapter._support.text import file_name
 from clod_adapter.errors import ClodError
 from clod_adapter.io.scene.colmap import HUGE, PosedImage, check_posed, marked
-from clod_adapter.io.scene.folder import DATAPARSER, ENDINGS, find_files, name_parts, read_json
+from clod_adapter.io.scene.folder import DATAPARSER, ENDINGS, UNUSED, find_files, name_parts, read_json
 from clod_adapter.io.scene.images import image_size
 
 FISHEYE = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
@@ -81,7 +81,7 @@ def _frames(path: Path, held_out: bool | None) -> tuple[list[PosedImage], list[s
     if "applied_transform" in content and not path.with_name(DATAPARSER).is_file():
         notes.append(f"{path.name} turned COLMAP's world (applied_transform): a checkpoint of the turned one is needed")
     if any("mask_path" in frame for frame in frames):
-        notes.append(f"the masks of {path.name} are not used")
+        notes.append(f"the masks of {path.name} are {UNUSED}")
     return images, notes
 
 
