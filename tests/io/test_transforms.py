@@ -155,6 +155,23 @@ def test_missing_photographs_and_unused_entries_are_noted(tmp_path: Path) -> Non
         load_scene(tmp_path)
 
 
+@pytest.mark.parametrize("start", ["/home/other/scene/", "C:\\scenes\\", "../", "../scene/./"])
+def test_paths_of_another_machine_end_in_the_folder(tmp_path: Path, start: str) -> None:
+    """A file of the whole path, outside of the folder, is never read."""
+    scene, names = tmp_path / "scene", [f"images/{i}" for i in range(3)]
+    frames = [{"file_path": start + name, "transform_matrix": to_world(i)} for i, name in enumerate(names)]
+    write_frames(scene, frames, **INTRINSICS, test_filenames=[start + names[1]])
+    write_images(tmp_path, [f"{name}.png" for name in names])
+    with pytest.raises(
+        ClodError, match="transforms.json: image name .* leaves the images folder .*; put the photograph"
+    ):
+        load_scene(scene)
+    write_images(scene, [f"{name}.png" for name in names])
+    loaded = load_scene(scene)
+    assert [view.camera.name for view in (*loaded.train, *loaded.test)] == [f"images/{i}.png" for i in (0, 2, 1)]
+    assert "paths of transforms.json lead out of its folder: photographs are those in it" in loaded.notes
+
+
 def changed(row: int, column: int, value: float) -> dict[str, Any]:
     matrix = np.eye(4)
     matrix[row, column] = value

@@ -28,6 +28,7 @@ RAW = "input"  # Inria's name for the photographs before they are undistorted in
 MASKS = ("masks", "mask")
 UNUSED = "not used: where the checkpoint is empty under them, put them into the photographs' alpha channel"  # of masks
 MISSING = 0.5  # the share of photographs that may be missing
+MOST_PARTS = 8  # of the end of a path from another machine
 LONGEST_NAME, LONGEST_PART = 4000, 255  # characters of a path, bytes of one of its parts
 
 
@@ -125,8 +126,11 @@ def _without_suffix(path: Path) -> Path:
     return path.with_name(path.stem.casefold())
 
 
-def name_parts(name: str, cameras: Path) -> tuple[str, ...]:
-    """The parts of a photograph's name, split at / and at the \\ of files made on Windows; refuses what is no name."""
+def name_parts(name: str, cameras: Path, home: Path | None = None) -> tuple[str, ...]:
+    """The parts of a photograph's name, split at / and at the \\ of files made on Windows; refuses what is no name.
+
+    Of a path that leads out of ``home``, the longest end that is a file there, with one of ENDINGS.
+    """
     if as_text(name) != name:
         raise ClodError(f"{cameras}: image name {as_text(name)[:80]!r} is not UTF-8; rename the photograph, there too")
     path = PureWindowsPath(name)
@@ -134,9 +138,21 @@ def name_parts(name: str, cameras: Path) -> tuple[str, ...]:
     control = any(sign < " " or "\x7f" <= sign <= "\x9f" for sign in name)
     if control or len(name) > LONGEST_NAME or longest > LONGEST_PART:
         raise ClodError(f"{cameras}: image name {name[:40]!r} ({len(name)} characters) is no file's name; rename it")
-    if not path.parts or path.anchor or ".." in path.parts:
-        raise ClodError(f"{cameras}: image name {name[:80]!r} leaves the images folder or is no name; rename it there")
-    return path.parts
+    if path.parts and not leaves(name):
+        return path.parts
+    if home is not None:
+        for count in range(min(MOST_PARTS, len(path.parts) - 1), 0, -1):
+            end = path.parts[-count:]
+            if ".." not in end and any(isfile(home / file_name("/".join(end) + ending)) for ending in ENDINGS):
+                return end
+    what = f"image name {name[:80]!r} leaves the images folder or is no name"
+    raise ClodError(f"{cameras}: {what}; put the photograph there, or correct the name")
+
+
+def leaves(name: str) -> bool:
+    """Whether a path is absolute or may lead out of the folder that it is relative to."""
+    path = PureWindowsPath(name)
+    return bool(path.anchor) or ".." in path.parts
 
 
 def scene_files(folder: Path) -> Iterator[Path]:

@@ -16,7 +16,7 @@ import pycolmap
 from clod_adapter._support.text import file_name
 from clod_adapter.errors import ClodError
 from clod_adapter.io.scene.colmap import HUGE, PosedImage, check_posed, marked
-from clod_adapter.io.scene.folder import DATAPARSER, ENDINGS, UNUSED, find_files, name_parts, read_json
+from clod_adapter.io.scene.folder import DATAPARSER, ENDINGS, UNUSED, find_files, leaves, name_parts, read_json
 from clod_adapter.io.scene.images import image_size
 
 FISHEYE = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
@@ -60,7 +60,7 @@ def _frames(path: Path, held_out: bool | None) -> tuple[list[PosedImage], list[s
     for number, frame in enumerate(frames):
         if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
             raise ClodError(f"{path}: frame {number} has no file_path; export the file again")
-        listed.append("/".join(name_parts(frame["file_path"], path)))
+        listed.append("/".join(name_parts(frame["file_path"], path, path.parent)))
     # isfile, as it is False for what can be no path
     names = [
         next((each + end for end in ENDINGS if isfile(path.parent / file_name(each + end))), each) for each in listed
@@ -78,6 +78,8 @@ def _frames(path: Path, held_out: bool | None) -> tuple[list[PosedImage], list[s
     notes = list[str]()
     if is_test and held_out is None:
         images, notes = marked(images, testing, f"the lists of {path.name}")
+    if any(leaves(frame["file_path"]) for frame in frames):
+        notes.append(f"paths of {path.name} lead out of its folder: photographs are those in it")
     if "applied_transform" in content and not path.with_name(DATAPARSER).is_file():
         notes.append(f"{path.name} turned COLMAP's world (applied_transform): a checkpoint of the turned one is needed")
     if any("mask_path" in frame for frame in frames):
@@ -92,7 +94,7 @@ def _split(path: Path, content: Mapping[str, Any]) -> Callable[[str], bool] | No
         if (given := content.get(key)) is not None:
             if not isinstance(given, list) or not all(isinstance(name, str) for name in given):
                 raise ClodError(f"{path}: {key} is no list of file names; correct or remove it")
-            lists[key] = {"/".join(name_parts(name, path)) for name in given}
+            lists[key] = {"/".join(name_parts(name, path, path.parent)) for name in given}
     if "train_filenames" in lists:
         return lambda name: name not in lists["train_filenames"]
     return (lambda name: any(name in names for names in lists.values())) if lists else None
