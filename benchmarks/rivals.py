@@ -7,22 +7,39 @@
 - ``specialist``: the merged file, tuned for that count alone;
 - ``tuned``: the whole base, tuned for as many steps;
 - ``prefix``: one file whose prefixes are the counts, by removal error, tuned with random prefixes (``tuning.tune``);
-- ``ranking``: prefixes by removal error without tuning.
+- ``ranking``: prefixes by removal error without tuning;
+- ``kept``: no rival, but what ``export --keep`` writes of one adapted file, a plain file per count.
 
 A scene is named as for adapt.py. Each run adds a row to ``results/rivals.jsonl``.
 """
 
+import tempfile
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 import clod_adapter as clod
 from clod_adapter.initialization.importance import removal_error
-from common import Row, append, arguments, checkpoint, falling, head, photographs, stored, table
+from common import (
+    COMMAND,
+    Process,
+    Row,
+    append,
+    arguments,
+    capture,
+    checkpoint,
+    falling,
+    head,
+    photographs,
+    stored,
+    table,
+)
 from tuning import MERGINGS, Tuning, find_tool, merge, tune
 
 FILE = "rivals.jsonl"
-RIVALS = ("merging", "specialist", "tuned", "prefix", "ranking")
+RIVALS = ("merging", "specialist", "tuned", "prefix", "ranking", "kept")
+MAX_SV = 20  # of the adapted file
 SHARES = (0.62, 0.35, 0.12, 0.05, 0.02)
 
 
@@ -36,7 +53,8 @@ def main() -> None:
         base, views = checkpoint(scene), photographs(scene)
         (untouched,) = clod.evaluate(base.gaussians, views.test, [1.0])
         for rival in args.only:
-            for label, files, more in contest(rival, base, views, args.iters):
+            folder = capture(scene.partition("/")[0])
+            for label, files, more in contest(rival, base, folder, views, args.iters):
                 rows = [measured(each, share, views) for share, each in files.items()]
                 append(FILE, {
                     "benchmark": "rivals", "scene": scene, "rival": rival, "label": label,
@@ -50,7 +68,7 @@ def measured(gaussians: clod.Gaussians, share: float, views: clod.Scene) -> Row:
 
 
 def contest(
-    rival: str, base: clod.Checkpoint, views: clod.Scene, iters: int
+    rival: str, base: clod.Checkpoint, folder: Path, views: clod.Scene, iters: int
 ) -> Iterator[tuple[str, Mapping[float, clod.Gaussians], dict[str, Any]]]:
     """For each row: label, file by share, and what else is recorded."""
     some, train, config = base.gaussians, views.train, Tuning(iters=iters, prefixes=rival == "prefix")
@@ -74,9 +92,23 @@ def contest(
         tuned, seconds = tune(some.select(falling(removal_error(some, train))), train, config)
         files = {share: head(tuned, count) for share, count in ({1.0: len(some)} | counts).items()}
         yield "prefixes by removal error, lengths log", files, about | {"train_seconds": seconds}
+    elif rival == "kept":
+        yield f"export --keep of one file, max_sv {MAX_SV}", kept(base, folder, counts), {}
     else:
         ranked = some.select(falling(removal_error(some, train)))
         yield "untouched, by removal error", {share: head(ranked, count) for share, count in counts.items()}, {}
+
+
+def kept(base: clod.Checkpoint, folder: Path, counts: Mapping[float, int]) -> dict[float, clod.Gaussians]:
+    """By share, the plain file that ``export --keep`` writes after the default command."""
+    with tempfile.TemporaryDirectory() as place:
+        dial, plain = Path(place) / "dial.ply", Path(place) / "plain.ply"
+        Process([*COMMAND, base.path, "--images", folder, "--max-sv", MAX_SV, "--out", dial, "--quiet"])
+        files = {}
+        for share, count in counts.items():
+            Process([*COMMAND, "export", dial, "--keep", count, "--out", plain])
+            files[share] = clod.load(plain).gaussians
+    return files
 
 
 def print_table() -> None:
