@@ -19,7 +19,8 @@ def main(model: str, folder: str, look: str = "") -> None:
 
     base = clod.load(model)
     views, server, steps = clod.load_scene(folder, origin=base.origin).train, viser.ViserServer(), 0
-    dial = None if look else clod.attach(base.gaussians, views)
+    trained = {name: value.clone().requires_grad_() for name, value in base.gaussians.tensors().items()}
+    dial = None if look else clod.attach(base.gaussians.replace(**trained), views)
     optimizer = torch.optim.Adam(dial.param_groups(splats=True), eps=1e-15) if dial else None
     slider = server.gui.add_slider("dial s", 0.0, (dial or base.gaussians).attenuation.max_sv, 0.01, 1.0)
     count = server.gui.add_text("drawn", "", disabled=True)

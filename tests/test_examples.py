@@ -119,7 +119,8 @@ def test_the_slider_turns_the_dial_while_it_trains(run: Any, capture: Any, monke
     (picture,) = client.scene.set_background_image.call_args.args
     assert picture.shape == (360, 480, 3) and picture.any()
     assert re.fullmatch(r"\d\d of 300, step 2", server.gui.add_text.return_value.value)
-    assert clod_adapter.load("slider.ply").gaussians.attenuation.max_sv == 5
+    written = clod_adapter.load("slider.ply").gaussians
+    assert written.attenuation.max_sv == 5 and not torch.equal(written.means, capture.gaussians.means)
 
 
 def test_bad_arguments_are_refused(run: Any) -> None:

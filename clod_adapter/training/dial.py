@@ -110,6 +110,9 @@ class Dial(nn.Module):
         Args:
             splats: also those of the caller's parameters that require a gradient. Not where the loop has optimizers
                 for them.
+
+        Raises:
+            ClodError: ``splats``, and none requires a gradient, as of a file that was read.
         """
         rates = learning_rates(self.config, self.decay)
         rates["means"] *= self._own_size  # an optimizer has one rate for all rows
@@ -118,6 +121,9 @@ class Dial(nn.Module):
             (given,) = self._given
             own = given.tensors() if isinstance(given, Gaussians) else given
             tuned = {name: value for name, value in own.items() if getattr(value, "requires_grad", False)}
+            if not tuned:
+                remedy = "attach copies with requires_grad_(), or leave out splats=True"
+                raise ClodError(f"no splat requires a gradient: {remedy}")
             found |= {name: value for name, value in tuned.items() if name not in found}  # growth_d is the dial's own
         named = [(name, value, rates.get(ATTRIBUTE_OF.get(name, name))) for name, value in found.items()]
         return [{"params": [value], "lr": rate, "name": name} for name, value, rate in named if rate is not None]
