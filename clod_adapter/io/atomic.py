@@ -3,7 +3,7 @@
 import os
 import shutil
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -23,7 +23,7 @@ def atomic_path(final: str | Path) -> Iterator[Path]:
 
 @contextmanager
 def atomic_paths(*finals: str | Path) -> Iterator[tuple[Path, ...]]:
-    """``atomic_path`` for several: all are flushed before the first is renamed. Errors name the final paths."""
+    """``atomic_path`` for several, of which all are replaced or none. Errors name the final paths."""
     targets = [Path(final) for final in finals]
     for target in targets:
         check_target(target)
@@ -33,8 +33,7 @@ def atomic_paths(*finals: str | Path) -> Iterator[tuple[Path, ...]]:
         for temporary in temporaries:
             for path in [*temporary.rglob("*"), temporary]:
                 _flush(path)
-        # One call from C, so that no Ctrl-C comes between two of them.
-        list(map(os.replace, list(map(str, temporaries)), list(map(str, targets))))
+        _replace(targets, temporaries)
         with suppress(OSError):  # the files are in place; some file systems cannot flush a folder
             for folder in {target.parent for target in targets}:
                 _flush(folder)
@@ -95,6 +94,8 @@ def check_target(final: Path) -> None:
         raise ClodError(f"{final}: folder {folder} does not exist; create it first")
     if not os.access(folder, os.W_OK | os.X_OK):
         raise ClodError(f"{final}: folder {folder} is not writable; choose another or change its permissions")
+    if os.path.ismount(final):
+        raise ClodError(f"{final}: is a mount point, which cannot be replaced; mount its folder instead")
     if final.is_dir() and any(final.iterdir()):
         raise ClodError(f"{final}: is a folder that is not empty; choose another name")
     if final.is_file() and not (final.stat().st_mode & 0o222 and os.access(final, os.W_OK)):
@@ -118,6 +119,34 @@ def _remove(path: Path) -> None:
         shutil.rmtree(path, ignore_errors=True)
     else:
         path.unlink(missing_ok=True)
+
+
+def _replace(targets: Sequence[Path], temporaries: Sequence[Path]) -> None:
+    """Renames all; where one cannot be, those before it are again what they were."""
+    earlier = {target: _temporary(target) for target in targets[:-1] if target.exists()}
+    try:
+        for target, kept in earlier.items():
+            _keep(target, kept)
+        # One call from C, so that no Ctrl-C comes between two of them.
+        list(map(os.replace, list(map(str, temporaries)), list(map(str, targets))))
+    except OSError:
+        for target, temporary in zip(targets, temporaries, strict=True):
+            if target in earlier and earlier[target].exists():
+                os.replace(earlier[target], target)
+            elif not temporary.exists():  # it was renamed
+                _remove(target)
+        raise
+    finally:
+        for kept in earlier.values():
+            _remove(kept)
+
+
+def _keep(target: Path, kept: Path) -> None:
+    """Gives the file a second name, or where the file system has no links, a copy."""
+    try:
+        os.link(target, kept)
+    except OSError:
+        shutil.copy2(target, kept)
 
 
 def _flush(path: Path) -> None:

@@ -5,6 +5,7 @@ import stat
 import subprocess
 import sys
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -69,6 +70,20 @@ def test_failure_keeps_only_the_old_files(tmp_path: Path, error: BaseException) 
     assert [final.read_bytes() for final in finals] == [b"old", b"old"] and len(os.listdir(tmp_path)) == 2
 
 
+@pytest.mark.parametrize("links", [True, False])
+def test_several_files_are_replaced_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, links: bool) -> None:
+    """Where a folder was made in place of the last one, the others stay as they were; also without hard links."""
+    if not links:
+        monkeypatch.setattr(os, "link", Mock(side_effect=OSError(1, "Operation not permitted")))
+    old, absent, last = (tmp_path / name for name in ("old", "absent", "last"))
+    old.write_bytes(b"old")
+    with pytest.raises(ClodError, match=r"last: cannot be written"), atomic_paths(old, absent, last) as temporaries:
+        for temporary in temporaries:
+            temporary.write_bytes(b"new")
+        last.mkdir()
+    assert old.read_bytes() == b"old" and sorted(os.listdir(tmp_path)) == ["last", "old"]
+
+
 def test_unwritable_targets_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A write-protected file is not replaced, although a rename needs the folder's permission only."""
     target = tmp_path / "full" / "a.txt"
@@ -77,7 +92,7 @@ def test_unwritable_targets_are_refused(tmp_path: Path, monkeypatch: pytest.Monk
     target.chmod(0o444)
     for path, message in (
         (target, "a.txt: is write-protected; choose another output"), (tmp_path / "no" / "out", "does not exist"),
-        (target.parent, "not empty"), (tmp_path / "out", "not writable"),
+        (target.parent, "not empty"), (Path("/"), "is a mount point"), (tmp_path / "out", "not writable"),
     ):  # fmt: skip
         if message == "not writable":
             monkeypatch.setattr(os, "access", lambda *_: False)  # root may write anywhere, so chmod proves nothing
