@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from argparse import ArgumentParser, Namespace
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -105,7 +106,11 @@ def execute(args: Namespace) -> dict[str, Any]:
         "seconds": watch.report(),
     }  # fmt: skip
     if args.report:
-        add_page(Path(args.report), report, model, base, scene, console)
+        try:
+            add_page(Path(args.report), report, model, base, scene, console)
+        except ClodError as error:  # the rows are measured, and printed
+            print(f"clod-adapt: error: {error}", file=sys.stderr)
+            report |= {"error": str(error), "exit_code": 2}
     return report
 
 

@@ -135,7 +135,10 @@ class Saver:
         if self.saved is None:
             return
         if finished:
-            self.path.unlink(missing_ok=True)
+            try:
+                self.path.unlink(missing_ok=True)
+            except OSError as error:
+                self.console.note(f"{self.path}: cannot be removed ({error.strerror or error}); it is of no use now")
             self.saved = None
         else:
             self.console.say(f"--resume resumes from step {self.saved}, which is in {self.path}")

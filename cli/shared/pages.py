@@ -30,7 +30,7 @@ def add_page(
     path: Path, report: dict[str, Any], model: Gaussians, base: Gaussians | None, scene: Scene, console: Console,
     training: Callable[[], dict[str, Any] | None] = lambda: None,
 ) -> None:  # fmt: skip
-    """Writes the page and adds its files to the report, unless Ctrl-C or the disk stops it, which a note says."""
+    """Writes the page and adds its files to the report, unless Ctrl-C stops it, which a note says."""
     try:
         with interrupt_as_stopped():
             curves = training()
@@ -39,8 +39,6 @@ def add_page(
                 written = write_page(path, jsonable(report), frames, others, jsonable(curves))
     except Stopped:
         console.note("the page was interrupted and not written")
-    except ClodError as error:
-        console.note(f"the page was not written: {error}")
     else:
         console.say(f"wrote {path}: open it in a browser")
         report["outputs"] = report.get("outputs", {}) | {name: str(file) for name, file in written.items()}
@@ -68,8 +66,12 @@ class AdaptPage:
                 self.snapshots.append((now.seconds, state.replace(**changing, **fixed)))
 
     def write(self, path: Path, report: dict[str, Any], result: Gaussians, start_seconds: float) -> None:
+        """The same of a run, whose other files are written: the disk stops the page alone, which a note says."""
         training = partial(self._training, result, start_seconds)
-        add_page(path, report, result, self.base, self.scene, self.console, training)
+        try:
+            add_page(path, report, result, self.base, self.scene, self.console, training)
+        except ClodError as error:
+            self.console.note(f"the page was not written: {error}")
 
     def _training(self, result: Gaussians, start_seconds: float) -> dict[str, Any] | None:
         """Held-out PSNR of the copies and of the result, at s = 1, 3 and the largest."""

@@ -79,6 +79,14 @@ def test_full_disk(clod: Any, tmp_path: Path, size: int, line: str) -> None:
     assert contents(tmp_path) == {tmp_path / "x.html": b"earlier"}
 
 
+def test_full_disk_while_measuring(clod: Any, tmp_path: Path) -> None:
+    """The rows are not lost with the page."""
+    with room(1000):
+        done = clod("eval DIAL --images SCENE --sv 1 --report x.html --json --quiet", code=2)
+    assert "cannot be written" in done.report["error"] and done.report["rows"] and not contents(tmp_path)
+    assert done.err == f"clod-adapt: error: {done.report['error']}\n"
+
+
 # Root gives up its rights by entering a user namespace; it may read nothing there that its owner may not.
 NO_ROOT = "" if os.geteuid() else "import ctypes; assert ctypes.CDLL(None).unshare(0x10000000) == 0"
 

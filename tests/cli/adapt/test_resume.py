@@ -137,6 +137,19 @@ def test_without_a_state_training_starts_over(clod: Any, tmp_path: Path, state: 
     assert f"{STATE} has step 2 of an interrupted run" in done.err and names(tmp_path) == OUTPUTS
 
 
+def test_a_state_that_cannot_be_removed_is_a_note(clod: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    unlink = Path.unlink
+
+    def refuse(path: Path, missing_ok: bool = False) -> None:
+        if path.name == STATE:
+            raise PermissionError(1, "Operation not permitted", str(path))
+        unlink(path, missing_ok)
+
+    monkeypatch.setattr(Path, "unlink", refuse)
+    assert f"note: {STATE}: cannot be removed (Operation not permitted)" in clod(ADAPT).err
+    assert names(Path()) == sorted([*OUTPUTS, STATE])
+
+
 @pytest.mark.parametrize(
     ("step", "save", "oldest", "share"), [(0.1, 0.1, 15.0, 0.015), (25.0, 3.0, 80.0, 0.15), (1.0, 30.0, 220.0, 0.2)]
 )
