@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, fields, replace
+from numbers import Integral, Real
 from typing import Any
 
 from clod_adapter.errors import ClodError
@@ -17,6 +18,13 @@ PLACED_MAX_SV = 8.0  # without photographs, by default: the budgets of viewers o
 MULTIPLIER = 3.0  # of the distances at which levels of a set begin: PlayCanvas's default
 # Gaussians that viewers draw at most on a device, by their makers; docs/formats.md has the sources.
 DEVICES = {"quest3": 500_000, "phone": 1_000_000, "laptop": 2_000_000, "desktop": 4_000_000}
+# By the annotation of a field, what its value is an instance of.
+KINDS: dict[str, tuple[type, str]] = {
+    "float": (Real, "a number"),
+    "int": (Integral, "a whole number"),
+    "bool": (bool, "true or false"),
+    "str": (str, "text"),
+}
 SH_COUNTS = {0: 1, 1: 4, 2: 9, 3: 16, 4: 25}  # spherical harmonics of each degree
 
 
@@ -29,6 +37,30 @@ def require(ok: bool, name: str, value: object, what: str) -> None:
     """Raises ClodError unless ``ok``; the message has the field's name, its value and ``what`` it must be."""
     if not ok:
         raise ClodError(f"{name} is {value}, it must be {what}")
+
+
+def check_types(config: Any) -> None:
+    """Raises ClodError for a field of another type than its annotation, or a number that is not finite."""
+    for each in fields(config):
+        value, annotation = getattr(config, each.name), each.type.removesuffix(" | None")
+        if value is None and annotation != each.type:
+            continue
+        kind, what = KINDS[annotation]
+        require(isinstance(value, kind), each.name, value, f"{what}, not {type(value).__name__}")
+        if kind in (Real, Integral):
+            require(math.isfinite(number(value)), each.name, value, "finite")
+            plain = int(value) if isinstance(value, Integral) else float(value)
+            object.__setattr__(config, each.name, plain)  # of numpy's numbers there is no JSON
+
+
+def number(value: Any) -> float:
+    """A number of Python, numpy or torch as a float; NaN, which no range contains, if it is none or too large."""
+    if isinstance(value, str) or not (isinstance(value, Real) or getattr(value, "shape", None) == ()):
+        return math.nan
+    try:
+        return float(value)
+    except (OverflowError, TypeError, ValueError):
+        return math.nan
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,11 +86,12 @@ class AttenuationConfig:
     )
 
     def __post_init__(self) -> None:
+        check_types(self)
         require(self.form in FORMS, "form", self.form, f"one of {', '.join(FORMS)}")
         distance, reference = self.scene_distance, self.reference_distance
         require(0 < distance < FARTHEST, "scene_distance", distance, f"above 0 and below {FARTHEST:g}")
         require(0 <= reference < FARTHEST, "reference_distance", reference, f"at least 0 and below {FARTHEST:g}")
-        require(1 <= self.max_sv < math.inf, "max_sv", self.max_sv, "at least 1 and finite")
+        require(self.max_sv >= 1, "max_sv", self.max_sv, "at least 1")
         near = self.near_distance
         require(0 <= near < FARTHEST, "near_distance", near, f"at least 0 and below {FARTHEST:g}")
 
@@ -85,8 +118,8 @@ class ScreenFilter:
     compensate: bool = option(False, "whether opacities are scaled by c to compensate for the widening")
 
     def __post_init__(self) -> None:
+        check_types(self)
         require(1e-3 <= self.variance <= 100, "variance", self.variance, "between 0.001 and 100 px^2")
-        require(isinstance(self.compensate, bool), "compensate", self.compensate, "true or false")
 
     def halved(self) -> ScreenFilter:
         """The same filter in the px^2 of images of half the size, which are means of 2x2 pixels: ``variance / 4``."""
@@ -143,8 +176,7 @@ class AdaptConfig:
     lr_shN: float = option(0.0, "learning rate of shN; 0 keeps SH degrees above 0 fixed, which costs 0.01 dB")
 
     def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            require(not isinstance(value, float) or math.isfinite(value), name, value, "finite")
+        check_types(self)
         require(self.max_sv >= 1, "max_sv", self.max_sv, "at least 1")
         require(self.max_sv <= LONGEST, "max_sv", self.max_sv, f"at most {LONGEST:g}")
         require(self.iters is None or self.iters >= 0, "iters", self.iters, "at least 0")
@@ -154,8 +186,8 @@ class AdaptConfig:
         require(0.5 < self.share <= 1, "start_share", self.start_share, "above 0.5 and at most 1")
         for name, allowed in {"form": FORMS, "growth": GROWTHS}.items():
             require(getattr(self, name) in allowed, name, getattr(self, name), f"one of {', '.join(allowed)}")
-        require(0 < self.exponent < math.inf, "exponent", self.exponent, "positive and finite")
-        require(0 <= self.reg_weight < math.inf, "reg_weight", self.reg_weight, "at least 0 and finite")
+        require(self.exponent > 0, "exponent", self.exponent, "positive")
+        require(self.reg_weight >= 0, "reg_weight", self.reg_weight, "at least 0")
         require(0 <= self.ssim_weight <= 1, "ssim_weight", self.ssim_weight, "between 0 and 1")
         for name in ("sigma", "growth", "means", "quats", "scales", "opacities", "sh0", "shN"):
             rate = getattr(self, f"lr_{name}")  # larger ones overflow float32 in the end

@@ -40,6 +40,14 @@ def test_impossible_values_are_named(kind: type) -> None:
                 kind(**{name: value})
 
 
+@pytest.mark.parametrize("kind", TABLES)
+def test_values_of_other_types_are_named(kind: type) -> None:
+    for name, default in vars(kind()).items():
+        for value in ([1], 10**400, {}, b"5", *(["5"] if not isinstance(default, str) else [])):
+            with pytest.raises(ClodError, match=re.escape(f"{name} is {value}, it must be ")):
+                kind(**{name: value})
+
+
 def test_limits_are_accepted() -> None:
     edges = {"max_sv": 1.0, "iters": 0, "time_budget": 0.1, "start_share": 1.0, "exponent": 0.1}
     AdaptConfig(**edges, reg_weight=0.0, ssim_weight=1.0, lr_means=0.0)
