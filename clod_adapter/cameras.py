@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from itertools import chain
+from numbers import Integral
+from operator import mul
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 
 from clod_adapter._support.arrays import float_tensor, tensor_of
+from clod_adapter.config import number
 from clod_adapter.errors import ClodError
 
 T = TypeVar("T")
 NEAR = 0.01
 """Distance of the near plane, world units, as in gsplat."""
 SMALLEST = 128  # pixels a side that an image of half the size has at least: smaller ones show too little
+BENT = 0.01  # a product of two axes of a rotation may differ so much from 0 or 1
 ROUNDING = 1e-6  # of the distance from 0: float32 does not resolve cameras closer together than that
 
 
@@ -33,7 +39,9 @@ class Camera:
         near: distance of the near plane, world units; Gaussians with a nearer centre are not drawn.
 
     Raises:
-        ClodError: a matrix has the wrong shape or the image has no pixels.
+        ClodError: a matrix has the wrong shape or the image has no pixels; or of matrices in main memory a value is not
+            finite, ``viewmat`` is no rotation and translation, or ``K`` has skew, a focal length that is not positive,
+            or another last row than 0, 0, 1.
     """
 
     viewmat: Tensor
@@ -45,11 +53,16 @@ class Camera:
 
     def __post_init__(self) -> None:
         for name in ("viewmat", "K"):
-            object.__setattr__(self, name, float_tensor(getattr(self, name)))
+            object.__setattr__(self, name, numbers_of(name, getattr(self, name)))
         if tuple(self.viewmat.shape) != (4, 4) or tuple(self.K.shape) != (3, 3):
             raise ClodError(f"camera {self.name!r} needs viewmat [4, 4] and K [3, 3]")
-        if self.width < 1 or self.height < 1:
-            raise ClodError(f"camera {self.name!r} has size {self.width}x{self.height}")
+        for size in (self.width, self.height):
+            if not isinstance(size, Integral) or size < 1:
+                raise ClodError(f"camera {self.name!r} has size {self.width}x{self.height}; give whole numbers")
+        if not 0 <= number(self.near) < math.inf:
+            raise ClodError(f"camera {self.name!r} has its near plane at {self.near}, it must be finite and at least 0")
+        if self.viewmat.device.type == self.K.device.type == "cpu":  # the host would wait for a GPU
+            _check_matrices(self.name, self.viewmat.tolist(), self.K.tolist())
 
     def __repr__(self) -> str:
         return f"Camera({self.name!r}, {self.width}x{self.height})"
@@ -73,6 +86,30 @@ class Camera:
     def position(self) -> Tensor:
         """``[3]`` the camera centre in world units, ``-R^T t``."""
         return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
+
+
+def numbers_of(name: str, values: Any) -> Tensor:
+    """``float_tensor`` of an argument; ClodError, with its name, where it is no array of numbers."""
+    try:
+        return float_tensor(values)
+    except (TypeError, ValueError) as error:
+        raise ClodError(f"{name} is {values!r:.80}, it must be an array of numbers") from error
+
+
+def _check_matrices(name: str, viewmat: list[list[float]], K: list[list[float]]) -> None:
+    """Refuses what is no pinhole camera."""
+    (fx, skew, _), (other_skew, fy, _), last = K
+    axes = [row[:3] for row in viewmat[:3]]
+    bent = max(abs(sum(map(mul, axes[i], axes[j])) - (i == j)) for i in range(3) for j in range(3))
+    moves = bent < BENT and viewmat[3] == [0, 0, 0, 1]
+    for ok, what in (
+        (all(map(math.isfinite, chain(*viewmat, *K))), "a value that is not finite"),
+        (moves, "a viewmat that is no rotation and translation"),
+        (fx > 0 and fy > 0, "a focal length that is not positive"),
+        (skew == other_skew == 0 and last == [0, 0, 1], "a K with skew, or whose last row is not 0, 0, 1"),
+    ):
+        if not ok:
+            raise ClodError(f"camera {name!r} has {what}")
 
 
 @dataclass(frozen=True, eq=False)

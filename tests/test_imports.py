@@ -20,7 +20,8 @@ PACKAGE = "clod_adapter"
 ORDER: list[set[str]] = [
     {"_support", "origin"},
     {"errors"},
-    {"_kernels", "cameras", "config"},
+    {"_kernels", "config"},
+    {"cameras"},
     {"calibration", "frame_rate", "gaussians", "losses"},
     {"equation"},
     {"hook", "progress", "rasterizers"},

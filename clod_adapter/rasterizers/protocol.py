@@ -8,8 +8,7 @@ import torch
 from torch import Tensor
 
 from clod_adapter._kernels import ALPHA_MAX, ALPHA_MIN, QUAT_MAX, QUAT_MIN, T_MIN
-from clod_adapter._support.arrays import float_tensor
-from clod_adapter.cameras import Camera
+from clod_adapter.cameras import Camera, numbers_of
 from clod_adapter.config import CLASSIC, ScreenFilter
 from clod_adapter.equation.attenuation import dial
 from clod_adapter.errors import ClodError
@@ -67,7 +66,7 @@ def behind(gaussians: Gaussians, background: Tensor | np.ndarray | None = None) 
     """The background ``[3]`` as a tensor; black where None is given."""
     if background is None:
         return torch.zeros(3, dtype=torch.float32, device=gaussians.means.device)
-    found = float_tensor(background)
+    found = numbers_of("background", background)
     if found.shape != (3,):  # a kernel would read past its end
         raise ClodError(f"background is {tuple(found.shape)} and must be (3,)")
     return found

@@ -47,11 +47,13 @@ class Gsplat:
         return image, image[..., :1], *surfaces, self.meta
 
     def arguments(self, name: str, batch: tuple[int, ...] = (), cameras: int = CAMERAS) -> dict[str, Any]:
-        """Every tensor that a function takes, random."""
+        """Every tensor that a function takes, random; of cameras the position and the principal point."""
         generator = torch.Generator().manual_seed(0)
         shapes = {key: (*batch, *shape) for key, shape in OF_SCENE.items()}
         shapes |= {key: (*batch, cameras, *shape) for key, shape in OF_CAMERA.items()}
         given: dict[str, Any] = {key: 0.1 + torch.rand(shape, generator=generator) for key, shape in shapes.items()}
+        for key, size in {"viewmats": 4, "Ks": 3}.items():
+            given[key][..., :-1], given[key][..., -1, -1] = torch.eye(size)[:, :-1], 1
         given |= {"width": WIDTH, "height": HEIGHT}
         taken = inspect.signature(getattr(self.installed, name)).parameters
         return {key: value for key, value in given.items() if key in taken}

@@ -57,7 +57,7 @@ def test_the_text_of_one_file(tmp_path: Path) -> None:
     assert str(tmp_path) not in text
     (poster,) = re.findall('<img id="poster" alt="" src="data:image/jpeg;base64,([^"]*)">', text)
     picture = np.asarray(Image.open(io.BytesIO(base64.b64decode(poster))), dtype=float)
-    wanted = render(shown, replace(cameras[0], K=cameras[0].K * 0.512, width=512, height=256), 2.0).pixels.numpy()
+    wanted = render(shown, cameras[0].resized(512, 256), 2.0).pixels.numpy()
     assert len(poster) < 60_000 and picture.shape == wanted.shape and np.abs(picture - wanted).mean() < 3
     page.write_viewer_page(tmp_path / "alone.html", saved)
     text = (tmp_path / "alone.html").read_text(encoding="utf-8")

@@ -1,0 +1,43 @@
+"""Cameras that are no pinholes are refused."""
+
+import math
+from typing import Any
+
+import pytest
+import torch
+
+from clod_adapter import Camera, ClodError
+
+VIEWMAT, K = torch.eye(4), torch.tensor([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]])
+
+
+def changed(matrix: torch.Tensor, row: int, column: int, value: float) -> torch.Tensor:
+    found = matrix.clone()
+    found[row, column] = value
+    return found
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"viewmat": "a"}, "viewmat is 'a', it must be an array of numbers"),
+        ({"viewmat": [[1], [1, 2]]}, "must be an array of numbers"),
+        ({"viewmat": torch.eye(3)}, "needs viewmat"),
+        ({"width": 64.0}, "has size 64.0x48; give whole numbers"),
+        ({"height": "48"}, "has size 64x48; give whole numbers"),
+        ({"height": 0}, "has size 64x0"),
+        ({"near": "0.1"}, "near plane at 0.1, it must be finite"),
+        ({"near": math.nan}, "near plane at nan"),
+        ({"viewmat": changed(VIEWMAT, 0, 3, math.nan)}, "a value that is not finite"),
+        ({"K": changed(K, 0, 2, math.inf)}, "a value that is not finite"),
+        ({"viewmat": torch.zeros(4, 4)}, "no rotation and translation"),
+        ({"viewmat": changed(VIEWMAT, 0, 0, 0.0)}, "no rotation and translation"),
+        ({"viewmat": changed(VIEWMAT, 3, 2, 4.0)}, "no rotation and translation"),  # transposed, as Inria stores it
+        ({"K": changed(K, 0, 0, 0.0)}, "a focal length that is not positive"),
+        ({"K": changed(K, 0, 1, 3.0)}, "a K with skew"),
+        ({"K": changed(K, 2, 2, 2.0)}, "a K with skew, or whose last row is not 0, 0, 1"),
+    ],
+)
+def test_what_is_no_pinhole_is_refused(given: dict[str, Any], message: str) -> None:
+    with pytest.raises(ClodError, match=message):
+        Camera(**{"viewmat": VIEWMAT, "K": K, "width": 64, "height": 48} | given)
