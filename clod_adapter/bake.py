@@ -10,7 +10,7 @@ from torch import Tensor
 
 from clod_adapter.cameras import Camera
 from clod_adapter.config import MULTIPLIER, require
-from clod_adapter.equation.attenuation import TAKEOVER, Attenuated, dial
+from clod_adapter.equation.attenuation import TAKEOVER, Attenuated, check_dial, dial
 from clod_adapter.equation.distances import Place, typical_distance
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import OPAQUE, Gaussians
@@ -46,6 +46,7 @@ def bake(
         raise ClodError("the Gaussians have no sigma_d, so there is no dial value to bake")
     if (camera is None) == (not cameras):
         raise ClodError("bake needs either camera or cameras; load(path).viewpoints are those stored with the file")
+    check_dial(virtual_scale)
     distances = typical_distance(gaussians.means, [camera] if camera else cameras, gaussians.attenuation)
     if camera:
         kept = shown = grown = dial(gaussians, distances, virtual_scale)

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from clod_adapter.cameras import Camera
+from clod_adapter.config import require
 from clod_adapter.equation.attenuation import dial, warn_of_no_dial
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
@@ -73,8 +74,10 @@ def render(
         rasterizer: the fastest one for the Gaussians' device by default.
 
     Raises:
-        ClodError: the dial is negative or not finite.
+        ClodError: the dial is negative or not finite, or an argument is of another type.
     """
+    for name, value, kind in (("gaussians", gaussians, Gaussians), ("camera", camera, Camera)):
+        require(isinstance(value, kind), name, f"a {type(value).__name__}", f"of type {kind.__name__}")
     if gaussians.sigma_d is None:
         warn_of_no_dial(virtual_scale, "give the result of clod_adapter.adapt")
     chosen = rasterizer or for_device(gaussians.means.device)

@@ -1,6 +1,7 @@
 """Rendering with and without a dial, baking, the order by extinction; calls that would draw or store something else."""
 
 import math
+import re
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
@@ -101,10 +102,18 @@ def test_several_cameras_share_one_distance_per_gaussian() -> None:
     assert torch.equal(bake(some, s, cameras=places).means, baked.means)
 
 
+NO_DIALS: Any = (-0.001, math.inf, math.nan, "5", None, [1.0], torch.ones(2), 10**400)
+
+
 def test_bad_arguments_are_refused() -> None:
     some, plain = spread(), gaussians(3, 0, 0)
+    wrong: Any = "a.ply"
     for message, call in {
-        **{f"virtual_scale is {s}": lambda s=s: render(plain, camera(), s) for s in (-0.001, math.inf, math.nan)},
+        **{f"virtual_scale is {re.escape(str(s))}": partial(render, plain, camera(), s) for s in NO_DIALS},
+        **{f"scale is {re.escape(str(s))}": partial(render, some, camera(), s) for s in NO_DIALS},
+        "gaussians is a str, it must be of type Gaussians": lambda: render(wrong, camera()),
+        "camera is a str, it must be of type Camera": lambda: render(plain, wrong),
+        "background is 'a.ply', it must be an array of numbers": lambda: render(plain, camera(), background=wrong),
         "background": lambda: render(plain, camera(), background=torch.ones(1)),  # a kernel would read past its end
         "opacities": lambda: splat(plain, plain.opacities[:2], camera()),
         "no sigma_d": lambda: bake(plain, 1.0),
@@ -162,7 +171,7 @@ def test_a_dial_value_without_a_dial_is_warned_of(draws: dict[str, Drawing], nam
     [
         ({"growth_d": MODEL.growth_d, "sigma_d": MODEL.sigma_d}, "growth_d needs sigma_d and attenuation"),
         ({"growth_d": MODEL.growth_d, "attenuation": DEFAULTS}, "growth_d needs sigma_d and attenuation"),
-        ({"virtual_scale": -1}, "virtual_scale is -1, it must be at least 0"),
+        ({"virtual_scale": -1}, "virtual_scale is -1, it must be a finite number of at least 0"),
         ({"sigma_d": MODEL.sigma_d, "opacities": WHOLE}, "opacities is torch.int64, it must be floating point"),
         ({"sigma_d": WHOLE}, "sigma_d is torch.int64, it must be floating point"),
     ],

@@ -49,7 +49,7 @@ import torch
 from torch import Tensor
 
 from clod_adapter.cameras import Camera
-from clod_adapter.config import AttenuationConfig, require
+from clod_adapter.config import AttenuationConfig, number, require
 from clod_adapter.equation.distances import normalized_distances
 from clod_adapter.equation.paper import paper_fade
 from clod_adapter.errors import ClodError
@@ -171,7 +171,7 @@ def growth_factors(growth_d: Tensor, d: Tensor, virtual_scale: float | Tensor, s
 
 def check_dial(virtual_scale: float) -> None:
     """Raises ClodError for a dial that is negative or not finite."""
-    require(0 <= virtual_scale < math.inf, "virtual_scale", virtual_scale, "at least 0 and finite")
+    require(0 <= number(virtual_scale) < math.inf, "virtual_scale", virtual_scale, "a finite number of at least 0")
 
 
 def warn_of_no_dial(virtual_scale: float, remedy: str, stacklevel: int = 3) -> None:

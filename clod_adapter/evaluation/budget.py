@@ -23,7 +23,7 @@ from torch import Tensor
 from clod_adapter.bake import baked_rows
 from clod_adapter.calibration import Calibration, crossing
 from clod_adapter.cameras import Camera
-from clod_adapter.config import AttenuationConfig, require
+from clod_adapter.config import AttenuationConfig, number, require
 from clod_adapter.equation.attenuation import dial
 from clod_adapter.equation.distances import Place, typical_distance
 from clod_adapter.errors import ClodError
@@ -79,8 +79,11 @@ def dial_for(
     given = {name: value for name, value in budgets.items() if value is not None}
     if len(given) != 1:
         raise ClodError(f"dial_for needs exactly one of keep, psnr_drop and fps, {len(given)} are given")
+    require(isinstance(gaussians, Gaussians), "gaussians", f"a {type(gaussians).__name__}", "of type Gaussians")
+    if isinstance(cameras, Place) or not all(isinstance(each, Place) for each in cameras or ()):
+        raise ClodError("cameras must be a list of cameras or viewpoints; of views [view.camera for view in views]")
     ((name, value),) = given.items()
-    require(0 < value < math.inf, name, value, "positive and finite")
+    require(0 < number(value) < math.inf, name, value, "a positive, finite number")
     if gaussians.sigma_d is None or gaussians.attenuation is None:
         raise ClodError("the Gaussians have no sigma_d, so no dial value meets a budget; adapt them first")
     if name == "keep":

@@ -64,13 +64,14 @@ def evaluate(
         ClodError: no views, no dial values, or one below 1 or not finite.
     """
     views = [views] if isinstance(views, View) else views
-    virtual_scales = [float(s) for s in np.atleast_1d(virtual_scales)]
+    virtual_scales = list(np.atleast_1d(virtual_scales))
     if len(views) == 0:
         raise ClodError("there are no held-out views to evaluate on")
     if not virtual_scales:
         raise ClodError("there are no dial values to evaluate at")
     for virtual_scale in virtual_scales:
         check_dial(virtual_scale)
+    virtual_scales = [float(s) for s in virtual_scales]
     gaussians = gaussians.without_empty_bands()
     dials = virtual_scales if gaussians.sigma_d is not None else [1.0] * len(virtual_scales)
     render(gaussians, views[0].camera, max(dials))  # compiled and warm before the clock starts

@@ -3,6 +3,7 @@ dial values keep the counts asked for, and interpolate known curves."""
 
 import math
 import random
+import re
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -208,7 +209,7 @@ def test_bad_arguments_are_refused() -> None:
     refused: tuple[tuple[dict[str, float], str], ...] = (
         ({}, "exactly one of keep, psnr_drop and fps"),
         ({"keep": 3, "fps": 3}, "exactly one of keep, psnr_drop and fps"),
-        ({"keep": 0}, "keep is 0, it must be positive and finite"),
+        ({"keep": 0}, "keep is 0, it must be a positive, finite number"),
         ({"fps": math.nan}, "fps is nan"),
         ({"psnr_drop": math.inf}, "psnr_drop is inf"),
         ({"psnr_drop": 1}, "needs the calibration"),
@@ -216,6 +217,13 @@ def test_bad_arguments_are_refused() -> None:
     for budgets, message in refused:
         with pytest.raises(ClodError, match=message):
             dial_for(some, cameras=camera, **budgets)
+    wrong: Any
+    for wrong in ("5", [1.0], torch.ones(2), 10**400):
+        with pytest.raises(ClodError, match=re.escape(f"keep is {wrong}, it must be a positive, finite number")):
+            dial_for(some, keep=wrong, cameras=camera)
+    for wrong in (camera[0], [View(camera[0], torch.zeros(36, 48, 3, dtype=torch.uint8))], "abc"):
+        with pytest.raises(ClodError, match="cameras must be a list of cameras or viewpoints"):
+            dial_for(some, keep=3, cameras=wrong)
     for name, message in (("keep", "no camera"), ("fps", "a calibration or cam")):
         with pytest.raises(ClodError, match=message):
             dial_for(some, **{name: 1})
