@@ -81,5 +81,6 @@ def render(
     if gaussians.sigma_d is None:
         warn_of_no_dial(virtual_scale, "give the result of clod_adapter.adapt")
     chosen = rasterizer or for_device(gaussians.means.device)
-    image, alpha = chosen.draw(gaussians, camera, virtual_scale, background=background)
+    with torch.autocast(gaussians.means.device.type, enabled=False):  # positions of 3 digits draw another image
+        image, alpha = chosen.draw(gaussians, camera, virtual_scale, background=background)
     return Rendering(image, alpha, gaussians, camera, virtual_scale)

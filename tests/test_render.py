@@ -20,6 +20,7 @@ from clod_adapter.adapter import detach, with_dial
 from clod_adapter.config import FORMS
 from clod_adapter.equation.attenuation import attenuate, dial
 from clod_adapter.equation.distances import normalized_distances, viewpoint_of
+from clod_adapter.rasterizers import Rasterizer, reference
 from clod_adapter.render import splat
 from scenes import camera, dialled, gaussians, ring, scene
 
@@ -100,6 +101,16 @@ def test_several_cameras_share_one_distance_per_gaussian() -> None:
     torch.testing.assert_close(baked.scales, (some.scales * grown.growth[:, None])[kept.keep], atol=1e-6, rtol=1e-5)
     places = [viewpoint_of(each, some.means, WORLD) for each in cameras]
     assert torch.equal(bake(some, s, cameras=places).means, baked.means)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_autocast_changes_nothing(form: str) -> None:
+    some, view = spread(form=form), camera()
+    for rasterizer in (None, Rasterizer(reference.rasterize)):
+        want = render(some, view, 2.0, rasterizer=rasterizer)
+        with torch.autocast("cpu"):
+            found = render(some, view, 2.0, rasterizer=rasterizer)
+        assert torch.equal(found.image, want.image) and torch.equal(found.kept, want.kept)
 
 
 NO_DIALS: Any = (-0.001, math.inf, math.nan, "5", None, [1.0], torch.ones(2), 10**400)

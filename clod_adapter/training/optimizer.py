@@ -54,7 +54,8 @@ class RowAdam:
         # After so many steps of its own a row's bias corrections are 1 in float32.
         last = math.ceil(-25 * math.log(2) / math.log(max(beta1, beta2)))
         count = np.arange(1, last + 2)
-        corrections = 1 / (1 - beta1**count), 1 / np.sqrt(1 - beta2**count)
+        with np.errstate(under="ignore"):
+            corrections = 1 / (1 - beta1**count), 1 / np.sqrt(1 - beta2**count)
         table = np.pad(np.stack(corrections), ((0, 0), (1, 0))).astype(np.float32)
         self._corrections = torch.from_numpy(table).to(some.device)
 

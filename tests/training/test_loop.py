@@ -7,6 +7,7 @@ from dataclasses import replace
 from types import ModuleType
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 import torch.distributed as dist
@@ -182,6 +183,13 @@ def test_settings_as_keywords(captured: Pair) -> None:
     assert adapted.gaussians.growth_d is None
     with pytest.raises(TypeError, match="max_vs"):
         adapt(*captured, max_vs=7)
+
+
+@pytest.mark.filterwarnings("error")
+def test_numpy_that_raises_changes_nothing(captured: Pair) -> None:
+    with np.errstate(all="raise"):
+        strict = adapt(*captured, config_of(iters=3), max_sv=3)
+    assert_equal(strict.gaussians, adapt(*captured, config_of(iters=3), max_sv=3).gaussians)
 
 
 def test_a_bar_by_default(captured: Pair, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
