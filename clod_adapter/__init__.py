@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from clod_adapter.training.loop import Adapted, adapt
     from clod_adapter.training.plan import Decision, Override, Plan
     from clod_adapter.training.planner import make_plan
-    from clod_adapter.training.pseudo_views import render_pseudo_views
+    from clod_adapter.training.pseudo_views import add_pseudo_views, render_pseudo_views
 
 # Imported on first use: torch takes a second or two, which the command's --help and most of its errors do without.
 _homes = {name: f"{__name__}.{home}" for home, names in {
@@ -60,7 +60,7 @@ _homes = {name: f"{__name__}.{home}" for home, names in {
     "io.scene.load": ("load_scene",),
     "io.checkpoint": ("Checkpoint", "load", "save"),
     "training.camera_placement": ("place_cameras",),
-    "training.pseudo_views": ("render_pseudo_views",),
+    "training.pseudo_views": ("add_pseudo_views", "render_pseudo_views"),
     "training.plan": ("Decision", "Override", "Plan"),
     "training.planner": ("make_plan",),
     "progress": ("Phase", "Progress", "Stopped"),
@@ -91,7 +91,7 @@ sys.modules[__name__].__class__ = _Lazy
 __all__ = [
     "AdaptConfig", "Adapted", "Adapter", "AttenuationConfig", "Calibration", "Camera", "Checkpoint", "ClodError",
     "Decision", "Dial", "DialValue", "Gaussians", "Hold", "Hook", "Override", "Phase", "Plan", "Progress", "Rendering",
-    "Scene", "ScreenFilter", "Stopped", "View", "adapt", "attach", "bake", "bake_levels", "detach",
+    "Scene", "ScreenFilter", "Stopped", "View", "adapt", "add_pseudo_views", "attach", "bake", "bake_levels", "detach",
     "dial_for", "evaluate", "extract", "from_gsplat", "load", "load_adapter", "load_scene", "make_plan",
     "order_by_extinction", "place_cameras", "render", "render_pseudo_views", "save", "save_adapter", "to_gsplat",
     "with_dial",

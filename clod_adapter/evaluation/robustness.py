@@ -16,7 +16,7 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.checkpoint import Checkpoint
 from clod_adapter.progress import Listener, Phase, Stopped, tell, within
 from clod_adapter.training.loop import adapt
-from clod_adapter.training.pseudo_views import PseudoView
+from clod_adapter.training.pseudo_views import PseudoView, add_pseudo_views
 
 # Shares of the unadapted base that its baseline keeps.
 BASELINE_SHARES = (1.0, 0.8, 0.62, 0.48, 0.35, 0.25, 0.18, 0.12, 0.08, 0.05)
@@ -38,7 +38,9 @@ def adapt_at_range(
     file: Checkpoint, scene: Scene, config: AdaptConfig, virtual_scales: Sequence[float], progress: Listener
 ) -> CellResult:
     """Adapts to ``[1, config.max_sv]``, and measures dial values, also beyond it; Stopped if that is not completed."""
-    base, config = detach(file.gaussians), config.for_views(len(scene.train))
+    base = detach(file.gaussians)
+    scene = add_pseudo_views(base, scene, config.seed, progress)
+    config = config.for_views(len(scene.train))
     adapted = adapt(base, scene, config, progress)
     if adapted.failed:
         raise ClodError(f"max_sv {config.max_sv:g}: {adapted.failed}; leave this range or checkpoint out")

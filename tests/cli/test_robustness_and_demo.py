@@ -21,6 +21,7 @@ from clod_adapter.cli.adapt import listeners
 from clod_adapter.cli.adapt import run as adapt_run
 from clod_adapter.evaluation import robustness as experiment
 from clod_adapter.report.page import Picture
+from clod_adapter.training import pseudo_views
 from runs import names, pressing
 
 pytest.importorskip("matplotlib")
@@ -34,6 +35,20 @@ def run(clod: Any, capture: Any, tmp_path: Path) -> Callable[..., Any]:
     capture.write(tmp_path / "plain.ply", capture.gaussians)
     capture.write(tmp_path / "masked.ply", capture.gaussians.select(capture.gaussians.opacities > 0.5))
     return partial(clod, "robustness plain.ply masked.ply --images scene --max-sv 3 1 --iters 3")
+
+
+def test_the_command_a_cell_and_python_train_the_same(clod: Any, capture: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Bit for bit, on few photographs."""
+    monkeypatch.setattr(pseudo_views, "MANY", 64)
+    clod("BASE --images SCENE --iters 3 --max-sv 3 --out dial.ply")
+    clod("robustness BASE --images SCENE --iters 3 --max-sv 3 --out out")
+    base = load(capture.ply).gaussians
+    scene = clod_adapter.add_pseudo_views(base, load_scene(capture.scene))
+    plan = clod_adapter.make_plan(base, scene, clod_adapter.AdaptConfig(iters=3, max_sv=3))
+    want = clod_adapter.adapt(base, scene, iters=3, max_sv=3).gaussians
+    assert plan.whole(base, plan.adapt(scene).gaussians) == want
+    for written in ("dial.safetensors", "out/cells/base_sv3.safetensors"):
+        assert clod_adapter.load_adapter(written).apply(base) == want
 
 
 def stamps(folder: Path) -> dict[str, int]:
