@@ -1,12 +1,13 @@
 """Choices of the method against their alternatives: PSNR at equal shares of the Gaussians, one change at a time.
 
     python benchmarks/choices.py plush_half bonsai146 --names SHARE NEARER full
+    python benchmarks/choices.py demo --names SHARE full                           # the folder of clod-adapt demo
     python benchmarks/choices.py SCENE.ply --names PLACED_SHARE PLACED_NEARER      # without photographs
     python benchmarks/choices.py --table                                           # the rows as a Markdown table
 
-A scene is a folder of the shared data, or a file, whose placed cameras and renders are used. Each run adds one row to
-``results/choices.jsonl``; "default" changes nothing. A choice is a constant of ``training/far.py``, a field of
-``schedule.FAR``, or a field of ``AdaptConfig``.
+A scene is a folder of the shared data, one of the demo, or a file, whose placed cameras and renders are used. Each run
+adds one row to ``results/choices.jsonl``; "default" changes nothing. A choice is a constant of ``training/far.py``, a
+field of ``schedule.FAR``, or a field of ``AdaptConfig``.
 """
 
 from dataclasses import fields, replace
@@ -44,6 +45,9 @@ def main() -> None:
 
 def opened(scene: str) -> tuple[clod.Gaussians, clod.Scene]:
     """The checkpoint and the views to train and to measure on."""
+    demo = Path(scene) / "base.ply"
+    if demo.exists():
+        return clod.load(demo).gaussians, clod.load_scene(demo.with_name("capture"))
     if not scene.endswith(".ply"):
         return checkpoint(scene).gaussians, photographs(scene)
     base = clod.load(scene).gaussians
