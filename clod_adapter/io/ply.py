@@ -32,7 +32,8 @@ class Head(NamedTuple):
 
     ply: PlyData  # elements, properties and comments; every element has 0 rows
     elements: tuple[tuple[PlyElement, int], ...]  # each with the number of rows that the header states
-    size: int  # bytes; the data starts there
+    text: bytes  # as plyfile reads it
+    size: int  # bytes of it in the file; the data starts there
     comments: tuple[str, ...]  # the file's, then each element's
 
 
@@ -45,9 +46,10 @@ def read_head(path: Path, data: bytes | None = None) -> Head:
     if end is None:
         most = f" in its first {HEADER_LIMIT:,} bytes" if len(start) >= HEADER_LIMIT else ""
         raise ClodError(f"{path}: the PLY header has no end{most}, so the file is truncated; copy or export it again")
-    header = re.sub(rb"\r\n?", b"\n", start[: end.end()])
+    text = re.sub(rb"(?<=[\r\n])(comment|obj_info)\b[^\r\n]+", _in_ascii, start[: end.end()])
+    header = re.sub(rb"\r\n?", b"\n", text)
     if re.search(rb"[^\t\n\x20-\x7e]", header):
-        raise ClodError(f"{path}: the PLY header has text that is not printable ASCII; remove that from the comments")
+        raise ClodError(f"{path}: the PLY header has a name that is not printable ASCII; export the file again")
     counts = re.findall(rb"(?m)^[ \t]*element[ \t]+\S+[ \t]+(\d{1,20})[ \t]*$", header)
     header = re.sub(rb"(?m)^([ \t]*element[ \t]+\S+[ \t]+)\d{1,20}[ \t]*$", rb"\g<1>0", header)
     with refused_if_damaged(path, "the PLY header is damaged", "export the file again"):
@@ -55,7 +57,11 @@ def read_head(path: Path, data: bytes | None = None) -> Head:
     if len(counts) != len(ply.elements):
         raise ClodError(f"{path}: the PLY header is damaged (a row count is not a number); export the file again")
     comments = *ply.comments, *(comment for element in ply for comment in element.comments)
-    return Head(ply, tuple(zip(ply, map(int, counts), strict=True)), end.end(), comments)
+    return Head(ply, tuple(zip(ply, map(int, counts), strict=True)), text, end.end(), comments)
+
+
+def _in_ascii(line: re.Match[bytes]) -> bytes:
+    return re.sub(rb"[^\t\x20-\x7e]", b"?", line[0])
 
 
 def has_dial(path: Path) -> bool:
@@ -106,7 +112,8 @@ def _elements(data: bytes, head: Head) -> dict[str, np.ndarray]:
             raise ValueError(f"a row of more than {_LONGEST:,} characters")  # which would be copied several times
         with warnings.catch_warnings(), np.errstate(over="ignore"):
             warnings.simplefilter("ignore")  # of text that is beyond float32's range
-            found = {each.name: each.data for each in PlyData.read(io.BytesIO(data))}
+            whole = b"".join((head.text, memoryview(data)[head.size :]))
+            found = {each.name: each.data for each in PlyData.read(io.BytesIO(whole))}
     return {name: rows.astype(rows.dtype.newbyteorder("="), copy=False) for name, rows in found.items()}
 
 

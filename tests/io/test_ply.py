@@ -187,3 +187,14 @@ def test_rows_are_those_of_the_file_whatever_happens_to_it_later(tmp_path: Path,
     assert found.vertex.dtype == vertex.dtype and found.vertex.dtype.isnative
     for name in vertex.dtype.names:
         np.testing.assert_array_equal(found.vertex[name], vertex[name])
+
+
+@pytest.mark.parametrize("order", ["<", "ascii"])
+def test_comments_beyond_ascii(tmp_path: Path, order: str) -> None:
+    """As CloudCompare writes a date in the user's language; outputs have question marks there."""
+    path = write_rows(tmp_path / "in.ply", random_rows(5, needed()), order, ("made on @",))
+    path.write_bytes(path.read_bytes().replace(b"@", "M\u00e4rz \x1b[2J".encode(), 1))
+    found = load(path)
+    assert found.comments == ("made on M??rz ?[2J",)
+    save(tmp_path / "out.ply", found.gaussians, found)
+    assert load(tmp_path / "out.ply").gaussians == found.gaussians

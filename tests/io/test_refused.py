@@ -127,7 +127,6 @@ def archive(kind: int, names: int) -> Callable[[Path], object]:
 
 
 LITTLE, BIG, GOOD = "binary_little_endian", "binary_big_endian", "1.0 " * 14 + "\n"
-COMMENTED = header("ascii", 0).replace(b"element", b"comment @\nelement")
 LIST = "property list uchar int a\n"
 OTHER_KINDS: Table = (
     ("a.ply", LFS, "Git LFS pointer.*git lfs pull"),
@@ -172,7 +171,7 @@ OF_PLY: tuple[tuple[Content, str], ...] = (
     *((header("ascii", 3) + f"{GOOD}{bad}\n{GOOD}".encode(), "damaged or truncated")
       for bad in ("1.0 " * 13, "1.0 " * 15, "1.0 " * 13 + "x", "1.0 " * 13 + "\u0661")),
     (header(LITTLE, 1, f"element face 1\n{LIST}") + bytes(100), "no usable Gaussian"),  # lists before it are read
-    (COMMENTED.replace(b"@", b"\x1b[2J"), "not printable ASCII"),
+    (header("ascii", 1).replace(b"float x", b"float \x1b[2J"), "a name that is not printable ASCII"),
     (b"ply\nformat ascii 1.0\n" + b"comment x\n" * 200_000 + b"end_header\n", "no end"),
     *((header(form, count) + b"0 " * 24, rf"is truncated.*claims {count} of vertex.*the file has")
       for form, count in (("ascii", 1 << 31), (LITTLE, (1 << 64) - 1), (BIG, 10))),
