@@ -25,6 +25,8 @@ from clod_adapter.io.values import FILTER_3D, GROWTH, MASKS, OPACITY, ROWS, SIGM
 MASK_COLUMNS = ("masks_0", "masks_1")
 HEADER_LIMIT = 1 << 20  # bytes
 _LONGEST = 1 << 20  # characters of a row of text
+_PREFIXED = rb"(?<=[\r\n])(property[ \t]+\w+[ \t]+)(?:scal(?:ar)?_)+"  # by CloudCompare, by 3dgsconverter
+UNPREFIXED = "saved by CloudCompare: its properties are read, and written, without the prefix scalar_"
 
 
 class Head(NamedTuple):
@@ -32,9 +34,10 @@ class Head(NamedTuple):
 
     ply: PlyData  # elements, properties and comments; every element has 0 rows
     elements: tuple[tuple[PlyElement, int], ...]  # each with the number of rows that the header states
-    text: bytes  # as plyfile reads it
-    size: int  # bytes of it in the file; the data starts there
+    text: bytes  # as plyfile reads it, names without CloudCompare's prefix
+    size: int  # bytes of the header in the file; the data starts there
     comments: tuple[str, ...]  # the file's, then each element's
+    notes: tuple[str, ...]  # what was changed, one line each
 
 
 def read_head(path: Path, data: bytes | None = None) -> Head:
@@ -47,6 +50,9 @@ def read_head(path: Path, data: bytes | None = None) -> Head:
         most = f" in its first {HEADER_LIMIT:,} bytes" if len(start) >= HEADER_LIMIT else ""
         raise ClodError(f"{path}: the PLY header has no end{most}, so the file is truncated; copy or export it again")
     text = re.sub(rb"(?<=[\r\n])(comment|obj_info)\b[^\r\n]+", _in_ascii, start[: end.end()])
+    notes: tuple[str, ...] = ()
+    if re.search(_PREFIXED + rb"scale_0\b", text) and b" scale_0" not in text:
+        text, notes = re.sub(_PREFIXED, rb"\g<1>", text), (UNPREFIXED,)
     header = re.sub(rb"\r\n?", b"\n", text)
     if re.search(rb"[^\t\n\x20-\x7e]", header):
         raise ClodError(f"{path}: the PLY header has a name that is not printable ASCII; export the file again")
@@ -57,7 +63,7 @@ def read_head(path: Path, data: bytes | None = None) -> Head:
     if len(counts) != len(ply.elements):
         raise ClodError(f"{path}: the PLY header is damaged (a row count is not a number); export the file again")
     comments = *ply.comments, *(comment for element in ply for comment in element.comments)
-    return Head(ply, tuple(zip(ply, map(int, counts), strict=True)), text, end.end(), comments)
+    return Head(ply, tuple(zip(ply, map(int, counts), strict=True)), text, end.end(), comments, notes)
 
 
 def _in_ascii(line: re.Match[bytes]) -> bytes:
@@ -83,14 +89,14 @@ def read(path: Path, data: bytes) -> Source:
         elements = _elements(data, head)
     if is_packed(head.ply):
         metadata = ply_metadata(path, head.comments, dial=False)
-        return Source(unpack(path, elements, degree), metadata, (NOTE,), head.comments, head=head)
+        return Source(unpack(path, elements, degree), metadata, (*head.notes, NOTE), head.comments, head=head)
     rows = elements["vertex"]
     arrays = _arrays(rows, degree)
     metadata = ply_metadata(path, head.comments, rows, dial=SIGMA in arrays)
     parts = [f"element {element.name}" for element in head.ply if element.name != "vertex"]
     parts += ["obj_info"] if head.ply.obj_info else []
     notes = (f"not carried over to outputs: {', '.join(parts)}",) if parts else ()
-    return Source(arrays, metadata, notes, head.comments, not metadata.described, rows, head)
+    return Source(arrays, metadata, (*head.notes, *notes), head.comments, not metadata.described, rows, head)
 
 
 def _elements(data: bytes, head: Head) -> dict[str, np.ndarray]:

@@ -12,6 +12,7 @@ from plyfile import PlyElement
 from clod_adapter.config import SH_COUNTS, AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.io.checkpoint import Checkpoint, load, save
+from clod_adapter.io.ply import UNPREFIXED
 from formats import model, needed, random_rows, write_elements, write_rows
 
 CONFIG = AttenuationConfig(form="paper", max_sv=7.0)
@@ -198,3 +199,17 @@ def test_comments_beyond_ascii(tmp_path: Path, order: str) -> None:
     assert found.comments == ("made on M??rz ?[2J",)
     save(tmp_path / "out.ply", found.gaussians, found)
     assert load(tmp_path / "out.ply").gaussians == found.gaussians
+
+
+@pytest.mark.parametrize("order", ["<", "ascii"])
+@pytest.mark.parametrize("prefix", ["scalar_", "scal_"])
+def test_columns_with_the_prefix_of_cloudcompare(tmp_path: Path, order: str, prefix: str) -> None:
+    """All but the position have it; outputs have none."""
+    rows = random_rows(9, needed(1))
+    plain = load(write_rows(tmp_path / "plain.ply", rows), activated="none")
+    rows.dtype.names = tuple(name if name in "xyz" else f"{prefix}{name}" for name in rows.dtype.names)
+    found = load(write_rows(tmp_path / "in.ply", rows, order), activated="none")
+    assert found.gaussians == plain.gaussians and found.vertex.dtype.names == plain.vertex.dtype.names
+    assert found.notes == (UNPREFIXED,)
+    save(tmp_path / "out.ply", found.gaussians, found)
+    assert load(tmp_path / "out.ply", activated="none").vertex.dtype == plain.vertex.dtype
