@@ -16,7 +16,7 @@ from plyfile import PlyData, PlyElement, PlyListProperty
 
 from clod_adapter.errors import ClodError, refused_if_damaged
 from clod_adapter.io import file_formats
-from clod_adapter.io.ply_layout import column_map, ply_metadata
+from clod_adapter.io.ply_layout import RGB, column_map, is_coloured, ply_metadata, with_harmonics
 from clod_adapter.io.ply_layout import write as write
 from clod_adapter.io.ply_packed import NOTE, check_packed, is_packed, unpack
 from clod_adapter.io.settings import Source
@@ -27,6 +27,10 @@ HEADER_LIMIT = 1 << 20  # bytes
 _LONGEST = 1 << 20  # characters of a row of text
 _PREFIXED = rb"(?<=[\r\n])(property[ \t]+\w+[ \t]+)(?:scal(?:ar)?_)+"  # by CloudCompare, by 3dgsconverter
 UNPREFIXED = "saved by CloudCompare: its properties are read, and written, without the prefix scalar_"
+COLOURED = (
+    "its colours are red, green, blue in 8 bits, read as SH degree 0; for all harmonics export it again by "
+    "ns-export gaussian-splat --ply-color-mode sh_coeffs"
+)
 
 
 class Head(NamedTuple):
@@ -90,13 +94,16 @@ def read(path: Path, data: bytes) -> Source:
     if is_packed(head.ply):
         metadata = ply_metadata(path, head.comments, dial=False)
         return Source(unpack(path, elements, degree), metadata, (*head.notes, NOTE), head.comments, head=head)
-    rows = elements["vertex"]
+    rows, notes = elements["vertex"], [*head.notes]
+    if is_coloured(rows.dtype.names or ()):
+        rows = with_harmonics(rows)
+        notes.append(COLOURED)
     arrays = _arrays(rows, degree)
     metadata = ply_metadata(path, head.comments, rows, dial=SIGMA in arrays)
     parts = [f"element {element.name}" for element in head.ply if element.name != "vertex"]
     parts += ["obj_info"] if head.ply.obj_info else []
-    notes = (f"not carried over to outputs: {', '.join(parts)}",) if parts else ()
-    return Source(arrays, metadata, (*head.notes, *notes), head.comments, not metadata.described, rows, head)
+    notes += [f"not carried over to outputs: {', '.join(parts)}"] if parts else []
+    return Source(arrays, metadata, tuple(notes), head.comments, not metadata.described, rows, head)
 
 
 def _elements(data: bytes, head: Head) -> dict[str, np.ndarray]:
@@ -175,6 +182,8 @@ def sh_degree_of(path: Path, header: PlyData) -> int:
         raise ClodError(f"{path}: {what}; give the point_cloud.ply that a 3DGS trainer writes")
     if {"scale_0", "scale_1"} <= types.keys() and "scale_2" not in types:
         raise ClodError(f"{path}: has no property scale_2, so this is a 2DGS file of flat disks; use a 3DGS checkpoint")
+    if is_coloured(types) and all(types[name] == "u1" for name in RGB):
+        types |= dict.fromkeys(column_map(0)["sh0"], "f4")
     degree = degree_of(path, sum(re.fullmatch(r"f_rest_\d+", name) is not None for name in types))
     for name in (name for group in column_map(degree).values() for name in group):
         if types.get(name) not in ("f4", "f8"):

@@ -8,7 +8,7 @@ sigma_d does not need it.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Container, Iterable
 from dataclasses import asdict, astuple, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,13 +21,14 @@ from clod_adapter.calibration import CalibrationRow, Viewpoint
 from clod_adapter.config import CLASSIC, SH_COUNTS, AttenuationConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.io.settings import EARLIER_FORM, FILTER, Metadata, read_metadata, tagged
-from clod_adapter.io.values import FILTER_3D, GROWTH, OPACITY, ROWS, SIGMA, arrays_of, dial_columns, hidden
+from clod_adapter.io.values import FILTER_3D, GROWTH, OPACITY, ROWS, SIGMA, arrays_of, dial_columns, hidden, sh0_of
 
 if TYPE_CHECKING:
     from clod_adapter.gaussians import Gaussians
 
 PREFIX = "clod_adapter "
 COLUMN = "clod_"
+RGB = ("red", "green", "blue")
 # Comments of the calibration: machine; total, views, width, height, reference; one for each row and each viewpoint.
 MACHINE, EXTENT, ROW, VIEWPOINT = "calibrated_on", "calibrated_with", "calibrated", "viewpoint"
 DIAL = "attenuation"
@@ -53,6 +54,20 @@ def column_map(sh_degree: int) -> dict[str, tuple[str, ...]]:
         "sh0": tuple(f"f_dc_{c}" for c in range(3)),
         "shN": tuple(f"f_rest_{c * bands + k}" for k in range(bands) for c in range(3)),
     }
+
+
+def is_coloured(names: Container[str]) -> bool:
+    """Whether RGB stands for the harmonics, as ``ns-export gaussian-splat --ply-color-mode rgb`` writes it."""
+    return all(name in names for name in (*RGB, "scale_0")) and "f_dc_0" not in names and "f_rest_0" not in names
+
+
+def with_harmonics(rows: np.ndarray) -> np.ndarray:
+    """The rows with f_dc in the place of RGB."""
+    names = {name: f"f_dc_{RGB.index(name)}" if name in RGB else name for name in rows.dtype.names or ()}
+    found = np.empty(len(rows), [(new, "f4" if old in RGB else rows.dtype[old]) for old, new in names.items()])
+    for old, new in names.items():
+        found[new] = sh0_of(rows[old]) if old in RGB else rows[old]
+    return found
 
 
 def inria_dtype(sh_degree: int, dial: Iterable[str] = ()) -> np.dtype:

@@ -11,8 +11,10 @@ from plyfile import PlyElement
 
 from clod_adapter.config import SH_COUNTS, AttenuationConfig
 from clod_adapter.errors import ClodError
+from clod_adapter.gaussians import SH_C0
+from clod_adapter.inspection.report import inspect
 from clod_adapter.io.checkpoint import Checkpoint, load, save
-from clod_adapter.io.ply import UNPREFIXED
+from clod_adapter.io.ply import COLOURED, UNPREFIXED
 from formats import model, needed, random_rows, write_elements, write_rows
 
 CONFIG = AttenuationConfig(form="paper", max_sv=7.0)
@@ -213,3 +215,17 @@ def test_columns_with_the_prefix_of_cloudcompare(tmp_path: Path, order: str, pre
     assert found.notes == (UNPREFIXED,)
     save(tmp_path / "out.ply", found.gaussians, found)
     assert load(tmp_path / "out.ply", activated="none").vertex.dtype == plain.vertex.dtype
+
+
+def test_rgb_of_nerfstudio(tmp_path: Path) -> None:
+    """In the place of harmonics, which outputs have."""
+    columns = [*needed()[:3], "red", "green", "blue", *needed()[6:], "label"]
+    rows = random_rows(5, columns, types=dict.fromkeys(("red", "green", "blue"), "u1"))
+    rows["red"] = [0, 51, 102, 204, 255]
+    found = load(write_rows(tmp_path / "in.ply", rows))
+    assert found.gaussians.sh_degree == 0 and found.notes == (COLOURED,)
+    np.testing.assert_allclose(0.5 + SH_C0 * found.gaussians.sh0[:, 0, 0], [0, 0.2, 0.4, 0.8, 1], atol=1e-6)
+    save(tmp_path / "out.ply", found.gaussians, found)
+    again = load(tmp_path / "out.ply")
+    assert again.gaussians == found.gaussians and again.vertex.dtype.names == (*needed(), "label")
+    assert inspect(tmp_path / "in.ply").splat.extra == ("label",)

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from clod_adapter.errors import ClodError
-from clod_adapter.gaussians import SH_C0, Gaussians
+from clod_adapter.gaussians import Gaussians
 from clod_adapter.io import values
 from clod_adapter.io.settings import Metadata, Source
 
@@ -44,6 +44,6 @@ def read(path: Path, data: bytes) -> Source:
         "means": rows["means"].copy(), "log_scales": values.logs_of(rows["scales"]),
         "quats": (rows["quats"].astype(np.float32) - 128) / 128,
         "opacity_logits": values.logits_of_bytes(rows["rgba"][:, 3]), "shN": np.zeros((len(rows), 0, 3)),
-        "sh0": ((rows["rgba"][:, None, :3].astype(np.float32) / 255) - 0.5) / SH_C0,
+        "sh0": values.sh0_of(rows["rgba"][:, None, :3]),
     }  # fmt: skip
     return Source(arrays, Metadata(), (QUANTISED,))
