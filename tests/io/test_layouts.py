@@ -18,6 +18,7 @@ from clod_adapter.equation.distances import normalized_distances
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import SH_C0, Gaussians
 from clod_adapter.integrations.splats import to_gsplat
+from clod_adapter.io import values
 from clod_adapter.io.checkpoint import load, save
 from clod_adapter.io.file_formats import write
 from clod_adapter.io.settings import Metadata
@@ -103,6 +104,32 @@ def test_glb_of_another_program(tmp_path: Path) -> None:
     assert found.gaussians.quats.tolist() == [[1, 0, 0, 0]] * 5 and found.gaussians.opacity_logits.isposinf().all()
     colours, others = found.notes[-2:]
     assert "'lin_rec709_display'" in colours and others.startswith("1 more primitives")
+
+
+@pytest.mark.parametrize(("name", "activation"), [("SCALE", "scales_of"), ("OPACITY", "sigmoid")])
+def test_logarithms_and_logits_in_a_glb(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, activation: str
+) -> None:
+    """As splat-transform 2.3 and JSplat wrote them; a stray value beyond the range is damaged."""
+    path, g = tmp_path / "a.glb", detach(gaussians(300, 0, 0))
+    right, linear = g.scales, g.scales.clone() if name == "SCALE" else g.opacities
+    linear.view(-1)[0] = -1
+    logarithms = g.log_scales if name == "SCALE" else g.opacity_logits
+    for stored, notes in ((linear, 0), (logarithms, 1)):
+        monkeypatch.setattr(values, activation, lambda *_, stored=stored: stored.numpy())
+        write(path, g)
+        found = load(path)
+        assert sum(f"its {name} is not" in note for note in found.notes) == notes
+        torch.testing.assert_close(found.gaussians.scales[1:], right[1:])
+        torch.testing.assert_close(found.gaussians.opacities[1:], g.opacities[1:])
+
+
+def test_logarithms_by_the_generator_of_a_glb(tmp_path: Path) -> None:
+    """Of a scene in large units, whose logarithms are all above 0."""
+    path, g = tmp_path / "a.glb", detach(gaussians(30, 0, 0))
+    write(path, g)
+    change_glb(path, lambda gltf: gltf["asset"].update(generator="splat-transform 2.3.1"))
+    torch.testing.assert_close(load(path).gaussians.log_scales, g.scales)
 
 
 def spz(path: Path) -> bytearray:

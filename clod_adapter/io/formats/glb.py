@@ -8,6 +8,7 @@ an origin. ``asset.extras.clod_adapter`` holds the document (``settings.document
 """
 
 import json
+import re
 import struct
 from collections.abc import Sequence
 from dataclasses import replace
@@ -52,6 +53,8 @@ _REMEDY = "export it again, as a .ply"
 _DAMAGED = "is damaged or no such .glb", _REMEDY
 IDENTITY = [0.0, 0.0, 0.0, 1.0]  # as xyzw
 _FAINTEST = -100.0  # logit of an opacity that float32 has rounded to 0
+_LOGARITHMS = r"splat-transform 2\.([0-2]\.\d+|3\.[01])"  # a program that wrote SCALE so, whatever its range
+_STRAY = 0.01  # the largest share of values beyond the extension's range that are only damaged
 
 
 def write(path: Path, gaussians: Gaussians, metadata: Metadata) -> tuple[str, ...]:
@@ -152,7 +155,9 @@ def read(path: Path, data: bytes) -> Source:
     notes += [f"{len(others)} more primitives with Gaussians in it are left out"] if others else []
     metadata = parse_metadata(path, text, dial=SIGMA in arrays)
     arrays["shN"] = np.stack(rest, 1) if rest else np.zeros((len(arrays["means"]), 0, 3), np.float32)
-    stored = _stored(arrays) if turned else half_turn(_stored(arrays), "z")
+    stored, changed = _stored(arrays, str(gltf["asset"].get("generator")))
+    notes += changed
+    stored = stored if turned else half_turn(stored, "z")
     if moved != metadata.origin:  # another program moved the node
         wide = stored["means"].astype(np.float64) + moved
         near = not any(origin_of(wide))  # float32 has enough digits
@@ -228,10 +233,22 @@ def _placed(path: Path, gltf: dict[str, Any], mesh: int) -> tuple[bool, Origin]:
     return turned, (0.0 - x, 0.0 - y, z)
 
 
-def _stored(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The values as checkpoints store them."""
-    logits = values.logit(np.clip(arrays["opacity_logits"], 0, 1))
-    return {
-        **arrays, "log_scales": values.logs_of(arrays["log_scales"]), "sh0": arrays["sh0"][:, None],
-        "quats": np.roll(arrays["quats"], 1, axis=1), "opacity_logits": np.maximum(logits, _FAINTEST),
-    }  # fmt: skip
+def _stored(arrays: dict[str, np.ndarray], generator: str) -> tuple[dict[str, np.ndarray], list[str]]:
+    """The values as checkpoints store them, and a line for each that the extension does not allow."""
+    scales, opacities, notes = arrays["log_scales"], arrays["opacity_logits"], list[str]()
+    if re.fullmatch(_LOGARITHMS, generator) or _beyond(scales, np.inf):
+        notes.append("its SCALE is not linear, as glTF has it, and is read as logarithms")
+    else:
+        scales = values.logs_of(scales)
+    if _beyond(opacities, 1):
+        notes.append("its OPACITY is not within 0 and 1, as glTF has it, and is read as logits")
+    else:
+        opacities = np.maximum(values.logit(np.clip(opacities, 0, 1)), _FAINTEST)
+    named = {"log_scales": scales, "opacity_logits": opacities, "sh0": arrays["sh0"][:, None]}
+    return {**arrays, **named, "quats": np.roll(arrays["quats"], 1, axis=1)}, notes
+
+
+def _beyond(numbers: np.ndarray, most: float) -> bool:
+    """Whether numbers, and not just a few damaged ones, are below 0 or above ``most``."""
+    with np.errstate(invalid="ignore"):  # a NaN that signals
+        return bool(np.mean((numbers < 0) | (numbers > most)) > _STRAY)
