@@ -19,7 +19,7 @@ from clod_adapter.io import file_formats
 from clod_adapter.io.ply_layout import RGB, column_map, is_coloured, ply_metadata, with_harmonics
 from clod_adapter.io.ply_layout import write as write
 from clod_adapter.io.ply_packed import NOTE, check_packed, is_packed, unpack
-from clod_adapter.io.settings import Source
+from clod_adapter.io.settings import Source, of_another_method
 from clod_adapter.io.values import FILTER_3D, GROWTH, MASKS, OPACITY, ROWS, SIGMA, Arrays, degree_of, dial_columns
 
 MASK_COLUMNS = ("masks_0", "masks_1")
@@ -94,7 +94,8 @@ def read(path: Path, data: bytes) -> Source:
     if is_packed(head.ply):
         metadata = ply_metadata(path, head.comments, dial=False)
         return Source(unpack(path, elements, degree), metadata, (*head.notes, NOTE), head.comments, head=head)
-    rows, notes = elements["vertex"], [*head.notes]
+    rows = elements["vertex"]
+    notes = [*head.notes, *of_another_method(rows.dtype.names or ())]
     if is_coloured(rows.dtype.names or ()):
         rows = with_harmonics(rows)
         notes.append(COLOURED)

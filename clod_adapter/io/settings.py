@@ -120,6 +120,29 @@ def _note_unknown(stored: Mapping[str, Any], known: Any, notes: list[str]) -> No
         notes.append(f"settings unknown to this version ignored: {', '.join(map(repr, unknown))}")
 
 
+# What other methods store beside plain Gaussians, by names of a PLY's properties or of gsplat's tensors.
+_METHODS = {
+    r"trbf_\w+|motion_\w+|omega_\d+|f_t_\d+": "SpacetimeGaussians, which move and fade with time",
+    r"t|times|scale_t(_\d+)?|rot_r_\d+|durations?|velocit\w+": "a 4D method, whose Gaussians move and fade with time",
+    r"sg_\w+|\w*asg_\w+": "spherical Gaussians, lobes that are added to the colour",
+    r"sb_params\w*|betas?": "Beta Splatting, which has another falloff, and lobes that are added to the colour",
+    r"shapes?|nu_degree|negative": "a method whose Gaussians have another falloff",
+    r"(rough|metal|specular|albedo|base_color|diffuse|brdf|incidents|refl)\w*": "a method that lights materials",
+}
+
+
+def of_another_method(names: Iterable[str]) -> list[str]:
+    """A warning for each method whose renderer draws more of a file with these names than plain Gaussians."""
+    lines = []
+    for pattern, method in _METHODS.items():
+        found = [name for name in names if re.fullmatch(pattern, name)]
+        if found:
+            some = ", ".join(found[:3]) + ", ..." * (len(found) > 3)
+            about = f"{some} of {method}, are not drawn, so the picture is not the trained one"
+            lines.append(f"{WARNING}{about}; adapt a checkpoint of plain Gaussians")
+    return lines
+
+
 def that_fit(lines: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """The lines of a file's history that every output has room for, the last ones first; and a note on the others."""
     kept, room = list[str](), _INHERITED

@@ -21,6 +21,7 @@ from clod_adapter.config import CLASSIC, FILTERS, AttenuationConfig, ScreenFilte
 from clod_adapter.equation.units import estimated_distance, in_world_units
 from clod_adapter.errors import ClodError
 from clod_adapter.inspection.report import inspect
+from clod_adapter.integrations.splats import to_gsplat
 from clod_adapter.io.adapter_file import load_adapter, save_adapter
 from clod_adapter.io.checkpoint import load, save
 from clod_adapter.io.file_formats import write
@@ -214,3 +215,24 @@ def test_file_without_settings_has_a_note(tmp_path: Path) -> None:
         for notes in (base.notes, inspect(path.with_name("rewritten.ply")).notes):
             (note,) = notes
             assert note.startswith(begin) and all(part in note for part in parts)
+
+
+@pytest.mark.parametrize(
+    ("names", "method"),
+    [
+        (["trbf_center", "trbf_scale", "motion_0", "motion_8", "omega_3"], "SpacetimeGaussians"),
+        (["t", "scale_t_0", "rot_r_3"], "a 4D method"),
+        (["sg_axis_0", "sg_sharpness_0"], "spherical Gaussians"),
+        (["beta", "sb_params_5"], "Beta Splatting"),
+        (["roughness", "base_color_1"], "materials"),
+        (["label", "confidence", "obj_dc_0", "nx"], ""),
+    ],
+)
+def test_columns_that_change_the_picture(tmp_path: Path, names: list[str], method: str) -> None:
+    """A warning names the method, of a PLY and of gsplat's checkpoint; other columns have none."""
+    rows = random_rows(5, [*needed(), *names])
+    splats = to_gsplat(gaussians(5, 0, 0)) | {name: torch.zeros(5) for name in names}
+    torch.save({"step": 1, "splats": splats}, tmp_path / "a.pt")
+    for path in (write_rows(tmp_path / "a.ply", rows), tmp_path / "a.pt"):
+        found = [note for note in load(path, activated="none").notes if note.startswith("warning: ")]
+        assert len(found) == bool(method) and all(method in note and names[0] in note for note in found)

@@ -18,7 +18,7 @@ import numpy as np
 
 from clod_adapter.errors import ClodError, refused_if_damaged
 from clod_adapter.io.file_formats import KEY, START, read_bytes, refuse
-from clod_adapter.io.settings import MODEL, Metadata, Source, document, parse_metadata
+from clod_adapter.io.settings import MODEL, Metadata, Source, document, of_another_method, parse_metadata
 from clod_adapter.io.values import SIGMA, arrays_of, dial_columns
 
 if TYPE_CHECKING:
@@ -78,7 +78,8 @@ def read(path: Path, data: bytes) -> Source:
     wanted = (*NAMES, *dial_columns(splats))
     arrays = {NAMES.get(name, name): _values(path, name, splats, len(data)) for name in wanted}
     metadata = parse_metadata(path, checkpoint.get(KEY), dial=SIGMA in arrays)
-    return Source(arrays, metadata, () if metadata.described else (FRAME,), metadata.about, not metadata.described)
+    notes = *(() if metadata.described else (FRAME,)), *of_another_method(splats)
+    return Source(arrays, metadata, notes, metadata.about, not metadata.described)
 
 
 def _values(path: Path, name: str, splats: dict[str, Any], size: int) -> np.ndarray:
