@@ -268,6 +268,15 @@ def test_checkpoint_of_gsplat(tmp_path: Path, degree: int) -> None:
     assert again.gaussians == base.gaussians and again.vertex.dtype.names[3:6] == ("nx", "ny", "nz")
 
 
+@pytest.mark.parametrize(("name", "what"), [("pose_adjust", "cameras"), ("post_processing", "colours")])
+def test_corrections_of_gsplat_are_not_applied(tmp_path: Path, name: str, what: str) -> None:
+    """A warning says so."""
+    module = {"embeds.weight": torch.zeros(3, 9)}
+    torch.save({"splats": to_gsplat(gaussians(12, 0, 0)), name: module}, tmp_path / "a.pt")
+    (warning,) = (note for note in load(tmp_path / "a.pt").notes if note.startswith("warning: "))
+    assert f"trained with {what}" in warning and f"({name})" in warning
+
+
 @pytest.mark.parametrize("suffix", [".ply", ".spz"])
 def test_splat_transform_reads_files(tmp_path: Path, suffix: str) -> None:
     """It keeps the dial's columns of a PLY bit for bit and in order, but drops the comments with the settings."""

@@ -18,13 +18,19 @@ import numpy as np
 
 from clod_adapter.errors import ClodError, refused_if_damaged
 from clod_adapter.io.file_formats import KEY, START, read_bytes, refuse
-from clod_adapter.io.settings import MODEL, Metadata, Source, document, of_another_method, parse_metadata
+from clod_adapter.io.settings import MODEL, WARNING, Metadata, Source, document, of_another_method, parse_metadata
 from clod_adapter.io.values import SIGMA, arrays_of, dial_columns
 
 if TYPE_CHECKING:
     from clod_adapter.gaussians import Gaussians
 
 FRAME = "gsplat's trainer may have normalised the coordinates; photographs must be in the same"
+# What the trainer corrects for each photograph, by the names of its modules in a checkpoint, and the remedy.
+_CORRECTIONS = {
+    "pose_adjust": ("cameras", "give the corrected cameras with the photographs, or train without --pose_opt"),
+    "post_processing": ("colours", "train without that, or expect a lower PSNR"),
+    "app_module": ("colours", "train without --app_opt, or expect a lower PSNR"),
+}
 _PICKLE_LIMIT = 1 << 20  # bytes; of a few tensors it has a few hundred
 _PLAIN = r"collections OrderedDict|torch\._utils _rebuild_(tensor_v2|parameter)|torch \w+Storage"
 
@@ -78,8 +84,13 @@ def read(path: Path, data: bytes) -> Source:
     wanted = (*NAMES, *dial_columns(splats))
     arrays = {NAMES.get(name, name): _values(path, name, splats, len(data)) for name in wanted}
     metadata = parse_metadata(path, checkpoint.get(KEY), dial=SIGMA in arrays)
-    notes = *(() if metadata.described else (FRAME,)), *of_another_method(splats)
-    return Source(arrays, metadata, notes, metadata.about, not metadata.described)
+    notes = [] if metadata.described else [FRAME]
+    for name, (what, remedy) in _CORRECTIONS.items():
+        if name in checkpoint:
+            about = f"trained with {what} corrected for each photograph ({name}), which is not applied"
+            notes.append(f"{WARNING}{about}; {remedy}")
+    notes += of_another_method(splats)
+    return Source(arrays, metadata, tuple(notes), metadata.about, not metadata.described)
 
 
 def _values(path: Path, name: str, splats: dict[str, Any], size: int) -> np.ndarray:
