@@ -16,6 +16,7 @@ from clod_adapter._support.text import as_text
 from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import atomic_path, check_target, output_lock, remove_leftovers
 from clod_adapter.io.file_formats import check_suffix, read_source
+from clod_adapter.io.ranks import ranks_of
 from clod_adapter.io.scene.folder import scene_files
 
 
@@ -152,7 +153,7 @@ def check_outputs(outputs: Outputs) -> None:
 def _inputs(outputs: Outputs) -> Iterator[tuple[Path, str]]:
     """The files that must not be overwritten, and what they are."""
     for file in map(Path, outputs.inputs):
-        yield file, "an input file"
+        yield from ((each, "an input file") for each in (file, *ranks_of(file).values()))
         for beside in (name.with_suffix(suffix) for name in (file, file.resolve()) for suffix in SUFFIXES):
             if BESIDE.search(_beginning(beside)):
                 yield beside, "the adapter, state or report of an input"

@@ -21,6 +21,7 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.hook import Hook
 from clod_adapter.io.file_formats import PLY, format_of, read_source, write
 from clod_adapter.io.ply_layout import PREFIX, write_rows
+from clod_adapter.io.ranks import ranks_of
 from clod_adapter.io.settings import WARNING, Metadata, matching_calibration, stated_filter, tagged, that_fit
 from clod_adapter.io.values import SIGMA, Activated, prepared
 from clod_adapter.origin import NOWHERE, Origin
@@ -41,8 +42,8 @@ class Checkpoint:
         comments: the header's but the settings, or the lines of history of another format; as far as an output has
             room for them.
         notes: what was dropped or noticed, one line each.
-        fingerprint: SHA-256 of the file's bytes, hex; preceded by "opacity:", "scales:" or "both:" where values were
-            taken as activated.
+        fingerprint: SHA-256 of the file's bytes, hex, or of those of all ranks; preceded by "opacity:", "scales:" or
+            "both:" where values were taken as activated.
         path: of the file.
         calibration: what its dial values keep, cost and take, if it stores that.
         origin: ``[3]`` what the means are relative to, world units: not 0 only for a scene far from 0, whose
@@ -102,6 +103,7 @@ def load(path: str | Path, *, activated: Activated | None = None, origin: Origin
 
     A PLY may have Inria's, MaskGaussian's, Mip-Splatting's or our extended layout: any property order, byte order or
     ascii, with or without normals, SH degree 0 to 4. It is read once; the fingerprint is of the bytes that were parsed.
+    Of a checkpoint of several GPUs any rank stands for all, which lie in its folder.
 
     Rows with a value that is not finite in a used column, or with a zero rotation, are dropped and counted in the
     notes; opacity = +inf stays and means fully opaque. Of MaskGaussian's old layout (``masks_0, masks_1``) rows with
@@ -206,7 +208,8 @@ def save(
     about, origin, vertex = (base.comments, base.origin, base.vertex) if base else ((), NOWHERE, None)
     metadata = Metadata(calibration=calibration, origin=origin, about=about, version=version or "")
     if base is not None:
-        if path.is_file() and base.path.is_file() and path.samefile(base.path):
+        inputs = [base.path, *ranks_of(base.path).values()]
+        if path.is_file() and any(each.is_file() and path.samefile(each) for each in inputs):
             raise ClodError(f"{path}: is the input file, which is never overwritten; choose another output")
         if (
             len(base.gaussians) not in (len(gaussians), gaussians.whole)

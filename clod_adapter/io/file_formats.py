@@ -92,7 +92,21 @@ def check_written(path: Path) -> None:
 
 
 def read_source(path: Path) -> Source:
-    """The content of a file in any format; every reader refuses, in one line, what is damaged or of another kind."""
+    """The content of a file in any format, with the other ranks of a checkpoint of several GPUs (``ranks``).
+
+    Every reader refuses, in one line, what is damaged or of another kind.
+    """
+    source = _read(path)
+    ranks: dict[int, Path] = {} if source.metadata.described else _call("ranks.ranks_of", path)
+    if ranks:
+        _call("ranks.check_ranks", path, ranks)
+    if len(ranks) < 2:
+        return source
+    joined: Source = _call("ranks.joined", path, [source if each == path else _read(each) for each in ranks.values()])
+    return joined
+
+
+def _read(path: Path) -> Source:
     check_readable(path)
     data = read_bytes(path)  # once, and not mapped: another program may write the file meanwhile
     found: Source = _call(f"{format_of(path).module}.read", path, data)

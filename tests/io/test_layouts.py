@@ -2,6 +2,7 @@
 
 import gzip
 import json
+import shutil
 import struct
 from dataclasses import replace
 from pathlib import Path
@@ -24,7 +25,18 @@ from clod_adapter.io.file_formats import write
 from clod_adapter.io.settings import Metadata
 from clod_adapter.origin import NOWHERE
 from clod_adapter.rasterizers.reference import sh_basis
-from formats import ATTENUATION, ORIGIN, change_glb, covariances, model, rows_by_place, splat_transform, turned
+from formats import (
+    ATTENUATION,
+    ORIGIN,
+    change_glb,
+    covariances,
+    inria_rows,
+    model,
+    rows_by_place,
+    splat_transform,
+    turned,
+    write_rows,
+)
 from scenes import camera, gaussians
 
 KHR = "KHR_gaussian_splatting"
@@ -266,6 +278,39 @@ def test_checkpoint_of_gsplat(tmp_path: Path, degree: int) -> None:
     save(tmp_path / "out.ply", base.gaussians, base)
     again = load(tmp_path / "out.ply")
     assert again.gaussians == base.gaussians and again.vertex.dtype.names[3:6] == ("nx", "ny", "nz")
+
+
+@pytest.mark.parametrize("name", ["ckpt_29999_rank{}.pt", "point_cloud_rk{}_ws3.ply"])
+def test_ranks_of_several_gpus(tmp_path: Path, name: str) -> None:
+    """Any of them is all of them; a file of another run or number does not matter, a missing or odd one is refused."""
+    g = gaussians(30, 1, 0)
+    paths = [tmp_path / name.format(rank) for rank in range(3)]
+    for rank, path in enumerate(paths):
+        part = g.select(torch.arange(10) + 10 * rank)
+        if path.suffix == ".pt":
+            torch.save({"splats": to_gsplat(part)}, path)
+        else:
+            write_rows(path, inria_rows(part))
+    for other in (name.replace("_r", "0_r"), name.replace("{}", "_").replace("ws3", "ws4")):
+        (tmp_path / other.format(9)).write_bytes(b"another")
+    found = [load(path) for path in paths]
+    assert all(each.gaussians == g for each in found) and len({each.fingerprint for each in found}) == 1
+    assert found[0].notes[-1] == "its 3 ranks, in files beside it, are read as one checkpoint"
+    with pytest.raises(ClodError, match="is the input file"):
+        save(paths[2], g, found[0])
+    save(tmp_path / "out.ply", g, found[0])
+    assert load(tmp_path / "out.ply").gaussians == g
+    shutil.copy(tmp_path / "out.ply", tmp_path / "out_rk1_ws3.ply")  # of this package
+    assert load(tmp_path / "out_rk1_ws3.ply").gaussians == g
+    if path.suffix == ".pt":
+        torch.save({"splats": to_gsplat(gaussians(5, 2, 0))}, paths[1])
+    else:
+        write_rows(paths[1], inria_rows(gaussians(5, 2, 0)))
+    with pytest.raises(ClodError, match=f"{paths[0].name}: does not fit the other ranks"):
+        load(paths[0])
+    paths[1].unlink()
+    with pytest.raises(ClodError, match=f"{paths[2].name}: is of a checkpoint of several GPUs, whose rank 1 is not"):
+        load(paths[2])
 
 
 @pytest.mark.parametrize(("name", "what"), [("pose_adjust", "cameras"), ("post_processing", "colours")])
