@@ -8,11 +8,14 @@ from dataclasses import astuple, dataclass, replace
 from itertools import pairwise
 from typing import Any
 
-from clod_adapter.config import require
+from clod_adapter.config import FARTHEST, require
 from clod_adapter.errors import ClodError
 
 AGAINST = ("photographs", "checkpoint")
 MOST = 1000  # rows and viewpoints, and characters of the machine's name, for which every file has room
+NARROWEST = 1e-4  # angle of view, radians
+LARGEST = 1 << 32  # count
+PIXELS = 1 << 26  # of an image: a page renders images of this size
 
 
 @dataclass(frozen=True)
@@ -38,7 +41,7 @@ class Viewpoint:
         fov: vertical angle of view, radians; 0 if unknown.
 
     Raises:
-        ClodError: a value is not finite, a vector is no unit vector, or the unit or the angle is not positive.
+        ClodError: a value is out of range, or a vector is no unit vector.
     """
 
     x: float
@@ -55,9 +58,10 @@ class Viewpoint:
 
     def __post_init__(self) -> None:
         values = astuple(self)
-        require(all(map(math.isfinite, values[:3])), "the centre of a viewpoint", values[:3], "finite")
+        near = all(abs(value) < FARTHEST for value in values[:3])
+        require(near, "the centre of a viewpoint", values[:3], f"below {FARTHEST:g}")
         lengths = math.hypot(*values[4:7]), math.hypot(*values[7:10])
-        known = 0 < self.fov < math.pi and max(abs(length - 1) for length in lengths) < 1e-3
+        known = NARROWEST < self.fov < math.pi and max(abs(length - 1) for length in lengths) < 1e-3
         require(known or not any(values[4:]), "the direction of a viewpoint", values[4:], "unit vectors and an angle")
         require(0 < self.unit < math.inf, "the unit of a viewpoint", self.unit, "positive and finite")
 
@@ -101,6 +105,10 @@ class Calibration:
             raise ClodError("calibration has a value that is not finite")
         if min(self.total, self.views, self.width, self.height) < 1 or min(row.frame_ms for row in self.rows) <= 0:
             raise ClodError("calibration has a count, size or frame time that is not positive")
+        counts = self.total, self.views, self.width, self.height
+        require(max(counts) <= LARGEST, "a count or size of a calibration", max(counts), f"at most {LARGEST}")
+        size = f"{self.width}x{self.height}"
+        require(self.width * self.height <= PIXELS, "the image of a calibration", size, f"at most {PIXELS} pixels")
         entries = len(self.rows) + len(self.viewpoints)
         require(entries <= MOST, "the number of rows and viewpoints", entries, f"at most {MOST}")
         plain = self.machine.isascii() and self.machine == _plain(self.machine) != ""

@@ -46,7 +46,7 @@ def dial_vector(config: AttenuationConfig, virtual_scale: float) -> np.ndarray:
     out, rate = np.zeros(dial.DIAL, np.float32), virtual_scale / config.scene_distance
     out[dial.RATE2] = min(rate, FASTEST) ** 2
     if config.near_distance > 0:
-        out[dial.NEAR2] = (config.scene_distance / config.near_distance) ** 2
+        out[dial.NEAR2] = min(config.scene_distance / config.near_distance, FASTEST) ** 2
     out[dial.GROWTH_RATE2] = min(rate / growth_distance(config), FASTEST) ** 2
     return out
 

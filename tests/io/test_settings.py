@@ -16,7 +16,7 @@ from plyfile import PlyData
 from safetensors.torch import load_file, save_file
 
 from clod_adapter.adapter import detach, extract, with_dial
-from clod_adapter.calibration import Calibration
+from clod_adapter.calibration import Calibration, Viewpoint
 from clod_adapter.config import CLASSIC, FILTERS, AttenuationConfig, ScreenFilter
 from clod_adapter.equation.units import estimated_distance, in_world_units
 from clod_adapter.errors import ClodError
@@ -100,6 +100,28 @@ def test_damaged_settings_are_refused(tmp_path: Path) -> None:
     ):  # fmt: skip
         with pytest.raises(ClodError, match=f"a.ply: its settings are damaged .*{message}.*; restore them, or export"):
             load(described(tmp_path / "a.ply", "max_sv 5", comment))
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("40 3 64 48", "40 3 100000 100000"),
+        ("40 3 64 48", f"40 3 {'9' * 310} 48"),
+        ("40 3 64 48", f"40 {'9' * 310} 64 48"),
+        ("viewpoint 1 ", "viewpoint 1e308 "),
+        (" 0.7", " 1e-308"),
+        ("calibrated 1 ", f"calibrated {'9' * 310} "),
+    ],
+)
+def test_a_calibration_of_absurd_numbers_is_ignored(tmp_path: Path, old: str, new: str) -> None:
+    """With a note; nothing is rendered in its size."""
+    places = (Viewpoint(1, 0, -5, 1, 0, 0, 1, 0, -1, 0, 0.7),)
+    write(tmp_path / "a.ply", model(0), Metadata(calibration=replace(CALIBRATION, viewpoints=places)))
+    data = (tmp_path / "a.ply").read_bytes()
+    assert data.count(old.encode()) == 1
+    (tmp_path / "a.ply").write_bytes(data.replace(old.encode(), new.encode()))
+    found = load(tmp_path / "a.ply")
+    assert found.calibration is None and any("calibration is unusable and ignored" in note for note in found.notes)
 
 
 def with_a_cut(path: Path) -> Path:
