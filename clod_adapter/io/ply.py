@@ -126,7 +126,7 @@ def _elements(data: bytes, head: Head) -> dict[str, np.ndarray]:
             raise ValueError(f"a row of more than {_LONGEST:,} characters")  # which would be copied several times
         with warnings.catch_warnings(), np.errstate(over="ignore"):
             warnings.simplefilter("ignore")  # of text that is beyond float32's range
-            whole = b"".join((head.text, memoryview(data)[head.size :]))
+            whole = data if data.startswith(head.text) else head.text + data[head.size :]  # a copy if it was changed
             found = {each.name: each.data for each in PlyData.read(io.BytesIO(whole))}
     return {name: rows.astype(rows.dtype.newbyteorder("="), copy=False) for name, rows in found.items()}
 

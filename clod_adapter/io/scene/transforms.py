@@ -65,7 +65,7 @@ def _frames(path: Path, held_out: bool | None) -> tuple[list[PosedImage], list[s
     names = [
         next((each + end for end in ENDINGS if isfile(path.parent / file_name(each + end))), each) for each in listed
     ]
-    files, _ = find_files(path.parent, [name_parts(name, path) for name in names])
+    files, _ = find_files(path.parent, [tuple(name.split("/")) for name in names])
     images, is_test = [], _split(path, content)
     testing = {name for each, name in zip(listed, names, strict=True) if is_test and is_test(each)}
     for frame, name, file in zip(frames, names, files, strict=True):
