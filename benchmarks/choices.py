@@ -10,17 +10,20 @@ adds one row to ``results/choices.jsonl``; "default" changes nothing. A choice i
 field of ``schedule.FAR``, or a field of ``AdaptConfig``.
 """
 
-from dataclasses import fields, replace
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import clod_adapter as clod
 from adapt import SHARES, at_shares
+from clod_adapter.config import PLACED_MAX_SV
 from clod_adapter.training import dial, far
 from clod_adapter.training.pseudo_views import render_pseudo_views
-from clod_adapter.training.schedule import FAR, Schedule
+from clod_adapter.training.schedule import FAR
 from common import Row, append, arguments, checkpoint, photographs, stored, table
-from stream import SEED, VIEWS
+from stream import rendered
 
 FILE, MAX_SV = "choices.jsonl", 7.0  # of captures, as adapt.jsonl has them
 ALTERNATIVES: dict[str, tuple[Any, ...]] = {
@@ -51,27 +54,22 @@ def opened(scene: str) -> tuple[clod.Gaussians, clod.Scene]:
     if not scene.endswith(".ply"):
         return checkpoint(scene).gaussians, photographs(scene)
     base = clod.load(scene).gaussians
-    test = render_pseudo_views(base, clod.place_cameras(base, views=VIEWS, seed=SEED)).train
-    return base, clod.Scene(render_pseudo_views(base, clod.place_cameras(base)).train, test)
+    return base, clod.Scene(render_pseudo_views(base, clod.place_cameras(base)).train, tuple(rendered(base)))
 
 
 def measure(scene: str, base: clod.Gaussians, views: clod.Scene, name: str, value: Any) -> None:
     """Adapts with one change, and adds the row."""
-    settings: dict[str, Any] = {} if scene.endswith(".ply") else {"max_sv": MAX_SV}
-    defaults = {each: getattr(far, each) for each in ALTERNATIVES if hasattr(far, each)}
-    try:
-        if name in defaults:
-            setattr(far, name, value)
-        elif name in {each.name for each in fields(Schedule)}:
-            dial.FAR = replace(FAR, **{name: value})
-        elif name != "default":
-            settings[name] = value
+    settings: dict[str, Any] = {"max_sv": PLACED_MAX_SV if scene.endswith(".ply") else MAX_SV}
+    change: AbstractContextManager[Any] = nullcontext()
+    if hasattr(far, name):
+        change = patch.object(far, name, value)
+    elif hasattr(FAR, name):
+        change = patch.object(dial, "FAR", replace(FAR, **{name: value}))
+    elif name != "default":
+        settings[name] = value
+    with change:
         plan = clod.make_plan(base, views, clod.AdaptConfig(**settings))
         adapted = plan.adapt(views)
-    finally:
-        dial.FAR = FAR
-        for each, default in defaults.items():
-            setattr(far, each, default)
     result = plan.whole(base, adapted.gaussians)
     append(FILE, {
         "benchmark": "choices", "scene": Path(scene).stem, "choice": name, "value": value, "steps": adapted.steps,

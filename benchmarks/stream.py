@@ -58,12 +58,7 @@ def compared(
 ) -> Iterator[Row]:
     """The rows: the run, the dial at 1, 2 and 5, and then each method at each budget."""
     base, out = clod.load(scene).gaussians, adapted or folder / "adapted.ply"
-    if images:
-        views = list(clod.load_scene(images).test)
-    else:
-        cameras = clod.place_cameras(base, views=VIEWS, seed=SEED)
-        with torch.no_grad():
-            views = [clod.View(camera, clod.render(base, camera).pixels) for camera in cameras]
+    views = clod.load_scene(images).test if images else rendered(base)
     if adapted is None:
         words = ["--images", images] if images else []
         run = Process([*COMMAND, scene, *words, "--out", out, "--json", "--accept-loss"])
@@ -91,6 +86,13 @@ def compared(
                 row = {"method": name, **measured(drawn, views, budget, len(base)), "multiplier": multiplier}
                 found[row["level"]] = max(row, found.get(row["level"], row), key=lambda each: each["psnr"])
         yield from found.values()
+
+
+def rendered(base: clod.Gaussians) -> list[clod.View]:
+    """The checkpoint's own renders from VIEWS placed cameras that training does not use."""
+    cameras = clod.place_cameras(base, views=VIEWS, seed=SEED)
+    with torch.no_grad():
+        return [clod.View(camera, clod.render(base, camera).pixels) for camera in cameras]
 
 
 def measured(shown: "Dial | Levels", views: Sequence[clod.View], budget: float, whole: int) -> Row:
