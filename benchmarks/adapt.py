@@ -48,7 +48,7 @@ def run(scene: str, label: str, config: clod.AdaptConfig, changed: dict[str, Any
     base_row = clod.evaluate(base.gaussians, views.test, [1.0])[0]
     plan = clod.make_plan(base.gaussians, views, config)
     adapted = plan.adapt(views)
-    whole = plan.whole(base.gaussians, adapted.gaussians)
+    whole = adapted.gaussians
     adapter = clod.extract(base.gaussians, whole, fingerprint=base.fingerprint, config=asdict(config))
     result = adapter.apply(base.gaussians)
     append(FILE, {

@@ -70,7 +70,7 @@ def measure(scene: str, base: clod.Gaussians, views: clod.Scene, name: str, valu
     with change:
         plan = clod.make_plan(base, views, clod.AdaptConfig(**settings))
         adapted = plan.adapt(views)
-    result = plan.whole(base, adapted.gaussians)
+    result = adapted.gaussians
     append(FILE, {
         "benchmark": "choices", "scene": Path(scene).stem, "choice": name, "value": value, "steps": adapted.steps,
         "full": clod.evaluate(result, views.test, [1.0])[0].as_dict(), "at_shares": at_shares(result, views.test),

@@ -16,7 +16,7 @@ from threading import Thread
 from typing import Any
 
 import clod_adapter as clod
-from clod_adapter.cli.shared.measure import machine
+from clod_adapter._support.machine import machine
 from clod_adapter.cli.shared.outputs import jsonable
 
 import torch

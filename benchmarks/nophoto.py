@@ -49,7 +49,7 @@ def run(scene: str, kind: str, config: clod.AdaptConfig, few: int | None) -> Non
     seconds = time.perf_counter() - began
     plan = clod.make_plan(base, views, config)
     adapted = plan.adapt(views)
-    result = plan.whole(base, adapted.gaussians)
+    result = adapted.gaussians
     rows = clod.evaluate(result, photographs.test, [s for s in DIALS if s <= config.max_sv])
     append(FILE, {
         "benchmark": "nophoto", "scene": scene, "kind": kind, "config": asdict(config), "views": len(views.train),

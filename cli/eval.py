@@ -72,6 +72,8 @@ def outputs(args: Namespace) -> Outputs:
 
 
 def execute(args: Namespace) -> dict[str, Any]:
+    from clod_adapter._support.machine import machine
+
     from .shared import measure as measuring
     from .shared.inputs import read_inputs
     from .shared.pages import add_page
@@ -87,7 +89,7 @@ def execute(args: Namespace) -> dict[str, Any]:
         rows = measuring.measure(model, scene.test, dials, console, stop)
         if not rows:
             raise Stopped("stopped before the first row")
-        (rows,) = measuring.with_frame_times([(model, rows)], scene.test, console, stop)
+        (rows,) = measuring.comparable([(model, rows)], scene.test, console, stop)
         print(measuring.table(measuring.by_dial(rows)))
         with suppress(Stopped):
             if base is not None:
@@ -102,7 +104,7 @@ def execute(args: Namespace) -> dict[str, Any]:
         "base_count": model.whole, "sh_degree": model.sh_degree, "views": len(scene.test),
         "rows": [row.as_dict() for row in rows], "base": args.base, **comparisons.report,
         "interrupted": stop.requests > 0, "attenuation": asdict(model.attenuation) if model.attenuation else None,
-        "notes": console.notes, "machine": measuring.machine(), "device": str(model.means.device),
+        "notes": console.notes, "machine": machine(), "device": str(model.means.device),
         "seconds": watch.report(),
     }  # fmt: skip
     if args.report:

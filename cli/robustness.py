@@ -100,10 +100,9 @@ class Cell:
 
     def run(self, scene: Scene, progress: Listener) -> dict[str, Any]:
         """Measures; writes the adapter and then the rows."""
+        from clod_adapter._support.machine import machine
         from clod_adapter.evaluation.robustness import adapt_at_range, baseline
         from clod_adapter.io.adapter_file import save_adapter
-
-        from .shared.measure import machine
 
         base, adapter_file = self.checkpoint, self.file.with_suffix(ADAPTER)
         if self.config is None:
@@ -124,15 +123,17 @@ class Cell:
 
 
 def execute(args: Namespace) -> dict[str, Any]:
+    from clod_adapter._support.machine import machine
+    from clod_adapter.evaluation.calibrate import report_dials
     from clod_adapter.evaluation.robustness import BASELINE_SHARES, scene_fingerprint
 
-    from .shared.inputs import align, prepare_kernels, read_inputs
-    from .shared.measure import Stopwatch, machine, report_dials
+    from .shared.inputs import align_shown, prepare_kernels, read_inputs
+    from .shared.measure import Stopwatch
 
     console, watch, stop, required = Console(args.quiet), Stopwatch(), GracefulStop(), not args.misaligned_ok
     checkpoints, scene = read_inputs(args, args.ply, console, training=True, required=required)
     for each in checkpoints[1:]:
-        if align(each, scene, args.images, console, required=required)[1]["frame"]:
+        if align_shown(each, scene, console, required=required)[1]["frame"]:
             raise ClodError(f"{each.path}: in another frame than {args.ply[0]}; give it alone")
     for each in checkpoints:
         if each.gaussians.sigma_d is not None:

@@ -3,8 +3,8 @@
 import clod_adapter as clod
 base = clod.load("pretrained.ply")
 scene = clod.load_scene("scene/", origin=base.origin)
-result = clod.adapt(base.gaussians, scene, clod.AdaptConfig(max_sv=5))
-clod.save("model.ply", result.gaussians, base)
+result = clod.adapt_checkpoint(base, scene, clod.AdaptConfig(max_sv=5))
+result.save("model.ply")
 image = clod.render(result.gaussians, scene.test[0].camera, virtual_scale=3).image
 """
 
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from clod_adapter.io.adapter_file import load_adapter, save_adapter
     from clod_adapter.io.checkpoint import Checkpoint, load, save
     from clod_adapter.io.scene.load import load_scene
+    from clod_adapter.pipeline import Result, adapt_checkpoint
     from clod_adapter.progress import Phase, Progress, Stopped
     from clod_adapter.render import Rendering, render
     from clod_adapter.training.camera_placement import place_cameras
@@ -63,6 +64,7 @@ _homes = {name: f"{__name__}.{home}" for home, names in {
     "training.pseudo_views": ("add_pseudo_views", "render_pseudo_views"),
     "training.plan": ("Decision", "Override", "Plan"),
     "training.planner": ("make_plan",),
+    "pipeline": ("Result", "adapt_checkpoint"),
     "progress": ("Phase", "Progress", "Stopped"),
     "render": ("Rendering", "render"),
     "training.dial": ("Dial", "attach"),
@@ -89,10 +91,51 @@ class _Lazy(ModuleType):
 sys.modules[__name__].__class__ = _Lazy
 
 __all__ = [
-    "AdaptConfig", "Adapted", "Adapter", "AttenuationConfig", "Calibration", "Camera", "Checkpoint", "ClodError",
-    "Decision", "Dial", "DialValue", "Gaussians", "Hold", "Hook", "Override", "Phase", "Plan", "Progress", "Rendering",
-    "Scene", "ScreenFilter", "Stopped", "View", "adapt", "add_pseudo_views", "attach", "bake", "bake_levels", "detach",
-    "dial_for", "evaluate", "extract", "from_gsplat", "load", "load_adapter", "load_scene", "make_plan",
-    "order_by_extinction", "place_cameras", "render", "render_pseudo_views", "save", "save_adapter", "to_gsplat",
+    "AdaptConfig",
+    "Adapted",
+    "Adapter",
+    "AttenuationConfig",
+    "Calibration",
+    "Camera",
+    "Checkpoint",
+    "ClodError",
+    "Decision",
+    "Dial",
+    "DialValue",
+    "Gaussians",
+    "Hold",
+    "Hook",
+    "Override",
+    "Phase",
+    "Plan",
+    "Progress",
+    "Rendering",
+    "Result",
+    "Scene",
+    "ScreenFilter",
+    "Stopped",
+    "View",
+    "adapt",
+    "adapt_checkpoint",
+    "add_pseudo_views",
+    "attach",
+    "bake",
+    "bake_levels",
+    "detach",
+    "dial_for",
+    "evaluate",
+    "extract",
+    "from_gsplat",
+    "load",
+    "load_adapter",
+    "load_scene",
+    "make_plan",
+    "order_by_extinction",
+    "place_cameras",
+    "render",
+    "render_pseudo_views",
+    "save",
+    "save_adapter",
+    "to_gsplat",
     "with_dial",
-]  # fmt: skip
+]

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from itertools import chain
 from numbers import Integral
 from operator import mul
+from pathlib import Path
 from typing import Any, TypeVar
 
 import torch
@@ -187,6 +188,7 @@ class Scene:
         train: views for training.
         test: held-out views.
         notes: changes made to the images when they were read, one line each, for the report.
+        folder: where the photographs were read from; None for those that were rendered.
         left_out: skipped steps of reading, with their reasons: ``("undistortion", "all 97 cameras are pinholes")``.
     """
 
@@ -194,6 +196,7 @@ class Scene:
     test: tuple[View, ...]
     notes: tuple[str, ...] = ()
     left_out: tuple[tuple[str, str], ...] = ()
+    folder: Path | None = None
 
     def __repr__(self) -> str:
         views = [*self.train, *self.test]

@@ -7,7 +7,6 @@ a look; ``clod-adapt`` is the same with progress, reports and the full number of
 """
 
 import sys
-from dataclasses import asdict
 
 import clod_adapter as clod
 
@@ -17,17 +16,9 @@ ITERS = 200
 def main(checkpoint: str, folder: str, out: str = "adapted.ply") -> None:
     base = clod.load(checkpoint)
     scene = clod.load_scene(folder, origin=base.origin)  # relative to what the checkpoint is, if it is far from 0
-    config = clod.AdaptConfig(max_sv=5, iters=ITERS)
-    result = clod.adapt(base.gaussians, scene, config)
-
-    # The adapter is the difference from the base; the file is made of both.
-    adapter = clod.extract(
-        base.gaussians, result.gaussians, fingerprint=base.fingerprint, config=asdict(config), origin=base.origin
-    )
-    adapted = adapter.apply(base.gaussians)
-    clod.save(out, adapted, base)
-
-    for row in clod.evaluate(adapted, scene.test, [1, 2, 3, 5]):
+    result = clod.adapt_checkpoint(base, scene, clod.AdaptConfig(max_sv=5, iters=ITERS))
+    result.save(out)  # and the adapter beside it, the difference from the base
+    for row in result.rows:
         print(f"dial {row.virtual_scale:g}: {row.psnr:.2f} dB with {row.kept_share:.0%} of the Gaussians")
     print(f"wrote {out}")
 

@@ -206,7 +206,7 @@ def test_training_stays_there(there: Gaussians, monkeypatch: pytest.MonkeyPatch)
     plain, views = detach(there), views_of(there)[:1]
     scene = Scene(views, ())
     plan = make_plan(plain, scene, SHORT)
-    whole = plan.whole(plain, plan.adapt(scene).gaussians)
+    whole = plan.adapt(scene).gaussians
     assert not torch.equal(whole.means.cpu(), plan.start.means.cpu())
     assert all(x.device == plain.means.device and bool(x.isfinite().all()) for x in whole.tensors().values())
     monkeypatch.setattr(importlib.import_module("clod_adapter.evaluation.frame_times"), "PASSES", 2)

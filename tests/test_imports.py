@@ -35,6 +35,7 @@ ORDER: list[set[str]] = [
     {"io.adapter_file"},
     {"alignment", "report", "training", "viewer"},
     {"evaluation", "inspection", "nerfstudio"},
+    {"pipeline"},
     {"demo"},
     {""},  # the package itself, whose __init__ re-exports from the rows above
     {"cli.shared"},

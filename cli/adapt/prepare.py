@@ -7,6 +7,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,21 +17,21 @@ import numpy as np
 from clod_adapter._kernels.memory import release
 from clod_adapter.adapter import dial_tensors
 from clod_adapter.cameras import Scene, View
+from clod_adapter.evaluation.calibrate import report_dials
 from clod_adapter.evaluation.evaluate import Row
 from clod_adapter.evaluation.robustness import scene_fingerprint
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.checkpoint import Checkpoint
-from clod_adapter.progress import GracefulStop, Phase, Stopped
-from clod_adapter.training.camera_placement import place_cameras
+from clod_adapter.progress import GracefulStop, Stopped
 from clod_adapter.training.loop import time_steps
 from clod_adapter.training.plan import NOT_NEEDED, Decision, Override, Plan
 from clod_adapter.training.planner import make_plan
-from clod_adapter.training.pseudo_views import add_pseudo_views, render_pseudo_views
+from clod_adapter.training.pseudo_views import with_pseudo_views
 
 from ..shared import inputs
 from ..shared.command import make_config
 from ..shared.console import Console, ProgressDisplay
-from ..shared.measure import Stopwatch, measure, report_dials
+from ..shared.measure import Stopwatch, measure
 from ..shared.outputs import AdaptFiles
 from ..shared.pages import SNAPSHOT_VIEWS
 from ..shared.process import launched
@@ -52,6 +53,7 @@ class Run:
     alignment: dict[str, Any] | None = None  # the measurements of the check; None without photographs
     base_rows: list[Row]  # at dial value 1; none if nothing is held out
     base_seconds = 0.0  # of measuring it
+    cut = True  # whether the measurements of the result are missing or incomplete
     forecast: dict[str, Any] | None = None
     forecast_at = 0.0
 
@@ -59,7 +61,7 @@ class Run:
         self.args, self.console, self.watch = args, Console(args.quiet), Stopwatch()
         self.stop = GracefulStop(aborts=launched().size == 1)  # launchers repeat signals
         self.config = make_config(args)
-        self.teacher = "checkpoint" if args.images is None else "photographs"
+        self.against = "checkpoint" if args.images is None else "photographs"
         self.outputs = AdaptFiles.of(args.ply, args.out)
         self.saver = Saver(self.outputs.state, self.config, self.console, self.stop, args.resume)
 
@@ -77,7 +79,7 @@ class Run:
         with watch.time("evaluate"):
             if photographs is not None:
                 required = not args.misaligned_ok
-                photographs, self.alignment = inputs.align(base, photographs, args.images, console, required=required)
+                photographs, self.alignment = inputs.align_shown(base, photographs, console, required=required)
                 views = [*photographs.test, *photographs.train]
             self.base = base = inputs.with_filter(base, args, console, views)
         if base.gaussians.screen_filter.compensate:
@@ -89,16 +91,9 @@ class Run:
 
     def place(self, photographs: Scene | None) -> None:
         """Adds pseudo views where photographs are few, and replaces them where there are none."""
-        gaussians, config, console = self.base.gaussians, self.config, self.console
-        with console.meter(Phase.CAMERAS) as meter:
-            if photographs is not None:
-                self.scene = add_pseudo_views(gaussians, photographs, config.seed, meter)
-            else:
-                cameras = place_cameras(gaussians, seed=config.seed, progress=meter)
-        if photographs is None:
-            with console.meter(Phase.PSEUDO_VIEWS) as meter:
-                self.scene = render_pseudo_views(gaussians, cameras, progress=meter)
-        console.note(*self.scene.notes)
+        with closing(ProgressDisplay(self.console, self.stop)) as display:
+            self.scene = with_pseudo_views(self.base.gaussians, photographs, self.config.seed, display)
+        self.console.note(*self.scene.notes)
 
     def identify(self) -> None:
         """Refuses the state of another run."""

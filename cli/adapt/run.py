@@ -2,27 +2,23 @@
 
 import argparse
 import shlex
-from collections.abc import Sequence
 from contextlib import closing
-from dataclasses import asdict, dataclass, replace
-from functools import partial
+from dataclasses import asdict, replace
 from typing import Any
 
 from clod_adapter._kernels.memory import release
+from clod_adapter._support.machine import machine
 from clod_adapter._support.text import package_version
-from clod_adapter.adapter import Adapter, detach, extract
-from clod_adapter.errors import ClodError
-from clod_adapter.evaluation.evaluate import Row
-from clod_adapter.gaussians import Gaussians
-from clod_adapter.io.adapter_file import save_adapter
+from clod_adapter.adapter import detach
+from clod_adapter.evaluation.calibrate import report_dials
 from clod_adapter.io.atomic import atomic_paths
-from clod_adapter.io.checkpoint import save
+from clod_adapter.pipeline import Result, calibrated, extract_result
 from clod_adapter.progress import GracefulStop, Progress
 from clod_adapter.training.plan import Plan
 from clod_adapter.training.state import Adapted
 
 from ..shared.console import ProgressDisplay, duration
-from ..shared.measure import by_dial, calibrate, machine, measure, report_dials, table, with_frame_times
+from ..shared.measure import by_dial, comparable, measure, table
 from ..shared.outputs import size, write_report
 from ..shared.pages import AdaptPage
 from ..shared.process import launched, listen_no_more
@@ -31,22 +27,6 @@ from .processes import BACKENDS, explain, hurried, together
 
 # dB: of s = 1 below the base, and against the checkpoint's renderings without photographs, what is told and what fails.
 LOST, ENOUGH = (0.1, 1.0), (33.0, 25.0)
-
-
-@dataclass(frozen=True)
-class Result:
-    """What is written: ``gaussians``, which are ``adapter`` applied to the base.
-
-    ``rows`` are of the dial, ``plain`` of a viewer that does not know it; some are missing if measuring was ``cut``.
-    """
-
-    plan: Plan
-    adapted: Adapted
-    adapter: Adapter
-    gaussians: Gaussians
-    rows: Sequence[Row] = ()
-    plain: Sequence[Row] = ()
-    cut: bool = True
 
 
 def adapt(args: argparse.Namespace) -> dict[str, Any]:
@@ -64,21 +44,19 @@ def adapt(args: argparse.Namespace) -> dict[str, Any]:
 
 def train(run: Run, page: AdaptPage | None) -> tuple[Plan, Adapted]:
     """Plans and trains; the result is of all Gaussians."""
-    base, scene, saver = run.base.gaussians, run.scene, run.saver
+    scene, saver = run.scene, run.saver
     display = ProgressDisplay(run.console, run.stop)
     plan = decide(run, display)
     forecast(run, plan)
 
     def show(now: Progress) -> bool:
         if page:
-            page(now, partial(plan.whole, base))
+            page(now, plan.restore_excluded)
         return display(now)
 
     with closing(display), together(plan, scene, saver.state, display) as group:
         adapted = plan.adapt(scene, saver.saving(show), saver.state, group)
     saver.keep()
-    start_seconds = adapted.start_seconds + plan.seconds["start"]
-    adapted = replace(adapted, gaussians=plan.whole(base, adapted.gaussians), start_seconds=start_seconds)
     how = "ended after" if adapted.failed else "interrupted after" if adapted.interrupted else "trained"
     run.console.say(f"{how} {adapted.steps} steps, {duration(adapted.seconds)}")
     release()
@@ -89,22 +67,11 @@ def make_result(run: Run, plan: Plan, adapted: Adapted) -> Result:
     """Extracts the adapter, and applies it to the base."""
     if hurried(adapted):
         listen_no_more()
-    base, found = run.base, adapted.gaussians
-    adapter = extract(
-        base.gaussians, found, fingerprint=base.fingerprint, config=asdict(run.config), origin=base.origin
-    )
-    note_training(run, adapted)
-    return Result(plan, adapted, adapter, adapter.apply(base.gaussians))
-
-
-def note_training(run: Run, adapted: Adapted) -> None:
-    note = run.console.note
     if adapted.lost:
-        note(f"training ended at step {adapted.steps}: {explain(adapted.lost)}")
-    if adapted.failed:
-        note(f"training ended early, and the result so far is written: {adapted.failed}")
-    if adapted.held:
-        note(f"{adapted.held:,} Gaussians were not moved by some steps: their gradients were not finite")
+        adapted = replace(adapted, lost=explain(adapted.lost))
+    run.console.note(*adapted.notes)
+    result = extract_result(run.base, run.scene, run.against, plan, adapted, run.config)
+    return replace(result, base_rows=run.base_rows)
 
 
 def finish(run: Run, result: Result, page: AdaptPage | None) -> dict[str, Any]:
@@ -115,9 +82,9 @@ def finish(run: Run, result: Result, page: AdaptPage | None) -> dict[str, Any]:
     with stop.listening():  # a first Ctrl-C ends the measurement, and lets the writing finish
         result = measure_result(run, result, stop)
         report = write_result(run, result)
-    complete = not interrupted and not result.cut
+    complete = not interrupted and not run.cut
     run.saver.close(complete)
-    if page and (result.cut or stop.requests):
+    if page and (run.cut or stop.requests):
         console.say("interrupted: the page of --report was not written")
     elif page:  # after the report, which it changes
         path = outputs.ply.with_suffix(".html")
@@ -145,27 +112,22 @@ def measure_result(run: Run, result: Result, stop: GracefulStop) -> Result:
         rows = measure(result.gaussians, views, report_dials(run.config.max_sv), console, stop)
         plain = measure(detached, views, [1.0], console, stop, "plain")
         measured = [(run.base.gaussians, run.base_rows), (result.gaussians, rows), (detached, plain)]
-        run.base_rows, rows, plain = with_frame_times(measured, views, console, stop)
-    return replace(result, rows=rows, plain=plain, cut=stop.requests > 0)
+        base_rows, rows, plain = comparable(measured, views, console, stop)
+    run.cut = stop.requests > 0
+    result = replace(result, base_rows=base_rows, rows=rows, plain=plain)
+    return result if run.cut or not rows else calibrated(result, console.say)
 
 
 def write_result(run: Run, result: Result) -> dict[str, Any]:
     """Writes the three files, all before the first replaces that of an earlier run, and returns the report."""
-    outputs, console, adapter, gaussians = run.outputs, run.console, result.adapter, result.gaussians
-    if result.rows and not result.cut:
-        try:
-            found = calibrate(result.rows, gaussians, run.scene, run.teacher, run.base.origin)
-            adapter = replace(adapter, calibration=found)
-        except ClodError as error:
-            console.say(f"the files have no calibration, so --fps and --psnr-drop will not work: {error}")
+    outputs, console, calibration = run.outputs, run.console, result.adapter.calibration
     report = describe(run, result)
     with (
         console.status(f"writing {outputs.ply} ..."),
         atomic_paths(outputs.adapter, outputs.ply, outputs.report) as (small, large, about),
     ):
-        save_adapter(small, adapter)
-        save(large, gaussians, run.base, version=adapter.version, calibration=adapter.calibration)
-        report["calibration"] = adapter.calibration and adapter.calibration.as_dict()
+        result.write(large, small)
+        report["calibration"] = calibration and calibration.as_dict()
         report |= {"adapter_bytes": small.stat().st_size, "ply_bytes": large.stat().st_size}
         write_report(about, report)
     console.say(f"wrote {outputs.adapter} and {outputs.ply}")
@@ -178,11 +140,11 @@ def describe(run: Run, result: Result) -> dict[str, Any]:
     times, count, device = result.plan.seconds, launched().size, result.gaussians.means.device
     planning = sum(times.values()) - times["start"]
     run.watch.seconds |= {"plan": planning, "start": adapted.start_seconds, "train": adapted.seconds}
-    if result.cut:
+    if run.cut:
         run.console.note("the measurements were interrupted: only the dial values that were finished are reported")
     report = {
         "command": "adapt", "version": package_version(), "model": args.ply, "scene": args.images,
-        "teacher": run.teacher, "screen_filter": asdict(result.gaussians.screen_filter),
+        "teacher": run.against, "screen_filter": asdict(result.gaussians.screen_filter),
         "base_count": adapter.base_count, "config": adapter.config, "attenuation": asdict(adapter.attenuation),
         "steps": adapted.steps, "interrupted": adapted.interrupted, "machine": machine(),
         "processes": {
@@ -192,7 +154,8 @@ def describe(run: Run, result: Result) -> dict[str, Any]:
         "outputs": {name: str(path) for name, path in vars(run.outputs).items()},
         "sh_degree": result.gaussians.sh_degree, "device": str(device),
         "seconds": run.watch.report(), "resumed_from": run.saver.state and run.saver.state.steps,
-        "alignment": run.alignment, "notes": run.console.notes, "base_rows": [row.as_dict() for row in run.base_rows],
+        "alignment": run.alignment, "notes": run.console.notes,
+        "base_rows": [row.as_dict() for row in result.base_rows],
         "rows": [row.as_dict() for row in result.rows],
         "detached_row": result.plain[0].as_dict() if result.plain else None,
         "plan": result.plan.as_dict(), "forecast": against_forecast(run),
@@ -205,10 +168,10 @@ def describe(run: Run, result: Result) -> dict[str, Any]:
 def judge(run: Run, result: Result) -> tuple[str, bool]:
     """What is wrong with s = 1 and what to do, empty if nothing is; and whether the result has failed."""
     full = [row.psnr for row in result.rows if row.virtual_scale == 1]
-    if not full or not run.base_rows:
+    if not full or not result.base_rows:
         return "", False
-    if run.teacher == "photographs":
-        lost = run.base_rows[0].psnr - full[0]
+    if run.against == "photographs":
+        lost = result.base_rows[0].psnr - full[0]
         line = f"s = 1 is {lost:.2f} dB below the base on the held-out photographs"
         more, bad, failed = "", not lost <= LOST[0], not lost <= LOST[1]
     else:
@@ -220,7 +183,7 @@ def judge(run: Run, result: Result) -> tuple[str, bool]:
 def print_summary(run: Run, result: Result, taken: dict[str, float]) -> None:
     args, outputs = run.args, run.outputs
     if result.rows:
-        marked = [("base", row) for row in run.base_rows] + by_dial(result.rows)
+        marked = [("base", row) for row in result.base_rows] + by_dial(result.rows)
         print(f"\n{table(marked + [('plain', row) for row in result.plain])}\n")
         if result.plain:
             print(f"plain: {outputs.ply} in a viewer that does not know the dial\n")

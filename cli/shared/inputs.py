@@ -2,7 +2,7 @@
 
 import argparse
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import cache
 from pathlib import Path, PureWindowsPath
 from typing import Any
@@ -11,15 +11,15 @@ import torch
 from numba.core.event import Event, Listener, install_listener
 
 from clod_adapter._support.text import first_line
-from clod_adapter.alignment.check import MOST_VIEWS, Alignment, check_alignment, compare_filters
-from clod_adapter.alignment.search import Guess, camera_in, guess_frame, scene_in
+from clod_adapter.alignment.align import WORDS, align, compare_frames, detect_filter
+from clod_adapter.alignment.check import MOST_VIEWS
+from clod_adapter.alignment.search import camera_in
 from clod_adapter.cameras import Camera, Scene, View, with_near_planes
 from clod_adapter.config import CLASSIC, FILTERS, AdaptConfig, ScreenFilter
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.evaluate import evaluate
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.checkpoint import Checkpoint, load
-from clod_adapter.io.scene.colmap import load_points
 from clod_adapter.io.scene.load import load_cameras, load_scene
 from clod_adapter.io.values import Activated, dial_columns
 from clod_adapter.origin import Origin
@@ -71,7 +71,7 @@ def read_inputs(
     if held_out and not scene.test:
         raise ClodError(f"{args.images}: there are no held-out photographs to evaluate on; give at least two")
     prepare_kernels(console, device, training=training)
-    scene, _ = align(found[0], scene, args.images, console, required=required)
+    scene, _ = align_shown(found[0], scene, console, required=required)
     return [with_filter(each, args, console, [*scene.test, *scene.train]) for each in found], scene
 
 
@@ -103,30 +103,18 @@ def no_gpu() -> str | None:
     return unusable()
 
 
-WORDS = {"off": "without antialiasing", "on": "with antialiasing", "mip": "with Mip-Splatting's antialiasing"}
-
-
 def with_filter(
     checkpoint: Checkpoint, args: argparse.Namespace, console: Console, views: Sequence[View] = ()
 ) -> Checkpoint:
-    """The checkpoint with the screen-space filter of ``--antialiasing``.
-
-    With ``auto`` it is the file's; if that has none, the one whose renders of ``views`` are clearly the closest.
-    """
+    """The checkpoint with the screen-space filter of ``--antialiasing``; with ``auto`` that of ``detect_filter``."""
     gaussians, name = checkpoint.gaussians, args.antialiasing
-    stored = gaussians.screen_filter
-    if name == "auto" and views and not checkpoint.filter_known:
+    if name == "auto":
         with console.status("comparing screen-space filters with the photographs ..."):
-            name, psnr = compare_filters(gaussians, views, expected := stored.name or "off")
-        if name != expected:
-            found = ", ".join(f"{psnr[each]:.2f} dB {WORDS[each]}" for each in (name, expected))
-            trained = f"{checkpoint.path}: by the photographs it was trained {WORDS[name]}: {found}"
-            console.note(f"{trained}; rendered so (--antialiasing {expected} overrides it)")
-    elif name != "auto" and checkpoint.filter_known and FILTERS[name] != stored:
+            return detect_filter(checkpoint, views, console.note)
+    stored = gaussians.screen_filter
+    if checkpoint.filter_known and FILTERS[name] != stored:
         had = f"the file has {stored.description}"
         console.note(f"{checkpoint.path}: rendered {WORDS[name]} (--antialiasing); {had}")
-    if name == "auto":
-        return checkpoint
     return replace(checkpoint, gaussians=gaussians.replace(screen_filter=FILTERS[name]))
 
 
@@ -192,31 +180,12 @@ class _Compiling(Listener):  # type: ignore[misc]
 SMALL = 320  # pixels, width of photographs that only tell the frame
 
 
-def align(
-    checkpoint: Checkpoint, scene: Scene, images: str, console: Console, *, required: bool
+def align_shown(
+    checkpoint: Checkpoint, scene: Scene, console: Console, *, required: bool
 ) -> tuple[Scene, dict[str, Any]]:
-    """The scene with its cameras in the checkpoint's frame, if that fits clearly; and measurements for the report.
-
-    Where the checkpoint fits in no frame, that is an error if ``required``, for training, and otherwise a warning.
-    """
-    ply, views = checkpoint.path, [*scene.test, *scene.train]
-    found, guess = _compared(checkpoint, views, images, console)
-    frame = None
-    if guess and guess.clear:
-        scene, frame = scene_in(scene, guess.frame), guess.frame.as_dict() | {"psnr": guess.psnr}
-    elif guess or not found.fits:
-        message = f"{ply}: does not match {images}: {mismatch(found, guess)}"
-        if required:
-            raise ClodError(f"{message}; use --misaligned-ok to train anyway")
-        console.note(f"warning: {message}")
-    elif required and not found.views:
-        console.note(f"warning: the photographs in {images}, to train on, have a single colour each")
-    elif required and found.margin < 0:
-        console.note(
-            f"warning: {ply} matches the photographs in {images}, but some differ more from it than from their own "
-            "mean colours; check for another exposure, views that it does not cover, or a poor checkpoint"
-        )
-    return scene, asdict(found) | {"guess": guess and guess.frame.description, "frame": frame}
+    """``align``, with a status line on a terminal."""
+    with console.status("comparing the checkpoint with the photographs ..."):
+        return align(checkpoint, scene, console.note, required=required)
 
 
 def read_cameras(model: Checkpoint, images: str, console: Console, *, training: bool = False) -> list[Camera]:
@@ -229,43 +198,8 @@ def read_cameras(model: Checkpoint, images: str, console: Console, *, training: 
     except ClodError:  # cameras alone will do
         return cameras
     prepare_kernels(console, model.gaussians.means.device, training=False)
-    _, guess = _compared(model, [*scene.test, *scene.train], images, console, every)
+    with console.status("comparing the checkpoint with the photographs ..."):
+        _, guess = compare_frames(model, scene, console.note, every)
     if not (guess and guess.clear):
         return cameras
     return with_near_planes([camera_in(camera, guess.frame) for camera in cameras])
-
-
-def _compared(
-    checkpoint: Checkpoint, views: Sequence[View], images: str, console: Console, cameras: Sequence[Camera] = ()
-) -> tuple[Alignment, Guess | None]:
-    """How renders match the photographs, and after a poor match another frame that explains them better."""
-    with console.status("comparing the checkpoint with the photographs ..."):
-        found = check_alignment(checkpoint.gaussians, views)
-    if not found.doubtful:
-        return found, None
-    with console.status("poor match: trying other frames ..."):
-        points = load_points(images, checkpoint.origin)
-        guess = guess_frame(checkpoint.gaussians, views, found, points, cameras)
-    if guess and guess.clear:
-        console.note(
-            f"{images}: the cameras are moved into the frame of {checkpoint.path} ({guess.frame.name}): renders have "
-            f"{guess.psnr:.1f} dB there, {found.psnr:.1f} dB as given"
-        )
-    return found, guess
-
-
-def mismatch(found: Alignment, guess: Guess | None) -> str:
-    """The measurements, and a remedy."""
-    share = f"{found.in_view:.2g}" if 0 < found.in_view < 0.01 else f"{found.in_view:.0%}"
-    facts = f"{share} of its Gaussians are in view"
-    if found.views:
-        mean = f"their mean colours {found.mean_colour_psnr:.1f} dB"
-        facts = f"renders have a PSNR of {found.psnr:.1f} dB against {found.views} photographs, {mean}; {facts}"
-    if found.on_white:
-        return (
-            f"{facts}; over white the renders have {found.white_psnr:.1f} dB, but clod-adapt renders over black: give "
-            "photographs with a transparent background (PNG; composited over black), or a checkpoint trained on black"
-        )
-    if guess:
-        return f"{facts}; in another frame renders have {guess.psnr:.1f} dB: {guess.frame.description}"
-    return f"{facts}; give the checkpoint of this scene, in the cameras' frame"

@@ -1,39 +1,25 @@
 """Dial values: solved from budgets, measured with progress, and shown in tables."""
 
-import os
-import platform
 import time
 from argparse import Namespace
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
-from dataclasses import replace
-from pathlib import Path
+from contextlib import contextmanager
 from typing import Any
 
-import numba
-import torch
-from torch import Tensor
-from torch.nn.functional import avg_pool2d
-
-from clod_adapter.calibration import Calibration, Viewpoint
-from clod_adapter.cameras import Camera, Scene, View, spread
-from clod_adapter.equation.distances import viewpoint_of
+from clod_adapter.calibration import Viewpoint
+from clod_adapter.cameras import Camera, View
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.budget import dial_for, dial_for_times, frame_times
+from clod_adapter.evaluation.calibrate import with_frame_times
 from clod_adapter.evaluation.evaluate import Row, evaluate
-from clod_adapter.evaluation.frame_times import time_frames
 from clod_adapter.evaluation.popping import Popping
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.checkpoint import Checkpoint
-from clod_adapter.origin import Origin
 from clod_adapter.progress import GracefulStop, Phase, Stopped
 
 from .command import given_budget, no_calibration
 from .console import Console
 from .inputs import prepare_kernels
-
-# Round values, each about 1.4 times the last, or more between 1 and 5.
-REPORT_DIALS = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0, 10.0, 14.0, 20.0, 28.0, 40.0)
 
 
 class Stopwatch:
@@ -55,31 +41,6 @@ class Stopwatch:
 
     def total(self) -> float:
         return time.perf_counter() - self.began
-
-
-def machine() -> dict[str, Any]:
-    gpu = {"gpu": torch.cuda.get_device_name()} if torch.cuda.is_available() else {}
-    versions = {"python": platform.python_version(), "torch": torch.__version__, "numba": numba.__version__}
-    return gpu | {"cpu": _cpu_name(), "cores": os.cpu_count(), "threads": torch.get_num_threads()} | versions
-
-
-def machine_name(device: str = "cpu") -> str:
-    """The hardware that determines frame times on that type of device."""
-    about = machine()
-    return about["gpu"] if device == "cuda" else f"{about['cpu']}, {about['threads']} threads"
-
-
-def _cpu_name() -> str:
-    with suppress(OSError):
-        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    return platform.processor() or platform.machine()
-
-
-def report_dials(max_sv: float) -> list[float]:
-    """The dial values of a report, in about even steps of their logarithm; the last one is ``max_sv``."""
-    return [s for s in REPORT_DIALS if s < max_sv] + [max_sv]
 
 
 def by_dial(rows: Sequence[Row]) -> list[tuple[str, Row]]:
@@ -134,27 +95,20 @@ def measure(
         return evaluate(gaussians, views, dials, progress=stop.heeding(meter)) if views and not stop.requests else []
 
 
-def with_frame_times(
+def comparable(
     measured: Sequence[tuple[Gaussians, list[Row]]], views: Sequence[View], console: Console, stop: GracefulStop
 ) -> list[list[Row]]:
-    """The rows of each model with frame times that can be compared; unchanged after a signal."""
-    jobs = [(model, sorted({row.virtual_scale for row in rows})) for model, rows in measured]
-    found = [rows for _, rows in measured]
-    if stop.requests or not any(found):
-        return found
+    """The rows of each model by ``with_frame_times``; unchanged after a signal, or where there are none."""
+    unchanged = [rows for _, rows in measured]
+    if stop.requests or not any(unchanged):
+        return unchanged
     try:
         with console.meter(Phase.FRAME_TIMES) as meter:
-            times = time_frames(jobs, [view.camera for view in views], stop.heeding(meter))
+            found, notes = with_frame_times(measured, views, stop.heeding(meter))
     except Stopped:
-        return found
-    console.note(*times.notes)
-    for k, ((_, dials), taken) in enumerate(zip(jobs, times.milliseconds, strict=True)):
-        found[k] = [replace(row, frame_ms=taken[dials.index(row.virtual_scale)]) for row in found[k]]
+        return unchanged
+    console.note(*notes)
     return found
-
-
-BLOCK = 8  # pixels
-VIEWPOINTS = 16  # most training cameras stored in a calibration: all 84 baked 0.006 dB better
 
 
 def solve_dials(
@@ -198,32 +152,3 @@ def solve_dials(
         more = solved.note and f" ({solved.note})"
         console.note(f"{asked}: s = {solved.virtual_scale:.5g}{more}{machine}")
     return dials
-
-
-def _interest(view: View) -> float:
-    """Contrast times detail times sharpness: a camera behind a wall sees contrasts, but no sharp ones.
-
-    The standard deviation of its image, the mean difference of neighbouring pixels, and that over the mean difference
-    of neighbouring blocks of BLOCK pixels.
-    """
-    image = view.image.float().mean(2)
-    detail, coarse = (_change(pixels) for pixels in (image, avg_pool2d(image[None], min(BLOCK, *image.shape))[0]))
-    return float(image.std()) * detail**2 / max(coarse, 1e-6)
-
-
-def _change(image: Tensor) -> float:
-    return sum(float(image.diff(dim=dim).abs().mean()) for dim in (0, 1) if image.shape[dim] > 1)
-
-
-def calibrate(rows: Sequence[Row], measured: Gaussians, scene: Scene, against: str, origin: Origin) -> Calibration:
-    """The calibration of rows measured on this machine; a ClodError if a PSNR is infinite."""
-    assert measured.attenuation is not None
-    camera, machine = scene.test[0].camera, machine_name(measured.means.device.type)
-    stored = list(spread(scene.train, VIEWPOINTS))
-    if against != "photographs":  # of placed cameras some look at little; viewers open at the first
-        stored.sort(key=_interest, reverse=True)
-    viewpoints = [viewpoint_of(each.camera, measured.means, measured.attenuation).moved(origin) for each in stored]
-    return Calibration.of(
-        rows, total=len(measured), views=len(scene.test), size=(camera.width, camera.height), machine=machine,
-        against=against, viewpoints=viewpoints,
-    )  # fmt: skip

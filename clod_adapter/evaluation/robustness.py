@@ -15,7 +15,7 @@ from clod_adapter.evaluation.evaluate import evaluate
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.checkpoint import Checkpoint
 from clod_adapter.progress import Listener, Phase, Stopped, tell, within
-from clod_adapter.training.loop import adapt
+from clod_adapter.training.planner import make_plan
 from clod_adapter.training.pseudo_views import PseudoView, add_pseudo_views
 
 # Shares of the unadapted base that its baseline keeps.
@@ -41,7 +41,7 @@ def adapt_at_range(
     base = detach(file.gaussians)
     scene = add_pseudo_views(base, scene, config.seed, progress)
     config = config.for_views(len(scene.train))
-    adapted = adapt(base, scene, config, progress)
+    adapted = make_plan(base, scene, config, progress=progress).adapt(scene, progress)
     if adapted.failed:
         raise ClodError(f"max_sv {config.max_sv:g}: {adapted.failed}; leave this range or checkpoint out")
     if adapted.interrupted:

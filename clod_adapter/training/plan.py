@@ -1,6 +1,6 @@
 """The training plan: what is trained, what is left out because the scene does not need it, and the measurements."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from clod_adapter.adapter import detach
@@ -70,6 +70,7 @@ class Plan:
     """What is trained, and how.
 
     Attributes:
+        base: the checkpoint that the plan was made for.
         decisions: one for each part of the checkpoint.
         start: what training begins with: the base with its initial dial, and far Gaussians that are added, without the
             SH degrees that are left out.
@@ -78,6 +79,7 @@ class Plan:
         seconds: wall time of "bands", and of what training begins with, "start".
     """
 
+    base: Gaussians
     decisions: tuple[Decision, ...]
     start: Gaussians
     sh_degree: int
@@ -91,15 +93,17 @@ class Plan:
         resume: TrainingState | None = None,
         group: ProcessGroup | None = None,
     ) -> Adapted:
-        """``loop.adapt`` of ``start``."""
-        return adapt(self.start, scene, self.config, progress, resume, group=group)
+        """``loop.adapt`` of ``start``; the result has the SH degrees that were left out again.
 
-    def whole(self, base: Gaussians, lean: Gaussians) -> Gaussians:
-        """``lean`` after training, together with the SH degrees that were left out, of the base's rows.
-
-        Args:
-            base: the checkpoint that the plan was made for.
+        The listener is given the Gaussians without them (``restore_excluded``).
         """
+        adapted = adapt(self.start, scene, self.config, progress, resume, group=group)
+        start_seconds = adapted.start_seconds + self.seconds["start"]
+        return replace(adapted, gaussians=self.restore_excluded(adapted.gaussians), start_seconds=start_seconds)
+
+    def restore_excluded(self, lean: Gaussians) -> Gaussians:
+        """``lean``, which training works on, together with the SH degrees that were left out, of the base's rows."""
+        base = self.base
         if self.sh_degree == base.sh_degree:
             return lean
         if lean.near is not None:

@@ -66,7 +66,7 @@ def make_plan(
     decisions += [Decision(name, "frozen", None, "", REQUESTED, name) for name in frozen]
     decisions += [Decision(item, NOT_NEEDED, None, "", why) for item, why in scene.left_out]
     rates: dict[str, Any] = {RATES[name]: 0.0 for name in frozen}
-    return Plan(tuple(decisions), initial, degree, replace(config, **rates), seconds)
+    return Plan(base, tuple(decisions), initial, degree, replace(config, **rates), seconds)
 
 
 @contextmanager

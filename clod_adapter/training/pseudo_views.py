@@ -90,6 +90,20 @@ def render_pseudo_views(gaussians: Gaussians, cameras: Sequence[Camera], *, prog
     return Scene(train, tuple(test), (note,))
 
 
+def with_pseudo_views(
+    gaussians: Gaussians, scene: Scene | None, seed: int = 0, progress: Listener | None = None
+) -> Scene:
+    """The scene with pseudo views beside few photographs, or, for None, of pseudo views at placed cameras alone.
+
+    Args:
+        progress: called in ``Phase.CAMERAS`` and ``Phase.PSEUDO_VIEWS``.
+    """
+    if scene is not None:
+        return add_pseudo_views(gaussians, scene, seed, progress)
+    cameras = place_cameras(gaussians, seed=seed, progress=progress)
+    return render_pseudo_views(gaussians, cameras, progress=progress)
+
+
 def add_pseudo_views(gaussians: Gaussians, scene: Scene, seed: int = 0, progress: Listener | None = None) -> Scene:
     """Adds ADDED pseudo views where there are few photographs.
 

@@ -99,6 +99,18 @@ class Adapted:
     held: int = 0
     signalled: bool = False
 
+    @property
+    def notes(self) -> list[str]:
+        """What ended training early, and what it did not move, a line each."""
+        found = list[str]()
+        if self.lost:
+            found.append(f"training ended at step {self.steps}: {self.lost}")
+        if self.failed:
+            found.append(f"training ended early, and the result so far is written: {self.failed}")
+        if self.held:
+            found.append(f"{self.held:,} Gaussians were not moved by some steps: their gradients were not finite")
+        return found
+
     def __repr__(self) -> str:
         ended = ", interrupted" if self.interrupted else ""
         return f"Adapted({self.gaussians!r}, {self.steps:,} steps, {self.seconds:.1f} s{ended})"

@@ -16,10 +16,9 @@ import clod_adapter
 from clod_adapter.cli import render as command
 from clod_adapter.cli import view
 from clod_adapter.cli.main import build_parser
-from clod_adapter.cli.shared import measure
 from clod_adapter.cli.shared.command import DEVICES
+from clod_adapter.evaluation import calibrate, frame_times
 from clod_adapter.evaluation import evaluate as module
-from clod_adapter.evaluation import frame_times
 from clod_adapter.evaluation.frame_times import FrameTimes, Model
 from clod_adapter.io.checkpoint import load, save
 from runs import pressing
@@ -105,7 +104,7 @@ def test_frames_are_timed_together(clod: Any, monkeypatch: pytest.MonkeyPatch) -
         found = tuple(tuple(1000.0 * (k + 1) / s for s in dials) for k, (_, dials) in enumerate(models))
         return FrameTimes(found, 0.5)
 
-    monkeypatch.setattr(measure, "time_frames", times)
+    monkeypatch.setattr(calibrate, "time_frames", times)
     monkeypatch.setattr(frame_times, "NOISY", 0.2)
     report = (done := clod("BASE --images SCENE --iters 2 --max-sv 4 --out dial.ply --json")).report
     assert seen == [[300, 540, 300]]

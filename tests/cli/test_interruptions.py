@@ -11,7 +11,8 @@ from typing import Any
 import pytest
 
 import clod_adapter
-from clod_adapter.cli.adapt import listeners, run
+from clod_adapter import pipeline
+from clod_adapter.cli.adapt import listeners
 from clod_adapter.cli.shared import measure
 from clod_adapter.training import planner
 from clod_adapter.training.state import load_state
@@ -98,9 +99,9 @@ MOMENTS = [  # where signals arrive, which, exit code, files, and the report's "
     ((planner, "sh_degree_losses"), [INT], 130, [], "clod-adapt: interrupted"),
     (SAVING, [signal.SIGUSR1] * 3, 0, BOTH, True),
     (SAVING, [signal.SIGHUP] * 3, 0, BOTH, True),
-    ((run, "extract"), [INT], 0, BOTH, False),
-    ((run, "save_adapter"), [INT, TERM], 130, [STATE], ABORTED),
-    ((run, "save"), [INT], 0, OUTPUTS, False),  # the files without the page
+    ((pipeline, "extract"), [INT], 0, BOTH, False),
+    ((pipeline, "save_adapter"), [INT, TERM], 130, [STATE], ABORTED),
+    ((pipeline, "save"), [INT], 0, OUTPUTS, False),  # the files without the page
 ]
 
 

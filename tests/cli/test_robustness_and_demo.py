@@ -15,14 +15,14 @@ import pytest
 from PIL import Image
 
 import clod_adapter
-from clod_adapter import config, evaluate, load, load_scene
+from clod_adapter import config, evaluate, load, load_scene, pipeline
 from clod_adapter import demo as gallery
 from clod_adapter.cli.adapt import listeners
 from clod_adapter.cli.adapt import run as adapt_run
 from clod_adapter.evaluation import robustness as experiment
 from clod_adapter.report.page import Picture
 from clod_adapter.training import pseudo_views
-from runs import names, pressing
+from runs import names, pressing, results
 
 pytest.importorskip("matplotlib")
 OUTPUTS = ["robustness.csv", "robustness.json", "robustness.png"]
@@ -42,13 +42,20 @@ def test_the_command_a_cell_and_python_train_the_same(clod: Any, capture: Any, m
     monkeypatch.setattr(pseudo_views, "MANY", 64)
     clod("BASE --images SCENE --iters 3 --max-sv 3 --out dial.ply")
     clod("robustness BASE --images SCENE --iters 3 --max-sv 3 --out out")
-    base = load(capture.ply).gaussians
-    scene = clod_adapter.add_pseudo_views(base, load_scene(capture.scene))
-    plan = clod_adapter.make_plan(base, scene, clod_adapter.AdaptConfig(iters=3, max_sv=3))
-    want = clod_adapter.adapt(base, scene, iters=3, max_sv=3).gaussians
-    assert plan.whole(base, plan.adapt(scene).gaussians) == want
+    base, scene = load(capture.ply), load_scene(capture.scene)
+    result = clod_adapter.adapt_checkpoint(base, scene, clod_adapter.AdaptConfig(iters=3, max_sv=3.0))
     for written in ("dial.safetensors", "out/cells/base_sv3.safetensors"):
-        assert clod_adapter.load_adapter(written).apply(base) == want
+        assert clod_adapter.load_adapter(written).apply(base.gaussians) == result.gaussians
+    result.save("python.ply")
+    assert results(Path(), "python") == results(Path())
+    assert clod_adapter.load("python.ply").calibration.rows[0].psnr == result.rows[0].psnr
+
+
+def test_the_command_and_python_train_the_same_without_photographs(clod: Any, capture: Any) -> None:
+    clod("BASE --iters 3 --out dial.ply --accept-loss")
+    settings = clod_adapter.AdaptConfig(iters=3, max_sv=config.PLACED_MAX_SV)
+    clod_adapter.adapt_checkpoint(load(capture.ply), config=settings).save("python.ply")
+    assert results(Path(), "python") == results(Path())
 
 
 def stamps(folder: Path) -> dict[str, int]:
@@ -151,7 +158,7 @@ def test_demo(clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.Monke
     assert found["pictures"] == {"dial": "-odd/dial.png", "curve": "-odd/curve.png"} and found["config"]["max_sv"] == 5
     made = {"capture", "base.ply", "gallery.ply", "gallery.safetensors", "gallery.json"}
     assert {*names(folder)} == made | PICTURES
-    monkeypatch.setattr(adapt_run, "extract", pressing(adapt_run.extract, signal.SIGINT))  # nothing is measured
+    monkeypatch.setattr(pipeline, "extract", pressing(pipeline.extract, signal.SIGINT))  # nothing is measured
     done = clod("demo --out=-odd --json")
     assert done.report["pictures"] == {} and "no figures" in done.err
     assert not PICTURES & {*names(folder)}

@@ -41,8 +41,7 @@ def test_sh_degrees_are_kept_or_left_out(visible: Pair) -> None:
     faint = base.replace(shN=1e-5 * base.shN)
     plan = make_plan(faint, scene, CONFIG)
     assert verdicts(plan)["SH degree 1"] == "left out" and plan.sh_degree == 0
-    lean = plan.adapt(scene).gaussians
-    assert lean.sh_degree == 0 and torch.equal(detach(plan.whole(faint, lean)).shN, faint.shN)
+    assert plan.start.sh_degree == 0 and torch.equal(detach(plan.adapt(scene).gaussians).shN, faint.shN)
     empty = make_plan(base.replace(shN=torch.zeros(len(base), 15, 3)), scene, CONFIG, Override(keep=ALL - {"bands"}))
     assert empty.decisions[0].what == "SH degree 1 to 3" and empty.decisions[0].number == 0 and empty.sh_degree == 0
     # A view that gains makes up for none that loses.
@@ -79,8 +78,8 @@ def test_a_resumed_plan_gives_the_same_bits(visible: Pair) -> None:
     plan, again = (make_plan(base, scene, CONFIG, Override(leave_out=frozenset({"means", "scales"}))) for _ in "ab")
     states = dict[int, TrainingState]()
     assert plan.decisions == again.decisions and json.loads(json.dumps(plan.as_dict()))["decisions"]
-    whole = plan.whole(base, plan.adapt(scene, states_of({12}, states)).gaussians)
-    found = again.whole(base, again.adapt(scene, resume=states[12]).gaussians)
+    whole = plan.adapt(scene, states_of({12}, states)).gaussians
+    found = again.adapt(scene, resume=states[12]).gaussians
     assert_equal(found, whole)
     assert_equal(detach(found), base)
     assert torch.equal(found.means, plan.start.means) and not torch.equal(found.quats, plan.start.quats)

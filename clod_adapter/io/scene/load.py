@@ -90,7 +90,7 @@ def load_scene(
         left_out.append(("undistortion", f"all {len(views)} cameras are pinholes"))
     if not any(what in (REDUCED, SCALED) for what, _ in done):
         left_out.append(("scaling", f"all {len(views)} photographs are used at full resolution"))
-    return in_its_unit(Scene(train, test, (*notes, *_summary(done, len(views))), tuple(left_out)))
+    return in_its_unit(Scene(train, test, (*notes, *_summary(done, len(views))), tuple(left_out), folder))
 
 
 def load_cameras(

@@ -37,14 +37,15 @@ def test_time_budget_ends_all_after_the_same_step(server: Server, words: list[An
 def test_signals_of_the_launcher_do_not_end_the_writing(server: Server, words: list[Any], tmp_path: Path) -> None:
     """It sends them after a lost process, and repeats its own, until the process ends."""
     pressed = (
-        "import argparse; from clod_adapter.cli.adapt import run\n"
+        "import argparse; from clod_adapter import pipeline; from clod_adapter.cli.adapt import run\n"
         "def pressing(real):\n"
         "    def call(*arguments, **more):\n"
         "        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGTERM): signal.raise_signal(number)\n"
         "        return real(*arguments, **more)\n"
         "    return call\n"
         "run.explain = pressing(run.explain)\n"
-        "for name in ('save_adapter', 'print_summary'): setattr(run, name, pressing(getattr(run, name)))\n"
+        "pipeline.save_adapter = pressing(pipeline.save_adapter)\n"
+        "run.print_summary = pressing(run.print_summary)\n"
         "main.json = argparse.Namespace(dumps=pressing(json.dumps))"
     )
     run = Launched(server, tmp_path / "run", *words, *LONG, "--quiet", "--json", before={0: pressed}, wait=STATE)

@@ -13,10 +13,10 @@ import torch
 from PIL import Image
 
 import clod_adapter
+from clod_adapter._support.machine import machine_name
 from clod_adapter.cli import adapt
-from clod_adapter.cli.adapt import prepare
-from clod_adapter.cli.shared.measure import machine_name
 from clod_adapter.config import AdaptConfig
+from clod_adapter.training import pseudo_views
 from clod_adapter.training.plan import NAMES
 from models import write_model
 from runs import OUTPUTS, names, rebuilt, results
@@ -131,7 +131,7 @@ def test_without_held_out_photographs(clod: Any, capture: Any, tmp_path: Path) -
 
 def test_without_photographs(clod: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The target images are renders of the base, rounded to bytes."""
-    monkeypatch.setattr(prepare, "place_cameras", partial(prepare.place_cameras, views=16))
+    monkeypatch.setattr(pseudo_views, "place_cameras", partial(pseudo_views.place_cameras, views=16))
     monkeypatch.setattr("clod_adapter.cli.adapt.run.ENOUGH", (50.0, 25.0))  # dB, more than the result has
     done = clod("BASE", TINY, "--json")
     report = done.report

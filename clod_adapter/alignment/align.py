@@ -1,0 +1,98 @@
+"""Brings a scene's cameras into the checkpoint's frame, and finds the checkpoint's screen-space filter.
+
+Both are told by the photographs, and each change by a note.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, replace
+from typing import Any
+
+from clod_adapter.alignment.check import Alignment, check_alignment, compare_filters
+from clod_adapter.alignment.search import Guess, guess_frame, scene_in
+from clod_adapter.cameras import Camera, Scene, View
+from clod_adapter.config import FILTERS
+from clod_adapter.errors import ClodError
+from clod_adapter.io.checkpoint import Checkpoint
+from clod_adapter.io.scene.colmap import load_points
+
+Note = Callable[[str], object]
+"""Is called with each line that the user should read."""
+
+WORDS = {"off": "without antialiasing", "on": "with antialiasing", "mip": "with Mip-Splatting's antialiasing"}
+
+
+def align(checkpoint: Checkpoint, scene: Scene, note: Note, *, required: bool) -> tuple[Scene, dict[str, Any]]:
+    """The scene with its cameras in the checkpoint's frame, if that fits clearly; and measurements for the report.
+
+    Raises:
+        ClodError: the checkpoint fits in no frame, and that is ``required``; if not, there is a note.
+    """
+    found, guess = compare_frames(checkpoint, scene, note)
+    ply, images, frame = checkpoint.path, scene.folder or "the photographs", None
+    if guess and guess.clear:
+        scene, frame = scene_in(scene, guess.frame), guess.frame.as_dict() | {"psnr": guess.psnr}
+    elif guess or not found.fits:
+        message = f"{ply}: does not match {images}: {mismatch(found, guess)}"
+        if required:
+            raise ClodError(f"{message}; use --misaligned-ok to train anyway")
+        note(f"warning: {message}")
+    elif required and not found.views:
+        note(f"warning: the photographs in {images}, to train on, have a single colour each")
+    elif required and found.margin < 0:
+        note(
+            f"warning: {ply} matches the photographs in {images}, but some differ more from it than from their own "
+            "mean colours; check for another exposure, views that it does not cover, or a poor checkpoint"
+        )
+    return scene, asdict(found) | {"guess": guess and guess.frame.description, "frame": frame}
+
+
+def compare_frames(
+    checkpoint: Checkpoint, scene: Scene, note: Note, cameras: Sequence[Camera] = ()
+) -> tuple[Alignment, Guess | None]:
+    """How renders match the photographs, and after a poor match another frame that explains them better.
+
+    ``cameras`` are all of the scene's, if its photographs are not.
+    """
+    views = [*scene.test, *scene.train]
+    found = check_alignment(checkpoint.gaussians, views)
+    if not found.doubtful:
+        return found, None
+    points = load_points(scene.folder, checkpoint.origin) if scene.folder else None
+    guess = guess_frame(checkpoint.gaussians, views, found, points, cameras)
+    if guess and guess.clear:
+        note(
+            f"{scene.folder or 'the photographs'}: the cameras are moved into the frame of {checkpoint.path} "
+            f"({guess.frame.name}): renders have {guess.psnr:.1f} dB there, {found.psnr:.1f} dB as given"
+        )
+    return found, guess
+
+
+def mismatch(found: Alignment, guess: Guess | None) -> str:
+    """The measurements, and a remedy."""
+    share = f"{found.in_view:.2g}" if 0 < found.in_view < 0.01 else f"{found.in_view:.0%}"
+    facts = f"{share} of its Gaussians are in view"
+    if found.views:
+        mean = f"their mean colours {found.mean_colour_psnr:.1f} dB"
+        facts = f"renders have a PSNR of {found.psnr:.1f} dB against {found.views} photographs, {mean}; {facts}"
+    if found.on_white:
+        return (
+            f"{facts}; over white the renders have {found.white_psnr:.1f} dB, but clod-adapt renders over black: give "
+            "photographs with a transparent background (PNG; composited over black), or a checkpoint trained on black"
+        )
+    if guess:
+        return f"{facts}; in another frame renders have {guess.psnr:.1f} dB: {guess.frame.description}"
+    return f"{facts}; give the checkpoint of this scene, in the cameras' frame"
+
+
+def detect_filter(checkpoint: Checkpoint, views: Sequence[View], note: Note) -> Checkpoint:
+    """The checkpoint with its file's screen-space filter; if that has none, with the one that fits ``views`` best."""
+    if checkpoint.filter_known or not views:
+        return checkpoint
+    gaussians = checkpoint.gaussians
+    expected = gaussians.screen_filter.name or "off"
+    name, psnr = compare_filters(gaussians, views, expected)
+    if name != expected:
+        found = ", ".join(f"{psnr[each]:.2f} dB {WORDS[each]}" for each in (name, expected))
+        trained = f"{checkpoint.path}: by the photographs it was trained {WORDS[name]}: {found}"
+        note(f"{trained}; rendered so (--antialiasing {expected} overrides it)")
+    return replace(checkpoint, gaussians=gaussians.replace(screen_filter=FILTERS[name]))

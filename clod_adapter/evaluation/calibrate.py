@@ -1,0 +1,81 @@
+"""The table of quality against the dial that is stored with a file: its dial values, its viewpoints."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from torch import Tensor
+from torch.nn.functional import avg_pool2d
+
+from clod_adapter._support.machine import machine_name
+from clod_adapter.calibration import Calibration
+from clod_adapter.cameras import Scene, View, spread
+from clod_adapter.equation.distances import viewpoint_of
+from clod_adapter.evaluation.evaluate import Row
+from clod_adapter.evaluation.frame_times import time_frames
+from clod_adapter.gaussians import Gaussians
+from clod_adapter.origin import Origin
+from clod_adapter.progress import Listener
+
+# Round values, each about 1.4 times the last, or more between 1 and 5.
+REPORT_DIALS = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0, 10.0, 14.0, 20.0, 28.0, 40.0)
+VIEWPOINTS = 16  # most training cameras that are stored: all 84 baked 0.006 dB better
+BLOCK = 8  # pixels
+
+
+def report_dials(max_sv: float) -> list[float]:
+    """The dial values of a report, in about even steps of their logarithm; the last one is ``max_sv``."""
+    return [s for s in REPORT_DIALS if s < max_sv] + [max_sv]
+
+
+def with_frame_times(
+    measured: Sequence[tuple[Gaussians, Sequence[Row]]], views: Sequence[View], progress: Listener | None = None
+) -> tuple[list[list[Row]], list[str]]:
+    """The rows of each model with frame times that can be compared (``time_frames``), and notes on them."""
+    jobs = [(model, sorted({row.virtual_scale for row in rows})) for model, rows in measured]
+    times = time_frames(jobs, [view.camera for view in views], progress)
+    found = list[list[Row]]()
+    for (_, rows), (_, dials), taken in zip(measured, jobs, times.milliseconds, strict=True):
+        milliseconds = dict(zip(dials, taken, strict=True))
+        found.append([replace(row, frame_ms=milliseconds[row.virtual_scale]) for row in rows])
+    return found, times.notes
+
+
+def calibrate(rows: Sequence[Row], measured: Gaussians, scene: Scene, against: str, origin: Origin) -> Calibration:
+    """The calibration of rows measured on this machine.
+
+    Args:
+        against: what the rows compare with: "photographs", or renders of the "checkpoint".
+        origin: of the file.
+
+    Raises:
+        ClodError: a PSNR is infinite.
+    """
+    assert measured.attenuation is not None
+    camera, machine = scene.test[0].camera, machine_name(measured.means.device.type)
+    stored = list(spread(scene.train, VIEWPOINTS))
+    if against != "photographs":  # of placed cameras some look at little; viewers open at the first
+        stored.sort(key=_interest, reverse=True)
+    return Calibration.of(
+        rows,
+        total=len(measured),
+        views=len(scene.test),
+        size=(camera.width, camera.height),
+        machine=machine,
+        against=against,
+        viewpoints=[viewpoint_of(each.camera, measured.means, measured.attenuation).moved(origin) for each in stored],
+    )
+
+
+def _interest(view: View) -> float:
+    """Contrast times detail times sharpness: a camera behind a wall sees contrasts, but no sharp ones.
+
+    The standard deviation of its image, the mean difference of neighbouring pixels, and that over the mean difference
+    of neighbouring blocks of BLOCK pixels.
+    """
+    image = view.image.float().mean(2)
+    detail, coarse = (_change(pixels) for pixels in (image, avg_pool2d(image[None], min(BLOCK, *image.shape))[0]))
+    return float(image.std()) * detail**2 / max(coarse, 1e-6)
+
+
+def _change(image: Tensor) -> float:
+    return sum(float(image.diff(dim=dim).abs().mean()) for dim in (0, 1) if image.shape[dim] > 1)
