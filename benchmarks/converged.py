@@ -1,68 +1,55 @@
 """Quality after adapting a base that was trained to its end, with few photographs, on held-out photographs.
 
-    python benchmarks/converged.py FOLDER [FOLDER ...] --record       # folders with images/, sparse/ and base.ply
-    python benchmarks/converged.py plush_half bonsai146 --base pretrained.ply --every 3 --record
+    python benchmarks/converged.py FOLDER [FOLDER ...] --record       # folders with images/, sparse/0/ and base.ply
+    python benchmarks/converged.py plush_half bonsai146 --every 3 --record
+    python benchmarks/converged.py plush_half bonsai146 --every 3 --base pretrained.ply --record
     python benchmarks/converged.py --table                            # the rows as a Markdown table
 
-Runs the default command on ``base.ply``. With ``--base`` the folders are captures of the shared data: of each, every
-third photograph by name is copied to a folder in ``benchmarks/cache``, where that checkpoint is tuned further on those
-photographs that are for training. Those held out there are held out from the capture too.
+Runs the default command on ``base.ply``. With ``--every`` the folders are captures of the shared data, of which that
+part of the photographs, by name, is copied to a folder in ``benchmarks/cache``; those held out there are held out from
+the capture too. The base is trained there from the COLMAP points (``from_points.py``), or, with ``--base``, is that
+checkpoint, trained on all photographs, and tuned further on those that are left.
 """
 
 import json
-import shutil
-import sys
 import tempfile
 from pathlib import Path
 
 import clod_adapter as clod
 from common import CACHE, COMMAND, Process, Row, append, arguments, capture, stored, table
+from from_points import thin, write_base
 from tuning import Tuning, tune
-
-import pycolmap
 
 FILE = "converged.jsonl"
 DIALS = (1.0, 2.0, 5.0)
-ITERS, FINAL = 1500, 0.01
+ITERS, FINAL = 1500, 0.01  # of tuning a checkpoint further
 
 
 def main() -> None:
     parser = arguments(__doc__, table=print_table, record=FILE)
     parser.add_argument("folders", nargs="+", metavar="FOLDER")
-    parser.add_argument("--base", metavar="CHECKPOINT", help="make base.ply from this file of the capture")
-    parser.add_argument("--every", type=int, default=3, metavar="K", help="with --base: one photograph in K is used")
-    parser.add_argument("--iters", type=int, default=ITERS, help="with --base: steps of tuning")
+    parser.add_argument("--every", type=int, metavar="K", help="captures, of which one photograph in K is used")
+    parser.add_argument("--base", metavar="CHECKPOINT", help="with --every: make base.ply from this file")
     args = parser.parse_args()
     for name in args.folders:
-        folder = make(name, args.base, args.every, args.iters) if args.base else Path(name).resolve()
+        folder = make(capture(name), args.every, args.base) if args.every else Path(name).resolve()
         run(folder, record=args.record)
 
 
-def make(name: str, start: str, every: int, iters: int) -> Path:
+def make(source: Path, every: int, start: str | None) -> Path:
     """The folder of the thinned capture with its base, made now if it is not in the cache."""
-    source, folder = capture(name), CACHE / f"{name}-{Path(start).stem}-{every}-{iters}"
+    folder = CACHE / f"{source.name}-{every}-{Path(start or 'points').stem}"
     base = folder / "base.ply"
-    if not base.exists():
-        thin(source, folder, every)
+    if base.exists():
+        return folder
+    thin(source, folder, every)
+    if start is None:
+        write_base(folder)
+    else:
         begun = clod.load(source / start)
-        tuned, seconds = tune(begun.gaussians, clod.load_scene(folder).train, Tuning(iters=iters, final=FINAL))
+        tuned, _ = tune(begun.gaussians, clod.load_scene(folder).train, Tuning(iters=ITERS, final=FINAL))
         clod.save(base, tuned, begun)
-        print(f"{base}: {iters} steps in {seconds:.0f} s", file=sys.stderr)
     return folder
-
-
-def thin(source: Path, folder: Path, every: int) -> None:
-    """Copies one photograph in ``every`` by name, and the part of the COLMAP model that is of these."""
-    model = pycolmap.Reconstruction(str(source / "sparse" / "0"))
-    images = sorted(model.images.values(), key=lambda image: image.name)
-    for place in ("images", "sparse/0"):
-        (folder / place).mkdir(parents=True, exist_ok=True)
-    for k, image in enumerate(images):
-        if k % every:
-            model.deregister_frame(image.frame_id)
-        else:
-            shutil.copy(source / "images" / image.name, folder / "images" / image.name)
-    model.write(str(folder / "sparse" / "0"))
 
 
 def run(folder: Path, *, record: bool) -> None:
