@@ -1,10 +1,11 @@
 """Quality, count and seconds of adapted checkpoints, by dial value.
 
-    python benchmarks/adapt.py plush_half bonsai146 --set max_sv=20.0 --label "max_sv 20" --seeds 0 1 2
-    python benchmarks/adapt.py --table                     # the rows as a Markdown table
+    python benchmarks/adapt.py plush_half bonsai146 --set max_sv=20.0 --label "max_sv 20" --seeds 0
+    1 2 python benchmarks/adapt.py --table                     # the rows as a Markdown table
 
-A scene is a folder of the shared data, followed by the name of the checkpoint where it is not ``pretrained``. Each run
-adds one row to ``results/adapt.jsonl``: settings, commit, machine, the base and the dial.
+A scene is a folder of the shared data, followed by the name of the checkpoint where it is not
+``pretrained``. Each run adds one row to ``results/adapt.jsonl``: settings, commit, machine, the
+base and the dial.
 """
 
 import ast
@@ -24,7 +25,9 @@ SHARES = (0.62, 0.35, 0.12, 0.05, 0.02)  # of the base's Gaussians, where the fi
 def main() -> None:
     parser = arguments(__doc__, table=print_table)
     parser.add_argument("scenes", nargs="*")
-    parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="a field of AdaptConfig")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="NAME=VALUE", help="a field of AdaptConfig"
+    )
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     parser.add_argument("--label", default="default", help="name of the row")
     args = parser.parse_args()
@@ -49,16 +52,28 @@ def run(scene: str, label: str, config: clod.AdaptConfig, changed: dict[str, Any
     plan = clod.make_plan(base.gaussians, views, config)
     adapted = plan.adapt(views)
     whole = adapted.gaussians
-    adapter = clod.extract(base.gaussians, whole, fingerprint=base.fingerprint, config=asdict(config))
+    adapter = clod.extract(
+        base.gaussians, whole, fingerprint=base.fingerprint, config=asdict(config)
+    )
     result = adapter.apply(base.gaussians)
-    append(FILE, {
-        "benchmark": "adapt", "scene": scene, "label": label, "changed": changed, "config": asdict(config),
-        "base_count": len(base.gaussians), "base": base_row.as_dict(),
-        "rows": [row.as_dict() for row in clod.evaluate(result, views.test, dials)],
-        "at_shares": at_shares(result, views.test), "steps": adapted.steps, "share": plan.config.share,
-        "start_seconds": round(sum(plan.seconds.values()) + adapted.start_seconds, 2),
-        "train_seconds": round(adapted.seconds, 2),
-    })  # fmt: skip
+    append(
+        FILE,
+        {
+            "benchmark": "adapt",
+            "scene": scene,
+            "label": label,
+            "changed": changed,
+            "config": asdict(config),
+            "base_count": len(base.gaussians),
+            "base": base_row.as_dict(),
+            "rows": [row.as_dict() for row in clod.evaluate(result, views.test, dials)],
+            "at_shares": at_shares(result, views.test),
+            "steps": adapted.steps,
+            "share": plan.config.share,
+            "start_seconds": round(sum(plan.seconds.values()) + adapted.start_seconds, 2),
+            "train_seconds": round(adapted.seconds, 2),
+        },
+    )
 
 
 def at_shares(model: clod.Gaussians, views: Sequence[clod.View]) -> list[dict[str, float]]:
@@ -66,11 +81,15 @@ def at_shares(model: clod.Gaussians, views: Sequence[clod.View]) -> list[dict[st
     found = []
     for share in SHARES:
         try:
-            solved = clod.dial_for(model, keep=share * model.whole, cameras=[view.camera for view in views])
+            solved = clod.dial_for(
+                model, keep=share * model.whole, cameras=[view.camera for view in views]
+            )
         except clod.ClodError:
             continue  # out of the dial's reach
         if not solved.note:
-            found.append({"share": share, **clod.evaluate(model, views, [solved.virtual_scale])[0].as_dict()})
+            found.append(
+                {"share": share, **clod.evaluate(model, views, [solved.virtual_scale])[0].as_dict()}
+            )
     return found
 
 
@@ -78,17 +97,31 @@ def print_table() -> None:
     """PSNR at s = 1 and at the matched shares, means over the seeds, a line a setting."""
     groups: dict[tuple[str, str, int], dict[int, Row]] = {}
     for row in stored(FILE):
-        groups.setdefault((row["scene"], row["label"], row["steps"]), {})[row["config"]["seed"]] = row
+        groups.setdefault((row["scene"], row["label"], row["steps"]), {})[row["config"]["seed"]] = (
+            row
+        )
     lines = []
     for (scene, label, steps), seeds in groups.items():
         rows = list(seeds.values())
         full = [fmean(row["rows"][0][key] for row in rows) for key in ("psnr", "kept_share")]
-        found = [[r["psnr"] for row in rows for r in row["at_shares"] if r["share"] == share] for share in SHARES]
+        found = [
+            [r["psnr"] for row in rows for r in row["at_shares"] if r["share"] == share]
+            for share in SHARES
+        ]
         cells = [f"{fmean(psnr):.2f}" if len(psnr) == len(rows) else "" for psnr in found]
         seconds = fmean(row["start_seconds"] + row["train_seconds"] for row in rows)
         head = [scene, label, steps, len(rows), f"{seconds:.0f}", f"{rows[0]['base']['psnr']:.2f}"]
         lines.append([*head, f"{full[0]:.2f} @ {full[1]:.0%}", *cells])
-    heads = ["scene", "settings", "steps", "seeds", "seconds", "base", "s = 1", *(f"{share:.0%}" for share in SHARES)]
+    heads = [
+        "scene",
+        "settings",
+        "steps",
+        "seeds",
+        "seconds",
+        "base",
+        "s = 1",
+        *(f"{share:.0%}" for share in SHARES),
+    ]
     print(table(heads, lines))
 
 

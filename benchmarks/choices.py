@@ -1,13 +1,15 @@
-"""Choices of the method against their alternatives: PSNR at equal shares of the Gaussians, one change at a time.
+"""Choices of the method against their alternatives: PSNR at equal shares of the Gaussians, one
+change at a time.
 
-    python benchmarks/choices.py plush_half bonsai146 --names SHARE NEARER full
-    python benchmarks/choices.py demo --names SHARE full                           # the folder of clod-adapt demo
-    python benchmarks/choices.py SCENE.ply --names PLACED_SHARE PLACED_NEARER      # without photographs
-    python benchmarks/choices.py --table                                           # the rows as a Markdown table
+    python benchmarks/choices.py plush_half bonsai146 --names SHARE NEARER full python
+    benchmarks/choices.py demo --names SHARE full                           # the folder of
+    clod-adapt demo python benchmarks/choices.py SCENE.ply --names PLACED_SHARE PLACED_NEARER      #
+    without photographs python benchmarks/choices.py --table
+    # the rows as a Markdown table
 
-A scene is a folder of the shared data, one of the demo, or a file, whose placed cameras and renders are used. Each run
-adds one row to ``results/choices.jsonl``; "default" changes nothing. A choice is a constant of ``training/far.py``, a
-field of ``schedule.FAR``, or a field of ``AdaptConfig``.
+A scene is a folder of the shared data, one of the demo, or a file, whose placed cameras and renders
+are used. Each run adds one row to ``results/choices.jsonl``; "default" changes nothing. A choice is
+a constant of ``training/far.py``, a field of ``schedule.FAR``, or a field of ``AdaptConfig``.
 """
 
 from contextlib import AbstractContextManager, nullcontext
@@ -27,10 +29,21 @@ from stream import rendered
 
 FILE, MAX_SV = "choices.jsonl", 7.0  # of captures, as adapt.jsonl has them
 ALTERNATIVES: dict[str, tuple[Any, ...]] = {
-    "SHARE": (0.4, 0.6), "NEARER": (0.3, 0.5), "PLACED_SHARE": (0.8,), "PLACED_NEARER": (0.05, 0.2), "LONGER": (1.0,),
-    "full": (0.0, 0.5), "coarse": (0.0, 0.9), "average": (0.0,), "growth": ("off",), "reg_weight": (0.5, 2.0),
-    "lr_sigma": (0.025, 0.1), "lr_growth": (0.006, 0.024), "lr_opacities": (0.05, 0.2), "lr_means": (0.03, 0.12),
-}  # fmt: skip
+    "SHARE": (0.4, 0.6),
+    "NEARER": (0.3, 0.5),
+    "PLACED_SHARE": (0.8,),
+    "PLACED_NEARER": (0.05, 0.2),
+    "LONGER": (1.0,),
+    "full": (0.0, 0.5),
+    "coarse": (0.0, 0.9),
+    "average": (0.0,),
+    "growth": ("off",),
+    "reg_weight": (0.5, 2.0),
+    "lr_sigma": (0.025, 0.1),
+    "lr_growth": (0.006, 0.024),
+    "lr_opacities": (0.05, 0.2),
+    "lr_means": (0.03, 0.12),
+}
 
 
 def main() -> None:
@@ -54,7 +67,9 @@ def opened(scene: str) -> tuple[clod.Gaussians, clod.Scene]:
     if not scene.endswith(".ply"):
         return checkpoint(scene).gaussians, photographs(scene)
     base = clod.load(scene).gaussians
-    return base, clod.Scene(render_pseudo_views(base, clod.place_cameras(base)).train, tuple(rendered(base)))
+    return base, clod.Scene(
+        render_pseudo_views(base, clod.place_cameras(base)).train, tuple(rendered(base))
+    )
 
 
 def measure(scene: str, base: clod.Gaussians, views: clod.Scene, name: str, value: Any) -> None:
@@ -71,11 +86,21 @@ def measure(scene: str, base: clod.Gaussians, views: clod.Scene, name: str, valu
         plan = clod.make_plan(base, views, clod.AdaptConfig(**settings))
         adapted = plan.adapt(views)
     result = adapted.gaussians
-    append(FILE, {
-        "benchmark": "choices", "scene": Path(scene).stem, "choice": name, "value": value, "steps": adapted.steps,
-        "full": clod.evaluate(result, views.test, [1.0])[0].as_dict(), "at_shares": at_shares(result, views.test),
-        "seconds": round(sum(plan.seconds.values()) + adapted.start_seconds + adapted.seconds, 1),
-    })  # fmt: skip
+    append(
+        FILE,
+        {
+            "benchmark": "choices",
+            "scene": Path(scene).stem,
+            "choice": name,
+            "value": value,
+            "steps": adapted.steps,
+            "full": clod.evaluate(result, views.test, [1.0])[0].as_dict(),
+            "at_shares": at_shares(result, views.test),
+            "seconds": round(
+                sum(plan.seconds.values()) + adapted.start_seconds + adapted.seconds, 1
+            ),
+        },
+    )
 
 
 def print_table() -> None:

@@ -1,7 +1,8 @@
 """A synthetic town of any number of Gaussians: a plain with houses on a grid, under a sky.
 
-It replaces captures that are too large for a repository. More Gaussians make a larger town of the same density, about
-five for each square metre of surface. World axes: x right, y DOWN, z into the picture, in metres; the ground is y = 0.
+It replaces captures that are too large for a repository. More Gaussians make a larger town of the
+same density, about five for each square metre of surface. World axes: x right, y DOWN, z into the
+picture, in metres; the ground is y = 0.
 """
 
 import math
@@ -19,9 +20,11 @@ import torch
 from PIL import Image
 
 Where = Literal["near", "far", "mixed"]
-PITCH, HOUSE, AREA, DENSITY = 24.0, 12.0, 1050.0, 5.0  # metres; square metres of surface of a lot; Gaussians on each
+# metres; square metres of surface of a lot; Gaussians on each
+PITCH, HOUSE, AREA, DENSITY = 24.0, 12.0, 1050.0, 5.0
 SKY = 0.03  # share of the Gaussians
-PERTURBED = {"means": 0.02, "log_scales": 0.15, "opacity_logits": 0.5, "sh0": 0.12}  # of a checkpoint, off the truth
+# of a checkpoint, off the truth
+PERTURBED = {"means": 0.02, "log_scales": 0.15, "opacity_logits": 0.5, "sh0": 0.12}
 
 
 def lots(count: int) -> int:
@@ -38,7 +41,9 @@ def city(count: int, *, seed: int = 0, sh_degree: int = 3) -> Gaussians:
     up = random.normal(size=(far, 3))
     up /= np.linalg.norm(up, axis=1, keepdims=True)
     points, normals = np.concatenate([points, 3 * size * up]), np.concatenate([normals, up])
-    colours = np.concatenate([colours, np.array([0.5, 0.6, 0.65]) - 0.25 * up[:, 1:2] * [0.4, 0.7, 1]])
+    colours = np.concatenate(
+        [colours, np.array([0.5, 0.6, 0.65]) - 0.25 * up[:, 1:2] * [0.4, 0.7, 1]]
+    )
     spacing = np.sqrt(lots(count) ** 2 * AREA / (count - far))
     flat = np.full(count, 0.7 * spacing)
     flat[count - far :] = 1.3 * math.sqrt(4 * math.pi * (3 * size) ** 2 / far)
@@ -48,7 +53,14 @@ def city(count: int, *, seed: int = 0, sh_degree: int = 3) -> Gaussians:
     logits = np.where(np.arange(count) < count - far, 2.6 + 1.2 * noise[:, 0], 3.0)
     means, quats, log_scales, logits, sh0, shN = (
         torch.from_numpy(np.ascontiguousarray(each, np.float32))
-        for each in (points, facing(normals), log_scales, logits, ((colours - 0.5) / SH_C0)[:, None], higher)
+        for each in (
+            points,
+            facing(normals),
+            log_scales,
+            logits,
+            ((colours - 0.5) / SH_C0)[:, None],
+            higher,
+        )
     )
     return Gaussians(means, quats, log_scales, logits, sh0, shN)
 
@@ -56,21 +68,31 @@ def city(count: int, *, seed: int = 0, sh_degree: int = 3) -> Gaussians:
 def surfaces(count: int, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Points, normals and colours on the plain and on the houses' walls and roofs."""
     side = lots(count)
-    lot, kind, along = random.integers(0, side**2, count), random.random(count), random.uniform(-0.5, 0.5, (count, 2))
+    lot, kind, along = (
+        random.integers(0, side**2, count),
+        random.random(count),
+        random.uniform(-0.5, 0.5, (count, 2)),
+    )
     height, hue = random.uniform(6, 14, side**2)[lot], random.uniform(0.35, 0.85, (side**2, 3))[lot]
     centre = PITCH * (np.stack([lot % side, lot // side], 1) - (side - 1) / 2)
     ground, roof = kind < 0.5, kind > 0.86
     turned = (4 * (kind - 0.5) / 0.36).astype(int).clip(0, 3)  # which of the four walls
     outward = np.stack([np.cos(turned * np.pi / 2), np.sin(turned * np.pi / 2)], 1).round()
     wall = HOUSE * (outward / 2 + along[:, :1] * outward[:, ::-1])
-    level = np.where((ground | roof)[:, None], np.where(ground, PITCH, HOUSE)[:, None] * along, wall)
+    level = np.where(
+        (ground | roof)[:, None], np.where(ground, PITCH, HOUSE)[:, None] * along, wall
+    )
     depth = np.where(ground, 0, np.where(roof, height, (along[:, 1] + 0.5) * height))
     points = np.stack([centre[:, 0] + level[:, 0], -depth, centre[:, 1] + level[:, 1]], 1)
     upward = (ground | roof)[:, None]
     normals = np.where(upward, [0.0, -1, 0], np.stack([outward[:, 0], 0 * depth, outward[:, 1]], 1))
     pattern = 0.08 * np.sin(points @ np.array([[1.1, 0.3, 2.0], [2.3, 1.7, 0.4], [0.6, 2.9, 1.5]]))
     base = np.where(ground[:, None], [0.42, 0.44, 0.4], np.where(roof[:, None], 0.7 * hue, hue))
-    return points, normals, (base + pattern + 0.03 * random.normal(size=(count, 3))).clip(0.02, 0.98)
+    return (
+        points,
+        normals,
+        (base + pattern + 0.03 * random.normal(size=(count, 3))).clip(0.02, 0.98),
+    )
 
 
 def facing(normals: np.ndarray) -> np.ndarray:
@@ -84,21 +106,29 @@ def facing(normals: np.ndarray) -> np.ndarray:
 def city_cameras(
     n: int, width: int, height: int, *, where: Where = "mixed", count: int, seed: int = 0
 ) -> list[clod.Camera]:
-    """``n`` cameras, named ``view_0000.png`` on: "near" in the streets, "far" in the air, or the two in turn."""
+    """``n`` cameras, named ``view_0000.png`` on: "near" in the streets, "far" in the air, or the
+    two in turn.
+    """
     random, size, cameras = np.random.default_rng(seed + 1), lots(count) * PITCH, []
     for k in range(n):
         if where == "near" or (where == "mixed" and k % 2 == 0):
             street = PITCH * (random.integers(0, lots(count) + 1) - lots(count) / 2)
             eye = np.array([street, -random.uniform(1.7, 4.5), random.uniform(-0.45, 0.45) * size])
             turn = math.radians(random.uniform(-25, 25))
-            target = eye + 20 * np.array([math.sin(turn), -0.1, -math.copysign(math.cos(turn), eye[2])])
+            target = eye + 20 * np.array(
+                [math.sin(turn), -0.1, -math.copysign(math.cos(turn), eye[2])]
+            )
         else:
             turn, pitch = random.uniform(0, 2 * np.pi), math.radians(random.uniform(28, 50))
             target = np.array([*random.uniform(-0.2, 0.2, 2) * size, 0])[[0, 2, 1]]
             away = random.uniform(0.6, 1.1) * max(size, 30)
-            eye = target + away * np.array([
-                math.cos(pitch) * math.cos(turn), -math.sin(pitch), math.cos(pitch) * math.sin(turn)
-            ])  # fmt: skip
+            eye = target + away * np.array(
+                [
+                    math.cos(pitch) * math.cos(turn),
+                    -math.sin(pitch),
+                    math.cos(pitch) * math.sin(turn),
+                ]
+            )
         cameras.append(look_at(eye, target, width, height, f"view_{k:04d}.png"))
     return cameras
 
@@ -113,11 +143,15 @@ def look_at(eye: np.ndarray, target: np.ndarray, width: int, height: int, name: 
     viewmat[:3, 3] = -viewmat[:3, :3] @ eye
     focal = width / 2 / math.tan(math.radians(65) / 2)
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
-    return clod.Camera(torch.from_numpy(viewmat).float(), torch.from_numpy(K).float(), width, height, name)
+    return clod.Camera(
+        torch.from_numpy(viewmat).float(), torch.from_numpy(K).float(), width, height, name
+    )
 
 
 def perturb(truth: Gaussians, seed: int = 0) -> Gaussians:
-    """A checkpoint with the errors of training: the truth slightly blurred and displaced. In place; returned."""
+    """A checkpoint with the errors of training: the truth slightly blurred and displaced. In place;
+    returned.
+    """
     generator = torch.Generator().manual_seed(seed)
     size = truth.log_scales[:, :2].mean(1, keepdim=True).exp()
     for name, by in PERTURBED.items():
@@ -129,14 +163,20 @@ def perturb(truth: Gaussians, seed: int = 0) -> Gaussians:
 
 
 def write_city(folder: str | Path, count: int, images: int, width: int, height: int) -> None:
-    """Writes a perturbed checkpoint ``folder/city.ply`` and photographs of the truth as a COLMAP scene, whole."""
+    """Writes a perturbed checkpoint ``folder/city.ply`` and photographs of the truth as a COLMAP
+    scene, whole.
+    """
     truth, cameras = city(count), city_cameras(images, width, height, count=count)
     with atomic_path(folder) as part:
         (part / "images").mkdir(parents=True)
         for camera in cameras:
             with torch.no_grad():
-                Image.fromarray(clod.render(truth, camera).pixels.numpy()).save(part / "images" / camera.name)
+                Image.fromarray(clod.render(truth, camera).pixels.numpy()).save(
+                    part / "images" / camera.name
+                )
         some = np.linspace(0, count * (1 - SKY), 2000, endpoint=False).astype(np.int64)
         colours = ((0.5 + SH_C0 * truth.sh0[some, 0].numpy()).clip(0, 1) * 255).astype(np.uint8)
-        write_model(part, cameras, [camera.name for camera in cameras], truth.means[some].numpy(), colours)
+        write_model(
+            part, cameras, [camera.name for camera in cameras], truth.means[some].numpy(), colours
+        )
         clod.save(part / "city.ply", perturb(truth))

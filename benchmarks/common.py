@@ -1,4 +1,6 @@
-"""Shared by the benchmarks: options, captures, rows of results, tables, and processes that are timed from outside."""
+"""Shared by the benchmarks: options, captures, rows of results, tables, and processes that are
+timed from outside.
+"""
 
 import argparse
 import json
@@ -36,14 +38,22 @@ class _Call(argparse.Action):
         parser.exit()
 
 
-def arguments(doc: str | None, *, table: Callable[[], None] | None = None, record: str = "") -> argparse.ArgumentParser:
-    """A parser with the module's docstring; with ``--table``, and with ``--record`` for a file of results."""
-    parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+def arguments(
+    doc: str | None, *, table: Callable[[], None] | None = None, record: str = ""
+) -> argparse.ArgumentParser:
+    """A parser with the module's docstring; with ``--table``, and with ``--record`` for a file of
+    results.
+    """
+    parser = argparse.ArgumentParser(
+        description=doc, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     if table:
         help_ = "print the stored rows as a Markdown table, run nothing"
         parser.add_argument("--table", action=_Call, nargs=0, const=table, help=help_)
     if record:
-        parser.add_argument("--record", action="store_true", help=f"add the rows to results/{record}")
+        parser.add_argument(
+            "--record", action="store_true", help=f"add the rows to results/{record}"
+        )
     return parser
 
 
@@ -66,13 +76,17 @@ def photographs(scene: str) -> clod.Scene:
 
 
 def commit() -> str:
-    """The commit of the package that is measured, with a + where it or the benchmarks differ; empty without git."""
+    """The commit of the package that is measured, with a + where it or the benchmarks differ; empty
+    without git.
+    """
     checkout = Path(clod.__file__).parents[1]
     if not shutil.which("git") or not (checkout / ".git").exists():
         return ""
 
     def git(*words: str) -> str:
-        return subprocess.run(["git", *words], cwd=checkout, capture_output=True, text=True, check=True).stdout.strip()
+        return subprocess.run(
+            ["git", *words], cwd=checkout, capture_output=True, text=True, check=True
+        ).stdout.strip()
 
     changed = git("status", "--porcelain", "--", "clod_adapter", "cli", "benchmarks/*.py")
     return git("rev-parse", "--short", "HEAD") + ("+" if changed else "")
@@ -95,12 +109,21 @@ def append(file: str, row: Row) -> None:
 def stored(file: str) -> list[Row]:
     """The rows of ``results/<file>``."""
     path = RESULTS / file
-    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()] if path.exists() else []
+    return (
+        [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+        if path.exists()
+        else []
+    )
 
 
-def table(heads: Sequence[str], rows: Iterable[Sequence[object]], numbers_from: int | None = None) -> str:
+def table(
+    heads: Sequence[str], rows: Iterable[Sequence[object]], numbers_from: int | None = None
+) -> str:
     """A Markdown table; columns from ``numbers_from`` on are aligned to the right."""
-    marks = ["---:" if numbers_from is not None and k >= numbers_from else "---" for k in range(len(heads))]
+    marks = [
+        "---:" if numbers_from is not None and k >= numbers_from else "---"
+        for k in range(len(heads))
+    ]
     lines = [f"| {' | '.join(map(str, cells))} |" for cells in (heads, *rows)]
     return "\n".join([lines[0], f"|{'|'.join(marks)}|", *lines[1:]])
 
@@ -121,32 +144,54 @@ def outcomes(report: Path) -> Row:
     bad = [case for case in cases if any(case.findall(kind) for kind in ("failure", "error"))]
     skipped = sum(case.find("skipped") is not None for case in cases)
     names = sorted({f"{case.get('classname')}::{case.get('name')}" for case in bad})
-    return {"passed": len(cases) - len(bad) - skipped, "failed": len(bad), "skipped": skipped, "failures": names}
+    return {
+        "passed": len(cases) - len(bad) - skipped,
+        "failed": len(bad),
+        "skipped": skipped,
+        "failures": names,
+    }
 
 
 class Process:
-    """A command in a process of its own: its output, the times of its messages, its memory over time, its cost.
+    """A command in a process of its own: its output, the times of its messages, its memory over
+    time, its cost.
 
     Attributes:
         out, lines: stdout; the lines of stderr.
-        moments, cpu: wall and CPU seconds up to the first line on stderr that matches each pattern of ``messages``.
+        moments, cpu: wall and CPU seconds up to the first line on stderr that matches each pattern
+            of ``messages``.
         memory: (seconds, resident bytes, CPU seconds) every 20 ms.
         seconds, cpu_seconds, peak_bytes: of the whole process, after ``finish``.
     """
 
     def __init__(
-        self, words: Iterable[object], messages: Mapping[str, str] | None = None, *, until: str = "",
-        environment: Mapping[str, str] | None = None, code: int = 0,
-    ) -> None:  # fmt: skip
-        """Runs to the end, or with ``until`` to a line on stdout that has this text: ``line``. ``code``: exit code."""
+        self,
+        words: Iterable[object],
+        messages: Mapping[str, str] | None = None,
+        *,
+        until: str = "",
+        environment: Mapping[str, str] | None = None,
+        code: int = 0,
+    ) -> None:
+        """Runs to the end, or with ``until`` to a line on stdout that has this text: ``line``.
+        ``code``: exit code.
+        """
         self.words, self.messages, self.code = [str(word) for word in words], messages or {}, code
         self.began = time.perf_counter()
         self.process = subprocess.Popen(
-            self.words, text=True, cwd=tempfile.gettempdir(), stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+            self.words,
+            text=True,
+            cwd=tempfile.gettempdir(),
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
             env=os.environ | {"PYTHONPATH": str(ROOT)} | dict(environment or {}),
-        )  # fmt: skip
+        )
         self.out, self.line, self.lines, self.ended = "", "", list[str](), False
-        self.moments, self.cpu, self.memory = dict[str, float](), dict[str, float](), list[tuple[float, int, float]]()
+        self.moments, self.cpu, self.memory = (
+            dict[str, float](),
+            dict[str, float](),
+            list[tuple[float, int, float]](),
+        )
         self.threads = [Thread(target=each, daemon=True) for each in (self._follow, self._sample)]
         for thread in self.threads:
             thread.start()
@@ -171,7 +216,10 @@ class Process:
 
     def _used(self) -> tuple[int, float]:
         """Resident bytes, and CPU seconds of all threads so far."""
-        statm, stat = (Path(f"/proc/{self.process.pid}/{name}").read_text("utf-8") for name in ("statm", "stat"))
+        statm, stat = (
+            Path(f"/proc/{self.process.pid}/{name}").read_text("utf-8")
+            for name in ("statm", "stat")
+        )
         fields = stat.rpartition(")")[2].split()
         cpu = (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
         return int(statm.split()[1]) * os.sysconf("SC_PAGE_SIZE"), cpu
@@ -193,7 +241,11 @@ class Process:
         self.threads[1].join()
         self.cpu_seconds, self.peak_bytes = usage.ru_utime + usage.ru_stime, usage.ru_maxrss * 1024
         if self.process.returncode != self.code:
-            sys.exit("\n".join([f"exit code {self.process.returncode}: {' '.join(self.words)}", *self.lines]))
+            sys.exit(
+                "\n".join(
+                    [f"exit code {self.process.returncode}: {' '.join(self.words)}", *self.lines]
+                )
+            )
 
     def cost(self) -> Row:
         times = {"seconds": round(self.seconds, 3), "cpu_seconds": round(self.cpu_seconds, 3)}

@@ -1,14 +1,16 @@
-"""Quality after adapting a base that was trained to its end, with few photographs, on held-out photographs.
+"""Quality after adapting a base that was trained to its end, with few photographs, on held-out
+photographs.
 
-    python benchmarks/converged.py FOLDER [FOLDER ...] --record       # folders with images/, sparse/0/ and base.ply
-    python benchmarks/converged.py plush_half bonsai146 --every 3 --record
+    python benchmarks/converged.py FOLDER [FOLDER ...] --record       # folders with images/,
+    sparse/0/ and base.ply python benchmarks/converged.py plush_half bonsai146 --every 3 --record
     python benchmarks/converged.py plush_half bonsai146 --every 3 --base pretrained.ply --record
     python benchmarks/converged.py --table                            # the rows as a Markdown table
 
-Runs the default command on ``base.ply``. With ``--every`` the folders are captures of the shared data, of which that
-part of the photographs, by name, is copied to a folder in ``benchmarks/cache``; those held out there are held out from
-the capture too. The base is trained there from the COLMAP points (``from_points.py``), or, with ``--base``, is that
-checkpoint, trained on all photographs, and tuned further on those that are left.
+Runs the default command on ``base.ply``. With ``--every`` the folders are captures of the shared
+data, of which that part of the photographs, by name, is copied to a folder in ``benchmarks/cache``;
+those held out there are held out from the capture too. The base is trained there from the COLMAP
+points (``from_points.py``), or, with ``--base``, is that checkpoint, trained on all photographs,
+and tuned further on those that are left.
 """
 
 import json
@@ -28,8 +30,12 @@ ITERS, FINAL = 1500, 0.01  # of tuning a checkpoint further
 def main() -> None:
     parser = arguments(__doc__, table=print_table, record=FILE)
     parser.add_argument("folders", nargs="+", metavar="FOLDER")
-    parser.add_argument("--every", type=int, metavar="K", help="captures, of which one photograph in K is used")
-    parser.add_argument("--base", metavar="CHECKPOINT", help="with --every: make base.ply from this file")
+    parser.add_argument(
+        "--every", type=int, metavar="K", help="captures, of which one photograph in K is used"
+    )
+    parser.add_argument(
+        "--base", metavar="CHECKPOINT", help="with --every: make base.ply from this file"
+    )
     args = parser.parse_args()
     for name in args.folders:
         folder = make(capture(name), args.every, args.base) if args.every else Path(name).resolve()
@@ -47,7 +53,9 @@ def make(source: Path, every: int, start: str | None) -> Path:
         write_base(folder)
     else:
         begun = clod.load(source / start)
-        tuned, _ = tune(begun.gaussians, clod.load_scene(folder).train, Tuning(iters=ITERS, final=FINAL))
+        tuned, _ = tune(
+            begun.gaussians, clod.load_scene(folder).train, Tuning(iters=ITERS, final=FINAL)
+        )
         clod.save(base, tuned, begun)
     return folder
 
@@ -57,27 +65,54 @@ def run(folder: Path, *, record: bool) -> None:
     base, scene = clod.load(folder / "base.ply"), clod.load_scene(folder)
     with tempfile.TemporaryDirectory() as place:
         out = Path(place) / "dial.ply"
-        process = Process([*COMMAND, base.path, "--images", folder, "--out", out, "--accept-loss", "--quiet"])
+        process = Process(
+            [*COMMAND, base.path, "--images", folder, "--out", out, "--accept-loss", "--quiet"]
+        )
         report = json.loads(out.with_suffix(".json").read_text(encoding="utf-8"))
         rows = clod.evaluate(clod.load(out).gaussians, scene.test, DIALS)
     row: Row = {
-        "benchmark": "converged", "name": folder.name, "photographs": len(scene.train), "held_out": len(scene.test),
-        "gaussians": len(base.gaussians), "base": report["base_rows"][0], "rows": [each.as_dict() for each in rows],
-        "steps": report["steps"], "seconds": round(process.seconds, 1),
-    }  # fmt: skip
+        "benchmark": "converged",
+        "name": folder.name,
+        "photographs": len(scene.train),
+        "held_out": len(scene.test),
+        "gaussians": len(base.gaussians),
+        "base": report["base_rows"][0],
+        "rows": [each.as_dict() for each in rows],
+        "steps": report["steps"],
+        "seconds": round(process.seconds, 1),
+    }
     if record:
         append(FILE, row)
     print(table(HEADS, [cells(row)]))
 
 
-HEADS = ["scene", "photographs", "Gaussians", "base", *(f"s = {s:g}" for s in DIALS), "steps", "seconds"]
+HEADS = [
+    "scene",
+    "photographs",
+    "Gaussians",
+    "base",
+    *(f"s = {s:g}" for s in DIALS),
+    "steps",
+    "seconds",
+]
 
 
 def cells(row: Row) -> list[object]:
-    quality = [f"{each['psnr']:.2f} / {each['ssim']:.3f} @ {each['kept_share']:.0%}" for each in row["rows"]]
+    quality = [
+        f"{each['psnr']:.2f} / {each['ssim']:.3f} @ {each['kept_share']:.0%}"
+        for each in row["rows"]
+    ]
     base = f"{row['base']['psnr']:.2f} / {row['base']['ssim']:.3f}"
     seconds = f"{row['seconds']:.0f}"
-    return [row["name"], row["photographs"], f"{row['gaussians']:,}", base, *quality, row["steps"], seconds]
+    return [
+        row["name"],
+        row["photographs"],
+        f"{row['gaussians']:,}",
+        base,
+        *quality,
+        row["steps"],
+        seconds,
+    ]
 
 
 def print_table() -> None:

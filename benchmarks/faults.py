@@ -1,12 +1,14 @@
-"""Puts deliberate faults into a copy of the code, one at a time, and records which test catches each.
+"""Puts deliberate faults into a copy of the code, one at a time, and records which test catches
+each.
 
     python benchmarks/faults.py --record            # all of faults/*.toml
     python benchmarks/faults.py io kernels/sign     # one file of them, one fault
     python benchmarks/faults.py --check             # whether each still applies, without a run
 
-A fault is one replaced text in one file: ``name``, ``file``, ``before`` (occurs once), ``after``, and ``tests``, the
-paths that run. With ``--whole`` the whole suite runs where these pass, minutes each. The exit code is 1 where a fault
-was not caught, and, before any run, where a ``before`` does not occur once.
+A fault is one replaced text in one file: ``name``, ``file``, ``before`` (occurs once), ``after``,
+and ``tests``, the paths that run. With ``--whole`` the whole suite runs where these pass, minutes
+each. The exit code is 1 where a fault was not caught, and, before any run, where a ``before`` does
+not occur once.
 """
 
 import os
@@ -24,7 +26,9 @@ from common import ROOT, SHARED, append, arguments
 
 FILE = "faults.jsonl"
 LISTS = ROOT / "benchmarks" / "faults"
-LEFT_OUT = shutil.ignore_patterns(".venv", ".git", "*.egg-info", "demo", "build", "node_modules", "*_cache")
+LEFT_OUT = shutil.ignore_patterns(
+    ".venv", ".git", "*.egg-info", "demo", "build", "node_modules", "*_cache"
+)
 
 
 def faults(words: Sequence[str]) -> Iterator[tuple[str, dict[str, Any]]]:
@@ -48,11 +52,16 @@ def misfits(words: Sequence[str]) -> list[str]:
 
 
 def first_failure(copy: Path, tests: Sequence[str]) -> tuple[str, str]:
-    """The first test that fails in the copy, or the run's error, empty where all pass; and pytest's last line."""
-    options = ["-x", "-q", "-p", "no:cacheprovider", "--numprocesses=0", "-o", "timeout=900"]  # kernels are compiled
+    """The first test that fails in the copy, or the run's error, empty where all pass; and pytest's
+    last line.
+    """
+    # kernels are compiled
+    options = ["-x", "-q", "-p", "no:cacheprovider", "--numprocesses=0", "-o", "timeout=900"]
     words = [sys.executable, "-m", "pytest", *options, *tests]
     environment = os.environ | {"PYTHONPATH": str(copy), "CLOD_SHARED_DATA": str(SHARED)}
-    done = subprocess.run(words, cwd=copy, env=environment, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        words, cwd=copy, env=environment, capture_output=True, text=True, check=False
+    )
     lines = (done.stdout + done.stderr).splitlines() or [""]
     failed = (line.split()[1] for line in lines if line.startswith(("FAILED", "ERROR ")))
     return next(failed, lines[-1]) if done.returncode else "", lines[-1]
@@ -73,7 +82,9 @@ def run(copy: Path, entry: dict[str, Any], whole: bool) -> tuple[str, str]:
 def main() -> None:
     parser = arguments(__doc__, record=FILE)
     parser.add_argument("faults", nargs="*", help="ROOM or ROOM/NAME; default: all")
-    parser.add_argument("--whole", action="store_true", help="run the whole suite where the fault's own tests pass")
+    parser.add_argument(
+        "--whole", action="store_true", help="run the whole suite where the fault's own tests pass"
+    )
     parser.add_argument("--check", action="store_true", help="only check that each fault applies")
     args = parser.parse_args()
     if (wrong := misfits(args.faults)) or args.check:
@@ -82,7 +93,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder) / ROOT.name
         shutil.copytree(ROOT, copy, ignore=LEFT_OUT, symlinks=True)
-        (copy / "clod_adapter" / "cli").symlink_to(copy / "cli")  # else the installed one is imported
+        # else the installed one is imported
+        (copy / "clod_adapter" / "cli").symlink_to(copy / "cli")
         for name, entry in faults(args.faults):
             began = time.perf_counter()
             by, counts = run(copy, entry, args.whole)
@@ -90,7 +102,10 @@ def main() -> None:
             print(f"{name:40} {by or f'NOT CAUGHT ({counts})'}", flush=True)
             if args.record:
                 seconds = round(time.perf_counter() - began, 1)
-                append(FILE, {"benchmark": "faults", "fault": name, "caught_by": by, "seconds": seconds})
+                append(
+                    FILE,
+                    {"benchmark": "faults", "fault": name, "caught_by": by, "seconds": seconds},
+                )
     sys.exit(bool(missed))
 
 

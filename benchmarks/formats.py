@@ -3,10 +3,10 @@
     python benchmarks/formats.py plush_half
     python benchmarks/formats.py --table                  # the rows as a Markdown table
 
-A checkpoint gets a sigma_d without training (``importance.initialize``), is written in each format that stores one and
-read again. PSNR is between the renders at s and those of the PLY, as means over the held-out views, in floating point;
-null where they are equal. ``.splat`` stores no sigma_d: a model baked at s is written and compared. Each format adds
-one row to ``results/formats.jsonl``.
+A checkpoint gets a sigma_d without training (``importance.initialize``), is written in each format
+that stores one and read again. PSNR is between the renders at s and those of the PLY, as means over
+the held-out views, in floating point; null where they are equal. ``.splat`` stores no sigma_d: a
+model baked at s is written and compared. Each format adds one row to ``results/formats.jsonl``.
 """
 
 import math
@@ -41,7 +41,12 @@ def run(scene: str, config: clod.AdaptConfig) -> None:
     baked = {s: clod.bake(model, s, cameras=[view.camera for view in views.train]) for s in DIALS}
     for suffix in WRITABLE:
         dial = FORMATS[suffix].carries_sigma
-        row: dict[str, Any] = {"benchmark": "formats", "scene": scene, "suffix": suffix, "dial": dial}
+        row: dict[str, Any] = {
+            "benchmark": "formats",
+            "scene": scene,
+            "suffix": suffix,
+            "dial": dial,
+        }
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / f"model{suffix}"
             for s in DIALS:
@@ -55,13 +60,17 @@ def round_trip(path: Path, gaussians: clod.Gaussians) -> dict[str, Any]:
     """The size, and the largest relative error of sigma_d, of those of at least 1e-4."""
     notes, again, error = write(path, gaussians), clod.load(path).gaussians, None
     if gaussians.sigma_d is not None and again.sigma_d is not None:
-        there = (again.means - gaussians.means).abs().amax(1) <= 1e-3  # SPZ moves the farthest nearer
+        # SPZ moves the farthest nearer
+        there = (again.means - gaussians.means).abs().amax(1) <= 1e-3
         old, new = gaussians.sigma_d.double()[there], again.sigma_d.double()[there]
         error = float(((new - old) / old)[old >= 1e-4].abs().max())
     return {
-        "count": len(gaussians), "sh_degree": gaussians.sh_degree, "notes": notes, "sigma_error": error,
+        "count": len(gaussians),
+        "sh_degree": gaussians.sh_degree,
+        "notes": notes,
+        "sigma_error": error,
         "bytes_per_gaussian": round(path.stat().st_size / len(gaussians), 2),
-    }  # fmt: skip
+    }
 
 
 @torch.no_grad()
@@ -79,7 +88,9 @@ def pictures(
 
 def print_table() -> None:
     keys = ("scene", "suffix", "bytes_per_gaussian", "sigma_error")
-    lines = [[*(row[key] for key in keys), row["s1"]["psnr"], row["s5"]["psnr"]] for row in stored(FILE)]
+    lines = [
+        [*(row[key] for key in keys), row["s1"]["psnr"], row["s5"]["psnr"]] for row in stored(FILE)
+    ]
     print(table([*keys, "PSNR at s = 1", "at s = 5"], lines))
 
 

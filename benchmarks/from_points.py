@@ -1,10 +1,11 @@
-"""Cameras of photographs, by COLMAP, and a base from its points, trained to its end on the training photographs.
+"""Cameras of photographs, by COLMAP, and a base from its points, trained to its end on the training
+photographs.
 
     python benchmarks/from_points.py PHOTOGRAPHS FOLDER --every 5 --thin 2
 
-writes FOLDER/images, FOLDER/sparse/0 and FOLDER/base.ply. The base is plain splatting with a fixed number of Gaussians:
-rounds of tuning, after each of which transparent Gaussians are moved to opaque ones, as in 3DGS as Markov Chain Monte
-Carlo (arXiv 2404.09591).
+writes FOLDER/images, FOLDER/sparse/0 and FOLDER/base.ply. The base is plain splatting with a fixed
+number of Gaussians: rounds of tuning, after each of which transparent Gaussians are moved to opaque
+ones, as in 3DGS as Markov Chain Monte Carlo (arXiv 2404.09591).
 """
 
 import argparse
@@ -25,28 +26,39 @@ from PIL import Image, ImageOps
 from scipy.spatial import cKDTree
 
 COUNT = 60_000
-ROUNDS, ROUND, LAST = 8, 250, 1500  # rounds that end with a relocation, steps of each, and of the last one
+# rounds that end with a relocation, steps of each, and of the last one
+ROUNDS, ROUND, LAST = 8, 250, 1500
 TRANSPARENT = 0.05  # opacity below which a Gaussian is moved
 OPACITY, SH_COEFFICIENTS = 0.3, 15
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("photographs", type=Path)
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--every", type=int, default=1, metavar="K", help="one photograph in K is used")
-    parser.add_argument("--thin", type=int, default=1, metavar="K", help="of those with a camera one in K is left")
+    parser.add_argument(
+        "--every", type=int, default=1, metavar="K", help="one photograph in K is used"
+    )
+    parser.add_argument(
+        "--thin", type=int, default=1, metavar="K", help="of those with a camera one in K is left"
+    )
     parser.add_argument("--size", type=int, default=900, help="pixels of the longer side at most")
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as place:
         posed = Path(place) / "posed"
-        find_cameras(sorted(args.photographs.iterdir())[:: args.every], args.size, Path(place), posed)
+        find_cameras(
+            sorted(args.photographs.iterdir())[:: args.every], args.size, Path(place), posed
+        )
         thin(posed, args.folder, args.thin)
     write_base(args.folder)
 
 
 def find_cameras(photographs: Sequence[Path], size: int, place: Path, folder: Path) -> None:
-    """COLMAP's largest model of the photographs, undistorted; ``place`` is for what is made on the way."""
+    """COLMAP's largest model of the photographs, undistorted; ``place`` is for what is made on the
+    way.
+    """
     smaller, database = place / "images", place / "database.db"
     smaller.mkdir()
     for path in photographs:
@@ -65,7 +77,9 @@ def find_cameras(photographs: Sequence[Path], size: int, place: Path, folder: Pa
 
 
 def thin(source: Path, folder: Path, every: int) -> None:
-    """Copies one photograph in ``every`` by name, and the part of the COLMAP model that is of these."""
+    """Copies one photograph in ``every`` by name, and the part of the COLMAP model that is of
+    these.
+    """
     model = pycolmap.Reconstruction(str(source / "sparse" / "0"))
     images = sorted(model.images.values(), key=lambda image: image.name)
     for place in ("images", "sparse/0"):
@@ -97,12 +111,16 @@ def train_base(folder: Path, seed: int = 0) -> tuple[clod.Gaussians, float]:
 
 
 def initial(model: pycolmap.Reconstruction, random: np.random.Generator) -> clod.Gaussians:
-    """COUNT Gaussians at points of the model, each displaced by as much as its neighbours are away."""
+    """COUNT Gaussians at points of the model, each displaced by as much as its neighbours are
+    away.
+    """
     xyz = np.array([point.xyz for point in model.points3D.values()])
     rgb = np.array([point.color for point in model.points3D.values()]) / 255
     distances = cKDTree(xyz).query(xyz, 4)[0][:, 1:].mean(1)
     rows = random.permutation(np.resize(random.permutation(len(xyz)), COUNT))
-    sizes = np.maximum(distances[rows], 1e-6 * np.ptp(xyz)) * min(1.0, (len(xyz) / COUNT) ** (1 / 3))
+    sizes = np.maximum(distances[rows], 1e-6 * np.ptp(xyz)) * min(
+        1.0, (len(xyz) / COUNT) ** (1 / 3)
+    )
     means = xyz[rows] + random.normal(size=(COUNT, 3)) * sizes[:, None]
     return clod.Gaussians(
         means=means.astype(np.float32),
@@ -115,7 +133,9 @@ def initial(model: pycolmap.Reconstruction, random: np.random.Generator) -> clod
 
 
 def relocated(gaussians: clod.Gaussians, random: np.random.Generator) -> clod.Gaussians:
-    """Transparent Gaussians become copies of opaque ones, chosen by opacity; both have half the optical depth."""
+    """Transparent Gaussians become copies of opaque ones, chosen by opacity; both have half the
+    optical depth.
+    """
     opacities = gaussians.opacities.double().numpy()
     dead = np.flatnonzero(opacities < TRANSPARENT)
     alive = np.flatnonzero(opacities >= TRANSPARENT)

@@ -1,14 +1,15 @@
 """All checks for an NVIDIA GPU in one command; with small sizes they also run on the CPU.
 
-    python benchmarks/gpu.py                         # needs torch with CUDA, gsplat 1.5.3 and the shared data
-    python benchmarks/gpu.py --device cpu --small    # the same code, in seconds
+    python benchmarks/gpu.py                         # needs torch with CUDA, gsplat 1.5.3 and the
+    shared data python benchmarks/gpu.py --device cpu --small    # the same code, in seconds
 
-``tests``: the contract of every backend, the gsplat integration and the optimizer.
-``plush``: plush_half adapted on the GPU and on the CPU with the same settings: seconds, and held-out quality.
-``city``: a synthetic city adapted (peak memory), then near and far frames in turn with plain gsplat on the same
-file: times, the dial's share, PSNR.
+``tests``: the contract of every backend, the gsplat integration and the optimizer. ``plush``:
+plush_half adapted on the GPU and on the CPU with the same settings: seconds, and held-out quality.
+``city``: a synthetic city adapted (peak memory), then near and far frames in turn with plain gsplat
+on the same file: times, the dial's share, PSNR.
 
-Each adds rows to ``results/gpu.jsonl``. Without a GPU, plain is this package's CPU rasterizer without the dial.
+Each adds rows to ``results/gpu.jsonl``. Without a GPU, plain is this package's CPU rasterizer
+without the dial.
 """
 
 import os
@@ -37,9 +38,11 @@ from torch import Tensor
 CHECKS = ("tests", "plush", "city")
 DIALS = (1.0, 3.0, 7.0)
 TESTS = (
-    "tests/rasterizers", "tests/integrations/test_gsplat.py", "tests/test_consumers.py",
+    "tests/rasterizers",
+    "tests/integrations/test_gsplat.py",
+    "tests/test_consumers.py",
     "tests/training/test_step.py",
-)  # fmt: skip
+)
 
 
 @dataclass(frozen=True)
@@ -61,7 +64,11 @@ SMALL = Size(count=3000, width=64, height=48, views=4, steps=3, plush_steps=3, r
 def main() -> None:
     parser = arguments(__doc__)
     parser.add_argument("--device", choices=["cuda", "cpu"], default="cuda")
-    parser.add_argument("--small", action="store_true", help="a tiny city, also in place of plush_half, and few tests")
+    parser.add_argument(
+        "--small",
+        action="store_true",
+        help="a tiny city, also in place of plush_half, and few tests",
+    )
     parser.add_argument("--only", nargs="+", choices=CHECKS, default=CHECKS)
     parser.add_argument("--count", type=int, help="Gaussians of the city")
     parser.add_argument("--results", default="gpu.jsonl", help="the file, in results/ or anywhere")
@@ -79,7 +86,10 @@ def main() -> None:
     }
     for name in args.only:
         for row in checks[name]():
-            append(args.results, {"benchmark": f"gpu {name}", "device": args.device, "size": asdict(size), **row})
+            append(
+                args.results,
+                {"benchmark": f"gpu {name}", "device": args.device, "size": asdict(size), **row},
+            )
 
 
 def run_tests(small: bool) -> dict[str, Any]:
@@ -87,8 +97,24 @@ def run_tests(small: bool) -> dict[str, Any]:
     few = ["-k", "test_for_device or test_no_gaussians"] if small else []
     with tempfile.TemporaryDirectory() as folder:
         report, began = Path(folder) / "report.xml", time.perf_counter()
-        command = [sys.executable, "-m", "pytest", "-p", "no:xdist", "-q", f"--junitxml={report}", *TESTS, *few]
-        subprocess.run(command, cwd=ROOT, stdout=sys.stderr, check=False, env={**os.environ, "PYTHONPATH": str(ROOT)})
+        command = [
+            sys.executable,
+            "-m",
+            "pytest",
+            "-p",
+            "no:xdist",
+            "-q",
+            f"--junitxml={report}",
+            *TESTS,
+            *few,
+        ]
+        subprocess.run(
+            command,
+            cwd=ROOT,
+            stdout=sys.stderr,
+            check=False,
+            env={**os.environ, "PYTHONPATH": str(ROOT)},
+        )
         found = outcomes(report)
     cases = found.pop("passed") + found["failed"] + found["skipped"]
     return {"cases": cases, **found, "seconds": round(time.perf_counter() - began, 1)}
@@ -104,18 +130,26 @@ def adapt_plush(device: torch.device, size: Size, small: bool) -> list[dict[str,
     rows = []
     for place in dict.fromkeys([device, torch.device("cpu")]):
         own = base.to(place)
-        clod.adapt(own, clod.Scene(scene.train[:1], ()), clod.AdaptConfig(iters=1))  # compiled before the clock starts
+        # compiled before the clock starts
+        clod.adapt(own, clod.Scene(scene.train[:1], ()), clod.AdaptConfig(iters=1))
         reset_peak(place)
         adapted = clod.adapt(own, scene, config)
         wait_for(place)
         base_row = clod.evaluate(own, scene.test, [1.0])[0]
         found = clod.evaluate(adapted.gaussians, scene.test, [1.0, 3.0, config.max_sv])
-        rows.append({
-            "on": place.type, "scene": "synthetic" if small else "plush_half", "config": asdict(config),
-            "count": len(own), "start_seconds": round(adapted.start_seconds, 2),
-            "train_seconds": round(adapted.seconds, 3), "peak_bytes": peak(place), "base": base_row.as_dict(),
-            "rows": [row.as_dict() for row in found],
-        })  # fmt: skip
+        rows.append(
+            {
+                "on": place.type,
+                "scene": "synthetic" if small else "plush_half",
+                "config": asdict(config),
+                "count": len(own),
+                "start_seconds": round(adapted.start_seconds, 2),
+                "train_seconds": round(adapted.seconds, 3),
+                "peak_bytes": peak(place),
+                "base": base_row.as_dict(),
+                "rows": [row.as_dict() for row in found],
+            }
+        )
     return rows
 
 
@@ -126,11 +160,16 @@ def measure_city(device: torch.device, size: Size) -> list[dict[str, Any]]:
     reset_peak(device)
     adapted = clod.adapt(base, scene, config)
     wait_for(device)
-    rows: list[dict[str, Any]] = [{
-        "what": "adapt", "config": asdict(config), "start_seconds": round(adapted.start_seconds, 2),
-        "train_seconds": round(adapted.seconds, 3), "peak_bytes": peak(device),
-        "base_bytes": sum(x.nbytes for x in base.tensors().values()),
-    }]  # fmt: skip
+    rows: list[dict[str, Any]] = [
+        {
+            "what": "adapt",
+            "config": asdict(config),
+            "start_seconds": round(adapted.start_seconds, 2),
+            "train_seconds": round(adapted.seconds, 3),
+            "peak_bytes": peak(device),
+            "base_bytes": sum(x.nbytes for x in base.tensors().values()),
+        }
+    ]
     del base
     model, truth = adapted.gaussians, city(size.count)
     for where in ("near", "far"):
@@ -141,7 +180,9 @@ def measure_city(device: torch.device, size: Size) -> list[dict[str, Any]]:
 
 
 @torch.no_grad()
-def frames(model: clod.Gaussians, views: list[clod.View], where: str, s: float, repeats: int) -> dict[str, Any]:
+def frames(
+    model: clod.Gaussians, views: list[clod.View], where: str, s: float, repeats: int
+) -> dict[str, Any]:
     """Medians in milliseconds, ours and plain in turn, over the views; and PSNR of the pictures."""
     device, plain = model.means.device, plain_frames(model)
     jobs: dict[str, Callable[[clod.Camera], Any]] = {
@@ -165,16 +206,24 @@ def frames(model: clod.Gaussians, views: list[clod.View], where: str, s: float, 
     full = [next(iter(plain.values()))(view.camera) for view in views]
     pixels = [(picture.clamp(0, 1) * 255).round().to(torch.uint8).cpu() for picture in full]
     return {
-        "what": "frames", "where": where, "virtual_scale": s, "kept": fmean(int(p.kept.sum()) for p in shown), "ms": ms,
+        "what": "frames",
+        "where": where,
+        "virtual_scale": s,
+        "kept": fmean(int(p.kept.sum()) for p in shown),
+        "ms": ms,
         "faster": {name: ms[name] / ms["ours"] for name in plain},
         "dial_share": ms["dial"] / ms["ours"],
         "psnr_full": fmean(psnr(p.image, f) for p, f in zip(shown, pixels, strict=True)),
-        "psnr_truth": fmean(psnr(p.image, view.image) for p, view in zip(shown, views, strict=True)),
-    }  # fmt: skip
+        "psnr_truth": fmean(
+            psnr(p.image, view.image) for p, view in zip(shown, views, strict=True)
+        ),
+    }
 
 
 def plain_frames(model: clod.Gaussians) -> dict[str, Callable[[clod.Camera], Tensor]]:
-    """The file without its dial, activated beforehand, as a viewer that does not know the dial draws it."""
+    """The file without its dial, activated beforehand, as a viewer that does not know the dial
+    draws it.
+    """
     scales, opacities = model.scales, model.opacities
     if model.means.device.type == "cpu":
         return {"plain": lambda camera: splat(model, opacities, camera)[0]}
@@ -182,10 +231,21 @@ def plain_frames(model: clod.Gaussians) -> dict[str, Callable[[clod.Camera], Ten
 
     colors = torch.cat([model.sh0, model.shN], 1)
 
-    return {"plain": lambda camera: gsplat.rasterization(
-        model.means, model.quats, scales, opacities, colors, camera.viewmat.to(scales)[None],
-        camera.K.to(scales)[None], camera.width, camera.height, near_plane=camera.near, sh_degree=model.sh_degree,
-    )[0][0]}  # fmt: skip
+    return {
+        "plain": lambda camera: gsplat.rasterization(
+            model.means,
+            model.quats,
+            scales,
+            opacities,
+            colors,
+            camera.viewmat.to(scales)[None],
+            camera.K.to(scales)[None],
+            camera.width,
+            camera.height,
+            near_plane=camera.near,
+            sh_degree=model.sh_degree,
+        )[0][0]
+    }
 
 
 def synthetic(size: Size, device: torch.device) -> tuple[clod.Gaussians, clod.Scene]:
@@ -197,7 +257,9 @@ def synthetic(size: Size, device: torch.device) -> tuple[clod.Gaussians, clod.Sc
 
 
 @torch.no_grad()
-def photograph(truth: clod.Gaussians, cameras: list[clod.Camera], device: torch.device) -> list[clod.View]:
+def photograph(
+    truth: clod.Gaussians, cameras: list[clod.Camera], device: torch.device
+) -> list[clod.View]:
     there = truth.to(device)
     return [clod.View(camera, clod.render(there, camera).pixels.cpu()) for camera in cameras]
 
@@ -208,7 +270,9 @@ def reset_peak(device: torch.device) -> None:
 
 
 def peak(device: torch.device) -> int:
-    """Bytes: of torch's allocations on a GPU since ``reset_peak``; on the CPU of the process, ever."""
+    """Bytes: of torch's allocations on a GPU since ``reset_peak``; on the CPU of the process,
+    ever.
+    """
     if device.type == "cuda":
         return torch.cuda.max_memory_allocated(device)
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024

@@ -1,11 +1,12 @@
-"""Runs the command in hostile surroundings and on damaged files, each as a shell line with the exit code that is right.
+"""Runs the command in hostile surroundings and on damaged files, each as a shell line with the exit
+code that is right.
 
     python benchmarks/hostile.py                # several minutes
     python benchmarks/hostile.py --only --batch  # the lines with this text
     python benchmarks/hostile.py --files 200    # more damaged files of each format
 
-A failure is another exit code, a traceback or a warning, an error that is not one last line, an input that changed, or
-other new files than expected.
+A failure is another exit code, a traceback or a warning, an error that is not one last line, an
+input that changed, or other new files than expected.
 """
 
 import argparse
@@ -41,7 +42,9 @@ from PIL import Image
 SCENE = "base.ply --images scene --iters 2 --max-sv 2 --accept-loss -o new.ply"
 EVAL = "eval base.ply --images scene --sv 1 --quiet"
 FILES = ("new.json", "new.ply", "new.safetensors")
-NOISE = re.compile(r"Traceback|\w+Warning:|warn\(|Segmentation|core dumped|FATAL|terminate called|this is a bug")
+NOISE = re.compile(
+    r"Traceback|\w+Warning:|warn\(|Segmentation|core dumped|FATAL|terminate called|this is a bug"
+)
 SECONDS = 120
 
 
@@ -75,11 +78,29 @@ def streams() -> Iterator[Case]:
 
 def environments() -> Iterator[Case]:
     for variables in (
-        "NUMBA_NUM_THREADS=0", "NUMBA_NUM_THREADS=x", "OMP_NUM_THREADS=abc", "TMPDIR=/missing", "-u HOME", "HOME=",
-        "COLUMNS=0", "COLUMNS=1", "COLUMNS=x", "TERM=", "LANG=xx_YY.z", "LC_ALL=C", "PYTHONOPTIMIZE=2",
-        "PYTHONWARNINGS=error", "PYTHONIOENCODING=ascii", "PYTHONUTF8=0", "XDG_CACHE_HOME=/proc/x",
-        "NUMBA_CACHE_DIR=/proc/x", "CUDA_VISIBLE_DEVICES=x", "RANK=x", "WORLD_SIZE=3", '-i PATH="$PATH"',
-    ):  # fmt: skip
+        "NUMBA_NUM_THREADS=0",
+        "NUMBA_NUM_THREADS=x",
+        "OMP_NUM_THREADS=abc",
+        "TMPDIR=/missing",
+        "-u HOME",
+        "HOME=",
+        "COLUMNS=0",
+        "COLUMNS=1",
+        "COLUMNS=x",
+        "TERM=",
+        "LANG=xx_YY.z",
+        "LC_ALL=C",
+        "PYTHONOPTIMIZE=2",
+        "PYTHONWARNINGS=error",
+        "PYTHONIOENCODING=ascii",
+        "PYTHONUTF8=0",
+        "XDG_CACHE_HOME=/proc/x",
+        "NUMBA_CACHE_DIR=/proc/x",
+        "CUDA_VISIBLE_DEVICES=x",
+        "RANK=x",
+        "WORLD_SIZE=3",
+        '-i PATH="$PATH"',
+    ):
         yield Case(f"env {variables} clod-adapt {EVAL}", 0)
     yield Case(f"env TMPDIR=/missing HOME=/missing clod-adapt {SCENE}", 0, FILES)
 
@@ -87,48 +108,109 @@ def environments() -> Iterator[Case]:
 def folders() -> Iterator[Case]:
     yield Case("mkdir gone; cd gone; rmdir ../gone; clod-adapt inspect ../base.ply")
     for words in (
-        'base.ply -o ""', "base.ply --out=", 'base.ply --images ""', '""', 'inspect ""', 'export base.ply -o ""',
-        "base.ply -o /proc/x.ply", "base.ply -o /dev/null", "inspect /dev/zero", "inspect /proc/self/mem", "inspect .",
-        "inspect /proc/self/environ", "base.ply --images /proc/self", "base.ply --images /dev",
-        'inspect "$(printf "a%.0s" $(seq 5000))"', "inspect $'a\\nb.ply'", "inspect $'\\xff.ply'",
-        "export base.ply -o new", "export base.ply -o new.zip", "export base.ply -o missing/new.ply",
-    ):  # fmt: skip
+        'base.ply -o ""',
+        "base.ply --out=",
+        'base.ply --images ""',
+        '""',
+        'inspect ""',
+        'export base.ply -o ""',
+        "base.ply -o /proc/x.ply",
+        "base.ply -o /dev/null",
+        "inspect /dev/zero",
+        "inspect /proc/self/mem",
+        "inspect .",
+        "inspect /proc/self/environ",
+        "base.ply --images /proc/self",
+        "base.ply --images /dev",
+        'inspect "$(printf "a%.0s" $(seq 5000))"',
+        "inspect $'a\\nb.ply'",
+        "inspect $'\\xff.ply'",
+        "export base.ply -o new",
+        "export base.ply -o new.zip",
+        "export base.ply -o missing/new.ply",
+    ):
         yield Case(f"clod-adapt {words}")
     yield Case("mkfifo p.ply; timeout 20 clod-adapt inspect p.ply; code=$?; rm p.ply; exit $code")
-    yield Case("ln -s loop.ply loop.ply; clod-adapt inspect loop.ply; code=$?; rm loop.ply; exit $code")
+    yield Case(
+        "ln -s loop.ply loop.ply; clod-adapt inspect loop.ply; code=$?; rm loop.ply; exit $code"
+    )
 
 
 def options() -> Iterator[Case]:
     for words in (
-        "--iters nan", "--iters 1e3", "--iters -1", "--iters 0x10", "--max-sv nan", "--max-sv inf", "--max-sv 0",
-        "--max-sv 1e400", "--batch 0", "--batch 1000000", "--batch 1.5", "--seed -1", "--seed 99999999999999999999",
-        "--time-budget 0", "--time-budget nan", "--time-budget inf", "--memory 0", "--memory nan", "--memory 8XB",
-        "--memory 1e400GB", "--with x", "--missing",
-        "--iters $(printf 1%.0s $(seq 100000))", "--max-sv",
-    ):  # fmt: skip
+        "--iters nan",
+        "--iters 1e3",
+        "--iters -1",
+        "--iters 0x10",
+        "--max-sv nan",
+        "--max-sv inf",
+        "--max-sv 0",
+        "--max-sv 1e400",
+        "--batch 0",
+        "--batch 1000000",
+        "--batch 1.5",
+        "--seed -1",
+        "--seed 99999999999999999999",
+        "--time-budget 0",
+        "--time-budget nan",
+        "--time-budget inf",
+        "--memory 0",
+        "--memory nan",
+        "--memory 8XB",
+        "--memory 1e400GB",
+        "--with x",
+        "--missing",
+        "--iters $(printf 1%.0s $(seq 100000))",
+        "--max-sv",
+    ):
         yield Case(f"clod-adapt base.ply --images scene -o new.ply {words}")
-    for words in ("--sv nan", "--sv inf", "--sv -1", "--keep 0", "--keep nan", "--psnr-drop 0", "--fps inf", "--sv"):
+    for words in (
+        "--sv nan",
+        "--sv inf",
+        "--sv -1",
+        "--keep 0",
+        "--keep nan",
+        "--psnr-drop 0",
+        "--fps inf",
+        "--sv",
+    ):
         yield Case(f"clod-adapt eval base.ply --images scene {words}")
-    for words in ("--levels nan", "--levels 1,,2", "--levels 1,1", "--camera ../x --images scene", "--order x"):
+    for words in (
+        "--levels nan",
+        "--levels 1,,2",
+        "--levels 1,1",
+        "--camera ../x --images scene",
+        "--order x",
+    ):
         yield Case(f"clod-adapt export base.ply -o new.ply {words}")
     for port in ("-1", "65536", "nan"):
         yield Case(f"clod-adapt view base.ply --no-browser --port {port}")
 
 
 def damaged(folder: Path, per_file: int) -> Iterator[Case]:
-    """Files and scenes that lie about what they contain, and random damage to sound ones; each is inspected or read."""
+    """Files and scenes that lie about what they contain, and random damage to sound ones; each is
+    inspected or read.
+    """
     ply, packed = (folder.parent / "base.ply").read_bytes(), zipped({"meta.json": b"{}"})
     spz = partial(struct.pack, "<IIIBBBB", 0x5053474E)
     contents = {
-        "bomb.sog": zipped({"meta.json": b" " * 50_000_000}), "up.sog": zipped({"../../x": b"", "meta.json": b"{}"}),
-        "ply.spz": ply, "ply.glb": ply, "ply.splat": ply, "ply.pt": ply, "ply.safetensors": ply, "sog.ply": packed,
-        "count.spz": gzip.compress(spz(3, 2**31, 3, 12, 0, 0)), "odd.splat": bytes(33),
+        "bomb.sog": zipped({"meta.json": b" " * 50_000_000}),
+        "up.sog": zipped({"../../x": b"", "meta.json": b"{}"}),
+        "ply.spz": ply,
+        "ply.glb": ply,
+        "ply.splat": ply,
+        "ply.pt": ply,
+        "ply.safetensors": ply,
+        "sog.ply": packed,
+        "count.spz": gzip.compress(spz(3, 2**31, 3, 12, 0, 0)),
+        "odd.splat": bytes(33),
         "bomb.spz": gzip.compress(spz(3, 3, 0, 12, 0, 0) + bytes(100_000_000)),
-        "deep.glb": glb(b"[" * 100_000), "uri.glb": glb(b'{"buffers":[{"byteLength":4,"uri":"../../etc/passwd"}]}'),
+        "deep.glb": glb(b"[" * 100_000),
+        "uri.glb": glb(b'{"buffers":[{"byteLength":4,"uri":"../../etc/passwd"}]}'),
         "comment.ply": b"ply\nformat ascii 1.0\ncomment " + b"x" * 2_000_000 + b"\nend_header\n",
         "code.pt": zipped({"archive/data.pkl": b"\x80\x02cposix\nsystem\nX\x04\0\0\0exit\x85R."}),
         "size.safetensors": struct.pack("<Q", 2**60) + b"{}",
-    }  # fmt: skip
+    }
     for name, data in contents.items():
         (folder / name).write_bytes(data)
         yield Case(f"clod-adapt inspect {folder}/{name}")
@@ -138,18 +220,27 @@ def damaged(folder: Path, per_file: int) -> Iterator[Case]:
             clod_adapter.save(folder / f"sound{suffix}", sound)
         for number in range(per_file):
             data = bytearray((folder / f"sound{suffix}").read_bytes())
-            for _ in range(chance.choice((1, 4, 30))):  # half of them in the first bytes, where headers are
+            # half of them in the first bytes, where headers are
+            for _ in range(chance.choice((1, 4, 30))):
                 at = chance.randrange(len(data) if chance.random() < 0.5 else min(len(data), 600))
                 data[at] = chance.randrange(256)
             cut = chance.randrange(len(data)) if chance.random() < 0.2 else len(data)
             (folder / f"damaged{number}{suffix}").write_bytes(data[:cut])
             yield Case(f"clod-adapt inspect {folder}/damaged{number}{suffix}", None)
-    pose, photograph = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 5], [0, 0, 0, 1]], folder.parent / "scene/images/000.png"
+    pose, photograph = (
+        [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 5], [0, 0, 0, 1]],
+        folder.parent / "scene/images/000.png",
+    )
     frame = {"file_path": "a.png", "transform_matrix": pose, "fl_x": 30, "w": 64, "h": 48}
     changes = (
-        {"file_path": "../../etc/passwd.png"}, {"file_path": "a\0b.png"}, {"file_path": "missing.png"},
-        {"transform_matrix": [[math.nan] * 4] * 4}, {"w": 2**31, "h": 2**31}, {"w": -1}, {"fl_x": 10**2000},
-    )  # fmt: skip
+        {"file_path": "../../etc/passwd.png"},
+        {"file_path": "a\0b.png"},
+        {"file_path": "missing.png"},
+        {"transform_matrix": [[math.nan] * 4] * 4},
+        {"w": 2**31, "h": 2**31},
+        {"w": -1},
+        {"fl_x": 10**2000},
+    )
     for number, change in enumerate(changes):
         scene = folder / f"transforms{number}"
         scene.mkdir()
@@ -168,7 +259,10 @@ def zipped(files: dict[str, bytes]) -> bytes:
 
 def glb(document: bytes) -> bytes:
     document += b" " * (-len(document) % 4)
-    return struct.pack("<IIIII", 0x46546C67, 2, 20 + len(document), len(document), 0x4E4F534A) + document
+    return (
+        struct.pack("<IIIII", 0x46546C67, 2, 20 + len(document), len(document), 0x4E4F534A)
+        + document
+    )
 
 
 def write_inputs(folder: Path) -> None:
@@ -176,11 +270,18 @@ def write_inputs(folder: Path) -> None:
     random = torch.Generator().manual_seed(0)
     normal = partial(torch.randn, generator=random)
     gaussians = Gaussians(
-        normal(200, 3), normal(200, 4), 0.5 * normal(200, 3) - 2, normal(200) + 1, normal(200, 1, 3),
+        normal(200, 3),
+        normal(200, 4),
+        0.5 * normal(200, 3) - 2,
+        normal(200) + 1,
+        normal(200, 1, 3),
         torch.zeros(200, 0, 3),
-    )  # fmt: skip
+    )
     clod_adapter.save(folder / "base.ply", gaussians)
-    cameras, names = clod_adapter.place_cameras(gaussians)[:10], [f"{number:03}.png" for number in range(10)]
+    cameras, names = (
+        clod_adapter.place_cameras(gaussians)[:10],
+        [f"{number:03}.png" for number in range(10)],
+    )
     (folder / "scene" / "images").mkdir(parents=True)
     write_model(folder / "scene", cameras, names)
     for camera, name in zip(cameras, names, strict=True):
@@ -197,7 +298,9 @@ def failures(case: Case, inputs: Path) -> list[str]:
         before = contents(folder)
         script = case.line.replace("clod-adapt", f"{sys.executable} -m clod_adapter")
         try:
-            done = subprocess.run(["bash", "-c", script], cwd=folder, capture_output=True, timeout=SECONDS)
+            done = subprocess.run(
+                ["bash", "-c", script], cwd=folder, capture_output=True, timeout=SECONDS
+            )
         except subprocess.TimeoutExpired:
             return [f"takes more than {SECONDS} s"]
         after = contents(folder)
@@ -219,7 +322,9 @@ def failures(case: Case, inputs: Path) -> list[str]:
 
 def contents(folder: Path) -> dict[str, bytes]:
     files = (path for path in folder.rglob("*") if path.is_file())
-    return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).digest() for path in files}
+    return {
+        str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).digest() for path in files
+    }
 
 
 def cases(inputs: Path, per_file: int) -> list[Case]:
@@ -230,18 +335,26 @@ def cases(inputs: Path, per_file: int) -> list[Case]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--only", default="", help="only the lines with this text")
-    parser.add_argument("--files", type=int, default=10, help="files of each format that are damaged at random")
+    parser.add_argument(
+        "--files", type=int, default=10, help="files of each format that are damaged at random"
+    )
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as name, ThreadPoolExecutor(os.cpu_count()) as pool:
         write_inputs(inputs := Path(name))
         chosen = [case for case in cases(inputs, args.files) if args.only in case.line]
         wrong = 0
-        for case, found in zip(chosen, pool.map(partial(failures, inputs=inputs), chosen), strict=True):
+        for case, found in zip(
+            chosen, pool.map(partial(failures, inputs=inputs), chosen), strict=True
+        ):
             if found:
                 wrong += 1
-                print(f"{case.line[:200]}\n  " + "\n  ".join(line[:300] for line in found), flush=True)
+                print(
+                    f"{case.line[:200]}\n  " + "\n  ".join(line[:300] for line in found), flush=True
+                )
     print(f"{len(chosen)} cases, {wrong} failures")
     sys.exit(wrong > 0)
 

@@ -1,10 +1,11 @@
-"""Makes viewers/kit: an adapted file of 2,000 Gaussians, its cameras, and reference pictures at dial values.
+"""Makes viewers/kit: an adapted file of 2,000 Gaussians, its cameras, and reference pictures at
+dial values.
 
     clod-adapt demo
     python benchmarks/kit.py
 
-The Gaussians are a random part of the demo's, enlarged to cover the same area. Values and pictures are those of
-``clod_adapter.render``; a test compares them.
+The Gaussians are a random part of the demo's, enlarged to cover the same area. Values and pictures
+are those of ``clod_adapter.render``; a test compares them.
 """
 
 import json
@@ -30,7 +31,9 @@ def main() -> None:
     model, scene = clod.load(f"{folder}/gallery.ply"), clod.load_scene(f"{folder}/capture")
     order = torch.randperm(len(model.gaussians), generator=torch.Generator().manual_seed(0))
     few = model.gaussians[order[:COUNT].sort().values]
-    few = few.replace(log_scales=few.log_scales + SHARE * math.log(len(model.gaussians) / COUNT) / 2)
+    few = few.replace(
+        log_scales=few.log_scales + SHARE * math.log(len(model.gaussians) / COUNT) / 2
+    )
     KIT.mkdir(exist_ok=True)
     for suffix in ("ply", "spz", "glb"):
         clod.save(KIT / f"kit.{suffix}", few)
@@ -40,7 +43,9 @@ def main() -> None:
 
 
 def resized(camera: clod.Camera) -> clod.Camera:
-    """Of WIDTH pixels, with square pixels and the principal point in the middle, as viewers have them."""
+    """Of WIDTH pixels, with square pixels and the principal point in the middle, as viewers have
+    them.
+    """
     height = round(camera.height * WIDTH / camera.width)
     focal = float(camera.K[0, 0]) * WIDTH / camera.width
     K = torch.tensor([[focal, 0, WIDTH / 2], [0, focal, height / 2], [0, 0, 1]])
@@ -56,9 +61,12 @@ def described(gaussians: clod.Gaussians, cameras: list[clod.Camera]) -> Iterator
             Image.fromarray(shown.pixels.numpy()).save(KIT / name, optimize=True)
             frames.append({"s": s, "kept": int(shown.kept.sum()), "picture": name})
         yield {
-            "world_to_camera": camera.viewmat.tolist(), "focal": float(camera.K[0, 0]),
-            "width": camera.width, "height": camera.height, "frames": frames,
-        }  # fmt: skip
+            "world_to_camera": camera.viewmat.tolist(),
+            "focal": float(camera.K[0, 0]),
+            "width": camera.width,
+            "height": camera.height,
+            "frames": frames,
+        }
 
 
 if __name__ == "__main__":

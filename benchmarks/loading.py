@@ -1,7 +1,9 @@
-"""CPU seconds and peak memory of ``clod_adapter.load`` of one large PLY, each run in a process of its own.
+"""CPU seconds and peak memory of ``clod_adapter.load`` of one large PLY, each run in a process of
+its own.
 
-python benchmarks/loading.py --record                         # 4,000,000 Gaussians: 1 GB of disk, 3 GB of memory
-python benchmarks/loading.py --against OLDER_CHECKOUT/.venv/bin/python    # in turn with another version
+python benchmarks/loading.py --record                         # 4,000,000 Gaussians: 1 GB of disk, 3
+GB of memory python benchmarks/loading.py --against OLDER_CHECKOUT/.venv/bin/python    # in turn
+with another version
 """
 
 import json
@@ -34,10 +36,17 @@ def write_ply(path: Path, count: int) -> None:
     properties = "".join(f"property float {name}\n" for name in names)
     random = np.random.default_rng(0)
     with open(path, "wb") as file:
-        header = f"ply\nformat binary_little_endian 1.0\nelement vertex {count}\n{properties}end_header\n"
+        header = (
+            "ply\nformat binary_little_endian 1.0\nelement vertex"
+            f" {count}\n{properties}end_header\n"
+        )
         file.write(header.encode())
         for start in range(0, count, 1 << 16):
-            file.write(random.normal(size=(min(1 << 16, count - start), len(names))).astype("<f4").tobytes())
+            file.write(
+                random.normal(size=(min(1 << 16, count - start), len(names)))
+                .astype("<f4")
+                .tobytes()
+            )
 
 
 def main() -> None:
@@ -51,11 +60,17 @@ def main() -> None:
         write_ply(path, args.count)
         found: dict[str, list[dict[str, float]]] = {"this": [], "other": []}
         for _ in range(args.runs):
-            for name, python in (("this", sys.executable), *([("other", args.against)] if args.against else [])):
+            for name, python in (
+                ("this", sys.executable),
+                *([("other", args.against)] if args.against else []),
+            ):
                 done = subprocess.run(
-                    [python, "-c", LOAD, str(path)], cwd=ROOT if name == "this" else folder, capture_output=True,
-                    text=True, check=True,
-                )  # fmt: skip
+                    [python, "-c", LOAD, str(path)],
+                    cwd=ROOT if name == "this" else folder,
+                    capture_output=True,
+                    text=True,
+                    check=True,
+                )
                 found[name].append(json.loads(done.stdout))
     for name, runs in found.items():
         if runs:

@@ -16,14 +16,20 @@ def write_model(
     points: Iterable[np.ndarray] = (),
     colors: Iterable[np.ndarray] = (),
 ) -> None:
-    """Writes a binary model of pinhole cameras to ``folder/sparse/0``; ``points [M, 3]``, ``colors [M, 3]`` uint8."""
+    """Writes a binary model of pinhole cameras to ``folder/sparse/0``; ``points [M, 3]``,
+    ``colors [M, 3]`` uint8.
+    """
     model = pycolmap.Reconstruction()
     for number, (camera, name) in enumerate(zip(cameras, names, strict=True), start=1):
         params = camera.K.double()[[0, 1, 0, 1], [0, 1, 2, 2]].numpy()
         size = {"width": camera.width, "height": camera.height}
-        model.add_camera_with_trivial_rig(pycolmap.Camera(model="PINHOLE", params=params, camera_id=number, **size))
+        model.add_camera_with_trivial_rig(
+            pycolmap.Camera(model="PINHOLE", params=params, camera_id=number, **size)
+        )
         image = pycolmap.Image(name=name, camera_id=number, image_id=number)
-        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(camera.viewmat[:3].double().numpy()))
+        model.add_image_with_trivial_frame(
+            image, pycolmap.Rigid3d(camera.viewmat[:3].double().numpy())
+        )
     for position, color in zip(points, colors, strict=True):
         model.add_point3D(position.astype(np.float64), pycolmap.Track(), color)
     target = folder / "sparse" / "0"

@@ -3,7 +3,8 @@
 clod-adapt demo                  # makes demo/base.ply, demo/gallery.ply and demo/capture
 python benchmarks/pictures.py    # dial.webp and viewer.webp in docs/images
 
-The dial's picture has numbers of the view shown, measured then. The other is of a headless Chromium.
+The dial's picture has numbers of the view shown, measured then. The other is of a headless
+Chromium.
 """
 
 import io
@@ -33,7 +34,9 @@ TITLE = "The base, and the dial at a fifth of its Gaussians"
 
 def main() -> None:
     parser = arguments(__doc__)
-    parser.add_argument("demo", nargs="?", default="demo", help="the folder of clod-adapt demo (default: demo)")
+    parser.add_argument(
+        "demo", nargs="?", default="demo", help="the folder of clod-adapt demo (default: demo)"
+    )
     folder = Path(parser.parse_args().demo)
     keep(IMAGES / "dial.webp", dial(folder))
     with browser.launch() as chromium:
@@ -54,11 +57,23 @@ def dial(folder: Path) -> bytes:
 def viewer(chromium: Any, folder: Path) -> bytes:
     """The page in dark."""
     camera = clod.load_scene(folder / "capture").test[VIEW].camera
-    words = [folder / "gallery.ply", "--base", folder / "base.ply", "--images", folder / "capture", "--sv", DIAL]
+    words = [
+        folder / "gallery.ply",
+        "--base",
+        folder / "base.ply",
+        "--images",
+        folder / "capture",
+        "--sv",
+        DIAL,
+    ]
     with serve(*words) as url, chromium.new_context(viewport=SIZE, color_scheme="dark") as context:
         shown = Shown(context.new_page()).ready(url)
-        cameras = shown.run("JSON.parse(document.getElementById('clod-config').textContent).cameras.map((c) => c.name)")
-        for _ in range(cameras.index(camera.name)):  # as a user goes to it, so that the view fills the window
+        cameras = shown.run(
+            "JSON.parse(document.getElementById('clod-config').textContent).cameras.map((c) =>"
+            " c.name)"
+        )
+        # as a user goes to it, so that the view fills the window
+        for _ in range(cameras.index(camera.name)):
             shown.page.keyboard.press("n")
         shown.run("clod.setWipe(0.55)")
         shown.page.evaluate("document.getElementById('frame').style.visibility = 'hidden'")

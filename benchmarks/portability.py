@@ -1,19 +1,26 @@
-"""Runs the test suite under conditions in which processors, users, shells and folders differ, and prints one table.
+"""Runs the test suite under conditions in which processors, users, shells and folders differ, and
+prints one table.
 
-    python benchmarks/portability.py --record                          # all conditions: an hour on two idle cores
-    python benchmarks/portability.py plain no_root+c_locale --tests tests/io   # one, and two of them at once
+    python benchmarks/portability.py --record                          # all conditions: an hour on
+    two idle cores python benchmarks/portability.py plain no_root+c_locale --tests tests/io   # one,
+    and two of them at once
 
 Run by another virtual environment's Python it tests the versions that are installed there. The
 exit code is 1 where a test failed or a condition could not be had. The conditions:
 
 - ``plain``: as ``make test`` runs it;
-- ``aten_default``, ``aten_avx2``, ``mkl_compatible``, ``numba_generic``: vector instructions of older processors;
-- ``libm_0``, ``libm_1``, ``libm_2``: other last bits of exp, log and the like (``tests/other_libm``);
+- ``aten_default``, ``aten_avx2``, ``mkl_compatible``, ``numba_generic``: vector instructions of
+older processors;
+- ``libm_0``, ``libm_1``, ``libm_2``: other last bits of exp, log and the like
+(``tests/other_libm``);
 - ``one_thread``, ``one_core``: a single thread; as many as otherwise, on one core;
 - ``no_root``: for root, in a user namespace without root's rights; for others ``plain`` is that;
-- ``ignored_sigint``, ``blocked_signals``: as a script's background job, and below a program that blocks signals;
-- ``c_locale``: ASCII as the encoding of files and of the terminal, and a day's time zone away from Greenwich;
-- ``folders``: temporary files, home and kernel cache in folders with spaces and other letters in their names;
+- ``ignored_sigint``, ``blocked_signals``: as a script's background job, and below a program that
+blocks signals;
+- ``c_locale``: ASCII as the encoding of files and of the terminal, and a day's time zone away from
+Greenwich;
+- ``folders``: temporary files, home and kernel cache in folders with spaces and other letters in
+their names;
 """
 
 from __future__ import annotations
@@ -39,15 +46,24 @@ PARALLEL = ["--numprocesses=auto", "--maxprocesses=4", "--dist=loadfile", "--no-
 
 @dataclass(frozen=True)
 class Condition:
-    """What is set, in which ``{work}`` is a temporary folder, and the command that starts the tests' own."""
+    """What is set, in which ``{work}`` is a temporary folder, and the command that starts the
+    tests' own.
+    """
 
     environment: dict[str, str] = field(default_factory=dict)
     prefix: tuple[str, ...] = ()
 
     def __add__(self, other: Condition) -> Condition:
         both = self.environment | other.environment
-        paths = [each.environment["PYTHONPATH"] for each in (self, other) if "PYTHONPATH" in each.environment]
-        return Condition(both | ({"PYTHONPATH": os.pathsep.join(paths)} if paths else {}), self.prefix + other.prefix)
+        paths = [
+            each.environment["PYTHONPATH"]
+            for each in (self, other)
+            if "PYTHONPATH" in each.environment
+        ]
+        return Condition(
+            both | ({"PYTHONPATH": os.pathsep.join(paths)} if paths else {}),
+            self.prefix + other.prefix,
+        )
 
 
 CONDITIONS = {
@@ -62,15 +78,23 @@ CONDITIONS = {
     "no_root": Condition({}, ("unshare", "--user") if os.geteuid() == 0 else ()),
     "ignored_sigint": Condition({}, ("env", "--ignore-signal=INT")),
     "blocked_signals": Condition({}, ("env", "--block-signal=INT,TERM")),
-    "c_locale": Condition({"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0", "TZ": "Pacific/Kiritimati"}),
+    "c_locale": Condition(
+        {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0", "TZ": "Pacific/Kiritimati"}
+    ),
     "folders": Condition(
-        {"TMPDIR": "{work}/tmp", "HOME": "{work}/home", "XDG_CACHE_HOME": "", "NUMBA_CACHE_DIR": "{work}/cache"}
+        {
+            "TMPDIR": "{work}/tmp",
+            "HOME": "{work}/home",
+            "XDG_CACHE_HOME": "",
+            "NUMBA_CACHE_DIR": "{work}/cache",
+        }
     ),
 }
 
 
 def run(name: str, tests: Sequence[str], parallel: Sequence[str] = PARALLEL) -> dict[str, Any]:
-    """Counts and seconds of the tests under a condition; ``failures`` names those that failed, or says why none ran.
+    """Counts and seconds of the tests under a condition; ``failures`` names those that failed, or
+    says why none ran.
 
     Args:
         name: of a condition, or of several at once, joined by +.
@@ -83,14 +107,28 @@ def run(name: str, tests: Sequence[str], parallel: Sequence[str] = PARALLEL) -> 
         for folder in ("tmp", "home", "cache"):
             (work / folder).mkdir(parents=True)
         report = Path(outer) / "report.xml"
-        words = [*condition.prefix, sys.executable, "-m", "pytest", *parallel, f"--junitxml={report}", *tests]
+        words = [
+            *condition.prefix,
+            sys.executable,
+            "-m",
+            "pytest",
+            *parallel,
+            f"--junitxml={report}",
+            *tests,
+        ]
         environment = {key: value.format(work=work) for key, value in condition.environment.items()}
         environment["CLOD_SHARED_DATA"] = str(SHARED)  # the default is relative to the checkout
         began = time.perf_counter()
         done = subprocess.run(
-            words, cwd=ROOT, env=os.environ | environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
-            errors="replace", check=False,
-        )  # fmt: skip
+            words,
+            cwd=ROOT,
+            env=os.environ | environment,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            errors="replace",
+            check=False,
+        )
         seconds = round(time.perf_counter() - began, 1)
         found = outcomes(report) if report.exists() else {"failures": [done.stdout.strip()[-200:]]}
     if done.returncode != 0 and not found["failures"]:
@@ -101,19 +139,34 @@ def run(name: str, tests: Sequence[str], parallel: Sequence[str] = PARALLEL) -> 
 def main() -> None:
     parser = arguments(__doc__, record=FILE)
     parser.add_argument("conditions", nargs="*", help="default: each of them; a+b is both at once")
-    parser.add_argument("--tests", nargs="+", default=[], metavar="PATH", help="default: all of them")
+    parser.add_argument(
+        "--tests", nargs="+", default=[], metavar="PATH", help="default: all of them"
+    )
     args = parser.parse_args()
     if unknown := {each for name in args.conditions for each in name.split("+")} - set(CONDITIONS):
-        parser.error(f"there is no condition {', '.join(sorted(unknown))}; there are {', '.join(CONDITIONS)}")
+        parser.error(
+            f"there is no condition {', '.join(sorted(unknown))}; there are {', '.join(CONDITIONS)}"
+        )
     print(f"{'condition':16} {'passed':>7} {'failed':>7} {'skipped':>7} {'seconds':>8}", flush=True)
     failed = False
     for name in args.conditions or CONDITIONS:
         found = run(name, args.tests)
         failed |= bool(found["failures"])
-        print(f"{name:16} {found['passed']:7} {found['failed']:7} {found['skipped']:7} {found['seconds']:8}")
-        print("\n".join(f"    {line}" for line in found["failures"]), end="\n" * bool(found["failures"]), flush=True)
+        print(
+            f"{name:16} {found['passed']:7} {found['failed']:7} {found['skipped']:7}"
+            f" {found['seconds']:8}"
+        )
+        print(
+            "\n".join(f"    {line}" for line in found["failures"]),
+            end="\n" * bool(found["failures"]),
+            flush=True,
+        )
         if args.record:
-            about = {"benchmark": "portability", "condition": name, "tests": args.tests or ["tests"]}
+            about = {
+                "benchmark": "portability",
+                "condition": name,
+                "tests": args.tests or ["tests"],
+            }
             append(FILE, {**about, **found})
     sys.exit(failed)
 

@@ -1,9 +1,10 @@
 """Times of the CPU rasterizer and of a C++ baseline; or its agreement with a float64 reference.
 
-The baseline is the yardstick, a hand-written C++ kernel outside the repository, built with g++; its fields are null
-where it is absent. Each runs in its own process with 2 threads, in turn step by step, so that drift of the machine
-affects both alike. Times are medians in milliseconds: ``forward_ms`` and ``both_ms`` of one step with all gradients,
-``render_ms`` of a frame without gradients, and of frames of the most opaque Gaussians.
+The baseline is the yardstick, a hand-written C++ kernel outside the repository, built with g++; its
+fields are null where it is absent. Each runs in its own process with 2 threads, in turn step by
+step, so that drift of the machine affects both alike. Times are medians in milliseconds:
+``forward_ms`` and ``both_ms`` of one step with all gradients, ``render_ms`` of a frame without
+gradients, and of frames of the most opaque Gaussians.
 """
 
 import importlib.util
@@ -40,7 +41,9 @@ JOBS: Jobs = {}  # of a worker's process
 
 def main() -> None:
     parser = arguments(__doc__, record=FILE)
-    parser.add_argument("--accuracy", action="store_true", help="agreement with float64 instead of times")
+    parser.add_argument(
+        "--accuracy", action="store_true", help="agreement with float64 instead of times"
+    )
     args = parser.parse_args()
     torch.set_num_threads(THREADS)
     kind = "accuracy" if args.accuracy else "speed"
@@ -58,10 +61,18 @@ def speed() -> list[Row]:
             workers = {"": worker(our_jobs, name)}
             if library:
                 workers["yardstick_"] = worker(yardstick_jobs, name, library)
-            steps = [{who: pool.submit(_run, "step").result() for who, pool in workers.items()}
-                     for _ in range(REPEATS + WARM)]  # fmt: skip
+            steps = [
+                {who: pool.submit(_run, "step").result() for who, pool in workers.items()}
+                for _ in range(REPEATS + WARM)
+            ]
             frames = [workers[""].submit(_run, "frames").result() for _ in range(REPEATS + WARM)]
-            row = {"workload": name, "gaussians": count, "width": width, "height": height, "repeats": REPEATS}
+            row = {
+                "workload": name,
+                "gaussians": count,
+                "width": width,
+                "height": height,
+                "repeats": REPEATS,
+            }
             for who in ("", "yardstick_"):
                 for k, what in enumerate(("forward", "both")):
                     row[f"{who}{what}_ms"] = middle([step[who][k] for step in steps if who in step])
@@ -77,7 +88,9 @@ def speed() -> list[Row]:
 
 
 def worker(make: Callable[..., Jobs], *given: Any) -> ProcessPoolExecutor:
-    """A process of its own: the yardstick's library, for example, makes its process flush denormal numbers."""
+    """A process of its own: the yardstick's library, for example, makes its process flush denormal
+    numbers.
+    """
     spawn = multiprocessing.get_context("spawn")
     return ProcessPoolExecutor(1, mp_context=spawn, initializer=_start, initargs=(make, *given))
 
@@ -97,13 +110,17 @@ def middle(times: Sequence[float]) -> float | None:
 
 
 def our_jobs(name: str) -> Jobs:
-    """A step; and frames of the most opaque: the others' rows removed, then their opacities 0, as the dial does."""
+    """A step; and frames of the most opaque: the others' rows removed, then their opacities 0, as
+    the dial does.
+    """
     workload = workloads.make(name)
     draw, leaves = ours(workload)
     rank = workload.opacities.argsort(descending=True).argsort()
     keep = [rank < share * len(rank) for share in SHARES]
     fewer = [workload.changed("", rows) for rows in keep]
-    fewer += [workload.changed("", opacities=torch.where(rows, workload.opacities, 0)) for rows in keep]
+    fewer += [
+        workload.changed("", opacities=torch.where(rows, workload.opacities, 0)) for rows in keep
+    ]
     frames = [ours(part)[0] for part in fewer]
     return {
         "step": lambda: timed_step(draw, leaves, workload.weights),
@@ -115,11 +132,15 @@ def ours(workload: Workload) -> tuple[Callable[[], Tensor], list[Tensor]]:
     """A function that draws the workload with our rasterizer, and the leaves of its gradients."""
     leaves = {name: value.clone().requires_grad_() for name, value in workload.parameters().items()}
     background = torch.zeros(3)
-    return lambda: cpu.rasterize(**leaves, camera=workload.camera, background=background)[0], list(leaves.values())
+    return lambda: cpu.rasterize(**leaves, camera=workload.camera, background=background)[0], list(
+        leaves.values()
+    )
 
 
 def timed_step(draw: Callable[[], Tensor], leaves: list[Tensor], weights: Tensor) -> list[float]:
-    """Milliseconds of the forward part and of a whole step: all gradients of a weighted sum of the pixels."""
+    """Milliseconds of the forward part and of a whole step: all gradients of a weighted sum of the
+    pixels.
+    """
     for leaf in leaves:
         leaf.grad = None
     began = time.perf_counter()
@@ -141,19 +162,31 @@ def yardstick_jobs(name: str, library: Path) -> Jobs:
     kernel, camera = binding.Lib(str(library), THREADS), workload.camera
     fields = ("means", "scales", "quats", "opacities", "sh")
     leaves = {field: getattr(workload, field).clone().requires_grad_() for field in fields}
-    scene = {**leaves, "viewmat": camera.viewmat, "K": camera.K, "W": camera.width, "H": camera.height}
+    scene = {
+        **leaves,
+        "viewmat": camera.viewmat,
+        "K": camera.K,
+        "W": camera.width,
+        "H": camera.height,
+    }
     return {
-        "step": lambda: timed_step(lambda: binding.render(kernel, scene)[0], list(leaves.values()), workload.weights)
+        "step": lambda: timed_step(
+            lambda: binding.render(kernel, scene)[0], list(leaves.values()), workload.weights
+        )
     }
 
 
 def build_yardstick(source: Path, folder: Path) -> Path | None:
-    """The yardstick's library, built as its ``measure.py`` does; None where its source or g++ is absent.
+    """The yardstick's library, built as its ``measure.py`` does; None where its source or g++ is
+    absent.
 
     Exits with a message where its scenes differ from ours.
     """
     if not (source / "kernel.cpp").is_file() or not shutil.which("g++"):
-        print(f"the yardstick is left out: there is no {source / 'kernel.cpp'}, or no g++", file=sys.stderr)
+        print(
+            f"the yardstick is left out: there is no {source / 'kernel.cpp'}, or no g++",
+            file=sys.stderr,
+        )
         return None
     theirs = load_module(source / "workload.py")
     for name, size in workloads.SIZES.items():
@@ -161,7 +194,16 @@ def build_yardstick(source: Path, folder: Path) -> Path | None:
         if different:
             sys.exit(f"{name} is not the yardstick's: {', '.join(different)} differ")
     library = folder / "libyardstick.so"
-    options = ["-O3", "-march=native", "-ffast-math", "-std=c++17", "-fopenmp", "-shared", "-fPIC", "-DTS=32"]
+    options = [
+        "-O3",
+        "-march=native",
+        "-ffast-math",
+        "-std=c++17",
+        "-fopenmp",
+        "-shared",
+        "-fPIC",
+        "-DTS=32",
+    ]
     subprocess.run(["g++", *options, str(source / "kernel.cpp"), "-o", str(library)], check=True)
     return library
 
@@ -176,9 +218,11 @@ def load_module(path: Path) -> Any:
 
 
 def accuracy() -> list[Row]:
-    """Image and gradients of a small room against ``rasterizers/reference.py`` in float64; and one thread against two.
+    """Image and gradients of a small room against ``rasterizers/reference.py`` in float64; and one
+    thread against two.
 
-    Float32 rounding may decide otherwise whether an alpha reaches 1/255 or a pixel ends: those pixels are ``flipped``.
+    Float32 rounding may decide otherwise whether an alpha reaches 1/255 or a pixel ends: those
+    pixels are ``flipped``.
     """
     scene = workloads.make("small", SMALL)
     exact, expected = differentiate(scene, reference.rasterize, torch.float64)
@@ -187,15 +231,27 @@ def accuracy() -> list[Row]:
     single, alone = differentiate(scene, cpu.rasterize, torch.float32)
     error = (image - exact).abs().amax(-1)
     flipped = error > 1e-4
-    apart = {name: ((found[name] - expected[name]).norm() / expected[name].norm()).item() for name in found}
-    return [{
-        "workload": "small", "gaussians": len(scene.means), "pixels": error.numel(), "flipped": int(flipped.sum()),
-        "error": error[~flipped].max().item(), "gradient_errors": apart,
-        "one_thread_alike": torch.equal(single, image) and all(torch.equal(alone[n], found[n]) for n in found),
-    }]  # fmt: skip
+    apart = {
+        name: ((found[name] - expected[name]).norm() / expected[name].norm()).item()
+        for name in found
+    }
+    return [
+        {
+            "workload": "small",
+            "gaussians": len(scene.means),
+            "pixels": error.numel(),
+            "flipped": int(flipped.sum()),
+            "error": error[~flipped].max().item(),
+            "gradient_errors": apart,
+            "one_thread_alike": torch.equal(single, image)
+            and all(torch.equal(alone[n], found[n]) for n in found),
+        }
+    ]
 
 
-def differentiate(scene: Workload, draw: Callable[..., Any], dtype: torch.dtype) -> tuple[Tensor, dict[str, Tensor]]:
+def differentiate(
+    scene: Workload, draw: Callable[..., Any], dtype: torch.dtype
+) -> tuple[Tensor, dict[str, Tensor]]:
     """The image, and the gradients of its weighted sum."""
     leaves = {name: value.to(dtype).requires_grad_() for name, value in scene.parameters().items()}
     image = draw(**leaves, camera=scene.camera, background=torch.zeros(3, dtype=dtype))[0]

@@ -6,7 +6,8 @@
 - ``merging``: ``splat-transform``, both of its methods, without training, one file per count;
 - ``specialist``: the merged file, tuned for that count alone;
 - ``tuned``: the whole base, tuned for as many steps;
-- ``prefix``: one file whose prefixes are the counts, by removal error, tuned with random prefixes (``tuning.tune``);
+- ``prefix``: one file whose prefixes are the counts, by removal error, tuned with random prefixes
+(``tuning.tune``);
 - ``ranking``: prefixes by removal error without tuning;
 - ``kept``: no rival, but what ``export --keep`` writes of one adapted file, a plain file per count.
 
@@ -46,7 +47,9 @@ SHARES = (0.62, 0.35, 0.12, 0.05, 0.02)
 def main() -> None:
     parser = arguments(__doc__, table=print_table)
     parser.add_argument("scenes", nargs="*")
-    parser.add_argument("--only", nargs="+", choices=RIVALS, default=RIVALS, help="some of the rivals")
+    parser.add_argument(
+        "--only", nargs="+", choices=RIVALS, default=RIVALS, help="some of the rivals"
+    )
     parser.add_argument("--iters", type=int, default=1500, help="steps of tuning")
     args = parser.parse_args()
     for scene in args.scenes:
@@ -56,10 +59,19 @@ def main() -> None:
             folder = capture(scene.partition("/")[0])
             for label, files, more in contest(rival, base, folder, views, args.iters):
                 rows = [measured(each, share, views) for share, each in files.items()]
-                append(FILE, {
-                    "benchmark": "rivals", "scene": scene, "rival": rival, "label": label,
-                    "base_count": len(base.gaussians), "base": untouched.as_dict(), "rows": rows, **more,
-                })  # fmt: skip
+                append(
+                    FILE,
+                    {
+                        "benchmark": "rivals",
+                        "scene": scene,
+                        "rival": rival,
+                        "label": label,
+                        "base_count": len(base.gaussians),
+                        "base": untouched.as_dict(),
+                        "rows": rows,
+                        **more,
+                    },
+                )
 
 
 def measured(gaussians: clod.Gaussians, share: float, views: clod.Scene) -> Row:
@@ -71,14 +83,22 @@ def contest(
     rival: str, base: clod.Checkpoint, folder: Path, views: clod.Scene, iters: int
 ) -> Iterator[tuple[str, Mapping[float, clod.Gaussians], dict[str, Any]]]:
     """For each row: label, file by share, and what else is recorded."""
-    some, train, config = base.gaussians, views.train, Tuning(iters=iters, prefixes=rival == "prefix")
+    some, train, config = (
+        base.gaussians,
+        views.train,
+        Tuning(iters=iters, prefixes=rival == "prefix"),
+    )
     counts = {share: max(round(share * len(some)), 1) for share in SHARES}
     about = {"config": asdict(config), "steps": iters}
     if rival == "merging":
         for method in MERGINGS:
             merged = {share: merge(base, count, method) for share, count in counts.items()}
             label = f"splat-transform {find_tool().version} {method}"
-            yield label, {s: m[0] for s, m in merged.items()}, {"merge_seconds": [m[1] for m in merged.values()]}
+            yield (
+                label,
+                {s: m[0] for s, m in merged.items()},
+                {"merge_seconds": [m[1] for m in merged.values()]},
+            )
     elif rival == "specialist":
         for share, count in counts.items():
             start, merging = merge(base, count)
@@ -96,14 +116,22 @@ def contest(
         yield f"export --keep of one file, max_sv {MAX_SV}", kept(base, folder, counts), {}
     else:
         ranked = some.select(falling(removal_error(some, train)))
-        yield "untouched, by removal error", {share: head(ranked, count) for share, count in counts.items()}, {}
+        yield (
+            "untouched, by removal error",
+            {share: head(ranked, count) for share, count in counts.items()},
+            {},
+        )
 
 
-def kept(base: clod.Checkpoint, folder: Path, counts: Mapping[float, int]) -> dict[float, clod.Gaussians]:
+def kept(
+    base: clod.Checkpoint, folder: Path, counts: Mapping[float, int]
+) -> dict[float, clod.Gaussians]:
     """By share, the plain file that ``export --keep`` writes after the default command."""
     with tempfile.TemporaryDirectory() as place:
         dial, plain = Path(place) / "dial.ply", Path(place) / "plain.ply"
-        Process([*COMMAND, base.path, "--images", folder, "--max-sv", MAX_SV, "--out", dial, "--quiet"])
+        Process(
+            [*COMMAND, base.path, "--images", folder, "--max-sv", MAX_SV, "--out", dial, "--quiet"]
+        )
         files = {}
         for share, count in counts.items():
             Process([*COMMAND, "export", dial, "--keep", count, "--out", plain])
@@ -117,8 +145,10 @@ def print_table() -> None:
     for row in stored(FILE):
         found = lines.setdefault((row["scene"], f"{row['rival']}: {row['label']}"), {})
         found.update({point["share"]: point["psnr"] for point in row["rows"]})
-    cells = [[*key, *(f"{found[share]:.2f}" if share in found else "" for share in shares)]
-             for key, found in lines.items()]  # fmt: skip
+    cells = [
+        [*key, *(f"{found[share]:.2f}" if share in found else "" for share in shares)]
+        for key, found in lines.items()
+    ]
     print(table(["scene", "rival", *(f"{share:.0%}" for share in shares)], cells))
 
 

@@ -1,12 +1,12 @@
 """Time and memory of the commands by the number of Gaussians.
 
-    python benchmarks/scaling.py            # some 15 minutes, 12 GB of memory, 8 GB of disk
-    python benchmarks/scaling.py --only adapt --sizes 100000 1000000
-    python benchmarks/scaling.py --table    # the tables of docs/performance.md, from the stored rows
+    python benchmarks/scaling.py            # some 15 minutes, 12 GB of memory, 8 GB of disk python
+    benchmarks/scaling.py --only adapt --sizes 100000 1000000 python benchmarks/scaling.py --table
+    # the tables of docs/performance.md, from the stored rows
 
-Runs each command in its own process on synthetic towns, which are kept in benchmarks/cache. Measures wall and CPU
-seconds and peak memory. A town of 1000 Gaussians gives the start-up cost. Rows go to
-results/scaling.jsonl; the last row of a kind counts.
+Runs each command in its own process on synthetic towns, which are kept in benchmarks/cache.
+Measures wall and CPU seconds and peak memory. A town of 1000 Gaussians gives the start-up cost.
+Rows go to results/scaling.jsonl; the last row of a kind counts.
 """
 
 import json
@@ -27,7 +27,8 @@ from common import CACHE, COMMAND, Process, Row, append, arguments, stored, tabl
 import numpy as np
 
 FILE, CITIES = "scaling.jsonl", CACHE / "scaling"
-FLOOR, SIZES, FROM = 1000, (10_000, 100_000, 1_000_000, 5_000_000), 100_000  # exponents are fitted from FROM on
+# exponents are fitted from FROM on
+FLOOR, SIZES, FROM = 1000, (10_000, 100_000, 1_000_000, 5_000_000), 100_000
 # The last fifth of STEPS has photographs of full size.
 IMAGES, WIDTH, HEIGHT, STEPS, MAX_SV = 10, 640, 400, 20, 3
 # Loading, importance and the pruning order by themselves; the report has all of "start".
@@ -41,7 +42,8 @@ spent = {}
 def timed(name, run, *given):
     began, cpu = time.perf_counter(), time.process_time()
     found = run(*given)
-    spent[name + "_seconds"], spent[name + "_cpu"] = time.perf_counter() - began, time.process_time() - cpu
+    spent[name + "_seconds"] = time.perf_counter() - began
+    spent[name + "_cpu"] = time.process_time() - cpu
     return found
 g = timed("load", load, Path(sys.argv[1]) / "city.ply").gaussians
 views = load_scene(sys.argv[1]).train
@@ -56,7 +58,9 @@ print(json.dumps({name: round(value, 3) for name, value in spent.items()}))
 def main() -> None:
     parser = arguments(__doc__, table=print_tables)
     parser.add_argument("--only", choices=RUNS, help="one command")
-    parser.add_argument("--sizes", nargs="+", type=int, default=[FLOOR, *SIZES], help="numbers of Gaussians")
+    parser.add_argument(
+        "--sizes", nargs="+", type=int, default=[FLOOR, *SIZES], help="numbers of Gaussians"
+    )
     args = parser.parse_args()
     CITIES.mkdir(parents=True, exist_ok=True)
     run_adapt(town(FLOOR))  # compiles the kernels
@@ -64,11 +68,16 @@ def main() -> None:
         for command in [args.only] if args.only else RUNS:
             found = RUNS[command](town(count))
             busy = round(os.getloadavg()[0], 2)
-            append(FILE, {"series": "count", "command": command, "gaussians": count, "busy": busy, **found})
+            append(
+                FILE,
+                {"series": "count", "command": command, "gaussians": count, "busy": busy, **found},
+            )
 
 
 def town(count: int) -> Path:
-    """A town, made where it is not there, in a process of its own, so that its memory is given back."""
+    """A town, made where it is not there, in a process of its own, so that its memory is given
+    back.
+    """
     folder = CITIES / f"town-{count}"
     if not folder.exists():
         with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
@@ -83,7 +92,17 @@ def dial_of(folder: Path) -> Path:
 def run_adapt(folder: Path) -> Row:
     """A few steps."""
     out = dial_of(folder)
-    words = [folder / "city.ply", "--images", folder, "--iters", STEPS, "--max-sv", MAX_SV, "--out", out]
+    words = [
+        folder / "city.ply",
+        "--images",
+        folder,
+        "--iters",
+        STEPS,
+        "--max-sv",
+        MAX_SV,
+        "--out",
+        out,
+    ]
     run = Process([*COMMAND, *words])
     seconds = json.loads(out.with_suffix(".json").read_text(encoding="utf-8"))["seconds"]
     return {**run.cost(), "step_seconds": seconds["train"] / STEPS, "phases": seconds}
@@ -91,12 +110,16 @@ def run_adapt(folder: Path) -> Row:
 
 def run_export(folder: Path) -> Row:
     with tempfile.TemporaryDirectory(dir=CITIES) as out:
-        return Process([*COMMAND, "export", dial_of(folder), "-o", Path(out) / "plain.ply", "--sv", 1.5]).cost()
+        return Process(
+            [*COMMAND, "export", dial_of(folder), "-o", Path(out) / "plain.ply", "--sv", 1.5]
+        ).cost()
 
 
 def run_view(folder: Path) -> Row:
     """Until a page would have all of the model; no browser."""
-    run = Process([*COMMAND, "view", dial_of(folder), "--images", folder, "--no-browser"], until="http://")
+    run = Process(
+        [*COMMAND, "view", dial_of(folder), "--images", folder, "--no-browser"], until="http://"
+    )
     with urllib.request.urlopen(run.line.split()[0] + "files/model") as answer:
         while answer.read(1 << 20):
             pass
@@ -107,8 +130,14 @@ def run_view(folder: Path) -> Row:
 
 
 RUNS: dict[str, Callable[[Path], Row]] = {
-    "adapt": lambda folder: run_adapt(folder) | json.loads(Process([sys.executable, "-c", PARTS, folder]).out),
-    "eval": lambda folder: Process([*COMMAND, "eval", dial_of(folder), "--images", folder, "--sv", 1, MAX_SV]).cost(),
+    "adapt": lambda folder: (
+        run_adapt(folder) | json.loads(Process([sys.executable, "-c", PARTS, folder]).out)
+    ),
+    "eval": (
+        lambda folder: Process(
+            [*COMMAND, "eval", dial_of(folder), "--images", folder, "--sv", 1, MAX_SV]
+        ).cost()
+    ),
     "export": run_export,
     "inspect": lambda folder: Process([*COMMAND, "inspect", dial_of(folder)]).cost(),
     "view": run_view,
@@ -116,30 +145,52 @@ RUNS: dict[str, Callable[[Path], Row]] = {
 
 
 def exponent(points: Sequence[tuple[float, float]]) -> float:
-    """Of the power of x that y follows, by least squares in logarithms; NaN of fewer than two points."""
+    """Of the power of x that y follows, by least squares in logarithms; NaN of fewer than two
+    points.
+    """
     usable = [point for point in points if point[1] > 0]
     return float(np.polyfit(*np.log(usable).T, 1)[0]) if len(usable) > 1 else math.nan
 
 
 def print_tables() -> None:
-    """Seconds by size with the exponents above start-up, from FROM on; peaks, and bytes a Gaussian between the last."""
+    """Seconds by size with the exponents above start-up, from FROM on; peaks, and bytes a Gaussian
+    between the last.
+    """
     last = {(row["command"], row["gaussians"]): row for row in stored(FILE) if "command" in row}
     sizes = sorted({count for _, count in last})
-    parts = [(command, "") for command in RUNS] + [("adapt", part) for part in ("load", "importance", "order", "step")]
+    parts = [(command, "") for command in RUNS] + [
+        ("adapt", part) for part in ("load", "importance", "order", "step")
+    ]
     lines, peaks = [], []
     for command, part in parts:
         rows = [last[command, n] for n in sizes if (command, n) in last]
         powers = []
         for clock in ("seconds", "cpu" if part else "cpu_seconds"):
-            times = [(row["gaussians"], row.get(f"{part}_{clock}" if part else clock, math.nan)) for row in rows]
+            times = [
+                (row["gaussians"], row.get(f"{part}_{clock}" if part else clock, math.nan))
+                for row in rows
+            ]
             floor = dict(times).get(FLOOR, 0.0)
             powers.append(exponent([(n, t - floor) for n, t in times if n >= FROM]))
-        cells = [f"{row.get(f'{part}_seconds' if part else 'seconds', math.nan):.3g}" for row in rows]
-        lines.append([part or command, *cells, *(f"{power:.2f}" if power == power else "" for power in powers)])
+        cells = [
+            f"{row.get(f'{part}_seconds' if part else 'seconds', math.nan):.3g}" for row in rows
+        ]
+        lines.append(
+            [
+                part or command,
+                *cells,
+                *(f"{power:.2f}" if power == power else "" for power in powers),
+            ]
+        )
         if not part and len(rows) > 1:
             (n, low), (m, high) = ((row["gaussians"], row["peak_bytes"]) for row in rows[-2:])
-            peaks.append([command, f"{low / 1e9:.2f}", f"{high / 1e9:.2f}", f"{(high - low) / (m - n):,.0f}"])
-    print(table(["seconds", *(f"{size:,}" for size in sizes), "exponent", "of CPU seconds"], lines), end="\n\n")
+            peaks.append(
+                [command, f"{low / 1e9:.2f}", f"{high / 1e9:.2f}", f"{(high - low) / (m - n):,.0f}"]
+            )
+    print(
+        table(["seconds", *(f"{size:,}" for size in sizes), "exponent", "of CPU seconds"], lines),
+        end="\n\n",
+    )
     print(table(["peak, GB", *(f"{size:,}" for size in sizes[-2:]), "bytes per Gaussian"], peaks))
 
 

@@ -1,11 +1,13 @@
-"""Numerical stability: the equation against 50 digits, stiffness, extreme scenes, popping. For docs/performance.md.
+"""Numerical stability: the equation against 50 digits, stiffness, extreme scenes, popping. For
+docs/performance.md.
 
     python benchmarks/stability.py                   # everything, then the tables and the pictures
-    python benchmarks/stability.py --only scenes     # one part; the rows of the others stay
-    python benchmarks/stability.py --page            # the tables and the pictures again, from the stored rows
+    python benchmarks/stability.py --only scenes     # one part; the rows of the others stay python
+    benchmarks/stability.py --page            # the tables and the pictures again, from the stored
+    rows
 
-Rows go to ``results/stability.jsonl``, where they replace those of the parts that were run. The tables of
-docs/performance.md are printed, its pictures are written.
+Rows go to ``results/stability.jsonl``, where they replace those of the parts that were run. The
+tables of docs/performance.md are printed, its pictures are written.
 """
 
 import json
@@ -20,15 +22,21 @@ from common import RESULTS, ROOT, about, arguments, stored
 
 FILE, IMAGES = "stability.jsonl", ROOT / "docs" / "images"
 PARTS = {
-    "equation": stability_equation, "stiffness": stability_stiffness, "scenes": stability_scenes,
+    "equation": stability_equation,
+    "stiffness": stability_stiffness,
+    "scenes": stability_scenes,
     "popping": stability_popping,
-}  # fmt: skip
+}
 
 
 def main() -> None:
     parser = arguments(__doc__)
-    parser.add_argument("--only", nargs="+", choices=PARTS, default=list(PARTS), help="parts to run")
-    parser.add_argument("--page", action="store_true", help="run nothing, print the tables of the stored rows")
+    parser.add_argument(
+        "--only", nargs="+", choices=PARTS, default=list(PARTS), help="parts to run"
+    )
+    parser.add_argument(
+        "--page", action="store_true", help="run nothing, print the tables of the stored rows"
+    )
     args = parser.parse_args()
     rows = {part: [row for row in stored(FILE) if row["part"] == part] for part in PARTS}
     for part in () if args.page else args.only:

@@ -1,7 +1,8 @@
 """The dial's equation against mpmath at 50 digits.
 
-Inputs are random over all magnitudes and rounded to their dtype; the reference is of exactly these numbers. Errors are
-relative, in units of the eps of the dtype. Results below the smallest normal number may be off by that number.
+Inputs are random over all magnitudes and rounded to their dtype; the reference is of exactly these
+numbers. Errors are relative, in units of the eps of the dtype. Results below the smallest normal
+number may be off by that number.
 """
 
 import math
@@ -24,31 +25,57 @@ POINTS = 2000  # of each dial value
 EXACT = 2.0**-52  # eps of float64, in which fades are computed
 OF_OPACITY = "2; float64: + 1 / (1 - t)"
 BOUNDS = {
-    "drawn opacity": OF_OPACITY, "its gradient by logit, relative to it": OF_OPACITY, "its gradient by sigma_d": "6",
-    "growth": "4 + 2 abs(h) (1 + log m)", "its gradient by growth_d": "4 + 2 abs(h) (1 + log m) + 2 / log m",
-}  # fmt: skip
+    "drawn opacity": OF_OPACITY,
+    "its gradient by logit, relative to it": OF_OPACITY,
+    "its gradient by sigma_d": "6",
+    "growth": "4 + 2 abs(h) (1 + log m)",
+    "its gradient by growth_d": "4 + 2 abs(h) (1 + log m) + 2 / log m",
+}
 
 
 class Tally:
     """Errors of the quantities in one dtype."""
 
     def __init__(self, dtype: str) -> None:
-        self.dtype, self.info, self.rows = dtype, torch.finfo(DTYPES[dtype]), dict[str, dict[str, Any]]()
+        self.dtype, self.info, self.rows = (
+            dtype,
+            torch.finfo(DTYPES[dtype]),
+            dict[str, dict[str, Any]](),
+        )
 
     def add(self, name: str, got: float, want: Any, allowed: float, scale: Any = None) -> None:
         """Counts the error of a number, relative to it or to ``scale``."""
-        row = self.rows.setdefault(name, {
-            "part": "equation", "quantity": name, "dtype": self.dtype, "bound": BOUNDS[name], "points": 0, "nan": 0,
-            "failed": 0, "worst": 0.0, "worst_of_bound": 0.0,
-        })  # fmt: skip
+        row = self.rows.setdefault(
+            name,
+            {
+                "part": "equation",
+                "quantity": name,
+                "dtype": self.dtype,
+                "bound": BOUNDS[name],
+                "points": 0,
+                "nan": 0,
+                "failed": 0,
+                "worst": 0.0,
+                "worst_of_bound": 0.0,
+            },
+        )
         error, size = math.inf, abs(want if scale is None else scale)
         if math.isfinite(got):
             off = abs(mpf(got) - want)
-            error = 0.0 if off <= self.info.tiny else float(off / (self.info.eps * size)) if size else math.inf
+            error = (
+                0.0
+                if off <= self.info.tiny
+                else float(off / (self.info.eps * size))
+                if size
+                else math.inf
+            )
         row["points"] += 1
         row["nan"] += math.isnan(got)
         row["failed"] += not error <= allowed
-        row["worst"], row["worst_of_bound"] = max(row["worst"], error), max(row["worst_of_bound"], error / allowed)
+        row["worst"], row["worst_of_bound"] = (
+            max(row["worst"], error),
+            max(row["worst_of_bound"], error / allowed),
+        )
 
 
 def measure() -> list[dict[str, Any]]:
@@ -70,33 +97,55 @@ def some_of(random: np.random.Generator, *columns: Any) -> Any:
 
 
 def check_opacities(tally: Tally, random: np.random.Generator, s: float) -> None:
-    """Drawn opacities and gradients, from far inside the reach to just beyond it; what is culled must be 0."""
-    logits = rounded(tally.dtype, some_of(random, random.uniform(-80, 80, POINTS), random.uniform(-12, 12, POINTS)))
-    sigma = rounded(tally.dtype, some_of(random, 10.0 ** random.uniform(-12, 9, POINTS), np.full(POINTS, SIGMA_MAX)))
+    """Drawn opacities and gradients, from far inside the reach to just beyond it; what is culled
+    must be 0.
+    """
+    logits = rounded(
+        tally.dtype,
+        some_of(random, random.uniform(-80, 80, POINTS), random.uniform(-12, 12, POINTS)),
+    )
+    sigma = rounded(
+        tally.dtype,
+        some_of(random, 10.0 ** random.uniform(-12, 9, POINTS), np.full(POINTS, SIGMA_MAX)),
+    )
     near = 10.0 ** random.uniform(-7, 0, POINTS)
     d = rounded(tally.dtype, sigma.double().numpy() / s * some_of(random, near, 1 - near, 1 + near))
-    out = attenuate(logits.requires_grad_(), sigma.requires_grad_(), d, s, AttenuationConfig()).drawn
+    out = attenuate(
+        logits.requires_grad_(), sigma.requires_grad_(), d, s, AttenuationConfig()
+    ).drawn
     slopes = torch.autograd.grad(out.sum(), (logits, sigma))
     columns = (column.detach().tolist() for column in (logits, sigma, d, out, *slopes))
     for logit, reach, distance, shown, by_logit, by_sigma in zip(*columns, strict=True):
         t = mpf(distance) * mpf(s) / mpf(reach)
         if abs(t - 1) < EXACT:
             continue  # both answers are right
-        a, allowed = 1 / (1 + mpmath.exp(-mpf(logit))), 2 + EXACT / tally.info.eps / max(float(1 - t), EXACT)
+        a, allowed = (
+            1 / (1 + mpmath.exp(-mpf(logit))),
+            2 + EXACT / tally.info.eps / max(float(1 - t), EXACT),
+        )
         want = a * (1 - t**4) if t < 1 else mpf(0)
         tally.add("drawn opacity", shown, want, allowed)
-        tally.add("its gradient by logit, relative to it", by_logit, want * (1 - a), allowed, scale=want)
-        tally.add("its gradient by sigma_d", by_sigma, 4 * a * t**4 / mpf(reach) if t < 1 else mpf(0), 6)
+        tally.add(
+            "its gradient by logit, relative to it", by_logit, want * (1 - a), allowed, scale=want
+        )
+        tally.add(
+            "its gradient by sigma_d", by_sigma, 4 * a * t**4 / mpf(reach) if t < 1 else mpf(0), 6
+        )
 
 
 def check_growth(tally: Tally, random: np.random.Generator, s: float) -> None:
     exponents = some_of(random, random.uniform(-1, 3, POINTS), random.uniform(-20, 20, POINTS))
-    h, d = rounded(tally.dtype, exponents), rounded(tally.dtype, 10.0 ** random.uniform(-2, 4, POINTS))
+    h, d = (
+        rounded(tally.dtype, exponents),
+        rounded(tally.dtype, 10.0 ** random.uniform(-2, 4, POINTS)),
+    )
     zero, r = torch.zeros_like(h), 0.3
     config = AttenuationConfig(reference_distance=r)
     got = attenuate(zero, zero, d, s, config, growth_d=h.requires_grad_()).growth
     (slope,) = torch.autograd.grad(got.sum(), h)
-    for exp, dist, grown, steep in zip(h.tolist(), d.tolist(), got.tolist(), slope.tolist(), strict=True):
+    for exp, dist, grown, steep in zip(
+        h.tolist(), d.tolist(), got.tolist(), slope.tolist(), strict=True
+    ):
         log_m = max(mpmath.log(mpf(dist) * mpf(s) / mpf(r)), mpf(0))
         log_g, allowed = mpf(exp) * log_m, 4 + 2 * abs(exp) * (1 + float(log_m))
         if abs(abs(log_g) - LOG_GROWTH_MAX) > tally.info.eps * allowed:
@@ -113,5 +162,14 @@ def tables(rows: list[dict[str, Any]]) -> str:
     lines = []
     for name, bound in BOUNDS.items():
         found = {row["dtype"]: row for row in rows if row["quantity"] == name}
-        lines.append([name, bound, *(f"{found[d]['worst']:.2g} ({found[d]['worst_of_bound']:.0%})" for d in DTYPES)])
-    return f"{points:,} points: {nan} NaN, {failed} past the bound\n\n{table(['', 'bound', *DTYPES], lines, 2)}"
+        lines.append(
+            [
+                name,
+                bound,
+                *(f"{found[d]['worst']:.2g} ({found[d]['worst_of_bound']:.0%})" for d in DTYPES),
+            ]
+        )
+    return (
+        f"{points:,} points: {nan} NaN, {failed} past the"
+        f" bound\n\n{table(['', 'bound', *DTYPES], lines, 2)}"
+    )

@@ -1,8 +1,10 @@
-"""Popping: the largest change of any pixel per step, in both forms of the dial, by the length of the steps.
+"""Popping: the largest change of any pixel per step, in both forms of the dial, by the length of
+the steps.
 
-The scene is made to pop: Gaussians in one place that end together, a black one that fades in front of a white one that
-ends its pixels, and one far away that enters the frustum while the camera turns. A fade changes in proportion to the
-step's length (slope 1), a pop by the same amount (slope 0).
+The scene is made to pop: Gaussians in one place that end together, a black one that fades in front
+of a white one that ends its pixels, and one far away that enters the frustum while the camera
+turns. A fade changes in proportion to the step's length (slope 1), a pop by the same amount (slope
+0).
 """
 
 import math
@@ -23,9 +25,11 @@ from torch import Tensor
 
 STEPS = (20, 40, 80, 160)
 SWEEPS = {
-    "dial": "the dial from 1 to 5", "pair": "the same, of the black and the white one alone",
-    "turn": "a camera that turns, s = 2", "path": "a camera that moves, s = 2",
-}  # fmt: skip
+    "dial": "the dial from 1 to 5",
+    "pair": "the same, of the black and the white one alone",
+    "turn": "a camera that turns, s = 2",
+    "path": "a camera that moves, s = 2",
+}
 OTHERS, TOGETHER, SCALE = 120, 4, 2.0
 GROWTH = 0.75  # growth_d that preserves area
 DISTANCE = 4.0  # of the camera from the middle
@@ -38,8 +42,15 @@ def measure() -> list[dict[str, Any]]:
         some = some.replace(growth_d=torch.full((len(some),), growth))
         for sweep, steps in product(SWEEPS, STEPS):
             found = _sweep(some, cameras, sweep, steps)
-            row = {"part": "popping", "form": form, "growth": growth, "sweep": sweep, "steps": steps,
-                   "pixel": found.pixel, "persistence": found.pixel_persistence}  # fmt: skip
+            row = {
+                "part": "popping",
+                "form": form,
+                "growth": growth,
+                "sweep": sweep,
+                "steps": steps,
+                "pixel": found.pixel,
+                "persistence": found.pixel_persistence,
+            }
             rows.append(row)
     return rows
 
@@ -68,20 +79,25 @@ def scene(form: str) -> tuple[Gaussians, dict[str, list[clod.Camera]]]:
         "turn": [start, _looking(eye, torch.tensor([2.5, 0.0, 0.0]))],
         "path": [start, _looking(torch.tensor([1.5, 0.3, -3.5]), torch.tensor([1.0, 0.0, 0.0]))],
     }
-    ends = config.max_sv ** torch.rand(n, generator=draw)  # the dial values at which Gaussians are culled
+    # the dial values at which Gaussians are culled
+    ends = config.max_sv ** torch.rand(n, generator=draw)
     ends[together], ends[front], ends[back] = 2.2, 4.7, 5.0
     sigma = ends * normalized_distances(means, start, settings)
     if form == "paper":
         sigma = sigma / (2 * (opacities / (TAU * ends)).log().clamp(min=1e-3)).sqrt()
     sigma[back] = SIGMA_MAX
     shapes = torch.randn(n, 4, generator=draw), log_scales
-    plain = Gaussians(means, *shapes, opacities.logit(), (colours - 0.5) / SH_C0, torch.empty(n, 0, 3))
+    plain = Gaussians(
+        means, *shapes, opacities.logit(), (colours - 0.5) / SH_C0, torch.empty(n, 0, 3)
+    )
     return clod.with_dial(plain, sigma, settings), cameras
 
 
 def _looking(eye: Tensor, at: Tensor, width: int = 48, height: int = 36) -> clod.Camera:
     forward = torch.nn.functional.normalize(at - eye, dim=0)
-    right = torch.nn.functional.normalize(torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0]), forward), dim=0)
+    right = torch.nn.functional.normalize(
+        torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0]), forward), dim=0
+    )
     viewmat = torch.eye(4)
     viewmat[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward])
     viewmat[:3, 3] = -viewmat[:3, :3] @ eye
@@ -103,7 +119,9 @@ def tables(rows: list[dict[str, Any]]) -> str:
     """Largest change of a pixel in the longest and the shortest steps."""
     ends, lines = [(name, steps) for name in SWEEPS for steps in (min(STEPS), max(STEPS))], []
     for form, growth in dict.fromkeys((row["form"], row["growth"]) for row in rows):
-        own = {(r["sweep"], r["steps"]): r for r in rows if (r["form"], r["growth"]) == (form, growth)}
+        own = {
+            (r["sweep"], r["steps"]): r for r in rows if (r["form"], r["growth"]) == (form, growth)
+        }
         name = f"{form}, growth_d {growth:g}" if growth else form
         lines.append([name, *(f"{own[end]['pixel']:.1f}" for end in ends)])
     return table(["form", *(f"{name}: 1/{steps}" for name, steps in ends)], lines)

@@ -1,8 +1,9 @@
-"""Extreme scenes, each adapted for 200 steps and rendered over its dial: all finite, and no loss of quality.
+"""Extreme scenes, each adapted for 200 steps and rendered over its dial: all finite, and no loss of
+quality.
 
-A case is the capture ``ci_banana`` with one extreme change to the checkpoint, the cameras, the photographs or the
-settings. It holds when every picture over the dial is finite and the full-quality end is at most 0.3 dB below the
-checkpoint itself on the same held-out views.
+A case is the capture ``ci_banana`` with one extreme change to the checkpoint, the cameras, the
+photographs or the settings. It holds when every picture over the dial is finite and the
+full-quality end is at most 0.3 dB below the checkpoint itself on the same held-out views.
 """
 
 import dataclasses
@@ -83,22 +84,35 @@ def behind(base: clod.Gaussians, scene: Scene) -> Case:
 
 
 def inside(base: clod.Gaussians, scene: Scene) -> Case:
-    """A Gaussian around a training camera, one around a held-out one, and one with its centre in the lens."""
+    """A Gaussian around a training camera, one around a held-out one, and one with its centre in
+    the lens.
+    """
     means, scales, logits = base.means.clone(), base.log_scales.clone(), base.opacity_logits.clone()
     for row, view in enumerate((scene.train[0], scene.test[0])):
-        means[row], scales[row], logits[row] = view.camera.position, math.log(0.1 * size_of(base)), -1.0
+        means[row], scales[row], logits[row] = (
+            view.camera.position,
+            math.log(0.1 * size_of(base)),
+            -1.0,
+        )
     return Case(base.replace(means=means, log_scales=scales, opacity_logits=logits), scene)
 
 
 def opacity(base: clod.Gaussians, scene: Scene, value: float) -> Case:
-    return Case(base.replace(opacity_logits=torch.full_like(base.opacity_logits, math.log(value / (1 - value)))), scene)
+    return Case(
+        base.replace(
+            opacity_logits=torch.full_like(base.opacity_logits, math.log(value / (1 - value)))
+        ),
+        scene,
+    )
 
 
 def flat(base: clod.Gaussians, scene: Scene, axes: int) -> Case:
     """The smallest ``axes`` axes a millionth of the largest: 1 for discs, 2 for needles."""
     order = base.log_scales.argsort(1)[:, :axes]
     shrunk = base.log_scales.amax(1, keepdim=True) - math.log(1e6)
-    return Case(base.replace(log_scales=base.log_scales.scatter(1, order, shrunk.expand(-1, axes))), scene)
+    return Case(
+        base.replace(log_scales=base.log_scales.scatter(1, order, shrunk.expand(-1, axes))), scene
+    )
 
 
 def black(base: clod.Gaussians, scene: Scene) -> Case:
@@ -106,7 +120,9 @@ def black(base: clod.Gaussians, scene: Scene) -> Case:
 
 
 def georeferenced(base: clod.Gaussians, scene: Scene, kind: str) -> Case:
-    """Coordinates a million units off, as file of ``kind`` f4 or f8 and COLMAP model; read back by our readers."""
+    """Coordinates a million units off, as file of ``kind`` f4 or f8 and COLMAP model; read back by
+    our readers.
+    """
     offset = np.array([437_000.0, 4_481_000.0, 1_000_000.0])
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -117,7 +133,9 @@ def georeferenced(base: clod.Gaussians, scene: Scene, kind: str) -> Case:
         (folder / "images").symlink_to((capture(CAPTURE) / "images").resolve())
         clod.save(folder / "plain.ply", base)
         rows = PlyData.read(str(folder / "plain.ply"))["vertex"].data
-        shifted = rows.astype([(n, kind if n in ("x", "y", "z") else rows.dtype[n]) for n in rows.dtype.names])
+        shifted = rows.astype(
+            [(n, kind if n in ("x", "y", "z") else rows.dtype[n]) for n in rows.dtype.names]
+        )
         for axis, by in zip("xyz", offset, strict=True):
             shifted[axis] = rows[axis].astype("f8") + by
         PlyData([PlyElement.describe(shifted, "vertex")]).write(str(folder / "utm.ply"))
@@ -155,7 +173,9 @@ CASES: dict[str, Change] = {
     "a single training image, scaled by 1e-4": partial(one_view, scale=1e-4),
     "a single training image, scaled by 1e4": partial(one_view, scale=1e4),
     "black images": black,
-    "two cameras at one place": lambda base, scene: Case(base, Scene((*scene.train, scene.train[0]), scene.test)),
+    "two cameras at one place": lambda base, scene: Case(
+        base, Scene((*scene.train, scene.train[0]), scene.test)
+    ),
     "max_sv 1": partial(Case, settings={"max_sv": 1.0}),
     "max_sv 100": partial(Case, settings={"max_sv": 100.0}),
     "max_sv 100, 1,500 steps": partial(Case, settings={"max_sv": 100.0, "iters": 1500}),
@@ -169,7 +189,10 @@ def measure() -> list[dict[str, Any]]:
 
 def run(name: str, case: Case) -> dict[str, Any]:
     started = time.perf_counter()
-    scene, config = add_pseudo_views(case.base, case.scene), clod.AdaptConfig(**{"iters": STEPS, **case.settings})
+    scene, config = (
+        add_pseudo_views(case.base, case.scene),
+        clod.AdaptConfig(**{"iters": STEPS, **case.settings}),
+    )
     adapted = clod.adapt(case.base, scene, config)
     seconds = time.perf_counter() - started
     result = clod.extract(case.base, adapted.gaussians, fingerprint="", config={}).apply(case.base)
@@ -177,20 +200,31 @@ def run(name: str, case: Case) -> dict[str, Any]:
     base_psnr = clod.evaluate(case.base, case.scene.test, [1.0])[0].psnr
     rows = clod.evaluate(result, case.scene.test, dials)
     finite = all(
-        bool(clod.render(result, view.camera, s).image.isfinite().all()) for view in case.scene.test[:1] for s in dials
+        bool(clod.render(result, view.camera, s).image.isfinite().all())
+        for view in case.scene.test[:1]
+        for s in dials
     ) and all(bool(tensor.isfinite().all()) for tensor in result.tensors().values())
     return {
-        "part": "scenes", "case": name, "finite": finite, "base_psnr": base_psnr,
-        "rows": [{"virtual_scale": r.virtual_scale, "psnr": r.psnr, "kept_share": r.kept_share} for r in rows],
-        "holds": finite and rows[0].psnr >= base_psnr - ALLOWED, "seconds": round(seconds, 1),
-    }  # fmt: skip
+        "part": "scenes",
+        "case": name,
+        "finite": finite,
+        "base_psnr": base_psnr,
+        "rows": [
+            {"virtual_scale": r.virtual_scale, "psnr": r.psnr, "kept_share": r.kept_share}
+            for r in rows
+        ],
+        "holds": finite and rows[0].psnr >= base_psnr - ALLOWED,
+        "seconds": round(seconds, 1),
+    }
 
 
 def tables(rows: list[dict[str, Any]]) -> str:
     """PSNR @ share kept at both ends of the dial, and which cases hold."""
     lines = []
     for row in rows:
-        ends = [f"{r['psnr']:.2f} @ {r['kept_share']:.0%}" for r in (row["rows"][0], row["rows"][-1])]
+        ends = [
+            f"{r['psnr']:.2f} @ {r['kept_share']:.0%}" for r in (row["rows"][0], row["rows"][-1])
+        ]
         marks = ["yes" if row[key] else "**no**" for key in ("finite", "holds")]
         lines.append([row["case"], f"{row['base_psnr']:.2f}", *ends, *marks, row["seconds"]])
     found = table(["scene", "base", "s = 1", "far end", "finite", "holds", "seconds"], lines)

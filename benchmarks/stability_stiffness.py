@@ -1,11 +1,14 @@
-"""Stiffness: optimizers, parameters and learning rates on values of sigma_d that span eight decades.
+"""Stiffness: optimizers, parameters and learning rates on values of sigma_d that span eight
+decades.
 
-The slope of the equation goes as 1/sigma_d, and is 0 beyond the reach. Gaussians at distances over eight decades have a
-known sigma_d that meets the target-count curve; training starts up to four decades off and minimises the mean square
-difference of the drawn opacities from the right ones, and the count term, with the package's schedule and mean of the
-last steps. Every optimizer gets the same gradients, and RowAdam's epsilon, which is that of 3DGS.
+The slope of the equation goes as 1/sigma_d, and is 0 beyond the reach. Gaussians at distances over
+eight decades have a known sigma_d that meets the target-count curve; training starts up to four
+decades off and minimises the mean square difference of the drawn opacities from the right ones, and
+the count term, with the package's schedule and mean of the last steps. Every optimizer gets the
+same gradients, and RowAdam's epsilon, which is that of 3DGS.
 
-``stuck``: a quarter each begins at one of STARTS. A Gaussian is stuck if no dial value gives it a gradient.
+``stuck``: a quarter each begins at one of STARTS. A Gaussian is stuck if no dial value gives it a
+gradient.
 """
 
 import math
@@ -20,7 +23,16 @@ import clod_adapter as clod
 from clod_adapter._kernels.threads import torch_on_one_thread
 from clod_adapter.equation.attenuation import SIGMA_MAX, attenuate
 from clod_adapter.initialization.importance import WIDEST, extinction_from_rank
-from clod_adapter.report.charts import BLUE, GREEN, ORANGE, PURPLE, QUIET, label_log, new_figure, save_figure
+from clod_adapter.report.charts import (
+    BLUE,
+    GREEN,
+    ORANGE,
+    PURPLE,
+    QUIET,
+    label_log,
+    new_figure,
+    save_figure,
+)
 from clod_adapter.training.dial import SIGMA_RANGE, Dial
 from clod_adapter.training.optimizer import RowAdam
 from clod_adapter.training.schedule import OURS
@@ -41,7 +53,9 @@ CONVERGED = 0.25  # of the start's error
 Stepper = Callable[[list[Tensor], list[float]], None]
 
 
-def _torch_optimizer(kind: type[torch.optim.Optimizer], **settings: Any) -> Callable[[list[Tensor]], Stepper]:
+def _torch_optimizer(
+    kind: type[torch.optim.Optimizer], **settings: Any
+) -> Callable[[list[Tensor]], Stepper]:
     def make(runs: list[Tensor]) -> Stepper:
         optimizer = kind([{"params": [x]} for x in runs], lr=1.0, **settings)
 
@@ -63,7 +77,8 @@ def _row_adam(runs: list[Tensor]) -> Stepper:
     )
 
 
-# AdamW is left out: its decay pulls sigma_d towards 0 (log sigma_d: 1), which nothing about a dial asks for.
+# AdamW is left out: its decay pulls sigma_d towards 0 (log sigma_d: 1), which nothing about a dial
+# asks for.
 OPTIMIZERS: dict[str, tuple[Callable[[list[Tensor]], Stepper], str]] = {
     "RowAdam": (_row_adam, BLUE),
     "Adam": (_torch_optimizer(torch.optim.Adam, eps=1e-15), GREEN),
@@ -77,7 +92,9 @@ OPTIMIZERS: dict[str, tuple[Callable[[list[Tensor]], Stepper], str]] = {
 
 @dataclass(frozen=True)
 class Problem:
-    """What the equation is to be fitted to: all ``[N]``, but ``wanted [dial values, N]``, the right ones as drawn."""
+    """What the equation is to be fitted to: all ``[N]``, but ``wanted [dial values, N]``, the right
+    ones as drawn.
+    """
 
     logits: Tensor
     distances: Tensor
@@ -86,8 +103,12 @@ class Problem:
     wanted: Tensor
 
     def error(self, sigma: Tensor) -> float:
-        """Root mean square over Gaussians and dial values of the opacity they are drawn with, less the right one."""
-        return float((drawn(self.logits, sigma, self.distances) - self.wanted).square().mean().sqrt())
+        """Root mean square over Gaussians and dial values of the opacity they are drawn with, less
+        the right one.
+        """
+        return float(
+            (drawn(self.logits, sigma, self.distances) - self.wanted).square().mean().sqrt()
+        )
 
 
 def drawn(logits: Tensor, sigma: Tensor, distances: Tensor) -> Tensor:
@@ -96,7 +117,9 @@ def drawn(logits: Tensor, sigma: Tensor, distances: Tensor) -> Tensor:
 
 
 def problem(n: int = 192) -> Problem:
-    """Distances d' from 1e-3 to 1e5, log-uniform; the start is wrong by up to WRONG decades each way."""
+    """Distances d' from 1e-3 to 1e5, log-uniform; the start is wrong by up to WRONG decades each
+    way.
+    """
     draw = torch.Generator().manual_seed(0)
     distances = 10 ** torch.empty(n).uniform_(-3, 5, generator=draw)
     logits = torch.empty(n).uniform_(0.3, 0.99, generator=draw).logit()
@@ -110,15 +133,23 @@ def problem(n: int = 192) -> Problem:
 def fit(
     task: Problem, optimizer: str, log: bool, rates: Sequence[float], steps: int, count: bool = True
 ) -> tuple[list[Tensor], float]:
-    """sigma_d after training, at dial value 1 and another one a step; and seconds. One run a rate, all at once."""
+    """sigma_d after training, at dial value 1 and another one a step; and seconds. One run a rate,
+    all at once.
+    """
     limits = tuple(map(math.log, SIGMA_RANGE)) if log else SIGMA_RANGE
     x = task.start.clamp(*SIGMA_RANGE)
     runs = [(x.log() if log else x).clone() for _ in rates]
-    step, means, random = OPTIMIZERS[optimizer][0](runs), torch.zeros(len(rates), len(x)), np.random.default_rng(0)
+    step, means, random = (
+        OPTIMIZERS[optimizer][0](runs),
+        torch.zeros(len(rates), len(x)),
+        np.random.default_rng(0),
+    )
     began, averaged = time.perf_counter(), 0
     for k in range(steps):
         fall = OURS.lr_final ** (k / steps)
-        found = gradients(task, torch.stack(runs), log, (0, int(random.integers(1, len(DIALS)))), count)
+        found = gradients(
+            task, torch.stack(runs), log, (0, int(random.integers(1, len(DIALS)))), count
+        )
         step(list(found), [rate * fall for rate in rates])
         for x in runs:
             x.clamp_(*limits)
@@ -128,9 +159,18 @@ def fit(
     return list(means.exp() if log else means), time.perf_counter() - began
 
 
-def gradients(task: Problem, x: Tensor, log: bool, dials: Sequence[int], count: bool = True) -> Tensor:
-    """``[runs, N]``: gradient by ``x`` of the loss at these dial values and, with ``count``, of the count term."""
-    settings, n, total, pull = CONFIG.attenuation(1.0), len(task.start), torch.zeros(()), torch.zeros_like(x)
+def gradients(
+    task: Problem, x: Tensor, log: bool, dials: Sequence[int], count: bool = True
+) -> Tensor:
+    """``[runs, N]``: gradient by ``x`` of the loss at these dial values and, with ``count``, of the
+    count term.
+    """
+    settings, n, total, pull = (
+        CONFIG.attenuation(1.0),
+        len(task.start),
+        torch.zeros(()),
+        torch.zeros_like(x),
+    )
     leaf = x.requires_grad_()
     sigma = (leaf.exp() if log else leaf).flatten()
     logits, distances = task.logits.repeat(len(x)), task.distances.repeat(len(x))
@@ -148,10 +188,14 @@ def gradients(task: Problem, x: Tensor, log: bool, dials: Sequence[int], count: 
 
 
 def stuck(task: Problem, log: bool, count: bool) -> Tensor:
-    """``[N]`` bool, Gaussians that are drawn wrongly at first, and get no gradient at any dial value."""
+    """``[N]`` bool, Gaussians that are drawn wrongly at first, and get no gradient at any dial
+    value.
+    """
     sigma = task.start.clamp(*SIGMA_RANGE)
     x = (sigma.log() if log else sigma)[None]
-    moved = torch.stack([gradients(task, x.clone(), log, (k,), count)[0] for k in range(len(DIALS))]).any(0)
+    moved = torch.stack(
+        [gradients(task, x.clone(), log, (k,), count)[0] for k in range(len(DIALS))]
+    ).any(0)
     wrong = (drawn(task.logits, sigma, task.distances) - task.wanted).abs().amax(0) > 0.01
     return wrong & ~moved
 
@@ -159,27 +203,50 @@ def stuck(task: Problem, log: bool, count: bool) -> Tensor:
 def measure() -> list[dict[str, Any]]:
     task, rows = problem(), []
     for optimizer, log in product(OPTIMIZERS, (True, False)):
-        own = {"part": "stiffness", "what": "equation", "optimizer": optimizer, "parameter": "log" if log else "linear"}
-        fit(task, optimizer, log, (1e-4,), 2)  # compiled, and imported by torch, before the clock starts
+        own = {
+            "part": "stiffness",
+            "what": "equation",
+            "optimizer": optimizer,
+            "parameter": "log" if log else "linear",
+        }
+        # compiled, and imported by torch, before the clock starts
+        fit(task, optimizer, log, (1e-4,), 2)
         errors = [task.error(sigma) for sigma in fit(task, optimizer, log, RATES, STEPS)[0]]
-        rows += [own | {"rate": rate, "steps": STEPS, "error": e} for rate, e in zip(RATES, errors, strict=True)]
+        rows += [
+            own | {"rate": rate, "steps": STEPS, "error": e}
+            for rate, e in zip(RATES, errors, strict=True)
+        ]
         best = RATES[int(np.nanargmin(errors))]
         for steps in LENGTHS:
             (sigma,), seconds = fit(task, optimizer, log, (best,), steps)
-            rows.append(own | {"rate": best, "steps": steps, "error": task.error(sigma), "seconds": seconds})
+            rows.append(
+                own | {"rate": best, "steps": steps, "error": task.error(sigma), "seconds": seconds}
+            )
     rows.append({"part": "stiffness", "what": "start", "error": task.error(task.start)})
     kind = torch.arange(len(task.right)) % len(STARTS)
-    ends = torch.stack([task.right * 0, task.right / 1e4, task.right * 1e4, torch.full_like(task.right, SIGMA_MAX)])
+    ends = torch.stack(
+        [task.right * 0, task.right / 1e4, task.right * 1e4, torch.full_like(task.right, SIGMA_MAX)]
+    )
     bad = replace(task, start=ends.gather(0, kind[None])[0])
     for log, count in ((False, False), (True, False), (True, True)):
         name = f"{'log' if log else 'linear'} sigma_d{', count term (default)' if count else ''}"
         counts = kind[stuck(bad, log, count)].bincount(minlength=len(STARTS)).tolist()
-        rows.append({"part": "stiffness", "what": "stuck", "method": name, "of": len(kind), "counts": counts})
+        rows.append(
+            {
+                "part": "stiffness",
+                "what": "stuck",
+                "method": name,
+                "of": len(kind),
+                "counts": counts,
+            }
+        )
     return rows
 
 
 def curves(rows: list[dict[str, Any]], timed: bool) -> dict[tuple[str, str], list[dict[str, Any]]]:
-    """Rows by optimizer and parameter: over the learning rates; or, timed, over the steps at the best one."""
+    """Rows by optimizer and parameter: over the learning rates; or, timed, over the steps at the
+    best one.
+    """
     found: dict[tuple[str, str], list[dict[str, Any]]] = {}
     for row in rows:
         if row["what"] == "equation" and ("seconds" in row) == timed:
@@ -194,36 +261,62 @@ def tables(rows: list[dict[str, Any]]) -> str:
     for key, own in curves(rows, False).items():
         best = min(own, key=lambda row: row["error"])
         good = [f"{row['rate']:.2g}" for row in own if row["error"] <= CONVERGED * start]
-        first = next((f"{row['seconds']:.2f}" for row in timed[key] if row["error"] <= CONVERGED * start), "")
+        first = next(
+            (f"{row['seconds']:.2f}" for row in timed[key] if row["error"] <= CONVERGED * start), ""
+        )
         span = " to ".join(dict.fromkeys((good[0], good[-1]))) if good else "none"
         lines.append([*key, f"{best['error']:.3f}", f"{best['rate']:.2g}", span, first])
-    heads = ["optimizer", "sigma_d", "best error", "at", "learning rates that converge", "seconds to it"]
+    heads = [
+        "optimizer",
+        "sigma_d",
+        "best error",
+        "at",
+        "learning rates that converge",
+        "seconds to it",
+    ]
     left = [[row["method"], *row["counts"]] for row in rows if row["what"] == "stuck"]
     (each,) = {row["of"] // len(STARTS) for row in rows if row["what"] == "stuck"}
-    return "\n\n".join([
-        table(heads, lines), f"RMS error at the start: {start:.2f}",
-        table([f"without a gradient, of {each} that begin at", *STARTS], left),
-    ])  # fmt: skip
+    return "\n\n".join(
+        [
+            table(heads, lines),
+            f"RMS error at the start: {start:.2f}",
+            table([f"without a gradient, of {each} that begin at", *STARTS], left),
+        ]
+    )
 
 
 def picture(rows: list[dict[str, Any]], path: Path) -> None:
-    """Error by learning rate on the left, by seconds at the best one on the right; dots for linear sigma_d."""
+    """Error by learning rate on the left, by seconds at the best one on the right; dots for linear
+    sigma_d.
+    """
     with new_figure((10.4, 4.6), layout="constrained") as figure:
         panels = figure.subplots(1, 2, sharey=True)
         for axes, timed, along in zip(panels, (False, True), ("rate", "seconds"), strict=True):
             for (optimizer, parameter), own in curves(rows, timed).items():
                 ours = (optimizer, parameter) == ("RowAdam", "log")
                 axes.plot(
-                    [row[along] for row in own], [row["error"] for row in own], color=OPTIMIZERS[optimizer][1],
-                    linestyle="-" if parameter == "log" else ":", linewidth=2.6 if ours else 1.3,
-                    label=optimizer + (" (default)" if ours else "") if parameter == "log" else None,
-                )  # fmt: skip
+                    [row[along] for row in own],
+                    [row["error"] for row in own],
+                    color=OPTIMIZERS[optimizer][1],
+                    linestyle="-" if parameter == "log" else ":",
+                    linewidth=2.6 if ours else 1.3,
+                    label=optimizer + (" (default)" if ours else "")
+                    if parameter == "log"
+                    else None,
+                )
             axes.set(xscale="log", yscale="log")
             label_log(axes.xaxis, "{:g}", subs=(1,))
         label_log(panels[0].yaxis, "{:g}")
         panels[0].axvline(CONFIG.lr_sigma, color=BLUE, linewidth=0.8)
-        panels[0].set(ylabel="RMS error of the opacity that is drawn", xlabel=f"learning rate, {STEPS} steps")
+        panels[0].set(
+            ylabel="RMS error of the opacity that is drawn", xlabel=f"learning rate, {STEPS} steps"
+        )
         panels[1].set_xlabel("seconds of training at the best learning rate")
         panels[0].plot([], [], color=QUIET, linestyle=":", label="linear sigma_d")
-        figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", frameon=False, ncols=4)
+        figure.legend(
+            *panels[0].get_legend_handles_labels(),
+            loc="outside lower center",
+            frameon=False,
+            ncols=4,
+        )
         save_figure(figure, path)

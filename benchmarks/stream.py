@@ -1,17 +1,20 @@
-"""The dial against streamed sets of levels, both drawn as a viewer draws them: PSNR at equal budgets.
+"""The dial against streamed sets of levels, both drawn as a viewer draws them: PSNR at equal
+budgets.
 
-    python benchmarks/stream.py SCENE.ply --record                                # without photographs
-    python benchmarks/stream.py SCENE.ply --author LEVEL.ply ... --record         # and the levels that its author ships
-    python benchmarks/stream.py SCENE.ply --images FOLDER --record                # with photographs
-    python benchmarks/stream.py --table
+    python benchmarks/stream.py SCENE.ply --record                                # without
+    photographs python benchmarks/stream.py SCENE.ply --author LEVEL.ply ... --record         # and
+    the levels that its author ships python benchmarks/stream.py SCENE.ply --images FOLDER --record
+    # with photographs python benchmarks/stream.py --table
 
-SCENE is adapted without options. Its rivals are sets whose finest level is SCENE itself: halved again and again by
-splat-transform (``make peers``) in both its ways, and the author's own. ``export --lod-meta`` of the adapted file is
-drawn too. A set is drawn by the rule of PlayCanvas 2.23 (gsplat-octree-instance.js, gsplat-budget-balancer.js): a
-node's distance is that of the nearest point of its box; level b >= 1 begins at K multiplier^(b - 1); in each frame one
-K for all nodes is such that their counts, in view or not, meet the budget. A set has the multiplier of MULTIPLIERS that
-is best for it. The dial has the value that keeps as many Gaussians in that frame. PSNR is that of the mean squared
-error over VIEWS placed cameras, against renders of SCENE, or over held-out photographs.
+SCENE is adapted without options. Its rivals are sets whose finest level is SCENE itself: halved
+again and again by splat-transform (``make peers``) in both its ways, and the author's own.
+``export --lod-meta`` of the adapted file is drawn too. A set is drawn by the rule of PlayCanvas
+2.23 (gsplat-octree-instance.js, gsplat-budget-balancer.js): a node's distance is that of the
+nearest point of its box; level b >= 1 begins at K multiplier^(b - 1); in each frame one K for all
+nodes is such that their counts, in view or not, meet the budget. A set has the multiplier of
+MULTIPLIERS that is best for it. The dial has the value that keeps as many Gaussians in that frame.
+PSNR is that of the mean squared error over VIEWS placed cameras, against renders of SCENE, or over
+held-out photographs.
 """
 
 import json
@@ -37,13 +40,19 @@ SETS = {"halved": "--decimate", "halved adaptively": "--decimate-adaptive"}
 def main() -> None:
     parser = arguments(__doc__, table=print_table, record=FILE)
     parser.add_argument("scene", type=Path)
-    parser.add_argument("--author", nargs="+", type=Path, default=[], help="coarser levels, the finest first")
+    parser.add_argument(
+        "--author", nargs="+", type=Path, default=[], help="coarser levels, the finest first"
+    )
     parser.add_argument("--images", type=Path, help="photographs; without it there are none")
-    parser.add_argument("--adapted", type=Path, help="the file of an earlier run, which is not run again")
+    parser.add_argument(
+        "--adapted", type=Path, help="the file of an earlier run, which is not run again"
+    )
     parser.add_argument("--only-dial", action="store_true", help="draw no sets")
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
-        for row in compared(args.scene, args.author, args.images, args.adapted, args.only_dial, Path(temporary)):
+        for row in compared(
+            args.scene, args.author, args.images, args.adapted, args.only_dial, Path(temporary)
+        ):
             row = {"benchmark": "stream", "scene": args.scene.stem, **row}
             if args.images:
                 row["scene"] = args.images.name
@@ -54,7 +63,12 @@ def main() -> None:
 
 
 def compared(
-    scene: Path, author: list[Path], images: Path | None, adapted: Path | None, only_dial: bool, folder: Path
+    scene: Path,
+    author: list[Path],
+    images: Path | None,
+    adapted: Path | None,
+    only_dial: bool,
+    folder: Path,
 ) -> Iterator[Row]:
     """The rows: the run, the dial at 1, 2 and 5, and then each method at each budget."""
     base, out = clod.load(scene).gaussians, adapted or folder / "adapted.ply"
@@ -66,7 +80,12 @@ def compared(
     dial = clod.load(out).gaussians
     for s in (0.0, 1.0, 2.0, 5.0):
         (row,) = clod.evaluate(clod.detach(dial) if s == 0 else dial, views, [max(s, 1.0)])
-        yield {"method": "dial", "level": f"s = {s:g}", "share": row.kept / len(base), "psnr": row.psnr}
+        yield {
+            "method": "dial",
+            "level": f"s = {s:g}",
+            "share": row.kept / len(base),
+            "psnr": row.psnr,
+        }
     shown = Dial(dial)
     for budget in BUDGETS:
         yield {"method": "dial", **measured(shown, views, budget, len(base))}
@@ -77,14 +96,22 @@ def compared(
         sets[name] = dict.fromkeys(MULTIPLIERS, [scene, *halved(scene, option, folder / name)])
     if author:
         sets["author"] = dict.fromkeys(MULTIPLIERS, [scene, *author])
-    sets["lod-meta"] = {each: own_levels(out, each, folder / f"own{each:g}") for each in MULTIPLIERS}
+    sets["lod-meta"] = {
+        each: own_levels(out, each, folder / f"own{each:g}") for each in MULTIPLIERS
+    }
     for name, files in sets.items():
         found = dict[str, Row]()
         for multiplier, levels in files.items():
             drawn = Levels([clod.load(file).gaussians for file in levels], multiplier, frames)
             for budget in BUDGETS:
-                row = {"method": name, **measured(drawn, views, budget, len(base)), "multiplier": multiplier}
-                found[row["level"]] = max(row, found.get(row["level"], row), key=lambda each: each["psnr"])
+                row = {
+                    "method": name,
+                    **measured(drawn, views, budget, len(base)),
+                    "multiplier": multiplier,
+                }
+                found[row["level"]] = max(
+                    row, found.get(row["level"], row), key=lambda each: each["psnr"]
+                )
         yield from found.values()
 
 
@@ -115,7 +142,11 @@ class Dial:
     def frame(self, camera: clod.Camera, count: int) -> tuple[clod.Gaussians, float, int]:
         """What is drawn of about ``count`` Gaussians, the dial value, and their exact number."""
         s = clod.dial_for(self.gaussians, keep=count, cameras=[camera]).virtual_scale
-        return self.gaussians, s, int(clod.render(self.gaussians, camera, virtual_scale=s).kept.sum())
+        return (
+            self.gaussians,
+            s,
+            int(clod.render(self.gaussians, camera, virtual_scale=s).kept.sum()),
+        )
 
 
 class Frames:
@@ -125,7 +156,10 @@ class Frames:
         self.means, self.leaves = base.means.numpy(), list[np.ndarray]()
         self.tree = self._cut(np.arange(len(base)))
         boxes = [self.means[rows] for rows in self.leaves]
-        self.low, self.high = np.stack([box.min(0) for box in boxes]), np.stack([box.max(0) for box in boxes])
+        self.low, self.high = (
+            np.stack([box.min(0) for box in boxes]),
+            np.stack([box.max(0) for box in boxes]),
+        )
 
     def _cut(self, rows: np.ndarray) -> object:
         points = self.means[rows]
@@ -161,7 +195,9 @@ class Levels:
     def __init__(self, levels: list[clod.Gaussians], multiplier: float, frames: Frames) -> None:
         self.levels, self.step, self.frames = levels, math.log(multiplier), frames
         self.nodes = [frames.nodes(level.means.numpy()) for level in levels]
-        self.counts = np.stack([np.bincount(nodes, minlength=len(frames.leaves)) for nodes in self.nodes])
+        self.counts = np.stack(
+            [np.bincount(nodes, minlength=len(frames.leaves)) for nodes in self.nodes]
+        )
 
     def frame(self, camera: clod.Camera, count: int) -> tuple[clod.Gaussians, float, int]:
         """As ``Dial.frame``."""
@@ -178,7 +214,9 @@ class Levels:
         level = chosen(low)
         shown = [torch.from_numpy(level[nodes] == k) for k, nodes in enumerate(self.nodes)]
         parts = [gaussians.select(rows) for gaussians, rows in zip(self.levels, shown, strict=True)]
-        joined = {name: torch.cat([part.tensors()[name] for part in parts]) for name in parts[0].tensors()}
+        joined = {
+            name: torch.cat([part.tensors()[name] for part in parts]) for name in parts[0].tensors()
+        }
         return parts[0].replace(**joined), 1.0, int(self.counts[level, every].sum())
 
 
@@ -194,7 +232,9 @@ def halved(scene: Path, option: str, folder: Path) -> list[Path]:
 
 def own_levels(adapted: Path, multiplier: float, folder: Path) -> list[Path]:
     """The levels of ``export --lod-meta``, as splat-transform reads them."""
-    Process([*COMMAND, "export", adapted, "--lod-meta", "--multiplier", multiplier, "--out", folder])
+    Process(
+        [*COMMAND, "export", adapted, "--lod-meta", "--multiplier", multiplier, "--out", folder]
+    )
     meta, files = folder / "lod-meta.json", list[Path]()
     for level in range(int(json.loads(meta.read_text("utf-8"))["lodLevels"])):
         files.append(folder / f"level{level}.ply")

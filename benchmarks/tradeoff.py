@@ -1,12 +1,14 @@
-"""Held-out error against seconds of training: ours, the paper's form, prefixes, a specialist for each dial value.
+"""Held-out error against seconds of training: ours, the paper's form, prefixes, a specialist for
+each dial value.
 
-    python benchmarks/tradeoff.py plush_half
-    python benchmarks/tradeoff.py plush_half --plot     # docs/images/error_vs_time.png, from the stored rows
+    python benchmarks/tradeoff.py plush_half python benchmarks/tradeoff.py plush_half --plot     #
+    docs/images/error_vs_time.png, from the stored rows
 
-Each number of steps is a separate run with its own schedule. A specialist is the base merged to the count that ours
-keeps at that dial value, by the better of splat-transform's methods, then tuned for as many steps; at s = 1 the whole
-base, tuned. Prefixes are one file, ordered by removal error and tuned with random prefixes, of which the same counts
-are measured. Each run adds a row to ``results/tradeoff.jsonl``.
+Each number of steps is a separate run with its own schedule. A specialist is the base merged to the
+count that ours keeps at that dial value, by the better of splat-transform's methods, then tuned for
+as many steps; at s = 1 the whole base, tuned. Prefixes are one file, ordered by removal error and
+tuned with random prefixes, of which the same counts are measured. Each run adds a row to
+``results/tradeoff.jsonl``.
 """
 
 import time
@@ -22,16 +24,20 @@ PICTURE = ROOT / "docs" / "images" / "error_vs_time.png"
 ITERS = (150, 400, 1200)
 MAX_SV, DIALS = 5.0, (1.0, 3.0, 5.0)
 LABELS = {
-    "ours": "ours, one file", "paper": "the paper's form, one file", "prefix": "prefixes, one file",
+    "ours": "ours, one file",
+    "paper": "the paper's form, one file",
+    "prefix": "prefixes, one file",
     "specialist": "specialists, a file each",
-}  # fmt: skip
+}
 
 
 def main() -> None:
     parser = arguments(__doc__)
     parser.add_argument("scene", help="a folder of the shared data")
     parser.add_argument("--iters", nargs="+", type=int, default=list(ITERS))
-    parser.add_argument("--only", nargs="+", choices=LABELS, default=list(LABELS), help="some of the methods")
+    parser.add_argument(
+        "--only", nargs="+", choices=LABELS, default=list(LABELS), help="some of the methods"
+    )
     parser.add_argument("--plot", action="store_true", help="only draw the stored rows")
     args = parser.parse_args()
     if not args.plot:
@@ -39,12 +45,28 @@ def main() -> None:
         (untouched,) = clod.evaluate(base.gaussians, views.test, [1.0])
         for method in args.only:
             for iters in args.iters:
-                made = dial if method in ("ours", "paper") else specialists if method == "specialist" else prefixes
+                made = (
+                    dial
+                    if method in ("ours", "paper")
+                    else specialists
+                    if method == "specialist"
+                    else prefixes
+                )
                 seconds, rows = made(args.scene, method, base, views, iters)
-                append(FILE, {
-                    "benchmark": "tradeoff", "scene": args.scene, "method": method, "iters": iters, "seed": 0,
-                    "max_sv": MAX_SV, "seconds": seconds, "base": untouched.as_dict(), "rows": rows,
-                })  # fmt: skip
+                append(
+                    FILE,
+                    {
+                        "benchmark": "tradeoff",
+                        "scene": args.scene,
+                        "method": method,
+                        "iters": iters,
+                        "seed": 0,
+                        "max_sv": MAX_SV,
+                        "seconds": seconds,
+                        "base": untouched.as_dict(),
+                        "rows": rows,
+                    },
+                )
     plot(args.scene)
 
 
@@ -52,13 +74,17 @@ Found = tuple[list[float], list[Row]]  # seconds to the file of each dial value,
 
 
 def dial(scene: str, method: str, base: clod.Checkpoint, views: clod.Scene, iters: int) -> Found:
-    config = (clod.AdaptConfig if method == "ours" else clod.AdaptConfig.paper)(max_sv=MAX_SV, iters=iters, seed=0)
+    config = (clod.AdaptConfig if method == "ours" else clod.AdaptConfig.paper)(
+        max_sv=MAX_SV, iters=iters, seed=0
+    )
     done = clod.adapt(base.gaussians, views, config)
     rows = clod.evaluate(done.gaussians, views.test, DIALS)
     return [done.start_seconds + done.seconds] * len(rows), [row.as_dict() for row in rows]
 
 
-def specialists(scene: str, method: str, base: clod.Checkpoint, views: clod.Scene, iters: int) -> Found:
+def specialists(
+    scene: str, method: str, base: clod.Checkpoint, views: clod.Scene, iters: int
+) -> Found:
     """Merging is within the time."""
     seconds, rows = [], []
     for s, count in zip(DIALS, counts(scene), strict=True):
@@ -69,14 +95,18 @@ def specialists(scene: str, method: str, base: clod.Checkpoint, views: clod.Scen
     return seconds, rows
 
 
-def prefixes(scene: str, method: str, base: clod.Checkpoint, views: clod.Scene, iters: int) -> Found:
+def prefixes(
+    scene: str, method: str, base: clod.Checkpoint, views: clod.Scene, iters: int
+) -> Found:
     """Ordering is within the time."""
     began = time.perf_counter()
     start = base.gaussians.select(falling(removal_error(base.gaussians, views.train)))
     ordering = time.perf_counter() - began
     tuned, spent = tune(start, views.train, Tuning(iters=iters, prefixes=True))
     files = zip(DIALS, (head(tuned, count) for count in counts(scene)), strict=True)
-    return [ordering + spent] * len(DIALS), [row_of(file, views, s, len(base.gaussians)) for s, file in files]
+    return [ordering + spent] * len(DIALS), [
+        row_of(file, views, s, len(base.gaussians)) for s, file in files
+    ]
 
 
 def row_of(file: clod.Gaussians, views: clod.Scene, s: float, count: int) -> Row:
@@ -86,18 +116,28 @@ def row_of(file: clod.Gaussians, views: clod.Scene, s: float, count: int) -> Row
 
 def counts(scene: str) -> list[int]:
     """Gaussians that ours keeps at each dial value in its longest run, of equal ones the last."""
-    longest = max((r for r in reversed(stored(FILE)) if (r["scene"], r["method"]) == (scene, "ours")),
-                  key=lambda row: row["iters"])  # fmt: skip
+    longest = max(
+        (r for r in reversed(stored(FILE)) if (r["scene"], r["method"]) == (scene, "ours")),
+        key=lambda row: row["iters"],
+    )
     return [round(row["kept"]) for row in longest["rows"]]
 
 
 def curves(scene: str, k: int) -> dict[str, list[Row]]:
     """Points by method at the k-th dial value, by rising time; of equal runs the last."""
     last = {(row["method"], row["iters"]): row for row in stored(FILE) if row["scene"] == scene}
-    points = {method: [
-        {"seconds": row["seconds"][k], "psnr": row["rows"][k]["psnr"], "share": row["rows"][k]["kept_share"]}
-        for (name, _), row in sorted(last.items()) if name == method
-    ] for method in LABELS}  # fmt: skip
+    points = {
+        method: [
+            {
+                "seconds": row["seconds"][k],
+                "psnr": row["rows"][k]["psnr"],
+                "share": row["rows"][k]["kept_share"],
+            }
+            for (name, _), row in sorted(last.items())
+            if name == method
+        ]
+        for method in LABELS
+    }
     return {method: found for method, found in points.items() if found}
 
 

@@ -1,4 +1,6 @@
-"""Plain tuning of a splat on photographs, without a dial, and merging by ``splat-transform --decimate`` (NanoGS)."""
+"""Plain tuning of a splat on photographs, without a dial, and merging by
+``splat-transform --decimate`` (NanoGS).
+"""
 
 import os
 import sys
@@ -25,7 +27,14 @@ from tqdm import tqdm
 
 TIMEOUT = 3600.0  # seconds of a merging
 # 3DGS's rates of training; means times the cameras' extent.
-RATES = {"means": 1.6e-4, "quats": 1e-3, "log_scales": 5e-3, "opacity_logits": 5e-2, "sh0": 2.5e-3, "shN": 1.25e-4}
+RATES = {
+    "means": 1.6e-4,
+    "quats": 1e-3,
+    "log_scales": 5e-3,
+    "opacity_logits": 5e-2,
+    "sh0": 2.5e-3,
+    "shN": 1.25e-4,
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,25 +48,35 @@ class Tuning:
     shortest: float = 0.01
 
 
-def tune(start: clod.Gaussians, views: tuple[clod.View, ...], config: Tuning) -> tuple[clod.Gaussians, float]:
-    """Minimises 0.8 L1 + 0.2 (1 - SSIM), a view a step, with Adam over all attributes; the result, and seconds.
+def tune(
+    start: clod.Gaussians, views: tuple[clod.View, ...], config: Tuning
+) -> tuple[clod.Gaussians, float]:
+    """Minimises 0.8 L1 + 0.2 (1 - SSIM), a view a step, with Adam over all attributes; the result,
+    and seconds.
 
-    With ``prefixes`` each step's loss is that of all Gaussians plus that of a random prefix of them, after Matryoshka
-    Gaussian Splatting (arXiv 2603.19234): two renders a step, no weights. ``start`` is then in the order of importance.
-    Drawn with the screen-space filter of ``start``.
+    With ``prefixes`` each step's loss is that of all Gaussians plus that of a random prefix of
+    them, after Matryoshka Gaussian Splatting (arXiv 2603.19234): two renders a step, no weights.
+    ``start`` is then in the order of importance. Drawn with the screen-space filter of ``start``.
     """
     start = detach(start)
     own = {"dtype": torch.float32, "copy": True, "memory_format": torch.contiguous_format}
     parameters = {name: getattr(start, name).detach().to(**own) for name in ATTRIBUTES}
     rates = RATES | {"means": RATES["means"] * camera_extent([view.camera for view in views])}
     tuned = [name for name in ATTRIBUTES if parameters[name].numel()]
-    optimizer, random = RowAdam({name: parameters[name] for name in tuned}), np.random.default_rng(config.seed)
+    optimizer, random = (
+        RowAdam({name: parameters[name] for name in tuned}),
+        np.random.default_rng(config.seed),
+    )
     everyone, order = torch.ones(len(start), dtype=torch.bool), list[int]()
     _gradients(start, parameters, tuned, views[0], len(start) if config.prefixes else None)
     began = time.perf_counter()
     for step in tqdm(range(config.iters), leave=False):
         order = order or random.permutation(len(views)).tolist()
-        prefix = max(round(config.shortest ** random.random() * len(start)), 1) if config.prefixes else None
+        prefix = (
+            max(round(config.shortest ** random.random() * len(start)), 1)
+            if config.prefixes
+            else None
+        )
         gradients = _gradients(start, parameters, tuned, views[order.pop()], prefix)
         share = config.final ** (step / config.iters)
         optimizer.step(gradients, everyone, {name: rate * share for name, rate in rates.items()})
@@ -66,9 +85,15 @@ def tune(start: clod.Gaussians, views: tuple[clod.View, ...], config: Tuning) ->
 
 @torch_on_one_thread()
 def _gradients(
-    start: clod.Gaussians, parameters: dict[str, Tensor], tuned: list[str], view: clod.View, prefix: int | None
+    start: clod.Gaussians,
+    parameters: dict[str, Tensor],
+    tuned: list[str],
+    view: clod.View,
+    prefix: int | None,
 ) -> dict[str, Tensor]:
-    leaves = {name: value.detach().requires_grad_(name in tuned) for name, value in parameters.items()}
+    leaves = {
+        name: value.detach().requires_grad_(name in tuned) for name, value in parameters.items()
+    }
     gaussians = start.replace(**leaves)
     loss = photometric_loss(splat(gaussians, gaussians.opacities, view.camera)[0], view.image)
     if prefix is not None:
@@ -81,9 +106,12 @@ def _gradients(
 
 
 def find_tool() -> SplatTransform:
-    """splat-transform of ``make peers``, or on the PATH, without a GPU; exits where it is missing or too old."""
+    """splat-transform of ``make peers``, or on the PATH, without a GPU; exits where it is missing
+    or too old.
+    """
     place = str(ROOT / ".venv" / "peers" / "node_modules" / ".bin")
-    if place not in os.environ["PATH"].split(os.pathsep):  # also for the commands that a benchmark starts
+    # also for the commands that a benchmark starts
+    if place not in os.environ["PATH"].split(os.pathsep):
         os.environ["PATH"] = os.pathsep.join([place, os.environ["PATH"]])
     try:
         return replace(SplatTransform.find(), gpu=False)
@@ -94,7 +122,9 @@ def find_tool() -> SplatTransform:
 MERGINGS = ("--decimate-adaptive", "--decimate")
 
 
-def merge(base: clod.Checkpoint, count: int, method: str = MERGINGS[0]) -> tuple[clod.Gaussians, float]:
+def merge(
+    base: clod.Checkpoint, count: int, method: str = MERGINGS[0]
+) -> tuple[clod.Gaussians, float]:
     """The base merged to ``count`` Gaussians, and the seconds that the tool took, then or now.
 
     Args:
@@ -119,7 +149,10 @@ def merge(base: clod.Checkpoint, count: int, method: str = MERGINGS[0]) -> tuple
 
 
 def _write_plain(path: Path, base: clod.Checkpoint) -> None:
-    """The rows that the reader used, without MaskGaussian's columns, whose averages would mean nothing."""
+    """The rows that the reader used, without MaskGaussian's columns, whose averages would mean
+    nothing.
+    """
     names = [name for name in base.vertex.dtype.names if not name.startswith("masks_")]
-    plain = base.vertex[names].astype([(name, base.vertex.dtype[name]) for name in names])  # a view keeps the gaps
+    # a view keeps the gaps
+    plain = base.vertex[names].astype([(name, base.vertex.dtype[name]) for name in names])
     PlyData([PlyElement.describe(plain, "vertex")]).write(path)

@@ -1,8 +1,8 @@
 """The page in a headless Chromium against clod_adapter.render: pictures and counts.
 
-Each capture's checkpoint is first adapted for 100 steps (kept in ``benchmarks/cache``). At some held-out cameras and
-dial values, and with the equation off: PSNR between the browser's picture and ``clod_adapter.render``, and the counts.
-Each capture adds a row to ``results/viewer.jsonl``.
+Each capture's checkpoint is first adapted for 100 steps (kept in ``benchmarks/cache``). At some
+held-out cameras and dial values, and with the equation off: PSNR between the browser's picture and
+``clod_adapter.render``, and the counts. Each capture adds a row to ``results/viewer.jsonl``.
 """
 
 import sys
@@ -45,9 +45,14 @@ def measure(chromium: Any, name: str) -> Row:
         shown = Shown(context.new_page()).ready(url)
         rows = [each for camera in cameras for each in compare(shown, model.gaussians, camera)]
         return {
-            "capture": name, "gaussians": len(model.gaussians), "sh_degree": model.gaussians.sh_degree, "picture": size,
-            "chromium": chromium.version, "rows": rows, "errors": shown.errors,
-        }  # fmt: skip
+            "capture": name,
+            "gaussians": len(model.gaussians),
+            "sh_degree": model.gaussians.sh_degree,
+            "picture": size,
+            "chromium": chromium.version,
+            "rows": rows,
+            "errors": shown.errors,
+        }
 
 
 def compare(shown: Shown, gaussians: clod.Gaussians, camera: clod.Camera) -> list[Row]:
@@ -58,12 +63,21 @@ def compare(shown: Shown, gaussians: clod.Gaussians, camera: clod.Camera) -> lis
         shown.run(f"clod.setEquation({str(dial is not None).lower()})")
         shown.run("clod.setDial(given)", dial or 1.0)
         with torch.no_grad():
-            wanted = clod.render(gaussians, camera, dial) if dial else clod.render(clod.detach(gaussians), camera)
+            wanted = (
+                clod.render(gaussians, camera, dial)
+                if dial
+                else clod.render(clod.detach(gaussians), camera)
+            )
         error = float(((shown.picture().astype(np.float64) - wanted.pixels.numpy()) ** 2).mean())
-        rows.append({
-            "camera": camera.name, "virtual_scale": dial, "psnr": 10 * float(np.log10(255**2 / max(error, 1e-9))),
-            "kept": int(wanted.kept.sum()), "kept_in_page": shown.counts()["kept"],
-        })  # fmt: skip
+        rows.append(
+            {
+                "camera": camera.name,
+                "virtual_scale": dial,
+                "psnr": 10 * float(np.log10(255**2 / max(error, 1e-9))),
+                "kept": int(wanted.kept.sum()),
+                "kept_in_page": shown.counts()["kept"],
+            }
+        )
     return rows
 
 
@@ -72,7 +86,17 @@ def adapted(name: str) -> Path:
     path = CACHE / f"viewer-{name}.ply"
     if not path.exists():
         CACHE.mkdir(exist_ok=True)
-        words = [capture(name) / "pretrained.ply", "--images", capture(name), "--max-sv", 5, "--iters", 100, "-o", path]
+        words = [
+            capture(name) / "pretrained.ply",
+            "--images",
+            capture(name),
+            "--max-sv",
+            5,
+            "--iters",
+            100,
+            "-o",
+            path,
+        ]
         Process([*COMMAND, *words])
     return path
 

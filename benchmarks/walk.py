@@ -1,11 +1,13 @@
-"""Near to far: from a door in a made-up town to a hundred times as far, by the dial at s = 1 and by its base.
+"""Near to far: from a door in a made-up town to a hundred times as far, by the dial at s = 1 and by
+its base.
 
     python benchmarks/walk.py --record     # adds a row to results/walk.jsonl
     python benchmarks/walk.py --table      # the last row as a Markdown table
 
-The town is ``city.py``'s, and the checkpoint the perturbed town, tuned on photographs from the streets, from the air
-and from as far as the walk; both are kept in ``benchmarks/cache``. The default command adapts it to these photographs.
-Every frame is compared with the supersampled, unperturbed town.
+The town is ``city.py``'s, and the checkpoint the perturbed town, tuned on photographs from the
+streets, from the air and from as far as the walk; both are kept in ``benchmarks/cache``. The
+default command adapts it to these photographs. Every frame is compared with the supersampled,
+unperturbed town.
 """
 
 import json
@@ -42,7 +44,9 @@ BANDS = {"within 12 m": 12.0, "12 to 40 m": 40.0, "40 to 120 m": 120.0, "beyond"
 
 def main() -> None:
     parser = arguments(__doc__, table=lambda: print(*map(summary, stored(FILE)[-1:])), record=FILE)
-    parser.add_argument("--count", type=int, default=COUNT, help=f"Gaussians of the town (default: {COUNT})")
+    parser.add_argument(
+        "--count", type=int, default=COUNT, help=f"Gaussians of the town (default: {COUNT})"
+    )
     args = parser.parse_args()
     row = measure(args.count)
     if args.record:
@@ -55,9 +59,25 @@ def measure(count: int) -> Row:
     truth = town(count)
     with tempfile.TemporaryDirectory() as place:
         out = Path(place) / "dial.ply"
-        run = Process([*COMMAND, folder / "base.ply", "--images", folder, "--out", out, "--json", "--accept-loss"])
+        run = Process(
+            [
+                *COMMAND,
+                folder / "base.ply",
+                "--images",
+                folder,
+                "--out",
+                out,
+                "--json",
+                "--accept-loss",
+            ]
+        )
         shown = {"base": clod.load(folder / "base.ply").gaussians, "dial": clod.load(out).gaussians}
-    row: Row = {"benchmark": "walk", "count": count, "steps": json.loads(run.out)["steps"], **run.cost()}
+    row: Row = {
+        "benchmark": "walk",
+        "count": count,
+        "steps": json.loads(run.out)["steps"],
+        **run.cost(),
+    }
     row |= {"distances": DISTANCES, "base": [], "dial": []}
     for distance in DISTANCES:
         camera = walker(count, distance)
@@ -79,7 +99,9 @@ def town(count: int) -> clod.Gaussians:
 
 
 def made(count: int) -> Path:
-    """A folder of photographs with their checkpoint, ``base.ply``, made now if it is not in the cache."""
+    """A folder of photographs with their checkpoint, ``base.ply``, made now if it is not in the
+    cache.
+    """
     folder = CACHE / f"walk-{count}"
     if not folder.exists():
         CACHE.mkdir(parents=True, exist_ok=True)
@@ -100,14 +122,18 @@ def photographers(count: int) -> list[clod.Camera]:
         turn = random.uniform(0, 2 * math.pi)
         rise = math.radians(random.uniform(15, 40))
         away = DISTANCES[-1] * math.exp(random.uniform(math.log(0.3), 0.1))
-        direction = np.array([math.cos(rise) * math.cos(turn), -math.sin(rise), math.cos(rise) * math.sin(turn)])
+        direction = np.array(
+            [math.cos(rise) * math.cos(turn), -math.sin(rise), math.cos(rise) * math.sin(turn)]
+        )
         found.append(look_at(away * direction, np.zeros(3), *SIZE, "far"))
     random.shuffle(found)  # every 8th is held out
     return found
 
 
 def walker(count: int, distance: float) -> clod.Camera:
-    """From a door in the middle of the town into its street, then along that and up; always facing the door."""
+    """From a door in the middle of the town into its street, then along that and up; always facing
+    the door.
+    """
     across = (PITCH - HOUSE) / 2  # to the middle of the street, which runs along z
     odd = lots(count) % 2
     door = np.array([odd * PITCH / 2 - across, -EYE, (odd - 1) * PITCH / 2])
@@ -123,7 +149,9 @@ def summary(row: Row) -> str:
     lines = []
     nearest = 0.0
     for name, farthest in BANDS.items():
-        inside = [k for k, distance in enumerate(row["distances"]) if nearest < distance <= farthest]
+        inside = [
+            k for k, distance in enumerate(row["distances"]) if nearest < distance <= farthest
+        ]
         base = [row["base"][k] for k in inside]
         dial = [row["dial"][k] for k in inside]
         psnr = fmean(each["psnr"] for each in base)
@@ -131,14 +159,18 @@ def summary(row: Row) -> str:
         share = sum(each["in_view"] for each in dial) / sum(each["in_view"] for each in base)
         lines.append([name, f"{psnr:.2f}", f"{gain:+.2f}", f"{share:.0%}"])
         nearest = farthest
-    return table(["from the door", "base, dB", "dial, dB against it", "Gaussians in view"], lines, 1)
+    return table(
+        ["from the door", "base, dB", "dial, dB against it", "Gaussians in view"], lines, 1
+    )
 
 
 @torch.no_grad()
 def supersampled(shown: clod.Gaussians, camera: clod.Camera) -> torch.Tensor:
     """``[H, W, 3]`` uint8, a render with SAMPLES by SAMPLES samples in a pixel."""
     K = camera.K * torch.tensor([[SAMPLES], [SAMPLES], [1.0]])
-    image = clod.render(shown, replace(camera, K=K, width=SAMPLES * camera.width, height=SAMPLES * camera.height)).image
+    image = clod.render(
+        shown, replace(camera, K=K, width=SAMPLES * camera.width, height=SAMPLES * camera.height)
+    ).image
     image = image.clamp(0, 1).reshape(camera.height, SAMPLES, camera.width, SAMPLES, 3).mean((1, 3))
     return (255 * image).round().to(torch.uint8)
 
@@ -150,9 +182,19 @@ def write_photographs(shown: clod.Gaussians, cameras: Sequence[clod.Camera], fol
     for k, camera in enumerate(cameras):
         name = f"images/{k:04}.png"
         Image.fromarray(supersampled(shown, camera).numpy()).save(folder / name)
-        pose = torch.linalg.inv(camera.viewmat.double()) @ torch.diag(torch.tensor([1.0, -1, -1, 1])).double()
+        pose = (
+            torch.linalg.inv(camera.viewmat.double())
+            @ torch.diag(torch.tensor([1.0, -1, -1, 1])).double()
+        )
         K = camera.K.tolist()
-        size = {"fl_x": K[0][0], "fl_y": K[1][1], "cx": K[0][2], "cy": K[1][2], "w": camera.width, "h": camera.height}
+        size = {
+            "fl_x": K[0][0],
+            "fl_y": K[1][1],
+            "cx": K[0][2],
+            "cy": K[1][2],
+            "w": camera.width,
+            "h": camera.height,
+        }
         frames.append({"file_path": name, "transform_matrix": pose.tolist(), **size})
     (folder / "transforms.json").write_text(json.dumps({"frames": frames}), "utf-8")
     return folder

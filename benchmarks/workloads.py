@@ -1,7 +1,8 @@
 """The scenes that the rasterizer is timed on: W1 and W2, synthetic rooms.
 
-W1 and W2 are a room with spheres and boxes in it, its surfaces covered with small flat Gaussians of mixed
-opacity, one in twenty large and faint. The yardstick makes the same ones: ``differences`` compares.
+W1 and W2 are a room with spheres and boxes in it, its surfaces covered with small flat Gaussians of
+mixed opacity, one in twenty large and faint. The yardstick makes the same ones: ``differences``
+compares.
 """
 
 from __future__ import annotations
@@ -22,7 +23,9 @@ Array = np.ndarray
 
 @dataclass(frozen=True)
 class Workload:
-    """Activated float32 parameters, a camera, and the weights of the loss ``(image * weights).sum()``."""
+    """Activated float32 parameters, a camera, and the weights of the loss
+    ``(image * weights).sum()``.
+    """
 
     name: str
     means: Tensor
@@ -41,12 +44,17 @@ class Workload:
 
     def changed(self, name: str, rows: Tensor | slice = slice(None), **fields: Tensor) -> Workload:
         """Those rows under another name, with some fields replaced."""
-        old = {f: getattr(self, f)[rows].contiguous() for f in ("means", "quats", "scales", "opacities", "sh")}
+        old = {
+            f: getattr(self, f)[rows].contiguous()
+            for f in ("means", "quats", "scales", "opacities", "sh")
+        }
         return Workload(name, **{**old, **fields}, camera=self.camera, weights=self.weights)
 
 
 def make(name: str, size: tuple[int, int, int, int] | None = None) -> Workload:
-    """W1, W2 or one of another size; the draws come in a fixed order, which the numbers depend on."""
+    """W1, W2 or one of another size; the draws come in a fixed order, which the numbers depend
+    on.
+    """
     count, width, height, seed = size or SIZES[name]
     draw = np.random.default_rng(seed)
     rotation, translation, focal = _pose(width)
@@ -60,9 +68,11 @@ def make(name: str, size: tuple[int, int, int, int] | None = None) -> Workload:
     viewmat = np.block([[rotation, translation[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]])
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
     return Workload(
-        name, *map(_tensor, (points, quats, pixels * depths[:, None] / focal, opacities, sh)),
-        Camera(_tensor(viewmat), _tensor(K), width, height), _tensor(weights),
-    )  # fmt: skip
+        name,
+        *map(_tensor, (points, quats, pixels * depths[:, None] / focal, opacities, sh)),
+        Camera(_tensor(viewmat), _tensor(K), width, height),
+        _tensor(weights),
+    )
 
 
 def _tensor(array: Array) -> Tensor:
@@ -73,13 +83,21 @@ def _pose(width: int) -> tuple[Array, Array, float]:
     """Rotation and translation of the view matrix, and the focal length in pixels."""
     yaw, pitch = np.radians(6.0), np.radians(-4.0)
     about_y = np.array([[np.cos(yaw), 0, np.sin(yaw)], [0, 1, 0], [-np.sin(yaw), 0, np.cos(yaw)]])
-    about_x = np.array([[1, 0, 0], [0, np.cos(pitch), -np.sin(pitch)], [0, np.sin(pitch), np.cos(pitch)]])
+    about_x = np.array(
+        [[1, 0, 0], [0, np.cos(pitch), -np.sin(pitch)], [0, np.sin(pitch), np.cos(pitch)]]
+    )
     rotation = about_x @ about_y
-    return rotation, -rotation @ np.array([0.3, -0.2, -4.2]), 0.5 * width / np.tan(np.radians(60) / 2)
+    return (
+        rotation,
+        -rotation @ np.array([0.3, -0.2, -4.2]),
+        0.5 * width / np.tan(np.radians(60) / 2),
+    )
 
 
 def _surface_points(draw: np.random.Generator, count: int) -> Array:
-    """Points near the surfaces: back, left, right, floor and ceiling of a room, four spheres, two boxes."""
+    """Points near the surfaces: back, left, right, floor and ceiling of a room, four spheres, two
+    boxes.
+    """
     kinds = draw.choice(7, count, p=[0.22, 0.10, 0.10, 0.12, 0.06, 0.28, 0.12])
     within = draw.uniform(-1, 1, (count, 3))
     points = within * [3, 2, 3]
@@ -95,14 +113,21 @@ def _surface_points(draw: np.random.Generator, count: int) -> Array:
     rows, axes = np.arange(len(faces)), draw.integers(0, 3, len(faces))
     faces[rows, axes] = np.sign(faces[rows, axes])
     which = draw.integers(0, 2, len(faces))
-    centres, halves = np.array([[-0.2, 1.3, -1.2], [-2.2, 0, 1.8]]), np.array([[0.5, 0.6, 0.4], [0.5, 1.2, 0.5]])
+    centres, halves = (
+        np.array([[-0.2, 1.3, -1.2], [-2.2, 0, 1.8]]),
+        np.array([[0.5, 0.6, 0.4], [0.5, 1.2, 0.5]]),
+    )
     points[kinds == 6] = centres[which] + faces * halves[which]
     return points + draw.normal(scale=0.015, size=points.shape)
 
 
 def _sizes_and_opacities(draw: np.random.Generator, count: int) -> tuple[Array, Array]:
-    """Standard deviations in pixels, and opacities: many faint, some nearly opaque; one in twenty large and faint."""
-    pixels = np.exp(np.log(1.2) + 0.5 * draw.normal(size=(count, 1)) + 0.35 * draw.normal(size=(count, 3)))
+    """Standard deviations in pixels, and opacities: many faint, some nearly opaque; one in twenty
+    large and faint.
+    """
+    pixels = np.exp(
+        np.log(1.2) + 0.5 * draw.normal(size=(count, 1)) + 0.35 * draw.normal(size=(count, 3))
+    )
     pixels[:, 2] *= 0.25
     kinds = draw.random(count)
     faint, medium = 0.005 + 0.5 * draw.beta(0.9, 4, count), draw.beta(2, 2, count)
@@ -116,12 +141,17 @@ def _sizes_and_opacities(draw: np.random.Generator, count: int) -> tuple[Array, 
 
 
 def _colors(draw: np.random.Generator, points: Array) -> Array:
-    """Spherical harmonics of degree 3: waves of colour through the room, higher degrees at random."""
+    """Spherical harmonics of degree 3: waves of colour through the room, higher degrees at
+    random.
+    """
     waves = 0.35 * np.sin(points @ draw.normal(size=(3, 3)) * 1.7 + 1.0)
     base = 0.5 + waves + 0.08 * draw.normal(size=points.shape)
     sh = np.empty((len(points), 16, 3))
     sh[:, 0] = (base - 0.5) / SH_C0
-    sh[:, 1:] = draw.normal(size=(len(points), 15, 3)) * np.repeat([0.10, 0.06, 0.04], [3, 5, 7])[None, :, None]
+    sh[:, 1:] = (
+        draw.normal(size=(len(points), 15, 3))
+        * np.repeat([0.10, 0.06, 0.04], [3, 5, 7])[None, :, None]
+    )
     return sh
 
 
@@ -129,7 +159,19 @@ def differences(ours: Workload, theirs: dict[str, Array | int]) -> list[str]:
     """Names of the yardstick's arrays that are not ours bit for bit."""
     camera = ours.camera
     mine = {
-        "means": ours.means, "scales": ours.scales, "quats": ours.quats, "opacities": ours.opacities, "sh": ours.sh,
-        "viewmat": camera.viewmat, "K": camera.K, "G": ours.weights, "width": camera.width, "height": camera.height,
-    }  # fmt: skip
-    return [name for name, value in mine.items() if not np.array_equal(np.asarray(value), np.asarray(theirs[name]))]
+        "means": ours.means,
+        "scales": ours.scales,
+        "quats": ours.quats,
+        "opacities": ours.opacities,
+        "sh": ours.sh,
+        "viewmat": camera.viewmat,
+        "K": camera.K,
+        "G": ours.weights,
+        "width": camera.width,
+        "height": camera.height,
+    }
+    return [
+        name
+        for name, value in mine.items()
+        if not np.array_equal(np.asarray(value), np.asarray(theirs[name]))
+    ]

@@ -15,16 +15,22 @@ from .shared.outputs import Outputs, check_ply_name, size
 def add_arguments(parser: ArgumentParser) -> None:
     given = parser.add_argument_group("input")
     given.add_argument("base", metavar="BASE.ply", help="the checkpoint that was adapted")
-    given.add_argument("adapter", metavar="ADAPTER.safetensors", help="the adapter that clod-adapt wrote")
+    given.add_argument(
+        "adapter", metavar="ADAPTER.safetensors", help="the adapter that clod-adapt wrote"
+    )
     add_activated(given)
     output = parser.add_argument_group("output")
-    output.add_argument("-o", "--out", metavar="OUT.ply", required=True, help="output file; replaced if it exists")
+    output.add_argument(
+        "-o", "--out", metavar="OUT.ply", required=True, help="output file; replaced if it exists"
+    )
 
 
 def check(args: Namespace) -> None:
     check_ply_name(Path(args.out), "--out")
     if not Path(args.adapter).is_file():
-        raise ClodError(f"{args.adapter}: No such file; give the .safetensors that clod-adapt wrote")
+        raise ClodError(
+            f"{args.adapter}: No such file; give the .safetensors that clod-adapt wrote"
+        )
     check_readable(Path(args.base))
 
 
@@ -50,9 +56,13 @@ def execute(args: Namespace) -> dict[str, Any]:
     dial = " and ".join(dial_tensors(adapted))
     print(f"wrote {args.out} ({size(Path(args.out))}): {len(adapted):,} Gaussians with {dial}")
     return {
-        "base": args.base, "adapter": args.adapter, "base_count": adapter.base_count,
-        "changed": sorted(adapter.updates), "notes": console.notes, "outputs": {"ply": args.out},
-    }  # fmt: skip
+        "base": args.base,
+        "adapter": args.adapter,
+        "base_count": adapter.base_count,
+        "changed": sorted(adapter.updates),
+        "notes": console.notes,
+        "outputs": {"ply": args.out},
+    }
 
 
 DESCRIPTION = "Rebuild the adapted PLY from checkpoint and adapter."

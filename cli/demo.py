@@ -1,4 +1,6 @@
-"""``clod-adapt demo``: adapts a scene that comes with the package, and draws figures of the result."""
+"""``clod-adapt demo``: adapts a scene that comes with the package, and draws figures of the
+result.
+"""
 
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
@@ -18,7 +20,9 @@ PICTURES = {"dial": "dial.png", "curve": "curve.png"}
 
 def add_arguments(parser: ArgumentParser) -> None:
     output = parser.add_argument_group("output")
-    output.add_argument("-o", "--out", metavar="DIR", default="demo", help="output folder (default: demo)")
+    output.add_argument(
+        "-o", "--out", metavar="DIR", default="demo", help="output folder (default: demo)"
+    )
 
 
 def check(args: Namespace) -> None:
@@ -42,7 +46,9 @@ def execute(args: Namespace) -> dict[str, Any]:
     capture, base, model = folder / "capture", folder / "base.ply", folder / "gallery.ply"
     pictures = {name: folder / file for name, file in PICTURES.items()}
     if base.exists() and not capture.exists():
-        raise ClodError(f"{base}: exists without {capture}, so the demo did not make it; choose another --out")
+        raise ClodError(
+            f"{base}: exists without {capture}, so the demo did not make it; choose another --out"
+        )
     prepare_kernels(console)
     unpack(capture, base)
     console.say(f"the scene is in {capture}, its checkpoint is {base}")
@@ -61,7 +67,11 @@ def execute(args: Namespace) -> dict[str, Any]:
         pictures, drawn = {}, "no figures: the measurements were interrupted"
     print(f"\n{duration(watch.total())} for the demo; everything is in {folder.resolve()}\n{drawn}")
     print("next, a splat of your own:\n  clod-adapt YOURS.ply --images YOUR_SCENE")
-    return report | {"command": "demo", "folder": str(folder), "pictures": {k: str(v) for k, v in pictures.items()}}
+    return report | {
+        "command": "demo",
+        "folder": str(folder),
+        "pictures": {k: str(v) for k, v in pictures.items()},
+    }
 
 
 DESCRIPTION = """\

@@ -14,9 +14,16 @@ from .shared.console import Console
 from .view import find_browser
 
 TORCH = "pip install --force-reinstall torch (https://pytorch.org has the command for a GPU)"
-REINSTALL = "pip install --force-reinstall numba; if that does not help, report it with clod-adapt doctor --json"
-NO_BROWSER = "clod-adapt view --no-browser --port 8000, and ssh -L 8000:127.0.0.1:8000 HOST where there is a browser"
-TOLERANCE = 2e-4  # RMS of colours in [0, 1]: rounding, and a pixel or two on the other side of a threshold
+REINSTALL = (
+    "pip install --force-reinstall numba; if that does not help, report it with clod-adapt doctor"
+    " --json"
+)
+NO_BROWSER = (
+    "clod-adapt view --no-browser --port 8000, and ssh -L 8000:127.0.0.1:8000 HOST where there is a"
+    " browser"
+)
+# RMS of colours in [0, 1]: rounding, and a pixel or two on the other side of a threshold
+TOLERANCE = 2e-4
 RENDERERS = ("cpu", "gsplat")
 
 
@@ -40,8 +47,14 @@ def check_gsplat() -> Found:
 
     if reason := no_gpu():
         found, _, fix = reason.partition(": ")
-        return False, found, fix or "install NVIDIA's driver, and a torch for its CUDA from https://pytorch.org"
-    return rendered("cuda", f"{torch.cuda.get_device_name()}; ", "pip install --force-reinstall gsplat==1.5.3")
+        return (
+            False,
+            found,
+            fix or "install NVIDIA's driver, and a torch for its CUDA from https://pytorch.org",
+        )
+    return rendered(
+        "cuda", f"{torch.cuda.get_device_name()}; ", "pip install --force-reinstall gsplat==1.5.3"
+    )
 
 
 def check_browser() -> Found:
@@ -53,9 +66,11 @@ def check_browser() -> Found:
 
 
 CHECKS: dict[str, Callable[[], Found]] = {
-    "torch": check_torch, "cpu": lambda: rendered("cpu", "", REINSTALL), "gsplat": check_gsplat,
+    "torch": check_torch,
+    "cpu": lambda: rendered("cpu", "", REINSTALL),
+    "gsplat": check_gsplat,
     "browser": check_browser,
-}  # fmt: skip
+}
 
 
 def rendered(device: str, name: str, fix: str) -> Found:
@@ -67,10 +82,14 @@ def rendered(device: str, name: str, fix: str) -> Found:
 
     normal = partial(torch.randn, generator=torch.Generator().manual_seed(7))
     scene: dict[str, Any] = {
-        "means": normal(60, 3).clamp(-1.5, 1.5) + torch.tensor([0.0, 0.0, 4.0]), "quats": normal(60, 4),
-        "scales": (0.5 * normal(60, 3) - 2).exp(), "opacities": (1.5 * normal(60)).sigmoid().clamp(max=0.95),
-        "sh0": normal(60, 1, 3), "shN": 0.1 * normal(60, 3, 3), "background": torch.zeros(3),
-    }  # fmt: skip
+        "means": normal(60, 3).clamp(-1.5, 1.5) + torch.tensor([0.0, 0.0, 4.0]),
+        "quats": normal(60, 4),
+        "scales": (0.5 * normal(60, 3) - 2).exp(),
+        "opacities": (1.5 * normal(60)).sigmoid().clamp(max=0.95),
+        "sh0": normal(60, 1, 3),
+        "shN": 0.1 * normal(60, 3, 3),
+        "background": torch.zeros(3),
+    }
     camera = Camera(torch.eye(4), torch.tensor([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]]), 64, 48)
     want, _ = reference.rasterize(**scene, camera=camera)
     splat = for_device(torch.device(device)).splat
@@ -91,7 +110,8 @@ def execute(args: Namespace) -> dict[str, Any]:
                 with redirect_stdout(io.StringIO()):  # gsplat prints
                     ok, found, fix = check()
             except Exception as error:  # any is a result: the code belongs to other projects
-                if isinstance(error.__cause__, KeyboardInterrupt):  # within the dispatching of a compiled function
+                # within the dispatching of a compiled function
+                if isinstance(error.__cause__, KeyboardInterrupt):
                     raise
                 ok, found, fix = False, f"{type(error).__name__}: {first_line(error)}", ""
             findings.append({"name": name, "ok": ok, "found": found, "fix": fix})

@@ -1,4 +1,6 @@
-"""``clod-adapt eval``: quality, count and time at some dial values, on the held-out photographs; and comparisons."""
+"""``clod-adapt eval``: quality, count and time at some dial values, on the held-out photographs;
+and comparisons.
+"""
 
 from __future__ import annotations
 
@@ -35,10 +37,14 @@ PATH_CAMERAS = 5  # neighbours by name, which are usually photographed one after
 
 def add_arguments(parser: ArgumentParser) -> None:
     given = parser.add_argument_group("input")
-    given.add_argument("model", metavar="MODEL.ply", help="an adapted file, or a plain one as a baseline")
+    given.add_argument(
+        "model", metavar="MODEL.ply", help="an adapted file, or a plain one as a baseline"
+    )
     common.add_reading(given)
     dial = parser.add_argument_group("dial values, one of")
-    default = "dial values from 1 (full quality) (default: 1 2 3 5 below the largest trained, and that)"
+    default = (
+        "dial values from 1 (full quality) (default: 1 2 3 5 below the largest trained, and that)"
+    )
     common.add_dial_options(dial, default, "(mean over the held-out views)", several=True)
     measuring = parser.add_argument_group("measuring")
     text = "also measure the checkpoint, pruned to the count of each row"
@@ -49,7 +55,9 @@ def add_arguments(parser: ArgumentParser) -> None:
     measuring.add_argument("--popping", action="store_true", help=text)
     common.add_device(measuring, "render")
     output = parser.add_argument_group("output")
-    output.add_argument("--report", metavar="OUT.html", help="also write a self-contained page, and its charts")
+    output.add_argument(
+        "--report", metavar="OUT.html", help="also write a self-contained page, and its charts"
+    )
 
 
 def paths(args: Namespace) -> list[str]:
@@ -61,7 +69,10 @@ def check(args: Namespace) -> None:
     labels(args.against)
     common.check_inputs(args.images, *paths(args))
     if args.base and file_has_dial(Path(args.base)):
-        raise ClodError(f"{args.base}: has a dial; give --base the checkpoint that was adapted, or use --against")
+        raise ClodError(
+            f"{args.base}: has a dial; give --base the checkpoint that was adapted, or use"
+            " --against"
+        )
 
 
 def outputs(args: Namespace) -> Outputs:
@@ -100,13 +111,23 @@ def execute(args: Namespace) -> dict[str, Any]:
                 comparisons.pop(max(row.virtual_scale for row in rows))
     print(comparisons.text(), end="")
     report: dict[str, Any] = {  # the page has the first two as well
-        "command": "eval", "version": package_version(), "model": args.model, "scene": args.images,
-        "base_count": model.whole, "sh_degree": model.sh_degree, "views": len(scene.test),
-        "rows": [row.as_dict() for row in rows], "base": args.base, **comparisons.report,
-        "interrupted": stop.requests > 0, "attenuation": asdict(model.attenuation) if model.attenuation else None,
-        "notes": console.notes, "machine": machine(), "device": str(model.means.device),
+        "command": "eval",
+        "version": package_version(),
+        "model": args.model,
+        "scene": args.images,
+        "base_count": model.whole,
+        "sh_degree": model.sh_degree,
+        "views": len(scene.test),
+        "rows": [row.as_dict() for row in rows],
+        "base": args.base,
+        **comparisons.report,
+        "interrupted": stop.requests > 0,
+        "attenuation": asdict(model.attenuation) if model.attenuation else None,
+        "notes": console.notes,
+        "machine": machine(),
+        "device": str(model.means.device),
         "seconds": watch.report(),
-    }  # fmt: skip
+    }
     if args.report:
         try:
             add_page(Path(args.report), report, model, base, scene, console)
@@ -119,14 +140,18 @@ def execute(args: Namespace) -> dict[str, Any]:
 class Comparisons:
     """Comparisons of a model; those that are finished, in ``report`` for --json and as text."""
 
-    def __init__(self, model: Gaussians, scene: Scene, console: Console, stop: GracefulStop) -> None:
+    def __init__(
+        self, model: Gaussians, scene: Scene, console: Console, stop: GracefulStop
+    ) -> None:
         self.model, self.scene, self.console, self.stop = model, scene, console, stop
         self.report: dict[str, Any] = {"base_row": None, "ranked": [], "against": [], "popping": []}
         self.tables: dict[str, list[tuple[str, Row]]] = {}
         self.popping: list[tuple[str, Popping]] = []
 
     def prune(self, base: Gaussians, rows: Sequence[Row]) -> None:
-        """Measures the base with all its Gaussians, and pruned by two rankings to the counts of ``rows``."""
+        """Measures the base with all its Gaussians, and pruned by two rankings to the counts of
+        ``rows``.
+        """
         from clod_adapter.cameras import spread
         from clod_adapter.initialization.importance import MOST_VIEWS, removal_error
 
@@ -141,11 +166,15 @@ class Comparisons:
             table = self.tables[PRUNED] = [("base", whole)]
             self.report["base_row"] = whole.as_dict()
             for i, (ours, by, order) in enumerate(jobs, 1):
-                row = self._row(base.select(order[: round(ours.kept)]), 1.0, meter.part(i, len(jobs) + 1, by))
+                row = self._row(
+                    base.select(order[: round(ours.kept)]), 1.0, meter.part(i, len(jobs) + 1, by)
+                )
                 row = replace(row, kept_share=row.kept / len(base))  # of the whole base
                 model = (f"s={ours.virtual_scale:g}", ours)
                 table += [*([] if model in table else [model]), (by, row)]
-                self.report["ranked"].append({"virtual_scale": ours.virtual_scale, "by": by, "row": row.as_dict()})
+                self.report["ranked"].append(
+                    {"virtual_scale": ours.virtual_scale, "by": by, "row": row.as_dict()}
+                )
 
     def match(self, others: Mapping[str, Gaussians], rows: Sequence[Row]) -> None:
         """Measures files at the dial values of ``rows``, and the model at the same counts."""
@@ -154,31 +183,54 @@ class Comparisons:
         cameras = [view.camera for view in self.scene.test]
         dials = [row.virtual_scale for row in rows]
         named = zip(others.items(), labels(list(others)), strict=True)
-        jobs = [(*each, name, s) for each, name in named for s in (dials if each[1].sigma_d is not None else [1.0])]
+        jobs = [
+            (*each, name, s)
+            for each, name in named
+            for s in (dials if each[1].sigma_d is not None else [1.0])
+        ]
         with self.console.meter("compare") as meter:
             for i, (path, other, name, s) in enumerate(jobs):
                 count = mean_kept(other, cameras, s)
                 same = matching_dial(self.model, cameras, count)
                 if abs((kept := mean_kept(self.model, cameras, same)) - count) > CLOSE * count:
                     more = f"{'at most' if kept < count else 'at least'} {kept:,.0f}"
-                    self.console.note(f"{path} keeps {count:,.0f} Gaussians; the model is compared with {more}")
+                    self.console.note(
+                        f"{path} keeps {count:,.0f} Gaussians; the model is compared with {more}"
+                    )
                 listener = meter.part(i, len(jobs), path)
                 theirs, ours = self._row(other, s, listener), self._row(self.model, same, listener)
-                self.tables.setdefault(MATCHED, []).extend([(name, theirs), (f"s={ours.virtual_scale:.4g}", ours)])
-                found = {"model": path, "label": name, "theirs": theirs.as_dict(), "ours": ours.as_dict()}
+                self.tables.setdefault(MATCHED, []).extend(
+                    [(name, theirs), (f"s={ours.virtual_scale:.4g}", ours)]
+                )
+                found = {
+                    "model": path,
+                    "label": name,
+                    "theirs": theirs.as_dict(),
+                    "ours": ours.as_dict(),
+                }
                 self.report["against"].append(found)
 
     def pop(self, max_sv: float) -> None:
         from clod_adapter.evaluation.popping import dial_popping, path_popping
 
         if self.model.sigma_d is None or max_sv <= 1:
-            self.console.note("popping is not measured: there is no dial, or only s = 1 was requested")
+            self.console.note(
+                "popping is not measured: there is no dial, or only s = 1 was requested"
+            )
             return
         test = [view.camera for view in self.scene.test]
-        some = [test[(2 * k + 1) * len(test) // (2 * POPPING_VIEWS)] for k in range(min(POPPING_VIEWS, len(test)))]
-        jobs: list[Any] = [(f"dial, {each.name}", partial(dial_popping, self.model, each, max_sv)) for each in some]
-        ordered = sorted([*test, *(view.camera for view in self.scene.train)], key=lambda camera: camera.name)
-        walk = ordered[max((len(ordered) - PATH_CAMERAS) // 2, 0) :][:PATH_CAMERAS]  # the middle of the capture
+        some = [
+            test[(2 * k + 1) * len(test) // (2 * POPPING_VIEWS)]
+            for k in range(min(POPPING_VIEWS, len(test)))
+        ]
+        jobs: list[Any] = [
+            (f"dial, {each.name}", partial(dial_popping, self.model, each, max_sv)) for each in some
+        ]
+        ordered = sorted(
+            [*test, *(view.camera for view in self.scene.train)], key=lambda camera: camera.name
+        )
+        # the middle of the capture
+        walk = ordered[max((len(ordered) - PATH_CAMERAS) // 2, 0) :][:PATH_CAMERAS]
         if len(walk) > 1:
             path = partial(path_popping, self.model, walk, max_sv)
             jobs.append((f"camera, {walk[0].name} to {walk[-1].name}, s = {max_sv:g}", path))
@@ -191,7 +243,9 @@ class Comparisons:
     def _row(self, gaussians: Gaussians, virtual_scale: float, listener: Listener) -> Row:
         from clod_adapter.evaluation.evaluate import evaluate
 
-        rows = evaluate(gaussians, self.scene.test, [virtual_scale], progress=self.stop.heeding(listener))
+        rows = evaluate(
+            gaussians, self.scene.test, [virtual_scale], progress=self.stop.heeding(listener)
+        )
         if not rows:
             raise Stopped("stopped within a comparison")
         return rows[0]

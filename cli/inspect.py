@@ -29,7 +29,9 @@ SETTINGS = ("max_sv", "iters", "seed", "form")  # of the training settings, thos
 
 def add_arguments(parser: ArgumentParser) -> None:
     given = parser.add_argument_group("input")
-    given.add_argument("file", metavar="FILE", help="a splat, an adapter, or the state of an interrupted run")
+    given.add_argument(
+        "file", metavar="FILE", help="a splat, an adapter, or the state of an interrupted run"
+    )
     parser.set_defaults(quiet=True)
 
 
@@ -50,25 +52,50 @@ def execute(args: Namespace) -> dict[str, Any]:
 def lines_of(found: Inspection) -> list[str]:
     lines = [f"{found.path} ({size(Path(found.path))})", _line("what", found.what)]
     if found.writer:
-        lines.append(_line("written by" if found.writer.startswith("clod-adapter") else "looks like", found.writer))
+        lines.append(
+            _line(
+                "written by" if found.writer.startswith("clod-adapter") else "looks like",
+                found.writer,
+            )
+        )
     lines += splat_lines(found.splat) if found.splat else []
     lines += tensor_lines(found.about) if found.about else []
-    lines += _block("anomaly", [anomaly.says for anomaly in found.anomalies]) + _block("excluded", found.left_out)
+    lines += _block("anomaly", [anomaly.says for anomaly in found.anomalies]) + _block(
+        "excluded", found.left_out
+    )
     lines += _block("note", [note for note in found.notes if not note.startswith(WARNING)])
-    return lines + _block("warning", [note.removeprefix(WARNING) for note in found.notes if note.startswith(WARNING)])
+    return lines + _block(
+        "warning", [note.removeprefix(WARNING) for note in found.notes if note.startswith(WARNING)]
+    )
 
 
 def splat_lines(splat: Splat) -> list[str]:
-    count = f"{splat.count:,}" if splat.count == splat.total else f"{splat.count:,} usable of {splat.total:,}"
-    used = f", of which only {splat.used_sh_degree} is used" if splat.used_sh_degree < splat.sh_degree else ""
+    count = (
+        f"{splat.count:,}"
+        if splat.count == splat.total
+        else f"{splat.count:,} usable of {splat.total:,}"
+    )
+    used = (
+        f", of which only {splat.used_sh_degree} is used"
+        if splat.used_sh_degree < splat.sh_degree
+        else ""
+    )
     lines = [_line("Gaussians", count), _line("harmonics", f"degree {splat.sh_degree}{used}")]
     if splat.encoding:
         names = ", ".join(splat.extra[:6]) + (", ..." if len(splat.extra) > 6 else "")
         more = f", not read: {names}" if splat.extra else ""
         lines.append(_line("layout", f"{splat.encoding}, {len(splat.columns)} properties{more}"))
     lines += _block("says", [comment[:LONGEST] for comment in splat.comments])
-    rows = [*zip("xyz", splat.position, strict=True), ("scale", splat.scale), ("opacity", splat.opacity)]
-    rows += [(name, each) for name, each in (("sigma_d", splat.sigma), ("growth_d", splat.growth)) if each is not None]
+    rows = [
+        *zip("xyz", splat.position, strict=True),
+        ("scale", splat.scale),
+        ("opacity", splat.opacity),
+    ]
+    rows += [
+        (name, each)
+        for name, each in (("sigma_d", splat.sigma), ("growth_d", splat.growth))
+        if each is not None
+    ]
     lines += ["", *spread_table(rows), ""]
     faint = f"{splat.fainter_than_visible:.1%} fainter than 1/255"
     lines.append(_line("shares", f"{faint}; {splat.needles:.1%} needles"))
@@ -81,7 +108,10 @@ def splat_lines(splat: Splat) -> list[str]:
 def spread_table(rows: Sequence[tuple[str, Spread]]) -> list[str]:
     names = ("least", "1 %", "median", "99 %", "greatest")
     lines = [_line("", "".join(f"{name:>11}" for name in names))]
-    return lines + [_line(name, "".join(f"{number:>11.4g}" for number in astuple(spread))) for name, spread in rows]
+    return lines + [
+        _line(name, "".join(f"{number:>11.4g}" for number in astuple(spread)))
+        for name, spread in rows
+    ]
 
 
 def calibration_lines(calibration: Calibration | None) -> list[str]:
@@ -91,7 +121,12 @@ def calibration_lines(calibration: Calibration | None) -> list[str]:
     c, rows = calibration, list(calibration.rows)
     if len(rows) > MOST_ROWS:
         rows = [rows[round(k * (len(rows) - 1) / (MOST_ROWS - 1))] for k in range(MOST_ROWS)]
-    lines = [_line("calibration", f"against {c.against}, {c.views} views of {c.width}x{c.height}, on {c.machine}")]
+    lines = [
+        _line(
+            "calibration",
+            f"against {c.against}, {c.views} views of {c.width}x{c.height}, on {c.machine}",
+        )
+    ]
     lines.append(_line("", f"{'s':>6}{'Gaussians':>12}{'PSNR':>9}{'SSIM':>8}{'frame ms':>10}"))
     numbers = "{:>6.3g}{:>12,.0f}{:>9.2f}{:>8.3f}{:>10.1f}"
     return lines + [_line("", numbers.format(*astuple(row))) for row in rows]
@@ -101,12 +136,27 @@ def tensor_lines(about: dict[str, Any]) -> list[str]:
     lines = [_line("Gaussians", f"{about['count']:,}")]
     if about["kind"] == "state":
         after = f"{about['steps']} steps in {duration(about['seconds'])}, loss {about['loss']:.4g}"
-        return [*lines, _line("after", after), _line("of", ", ".join(f"{k} {v}" for k, v in about["belongs"].items()))]
+        return [
+            *lines,
+            _line("after", after),
+            _line("of", ", ".join(f"{k} {v}" for k, v in about["belongs"].items())),
+        ]
     lines.append(_line("for the file", f"with SHA-256 {about['base']}"))
-    lines.append(_line("changes", ", ".join(f"{k} ({v})" for k, v in about["updates"].items()) or "only the dial"))
-    settings = ", ".join(f"{key} {value}" for key, value in about["config"].items() if key in SETTINGS)
+    lines.append(
+        _line(
+            "changes",
+            ", ".join(f"{k} ({v})" for k, v in about["updates"].items()) or "only the dial",
+        )
+    )
+    settings = ", ".join(
+        f"{key} {value}" for key, value in about["config"].items() if key in SETTINGS
+    )
     lines.append(_line("trained with", settings or "unknown settings"))
-    columns = {name: about[key] for name, key in (("sigma_d", "sigma"), ("growth_d", "growth")) if about[key]}
+    columns = {
+        name: about[key]
+        for name, key in (("sigma_d", "sigma"), ("growth_d", "growth"))
+        if about[key]
+    }
     lines += ["", *spread_table([*columns.items()]), ""]
     lines.append(_line("dial", f"{' and '.join(columns)}, {_settings(about['attenuation'])}"))
     return lines + calibration_lines(about["calibration"])
@@ -120,7 +170,9 @@ def _settings(attenuation: AttenuationConfig) -> str:
 
 def _block(name: str, says: Sequence[str]) -> list[str]:
     lines = [_line(name if k == 0 else "", line) for k, line in enumerate(says[:MOST_LINES])]
-    return lines + ([_line("", f"and {len(says) - MOST_LINES} more: --json")] if len(says) > MOST_LINES else [])
+    return lines + (
+        [_line("", f"and {len(says) - MOST_LINES} more: --json")] if len(says) > MOST_LINES else []
+    )
 
 
 def _line(name: str, says: str) -> str:

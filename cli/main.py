@@ -23,8 +23,10 @@ from .shared.outputs import Outputs, claimed, jsonable
 
 PROG = "clod-adapt"
 INTERRUPTED = 130  # exit code
-LIBRARY = ("torch", "numba", "clod_adapter.io.scene.load", "clod_adapter.training.loop")  # what most commands import
-NEAR = 0.75  # similarity of a misspelt command: two neighbouring letters exchanged in "view" have it
+# what most commands import
+LIBRARY = ("torch", "numba", "clod_adapter.io.scene.load", "clod_adapter.training.loop")
+# similarity of a misspelt command: two neighbouring letters exchanged in "view" have it
+NEAR = 0.75
 REPORT = "please report it, with the lines above, as an issue of this program's repository"
 
 FIRST = f"""\
@@ -35,9 +37,10 @@ Give a trained 3D Gaussian splat a quality dial:
   {PROG} --help             all options and commands
 """
 
-# Each is a module, imported on first use, with DESCRIPTION, USAGE, EPILOG, and execute(args), which gives the rest of
-# what --json prints, or None. It may have add_arguments(parser), check(args), and outputs(args), which is called after
-# it. It imports torch within functions, so that --help and the errors of check take no second. Adapting has no name.
+# Each is a module, imported on first use, with DESCRIPTION, USAGE, EPILOG, and execute(args), which
+# gives the rest of what --json prints, or None. It may have add_arguments(parser), check(args), and
+# outputs(args), which is called after it. It imports torch within functions, so that --help and the
+# errors of check take no second. Adapting has no name.
 COMMANDS = {
     "view": "Look at a file in the browser, and turn its dial.",
     "inspect": "Print what a file is and what it contains.",
@@ -53,7 +56,9 @@ WITHOUT_TORCH = ("inspect", "doctor")  # which load it where they need it
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Runs a command line; returns its exit code: 2 for bad input, 130 if interrupted without a result, 1 for a bug."""
+    """Runs a command line; returns its exit code: 2 for bad input, 130 if interrupted without a
+    result, 1 for a bug.
+    """
     words = sys.argv[1:] if argv is None else argv
     with process.unbreakable_streams():
         try:
@@ -61,11 +66,15 @@ def main(argv: list[str] | None = None) -> int:
                 return _main(words)
         except Exception:
             traceback.print_exc()
-            return refuse(f"this is a bug in {PROG} {package_version()}, not in the input: {REPORT}", 1, words)
+            return refuse(
+                f"this is a bug in {PROG} {package_version()}, not in the input: {REPORT}", 1, words
+            )
 
 
 def refuse(why: str, code: int, words: list[str]) -> int:
-    """Prints why a command failed, with --json also as the one object on stdout; returns the exit code."""
+    """Prints why a command failed, with --json also as the one object on stdout; returns the exit
+    code.
+    """
     line = f"{PROG}: {why}" if code == INTERRUPTED else f"{PROG}: error: {why}"
     print(line, file=sys.stderr)
     if "--json" in words:
@@ -80,8 +89,14 @@ def _main(words: list[str]) -> int:
             if not words:
                 print(FIRST, end="")
                 return 0
-            if not name and not os.path.exists(words[0]) and (near := get_close_matches(words[0], COMMANDS, 1, NEAR)):
-                raise ClodError(f"{words[0]}: no such file or command; did you mean {PROG} {near[0]}?")
+            if (
+                not name
+                and not os.path.exists(words[0])
+                and (near := get_close_matches(words[0], COMMANDS, 1, NEAR))
+            ):
+                raise ClodError(
+                    f"{words[0]}: no such file or command; did you mean {PROG} {near[0]}?"
+                )
             args = build_parser(name).parse_args(words[1:] if name else words)
             return run_here(name, args)
     except ClodError as error:
@@ -94,7 +109,9 @@ def _main(words: list[str]) -> int:
         if not isinstance(error, OSError):
             raise
         name = f"{error.filename}: " if error.filename is not None else ""
-        return refuse(f"{name}{error.strerror or error}; check the path and its permissions", 2, words)
+        return refuse(
+            f"{name}{error.strerror or error}; check the path and its permissions", 2, words
+        )
 
 
 def command_of(name: str) -> ModuleType:
@@ -102,7 +119,9 @@ def command_of(name: str) -> ModuleType:
 
 
 def run_here(name: str, args: argparse.Namespace) -> int:
-    """Runs a command and returns its exit code. Of several processes the first runs it; the others only train."""
+    """Runs a command and returns its exit code. Of several processes the first runs it; the others
+    only train.
+    """
     launch = process.launched()
     if launch.size == 1:
         return run(name, args)

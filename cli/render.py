@@ -32,10 +32,16 @@ def add_arguments(parser: ArgumentParser) -> None:
     text = "photographs whose cameras to render: names, all, or held-out (default)"
     given.add_argument("--views", metavar="NAME", nargs="+", default=["held-out"], help=text)
     dial = parser.add_argument_group("dial values, one of")
-    common.add_dial_options(dial, "dial values (default: 1)", "(mean over the images)", several=True)
+    common.add_dial_options(
+        dial, "dial values (default: 1)", "(mean over the images)", several=True
+    )
     output = parser.add_argument_group("output")
-    output.add_argument("-o", "--out", metavar="FOLDER", required=True, help="output folder; made if missing")
-    output.add_argument("--beside", action="store_true", help="put the photograph left of the renders")
+    output.add_argument(
+        "-o", "--out", metavar="FOLDER", required=True, help="output folder; made if missing"
+    )
+    output.add_argument(
+        "--beside", action="store_true", help="put the photograph left of the renders"
+    )
     common.add_device(output, "render")
 
 
@@ -47,9 +53,12 @@ def check(args: Namespace) -> None:
     cameras = find_cameras(scene)
     places = [folder.resolve() for folder in (scene, cameras.parent, cameras.parent.parent)]
     folders = photograph_folders(scene, cameras)
-    if cameras.is_dir():  # folders next to a model's images/ are free; a transforms.json may name any file below it
+    # folders next to a model's images/ are free; a transforms.json may name any file below it
+    if cameras.is_dir():
         folders.remove(scene)
-    if out.resolve() in places or any(out.resolve().is_relative_to(folder.resolve()) for folder in folders):
+    if out.resolve() in places or any(
+        out.resolve().is_relative_to(folder.resolve()) for folder in folders
+    ):
         raise ClodError(f"{out}: the scene's own photographs may be there; choose another --out")
 
 
@@ -70,32 +79,54 @@ def execute(args: Namespace) -> dict[str, Any]:
     solved = solve_dials(args, model, [view.camera for view in views], console)
     dials = choose_dials(solved or [1.0], model, console)
     gaussians = model.gaussians.without_empty_bands()
-    pictures = write_images(gaussians, [*zip(images, views, strict=True)], dials, args.beside, console)
+    pictures = write_images(
+        gaussians, [*zip(images, views, strict=True)], dials, args.beside, console
+    )
     print(f"wrote {len(pictures)} image{'s' * (len(pictures) != 1)} to {out}")
     for k, dial in enumerate(dials):
         kept, error = (fmean(picture[key][k] for picture in pictures) for key in ("kept", "psnr"))
-        about = f"{kept:,.0f} of {gaussians.whole:,} Gaussians, {error:.2f} dB, means over the images"
+        about = (
+            f"{kept:,.0f} of {gaussians.whole:,} Gaussians, {error:.2f} dB, means over the images"
+        )
         print(f"  s = {dial:.5g}: {about}")
     return {
-        "model": args.model, "scene": args.images, "base_count": gaussians.whole, "virtual_scales": dials,
-        "pictures": pictures, "interrupted": len(pictures) < len(views), "notes": console.notes,
-        "seconds": watch.report(), "outputs": {"folder": args.out},
-    }  # fmt: skip
+        "model": args.model,
+        "scene": args.images,
+        "base_count": gaussians.whole,
+        "virtual_scales": dials,
+        "pictures": pictures,
+        "interrupted": len(pictures) < len(views),
+        "notes": console.notes,
+        "seconds": watch.report(),
+        "outputs": {"folder": args.out},
+    }
 
 
 def image_names(views: Sequence[View]) -> list[Path]:
-    """The PNG's name for each view: that of its photograph, with its suffix only where names would collide."""
+    """The PNG's name for each view: that of its photograph, with its suffix only where names would
+    collide.
+    """
     paths = [Path(file_name(str(Path(*PureWindowsPath(view.camera.name).parts)))) for view in views]
     short = [path.with_suffix(".png") for path in paths]
-    return short if len(set(short)) == len(short) else [path.with_name(f"{path.name}.png") for path in paths]
+    return (
+        short
+        if len(set(short)) == len(short)
+        else [path.with_name(f"{path.name}.png") for path in paths]
+    )
 
 
 def write_images(
-    gaussians: Gaussians, views: Sequence[tuple[Path, View]], dials: Sequence[float], beside: bool, console: Console
+    gaussians: Gaussians,
+    views: Sequence[tuple[Path, View]],
+    dials: Sequence[float],
+    beside: bool,
+    console: Console,
 ) -> list[dict[str, Any]]:
-    """Writes a file per view, until Ctrl-C: the dial values from left to right, after the photograph if asked for.
+    """Writes a file per view, until Ctrl-C: the dial values from left to right, after the
+    photograph if asked for.
 
-    Gives of each the view, the file, and per dial value the Gaussians kept, and PSNR (dB) against the photograph.
+    Gives of each the view, the file, and per dial value the Gaussians kept, and PSNR (dB) against
+    the photograph.
     """
     import torch
 
@@ -111,7 +142,9 @@ def write_images(
             write_png(file, torch.cat([view.image, *panels] if beside else panels, dim=1))
             kept = [int(rendering.kept.sum()) for rendering in shown]
             errors = [psnr(rendering.image, view.image) for rendering in shown]
-            written.append({"view": view.camera.name, "file": str(file), "kept": kept, "psnr": errors})
+            written.append(
+                {"view": view.camera.name, "file": str(file), "kept": kept, "psnr": errors}
+            )
             meter.update(len(written) / len(views), f"{len(written)}/{len(views)}")
             if stop.requests:
                 break

@@ -1,4 +1,6 @@
-"""``clod-adapt robustness``: adapts checkpoints at several ranges of the dial; writes a figure, a CSV and a JSON."""
+"""``clod-adapt robustness``: adapts checkpoints at several ranges of the dial; writes a figure, a
+CSV and a JSON.
+"""
 
 from __future__ import annotations
 
@@ -31,14 +33,18 @@ ADAPTER = ".safetensors"  # suffix
 
 def add_arguments(parser: ArgumentParser) -> None:
     given = parser.add_argument_group("input")
-    given.add_argument("ply", metavar="PLY", nargs="+", help="checkpoints of one scene; never modified")
+    given.add_argument(
+        "ply", metavar="PLY", nargs="+", help="checkpoints of one scene; never modified"
+    )
     common.add_reading(given)
     output = parser.add_argument_group("output")
     text = "output folder; resumed if it exists (default: robustness)"
     output.add_argument("-o", "--out", metavar="DIR", default="robustness", help=text)
     training = parser.add_argument_group("training")
     text = "largest dial value of each adaptation; 1 trains at full detail only (default: 1 3 5 7)"
-    training.add_argument("--max-sv", metavar="S", type=float, nargs="+", default=[1.0, 3.0, 5.0, 7.0], help=text)
+    training.add_argument(
+        "--max-sv", metavar="S", type=float, nargs="+", default=[1.0, 3.0, 5.0, 7.0], help=text
+    )
     common.add_settings(training, without=["max_sv"])
 
 
@@ -64,7 +70,9 @@ def result_files(folder: Path) -> dict[str, Path]:
 
 
 def cell_file(folder: Path, label: str, max_sv: float | None) -> Path:
-    """The rows of a checkpoint's cell: at a range, or of the baseline for None. The adapter is beside them."""
+    """The rows of a checkpoint's cell: at a range, or of the baseline for None. The adapter is
+    beside them.
+    """
     return folder / (f"{label}_base.json" if max_sv is None else f"{label}_sv{max_sv:g}.json")
 
 
@@ -77,17 +85,25 @@ class Cell:
     config: AdaptConfig | None
     points: tuple[float, ...]  # dial values, or shares of the baseline, that are measured
     scene_sha256: str  # of the photographs
-    file: Path  # its rows, as JSON, which mark it as finished; the adapter, which a baseline has not, is beside them
+    # its rows, as JSON, which mark it as finished; the adapter, which a baseline has not, is beside
+    # them
+    file: Path
 
     @property
     def key(self) -> dict[str, Any]:
         """Everything that the result depends on, as JSON."""
-        drawn, config = self.checkpoint.gaussians.screen_filter, asdict(self.config) if self.config else None
+        drawn, config = (
+            self.checkpoint.gaussians.screen_filter,
+            asdict(self.config) if self.config else None,
+        )
         return {
-            "version": package_version(), "config": config, "points": list(self.points),
-            "checkpoint_sha256": self.checkpoint.fingerprint, "scene_sha256": self.scene_sha256,
+            "version": package_version(),
+            "config": config,
+            "points": list(self.points),
+            "checkpoint_sha256": self.checkpoint.fingerprint,
+            "scene_sha256": self.scene_sha256,
             **({"screen_filter": repr(drawn)} if drawn != CLASSIC else {}),
-        }  # fmt: skip
+        }
 
     def read(self) -> dict[str, Any] | None:
         """The finished cell, or None if there is none with this key."""
@@ -96,7 +112,11 @@ class Cell:
         except (OSError, ValueError):
             return None
         same = isinstance(found, dict) and found.get("key") == self.key
-        return found if same and (self.config is None or self.file.with_suffix(ADAPTER).is_file()) else None
+        return (
+            found
+            if same and (self.config is None or self.file.with_suffix(ADAPTER).is_file())
+            else None
+        )
 
     def run(self, scene: Scene, progress: Listener) -> dict[str, Any]:
         """Measures; writes the adapter and then the rows."""
@@ -113,11 +133,15 @@ class Cell:
         if result.adapter:
             save_adapter(adapter_file, result.adapter)
         cell = {
-            "checkpoint": as_text(self.label), "max_sv": self.config and self.config.max_sv, "rows": result.rows,
+            "checkpoint": as_text(self.label),
+            "max_sv": self.config and self.config.max_sv,
+            "rows": result.rows,
             "adapter": str(adapter_file) if result.adapter else None,
-            "seconds": round(result.seconds, 3), "distribution": result.distribution, "machine": machine(),
+            "seconds": round(result.seconds, 3),
+            "distribution": result.distribution,
+            "machine": machine(),
             "key": self.key,
-        }  # fmt: skip
+        }
         write_report(self.file, cell)
         return cell
 
@@ -130,7 +154,12 @@ def execute(args: Namespace) -> dict[str, Any]:
     from .shared.inputs import align_shown, prepare_kernels, read_inputs
     from .shared.measure import Stopwatch
 
-    console, watch, stop, required = Console(args.quiet), Stopwatch(), GracefulStop(), not args.misaligned_ok
+    console, watch, stop, required = (
+        Console(args.quiet),
+        Stopwatch(),
+        GracefulStop(),
+        not args.misaligned_ok,
+    )
     checkpoints, scene = read_inputs(args, args.ply, console, training=True, required=required)
     for each in checkpoints[1:]:
         if align_shown(each, scene, console, required=required)[1]["frame"]:
@@ -138,11 +167,15 @@ def execute(args: Namespace) -> dict[str, Any]:
     for each in checkpoints:
         if each.gaussians.sigma_d is not None:
             console.note(f"the dial of {each.path} is ignored")
-        prepare_kernels(console, each.gaussians.means.device, screen_filter=each.gaussians.screen_filter)
+        prepare_kernels(
+            console, each.gaussians.means.device, screen_filter=each.gaussians.screen_filter
+        )
     bases = dict(zip(labels(args.ply), checkpoints, strict=True))
     configs, sha256 = common.make_configs(args), scene_fingerprint(scene)
     # Every range is measured at the dial values of the widest one and at its own end.
-    dials = tuple(sorted({*report_dials(configs[-1].max_sv), *(config.max_sv for config in configs)}))
+    dials = tuple(
+        sorted({*report_dials(configs[-1].max_sv), *(config.max_sv for config in configs)})
+    )
     cells = dict[str, Cell]()
     for label, base in bases.items():
         for config in (None, *configs):
@@ -165,15 +198,27 @@ def execute(args: Namespace) -> dict[str, Any]:
             raise Stopped("stopped before the first cell was finished")
         files, missing = result_files(Path(args.out)), [name for name in cells if name not in found]
         report = {
-            "command": "robustness", "version": package_version(), "scene": args.images,
+            "command": "robustness",
+            "version": package_version(),
+            "scene": args.images,
             "checkpoints": [
-                {"checkpoint": label, "model": str(each.path), "count": len(each.gaussians), "sha256": each.fingerprint}
+                {
+                    "checkpoint": label,
+                    "model": str(each.path),
+                    "count": len(each.gaussians),
+                    "sha256": each.fingerprint,
+                }
                 for label, each in bases.items()
             ],
             "cells": [found[name] for name in cells if name in found],
-            "missing": missing, "interrupted": bool(missing), "notes": console.notes, "views": len(scene.test),
-            "machine": machine(), "seconds": watch.report(), "outputs": {k: str(v) for k, v in files.items()},
-        }  # fmt: skip
+            "missing": missing,
+            "interrupted": bool(missing),
+            "notes": console.notes,
+            "views": len(scene.test),
+            "machine": machine(),
+            "seconds": watch.report(),
+            "outputs": {k: str(v) for k, v in files.items()},
+        }
         write_results(report, files, Path(args.images).resolve().name)
     print_cells(report)
     print("\n" + "\n".join(map(str, files.values())) + f"\n\n{duration(watch.total())} in all")
@@ -183,16 +228,23 @@ def execute(args: Namespace) -> dict[str, Any]:
 def write_results(report: dict[str, Any], files: dict[str, Path], scene: str) -> None:
     from clod_adapter.report.robustness_figure import robustness_figure
 
-    title = f"{as_text(scene)}: the dial after the fact, by range; mean of {report['views']} held-out photographs"
+    title = (
+        f"{as_text(scene)}: the dial after the fact, by range; mean of {report['views']} held-out"
+        " photographs"
+    )
     robustness_figure(files["png"], report["cells"], title)
     with atomic_path(files["csv"]) as part, open(part, "w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, ["checkpoint", "max_sv", "within_range", *report["cells"][0]["rows"][0]])
+        writer = csv.DictWriter(
+            file, ["checkpoint", "max_sv", "within_range", *report["cells"][0]["rows"][0]]
+        )
         writer.writeheader()
         for cell in report["cells"]:
             name, limit = cell["checkpoint"], cell["max_sv"]
             for row in cell["rows"]:
                 inside = "" if limit is None else row["virtual_scale"] <= limit
-                writer.writerow({"checkpoint": name, "max_sv": limit or "base", "within_range": inside, **row})
+                writer.writerow(
+                    {"checkpoint": name, "max_sv": limit or "base", "within_range": inside, **row}
+                )
     write_report(files["json"], report)
 
 
@@ -202,7 +254,10 @@ def print_cells(report: dict[str, Any]) -> None:
     width = max(map(len, ["checkpoint", *names]))
     print(f"\n{'checkpoint':<{width}}  range     at the first              at the last")
     for checkpoint, cell in zip(names, report["cells"], strict=True):
-        ends = [f"{row['psnr'] or 0:6.2f} dB @ {row['kept']:9,.0f}" for row in (cell["rows"][0], cell["rows"][-1])]
+        ends = [
+            f"{row['psnr'] or 0:6.2f} dB @ {row['kept']:9,.0f}"
+            for row in (cell["rows"][0], cell["rows"][-1])
+        ]
         name = "base" if cell["max_sv"] is None else f"[1, {cell['max_sv']:g}]"
         print(f"{checkpoint:<{width}}  {name:<8}  {ends[0]}    {ends[1]}")
     if report["missing"]:

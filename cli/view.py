@@ -24,32 +24,52 @@ from .shared.outputs import jsonable
 from .shared.process import interrupt_as_stopped
 
 MODEL, BASE = "/files/model", "/files/base"
-IN_TERMINAL = ("lynx", "w3m", "links", "links2", "elinks", "www-browser")  # they would take over the terminal
+# they would take over the terminal
+IN_TERMINAL = ("lynx", "w3m", "links", "links2", "elinks", "www-browser")
 
 
 def add_arguments(parser: ArgumentParser) -> None:
     given = parser.add_argument_group("input")
-    text = "an adapted file, or a plain one, which has no dial; several, or a folder of them, to switch between"
+    text = (
+        "an adapted file, or a plain one, which has no dial; several, or a folder of them, to"
+        " switch between"
+    )
     given.add_argument("models", metavar="MODEL.ply", nargs="+", help=text)
-    given.add_argument("--base", metavar="BASE.ply", help="the checkpoint, or another file, to compare with")
+    given.add_argument(
+        "--base", metavar="BASE.ply", help="the checkpoint, or another file, to compare with"
+    )
     common.add_reading(given, "scene folder, for its cameras only", photographs=False)
     page = parser.add_argument_group("page")
     initial: Any = page.add_mutually_exclusive_group()
-    text = "initial dial value (default: 1 with photographs, else everything; then it holds 30 frames per second)"
+    text = (
+        "initial dial value (default: 1 with photographs, else everything; then it holds 30 frames"
+        " per second)"
+    )
     initial.add_argument("--sv", metavar="S", type=float, nargs=1, help=text)
     common.add_device_preset(initial)
-    page.add_argument("--port", metavar="P", type=int, default=0, help="port of the server (default: a free one)")
+    page.add_argument(
+        "--port", metavar="P", type=int, default=0, help="port of the server (default: a free one)"
+    )
     page.add_argument("--no-browser", action="store_true", help="print the address only")
 
 
 def view_files(given: Sequence[str]) -> list[str]:
-    """The files to show: those given, and of a folder the checkpoints in it, by name, numbers by their value."""
-    return [file for path in given for file in (_files_in(Path(path)) if Path(path).is_dir() else [path])]
+    """The files to show: those given, and of a folder the checkpoints in it, by name, numbers by
+    their value.
+    """
+    return [
+        file
+        for path in given
+        for file in (_files_in(Path(path)) if Path(path).is_dir() else [path])
+    ]
 
 
 def _files_in(folder: Path) -> list[str]:
     def natural(path: Path) -> list[tuple[int, str]]:
-        return [(int(part), "") if part.isdigit() else (0, part) for part in re.split(r"(\d+)", path.name)]
+        return [
+            (int(part), "") if part.isdigit() else (0, part)
+            for part in re.split(r"(\d+)", path.name)
+        ]
 
     splats = []
     for path in sorted(folder.iterdir(), key=natural):
@@ -64,28 +84,35 @@ def _files_in(folder: Path) -> list[str]:
 
 def check(args: Namespace) -> None:
     if not 0 <= args.port < 1 << 16:
-        raise ClodError(f"--port is {args.port}, it must be between 1 and 65535, or 0 for a free one")
+        raise ClodError(
+            f"--port is {args.port}, it must be between 1 and 65535, or 0 for a free one"
+        )
     files = view_files(args.models)
     common.check_inputs(args.images, *files, *([args.base] if args.base else []))
     common.check_dials(args, files[0])
 
 
 def execute(args: Namespace) -> None:
-    """Prints the address, or with --json the report, and serves the page until it is interrupted."""
+    """Prints the address, or with --json the report, and serves the page until it is
+    interrupted.
+    """
     from clod_adapter.viewer.server import Server
 
     console = Console(args.quiet)
     answers, report = make_page(args, console)
     with Server(answers, args.port) as server:
         report |= {"url": server.url, "port": server.port}
-        # Here, and not by main after the command: a script needs the address while the page is served.
+        # Here, and not by main after the command: a script needs the address while the page is
+        # served.
         shown = json.dumps(jsonable(report)) if args.json else f"{server.url}  (Ctrl-C ends)"
         # Around print: a reader of the address may interrupt before the server waits.
         with suppress(Stopped), interrupt_as_stopped():
             print(shown, file=sys.__stdout__ if args.json else None, flush=True)
             browser = None if args.no_browser else find_browser()
             if not args.no_browser and not (browser and browser.open(server.url)):
-                console.say(f"no browser found; open {server.url}, from another machine through ssh -L")
+                console.say(
+                    f"no browser found; open {server.url}, from another machine through ssh -L"
+                )
             server.serve_forever()
         console.say("ended")
 
@@ -98,19 +125,29 @@ def make_page(args: Namespace, console: Console) -> tuple[dict[str, Any], dict[s
     from .shared.inputs import read_cameras, read_checkpoint, with_filter
     from .shared.measure import solve_dials
 
-    files, read = view_files(args.models), partial(read_checkpoint, console=console, activated=args.activated)
+    files, read = (
+        view_files(args.models),
+        partial(read_checkpoint, console=console, activated=args.activated),
+    )
     model = with_filter(read(files[0]), args, console)
-    models = [model, *(with_filter(read(path, origin=model.origin), args, console) for path in files[1:])]
+    models = [
+        model,
+        *(with_filter(read(path, origin=model.origin), args, console) for path in files[1:]),
+    ]
     base = with_filter(read(args.base, origin=model.origin), args, console) if args.base else None
     if args.device_preset and args.images is None and not model.viewpoints:
-        raise ClodError(f"{model.path}: stores no cameras, which --device-preset needs; give --images")
+        raise ClodError(
+            f"{model.path}: stores no cameras, which --device-preset needs; give --images"
+        )
     if base and args.antialiasing == "auto" and not base.filter_known:  # drawn as the model is
         drawn = model.gaussians.screen_filter
         base = replace(base, gaussians=base.gaussians.replace(screen_filter=drawn))
     cameras = read_cameras(model, args.images, console) if args.images else []
     dials = solve_dials(args, model, cameras or model.viewpoints, console)
     opening = common.initial_dial(dials[0], model.gaussians.attenuation, console) if dials else None
-    payloads = {MODEL if k == 0 else f"/files/{k}": Payload.of(each) for k, each in enumerate(models)}
+    payloads = {
+        MODEL if k == 0 else f"/files/{k}": Payload.of(each) for k, each in enumerate(models)
+    }
     names = [payload.name for payload in payloads.values()]
     if len({*names}) < len(names):  # with their folders, to tell them apart
         names = [as_text("/".join(Path(each.path).absolute().parts[-2:])) for each in models]
@@ -118,14 +155,28 @@ def make_page(args: Namespace, console: Console) -> tuple[dict[str, Any], dict[s
     payloads |= {BASE: Payload.of(base)} if base else {}
     base_entry = {"name": payloads[BASE].name, "href": BASE} if base else None
     shown, placed = cameras or model.cameras, model.placed and not cameras
-    config = page_config(entries, base_entry, [camera_entry(each, placed) for each in shown], opening)
+    config = page_config(
+        entries, base_entry, [camera_entry(each, placed) for each in shown], opening
+    )
     page = b"".join(document(config))
-    answers = {path: Response("application/octet-stream", each.size, each.blocks) for path, each in payloads.items()}
-    answers["/"] = Response("text/html; charset=utf-8", len(page), lambda: (page,), policy("'self'"))
+    answers = {
+        path: Response("application/octet-stream", each.size, each.blocks)
+        for path, each in payloads.items()
+    }
+    answers["/"] = Response(
+        "text/html; charset=utf-8", len(page), lambda: (page,), policy("'self'")
+    )
     return answers, {
-        "command": "view", "version": package_version(), "model": files[0], "files": files, "base": args.base,
-        "scene": args.images, "base_count": len(model.gaussians), "cameras": len(cameras), "notes": console.notes,
-    }  # fmt: skip
+        "command": "view",
+        "version": package_version(),
+        "model": files[0],
+        "files": files,
+        "base": args.base,
+        "scene": args.images,
+        "base_count": len(model.gaussians),
+        "cameras": len(cameras),
+        "notes": console.notes,
+    }
 
 
 def find_browser() -> webbrowser.BaseBrowser | None:
@@ -138,7 +189,8 @@ def find_browser() -> webbrowser.BaseBrowser | None:
         return browser
     if "BROWSER" not in os.environ or browser.basename in IN_TERMINAL:
         return None
-    return webbrowser.BackgroundBrowser([browser.name, *browser.args])  # an editor's, whose end is not waited for
+    # an editor's, whose end is not waited for
+    return webbrowser.BackgroundBrowser([browser.name, *browser.args])
 
 
 DESCRIPTION = """\

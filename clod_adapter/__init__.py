@@ -15,8 +15,9 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 if "torch" not in sys.modules:
-    # GNU OpenMP's idle threads spin by default and take the cores from the splatting threads: measured at
-    # up to six times the time of a training step. Only the first import of torch reads this.
+    # GNU OpenMP's idle threads spin by default and take the cores from the splatting threads:
+    # measured at up to six times the time of a training step. Only the first import of torch reads
+    # this.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 if TYPE_CHECKING:
@@ -44,32 +45,37 @@ if TYPE_CHECKING:
     from clod_adapter.training.planner import make_plan
     from clod_adapter.training.pseudo_views import add_pseudo_views, render_pseudo_views
 
-# Imported on first use: torch takes a second or two, which the command's --help and most of its errors do without.
-_homes = {name: f"{__name__}.{home}" for home, names in {
-    "adapter": ("Adapter", "detach", "extract", "with_dial"),
-    "evaluation.budget": ("DialValue", "dial_for"),
-    "calibration": ("Calibration",),
-    "cameras": ("Camera", "Scene", "View"),
-    "config": ("AdaptConfig", "AttenuationConfig", "ScreenFilter"),
-    "errors": ("ClodError",),
-    "evaluation.evaluate": ("evaluate",),
-    "bake": ("bake", "bake_levels", "order_by_extinction"),
-    "gaussians": ("Gaussians",),
-    "hook": ("Hold", "Hook"),
-    "integrations.splats": ("from_gsplat", "to_gsplat"),
-    "io.adapter_file": ("load_adapter", "save_adapter"),
-    "io.scene.load": ("load_scene",),
-    "io.checkpoint": ("Checkpoint", "load", "save"),
-    "training.camera_placement": ("place_cameras",),
-    "training.pseudo_views": ("add_pseudo_views", "render_pseudo_views"),
-    "training.plan": ("Decision", "Override", "Plan"),
-    "training.planner": ("make_plan",),
-    "pipeline": ("Result", "adapt_checkpoint"),
-    "progress": ("Phase", "Progress", "Stopped"),
-    "render": ("Rendering", "render"),
-    "training.dial": ("Dial", "attach"),
-    "training.loop": ("Adapted", "adapt"),
-}.items() for name in names}  # fmt: skip
+# Imported on first use: torch takes a second or two, which the command's --help and most of its
+# errors do without.
+_homes = {
+    name: f"{__name__}.{home}"
+    for home, names in {
+        "adapter": ("Adapter", "detach", "extract", "with_dial"),
+        "evaluation.budget": ("DialValue", "dial_for"),
+        "calibration": ("Calibration",),
+        "cameras": ("Camera", "Scene", "View"),
+        "config": ("AdaptConfig", "AttenuationConfig", "ScreenFilter"),
+        "errors": ("ClodError",),
+        "evaluation.evaluate": ("evaluate",),
+        "bake": ("bake", "bake_levels", "order_by_extinction"),
+        "gaussians": ("Gaussians",),
+        "hook": ("Hold", "Hook"),
+        "integrations.splats": ("from_gsplat", "to_gsplat"),
+        "io.adapter_file": ("load_adapter", "save_adapter"),
+        "io.scene.load": ("load_scene",),
+        "io.checkpoint": ("Checkpoint", "load", "save"),
+        "training.camera_placement": ("place_cameras",),
+        "training.pseudo_views": ("add_pseudo_views", "render_pseudo_views"),
+        "training.plan": ("Decision", "Override", "Plan"),
+        "training.planner": ("make_plan",),
+        "pipeline": ("Result", "adapt_checkpoint"),
+        "progress": ("Phase", "Progress", "Stopped"),
+        "render": ("Rendering", "render"),
+        "training.dial": ("Dial", "attach"),
+        "training.loop": ("Adapted", "adapt"),
+    }.items()
+    for name in names
+}
 
 
 class _Lazy(ModuleType):
@@ -80,7 +86,8 @@ class _Lazy(ModuleType):
         return value
 
     def __setattr__(self, name: str, value: Any) -> None:
-        # Importing a submodule binds its name in the package, where the function of that name (render) stands.
+        # Importing a submodule binds its name in the package, where the function of that name
+        # (render) stands.
         if not (name in _homes and isinstance(value, ModuleType)):
             super().__setattr__(name, value)
 

@@ -1,4 +1,6 @@
-"""The adapter: what training adds to a checkpoint, small, exact and removable. Training writes what it gives."""
+"""The adapter: what training adds to a checkpoint, small, exact and removable. Training writes what
+it gives.
+"""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -23,24 +25,31 @@ DIAL = ("sigma_d", "growth_d")
 
 @dataclass(frozen=True)
 class Adapter:
-    """A learned dial and the light update of the other attributes; applied to its base it gives the result bit for bit.
+    """A learned dial and the light update of the other attributes; applied to its base it gives the
+    result bit for bit.
 
     Attributes:
         sigma_d: ``[N]`` float32, finite.
         attenuation: how sigma_d is to be read.
-        updates: of what changed, in its shape: differences from the base (float16), or new values (float32).
+        updates: of what changed, in its shape: differences from the base (float16), or new values
+            (float32).
         base_fingerprint: SHA-256 of the checkpoint file it was trained on, hex.
         config: the training config, JSON-able, for the record.
-        version: of the package that made it; it stands in the header of the PLY, which is so the same again.
-        calibration: what the result's dial values keep, cost and take, where that was measured; in the header too.
+        version: of the package that made it; it stands in the header of the PLY, which is so the
+            same again.
+        calibration: what the result's dial values keep, cost and take, where that was measured; in
+            the header too.
         origin: ``[3]`` what the base's means were relative to, world units (``Checkpoint.origin``).
         screen_filter: that it was trained with, and the result is drawn with.
-        growth_d: ``[N]`` float32, finite, exponents of the growth of the scales. None for no growth.
-        added: the ATTRIBUTES of far Gaussians, float32, which follow the base's. None without; else updates are empty.
+        growth_d: ``[N]`` float32, finite, exponents of the growth of the scales. None for no
+            growth.
+        added: the ATTRIBUTES of far Gaussians, float32, which follow the base's. None without; else
+            updates are empty.
         notes: of reading its file: settings that were ignored or filled in.
 
     Raises:
-        ClodError: a tensor has the wrong type or shape, sigma_d or growth_d is not finite, or version is no plain text.
+        ClodError: a tensor has the wrong type or shape, sigma_d or growth_d is not finite, or
+            version is no plain text.
     """
 
     sigma_d: Tensor
@@ -68,23 +77,42 @@ class Adapter:
             sound = column.shape == (count,) and column.dtype == torch.float32
             require(sound, f"Adapter.{name}", _kind(column), f"float32 [{count}]")
             if not column.isfinite().all():
-                raise ClodError(f"Adapter.{name} holds a value that is not finite; the training has diverged")
+                raise ClodError(
+                    f"Adapter.{name} holds a value that is not finite; the training has diverged"
+                )
         plain = self.version.isascii() and self.version.isprintable()
         require(plain, "Adapter.version", repr(self.version), "printable ASCII")
         for name, update in self.updates.items():
             if name not in ATTRIBUTES:
-                raise ClodError(f"Adapter.updates has {name!r}, it may have {', '.join(ATTRIBUTES)}")
-            sound = update.dtype in (torch.float16, torch.float32) and update.shape[:1] == self.sigma_d.shape
-            require(sound, f"Adapter.updates[{name!r}]", _kind(update), f"float16 or float32 of {count} rows")
+                raise ClodError(
+                    f"Adapter.updates has {name!r}, it may have {', '.join(ATTRIBUTES)}"
+                )
+            sound = (
+                update.dtype in (torch.float16, torch.float32)
+                and update.shape[:1] == self.sigma_d.shape
+            )
+            require(
+                sound,
+                f"Adapter.updates[{name!r}]",
+                _kind(update),
+                f"float16 or float32 of {count} rows",
+            )
         if self.added:
             attributes: Any = self.added
             far = Gaussians(**attributes)  # checks names and shapes
             fits = not self.updates and len(far) < count
-            require(fits, "Adapter.added", f"of {len(far)} of {count} rows", "of fewer, without updates")
+            require(
+                fits, "Adapter.added", f"of {len(far)} of {count} rows", "of fewer, without updates"
+            )
 
     def __repr__(self) -> str:
-        dial = f"dial to {self.attenuation.max_sv:g}{'' if self.growth_d is None else ' with growth'}"
-        return f"Adapter({len(self.sigma_d):,} Gaussians, {dial}, updates of {', '.join(self.updates) or 'nothing'})"
+        dial = (
+            f"dial to {self.attenuation.max_sv:g}{'' if self.growth_d is None else ' with growth'}"
+        )
+        return (
+            f"Adapter({len(self.sigma_d):,} Gaussians, {dial}, updates of"
+            f" {', '.join(self.updates) or 'nothing'})"
+        )
 
     @property
     def base_count(self) -> int:
@@ -95,7 +123,8 @@ class Adapter:
         """The adapted Gaussians: the base plus the differences in float32, and the dial.
 
         Args:
-            base: the Gaussians of the checkpoint it was trained on, as ``load(path, origin=adapter.origin)`` reads it.
+            base: the Gaussians of the checkpoint it was trained on, as
+                ``load(path, origin=adapter.origin)`` reads it.
             fingerprint: that checkpoint file's SHA-256; when given it must be the adapter's.
 
         Raises:
@@ -103,18 +132,27 @@ class Adapter:
         """
         other = None
         if fingerprint is not None and fingerprint != self.base_fingerprint:
-            other = f"its SHA-256 is {fingerprint[:12]}..., the adapter was trained on {self.base_fingerprint[:12]}..."
+            other = (
+                f"its SHA-256 is {fingerprint[:12]}..., the adapter was trained on"
+                f" {self.base_fingerprint[:12]}..."
+            )
         elif len(base) != self.base_count:
             other = f"it has {len(base)} Gaussians, the adapter {self.base_count}"
         if other:
-            raise ClodError(f"a different base was given: {other}; give the checkpoint it was trained on")
+            raise ClodError(
+                f"a different base was given: {other}; give the checkpoint it was trained on"
+            )
         changes: dict[str, Tensor] = {}
         for name, update in self.updates.items():
             old = getattr(base, name)
             if update.shape != old.shape:
-                raise ClodError(f"a different base was given: {name} is {_kind(old)}, the adapter's {_kind(update)}")
+                raise ClodError(
+                    f"a different base was given: {name} is {_kind(old)}, the adapter's"
+                    f" {_kind(update)}"
+                )
             update = update.to(old.device)
-            if update.dtype == torch.float16:  # old, not old + 0, where nothing changed: that would turn -0 into 0
+            # old, not old + 0, where nothing changed: that would turn -0 into 0
+            if update.dtype == torch.float16:
                 update = torch.where(update == 0, old, old + update.float())
             changes[name] = update
         plain = base.replace(sigma_d=None, growth_d=None, attenuation=None)
@@ -122,9 +160,14 @@ class Adapter:
         if self.added:
             far: Any = {name: x.to(base.means.device) for name, x in self.added.items()}
             far |= {name: column[len(base) :] for name, column in columns.items()}
-            return with_near(plain, Gaussians(**far, attenuation=self.attenuation, screen_filter=self.screen_filter))
+            return with_near(
+                plain,
+                Gaussians(**far, attenuation=self.attenuation, screen_filter=self.screen_filter),
+            )
         changes |= columns
-        return plain.replace(**changes, attenuation=self.attenuation, screen_filter=self.screen_filter)
+        return plain.replace(
+            **changes, attenuation=self.attenuation, screen_filter=self.screen_filter
+        )
 
 
 def dial_tensors(owner: Adapter | Gaussians) -> dict[str, Tensor]:
@@ -133,20 +176,28 @@ def dial_tensors(owner: Adapter | Gaussians) -> dict[str, Tensor]:
 
 
 def extract(
-    base: Gaussians, adapted: Gaussians, *, fingerprint: str, config: dict[str, Any], origin: Origin = NOWHERE
+    base: Gaussians,
+    adapted: Gaussians,
+    *,
+    fingerprint: str,
+    config: dict[str, Any],
+    origin: Origin = NOWHERE,
 ) -> Adapter:
     """What has to be added to ``base`` to get ``adapted``, rounded to float16 differences.
 
-    sigma_d is taken in world units. Attributes with identical values are left out. Where the differences do not fit
-    float16 (one overflows, all are tiny, or an infinite logit became finite) the attribute is kept as its float32
-    values. A dial that ``base`` may already have plays no part.
+    sigma_d is taken in world units. Attributes with identical values are left out. Where the
+    differences do not fit float16 (one overflows, all are tiny, or an infinite logit became finite)
+    the attribute is kept as its float32 values. A dial that ``base`` may already have plays no
+    part.
 
     Raises:
         ClodError: ``adapted`` has no dial, is not finite, or is not the same Gaussians as ``base``.
     """
     adapted = in_world_units(adapted)
     if adapted.attenuation is None:
-        raise ClodError("the adapted Gaussians have no sigma_d, and so no dial; give the result of adapt")
+        raise ClodError(
+            "the adapted Gaussians have no sigma_d, and so no dial; give the result of adapt"
+        )
     updates, added, near = dict[str, Tensor](), dict[str, Tensor](), adapted
     if adapted.near is not None and base.near is None:
         near, far = (adapted.select(rows) for rows in (adapted.near, ~adapted.near))
@@ -154,21 +205,35 @@ def extract(
     for name in ATTRIBUTES:
         old, new = getattr(base, name).detach().float(), getattr(near, name).detach().float()
         if old.shape != new.shape:
-            raise ClodError(f"{name} is {_kind(new)}, in the base {_kind(old)}; give the Gaussians that were adapted")
+            raise ClodError(
+                f"{name} is {_kind(new)}, in the base {_kind(old)}; give the Gaussians that were"
+                " adapted"
+            )
         if not torch.equal(old, new):
             updates[name] = _update(name, old, new).cpu()
-    columns: Any = {name: x.detach().float().cpu().clone() for name, x in dial_tensors(adapted).items()}
+    columns: Any = {
+        name: x.detach().float().cpu().clone() for name, x in dial_tensors(adapted).items()
+    }
     return Adapter(
-        **columns, attenuation=adapted.attenuation, updates=updates, base_fingerprint=fingerprint, config=dict(config),
-        origin=origin, screen_filter=adapted.screen_filter, added=added,
-    )  # fmt: skip
+        **columns,
+        attenuation=adapted.attenuation,
+        updates=updates,
+        base_fingerprint=fingerprint,
+        config=dict(config),
+        origin=origin,
+        screen_filter=adapted.screen_filter,
+        added=added,
+    )
 
 
 def with_dial(
-    gaussians: Gaussians, sigma_d: Tensor | None = None, attenuation: AttenuationConfig | None = None,
-    growth_d: Tensor | None = None
-) -> Gaussians:  # fmt: skip
-    """The Gaussians with this dial alone, by the default settings; without ``sigma_d`` one that changes nothing.
+    gaussians: Gaussians,
+    sigma_d: Tensor | None = None,
+    attenuation: AttenuationConfig | None = None,
+    growth_d: Tensor | None = None,
+) -> Gaussians:
+    """The Gaussians with this dial alone, by the default settings; without ``sigma_d`` one that
+    changes nothing.
 
     That is SIGMA_MAX, whose gradient is 0: for a dial that a training loop learns, see ``attach``.
 
@@ -177,11 +242,15 @@ def with_dial(
     """
     if sigma_d is None:
         sigma_d = torch.full_like(gaussians.opacity_logits, SIGMA_MAX, dtype=torch.float32)
-    return gaussians.replace(sigma_d=sigma_d, growth_d=growth_d, attenuation=attenuation or AttenuationConfig())
+    return gaussians.replace(
+        sigma_d=sigma_d, growth_d=growth_d, attenuation=attenuation or AttenuationConfig()
+    )
 
 
 def detach(gaussians: Gaussians) -> Gaussians:
-    """The Gaussians without their dial, as s = 0 shows them: the near ones, if others take over from these."""
+    """The Gaussians without their dial, as s = 0 shows them: the near ones, if others take over
+    from these.
+    """
     gaussians = gaussians if gaussians.near is None else gaussians.select(gaussians.near)
     return gaussians.replace(sigma_d=None, growth_d=None, attenuation=None)
 
@@ -192,7 +261,8 @@ def _update(name: str, old: Tensor, new: Tensor) -> Tensor:
         raise ClodError(f"{name} holds a new value that is not finite; the training has diverged")
     exact = torch.where(same, 0.0, new - old)
     delta = exact.half()
-    # float16 has 11 bits, but fewer below 6e-5: in a scene of small numbers that is all there is to a difference.
+    # float16 has 11 bits, but fewer below 6e-5: in a scene of small numbers that is all there is to
+    # a difference.
     error, largest = (delta.float() - exact).abs().amax(), exact.abs().amax()
     return delta if delta.isfinite().all() and error <= HALF_ERROR * largest else new.clone()
 

@@ -1,4 +1,6 @@
-"""Plain Gaussians from adapted ones: one dial value baked into the opacities; and rows in the order of the dial."""
+"""Plain Gaussians from adapted ones: one dial value baked into the opacities; and rows in the order
+of the dial.
+"""
 
 import math
 from collections.abc import Sequence
@@ -15,39 +17,55 @@ from clod_adapter.equation.distances import Place, typical_distance
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import OPAQUE, Gaussians
 
-# Exponents of the dial value that opacities and scales are baked at for several cameras: the best on held-out
-# photographs of FADED 0, 0.5, 0.75 and 1, and then of seven GROWN from 0 to 1.25. At equal counts the file is never
-# below the dial by more than 0.05 dB, and up to 0.65 dB above it.
+# Exponents of the dial value that opacities and scales are baked at for several cameras: the best
+# on held-out photographs of FADED 0, 0.5, 0.75 and 1, and then of seven GROWN from 0 to 1.25. At
+# equal counts the file is never below the dial by more than 0.05 dB, and up to 0.65 dB above it.
 FADED, GROWN = 0.75, 0.9
 MOST = 100.0  # multiplier of the distances at which levels begin
-FEWEST, LEVELS = 0.01, 16  # share of the Gaussians in the coarsest level, and the largest number of levels
+# share of the Gaussians in the coarsest level, and the largest number of levels
+FEWEST, LEVELS = 0.01, 16
 
 
 @torch.no_grad()
 def bake(
-    gaussians: Gaussians, virtual_scale: float, camera: Camera | None = None, *, cameras: Sequence[Place] = ()
+    gaussians: Gaussians,
+    virtual_scale: float,
+    camera: Camera | None = None,
+    *,
+    cameras: Sequence[Place] = (),
 ) -> Gaussians:
-    """The Gaussians that one dial value keeps, with the opacities and scales of that dial value and without a dial.
+    """The Gaussians that one dial value keeps, with the opacities and scales of that dial value and
+    without a dial.
 
-    ``logit' = log o - log(1 - o)`` with ``o`` the drawn opacity, ``log_scales' = log_scales + log g`` with ``g`` the
-    growth (``attenuation.attenuate``); +inf becomes ``OPAQUE``. For one ``camera`` the image from there equals the
-    rendering at s. For ``cameras`` each Gaussian has one distance (``distances.typical_distance``): those kept there at
-    s are kept, with the opacities of ``s^FADED``, as fading only prevents popping, and then the scales of ``s^GROWN``.
+    ``logit' = log o - log(1 - o)`` with ``o`` the drawn opacity,
+    ``log_scales' = log_scales + log g`` with ``g`` the growth (``attenuation.attenuate``); +inf
+    becomes ``OPAQUE``. For one ``camera`` the image from there equals the rendering at s. For
+    ``cameras`` each Gaussian has one distance (``distances.typical_distance``): those kept there at
+    s are kept, with the opacities of ``s^FADED``, as fading only prevents popping, and then the
+    scales of ``s^GROWN``.
 
     Args:
-        virtual_scale: the dial s >= 0; ``dial_for(gaussians, keep=n, cameras=cameras, baked=True)`` keeps n.
+        virtual_scale: the dial s >= 0; ``dial_for(gaussians, keep=n, cameras=cameras, baked=True)``
+            keeps n.
         camera: the one from where the result is exact.
-        cameras: instead of ``camera``: the training cameras, or some of them, such as ``load(path).viewpoints``.
+        cameras: instead of ``camera``: the training cameras, or some of them, such as
+            ``load(path).viewpoints``.
 
     Raises:
-        ClodError: no dial, neither or both of camera and cameras, or a value negative, not finite or that keeps none.
+        ClodError: no dial, neither or both of camera and cameras, or a value negative, not finite
+            or that keeps none.
     """
     if gaussians.sigma_d is None or gaussians.attenuation is None:
         raise ClodError("the Gaussians have no sigma_d, so there is no dial value to bake")
     if (camera is None) == (not cameras):
-        raise ClodError("bake needs either camera or cameras; load(path).viewpoints are those stored with the file")
+        raise ClodError(
+            "bake needs either camera or cameras; load(path).viewpoints are those stored with the"
+            " file"
+        )
     check_dial(virtual_scale)
-    distances = typical_distance(gaussians.means, [camera] if camera else cameras, gaussians.attenuation)
+    distances = typical_distance(
+        gaussians.means, [camera] if camera else cameras, gaussians.attenuation
+    )
     if camera:
         kept = shown = grown = dial(gaussians, distances, virtual_scale)
     else:
@@ -69,17 +87,21 @@ class Level(NamedTuple):
 def bake_levels(gaussians: Gaussians, multiplier: float = MULTIPLIER) -> list[Level]:
     """Levels for viewers that draw each in a band of distances, the finest first.
 
-    The finest is what s = 0 draws: with near and far Gaussians the checkpoint, bit for bit. Level k >= 1 is for the
-    distances from ``H m^(k - 1)`` to ``H m^k``, with m the multiplier and H the ``near_distance``, or else the median
-    reach. It has the Gaussians whose reach is beyond the middle of its band, ``H m^(k - 1/2)``, with the opacities of
-    its beginning and the scales of its middle. The last level has at least FEWEST of the Gaussians.
+    The finest is what s = 0 draws: with near and far Gaussians the checkpoint, bit for bit. Level
+    k >= 1 is for the distances from ``H m^(k - 1)`` to ``H m^k``, with m the multiplier and H the
+    ``near_distance``, or else the median reach. It has the Gaussians whose reach is beyond the
+    middle of its band, ``H m^(k - 1/2)``, with the opacities of its beginning and the scales of its
+    middle. The last level has at least FEWEST of the Gaussians.
 
     Raises:
-        ClodError: no dial, the paper's form, whose distances depend on the view, or a multiplier that is not above 1.
+        ClodError: no dial, the paper's form, whose distances depend on the view, or a multiplier
+            that is not above 1.
     """
     attenuation = gaussians.attenuation
     if gaussians.sigma_d is None or attenuation is None or attenuation.form == "paper":
-        raise ClodError("levels for bands of distance need a dial of the form ours; adapt with --form ours")
+        raise ClodError(
+            "levels for bands of distance need a dial of the form ours; adapt with --form ours"
+        )
     require(1 < multiplier <= MOST, "multiplier", multiplier, f"above 1 and at most {MOST:g}")
 
     def seen_from(distance: float) -> Attenuated:
@@ -88,7 +110,9 @@ def bake_levels(gaussians: Gaussians, multiplier: float = MULTIPLIER) -> list[Le
 
     stored = seen_from(0.0)
     levels = [Level(0.0, _plain(gaussians, stored, stored, stored))]
-    begins = attenuation.near_distance or float(gaussians.sigma_d.median()) * attenuation.scene_distance
+    begins = (
+        attenuation.near_distance or float(gaussians.sigma_d.median()) * attenuation.scene_distance
+    )
     while len(levels) < LEVELS:
         middle = seen_from(begins * math.sqrt(multiplier))
         if int(middle.keep.sum()) < max(FEWEST * gaussians.whole, 1):
@@ -98,20 +122,27 @@ def bake_levels(gaussians: Gaussians, multiplier: float = MULTIPLIER) -> list[Le
     return levels
 
 
-def _plain(gaussians: Gaussians, kept: Attenuated, shown: Attenuated, grown: Attenuated) -> Gaussians:
-    """Those that are kept, with the opacities that are shown and the scales that are grown, without a dial."""
+def _plain(
+    gaussians: Gaussians, kept: Attenuated, shown: Attenuated, grown: Attenuated
+) -> Gaussians:
+    """Those that are kept, with the opacities that are shown and the scales that are grown, without
+    a dial.
+    """
     baked = {"opacity_logits": _logits_drawn(shown, gaussians.opacity_logits)}
     if gaussians.growth_d is not None:
         baked["log_scales"] = gaussians.log_scales + grown.growth.log()[:, None]
-    return gaussians.replace(**baked, sigma_d=None, growth_d=None, attenuation=None).select(kept.keep)
+    return gaussians.replace(**baked, sigma_d=None, growth_d=None, attenuation=None).select(
+        kept.keep
+    )
 
 
 @torch.no_grad()
 def order_by_extinction(gaussians: Gaussians, cameras: Sequence[Place]) -> Tensor:
-    """``[N]`` int64, the rows by descending extinction scale ``sigma_d / d``, for renderers that draw a prefix.
+    """``[N]`` int64, the rows by descending extinction scale ``sigma_d / d``, for renderers that
+    draw a prefix.
 
-    Ties stay in order; where d is 0 it is infinite. With ``gaussians.select(rows)`` the first n are those that ``bake``
-    keeps for the cameras.
+    Ties stay in order; where d is 0 it is infinite. With ``gaussians.select(rows)`` the first n are
+    those that ``bake`` keeps for the cameras.
 
     Raises:
         ClodError: no dial, no camera, or the paper's form.
@@ -119,9 +150,15 @@ def order_by_extinction(gaussians: Gaussians, cameras: Sequence[Place]) -> Tenso
     if gaussians.sigma_d is None or gaussians.attenuation is None:
         raise ClodError("the Gaussians have no sigma_d, so there is no pruning order")
     if gaussians.near is not None:
-        raise ClodError("near and far Gaussians have no order: far ones begin where near ones end; bake dial values")
+        raise ClodError(
+            "near and far Gaussians have no order: far ones begin where near ones end; bake dial"
+            " values"
+        )
     if gaussians.attenuation.form == "paper":
-        raise ClodError("in the paper's form rows have no order: the cut depends on opacity; adapt with --form ours")
+        raise ClodError(
+            "in the paper's form rows have no order: the cut depends on opacity; adapt with --form"
+            " ours"
+        )
     distances = typical_distance(gaussians.means, cameras, gaussians.attenuation)
     scales = torch.where(distances > 0, gaussians.sigma_d.double() / distances, torch.inf)
     return scales.argsort(descending=True, stable=True)
@@ -132,7 +169,9 @@ def baked_rows(gaussians: Gaussians, distances: Tensor, virtual_scale: float) ->
     return _of_several(gaussians, distances, virtual_scale)[0].keep
 
 
-def _of_several(gaussians: Gaussians, distances: Tensor, virtual_scale: float) -> tuple[Attenuated, Attenuated]:
+def _of_several(
+    gaussians: Gaussians, distances: Tensor, virtual_scale: float
+) -> tuple[Attenuated, Attenuated]:
     """What is kept over several cameras, and what is drawn of it.
 
     Far Gaussians take over from near ones at once, in the middle of their zone.
@@ -141,11 +180,15 @@ def _of_several(gaussians: Gaussians, distances: Tensor, virtual_scale: float) -
     if near is not None:  # which do not end by themselves
         assert attenuation is not None and gaussians.sigma_d is not None
         sigma_d = gaussians.sigma_d.masked_fill(near, math.inf)
-        whole = gaussians.replace(sigma_d=sigma_d, attenuation=replace(attenuation, near_distance=0.0))
+        whole = gaussians.replace(
+            sigma_d=sigma_d, attenuation=replace(attenuation, near_distance=0.0)
+        )
     kept, shown = (dial(whole, distances, s) for s in (virtual_scale, virtual_scale**FADED))
     if near is not None:
         assert attenuation is not None
-        middle = math.sqrt(1 - 0.5 / TAKEOVER) * attenuation.near_distance / attenuation.scene_distance
+        middle = (
+            math.sqrt(1 - 0.5 / TAKEOVER) * attenuation.near_distance / attenuation.scene_distance
+        )
         kept = kept._replace(keep=kept.keep & (near != (distances * virtual_scale >= middle)))
     return kept, shown
 

@@ -1,4 +1,6 @@
-"""The calibration table of a file, stored in it, with cameras by which a dial value is baked without photographs."""
+"""The calibration table of a file, stored in it, with cameras by which a dial value is baked
+without photographs.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,8 @@ from clod_adapter.config import FARTHEST, require
 from clod_adapter.errors import ClodError
 
 AGAINST = ("photographs", "checkpoint")
-MOST = 1000  # rows and viewpoints, and characters of the machine's name, for which every file has room
+# rows and viewpoints, and characters of the machine's name, for which every file has room
+MOST = 1000
 NARROWEST = 1e-4  # angle of view, radians
 LARGEST = 1 << 32  # count
 PIXELS = 1 << 26  # of an image: a page renders images of this size
@@ -20,7 +23,9 @@ PIXELS = 1 << 26  # of an image: a page renders images of this size
 
 @dataclass(frozen=True)
 class CalibrationRow:
-    """Means over the held-out views: Gaussians kept, PSNR in dB and SSIM, and the median milliseconds of a frame."""
+    """Means over the held-out views: Gaussians kept, PSNR in dB and SSIM, and the median
+    milliseconds of a frame.
+    """
 
     virtual_scale: float
     kept: float
@@ -62,8 +67,15 @@ class Viewpoint:
         require(near, "the centre of a viewpoint", values[:3], f"below {FARTHEST:g}")
         lengths = math.hypot(*values[4:7]), math.hypot(*values[7:10])
         known = NARROWEST < self.fov < math.pi and max(abs(length - 1) for length in lengths) < 1e-3
-        require(known or not any(values[4:]), "the direction of a viewpoint", values[4:], "unit vectors and an angle")
-        require(0 < self.unit < math.inf, "the unit of a viewpoint", self.unit, "positive and finite")
+        require(
+            known or not any(values[4:]),
+            "the direction of a viewpoint",
+            values[4:],
+            "unit vectors and an angle",
+        )
+        require(
+            0 < self.unit < math.inf, "the unit of a viewpoint", self.unit, "positive and finite"
+        )
 
     def moved(self, by: Sequence[float]) -> Viewpoint:
         """A copy with its centre moved by ``by [3]``, world units."""
@@ -72,7 +84,8 @@ class Viewpoint:
 
 @dataclass(frozen=True)
 class Calibration:
-    """Count, quality and frame time at ascending dial values, the first s = 1, and how they were measured.
+    """Count, quality and frame time at ascending dial values, the first s = 1, and how they were
+    measured.
 
     Attributes:
         rows: at least one.
@@ -80,8 +93,10 @@ class Calibration:
         views: number of held-out views that the rows average over.
         width, height: image size in pixels.
         machine: where the frame times were measured, one line of printable ASCII.
-        against: reference of PSNR and SSIM: the ``photographs``, or without any, renders of the ``checkpoint``.
-        viewpoints: of some training cameras, in the file's coordinates; empty in files of earlier versions.
+        against: reference of PSNR and SSIM: the ``photographs``, or without any, renders of the
+            ``checkpoint``.
+        viewpoints: of some training cameras, in the file's coordinates; empty in files of earlier
+            versions.
 
     Raises:
         ClodError: a field is out of range, or dial values do not ascend from 1.
@@ -103,47 +118,90 @@ class Calibration:
             raise ClodError(f"calibration has dial values {dials}, they must ascend from 1")
         if not all(math.isfinite(value) for row in self.rows for value in astuple(row)):
             raise ClodError("calibration has a value that is not finite")
-        if min(self.total, self.views, self.width, self.height) < 1 or min(row.frame_ms for row in self.rows) <= 0:
+        if (
+            min(self.total, self.views, self.width, self.height) < 1
+            or min(row.frame_ms for row in self.rows) <= 0
+        ):
             raise ClodError("calibration has a count, size or frame time that is not positive")
         counts = self.total, self.views, self.width, self.height
-        require(max(counts) <= LARGEST, "a count or size of a calibration", max(counts), f"at most {LARGEST}")
+        require(
+            max(counts) <= LARGEST,
+            "a count or size of a calibration",
+            max(counts),
+            f"at most {LARGEST}",
+        )
         size = f"{self.width}x{self.height}"
-        require(self.width * self.height <= PIXELS, "the image of a calibration", size, f"at most {PIXELS} pixels")
+        require(
+            self.width * self.height <= PIXELS,
+            "the image of a calibration",
+            size,
+            f"at most {PIXELS} pixels",
+        )
         entries = len(self.rows) + len(self.viewpoints)
         require(entries <= MOST, "the number of rows and viewpoints", entries, f"at most {MOST}")
         plain = self.machine.isascii() and self.machine == _plain(self.machine) != ""
-        require(plain, "the machine of a calibration", repr(self.machine), "one line of printable ASCII")
+        require(
+            plain, "the machine of a calibration", repr(self.machine), "one line of printable ASCII"
+        )
         if self.against not in AGAINST:
-            raise ClodError(f"calibration is against {self.against!r}, it must be one of {', '.join(AGAINST)}")
+            raise ClodError(
+                f"calibration is against {self.against!r}, it must be one of {', '.join(AGAINST)}"
+            )
 
     @classmethod
-    def of(cls, rows: Iterable[Any], *, size: tuple[int, int], machine: str, **others: Any) -> Calibration:
-        """The table of an evaluation's rows (``evaluate.Row``) for images of ``size`` (width, height).
+    def of(
+        cls, rows: Iterable[Any], *, size: tuple[int, int], machine: str, **others: Any
+    ) -> Calibration:
+        """The table of an evaluation's rows (``evaluate.Row``) for images of ``size`` (width,
+        height).
 
         Rows may be in any order, and the machine's name any text; the other fields are passed on.
         """
-        found = [CalibrationRow(*map(float, (r.virtual_scale, r.kept, r.psnr, r.ssim, r.frame_ms))) for r in rows]
-        ascending = tuple({row.virtual_scale: row for row in sorted(found, key=lambda r: r.virtual_scale)}.values())
+        found = [
+            CalibrationRow(*map(float, (r.virtual_scale, r.kept, r.psnr, r.ssim, r.frame_ms)))
+            for r in rows
+        ]
+        ascending = tuple(
+            {
+                row.virtual_scale: row for row in sorted(found, key=lambda r: r.virtual_scale)
+            }.values()
+        )
         name = _plain(machine.encode("ascii", "replace").decode()) or "unknown"
         return cls(ascending, width=size[0], height=size[1], machine=name, **others)
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Calibration:
-        """The inverse of ``as_dict``; ClodError, KeyError, TypeError or ValueError where it is none."""
-        rows = tuple(CalibrationRow(**{name: float(value) for name, value in row.items()}) for row in values["rows"])
+        """The inverse of ``as_dict``; ClodError, KeyError, TypeError or ValueError where it is
+        none.
+        """
+        rows = tuple(
+            CalibrationRow(**{name: float(value) for name, value in row.items()})
+            for row in values["rows"]
+        )
         counts = {name: int(values[name]) for name in ("total", "views", "width", "height")}
-        against = str(values.get("against", AGAINST[0]))  # files of earlier versions have no such key
-        viewpoints = tuple(Viewpoint(**{k: float(v) for k, v in row.items()}) for row in values.get("viewpoints", ()))
-        return cls(rows, machine=str(values["machine"]), against=against, viewpoints=viewpoints, **counts)
+        # files of earlier versions have no such key
+        against = str(values.get("against", AGAINST[0]))
+        viewpoints = tuple(
+            Viewpoint(**{k: float(v) for k, v in row.items()})
+            for row in values.get("viewpoints", ())
+        )
+        return cls(
+            rows, machine=str(values["machine"]), against=against, viewpoints=viewpoints, **counts
+        )
 
     def as_dict(self) -> dict[str, Any]:
         """The table as plain JSON values."""
-        lists = {name: [dict(vars(row)) for row in getattr(self, name)] for name in ("rows", "viewpoints")}
+        lists = {
+            name: [dict(vars(row)) for row in getattr(self, name)]
+            for name in ("rows", "viewpoints")
+        }
         return {**vars(self), **lists}
 
 
 def crossing(dials: Sequence[float], values: Sequence[float], target: float) -> float | None:
-    """The smallest dial value from which on ``values``, linear in log s, are at most ``target``; None if none is."""
+    """The smallest dial value from which on ``values``, linear in log s, are at most ``target``;
+    None if none is.
+    """
     above = [k for k, value in enumerate(values) if value > target]
     if not above:
         return dials[0]
@@ -155,4 +213,6 @@ def crossing(dials: Sequence[float], values: Sequence[float], target: float) -> 
 
 
 def _plain(text: str) -> str:
-    return " ".join("".join(letter if letter.isprintable() else " " for letter in text).split())[:MOST].strip()
+    return " ".join("".join(letter if letter.isprintable() else " " for letter in text).split())[
+        :MOST
+    ].strip()

@@ -21,9 +21,11 @@ from clod_adapter.errors import ClodError
 T = TypeVar("T")
 NEAR = 0.01
 """Distance of the near plane, world units, as in gsplat."""
-SMALLEST = 128  # pixels a side that an image of half the size has at least: smaller ones show too little
+# pixels a side that an image of half the size has at least: smaller ones show too little
+SMALLEST = 128
 BENT = 0.01  # a product of two axes of a rotation may differ so much from 0 or 1
-ROUNDING = 1e-6  # of the distance from 0: float32 does not resolve cameras closer together than that
+# of the distance from 0: float32 does not resolve cameras closer together than that
+ROUNDING = 1e-6
 
 
 @dataclass(frozen=True)
@@ -40,9 +42,9 @@ class Camera:
         near: distance of the near plane, world units; Gaussians with a nearer centre are not drawn.
 
     Raises:
-        ClodError: a matrix has the wrong shape or the image has no pixels; or of matrices in main memory a value is not
-            finite, ``viewmat`` is no rotation and translation, or ``K`` has skew, a focal length that is not positive,
-            or another last row than 0, 0, 1.
+        ClodError: a matrix has the wrong shape or the image has no pixels; or of matrices in main
+            memory a value is not finite, ``viewmat`` is no rotation and translation, or ``K`` has
+            skew, a focal length that is not positive, or another last row than 0, 0, 1.
     """
 
     viewmat: Tensor
@@ -59,9 +61,14 @@ class Camera:
             raise ClodError(f"camera {self.name!r} needs viewmat [4, 4] and K [3, 3]")
         for size in (self.width, self.height):
             if not isinstance(size, Integral) or size < 1:
-                raise ClodError(f"camera {self.name!r} has size {self.width}x{self.height}; give whole numbers")
+                raise ClodError(
+                    f"camera {self.name!r} has size {self.width}x{self.height}; give whole numbers"
+                )
         if not 0 <= number(self.near) < math.inf:
-            raise ClodError(f"camera {self.name!r} has its near plane at {self.near}, it must be finite and at least 0")
+            raise ClodError(
+                f"camera {self.name!r} has its near plane at {self.near}, it must be finite and at"
+                " least 0"
+            )
         if self.viewmat.device.type == self.K.device.type == "cpu":  # the host would wait for a GPU
             _check_matrices(self.name, self.viewmat.tolist(), self.K.tolist())
 
@@ -69,7 +76,9 @@ class Camera:
         return f"Camera({self.name!r}, {self.width}x{self.height})"
 
     def halved(self) -> Camera:
-        """The same view with half the width and height; the last column or row of an odd size is left out."""
+        """The same view with half the width and height; the last column or row of an odd size is
+        left out.
+        """
         K = self.K * self.K.new_tensor([[0.5], [0.5], [1.0]])
         return replace(self, K=K, width=self.width // 2, height=self.height // 2)
 
@@ -90,7 +99,9 @@ class Camera:
 
 
 def numbers_of(name: str, values: Any) -> Tensor:
-    """``float_tensor`` of an argument; ClodError, with its name, where it is no array of numbers."""
+    """``float_tensor`` of an argument; ClodError, with its name, where it is no array of
+    numbers.
+    """
     try:
         return float_tensor(values)
     except (TypeError, ValueError) as error:
@@ -107,7 +118,10 @@ def _check_matrices(name: str, viewmat: list[list[float]], K: list[list[float]])
         (all(map(math.isfinite, chain(*viewmat, *K))), "a value that is not finite"),
         (moves, "a viewmat that is no rotation and translation"),
         (fx > 0 and fy > 0, "a focal length that is not positive"),
-        (skew == other_skew == 0 and last == [0, 0, 1], "a K with skew, or whose last row is not 0, 0, 1"),
+        (
+            skew == other_skew == 0 and last == [0, 0, 1],
+            "a K with skew, or whose last row is not 0, 0, 1",
+        ),
     ):
         if not ok:
             raise ClodError(f"camera {name!r} has {what}")
@@ -130,14 +144,18 @@ class View:
         _check_image(self.camera, self.image)
 
     def __repr__(self) -> str:
-        return f"{type(self).__name__}({self.camera.name!r}, {self.camera.width}x{self.camera.height})"
+        return (
+            f"{type(self).__name__}({self.camera.name!r}, {self.camera.width}x{self.camera.height})"
+        )
 
     def at(self, camera: Camera) -> View:
         """The same photograph with another camera of its size."""
         return View(camera, self.image)
 
     def halved(self) -> View:
-        """The photograph at half the size, by means of 2x2 pixels, with the camera for it; made when it is read."""
+        """The photograph at half the size, by means of 2x2 pixels, with the camera for it; made
+        when it is read.
+        """
         camera = self.camera.halved()
 
         def image() -> Tensor:
@@ -148,16 +166,23 @@ class View:
         return StoredView(camera, image)
 
     def columns(self, first: int, end: int) -> View:
-        """The columns ``[first, end)`` of the photograph, with the camera for them; made when they are read."""
+        """The columns ``[first, end)`` of the photograph, with the camera for them; made when they
+        are read.
+        """
         K = self.camera.K.clone()
         K[0, 2] -= first
-        return StoredView(replace(self.camera, K=K, width=end - first), lambda: self.image[:, first:end])
+        return StoredView(
+            replace(self.camera, K=K, width=end - first), lambda: self.image[:, first:end]
+        )
 
 
 class StoredView(View):
-    """A view that reads its photograph, by ``image``, on every access; a pickle or a copy is a View that holds it."""
+    """A view that reads its photograph, by ``image``, on every access; a pickle or a copy is a View
+    that holds it.
+    """
 
-    def __init__(self, camera: Camera, image: Callable[[], Tensor] | Tensor) -> None:  # a Tensor from replace
+    # a Tensor from replace
+    def __init__(self, camera: Camera, image: Callable[[], Tensor] | Tensor) -> None:
         object.__setattr__(self, "camera", camera)
         object.__setattr__(self, "_read", (lambda: image) if isinstance(image, Tensor) else image)
 
@@ -189,7 +214,8 @@ class Scene:
         test: held-out views.
         notes: changes made to the images when they were read, one line each, for the report.
         folder: where the photographs were read from; None for those that were rendered.
-        left_out: skipped steps of reading, with their reasons: ``("undistortion", "all 97 cameras are pinholes")``.
+        left_out: skipped steps of reading, with their reasons:
+            ``("undistortion", "all 97 cameras are pinholes")``.
     """
 
     train: tuple[View, ...]
@@ -206,9 +232,11 @@ class Scene:
 
 
 def camera_extent(cameras: Sequence[Camera]) -> float:
-    """1.1 times the largest distance of a camera from their mean, world units (3DGS's unit for position steps).
+    """1.1 times the largest distance of a camera from their mean, world units (3DGS's unit for
+    position steps).
 
-    At most 3.3 times their median, unless that is 0: one distant camera does not count. 0 for cameras in one place.
+    At most 3.3 times their median, unless that is 0: one distant camera does not count. 0 for
+    cameras in one place.
     """
     centres = torch.stack([camera.position for camera in cameras])
     distances = (centres - centres.mean(0)).norm(dim=1)
@@ -218,21 +246,34 @@ def camera_extent(cameras: Sequence[Camera]) -> float:
 
 
 def near_plane(extent: float) -> float:
-    """Distance of the near plane, world units, > 0: NEAR, scaled by the extent of the cameras if that is below 1."""
+    """Distance of the near plane, world units, > 0: NEAR, scaled by the extent of the cameras if
+    that is below 1.
+    """
     return NEAR * min(extent, 1.0)  # a scene in kilometres would lie in front of NEAR
 
 
 def with_near_planes(cameras: Sequence[Camera]) -> list[Camera]:
-    """All cameras of a scene, with the near plane of ``near_plane``; cameras in one place keep theirs."""
+    """All cameras of a scene, with the near plane of ``near_plane``; cameras in one place keep
+    theirs.
+    """
     extent = camera_extent(cameras) if cameras else 0.0
-    return [replace(camera, near=near_plane(extent)) for camera in cameras] if extent else list(cameras)
+    return (
+        [replace(camera, near=near_plane(extent)) for camera in cameras]
+        if extent
+        else list(cameras)
+    )
 
 
 def in_its_unit(scene: Scene) -> Scene:
     """The scene with the near planes of ``with_near_planes``."""
     views = (*scene.train, *scene.test)
-    moved = [view.at(own) for view, own in zip(views, with_near_planes([v.camera for v in views]), strict=True)]
-    return replace(scene, train=tuple(moved[: len(scene.train)]), test=tuple(moved[len(scene.train) :]))
+    moved = [
+        view.at(own)
+        for view, own in zip(views, with_near_planes([v.camera for v in views]), strict=True)
+    ]
+    return replace(
+        scene, train=tuple(moved[: len(scene.train)]), test=tuple(moved[len(scene.train) :])
+    )
 
 
 def spread(views: Sequence[T], most: int) -> Sequence[T]:

@@ -1,4 +1,6 @@
-"""Settings of the equation, the screen-space filter and training: frozen dataclasses, with the help of each option."""
+"""Settings of the equation, the screen-space filter and training: frozen dataclasses, with the help
+of each option.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,8 @@ GROWTHS = ("on", "off")
 FARTHEST = 3e38  # world units: a float32, as which distances are divided by it
 LONGEST = 1e6  # dial value of training: its powers stay finite
 STEPS, STEPS_PER_VIEW = 2500, 24.0  # of training, by default, with one view a step
-PLACED_MAX_SV = 8.0  # without photographs, by default: the budgets of viewers of large scenes lie there
+# without photographs, by default: the budgets of viewers of large scenes lie there
+PLACED_MAX_SV = 8.0
 MULTIPLIER = 3.0  # of the distances at which levels of a set begin: PlayCanvas's default
 # Gaussians that viewers draw at most on a device, by their makers; docs/formats.md has the sources.
 DEVICES = {"quest3": 500_000, "phone": 1_000_000, "laptop": 2_000_000, "desktop": 4_000_000}
@@ -34,13 +37,17 @@ def option(default: Any, help: str) -> Any:
 
 
 def require(ok: bool, name: str, value: object, what: str) -> None:
-    """Raises ClodError unless ``ok``; the message has the field's name, its value and ``what`` it must be."""
+    """Raises ClodError unless ``ok``; the message has the field's name, its value and ``what`` it
+    must be.
+    """
     if not ok:
         raise ClodError(f"{name} is {value}, it must be {what}")
 
 
 def check_types(config: Any) -> None:
-    """Raises ClodError for a field of another type than its annotation, or a number that is not finite."""
+    """Raises ClodError for a field of another type than its annotation, or a number that is not
+    finite.
+    """
     for each in fields(config):
         value, annotation = getattr(config, each.name), each.type.removesuffix(" | None")
         if value is None and annotation != each.type:
@@ -54,8 +61,12 @@ def check_types(config: Any) -> None:
 
 
 def number(value: Any) -> float:
-    """A number of Python, numpy or torch as a float; NaN, which no range contains, if it is none or too large."""
-    if isinstance(value, str) or not (isinstance(value, Real) or getattr(value, "shape", None) == ()):
+    """A number of Python, numpy or torch as a float; NaN, which no range contains, if it is none or
+    too large.
+    """
+    if isinstance(value, str) or not (
+        isinstance(value, Real) or getattr(value, "shape", None) == ()
+    ):
         return math.nan
     try:
         return float(value)
@@ -65,32 +76,46 @@ def number(value: Any) -> float:
 
 @dataclass(frozen=True, kw_only=True)
 class AttenuationConfig:
-    """Settings of the equation that reads ``sigma_d``. Stored in the file; the defaults are those of adapting.
+    """Settings of the equation that reads ``sigma_d``. Stored in the file; the defaults are those
+    of adapting.
 
-    The form ``ours`` (``attenuation.attenuate``) has distances in units of ``scene_distance``, which is 1 in files:
-    sigma_d is a length of the scene. The form ``paper`` (``equation/paper.py``) has them as a share of the largest
-    distance in the view.
+    The form ``ours`` (``attenuation.attenuate``) has distances in units of ``scene_distance``,
+    which is 1 in files: sigma_d is a length of the scene. The form ``paper``
+    (``equation/paper.py``) has them as a share of the largest distance in the view.
 
     Raises:
         ClodError: a field is out of range.
     """
 
     form: str = option("ours", "equation of the dial: ours, or the paper's")
-    scene_distance: float = option(1.0, "unit of distances, world units; files have 1, sigma_d in world units")
+    scene_distance: float = option(
+        1.0, "unit of distances, world units; files have 1, sigma_d in world units"
+    )
     reference_distance: float = option(
-        0.0, "median distance in the nearest training views, world units, from which on scales grow; 0 if unknown"
+        0.0,
+        "median distance in the nearest training views, world units, from which on scales grow; 0"
+        " if unknown",
     )
     max_sv: float = option(5.0, "largest dial value of training")
     near_distance: float = option(
-        0.0, "distance at s = 1, world units, at which far Gaussians take over from near ones; 0 without near ones"
+        0.0,
+        "distance at s = 1, world units, at which far Gaussians take over from near ones; 0 without"
+        " near ones",
     )
 
     def __post_init__(self) -> None:
         check_types(self)
         require(self.form in FORMS, "form", self.form, f"one of {', '.join(FORMS)}")
         distance, reference = self.scene_distance, self.reference_distance
-        require(0 < distance < FARTHEST, "scene_distance", distance, f"above 0 and below {FARTHEST:g}")
-        require(0 <= reference < FARTHEST, "reference_distance", reference, f"at least 0 and below {FARTHEST:g}")
+        require(
+            0 < distance < FARTHEST, "scene_distance", distance, f"above 0 and below {FARTHEST:g}"
+        )
+        require(
+            0 <= reference < FARTHEST,
+            "reference_distance",
+            reference,
+            f"at least 0 and below {FARTHEST:g}",
+        )
         require(self.max_sv >= 1, "max_sv", self.max_sv, "at least 1")
         near = self.near_distance
         require(0 <= near < FARTHEST, "near_distance", near, f"at least 0 and below {FARTHEST:g}")
@@ -98,31 +123,39 @@ class AttenuationConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class ScreenFilter:
-    """The screen-space filter of a checkpoint's training, which rendering has to repeat. Stored in the file.
+    """The screen-space filter of a checkpoint's training, which rendering has to repeat. Stored in
+    the file.
 
-    With C ``[2, 2]`` the covariance of a projected Gaussian, in px^2, a renderer draws C + variance I. With
-    ``compensate`` it also multiplies the opacity by
+    With C ``[2, 2]`` the covariance of a projected Gaussian, in px^2, a renderer draws C + variance
+    I. With ``compensate`` it also multiplies the opacity by
 
         c = sqrt(max(0, det C / det(C + variance I)))
 
-    so that a widened Gaussian keeps its integral, and drops a Gaussian whose product is below 1/255.
-    The 2D Mip filter of Mip-Splatting (Yu et al., CVPR 2024); ``rasterize_mode="antialiased"`` of gsplat and
-    ``--antialiasing`` of Inria's trainer are the same with a variance of 0.3 instead of 0.1. (Inria's c is at least
-    0.005, Mip-Splatting's at least 0.001; gsplat's and this one have no lower bound.)
+    so that a widened Gaussian keeps its integral, and drops a Gaussian whose product is below
+    1/255. The 2D Mip filter of Mip-Splatting (Yu et al., CVPR 2024);
+    ``rasterize_mode="antialiased"`` of gsplat and ``--antialiasing`` of Inria's trainer are the
+    same with a variance of 0.3 instead of 0.1. (Inria's c is at least 0.005, Mip-Splatting's at
+    least 0.001; gsplat's and this one have no lower bound.)
 
     Raises:
         ClodError: the variance is not between 0.001 and 100, or ``compensate`` is not a bool.
     """
 
     variance: float = option(0.3, "px^2 added to the covariance of every projected Gaussian")
-    compensate: bool = option(False, "whether opacities are scaled by c to compensate for the widening")
+    compensate: bool = option(
+        False, "whether opacities are scaled by c to compensate for the widening"
+    )
 
     def __post_init__(self) -> None:
         check_types(self)
-        require(1e-3 <= self.variance <= 100, "variance", self.variance, "between 0.001 and 100 px^2")
+        require(
+            1e-3 <= self.variance <= 100, "variance", self.variance, "between 0.001 and 100 px^2"
+        )
 
     def halved(self) -> ScreenFilter:
-        """The same filter in the px^2 of images of half the size, which are means of 2x2 pixels: ``variance / 4``."""
+        """The same filter in the px^2 of images of half the size, which are means of 2x2 pixels:
+        ``variance / 4``.
+        """
         return replace(self, variance=max(self.variance / 4, 1e-3))
 
     @property
@@ -133,12 +166,21 @@ class ScreenFilter:
     @property
     def description(self) -> str:
         """Description for messages."""
-        return f"{self.variance:g} px^2 of blur, opacities {'' if self.compensate else 'not '}compensated for it"
+        return (
+            f"{self.variance:g} px^2 of blur, opacities"
+            f" {'' if self.compensate else 'not '}compensated for it"
+        )
 
 
 CLASSIC = ScreenFilter()
-FILTERS = {"off": CLASSIC, "on": ScreenFilter(compensate=True), "mip": ScreenFilter(variance=0.1, compensate=True)}
-"""Values of ``--antialiasing``: off is 3DGS, on is gsplat's and Inria's antialiasing, mip is Mip-Splatting."""
+FILTERS = {
+    "off": CLASSIC,
+    "on": ScreenFilter(compensate=True),
+    "mip": ScreenFilter(variance=0.1, compensate=True),
+}
+"""Values of ``--antialiasing``: off is 3DGS, on is gsplat's and Inria's antialiasing, mip is
+Mip-Splatting.
+"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -149,31 +191,45 @@ class AdaptConfig:
         ClodError: a field is out of range.
     """
 
-    form: str = option("ours", "training as measured here (ours) or as published (paper); AdaptConfig.paper sets it")
+    form: str = option(
+        "ours",
+        "training as measured here (ours) or as published (paper); AdaptConfig.paper sets it",
+    )
     max_sv: float = option(5.0, "largest dial value to train for")
     iters: int | None = option(
-        None, f"training steps (default: {STEPS}, or {STEPS_PER_VIEW:g} for each training view if that is more)"
+        None,
+        f"training steps (default: {STEPS}, or {STEPS_PER_VIEW:g} for each training view if that is"
+        " more)",
     )
     batch: int = option(1, "views per step; learning rates scale with its square root")
     time_budget: float | None = option(
-        None, "stop training after this many seconds; schedules are scaled to it (default: no limit)"
+        None,
+        "stop training after this many seconds; schedules are scaled to it (default: no limit)",
     )
     seed: int = option(0, "seed of the view order, the dial values and the importance estimate")
     start_share: float | None = option(
         None, "share of Gaussians to keep at s = 1 where there are no far ones (default: 0.62)"
     )
-    exponent: float = option(1.5, "target-count curve: the target share of Gaussians at s is s^-exponent")
+    exponent: float = option(
+        1.5, "target-count curve: the target share of Gaussians at s is s^-exponent"
+    )
     reg_weight: float = option(1.0, "weight of the count loss (the paper's lambda_reg)")
     ssim_weight: float = option(0.2, "weight w of 1 - SSIM; L1 has 1 - w")
-    lr_sigma: float = option(0.05, "learning rate of log sigma_d: its largest relative change per step")
-    growth: str = option("on", "growth of the Gaussians that remain, by a growth_d beside sigma_d: on or off")
+    lr_sigma: float = option(
+        0.05, "learning rate of log sigma_d: its largest relative change per step"
+    )
+    growth: str = option(
+        "on", "growth of the Gaussians that remain, by a growth_d beside sigma_d: on or off"
+    )
     lr_growth: float = option(1.2e-2, "learning rate of growth_d")
     lr_means: float = option(0.06, "learning rate of means, times the Gaussian's own size")
     lr_quats: float = option(1.6e-3, "learning rate of quats")
     lr_scales: float = option(1.6e-2, "learning rate of log_scales")
     lr_opacities: float = option(0.1, "learning rate of opacity_logits")
     lr_sh0: float = option(4e-3, "learning rate of sh0")
-    lr_shN: float = option(0.0, "learning rate of shN; 0 keeps SH degrees above 0 fixed, which costs 0.01 dB")
+    lr_shN: float = option(
+        0.0, "learning rate of shN; 0 keeps SH degrees above 0 fixed, which costs 0.01 dB"
+    )
 
     def __post_init__(self) -> None:
         check_types(self)
@@ -182,10 +238,20 @@ class AdaptConfig:
         require(self.iters is None or self.iters >= 0, "iters", self.iters, "at least 0")
         require(1 <= self.batch <= 4096, "batch", self.batch, "between 1 and 4096")
         require(0 <= self.seed < 2**63, "seed", self.seed, "at least 0 and below 2^63")
-        require(self.time_budget is None or self.time_budget > 0, "time_budget", self.time_budget, "positive seconds")
+        require(
+            self.time_budget is None or self.time_budget > 0,
+            "time_budget",
+            self.time_budget,
+            "positive seconds",
+        )
         require(0.5 < self.share <= 1, "start_share", self.start_share, "above 0.5 and at most 1")
         for name, allowed in {"form": FORMS, "growth": GROWTHS}.items():
-            require(getattr(self, name) in allowed, name, getattr(self, name), f"one of {', '.join(allowed)}")
+            require(
+                getattr(self, name) in allowed,
+                name,
+                getattr(self, name),
+                f"one of {', '.join(allowed)}",
+            )
         require(self.exponent > 0, "exponent", self.exponent, "positive")
         require(self.reg_weight >= 0, "reg_weight", self.reg_weight, "at least 0")
         require(0 <= self.ssim_weight <= 1, "ssim_weight", self.ssim_weight, "between 0 and 1")
@@ -195,14 +261,24 @@ class AdaptConfig:
 
     @classmethod
     def paper(cls, **changes: Any) -> AdaptConfig:
-        """The paper's form with its settings where it gives them, and the defaults elsewhere; then ``changes``.
+        """The paper's form with its settings where it gives them, and the defaults elsewhere; then
+        ``changes``.
 
-        CLoD-GS section 3.3: lambda 1, sigma_d itself trained at 1e-2. Chosen here: half the default rates.
+        CLoD-GS section 3.3: lambda 1, sigma_d itself trained at 1e-2. Chosen here: half the default
+        rates.
         """
         own: dict[str, Any] = {
-            "form": "paper", "iters": 1600, "reg_weight": 1.0, "growth": "off", "lr_sigma": 1e-2,
-            "lr_means": 0.03, "lr_quats": 8e-4, "lr_scales": 8e-3, "lr_opacities": 5e-2, "lr_sh0": 2e-3,
-        }  # fmt: skip
+            "form": "paper",
+            "iters": 1600,
+            "reg_weight": 1.0,
+            "growth": "off",
+            "lr_sigma": 1e-2,
+            "lr_means": 0.03,
+            "lr_quats": 8e-4,
+            "lr_scales": 8e-3,
+            "lr_opacities": 5e-2,
+            "lr_sh0": 2e-3,
+        }
         return cls(**{**own, **changes})
 
     @property
@@ -216,13 +292,17 @@ class AdaptConfig:
         return self.iters if self.iters is not None else self.for_views(0).steps
 
     def for_views(self, views: int) -> AdaptConfig:
-        """A copy whose ``iters`` is set, by the number of training views and the batch where it is not."""
+        """A copy whose ``iters`` is set, by the number of training views and the batch where it is
+        not.
+        """
         if self.iters is not None:
             return self
         return replace(self, iters=max(round(max(STEPS, STEPS_PER_VIEW * views) / self.batch), 1))
 
     def attenuation(self, scene_distance: float) -> AttenuationConfig:
-        """Settings of the equation in training; files have them in world units (``units.in_world_units``)."""
+        """Settings of the equation in training; files have them in world units
+        (``units.in_world_units``).
+        """
         return AttenuationConfig(form=self.form, scene_distance=scene_distance, max_sv=self.max_sv)
 
 

@@ -11,8 +11,8 @@ from clod_adapter._support.text import as_text, first_line
 class ClodError(Exception):
     """Bad input or bad use.
 
-    The message is one line: the file or field, what is wrong with it and what to do. The command line prints it and
-    exits with code 2.
+    The message is one line: the file or field, what is wrong with it and what to do. The command
+    line prints it and exits with code 2.
     """
 
     def __init__(self, message: str) -> None:
@@ -24,9 +24,11 @@ class ClodError(Exception):
 def refused_if_damaged(
     path: Path, what: str = "is damaged or truncated", fix: str = "copy or export it again"
 ) -> Iterator[None]:
-    """Makes errors of reading a file, raised within, one line: the file, ``what`` it is, the reason, and the ``fix``.
+    """Makes errors of reading a file, raised within, one line: the file, ``what`` it is, the
+    reason, and the ``fix``.
 
-    A ClodError that names the file already is unchanged, and a MemoryError, which is not of the file.
+    A ClodError that names the file already is unchanged, and a MemoryError, which is not of the
+    file.
     """
     try:
         yield
@@ -35,8 +37,11 @@ def refused_if_damaged(
     except Exception as error:  # of libraries, and whatever a crafted file provokes
         if isinstance(error, ClodError) and str(error).startswith(str(ClodError(f"{path}: "))):
             raise
-        # Of what a file contains libraries raise it without a number, or with that of a seek to nowhere.
+        # Of what a file contains libraries raise it without a number, or with that of a seek to
+        # nowhere.
         if isinstance(error, OSError) and error.errno not in (None, EINVAL):
-            raise ClodError(f"{path}: cannot be read ({error.strerror}); check the path and its permissions") from error
+            raise ClodError(
+                f"{path}: cannot be read ({error.strerror}); check the path and its permissions"
+            ) from error
         reason = f"no {error}" if isinstance(error, KeyError) else first_line(error)
         raise ClodError(f"{path}: {what} ({reason:.200}); {fix}") from error

@@ -15,7 +15,9 @@ from clod_adapter.config import CLASSIC, SH_COUNTS, AttenuationConfig, ScreenFil
 from clod_adapter.errors import ClodError
 
 SH_C0 = 0.28209479177387814
-"""The harmonic of degree 0, ``1 / (2 sqrt(pi))``: a colour without higher degrees is ``0.5 + SH_C0 sh0``."""
+"""The harmonic of degree 0, ``1 / (2 sqrt(pi))``: a colour without higher degrees is
+``0.5 + SH_C0 sh0``.
+"""
 
 OPAQUE = 20.0
 """A logit whose opacity is 1 in float32; written instead of +inf, which some readers refuse."""
@@ -25,9 +27,9 @@ OPAQUE = 20.0
 class Gaussians:
     """N Gaussians with the parameters that checkpoints store, and, once adapted, their dial.
 
-    Fields may be given as numpy arrays, which become float32 tensors. ``gaussians[:100]``, ``gaussians[mask]`` and
-    ``gaussians[indices]`` are the Gaussians of these rows. ``a == b`` is whether all fields are equal, bit for bit but
-    for the sign of 0.
+    Fields may be given as numpy arrays, which become float32 tensors. ``gaussians[:100]``,
+    ``gaussians[mask]`` and ``gaussians[indices]`` are the Gaussians of these rows. ``a == b`` is
+    whether all fields are equal, bit for bit but for the sign of 0.
 
     Attributes:
         means: ``[N, 3]`` centres, world units.
@@ -36,13 +38,17 @@ class Gaussians:
         opacity_logits: ``[N]``; the opacity is their sigmoid. +inf means fully opaque.
         sh0: ``[N, 1, 3]`` degree-0 spherical harmonics.
         shN: ``[N, K-1, 3]`` spherical harmonics of degrees 1 and up, K in {1, 4, 9, 16, 25}.
-        sigma_d: ``[N]`` reaches, the distances at which they end, or None for a checkpoint without a dial.
-        attenuation: settings of the equation that reads ``sigma_d``; None exactly if ``sigma_d`` is None.
-        growth_d: ``[N]`` exponent of the growth of scales (``attenuation.growth_factors``), or None; needs a sigma_d.
+        sigma_d: ``[N]`` reaches, the distances at which they end, or None for a checkpoint without
+            a dial.
+        attenuation: settings of the equation that reads ``sigma_d``; None exactly if ``sigma_d`` is
+            None.
+        growth_d: ``[N]`` exponent of the growth of scales (``attenuation.growth_factors``), or
+            None; needs a sigma_d.
         screen_filter: the filter for rendering, that of training.
 
     Raises:
-        ClodError: a tensor has the wrong shape or holds integers, or one of sigma_d and attenuation is missing.
+        ClodError: a tensor has the wrong shape or holds integers, or one of sigma_d and attenuation
+            is missing.
     """
 
     means: Tensor
@@ -62,16 +68,29 @@ class Gaussians:
                 object.__setattr__(self, field.name, float_tensor(value))
         n = len(self.means)
         shapes = {
-            "means": (n, 3), "quats": (n, 4), "log_scales": (n, 3), "opacity_logits": (n,), "sh0": (n, 1, 3),
-            "sigma_d": (n,), "growth_d": (n,),
-        }  # fmt: skip
+            "means": (n, 3),
+            "quats": (n, 4),
+            "log_scales": (n, 3),
+            "opacity_logits": (n,),
+            "sh0": (n, 1, 3),
+            "sigma_d": (n,),
+            "growth_d": (n,),
+        }
         for name, value in self.tensors().items():
-            require(value.is_floating_point(), f"Gaussians.{name}", value.dtype, "floating point: .float()")
+            require(
+                value.is_floating_point(),
+                f"Gaussians.{name}",
+                value.dtype,
+                "floating point: .float()",
+            )
             found = tuple(value.shape)
             if name != "shN" and found != shapes[name]:
                 raise ClodError(f"Gaussians.{name} has shape {found}, expected {shapes[name]}")
             if name == "shN" and found not in [(n, count - 1, 3) for count in SH_COUNTS.values()]:
-                raise ClodError(f"Gaussians.shN has shape {found}, expected ({n}, K-1, 3) with K-1 in 0, 3, 8, 15, 24")
+                raise ClodError(
+                    f"Gaussians.shN has shape {found}, expected ({n}, K-1, 3) with K-1 in 0, 3, 8,"
+                    " 15, 24"
+                )
         if (self.sigma_d is None) != (self.attenuation is None):
             raise ClodError("Gaussians needs both sigma_d and attenuation, or neither")
         if self.growth_d is not None and self.sigma_d is None:
@@ -82,14 +101,18 @@ class Gaussians:
 
     @property
     def near(self) -> Tensor | None:
-        """``[N]`` bool: the checkpoint's own, without a reach, if there are others that take over; None if not."""
+        """``[N]`` bool: the checkpoint's own, without a reach, if there are others that take over;
+        None if not.
+        """
         if self.sigma_d is None or self.attenuation is None or self.attenuation.near_distance == 0:
             return None
         return self.sigma_d <= 0
 
     @property
     def whole(self) -> int:
-        """How many are drawn at s = 0: all, or the near ones. Shares of what is kept are shares of these."""
+        """How many are drawn at s = 0: all, or the near ones. Shares of what is kept are shares of
+        these.
+        """
         return len(self) if self.near is None else int(self.near.sum())
 
     def __eq__(self, other: object) -> bool:
@@ -103,7 +126,9 @@ class Gaussians:
         ):
             return False
         pairs = [(mine[name], theirs[name]) for name in mine]
-        return all((a.device, a.dtype) == (b.device, b.dtype) and torch.equal(a, b) for a, b in pairs)
+        return all(
+            (a.device, a.dtype) == (b.device, b.dtype) and torch.equal(a, b) for a, b in pairs
+        )
 
     __hash__ = None  # type: ignore[assignment]
 
@@ -115,18 +140,24 @@ class Gaussians:
         """
         if not isinstance(rows, slice):
             rows = torch.as_tensor(rows, device=self.means.device)
-            rows = rows.long() if rows.shape == (0,) and rows.dtype != torch.bool else rows  # [] is float
+            # [] is float
+            rows = rows.long() if rows.shape == (0,) and rows.dtype != torch.bool else rows
             if rows.dim() != 1 or (rows.dtype == torch.bool and len(rows) != len(self)):
                 raise ClodError(
-                    f"rows has shape {tuple(rows.shape)}; give a slice, indices [M] or a mask [{len(self)}]"
+                    f"rows has shape {tuple(rows.shape)}; give a slice, indices [M] or a mask"
+                    f" [{len(self)}]"
                 )
         try:
             return self.select(rows)
         except IndexError as error:
-            raise ClodError(f"there are {len(self)} Gaussians, and {str(error).splitlines()[0]}") from error
+            raise ClodError(
+                f"there are {len(self)} Gaussians, and {str(error).splitlines()[0]}"
+            ) from error
 
     def __repr__(self) -> str:
-        """Count, SH degree, dial and device, as in ``Gaussians(120,000, SH degree 3, dial to 5 with growth, cpu)``."""
+        """Count, SH degree, dial and device, as in
+        ``Gaussians(120,000, SH degree 3, dial to 5 with growth, cpu)``.
+        """
         return f"Gaussians({self.summary}, {self.means.device})"
 
     @property
@@ -134,8 +165,15 @@ class Gaussians:
         """``120,000, SH degree 3, dial to 5 with growth``."""
         dial = "no dial"
         if self.attenuation is not None:
-            dial = f"dial to {self.attenuation.max_sv:g}{'' if self.growth_d is None else ' with growth'}"
-        count = f"{len(self):,}" if self.near is None else f"{self.whole:,} and {len(self) - self.whole:,} far"
+            dial = (
+                "dial to"
+                f" {self.attenuation.max_sv:g}{'' if self.growth_d is None else ' with growth'}"
+            )
+        count = (
+            f"{len(self):,}"
+            if self.near is None
+            else f"{self.whole:,} and {len(self) - self.whole:,} far"
+        )
         return f"{count}, SH degree {self.sh_degree}, {dial}"
 
     @property
@@ -154,7 +192,11 @@ class Gaussians:
 
     def tensors(self) -> dict[str, Tensor]:
         """The tensor fields by name; without those that are None."""
-        return {f.name: each for f in dataclasses.fields(self) if isinstance(each := getattr(self, f.name), Tensor)}
+        return {
+            f.name: each
+            for f in dataclasses.fields(self)
+            if isinstance(each := getattr(self, f.name), Tensor)
+        }
 
     def replace(self, **changes: Tensor | AttenuationConfig | ScreenFilter | None) -> Gaussians:
         """A copy with the named fields replaced."""
@@ -165,16 +207,22 @@ class Gaussians:
         return self.replace(**{name: value[rows] for name, value in self.tensors().items()})
 
     def without_empty_bands(self) -> Gaussians:
-        """A copy without the highest SH degrees whose coefficients are all 0; renders the same image, faster."""
+        """A copy without the highest SH degrees whose coefficients are all 0; renders the same
+        image, faster.
+        """
         degree = self.sh_degree
-        while degree > 0 and not self.shN[:, SH_COUNTS[degree - 1] - 1 : SH_COUNTS[degree] - 1].any():
+        while (
+            degree > 0 and not self.shN[:, SH_COUNTS[degree - 1] - 1 : SH_COUNTS[degree] - 1].any()
+        ):
             degree -= 1
         return self.without_bands(degree)
 
     def without_bands(self, degree: int) -> Gaussians:
         """A copy without the SH degrees above ``degree``; itself if it has none."""
         above = degree < self.sh_degree
-        return self.replace(shN=self.shN[:, : SH_COUNTS[degree] - 1].contiguous()) if above else self
+        return (
+            self.replace(shN=self.shN[:, : SH_COUNTS[degree] - 1].contiguous()) if above else self
+        )
 
     def to(self, device: torch.device | str) -> Gaussians:
         """A copy on another device."""
@@ -190,7 +238,9 @@ class LossNotFinite(Exception):
 
 
 def bad_rows(values: Tensor) -> Tensor | None:
-    """``[N]`` bool, the rows of ``values [N, ...]`` with a value that is not finite; None if there is none."""
+    """``[N]`` bool, the rows of ``values [N, ...]`` with a value that is not finite; None if there
+    is none.
+    """
     bad = spoilt_rows({"": values})
     return bad if bool(bad.any()) else None
 
@@ -201,18 +251,25 @@ def spoilt_rows(gradients: dict[str, Tensor]) -> Tensor:
     if tensors[0].device.type == "cpu" and all(bool(tensor.sum().isfinite()) for tensor in tensors):
         # A GPU is not asked: the host would wait for its answer.
         return torch.zeros(len(tensors[0]), dtype=torch.bool, device="cpu")
-    return torch.stack([~each.isfinite().reshape(len(each), each.shape[1:].numel()).all(1) for each in tensors]).any(0)
+    return torch.stack(
+        [~each.isfinite().reshape(len(each), each.shape[1:].numel()).all(1) for each in tensors]
+    ).any(0)
 
 
 def require_finite(gaussians: Gaussians, what: str, remedy: str) -> None:
-    """Raises ClodError, ``what`` being its subject and ``remedy`` its end, where an attribute is not finite."""
+    """Raises ClodError, ``what`` being its subject and ``remedy`` its end, where an attribute is
+    not finite.
+    """
     for name, values in gaussians.tensors().items():
         if name == "opacity_logits":
             values = torch.where(values.isinf(), 0.0, values)  # +-inf are opacities of 1 and 0
         if (bad := bad_rows(values)) is None:
             continue
         first = int(bad.nonzero()[0, 0])
-        raise ClodError(f"{what}: {name} is not finite in {int(bad.sum()):,} rows (the first is {first}); {remedy}")
+        raise ClodError(
+            f"{what}: {name} is not finite in {int(bad.sum()):,} rows (the first is {first});"
+            f" {remedy}"
+        )
 
 
 def largest_colour(gaussians: Gaussians) -> str:
@@ -225,14 +282,19 @@ def largest_colour(gaussians: Gaussians) -> str:
 
 
 def with_near(near: Gaussians, far: Gaussians) -> Gaussians:
-    """The near Gaussians, whose own dial plays no part, and after them far ones, whose dial has a near_distance.
+    """The near Gaussians, whose own dial plays no part, and after them far ones, whose dial has a
+    near_distance.
 
     The result has the SH degree of ``near``, which is that of ``far`` or a higher one.
     """
-    own = {name: value for name, value in near.tensors().items() if name not in ("sigma_d", "growth_d")}
+    own = {
+        name: value for name, value in near.tensors().items() if name not in ("sigma_d", "growth_d")
+    }
     theirs = far.tensors()
     rest = own["shN"].new_zeros(len(far), *own["shN"].shape[1:])
     rest[:, : far.shN.shape[1]] = far.shN
     own |= {name: near.means.new_zeros(len(near)) for name in theirs.keys() - own.keys()}
     theirs["shN"] = rest
-    return far.replace(**{name: torch.cat([value, theirs[name].to(value)]) for name, value in own.items()})
+    return far.replace(
+        **{name: torch.cat([value, theirs[name].to(value)]) for name, value in own.items()}
+    )

@@ -16,11 +16,13 @@ ROWS = 1 << 15  # Gaussians that are fitted at a time
 
 @torch.no_grad()
 def with_sh_degree(gaussians: Gaussians, sh_degree: int, places: Sequence[Place]) -> Gaussians:
-    """The Gaussians with this SH degree, or their own if it is lower, and the colours that cameras see kept.
+    """The Gaussians with this SH degree, or their own if it is lower, and the colours that cameras
+    see kept.
 
-    With the basis ``B(v)`` in the direction from camera v, split into low and high degrees, the low coefficients change
-    by the ``c`` that minimises ``sum over v of |B_low(v) c - B_high(v) h_high|^2 + RIDGE V |c|^2``: linear least
-    squares for each Gaussian and channel, over V cameras.
+    With the basis ``B(v)`` in the direction from camera v, split into low and high degrees, the low
+    coefficients change by the ``c`` that minimises
+    ``sum over v of |B_low(v) c - B_high(v) h_high|^2 + RIDGE V |c|^2``: linear least squares for
+    each Gaussian and channel, over V cameras.
 
     Args:
         places: cameras, or viewpoints; as many as possible, from where the result is to be seen.
@@ -31,7 +33,9 @@ def with_sh_degree(gaussians: Gaussians, sh_degree: int, places: Sequence[Place]
     Example:
         >>> small = with_sh_degree(model.gaussians, 1, model.viewpoints)
     """
-    require(sh_degree in SH_COUNTS, "sh_degree", sh_degree, f"one of {', '.join(map(str, SH_COUNTS))}")
+    require(
+        sh_degree in SH_COUNTS, "sh_degree", sh_degree, f"one of {', '.join(map(str, SH_COUNTS))}"
+    )
     if gaussians.sh_degree <= sh_degree:
         return gaussians
     kept = SH_COUNTS[sh_degree]
@@ -51,7 +55,9 @@ def _fitted(means: Tensor, shN: Tensor, kept: int, places: Sequence[Place]) -> T
     products = torch.zeros(len(means), kept, 3, dtype=torch.float64, device=means.device)
     for place in places:
         away = means.double() - position_of(place, means).double()
-        basis = sh_basis(away / away.norm(dim=1, keepdim=True).clamp(min=1e-12))[:, : kept + high.shape[1]]
+        basis = sh_basis(away / away.norm(dim=1, keepdim=True).clamp(min=1e-12))[
+            :, : kept + high.shape[1]
+        ]
         low, lost = basis[:, :kept], (basis[:, kept:, None] * high).sum(1)
         squares += low[:, :, None] * low[:, None]
         products += low[:, :, None] * lost[:, None]

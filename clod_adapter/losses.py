@@ -1,4 +1,6 @@
-"""A render compared with a photograph: the photometric loss, its parts L1, SSIM and PSNR on any device, and reports."""
+"""A render compared with a photograph: the photometric loss, its parts L1, SSIM and PSNR on any
+device, and reports.
+"""
 
 import math
 from typing import Any
@@ -13,20 +15,24 @@ C1, C2 = 0.01**2, 0.03**2
 
 
 def psnr(image: Tensor, target: Tensor) -> float:
-    """PSNR in dB of a ``[H, W, 3]`` float render, clamped to [0, 1], against a uint8 photograph; on its device.
+    """PSNR in dB of a ``[H, W, 3]`` float render, clamped to [0, 1], against a uint8 photograph; on
+    its device.
 
-    ``-10 log10 mean (image - target)^2``; infinite for equal images, NaN if a pixel of the render is NaN.
+    ``-10 log10 mean (image - target)^2``; infinite for equal images, NaN if a pixel of the render
+    is NaN.
     """
     error = float((image.detach().clamp(0, 1) - unit(target, image)).double().square().mean())
     return math.inf if error == 0 else -10 * math.log10(error)
 
 
 def psnr_ssim(image: Tensor, target: Tensor) -> tuple[float, float]:
-    """``psnr``, and the mean structural similarity in [-1, 1] (Wang et al. 2004), as evaluations report them.
+    """``psnr``, and the mean structural similarity in [-1, 1] (Wang et al. 2004), as evaluations
+    report them.
 
-    Both by scikit-image. Gaussian window of 11 taps with sigma 1.5, population covariance, data range 1. As in 3DGS,
-    windows at the border read zeros beyond it and every pixel counts: scikit-image leaves out the pixels within 5 of
-    the border, and zeros added there are what it leaves out here.
+    Both by scikit-image. Gaussian window of 11 taps with sigma 1.5, population covariance, data
+    range 1. As in 3DGS, windows at the border read zeros beyond it and every pixel counts:
+    scikit-image leaves out the pixels within 5 of the border, and zeros added there are what it
+    leaves out here.
     """
     from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
@@ -36,14 +42,21 @@ def psnr_ssim(image: Tensor, target: Tensor) -> tuple[float, float]:
         value = peak_signal_noise_ratio(photograph, shown, data_range=1)
     border = [(WINDOW // 2, WINDOW // 2)] * 2 + [(0, 0)]
     similarity = structural_similarity(
-        np.pad(photograph, border), np.pad(shown, border), gaussian_weights=True, sigma=SIGMA,
-        use_sample_covariance=False, data_range=1, channel_axis=-1,
-    )  # fmt: skip
+        np.pad(photograph, border),
+        np.pad(shown, border),
+        gaussian_weights=True,
+        sigma=SIGMA,
+        use_sample_covariance=False,
+        data_range=1,
+        channel_axis=-1,
+    )
     return float(value), float(similarity)
 
 
 def ssim_plain(image: Tensor, target: Tensor) -> Tensor:
-    """``psnr_ssim``'s similarity of two ``[H, W, 3]`` float images in [0, 1]: a 0-d tensor, differentiable."""
+    """``psnr_ssim``'s similarity of two ``[H, W, 3]`` float images in [0, 1]: a 0-d tensor,
+    differentiable.
+    """
     places = torch.arange(WINDOW, dtype=image.dtype, device=image.device)
     taps = torch.exp(-((places - WINDOW // 2) ** 2) / (2 * SIGMA**2))
     taps = taps / taps.sum()
@@ -59,18 +72,23 @@ def ssim_plain(image: Tensor, target: Tensor) -> Tensor:
 
 
 def photometric_loss(image: Tensor, target: Tensor, ssim_weight: float = 0.2) -> Tensor:
-    """``(1 - w) mean |image - target| + w (1 - SSIM)``, w = ssim_weight (3DGS; CLoD-GS's L_render has 0.2).
+    """``(1 - w) mean |image - target| + w (1 - SSIM)``, w = ssim_weight (3DGS; CLoD-GS's L_render
+    has 0.2).
 
     Of a float render ``[H, W, 3]`` that is not clamped, and a uint8 photograph.
     """
     if image.device.type == "cpu" and image.dtype == torch.float32:
         return _FusedLoss.apply(image, target, ssim_weight)  # type: ignore[no-any-return, no-untyped-call]
     wanted = unit(target, image)
-    return (1 - ssim_weight) * (image - wanted).abs().mean() + ssim_weight * (1 - ssim_plain(image, wanted))
+    return (1 - ssim_weight) * (image - wanted).abs().mean() + ssim_weight * (
+        1 - ssim_plain(image, wanted)
+    )
 
 
 def unit(photograph: Tensor, like: Tensor) -> Tensor:
-    """A uint8 photograph in [0, 1], of the type and on the device of ``like``; transferred as bytes."""
+    """A uint8 photograph in [0, 1], of the type and on the device of ``like``; transferred as
+    bytes.
+    """
     return photograph.to(like.device, non_blocking=like.device.type != "cpu").to(like.dtype) / 255
 
 
@@ -88,12 +106,31 @@ class _FusedLoss(torch.autograd.Function):
         shape = (3, height, kernels.stride(width))
         x, y, *slopes = (recycled(shape).numpy() for _ in range(5))
         for plane in (x, y):
-            plane[:, :, kernels.PAD + width :] = 0  # lanes beyond the image; margins of the other planes are not read
+            # lanes beyond the image; margins of the other planes are not read
+            plane[:, :, kernels.PAD + width :] = 0
         sums, differences = np.zeros(workers), np.zeros(workers)
         gradient = torch.empty(height, width, 3, dtype=torch.float32, device="cpu")
-        threads.run(kernels.to_planes, workers, image.detach().contiguous().numpy(), target.contiguous().numpy(), x, y)
+        threads.run(
+            kernels.to_planes,
+            workers,
+            image.detach().contiguous().numpy(),
+            target.contiguous().numpy(),
+            x,
+            y,
+        )
         threads.run(kernels.ssim_slopes, workers, x, y, width, *slopes, sums)
-        threads.run(kernels.loss_gradient, workers, x, y, width, *slopes, l1, dssim, gradient.numpy(), differences)
+        threads.run(
+            kernels.loss_gradient,
+            workers,
+            x,
+            y,
+            width,
+            *slopes,
+            l1,
+            dssim,
+            gradient.numpy(),
+            differences,
+        )
         ctx.save_for_backward(gradient)
         difference, similarity = float(differences.sum()), float(sums.sum())
         return torch.tensor(l1 * difference + ssim_weight - dssim * similarity, dtype=torch.float32)

@@ -11,16 +11,19 @@ if TYPE_CHECKING:
 
 Origin = tuple[float, float, float]
 NOWHERE: Origin = (0.0, 0.0, 0.0)
-# Times the spread of the scene. Closer to 0, float32 resolves 1e-5 of the spread, and the origin stays 0.
+# Times the spread of the scene. Closer to 0, float32 resolves 1e-5 of the spread, and the origin
+# stays 0.
 FAR = 100.0
 SAMPLE = 1 << 18  # rows that it is found from, evenly spread; more would take memory
 FINEST = 2.0**-40  # of the distance from 0: the finest unit that an origin is rounded to
 
 
 def origin_of(means: np.ndarray) -> Origin:
-    """The origin for the coordinates ``[N, 3]``, world units: the median, or 0 unless the scene is far from 0.
+    """The origin for the coordinates ``[N, 3]``, world units: the median, or 0 unless the scene is
+    far from 0.
 
-    Rounded to a power of two near the spread (the middle 80 % along the widest axis): subtracting it is exact then.
+    Rounded to a power of two near the spread (the middle 80 % along the widest axis): subtracting
+    it is exact then.
     """
     import numpy as np  # here: --help needs none
 
@@ -30,7 +33,10 @@ def origin_of(means: np.ndarray) -> Origin:
     if not finite.any():
         return NOWHERE
     shares = (0.1, 0.5, 0.9)  # axis by axis, which takes a third of the memory
-    found = [np.quantile(means[:, k][finite], shares, method="nearest", overwrite_input=True) for k in range(3)]
+    found = [
+        np.quantile(means[:, k][finite], shares, method="nearest", overwrite_input=True)
+        for k in range(3)
+    ]
     low, middle, high = np.stack(found, 1).astype(np.float64)
     with np.errstate(over="ignore"):  # of doubles
         spread = float((high - low).max())
@@ -43,7 +49,9 @@ def origin_of(means: np.ndarray) -> Origin:
 
 
 def parse_origin(values: Any) -> Origin:
-    """The origin from three stored numbers; raises TypeError or ValueError if they are not three finite numbers."""
+    """The origin from three stored numbers; raises TypeError or ValueError if they are not three
+    finite numbers.
+    """
     x, y, z = map(float, values)
     if not all(map(math.isfinite, (x, y, z))):
         raise ValueError(f"origin is {values!r:.80}, not finite")

@@ -37,8 +37,9 @@ class Result:
         adapted: the training: its steps, its seconds, whether it was interrupted.
         adapter: what changed; ``adapter.apply(base.gaussians) == gaussians``.
         gaussians: the result, near and far.
-        base_rows, rows, plain: quality and frame times on the held-out views of the base, of the result at
-            ``report_dials``, and of the result in a viewer that does not know the dial. Empty if nothing is held out.
+        base_rows, rows, plain: quality and frame times on the held-out views of the base, of the
+            result at ``report_dials``, and of the result in a viewer that does not know the dial.
+            Empty if nothing is held out.
         notes: lines that the user should read.
         alignment: how checkpoint and photographs match; None without photographs.
     """
@@ -57,7 +58,8 @@ class Result:
     alignment: dict[str, Any] | None = None
 
     def save(self, path: str | Path) -> None:
-        """Writes ``path``, a PLY, and the adapter, which has its name with ``.safetensors``; both or none.
+        """Writes ``path``, a PLY, and the adapter, which has its name with ``.safetensors``; both
+        or none.
 
         Raises:
             ClodError: as ``save``.
@@ -84,8 +86,9 @@ def adapt_checkpoint(
 ) -> Result:
     """Gives a checkpoint its dial, as ``clod-adapt`` does: the same Gaussians, bit for bit.
 
-    The cameras are brought into the checkpoint's frame, its screen-space filter is found, pseudo views are added to
-    few photographs or take the place of none, a plan is made, the dial is learned and measured.
+    The cameras are brought into the checkpoint's frame, its screen-space filter is found, pseudo
+    views are added to few photographs or take the place of none, a plan is made, the dial is
+    learned and measured.
 
         base = clod.load("pretrained.ply")
         scene = clod.load_scene("scene/", origin=base.origin)
@@ -96,7 +99,8 @@ def adapt_checkpoint(
         scene: posed photographs; without them the checkpoint's own renders are the truth.
         config: by default ``AdaptConfig()``, without photographs with max_sv PLACED_MAX_SV.
         override: decisions of the plan that are fixed in advance.
-        progress: called after each step of each phase; stops if it returns False, in training with the result so far.
+        progress: called after each step of each phase; stops if it returns False, in training with
+            the result so far.
         misaligned_ok: train although the checkpoint does not match the photographs.
 
     Raises:
@@ -124,7 +128,9 @@ def adapt_checkpoint(
 def extract_result(
     base: Checkpoint, scene: Scene, against: str, plan: Plan, adapted: Adapted, config: AdaptConfig
 ) -> Result:
-    """The result of a training, without measurements: the adapter, and the adapter applied to the base."""
+    """The result of a training, without measurements: the adapter, and the adapter applied to the
+    base.
+    """
     facts: Any = {"fingerprint": base.fingerprint, "config": asdict(config), "origin": base.origin}
     adapter = extract(base.gaussians, adapted.gaussians, **facts)
     return Result(base, scene, against, plan, adapted, adapter, adapter.apply(base.gaussians))
@@ -133,7 +139,9 @@ def extract_result(
 def calibrated(result: Result, note: Note) -> Result:
     """The result with the calibration of its rows in its adapter, or a note that there is none."""
     try:
-        found = calibrate(result.rows, result.gaussians, result.scene, result.against, result.base.origin)
+        found = calibrate(
+            result.rows, result.gaussians, result.scene, result.against, result.base.origin
+        )
     except ClodError as error:
         note(f"the files have no calibration, so --fps and --psnr-drop will not work: {error}")
         return result
@@ -145,7 +153,10 @@ def _measured(result: Result, max_sv: float, progress: Listener | None) -> Resul
     views, plain = result.scene.test, detach(result.gaussians)
     measured = [
         (result.base.gaussians, result.base_rows),
-        (result.gaussians, evaluate(result.gaussians, views, report_dials(max_sv), progress=progress)),
+        (
+            result.gaussians,
+            evaluate(result.gaussians, views, report_dials(max_sv), progress=progress),
+        ),
         (plain, evaluate(plain, views, [1.0], progress=progress)),
     ]
     (base_rows, rows, plain_rows), _ = with_frame_times(measured, views, progress)

@@ -1,4 +1,6 @@
-"""Progress of long-running functions: what a listener is given, and how it, or a signal, stops them."""
+"""Progress of long-running functions: what a listener is given, and how it, or a signal, stops
+them.
+"""
 
 from __future__ import annotations
 
@@ -17,8 +19,8 @@ if TYPE_CHECKING:  # the command reports an interrupt without importing torch
     from clod_adapter.gaussians import Gaussians
 
 PRESSED = (signal.SIGINT, signal.SIGTERM)
-# Of a closed terminal, and of schedulers before a job's time is over; the same one may arrive several times. Not all
-# platforms have them.
+# Of a closed terminal, and of schedulers before a job's time is over; the same one may arrive
+# several times. Not all platforms have them.
 WARNINGS = ("SIGHUP", "SIGUSR1", "SIGUSR2", "SIGXCPU")
 ENDING = (*PRESSED, *(getattr(signal, name) for name in WARNINGS if hasattr(signal, name)))
 
@@ -47,13 +49,14 @@ class Progress:
     """The state of a phase; given to the listener after each of its steps.
 
     Attributes:
-        done, total: steps of the phase: views, Gaussians (pruning order), candidates (cameras) or training steps.
+        done, total: steps of the phase: views, Gaussians (pruning order), candidates (cameras) or
+            training steps.
         seconds: of training, 0 in other phases.
         time_share: the share of the time budget that is used; 0 without one.
-        loss: running mean of the photometric loss at the smaller dial value of each view, NaN in other phases. In the
-            first half of the steps that is above 1 in every second one.
-        gaussians: in training, gives the result so far (while steps are averaged the mean). It shares
-            memory with the parameters, so use it within the listener.
+        loss: running mean of the photometric loss at the smaller dial value of each view, NaN in
+            other phases. In the first half of the steps that is above 1 in every second one.
+        gaussians: in training, gives the result so far (while steps are averaged the mean). It
+            shares memory with the parameters, so use it within the listener.
         state: in training, gives the ``TrainingState`` to resume from, likewise.
         error: why training ends here: a process was lost, or a step failed.
     """
@@ -70,7 +73,9 @@ class Progress:
 
     @property
     def share(self) -> float:
-        """The share of the phase that is done, in [0, 1], by steps or by time budget, whichever is larger."""
+        """The share of the phase that is done, in [0, 1], by steps or by time budget, whichever is
+        larger.
+        """
         return max(self.done / self.total if self.total else 1.0, self.time_share)
 
 
@@ -88,27 +93,36 @@ def tell(listener: Listener | None, phase: Phase, done: int, total: int) -> None
         raise Stopped(f"stopped at {phase} {done}/{total}")
 
 
-def within(listener: Listener | None, before: int, total: int, phase: Phase | None = None) -> Listener | None:
+def within(
+    listener: Listener | None, before: int, total: int, phase: Phase | None = None
+) -> Listener | None:
     """The listener of a part of a phase of ``total`` steps, ``before`` of which come first."""
     if listener is None:
         return None
-    return lambda now: listener(replace(now, phase=phase or now.phase, done=before + now.done, total=total))
+    return lambda now: listener(
+        replace(now, phase=phase or now.phase, done=before + now.done, total=total)
+    )
 
 
 @contextmanager
 def shown(progress: Listener | Literal[False] | None) -> Iterator[Listener | None]:
-    """The listener ``progress``. For None a bar, where stderr is a terminal or a notebook's; for False none."""
+    """The listener ``progress``. For None a bar, where stderr is a terminal or a notebook's; for
+    False none.
+    """
     if progress is not None or not (sys.stderr.isatty() or "ipykernel" in sys.modules):
         yield progress or None
         return
     from tqdm import tqdm
 
     phase: Phase | None = None
-    with tqdm(file=sys.stderr, leave=False, dynamic_ncols=True, delay=1e-9) as bar:  # not shown without a phase
+    # not shown without a phase
+    with tqdm(file=sys.stderr, leave=False, dynamic_ncols=True, delay=1e-9) as bar:
 
         def show(now: Progress) -> None:
             nonlocal phase
-            bar.set_postfix_str("" if math.isnan(now.loss) else f"loss {now.loss:.4f}", refresh=False)
+            bar.set_postfix_str(
+                "" if math.isnan(now.loss) else f"loss {now.loss:.4f}", refresh=False
+            )
             if phase != now.phase:
                 phase = now.phase
                 bar.set_description_str(now.phase, refresh=False)
@@ -122,7 +136,8 @@ def shown(progress: Listener | Literal[False] | None) -> Iterator[Listener | Non
 class GracefulStop:
     """Counts signals of ENDING. The first one requests a stop after the step under way.
 
-    The second Ctrl-C or SIGTERM raises KeyboardInterrupt, unless a launcher repeats them (``aborts``).
+    The second Ctrl-C or SIGTERM raises KeyboardInterrupt, unless a launcher repeats them
+    (``aborts``).
     """
 
     def __init__(self, aborts: bool = True, presses: int = 0) -> None:
@@ -148,9 +163,14 @@ class GracefulStop:
 
 
 @contextmanager
-def handled_by(handler: Callable[[int, FrameType | None], Any], in_place_of: Any = None) -> Iterator[None]:
-    """Within the block ``handler`` has all signals that are not ignored, or those alone that another handler had."""
-    if threading.current_thread() is not threading.main_thread():  # Python allows handlers only there
+def handled_by(
+    handler: Callable[[int, FrameType | None], Any], in_place_of: Any = None
+) -> Iterator[None]:
+    """Within the block ``handler`` has all signals that are not ignored, or those alone that
+    another handler had.
+    """
+    # Python allows handlers only there
+    if threading.current_thread() is not threading.main_thread():
         yield
         return
     heard = [n for n in ENDING if n == signal.SIGTERM or signal.getsignal(n) is not signal.SIG_IGN]

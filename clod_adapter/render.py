@@ -34,7 +34,9 @@ class Rendering:
 
     @cached_property
     def kept(self) -> Tensor:
-        """``[N]`` bool, the Gaussians that the dial keeps, computed when it is first asked for: a frame needs none."""
+        """``[N]`` bool, the Gaussians that the dial keeps, computed when it is first asked for: a
+        frame needs none.
+        """
         return dial(self.gaussians, self.camera, self.virtual_scale).keep
 
     @property
@@ -46,14 +48,23 @@ class Rendering:
 def splat(
     gaussians: Gaussians, opacities: Tensor, camera: Camera, growth: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Image ``[H, W, 3]`` on black and alpha ``[H, W]``, of activated opacities ``[N]`` and scales times ``growth``."""
+    """Image ``[H, W, 3]`` on black and alpha ``[H, W]``, of activated opacities ``[N]`` and scales
+    times ``growth``.
+    """
     if opacities.shape != (len(gaussians),):
         raise ClodError(f"opacities are {tuple(opacities.shape)} and must be ({len(gaussians)},)")
     scales = gaussians.scales if growth is None else gaussians.scales * growth[:, None]
     return for_device(gaussians.means.device).splat(
-        gaussians.means, gaussians.quats, scales, opacities, gaussians.sh0, gaussians.shN, camera,
-        behind(gaussians), gaussians.screen_filter,
-    )  # fmt: skip
+        gaussians.means,
+        gaussians.quats,
+        scales,
+        opacities,
+        gaussians.sh0,
+        gaussians.shN,
+        camera,
+        behind(gaussians),
+        gaussians.screen_filter,
+    )
 
 
 def render(
@@ -67,7 +78,8 @@ def render(
     """Renders at one dial value, differentiably.
 
     Args:
-        gaussians: adapted or not; without ``sigma_d`` the dial has no effect, and above s = 1 a warning says so.
+        gaussians: adapted or not; without ``sigma_d`` the dial has no effect, and above s = 1 a
+            warning says so.
         camera: the view.
         virtual_scale: the dial s >= 0 (the paper's s_v).
         background: ``[3]``, tensor or array; black by default.
@@ -77,10 +89,13 @@ def render(
         ClodError: the dial is negative or not finite, or an argument is of another type.
     """
     for name, value, kind in (("gaussians", gaussians, Gaussians), ("camera", camera, Camera)):
-        require(isinstance(value, kind), name, f"a {type(value).__name__}", f"of type {kind.__name__}")
+        require(
+            isinstance(value, kind), name, f"a {type(value).__name__}", f"of type {kind.__name__}"
+        )
     if gaussians.sigma_d is None:
         warn_of_no_dial(virtual_scale, "give the result of clod_adapter.adapt")
     chosen = rasterizer or for_device(gaussians.means.device)
-    with torch.autocast(gaussians.means.device.type, enabled=False):  # positions of 3 digits draw another image
+    # positions of 3 digits draw another image
+    with torch.autocast(gaussians.means.device.type, enabled=False):
         image, alpha = chosen.draw(gaussians, camera, virtual_scale, background=background)
     return Rendering(image, alpha, gaussians, camera, virtual_scale)

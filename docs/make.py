@@ -1,4 +1,5 @@
-"""Writes the pages of the site into build/pages: those of this folder, and the reference, made from the code.
+"""Writes the pages of the site into build/pages: those of this folder, and the reference, made from
+the code.
 
 python docs/make.py        # then mkdocs build, as make docs does
 """
@@ -17,7 +18,8 @@ OUT = HERE.parent / "build" / "pages"
 SETTINGS = """\
 # Settings
 
-Made from the config classes: frozen dataclasses with keyword arguments only, which refuse invalid values.
+Made from the config classes: frozen dataclasses with keyword arguments only, which refuse invalid
+values.
 `AdaptConfig.paper()` is the paper's own form; AttenuationConfig is stored in the file.
 
 | AdaptConfig | default | paper | meaning |
@@ -32,11 +34,14 @@ INTEGRATIONS = (
     *(
         f"integrations.gsplat.{name}"
         for name in (
-            "rasterization", "rasterization_2dgs", "rasterization_inria_wrapper", "rasterization_2dgs_inria_wrapper"
+            "rasterization",
+            "rasterization_2dgs",
+            "rasterization_inria_wrapper",
+            "rasterization_2dgs_inria_wrapper",
         )
     ),
     "integrations.inria.GaussianRasterizer",
-)  # fmt: skip
+)
 
 
 def commands_page() -> str:
@@ -50,13 +55,18 @@ def command_section(name: str) -> str:
     title, command = f"{PROG} {name}".strip(), command_of(name)
     rows = [option_row(action) for action in build_parser(name)._actions if action.dest != "help"]
     table = "\n".join(["| | |", "|---|---|", *rows])
-    usage, notes = f"```text\n{title} {command.USAGE}\n```\n", f"```text\n{command.EPILOG.strip()}\n```\n"
+    usage, notes = (
+        f"```text\n{title} {command.USAGE}\n```\n",
+        f"```text\n{command.EPILOG.strip()}\n```\n",
+    )
     return f"## {title}\n\n{usage}\n{command.DESCRIPTION.strip()}\n\n{table}\n\n{notes}"
 
 
 def option_row(action: argparse.Action) -> str:
     """Table row of an option or argument."""
-    value = action.metavar or ("{" + ",".join(map(str, action.choices)) + "}" if action.choices else "")
+    value = action.metavar or (
+        "{" + ",".join(map(str, action.choices)) + "}" if action.choices else ""
+    )
     value = {"+": f"{value} [{value} ...]", "?": f"[{value}]"}.get(
         str(action.nargs), value if action.nargs != 0 else ""
     )
@@ -65,14 +75,20 @@ def option_row(action: argparse.Action) -> str:
 
 
 def settings_page() -> str:
-    """Every field of the two configs with its default and, if different, its value in the paper's own form."""
+    """Every field of the two configs with its default and, if different, its value in the paper's
+    own form.
+    """
     ours, paper, travels = AdaptConfig(), AdaptConfig.paper(), AttenuationConfig()
     rows = []
     for name, text in field_descriptions(AdaptConfig).items():
         value, other = getattr(ours, name), getattr(paper, name)
-        rows.append(f"| `{name}` | {shown(value)} | {shown(other) if other != value else ''} | {text} |")
+        rows.append(
+            f"| `{name}` | {shown(value)} | {shown(other) if other != value else ''} | {text} |"
+        )
     about = field_descriptions(AttenuationConfig)
-    fields = [f"| `{name}` | {shown(getattr(travels, name))} | {text} |" for name, text in about.items()]
+    fields = [
+        f"| `{name}` | {shown(getattr(travels, name))} | {text} |" for name, text in about.items()
+    ]
     return SETTINGS.format(rows="\n".join(rows), fields="\n".join(fields))
 
 

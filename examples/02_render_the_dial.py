@@ -2,8 +2,8 @@
 
     python examples/02_render_the_dial.py adapted.ply [scene/]
 
-The view is the scene's first held-out camera, or its first one where none is held out; without a scene, one that
-looks at the middle of the splat.
+The view is the scene's first held-out camera, or its first one where none is held out; without a
+scene, one that looks at the middle of the splat.
 """
 
 import sys
@@ -30,7 +30,9 @@ def main(model: str, folder: str | None = None) -> None:
 
 
 def camera_facing(gaussians: clod.Gaussians, width: int = 320, height: int = 240) -> clod.Camera:
-    """Along +z at the median of the centres, from far enough to have nine tenths of them in view."""
+    """Along +z at the median of the centres, from far enough to have nine tenths of them in
+    view.
+    """
     middle = gaussians.means.median(dim=0).values
     radius = float((gaussians.means - middle).norm(dim=1).sort().values[int(0.9 * len(gaussians))])
     viewmat = torch.eye(4)

@@ -2,8 +2,8 @@
 
     python examples/03_gsplat.py adapted.ply scene/
 
-All held-out cameras are drawn in one call at several dial values; the first one's pictures are written. gsplat draws on
-CUDA devices only; 02_render_the_dial.py does the same without.
+All held-out cameras are drawn in one call at several dial values; the first one's pictures are
+written. gsplat draws on CUDA devices only; 02_render_the_dial.py does the same without.
 """
 
 import sys
@@ -32,12 +32,27 @@ def main(model: str, folder: str, device: str = "cuda") -> None:
 
     for virtual_scale in DIALS:
         images, _, meta = gsplat.rasterization(
-            g.means, g.quats, g.scales, g.opacities, colors, viewmats, Ks, width, height, sh_degree=g.sh_degree,
-            sigma_d=g.sigma_d, growth_d=g.growth_d, attenuation=g.attenuation, virtual_scale=virtual_scale,
-        )  # fmt: skip
+            g.means,
+            g.quats,
+            g.scales,
+            g.opacities,
+            colors,
+            viewmats,
+            Ks,
+            width,
+            height,
+            sh_degree=g.sh_degree,
+            sigma_d=g.sigma_d,
+            growth_d=g.growth_d,
+            attenuation=g.attenuation,
+            virtual_scale=virtual_scale,
+        )
         name = f"{Path(model).stem}_gsplat_sv{virtual_scale}.png"
-        Image.fromarray((images[0].clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()).save(name)
-        drawn = len(meta["gaussian_ids"]) / len(cameras)  # ids of the file's rows, as far as they are in sight
+        Image.fromarray((images[0].clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()).save(
+            name
+        )
+        # ids of the file's rows, as far as they are in sight
+        drawn = len(meta["gaussian_ids"]) / len(cameras)
         print(f"wrote {name}: {drawn:,.0f} of {g.whole:,} Gaussians a camera")
 
 
@@ -46,7 +61,9 @@ if __name__ == "__main__":
         sys.exit(__doc__)
     try:
         if not torch.cuda.is_available():
-            raise clod.ClodError("gsplat draws on CUDA devices only, and there is none; try 02_render_the_dial.py")
+            raise clod.ClodError(
+                "gsplat draws on CUDA devices only, and there is none; try 02_render_the_dial.py"
+            )
         main(*sys.argv[1:])
     except (clod.ClodError, ImportError) as error:
         sys.exit(f"error: {error}")

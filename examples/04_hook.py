@@ -2,8 +2,8 @@
 
     python examples/04_hook.py adapted.ply
 
-The renderer here is ten lines of numpy that draw each Gaussian as one pixel. docs/writing_a_renderer.md is for
-renderers in other languages.
+The renderer here is ten lines of numpy that draw each Gaussian as one pixel.
+docs/writing_a_renderer.md is for renderers in other languages.
 """
 
 import sys
@@ -26,15 +26,20 @@ def main(model: str) -> None:
 
     for virtual_scale in (1, 2, 3, 5):
         hook = checkpoint.hook(virtual_scale)
-        drawn, keep, _ = hook(means, opacities, viewmat, K, WIDTH, HEIGHT)  # growth: pixels have no scales
-        picture = dots(means[keep] @ viewmat[:3, :3].T + viewmat[:3, 3], drawn[keep], colors[keep], K)
+        # growth: pixels have no scales
+        drawn, keep, _ = hook(means, opacities, viewmat, K, WIDTH, HEIGHT)
+        picture = dots(
+            means[keep] @ viewmat[:3, :3].T + viewmat[:3, 3], drawn[keep], colors[keep], K
+        )
         name = f"{Path(model).stem}_dots_sv{virtual_scale}.png"
         Image.fromarray((picture * 255).round().astype(np.uint8)).save(name)
         print(f"wrote {name}: {keep.sum():,} of {gaussians.whole:,} Gaussians")
 
 
 def dots(seen: np.ndarray, opacities: np.ndarray, colors: np.ndarray, K: np.ndarray) -> np.ndarray:
-    """``[H, W, 3]``: the farthest of what is ``seen`` (camera coordinates) first, each blended over its pixel."""
+    """``[H, W, 3]``: the farthest of what is ``seen`` (camera coordinates) first, each blended over
+    its pixel.
+    """
     x, y, z = K @ seen.T
     pixels = np.stack([y, x]) // np.maximum(z, 1e-6)
     inside = (z > 0.01) & (pixels >= 0).all(0) & (pixels[0] < HEIGHT) & (pixels[1] < WIDTH)
@@ -46,7 +51,9 @@ def dots(seen: np.ndarray, opacities: np.ndarray, colors: np.ndarray, K: np.ndar
 
 
 def camera_facing(means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Along +z at the median of the centres, from far enough to have nine tenths of them in view."""
+    """Along +z at the median of the centres, from far enough to have nine tenths of them in
+    view.
+    """
     middle = np.median(means, axis=0)
     radius = np.quantile(np.linalg.norm(means - middle, axis=1), 0.9)
     viewmat = np.eye(4)

@@ -2,8 +2,9 @@
 
     python examples/05_budgets.py adapted.ply scene/
 
-The file must be one that ``clod-adapt`` wrote, for the loss is read off the calibration in its header. Counts are
-solved for exactly, over the scene's held-out cameras; for the frame rate some frames are timed here and now.
+The file must be one that ``clod-adapt`` wrote, for the loss is read off the calibration in its
+header. Counts are solved for exactly, over the scene's held-out cameras; for the frame rate some
+frames are timed here and now.
 """
 
 import sys
@@ -21,7 +22,12 @@ def main(model: str, folder: str) -> None:
     scene = clod.load_scene(folder, origin=checkpoint.origin)
     cameras = [view.camera for view in scene.test or scene.train]
     for share in SHARES:
-        show(f"{share:.0%} of the Gaussians", gaussians, keep=share * gaussians.whole, cameras=cameras)
+        show(
+            f"{share:.0%} of the Gaussians",
+            gaussians,
+            keep=share * gaussians.whole,
+            cameras=cameras,
+        )
     for drop in DROPS:
         show(f"{drop:g} dB given up", gaussians, psnr_drop=drop, calibration=checkpoint.calibration)
     for rate in RATES:

@@ -22,8 +22,10 @@ class Backend:
     module: str  # below clod_adapter.rasterizers
     device: str = "cpu"
     dtype: torch.dtype = torch.float32  # of its inputs
-    repeats: bool = True  # the same input gives the same bits; otherwise sums are rounded in no fixed order
-    looser: float = 1.0  # factor on the tolerances; above 1 for float32 kernels with fast intrinsics
+    # the same input gives the same bits; otherwise sums are rounded in no fixed order
+    repeats: bool = True
+    # factor on the tolerances; above 1 for float32 kernels with fast intrinsics
+    looser: float = 1.0
     drops_last: bool = False  # leaves out the Gaussian that ends a pixel, as gsplat does
 
     def __call__(self, *args: Any, **kwargs: Any) -> tuple[Tensor, Tensor]:
@@ -31,7 +33,9 @@ class Backend:
             return x.to(self.device, self.dtype) if isinstance(x, Tensor) else x
 
         rasterize = importlib.import_module(f"clod_adapter.rasterizers.{self.module}").rasterize
-        image, alpha = rasterize(*map(place, args), **{name: place(value) for name, value in kwargs.items()})
+        image, alpha = rasterize(
+            *map(place, args), **{name: place(value) for name, value in kwargs.items()}
+        )
         return image.cpu().float(), alpha.cpu().float()
 
     @property
@@ -45,7 +49,8 @@ class Backend:
         return {"rtol": 0.0, "atol": 0.0} if self.repeats else {"rtol": 1e-3, "atol": 1e-3}
 
 
-# gsplat's kernels are CUDA's alone. In torch, in float64, what is around them answers for every digit.
+# gsplat's kernels are CUDA's alone. In torch, in float64, what is around them answers for every
+# digit.
 BACKENDS = {
     "cpu": Backend("cpu"),
     "cuda, gsplat in torch": Backend("cuda", dtype=torch.float64, drops_last=True),
@@ -55,7 +60,9 @@ BACKENDS = {
 
 @contextmanager
 def torch_threads(count: int) -> Iterator[None]:
-    """Sets the number of torch's threads, which kernels then use for few rows too, and restores it at the end."""
+    """Sets the number of torch's threads, which kernels then use for few rows too, and restores it
+    at the end.
+    """
     before, few = torch.get_num_threads(), cpu.FEW
     torch.set_num_threads(count)
     cpu.FEW = 0
@@ -66,8 +73,12 @@ def torch_threads(count: int) -> Iterator[None]:
         cpu.FEW = few
 
 
-def fresh_copy(monkeypatch: pytest.MonkeyPatch, name: str, package: str, installed: ModuleType | None) -> ModuleType:
-    """A second copy of ``clod_adapter.integrations.NAME``, imported with ``package`` replaced or absent."""
+def fresh_copy(
+    monkeypatch: pytest.MonkeyPatch, name: str, package: str, installed: ModuleType | None
+) -> ModuleType:
+    """A second copy of ``clod_adapter.integrations.NAME``, imported with ``package`` replaced or
+    absent.
+    """
     monkeypatch.setitem(sys.modules, package, installed)
     spec = importlib.util.find_spec(f"clod_adapter.integrations.{name}")
     assert spec is not None and spec.loader is not None

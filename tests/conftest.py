@@ -1,6 +1,7 @@
 """Fixtures of several folders: the shared data, a browser, and a tiny capture."""
 
-# Before anything imports torch, whose idle threads would else spin and take the cores from the kernels.
+# Before anything imports torch, whose idle threads would else spin and take the cores from the
+# kernels.
 import clod_adapter  # noqa: F401
 
 # isort: split
@@ -49,8 +50,12 @@ def pytest_sessionstart(session: pytest.Session) -> None:
 
 @pytest.fixture
 def ci_banana() -> Path:
-    """A small real scene of the shared data: CLOD_SHARED_DATA, or shared/data beside the checkout."""
-    shared = os.environ.get("CLOD_SHARED_DATA", Path(__file__).resolve().parents[2] / "shared" / "data")
+    """A small real scene of the shared data: CLOD_SHARED_DATA, or shared/data beside the
+    checkout.
+    """
+    shared = os.environ.get(
+        "CLOD_SHARED_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"
+    )
     if not (path := Path(shared) / "ci_banana").exists():
         pytest.skip(f"shared data absent: {path} (set CLOD_SHARED_DATA)")
     return path
@@ -58,7 +63,9 @@ def ci_banana() -> Path:
 
 @pytest.fixture(scope="session")
 def chromium() -> Iterator[Any]:
-    """The one browser of a test process (Playwright allows no second); skips where there is none."""
+    """The one browser of a test process (Playwright allows no second); skips where there is
+    none.
+    """
     with browser.launch() as chromium:
         yield chromium
 
@@ -71,7 +78,9 @@ def without_splat_transform(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @dataclass(frozen=True)
 class Capture:
-    """A scene folder with ten 64x48 photographs, the checkpoint they show, and a writer of such checkpoints."""
+    """A scene folder with ten 64x48 photographs, the checkpoint they show, and a writer of such
+    checkpoints.
+    """
 
     scene: Path
     ply: Path
@@ -87,10 +96,17 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
     (scene / "images").mkdir(parents=True)
     normal = partial(torch.randn, generator=torch.Generator().manual_seed(1))
     gaussians = Gaussians(
-        means=normal(300, 3), quats=normal(300, 4), log_scales=normal(300, 3) * 0.5 - 2.0,
-        opacity_logits=normal(300) * 1.5 + 1.0, sh0=normal(300, 1, 3), shN=normal(300, 3, 3) * 0.1,
-    )  # fmt: skip
-    cameras, names = [_camera(2 * math.pi * i / 10) for i in range(10)], [f"{i:03}.png" for i in range(10)]
+        means=normal(300, 3),
+        quats=normal(300, 4),
+        log_scales=normal(300, 3) * 0.5 - 2.0,
+        opacity_logits=normal(300) * 1.5 + 1.0,
+        sh0=normal(300, 1, 3),
+        shN=normal(300, 3, 3) * 0.1,
+    )
+    cameras, names = (
+        [_camera(2 * math.pi * i / 10) for i in range(10)],
+        [f"{i:03}.png" for i in range(10)],
+    )
     write_model(scene, cameras, names)
     for camera, name in zip(cameras, names, strict=True):
         Image.fromarray(render(gaussians, camera).pixels.numpy()).save(scene / "images" / name)
@@ -106,7 +122,19 @@ def captured() -> tuple[Gaussians, Scene]:
 def dialled(capture: Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The capture's checkpoint with a dial up to 4 and its calibration, as clod-adapt writes it."""
     path = tmp_path_factory.mktemp("dialled") / "dial.ply"
-    words = [capture.ply, "--images", capture.scene, "--iters", 12, "--max-sv", 4, "--out", path, "--quiet", "--json"]
+    words = [
+        capture.ply,
+        "--images",
+        capture.scene,
+        "--iters",
+        12,
+        "--max-sv",
+        4,
+        "--out",
+        path,
+        "--quiet",
+        "--json",
+    ]
     assert main(accepted(words)) == 0
     return path
 

@@ -1,8 +1,9 @@
 """A simulated device: it wraps CPU tensors, and operations that would fail on a GPU fail on it.
 
-Mixing its tensors with the CPU's in one operation, ``.numpy()``, and indexing the CPU's with its own are refused; 0-d
-CPU tensors mix, as on CUDA. It is torch's private backend under the name ``gpu``, which is neither "cpu" nor "cuda".
-``waits`` tells where the host would wait for the device.
+Mixing its tensors with the CPU's in one operation, ``.numpy()``, and indexing the CPU's with its
+own are refused; 0-d CPU tensors mix, as on CUDA. It is torch's private backend under the name
+``gpu``, which is neither "cpu" nor "cuda". ``waits`` tells where the host would wait for the
+device.
 """
 
 from __future__ import annotations
@@ -22,7 +23,15 @@ from torch.utils._pytree import tree_flatten, tree_map
 
 MOVES = ("aten._to_copy.default", "aten.copy_.default")  # what may see tensors of both
 # Operations whose result, or its size, the host reads.
-READS = ("_local_scalar_dense", "nonzero", "equal", "masked_select", "_unique2", "unique_consecutive", "unique_dim")
+READS = (
+    "_local_scalar_dense",
+    "nonzero",
+    "equal",
+    "masked_select",
+    "_unique2",
+    "unique_consecutive",
+    "unique_dim",
+)
 _log: list[str] = []
 
 
@@ -35,14 +44,20 @@ class Walled(Tensor):
     @staticmethod
     def __new__(cls, real: Tensor) -> Walled:
         made = Tensor._make_wrapper_subclass(
-            cls, real.shape, strides=real.stride(), storage_offset=real.storage_offset(), dtype=real.dtype,
+            cls,
+            real.shape,
+            strides=real.stride(),
+            storage_offset=real.storage_offset(),
+            dtype=real.dtype,
             device=torch.device("gpu", 0),
-        )  # fmt: skip
+        )
         made.inner = real
         return made
 
     @classmethod
-    def __torch_dispatch__(cls, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+    def __torch_dispatch__(
+        cls, function: Any, types: Any, args: Any = (), kwargs: Any = None
+    ) -> Any:
         return _run(function, args, kwargs or {})
 
 
@@ -51,7 +66,10 @@ def _run(function: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     walled = [x for x in tensors if isinstance(x, Walled)]
     outside = [x for x in tensors if not isinstance(x, Walled) and x.dim()]
     if walled and outside and str(function) not in MOVES:
-        raise RuntimeError(f"{function}: tensors of the fake GPU and of the CPU, {[tuple(x.shape) for x in outside]}")
+        raise RuntimeError(
+            f"{function}: tensors of the fake GPU and of the CPU,"
+            f" {[tuple(x.shape) for x in outside]}"
+        )
     if _waits(function, args, kwargs, walled):
         _log.append(_place())
     device = kwargs.get("device")
@@ -63,16 +81,22 @@ def _run(function: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     out = function(*args, **kwargs)
     if not inside:
         return out
-    return tree_map(lambda x: own[id(x)] if id(x) in own else Walled(x) if isinstance(x, Tensor) else x, out)
+    return tree_map(
+        lambda x: own[id(x)] if id(x) in own else Walled(x) if isinstance(x, Tensor) else x, out
+    )
 
 
 def _waits(function: Any, args: Any, kwargs: dict[str, Any], walled: list[Any]) -> bool:
-    """Whether the host waits for the device: it reads a value or a size, or copies and is not told to go on."""
+    """Whether the host waits for the device: it reads a value or a size, or copies and is not told
+    to go on.
+    """
     name = str(function)
     if name in MOVES:
         to = torch.device(kwargs.get("device") or args[0].device)
         going_on = kwargs.get("non_blocking") or (name == MOVES[1] and args[2:] == (True,))
-        return (to.type == "gpu") != bool(walled if name == MOVES[0] else isinstance(args[1], Walled)) and not going_on
+        return (to.type == "gpu") != bool(
+            walled if name == MOVES[0] else isinstance(args[1], Walled)
+        ) and not going_on
     masks = args[1] if name.startswith("aten.index") and isinstance(args[1], (list, tuple)) else ()
     masked = any(isinstance(rows, Walled) and rows.dtype == torch.bool for rows in masks)
     return bool(walled) and (masked or name.split(".")[1] in READS)
@@ -95,14 +119,18 @@ def waits() -> Iterator[list[str]]:
 
 
 class _Dispatch(TorchDispatchMode):
-    def __torch_dispatch__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+    def __torch_dispatch__(
+        self, function: Any, types: Any, args: Any = (), kwargs: Any = None
+    ) -> Any:
         return _run(function, args, kwargs or {})
 
 
 class _Functions(TorchFunctionMode):
     """Handles calls that dispatch does not see: ``torch.tensor`` with a device, and ``tolist``."""
 
-    def __torch_function__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+    def __torch_function__(
+        self, function: Any, types: Any, args: Any = (), kwargs: Any = None
+    ) -> Any:
         kwargs = kwargs or {}
         if function is torch.tensor and kwargs.get("device") is not None:
             device = kwargs.pop("device")
@@ -114,17 +142,22 @@ class _Functions(TorchFunctionMode):
 
 @lru_cache(maxsize=1)
 def register() -> bool:
-    """Whether this torch has devices written in Python; registers this one, unless there is a real GPU: before the
-    first backward pass, when autograd starts a thread per device."""
+    """Whether this torch has devices written in Python; registers this one, unless there is a real
+    GPU: before the first backward pass, when autograd starts a thread per device.
+    """
     if torch.cuda.is_available():
         return True
     try:
-        from torch.utils.backend_registration import _DummyBackendModule, _setup_privateuseone_for_python_backend
+        from torch.utils.backend_registration import (
+            _DummyBackendModule,
+            _setup_privateuseone_for_python_backend,
+        )
     except ImportError:
         return False
 
     class Module(_DummyBackendModule):
-        def get_amp_supported_dtype(self) -> list[torch.dtype]:  # torch.autocast asks for it, to be disabled too
+        # torch.autocast asks for it, to be disabled too
+        def get_amp_supported_dtype(self) -> list[torch.dtype]:
             return [torch.float16, torch.bfloat16]
 
     _setup_privateuseone_for_python_backend("gpu", Module())

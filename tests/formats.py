@@ -1,4 +1,6 @@
-"""Helpers of the tests of file formats: models with extreme values, damaged files, splat-transform."""
+"""Helpers of the tests of file formats: models with extreme values, damaged files,
+splat-transform.
+"""
 
 import gzip
 import json
@@ -26,11 +28,14 @@ from scenes import gaussians
 ATTENUATION = AttenuationConfig(reference_distance=3.217, max_sv=7.0)
 CALIBRATION = Calibration((CalibrationRow(1, 30, 29.1, 0.9, 2.5),), 40, 3, 64, 48, "a machine")
 ORIGIN = (5.1e5, -4096.0, 0.25)
-PACKED = Path(__file__).parent / "io" / "of_splat_transform" / "capture.compressed.ply"  # of the fixture ``capture``
+# of the fixture ``capture``
+PACKED = Path(__file__).parent / "io" / "of_splat_transform" / "capture.compressed.ply"
 
 
 def model(degree: int = 3, count: int = 40, *, growth: bool = True) -> Gaussians:
-    """With extreme values: opacity 1, sigma_d of 0 to 1e9, quaternions of length 1e-14 to 1e14, growth_d of -1 to 3."""
+    """With extreme values: opacity 1, sigma_d of 0 to 1e9, quaternions of length 1e-14 to 1e14,
+    growth_d of -1 to 3.
+    """
     g = gaussians(count, degree, seed=degree)
     sigma = torch.rand(count, generator=torch.Generator().manual_seed(1)) * 4
     sigma[:4] = torch.tensor([1e9, 0.0, 1e-3, 65504.0])
@@ -38,8 +43,16 @@ def model(degree: int = 3, count: int = 40, *, growth: bool = True) -> Gaussians
     logits[0] = torch.inf
     quats = g.quats.clone()
     quats[1:4] *= torch.tensor([1e-14, 1e14, 3.0])[:, None]
-    growth_d = torch.linspace(-1, 3, count).where(torch.arange(count) % 5 != 2, 0) if growth else None
-    return g.replace(opacity_logits=logits, quats=quats, sigma_d=sigma, growth_d=growth_d, attenuation=ATTENUATION)
+    growth_d = (
+        torch.linspace(-1, 3, count).where(torch.arange(count) % 5 != 2, 0) if growth else None
+    )
+    return g.replace(
+        opacity_logits=logits,
+        quats=quats,
+        sigma_d=sigma,
+        growth_d=growth_d,
+        attenuation=ATTENUATION,
+    )
 
 
 def axes_of(quats: torch.Tensor) -> torch.Tensor:
@@ -48,7 +61,9 @@ def axes_of(quats: torch.Tensor) -> torch.Tensor:
 
 
 def turned(a: torch.Tensor, b: torch.Tensor) -> float:
-    """The sine of the largest angle between the axes of two ellipsoids, whose half turns are the same."""
+    """The sine of the largest angle between the axes of two ellipsoids, whose half turns are the
+    same.
+    """
     return float(torch.linalg.cross(axes_of(a), axes_of(b), dim=1).norm(dim=1).max())
 
 
@@ -59,14 +74,21 @@ def covariances(g: Gaussians) -> torch.Tensor:
 
 
 def damaged(whole: bytes, data: st.DataObject) -> bytes:
-    """A truncated file, or one with a few values overwritten, at its beginning more often than in the rest."""
+    """A truncated file, or one with a few values overwritten, at its beginning more often than in
+    the rest.
+    """
     if data.draw(st.booleans()):
         return whole[: data.draw(st.integers(0, len(whole) - 1))]
     changed = bytearray(whole)
-    words = st.sampled_from([b"\xff" * 8, b"\xff" * 4, b"\0" * 8, b"\0\0\0\x80", b"nan", b" ", b"-1", b"\n", b"#"])
+    words = st.sampled_from(
+        [b"\xff" * 8, b"\xff" * 4, b"\0" * 8, b"\0\0\0\x80", b"nan", b" ", b"-1", b"\n", b"#"]
+    )
     for _ in range(data.draw(st.integers(1, 4))):
         end = min(data.draw(st.sampled_from([16, 64, 1024, len(whole)])), len(whole))
-        at, value = data.draw(st.integers(0, end - 1)), data.draw(st.binary(min_size=1, max_size=1) | words)
+        at, value = (
+            data.draw(st.integers(0, end - 1)),
+            data.draw(st.binary(min_size=1, max_size=1) | words),
+        )
         changed[at : at + len(value)] = value
     return bytes(changed)
 
@@ -89,9 +111,12 @@ def rows_by_place(means: np.ndarray, others: np.ndarray) -> np.ndarray:
 
 
 def change_setting(path: Path, name: str, old: str, new: str) -> Path:
-    """Changes a setting in a file of any format that stores it, or in an adapter: text of the same length."""
+    """Changes a setting in a file of any format that stores it, or in an adapter: text of the same
+    length.
+    """
     assert len(old) == len(new)
-    pattern = rf'({name}\\?"?:? ?){old}(?![.\d])'.encode()  # of JSON, of JSON in JSON, and of the comments of a PLY
+    # of JSON, of JSON in JSON, and of the comments of a PLY
+    pattern = rf'({name}\\?"?:? ?){old}(?![.\d])'.encode()
 
     def changed(whole: bytes) -> bytes:
         found, count = re.subn(pattern, rb"\g<1>" + new.encode(), whole)
@@ -100,7 +125,10 @@ def change_setting(path: Path, name: str, old: str, new: str) -> Path:
 
     if path.suffix == ".pt":
         checkpoint = torch.load(path, weights_only=True)
-        torch.save(checkpoint | {"clod_adapter": changed(checkpoint["clod_adapter"].encode()).decode()}, path)
+        torch.save(
+            checkpoint | {"clod_adapter": changed(checkpoint["clod_adapter"].encode()).decode()},
+            path,
+        )
     elif path.suffix == ".spz":
         path.write_bytes(gzip.compress(changed(gzip.decompress(path.read_bytes()))))
     else:
@@ -108,18 +136,26 @@ def change_setting(path: Path, name: str, old: str, new: str) -> Path:
     return path
 
 
-def write_rows(path: Path, rows: np.ndarray, order: str = "<", comments: Iterable[str] = ()) -> Path:
+def write_rows(
+    path: Path, rows: np.ndarray, order: str = "<", comments: Iterable[str] = ()
+) -> Path:
     """A PLY of these vertices, in the byte order "<" or ">", or "ascii"."""
-    return write_elements(path, [PlyElement.describe(rows, "vertex", comments=list(comments))], order)
+    return write_elements(
+        path, [PlyElement.describe(rows, "vertex", comments=list(comments))], order
+    )
 
 
 def write_elements(path: Path, elements: Sequence[PlyElement], order: str = "<") -> Path:
-    PlyData(elements, text=order == "ascii", byte_order="=" if order == "ascii" else order).write(str(path))
+    PlyData(elements, text=order == "ascii", byte_order="=" if order == "ascii" else order).write(
+        str(path)
+    )
     return path
 
 
 def without_comments(path: Path, **columns: Any) -> Path:
-    """The file as another tool writes it: without its comments, some columns added or changed in every row."""
+    """The file as another tool writes it: without its comments, some columns added or changed in
+    every row.
+    """
     rows = with_columns(PlyData.read(str(path))["vertex"].data, **columns)
     return write_rows(path.with_name("rewritten.ply"), rows)
 
@@ -152,19 +188,42 @@ def needed(degree: int = 0) -> list[str]:
     return ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", *rest, "opacity", *shape]
 
 
-def random_rows(count: int, names: Sequence[str], seed: int = 0, types: dict[str, str] | None = None) -> np.ndarray:
+def random_rows(
+    count: int, names: Sequence[str], seed: int = 0, types: dict[str, str] | None = None
+) -> np.ndarray:
     """Normal values in columns of float32 or of ``types``."""
-    rng, rows = np.random.default_rng(seed), np.empty(count, [(name, (types or {}).get(name, "f4")) for name in names])
+    rng, rows = (
+        np.random.default_rng(seed),
+        np.empty(count, [(name, (types or {}).get(name, "f4")) for name in names]),
+    )
     for name in names:
-        rows[name] = rng.integers(0, 99, count) if rows.dtype[name].kind in "iu" else rng.normal(size=count)
+        rows[name] = (
+            rng.integers(0, 99, count) if rows.dtype[name].kind in "iu" else rng.normal(size=count)
+        )
     return rows
 
 
 def inria_rows(g: Gaussians) -> np.ndarray:
-    """The vertices that Inria's trainer writes of these Gaussians, normals included; the dial's columns last."""
+    """The vertices that Inria's trainer writes of these Gaussians, normals included; the dial's
+    columns last.
+    """
     flat = g.shN.numpy().transpose(0, 2, 1).reshape(len(g), -1)  # channel by channel
-    parts = [g.means, torch.zeros(len(g), 3), g.sh0[:, 0], flat, g.opacity_logits[:, None], g.log_scales, g.quats]
+    parts = [
+        g.means,
+        torch.zeros(len(g), 3),
+        g.sh0[:, 0],
+        flat,
+        g.opacity_logits[:, None],
+        g.log_scales,
+        g.quats,
+    ]
     names = needed(g.sh_degree)
-    columns = dict(zip([*names[:3], "nx", "ny", "nz", *names[3:]], np.concatenate(parts, 1).T, strict=True))
-    columns |= {name: tensor.numpy() for name, tensor in g.tensors().items() if name in ("sigma_d", "growth_d")}
+    columns = dict(
+        zip([*names[:3], "nx", "ny", "nz", *names[3:]], np.concatenate(parts, 1).T, strict=True)
+    )
+    columns |= {
+        name: tensor.numpy()
+        for name, tensor in g.tensors().items()
+        if name in ("sigma_d", "growth_d")
+    }
     return with_columns(np.empty(len(g), [(name, "f4") for name in columns]), **columns)

@@ -1,9 +1,9 @@
 """gsplat's own ``rasterization`` without CUDA: its Python, with torch for its kernels.
 
-Slow: for a few dozen Gaussians in small images, each of which counts as one tile. It follows the kernels of the
-installed version, 1.4.0 or 1.5.3: where the projection has opacities, rows below 1/255 are dropped in it and narrow by
-their opacity; packed rows and keys are in the kernels' order, and what the packed kernels cannot do (a background,
-gsplat's issue 764) is refused.
+Slow: for a few dozen Gaussians in small images, each of which counts as one tile. It follows the
+kernels of the installed version, 1.4.0 or 1.5.3: where the projection has opacities, rows below
+1/255 are dropped in it and narrow by their opacity; packed rows and keys are in the kernels' order,
+and what the packed kernels cannot do (a background, gsplat's issue 764) is refused.
 """
 
 import inspect
@@ -18,12 +18,16 @@ ALPHA_MIN, ALPHA_MAX, TRANSMITTANCE_MIN = 1 / 255, 0.999, 1e-4
 
 
 def install(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Replaces the kernels in gsplat and its rendering module; skips the test where there is no gsplat."""
+    """Replaces the kernels in gsplat and its rendering module; skips the test where there is no
+    gsplat.
+    """
     gsplat = pytest.importorskip("gsplat", reason="pip install gsplat==1.5.3")
     from gsplat import rendering
     from gsplat.cuda import _torch_impl
 
-    def spherical_harmonics(degree: int, dirs: Tensor, coeffs: Tensor, masks: Tensor | None = None) -> Tensor:
+    def spherical_harmonics(
+        degree: int, dirs: Tensor, coeffs: Tensor, masks: Tensor | None = None
+    ) -> Tensor:
         return _torch_impl._spherical_harmonics(degree, dirs, coeffs)
 
     replaced: dict[str, Any] = {
@@ -34,27 +38,56 @@ def install(monkeypatch: pytest.MonkeyPatch) -> None:
         "spherical_harmonics": spherical_harmonics,
     }
     for name, function in replaced.items():
-        monkeypatch.setattr(function, "__signature__", inspect.signature(getattr(gsplat, name)), raising=False)
+        monkeypatch.setattr(
+            function, "__signature__", inspect.signature(getattr(gsplat, name)), raising=False
+        )
         for module in (rendering, gsplat):
             monkeypatch.setattr(module, name, function)
 
 
 def fully_fused_projection(
-    means: Tensor, covars: Tensor | None, quats: Tensor | None, scales: Tensor | None, viewmats: Tensor, Ks: Tensor,
-    width: int, height: int, *, eps2d: float, near_plane: float, far_plane: float, radius_clip: float, packed: bool,
-    sparse_grad: bool, calc_compensations: bool, camera_model: str, opacities: Tensor | None = None,
-) -> tuple[Any, ...]:  # fmt: skip
+    means: Tensor,
+    covars: Tensor | None,
+    quats: Tensor | None,
+    scales: Tensor | None,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    *,
+    eps2d: float,
+    near_plane: float,
+    far_plane: float,
+    radius_clip: float,
+    packed: bool,
+    sparse_grad: bool,
+    calc_compensations: bool,
+    camera_model: str,
+    opacities: Tensor | None = None,
+) -> tuple[Any, ...]:
     """Without opacities gsplat 1.4.0's: one radius for both directions, no batches."""
     from gsplat.cuda import _torch_impl
 
     if covars is None:
         assert quats is not None
-        quats = quats / quats.norm(dim=-1, keepdim=True)  # as the kernel: of any length, and NaN where it is 0
+        # as the kernel: of any length, and NaN where it is 0
+        quats = quats / quats.norm(dim=-1, keepdim=True)
         covars, _ = _torch_impl._quat_scale_to_covar_preci(quats, scales, True, False, triu=False)
     else:
-        covars = covars[..., [0, 1, 2, 1, 3, 4, 2, 4, 5]].unflatten(-1, (3, 3))  # from the upper triangle
+        # from the upper triangle
+        covars = covars[..., [0, 1, 2, 1, 3, 4, 2, 4, 5]].unflatten(-1, (3, 3))
     radii, *values, compensations = _torch_impl._fully_fused_projection(
-        means, covars, viewmats, Ks, width, height, eps2d, near_plane, far_plane, calc_compensations, camera_model
+        means,
+        covars,
+        viewmats,
+        Ks,
+        width,
+        height,
+        eps2d,
+        near_plane,
+        far_plane,
+        calc_compensations,
+        camera_model,
     )
     if opacities is None:
         radii = radii.amax(-1) if radii.dim() == 3 else radii  # later torch code has two
@@ -62,46 +95,85 @@ def fully_fused_projection(
     else:
         shown = opacities[..., None, :] * (1 if compensations is None else compensations)
         narrower = (2 * (shown / ALPHA_MIN).clamp(min=1).log()).sqrt() / 3.33
-        radii = torch.ceil(radii * narrower.clamp(max=1)[..., None]).int() * (shown >= ALPHA_MIN)[..., None].int()
+        radii = (
+            torch.ceil(radii * narrower.clamp(max=1)[..., None]).int()
+            * (shown >= ALPHA_MIN)[..., None].int()
+        )
         seen = (radii > 0).all(-1)
     found = radii, *values, compensations
     if not packed:
         return found
     flat = seen if opacities is None else seen.reshape(-1, *seen.shape[-2:])  # [C, N], or [B, C, N]
     ids = torch.nonzero(flat, as_tuple=True)
-    rows = (None if x is None else x.reshape(*flat.shape, *x.shape[seen.dim() :])[ids] for x in found)
+    rows = (
+        None if x is None else x.reshape(*flat.shape, *x.shape[seen.dim() :])[ids] for x in found
+    )
     return *ids, *rows
 
 
 @torch.no_grad()
 def isect_tiles(
-    means2d: Tensor, radii: Tensor, depths: Tensor, tile_size: int, tile_width: int, tile_height: int, *,
-    packed: bool, gaussian_ids: Tensor | None, segmented: bool = False, n_images: int = 0, n_cameras: int = 0,
-    image_ids: Tensor | None = None, camera_ids: Tensor | None = None,
-) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
+    means2d: Tensor,
+    radii: Tensor,
+    depths: Tensor,
+    tile_size: int,
+    tile_width: int,
+    tile_height: int,
+    *,
+    packed: bool,
+    gaussian_ids: Tensor | None,
+    segmented: bool = False,
+    n_images: int = 0,
+    n_cameras: int = 0,
+    image_ids: Tensor | None = None,
+    camera_ids: Tensor | None = None,
+) -> tuple[Tensor, Tensor, Tensor]:
     image_ids = camera_ids if image_ids is None else image_ids
     if image_ids is None:
-        image_ids = torch.arange(n_images or n_cameras, device=depths.device).repeat_interleave(means2d.shape[-2])
+        image_ids = torch.arange(n_images or n_cameras, device=depths.device).repeat_interleave(
+            means2d.shape[-2]
+        )
     shown = (radii > 0).reshape(depths.numel(), -1).all(-1)
     bits = (tile_width * tile_height).bit_length()
-    keys = (image_ids[shown] << 32 + bits) | depths.flatten()[shown].float().view(torch.int32).long()
+    keys = (image_ids[shown] << 32 + bits) | depths.flatten()[shown].float().view(
+        torch.int32
+    ).long()
     keys, order = torch.sort(keys, stable=True)
     return shown.int().reshape(depths.shape), keys, shown.nonzero()[order, 0].int()
 
 
 def rasterize_to_pixels(
-    means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, width: int, height: int, tile_size: int,
-    isect_offsets: Tensor, flatten_ids: Tensor, *, backgrounds: Tensor | None, packed: bool, absgrad: bool,
-) -> tuple[Tensor, Tensor]:  # fmt: skip
+    means2d: Tensor,
+    conics: Tensor,
+    colors: Tensor,
+    opacities: Tensor,
+    width: int,
+    height: int,
+    tile_size: int,
+    isect_offsets: Tensor,
+    flatten_ids: Tensor,
+    *,
+    backgrounds: Tensor | None,
+    packed: bool,
+    absgrad: bool,
+) -> tuple[Tensor, Tensor]:
     assert not packed or backgrounds is None
-    if absgrad and means2d.requires_grad:  # the kernel sums the absolute values of all pixels: more than this
+    # the kernel sums the absolute values of all pixels: more than this
+    if absgrad and means2d.requires_grad:
         means2d.register_hook(lambda gradient: setattr(means2d, "absgrad", gradient.abs()))
-    table = [means2d.reshape(-1, 2), conics.reshape(-1, 3), opacities.flatten(), colors.reshape(-1, colors.shape[-1])]
+    table = [
+        means2d.reshape(-1, 2),
+        conics.reshape(-1, 3),
+        opacities.flatten(),
+        colors.reshape(-1, colors.shape[-1]),
+    ]
     images = isect_offsets.shape[:-2]
     bounds = [*isect_offsets[..., 0, 0].flatten().tolist(), len(flatten_ids)]
     y, x = torch.meshgrid(*(torch.arange(n) + 0.5 for n in (height, width)), indexing="ij")
     rows = [flatten_ids[begin:end].long() for begin, end in pairwise(bounds)]
-    canvas = torch.stack([_blend([values[ids] for values in table], x.to(colors), y.to(colors)) for ids in rows])
+    canvas = torch.stack(
+        [_blend([values[ids] for values in table], x.to(colors), y.to(colors)) for ids in rows]
+    )
     drawn, alphas = canvas[..., :-1], canvas[..., -1:]
     if backgrounds is not None:
         drawn = drawn + (1 - alphas) * backgrounds.reshape(len(canvas), 1, 1, -1)
@@ -113,8 +185,14 @@ def _blend(table: list[Tensor], x: Tensor, y: Tensor) -> Tensor:
     centres, conics, opacities, colors = table
     dx, dy = x[..., None] - centres[:, 0], y[..., None] - centres[:, 1]
     a, b, c = conics.unbind(-1)
-    alpha = (opacities * torch.exp(-(0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy))).clamp(max=ALPHA_MAX)
+    alpha = (opacities * torch.exp(-(0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy))).clamp(
+        max=ALPHA_MAX
+    )
     alpha = alpha * (alpha >= ALPHA_MIN)
     after = torch.cumprod(1 - alpha, -1)
-    weights = alpha * torch.cat([torch.ones_like(after[..., :1]), after[..., :-1]], -1) * (after > TRANSMITTANCE_MIN)
+    weights = (
+        alpha
+        * torch.cat([torch.ones_like(after[..., :1]), after[..., :-1]], -1)
+        * (after > TRANSMITTANCE_MIN)
+    )
     return torch.cat([weights @ colors, weights.sum(-1, keepdim=True)], -1)

@@ -7,7 +7,12 @@ from types import ModuleType
 from typing import Any
 
 TEXT = Path(__file__).parent / "integrations" / "gsplat_signatures.txt"
-FUNCTIONS = ("rasterization", "rasterization_2dgs", "rasterization_inria_wrapper", "rasterization_2dgs_inria_wrapper")
+FUNCTIONS = (
+    "rasterization",
+    "rasterization_2dgs",
+    "rasterization_inria_wrapper",
+    "rasterization_2dgs_inria_wrapper",
+)
 
 
 def signatures() -> dict[str, dict[str, str]]:
@@ -21,8 +26,12 @@ def signatures() -> dict[str, dict[str, str]]:
     return {version: common | own for version, own in found.items()}
 
 
-def module(version: str, draw: Callable[[str, str, dict[str, Any]], Any] = lambda *given: given) -> Any:
-    """The module ``gsplat`` of this version; ``draw`` gets a function's name, the version and the arguments."""
+def module(
+    version: str, draw: Callable[[str, str, dict[str, Any]], Any] = lambda *given: given
+) -> Any:
+    """The module ``gsplat`` of this version; ``draw`` gets a function's name, the version and the
+    arguments.
+    """
     made: Any = ModuleType("gsplat")
     made.__version__ = version
     for name, parameters in signatures()[version].items():

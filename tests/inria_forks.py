@@ -1,7 +1,9 @@
-"""Stand-ins for forks of diff-gaussian-rasterization: their signatures, drawn with the package's own rasterizer.
+"""Stand-ins for forks of diff-gaussian-rasterization: their signatures, drawn with the package's
+own rasterizer.
 
-Signatures and results from their sources: Inria's of 2023 and of 2024, MonoGS's "w-pose", Mip-Splatting's with depth
-and alpha, feature-3dgs. All of them cull what is nearer than 0.2 before anything else.
+Signatures and results from their sources: Inria's of 2023 and of 2024, MonoGS's "w-pose",
+Mip-Splatting's with depth and alpha, feature-3dgs. All of them cull what is nearer than 0.2 before
+anything else.
 """
 
 from collections import namedtuple
@@ -31,7 +33,9 @@ FORKS = {  # settings in addition to SETTINGS, parameters of the call, results
 
 
 def module(name: str) -> Any:
-    """The module ``diff_gaussian_rasterization`` of this fork; its rasterizer notes the arguments in ``given``."""
+    """The module ``diff_gaussian_rasterization`` of this fork; its rasterizer notes the arguments
+    in ``given``.
+    """
     settings, call, results = FORKS[name]
 
     class GaussianRasterizer(nn.Module):
@@ -48,21 +52,30 @@ def module(name: str) -> Any:
             return tuple(drawn[result] for result in results.split())
 
     forward: Any = GaussianRasterizer.forward
-    parameters = [Parameter(each, Parameter.POSITIONAL_OR_KEYWORD, default=None) for each in ("self", *call.split())]
+    parameters = [
+        Parameter(each, Parameter.POSITIONAL_OR_KEYWORD, default=None)
+        for each in ("self", *call.split())
+    ]
     forward.__signature__ = Signature(parameters)
     made: Any = ModuleType("diff_gaussian_rasterization")
     made.GaussianRasterizer = GaussianRasterizer
-    made.GaussianRasterizationSettings = namedtuple("GaussianRasterizationSettings", f"{SETTINGS} {settings}")
+    made.GaussianRasterizationSettings = namedtuple(
+        "GaussianRasterizationSettings", f"{SETTINGS} {settings}"
+    )
     return made
 
 
 def settings_of(kind: Any, view: Camera, **others: Any) -> Any:
     """The fork's settings for a camera whose principal point is the image's middle."""
     values = {
-        "image_height": view.height, "image_width": view.width, "tanfovx": view.width / (2 * float(view.K[0, 0])),
-        "tanfovy": view.height / (2 * float(view.K[1, 1])), "bg": torch.zeros(3), "viewmatrix": view.viewmat.T,
+        "image_height": view.height,
+        "image_width": view.width,
+        "tanfovx": view.width / (2 * float(view.K[0, 0])),
+        "tanfovy": view.height / (2 * float(view.K[1, 1])),
+        "bg": torch.zeros(3),
+        "viewmatrix": view.viewmat.T,
         "campos": view.position,
-    }  # fmt: skip
+    }
     return kind(**{name: (values | others).get(name) for name in kind._fields})
 
 
@@ -82,8 +95,20 @@ def _draw(settings: Any, given: dict[str, Any]) -> dict[str, Any]:
     names = ("means3D", "rotations", "scales", "opacities", "shs")
     means, quats, scales, opacities, shs = (given[name][seen] for name in names)
     image, alpha = rasterize(
-        means, quats, scales, opacities[:, 0], shs[:, :1], shs[:, 1:], screen_filter=screen_filter,
-        camera=Camera(settings.viewmatrix.T, K, width, height), background=settings.bg,
-    )  # fmt: skip
+        means,
+        quats,
+        scales,
+        opacities[:, 0],
+        shs[:, :1],
+        shs[:, 1:],
+        screen_filter=screen_filter,
+        camera=Camera(settings.viewmatrix.T, K, width, height),
+        background=settings.bg,
+    )
     color = image.permute(2, 0, 1) + 0 * given["means2D"].sum()
-    return result | {"color": color, "alpha": alpha, "depth": 2 * alpha, "touched": 2 * result["radii"]}
+    return result | {
+        "color": color,
+        "alpha": alpha,
+        "depth": 2 * alpha,
+        "touched": 2 * result["radii"],
+    }

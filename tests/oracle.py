@@ -1,8 +1,8 @@
 """Comparison of a rasterizer with the float64 reference, forward and backward.
 
-Image and alpha differ by at most IMAGE, and the gradient of each input by at most GRADIENT of its length. Pixels at a
-threshold (an alpha at 1/255 or at the clamp, a transmittance at 1e-4) are excluded: they must be few, and may differ
-by the effect of one Gaussian at 1/255.
+Image and alpha differ by at most IMAGE, and the gradient of each input by at most GRADIENT of its
+length. Pixels at a threshold (an alpha at 1/255 or at the clamp, a transmittance at 1e-4) are
+excluded: they must be few, and may differ by the effect of one Gaussian at 1/255.
 """
 
 import math
@@ -36,50 +36,89 @@ def weights(camera: Camera) -> tuple[Tensor, Tensor]:
 
 
 def differentiate(
-    rasterize: Splat, scene: Parameters, camera: Camera, v: tuple[Tensor, Tensor], screen_filter: ScreenFilter = CLASSIC
+    rasterize: Splat,
+    scene: Parameters,
+    camera: Camera,
+    v: tuple[Tensor, Tensor],
+    screen_filter: ScreenFilter = CLASSIC,
 ) -> Result:
     """Forward and backward, in the scene's float type."""
     dtype = scene["means"].dtype
     leaves = {name: value.clone().requires_grad_() for name, value in scene.items()}
     behind = BACKGROUND.to(dtype, copy=True).requires_grad_()
-    image, alpha = rasterize(**leaves, camera=camera, background=behind, screen_filter=screen_filter)
+    image, alpha = rasterize(
+        **leaves, camera=camera, background=behind, screen_filter=screen_filter
+    )
     total = (image * v[0].to(dtype)).sum() + (alpha * v[1].to(dtype)).sum()
     found = torch.autograd.grad(total, [*leaves.values(), behind])
-    return Result(image.detach(), alpha.detach(), dict(zip([*leaves, "background"], found, strict=True)))
+    return Result(
+        image.detach(), alpha.detach(), dict(zip([*leaves, "background"], found, strict=True))
+    )
 
 
-def on_a_cut(scene: Parameters, camera: Camera, nudge: float, screen_filter: ScreenFilter) -> Tensor:
-    """``[H, W]`` bool: pixels that change if the cuts move by ``nudge``, or have an alpha as near to the clamp."""
+def on_a_cut(
+    scene: Parameters, camera: Camera, nudge: float, screen_filter: ScreenFilter
+) -> Tensor:
+    """``[H, W]`` bool: pixels that change if the cuts move by ``nudge``, or have an alpha as near
+    to the clamp.
+    """
 
     def draw(patch: pytest.MonkeyPatch, **constants: object) -> Tensor:
         for name, value in constants.items():
             patch.setattr(reference, name, value)
         behind = BACKGROUND.double()
-        return reference.rasterize(**scene, camera=camera, background=behind, screen_filter=screen_filter)[0]
+        return reference.rasterize(
+            **scene, camera=camera, background=behind, screen_filter=screen_filter
+        )[0]
 
     images, seen, blend = [], [], reference.blend
     for factor in (1 - nudge, 1 + nudge):
         with pytest.MonkeyPatch.context() as patch:
-            images.append(draw(patch, ALPHA_MIN=reference.ALPHA_MIN * factor, T_MIN=reference.T_MIN * factor))
+            images.append(
+                draw(patch, ALPHA_MIN=reference.ALPHA_MIN * factor, T_MIN=reference.T_MIN * factor)
+            )
     with pytest.MonkeyPatch.context() as patch:
-        draw(patch, ALPHA_MAX=math.inf, blend=lambda alphas: seen.append(alphas) or blend(alphas.clamp(max=0.5)))
+        draw(
+            patch,
+            ALPHA_MAX=math.inf,
+            blend=lambda alphas: seen.append(alphas) or blend(alphas.clamp(max=0.5)),
+        )
     at_the_clamp = ((seen[0] / reference.ALPHA_MAX - 1).abs() < nudge).any(1)
     return (images[0] != images[1]).any(-1) | at_the_clamp.reshape(camera.height, camera.width)
 
 
-def without_last(alphas: Tensor, blend: Callable[..., Any] = reference.blend) -> tuple[Tensor, Tensor]:
+def without_last(
+    alphas: Tensor, blend: Callable[..., Any] = reference.blend
+) -> tuple[Tensor, Tensor]:
     """``reference.blend`` without the Gaussians that end a pixel."""
     return blend(torch.where(torch.cumprod(1 - alphas, 1) > reference.T_MIN, alphas, 0))
 
 
 def assert_agrees(
-    rasterize: Splat, scene: Parameters, camera: Camera, *, image: float = IMAGE, gradient: float = GRADIENT,
-    cut: float = ON_A_CUT, nudge: float = 1e-4, rows: Tensor | None = None, screen_filter: ScreenFilter = CLASSIC,
-) -> None:  # fmt: skip
-    """Asserts agreement; with ``rows``, with the picture of those alone, and gradients of 0 for the others."""
+    rasterize: Splat,
+    scene: Parameters,
+    camera: Camera,
+    *,
+    image: float = IMAGE,
+    gradient: float = GRADIENT,
+    cut: float = ON_A_CUT,
+    nudge: float = 1e-4,
+    rows: Tensor | None = None,
+    screen_filter: ScreenFilter = CLASSIC,
+) -> None:
+    """Asserts agreement; with ``rows``, with the picture of those alone, and gradients of 0 for the
+    others.
+    """
     looser = getattr(rasterize, "looser", 1.0)  # a backend in float32 with fast intrinsics
-    image, gradient, cut, nudge = image * looser, gradient * looser, cut * looser**0.5, nudge * looser**0.5
-    twin = {name: (value if rows is None else value[rows]).double() for name, value in scene.items()}
+    image, gradient, cut, nudge = (
+        image * looser,
+        gradient * looser,
+        cut * looser**0.5,
+        nudge * looser**0.5,
+    )
+    twin = {
+        name: (value if rows is None else value[rows]).double() for name, value in scene.items()
+    }
     with pytest.MonkeyPatch.context() as patch:
         if getattr(rasterize, "drops_last", False):
             patch.setattr(reference, "blend", without_last)
@@ -95,20 +134,27 @@ def assert_agrees(
         error = (getattr(found, name) - getattr(want, name)).abs()
         worst = error[~unsure].max().item() if (~unsure).any() else 0.0
         assert worst <= image, f"{name} is off by {worst:.1e}"
-        assert (error[unsure] <= 4 / 255 * colors).all(), f"{name} on a cut is off by {error[unsure].max():.1e}"
+        assert (error[unsure] <= 4 / 255 * colors).all(), (
+            f"{name} on a cut is off by {error[unsure].max():.1e}"
+        )
     for name, expected in want.gradients.items():
         got = found.gradients[name].double()
         if rows is not None and name != "background":
             assert (got[~rows] == 0).all(), f"rows that are not drawn have a gradient of {name}"
             got = got[rows]
         error, length = (got - expected).norm().item(), expected.norm().item()
-        assert error <= gradient * length, f"gradient of {name} is off by {error:.1e} of {length:.1e}"
+        assert error <= gradient * length, (
+            f"gradient of {name} is off by {error:.1e} of {length:.1e}"
+        )
 
 
 def assert_same(a: Result, b: Result, **tolerance: Any) -> None:
     """Asserts equality: bit for bit, or within ``torch.testing.assert_close``'s tolerances."""
     pairs = [("image", a.image, b.image), ("alpha", a.alpha, b.alpha)]
-    for name, x, y in [*pairs, *((name, a.gradients[name], b.gradients[name]) for name in a.gradients)]:
+    for name, x, y in [
+        *pairs,
+        *((name, a.gradients[name], b.gradients[name]) for name in a.gradients),
+    ]:
         if tolerance:
             torch.testing.assert_close(x, y, **tolerance, msg=lambda m, name=name: f"{name}: {m}")
         else:

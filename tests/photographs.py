@@ -14,7 +14,8 @@ from clod_adapter.cameras import Camera
 from models import write_model
 
 SIZE = {"width": 160, "height": 120}
-INTRINSICS = {"fl_x": 30.0, "fl_y": 31.0, "cx": 19.25, "cy": 15.5, "w": 40, "h": 30}  # of a transforms file
+# of a transforms file
+INTRINSICS = {"fl_x": 30.0, "fl_y": 31.0, "cx": 19.25, "cy": 15.5, "w": 40, "h": 30}
 LENSES = {
     "SIMPLE_RADIAL": [140, 82, 58, -0.12],
     "OPENCV": [140, 142, 82, 58, -0.15, 0.05, 0.004, -0.003],
@@ -64,16 +65,24 @@ def to_world(seed: int) -> list[list[float]]:
     return (np.linalg.inv(pose(seed).double().numpy()) @ np.diag([1.0, -1.0, -1.0, 1.0])).tolist()
 
 
-def write_frames(folder: Path, frames: list[Any], file: str = "transforms.json", **rest: Any) -> Path:
+def write_frames(
+    folder: Path, frames: list[Any], file: str = "transforms.json", **rest: Any
+) -> Path:
     folder.mkdir(exist_ok=True)
     (folder / file).write_text(json.dumps({**rest, "frames": frames}))
     return folder
 
 
 def model_of(
-    folder: Path, kind: str, params: Sequence[float], width: int = 40, height: int = 30, *,
-    names: Sequence[str] = ("a.png",), form: str = "binary",
-) -> Path:  # fmt: skip
+    folder: Path,
+    kind: str,
+    params: Sequence[float],
+    width: int = 40,
+    height: int = 30,
+    *,
+    names: Sequence[str] = ("a.png",),
+    form: str = "binary",
+) -> Path:
     """The folder of a COLMAP model whose cameras are all at the origin and see two points."""
     reconstruction = pycolmap.Reconstruction()
     lens = pycolmap.Camera(model=kind, params=params, camera_id=1, width=width, height=height)
@@ -83,7 +92,9 @@ def model_of(
         image = pycolmap.Image(name=name, camera_id=1, image_id=number, points2D=keypoints)
         reconstruction.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
     for k in range(2):
-        track = pycolmap.Track([pycolmap.TrackElement(number, k) for number in range(1, len(names) + 1)])
+        track = pycolmap.Track(
+            [pycolmap.TrackElement(number, k) for number in range(1, len(names) + 1)]
+        )
         reconstruction.add_point3D(np.array([k, 1, 5], float), track, np.zeros(3, np.uint8))
     target = folder / "sparse" / "0"
     target.mkdir(parents=True, exist_ok=True)
@@ -92,8 +103,14 @@ def model_of(
 
 
 def seen(camera: pycolmap.Camera) -> np.ndarray:
-    """``[H, W, 3]`` uint8: a smooth pattern on the plane z = 1, seen through the lens of a camera at the origin."""
+    """``[H, W, 3]`` uint8: a smooth pattern on the plane z = 1, seen through the lens of a camera
+    at the origin.
+    """
     across, down = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     u, v = camera.cam_from_img(np.stack([across.ravel(), down.ravel()], axis=1)).T
     waves = [np.sin(5 * u + v), np.sin(5 * v - 2 * u), np.sin(4 * (u + v) + 1)]
-    return np.rint(127.5 + 120 * np.stack(waves, axis=1)).astype(np.uint8).reshape(camera.height, camera.width, 3)
+    return (
+        np.rint(127.5 + 120 * np.stack(waves, axis=1))
+        .astype(np.uint8)
+        .reshape(camera.height, camera.width, 3)
+    )

@@ -1,4 +1,6 @@
-"""Shared by tests of the command: file names, injected errors and interrupts, processes that start fast."""
+"""Shared by tests of the command: file names, injected errors and interrupts, processes that start
+fast.
+"""
 
 import copy
 import json
@@ -67,7 +69,11 @@ for line in sys.stdin:
 def accepted(words: Sequence[object]) -> list[str]:
     """The words of a command, as text; adapting, which takes few steps here, accepts its loss."""
     found = [str(word) for word in words]
-    return [*found, "--accept-loss"] if found and Path(found[0]).suffix and "--help" not in found else found
+    return (
+        [*found, "--accept-loss"]
+        if found and Path(found[0]).suffix and "--help" not in found
+        else found
+    )
 
 
 class Server:
@@ -75,7 +81,11 @@ class Server:
 
     def __init__(self) -> None:
         self.process = subprocess.Popen(
-            [sys.executable, "-c", SERVER], text=True, bufsize=1, stdin=subprocess.PIPE, stdout=subprocess.PIPE
+            [sys.executable, "-c", SERVER],
+            text=True,
+            bufsize=1,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
         )
         assert self.process.stdout.readline() == "ready\n"
 
@@ -83,12 +93,22 @@ class Server:
         self.process.stdin.write(json.dumps(about) + "\n")
         return int(self.process.stdout.readline())
 
-    def start(self, folder: Path, *words: object, rank: object = "", before: str = "", **environment: object) -> int:
+    def start(
+        self,
+        folder: Path,
+        *words: object,
+        rank: object = "",
+        before: str = "",
+        **environment: object,
+    ) -> int:
         """The process's id, valid until it is waited for; ``before`` is code that it runs first."""
         return self.ask(
-            folder=str(folder), log=f"{folder}{rank}.log", words=accepted(words), before=before,
+            folder=str(folder),
+            log=f"{folder}{rank}.log",
+            words=accepted(words),
+            before=before,
             environment={name: str(value) for name, value in environment.items()},
-        )  # fmt: skip
+        )
 
     def wait(self, pid: int) -> int:
         return self.ask(wait=pid)
@@ -100,20 +120,40 @@ class Server:
 
 
 class Launched:
-    """``size`` processes started as by torchrun; ``before`` is code that some run first; until file ``wait`` exists."""
+    """``size`` processes started as by torchrun; ``before`` is code that some run first; until file
+    ``wait`` exists.
+    """
 
     def __init__(
-        self, server: Server, folder: Path, *words: object, size: int = 2, before: Any = None, wait: str = ""
+        self,
+        server: Server,
+        folder: Path,
+        *words: object,
+        size: int = 2,
+        before: Any = None,
+        wait: str = "",
     ) -> None:
         folder.mkdir(exist_ok=True)
         self.server, self.folder = server, folder
         self.store = dist.TCPStore("localhost", 0, is_master=True, wait_for_workers=False)
         told = {
-            "WORLD_SIZE": size, "LOCAL_WORLD_SIZE": size, "MASTER_ADDR": "localhost", "MASTER_PORT": self.store.port,
-            "TORCHELASTIC_USE_AGENT_STORE": True, "TORCHELASTIC_RESTART_COUNT": 0,
-        }  # fmt: skip
+            "WORLD_SIZE": size,
+            "LOCAL_WORLD_SIZE": size,
+            "MASTER_ADDR": "localhost",
+            "MASTER_PORT": self.store.port,
+            "TORCHELASTIC_USE_AGENT_STORE": True,
+            "TORCHELASTIC_RESTART_COUNT": 0,
+        }
         self.pids = [
-            server.start(folder, *words, rank=k, before=(before or {}).get(k, ""), RANK=k, LOCAL_RANK=k, **told)
+            server.start(
+                folder,
+                *words,
+                rank=k,
+                before=(before or {}).get(k, ""),
+                RANK=k,
+                LOCAL_RANK=k,
+                **told,
+            )
             for k in range(size)
         ]
         wait_for(folder / wait)
@@ -140,12 +180,20 @@ def log_of(folder: Path, rank: object = "") -> str:
 
 
 def contents(*roots: Path) -> dict[Path, bytes]:
-    return {file: file.read_bytes() for root in roots for file in (root, *root.rglob("*")) if file.is_file()}
+    return {
+        file: file.read_bytes()
+        for root in roots
+        for file in (root, *root.rglob("*"))
+        if file.is_file()
+    }
 
 
 def results(folder: Path, name: str = "dial") -> dict[str, bytes]:
     """The PLY and the adapter, without measured times."""
-    return {suffix: stripped((folder / f"{name}{suffix}").read_bytes()) for suffix in (".ply", ".safetensors")}
+    return {
+        suffix: stripped((folder / f"{name}{suffix}").read_bytes())
+        for suffix in (".ply", ".safetensors")
+    }
 
 
 def rebuilt(clod: Callable[..., Any], base: object, *more: str) -> bool:
@@ -175,7 +223,9 @@ def pressing(real: Callable[..., Any], *numbers: int, at: int = 1) -> Callable[.
 
 
 def change_step(patch: pytest.MonkeyPatch, at: int, change: Callable[[Any], Any]) -> None:
-    """Replaces the gradients of the ``at``-th step by ``change`` of them, not in the kernels' runs of one step."""
+    """Replaces the gradients of the ``at``-th step by ``change`` of them, not in the kernels' runs
+    of one step.
+    """
     real, steps = Trainer.gradient_sum, count(1)
 
     def changed(self: Trainer, *given: Any) -> Any:
@@ -188,9 +238,16 @@ def change_step(patch: pytest.MonkeyPatch, at: int, change: Callable[[Any], Any]
 def config_of(**changes: Any) -> AdaptConfig:
     """Fixed settings, so that the tests do not depend on the defaults."""
     settings = {
-        "start_share": 0.6, "lr_sigma": 1e-2, "lr_growth": 1e-2, "lr_means": 3e-5, "lr_quats": 4e-4,
-        "lr_scales": 2e-3, "lr_opacities": 1e-2, "lr_sh0": 1e-3, "lr_shN": 5e-5,
-    }  # fmt: skip
+        "start_share": 0.6,
+        "lr_sigma": 1e-2,
+        "lr_growth": 1e-2,
+        "lr_means": 3e-5,
+        "lr_quats": 4e-4,
+        "lr_scales": 2e-3,
+        "lr_opacities": 1e-2,
+        "lr_sh0": 1e-3,
+        "lr_shN": 5e-5,
+    }
     return AdaptConfig(**(settings | changes))
 
 

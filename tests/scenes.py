@@ -12,17 +12,29 @@ from clod_adapter import AttenuationConfig, Camera, Gaussians, Scene, View, rend
 
 
 def camera(
-    width: int = 61, height: int = 45, *, fov: float = 60.0, off_centre: tuple[float, float] = (0.52, 0.47)
+    width: int = 61,
+    height: int = 45,
+    *,
+    fov: float = 60.0,
+    off_centre: tuple[float, float] = (0.52, 0.47),
 ) -> Camera:
-    """At (0.3, -0.2, -3), looking roughly along +z, principal point at ``off_centre`` shares of the image."""
+    """At (0.3, -0.2, -3), looking roughly along +z, principal point at ``off_centre`` shares of the
+    image.
+    """
     yaw, pitch = 0.12, -0.07
-    ry = torch.tensor([[math.cos(yaw), 0, math.sin(yaw)], [0, 1, 0], [-math.sin(yaw), 0, math.cos(yaw)]])
-    rx = torch.tensor([[1, 0, 0], [0, math.cos(pitch), -math.sin(pitch)], [0, math.sin(pitch), math.cos(pitch)]])
+    ry = torch.tensor(
+        [[math.cos(yaw), 0, math.sin(yaw)], [0, 1, 0], [-math.sin(yaw), 0, math.cos(yaw)]]
+    )
+    rx = torch.tensor(
+        [[1, 0, 0], [0, math.cos(pitch), -math.sin(pitch)], [0, math.sin(pitch), math.cos(pitch)]]
+    )
     viewmat = torch.eye(4)
     viewmat[:3, :3] = rx @ ry
     viewmat[:3, 3] = -(rx @ ry) @ torch.tensor([0.3, -0.2, -3.0])
     focal = 0.5 * width / math.tan(math.radians(fov) / 2)
-    K = torch.tensor([[focal, 0, width * off_centre[0]], [0, focal * 1.03, height * off_centre[1]], [0, 0, 1.0]])
+    K = torch.tensor(
+        [[focal, 0, width * off_centre[0]], [0, focal * 1.03, height * off_centre[1]], [0, 0, 1.0]]
+    )
     return Camera(viewmat, K, width, height)
 
 
@@ -70,7 +82,9 @@ def looking(towards: Tensor) -> Tensor:
 
 
 def ring(count: int, width: int, height: int, *, radius: float = 4.0) -> list[Camera]:
-    """Cameras on a circle around the origin, looking at it, at slightly different heights and distances."""
+    """Cameras on a circle around the origin, looking at it, at slightly different heights and
+    distances.
+    """
     cameras = []
     for k in range(count):
         turn = 2 * math.pi * k / count
@@ -88,8 +102,12 @@ def photograph(truth: Gaussians, cameras: list[Camera]) -> tuple[View, ...]:
     return tuple(View(each, render(truth, each).pixels) for each in cameras)
 
 
-def capture(n: int = 300, views: int = 8, width: int = 48, height: int = 36, seed: int = 0) -> tuple[Gaussians, Scene]:
-    """A slightly perturbed checkpoint and photographs of the original; every fourth one is held out."""
+def capture(
+    n: int = 300, views: int = 8, width: int = 48, height: int = 36, seed: int = 0
+) -> tuple[Gaussians, Scene]:
+    """A slightly perturbed checkpoint and photographs of the original; every fourth one is held
+    out.
+    """
     truth = gaussians(n, 1, seed, size=0.15)
     g = torch.Generator().manual_seed(seed + 1)
 
@@ -97,9 +115,11 @@ def capture(n: int = 300, views: int = 8, width: int = 48, height: int = 36, see
         return values + by * torch.randn(values.shape, generator=g)
 
     base = truth.replace(
-        means=near(truth.means, 0.01), log_scales=near(truth.log_scales, 0.05), sh0=near(truth.sh0, 0.05),
+        means=near(truth.means, 0.01),
+        log_scales=near(truth.log_scales, 0.05),
+        sh0=near(truth.sh0, 0.05),
         opacity_logits=near(truth.opacity_logits, 0.2),
-    )  # fmt: skip
+    )
     seen = photograph(truth, ring(views, width, height))
     return base, Scene(tuple(v for k, v in enumerate(seen) if k % 4), seen[::4])
 

@@ -39,7 +39,9 @@ class Shown:
     asked: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self.page.on("console", lambda message: message.type == "error" and self.errors.append(message.text))
+        self.page.on(
+            "console", lambda message: message.type == "error" and self.errors.append(message.text)
+        )
         self.page.on("pageerror", lambda error: self.errors.append(str(error)))
         self.page.on("request", lambda request: self.asked.append(request.url))
 
@@ -49,15 +51,20 @@ class Shown:
         return self
 
     def run(self, script: str, *arguments: object) -> Any:
-        waiting = f"async (given) => {{ const r = await {script}; await clod.whenDrawn(); return r }}"
+        waiting = (
+            f"async (given) => {{ const r = await {script}; await clod.whenDrawn(); return r }}"
+        )
         return self.page.evaluate(waiting, *arguments)
 
     def until(self, condition: str) -> None:
-        """Waits until it holds. Not Playwright's wait_for_function, which the page's policy forbids to evaluate."""
+        """Waits until it holds. Not Playwright's wait_for_function, which the page's policy forbids
+        to evaluate.
+        """
         script = f"""() => new Promise((resolve, reject) => {{
             const late = new Error("never " + {json.dumps(condition)});
             const ended = setTimeout(() => reject(late), {SECONDS}000);
-            const look = () => ({condition}) ? (clearTimeout(ended), resolve()) : setTimeout(look, 20);
+            const found = () => (clearTimeout(ended), resolve());
+            const look = () => ({condition}) ? found() : setTimeout(look, 20);
             look();
         }})"""
         self.page.evaluate(script)
@@ -95,11 +102,16 @@ def assert_same(shown: Shown, wanted: Rendering) -> None:
 
 
 def drop(shown: Shown, name: str, data: bytes, *, wait: int = 0) -> None:
-    """Drops a file on the page that can be read after ``wait`` milliseconds; a name without a suffix never can be."""
+    """Drops a file on the page that can be read after ``wait`` milliseconds; a name without a
+    suffix never can be.
+    """
     script = """([name, data, wait]) => {
-        const file = new File([Uint8Array.from(atob(data), (letter) => letter.charCodeAt(0))], name);
-        const read = file.arrayBuffer.bind(file), later = new Promise((resolve) => setTimeout(resolve, wait));
-        file.arrayBuffer = () => later.then(() => name.includes(".") ? read() : Promise.reject(new DOMException("")));
+        const bytes = Uint8Array.from(atob(data), (letter) => letter.charCodeAt(0));
+        const file = new File([bytes], name);
+        const read = file.arrayBuffer.bind(file), refused = new DOMException("");
+        const later = new Promise((resolve) => setTimeout(resolve, wait));
+        const answer = () => name.includes(".") ? read() : Promise.reject(refused);
+        file.arrayBuffer = () => later.then(answer);
         const event = new DragEvent("drop", { bubbles: true, cancelable: true });
         Object.defineProperty(event, "dataTransfer", { value: { files: [file] } });
         document.body.dispatchEvent(event);
@@ -125,13 +137,18 @@ def fold(shown: Shown, open: bool) -> None:
 
 def take(shown: Shown, path: Path) -> None:
     """Shows another file in the tab, by the page's own function, and waits until it is drawn."""
-    script = "clod.load(Uint8Array.from(atob(given[1]), (letter) => letter.charCodeAt(0)).buffer, given[0])"
+    script = (
+        "clod.load(Uint8Array.from(atob(given[1]), (letter) => letter.charCodeAt(0)).buffer,"
+        " given[0])"
+    )
     shown.run(script, [path.name, base64.b64encode(path.read_bytes()).decode()])
 
 
 @contextmanager
 def serve(*words: object) -> Iterator[str]:
-    """The address of a server of ``clod-adapt view`` with these arguments, by default at s = 1, where it stays."""
+    """The address of a server of ``clod-adapt view`` with these arguments, by default at s = 1,
+    where it stays.
+    """
     given = [str(word) for word in words]
     given += [] if "--sv" in given or "--device-preset" in given else ["--sv", "1"]
     answers, _ = make_page(build_parser("view").parse_args(given), Console(quiet=True))

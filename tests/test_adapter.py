@@ -1,4 +1,6 @@
-"""The adapter reproduces the result, can be removed exactly, identifies its base, and is written as a tensor file."""
+"""The adapter reproduces the result, can be removed exactly, identifies its base, and is written as
+a tensor file.
+"""
 
 import json
 from dataclasses import replace
@@ -34,10 +36,15 @@ def gaussians(n: int = 6, seed: int = 0, bands: int = 8) -> Gaussians:
 
 
 def bits(g: Gaussians) -> dict[str, list[int]]:
-    return {name: value.detach().view(torch.int32).flatten().tolist() for name, value in g.tensors().items()}
+    return {
+        name: value.detach().view(torch.int32).flatten().tolist()
+        for name, value in g.tensors().items()
+    }
 
 
-def adapt(base: Gaussians, names: list[str], scale: float = 0.01, seed: int = 1, growth: bool = True) -> Gaussians:
+def adapt(
+    base: Gaussians, names: list[str], scale: float = 0.01, seed: int = 1, growth: bool = True
+) -> Gaussians:
     """With other values of these attributes, but in the first row."""
     g = torch.Generator().manual_seed(seed)
     changes = {name: getattr(base, name).clone() for name in names}
@@ -49,9 +56,12 @@ def adapt(base: Gaussians, names: list[str], scale: float = 0.01, seed: int = 1,
 
 @settings(deadline=None, max_examples=30)
 @given(
-    st.lists(st.sampled_from(ATTRIBUTES), unique=True), st.sampled_from([1e-9, 1e-3, 1.0, 1e4, 1e6]),
-    st.integers(0, 1000), st.sampled_from([0, 3, 15]), st.booleans(),
-)  # fmt: skip
+    st.lists(st.sampled_from(ATTRIBUTES), unique=True),
+    st.sampled_from([1e-9, 1e-3, 1.0, 1e4, 1e6]),
+    st.integers(0, 1000),
+    st.sampled_from([0, 3, 15]),
+    st.booleans(),
+)
 def test_applying_an_adapter_gives_the_result(
     names: list[str], scale: float, seed: int, bands: int, growth: bool
 ) -> None:
@@ -73,22 +83,36 @@ def test_applying_an_adapter_gives_the_result(
 
 
 def test_the_type_of_a_difference() -> None:
-    """Differences in float16; new values in float32 where a difference overflows or underflows float16."""
-    for unit, step, dtype in (1.0, 0.01, torch.float16), (1.0, 1e6, torch.float32), (1e-4, 1e-7, torch.float32):
+    """Differences in float16; new values in float32 where a difference overflows or underflows
+    float16.
+    """
+    for unit, step, dtype in (
+        (1.0, 0.01, torch.float16),
+        (1.0, 1e6, torch.float32),
+        (1e-4, 1e-7, torch.float32),
+    ):
         base = gaussians(50)
         base = base.replace(means=unit * base.means)
         adapted = adapt(base, ["means"], step)
         adapter = extract(base, adapted)
         assert {name: update.dtype for name, update in adapter.updates.items()} == {"means": dtype}
-        assert dtype == torch.float16 or bits(adapter.apply(base))["means"] == bits(adapted)["means"]
+        assert (
+            dtype == torch.float16 or bits(adapter.apply(base))["means"] == bits(adapted)["means"]
+        )
 
 
 def test_with_dial_and_detach() -> None:
-    """Without sigma_d the dial has no effect and can be removed exactly; with it, its tensor is used as it is."""
+    """Without sigma_d the dial has no effect and can be removed exactly; with it, its tensor is
+    used as it is.
+    """
     base, sigma_d = gaussians(), torch.rand(6)
     on, chosen = with_dial(base), with_dial(base, sigma_d, CONFIG)
     assert on.attenuation == with_dial(base, sigma_d).attenuation == AttenuationConfig()
-    assert (on.sigma_d == SIGMA_MAX).all() and chosen.sigma_d is sigma_d and chosen.attenuation is CONFIG
+    assert (
+        (on.sigma_d == SIGMA_MAX).all()
+        and chosen.sigma_d is sigma_d
+        and chosen.attenuation is CONFIG
+    )
     grown = with_dial(base, sigma_d, CONFIG, torch.rand(6))
     assert detach(grown) == detach(on) == base and with_dial(grown, sigma_d, CONFIG) == chosen
 
@@ -105,7 +129,10 @@ def test_extracting_ignores_a_dial_of_the_base_and_drops_graphs() -> None:
 
 def test_other_input_is_refused() -> None:
     base, full = gaussians(), partial(torch.full, (6,))
-    adapter, small = extract(base, adapt(base, ["shN"])), extract(gaussians(3), with_dial(gaussians(3)))
+    adapter, small = (
+        extract(base, adapt(base, ["shN"])),
+        extract(gaussians(3), with_dial(gaussians(3))),
+    )
     refused = {
         "different base.*SHA-256 is bbbb": lambda: adapter.apply(base, "b" * 64),
         "different base.*7 Gaussians, the adapter 6": lambda: adapter.apply(gaussians(7)),
@@ -113,8 +140,12 @@ def test_other_input_is_refused() -> None:
         "no sigma_d": lambda: extract(base, base),
         "means is float32": lambda: extract(base, with_dial(gaussians(5))),
         "sigma_d holds .* diverged": lambda: extract(base, with_dial(base, full(torch.nan))),
-        "growth_d holds": lambda: extract(base, with_dial(base, full(1.0), growth_d=full(torch.inf))),
-        "sh0 holds a new": lambda: extract(base, with_dial(base.replace(sh0=torch.full((6, 1, 3), torch.inf)))),
+        "growth_d holds": lambda: extract(
+            base, with_dial(base, full(1.0), growth_d=full(torch.inf))
+        ),
+        "sh0 holds a new": lambda: extract(
+            base, with_dial(base.replace(sh0=torch.full((6, 1, 3), torch.inf)))
+        ),
         "'colour'": lambda: replace(small, updates={"colour": torch.ones(3)}),
     }
     for message, call in refused.items():
@@ -128,13 +159,18 @@ def test_arrays_become_tensors_and_repr_is_short() -> None:
     update = {"means": np.full((6, 3), 0.5, np.float16)}
     adapter = Adapter(**columns, attenuation=CONFIG, updates=update, base_fingerprint="", config={})
     torch.testing.assert_close(adapter.apply(base).means, base.means + 0.5)
-    assert repr(adapter) == f"Adapter(6 Gaussians, dial to {CONFIG.max_sv:g} with growth, updates of means)"
+    assert (
+        repr(adapter)
+        == f"Adapter(6 Gaussians, dial to {CONFIG.max_sv:g} with growth, updates of means)"
+    )
 
 
 STORED = {"steps": 3, "lr": 0.1, "names": ["a", None], "nested": {"b": True}, "ü": "é"}
 
 
-def adapter(n: int = 5, config: dict[str, object] | None = None, reference: float = 0.1 / 3) -> Adapter:
+def adapter(
+    n: int = 5, config: dict[str, object] | None = None, reference: float = 0.1 / 3
+) -> Adapter:
     generator = torch.Generator().manual_seed(n)
     updates = {
         "means": torch.randn(n, 3, generator=generator).half(),
@@ -142,31 +178,52 @@ def adapter(n: int = 5, config: dict[str, object] | None = None, reference: floa
         "shN": torch.zeros(n, 0, 3).half(),
     }
     attenuation = AttenuationConfig(reference_distance=np.float64(reference), max_sv=7.0)
-    return Adapter(torch.rand(n, generator=generator), attenuation, updates, "ab" * 32, config or {})
+    return Adapter(
+        torch.rand(n, generator=generator), attenuation, updates, "ab" * 32, config or {}
+    )
 
 
-@settings(deadline=None, max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    deadline=None, max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 @given(st.integers(0, 20), st.floats(0, 1e30), st.booleans())
 def test_adapter_round_trips(tmp_path: Path, n: int, reference: float, growth: bool) -> None:
-    saved = replace(adapter(n, STORED, reference), growth_d=torch.linspace(-1, 3, n) if growth else None)
+    saved = replace(
+        adapter(n, STORED, reference), growth_d=torch.linspace(-1, 3, n) if growth else None
+    )
     save_adapter(tmp_path / "a.safetensors", saved)
     loaded = load_adapter(str(tmp_path / "a.safetensors"))
-    assert (loaded.attenuation, loaded.config, loaded.base_fingerprint) == (saved.attenuation, STORED, "ab" * 32)
-    assert torch.equal(loaded.sigma_d, saved.sigma_d) and loaded.updates.keys() == saved.updates.keys()
+    assert (loaded.attenuation, loaded.config, loaded.base_fingerprint) == (
+        saved.attenuation,
+        STORED,
+        "ab" * 32,
+    )
+    assert (
+        torch.equal(loaded.sigma_d, saved.sigma_d) and loaded.updates.keys() == saved.updates.keys()
+    )
     assert torch.equal(loaded.growth_d, saved.growth_d) if growth else loaded.growth_d is None
     for name, update in saved.updates.items():
-        assert loaded.updates[name].dtype == update.dtype and torch.equal(loaded.updates[name], update)
+        assert loaded.updates[name].dtype == update.dtype and torch.equal(
+            loaded.updates[name], update
+        )
     save_adapter(tmp_path / "b.safetensors", loaded)
     assert (tmp_path / "a.safetensors").read_bytes() == (tmp_path / "b.safetensors").read_bytes()
 
 
 def test_tensor_files_are_safetensors(tmp_path: Path) -> None:
-    """Types in any order, a transposed and an empty tensor, a scalar, text that is not ASCII; for all to read."""
+    """Types in any order, a transposed and an empty tensor, a scalar, text that is not ASCII; for
+    all to read.
+    """
     tensors = {
-        "mask": torch.tensor([True, False, True]), "bytes": torch.arange(5, dtype=torch.uint8),
-        "half": torch.randn(3).half(), "means": torch.randn(3, 2).T, "none": torch.zeros(0, 3),
-        "one": torch.tensor(2.5), "long": torch.arange(2), "double": torch.randn(2, dtype=torch.float64),
-    }  # fmt: skip
+        "mask": torch.tensor([True, False, True]),
+        "bytes": torch.arange(5, dtype=torch.uint8),
+        "half": torch.randn(3).half(),
+        "means": torch.randn(3, 2).T,
+        "none": torch.zeros(0, 3),
+        "one": torch.tensor(2.5),
+        "long": torch.arange(2),
+        "double": torch.randn(2, dtype=torch.float64),
+    }
     metadata = {"about": 'a "quoted" é'}
     write_tensors(tmp_path / "a", tensors, metadata)
     found, about = read_tensors(tmp_path / "a")
@@ -177,7 +234,8 @@ def test_tensor_files_are_safetensors(tmp_path: Path) -> None:
     assert (tmp_path / "a").stat().st_mode == (tmp_path / "b").stat().st_mode
 
 
-CHANGES: tuple[tuple[dict[str, Any], str], ...] = (  # of tensors, None for one that is absent, or of settings
+# of tensors, None for one that is absent, or of settings
+CHANGES: tuple[tuple[dict[str, Any], str], ...] = (
     ({"extra": torch.ones(5)}, "updates has 'extra'"),
     ({"means": torch.ones(4, 3)}, "5 rows"),
     ({"means": torch.ones(5, 3, dtype=torch.int32)}, "float16 or float32"),
@@ -191,7 +249,7 @@ CHANGES: tuple[tuple[dict[str, Any], str], ...] = (  # of tensors, None for one 
     ({"package_version": "1\n2"}, "printable"),
     ({"format_version": "x"}, "settings are damaged"),
     ({"config": [1]}, "config is .1., not a dict"),
-)  # fmt: skip
+)
 
 
 def test_invalid_files_are_refused(tmp_path: Path) -> None:
@@ -199,10 +257,20 @@ def test_invalid_files_are_refused(tmp_path: Path) -> None:
     save_adapter(path, adapter())
     with safe_open(path, framework="pt") as file:
         about, tensors = json.loads(file.metadata()["clod_adapter"]), load_file(path)
-    assert about["format"] == "clod-adapter" and about["format_version"] == 3 and "package_version" in about
-    assert about["base_sha256"] == "ab" * 32 and about["attenuation"]["reference_distance"] == 0.1 / 3
+    assert (
+        about["format"] == "clod-adapter"
+        and about["format_version"] == 3
+        and "package_version" in about
+    )
+    assert (
+        about["base_sha256"] == "ab" * 32 and about["attenuation"]["reference_distance"] == 0.1 / 3
+    )
     texts = "[" * 100_000, '{"format": ' * 50_000, "1" * 10_000, "nul", '"\\ud800"'
-    for change, message in (*CHANGES, *((text, "settings are damaged") for text in texts), (None, "not an adapter")):
+    for change, message in (
+        *CHANGES,
+        *((text, "settings are damaged") for text in texts),
+        (None, "not an adapter"),
+    ):
         text, kept = json.dumps(about), tensors
         if isinstance(change, dict) and change.keys() <= about.keys():
             text = json.dumps(about | change)

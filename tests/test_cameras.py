@@ -32,7 +32,8 @@ def changed(matrix: torch.Tensor, row: int, column: int, value: float) -> torch.
         ({"K": changed(K, 0, 2, math.inf)}, "a value that is not finite"),
         ({"viewmat": torch.zeros(4, 4)}, "no rotation and translation"),
         ({"viewmat": changed(VIEWMAT, 0, 0, 0.0)}, "no rotation and translation"),
-        ({"viewmat": changed(VIEWMAT, 3, 2, 4.0)}, "no rotation and translation"),  # transposed, as Inria stores it
+        # transposed, as Inria stores it
+        ({"viewmat": changed(VIEWMAT, 3, 2, 4.0)}, "no rotation and translation"),
         ({"K": changed(K, 0, 0, 0.0)}, "a focal length that is not positive"),
         ({"K": changed(K, 0, 1, 3.0)}, "a K with skew"),
         ({"K": changed(K, 2, 2, 2.0)}, "a K with skew, or whose last row is not 0, 0, 1"),

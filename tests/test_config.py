@@ -1,4 +1,6 @@
-"""Settings and the calibration table: impossible values are refused, and exact round trips through adapter and PLY."""
+"""Settings and the calibration table: impossible values are refused, and exact round trips through
+adapter and PLY.
+"""
 
 import math
 import re
@@ -21,15 +23,24 @@ from scenes import gaussians, ring
 BOTH = {"form": ["theirs"], "max_sv": [0.99, math.inf, math.nan]}
 RATES = ("sigma", "growth", "means", "quats", "scales", "opacities", "sh0", "shN")
 TABLES: dict[type, dict[str, list[Any]]] = {
-    AdaptConfig: BOTH | {
+    AdaptConfig: BOTH
+    | {
         "max_sv": [*BOTH["max_sv"], 1e7],
-        "iters": [-1], "time_budget": [0.0, math.nan], "start_share": [0.5, 1.01], "exponent": [0.0, math.inf],
-        "reg_weight": [-1.0, math.nan], "ssim_weight": [-0.1, 1.1], "growth": ["yes"],
-        "batch": [0, 4097], "seed": [-1, 2**63], **{f"lr_{name}": [-1e-9, 1.1e6, math.nan] for name in RATES},
+        "iters": [-1],
+        "time_budget": [0.0, math.nan],
+        "start_share": [0.5, 1.01],
+        "exponent": [0.0, math.inf],
+        "reg_weight": [-1.0, math.nan],
+        "ssim_weight": [-0.1, 1.1],
+        "growth": ["yes"],
+        "batch": [0, 4097],
+        "seed": [-1, 2**63],
+        **{f"lr_{name}": [-1e-9, 1.1e6, math.nan] for name in RATES},
     },
-    AttenuationConfig: BOTH | {"scene_distance": [0.0, 1e308, math.nan], "reference_distance": [-1.0, math.inf]},
+    AttenuationConfig: BOTH
+    | {"scene_distance": [0.0, 1e308, math.nan], "reference_distance": [-1.0, math.inf]},
     ScreenFilter: {"variance": [9e-4, 101.0, math.nan], "compensate": [1, "yes", None]},
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("kind", TABLES)
@@ -64,30 +75,48 @@ def test_every_field_has_help_and_a_default(kind: type) -> None:
 
 def test_the_papers_form() -> None:
     paper = AdaptConfig.paper(max_sv=7, reg_weight=0.0)
-    assert (paper.form, paper.max_sv, paper.iters, paper.lr_sigma, paper.reg_weight) == ("paper", 7, 1600, 1e-2, 0)
+    assert (paper.form, paper.max_sv, paper.iters, paper.lr_sigma, paper.reg_weight) == (
+        "paper",
+        7,
+        1600,
+        1e-2,
+        0,
+    )
 
 
 number, positive = st.floats(-1e6, 1e6, allow_nan=False), st.floats(1e-9, 1e6)
-rows = st.lists(st.tuples(st.floats(1, 300, exclude_min=True), number, number, number, positive), max_size=9)
+rows = st.lists(
+    st.tuples(st.floats(1, 300, exclude_min=True), number, number, number, positive), max_size=9
+)
 
 
 @st.composite
 def tables(draw: st.DrawFn) -> Calibration:
-    found = {values[0]: values for values in [(1.0, *draw(st.tuples(number, number, number)), 2.5), *draw(rows)]}
-    machine, against = draw(st.text(min_size=1, max_size=40)), draw(st.sampled_from(["photographs", "checkpoint"]))
+    found = {
+        values[0]: values
+        for values in [(1.0, *draw(st.tuples(number, number, number)), 2.5), *draw(rows)]
+    }
+    machine, against = (
+        draw(st.text(min_size=1, max_size=40)),
+        draw(st.sampled_from(["photographs", "checkpoint"])),
+    )
     some = [Row(s, psnr, ssim, kept, 0.5, 1.0, ms) for s, kept, psnr, ssim, ms in found.values()]
     places = draw(st.lists(st.builds(Viewpoint, number, number, number, positive), max_size=3))
     about = {"total": 4, "views": 13, "size": (640, 480), "machine": machine, "against": against}
     return Calibration.of(some, **about, viewpoints=places)
 
 
-@settings(deadline=None, max_examples=6, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    deadline=None, max_examples=6, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 @given(tables())
 def test_round_trips(tmp_path: Path, calibration: Calibration) -> None:
     base = gaussians(4, 0, 0)
     dialled = with_dial(base, torch.ones(4))
     save(tmp_path / "a.ply", dialled, calibration=calibration)
-    assert load(tmp_path / "a.ply").calibration == calibration and load(tmp_path / "a.ply").notes == ()
+    assert (
+        load(tmp_path / "a.ply").calibration == calibration and load(tmp_path / "a.ply").notes == ()
+    )
     adapter = replace(extract(base, dialled, fingerprint="", config={}), calibration=calibration)
     save_adapter(tmp_path / "a.safetensors", adapter)
     assert load_adapter(tmp_path / "a.safetensors").calibration == calibration
@@ -97,31 +126,49 @@ def test_round_trips(tmp_path: Path, calibration: Calibration) -> None:
 
 def test_rows_of_an_evaluation() -> None:
     some = [Row(s, 30 - s, 0.9, 100 / s, 1 / s, 50 / s, 10 / s) for s in (2.0, 1.0)]
-    found = Calibration.of(some, total=100, views=3, size=(64, 48), machine=" AMD\tRyzen\u2122  9\n")
-    assert found.rows == (CalibrationRow(1.0, 100.0, 29.0, 0.9, 10.0), CalibrationRow(2.0, 50.0, 28.0, 0.9, 5.0))
+    found = Calibration.of(
+        some, total=100, views=3, size=(64, 48), machine=" AMD\tRyzen\u2122  9\n"
+    )
+    assert found.rows == (
+        CalibrationRow(1.0, 100.0, 29.0, 0.9, 10.0),
+        CalibrationRow(2.0, 50.0, 28.0, 0.9, 5.0),
+    )
     assert (found.machine, found.width, found.height) == ("AMD Ryzen? 9", 64, 48)
 
 
 ROW = CalibrationRow(1.0, 10.0, 30.0, 0.9, 5.0)
-GOOD: dict[str, Any] = {"rows": (ROW,), "total": 4, "views": 1, "width": 8, "height": 8, "machine": "m"}
+GOOD: dict[str, Any] = {
+    "rows": (ROW,),
+    "total": 4,
+    "views": 1,
+    "width": 8,
+    "height": 8,
+    "machine": "m",
+}
 PLACE = Viewpoint(1.5, 2.5, 3.5, 4.5, look_z=1.0, up_y=-1.0, fov=0.8)
 
 
 @pytest.mark.parametrize(
     ("good", "bad", "said"),
     [
-        *((Calibration(**GOOD), {"rows": rows}, "ascend from 1") for rows in (
-            (), (replace(ROW, virtual_scale=2.0),), (ROW, ROW))),
+        *(
+            (Calibration(**GOOD), {"rows": rows}, "ascend from 1")
+            for rows in ((), (replace(ROW, virtual_scale=2.0),), (ROW, ROW))
+        ),
         (Calibration(**GOOD), {"rows": (replace(ROW, psnr=float("inf")),)}, "not finite"),
         (Calibration(**GOOD), {"rows": (replace(ROW, frame_ms=0.0),)}, "not positive"),
         (Calibration(**GOOD), {"total": 0}, "not positive"),
-        (Calibration(**GOOD), {"against": "thin air"}, "'thin air', it must be one of photographs, checkpoint"),
+        (
+            Calibration(**GOOD),
+            {"against": "thin air"},
+            "'thin air', it must be one of photographs, checkpoint",
+        ),
         (Calibration(**GOOD), {"machine": "caf\u00e9"}, "machine"),
         (PLACE, {"x": float("nan")}, "the centre of a viewpoint is"),
         (PLACE, {"unit": 0.0}, "the unit of a viewpoint is"),
         *((PLACE, bad, "the direction of a viewpoint is") for bad in ({"up_x": 7.0}, {"fov": -1})),
     ],
-)  # fmt: skip
+)
 def test_bad_values_are_refused(good: Any, bad: dict[str, Any], said: str) -> None:
     with pytest.raises(ClodError, match=said):
         replace(good, **bad)
@@ -129,11 +176,17 @@ def test_bad_values_are_refused(good: Any, bad: dict[str, Any], said: str) -> No
 
 def test_stored_viewpoints_are_cameras_again(tmp_path: Path) -> None:
     cameras, dialled = ring(3, 40, 30), with_dial(gaussians(4, 0, 0), torch.ones(4))
-    viewpoints = tuple(viewpoint_of(camera, torch.randn(50, 3), AttenuationConfig()) for camera in cameras)
+    viewpoints = tuple(
+        viewpoint_of(camera, torch.randn(50, 3), AttenuationConfig()) for camera in cameras
+    )
     for places in (viewpoints, (Viewpoint(1.5, 2.5, 3.5, 4.5),)):
         save(tmp_path / "a.ply", dialled, calibration=Calibration(**GOOD, viewpoints=places))
         stored = load(tmp_path / "a.ply")
-        assert stored.viewpoints == places and len(stored.cameras) == len(places) - (len(places) == 1)
+        assert stored.viewpoints == places and len(stored.cameras) == len(places) - (
+            len(places) == 1
+        )
         for camera, found in zip(cameras, stored.cameras, strict=False):
             assert torch.allclose(found.viewmat, camera.viewmat, atol=1e-5)
-            assert float(found.K[1, 1]) / found.height == pytest.approx(float(camera.K[1, 1]) / 30, rel=1e-5)
+            assert float(found.K[1, 1]) / found.height == pytest.approx(
+                float(camera.K[1, 1]) / 30, rel=1e-5
+            )

@@ -1,5 +1,7 @@
-"""Everything that uses a dial follows sigma_d in its unit and the growth of one function, and gives on another device,
-which it neither waits for nor leaves, what it gives on the CPU: a GPU, or else a simulated one (``fake_gpu``)."""
+"""Everything that uses a dial follows sigma_d in its unit and the growth of one function, and gives
+on another device, which it neither waits for nor leaves, what it gives on the CPU: a GPU, or else a
+simulated one (``fake_gpu``).
+"""
 
 import importlib
 from collections.abc import Callable, Iterator
@@ -92,7 +94,10 @@ def hook(model: Gaussians) -> list[Any]:
 
 
 def popping(model: Gaussians) -> list[Any]:
-    return [dial_popping(model, CAMERAS[0], DIAL, steps=2).mean, path_popping(model, CAMERAS[:2], DIAL, steps=2).mean]
+    return [
+        dial_popping(model, CAMERAS[0], DIAL, steps=2).mean,
+        path_popping(model, CAMERAS[:2], DIAL, steps=2).mean,
+    ]
 
 
 CONSUMERS: dict[str, Callable[[Gaussians], list[Any]]] = {
@@ -125,20 +130,29 @@ def agree(these: list[Any], those: list[Any], within: float) -> bool:
 
 @pytest.mark.parametrize("name", CONSUMERS)
 def test_everything_follows_sigma_d_in_its_unit(name: str) -> None:
-    """Reaches of other Gaussians change the result; the same ones in another unit do not, to rounding."""
+    """Reaches of other Gaussians change the result; the same ones in another unit do not, to
+    rounding.
+    """
     consumer, model = CONSUMERS[name], model_of()
     before = consumer(model)
-    assert model.sigma_d is not None and not same(consumer(model.replace(sigma_d=model.sigma_d.flip(0))), before)
+    assert model.sigma_d is not None and not same(
+        consumer(model.replace(sigma_d=model.sigma_d.flip(0))), before
+    )
     assert agree(consumer(in_world_units(model)), before, 1e-4)
 
 
 # Growth is no part of the culling rule.
-WITHOUT_GROWTH = {"order_by_extinction", *(name for name in CONSUMERS if name.startswith("dial_for"))}
+WITHOUT_GROWTH = {
+    "order_by_extinction",
+    *(name for name in CONSUMERS if name.startswith("dial_for")),
+}
 
 
 @pytest.mark.parametrize("name", CONSUMERS)
 def test_everything_grows_by_one_function(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Other factors change whatever draws by the default ``draw`` (tests/rasterizers/test_dial.py), and no count."""
+    """Other factors change whatever draws by the default ``draw`` (tests/rasterizers/test_dial.py),
+    and no count.
+    """
     monkeypatch.setitem(BACKENDS, "cpu", lambda: Rasterizer(cpu.rasterize))
     consumer = CONSUMERS[name]
     before = consumer(model_of())
@@ -172,7 +186,9 @@ def there(monkeypatch: pytest.MonkeyPatch) -> Iterator[Gaussians]:
 
 def own_loop(model: Gaussians) -> list[Any]:
     """Loss and gradients of a dial that a training loop of one's own learns."""
-    splats = torch.nn.ParameterDict({n: torch.nn.Parameter(x.clone()) for n, x in to_gsplat(detach(model)).items()})
+    splats = torch.nn.ParameterDict(
+        {n: torch.nn.Parameter(x.clone()) for n, x in to_gsplat(detach(model)).items()}
+    )
     dialled = attach(from_gsplat(splats), CAMERAS, CONFIG)
     groups = dialled.param_groups(splats=True)
     loss = dialled.loss(DIAL, render(dialled.gaussians(), CAMERAS[0], DIAL).image.square().mean())
@@ -192,7 +208,9 @@ RUNS: dict[str, Callable[[Gaussians], list[Any]]] = CONSUMERS | {
 
 
 @pytest.mark.parametrize("name", RUNS)
-def test_results_are_there_and_those_of_the_cpu(there: Gaussians, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_results_are_there_and_those_of_the_cpu(
+    there: Gaussians, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """To the difference of two rasterizers."""
     if name in ("render", "objective"):
         monkeypatch.setitem(BACKENDS, "gpu", lambda: Rasterizer(cuda.rasterize))
@@ -208,13 +226,22 @@ def test_training_stays_there(there: Gaussians, monkeypatch: pytest.MonkeyPatch)
     plan = make_plan(plain, scene, SHORT)
     whole = plan.adapt(scene).gaussians
     assert not torch.equal(whole.means.cpu(), plan.start.means.cpu())
-    assert all(x.device == plain.means.device and bool(x.isfinite().all()) for x in whole.tensors().values())
+    assert all(
+        x.device == plain.means.device and bool(x.isfinite().all())
+        for x in whole.tensors().values()
+    )
     monkeypatch.setattr(importlib.import_module("clod_adapter.evaluation.frame_times"), "PASSES", 2)
-    assert whole.whole == len(plain) and all(taken > 0 for _, taken in frame_times(there, CAMERAS[:1])[0])
+    assert whole.whole == len(plain) and all(
+        taken > 0 for _, taken in frame_times(there, CAMERAS[:1])[0]
+    )
 
 
-def test_a_step_waits_for_the_device_once(there: Gaussians, monkeypatch: pytest.MonkeyPatch) -> None:
-    """At its end, for the loss; the rasterizer aside: gsplat itself asks how many rows and tiles there are."""
+def test_a_step_waits_for_the_device_once(
+    there: Gaussians, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At its end, for the loss; the rasterizer aside: gsplat itself asks how many rows and tiles
+    there are.
+    """
     if there.means.is_cuda:
         pytest.skip("the simulated device tells where the host waits")
     monkeypatch.setitem(BACKENDS, "gpu", lambda: Rasterizer(cuda.rasterize))
@@ -225,4 +252,6 @@ def test_a_step_waits_for_the_device_once(there: Gaussians, monkeypatch: pytest.
     for share_done in (0.1, 0.9):
         with waits() as found:
             trainer.step(share_done)
-        assert [place for place in found if not place.startswith("rasterizers/")] == ["training/trainer.py:step"]
+        assert [place for place in found if not place.startswith("rasterizers/")] == [
+            "training/trainer.py:step"
+        ]

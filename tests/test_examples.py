@@ -1,4 +1,6 @@
-"""The examples run as they stand, and the scripts of benchmarks at a small size; what these measure with is right."""
+"""The examples run as they stand, and the scripts of benchmarks at a small size; what these measure
+with is right.
+"""
 
 import json
 import re
@@ -29,10 +31,14 @@ EXAMPLES = {int(path.name[:2]): path for path in sorted(FOLDER.glob("[0-9]*.py")
 
 @pytest.fixture
 def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Any:
-    """Runs an example by its number in the test's folder, with 5 steps of training; returns what it printed."""
+    """Runs an example by its number in the test's folder, with 5 steps of training; returns what it
+    printed.
+    """
     monkeypatch.chdir(tmp_path)
     adapt = clod_adapter.adapt
-    monkeypatch.setattr(clod_adapter, "adapt", lambda base, scene, config: adapt(base, scene, type(config)(iters=5)))
+    monkeypatch.setattr(
+        clod_adapter, "adapt", lambda base, scene, config: adapt(base, scene, type(config)(iters=5))
+    )
 
     def start(number: int, *words: object) -> str:
         monkeypatch.setattr(sys, "argv", [EXAMPLES[number].name, *map(str, words)])
@@ -43,7 +49,9 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureF
 
 
 def test_training_and_rendering(run: Any, capture: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Pictures by the library, by gsplat, with torch in place of its kernels, and by a renderer of one's own."""
+    """Pictures by the library, by gsplat, with torch in place of its kernels, and by a renderer of
+    one's own.
+    """
     gsplat_in_torch.install(monkeypatch)
     printed = run(1, capture.ply, capture.scene, "dial.ply")
     assert "dial 5:" in printed and clod_adapter.load("dial.ply").gaussians.sigma_d is not None
@@ -63,64 +71,105 @@ def test_training_and_rendering(run: Any, capture: Any, monkeypatch: pytest.Monk
         assert {picture.size for picture in pictures} == {size}
         assert len({picture.tobytes() for picture in pictures}) == 4
     for dial in (1, 2, 3, 5):
-        own, theirs = (np.asarray(Image.open(f"{stem}{dial}.png"), float) for stem in ("dial_sv", "dial_gsplat_sv"))
+        own, theirs = (
+            np.asarray(Image.open(f"{stem}{dial}.png"), float)
+            for stem in ("dial_sv", "dial_gsplat_sv")
+        )
         assert np.abs(own - theirs).mean() < 0.1
     scene = clod_adapter.load_scene(capture.scene)
-    monkeypatch.setattr(clod_adapter, "load_scene", lambda folder, origin: clod_adapter.Scene(scene.train, (), ()))
+    monkeypatch.setattr(
+        clod_adapter, "load_scene", lambda folder, origin: clod_adapter.Scene(scene.train, (), ())
+    )
     assert "of 300 Gaussians" in run(2, "dial.ply", capture.scene)  # without held-out views
 
 
 def test_budgets(run: Any, dialled: Path, capture: Any) -> None:
     printed = run(5, dialled, capture.scene).splitlines()
-    names = ["50% of", "25% of", "10% of", "0.1 dB", "0.5 dB", "1 dB", "10 frames", "30 frames", "60 frames"]
-    assert len(printed) == 9 and all(line.startswith(name) for line, name in zip(printed, names, strict=True))
+    names = [
+        "50% of",
+        "25% of",
+        "10% of",
+        "0.1 dB",
+        "0.5 dB",
+        "1 dB",
+        "10 frames",
+        "30 frames",
+        "60 frames",
+    ]
+    assert len(printed) == 9 and all(
+        line.startswith(name) for line, name in zip(printed, names, strict=True)
+    )
     found = [float(line.partition("s = ")[2].split()[0]) for line in (printed[0], *printed[3:6])]
     assert 1 < found[0] < 4 and 1 <= found[1] <= found[2] <= found[3] <= 4
-    assert "(beyond s = 4, " in printed[2]  # a tenth is less than the far end keeps, and that is said
+    # a tenth is less than the far end keeps, and that is said
+    assert "(beyond s = 4, " in printed[2]
 
 
-def test_adapter_is_applied_and_removed(run: Any, dialled: Path, capture: Any, tmp_path: Path) -> None:
+def test_adapter_is_applied_and_removed(
+    run: Any, dialled: Path, capture: Any, tmp_path: Path
+) -> None:
     printed = run(6, capture.ply, dialled.with_suffix(".safetensors"), "again.ply")
     assert "changed: sigma_d, far Gaussians" in printed and f"{capture.ply}, bit for bit" in printed
     assert (tmp_path / "again.ply").read_bytes() == dialled.read_bytes()
-    other = capture.write(tmp_path / "other.ply", capture.gaussians.replace(sh0=capture.gaussians.sh0 + 1))
+    other = capture.write(
+        tmp_path / "other.ply", capture.gaussians.replace(sh0=capture.gaussians.sh0 + 1)
+    )
     with pytest.raises(SystemExit, match="a different base was given"):
         run(6, other, dialled.with_suffix(".safetensors"), "other_again.ply")
     assert not (tmp_path / "other_again.ply").exists()
 
 
 def test_a_loop_of_gsplat_trains_a_dial(
-    capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    capture: Any,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """With torch in place of its kernels; in at most 20 lines more than the loop has without a dial."""
+    """With torch in place of its kernels; in at most 20 lines more than the loop has without a
+    dial.
+    """
     gsplat_in_torch.install(monkeypatch)
     torch.manual_seed(0)  # the order of the views
     source = EXAMPLES[7].read_text(encoding="utf-8")
     assert 0 < len(re.findall(r"# dial\b", source)) <= 20
-    runpy.run_path(str(EXAMPLES[7]))["main"](str(capture.ply), str(capture.scene), str(tmp_path / "d.ply"), "cpu", 24)
-    rows = re.findall(r"dial \S+: (.+) dB before, (.+) dB after, (\d+)% .*target (\d+)%", capsys.readouterr().out)
+    runpy.run_path(str(EXAMPLES[7]))["main"](
+        str(capture.ply), str(capture.scene), str(tmp_path / "d.ply"), "cpu", 24
+    )
+    rows = re.findall(
+        r"dial \S+: (.+) dB before, (.+) dB after, (\d+)% .*target (\d+)%", capsys.readouterr().out
+    )
     for before, after, kept, target in (map(float, row) for row in rows):
         assert after > before + 1 and abs(kept - target) < 15
     model = clod_adapter.load(tmp_path / "d.ply").gaussians
     assert len(rows) == 2 and model.growth_d.abs().max() > 0.05 and len(model) == 300
 
 
-def test_the_slider_turns_the_dial_while_it_trains(run: Any, capture: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_slider_turns_the_dial_while_it_trains(
+    run: Any, capture: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """With mocks in place of viser; it is interrupted in the third step."""
     viser = MagicMock()
     monkeypatch.setitem(sys.modules, "viser", viser)
     monkeypatch.setitem(sys.modules, "viser.transforms", viser.transforms)
     moved = viser.transforms.SE3.from_rotation_and_translation.return_value.inverse.return_value
-    moved.as_matrix.return_value = clod_adapter.load_scene(capture.scene).train[0].camera.viewmat.numpy()
+    moved.as_matrix.return_value = (
+        clod_adapter.load_scene(capture.scene).train[0].camera.viewmat.numpy()
+    )
     server, client = viser.ViserServer.return_value, MagicMock()
     server.get_clients.side_effect = [{0: client}, {0: client}, KeyboardInterrupt]
-    server.gui.add_slider.return_value.value, client.camera.aspect, client.camera.fov = 5.0, 4 / 3, 0.9
+    server.gui.add_slider.return_value.value, client.camera.aspect, client.camera.fov = (
+        5.0,
+        4 / 3,
+        0.9,
+    )
     run(8, capture.ply, capture.scene)
     (picture,) = client.scene.set_background_image.call_args.args
     assert picture.shape == (360, 480, 3) and picture.any()
     assert re.fullmatch(r"\d\d of 300, step 2", server.gui.add_text.return_value.value)
     written = clod_adapter.load("slider.ply").gaussians
-    assert written.attenuation.max_sv == 5 and not torch.equal(written.means, capture.gaussians.means)
+    assert written.attenuation.max_sv == 5 and not torch.equal(
+        written.means, capture.gaussians.means
+    )
 
 
 def test_bad_arguments_are_refused(run: Any) -> None:
@@ -144,7 +193,10 @@ def test_a_written_town_can_be_loaded_and_trained(tmp_path: Path) -> None:
     view = scene.train[0]
     with torch.no_grad():
         truth = render(city.city(4000), view.camera).image
-        error, of_truth = psnr(render(base.gaussians, view.camera).image, view.image), psnr(truth, view.image)
+        error, of_truth = (
+            psnr(render(base.gaussians, view.camera).image, view.image),
+            psnr(truth, view.image),
+        )
     assert of_truth > 45 > 35 > error > 15
 
 
@@ -154,10 +206,14 @@ def test_a_table_is_markdown() -> None:
 
 
 def test_a_process_is_timed_by_its_messages() -> None:
-    code = "import sys, time; print('half', file=sys.stderr, flush=True); time.sleep(1.5); print('done')"
+    code = (
+        "import sys, time; print('half', file=sys.stderr, flush=True); time.sleep(1.5);"
+        " print('done')"
+    )
     run = common.Process([sys.executable, "-c", code], {"half": "^half"})
     assert (run.out, run.lines) == ("done\n", ["half"])
-    assert 0 < run.moments["half"] <= run.seconds - 0.3  # a busy machine reads the message up to a second late
+    # a busy machine reads the message up to a second late
+    assert 0 < run.moments["half"] <= run.seconds - 0.3
     assert run.peak_bytes >= max(size for _, size, _ in run.memory) > 0
     with pytest.raises(SystemExit, match="exit code 3"):
         common.Process([sys.executable, "-c", "raise SystemExit(3)"])
@@ -172,10 +228,14 @@ def test_plush_and_city_small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -
     words = "gpu.py --device cpu --small --only plush city --count 1000 --results"
     monkeypatch.setattr(sys, "argv", [*words.split(), str(out)])
     gpu.main()
-    plush, adapted, *frames = [json.loads(line) for line in out.read_text(encoding="utf-8").splitlines()]
+    plush, adapted, *frames = [
+        json.loads(line) for line in out.read_text(encoding="utf-8").splitlines()
+    ]
     assert (plush["benchmark"], plush["on"], plush["count"]) == ("gpu plush", "cpu", 1000)
     assert plush["train_seconds"] > 0 and adapted["peak_bytes"] > adapted["base_bytes"] > 0
-    assert [(r["where"], r["virtual_scale"]) for r in frames] == [(w, s) for w in ("near", "far") for s in (1, 3, 7)]
+    assert [(r["where"], r["virtual_scale"]) for r in frames] == [
+        (w, s) for w in ("near", "far") for s in (1, 3, 7)
+    ]
     assert all(min(row["ms"].values()) > 0 for row in frames)
     assert frames[0]["kept"] > frames[1]["kept"] and frames[0]["psnr_full"] > frames[1]["psnr_full"]
 

@@ -1,4 +1,6 @@
-"""Cameras and views: conventions, checks, extent and near plane. Gaussians: shapes, selection, and SH degrees."""
+"""Cameras and views: conventions, checks, extent and near plane. Gaussians: shapes, selection, and
+SH degrees.
+"""
 
 import dataclasses
 import re
@@ -18,20 +20,29 @@ def test_bad_cameras_and_images_are_named() -> None:
     for change in ({"viewmat": torch.eye(3)}, {"K": torch.eye(4)}, {"width": 0}, {"height": -1}):
         with pytest.raises(ClodError, match=r"camera 'x\.png'"):
             dataclasses.replace(good, **change)
-    for image in (torch.zeros(45, 61, 3), torch.zeros(61, 45, 3).byte(), torch.zeros(45, 61).byte()):
-        with pytest.raises(ClodError, match=r"view 'x\.png': image must be uint8 of shape \(45, 61, 3\)"):
+    for image in (
+        torch.zeros(45, 61, 3),
+        torch.zeros(61, 45, 3).byte(),
+        torch.zeros(45, 61).byte(),
+    ):
+        with pytest.raises(
+            ClodError, match=r"view 'x\.png': image must be uint8 of shape \(45, 61, 3\)"
+        ):
             View(good, image)
 
 
 def test_extent_of_cameras() -> None:
     cameras = ring(8, 8, 6, radius=2.0)
     centres = torch.stack([camera.position for camera in cameras])
-    assert camera_extent(cameras) == pytest.approx(1.1 * (centres - centres.mean(0)).norm(dim=1).max().item())
+    assert camera_extent(cameras) == pytest.approx(
+        1.1 * (centres - centres.mean(0)).norm(dim=1).max().item()
+    )
     assert camera_extent(cameras[:1]) == 0
     viewmat = torch.eye(4)
     viewmat[2, 3] = 1e6
     far = dataclasses.replace(cameras[0], viewmat=viewmat)
-    # The one far off moves the mean of nine by a ninth of its distance, from which all the others are then as far.
+    # The one far off moves the mean of nine by a ninth of its distance, from which all the others
+    # are then as far.
     assert camera_extent([*cameras, far]) <= 3.3 * 1e6 / 9 * 1.01
 
 
@@ -40,14 +51,18 @@ def test_rounding_between_cameras_has_no_extent() -> None:
     turning = ring(10, 8, 6)
     for each in turning:
         each.viewmat[:3, 3] = -each.viewmat[:3, :3] @ torch.tensor([3.0, -2.0, 1.5])
-    assert len({tuple(each.position.tolist()) for each in turning}) > 1 and camera_extent(turning) == 0
+    assert (
+        len({tuple(each.position.tolist()) for each in turning}) > 1 and camera_extent(turning) == 0
+    )
     views = tuple(View(c, torch.zeros(6, 8, 3, dtype=torch.uint8)) for c in turning)
     assert in_its_unit(Scene(views, ())).train[0].camera.near == NEAR
 
 
 @pytest.mark.parametrize(("radius", "near"), [(1e-4, 1e-6), (0.5, 5e-3), (2.0, NEAR), (1e4, NEAR)])
 def test_near_plane_of_small_scenes(radius: float, near: float) -> None:
-    views = tuple(View(c, torch.zeros(6, 8, 3, dtype=torch.uint8)) for c in ring(8, 8, 6, radius=radius))
+    views = tuple(
+        View(c, torch.zeros(6, 8, 3, dtype=torch.uint8)) for c in ring(8, 8, 6, radius=radius)
+    )
     scene = in_its_unit(Scene(views[1:], views[:1]))
     found = {view.camera.near for view in (*scene.train, *scene.test)}
     assert len(found) == 1 and found.pop() == pytest.approx(near, rel=0.25)
@@ -60,7 +75,14 @@ def test_halved_views_are_means_of_four_pixels() -> None:
     view = photograph(some, [whole])[0]
     half, image = view.halved(), view.image[:90, :120].double()
     assert (half.camera.width, half.camera.height) == (60, 45)
-    assert float((half.image - image.unflatten(0, (45, 2)).unflatten(2, (60, 2)).mean((1, 3))).abs().max()) <= 0.5
+    assert (
+        float(
+            (half.image - image.unflatten(0, (45, 2)).unflatten(2, (60, 2)).mean((1, 3)))
+            .abs()
+            .max()
+        )
+        <= 0.5
+    )
     errors = []
     for screen_filter in (CLASSIC, CLASSIC.halved()):
         shown = render(some.replace(screen_filter=screen_filter), half.camera).image.clamp(0, 1)
@@ -72,9 +94,14 @@ def test_arrays_become_tensors() -> None:
     view = photograph(gaussians(5, 0, 0), ring(1, 20, 16))[0]
     arrays = view.camera.viewmat.double().numpy(), view.camera.K.double().numpy()
     again = View(Camera(*arrays, 20, 16), view.image.numpy()[:, ::-1])
-    assert torch.equal(again.camera.viewmat, view.camera.viewmat) and again.camera.K.dtype == torch.float32
+    assert (
+        torch.equal(again.camera.viewmat, view.camera.viewmat)
+        and again.camera.K.dtype == torch.float32
+    )
     assert torch.equal(again.image, view.image.flip(1))
-    assert repr(again) == "View('', 20x16)" and repr(Scene((again,), ())).endswith("0 held out, 20x16)")
+    assert repr(again) == "View('', 20x16)" and repr(Scene((again,), ())).endswith(
+        "0 held out, 20x16)"
+    )
 
 
 CONFIG = AttenuationConfig()
@@ -90,10 +117,20 @@ def adapted() -> Gaussians:
 
 def test_wrong_shapes_are_named() -> None:
     for name, shape in (
-        ("means", (5, 2)), ("quats", (5, 3)), ("log_scales", (4, 3)), ("opacity_logits", (5, 1)), ("sh0", (5, 3)),
-        ("shN", (5, 7, 3)), ("shN", (4, 8, 3)), ("shN", (5, 8, 4)), ("sigma_d", (4,)), ("growth_d", (5, 1)),
-    ):  # fmt: skip
-        with pytest.raises(ClodError, match=rf"Gaussians.{name} has shape {re.escape(str(shape))}, expected"):
+        ("means", (5, 2)),
+        ("quats", (5, 3)),
+        ("log_scales", (4, 3)),
+        ("opacity_logits", (5, 1)),
+        ("sh0", (5, 3)),
+        ("shN", (5, 7, 3)),
+        ("shN", (4, 8, 3)),
+        ("shN", (5, 8, 4)),
+        ("sigma_d", (4,)),
+        ("growth_d", (5, 1)),
+    ):
+        with pytest.raises(
+            ClodError, match=rf"Gaussians.{name} has shape {re.escape(str(shape))}, expected"
+        ):
             adapted().replace(**{name: torch.zeros(shape)})
     for changes in ({"sigma_d": torch.ones(5)}, {"attenuation": CONFIG}):
         with pytest.raises(ClodError, match="both sigma_d and attenuation"):
@@ -102,7 +139,9 @@ def test_wrong_shapes_are_named() -> None:
 
 @pytest.mark.parametrize(("degree", "used"), [(0, 0), (1, 0), (2, 1), (3, 3), (4, 1)])
 def test_empty_sh_degrees_are_removed(degree: int, used: int) -> None:
-    """The highest degrees that are 0 are removed; one coefficient keeps its degree and all below."""
+    """The highest degrees that are 0 are removed; one coefficient keeps its degree and all
+    below.
+    """
     some, bands = gaussians(7, degree, 0), (used + 1) ** 2 - 1
     some.shN[:, max(used**2 - 1, 0) :] = 0
     if used:
@@ -115,34 +154,54 @@ def test_empty_sh_degrees_are_removed(degree: int, used: int) -> None:
 def test_rows_by_brackets() -> None:
     some = adapted()
     for rows, wanted in (
-        (slice(3), [0, 1, 2]), (slice(None, None, 2), [0, 2, 4]), ([3, 0], [3, 0]), (np.array([4, -1]), [4, 4]),
-        (np.array([0, 1, 1, 0, 0], bool), [1, 2]), (some.sigma_d > 2.5, [3, 4]), ([], []),
-    ):  # fmt: skip
+        (slice(3), [0, 1, 2]),
+        (slice(None, None, 2), [0, 2, 4]),
+        ([3, 0], [3, 0]),
+        (np.array([4, -1]), [4, 4]),
+        (np.array([0, 1, 1, 0, 0], bool), [1, 2]),
+        (some.sigma_d > 2.5, [3, 4]),
+        ([], []),
+    ):
         found = some[rows]
         assert found.attenuation is CONFIG and len(found) == len(wanted)
         for name, value in found.tensors().items():
             assert torch.equal(value, getattr(some, name)[wanted]), name
 
 
-@pytest.mark.parametrize("rows", [2, torch.ones(4, dtype=torch.bool), [5], torch.zeros(2, 2, dtype=torch.long)])
+@pytest.mark.parametrize(
+    "rows", [2, torch.ones(4, dtype=torch.bool), [5], torch.zeros(2, 2, dtype=torch.long)]
+)
 def test_other_rows_are_refused(rows: object) -> None:
-    with pytest.raises(ClodError, match="give a slice, indices .M. or a mask .5.|there are 5 Gaussians, and index 5"):
+    with pytest.raises(
+        ClodError,
+        match="give a slice, indices .M. or a mask .5.|there are 5 Gaussians, and index 5",
+    ):
         adapted()[rows]
 
 
 def test_gaussians_are_compared_as_a_whole() -> None:
     some = adapted()
-    assert some == some.replace(**{name: value.double().numpy() for name, value in some.tensors().items()})
+    assert some == some.replace(
+        **{name: value.double().numpy() for name, value in some.tensors().items()}
+    )
     for other in (
-        some[:4], some.replace(means=some.means + 1), some.replace(means=some.means.double()), plain(), "text",
-        some.replace(growth_d=torch.ones(5)), some.replace(attenuation=AttenuationConfig(max_sv=2)),
-    ):  # fmt: skip
+        some[:4],
+        some.replace(means=some.means + 1),
+        some.replace(means=some.means.double()),
+        plain(),
+        "text",
+        some.replace(growth_d=torch.ones(5)),
+        some.replace(attenuation=AttenuationConfig(max_sv=2)),
+    ):
         assert (some == other) is False
 
 
 def test_repr_is_short_and_devices_have_names() -> None:
     some = adapted()
     assert repr(plain()) == "Gaussians(5, SH degree 2, no dial, cpu)"
-    assert repr(some.replace(growth_d=torch.ones(5))) == "Gaussians(5, SH degree 2, dial to 5 with growth, cpu)"
+    assert (
+        repr(some.replace(growth_d=torch.ones(5)))
+        == "Gaussians(5, SH degree 2, dial to 5 with growth, cpu)"
+    )
     assert repr(some.to("meta")) == "Gaussians(5, SH degree 2, dial to 5, meta)"
     assert some.cpu().means.device.type == "cpu"

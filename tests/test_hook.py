@@ -1,4 +1,6 @@
-"""The hook's opacities in numpy and torch, and the law of a held frame rate on simulated renderers."""
+"""The hook's opacities in numpy and torch, and the law of a held frame rate on simulated
+renderers.
+"""
 
 import math
 from collections.abc import Callable
@@ -56,7 +58,9 @@ def test_gradients_reach_opacities_sigma_d_and_growth_d_only() -> None:
     a, sigma, growth, means = (tensor[keep].double().requires_grad_() for tensor in given)
     viewmat = view.viewmat.double().requires_grad_()
 
-    def drawn(a: torch.Tensor, sigma: torch.Tensor, growth: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def drawn(
+        a: torch.Tensor, sigma: torch.Tensor, growth: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         return Hook(sigma, model.attenuation, 2.0, growth)(means, a, viewmat)[::2]
 
     assert torch.autograd.gradcheck(drawn, (a, sigma, growth), eps=1e-8)
@@ -82,7 +86,8 @@ def test_hold_moves_the_dial_by_the_times_it_takes() -> None:
     hold = start.hold(milliseconds=10)
     for _ in range(8):
         hold.took(30)
-    assert hold.hook.virtual_scale == pytest.approx(2 * 1.1**6) and start.virtual_scale == 2  # from the third frame on
+    # from the third frame on
+    assert hold.hook.virtual_scale == pytest.approx(2 * 1.1**6) and start.virtual_scale == 2
     assert hold.hook.sigma_d is start.sigma_d and not hold.out_of_reach
     for _ in range(10):
         hold.took(30)
@@ -106,14 +111,18 @@ BEFORE, AFTER = 25, 100  # frames before and after a change of the load
 
 @dataclass(frozen=True)
 class Renderer:
-    """``ms(s) = load BUDGET (fixed + (1 - fixed) (s / start)^-exponent)``, which is the budget at ``start``."""
+    """``ms(s) = load BUDGET (fixed + (1 - fixed) (s / start)^-exponent)``, which is the budget at
+    ``start``.
+    """
 
     exponent: float
     fixed: float
     start: float
 
     def ms(self, dial: float, load: float = 1.0) -> float:
-        return load * BUDGET * (self.fixed + (1 - self.fixed) * (dial / self.start) ** -self.exponent)
+        return (
+            load * BUDGET * (self.fixed + (1 - self.fixed) * (dial / self.start) ** -self.exponent)
+        )
 
     def best(self, load: float) -> float:
         """The dial value in [1, MAX_SV] whose time is the budget, or the nearest to it."""
@@ -140,7 +149,9 @@ class Renderer:
 @pytest.mark.parametrize("load", [2.0, 4.0, 1 / 3])
 @pytest.mark.parametrize("outliers", [False, True])
 def test_the_time_is_within_10_percent_after_a_change(load: float, outliers: bool) -> None:
-    """After at most 22 frames: 4, and 18 steps of 10 % from end to end; without outliers, it never turns back."""
+    """After at most 22 frames: 4, and 18 steps of 10 % from end to end; without outliers, it never
+    turns back.
+    """
     for exponent, fixed in product(EXPONENTS, FIXED):
         renderer = Renderer(exponent, fixed, start=2.0 if load > 1 else 5.0)
         loads = [1.0] * BEFORE + [load] * AFTER
@@ -151,10 +162,17 @@ def test_the_time_is_within_10_percent_after_a_change(load: float, outliers: boo
 
 
 def test_it_does_not_oscillate_under_noise_of_20_percent() -> None:
-    """Over 400 frames of one load: the dial's changes are small, and the time stays near the budget."""
+    """Over 400 frames of one load: the dial's changes are small, and the time stays near the
+    budget.
+    """
     for exponent, fixed, seed in product(EXPONENTS, FIXED, range(2)):
-        renderer, noise = Renderer(exponent, fixed, start=3.0), np.random.default_rng(seed).lognormal(0.0, 0.2, 400)
-        dials = np.array(renderer.follow([1.0] * 400, lambda frame, noise=noise: float(noise[frame])))
+        renderer, noise = (
+            Renderer(exponent, fixed, start=3.0),
+            np.random.default_rng(seed).lognormal(0.0, 0.2, 400),
+        )
+        dials = np.array(
+            renderer.follow([1.0] * 400, lambda frame, noise=noise: float(noise[frame]))
+        )
         times = np.log([renderer.ms(dial) / BUDGET for dial in dials])
         changes = np.abs(np.diff(np.log(dials)))
         assert changes.mean() <= 0.015 and np.median(changes) <= 0.005, (exponent, fixed, seed)
@@ -163,7 +181,11 @@ def test_it_does_not_oscillate_under_noise_of_20_percent() -> None:
 
 def test_the_first_frames_and_single_outliers_do_not_move_it() -> None:
     """A first frame includes compilation; a frame of 0 ms is below a timer's resolution."""
-    assert next_dial([(2.0, 900.0)], BUDGET, MAX_SV) == next_dial([(2.0, 900.0)] * 2, BUDGET, MAX_SV) == 2.0
+    assert (
+        next_dial([(2.0, 900.0)], BUDGET, MAX_SV)
+        == next_dial([(2.0, 900.0)] * 2, BUDGET, MAX_SV)
+        == 2.0
+    )
     calm = [(2.0, BUDGET)] * 5
     for time in (900.0, 0.0):
         assert next_dial([*calm, (2.0, time)], BUDGET, MAX_SV) == 2.0

@@ -15,8 +15,8 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = "clod_adapter"
 
-# Lowest first. A unit is a module or package of clod_adapter, of clod_adapter/io, or of cli; it imports from rows above
-# its own and from itself, never from beside it.
+# Lowest first. A unit is a module or package of clod_adapter, of clod_adapter/io, or of cli; it
+# imports from rows above its own and from itself, never from beside it.
 ORDER: list[set[str]] = [
     {"_support", "origin"},
     {"errors"},
@@ -40,18 +40,28 @@ ORDER: list[set[str]] = [
     {""},  # the package itself, whose __init__ re-exports from the rows above
     {"cli.shared"},
     {"cli.view"},
-    {"cli.adapt", "cli.apply", "cli.doctor", "cli.eval", "cli.export", "cli.inspect", "cli.render",
-     "cli.robustness"},
+    {
+        "cli.adapt",
+        "cli.apply",
+        "cli.doctor",
+        "cli.eval",
+        "cli.export",
+        "cli.inspect",
+        "cli.render",
+        "cli.robustness",
+    },
     {"cli.demo"},  # runs adapt
     {"cli.main"},
     {"__main__"},
-]  # fmt: skip
+]
 LEVELS = {unit: level for level, units in enumerate(ORDER) for unit in units}
 SOURCES = sorted([*(ROOT / PACKAGE).rglob("*.py"), *(ROOT / "cli").rglob("*.py")])
 
 
 def module_of(path: Path) -> str:
-    """Dotted name below the package: ``io.checkpoint``, ``cli.main``, and an empty one for the package itself."""
+    """Dotted name below the package: ``io.checkpoint``, ``cli.main``, and an empty one for the
+    package itself.
+    """
     parts = path.relative_to(ROOT).with_suffix("").parts
     return ".".join(part for part in parts if part not in (PACKAGE, "__init__"))
 
@@ -66,7 +76,9 @@ def unit_of(module: str) -> str:
 
 
 def imports_of(path: Path) -> dict[str, int]:
-    """The lines of every import from the package in a file, at any depth, by module (as by ``module_of``)."""
+    """The lines of every import from the package in a file, at any depth, by module (as by
+    ``module_of``).
+    """
     found = list[tuple[str, int]]()
     here = f"{PACKAGE}.{module_of(path.parent / '__init__.py')}".rstrip(".")
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
@@ -75,13 +87,18 @@ def imports_of(path: Path) -> dict[str, int]:
         elif isinstance(node, ast.ImportFrom):
             base = resolve_name("." * node.level + (node.module or ""), here)
             for name in (f"{base}.{alias.name}" for alias in node.names):
-                # "from clod_adapter import io" names a module, "from clod_adapter import Gaussians" a re-export.
+                # "from clod_adapter import io" names a module, "from clod_adapter import Gaussians"
+                # a re-export.
                 found.append((name if name.partition(".")[2] in MODULES else base, node.lineno))
-    return {name.partition(".")[2]: line for name, line in found if name.partition(".")[0] == PACKAGE}
+    return {
+        name.partition(".")[2]: line for name, line in found if name.partition(".")[0] == PACKAGE
+    }
 
 
 def test_imports_fall() -> None:
-    """No file imports itself by way of others. Its package, whose __init__ runs first, does not import it back."""
+    """No file imports itself by way of others. Its package, whose __init__ runs first, does not
+    import it back.
+    """
     wrong, graph = [], dict[str, set[str]]()
     for path in SOURCES:
         own = module_of(path)
@@ -89,7 +106,9 @@ def test_imports_fall() -> None:
         graph[own] = found.keys() - {own}
         for target, line in found.items():
             if unit_of(target) != unit_of(own) and LEVELS[unit_of(target)] >= LEVELS[unit_of(own)]:
-                wrong.append(f"{path.relative_to(ROOT)}:{line} imports {target}, which is not below it")
+                wrong.append(
+                    f"{path.relative_to(ROOT)}:{line} imports {target}, which is not below it"
+                )
     assert not wrong, "\n".join(wrong)
     TopologicalSorter(graph).prepare()  # raises CycleError
 
@@ -112,16 +131,20 @@ import gsplat_versions
 sys.meta_path.insert(0, Installed())
 inria = types.ModuleType("diff_gaussian_rasterization")
 inria.GaussianRasterizationSettings, inria.GaussianRasterizer = tuple, torch.nn.Module
-sys.modules |= {"gsplat": gsplat_versions.module("1.4.0", lambda *given: given), inria.__name__: inria}
+gsplat = gsplat_versions.module("1.4.0", lambda *given: given)
+sys.modules |= {"gsplat": gsplat, inria.__name__: inria}
 import clod_adapter as clod
 import clod_adapter.integrations.inria
 from clod_adapter.integrations.gsplat import rasterization
 
 means, ones, eye = torch.rand(5, 3), torch.ones(5), torch.eye(4)
-dial = {"sigma_d": ones, "growth_d": ones, "attenuation": clod.AttenuationConfig(), "virtual_scale": 2}
+attenuation = clod.AttenuationConfig()
+dial = {"sigma_d": ones, "growth_d": ones, "attenuation": attenuation, "virtual_scale": 2}
 drawn, keep, growth = clod.Hook(**dial)(means, ones, eye)
-given = rasterization(means, torch.rand(5, 4), means, ones, means, eye[None], eye[None, :3, :3], 4, 4, **dial)[2]
-assert torch.equal(given["opacities"], drawn) and torch.equal(given["scales"], means * growth[:, None])
+quats, K = torch.rand(5, 4), eye[None, :3, :3]
+given = rasterization(means, quats, means, ones, means, eye[None], K, 4, 4, **dial)[2]
+assert torch.equal(given["opacities"], drawn)
+assert torch.equal(given["scales"], means * growth[:, None])
 try:
     clod.load("model.ply")
 except ModuleNotFoundError as error:
@@ -137,16 +160,26 @@ assert not hasattr(clod, "nonsense")
 
 
 def test_imports_are_light_and_on_first_use() -> None:
-    """Hook and drop-ins need torch and numpy alone; functions stay functions beside submodules of the same name."""
-    done = subprocess.run([sys.executable, "-c", STEPS], cwd=ROOT, capture_output=True, text=True, check=False)
+    """Hook and drop-ins need torch and numpy alone; functions stay functions beside submodules of
+    the same name.
+    """
+    done = subprocess.run(
+        [sys.executable, "-c", STEPS], cwd=ROOT, capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stderr
 
 
 def test_every_package_is_installed() -> None:
-    listed = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["setuptools"]["packages"]
-    folders = {f"{PACKAGE}.{module_of(path)}".rstrip(".") for path in SOURCES if path.name == "__init__.py"}
+    listed = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"][
+        "setuptools"
+    ]["packages"]
+    folders = {
+        f"{PACKAGE}.{module_of(path)}".rstrip(".") for path in SOURCES if path.name == "__init__.py"
+    }
     assert set(listed) == folders, "list the package in pyproject.toml, [tool.setuptools] packages"
-    homeless = [str(p.relative_to(ROOT)) for p in SOURCES if not (p.parent / "__init__.py").exists()]
+    homeless = [
+        str(p.relative_to(ROOT)) for p in SOURCES if not (p.parent / "__init__.py").exists()
+    ]
     assert not homeless, f"in a folder without __init__.py: {homeless}"
 
 
@@ -154,7 +187,15 @@ def test_no_machine_paths() -> None:
     if shutil.which("git") is None or not (ROOT / ".git").exists():
         pytest.skip("not a git checkout, so there is no list of tracked files")
     listing = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
-    files = subprocess.run(listing, cwd=ROOT, capture_output=True, check=True).stdout.decode().split("\0")
+    files = (
+        subprocess.run(listing, cwd=ROOT, capture_output=True, check=True)
+        .stdout.decode()
+        .split("\0")
+    )
     pattern = re.compile(rb"(?<![\w./~-])/(?:work|root)/")
-    found = [name for name in files if name and (ROOT / name).is_file() and pattern.search((ROOT / name).read_bytes())]
+    found = [
+        name
+        for name in files
+        if name and (ROOT / name).is_file() and pattern.search((ROOT / name).read_bytes())
+    ]
     assert not found, f"absolute paths of somebody's machine in {found}"

@@ -1,4 +1,6 @@
-"""Rendering with and without a dial, baking, the order by extinction; calls that would draw or store something else."""
+"""Rendering with and without a dial, baking, the order by extinction; calls that would draw or
+store something else.
+"""
 
 import math
 import re
@@ -15,7 +17,16 @@ import torch
 import gsplat_versions
 import inria_forks
 from backends import fresh_copy
-from clod_adapter import AttenuationConfig, ClodError, Gaussians, Hook, bake, order_by_extinction, render, save
+from clod_adapter import (
+    AttenuationConfig,
+    ClodError,
+    Gaussians,
+    Hook,
+    bake,
+    order_by_extinction,
+    render,
+    save,
+)
 from clod_adapter.adapter import detach, with_dial
 from clod_adapter.config import FORMS
 from clod_adapter.equation.attenuation import attenuate, dial
@@ -38,15 +49,26 @@ def test_a_disabled_adapter_is_the_base() -> None:
         *(render(with_dial(base, attenuation=config), view) for config in (None, CONFIG)),
         *(render(base, view, s) for s in (1.0, 2.0, 7.0)),
     ):
-        assert all(torch.equal(getattr(found, name), getattr(want, name)) for name in ("image", "alpha", "kept"))
+        assert all(
+            torch.equal(getattr(found, name), getattr(want, name))
+            for name in ("image", "alpha", "kept")
+        )
 
 
 @pytest.mark.filterwarnings("ignore:virtual_scale")
 def test_rendering_no_gaussians() -> None:
     none = gaussians(0, 1, 0)
-    for some in (none, with_dial(none), with_dial(none, attenuation=AttenuationConfig(form="paper"))):
+    for some in (
+        none,
+        with_dial(none),
+        with_dial(none, attenuation=AttenuationConfig(form="paper")),
+    ):
         rendering = render(some, camera(), 2.0)
-        assert rendering.kept.shape == (0,) and (rendering.image == 0).all() and (rendering.alpha == 0).all()
+        assert (
+            rendering.kept.shape == (0,)
+            and (rendering.image == 0).all()
+            and (rendering.alpha == 0).all()
+        )
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -55,10 +77,16 @@ def test_a_dial_of_0_shows_the_file_without_its_dial(form: str) -> None:
     found, want = render(own, view, 0.0).image, render(detach(own), view).image
     torch.testing.assert_close(found, want, rtol=0, atol=0 if form == "ours" else 1e-6)
     shown = dial(own, view, 0.0)
-    assert bool(shown.keep.all()) and torch.equal(shown.drawn, own.opacities) and bool((shown.growth == 1).all())
+    assert (
+        bool(shown.keep.all())
+        and torch.equal(shown.drawn, own.opacities)
+        and bool((shown.growth == 1).all())
+    )
     faded = [dial(own, view, s) for s in (0.0, 1e-4, 0.3, 0.6, 1 - 1e-4, 1.0, 2.0)]
     for nearer, farther in zip(faded, faded[1:], strict=False):
-        assert bool((farther.drawn <= nearer.drawn).all()) and bool((farther.keep <= nearer.keep).all())
+        assert bool((farther.drawn <= nearer.drawn).all()) and bool(
+            (farther.keep <= nearer.keep).all()
+        )
 
 
 WORLD = AttenuationConfig(scene_distance=4.0)
@@ -66,14 +94,17 @@ WORLD = AttenuationConfig(scene_distance=4.0)
 
 def test_a_dial_without_effect_changes_nothing() -> None:
     some = gaussians(50, 0, 1)
-    some.opacity_logits[:2] = torch.tensor([22.0, math.inf])  # more than opaque is left, no number is not
+    # more than opaque is left, no number is not
+    some.opacity_logits[:2] = torch.tensor([22.0, math.inf])
     baked = bake(with_dial(some), 1.0, cameras=[camera(), camera()])
     assert baked.opacity_logits[:2].tolist() == [22, 20]
     assert torch.equal(baked.opacity_logits[2:], some.opacity_logits[2:])
 
 
 def spread(**settings: str) -> Gaussians:
-    """Gaussians at many distances from ``camera()``, some of which are culled, and most of which grow."""
+    """Gaussians at many distances from ``camera()``, some of which are culled, and most of which
+    grow.
+    """
     sigma, growth = torch.rand(2, 300, generator=torch.Generator().manual_seed(2))
     some = with_dial(gaussians(300, 1, 7), 5 * sigma + 0.1, replace(WORLD, **settings))
     some.opacity_logits[:30:10] = math.inf
@@ -84,7 +115,10 @@ def spread(**settings: str) -> Gaussians:
 def test_baked_image_matches_render_from_its_camera(form: str) -> None:
     some = spread(form=form)
     want, baked = render(some, camera(), 2.5), bake(some, 2.5, camera())
-    assert baked.sigma_d is baked.growth_d is baked.attenuation is None and baked.opacity_logits.isfinite().all()
+    assert (
+        baked.sigma_d is baked.growth_d is baked.attenuation is None
+        and baked.opacity_logits.isfinite().all()
+    )
     assert len(baked) == want.kept.sum() and 0 < len(baked) < 300
     torch.testing.assert_close(render(baked, camera()).image, want.image, atol=2e-5, rtol=0)
 
@@ -92,13 +126,21 @@ def test_baked_image_matches_render_from_its_camera(form: str) -> None:
 def test_several_cameras_share_one_distance_per_gaussian() -> None:
     some, cameras, s = spread(), ring(3, 61, 45), 3.0
     assert some.sigma_d is not None and some.attenuation is not None
-    d = torch.stack([normalized_distances(some.means, each, WORLD).log() for each in cameras]).mean(0).exp()
+    d = (
+        torch.stack([normalized_distances(some.means, each, WORLD).log() for each in cameras])
+        .mean(0)
+        .exp()
+    )
     given = (some.opacity_logits, some.sigma_d, d)
-    kept, shown, grown = (attenuate(*given, x, some.attenuation, growth_d=some.growth_d) for x in (s, s**0.75, s**0.9))
+    kept, shown, grown = (
+        attenuate(*given, x, some.attenuation, growth_d=some.growth_d) for x in (s, s**0.75, s**0.9)
+    )
     baked = bake(some, s, cameras=cameras)
     assert torch.equal(baked.means, some.means[kept.keep]) and 0 < len(baked) < 300
     torch.testing.assert_close(baked.opacities, shown.drawn[kept.keep], atol=1e-6, rtol=1e-5)
-    torch.testing.assert_close(baked.scales, (some.scales * grown.growth[:, None])[kept.keep], atol=1e-6, rtol=1e-5)
+    torch.testing.assert_close(
+        baked.scales, (some.scales * grown.growth[:, None])[kept.keep], atol=1e-6, rtol=1e-5
+    )
     places = [viewpoint_of(each, some.means, WORLD) for each in cameras]
     assert torch.equal(bake(some, s, cameras=places).means, baked.means)
 
@@ -120,18 +162,26 @@ def test_bad_arguments_are_refused() -> None:
     some, plain = spread(), gaussians(3, 0, 0)
     wrong: Any = "a.ply"
     for message, call in {
-        **{f"virtual_scale is {re.escape(str(s))}": partial(render, plain, camera(), s) for s in NO_DIALS},
+        **{
+            f"virtual_scale is {re.escape(str(s))}": partial(render, plain, camera(), s)
+            for s in NO_DIALS
+        },
         **{f"scale is {re.escape(str(s))}": partial(render, some, camera(), s) for s in NO_DIALS},
         "gaussians is a str, it must be of type Gaussians": lambda: render(wrong, camera()),
         "camera is a str, it must be of type Camera": lambda: render(plain, wrong),
-        "background is 'a.ply', it must be an array of numbers": lambda: render(plain, camera(), background=wrong),
-        "background": lambda: render(plain, camera(), background=torch.ones(1)),  # a kernel would read past its end
+        "background is 'a.ply', it must be an array of numbers": lambda: render(
+            plain, camera(), background=wrong
+        ),
+        # a kernel would read past its end
+        "background": lambda: render(plain, camera(), background=torch.ones(1)),
         "opacities": lambda: splat(plain, plain.opacities[:2], camera()),
         "no sigma_d": lambda: bake(plain, 1.0),
         "virtual_scale is -0.5": lambda: bake(some, -0.5, camera()),
         "no Gaussian is kept at s = 200": lambda: bake(some, 200.0, camera()),
         "either camera or cameras": lambda: bake(some, 2.0),
-        "paper's form rows have no order": lambda: order_by_extinction(spread(form="paper"), [camera()]),
+        "paper's form rows have no order": lambda: order_by_extinction(
+            spread(form="paper"), [camera()]
+        ),
         "no camera is given": lambda: order_by_extinction(some, []),
         "no pruning order": lambda: order_by_extinction(plain, [camera()]),
     }.items():
@@ -147,19 +197,36 @@ Drawing = Callable[..., Any]
 
 @pytest.fixture
 def draws(monkeypatch: pytest.MonkeyPatch) -> dict[str, Drawing]:
-    """The drop-ins for gsplat and for Inria's rasterizer, and the renderer, called with arguments of the dial alone."""
+    """The drop-ins for gsplat and for Inria's rasterizer, and the renderer, called with arguments
+    of the dial alone.
+    """
     given = {**scene(N, 1, 0), "opacities": MODEL.opacities}
     colors, points = torch.cat([given.pop("sh0"), given.pop("shN")], 1), given["means"]
-    ours = fresh_copy(monkeypatch, "gsplat", "gsplat", gsplat_versions.module("1.5.3")).rasterization
+    ours = fresh_copy(
+        monkeypatch, "gsplat", "gsplat", gsplat_versions.module("1.5.3")
+    ).rasterization
     fork = inria_forks.module("inria 2024")
     inria = fresh_copy(monkeypatch, "inria", "diff_gaussian_rasterization", fork)
-    of_inria = inria.GaussianRasterizer(inria_forks.settings_of(fork.GaussianRasterizationSettings, VIEW))
-    views = {"viewmats": VIEW.viewmat[None], "Ks": VIEW.K[None], "width": VIEW.width, "height": VIEW.height}
+    of_inria = inria.GaussianRasterizer(
+        inria_forks.settings_of(fork.GaussianRasterizationSettings, VIEW)
+    )
+    views = {
+        "viewmats": VIEW.viewmat[None],
+        "Ks": VIEW.K[None],
+        "width": VIEW.width,
+        "height": VIEW.height,
+    }
     rows = {"shs": colors, "scales": given["scales"], "rotations": given["quats"]}
     return {
         "gsplat": lambda **dial: ours(**{**given, "colors": colors, "sh_degree": 1} | views | dial),
         "inria": lambda **dial: of_inria(
-            **{"means3D": points, "means2D": 0 * points, "opacities": given["opacities"][:, None], **rows} | dial
+            **{
+                "means3D": points,
+                "means2D": 0 * points,
+                "opacities": given["opacities"][:, None],
+                **rows,
+            }
+            | dial
         ),
         "render": lambda **dial: render(gaussians(N, 1, 0), VIEW, **dial),
     }
@@ -180,14 +247,25 @@ def test_a_dial_value_without_a_dial_is_warned_of(draws: dict[str, Drawing], nam
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"growth_d": MODEL.growth_d, "sigma_d": MODEL.sigma_d}, "growth_d needs sigma_d and attenuation"),
-        ({"growth_d": MODEL.growth_d, "attenuation": DEFAULTS}, "growth_d needs sigma_d and attenuation"),
+        (
+            {"growth_d": MODEL.growth_d, "sigma_d": MODEL.sigma_d},
+            "growth_d needs sigma_d and attenuation",
+        ),
+        (
+            {"growth_d": MODEL.growth_d, "attenuation": DEFAULTS},
+            "growth_d needs sigma_d and attenuation",
+        ),
         ({"virtual_scale": -1}, "virtual_scale is -1, it must be a finite number of at least 0"),
-        ({"sigma_d": MODEL.sigma_d, "opacities": WHOLE}, "opacities is torch.int64, it must be floating point"),
+        (
+            {"sigma_d": MODEL.sigma_d, "opacities": WHOLE},
+            "opacities is torch.int64, it must be floating point",
+        ),
         ({"sigma_d": WHOLE}, "sigma_d is torch.int64, it must be floating point"),
     ],
 )
-def test_drop_ins_refuse(draws: dict[str, Drawing], name: str, given: dict[str, Any], message: str) -> None:
+def test_drop_ins_refuse(
+    draws: dict[str, Drawing], name: str, given: dict[str, Any], message: str
+) -> None:
     with pytest.raises(ClodError, match=message):
         draws[name](**given)
 
@@ -195,16 +273,27 @@ def test_drop_ins_refuse(draws: dict[str, Drawing], name: str, given: dict[str, 
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: MODEL.replace(means=MODEL.means.long()), "Gaussians.means is torch.int64, it must be floating point"),
+        (
+            lambda: MODEL.replace(means=MODEL.means.long()),
+            "Gaussians.means is torch.int64, it must be floating point",
+        ),
         (lambda: MODEL.replace(opacity_logits=WHOLE), "Gaussians.opacity_logits is torch.int64"),
         (lambda: HOOK(MODEL.means, WHOLE, VIEW.viewmat), "opacities is torch.int64"),
-        (lambda: HOOK(MODEL.means.long().numpy(), MODEL.opacities.numpy(), VIEW.viewmat), "means is torch.int64"),
-        *((partial(save, name, MODEL), f"{name}: {message}") for name, message in (
-            ("x.foo", ".foo is no format to write; choose one of .ply, .glb, "), ("x", "no suffix is no format"),
-            ("x.ksplat", ".ksplat is no format"), ("x.sog", "is written by clod-adapt export alone: save a .ply"),
-        )),
+        (
+            lambda: HOOK(MODEL.means.long().numpy(), MODEL.opacities.numpy(), VIEW.viewmat),
+            "means is torch.int64",
+        ),
+        *(
+            (partial(save, name, MODEL), f"{name}: {message}")
+            for name, message in (
+                ("x.foo", ".foo is no format to write; choose one of .ply, .glb, "),
+                ("x", "no suffix is no format"),
+                ("x.ksplat", ".ksplat is no format"),
+                ("x.sog", "is written by clod-adapt export alone: save a .ply"),
+            )
+        ),
     ],
-)  # fmt: skip
+)
 def test_calls_are_refused(
     call: Callable[[], Any], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

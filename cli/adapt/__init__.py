@@ -14,21 +14,36 @@ NAMES = ("bands", "means", "quats", "scales", "opacities", "sh0")
 
 def add_arguments(parser: ArgumentParser) -> None:
     given = parser.add_argument_group("input")
-    text = "checkpoint: a PLY in Inria's 3DGS layout, or another file that inspect reads; never modified"
+    text = (
+        "checkpoint: a PLY in Inria's 3DGS layout, or another file that inspect reads; never"
+        " modified"
+    )
     given.add_argument("ply", metavar="PLY", help=text)
-    scene = "images/ with a COLMAP model in sparse/0, or a transforms.json of nerfstudio or instant-ngp"
+    scene = (
+        "images/ with a COLMAP model in sparse/0, or a transforms.json of nerfstudio or instant-ngp"
+    )
     add_reading(given, f"scene folder: {scene} (default: none, see below)")
     output = parser.add_argument_group("output")
     text = "output file (default: name of PLY with _clod, in the current folder)"
     output.add_argument("-o", "--out", metavar="OUT.ply", help=text)
-    output.add_argument("--report", action="store_true", help="also write a page, OUT.html, and its charts")
+    output.add_argument(
+        "--report", action="store_true", help="also write a page, OUT.html, and its charts"
+    )
     training = parser.add_argument_group("training")
     add_settings(training)
-    training.add_argument("--resume", action="store_true", help="continue the same command where it was interrupted")
+    training.add_argument(
+        "--resume", action="store_true", help="continue the same command where it was interrupted"
+    )
     text = "exit code 0 even if s = 1 is far below the base (see exit codes)"
     training.add_argument("--accept-loss", action="store_true", help=text)
     options = parser.add_argument_group("advanced")
-    several: Any = {"metavar": "NAME", "nargs": "+", "action": "extend", "choices": NAMES, "default": []}
+    several: Any = {
+        "metavar": "NAME",
+        "nargs": "+",
+        "action": "extend",
+        "choices": NAMES,
+        "default": [],
+    }
     text = f"train these whatever the plan measures: {', '.join(NAMES)}"
     options.add_argument("--with", dest="keep_in", help=text, **several)
     text = "exclude or freeze these whatever the plan measures"
@@ -38,14 +53,18 @@ def add_arguments(parser: ArgumentParser) -> None:
 def check(args: Namespace) -> None:
     make_config(args)
     if both := sorted(set(args.keep_in) & set(args.leave_out)):
-        raise ClodError(f"--with and --without both name {', '.join(both)}; give each to one of them")
+        raise ClodError(
+            f"--with and --without both name {', '.join(both)}; give each to one of them"
+        )
     check_inputs(args.images, args.ply)
 
 
 def outputs(args: Namespace) -> Outputs:
     files = AdaptFiles.of(args.ply, args.out)
     check_ply_name(files.ply, "--out")
-    page = page_files(files.ply.with_suffix(".html"), ["rendering", "adapting"]) if args.report else []
+    page = (
+        page_files(files.ply.with_suffix(".html"), ["rendering", "adapting"]) if args.report else []
+    )
     named, default = ([], [files.ply]) if args.out is None else ([files.ply], [])
     derived = [*default, files.adapter, files.report, files.state, *page]
     return Outputs(named, derived, inputs=[args.ply], scene=args.images)

@@ -19,8 +19,10 @@ from ..shared.console import Console
 
 # Not "leave out --resume": the demo gives that option itself.
 ORIGINAL = "use the original arguments, or delete the file to start over"
-SAVE_EVERY, OLDEST = 5.0, 50.0  # seconds between saves, at least, and unless saving takes very long at most
-SAVE_COST, MOST_COST = 0.015, 0.2  # shares of the time that saving may take, within OLDEST and at all
+# seconds between saves, at least, and unless saving takes very long at most
+SAVE_EVERY, OLDEST = 5.0, 50.0
+# shares of the time that saving may take, within OLDEST and at all
+SAVE_COST, MOST_COST = 0.015, 0.2
 
 
 def settings_key(config: AdaptConfig) -> dict[str, Any]:
@@ -28,17 +30,22 @@ def settings_key(config: AdaptConfig) -> dict[str, Any]:
 
 
 class Saver:
-    """Saves the training state of one run; finds that of an earlier one, of the same settings, with ``resume``.
+    """Saves the training state of one run; finds that of an earlier one, of the same settings, with
+    ``resume``.
 
     A file that is no training state is refused, and not replaced.
     """
 
-    def __init__(self, path: Path, config: AdaptConfig, console: Console, stop: GracefulStop, resume: bool) -> None:
+    def __init__(
+        self, path: Path, config: AdaptConfig, console: Console, stop: GracefulStop, resume: bool
+    ) -> None:
         self.path, self.console, self.stop = path, console, stop
         self.run_of = settings_key(config)
         self.state: TrainingState | None = None  # the one to resume from
-        self.saved: int | None = None  # the step that is in the file; None if the file is not of this run
-        self.latest: Progress | None = None  # the last that is not saved; it references everything that is trained
+        # the step that is in the file; None if the file is not of this run
+        self.saved: int | None = None
+        # the last that is not saved; it references everything that is trained
+        self.latest: Progress | None = None
         self.due, self.warned = 0.0, False  # when the next save is, and whether one has failed
         if path.exists():
             found, self.then = load_state(path)
@@ -47,26 +54,35 @@ class Saver:
                 self.state = found
             else:
                 console.say(
-                    f"{path} has step {found.steps} of an interrupted run, which --resume would continue; this run "
-                    "starts over, and replaces the file once its training has begun"
+                    f"{path} has step {found.steps} of an interrupted run, which --resume would"
+                    " continue; this run starts over, and replaces the file once its training has"
+                    " begun"
                 )
         elif resume:
             console.say(f"there is no {path} to resume from: starting from the beginning")
 
     def _check_settings(self) -> None:
         if (then := self.then.get("version")) != (now := self.run_of["version"]):
-            raise ClodError(f"{self.path}: is of version {then} of this package, not {now}; delete it to start over")
+            raise ClodError(
+                f"{self.path}: is of version {then} of this package, not {now}; delete it to start"
+                " over"
+            )
         now, then = self.run_of["config"], self.then.get("config")
         if not isinstance(then, dict) or then.keys() != now.keys():
             raise ClodError(f"{self.path}: is of other settings; {ORIGINAL}")
         if different := [name for name in now if now[name] != then[name]]:
-            given = {name: f"{as_option(name)} {then[name]}" for name in different if name in SETTINGS}
+            given = {
+                name: f"{as_option(name)} {then[name]}" for name in different if name in SETTINGS
+            }
             given |= {name: f"no {as_option(name)}" for name in given if then[name] is None}
             options = [given.get(name, "another --form") for name in different]
-            raise ClodError(f"{self.path}: is of a run with {', '.join(dict.fromkeys(options))}; {ORIGINAL}")
+            raise ClodError(
+                f"{self.path}: is of a run with {', '.join(dict.fromkeys(options))}; {ORIGINAL}"
+            )
 
     def identify(self, checkpoint: str, source: str, **hashes: Any) -> None:
-        """Sets what else identifies the run: hashes of base and views, and overrides; refuses the state of another.
+        """Sets what else identifies the run: hashes of base and views, and overrides; refuses the
+        state of another.
 
         ``checkpoint`` and ``source`` are the names of base and views.
         """
@@ -76,7 +92,10 @@ class Saver:
         for key, what in (
             ("base_sha256", f"another checkpoint than {checkpoint}"),
             ("views_sha256", f"other photographs than {source}"),
-            ("overruled", f"a run with other --with or --without, {self.then.get('overruled')!r:.80}"),
+            (
+                "overruled",
+                f"a run with other --with or --without, {self.then.get('overruled')!r:.80}",
+            ),
         ):
             if self.then.get(key) != self.run_of.get(key):
                 raise ClodError(f"{self.path}: is of {what}; {ORIGINAL}")
@@ -84,7 +103,9 @@ class Saver:
         self.console.say(f"resuming {self.path} from step {self.saved}")
 
     def saving(self, listener: Listener) -> Listener:
-        """The listener that also saves: after the first step, now and then, and when training stops or fails."""
+        """The listener that also saves: after the first step, now and then, and when training stops
+        or fails.
+        """
 
         def listen(now: Progress) -> bool:
             self.latest = now if now.state else None
@@ -106,7 +127,9 @@ class Saver:
             self.saved, self.latest = self.latest.done, None
         except (ClodError, MemoryError) as error:
             if not self.warned:
-                self.console.say(f"warning: the run continues, but --resume will not find it: {error}")
+                self.console.say(
+                    f"warning: the run continues, but --resume will not find it: {error}"
+                )
             self.warned = True
         now = time.perf_counter()
         cost = now - began
@@ -114,19 +137,26 @@ class Saver:
 
     @contextmanager
     def rescuing(self, how: str = "--resume") -> Iterator[None]:
-        """After an error within the block says on stderr, also with ``--quiet``, from which step ``how`` resumes."""
+        """After an error within the block says on stderr, also with ``--quiet``, from which step
+        ``how`` resumes.
+        """
         try:
             yield
         except Stopped:
             raise
         except StateRefused as error:
-            raise ClodError(f"{self.path}: {str(error).partition(';')[0]}; delete it to start over") from error
+            raise ClodError(
+                f"{self.path}: {str(error).partition(';')[0]}; delete it to start over"
+            ) from error
         except BaseException as error:
             if isinstance(error, Exception):  # not after an abort
                 self.keep()
             if self.saved is not None:
                 with suppress(OSError):  # stderr is closed, or on the disk that is full
-                    print(f"{how} resumes from step {self.saved}, which is in {self.path}", file=sys.stderr)
+                    print(
+                        f"{how} resumes from step {self.saved}, which is in {self.path}",
+                        file=sys.stderr,
+                    )
             raise
 
     def close(self, finished: bool) -> None:
@@ -138,7 +168,10 @@ class Saver:
             try:
                 self.path.unlink(missing_ok=True)
             except OSError as error:
-                self.console.note(f"{self.path}: cannot be removed ({error.strerror or error}); it is of no use now")
+                self.console.note(
+                    f"{self.path}: cannot be removed ({error.strerror or error}); it is of no"
+                    " use now"
+                )
             self.saved = None
         else:
             self.console.say(f"--resume resumes from step {self.saved}, which is in {self.path}")

@@ -1,4 +1,6 @@
-"""A run of ``clod-adapt`` before its training: the arguments, what is read, and the training plan."""
+"""A run of ``clod-adapt`` before its training: the arguments, what is read, and the training
+plan.
+"""
 
 import argparse
 import math
@@ -43,14 +45,16 @@ WRITING = 1e8  # bytes of a PLY per second, with everything that is written besi
 
 
 class Run:
-    """The arguments, the services that all steps use, and what ``read`` and ``measure_base`` have found.
+    """The arguments, the services that all steps use, and what ``read`` and ``measure_base`` have
+    found.
 
     Without photographs, or with too few, ``scene`` has pseudo views.
     """
 
     base: Checkpoint
     scene: Scene
-    alignment: dict[str, Any] | None = None  # the measurements of the check; None without photographs
+    # the measurements of the check; None without photographs
+    alignment: dict[str, Any] | None = None
     base_rows: list[Row]  # at dial value 1; none if nothing is held out
     base_seconds = 0.0  # of measuring it
     cut = True  # whether the measurements of the result are missing or incomplete
@@ -73,13 +77,17 @@ class Run:
             base = inputs.read_checkpoint(args.ply, console, args.activated, device=device)
             if base.vertex is not None:  # only writing needs the file's rows
                 base = replace(base, vertex=mapped(base.vertex, self.outputs.ply.parent))
-            photographs = inputs.read_scene(args.images, console, base.origin) if args.images else None
+            photographs = (
+                inputs.read_scene(args.images, console, base.origin) if args.images else None
+            )
         with watch.time("kernels"):
             inputs.prepare_kernels(console, device)
         with watch.time("evaluate"):
             if photographs is not None:
                 required = not args.misaligned_ok
-                photographs, self.alignment = inputs.align_shown(base, photographs, console, required=required)
+                photographs, self.alignment = inputs.align_shown(
+                    base, photographs, console, required=required
+                )
                 views = [*photographs.test, *photographs.train]
             self.base = base = inputs.with_filter(base, args, console, views)
         if base.gaussians.screen_filter.compensate:
@@ -92,16 +100,23 @@ class Run:
     def place(self, photographs: Scene | None) -> None:
         """Adds pseudo views where photographs are few, and replaces them where there are none."""
         with closing(ProgressDisplay(self.console, self.stop)) as display:
-            self.scene = with_pseudo_views(self.base.gaussians, photographs, self.config.seed, display)
+            self.scene = with_pseudo_views(
+                self.base.gaussians, photographs, self.config.seed, display
+            )
         self.console.note(*self.scene.notes)
 
     def identify(self) -> None:
         """Refuses the state of another run."""
         self.saver.identify(
-            self.args.ply, self.args.images or "the pseudo views",
-            base_sha256=self.checkpoint(), views_sha256=scene_fingerprint(self.scene),
-            overruled={"--with": sorted(self.args.keep_in), "--without": sorted(self.args.leave_out)},
-        )  # fmt: skip
+            self.args.ply,
+            self.args.images or "the pseudo views",
+            base_sha256=self.checkpoint(),
+            views_sha256=scene_fingerprint(self.scene),
+            overruled={
+                "--with": sorted(self.args.keep_in),
+                "--without": sorted(self.args.leave_out),
+            },
+        )
 
     def checkpoint(self) -> str:
         """Identifies the Gaussians, which depend on the options for reading too."""
@@ -113,9 +128,13 @@ class Run:
         if columns := tuple(dial_tensors(self.base.gaussians)):
             used = columns if self.config.growth == "on" else columns[:1]
             dropped = "; its growth_d is dropped, as growth is off" if used < columns else ""
-            console.note(f"{args.ply} has a dial already: continuing from its {' and '.join(used)}{dropped}")
+            console.note(
+                f"{args.ply} has a dial already: continuing from its {' and '.join(used)}{dropped}"
+            )
         if not scene.test:
-            console.note("no photographs are held out, so nothing is measured; at least two are needed")
+            console.note(
+                "no photographs are held out, so nothing is measured; at least two are needed"
+            )
         began = time.perf_counter()
         with self.watch.time("evaluate"), self.stop.listening():
             rows = measure(self.base.gaussians, scene.test, [1.0], console, self.stop, "base")
@@ -138,7 +157,9 @@ def decide(run: Run, display: ProgressDisplay) -> Plan:
 
 
 def forecast(run: Run, plan: Plan) -> None:
-    """Estimates time and peak memory of the rest of a run in one process, unless it is short, from a few steps."""
+    """Estimates time and peak memory of the rest of a run in one process, unless it is short, from
+    a few steps.
+    """
     config, views, base, state = plan.config, len(run.scene.test), run.base, run.saver.state
     steps = config.steps - (state.steps if state else 0)
     if steps < LONG or launched().size > 1:
@@ -146,12 +167,19 @@ def forecast(run: Run, plan: Plan) -> None:
     with run.console.status("timing a few steps ..."):
         each, fixed = time_steps(plan.start, run.scene, config, min(max(steps // 40, 16), 24))
     release()
-    training = fixed + min(1.02 * steps * each, config.time_budget or math.inf)  # with saving the state
-    dials, frame = len(report_dials(config.max_sv)) + 1, run.base_rows[0].frame_ms / 1e3 if run.base_rows else 0.0
+    # with saving the state
+    training = fixed + min(1.02 * steps * each, config.time_budget or math.inf)
+    dials, frame = (
+        len(report_dials(config.max_sv)) + 1,
+        run.base_rows[0].frame_ms / 1e3 if run.base_rows else 0.0,
+    )
     measuring = CHEAPER * dials * (run.base_seconds + 15 * frame)
     peak = peak_bytes()
     if run.args.report:  # curves of seven states at three dial values, 15 pictures and the charts
-        measuring += CHEAPER * (21 * run.base_seconds * min(SNAPSHOT_VIEWS / max(views, 1), 1) + 15 * frame) + 5
+        measuring += (
+            CHEAPER * (21 * run.base_seconds * min(SNAPSHOT_VIEWS / max(views, 1), 1) + 15 * frame)
+            + 5
+        )
         peak += 7 * _bytes(plan.start.without_bands(0))
     seconds = training + measuring + _bytes(base.gaussians) / WRITING
     minutes = f"{seconds:.0f} seconds" if seconds < 90 else f"{seconds / 60:.0f} minutes"
@@ -163,7 +191,10 @@ def forecast(run: Run, plan: Plan) -> None:
 
 def against_forecast(run: Run) -> dict[str, Any] | None:
     """The forecast, and what the run has taken since."""
-    taken = {"actual_seconds": round(time.perf_counter() - run.forecast_at, 1), "actual_bytes": peak_bytes()}
+    taken = {
+        "actual_seconds": round(time.perf_counter() - run.forecast_at, 1),
+        "actual_bytes": peak_bytes(),
+    }
     return run.forecast and run.forecast | taken
 
 
@@ -172,12 +203,18 @@ def peak_bytes() -> int:
         import resource
     except ImportError:  # Windows
         return 0  # not known
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (
+        1 if sys.platform == "darwin" else 1024
+    )
 
 
 def show_plan(decisions: Sequence[Decision], console: Console) -> None:
     rows = [(d.what, d.verdict, d.measured, d.name) for d in decisions if d.verdict != NOT_NEEDED]
-    a, b, c = (max(map(len, column)) for column in list(zip(*rows, strict=True))[:3]) if rows else (0, 0, 0)
+    a, b, c = (
+        (max(map(len, column)) for column in list(zip(*rows, strict=True))[:3])
+        if rows
+        else (0, 0, 0)
+    )
     console.say("plan: action, measured effect, option that overrides it; reasons in the report")
     for what, verdict, effect, name in rows:
         option = f"{'--without' if verdict == 'kept' else '--with'} {name}" if name else ""
@@ -196,12 +233,15 @@ def _bytes(gaussians: Gaussians) -> int:
 
 
 def mapped(array: np.ndarray, folder: Path) -> np.ndarray:
-    """The array in a mapped file without a name in ``folder``; itself where four times its size are not free there."""
+    """The array in a mapped file without a name in ``folder``; itself where four times its size are
+    not free there.
+    """
     try:
         if array.nbytes == 0 or shutil.disk_usage(folder).free < 4 * array.nbytes:
             return array
         with tempfile.TemporaryFile(dir=folder) as file:
-            file.write(array.reshape(-1).view(np.uint8).data)  # not tofile, which loses the error of a full disk
+            # not tofile, which loses the error of a full disk
+            file.write(array.reshape(-1).view(np.uint8).data)
             file.flush()
             return np.asarray(np.memmap(file, array.dtype, "c", shape=array.shape))
     except OSError:

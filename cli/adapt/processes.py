@@ -1,6 +1,7 @@
 """Adapting in several processes: the first one reads, prints and writes.
 
-The others wait for its training job, or to be told in the launcher's store that there is none, and end after it.
+The others wait for its training job, or to be told in the launcher's store that there is none, and
+end after it.
 """
 
 from __future__ import annotations
@@ -17,7 +18,13 @@ import torch
 from clod_adapter.cameras import Scene
 from clod_adapter.errors import ClodError
 from clod_adapter.progress import GracefulStop, Stopped
-from clod_adapter.training.distributed import PATIENCE, ProcessGroup, ProcessLost, joined, require_distributed
+from clod_adapter.training.distributed import (
+    PATIENCE,
+    ProcessGroup,
+    ProcessLost,
+    joined,
+    require_distributed,
+)
 from clod_adapter.training.loop import adapt
 from clod_adapter.training.plan import Plan
 from clod_adapter.training.pseudo_views import teachers_to
@@ -30,7 +37,8 @@ if TYPE_CHECKING:
     from torch.distributed.distributed_c10d import Store
 
 BACKENDS = {"cpu": "gloo", "cuda": "nccl"}  # of torch.distributed, by device
-# Keys in the store: by which the first process calls the others, to "train" or to "end"; and why a process has ended.
+# Keys in the store: by which the first process calls the others, to "train" or to "end"; and why a
+# process has ended.
 CALL, REASON = "clod/call", "clod/reason{}"
 POLL_EVERY = 0.05  # seconds between checks for work
 
@@ -51,7 +59,9 @@ def leading() -> Iterator[None]:
 def together(
     plan: Plan, scene: Scene, state: TrainingState | None, display: ProgressDisplay
 ) -> Iterator[ProcessGroup | None]:
-    """The group to train with, after giving the others the job of ``plan.adapt``; None for a single process."""
+    """The group to train with, after giving the others the job of ``plan.adapt``; None for a single
+    process.
+    """
     launch = launched()
     if launch.size == 1:
         yield None
@@ -62,7 +72,8 @@ def together(
     display.console.say(f"{launch.size} processes ({BACKENDS[device]}): {each}")
     _store().set(CALL, "train")
     try:
-        if any(_store().check([REASON.format(k)]) for k in range(1, launch.size)):  # it would wait for ten minutes
+        # it would wait for ten minutes
+        if any(_store().check([REASON.format(k)]) for k in range(1, launch.size)):
             raise ProcessLost("a process of the group has ended")
         _use_threads(launch.local_size)
         with joined(_store(), launch.rank, launch.size) as group:
@@ -72,7 +83,9 @@ def together(
     except ProcessLost as error:
         if display.stop.requests:
             raise Stopped("stopped before the first step") from error
-        raise ClodError(f"{explain(str(error))}; this was before the first step, so start again") from error
+        raise ClodError(
+            f"{explain(str(error))}; this was before the first step, so start again"
+        ) from error
     finally:
         _use_threads(1)  # the others are done
 
@@ -102,7 +115,10 @@ def _train(group: ProcessGroup, launch: Launch, stop: GracefulStop) -> None:
     start, views, config, state, device = job
     if device == "cuda":  # one for each process on this machine
         if (gpus := torch.cuda.device_count()) < launch.local_size:
-            raise ClodError(f"{launch.local_size} processes on a machine with {gpus} GPUs; start as many as there are")
+            raise ClodError(
+                f"{launch.local_size} processes on a machine with {gpus} GPUs; start as many as"
+                " there are"
+            )
         torch.cuda.set_device(launch.local_rank)
     scene = Scene(teachers_to(views, device), ())
     adapt(start.to(device), scene, config, stop.heeding(), state, group=group)
@@ -118,7 +134,9 @@ def explain(lost: str) -> str:
 
 
 def hurried(adapted: Adapted) -> bool:
-    """Whether the launcher ends the processes: after its signal, or a lost process, it waits for 30 seconds."""
+    """Whether the launcher ends the processes: after its signal, or a lost process, it waits for 30
+    seconds.
+    """
     return adapted.interrupted and not adapted.failed and launched().size > 1
 
 
@@ -131,7 +149,8 @@ def _is_called(stop: GracefulStop, rank: int) -> bool:
                 store.set(REASON.format(rank), f"process {rank}: ended by a signal")
                 break
             time.sleep(POLL_EVERY)
-        return store.check([CALL]) and store.get(CALL) == b"train"  # it may have called before it could know
+        # it may have called before it could know
+        return store.check([CALL]) and store.get(CALL) == b"train"
     except RuntimeError:  # the store has ended, and the first process with it
         return False
 
@@ -145,12 +164,20 @@ def _store() -> Store:
     try:
         store, _, _ = next(iter(rendezvous("env://", timeout=PATIENCE)))
     except (RuntimeError, ValueError) as error:
-        raise ClodError(f"the processes cannot meet ({str(error).partition('. ')[0]}); use torchrun") from error
+        raise ClodError(
+            f"the processes cannot meet ({str(error).partition('. ')[0]}); use torchrun"
+        ) from error
     return store
 
 
 def _use_threads(local_size: int) -> None:
-    """Uses this process's share of the machine's cores, or OMP_NUM_THREADS, unless it is torchrun's default, 1."""
+    """Uses this process's share of the machine's cores, or OMP_NUM_THREADS, unless it is torchrun's
+    default, 1.
+    """
     if os.environ.get("OMP_NUM_THREADS", "1") == "1":
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        cores = (
+            len(os.sched_getaffinity(0))
+            if hasattr(os, "sched_getaffinity")
+            else os.cpu_count() or 1
+        )
         torch.set_num_threads(max(cores // local_size, 1))

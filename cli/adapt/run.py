@@ -1,4 +1,6 @@
-"""``clod-adapt``: gives a checkpoint its dial, and writes the extended file, the adapter and a report."""
+"""``clod-adapt``: gives a checkpoint its dial, and writes the extended file, the adapter and a
+report.
+"""
 
 import argparse
 import shlex
@@ -25,7 +27,8 @@ from ..shared.process import launched, listen_no_more
 from .prepare import Run, against_forecast, decide, forecast
 from .processes import BACKENDS, explain, hurried, together
 
-# dB: of s = 1 below the base, and against the checkpoint's renderings without photographs, what is told and what fails.
+# dB: of s = 1 below the base, and against the checkpoint's renderings without photographs, what is
+# told and what fails.
 LOST, ENOUGH = (0.1, 1.0), (33.0, 25.0)
 
 
@@ -33,10 +36,13 @@ def adapt(args: argparse.Namespace) -> dict[str, Any]:
     """Plans, trains, writes and reports."""
     run = Run(args)
     run.read()
-    page = AdaptPage(run.base.gaussians, run.scene, run.config, run.console) if args.report else None
+    page = (
+        AdaptPage(run.base.gaussians, run.scene, run.config, run.console) if args.report else None
+    )
     run.identify()
     run.measure_base()
-    with run.stop.listening(), run.saver.rescuing():  # until training has ended, so that a Ctrl-C loses nothing
+    # until training has ended, so that a Ctrl-C loses nothing
+    with run.stop.listening(), run.saver.rescuing():
         result = make_result(run, *train(run, page))
     with run.saver.rescuing():
         return finish(run, result, page)
@@ -57,7 +63,13 @@ def train(run: Run, page: AdaptPage | None) -> tuple[Plan, Adapted]:
     with closing(display), together(plan, scene, saver.state, display) as group:
         adapted = plan.adapt(scene, saver.saving(show), saver.state, group)
     saver.keep()
-    how = "ended after" if adapted.failed else "interrupted after" if adapted.interrupted else "trained"
+    how = (
+        "ended after"
+        if adapted.failed
+        else "interrupted after"
+        if adapted.interrupted
+        else "trained"
+    )
     run.console.say(f"{how} {adapted.steps} steps, {duration(adapted.seconds)}")
     release()
     return plan, adapted
@@ -90,7 +102,8 @@ def finish(run: Run, result: Result, page: AdaptPage | None) -> dict[str, Any]:
         path = outputs.ply.with_suffix(".html")
         with run.watch.time("page"):
             page.write(path, report, result.gaussians, result.adapted.start_seconds)
-        report["seconds"] |= {"page": round(run.watch.seconds["page"], 3)}  # beside the total, which the page has too
+        # beside the total, which the page has too
+        report["seconds"] |= {"page": round(run.watch.seconds["page"], 3)}
         report["forecast"] = against_forecast(run)
         write_report(outputs.report, report)
     print_summary(run, result, report["seconds"])
@@ -102,7 +115,8 @@ def finish(run: Run, result: Result, page: AdaptPage | None) -> dict[str, Any]:
 def measure_result(run: Run, result: Result, stop: GracefulStop) -> Result:
     """Measures the result on the held-out views, unless the run is to end now.
 
-    That is after a Ctrl-C that came when training was complete, and if the launcher ends the processes.
+    That is after a Ctrl-C that came when training was complete, and if the launcher ends the
+    processes.
     """
     views, console = run.scene.test, run.console
     if run.stop.requests > 0 and not result.adapted.interrupted or hurried(result.adapted):
@@ -111,7 +125,11 @@ def measure_result(run: Run, result: Result, stop: GracefulStop) -> Result:
     with run.watch.time("evaluate"):
         rows = measure(result.gaussians, views, report_dials(run.config.max_sv), console, stop)
         plain = measure(detached, views, [1.0], console, stop, "plain")
-        measured = [(run.base.gaussians, run.base_rows), (result.gaussians, rows), (detached, plain)]
+        measured = [
+            (run.base.gaussians, run.base_rows),
+            (result.gaussians, rows),
+            (detached, plain),
+        ]
         base_rows, rows, plain = comparable(measured, views, console, stop)
     run.cut = stop.requests > 0
     result = replace(result, base_rows=base_rows, rows=rows, plain=plain)
@@ -119,7 +137,9 @@ def measure_result(run: Run, result: Result, stop: GracefulStop) -> Result:
 
 
 def write_result(run: Run, result: Result) -> dict[str, Any]:
-    """Writes the three files, all before the first replaces that of an earlier run, and returns the report."""
+    """Writes the three files, all before the first replaces that of an earlier run, and returns the
+    report.
+    """
     outputs, console, calibration = run.outputs, run.console, result.adapter.calibration
     report = describe(run, result)
     with (
@@ -139,34 +159,58 @@ def describe(run: Run, result: Result) -> dict[str, Any]:
     args, adapted, adapter = run.args, result.adapted, result.adapter
     times, count, device = result.plan.seconds, launched().size, result.gaussians.means.device
     planning = sum(times.values()) - times["start"]
-    run.watch.seconds |= {"plan": planning, "start": adapted.start_seconds, "train": adapted.seconds}
+    run.watch.seconds |= {
+        "plan": planning,
+        "start": adapted.start_seconds,
+        "train": adapted.seconds,
+    }
     if run.cut:
-        run.console.note("the measurements were interrupted: only the dial values that were finished are reported")
+        run.console.note(
+            "the measurements were interrupted: only the dial values that were finished are"
+            " reported"
+        )
     report = {
-        "command": "adapt", "version": package_version(), "model": args.ply, "scene": args.images,
-        "teacher": run.against, "screen_filter": asdict(result.gaussians.screen_filter),
-        "base_count": adapter.base_count, "config": adapter.config, "attenuation": asdict(adapter.attenuation),
-        "steps": adapted.steps, "interrupted": adapted.interrupted, "machine": machine(),
+        "command": "adapt",
+        "version": package_version(),
+        "model": args.ply,
+        "scene": args.images,
+        "teacher": run.against,
+        "screen_filter": asdict(result.gaussians.screen_filter),
+        "base_count": adapter.base_count,
+        "config": adapter.config,
+        "attenuation": asdict(adapter.attenuation),
+        "steps": adapted.steps,
+        "interrupted": adapted.interrupted,
+        "machine": machine(),
         "processes": {
-            "count": count, "backend": BACKENDS[device.type] if count > 1 else None, "batch": run.config.batch,
-            "waiting_seconds": round(adapted.waiting, 3), "exchange_seconds": round(adapted.exchanging, 3),
+            "count": count,
+            "backend": BACKENDS[device.type] if count > 1 else None,
+            "batch": run.config.batch,
+            "waiting_seconds": round(adapted.waiting, 3),
+            "exchange_seconds": round(adapted.exchanging, 3),
         },
         "outputs": {name: str(path) for name, path in vars(run.outputs).items()},
-        "sh_degree": result.gaussians.sh_degree, "device": str(device),
-        "seconds": run.watch.report(), "resumed_from": run.saver.state and run.saver.state.steps,
-        "alignment": run.alignment, "notes": run.console.notes,
+        "sh_degree": result.gaussians.sh_degree,
+        "device": str(device),
+        "seconds": run.watch.report(),
+        "resumed_from": run.saver.state and run.saver.state.steps,
+        "alignment": run.alignment,
+        "notes": run.console.notes,
         "base_rows": [row.as_dict() for row in result.base_rows],
         "rows": [row.as_dict() for row in result.rows],
         "detached_row": result.plain[0].as_dict() if result.plain else None,
-        "plan": result.plan.as_dict(), "forecast": against_forecast(run),
-    }  # fmt: skip
+        "plan": result.plan.as_dict(),
+        "forecast": against_forecast(run),
+    }
     line, failed = ("", False) if report["interrupted"] else judge(run, result)
     failed = adapted.failed is not None or failed and not args.accept_loss
     return report | ({"loss": line} if line else {}) | ({"exit_code": 1} if failed else {})
 
 
 def judge(run: Run, result: Result) -> tuple[str, bool]:
-    """What is wrong with s = 1 and what to do, empty if nothing is; and whether the result has failed."""
+    """What is wrong with s = 1 and what to do, empty if nothing is; and whether the result has
+    failed.
+    """
     full = [row.psnr for row in result.rows if row.virtual_scale == 1]
     if not full or not result.base_rows:
         return "", False
@@ -176,8 +220,14 @@ def judge(run: Run, result: Result) -> tuple[str, bool]:
         more, bad, failed = "", not lost <= LOST[0], not lost <= LOST[1]
     else:
         line = f"s = 1 has {full[0]:.2f} dB against the checkpoint's own renderings"
-        more, bad, failed = ", or give the photographs (--images)", not full[0] >= ENOUGH[0], not full[0] >= ENOUGH[1]
-    return (f"{line}:\ntrain longer (--iters){more}, or show s = 0, which is the base" if bad else ""), failed
+        more, bad, failed = (
+            ", or give the photographs (--images)",
+            not full[0] >= ENOUGH[0],
+            not full[0] >= ENOUGH[1],
+        )
+    return (
+        f"{line}:\ntrain longer (--iters){more}, or show s = 0, which is the base" if bad else ""
+    ), failed
 
 
 def print_summary(run: Run, result: Result, taken: dict[str, float]) -> None:

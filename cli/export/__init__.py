@@ -1,4 +1,6 @@
-"""``clod-adapt export``: writes a model in another format, with its dial or with one dial value baked in."""
+"""``clod-adapt export``: writes a model in another format, with its dial or with one dial value
+baked in.
+"""
 
 from argparse import ArgumentParser, ArgumentTypeError, Namespace
 from itertools import pairwise
@@ -25,7 +27,9 @@ def levels_of(text: str) -> list[float]:
     except ValueError:
         levels = []
     if not levels or levels[0] < 0 or not all(a < b for a, b in pairwise([*levels, inf])):
-        raise ArgumentTypeError(f"{text!r} must be ascending dial values of at least 0, as in 1,2,4,7")
+        raise ArgumentTypeError(
+            f"{text!r} must be ascending dial values of at least 0, as in 1,2,4,7"
+        )
     return levels
 
 
@@ -34,22 +38,42 @@ def add_arguments(parser: ArgumentParser) -> None:
     given.add_argument("model", metavar="MODEL", help="an adapted file, or a plain one to convert")
     about = "scene folder: cameras to bake for, and for the views of a page"
     common.add_reading(given, about, photographs=False)
-    given.add_argument("--camera", metavar="PHOTO", help="bake for the camera of this photograph alone")
+    given.add_argument(
+        "--camera", metavar="PHOTO", help="bake for the camera of this photograph alone"
+    )
     dial = parser.add_argument_group("dial values, one of")
-    values = common.add_dial_options(dial, "the dial value to bake", "(in the file written)", several=False)
-    values.add_argument("--levels", metavar="S,S,...", type=levels_of, help="dial values, each baked into a file")
+    values = common.add_dial_options(
+        dial, "the dial value to bake", "(in the file written)", several=False
+    )
+    values.add_argument(
+        "--levels", metavar="S,S,...", type=levels_of, help="dial values, each baked into a file"
+    )
     output = parser.add_argument_group("output")
-    output.add_argument("-o", "--out", metavar="OUT", required=True, help="output file; its suffix is the format")
+    output.add_argument(
+        "-o", "--out", metavar="OUT", required=True, help="output file; its suffix is the format"
+    )
     sets = output.add_mutually_exclusive_group()
-    for option, form in (("--lod-meta", "streaming set for PlayCanvas's viewers"), ("--3dtiles", "3D Tiles set")):
+    for option, form in (
+        ("--lod-meta", "streaming set for PlayCanvas's viewers"),
+        ("--3dtiles", "3D Tiles set"),
+    ):
         text = f"write a {form}, a level for each band of distance, to the new folder OUT"
         sets.add_argument(option, dest="folder", action="store_const", const=option, help=text)
-    text = f"ratio of the distances at which two levels begin, as set in the viewer (default: {MULTIPLIER:g})"
+    text = (
+        "ratio of the distances at which two levels begin, as set in the viewer (default:"
+        f" {MULTIPLIER:g})"
+    )
     output.add_argument("--multiplier", metavar="M", type=float, default=MULTIPLIER, help=text)
     text = "fit the view-dependent colours to this SH degree, 0 to 3: most of a file's bytes"
     output.add_argument("--sh-degree", metavar="N", type=int, choices=range(4), help=text)
-    output.add_argument("--order", choices=["extinction"], help="put first the Gaussians that are culled last")
-    output.add_argument("--exact", action="store_true", help="an .html page with float32 values: eight times the size")
+    output.add_argument(
+        "--order", choices=["extinction"], help="put first the Gaussians that are culled last"
+    )
+    output.add_argument(
+        "--exact",
+        action="store_true",
+        help="an .html page with float32 values: eight times the size",
+    )
     common.add_device(output, "time frames for --fps with --images")
 
 
@@ -57,38 +81,83 @@ def check(args: Namespace) -> None:
     bakes = args.sv is not None or common.given_budget(args) is not None or bool(args.levels)
     page, folder, out = is_page(args), args.folder, Path(args.out)
     refuse(
-        (folder and bakes,
-         f"{folder} has a level for each band of distance, no dial value; remove --levels, --sv or the budget"),
-        (args.multiplier != MULTIPLIER and not folder, f"--multiplier is for {' and '.join(FOLDERS)}; add one of them"),
+        (
+            folder and bakes,
+            (
+                f"{folder} has a level for each band of distance, no dial value; remove --levels,"
+                " --sv or the budget"
+            ),
+        ),
+        (
+            args.multiplier != MULTIPLIER and not folder,
+            f"--multiplier is for {' and '.join(FOLDERS)}; add one of them",
+        ),
         (folder and args.order, f"{folder} sorts the Gaussians itself; remove --order"),
-        (args.camera is not None and args.images is None,
-         "--camera needs the scene of the photograph; give --images too"),
-        (page and (args.levels or args.camera is not None or args.order),
-         f"a {PAGE} page contains the whole dial; remove --levels, --camera and --order"),
-        (args.camera is not None and not bakes, "--camera needs a dial value to bake; give one, as in --sv 2"),
-        (args.exact and not page, f"--exact is for {PAGE} pages; another format has its own precision: remove it"),
-        (args.images is not None and not (bakes or args.order or page or args.sh_degree is not None),
-         f"--images is used for baking, --sh-degree, --order and {PAGE} only; add one of them, as in --sv 2"),
-        (folder and out.suffix.lower() in (".json", *FORMATS),
-         f"{out}: with {folder}, --out names the folder for {FOLDERS.get(folder)}, not a file"),
-        (folder and out.exists() and not out.is_dir(),
-         f"{out}: is a file; with {folder}, --out must name a new folder"),
-        (folder and not out.name, f"{out}: is the current folder; --out must name a new one"),  # ".", never replaced
-    )  # fmt: skip
+        (
+            args.camera is not None and args.images is None,
+            "--camera needs the scene of the photograph; give --images too",
+        ),
+        (
+            page and (args.levels or args.camera is not None or args.order),
+            f"a {PAGE} page contains the whole dial; remove --levels, --camera and --order",
+        ),
+        (
+            args.camera is not None and not bakes,
+            "--camera needs a dial value to bake; give one, as in --sv 2",
+        ),
+        (
+            args.exact and not page,
+            f"--exact is for {PAGE} pages; another format has its own precision: remove it",
+        ),
+        (
+            args.images is not None
+            and not (bakes or args.order or page or args.sh_degree is not None),
+            (
+                f"--images is used for baking, --sh-degree, --order and {PAGE} only; add one of"
+                " them, as in --sv 2"
+            ),
+        ),
+        (
+            folder and out.suffix.lower() in (".json", *FORMATS),
+            f"{out}: with {folder}, --out names the folder for {FOLDERS.get(folder)}, not a file",
+        ),
+        (
+            folder and out.exists() and not out.is_dir(),
+            f"{out}: is a file; with {folder}, --out must name a new folder",
+        ),
+        # ".", never replaced
+        (folder and not out.name, f"{out}: is the current folder; --out must name a new one"),
+    )
     suffix = "" if folder else suffix_of(out)
     common.check_dials(args, args.model)
     common.check_inputs(args.images, args.model)
     dial, form = file_has_dial(Path(args.model)), FORMATS.get(suffix)
     others = ", ".join(other for other, each in FORMATS.items() if each.carries_sigma)
     refuse(
-        (bakes and not dial, f"{args.model}: has no sigma_d, so no dial value can be baked; export it without one"),
-        (folder and not dial, f"{args.model}: has no sigma_d, so there are no levels; adapt it first"),
-        (args.order and not dial, f"{args.model}: has no sigma_d to order its Gaussians by; adapt it first"),
-        (dial and not bakes and form and not form.carries_sigma,
-         f"{out}: {suffix} cannot store a dial; choose a dial value to bake, as in --sv 1, or another format "
-         f"({others})"),
-        (args.order and form and not form.ordered, f"{out}: {suffix} sorts the Gaussians itself; remove --order"),
-    )  # fmt: skip
+        (
+            bakes and not dial,
+            f"{args.model}: has no sigma_d, so no dial value can be baked; export it without one",
+        ),
+        (
+            folder and not dial,
+            f"{args.model}: has no sigma_d, so there are no levels; adapt it first",
+        ),
+        (
+            args.order and not dial,
+            f"{args.model}: has no sigma_d to order its Gaussians by; adapt it first",
+        ),
+        (
+            dial and not bakes and form and not form.carries_sigma,
+            (
+                f"{out}: {suffix} cannot store a dial; choose a dial value to bake, as in --sv 1,"
+                f" or another format ({others})"
+            ),
+        ),
+        (
+            args.order and form and not form.ordered,
+            f"{out}: {suffix} sorts the Gaussians itself; remove --order",
+        ),
+    )
     if folder == "--lod-meta" or suffix in PACKED:
         SplatTransform.find()
 
@@ -103,7 +172,9 @@ def refuse(*cases: tuple[object, str]) -> None:
 def outputs(args: Namespace) -> Outputs:
     out, folder = Path(args.out), bool(args.folder)
     levels = level_paths(out, args.levels) if args.levels and not folder else []
-    return Outputs([] if levels else [out], levels, whole=folder, inputs=[args.model], scene=args.images)
+    return Outputs(
+        [] if levels else [out], levels, whole=folder, inputs=[args.model], scene=args.images
+    )
 
 
 def execute(args: Namespace) -> dict[str, Any]:

@@ -34,10 +34,15 @@ from .names import FOLDERS, PAGE, STORE_FILTER, is_page, level_paths, suffix_of
 
 PLACED = 16  # cameras placed where none are known
 SETTINGS = {
-    "--lod-meta": "in PlayCanvas: lodBaseDistance = {begins:.4g}, lodMultiplier = {multiplier:g}, and a splatBudget "
-    "below the finest level's number; within the budget it draws that level everywhere",
-    "--3dtiles": "in CesiumJS with maximumScreenSpaceError = 16, its default, level 1 begins at {begins:.4g} on a "
-    "screen of 1,080 lines",
+    "--lod-meta": (
+        "in PlayCanvas: lodBaseDistance = {begins:.4g}, lodMultiplier = {multiplier:g}, and a"
+        " splatBudget below the finest level's number; within the budget it draws that level"
+        " everywhere"
+    ),
+    "--3dtiles": (
+        "in CesiumJS with maximumScreenSpaceError = 16, its default, level 1 begins at {begins:.4g}"
+        " on a screen of 1,080 lines"
+    ),
 }
 COMPARED = 4  # views on which a page is compared with the exact values
 
@@ -50,16 +55,29 @@ def export(args: Namespace) -> dict[str, Any]:
     for output in written:
         print(line_of(output, total))
         if args.folder and len(output["levels"]) > 1:
-            print(SETTINGS[args.folder].format(begins=output["levels"][1]["begins"], multiplier=args.multiplier))
+            print(
+                SETTINGS[args.folder].format(
+                    begins=output["levels"][1]["begins"], multiplier=args.multiplier
+                )
+            )
     if export.dials and not export.page:
-        baked = f"exact at the camera of {camera.name} only" if camera else f"baked for {export.about}"
+        baked = (
+            f"exact at the camera of {camera.name} only" if camera else f"baked for {export.about}"
+        )
         scales = "" if export.gaussians.growth_d is None else "; the scales include growth"
-        print(f"{baked}; lossy: without the dial and the Gaussians culled at this dial value{scales}")
+        print(
+            f"{baked}; lossy: without the dial and the Gaussians culled at this dial value{scales}"
+        )
     return {
-        "model": args.model, "base_count": total,
-        "camera": camera.name if camera else None, "cameras": len(export.cameras), "order": args.order,
-        "outputs": written, "notes": export.console.notes, "seconds": watch.report(),
-    }  # fmt: skip
+        "model": args.model,
+        "base_count": total,
+        "camera": camera.name if camera else None,
+        "cameras": len(export.cameras),
+        "order": args.order,
+        "outputs": written,
+        "notes": export.console.notes,
+        "seconds": watch.report(),
+    }
 
 
 def line_of(output: dict[str, Any], total: int) -> str:
@@ -70,7 +88,11 @@ def line_of(output: dict[str, Any], total: int) -> str:
         return f"{line} Gaussians in {len(levels)} levels, by distance: {shown}"
     if output["virtual_scale"] is None:
         return f"{line} Gaussians"
-    about = "Gaussians, initial dial value" if output["file"].lower().endswith(PAGE) else f"of {total:,} Gaussians,"
+    about = (
+        "Gaussians, initial dial value"
+        if output["file"].lower().endswith(PAGE)
+        else f"of {total:,} Gaussians,"
+    )
     return f"{line} {about} s = {output['virtual_scale']:.5g}"
 
 
@@ -85,16 +107,21 @@ class Export:
         device = inputs.pick_device(args.device, self.console) if times else inputs.CPU
         read = inputs.read_checkpoint(args.model, self.console, args.activated, device=device)
         self.model = inputs.with_filter(read, args, self.console)
-        self.cameras, self.about = self._find_cameras()  # to bake or fit for, none where nothing is; in printable ASCII
+        # to bake or fit for, none where nothing is; in printable ASCII
+        self.cameras, self.about = self._find_cameras()
         reads = self.page and args.images is not None  # cameras of the scene, for a page
         self.views = inputs.read_cameras(self.model, args.images, self.console) if reads else []
         if args.sh_degree is not None:
             self._reduce_sh_degree(args.sh_degree)
         self.gaussians = self.model.gaussians  # sorted with --order
         if args.order:
-            self.gaussians = self.gaussians.select(order_by_extinction(self.gaussians, self.cameras))
+            self.gaussians = self.gaussians.select(
+                order_by_extinction(self.gaussians, self.cameras)
+            )
         baked, attenuation = self.camera is None and not self.page, self.gaussians.attenuation
-        dials = args.levels or solve_dials(args, self.model, self.cameras, self.console, baked=baked)
+        dials = args.levels or solve_dials(
+            args, self.model, self.cameras, self.console, baked=baked
+        )
         if dials and self.page:
             dials = [initial_dial(dials[0], attenuation, self.console)]
         elif dials:
@@ -102,13 +129,23 @@ class Export:
         self.dials: list[float] = dials or []  # which are baked, or the one at which a page opens
 
     def _find_cameras(self) -> tuple[Sequence[Camera | Viewpoint], str]:
-        """The cameras of --camera, --images or the model's file, else placed ones; and what they are."""
+        """The cameras of --camera, --images or the model's file, else placed ones; and what they
+        are.
+        """
         args, model = self.args, self.model
         counts = given_budget(args) and not (self.page and args.psnr_drop)
-        if not (args.order or args.levels or counts or args.sh_degree is not None or (args.sv and not self.page)):
+        if not (
+            args.order
+            or args.levels
+            or counts
+            or args.sh_degree is not None
+            or (args.sv and not self.page)
+        ):
             return (), ""
         if args.images is not None:
-            cameras = inputs.read_cameras(model, args.images, self.console, training=args.camera is None)
+            cameras = inputs.read_cameras(
+                model, args.images, self.console, training=args.camera is None
+            )
             if args.camera is None:
                 return cameras, f"{len(cameras)} training cameras"
             found = inputs.named(cameras, args.camera, "--camera")
@@ -123,7 +160,9 @@ class Export:
             with self.console.meter("placing cameras") as meter:
                 cameras = place_cameras(model.gaussians, views=PLACED, progress=meter)
         except ClodError as error:
-            raise ClodError(f"{model.path}: no cameras stored to bake for, and {error}; give --images") from error
+            raise ClodError(
+                f"{model.path}: no cameras stored to bake for, and {error}; give --images"
+            ) from error
         placed = f"baked for {len(cameras)} placed ones; --images gives a better result"
         self.console.note(f"{model.path} stores no cameras: {placed}")
         return cameras, f"{len(cameras)} placed cameras"
@@ -133,18 +172,28 @@ class Export:
         before, cameras = self.model.gaussians, self.cameras
         after = with_sh_degree(before, sh_degree, cameras)
         if after is before:
-            self.console.note(f"--sh-degree {sh_degree}: the file has degree {before.sh_degree}, and stays as it is")
+            self.console.note(
+                f"--sh-degree {sh_degree}: the file has degree {before.sh_degree}, and stays as"
+                " it is"
+            )
             return
         inputs.prepare_kernels(self.console, before.means.device, training=False)
         found = self._agreement(after, before)
-        about = f"--sh-degree {sh_degree}: renders have a PSNR of {found:.1f} dB against those with degree"
+        about = (
+            f"--sh-degree {sh_degree}: renders have a PSNR of {found:.1f} dB against those with"
+            " degree"
+        )
         self.console.note(f"{about} {before.sh_degree} (fitted to {self.about})")
         self.model = replace(self.model, gaussians=after, vertex=None)
 
     def _agreement(self, shown: Gaussians, exact: Gaussians) -> float:
-        """PSNR in dB of renders of the first against those of the second, in the mean over COMPARED views."""
+        """PSNR in dB of renders of the first against those of the second, in the mean over COMPARED
+        views.
+        """
         known = self.views or [camera for camera in self.cameras if isinstance(camera, Camera)]
-        views = spread(known or self.model.cameras or place_cameras(exact, views=COMPARED), COMPARED)
+        views = spread(
+            known or self.model.cameras or place_cameras(exact, views=COMPARED), COMPARED
+        )
         return fmean(psnr(render(shown, each).image, render(exact, each).pixels) for each in views)
 
     def note_losses(self) -> None:
@@ -152,11 +201,17 @@ class Export:
         names = (self.model.vertex.dtype.names if self.model.vertex is not None else None) or ()
         if dropped := extra_columns(names, self.gaussians.sh_degree):
             self.console.note(f"columns dropped: {', '.join(dropped)}")
-        drawn, dialled = self.gaussians.screen_filter, self.gaussians.sigma_d is not None and not self.dials
+        drawn, dialled = (
+            self.gaussians.screen_filter,
+            self.gaussians.sigma_d is not None and not self.dials,
+        )
         stored = not self.args.folder and suffix_of(Path(self.args.out)) in STORE_FILTER
         if drawn.compensate and not dialled and not stored:
             options = 'antiAlias in PlayCanvas, rasterize_mode="antialiased" in gsplat'
-            about = f"trained antialiased ({drawn.description}): most readers need an option for it: {options}"
+            about = (
+                f"trained antialiased ({drawn.description}): most readers need an option for it:"
+                f" {options}"
+            )
             self.console.note(about)
 
     def write(self) -> list[dict[str, Any]]:
@@ -169,26 +224,44 @@ class Export:
                 taken = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
             levels = [{"begins": level.begins, "count": len(level.gaussians)} for level in found]
             counts = [level["count"] for level in levels]
-            return [{"file": str(out / FOLDERS[option]), "levels": levels, "count": sum(counts), "bytes": taken}]
+            return [
+                {
+                    "file": str(out / FOLDERS[option]),
+                    "levels": levels,
+                    "count": sum(counts),
+                    "bytes": taken,
+                }
+            ]
         paths = level_paths(out, self.args.levels) if self.args.levels else [out]
         dials: Sequence[float | None] = self.dials or [None]
         with atomic_paths(*paths) as temporaries:
             for path, temporary, dial in zip(paths, temporaries, dials, strict=True):
                 count = self._write_file(temporary, suffix_of(path), dial)
                 taken = temporary.stat().st_size
-                written.append({"file": str(path), "virtual_scale": dial, "count": count, "bytes": taken})
+                written.append(
+                    {"file": str(path), "virtual_scale": dial, "count": count, "bytes": taken}
+                )
         return written
 
     def _content(self, virtual_scale: float | None) -> tuple[Gaussians, tuple[str, ...]]:
-        """The Gaussians of one file, baked if there is a dial value; and its comments, those of the model first."""
+        """The Gaussians of one file, baked if there is a dial value; and its comments, those of the
+        model first.
+        """
         about, gaussians, cameras = [*self.model.comments], self.gaussians, self.about
         if virtual_scale is not None:
             if self.camera:
                 place = zip(self.camera.position.double().tolist(), self.model.origin, strict=True)
-                cameras = f"the camera at ({', '.join(f'{x + by:.9g}' for x, by in place)}): exact from there only"
+                cameras = (
+                    f"the camera at ({', '.join(f'{x + by:.9g}' for x, by in place)}): exact from"
+                    " there only"
+                )
             about.append(f"baked at s = {virtual_scale:.6g} by clod-adapter for {cameras}")
-            gaussians = bake(gaussians, virtual_scale, self.camera, cameras=() if self.camera else self.cameras)
-        about += ["rows in the order in which the dial keeps them longest"] if self.args.order else []
+            gaussians = bake(
+                gaussians, virtual_scale, self.camera, cameras=() if self.camera else self.cameras
+            )
+        about += (
+            ["rows in the order in which the dial keeps them longest"] if self.args.order else []
+        )
         return gaussians, tuple(dict.fromkeys(about))
 
     def _write_file(self, path: Path, suffix: str, virtual_scale: float | None) -> int:
@@ -199,13 +272,18 @@ class Export:
         gaussians, about = self._content(virtual_scale)
         if suffix not in WRITABLE:
             with TemporaryDirectory(dir=path.parent, prefix=".tmp-") as folder:
-                source, packed = Path(folder) / "plain.ply", Path(folder) / f"packed{suffix}"  # suffix: the format
+                # suffix: the format
+                source, packed = Path(folder) / "plain.ply", Path(folder) / f"packed{suffix}"
                 write(source, gaussians, Metadata(about=about))
                 self._transform([source], packed, len(gaussians))
                 packed.replace(path)
             return len(gaussians)
         stored = self.model.calibration if virtual_scale is None else None
-        self.console.note(*write(path, gaussians, Metadata(calibration=stored, origin=self.model.origin, about=about)))
+        self.console.note(
+            *write(
+                path, gaussians, Metadata(calibration=stored, origin=self.model.origin, about=about)
+            )
+        )
         if suffix == ".ply" and any(self.model.origin):
             self.console.note("x, y and z are doubles, which SIBR and some other readers misread")
         return gaussians.whole
@@ -229,7 +307,11 @@ class Export:
     def _write_page(self, path: Path, virtual_scale: float | None) -> None:
         """Notes the PSNR of its renders against those of the exact Gaussians."""
         inputs.prepare_kernels(self.console, self.gaussians.means.device, training=False)
-        how: dict[str, Any] = {"cameras": self.views, "virtual_scale": virtual_scale, "exact": self.args.exact}
+        how: dict[str, Any] = {
+            "cameras": self.views,
+            "virtual_scale": virtual_scale,
+            "exact": self.args.exact,
+        }
         shown, losses = write_viewer_page(path, self.model, **how)
         self.console.note(*losses)
         if self.args.exact:
@@ -240,13 +322,20 @@ class Export:
         self.console.note(f"{about}; --exact keeps all digits")
 
     def _transform(self, words: list[str | Path], out: Path, count: int) -> None:
-        tool, text = splat_transform.SplatTransform.find(), f"splat-transform packs {count:,} Gaussians"
+        tool, text = (
+            splat_transform.SplatTransform.find(),
+            f"splat-transform packs {count:,} Gaussians",
+        )
         with self.console.status(f"{text} ...") as show:
             limit = splat_transform.LIMIT + splat_transform.LIMIT_EACH * count
-            seconds = tool.run(*words, out, timeout=limit, progress=lambda s: show(f"{text}, {duration(s)} so far"))
+            seconds = tool.run(
+                *words, out, timeout=limit, progress=lambda s: show(f"{text}, {duration(s)} so far")
+            )
         self.console.say(f"splat-transform {tool.version} took {duration(seconds)}")
         self.console.note("splat-transform rounds values and sorts the Gaussians")
         if any(self.model.origin):
             self.console.note("coordinates are relative to the model's origin, which is dropped")
         if not tool.gpu and self.gaussians.sh_degree > 0 and out.suffix != ".ply":
-            self.console.note("splat-transform runs without a GPU: its palette of spherical harmonics is coarser")
+            self.console.note(
+                "splat-transform runs without a GPU: its palette of spherical harmonics is coarser"
+            )

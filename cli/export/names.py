@@ -19,18 +19,27 @@ FORMATS = {
     **PACKED,
     PAGE: Format(
         about=("the viewer with the splat, in one file;", "as .spz, or with --exact as float32"),
-        ordered=False, carries_sigma=True,
+        ordered=False,
+        carries_sigma=True,
     ),
-}  # fmt: skip
-STORE_FILTER = (".spz", ".safetensors", PAGE)  # formats in which every reader finds the screen-space filter
-FOLDERS = {"--lod-meta": "lod-meta.json", "--3dtiles": "tileset.json"}  # options that make OUT a folder, and its index
+}
+# formats in which every reader finds the screen-space filter
+STORE_FILTER = (".spz", ".safetensors", PAGE)
+# options that make OUT a folder, and its index
+FOLDERS = {"--lod-meta": "lod-meta.json", "--3dtiles": "tileset.json"}
 
 
 def suffix_of(out: Path) -> str:
     """The known suffix of ``out``, in lower case."""
-    found = [suffix for suffix in FORMATS if out.name.lower().endswith(suffix) and len(out.name) > len(suffix)]
+    found = [
+        suffix
+        for suffix in FORMATS
+        if out.name.lower().endswith(suffix) and len(out.name) > len(suffix)
+    ]
     if not found:
-        raise ClodError(f"{out}: --out must end in one of {', '.join(FORMATS)}, which is the format")
+        raise ClodError(
+            f"{out}: --out must end in one of {', '.join(FORMATS)}, which is the format"
+        )
     return max(found, key=len)  # .compressed.ply ends in .ply
 
 
@@ -40,4 +49,6 @@ def is_page(args: Namespace) -> bool:
 
 def level_paths(out: Path, levels: Sequence[float]) -> list[Path]:
     suffix = out.name[-len(suffix_of(out)) :]
-    return [out.with_name(f"{out.name.removesuffix(suffix)}_s{level:g}{suffix}") for level in levels]
+    return [
+        out.with_name(f"{out.name.removesuffix(suffix)}_s{level:g}{suffix}") for level in levels
+    ]

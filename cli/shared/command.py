@@ -4,14 +4,23 @@ from __future__ import annotations
 
 import math
 import sysconfig
-from argparse import ArgumentParser, Namespace, RawDescriptionHelpFormatter, _ActionsContainer  # a parser or its group
+
+# a parser or its group
+from argparse import ArgumentParser, Namespace, RawDescriptionHelpFormatter, _ActionsContainer
 from collections.abc import Sequence
 from pathlib import Path
 from site import getuserbase
 from typing import Any, NoReturn
 
 from clod_adapter._support.text import package_version
-from clod_adapter.config import DEVICES, FILTERS, PLACED_MAX_SV, AdaptConfig, AttenuationConfig, field_descriptions
+from clod_adapter.config import (
+    DEVICES,
+    FILTERS,
+    PLACED_MAX_SV,
+    AdaptConfig,
+    AttenuationConfig,
+    field_descriptions,
+)
 from clod_adapter.errors import ClodError
 from clod_adapter.io.file_formats import PLY, check_readable, file_has_dial, format_of
 from clod_adapter.io.scene.folder import find_cameras
@@ -24,9 +33,14 @@ from .process import check_printed, launched
 def parser_of(command: Any, prog: str) -> Parser:
     """The parser, with the options that all commands have."""
     parser = Parser(
-        prog=prog, usage=f"{prog} {command.USAGE}", description=command.DESCRIPTION, epilog=command.EPILOG,
-        formatter_class=RawDescriptionHelpFormatter, add_help=False, allow_abbrev=False,
-    )  # fmt: skip
+        prog=prog,
+        usage=f"{prog} {command.USAGE}",
+        description=command.DESCRIPTION,
+        epilog=command.EPILOG,
+        formatter_class=RawDescriptionHelpFormatter,
+        add_help=False,
+        allow_abbrev=False,
+    )
     if hasattr(command, "add_arguments"):
         command.add_arguments(parser)
     parser.general = parser.add_argument_group("general")
@@ -48,7 +62,9 @@ class Parser(ArgumentParser):
         for action in self._actions:
             value = getattr(found, action.dest, None)
             if "" in (value if isinstance(value, list) else [value]):
-                self.error(f"argument {'/'.join(action.option_strings) or action.metavar}: is empty")
+                self.error(
+                    f"argument {'/'.join(action.option_strings) or action.metavar}: is empty"
+                )
         return found
 
     def error(self, message: str) -> NoReturn:
@@ -72,7 +88,10 @@ class Parser(ArgumentParser):
 def manual() -> Path | None:
     """The first page of the documentation on this machine: of a checkout, or as installed."""
     folders = [Path(__file__).resolve().parents[2] / "docs"]
-    folders += [Path(root, "share", "doc", "clod-adapter") for root in (sysconfig.get_path("data"), getuserbase())]
+    folders += [
+        Path(root, "share", "doc", "clod-adapter")
+        for root in (sysconfig.get_path("data"), getuserbase())
+    ]
     return next((page for folder in folders if (page := folder / "index.md").is_file()), None)
 
 
@@ -80,8 +99,13 @@ def manual() -> Path | None:
 BUDGET_OPTIONS: tuple[tuple[str, str, type, str], ...] = (
     ("keep", "N", int, "the dial value that keeps N Gaussians {where}"),
     ("fps", "F", float, "the dial value that renders F frames per second, by frame times {times}"),
-    ("psnr_drop", "DB", float, "the dial value that loses DB decibels against s = 1, by the calibration"),
-)  # fmt: skip
+    (
+        "psnr_drop",
+        "DB",
+        float,
+        "the dial value that loses DB decibels against s = 1, by the calibration",
+    ),
+)
 BUDGETS = """\
 budgets, each solved for a dial value:
   --keep       exact; s = 1 keeps fewer Gaussians than the file has
@@ -105,24 +129,38 @@ def add_activated(options: _ActionsContainer) -> None:
 
 
 def add_reading(options: _ActionsContainer, images: str = "", photographs: bool = True) -> None:
-    """Adds ``--images``, required unless there is another help for it, and the options for reading a checkpoint."""
+    """Adds ``--images``, required unless there is another help for it, and the options for reading
+    a checkpoint.
+    """
     scene = images or "scene folder: photographs, and a COLMAP model or transforms.json"
     options.add_argument("--images", metavar="DIR", required=not images, help=scene)
     add_activated(options)
     text = (
-        "screen-space filter of the training: off, on (gsplat's rasterize_mode antialiased, Inria's --antialiasing), "
-        f"mip (Mip-Splatting), or auto: as the file says, else {'by the photographs' if photographs else 'off'}"
+        "screen-space filter of the training: off, on (gsplat's rasterize_mode antialiased,"
+        " Inria's --antialiasing), mip (Mip-Splatting), or auto: as the file says, else"
+        f" {'by the photographs' if photographs else 'off'}"
     )
-    options.add_argument("--antialiasing", choices=["auto", *FILTERS], default="auto", help=f"{text} (default: auto)")
+    options.add_argument(
+        "--antialiasing", choices=["auto", *FILTERS], default="auto", help=f"{text} (default: auto)"
+    )
 
 
 def add_device(options: _ActionsContainer, what: str) -> None:
     usual = "auto: the NVIDIA GPU if gsplat works on it, else the CPU (default: auto)"
-    options.add_argument("--device", choices=["auto", "cpu", "cuda"], default="auto", help=f"where to {what}; {usual}")
+    options.add_argument(
+        "--device",
+        choices=["auto", "cpu", "cuda"],
+        default="auto",
+        help=f"where to {what}; {usual}",
+    )
 
 
-def add_dial_options(options: _ActionsContainer, sv_help: str, where: str, *, several: bool) -> _ActionsContainer:
-    """Adds --sv and the budgets, of which one may be given, with ``several`` values; returns their group."""
+def add_dial_options(
+    options: _ActionsContainer, sv_help: str, where: str, *, several: bool
+) -> _ActionsContainer:
+    """Adds --sv and the budgets, of which one may be given, with ``several`` values; returns their
+    group.
+    """
     times = "measured first" if several else "in the file, or with --images measured first"
     group: Any = options.add_mutually_exclusive_group()
     count = "+" if several else 1
@@ -136,7 +174,10 @@ def add_dial_options(options: _ActionsContainer, sv_help: str, where: str, *, se
 
 
 def add_device_preset(options: _ActionsContainer) -> None:
-    text = f"--keep with the number that viewers allow a device: {', '.join(f'{n:,}' for n in DEVICES.values())}"
+    text = (
+        "--keep with the number that viewers allow a device:"
+        f" {', '.join(f'{n:,}' for n in DEVICES.values())}"
+    )
     options.add_argument("--device-preset", choices=[*DEVICES], help=text)
 
 
@@ -150,7 +191,10 @@ def initial_dial(virtual_scale: float, dial: AttenuationConfig | None, console: 
         console.note(*[f"no sigma_d, so s = {virtual_scale:g} has no effect"] * (virtual_scale > 1))
         return 1.0
     if virtual_scale > dial.max_sv:
-        console.note(f"the page's dial ends at s = {dial.max_sv:g}, the largest value trained for, and opens there")
+        console.note(
+            f"the page's dial ends at s = {dial.max_sv:g}, the largest value trained for, and opens"
+            " there"
+        )
     return min(virtual_scale, dial.max_sv)
 
 
@@ -176,24 +220,34 @@ def check_dials(args: Namespace, model: str) -> None:
     """Refuses dial values out of range, and budgets of a file without a dial."""
     for virtual_scale in args.sv or ():
         if not 0 <= virtual_scale < math.inf:
-            raise ClodError(f"--sv has {virtual_scale:g}, it must be at least 0 (1 is full quality, 0 everything)")
+            raise ClodError(
+                f"--sv has {virtual_scale:g}, it must be at least 0 (1 is full quality, 0"
+                " everything)"
+            )
     name, option, values = given_budget(args) or ("", "", [])
     for value in values:
         if not 0 < value < math.inf:
             raise ClodError(f"{option} has {value:g}, it must be positive and finite")
     if name and not file_has_dial(Path(model)):
         option = option.partition(",")[0]
-        raise ClodError(f"{model}: has no sigma_d, which {option} needs; adapt it first: clod-adapt {model} ...")
+        raise ClodError(
+            f"{model}: has no sigma_d, which {option} needs; adapt it first: clod-adapt {model} ..."
+        )
     if name == "psnr_drop" and format_of(Path(model)) is PLY:
         from clod_adapter.io.ply import read_head  # here: --help needs no plyfile
         from clod_adapter.io.ply_layout import PREFIX
 
-        if not any(comment.startswith(f"{PREFIX}calibrated ") for comment in read_head(Path(model)).comments):
+        if not any(
+            comment.startswith(f"{PREFIX}calibrated ")
+            for comment in read_head(Path(model)).comments
+        ):
             raise no_calibration(Path(model), option)
 
 
 def check_inputs(scene: str | None, *paths: str) -> None:
-    """Refuses a file that is none to read, and a scene that is no folder with a COLMAP model or a transforms.json."""
+    """Refuses a file that is none to read, and a scene that is no folder with a COLMAP model or a
+    transforms.json.
+    """
     for path in paths:
         check_readable(Path(path))
     if scene is not None and not Path(scene).is_dir():
@@ -202,13 +256,16 @@ def check_inputs(scene: str | None, *paths: str) -> None:
         find_cameras(Path(scene))
 
 
-# Training settings, by field of AdaptConfig: metavar, type, and what help says of a default that depends on another
-# option or on the scene.
+# Training settings, by field of AdaptConfig: metavar, type, and what help says of a default that
+# depends on another option or on the scene.
 SETTINGS: dict[str, tuple[str, Any, str | None]] = {
-    "max_sv": ("S", float, f" (default: 5, without photographs {PLACED_MAX_SV:g})"), "iters": ("N", int, ""),
-    "batch": ("N", int, " (default: 1 per process)"), "time_budget": ("SEC", float, None), "seed": ("N", int, None),
+    "max_sv": ("S", float, f" (default: 5, without photographs {PLACED_MAX_SV:g})"),
+    "iters": ("N", int, ""),
+    "batch": ("N", int, " (default: 1 per process)"),
+    "time_budget": ("SEC", float, None),
+    "seed": ("N", int, None),
     "growth": ("on|off", str, " (default: on, with --form paper off)"),
-}  # fmt: skip
+}
 
 
 def add_settings(options: _ActionsContainer, without: Sequence[str] = ()) -> None:
@@ -218,7 +275,9 @@ def add_settings(options: _ActionsContainer, without: Sequence[str] = ()) -> Non
         metavar, kind, shown = SETTINGS[name]
         default = getattr(defaults, name) if shown is None else None
         text = helps[name] + (shown or ("" if default is None else f" (default: {default:g})"))
-        options.add_argument(as_option(name), metavar=metavar, type=kind, default=default, help=text)
+        options.add_argument(
+            as_option(name), metavar=metavar, type=kind, default=default, help=text
+        )
     text = "training as measured here (ours) or as published (paper) (default: ours)"
     options.add_argument("--form", choices=["ours", "paper"], default="ours", help=text)
     text = "train even if the checkpoint does not match the photographs"
@@ -238,10 +297,15 @@ def make_config(args: Namespace) -> AdaptConfig:
         name, _, rest = str(error).partition(" ")
         raise ClodError(f"{as_option(name)} {rest}") from error
     if config.batch < size:
-        raise ClodError(f"--batch is {config.batch}, it must be at least {size}: a view for each process")
+        raise ClodError(
+            f"--batch is {config.batch}, it must be at least {size}: a view for each process"
+        )
     return config
 
 
 def make_configs(args: Namespace) -> list[AdaptConfig]:
     """One config per value of ``--max-sv``, ascending."""
-    return [make_config(Namespace(**vars(args) | {"max_sv": value})) for value in sorted(set(args.max_sv))]
+    return [
+        make_config(Namespace(**vars(args) | {"max_sv": value}))
+        for value in sorted(set(args.max_sv))
+    ]

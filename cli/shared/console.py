@@ -17,7 +17,8 @@ if TYPE_CHECKING:
     from tqdm import tqdm
 
 LINE_EVERY = 10.0  # seconds between progress lines if stderr is not a terminal
-TEXT = 36  # most characters of the text beside a bar, so that 80 columns have room for label, time and bar
+# most characters of the text beside a bar, so that 80 columns have room for label, time and bar
+TEXT = 36
 BAR_FORMAT = "{desc} {percentage:3.0f}%|{bar}| {remaining} left{postfix}"
 
 
@@ -25,7 +26,8 @@ BAR_FORMAT = "{desc} {percentage:3.0f}%|{bar}| {remaining} left{postfix}"
 def bars() -> type[tqdm[Any]]:
     from tqdm import tqdm  # here: --help has no bar
 
-    tqdm.monitor_interval = 0  # bars are updated at every step anyway, and its thread may fail to start
+    # bars are updated at every step anyway, and its thread may fail to start
+    tqdm.monitor_interval = 0
     return tqdm
 
 
@@ -41,7 +43,9 @@ class Console:
             bars().write(text, file=sys.stderr)  # print would overwrite a bar on this line
 
     def note(self, *texts: str, of: str = "") -> None:
-        """Writes and keeps notes, or warnings if they begin so, on input or output, ``of`` this file."""
+        """Writes and keeps notes, or warnings if they begin so, on input or output, ``of`` this
+        file.
+        """
         for text in texts:
             mark = WARNING * text.startswith(WARNING)
             kept = f"{mark}{of}: {text.removeprefix(mark)}" if of else text
@@ -51,11 +55,15 @@ class Console:
 
     @contextmanager
     def status(self, text: str) -> Iterator[Callable[[str], None]]:
-        """Shows on a terminal the work under way, if its progress is unknown; yields a function that changes it."""
+        """Shows on a terminal the work under way, if its progress is unknown; yields a function
+        that changes it.
+        """
         if self.quiet or not sys.stderr.isatty():
             yield lambda more: None
             return
-        with bars()(bar_format="{desc}", desc=text, file=sys.stderr, leave=False, dynamic_ncols=True) as shown:
+        with bars()(
+            bar_format="{desc}", desc=text, file=sys.stderr, leave=False, dynamic_ncols=True
+        ) as shown:
             yield shown.set_description_str
 
     def meter(self, label: str) -> closing[Meter]:
@@ -79,20 +87,32 @@ class Meter:
         self.began = self.printed = time.perf_counter()
         if not self.console.quiet and sys.stderr.isatty():
             self.bar = bars()(
-                total=1.0, initial=initial, desc=label, bar_format=BAR_FORMAT, file=sys.stderr, leave=False, delay=0.5,
-                miniters=0, dynamic_ncols=True,
-            )  # fmt: skip
+                total=1.0,
+                initial=initial,
+                desc=label,
+                bar_format=BAR_FORMAT,
+                file=sys.stderr,
+                leave=False,
+                delay=0.5,
+                miniters=0,
+                dynamic_ncols=True,
+            )
 
     def update(self, share: float, text: str = "") -> None:
         """Shows the ``share`` that is done, in [0, 1], followed by ``text``."""
-        now, text = time.perf_counter(), text if len(text) <= TEXT else f"{text[: TEXT - 3].rstrip()}..."
+        now, text = (
+            time.perf_counter(),
+            text if len(text) <= TEXT else f"{text[: TEXT - 3].rstrip()}...",
+        )
         if self.bar is not None:
             self.bar.set_postfix_str(text, refresh=False)
             self.bar.update(min(share, 1.0) - self.bar.n)
         elif now - self.printed >= LINE_EVERY:
             self.printed = now
             left = (now - self.began) * (1 - share) / max(share - self.initial, 1e-9)
-            self.console.say(f"{self.label} {share:4.0%}, {duration(left)} left, {text}".removesuffix(", "))
+            self.console.say(
+                f"{self.label} {share:4.0%}, {duration(left)} left, {text}".removesuffix(", ")
+            )
 
     def __call__(self, now: Progress) -> bool | None:
         self.update(now.share, f"{now.done}/{now.total}")
@@ -111,14 +131,17 @@ class Meter:
 class ProgressDisplay(Meter):
     """A listener that shows each phase, training as ``training``, and stops on Ctrl-C."""
 
-    def __init__(self, console: Console, stop: GracefulStop, training: str = Phase.TRAINING) -> None:
+    def __init__(
+        self, console: Console, stop: GracefulStop, training: str = Phase.TRAINING
+    ) -> None:
         self.console, self.stop, self.training = console, stop, training
         self.phase: Phase | None = None
 
     def __call__(self, now: Progress) -> bool:
         training = now.phase == Phase.TRAINING
         if now.phase != self.phase:
-            self.phase, before = now.phase, now.share if now.done > 1 else 0.0  # a resumed training's
+            # a resumed training's
+            self.phase, before = now.phase, now.share if now.done > 1 else 0.0
             self.begin(self.training if training else now.phase, before)
         by_time = now.share > now.done / max(now.total, 1)
         self.update(now.share, f"step {now.done}" if by_time else f"{now.done}/{now.total}")
@@ -126,7 +149,11 @@ class ProgressDisplay(Meter):
             return True
         self.close()
         if training and not now.error:
-            again = " (Ctrl-C again aborts without writing)" if self.stop.aborts and self.stop.presses else ""
+            again = (
+                " (Ctrl-C again aborts without writing)"
+                if self.stop.aborts and self.stop.presses
+                else ""
+            )
             self.console.say(f"stopping{again}")
         return False
 

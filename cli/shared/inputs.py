@@ -1,4 +1,6 @@
-"""What commands read: checkpoints, scenes in their frame, and the device; and the kernels compiled for them."""
+"""What commands read: checkpoints, scenes in their frame, and the device; and the kernels compiled
+for them.
+"""
 
 import argparse
 from collections.abc import Sequence
@@ -34,16 +36,23 @@ CPU = torch.device("cpu")
 
 
 def read_checkpoint(
-    path: str, console: Console, activated: Activated | None = None, origin: Origin | None = None,
+    path: str,
+    console: Console,
+    activated: Activated | None = None,
+    origin: Origin | None = None,
     device: torch.device = CPU,
-) -> Checkpoint:  # fmt: skip
+) -> Checkpoint:
     with console.status(f"reading {path} ({size(Path(path))}) ..."):
         checkpoint = load(path, activated=activated, origin=origin)
     gaussians = checkpoint.gaussians
     columns, drawn = " and ".join(dial_columns(gaussians.tensors())), gaussians.screen_filter
-    more = f", with {columns}" * bool(columns) + f", drawn with {drawn.description}" * (drawn != CLASSIC)
+    more = f", with {columns}" * bool(columns) + f", drawn with {drawn.description}" * (
+        drawn != CLASSIC
+    )
     far = f" and {len(gaussians) - gaussians.whole:,} far" if gaussians.near is not None else ""
-    console.say(f"{path}: {gaussians.whole:,}{far} Gaussians, SH degree {gaussians.sh_degree}{more}")
+    console.say(
+        f"{path}: {gaussians.whole:,}{far} Gaussians, SH degree {gaussians.sh_degree}{more}"
+    )
     console.note(*checkpoint.notes, of=path)
     return replace(checkpoint, gaussians=gaussians.to(device))
 
@@ -53,30 +62,43 @@ def read_scene(folder: str, console: Console, origin: Origin) -> Scene:
         scene = load_scene(folder, origin=origin, progress=meter)
     camera = scene.train[0].camera
     size = f"{camera.width}x{camera.height}"
-    console.say(f"{folder}: {len(scene.train)} photographs to train on, {len(scene.test)} held out, {size}")
+    console.say(
+        f"{folder}: {len(scene.train)} photographs to train on, {len(scene.test)} held out, {size}"
+    )
     console.note(*scene.notes)
     return scene
 
 
 def read_inputs(
-    args: argparse.Namespace, paths: Sequence[str], console: Console, *, held_out: bool = True, training: bool = False,
+    args: argparse.Namespace,
+    paths: Sequence[str],
+    console: Console,
+    *,
+    held_out: bool = True,
+    training: bool = False,
     required: bool = False,
-) -> tuple[list[Checkpoint], Scene]:  # fmt: skip
-    """Checkpoints, with their screen-space filters, and photographs, in the frame and origin of the first one."""
+) -> tuple[list[Checkpoint], Scene]:
+    """Checkpoints, with their screen-space filters, and photographs, in the frame and origin of the
+    first one.
+    """
     device, found = pick_device(args.device, console), list[Checkpoint]()
     for path in paths:
         origin = found[0].origin if found else None
         found.append(read_checkpoint(path, console, args.activated, origin, device))
     scene = read_scene(args.images, console, found[0].origin)
     if held_out and not scene.test:
-        raise ClodError(f"{args.images}: there are no held-out photographs to evaluate on; give at least two")
+        raise ClodError(
+            f"{args.images}: there are no held-out photographs to evaluate on; give at least two"
+        )
     prepare_kernels(console, device, training=training)
     scene, _ = align_shown(found[0], scene, console, required=required)
     return [with_filter(each, args, console, [*scene.test, *scene.train]) for each in found], scene
 
 
 def pick_device(name: str, console: Console) -> torch.device:
-    """The device of ``--device``; prints why a GPU is not used. Without one that works, cuda is an error."""
+    """The device of ``--device``; prints why a GPU is not used. Without one that works, cuda is an
+    error.
+    """
     if name == "cpu" or (name == "auto" and not torch.cuda.is_available()):
         return CPU
     reason = no_gpu()
@@ -93,9 +115,15 @@ def pick_device(name: str, console: Console) -> torch.device:
 def no_gpu() -> str | None:
     """Why no GPU backend works, None if one does. The first call may compile gsplat for minutes."""
     if not torch.cuda.is_available() and torch.version.cuda is None:
-        return f"torch {torch.__version__} is built without CUDA: install torch from https://pytorch.org for your CUDA"
+        return (
+            f"torch {torch.__version__} is built without CUDA: install torch from"
+            " https://pytorch.org for your CUDA"
+        )
     if not torch.cuda.is_available():
-        return "torch finds no NVIDIA GPU; check with nvidia-smi that there is one and that its driver is new enough"
+        return (
+            "torch finds no NVIDIA GPU; check with nvidia-smi that there is one and that its driver"
+            " is new enough"
+        )
     try:
         torch.ones(1, device="cuda").add_(1).item()
     except (RuntimeError, AssertionError) as error:  # not supported by this torch, or in use
@@ -106,7 +134,9 @@ def no_gpu() -> str | None:
 def with_filter(
     checkpoint: Checkpoint, args: argparse.Namespace, console: Console, views: Sequence[View] = ()
 ) -> Checkpoint:
-    """The checkpoint with the screen-space filter of ``--antialiasing``; with ``auto`` that of ``detect_filter``."""
+    """The checkpoint with the screen-space filter of ``--antialiasing``; with ``auto`` that of
+    ``detect_filter``.
+    """
     gaussians, name = checkpoint.gaussians, args.antialiasing
     if name == "auto":
         with console.status("comparing screen-space filters with the photographs ..."):
@@ -131,7 +161,9 @@ def pick_views(scene: Scene, wanted: Sequence[str]) -> list[View]:
 
 
 def named(cameras: Sequence[Camera], name: str, option: str) -> list[Camera]:
-    """The cameras whose photograph has this name; if none has, without its suffix, its folder, or both."""
+    """The cameras whose photograph has this name; if none has, without its suffix, its folder, or
+    both.
+    """
     if found := [camera for camera in cameras if camera.name == name]:
         return found
     for camera in cameras:
@@ -145,20 +177,34 @@ def named(cameras: Sequence[Camera], name: str, option: str) -> list[Camera]:
 
 
 def prepare_kernels(
-    console: Console, device: torch.device = CPU, *, training: bool = True, screen_filter: ScreenFilter = CLASSIC
+    console: Console,
+    device: torch.device = CPU,
+    *,
+    training: bool = True,
+    screen_filter: ScreenFilter = CLASSIC,
 ) -> None:
-    """Evaluates, and with ``training`` adapts, a scene of one Gaussian, so that all kernels are compiled."""
+    """Evaluates, and with ``training`` adapts, a scene of one Gaussian, so that all kernels are
+    compiled.
+    """
     one = Gaussians(
-        torch.tensor([[0.0, 0.0, 2.0]]), torch.ones(1, 4), torch.zeros(1, 3), torch.zeros(1), torch.zeros(1, 1, 3),
-        torch.zeros(1, 3, 3), screen_filter=screen_filter,
-    ).to(device)  # fmt: skip
+        torch.tensor([[0.0, 0.0, 2.0]]),
+        torch.ones(1, 4),
+        torch.zeros(1, 3),
+        torch.zeros(1),
+        torch.zeros(1, 1, 3),
+        torch.zeros(1, 3, 3),
+        screen_filter=screen_filter,
+    ).to(device)
     view = View(Camera(torch.eye(4), torch.eye(3), 4, 4), torch.zeros(4, 4, 3, dtype=torch.uint8))
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # after a Ctrl-C in one, each of several would compile on its own
     try:
         with install_listener("numba:compile", _Compiling(console)):
             evaluate(one, [view], [1.0])
-            if training and adapt(one, Scene((view,), ()), AdaptConfig(iters=1), progress=False).interrupted:
+            if (
+                training
+                and adapt(one, Scene((view,), ()), AdaptConfig(iters=1), progress=False).interrupted
+            ):
                 raise Stopped("stopped while the kernels were compiled")
     finally:
         torch.set_num_threads(threads)
@@ -171,7 +217,9 @@ class _Compiling(Listener):  # type: ignore[misc]
         self.say_once = cache(console.say)
 
     def on_start(self, event: Event) -> None:
-        self.say_once("compiling kernels (first run only, or without a writable NUMBA_CACHE_DIR) ...")
+        self.say_once(
+            "compiling kernels (first run only, or without a writable NUMBA_CACHE_DIR) ..."
+        )
 
     def on_end(self, event: Event) -> None:
         pass
@@ -188,7 +236,9 @@ def align_shown(
         return align(checkpoint, scene, console.note, required=required)
 
 
-def read_cameras(model: Checkpoint, images: str, console: Console, *, training: bool = False) -> list[Camera]:
+def read_cameras(
+    model: Checkpoint, images: str, console: Console, *, training: bool = False
+) -> list[Camera]:
     """``load_cameras``, moved into the model's frame, which few small photographs tell."""
     every, notes = load_cameras(images, model.origin)
     cameras = load_cameras(images, model.origin, training=True)[0] if training else every

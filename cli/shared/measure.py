@@ -37,7 +37,9 @@ class Stopwatch:
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - began
 
     def report(self) -> dict[str, float]:
-        return {name: round(value, 3) for name, value in {**self.seconds, "total": self.total()}.items()}
+        return {
+            name: round(value, 3) for name, value in {**self.seconds, "total": self.total()}.items()
+        }
 
     def total(self) -> float:
         return time.perf_counter() - self.began
@@ -67,7 +69,10 @@ fade (0.5), but not that of a jump (1.0):
 def popping_table(results: Sequence[tuple[str, Popping]]) -> str:
     text = POPPING
     for moved, p in results:
-        text += f"\n{moved}\n  {p.steps:5}  {p.mean:7.4f}  {p.largest:7.4f}  {p.at:5.2f}  {p.ratio:6.1f}"
+        text += (
+            f"\n{moved}\n  {p.steps:5}  {p.mean:7.4f}  {p.largest:7.4f}  {p.at:5.2f} "
+            f" {p.ratio:6.1f}"
+        )
         text += f"  {p.persistence:6.2f}  {p.pixel:6.1f}  {p.pixel_persistence:6.2f}"
     return text
 
@@ -76,29 +81,52 @@ DIALS = (1.0, 2.0, 3.0, 5.0)
 
 
 def choose_dials(given: list[float] | None, model: Checkpoint, console: Console) -> list[float]:
-    """The dial values to measure; a note if they are outside the trained range, or there is no dial."""
+    """The dial values to measure; a note if they are outside the trained range, or there is no
+    dial.
+    """
     attenuation = model.gaussians.attenuation
     trained = attenuation.max_sv if attenuation else None
-    dials = given or [s for s in DIALS if trained is None or s < trained] + ([trained] if trained else [])
+    dials = given or [s for s in DIALS if trained is None or s < trained] + (
+        [trained] if trained else []
+    )
     if max(dials) > (trained or 1):
         untrained = f"trained up to s = {trained or 0:g}; larger dial values were not trained"
-        console.note(untrained if trained else f"{model.path} has no sigma_d, so every dial value renders all of it")
+        console.note(
+            untrained
+            if trained
+            else f"{model.path} has no sigma_d, so every dial value renders all of it"
+        )
     return dials
 
 
 def measure(
-    gaussians: Gaussians, views: Sequence[View], dials: Sequence[float], console: Console, stop: GracefulStop,
+    gaussians: Gaussians,
+    views: Sequence[View],
+    dials: Sequence[float],
+    console: Console,
+    stop: GracefulStop,
     label: str = "measure",
-) -> list[Row]:  # fmt: skip
-    """The rows of the dial values; those that were finished when ``stop`` heard a signal, none without views."""
+) -> list[Row]:
+    """The rows of the dial values; those that were finished when ``stop`` heard a signal, none
+    without views.
+    """
     with console.meter(label) as meter:
-        return evaluate(gaussians, views, dials, progress=stop.heeding(meter)) if views and not stop.requests else []
+        return (
+            evaluate(gaussians, views, dials, progress=stop.heeding(meter))
+            if views and not stop.requests
+            else []
+        )
 
 
 def comparable(
-    measured: Sequence[tuple[Gaussians, list[Row]]], views: Sequence[View], console: Console, stop: GracefulStop
+    measured: Sequence[tuple[Gaussians, list[Row]]],
+    views: Sequence[View],
+    console: Console,
+    stop: GracefulStop,
 ) -> list[list[Row]]:
-    """The rows of each model by ``with_frame_times``; unchanged after a signal, or where there are none."""
+    """The rows of each model by ``with_frame_times``; unchanged after a signal, or where there are
+    none.
+    """
     unchanged = [rows for _, rows in measured]
     if stop.requests or not any(unchanged):
         return unchanged
@@ -112,38 +140,59 @@ def comparable(
 
 
 def solve_dials(
-    args: Namespace, model: Checkpoint, cameras: Sequence[Camera | Viewpoint], console: Console, *, baked: bool = False
+    args: Namespace,
+    model: Checkpoint,
+    cameras: Sequence[Camera | Viewpoint],
+    console: Console,
+    *,
+    baked: bool = False,
 ) -> list[float] | None:
     """The dial values of --sv or of a budget, None without either.
 
     Args:
-        cameras: those that the command renders, or bakes for. Where none of them has an image size, as those stored in
-            a file, frame times are those of the calibration.
+        cameras: those that the command renders, or bakes for. Where none of them has an image size,
+            as those stored in a file, frame times are those of the calibration.
         baked: whether a count is of the file baked for the cameras, and not the mean over them.
     """
     budget = given_budget(args)
     if budget is None:
         return args.sv
     name, option, values = budget
-    whole, calibration = [camera for camera in cameras if isinstance(camera, Camera)], model.calibration
+    whole, calibration = (
+        [camera for camera in cameras if isinstance(camera, Camera)],
+        model.calibration,
+    )
     times, machine = None, ""
     if name == "fps" and whole:
         prepare_kernels(console, model.gaussians.means.device, training=False)
         with console.meter("timing") as meter:
             times, notes = frame_times(model.gaussians, whole, progress=meter)
         (first, slow), (last, fast) = times[0], times[-1]
-        console.note(f"frames timed here: {slow:.1f} ms at s = {first:g}, {fast:.1f} ms at s = {last:g}", *notes)
+        console.note(
+            f"frames timed here: {slow:.1f} ms at s = {first:g}, {fast:.1f} ms at s = {last:g}",
+            *notes,
+        )
     elif name != "keep" and calibration is None:
         why = next((note for note in model.notes if "calibration" in note), "")
         raise no_calibration(model.path, option, why)
     elif name == "fps" and calibration is not None:
-        machine = f" (frame times of {calibration.machine} at {calibration.width}x{calibration.height})"
+        machine = (
+            f" (frame times of {calibration.machine} at {calibration.width}x{calibration.height})"
+        )
     elif name == "psnr_drop" and calibration is not None and calibration.against == "checkpoint":
-        console.note("--psnr-drop uses a calibration made without photographs, against renders of the checkpoint")
+        console.note(
+            "--psnr-drop uses a calibration made without photographs, against renders of the"
+            " checkpoint"
+        )
     dials = []
     for value in values:
         asked = f"{option} {value}" if isinstance(value, int) else f"{option} {value:g}"
-        wanted: dict[str, Any] = {name: value, "cameras": cameras, "calibration": calibration, "baked": baked}
+        wanted: dict[str, Any] = {
+            name: value,
+            "cameras": cameras,
+            "calibration": calibration,
+            "baked": baked,
+        }
         try:
             solved = dial_for_times(times, value) if times else dial_for(model.gaussians, **wanted)
         except ClodError as error:

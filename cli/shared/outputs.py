@@ -1,4 +1,6 @@
-"""Output files: their names; compared with existing files and inputs, and locked, before a command begins; reports."""
+"""Output files: their names; compared with existing files and inputs, and locked, before a command
+begins; reports.
+"""
 
 from __future__ import annotations
 
@@ -54,7 +56,9 @@ def labels(paths: Sequence[str]) -> list[str]:
         if resolved[k] in resolved[:k]:
             raise ClodError(f"{path}: is given twice")
         if names[k] in names[:k]:
-            raise ClodError(f"{path}: has the same name as {paths[names.index(names[k])]}; rename one of them")
+            raise ClodError(
+                f"{path}: has the same name as {paths[names.index(names[k])]}; rename one of them"
+            )
     return names
 
 
@@ -65,7 +69,9 @@ def size(of: Path | int) -> str:
 
 
 def jsonable(value: Any) -> Any:
-    """``value`` with numbers that JSON cannot represent (an infinite PSNR) as null, and file names as text."""
+    """``value`` with numbers that JSON cannot represent (an infinite PSNR) as null, and file names
+    as text.
+    """
     if isinstance(value, dict):
         return {jsonable(key): jsonable(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):
@@ -81,11 +87,13 @@ def write_report(path: Path, report: dict[str, Any]) -> None:
         temporary.write_text(text + "\n", encoding="utf-8")
 
 
-# Found at the beginning of the files that clod-adapt writes: in PLY comments, metadata, pages, reports and tables. An
-# .spz is compressed; .splat, .sog and .compressed.ply have no such text.
+# Found at the beginning of the files that clod-adapt writes: in PLY comments, metadata, pages,
+# reports and tables. An .spz is compressed; .splat, .sog and .compressed.ply have no such text.
 OURS = re.compile(rb'clod[-_]adapter|\A\{\s+"(command|checkpoint)": "|\Acheckpoint,max_sv,')
 # The same of the files that adapting writes beside its PLY: adapter, state, report and page.
-BESIDE = re.compile(rb'\\"clod-adapter\\"|clod_adapter_state|\A\{\s+"command": "adapt"|, adaptation report')
+BESIDE = re.compile(
+    rb'\\"clod-adapter\\"|clod_adapter_state|\A\{\s+"command": "adapt"|, adaptation report'
+)
 SUFFIXES = (".safetensors", ".resume.safetensors", ".json", ".html")  # of these files
 BEGINNING = 1 << 16  # bytes
 
@@ -95,8 +103,10 @@ class Outputs:
     """What a command writes, and what it reads."""
 
     named: Sequence[Path] = ()  # files named on the command line; existing ones are replaced
-    derived: Sequence[Path] = ()  # files named after these; existing ones are replaced if clod-adapt wrote them
-    folders: Sequence[Path] = ()  # made if missing; the first is locked in place of the files, and contains the others
+    # files named after these; existing ones are replaced if clod-adapt wrote them
+    derived: Sequence[Path] = ()
+    # made if missing; the first is locked in place of the files, and contains the others
+    folders: Sequence[Path] = ()
     whole: bool = False  # whether ``named`` is a new folder, not a file
     inputs: Sequence[str] = ()  # files named to be read
     scene: str | None = None  # a scene folder, all of whose files are inputs (``scene_files``)
@@ -108,7 +118,9 @@ class Outputs:
 
 @contextmanager
 def claimed(outputs: Outputs) -> Iterator[None]:
-    """Checks the outputs, and in the body holds their locks; there the folders exist, afterwards no empty one."""
+    """Checks the outputs, and in the body holds their locks; there the folders exist, afterwards no
+    empty one.
+    """
     check_outputs(outputs)
     with ExitStack() as stack:
         for folder in outputs.folders:
@@ -126,7 +138,9 @@ def claimed(outputs: Outputs) -> Iterator[None]:
 
 
 def check_outputs(outputs: Outputs) -> None:
-    """Refuses outputs that cannot be written, or would replace an input, what is beside it, or a foreign file."""
+    """Refuses outputs that cannot be written, or would replace an input, what is beside it, or a
+    foreign file.
+    """
     for folder in outputs.folders:
         parent = next(parent for parent in (folder, *folder.parents) if parent.exists())
         if not parent.is_dir():
@@ -144,17 +158,24 @@ def check_outputs(outputs: Outputs) -> None:
     for file, what in _inputs(outputs) if taken else ():
         if (key := _key(file)) in taken:
             other = "" if os.path.abspath(file) == os.path.abspath(taken[key]) else f" ({file})"
-            raise ClodError(f"{taken[key]}: is {what}{other}, which is never overwritten; choose another output")
+            raise ClodError(
+                f"{taken[key]}: is {what}{other}, which is never overwritten; choose another output"
+            )
     for path in outputs.derived:
         if path.exists() and not _is_ours(path):
-            raise ClodError(f"{path}: exists, and clod-adapt did not write it; move it, or choose another output")
+            raise ClodError(
+                f"{path}: exists, and clod-adapt did not write it; move it, or choose another"
+                " output"
+            )
 
 
 def _inputs(outputs: Outputs) -> Iterator[tuple[Path, str]]:
     """The files that must not be overwritten, and what they are."""
     for file in map(Path, outputs.inputs):
         yield from ((each, "an input file") for each in (file, *ranks_of(file).values()))
-        for beside in (name.with_suffix(suffix) for name in (file, file.resolve()) for suffix in SUFFIXES):
+        for beside in (
+            name.with_suffix(suffix) for name in (file, file.resolve()) for suffix in SUFFIXES
+        ):
             if BESIDE.search(_beginning(beside)):
                 yield beside, "the adapter, state or report of an input"
     if outputs.scene is not None:
@@ -195,4 +216,6 @@ def make_folder(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise ClodError(f"{folder}: cannot be made ({error.strerror or error}); choose another --out") from error
+        raise ClodError(
+            f"{folder}: cannot be made ({error.strerror or error}); choose another --out"
+        ) from error

@@ -22,15 +22,23 @@ from .outputs import jsonable
 from .process import interrupt_as_stopped
 
 FRAMES = 13  # positions of the page's slider
-SNAPSHOTS = tuple(2.0**-k for k in range(6, 0, -1))  # shares of the training at which the result so far is copied
+# shares of the training at which the result so far is copied
+SNAPSHOTS = tuple(2.0**-k for k in range(6, 0, -1))
 SNAPSHOT_VIEWS = 12  # held-out views that snapshots are measured on, at most
 
 
 def add_page(
-    path: Path, report: dict[str, Any], model: Gaussians, base: Gaussians | None, scene: Scene, console: Console,
+    path: Path,
+    report: dict[str, Any],
+    model: Gaussians,
+    base: Gaussians | None,
+    scene: Scene,
+    console: Console,
     training: Callable[[], dict[str, Any] | None] = lambda: None,
-) -> None:  # fmt: skip
-    """Writes the page and adds its files to the report, unless Ctrl-C stops it, which a note says."""
+) -> None:
+    """Writes the page and adds its files to the report, unless Ctrl-C stops it, which a note
+    says.
+    """
     try:
         with interrupt_as_stopped():
             curves = training()
@@ -41,16 +49,23 @@ def add_page(
         console.note("the page was interrupted and not written")
     else:
         console.say(f"wrote {path}: open it in a browser")
-        report["outputs"] = report.get("outputs", {}) | {name: str(file) for name, file in written.items()}
+        report["outputs"] = report.get("outputs", {}) | {
+            name: str(file) for name, file in written.items()
+        }
 
 
 class AdaptPage:
-    """Copies the result so far during training, and measures the copies after its end, for the page."""
+    """Copies the result so far during training, and measures the copies after its end, for the
+    page.
+    """
 
-    def __init__(self, base: Gaussians, scene: Scene, config: AdaptConfig, console: Console) -> None:
+    def __init__(
+        self, base: Gaussians, scene: Scene, config: AdaptConfig, console: Console
+    ) -> None:
         self.base, self.scene, self.config, self.console = base, scene, config, console
         self.due = [0.0, *SNAPSHOTS]
-        self.snapshots: list[tuple[float, Gaussians]] = []  # seconds of the training, and the state then
+        # seconds of the training, and the state then
+        self.snapshots: list[tuple[float, Gaussians]] = []
         self.trained = 0.0
 
     def __call__(self, now: Progress, whole: Callable[[Gaussians], Gaussians]) -> None:
@@ -61,12 +76,24 @@ class AdaptPage:
                 self.due = [share for share in self.due if share > now.share]
                 state = whole(now.gaussians())
                 # The largest, if it is not trained; far Gaussians have their own.
-                fixed = {"shN": self.base.shN} if len(state) == len(self.base) and self.config.lr_shN == 0 else {}
-                changing = {name: value.clone() for name, value in state.tensors().items() if name not in fixed}
+                fixed = (
+                    {"shN": self.base.shN}
+                    if len(state) == len(self.base) and self.config.lr_shN == 0
+                    else {}
+                )
+                changing = {
+                    name: value.clone()
+                    for name, value in state.tensors().items()
+                    if name not in fixed
+                }
                 self.snapshots.append((now.seconds, state.replace(**changing, **fixed)))
 
-    def write(self, path: Path, report: dict[str, Any], result: Gaussians, start_seconds: float) -> None:
-        """The same of a run, whose other files are written: the disk stops the page alone, which a note says."""
+    def write(
+        self, path: Path, report: dict[str, Any], result: Gaussians, start_seconds: float
+    ) -> None:
+        """The same of a run, whose other files are written: the disk stops the page alone, which a
+        note says.
+        """
         training = partial(self._training, result, start_seconds)
         try:
             add_page(path, report, result, self.base, self.scene, self.console, training)
@@ -82,7 +109,9 @@ class AdaptPage:
         if self.snapshots[-1][0] == self.trained:  # the result itself
             self.snapshots.pop()
         states = [*self.snapshots, (self.trained, result)]
-        curves: list[dict[str, Any]] = [{"label": f"s = {s:g}", "virtual_scale": s, "points": []} for s in dials]
+        curves: list[dict[str, Any]] = [
+            {"label": f"s = {s:g}", "virtual_scale": s, "points": []} for s in dials
+        ]
         with self.console.meter("snapshots") as meter:
             for k, (seconds, state) in enumerate(states):
                 for curve, row in zip(curves, evaluate(state, views, dials), strict=True):
@@ -101,10 +130,16 @@ def pictures(
         return [], {}
     view = views[len(views) // 2]
     if own:
-        others = {"base": Picture(view.image.numpy(), "base, unadapted", "its own rendering, the reference")}
+        others = {
+            "base": Picture(
+                view.image.numpy(), "base, unadapted", "its own rendering, the reference"
+            )
+        }
     else:
         others = {"photograph": Picture(view.image.numpy(), "photograph", "held out from training")}
-        others |= {"base": _rendered(base, view, 1.0, "base, unadapted")} if base is not None else {}
+        others |= (
+            {"base": _rendered(base, view, 1.0, "base, unadapted")} if base is not None else {}
+        )
     widest = model.attenuation.max_sv if model.attenuation else 1.0
     dials = dict.fromkeys(float(f"{widest ** (k / (FRAMES - 1)):.2g}") for k in range(FRAMES))
     title = "s = {:g}" if model.sigma_d is not None else "the file"
@@ -114,5 +149,7 @@ def pictures(
 def _rendered(gaussians: Gaussians, view: View, virtual_scale: float, title: str) -> Picture:
     rendering = render(gaussians, view.camera, virtual_scale)
     kept, error = int(rendering.kept.sum()), psnr(rendering.image, view.image)
-    detail = f"{error:.2f} dB on this view, {kept:,} Gaussians ({kept / max(gaussians.whole, 1):.0%})"
+    detail = (
+        f"{error:.2f} dB on this view, {kept:,} Gaussians ({kept / max(gaussians.whole, 1):.0%})"
+    )
     return Picture(rendering.image.cpu().numpy(), title, detail)

@@ -14,14 +14,17 @@ from clod_adapter.progress import ENDING, Stopped, handled_by
 
 
 class Stream:
-    """A text stream that raises no OSError: it keeps the first one as ``error`` and discards what follows."""
+    """A text stream that raises no OSError: it keeps the first one as ``error`` and discards what
+    follows.
+    """
 
     def __init__(self, stream: TextIO | None) -> None:
         self.error: OSError | None = None
         if stream is None:  # Python's, where the shell closed it
             stream, self.error = open(os.devnull, "w"), OSError(errno.EBADF, "it is closed")  # noqa: SIM115
         elif isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")  # characters that its encoding lacks, as in names of files
+            # characters that its encoding lacks, as in names of files
+            stream.reconfigure(errors="backslashreplace")
         self._stream = stream
 
     def write(self, text: str) -> int:
@@ -38,7 +41,8 @@ class Stream:
             return call()
         except OSError as error:
             self.error = error
-            with open(os.devnull, "w") as nowhere:  # Python flushes what is left again when it exits
+            # Python flushes what is left again when it exits
+            with open(os.devnull, "w") as nowhere:
                 os.dup2(nowhere.fileno(), self._stream.fileno())
             return None
 
@@ -46,7 +50,8 @@ class Stream:
 @contextmanager
 def unbreakable_streams() -> Iterator[None]:
     """Within the block sys.stdout and sys.stderr are Streams."""
-    for number in range(3):  # a file that is opened later must not get the number of a closed stream
+    # a file that is opened later must not get the number of a closed stream
+    for number in range(3):
         try:
             os.fstat(number)
         except OSError:
@@ -64,22 +69,30 @@ def check_printed() -> None:
     """Refuses a stdout that did not take all that was printed."""
     sys.stdout.flush()
     if error := getattr(sys.stdout, "error", None):  # not of a redirected one
-        raise ClodError(f"stdout cannot be written ({error.strerror or error}), so the result is lost; open it")
+        raise ClodError(
+            f"stdout cannot be written ({error.strerror or error}), so the result is lost; open it"
+        )
 
 
 @contextmanager
 def interrupt_as_stopped() -> Iterator[None]:
-    """Within the block Ctrl-C raises Stopped. From the dispatcher of a compiled function it comes as a SystemError."""
+    """Within the block Ctrl-C raises Stopped. From the dispatcher of a compiled function it comes
+    as a SystemError.
+    """
     try:
         yield
     except (KeyboardInterrupt, SystemError) as error:
-        if not isinstance(error, KeyboardInterrupt) and not isinstance(error.__cause__, KeyboardInterrupt):
+        if not isinstance(error, KeyboardInterrupt) and not isinstance(
+            error.__cause__, KeyboardInterrupt
+        ):
             raise
         raise Stopped("interrupted") from error
 
 
 def signals_as_interrupt() -> AbstractContextManager[None]:
-    """Within the block all raise KeyboardInterrupt. Enter it after importing pycolmap, which sets a handler."""
+    """Within the block all raise KeyboardInterrupt. Enter it after importing pycolmap, which sets a
+    handler.
+    """
     return handled_by(signal.default_int_handler)
 
 
@@ -91,13 +104,20 @@ def listen_no_more() -> None:
 
 # In RuntimeErrors (torch's allocators, Python's threads) and ImportErrors (the loader's).
 MESSAGES = (
-    "can't allocate memory", "not enough memory", "out of memory", "std::bad_alloc", "can't start new thread",
-    "failed to map segment", "cannot allocate memory",
-)  # fmt: skip
+    "can't allocate memory",
+    "not enough memory",
+    "out of memory",
+    "std::bad_alloc",
+    "can't start new thread",
+    "failed to map segment",
+    "cannot allocate memory",
+)
 
 
 def check_surroundings() -> None:
-    """Refuses a deleted current folder; removes variables that numba and matplotlib would refuse."""
+    """Refuses a deleted current folder; removes variables that numba and matplotlib would
+    refuse.
+    """
     for name in ("NUMBA_NUM_THREADS", "MPLBACKEND"):
         os.environ.pop(name, None)
     try:
@@ -112,7 +132,9 @@ def shortage(error: BaseException) -> str | None:
     if not short and not any(message in str(error).lower() for message in MESSAGES):
         return None
     text = (str(error) or "allocating").splitlines()[0]
-    return f"not enough memory ({text[:200]}); free some memory, or raise the limit on it (ulimit -v)"
+    return (
+        f"not enough memory ({text[:200]}); free some memory, or raise the limit on it (ulimit -v)"
+    )
 
 
 NEEDED = ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")
@@ -137,13 +159,18 @@ def launched() -> Launch:
     except ValueError:
         launch = Launch(-1)
     if not 0 <= launch.rank < launch.size or not 0 <= launch.local_rank < launch.local_size:
-        raise ClodError(f"inconsistent environment variables {', '.join(names)}; start the processes with torchrun")
+        raise ClodError(
+            f"inconsistent environment variables {', '.join(names)}; start the processes with"
+            " torchrun"
+        )
     return launch
 
 
 @contextmanager
 def silence_but_first() -> Iterator[None]:
-    """Within the block, only the first of several processes prints; an exception that leaves it is not silenced."""
+    """Within the block, only the first of several processes prints; an exception that leaves it is
+    not silenced.
+    """
     if os.environ.get("RANK", "0") == "0" or not all(name in os.environ for name in NEEDED):
         yield
         return

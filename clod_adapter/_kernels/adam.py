@@ -8,26 +8,52 @@ from clod_adapter._kernels.elementary import vsqrt
 from clod_adapter._kernels.pointers import load_where, pointer, scratch, store_where
 from clod_adapter._kernels.simd import anywhere, fma, gt, load, splat
 
-ROOM = 16 * 72  # numbers of sixteen rows: at most the harmonics of degree 4, the highest that Gaussians have
+# numbers of sixteen rows: at most the harmonics of degree 4, the highest that Gaussians have
+ROOM = 16 * 72
 
 
 @kernel
 def adam_rows(
-    worker, workers, parameter, first, second, gradient, mask, steps, counted, corrections, units, rate, beta1, beta2,
+    worker,
+    workers,
+    parameter,
+    first,
+    second,
+    gradient,
+    mask,
+    steps,
+    counted,
+    corrections,
+    units,
+    rate,
+    beta1,
+    beta2,
     epsilon,
-):  # fmt: skip
-    """Updates the rows of ``parameter [N, width]`` and of its moments where ``mask [N]`` is set, with ``gradient``.
+):
+    """Updates the rows of ``parameter [N, width]`` and of its moments where ``mask [N]`` is set,
+    with ``gradient``.
 
     ``steps[row]`` counts the updates of the row: ``counted``, 1 or 0, is added first. For n updates
-    ``corrections[0, n]`` is ``1 / (1 - beta1^n)`` and ``corrections[1, n]`` is ``1 / sqrt(1 - beta2^n)``; the last
-    entry holds for all larger n. ``units``, ``[N]`` or ``[1]`` for all, multiplies a row's rate.
+    ``corrections[0, n]`` is ``1 / (1 - beta1^n)`` and ``corrections[1, n]`` is
+    ``1 / sqrt(1 - beta2^n)``; the last entry holds for all larger n. ``units``, ``[N]`` or ``[1]``
+    for all, multiplies a row's rate.
     """
-    width, most, rate, each = parameter.shape[1], corrections.shape[1] - 1, float32(rate), int64(len(units) > 1)
+    width, most, rate, each = (
+        parameter.shape[1],
+        corrections.shape[1] - 1,
+        float32(rate),
+        int64(len(units) > 1),
+    )
     beta1, beta2, epsilon = splat(float32(beta1)), splat(float32(beta2)), float32(epsilon)
     rest1, rest2 = splat(ONE) - beta1, splat(ONE) - beta2
     begin, end = len(parameter) * worker // workers, len(parameter) * (worker + 1) // workers
     lengths, factors = scratch(float32, ROOM), scratch(float32, ROOM)
-    parameter, first, second, gradient = pointer(parameter), pointer(first), pointer(second), pointer(gradient)
+    parameter, first, second, gradient = (
+        pointer(parameter),
+        pointer(first),
+        pointer(second),
+        pointer(gradient),
+    )
     for start in range(begin, end, 16):
         stop, some = min(start + 16, end), False
         for row in range(start, stop):
@@ -40,7 +66,10 @@ def adam_rows(
             if mask[row]:
                 steps[row] += counted
                 count = min(steps[row], most)
-                length, factor = rate * units[each * row] * corrections[0, count], corrections[1, count]
+                length, factor = (
+                    rate * units[each * row] * corrections[0, count],
+                    corrections[1, count],
+                )
                 for k in range(width * (row - start), width * (row - start + 1)):
                     lengths[k], factors[k] = length, factor
         for k in range(0, 16 * width, 16):
@@ -50,7 +79,9 @@ def adam_rows(
                 g = load_where(chosen, gradient, at)
                 m = fma(beta1, load_where(chosen, first, at), rest1 * g)
                 v = fma(beta2, load_where(chosen, second, at), rest2 * g * g)
-                x = load_where(chosen, parameter, at) - load(lengths, k) * m / (vsqrt(v) * factor + epsilon)
+                x = load_where(chosen, parameter, at) - load(lengths, k) * m / (
+                    vsqrt(v) * factor + epsilon
+                )
                 store_where(chosen, first, at, m)
                 store_where(chosen, second, at, v)
                 store_where(chosen, parameter, at, x)

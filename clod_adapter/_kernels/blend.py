@@ -1,9 +1,10 @@
 """Front-to-back blending of each tile, and its gradient.
 
-A tile is processed in blocks of 4x4 pixels, one vector lane per pixel. The state of a block is contiguous: 16
-transmittances, then 16 reds, greens and blues. A pixel whose transmittance falls to T_MIN is finished and stores its
-transmittance negated; a block is finished when all its pixels are. The Gaussian that finishes a pixel is drawn: were it
-left out, as gsplat and Inria do, up to a tenth of the pixel would change at once when it or one before it fades.
+A tile is processed in blocks of 4x4 pixels, one vector lane per pixel. The state of a block is
+contiguous: 16 transmittances, then 16 reds, greens and blues. A pixel whose transmittance falls to
+T_MIN is finished and stores its transmittance negated; a block is finished when all its pixels are.
+The Gaussian that finishes a pixel is drawn: were it left out, as gsplat and Inria do, up to a tenth
+of the pixel would change at once when it or one before it fades.
 """
 
 import numpy as np
@@ -13,7 +14,19 @@ from clod_adapter._kernels import conventions as c
 from clod_adapter._kernels.compiling import kernel, part
 from clod_adapter._kernels.elementary import exp2, lowest, set_spans, vabs
 from clod_adapter._kernels.pointers import count_up, pointer, prefetch, scratch, store_sums
-from clod_adapter._kernels.simd import anywhere, both, fma, ge, gt, load, select, splat, store, vmax, vmin
+from clod_adapter._kernels.simd import (
+    anywhere,
+    both,
+    fma,
+    ge,
+    gt,
+    load,
+    select,
+    splat,
+    store,
+    vmax,
+    vmin,
+)
 from clod_adapter._kernels.tiles import spans
 
 BLOCK, ACROSS = 4, 16  # pixels of a block, and blocks of a tile
@@ -52,7 +65,9 @@ def none_set(words, at):
 
 @part
 def find_blocks(records, r, ox, oy, masks, at):
-    """Sets in ``masks[at : at + WORDS]`` the tile's blocks that the ellipse of the record at ``r`` touches."""
+    """Sets in ``masks[at : at + WORDS]`` the tile's blocks that the ellipse of the record at ``r``
+    touches.
+    """
     low, high = spans(records, r, ox, oy, float32(BLOCK))
     low = vmin(vmax(low, splat(c.ZERO)), splat(LAST + c.ONE))
     set_spans(masks, at, low, vmax(vmin(high, splat(LAST)), splat(-c.ONE)))
@@ -72,9 +87,9 @@ def spread(records, r, ox, oy):
 def meet(shape, t, block):
     """What a Gaussian does to the pixels of a block with transmittances ``t``.
 
-    ``shape`` is of its exponent ``-QA, -QB, -QC, LOG``, and the offsets from its centre to the pixels of the tile's
-    first block. Returns the pixels' offsets, alpha before and after its limit, the transmittance behind the Gaussian,
-    which pixels blend it, and which are finished by it.
+    ``shape`` is of its exponent ``-QA, -QB, -QC, LOG``, and the offsets from its centre to the
+    pixels of the tile's first block. Returns the pixels' offsets, alpha before and after its limit,
+    the transmittance behind the Gaussian, which pixels blend it, and which are finished by it.
     """
     qa, qb, qc, log, base_x, base_y = shape
     dx, dy = base_x + splat(BLOCK_X[block]), base_y + splat(BLOCK_Y[block])
@@ -87,17 +102,42 @@ def meet(shape, t, block):
 
 @kernel
 def blend(
-    worker, workers, records, entries, offsets, across, width, height, tiles, masks, cursor, room, background, image,
+    worker,
+    workers,
+    records,
+    entries,
+    offsets,
+    across,
+    width,
+    height,
+    tiles,
+    masks,
+    cursor,
+    room,
+    background,
+    image,
     alpha,
-):  # fmt: skip
-    """Forward pass: writes ``image [H, W, 3]`` and ``alpha [H, W]``. An atomic cursor assigns ``tiles`` to workers.
+):
+    """Forward pass: writes ``image [H, W, 3]`` and ``alpha [H, W]``. An atomic cursor assigns
+    ``tiles`` to workers.
 
     ``masks`` receives WORDS words per entry, one bit for each block of the tile that blends it.
-    ``room[worker]`` holds FORWARD_STATE floats of scratch (on the stack, LLVM would take minutes to compile it).
+    ``room[worker]`` holds FORWARD_STATE floats of scratch (on the stack, LLVM would take minutes to
+    compile it).
     """
     count, tiles, records, entries = len(tiles), pointer(tiles), pointer(records), pointer(entries)
-    offsets, background, image, alpha = pointer(offsets), pointer(background), pointer(image), pointer(alpha)
-    state, live, masks, cursor = pointer(room[worker]), scratch(uint64, WORDS), pointer(masks), pointer(cursor)
+    offsets, background, image, alpha = (
+        pointer(offsets),
+        pointer(background),
+        pointer(image),
+        pointer(alpha),
+    )
+    state, live, masks, cursor = (
+        pointer(room[worker]),
+        scratch(uint64, WORDS),
+        pointer(masks),
+        pointer(cursor),
+    )
     zero = splat(c.ZERO)
     while True:
         turn = count_up(cursor)
@@ -162,7 +202,9 @@ def write_tile(ox, oy, width, height, state, background, image, alpha):
 
 @part
 def read_tile(ox, oy, width, height, image, alpha, v_image, v_alpha, state):
-    """Loads for each pixel the remainder of v . C behind the current Gaussian, and v of the three channels."""
+    """Loads for each pixel the remainder of v . C behind the current Gaussian, and v of the three
+    channels.
+    """
     part = scratch(float32, 80)
     for block in range(BLOCKS):
         x, y, at = ox + BLOCK * (block % ACROSS), oy + BLOCK * (block // ACROSS), block * 80
@@ -188,10 +230,29 @@ def read_tile(ox, oy, width, height, image, alpha, v_image, v_alpha, state):
 
 @kernel
 def blend_gradient(
-    worker, workers, records, entries, offsets, across, width, height, tiles, masks, cursor, room, entry_slots, image,
-    alpha, v_image, v_alpha, shaped, colored, pair_sums,
-):  # fmt: skip
-    """Backward pass: for each pair of Gaussian and tile the nine sums over pixels for the projection's gradient.
+    worker,
+    workers,
+    records,
+    entries,
+    offsets,
+    across,
+    width,
+    height,
+    tiles,
+    masks,
+    cursor,
+    room,
+    entry_slots,
+    image,
+    alpha,
+    v_image,
+    v_alpha,
+    shaped,
+    colored,
+    pair_sums,
+):
+    """Backward pass: for each pair of Gaussian and tile the nine sums over pixels for the
+    projection's gradient.
 
     With s = alpha dL/dalpha and (dx, dy) from the centre: three of weight * v, then s, s dx, s dy,
     s dx^2, s dx dy, s dy^2. Runs front to back like the forward pass with a running remainder of
@@ -199,8 +260,18 @@ def blend_gradient(
     """
     count, tiles, records, entries = len(tiles), pointer(tiles), pointer(records), pointer(entries)
     entry_slots, offsets, pair_sums = pointer(entry_slots), pointer(offsets), pointer(pair_sums)
-    image, alpha, v_image, v_alpha = pointer(image), pointer(alpha), pointer(v_image), pointer(v_alpha)
-    state, live, masks, cursor = pointer(room[worker]), scratch(uint64, WORDS), pointer(masks), pointer(cursor)
+    image, alpha, v_image, v_alpha = (
+        pointer(image),
+        pointer(alpha),
+        pointer(v_image),
+        pointer(v_alpha),
+    )
+    state, live, masks, cursor = (
+        pointer(room[worker]),
+        scratch(uint64, WORDS),
+        pointer(masks),
+        pointer(cursor),
+    )
     zero, one, most = splat(c.ZERO), splat(c.ONE), splat(c.ALPHA_MAX)
     while True:
         turn = count_up(cursor)
@@ -235,7 +306,11 @@ def blend_gradient(
                     v_r, v_g, v_b = load(state, at + 32), load(state, at + 48), load(state, at + 64)
                     q = fma(v_r, red, fma(v_g, green, v_b * blue))
                     if colored:
-                        s_r, s_g, s_b = fma(weight, v_r, s_r), fma(weight, v_g, s_g), fma(weight, v_b, s_b)
+                        s_r, s_g, s_b = (
+                            fma(weight, v_r, s_r),
+                            fma(weight, v_g, s_g),
+                            fma(weight, v_b, s_b),
+                        )
                     rest = load(state, at + 16) - weight * q
                     store(state, at + 16, rest)
                     v_a = t * q - rest / (one - a)

@@ -1,4 +1,6 @@
-"""Colours: real spherical harmonics up to degree 4, in the order and signs of 3DGS, of sixteen Gaussians at a time."""
+"""Colours: real spherical harmonics up to degree 4, in the order and signs of 3DGS, of sixteen
+Gaussians at a time.
+"""
 
 from numba import float32, int64, uint64
 
@@ -10,10 +12,22 @@ from clod_adapter._kernels.simd import f32x16, fma, gt, splat, vmax
 
 C0 = float32(0.28209479177387814)
 C1 = float32(0.4886025119029199)
-C20, C22, C24 = float32(1.0925484305920792), float32(0.31539156525252005), float32(0.5462742152960396)
-C30, C31, C32 = float32(-0.5900435899266435), float32(2.890611442640554), float32(-0.4570457994644658)
+C20, C22, C24 = (
+    float32(1.0925484305920792),
+    float32(0.31539156525252005),
+    float32(0.5462742152960396),
+)
+C30, C31, C32 = (
+    float32(-0.5900435899266435),
+    float32(2.890611442640554),
+    float32(-0.4570457994644658),
+)
 C33, C35 = float32(0.3731763325901154), float32(1.445305721320277)
-C40, C41, C42 = float32(2.5033429417967046), float32(-1.7701307697799304), float32(0.9461746957575601)
+C40, C41, C42 = (
+    float32(2.5033429417967046),
+    float32(-1.7701307697799304),
+    float32(0.9461746957575601),
+)
 C43, C44 = float32(-0.6690465435572892), float32(0.10578554691520431)
 C46, C48 = float32(0.47308734787878004), float32(0.6258357354491761)
 F2, F3, F4, F7 = float32(2), float32(3), float32(4), float32(7)
@@ -59,21 +73,46 @@ def sh_basis_gradient(degree, x, y, z, v):
         gz += C20 * (-y * v[5] - x * v[7]) + F4 * C22 * z * v[6]
     if degree >= 3:
         xx, yy, zz, xy, yz, xz = x * x, y * y, z * z, x * y, y * z, x * z
-        gx += F6 * C30 * xy * v[9] + C31 * yz * v[10] - F2 * C32 * xy * v[11] - F6 * C33 * xz * v[12]
-        gx += C32 * (F4 * zz - F3 * xx - yy) * v[13] + F2 * C35 * xz * v[14] + F3 * C30 * (xx - yy) * v[15]
-        gy += F3 * C30 * (xx - yy) * v[9] + C31 * xz * v[10] + C32 * (F4 * zz - xx - F3 * yy) * v[11]
-        gy += -F6 * C33 * yz * v[12] - F2 * C32 * xy * v[13] - F2 * C35 * yz * v[14] - F6 * C30 * xy * v[15]
+        gx += (
+            F6 * C30 * xy * v[9] + C31 * yz * v[10] - F2 * C32 * xy * v[11] - F6 * C33 * xz * v[12]
+        )
+        gx += (
+            C32 * (F4 * zz - F3 * xx - yy) * v[13]
+            + F2 * C35 * xz * v[14]
+            + F3 * C30 * (xx - yy) * v[15]
+        )
+        gy += (
+            F3 * C30 * (xx - yy) * v[9] + C31 * xz * v[10] + C32 * (F4 * zz - xx - F3 * yy) * v[11]
+        )
+        gy += (
+            -F6 * C33 * yz * v[12]
+            - F2 * C32 * xy * v[13]
+            - F2 * C35 * yz * v[14]
+            - F6 * C30 * xy * v[15]
+        )
         gz += C31 * xy * v[10] + F4 * F2 * C32 * yz * v[11] + F3 * C33 * (F2 * zz - xx - yy) * v[12]
         gz += F4 * F2 * C32 * xz * v[13] + C35 * (xx - yy) * v[14]
     if degree >= 4:
         seven = F7 * zz
-        gx += C40 * y * (F3 * xx - yy) * v[16] + F6 * C41 * xy * z * v[17] + C42 * y * (seven - ONE) * v[18]
+        gx += (
+            C40 * y * (F3 * xx - yy) * v[16]
+            + F6 * C41 * xy * z * v[17]
+            + C42 * y * (seven - ONE) * v[18]
+        )
         gx += C43 * z * (seven - F3) * v[21] + F2 * C46 * x * (seven - ONE) * v[22]
         gx += F3 * C41 * z * (xx - yy) * v[23] + F4 * C48 * x * (xx - F3 * yy) * v[24]
-        gy += C40 * x * (xx - F3 * yy) * v[16] + F3 * C41 * z * (xx - yy) * v[17] + C42 * x * (seven - ONE) * v[18]
+        gy += (
+            C40 * x * (xx - F3 * yy) * v[16]
+            + F3 * C41 * z * (xx - yy) * v[17]
+            + C42 * x * (seven - ONE) * v[18]
+        )
         gy += C43 * z * (seven - F3) * v[19] - F2 * C46 * y * (seven - ONE) * v[22]
         gy += -F6 * C41 * xy * z * v[23] + F4 * C48 * y * (yy - F3 * xx) * v[24]
-        gz += C41 * y * (F3 * xx - yy) * v[17] + F2 * F7 * C42 * xy * z * v[18] + C43 * y * (F3 * seven - F3) * v[19]
+        gz += (
+            C41 * y * (F3 * xx - yy) * v[17]
+            + F2 * F7 * C42 * xy * z * v[18]
+            + C43 * y * (F3 * seven - F3) * v[19]
+        )
         gz += C44 * z * (F4 * F35 * zz - F2 * F30) * v[20] + C43 * x * (F3 * seven - F3) * v[21]
         gz += F2 * F7 * C46 * z * (xx - yy) * v[22] + C41 * x * (xx - F3 * yy) * v[23]
     return gx, gy, gz
@@ -90,14 +129,18 @@ def view_direction(w, cam, out):
 
 @part
 def load_sh(shN, rows, terms, w):
-    """Loads the ``terms`` harmonics above degree 0 of sixteen rows, three channels each, into ``w``."""
+    """Loads the ``terms`` harmonics above degree 0 of sixteen rows, three channels each, into
+    ``w``.
+    """
     for first in range(0, 3 * terms, 16):
         load_rows(shN, rows, 3 * terms, first, min(3 * terms - first, 16), w, first)
 
 
 @part
 def color(first, found, means, sh0, shN, degree, cam, records, depths, ids):
-    """Writes the colours ``max(0, 0.5 + SH)`` of the packed records; returns how many remain: only finite ones."""
+    """Writes the colours ``max(0, 0.5 + SH)`` of the packed records; returns how many remain: only
+    finite ones.
+    """
     w, sh, basis = scratch(f32x16, 16), scratch(f32x16, 80), scratch(f32x16, 25)
     rows, targets = scratch(int64, 16), scratch(int64, 16)
     terms = (degree + 1) * (degree + 1) - 1

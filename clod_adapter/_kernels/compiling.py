@@ -16,12 +16,20 @@ from clod_adapter.errors import ClodError
 if config.DISABLE_JIT:  # type: ignore[attr-defined]
     raise ClodError("NUMBA_DISABLE_JIT is set, and the kernels run compiled only; unset it")
 
-# A kernel uses constants and functions of other files, so the stamp covers the sources of all kernels.
-_STAMP = hashlib.sha256(b"".join(p.read_bytes() for p in sorted(Path(__file__).parent.glob("*.py")))).hexdigest()
+# A kernel uses constants and functions of other files, so the stamp covers the sources of all
+# kernels.
+_STAMP = hashlib.sha256(
+    b"".join(p.read_bytes() for p in sorted(Path(__file__).parent.glob("*.py")))
+).hexdigest()
 
 
 # Division by zero gives inf, as in NumPy, and no exception; a * b + c may be fused.
-OPTIONS: Any = {"nogil": True, "error_model": "numpy", "fastmath": {"contract"}, "no_cfunc_wrapper": True}
+OPTIONS: Any = {
+    "nogil": True,
+    "error_model": "numpy",
+    "fastmath": {"contract"},
+    "no_cfunc_wrapper": True,
+}
 
 
 def kernel(function: Callable[..., Any]) -> Any:
@@ -33,10 +41,11 @@ def kernel(function: Callable[..., Any]) -> Any:
 
 
 class _CacheFile(IndexDataCacheFile):  # type: ignore[misc]
-    """Compiled variants, each in a file named by a hash of all that its code depends on and written atomically.
+    """Compiled variants, each in a file named by a hash of all that its code depends on and written
+    atomically.
 
-    Numba's own writes an index and then a numbered file: in between other processes load old code, two processes may
-    choose the same number, and a truncated file stays an error.
+    Numba's own writes an index and then a numbered file: in between other processes load old code,
+    two processes may choose the same number, and a truncated file stays an error.
     """
 
     def _name(self, key: Any) -> str:
@@ -82,9 +91,12 @@ class _Inlined(JITCodeLibrary):  # type: ignore[misc]
 
 class _Inlining(CompilerBase):  # type: ignore[misc]
     def define_pipelines(self) -> Any:
-        self.state.library = _Inlined(self.state.targetctx.codegen(), self.state.func_id.func_qualname)
+        self.state.library = _Inlined(
+            self.state.targetctx.codegen(), self.state.func_id.func_qualname
+        )
         return [DefaultPassBuilder.define_nopython_pipeline(self.state)]
 
 
-# Always inlined: a call would pass seven words on the stack per array. Only kernels call it: Python would crash.
+# Always inlined: a call would pass seven words on the stack per array. Only kernels call it: Python
+# would crash.
 part = njit(forceinline=True, no_cpython_wrapper=True, pipeline_class=_Inlining, **OPTIONS)  # type: ignore[call-overload]

@@ -4,9 +4,15 @@ from numba import float32
 
 import clod_adapter._kernels as limits
 
-ALPHA_MIN, ALPHA_MAX, T_MIN = (float32(v) for v in (limits.ALPHA_MIN, limits.ALPHA_MAX, limits.T_MIN))
+ALPHA_MIN, ALPHA_MAX, T_MIN = (
+    float32(v) for v in (limits.ALPHA_MIN, limits.ALPHA_MAX, limits.T_MIN)
+)
 QUAT_MIN2, QUAT_MAX2 = float32(limits.QUAT_MIN**2), float32(limits.QUAT_MAX**2)
-LOG2E, LOG2_255, TWO_LN2 = float32(1.4426950408889634), float32(7.994353436858858), float32(1.3862943611198906)
+LOG2E, LOG2_255, TWO_LN2 = (
+    float32(1.4426950408889634),
+    float32(7.994353436858858),
+    float32(1.3862943611198906),
+)
 HALF, ZERO, ONE, TWO = float32(0.5), float32(0), float32(1), float32(2)
 HUGE = float32(3e38)  # larger values are dropped as not finite
 
@@ -15,16 +21,17 @@ HUGE = float32(3e38)  # larger values are dropped as not finite
 MX, MY, QA, QB, QC, LOG, RED, GREEN, BLUE, REACH, RX, DET, X0, Y0, X1, Y1 = range(16)
 RECORD = 16
 
-# A camera: viewmat row-major (16), fx, fy, cx, cy, width, height, ray clamp low x, high x, low y, high y,
-# centre in world coordinates (3), near plane; then the screen-space filter: its variance (px^2), and 1 if opacities are
-# compensated for it.
+# A camera: viewmat row-major (16), fx, fy, cx, cy, width, height, ray clamp low x, high x, low y,
+# high y, centre in world coordinates (3), near plane; then the screen-space filter: its variance
+# (px^2), and 1 if opacities are compensated for it.
 FX, FY, CX, CY, WIDTH, HEIGHT, LOW_X, HIGH_X, LOW_Y, HIGH_Y, EYE = range(16, 27)
 NEAR, BLUR, COMPENSATE = range(EYE + 3, EYE + 6)
 CAMERA = COMPENSATE + 1
 
-# The workspace of sixteen Gaussians: vectors with one lane per Gaussian. As stored: mean (3), quaternion (4), scales
-# (3). Then camera point (3), rotation (9), U = J R_view (6), P = U R S (6), blurred covariance (3), its determinant,
-# unit quaternion (4), 1 / |quaternion|, determinant of P P^T.
+# The workspace of sixteen Gaussians: vectors with one lane per Gaussian. As stored: mean (3),
+# quaternion (4), scales (3). Then camera point (3), rotation (9), U = J R_view (6), P = U R S (6),
+# blurred covariance (3), its determinant, unit quaternion (4), 1 / |quaternion|, determinant of P
+# P^T.
 MEAN, STORED, SCALE, POINT, ROT, UMAT, PMAT = 0, 3, 7, 10, 13, 22, 28
 COV, COVDET, QUAT, QINV, RAWDET = 34, 37, 38, 42, 43
 WORKSPACE = 44 + 16  # load_rows always fills sixteen vectors
@@ -37,7 +44,7 @@ PAIR = 9
 # Records are prefetched this many entries ahead.
 AHEAD = 4
 
-# Gradients of sixteen Gaussians as vectors: sums over pixels (9), P (6), rotation matrix (9), then what is stored:
-# scales (3), quaternion (4), mean (3), SH degree 0 (3).
+# Gradients of sixteen Gaussians as vectors: sums over pixels (9), P (6), rotation matrix (9), then
+# what is stored: scales (3), quaternion (4), mean (3), SH degree 0 (3).
 SUMS, V_P, V_ROT, V_SCALE, V_QUAT, V_MEAN, V_SH0 = 0, 9, 15, 24, 27, 31, 34
 GRADIENTS = 37 + 16

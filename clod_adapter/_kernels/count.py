@@ -1,4 +1,6 @@
-"""The count term's gradient at typical distances (``training/target_count.py``), sixteen Gaussians at a time."""
+"""The count term's gradient at typical distances (``training/target_count.py``), sixteen Gaussians
+at a time.
+"""
 
 from numba import float32
 
@@ -32,8 +34,9 @@ def count_kept(worker, workers, sigma, d, dial2, counts):
 
 @kernel
 def count_slope(worker, workers, sigma, d, dial2, lift, penalty, out):
-    """``out [N]``: ``penalty w / (1 + w)^2``, ``w = min(t, 1/t)^(2^DOUBLINGS)``; where a row is culled, at least
-    ``penalty lift``."""
+    """``out [N]``: ``penalty w / (1 + w)^2``, ``w = min(t, 1/t)^(2^DOUBLINGS)``; where a row is
+    culled, at least ``penalty lift``.
+    """
     first, last = len(sigma) * worker // workers, len(sigma) * (worker + 1) // workers
     sigma, d, out = pointer(sigma), pointer(d), pointer(out)
     square, least, scale = float32(dial2), float32(lift), float32(penalty)
@@ -44,4 +47,6 @@ def count_slope(worker, workers, sigma, d, dial2, lift, penalty, out):
         for _ in range(DOUBLINGS - 1):
             odds = odds * odds
         slope = odds / ((ONE + odds) * (ONE + odds))
-        store_some(out, i, last - i, scale * select(gt(reach2, far2), slope, vmax(slope, splat(least))))
+        store_some(
+            out, i, last - i, scale * select(gt(reach2, far2), slope, vmax(slope, splat(least)))
+        )

@@ -1,8 +1,8 @@
 """The dial's equation (``equation/attenuation.py``) as the first part of the projection.
 
-``kept`` reads the 16 bytes of a Gaussian that decide whether it is culled, its centre and its reach; what is culled
-costs nothing after that. All in float32: of a few hundred thousand Gaussians, one at its end may be judged otherwise
-than by the equation, with an opacity of 0 there.
+``kept`` reads the 16 bytes of a Gaussian that decide whether it is culled, its centre and its
+reach; what is culled costs nothing after that. All in float32: of a few hundred thousand Gaussians,
+one at its end may be judged otherwise than by the equation, with an opacity of 0 there.
 """
 
 from numba import float32, uint64
@@ -10,11 +10,19 @@ from numba import float32, uint64
 from clod_adapter._kernels import conventions as c
 from clod_adapter._kernels.compiling import kernel, part
 from clod_adapter._kernels.elementary import bits_of, exp2, log2, vabs
-from clod_adapter._kernels.pointers import first_lanes, gather, load_some, load_triples, pointer, scatter, scratch
+from clod_adapter._kernels.pointers import (
+    first_lanes,
+    gather,
+    load_some,
+    load_triples,
+    pointer,
+    scatter,
+    scratch,
+)
 from clod_adapter._kernels.simd import both, f32x16, ge, gt, select, splat, vmax, vmin
 
-# A dial: (s / D)^2 and (s / (D r))^2, in 1 / world units^2, 1 / H^2 (0 without near Gaussians), and 1 where scales and
-# opacities are activated and there is no dial.
+# A dial: (s / D)^2 and (s / (D r))^2, in 1 / world units^2, 1 / H^2 (0 without near Gaussians), and
+# 1 where scales and opacities are activated and there is no dial.
 RATE2, GROWTH_RATE2, NEAR2, ACTIVATED = range(4)
 DIAL = ACTIVATED + 1
 
@@ -69,7 +77,8 @@ def reciprocal_opacity(logit):
 
 @part
 def kept(at, many, means, opacities, sigma, cam, dial, dialled):
-    """The bits of those of ``many`` <= 16 rows from ``at`` on that are in front of the camera and not culled.
+    """The bits of those of ``many`` <= 16 rows from ``at`` on that are in front of the camera and
+    not culled.
 
     Activated opacities are 1/255 at least.
     """
@@ -104,7 +113,8 @@ def mark_kept(worker, workers, means, sigma, cam, dial, out):
 
 @part
 def drawn(rows, opacities, sigma, growth, cam, dial, dialled, grows, w):
-    """The drawn opacities of sixteen rows, whose centres and logarithms of scales ``w`` holds; makes these scales.
+    """The drawn opacities of sixteen rows, whose centres and logarithms of scales ``w`` holds;
+    makes these scales.
 
     Activated ones stay as they are.
     """
@@ -123,7 +133,8 @@ def drawn(rows, opacities, sigma, growth, cam, dial, dialled, grows, w):
         opacity = opacity * fade
         if grows:
             size = gather(growth, rows) * log2_magnification(distance2, dial)
-            size = vmin(splat(LOG2_GROWTH_MAX), vmax(splat(-LOG2_GROWTH_MAX), size))  # NaN stays, and is not drawn
+            # NaN stays, and is not drawn
+            size = vmin(splat(LOG2_GROWTH_MAX), vmax(splat(-LOG2_GROWTH_MAX), size))
     for k in range(c.SCALE, c.SCALE + 3):
         w[k] = exp2(vmin(w[k] * c.LOG2E + size, splat(FARTHEST_EXPONENT)))
     return opacity
@@ -137,16 +148,19 @@ def log2_magnification(distance2, dial):
 
 @part
 def dial_gradient(rows, given, cam, dial, dialled, grows, shaped, w, g):
-    """Gradients of logit, sigma and growth of sixteen rows; makes those of the scales in ``g`` of their logarithms.
+    """Gradients of logit, sigma and growth of sixteen rows; makes those of the scales in ``g`` of
+    their logarithms.
 
-    With w the gradient of the logarithm of the drawn opacity (``equation/attenuation.py``), per Gaussian::
+    With w the gradient of the logarithm of the drawn opacity (``equation/attenuation.py``), per
+    Gaussian::
 
         dL/dlogit    = w sigmoid(-logit)
         dL/dsigma    = w 4 t^4 / ((1 - t^4) sigma)      distances are constants
         dL/dlogscale = dL/dscale scale
         dL/dgrowth   = sum of dL/dlogscale, times log m         0 where the growth is clamped
 
-    Of activated ones, that of the opacity alone. ``given`` are the three, and where their gradients go.
+    Of activated ones, that of the opacity alone. ``given`` are the three, and where their gradients
+    go.
     """
     opacities, sigma, growth, v_opacities, v_sigma, v_growth = given
     opacity = gather(opacities, rows)

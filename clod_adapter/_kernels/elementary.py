@@ -1,11 +1,22 @@
-"""Elementary functions of sixteen-lane vectors, and sets of blocks and of lanes as bits of a uint64."""
+"""Elementary functions of sixteen-lane vectors, and sets of blocks and of lanes as bits of a
+uint64.
+"""
 
 import math
 
 from llvmlite import ir
 from numba import types
 
-from clod_adapter._kernels.simd import INTEGERS, LANES, VECTOR, call_llvm, f32x16, llvm_function, mask16, operation
+from clod_adapter._kernels.simd import (
+    INTEGERS,
+    LANES,
+    VECTOR,
+    call_llvm,
+    f32x16,
+    llvm_function,
+    mask16,
+    operation,
+)
 
 
 def _constant(value: float) -> ir.Constant:
@@ -15,7 +26,8 @@ def _constant(value: float) -> ir.Constant:
 vsqrt, vfloor, vceil, vabs = (llvm_function(name, 1) for name in ("sqrt", "floor", "ceil", "fabs"))
 
 
-# Minimax polynomial of 2^f on [-0.5, 0.5] with p(0) = 1: relative error 9e-8, in float32 arithmetic 2e-7.
+# Minimax polynomial of 2^f on [-0.5, 0.5] with p(0) = 1: relative error 9e-8, in float32 arithmetic
+# 2e-7.
 _EXP2 = (1.32646524e-3, 9.67151132e-3, 5.55073396e-2, 2.40222421e-1, 6.93146978e-1, 1.0)
 
 # Added to a small number, it leaves the nearest integer in the low bits of the sum.
@@ -44,17 +56,23 @@ def log2(builder, x):
     """``log2(x)`` of positive normal numbers, to 1e-7 plus its own rounding; 0 at 1."""
     bits = builder.bitcast(x, INTEGERS)
     exponent = builder.ashr(builder.sub(bits, _constant(_TINY)), _constant(23))
-    m = builder.bitcast(builder.sub(bits, builder.shl(exponent, _constant(23))), VECTOR)  # in [sqrt(1/2), sqrt(2))
+    # in [sqrt(1/2), sqrt(2))
+    m = builder.bitcast(builder.sub(bits, builder.shl(exponent, _constant(23))), VECTOR)
     s = builder.fdiv(builder.fsub(m, _constant(1.0)), builder.fadd(m, _constant(1.0)))
     square, p = builder.fmul(s, s), _constant(2 / math.log(2) / 9)
     for k in (7, 5, 3, 1):
-        p = call_llvm(builder, "llvm.fmuladd.v16f32", VECTOR, [p, square, _constant(2 / math.log(2) / k)])
-    return call_llvm(builder, "llvm.fmuladd.v16f32", VECTOR, [p, s, builder.sitofp(exponent, VECTOR)])
+        p = call_llvm(
+            builder, "llvm.fmuladd.v16f32", VECTOR, [p, square, _constant(2 / math.log(2) / k)]
+        )
+    return call_llvm(
+        builder, "llvm.fmuladd.v16f32", VECTOR, [p, s, builder.sitofp(exponent, VECTOR)]
+    )
 
 
 @operation(types.none, types.CPointer(types.uint64), types.int64, f32x16, f32x16)
 def set_spans(builder, words, index, low, high):
-    """In the r-th of sixteen groups of sixteen bits from ``words[index]`` on, sets bits low[r] to high[r].
+    """In the r-th of sixteen groups of sixteen bits from ``words[index]`` on, sets bits low[r] to
+    high[r].
 
     Both are rounded towards zero; where high < low no bit is set.
     """
@@ -62,7 +80,9 @@ def set_spans(builder, words, index, low, high):
     bits = builder.sub(builder.shl(_constant(2), high), builder.shl(_constant(1), low))
     bits = builder.select(builder.icmp_signed(">=", high, low), bits, _constant(0))
     narrow = builder.trunc(bits, ir.VectorType(ir.IntType(16), LANES))
-    builder.store(narrow, builder.bitcast(builder.gep(words, [index]), narrow.type.as_pointer()), align=8)
+    builder.store(
+        narrow, builder.bitcast(builder.gep(words, [index]), narrow.type.as_pointer()), align=8
+    )
 
 
 # The mask as the low sixteen bits of a uint64.

@@ -18,7 +18,9 @@ _recent: deque[int] = deque()
 
 
 def recycled(shape: torch.Size | tuple[int, ...]) -> Tensor:
-    """An uninitialised float32 tensor in memory of an earlier, freed one; a large one begins on a cache line."""
+    """An uninitialised float32 tensor in memory of an earlier, freed one; a large one begins on a
+    cache line.
+    """
     size = math.prod(shape)
     if size < _SMALL:
         return torch.empty(shape, dtype=torch.float32, device="cpu")
@@ -45,7 +47,8 @@ def recycled_array(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
 
 
 def _give_back(whole: np.ndarray) -> None:
-    # No lock: this runs where the last tensor is freed, perhaps within ``recycled``. Each operation is atomic.
+    # No lock: this runs where the last tensor is freed, perhaps within ``recycled``. Each operation
+    # is atomic.
     _idle.setdefault(len(whole), []).append(whole)
     _recent.append(len(whole))
     while len(_recent) > IDLE or sum(_recent) > IDLE_FLOATS:

@@ -1,4 +1,6 @@
-"""Memory in kernels: pointers, stack memory, prefetching, atomics, and rows of a table, one lane per row."""
+"""Memory in kernels: pointers, stack memory, prefetching, atomics, and rows of a table, one lane
+per row.
+"""
 
 from llvmlite import ir
 from numba import float32, types
@@ -20,15 +22,19 @@ from clod_adapter._kernels.simd import (
 )
 
 I32, I64, NOTHING = ir.IntType(32), ir.IntType(64), ir.VoidType()
-FLOATS, NUMBERS, VECTORS = types.CPointer(float32), types.CPointer(types.int64), types.CPointer(f32x16)
+FLOATS, NUMBERS, VECTORS = (
+    types.CPointer(float32),
+    types.CPointer(types.int64),
+    types.CPointer(f32x16),
+)
 
 
 @intrinsic
 def pointer(typingctx, array):
     """The address of a contiguous array; ``p[i]`` is its i-th element in memory order.
 
-    Kernels convert their arguments to pointers first: passing an array counts references atomically, and indexing one
-    handles negative indices. Bounds are not checked.
+    Kernels convert their arguments to pointers first: passing an array counts references
+    atomically, and indexing one handles negative indices. Bounds are not checked.
     """
 
     def codegen(context, builder, signature, args):
@@ -39,7 +45,9 @@ def pointer(typingctx, array):
 
 @intrinsic(prefer_literal=True)
 def scratch(typingctx, kind, size):
-    """A pointer to a constant number of ``kind`` on the stack; LLVM keeps small ones in registers."""
+    """A pointer to a constant number of ``kind`` on the stack; LLVM keeps small ones in
+    registers.
+    """
     element = kind.instance_type
 
     def codegen(context, builder, signature, args):
@@ -54,7 +62,9 @@ def scratch(typingctx, kind, size):
 def prefetch(builder, values, index):
     """Prefetches the cache line of ``values[index]``."""
     byte = builder.bitcast(builder.gep(values, [index]), ir.IntType(8).as_pointer())
-    call_llvm(builder, "llvm.prefetch.p0i8", NOTHING, [byte, *(ir.Constant(I32, v) for v in (0, 3, 1))])
+    call_llvm(
+        builder, "llvm.prefetch.p0i8", NOTHING, [byte, *(ir.Constant(I32, v) for v in (0, 3, 1))]
+    )
 
 
 @operation(types.int64, NUMBERS)
@@ -157,20 +167,29 @@ def _lanes(builder, lanes, at, count=LANES):
 
 @operation(types.none, FLOATS, NUMBERS, *[types.int64] * 3, VECTORS, types.int64)
 def load_rows(builder, source, rows, width, first, count, lanes, at):
-    """``lanes[at + k]`` = column ``first + k`` of sixteen rows of ``source [*, width]``, for k < count <= 16.
+    """``lanes[at + k]`` = column ``first + k`` of sixteen rows of ``source [*, width]``, for
+    k < count <= 16.
 
     ``rows`` are their sixteen numbers. The vectors up to at + 15 are overwritten.
     """
     mask = _first(builder, count)
-    found = [_masked_load(builder, address, mask) for address in _addresses(builder, source, rows, width, first)]
-    for vector, address in zip(_transposed(builder, found), _lanes(builder, lanes, at), strict=True):
+    found = [
+        _masked_load(builder, address, mask)
+        for address in _addresses(builder, source, rows, width, first)
+    ]
+    for vector, address in zip(
+        _transposed(builder, found), _lanes(builder, lanes, at), strict=True
+    ):
         builder.store(vector, address, align=4)
 
 
 @operation(types.none, FLOATS, NUMBERS, *[types.int64] * 3, VECTORS, types.int64)
 def store_rows(builder, destination, rows, width, first, count, lanes, at):
     """The inverse of ``load_rows``; of rows that are listed twice the last is stored."""
-    mask, found = _first(builder, count), [builder.load(x, align=4) for x in _lanes(builder, lanes, at)]
+    mask, found = (
+        _first(builder, count),
+        [builder.load(x, align=4) for x in _lanes(builder, lanes, at)],
+    )
     addresses = _addresses(builder, destination, rows, width, first)
     for address, row in zip(addresses, _transposed(builder, found), strict=True):
         _masked_store(builder, address, mask, row)
@@ -178,13 +197,17 @@ def store_rows(builder, destination, rows, width, first, count, lanes, at):
 
 @operation(types.none, VECTORS)
 def _split_triples(builder, lanes):
-    """Of sixteen triples in three vectors, makes vectors of the first, the second and the third ones."""
+    """Of sixteen triples in three vectors, makes vectors of the first, the second and the third
+    ones.
+    """
     addresses = _lanes(builder, lanes, ir.Constant(I64, 0), 3)
     a, b, c = (builder.load(x, align=4) for x in addresses)
     for k, address in enumerate(addresses):
         order = range(k, 3 * LANES, 3)
         # Lanes of a and b first; those of c, from 32 on, take the places that are left.
-        two = builder.shuffle_vector(a, b, ir.Constant(INTEGERS, [min(o, 2 * LANES - 1) for o in order]))
+        two = builder.shuffle_vector(
+            a, b, ir.Constant(INTEGERS, [min(o, 2 * LANES - 1) for o in order])
+        )
         rest = [lane if o < 2 * LANES else o - LANES for lane, o in enumerate(order)]
         builder.store(builder.shuffle_vector(two, c, ir.Constant(INTEGERS, rest)), address, align=4)
 
@@ -205,5 +228,7 @@ def store_sums(builder, values, index, *given):
     while len(vectors) > 1:  # adds neighbouring lanes until one vector holds all the sums, in order
         vectors = [*vectors, vectors[-1]] if len(vectors) % 2 else vectors
         pairs = zip(vectors[::2], vectors[1::2], strict=True)
-        vectors = [builder.fadd(*(builder.shuffle_vector(a, b, half) for half in halves)) for a, b in pairs]
+        vectors = [
+            builder.fadd(*(builder.shuffle_vector(a, b, half) for half in halves)) for a, b in pairs
+        ]
     _masked_store(builder, _vector_at(builder, values, index), nine, vectors[0])

@@ -1,8 +1,9 @@
 """Projection of Gaussians to the image: the local affine approximation (EWA splatting).
 
-Conventions of gsplat: pixel centres at +0.5, the filter's variance added to the covariance and, with ``compensate``,
-the opacity compensated for it; the Jacobian's ray clamped to 1.3 times the field of view (0.3 beyond the image on
-either side), the camera's near plane, alpha below 1/255 dropped. Sixteen Gaussians at a time, one per lane.
+Conventions of gsplat: pixel centres at +0.5, the filter's variance added to the covariance and,
+with ``compensate``, the opacity compensated for it; the Jacobian's ray clamped to 1.3 times the
+field of view (0.3 beyond the image on either side), the camera's near plane, alpha below 1/255
+dropped. Sixteen Gaussians at a time, one per lane.
 """
 
 from numba import float32, float64, int64, uint64
@@ -27,11 +28,16 @@ def load_stored(means, quats, scales, rows, w):
 
 @part
 def covariance(cam, w):
-    """Fills the rest of the workspace ``w``; returns which are in front of the near plane and have a rotation."""
+    """Fills the rest of the workspace ``w``; returns which are in front of the near plane and have
+    a rotation.
+    """
     for d in range(3):
         row = 4 * d
         w[c.POINT + d] = (
-            cam[row] * w[c.MEAN] + cam[row + 1] * w[c.MEAN + 1] + cam[row + 2] * w[c.MEAN + 2] + cam[row + 3]
+            cam[row] * w[c.MEAN]
+            + cam[row + 1] * w[c.MEAN + 1]
+            + cam[row + 2] * w[c.MEAN + 2]
+            + cam[row + 3]
         )
     norm2 = w[c.STORED] * w[c.STORED] + w[c.STORED + 1] * w[c.STORED + 1]
     norm2 = norm2 + w[c.STORED + 2] * w[c.STORED + 2] + w[c.STORED + 3] * w[c.STORED + 3]
@@ -54,7 +60,14 @@ def covariance(cam, w):
             w[c.PMAT + 3 * row + k] = along * w[c.SCALE + k]
     # P P^T with and without blur, and determinants as sums of squares, exact for needles.
     blur = cam[c.BLUR]
-    p0, p1, p2, p3, p4, p5 = w[c.PMAT], w[c.PMAT + 1], w[c.PMAT + 2], w[c.PMAT + 3], w[c.PMAT + 4], w[c.PMAT + 5]
+    p0, p1, p2, p3, p4, p5 = (
+        w[c.PMAT],
+        w[c.PMAT + 1],
+        w[c.PMAT + 2],
+        w[c.PMAT + 3],
+        w[c.PMAT + 4],
+        w[c.PMAT + 5],
+    )
     xx, yy = p0 * p0 + p1 * p1 + p2 * p2, p3 * p3 + p4 * p4 + p5 * p5
     w[c.COV], w[c.COV + 1], w[c.COV + 2] = xx + blur, p0 * p3 + p1 * p4 + p2 * p5, yy + blur
     cx, cy, cz = p1 * p5 - p2 * p4, p2 * p3 - p0 * p5, p0 * p4 - p1 * p3
@@ -82,25 +95,35 @@ def rotation(w):
 def centres(means, rows, cam, out):
     """Sixteen centres on the image, x then y in pixels, and their depths, into ``out [48]``.
 
-    In float64: at the edge of a picture 960 wide a float32 centre is off by 1e-4 pixels, and alpha by as much.
+    In float64: at the edge of a picture 960 wide a float32 centre is off by 1e-4 pixels, and alpha
+    by as much.
     """
     for lane in range(16):
         at = 3 * rows[lane]
         x, y, z = float64(means[at]), float64(means[at + 1]), float64(means[at + 2])
         depth = cam[8] * x + cam[9] * y + cam[10] * z + cam[11]
         inverse = float64(1) / depth
-        out[lane] = cam[c.FX] * (cam[0] * x + cam[1] * y + cam[2] * z + cam[3]) * inverse + cam[c.CX]
-        out[16 + lane] = cam[c.FY] * (cam[4] * x + cam[5] * y + cam[6] * z + cam[7]) * inverse + cam[c.CY]
+        out[lane] = (
+            cam[c.FX] * (cam[0] * x + cam[1] * y + cam[2] * z + cam[3]) * inverse + cam[c.CX]
+        )
+        out[16 + lane] = (
+            cam[c.FY] * (cam[4] * x + cam[5] * y + cam[6] * z + cam[7]) * inverse + cam[c.CY]
+        )
         out[32 + lane] = depth
 
 
 @part
 def make_records(w, centre, opacity, cam, record):
-    """Fills the sixteen columns of the records except the colours; returns which of them reach a pixel centre."""
+    """Fills the sixteen columns of the records except the colours; returns which of them reach a
+    pixel centre.
+    """
     mx, my = load(centre, 0), load(centre, 16)
     idet = c.ONE / w[c.COVDET]
     record[c.MX], record[c.MY] = mx, my
-    record[c.QA], record[c.QC] = c.HALF * c.LOG2E * w[c.COV + 2] * idet, c.HALF * c.LOG2E * w[c.COV] * idet
+    record[c.QA], record[c.QC] = (
+        c.HALF * c.LOG2E * w[c.COV + 2] * idet,
+        c.HALF * c.LOG2E * w[c.COV] * idet,
+    )
     record[c.QB], record[c.DET] = -(c.LOG2E * w[c.COV + 1] * idet), c.LOG2E * c.LOG2E * idet
     if cam[c.COMPENSATE] > c.ZERO:  # NaN for an infinite covariance, which is not drawn
         opacity = opacity * vsqrt(w[c.RAWDET] * idet)
@@ -119,14 +142,16 @@ def make_records(w, centre, opacity, cam, record):
 
 @part
 def add_records(rows, filled, packed, spare, means, opacity, cam, w, records, depths, ids):
-    """Packs those of the first ``filled`` of sixteen ``rows`` that reach a pixel centre, from the record ``packed`` on.
+    """Packs those of the first ``filled`` of sixteen ``rows`` that reach a pixel centre, from the
+    record ``packed`` on.
 
     ``w`` holds what is stored of the rows. Returns the number of the next record.
     """
     record, centre, targets = scratch(f32x16, RECORD), scratch(float32, 48), scratch(int64, 16)
     valid = covariance(cam, w)
     centres(means, rows, cam, centre)
-    valid = both(valid, ge(load(centre, 32), splat(cam[c.NEAR])))  # in float32 too, not only in float64
+    # in float32 too, not only in float64
+    valid = both(valid, ge(load(centre, 32), splat(cam[c.NEAR])))
     valid = both(valid, both(make_records(w, centre, opacity, cam, record), first_lanes(filled)))
     bits = bits_of(valid)
     if bits == uint64(0):
@@ -142,20 +167,52 @@ def add_records(rows, filled, packed, spare, means, opacity, cam, w, records, de
 
 @kernel
 def project(
-    worker, workers, means, quats, scales, opacities, sigma, growth, sh0, shN, degree, cam, dial, records, depths, ids,
+    worker,
+    workers,
+    means,
+    quats,
+    scales,
+    opacities,
+    sigma,
+    growth,
+    sh0,
+    shN,
+    degree,
+    cam,
+    dial,
+    records,
+    depths,
+    ids,
     counts,
-):  # fmt: skip
-    """Writes records, depths and row numbers of this worker's visible Gaussians, packed from its first row.
+):
+    """Writes records, depths and row numbers of this worker's visible Gaussians, packed from its
+    first row.
 
-    Scales and opacities are logarithms and logits as stored, drawn at the ``dial``, or activated ones. Where ``sigma``
-    or ``growth`` is empty, there is no dial, or no growth. After its N records, ``records`` has a spare one for each
-    worker.
+    Scales and opacities are logarithms and logits as stored, drawn at the ``dial``, or activated
+    ones. Where ``sigma`` or ``growth`` is empty, there is no dial, or no growth. After its N
+    records, ``records`` has a spare one for each worker.
     """
-    n, spare, dialled, grows = len(opacities), len(opacities) + worker, len(sigma) > 0, len(growth) > 0
+    n, spare, dialled, grows = (
+        len(opacities),
+        len(opacities) + worker,
+        len(sigma) > 0,
+        len(growth) > 0,
+    )
     first, last = n * worker // workers, n * (worker + 1) // workers
-    means, quats, scales, opacities = pointer(means), pointer(quats), pointer(scales), pointer(opacities)
+    means, quats, scales, opacities = (
+        pointer(means),
+        pointer(quats),
+        pointer(scales),
+        pointer(opacities),
+    )
     sigma, growth, sh0, shN = pointer(sigma), pointer(growth), pointer(sh0), pointer(shN)
-    cam, dial, records, depths, ids = pointer(cam), pointer(dial), pointer(records), pointer(depths), pointer(ids)
+    cam, dial, records, depths, ids = (
+        pointer(cam),
+        pointer(dial),
+        pointer(records),
+        pointer(depths),
+        pointer(ids),
+    )
     w, rows, queue = scratch(f32x16, WORKSPACE), scratch(int64, 16), scratch(int64, 32)
     i = packed = first
     queued = 0
@@ -177,5 +234,9 @@ def project(
         queued -= filled
         load_stored(means, quats, scales, rows, w)
         opacity = drawn(rows, opacities, sigma, growth, cam, dial, dialled, grows, w)
-        packed = add_records(rows, filled, packed, spare, means, opacity, cam, w, records, depths, ids)
-    counts[worker] = color(first, packed - first, means, sh0, shN, degree, cam, records, depths, ids)
+        packed = add_records(
+            rows, filled, packed, spare, means, opacity, cam, w, records, depths, ids
+        )
+    counts[worker] = color(
+        first, packed - first, means, sh0, shN, degree, cam, records, depths, ids
+    )

@@ -1,4 +1,6 @@
-"""Gradient of the projection: from the blending's sums over pixels to the parameters of each Gaussian."""
+"""Gradient of the projection: from the blending's sums over pixels to the parameters of each
+Gaussian.
+"""
 
 from numba import float32, int64
 
@@ -17,8 +19,9 @@ def covariance_gradient(w, g, cam, compensated):
     """Gradients of scales, rotation matrix and mean from the sums over pixels."""
     idet = c.ONE / w[c.COVDET]
     a, b, e = w[c.COV + 2] * idet, -(w[c.COV + 1] * idet), w[c.COV] * idet
-    # dL/dP = K M (K P) with the conic K = [[a, b], [b, e]] and the second moments M of the sums. K P comes from
-    # K = adj(P P^T + blur) / det term by term: for a needle, K times the long column of P would cancel.
+    # dL/dP = K M (K P) with the conic K = [[a, b], [b, e]] and the second moments M of the sums. K
+    # P comes from K = adj(P P^T + blur) / det term by term: for a needle, K times the long column
+    # of P would cancel.
     for k in range(3):
         p0, p1 = w[c.PMAT + k], w[c.PMAT + 3 + k]
         t0, t1 = cam[c.BLUR] * p0, cam[c.BLUR] * p1
@@ -43,11 +46,19 @@ def covariance_gradient(w, g, cam, compensated):
 
 @part
 def compensation_gradient(w, g, k, t0, t1):
-    """Adds the gradient through the compensation c to column k of P: that of log c is ``(P P^T)^-1 P - K P``.
+    """Adds the gradient through the compensation c to column k of P: that of log c is
+    ``(P P^T)^-1 P - K P``.
 
-    ``t0, t1`` is the column of K P. The gradient with respect to log c equals that with respect to log opacity.
+    ``t0, t1`` is the column of K P. The gradient with respect to log c equals that with respect to
+    log opacity.
     """
-    p0, p1, u0, u1, inverse = w[c.PMAT + k], w[c.PMAT + 3 + k], splat(c.ZERO), splat(c.ZERO), c.ONE / w[c.RAWDET]
+    p0, p1, u0, u1, inverse = (
+        w[c.PMAT + k],
+        w[c.PMAT + 3 + k],
+        splat(c.ZERO),
+        splat(c.ZERO),
+        c.ONE / w[c.RAWDET],
+    )
     for j in range(3):
         if j != k:
             cross = p0 * w[c.PMAT + 3 + j] - w[c.PMAT + j] * p1
@@ -58,7 +69,9 @@ def compensation_gradient(w, g, k, t0, t1):
 
 @part
 def point_gradient(w, g, v_x, v_y, cam):
-    """Adds the gradients through the projected centre and through the Jacobian to that of the mean."""
+    """Adds the gradients through the projected centre and through the Jacobian to that of the
+    mean.
+    """
     x, y, iz = w[c.POINT], w[c.POINT + 1], c.ONE / w[c.POINT + 2]
     rx, ry = x * iz, y * iz
     clamped_x = vmin(vmax(rx, splat(cam[c.LOW_X])), splat(cam[c.HIGH_X]))
@@ -73,7 +86,9 @@ def point_gradient(w, g, v_x, v_y, cam):
         j11, j12 = j11 + u1 * cam[4 + d], j12 + u1 * cam[8 + d]
     fx, fy = cam[c.FX] * iz, cam[c.FY] * iz
     # The projected centre, then the factor 1/z of all four entries of the Jacobian.
-    v_z = -(fx * rx * v_x + fy * ry * v_y) - iz * (fx * (j00 - clamped_x * j02) + fy * (j11 - clamped_y * j12))
+    v_z = -(fx * rx * v_x + fy * ry * v_y) - iz * (
+        fx * (j00 - clamped_x * j02) + fy * (j11 - clamped_y * j12)
+    )
     v_rx = select(eq(clamped_x, rx), -(fx * j02 * iz), splat(c.ZERO))
     v_ry = select(eq(clamped_y, ry), -(fy * j12 * iz), splat(c.ZERO))
     v_x, v_y, v_z = fx * v_x + v_rx, fy * v_y + v_ry, v_z - v_rx * rx - v_ry * ry
@@ -98,7 +113,9 @@ def quat_gradient(w, g):
 
 @part
 def color_gradient(w, g, shN, rows, degree, cam, sh, basis, tuned, v_shN):
-    """Gradients of the harmonics above degree 0 if ``tuned``, and of the mean through the direction."""
+    """Gradients of the harmonics above degree 0 if ``tuned``, and of the mean through the
+    direction.
+    """
     inverse = view_direction(w, cam, sh)
     x, y, z = sh[0], sh[1], sh[2]
     sh_basis(degree, x, y, z, basis)
@@ -126,7 +143,9 @@ def clear(values, first, last, width):
 
 
 @part
-def no_gradient(first, last, shaped, colored, terms, v_means, v_quats, v_scales, v_opacities, v_sh0, v_shN):
+def no_gradient(
+    first, last, shaped, colored, terms, v_means, v_quats, v_scales, v_opacities, v_sh0, v_shN
+):
     """Sets the gradients of the rows from ``first`` up to ``last``, which are not visible, to 0."""
     clear(v_opacities, first, last, 1)
     clear(v_means, first, last, 3 * shaped)
@@ -138,7 +157,9 @@ def no_gradient(first, last, shaped, colored, terms, v_means, v_quats, v_scales,
 
 @part
 def add_slots(pair_sums, slots, records, packed, lanes, sums, g):
-    """Sums the slots of sixteen packed Gaussians into ``g[SUMS]`` and into the rows of ``sums [16, 16]``."""
+    """Sums the slots of sixteen packed Gaussians into ``g[SUMS]`` and into the rows of
+    ``sums [16, 16]``.
+    """
     for lane in range(16):
         total = splat(c.ZERO)
         for slot in range(slots[2 * packed[lane]], slots[2 * packed[lane] + 1]):
@@ -147,31 +168,84 @@ def add_slots(pair_sums, slots, records, packed, lanes, sums, g):
     load_rows(sums, lanes, 16, 0, c.PAIR, g, c.SUMS)
     load_rows(records, packed, c.RECORD, c.RED, 3, g, c.SUMS + c.PAIR)
     for k in range(3):  # a colour clamped at 0 has no gradient
-        g[c.SUMS + k] = select(gt(g[c.SUMS + c.PAIR + k], splat(c.ZERO)), g[c.SUMS + k], splat(c.ZERO))
+        g[c.SUMS + k] = select(
+            gt(g[c.SUMS + c.PAIR + k], splat(c.ZERO)), g[c.SUMS + k], splat(c.ZERO)
+        )
 
 
 @kernel
 def project_gradient(
-    worker, workers, means, quats, scales, opacities, sigma, growth, shN, degree, cam, dial, records, packed_ids,
-    counts, slots, pair_sums, compensated, trained, v_means, v_quats, v_scales, v_opacities, v_sigma, v_growth, v_sh0,
+    worker,
+    workers,
+    means,
+    quats,
+    scales,
+    opacities,
+    sigma,
+    growth,
+    shN,
+    degree,
+    cam,
+    dial,
+    records,
+    packed_ids,
+    counts,
+    slots,
+    pair_sums,
+    compensated,
+    trained,
+    v_means,
+    v_quats,
+    v_scales,
+    v_opacities,
+    v_sigma,
+    v_growth,
+    v_sh0,
     v_shN,
-):  # fmt: skip
-    """Sums the slots of each visible Gaussian and computes the gradients of what ``project`` takes, in row order.
+):
+    """Sums the slots of each visible Gaussian and computes the gradients of what ``project`` takes,
+    in row order.
 
-    They are 0 from the row ``trained`` on. ``compensated`` is True if the camera's filter compensates opacities, else
-    None, a separate type for which numba compiles the kernel without compensation. Empty ``v_means``, ``v_quats`` and
-    ``v_scales`` skip these gradients, an empty ``v_sh0`` or ``v_shN`` its own.
+    They are 0 from the row ``trained`` on. ``compensated`` is True if the camera's filter
+    compensates opacities, else None, a separate type for which numba compiles the kernel without
+    compensation. Empty ``v_means``, ``v_quats`` and ``v_scales`` skip these gradients, an empty
+    ``v_sh0`` or ``v_shN`` its own.
     """
     w, g = scratch(f32x16, WORKSPACE), scratch(f32x16, GRADIENTS)
     sh, basis = scratch(f32x16, 80), scratch(f32x16, 25)
-    rows, packed, lanes, sums = scratch(int64, 16), scratch(int64, 16), scratch(int64, 16), scratch(float32, 256)
+    rows, packed, lanes, sums = (
+        scratch(int64, 16),
+        scratch(int64, 16),
+        scratch(int64, 16),
+        scratch(float32, 256),
+    )
     shaped, colored, tuned = len(v_means) > 0, len(v_sh0) > 0, len(v_shN) > 0
-    dialled, grows, terms = len(sigma) > 0, len(growth) > 0, (degree + 1) * (degree + 1) - 1 if tuned else 0
+    dialled, grows, terms = (
+        len(sigma) > 0,
+        len(growth) > 0,
+        (degree + 1) * (degree + 1) - 1 if tuned else 0,
+    )
     first, last = len(opacities) * worker // workers, len(opacities) * (worker + 1) // workers
     end = first + counts[worker]
-    means, quats, scales, opacities = pointer(means), pointer(quats), pointer(scales), pointer(opacities)
-    sigma, growth, shN, cam, dial = pointer(sigma), pointer(growth), pointer(shN), pointer(cam), pointer(dial)
-    records, packed_ids, slots, pair_sums = pointer(records), pointer(packed_ids), pointer(slots), pointer(pair_sums)
+    means, quats, scales, opacities = (
+        pointer(means),
+        pointer(quats),
+        pointer(scales),
+        pointer(opacities),
+    )
+    sigma, growth, shN, cam, dial = (
+        pointer(sigma),
+        pointer(growth),
+        pointer(shN),
+        pointer(cam),
+        pointer(dial),
+    )
+    records, packed_ids, slots, pair_sums = (
+        pointer(records),
+        pointer(packed_ids),
+        pointer(slots),
+        pointer(pair_sums),
+    )
     v_means, v_quats, v_scales = pointer(v_means), pointer(v_quats), pointer(v_scales)
     v_opacities, v_sigma, v_growth = pointer(v_opacities), pointer(v_sigma), pointer(v_growth)
     v_sh0, v_shN = pointer(v_sh0), pointer(v_shN)
@@ -185,7 +259,19 @@ def project_gradient(
             packed[lane], lanes[lane] = min(start + lane, end - 1), lane
             row = rows[lane] = packed_ids[packed[lane]]
             if row > done:
-                no_gradient(done, row, shaped, colored, terms, v_means, v_quats, v_scales, v_opacities, v_sh0, v_shN)
+                no_gradient(
+                    done,
+                    row,
+                    shaped,
+                    colored,
+                    terms,
+                    v_means,
+                    v_quats,
+                    v_scales,
+                    v_opacities,
+                    v_sh0,
+                    v_shN,
+                )
             done = max(done, row + 1)
         add_slots(pair_sums, slots, records, packed, lanes, sums, g)
         load_stored(means, quats, scales, rows, w)
@@ -206,4 +292,6 @@ def project_gradient(
             for k in range(3):
                 g[c.V_SH0 + k] = C0 * g[c.SUMS + k]
             store_rows(v_sh0, rows, 3, 0, 3, g, c.V_SH0)
-    no_gradient(done, last, shaped, colored, terms, v_means, v_quats, v_scales, v_opacities, v_sh0, v_shN)
+    no_gradient(
+        done, last, shaped, colored, terms, v_means, v_quats, v_scales, v_opacities, v_sh0, v_shN
+    )

@@ -1,7 +1,8 @@
 """Sixteen-lane float vectors for Numba, as LLVM vectors.
 
-LLVM lowers ``<16 x float>`` to one AVX-512, two AVX or four SSE/NEON registers. Loads and stores take a contiguous
-float32 array or a pointer, and the index of the first lane; bounds are not checked.
+LLVM lowers ``<16 x float>`` to one AVX-512, two AVX or four SSE/NEON registers. Loads and stores
+take a contiguous float32 array or a pointer, and the index of the first lane; bounds are not
+checked.
 """
 
 import operator
@@ -40,7 +41,11 @@ def call_llvm(builder, name, result, arguments):
 
 
 def _pointer(context, builder, kind, value, index):
-    data = value if isinstance(kind, types.CPointer) else context.make_array(kind)(context, builder, value).data
+    data = (
+        value
+        if isinstance(kind, types.CPointer)
+        else context.make_array(kind)(context, builder, value).data
+    )
     return builder.bitcast(builder.gep(data, [index]), VECTOR.as_pointer())
 
 
@@ -49,7 +54,9 @@ def load(typingctx, array, index):
     """``array[index : index + 16]``."""
 
     def codegen(context, builder, signature, args):
-        return builder.load(_pointer(context, builder, signature.args[0], args[0], args[1]), align=4)
+        return builder.load(
+            _pointer(context, builder, signature.args[0], args[0], args[1]), align=4
+        )
 
     return f32x16(array, types.intp), codegen
 
@@ -70,15 +77,20 @@ def spread(builder, value, kind=VECTOR):
     """Sixteen copies of a number; a vector as it is."""
     if value.type == kind:
         return value
-    one = builder.insert_element(ir.Constant(kind, ir.Undefined), value, ir.Constant(ir.IntType(32), 0))
-    return builder.shuffle_vector(one, ir.Constant(kind, ir.Undefined), ir.Constant(INTEGERS, [0] * LANES))
+    one = builder.insert_element(
+        ir.Constant(kind, ir.Undefined), value, ir.Constant(ir.IntType(32), 0)
+    )
+    return builder.shuffle_vector(
+        one, ir.Constant(kind, ir.Undefined), ir.Constant(INTEGERS, [0] * LANES)
+    )
 
 
 def _operators(name, kinds, flags, *operators):
     """Defines operators of vectors: ``kinds`` are the arguments' types."""
 
     class Typing(AbstractTemplate):  # type: ignore[misc]
-        metadata = {"target": "cpu"}  # tried before the generic ones, of which each takes time to fail
+        # tried before the generic ones, of which each takes time to fail
+        metadata = {"target": "cpu"}
 
         def generic(self, args, kws):
             return typing_signature(f32x16, *args) if tuple(args) in kinds else None
@@ -93,7 +105,10 @@ def _operators(name, kinds, flags, *operators):
 
 
 # Not ``overload``: inlining hundreds of operators takes numba minutes.
-_pairs, _loose = ((f32x16, f32x16), (f32x16, types.float32), (types.float32, f32x16)), ("nsz", "contract")
+_pairs, _loose = (
+    ((f32x16, f32x16), (f32x16, types.float32), (types.float32, f32x16)),
+    ("nsz", "contract"),
+)
 _operators("fadd", _pairs, _loose, operator.add, operator.iadd)
 _operators("fsub", _pairs, _loose, operator.sub, operator.isub)
 _operators("fmul", _pairs, _loose, operator.mul, operator.imul)

@@ -1,7 +1,8 @@
 """Fused SSIM with its gradient: separable 11-tap Gaussian (sigma 1.5), zero padding, data range 1.
 
-Images are copied to planes ``[3, H, stride]`` with 16 zero lanes left and right of each row, so that blurs along a row
-need no edge cases. Rows beyond the image are skipped, which equals zero padding.
+Images are copied to planes ``[3, H, stride]`` with 16 zero lanes left and right of each row, so
+that blurs along a row need no edge cases. Rows beyond the image are skipped, which equals zero
+padding.
 """
 
 import numpy as np
@@ -45,13 +46,23 @@ def blur_row(lines, line, length):
 
 @kernel
 def ssim_slopes(worker, workers, x, y, width, g_mean, g_square, g_product, sums):
-    """Derivatives of each pixel's SSIM by the blurred x, x^2 and x y; ``sums[worker]``: sum of SSIM over the pixels."""
+    """Derivatives of each pixel's SSIM by the blurred x, x^2 and x y; ``sums[worker]``: sum of SSIM
+    over the pixels.
+    """
     channels, height, step = x.shape
-    x, y, g_mean, g_square, g_product = pointer(x), pointer(y), pointer(g_mean), pointer(g_square), pointer(g_product)
+    x, y, g_mean, g_square, g_product = (
+        pointer(x),
+        pointer(y),
+        pointer(g_mean),
+        pointer(g_square),
+        pointer(g_product),
+    )
     lines, zero = np.zeros(6 * step, np.float32), splat(float32(0))
     c1, c2, two = splat(C1), splat(C2), splat(TWO)
     result = 0.0
-    for task in range(channels * height * worker // workers, channels * height * (worker + 1) // workers):
+    for task in range(
+        channels * height * worker // workers, channels * height * (worker + 1) // workers
+    ):
         channel, row = task // height, task % height
         for at in range(PAD, step - PAD, 16):
             m_x = m_y = m_xx = m_yy = m_xy = zero
@@ -89,14 +100,26 @@ def ssim_slopes(worker, workers, x, y, width, g_mean, g_square, g_product, sums)
 
 
 @kernel
-def loss_gradient(worker, workers, x, y, width, g_mean, g_square, g_product, l1, dssim, v_image, sums):
-    """Gradient of ``l1 sum |x - y| - dssim sum SSIM`` by x, as ``[H, W, 3]``; ``sums[worker]``: sum of |x - y|."""
+def loss_gradient(
+    worker, workers, x, y, width, g_mean, g_square, g_product, l1, dssim, v_image, sums
+):
+    """Gradient of ``l1 sum |x - y| - dssim sum SSIM`` by x, as ``[H, W, 3]``; ``sums[worker]``: sum
+    of |x - y|.
+    """
     channels, height, step = x.shape
-    x, y, g_mean, g_square, g_product = pointer(x), pointer(y), pointer(g_mean), pointer(g_square), pointer(g_product)
+    x, y, g_mean, g_square, g_product = (
+        pointer(x),
+        pointer(y),
+        pointer(g_mean),
+        pointer(g_square),
+        pointer(g_product),
+    )
     lines, out, zero = np.zeros(3 * step, np.float32), np.empty(step, np.float32), splat(float32(0))
     two, weight = splat(TWO), splat(float32(-dssim))
     result = 0.0
-    for task in range(channels * height * worker // workers, channels * height * (worker + 1) // workers):
+    for task in range(
+        channels * height * worker // workers, channels * height * (worker + 1) // workers
+    ):
         channel, row = task // height, task % height
         for at in range(PAD, step - PAD, 16):
             m, s, p = zero, zero, zero
@@ -114,5 +137,7 @@ def loss_gradient(worker, workers, x, y, width, g_mean, g_square, g_product, l1,
         for column in range(width):
             difference = x[task * step + PAD + column] - y[task * step + PAD + column]
             result += abs(difference)
-            v_image[row, column, channel] = out[PAD + column] + float32(l1) * float32(np.sign(difference))
+            v_image[row, column, channel] = out[PAD + column] + float32(l1) * float32(
+                np.sign(difference)
+            )
     sums[worker] = result

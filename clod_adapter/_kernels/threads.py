@@ -1,4 +1,6 @@
-"""Runs compiled kernels on several cores, from plain Python threads: another OpenMP runtime would slow torch's down."""
+"""Runs compiled kernels on several cores, from plain Python threads: another OpenMP runtime would
+slow torch's down.
+"""
 
 import threading
 from collections.abc import Callable, Iterator
@@ -15,7 +17,9 @@ _alone, _before = 0, 0  # contexts open now, and torch's threads before the firs
 
 
 def worker_count() -> int:
-    """Number of workers: torch's number of threads (``torch.set_num_threads``, ``OMP_NUM_THREADS``)."""
+    """Number of workers: torch's number of threads (``torch.set_num_threads``,
+    ``OMP_NUM_THREADS``).
+    """
     return _before if _alone else torch.get_num_threads()
 
 

@@ -16,9 +16,10 @@ ROWS = np.arange(16, dtype=np.float32)
 def spans(records, r, ox, oy, side):
     """Columns of cells that the ellipse of the record at ``r`` touches in sixteen rows of cells.
 
-    Cells have ``side`` pixels a side, the first begins at (ox, oy). Returns the first and the last column of each row,
-    in lanes, 0 and -1 where it touches none. The ellipse is where alpha reaches 1/255. In a row of cells it is widest
-    at its own leftmost and rightmost points where those lie in it, else at the nearer edge.
+    Cells have ``side`` pixels a side, the first begins at (ox, oy). Returns the first and the last
+    column of each row, in lanes, 0 and -1 where it touches none. The ellipse is where alpha reaches
+    1/255. In a row of cells it is widest at its own leftmost and rightmost points where those lie
+    in it, else at the nearer edge.
     """
     my, rx, b = splat(records[r + c.MY]), splat(records[r + c.RX]), splat(records[r + c.QB])
     row = load(ROWS, 0) * side + (float32(oy) + c.HALF)
@@ -37,15 +38,18 @@ def spans(records, r, ox, oy, side):
     each = splat(c.ONE / side)
     low = vfloor((vmax(vceil(mx + x0 - c.SLACK), splat(records[r + c.X0])) - float32(ox)) * each)
     high = vfloor((vmin(vfloor(mx + x1 + c.SLACK), splat(records[r + c.X1])) - float32(ox)) * each)
-    touched = both(ge(bottom, top), ge(high, low))  # of cells: the columns of a needle may have crossed by rounding
+    # of cells: the columns of a needle may have crossed by rounding
+    touched = both(ge(bottom, top), ge(high, low))
     return select(touched, low, zero), select(touched, high, splat(-c.ONE))
 
 
 @kernel
 def depth_order(depths, counts, keys, order, keys_other, order_other):
-    """The packed records, near ones first: a radix sort of positive floats by their bits, 11 at a time.
+    """The packed records, near ones first: a radix sort of positive floats by their bits, 11 at a
+    time.
 
-    Worker w packed the first ``counts[w]`` of its part of ``depths [N]``, as uint32; the others are scratch.
+    Worker w packed the first ``counts[w]`` of its part of ``depths [N]``, as uint32; the others are
+    scratch.
     """
     digits, n = np.zeros((3, 2048), np.int64), 0
     for worker in range(len(counts)):
@@ -72,7 +76,8 @@ def depth_order(depths, counts, keys, order, keys_other, order_other):
 
 @part
 def tiles_across(records, r, ty, y0, y1, found):
-    """First and last column of tiles that the record at ``r`` touches in the tile row ``ty``; none: last < first.
+    """First and last column of tiles that the record at ``r`` touches in the tile row ``ty``; none:
+    last < first.
 
     ``found [32]`` keeps those of sixteen rows, for calls with ascending ``ty``.
     """
@@ -103,14 +108,23 @@ def tile_offsets(histogram, offsets, totals):
 
 
 @kernel
-def list_tiles(worker, workers, records, order, across, histogram, totals, slots, entries, entry_slots):
-    """Counts this worker's Gaussians per tile (its row of the histogram) and pairs of Gaussian and tile (its total).
+def list_tiles(
+    worker, workers, records, order, across, histogram, totals, slots, entries, entry_slots
+):
+    """Counts this worker's Gaussians per tile (its row of the histogram) and pairs of Gaussian and
+    tile (its total).
 
-    With ``slots``, from the offsets that ``tile_offsets`` makes of these: writes each tile's Gaussians in depth order,
-    and the slot that receives the pair's gradient. ``slots[2 p]`` to ``slots[2 p + 1]`` are those of the record p.
+    With ``slots``, from the offsets that ``tile_offsets`` makes of these: writes each tile's
+    Gaussians in depth order, and the slot that receives the pair's gradient. ``slots[2 p]`` to
+    ``slots[2 p + 1]`` are those of the record p.
     """
     first, last = len(order) * worker // workers, len(order) * (worker + 1) // workers
-    listed, cursor, records, order = len(slots) > 0, pointer(histogram[worker]), pointer(records), pointer(order)
+    listed, cursor, records, order = (
+        len(slots) > 0,
+        pointer(histogram[worker]),
+        pointer(records),
+        pointer(order),
+    )
     slots, entries, entry_slots = pointer(slots), pointer(entries), pointer(entry_slots)
     found, slot = scratch(float32, 32), totals[worker]
     for j in range(first, last):

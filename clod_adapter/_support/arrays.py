@@ -8,7 +8,9 @@ from torch import Tensor
 
 
 def tensor_of(values: Any) -> Tensor:
-    """A tensor unchanged; an array as a copy, as torch accepts neither foreign byte order nor negative strides."""
+    """A tensor unchanged; an array as a copy, as torch accepts neither foreign byte order nor
+    negative strides.
+    """
     if isinstance(values, Tensor):
         return values
     array = np.asarray(values)
@@ -16,5 +18,7 @@ def tensor_of(values: Any) -> Tensor:
 
 
 def float_tensor(values: Any) -> Tensor:
-    """A tensor unchanged; an array in float32, for which the rasterizers are made: numpy's default is float64."""
+    """A tensor unchanged; an array in float32, for which the rasterizers are made: numpy's default
+    is float64.
+    """
     return values if isinstance(values, Tensor) else torch.from_numpy(np.array(values, np.float32))

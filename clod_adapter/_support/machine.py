@@ -13,8 +13,16 @@ import torch
 def machine() -> dict[str, Any]:
     """Processor, cores, threads, versions and, if there is one, GPU, for reports."""
     gpu = {"gpu": torch.cuda.get_device_name()} if torch.cuda.is_available() else {}
-    versions = {"python": platform.python_version(), "torch": torch.__version__, "numba": numba.__version__}
-    return gpu | {"cpu": _cpu_name(), "cores": os.cpu_count(), "threads": torch.get_num_threads()} | versions
+    versions = {
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+        "numba": numba.__version__,
+    }
+    return (
+        gpu
+        | {"cpu": _cpu_name(), "cores": os.cpu_count(), "threads": torch.get_num_threads()}
+        | versions
+    )
 
 
 def machine_name(device: str = "cpu") -> str:

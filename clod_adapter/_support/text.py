@@ -1,4 +1,6 @@
-"""Text for outputs: file names, which to the system are bytes and need not be text; messages; the version."""
+"""Text for outputs: file names, which to the system are bytes and need not be text; messages; the
+version.
+"""
 
 import json
 import os
@@ -8,8 +10,8 @@ from typing import Any
 def as_text(name: str) -> str:
     """``name`` as text that UTF-8 can encode; valid text is unchanged.
 
-    A lone surrogate of a byte of a file name (PEP 383) becomes a character if it is valid UTF-8 with its neighbours,
-    else ``\\xff``; other surrogates become ``\\ud800``.
+    A lone surrogate of a byte of a file name (PEP 383) becomes a character if it is valid UTF-8
+    with its neighbours, else ``\\xff``; other surrogates become ``\\ud800``.
     """
     try:
         data = name.encode("utf-8", "surrogateescape")
@@ -19,17 +21,23 @@ def as_text(name: str) -> str:
 
 
 def file_name(text: str) -> str:
-    """The file name whose bytes are ``text`` in UTF-8, as a COLMAP model or a JSON file has it, in any locale."""
+    """The file name whose bytes are ``text`` in UTF-8, as a COLMAP model or a JSON file has it, in
+    any locale.
+    """
     return os.fsdecode(text.encode("utf-8"))
 
 
 def first_line(error: BaseException) -> str:
     """The first line of an error's message that is not blank, or its type."""
-    return next((line.strip() for line in str(error).splitlines() if line.strip()), type(error).__name__)
+    return next(
+        (line.strip() for line in str(error).splitlines() if line.strip()), type(error).__name__
+    )
 
 
 def script_json(value: Any) -> str:
-    """JSON without <, so that no text in it can end an HTML script element, or begin a comment in it."""
+    """JSON without <, so that no text in it can end an HTML script element, or begin a comment in
+    it.
+    """
     return json.dumps(value, allow_nan=False, ensure_ascii=False).replace("<", "\\u003c")
 
 

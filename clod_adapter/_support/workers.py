@@ -1,4 +1,6 @@
-"""Worker threads of ``concurrent.futures``; where a thread cannot be started, MemoryError is raised."""
+"""Worker threads of ``concurrent.futures``; where a thread cannot be started, MemoryError is
+raised.
+"""
 
 import os
 from collections import deque
@@ -23,19 +25,25 @@ if hasattr(os, "register_at_fork"):
 
 
 def submit(pool: ThreadPoolExecutor, call: Callable[..., Result], *given: Any) -> Future[Result]:
-    """``pool.submit``. Where a thread cannot be started, the pool's calls that have not begun are dropped."""
+    """``pool.submit``. Where a thread cannot be started, the pool's calls that have not begun are
+    dropped.
+    """
     try:
         return pool.submit(call, *given)
     except RuntimeError as error:
         shared.cache_clear()
         pool.shutdown(cancel_futures=True)
-        raise MemoryError("a thread cannot be started: too little memory, or too many threads") from error
+        raise MemoryError(
+            "a thread cannot be started: too little memory, or too many threads"
+        ) from error
 
 
 def in_order(calls: Iterable[Callable[[], Result]], count: int) -> Generator[Result, None, None]:
-    """Results of the calls, in order, run on ``count`` threads; at most ``2 count`` calls are in progress or waiting.
+    """Results of the calls, in order, run on ``count`` threads; at most ``2 count`` calls are in
+    progress or waiting.
 
-    If a call raises or the iterator is closed, started calls are waited for and no more are started.
+    If a call raises or the iterator is closed, started calls are waited for and no more are
+    started.
     """
     pool, pending = ThreadPoolExecutor(count), deque[Future[Result]]()
     try:

@@ -1,4 +1,5 @@
-"""Brings a scene's cameras into the checkpoint's frame, and finds the checkpoint's screen-space filter.
+"""Brings a scene's cameras into the checkpoint's frame, and finds the checkpoint's screen-space
+filter.
 
 Both are told by the photographs, and each change by a note.
 """
@@ -18,14 +19,22 @@ from clod_adapter.io.scene.colmap import load_points
 Note = Callable[[str], object]
 """Is called with each line that the user should read."""
 
-WORDS = {"off": "without antialiasing", "on": "with antialiasing", "mip": "with Mip-Splatting's antialiasing"}
+WORDS = {
+    "off": "without antialiasing",
+    "on": "with antialiasing",
+    "mip": "with Mip-Splatting's antialiasing",
+}
 
 
-def align(checkpoint: Checkpoint, scene: Scene, note: Note, *, required: bool) -> tuple[Scene, dict[str, Any]]:
-    """The scene with its cameras in the checkpoint's frame, if that fits clearly; and measurements for the report.
+def align(
+    checkpoint: Checkpoint, scene: Scene, note: Note, *, required: bool
+) -> tuple[Scene, dict[str, Any]]:
+    """The scene with its cameras in the checkpoint's frame, if that fits clearly; and measurements
+    for the report.
 
     Raises:
-        ClodError: the checkpoint fits in no frame, and that is ``required``; if not, there is a note.
+        ClodError: the checkpoint fits in no frame, and that is ``required``; if not, there is a
+            note.
     """
     found, guess = compare_frames(checkpoint, scene, note)
     ply, images, frame = checkpoint.path, scene.folder or "the photographs", None
@@ -40,8 +49,9 @@ def align(checkpoint: Checkpoint, scene: Scene, note: Note, *, required: bool) -
         note(f"warning: the photographs in {images}, to train on, have a single colour each")
     elif required and found.margin < 0:
         note(
-            f"warning: {ply} matches the photographs in {images}, but some differ more from it than from their own "
-            "mean colours; check for another exposure, views that it does not cover, or a poor checkpoint"
+            f"warning: {ply} matches the photographs in {images}, but some differ more from it than"
+            " from their own mean colours; check for another exposure, views that it does not"
+            " cover, or a poor checkpoint"
         )
     return scene, asdict(found) | {"guess": guess and guess.frame.description, "frame": frame}
 
@@ -49,7 +59,8 @@ def align(checkpoint: Checkpoint, scene: Scene, note: Note, *, required: bool) -
 def compare_frames(
     checkpoint: Checkpoint, scene: Scene, note: Note, cameras: Sequence[Camera] = ()
 ) -> tuple[Alignment, Guess | None]:
-    """How renders match the photographs, and after a poor match another frame that explains them better.
+    """How renders match the photographs, and after a poor match another frame that explains them
+    better.
 
     ``cameras`` are all of the scene's, if its photographs are not.
     """
@@ -61,8 +72,9 @@ def compare_frames(
     guess = guess_frame(checkpoint.gaussians, views, found, points, cameras)
     if guess and guess.clear:
         note(
-            f"{scene.folder or 'the photographs'}: the cameras are moved into the frame of {checkpoint.path} "
-            f"({guess.frame.name}): renders have {guess.psnr:.1f} dB there, {found.psnr:.1f} dB as given"
+            f"{scene.folder or 'the photographs'}: the cameras are moved into the frame of"
+            f" {checkpoint.path} ({guess.frame.name}): renders have {guess.psnr:.1f} dB there,"
+            f" {found.psnr:.1f} dB as given"
         )
     return found, guess
 
@@ -73,19 +85,27 @@ def mismatch(found: Alignment, guess: Guess | None) -> str:
     facts = f"{share} of its Gaussians are in view"
     if found.views:
         mean = f"their mean colours {found.mean_colour_psnr:.1f} dB"
-        facts = f"renders have a PSNR of {found.psnr:.1f} dB against {found.views} photographs, {mean}; {facts}"
+        facts = (
+            f"renders have a PSNR of {found.psnr:.1f} dB against {found.views} photographs, {mean};"
+            f" {facts}"
+        )
     if found.on_white:
         return (
-            f"{facts}; over white the renders have {found.white_psnr:.1f} dB, but clod-adapt renders over black: give "
-            "photographs with a transparent background (PNG; composited over black), or a checkpoint trained on black"
+            f"{facts}; over white the renders have {found.white_psnr:.1f} dB, but clod-adapt"
+            " renders over black: give photographs with a transparent background (PNG; composited"
+            " over black), or a checkpoint trained on black"
         )
     if guess:
-        return f"{facts}; in another frame renders have {guess.psnr:.1f} dB: {guess.frame.description}"
+        return (
+            f"{facts}; in another frame renders have {guess.psnr:.1f} dB: {guess.frame.description}"
+        )
     return f"{facts}; give the checkpoint of this scene, in the cameras' frame"
 
 
 def detect_filter(checkpoint: Checkpoint, views: Sequence[View], note: Note) -> Checkpoint:
-    """The checkpoint with its file's screen-space filter; if that has none, with the one that fits ``views`` best."""
+    """The checkpoint with its file's screen-space filter; if that has none, with the one that fits
+    ``views`` best.
+    """
     if checkpoint.filter_known or not views:
         return checkpoint
     gaussians = checkpoint.gaussians

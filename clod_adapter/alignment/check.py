@@ -1,8 +1,10 @@
-"""Checks before training that a checkpoint and the posed photographs share a world frame and a screen-space filter.
+"""Checks before training that a checkpoint and the posed photographs share a world frame and a
+screen-space filter.
 
-A checkpoint whose renders at s = 1 have a larger error than the photographs' mean colours nearly always has another
-position, other axes or another scale. Three other causes are told apart: views outside the checkpoint's coverage (by
-the share of explained views), another exposure (by the correlation) and another background (by a render over white).
+A checkpoint whose renders at s = 1 have a larger error than the photographs' mean colours nearly
+always has another position, other axes or another scale. Three other causes are told apart: views
+outside the checkpoint's coverage (by the share of explained views), another exposure (by the
+correlation) and another background (by a render over white).
 """
 
 import math
@@ -23,14 +25,15 @@ from clod_adapter.render import render
 MOST_VIEWS = 8
 # Root mean square deviation, below which a photograph counts as one colour with noise.
 FLAT = 2 / 255
-# Decides only if all photographs are flat. Eight photographs see nine tenths of a matching file, but much less of a
-# large one of which only some cameras were given.
+# Decides only if all photographs are flat. Eight photographs see nine tenths of a matching file,
+# but much less of a large one of which only some cameras were given.
 FEWEST_IN_VIEW = 0.01
-# Misplaced files measured at most 0.39, those off by a pixel or two at least 0.43 (the search finds these), matching
-# ones at least 0.91, or 0.67 with half of the Gaussians removed.
+# Misplaced files measured at most 0.39, those off by a pixel or two at least 0.43 (the search finds
+# these), matching ones at least 0.91, or 0.67 with half of the Gaussians removed.
 CORRELATED = 0.5
 CLEAR = 3.0  # dB by which another explanation must be better
-DOUBTFUL = 6.0  # dB above the mean colours, below which the frame may be wrong; matching files had 8 to 18
+# dB above the mean colours, below which the frame may be wrong; matching files had 8 to 18
+DOUBTFUL = 6.0
 # A wrong filter measured at least 0.48 dB worse than that of training.
 CLEAR_FILTER = 0.2  # dB, mean over the views
 MOST = 0.75  # share of the views in which the chosen filter must be better
@@ -38,7 +41,9 @@ MOST = 0.75  # share of the views in which the chosen filter must be better
 
 @dataclass(frozen=True)
 class Alignment:
-    """Agreement of renders and photographs; PSNRs are of the mean squared error over the views, NaN without any."""
+    """Agreement of renders and photographs; PSNRs are of the mean squared error over the views, NaN
+    without any.
+    """
 
     views: int  # number of views compared; photographs of one colour are skipped
     in_view: float  # share of the Gaussians whose centre projects into any of the views
@@ -72,12 +77,17 @@ class Alignment:
     @property
     def on_white(self) -> bool:
         """Whether the renders are worse than the mean colours over black, but better over white."""
-        return self.margin < 0 < self.white_psnr - self.mean_colour_psnr and self.white_psnr > self.psnr + CLEAR
+        return (
+            self.margin < 0 < self.white_psnr - self.mean_colour_psnr
+            and self.white_psnr > self.psnr + CLEAR
+        )
 
 
 @torch.no_grad()
 def check_alignment(gaussians: Gaussians, views: Sequence[View]) -> Alignment:
-    """Renders at most MOST_VIEWS of the views, evenly spread, at s = 1, and compares them with the photographs."""
+    """Renders at most MOST_VIEWS of the views, evenly spread, at s = 1, and compares them with the
+    photographs.
+    """
     views = spread(views, MOST_VIEWS)
     seen = torch.zeros(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
     for view in views:
@@ -88,17 +98,21 @@ def check_alignment(gaussians: Gaussians, views: Sequence[View]) -> Alignment:
         return Alignment(0, in_view, *[math.nan] * 5)
     error, over_white, constant, *_ = table.mean(0).tolist()
     return Alignment(
-        views=len(table), in_view=in_view, psnr=_decibels(error), mean_colour_psnr=_decibels(constant),
-        white_psnr=_decibels(over_white), correlation=correlation(table),
+        views=len(table),
+        in_view=in_view,
+        psnr=_decibels(error),
+        mean_colour_psnr=_decibels(constant),
+        white_psnr=_decibels(over_white),
+        correlation=correlation(table),
         explained=float((table[:, 0] < table[:, 2]).float().mean()),
-    )  # fmt: skip
+    )
 
 
 def compare_renders(gaussians: Gaussians, views: Sequence[View]) -> Tensor:
     """``[n, 5]`` means over the pixels and channels of each photograph that is not of one colour.
 
-    Squared error of the render over black, over white, and of the photograph's mean colour; variance of the render;
-    covariance of render and photograph.
+    Squared error of the render over black, over white, and of the photograph's mean colour;
+    variance of the render; covariance of render and photograph.
     """
     rows = []
     for view in views:
@@ -111,7 +125,9 @@ def compare_renders(gaussians: Gaussians, views: Sequence[View]) -> Tensor:
         white = (rendering.image + (1 - rendering.alpha)[..., None]).clamp(0, 1)
         centred = black - black.mean((0, 1))
         errors = [(black - photograph).square(), (white - photograph).square(), about.square()]
-        rows.append(torch.stack([each.mean() for each in (*errors, centred.square(), centred * about)]))
+        rows.append(
+            torch.stack([each.mean() for each in (*errors, centred.square(), centred * about)])
+        )
     return torch.stack(rows) if rows else gaussians.means.new_empty(0, 5)
 
 
@@ -126,13 +142,16 @@ def _decibels(error: float) -> float:
 
 
 @torch.no_grad()
-def compare_filters(gaussians: Gaussians, views: Sequence[View], expected: str = "off") -> tuple[str, dict[str, float]]:
+def compare_filters(
+    gaussians: Gaussians, views: Sequence[View], expected: str = "off"
+) -> tuple[str, dict[str, float]]:
     """The name in FILTERS of the filter that fits the photographs, and the mean PSNR with each.
 
-    Most files do not name theirs. With another filter than that of training, Gaussians of about a pixel render too
-    opaque or too faint. Another than ``expected`` is chosen if its mean PSNR over MOST_VIEWS of the views is
-    CLEAR_FILTER dB higher, its PSNR is higher in MOST of them and its pooled error is DOUBTFUL dB below that of the
-    photographs' mean colours (in a wrong frame, fainter is closer).
+    Most files do not name theirs. With another filter than that of training, Gaussians of about a
+    pixel render too opaque or too faint. Another than ``expected`` is chosen if its mean PSNR over
+    MOST_VIEWS of the views is CLEAR_FILTER dB higher, its PSNR is higher in MOST of them and its
+    pooled error is DOUBTFUL dB below that of the photographs' mean colours (in a wrong frame,
+    fainter is closer).
     """
     views = spread(views, MOST_VIEWS)
     photographs = [unit(view.image, gaussians.means) for view in views]
@@ -140,9 +159,13 @@ def compare_filters(gaussians: Gaussians, views: Sequence[View], expected: str =
 
     def errors(filtered: Gaussians) -> Tensor:
         pairs = zip(photographs, views, strict=True)
-        return torch.stack([(render(filtered, v.camera).image.clamp(0, 1) - p).square().mean() for p, v in pairs])
+        return torch.stack(
+            [(render(filtered, v.camera).image.clamp(0, 1) - p).square().mean() for p, v in pairs]
+        )
 
-    error = torch.stack([errors(gaussians.replace(screen_filter=each)) for each in FILTERS.values()])
+    error = torch.stack(
+        [errors(gaussians.replace(screen_filter=each)) for each in FILTERS.values()]
+    )
     psnr, names = -10 * error.clamp(min=1e-10).log10(), list(FILTERS)
     gained, means = psnr - psnr[names.index(expected)], psnr.mean(1)
     clear = (gained.mean(1) > CLEAR_FILTER) & ((gained > 0).float().mean(1) >= MOST)

@@ -1,7 +1,9 @@
-"""Frames of checkpoints that differ from that of the cameras: swapped axes, inverted poses, normalized worlds.
+"""Frames of checkpoints that differ from that of the cameras: swapped axes, inverted poses,
+normalized worlds.
 
-A frame is a similarity ``x_cameras = s R x_file + t``. The cameras are transformed into the frame of the file, which is
-exact for spherical harmonics too: ``[R_c | t_c]`` becomes ``[R_c R | (R_c t + t_c) / s]``.
+A frame is a similarity ``x_cameras = s R x_file + t``. The cameras are transformed into the frame
+of the file, which is exact for spherical harmonics too: ``[R_c | t_c]`` becomes
+``[R_c R | (R_c t + t_c) / s]``.
 """
 
 import itertools
@@ -13,9 +15,16 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-GSPLAT = "the checkpoint is in gsplat's normalized frame: train with --no-normalize-world-space, or undo the transform"
-NERFSTUDIO = "the checkpoint is in nerfstudio's normalized frame: copy dataparser_transforms.json to the scene"
-# Rotations of COLMAP's world in nerfstudio's readers before normalization: none, the current one, the older one.
+GSPLAT = (
+    "the checkpoint is in gsplat's normalized frame: train with --no-normalize-world-space, or undo"
+    " the transform"
+)
+NERFSTUDIO = (
+    "the checkpoint is in nerfstudio's normalized frame: copy dataparser_transforms.json to the"
+    " scene"
+)
+# Rotations of COLMAP's world in nerfstudio's readers before normalization: none, the current one,
+# the older one.
 NERFSTUDIO_TURNS = (
     ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
     ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0)),
@@ -24,20 +33,38 @@ NERFSTUDIO_TURNS = (
 
 
 POSES = (
-    ("OpenGL poses", False, True,
-     "the cameras look along -z with y up (OpenGL), where COLMAP's look along z with y down: negate the y and z axes "
-     "of their poses"),
-    ("inverted poses", True, False,
-     "the poses are camera to world, where COLMAP's are world to camera: invert them"),
-    ("inverted OpenGL poses", True, True,
-     "the poses are camera to world in OpenGL's axes, where COLMAP's are world to camera: negate their y and z axes "
-     "and invert them"),
-)  # fmt: skip
+    (
+        "OpenGL poses",
+        False,
+        True,
+        (
+            "the cameras look along -z with y up (OpenGL), where COLMAP's look along z with y down:"
+            " negate the y and z axes of their poses"
+        ),
+    ),
+    (
+        "inverted poses",
+        True,
+        False,
+        "the poses are camera to world, where COLMAP's are world to camera: invert them",
+    ),
+    (
+        "inverted OpenGL poses",
+        True,
+        True,
+        (
+            "the poses are camera to world in OpenGL's axes, where COLMAP's are world to camera:"
+            " negate their y and z axes and invert them"
+        ),
+    ),
+)
 
 
 @dataclass(frozen=True)
 class Frame:
-    """A frame of the file, ``x_cameras = scale rotation x_file + offset``, after the poses were corrected."""
+    """A frame of the file, ``x_cameras = scale rotation x_file + offset``, after the poses were
+    corrected.
+    """
 
     name: str
     description: str  # cause and remedy, for messages
@@ -48,7 +75,9 @@ class Frame:
     opengl: bool = False  # the cameras look along -z with y up
 
     def of(self, viewmats: Tensor) -> Tensor:
-        """``[V, 4, 4]`` float64, world to camera in the file's frame, of cameras as they were given."""
+        """``[V, 4, 4]`` float64, world to camera in the file's frame, of cameras as they were
+        given.
+        """
         viewmats = torch.linalg.inv(viewmats.double()) if self.inverted else viewmats.double()
         if self.opengl:
             viewmats = torch.diag(viewmats.new_tensor([1.0, -1, -1, 1])) @ viewmats
@@ -61,14 +90,18 @@ class Frame:
 
 
 def known_frames(viewmats: Tensor, points: Tensor | None = None) -> list[Frame]:
-    """The frames that follow from all cameras ``[V, 4, 4]`` and the scene's points, by which trainers normalize."""
+    """The frames that follow from all cameras ``[V, 4, 4]`` and the scene's points, by which
+    trainers normalize.
+    """
     here = torch.eye(3, dtype=torch.float64), 1.0, torch.zeros(3, dtype=torch.float64)
     poses = [Frame(name, text, *here, inverted, opengl) for name, inverted, opengl, text in POSES]
     return [*poses, *_axes(viewmats), *_nerfstudio(viewmats), *_gsplat(viewmats, points)]
 
 
 def into_file(viewmats: Tensor, rotation: Tensor, scale: float, offset: Tensor) -> Tensor:
-    """``[V, 4, 4]`` the cameras in the file's frame, for ``x_cameras = scale rotation x_file + offset``."""
+    """``[V, 4, 4]`` the cameras in the file's frame, for
+    ``x_cameras = scale rotation x_file + offset``.
+    """
     out = viewmats.clone()
     out[:, :3, :3] = viewmats[:, :3, :3] @ rotation
     out[:, :3, 3] = (viewmats[:, :3, :3] @ offset + viewmats[:, :3, 3]) / scale
@@ -76,9 +109,11 @@ def into_file(viewmats: Tensor, rotation: Tensor, scale: float, offset: Tensor) 
 
 
 def focus_of(viewmats: Tensor, rounds: int = 1) -> Tensor:
-    """``[3]`` the least-squares point closest to the optical axes; the mean centre if they are parallel.
+    """``[3]`` the least-squares point closest to the optical axes; the mean centre if they are
+    parallel.
 
-    After many ``rounds``, weighted by inverse distances, of least distances: one far camera does not decide it.
+    After many ``rounds``, weighted by inverse distances, of least distances: one far camera does
+    not decide it.
     """
     poses = torch.linalg.inv(viewmats.double())
     centres, forward = poses[:, :3, 3], poses[:, :3, 2]
@@ -97,18 +132,27 @@ def focus_of(viewmats: Tensor, rounds: int = 1) -> Tensor:
 def _axes(viewmats: Tensor) -> Iterator[Frame]:
     """The 47 other signed permutations of the axes, including mirrored ones."""
     identity = torch.eye(3, dtype=viewmats.dtype)
-    for order, signs in itertools.product(itertools.permutations(range(3)), itertools.product((1.0, -1.0), repeat=3)):
+    for order, signs in itertools.product(
+        itertools.permutations(range(3)), itertools.product((1.0, -1.0), repeat=3)
+    ):
         rotation = torch.diag(viewmats.new_tensor(signs)) @ identity[list(order)]
         if rotation.equal(identity):
             continue
-        names = ", ".join(("-" if sign < 0 else "") + "xyz"[axis] for sign, axis in zip(signs, order, strict=True))
+        names = ", ".join(
+            ("-" if sign < 0 else "") + "xyz"[axis] for sign, axis in zip(signs, order, strict=True)
+        )
         mirrored = " (mirrored)" if torch.linalg.det(rotation) < 0 else ""
-        text = f"the cameras' x, y, z are the file's {names}{mirrored}: export the checkpoint without that rotation"
+        text = (
+            f"the cameras' x, y, z are the file's {names}{mirrored}: export the checkpoint without"
+            " that rotation"
+        )
         yield Frame(f"axes {names}", text, rotation, 1.0, viewmats.new_zeros(3))
 
 
 def _nerfstudio(viewmats: Tensor) -> Iterator[Frame]:
-    """nerfstudio's default: mean up direction to z, mean centre to the origin, largest coordinate to 1."""
+    """nerfstudio's default: mean up direction to z, mean centre to the origin, largest coordinate
+    to 1.
+    """
     poses = torch.linalg.inv(viewmats)
     for rows in NERFSTUDIO_TURNS:
         turn = viewmats.new_tensor(rows)
@@ -116,15 +160,20 @@ def _nerfstudio(viewmats: Tensor) -> Iterator[Frame]:
         rotation = _turning(up, viewmats.new_tensor([0.0, 0, 1]))
         farthest = float(((centres - centres.mean(0)) @ rotation.T).abs().max())
         if farthest > 0:
-            yield _normalized("nerfstudio", NERFSTUDIO, rotation @ turn, 1 / farthest, -rotation @ centres.mean(0))
+            yield _normalized(
+                "nerfstudio", NERFSTUDIO, rotation @ turn, 1 / farthest, -rotation @ centres.mean(0)
+            )
 
 
 def _gsplat(viewmats: Tensor, points: Tensor | None) -> Iterator[Frame]:
-    """gsplat's ``normalize``: up, focus and median distance of the cameras, then principal axes of the points."""
+    """gsplat's ``normalize``: up, focus and median distance of the cameras, then principal axes of
+    the points.
+    """
     poses = torch.linalg.inv(viewmats)
     rotation = _turning(-poses[:, :3, 1].mean(0), viewmats.new_tensor([0.0, -1, 0]))
     centres, forward = poses[:, :3, 3] @ rotation.T, poses[:, :3, 2] @ rotation.T
-    focus = (centres - (forward * centres).sum(1, keepdim=True) * forward).quantile(0.5, dim=0)  # as numpy's median
+    # as numpy's median
+    focus = (centres - (forward * centres).sum(1, keepdim=True) * forward).quantile(0.5, dim=0)
     distance = float((centres - focus).norm(dim=1).quantile(0.5))
     if distance == 0:
         return
@@ -135,18 +184,23 @@ def _gsplat(viewmats: Tensor, points: Tensor | None) -> Iterator[Frame]:
     middle = turned.quantile(0.5, dim=0)
     axes = torch.linalg.eigh((turned - middle).T.cov()).eigenvectors.flip(1).T
     axes = axes * torch.linalg.det(axes).sign()
-    for signs in ((1.0, 1, 1), (1.0, -1, -1), (-1.0, 1, -1), (-1.0, -1, 1)):  # eigenvectors have no sign
+    # eigenvectors have no sign
+    for signs in ((1.0, 1, 1), (1.0, -1, -1), (-1.0, 1, -1), (-1.0, -1, 1)):
         turn = torch.diag(viewmats.new_tensor(signs)) @ axes
         yield _normalized("gsplat", GSPLAT, turn @ rotation, 1 / distance, -turn @ middle)
 
 
-def _normalized(name: str, description: str, rotation: Tensor, scale: float, offset: Tensor) -> Frame:
+def _normalized(
+    name: str, description: str, rotation: Tensor, scale: float, offset: Tensor
+) -> Frame:
     """The frame of ``x_file = scale (rotation x_cameras + offset)``."""
     return Frame(name, description, rotation.T, 1 / scale, -rotation.T @ offset)
 
 
 def _turning(source: Tensor, target: Tensor) -> Tensor:
-    """The smallest rotation from one direction to another (Rodrigues); half a turn for opposite directions."""
+    """The smallest rotation from one direction to another (Rodrigues); half a turn for opposite
+    directions.
+    """
     a, b = F.normalize(source, dim=0), F.normalize(target, dim=0)
     identity = torch.eye(3, dtype=a.dtype)
     cosine = float(a @ b)

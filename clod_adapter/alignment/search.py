@@ -1,7 +1,8 @@
 """Searches the frame of a checkpoint that does not fit its cameras.
 
-Known frames are ranked by the correlation of small renders with the photographs. If none fits, a scale and an offset
-are searched. The result is measured by ``check_alignment`` and given only if it fits clearly better.
+Known frames are ranked by the correlation of small renders with the photographs. If none fits, a
+scale and an offset are searched. The result is measured by ``check_alignment`` and given only if it
+fits clearly better.
 """
 
 from collections.abc import Callable, Sequence
@@ -11,7 +12,14 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from clod_adapter.alignment.check import CLEAR, DOUBTFUL, Alignment, check_alignment, compare_renders, correlation
+from clod_adapter.alignment.check import (
+    CLEAR,
+    DOUBTFUL,
+    Alignment,
+    check_alignment,
+    compare_renders,
+    correlation,
+)
 from clod_adapter.alignment.frames import Frame, focus_of, known_frames
 from clod_adapter.cameras import Camera, Scene, View, in_its_unit, spread
 from clod_adapter.gaussians import Gaussians
@@ -33,7 +41,8 @@ class Guess:
 
     frame: Frame
     psnr: float  # pooled, of the renders in that frame
-    clear: bool  # as far above the photographs' mean colours as files in their own frame are (DOUBTFUL)
+    # as far above the photographs' mean colours as files in their own frame are (DOUBTFUL)
+    clear: bool
 
 
 @torch.no_grad()
@@ -44,19 +53,26 @@ def guess_frame(
     points: Tensor | None = None,
     cameras: Sequence[Camera] = (),
 ) -> Guess | None:
-    """A frame whose PSNR is BETTER_THAN_MEAN dB above the photographs' mean colours and CLEAR dB above ``found``.
+    """A frame whose PSNR is BETTER_THAN_MEAN dB above the photographs' mean colours and CLEAR dB
+    above ``found``.
 
     ``cameras`` are all of the scene's, if ``views`` are not, and ``points`` those of its model.
     """
     if len(gaussians) == 0 or found.views == 0:
         return None
-    every = torch.stack([camera.viewmat.double() for camera in cameras or [view.camera for view in views]])
+    every = torch.stack(
+        [camera.viewmat.double() for camera in cameras or [view.camera for view in views]]
+    )
     score = _small(gaussians, views, *COARSE)
 
     def measured(frame: Frame) -> Guess | None:
         psnr = check_alignment(gaussians, views_in(views, frame)).psnr
         enough = max(found.mean_colour_psnr + BETTER_THAN_MEAN, found.psnr + CLEAR)
-        return Guess(frame, psnr, psnr >= found.mean_colour_psnr + DOUBTFUL) if psnr >= enough else None
+        return (
+            Guess(frame, psnr, psnr >= found.mean_colour_psnr + DOUBTFUL)
+            if psnr >= enough
+            else None
+        )
 
     known = measured(max(known_frames(every, points), key=score))
     if known:
@@ -78,14 +94,22 @@ def views_in(views: Sequence[View], frame: Frame) -> tuple[View, ...]:
 
 def scene_in(scene: Scene, frame: Frame) -> Scene:
     """The scene with its cameras in the file's frame, and the near planes of that frame's unit."""
-    return in_its_unit(replace(scene, train=views_in(scene.train, frame), test=views_in(scene.test, frame)))
+    return in_its_unit(
+        replace(scene, train=views_in(scene.train, frame), test=views_in(scene.test, frame))
+    )
 
 
-def _small(gaussians: Gaussians, views: Sequence[View], width: int, most: int) -> Callable[[Frame], float]:
-    """The correlation of small photographs with renders, in a frame, of the ``most`` Gaussians that cover most."""
+def _small(
+    gaussians: Gaussians, views: Sequence[View], width: int, most: int
+) -> Callable[[Frame], float]:
+    """The correlation of small photographs with renders, in a frame, of the ``most`` Gaussians that
+    cover most.
+    """
     shrunk = [_shrunk(view, width) for view in spread(views, VIEWS)]
     if len(gaussians) > most:
-        cover = F.logsigmoid(gaussians.opacity_logits) + gaussians.log_scales.topk(2, dim=1).values.sum(1)
+        cover = F.logsigmoid(gaussians.opacity_logits) + gaussians.log_scales.topk(
+            2, dim=1
+        ).values.sum(1)
         gaussians = gaussians.select(cover.topk(most).indices)
     return lambda frame: correlation(compare_renders(gaussians, views_in(shrunk, frame)))
 
@@ -95,15 +119,19 @@ def _search(
 ) -> Frame | None:
     """The best scale and offset; None if no correlation reaches LOWEST_CORRELATION.
 
-    Climbs to the nearest maximum from the best scale about the origin, and from the best ones about the points that all
-    and most cameras look at, with the median of the Gaussians moved there.
+    Climbs to the nearest maximum from the best scale about the origin, and from the best ones about
+    the points that all and most cameras look at, with the median of the Gaussians moved there.
     """
     middle, found = gaussians.means.double().median(dim=0).values.cpu(), []  # where cameras are
     for towards, rounds in ((0.0, 1), (1.0, 1), (1.0, ROUNDS)):
         focus = focus_of(viewmats, rounds)
-        unit = float((torch.linalg.inv(viewmats)[:, :3, 3] - focus).norm(dim=1).quantile(0.5).clamp(min=1e-9))
+        unit = float(
+            (torch.linalg.inv(viewmats)[:, :3, 3] - focus).norm(dim=1).quantile(0.5).clamp(min=1e-9)
+        )
         places = [_placed(scale, towards * (focus - scale * middle)) for scale in SCALES]
-        found.append((*_climb(score, max(places, key=score), focus, unit, (0.1, 0.02)), focus, unit))
+        found.append(
+            (*_climb(score, max(places, key=score), focus, unit, (0.1, 0.02)), focus, unit)
+        )
     best, frame, focus, unit = max(found, key=lambda start: start[0])
     if not best >= LOWEST_CORRELATION:
         return None
@@ -120,11 +148,17 @@ def _placed(scale: float, offset: Tensor) -> Frame:
 
 
 def _climb(
-    score: Callable[[Frame], float], frame: Frame, focus: Tensor, unit: float, steps: tuple[float, float]
+    score: Callable[[Frame], float],
+    frame: Frame,
+    focus: Tensor,
+    unit: float,
+    steps: tuple[float, float],
 ) -> tuple[float, Frame]:
-    """Pattern search for the nearest maximum; ``steps`` are the first and the last step, shares of ``unit``.
+    """Pattern search for the nearest maximum; ``steps`` are the first and the last step, shares of
+    ``unit``.
 
-    Moves along the axes, and scales about the point that the cameras look at, which keeps it in view.
+    Moves along the axes, and scales about the point that the cameras look at, which keeps it in
+    view.
     """
     step, smallest = steps
     best, trials = score(frame), 0
@@ -150,5 +184,7 @@ def _shrunk(view: View, width: int) -> View:
     if camera.width <= width:
         return view
     height = max(1, round(camera.height * width / camera.width))
-    image = F.adaptive_avg_pool2d(view.image.permute(2, 0, 1).float(), (height, width)).permute(1, 2, 0)
+    image = F.adaptive_avg_pool2d(view.image.permute(2, 0, 1).float(), (height, width)).permute(
+        1, 2, 0
+    )
     return View(camera.resized(width, height), image.round().to(torch.uint8))

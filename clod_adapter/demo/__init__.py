@@ -1,4 +1,6 @@
-"""The demo: photographs of a ray-traced gallery, a checkpoint trained on them, and figures of the results."""
+"""The demo: photographs of a ray-traced gallery, a checkpoint trained on them, and figures of the
+results.
+"""
 
 import zipfile
 from collections.abc import Mapping, Sequence
@@ -29,15 +31,23 @@ def unpack(capture: Path, base: Path) -> None:
     """Writes the capture and the base checkpoint that come with the package, unless they exist."""
     packed = resources.files("clod_adapter.demo")
     if not capture.exists():
-        with atomic_path(capture) as part, (packed / "capture.zip").open("rb") as file, zipfile.ZipFile(file) as photos:
+        with (
+            atomic_path(capture) as part,
+            (packed / "capture.zip").open("rb") as file,
+            zipfile.ZipFile(file) as photos,
+        ):
             photos.extractall(part)
     if not base.exists():
         with resources.as_file(packed / "base.spz") as path:
             save(base, load(path).gaussians)
 
 
-def draw(capture: Path, base: Path, model: Path, report: Mapping[str, Any], pictures: Mapping[str, Path]) -> None:
-    """Draws a held-out view of the base and at several dial values, and the quality curve of all held-out views."""
+def draw(
+    capture: Path, base: Path, model: Path, report: Mapping[str, Any], pictures: Mapping[str, Path]
+) -> None:
+    """Draws a held-out view of the base and at several dial values, and the quality curve of all
+    held-out views.
+    """
     view, gaussians = load_scene(capture).test[VIEW], load(model).gaussians
     panels = [Picture(view.image.numpy(), "photograph", "held out from training")]
     panels += measured(load(base).gaussians, gaussians, DIALS, view)
@@ -48,20 +58,29 @@ def draw(capture: Path, base: Path, model: Path, report: Mapping[str, Any], pict
 
 
 @torch.no_grad()
-def measured(base: Gaussians, model: Gaussians, dials: Sequence[float], view: View) -> list[Picture]:
+def measured(
+    base: Gaussians, model: Gaussians, dials: Sequence[float], view: View
+) -> list[Picture]:
     """Panels of the base and of the ascending dial values."""
     times = time_frames([(base, [1.0]), (model, dials)], [view.camera]).milliseconds
     shown = [("base", base, 1.0), *((f"s = {s:.3g}", model, s) for s in dials)]
     panels = []
     for (title, gaussians, s), taken in zip(shown, (*times[0], *times[1]), strict=True):
         (row,) = evaluate(gaussians, [view], [s])
-        detail = f"{row.kept:,.0f} Gaussians ({row.kept_share:.0%})\n{row.psnr:.1f} dB,  {taken:.1f} ms a frame"
+        detail = (
+            f"{row.kept:,.0f} Gaussians ({row.kept_share:.0%})\n{row.psnr:.1f} dB,  {taken:.1f} ms"
+            " a frame"
+        )
         panels.append(Picture(render(gaussians, view.camera, s).image.numpy(), title, detail))
     return panels
 
 
-def dial_strip(path: str | Path, panels: Sequence[Picture], title: str, crop: tuple[int, int, int, int] = CROP) -> None:
-    """Draws panels of one size side by side, above the part ``crop`` (left, top, width, height) of each enlarged."""
+def dial_strip(
+    path: str | Path, panels: Sequence[Picture], title: str, crop: tuple[int, int, int, int] = CROP
+) -> None:
+    """Draws panels of one size side by side, above the part ``crop`` (left, top, width, height) of
+    each enlarged.
+    """
     height, width = panels[0].image.shape[:2]
     left, right, top, bottom = crop[0], crop[0] + crop[2], crop[1], crop[1] + crop[3]
     tall, cell = [height / width, crop[3] / crop[2]], 2.6  # inches
@@ -72,7 +91,10 @@ def dial_strip(path: str | Path, panels: Sequence[Picture], title: str, crop: tu
             pixels = panel.image if panel.image.dtype == np.uint8 else np.clip(panel.image, 0, 1)
             whole.imshow(pixels, interpolation="antialiased", aspect="auto")
             part.imshow(pixels[top:bottom, left:right], interpolation="nearest", aspect="auto")
-            xs, ys = np.array([left, right, right, left, left]), np.array([top, top, bottom, bottom, top])
+            xs, ys = (
+                np.array([left, right, right, left, left]),
+                np.array([top, top, bottom, bottom, top]),
+            )
             whole.plot(xs - 0.5, ys - 0.5, color="white", linewidth=1.4, scalex=False, scaley=False)
             whole.set_axis_off()
             part.set(xticks=[], yticks=[], frame_on=False)
@@ -80,20 +102,33 @@ def dial_strip(path: str | Path, panels: Sequence[Picture], title: str, crop: tu
         save_figure(figure, path)
 
 
-def quality_curve(figure: Any, rows: Sequence[Mapping[str, float]], base_row: Mapping[str, float]) -> None:
-    """Draws PSNR, and below it SSIM, against the number of Gaussians kept, one labelled point per dial value."""
+def quality_curve(
+    figure: Any, rows: Sequence[Mapping[str, float]], base_row: Mapping[str, float]
+) -> None:
+    """Draws PSNR, and below it SSIM, against the number of Gaussians kept, one labelled point per
+    dial value.
+    """
     title = "Quality against Gaussians, mean over the held-out views"
     figure.suptitle(title, fontsize=11, weight="bold", x=0.02, ha="left")
     both = figure.subplots(2, 1, sharex=True, height_ratios=[1.5, 1])
-    for axes, key, label, colour in zip(both, ("psnr", "ssim"), ("PSNR (dB)", "SSIM"), (BLUE, ORANGE), strict=True):
+    for axes, key, label, colour in zip(
+        both, ("psnr", "ssim"), ("PSNR (dB)", "SSIM"), (BLUE, ORANGE), strict=True
+    ):
         axes.set_xscale("log")
         axes.margins(x=0.1, y=0.16)
         points = [("base", (base_row["kept"], base_row[key]))]
         points += [(f"{row['virtual_scale']:g}", (row["kept"], row[key])) for row in rows]
-        axes.plot(*zip(*(point for _, point in points[1:]), strict=True), "-o", color=colour, linewidth=1.8)
+        axes.plot(
+            *zip(*(point for _, point in points[1:]), strict=True),
+            "-o",
+            color=colour,
+            linewidth=1.8,
+        )
         axes.plot(*points[0][1], "D", color="white", markeredgecolor=INK, markersize=7, zorder=1)
         for text, point in points:
-            axes.annotate(text, point, (-4, 5), textcoords="offset points", ha="right", fontsize=8.5)
+            axes.annotate(
+                text, point, (-4, 5), textcoords="offset points", ha="right", fontsize=8.5
+            )
         axes.set_ylabel(label)
     axes.set_xlabel("Gaussians kept (log scale); the numbers are dial values")
     label_log(axes.xaxis)

@@ -1,11 +1,13 @@
-"""The normalised distance d of the dial's equation: of one camera, and one for each Gaussian over several cameras.
+"""The normalised distance d of the dial's equation: of one camera, and one for each Gaussian over
+several cameras.
 
 For a camera with centre c, a Gaussian with centre mu and the unit D (all in world units)::
 
     d = |mu - c| / D
 
-A plain file and an order of rows have one for each Gaussian, the geometric mean over the known cameras v:
-``d_i = exp(mean over v of log d_iv)``. A mean over the cameras that see it was no better.
+A plain file and an order of rows have one for each Gaussian, the geometric mean over the known
+cameras v: ``d_i = exp(mean over v of log d_iv)``. A mean over the cameras that see it was no
+better.
 """
 
 import math
@@ -20,18 +22,23 @@ from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
 
 Place = Camera | Viewpoint
-OUTLIER = 16.0  # times the median distance from the scene's centre: one camera that far away must not decide
-NEAREST = 1e-6  # lower bound of d in the geometric mean: a camera in a Gaussian's centre must not decide alone
+# times the median distance from the scene's centre: one camera that far away must not decide
+OUTLIER = 16.0
+# lower bound of d in the geometric mean: a camera in a Gaussian's centre must not decide alone
+NEAREST = 1e-6
 
 
 @torch.no_grad()
 def normalized_distances(means: Tensor, camera: Camera, config: AttenuationConfig) -> Tensor:
-    """``[N]`` the equation's d, without unit, >= 0, of ``means [N, 3]``, in float32 or, from float64, in float64.
+    """``[N]`` the equation's d, without unit, >= 0, of ``means [N, 3]``, in float32 or, from
+    float64, in float64.
 
     A constant for autograd: the dial adds nothing to the gradient of ``means``.
     """
-    means = means.to(torch.promote_types(means.dtype, torch.float32))  # float16's square overflows from 256 on
-    with torch.autocast(means.device.type, enabled=False):  # it would round the camera's position to 3 digits
+    # float16's square overflows from 256 on
+    means = means.to(torch.promote_types(means.dtype, torch.float32))
+    # it would round the camera's position to 3 digits
+    with torch.autocast(means.device.type, enabled=False):
         away = means - camera.position.to(means, non_blocking=means.device.type != "cpu")
         x, y, z = away.unbind(1)  # three times as fast as a norm over rows of 3
         distances = x.square().addcmul_(y, y).addcmul_(z, z).sqrt_()
@@ -39,30 +46,44 @@ def normalized_distances(means: Tensor, camera: Camera, config: AttenuationConfi
 
 
 @torch.no_grad()
-def normalizing_distance(distances: Tensor, means: Tensor, camera: Camera, config: AttenuationConfig) -> Tensor:
-    """0-d, D, world units, > 0: ``config.scene_distance``, in the paper's form the largest distance in the view.
+def normalizing_distance(
+    distances: Tensor, means: Tensor, camera: Camera, config: AttenuationConfig
+) -> Tensor:
+    """0-d, D, world units, > 0: ``config.scene_distance``, in the paper's form the largest distance
+    in the view.
 
-    That is taken over the Gaussians whose centre projects into the image from beyond the near plane, or over all where
-    there is none. It is at least the smallest normal number, so that 0 / D is 0, and 1 where there are no Gaussians.
+    That is taken over the Gaussians whose centre projects into the image from beyond the near
+    plane, or over all where there is none. It is at least the smallest normal number, so that 0 / D
+    is 0, and 1 where there are no Gaussians.
     """
     if config.form == "ours" or len(distances) == 0:
         value = config.scene_distance if config.form == "ours" else 1.0
         return torch.full((), value, dtype=distances.dtype, device=distances.device)
     inside = in_frustum(means, camera)
     # Without a selection, for whose size the host would wait for a GPU.
-    return distances.where(inside | ~inside.any(), 0).max().clamp(min=torch.finfo(distances.dtype).tiny)
+    return (
+        distances.where(inside | ~inside.any(), 0)
+        .max()
+        .clamp(min=torch.finfo(distances.dtype).tiny)
+    )
 
 
 def in_frustum(means: Tensor, camera: Camera) -> Tensor:
     """``[N]`` bool: the centre projects into the image, from beyond the near plane."""
-    projection = (camera.K @ camera.viewmat[:3].to(camera.K)).to(means, non_blocking=means.device.type != "cpu")
+    projection = (camera.K @ camera.viewmat[:3].to(camera.K)).to(
+        means, non_blocking=means.device.type != "cpu"
+    )
     x, y, z = projection[:, :3] @ means.T + projection[:, 3:]
-    return (z > camera.near) & (x >= 0) & (x < camera.width * z) & (y >= 0) & (y < camera.height * z)
+    return (
+        (z > camera.near) & (x >= 0) & (x < camera.width * z) & (y >= 0) & (y < camera.height * z)
+    )
 
 
 @torch.no_grad()
 def camera_unit(means: Tensor, camera: Camera, config: AttenuationConfig) -> float:
-    """``normalizing_distance`` of one camera and centres ``means [N, 3]``, world units, as a number to store."""
+    """``normalizing_distance`` of one camera and centres ``means [N, 3]``, world units, as a number
+    to store.
+    """
     if config.form == "ours":
         return config.scene_distance
     distances = (means - camera.position.to(means)).norm(dim=1)
@@ -70,44 +91,66 @@ def camera_unit(means: Tensor, camera: Camera, config: AttenuationConfig) -> flo
 
 
 def median_distance(means: Tensor, camera: Camera) -> float:
-    """Of the centres ``means [N, 3]`` in the image, or of all if there is none; world units, 1 for no centres."""
+    """Of the centres ``means [N, 3]`` in the image, or of all if there is none; world units, 1 for
+    no centres.
+    """
     inside = in_frustum(means, camera)
     distances = (means - camera.position.to(means)).norm(dim=1)
     visible = distances[inside] if bool(inside.any()) else distances
-    return float(visible.median().clamp(min=torch.finfo(visible.dtype).tiny)) if len(visible) else 1.0
+    return (
+        float(visible.median().clamp(min=torch.finfo(visible.dtype).tiny)) if len(visible) else 1.0
+    )
 
 
 def viewpoint_of(camera: Camera, means: Tensor, config: AttenuationConfig) -> Viewpoint:
-    """The viewpoint of a camera that looks at Gaussians with centres ``means [N, 3]``, world units."""
+    """The viewpoint of a camera that looks at Gaussians with centres ``means [N, 3]``, world
+    units.
+    """
     x, y, z = camera.position.to(means).double().tolist()
     down, look = camera.viewmat[1:3, :3].tolist()
     return Viewpoint(
-        x, y, z, camera_unit(means, camera, config), look[0], look[1], look[2], -down[0], -down[1], -down[2],
+        x,
+        y,
+        z,
+        camera_unit(means, camera, config),
+        look[0],
+        look[1],
+        look[2],
+        -down[0],
+        -down[1],
+        -down[2],
         fov=2 * math.atan(0.5 * camera.height / float(camera.K[1, 1])),
-    )  # fmt: skip
+    )
 
 
 def camera_of(viewpoint: Viewpoint, width: int, height: int, name: str = "") -> Camera:
     """The camera of a viewpoint that has a direction, for images of this size."""
     v = viewpoint
-    look, up = torch.tensor([[v.look_x, v.look_y, v.look_z], [v.up_x, v.up_y, v.up_z]], dtype=torch.float64)
+    look, up = torch.tensor(
+        [[v.look_x, v.look_y, v.look_z], [v.up_x, v.up_y, v.up_z]], dtype=torch.float64
+    )
     viewmat = torch.eye(4, dtype=torch.float64)
     viewmat[:3, :3] = torch.stack([torch.linalg.cross(look, up), -up, look])
     viewmat[:3, 3] = -viewmat[:3, :3] @ torch.tensor([v.x, v.y, v.z], dtype=torch.float64)
     focal = 0.5 * height / math.tan(0.5 * v.fov)
-    K = torch.tensor([[focal, 0, 0.5 * width], [0, focal, 0.5 * height], [0, 0, 1.0]], dtype=torch.float32)
+    K = torch.tensor(
+        [[focal, 0, 0.5 * width], [0, focal, 0.5 * height], [0, 0, 1.0]], dtype=torch.float32
+    )
     return Camera(viewmat.float(), K, width, height, name)
 
 
 @torch.no_grad()
 def typical_distance(means: Tensor, places: Sequence[Place], config: AttenuationConfig) -> Tensor:
-    """``[N]`` d_i, without unit, >= 0: the distances from one place, or the geometric mean over several.
+    """``[N]`` d_i, without unit, >= 0: the distances from one place, or the geometric mean over
+    several.
 
-    Places over OUTLIER times as far from the scene's centre as the median place and the median Gaussian do not count.
-    ClodError where there is no place.
+    Places over OUTLIER times as far from the scene's centre as the median place and the median
+    Gaussian do not count. ClodError where there is no place.
     """
     if not places:
-        raise ClodError("no camera is given, so there is no distance for the dial to fade by; give at least one")
+        raise ClodError(
+            "no camera is given, so there is no distance for the dial to fade by; give at least one"
+        )
     if len(places) == 1:
         return _from(places[0], means, config)
     logs, places = torch.zeros_like(means[:, 0]), _without_outliers(means, places)
@@ -126,7 +169,11 @@ def _without_outliers(means: Tensor, places: Sequence[Place]) -> Sequence[Place]
 
 
 def position_of(place: Place, means: Tensor) -> Tensor:
-    return place.position.to(means) if isinstance(place, Camera) else means.new_tensor([place.x, place.y, place.z])
+    return (
+        place.position.to(means)
+        if isinstance(place, Camera)
+        else means.new_tensor([place.x, place.y, place.z])
+    )
 
 
 def _from(place: Place, means: Tensor, config: AttenuationConfig) -> Tensor:

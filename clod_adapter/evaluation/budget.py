@@ -1,14 +1,16 @@
 """Budgets: the dial value for a number of Gaussians, a PSNR drop, or a frame rate.
 
-- A count needs no measurement. From one camera a Gaussian is kept iff s is below its extinction scale ``sigma_d / d``,
-  so the dial that keeps n lies between the n-th and the (n+1)-th largest; for the mean over V cameras, of the pooled
-  scales and n V. Exact but for scales that are equal.
+- A count needs no measurement. From one camera a Gaussian is kept iff s is below its extinction
+scale ``sigma_d / d``,
+  so the dial that keeps n lies between the n-th and the (n+1)-th largest; for the mean over V
+  cameras, of the pooled scales and n V. Exact but for scales that are equal.
 - PSNR is read from the calibration table that is stored with the file (``calibration.py``).
-- Frame rates depend on the machine, the image size and the load: frames are timed, from cameras. The table's times are
+- Frame rates depend on the machine, the image size and the load: frames are timed, from cameras.
+The table's times are
   used only where they are passed in, or (``clod-adapt export``) where nothing can be timed.
 
-A budget that s = 1 meets gives 1 and a note. Only a count is met beyond ``max_sv``, where nothing was trained, with a
-note.
+A budget that s = 1 meets gives 1 and a note. Only a count is met beyond ``max_sv``, where nothing
+was trained, with a note.
 """
 
 import math
@@ -64,45 +66,65 @@ def dial_for(
     Args:
         gaussians: with a dial.
         keep: largest number of Gaussians: in the view of one camera, or the mean over several.
-        psnr_drop: dB below the calibration's PSNR at s = 1; gives the largest dial value before PSNR first is lower.
-        fps: frames per second. The times of a calibration are used as they are, whatever machine and image size they
-            are from (``calibration.machine``, ``width``, ``height``); without one, ``cameras`` are timed.
+        psnr_drop: dB below the calibration's PSNR at s = 1; gives the largest dial value before
+            PSNR first is lower.
+        fps: frames per second. The times of a calibration are used as they are, whatever machine
+            and image size they are from (``calibration.machine``, ``width``, ``height``); without
+            one, ``cameras`` are timed.
         cameras: for ``keep`` and ``fps``; ``fps`` needs whole cameras to render from.
         calibration: for ``psnr_drop`` and ``fps``; ``load(path).calibration``.
         baked: ``keep`` counts the Gaussians that ``bake`` keeps for the cameras.
 
     Raises:
-        ClodError: not exactly one budget, a budget that is not positive, no dial, no data for the budget, or one that
-            no dial value reaches, or of a frame rate the largest trained one; the message gives its value there.
+        ClodError: not exactly one budget, a budget that is not positive, no dial, no data for the
+            budget, or one that no dial value reaches, or of a frame rate the largest trained one;
+            the message gives its value there.
     """
     budgets = {"keep": keep, "psnr_drop": psnr_drop, "fps": fps}
     given = {name: value for name, value in budgets.items() if value is not None}
     if len(given) != 1:
-        raise ClodError(f"dial_for needs exactly one of keep, psnr_drop and fps, {len(given)} are given")
-    require(isinstance(gaussians, Gaussians), "gaussians", f"a {type(gaussians).__name__}", "of type Gaussians")
+        raise ClodError(
+            f"dial_for needs exactly one of keep, psnr_drop and fps, {len(given)} are given"
+        )
+    require(
+        isinstance(gaussians, Gaussians),
+        "gaussians",
+        f"a {type(gaussians).__name__}",
+        "of type Gaussians",
+    )
     if isinstance(cameras, Place) or not all(isinstance(each, Place) for each in cameras or ()):
-        raise ClodError("cameras must be a list of cameras or viewpoints; of views [view.camera for view in views]")
+        raise ClodError(
+            "cameras must be a list of cameras or viewpoints; of views [view.camera for view in"
+            " views]"
+        )
     ((name, value),) = given.items()
     require(0 < number(value) < math.inf, name, value, "a positive, finite number")
     if gaussians.sigma_d is None or gaussians.attenuation is None:
-        raise ClodError("the Gaussians have no sigma_d, so no dial value meets a budget; adapt them first")
+        raise ClodError(
+            "the Gaussians have no sigma_d, so no dial value meets a budget; adapt them first"
+        )
     if name == "keep":
         return _for_count(gaussians, gaussians.attenuation, cameras, baked, value)
     if name == "psnr_drop":
         return _for_psnr_drop(calibration, value)
-    stored = [(row.virtual_scale, row.frame_ms) for row in calibration.rows] if calibration else None
+    stored = (
+        [(row.virtual_scale, row.frame_ms) for row in calibration.rows] if calibration else None
+    )
     whole = [camera for camera in cameras if isinstance(camera, Camera)]
     return dial_for_times(stored or frame_times(gaussians, whole)[0], value)
 
 
 def dial_for_times(times: Sequence[tuple[float, float]], fps: float) -> DialValue:
-    """The smallest dial value from which frames take at most ``1000 / fps`` ms, by (dial value, ms) that ascend."""
+    """The smallest dial value from which frames take at most ``1000 / fps`` ms, by (dial value, ms)
+    that ascend.
+    """
     dials, taken = [s for s, _ in times], [ms for _, ms in times]
     found = crossing(dials, taken, 1e3 / fps)
     if found is None:
         raise ClodError(
-            f"{fps:g} frames a second are out of reach: at s = {dials[-1]:g}, the largest dial value it was trained "
-            f"for, a frame takes {taken[-1]:.1f} ms, {1e3 / taken[-1]:.0f} a second"
+            f"{fps:g} frames a second are out of reach: at s = {dials[-1]:g}, the largest dial"
+            f" value it was trained for, a frame takes {taken[-1]:.1f} ms, {1e3 / taken[-1]:.0f} a"
+            " second"
         )
     if found == dials[0]:
         return DialValue(1.0, f"s = 1 draws {1e3 / taken[0]:.0f} frames a second already")
@@ -112,7 +134,9 @@ def dial_for_times(times: Sequence[tuple[float, float]], fps: float) -> DialValu
 def frame_times(
     gaussians: Gaussians, cameras: Sequence[Camera], *, progress: Listener | None = None
 ) -> tuple[list[tuple[float, float]], list[str]]:
-    """Measures milliseconds per frame at six dial values up to max_sv, in even steps of log s; and notes on that."""
+    """Measures milliseconds per frame at six dial values up to max_sv, in even steps of log s; and
+    notes on that.
+    """
     assert gaussians.attenuation is not None
     max_sv = gaussians.attenuation.max_sv
     virtual_scales = sorted({max_sv ** (k / (TIMED_DIALS - 1)) for k in range(TIMED_DIALS)})
@@ -122,24 +146,36 @@ def frame_times(
 
 def _for_psnr_drop(calibration: Calibration | None, drop: float) -> DialValue:
     if calibration is None:
-        raise ClodError("a PSNR drop needs the calibration table that adapting stores with the file")
+        raise ClodError(
+            "a PSNR drop needs the calibration table that adapting stores with the file"
+        )
     best, last = calibration.rows[0].psnr, calibration.rows[-1]
-    # From the largest s, where 1/s ascends: the point from which, down to s = 1, the loss stays within the drop.
+    # From the largest s, where 1/s ascends: the point from which, down to s = 1, the loss stays
+    # within the drop.
     nearness = [1 / row.virtual_scale for row in reversed(calibration.rows)]
     losses = [best - row.psnr for row in reversed(calibration.rows)]
     found = crossing(nearness, losses, drop)
     assert found is not None  # s = 1 loses nothing
     if found > nearness[0]:
         return DialValue(1 / found)
-    note = f"only {losses[0]:.2f} dB are lost at s = {last.virtual_scale:g}, the largest dial value measured"
+    note = (
+        f"only {losses[0]:.2f} dB are lost at s = {last.virtual_scale:g}, the largest dial value"
+        " measured"
+    )
     return DialValue(last.virtual_scale, note)
 
 
 @torch.no_grad()
 def _for_count(
-    gaussians: Gaussians, config: AttenuationConfig, cameras: Sequence[Place], baked: bool, keep: float
+    gaussians: Gaussians,
+    config: AttenuationConfig,
+    cameras: Sequence[Place],
+    baked: bool,
+    keep: float,
 ) -> DialValue:
-    """Of the Gaussians at the distances of each camera, or ``baked``: at one distance over all cameras."""
+    """Of the Gaussians at the distances of each camera, or ``baked``: at one distance over all
+    cameras.
+    """
     views = [cameras] if baked or not cameras else [[camera] for camera in cameras]
     largest, wanted = config.max_sv, math.floor(keep * len(views))
 
@@ -150,11 +186,17 @@ def _for_count(
     def count(virtual_scale: float) -> int:
         if baked:
             return int(baked_rows(gaussians, distances(0), virtual_scale).sum())
-        return sum(int(dial(gaussians, distances(k), virtual_scale).keep.sum()) for k in range(len(views)))
+        return sum(
+            int(dial(gaussians, distances(k), virtual_scale).keep.sum()) for k in range(len(views))
+        )
 
     most, fewest = count(1.0), count(largest)
     if wanted >= most:
-        note = f"s = 1 keeps {most / len(views):,.0f} of {gaussians.whole:,} already" if wanted > most else ""
+        note = (
+            f"s = 1 keeps {most / len(views):,.0f} of {gaussians.whole:,} already"
+            if wanted > most
+            else ""
+        )
         return DialValue(1.0, note)
     note = ""
     if wanted < fewest:
@@ -169,10 +211,14 @@ def _for_count(
         assert gaussians.sigma_d is not None
         pools = []  # of those that are culled within the range of the dial
         for k in range(len(views)):
-            own = dial(gaussians, distances(k), 1.0).keep & ~dial(gaussians, distances(k), largest).keep
+            own = (
+                dial(gaussians, distances(k), 1.0).keep
+                & ~dial(gaussians, distances(k), largest).keep
+            )
             pools.append(gaussians.sigma_d[own].double() / distances(k)[own])
         pooled = torch.cat(pools)
-        first = float(pooled.kthvalue(len(pooled) - (wanted - fewest)).values)  # that is to be culled
+        # that is to be culled
+        first = float(pooled.kthvalue(len(pooled) - (wanted - fewest)).values)
         return DialValue(min(first * (1 + ROUNDING), largest), note)
     low, high = 1.0, largest
     while high / low > 1 + 1e-9:

@@ -1,4 +1,6 @@
-"""The table of quality against the dial that is stored with a file: its dial values, its viewpoints."""
+"""The table of quality against the dial that is stored with a file: its dial values, its
+viewpoints.
+"""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -23,14 +25,20 @@ BLOCK = 8  # pixels
 
 
 def report_dials(max_sv: float) -> list[float]:
-    """The dial values of a report, in about even steps of their logarithm; the last one is ``max_sv``."""
+    """The dial values of a report, in about even steps of their logarithm; the last one is
+    ``max_sv``.
+    """
     return [s for s in REPORT_DIALS if s < max_sv] + [max_sv]
 
 
 def with_frame_times(
-    measured: Sequence[tuple[Gaussians, Sequence[Row]]], views: Sequence[View], progress: Listener | None = None
+    measured: Sequence[tuple[Gaussians, Sequence[Row]]],
+    views: Sequence[View],
+    progress: Listener | None = None,
 ) -> tuple[list[list[Row]], list[str]]:
-    """The rows of each model with frame times that can be compared (``time_frames``), and notes on them."""
+    """The rows of each model with frame times that can be compared (``time_frames``), and notes on
+    them.
+    """
     jobs = [(model, sorted({row.virtual_scale for row in rows})) for model, rows in measured]
     times = time_frames(jobs, [view.camera for view in views], progress)
     found = list[list[Row]]()
@@ -40,7 +48,9 @@ def with_frame_times(
     return found, times.notes
 
 
-def calibrate(rows: Sequence[Row], measured: Gaussians, scene: Scene, against: str, origin: Origin) -> Calibration:
+def calibrate(
+    rows: Sequence[Row], measured: Gaussians, scene: Scene, against: str, origin: Origin
+) -> Calibration:
     """The calibration of rows measured on this machine.
 
     Args:
@@ -62,18 +72,24 @@ def calibrate(rows: Sequence[Row], measured: Gaussians, scene: Scene, against: s
         size=(camera.width, camera.height),
         machine=machine,
         against=against,
-        viewpoints=[viewpoint_of(each.camera, measured.means, measured.attenuation).moved(origin) for each in stored],
+        viewpoints=[
+            viewpoint_of(each.camera, measured.means, measured.attenuation).moved(origin)
+            for each in stored
+        ],
     )
 
 
 def _interest(view: View) -> float:
-    """Contrast times detail times sharpness: a camera behind a wall sees contrasts, but no sharp ones.
+    """Contrast times detail times sharpness: a camera behind a wall sees contrasts, but no sharp
+    ones.
 
-    The standard deviation of its image, the mean difference of neighbouring pixels, and that over the mean difference
-    of neighbouring blocks of BLOCK pixels.
+    The standard deviation of its image, the mean difference of neighbouring pixels, and that over
+    the mean difference of neighbouring blocks of BLOCK pixels.
     """
     image = view.image.float().mean(2)
-    detail, coarse = (_change(pixels) for pixels in (image, avg_pool2d(image[None], min(BLOCK, *image.shape))[0]))
+    detail, coarse = (
+        _change(pixels) for pixels in (image, avg_pool2d(image[None], min(BLOCK, *image.shape))[0])
+    )
     return float(image.std()) * detail**2 / max(coarse, 1e-6)
 
 

@@ -1,4 +1,6 @@
-"""Quality, count and time over dial values, on held-out views; and the errors of levels for 3D Tiles."""
+"""Quality, count and time over dial values, on held-out views; and the errors of levels for 3D
+Tiles.
+"""
 
 import statistics
 from collections.abc import Iterator, Sequence
@@ -30,7 +32,8 @@ class Row:
         psnr: dB; ssim: in [-1, 1] (``losses.psnr_ssim``).
         kept: Gaussians the dial leaves in, of all; kept_share: that divided by all.
         in_view: kept Gaussians whose centre is in the image.
-        frame_ms: median time of a frame, milliseconds; ``frame_times.time_frames`` has times to compare.
+        frame_ms: median time of a frame, milliseconds; ``frame_times.time_frames`` has times to
+            compare.
     """
 
     virtual_scale: float
@@ -58,7 +61,8 @@ def evaluate(
     Args:
         gaussians: adapted or not; without ``sigma_d`` every dial value shows the base.
         views: one or several; virtual_scales: one dial value or several.
-        progress: called in ``Phase.EVALUATION`` after each view of each dial value; False returns the rows so far.
+        progress: called in ``Phase.EVALUATION`` after each view of each dial value; False returns
+            the rows so far.
 
     Raises:
         ClodError: no views, no dial values, or one below 1 or not finite.
@@ -80,7 +84,9 @@ def evaluate(
         found = []
         for measured in _measured(gaussians, views, dials[i]):
             found.append(measured)
-            done = Progress(Phase.EVALUATION, i * len(views) + len(found), len(virtual_scales) * len(views))
+            done = Progress(
+                Phase.EVALUATION, i * len(views) + len(found), len(virtual_scales) * len(views)
+            )
             stopped = progress is not None and progress(done) is False
             if stopped and len(found) < len(views):
                 return rows
@@ -93,14 +99,22 @@ def evaluate(
     return rows
 
 
-def _measured(gaussians: Gaussians, views: Sequence[View], virtual_scale: float) -> Iterator[tuple[float, ...]]:
-    """For each view seconds, PSNR, SSIM, and Gaussians kept and in the image; PSNR and SSIM of several at a time."""
+def _measured(
+    gaussians: Gaussians, views: Sequence[View], virtual_scale: float
+) -> Iterator[tuple[float, ...]]:
+    """For each view seconds, PSNR, SSIM, and Gaussians kept and in the image; PSNR and SSIM of
+    several at a time.
+    """
     workers = min(torch.get_num_threads(), SCORED)
     with ThreadPoolExecutor(workers) as pool:
         for first in range(0, len(views), workers):
             some = views[first : first + workers]
             found = [timed_frame(gaussians, view.camera, virtual_scale) for view in some]
-            scores = pool.map(psnr_ssim, [rendering.image for rendering, _ in found], [view.image for view in some])
+            scores = pool.map(
+                psnr_ssim,
+                [rendering.image for rendering, _ in found],
+                [view.image for view in some],
+            )
             for view, (rendering, seconds), score in zip(some, found, scores, strict=True):
                 inside = rendering.kept & in_frustum(gaussians.means, view.camera)
                 yield seconds, *score, int(rendering.kept.sum()), int(inside.sum())

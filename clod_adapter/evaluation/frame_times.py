@@ -1,8 +1,10 @@
-"""Frame times of dial values, measured so that they can be compared: all of them in turn, several times.
+"""Frame times of dial values, measured so that they can be compared: all of them in turn, several
+times.
 
-One pass renders every dial value of every model from every view: a change of the clock rate or the load meets all. A
-time is the median over the passes, after a warm-up with the slowest dial value. Where it is above that of the dial
-value before it, which draws more, and the passes do not agree on that, both get their mean.
+One pass renders every dial value of every model from every view: a change of the clock rate or the
+load meets all. A time is the median over the passes, after a warm-up with the slowest dial value.
+Where it is above that of the dial value before it, which draws more, and the passes do not agree on
+that, both get their mean.
 """
 
 import statistics
@@ -21,8 +23,11 @@ from clod_adapter.rasterizers import wait_for
 from clod_adapter.render import Rendering, render
 
 VIEWS, PASSES, FEWEST = 3, 5, 3
-SECONDS = 10.0  # after which no pass begins, once there are FEWEST; a pass that would take a third of it has one view
-WARM_FRAMES, WARM_SECONDS, STEADY = 8, 2.0, 0.1  # the warm-up ends with two frames whose times differ by a tenth
+# after which no pass begins, once there are FEWEST; a pass that would take a third of it has one
+# view
+SECONDS = 10.0
+# the warm-up ends with two frames whose times differ by a tenth
+WARM_FRAMES, WARM_SECONDS, STEADY = 8, 2.0, 0.1
 RISE = 0.05  # an increase of the time in every pass is real if it is at least this large
 NOISY = 0.2  # a larger spread of the passes is reported
 
@@ -31,9 +36,11 @@ Model = tuple[Gaussians, Sequence[float]]  # and the dial values, ascending, to 
 
 @dataclass(frozen=True)
 class FrameTimes:
-    """Milliseconds per frame of each dial value of each model: means over the views, medians over the passes.
+    """Milliseconds per frame of each dial value of each model: means over the views, medians over
+    the passes.
 
-    ``spread`` is the interquartile range of the passes over their median; the median over the dial values.
+    ``spread`` is the interquartile range of the passes over their median; the median over the dial
+    values.
     """
 
     milliseconds: tuple[tuple[float, ...], ...]
@@ -44,12 +51,19 @@ class FrameTimes:
         """A note if the machine was too busy for these times."""
         if self.spread <= NOISY:
             return []
-        return [f"frame times are rough: they varied by {self.spread:.0%}, as this machine was busy with other work"]
+        return [
+            f"frame times are rough: they varied by {self.spread:.0%}, as this machine was busy"
+            " with other work"
+        ]
 
 
 @torch.no_grad()
-def time_frames(models: Sequence[Model], cameras: Sequence[Camera], progress: Listener | None = None) -> FrameTimes:
-    """Times frames from at most three of the cameras, evenly spread; the first dial value of all is the slowest."""
+def time_frames(
+    models: Sequence[Model], cameras: Sequence[Camera], progress: Listener | None = None
+) -> FrameTimes:
+    """Times frames from at most three of the cameras, evenly spread; the first dial value of all is
+    the slowest.
+    """
     if not cameras:
         raise ClodError("frames a second need a calibration or cameras to time frames from")
     lean = [(model.without_empty_bands(), dials) for model, dials in models]
@@ -64,25 +78,39 @@ def time_frames(models: Sequence[Model], cameras: Sequence[Camera], progress: Li
         passes.append([1e3 * statistics.fmean(each) for each in zip(*taken, strict=True)])
         tell(progress, Phase.FRAME_TIMES, len(passes), PASSES)
     ends = [0, *accumulate(len(dials) for _, dials in models)]
-    found = tuple(tuple(settled([each[first:end] for each in passes])) for first, end in pairwise(ends))
-    quartiles = [statistics.quantiles(column, n=4, method="inclusive") for column in zip(*passes, strict=True)]
-    return FrameTimes(found, statistics.median((high - low) / middle for low, middle, high in quartiles))
+    found = tuple(
+        tuple(settled([each[first:end] for each in passes])) for first, end in pairwise(ends)
+    )
+    quartiles = [
+        statistics.quantiles(column, n=4, method="inclusive")
+        for column in zip(*passes, strict=True)
+    ]
+    return FrameTimes(
+        found, statistics.median((high - low) / middle for low, middle, high in quartiles)
+    )
 
 
 def settled(passes: Sequence[Sequence[float]]) -> list[float]:
-    """``[K]`` medians of ``[P, K]`` times; without increases from one to the next on which the passes do not agree."""
+    """``[K]`` medians of ``[P, K]`` times; without increases from one to the next on which the
+    passes do not agree.
+    """
     levels = list[list[float]]()  # of equal times
     for k, column in enumerate(zip(*passes, strict=True)):
         levels.append([statistics.median(column)])
-        if not k or all(each[k] > (1 + RISE) * each[k - 1] for each in passes):  # fewer Gaussians, which have grown
+        # fewer Gaussians, which have grown
+        if not k or all(each[k] > (1 + RISE) * each[k - 1] for each in passes):
             start = len(levels) - 1
-        while len(levels) > start + 1 and statistics.fmean(levels[-1]) > statistics.fmean(levels[-2]):
+        while len(levels) > start + 1 and statistics.fmean(levels[-1]) > statistics.fmean(
+            levels[-2]
+        ):
             levels[-2:] = [levels[-2] + levels[-1]]
     return [statistics.fmean(level) for level in levels for _ in level]
 
 
 def _warm_up(gaussians: Gaussians, virtual_scale: float, camera: Camera) -> float:
-    """Renders until the times are steady, with compiled functions and a raised clock rate; the last time, seconds."""
+    """Renders until the times are steady, with compiled functions and a raised clock rate; the last
+    time, seconds.
+    """
     began, before = time.perf_counter(), 0.0
     for _ in range(WARM_FRAMES):
         taken = timed_frame(gaussians, camera, virtual_scale)[1]
@@ -92,7 +120,9 @@ def _warm_up(gaussians: Gaussians, virtual_scale: float, camera: Camera) -> floa
     return taken
 
 
-def timed_frame(gaussians: Gaussians, camera: Camera, virtual_scale: float) -> tuple[Rendering, float]:
+def timed_frame(
+    gaussians: Gaussians, camera: Camera, virtual_scale: float
+) -> tuple[Rendering, float]:
     """A rendering, and the seconds that it took, the device's work included."""
     wait_for(gaussians.means.device)
     began = time.perf_counter()

@@ -1,19 +1,23 @@
 """Popping: whether the image changes evenly or in jumps as the dial turns or the camera moves.
 
-Neighbouring steps of a sweep are compared *from one camera*, so that the camera's own motion does not count. With
-``I_c(k)`` the image, clamped to [0, 1], from camera c with the opacities and scales of step k, step k changes it by
+Neighbouring steps of a sweep are compared *from one camera*, so that the camera's own motion does
+not count. With ``I_c(k)`` the image, clamped to [0, 1], from camera c with the opacities and scales
+of step k, step k changes it by
 
     delta_k = I_c(k+1) - I_c(k)      c the camera of step k+1
     change_k = 255 rms(delta_k)      root mean square over pixels and channels, in levels of 255
 
 A fade changes the image in proportion to the length of the step, a jump by a constant amount:
 
-    ratio       = max change / mean change              1 if all steps are equal, n for one switch within n steps
-    persistence = max change / max change over 2 steps  1/2 for a fade, 1 for a jump or a flicker, about 0.7 if many
-                  (I_c(k+1) - I_c(k-1))                 small jumps at different places add up in every step
+    ratio       = max change / mean change              1 if all steps are equal, n for one switch
+    within n steps persistence = max change / max change over 2 steps  1/2 for a fade, 1 for a jump
+    or a flicker, about 0.7 if many
+                  (I_c(k+1) - I_c(k-1))                 small jumps at different places add up in
+                  every step
 
-``max change (2 - 1 / persistence)`` approximates the largest change in the limit of short steps. A single Gaussian
-hardly changes the root mean square, so the largest change of a pixel is measured too.
+``max change (2 - 1 / persistence)`` approximates the largest change in the limit of short steps. A
+single Gaussian hardly changes the root mean square, so the largest change of a pixel is measured
+too.
 """
 
 import math
@@ -39,8 +43,9 @@ from clod_adapter.render import render
 class Popping:
     """How the image changes over a sweep, in steps of equal length; changes are in levels of 255.
 
-    ``mean`` and ``largest`` are changes of a step, ``at`` the end of the largest one, as a dial value or a share of the
-    camera path; ``pixel`` is the largest change of one channel of one pixel. Ratios are NaN if nothing changes.
+    ``mean`` and ``largest`` are changes of a step, ``at`` the end of the largest one, as a dial
+    value or a share of the camera path; ``pixel`` is the largest change of one channel of one
+    pixel. Ratios are NaN if nothing changes.
     """
 
     steps: int
@@ -56,8 +61,12 @@ class Popping:
 
 
 @torch.no_grad()
-def sweep(show: Callable[[int, int], Tensor], positions: Sequence[float], progress: Listener | None = None) -> Popping:
-    """Measures images: ``show(k, j)`` is that ``[H, W, 3]`` from the camera of step k with the Gaussians of step j."""
+def sweep(
+    show: Callable[[int, int], Tensor], positions: Sequence[float], progress: Listener | None = None
+) -> Popping:
+    """Measures images: ``show(k, j)`` is that ``[H, W, 3]`` from the camera of step k with the
+    Gaussians of step j.
+    """
     require(len(positions) >= 3, "number of positions", len(positions), "at least 3")
     once, twice = [], []
     for k in range(1, len(positions)):
@@ -70,15 +79,26 @@ def sweep(show: Callable[[int, int], Tensor], positions: Sequence[float], progre
     wide_changes, wide_pixels = zip(*twice, strict=True)
     largest, pixel, mean = max(changes), max(pixels), math.fsum(changes) / len(changes)
     return Popping(
-        steps=len(changes), mean=mean, largest=largest, at=float(positions[changes.index(largest) + 1]),
-        ratio=_ratio(largest, mean), persistence=_ratio(largest, max(largest, *wide_changes)), pixel=pixel,
-        pixel_at=float(positions[pixels.index(pixel) + 1]), pixel_persistence=_ratio(pixel, max(pixel, *wide_pixels)),
+        steps=len(changes),
+        mean=mean,
+        largest=largest,
+        at=float(positions[changes.index(largest) + 1]),
+        ratio=_ratio(largest, mean),
+        persistence=_ratio(largest, max(largest, *wide_changes)),
+        pixel=pixel,
+        pixel_at=float(positions[pixels.index(pixel) + 1]),
+        pixel_persistence=_ratio(pixel, max(pixel, *wide_pixels)),
         changes=changes,
-    )  # fmt: skip
+    )
 
 
 def dial_popping(
-    gaussians: Gaussians, camera: Camera, max_sv: float, *, steps: int = 200, progress: Listener | None = None
+    gaussians: Gaussians,
+    camera: Camera,
+    max_sv: float,
+    *,
+    steps: int = 200,
+    progress: Listener | None = None,
 ) -> Popping:
     """Turns the dial from 1 to ``max_sv`` in steps of equal ratio, for one camera."""
     require(1 < max_sv < math.inf, "max_sv", max_sv, "above 1 and finite")
@@ -108,14 +128,19 @@ def path_popping(
 
 
 def path(cameras: Sequence[Camera], steps: int) -> list[Camera]:
-    """``steps + 1`` cameras at equal distances along the path through all of them, interpolated linearly and by slerp.
+    """``steps + 1`` cameras at equal distances along the path through all of them, interpolated
+    linearly and by slerp.
 
-    If no centre moves, each rotation takes the same number of steps. Size and intrinsics are the first camera's.
+    If no centre moves, each rotation takes the same number of steps. Size and intrinsics are the
+    first camera's.
     """
     require(steps >= 2, "steps", steps, "at least 2")
     if len(cameras) < 2:
         raise ClodError(f"a camera path needs at least two cameras, not {len(cameras)}")
-    first, viewmats = cameras[0], torch.stack([camera.viewmat.detach().double().cpu() for camera in cameras]).numpy()
+    first, viewmats = (
+        cameras[0],
+        torch.stack([camera.viewmat.detach().double().cpu() for camera in cameras]).numpy(),
+    )
     centres = -np.einsum("nji,nj->ni", viewmats[:, :3, :3], viewmats[:, :3, 3])
     lengths = np.linalg.norm(np.diff(centres, axis=0), axis=1)
     lengths = np.maximum(lengths, 1e-9 * lengths.sum() or 1.0)
@@ -126,7 +151,9 @@ def path(cameras: Sequence[Camera], steps: int) -> list[Camera]:
     moved = np.stack([np.interp(at, places, axis) for axis in centres.T], 1)
     poses[:, :3, 3] = -np.einsum("nij,nj->ni", poses[:, :3, :3], moved)
     found = torch.from_numpy(poses).to(first.viewmat)
-    return [Camera(viewmat, first.K, first.width, first.height, near=first.near) for viewmat in found]
+    return [
+        Camera(viewmat, first.K, first.width, first.height, near=first.near) for viewmat in found
+    ]
 
 
 def _change(delta: Tensor) -> tuple[float, float]:

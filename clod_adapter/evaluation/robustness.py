@@ -1,4 +1,6 @@
-"""Cells of the robustness experiment: a checkpoint adapted at one range of the dial (CLoD-GS 4.4), or its baseline."""
+"""Cells of the robustness experiment: a checkpoint adapted at one range of the dial (CLoD-GS 4.4),
+or its baseline.
+"""
 
 import hashlib
 from collections.abc import Sequence
@@ -21,12 +23,15 @@ from clod_adapter.training.pseudo_views import PseudoView, add_pseudo_views
 # Shares of the unadapted base that its baseline keeps.
 BASELINE_SHARES = (1.0, 0.8, 0.62, 0.48, 0.35, 0.25, 0.18, 0.12, 0.08, 0.05)
 OPACITY_EDGES = tuple(k / 40 for k in range(41))
-LOG_SIGMA_EDGES = tuple(-3 + k / 10 for k in range(61))  # log10 of sigma_d; the end bins include values outside
+# log10 of sigma_d; the end bins include values outside
+LOG_SIGMA_EDGES = tuple(-3 + k / 10 for k in range(61))
 
 
 @dataclass(frozen=True)
 class CellResult:
-    """The result of a cell, with a row for each dial value of a range, or share of a baseline, which has no adapter."""
+    """The result of a cell, with a row for each dial value of a range, or share of a baseline,
+    which has no adapter.
+    """
 
     rows: list[dict[str, float]]
     distribution: dict[str, Any]
@@ -35,36 +40,58 @@ class CellResult:
 
 
 def adapt_at_range(
-    file: Checkpoint, scene: Scene, config: AdaptConfig, virtual_scales: Sequence[float], progress: Listener
+    file: Checkpoint,
+    scene: Scene,
+    config: AdaptConfig,
+    virtual_scales: Sequence[float],
+    progress: Listener,
 ) -> CellResult:
-    """Adapts to ``[1, config.max_sv]``, and measures dial values, also beyond it; Stopped if that is not completed."""
+    """Adapts to ``[1, config.max_sv]``, and measures dial values, also beyond it; Stopped if that
+    is not completed.
+    """
     base = detach(file.gaussians)
     scene = add_pseudo_views(base, scene, config.seed, progress)
     config = config.for_views(len(scene.train))
     adapted = make_plan(base, scene, config, progress=progress).adapt(scene, progress)
     if adapted.failed:
-        raise ClodError(f"max_sv {config.max_sv:g}: {adapted.failed}; leave this range or checkpoint out")
+        raise ClodError(
+            f"max_sv {config.max_sv:g}: {adapted.failed}; leave this range or checkpoint out"
+        )
     if adapted.interrupted:
         raise Stopped(f"stopped at step {adapted.steps}")
-    adapter = extract(base, adapted.gaussians, fingerprint=file.fingerprint, config=asdict(config), origin=file.origin)
+    adapter = extract(
+        base,
+        adapted.gaussians,
+        fingerprint=file.fingerprint,
+        config=asdict(config),
+        origin=file.origin,
+    )
     result = adapter.apply(base)
     rows = _rows(result, scene.test, virtual_scales, progress)
     return CellResult(rows, distribution(result), adapter, adapted.start_seconds + adapted.seconds)
 
 
-def baseline(base: Gaussians, views: Sequence[View], shares: Sequence[float], progress: Listener) -> CellResult:
+def baseline(
+    base: Gaussians, views: Sequence[View], shares: Sequence[float], progress: Listener
+) -> CellResult:
     """The unadapted base with only its most opaque Gaussians: one row per share."""
     base, rows = detach(base), []
     order = base.opacity_logits.argsort(descending=True, stable=True)
     for k, share in enumerate(shares):
-        pruned = base.select(order[: max(1, round(share * len(base)))].sort().values)  # in their own order
-        (row,) = _rows(pruned, views, [1.0], within(progress, k * len(views), len(shares) * len(views)))
+        # in their own order
+        pruned = base.select(order[: max(1, round(share * len(base)))].sort().values)
+        (row,) = _rows(
+            pruned, views, [1.0], within(progress, k * len(views), len(shares) * len(views))
+        )
         rows.append(row | {"kept_share": len(pruned) / len(base)})
     return CellResult(rows, distribution(base))
 
 
 def _rows(
-    gaussians: Gaussians, views: Sequence[View], virtual_scales: Sequence[float], progress: Listener | None
+    gaussians: Gaussians,
+    views: Sequence[View],
+    virtual_scales: Sequence[float],
+    progress: Listener | None,
 ) -> list[dict[str, float]]:
     rows = evaluate(gaussians, views, virtual_scales, progress=progress)
     if len(rows) < len(virtual_scales):
@@ -73,7 +100,9 @@ def _rows(
 
 
 def distribution(gaussians: Gaussians) -> dict[str, Any]:
-    """Histograms with ``edges`` and ``shares``: ``opacity`` over [0, 1], and ``log10_sigma_d`` if there is a dial."""
+    """Histograms with ``edges`` and ``shares``: ``opacity`` over [0, 1], and ``log10_sigma_d`` if
+    there is a dial.
+    """
     columns = {"opacity": (gaussians.opacities, OPACITY_EDGES)}
     if gaussians.sigma_d is not None:
         columns["log10_sigma_d"] = gaussians.sigma_d.clamp(min=1e-30).log10(), LOG_SIGMA_EDGES
@@ -87,7 +116,9 @@ def distribution(gaussians: Gaussians) -> dict[str, Any]:
 
 
 def scene_fingerprint(scene: Scene, progress: Listener | None = None) -> str:
-    """SHA-256, hex, of photographs' pixels, cameras and split; a pseudo view's pixels are those of its checkpoint."""
+    """SHA-256, hex, of photographs' pixels, cameras and split; a pseudo view's pixels are those of
+    its checkpoint.
+    """
     digest, done = hashlib.sha256(), 0
     for views in (scene.train, scene.test):
         digest.update(f"{len(views)};".encode())

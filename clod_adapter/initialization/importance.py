@@ -1,4 +1,6 @@
-"""Initialization without training: each Gaussian's contribution to the views, and the sigma_d from its rank."""
+"""Initialization without training: each Gaussian's contribution to the views, and the sigma_d from
+its rank.
+"""
 
 import math
 from collections.abc import Sequence
@@ -18,10 +20,11 @@ from clod_adapter.initialization.pruning_order import PruningOrder, initial_grow
 from clod_adapter.progress import Listener, Phase, tell
 from clod_adapter.render import splat
 
-# Times the largest dial value, the largest extinction scale: beyond, a reach has no gradient in training, and would
-# never change.
+# Times the largest dial value, the largest extinction scale: beyond, a reach has no gradient in
+# training, and would never change.
 WIDEST = 4.0
-# Most views that are rendered: twice as many changed the trained result by 0.01 to 0.04 dB (docs/performance.md).
+# Most views that are rendered: twice as many changed the trained result by 0.01 to 0.04 dB
+# (docs/performance.md).
 MOST_VIEWS = 64
 NEAREST = 0.05  # share of the views that may be nearer than where growth begins
 
@@ -32,13 +35,18 @@ def initialize(
     config: AdaptConfig,
     progress: Listener | None = None,
 ) -> Gaussians:
-    """The Gaussians with an initial sigma_d, in world units, and growth_d, from up to MOST_VIEWS evenly spread views.
+    """The Gaussians with an initial sigma_d, in world units, and growth_d, from up to MOST_VIEWS
+    evenly spread views.
 
-    A dial that ``base`` already has, with any effect, is kept with its own settings except the config's ``max_sv``.
+    A dial that ``base`` already has, with any effect, is kept with its own settings except the
+    config's ``max_sv``.
     """
     if base.attenuation is not None and has_dial(base):
         if base.attenuation.form != config.form:
-            raise ClodError(f"the dial has the form {base.attenuation.form}; adapt with the same, or give a plain file")
+            raise ClodError(
+                f"the dial has the form {base.attenuation.form}; adapt with the same, or give a"
+                " plain file"
+            )
         known = known_distance(base.attenuation) or scene_distance(base, spread(views, MOST_VIEWS))
         own = replace(base.attenuation, max_sv=config.max_sv, reference_distance=known)
         return in_world_units(with_growth(base.replace(attenuation=own), config, base.growth_d))
@@ -52,29 +60,45 @@ def initialize(
     return in_world_units(with_growth(initial, config, fitted))
 
 
-def importance(base: Gaussians, views: Sequence[View], config: AdaptConfig, progress: Listener | None = None) -> Tensor:
-    """``[N]`` what each Gaussian matters to the pictures: the root of its ``removal_error``, times its opacity."""
+def importance(
+    base: Gaussians, views: Sequence[View], config: AdaptConfig, progress: Listener | None = None
+) -> Tensor:
+    """``[N]`` what each Gaussian matters to the pictures: the root of its ``removal_error``, times
+    its opacity.
+    """
     return removal_error(base, views, seed=config.seed, progress=progress).sqrt() * base.opacities
 
 
-def reach_of(pruned: PruningOrder, distances: Tensor, config: AdaptConfig, total: int | None = None) -> Tensor:
-    """``[N]`` sigma_d, in the unit of the typical ``distances [N]``; ``total`` as for ``extinction_from_rank``."""
+def reach_of(
+    pruned: PruningOrder, distances: Tensor, config: AdaptConfig, total: int | None = None
+) -> Tensor:
+    """``[N]`` sigma_d, in the unit of the typical ``distances [N]``; ``total`` as for
+    ``extinction_from_rank``.
+    """
     scales = extinction_from_rank(pruned.position.max() - pruned.position, config, total)
     return distances * scales.clamp(max=WIDEST * config.max_sv)
 
 
-def with_growth(initial: Gaussians, config: AdaptConfig, growth_d: Tensor | None = None) -> Gaussians:
+def with_growth(
+    initial: Gaussians, config: AdaptConfig, growth_d: Tensor | None = None
+) -> Gaussians:
     """``initial`` with ``growth_d``, by default 0; without one if the config has no growth."""
     if config.growth == "off":
         return initial.replace(growth_d=None)
-    return initial.replace(growth_d=torch.zeros_like(initial.opacity_logits) if growth_d is None else growth_d)
+    return initial.replace(
+        growth_d=torch.zeros_like(initial.opacity_logits) if growth_d is None else growth_d
+    )
 
 
 def for_training(initial: Gaussians) -> Gaussians:
-    """The result of ``initialize`` with sigma_d in units of the reference distance, which it has unless that is 1."""
+    """The result of ``initialize`` with sigma_d in units of the reference distance, which it has
+    unless that is 1.
+    """
     assert initial.attenuation is not None
     known = known_distance(initial.attenuation) or 1.0
-    return with_distance(initial.replace(attenuation=replace(initial.attenuation, reference_distance=known)), known)
+    return with_distance(
+        initial.replace(attenuation=replace(initial.attenuation, reference_distance=known)), known
+    )
 
 
 def has_dial(base: Gaussians) -> bool:
@@ -84,16 +108,21 @@ def has_dial(base: Gaussians) -> bool:
 
 
 def usable_views(base: Gaussians, views: Sequence[View]) -> tuple[View, ...]:
-    """The views with at least one Gaussian's centre beyond their near plane; the others render nothing."""
+    """The views with at least one Gaussian's centre beyond their near plane; the others render
+    nothing.
+    """
     found = []
     for view in views:
-        depths = base.means @ view.camera.viewmat[2, :3].to(base.means) + view.camera.viewmat[2, 3].to(base.means)
+        depths = base.means @ view.camera.viewmat[2, :3].to(base.means) + view.camera.viewmat[
+            2, 3
+        ].to(base.means)
         if bool((depths >= view.camera.near).any()):
             found.append(view)
     if not found:
         raise ClodError(
-            f"no Gaussian is in front of any of the {len(views)} training cameras: checkpoint and cameras are not of "
-            "one scene, or not in one coordinate frame; give the photographs and poses it was trained on"
+            f"no Gaussian is in front of any of the {len(views)} training cameras: checkpoint and"
+            " cameras are not of one scene, or not in one coordinate frame; give the photographs"
+            " and poses it was trained on"
         )
     return tuple(found)
 
@@ -101,8 +130,9 @@ def usable_views(base: Gaussians, views: Sequence[View]) -> tuple[View, ...]:
 def scene_distance(base: Gaussians, views: Sequence[View]) -> float:
     """D of training, world units: the median distance in the frustum, of the nearest views.
 
-    The farthest of the NEAREST share of the views, and at least the second nearest of three or more. Growth begins
-    there: nearer, stored scales and opacities must fill the gaps (docs/method.md, "Near to far").
+    The farthest of the NEAREST share of the views, and at least the second nearest of three or
+    more. Growth begins there: nearer, stored scales and opacities must fill the gaps
+    (docs/method.md, "Near to far").
     """
     medians = sorted(median_distance(base.means, view.camera) for view in views)
     return medians[max(math.ceil(NEAREST * len(medians)), 2 if len(medians) > 2 else 1) - 1]
@@ -111,11 +141,13 @@ def scene_distance(base: Gaussians, views: Sequence[View]) -> float:
 def removal_error(
     gaussians: Gaussians, views: Sequence[View], *, seed: int = 0, progress: Listener | None = None
 ) -> Tensor:
-    """``[N]`` estimate of the squared image error of removing each Gaussian alone, mean over the views.
+    """``[N]`` estimate of the squared image error of removing each Gaussian alone, mean over the
+    views.
 
-    To first order removing Gaussian i changes pixel p by ``a_i dC_p/da_i``. The sum of squares over the pixels is
-    estimated without bias by one backward pass per view: with random signs z, ``E[(sum_p z_p dC_p/da_i)^2] =
-    sum_p (dC_p/da_i)^2`` (Hutchinson). Images have half the size, unless they are small, in a third of the time.
+    To first order removing Gaussian i changes pixel p by ``a_i dC_p/da_i``. The sum of squares over
+    the pixels is estimated without bias by one backward pass per view: with random signs z,
+    ``E[(sum_p z_p dC_p/da_i)^2] = sum_p (dC_p/da_i)^2`` (Hutchinson). Images have half the size,
+    unless they are small, in a third of the time.
     """
     generator = torch.Generator().manual_seed(seed)
     total = torch.zeros_like(gaussians.means[:, 0])
@@ -123,10 +155,15 @@ def removal_error(
     for done, view in enumerate(views, 1):
         opacities = gaussians.opacities.detach().requires_grad_()
         small = view.camera.halvable
-        image, _ = splat(smaller if small else gaussians, opacities, view.camera.halved() if small else view.camera)
+        image, _ = splat(
+            smaller if small else gaussians,
+            opacities,
+            view.camera.halved() if small else view.camera,
+        )
         drawn = torch.randint(0, 2, image.shape, generator=generator, dtype=torch.uint8)
         signs = drawn.to(image.device).to(image) * 2 - 1
-        (gradient,) = torch.autograd.grad((image * signs).sum(), opacities)  # as grad_outputs they would import sympy
+        # as grad_outputs they would import sympy
+        (gradient,) = torch.autograd.grad((image * signs).sum(), opacities)
         total += (gradient * opacities.detach()).square()
         tell(progress, Phase.IMPORTANCE, done, len(views))
     if (bad := bad_rows(total)) is not None:
@@ -136,17 +173,23 @@ def removal_error(
 
 
 def extinction_from_rank(rank: Tensor, config: AdaptConfig, total: int | None = None) -> Tensor:
-    """``[N]`` the dial values at which Gaussians are culled, so that counts follow the target-count curve.
+    """``[N]`` the dial values at which Gaussians are culled, so that counts follow the target-count
+    curve.
 
-    The Gaussian of ``rank`` (0 the most important, integers below N) is culled where ``target_count.target_curve``
-    falls to its share of the ranks, or of ``total``. Ranks beyond ``config.share`` are culled before s = 1.
+    The Gaussian of ``rank`` (0 the most important, integers below N) is culled where
+    ``target_count.target_curve`` falls to its share of the ranks, or of ``total``. Ranks beyond
+    ``config.share`` are culled before s = 1.
     """
     share = (rank.double() + 0.5) / (total or len(rank))
     power = (1 / share + (share**-2 - 4 * (1 / config.share - 1)).clamp(min=0).sqrt()) / 2
-    return torch.where(share <= config.share, power ** (1 / config.exponent), config.share / share).float()
+    return torch.where(
+        share <= config.share, power ** (1 / config.exponent), config.share / share
+    ).float()
 
 
-def coverage(gaussians: Gaussians, opacities: Tensor, camera: Camera, growth: Tensor | None = None) -> Tensor:
+def coverage(
+    gaussians: Gaussians, opacities: Tensor, camera: Camera, growth: Tensor | None = None
+) -> Tensor:
     """``[N]`` pixels that each Gaussian covers: the gradient of the image by its colour."""
     grey = gaussians.sh0.new_zeros(gaussians.sh0.shape).requires_grad_()
     plain = gaussians.replace(sh0=grey, shN=gaussians.shN[:, :0])

@@ -1,12 +1,14 @@
-"""Merging Gaussians: fewer and larger ones that stand for others, by moments; no photograph is needed.
+"""Merging Gaussians: fewer and larger ones that stand for others, by moments; no photograph is
+needed.
 
-A group of Gaussians with masses ``m = opacity area`` becomes one with their total mass, their mean ``mu`` weighted by
-mass, the covariance ``mean of (C_i + (mu_i - mu)(mu_i - mu)^T)``, and the mean of their harmonics. Its opacity is the
-mass over its own area, at most OPAQUEST. The two whose merging changes least are merged first: by the change of shape
-and colour times ``sqrt(w_i w_j / (w_i + w_j))``, with w their importance.
+A group of Gaussians with masses ``m = opacity area`` becomes one with their total mass, their mean
+``mu`` weighted by mass, the covariance ``mean of (C_i + (mu_i - mu)(mu_i - mu)^T)``, and the mean
+of their harmonics. Its opacity is the mass over its own area, at most OPAQUEST. The two whose
+merging changes least are merged first: by the change of shape and colour times
+``sqrt(w_i w_j / (w_i + w_j))``, with w their importance.
 
-After Gaussian mixture reduction (Runnalls, "Kullback-Leibler approach to Gaussian mixture reduction", 2007), with the
-area of an ellipsoid (Thomsen's formula) as splat-transform weighs.
+After Gaussian mixture reduction (Runnalls, "Kullback-Leibler approach to Gaussian mixture
+reduction", 2007), with the area of an ellipsoid (Thomsen's formula) as splat-transform weighs.
 """
 
 from __future__ import annotations
@@ -35,7 +37,9 @@ THOMSEN = 1.6075
 
 @dataclass(frozen=True)
 class Mixture:
-    """Masses ``[N]``, centres ``[N, 3]``, covariances ``[N, 6]`` in the order of _ENTRIES, harmonics ``[N, 3 K]``."""
+    """Masses ``[N]``, centres ``[N, 3]``, covariances ``[N, 6]`` in the order of _ENTRIES,
+    harmonics ``[N, 3 K]``.
+    """
 
     mass: np.ndarray
     means: np.ndarray
@@ -55,19 +59,26 @@ class Mixture:
 
         means = mean(self.means)
         spread = _products((self.means - means[groups]).T).T
-        return Mixture(total, means, mean(self.covariances + spread), mean(self.harmonics).astype(np.float32))
+        return Mixture(
+            total, means, mean(self.covariances + spread), mean(self.harmonics).astype(np.float32)
+        )
 
 
-def merge(gaussians: Gaussians, importance: Tensor, count: int, progress: Listener | None = None) -> Gaussians:
-    """About ``count`` Gaussians, without a dial, that stand for all of them; themselves if there are no more.
+def merge(
+    gaussians: Gaussians, importance: Tensor, count: int, progress: Listener | None = None
+) -> Gaussians:
+    """About ``count`` Gaussians, without a dial, that stand for all of them; themselves if there
+    are no more.
 
     Args:
-        importance: ``[N]``, at least 0, what a Gaussian matters to the pictures; merged ones have the sum. Without it
-            what nobody sees takes as many of the merged ones as what everybody sees: 0.5 dB.
+        importance: ``[N]``, at least 0, what a Gaussian matters to the pictures; merged ones have
+            the sum. Without it what nobody sees takes as many of the merged ones as what everybody
+            sees: 0.5 dB.
     """
     mixture, before = mixture_of(gaussians), len(gaussians)
     weights = importance.detach().double().cpu().numpy()
-    weights = weights + LEAST * weights.mean()  # of what no view shows, the most similar are merged first
+    # of what no view shows, the most similar are merged first
+    weights = weights + LEAST * weights.mean()
     while len(mixture) > count:
         groups = _groups(mixture, weights, max(count, int((1 - ROUND) * len(mixture))))
         if groups.max() + 1 == len(mixture):
@@ -83,7 +94,11 @@ def mixture_of(gaussians: Gaussians) -> Mixture:
     full = np.einsum("nij,nj,nkj->nik", axes, scales**2, axes)
     covariances = np.stack([full[:, i, j] for i, j in _ENTRIES], 1)
     mass = gaussians.opacities.detach().double().cpu().numpy() * _areas(scales)
-    bands = [x.detach().float().cpu().numpy().reshape(len(x), -1) for x in (gaussians.sh0, gaussians.shN) if x.numel()]
+    bands = [
+        x.detach().float().cpu().numpy().reshape(len(x), -1)
+        for x in (gaussians.sh0, gaussians.shN)
+        if x.numel()
+    ]
     means = gaussians.means.detach().double().cpu().numpy()
     return Mixture(mass + np.finfo(np.float32).tiny, means, covariances, np.concatenate(bands, 1))
 
@@ -99,10 +114,16 @@ def gaussians_of(mixture: Mixture, like: Gaussians) -> Gaussians:
     opacities = np.clip(mixture.mass / _areas(scales), 1e-6, OPAQUEST)
     harmonics = mixture.harmonics.reshape(len(mixture), -1, 3)
     arrays = {
-        "means": mixture.means, "quats": _quaternions(axes), "log_scales": np.log(scales),
-        "opacity_logits": np.log(opacities / (1 - opacities)), "sh0": harmonics[:, :1], "shN": harmonics[:, 1:],
-    }  # fmt: skip
-    tensors = {name: torch.from_numpy(np.ascontiguousarray(x, np.float32)) for name, x in arrays.items()}
+        "means": mixture.means,
+        "quats": _quaternions(axes),
+        "log_scales": np.log(scales),
+        "opacity_logits": np.log(opacities / (1 - opacities)),
+        "sh0": harmonics[:, :1],
+        "shN": harmonics[:, 1:],
+    }
+    tensors = {
+        name: torch.from_numpy(np.ascontiguousarray(x, np.float32)) for name, x in arrays.items()
+    }
     found: Any = {name: x.to(like.means) for name, x in tensors.items()}
     return Gaussians(**found, screen_filter=like.screen_filter)
 
@@ -111,7 +132,9 @@ _ENTRIES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
 def _groups(mixture: Mixture, weights: np.ndarray, count: int) -> np.ndarray:
-    """``[N]`` the number of each one's group: pairs, the cheapest first, until ``count`` groups remain, or singles."""
+    """``[N]`` the number of each one's group: pairs, the cheapest first, until ``count`` groups
+    remain, or singles.
+    """
     partner, left = np.arange(len(mixture)), len(mixture)
     for first, second in _cheapest(mixture, weights):
         some = slice(left - count)
@@ -123,9 +146,13 @@ def _groups(mixture: Mixture, weights: np.ndarray, count: int) -> np.ndarray:
 
 
 def _cheapest(mixture: Mixture, weights: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Pairs of neighbours without a common one: the cheapest of both each, by rising cost, then of what remains."""
+    """Pairs of neighbours without a common one: the cheapest of both each, by rising cost, then of
+    what remains.
+    """
     i, j = _neighbours(mixture)
-    weight = np.sqrt(weights[i] * weights[j] / np.maximum(weights[i] + weights[j], np.finfo(float).tiny))
+    weight = np.sqrt(
+        weights[i] * weights[j] / np.maximum(weights[i] + weights[j], np.finfo(float).tiny)
+    )
     order = np.argsort((_cost(mixture, i, j) + LEAST) * weight, kind="stable")
     i, j = i[order], j[order]
     free = np.ones(len(mixture), bool)
@@ -151,7 +178,9 @@ def _neighbours(mixture: Mixture) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _cost(mixture: Mixture, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Of merging two: the entropy of the merged shape above the mean of both, and the squared difference of colours."""
+    """Of merging two: the entropy of the merged shape above the mean of both, and the squared
+    difference of colours.
+    """
     found, entropy = np.empty(len(first)), _log_determinants(mixture.covariances.T)
     for start in range(0, len(first), EDGES):
         part = slice(start, start + EDGES)
@@ -161,7 +190,9 @@ def _cost(mixture: Mixture, first: np.ndarray, second: np.ndarray) -> np.ndarray
         merged = p * mixture.covariances[i].T + q * mixture.covariances[j].T
         merged += p * q * _products((mixture.means[i] - mixture.means[j]).T)
         shape = _log_determinants(merged) - p * entropy[i] - q * entropy[j]
-        found[part] = shape / 2 + COLOUR * np.square(mixture.harmonics[i] - mixture.harmonics[j]).sum(1)
+        found[part] = shape / 2 + COLOUR * np.square(
+            mixture.harmonics[i] - mixture.harmonics[j]
+        ).sum(1)
     return found
 
 

@@ -8,14 +8,17 @@ from clod_adapter._kernels import threads
 
 ROWS = 1 << 17  # rows whose neighbours are in memory at a time
 CROWD = 64  # Gaussians with equal centres, from which on these are displaced,
-JITTER = 1e-6  # by this share of their size: a k-d tree cannot split equal points, and compares each with all others
+# by this share of their size: a k-d tree cannot split equal points, and compares each with all
+# others
+JITTER = 1e-6
 
 
 def nearest(centres: np.ndarray, count: int) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Some rows ``[n]``, and ``[n, K]`` the distances and the rows of the ``count`` nearest, after their own.
+    """Some rows ``[n]``, and ``[n, K]`` the distances and the rows of the ``count`` nearest, after
+    their own.
 
-    In the tree's order, in which successive rows are neighbours: a third of the time for a file in random order. There
-    are fewer than ``count`` where there are no more.
+    In the tree's order, in which successive rows are neighbours: a third of the time for a file in
+    random order. There are fewer than ``count`` where there are no more.
     """
     from scipy.spatial import cKDTree  # only here: it takes a fifth of a second to import
 

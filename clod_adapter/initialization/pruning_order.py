@@ -1,4 +1,6 @@
-"""The pruning order, in which a similar neighbour remains for each Gaussian that is removed, and growth to cover it."""
+"""The pruning order, in which a similar neighbour remains for each Gaussian that is removed, and
+growth to cover it.
+"""
 
 from typing import NamedTuple
 
@@ -18,7 +20,8 @@ REMOVED = 0.25  # of the remaining Gaussians, per round
 COLOUR_FLOOR = 0.03  # smallest difference of colours (of 1) that counts
 APART = 0.05  # weight of the distance, relative to a squared difference of colours
 DIFFERENT = 1e12  # dissimilarity for colours or sizes that are not finite
-STUCK = 0.02  # of the remaining: if a round removes fewer, it removes the cheapest REMOVED without conditions
+# of the remaining: if a round removes fewer, it removes the cheapest REMOVED without conditions
+STUCK = 0.02
 BLOCK = 1 << 13  # rows that are compared at a time: three times as fast as it fits in cache
 DIALS = 24  # dial values of the fit of growth, evenly spaced in log s
 MOST = 1.0  # of its exponents before SHARE
@@ -26,7 +29,8 @@ SHARE = 0.65  # of the fitted exponents that is used; 0.5 and 0.8 are no better 
 
 
 class PruningOrder(NamedTuple):
-    """How many Gaussians are removed before each, and the similar one, removed later, that took its importance.
+    """How many Gaussians are removed before each, and the similar one, removed later, that took its
+    importance.
 
     Both are ``[N]`` int64. The last one's substitute is itself.
     """
@@ -35,21 +39,28 @@ class PruningOrder(NamedTuple):
     substitute: Tensor
 
 
-def pruning_order(gaussians: Gaussians, importance: Tensor, progress: Listener | None = None) -> PruningOrder:
-    """Half-edge collapse, as for the levels of a mesh: which Gaussians can be removed first, and in whose favour.
+def pruning_order(
+    gaussians: Gaussians, importance: Tensor, progress: Listener | None = None
+) -> PruningOrder:
+    """Half-edge collapse, as for the levels of a mesh: which Gaussians can be removed first, and in
+    whose favour.
 
     In rounds. Removing Gaussian i costs the minimum over its NEIGHBOURS nearest centres j of
-    ``w_i (|c_i - c_j|^2 + COLOUR_FLOOR^2 + APART r^2 / (r^2 + (l_i + l_j)^2))``, with w the importance, c the colours
-    of SH degree 0, r the distance of the centres and l the largest scales. The cheapest REMOVED of them are removed,
-    except those whose j is cheaper or which are the j of a removed one; their importance is added to that of j.
-    Ranking by importance alone thins out plain surfaces, whose Gaussians have little importance each, until none is
-    left there to grow into the gaps. (Kobbelt, Campagna and Seidel 1998, without quadrics; measured in docs/method.md.)
+    ``w_i (|c_i - c_j|^2 + COLOUR_FLOOR^2 + APART r^2 / (r^2 + (l_i + l_j)^2))``, with w the
+    importance, c the colours of SH degree 0, r the distance of the centres and l the largest
+    scales. The cheapest REMOVED of them are removed, except those whose j is cheaper or which are
+    the j of a removed one; their importance is added to that of j. Ranking by importance alone
+    thins out plain surfaces, whose Gaussians have little importance each, until none is left there
+    to grow into the gaps. (Kobbelt, Campagna and Seidel 1998, without quadrics; measured in
+    docs/method.md.)
     """
     if not bool(gaussians.means.isfinite().all()):
         raise ClodError("means are not all finite, so neighbours are not defined; remove such rows")
     count = len(gaussians)
     colours = 0.5 + SH_C0 * gaussians.sh0.detach()[:, 0].double().cpu().numpy()
-    sizes = gaussians.log_scales.detach().double().exp().amax(1).cpu().numpy() if count else np.empty(0)
+    sizes = (
+        gaussians.log_scales.detach().double().exp().amax(1).cpu().numpy() if count else np.empty(0)
+    )
     weights, order = importance.detach().double().cpu().numpy().copy(), np.empty(count, np.int64)
     centres = without_crowds(gaussians.means.detach().double().cpu().numpy(), sizes)
     favoured, left, gone = np.arange(count), np.arange(count), 0
@@ -64,7 +75,9 @@ def pruning_order(gaussians: Gaussians, importance: Tensor, progress: Listener |
         tell(progress, Phase.PRUNING_ORDER, gone, count)
     order[left] = gone
     tell(progress, Phase.PRUNING_ORDER, count, count)
-    return PruningOrder(*(torch.from_numpy(rows).to(importance.device) for rows in (order, favoured)))
+    return PruningOrder(
+        *(torch.from_numpy(rows).to(importance.device) for rows in (order, favoured))
+    )
 
 
 def _removed(cost: np.ndarray, substitute: np.ndarray) -> np.ndarray:
@@ -81,14 +94,18 @@ def _removed(cost: np.ndarray, substitute: np.ndarray) -> np.ndarray:
     return removed if len(removed) > STUCK * len(cost) else cheapest
 
 
-def _substitutes(centres: np.ndarray, colours: np.ndarray, sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _substitutes(
+    centres: np.ndarray, colours: np.ndarray, sizes: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """The most similar neighbour of each, and its dissimilarity."""
     substitute, difference = np.empty(len(centres), np.int64), np.empty(len(centres))
     channels = np.ascontiguousarray(colours.T)
     for part, apart, near in nearest(centres, NEIGHBOURS):
         for at in range(0, len(part), BLOCK):
             rows, these = part[at : at + BLOCK], slice(at, at + BLOCK)
-            substitute[rows], difference[rows] = _most_similar(rows, near[these].T, apart[these].T, channels, sizes)
+            substitute[rows], difference[rows] = _most_similar(
+                rows, near[these].T, apart[these].T, channels, sizes
+            )
     return substitute, difference
 
 
@@ -114,10 +131,11 @@ def _most_similar(
 def initial_growth(gaussians: Gaussians, substitutes: Tensor, distances: Tensor) -> Tensor:
     """``[N]`` the exponents h, in [0, MOST SHARE], from the pruning order; no photograph is needed.
 
-    At a dial value s a Gaussian stands for itself and for all that were removed before s in whose favour it, or their
-    substitute, was kept. Areas A are opacity times the product of the two larger scales, as merging tools weigh them.
-    h is the least-squares fit of ``h log m(s) = log(sum of A / own A) / 2`` over the dial values at which it is kept,
-    times SHARE.
+    At a dial value s a Gaussian stands for itself and for all that were removed before s in whose
+    favour it, or their substitute, was kept. Areas A are opacity times the product of the two
+    larger scales, as merging tools weigh them. h is the least-squares fit of
+    ``h log m(s) = log(sum of A / own A) / 2`` over the dial values at which it is kept, times
+    SHARE.
     """
     config: AttenuationConfig | None = gaussians.attenuation
     assert config is not None and gaussians.sigma_d is not None
@@ -128,9 +146,15 @@ def initial_growth(gaussians: Gaussians, substitutes: Tensor, distances: Tensor)
     for k in range(1, DIALS):
         s = config.max_sv ** (k / (DIALS - 1))
         kept = extinction > s
-        stands_for = torch.zeros_like(area).index_add_(0, _kept_substitutes(kept, substitutes), area)
+        stands_for = torch.zeros_like(area).index_add_(
+            0, _kept_substitutes(kept, substitutes), area
+        )
         wanted = (stands_for / area).clamp(min=1).log().div_(2).nan_to_num_(0.0, 0.0)
-        available = growth_factors(torch.ones_like(distances), distances, s, growth_distance(config)).double().log()
+        available = (
+            growth_factors(torch.ones_like(distances), distances, s, growth_distance(config))
+            .double()
+            .log()
+        )
         total += kept * wanted * available
         weight += kept * available.square()
     exponents = (total / weight.clamp(min=1e-12)).clamp_(0, MOST)
@@ -138,10 +162,13 @@ def initial_growth(gaussians: Gaussians, substitutes: Tensor, distances: Tensor)
 
 
 def _kept_substitutes(kept: Tensor, substitutes: Tensor) -> Tensor:
-    """``[N]`` the first kept one of each Gaussian, its substitute, the substitute of that and so on."""
+    """``[N]`` the first kept one of each Gaussian, its substitute, the substitute of that and so
+    on.
+    """
     own = torch.arange(len(kept), device=kept.device)
     found = torch.where(kept, own, substitutes)
-    for _ in range(len(kept).bit_length()):  # each time chains are twice as long; there may be circles of removed ones
+    # each time chains are twice as long; there may be circles of removed ones
+    for _ in range(len(kept).bit_length()):
         if torch.equal(further := found[found], found):
             break
         found = further

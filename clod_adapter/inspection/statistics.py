@@ -32,7 +32,9 @@ class Spread:
     def of(cls, values: np.ndarray) -> Spread:
         """Of at least one value."""
         with np.errstate(invalid="ignore"):  # between two infinite ones
-            low, median, high = (float(value) for value in np.quantile(values, (BULK[0], 0.5, BULK[1])))
+            low, median, high = (
+                float(value) for value in np.quantile(values, (BULK[0], 0.5, BULK[1]))
+            )
         return cls(float(values.min()), low, median, high, float(values.max()))
 
 
@@ -79,9 +81,15 @@ class Splat:
 
 
 def values_of(found: Prepared) -> dict[str, Any]:
-    """The fields of ``Splat`` up to ``growth``, of a file's rows, of which one is usable at least."""
+    """The fields of ``Splat`` up to ``growth``, of a file's rows, of which one is usable at
+    least.
+    """
     keep = found.keep
-    columns = {name: np.ascontiguousarray(array[keep].T) for name, array in found.arrays.items() if name != "shN"}
+    columns = {
+        name: np.ascontiguousarray(array[keep].T)
+        for name, array in found.arrays.items()
+        if name != "shN"
+    }
     means, logits = columns["means"], columns["opacity_logits"].astype(np.float64)
     with np.errstate(over="ignore"):
         scales = np.sort(np.exp(columns["log_scales"].astype(np.float64)), 0)
@@ -93,17 +101,25 @@ def values_of(found: Prepared) -> dict[str, Any]:
     diagonal = float(np.linalg.norm([spread.high - spread.low for spread in position]))
     moved = zip(position, found.origin, strict=True)
     same = means[:, np.lexsort(means)]
-    used = [k + 1 for k in range(found.arrays["shN"].shape[1]) if found.arrays["shN"][:, k][keep].any()]
+    used = [
+        k + 1 for k in range(found.arrays["shN"].shape[1]) if found.arrays["shN"][:, k][keep].any()
+    ]
     return dict(
-        total=len(keep), count=int(keep.sum()), dropped=found.dropped,
+        total=len(keep),
+        count=int(keep.sum()),
+        dropped=found.dropped,
         position=tuple(Spread(*(value + by for value in astuple(each))) for each, by in moved),
-        used_sh_degree=next(degree for degree, count in SH_COUNTS.items() if count > max(used, default=0)),
-        scale=Spread.of(scales.ravel()), opacity=Spread.of(opacities),
-        needles=float((scales[2] > NEEDLE * scales[1]).mean()), infinite_opacity=int(np.isposinf(logits).sum()),
+        used_sh_degree=next(
+            degree for degree, count in SH_COUNTS.items() if count > max(used, default=0)
+        ),
+        scale=Spread.of(scales.ravel()),
+        opacity=Spread.of(opacities),
+        needles=float((scales[2] > NEEDLE * scales[1]).mean()),
+        infinite_opacity=int(np.isposinf(logits).sum()),
         doubles=int((same[:, 1:] == same[:, :-1]).all(0).sum()),
         far=int((distance > FAR * np.quantile(distance, 0.9)).sum()),
         giant=int((scales[2] > diagonal / 2).sum()) if diagonal > 0 else 0,
         fainter_than_visible=float((opacities < FAINT).mean()),
         sigma=Spread.of(columns[SIGMA]) if SIGMA in columns else None,
         growth=Spread.of(columns[GROWTH]) if GROWTH in columns else None,
-    )  # fmt: skip
+    )

@@ -6,13 +6,15 @@ colors, alphas, meta = clod_gsplat.rasterization(
     sigma_d=model.sigma_d, growth_d=model.growth_d, attenuation=model.attenuation, virtual_scale=3,
 )
 
-gsplat takes one opacity and scale per Gaussian for all cameras; the dial gives one for each camera. So each camera is
-one call of gsplat, and the results are joined in gsplat's form, including ids, order and gradients. (A batch of scenes
-could share a call, but gsplat 1.5.3's packed projection culls all scenes by the opacities of the first.) Culled
-Gaussians cost no more than Gaussians out of view. Nothing is gathered: rows and ids stay those of the caller.
+gsplat takes one opacity and scale per Gaussian for all cameras; the dial gives one for each camera.
+So each camera is one call of gsplat, and the results are joined in gsplat's form, including ids,
+order and gradients. (A batch of scenes could share a call, but gsplat 1.5.3's packed projection
+culls all scenes by the opacities of the first.) Culled Gaussians cost no more than Gaussians out of
+view. Nothing is gathered: rows and ids stay those of the caller.
 
-For gsplat 1.4.0 to 1.6.0, by the signature that is installed. The signatures here, for type checkers and readers, have
-the arguments of all these versions; those that not all have are keywords.
+For gsplat 1.4.0 to 1.6.0, by the signature that is installed. The signatures here, for type
+checkers and readers, have the arguments of all these versions; those that not all have are
+keywords.
 """
 
 import functools
@@ -29,9 +31,16 @@ from clod_adapter.integrations.gsplat_cameras import PER_ROW, render
 try:
     import gsplat
 except ImportError as error:
-    raise ImportError("gsplat cannot be imported; it needs torch and CUDA: pip install gsplat==1.5.3") from error
+    raise ImportError(
+        "gsplat cannot be imported; it needs torch and CUDA: pip install gsplat==1.5.3"
+    ) from error
 
-__all__ = ["rasterization", "rasterization_2dgs", "rasterization_2dgs_inria_wrapper", "rasterization_inria_wrapper"]
+__all__ = [
+    "rasterization",
+    "rasterization_2dgs",
+    "rasterization_2dgs_inria_wrapper",
+    "rasterization_inria_wrapper",
+]
 
 RenderMode = Literal["RGB", "d", "Ed", "D", "ED", "RGB-d", "RGB-Ed", "RGB+D", "RGB+ED"]
 CameraModel = Literal["pinhole", "ortho", "fisheye", "ftheta", "lidar"]
@@ -41,20 +50,30 @@ Typed = TypeVar("Typed", bound=Callable[..., Any])
 
 
 def _of_gsplat(typed: Typed) -> Typed:
-    """gsplat's function of the same name with the four arguments; ``typed`` has their types and text."""
+    """gsplat's function of the same name with the four arguments; ``typed`` has their types and
+    text.
+    """
     name = typed.__name__
     projection = inspect.signature(gsplat.fully_fused_projection).parameters
-    hide = not (name == "rasterization" and "opacities" in projection)  # else that projection culls opacity 0
+    # else that projection culls opacity 0
+    hide = not (name == "rasterization" and "opacities" in projection)
 
     @functools.wraps(typed)
     def dialled(*args: Any, **kwargs: Any) -> Any:
-        function, own = getattr(gsplat, name), {each: kwargs.pop(each, default) for each, default in DIAL.items()}
+        function, own = (
+            getattr(gsplat, name),
+            {each: kwargs.pop(each, default) for each, default in DIAL.items()},
+        )
         settings = dropped_in(**own)
         if settings is None:
             return function(*args, **kwargs)
         bound = inspect.signature(function).bind(*args, **kwargs)
         bound.apply_defaults()
-        given = bound.arguments | bound.arguments.pop("kwargs", {}) | {each: own[each] for each in PER_ROW}
+        given = (
+            bound.arguments
+            | bound.arguments.pop("kwargs", {})
+            | {each: own[each] for each in PER_ROW}
+        )
         return render(function, given, own["virtual_scale"], settings, hide)
 
     return dialled  # type: ignore[return-value]
@@ -62,45 +81,81 @@ def _of_gsplat(typed: Typed) -> Typed:
 
 @_of_gsplat
 def rasterization(
-    means: Tensor, quats: Tensor | None, scales: Tensor | None, opacities: Tensor, colors: Tensor | None,
-    viewmats: Tensor, Ks: Tensor, width: int, height: int, near_plane: float = 0.01, far_plane: float = 1e10,
-    radius_clip: float = 0.0, eps2d: float = 0.3, sh_degree: int | None = None, packed: bool = True,
-    tile_size: int = 16, backgrounds: Tensor | None = None, render_mode: RenderMode = "RGB",
-    sparse_grad: bool = False, absgrad: bool = False, rasterize_mode: Literal["classic", "antialiased"] = "classic",
-    channel_chunk: int = 32, distributed: bool = False, camera_model: CameraModel = "pinhole", *,
-    segmented: bool = False, covars: Tensor | None = None, with_ut: bool = False, with_eval3d: bool = False,
-    return_normals: bool = False, global_z_order: bool = True, rays: Tensor | None = None,
-    radial_coeffs: Tensor | None = None, tangential_coeffs: Tensor | None = None,
-    thin_prism_coeffs: Tensor | None = None, ftheta_coeffs: Any = None, lidar_coeffs: Any = None,
-    external_distortion_coeffs: Any = None, rolling_shutter: Any = None, viewmats_rs: Tensor | None = None,
-    ut_params: Any = None, extra_signals: Tensor | None = None, extra_signals_sh_degree: int | None = None,
-    renderer_config: Any = None, sigma_d: Tensor | None = None, virtual_scale: float = 1.0,
-    attenuation: AttenuationConfig | None = None, growth_d: Tensor | None = None,
-) -> tuple[Tensor, Tensor, Meta]:  # fmt: skip
+    means: Tensor,
+    quats: Tensor | None,
+    scales: Tensor | None,
+    opacities: Tensor,
+    colors: Tensor | None,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    near_plane: float = 0.01,
+    far_plane: float = 1e10,
+    radius_clip: float = 0.0,
+    eps2d: float = 0.3,
+    sh_degree: int | None = None,
+    packed: bool = True,
+    tile_size: int = 16,
+    backgrounds: Tensor | None = None,
+    render_mode: RenderMode = "RGB",
+    sparse_grad: bool = False,
+    absgrad: bool = False,
+    rasterize_mode: Literal["classic", "antialiased"] = "classic",
+    channel_chunk: int = 32,
+    distributed: bool = False,
+    camera_model: CameraModel = "pinhole",
+    *,
+    segmented: bool = False,
+    covars: Tensor | None = None,
+    with_ut: bool = False,
+    with_eval3d: bool = False,
+    return_normals: bool = False,
+    global_z_order: bool = True,
+    rays: Tensor | None = None,
+    radial_coeffs: Tensor | None = None,
+    tangential_coeffs: Tensor | None = None,
+    thin_prism_coeffs: Tensor | None = None,
+    ftheta_coeffs: Any = None,
+    lidar_coeffs: Any = None,
+    external_distortion_coeffs: Any = None,
+    rolling_shutter: Any = None,
+    viewmats_rs: Tensor | None = None,
+    ut_params: Any = None,
+    extra_signals: Tensor | None = None,
+    extra_signals_sh_degree: int | None = None,
+    renderer_config: Any = None,
+    sigma_d: Tensor | None = None,
+    virtual_scale: float = 1.0,
+    attenuation: AttenuationConfig | None = None,
+    growth_d: Tensor | None = None,
+) -> tuple[Tensor, Tensor, Meta]:
     """``gsplat.rasterization`` with the opacities and scales of one dial value, for each camera.
 
-    Equals gsplat called with the opacities of ``attenuation.attenuate`` and ``scales`` times its growth (``covars``,
-    where given, times its square), camera by camera for ``[..., C, 4, 4]``. Differentiable in ``sigma_d``, ``growth_d``
-    and all that gsplat differentiates in; the distances are constants, so the dial adds nothing to the gradients of
-    ``means`` and ``viewmats``. ``meta`` is gsplat's: ``means2d`` takes ``retain_grad()`` and, with ``absgrad``, has its
-    ``absgrad``, as densification strategies need it. (With several cameras ``means2d`` is a copy, which
+    Equals gsplat called with the opacities of ``attenuation.attenuate`` and ``scales`` times its
+    growth (``covars``, where given, times its square), camera by camera for ``[..., C, 4, 4]``.
+    Differentiable in ``sigma_d``, ``growth_d`` and all that gsplat differentiates in; the distances
+    are constants, so the dial adds nothing to the gradients of ``means`` and ``viewmats``. ``meta``
+    is gsplat's: ``means2d`` takes ``retain_grad()`` and, with ``absgrad``, has its ``absgrad``, as
+    densification strategies need it. (With several cameras ``means2d`` is a copy, which
     ``torch.autograd.grad`` and hooks on it do not reach.)
 
     Pass a file's ``Gaussians.screen_filter`` as without a dial: ``eps2d`` is its variance, and
     ``rasterize_mode="antialiased"`` its compensation of opacities.
 
-    Distances are from the centre of ``viewmats`` for every camera model: Gaussians fade as an orthographic camera moves
-    back; for a rolling shutter it is the first pose. The paper's form takes the frustum of a pinhole camera with
-    these ``Ks``.
+    Distances are from the centre of ``viewmats`` for every camera model: Gaussians fade as an
+    orthographic camera moves back; for a rolling shutter it is the first pose. The paper's form
+    takes the frustum of a pinhole camera with these ``Ks``.
 
     Args:
-        sigma_d: ``[..., N]`` like ``opacities``; None calls gsplat's function unchanged, with a warning if
-            ``virtual_scale`` is above 1.
+        sigma_d: ``[..., N]`` like ``opacities``; None calls gsplat's function unchanged, with a
+            warning if ``virtual_scale`` is above 1.
         virtual_scale: the dial s >= 0.
         attenuation: settings of the equation, ``Gaussians.attenuation`` of the file; by default
             ``AttenuationConfig()``, with distances in world units.
-        growth_d: ``[..., N]`` exponents of the growth of the scales, which begins at ``reference_distance`` of the
-            attenuation, which is needed then, or, where that is 0, at 1 world unit; None for no growth.
+        growth_d: ``[..., N]`` exponents of the growth of the scales, which begins at
+            ``reference_distance`` of the attenuation, which is needed then, or, where that is 0, at
+            1 world unit; None for no growth.
 
     The others are those of the installed gsplat, by position or by name, with its defaults.
 
@@ -108,9 +163,10 @@ def rasterization(
         ``render_colors [..., C, H, W, X]``, ``render_alphas [..., C, H, W, 1]`` and ``meta``.
 
     Raises:
-        ClodError: the dial is negative, growth_d comes without attenuation, a tensor holds integers, sigma_d or
-            growth_d differs from opacities in shape, ``distributed`` is set, with which the cameras of all processes
-            share one opacity, or several cameras come with a tensor that none of the known versions has.
+        ClodError: the dial is negative, growth_d comes without attenuation, a tensor holds
+            integers, sigma_d or growth_d differs from opacities in shape, ``distributed`` is set,
+            with which the cameras of all processes share one opacity, or several cameras come with
+            a tensor that none of the known versions has.
         TypeError: an argument is missing, or the installed gsplat does not have it.
     """
     raise NotImplementedError
@@ -118,52 +174,104 @@ def rasterization(
 
 @_of_gsplat
 def rasterization_2dgs(
-    means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor, viewmats: Tensor, Ks: Tensor,
-    width: int, height: int, near_plane: float = 0.01, far_plane: float = 1e10, radius_clip: float = 0.0,
-    eps2d: float = 0.3, sh_degree: int | None = None, packed: bool = False, tile_size: int = 16,
-    backgrounds: Tensor | None = None, render_mode: RenderMode = "RGB", sparse_grad: bool = False,
-    absgrad: bool = False, distloss: bool = False, depth_mode: Literal["expected", "median"] = "expected", *,
-    sigma_d: Tensor | None = None, virtual_scale: float = 1.0, attenuation: AttenuationConfig | None = None,
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    near_plane: float = 0.01,
+    far_plane: float = 1e10,
+    radius_clip: float = 0.0,
+    eps2d: float = 0.3,
+    sh_degree: int | None = None,
+    packed: bool = False,
+    tile_size: int = 16,
+    backgrounds: Tensor | None = None,
+    render_mode: RenderMode = "RGB",
+    sparse_grad: bool = False,
+    absgrad: bool = False,
+    distloss: bool = False,
+    depth_mode: Literal["expected", "median"] = "expected",
+    *,
+    sigma_d: Tensor | None = None,
+    virtual_scale: float = 1.0,
+    attenuation: AttenuationConfig | None = None,
     growth_d: Tensor | None = None,
-) -> tuple[Tensor, Tensor, Tensor, Tensor | None, Tensor, Tensor, Meta]:  # fmt: skip
-    """``gsplat.rasterization_2dgs`` with the opacities and scales of one dial value; see ``rasterization``.
+) -> tuple[Tensor, Tensor, Tensor, Tensor | None, Tensor, Tensor, Meta]:
+    """``gsplat.rasterization_2dgs`` with the opacities and scales of one dial value; see
+    ``rasterization``.
 
     The gradients for densification are in ``meta["gradient_2dgs"]``, as with gsplat.
 
     Returns:
-        Colours, alphas, normals, normals from depth (None without a depth), distortion and median depth of
-        ``[..., C, H, W, X]``, and ``meta``.
+        Colours, alphas, normals, normals from depth (None without a depth), distortion and median
+        depth of ``[..., C, H, W, X]``, and ``meta``.
     """
     raise NotImplementedError
 
 
 @_of_gsplat
 def rasterization_inria_wrapper(
-    means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor, viewmats: Tensor, Ks: Tensor,
-    width: int, height: int, near_plane: float = 0.01, far_plane: float = 100.0, eps2d: float = 0.3,
-    sh_degree: int | None = None, backgrounds: Tensor | None = None, *, sigma_d: Tensor | None = None,
-    virtual_scale: float = 1.0, attenuation: AttenuationConfig | None = None, growth_d: Tensor | None = None,
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    near_plane: float = 0.01,
+    far_plane: float = 100.0,
+    eps2d: float = 0.3,
+    sh_degree: int | None = None,
+    backgrounds: Tensor | None = None,
+    *,
+    sigma_d: Tensor | None = None,
+    virtual_scale: float = 1.0,
+    attenuation: AttenuationConfig | None = None,
+    growth_d: Tensor | None = None,
     **kwargs: Any,
-) -> tuple[Tensor, None, Meta]:  # fmt: skip
+) -> tuple[Tensor, None, Meta]:
     """``gsplat.rasterization_inria_wrapper`` with a dial; see ``rasterization``.
 
-    gsplat 1.5 and 1.6 return one camera's image without the camera's dimension, and refuse several; several are
-    returned as ``[C, H, W, X]`` here, as gsplat 1.4.0 returns them.
+    gsplat 1.5 and 1.6 return one camera's image without the camera's dimension, and refuse several;
+    several are returned as ``[C, H, W, X]`` here, as gsplat 1.4.0 returns them.
     """
     raise NotImplementedError
 
 
 @_of_gsplat
 def rasterization_2dgs_inria_wrapper(
-    means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor, viewmats: Tensor, Ks: Tensor,
-    width: int, height: int, near_plane: float = 0.01, far_plane: float = 100.0, eps2d: float = 0.3,
-    sh_degree: int | None = None, backgrounds: Tensor | None = None, depth_ratio: int = 0, *,
-    sigma_d: Tensor | None = None, virtual_scale: float = 1.0, attenuation: AttenuationConfig | None = None,
-    growth_d: Tensor | None = None, **kwargs: Any,
-) -> tuple[tuple[Tensor, Tensor], Meta]:  # fmt: skip
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    near_plane: float = 0.01,
+    far_plane: float = 100.0,
+    eps2d: float = 0.3,
+    sh_degree: int | None = None,
+    backgrounds: Tensor | None = None,
+    depth_ratio: int = 0,
+    *,
+    sigma_d: Tensor | None = None,
+    virtual_scale: float = 1.0,
+    attenuation: AttenuationConfig | None = None,
+    growth_d: Tensor | None = None,
+    **kwargs: Any,
+) -> tuple[tuple[Tensor, Tensor], Meta]:
     """``gsplat.rasterization_2dgs_inria_wrapper`` with a dial; see ``rasterization``.
 
-    Of several cameras gsplat returns the alphas and the maps of the last one; here they are of all. ``means2d`` of
-    ``meta`` is ``[N, 3]`` for one camera and ``[C, N, 3]`` for several.
+    Of several cameras gsplat returns the alphas and the maps of the last one; here they are of all.
+    ``means2d`` of ``meta`` is ``[N, 3]`` for one camera and ``[C, N, 3]`` for several.
     """
     raise NotImplementedError

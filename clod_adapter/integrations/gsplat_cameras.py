@@ -1,7 +1,9 @@
-"""gsplat's functions with opacities and scales of one dial value: one call for each camera, joined in gsplat's form.
+"""gsplat's functions with opacities and scales of one dial value: one call for each camera, joined
+in gsplat's form.
 
-Which arguments and results there are is read from the installed gsplat. Rows of opacity 0 have to be culled before
-tiles and sorting: where gsplat's projection does not do that, their centres move behind the camera.
+Which arguments and results there are is read from the installed gsplat. Rows of opacity 0 have to
+be culled before tiles and sorting: where gsplat's projection does not do that, their centres move
+behind the camera.
 """
 
 import math
@@ -24,59 +26,103 @@ from clod_adapter.hook import Hook
 PER_ROW = ("sigma_d", "growth_d")
 PER_GAUSSIAN = ("means", "quats", "scales", "opacities", "covars", *PER_ROW)
 PER_CAMERA = (
-    "viewmats", "Ks", "backgrounds", "viewmats_rs", "radial_coeffs", "tangential_coeffs", "thin_prism_coeffs", "rays",
-)  # fmt: skip
-PER_EITHER = {"colors": "sh_degree", "extra_signals": "extra_signals_sh_degree"}  # and the SH degree of each
+    "viewmats",
+    "Ks",
+    "backgrounds",
+    "viewmats_rs",
+    "radial_coeffs",
+    "tangential_coeffs",
+    "thin_prism_coeffs",
+    "rays",
+)
+# and the SH degree of each
+PER_EITHER = {"colors": "sh_degree", "extra_signals": "extra_signals_sh_degree"}
 GRADIENTS = ("means2d", "gradient_2dgs")
 
 
 def render(
-    function: Callable[..., Any], given: dict[str, Any], virtual_scale: float, config: AttenuationConfig, hide: bool
+    function: Callable[..., Any],
+    given: dict[str, Any],
+    virtual_scale: float,
+    config: AttenuationConfig,
+    hide: bool,
 ) -> Any:
     """``function``'s result for arguments by name, with ``sigma_d`` and ``growth_d`` among them.
 
     With ``hide``, culled centres move behind the camera, as this function draws rows of opacity 0.
     """
     if given.get("distributed"):
-        raise ClodError("distributed=True shares one opacity among all cameras, a dial needs one each; set it to False")
+        raise ClodError(
+            "distributed=True shares one opacity among all cameras, a dial needs one each; set it"
+            " to False"
+        )
     for name in PER_ROW:
         if given[name] is not None and given[name].shape != given["opacities"].shape:
-            shapes = f"{name} is {tuple(given[name].shape)} and opacities {tuple(given['opacities'].shape)}"
+            shapes = (
+                f"{name} is {tuple(given[name].shape)} and opacities"
+                f" {tuple(given['opacities'].shape)}"
+            )
             raise ClodError(f"{shapes}; both must be [..., N]")
     shape = given["viewmats"].shape[:-2]
     one = partial(_one_camera, function, virtual_scale=virtual_scale, config=config, hide=hide)
-    return one(given) if math.prod(shape) == 1 else _joined([one(each) for each in _cameras(given, shape)], shape)
+    return (
+        one(given)
+        if math.prod(shape) == 1
+        else _joined([one(each) for each in _cameras(given, shape)], shape)
+    )
 
 
 def _one_camera(
-    function: Callable[..., Any], given: dict[str, Any], virtual_scale: float, config: AttenuationConfig, hide: bool
+    function: Callable[..., Any],
+    given: dict[str, Any],
+    virtual_scale: float,
+    config: AttenuationConfig,
+    hide: bool,
 ) -> Any:
     """gsplat's result for a single camera with any batch dimensions."""
     camera = Camera(
-        given["viewmats"].reshape(4, 4), given["Ks"].reshape(3, 3), given["width"], given["height"],
+        given["viewmats"].reshape(4, 4),
+        given["Ks"].reshape(3, 3),
+        given["width"],
+        given["height"],
         near=given["near_plane"],
-    )  # fmt: skip
+    )
     arguments = dict(given)
     sigma_d, growth_d = (arguments.pop(name) for name in PER_ROW)
-    hook = Hook(sigma_d.flatten(), config, virtual_scale, None if growth_d is None else growth_d.flatten())
+    hook = Hook(
+        sigma_d.flatten(), config, virtual_scale, None if growth_d is None else growth_d.flatten()
+    )
     opacities, means = given["opacities"], given["means"]
     shown = hook.attenuate(means.reshape(-1, 3), opacities.flatten(), camera)
     arguments["opacities"] = shown.drawn.to(opacities).reshape(opacities.shape)
     if growth_d is not None:
-        name, growth = ("scales", shown.growth) if given.get("covars") is None else ("covars", shown.growth.square())
+        name, growth = (
+            ("scales", shown.growth)
+            if given.get("covars") is None
+            else ("covars", shown.growth.square())
+        )
         old = given[name]
-        arguments[name] = old * growth.to(old).reshape(opacities.shape + (1,) * (old.dim() - opacities.dim()))
+        arguments[name] = old * growth.to(old).reshape(
+            opacities.shape + (1,) * (old.dim() - opacities.dim())
+        )
     if hide and not given.get("sparse_grad"):  # sparse gradients do not pass through where
         behind = (camera.position - camera.viewmat[2, :3]).detach().to(means)
-        arguments["means"] = torch.where(shown.keep.reshape(opacities.shape)[..., None], means, behind)
+        arguments["means"] = torch.where(
+            shown.keep.reshape(opacities.shape)[..., None], means, behind
+        )
     return function(**arguments)
 
 
 def _cameras(given: dict[str, Any], shape: torch.Size) -> Iterator[dict[str, Any]]:
     """Arguments for each camera, without batch dimensions, in gsplat's order of images."""
     known = {*PER_GAUSSIAN, *PER_CAMERA, *PER_EITHER}
-    if unknown := [name for name, value in given.items() if isinstance(value, Tensor) and name not in known]:
-        raise ClodError(f"{unknown[0]} may differ between cameras in a way unknown here; render one camera at a time")
+    if unknown := [
+        name for name, value in given.items() if isinstance(value, Tensor) and name not in known
+    ]:
+        raise ClodError(
+            f"{unknown[0]} may differ between cameras in a way unknown here; render one camera at a"
+            " time"
+        )
     if isinstance(given.get("rays"), Tensor):  # the only one that gsplat broadcasts
         given = {**given, "rays": given["rays"].expand(*shape, *[-1] * 3)}
     for index in np.ndindex(*shape):
@@ -84,13 +130,19 @@ def _cameras(given: dict[str, Any], shape: torch.Size) -> Iterator[dict[str, Any
         places = dict.fromkeys(PER_GAUSSIAN, batch) | dict.fromkeys(PER_CAMERA, camera)
         for name, degree in PER_EITHER.items():
             if isinstance(value := given.get(name), Tensor):
-                leading = value.dim() - (2 if given[degree] is None else 3)  # of N rows, or of N rows of K coefficients
+                # of N rows, or of N rows of K coefficients
+                leading = value.dim() - (2 if given[degree] is None else 3)
                 places[name] = camera if leading == len(shape) else batch if leading else ...
-        yield {name: value[places[name]] if isinstance(value, Tensor) else value for name, value in given.items()}
+        yield {
+            name: value[places[name]] if isinstance(value, Tensor) else value
+            for name, value in given.items()
+        }
 
 
 def _joined(parts: Sequence[Any], shape: torch.Size) -> Any:
-    """gsplat's result for all images from that of each; ``shape`` has batch dimensions and cameras."""
+    """gsplat's result for all images from that of each; ``shape`` has batch dimensions and
+    cameras.
+    """
     first = parts[0]
     if isinstance(first, tuple):
         return tuple(_joined(same, shape) for same in zip(*parts, strict=True))
@@ -109,14 +161,17 @@ def _joined_meta(metas: Sequence[dict[str, Any]], shape: torch.Size) -> dict[str
     counted: dict[str, Sequence[int]] = {}
     if "depths" in first:
         # Width of the tile's number in gsplat's sorting key; gsplat 1.6 has a function for it.
-        bits = getattr(sys.modules.get("gsplat.cuda._torch_impl"), "_bits_for_count", int.bit_length)
+        bits = getattr(
+            sys.modules.get("gsplat.cuda._torch_impl"), "_bits_for_count", int.bit_length
+        )
         tile_bits = int(bits(first["tile_width"] * first["tile_height"]))
         counted = {
             "batch_ids": [image // shape[-1] for image in images],
             "camera_ids": [image % shape[-1] for image in images],
             "flatten_ids": [0, *accumulate(meta["depths"].numel() for meta in metas)],
             "isect_offsets": [0, *accumulate(len(meta["isect_ids"]) for meta in metas)],
-            "isect_ids": [image << 32 + tile_bits for image in images],  # image, tile, depth: gsplat's sorting key
+            # image, tile, depth: gsplat's sorting key
+            "isect_ids": [image << 32 + tile_bits for image in images],
         }
     counts = {"n_batches": math.prod(shape[:-1]), "n_cameras": shape[-1]}
     joined = first | {name: count for name, count in counts.items() if name in first}
@@ -126,7 +181,8 @@ def _joined_meta(metas: Sequence[dict[str, Any]], shape: torch.Size) -> dict[str
             if name in counted:
                 values = [ids + start for ids, start in zip(values, counted[name], strict=False)]
             of_images = name == "isect_offsets" or value.dim() == 4
-            without_camera = name == "means2d" and value.dim() == 2 and not packed  # of the Inria wrappers
+            # of the Inria wrappers
+            without_camera = name == "means2d" and value.dim() == 2 and not packed
             joined[name] = (torch.stack if without_camera else torch.cat)(values)
             if of_images or not (packed or name in counted):
                 joined[name] = joined[name].unflatten(0, shape)
@@ -138,21 +194,25 @@ def _joined_meta(metas: Sequence[dict[str, Any]], shape: torch.Size) -> dict[str
 def _pass_gradients_on(parts: list[Tensor], whole: Tensor) -> None:
     """Gives ``whole`` the ``grad`` and ``absgrad`` of the parts, which gsplat rendered from.
 
-    As with gsplat: ``grad`` if it is retained, as a leaf's always is, summed over backward passes; ``absgrad`` of the
-    last one.
+    As with gsplat: ``grad`` if it is retained, as a leaf's always is, summed over backward passes;
+    ``absgrad`` of the last one.
     """
     if not whole.requires_grad:
         return
     if all(part.is_leaf for part in parts):
         whole.retain_grad()
     whole.parts = parts  # type: ignore[attr-defined]
-    weak: Any = weakref.ref(whole)  # the graph of whole holds the hooks; a strong reference would be a cycle
+    # the graph of whole holds the hooks; a strong reference would be a cycle
+    weak: Any = weakref.ref(whole)
     values = whole.shape[-1]
     rows = [0, *accumulate(part.numel() // values for part in parts)]
-    seen: list[Any] = [0] * len(parts)  # gradients that came through whole and are in its grad already
+    # gradients that came through whole and are in its grad already
+    seen: list[Any] = [0] * len(parts)
 
     def by_whole(gradient: Tensor) -> None:
-        seen[:] = gradient.reshape(-1, values).split([stop - start for start, stop in pairwise(rows)])
+        seen[:] = gradient.reshape(-1, values).split(
+            [stop - start for start, stop in pairwise(rows)]
+        )
 
     def by_part(gradient: Tensor, number: int) -> None:
         drawn, seen[number] = gradient.reshape(-1, values) - seen[number], 0

@@ -6,9 +6,10 @@ color, radii, *others = GaussianRasterizer(raster_settings)(
     sigma_d=model.sigma_d, growth_d=model.growth_d, attenuation=model.attenuation, virtual_scale=3,
 )
 
-Forks differ in settings, further arguments and results, which all are passed on. Culled Gaussians get opacity 0 and a
-position just behind the camera's centre, where every fork culls them first, by depth or, for panoramas, by distance:
-they cost as much as a Gaussian out of view. All rows keep their places, with radii of 0.
+Forks differ in settings, further arguments and results, which all are passed on. Culled Gaussians
+get opacity 0 and a position just behind the camera's centre, where every fork culls them first, by
+depth or, for panoramas, by distance: they cost as much as a Gaussian out of view. All rows keep
+their places, with radii of 0.
 """
 
 import inspect
@@ -27,8 +28,8 @@ try:
     from diff_gaussian_rasterization import GaussianRasterizationSettings
 except ImportError as error:
     raise ImportError(
-        "diff_gaussian_rasterization cannot be imported; it needs torch and CUDA: "
-        "pip install --no-build-isolation git+https://github.com/graphdeco-inria/diff-gaussian-rasterization"
+        "diff_gaussian_rasterization cannot be imported; it needs torch and CUDA: pip install"
+        " --no-build-isolation git+https://github.com/graphdeco-inria/diff-gaussian-rasterization"
     ) from error
 
 __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer"]
@@ -51,20 +52,21 @@ class GaussianRasterizer(installed.GaussianRasterizer):  # type: ignore[misc]
     ) -> Any:
         """The installed fork's result with the opacities and scales of one dial value.
 
-        Equals the fork called with the opacities of ``attenuation.attenuate``, ``scales`` times its growth
-        (``cov3D_precomp``, where given, times its square) and without culled rows, plus rows of radius 0 for these.
-        Differentiable in ``sigma_d`` and ``growth_d``; the distances are constants. A file's
-        ``Gaussians.screen_filter`` belongs in the settings of forks that support it (``antialiasing``,
-        Mip-Splatting's ``kernel_size``).
+        Equals the fork called with the opacities of ``attenuation.attenuate``, ``scales`` times its
+        growth (``cov3D_precomp``, where given, times its square) and without culled rows, plus rows
+        of radius 0 for these. Differentiable in ``sigma_d`` and ``growth_d``; the distances are
+        constants. A file's ``Gaussians.screen_filter`` belongs in the settings of forks that
+        support it (``antialiasing``, Mip-Splatting's ``kernel_size``).
 
         Args:
             means3D, means2D, opacities, args, kwargs: those of the fork, by position or by name.
-            sigma_d, virtual_scale, attenuation, growth_d: as for ``integrations.gsplat.rasterization``, each ``[N]``.
+            sigma_d, virtual_scale, attenuation, growth_d: as for
+                ``integrations.gsplat.rasterization``, each ``[N]``.
 
         Raises:
-            ClodError: the dial is negative, growth_d comes without attenuation, a tensor holds integers, the shapes do
-                not match, or the settings have ``prefiltered``, with which the rasterizer aborts at the first Gaussian
-                out of view.
+            ClodError: the dial is negative, growth_d comes without attenuation, a tensor holds
+                integers, the shapes do not match, or the settings have ``prefiltered``, with which
+                the rasterizer aborts at the first Gaussian out of view.
         """
         config = dropped_in(sigma_d, virtual_scale, attenuation, growth_d)
         if config is None or sigma_d is None:
@@ -72,7 +74,8 @@ class GaussianRasterizer(installed.GaussianRasterizer):  # type: ignore[misc]
         settings = self.raster_settings
         if settings.prefiltered:
             raise ClodError(
-                "raster_settings.prefiltered is True, but culled Gaussians are out of view; set it to False"
+                "raster_settings.prefiltered is True, but culled Gaussians are out of view; set it"
+                " to False"
             )
         hook = Hook(sigma_d, config, virtual_scale, growth_d)
         viewmat = settings.viewmatrix.T  # Inria's matrices multiply from the right
@@ -80,7 +83,8 @@ class GaussianRasterizer(installed.GaussianRasterizer):  # type: ignore[misc]
         fx, fy = width / (2 * settings.tanfovx), height / (2 * settings.tanfovy)
         K = torch.tensor([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1]], dtype=torch.float32)
         drawn, keep, growth = hook(means3D, opacities, viewmat, K, width, height)
-        hidden = settings.campos - NEAR * settings.viewmatrix[:3, 2]  # opposite to the viewing direction
+        # opposite to the viewing direction
+        hidden = settings.campos - NEAR * settings.viewmatrix[:3, 2]
         means3D = torch.where(keep[:, None], means3D, hidden.to(means3D))
         bound = inspect.signature(super().forward).bind(means3D, means2D, drawn, *args, **kwargs)
         for name, power in () if growth_d is None else (("scales", 1), ("cov3D_precomp", 2)):

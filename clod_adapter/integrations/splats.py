@@ -1,4 +1,6 @@
-"""The parameters that gsplat's ``simple_trainer`` and nerfstudio's splatfacto train, as ``Gaussians`` and back."""
+"""The parameters that gsplat's ``simple_trainer`` and nerfstudio's splatfacto train, as
+``Gaussians`` and back.
+"""
 
 from collections.abc import Mapping
 from typing import Any
@@ -13,35 +15,50 @@ from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import SH_C0, Gaussians
 
 NAMES = {
-    "means": "means", "quats": "quats", "scales": "log_scales", "opacities": "opacity_logits",
-    "sh0": "sh0", "shN": "shN",
-}  # fmt: skip
+    "means": "means",
+    "quats": "quats",
+    "scales": "log_scales",
+    "opacities": "opacity_logits",
+    "sh0": "sh0",
+    "shN": "shN",
+}
 """By the name of gsplat's trainer, that of ``Gaussians``."""
 
 
-def from_gsplat(splats: Mapping[str, Tensor | np.ndarray], *, screen_filter: ScreenFilter = CLASSIC) -> Gaussians:
-    """The Gaussians of a ``splats`` dictionary, without a dial; they share its tensors, and so its gradients.
+def from_gsplat(
+    splats: Mapping[str, Tensor | np.ndarray], *, screen_filter: ScreenFilter = CLASSIC
+) -> Gaussians:
+    """The Gaussians of a ``splats`` dictionary, without a dial; they share its tensors, and so its
+    gradients.
 
-    Scales are logarithms and opacities logits, ``[N]`` or ``[N, 1]``. Colours are gsplat's ``sh0 [N, 1, 3]`` and
-    ``shN [N, K-1, 3]`` or splatfacto's ``features_dc [N, 3]`` and ``features_rest``; without higher SH degrees the
-    second may be absent. Of splatfacto with SH degree 0 ``features_dc`` are logits of colours, which are converted.
+    Scales are logarithms and opacities logits, ``[N]`` or ``[N, 1]``. Colours are gsplat's
+    ``sh0 [N, 1, 3]`` and ``shN [N, K-1, 3]`` or splatfacto's ``features_dc [N, 3]`` and
+    ``features_rest``; without higher SH degrees the second may be absent. Of splatfacto with SH
+    degree 0 ``features_dc`` are logits of colours, which are converted.
 
     Args:
         splats: a dictionary or ``torch.nn.ParameterDict``; numpy arrays become float32 tensors.
-        screen_filter: ``ScreenFilter(compensate=True)`` where it was trained with ``rasterize_mode="antialiased"``.
+        screen_filter: ``ScreenFilter(compensate=True)`` where it was trained with
+            ``rasterize_mode="antialiased"``.
 
     Raises:
         ClodError: a parameter is missing or has the wrong shape.
     """
     named = {name: float_tensor(value) for name, value in splats.items()}
-    degree_0 = "features_dc" in named and named.get("features_rest", torch.empty(0, 0)).shape[1] == 0
+    degree_0 = (
+        "features_dc" in named and named.get("features_rest", torch.empty(0, 0)).shape[1] == 0
+    )
     if "features_dc" in named:
         colours = named["features_dc"]
         named["sh0"] = ((colours.sigmoid() - 0.5) / SH_C0 if degree_0 else colours).unsqueeze(1)
         named["shN"] = named.get("features_rest", colours.new_zeros(len(colours), 0, 3))
     missing = [name for name in NAMES if name not in named and name != "shN"]
     if missing:
-        more = "; with appearance optimisation there are no spherical harmonics" if "features" in named else ""
+        more = (
+            "; with appearance optimisation there are no spherical harmonics"
+            if "features" in named
+            else ""
+        )
         raise ClodError(f"splats needs {', '.join(missing)} too, it has {', '.join(splats)}{more}")
     named.setdefault("shN", named["sh0"].new_zeros(len(named["sh0"]), 0, 3))
     if named["opacities"].dim() == 2 and named["opacities"].shape[1] == 1:

@@ -1,8 +1,9 @@
 """Adapters as safetensors files: tensors, and one JSON document.
 
-Tensors: ``sigma_d`` float32, with growth also ``growth_d`` float32, and each update under the name of its attribute:
-float16 for a difference from the base, float32 for new values. Far Gaussians' attributes have names that begin with
-``far.``. The JSON is stored under the metadata key ``clod_adapter``, keys sorted: equal adapters give equal files.
+Tensors: ``sigma_d`` float32, with growth also ``growth_d`` float32, and each update under the name
+of its attribute: float16 for a difference from the base, float32 for new values. Far Gaussians'
+attributes have names that begin with ``far.``. The JSON is stored under the metadata key
+``clod_adapter``, keys sorted: equal adapters give equal files.
 """
 
 from pathlib import Path
@@ -13,7 +14,14 @@ from clod_adapter.config import CLASSIC
 from clod_adapter.errors import ClodError, refused_if_damaged
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.file_formats import KEY, read_bytes
-from clod_adapter.io.settings import ADAPTER, DAMAGED, Metadata, document, parse_document, read_metadata
+from clod_adapter.io.settings import (
+    ADAPTER,
+    DAMAGED,
+    Metadata,
+    document,
+    parse_document,
+    read_metadata,
+)
 from clod_adapter.io.tensor_file import parse_tensors, read_tensor_header, write_tensors
 
 ADDED = "far."
@@ -32,7 +40,9 @@ def save_adapter(path: str | Path, adapter: Adapter) -> None:
     try:
         text = document(ADAPTER, settings, **about)
     except (TypeError, ValueError) as error:
-        raise ClodError(f"the adapter's config is not plain JSON ({error}); use finite numbers and strings") from error
+        raise ClodError(
+            f"the adapter's config is not plain JSON ({error}); use finite numbers and strings"
+        ) from error
     with atomic_path(path) as temporary:
         write_tensors(temporary, tensors, {KEY: text})
         _description(temporary, read_tensor_header(temporary)[1])  # it can be read again
@@ -49,7 +59,11 @@ def load_adapter(path: str | Path) -> Adapter:
     about, settings = _description(path, metadata)
     assert settings.attenuation is not None
     with refused_if_damaged(path, "its tensors or settings are damaged", DAMAGED[1]):
-        added = {name.removeprefix(ADDED): tensors.pop(name) for name in [*tensors] if name.startswith(ADDED)}
+        added = {
+            name.removeprefix(ADDED): tensors.pop(name)
+            for name in [*tensors]
+            if name.startswith(ADDED)
+        }
         return Adapter(
             added=added,
             sigma_d=tensors.pop("sigma_d"),
@@ -69,7 +83,9 @@ def load_adapter(path: str | Path) -> Adapter:
 def _description(path: Path, metadata: dict[str, str]) -> tuple[dict[str, Any], Metadata]:
     """The JSON document of an adapter, and the settings in it; refuses another file."""
     if KEY not in metadata:
-        raise ClodError(f"{path}: is a safetensors file but not an adapter; give a file that this package wrote")
+        raise ClodError(
+            f"{path}: is a safetensors file but not an adapter; give a file that this package wrote"
+        )
     about = parse_document(path, metadata[KEY], ADAPTER)
     with refused_if_damaged(path, *DAMAGED):
         for name, wanted in (("base_sha256", str), ("package_version", str), ("config", dict)):

@@ -1,4 +1,6 @@
-"""Outputs appear whole or not at all: write under a temporary name, then rename; and one run at a time writes them."""
+"""Outputs appear whole or not at all: write under a temporary name, then rename; and one run at a
+time writes them.
+"""
 
 import os
 import shutil
@@ -14,8 +16,9 @@ from clod_adapter.errors import ClodError
 def atomic_path(final: str | Path) -> Iterator[Path]:
     """Gives a temporary name beside ``final``; on success the file written there replaces it.
 
-    The body writes a file, or makes a folder, there. It is flushed to disk before it is renamed, so a crash leaves the
-    old ``final`` or the new one; on any exception (KeyboardInterrupt too) the temporary is removed.
+    The body writes a file, or makes a folder, there. It is flushed to disk before it is renamed, so
+    a crash leaves the old ``final`` or the new one; on any exception (KeyboardInterrupt too) the
+    temporary is removed.
     """
     with atomic_paths(final) as (temporary,):
         yield temporary
@@ -23,7 +26,9 @@ def atomic_path(final: str | Path) -> Iterator[Path]:
 
 @contextmanager
 def atomic_paths(*finals: str | Path) -> Iterator[tuple[Path, ...]]:
-    """``atomic_path`` for several, of which all are replaced or none. Errors name the final paths."""
+    """``atomic_path`` for several, of which all are replaced or none. Errors name the final
+    paths.
+    """
     targets = [Path(final) for final in finals]
     for target in targets:
         check_target(target)
@@ -62,18 +67,22 @@ def remove_leftovers(final: Path) -> None:
 def output_lock(final: Path, *, of: Path | None = None) -> Iterator[None]:
     """Holds, in the body, the lock of ``final``, by a hidden file beside it; errors name ``of``.
 
-    Of two runs the second would remove the temporaries of the first. The lock ends with the process, however that ends.
-    On a file system without locks nothing is locked.
+    Of two runs the second would remove the temporaries of the first. The lock ends with the
+    process, however that ends. On a file system without locks nothing is locked.
     """
     from filelock import FileLock, Timeout  # here: --help needs no lock
 
-    path = final.parent / f"{_mark(final.with_name(final.name.casefold()))}lock"  # some file systems ignore case
+    # some file systems ignore case
+    path = final.parent / f"{_mark(final.with_name(final.name.casefold()))}lock"
     lock, name = FileLock(path, timeout=0), of or final
     try:
         lock.acquire()
     except (OSError, NotImplementedError) as error:
-        if isinstance(error, Timeout | PermissionError) and os.path.exists(path):  # the latter: a run of another user
-            raise ClodError(f"{name}: another run is writing it; wait for that, or choose another name") from error
+        # the latter: a run of another user
+        if isinstance(error, Timeout | PermissionError) and os.path.exists(path):
+            raise ClodError(
+                f"{name}: another run is writing it; wait for that, or choose another name"
+            ) from error
         if isinstance(error, Timeout):  # raised too where no file can be made
             raise ClodError(f"{name}: cannot be written; check the path") from error
         with suppress(OSError):  # no locks here
@@ -93,14 +102,21 @@ def check_target(final: Path) -> None:
     if not folder.is_dir():
         raise ClodError(f"{final}: folder {folder} does not exist; create it first")
     if not os.access(folder, os.W_OK | os.X_OK):
-        raise ClodError(f"{final}: folder {folder} is not writable; choose another or change its permissions")
+        raise ClodError(
+            f"{final}: folder {folder} is not writable; choose another or change its permissions"
+        )
     if os.path.ismount(final):
-        raise ClodError(f"{final}: is a mount point, which cannot be replaced; mount its folder instead")
+        raise ClodError(
+            f"{final}: is a mount point, which cannot be replaced; mount its folder instead"
+        )
     if final.is_dir() and any(final.iterdir()):
         raise ClodError(f"{final}: is a folder that is not empty; choose another name")
     if final.is_file() and not (final.stat().st_mode & 0o222 and os.access(final, os.W_OK)):
         # A rename would replace it, and root has access to everything.
-        raise ClodError(f"{final}: is write-protected; choose another output, or chmod u+w if it is to be replaced")
+        raise ClodError(
+            f"{final}: is write-protected; choose another output, or chmod u+w if it is to be"
+            " replaced"
+        )
 
 
 def _mark(final: Path) -> str:
@@ -109,7 +125,8 @@ def _mark(final: Path) -> str:
 
 
 def _temporary(final: Path) -> Path:
-    # A temporary of a temporary has the mark of the final file. Some writers choose their format by the suffix.
+    # A temporary of a temporary has the mark of the final file. Some writers choose their format by
+    # the suffix.
     mark = final.name[:14] if final.name.startswith(".tmp-") else _mark(final)
     return final.parent / f"{mark}{os.urandom(8).hex()}{final.suffix}"
 

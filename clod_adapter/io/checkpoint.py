@@ -22,7 +22,14 @@ from clod_adapter.hook import Hook
 from clod_adapter.io.file_formats import PLY, format_of, read_source, write
 from clod_adapter.io.ply_layout import PREFIX, write_rows
 from clod_adapter.io.ranks import ranks_of
-from clod_adapter.io.settings import WARNING, Metadata, matching_calibration, stated_filter, tagged, that_fit
+from clod_adapter.io.settings import (
+    WARNING,
+    Metadata,
+    matching_calibration,
+    stated_filter,
+    tagged,
+    that_fit,
+)
 from clod_adapter.io.values import SIGMA, Activated, prepared
 from clod_adapter.origin import NOWHERE, Origin
 
@@ -35,21 +42,22 @@ class Checkpoint:
     """A file as read: its Gaussians, and what the writer keeps of it.
 
     Attributes:
-        gaussians: the usable Gaussians, float32; with sigma_d and attenuation, and perhaps growth_d, if the file is
-            extended.
-        vertex: of a PLY, ``[N]`` structured array: the same rows with every column as it is in the file, native byte
-            order; None for other formats.
-        comments: the header's but the settings, or the lines of history of another format; as far as an output has
-            room for them.
+        gaussians: the usable Gaussians, float32; with sigma_d and attenuation, and perhaps
+            growth_d, if the file is extended.
+        vertex: of a PLY, ``[N]`` structured array: the same rows with every column as it is in the
+            file, native byte order; None for other formats.
+        comments: the header's but the settings, or the lines of history of another format; as far
+            as an output has room for them.
         notes: what was dropped or noticed, one line each.
-        fingerprint: SHA-256 of the file's bytes, hex, or of those of all ranks; preceded by "opacity:", "scales:" or
-            "both:" where values were taken as activated.
+        fingerprint: SHA-256 of the file's bytes, hex, or of those of all ranks; preceded by
+            "opacity:", "scales:" or "both:" where values were taken as activated.
         path: of the file.
         calibration: what its dial values keep, cost and take, if it stores that.
-        origin: ``[3]`` what the means are relative to, world units: not 0 only for a scene far from 0, whose
-            photographs are to be read relative to it too (``load_scene``). Outputs have the file's own coordinates.
-        filter_known: whether the file states its screen-space filter, or a dial was tuned with it; else that of the
-            Gaussians is only implied.
+        origin: ``[3]`` what the means are relative to, world units: not 0 only for a scene far from
+            0, whose photographs are to be read relative to it too (``load_scene``). Outputs have
+            the file's own coordinates.
+        filter_known: whether the file states its screen-space filter, or a dial was tuned with it;
+            else that of the Gaussians is only implied.
     """
 
     gaussians: Gaussians
@@ -67,7 +75,9 @@ class Checkpoint:
 
     @property
     def viewpoints(self) -> tuple[Viewpoint, ...]:
-        """Those of the calibration, relative to the origin as the Gaussians are; empty without a calibration."""
+        """Those of the calibration, relative to the origin as the Gaussians are; empty without a
+        calibration.
+        """
         stored = self.calibration.viewpoints if self.calibration else ()
         return tuple(viewpoint.moved([-value for value in self.origin]) for viewpoint in stored)
 
@@ -78,60 +88,84 @@ class Checkpoint:
             return []
         size = self.calibration.width, self.calibration.height
         seen = [viewpoint for viewpoint in self.viewpoints if viewpoint.fov > 0]
-        return with_near_planes([camera_of(each, *size, f"viewpoint {k + 1}") for k, each in enumerate(seen)])
+        return with_near_planes(
+            [camera_of(each, *size, f"viewpoint {k + 1}") for k, each in enumerate(seen)]
+        )
 
     @property
     def placed(self) -> bool:
-        """Whether these cameras were placed without photographs, so that they do not tell which way is up."""
+        """Whether these cameras were placed without photographs, so that they do not tell which way
+        is up.
+        """
         return self.calibration is not None and self.calibration.against == "checkpoint"
 
     def hook(self, virtual_scale: float = 1.0) -> Hook:
-        """The dial for a renderer that has these Gaussians: attenuated opacities, and factors of the scales.
+        """The dial for a renderer that has these Gaussians: attenuated opacities, and factors of
+        the scales.
 
         Raises:
             ClodError: the file has no sigma_d, or the dial is negative or not finite.
         """
         own = self.gaussians
         if own.sigma_d is None or own.attenuation is None:
-            raise ClodError(f"{self.path}: it has no sigma_d, so there is no dial; clod-adapt adapt gives it one")
+            raise ClodError(
+                f"{self.path}: it has no sigma_d, so there is no dial; clod-adapt adapt gives"
+                " it one"
+            )
         return Hook(own.sigma_d, own.attenuation, virtual_scale, own.growth_d)
 
 
 @torch.inference_mode(False)  # training takes no inference tensors
-def load(path: str | Path, *, activated: Activated | None = None, origin: Origin | None = None) -> Checkpoint:
-    """Reads a checkpoint of plain Gaussians; the suffix decides the format (``file_formats.FORMATS``).
+def load(
+    path: str | Path, *, activated: Activated | None = None, origin: Origin | None = None
+) -> Checkpoint:
+    """Reads a checkpoint of plain Gaussians; the suffix decides the format
+    (``file_formats.FORMATS``).
 
-    A PLY may have Inria's, MaskGaussian's, Mip-Splatting's or our extended layout: any property order, byte order or
-    ascii, with or without normals, SH degree 0 to 4. It is read once; the fingerprint is of the bytes that were parsed.
-    Of a checkpoint of several GPUs any rank stands for all, which lie in its folder.
+    A PLY may have Inria's, MaskGaussian's, Mip-Splatting's or our extended layout: any property
+    order, byte order or ascii, with or without normals, SH degree 0 to 4. It is read once; the
+    fingerprint is of the bytes that were parsed. Of a checkpoint of several GPUs any rank stands
+    for all, which lie in its folder.
 
-    Rows with a value that is not finite in a used column, or with a zero rotation, are dropped and counted in the
-    notes; opacity = +inf stays and means fully opaque. Of MaskGaussian's old layout (``masks_0, masks_1``) rows with
-    existence probability sigmoid(masks_0 - masks_1) < 0.5 are dropped too. Mip-Splatting's ``filter_3D`` is fused into
-    scale and opacity.
+    Rows with a value that is not finite in a used column, or with a zero rotation, are dropped and
+    counted in the notes; opacity = +inf stays and means fully opaque. Of MaskGaussian's old layout
+    (``masks_0, masks_1``) rows with existence probability sigmoid(masks_0 - masks_1) < 0.5 are
+    dropped too. Mip-Splatting's ``filter_3D`` is fused into scale and opacity.
 
     Args:
-        activated: which values are activated already, for a file where no opacity is below -0.1 and half are at most
-            1, or no scale is below 0, as in no usual file of logits and logarithms: "none", "opacity", "scales" or
-            "both". Not needed for files of this package, and for formats that define it.
-        origin: what the means are to be relative to, world units; by default chosen by ``origin_of``.
+        activated: which values are activated already, for a file where no opacity is below -0.1 and
+            half are at most 1, or no scale is below 0, as in no usual file of logits and
+            logarithms: "none", "opacity", "scales" or "both". Not needed for files of this package,
+            and for formats that define it.
+        origin: what the means are to be relative to, world units; by default chosen by
+            ``origin_of``.
 
     Raises:
-        ClodError: not a checkpoint, damaged, of another kind, nothing usable in it, or the range of the values leaves
-            open whether they are activated and ``activated`` is None.
+        ClodError: not a checkpoint, damaged, of another kind, nothing usable in it, or the range of
+            the values leaves open whether they are activated and ``activated`` is None.
     """
     path = Path(path)
     source = read_source(path)
     metadata, dial = source.metadata, SIGMA in source.arrays
-    found = prepared(path, source.arrays, activated if source.activation_unknown else "none", metadata.origin, origin)
+    found = prepared(
+        path,
+        source.arrays,
+        activated if source.activation_unknown else "none",
+        metadata.origin,
+        origin,
+    )
     arrays, rows, total = found.arrays, source.rows, len(found.keep)
     if not found.keep.all():
         arrays = {name: array[found.keep] for name, array in arrays.items()}
         rows = None if rows is None else rows[found.keep]
     screen_filter = stated_filter(source)
     tensors: dict[str, Any] = {name: torch.from_numpy(array) for name, array in arrays.items()}
-    gaussians = Gaussians(**tensors, attenuation=metadata.attenuation if dial else None, screen_filter=screen_filter)
-    dropped = [f"{lost} of {total} Gaussians dropped: {reason}" for reason, lost in found.dropped.items()]
+    gaussians = Gaussians(
+        **tensors, attenuation=metadata.attenuation if dial else None, screen_filter=screen_filter
+    )
+    dropped = [
+        f"{lost} of {total} Gaussians dropped: {reason}" for reason, lost in found.dropped.items()
+    ]
     notes = [*found.changes, *dropped]
     if arrays["opacity_logits"].max() == np.inf:  # else no mask is made
         opaque = np.count_nonzero(arrays["opacity_logits"] == np.inf)
@@ -145,22 +179,31 @@ def load(path: str | Path, *, activated: Activated | None = None, origin: Origin
     calibration, mismatch = matching_calibration(metadata, len(gaussians)) if dial else (None, [])
     about = [comment for comment in source.comments if not comment.startswith(PREFIX)]
     if source.head is None:
-        printable = ["".join(c if c.isascii() and c.isprintable() else "?" for c in line) for line in about]
+        printable = [
+            "".join(c if c.isascii() and c.isprintable() else "?" for c in line) for line in about
+        ]
         about = tagged(printable, screen_filter)
     comments, cut = that_fit([*about, *found.changes])
     return Checkpoint(
-        gaussians, rows, comments, (*notes, *mismatch, *source.notes, *cut),
-        source.sha256 if found.activated == "none" else f"{found.activated}:{source.sha256}", path, calibration,
-        found.origin, filter_known=dial or metadata.screen_filter is not None,
-    )  # fmt: skip
+        gaussians,
+        rows,
+        comments,
+        (*notes, *mismatch, *source.notes, *cut),
+        source.sha256 if found.activated == "none" else f"{found.activated}:{source.sha256}",
+        path,
+        calibration,
+        found.origin,
+        filter_known=dial or metadata.screen_filter is not None,
+    )
 
 
 @torch.no_grad()
 def plausibility(arrays: Mapping[str, np.ndarray], config: AttenuationConfig) -> list[str]:
-    """Of a dial without settings, a line with the share that it keeps at s = 1 from the nominal distance.
+    """Of a dial without settings, a line with the share that it keeps at s = 1 from the nominal
+    distance.
 
-    A warning where that is too small, as of a file whose positions were enlarged. Nothing for the paper's form, which
-    is invariant to scale.
+    A warning where that is too small, as of a file whose positions were enlarged. Nothing for the
+    paper's form, which is invariant to scale.
     """
     if config.form == "paper":
         return []
@@ -186,36 +229,46 @@ def save(
 ) -> None:
     """Writes ``gaussians`` in the format of the path's suffix (``file_formats.WRITABLE``).
 
-    A PLY is an extended file: the base's columns, then ``sigma_d`` and ``growth_d``. Without a base the columns are
-    those of Inria's layout. What another format loses is a warning.
+    A PLY is an extended file: the base's columns, then ``sigma_d`` and ``growth_d``. Without a base
+    the columns are those of Inria's layout. What another format loses is a warning.
 
-    Row ``i`` of ``gaussians`` is row ``i`` of ``base``, after which far Gaussians follow. Columns keep name, order and
-    type; a value is overwritten only where it differs from the base's float32 reading, so what was not tuned stays
-    byte-equal. Where the base has an origin, x, y and z are written as double. sigma_d is written in world units
-    (``units.in_world_units``). The settings follow the element line as comments, and those that are not the defaults
-    are stored in columns too. Without a sigma_d a plain file results.
+    Row ``i`` of ``gaussians`` is row ``i`` of ``base``, after which far Gaussians follow. Columns
+    keep name, order and type; a value is overwritten only where it differs from the base's float32
+    reading, so what was not tuned stays byte-equal. Where the base has an origin, x, y and z are
+    written as double. sigma_d is written in world units (``units.in_world_units``). The settings
+    follow the element line as comments, and those that are not the defaults are stored in columns
+    too. Without a sigma_d a plain file results.
 
     Args:
-        version: of the package that made the values, for the header (``Adapter.version``); by default the running one.
-        calibration: of these Gaussians, for the header. The base's is not passed on, which is of the base.
+        version: of the package that made the values, for the header (``Adapter.version``); by
+            default the running one.
+        calibration: of these Gaussians, for the header. The base's is not passed on, which is of
+            the base.
 
     Raises:
-        ClodError: another suffix or none, there are no Gaussians, they do not match the base, a new value is not
-            finite, the target is the base itself, cannot be written, or not be read again; for another format than
-            PLY also sigma_d that it does not carry.
+        ClodError: another suffix or none, there are no Gaussians, they do not match the base, a new
+            value is not finite, the target is the base itself, cannot be written, or not be read
+            again; for another format than PLY also sigma_d that it does not carry.
     """
     path = Path(path)
-    about, origin, vertex = (base.comments, base.origin, base.vertex) if base else ((), NOWHERE, None)
+    about, origin, vertex = (
+        (base.comments, base.origin, base.vertex) if base else ((), NOWHERE, None)
+    )
     metadata = Metadata(calibration=calibration, origin=origin, about=about, version=version or "")
     if base is not None:
         inputs = [base.path, *ranks_of(base.path).values()]
         if path.is_file() and any(each.is_file() and path.samefile(each) for each in inputs):
-            raise ClodError(f"{path}: is the input file, which is never overwritten; choose another output")
+            raise ClodError(
+                f"{path}: is the input file, which is never overwritten; choose another output"
+            )
         if (
             len(base.gaussians) not in (len(gaussians), gaussians.whole)
             or gaussians.sh_degree != base.gaussians.sh_degree
         ):
-            what = f"Gaussians ({gaussians.summary}) do not fit their base {base.path} ({base.gaussians.summary})"
+            what = (
+                f"Gaussians ({gaussians.summary}) do not fit their base {base.path}"
+                f" ({base.gaussians.summary})"
+            )
             raise ClodError(f"{path}: {what}; save with the checkpoint they came from")
     writer = partial(write_rows, base=vertex) if format_of(path) is PLY else None
     for note in write(path, gaussians, metadata, writer=writer):

@@ -1,6 +1,8 @@
-"""The file formats of Gaussians, by the suffix of the file: one table, and first checks of a file, without torch.
+"""The file formats of Gaussians, by the suffix of the file: one table, and first checks of a file,
+without torch.
 
-What reads, checks or refuses a file, here and in the readers, raises a ClodError of one line that names the file.
+What reads, checks or refuses a file, here and in the readers, raises a ClodError of one line that
+names the file.
 """
 
 from __future__ import annotations
@@ -25,16 +27,18 @@ Writer = Callable[..., tuple[str, ...]]
 
 
 class Format(NamedTuple):
-    """A format. Its module has ``read``, of a path and the bytes of the file to a ``Source`` without their hash.
+    """A format. Its module has ``read``, of a path and the bytes of the file to a ``Source``
+    without their hash.
 
-    If it carries sigma_d also ``has_dial``, of a file that was checked; if it is written also ``write``, of a path,
-    Gaussians in world units and their ``Metadata``, to a line for each loss.
+    If it carries sigma_d also ``has_dial``, of a file that was checked; if it is written also
+    ``write``, of a path, Gaussians in world units and their ``Metadata``, to a line for each loss.
     """
 
     module: str = ""  # under ``clod_adapter.io``, imported when it is used
     check: str = "file_formats.check_start"  # refuses, without torch, a file of another format
     carries_sigma: bool = False  # whether the dial is written: sigma_d, growth_d and their settings
-    about: tuple[str, ...] = ()  # where it is written, the precision of its values; lines of at most 54 letters
+    # where it is written, the precision of its values; lines of at most 54 letters
+    about: tuple[str, ...] = ()
     ordered: bool = True  # whether the rows keep their order
 
 
@@ -48,7 +52,12 @@ FORMATS = {
     ".glb": Format("formats.glb", carries_sigma=True, about=_GLB),
     ".spz": Format("formats.spz", carries_sigma=True, about=_SPZ),
     ".safetensors": Format("tensor_file", carries_sigma=True, about=("exact; for Python",)),
-    ".pt": Format("formats.pt", "formats.pt.check", carries_sigma=True, about=("exact; layout of gsplat's trainer",)),
+    ".pt": Format(
+        "formats.pt",
+        "formats.pt.check",
+        carries_sigma=True,
+        about=("exact; layout of gsplat's trainer",),
+    ),
     ".splat": Format("formats.splat", about=("8 bits, SH degree 0",), ordered=False),
     ".sog": _CONVERTED,
     ".ksplat": _CONVERTED,
@@ -57,7 +66,9 @@ WRITABLE = tuple(suffix for suffix, form in FORMATS.items() if form.about)
 
 
 def format_of(path: Path) -> Format:
-    """The format of a file, by its name alone, so that only a .pt is unpickled; any other name is a PLY's."""
+    """The format of a file, by its name alone, so that only a .pt is unpickled; any other name is a
+    PLY's.
+    """
     return FORMATS.get(path.suffix.lower(), PLY)
 
 
@@ -76,23 +87,32 @@ def file_has_dial(path: Path) -> bool:
 def check_suffix(path: Path) -> None:
     """Refuses a name whose suffix is none of WRITABLE."""
     if path.name.lower().endswith((".sog", ".compressed.ply")):
-        raise ClodError(f"{path}: is written by clod-adapt export alone: save a .ply, then clod-adapt export it")
+        raise ClodError(
+            f"{path}: is written by clod-adapt export alone: save a .ply, then clod-adapt export it"
+        )
     if path.suffix.lower() not in WRITABLE:
         found = path.suffix or "no suffix"
-        raise ClodError(f"{path}: {found} is no format to write; choose one of {', '.join(WRITABLE)}")
+        raise ClodError(
+            f"{path}: {found} is no format to write; choose one of {', '.join(WRITABLE)}"
+        )
 
 
 def check_written(path: Path) -> None:
-    """Refuses a file just written that could not be read again: a PLY by its header and length, others read whole."""
+    """Refuses a file just written that could not be read again: a PLY by its header and length,
+    others read whole.
+    """
     try:
         (file_has_dial if format_of(path) is PLY else read_source)(path)
     except ClodError as error:
         reason = str(error).removeprefix(f"{path}: ")
-        raise ClodError(f"{path}: is not written, because it could not be read again: {reason}") from error
+        raise ClodError(
+            f"{path}: is not written, because it could not be read again: {reason}"
+        ) from error
 
 
 def read_source(path: Path) -> Source:
-    """The content of a file in any format, with the other ranks of a checkpoint of several GPUs (``ranks``).
+    """The content of a file in any format, with the other ranks of a checkpoint of several GPUs
+    (``ranks``).
 
     Every reader refuses, in one line, what is damaged or of another kind.
     """
@@ -102,7 +122,9 @@ def read_source(path: Path) -> Source:
         _call("ranks.check_ranks", path, ranks)
     if len(ranks) < 2:
         return source
-    joined: Source = _call("ranks.joined", path, [source if each == path else _read(each) for each in ranks.values()])
+    joined: Source = _call(
+        "ranks.joined", path, [source if each == path else _read(each) for each in ranks.values()]
+    )
     return joined
 
 
@@ -114,30 +136,45 @@ def _read(path: Path) -> Source:
 
 
 def write(
-    path: str | Path, gaussians: Gaussians, metadata: Metadata | None = None, *, writer: Writer | None = None
+    path: str | Path,
+    gaussians: Gaussians,
+    metadata: Metadata | None = None,
+    *,
+    writer: Writer | None = None,
 ) -> tuple[str, ...]:
-    """Writes Gaussians in the format of the suffix, whole or not at all, sigma_d in world units; a line for each loss.
+    """Writes Gaussians in the format of the suffix, whole or not at all, sigma_d in world units; a
+    line for each loss.
 
-    ``metadata`` lacks their dial and screen-space filter; ``writer`` replaces the format's ``write``.
+    ``metadata`` lacks their dial and screen-space filter; ``writer`` replaces the format's
+    ``write``.
     """
     check_suffix(Path(path))
     form = format_of(Path(path))
     if len(gaussians) == 0:
-        raise ClodError(f"{path}: there are no Gaussians to write, and no reader takes a file without any")
+        raise ClodError(
+            f"{path}: there are no Gaussians to write, and no reader takes a file without any"
+        )
     if gaussians.sigma_d is not None and not form.carries_sigma:
-        raise ClodError(f"{path}: {Path(path).suffix} has no room for a dial; choose a dial value to bake")
+        raise ClodError(
+            f"{path}: {Path(path).suffix} has no room for a dial; choose a dial value to bake"
+        )
     from clod_adapter.equation.units import in_world_units  # here: the table needs no torch
 
     g = in_world_units(gaussians)
-    stored = replace(metadata or Metadata(), attenuation=g.attenuation, screen_filter=g.screen_filter)
+    stored = replace(
+        metadata or Metadata(), attenuation=g.attenuation, screen_filter=g.screen_filter
+    )
     with atomic_path(path) as temporary:
-        notes: tuple[str, ...] = (writer or partial(_call, f"{form.module}.write"))(temporary, g, stored)
+        notes: tuple[str, ...] = (writer or partial(_call, f"{form.module}.write"))(
+            temporary, g, stored
+        )
         check_written(temporary)
     return notes
 
 
 START = 64  # bytes that tell the kind of a file
-NEW_SPZ = b"NGSP"  # first bytes of version 4, which splat-transform reads; earlier versions are gzipped
+# first bytes of version 4, which splat-transform reads; earlier versions are gzipped
+NEW_SPZ = b"NGSP"
 _START: dict[str, tuple[bytes, ...]] = {".glb": (b"glTF",), ".spz": (b"\x1f\x8b", NEW_SPZ)}
 
 
@@ -149,10 +186,17 @@ def check_start(path: Path) -> None:
         refuse(path, start, f"is not a {suffix} file by its first bytes; copy or export it again")
     if suffix == ".spz" and start.startswith(NEW_SPZ):
         _call("formats.splat_transform.check", path)
-    if suffix == ".splat" and (path.stat().st_size % 32 or start.startswith(b"ply")):  # else any bytes are one
-        refuse(path, start, "is not a .splat file, whose rows have 32 bytes; copy or export it again")
-    if suffix == ".safetensors" and '"clod-adapter"' in _call("tensor_file.read_tensor_header", path)[1].get(KEY, ""):
-        raise ClodError(f"{path}: is an adapter, not a model; clod-adapt apply BASE.ply {path.name} -o OUT.ply")
+    # else any bytes are one
+    if suffix == ".splat" and (path.stat().st_size % 32 or start.startswith(b"ply")):
+        refuse(
+            path, start, "is not a .splat file, whose rows have 32 bytes; copy or export it again"
+        )
+    if suffix == ".safetensors" and '"clod-adapter"' in _call(
+        "tensor_file.read_tensor_header", path
+    )[1].get(KEY, ""):
+        raise ClodError(
+            f"{path}: is an adapter, not a model; clod-adapt apply BASE.ply {path.name} -o OUT.ply"
+        )
 
 
 def _call(function: str, *args: Any) -> Any:
@@ -160,23 +204,46 @@ def _call(function: str, *args: Any) -> Any:
     return getattr(import_module(f"clod_adapter.io.{module}"), name)(*args)
 
 
-_CONVERT = "convert it: splat-transform IN{suffix} OUT.ply; better still, adapt the PLY that it was made from"
+_CONVERT = (
+    "convert it: splat-transform IN{suffix} OUT.ply; better still, adapt the PLY that it was made"
+    " from"
+)
 _DOWNLOAD = "download the file itself"
 # First bytes (after white space) that are never those of a splat, what the file is, and the remedy.
 CONTENTS = (
-    (b"version https://git-lfs", "a Git LFS pointer, not the file it stands for", "fetch that: git lfs pull"),
-    ((b"<!doctype html", b"<html"), "a web page, of clod-adapt export or of a failed download", _DOWNLOAD),
+    (
+        b"version https://git-lfs",
+        "a Git LFS pointer, not the file it stands for",
+        "fetch that: git lfs pull",
+    ),
+    (
+        (b"<!doctype html", b"<html"),
+        "a web page, of clod-adapt export or of a failed download",
+        _DOWNLOAD,
+    ),
     (b"<?xml", "an XML document, perhaps an error that a server sent", _DOWNLOAD),
 )
 # The same by suffix, or else by first bytes, of other formats.
 OTHERS: dict[str | bytes, tuple[str, str]] = {
     ".lcc": ("an LCC file, compressed for delivery", _CONVERT),
-    ".hier": ("a Hierarchical-3DGS tree", "use the chunk's point_cloud.ply that the tree was built from"),
-    ".ckpt": ("a checkpoint of Nerfstudio", "use ns-export gaussian-splat --load-config CONFIG.yml --output-dir OUT"),
-    ".pth": ("a trainer's checkpoint, such as Inria's", "use the point_cloud/iteration_N/point_cloud.ply beside it"),
+    ".hier": (
+        "a Hierarchical-3DGS tree",
+        "use the chunk's point_cloud.ply that the tree was built from",
+    ),
+    ".ckpt": (
+        "a checkpoint of Nerfstudio",
+        "use ns-export gaussian-splat --load-config CONFIG.yml --output-dir OUT",
+    ),
+    ".pth": (
+        "a trainer's checkpoint, such as Inria's",
+        "use the point_cloud/iteration_N/point_cloud.ply beside it",
+    ),
     ".json": ("a JSON document; of an unbundled SOG it is the table of contents", _CONVERT),
     b"\x1f\x8b": ("compressed with gzip", "unpack it first: gunzip"),
-    b"PK\x03\x04": ("a zip archive", "unpack it first; a gsplat checkpoint must be called .pt to be read as one"),
+    b"PK\x03\x04": (
+        "a zip archive",
+        "unpack it first; a gsplat checkpoint must be called .pt to be read as one",
+    ),
     b"glTF": ("a glTF model", "call it .glb"),
     b"NGSP": ("an SPZ file", "call it .spz"),
     b"ply\n": ("a PLY file", "call it .ply"),
@@ -193,12 +260,15 @@ def refuse_irregular(path: Path, remedy: str = "give the name of a file") -> Non
 def refuse_long_numbers(path: Path, text: bytes) -> None:
     """Refuses a number of a thousand digits, of which parsers make copies."""
     if re.search(rb"\d{1000}", text):
-        raise ClodError(f"{path}: is damaged (a number of more than 1,000 digits); copy or export it again")
+        raise ClodError(
+            f"{path}: is damaged (a number of more than 1,000 digits); copy or export it again"
+        )
 
 
 def read_bytes(path: Path, most: int = -1) -> bytes:
     """The bytes of a file, or its first ones."""
-    with refused_if_damaged(path, "cannot be read", "check the path"):  # ValueError: a name that holds a NUL
+    # ValueError: a name that holds a NUL
+    with refused_if_damaged(path, "cannot be read", "check the path"):
         refuse_irregular(path)
         with open(path, "rb") as file:
             return file.read(most)

@@ -20,16 +20,29 @@ from clod_adapter.io.ply_layout import RGB, column_map, is_coloured, ply_metadat
 from clod_adapter.io.ply_layout import write as write
 from clod_adapter.io.ply_packed import NOTE, check_packed, is_packed, unpack
 from clod_adapter.io.settings import Source, of_another_method
-from clod_adapter.io.values import FILTER_3D, GROWTH, MASKS, OPACITY, ROWS, SIGMA, Arrays, degree_of, dial_columns
+from clod_adapter.io.values import (
+    FILTER_3D,
+    GROWTH,
+    MASKS,
+    OPACITY,
+    ROWS,
+    SIGMA,
+    Arrays,
+    degree_of,
+    dial_columns,
+)
 
 MASK_COLUMNS = ("masks_0", "masks_1")
 HEADER_LIMIT = 1 << 20  # bytes
 _LONGEST = 1 << 20  # characters of a row of text
-_PREFIXED = rb"(?<=[\r\n])(property[ \t]+\w+[ \t]+)(?:scal(?:ar)?_)+"  # by CloudCompare, by 3dgsconverter
-UNPREFIXED = "saved by CloudCompare: its properties are read, and written, without the prefix scalar_"
+# by CloudCompare, by 3dgsconverter
+_PREFIXED = rb"(?<=[\r\n])(property[ \t]+\w+[ \t]+)(?:scal(?:ar)?_)+"
+UNPREFIXED = (
+    "saved by CloudCompare: its properties are read, and written, without the prefix scalar_"
+)
 COLOURED = (
-    "its colours are red, green, blue in 8 bits, read as SH degree 0; for all harmonics export it again by "
-    "ns-export gaussian-splat --ply-color-mode sh_coeffs"
+    "its colours are red, green, blue in 8 bits, read as SH degree 0; for all harmonics export it"
+    " again by ns-export gaussian-splat --ply-color-mode sh_coeffs"
 )
 
 
@@ -37,7 +50,8 @@ class Head(NamedTuple):
     """A PLY header."""
 
     ply: PlyData  # elements, properties and comments; every element has 0 rows
-    elements: tuple[tuple[PlyElement, int], ...]  # each with the number of rows that the header states
+    # each with the number of rows that the header states
+    elements: tuple[tuple[PlyElement, int], ...]
     text: bytes  # as plyfile reads it, names without CloudCompare's prefix
     size: int  # bytes of the header in the file; the data starts there
     comments: tuple[str, ...]  # the file's, then each element's
@@ -45,29 +59,43 @@ class Head(NamedTuple):
 
 
 def read_head(path: Path, data: bytes | None = None) -> Head:
-    """The header of a file, or of its bytes, alone: nothing is parsed or allocated of the rows that it states."""
+    """The header of a file, or of its bytes, alone: nothing is parsed or allocated of the rows that
+    it states.
+    """
     start = file_formats.read_bytes(path, HEADER_LIMIT) if data is None else data[:HEADER_LIMIT]
     if not re.match(rb"ply\r?\n|ply\r", start):
-        file_formats.refuse(path, start, "is not a PLY file; convert it to a .ply in Inria's 3DGS layout first")
+        file_formats.refuse(
+            path, start, "is not a PLY file; convert it to a .ply in Inria's 3DGS layout first"
+        )
     end = re.search(rb"[\r\n]end_header(\r?\n|\r)", start)
     if end is None:
         most = f" in its first {HEADER_LIMIT:,} bytes" if len(start) >= HEADER_LIMIT else ""
-        raise ClodError(f"{path}: the PLY header has no end{most}, so the file is truncated; copy or export it again")
+        raise ClodError(
+            f"{path}: the PLY header has no end{most}, so the file is truncated; copy or export it"
+            " again"
+        )
     text = re.sub(rb"(?<=[\r\n])(comment|obj_info)\b[^\r\n]+", _in_ascii, start[: end.end()])
     notes: tuple[str, ...] = ()
     if re.search(_PREFIXED + rb"scale_0\b", text) and b" scale_0" not in text:
         text, notes = re.sub(_PREFIXED, rb"\g<1>", text), (UNPREFIXED,)
     header = re.sub(rb"\r\n?", b"\n", text)
     if re.search(rb"[^\t\n\x20-\x7e]", header):
-        raise ClodError(f"{path}: the PLY header has a name that is not printable ASCII; export the file again")
+        raise ClodError(
+            f"{path}: the PLY header has a name that is not printable ASCII; export the file again"
+        )
     counts = re.findall(rb"(?m)^[ \t]*element[ \t]+\S+[ \t]+(\d{1,20})[ \t]*$", header)
     header = re.sub(rb"(?m)^([ \t]*element[ \t]+\S+[ \t]+)\d{1,20}[ \t]*$", rb"\g<1>0", header)
     with refused_if_damaged(path, "the PLY header is damaged", "export the file again"):
         ply = PlyData.read(io.BytesIO(header), mmap=False)
     if len(counts) != len(ply.elements):
-        raise ClodError(f"{path}: the PLY header is damaged (a row count is not a number); export the file again")
+        raise ClodError(
+            f"{path}: the PLY header is damaged (a row count is not a number); export the file"
+            " again"
+        )
     comments = *ply.comments, *(comment for element in ply for comment in element.comments)
-    return Head(ply, tuple(zip(ply, map(int, counts), strict=True)), text, end.end(), comments, notes)
+    return Head(
+        ply, tuple(zip(ply, map(int, counts), strict=True)), text, end.end(), comments, notes
+    )
 
 
 def _in_ascii(line: re.Match[bytes]) -> bytes:
@@ -75,7 +103,9 @@ def _in_ascii(line: re.Match[bytes]) -> bytes:
 
 
 def has_dial(path: Path) -> bool:
-    """Whether the header has a sigma_d; refuses another kind, damaged settings, and too few bytes for its rows."""
+    """Whether the header has a sigma_d; refuses another kind, damaged settings, and too few bytes
+    for its rows.
+    """
     head = read_head(path)
     sh_degree_of(path, head.ply)
     _check_length(path, head, path.stat().st_size)
@@ -93,7 +123,9 @@ def read(path: Path, data: bytes) -> Source:
         elements = _elements(data, head)
     if is_packed(head.ply):
         metadata = ply_metadata(path, head.comments, dial=False)
-        return Source(unpack(path, elements, degree), metadata, (*head.notes, NOTE), head.comments, head=head)
+        return Source(
+            unpack(path, elements, degree), metadata, (*head.notes, NOTE), head.comments, head=head
+        )
     rows = elements["vertex"]
     notes = [*head.notes, *of_another_method(rows.dtype.names or ())]
     if is_coloured(rows.dtype.names or ()):
@@ -110,8 +142,8 @@ def read(path: Path, data: bytes) -> Source:
 def _elements(data: bytes, head: Head) -> dict[str, np.ndarray]:
     """The rows of elements by name, native byte order, of all bytes of a file.
 
-    plyfile reads text, and binary lists row by row: elements from the first with lists on are left out where the
-    Gaussians stand before it.
+    plyfile reads text, and binary lists row by row: elements from the first with lists on are left
+    out where the Gaussians stand before it.
     """
     at, found = head.size, dict[str, np.ndarray]()
     for element, count in () if head.ply.text else head.elements:
@@ -121,24 +153,34 @@ def _elements(data: bytes, head: Head) -> dict[str, np.ndarray]:
         found[element.name] = np.frombuffer(data, kind, count, at)
         at += count * kind.itemsize
     if "vertex" not in found:
-        lines = io.TextIOWrapper(io.BytesIO(data if head.ply.text else b""), "latin-1")  # CR ends a line too
+        # CR ends a line too
+        lines = io.TextIOWrapper(io.BytesIO(data if head.ply.text else b""), "latin-1")
         if any(len(line) == _LONGEST for line in iter(lambda: lines.readline(_LONGEST), "")):
-            raise ValueError(f"a row of more than {_LONGEST:,} characters")  # which would be copied several times
+            # which would be copied several times
+            raise ValueError(f"a row of more than {_LONGEST:,} characters")
         with warnings.catch_warnings(), np.errstate(over="ignore"):
             warnings.simplefilter("ignore")  # of text that is beyond float32's range
-            whole = data if data.startswith(head.text) else head.text + data[head.size :]  # a copy if it was changed
+            # a copy if it was changed
+            whole = data if data.startswith(head.text) else head.text + data[head.size :]
             found = {each.name: each.data for each in PlyData.read(io.BytesIO(whole))}
-    return {name: rows.astype(rows.dtype.newbyteorder("="), copy=False) for name, rows in found.items()}
+    return {
+        name: rows.astype(rows.dtype.newbyteorder("="), copy=False) for name, rows in found.items()
+    }
 
 
 def _arrays(rows: np.ndarray, sh_degree: int) -> Arrays:
-    """The columns of ``column_map``, of the dial, of masks and filter, by attribute; doubles of the means stay."""
+    """The columns of ``column_map``, of the dial, of masks and filter, by attribute; doubles of the
+    means stay.
+    """
     names = rows.dtype.names or ()
     groups = column_map(sh_degree) | dial_columns(names)
     groups |= {MASKS: MASK_COLUMNS} if set(MASK_COLUMNS) <= set(names) else {}
     groups |= {FILTER_3D: (FILTER_3D,)} if FILTER_3D in names else {}
     kinds = {"means": np.float64} if "f8" in {rows.dtype[name].str[1:] for name in "xyz"} else {}
-    found = {key: np.empty((len(rows), len(group)), kinds.get(key, np.float32)) for key, group in groups.items()}
+    found = {
+        key: np.empty((len(rows), len(group)), kinds.get(key, np.float32))
+        for key, group in groups.items()
+    }
     with np.errstate(over="ignore", invalid="ignore"):  # invalid: a NaN that signals
         for start in range(0, len(rows), ROWS):  # a block stays in cache, which is 8 times faster
             block = rows[start : start + ROWS]
@@ -149,7 +191,9 @@ def _arrays(rows: np.ndarray, sh_degree: int) -> Arrays:
     for name in ("opacity_logits", SIGMA, GROWTH, OPACITY):
         if name in found:
             found[name] = found[name][:, 0]
-    return found | {name: found[name].reshape(len(rows), len(groups[name]) // 3, 3) for name in ("sh0", "shN")}
+    return found | {
+        name: found[name].reshape(len(rows), len(groups[name]) // 3, 3) for name in ("sh0", "shN")
+    }
 
 
 def _check_length(path: Path, head: Head, length: int) -> None:
@@ -157,39 +201,66 @@ def _check_length(path: Path, head: Head, length: int) -> None:
     text = head.ply.text
     least = head.size - text
     for element, count in head.elements:
-        kinds = [p.len_dtype if isinstance(p, PlyListProperty) else p.val_dtype for p in element.properties]
+        kinds = [
+            p.len_dtype if isinstance(p, PlyListProperty) else p.val_dtype
+            for p in element.properties
+        ]
         # Of text a digit, and a space or line end, which the last line may lack.
-        least += count * (max(1, 2 * len(kinds)) if text else sum(np.dtype(kind).itemsize for kind in kinds))
+        least += count * (
+            max(1, 2 * len(kinds)) if text else sum(np.dtype(kind).itemsize for kind in kinds)
+        )
     if least > length:
         rows = ", ".join(f"{count} of {element.name}" for element, count in head.elements)
-        what = f"is truncated or damaged: its header claims {rows}, {least} bytes or more, and the file has {length}"
+        what = (
+            f"is truncated or damaged: its header claims {rows}, {least} bytes or more, and the"
+            f" file has {length}"
+        )
         raise ClodError(f"{path}: {what}; copy or export it again")
 
 
 def sh_degree_of(path: Path, header: PlyData) -> int:
-    """The SH degree of a checkpoint with this header; refuses something else, and missing columns."""
+    """The SH degree of a checkpoint with this header; refuses something else, and missing
+    columns.
+    """
     if is_packed(header):
         return check_packed(path, header)
     if "vertex" not in header:
         found = ", ".join(element.name for element in header) or "none"
-        raise ClodError(f"{path}: has no vertex element (elements: {found}); give a splat in Inria's 3DGS layout")
+        raise ClodError(
+            f"{path}: has no vertex element (elements: {found}); give a splat in Inria's 3DGS"
+            " layout"
+        )
     properties = header["vertex"].properties
     types = {p.name: "list" if isinstance(p, PlyListProperty) else p.val_dtype for p in properties}
-    if anchors := sorted(name for name in types if re.fullmatch(r"f_offset_\d+|f_anchor_feat_\d+", name)):
-        what = f"property {anchors[0]} is of Scaffold-GS or Octree-GS, where a network makes Gaussians for each view"
-        raise ClodError(f"{path}: {what}; use a checkpoint of 3DGS or of a method that keeps plain Gaussians")
+    if anchors := sorted(
+        name for name in types if re.fullmatch(r"f_offset_\d+|f_anchor_feat_\d+", name)
+    ):
+        what = (
+            f"property {anchors[0]} is of Scaffold-GS or Octree-GS, where a network makes Gaussians"
+            " for each view"
+        )
+        raise ClodError(
+            f"{path}: {what}; use a checkpoint of 3DGS or of a method that keeps plain Gaussians"
+        )
     if not types.keys() & {"f_dc_0", "scale_0"}:
         what = "properties f_dc_0 and scale_0 are missing, so this is a mesh or a point cloud"
         raise ClodError(f"{path}: {what}; give the point_cloud.ply that a 3DGS trainer writes")
     if {"scale_0", "scale_1"} <= types.keys() and "scale_2" not in types:
-        raise ClodError(f"{path}: has no property scale_2, so this is a 2DGS file of flat disks; use a 3DGS checkpoint")
+        raise ClodError(
+            f"{path}: has no property scale_2, so this is a 2DGS file of flat disks; use a 3DGS"
+            " checkpoint"
+        )
     if is_coloured(types) and all(types[name] == "u1" for name in RGB):
         types |= dict.fromkeys(column_map(0)["sh0"], "f4")
     degree = degree_of(path, sum(re.fullmatch(r"f_rest_\d+", name) is not None for name in types))
     for name in (name for group in column_map(degree).values() for name in group):
         if types.get(name) not in ("f4", "f8"):
             what = "is not float or double" if name in types else "is missing"
-            raise ClodError(f"{path}: property {name} {what}; export the file again in Inria's 3DGS layout")
+            raise ClodError(
+                f"{path}: property {name} {what}; export the file again in Inria's 3DGS layout"
+            )
     if lists := [name for name, kind in types.items() if kind == "list"]:
-        raise ClodError(f"{path}: property {lists[0]} is a list, which splat viewers cannot read; remove it")
+        raise ClodError(
+            f"{path}: property {lists[0]} is a list, which splat viewers cannot read; remove it"
+        )
     return degree

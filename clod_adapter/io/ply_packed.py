@@ -1,9 +1,11 @@
-"""PlayCanvas's compressed PLY, which SuperSplat, splat-transform and gsplat's exporter write: 32 bits an attribute.
+"""PlayCanvas's compressed PLY, which SuperSplat, splat-transform and gsplat's exporter write: 32
+bits an attribute.
 
-Gaussians form chunks of 256. The element ``chunk`` stores the ranges of position, logarithmic scale and, if newer,
-colour; ``vertex`` stores each Gaussian within the ranges of its chunk: position and scale in 11, 10 and 11 bits, the
-three smaller components of the unit quaternion in 10 bits each and the index of the largest in 2, colour and opacity in
-8 bits each. The optional element ``sh`` stores the higher harmonics in 8 bits, between -4 and 4.
+Gaussians form chunks of 256. The element ``chunk`` stores the ranges of position, logarithmic scale
+and, if newer, colour; ``vertex`` stores each Gaussian within the ranges of its chunk: position and
+scale in 11, 10 and 11 bits, the three smaller components of the unit quaternion in 10 bits each and
+the index of the largest in 2, colour and opacity in 8 bits each. The optional element ``sh`` stores
+the higher harmonics in 8 bits, between -4 and 4.
 
 Source: splat-transform 3.7, ``read-ply``; gsplat, ``exporter.splat2ply_bytes_compressed``.
 """
@@ -21,14 +23,21 @@ from clod_adapter.io.values import Arrays, degree_of
 BLOCK = 256
 _BITS = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 _AXES = ("x", "y", "z")
-_RANGES = tuple(f"{end}_{what}{axis}" for what in ("", "scale_") for end in ("min", "max") for axis in _AXES)
+_RANGES = tuple(
+    f"{end}_{what}{axis}" for what in ("", "scale_") for end in ("min", "max") for axis in _AXES
+)
 _COLOURS = tuple(f"{end}_{channel}" for end in ("min", "max") for channel in "rgb")
-NOTE = "quantised: positions and scales in 11 bits a block, rotations in 10, colours, harmonics and opacities in 8"
+NOTE = (
+    "quantised: positions and scales in 11 bits a block, rotations in 10, colours, harmonics and"
+    " opacities in 8"
+)
 
 
 def is_packed(header: PlyData) -> bool:
     """Whether the vertices are packed."""
-    return "vertex" in header and any(p.name.startswith("packed_") for p in header["vertex"].properties)
+    return "vertex" in header and any(
+        p.name.startswith("packed_") for p in header["vertex"].properties
+    )
 
 
 def check_packed(path: Path, header: PlyData) -> int:
@@ -48,23 +57,38 @@ def unpack(path: Path, elements: Mapping[str, np.ndarray], degree: int) -> Array
     chunks, packed, table = elements["chunk"], elements["vertex"], elements.get("sh")
     count, bands = len(packed), SH_COUNTS[degree] - 1
     if len(chunks) < (needed := -(-count // BLOCK)):
-        raise ClodError(f"{path}: is damaged: {count} Gaussians need {needed} chunks, not {len(chunks)}; copy it again")
+        raise ClodError(
+            f"{path}: is damaged: {count} Gaussians need {needed} chunks, not {len(chunks)}; copy"
+            " it again"
+        )
     if table is not None and len(table) != count:
-        raise ClodError(f"{path}: is damaged: {len(table)} harmonics for {count} Gaussians; export it again")
+        raise ClodError(
+            f"{path}: is damaged: {len(table)} harmonics for {count} Gaussians; export it again"
+        )
 
     def within(name: str, share: np.ndarray) -> np.ndarray:
         """Values at shares of the ranges of their blocks."""
         low, high = (chunks[f"{end}_{name}"][np.arange(count) // BLOCK] for end in ("min", "max"))
         return low * (1 - share) + high * share  # type: ignore[no-any-return]
 
-    with np.errstate(invalid="ignore", over="ignore"):  # ranges that are not finite: their rows are dropped later
+    # ranges that are not finite: their rows are dropped later
+    with np.errstate(invalid="ignore", over="ignore"):
         means, log_scales = (
-            np.stack(list(map(within, (what + axis for axis in _AXES), _shares(packed[bits], (11, 10, 11)))), 1)
+            np.stack(
+                list(
+                    map(
+                        within, (what + axis for axis in _AXES), _shares(packed[bits], (11, 10, 11))
+                    )
+                ),
+                1,
+            )
             for what, bits in (("", "packed_position"), ("scale_", "packed_scale"))
         )
         *colours, opacity = _shares(packed["packed_color"], (8, 8, 8, 8))
         if set(_COLOURS) <= set(chunks.dtype.names or ()):
-            colours = [within(channel, share) for channel, share in zip("rgb", colours, strict=True)]
+            colours = [
+                within(channel, share) for channel, share in zip("rgb", colours, strict=True)
+            ]
     opacity = np.clip(opacity, 0.25 / 255, 254.75 / 255)  # so that no logit is infinite
     levels = np.arange(256, dtype=np.float32)
     steps = (np.where(levels == 0, 0, np.where(levels == 255, 1, (levels + 0.5) / 256)) - 0.5) * 8
@@ -73,25 +97,39 @@ def unpack(path: Path, elements: Mapping[str, np.ndarray], degree: int) -> Array
         for k in range(3 * bands):  # channel by channel
             harmonics[:, k % bands, k // bands] = steps[table[f"f_rest_{k}"]]
     return {
-        "means": means, "log_scales": log_scales, "sh0": (np.stack(colours, 1)[:, None] - 0.5) / SH_C0,
+        "means": means,
+        "log_scales": log_scales,
+        "sh0": (np.stack(colours, 1)[:, None] - 0.5) / SH_C0,
         "quats": np.ascontiguousarray(_rotations(packed["packed_rotation"]).T.astype(np.float32)),
         "opacity_logits": np.log(opacity / (1 - opacity)).astype(np.float32),
         "shN": harmonics,
-    }  # fmt: skip
+    }
 
 
 def _require(path: Path, header: PlyData, element: str, names: tuple[str, ...], kind: str) -> None:
     if element not in header:
-        raise ClodError(f"{path}: is a compressed PLY without its element {element}; export it again")
-    types = {p.name: "list" if isinstance(p, PlyListProperty) else p.val_dtype for p in header[element].properties}
+        raise ClodError(
+            f"{path}: is a compressed PLY without its element {element}; export it again"
+        )
+    types = {
+        p.name: "list" if isinstance(p, PlyListProperty) else p.val_dtype
+        for p in header[element].properties
+    }
     if "list" in types.values():
-        raise ClodError(f"{path}: element {element} of a compressed PLY has a list; export it again")
+        raise ClodError(
+            f"{path}: element {element} of a compressed PLY has a list; export it again"
+        )
     if absent := [name for name in names if types.get(name) != kind]:
-        raise ClodError(f"{path}: is a compressed PLY, whose {element} has no {absent[0]} of type {kind}; export again")
+        raise ClodError(
+            f"{path}: is a compressed PLY, whose {element} has no {absent[0]} of type {kind};"
+            " export again"
+        )
 
 
 def _shares(bits: np.ndarray, widths: tuple[int, ...]) -> list[np.ndarray]:
-    """The parts of ``[N]`` uint32, highest first, each over the largest it can be: ``[N]`` in [0, 1]."""
+    """The parts of ``[N]`` uint32, highest first, each over the largest it can be: ``[N]`` in
+    [0, 1].
+    """
     shift, found = 32, []
     for width in widths:
         shift -= width
@@ -105,7 +143,13 @@ def _rotations(bits: np.ndarray) -> np.ndarray:
     small = (np.stack(_shares(bits << np.uint32(2), (10, 10, 10))) - 0.5) * np.float32(np.sqrt(2))
     largest = np.sqrt(np.maximum(0, 1 - (small**2).sum(0)))
     missing = bits >> np.uint32(30)
-    return np.stack([
-        np.where(missing == part, largest, np.where(missing > part, small[min(part, 2)], small[max(part - 1, 0)]))
-        for part in range(4)
-    ])  # fmt: skip
+    return np.stack(
+        [
+            np.where(
+                missing == part,
+                largest,
+                np.where(missing > part, small[min(part, 2)], small[max(part - 1, 0)]),
+            )
+            for part in range(4)
+        ]
+    )

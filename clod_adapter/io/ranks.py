@@ -1,4 +1,6 @@
-"""Checkpoints of several GPUs, of which each wrote the Gaussians that it held: gsplat's trainer, and Grendel-GS."""
+"""Checkpoints of several GPUs, of which each wrote the Gaussians that it held: gsplat's trainer,
+and Grendel-GS.
+"""
 
 import hashlib
 import re
@@ -13,12 +15,17 @@ _NAME = re.compile(r"(.+_(?:rank|rk))(\d{1,4})(\.pt|_ws(\d{1,4})\.ply)")
 
 
 def ranks_of(path: Path) -> dict[int, Path]:
-    """The files of the same checkpoint in its folder, itself too, by rank; empty where its name has no rank."""
+    """The files of the same checkpoint in its folder, itself too, by rank; empty where its name has
+    no rank.
+    """
     found = _NAME.fullmatch(path.name)
     if not found:
         return {}
     before, rank, after, _ = found.groups()
-    beside = [_NAME.fullmatch(other.name) for other in path.parent.glob(f"{escape(before)}*{escape(after)}")]
+    beside = [
+        _NAME.fullmatch(other.name)
+        for other in path.parent.glob(f"{escape(before)}*{escape(after)}")
+    ]
     others = {int(name[2]): path.with_name(name[0]) for name in beside if name}
     return dict(sorted((others | {int(rank): path}).items()))
 
@@ -37,8 +44,12 @@ def joined(path: Path, parts: Sequence[Source]) -> Source:
     import numpy as np  # here: names are checked without it
 
     first = parts[0]
-    with refused_if_damaged(path, "does not fit the other ranks beside it", "put those of one run into a folder"):
-        arrays = {name: np.concatenate([part.arrays[name] for part in parts]) for name in first.arrays}
+    with refused_if_damaged(
+        path, "does not fit the other ranks beside it", "put those of one run into a folder"
+    ):
+        arrays = {
+            name: np.concatenate([part.arrays[name] for part in parts]) for name in first.arrays
+        }
         rows = [part.rows for part in parts if part.rows is not None]
         whole = np.concatenate(rows) if rows else None
     digest = hashlib.sha256("".join(part.sha256 for part in parts).encode()).hexdigest()

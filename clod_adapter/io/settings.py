@@ -1,12 +1,12 @@
 """Settings that travel with a file: one reader for PLY comments, PLY columns and JSON documents.
 
-Each format gives the same mapping, whose numbers may be text: ``attenuation`` and ``screen_filter`` to the fields of
-their classes, ``calibration`` as Calibration.as_dict, ``origin`` to [x, y, z], ``about`` to lines of text, and
-``package_version``.
+Each format gives the same mapping, whose numbers may be text: ``attenuation`` and ``screen_filter``
+to the fields of their classes, ``calibration`` as Calibration.as_dict, ``origin`` to [x, y, z],
+``about`` to lines of text, and ``package_version``.
 
-Formats other than PLY store it as a JSON document under the key ``clod_adapter`` (``file_formats.KEY``). An unknown
-field is ignored with a note, a damaged setting is refused, and a damaged calibration, which rendering does not need, is
-ignored with a note.
+Formats other than PLY store it as a JSON document under the key ``clod_adapter``
+(``file_formats.KEY``). An unknown field is ignored with a note, a damaged setting is refused, and a
+damaged calibration, which rendering does not need, is ignored with a note.
 """
 
 from __future__ import annotations
@@ -33,13 +33,24 @@ MODEL, ADAPTER = "clod-model", "clod-adapter"
 # Of the kinds of documents: the version of the format, and the message for another kind.
 KINDS = {
     MODEL: (1, "is not a model but {}; clod-adapt apply makes one of an adapter"),
-    ADAPTER: (3, "is not an adapter but {}; give what clod-adapt wrote beside its PLY; a 'clod-model' needs none"),
+    ADAPTER: (
+        3,
+        (
+            "is not an adapter but {}; give what clod-adapt wrote beside its PLY; a 'clod-model'"
+            " needs none"
+        ),
+    ),
 }
-DAMAGED = "its settings are damaged", "restore them, or export the file again"  # for ``refused_if_damaged``
+# for ``refused_if_damaged``
+DAMAGED = "its settings are damaged", "restore them, or export the file again"
 # Settings of a dial before every Gaussian had a reach.
 EARLIER = {"tau", "eps", "cut", "normalizer"}
-EARLIER_FORM = "its dial is of an earlier form, which is not read any more; adapt its checkpoint again with clod-adapt"
-_INHERITED = 60_000  # bytes of history that an output inherits; a PLY header must have room for them
+EARLIER_FORM = (
+    "its dial is of an earlier form, which is not read any more; adapt its checkpoint again with"
+    " clod-adapt"
+)
+# bytes of history that an output inherits; a PLY header must have room for them
+_INHERITED = 60_000
 _OVERHEAD = 9  # bytes of a PLY's comment besides its text
 
 
@@ -49,48 +60,67 @@ class Metadata:
 
     attenuation: AttenuationConfig | None = None  # None for a file without a sigma_d
     screen_filter: ScreenFilter | None = None  # None where the file does not store one
-    calibration: Calibration | None = None  # as stored; ``matching_calibration`` compares it with the Gaussians
+    # as stored; ``matching_calibration`` compares it with the Gaussians
+    calibration: Calibration | None = None
     origin: Origin = NOWHERE  # what the means are relative to, world units
     about: tuple[str, ...] = ()  # lines on the history of the file
-    version: str = ""  # of the package that made it; "" as read: another program, to be written: the running one
+    # of the package that made it; "" as read: another program, to be written: the running one
+    version: str = ""
     described: bool = False  # whether the file has a description by this package
     notes: tuple[str, ...] = ()  # what was ignored, one line each
 
 
 class Source(NamedTuple):
-    """The content of a file, as every reader returns it; ``checkpoint.load`` makes a checkpoint of it.
+    """The content of a file, as every reader returns it; ``checkpoint.load`` makes a checkpoint of
+    it.
 
-    ``arrays`` are every row of the file, by the names of ``Gaussians.tensors``, in any type of floats; of a PLY also
-    "masks" ``[N, 2]`` (MaskGaussian's) and "filter_3D" ``[N, 1]`` (Mip-Splatting's), where it has them.
+    ``arrays`` are every row of the file, by the names of ``Gaussians.tensors``, in any type of
+    floats; of a PLY also "masks" ``[N, 2]`` (MaskGaussian's) and "filter_3D" ``[N, 1]``
+    (Mip-Splatting's), where it has them.
     """
 
     arrays: dict[str, np.ndarray]
     metadata: Metadata  # means are relative to its origin
-    notes: tuple[str, ...] = ()  # what the reader noticed, one line each, besides the notes of the metadata
+    # what the reader noticed, one line each, besides the notes of the metadata
+    notes: tuple[str, ...] = ()
     comments: tuple[str, ...] = ()  # lines on its history, and settings in a PLY's comments
     activation_unknown: bool = False  # whether opacities and scales may be activated already
-    rows: np.ndarray | None = None  # ``[N]`` structured array of a PLY as it is in the file, native byte order
+    # ``[N]`` structured array of a PLY as it is in the file, native byte order
+    rows: np.ndarray | None = None
     head: Any = None  # ``ply.Head`` of a PLY
     sha256: str = ""  # of the bytes that were parsed, hex
 
 
-def read_metadata(path: Path, values: Mapping[str, Any], *, dial: bool, described: bool = True) -> Metadata:
-    """The settings in a mapping; of a file that has a sigma_d (``dial``) missing ones take their defaults."""
+def read_metadata(
+    path: Path, values: Mapping[str, Any], *, dial: bool, described: bool = True
+) -> Metadata:
+    """The settings in a mapping; of a file that has a sigma_d (``dial``) missing ones take their
+    defaults.
+    """
     notes: list[str] = []
     with refused_if_damaged(path, *DAMAGED):
         version = values.get("package_version", "")
         if not isinstance(version, str):
             raise TypeError(f"package_version is {version!r:.40}, not a string")
         return Metadata(
-            attenuation=_attenuation(path, values.get("attenuation", {}), described, notes) if dial else None,
+            attenuation=(
+                _attenuation(path, values.get("attenuation", {}), described, notes)
+                if dial
+                else None
+            ),
             screen_filter=_screen_filter(values[FILTER], notes) if FILTER in values else None,
             calibration=_calibration(values.get("calibration"), notes),
-            origin=parse_origin(values.get("origin", NOWHERE)), about=tuple(map(str, values.get("about", ()))),
-            version=version, described=described, notes=tuple(notes),
-        )  # fmt: skip
+            origin=parse_origin(values.get("origin", NOWHERE)),
+            about=tuple(map(str, values.get("about", ()))),
+            version=version,
+            described=described,
+            notes=tuple(notes),
+        )
 
 
-def _attenuation(path: Path, stored: Mapping[str, Any], described: bool, notes: list[str]) -> AttenuationConfig:
+def _attenuation(
+    path: Path, stored: Mapping[str, Any], described: bool, notes: list[str]
+) -> AttenuationConfig:
     if EARLIER & stored.keys():
         raise ClodError(f"{path}: {EARLIER_FORM}")
     kinds: dict[str, Any] = {field.name: type(field.default) for field in fields(AttenuationConfig)}
@@ -120,19 +150,28 @@ def _note_unknown(stored: Mapping[str, Any], known: Any, notes: list[str]) -> No
         notes.append(f"settings unknown to this version ignored: {', '.join(map(repr, unknown))}")
 
 
-# What other methods store beside plain Gaussians, by names of a PLY's properties or of gsplat's tensors.
+# What other methods store beside plain Gaussians, by names of a PLY's properties or of gsplat's
+# tensors.
 _METHODS = {
     r"trbf_\w+|motion_\w+|omega_\d+|f_t_\d+": "SpacetimeGaussians, which move and fade with time",
-    r"t|times|scale_t(_\d+)?|rot_r_\d+|durations?|velocit\w+": "a 4D method, whose Gaussians move and fade with time",
+    r"t|times|scale_t(_\d+)?|rot_r_\d+|durations?|velocit\w+": (
+        "a 4D method, whose Gaussians move and fade with time"
+    ),
     r"sg_\w+|\w*asg_\w+": "spherical Gaussians, lobes that are added to the colour",
-    r"sb_params\w*|betas?": "Beta Splatting, which has another falloff, and lobes that are added to the colour",
+    r"sb_params\w*|betas?": (
+        "Beta Splatting, which has another falloff, and lobes that are added to the colour"
+    ),
     r"shapes?|nu_degree|negative": "a method whose Gaussians have another falloff",
-    r"(rough|metal|specular|albedo|base_color|diffuse|brdf|incidents|refl)\w*": "a method that lights materials",
+    r"(rough|metal|specular|albedo|base_color|diffuse|brdf|incidents|refl)\w*": (
+        "a method that lights materials"
+    ),
 }
 
 
 def of_another_method(names: Iterable[str]) -> list[str]:
-    """A warning for each method whose renderer draws more of a file with these names than plain Gaussians."""
+    """A warning for each method whose renderer draws more of a file with these names than plain
+    Gaussians.
+    """
     lines = []
     for pattern, method in _METHODS.items():
         found = [name for name in names if re.fullmatch(pattern, name)]
@@ -144,14 +183,19 @@ def of_another_method(names: Iterable[str]) -> list[str]:
 
 
 def that_fit(lines: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """The lines of a file's history that every output has room for, the last ones first; and a note on the others."""
+    """The lines of a file's history that every output has room for, the last ones first; and a note
+    on the others.
+    """
     kept, room = list[str](), _INHERITED
     for line in reversed(lines):
         if len(line) + _OVERHEAD <= room:
             kept.append(line)
             room -= len(line) + _OVERHEAD
     gone = len(lines) - len(kept)
-    note = f"{gone} of {len(lines)} comments are not carried over to outputs, which hold {_INHERITED:,} characters"
+    note = (
+        f"{gone} of {len(lines)} comments are not carried over to outputs, which hold"
+        f" {_INHERITED:,} characters"
+    )
     return tuple(reversed(kept)), (note,) if gone else ()
 
 
@@ -168,21 +212,30 @@ def document(kind: str, metadata: Metadata, **more: Any) -> str:
 
     Its keys are sorted, so that equal models give equal files.
     """
-    dial, calibration, screen_filter = metadata.attenuation, metadata.calibration, metadata.screen_filter or CLASSIC
+    dial, calibration, screen_filter = (
+        metadata.attenuation,
+        metadata.calibration,
+        metadata.screen_filter or CLASSIC,
+    )
     optional: dict[str, Any] = {
         "package_version": metadata.version or package_version(),
         "attenuation": asdict(dial) if dial else None,
         FILTER: asdict(screen_filter) if screen_filter != CLASSIC else None,
         "origin": list(metadata.origin) if any(metadata.origin) else None,
-        "calibration": calibration.as_dict() if calibration else None, "about": list(metadata.about),
-    }  # fmt: skip
+        "calibration": calibration.as_dict() if calibration else None,
+        "about": list(metadata.about),
+    }
     values = {name: value for name, value in optional.items() if value}
     values |= {"format": kind, "format_version": KINDS[kind][0]}
     return json.dumps(values | more, sort_keys=True, allow_nan=False)
 
 
-def parse_metadata(path: Path, text: str | bytes | dict[str, Any] | None, *, dial: bool) -> Metadata:
-    """The settings in a model's document, parsed or not; those of a file of another program where it is None."""
+def parse_metadata(
+    path: Path, text: str | bytes | dict[str, Any] | None, *, dial: bool
+) -> Metadata:
+    """The settings in a model's document, parsed or not; those of a file of another program where
+    it is None.
+    """
     values = {} if text is None else parse_document(path, text, MODEL)
     return read_metadata(path, values, dial=dial, described=text is not None)
 
@@ -192,16 +245,22 @@ def parse_document(path: Path, text: str | bytes | dict[str, Any], kind: str) ->
     version, wrong = KINDS[kind]
     with refused_if_damaged(path, *DAMAGED):
         values: dict[str, Any] = text if isinstance(text, dict) else json.loads(text)
-        found, newer = values["format"], values["format"] == kind and values["format_version"] > version
+        found, newer = (
+            values["format"],
+            values["format"] == kind and values["format_version"] > version,
+        )
     if found != kind:
         raise ClodError(f"{path}: {wrong.format(f'{found!r:.40}')}")
     if newer:
-        raise ClodError(f"{path}: its format {values['format_version']!r:.20} is too new; upgrade clod-adapter")
+        raise ClodError(
+            f"{path}: its format {values['format_version']!r:.20} is too new; upgrade clod-adapter"
+        )
     return values
 
 
-# The screen-space filter as other programs state it: Brush and splat-transform write the comment TAG, Postshot
-# ``antialiased 1``, SPZ a flag, Mip-Splatting the column ``filter_3D``. None of them states the variance.
+# The screen-space filter as other programs state it: Brush and splat-transform write the comment
+# TAG, Postshot ``antialiased 1``, SPZ a flag, Mip-Splatting the column ``filter_3D``. None of them
+# states the variance.
 TAG = "SplatRenderMode: mip"
 _ANTIALIASED = r"(?i)\s*(splatrendermode:\s*mip|antialiased 1)\s*"
 _EITHER = r"(?i)\s*(splatrendermode:\s*\S*|antialiased [01])\s*"
@@ -213,7 +272,9 @@ def is_antialiased(comments: Iterable[str]) -> bool:
 
 
 def tagged(comments: Sequence[str], screen_filter: ScreenFilter) -> list[str]:
-    """The comments, with those of other programs corrected where they contradict ``screen_filter``."""
+    """The comments, with those of other programs corrected where they contradict
+    ``screen_filter``.
+    """
     if is_antialiased(comments) == screen_filter.compensate:
         return list(comments)
     rest = [comment for comment in comments if not re.fullmatch(_EITHER, comment)]
@@ -221,7 +282,9 @@ def tagged(comments: Sequence[str], screen_filter: ScreenFilter) -> list[str]:
 
 
 def stated_filter(source: Source) -> ScreenFilter:
-    """The screen-space filter that a file states, or that other programs' comments and columns imply."""
+    """The screen-space filter that a file states, or that other programs' comments and columns
+    imply.
+    """
     metadata, compensated = source.metadata, is_antialiased(source.comments)
     if metadata.screen_filter is not None:
         return metadata.screen_filter

@@ -1,7 +1,8 @@
 """Safetensors files: tensors and metadata; and whole models as such files, every value unchanged.
 
-A model has the tensors of ``Gaussians`` by their names there, float32. The metadata key ``clod_adapter`` holds the JSON
-document (``settings.document``), whose format distinguishes a model from an adapter.
+A model has the tensors of ``Gaussians`` by their names there, float32. The metadata key
+``clod_adapter`` holds the JSON document (``settings.document``), whose format distinguishes a model
+from an adapter.
 """
 
 from __future__ import annotations
@@ -31,15 +32,17 @@ _DAMAGED = "is not a safetensors file, or damaged", "copy or export it again"
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> None:
     """Writes a file, the widest types first.
 
-    safetensors' ``save`` holds all of it in memory; ``save_file`` takes names in UTF-8 only, and makes files that only
-    their owner can read.
+    safetensors' ``save`` holds all of it in memory; ``save_file`` takes names in UTF-8 only, and
+    makes files that only their owner can read.
     """
     arrays = {name: tensor.detach().cpu().contiguous().numpy() for name, tensor in tensors.items()}
     header, at = dict[str, Any](__metadata__=dict(metadata)), 0
     names = sorted(arrays, key=lambda name: (-arrays[name].itemsize, name))
     for name in names:
         array, end = arrays[name], at + arrays[name].nbytes
-        kind = "BOOL" if array.dtype.kind == "b" else f"{array.dtype.kind.upper()}{8 * array.itemsize}"
+        kind = (
+            "BOOL" if array.dtype.kind == "b" else f"{array.dtype.kind.upper()}{8 * array.itemsize}"
+        )
         header[name] = {"dtype": kind, "shape": list(array.shape), "data_offsets": [at, end]}
         at = end
     head = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
@@ -54,7 +57,9 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     """The tensors and the metadata of a file; for ``refused_if_damaged``."""
     with open(path, "rb") as file, safe_open(_name_of(file), framework="pt") as tensors:
         # Copies, since the file may change under a memory map.
-        return {name: tensors.get_tensor(name).clone() for name in tensors.keys()}, tensors.metadata() or {}  # noqa: SIM118
+        names = tensors.keys()
+        copies = {name: tensors.get_tensor(name).clone() for name in names}
+        return copies, tensors.metadata() or {}
 
 
 def parse_tensors(path: Path, data: bytes) -> tuple[dict[str, Tensor], dict[str, str]]:
@@ -99,12 +104,17 @@ def read(path: Path, data: bytes) -> Source:
 
     tensors, stored = parse_tensors(path, data)
     if KEY not in stored:
-        raise ClodError(f"{path}: is a safetensors file but not a model of clod-adapter; give a file that it wrote")
+        raise ClodError(
+            f"{path}: is a safetensors file but not a model of clod-adapter; give a file that it"
+            " wrote"
+        )
     metadata = parse_metadata(path, stored[KEY], dial=SIGMA in tensors)
     if missing := [name for name in ATTRIBUTES if name not in tensors]:
         raise ClodError(f"{path}: has no tensor {missing[0]!r}; export it again")
     wanted = (*ATTRIBUTES, *dial_columns(tensors))
     if odd := [name for name in wanted if not tensors[name].is_floating_point()]:
-        raise ClodError(f"{path}: tensor {odd[0]!r} is not of floating-point numbers; export it again")
+        raise ClodError(
+            f"{path}: tensor {odd[0]!r} is not of floating-point numbers; export it again"
+        )
     arrays = {name: tensors[name].float().numpy() for name in wanted}
     return Source(arrays, metadata, comments=metadata.about)

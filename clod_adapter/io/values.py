@@ -1,7 +1,9 @@
-"""The values of Gaussians between a file and memory: activations, filters, usable rows, the origin, quantised levels.
+"""The values of Gaussians between a file and memory: activations, filters, usable rows, the origin,
+quantised levels.
 
-Some trainers and tools store activated opacities or scales, which only their range shows. Mip-Splatting (Yu et al.,
-CVPR 2024, equation 9) stores a filter beside them, ``filter_3D``, that its renderer applies.
+Some trainers and tools store activated opacities or scales, which only their range shows.
+Mip-Splatting (Yu et al., CVPR 2024, equation 9) stores a filter beside them, ``filter_3D``, that
+its renderer applies.
 """
 
 from __future__ import annotations
@@ -24,19 +26,27 @@ if TYPE_CHECKING:
 Activated = Literal["none", "opacity", "scales", "both"]
 Arrays = dict[str, np.ndarray]
 SIGMA, GROWTH, FILTER_3D, MASKS = "sigma_d", "growth_d", "filter_3D", "masks"
-OPACITY = "opacity_d"  # of far Gaussians, whose ``opacity`` is INVISIBLE: without the dial near ones alone are drawn
+# of far Gaussians, whose ``opacity`` is INVISIBLE: without the dial near ones alone are drawn
+OPACITY = "opacity_d"
 INVISIBLE = -20.0  # logit
 ROWS = 4096  # in a block, which stays in the processor's cache
 _FEW = 10  # Gaussians; fewer may have any range
-_FAINTEST = -0.1  # logit of 0.475; trainers keep fainter Gaussians, and files of |a| reach just below 0
+# logit of 0.475; trainers keep fainter Gaussians, and files of |a| reach just below 0
+_FAINTEST = -0.1
 _TINY = float(np.finfo(np.float32).tiny)
 _OPAQUE = 1 - 2.0**-24  # the largest float32 below 1
 _SH_C0 = 0.28209479177387814  # gaussians.SH_C0, without torch
 
 
 def dial_columns(names: Container[str]) -> dict[str, tuple[str, ...]]:
-    """The dial's columns among ``names``, by attribute; growth_d without a sigma_d is another tool's."""
-    return {name: (name,) for name in (SIGMA, GROWTH, OPACITY) if name in names} if SIGMA in names else {}
+    """The dial's columns among ``names``, by attribute; growth_d without a sigma_d is another
+    tool's.
+    """
+    return (
+        {name: (name,) for name in (SIGMA, GROWTH, OPACITY) if name in names}
+        if SIGMA in names
+        else {}
+    )
 
 
 def degree_of(path: Path, rest: int) -> int:
@@ -45,7 +55,9 @@ def degree_of(path: Path, rest: int) -> int:
     if rest in degrees:
         return degrees[rest]
     wanted = ", ".join(map(str, degrees))
-    raise ClodError(f"{path}: {rest} f_rest_* properties fit no SH degree ({wanted} do); export the file again")
+    raise ClodError(
+        f"{path}: {rest} f_rest_* properties fit no SH degree ({wanted} do); export the file again"
+    )
 
 
 class Prepared(NamedTuple):
@@ -60,28 +72,48 @@ class Prepared(NamedTuple):
 
 
 def prepared(
-    path: Path, arrays: Mapping[str, np.ndarray], activated: Activated | None, at: Origin, origin: Origin | None
+    path: Path,
+    arrays: Mapping[str, np.ndarray],
+    activated: Activated | None,
+    at: Origin,
+    origin: Origin | None,
 ) -> Prepared:
-    """The values of ``Source.arrays``, whose means are relative to ``at``, as ``Gaussians`` take them: one at least.
+    """The values of ``Source.arrays``, whose means are relative to ``at``, as ``Gaussians`` take
+    them: one at least.
 
     Args:
         activated: which values are activated, where their range allows both; None to refuse then.
-        origin: what the means are to be relative to; None for ``at``, or what ``origin_of`` finds where that is 0.
+        origin: what the means are to be relative to; None for ``at``, or what ``origin_of`` finds
+            where that is 0.
     """
     count, rest = arrays["means"].shape[:1], arrays["shN"].shape[1:2]
     shapes: dict[str, tuple[int, ...]] = {
-        "means": (3,), "quats": (4,), "log_scales": (3,), "sh0": (1, 3), "shN": (*rest, 3), MASKS: (2,), FILTER_3D: (1,)
-    }  # fmt: skip
+        "means": (3,),
+        "quats": (4,),
+        "log_scales": (3,),
+        "sh0": (1, 3),
+        "shN": (*rest, 3),
+        MASKS: (2,),
+        FILTER_3D: (1,),
+    }
     for name, array in arrays.items():
         if array.shape != (shape := (*count, *shapes.get(name, ()))):
-            raise ClodError(f"{path}: {name} has shape {array.shape}, expected {shape}; export it again")
+            raise ClodError(
+                f"{path}: {name} has shape {array.shape}, expected {shape}; export it again"
+            )
     if rest[0] + 1 not in SH_COUNTS.values():
-        raise ClodError(f"{path}: shN has {rest[0]} coefficients, which fit no SH degree; export it again")
+        raise ClodError(
+            f"{path}: shN has {rest[0]} coefficients, which fit no SH degree; export it again"
+        )
     if OPACITY in arrays:
         far = arrays[SIGMA] > 0
         shown = {"opacity_logits": np.where(far, arrays[OPACITY], arrays["opacity_logits"])}
         arrays = {name: array for name, array in arrays.items() if name != OPACITY} | shown
-    narrow = {name: np.ascontiguousarray(array, np.float32) for name, array in arrays.items() if name != "means"}
+    narrow = {
+        name: np.ascontiguousarray(array, np.float32)
+        for name, array in arrays.items()
+        if name != "means"
+    }
     values, was, changes = _as_logits(path, {**arrays, **narrow}, activated)
     if origin is None:
         origin = at if any(at) else origin_of(values["means"])
@@ -89,24 +121,40 @@ def prepared(
     keep, dropped = _usable(values)
     if not keep.any():
         why = "; ".join(dropped) or "it is empty"
-        raise ClodError(f"{path}: no usable Gaussian in it, of {len(keep)} rows ({why}); export it again")
+        raise ClodError(
+            f"{path}: no usable Gaussian in it, of {len(keep)} rows ({why}); export it again"
+        )
     values.pop(MASKS, None)
     return Prepared(values, keep, origin, was, changes, dropped)
 
 
-def _as_logits(path: Path, arrays: Arrays, activated: Activated | None) -> tuple[Arrays, Activated, list[str]]:
-    """Logit opacities, logarithmic scales and no ``filter_3D``; what was activated; a line for each change."""
+def _as_logits(
+    path: Path, arrays: Arrays, activated: Activated | None
+) -> tuple[Arrays, Activated, list[str]]:
+    """Logit opacities, logarithmic scales and no ``filter_3D``; what was activated; a line for each
+    change.
+    """
     choices = get_args(Activated)
-    require(activated in (None, *choices), "activated", repr(activated), f"one of {', '.join(choices)}")
+    require(
+        activated in (None, *choices), "activated", repr(activated), f"one of {', '.join(choices)}"
+    )
     found = in_question(arrays) if activated != "none" else {}
     if found and activated is None:
-        ranges = " and ".join(f"{name} from {low:.4g} to {high:.4g}" for name, (low, high) in found.items())
-        what = f"has {ranges}, which looks activated where a 3DGS file has logits (opacity) and logarithms (scales)"
-        fix = f"give --activated {choice_of(found)}, if not, --activated none (activated= in Python)"
+        ranges = " and ".join(
+            f"{name} from {low:.4g} to {high:.4g}" for name, (low, high) in found.items()
+        )
+        what = (
+            f"has {ranges}, which looks activated where a 3DGS file has logits (opacity) and"
+            " logarithms (scales)"
+        )
+        fix = (
+            f"give --activated {choice_of(found)}, if not, --activated none (activated= in Python)"
+        )
         raise ClodError(f"{path}: {what}; if it is, {fix}")
     taken, notes = [name for name in found if activated in (name, "both")], list[str]()
     if "opacity" in taken:
-        opacity = np.abs(arrays["opacity_logits"].astype(np.float64))  # the absolute value is Taming-3DGS's activation
+        # the absolute value is Taming-3DGS's activation
+        opacity = np.abs(arrays["opacity_logits"].astype(np.float64))
         more = f" ({above} above 1 taken as 1)" if (above := int((opacity > 1).sum())) else ""
         arrays["opacity_logits"] = logit(np.clip(opacity, _TINY, _OPAQUE)).astype(np.float32)
         notes.append(f"opacity taken as activated, and stored as logits{more}")
@@ -115,15 +163,23 @@ def _as_logits(path: Path, arrays: Arrays, activated: Activated | None) -> tuple
         notes.append("scales taken as activated, and stored as logarithms")
     if FILTER_3D in arrays:
         arrays["log_scales"], arrays["opacity_logits"] = _fused(arrays, arrays.pop(FILTER_3D))
-        notes.append("Mip-Splatting's filter_3D is fused into scale and opacity, and left out of outputs")
+        notes.append(
+            "Mip-Splatting's filter_3D is fused into scale and opacity, and left out of outputs"
+        )
     return arrays, choice_of(taken), notes
 
 
 def in_question(arrays: Mapping[str, np.ndarray]) -> dict[str, tuple[float, float]]:
-    """The range of "opacity" and of "scales", where it looks activated: at least ``_FEW`` values, none too small."""
+    """The range of "opacity" and of "scales", where it looks activated: at least ``_FEW`` values,
+    none too small.
+    """
     found, opacity = dict[str, tuple[float, float]](), arrays["opacity_logits"]
     # At most half of the values above 1: not true of logits whose faint ones were pruned.
-    faint = {"opacity": (opacity[:, None], _FAINTEST)} if 2 * np.count_nonzero(opacity > 1) <= len(opacity) else {}
+    faint = (
+        {"opacity": (opacity[:, None], _FAINTEST)}
+        if 2 * np.count_nonzero(opacity > 1) <= len(opacity)
+        else {}
+    )
     for name, (values, least) in {**faint, "scales": (arrays["log_scales"], 0.0)}.items():
         low, high, count = np.inf, -np.inf, 0
         for start in range(0, len(values), ROWS):
@@ -143,31 +199,50 @@ def choice_of(found: Iterable[str]) -> Activated:
 
 
 def _fused(arrays: Arrays, filter_3d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """With the filter ``f``: scales ``sqrt(s^2 + f^2)``, opacity ``a sqrt(det(s^2) / det(s^2 + f^2))``, in logs."""
-    scales, logits = arrays["log_scales"].astype(np.float64), arrays["opacity_logits"][:, None].astype(np.float64)
-    with np.errstate(all="ignore"):  # values that are not finite stay so; their rows are dropped later
+    """With the filter ``f``: scales ``sqrt(s^2 + f^2)``, opacity
+    ``a sqrt(det(s^2) / det(s^2 + f^2))``, in logs.
+    """
+    scales, logits = (
+        arrays["log_scales"].astype(np.float64),
+        arrays["opacity_logits"][:, None].astype(np.float64),
+    )
+    # values that are not finite stay so; their rows are dropped later
+    with np.errstate(all="ignore"):
         size = np.log(np.abs(filter_3d.astype(np.float64)))
         wider = 0.5 * np.logaddexp(2 * scales, 2 * size)
         log_opacity = -np.logaddexp(0, -logits) + (scales - wider).sum(1, keepdims=True)
         # log(1 - a), of a near 1 from the logit itself where there is no filter
         fused = np.where(log_opacity < 0, log_opacity - np.log(-np.expm1(log_opacity)), np.inf)
         unfiltered = (wider == scales).all(1, keepdims=True)
-        return wider.astype(np.float32), np.where(unfiltered, logits, fused)[:, 0].astype(np.float32)
+        return wider.astype(np.float32), np.where(unfiltered, logits, fused)[:, 0].astype(
+            np.float32
+        )
 
 
 def _usable(arrays: Arrays) -> tuple[np.ndarray, dict[str, int]]:
-    """``[N]`` bool, the Gaussians that can be drawn, and the number of the others by the first rule that they break."""
+    """``[N]`` bool, the Gaussians that can be drawn, and the number of the others by the first rule
+    that they break.
+    """
     from clod_adapter._kernels import QUAT_MAX, QUAT_MIN  # here: a header is checked without numba
 
-    keep, unlikely = np.ones(len(arrays["means"]), bool), "MaskGaussian existence probability below 0.5"
-    dropped = dict.fromkeys((unlikely, "a value is not finite", "rotation is zero or not of a usable length"), 0)
+    keep, unlikely = (
+        np.ones(len(arrays["means"]), bool),
+        "MaskGaussian existence probability below 0.5",
+    )
+    dropped = dict.fromkeys(
+        (unlikely, "a value is not finite", "rotation is zero or not of a usable length"), 0
+    )
     for start in range(0, len(keep), ROWS):
         block = {name: values[start : start + ROWS] for name, values in arrays.items()}
         exists, finite = np.ones((2, len(block["means"])), bool)
         if MASKS in block:  # sigmoid(first - second) >= 0.5; NaN is for the next rule
             exists = ~(block[MASKS][:, 0] < block[MASKS][:, 1])
         for name, values in block.items():
-            usable = np.isfinite(values) | (values == np.inf) if name == "opacity_logits" else np.isfinite(values)
+            usable = (
+                np.isfinite(values) | (values == np.inf)
+                if name == "opacity_logits"
+                else np.isfinite(values)
+            )
             if not usable.all():  # which is far faster than by rows
                 finite &= usable.reshape(len(usable), -1).all(1)
         with np.errstate(over="ignore", invalid="ignore"):
@@ -180,8 +255,13 @@ def _usable(arrays: Arrays) -> tuple[np.ndarray, dict[str, int]]:
 
 
 def hidden(gaussians: Gaussians) -> dict[str, Tensor]:
-    """``Gaussians.tensors`` as files store them: far ones are INVISIBLE, and OPACITY has their own logits."""
-    tensors, near = {name: tensor.detach() for name, tensor in gaussians.tensors().items()}, gaussians.near
+    """``Gaussians.tensors`` as files store them: far ones are INVISIBLE, and OPACITY has their own
+    logits.
+    """
+    tensors, near = (
+        {name: tensor.detach() for name, tensor in gaussians.tensors().items()},
+        gaussians.near,
+    )
     if near is not None:
         logits = tensors["opacity_logits"]
         tensors["opacity_logits"] = logits.masked_fill(~near, INVISIBLE)
@@ -193,32 +273,43 @@ def arrays_of(path: Path, gaussians: Gaussians) -> Arrays:
     """The float32 arrays of ``hidden``; refuses values that ``load`` would drop."""
     arrays = _on_the_host(gaussians.tensors())
     if dropped := _usable(arrays)[1]:
-        spoilt = [name for name, array in arrays.items() if not np.isfinite(array).all()] or ["quats"]
-        raise ClodError(f"{path}: {', '.join(spoilt)}: {', '.join(dropped)}; drop such rows first, as load does")
+        spoilt = [name for name, array in arrays.items() if not np.isfinite(array).all()] or [
+            "quats"
+        ]
+        raise ClodError(
+            f"{path}: {', '.join(spoilt)}: {', '.join(dropped)}; drop such rows first, as load does"
+        )
     return _on_the_host(hidden(gaussians))  # without copies, on a CPU
 
 
 def _on_the_host(tensors: Mapping[str, Tensor]) -> Arrays:
-    return {name: tensor.detach().float().cpu().contiguous().numpy() for name, tensor in tensors.items()}
+    return {
+        name: tensor.detach().float().cpu().contiguous().numpy() for name, tensor in tensors.items()
+    }
 
 
 def half_turn(arrays: Mapping[str, np.ndarray], axis: str) -> dict[str, np.ndarray]:
     """The Gaussians under a half turn about ``x`` or ``z``, between axes with y down and with y up.
 
-    Exact, and its own inverse. With ``P`` the turn (two signs), means become ``P mu``, rotations ``P R P``, which
-    gives the same ellipsoids, and harmonics change sign where they are odd in an odd number of the axes that flip.
+    Exact, and its own inverse. With ``P`` the turn (two signs), means become ``P mu``, rotations
+    ``P R P``, which gives the same ellipsoids, and harmonics change sign where they are odd in an
+    odd number of the axes that flip.
     """
     x, y, z = (np.float32(1 if name == axis else -1) for name in "xyz")
-    # Of degree and order: odd in y for a negative order, in x for an odd one (else an even one), in z where they differ
-    # by an odd number.
+    # Of degree and order: odd in y for a negative order, in x for an odd one (else an even one), in
+    # z where they differ by an odd number.
     orders = [(degree, order) for degree in range(1, 5) for order in range(-degree, degree + 1)]
-    harmonics = [x ** ((abs(m) - (m < 0)) % 2) * y ** int(m < 0) * z ** ((degree - m) % 2) for degree, m in orders]
+    harmonics = [
+        x ** ((abs(m) - (m < 0)) % 2) * y ** int(m < 0) * z ** ((degree - m) % 2)
+        for degree, m in orders
+    ]
     bands = arrays["shN"].shape[1]
     return {
-        **arrays, "means": arrays["means"] * np.array([x, y, z], np.float32),
+        **arrays,
+        "means": arrays["means"] * np.array([x, y, z], np.float32),
         "quats": arrays["quats"] * np.array([1, x, y, z], np.float32),
         "shN": arrays["shN"] * np.array(harmonics[:bands], np.float32)[:, None],
-    }  # fmt: skip
+    }
 
 
 def normalized(quats: np.ndarray) -> np.ndarray:
@@ -250,7 +341,9 @@ def scales_of(path: Path, log_scales: np.ndarray) -> np.ndarray:
 
 
 def logs_of(scales: np.ndarray) -> np.ndarray:
-    """The inverse of ``scales_of``, in float64; values of 0 or less are read as float32's smallest number."""
+    """The inverse of ``scales_of``, in float64; values of 0 or less are read as float32's smallest
+    number.
+    """
     with np.errstate(invalid="ignore"):  # a NaN that signals
         return np.log(np.maximum(scales.astype(np.float64), _TINY))
 
@@ -272,5 +365,7 @@ def bytes_of(values: np.ndarray) -> np.ndarray:
 
 
 def logits_of_bytes(levels: np.ndarray) -> np.ndarray:
-    """Finite logits of opacities in 255ths: the first and last level are a quarter of a level from 0 and 1."""
+    """Finite logits of opacities in 255ths: the first and last level are a quarter of a level from
+    0 and 1.
+    """
     return logit(np.clip(levels.astype(np.float64), 0.25, 254.75) / 255)

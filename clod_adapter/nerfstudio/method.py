@@ -1,4 +1,6 @@
-"""The method ``clod-splatfacto``, which nerfstudio finds by the entry point ``nerfstudio.method_configs``."""
+"""The method ``clod-splatfacto``, which nerfstudio finds by the entry point
+``nerfstudio.method_configs``.
+"""
 
 import sys
 from collections.abc import Mapping, Sequence
@@ -26,28 +28,44 @@ from torch.nn import Parameter
 from clod_adapter.cameras import Camera
 from clod_adapter.config import AdaptConfig, ScreenFilter
 from clod_adapter.errors import ClodError
-from clod_adapter.nerfstudio.splatfacto import camera_of, chosen, new_dial, shown, state_of, write_ply
+from clod_adapter.nerfstudio.splatfacto import (
+    camera_of,
+    chosen,
+    new_dial,
+    shown,
+    state_of,
+    write_ply,
+)
 from clod_adapter.training.dial import Dial
 from clod_adapter.training.schedule import OURS
 
 OWN = "_model.dial."
 EXPORTER = "nerfstudio.scripts.exporter"
 TRAINED = 30000
-"""Step from which splatfacto uses whole photographs and all SH degrees, as when it loads a checkpoint."""
+"""Step from which splatfacto uses whole photographs and all SH degrees, as when it loads a
+checkpoint.
+"""
 
-# Learning rates in nerfstudio's checkpoints are numpy's numbers, which torch 2.6 and newer refuse to read, in
-# nerfstudio's own commands too. These names run no code. Older versions of torch cannot be told of them.
+# Learning rates in nerfstudio's checkpoints are numpy's numbers, which torch 2.6 and newer refuse
+# to read, in nerfstudio's own commands too. These names run no code. Older versions of torch cannot
+# be told of them.
 if torch.__version__ >= "2.6":
     SCALAR: Any = np.float64(0).__reduce__()[0]
-    torch.serialization.add_safe_globals([
-        (SCALAR, "numpy._core.multiarray.scalar"), (SCALAR, "numpy.core.multiarray.scalar"),
-        np.dtype, type(np.dtype("f8")),
-    ])  # fmt: skip
+    torch.serialization.add_safe_globals(
+        [
+            (SCALAR, "numpy._core.multiarray.scalar"),
+            (SCALAR, "numpy.core.multiarray.scalar"),
+            np.dtype,
+            type(np.dtype("f8")),
+        ]
+    )
 
 
 @dataclass
 class ClodSplatfactoModelConfig(SplatfactoModelConfig):  # type: ignore[misc]
-    """splatfacto's settings and those of the dial; densification has none, as the Gaussians stay the same."""
+    """splatfacto's settings and those of the dial; densification has none, as the Gaussians stay
+    the same.
+    """
 
     _target: type = field(default_factory=lambda: ClodSplatfactoModel)
     max_sv: float = 5.0
@@ -61,7 +79,8 @@ class ClodSplatfactoModelConfig(SplatfactoModelConfig):  # type: ignore[misc]
 class ClodSplatfactoModel(SplatfactoModel):  # type: ignore[misc]
     """A trained splatfacto whose Gaussians fade out by the dial.
 
-    splatfacto reads its parameters through properties while it draws; there they are those of the dial value.
+    splatfacto reads its parameters through properties while it draws; there they are those of the
+    dial value.
     """
 
     config: ClodSplatfactoModelConfig
@@ -106,7 +125,9 @@ class ClodSplatfactoModel(SplatfactoModel):  # type: ignore[misc]
         finally:
             self._shown = {}
 
-    def get_loss_dict(self, outputs: Any, batch: Any, metrics_dict: Any = None) -> dict[str, Tensor]:
+    def get_loss_dict(
+        self, outputs: Any, batch: Any, metrics_dict: Any = None
+    ) -> dict[str, Tensor]:
         losses: dict[str, Tensor] = super().get_loss_dict(outputs, batch, metrics_dict)
         if self.dial is not None and self.training:
             losses["main_loss"] = self.dial.loss(self.virtual_scale, losses["main_loss"])
@@ -114,8 +135,14 @@ class ClodSplatfactoModel(SplatfactoModel):  # type: ignore[misc]
 
     def get_param_groups(self) -> dict[str, list[Parameter]]:
         groups = super().get_param_groups()
-        groups = {name: values for name, values in groups.items() if all(value.requires_grad for value in values)}
-        return groups | {name: [value] for name, value in (self.dial.named_parameters() if self.dial else ())}
+        groups = {
+            name: values
+            for name, values in groups.items()
+            if all(value.requires_grad for value in values)
+        }
+        return groups | {
+            name: [value] for name, value in (self.dial.named_parameters() if self.dial else ())
+        }
 
     def step_cb(self, optimizers: Optimizers, step: int) -> None:
         super().step_cb(optimizers, TRAINED + step)
@@ -125,11 +152,19 @@ class ClodSplatfactoModel(SplatfactoModel):  # type: ignore[misc]
 
 
 class ClodPipeline(VanillaPipeline):  # type: ignore[misc]
-    """Attaches the dial once the Gaussians are loaded, in ns-train and in all commands that read its result."""
+    """Attaches the dial once the Gaussians are loaded, in ns-train and in all commands that read
+    its result.
+    """
 
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
-        saved = {name.removeprefix(OWN): value for name, value in loaded_state.items() if name.startswith(OWN)}
-        super().load_pipeline({name: value for name, value in loaded_state.items() if not name.startswith(OWN)}, step)
+        saved = {
+            name.removeprefix(OWN): value
+            for name, value in loaded_state.items()
+            if name.startswith(OWN)
+        }
+        super().load_pipeline(
+            {name: value for name, value in loaded_state.items() if not name.startswith(OWN)}, step
+        )
         cameras = self.datamanager.train_dataset.cameras
         self.model.attach([camera_of(cameras[i : i + 1]) for i in range(len(cameras))], saved)
         self._export_with_dial()
@@ -137,15 +172,25 @@ class ClodPipeline(VanillaPipeline):  # type: ignore[misc]
     def state_dict(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
         state: dict[str, Any] = super().state_dict(*args, **kwargs)
         dial = self.model.dial
-        return state if dial is None else state | {OWN + name: value for name, value in state_of(dial).items()}
+        return (
+            state
+            if dial is None
+            else state | {OWN + name: value for name, value in state_of(dial).items()}
+        )
 
     def _export_with_dial(self) -> None:
-        """In ns-export, whose commands no plugin can add to: the function that writes the PLY's rows."""
-        exporter = getattr(sys.modules.get(EXPORTER) or sys.modules["__main__"], "ExportGaussianSplat", None)
+        """In ns-export, whose commands no plugin can add to: the function that writes the PLY's
+        rows.
+        """
+        exporter = getattr(
+            sys.modules.get(EXPORTER) or sys.modules["__main__"], "ExportGaussianSplat", None
+        )
         if exporter is None:
             return
         plain, compensate = exporter.write_ply, self.model.config.rasterize_mode != "classic"
-        adapted = partial(write_ply, dial=self.model.dial, screen_filter=ScreenFilter(compensate=compensate))
+        adapted = partial(
+            write_ply, dial=self.model.dial, screen_filter=ScreenFilter(compensate=compensate)
+        )
 
         def write(filename: str, count: int, map_to_tensors: dict[str, Any]) -> None:
             if "f_dc_0" in map_to_tensors:
@@ -163,21 +208,32 @@ def decaying(rate: float, final: float, steps: int) -> dict[str, Any]:
 
 
 class ClodTrainer(Trainer):  # type: ignore[misc]
-    """Starts from a trained splatfacto; its optimizers are made anew, for the loaded Gaussians and the dial."""
+    """Starts from a trained splatfacto; its optimizers are made anew, for the loaded Gaussians and
+    the dial.
+    """
 
     def setup_optimizers(self) -> Optimizers:
         dial = self.pipeline.model.dial
         if dial is None:  # before the checkpoint is loaded
             return Optimizers({}, {})
-        rates = {group["name"]: group["lr"] for group in dial.param_groups(splats=True) if group["lr"] > 0}
+        rates = {
+            group["name"]: group["lr"]
+            for group in dial.param_groups(splats=True)
+            if group["lr"] > 0
+        }
         steps, final = self.config.max_num_iterations, OURS.lr_final
         own = {name: decaying(rate, final * rate, steps) for name, rate in rates.items()}
         return Optimizers(self.config.optimizers | own, self.pipeline.get_param_groups())
 
     def _load_checkpoint(self) -> None:
-        """Of splatfacto: its Gaussians, for a new dial from step 0. Of this method: everything, from the next step."""
+        """Of splatfacto: its Gaussians, for a new dial from step 0. Of this method: everything,
+        from the next step.
+        """
         if torch.__version__ < "2.6":
-            raise ClodError(f"clod-splatfacto needs torch 2.6 or newer to read checkpoints, not {torch.__version__}")
+            raise ClodError(
+                "clod-splatfacto needs torch 2.6 or newer to read checkpoints, not"
+                f" {torch.__version__}"
+            )
         state = torch.load(self._checkpoint(), map_location="cpu", weights_only=True)
         resumed = any(name.startswith(OWN) for name in state["pipeline"])
         self._start_step = state["step"] + 1 if resumed else 0
@@ -191,13 +247,23 @@ class ClodTrainer(Trainer):  # type: ignore[misc]
     def _checkpoint(self) -> Path:
         folder, step = self.config.load_dir, self.config.load_step
         if folder is None and self.config.load_checkpoint is None:
-            where = "--load-dir outputs/SCENE/splatfacto/DATE/nerfstudio_models, or a file with --load-checkpoint"
-            raise ClodError(f"clod-splatfacto adapts a trained splatfacto: give its folder with {where}")
+            where = (
+                "--load-dir outputs/SCENE/splatfacto/DATE/nerfstudio_models, or a file with"
+                " --load-checkpoint"
+            )
+            raise ClodError(
+                f"clod-splatfacto adapts a trained splatfacto: give its folder with {where}"
+            )
         if folder is None:
             return Path(self.config.load_checkpoint)
-        found = sorted(Path(folder).glob("step-*.ckpt" if step is None else f"step-{step:09d}.ckpt"))
+        found = sorted(
+            Path(folder).glob("step-*.ckpt" if step is None else f"step-{step:09d}.ckpt")
+        )
         if not found:
-            raise ClodError(f"{folder}: has no checkpoint{'' if step is None else f' of step {step}'} (step-*.ckpt)")
+            raise ClodError(
+                f"{folder}: has no checkpoint{'' if step is None else f' of step {step}'}"
+                " (step-*.ckpt)"
+            )
         return found[-1]
 
 
@@ -214,7 +280,8 @@ method = MethodSpecification(
         pipeline=VanillaPipelineConfig(
             _target=ClodPipeline,
             datamanager=FullImageDatamanagerConfig(
-                dataparser=NerfstudioDataParserConfig(load_3D_points=True), cache_images_type="uint8"
+                dataparser=NerfstudioDataParserConfig(load_3D_points=True),
+                cache_images_type="uint8",
             ),
             model=ClodSplatfactoModelConfig(),
         ),
@@ -225,5 +292,8 @@ method = MethodSpecification(
         viewer=ViewerConfig(num_rays_per_chunk=1 << 15),
         vis="viewer",
     ),
-    description="A quality dial for a trained splatfacto (clod-adapter); needs --load-dir or --load-checkpoint.",
+    description=(
+        "A quality dial for a trained splatfacto (clod-adapter); needs --load-dir or"
+        " --load-checkpoint."
+    ),
 )

@@ -32,18 +32,23 @@ def camera_of(camera: Any) -> Camera:
     viewmat = torch.eye(4, dtype=torch.float32)
     viewmat[:3, :3], viewmat[:3, 3] = rotation.T, -rotation.T @ pose[:, 3]
     fx, fy, cx, cy, width, height = (
-        float(getattr(camera, name).flatten()[0]) for name in ("fx", "fy", "cx", "cy", "width", "height")
+        float(getattr(camera, name).flatten()[0])
+        for name in ("fx", "fy", "cx", "cy", "width", "height")
     )
     K = torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]], dtype=torch.float32)
     return Camera(viewmat, K, int(width), int(height))
 
 
-def shown(parameters: Mapping[str, Tensor], dial: Dial, camera: Camera, virtual_scale: float) -> dict[str, Tensor]:
-    """What splatfacto is to draw in place of its ``means``, ``scales`` and ``opacities`` for a camera and dial value.
+def shown(
+    parameters: Mapping[str, Tensor], dial: Dial, camera: Camera, virtual_scale: float
+) -> dict[str, Tensor]:
+    """What splatfacto is to draw in place of its ``means``, ``scales`` and ``opacities`` for a
+    camera and dial value.
 
-    Scales are logarithms and opacities logits, as splatfacto activates them itself. Culled Gaussians get the logit of
-    opacity 0 and a centre behind the camera, where gsplat's projection culls them before it sorts. Differentiable in
-    the parameters and the dial; culled rows have gradient 0.
+    Scales are logarithms and opacities logits, as splatfacto activates them itself. Culled
+    Gaussians get the logit of opacity 0 and a centre behind the camera, where gsplat's projection
+    culls them before it sorts. Differentiable in the parameters and the dial; culled rows have
+    gradient 0.
     """
     found = dial(camera, virtual_scale)
     means, opacities, scales = (parameters[name] for name in ("means", "opacities", "scales"))
@@ -58,17 +63,29 @@ def shown(parameters: Mapping[str, Tensor], dial: Dial, camera: Camera, virtual_
 
 
 def new_dial(
-    parameters: Mapping[str, Tensor], cameras: Sequence[Camera], config: AdaptConfig, saved: Mapping[str, Any]
+    parameters: Mapping[str, Tensor],
+    cameras: Sequence[Camera],
+    config: AdaptConfig,
+    saved: Mapping[str, Any],
 ) -> Dial:
     """The dial that ``saved`` describes (``state_of``), or an initialized one if it is empty."""
     if not saved:
         return attach(parameters, cameras, config)
     attenuation = AttenuationConfig(**saved[SETTINGS])
     if attenuation.max_sv != config.max_sv:
-        raise ClodError(f"the dial was trained up to {attenuation.max_sv:g}; set --pipeline.model.max-sv to that")
-    tensors = {name: value.to(parameters["means"].device) for name, value in saved.items() if name != SETTINGS}
+        raise ClodError(
+            f"the dial was trained up to {attenuation.max_sv:g}; set --pipeline.model.max-sv to"
+            " that"
+        )
+    tensors = {
+        name: value.to(parameters["means"].device)
+        for name, value in saved.items()
+        if name != SETTINGS
+    }
     start = from_gsplat({name: value.detach() for name, value in parameters.items()}).replace(
-        sigma_d=tensors["log_sigma"].exp(), growth_d=tensors.get("growth_d"), attenuation=attenuation
+        sigma_d=tensors["log_sigma"].exp(),
+        growth_d=tensors.get("growth_d"),
+        attenuation=attenuation,
     )
     dial = Dial(parameters, start, cameras, config)
     dial.load_state_dict(tensors)
@@ -76,7 +93,9 @@ def new_dial(
 
 
 def state_of(dial: Dial) -> dict[str, Any]:
-    """What a checkpoint has to hold for ``new_dial``: tensors, and the settings as plain numbers and names."""
+    """What a checkpoint has to hold for ``new_dial``: tensors, and the settings as plain numbers
+    and names.
+    """
     return {**dial.state_dict(), SETTINGS: asdict(dial.attenuation)}
 
 
@@ -87,21 +106,29 @@ def chosen(default: float) -> float:
         value = float(text) if text else default
         check_dial(value)
     except (ValueError, ClodError) as error:
-        raise ClodError(f"{VIRTUAL_SCALE} is {text!r}, it must be a number of at least 0") from error
+        raise ClodError(
+            f"{VIRTUAL_SCALE} is {text!r}, it must be a number of at least 0"
+        ) from error
     return value
 
 
-def write_ply(path: str, columns: Mapping[str, np.ndarray[Any, Any]], dial: Dial, screen_filter: ScreenFilter) -> None:
+def write_ply(
+    path: str, columns: Mapping[str, np.ndarray[Any, Any]], dial: Dial, screen_filter: ScreenFilter
+) -> None:
     """The rows that nerfstudio exports, with their dial, as an extended PLY.
 
-    nerfstudio drops rows (faint, not finite, outside of a box) and keeps the order of the others; ``columns`` are
-    ``[M]`` or ``[M, 1]`` each. The dial's rows are found by their attributes.
+    nerfstudio drops rows (faint, not finite, outside of a box) and keeps the order of the others;
+    ``columns`` are ``[M]`` or ``[M, 1]`` each. The dial's rows are found by their attributes.
     """
     gaussians = dial.gaussians().cpu().replace(screen_filter=screen_filter)
-    exported = np.stack([columns[name].ravel() for name in ("x", "y", "z", "opacity")], 1).astype(np.float32)
+    exported = np.stack([columns[name].ravel() for name in ("x", "y", "z", "opacity")], 1).astype(
+        np.float32
+    )
     values = torch.cat([gaussians.means, gaussians.opacity_logits[:, None]], 1).detach().numpy()
     own = enumerate(row.tobytes() for row in values)
     rows = [next((i for i, mine in own if mine == each.tobytes()), -1) for each in exported]
     if -1 in rows:
-        raise ClodError(f"{path}: nerfstudio exports other rows than those of the dial; nothing is written")
+        raise ClodError(
+            f"{path}: nerfstudio exports other rows than those of the dial; nothing is written"
+        )
     save(path, gaussians[rows])

@@ -25,11 +25,17 @@ def _cuda() -> Rasterizer:
 
 
 BACKENDS: dict[str, Callable[[], Rasterizer]] = {"cpu": _cpu, "cuda": _cuda}
-"""By the type of a device, a function that returns its rasterizer; another backend is another entry."""
+"""By the type of a device, a function that returns its rasterizer; another backend is another
+entry.
+"""
 
 
 def for_device(device: torch.device) -> Rasterizer:
-    """The rasterizer for tensors on ``device``, imported on first use; ClodError where there is none that works."""
+    """The rasterizer for tensors on ``device``, imported on first use; ClodError where there is
+    none that works.
+    """
     if device.type not in BACKENDS:
-        raise ClodError(f"no rasterizer for device {device}: move the Gaussians to the CPU with .to('cpu')")
+        raise ClodError(
+            f"no rasterizer for device {device}: move the Gaussians to the CPU with .to('cpu')"
+        )
     return BACKENDS[device.type]()

@@ -1,4 +1,6 @@
-"""Tile-based splatting on the CPU, compiled by Numba: forward and backward pass on several threads."""
+"""Tile-based splatting on the CPU, compiled by Numba: forward and backward pass on several
+threads.
+"""
 
 import math
 from typing import Any
@@ -37,7 +39,10 @@ def camera_vector(camera: Camera, screen_filter: ScreenFilter = CLASSIC) -> np.n
     out[24:26] = -(cy / fy + margin_y), (camera.height - cy) / fy + margin_y
     out[26:29] = -viewmat[:3, 3] @ viewmat[:3, :3]
     out[conventions.NEAR] = camera.near
-    out[conventions.BLUR], out[conventions.COMPENSATE] = screen_filter.variance, screen_filter.compensate
+    out[conventions.BLUR], out[conventions.COMPENSATE] = (
+        screen_filter.variance,
+        screen_filter.compensate,
+    )
     return out
 
 
@@ -63,19 +68,34 @@ class Frame:
     """
 
     def __init__(
-        self, arrays: list[np.ndarray], degree: int, camera: Camera, screen_filter: ScreenFilter, dial: np.ndarray
+        self,
+        arrays: list[np.ndarray],
+        degree: int,
+        camera: Camera,
+        screen_filter: ScreenFilter,
+        dial: np.ndarray,
     ) -> None:
         n, workers = len(arrays[0]), workers_for(len(arrays[0]))
-        self.camera, self.compensated = camera_vector(camera, screen_filter), screen_filter.compensate or None
+        self.camera, self.compensated = (
+            camera_vector(camera, screen_filter),
+            screen_filter.compensate or None,
+        )
         self.records = recycled_array(((n + workers) * conventions.RECORD,), np.float32)
         self.packed_ids, self.counts = recycled_array((n,), np.int32), np.zeros(workers, np.int64)
         depths, packed = recycled_array((n,), np.float32), (self.packed_ids, self.counts)
-        threads.run(project, workers, *arrays, degree, self.camera, dial, self.records, depths, *packed)
-        keys, order, *others = (recycled_array((int(self.counts.sum()),), kind) for kind in (np.uint32, np.int32) * 2)
+        threads.run(
+            project, workers, *arrays, degree, self.camera, dial, self.records, depths, *packed
+        )
+        keys, order, *others = (
+            recycled_array((int(self.counts.sum()),), kind) for kind in (np.uint32, np.int32) * 2
+        )
         order = tiles.depth_order(depths.view(np.uint32), self.counts, keys, order, *others)
         across, down = -(-camera.width // conventions.TILE), -(-camera.height // conventions.TILE)
         offsets, listing = np.empty(across * down + 1, np.int64), workers_for(len(order))
-        histogram, totals = np.zeros((listing, across * down), np.int64), np.zeros(listing, np.int64)
+        histogram, totals = (
+            np.zeros((listing, across * down), np.int64),
+            np.zeros(listing, np.int64),
+        )
         given = self.records, order, across, histogram, totals
         threads.run(tiles.list_tiles, listing, *given, *[np.empty(0, np.int32)] * 3)
         total = tiles.tile_offsets(histogram, offsets, totals)
@@ -83,8 +103,15 @@ class Frame:
         self.entry_slots = recycled_array((total,), np.int32)
         threads.run(tiles.list_tiles, listing, *given, self.slots, entries, self.entry_slots)
         # Longest lists first: no thread starts a long tile when the others are done.
-        order, masks = np.argsort(-np.diff(offsets), kind="stable"), recycled_array((total * blend.WORDS,), np.uint64)
-        self.workers, self.size, lists = threads.worker_count(), (camera.height, camera.width), (entries, offsets)
+        order, masks = (
+            np.argsort(-np.diff(offsets), kind="stable"),
+            recycled_array((total * blend.WORDS,), np.uint64),
+        )
+        self.workers, self.size, lists = (
+            threads.worker_count(),
+            (camera.height, camera.width),
+            (entries, offsets),
+        )
         self.blended = self.records, *lists, across, camera.width, camera.height, order, masks
 
     def blend(self, background: np.ndarray) -> tuple[Tensor, Tensor]:
@@ -94,13 +121,29 @@ class Frame:
         return image, alpha
 
     def blend_gradient(
-        self, image: Tensor, alpha: Tensor, v_image: Tensor, v_alpha: Tensor, shaped: bool, colored: bool
+        self,
+        image: Tensor,
+        alpha: Tensor,
+        v_image: Tensor,
+        v_alpha: Tensor,
+        shaped: bool,
+        colored: bool,
     ) -> np.ndarray:
-        """The sums over pixels of each pair of Gaussian and tile, those of shape and colour if asked for."""
+        """The sums over pixels of each pair of Gaussian and tile, those of shape and colour if
+        asked for.
+        """
         # Reads of the last pair are sixteen floats wide too.
         sums = recycled_array((len(self.entry_slots) * conventions.PAIR + 16,), np.float32)
         given = [x.contiguous().numpy() for x in (image, alpha, v_image, v_alpha)]
-        self._run(blend.blend_gradient, blend.BACKWARD_STATE, self.entry_slots, *given, shaped, colored, sums)
+        self._run(
+            blend.blend_gradient,
+            blend.BACKWARD_STATE,
+            self.entry_slots,
+            *given,
+            shaped,
+            colored,
+            sums,
+        )
         return sums
 
     def _run(self, kernel: Any, state: int, *own: Any) -> None:
@@ -116,16 +159,29 @@ def _arrays(tensors: Any) -> list[np.ndarray]:
 
 
 class _Picture(torch.autograd.Function):
-    """Of Gaussians as they are stored, at one dial value, or of activated ones, as ``dialling`` says.
+    """Of Gaussians as they are stored, at one dial value, or of activated ones, as ``dialling``
+    says.
 
     Without a dial, ``sigma_d`` is empty, without growth its exponents.
     """
 
     @staticmethod
     def forward(  # type: ignore[no-untyped-def]
-        ctx: Any, means, quats, scales, opacities, sigma_d, growth_d, sh0, shN, background, camera, screen_filter,
-        dialling, trained,
-    ):  # fmt: skip
+        ctx: Any,
+        means,
+        quats,
+        scales,
+        opacities,
+        sigma_d,
+        growth_d,
+        sh0,
+        shN,
+        background,
+        camera,
+        screen_filter,
+        dialling,
+        trained,
+    ):
         inputs = (means, quats, scales, opacities, sigma_d, growth_d, sh0, shN)
         ctx.degree = math.isqrt(shN.shape[1] + 1) - 1
         frame = Frame(_arrays(inputs), ctx.degree, camera, screen_filter, dialling)
@@ -144,50 +200,98 @@ class _Picture(torch.autograd.Function):
         colored = any(need[6:8]) or (shaped and ctx.degree > 0)
         pair_sums = frame.blend_gradient(image, alpha, *gradients, shaped, colored)
         wanted = [shaped] * 3 + [True] * 3 + [need[6], need[7]]
-        found = [recycled(x.shape if want else (0, *x.shape[1:])) for x, want in zip(inputs, wanted, strict=True)]
+        found = [
+            recycled(x.shape if want else (0, *x.shape[1:]))
+            for x, want in zip(inputs, wanted, strict=True)
+        ]
         *arrays, _sh0, shN = _arrays(inputs)
         threads.run(
-            project_gradient, len(frame.counts), *arrays, shN, ctx.degree, frame.camera, ctx.dialling, frame.records,
-            frame.packed_ids, frame.counts, frame.slots, pair_sums, frame.compensated, ctx.trained, *_arrays(found),
-        )  # fmt: skip
+            project_gradient,
+            len(frame.counts),
+            *arrays,
+            shN,
+            ctx.degree,
+            frame.camera,
+            ctx.dialling,
+            frame.records,
+            frame.packed_ids,
+            frame.counts,
+            frame.slots,
+            pair_sums,
+            frame.compensated,
+            ctx.trained,
+            *_arrays(found),
+        )
         slopes = [g if asked else None for g, asked in zip(found, need, strict=False)]
         behind = ((1 - alpha)[..., None] * gradients[0]).sum((0, 1)) if need[8] else None
         return *slopes, behind, None, None, None, None
 
 
 class _Compiled(Rasterizer):
-    """The dial is the first part of the projection, and the last of its gradient: what it culls is not touched again,
-    and nothing is copied."""
+    """The dial is the first part of the projection, and the last of its gradient: what it culls is
+    not touched again, and nothing is copied.
+    """
 
     def draw(
-        self, gaussians: Gaussians, camera: Camera, virtual_scale: float = 1.0, *,
-        background: Tensor | np.ndarray | None = None, seen_from: Camera | None = None, trained: int | None = None,
-    ) -> tuple[Tensor, Tensor]:  # fmt: skip
+        self,
+        gaussians: Gaussians,
+        camera: Camera,
+        virtual_scale: float = 1.0,
+        *,
+        background: Tensor | np.ndarray | None = None,
+        seen_from: Camera | None = None,
+        trained: int | None = None,
+    ) -> tuple[Tensor, Tensor]:
         background = behind(gaussians, background)
         if seen_from is not None or _composed(gaussians):
-            return super().draw(gaussians, camera, virtual_scale, background=background, seen_from=seen_from)
+            return super().draw(
+                gaussians, camera, virtual_scale, background=background, seen_from=seen_from
+            )
         check_dial(virtual_scale)
         g = gaussians
         sigma_d, growth_d = (NOTHING if x is None else x.float() for x in (g.sigma_d, g.growth_d))
-        require_float32("CPU", **(g.tensors() | {"sigma_d": sigma_d, "growth_d": growth_d, "background": background}))
+        require_float32(
+            "CPU",
+            **(g.tensors() | {"sigma_d": sigma_d, "growth_d": growth_d, "background": background}),
+        )
         return _Picture.apply(  # type: ignore[no-any-return, no-untyped-call]
-            g.means, g.quats, g.log_scales, g.opacity_logits, sigma_d, growth_d, g.sh0, g.shN, background, camera,
-            g.screen_filter, _dial_vector(g, virtual_scale), len(g) if trained is None else trained,
-        )  # fmt: skip
+            g.means,
+            g.quats,
+            g.log_scales,
+            g.opacity_logits,
+            sigma_d,
+            growth_d,
+            g.sh0,
+            g.shN,
+            background,
+            camera,
+            g.screen_filter,
+            _dial_vector(g, virtual_scale),
+            len(g) if trained is None else trained,
+        )
 
     @torch.no_grad()
     def kept(self, gaussians: Gaussians, camera: Camera, virtual_scale: float) -> Tensor:
-        if gaussians.sigma_d is None or gaussians.means.dtype != torch.float32 or _composed(gaussians):
+        if (
+            gaussians.sigma_d is None
+            or gaussians.means.dtype != torch.float32
+            or _composed(gaussians)
+        ):
             return super().kept(gaussians, camera, virtual_scale)
         found = np.empty(len(gaussians), np.uint8)
         given = _arrays((gaussians.means, gaussians.sigma_d.float()))
-        settings = camera_vector(camera, gaussians.screen_filter), _dial_vector(gaussians, virtual_scale)
+        settings = (
+            camera_vector(camera, gaussians.screen_filter),
+            _dial_vector(gaussians, virtual_scale),
+        )
         threads.run(dial.mark_kept, workers_for(len(found)), *given, *settings, found)
         return torch.from_numpy(found).view(torch.bool)
 
 
 def _composed(gaussians: Gaussians) -> bool:
-    """Whether the dial is composed with ``rasterize``, as the paper's form is: it has no kernels."""
+    """Whether the dial is composed with ``rasterize``, as the paper's form is: it has no
+    kernels.
+    """
     return gaussians.attenuation is not None and gaussians.attenuation.form == "paper"
 
 
@@ -197,17 +301,42 @@ def _dial_vector(gaussians: Gaussians, virtual_scale: float) -> np.ndarray:
 
 
 def rasterize(
-    means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh0: Tensor, shN: Tensor, camera: Camera,
-    background: Tensor, screen_filter: ScreenFilter = CLASSIC,
-) -> tuple[Tensor, Tensor]:  # fmt: skip
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    sh0: Tensor,
+    shN: Tensor,
+    camera: Camera,
+    background: Tensor,
+    screen_filter: ScreenFilter = CLASSIC,
+) -> tuple[Tensor, Tensor]:
     """See ``clod_adapter.rasterizers.Splat``; of float32 tensors alone."""
     require_float32(
-        "CPU", means=means, quats=quats, scales=scales, opacities=opacities, sh0=sh0, shN=shN, background=background
+        "CPU",
+        means=means,
+        quats=quats,
+        scales=scales,
+        opacities=opacities,
+        sh0=sh0,
+        shN=shN,
+        background=background,
     )
     return _Picture.apply(  # type: ignore[no-any-return, no-untyped-call]
-        means, quats, scales, opacities, NOTHING, NOTHING, sh0, shN, background, camera, screen_filter, ACTIVATED,
+        means,
+        quats,
+        scales,
+        opacities,
+        NOTHING,
+        NOTHING,
+        sh0,
+        shN,
+        background,
+        camera,
+        screen_filter,
+        ACTIVATED,
         len(means),
-    )  # fmt: skip
+    )
 
 
 RASTERIZER = _Compiled(rasterize)

@@ -1,9 +1,11 @@
-"""Splatting on an NVIDIA GPU by the kernels of gsplat 1.4.0 to 1.6.0, restricted to the rows that are drawn.
+"""Splatting on an NVIDIA GPU by the kernels of gsplat 1.4.0 to 1.6.0, restricted to the rows that
+are drawn.
 
-gsplat's projection tests the opacity last, and packed mode does all other work on a row twice. So rows below 1/255,
-such as culled ones, are removed first, and harmonics are gathered only of rows that the projection finds in the image.
-Gradients of removed rows are 0. gsplat sums over pixels in no fixed order, so results repeat except for rounding. It
-leaves out the Gaussian that ends a pixel, which the CPU's kernels draw (``_kernels/blend.py``).
+gsplat's projection tests the opacity last, and packed mode does all other work on a row twice. So
+rows below 1/255, such as culled ones, are removed first, and harmonics are gathered only of rows
+that the projection finds in the image. Gradients of removed rows are 0. gsplat sums over pixels in
+no fixed order, so results repeat except for rounding. It leaves out the Gaussian that ends a pixel,
+which the CPU's kernels draw (``_kernels/blend.py``).
 """
 
 import contextlib
@@ -32,42 +34,63 @@ OLDEST, INSTALL = (1, 4, 0), "pip install gsplat==1.5.3"
 def unusable() -> str | None:
     """Why gsplat cannot render on a GPU here, with the command that fixes it; None if it can.
 
-    The first call on a machine may compile gsplat's kernels, which takes minutes; gsplat prints a message.
+    The first call on a machine may compile gsplat's kernels, which takes minutes; gsplat prints a
+    message.
     """
     try:
-        with contextlib.redirect_stdout(sys.stderr):  # its messages would mix with results on stdout
+        # its messages would mix with results on stdout
+        with contextlib.redirect_stdout(sys.stderr):
             import gsplat
 
             if tuple(int(number) for number in re.findall(r"\d+", gsplat.__version__)[:3]) < OLDEST:
-                return f"gsplat {gsplat.__version__} is too old, its functions take other arguments: {INSTALL}"
+                return (
+                    f"gsplat {gsplat.__version__} is too old, its functions take other arguments:"
+                    f" {INSTALL}"
+                )
             from gsplat.cuda import _backend
-    except Exception as error:  # a failed compilation is a RuntimeError, a missing library an OSError or ImportError
+    # a failed compilation is a RuntimeError, a missing library an OSError or ImportError
+    except Exception as error:
         what = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
         return f"gsplat cannot be imported ({what}): {INSTALL}"
     if _backend._C is None:
         return (
-            f"gsplat {gsplat.__version__} has no CUDA kernels, and there is no CUDA toolkit to compile them with: "
-            f"install nvcc of CUDA {torch.version.cuda}, https://developer.nvidia.com/cuda-toolkit-archive"
+            f"gsplat {gsplat.__version__} has no CUDA kernels, and there is no CUDA toolkit to"
+            f" compile them with: install nvcc of CUDA {torch.version.cuda},"
+            " https://developer.nvidia.com/cuda-toolkit-archive"
         )
     return None
 
 
 def rasterize(
-    means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh0: Tensor, shN: Tensor, camera: Camera,
-    background: Tensor, screen_filter: ScreenFilter = CLASSIC,
-) -> tuple[Tensor, Tensor]:  # fmt: skip
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    sh0: Tensor,
+    shN: Tensor,
+    camera: Camera,
+    background: Tensor,
+    screen_filter: ScreenFilter = CLASSIC,
+) -> tuple[Tensor, Tensor]:
     """See ``clod_adapter.rasterizers.Splat``; of float32 tensors alone."""
     given = {
-        "means": means, "quats": quats, "scales": scales, "opacities": opacities, "sh0": sh0, "shN": shN,
+        "means": means,
+        "quats": quats,
+        "scales": scales,
+        "opacities": opacities,
+        "sh0": sh0,
+        "shN": shN,
         "background": background,
-    }  # fmt: skip
+    }
     require_float32("CUDA", **{name: tensor for name, tensor in given.items() if tensor.is_cuda})
     rows = drawable(quats, opacities).nonzero()[:, 0]
     geometry = [_Rows.apply(rows, x) for x in (means, quats, scales, opacities)]
     drawn = _project(geometry, sh0, shN, rows, camera, screen_filter) if len(rows) else None
     if drawn is None or len(drawn["means2d"]) == 0:
         # Nothing to draw; the gradients are 0.
-        nothing = sum(_Rows.apply(rows[:0], x).sum() for x in (means, quats, scales, opacities, sh0, shN))
+        nothing = sum(
+            _Rows.apply(rows[:0], x).sum() for x in (means, quats, scales, opacities, sh0, shN)
+        )
         empty = nothing + means.new_zeros(camera.height, camera.width)
         return background + empty[..., None], empty
     image, alpha = _blend(drawn, camera)
@@ -75,7 +98,12 @@ def rasterize(
 
 
 def _project(
-    geometry: list[Tensor], sh0: Tensor, shN: Tensor, rows: Tensor, camera: Camera, screen_filter: ScreenFilter
+    geometry: list[Tensor],
+    sh0: Tensor,
+    shN: Tensor,
+    rows: Tensor,
+    camera: Camera,
+    screen_filter: ScreenFilter,
 ) -> dict[str, Tensor]:
     """Inputs of gsplat's tiles and pixels: one row for each Gaussian in the image, in row order."""
     import gsplat
@@ -83,18 +111,36 @@ def _project(
     means, quats, scales, opacities = geometry
     # In one transfer to the device.
     parts = (camera.viewmat.flatten(), camera.K.flatten(), camera.position)
-    flat = torch.cat([part.detach().to(means.dtype) for part in parts]).to(means.device, non_blocking=True)
+    flat = torch.cat([part.detach().to(means.dtype) for part in parts]).to(
+        means.device, non_blocking=True
+    )
     viewmat, K, eye = flat[:16].view(1, 4, 4), flat[16:25].view(1, 3, 3), flat[25:]
     *found, radii, means2d, depths, conics, compensations = _call(
-        gsplat.fully_fused_projection, means, None, quats, scales, viewmat, K, camera.width, camera.height,
-        eps2d=screen_filter.variance, packed=True, near_plane=camera.near, far_plane=math.inf, radius_clip=0.0,
-        sparse_grad=False, calc_compensations=screen_filter.compensate, camera_model="pinhole",
+        gsplat.fully_fused_projection,
+        means,
+        None,
+        quats,
+        scales,
+        viewmat,
+        K,
+        camera.width,
+        camera.height,
+        eps2d=screen_filter.variance,
+        packed=True,
+        near_plane=camera.near,
+        far_plane=math.inf,
+        radius_clip=0.0,
+        sparse_grad=False,
+        calc_compensations=screen_filter.compensate,
+        camera_model="pinhole",
         opacities=opacities.detach(),
-    )  # fmt: skip
-    ids = found[:3][-1]  # of cameras, Gaussians; 1.5.3 has batches before them, 1.6.0 also the bounds of each image
+    )
+    # of cameras, Gaussians; 1.5.3 has batches before them, 1.6.0 also the bounds of each image
+    ids = found[:3][-1]
     harmonics = torch.cat([_Rows.apply(rows[ids], x) for x in (sh0, shN)], 1)
     degree, centres = math.isqrt(harmonics.shape[1]) - 1, _Rows.apply(ids, means)
-    if "viewmats" in inspect.signature(gsplat.spherical_harmonics).parameters:  # 1.6.0 finds the directions itself
+    # 1.6.0 finds the directions itself
+    if "viewmats" in inspect.signature(gsplat.spherical_harmonics).parameters:
         colors = 0.5 + gsplat.spherical_harmonics(degree, centres, viewmat, harmonics)[0]
     else:
         colors = 0.5 + gsplat.spherical_harmonics(degree, centres - eye, harmonics)
@@ -103,32 +149,62 @@ def _project(
     sound = (means2d.sum(1) + conics.sum(1) + colors.sum(1) + shown).detach().isfinite()
     rows_of = sound[:, None]
     return {
-        "means2d": means2d.where(rows_of, 0), "conics": conics.where(rows_of, 0), "radii": radii, "depths": depths,
-        "colors": colors.where(rows_of, 0).clamp(min=0), "opacities": shown.where(sound, 0),
-    }  # fmt: skip
+        "means2d": means2d.where(rows_of, 0),
+        "conics": conics.where(rows_of, 0),
+        "radii": radii,
+        "depths": depths,
+        "colors": colors.where(rows_of, 0).clamp(min=0),
+        "opacities": shown.where(sound, 0),
+    }
 
 
 def _blend(drawn: dict[str, Tensor], camera: Camera) -> tuple[Tensor, Tensor]:
-    """Image ``[H, W, 3]`` without a background and alpha ``[H, W]``: tile lists sorted by depth, then pixels."""
+    """Image ``[H, W, 3]`` without a background and alpha ``[H, W]``: tile lists sorted by depth,
+    then pixels.
+    """
     import gsplat
 
     across, down = -(-camera.width // TILE), -(-camera.height // TILE)
     depths, means2d = drawn["depths"], drawn["means2d"]
     ids = torch.zeros(len(depths), dtype=torch.int64, device=depths.device)  # all of one image
     _, keys, order = _call(
-        gsplat.isect_tiles, means2d, drawn["radii"], depths, TILE, across, down, segmented=False, packed=True,
-        n_images=1, image_ids=ids, n_cameras=1, camera_ids=ids, gaussian_ids=ids,
-    )  # fmt: skip
+        gsplat.isect_tiles,
+        means2d,
+        drawn["radii"],
+        depths,
+        TILE,
+        across,
+        down,
+        segmented=False,
+        packed=True,
+        n_images=1,
+        image_ids=ids,
+        n_cameras=1,
+        camera_ids=ids,
+        gaussian_ids=ids,
+    )
     offsets = gsplat.isect_offset_encode(keys, 1, across, down)
     image, alpha = gsplat.rasterize_to_pixels(
-        means2d, drawn["conics"], drawn["colors"], drawn["opacities"], camera.width, camera.height, TILE, offsets,
-        order, backgrounds=None, packed=True, absgrad=False,
-    )  # fmt: skip
+        means2d,
+        drawn["conics"],
+        drawn["colors"],
+        drawn["opacities"],
+        camera.width,
+        camera.height,
+        TILE,
+        offsets,
+        order,
+        backgrounds=None,
+        packed=True,
+        absgrad=False,
+    )
     return image[0], alpha[0, ..., 0]
 
 
 def _call(function: Callable[..., Any], *args: Any, **options: Any) -> Any:
-    """The result of gsplat's function, without the options that the installed version does not have."""
+    """The result of gsplat's function, without the options that the installed version does not
+    have.
+    """
     known = inspect.signature(function).parameters
     return function(*args, **{name: value for name, value in options.items() if name in known})
 
@@ -136,7 +212,8 @@ def _call(function: Callable[..., Any], *args: Any, **options: Any) -> Any:
 class _Rows(Function):
     """Selected rows of a tensor, each at most once.
 
-    The backward pass replaces values that are not finite by 0: they are 0 times the projection of rows not drawn.
+    The backward pass replaces values that are not finite by 0: they are 0 times the projection of
+    rows not drawn.
     """
 
     @staticmethod

@@ -1,4 +1,6 @@
-"""The interface of every rasterizer, by which a dial value becomes a picture, and their common checks."""
+"""The interface of every rasterizer, by which a dial value becomes a picture, and their common
+checks.
+"""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -14,51 +16,87 @@ from clod_adapter.equation.attenuation import dial
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 
-__all__ = ["ALPHA_MAX", "ALPHA_MIN", "T_MIN", "Rasterizer", "Splat", "drawable", "require_float32", "wait_for"]
+__all__ = [
+    "ALPHA_MAX",
+    "ALPHA_MIN",
+    "T_MIN",
+    "Rasterizer",
+    "Splat",
+    "drawable",
+    "require_float32",
+    "wait_for",
+]
 
 
 class Splat(Protocol):
-    """Splats activated Gaussians into one camera, on ``background [3]``, differentiably in every tensor argument.
+    """Splats activated Gaussians into one camera, on ``background [3]``, differentiably in every
+    tensor argument.
 
-    ``means [N, 3]`` and the standard deviations ``scales [N, 3]`` are in world units, ``quats [N, 4]`` wxyz of any
-    length from QUAT_MIN to QUAT_MAX, ``sh0 [N, 1, 3]``, ``shN [N, K-1, 3]``. Rows whose ``opacities [N]``, compensated
-    by the ``screen_filter``, are below 1/255 are skipped. Returns the image ``[H, W, 3]``, not clamped, and the
-    accumulated alpha ``[H, W]``.
+    ``means [N, 3]`` and the standard deviations ``scales [N, 3]`` are in world units,
+    ``quats [N, 4]`` wxyz of any length from QUAT_MIN to QUAT_MAX, ``sh0 [N, 1, 3]``,
+    ``shN [N, K-1, 3]``. Rows whose ``opacities [N]``, compensated by the ``screen_filter``, are
+    below 1/255 are skipped. Returns the image ``[H, W, 3]``, not clamped, and the accumulated alpha
+    ``[H, W]``.
     """
 
     def __call__(
-        self, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh0: Tensor, shN: Tensor,
-        camera: Camera, background: Tensor, screen_filter: ScreenFilter = CLASSIC,
-    ) -> tuple[Tensor, Tensor]: ...  # fmt: skip
+        self,
+        means: Tensor,
+        quats: Tensor,
+        scales: Tensor,
+        opacities: Tensor,
+        sh0: Tensor,
+        shN: Tensor,
+        camera: Camera,
+        background: Tensor,
+        screen_filter: ScreenFilter = CLASSIC,
+    ) -> tuple[Tensor, Tensor]: ...
 
 
 @dataclass(frozen=True)
 class Rasterizer:
-    """What makes a picture of Gaussians at a dial value. Whatever renders, trains or measures pictures calls ``draw``.
+    """What makes a picture of Gaussians at a dial value. Whatever renders, trains or measures
+    pictures calls ``draw``.
 
-    The dial is composed with ``splat``. A subclass may have kernels with the dial in them, which give the same to
-    rounding.
+    The dial is composed with ``splat``. A subclass may have kernels with the dial in them, which
+    give the same to rounding.
     """
 
     splat: Splat
 
     def draw(
-        self, gaussians: Gaussians, camera: Camera, virtual_scale: float = 1.0, *,
-        background: Tensor | np.ndarray | None = None, seen_from: Camera | None = None, trained: int | None = None,
-    ) -> tuple[Tensor, Tensor]:  # fmt: skip
-        """Image ``[H, W, 3]`` and alpha ``[H, W]`` at one dial value, on black by default; differentiable throughout.
+        self,
+        gaussians: Gaussians,
+        camera: Camera,
+        virtual_scale: float = 1.0,
+        *,
+        background: Tensor | np.ndarray | None = None,
+        seen_from: Camera | None = None,
+        trained: int | None = None,
+    ) -> tuple[Tensor, Tensor]:
+        """Image ``[H, W, 3]`` and alpha ``[H, W]`` at one dial value, on black by default;
+        differentiable throughout.
 
-        ``seen_from`` is the camera of the dial's distances, where it is another. The first ``trained`` rows alone need
-        gradients.
+        ``seen_from`` is the camera of the dial's distances, where it is another. The first
+        ``trained`` rows alone need gradients.
         """
         dialled, g = dial(gaussians, seen_from or camera, virtual_scale), gaussians
         return self.splat(
-            g.means, g.quats, g.scales * dialled.growth[:, None], dialled.drawn, g.sh0, g.shN, camera,
-            behind(gaussians, background), g.screen_filter,
-        )  # fmt: skip
+            g.means,
+            g.quats,
+            g.scales * dialled.growth[:, None],
+            dialled.drawn,
+            g.sh0,
+            g.shN,
+            camera,
+            behind(gaussians, background),
+            g.screen_filter,
+        )
 
     def kept(self, gaussians: Gaussians, camera: Camera, virtual_scale: float) -> Tensor:
-        """``[N]`` bool, the Gaussians that ``draw`` does not cull at this dial value, in the image or not."""
+        """``[N]`` bool, the Gaussians that ``draw`` does not cull at this dial value, in the image
+        or not.
+        """
         return dial(gaussians, camera, virtual_scale).keep
 
 
@@ -82,7 +120,10 @@ def require_float32(backend: str, **tensors: Tensor) -> None:
     """Raises ClodError, with the tensor's name, unless all tensors are float32."""
     for name, tensor in tensors.items():
         if tensor.dtype != torch.float32:
-            raise ClodError(f"the {backend} rasterizer takes float32 only, and {name} is {tensor.dtype}: use .float()")
+            raise ClodError(
+                f"the {backend} rasterizer takes float32 only, and {name} is {tensor.dtype}: use"
+                " .float()"
+            )
 
 
 def wait_for(device: torch.device) -> None:

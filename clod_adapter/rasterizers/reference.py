@@ -1,8 +1,9 @@
-"""The reference for tests: plain torch splatting, every Gaussian at every pixel, gradients by autograd.
+"""The reference for tests: plain torch splatting, every Gaussian at every pixel, gradients by
+autograd.
 
-Any device, any float type, slow. Same conventions as the fast backends: pixel centres at +0.5,
-the screen-space filter, the camera's near plane, alpha clamped to 0.999 and dropped below 1/255, a pixel ends
-with the Gaussian at which its transmittance falls to 1e-4.
+Any device, any float type, slow. Same conventions as the fast backends: pixel centres at +0.5, the
+screen-space filter, the camera's near plane, alpha clamped to 0.999 and dropped below 1/255, a
+pixel ends with the Gaussian at which its transmittance falls to 1e-4.
 """
 
 import torch
@@ -15,9 +16,16 @@ from clod_adapter.rasterizers.protocol import ALPHA_MAX, ALPHA_MIN, T_MIN, drawa
 
 
 def rasterize(
-    means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh0: Tensor, shN: Tensor, camera: Camera,
-    background: Tensor, screen_filter: ScreenFilter = CLASSIC,
-) -> tuple[Tensor, Tensor]:  # fmt: skip
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    sh0: Tensor,
+    shN: Tensor,
+    camera: Camera,
+    background: Tensor,
+    screen_filter: ScreenFilter = CLASSIC,
+) -> tuple[Tensor, Tensor]:
     """See ``clod_adapter.rasterizers.Splat``."""
     viewmat, K = camera.viewmat.to(means), camera.K.to(means)
     points = means @ viewmat[:3, :3].T + viewmat[:3, 3]
@@ -33,13 +41,17 @@ def rasterize(
     alphas = (opacities * power.exp()).clamp(max=ALPHA_MAX)
     weights, transmittance = blend(torch.where(alphas >= ALPHA_MIN, alphas, 0))
     image = weights @ colors + transmittance[:, None] * background
-    return image.reshape(camera.height, camera.width, 3), (1 - transmittance).reshape(camera.height, camera.width)
+    return image.reshape(camera.height, camera.width, 3), (1 - transmittance).reshape(
+        camera.height, camera.width
+    )
 
 
 def project(
     points: Tensor, quats: Tensor, scales: Tensor, viewmat: Tensor, K: Tensor, camera: Camera
 ) -> tuple[Tensor, Tensor]:
-    """Image centres ``[n, 2]`` and P ``[n, 2, 3]`` of covariances P P^T by the local affine approximation (EWA)."""
+    """Image centres ``[n, 2]`` and P ``[n, 2, 3]`` of covariances P P^T by the local affine
+    approximation (EWA).
+    """
     depth = points[:, 2]
     focal = torch.stack([K[0, 0], K[1, 1]])
     size = torch.tensor([camera.width, camera.height]).to(points)
@@ -59,18 +71,26 @@ def rotations(quats: Tensor) -> Tensor:
     w, x, y, z = (quats / quats.norm(dim=1, keepdim=True)).unbind(1)
     return torch.stack(
         [
-            1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-            2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-            2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-        ], 1,
-    ).reshape(-1, 3, 3)  # fmt: skip
+            1 - 2 * (y * y + z * z),
+            2 * (x * y - w * z),
+            2 * (x * z + w * y),
+            2 * (x * y + w * z),
+            1 - 2 * (x * x + z * z),
+            2 * (y * z - w * x),
+            2 * (x * z - w * y),
+            2 * (y * z + w * x),
+            1 - 2 * (x * x + y * y),
+        ],
+        1,
+    ).reshape(-1, 3, 3)
 
 
 def blurred(half: Tensor, opacities: Tensor, screen_filter: ScreenFilter) -> tuple[Tensor, Tensor]:
-    """Covariances ``[n, 2, 2]`` with the filter's variance, and the opacities ``[n]`` that go with them.
+    """Covariances ``[n, 2, 2]`` with the filter's variance, and the opacities ``[n]`` that go with
+    them.
 
-    A compensated opacity below ALPHA_MIN is 0. ``det P P^T`` is taken as the squared length of the cross product of
-    the rows of P ``[n, 2, 3]``, exact where P P^T would cancel.
+    A compensated opacity below ALPHA_MIN is 0. ``det P P^T`` is taken as the squared length of the
+    cross product of the rows of P ``[n, 2, 3]``, exact where P P^T would cancel.
     """
     covariance = half @ half.transpose(1, 2) + screen_filter.variance * torch.eye(2).to(half)
     if not screen_filter.compensate:
@@ -99,23 +119,38 @@ def shade(means: Tensor, sh0: Tensor, shN: Tensor, eye: Tensor) -> Tensor:
 
 
 def sh_basis(directions: Tensor) -> Tensor:
-    """The 25 real spherical harmonics up to degree 4 of unit ``directions [n, 3]``, order and signs of 3DGS."""
+    """The 25 real spherical harmonics up to degree 4 of unit ``directions [n, 3]``, order and signs
+    of 3DGS.
+    """
     x, y, z = directions.unbind(1)
     xx, yy, zz, xy, yz, xz = x * x, y * y, z * z, x * y, y * z, x * z
     return torch.stack(
         [
             torch.full_like(x, SH_C0),
-            -0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x,
-            1.0925484305920792 * xy, -1.0925484305920792 * yz, 0.31539156525252005 * (2 * zz - xx - yy),
-            -1.0925484305920792 * xz, 0.5462742152960396 * (xx - yy),
-            -0.5900435899266435 * y * (3 * xx - yy), 2.890611442640554 * xy * z,
-            -0.4570457994644658 * y * (4 * zz - xx - yy), 0.3731763325901154 * z * (2 * zz - 3 * xx - 3 * yy),
-            -0.4570457994644658 * x * (4 * zz - xx - yy), 1.445305721320277 * z * (xx - yy),
+            -0.4886025119029199 * y,
+            0.4886025119029199 * z,
+            -0.4886025119029199 * x,
+            1.0925484305920792 * xy,
+            -1.0925484305920792 * yz,
+            0.31539156525252005 * (2 * zz - xx - yy),
+            -1.0925484305920792 * xz,
+            0.5462742152960396 * (xx - yy),
+            -0.5900435899266435 * y * (3 * xx - yy),
+            2.890611442640554 * xy * z,
+            -0.4570457994644658 * y * (4 * zz - xx - yy),
+            0.3731763325901154 * z * (2 * zz - 3 * xx - 3 * yy),
+            -0.4570457994644658 * x * (4 * zz - xx - yy),
+            1.445305721320277 * z * (xx - yy),
             -0.5900435899266435 * x * (xx - 3 * yy),
-            2.5033429417967046 * xy * (xx - yy), -1.7701307697799304 * yz * (3 * xx - yy),
-            0.9461746957575601 * xy * (7 * zz - 1), -0.6690465435572892 * yz * (7 * zz - 3),
-            0.10578554691520431 * (zz * (35 * zz - 30) + 3), -0.6690465435572892 * xz * (7 * zz - 3),
-            0.47308734787878004 * (xx - yy) * (7 * zz - 1), -1.7701307697799304 * xz * (xx - 3 * yy),
+            2.5033429417967046 * xy * (xx - yy),
+            -1.7701307697799304 * yz * (3 * xx - yy),
+            0.9461746957575601 * xy * (7 * zz - 1),
+            -0.6690465435572892 * yz * (7 * zz - 3),
+            0.10578554691520431 * (zz * (35 * zz - 30) + 3),
+            -0.6690465435572892 * xz * (7 * zz - 3),
+            0.47308734787878004 * (xx - yy) * (7 * zz - 1),
+            -1.7701307697799304 * xz * (xx - 3 * yy),
             0.6258357354491761 * (xx * (xx - 3 * yy) - yy * (3 * xx - yy)),
-        ], 1,
-    )  # fmt: skip
+        ],
+        1,
+    )

@@ -1,7 +1,8 @@
-"""The common style of figures, and charts of error against rendering time and adapting time, as PNG or SVG.
+"""The common style of figures, and charts of error against rendering time and adapting time, as PNG
+or SVG.
 
-Their series are rows that ``clod-adapt --json`` and ``clod-adapt eval --json`` print. matplotlib is an optional
-dependency, imported when a figure is drawn.
+Their series are rows that ``clod-adapt --json`` and ``clod-adapt eval --json`` print. matplotlib is
+an optional dependency, imported when a figure is drawn.
 """
 
 import importlib.util
@@ -60,13 +61,17 @@ class Series:
 def series_of(report: Mapping[str, Any]) -> list[Series]:
     """The series of a report: the model at its dial values first, then the measured comparisons.
 
-    Keys: ``rows``; ``base_row`` or ``base_rows``, the unadapted base; ``detached_row``, the file without its dial;
-    ``ranked``, ``[{by, row}]``, the base pruned by rank; ``against``, ``[{label, theirs}]``, other files. Rows
-    without a PSNR (null in JSON if infinite) are skipped.
+    Keys: ``rows``; ``base_row`` or ``base_rows``, the unadapted base; ``detached_row``, the file
+    without its dial; ``ranked``, ``[{by, row}]``, the base pruned by rank; ``against``,
+    ``[{label, theirs}]``, other files. Rows without a PSNR (null in JSON if infinite) are skipped.
     """
     base: list[Any] = report.get("base_rows") or [report.get("base_row")]
     plain_model = report.get("attenuation", {}) is None  # evaluation of a file without a dial
-    model = Series("the file, no dial" if plain_model else "dial, one file", report.get("rows", []), not plain_model)
+    model = Series(
+        "the file, no dial" if plain_model else "dial, one file",
+        report.get("rows", []),
+        not plain_model,
+    )
     others = dict[tuple[str, bool], Any]()  # by label, and whether several rows are of one file
     for entry in report.get("ranked") or []:
         others.setdefault((f"base pruned by {entry['by']}", False), []).append(entry["row"])
@@ -89,20 +94,29 @@ def chart(draw: Draw, size: tuple[float, float]) -> Iterator[Any]:
     """A figure with the chart in fixed margins, whose layout takes no time."""
     (left, bottom, right, top), (width, height) = MARGINS, size
     with new_figure(size) as figure:
-        place = (left / width, bottom / height, 1 - (left + right) / width, 1 - (bottom + top) / height)
+        place = (
+            left / width,
+            bottom / height,
+            1 - (left + right) / width,
+            1 - (bottom + top) / height,
+        )
         draw(figure.add_axes(place))
         yield figure
 
 
 def inline_svg(draw: Draw, name: str, label: str) -> list[str]:
-    """The chart as SVG elements for desktops and phones, in the colours of ``style.css``, with ids by its name."""
+    """The chart as SVG elements for desktops and phones, in the colours of ``style.css``, with ids
+    by its name.
+    """
     names = {INK: "ink", QUIET: "quiet", GRID: "line", PAPER: "paper"}
     names |= {colour: f"series-{k + 1}" for k, colour in enumerate(SERIES[:-1])}
     found = []
     for kind, size in (("wide", SIZE), ("narrow", NARROW)):
         with chart(draw, size) as figure:
             text = io.StringIO()
-            figure.savefig(text, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
+            figure.savefig(
+                text, format="svg", transparent=True, metadata={"Date": None, "Creator": None}
+            )
         svg = text.getvalue()[text.getvalue().index("<svg") :]
         for colour, variable in names.items():
             svg = svg.replace(colour, f"var(--{variable})")
@@ -115,13 +129,18 @@ def inline_svg(draw: Draw, name: str, label: str) -> list[str]:
 
 
 def draw_rendering(axes: Any, series: Sequence[Series]) -> None:
-    """Draws error against milliseconds per frame: lines for files with a dial, points for others."""
+    """Draws error against milliseconds per frame: lines for files with a dial, points for
+    others.
+    """
     notes = list[tuple[str, tuple[float, float]]]()
     for k, one in enumerate(series):
         points = [(row["frame_ms"], row["psnr"]) for row in one.rows]
         _line(axes, k, one.label, points, linestyle="-" if one.dial else "none")
         if one.dial:
-            notes += [(f"s = {row['virtual_scale']:g}", at) for row, at in zip(one.rows, points, strict=True)]
+            notes += [
+                (f"s = {row['virtual_scale']:g}", at)
+                for row, at in zip(one.rows, points, strict=True)
+            ]
     _finish(axes, "milliseconds per frame (log scale)")
     # Labels of points, without those that would cover another; the first and the last come first.
     unit, placed = axes.figure.dpi / 72, list[Any]()
@@ -129,20 +148,35 @@ def draw_rendering(axes: Any, series: Sequence[Series]) -> None:
         x, y = axes.transData.transform(at) / unit
         if all(abs(x - other[0]) > ROOM[0] or abs(y - other[1]) > ROOM[1] for other in placed):
             placed.append((x, y))
-            axes.annotate(text, at, (-5, -11), textcoords="offset points", ha="right", fontsize=8, color=QUIET)
+            axes.annotate(
+                text, at, (-5, -11), textcoords="offset points", ha="right", fontsize=8, color=QUIET
+            )
 
 
 def draw_training(axes: Any, curves: Sequence[Mapping[str, Any]], base_psnr: float | None) -> None:
-    """Draws held-out error against seconds of adapting, and that of the unadapted base as a horizontal line."""
+    """Draws held-out error against seconds of adapting, and that of the unadapted base as a
+    horizontal line.
+    """
     for k, curve in enumerate(curves):
-        _line(axes, k, curve["label"], [(point["seconds"], point["psnr"]) for point in curve["points"]])
+        _line(
+            axes,
+            k,
+            curve["label"],
+            [(point["seconds"], point["psnr"]) for point in curve["points"]],
+        )
     if base_psnr is not None:
         axes.axhline(base_psnr, color=INK, linestyle="--", linewidth=1.1, label=BASE)
     _finish(axes, "seconds of adapting (log scale)")
 
 
-def _line(axes: Any, k: int, label: str, points: Sequence[tuple[float, float]], linestyle: str = "-") -> None:
-    style = {"color": SERIES[k % len(SERIES)], "marker": MARKERS[k % len(MARKERS)], "linestyle": linestyle}
+def _line(
+    axes: Any, k: int, label: str, points: Sequence[tuple[float, float]], linestyle: str = "-"
+) -> None:
+    style = {
+        "color": SERIES[k % len(SERIES)],
+        "marker": MARKERS[k % len(MARKERS)],
+        "linestyle": linestyle,
+    }
     axes.plot(*zip(*points, strict=True), linewidth=1.8, markersize=5.5, label=label, **style)
 
 
@@ -152,7 +186,9 @@ def error(psnr: float) -> float:
 
 
 def _finish(axes: Any, label: str) -> None:
-    """Axes of an error chart: PSNR downwards, which is the logarithm of the error; labels of both at the same ticks."""
+    """Axes of an error chart: PSNR downwards, which is the logarithm of the error; labels of both
+    at the same ticks.
+    """
     axes.set_xscale("log")
     axes.set_xlabel(label)
     axes.margins(x=0.2, y=0.12)
@@ -163,7 +199,9 @@ def _finish(axes: Any, label: str) -> None:
     left, far = axes.get_xlim()
     label_log(axes.xaxis, "{:,g}", (1, 2, 5) if far / left > 20 else (1, 1.5, 2, 3, 4, 5, 7))
     axes.legend(loc="best")
-    axes.annotate("better", (0.012, 0.018), xycoords="axes fraction", fontsize=8, color=QUIET, style="italic")
+    axes.annotate(
+        "better", (0.012, 0.018), xycoords="axes fraction", fontsize=8, color=QUIET, style="italic"
+    )
 
 
 def check_matplotlib() -> None:
@@ -174,7 +212,9 @@ def check_matplotlib() -> None:
 
 @contextmanager
 def new_figure(inches: tuple[float, float], **options: Any) -> Iterator[Any]:
-    """A matplotlib figure in the common style; without pyplot, so a notebook's figures are not affected."""
+    """A matplotlib figure in the common style; without pyplot, so a notebook's figures are not
+    affected.
+    """
     check_matplotlib()
     import matplotlib
     from matplotlib.figure import Figure
@@ -185,7 +225,11 @@ def new_figure(inches: tuple[float, float], **options: Any) -> Iterator[Any]:
 
 def save_figure(figure: Any, path: str | Path) -> None:
     # Text in a PNG by which a later run recognizes its own output.
-    about = {"Software": f"clod-adapter {package_version()}"} if Path(path).suffix.lower() == ".png" else None
+    about = (
+        {"Software": f"clod-adapter {package_version()}"}
+        if Path(path).suffix.lower() == ".png"
+        else None
+    )
     with atomic_path(path) as part:
         figure.savefig(part, facecolor=PAPER, metadata=about)
 

@@ -1,6 +1,7 @@
 """The HTML report of one model: quality and cost by dial value, and error against adapting time.
 
-``page.html`` is its template. Style, script, charts and images are in the file; nothing is loaded from a network.
+``page.html`` is its template. Style, script, charts and images are in the file; nothing is loaded
+from a network.
 """
 
 import base64
@@ -36,9 +37,13 @@ class Picture:
     def url(self) -> str:
         """The image as WebP in a data: URL, at most WIDEST pixels wide."""
         image, file = self.image, io.BytesIO()
-        picture = Image.fromarray(image if image.dtype == np.uint8 else (image.clip(0, 1) * 255).round().astype("u1"))
+        picture = Image.fromarray(
+            image if image.dtype == np.uint8 else (image.clip(0, 1) * 255).round().astype("u1")
+        )
         if picture.width > WIDEST:
-            picture = picture.resize((WIDEST, round(picture.height * WIDEST / picture.width)), Image.Resampling.LANCZOS)
+            picture = picture.resize(
+                (WIDEST, round(picture.height * WIDEST / picture.width)), Image.Resampling.LANCZOS
+            )
         picture.save(file, "WEBP", quality=QUALITY)
         return "data:image/webp;base64," + base64.b64encode(file.getvalue()).decode("ascii")
 
@@ -49,42 +54,75 @@ def own_teacher(report: Mapping[str, Any]) -> bool:
 
 
 def write_page(
-    path: str | Path, report: Mapping[str, Any], frames: Sequence[Picture], others: Mapping[str, Picture],
+    path: str | Path,
+    report: Mapping[str, Any],
+    frames: Sequence[Picture],
+    others: Mapping[str, Picture],
     training: Mapping[str, Any] | None = None,
-) -> dict[str, Path]:  # fmt: skip
+) -> dict[str, Path]:
     """Writes the page and its charts as PNGs in the same folder, atomically; returns the paths.
 
-    ``report`` is the output of ``clod-adapt`` or ``clod-adapt eval`` with --json; ``frames`` are one held-out view at
-    ascending dial values, ``others`` the photograph and the base by name; ``training`` has ``curves`` and ``base_psnr``
-    of ``charts.draw_training``, and the number of ``views``.
+    ``report`` is the output of ``clod-adapt`` or ``clod-adapt eval`` with --json; ``frames`` are
+    one held-out view at ascending dial values, ``others`` the photograph and the base by name;
+    ``training`` has ``curves`` and ``base_psnr`` of ``charts.draw_training``, and the number of
+    ``views``.
     """
     import jinja2
 
     path, own, series = Path(path), own_teacher(report), charts.series_of(report)
     # Against its own renders, the base has only rounding errors, far below the range of the charts.
     drawn = [one for one in series if not (own and one.label == charts.BASE)]
-    draws: dict[str, charts.Draw] = {"rendering": partial(charts.draw_rendering, series=drawn)} if drawn else {}
+    draws: dict[str, charts.Draw] = (
+        {"rendering": partial(charts.draw_rendering, series=drawn)} if drawn else {}
+    )
     if training:
         base_psnr = None if own else training["base_psnr"]
-        draws["adapting"] = partial(charts.draw_training, curves=training["curves"], base_psnr=base_psnr)
-    dial = sorted(drawn[0].rows, key=lambda row: row["virtual_scale"]) if drawn and drawn[0].dial else []
+        draws["adapting"] = partial(
+            charts.draw_training, curves=training["curves"], base_psnr=base_psnr
+        )
+    dial = (
+        sorted(drawn[0].rows, key=lambda row: row["virtual_scale"])
+        if drawn and drawn[0].dial
+        else []
+    )
     tiles = [(one.label, one.rows[0]) for one in drawn if one.label == charts.BASE]
     ends_and_middle = dict.fromkeys((0, len(dial) // 2, len(dial) - 1)) if dial else ()
     tiles += [(f"s = {dial[k]['virtual_scale']:g}", dial[k]) for k in ends_and_middle]
-    settings = {"model": report["model"], "scene": "none (synthetic views)" if own else report["scene"]}
+    settings = {
+        "model": report["model"],
+        "scene": "none (synthetic views)" if own else report["scene"],
+    }
     settings |= {"version": report["version"], **report["machine"], "device": report["device"]}
     settings |= {f"{name}, seconds": f"{value:.1f}" for name, value in report["seconds"].items()}
     few = dict.fromkeys(round(k * (len(frames) - 1) / 3) for k in range(4))
     strip = [*others.values(), *(frames[k] for k in few)] if frames else []
     source = files("clod_adapter.report")
-    template, style, script = ((source / n).read_text("utf-8") for n in ("page.html", "style.css", "dial.js"))
-    page = jinja2.Environment(autoescape=True).from_string(template).render(
-        report=report, own=own, name=PurePath(report.get("outputs", {}).get("ply", report["model"])).name,
-        model=PurePath(report["model"]).name, scene="" if own else PurePath(abspath(report["scene"])).name,
-        series=series, drawn=drawn, tiles=tiles, frames=frames, others=others, strip=strip, training=training,
-        settings=settings, charts={name: partial(charts.inline_svg, draw, name) for name, draw in draws.items()},
-        data=script_json({"report": report, "training": training}), style=style, script=script,
-    )  # fmt: skip
+    template, style, script = (
+        (source / n).read_text("utf-8") for n in ("page.html", "style.css", "dial.js")
+    )
+    page = (
+        jinja2.Environment(autoescape=True)
+        .from_string(template)
+        .render(
+            report=report,
+            own=own,
+            name=PurePath(report.get("outputs", {}).get("ply", report["model"])).name,
+            model=PurePath(report["model"]).name,
+            scene="" if own else PurePath(abspath(report["scene"])).name,
+            series=series,
+            drawn=drawn,
+            tiles=tiles,
+            frames=frames,
+            others=others,
+            strip=strip,
+            training=training,
+            settings=settings,
+            charts={name: partial(charts.inline_svg, draw, name) for name, draw in draws.items()},
+            data=script_json({"report": report, "training": training}),
+            style=style,
+            script=script,
+        )
+    )
     outputs = {name: charts.chart_file(path, name) for name in draws}
     with atomic_paths(path, *outputs.values()) as (temporary, *pngs):
         for png, draw in zip(pngs, draws.values(), strict=True):

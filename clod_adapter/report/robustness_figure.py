@@ -1,4 +1,6 @@
-"""The figure of the robustness experiment: quality against count, distributions of opacity and sigma_d."""
+"""The figure of the robustness experiment: quality against count, distributions of opacity and
+sigma_d.
+"""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -16,7 +18,8 @@ Styles = dict[float | None, dict[str, Any]]  # of lines, by the cells' ``max_sv`
 def robustness_figure(path: str | Path, cells: Sequence[Mapping[str, Any]], title: str) -> None:
     """Draws four panels per checkpoint: PSNR and SSIM against Gaussians kept, opacity, sigma_d.
 
-    ``cells`` are those of the experiment's JSON, of which some may be missing; a baseline's ``max_sv`` is None.
+    ``cells`` are those of the experiment's JSON, of which some may be missing; a baseline's
+    ``max_sv`` is None.
     """
     names = list(dict.fromkeys(cell["checkpoint"] for cell in cells))
     ranges = sorted({cell["max_sv"] for cell in cells if cell["max_sv"] is not None})
@@ -37,11 +40,15 @@ def robustness_figure(path: str | Path, cells: Sequence[Mapping[str, Any]], titl
             axes[0].set_title(name, loc="left", fontsize=10, weight="bold")
             for panel, label in zip(axes[:2], PANELS, strict=False):
                 panel.set_ylabel(label)
-        for panel, label in zip(grid[-1], ("Gaussians kept (log scale)",) * 2 + PANELS[2:], strict=True):
+        for panel, label in zip(
+            grid[-1], ("Gaussians kept (log scale)",) * 2 + PANELS[2:], strict=True
+        ):
             panel.set_xlabel(label)
         lines = {line.get_label(): line for axes in grid[:, 0] for line in axes.get_lines()}
         labels = sorted(lines, key=lambda label: label == BEYOND)
-        figure.legend([lines[label] for label in labels], labels, loc="outside lower left", ncols=len(labels))
+        figure.legend(
+            [lines[label] for label in labels], labels, loc="outside lower left", ncols=len(labels)
+        )
         save_figure(figure, path)
 
 
@@ -56,7 +63,9 @@ def _quality(axes: Any, cells: Sequence[Mapping[str, Any]], key: str, styles: St
         elif outside := [row for row in rows if row["virtual_scale"] >= last]:
             _plot(axes, outside, key, style | {"linestyle": ":", "mfc": "white", "label": BEYOND})
         # On top, as the end of the range is in both.
-        _plot(axes, [row for row in rows if last is None or row["virtual_scale"] <= last], key, style)
+        _plot(
+            axes, [row for row in rows if last is None or row["virtual_scale"] <= last], key, style
+        )
     axes.margins(x=0.06, y=0.12)
     label_log(axes.xaxis)
 
@@ -80,7 +89,9 @@ def _distribution(axes: Any, cells: Sequence[Mapping[str, Any]], key: str, style
     # The decades of sigma_d whose bins hold a thousandth of the Gaussians or more.
     axes.set_ylim(bottom=0)
     histograms = [cell["distribution"][key] for cell in cells if key in cell["distribution"]]
-    bins = [each for h in histograms for each in zip(pairwise(h["edges"]), h["shares"], strict=True)]
+    bins = [
+        each for h in histograms for each in zip(pairwise(h["edges"]), h["shares"], strict=True)
+    ]
     if used := [edge for ends, share in bins if share > 1e-3 for edge in ends]:
         low, high = math.floor(min(used)), math.ceil(max(used))
         axes.set_xlim(low, high)

@@ -1,12 +1,13 @@
 """Cameras for a checkpoint without photographs, placed from its Gaussians alone.
 
-Two properties tell where photographs looked. Gaussians are a pixel or two large in their nearest cameras, so the
-smallest give the distance of the cameras (``reach``). And only photographs change the higher SH degrees from 0, so
-their colour is strong in the directions from which a Gaussian was photographed.
+Two properties tell where photographs looked. Gaussians are a pixel or two large in their nearest
+cameras, so the smallest give the distance of the cameras (``reach``). And only photographs change
+the higher SH degrees from 0, so their colour is strong in the directions from which a Gaussian was
+photographed.
 
-Candidate cameras look at random Gaussians from random directions. Each is scored by two small renderings (``_score``),
-and as many again are tried near the best. Of the good ones, cameras far from each other are chosen. No up direction,
-scene type or unit is needed.
+Candidate cameras look at random Gaussians from random directions. Each is scored by two small
+renderings (``_score``), and as many again are tried near the best. Of the good ones, cameras far
+from each other are chosen. No up direction, scene type or unit is needed.
 """
 
 import itertools
@@ -34,9 +35,11 @@ WIDTH, HEIGHT = 496, 368  # of the images; sizes in pixels refer to the width
 FIELD = 55.0  # horizontal, degrees: between a phone's 65 and the 35 of a portrait lens
 TRIES = 3  # candidates for each view, first anywhere, then as many near the best of those
 BEST = 0.2  # share of the first candidates that are good; later ones must score as high
-STEP = 0.2  # standard deviation of the offset from a good camera, of the reach, and of its unit direction
+# standard deviation of the offset from a good camera, of the reach, and of its unit direction
+STEP = 0.2
 LOOK = (80, 60)  # size of the renderings that a candidate is scored by
-SMALL, SMALL_PIXELS = 0.1, 2.0  # a tenth of the Gaussians is at most this many pixels large in the nearest cameras
+# a tenth of the Gaussians is at most this many pixels large in the nearest cameras
+SMALL, SMALL_PIXELS = 0.1, 2.0
 FAR = 4.0  # cameras stand at most this many times as far away as the scene is large
 VISIBLE = 0.05  # Gaussians of lower opacity are ignored
 SAMPLE = 200_000  # Gaussians that are rendered, about
@@ -57,14 +60,16 @@ def place_cameras(
 
     Args:
         gaussians: a checkpoint; a dial it has is ignored.
-        views: number of cameras, at least 1; by default as many as the scene needs: rounds of VIEWS cameras, each
-            towards Gaussians that none has shown yet, until SHOWN of them are shown, by opacity, or there are MOST.
+        views: number of cameras, at least 1; by default as many as the scene needs: rounds of VIEWS
+            cameras, each towards Gaussians that none has shown yet, until SHOWN of them are shown,
+            by opacity, or there are MOST.
         seed: of the candidate cameras.
         field: horizontal field of view, degrees; ideally that of the original cameras.
         progress: called in ``Phase.CAMERAS`` after each candidate.
 
     Returns:
-        ``views`` cameras (fewer if fewer see anything) of 496x368 pixels; every prefix of a round is spread out.
+        ``views`` cameras (fewer if fewer see anything) of 496x368 pixels; every prefix of a round
+        is spread out.
 
     Raises:
         ClodError: no Gaussian is visible and finite, or no camera sees anything.
@@ -73,7 +78,11 @@ def place_cameras(
     require(views is None or views >= 1, "views", views, "at least 1")
     placement = _Placement(detach(gaussians), seed, field, progress)
     found = placement.round(views or VIEWS)
-    while views is None and len(found) + VIEWS <= MOST and placement.shown_share(found[-VIEWS:]) < SHOWN:
+    while (
+        views is None
+        and len(found) + VIEWS <= MOST
+        and placement.shown_share(found[-VIEWS:]) < SHOWN
+    ):
         try:
             found += placement.round(VIEWS)
         except ClodError:  # what is left cannot be shown
@@ -87,18 +96,27 @@ def place_cameras(
 class _Placement:
     """Rounds of cameras for one checkpoint, each for what the cameras before do not show."""
 
-    def __init__(self, plain: Gaussians, seed: int, field: float, progress: Listener | None) -> None:
+    def __init__(
+        self, plain: Gaussians, seed: int, field: float, progress: Listener | None
+    ) -> None:
         usable = _usable(plain)
         self.few, self.growth = _sample(plain, usable, seed)
         self.zoom = 0.5 / math.tan(math.radians(field) / 2)  # the focal length in image widths
-        # The distance, world units, at which the smallest tenth is at most SMALL_PIXELS pixels large.
+        # The distance, world units, at which the smallest tenth is at most SMALL_PIXELS pixels
+        # large.
         sizes, means = plain.scales.amax(1)[usable], plain.means[usable]
         footprint = _quantile(sizes, SMALL) * WIDTH * self.zoom / SMALL_PIXELS
         from_centre = (means - means.median(0).values).norm(dim=1)
         self.reach = min(footprint, FAR * _quantile(from_centre, 0.5)) or footprint
-        self.generator, self.progress, self.judged = torch.Generator().manual_seed(seed), progress, 0
+        self.generator, self.progress, self.judged = (
+            torch.Generator().manual_seed(seed),
+            progress,
+            0,
+        )
         # Each row stands for growth^2 of the checkpoint's.
-        self.weight = self.few.opacities if self.growth is None else self.few.opacities * self.growth**2
+        self.weight = (
+            self.few.opacities if self.growth is None else self.few.opacities * self.growth**2
+        )
         self.hidden = torch.ones_like(self.weight)
 
     def round(self, views: int) -> list[Camera]:
@@ -110,25 +128,33 @@ class _Placement:
             for camera in cameras:
                 scored.append((_score(self.few, self.growth, camera), camera))
                 tell(self.progress, Phase.CAMERAS, start + len(scored), start + 2 * tries)
-            return sorted((each for each in scored if each[0] > -math.inf), key=lambda each: -each[0])
+            return sorted(
+                (each for each in scored if each[0] > -math.inf), key=lambda each: -each[0]
+            )
 
         good = ranked(self._towards(tries))[: max(round(BEST * tries), 1)]
         if not good:
-            raise ClodError("no camera can be placed: the checkpoint is empty from every candidate camera")
+            raise ClodError(
+                "no camera can be placed: the checkpoint is empty from every candidate camera"
+            )
         least, found = good[-1][0], ranked(self._beside([camera for _, camera in good], tries))
         self.judged += len(scored)
         enough = max(views, sum(value >= least for value, _ in found))
         return self._spread([camera for _, camera in found[:enough]], views)
 
     def _towards(self, count: int) -> Iterator[Camera]:
-        """Cameras towards rows, preferably small opaque ones, from uniform directions, at half to twice the reach."""
+        """Cameras towards rows, preferably small opaque ones, from uniform directions, at half to
+        twice the reach.
+        """
         means, random = self.few.means, partial(torch.rand, generator=self.generator)
         # torch.multinomial has a limit of 2^24 weights.
         interest = self.weight * self.hidden / self.few.scales.amax(1).clamp(min=1e-12)
         ends = interest.double().cumsum(0).cpu()  # cameras are placed on the CPU
         drawn = torch.searchsorted(ends, random(count, dtype=torch.float64) * ends[-1])
         targets = means[drawn.clamp(max=len(means) - 1).to(means.device)].cpu()
-        sides = F.normalize(torch.randn(count, 3, generator=self.generator, dtype=torch.float32), dim=1)
+        sides = F.normalize(
+            torch.randn(count, 3, generator=self.generator, dtype=torch.float32), dim=1
+        )
         away = self.reach * 2 ** (2 * random(count, 1, dtype=torch.float32) - 1)
         for eye, target in zip(targets + away * sides, targets, strict=True):
             yield _looking(eye, target, self.zoom)
@@ -141,8 +167,12 @@ class _Placement:
             yield _looking(eye, eye + self.reach * (camera.viewmat[2, :3] + turn), self.zoom)
 
     def _spread(self, cameras: list[Camera], count: int) -> list[Camera]:
-        """``count`` of the cameras by farthest-point sampling of position and direction, from the first one."""
-        places = torch.stack([torch.cat([c.position / self.reach, c.viewmat[2, :3]]) for c in cameras])
+        """``count`` of the cameras by farthest-point sampling of position and direction, from the
+        first one.
+        """
+        places = torch.stack(
+            [torch.cat([c.position / self.reach, c.viewmat[2, :3]]) for c in cameras]
+        )
         taken = [0]
         gap = (places - places[0]).norm(dim=1)
         while len(taken) < min(count, len(cameras)):
@@ -151,7 +181,9 @@ class _Placement:
         return [cameras[k] for k in taken]
 
     def shown_share(self, cameras: Sequence[Camera]) -> float:
-        """The share of the Gaussians, by opacity, that these cameras and those before show: COVERED pixels or more."""
+        """The share of the Gaussians, by opacity, that these cameras and those before show: COVERED
+        pixels or more.
+        """
         for camera in cameras:
             pixels = coverage(self.few, self.few.opacities, camera, self.growth)
             self.hidden *= pixels * (WIDTH / camera.width) ** 2 < COVERED
@@ -159,27 +191,38 @@ class _Placement:
 
 
 def _usable(gaussians: Gaussians) -> Tensor:
-    """``[n]`` int64, the visible and finite Gaussians. An infinite opacity logit is a fully opaque Gaussian."""
+    """``[n]`` int64, the visible and finite Gaussians. An infinite opacity logit is a fully opaque
+    Gaussian.
+    """
     others = {n: v for n, v in gaussians.tensors().items() if n != "opacity_logits"}
     rows = (gaussians.opacities > VISIBLE) & ~spoilt_rows(others)
     if not rows.any():
-        raise ClodError("no camera can be placed: the checkpoint has no Gaussian that is visible and finite")
+        raise ClodError(
+            "no camera can be placed: the checkpoint has no Gaussian that is visible and finite"
+        )
     return rows.nonzero()[:, 0]
 
 
 def _looking(eye: Tensor, target: Tensor, zoom: float) -> Camera:
     """A camera for scoring. The up direction is unknown; COLMAP's y axis usually points down."""
     forward = F.normalize(target - eye, dim=0)
-    down = torch.tensor([0.0, 1.0, 0.0] if abs(float(forward[1])) < 0.99 else [0.0, 0.0, 1.0], dtype=torch.float32)
+    down = torch.tensor(
+        [0.0, 1.0, 0.0] if abs(float(forward[1])) < 0.99 else [0.0, 0.0, 1.0], dtype=torch.float32
+    )
     right = F.normalize(torch.linalg.cross(down, forward), dim=0)
     viewmat = torch.eye(4, dtype=torch.float32)
     viewmat[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward])
     viewmat[:3, 3] = -viewmat[:3, :3] @ eye
-    return Camera(viewmat, _intrinsics(zoom, *LOOK), *LOOK, near=near_plane(float((target - eye).norm())))
+    return Camera(
+        viewmat, _intrinsics(zoom, *LOOK), *LOOK, near=near_plane(float((target - eye).norm()))
+    )
 
 
 def _intrinsics(zoom: float, width: int, height: int) -> Tensor:
-    return torch.tensor([[zoom * width, 0, width / 2], [0, zoom * width, height / 2], [0, 0, 1.0]], dtype=torch.float32)
+    return torch.tensor(
+        [[zoom * width, 0, width / 2], [0, zoom * width, height / 2], [0, 0, 1.0]],
+        dtype=torch.float32,
+    )
 
 
 def _quantile(values: Tensor, share: float) -> float:
@@ -187,27 +230,35 @@ def _quantile(values: Tensor, share: float) -> float:
 
 
 def _sample(gaussians: Gaussians, rows: Tensor, seed: int) -> tuple[Gaussians, Tensor | None]:
-    """About SAMPLE of the Gaussians at ``rows [n]``, and the factors of their scales; all, and None, if n <= SAMPLE.
+    """About SAMPLE of the Gaussians at ``rows [n]``, and the factors of their scales; all, and
+    None, if n <= SAMPLE.
 
-    One of largest scale l is drawn with probability ``p = min(1, c l)``, the sum of which is SAMPLE. Its scales are
-    multiplied by ``p^-1/2``, so that surfaces are covered as before and walls stay opaque.
+    One of largest scale l is drawn with probability ``p = min(1, c l)``, the sum of which is
+    SAMPLE. Its scales are multiplied by ``p^-1/2``, so that surfaces are covered as before and
+    walls stay opaque.
     """
     if len(rows) <= SAMPLE:
         return gaussians.select(rows).without_empty_bands(), None
-    size = gaussians.scales.amax(1)[rows].double().nan_to_num(0.0, 0.0)  # infinite ones are not drawn
+    # infinite ones are not drawn
+    size = gaussians.scales.amax(1)[rows].double().nan_to_num(0.0, 0.0)
     share = size * (SAMPLE / size.sum())
     for _ in range(ROUNDS):
         share = (share * (SAMPLE / share.sum())).clamp_(max=1)
-    random = torch.rand(len(rows), generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    random = torch.rand(
+        len(rows), generator=torch.Generator().manual_seed(seed), dtype=torch.float64
+    )
     drawn = random.to(share.device) < share
-    return gaussians.select(rows[drawn]).without_empty_bands(), share[drawn].rsqrt().to(gaussians.means)
+    return gaussians.select(rows[drawn]).without_empty_bands(), share[drawn].rsqrt().to(
+        gaussians.means
+    )
 
 
 def _score(gaussians: Gaussians, growth: Tensor | None, camera: Camera) -> float:
-    """How likely a photograph was taken from here, ``log h - 0.5 p - 2 e``; -inf if the rendering is empty.
+    """How likely a photograph was taken from here, ``log h - 0.5 p - 2 e``; -inf if the rendering
+    is empty.
 
-    h is the mean magnitude of the higher SH degrees' colour, p the mean log size in pixels without ``growth`` (both
-    weighted by alpha), e the share of pixels that are not covered.
+    h is the mean magnitude of the higher SH degrees' colour, p the mean log size in pixels without
+    ``growth`` (both weighted by alpha), e the share of pixels that are not covered.
     """
     higher = torch.zeros_like(gaussians.sh0)  # the colour is then 0.5 + that of the higher degrees
     bands, alpha = splat(gaussians.replace(sh0=higher), gaussians.opacities, camera, growth=growth)
@@ -216,11 +267,18 @@ def _score(gaussians: Gaussians, growth: Tensor | None, camera: Camera) -> float
         return -math.inf
     row = camera.viewmat[2].to(gaussians.means)
     depths = gaussians.means @ row[:3] + row[3]
-    pixels = gaussians.scales.amax(1) * WIDTH / camera.width * camera.K[0, 0] / depths.clamp(min=1e-6)
-    shade = (pixels.clamp(1e-3, 1e4).log() + 7)[:, None, None].expand(-1, 1, 3)  # positive, as colours are
+    pixels = (
+        gaussians.scales.amax(1) * WIDTH / camera.width * camera.K[0, 0] / depths.clamp(min=1e-6)
+    )
+    # positive, as colours are
+    shade = (pixels.clamp(1e-3, 1e4).log() + 7)[:, None, None].expand(-1, 1, 3)
     plain = gaussians.replace(sh0=(shade - 0.5) / SH_C0, shN=gaussians.shN[:, :0])
     sizes, _ = splat(plain, gaussians.opacities, camera, growth=growth)
     size = float(sizes[..., 0].sum()) / covered - 7
     empty = float((alpha < 0.9).float().mean())
-    strength = float((bands - 0.5 * alpha[..., None]).abs().mean(2).sum()) / covered if gaussians.sh_degree else 1.0
+    strength = (
+        float((bands - 0.5 * alpha[..., None]).abs().mean(2).sum()) / covered
+        if gaussians.sh_degree
+        else 1.0
+    )
     return math.log(strength + 1e-4) - 0.5 * size - 2 * empty

@@ -1,7 +1,9 @@
-"""The method as a component of a training loop of one's own (docs/python.md), for any rasterizer and optimizer.
+"""The method as a component of a training loop of one's own (docs/python.md), for any rasterizer
+and optimizer.
 
-Initialization, dial values and objective are those of ``training.loop.adapt``, which drives a dial too, steps the kept
-rows alone, and averages the last steps. The number of splats is fixed: densify and prune before.
+Initialization, dial values and objective are those of ``training.loop.adapt``, which drives a dial
+too, steps the kept rows alone, and averages the last steps. The number of splats is fixed: densify
+and prune before.
 """
 
 import math
@@ -20,7 +22,12 @@ from clod_adapter.equation.attenuation import dial as dialled_by
 from clod_adapter.equation.distances import typical_distance
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians, require_finite
-from clod_adapter.initialization.importance import MOST_VIEWS, for_training, initialize, usable_views
+from clod_adapter.initialization.importance import (
+    MOST_VIEWS,
+    for_training,
+    initialize,
+    usable_views,
+)
 from clod_adapter.integrations.splats import NAMES, from_gsplat
 from clod_adapter.progress import Listener, shown
 from clod_adapter.training.far import with_far
@@ -38,19 +45,21 @@ Splats = Gaussians | Mapping[str, Tensor]
 class Dial(nn.Module):
     """A dial that a training loop learns; ``attach`` makes it.
 
-    ``parameters()`` and ``state_dict()`` are those of the dial alone. The splats stay the caller's: they are read anew
-    each time, never copied, and no part of the module.
+    ``parameters()`` and ``state_dict()`` are those of the dial alone. The splats stay the caller's:
+    they are read anew each time, never copied, and no part of the module.
 
     Attributes:
         log_sigma: ``[N]`` parameter, the logarithm of sigma_d.
         growth_d: ``[N]`` parameter, or None if the config has no growth.
         attenuation: settings of both; distances are in units of the reference distance.
         config: settings of the training.
-        typical: ``[N]`` normalised distances at which Gaussians are counted; no view's own, whose counts differ from
-            the mean's: gradients that correct such differences cancel out, and only add noise.
+        typical: ``[N]`` normalised distances at which Gaussians are counted; no view's own, whose
+            counts differ from the mean's: gradients that correct such differences cancel out, and
+            only add noise.
     """
 
-    # The parameter that sigma_d is trained through, and others whose culled rows have gradients too.
+    # The parameter that sigma_d is trained through, and others whose culled rows have gradients
+    # too.
     decay: ClassVar[str] = "log_sigma"
     everywhere: ClassVar[frozenset[str]] = frozenset()
     limits: ClassVar[tuple[float, float]] = (math.log(SIGMA_RANGE[0]), math.log(SIGMA_RANGE[1]))
@@ -65,11 +74,15 @@ class Dial(nn.Module):
 
         def __call__(self, camera: Camera, virtual_scale: float) -> Attenuated: ...
 
-    def __init__(self, splats: Splats, start: Gaussians, cameras: Sequence[Camera], config: AdaptConfig) -> None:
+    def __init__(
+        self, splats: Splats, start: Gaussians, cameras: Sequence[Camera], config: AdaptConfig
+    ) -> None:
         super().__init__()
         assert start.sigma_d is not None and start.attenuation is not None
-        self._given = (splats,)  # a ParameterDict that is an attribute would be a part of the module
-        # Far Gaussians come first: they alone are trained, and their target counts are shares of the near ones' number.
+        # a ParameterDict that is an attribute would be a part of the module
+        self._given = (splats,)
+        # Far Gaussians come first: they alone are trained, and their target counts are shares of
+        # the near ones' number.
         self.trained, self.total = len(start), len(start)
         self.attenuation, self.config = start.attenuation, config.for_views(len(cameras))
         if start.near is not None:
@@ -78,15 +91,23 @@ class Dial(nn.Module):
         self._target = partial(target_share, count=self.trained, config=config, total=self.total)
         self.register_parameter(self.decay, nn.Parameter(self.parameter_of(start.sigma_d)))
         growth_d = start.growth_d
-        self.growth_d = None if growth_d is None else nn.Parameter(growth_d.detach().float().clamp(*GROWTH_RANGE))
-        typical = typical_distance(start.means, spread(cameras, MOST_VIEWS), start.attenuation)[: self.trained]
+        self.growth_d = (
+            None
+            if growth_d is None
+            else nn.Parameter(growth_d.detach().float().clamp(*GROWTH_RANGE))
+        )
+        typical = typical_distance(start.means, spread(cameras, MOST_VIEWS), start.attenuation)[
+            : self.trained
+        ]
         self.register_buffer("typical", typical, persistent=False)
         self._own_size = float(own_sizes(start.log_scales).median())
         self.sampler, self._sampled = ViewSampler((), config, self.schedule), 0
 
     @staticmethod
     def sigma_of(parameter: Tensor) -> Tensor:
-        """``[N]`` sigma_d from the parameter ``decay``, differentiable; ``parameter_of`` is the inverse, clamped."""
+        """``[N]`` sigma_d from the parameter ``decay``, differentiable; ``parameter_of`` is the
+        inverse, clamped.
+        """
         return parameter.exp()
 
     @staticmethod
@@ -95,7 +116,10 @@ class Dial(nn.Module):
         return torch.where(sigma > 0, sigma.clamp(*SIGMA_RANGE).log(), -math.inf)
 
     def __repr__(self) -> str:
-        return f"Dial({len(self.typical):,} Gaussians, s from 1 to {self.config.max_sv:g}, {self.typical.device})"
+        return (
+            f"Dial({len(self.typical):,} Gaussians, s from 1 to {self.config.max_sv:g},"
+            f" {self.typical.device})"
+        )
 
     @property
     def sigma_d(self) -> Tensor:
@@ -108,8 +132,8 @@ class Dial(nn.Module):
         ``adapt`` decays all rates exponentially to ``schedule.lr_final`` of them over its steps.
 
         Args:
-            splats: also those of the caller's parameters that require a gradient. Not where the loop has optimizers
-                for them.
+            splats: also those of the caller's parameters that require a gradient. Not where the
+                loop has optimizers for them.
 
         Raises:
             ClodError: ``splats``, and none requires a gradient, as of a file that was read.
@@ -120,37 +144,52 @@ class Dial(nn.Module):
         if splats:
             (given,) = self._given
             own = given.tensors() if isinstance(given, Gaussians) else given
-            tuned = {name: value for name, value in own.items() if getattr(value, "requires_grad", False)}
+            tuned = {
+                name: value for name, value in own.items() if getattr(value, "requires_grad", False)
+            }
             if not tuned:
                 remedy = "attach copies with requires_grad_(), or leave out splats=True"
                 raise ClodError(f"no splat requires a gradient: {remedy}")
-            found |= {name: value for name, value in tuned.items() if name not in found}  # growth_d is the dial's own
-        named = [(name, value, rates.get(ATTRIBUTE_OF.get(name, name))) for name, value in found.items()]
-        return [{"params": [value], "lr": rate, "name": name} for name, value, rate in named if rate is not None]
+            # growth_d is the dial's own
+            found |= {name: value for name, value in tuned.items() if name not in found}
+        named = [
+            (name, value, rates.get(ATTRIBUTE_OF.get(name, name))) for name, value in found.items()
+        ]
+        return [
+            {"params": [value], "lr": rate, "name": name}
+            for name, value, rate in named
+            if rate is not None
+        ]
 
     def sample(self) -> float:
         """The next dial value, by ``schedule`` over ``config.steps`` calls.
 
-        Called once a step, it also keeps the parameters in the range in which the equation has a gradient. Dial values
-        are evenly spread, not random: take the views in random order, or some meet the same dial values each round.
+        Called once a step, it also keeps the parameters in the range in which the equation has a
+        gradient. Dial values are evenly spread, not random: take the views in random order, or some
+        meet the same dial values each round.
         """
         self.clamp()
         self._sampled += 1
-        return self.sampler.dial(self._sampled - 1, min((self._sampled - 1) / max(self.config.steps, 1), 1.0))
+        return self.sampler.dial(
+            self._sampled - 1, min((self._sampled - 1) / max(self.config.steps, 1), 1.0)
+        )
 
     def forward(self, camera: Camera, virtual_scale: float) -> Attenuated:
-        """The opacities ``drawn [N]`` and the factor ``growth [N]`` of the scales, for one camera and dial value.
+        """The opacities ``drawn [N]`` and the factor ``growth [N]`` of the scales, for one camera
+        and dial value.
 
-        Differentiable in the splats' opacities and the dial's parameters. ``growth`` is 1 without growth.
-        ``integrations.gsplat.rasterization`` takes ``sigma_d``, ``growth_d`` and ``attenuation`` instead.
+        Differentiable in the splats' opacities and the dial's parameters. ``growth`` is 1 without
+        growth. ``integrations.gsplat.rasterization`` takes ``sigma_d``, ``growth_d`` and
+        ``attenuation`` instead.
         """
         return dialled_by(self.gaussians(), camera, virtual_scale)
 
     def loss(self, virtual_scale: float, rendering_loss: Tensor) -> Tensor:
-        """0-d, the objective of one rendering at s: ``w_s rendering_loss`` and the target-count term.
+        """0-d, the objective of one rendering at s: ``w_s rendering_loss`` and the target-count
+        term.
 
-        ``w_s`` is ``weight``. Gaussians are counted at s, if it is 1 or more, and at a random dial value up to 1.5
-        times ``max_sv``.
+        ``w_s`` is ``weight``. Gaussians are counted at s, if it is 1 or more, and at a random dial
+        value up to 1.5 times ``max_sv``.
 
         Args:
             rendering_loss: 0-d, of an image rendered at s.
@@ -164,25 +203,34 @@ class Dial(nn.Module):
         """``w_s = max(0, 1 - k s / max_sv)^2``, the weight of the loss at the dial value s."""
         return max(1 - self.weight_slope * virtual_scale / self.config.max_sv, 0.0) ** 2
 
-    def counts(self, virtual_scale: float, counted: float | None, loss: Tensor) -> list[tuple[float, Tensor]]:
-        """The dial values, from 1 on, at which Gaussians are counted, and the losses that weigh the count term there.
+    def counts(
+        self, virtual_scale: float, counted: float | None, loss: Tensor
+    ) -> list[tuple[float, Tensor]]:
+        """The dial values, from 1 on, at which Gaussians are counted, and the losses that weigh the
+        count term there.
 
-        The weight at ``counted`` is 1: with half of w_s, counts at the far end were 1.25 times the target.
+        The weight at ``counted`` is 1: with half of w_s, counts at the far end were 1.25 times the
+        target.
         """
         if counted is None:
             return []
         here = [(virtual_scale, self.weight(virtual_scale) * loss)] if virtual_scale >= 1 else []
         return [*here, (counted, loss)]
 
-    def objective(self, loss: Tensor, shown: Gaussians, camera: Camera, virtual_scale: float) -> Tensor:
-        """0-d, what ``adapt`` differentiates, of the photometric loss of a rendering of ``shown``."""
+    def objective(
+        self, loss: Tensor, shown: Gaussians, camera: Camera, virtual_scale: float
+    ) -> Tensor:
+        """0-d, what ``adapt`` differentiates, of the photometric loss of a rendering of
+        ``shown``.
+        """
         return self.weight(virtual_scale) * loss
 
     def count_loss(self, virtual_scale: float, rendering_loss: Tensor) -> Tensor:
-        """0-d, the target-count term ``L reg_weight (eta / target - 1)^2`` alone; eta is the share kept.
+        """0-d, the target-count term ``L reg_weight (eta / target - 1)^2`` alone; eta is the share
+        kept.
 
-        L is ``rendering_loss``, a constant. The gradient, of ``log_sigma`` only, is ``target_count.count_gradient``.
-        0 below s = 1, where there is no target.
+        L is ``rendering_loss``, a constant. The gradient, of ``log_sigma`` only, is
+        ``target_count.count_gradient``. 0 below s = 1, where there is no target.
         """
         if virtual_scale < 1:
             return self.log_sigma.new_zeros(())
@@ -195,16 +243,21 @@ class Dial(nn.Module):
 
     @torch.no_grad()
     def count_gradient(self, parameter: Tensor, virtual_scale: float, loss: Tensor) -> Tensor:
-        """``[trained]`` the count term's gradient of ``log_sigma`` at one dial value, of the trained rows."""
+        """``[trained]`` the count term's gradient of ``log_sigma`` at one dial value, of the
+        trained rows.
+        """
         sigma, target = self.sigma_of(parameter), self._target(virtual_scale)
         return count_gradient(self.typical, sigma, virtual_scale, loss, self.config, target)
 
     def target_share(self, virtual_scale: float) -> float:
-        """The share of the splats that the target-count curve keeps at s, in (0, 1]; 1 below s = 1."""
+        """The share of the splats that the target-count curve keeps at s, in (0, 1]; 1 below
+        s = 1.
+        """
         return self._target(virtual_scale)
 
     def gaussians(self) -> Gaussians:
-        """The splats with this dial, for ``render`` in the loop and ``save`` after it: gradients reach both.
+        """The splats with this dial, for ``render`` in the loop and ``save`` after it: gradients
+        reach both.
 
         Raises:
             ClodError: their number has changed.
@@ -215,7 +268,9 @@ class Dial(nn.Module):
         if len(current) != count:
             now = f"there are {len(current)} splats now, but the dial is for {count}"
             raise ClodError(f"{now}; attach it after densification and pruning")
-        return current.replace(sigma_d=self.sigma_d, attenuation=self.attenuation, growth_d=self.growth_d)
+        return current.replace(
+            sigma_d=self.sigma_d, attenuation=self.attenuation, growth_d=self.growth_d
+        )
 
     @torch.no_grad()
     def clamp(self) -> None:
@@ -228,14 +283,18 @@ class Dial(nn.Module):
 @torch.inference_mode(False)
 @torch.enable_grad()
 def attach(
-    splats: Splats, scene: Scene | Sequence[View] | Sequence[Camera], config: AdaptConfig | None = None,
-    progress: Listener | Literal[False] | None = None, **settings: Any,
-) -> Dial:  # fmt: skip
-    """A dial for trained splats, initialized as ``adapt`` does: renders up to 64 views, at most once each.
+    splats: Splats,
+    scene: Scene | Sequence[View] | Sequence[Camera],
+    config: AdaptConfig | None = None,
+    progress: Listener | Literal[False] | None = None,
+    **settings: Any,
+) -> Dial:
+    """A dial for trained splats, initialized as ``adapt`` does: renders up to 64 views, at most
+    once each.
 
     Args:
-        splats: ``Gaussians``, or the parameters of gsplat's ``simple_trainer`` or splatfacto (``from_gsplat``), on any
-            device that can render. They are not changed.
+        splats: ``Gaussians``, or the parameters of gsplat's ``simple_trainer`` or splatfacto
+            (``from_gsplat``), on any device that can render. They are not changed.
         scene: the training views, or their cameras, in the frame of the splats.
         progress: as for ``adapt``.
         settings: fields of ``AdaptConfig`` that replace those of ``config``.
@@ -247,7 +306,9 @@ def attach(
     if config.form != "ours":
         raise ClodError(f"attach has no form {config.form}: call adapt, or leave the form out")
     given = scene.train if isinstance(scene, Scene) else scene
-    views = tuple(each if isinstance(each, View) else StoredView(each, _no_photograph) for each in given)
+    views = tuple(
+        each if isinstance(each, View) else StoredView(each, _no_photograph) for each in given
+    )
     base = splats if isinstance(splats, Gaussians) else from_gsplat(splats)
     base = base.replace(**{name: value.detach() for name, value in base.tensors().items()})
     require_trainable(base, Scene(views, ()), config)
@@ -257,14 +318,21 @@ def attach(
     return Dial(splats, start, [view.camera for view in views], config)
 
 
-def require_trainable(base: Gaussians, scene: Scene, config: AdaptConfig, processes: int = 1) -> None:
+def require_trainable(
+    base: Gaussians, scene: Scene, config: AdaptConfig, processes: int = 1
+) -> None:
     """Raises ClodError if there is nothing to train, or on nothing, or a value is not finite."""
     if not scene.train:
-        raise ClodError("the scene has no training views: give at least one photograph that is not held out")
+        raise ClodError(
+            "the scene has no training views: give at least one photograph that is not held out"
+        )
     if len(base) == 0:
         raise ClodError("the checkpoint has no Gaussians, so there is nothing to adapt")
     if config.batch < processes:
-        raise ClodError(f"batch is {config.batch}, it must be at least {processes}, a view for each of the processes")
+        raise ClodError(
+            f"batch is {config.batch}, it must be at least {processes}, a view for each of the"
+            " processes"
+        )
     require_finite(base, "the checkpoint", "leave out such rows")
 
 

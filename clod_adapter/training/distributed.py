@@ -1,6 +1,7 @@
 """Several processes that train one set of Gaussians, on ``torch.distributed``.
 
-All hold the same parameters, sample the same views, and make every step. Only the views of a batch are divided.
+All hold the same parameters, sample the same views, and make every step. Only the views of a batch
+are divided.
 """
 
 from __future__ import annotations
@@ -27,7 +28,8 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-# A process that does not answer for so long counts as lost. The first one may be evaluating or saving meanwhile.
+# A process that does not answer for so long counts as lost. The first one may be evaluating or
+# saving meanwhile.
 PATIENCE = timedelta(minutes=10)
 CHUNK = 1 << 28  # bytes sent at a time
 OLDEST = "2.9"  # torch
@@ -40,8 +42,9 @@ class ProcessLost(ClodError):
 class ProcessGroup:
     """The processes that train together: the default group of ``torch.distributed``.
 
-    All call the methods in the same order. They raise ProcessLost if a process has ended; no exchange is possible then.
-    ``waiting`` and ``exchanging`` are seconds spent waiting for the slowest process, and sending and summing.
+    All call the methods in the same order. They raise ProcessLost if a process has ended; no
+    exchange is possible then. ``waiting`` and ``exchanging`` are seconds spent waiting for the
+    slowest process, and sending and summing.
     """
 
     def __init__(self) -> None:
@@ -54,7 +57,10 @@ class ProcessGroup:
 
     def agree(self, share_done: float, going: bool) -> tuple[float, bool]:
         """The first process's ``share_done``, and whether all processes continue."""
-        said = torch.tensor([share_done if self.rank == 0 else -math.inf, 0.0 if going else 1.0], dtype=torch.float64)
+        said = torch.tensor(
+            [share_done if self.rank == 0 else -math.inf, 0.0 if going else 1.0],
+            dtype=torch.float64,
+        )
         self._meet(said, "MAX")
         return float(said[0]), not said[1]
 
@@ -64,11 +70,13 @@ class ProcessGroup:
         self._meet(loss)
         gradients = {name: gradient.contiguous() for name, gradient in own.gradients.items()}
         kept = own.kept.to(torch.uint8)
-        # All at once and in place. Sending only the rows kept, or one packed message, takes longer: on loopback a
-        # million Gaussians take 80 ms, packed 150 ms, only the rows kept 300 ms.
+        # All at once and in place. Sending only the rows kept, or one packed message, takes longer:
+        # on loopback a million Gaussians take 80 ms, packed 150 ms, only the rows kept 300 ms.
         with self._timed("exchanging"):
             under_way = [dist.all_reduce(kept, dist.ReduceOp.MAX, async_op=True)]
-            under_way += [dist.all_reduce(gradient, async_op=True) for gradient in gradients.values()]
+            under_way += [
+                dist.all_reduce(gradient, async_op=True) for gradient in gradients.values()
+            ]
             for work in under_way:
                 work.wait()
             if kept.is_cuda:
@@ -76,7 +84,9 @@ class ProcessGroup:
         return GradientSum(gradients, kept.bool(), loss[0], int(loss[1]))
 
     def broadcast(self, value: T) -> T:
-        """The first process's value, with its tensors on the CPU; the argument of the others is ignored."""
+        """The first process's value, with its tensors on the CPU; the argument of the others is
+        ignored.
+        """
         file = io.BytesIO()
         self._meet()
         with self._timed("exchanging"):
@@ -91,12 +101,19 @@ class ProcessGroup:
                 dist.broadcast(part, 0)
         if self.rank == 0:
             return value
-        return cast(T, torch.load(io.BytesIO(sent.numpy().data), map_location="cpu", weights_only=False))
+        return cast(
+            T, torch.load(io.BytesIO(sent.numpy().data), map_location="cpu", weights_only=False)
+        )
 
     def _meet(self, said: Tensor | None = None, how: str = "SUM") -> None:
-        """Waits for all processes and reduces a few numbers, on the CPU: gloo reports a lost process at once."""
+        """Waits for all processes and reduces a few numbers, on the CPU: gloo reports a lost
+        process at once.
+        """
         with self._timed("waiting"):
-            dist.all_reduce(torch.zeros(1, dtype=torch.float32) if said is None else said, getattr(dist.ReduceOp, how))
+            dist.all_reduce(
+                torch.zeros(1, dtype=torch.float32) if said is None else said,
+                getattr(dist.ReduceOp, how),
+            )
 
     @contextmanager
     def _timed(self, name: str) -> Iterator[None]:
@@ -107,12 +124,19 @@ class ProcessGroup:
 
 
 def require_distributed() -> None:
-    """Refuses a torch that cannot train in several processes; 2.4 and 2.6 hang in the exchange of three."""
+    """Refuses a torch that cannot train in several processes; 2.4 and 2.6 hang in the exchange of
+    three.
+    """
     if not dist.is_available():
-        raise ClodError("this torch has no torch.distributed, so only one process can train: leave out torchrun")
+        raise ClodError(
+            "this torch has no torch.distributed, so only one process can train: leave out torchrun"
+        )
     if torch.__version__ < OLDEST:
         fix = "leave out torchrun, or pip install --upgrade torch"
-        raise ClodError(f"several processes need torch {OLDEST} or newer, and this is {torch.__version__}: {fix}")
+        raise ClodError(
+            f"several processes need torch {OLDEST} or newer, and this is {torch.__version__}:"
+            f" {fix}"
+        )
 
 
 @contextmanager
@@ -132,7 +156,9 @@ def joined(store: Store, rank: int, size: int) -> Iterator[ProcessGroup]:
 
 @contextmanager
 def _silent_stdout() -> Iterator[None]:
-    """Discards output to the file descriptor of stdout, where gloo prints its connections (torch 2.9.1)."""
+    """Discards output to the file descriptor of stdout, where gloo prints its connections (torch
+    2.9.1).
+    """
     try:
         stdout = os.dup(1)
     except OSError:  # it is closed

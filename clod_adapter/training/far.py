@@ -1,8 +1,10 @@
-"""Far Gaussians: fewer, merged ones, which take over from the checkpoint's own where these are far away.
+"""Far Gaussians: fewer, merged ones, which take over from the checkpoint's own where these are far
+away.
 
-Without photographs the checkpoint is the truth, and what training changes is loss where nothing is left out. So its own
-Gaussians stay as they are, and are drawn up to ``near_distance``; from there on far Gaussians are, which start as
-merged ones (``initialization/merging.py``) and are trained for their own distances alone.
+Without photographs the checkpoint is the truth, and what training changes is loss where nothing is
+left out. So its own Gaussians stay as they are, and are drawn up to ``near_distance``; from there
+on far Gaussians are, which start as merged ones (``initialization/merging.py``) and are trained for
+their own distances alone.
 """
 
 from __future__ import annotations
@@ -35,25 +37,29 @@ from clod_adapter.progress import Listener
 from clod_adapter.rasterizers import ALPHA_MAX
 from clod_adapter.training.pseudo_views import PseudoView
 
-# The number of far Gaussians as a share of the near ones', and the share of the distances in all views that are below
-# near_distance. Trained on photographs, far Gaussians are better than the checkpoint's own from the nearest ones on.
-# Of a checkpoint that is itself the truth none is better, and fewer far ones do for small budgets.
+# The number of far Gaussians as a share of the near ones', and the share of the distances in all
+# views that are below near_distance. Trained on photographs, far Gaussians are better than the
+# checkpoint's own from the nearest ones on. Of a checkpoint that is itself the truth none is
+# better, and fewer far ones do for small budgets.
 SHARE, NEARER = 0.8, 0.05
 PLACED_SHARE, PLACED_NEARER = 0.4, 0.5
 LONGER = 1.2  # times near_distance, the smallest reach
 SAMPLE = 20_000  # Gaussians whose distances tell near_distance
 WITHOUT_FAR = (
-    "the checkpoint's dial has no far Gaussians, as of a training loop or the paper's form; adapt a plain file"
+    "the checkpoint's dial has no far Gaussians, as of a training loop or the paper's form; adapt a"
+    " plain file"
 )
 
 
 def with_far(
     base: Gaussians, views: Sequence[View], config: AdaptConfig, progress: Listener | None = None
 ) -> Gaussians:
-    """The base's Gaussians as near ones, and after them far ones with an initial reach; in world units.
+    """The base's Gaussians as near ones, and after them far ones with an initial reach; in world
+    units.
 
-    A far Gaussian ends where the number of those that matter more is the target count; its importance is measured as
-    ``importance.initialize`` does. Near and far Gaussians that the base already has are continued from.
+    A far Gaussian ends where the number of those that matter more is the target count; its
+    importance is measured as ``importance.initialize`` does. Near and far Gaussians that the base
+    already has are continued from.
 
     Raises:
         ClodError: the base has a dial without far Gaussians.
@@ -76,14 +82,17 @@ def with_far(
     far = merge(base, error.sqrt() * base.opacities, max(round(share * len(base)), 1), progress)
     pruned = pruning_order(far, importance(far, views, config, progress), progress)
     distances = typical_distance(far.means, cameras, attenuation)
-    reach = reach_of(pruned, distances, replace(config, start_share=1.0), len(base)).clamp(min=LONGER * near)
+    reach = reach_of(pruned, distances, replace(config, start_share=1.0), len(base)).clamp(
+        min=LONGER * near
+    )
     attenuation = replace(attenuation, near_distance=near * attenuation.scene_distance)
     far = with_growth(far.replace(sigma_d=reach, attenuation=attenuation), config)
     return in_world_units(with_near(base, far))
 
 
 def supposed_error(gaussians: Gaussians, error: Tensor) -> Tensor:
-    """``[N]`` the error; of one that no view shows that of a shown one of equal ``opacity^2 area``, in the median.
+    """``[N]`` the error; of one that no view shows that of a shown one of equal ``opacity^2 area``,
+    in the median.
 
     Rasterizers clamp alpha, where it has no derivative: Gaussians that opaque count as shown.
     """

@@ -36,40 +36,50 @@ def adapt(
     group: ProcessGroup | None = None,
     **settings: Any,
 ) -> Adapted:
-    """Learns sigma_d for ``base`` on the training views of ``scene``, and tunes the other attributes lightly.
+    """Learns sigma_d for ``base`` on the training views of ``scene``, and tunes the other
+    attributes lightly.
 
-    A step follows the sum of the gradients of ``batch`` views, each rendered at one dial value (``schedule.Schedule``),
-    to minimise ``w_s L_render(s)``, where L_render is ``losses.photometric_loss`` and ``w_s`` is ``Dial.weight``.
-    ``target_count.count_gradient`` moves sigma_d so that the share of Gaussians kept at their typical distances follows
-    the target-count curve. The result is the mean of the parameters over the last fifth of the steps, in world units.
-    Far Gaussians are added and trained, and those of the base stay as they are (``training/far.py``); a base that has
-    far Gaussians is continued from. ``AdaptConfig.paper`` gives CLoD-GS's own training.
+    A step follows the sum of the gradients of ``batch`` views, each rendered at one dial value
+    (``schedule.Schedule``), to minimise ``w_s L_render(s)``, where L_render is
+    ``losses.photometric_loss`` and ``w_s`` is ``Dial.weight``. ``target_count.count_gradient``
+    moves sigma_d so that the share of Gaussians kept at their typical distances follows the
+    target-count curve. The result is the mean of the parameters over the last fifth of the steps,
+    in world units. Far Gaussians are added and trained, and those of the base stay as they are
+    (``training/far.py``); a base that has far Gaussians is continued from. ``AdaptConfig.paper``
+    gives CLoD-GS's own training.
 
-    Training ends early, and returns the result so far with ``Adapted.interrupted``, in these cases. After the
-    last one ``progress`` is called once more, with ``Progress.error``.
+    Training ends early, and returns the result so far with ``Adapted.interrupted``, in these cases.
+    After the last one ``progress`` is called once more, with ``Progress.error``.
 
     - ``progress`` returns False. In a group of processes all of them end after the same step.
-    - Ctrl-C, or another signal whose handler is Python's default one. The step under way is completed first, so the
-      parameters are those of a whole step; a second Ctrl-C raises KeyboardInterrupt at once. Before the first step
-      is complete, a Ctrl-C raises KeyboardInterrupt as everywhere.
+    - Ctrl-C, or another signal whose handler is Python's default one. The step under way is
+    completed first, so the
+      parameters are those of a whole step; a second Ctrl-C raises KeyboardInterrupt at once. Before
+      the first step is complete, a Ctrl-C raises KeyboardInterrupt as everywhere.
     - A process of the group is lost, or the loss of a step is not finite.
 
-    Any other error during a step is raised, after a last call of ``progress``. The result is finite where the base is
-    (an opacity logit of +-inf stays). A row whose gradient is not finite is not moved by that step (``Adapted.held``).
+    Any other error during a step is raised, after a last call of ``progress``. The result is finite
+    where the base is (an opacity logit of +-inf stays). A row whose gradient is not finite is not
+    moved by that step (``Adapted.held``).
 
     Args:
-        progress: called after each step of each phase: ``Phase.IMPORTANCE``, ``PRUNING_ORDER``, ``TRAINING``. By
-            default a progress bar, where stderr is a terminal or a notebook's; False for none.
-        resume: ``Progress.state`` of an earlier call with the same base, views and config. With as many threads and
-            processes the result has the same bits as an uninterrupted run. A time budget includes the earlier call.
-        group: the processes that train together, given the same arguments except ``progress``. Each computes its
-            share of a step's views. All have the same result: that of one process, except for rounding.
-        settings: fields of ``AdaptConfig`` that replace those of ``config``: ``adapt(base, scene, max_sv=7)``.
+        progress: called after each step of each phase: ``Phase.IMPORTANCE``, ``PRUNING_ORDER``,
+            ``TRAINING``. By default a progress bar, where stderr is a terminal or a notebook's;
+            False for none.
+        resume: ``Progress.state`` of an earlier call with the same base, views and config. With as
+            many threads and processes the result has the same bits as an uninterrupted run. A time
+            budget includes the earlier call.
+        group: the processes that train together, given the same arguments except ``progress``. Each
+            computes its share of a step's views. All have the same result: that of one process,
+            except for rounding.
+        settings: fields of ``AdaptConfig`` that replace those of ``config``:
+            ``adapt(base, scene, max_sv=7)``.
 
     Raises:
-        ClodError: no training views, none with a Gaussian in front of it, no Gaussians, an attribute that is not
-            finite, a first step whose loss is not finite, ``resume`` does not fit or is damaged (StateRefused), fewer
-            views a step than processes, or a process was lost before the first step.
+        ClodError: no training views, none with a Gaussian in front of it, no Gaussians, an
+            attribute that is not finite, a first step whose loss is not finite, ``resume`` does not
+            fit or is damaged (StateRefused), fewer views a step than processes, or a process was
+            lost before the first step.
         Stopped: ``progress`` returned False before training.
     """
     config = replace(config or AdaptConfig(), **settings)
@@ -80,7 +90,8 @@ def adapt(
     lean = base if config.lr_shN > 0 else base.without_empty_bands()
     views = usable_views(lean, scene.train)
     with shown(False if progress is None and group and group.rank else progress) as listener:
-        begun = _initialized(lean, views, config, listener, group)  # of a resumed run too: the same again
+        # of a resumed run too: the same again
+        begun = _initialized(lean, views, config, listener, group)
         trainer = Trainer(begun, views, config, group)
         trainer.empty_sh = None if lean is base else base.shN.clone()
         trainer.start_seconds = time.perf_counter() - began
@@ -93,8 +104,12 @@ def adapt(
         return _train(trainer, listener)
 
 
-def time_steps(start: Gaussians, scene: Scene, config: AdaptConfig, steps: int) -> tuple[float, float]:
-    """Seconds of a step of ``adapt``, as the mean of ``steps`` over the schedule, and of all beside the steps."""
+def time_steps(
+    start: Gaussians, scene: Scene, config: AdaptConfig, steps: int
+) -> tuple[float, float]:
+    """Seconds of a step of ``adapt``, as the mean of ``steps`` over the schedule, and of all beside
+    the steps.
+    """
     began = time.perf_counter()
     views = usable_views(start, scene.train)
     trainer = Trainer(_initialized(start, views, config), views, config)
@@ -107,9 +122,12 @@ def time_steps(start: Gaussians, scene: Scene, config: AdaptConfig, steps: int) 
 
 
 def _initialized(
-    lean: Gaussians, views: tuple[View, ...], config: AdaptConfig, progress: Listener | None = None,
+    lean: Gaussians,
+    views: tuple[View, ...],
+    config: AdaptConfig,
+    progress: Listener | None = None,
     group: ProcessGroup | None = None,
-) -> Gaussians:  # fmt: skip
+) -> Gaussians:
     """What training begins with: of a group, which may round differently, the first process's."""
     begun = for_training(form_of(config).begin(lean, views, config, progress))
     found: Any = {name: getattr(begun, name) for name in (*begun.tensors(), "attenuation")}
@@ -119,7 +137,12 @@ def _initialized(
 def _train(trainer: Trainer, progress: Listener | None) -> Adapted:
     """Steps until the steps or the time budget are used up, or something ends training early."""
     group, lost, failed = trainer.group, None, None
-    began, going, first, stop = time.perf_counter() - trainer.seconds, True, trainer.done + 1, GracefulStop()
+    began, going, first, stop = (
+        time.perf_counter() - trainer.seconds,
+        True,
+        trainer.done + 1,
+        GracefulStop(),
+    )
     before = (group.waiting, group.exchanging) if group else (0.0, 0.0)
 
     def tell(error: str | None = None) -> bool:
@@ -159,14 +182,29 @@ def _train(trainer: Trainer, progress: Listener | None) -> Adapted:
         result = trainer.gaussians()
     signalled = stop.requests > 0
     return Adapted(
-        result, trainer.done, trainer.seconds, trainer.start_seconds, not going or signalled, lost, *waited, failed,
-        int(trainer.held.sum()), signalled,
-    )  # fmt: skip
+        result,
+        trainer.done,
+        trainer.seconds,
+        trainer.start_seconds,
+        not going or signalled,
+        lost,
+        *waited,
+        failed,
+        int(trainer.held.sum()),
+        signalled,
+    )
 
 
 def _progress(trainer: Trainer, error: str | None = None) -> Progress:
     used = trainer.seconds / (trainer.config.time_budget or math.inf)
     return Progress(
-        Phase.TRAINING, trainer.done, trainer.config.steps, trainer.seconds, used, trainer.loss, trainer.gaussians,
-        trainer.state, error,
-    )  # fmt: skip
+        Phase.TRAINING,
+        trainer.done,
+        trainer.config.steps,
+        trainer.seconds,
+        used,
+        trainer.loss,
+        trainer.gaussians,
+        trainer.state,
+        error,
+    )

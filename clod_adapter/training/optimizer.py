@@ -25,30 +25,43 @@ class GradientSum:
 
     def __add__(self, other: GradientSum) -> GradientSum:
         gradients = {name: mine + other.gradients[name] for name, mine in self.gradients.items()}
-        return GradientSum(gradients, self.kept | other.kept, self.loss + other.loss, self.views + other.views)
+        return GradientSum(
+            gradients, self.kept | other.kept, self.loss + other.loss, self.views + other.views
+        )
 
 
 class RowAdam:
-    """Adam (Kingma and Ba 2015) over named ``[N, ...]`` parameters, the same subset of their rows in a step.
+    """Adam (Kingma and Ba 2015) over named ``[N, ...]`` parameters, the same subset of their rows
+    in a step.
 
-    A row that is not stepped keeps its value and its moments; the bias correction counts a row's own ``steps``.
-    ``moments`` has the ``first`` and the ``second`` ones by parameter.
+    A row that is not stepped keeps its value and its moments; the bias correction counts a row's
+    own ``steps``. ``moments`` has the ``first`` and the ``second`` ones by parameter.
 
     Args:
-        parameters: at least one; updated in place; float32, contiguous, as the leading rows of a larger tensor are.
+        parameters: at least one; updated in place; float32, contiguous, as the leading rows of a
+            larger tensor are.
         units: ``[N]`` factors of the rates of each row, by parameter; by default 1.
     """
 
     def __init__(
-        self, parameters: dict[str, Tensor], *, beta1: float = 0.9, beta2: float = 0.999, epsilon: float = 1e-15,
+        self,
+        parameters: dict[str, Tensor],
+        *,
+        beta1: float = 0.9,
+        beta2: float = 0.999,
+        epsilon: float = 1e-15,
         units: dict[str, Tensor] | None = None,
-    ):  # fmt: skip
+    ):
         self.parameters = parameters
         one = torch.ones(1, dtype=torch.float32)
-        self._units = {name: (units or {}).get(name, one.to(p.device)) for name, p in parameters.items()}
+        self._units = {
+            name: (units or {}).get(name, one.to(p.device)) for name, p in parameters.items()
+        }
         self.beta1, self.beta2, self.epsilon = beta1, beta2, epsilon
         kinds = ("first", "second")
-        self.moments = {kind: {name: torch.zeros_like(p) for name, p in parameters.items()} for kind in kinds}
+        self.moments = {
+            kind: {name: torch.zeros_like(p) for name, p in parameters.items()} for kind in kinds
+        }
         some = next(iter(parameters.values()))
         self.steps = torch.zeros(len(some), dtype=torch.int32, device=some.device)
         # After so many steps of its own a row's bias corrections are 1 in float32.
@@ -70,16 +83,28 @@ class RowAdam:
         else:
             self._step_plain(gradients, rows, rates)
 
-    def _step_fused(self, gradients: dict[str, Tensor], rows: Tensor, rates: dict[str, float]) -> None:
+    def _step_fused(
+        self, gradients: dict[str, Tensor], rows: Tensor, rates: dict[str, float]
+    ) -> None:
         from clod_adapter._kernels import threads
         from clod_adapter._kernels.adam import adam_rows
 
         jobs = list[tuple[Any, ...]]()
         for name, parameter in self.parameters.items():
-            tensors = (parameter, *(each[name] for each in self.moments.values()), gradients[name].contiguous())
+            tensors = (
+                parameter,
+                *(each[name] for each in self.moments.values()),
+                gradients[name].contiguous(),
+            )
             flat = [x.view(len(x), math.prod(x.shape[1:])).numpy() for x in tensors]
             counted = 0 if jobs else 1
-            own = rows.numpy(), self.steps.numpy(), counted, self._corrections.numpy(), self._units[name].numpy()
+            own = (
+                rows.numpy(),
+                self.steps.numpy(),
+                counted,
+                self._corrections.numpy(),
+                self._units[name].numpy(),
+            )
             jobs.append((*flat, *own, rates[name]))
 
         def adam(worker: int, workers: int) -> None:
@@ -88,14 +113,23 @@ class RowAdam:
 
         threads.run(adam, threads.worker_count())
 
-    def _step_plain(self, gradients: dict[str, Tensor], rows: Tensor, rates: dict[str, float]) -> None:
-        """The plain twin of the fused step: all rows, without asking which (a GPU would have to answer first)."""
+    def _step_plain(
+        self, gradients: dict[str, Tensor], rows: Tensor, rates: dict[str, float]
+    ) -> None:
+        """The plain twin of the fused step: all rows, without asking which (a GPU would have to
+        answer first).
+        """
         self.steps.add_(rows)
-        length, correction = self._corrections[:, self.steps.clamp(max=self._corrections.shape[1] - 1)].unsqueeze(2)
+        length, correction = self._corrections[
+            :, self.steps.clamp(max=self._corrections.shape[1] - 1)
+        ].unsqueeze(2)
         for name, parameter in self.parameters.items():
             values = (parameter, *(each[name] for each in self.moments.values()))
             x, first, second = (each.view(len(each), math.prod(each.shape[1:])) for each in values)
-            gradient, lengths = gradients[name].reshape(x.shape), length * self._units[name][:, None]
+            gradient, lengths = (
+                gradients[name].reshape(x.shape),
+                length * self._units[name][:, None],
+            )
             m = self.beta1 * first + (1 - self.beta1) * gradient
             v = self.beta2 * second + (1 - self.beta2) * gradient * gradient
             moved = x - rates[name] * lengths * m / (v.sqrt() * correction + self.epsilon)
@@ -112,16 +146,20 @@ def learning_rates(config: AdaptConfig, decay: str) -> dict[str, float]:
 
 @torch.no_grad()
 def own_sizes(log_scales: Tensor) -> Tensor:
-    """``[N]`` the unit of each Gaussian's position steps, world units: the geometric mean of its scales.
+    """``[N]`` the unit of each Gaussian's position steps, world units: the geometric mean of its
+    scales.
 
-    A length of the scene, as in 3DGS, is a hundred times the size of most Gaussians in a scene of millions.
+    A length of the scene, as in 3DGS, is a hundred times the size of most Gaussians in a scene of
+    millions.
     """
     return log_scales.detach().float().mean(1).exp()
 
 
 @torch.no_grad()
 def add_to_mean(mean: dict[str, Tensor], values: dict[str, Tensor], count: int) -> None:
-    """Takes the ``count``-th ``values`` into their running ``mean``; infinite ones, opacities, are their own mean."""
+    """Takes the ``count``-th ``values`` into their running ``mean``; infinite ones, opacities, are
+    their own mean.
+    """
     for name, value in values.items():
         if count == 1:
             mean[name] = value.clone()

@@ -1,6 +1,7 @@
 """CLoD-GS's own training (section 3.3), with the settings of ``AdaptConfig.paper``.
 
-Chosen here: sigma_d begins as 1, the count's sigmoid is SOFTNESS wide, learning rates decay to a twentieth.
+Chosen here: sigma_d begins as 1, the count's sigmoid is SOFTNESS wide, learning rates decay to a
+twentieth.
 """
 
 from collections.abc import Sequence
@@ -14,7 +15,13 @@ from clod_adapter.equation.distances import normalized_distances
 from clod_adapter.equation.paper import soft_count
 from clod_adapter.equation.units import in_world_units
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.initialization.importance import MOST_VIEWS, has_dial, initialize, scene_distance, with_growth
+from clod_adapter.initialization.importance import (
+    MOST_VIEWS,
+    has_dial,
+    initialize,
+    scene_distance,
+    with_growth,
+)
 from clod_adapter.progress import Listener
 from clod_adapter.training.dial import SIGMA_RANGE, Dial
 from clod_adapter.training.schedule import PAPER
@@ -23,7 +30,8 @@ SOFTNESS = 0.5  # of the sigmoid of the straight-through count, in log opacity
 
 
 class PaperDial(Dial):
-    """The paper's form: sigma_d itself is trained, and the count term reaches it and the opacities in each view.
+    """The paper's form: sigma_d itself is trained, and the count term reaches it and the opacities
+    in each view.
 
     The objective is ``w_s (L_render + lambda L_reg)`` with ``w_s = (1 - 0.5 s / max_sv)^2``, and
     ``L_reg = (s - 1)^2 relu(eta - s^-p)^2``, eta the share kept.
@@ -37,14 +45,21 @@ class PaperDial(Dial):
 
     @staticmethod
     def begin(
-        base: Gaussians, views: Sequence[View], config: AdaptConfig, progress: Listener | None = None
+        base: Gaussians,
+        views: Sequence[View],
+        config: AdaptConfig,
+        progress: Listener | None = None,
     ) -> Gaussians:
-        """sigma_d = 1 in units of the largest distance in the frustum, no dial of its own; a dial it has is kept."""
+        """sigma_d = 1 in units of the largest distance in the frustum, no dial of its own; a dial
+        it has is kept.
+        """
         if has_dial(base):
             return initialize(base, views, config)
         distance = scene_distance(base, spread(views, MOST_VIEWS))
         attenuation = config.attenuation(distance)
-        initial = base.replace(sigma_d=torch.ones_like(base.opacity_logits), attenuation=attenuation)
+        initial = base.replace(
+            sigma_d=torch.ones_like(base.opacity_logits), attenuation=attenuation
+        )
         return in_world_units(with_growth(initial, config))
 
     @staticmethod
@@ -55,7 +70,9 @@ class PaperDial(Dial):
     def parameter_of(sigma_d: Tensor) -> Tensor:
         return sigma_d.detach().float().clamp(*SIGMA_RANGE)
 
-    def objective(self, loss: Tensor, shown: Gaussians, camera: Camera, virtual_scale: float) -> Tensor:
+    def objective(
+        self, loss: Tensor, shown: Gaussians, camera: Camera, virtual_scale: float
+    ) -> Tensor:
         if self.config.reg_weight > 0 and virtual_scale >= 1:
             loss = loss + self.count_term(shown, camera, virtual_scale)
         return self.weight(virtual_scale) * loss

@@ -1,4 +1,6 @@
-"""The training plan: what is trained, what is left out because the scene does not need it, and the measurements."""
+"""The training plan: what is trained, what is left out because the scene does not need it, and the
+measurements.
+"""
 
 from dataclasses import asdict, dataclass, replace
 from typing import Any
@@ -27,7 +29,8 @@ class Decision:
         verdict: "kept", "left out", of an attribute "frozen", or NOT_NEEDED.
         number: the measured effect, in ``unit``; None if nothing was measured.
         why: what the number is, or the reason if there is none.
-        name: the name in NAMES by which ``Override`` changes it; empty if there is nothing to change.
+        name: the name in NAMES by which ``Override`` changes it; empty if there is nothing to
+            change.
     """
 
     what: str
@@ -72,8 +75,8 @@ class Plan:
     Attributes:
         base: the checkpoint that the plan was made for.
         decisions: one for each part of the checkpoint.
-        start: what training begins with: the base with its initial dial, and far Gaussians that are added, without the
-            SH degrees that are left out.
+        start: what training begins with: the base with its initial dial, and far Gaussians that are
+            added, without the SH degrees that are left out.
         sh_degree: the SH degree that is trained.
         config: with learning rate 0 for frozen attributes.
         seconds: wall time of "bands", and of what training begins with, "start".
@@ -99,10 +102,14 @@ class Plan:
         """
         adapted = adapt(self.start, scene, self.config, progress, resume, group=group)
         start_seconds = adapted.start_seconds + self.seconds["start"]
-        return replace(adapted, gaussians=self.restore_excluded(adapted.gaussians), start_seconds=start_seconds)
+        return replace(
+            adapted, gaussians=self.restore_excluded(adapted.gaussians), start_seconds=start_seconds
+        )
 
     def restore_excluded(self, lean: Gaussians) -> Gaussians:
-        """``lean``, which training works on, together with the SH degrees that were left out, of the base's rows."""
+        """``lean``, which training works on, together with the SH degrees that were left out, of
+        the base's rows.
+        """
         base = self.base
         if self.sh_degree == base.sh_degree:
             return lean
@@ -116,7 +123,9 @@ class Plan:
     def as_dict(self) -> dict[str, Any]:
         """Plain JSON."""
         seconds = {name: round(value, 3) for name, value in self.seconds.items()}
-        decisions = [asdict(decision) | {"measured": decision.measured} for decision in self.decisions]
+        decisions = [
+            asdict(decision) | {"measured": decision.measured} for decision in self.decisions
+        ]
         return {"decisions": decisions, "seconds": seconds}
 
 

@@ -22,7 +22,8 @@ from clod_adapter.training.dial import require_trainable
 from clod_adapter.training.paper import form_of
 from clod_adapter.training.plan import NOT_NEEDED, RATES, Decision, Override, Plan, psnr_change
 
-LIMIT = 0.02  # dB: SH degrees are left out if the PSNR of the training views changes by less without them
+# dB: SH degrees are left out if the PSNR of the training views changes by less without them
+LIMIT = 0.02
 VIEWS = 8  # evenly spread training views on which that is measured
 REQUESTED = "as requested, not measured"
 FEW = 0.02  # share of the Gaussians that the farthest views and the smallest budgets have
@@ -38,7 +39,8 @@ def make_plan(
     override: Override | None = None,
     progress: Listener | None = None,
 ) -> Plan:
-    """Measures what the training views of ``scene`` need of ``base``, and computes what training begins with.
+    """Measures what the training views of ``scene`` need of ``base``, and computes what training
+    begins with.
 
     The same Gaussians, views and settings give the same plan.
 
@@ -100,12 +102,16 @@ def _sh_degree(
 
 
 def _far_end(initial: Gaussians, views: Sequence[View], config: AdaptConfig) -> list[Decision]:
-    """The share of the Gaussians that the largest dial value will keep, and the one that would keep FEW."""
+    """The share of the Gaussians that the largest dial value will keep, and the one that would keep
+    FEW.
+    """
     if config.form == "paper" or config.max_sv == 1:
         return []
     assert initial.attenuation is not None
     cameras = [view.camera for view in spread(views, VIEWS)]
-    distances = [normalized_distances(initial.means, camera, initial.attenuation) for camera in cameras]
+    distances = [
+        normalized_distances(initial.means, camera, initial.attenuation) for camera in cameras
+    ]
 
     def share(s: float) -> float:
         return fmean(int(dial(initial, d, s).keep.sum()) for d in distances) / initial.whole
@@ -116,7 +122,9 @@ def _far_end(initial: Gaussians, views: Sequence[View], config: AdaptConfig) -> 
         farther *= FARTHER
     if config.max_sv < farther < FARTHEST:
         reached += f", {FEW:.0%} with --max-sv {farther:.2g}"
-    return [Decision(reached, "kept", None, "", "in the mean of the training views, before training")]
+    return [
+        Decision(reached, "kept", None, "", "in the mean of the training views, before training")
+    ]
 
 
 def _counted(views: int) -> str:
@@ -124,11 +132,15 @@ def _counted(views: int) -> str:
 
 
 @torch.no_grad()
-def sh_degree_losses(base: Gaussians, views: Sequence[View], limit: float) -> Iterator[tuple[int, float]]:
-    """Effect of removing the highest SH degrees: (degree, dB without it and those above), from the highest down.
+def sh_degree_losses(
+    base: Gaussians, views: Sequence[View], limit: float
+) -> Iterator[tuple[int, float]]:
+    """Effect of removing the highest SH degrees: (degree, dB without it and those above), from the
+    highest down.
 
-    The mean over ``views`` of the absolute change of PSNR against the photographs at full detail. Ends after the first
-    degree that is not below ``limit``. Degrees whose coefficients are all 0 have effect 0 without rendering.
+    The mean over ``views`` of the absolute change of PSNR against the photographs at full detail.
+    Ends after the first degree that is not below ``limit``. Degrees whose coefficients are all 0
+    have effect 0 without rendering.
     """
     used = base.without_empty_bands().sh_degree
     yield from ((degree, 0.0) for degree in range(base.sh_degree, used, -1))
@@ -139,7 +151,9 @@ def sh_degree_losses(base: Gaussians, views: Sequence[View], limit: float) -> It
 
     with_all = quality(used) if used else []
     for degree in range(used, 0, -1):
-        change = fmean(abs(psnr_change(a, b)) for a, b in zip(with_all, quality(degree - 1), strict=True))
+        change = fmean(
+            abs(psnr_change(a, b)) for a, b in zip(with_all, quality(degree - 1), strict=True)
+        )
         yield degree, change
         if not change < limit:
             return

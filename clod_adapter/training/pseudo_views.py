@@ -19,26 +19,32 @@ from clod_adapter.progress import Listener, Phase, tell
 from clod_adapter.render import render
 from clod_adapter.training.camera_placement import SAMPLE, place_cameras
 
-# To fewer than MANY photographs ADDED pseudo views are added: up to half of them at the cameras of the photographs, at
-# most NEAR at each, from where they are moved WIDER; the others at placed cameras.
+# To fewer than MANY photographs ADDED pseudo views are added: up to half of them at the cameras of
+# the photographs, at most NEAR at each, from where they are moved WIDER; the others at placed
+# cameras.
 MANY, ADDED, NEAR, WIDER = 64, 96, 4, 2.0
 TEST_EVERY = 8  # as with photographs
-# Standard deviations of the random offset of a camera, of its distance to the scene, and of its direction, radians; and
-# the largest change of log focal length.
+# Standard deviations of the random offset of a camera, of its distance to the scene, and of its
+# direction, radians; and the largest change of log focal length.
 MOVED, TURNED, ZOOMED = 0.1, 0.05, 0.15
-# Without photographs a share BACKED of the moved cameras also steps back, log-uniformly up to FARTHER reaches from the
-# scene: a dial that was learned near the scene only loses what is small in the distance.
+# Without photographs a share BACKED of the moved cameras also steps back, log-uniformly up to
+# FARTHER reaches from the scene: a dial that was learned near the scene only loses what is small in
+# the distance.
 BACKED, FARTHER = 1 / 3, 4.0
 
 
 class PseudoView(StoredView):
-    """A view whose photograph is a rendering of ``teacher``, made when it is read, and from nearby in each step.
+    """A view whose photograph is a rendering of ``teacher``, made when it is read, and from nearby
+    in each step.
 
-    With a fixed set of renderings Gaussians drift towards what only these cameras see. ``at`` returns a fixed one.
-    ``reach`` is the unit of a moved camera's offset (``reaches``), ``backed`` the share that step back as well.
+    With a fixed set of renderings Gaussians drift towards what only these cameras see. ``at``
+    returns a fixed one. ``reach`` is the unit of a moved camera's offset (``reaches``), ``backed``
+    the share that step back as well.
     """
 
-    def __init__(self, camera: Camera, teacher: Gaussians, reach: float, backed: float = 0.0) -> None:
+    def __init__(
+        self, camera: Camera, teacher: Gaussians, reach: float, backed: float = 0.0
+    ) -> None:
         super().__init__(camera, lambda: render(teacher, camera).pixels.cpu())
         self.__dict__.update(teacher=teacher, reach=reach, backed=backed)
 
@@ -50,10 +56,14 @@ class PseudoView(StoredView):
         return PseudoView, (self.camera, self.teacher, self.reach, self.backed)
 
     def moved(self, random: np.random.Generator) -> View:
-        """A view from a random camera near this one, or behind it; rendered when its image is read."""
+        """A view from a random camera near this one, or behind it; rendered when its image is
+        read.
+        """
         x, y, z = TURNED * random.standard_normal(3)
         step = torch.eye(4, dtype=torch.float64)  # on the CPU, where cameras are placed
-        step[:3, :3] = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64).matrix_exp()
+        step[:3, :3] = torch.tensor(
+            [[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64
+        ).matrix_exp()
         step[:3, 3] = torch.from_numpy(MOVED * self.reach * random.standard_normal(3))
         zoom = math.exp(ZOOMED * (2 * random.random() - 1))
         viewmat = (step @ self.camera.viewmat.double()).to(self.camera.viewmat)
@@ -65,11 +75,14 @@ class PseudoView(StoredView):
 
 
 @torch.no_grad()
-def render_pseudo_views(gaussians: Gaussians, cameras: Sequence[Camera], *, progress: Listener | None = None) -> Scene:
-    """A scene of ``cameras`` with the checkpoint's own renderings as photographs; every 8th is held out.
+def render_pseudo_views(
+    gaussians: Gaussians, cameras: Sequence[Camera], *, progress: Listener | None = None
+) -> Scene:
+    """A scene of ``cameras`` with the checkpoint's own renderings as photographs; every 8th is held
+    out.
 
-    Those to train on are rendered when they are read, and training renders each from a camera near it instead
-    (``PseudoView.moved``); ``view.at(view.camera)`` stays where it is.
+    Those to train on are rendered when they are read, and training renders each from a camera near
+    it instead (``PseudoView.moved``); ``view.at(view.camera)`` stays where it is.
 
     Args:
         gaussians: the teacher, rendered at s = 1.
@@ -77,15 +90,18 @@ def render_pseudo_views(gaussians: Gaussians, cameras: Sequence[Camera], *, prog
     """
     teacher = gaussians.without_empty_bands()
     held_out = range(0, len(cameras), TEST_EVERY) if len(cameras) > 1 else range(0)
-    train = tuple(view for k, view in enumerate(_views(teacher, cameras, backed=BACKED)) if k not in held_out)
+    train = tuple(
+        view for k, view in enumerate(_views(teacher, cameras, backed=BACKED)) if k not in held_out
+    )
     test = list[View]()
     for k in held_out:
         test.append(View(cameras[k], render(teacher, cameras[k]).pixels.cpu()))
         tell(progress, Phase.PSEUDO_VIEWS, len(test), len(held_out))
     size = f"{cameras[0].width}x{cameras[0].height}, {_field(cameras[0]):.0f} degrees wide"
     note = (
-        f"no photographs: {len(train)} pseudo views to train on, {len(test)} held out, {size}; the "
-        "checkpoint is the teacher, and all numbers compare with its renderings, not with photographs"
+        f"no photographs: {len(train)} pseudo views to train on, {len(test)} held out, {size}; the"
+        " checkpoint is the teacher, and all numbers compare with its renderings, not with"
+        " photographs"
     )
     return Scene(train, tuple(test), (note,))
 
@@ -93,7 +109,8 @@ def render_pseudo_views(gaussians: Gaussians, cameras: Sequence[Camera], *, prog
 def with_pseudo_views(
     gaussians: Gaussians, scene: Scene | None, seed: int = 0, progress: Listener | None = None
 ) -> Scene:
-    """The scene with pseudo views beside few photographs, or, for None, of pseudo views at placed cameras alone.
+    """The scene with pseudo views beside few photographs, or, for None, of pseudo views at placed
+    cameras alone.
 
     Args:
         progress: called in ``Phase.CAMERAS`` and ``Phase.PSEUDO_VIEWS``.
@@ -104,10 +121,13 @@ def with_pseudo_views(
     return render_pseudo_views(gaussians, cameras, progress=progress)
 
 
-def add_pseudo_views(gaussians: Gaussians, scene: Scene, seed: int = 0, progress: Listener | None = None) -> Scene:
+def add_pseudo_views(
+    gaussians: Gaussians, scene: Scene, seed: int = 0, progress: Listener | None = None
+) -> Scene:
     """Adds ADDED pseudo views where there are few photographs.
 
-    They hold what the photographs do not show: fine-tuned on 33 photographs alone a checkpoint lost 0.8 dB on others.
+    They hold what the photographs do not show: fine-tuned on 33 photographs alone a checkpoint lost
+    0.8 dB on others.
     """
     photographs = scene.train
     if not 0 < len(photographs) < MANY:
@@ -140,7 +160,8 @@ def _views(
 
 
 def reaches(gaussians: Gaussians, cameras: Sequence[Camera]) -> list[float]:
-    """Of each camera its distance to the scene, world units: the median in its image, or over the cameras if less.
+    """Of each camera its distance to the scene, world units: the median in its image, or over the
+    cameras if less.
 
     A camera that looks past the scene has the background's.
     """
@@ -155,9 +176,13 @@ def teachers_to(views: Sequence[View], device: str) -> tuple[View, ...]:
     own = {id(view.teacher): view.teacher for view in views if isinstance(view, PseudoView)}
     there = {number: teacher.to(device) for number, teacher in own.items()}
     return tuple(
-        PseudoView(view.camera, there[id(view.teacher)], view.reach, view.backed)
-        if isinstance(view, PseudoView) else view for view in views
-    )  # fmt: skip
+        (
+            PseudoView(view.camera, there[id(view.teacher)], view.reach, view.backed)
+            if isinstance(view, PseudoView)
+            else view
+        )
+        for view in views
+    )
 
 
 def _field(camera: Camera) -> float:

@@ -1,4 +1,6 @@
-"""The schedule of a training: which view a step renders, at which dial value and size, and how far it moves."""
+"""The schedule of a training: which view a step renders, at which dial value and size, and how far
+it moves.
+"""
 
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
@@ -20,10 +22,14 @@ class Schedule:
 
     full: float = 0.5  # share of the steps at s = 0 and s = 1 at first
     unattenuated: float = 0.25  # of these: at s = 0, where every Gaussian is as it is stored
-    full_final: float = 0.4  # of itself, to which that falls linearly: s = 1 is learned before the far end
-    coarse: float = 0.9  # share of the training in which steps beyond s = 1 have photographs of half the size
-    lr_final: float = 0.1  # final learning rates as a share of the first ones, between which they decay exponentially
-    average: float = 0.2  # share of the steps so far, at the end, whose parameters are averaged for the result
+    # of itself, to which that falls linearly: s = 1 is learned before the far end
+    full_final: float = 0.4
+    # share of the training in which steps beyond s = 1 have photographs of half the size
+    coarse: float = 0.9
+    # final learning rates as a share of the first ones, between which they decay exponentially
+    lr_final: float = 0.1
+    # share of the steps so far, at the end, whose parameters are averaged for the result
+    average: float = 0.2
     # Times max_sv, the largest dial value of steps: quality and counts do not break off at max_sv.
     rendered: float = 1.25
     counted: float = 1.5  # and of counts
@@ -32,7 +38,8 @@ class Schedule:
     def dial(self, place: float, share_done: float, end: float) -> float:
         """The dial value at ``place`` in [0, 1): 0, 1, or from 1 to ``end``.
 
-        Steps at s = 0 train what cameras nearer than the photographs see, and viewers that do not know the dial.
+        Steps at s = 0 train what cameras nearer than the photographs see, and viewers that do not
+        know the dial.
         """
         full = self.full * (1 - (1 - self.full_final) * share_done)
         if place < full:
@@ -41,15 +48,20 @@ class Schedule:
 
 
 OURS = Schedule()
-# Of far Gaussians: near ones, which s = 0 shows, are not trained. With coarse 0.9 images at a tenth lose 0.4 dB on the
-# demo, whose photographs are exact, and gain 0.04 dB on plush_half, at less SSIM.
+# Of far Gaussians: near ones, which s = 0 shows, are not trained. With coarse 0.9 images at a tenth
+# lose 0.4 dB on the demo, whose photographs are exact, and gain 0.04 dB on plush_half, at less
+# SSIM.
 FAR = replace(OURS, full=0.33, unattenuated=0.0, coarse=0.5)
 # One s ~ U(1, max_sv) a step, of whole photographs; no average of parameters.
-PAPER = Schedule(full=0.0, coarse=0.0, lr_final=0.05, average=0.0, rendered=1.0, counted=0.0, even=True)
+PAPER = Schedule(
+    full=0.0, coarse=0.0, lr_final=0.05, average=0.0, rendered=1.0, counted=0.0, even=True
+)
 
 
 class Sample(NamedTuple):
-    """A view, perhaps of half its size, the dial value it is rendered at, and another, where Gaussians are counted."""
+    """A view, perhaps of half its size, the dial value it is rendered at, and another, where
+    Gaussians are counted.
+    """
 
     view: View
     dial: float
@@ -63,14 +75,18 @@ class ViewSampler:
     ``order`` has the numbers of the remaining views of this round, the next one last.
     """
 
-    def __init__(self, views: tuple[View, ...], config: AdaptConfig, schedule: Schedule = OURS) -> None:
+    def __init__(
+        self, views: tuple[View, ...], config: AdaptConfig, schedule: Schedule = OURS
+    ) -> None:
         self.views, self.max_sv, self.schedule = views, config.max_sv, schedule
         self.random = np.random.default_rng(config.seed)
         self.order: list[int] = []
         self.offset = self.random.random()
 
     def draw(self, number: int, share_done: float) -> Sample:
-        """The next view, each one once per round, and its dial value; ``number`` counts samples from 0."""
+        """The next view, each one once per round, and its dial value; ``number`` counts samples
+        from 0.
+        """
         if not self.order:
             self.order = self.random.permutation(len(self.views)).tolist()
         view = self.views[self.order.pop()]
@@ -82,7 +98,9 @@ class ViewSampler:
         return Sample(view, dial, self.counted(), halved)
 
     def counted(self) -> float | None:
-        """A log-uniform dial value that Gaussians are only counted at; None with a single dial value."""
+        """A log-uniform dial value that Gaussians are only counted at; None with a single dial
+        value.
+        """
         if self.max_sv == 1 or self.schedule.counted == 0:
             return None
         return (self.schedule.counted * self.max_sv) ** self.random.random()
@@ -90,8 +108,8 @@ class ViewSampler:
     def dial(self, number: int, share_done: float) -> float:
         """The dial value of a step, by ``Schedule.dial``; with max_sv 1 there is one.
 
-        Multiples of the golden ratio modulo 1 are spread more evenly than random numbers, in every stretch of a run:
-        0.05 dB at s = 5 on plush_half.
+        Multiples of the golden ratio modulo 1 are spread more evenly than random numbers, in every
+        stretch of a run: 0.05 dB at s = 5 on plush_half.
         """
         if self.max_sv == 1:
             return 1.0
@@ -109,5 +127,7 @@ class ViewSampler:
         try:
             self.random.bit_generator.state = random
         except (KeyError, OverflowError, TypeError, ValueError) as error:
-            raise ClodError(f"the training state's random state is damaged ({error!r}); start over") from error
+            raise ClodError(
+                f"the training state's random state is damaged ({error!r}); start over"
+            ) from error
         self.order = list(order)

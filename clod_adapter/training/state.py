@@ -16,7 +16,9 @@ from clod_adapter.io.file_formats import refuse_irregular
 from clod_adapter.io.tensor_file import read_tensors, write_tensors
 
 KEY = "clod_adapter_state"  # of the JSON document in the metadata of a file
-OTHER_RUN = "the training state is of other Gaussians, views or settings; use those it was saved with"
+OTHER_RUN = (
+    "the training state is of other Gaussians, views or settings; use those it was saved with"
+)
 
 
 class StateRefused(ClodError):
@@ -28,9 +30,10 @@ class TrainingState:
     """Everything that later steps depend on, except the base, the views and the config.
 
     Attributes:
-        tensors: by kind and name, as in ``parameter.means``: of each trained attribute its ``parameter``, Adam's
-            ``first`` and ``second`` moment, and the ``mean`` if there is one. float32. ``steps.kept`` and ``steps.all``
-            count Adam's steps of each row of parameters that move where the dial keeps the row, or always; int32.
+        tensors: by kind and name, as in ``parameter.means``: of each trained attribute its
+            ``parameter``, Adam's ``first`` and ``second`` moment, and the ``mean`` if there is one.
+            float32. ``steps.kept`` and ``steps.all`` count Adam's steps of each row of parameters
+            that move where the dial keeps the row, or always; int32.
         random, order: of ``schedule.ViewSampler``.
         loss: its running mean; averaged: the number of steps in the mean.
         steps, seconds: of training; start_seconds: before it.
@@ -48,13 +51,22 @@ class TrainingState:
 
     def __post_init__(self) -> None:
         times = (self.seconds, self.start_seconds)
-        possible = 0 <= self.averaged <= self.steps < 2**31 and all(0 <= seconds < math.inf for seconds in times)
+        possible = 0 <= self.averaged <= self.steps < 2**31 and all(
+            0 <= seconds < math.inf for seconds in times
+        )
         if not possible:
-            raise StateRefused("the training state has impossible counts of steps or seconds; start over")
+            raise StateRefused(
+                "the training state has impossible counts of steps or seconds; start over"
+            )
 
     def check(self, own: dict[str, Tensor]) -> None:
-        """Refuses a state of another run than that with tensors ``own``, and values that training cannot produce."""
-        shapes = [{name: (t.shape, t.dtype) for name, t in tensors.items()} for tensors in (own, self.tensors)]
+        """Refuses a state of another run than that with tensors ``own``, and values that training
+        cannot produce.
+        """
+        shapes = [
+            {name: (t.shape, t.dtype) for name, t in tensors.items()}
+            for tensors in (own, self.tensors)
+        ]
         if shapes[0] != shapes[1]:
             raise StateRefused(OTHER_RUN)
         for name, values in self.tensors.items():
@@ -68,7 +80,9 @@ class TrainingState:
             else:  # an infinite opacity does not change
                 sound = values.isfinite() | (values == own[f"parameter.{attribute}"])
             if not bool(sound.all()):
-                raise StateRefused(f"the training state has impossible values of {name}; start over")
+                raise StateRefused(
+                    f"the training state has impossible values of {name}; start over"
+                )
 
 
 @dataclass(frozen=True)
@@ -78,12 +92,15 @@ class Adapted:
     Attributes:
         gaussians: with ``sigma_d`` and ``attenuation``.
         steps: training steps done.
-        seconds: wall time of the training loop; start_seconds: before it. Both include the run that was resumed.
-        interrupted: training ended early: the listener returned False, Ctrl-C, a process was lost, or the loss of a
-            step was not finite.
+        seconds: wall time of the training loop; start_seconds: before it. Both include the run that
+            was resumed.
+        interrupted: training ended early: the listener returned False, Ctrl-C, a process was lost,
+            or the loss of a step was not finite.
         lost: which process was lost; failed: which step's loss was not finite.
-        waiting, exchanging: seconds of this call spent waiting for and exchanging with other processes.
-        held: the number of Gaussians that some step of this call did not move because their gradient was not finite.
+        waiting, exchanging: seconds of this call spent waiting for and exchanging with other
+            processes.
+        held: the number of Gaussians that some step of this call did not move because their
+            gradient was not finite.
         signalled: a Ctrl-C, or another signal with Python's own handler, arrived.
     """
 
@@ -108,7 +125,10 @@ class Adapted:
         if self.failed:
             found.append(f"training ended early, and the result so far is written: {self.failed}")
         if self.held:
-            found.append(f"{self.held:,} Gaussians were not moved by some steps: their gradients were not finite")
+            found.append(
+                f"{self.held:,} Gaussians were not moved by some steps: their gradients were not"
+                " finite"
+            )
         return found
 
     def __repr__(self) -> str:
@@ -120,7 +140,9 @@ def save_state(path: str | Path, state: TrainingState, belongs: dict[str, Any]) 
     """Writes a state, and plain JSON that identifies its run; loading gives the same bits."""
     # Not asdict of the whole, which would copy the tensors.
     about = {f.name: getattr(state, f.name) for f in fields(state) if f.name != "tensors"}
-    metadata = {KEY: json.dumps({**about, "attenuation": asdict(state.attenuation), "belongs": belongs})}
+    metadata = {
+        KEY: json.dumps({**about, "attenuation": asdict(state.attenuation), "belongs": belongs})
+    }
     with atomic_path(path) as temporary:
         write_tensors(temporary, state.tensors, metadata)
 
@@ -129,10 +151,17 @@ def load_state(path: str | Path) -> tuple[TrainingState, dict[str, Any]]:
     """Reads a state, and ``belongs`` of the run that saved it."""
     path = Path(path)
     refuse_irregular(path, "delete it to start over")
-    with refused_if_damaged(path, "is not a training state or is damaged", "delete it to start over"):
+    with refused_if_damaged(
+        path, "is not a training state or is damaged", "delete it to start over"
+    ):
         tensors, metadata = read_tensors(path)
         about = json.loads(metadata[KEY])
-        belongs, attenuation = dict(about.pop("belongs")), AttenuationConfig(**about.pop("attenuation"))
+        belongs, attenuation = (
+            dict(about.pop("belongs")),
+            AttenuationConfig(**about.pop("attenuation")),
+        )
         random, order = dict(about.pop("random")), tuple(map(int, about.pop("order")))
-        counts: Any = {name: (int if name in ("averaged", "steps") else float)(n) for name, n in about.items()}
+        counts: Any = {
+            name: (int if name in ("averaged", "steps") else float)(n) for name, n in about.items()
+        }
         return TrainingState(tensors, attenuation, random, order, **counts), belongs

@@ -18,40 +18,62 @@ from clod_adapter.gaussians import Gaussians, LossNotFinite, require_finite, spo
 from clod_adapter.losses import photometric_loss
 from clod_adapter.rasterizers import for_device
 from clod_adapter.training.distributed import ProcessGroup
-from clod_adapter.training.optimizer import GradientSum, RowAdam, add_to_mean, learning_rates, own_sizes
+from clod_adapter.training.optimizer import (
+    GradientSum,
+    RowAdam,
+    add_to_mean,
+    learning_rates,
+    own_sizes,
+)
 from clod_adapter.training.paper import form_of
 from clod_adapter.training.schedule import Sample
 from clod_adapter.training.state import TrainingState
 
-# Adam's decay rates per view. A batch takes their powers and multiplies learning rates by its square root, so that
-# each view has the same effect (Zhao et al., "On Scaling Up 3D Gaussian Splatting Training", ICLR 2025).
+# Adam's decay rates per view. A batch takes their powers and multiplies learning rates by its
+# square root, so that each view has the same effect (Zhao et al., "On Scaling Up 3D Gaussian
+# Splatting Training", ICLR 2025).
 BETA1, BETA2 = 0.9, 0.999
 
 
 class Trainer:
-    """Holds everything that training steps change. The start has a growth_d if the config has growth.
+    """Holds everything that training steps change. The start has a growth_d if the config has
+    growth.
 
     Attributes:
         count: the number of trained rows, the first ones.
-        parameters: tensors by name, those of the dial too; ``stepped``: names of those that are trained.
-        mean: of the trained parameters over the last steps, by the schedule; averaged: how many steps it has.
+        parameters: tensors by name, those of the dial too; ``stepped``: names of those that are
+            trained.
+        mean: of the trained parameters over the last steps, by the schedule; averaged: how many
+            steps it has.
         loss: running mean of the photometric loss, NaN before the first step.
-        held: ``[trained]`` bool, rows that some step did not move because their gradient was not finite.
+        held: ``[trained]`` bool, rows that some step did not move because their gradient was not
+            finite.
     """
 
     def __init__(
-        self, start: Gaussians, views: tuple[View, ...], config: AdaptConfig, group: ProcessGroup | None = None
+        self,
+        start: Gaussians,
+        views: tuple[View, ...],
+        config: AdaptConfig,
+        group: ProcessGroup | None = None,
     ) -> None:
-        self.order: Tensor | None = None  # of the result's rows, where far ones come first in training
+        # of the result's rows, where far ones come first in training
+        self.order: Tensor | None = None
         if start.near is not None:
             far_first = start.near.int().argsort(stable=True)
             self.order, start = far_first.argsort(), start.select(far_first)
         form = form_of(config)
         self.rates = learning_rates(config, form.decay)
         # A frozen attribute requests no gradient from the rasterizer.
-        tuned = [n for n in ATTRIBUTES if n == "opacity_logits" or self.rates[n] > 0 and getattr(start, n).numel()]
+        tuned = [
+            n
+            for n in ATTRIBUTES
+            if n == "opacity_logits" or self.rates[n] > 0 and getattr(start, n).numel()
+        ]
         own: dict[str, Any] = {"dtype": torch.float32, "memory_format": torch.contiguous_format}
-        attributes: Any = {name: getattr(start, name).detach().to(**own, copy=name in tuned) for name in ATTRIBUTES}
+        attributes: Any = {
+            name: getattr(start, name).detach().to(**own, copy=name in tuned) for name in ATTRIBUTES
+        }
         splats = Gaussians(**attributes, screen_filter=start.screen_filter)
         self.dial = form(splats, start, [view.camera for view in views], config)
         dials = {name: value.detach() for name, value in self.dial.named_parameters()}
@@ -60,13 +82,21 @@ class Trainer:
         self.sampler, self.screen_filter = self.dial.sampler, start.screen_filter
         self.sampler.views = views
         # Of culled Gaussians too the count term has a gradient.
-        everywhere, parts = {self.dial.decay, *self.dial.everywhere}, {"kept": dict[str, Tensor](), "all": {}}
+        everywhere, parts = (
+            {self.dial.decay, *self.dial.everywhere},
+            {"kept": dict[str, Tensor](), "all": {}},
+        )
         for name, value in self.trained().items():
             parts["all" if name in everywhere else "kept"][name] = value
         beta1, beta2 = BETA1**config.batch, BETA2**config.batch
         units = {"means": own_sizes(start.log_scales[: self.count])}
-        self.optimizers = {rows: RowAdam(p, beta1=beta1, beta2=beta2, units=units) for rows, p in parts.items() if p}
-        self.empty_sh: Tensor | None = None  # the whole shN of a base whose empty degrees were removed
+        self.optimizers = {
+            rows: RowAdam(p, beta1=beta1, beta2=beta2, units=units)
+            for rows, p in parts.items()
+            if p
+        }
+        # the whole shN of a base whose empty degrees were removed
+        self.empty_sh: Tensor | None = None
         self.done, self.seconds, self.start_seconds, self.loss = 0, 0.0, 0.0, math.nan
         self.mean: dict[str, Tensor] = {}
         self.averaged = 0
@@ -75,9 +105,11 @@ class Trainer:
 
     @torch_on_one_thread()
     def step(self, share_done: float, until: float = math.inf) -> None:
-        """Samples views and dial values, sums the gradients of their losses, and updates the parameters once.
+        """Samples views and dial values, sums the gradients of their losses, and updates the
+        parameters once.
 
-        Nothing has changed after LossNotFinite, or an error of the rasterizer. A view is not begun after ``until``.
+        Nothing has changed after LossNotFinite, or an error of the rasterizer. A view is not begun
+        after ``until``.
         """
         before = self.sampler.state()
         numbers = range(self.done * self.config.batch, (self.done + 1) * self.config.batch)
@@ -88,10 +120,13 @@ class Trainer:
             found = self.group.sum(found) if self.group else found
             self._updating = True
             self._update(found, share_done)
-            loss = float(found.loss) / found.views  # the host waits for a GPU, as else only gsplat does
+            # the host waits for a GPU, as else only gsplat does
+            loss = float(found.loss) / found.views
             if not math.isfinite(loss):
                 self._updating = False
-                names = ", ".join(view.camera.name or "a view without a name" for view, *_ in samples)
+                names = ", ".join(
+                    view.camera.name or "a view without a name" for view, *_ in samples
+                )
                 raise LossNotFinite(f"the loss of step {self.done + 1} is not finite ({names})")
         except Exception:
             self.sampler.restore(*before)
@@ -105,7 +140,9 @@ class Trainer:
         self._updating = False
 
     def gradient_sum(self, samples: Sequence[Sample], until: float = math.inf) -> GradientSum:
-        """The gradients summed over the first sample and those begun before ``until`` (``perf_counter``)."""
+        """The gradients summed over the first sample and those begun before ``until``
+        (``perf_counter``).
+        """
         found = self._of_view(samples[0])
         for sample in samples[1:]:
             if time.perf_counter() >= until:
@@ -116,7 +153,10 @@ class Trainer:
     def _of_view(self, sample: Sample) -> GradientSum:
         """Renders one view at its dial value, and differentiates the objective."""
         (view, s, counted, halved), first = sample, slice(self.count)
-        leaves = {name: value.detach().requires_grad_(name in self.stepped) for name, value in self.parameters.items()}
+        leaves = {
+            name: value.detach().requires_grad_(name in self.stepped)
+            for name, value in self.parameters.items()
+        }
         shown = self._shown(leaves, halved)
         rasterizer = for_device(shown.means.device)
         kept = rasterizer.kept(shown, view.camera, s)[first]
@@ -124,7 +164,9 @@ class Trainer:
         loss = photometric_loss(image, view.image, self.config.ssim_weight)
         total = self.dial.objective(loss, shown, view.camera, s)
         found = torch.autograd.grad(total, [leaves[name] for name in self.stepped])
-        gradients = {name: gradient[first] for name, gradient in zip(self.stepped, found, strict=True)}
+        gradients = {
+            name: gradient[first] for name, gradient in zip(self.stepped, found, strict=True)
+        }
         plain, decay = loss.detach().double(), self.dial.decay
         parameter = self.parameters[decay][first]
         for at, weighted in self.dial.counts(s, counted, plain):
@@ -137,11 +179,16 @@ class Trainer:
         return found.replace(screen_filter=self.screen_filter.halved()) if halved else found
 
     def _update(self, found: GradientSum, share_done: float) -> None:
-        """Moves the rows whose gradients are finite; none if the loss is not, without asking which."""
+        """Moves the rows whose gradients are finite; none if the loss is not, without asking
+        which.
+        """
         learned, spoilt = torch.as_tensor(found.loss).isfinite(), spoilt_rows(found.gradients)
         self.held |= learned & spoilt
         finite = spoilt.logical_not_().logical_and_(learned)
-        rates = {name: rate * self.dial.schedule.lr_final**share_done for name, rate in self.rates.items()}
+        rates = {
+            name: rate * self.dial.schedule.lr_final**share_done
+            for name, rate in self.rates.items()
+        }
         moved = {"kept": found.kept.logical_and_(finite), "all": finite}
         for rows, optimizer in self.optimizers.items():
             optimizer.step(found.gradients, moved[rows], rates)
@@ -150,14 +197,25 @@ class Trainer:
     def state(self) -> TrainingState:
         """Everything that later steps depend on; its tensors are the trainer's own."""
         if self._updating:
-            raise ClodError(f"step {self.done + 1} failed while it updated the parameters, so they cannot be saved")
+            raise ClodError(
+                f"step {self.done + 1} failed while it updated the parameters, so they cannot be"
+                " saved"
+            )
         return TrainingState(
-            self._changing(), self.dial.attenuation, *self.sampler.state(), self.loss, self.averaged, self.done,
-            self.seconds, self.start_seconds,
-        )  # fmt: skip
+            self._changing(),
+            self.dial.attenuation,
+            *self.sampler.state(),
+            self.loss,
+            self.averaged,
+            self.done,
+            self.seconds,
+            self.start_seconds,
+        )
 
     def restore(self, state: TrainingState) -> None:
-        """The inverse of ``state``; copies its tensors. Raises ClodError if it is of another run, or damaged."""
+        """The inverse of ``state``; copies its tensors. Raises ClodError if it is of another run,
+        or damaged.
+        """
         if state.averaged:
             self.mean = {name: torch.empty_like(value) for name, value in self.trained().items()}
         own = self._changing()
@@ -166,7 +224,11 @@ class Trainer:
         for name, tensor in own.items():
             tensor.copy_(state.tensors[name])
         self.loss, self.averaged = state.loss, state.averaged
-        self.done, self.seconds, self.start_seconds = state.steps, state.seconds, state.start_seconds
+        self.done, self.seconds, self.start_seconds = (
+            state.steps,
+            state.seconds,
+            state.start_seconds,
+        )
         require_finite(self.gaussians(), "the training state", "start over")
 
     def gaussians(self) -> Gaussians:
@@ -174,7 +236,10 @@ class Trainer:
         found = self._assembled(self.parameters | self.averages())
         found = found if self.order is None else found.select(self.order)
         if self.empty_sh is not None:
-            added = self.empty_sh.new_zeros(len(found) - len(self.empty_sh), *self.empty_sh.shape[1:])  # far ones
+            # far ones
+            added = self.empty_sh.new_zeros(
+                len(found) - len(self.empty_sh), *self.empty_sh.shape[1:]
+            )
             found = found.replace(shN=torch.cat([self.empty_sh, added]))
         return in_world_units(found)
 
@@ -182,14 +247,20 @@ class Trainer:
         """The mean parameters, of all rows; none before there is a mean."""
         if self.count == len(self.parameters["means"]):
             return self.mean
-        return {name: torch.cat([mean, self.parameters[name][self.count :]]) for name, mean in self.mean.items()}
+        return {
+            name: torch.cat([mean, self.parameters[name][self.count :]])
+            for name, mean in self.mean.items()
+        }
 
     def _assembled(self, parameters: dict[str, Tensor]) -> Gaussians:
         values: Any = {name: parameters[name] for name in ATTRIBUTES}
         return Gaussians(
-            **values, sigma_d=self.dial.sigma_of(parameters[self.dial.decay]), attenuation=self.dial.attenuation,
-            growth_d=parameters.get("growth_d"), screen_filter=self.screen_filter,
-        )  # fmt: skip
+            **values,
+            sigma_d=self.dial.sigma_of(parameters[self.dial.decay]),
+            attenuation=self.dial.attenuation,
+            growth_d=parameters.get("growth_d"),
+            screen_filter=self.screen_filter,
+        )
 
     def trained(self) -> dict[str, Tensor]:
         """Views of the rows of the parameters that steps change."""

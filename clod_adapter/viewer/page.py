@@ -1,7 +1,9 @@
-"""The viewer's page, for the server or as one file that includes the splats, and the data that it shows.
+"""The viewer's page, for the server or as one file that includes the splats, and the data that it
+shows.
 
-The page loads nothing from other hosts: its Content-Security-Policy allows one script and one style, by their hashes,
-and connections to its own server only. Splats are PLY in one layout, whatever the file, or SPZ.
+The page loads nothing from other hosts: its Content-Security-Policy allows one script and one
+style, by their hashes, and connections to its own server only. Splats are PLY in one layout,
+whatever the file, or SPZ.
 """
 
 import base64
@@ -39,7 +41,8 @@ BLOCK_ROWS = 1 << 14
 STYLE, SCRIPT = "viewer.css", "viewer.js"
 ELEMENT = "clod-model"  # id of the elements with the splats
 PART = 3 << 24  # bytes of a script element, a multiple of 3; browsers limit strings to about 5e8
-POSTER_SIDE, POSTER_QUALITY = 512, 60  # of the picture shown while the page loads: pixels, and of JPEG
+# of the picture shown while the page loads: pixels, and of JPEG
+POSTER_SIDE, POSTER_QUALITY = 512, 60
 
 Entry = Mapping[str, Any]
 
@@ -58,10 +61,12 @@ class Payload:
         gaussians = checkpoint.gaussians.without_empty_bands()
         if gaussians.attenuation is not None and gaussians.attenuation.form == "paper":
             raise ClodError(
-                f"{checkpoint.path}: its dial is of the paper's form, which viewers do not draw; adapt it without "
-                "--form paper"
+                f"{checkpoint.path}: its dial is of the paper's form, which viewers do not draw;"
+                " adapt it without --form paper"
             )
-        return cls(as_text(checkpoint.path.name), gaussians, checkpoint.calibration, checkpoint.origin)
+        return cls(
+            as_text(checkpoint.path.name), gaussians, checkpoint.calibration, checkpoint.origin
+        )
 
     @cached_property
     def header(self) -> bytes:
@@ -79,12 +84,19 @@ class Payload:
         return len(self.header) + 4 * self.header.count(b"\nproperty ") * len(self.gaussians)
 
     def blocks(self) -> Iterator[bytes]:
-        """The PLY in blocks of rows: little-endian float32, Inria's layout without normals, the dial last.
+        """The PLY in blocks of rows: little-endian float32, Inria's layout without normals, the
+        dial last.
 
         A logit above 20 is written as 20, the same opacity in float32.
         """
         g, tensors = self.gaussians, self.gaussians.tensors()
-        columns = [g.means, g.sh0, g.shN.transpose(1, 2), g.opacity_logits.clamp(max=OPAQUE)[:, None], g.log_scales]
+        columns = [
+            g.means,
+            g.sh0,
+            g.shN.transpose(1, 2),
+            g.opacity_logits.clamp(max=OPAQUE)[:, None],
+            g.log_scales,
+        ]
         columns += [g.quats, *(tensors[name][:, None] for name in dial_columns(tensors))]
         yield self.header
         for parts in zip(*(column.split(BLOCK_ROWS) for column in columns), strict=True):
@@ -94,11 +106,16 @@ class Payload:
     def packed(self, file: str) -> tuple[bytes, Gaussians, tuple[str, ...]]:
         """The splat as SPZ, of which rows that are near one another take a tenth less.
 
-        ``file`` is a temporary name. Returns the bytes, the Gaussians in them, and a line for each loss.
+        ``file`` is a temporary name. Returns the bytes, the Gaussians in them, and a line for each
+        loss.
         """
         rows = _along_curve(self.gaussians.means)
         try:
-            notes = write(file, self.gaussians.select(rows), Metadata(calibration=self.calibration, origin=self.origin))
+            notes = write(
+                file,
+                self.gaussians.select(rows),
+                Metadata(calibration=self.calibration, origin=self.origin),
+            )
             found = load(file, origin=self.origin).gaussians.to(self.gaussians.means.device)
             return Path(file).read_bytes(), found, notes
         finally:
@@ -106,7 +123,9 @@ class Payload:
 
 
 def _along_curve(means: Tensor) -> Tensor:
-    """The rows in Morton order, of cells that divide all but the outermost 1 % on each side by 1024."""
+    """The rows in Morton order, of cells that divide all but the outermost 1 % on each side by
+    1024.
+    """
     points = means.detach().double().cpu().numpy()
     low, high = np.quantile(points, (0.01, 0.99), axis=0)
     cells = (1023 * (points - low) / np.maximum(high - low, 1e-300)).clip(0, 1023).astype(np.int64)
@@ -115,29 +134,45 @@ def _along_curve(means: Tensor) -> Tensor:
 
 
 def camera_entry(camera: Camera, placed: bool = False) -> Entry:
-    """A camera of the page's configuration. ``placed``: it is not a photograph's; the page levels it."""
+    """A camera of the page's configuration. ``placed``: it is not a photograph's; the page levels
+    it.
+    """
 
     def digits(matrix: Tensor) -> list[list[float]]:
-        return [[float(f"{value:.9g}") for value in row] for row in matrix.tolist()]  # full float32 precision
+        # full float32 precision
+        return [[float(f"{value:.9g}") for value in row] for row in matrix.tolist()]
 
     return {
-        "name": camera.name, "viewmat": digits(camera.viewmat), "K": digits(camera.K), "width": camera.width,
-        "height": camera.height, "near": camera.near, "placed": placed,
-    }  # fmt: skip
+        "name": camera.name,
+        "viewmat": digits(camera.viewmat),
+        "K": digits(camera.K),
+        "width": camera.width,
+        "height": camera.height,
+        "near": camera.near,
+        "placed": placed,
+    }
 
 
 def page_config(
-    models: Sequence[Entry], base: Entry | None, cameras: Sequence[Entry], virtual_scale: float | None
+    models: Sequence[Entry],
+    base: Entry | None,
+    cameras: Sequence[Entry],
+    virtual_scale: float | None,
 ) -> Entry:
-    """The page's configuration. Models and ``base`` have a ``name``, and ``href`` or ``element`` for their data.
+    """The page's configuration. Models and ``base`` have a ``name``, and ``href`` or ``element``
+    for their data.
 
-    ``virtual_scale`` is the first dial value; None for 1 with photographs, else 0 (everything), and then what suits the
-    device.
+    ``virtual_scale`` is the first dial value; None for 1 with photographs, else 0 (everything), and
+    then what suits the device.
     """
     return {
-        "title": models[0]["name"], "model": models[0], "base": base, "others": models[1:], "cameras": cameras,
+        "title": models[0]["name"],
+        "model": models[0],
+        "base": base,
+        "others": models[1:],
+        "cameras": cameras,
         "virtual_scale": virtual_scale,
-    }  # fmt: skip
+    }
 
 
 def write_viewer_page(
@@ -150,10 +185,14 @@ def write_viewer_page(
 ) -> tuple[Gaussians, tuple[str, ...]]:
     """Writes the page as one file with the splats in it; the same arguments give the same bytes.
 
-    ``virtual_scale`` is as in ``page_config``; ``exact`` includes float32, not SPZ. Returns the Gaussians as the page
-    shows them, and a line for each loss.
+    ``virtual_scale`` is as in ``page_config``; ``exact`` includes float32, not SPZ. Returns the
+    Gaussians as the page shows them, and a line for each loss.
     """
-    shown, placed, payload = cameras or model.cameras, model.placed and not cameras, Payload.of(model)
+    shown, placed, payload = (
+        cameras or model.cameras,
+        model.placed and not cameras,
+        Payload.of(model),
+    )
     entries = [camera_entry(each, placed) for each in shown]
     config = page_config([{"name": payload.name, "element": ELEMENT}], None, entries, virtual_scale)
     with atomic_path(path) as temporary:
@@ -170,7 +209,9 @@ def write_viewer_page(
 
 
 def _poster(gaussians: Gaussians, camera: Camera, virtual_scale: float) -> str:
-    """An element with the view of a camera as a JPEG, for the time until the page has drawn its own."""
+    """An element with the view of a camera as a JPEG, for the time until the page has drawn its
+    own.
+    """
     scale = min(POSTER_SIDE / max(camera.width, camera.height), 1.0)
     width, height = (max(round(scale * side), 1) for side in (camera.width, camera.height))
     small = camera.resized(width, height)
@@ -183,7 +224,9 @@ def _poster(gaussians: Gaussians, camera: Camera, virtual_scale: float) -> str:
 
 
 def policy(connect: str = "") -> str:
-    """The page's Content-Security-Policy; ``connect`` is a further source that it may fetch from."""
+    """The page's Content-Security-Policy; ``connect`` is a further source that it may fetch
+    from.
+    """
     digests = [hashlib.sha256(_static_file(name).encode()).digest() for name in (SCRIPT, STYLE)]
     script, style = (f"'sha256-{base64.b64encode(each).decode()}'" for each in digests)
     return (
@@ -195,11 +238,15 @@ def policy(connect: str = "") -> str:
 def document(
     config: Mapping[str, Any], data: Iterable[bytes] = (), meta: str = "", poster: str = ""
 ) -> Iterator[bytes]:
-    """The page in pieces, because data may be large; ``meta`` is added to its head, ``poster`` above its canvas."""
+    """The page in pieces, because data may be large; ``meta`` is added to its head, ``poster``
+    above its canvas.
+    """
     content = {
         "STYLE": f"{meta}<style>{_static_file(STYLE)}</style>",
         "POSTER": poster,
-        "CONFIG": f'<script type="application/json" id="clod-config">{script_json(config)}</script>',
+        "CONFIG": (
+            f'<script type="application/json" id="clod-config">{script_json(config)}</script>'
+        ),
         "SCRIPT": f'<script type="module">{_static_file(SCRIPT)}</script>',
     }
     for number, part in enumerate(re.split("<!--CLOD-([A-Z]+)-->", _static_file("page.html"))):
@@ -210,10 +257,15 @@ def document(
 
 
 def _elements(data: bytes) -> Iterator[bytes]:
-    """Script elements with the bytes as base64; large data are divided among several with the same id."""
+    """Script elements with the bytes as base64; large data are divided among several with the same
+    id.
+    """
     for start in range(0, len(data), PART):
         part = base64.b64encode(data[start : start + PART])
-        yield b'<script type="application/octet-stream" id="%s">%s</script>\n' % (ELEMENT.encode(), part)
+        yield b'<script type="application/octet-stream" id="%s">%s</script>\n' % (
+            ELEMENT.encode(),
+            part,
+        )
 
 
 @cache

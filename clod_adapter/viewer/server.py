@@ -1,7 +1,8 @@
 """Serves the page over HTTP on the loopback address, from a fixed set of responses.
 
-Requests select one of the responses; no folder is served, no file is opened, nothing is changed. A request is answered
-only if its Host header names this machine, which protects against DNS rebinding by other pages.
+Requests select one of the responses; no folder is served, no file is opened, nothing is changed. A
+request is answered only if its Host header names this machine, which protects against DNS rebinding
+by other pages.
 """
 
 import re
@@ -21,14 +22,19 @@ HOST = "127.0.0.1"
 LOOPBACK = re.compile(r"(127\.0\.0\.1|localhost)(:\d{1,5})?", re.ASCII)
 IDLE_TIMEOUT = 30  # of a connection between responses, seconds
 HEADERS = {
-    "Cache-Control": "no-store", "X-Content-Type-Options": "nosniff", "Cross-Origin-Resource-Policy": "same-origin",
-    "Cross-Origin-Opener-Policy": "same-origin", "Referrer-Policy": "no-referrer",
-}  # fmt: skip
+    "Cache-Control": "no-store",
+    "X-Content-Type-Options": "nosniff",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Referrer-Policy": "no-referrer",
+}
 
 
 @dataclass(frozen=True)
 class Response:
-    """The response to a path; ``blocks`` returns its bytes in pieces, ``policy`` is the Content-Security-Policy."""
+    """The response to a path; ``blocks`` returns its bytes in pieces, ``policy`` is the
+    Content-Security-Policy.
+    """
 
     media_type: str
     size: int
@@ -37,7 +43,9 @@ class Response:
 
 
 class Server(ThreadingHTTPServer):
-    """Serves ``responses``, by path, on loopback once ``serve_forever`` runs; port 0 selects a free one."""
+    """Serves ``responses``, by path, on loopback once ``serve_forever`` runs; port 0 selects a free
+    one.
+    """
 
     # Not daemons: a thread that holds a tensor when the interpreter exits would abort the process.
     daemon_threads = False
@@ -50,7 +58,8 @@ class Server(ThreadingHTTPServer):
             super().__init__((HOST, port), _Handler)
         except OSError as error:
             raise ClodError(
-                f"port {port} of {HOST} is not available ({error.strerror}); choose another, or 0 for a free one"
+                f"port {port} of {HOST} is not available ({error.strerror}); choose another, or 0"
+                " for a free one"
             ) from error
 
     @property
@@ -79,7 +88,8 @@ class Server(ThreadingHTTPServer):
         for request in list(self._sockets):
             with suppress(OSError):
                 request.shutdown(socket.SHUT_RDWR)
-        with suppress(RuntimeError):  # of a thread that a Ctrl-C kept from starting; Python waits for the others
+        # of a thread that a Ctrl-C kept from starting; Python waits for the others
+        with suppress(RuntimeError):
             super().server_close()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
@@ -96,7 +106,8 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         hosts = self.headers.get_all("Host") or []
-        if len(hosts) != 1 or not LOOPBACK.fullmatch(hosts[0].lower()):  # an ssh tunnel may have another port
+        # an ssh tunnel may have another port
+        if len(hosts) != 1 or not LOOPBACK.fullmatch(hosts[0].lower()):
             self.send_error(HTTPStatus.MISDIRECTED_REQUEST)
             return
         response = self.server.responses.get(self.path.partition("?")[0])
@@ -108,7 +119,8 @@ class _Handler(BaseHTTPRequestHandler):
         self.send_header("Content-Length", str(response.size))
         self.send_header("Content-Security-Policy", f"{response.policy}; frame-ancestors 'none'")
         self.end_headers()
-        self.connection.settimeout(None)  # a page that is busy with a file's first rows takes no bytes
+        # a page that is busy with a file's first rows takes no bytes
+        self.connection.settimeout(None)
         for block in response.blocks() if self.command == "GET" else ():
             self.wfile.write(block)
         self.connection.settimeout(self.timeout)

@@ -1,4 +1,6 @@
-"""The alignment of a checkpoint with its cameras: what fits, which frame is suggested, which screen filter is found."""
+"""The alignment of a checkpoint with its cameras: what fits, which frame is suggested, which screen
+filter is found.
+"""
 
 import math
 import re
@@ -29,7 +31,10 @@ def pair() -> tuple[Gaussians, list[View]]:
 
 
 def posed(views: Sequence[View], change: Callable[[Tensor], Tensor]) -> list[View]:
-    return [View(replace(view.camera, viewmat=change(view.camera.viewmat).float()), view.image) for view in views]
+    return [
+        View(replace(view.camera, viewmat=change(view.camera.viewmat).float()), view.image)
+        for view in views
+    ]
 
 
 def in_world(views: Sequence[View], scale: float, rotation: Tensor, offset: Tensor) -> list[View]:
@@ -42,7 +47,12 @@ def test_an_aligned_file_fits_under_any_exposure(pair: tuple[Gaussians, list[Vie
     base, views = pair
     found = check_alignment(base, views)
     assert found.fits and not found.on_white and found.views == 8
-    assert found.explained == 1 and found.correlation > 0.9 and found.margin > 6 and 0 < found.in_view <= 1
+    assert (
+        found.explained == 1
+        and found.correlation > 0.9
+        and found.margin > 6
+        and 0 < found.in_view <= 1
+    )
     darker = [View(view.camera, (view.image * 0.4).round().to(torch.uint8)) for view in views]
     assert check_alignment(base, darker).fits
 
@@ -55,17 +65,30 @@ def test_measures_match_their_definitions(pair: tuple[Gaussians, list[View]]) ->
     photographs = torch.stack([view.image / 255 for view in views])
     constants = photographs.mean((1, 2), keepdim=True)
     for value, images in ((found.psnr, renders), (found.mean_colour_psnr, constants)):
-        assert value == pytest.approx(-10 * math.log10((images - photographs).square().mean()), abs=1e-4)
-    both = torch.stack([(renders - renders.mean((1, 2), keepdim=True)).flatten(), (photographs - constants).flatten()])
-    assert found.correlation == pytest.approx(float(torch.nn.functional.cosine_similarity(*both, dim=0)), abs=1e-4)
+        assert value == pytest.approx(
+            -10 * math.log10((images - photographs).square().mean()), abs=1e-4
+        )
+    both = torch.stack(
+        [
+            (renders - renders.mean((1, 2), keepdim=True)).flatten(),
+            (photographs - constants).flatten(),
+        ]
+    )
+    assert found.correlation == pytest.approx(
+        float(torch.nn.functional.cosine_similarity(*both, dim=0)), abs=1e-4
+    )
 
 
 MIRRORED = torch.diag(EYE.new_tensor([-1.0, 1, 1])) @ EYE[[1, 2, 0]]
 BACKWARD = torch.diag(torch.tensor([1.0, -1, -1, 1]))
 FRAMES = {
     "file's -y, z, x (mirrored)": lambda views: in_world(views, 1.0, MIRRORED, NONE),
-    "4 times as large and moved by (": lambda views: in_world(views, 4.0, EYE, EYE.new_tensor([3.0, -2, 1])),
-    "negate the y and z axes of their poses": lambda views: posed(views, lambda pose: BACKWARD @ pose),
+    "4 times as large and moved by (": lambda views: in_world(
+        views, 4.0, EYE, EYE.new_tensor([3.0, -2, 1])
+    ),
+    "negate the y and z axes of their poses": lambda views: posed(
+        views, lambda pose: BACKWARD @ pose
+    ),
     "and invert them": lambda views: posed(views, lambda pose: torch.linalg.inv(pose) @ BACKWARD),
 }
 
@@ -81,7 +104,12 @@ def test_another_frame_is_named(pair: tuple[Gaussians, list[View]], says: str) -
     elsewhere = FRAMES[says](views)
     found = check_alignment(base, elsewhere)
     guess = guess_frame(base, elsewhere, found)
-    assert not found.fits and guess is not None and guess.psnr > found.mean_colour_psnr + 3 and guess.clear
+    assert (
+        not found.fits
+        and guess is not None
+        and guess.psnr > found.mean_colour_psnr + 3
+        and guess.clear
+    )
     assert says in re.sub(r"-?\d+(\.\d+)?", rounded, guess.frame.description)
     back = scene_in(Scene(tuple(elsewhere), ()), guess.frame)
     assert check_alignment(base, back.train).psnr > check_alignment(base, views).psnr - 1
@@ -89,10 +117,16 @@ def test_another_frame_is_named(pair: tuple[Gaussians, list[View]], says: str) -
 
 def test_frames_of_trainers(pair: tuple[Gaussians, list[View]]) -> None:
     _, views = pair
-    viewmats = torch.stack([v.camera.viewmat.double() for v in in_world(views, 3.0, FLIP, NONE + 2)])
-    points = torch.randn(500, 3, generator=torch.Generator().manual_seed(1)) * torch.tensor([1.0, 5, 2]) + 3
+    viewmats = torch.stack(
+        [v.camera.viewmat.double() for v in in_world(views, 3.0, FLIP, NONE + 2)]
+    )
+    points = (
+        torch.randn(500, 3, generator=torch.Generator().manual_seed(1)) * torch.tensor([1.0, 5, 2])
+        + 3
+    )
     frames = known_frames(viewmats, points)
-    # nerfstudio's: the cameras' mean is the origin, their mean up is z, and their farthest coordinate is 1.
+    # nerfstudio's: the cameras' mean is the origin, their mean up is z, and their farthest
+    # coordinate is 1.
     of_nerfstudio = [frame for frame in frames if "nerfstudio" in frame.description]
     assert len(of_nerfstudio) == len(NERFSTUDIO_TURNS)
     for frame in of_nerfstudio:
@@ -101,27 +135,35 @@ def test_frames_of_trainers(pair: tuple[Gaussians, list[View]]) -> None:
         assert poses[:, :3, 3].abs().max() == pytest.approx(1, abs=1e-6)
         up = -poses[:, :3, 1].mean(0)
         assert up[:2].abs().max() < 1e-6 < up[2]
-    # gsplat's: the points' median is near the origin and their principal axes are the axes, the longest first.
+    # gsplat's: the points' median is near the origin and their principal axes are the axes, the
+    # longest first.
     of_gsplat = [frame for frame in frames if "gsplat" in frame.description]
     assert len(of_gsplat) == 5  # without the points, and with each sign of their axes
     for frame in of_gsplat[1:]:
         # The map that takes the cameras there, from where the first one is in both.
         back, there = torch.linalg.inv(frame.of(viewmats)), torch.linalg.inv(viewmats)
-        scale = (back[0, :3, 3] - back[1, :3, 3]).norm() / (there[0, :3, 3] - there[1, :3, 3]).norm()
+        scale = (back[0, :3, 3] - back[1, :3, 3]).norm() / (
+            there[0, :3, 3] - there[1, :3, 3]
+        ).norm()
         rotation = back[0, :3, :3] @ there[0, :3, :3].T
         moved = scale * (points.double() - there[0, :3, 3]) @ rotation.T + back[0, :3, 3]
         assert torch.linalg.det(rotation) == pytest.approx(1)
-        assert moved.quantile(0.5, dim=0).abs().max() < 0.02  # to what a median per axis changes in a turn
+        # to what a median per axis changes in a turn
+        assert moved.quantile(0.5, dim=0).abs().max() < 0.02
         spread = moved.T.cov()
         assert (spread - torch.diag(spread.diag())).abs().max() < 1e-6 * spread.max()
         assert spread.diag().tolist() == sorted(spread.diag().tolist(), reverse=True)
 
 
 def seen_with(name: str, views: int = 5) -> tuple[Gaussians, tuple[View, ...]]:
-    """A checkpoint that names no filter, and photographs of it drawn with ``name``: of Gaussians of a pixel at most."""
+    """A checkpoint that names no filter, and photographs of it drawn with ``name``: of Gaussians of
+    a pixel at most.
+    """
     fine = gaussians(1500, 0, 0, size=0.025)
     noisy = fine.sh0 + 0.1 * torch.randn(fine.sh0.shape, generator=torch.Generator().manual_seed(1))
-    return fine.replace(sh0=noisy), photograph(fine.replace(screen_filter=FILTERS[name]), ring(views, 48, 36))
+    return fine.replace(sh0=noisy), photograph(
+        fine.replace(screen_filter=FILTERS[name]), ring(views, 48, 36)
+    )
 
 
 @pytest.mark.parametrize(("name", "expected"), [("off", "on"), ("on", "mip"), ("mip", "off")])
@@ -142,7 +184,9 @@ def test_expected_filter_is_kept_without_a_clear_difference() -> None:
 
 
 def test_a_filter_must_be_better_in_most_views() -> None:
-    """Two of five photographs have another filter, which is better in the mean but not in most views."""
+    """Two of five photographs have another filter, which is better in the mean but not in most
+    views.
+    """
     base, classic = seen_with("off")
     _, other = seen_with("on")
     few = [*classic[:3], *(View(view.camera, view.image) for view in other[3:])]

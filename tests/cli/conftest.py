@@ -20,7 +20,9 @@ from runs import Server, accepted
 
 @pytest.fixture(scope="session", autouse=True)
 def signals_arrive() -> Iterator[None]:
-    """Signals reach the tests and their child processes, also if the shell ignores or blocks them."""
+    """Signals reach the tests and their child processes, also if the shell ignores or blocks
+    them.
+    """
     blocked = signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDING)
     before = {number: signal.signal(number, signal.SIG_DFL) for number in ENDING}
     signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -32,7 +34,9 @@ def signals_arrive() -> Iterator[None]:
 
 @pytest.fixture(autouse=True)
 def shorter(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Cameras are placed for small images, few are added, and the search for another frame gives up early."""
+    """Cameras are placed for small images, few are added, and the search for another frame gives up
+    early.
+    """
     monkeypatch.setattr(camera_placement, "WIDTH", 62)
     monkeypatch.setattr(camera_placement, "HEIGHT", 46)
     monkeypatch.setattr(pseudo_views, "ADDED", 8)
@@ -54,7 +58,8 @@ class Done(NamedTuple):
 
 @pytest.fixture(scope="session")
 def run_in(capture: Any, dialled: Path) -> Callable[..., Done]:
-    """Runs ``clod-adapt`` in a folder, in this process, to the exit code ``code``; it ``accept``s its loss.
+    """Runs ``clod-adapt`` in a folder, in this process, to the exit code ``code``; it ``accept``s
+    its loss.
 
     Text is split into words, of which BASE, SCENE, DIAL and ADAPTER are the shared files.
     """
@@ -63,7 +68,9 @@ def run_in(capture: Any, dialled: Path) -> Callable[..., Done]:
 
     def run(folder: Path, *words: object, code: int = 0, accept: bool = True) -> Done:
         out, err = io.StringIO(), io.StringIO()
-        parts = [part for word in words for part in (word.split() if isinstance(word, str) else [word])]
+        parts = [
+            part for word in words for part in (word.split() if isinstance(word, str) else [word])
+        ]
         given = [str(shared.get(part, part)) for part in parts]
         with pytest.MonkeyPatch.context() as patch, redirect_stdout(out), redirect_stderr(err):
             patch.chdir(folder)
@@ -79,7 +86,9 @@ def run_in(capture: Any, dialled: Path) -> Callable[..., Done]:
 
 
 @pytest.fixture
-def clod(run_in: Callable[..., Done], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Done]:
+def clod(
+    run_in: Callable[..., Done], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Callable[..., Done]:
     """``run_in`` with the test's folder, which is the current one."""
     monkeypatch.chdir(tmp_path)
     return partial(run_in, tmp_path)
@@ -87,8 +96,13 @@ def clod(run_in: Callable[..., Done], tmp_path: Path, monkeypatch: pytest.Monkey
 
 @pytest.fixture
 def blank_figure(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Replaces the figure of ``clod-adapt robustness``, which takes a second to draw, by an empty file."""
-    monkeypatch.setattr("clod_adapter.report.robustness_figure.robustness_figure", lambda path, *_: Path(path).touch())
+    """Replaces the figure of ``clod-adapt robustness``, which takes a second to draw, by an empty
+    file.
+    """
+    monkeypatch.setattr(
+        "clod_adapter.report.robustness_figure.robustness_figure",
+        lambda path, *_: Path(path).touch(),
+    )
 
 
 @pytest.fixture(scope="session")

@@ -31,7 +31,8 @@ words = sys.argv[1:]
 if words == ["--version"]:
     print("node:v22.1.0;splat-transform v3.7.0")
 elif words != ["--list-gpus"]:
-    out, inputs = pathlib.Path(words[-1]), [pathlib.Path(word) for word in words if word.endswith("ply")]
+    out = pathlib.Path(words[-1])
+    inputs = [pathlib.Path(word) for word in words if word.endswith("ply")]
     sizes = [path.stat().st_size for path in inputs if path.exists()]
     out.write_text(json.dumps({"words": words, "sizes": sizes}))
     BEHAVE
@@ -39,7 +40,9 @@ elif words != ["--list-gpus"]:
 
 
 @pytest.fixture
-def tool(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
+def tool(
+    tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+) -> Callable[[str], None]:
     """A stand-in for splat-transform that stores its arguments and runs ``behave``."""
 
     def make(behave: str = "pass") -> None:
@@ -64,33 +67,52 @@ def test_baking(clod: Any, capture: Any, dialled: Path) -> None:
     (output,), data = done.report["outputs"], Path("x.ply").read_bytes()
     assert output == {"file": "x.ply", "virtual_scale": 2, "count": len(want), "bytes": len(data)}
     assert done.report["notes"] == [] and "baked for 8 training cameras; lossy" in done.err
-    assert f"{len(want)} of 300 Gaussians, s = 2\n" in done.err and "scales include growth" in done.err
+    assert (
+        f"{len(want)} of 300 Gaussians, s = 2\n" in done.err and "scales include growth" in done.err
+    )
     assert len(want) < 300 and load("x.ply").gaussians == want
     # SIBR takes the count from the third line, and rows of float32 in Inria's order without gaps.
     head, _, rows = data.partition(b"end_header\n")
-    assert head.split(b"\n")[:3] == [b"ply", b"format binary_little_endian 1.0", b"element vertex %d" % len(want)]
+    assert head.split(b"\n")[:3] == [
+        b"ply",
+        b"format binary_little_endian 1.0",
+        b"element vertex %d" % len(want),
+    ]
     assert rows == inria_rows(want).tobytes()
     report = clod(EXPORT, "--sv 2 --images SCENE -o x.ply").report
     cameras = [view.camera for view in clod_adapter.load_scene(capture.scene).train]
     model, again = load(dialled).gaussians, load("x.ply").gaussians
     assert report["cameras"] == 8
-    torch.testing.assert_close(again.opacity_logits, clod_adapter.bake(model, 2.0, cameras=cameras).opacity_logits)
+    torch.testing.assert_close(
+        again.opacity_logits, clod_adapter.bake(model, 2.0, cameras=cameras).opacity_logits
+    )
 
-    there, camera = f"{EXPORT} --camera 003 --images SCENE", next(each for each in cameras if each.name == "003.png")
+    there, camera = (
+        f"{EXPORT} --camera 003 --images SCENE",
+        next(each for each in cameras if each.name == "003.png"),
+    )
     n = sum(int(clod_adapter.render(model, camera, s).kept.sum()) for s in (4.0, 1.0)) // 2
     done, plain = clod(there, "-o one.ply --keep", n), load("one.ply")
     (output,) = done.report["outputs"]
     assert done.report["camera"] == "003.png" and output["count"] == n == len(plain.gaussians)
-    want = clod_adapter.render(model, camera, output["virtual_scale"])  # there the image is the dial's
-    torch.testing.assert_close(clod_adapter.render(plain.gaussians, camera).image, want.image, atol=2e-5, rtol=0)
+    # there the image is the dial's
+    want = clod_adapter.render(model, camera, output["virtual_scale"])
+    torch.testing.assert_close(
+        clod_adapter.render(plain.gaussians, camera).image, want.image, atol=2e-5, rtol=0
+    )
     assert "exact at the camera of 003.png only" in done.err
     assert any("for the camera at (" in comment for comment in plain.comments)
     report = clod(there, "--fps 1 -o fast.ply").report  # timed here, at that camera
-    assert report["outputs"][0]["virtual_scale"] == 1 and any("frames timed here" in note for note in report["notes"])
+    assert report["outputs"][0]["virtual_scale"] == 1 and any(
+        "frames timed here" in note for note in report["notes"]
+    )
 
     save("old.ply", model)  # as before cameras were stored
     (note,) = clod("export old.ply --sv 2 -o x.ply --json").report["notes"]
-    assert note == "old.ply stores no cameras: baked for 16 placed ones; --images gives a better result"
+    assert (
+        note
+        == "old.ply stores no cameras: baked for 16 placed ones; --images gives a better result"
+    )
     want = clod_adapter.bake(model, 2.0, cameras=clod_adapter.place_cameras(model, views=16))
     assert torch.equal(load("x.ply").gaussians.means, want.means)
 
@@ -102,41 +124,62 @@ def test_levels(clod: Any, dialled: Path, tmp_path: Path) -> None:
     assert [load(name).gaussians for name in names] == [baked(dialled, s) for s in (1.0, 2.5, 4.0)]
 
 
-def test_sets_have_a_level_for_each_band_of_distances(clod: Any, dialled: Path, tmp_path: Path) -> None:
-    """The finest is the checkpoint; in others are those that reach the middle of the band, as large as there."""
+def test_sets_have_a_level_for_each_band_of_distances(
+    clod: Any, dialled: Path, tmp_path: Path
+) -> None:
+    """The finest is the checkpoint; in others are those that reach the middle of the band, as large
+    as there.
+    """
     done = clod(EXPORT, "--3dtiles --multiplier 2 -o tiles")
     (output,), model = done.report["outputs"], load(dialled).gaussians
     counts, begins = ([level[name] for level in output["levels"]] for name in ("count", "begins"))
     near = model.attenuation.near_distance
     assert begins[:3] == [0.0, near, 2 * near] and f"level 1 begins at {near:.4g}" in done.err
-    assert counts[0] == model.whole and counts == sorted(counts, reverse=True) and counts[-1] >= 0.01 * model.whole
+    assert (
+        counts[0] == model.whole
+        and counts == sorted(counts, reverse=True)
+        and counts[-1] >= 0.01 * model.whole
+    )
     levels = clod_adapter.bake_levels(model, 2.0)
     assert levels[0].gaussians == clod_adapter.detach(model)
     for k, level in enumerate(levels[1:], 1):
         reached = model.sigma_d > near * 2 ** (k - 0.5)
-        assert torch.equal(level.gaussians.means, model.means[reached]) and len(level.gaussians) == counts[k]
+        assert (
+            torch.equal(level.gaussians.means, model.means[reached])
+            and len(level.gaussians) == counts[k]
+        )
     root = json.loads((tmp_path / "tiles" / "tileset.json").read_text())["root"]
     assert root["geometricError"] > root["children"][0]["geometricError"] >= 0
 
 
 def test_a_lower_sh_degree_is_fitted(clod: Any, capture: Any) -> None:
-    """Nearer to the renders of all degrees than one that is cut; what needs no higher degree stays as it is."""
+    """Nearer to the renders of all degrees than one that is cut; what needs no higher degree stays
+    as it is.
+    """
     views = clod_adapter.load_scene(capture.scene)
     base = scenes.gaussians(300, 3, 0).replace(means=capture.gaussians.means)
     capture.write("rich.ply", base)
     report = clod("export rich.ply --sh-degree 1 --images SCENE -o x.ply --json").report
     (note,) = (note for note in report["notes"] if "--sh-degree 1" in note)
     fitted, cut = load("x.ply").gaussians, base.without_bands(1)
-    assert fitted.sh_degree == 1 and "against those with degree 3 (fitted to 8 training cameras)" in note
+    assert (
+        fitted.sh_degree == 1
+        and "against those with degree 3 (fitted to 8 training cameras)" in note
+    )
 
     def error(shown: clod_adapter.Gaussians) -> float:
         cameras = [view.camera for view in views.train]
-        pairs = ((clod_adapter.render(each, camera).image for each in (shown, base)) for camera in cameras)
+        pairs = (
+            (clod_adapter.render(each, camera).image for each in (shown, base))
+            for camera in cameras
+        )
         return sum(float((one - other).square().mean()) for one, other in pairs)
 
     assert error(fitted) < 0.7 * error(cut)
     plain = base.replace(shN=torch.cat([base.shN[:, :3], torch.zeros(300, 12, 3)], 1))
-    assert torch.allclose(with_sh_degree(plain, 1, [view.camera for view in views.train]).shN, plain.shN[:, :3])
+    assert torch.allclose(
+        with_sh_degree(plain, 1, [view.camera for view in views.train]).shN, plain.shN[:, :3]
+    )
     assert "has degree 1, and stays as it is" in clod("export x.ply --sh-degree 2 -o y.ply").err
 
 
@@ -149,7 +192,11 @@ def test_formats(clod: Any, dialled: Path, suffix: str) -> None:
     assert output["virtual_scale"] == (None if kept else 1) and (output["count"] == 300 or not kept)
     assert (again.gaussians.sigma_d is not None) == (again.gaussians.growth_d is not None) == kept
     if suffix == ".ply":
-        assert (again.gaussians, again.calibration, again.notes) == (model.gaussians, model.calibration, ())
+        assert (again.gaussians, again.calibration, again.notes) == (
+            model.gaussians,
+            model.calibration,
+            (),
+        )
     clod(EXPORT, f"--sv 2 -o baked{suffix}")
     clod(f"export baked{suffix} -o again.ply")
     header = Path("again.ply").read_bytes().partition(b"end_header")[0].decode()
@@ -157,18 +204,29 @@ def test_formats(clod: Any, dialled: Path, suffix: str) -> None:
 
 
 def test_losses_are_noted(clod: Any, dialled: Path, tmp_path: Path) -> None:
-    """Harmonics and foreign columns; positions far from 0 become doubles. Columns of settings are not dropped."""
+    """Harmonics and foreign columns; positions far from 0 become doubles. Columns of settings are
+    not dropped.
+    """
     report = clod("export BASE -o x.splat --json").report
-    assert report["outputs"] == [{"file": "x.splat", "virtual_scale": None, "count": 300, "bytes": 300 * 32}]
+    assert report["outputs"] == [
+        {"file": "x.splat", "virtual_scale": None, "count": 300, "bytes": 300 * 32}
+    ]
     assert "view-dependent colour is dropped" in report["notes"]
     model, element = load(dialled), PlyData.read(str(dialled), mmap=False)["vertex"]
-    write_rows(tmp_path / "labelled.ply", with_columns(element.data, label=7), comments=element.comments)
+    write_rows(
+        tmp_path / "labelled.ply", with_columns(element.data, label=7), comments=element.comments
+    )
     assert clod("export labelled.ply -o x.ply --json").report["notes"] == ["columns dropped: label"]
-    assert load("x.ply").gaussians == model.gaussians and load("x.ply").vertex.dtype == model.vertex.dtype
+    assert (
+        load("x.ply").gaussians == model.gaussians
+        and load("x.ply").vertex.dtype == model.vertex.dtype
+    )
     far = element.data.astype([(n, "f8" if n in "xyz" else t) for n, t in element.data.dtype.descr])
     far["x"] += 437_000.0
     there = tuple(viewpoint.moved([437_000.0, 0, 0]) for viewpoint in model.calibration.viewpoints)
-    settings = Metadata(model.gaussians.attenuation, calibration=replace(model.calibration, viewpoints=there))
+    settings = Metadata(
+        model.gaussians.attenuation, calibration=replace(model.calibration, viewpoints=there)
+    )
     write_rows(tmp_path / "far.ply", far, comments=write_comments(settings))
     report, again = clod("export far.ply --sv 2 -o x.ply --json").report, load("x.ply")
     assert any("x, y and z are doubles" in note for note in report["notes"])
@@ -189,7 +247,9 @@ def test_order_by_extinction(clod: Any, capture: Any, dialled: Path) -> None:
     assert any("rows in the order" in comment for comment in ordered.comments)
     n = len(clod_adapter.bake(model.gaussians, 3.0, cameras=cameras))
     clod(words, "-o first.ply --keep", n)
-    assert n < 300 and torch.equal(load("first.ply").gaussians.means, model.gaussians.means[rows[:n]])
+    assert n < 300 and torch.equal(
+        load("first.ply").gaussians.means, model.gaussians.means[rows[:n]]
+    )
     clod(words, "--camera 003 --sv 2 -o one.ply")
     camera = next(camera for camera in cameras if camera.name == "003.png")
     ordered = model.gaussians.select(clod_adapter.order_by_extinction(model.gaussians, [camera]))
@@ -202,27 +262,46 @@ def test_splat_transform(clod: Any, dialled: Path, tmp_path: Path, tool: Any) ->
     notes = done.report["notes"]
     assert " took " in done.err and "splat-transform rounds values and sorts the Gaussians" in notes
     assert any("without a GPU" in note for note in notes) and files(tmp_path) == ["x.sog"]
-    assert said["words"][:5] == ["-w", "-g", "cpu", "-i", "1"] and said["words"][-1].endswith("packed.sog")
+    assert said["words"][:5] == ["-w", "-g", "cpu", "-i", "1"] and said["words"][-1].endswith(
+        "packed.sog"
+    )
     assert said["sizes"][0] > 92 * done.report["outputs"][0]["count"]
     tool("(out.parent / '0_0').mkdir(); (out.parent / '0_0' / 'a.webp').write_text('1234')")
     (tmp_path / "-o").mkdir()  # empty; not an option of the tool
     (output,) = clod(EXPORT, "--lod-meta --out=-o").report["outputs"]
     levels = clod_adapter.bake_levels(load(dialled).gaussians)
     counts = [len(level.gaussians) for level in levels]
-    assert [level["count"] for level in output["levels"]] == counts and output["count"] == sum(counts)
+    assert [level["count"] for level in output["levels"]] == counts and output["count"] == sum(
+        counts
+    )
     assert files(tmp_path / "-o") == ["0_0", "0_0/a.webp", "lod-meta.json"]
     text = Path(output["file"]).read_text()
     words = json.loads(text)["words"][5:]
-    assert output["bytes"] == len(text) + 4 and words[:4] == ["--lod-chunk-extent", "0", "--lod-chunk-min", "8"]
-    assert words[5::3] == ["-l"] * len(levels) and words[6::3] == [str(k) for k in range(len(levels))]
+    assert output["bytes"] == len(text) + 4 and words[:4] == [
+        "--lod-chunk-extent",
+        "0",
+        "--lod-chunk-min",
+        "8",
+    ]
+    assert words[5::3] == ["-l"] * len(levels) and words[6::3] == [
+        str(k) for k in range(len(levels))
+    ]
     assert words[-1].endswith("/lod-meta.json")
 
 
-def test_failure_of_the_tool_leaves_no_file(clod: Any, tmp_path: Path, tool: Any, monkeypatch: Any) -> None:
+def test_failure_of_the_tool_leaves_no_file(
+    clod: Any, tmp_path: Path, tool: Any, monkeypatch: Any
+) -> None:
     monkeypatch.setattr(splat_transform, "LIMIT_EACH", 0.0)
     interrupt = "import os, signal, time; os.kill(os.getppid(), signal.SIGINT); time.sleep(60)"
     for words, behave, limit, code, said in (
-        ("--sv 2 -o x.sog", "import time; time.sleep(60)", 0.5, 2, "was ended, it took longer than 0 s\n"),
+        (
+            "--sv 2 -o x.sog",
+            "import time; time.sleep(60)",
+            0.5,
+            2,
+            "was ended, it took longer than 0 s\n",
+        ),
         ("--lod-meta -o out", interrupt, 60.0, 130, "interrupted\n"),
     ):
         monkeypatch.setattr(splat_transform, "LIMIT", limit)
@@ -239,7 +318,9 @@ def test_the_real_tool(clod: Any, dialled: Path, tmp_path: Path) -> None:
     clod("export DIAL --lod-meta --multiplier 2 -o out")
     meta = json.loads((tmp_path / "out" / "lod-meta.json").read_text())
     levels = clod_adapter.bake_levels(load(dialled).gaussians, 2.0)
-    assert meta["counts"] == [len(level.gaussians) for level in levels] and meta["lodLevels"] == len(levels)
+    assert meta["counts"] == [len(level.gaussians) for level in levels] and meta[
+        "lodLevels"
+    ] == len(levels)
     assert all((tmp_path / "out" / name).is_file() for name in meta["filenames"])
     assert not [name for name in files(tmp_path) if "tmp" in name]
 
@@ -249,7 +330,9 @@ def test_page_holds_the_splat_and_its_dial(clod: Any, dialled: Path, tmp_path: P
     def page(*words: str, held: str) -> tuple[Any, Any, Any]:
         """What was printed, the settings of the page, and the splat in it."""
         done, text = clod(EXPORT, "-o page.html", *words), Path("page.html").read_text("utf-8")
-        data, config = (re.findall(f'id="clod-{part}">(.*?)</script>', text)[0] for part in ("model", "config"))
+        data, config = (
+            re.findall(f'id="clod-{part}">(.*?)</script>', text)[0] for part in ("model", "config")
+        )
         Path(held).write_bytes(base64.b64decode(data))
         return done, json.loads(config), load(held)
 
@@ -257,9 +340,15 @@ def test_page_holds_the_splat_and_its_dial(clod: Any, dialled: Path, tmp_path: P
     (output,) = done.report["outputs"]
     assert config["model"]["name"] == dialled.name and config["virtual_scale"] == 4
     assert any("dial ends at s = 4" in note for note in done.report["notes"])
-    assert "Gaussians, initial dial value s = 4" in done.err and " of " not in done.err.splitlines()[-1]
+    assert (
+        "Gaussians, initial dial value s = 4" in done.err
+        and " of " not in done.err.splitlines()[-1]
+    )
     assert [camera["name"] for camera in config["cameras"]] == [f"{k:03}.png" for k in range(10)]
-    assert held.gaussians.whole == output["count"] == 300 and output["bytes"] == Path("page.html").stat().st_size
+    assert (
+        held.gaussians.whole == output["count"] == 300
+        and output["bytes"] == Path("page.html").stat().st_size
+    )
     assert held.gaussians.sigma_d is not None and held.calibration is not None
     said = re.search(r"PSNR of (\S+) dB against the exact file \(s = 1\)", done.err)
     assert said and float(said[1]) > 40 and [*tmp_path.glob(".tmp-*")] == []

@@ -1,4 +1,6 @@
-"""Kills and signals: inputs are unchanged, outputs are complete or absent, and --resume gives the same files."""
+"""Kills and signals: inputs are unchanged, outputs are complete or absent, and --resume gives the
+same files.
+"""
 
 import json
 import os
@@ -23,7 +25,17 @@ ITERS = 24
 
 @pytest.fixture(scope="module")
 def words(capture: Any) -> list[Any]:
-    return [capture.ply, "--images", capture.scene, "--iters", ITERS, "--max-sv", 4, "--out", "dial.ply"]
+    return [
+        capture.ply,
+        "--images",
+        capture.scene,
+        "--iters",
+        ITERS,
+        "--max-sv",
+        4,
+        "--out",
+        "dial.ply",
+    ]
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +48,11 @@ def undisturbed(server: Server, words: list[Any], tmp_path_factory: pytest.TempP
 
 def assert_whole(folder: Path) -> None:
     """Outputs can be read, and all other files have the name of a temporary file."""
-    readers: list[Any] = [lambda path: json.loads(path.read_text()), clod_adapter.load, clod_adapter.load_adapter]
+    readers: list[Any] = [
+        lambda path: json.loads(path.read_text()),
+        clod_adapter.load,
+        clod_adapter.load_adapter,
+    ]
     known = dict(zip(OUTPUTS, readers, strict=True)) | {STATE: load_state}
     for path in folder.iterdir():
         assert path.name in known or path.name.startswith(".tmp-")
@@ -52,8 +68,12 @@ def assert_same(folder: Path, want: Path) -> None:
     assert found["steps"] == wanted["steps"] and not found["interrupted"]
 
 
-def test_kills(server: Server, words: list[Any], capture: Any, undisturbed: Path, tmp_path: Path) -> None:
-    """A run that replaces earlier files is killed soon after a state was saved, and later, and resumed."""
+def test_kills(
+    server: Server, words: list[Any], capture: Any, undisturbed: Path, tmp_path: Path
+) -> None:
+    """A run that replaces earlier files is killed soon after a state was saved, and later, and
+    resumed.
+    """
     inputs = contents(capture.ply, capture.scene)
     server.run(tmp_path, *words, "--seed", 4)
     child = server.start(tmp_path, *words)
@@ -72,7 +92,9 @@ def test_kills(server: Server, words: list[Any], capture: Any, undisturbed: Path
 def test_one_interrupt_of_training_writes_the_result_so_far(
     server: Server, words: list[Any], undisturbed: Path, tmp_path: Path, clod: Any
 ) -> None:
-    """The state is written too, and the log has only the command's lines. No other run may write there before."""
+    """The state is written too, and the log has only the command's lines. No other run may write
+    there before.
+    """
     child = server.start(tmp_path, *words)
     wait_for(tmp_path / STATE)
     os.kill(child, signal.SIGSTOP)
@@ -83,11 +105,24 @@ def test_one_interrupt_of_training_writes_the_result_so_far(
     os.kill(child, signal.SIGCONT)
     code, log = server.wait(child), log_of(tmp_path)
     report = json.loads((tmp_path / "dial.json").read_text())
-    assert code == 0 and report["interrupted"] and report["resumed_from"] is None and "interrupted after" in log, log
-    assert names(tmp_path) == sorted([*OUTPUTS, STATE]) and load_state(tmp_path / STATE)[0].steps == report["steps"]
-    assert f"--resume resumes from step {report['steps']}, which is in {STATE}" in log and "SIGTERM" not in log
+    assert (
+        code == 0
+        and report["interrupted"]
+        and report["resumed_from"] is None
+        and "interrupted after" in log
+    ), log
+    assert (
+        names(tmp_path) == sorted([*OUTPUTS, STATE])
+        and load_state(tmp_path / STATE)[0].steps == report["steps"]
+    )
+    assert (
+        f"--resume resumes from step {report['steps']}, which is in {STATE}" in log
+        and "SIGTERM" not in log
+    )
     assert_whole(tmp_path)
-    assert f"resuming {STATE} from step {report['steps']}" in server.run(tmp_path, *words, "--resume")
+    assert f"resuming {STATE} from step {report['steps']}" in server.run(
+        tmp_path, *words, "--resume"
+    )
     assert_same(tmp_path, undisturbed)
     assert json.loads((tmp_path / "dial.json").read_text())["resumed_from"] == report["steps"]
 
@@ -95,7 +130,8 @@ def test_one_interrupt_of_training_writes_the_result_so_far(
 INT, TERM = signal.SIGINT, signal.SIGTERM
 SAVING, BOTH = (listeners, "save_state"), sorted([*OUTPUTS, STATE])  # while training
 ABORTED = f"--resume resumes from step {ITERS}, which is in {STATE}\nclod-adapt: interrupted"
-MOMENTS = [  # where signals arrive, which, exit code, files, and the report's "interrupted" or the end of stderr
+# where signals arrive, which, exit code, files, and the report's "interrupted" or the end of stderr
+MOMENTS = [
     ((planner, "sh_degree_losses"), [INT], 130, [], "clod-adapt: interrupted"),
     (SAVING, [signal.SIGUSR1] * 3, 0, BOTH, True),
     (SAVING, [signal.SIGHUP] * 3, 0, BOTH, True),
@@ -107,7 +143,15 @@ MOMENTS = [  # where signals arrive, which, exit code, files, and the report's "
 
 @pytest.mark.parametrize(("place", "numbers", "code", "files", "said"), MOMENTS)
 def test_signals_at_a_moment(
-    clod: Any, words: Any, tmp_path: Path, monkeypatch: Any, place: Any, numbers: Any, code: int, files: Any, said: Any
+    clod: Any,
+    words: Any,
+    tmp_path: Path,
+    monkeypatch: Any,
+    place: Any,
+    numbers: Any,
+    code: int,
+    files: Any,
+    said: Any,
 ) -> None:
     """Warnings may be repeated, as launchers do; a second Ctrl-C or SIGTERM aborts."""
     monkeypatch.setattr(*place, pressing(getattr(*place), *numbers))
@@ -115,15 +159,24 @@ def test_signals_at_a_moment(
     assert names(tmp_path) == files, done
     if code == 0:
         assert done.report["interrupted"] == said and "page" not in done.report["outputs"]
-        assert bool(done.report["rows"]) == bool(done.report["calibration"]) == (place[1] != "extract")
+        assert (
+            bool(done.report["rows"]) == bool(done.report["calibration"]) == (place[1] != "extract")
+        )
     else:
         assert done.err.rstrip().endswith(said), done
-    assert signal.getsignal(INT) is signal.default_int_handler and signal.getsignal(TERM) is signal.SIG_DFL
+    assert (
+        signal.getsignal(INT) is signal.default_int_handler
+        and signal.getsignal(TERM) is signal.SIG_DFL
+    )
 
 
 @pytest.mark.parametrize("number", [INT, TERM])
-def test_ignored_signals(clod: Any, words: list[Any], monkeypatch: pytest.MonkeyPatch, number: int) -> None:
-    """They stay ignored, as in a background job of a script or below nohup; SIGTERM still ends training."""
+def test_ignored_signals(
+    clod: Any, words: list[Any], monkeypatch: pytest.MonkeyPatch, number: int
+) -> None:
+    """They stay ignored, as in a background job of a script or below nohup; SIGTERM still ends
+    training.
+    """
     monkeypatch.setattr(*SAVING, pressing(listeners.save_state, number))
     before = signal.signal(number, signal.SIG_IGN)
     try:
@@ -133,26 +186,40 @@ def test_ignored_signals(clod: Any, words: list[Any], monkeypatch: pytest.Monkey
         signal.signal(number, before)
 
 
-def test_interrupts_of_the_measurement(clod: Any, words: list[Any], tmp_path: Path, monkeypatch: Any) -> None:
-    """The first one keeps the finished rows; one after an interrupt of training aborts, as its message says."""
+def test_interrupts_of_the_measurement(
+    clod: Any, words: list[Any], tmp_path: Path, monkeypatch: Any
+) -> None:
+    """The first one keeps the finished rows; one after an interrupt of training aborts, as its
+    message says.
+    """
     real = measure.evaluate
 
     def evaluate(gaussians: Any, views: Any, dials: list[float], progress: Any, **rest: Any) -> Any:
         pressed = pressing(progress, INT, at=3 * len(views) + 1)
-        return real(gaussians, views, dials, progress=pressed if len(dials) == 5 else progress, **rest)
+        return real(
+            gaussians, views, dials, progress=pressed if len(dials) == 5 else progress, **rest
+        )
 
     monkeypatch.setattr(measure, "evaluate", evaluate)
     report = (done := clod(*words, "--json")).report
     assert [row["virtual_scale"] for row in report["rows"]] == [1, 1.5, 2]
-    assert "measurements were interrupted" in report["notes"][0] in done.err and report["interrupted"] is False
-    assert report["calibration"] is None and clod_adapter.load(tmp_path / "dial.ply").calibration is None
+    assert (
+        "measurements were interrupted" in report["notes"][0] in done.err
+        and report["interrupted"] is False
+    )
+    assert (
+        report["calibration"] is None
+        and clod_adapter.load(tmp_path / "dial.ply").calibration is None
+    )
     assert names(tmp_path) == BOTH
     monkeypatch.setattr(*SAVING, pressing(listeners.save_state, INT))
     done = clod(*words, code=130)
     assert "Ctrl-C again aborts without writing" in done.err and "interrupted after" in done.err
 
 
-def test_closed_terminal_does_not_end_the_writing(server: Server, words: list[Any], tmp_path: Path) -> None:
+def test_closed_terminal_does_not_end_the_writing(
+    server: Server, words: list[Any], tmp_path: Path
+) -> None:
     """It sends SIGHUP, and writing to it is an error."""
     terminal, other = pty.openpty()
     before = f"os.setsid(); terminal = os.open({os.ttyname(other)!r}, os.O_RDWR); "
@@ -163,5 +230,7 @@ def test_closed_terminal_does_not_end_the_writing(server: Server, words: list[An
     os.close(other)
     os.close(terminal)
     assert server.wait(child) == 0
-    assert json.loads((tmp_path / "dial.json").read_text())["interrupted"] and names(tmp_path) == BOTH
+    assert (
+        json.loads((tmp_path / "dial.json").read_text())["interrupted"] and names(tmp_path) == BOTH
+    )
     assert_whole(tmp_path)

@@ -1,4 +1,6 @@
-"""``cli/main.py``: exit codes, pipes, errors of every kind, ``--help``, and progress; ``clod-adapt doctor``."""
+"""``cli/main.py``: exit codes, pipes, errors of every kind, ``--help``, and progress;
+``clod-adapt doctor``.
+"""
 
 import io
 import json
@@ -22,23 +24,39 @@ from clod_adapter.rasterizers import reference
 
 CAUSED = SystemError("returned a result with an exception set")  # as numba hands on a Ctrl-C
 CAUSED.__cause__ = KeyboardInterrupt()
-LITTLE = "error: not enough memory \\(.*\\); free some memory, or raise the limit on it \\(ulimit -v\\)"
-BUG = f"error: this is a bug in clod-adapt {package_version()}, not in the input: please report it, with the lines"
+LITTLE = (
+    "error: not enough memory \\(.*\\); free some memory, or raise the limit on it \\(ulimit -v\\)"
+)
+BUG = (
+    f"error: this is a bug in clod-adapt {package_version()}, not in the input: please report it,"
+    " with the lines"
+)
 
 
 @pytest.mark.parametrize(
     ("error", "code", "said"),
     [
-        (OSError(28, "No space left on device", "a/file"), 2, "error: a/file: No space left on device; check the path"),
-        (KeyboardInterrupt(), 130, "interrupted$"), (CAUSED, 130, "interrupted$"),
-        (SystemError("of numba"), 1, BUG), (RuntimeError("unknown"), 1, BUG),
-        (MemoryError(), 2, LITTLE), (RuntimeError("can't start new thread"), 2, LITTLE),
+        (
+            OSError(28, "No space left on device", "a/file"),
+            2,
+            "error: a/file: No space left on device; check the path",
+        ),
+        (KeyboardInterrupt(), 130, "interrupted$"),
+        (CAUSED, 130, "interrupted$"),
+        (SystemError("of numba"), 1, BUG),
+        (RuntimeError("unknown"), 1, BUG),
+        (MemoryError(), 2, LITTLE),
+        (RuntimeError("can't start new thread"), 2, LITTLE),
         (torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB."), 2, LITTLE),
         (ImportError("libtorch_cpu.so: failed to map segment from shared object"), 2, LITTLE),
     ],
-)  # fmt: skip
-def test_errors_of_the_work(clod: Any, monkeypatch: Any, error: BaseException, code: int, said: str) -> None:
-    """One line, with --json also an object on stdout; below a traceback only where the error is ours."""
+)
+def test_errors_of_the_work(
+    clod: Any, monkeypatch: Any, error: BaseException, code: int, said: str
+) -> None:
+    """One line, with --json also an object on stdout; below a traceback only where the error is
+    ours.
+    """
     monkeypatch.setattr("clod_adapter.cli.shared.inputs.load", Mock(side_effect=error))
     done = clod("eval BASE --images SCENE --json --quiet", code=code)
     lines = done.err.splitlines()
@@ -51,10 +69,18 @@ def test_errors_of_the_work(clod: Any, monkeypatch: Any, error: BaseException, c
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="Linux has this device")
 @pytest.mark.parametrize("words", ["inspect PLY --json", "--help"])
 def test_results_that_cannot_be_printed_are_an_error(capture: Any, words: str) -> None:
-    command = [sys.executable, "-m", "clod_adapter", *words.replace("PLY", str(capture.ply)).split()]
+    command = [
+        sys.executable,
+        "-m",
+        "clod_adapter",
+        *words.replace("PLY", str(capture.ply)).split(),
+    ]
     with open("/dev/full", "w") as full:
         done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
-    said = "clod-adapt: error: stdout cannot be written (No space left on device), so the result is lost; open it\n"
+    said = (
+        "clod-adapt: error: stdout cannot be written (No space left on device), so the result is"
+        " lost; open it\n"
+    )
     assert (done.returncode, done.stderr) == (2, said)
 
 
@@ -66,7 +92,8 @@ def test_help(clod: Any, command: str, monkeypatch: pytest.MonkeyPatch) -> None:
     assert done.out.startswith("usage: clod-adapt") and "--json" in done.out
     *lines, page = done.out.splitlines()
     assert max(map(len, lines)) <= 80 and page.startswith("manual: ") and page.endswith("index.md")
-    short = re.search(r"\n  -o[ ,]", done.out) is not None  # Python 3.13 writes "-o, --out X", 3.12 "-o X, --out X"
+    # Python 3.13 writes "-o, --out X", 3.12 "-o X, --out X"
+    short = re.search(r"\n  -o[ ,]", done.out) is not None
     assert ("--out " in done.out) == short == (command not in ("eval", "inspect", "view", "doctor"))
     titles = re.findall(r"(?m)^(\w[\w ,]*):\n  (?:-|[A-Z])", done.out)
     titles = titles[: titles.index("general") + 1]
@@ -74,7 +101,11 @@ def test_help(clod: Any, command: str, monkeypatch: pytest.MonkeyPatch) -> None:
     assert not {"positional arguments", "options"} & set(titles)
     if not command:
         assert all(f"clod-adapt {other}" in done.out for other in COMMANDS)
-        assert (first := clod()).out.count("\n") == 5 and "clod-adapt PLY --images DIR" in first.out and first.err == ""
+        assert (
+            (first := clod()).out.count("\n") == 5
+            and "clod-adapt PLY --images DIR" in first.out
+            and first.err == ""
+        )
         assert clod("--version").out.split() == ["clod-adapt", package_version()]
 
 
@@ -95,9 +126,13 @@ def test_bar_fits_the_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "\n" not in terminal.getvalue() and not lines[-1].strip()  # cleared at the end
 
 
-def test_progress_lines_without_a_terminal(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_progress_lines_without_a_terminal(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     now = 0.0
-    monkeypatch.setattr("clod_adapter.cli.shared.console.time", SimpleNamespace(perf_counter=lambda: now))
+    monkeypatch.setattr(
+        "clod_adapter.cli.shared.console.time", SimpleNamespace(perf_counter=lambda: now)
+    )
     meter = Meter(Console(), "training")
     for now in range(1, 21):
         meter.update(now / 90, f"step {now} of a checkpoint of a very long name")
@@ -110,7 +145,13 @@ def test_progress_lines_without_a_terminal(capsys: pytest.CaptureFixture[str], m
     meter.began = meter.printed = 0.0
     meter.update(0.6)
     assert capsys.readouterr().err == "training  60%, 40 s left\n"
-    for seconds, text in ((0.04, "0.0 s"), (9.96, "10 s"), (59.7, "1:00"), (125, "2:05"), (3725, "1:02:05")):
+    for seconds, text in (
+        (0.04, "0.0 s"),
+        (9.96, "10 s"),
+        (59.7, "1:00"),
+        (125, "2:05"),
+        (3725, "1:02:05"),
+    ):
         assert duration(seconds) == text
 
 
@@ -131,30 +172,51 @@ NAMES = ["torch", "cpu", "gsplat", "browser"]
 
 
 def test_lines_of_this_machine(clod: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    for browser, ok in ((webbrowser.GenericBrowser("lynx"), "off "), (webbrowser.BackgroundBrowser("firefox"), "ok ")):
+    for browser, ok in (
+        (webbrowser.GenericBrowser("lynx"), "off "),
+        (webbrowser.BackgroundBrowser("firefox"), "ok "),
+    ):
         monkeypatch.setattr(webbrowser, "get", Mock(return_value=browser))
         done = clod("doctor")
         *lines, last = done.out.replace("\n    -> ", "  -> ").splitlines()
         assert [line.split()[0] for line in lines] == NAMES and lines[3][9:].startswith(ok), done
-        assert all((line[9:12] == "ok ") != (" -> " in line) for line in lines)  # what fails has its fix
+        # what fails has its fix
+        assert all((line[9:12] == "ok ") != (" -> " in line) for line in lines)
     assert lines[1].startswith("cpu      ok   renders the reference image (RMS ")
     assert last.startswith("rendering and training backends: cpu")
 
 
 def test_json_without_torch() -> None:
     """Run as a module, as by torchrun."""
-    code = "import sys, runpy; sys.modules['torch'] = None; sys.argv = ['clod-adapt', 'doctor', '--json']\n"
+    code = (
+        "import sys, runpy; sys.modules['torch'] = None; sys.argv = ['clod-adapt', 'doctor',"
+        " '--json']\n"
+    )
     code += "runpy.run_module('clod_adapter', run_name='__main__')"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     report = json.loads(done.stdout)
-    assert set(report) == {"command", "version", "draws", "exit_code", "findings"} and report["draws"] == []
-    assert done.returncode == report["exit_code"] == 1 and "Traceback" not in done.stderr, done.stderr
+    assert (
+        set(report) == {"command", "version", "draws", "exit_code", "findings"}
+        and report["draws"] == []
+    )
+    assert done.returncode == report["exit_code"] == 1 and "Traceback" not in done.stderr, (
+        done.stderr
+    )
     found = {each["name"]: each for each in report["findings"]}
-    assert [*found] == NAMES and found["torch"]["fix"].startswith("pip install") and not found["cpu"]["ok"]
-    assert done.stderr.splitlines()[-1] == "no rendering backend works: fix torch first, then the CPU backend"
+    assert (
+        [*found] == NAMES
+        and found["torch"]["fix"].startswith("pip install")
+        and not found["cpu"]["ok"]
+    )
+    assert (
+        done.stderr.splitlines()[-1]
+        == "no rendering backend works: fix torch first, then the CPU backend"
+    )
 
 
-@pytest.mark.parametrize("change", [lambda image: image.roll(1, 1), lambda image: image * torch.nan])
+@pytest.mark.parametrize(
+    "change", [lambda image: image.roll(1, 1), lambda image: image * torch.nan]
+)
 def test_a_wrong_image_is_reported(clod: Any, monkeypatch: pytest.MonkeyPatch, change: Any) -> None:
     def rasterize(**given: Any) -> tuple[torch.Tensor, torch.Tensor]:
         image, alpha = reference.rasterize(**given)

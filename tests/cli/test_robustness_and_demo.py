@@ -1,4 +1,6 @@
-"""``clod-adapt robustness``: outputs, resuming, interrupts; ``clod-adapt demo``, on the tests' own capture."""
+"""``clod-adapt robustness``: outputs, resuming, interrupts; ``clod-adapt demo``, on the tests' own
+capture.
+"""
 
 import csv
 import json
@@ -33,17 +35,23 @@ def run(clod: Any, capture: Any, tmp_path: Path) -> Callable[..., Any]:
     """Runs the command on two checkpoints, the second without the faintest Gaussians."""
     shutil.copytree(capture.scene, tmp_path / "scene")
     capture.write(tmp_path / "plain.ply", capture.gaussians)
-    capture.write(tmp_path / "masked.ply", capture.gaussians.select(capture.gaussians.opacities > 0.5))
+    capture.write(
+        tmp_path / "masked.ply", capture.gaussians.select(capture.gaussians.opacities > 0.5)
+    )
     return partial(clod, "robustness plain.ply masked.ply --images scene --max-sv 3 1 --iters 3")
 
 
-def test_the_command_a_cell_and_python_train_the_same(clod: Any, capture: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_command_a_cell_and_python_train_the_same(
+    clod: Any, capture: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Bit for bit, on few photographs."""
     monkeypatch.setattr(pseudo_views, "MANY", 64)
     clod("BASE --images SCENE --iters 3 --max-sv 3 --out dial.ply")
     clod("robustness BASE --images SCENE --iters 3 --max-sv 3 --out out")
     base, scene = load(capture.ply), load_scene(capture.scene)
-    result = clod_adapter.adapt_checkpoint(base, scene, clod_adapter.AdaptConfig(iters=3, max_sv=3.0))
+    result = clod_adapter.adapt_checkpoint(
+        base, scene, clod_adapter.AdaptConfig(iters=3, max_sv=3.0)
+    )
     for written in ("dial.safetensors", "out/cells/base_sv3.safetensors"):
         assert clod_adapter.load_adapter(written).apply(base.gaussians) == result.gaussians
     result.save("python.ply")
@@ -62,18 +70,24 @@ def stamps(folder: Path) -> dict[str, int]:
     return {path.name: path.stat().st_mtime_ns for path in (folder / "cells").iterdir()}
 
 
-def test_outputs_of_all_cells(run: Any, clod: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_outputs_of_all_cells(
+    run: Any, clod: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("clod_adapter.cli.shared.console.LINE_EVERY", 0)
     done = run("--json")
     report, folder = done.report, tmp_path / "robustness"
     assert names(folder) == ["cells", *OUTPUTS]
     assert report == json.loads((folder / "robustness.json").read_text())
     cells = {(cell["checkpoint"], cell["max_sv"]): cell["rows"] for cell in report["cells"]}
-    assert list(cells) == [(name, max_sv) for name in ("plain", "masked") for max_sv in (None, 1, 3)]
+    assert list(cells) == [
+        (name, max_sv) for name in ("plain", "masked") for max_sv in (None, 1, 3)
+    ]
     assert report["missing"] == [] and not report["interrupted"]
     for (_, max_sv), rows in cells.items():
         dials = [row["virtual_scale"] for row in rows]
-        assert dials == ([1.0] * len(experiment.BASELINE_SHARES) if max_sv is None else [1, 1.5, 2, 3])
+        assert dials == (
+            [1.0] * len(experiment.BASELINE_SHARES) if max_sv is None else [1, 1.5, 2, 3]
+        )
     with open(folder / "robustness.csv", newline="", encoding="utf-8") as file:
         table = list(csv.DictReader(file))
     assert len(table) == 2 * (len(experiment.BASELINE_SHARES) + 8)
@@ -89,7 +103,9 @@ def test_outputs_of_all_cells(run: Any, clod: Any, tmp_path: Path, monkeypatch: 
     base, shares = clod_adapter.load("plain.ply").gaussians, experiment.BASELINE_SHARES
     assert [row["kept"] for row in cells["plain", None]] == [round(300 * share) for share in shares]
     few = base[base.opacities.argsort(descending=True)[: round(300 * shares[-1])]]
-    assert clod_adapter.evaluate(few, scene.test, [1.0])[0].psnr == pytest.approx(cells["plain", None][-1]["psnr"])
+    assert clod_adapter.evaluate(few, scene.test, [1.0])[0].psnr == pytest.approx(
+        cells["plain", None][-1]["psnr"]
+    )
     (again,) = clod_adapter.evaluate(clod_adapter.load("x.ply").gaussians, scene.test, [3.0])
     assert again.psnr == cells["plain", 3][-1]["psnr"]
     lines = re.findall(r"^(\w+) \((\d)/6\) training +\d+%, .* left", done.err, re.M)
@@ -97,15 +113,21 @@ def test_outputs_of_all_cells(run: Any, clod: Any, tmp_path: Path, monkeypatch: 
 
 
 @pytest.mark.usefixtures("blank_figure")
-def test_interrupted_unfinished_and_changed_cells(run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Finished cells stay; unfinished and changed ones run again. An interrupt of the first one writes nothing."""
+def test_interrupted_unfinished_and_changed_cells(
+    run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Finished cells stay; unfinished and changed ones run again. An interrupt of the first one
+    writes nothing.
+    """
     folder = tmp_path / "robustness"
     with monkeypatch.context() as patch:
         patch.setattr(experiment, "baseline", pressing(experiment.baseline, signal.SIGINT))
         run(code=130)
     assert not folder.exists()
     with monkeypatch.context() as patch:
-        patch.setattr(experiment, "adapt_at_range", pressing(experiment.adapt_at_range, signal.SIGINT, at=2))
+        patch.setattr(
+            experiment, "adapt_at_range", pressing(experiment.adapt_at_range, signal.SIGINT, at=2)
+        )
         report = (done := run("--json")).report
     assert report["interrupted"] and "plain_sv3 was not finished" in done.err
     assert [cell["max_sv"] for cell in report["cells"]] == [None, 1]
@@ -120,8 +142,10 @@ def test_interrupted_unfinished_and_changed_cells(run: Any, tmp_path: Path, monk
     changed = {name for name, stamp in stamps(folder).items() if stamp != before.get(name)}
     assert changed == {"masked_sv1.safetensors", "masked_sv1.json"}
     shutil.copy("plain.ply", "masked.ply")
-    assert "1 of 6 cells are done already: plain_base" in run("--seed 1").err  # baselines do not depend on the seed
-    Image.new("RGB", (64, 48)).save(tmp_path / "scene" / "images" / "003.png")  # of a photograph that is trained on
+    # baselines do not depend on the seed
+    assert "1 of 6 cells are done already: plain_base" in run("--seed 1").err
+    # of a photograph that is trained on
+    Image.new("RGB", (64, 48)).save(tmp_path / "scene" / "images" / "003.png")
     monkeypatch.setattr(experiment, "baseline", pressing(experiment.baseline, signal.SIGINT))
     run("--seed 1", code=130)
 
@@ -130,20 +154,29 @@ PICTURES = {"dial.png", "curve.png"}
 
 
 def test_demo(clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It names its files and the next command, resumes without naming --resume, and reports no figure not drawn."""
+    """It names its files and the next command, resumes without naming --resume, and reports no
+    figure not drawn.
+    """
 
     def unpack(scene: Path, base: Path) -> None:
         shutil.copytree(capture.scene, scene, dirs_exist_ok=True)
         shutil.copyfile(capture.ply, base)
 
-    monkeypatch.setattr(gallery, "unpack", unpack)  # the tests' own capture, a few steps, and empty pictures
-    monkeypatch.setattr(gallery, "draw", lambda *given: [path.write_bytes(b"") for path in given[-1].values()])
+    # the tests' own capture, a few steps, and empty pictures
+    monkeypatch.setattr(gallery, "unpack", unpack)
+    monkeypatch.setattr(
+        gallery, "draw", lambda *given: [path.write_bytes(b"") for path in given[-1].values()]
+    )
     monkeypatch.setattr(config, "STEPS", 2)
     monkeypatch.setattr(config, "STEPS_PER_VIEW", 0)
     monkeypatch.setattr(adapt_run, "LOST", (99.0, 99.0))  # two steps cannot keep full quality
     folder, state = tmp_path / "-odd", Path("-odd/gallery.resume.safetensors")
     with monkeypatch.context() as patch:
-        patch.setattr(listeners, "save_state", pressing(listeners.save_state, signal.SIGINT, signal.SIGTERM, at=2))
+        patch.setattr(
+            listeners,
+            "save_state",
+            pressing(listeners.save_state, signal.SIGINT, signal.SIGTERM, at=2),
+        )
         clod("demo --out=-odd", code=130)
     with monkeypatch.context() as patch:
         patch.setattr(listeners, "package_version", lambda: "0.0.7")
@@ -154,11 +187,19 @@ def test_demo(clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.Monke
     done = clod("demo --out=-odd")
     assert f"everything is in {folder}" in done.out and "clod-adapt YOURS.ply" in done.out, done
     found = clod("demo --out=-odd --quiet --json").report
-    assert found["command"] == "demo" and found["folder"] == "-odd" and found["scene"] == "-odd/capture"
-    assert found["pictures"] == {"dial": "-odd/dial.png", "curve": "-odd/curve.png"} and found["config"]["max_sv"] == 5
+    assert (
+        found["command"] == "demo"
+        and found["folder"] == "-odd"
+        and found["scene"] == "-odd/capture"
+    )
+    assert (
+        found["pictures"] == {"dial": "-odd/dial.png", "curve": "-odd/curve.png"}
+        and found["config"]["max_sv"] == 5
+    )
     made = {"capture", "base.ply", "gallery.ply", "gallery.safetensors", "gallery.json"}
     assert {*names(folder)} == made | PICTURES
-    monkeypatch.setattr(pipeline, "extract", pressing(pipeline.extract, signal.SIGINT))  # nothing is measured
+    # nothing is measured
+    monkeypatch.setattr(pipeline, "extract", pressing(pipeline.extract, signal.SIGINT))
     done = clod("demo --out=-odd --json")
     assert done.report["pictures"] == {} and "no figures" in done.err
     assert not PICTURES & {*names(folder)}
@@ -179,7 +220,10 @@ def test_scene_and_base_of_the_package(tmp_path: Path) -> None:
 def test_strip_shows_every_panel(tmp_path: Path) -> None:
     colours = [(200, 30, 30), (30, 160, 30), (30, 30, 200)]
     images = [np.full((30, 40, 3), colour, np.uint8) for colour in colours]
-    panels = [Picture(image / 255 if k == 1 else image, "s = 1", "29.0 dB") for k, image in enumerate(images)]
+    panels = [
+        Picture(image / 255 if k == 1 else image, "s = 1", "29.0 dB")
+        for k, image in enumerate(images)
+    ]
     gallery.dial_strip(tmp_path / "strip.png", panels, "one view", crop=(10, 5, 16, 12))
     picture = np.asarray(Image.open(tmp_path / "strip.png").convert("RGB"))
     for k, colour in enumerate(colours):

@@ -1,4 +1,5 @@
-"""The command on a full disk, without permissions, without what Windows and macOS lack, and with odd files.
+"""The command on a full disk, without permissions, without what Windows and macOS lack, and with
+odd files.
 
 These have names that are not UTF-8, or are photographs that are none by their content.
 """
@@ -26,7 +27,9 @@ import resource
 
 @contextmanager
 def room(size: int) -> Iterator[None]:
-    """Within the block files have at most so many bytes; a longer write fails, as on a full disk."""
+    """Within the block files have at most so many bytes; a longer write fails, as on a full
+    disk.
+    """
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
     try:
@@ -41,11 +44,15 @@ def assert_one_error(done: Any) -> None:
 
 
 def test_full_disk_while_adapting(clod: Any, dialled: Path, tmp_path: Path) -> None:
-    """One line, and unchanged files of an earlier run. Without room for the page the others are complete."""
+    """One line, and unchanged files of an earlier run. Without room for the page the others are
+    complete.
+    """
     words = "BASE --images SCENE --iters 2 --max-sv 2 -o dial.ply"
     shutil.copytree(dialled.parent, tmp_path, dirs_exist_ok=True)
     earlier = contents(tmp_path)
-    report, adapter, ply = (len(earlier[tmp_path / f"dial.{suffix}"]) for suffix in ("json", "safetensors", "ply"))
+    report, adapter, ply = (
+        len(earlier[tmp_path / f"dial.{suffix}"]) for suffix in ("json", "safetensors", "ply")
+    )
     assert report < adapter < ply
     for size in (report // 2, (adapter + ply) // 2):
         with room(size):
@@ -55,7 +62,11 @@ def test_full_disk_while_adapting(clod: Any, dialled: Path, tmp_path: Path) -> N
     with room(ply + 5000):
         report = (done := clod(words, "--report --json")).report
     assert "the page was not written: " in done.err and "page" not in report["outputs"]
-    assert report["rows"] and report["seconds"]["page"] > 0 and "the page was not" in report["notes"][-1]
+    assert (
+        report["rows"]
+        and report["seconds"]["page"] > 0
+        and "the page was not" in report["notes"][-1]
+    )
     assert report == json.loads((tmp_path / "dial.json").read_text())
     now = contents(tmp_path)
     assert now.keys() == earlier.keys() and not any(now[name] == earlier[name] for name in now)
@@ -66,7 +77,8 @@ def test_full_disk_while_adapting(clod: Any, dialled: Path, tmp_path: Path) -> N
     [
         (2000, "export DIAL -o x.ply"),
         (2000, "export DIAL -o x.html"),
-        (12000, "export DIAL --levels 1,4,9 -o x.ply"),  # the last file fits, and the first does not
+        # the last file fits, and the first does not
+        (12000, "export DIAL --levels 1,4,9 -o x.ply"),
         (1000, "render DIAL --images SCENE -o pictures"),
         (1000, "apply BASE ADAPTER -o x.ply"),
         (1000, "robustness BASE --images SCENE --iters 0 --max-sv 2 -o out"),
@@ -83,11 +95,16 @@ def test_full_disk_while_measuring(clod: Any, tmp_path: Path) -> None:
     """The rows are not lost with the page."""
     with room(1000):
         done = clod("eval DIAL --images SCENE --sv 1 --report x.html --json --quiet", code=2)
-    assert "cannot be written" in done.report["error"] and done.report["rows"] and not contents(tmp_path)
+    assert (
+        "cannot be written" in done.report["error"]
+        and done.report["rows"]
+        and not contents(tmp_path)
+    )
     assert done.err == f"clod-adapt: error: {done.report['error']}\n"
 
 
-# Root gives up its rights by entering a user namespace; it may read nothing there that its owner may not.
+# Root gives up its rights by entering a user namespace; it may read nothing there that its owner
+# may not.
 NO_ROOT = "" if os.geteuid() else "import ctypes; assert ctypes.CDLL(None).unshare(0x10000000) == 0"
 
 
@@ -95,14 +112,28 @@ NO_ROOT = "" if os.geteuid() else "import ctypes; assert ctypes.CDLL(None).unsha
     ("path", "mode", "said"),
     [
         ("base.ply", 0, "base.ply: cannot be read (Permission denied); check the path"),
-        ("scene/images/001.png", 0, "001.png: cannot be read (Permission denied); check the path and its permissions"),
+        (
+            "scene/images/001.png",
+            0,
+            "001.png: cannot be read (Permission denied); check the path and its permissions",
+        ),
         ("scene/images", 0, "scene/images: cannot be read; check its permissions"),
-        ("out", 0o555, "out/dial.ply: folder out is not writable; choose another or change its permissions"),
-        ("out/dial.ply", 0o444, "dial.ply: is write-protected; choose another output, or chmod u+w"),
+        (
+            "out",
+            0o555,
+            "out/dial.ply: folder out is not writable; choose another or change its permissions",
+        ),
+        (
+            "out/dial.ply",
+            0o444,
+            "dial.ply: is write-protected; choose another output, or chmod u+w",
+        ),
         (f"out/{STATE}", 0, f"{STATE}: is write-protected; choose another output, or chmod u+w"),
     ],
 )
-def test_without_permission(server: Server, capture: Any, tmp_path: Path, path: str, mode: int, said: str) -> None:
+def test_without_permission(
+    server: Server, capture: Any, tmp_path: Path, path: str, mode: int, said: str
+) -> None:
     """As of another user: one line, before any work."""
     shutil.copytree(capture.scene.parent, tmp_path, dirs_exist_ok=True)
     (tmp_path / "out").mkdir()
@@ -115,7 +146,9 @@ def test_without_permission(server: Server, capture: Any, tmp_path: Path, path: 
     log = log_of(tmp_path)
     if NO_ROOT and code == 1 and not log:
         pytest.skip("root cannot give up its rights here")
-    assert code == 2 and log.count("\n") == 1 and said in log and names(tmp_path / "out") == before, log
+    assert (
+        code == 2 and log.count("\n") == 1 and said in log and names(tmp_path / "out") == before
+    ), log
 
 
 COMMANDS = """
@@ -131,10 +164,15 @@ export dial.ply -o plain.html
 def test_commands_without_posix(capture: Any, tmp_path: Path) -> None:
     """Files that are open are not renamed or removed."""
     paths = {"base.ply": str(capture.ply), "scene": str(capture.scene)}
-    commands = [[*(paths.get(w, w) for w in line.split()), "--quiet"] for line in COMMANDS.strip().splitlines()]
+    commands = [
+        [*(paths.get(w, w) for w in line.split()), "--quiet"]
+        for line in COMMANDS.strip().splitlines()
+    ]
     program = Path(__file__).with_name("without_posix.py")
     words = [sys.executable, str(program), json.dumps(commands)]
-    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=300)
+    done = subprocess.run(
+        words, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=300
+    )
     assert done.returncode == 0, done.stdout + done.stderr
     assert {"dial.ply", "dial.json", "pictures", "plain.spz", "plain.html"} <= set(names(tmp_path))
     assert (tmp_path / "again.ply").read_bytes() == (tmp_path / "dial.ply").read_bytes()
@@ -170,19 +208,34 @@ def test_names_that_are_not_utf8(clod: Any, capture: Any, dialled: Path, tmp_pat
 
 
 CONTENT = {
-    "PostScript": b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 64 48\n%%EndComments\nshowpage\n%%EOF\n",
+    "PostScript": (
+        b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 64 48\n%%EndComments\nshowpage\n%%EOF\n"
+    ),
     "GIF": b"GIF89a" + struct.pack("<HH", 64, 48) + bytes(40),
-    "WMF": b"\xd7\xcd\xc6\x9a\0\0" + struct.pack("<4hHLH", 0, 0, 64, 48, 72, 0, 0) + b"\x01\x00\x09\x00" + bytes(100),
+    "WMF": (
+        b"\xd7\xcd\xc6\x9a\0\0"
+        + struct.pack("<4hHLH", 0, 0, 64, 48, 72, 0, 0)
+        + b"\x01\x00\x09\x00"
+        + bytes(100)
+    ),
     "PPM": b"P6 64 48 255\n" + bytes(3 * 64 * 48),
 }
 
 
-def test_photographs_that_are_none_start_no_program(clod: Any, capture: Any, tmp_path: Path, monkeypatch: Any) -> None:
+def test_photographs_that_are_none_start_no_program(
+    clod: Any, capture: Any, tmp_path: Path, monkeypatch: Any
+) -> None:
     monkeypatch.setattr(subprocess, "Popen", started := Mock(side_effect=OSError))
     shutil.copytree(capture.scene, tmp_path / "scene")
     for kind, content in CONTENT.items():
         (tmp_path / "scene" / "images" / "001.png").write_bytes(content)
         done = clod("eval BASE --images scene --quiet", code=2)
-        found = kind if kind in ("PostScript", "GIF") else "damaged or none of PNG, JPEG, TIFF, WEBP, BMP"
-        assert done.err.endswith(f"images/001.png: cannot be decoded, is {found}; export it as JPEG or PNG\n"), done
+        found = (
+            kind
+            if kind in ("PostScript", "GIF")
+            else "damaged or none of PNG, JPEG, TIFF, WEBP, BMP"
+        )
+        assert done.err.endswith(
+            f"images/001.png: cannot be decoded, is {found}; export it as JPEG or PNG\n"
+        ), done
         assert done.err.count("\n") == 1 and not started.called, kind

@@ -1,4 +1,6 @@
-"""``clod-adapt view`` without a page in a browser: messages, files, interrupts; texts of ``clod-adapt inspect``."""
+"""``clod-adapt view`` without a page in a browser: messages, files, interrupts; texts of
+``clod-adapt inspect``.
+"""
 
 import json
 import os
@@ -35,14 +37,31 @@ def assert_holds(data: bytes, file: Path, folder: Path) -> None:
     assert len(served) == len(shown) and (served.attenuation is None) == (shown.attenuation is None)
 
 
-def test_serves_until_it_is_interrupted(server: Server, capture: Any, dialled: Path, tmp_path: Path) -> None:
-    words = [dialled, "--base", capture.ply, "--images", capture.scene, "--sv", 2, "--no-browser", "--json", "--quiet"]
+def test_serves_until_it_is_interrupted(
+    server: Server, capture: Any, dialled: Path, tmp_path: Path
+) -> None:
+    words = [
+        dialled,
+        "--base",
+        capture.ply,
+        "--images",
+        capture.scene,
+        "--sv",
+        2,
+        "--no-browser",
+        "--json",
+        "--quiet",
+    ]
     process = server.start(tmp_path, "view", *words)
     wait_for(Path(f"{tmp_path}.log"), "\n")
     report = json.loads(log_of(tmp_path))
     assert report["url"] == f"http://127.0.0.1:{report['port']}/" and report["cameras"] == 10
     config = config_of(fetch(report["url"]))
-    assert config["title"] == "dial.ply" and config["virtual_scale"] == 2 and len(config["cameras"]) == 10
+    assert (
+        config["title"] == "dial.ply"
+        and config["virtual_scale"] == 2
+        and len(config["cameras"]) == 10
+    )
     for name, file in ("model", dialled), ("base", capture.ply):
         assert config[name]["href"] == f"/files/{name}"
         assert_holds(fetch(f"{report['url']}files/{name}"), file, tmp_path)
@@ -50,8 +69,12 @@ def test_serves_until_it_is_interrupted(server: Server, capture: Any, dialled: P
     assert server.wait(process) == 0 and log_of(tmp_path).count("\n") == 1
 
 
-def test_dial_values_and_files_of_a_page(capture: Any, dialled: Path, tmp_path: Path, capsys: Any) -> None:
-    """Of a folder the splats by name, numbers by value; files of one name have those of their folders. With notes."""
+def test_dial_values_and_files_of_a_page(
+    capture: Any, dialled: Path, tmp_path: Path, capsys: Any
+) -> None:
+    """Of a folder the splats by name, numbers by value; files of one name have those of their
+    folders. With notes.
+    """
 
     def page_of(*words: object) -> tuple[Any, Any, Any]:
         args = build_parser("view").parse_args([*map(str, words)])
@@ -59,69 +82,121 @@ def test_dial_values_and_files_of_a_page(capture: Any, dialled: Path, tmp_path: 
         answers, report = view.make_page(args, view.Console(False))
         return answers, report, config_of(b"".join(answers["/"].blocks()))
 
-    for path, opens, said in (dialled, 4, "the page's dial ends at s = 4"), (capture.ply, 1, "s = 9 has no effect"):
+    for path, opens, said in (
+        (dialled, 4, "the page's dial ends at s = 4"),
+        (capture.ply, 1, "s = 9 has no effect"),
+    ):
         _, report, config = page_of(path, "--sv=9")
         (note,) = [note for note in report["notes"] if said in note]
         assert config["virtual_scale"] == opens and note in capsys.readouterr().err
     (tmp_path / "more").mkdir()
-    for name, file in (("lod10.ply", dialled), ("lod2.ply", dialled), ("more/lod2.ply", capture.ply)):
+    for name, file in (
+        ("lod10.ply", dialled),
+        ("lod2.ply", dialled),
+        ("more/lod2.ply", capture.ply),
+    ):
         (tmp_path / name).write_bytes(file.read_bytes())
-    (tmp_path / "points.ply").write_text("ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nend_header\n")
+    (tmp_path / "points.ply").write_text(
+        "ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nend_header\n"
+    )
     answers, report, config = page_of(tmp_path, tmp_path / "more" / "lod2.ply")
     entries, folder = [config["model"], *config["others"]], tmp_path.name
-    assert [entry["name"] for entry in entries] == [f"{folder}/lod2.ply", f"{folder}/lod10.ply", "more/lod2.ply"]
+    assert [entry["name"] for entry in entries] == [
+        f"{folder}/lod2.ply",
+        f"{folder}/lod10.ply",
+        "more/lod2.ply",
+    ]
     for entry, file in zip(entries, (dialled, dialled, capture.ply), strict=True):
         assert_holds(b"".join(answers[entry["href"]].blocks()), file, tmp_path)
     assert report["model"].endswith("lod2.ply") and len(report["files"]) == 3
 
 
 def test_interrupts_and_browsers(clod: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One that opens a window is opened; an interrupt right after the address ends the command as usual."""
+    """One that opens a window is opened; an interrupt right after the address ends the command as
+    usual.
+    """
     browser = Mock(spec=webbrowser.BaseBrowser, **{"open.side_effect": KeyboardInterrupt})
     monkeypatch.setattr(webbrowser, "get", lambda: browser)
     assert clod("view BASE --quiet") == (f"{browser.open.call_args[0][0]}  (Ctrl-C ends)\n", "")
     monkeypatch.setenv("BROWSER", "editor")  # a program whose end is not waited for
     monkeypatch.setattr(webbrowser, "get", lambda: webbrowser.GenericBrowser("editor"))
     assert isinstance(view.find_browser(), webbrowser.BackgroundBrowser)
-    monkeypatch.setattr(webbrowser, "get", Mock(side_effect=webbrowser.Error("could not locate runnable browser")))
+    monkeypatch.setattr(
+        webbrowser, "get", Mock(side_effect=webbrowser.Error("could not locate runnable browser"))
+    )
     assert view.find_browser() is None
     with socket.create_server(("127.0.0.1", 0)) as taken:
         done = clod("view BASE --no-browser --port", taken.getsockname()[1], code=2)
-    assert re.search(r"^clod-adapt: error: .*port \d+ of 127.0.0.1 is not available .*choose another", done.err, re.M)
+    assert re.search(
+        r"^clod-adapt: error: .*port \d+ of 127.0.0.1 is not available .*choose another",
+        done.err,
+        re.M,
+    )
 
 
 def test_a_plain_file_fits_on_a_screen(clod: Any, capture: Any) -> None:
     done = clod("inspect BASE")
     lines = done.out.splitlines()
     assert len(lines) <= 24 and all(len(line) <= 120 for line in lines[1:]) and done.err == ""
-    assert lines[0].startswith(f"{capture.ply} (") and lines[2].startswith("looks like   Inria's trainer")
+    assert lines[0].startswith(f"{capture.ply} (") and lines[2].startswith(
+        "looks like   Inria's trainer"
+    )
     assert lines[3] == "Gaussians    300" and "dial         none: no sigma_d" in lines
-    at = next(k for k, line in enumerate(lines) if line.split() == ["least", "1", "%", "median", "99", "%", "greatest"])
-    assert [line.split()[0] for line in lines[at + 1 : at + 6]] == ["x", "y", "z", "scale", "opacity"]
+    at = next(
+        k
+        for k, line in enumerate(lines)
+        if line.split() == ["least", "1", "%", "median", "99", "%", "greatest"]
+    )
+    assert [line.split()[0] for line in lines[at + 1 : at + 6]] == [
+        "x",
+        "y",
+        "z",
+        "scale",
+        "opacity",
+    ]
     assert len({len(line) for line in lines[at : at + 6]}) == 1
 
 
 def test_a_dial_and_its_calibration(clod: Any, dialled: Path) -> None:
     text, report = clod("inspect DIAL").out, clod("inspect DIAL --json").report
     lines, splat = text.splitlines(), report["splat"]
-    assert "written by   clod-adapter" in text and "s = 1 to 4, distances in world units" in text and len(lines) <= 32
+    assert (
+        "written by   clod-adapter" in text
+        and "s = 1 to 4, distances in world units" in text
+        and len(lines) <= 32
+    )
     at = next(k for k, line in enumerate(lines) if "Gaussians" in line and "PSNR" in line)
     first, *_, last = table = [line.split() for line in lines[at + 1 : at + 8]]
     assert (first[0], last[0]) == ("1", "4") and all(len(row) == 5 for row in table)
     assert report["command"] == "inspect" and report["path"] == str(dialled)
     assert report["oddities"] == [] and "anomalies" not in report
-    assert splat["count"] == splat["total"] == 540 and splat["columns"][-1] == ["opacity_d", "float32"]
-    assert {"least", "low", "median", "high", "greatest"} == set(splat["sigma"]) == set(splat["growth"])
+    assert splat["count"] == splat["total"] == 540 and splat["columns"][-1] == [
+        "opacity_d",
+        "float32",
+    ]
+    assert (
+        {"least", "low", "median", "high", "greatest"}
+        == set(splat["sigma"])
+        == set(splat["growth"])
+    )
     assert splat["dial"]["attenuation"]["max_sv"] == 4 and len(splat["position"]) == 3
     told = json.loads(dialled.with_suffix(".json").read_text())
     assert splat["dial"]["calibration"] == told["calibration"]
     clod("export DIAL --sv 2 -o x.ply")
-    assert "\nsays         baked at s = 2 by clod-adapter for 8 training cameras\n" in clod("inspect x.ply").out
+    assert (
+        "\nsays         baked at s = 2 by clod-adapter for 8 training cameras\n"
+        in clod("inspect x.ply").out
+    )
 
 
 def test_adapter(clod: Any) -> None:
     text, about = clod("inspect ADAPTER").out, clod("inspect ADAPTER --json").report["about"]
-    assert "an adapter" in text and "with SHA-256 " in text and "max_sv 4" in text and "\ngrowth_d " in text
+    assert (
+        "an adapter" in text
+        and "with SHA-256 " in text
+        and "max_sv 4" in text
+        and "\ngrowth_d " in text
+    )
     assert "\ndial         sigma_d and growth_d, s = 1 to 4" in text and len(about["growth"]) == 5
     assert about["updates"] == {}
     assert about["count"] == 540 and about["config"]["iters"] == 12

@@ -1,8 +1,10 @@
-"""Removes from Python what Windows or macOS lack, then runs ``clod-adapt`` with each list of words of a JSON list.
+"""Removes from Python what Windows or macOS lack, then runs ``clod-adapt`` with each list of words
+of a JSON list.
 
     python without_posix.py JSON
 
-Where a renamed, replaced or removed file is open or mapped in this process, that raises the PermissionError of Windows.
+Where a renamed, replaced or removed file is open or mapped in this process, that raises the
+PermissionError of Windows.
 """
 
 import json
@@ -12,12 +14,35 @@ import sys
 from importlib import import_module
 from importlib.abc import MetaPathFinder
 
-for other in ("filelock", "numba", "plyfile", "pycolmap", "safetensors.torch", "skimage.metrics", "torch", "tqdm"):
+for other in (
+    "filelock",
+    "numba",
+    "plyfile",
+    "pycolmap",
+    "safetensors.torch",
+    "skimage.metrics",
+    "torch",
+    "tqdm",
+):
     import_module(other)  # these look at sys.platform, and use what Linux has
 ABSENT = (
-    "sched_getaffinity", "sched_setaffinity", "posix_fadvise", "posix_fallocate", "fork", "getuid", "geteuid", "setsid",
-    "killpg", "mkfifo", "fchmod", "chown", "getloadavg", "sysconf", "pread", "pwrite",
-)  # fmt: skip
+    "sched_getaffinity",
+    "sched_setaffinity",
+    "posix_fadvise",
+    "posix_fallocate",
+    "fork",
+    "getuid",
+    "geteuid",
+    "setsid",
+    "killpg",
+    "mkfifo",
+    "fchmod",
+    "chown",
+    "getloadavg",
+    "sysconf",
+    "pread",
+    "pwrite",
+)
 SIGNALS = ("SIGHUP", "SIGUSR1", "SIGUSR2", "SIGXCPU", "SIGKILL", "pthread_sigmask", "setitimer")
 MODULES = ("fcntl", "resource", "termios", "pwd", "grp", "pty", "tty")
 
@@ -54,7 +79,9 @@ def watch(event, given):
         busy = False
         for name in given[: 2 if event == "os.rename" else 1]:
             if os.path.abspath(os.fsdecode(name)) in taken:
-                raise PermissionError(13, "The process cannot access the file because it is being used", name)
+                raise PermissionError(
+                    13, "The process cannot access the file because it is being used", name
+                )
 
 
 READ, busy = os.open, False

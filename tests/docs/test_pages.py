@@ -1,5 +1,7 @@
-"""Every command in the documentation parses, and runs unless its block states a reason; the pages agree with the code
-and the results, install lines work before a release too, and the site fetches nothing from other hosts."""
+"""Every command in the documentation parses, and runs unless its block states a reason; the pages
+agree with the code and the results, install lines work before a release too, and the site fetches
+nothing from other hosts.
+"""
 
 import csv
 import json
@@ -36,7 +38,9 @@ FENCE = re.compile(r"^( *)(`{3,})(\w*)\n(.*?)^\1\2 *$", re.DOTALL | re.MULTILINE
 
 
 class Block(NamedTuple):
-    """A fenced block; ``reason`` is that of ``<!-- not run: REASON -->`` above it, and empty if it is run."""
+    """A fenced block; ``reason`` is that of ``<!-- not run: REASON -->`` above it, and empty if it
+    is run.
+    """
 
     place: str
     language: str  # of the fence; ``sh`` for the README's, which have none
@@ -44,9 +48,19 @@ class Block(NamedTuple):
     reason: str
 
     def commands(self) -> list[list[str]]:
-        """The words of each line of a shell block, without comments, continued lines put together."""
-        lines = self.text.replace("\\\n", " ").splitlines() if self.language in ("sh", "console") else []
-        return [words for line in lines if (words := shlex.split(line.removeprefix("$ "), comments=True))]
+        """The words of each line of a shell block, without comments, continued lines put
+        together.
+        """
+        lines = (
+            self.text.replace("\\\n", " ").splitlines()
+            if self.language in ("sh", "console")
+            else []
+        )
+        return [
+            words
+            for line in lines
+            if (words := shlex.split(line.removeprefix("$ "), comments=True))
+        ]
 
 
 def blocks(page: Path) -> list[Block]:
@@ -65,14 +79,19 @@ def spoken(page: Path, program: str) -> list[str]:
     text = FENCE.sub("", page.read_text(encoding="utf-8"))
     spans = [" ".join(span.split()) for span in re.findall(r"`([^`]+)`", text)]
     lines = [line.strip() for line in text.splitlines() if line.startswith("    ")]
-    said = [each.partition("  #")[0].strip() for each in [*spans, *lines] if each.startswith(f"{program} ")]
+    said = [
+        each.partition("  #")[0].strip()
+        for each in [*spans, *lines]
+        if each.startswith(f"{program} ")
+    ]
     return [each for each in said if " -" in each and "..." not in each]
 
 
 @pytest.fixture(scope="session")
 def desk(capture: Any, dialled: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """``scene/``, ``pretrained.ply``, ``pretrained_mask.ply`` (MaskGaussian's old layout), ``pretrained_clod.*``, and
-    ``demo/`` with the demo's file names."""
+    """``scene/``, ``pretrained.ply``, ``pretrained_mask.ply`` (MaskGaussian's old layout),
+    ``pretrained_clod.*``, and ``demo/`` with the demo's file names.
+    """
     folder = tmp_path_factory.mktemp("desk")
     shutil.copytree(capture.scene, folder / "scene")
     shutil.copyfile(capture.ply, folder / "pretrained.ply")
@@ -89,20 +108,25 @@ def desk(capture: Any, dialled: Path, tmp_path_factory: pytest.TempPathFactory) 
 IDS = [str(page.relative_to(ROOT)) for page in PAGES]
 LANGUAGES = {"sh", "console", "python", "text", "json", "glsl", "wgsl", "html", "css", "js"}
 STEPS = 20  # of a training that the pages run, at most
-# Commands that are not run: two change the environment that the tests run in, and one, the demo, takes a minute.
+# Commands that are not run: two change the environment that the tests run in, and one, the demo,
+# takes a minute.
 SKIPPED = ("pip", "make", "clod-adapt demo")
 
 
 @pytest.mark.usefixtures("without_splat_transform")
 @pytest.mark.parametrize("page", PAGES, ids=IDS)
-def test_blocks_run_in_the_order_of_the_page(page: Path, desk: Path, tmp_path: Path, monkeypatch: Any) -> None:
+def test_blocks_run_in_the_order_of_the_page(
+    page: Path, desk: Path, tmp_path: Path, monkeypatch: Any
+) -> None:
     """Training is shortened."""
     shutil.copytree(desk, tmp_path, dirs_exist_ok=True)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(clod_adapter, "AdaptConfig", short)
     names: dict[str, Any] = {"__name__": "__main__"}
     for block in blocks(page):
-        assert block.language in LANGUAGES, f"{block.place}: {block.language or 'no language'}; text is not run"
+        assert block.language in LANGUAGES, (
+            f"{block.place}: {block.language or 'no language'}; text is not run"
+        )
         if block.reason:
             continue
         try:
@@ -123,7 +147,9 @@ def short(**settings: Any) -> AdaptConfig:
 
 def run(words: list[str]) -> None:
     words, out = (words[:-2], Path(words[-1])) if ">" in words else (words, Path("said.txt"))
-    assert words[0] in ("clod-adapt", "python"), f"{words[0]}: not known; mark the block with <!-- not run: REASON -->"
+    assert words[0] in ("clod-adapt", "python"), (
+        f"{words[0]}: not known; mark the block with <!-- not run: REASON -->"
+    )
     with out.open("w", encoding="utf-8") as stream, redirect_stdout(stream):
         if words[0] == "python":
             runpy.run_path(str(ROOT / words[1]), run_name="__main__")
@@ -171,15 +197,21 @@ def keys(value: Any) -> Iterator[str]:
             yield from keys(entry)
 
 
-def test_every_field_of_the_reports_is_explained(desk: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_field_of_the_reports_is_explained(
+    desk: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     explained = set(re.findall(r"`([a-z_0-9]+)`", (DOCS / "python.md").read_text(encoding="utf-8")))
-    model, base, scene = (str(desk / name) for name in ("pretrained_clod.ply", "pretrained.ply", "scene"))
+    model, base, scene = (
+        str(desk / name) for name in ("pretrained_clod.ply", "pretrained.ply", "scene")
+    )
     words = ["eval", model, "--images", scene, "--sv", "1", "3", "--popping", "--quiet"]
     capsys.readouterr()
     assert main([*words, "--base", base, "--against", base, "--json"]) == 0
     measured = json.loads(capsys.readouterr().out)
     adapted = json.loads(desk.joinpath("pretrained_clod.json").read_text(encoding="utf-8"))
-    assert {"rows", "alignment", "frame_ms"} <= set(keys(adapted)) and {"ranked", "moved"} <= set(keys(measured))
+    assert {"rows", "alignment", "frame_ms"} <= set(keys(adapted)) and {"ranked", "moved"} <= set(
+        keys(measured)
+    )
     missing = (set(keys(adapted)) | set(keys(measured))) - explained
     assert not missing, f"docs/python.md does not explain {sorted(missing)}"
 
@@ -188,7 +220,10 @@ def tables(page: str) -> list[list[list[str]]]:
     """The tables of a page, as rows of cells without emphasis."""
     found = re.findall(r"(?:^\|.*\|\n)+", (DOCS / page).read_text(encoding="utf-8"), re.MULTILINE)
     lines = [[line for line in table.splitlines() if "---" not in line] for table in found]
-    return [[[cell.strip(" *") for cell in line.strip("|").split("|")] for line in table] for table in lines]
+    return [
+        [[cell.strip(" *") for cell in line.strip("|").split("|")] for line in table]
+        for table in lines
+    ]
 
 
 def measured(value: Any) -> Iterator[str]:
@@ -210,28 +245,49 @@ def test_qualities_in_tables_are_measured() -> None:
     """A number of decibels, with or without the share kept, is one of benchmarks/results."""
     found = set()
     for file in RESULTS.glob("*.jsonl"):
-        found |= {each for line in file.read_text(encoding="utf-8").splitlines() for each in measured(json.loads(line))}
+        found |= {
+            each
+            for line in file.read_text(encoding="utf-8").splitlines()
+            for each in measured(json.loads(line))
+        }
     with (RESULTS / "robustness.csv").open(encoding="utf-8") as stream:
         found |= set(measured(list(csv.DictReader(stream))))
-    cells = [cell for page in ("method.md", "performance.md") for rows in tables(page) for row in rows for cell in row]
-    told = [cell.replace(" %", "%") for cell in cells if re.fullmatch(r"\d\d\.\d\d( @ \d+ ?%)?", cell)]
+    cells = [
+        cell
+        for page in ("method.md", "performance.md")
+        for rows in tables(page)
+        for row in rows
+        for cell in row
+    ]
+    told = [
+        cell.replace(" %", "%") for cell in cells if re.fullmatch(r"\d\d\.\d\d( @ \d+ ?%)?", cell)
+    ]
     assert len(told) > 50 and not {*told} - found
 
 
-SOURCES = [ROOT / "README.md", *(path for folder in ("cli", "clod_adapter") for path in (ROOT / folder).rglob("*.py"))]
+SOURCES = [
+    ROOT / "README.md",
+    *(path for folder in ("cli", "clod_adapter") for path in (ROOT / folder).rglob("*.py")),
+]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 
 
 def test_no_line_installs_clod_adapter_from_the_index() -> None:
     for path in (*SOURCES, *(ROOT / "docs").glob("*.md")):
-        assert not re.search(r"pip install[^`\n]*clod-adapter", path.read_text(encoding="utf-8")), path
+        assert not re.search(r"pip install[^`\n]*clod-adapter", path.read_text(encoding="utf-8")), (
+            path
+        )
 
 
 def test_help_names_the_installed_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ((folder, patterns),) = PROJECT["tool"]["setuptools"]["data-files"].items()
-    assert patterns == ["docs/*.md"] and all(url.startswith("https://") for url in PROJECT["project"]["urls"].values())
+    assert patterns == ["docs/*.md"] and all(
+        url.startswith("https://") for url in PROJECT["project"]["urls"].values()
+    )
     assert command.manual() == ROOT / "docs" / "index.md"  # of the checkout
-    monkeypatch.setattr(command, "__file__", str(tmp_path / "lib" / "cli" / "shared" / "command.py"))
+    monkeypatch.setattr(
+        command, "__file__", str(tmp_path / "lib" / "cli" / "shared" / "command.py")
+    )
     monkeypatch.setattr(sysconfig, "get_path", lambda name: str(tmp_path))
     monkeypatch.setattr(command, "getuserbase", lambda: str(tmp_path))
     assert "manual:" not in command.parser_of(adapt, "clod-adapt").format_help()
@@ -248,8 +304,12 @@ FETCHED = re.compile(r"<(?!a\s|link\s[^>]*rel=\"?canonical)[^>]*\s(?:src|href)=\
 def anchors(page: Path) -> set[str]:
     """The anchors of a page's headings, as Markdown's toc extension and GitHub make them."""
     found = set()
-    for title in re.findall(r"^#+ +(.+?) *$", FENCE.sub("", page.read_text(encoding="utf-8")), re.MULTILINE):
-        plain = re.sub(r"[^\w\s-]", "", re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", title)).strip().lower()
+    for title in re.findall(
+        r"^#+ +(.+?) *$", FENCE.sub("", page.read_text(encoding="utf-8")), re.MULTILINE
+    ):
+        plain = (
+            re.sub(r"[^\w\s-]", "", re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", title)).strip().lower()
+        )
         found.add(re.sub(r"[-\s]+", "-", plain))
     return found
 
@@ -265,29 +325,45 @@ def test_links_and_pictures_exist() -> None:
             assert found.exists(), f"{page.name}: {target}: no such file"
             assert not anchor or anchor in anchors(found), f"{page.name}: {target}: no such heading"
     for picture in (DOCS / "images").iterdir():
-        assert picture.suffix == ".svg" or any(picture.name in text for text in texts.values()), picture.name
+        assert picture.suffix == ".svg" or any(picture.name in text for text in texts.values()), (
+            picture.name
+        )
 
 
 def test_the_built_site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Built as by ``make docs``; a broken link is an error. Its search covers all pages and public names."""
+    """Built as by ``make docs``; a broken link is an error. Its search covers all pages and public
+    names.
+    """
     pytest.importorskip("mkdocs", reason="pip install '.[docs]'")
     site = tmp_path / "site"
     monkeypatch.chdir(ROOT)
     monkeypatch.setenv("NO_MKDOCS_2_WARNING", "1")
     monkeypatch.setattr(sys, "argv", ["make.py"])
     runpy.run_path("docs/make.py", run_name="__main__")
-    done = CliRunner().invoke(import_module("mkdocs.__main__").cli, ["build", "--site-dir", str(site)])
-    warned = [line for line in done.output.splitlines() if line.startswith("WARNING") and "griffe: " not in line]
+    done = CliRunner().invoke(
+        import_module("mkdocs.__main__").cli, ["build", "--site-dir", str(site)]
+    )
+    warned = [
+        line
+        for line in done.output.splitlines()
+        if line.startswith("WARNING") and "griffe: " not in line
+    ]
     assert done.exit_code == 0 and not warned, done.output
     for page in site.glob("*.html"):
         fetched = FETCHED.findall(page.read_text(encoding="utf-8"))
         far = [url for url in fetched if re.match(r"([a-z]+:)?//", url)]
         assert fetched and not far, f"{page.name} fetches {far}"
     for style in site.rglob("*.css"):
-        assert not re.search(r"url\([\"']?(https?:)?//|@import", style.read_text(encoding="utf-8")), style.name
+        assert not re.search(
+            r"url\([\"']?(https?:)?//|@import", style.read_text(encoding="utf-8")
+        ), style.name
     index = json.loads((site / "search" / "search_index.json").read_text(encoding="utf-8"))
     entries = {entry["location"] for entry in index["docs"]}
-    pages = {f"{page.stem}.html" for page in DOCS.glob("*.md")} | {"commands.html", "settings.html", "names.html"}
+    pages = {f"{page.stem}.html" for page in DOCS.glob("*.md")} | {
+        "commands.html",
+        "settings.html",
+        "names.html",
+    }
     assert pages == {entry.partition("#")[0] for entry in entries}
     named = {f"names.html#{clod_adapter._homes[name]}.{name}" for name in clod_adapter.__all__}
     assert named | {f"commands.html#clod-adapt-{name}" for name in COMMANDS} <= entries

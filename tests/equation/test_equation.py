@@ -1,4 +1,6 @@
-"""The equation and growth against mpmath at 50 digits, and the properties the dial stands on; the paper's form."""
+"""The equation and growth against mpmath at 50 digits, and the properties the dial stands on; the
+paper's form.
+"""
 
 import itertools
 import math
@@ -35,8 +37,12 @@ def grid(dtype: torch.dtype, *axes: list[float]) -> list[Tensor]:
     return list(torch.tensor(list(itertools.product(*axes)), dtype=dtype).unbind(1))
 
 
-def assert_close(got: Tensor, want: list[Any], allowed: list[float], floor: list[Any] | None = None) -> None:
-    """Errors within ``allowed`` times the wanted value, or ``floor``, or the smallest normal; too large means inf."""
+def assert_close(
+    got: Tensor, want: list[Any], allowed: list[float], floor: list[Any] | None = None
+) -> None:
+    """Errors within ``allowed`` times the wanted value, or ``floor``, or the smallest normal; too
+    large means inf.
+    """
     info = torch.finfo(got.dtype)
     for i, (g, w) in enumerate(zip(got.tolist(), want, strict=True)):
         if abs(w) > info.max:
@@ -53,7 +59,9 @@ def opacity(logit: float) -> Any:
 @each_dtype
 @pytest.mark.parametrize("scale", SCALES)
 def test_drawn_opacities_and_their_gradients_match_mpmath(dtype: torch.dtype, scale: float) -> None:
-    """Within the bounds that the module states; just inside the reach, at its end and just beyond."""
+    """Within the bounds that the module states; just inside the reach, at its end and just
+    beyond.
+    """
     logits, sigma, share = grid(dtype, LOGITS, SIGMAS, SHARES)
     d = (sigma.double().abs().clamp(min=1e-9) * share.double() / scale).to(dtype)
     leaves = logits.requires_grad_(), sigma.requires_grad_()
@@ -71,7 +79,9 @@ def test_drawn_opacities_and_their_gradients_match_mpmath(dtype: torch.dtype, sc
         allowed.append(2 * eps + (2**-52 / float(1 - t) if t < 1 else 0))
     assert out.keep.tolist() == kept and 0 < sum(kept) < len(kept)
     assert_close(out.drawn.detach(), want, allowed)
-    assert_close(by_logit, slopes, [0.0] * len(want), [x * w for x, w in zip(allowed, want, strict=True)])
+    assert_close(
+        by_logit, slopes, [0.0] * len(want), [x * w for x, w in zip(allowed, want, strict=True)]
+    )
     assert_close(by_sigma, of_sigma, [6 * eps] * len(want))
 
 
@@ -79,26 +89,45 @@ def test_drawn_opacities_and_their_gradients_match_mpmath(dtype: torch.dtype, sc
 def test_a_reach_ends_where_the_distance_equals_it(dtype: torch.dtype) -> None:
     """Whatever the opacity; what is kept is drawn with more than 0."""
     reach = torch.rand(20_000, generator=torch.Generator().manual_seed(0), dtype=dtype) + 0.1
-    for factor, inside in ((1 - torch.finfo(dtype).eps, True), (1, False), (1 + torch.finfo(dtype).eps, False)):
-        for opacities in (torch.zeros_like(reach), torch.full_like(reach, 1e-3), torch.ones_like(reach)):
+    for factor, inside in (
+        (1 - torch.finfo(dtype).eps, True),
+        (1, False),
+        (1 + torch.finfo(dtype).eps, False),
+    ):
+        for opacities in (
+            torch.zeros_like(reach),
+            torch.full_like(reach, 1e-3),
+            torch.ones_like(reach),
+        ):
             out = attenuate(opacities, reach, reach / 4 * factor, 4.0, OURS, activated=True)
-            assert (out.keep == inside).all() and torch.equal(out.drawn > 0, out.keep & (opacities > 0))
+            assert (out.keep == inside).all() and torch.equal(
+                out.drawn > 0, out.keep & (opacities > 0)
+            )
 
 
 positive = st.floats(1e-3, 1e3)
 
 
 @settings(deadline=None, max_examples=50)
-@given(s=positive, d=positive, turned=st.floats(1, 10), away=st.floats(1, 10), dtype=st.sampled_from(DTYPES))
+@given(
+    s=positive,
+    d=positive,
+    turned=st.floats(1, 10),
+    away=st.floats(1, 10),
+    dtype=st.sampled_from(DTYPES),
+)
 def test_what_is_drawn_is_nested_and_fades_evenly(
     s: float, d: float, turned: float, away: float, dtype: torch.dtype
 ) -> None:
-    """Further away, or at a larger dial value, no Gaussian comes back or is stronger, and opacity changes by at most
-    4 a per unit of log s and log d. It ends at ``s* = sigma_d / d``."""
+    """Further away, or at a larger dial value, no Gaussian comes back or is stronger, and opacity
+    changes by at most 4 a per unit of log s and log d. It ends at ``s* = sigma_d / d``.
+    """
     sigma = torch.logspace(-7, 7, 2000, dtype=dtype)
     a = torch.linspace(0, 1, 2000, dtype=dtype).roll(700)
     near, far = (torch.full_like(sigma, value) for value in (d, d * away))
-    before, after = (attenuate(a, sigma, *at, OURS, activated=True) for at in ((near, s), (far, s * turned)))
+    before, after = (
+        attenuate(a, sigma, *at, OURS, activated=True) for at in ((near, s), (far, s * turned))
+    )
     assert not (after.keep & ~before.keep).any() and (after.drawn <= before.drawn).all()
     changed, eps = before.drawn - after.drawn, torch.finfo(dtype).eps
     assert (changed <= 4 * a * math.log(away * turned) + 8 * eps).all()
@@ -109,23 +138,33 @@ def test_what_is_drawn_is_nested_and_fades_evenly(
 
 @each_dtype
 def test_without_an_effect_the_dial_is_bit_exact(dtype: torch.dtype) -> None:
-    """At s = 0, at the camera's centre, with an infinite sigma_d, and with SIGMA_MAX nearer than its docstring says."""
-    logits = torch.cat([torch.linspace(-120, 60, 4001), torch.tensor([math.inf, -math.inf])]).to(dtype)
+    """At s = 0, at the camera's centre, with an infinite sigma_d, and with SIGMA_MAX nearer than
+    its docstring says.
+    """
+    logits = torch.cat([torch.linspace(-120, 60, 4001), torch.tensor([math.inf, -math.inf])]).to(
+        dtype
+    )
     d, ones = torch.linspace(0, 1.5, len(logits), dtype=dtype), torch.ones_like(logits)
     widest = 1e7 if dtype == torch.float32 else 8e4
     for sigma, distances, s in (
-        (d - 0.7, d, 0.0), (d - 0.7, 0 * d, 6.0), (math.inf * ones, d, 1e30), (SIGMA_MAX * ones, widest * d / 2, 1.3),
-    ):  # fmt: skip
+        (d - 0.7, d, 0.0),
+        (d - 0.7, 0 * d, 6.0),
+        (math.inf * ones, d, 1e30),
+        (SIGMA_MAX * ones, widest * d / 2, 1.3),
+    ):
         found = attenuate(logits, sigma, distances, s, OURS)
         assert torch.equal(found.drawn, logits.sigmoid()) and found.keep.all()
 
 
 @each_dtype
 @pytest.mark.parametrize(
-    ("config", "s"), [(OURS, 0.0), (OURS, 7.0), (OURS, 1e39), (OURS, 1e300), (PAPER, 0.0), (PAPER, 7.0)]
+    ("config", "s"),
+    [(OURS, 0.0), (OURS, 7.0), (OURS, 1e39), (OURS, 1e300), (PAPER, 0.0), (PAPER, 7.0)],
 )
 def test_edges_are_finite(dtype: torch.dtype, config: AttenuationConfig, s: float) -> None:
-    """Values and gradients; of the paper's form, whose distances are shares of the largest, up to SIGMA_MAX."""
+    """Values and gradients; of the paper's form, whose distances are shares of the largest, up to
+    SIGMA_MAX.
+    """
     tiny, largest = torch.finfo(dtype).tiny, torch.finfo(dtype).max
     sigmas = [0.0, tiny, 1e-30, 1e-12, 1.0, SIGMA_MAX, -1.0, -math.inf, 1e30, math.inf]
     distances = [0.0, tiny, 1e-30, 1e-12, 1.0, SIGMA_MAX, 1e30, largest]
@@ -135,13 +174,18 @@ def test_edges_are_finite(dtype: torch.dtype, config: AttenuationConfig, s: floa
     out = attenuate(logits.requires_grad_(), sigma.requires_grad_(), d, s, config)
     slopes = torch.autograd.grad(out.drawn.sum(), (logits, sigma))
     assert all(x.isfinite().all() for x in (out.drawn, *slopes))
-    assert not out.drawn[~out.keep].any() and not out.keep[(d.double() * s > 0) & (sigma <= 0) & (config is OURS)].any()
+    assert (
+        not out.drawn[~out.keep].any()
+        and not out.keep[(d.double() * s > 0) & (sigma <= 0) & (config is OURS)].any()
+    )
 
 
 @pytest.mark.parametrize("activated", [False, True])
 def test_gradients_are_those_of_differences(activated: bool) -> None:
     """In float64; at opacities 0 and 1 too, of both forms, and of growth."""
-    sigma, d, h = grid(torch.float64, [0.3, 0.9, 2.0, 40.0], [0.05, 0.21, 0.55, 3.0], [-0.5, 0.0, 1.5])
+    sigma, d, h = grid(
+        torch.float64, [0.3, 0.9, 2.0, 40.0], [0.05, 0.21, 0.55, 3.0], [-0.5, 0.0, 1.5]
+    )
     opacities = torch.linspace(*((0, 1) if activated else (-5, 9)), len(d), dtype=torch.float64)
     for config in (OURS, PAPER):
 
@@ -155,7 +199,9 @@ def test_gradients_are_those_of_differences(activated: bool) -> None:
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
 def test_half_precision_is_computed_in_float32(dtype: torch.dtype) -> None:
-    logits, sigma, d = (torch.linspace(a, b, 50).to(dtype) for a, b in ((-6, 4), (0.01, 1), (0, 1.5)))
+    logits, sigma, d = (
+        torch.linspace(a, b, 50).to(dtype) for a, b in ((-6, 4), (0.01, 1), (0, 1.5))
+    )
     for config in (OURS, PAPER):
         out = attenuate(logits, sigma.requires_grad_(), d, 1.3, config)
         want = attenuate(logits.float(), sigma.float(), d.float(), 1.3, config)
@@ -183,7 +229,9 @@ def test_the_papers_form_is_its_formula(dtype: torch.dtype, scale: float) -> Non
     out = attenuate(logits, leaf, d, scale, PAPER)
     (slope,) = torch.autograd.grad(out.drawn.sum(), leaf)
     want, slopes, allowed = [], [], []
-    for x, decay, distance, kept in zip(*(c.tolist() for c in (logits, sigma, d, out.keep)), strict=True):
+    for x, decay, distance, kept in zip(
+        *(c.tolist() for c in (logits, sigma, d, out.keep)), strict=True
+    ):
         v = 2 * mpf(decay) ** 2 + mpf(EPS)
         u = (mpf(distance) * mpf(scale)) ** 2 / v
         faded = opacity(x) * mpmath.exp(-u)
@@ -200,7 +248,9 @@ def test_the_papers_form_is_its_formula(dtype: torch.dtype, scale: float) -> Non
 
 
 @each_dtype
-@pytest.mark.parametrize(("scale", "reach"), [*zip(SCALES, [1e-3, 0.3, 1.0, 4.2], strict=True), (7.0, 1e-3)])
+@pytest.mark.parametrize(
+    ("scale", "reach"), [*zip(SCALES, [1e-3, 0.3, 1.0, 4.2], strict=True), (7.0, 1e-3)]
+)
 def test_growth_and_its_slope_match_mpmath(dtype: torch.dtype, scale: float, reach: float) -> None:
     h, d = grid(dtype, EXPONENTS, [*DISTANCES, 1.0000001, 5e3])
     out = growth_factors(h.requires_grad_(), d, scale, reach)
@@ -221,9 +271,13 @@ def test_growth_and_its_slope_match_mpmath(dtype: torch.dtype, scale: float, rea
 
 @each_dtype
 def test_growth_is_finite(dtype: torch.dtype) -> None:
-    """At any finite exponent, at the centre, at distances and dial values whose product overflows."""
+    """At any finite exponent, at the centre, at distances and dial values whose product
+    overflows.
+    """
     largest = torch.finfo(dtype).max
-    edges = itertools.product([0.0, -0.0, 1e-30, 1.0, -1.0, largest, -largest], [0.0, 1e-40, 1.0, 1e30, largest])
+    edges = itertools.product(
+        [0.0, -0.0, 1e-30, 1.0, -1.0, largest, -largest], [0.0, 1e-40, 1.0, 1e30, largest]
+    )
     h, d = torch.tensor([*edges], dtype=dtype).unbind(1)
     h.requires_grad_()
     for s, r in itertools.product([1.0, 5.0, 1e39, 1e300], [1e-300, 1e-3, 1.0, 1e300]):
@@ -241,7 +295,9 @@ def test_bad_calls_are_named() -> None:
         attenuate(three, three, three, -0.5, OURS)
     with pytest.raises(ClodError, match=r"sigma_d \(4,\)"):
         attenuate(three, four, three, 2.0, OURS)
-    with pytest.raises(ClodError, match="sigma_d is no tensor but ndarray; pass torch.as_tensor of it"):
+    with pytest.raises(
+        ClodError, match="sigma_d is no tensor but ndarray; pass torch.as_tensor of it"
+    ):
         attenuate(three, three.numpy(), three, 2.0, OURS)
     for seen_from in (three, (torch.ones(3, 3), camera())):
         with pytest.raises(ClodError, match=r"growth_d \(1,\)"):

@@ -1,5 +1,6 @@
-"""Rows of an evaluation, by hand and of an unadapted file; frame times on a simulated clock; budgets: solved
-dial values keep the counts asked for, and interpolate known curves."""
+"""Rows of an evaluation, by hand and of an unadapted file; frame times on a simulated clock;
+budgets: solved dial values keep the counts asked for, and interpolate known curves.
+"""
 
 import math
 import random
@@ -12,7 +13,17 @@ import torch
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
-from clod_adapter import AttenuationConfig, Camera, ClodError, Gaussians, Stopped, View, dial_for, evaluate, render
+from clod_adapter import (
+    AttenuationConfig,
+    Camera,
+    ClodError,
+    Gaussians,
+    Stopped,
+    View,
+    dial_for,
+    evaluate,
+    render,
+)
 from clod_adapter.adapter import with_dial
 from clod_adapter.calibration import Calibration, CalibrationRow
 from clod_adapter.config import FORMS
@@ -24,7 +35,9 @@ from scenes import camera, gaussians, in_front, photograph, ring
 
 
 def row_of_four() -> Gaussians:
-    """Four Gaussians at camera depths 1, 2, 4 and 8, the last far outside the image; each has a reach of 3."""
+    """Four Gaussians at camera depths 1, 2, 4 and 8, the last far outside the image; each has a
+    reach of 3.
+    """
     means = in_front(camera(), torch.tensor([[0.0, 0, 1], [0, 0, 2], [0, 0, 4], [80, 0, 8]]))
     some = gaussians(4, 0, 0).replace(means=means, opacity_logits=torch.full((4,), 2.0))
     return with_dial(some, torch.full((4,), 3.0), AttenuationConfig())
@@ -46,7 +59,9 @@ def test_rows_are_means_over_renders() -> None:
     some = with_dial(gaussians(200, 1, 0), sigma_d, AttenuationConfig(scene_distance=4.0))
     views = photograph(gaussians(200, 1, 0), ring(3, 32, 24))
     seen = []
-    rows = evaluate(some, views, [1.0, 2.0], progress=lambda now: seen.append((now.done, now.total)))
+    rows = evaluate(
+        some, views, [1.0, 2.0], progress=lambda now: seen.append((now.done, now.total))
+    )
     assert seen == [(k, 6) for k in range(1, 7)]
     for row in rows:
         with torch.no_grad():
@@ -76,7 +91,9 @@ Clock = Callable[[Callable[[int, float], float]], list[tuple[str, float]]]
 
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
-    """Renders in no time; the clock advances by ``cost(frame, s)`` seconds. Returns the frames that are drawn."""
+    """Renders in no time; the clock advances by ``cost(frame, s)`` seconds. Returns the frames that
+    are drawn.
+    """
 
     def install(cost: Callable[[int, float], float]) -> list[tuple[str, float]]:
         drawn, now = list[tuple[str, float]](), [0.0]
@@ -98,12 +115,16 @@ def of_one(**options: Any) -> FrameTimes:
 
 
 def test_drift_and_interruptions_do_not_zigzag(clock: Clock) -> None:
-    """Frames take 20/s ms; 3 times that at first, a half more at the end, and one in twelve is interrupted."""
+    """Frames take 20/s ms; 3 times that at first, a half more at the end, and one in twelve is
+    interrupted.
+    """
     chance = random.Random(0)
 
     def cost(frame: int, s: float) -> float:
         slow = 3 if frame < 4 else 1 + frame / 500
-        return 0.02 / s * slow * chance.uniform(0.97, 1.03) + (0.05 if chance.random() < 1 / 12 else 0)
+        return 0.02 / s * slow * chance.uniform(0.97, 1.03) + (
+            0.05 if chance.random() < 1 / 12 else 0
+        )
 
     clock(cost)
     found = of_one()
@@ -116,10 +137,14 @@ def test_drift_and_interruptions_do_not_zigzag(clock: Clock) -> None:
 def test_frames_are_interleaved_and_few_where_they_are_slow(clock: Clock) -> None:
     drawn = clock(lambda frame, s: 0.01)
     seen = list[tuple[int, int]]()
-    assert of_one(progress=lambda now: seen.append((now.done, now.total))).milliseconds == ((pytest.approx(10),) * 9,)
+    assert of_one(progress=lambda now: seen.append((now.done, now.total))).milliseconds == (
+        (pytest.approx(10),) * 9,
+    )
     assert seen == [(k, PASSES) for k in range(1, PASSES + 1)]
     timed = drawn[-PASSES * 9 * 3 :]  # nine cameras: every third is one of at most four
-    assert len({name for name, _ in drawn}) == 3 <= VIEWS and [s for _, s in timed] == [*DIALS] * (3 * PASSES)
+    assert len({name for name, _ in drawn}) == 3 <= VIEWS and [s for _, s in timed] == [*DIALS] * (
+        3 * PASSES
+    )
     assert {s for _, s in drawn[: -len(timed)]} == {1.0}  # the warm-up, with the slowest
     drawn = clock(lambda frame, s: 1.0)
     of_one()
@@ -147,23 +172,37 @@ def kept(some: Gaussians, cameras: Sequence[Camera], s: float) -> int:
 
 
 @settings(deadline=None, max_examples=30)
-@example(n=2, seed=2, views=5, share=0.25, form="paper")  # one Gaussian is at distance 1 in three views
+# one Gaussian is at distance 1 in three views
+@example(n=2, seed=2, views=5, share=0.25, form="paper")
 @given(
-    n=st.integers(2, 3000), seed=st.integers(0, 10**6), views=st.integers(1, 5), share=st.floats(-1, 1),
+    n=st.integers(2, 3000),
+    seed=st.integers(0, 10**6),
+    views=st.integers(1, 5),
+    share=st.floats(-1, 1),
     form=st.sampled_from(FORMS),
-)  # fmt: skip
-def test_counts_are_exact_up_to_ties(n: int, seed: int, views: int, share: float, form: str) -> None:
+)
+def test_counts_are_exact_up_to_ties(
+    n: int, seed: int, views: int, share: float, form: str
+) -> None:
     some, cameras = adapted(n, seed, form), ring(views, 48, 36)
     most, fewest = kept(some, cameras, 1.0), kept(some, cameras, MAX_SV)
     wanted = fewest + round(share * (most - fewest if share > 0 else fewest))
     assume(wanted >= views)
     solved = dial_for(some, keep=wanted / views, cameras=cameras)
     found = kept(some, cameras, solved.virtual_scale)
-    assert solved.virtual_scale >= 1 and (solved.virtual_scale <= MAX_SV) == (solved.note == "") == (wanted >= fewest)
-    # At most what was asked for; and where it is less, more would stay at the next smaller dial value in float32.
+    assert solved.virtual_scale >= 1 and (solved.virtual_scale <= MAX_SV) == (
+        solved.note == ""
+    ) == (wanted >= fewest)
+    # At most what was asked for; and where it is less, more would stay at the next smaller dial
+    # value in float32.
     assert found <= wanted, (seed, found, wanted)
-    assert found == wanted or kept(some, cameras, solved.virtual_scale * (1 - 1e-6)) > wanted, (seed, found, wanted)
-    # The Gaussian whose distance is the unit is at distance 1, and ends at the same s in each view where it is that.
+    assert found == wanted or kept(some, cameras, solved.virtual_scale * (1 - 1e-6)) > wanted, (
+        seed,
+        found,
+        wanted,
+    )
+    # The Gaussian whose distance is the unit is at distance 1, and ends at the same s in each view
+    # where it is that.
     ties = 0 if form == "ours" else views - 1
     assert wanted - found <= max(1, 0.001 * wanted) + ties, (seed, found, wanted)
 
@@ -171,12 +210,16 @@ def test_counts_are_exact_up_to_ties(n: int, seed: int, views: int, share: float
 def table(psnr: Sequence[float], times: Sequence[float] = ()) -> Calibration:
     dials = [2.0**k for k in range(len(psnr))]
     times = times or [10.0 / s for s in dials]
-    rows = tuple(CalibrationRow(s, 100 / s, p, 0.9, t) for s, p, t in zip(dials, psnr, times, strict=True))
+    rows = tuple(
+        CalibrationRow(s, 100 / s, p, 0.9, t) for s, p, t in zip(dials, psnr, times, strict=True)
+    )
     return Calibration(rows, 100, 2, 64, 48, "a machine")
 
 
 def test_a_psnr_drop_is_linear_in_log_s() -> None:
-    """From s = 1, not from the best; where it is first spent; a larger one than any is the largest dial value."""
+    """From s = 1, not from the best; where it is first spent; a larger one than any is the largest
+    dial value.
+    """
     for psnr, drop, wanted in (
         ([30, 29, 28], 1, 2),
         ([30, 29, 28], 1.25, 2 * 2**0.25),
@@ -219,7 +262,9 @@ def test_bad_arguments_are_refused() -> None:
             dial_for(some, cameras=camera, **budgets)
     wrong: Any
     for wrong in ("5", [1.0], torch.ones(2), 10**400):
-        with pytest.raises(ClodError, match=re.escape(f"keep is {wrong}, it must be a positive, finite number")):
+        with pytest.raises(
+            ClodError, match=re.escape(f"keep is {wrong}, it must be a positive, finite number")
+        ):
             dial_for(some, keep=wrong, cameras=camera)
     for wrong in (camera[0], [View(camera[0], torch.zeros(36, 48, 3, dtype=torch.uint8))], "abc"):
         with pytest.raises(ClodError, match="cameras must be a list of cameras or viewpoints"):

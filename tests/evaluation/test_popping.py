@@ -1,12 +1,14 @@
-"""The measure of popping separates a jump from a fade and excludes the camera's motion; and a dial pops nowhere:
+"""The measure of popping separates a jump from a fade and excludes the camera's motion; and a dial
+pops nowhere:
 
 With a step h of log s or log d, no pixel changes by more than
 
     255 (4 W + 2/e n G) h + n + 2 255 T_MIN
 
-levels, where n Gaussians are drawn on it with footprints ``exp(-q)`` that sum to W, G is the largest ``|growth_d|``,
-and colours are in [0, 1]. The picture changes by at most T <= 1 per alpha. A drawn opacity changes by at most 4 a h, a
-footprint by at most ``2 q exp(-q) |growth_d| h <= 2/e |growth_d| h``. An alpha that begins or ends at 1/255 adds a
+levels, where n Gaussians are drawn on it with footprints ``exp(-q)`` that sum to W, G is the
+largest ``|growth_d|``, and colours are in [0, 1]. The picture changes by at most T <= 1 per alpha.
+A drawn opacity changes by at most 4 a h, a footprint by at most
+``2 q exp(-q) |growth_d| h <= 2/e |growth_d| h``. An alpha that begins or ends at 1/255 adds a
 level, and what is not drawn behind the end of a pixel, in either picture, T_MIN.
 """
 
@@ -31,27 +33,40 @@ from scenes import gaussians, ring
 
 
 def dialled() -> Gaussians:
-    """Gaussians that end at different dial values; scene distance 4, where the ring of cameras is."""
-    reaches = torch.linspace(0.3, 4, 200)[torch.randperm(200, generator=torch.Generator().manual_seed(3))]
+    """Gaussians that end at different dial values; scene distance 4, where the ring of cameras
+    is.
+    """
+    reaches = torch.linspace(0.3, 4, 200)[
+        torch.randperm(200, generator=torch.Generator().manual_seed(3))
+    ]
     return with_dial(gaussians(200, 1, 0, size=0.2), reaches, AttenuationConfig(scene_distance=4.0))
 
 
 def test_popping_of_a_fade_and_of_a_switch() -> None:
-    """Grey rising by 1/100 a step on one of two pixels; and black that becomes grey 1/2 in one step."""
+    """Grey rising by 1/100 a step on one of two pixels; and black that becomes grey 1/2 in one
+    step.
+    """
     positions = [k / 10 for k in range(11)]
     fade = sweep(lambda _, j: torch.tensor([[[j / 100] * 3, [0.0] * 3]]), positions)
     assert fade.steps == 10 and fade.mean == pytest.approx(2.55 / math.sqrt(2), rel=1e-4)
-    assert fade.ratio == pytest.approx(1, abs=1e-4) and fade.persistence == pytest.approx(0.5, abs=1e-4)
-    assert fade.pixel == pytest.approx(2.55, rel=1e-4) and fade.pixel_persistence == pytest.approx(0.5, abs=1e-4)
+    assert fade.ratio == pytest.approx(1, abs=1e-4) and fade.persistence == pytest.approx(
+        0.5, abs=1e-4
+    )
+    assert fade.pixel == pytest.approx(2.55, rel=1e-4) and fade.pixel_persistence == pytest.approx(
+        0.5, abs=1e-4
+    )
     switch = sweep(lambda _, j: torch.full((1, 2, 3), 0.5 * (j >= 4)), positions)
     assert switch.largest == switch.pixel == 127.5 and switch.at == switch.pixel_at == 0.4
     assert switch.ratio == pytest.approx(10) and switch.persistence == switch.pixel_persistence == 1
     assert list(switch.changes) == [0, 0, 0, 127.5, *[0] * 6]
     # There and back at every step: over two steps nothing is left, which must not make it a fade.
     flicker = sweep(lambda _, j: torch.full((1, 1, 3), 0.2 * (j % 2)), [0, 1, 2, 3])
-    assert flicker.ratio == pytest.approx(1) and flicker.persistence == flicker.pixel_persistence == 1
+    assert (
+        flicker.ratio == pytest.approx(1) and flicker.persistence == flicker.pixel_persistence == 1
+    )
     both = sweep(lambda _, j: torch.full((1, 1, 3), 0.01 * j + 0.2 * (j >= 4)), positions)
-    assert both.pixel * (2 - 1 / both.pixel_persistence) == pytest.approx(0.2 * 255, rel=1e-4)  # the jump alone
+    # the jump alone
+    assert both.pixel * (2 - 1 / both.pixel_persistence) == pytest.approx(0.2 * 255, rel=1e-4)
     white = sweep(lambda _, j: torch.full((1, 1, 3), 1.0 + j), [0, 1, 2])  # nothing is brighter
     assert white.largest == white.pixel == 0 and math.isnan(white.ratio)
 
@@ -59,9 +74,14 @@ def test_popping_of_a_fade_and_of_a_switch() -> None:
 def test_dial_sweep_measures_its_renders() -> None:
     some, camera = dialled(), ring(3, 32, 24)[1]
     seen = []
-    result = dial_popping(some, camera, 3.0, steps=4, progress=lambda now: seen.append((now.done, now.total)))
+    result = dial_popping(
+        some, camera, 3.0, steps=4, progress=lambda now: seen.append((now.done, now.total))
+    )
     images = [render(some, camera, 3 ** (k / 4)).image.clamp(0, 1) for k in range(5)]
-    want = [255 * float((b - a).square().mean().sqrt()) for a, b in zip(images[:-1], images[1:], strict=True)]
+    want = [
+        255 * float((b - a).square().mean().sqrt())
+        for a, b in zip(images[:-1], images[1:], strict=True)
+    ]
     assert result.changes == pytest.approx(want) and seen == [(k, 4) for k in range(1, 5)]
     assert result.at == pytest.approx(3 ** ((want.index(max(want)) + 1) / 4))
 
@@ -73,7 +93,9 @@ def test_camera_motion_alone_is_no_change() -> None:
     moved = path_popping(some, cameras, 3.0, steps=6)
     images = torch.stack([render(some, camera, 3.0).image for camera in path(cameras, 6)])
     motion = 255 * (images[1:] - images[:-1]).square().mean((1, 2, 3)).sqrt()
-    assert all(0 < change < 0.7 * by for change, by in zip(moved.changes, motion.tolist(), strict=True))
+    assert all(
+        0 < change < 0.7 * by for change, by in zip(moved.changes, motion.tolist(), strict=True)
+    )
 
 
 def test_path_passes_through_the_cameras_at_equal_steps() -> None:
@@ -84,21 +106,30 @@ def test_path_passes_through_the_cameras_at_equal_steps() -> None:
         assert torch.allclose(got.viewmat, want.viewmat, atol=1e-5)
     centres = torch.stack([camera.position for camera in found])
     gaps = (centres[1:] - centres[:-1]).norm(dim=1)
-    assert gaps.max() < 1.001 * gaps.median()  # one step cuts the corner at the camera in the middle
+    # one step cuts the corner at the camera in the middle
+    assert gaps.max() < 1.001 * gaps.median()
     assert (centres - cameras[1].position).norm(dim=1).min() < 0.51 * gaps.max()
 
 
 def adversary(form: str) -> tuple[Gaussians, list[Camera]]:
-    """Four coincident opaque white Gaussians that end together at s = 2.2, and three black ones behind them, of which
-    one is far away and comes into view once the camera has turned."""
+    """Four coincident opaque white Gaussians that end together at s = 2.2, and three black ones
+    behind them, of which one is far away and comes into view once the camera has turned.
+    """
     camera = ring(1, 32, 24)[0]
     forward, right = camera.viewmat[2, :3], camera.viewmat[0, :3]
-    means = torch.cat([torch.zeros(4, 3), torch.stack([forward, 2 * forward, 60 * forward + 40 * right])])
+    means = torch.cat(
+        [torch.zeros(4, 3), torch.stack([forward, 2 * forward, 60 * forward + 40 * right])]
+    )
     some = gaussians(7, 0, 0).replace(
-        means=means, log_scales=torch.full((7, 3), math.log(0.4)), opacity_logits=torch.full((7,), 3.0),
+        means=means,
+        log_scales=torch.full((7, 3), math.log(0.4)),
+        opacity_logits=torch.full((7,), 3.0),
         sh0=torch.tensor([1.7] * 4 + [-1.7] * 3)[:, None, None].expand(7, 1, 3),
-    )  # fmt: skip
-    config, ends = AttenuationConfig(form=form, scene_distance=4.0), torch.tensor([2.2] * 4 + [3.0, 4.0, 5.0])
+    )
+    config, ends = (
+        AttenuationConfig(form=form, scene_distance=4.0),
+        torch.tensor([2.2] * 4 + [3.0, 4.0, 5.0]),
+    )
     sigma = ends * normalized_distances(means, camera, config)
     if form == "paper":
         sigma = sigma / (2 * (some.opacities / (TAU * ends)).log()).sqrt()
@@ -119,7 +150,9 @@ def test_a_dial_pops_nowhere_and_the_papers_form_does() -> None:
 
 
 def test_a_camera_that_turns_changes_nothing() -> None:
-    """In the paper's form, a far Gaussian that enters the view changes the unit, and with it all opacities, at once."""
+    """In the paper's form, a far Gaussian that enters the view changes the unit, and with it all
+    opacities, at once.
+    """
     for form in FORMS:
         some, cameras = adversary(form)
         pixels = [path_popping(some, cameras, 2.0, steps=steps).pixel for steps in (10, 20)]
@@ -132,30 +165,42 @@ def most(count: int, step: float) -> float:
 
 
 def lines_of_sight(seed: int) -> tuple[Gaussians, Camera]:
-    """Two to four Gaussians on each of 108 lines of sight, black or white, that let through a little less than T_MIN at
-    s = 1, and more as they fade. On the first line, a black one fades in front of a white one that ends the pixel."""
+    """Two to four Gaussians on each of 108 lines of sight, black or white, that let through a
+    little less than T_MIN at s = 1, and more as they fade. On the first line, a black one fades in
+    front of a white one that ends the pixel.
+    """
     random, rows = np.random.default_rng(seed), []
     for x, y in product(range(-44, 48, 8), range(-32, 36, 8)):
         count = 2 if not rows else random.integers(2, 5)
         decades = random.dirichlet(np.ones(count)) * random.uniform(4, 4.4)
         for opacity in 1 - 10**-decades:
             depth, reach = random.uniform(2, 3), random.uniform(1, 2.5)
-            rows.append([x, y, depth, opacity, depth * reach, random.integers(2), random.uniform(-1, 1)])
+            rows.append(
+                [x, y, depth, opacity, depth * reach, random.integers(2), random.uniform(-1, 1)]
+            )
     rows[:2] = [[-44, -32, 2, 0.93, 6.6, 0, 0], [-44, -32, 3, 0.9997, SIGMA_MAX, 1, 0]]
-    x, y, depths, opacities, reaches, white, growth_d = torch.tensor(np.array(rows), dtype=torch.float32).unbind(1)
+    x, y, depths, opacities, reaches, white, growth_d = torch.tensor(
+        np.array(rows), dtype=torch.float32
+    ).unbind(1)
     means = torch.stack([x / 100, y / 100, torch.ones_like(x)], 1) * depths[:, None]
     some = gaussians(len(rows), 0, 0).replace(
-        means=means, log_scales=(0.005 * depths).log()[:, None].repeat(1, 3), opacity_logits=opacities.logit(),
+        means=means,
+        log_scales=(0.005 * depths).log()[:, None].repeat(1, 3),
+        opacity_logits=opacities.logit(),
         sh0=((white - 0.5) / SH_C0)[:, None, None].repeat(1, 1, 3),
-    )  # fmt: skip
+    )
     K = torch.tensor([[100.0, 0, 48.5], [0, 100, 36.5], [0, 0, 1]])
-    some = with_dial(some, reaches, AttenuationConfig(reference_distance=2.0)).replace(growth_d=growth_d)
+    some = with_dial(some, reaches, AttenuationConfig(reference_distance=2.0)).replace(
+        growth_d=growth_d
+    )
     return some, Camera(torch.eye(4), K, 96, 72)
 
 
 @pytest.mark.parametrize("seed", [0, 1])
 def test_no_pixel_jumps_where_it_ends(seed: int) -> None:
-    """As the dial turns, and as a camera moves back that the distances are from, in 250 steps that double d s."""
+    """As the dial turns, and as a camera moves back that the distances are from, in 250 steps that
+    double d s.
+    """
     some, view = lines_of_sight(seed)
     assert dial_popping(some, view, 2.0, steps=250).pixel <= most(4, math.log(2) / 250)
     places = [2 ** (k / 250) for k in range(251)]
@@ -163,7 +208,9 @@ def test_no_pixel_jumps_where_it_ends(seed: int) -> None:
     def picture(_: int, j: int) -> torch.Tensor:
         back = torch.eye(4)
         back[2, 3] = 2 * (places[j] - 1)
-        return for_device(torch.device("cpu")).draw(some, view, seen_from=dataclasses.replace(view, viewmat=back))[0]
+        return for_device(torch.device("cpu")).draw(
+            some, view, seen_from=dataclasses.replace(view, viewmat=back)
+        )[0]
 
     with torch.no_grad():
         assert sweep(picture, places).pixel <= most(4, math.log(2) / 250)

@@ -1,4 +1,6 @@
-"""The importance estimate against brute force, the counts kept with the resulting sigma_d, and the pruning order."""
+"""The importance estimate against brute force, the counts kept with the resulting sigma_d, and the
+pruning order.
+"""
 
 import dataclasses
 
@@ -12,7 +14,14 @@ from clod_adapter.equation.distances import typical_distance
 from clod_adapter.gaussians import SH_C0
 from clod_adapter.initialization import pruning_order as pruning
 from clod_adapter.initialization.importance import initialize, removal_error, usable_views
-from clod_adapter.initialization.pruning_order import APART, COLOUR_FLOOR, MOST, NEIGHBOURS, REMOVED, SHARE
+from clod_adapter.initialization.pruning_order import (
+    APART,
+    COLOUR_FLOOR,
+    MOST,
+    NEIGHBOURS,
+    REMOVED,
+    SHARE,
+)
 from clod_adapter.render import splat
 from scenes import gaussians, photograph, ring
 
@@ -20,14 +29,20 @@ REVERSED = torch.diag(torch.tensor([-1.0, 1, -1, 1]))  # looks the other way
 
 
 def changes(some: Gaussians, view: View) -> Tensor:
-    """``[N, pixels]`` of removing each Gaussian alone; an image is linear in each opacity where nothing is clamped."""
+    """``[N, pixels]`` of removing each Gaussian alone; an image is linear in each opacity where
+    nothing is clamped.
+    """
     whole, _ = splat(some, some.opacities, view.camera)
     without = some.opacities.repeat(len(some), 1).fill_diagonal_(0)
-    return torch.stack([(splat(some, each, view.camera)[0] - whole).flatten() for each in without]).double()
+    return torch.stack(
+        [(splat(some, each, view.camera)[0] - whole).flatten() for each in without]
+    ).double()
 
 
 def test_removal_error_is_unbiased(draws: int = 100) -> None:
-    """To 5 standard deviations: with random signs z, ``(sum z v)^2`` has mean |v|^2, variance 2 (|v|^4 - sum v^4)."""
+    """To 5 standard deviations: with random signs z, ``(sum z v)^2`` has mean |v|^2, variance 2
+    (|v|^4 - sum v^4).
+    """
     some = gaussians(15, 1, 0, size=0.4)
     some = some.replace(opacity_logits=(0.02 + 0.3 * some.opacities).logit())
     views = photograph(some, ring(3, 16, 12))
@@ -38,19 +53,25 @@ def test_removal_error_is_unbiased(draws: int = 100) -> None:
     error = (found.mean(0) - exact).abs()
     spread = (variance / draws).sqrt()
     assert (exact > 0).sum() > 10
-    assert (error <= 5 * spread + 1e-5 * exact.max()).all(), f"{(error / spread).max():.1f} deviations"
-    assert (spread < 0.15 * exact + 1e-9).all()  # so the test could tell a factor of 2, or a missing view
+    assert (error <= 5 * spread + 1e-5 * exact.max()).all(), (
+        f"{(error / spread).max():.1f} deviations"
+    )
+    # so the test could tell a factor of 2, or a missing view
+    assert (spread < 0.15 * exact + 1e-9).all()
 
 
 def test_removal_error_depends_on_the_seed_alone() -> None:
     some = gaussians(100, 1, 0)
-    some = some.replace(means=torch.cat([some.means[:75], some.means[75:] + 1e3]))  # outside of every view
+    # outside of every view
+    some = some.replace(means=torch.cat([some.means[:75], some.means[75:] + 1e3]))
     (view,) = photograph(some, ring(1, 20, 16))
     both = removal_error(some, [view, view], seed=3)
     assert torch.equal(both, removal_error(some, [view, view], seed=3))
     assert not torch.equal(both, removal_error(some, [view, view], seed=4))
     assert (both[75:] == 0).all() and (both[:75] > 0).any()
-    blind = View(dataclasses.replace(view.camera, viewmat=REVERSED @ view.camera.viewmat), view.image)
+    blind = View(
+        dataclasses.replace(view.camera, viewmat=REVERSED @ view.camera.viewmat), view.image
+    )
     assert usable_views(some.select(torch.arange(75)), [view, blind, view]) == (view, view)
     with pytest.raises(ClodError, match="in front of any of the 1 training cameras"):
         usable_views(gaussians(20, 0, 0), [blind])
@@ -69,7 +90,9 @@ def distances_of(some: Gaussians, views: tuple[View, ...]) -> Tensor:
 
 @pytest.mark.parametrize(("share", "exponent"), [(0.51, 1.5), (0.8, 2.5), (1.0, 1.5)])
 def test_kept_shares_follow_the_target_curve(share: float, exponent: float, n: int = 1000) -> None:
-    """At the distances of the initialization, ``1 / (s^p + (1/share - 1) s^-p)``, to one Gaussian."""
+    """At the distances of the initialization, ``1 / (s^p + (1/share - 1) s^-p)``, to one
+    Gaussian.
+    """
     some, views = dialled(n, start_share=share, exponent=exponent)
     for s in (1.0, 1.2, 1.7, 2.0, 3.0, 5.0, 7.0, 15.0):
         kept = dial(some, distances_of(some, views), s).keep
@@ -81,7 +104,10 @@ def test_initialization_culls_in_the_pruning_order() -> None:
     """In which one that a neighbour replaces goes earlier than by its removal error alone."""
     some, views = dialled(200)
     assert some.sigma_d is not None
-    error, found = removal_error(some, views, seed=0), (some.sigma_d / distances_of(some, views)).argsort()
+    error, found = (
+        removal_error(some, views, seed=0),
+        (some.sigma_d / distances_of(some, views)).argsort(),
+    )
     order = pruning.pruning_order(some, error.sqrt() * some.opacities).position
     assert torch.equal(found[100:180], order.argsort()[100:180])
     assert not torch.equal(order.argsort()[100:180], error.argsort(stable=True)[100:180])
@@ -95,15 +121,26 @@ def plainly(some: Gaussians, worth: Tensor) -> list[int]:
 
     def unlike(i: int, j: int) -> float:
         apart, reach = (centres[i] - centres[j]).square().sum(), (sizes[i] + sizes[j]).square()
-        return float((colours[i] - colours[j]).square().sum() + COLOUR_FLOOR**2 + APART * apart / (apart + reach))
+        return float(
+            (colours[i] - colours[j]).square().sum()
+            + COLOUR_FLOOR**2
+            + APART * apart / (apart + reach)
+        )
 
     while len(left) > 1:
         heirs = {}
         for i in left:
-            near = sorted((j for j in left if j != i), key=lambda j: float((centres[i] - centres[j]).square().sum()))
+            near = sorted(
+                (j for j in left if j != i),
+                key=lambda j: float((centres[i] - centres[j]).square().sum()),
+            )
             heirs[i] = min(near[:NEIGHBOURS], key=lambda j: unlike(i, j))
         ranked = sorted(left, key=lambda i: worths[i] * unlike(i, heirs[i]))
-        leaving = [i for i in ranked[: max(int(REMOVED * len(left)), 1)] if ranked.index(heirs[i]) > ranked.index(i)]
+        leaving = [
+            i
+            for i in ranked[: max(int(REMOVED * len(left)), 1)]
+            if ranked.index(heirs[i]) > ranked.index(i)
+        ]
         leaving = [i for i in leaving if i not in [heirs[j] for j in leaving]]
         for i in leaving:
             worths[heirs[i]] += worths[i]
@@ -116,7 +153,9 @@ def plainly(some: Gaussians, worth: Tensor) -> list[int]:
 def test_order_matches_the_plain_implementation(n: int, seed: int) -> None:
     some, seen = gaussians(n, 1, seed), []
     worth = torch.rand(n, generator=torch.Generator().manual_seed(seed))
-    order = pruning.pruning_order(some, worth, lambda now: seen.append((now.done, now.total))).position
+    order = pruning.pruning_order(
+        some, worth, lambda now: seen.append((now.done, now.total))
+    ).position
     assert order.argsort().tolist() == plainly(some, worth), f"n {n}, seed {seed}"
     assert n < 60 or (seen == sorted(seen) and 0 < seen[0][0] < 30 and seen[-1] == (60, 60))
 
@@ -128,7 +167,9 @@ def test_coincident_gaussians_are_moved_apart() -> None:
     # Of no worth and no size at all: ties, and nothing to divide by.
     for one in (alike, alike.replace(log_scales=torch.full((2000, 3), -400.0))):
         seen.clear()
-        order = pruning.pruning_order(one, torch.zeros(2000), lambda now: seen.append((now.done, now.total))).position
+        order = pruning.pruning_order(
+            one, torch.zeros(2000), lambda now: seen.append((now.done, now.total))
+        ).position
         assert order.sort().values.equal(torch.arange(2000)) and len(seen) < 300
 
 
@@ -139,13 +180,17 @@ def test_exponents_are_in_range_and_0_without_descendants() -> None:
     some, d = gaussians(400, 0, 0), torch.full((400,), 0.9)
     order = pruning.pruning_order(some, torch.rand(400, generator=torch.Generator().manual_seed(0)))
     config, sigma_d = AttenuationConfig(max_sv=MAX_SV), d * (1 + 9 * (order.position + 1) / 400)
-    found = pruning.initial_growth(some.replace(sigma_d=sigma_d, attenuation=config), order.substitute, d)
+    found = pruning.initial_growth(
+        some.replace(sigma_d=sigma_d, attenuation=config), order.substitute, d
+    )
     alone = torch.ones(400, dtype=torch.bool)
     alone[order.substitute[order.substitute != torch.arange(400)]] = False
     assert found.dtype == torch.float32 and found.min() >= 0 and found.max() <= MOST * SHARE
     assert not found[alone].any() and (found[~alone] > 0).sum() > 50
     for iters in (0, 1):  # growth begins with 0 where it is trained
-        grown = initialize(some, photograph(some, ring(2, 16, 12)), AdaptConfig(iters=iters)).growth_d
+        grown = initialize(
+            some, photograph(some, ring(2, 16, 12)), AdaptConfig(iters=iters)
+        ).growth_d
         assert bool(grown.any()) == (iters == 0)
 
 

@@ -1,4 +1,6 @@
-"""What ``inspect`` finds in a file: values, anomalies, the dial, states and the writer; and what it refuses."""
+"""What ``inspect`` finds in a file: values, anomalies, the dial, states and the writer; and what it
+refuses.
+"""
 
 import json
 import math
@@ -34,7 +36,11 @@ def seen(path: Path) -> tuple[Inspection, Splat]:
     """The result for a splat, which can be printed and be written as JSON."""
     found = inspect(path)
     json.dumps(jsonable(found.as_dict()), allow_nan=False)
-    assert all(line.isprintable() for line in lines_of(found)) and found.splat is not None and found.about is None
+    assert (
+        all(line.isprintable() for line in lines_of(found))
+        and found.splat is not None
+        and found.about is None
+    )
     return found, found.splat
 
 
@@ -49,20 +55,32 @@ def test_a_plain_file(tmp_path: Path) -> None:
     assert (v.total, v.count, v.dropped, splat.sh_degree, v.used_sh_degree) == (300, 300, {}, 1, 1)
     assert found.what == "a splat, PLY" and "Inria" in (found.writer or "") and splat.dial is None
     assert splat.columns[0] == ("x", "float32") and len(splat.columns) == len(vertex.dtype.names)
-    assert (found.anomalies, found.left_out, found.notes, splat.extra, splat.origin) == ((), (), (), (), NOWHERE)
+    assert (found.anomalies, found.left_out, found.notes, splat.extra, splat.origin) == (
+        (),
+        (),
+        (),
+        (),
+        NOWHERE,
+    )
     for axis, spread in zip("xyz", v.position, strict=True):
         assert (spread.least, spread.greatest) == (vertex[axis].min(), vertex[axis].max())
-        assert [spread.low, spread.median, spread.high] == pytest.approx(np.quantile(vertex[axis], (0.01, 0.5, 0.99)))
+        assert [spread.low, spread.median, spread.high] == pytest.approx(
+            np.quantile(vertex[axis], (0.01, 0.5, 0.99))
+        )
     scales = np.sort(np.exp(np.stack([vertex[f"scale_{k}"] for k in range(3)])), 0)
     opacities = 1 / (1 + np.exp(-vertex["opacity"].astype(float)))
-    assert v.scale.median == pytest.approx(np.median(scales)) and v.scale.greatest == pytest.approx(scales.max())
+    assert v.scale.median == pytest.approx(np.median(scales)) and v.scale.greatest == pytest.approx(
+        scales.max()
+    )
     assert v.opacity.median == pytest.approx(np.median(opacities))
     assert v.fainter_than_visible == (opacities < 1 / 255).mean()
     assert v.needles == (scales[2] > 10 * scales[1]).mean()
 
 
 @pytest.mark.parametrize(("degree", "used"), [(0, 0), (2, 1), (3, 0), (4, 4)])
-def test_empty_sh_degrees_are_those_that_adapting_skips(tmp_path: Path, degree: int, used: int) -> None:
+def test_empty_sh_degrees_are_those_that_adapting_skips(
+    tmp_path: Path, degree: int, used: int
+) -> None:
     vertex, bands = table(20, degree), (degree + 1) ** 2 - 1
     for name in vertex.dtype.names or ():
         if name.startswith("f_rest_") and int(name[7:]) % bands >= (used + 1) ** 2 - 1:
@@ -83,7 +101,9 @@ def test_dropped_rows_are_those_that_load_drops(tmp_path: Path) -> None:
     v, base = seen(write_rows(tmp_path / "a.ply", vertex))[1], load(tmp_path / "a.ply")
     assert v.count == len(base.gaussians) < 38 and v.total == 40
     notes = [note for note in base.notes if "dropped" in note]
-    assert notes == [f"{gone} of 40 Gaussians dropped: {reason}" for reason, gone in v.dropped.items()]
+    assert notes == [
+        f"{gone} of 40 Gaussians dropped: {reason}" for reason, gone in v.dropped.items()
+    ]
     assert v.infinite_opacity == int((base.gaussians.opacity_logits == torch.inf).sum()) > 0
     assert v.position[0].greatest == float(base.gaussians.means[:, 0].max())
 
@@ -96,10 +116,19 @@ def test_anomalies_are_counted(tmp_path: Path) -> None:
         vertex[name][20] = 1e4
     vertex["scale_1"][30:32] = 9.0
     labelled = with_columns(vertex, label=1)
-    found, splat = seen(write_rows(tmp_path / "a.ply", labelled, comments=("SplatRenderMode: mip",)))
-    assert kinds(found) == {"infinite_opacity": 3, "doubles": 4, "far": 1, "giant": 2, "antialiased": 0}
+    found, splat = seen(
+        write_rows(tmp_path / "a.ply", labelled, comments=("SplatRenderMode: mip",))
+    )
+    assert kinds(found) == {
+        "infinite_opacity": 3,
+        "doubles": 4,
+        "far": 1,
+        "giant": 2,
+        "antialiased": 0,
+    }
     assert splat.extra == ("label",) and any("label" in line for line in found.left_out)
-    vertex["x"], vertex["y"], vertex["z"] = np.where(np.arange(600) % 2, -0.0, 0.0), 0, 1.5  # -0 is 0
+    # -0 is 0
+    vertex["x"], vertex["y"], vertex["z"] = np.where(np.arange(600) % 2, -0.0, 0.0), 0, 1.5
     v = seen(write_rows(tmp_path / "b.ply", vertex))[1]
     assert v.doubles == 599 and v.far == v.giant == 0
     vertex["x"] = np.nan
@@ -111,7 +140,9 @@ def test_values_that_look_activated_are_read_as_activated(tmp_path: Path) -> Non
     vertex = table()
     opacity = vertex["opacity"] = 1 / (1 + np.exp(-vertex["opacity"]))
     found, splat = seen(write_rows(tmp_path / "a.ply", vertex))
-    assert [o.kind for o in found.anomalies] == ["activated"] and "--activated opacity" in found.anomalies[0].says
+    assert [o.kind for o in found.anomalies] == [
+        "activated"
+    ] and "--activated opacity" in found.anomalies[0].says
     assert splat.opacity.median == pytest.approx(np.median(opacity), rel=1e-5)
 
 
@@ -122,15 +153,31 @@ def test_other_trainers_encodings_and_coordinates(tmp_path: Path) -> None:
     found, splat = seen(write_rows(tmp_path / "f.ply", with_columns(vertex, filter_3D=0.5)))
     assert splat.scale.least >= 0.5 and splat.extra == ()
     assert any("filter_3D" in line for line in found.left_out)
-    wide = vertex.astype([(name, "f8" if name in "xyz" else "f4") for name in vertex.dtype.names or ()])
+    wide = vertex.astype(
+        [(name, "f8" if name in "xyz" else "f4") for name in vertex.dtype.names or ()]
+    )
     wide["y"] += 4_500_000.0
-    found, splat = seen(write_rows(tmp_path / "a.ply", wide, comments=("Generated by Nerstudio 1.1.5",)))
+    found, splat = seen(
+        write_rows(tmp_path / "a.ply", wide, comments=("Generated by Nerstudio 1.1.5",))
+    )
     assert "dataparser_transforms.json" in found.notes[0] and "far_from_0" in kinds(found)
     assert splat.origin == load(tmp_path / "a.ply").origin and splat.doubles == 0
     assert splat.position[1].median == pytest.approx(np.median(wide["y"]), abs=1e-6)
-    for order, name in {"<": "binary little-endian", ">": "binary big-endian", "ascii": "ascii"}.items():
-        parts = [PlyElement.describe(vertex[:12], "vertex"), PlyElement.describe(np.zeros(1, [("fx", "f4")]), "camera")]
-        data = PlyData(parts, text=order == "ascii", byte_order="=" if order == "ascii" else order, obj_info=["x"])
+    for order, name in {
+        "<": "binary little-endian",
+        ">": "binary big-endian",
+        "ascii": "ascii",
+    }.items():
+        parts = [
+            PlyElement.describe(vertex[:12], "vertex"),
+            PlyElement.describe(np.zeros(1, [("fx", "f4")]), "camera"),
+        ]
+        data = PlyData(
+            parts,
+            text=order == "ascii",
+            byte_order="=" if order == "ascii" else order,
+            obj_info=["x"],
+        )
         data.write(str(tmp_path / "o.ply"))
         found, splat = seen(tmp_path / "o.ply")
         assert "element camera, obj_info" in found.left_out and splat.encoding == name
@@ -141,11 +188,19 @@ def test_other_trainers_encodings_and_coordinates(tmp_path: Path) -> None:
 
 
 def test_a_dial(tmp_path: Path) -> None:
-    g = with_dial(scenes.gaussians(40, 1, 0), attenuation=ATTENUATION, growth_d=torch.linspace(-1, 3, 40))
+    g = with_dial(
+        scenes.gaussians(40, 1, 0), attenuation=ATTENUATION, growth_d=torch.linspace(-1, 3, 40)
+    )
     save(tmp_path / "a.ply", g, calibration=CALIBRATION)
     (found, splat), names = seen(tmp_path / "a.ply"), "sigma_d and growth_d"
-    assert splat.dial is not None and splat.dial.calibration == CALIBRATION and splat.dial.attenuation == ATTENUATION
-    assert found.what == f"an adapted splat, with {names}, PLY" and "clod-adapter" in (found.writer or "")
+    assert (
+        splat.dial is not None
+        and splat.dial.calibration == CALIBRATION
+        and splat.dial.attenuation == ATTENUATION
+    )
+    assert found.what == f"an adapted splat, with {names}, PLY" and "clod-adapter" in (
+        found.writer or ""
+    )
     assert splat.sigma is not None and splat.sigma.least > 0 and splat.comments == splat.extra == ()
     rows = [line.split() for line in lines_of(found) if line.startswith("growth_d")]
     assert rows == [["growth_d", "-1", "-0.96", "1", "2.96", "3"]]
@@ -155,13 +210,22 @@ def test_a_dial(tmp_path: Path) -> None:
 
 
 def test_a_state(tmp_path: Path) -> None:
-    tensors = {"parameter.means": torch.zeros(7, 3), "steps.kept": torch.zeros(7, dtype=torch.int32)}
+    tensors = {
+        "parameter.means": torch.zeros(7, 3),
+        "steps.kept": torch.zeros(7, dtype=torch.int32),
+    }
     numbers = {"loss": math.nan, "averaged": 0, "steps": 9, "seconds": 1.5, "start_seconds": 0.5}
-    state = TrainingState(tensors, ATTENUATION, np.random.default_rng(0).bit_generator.state, (1, 0), **numbers)
+    state = TrainingState(
+        tensors, ATTENUATION, np.random.default_rng(0).bit_generator.state, (1, 0), **numbers
+    )
     save_state(tmp_path / "s.safetensors", state, {"base": "abc", "version": "0"})
     found = inspect(tmp_path / "s.safetensors")
     assert found.about is not None and "interrupted run" in found.what
-    assert (found.about["count"], found.about["steps"], found.about["belongs"]["base"]) == (7, 9, "abc")
+    assert (found.about["count"], found.about["steps"], found.about["belongs"]["base"]) == (
+        7,
+        9,
+        "abc",
+    )
     json.dumps(jsonable(found.as_dict()), allow_nan=False)
 
 
@@ -190,7 +254,9 @@ UNKNOWN = ("by hand", "Vertical axis: y")
     ],
 )
 def test_writers(tmp_path: Path, names: list[str], comments: tuple[str, ...], says: str) -> None:
-    path = write_rows(tmp_path / "a.ply", np.zeros(1, [(name, "f4") for name in names]), comments=comments)
+    path = write_rows(
+        tmp_path / "a.ply", np.zeros(1, [(name, "f4") for name in names]), comments=comments
+    )
     assert str(looks_like(read_head(path))).startswith(says)
 
 

@@ -1,5 +1,7 @@
-"""One adapted file looks the same through every path that draws it, and so do the files of viewers/kit; the wrapper
-against stand-ins for five forks of Inria's rasterizer, called with the kept rows alone."""
+"""One adapted file looks the same through every path that draws it, and so do the files of
+viewers/kit; the wrapper against stand-ins for five forks of Inria's rasterizer, called with the
+kept rows alone.
+"""
 
 import json
 from pathlib import Path
@@ -37,11 +39,23 @@ def through_gsplat(checkpoint: Checkpoint, monkeypatch: pytest.MonkeyPatch) -> T
 
     g = checkpoint.gaussians
     images, _, _ = rasterization(
-        g.means, g.quats, g.scales, g.opacities, torch.cat([g.sh0, g.shN], 1), VIEW.viewmat[None], VIEW.K[None],
-        VIEW.width, VIEW.height, sh_degree=1, sigma_d=g.sigma_d, growth_d=g.growth_d, attenuation=g.attenuation,
-        virtual_scale=DIAL, eps2d=g.screen_filter.variance,
+        g.means,
+        g.quats,
+        g.scales,
+        g.opacities,
+        torch.cat([g.sh0, g.shN], 1),
+        VIEW.viewmat[None],
+        VIEW.K[None],
+        VIEW.width,
+        VIEW.height,
+        sh_degree=1,
+        sigma_d=g.sigma_d,
+        growth_d=g.growth_d,
+        attenuation=g.attenuation,
+        virtual_scale=DIAL,
+        eps2d=g.screen_filter.variance,
         rasterize_mode="antialiased" if g.screen_filter.compensate else "classic",
-    )  # fmt: skip
+    )
     return images[0]
 
 
@@ -50,13 +64,22 @@ def inria(monkeypatch: pytest.MonkeyPatch, installed: ModuleType | None) -> Any:
 
 
 def arguments(g: Gaussians, fork: str = "inria 2024") -> dict[str, Any]:
-    """A fork's arguments by name, and those of the dial; floating-point tensors require gradients."""
+    """A fork's arguments by name, and those of the dial; floating-point tensors require
+    gradients.
+    """
     given: dict[str, Any] = {
-        "means3D": g.means, "means2D": torch.zeros_like(g.means), "opacities": g.opacities[:, None],
-        "shs": torch.cat([g.sh0, g.shN], 1), "scales": g.scales, "rotations": torch.nn.functional.normalize(g.quats),
-        "sigma_d": g.sigma_d, "growth_d": g.growth_d,
-    }  # fmt: skip
-    given = {name: value.clone().requires_grad_() for name, value in given.items() if value is not None}
+        "means3D": g.means,
+        "means2D": torch.zeros_like(g.means),
+        "opacities": g.opacities[:, None],
+        "shs": torch.cat([g.sh0, g.shN], 1),
+        "scales": g.scales,
+        "rotations": torch.nn.functional.normalize(g.quats),
+        "sigma_d": g.sigma_d,
+        "growth_d": g.growth_d,
+    }
+    given = {
+        name: value.clone().requires_grad_() for name, value in given.items() if value is not None
+    }
     further = set(FORKS[fork][1].split()) - set(inria_forks.CALL.split())
     given |= {name: torch.ones(len(g), 2) for name in further}
     return given | {"attenuation": g.attenuation, "virtual_scale": DIAL}
@@ -64,11 +87,15 @@ def arguments(g: Gaussians, fork: str = "inria 2024") -> dict[str, Any]:
 
 def through_inria(checkpoint: Checkpoint, monkeypatch: pytest.MonkeyPatch) -> Tensor:
     g = checkpoint.gaussians
-    name, settings = ("mip-splatting", {"kernel_size": 0.1}) if g.screen_filter == FILTERS["mip"] else (
-        "inria 2024", {"antialiasing": g.screen_filter.compensate}
-    )  # fmt: skip
+    name, settings = (
+        ("mip-splatting", {"kernel_size": 0.1})
+        if g.screen_filter == FILTERS["mip"]
+        else ("inria 2024", {"antialiasing": g.screen_filter.compensate})
+    )
     ours = inria(monkeypatch, inria_forks.module(name))
-    rasterizer = ours.GaussianRasterizer(settings_of(ours.GaussianRasterizationSettings, VIEW, **settings))
+    rasterizer = ours.GaussianRasterizer(
+        settings_of(ours.GaussianRasterizationSettings, VIEW, **settings)
+    )
     return rasterizer(**arguments(g))[0].permute(1, 2, 0).detach()
 
 
@@ -79,9 +106,12 @@ def through_hook(checkpoint: Checkpoint, monkeypatch: pytest.MonkeyPatch) -> Ten
     opacities, keep, growth = map(torch.from_numpy, checkpoint.hook(DIAL)(*arrays))
     assert torch.equal(opacities > 0, keep)
     plain = g.replace(
-        sigma_d=None, growth_d=None, attenuation=None, log_scales=g.log_scales + growth.log()[:, None],
+        sigma_d=None,
+        growth_d=None,
+        attenuation=None,
+        log_scales=g.log_scales + growth.log()[:, None],
         opacity_logits=opacities.logit(),
-    )  # fmt: skip
+    )
     return render(plain[keep], VIEW, rasterizer=Rasterizer(reference.rasterize)).image
 
 
@@ -90,7 +120,9 @@ def adapted(**settings: Any) -> Gaussians:
     some = scenes.dialled(60, 1, 3, **settings)
     values = torch.rand(60, generator=torch.Generator().manual_seed(5))
     return some.replace(
-        means=some.means * torch.tensor([1, 1, 0.5]), sigma_d=2 * some.sigma_d, growth_d=2 * values - 0.5
+        means=some.means * torch.tensor([1, 1, 0.5]),
+        sigma_d=2 * some.sigma_d,
+        growth_d=2 * values - 0.5,
     )
 
 
@@ -109,10 +141,16 @@ def test_paths_agree(screen_filter: str, tmp_path: Path, monkeypatch: pytest.Mon
         image = draw(checkpoint, monkeypatch)
         torch.testing.assert_close(image, wanted(model), rtol=1e-3, atol=1e-3)
     assert 20 < int(render(model, VIEW, DIAL).kept.sum()) < 50
-    for other in (model.replace(growth_d=None), model.replace(sigma_d=None, growth_d=None, attenuation=None)):
+    for other in (
+        model.replace(growth_d=None),
+        model.replace(sigma_d=None, growth_d=None, attenuation=None),
+    ):
         assert (wanted(other) - wanted(model)).abs().max() > 0.1
     for name, other in FILTERS.items():
-        assert name == screen_filter or (wanted(model.replace(screen_filter=other)) - wanted(model)).abs().max() > 0.01
+        assert (
+            name == screen_filter
+            or (wanted(model.replace(screen_filter=other)) - wanted(model)).abs().max() > 0.01
+        )
 
 
 @pytest.mark.parametrize(("suffix", "levels"), [("ply", 1), ("glb", 1), ("spz", 12)])
@@ -124,7 +162,9 @@ def test_the_kit_is_what_the_library_draws_and_writes(suffix: str, levels: int) 
         camera = clod.Camera(torch.tensor(about["world_to_camera"]), K, width, height)
         for frame in about["frames"]:
             shown = clod.render(gaussians, camera, frame["s"])
-            assert int(shown.kept.sum()) == pytest.approx(frame["kept"], rel=0.005 if suffix == "spz" else 0)
+            assert int(shown.kept.sum()) == pytest.approx(
+                frame["kept"], rel=0.005 if suffix == "spz" else 0
+            )
             stored = np.asarray(Image.open(KIT / frame["picture"], formats=["PNG"]), np.float64)
             assert np.abs(shown.image.clamp(0, 1).numpy() * 255 - stored).max() < levels
 
@@ -134,18 +174,28 @@ def test_kept_rows_are_drawn_as_by_the_fork(name: str, monkeypatch: pytest.Monke
     """Also called by position. Without sigma_d, results are the fork's."""
     fork, model = inria_forks.module(name), adapted(form="paper")
     given = arguments(model if name != "w-pose" else model.replace(growth_d=None), name)
-    dial = {key: given.pop(key) for key in ("sigma_d", "growth_d", "attenuation", "virtual_scale") if key in given}
-    settings = settings_of(fork.GaussianRasterizationSettings, VIEW, bg=torch.tensor([0.2, 0.5, 0.1]))
+    dial = {
+        key: given.pop(key)
+        for key in ("sigma_d", "growth_d", "attenuation", "virtual_scale")
+        if key in given
+    }
+    settings = settings_of(
+        fork.GaussianRasterizationSettings, VIEW, bg=torch.tensor([0.2, 0.5, 0.1])
+    )
     theirs, module = fork.GaussianRasterizer(settings), inria(monkeypatch, fork)
     ours = module.GaussianRasterizer(raster_settings=settings)
     assert module.GaussianRasterizationSettings is fork.GaussianRasterizationSettings
     for mine, want in zip(ours(**given), theirs(**given), strict=True):
         assert torch.equal(mine, want)
     logits, where = given["opacities"][:, 0].logit(), (given["means3D"], VIEW)
-    drawn = attenuate(logits, dial["sigma_d"], where, DIAL, dial["attenuation"], growth_d=dial.get("growth_d"))
+    drawn = attenuate(
+        logits, dial["sigma_d"], where, DIAL, dial["attenuation"], growth_d=dial.get("growth_d")
+    )
     keep = drawn.keep
     assert 0 < int(keep.sum()) < 60
-    rows = {key: value[keep] for key, value in given.items()} | {"opacities": drawn.drawn[keep, None]}
+    rows = {key: value[keep] for key, value in given.items()} | {
+        "opacities": drawn.drawn[keep, None]
+    }
     want = theirs(**rows | {"scales": rows["scales"] * drawn.growth[keep, None]})
     got = ours(**given, **dial)
     assert torch.equal(ours(*map(given.get, FORKS[name][1].split()), **dial)[0], got[0])
@@ -154,7 +204,9 @@ def test_kept_rows_are_drawn_as_by_the_fork(name: str, monkeypatch: pytest.Monke
             assert torch.equal(mine[keep], of_fork) and len(mine) == 60 and not mine[~keep].any()
         elif result != "features":
             torch.testing.assert_close(mine, of_fork, rtol=1e-5, atol=1e-5)
-    leaves = [each for each in (given | dial).values() if isinstance(each, Tensor) and each.requires_grad]
+    leaves = [
+        each for each in (given | dial).values() if isinstance(each, Tensor) and each.requires_grad
+    ]
     weights = torch.rand(got[0].shape, generator=torch.Generator().manual_seed(1))
     slopes = [torch.autograd.grad((picture[0] * weights).sum(), leaves) for picture in (got, want)]
     for leaf, mine, of_fork in zip(leaves, *slopes, strict=True):
@@ -163,38 +215,63 @@ def test_kept_rows_are_drawn_as_by_the_fork(name: str, monkeypatch: pytest.Monke
     assert float(slopes[0][-1].abs().max()) > 0
 
 
-def test_culled_rows_are_invisible_to_a_fork_that_culls_at_zero(monkeypatch: pytest.MonkeyPatch) -> None:
-    """From many positions, since rounding moves a point at the camera's centre in front of it or behind it."""
+def test_culled_rows_are_invisible_to_a_fork_that_culls_at_zero(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """From many positions, since rounding moves a point at the camera's centre in front of it or
+    behind it.
+    """
     monkeypatch.setattr(inria_forks, "NEAREST", 0.0)
     fork = inria_forks.module("inria 2024")
-    given, ours = arguments(adapted().replace(sigma_d=torch.full((60,), 1e-3))), inria(monkeypatch, fork)
+    given, ours = (
+        arguments(adapted().replace(sigma_d=torch.full((60,), 1e-3))),
+        inria(monkeypatch, fork),
+    )
     for view in scenes.ring(31, 48, 36):
-        assert not ours.GaussianRasterizer(settings_of(fork.GaussianRasterizationSettings, view))(**given)[1].any()
+        assert not ours.GaussianRasterizer(settings_of(fork.GaussianRasterizationSettings, view))(
+            **given
+        )[1].any()
 
 
 def test_covariances_grow_by_the_square(monkeypatch: pytest.MonkeyPatch) -> None:
     """``cov3D_precomp`` instead of scales and rotations, by name and by position."""
     fork, given = inria_forks.module("inria 2024"), arguments(adapted())
-    ours = inria(monkeypatch, fork).GaussianRasterizer(settings_of(fork.GaussianRasterizationSettings, VIEW))
+    ours = inria(monkeypatch, fork).GaussianRasterizer(
+        settings_of(fork.GaussianRasterizationSettings, VIEW)
+    )
     ours(**given)
     growth = ours.given["scales"][:, 0] / given.pop("scales")[:, 0]
     assert growth.min() < 0.9 and growth.max() > 1.1
-    given |= {"rotations": None, "cov3D_precomp": torch.rand(60, 6, generator=torch.Generator().manual_seed(3))}
+    given |= {
+        "rotations": None,
+        "cov3D_precomp": torch.rand(60, 6, generator=torch.Generator().manual_seed(3)),
+    }
     words = inria_forks.CALL.split()
-    for values, names in (([], given), (map(given.get, words), {k: v for k, v in given.items() if k not in words})):
+    for values, names in (
+        ([], given),
+        (map(given.get, words), {k: v for k, v in given.items() if k not in words}),
+    ):
         ours(*values, **names)
-        torch.testing.assert_close(ours.given["cov3D_precomp"], given["cov3D_precomp"] * growth[:, None].square())
+        torch.testing.assert_close(
+            ours.given["cov3D_precomp"], given["cov3D_precomp"] * growth[:, None].square()
+        )
 
 
 def test_bad_arguments_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     fork, short = inria_forks.module("inria 2024"), torch.ones(59)
     for prefiltered, changed, message in (
         (True, {}, "prefiltered is True.*set it to False"),
-        (None, {"sigma_d": short, "growth_d": None}, r"the dial is for 59 Gaussians, but means is \(60, 3\)"),
+        (
+            None,
+            {"sigma_d": short, "growth_d": None},
+            r"the dial is for 59 Gaussians, but means is \(60, 3\)",
+        ),
         (None, {"growth_d": short}, r"sigma_d \(60,\), growth_d \(59,\)"),
     ):
         settings = settings_of(fork.GaussianRasterizationSettings, VIEW, prefiltered=prefiltered)
         with pytest.raises(ClodError, match=message):
             inria(monkeypatch, fork).GaussianRasterizer(settings)(**arguments(adapted()) | changed)
-    with pytest.raises(ImportError, match="pip install .*graphdeco-inria/diff-gaussian-rasterization"):
+    with pytest.raises(
+        ImportError, match="pip install .*graphdeco-inria/diff-gaussian-rasterization"
+    ):
         inria(monkeypatch, None)

@@ -1,4 +1,6 @@
-"""The wrappers against the installed gsplat, with its kernels on CUDA or with torch in their place."""
+"""The wrappers against the installed gsplat, with its kernels on CUDA or with torch in their
+place.
+"""
 
 import gc
 import inspect
@@ -32,7 +34,9 @@ def tools(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Si
         gsplat_in_torch.install(monkeypatch)
     from clod_adapter.integrations import gsplat as wrapper
 
-    return SimpleNamespace(theirs=gsplat.rasterization, ours=wrapper.rasterization, device=request.param)
+    return SimpleNamespace(
+        theirs=gsplat.rasterization, ours=wrapper.rasterization, device=request.param
+    )
 
 
 def takes(function: str, argument: str) -> bool:
@@ -46,31 +50,52 @@ def test_the_stored_signatures_are_the_installed_ones() -> None:
     gsplat = pytest.importorskip("gsplat", reason="pip install gsplat==1.5.3")
     stored = gsplat_versions.module({"1.5.1": "1.5.0"}.get(gsplat.__version__, gsplat.__version__))
     for name in gsplat_versions.FUNCTIONS:
-        theirs, ours = (inspect.signature(getattr(each, name)).parameters for each in (gsplat, stored))
-        assert [(p.name, p.kind) for p in ours.values()] == [(p.name, p.kind) for p in theirs.values()]
+        theirs, ours = (
+            inspect.signature(getattr(each, name)).parameters for each in (gsplat, stored)
+        )
+        assert [(p.name, p.kind) for p in ours.values()] == [
+            (p.name, p.kind) for p in theirs.values()
+        ]
         for mine, want in zip(ours.values(), theirs.values(), strict=True):
-            assert mine.default == (str(want.default) if isinstance(want.default, Enum) else want.default)
+            assert mine.default == (
+                str(want.default) if isinstance(want.default, Enum) else want.default
+            )
 
 
-def arguments(cameras: int, batch: tuple[int, ...] = (), device: str = "cpu") -> tuple[dict[str, Any], dict[str, Any]]:
-    """Arguments of the Gaussians, with colours of SH degree 1, and of the cameras, with batch dimensions."""
+def arguments(
+    cameras: int, batch: tuple[int, ...] = (), device: str = "cpu"
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Arguments of the Gaussians, with colours of SH degree 1, and of the cameras, with batch
+    dimensions.
+    """
     copies = [scene(N, 1, seed, size=0.2) for seed in range(math.prod(batch))]
     parts = [each | {"colors": torch.cat([each.pop("sh0"), each.pop("shN")], 1)} for each in copies]
-    given = {key: torch.stack([part[key] for part in parts]).reshape(*batch, *x.shape) for key, x in parts[0].items()}
+    given = {
+        key: torch.stack([part[key] for part in parts]).reshape(*batch, *x.shape)
+        for key, x in parts[0].items()
+    }
     views = ring(cameras * len(copies), WIDTH, HEIGHT) if cameras > 1 else [camera(WIDTH, HEIGHT)]
-    given |= {"viewmats": torch.stack([view.viewmat for view in views]), "Ks": torch.stack([view.K for view in views])}
+    given |= {
+        "viewmats": torch.stack([view.viewmat for view in views]),
+        "Ks": torch.stack([view.K for view in views]),
+    }
     given = {name: value.to(device) for name, value in given.items()}
-    matrices = {name: given.pop(name).unflatten(0, (*batch, cameras)) for name in ("viewmats", "Ks")}
+    matrices = {
+        name: given.pop(name).unflatten(0, (*batch, cameras)) for name in ("viewmats", "Ks")
+    }
     return given, {**matrices, "width": WIDTH, "height": HEIGHT}
 
 
 @pytest.mark.parametrize(
-    ("cameras", "batch", "packed"), [(1, (), False), (3, (), True), (3, (2,), True), (3, (2,), False)]
+    ("cameras", "batch", "packed"),
+    [(1, (), False), (3, (), True), (3, (2,), True), (3, (2,), False)],
 )
 def test_without_attenuation_results_are_gsplats(
     tools: SimpleNamespace, cameras: int, batch: tuple[int, ...], packed: bool
 ) -> None:
-    """Images and every value of meta, where all cameras are drawn in one call, and statistics of densification."""
+    """Images and every value of meta, where all cameras are drawn in one call, and statistics of
+    densification.
+    """
     import gsplat
 
     if batch and not takes("rasterization", "with_ut"):
@@ -78,7 +103,12 @@ def test_without_attenuation_results_are_gsplats(
     if packed and tools.device == "cuda" and batch:
         pytest.skip("gsplat 1.5.3's packed projection takes the first scene's opacities for all")
     given, views = arguments(cameras, batch, tools.device)
-    views |= {"sh_degree": 1, "packed": packed, "render_mode": "RGB+ED", "rasterize_mode": "antialiased"}
+    views |= {
+        "sh_degree": 1,
+        "packed": packed,
+        "render_mode": "RGB+ED",
+        "rasterize_mode": "antialiased",
+    }
     dial = {"sigma_d": torch.full_like(given["opacities"], 1e9), "attenuation": WHOLE}
     results, states = [], []
     for function, more in ((tools.theirs, {}), (tools.ours, dial)):
@@ -117,32 +147,48 @@ def test_attenuated_results_match_gsplat_per_camera(
     sigma_d = 0.2 + 2 * torch.rand(N, generator=torch.Generator().manual_seed(7)).to(tools.device)
     dial = {"sigma_d": sigma_d} | ({"growth_d": sigma_d - 1} if growing else {})
     leaves = {**given, "viewmats": views.pop("viewmats"), **dial}
-    leaves = {name: value.clone().requires_grad_() for name, value in leaves.items() if value is not None}
+    leaves = {
+        name: value.clone().requires_grad_() for name, value in leaves.items() if value is not None
+    }
     dial, given = {name: leaves[name] for name in dial}, {name: leaves.get(name) for name in given}
     views |= {"sh_degree": 1, "packed": packed, "absgrad": True}
-    ours = tools.ours(**given, **views, **dial, viewmats=leaves["viewmats"], virtual_scale=2.0, attenuation=config)
+    ours = tools.ours(
+        **given, **views, **dial, viewmats=leaves["viewmats"], virtual_scale=2.0, attenuation=config
+    )
     theirs = []
     for viewmat, K in zip(leaves["viewmats"], views.pop("Ks"), strict=True):
         where, growth_d = (given["means"], Camera(viewmat, K, WIDTH, HEIGHT)), dial.get("growth_d")
-        shown = attenuate(given["opacities"].logit(), dial["sigma_d"], where, 2.0, config, growth_d=growth_d)
+        shown = attenuate(
+            given["opacities"].logit(), dial["sigma_d"], where, 2.0, config, growth_d=growth_d
+        )
         assert 0 < int(shown.keep.sum()) < N
-        name, factor = ("covars", shown.growth[:, None, None] ** 2) if growing == "covars" else (
-            "scales", shown.growth[:, None]
-        )  # fmt: skip
+        name, factor = (
+            ("covars", shown.growth[:, None, None] ** 2)
+            if growing == "covars"
+            else ("scales", shown.growth[:, None])
+        )
         faded = given | {"opacities": shown.drawn, name: given[name] * factor}
         theirs.append(tools.theirs(**faded, **views, viewmats=viewmat[None], Ks=K[None]))
     for k in range(2):
-        torch.testing.assert_close(ours[k], torch.cat([part[k] for part in theirs]), rtol=1e-4, atol=1e-5)
+        torch.testing.assert_close(
+            ours[k], torch.cat([part[k] for part in theirs]), rtol=1e-4, atol=1e-5
+        )
 
     points = [ours[2]["means2d"], *(part[2]["means2d"] for part in theirs)]
     for point in points:
         point.retain_grad()
     weights = torch.rand(ours[0].shape, generator=torch.Generator().manual_seed(1)).to(tools.device)
     loss = (ours[0] * weights).sum() + ours[1].sum()
-    of_theirs = sum((part[0] * w).sum() + part[1].sum() for part, w in zip(theirs, weights, strict=True))
-    first, second = (torch.autograd.grad(x, list(leaves.values()), retain_graph=True) for x in (loss, of_theirs))
+    of_theirs = sum(
+        (part[0] * w).sum() + part[1].sum() for part, w in zip(theirs, weights, strict=True)
+    )
+    first, second = (
+        torch.autograd.grad(x, list(leaves.values()), retain_graph=True) for x in (loss, of_theirs)
+    )
     for name, mine, want in zip(leaves, first, second, strict=True):
-        torch.testing.assert_close(mine, want, rtol=1e-3, atol=1e-4, msg=lambda text, name=name: f"{name}: {text}")
+        torch.testing.assert_close(
+            mine, want, rtol=1e-3, atol=1e-4, msg=lambda text, name=name: f"{name}: {text}"
+        )
     assert float(first[-1].abs().max()) > 0
     if not takes("fully_fused_projection", "opacities"):
         return  # called with culled rows, that gsplat projects them
@@ -163,7 +209,9 @@ def test_memory_is_released(tools: SimpleNamespace) -> None:
     gc.disable()
     try:
         for backward in (False, True):
-            colors, alphas, meta = tools.ours(**given, **views, sh_degree=1, sigma_d=10 * given["opacities"])
+            colors, alphas, meta = tools.ours(
+                **given, **views, sh_degree=1, sigma_d=10 * given["opacities"]
+            )
             points = weakref.ref(meta["means2d"])
             if backward:
                 colors.sum().backward()

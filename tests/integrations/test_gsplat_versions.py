@@ -19,16 +19,31 @@ from gsplat_versions import FUNCTIONS
 N, WIDTH, HEIGHT, CAMERAS = 5, 20, 12, 3
 VERSIONS = gsplat_versions.signatures()
 WHOLE = AttenuationConfig()
-OF_SCENE = {"means": (N, 3), "quats": (N, 4), "scales": (N, 3), "opacities": (N,), "covars": (N, 3, 3)}
+OF_SCENE = {
+    "means": (N, 3),
+    "quats": (N, 4),
+    "scales": (N, 3),
+    "opacities": (N,),
+    "covars": (N, 3, 3),
+}
 OF_CAMERA = {
-    "viewmats": (4, 4), "Ks": (3, 3), "backgrounds": (3,), "viewmats_rs": (4, 4), "radial_coeffs": (6,),
-    "tangential_coeffs": (2,), "thin_prism_coeffs": (4,), "rays": (HEIGHT, WIDTH, 6), "colors": (N, 3),
+    "viewmats": (4, 4),
+    "Ks": (3, 3),
+    "backgrounds": (3,),
+    "viewmats_rs": (4, 4),
+    "radial_coeffs": (6,),
+    "tangential_coeffs": (2,),
+    "thin_prism_coeffs": (4,),
+    "rays": (HEIGHT, WIDTH, 6),
+    "colors": (N, 3),
     "extra_signals": (N, 3),
-}  # fmt: skip
+}
 
 
 class Gsplat:
-    """A version's stand-in, whose images have the number of the call, and our module on top of it."""
+    """A version's stand-in, whose images have the number of the call, and our module on top of
+    it.
+    """
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, version: str) -> None:
         self.calls: list[dict[str, Any]] = []
@@ -46,12 +61,18 @@ class Gsplat:
         surfaces = (image, image[0], image, image) if name == "rasterization_2dgs" else ()
         return image, image[..., :1], *surfaces, self.meta
 
-    def arguments(self, name: str, batch: tuple[int, ...] = (), cameras: int = CAMERAS) -> dict[str, Any]:
-        """Every tensor that a function takes, random; of cameras the position and the principal point."""
+    def arguments(
+        self, name: str, batch: tuple[int, ...] = (), cameras: int = CAMERAS
+    ) -> dict[str, Any]:
+        """Every tensor that a function takes, random; of cameras the position and the principal
+        point.
+        """
         generator = torch.Generator().manual_seed(0)
         shapes = {key: (*batch, *shape) for key, shape in OF_SCENE.items()}
         shapes |= {key: (*batch, cameras, *shape) for key, shape in OF_CAMERA.items()}
-        given: dict[str, Any] = {key: 0.1 + torch.rand(shape, generator=generator) for key, shape in shapes.items()}
+        given: dict[str, Any] = {
+            key: 0.1 + torch.rand(shape, generator=generator) for key, shape in shapes.items()
+        }
         for key, size in {"viewmats": 4, "Ks": 3}.items():
             given[key][..., :-1], given[key][..., -1, -1] = torch.eye(size)[:, :-1], 1
         given |= {"width": WIDTH, "height": HEIGHT}
@@ -61,12 +82,17 @@ class Gsplat:
 
 def test_types_are_those_of_all_versions_and_four(monkeypatch: pytest.MonkeyPatch) -> None:
     """Arguments before the keywords have one place in every version."""
-    four, every = {"sigma_d", "virtual_scale", "attenuation", "growth_d"}, [Gsplat(monkeypatch, v) for v in VERSIONS]
+    four, every = (
+        {"sigma_d", "virtual_scale", "attenuation", "growth_d"},
+        [Gsplat(monkeypatch, v) for v in VERSIONS],
+    )
     assert sorted(every[0].ours.__all__) == sorted(FUNCTIONS)
     for name in FUNCTIONS:
         typed = inspect.signature(getattr(every[0].ours, name)).parameters
         positional = [p.name for p in typed.values() if p.kind is p.POSITIONAL_OR_KEYWORD]
-        installed = [list(inspect.signature(getattr(gsplat.installed, name)).parameters) for gsplat in every]
+        installed = [
+            list(inspect.signature(getattr(gsplat.installed, name)).parameters) for gsplat in every
+        ]
         assert all(theirs[: len(positional)] == positional for theirs in installed)
         assert set(typed) == four.union(*installed)
 
@@ -104,22 +130,41 @@ def test_a_camera_is_a_call_with_its_part_of_every_argument(
 def test_meta_of_other_functions_and_versions_is_joined(monkeypatch: pytest.MonkeyPatch) -> None:
     """gsplat 1.6 has a width of its own for the tile's number in the sorting key."""
     gsplat = Gsplat(monkeypatch, "1.6.0")
-    gsplat.meta = {"radii": torch.ones(1, N), "means2d": torch.zeros(N, 3), "n_cameras": 1, "gaussian_ids": None}
+    gsplat.meta = {
+        "radii": torch.ones(1, N),
+        "means2d": torch.zeros(N, 3),
+        "n_cameras": 1,
+        "gaussian_ids": None,
+    }
     sigma_d = torch.ones(N)
     given = gsplat.arguments("rasterization_2dgs_inria_wrapper")
     meta = gsplat.ours.rasterization_2dgs_inria_wrapper(**given, sigma_d=sigma_d, packed=True)[1]
     assert meta["radii"].shape == (CAMERAS, N) and meta["means2d"].shape == (CAMERAS, N, 3)
     assert meta["n_cameras"] == CAMERAS and gsplat.calls[0]["kwargs"] == {"packed": True}
-    gsplat.meta = {"depths": torch.ones(1, N), "tile_width": 2, "tile_height": 2, "isect_ids": torch.tensor([7])}
-    for torch_code, bits in ((None, 3), (SimpleNamespace(_bits_for_count=lambda count: (count - 1).bit_length()), 2)):
+    gsplat.meta = {
+        "depths": torch.ones(1, N),
+        "tile_width": 2,
+        "tile_height": 2,
+        "isect_ids": torch.tensor([7]),
+    }
+    for torch_code, bits in (
+        (None, 3),
+        (SimpleNamespace(_bits_for_count=lambda count: (count - 1).bit_length()), 2),
+    ):
         monkeypatch.setitem(sys.modules, "gsplat.cuda._torch_impl", torch_code)
         meta = gsplat.ours.rasterization(**gsplat.arguments("rasterization"), sigma_d=sigma_d)[2]
         assert meta["isect_ids"].tolist() == [7 + (image << 32 + bits) for image in range(CAMERAS)]
 
 
-@pytest.mark.parametrize(("version", "name"), [("1.4.0", "rasterization"), *(("1.5.3", name) for name in FUNCTIONS)])
-def test_culled_rows_are_culled_by_the_projection(monkeypatch: pytest.MonkeyPatch, version: str, name: str) -> None:
-    """By their opacity where the projection has it as an argument, else by a centre behind the camera."""
+@pytest.mark.parametrize(
+    ("version", "name"), [("1.4.0", "rasterization"), *(("1.5.3", name) for name in FUNCTIONS)]
+)
+def test_culled_rows_are_culled_by_the_projection(
+    monkeypatch: pytest.MonkeyPatch, version: str, name: str
+) -> None:
+    """By their opacity where the projection has it as an argument, else by a centre behind the
+    camera.
+    """
     gsplat = Gsplat(monkeypatch, version)
     given = gsplat.arguments(name, cameras=1) | {"viewmats": torch.eye(4)[None]}
     sigma_d = torch.tensor([1e9, 1e-6, 1e9, 1e-6, 1e9])

@@ -1,13 +1,19 @@
-"""``clod-splatfacto`` with the real nerfstudio on a CPU: its trainer, its commands' loading, its viewer and its export.
+"""``clod-splatfacto`` with the real nerfstudio on a CPU: its trainer, its commands' loading, its
+viewer and its export.
 
 Skipped where nerfstudio is absent. Without CUDA, open3d and pymeshlab, beside the packages of dev:
 
-    pip install --no-deps nerfstudio==1.1.5 gsplat==1.4.0 nerfacc==0.5.2 torchmetrics pytorch-msssim timm==0.6.7 \\
-        viser==0.2.7 tyro==0.9.8 tensorboard==2.14.1 "protobuf<=3.20.3" tensorly lightning-utilities comet_ml wandb
-    pip install opencv-python-headless scikit-learn xatlas trimesh splines appdirs pyquaternion rawpy fpsample h5py \\
-        pathos av gdown plotly python-socketio msgpack msgpack-numpy shtab docstring-parser typeguard msgspec yourdfpy
+    pip install --no-deps nerfstudio==1.1.5 gsplat==1.4.0 nerfacc==0.5.2 torchmetrics pytorch-msssim
+    timm==0.6.7 \\
+        viser==0.2.7 tyro==0.9.8 tensorboard==2.14.1 "protobuf<=3.20.3" tensorly lightning-utilities
+        comet_ml wandb
+    pip install opencv-python-headless scikit-learn xatlas trimesh splines appdirs pyquaternion
+    rawpy fpsample h5py \\
+        pathos av gdown plotly python-socketio msgpack msgpack-numpy shtab docstring-parser
+        typeguard msgspec yourdfpy
 
-gsplat's kernels are torch (``gsplat_in_torch``); open3d, pymeshlab and the weights of LPIPS are absent.
+gsplat's kernels are torch (``gsplat_in_torch``); open3d, pymeshlab and the weights of LPIPS are
+absent.
 """
 
 import copy
@@ -41,7 +47,11 @@ def nerfstudio(monkeypatch: pytest.MonkeyPatch) -> Any:
     monkeypatch.setenv("TORCHDYNAMO_DISABLE", "1")
     import torchmetrics.image.lpip
 
-    monkeypatch.setattr(torchmetrics.image.lpip, "LearnedPerceptualImagePatchSimilarity", lambda **_: torch.nn.Module())
+    monkeypatch.setattr(
+        torchmetrics.image.lpip,
+        "LearnedPerceptualImagePatchSimilarity",
+        lambda **_: torch.nn.Module(),
+    )
     monkeypatch.setattr(torch.Tensor, "cuda", lambda self, *args, **kwargs: self)
     for name in ("open3d", "pymeshlab", "mediapy"):  # of exports that are not tested here
         monkeypatch.setitem(sys.modules, name, ModuleType(name))
@@ -64,7 +74,9 @@ def write_capture(folder: Path) -> Gaussians:
 
 
 def configured(method: Any, folder: Path, load_dir: Path) -> Any:
-    """What ``ns-train clod-splatfacto --load-dir ...`` makes, in world coordinates and with a short training."""
+    """What ``ns-train clod-splatfacto --load-dir ...`` makes, in world coordinates and with a short
+    training.
+    """
     config = copy.deepcopy(method.config)
     parser = config.pipeline.datamanager.dataparser
     parser.data, parser.auto_scale_poses = folder, False
@@ -72,8 +84,18 @@ def configured(method: Any, folder: Path, load_dir: Path) -> Any:
     model = config.pipeline.model
     model.random_init, model.num_random, model.sh_degree = True, 10, 1
     model.background_color = "black"
-    model.warmup_length, model.refine_every, model.stop_split_at, model.cull_alpha_thresh = 0, 2, 10**6, 0.5  # all off
-    config.load_dir, config.output_dir, config.max_num_iterations = load_dir, folder / "outputs", STEPS
+    # all off
+    model.warmup_length, model.refine_every, model.stop_split_at, model.cull_alpha_thresh = (
+        0,
+        2,
+        10**6,
+        0.5,
+    )
+    config.load_dir, config.output_dir, config.max_num_iterations = (
+        load_dir,
+        folder / "outputs",
+        STEPS,
+    )
     config.vis, config.machine.device_type, config.experiment_name = "tensorboard", "cpu", "capture"
     config.steps_per_eval_image = config.steps_per_eval_all_images = 1000
     config.set_timestamp()
@@ -86,13 +108,21 @@ def write_splatfacto(config: Any, base: Gaussians, folder: Path) -> None:
 
     own = config.pipeline
     model = SplatfactoModelConfig(random_init=True, num_random=10, sh_degree=1)
-    pipeline = VanillaPipelineConfig(datamanager=own.datamanager, model=model).setup(device="cpu", test_mode="val")
+    pipeline = VanillaPipelineConfig(datamanager=own.datamanager, model=model).setup(
+        device="cpu", test_mode="val"
+    )
     values = to_gsplat(base)
     values |= {"features_dc": values.pop("sh0")[:, 0], "features_rest": values.pop("shN")}
     for name, value in (values | {"opacities": values["opacities"][:, None]}).items():
         pipeline.model.gauss_params[name] = torch.nn.Parameter(value.clone())
     folder.mkdir()
-    state = {"step": 29999, "pipeline": pipeline.state_dict(), "optimizers": {}, "schedulers": {}, "scalers": {}}
+    state = {
+        "step": 29999,
+        "pipeline": pipeline.state_dict(),
+        "optimizers": {},
+        "schedulers": {},
+        "scalers": {},
+    }
     torch.save(state, folder / "step-000029999.ckpt")
 
 
@@ -109,7 +139,9 @@ def run(nerfstudio: Any, tmp_path: Path) -> SimpleNamespace:
     base = write_capture(tmp_path)
     config = configured(nerfstudio.method, tmp_path, tmp_path / "splatfacto")
     write_splatfacto(config, base, tmp_path / "splatfacto")
-    return SimpleNamespace(base=base, trainer=trained(config), config=config, folder=tmp_path, method=nerfstudio.method)
+    return SimpleNamespace(
+        base=base, trainer=trained(config), config=config, folder=tmp_path, method=nerfstudio.method
+    )
 
 
 def test_the_entry_point_is_the_method(nerfstudio: Any) -> None:
@@ -131,18 +163,32 @@ def test_a_dial_is_trained_and_found_by_the_other_commands(
 
     model = run.trainer.pipeline.model
     assert model.num_points == N and set(run.trainer.optimizers.optimizers) == {
-        "means", "scales", "quats", "features_dc", "opacities", "log_sigma", "growth_d"
-    }  # fmt: skip
-    assert not torch.equal(model.means, run.base.means) and torch.equal(model.features_rest, run.base.shN)
+        "means",
+        "scales",
+        "quats",
+        "features_dc",
+        "opacities",
+        "log_sigma",
+        "growth_d",
+    }
+    assert not torch.equal(model.means, run.base.means) and torch.equal(
+        model.features_rest, run.base.shN
+    )
     start = resumed(run, run.folder / "splatfacto", "start").pipeline.model.dial
     assert float((model.dial.log_sigma - start.log_sigma).abs().mean()) > 0.05
 
     written = run.config.get_base_dir() / "config.yml"
     monkeypatch.setenv("CLOD_VIRTUAL_SCALE", "3")
     pipeline = eval_setup(written, test_mode="test")[1]
-    assert [element.name for _, element in parse_object(pipeline, ViewerElement, "Custom Elements")] == ["Dial s"]
+    assert [
+        element.name for _, element in parse_object(pipeline, ViewerElement, "Custom Elements")
+    ] == ["Dial s"]
     dataset = pipeline.datamanager.train_dataset
-    view = next(view for view in scenes.ring(8, WIDTH, HEIGHT) if view.name == dataset.image_filenames[0].name)
+    view = next(
+        view
+        for view in scenes.ring(8, WIDTH, HEIGHT)
+        if view.name == dataset.image_filenames[0].name
+    )
     camera = dataset.cameras[:1]
     for dial in (3.0, 1.0):
         pipeline.model.slider.default_value = dial
@@ -151,16 +197,21 @@ def test_a_dial_is_trained_and_found_by_the_other_commands(
         assert float((image - want).abs().max()) < 0.02
         assert pipeline.model.means is pipeline.model.gauss_params["means"]
 
-    monkeypatch.setattr(ExportGaussianSplat, "write_ply", ExportGaussianSplat.write_ply)  # restored afterwards
+    # restored afterwards
+    monkeypatch.setattr(ExportGaussianSplat, "write_ply", ExportGaussianSplat.write_ply)
     ExportGaussianSplat(load_config=written, output_dir=run.folder / "export").main()
     exported, own = load(run.folder / "export" / "splat.ply").gaussians, model.dial.gaussians()
     faint = own.opacity_logits < -5.5373
     assert len(exported) == N - int(faint.sum()) and exported.attenuation == own.attenuation
     for name, value in exported.tensors().items():
-        torch.testing.assert_close(value, own.tensors()[name][~faint].detach(), rtol=1e-6, atol=1e-6)
+        torch.testing.assert_close(
+            value, own.tensors()[name][~faint].detach(), rtol=1e-6, atol=1e-6
+        )
 
     trainer = resumed(run, run.config.get_checkpoint_dir(), "again")
-    assert trainer._start_step == STEPS and torch.equal(trainer.pipeline.model.dial.log_sigma, model.dial.log_sigma)
+    assert trainer._start_step == STEPS and torch.equal(
+        trainer.pipeline.model.dial.log_sigma, model.dial.log_sigma
+    )
     assert trainer.optimizers.optimizers["log_sigma"].state_dict()["state"][0]["step"] == STEPS
 
 
@@ -173,7 +224,9 @@ def resumed(run: SimpleNamespace, folder: Path, name: str) -> Any:
     return trainer
 
 
-def test_without_a_checkpoint_the_command_says_what_it_needs(nerfstudio: Any, tmp_path: Path) -> None:
+def test_without_a_checkpoint_the_command_says_what_it_needs(
+    nerfstudio: Any, tmp_path: Path
+) -> None:
     write_capture(tmp_path)
     config = configured(nerfstudio.method, tmp_path, tmp_path / "none")
     with pytest.raises(ClodError, match="none: has no checkpoint"):

@@ -1,4 +1,6 @@
-"""For authors of renderers: the page docs/writing_a_renderer.md, and the golden values of the shader functions."""
+"""For authors of renderers: the page docs/writing_a_renderer.md, and the golden values of the
+shader functions.
+"""
 
 import json
 import re
@@ -62,18 +64,26 @@ WEBGL = """([source, call, rows]) => {
 
 def run(page: Any, shader: str, table: str) -> list[float]:
     """The shader's result for every golden row of a table, of four inputs each."""
-    source, rows = SHADERS.joinpath(shader).read_text(encoding="utf-8"), [row[:4] for row in STORED[table]]
+    source, rows = (
+        SHADERS.joinpath(shader).read_text(encoding="utf-8"),
+        [row[:4] for row in STORED[table]],
+    )
     if shader.endswith("glsl"):
         return list(page.evaluate(WEBGL, [source, CALLS[table], rows]))
     statements = "let a = vec4f(rows[at], rows[at + 1], rows[at + 2], rows[at + 3]);"
-    return [row[0] for row in browser.compute(page, source, f"{statements} rows[at] = {CALLS[table]};", rows)]
+    return [
+        row[0]
+        for row in browser.compute(page, source, f"{statements} rows[at] = {CALLS[table]};", rows)
+    ]
 
 
 @pytest.fixture(scope="module")
 def page(chromium: Any) -> Iterator[Any]:
     """A page from a secure place, as WebGPU needs it; nothing is fetched."""
     with closing(chromium.new_page()) as page:
-        page.route("**/*", lambda route: route.fulfill(body="<!doctype html>", content_type="text/html"))
+        page.route(
+            "**/*", lambda route: route.fulfill(body="<!doctype html>", content_type="text/html")
+        )
         page.goto("http://127.0.0.1/")
         yield page
 
@@ -83,23 +93,34 @@ def test_shaders_match_the_golden_values(page: Any, shader: str) -> None:
     for table in ("rows", "near_rows"):
         for got, row in zip(run(page, shader, table), STORED[table], strict=True):
             opacity, *_, want = row
-            assert abs(got - want) <= STORED["tolerance"] * opacity and (want > 0 or got == 0), (row, got)
+            assert abs(got - want) <= STORED["tolerance"] * opacity and (want > 0 or got == 0), (
+                row,
+                got,
+            )
     for got, row in zip(run(page, shader, "scale_rows"), STORED["scale_rows"], strict=True):
         assert abs(got - row[-1]) <= STORED["tolerance"] * row[-1], (row, got)
 
 
-def my_opacity(opacity: float, sigma: float, distance: float, scale: float, near: float = 0.0) -> float:
+def my_opacity(
+    opacity: float, sigma: float, distance: float, scale: float, near: float = 0.0
+) -> float:
     row = torch.tensor([[opacity], [sigma], [distance]], dtype=torch.float64)
-    return float(attenuate(*row, scale, AttenuationConfig(near_distance=near), activated=True).drawn)
+    return float(
+        attenuate(*row, scale, AttenuationConfig(near_distance=near), activated=True).drawn
+    )
 
 
 def my_scale(growth: float, distance: float, scale: float, start: float) -> float:
-    return float(growth_factors(*torch.tensor([[growth], [distance]], dtype=torch.float64), scale, start))
+    return float(
+        growth_factors(*torch.tensor([[growth], [distance]], dtype=torch.float64), scale, start)
+    )
 
 
 def test_golden_values_match_the_equation() -> None:
-    """The inputs are usual, extreme and near the end of the reach, all exact in float32; the last columns are the
-    equation's in float64, equal to rounding, since exp differs between processors."""
+    """The inputs are usual, extreme and near the end of the reach, all exact in float32; the last
+    columns are the equation's in float64, equal to rounding, since exp differs between
+    processors.
+    """
     for table, near in (("rows", 0.0), ("near_rows", STORED["near_distance"])):
         for *row, drawn in STORED[table]:
             assert my_opacity(*row, near) == pytest.approx(drawn, rel=1e-12, abs=1e-300)
@@ -117,7 +138,9 @@ def block(word: str) -> str:
 
 
 def test_the_code_of_the_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The golden loop, which refuses functions that are off; the hook; and a held frame time, with 20 ms a frame."""
+    """The golden loop, which refuses functions that are off; the hook; and a held frame time, with
+    20 ms a frame.
+    """
     monkeypatch.chdir(tmp_path)
     adapted = scenes.dialled(300, 1, 3, scene_distance=1.0, reference_distance=5.0)
     adapted = adapted.replace(growth_d=torch.linspace(0, 1, 300))
@@ -126,15 +149,30 @@ def test_the_code_of_the_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     exec(block("golden"), dict(own))
     for name, function in own.items():
         with pytest.raises(AssertionError):
-            exec(block("golden"), own | {name: lambda *row, function=function: function(*row) * 1.001})
-    names: dict[str, Any] = {"means": adapted.means, "opacities": adapted.opacities, "viewmat": torch.eye(4)}
-    names |= {"scales": adapted.scales, "K": torch.eye(3), "width": 2, "height": 2, "clod_adapter": clod_adapter}
+            exec(
+                block("golden"),
+                own | {name: lambda *row, function=function: function(*row) * 1.001},
+            )
+    names: dict[str, Any] = {
+        "means": adapted.means,
+        "opacities": adapted.opacities,
+        "viewmat": torch.eye(4),
+    }
+    names |= {
+        "scales": adapted.scales,
+        "K": torch.eye(3),
+        "width": 2,
+        "height": 2,
+        "clod_adapter": clod_adapter,
+    }
     exec(block(".hook("), names, names)
     hook = Hook(adapted.sigma_d, adapted.attenuation, 3.0, adapted.growth_d)
     want = hook(adapted.means, adapted.opacities, torch.eye(4))
     assert torch.equal(names["opacities"], want[0]) and torch.equal(names["keep"], want[1])
     assert torch.equal(names["scales"], adapted.scales * want[2][:, None]) and want[2].max() > 1.1
-    monkeypatch.setattr("clod_adapter.hook.time.perf_counter", iter(0.02 * k for k in range(99)).__next__)
+    monkeypatch.setattr(
+        "clod_adapter.hook.time.perf_counter", iter(0.02 * k for k in range(99)).__next__
+    )
     names |= {"hook": hook, "a": adapted.opacities, "path": [torch.eye(4)] * 4}
     exec(block(".hold("), names, names)
     assert names["hook"].virtual_scale == pytest.approx(3.3)
@@ -142,8 +180,12 @@ def test_the_code_of_the_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 
 def test_defaults_of_the_page_match_the_reader() -> None:
-    told = dict(re.findall(r"`(\w+)`\s+\(`?(?:default )?([\w./-]+)`?\)", PAGE.split("2. **Activate**")[0]))
+    told = dict(
+        re.findall(r"`(\w+)`\s+\(`?(?:default )?([\w./-]+)`?\)", PAGE.split("2. **Activate**")[0])
+    )
     assert set(told) == {field.name for field in fields(AttenuationConfig)}
     for name, value in told.items():
         default = getattr(AttenuationConfig(), name)
-        assert value == default if isinstance(default, str) else eval(value) == pytest.approx(default)
+        assert (
+            value == default if isinstance(default, str) else eval(value) == pytest.approx(default)
+        )

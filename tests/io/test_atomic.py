@@ -58,7 +58,9 @@ def test_failure_keeps_only_the_old_files(tmp_path: Path, error: BaseException) 
             assert not os.path.exists(finals[0]) and not os.path.exists(finals[1])
             temporary.write_bytes(b"old")
     with (
-        pytest.raises((ClodError, KeyboardInterrupt), match=r"^$|.*/out: cannot be written: No space left$"),
+        pytest.raises(
+            (ClodError, KeyboardInterrupt), match=r"^$|.*/out: cannot be written: No space left$"
+        ),
         atomic_paths(*finals) as (first, second),
         atomic_path(second) as temporary,
     ):
@@ -67,17 +69,26 @@ def test_failure_keeps_only_the_old_files(tmp_path: Path, error: BaseException) 
         raise error
     with pytest.raises(ClodError, match="cannot be written"), atomic_paths(*finals) as (first, _):
         first.write_bytes(b"new")  # and the other not at all
-    assert [final.read_bytes() for final in finals] == [b"old", b"old"] and len(os.listdir(tmp_path)) == 2
+    assert [final.read_bytes() for final in finals] == [b"old", b"old"] and len(
+        os.listdir(tmp_path)
+    ) == 2
 
 
 @pytest.mark.parametrize("links", [True, False])
-def test_several_files_are_replaced_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, links: bool) -> None:
-    """Where a folder was made in place of the last one, the others stay as they were; also without hard links."""
+def test_several_files_are_replaced_together(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, links: bool
+) -> None:
+    """Where a folder was made in place of the last one, the others stay as they were; also without
+    hard links.
+    """
     if not links:
         monkeypatch.setattr(os, "link", Mock(side_effect=OSError(1, "Operation not permitted")))
     old, absent, last = (tmp_path / name for name in ("old", "absent", "last"))
     old.write_bytes(b"old")
-    with pytest.raises(ClodError, match=r"last: cannot be written"), atomic_paths(old, absent, last) as temporaries:
+    with (
+        pytest.raises(ClodError, match=r"last: cannot be written"),
+        atomic_paths(old, absent, last) as temporaries,
+    ):
         for temporary in temporaries:
             temporary.write_bytes(b"new")
         last.mkdir()
@@ -85,17 +96,23 @@ def test_several_files_are_replaced_together(tmp_path: Path, monkeypatch: pytest
 
 
 def test_unwritable_targets_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A write-protected file is not replaced, although a rename needs the folder's permission only."""
+    """A write-protected file is not replaced, although a rename needs the folder's permission
+    only.
+    """
     target = tmp_path / "full" / "a.txt"
     target.parent.mkdir()
     target.write_text("earlier")
     target.chmod(0o444)
     for path, message in (
-        (target, "a.txt: is write-protected; choose another output"), (tmp_path / "no" / "out", "does not exist"),
-        (target.parent, "not empty"), (Path("/"), "is a mount point"), (tmp_path / "out", "not writable"),
-    ):  # fmt: skip
+        (target, "a.txt: is write-protected; choose another output"),
+        (tmp_path / "no" / "out", "does not exist"),
+        (target.parent, "not empty"),
+        (Path("/"), "is a mount point"),
+        (tmp_path / "out", "not writable"),
+    ):
         if message == "not writable":
-            monkeypatch.setattr(os, "access", lambda *_: False)  # root may write anywhere, so chmod proves nothing
+            # root may write anywhere, so chmod proves nothing
+            monkeypatch.setattr(os, "access", lambda *_: False)
         with pytest.raises(ClodError, match=message), atomic_path(path):
             raise AssertionError("the body must not run")
     assert target.read_text() == "earlier" and list(tmp_path.iterdir()) == [target.parent]
@@ -113,7 +130,9 @@ with output_lock(Path(sys.argv[1])):
 
 def test_lock_keeps_other_processes_out_until_its_own_is_killed(tmp_path: Path) -> None:
     final = tmp_path / "out.ply"
-    holder = subprocess.Popen([sys.executable, "-c", HOLD, str(final)], stdout=subprocess.PIPE, text=True)
+    holder = subprocess.Popen(
+        [sys.executable, "-c", HOLD, str(final)], stdout=subprocess.PIPE, text=True
+    )
     assert holder.stdout is not None and holder.stdout.readline() == "held\n"
     remove_leftovers(final)  # as a second run would
     for path, name in ((final, final), (tmp_path / "OUT.ply", Path("all"))):

@@ -23,7 +23,17 @@ from clod_adapter.io.adapter_file import load_adapter, save_adapter
 from clod_adapter.io.checkpoint import load, save
 from clod_adapter.io.file_formats import FORMATS, WRITABLE, check_readable, file_has_dial, write
 from clod_adapter.io.settings import Metadata
-from formats import ATTENUATION, CALIBRATION, ORIGIN, PACKED, damaged, model, rows_by_place, turned, write_elements
+from formats import (
+    ATTENUATION,
+    CALIBRATION,
+    ORIGIN,
+    PACKED,
+    damaged,
+    model,
+    rows_by_place,
+    turned,
+    write_elements,
+)
 
 ABOUT = "made in a test", "of two lines"
 DIAL = tuple(suffix for suffix in WRITABLE if FORMATS[suffix].carries_sigma)
@@ -34,13 +44,23 @@ def of(suffix: str, degree: int = 1, count: int = 40) -> Gaussians:
     return model(degree, count) if suffix in DIAL else detach(model(degree, count))
 
 
-# Largest differences of positions, log scales, opacities, sh0, shN and sigma_d, and the largest angle.
+# Largest differences of positions, log scales, opacities, sh0, shN and sigma_d, and the largest
+# angle.
 EXACT = (0, 0, 0, 0, 0, 0, 1e-6)
 LOSSES = {
     ".glb": (0, 2e-6, 1e-6, 0, 0, 0, 1e-6),
-    ".glb of splat-transform": (*[1e-5] * 5, 0, 1e-5),  # stored: the fixture has other last bits on other processors
+    # stored: the fixture has other last bits on other processors
+    ".glb of splat-transform": (*[1e-5] * 5, 0, 1e-5),
     ".spz": (2.0**-20, 0.5001 / 16, 0.501 / 255, 0.51 / (0.15 * 255), 2.01 / 128, 2.0**-11, 5e-3),
-    ".spz of splat-transform": (1.25e-4, 0.5001 / 16, 0.501 / 255, 0.51 / (0.15 * 255), 8.6 / 128, 0, 5e-3),
+    ".spz of splat-transform": (
+        1.25e-4,
+        0.5001 / 16,
+        0.501 / 255,
+        0.51 / (0.15 * 255),
+        8.6 / 128,
+        0,
+        5e-3,
+    ),
     ".compressed.ply": (4e-3, 2e-3, 0.51 / 255, 0.015, 4.1 / 128, 0, 9e-3),
 }
 
@@ -54,7 +74,11 @@ def any_file(folder: Path, kind: str) -> Path:
         return path
     write(path, g, Metadata(calibration=CALIBRATION if g.sigma_d is not None else None))
     if kind in (".ascii.ply", ".big.ply"):
-        write_elements(path, PlyData.read(str(path), mmap=False).elements, "ascii" if kind == ".ascii.ply" else ">")
+        write_elements(
+            path,
+            PlyData.read(str(path), mmap=False).elements,
+            "ascii" if kind == ".ascii.ply" else ">",
+        )
     return path
 
 
@@ -68,7 +92,13 @@ def same(kind: str, g: Gaussians, again: Gaussians) -> None:
     bands = again.shN.shape[1]
     assert bands == min(g.shN.shape[1], 24 if kind not in LOSSES else 15)
     shN = g.shN[:, :bands].clamp(-1, 127 / 128) if "spz" in kind else g.shN[:, :bands]
-    wanted = {"means": g.means, "log_scales": g.log_scales, "opacities": g.opacities, "sh0": g.sh0, "shN": shN}
+    wanted = {
+        "means": g.means,
+        "log_scales": g.log_scales,
+        "opacities": g.opacities,
+        "sh0": g.sh0,
+        "shN": shN,
+    }
     for (name, values), atol in zip(wanted.items(), losses, strict=True):
         torch.testing.assert_close(getattr(again, name), values, rtol=0, atol=atol, msg=name)
     assert turned(again.quats, g.quats) <= angle
@@ -80,9 +110,13 @@ def same(kind: str, g: Gaussians, again: Gaussians) -> None:
             torch.testing.assert_close(found, most, rtol=sigma, atol=1e-6 * sigma)
 
 
-@pytest.mark.parametrize("kind", [".glb of splat-transform", ".spz of splat-transform", ".compressed.ply"])
+@pytest.mark.parametrize(
+    "kind", [".glb of splat-transform", ".spz of splat-transform", ".compressed.ply"]
+)
 def test_files_of_splat_transform(capture: Any, kind: str) -> None:
-    """Of version 3.7: a .glb in glTF's axes under a node without a rotation; an .spz of version 3; two blocks."""
+    """Of version 3.7: a .glb in glTF's axes under a node without a rotation; an .spz of version 3;
+    two blocks.
+    """
     found = load(PACKED.with_name(f"capture{kind.split()[0]}"))
     rows = rows_by_place(capture.gaussians.means.numpy(), found.gaussians.means.numpy())
     same(kind, capture.gaussians, found.gaussians[torch.from_numpy(rows)])
@@ -92,21 +126,35 @@ def test_files_of_splat_transform(capture: Any, kind: str) -> None:
 
 def test_an_older_compressed_ply(tmp_path: Path) -> None:
     """Of SH degree 0; its colours are in [0, 1] and have no ranges."""
-    now, (chunks, vertex, _) = load(PACKED).gaussians, PlyData.read(str(PACKED), mmap=False).elements
-    ranges = [np.stack([chunks.data[f"{end}_{name}"] for name in "rgb"], 1).repeat(256, 0) for end in ("min", "max")]
+    now, (chunks, vertex, _) = (
+        load(PACKED).gaussians,
+        PlyData.read(str(PACKED), mmap=False).elements,
+    )
+    ranges = [
+        np.stack([chunks.data[f"{end}_{name}"] for name in "rgb"], 1).repeat(256, 0)
+        for end in ("min", "max")
+    ]
     older = chunks.data[[name for name in chunks.data.dtype.names if name[4:] not in "rgb"]]
     write_elements(tmp_path / "a.ply", [PlyElement.describe(repack_fields(older), "chunk"), vertex])
     found = load(tmp_path / "a.ply").gaussians
     low, high = (torch.from_numpy(each[: len(now)]) for each in ranges)
-    torch.testing.assert_close((0.5 + SH_C0 * found.sh0[:, 0]) * (high - low) + low, 0.5 + SH_C0 * now.sh0[:, 0])
+    torch.testing.assert_close(
+        (0.5 + SH_C0 * found.sh0[:, 0]) * (high - low) + low, 0.5 + SH_C0 * now.sh0[:, 0]
+    )
     scenes.assert_equal(found.replace(sh0=now.sh0, shN=now.shN), now)
 
 
 @pytest.mark.parametrize(
     ("suffix", "degree", "far", "growth"),
-    [(suffix, (k + 2 * j) % 5, bool(j % 2), j > 0) for k, suffix in enumerate(DIAL) for j in range(3)],
+    [
+        (suffix, (k + 2 * j) % 5, bool(j % 2), j > 0)
+        for k, suffix in enumerate(DIAL)
+        for j in range(3)
+    ],
 )
-def test_dial_round_trips(tmp_path: Path, suffix: str, degree: int, far: bool, growth: bool) -> None:
+def test_dial_round_trips(
+    tmp_path: Path, suffix: str, degree: int, far: bool, growth: bool
+) -> None:
     g, origin = model(degree, growth=growth), ORIGIN if far else (0.0, 0.0, 0.0)
     path = tmp_path / f"a{suffix.upper()}"
     notes = write(path, g, Metadata(calibration=CALIBRATION, origin=origin, about=ABOUT))
@@ -115,20 +163,33 @@ def test_dial_round_trips(tmp_path: Path, suffix: str, degree: int, far: bool, g
     assert file_has_dial(path)
     found = load(path, origin=origin if suffix == ".ply" else None)  # which a PLY does not store
     same(suffix, g, found.gaussians)
-    assert (found.gaussians.attenuation, found.calibration, found.origin) == (ATTENUATION, CALIBRATION, origin)
+    assert (found.gaussians.attenuation, found.calibration, found.origin) == (
+        ATTENUATION,
+        CALIBRATION,
+        origin,
+    )
     assert found.filter_known and all(line in found.comments for line in ABOUT)
     known = ("quantised", "opacity = +inf", "far from 0")
     assert not [note for note in found.notes if not any(part in note for part in known)]
-    assert any("far from 0: read relative to (510000, -4096, 0.25)" in note for note in found.notes) == far
+    assert (
+        any("far from 0: read relative to (510000, -4096, 0.25)" in note for note in found.notes)
+        == far
+    )
     write(tmp_path / f"b{suffix}", g, Metadata(calibration=CALIBRATION, origin=origin, about=ABOUT))
     assert path.read_bytes() == (tmp_path / f"b{suffix}").read_bytes()
     seen = inspect(path)
-    assert seen.splat is not None and seen.splat.dial is not None and seen.splat.dial.calibration == CALIBRATION
+    assert (
+        seen.splat is not None
+        and seen.splat.dial is not None
+        and seen.splat.dial.calibration == CALIBRATION
+    )
     assert seen.splat.dial_columns == "sigma_d" + growth * " and growth_d"
     save(tmp_path / "out.ply", found.gaussians, found, calibration=found.calibration)
     again = load(tmp_path / "out.ply", origin=found.origin)
     tensors = again.gaussians.tensors()
-    assert all(torch.equal(tensor, tensors[name]) for name, tensor in found.gaussians.tensors().items())
+    assert all(
+        torch.equal(tensor, tensors[name]) for name, tensor in found.gaussians.tensors().items()
+    )
     assert (again.gaussians.attenuation, again.calibration) == (ATTENUATION, CALIBRATION)
 
 
@@ -139,7 +200,10 @@ def test_model_without_dial_round_trips(tmp_path: Path, suffix: str) -> None:
     assert not file_has_dial(path)
     found = load(path)
     rows = torch.from_numpy(rows_by_place(g.means.numpy(), found.gaussians.means.numpy()))
-    assert found.gaussians.sigma_d is None and (found.gaussians.means[rows] - g.means).abs().max() <= 2.0**-20
+    assert (
+        found.gaussians.sigma_d is None
+        and (found.gaussians.means[rows] - g.means).abs().max() <= 2.0**-20
+    )
     assert any("quantised" in note for note in found.notes) == (suffix in (".spz", ".splat"))
     seen = inspect(path)
     assert seen.splat is not None and seen.splat.dial is None
@@ -169,10 +233,16 @@ def test_refused_write_leaves_no_file(tmp_path: Path, suffix: str) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@settings(deadline=None, max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    deadline=None, max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 @given(data=st.data(), inside=st.booleans())
-def test_damage_raises_only_clod_error(tmp_path: Path, kind: str, data: st.DataObject, inside: bool) -> None:
-    """Of the file, or ``inside`` of the contents of an SPZ before compression, or of the pickle in a .pt."""
+def test_damage_raises_only_clod_error(
+    tmp_path: Path, kind: str, data: st.DataObject, inside: bool
+) -> None:
+    """Of the file, or ``inside`` of the contents of an SPZ before compression, or of the pickle in
+    a .pt.
+    """
     source = tmp_path / f"a{kind}"
     whole = (source if source.exists() else any_file(tmp_path, kind)).read_bytes()
     path = tmp_path / f"damaged{kind}"
@@ -194,7 +264,9 @@ def test_damage_raises_only_clod_error(tmp_path: Path, kind: str, data: st.DataO
 def test_adapter_is_refused_as_model(tmp_path: Path) -> None:
     path = any_file(tmp_path, ".adapter.safetensors")
     for opened in (check_readable, load):
-        with pytest.raises(ClodError, match=f"{path}: is an adapter, not a model; clod-adapt apply BASE.ply"):
+        with pytest.raises(
+            ClodError, match=f"{path}: is an adapter, not a model; clod-adapt apply BASE.ply"
+        ):
             opened(path)
 
 
@@ -221,7 +293,11 @@ def test_long_history_is_cut(tmp_path: Path) -> None:
     assert found.comments[-1] == "last" and set(found.comments[:9]) == {"x" * 1000}
     save(tmp_path / "b.ply", found.gaussians, found)
     for suffix in WRITABLE:
-        write(tmp_path / f"c{suffix}", found.gaussians, Metadata(calibration=CALIBRATION, about=found.comments))
+        write(
+            tmp_path / f"c{suffix}",
+            found.gaussians,
+            Metadata(calibration=CALIBRATION, about=found.comments),
+        )
     for path in tmp_path.glob("[bc].*"):
         again = load(path)
         assert again.comments == (() if path.suffix == ".splat" else found.comments), path
@@ -230,13 +306,17 @@ def test_long_history_is_cut(tmp_path: Path) -> None:
 
 def test_what_cannot_be_read_again_is_not_written(tmp_path: Path) -> None:
     (tmp_path / "a.ply").write_bytes(b"earlier")
-    with pytest.raises(ClodError, match=f"^{tmp_path}/a.ply: is not written, because it could not be read again: "):
+    with pytest.raises(
+        ClodError, match=f"^{tmp_path}/a.ply: is not written, because it could not be read again: "
+    ):
         write(tmp_path / "a.ply", model(0), Metadata(about=("x" * 1000,) * 1100))
     assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"earlier"]
 
 
 def test_text_is_made_ascii_and_infinite_opacity_finite(tmp_path: Path) -> None:
-    write(tmp_path / "a.safetensors", model(0), Metadata(about=("caf\u00e9", "clod_adapter max_sv 2")))
+    write(
+        tmp_path / "a.safetensors", model(0), Metadata(about=("caf\u00e9", "clod_adapter max_sv 2"))
+    )
     found = load(tmp_path / "a.safetensors")
     assert found.comments == ("caf?",) and found.gaussians.attenuation == ATTENUATION
     (note,) = write(tmp_path / "a.ply", model())

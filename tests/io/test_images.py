@@ -31,11 +31,23 @@ CASES: tuple[tuple[Image.Image, str, dict[str, Any], np.ndarray, list[str]], ...
     # Grey of 16 bits to the nearest level; Pillow reads such colours itself.
     (Image.fromarray(DEEP), "PNG", {}, np.rint(DEEP / 257), []),
     (Image.fromarray(DEEP), "TIFF", {}, np.rint(DEEP / 257), []),
-    (Image.fromarray(np.dstack([pixels(0), ALPHA])), "PNG", {}, pixels(0) * (ALPHA[..., None] > 0), OVER_BLACK),
+    (
+        Image.fromarray(np.dstack([pixels(0), ALPHA])),
+        "PNG",
+        {},
+        pixels(0) * (ALPHA[..., None] > 0),
+        OVER_BLACK,
+    ),
     (Image.fromarray(np.dstack([pixels(0), np.full_like(GREY, 255)])), "PNG", {}, pixels(0), []),
     (Image.fromarray(GREY), "PNG", {"transparency": 99}, np.where(GREY == 99, 0, GREY), OVER_BLACK),
     # A JPEG with further pictures, as phones write.
-    (Image.fromarray(FLAT), "MPO", {"save_all": True, "append_images": [Image.fromarray(FLAT)]}, FLAT, []),
+    (
+        Image.fromarray(FLAT),
+        "MPO",
+        {"save_all": True, "append_images": [Image.fromarray(FLAT)]},
+        FLAT,
+        [],
+    ),
     *((Image.fromarray(FLAT), kind, {}, FLAT, []) for kind in ("TIFF", "WEBP", "BMP")),
 )
 
@@ -62,7 +74,9 @@ def test_separate_planes_and_32_bits_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("orientation", [5, 6, 7, 8])
-def test_exif_rotation_is_applied_if_the_camera_has_the_rotated_shape(tmp_path: Path, orientation: int) -> None:
+def test_exif_rotation_is_applied_if_the_camera_has_the_rotated_shape(
+    tmp_path: Path, orientation: int
+) -> None:
     exif = Image.Exif()
     exif[0x0112] = orientation
     Image.fromarray(pixels(0)).save(tmp_path / "a.png", exif=exif)
@@ -70,9 +84,12 @@ def test_exif_rotation_is_applied_if_the_camera_has_the_rotated_shape(tmp_path: 
     np.testing.assert_array_equal(as_it_is, pixels(0))  # as COLMAP reads it
     assert notes == []
     turned, notes = read(tmp_path / "a.png", 300, 400)
-    a, b = {5: (0, 0), 6: (-1, 0), 7: (-1, -1), 8: (0, -1)}[orientation]  # what is at the top left once turned
+    # what is at the top left once turned
+    a, b = {5: (0, 0), 6: (-1, 0), 7: (-1, -1), 8: (0, -1)}[orientation]
     np.testing.assert_array_equal(turned[0, 0], pixels(0)[a, b])
-    assert turned.shape == (40, 30, 3) and notes == ["rotated by their EXIF orientation, as the cameras are"]
+    assert turned.shape == (40, 30, 3) and notes == [
+        "rotated by their EXIF orientation, as the cameras are"
+    ]
 
 
 @pytest.mark.parametrize("name", ["a.jpg", "a.png", "a.tif", "a.webp", "a.heic", "absent.png"])
@@ -93,16 +110,25 @@ def test_what_cannot_be_decoded_is_refused(tmp_path: Path, name: str) -> None:
             image_size(path)
 
 
-def reduced(path: Path, monkeypatch: pytest.MonkeyPatch, width: int, height: int, max_width: int) -> np.ndarray:
+def reduced(
+    path: Path, monkeypatch: pytest.MonkeyPatch, width: int, height: int, max_width: int
+) -> np.ndarray:
     monkeypatch.setattr(images, "LARGE", 1000)
     image, notes = read_image(path, width, height, max_width)
-    assert len(notes) == len(set(notes)) and sum("takes long: reduced first" in what for what, _ in notes) == 1
+    assert (
+        len(notes) == len(set(notes))
+        and sum("takes long: reduced first" in what for what, _ in notes) == 1
+    )
     return np.asarray(image).astype(float)
 
 
 @pytest.mark.parametrize("kind", ["RGB", "L", "RGBA", "P", "I;16", "CMYK"])
-def test_large_image_is_reduced_to_block_means(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
-    """By 3, so that it is at least twice as wide as what is made of it; in bands, of which the last one is cut."""
+def test_large_image_is_reduced_to_block_means(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
+) -> None:
+    """By 3, so that it is at least twice as wide as what is made of it; in bands, of which the last
+    one is cut.
+    """
     width, height = 200, 3 * BAND + 70
     rgb = pixels(3, width, height)
     image = Image.fromarray(rgb)
@@ -117,11 +143,17 @@ def test_large_image_is_reduced_to_block_means(tmp_path: Path, monkeypatch: pyte
     whole = read(path, width, height)[0].astype(float)
     got = reduced(path, monkeypatch, width, height, 33)
     assert got.shape == (-(-height // 3), -(-width // 3), 3)
-    want = whole[: height // 3 * 3, : width // 3 * 3].reshape(height // 3, 3, width // 3, 3, 3).mean((1, 3))
+    want = (
+        whole[: height // 3 * 3, : width // 3 * 3]
+        .reshape(height // 3, 3, width // 3, 3, 3)
+        .mean((1, 3))
+    )
     assert np.abs(got[: height // 3, : width // 3] - want).max() <= 1
 
 
-def test_large_jpeg_is_reduced_while_decoding(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_large_jpeg_is_reduced_while_decoding(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     ramp = np.linspace(0, 255, 400 * 300).reshape(300, 400).astype(np.uint8)
     exif = Image.Exif()
     exif[0x0112] = 6
@@ -135,5 +167,7 @@ def test_large_jpeg_is_reduced_while_decoding(tmp_path: Path, monkeypatch: pytes
 def test_wrong_shape_is_refused(tmp_path: Path) -> None:
     Image.fromarray(GREY).save(tmp_path / "a.png")
     for height in (30, 40):  # a turned one, too, as there is no EXIF
-        with pytest.raises(ClodError, match=f"a.png: is 40x30, its camera 30x{height}, another shape"):
+        with pytest.raises(
+            ClodError, match=f"a.png: is 40x30, its camera 30x{height}, another shape"
+        ):
             read(tmp_path / "a.png", 30, height)

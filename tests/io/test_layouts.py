@@ -1,4 +1,6 @@
-"""What each format stores, byte by byte where its readers document it; files of other programs, and files they read."""
+"""What each format stores, byte by byte where its readers document it; files of other programs, and
+files they read.
+"""
 
 import gzip
 import json
@@ -49,14 +51,25 @@ def test_glb_in_pygltflib(tmp_path: Path) -> None:
     gltf = pygltflib.GLTF2().load(str(tmp_path / "a.glb"))
     (mesh,), (node,) = gltf.meshes, gltf.nodes
     (primitive,) = mesh.primitives
-    assert primitive.mode == pygltflib.POINTS and gltf.extensionsUsed == [KHR] and not gltf.extensionsRequired
+    assert (
+        primitive.mode == pygltflib.POINTS
+        and gltf.extensionsUsed == [KHR]
+        and not gltf.extensionsRequired
+    )
     assert primitive.extensions[KHR] == {
-        "kernel": "ellipse", "colorSpace": "srgb_rec709_display", "projection": "perspective",
+        "kernel": "ellipse",
+        "colorSpace": "srgb_rec709_display",
+        "projection": "perspective",
         "sortingMethod": "cameraDistance",
-    }  # fmt: skip
-    assert gltf.asset.extras["clod_adapter"]["attenuation"]["reference_distance"] == ATTENUATION.reference_distance
+    }
+    assert (
+        gltf.asset.extras["clod_adapter"]["attenuation"]["reference_distance"]
+        == ATTENUATION.reference_distance
+    )
     found, blob = {}, gltf.binary_blob()
-    for name, number in ((name, number) for name, number in vars(primitive.attributes).items() if number is not None):
+    for name, number in (
+        (name, number) for name, number in vars(primitive.attributes).items() if number is not None
+    ):
         accessor, view = gltf.accessors[number], gltf.bufferViews[gltf.accessors[number].bufferView]
         kind = {pygltflib.FLOAT: "<f4", pygltflib.UNSIGNED_BYTE: "u1"}[accessor.componentType]
         data = blob[view.byteOffset : view.byteOffset + view.byteLength]
@@ -65,9 +78,15 @@ def test_glb_in_pygltflib(tmp_path: Path) -> None:
     position = gltf.accessors[primitive.attributes.POSITION]
     assert position.min == g.means.amin(0).tolist() and position.max == g.means.amax(0).tolist()
     assert set(found) == {
-        "POSITION", "COLOR_0", "_SIGMA_D", "_GROWTH_D", f"{KHR}:ROTATION", f"{KHR}:SCALE", f"{KHR}:OPACITY",
+        "POSITION",
+        "COLOR_0",
+        "_SIGMA_D",
+        "_GROWTH_D",
+        f"{KHR}:ROTATION",
+        f"{KHR}:SCALE",
+        f"{KHR}:OPACITY",
         *(f"{KHR}:SH_DEGREE_{d}_COEF_{k}" for d in range(4) for k in range(2 * d + 1)),
-    }  # fmt: skip
+    }
     np.testing.assert_allclose(found[f"{KHR}:SCALE"], g.scales, rtol=1e-6)
     np.testing.assert_allclose(found[f"{KHR}:OPACITY"][:, 0], g.opacities, rtol=1e-6)
     unit = (g.quats.double() / g.quats.double().norm(dim=1, keepdim=True))[:, [1, 2, 3, 0]]
@@ -75,32 +94,58 @@ def test_glb_in_pygltflib(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found[f"{KHR}:SH_DEGREE_2_COEF_1"], g.shN[:, 4])
     for name in ("sigma_d", "growth_d"):
         np.testing.assert_array_equal(found[f"_{name.upper()}"][:, 0], getattr(g, name))
-    np.testing.assert_allclose(found["COLOR_0"][:, :3] / 255, (0.5 + SH_C0 * g.sh0[:, 0]).clamp(0, 1), atol=2.1e-3)
+    np.testing.assert_allclose(
+        found["COLOR_0"][:, :3] / 255, (0.5 + SH_C0 * g.sh0[:, 0]).clamp(0, 1), atol=2.1e-3
+    )
     # The node turns y down into glTF's y up: (x, y, z) becomes (-x, -y, z).
     assert node.rotation == [0, 0, 1, 0] and node.translation == [-ORIGIN[0], -ORIGIN[1], ORIGIN[2]]
 
 
 def test_glb_of_another_program(tmp_path: Path) -> None:
-    """Interleaved, in short integers, moved, without metadata: sigma_d then has the default settings."""
+    """Interleaved, in short integers, moved, without metadata: sigma_d then has the default
+    settings.
+    """
     write(tmp_path / "a.glb", model(0, 5), Metadata(origin=ORIGIN))
     path = change_glb(tmp_path / "a.glb", lambda g: g["asset"].pop("extras"))
     found = load(path)
     assert found.origin == ORIGIN and found.gaussians.attenuation == AttenuationConfig()
-    change_glb(path, lambda g: g["nodes"][0].update(translation=[1.0, -2.0, 4.0]))  # near 0 there is no origin
+    # near 0 there is no origin
+    change_glb(path, lambda g: g["nodes"][0].update(translation=[1.0, -2.0, 4.0]))
     moved = load(path)
-    torch.testing.assert_close(moved.gaussians.means, model(0, 5).means + torch.tensor([-1.0, 2.0, 4.0]))
+    torch.testing.assert_close(
+        moved.gaussians.means, model(0, 5).means + torch.tensor([-1.0, 2.0, 4.0])
+    )
     assert moved.origin == NOWHERE
     change_glb(path, lambda g: g["nodes"][0].pop("translation"))
-    rows = np.zeros(5, [("position", "<f4", 3), ("rotation", "<i2", 4), ("opacity", "u1"), ("pad", "u1", 3)])
-    rows["position"], rows["rotation"], rows["opacity"] = np.arange(15).reshape(5, 3), [0, 0, 0, 32767], 255
+    rows = np.zeros(
+        5, [("position", "<f4", 3), ("rotation", "<i2", 4), ("opacity", "u1"), ("pad", "u1", 3)]
+    )
+    rows["position"], rows["rotation"], rows["opacity"] = (
+        np.arange(15).reshape(5, 3),
+        [0, 0, 0, 32767],
+        255,
+    )
 
     def interleave(g: dict[str, Any]) -> None:
         primitive, accessors = g["meshes"][0]["primitives"][0], g["accessors"]
         names = primitive["attributes"]
-        for name, offset, kind in (("POSITION", 0, 5126), (f"{KHR}:ROTATION", 12, 5122), (f"{KHR}:OPACITY", 20, 5121)):
-            where = {"bufferView": len(g["bufferViews"]), "byteOffset": offset, "componentType": kind}
+        for name, offset, kind in (
+            ("POSITION", 0, 5126),
+            (f"{KHR}:ROTATION", 12, 5122),
+            (f"{KHR}:OPACITY", 20, 5121),
+        ):
+            where = {
+                "bufferView": len(g["bufferViews"]),
+                "byteOffset": offset,
+                "componentType": kind,
+            }
             accessors[names[name]].update(where, normalized=kind != 5126)
-        view = {"buffer": 0, "byteOffset": g["buffers"][0]["byteLength"], "byteLength": rows.nbytes, "byteStride": 24}
+        view = {
+            "buffer": 0,
+            "byteOffset": g["buffers"][0]["byteLength"],
+            "byteLength": rows.nbytes,
+            "byteStride": 24,
+        }
         g["bufferViews"].append(view)
         g["nodes"][0].pop("rotation")
         g["meshes"].append({"primitives": [primitive, {"attributes": {"POSITION": 0}}]})
@@ -113,7 +158,10 @@ def test_glb_of_another_program(tmp_path: Path) -> None:
     path.write_bytes(head + struct.pack("<II", len(body), 0x004E4942) + body)
     found = load(path)
     np.testing.assert_array_equal(found.gaussians.means, rows["position"] * [-1, -1, 1])
-    assert found.gaussians.quats.tolist() == [[1, 0, 0, 0]] * 5 and found.gaussians.opacity_logits.isposinf().all()
+    assert (
+        found.gaussians.quats.tolist() == [[1, 0, 0, 0]] * 5
+        and found.gaussians.opacity_logits.isposinf().all()
+    )
     colours, others = found.notes[-2:]
     assert "'lin_rec709_display'" in colours and others.startswith("1 more primitives")
 
@@ -174,15 +222,26 @@ def test_axes_of_an_spz(tmp_path: Path, axes: int, signs: list[float]) -> None:
     (tmp_path / "b.spz").write_bytes(gzip.compress(data))
     other, turn = load(tmp_path / "b.spz").gaussians, torch.diag(torch.tensor(signs))
     assert torch.equal(other.means, ours.means @ turn)
-    torch.testing.assert_close(covariances(other), turn.double() @ covariances(ours) @ turn.double())
-    seen = torch.nn.functional.normalize(torch.randn(40, 3, generator=torch.Generator().manual_seed(0)))
-    drawn = ((sh_basis(u)[:, 1:16, None] * g.shN).sum(1) for u, g in ((seen, ours), (seen @ turn, other)))
+    torch.testing.assert_close(
+        covariances(other), turn.double() @ covariances(ours) @ turn.double()
+    )
+    seen = torch.nn.functional.normalize(
+        torch.randn(40, 3, generator=torch.Generator().manual_seed(0))
+    )
+    drawn = (
+        (sh_basis(u)[:, 1:16, None] * g.shN).sum(1) for u, g in ((seen, ours), (seen @ turn, other))
+    )
     torch.testing.assert_close(*drawn, atol=1e-5, rtol=1e-5)
 
 
 def test_spz_of_version_2(tmp_path: Path) -> None:
     """Rotations in three bytes: x, y, z of unit length with w >= 0."""
-    rows = struct.pack("<IIIBBBB", 0x5053474E, 2, 2, 0, 12, 0, 0) + bytes(18) + bytes([0, 255]) + bytes(12)
+    rows = (
+        struct.pack("<IIIBBBB", 0x5053474E, 2, 2, 0, 12, 0, 0)
+        + bytes(18)
+        + bytes([0, 255])
+        + bytes(12)
+    )
     (tmp_path / "a.spz").write_bytes(gzip.compress(rows + bytes([128, 128, 128, 255, 128, 128])))
     g = load(tmp_path / "a.spz").gaussians
     assert turned(g.quats, torch.tensor([[1.0, 0, 0, 0], [0, 1, 0, 0]])) < 0.02
@@ -194,18 +253,26 @@ def grown(g: Gaussians, s: float) -> torch.Tensor:
     assert g.attenuation is not None and g.growth_d is not None
     from_0 = replace(camera(), viewmat=torch.eye(4))
     d = normalized_distances(g.means, from_0, g.attenuation)
-    return g.log_scales + growth_factors(g.growth_d, d, s, growth_distance(g.attenuation)).log()[:, None]
+    return (
+        g.log_scales
+        + growth_factors(g.growth_d, d, s, growth_distance(g.attenuation)).log()[:, None]
+    )
 
 
 @pytest.mark.parametrize(
-    ("typical", "known", "step"), [(3e-3, True, 2.0**-20), (250.0, False, 2.0**-13), (40_000.0, True, 2.0**-6)]
+    ("typical", "known", "step"),
+    [(3e-3, True, 2.0**-20), (250.0, False, 2.0**-13), (40_000.0, True, 2.0**-6)],
 )
 def test_units_of_an_spz(tmp_path: Path, typical: float, known: bool, step: float) -> None:
-    """Positions use the available bits; a sigma_d of large units is not clipped to float16; the growth is the same."""
+    """Positions use the available bits; a sigma_d of large units is not clipped to float16; the
+    growth is the same.
+    """
     g, sigma = model(0), typical * torch.logspace(-1, 3.3, 40)
     config = replace(ATTENUATION, reference_distance=typical if known else 0.0)
     means = typical * torch.nn.functional.normalize(g.means) * torch.linspace(0.5, 2, 40)[:, None]
-    g = g.replace(means=means, attenuation=config, sigma_d=sigma, growth_d=torch.linspace(-1, 1, 40))
+    g = g.replace(
+        means=means, attenuation=config, sigma_d=sigma, growth_d=torch.linspace(-1, 1, 40)
+    )
     write(tmp_path / "a.spz", g)
     again = load(tmp_path / "a.spz").gaussians
     assert again.attenuation is not None and again.attenuation.scene_distance == 1
@@ -213,7 +280,8 @@ def test_units_of_an_spz(tmp_path: Path, typical: float, known: bool, step: floa
     torch.testing.assert_close(again.sigma_d, sigma, rtol=2.0**-11, atol=0)
     assert (again.means - means).abs().max() <= step
     for s in (1.0, 6.0):
-        assert (grown(again, s) - grown(g, s)).abs().max() <= 0.04  # half a step of the scales, of 1/16
+        # half a step of the scales, of 1/16
+        assert (grown(again, s) - grown(g, s)).abs().max() <= 0.04
 
 
 def test_far_positions_of_an_spz(tmp_path: Path) -> None:
@@ -256,7 +324,10 @@ def test_losses_of_a_splat(tmp_path: Path) -> None:
     again = load(tmp_path / "a.splat").gaussians
     rows = rows_by_place(again.means.numpy(), g.means.numpy())
     weights = (g.scales.prod(1) * g.opacities)[rows]
-    assert turned(again.quats, g.quats[rows]) < 0.02 and (weights[1:] <= weights[:-1] * (1 + 1e-5)).all()
+    assert (
+        turned(again.quats, g.quats[rows]) < 0.02
+        and (weights[1:] <= weights[:-1] * (1 + 1e-5)).all()
+    )
 
 
 @pytest.mark.parametrize("degree", [0, 3])
@@ -269,7 +340,11 @@ def test_checkpoint_of_gsplat(tmp_path: Path, degree: int) -> None:
     extra = {"app_module": torch.nn.Linear(2, 2).state_dict(), "optimizer": [torch.zeros(3)]}
     torch.save({"step": 6999, "splats": splats, **extra}, tmp_path / "a.PT")
     base = load(tmp_path / "a.PT")
-    assert base.gaussians.sh_degree == degree and base.gaussians.sigma_d is None and "normalised" in base.notes[1]
+    assert (
+        base.gaussians.sh_degree == degree
+        and base.gaussians.sigma_d is None
+        and "normalised" in base.notes[1]
+    )
     assert "1 of 12 Gaussians dropped" in base.notes[0] and len(base.fingerprint) == 64
     for name, tensor in to_gsplat(base.gaussians).items():
         assert torch.equal(tensor, values[name][torch.arange(12) != 3].float()), name
@@ -282,7 +357,9 @@ def test_checkpoint_of_gsplat(tmp_path: Path, degree: int) -> None:
 
 @pytest.mark.parametrize("name", ["ckpt_29999_rank{}.pt", "point_cloud_rk{}_ws3.ply"])
 def test_ranks_of_several_gpus(tmp_path: Path, name: str) -> None:
-    """Any of them is all of them; a file of another run or number does not matter, a missing or odd one is refused."""
+    """Any of them is all of them; a file of another run or number does not matter, a missing or odd
+    one is refused.
+    """
     g = gaussians(30, 1, 0)
     paths = [tmp_path / name.format(rank) for rank in range(3)]
     for rank, path in enumerate(paths):
@@ -294,7 +371,10 @@ def test_ranks_of_several_gpus(tmp_path: Path, name: str) -> None:
     for other in (name.replace("_r", "0_r"), name.replace("{}", "_").replace("ws3", "ws4")):
         (tmp_path / other.format(9)).write_bytes(b"another")
     found = [load(path) for path in paths]
-    assert all(each.gaussians == g for each in found) and len({each.fingerprint for each in found}) == 1
+    assert (
+        all(each.gaussians == g for each in found)
+        and len({each.fingerprint for each in found}) == 1
+    )
     assert found[0].notes[-1] == "its 3 ranks, in files beside it, are read as one checkpoint"
     with pytest.raises(ClodError, match="is the input file"):
         save(paths[2], g, found[0])
@@ -309,11 +389,15 @@ def test_ranks_of_several_gpus(tmp_path: Path, name: str) -> None:
     with pytest.raises(ClodError, match=f"{paths[0].name}: does not fit the other ranks"):
         load(paths[0])
     paths[1].unlink()
-    with pytest.raises(ClodError, match=f"{paths[2].name}: is of a checkpoint of several GPUs, whose rank 1 is not"):
+    with pytest.raises(
+        ClodError, match=f"{paths[2].name}: is of a checkpoint of several GPUs, whose rank 1 is not"
+    ):
         load(paths[2])
 
 
-@pytest.mark.parametrize(("name", "what"), [("pose_adjust", "cameras"), ("post_processing", "colours")])
+@pytest.mark.parametrize(
+    ("name", "what"), [("pose_adjust", "cameras"), ("post_processing", "colours")]
+)
 def test_corrections_of_gsplat_are_not_applied(tmp_path: Path, name: str, what: str) -> None:
     """A warning says so."""
     module = {"embeds.weight": torch.zeros(3, 9)}
@@ -324,7 +408,9 @@ def test_corrections_of_gsplat_are_not_applied(tmp_path: Path, name: str, what: 
 
 @pytest.mark.parametrize("suffix", [".ply", ".spz"])
 def test_splat_transform_reads_files(tmp_path: Path, suffix: str) -> None:
-    """It keeps the dial's columns of a PLY bit for bit and in order, but drops the comments with the settings."""
+    """It keeps the dial's columns of a PLY bit for bit and in order, but drops the comments with
+    the settings.
+    """
     write(tmp_path / f"a{suffix}", model(3))
     splat_transform(tmp_path / f"a{suffix}", tmp_path / "b.ply")
     ours, found = load(tmp_path / f"a{suffix}").gaussians, load(tmp_path / "b.ply")
@@ -339,5 +425,6 @@ def test_splat_transform_reads_files(tmp_path: Path, suffix: str) -> None:
             assert torch.equal(getattr(theirs, name), getattr(ours, name))
         assert theirs.attenuation == AttenuationConfig(reference_distance=3.217)
         assert any("its dial is not described" in note for note in found.notes)
-        splat_transform(tmp_path / "b.ply", tmp_path / "c.spz")  # of version 4, which splat-transform reads
+        # of version 4, which splat-transform reads
+        splat_transform(tmp_path / "b.ply", tmp_path / "c.spz")
         assert load(tmp_path / "c.spz").gaussians.means.shape == theirs.means.shape

@@ -1,4 +1,6 @@
-"""Sets of several levels: 3D Tiles with the tiles as the SPZ reader finds them, and options of streaming sets."""
+"""Sets of several levels: 3D Tiles with the tiles as the SPZ reader finds them, and options of
+streaming sets.
+"""
 
 import json
 import struct
@@ -25,7 +27,10 @@ def levels(n: int = 400) -> list[Gaussians]:
 
 
 def tiles_of(tile: dict[str, Any], depth: int = 0) -> list[tuple[int, dict[str, Any]]]:
-    return [(depth, tile), *(each for child in tile.get("children", ()) for each in tiles_of(child, depth + 1))]
+    return [
+        (depth, tile),
+        *(each for child in tile.get("children", ()) for each in tiles_of(child, depth + 1)),
+    ]
 
 
 def read_tile(path: Path, folder: Path) -> tuple[dict[str, Any], Gaussians]:
@@ -42,8 +47,9 @@ def read_tile(path: Path, folder: Path) -> tuple[dict[str, Any], Gaussians]:
 
 
 def test_index_and_tiles(tmp_path: Path) -> None:
-    """Properties and ranges of tileset.schema.json and tile.schema.json of 3D Tiles 1.1; one chain of levels, coarsest
-    first; errors descend; what is packed is what was given."""
+    """Properties and ranges of tileset.schema.json and tile.schema.json of 3D Tiles 1.1; one chain
+    of levels, coarsest first; errors descend; what is packed is what was given.
+    """
     given = levels()
     notes = write_tileset(tmp_path, [*zip(BEGINS, given, strict=True)], origin=NOWHERE)
     assert any("rounded" in note for note in notes)
@@ -54,36 +60,60 @@ def test_index_and_tiles(tmp_path: Path) -> None:
     required = index["extensions"]["3DTILES_content_gltf"]["extensionsRequired"]
     assert required == ["KHR_gaussian_splatting", "KHR_gaussian_splatting_compression_spz_2"]
     chain = [tile for _, tile in tiles_of(index["root"])]
-    begins = [tile["geometricError"] * 935 / 16 for tile in chain]  # on a screen of 1,080 lines, 60 degrees high
-    assert begins == pytest.approx(BEGINS[::-1]) and index["geometricError"] >= chain[0]["geometricError"]
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["0_0.glb", "0_1.glb", "root.glb", TILESET]
+    # on a screen of 1,080 lines, 60 degrees high
+    begins = [tile["geometricError"] * 935 / 16 for tile in chain]
+    assert (
+        begins == pytest.approx(BEGINS[::-1])
+        and index["geometricError"] >= chain[0]["geometricError"]
+    )
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "0_0.glb",
+        "0_1.glb",
+        "root.glb",
+        TILESET,
+    ]
     for tile, want in zip(chain, given[::-1], strict=True):
         assert set(tile) - {"content", "children", "refine"} == {"boundingVolume", "geometricError"}
         (box,) = tile["boundingVolume"].values()
-        assert len(box) == 12 and all(isinstance(number, float) for number in box) and tile.get("children", True)
+        assert (
+            len(box) == 12
+            and all(isinstance(number, float) for number in box)
+            and tile.get("children", True)
+        )
         gltf, found = read_tile(tmp_path / tile["content"]["uri"], tmp_path)
         torch.testing.assert_close(found.means, want.means, rtol=0, atol=1e-4)
         torch.testing.assert_close(found.log_scales, want.log_scales, rtol=0, atol=0.04)
         primitive = gltf["meshes"][0]["primitives"][0]
-        assert primitive["extensions"]["KHR_gaussian_splatting"]["extensions"] == {tileset.SPZ: {"bufferView": 0}}
+        assert primitive["extensions"]["KHR_gaussian_splatting"]["extensions"] == {
+            tileset.SPZ: {"bufferView": 0}
+        }
         assert {accessor["count"] for accessor in gltf["accessors"]} == {len(want)}
-        assert sum("SH_DEGREE" in name for name in primitive["attributes"]) == 8  # of degree 1 and 2, as readers count
-        assert gltf["accessors"][primitive["attributes"]["POSITION"]]["min"] == want.means.amin(0).tolist()
+        # of degree 1 and 2, as readers count
+        assert sum("SH_DEGREE" in name for name in primitive["attributes"]) == 8
+        assert (
+            gltf["accessors"][primitive["attributes"]["POSITION"]]["min"]
+            == want.means.amin(0).tolist()
+        )
 
 
 def test_a_set_is_drawn_until_it_is_a_pixel(tmp_path: Path) -> None:
-    """Viewers draw nothing where the index's error covers at most 16 pixels, whatever the levels' errors."""
+    """Viewers draw nothing where the index's error covers at most 16 pixels, whatever the levels'
+    errors.
+    """
     for size in (0.02, 500.0):
         given = [level.replace(means=level.means * size) for level in levels()]
         write_tileset(tmp_path, [*zip((0.0, 1e-6, 2e-6), given, strict=True)], origin=NOWHERE)
         index = json.loads((tmp_path / TILESET).read_text())
         halves = np.diag(np.reshape(index["root"]["boundingVolume"]["box"], (4, 3))[1:])
-        pixels = 2 * float(np.linalg.norm(halves)) * 16 / index["geometricError"]  # of the box, where that error is 16
+        # of the box, where that error is 16
+        pixels = 2 * float(np.linalg.norm(halves)) * 16 / index["geometricError"]
         assert 0.9 < pixels < 1.1
 
 
 def test_boxes_are_where_viewers_place_the_gaussians(tmp_path: Path) -> None:
-    """The node's matrix, then glTF's y-up axes into z-up ones, with a large origin; floaters are left out."""
+    """The node's matrix, then glTF's y-up axes into z-up ones, with a large origin; floaters are
+    left out.
+    """
     given = [level.replace(means=level.means * torch.tensor([3.0, 1.0, 0.5])) for level in levels()]
     given[0].means[0] = 1e4
     write_tileset(tmp_path, [*zip(BEGINS, given, strict=True)], origin=(1000.0, -2000.0, 50.0))
@@ -106,7 +136,13 @@ def test_cells_hold_every_gaussian_once(tmp_path: Path, monkeypatch: pytest.Monk
     root = json.loads((tmp_path / TILESET).read_text())["root"]
     assert len(root["children"]) >= 6
     for level, want in enumerate(given[:2]):
-        of_level = [tile for depth, tile in tiles_of(root) if depth == 2 - level and "content" in tile]
-        parts = [read_tile(tmp_path / tile["content"]["uri"], tmp_path)[1].means for tile in of_level]
+        of_level = [
+            tile for depth, tile in tiles_of(root) if depth == 2 - level and "content" in tile
+        ]
+        parts = [
+            read_tile(tmp_path / tile["content"]["uri"], tmp_path)[1].means for tile in of_level
+        ]
         assert all(len(part) <= 100 for part in parts) and sum(map(len, parts)) == len(want)
-        torch.testing.assert_close(torch.cat(parts).double().sum(0), want.means.double().sum(0), rtol=0, atol=0.02)
+        torch.testing.assert_close(
+            torch.cat(parts).double().sum(0), want.means.double().sum(0), rtol=0, atol=0.02
+        )

@@ -36,7 +36,9 @@ def files(draw: st.DrawFn) -> tuple[np.ndarray, str, int]:
     degree = draw(st.integers(0, 4))
     names = needed(degree)
     names += ["nx", "ny", "nz"] if draw(st.booleans()) else []
-    names += draw(st.lists(st.sampled_from(["label", "confidence", "time_7", "growth_d"]), unique=True))
+    names += draw(
+        st.lists(st.sampled_from(["label", "confidence", "time_7", "growth_d"]), unique=True)
+    )
     names = draw(st.permutations(names))
     doubles = draw(st.lists(st.sampled_from(names), max_size=5))
     types = {name: "f8" for name in doubles} | {"label": draw(st.sampled_from(["u1", "i4", "i2"]))}
@@ -44,21 +46,35 @@ def files(draw: st.DrawFn) -> tuple[np.ndarray, str, int]:
     return vertex, draw(st.sampled_from(["<", ">", "ascii"])), degree
 
 
-@settings(deadline=None, max_examples=20, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    deadline=None, max_examples=20, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 @given(files(), st.integers(0, 1000))
-def test_every_layout_round_trips(tmp_path: Path, file: tuple[np.ndarray, str, int], seed: int) -> None:
+def test_every_layout_round_trips(
+    tmp_path: Path, file: tuple[np.ndarray, str, int], seed: int
+) -> None:
     """Bit for bit, but for values that change; growth_d without sigma_d is a column like others."""
     vertex, kind, degree = file
-    source, out = write_rows(tmp_path / "in.ply", vertex, kind, ("made by hand",)), tmp_path / "out.ply"
+    source, out = (
+        write_rows(tmp_path / "in.ply", vertex, kind, ("made by hand",)),
+        tmp_path / "out.ply",
+    )
     before = source.read_bytes()
     base = load(source)
     g = base.gaussians
-    assert g.sh_degree == degree and g.sigma_d is g.growth_d is None and g.means.dtype == torch.float32
+    assert (
+        g.sh_degree == degree and g.sigma_d is g.growth_d is None and g.means.dtype == torch.float32
+    )
     assert base.notes == ()
     save(out, g, base)
     assert read_back(out)[1].dtype.names == vertex.dtype.names
     f32 = {name: vertex[name].astype(np.float32) for name in vertex.dtype.names}
-    columns = {"y": g.means[:, 1], "rot_0": g.quats[:, 0], "scale_2": g.log_scales[:, 2], "f_dc_2": g.sh0[:, 0, 2]}
+    columns = {
+        "y": g.means[:, 1],
+        "rot_0": g.quats[:, 0],
+        "scale_2": g.log_scales[:, 2],
+        "f_dc_2": g.sh0[:, 0, 2],
+    }
     bands = SH_COUNTS[degree] - 1
     columns |= {f"f_rest_{c * bands + k}": g.shN[:, k, c] for k in range(bands) for c in range(3)}
     for name, values in (columns | {"opacity": g.opacity_logits}).items():
@@ -71,16 +87,27 @@ def test_every_layout_round_trips(tmp_path: Path, file: tuple[np.ndarray, str, i
     sigma_d = torch.linspace(0.1, 3, len(g))
     growth_d = torch.linspace(-1, 3, len(g)) if seed % 3 else None
     tuned = g.replace(**changes, sigma_d=sigma_d, growth_d=growth_d, attenuation=CONFIG)
-    save(out, tuned.replace(means=changes["means"].requires_grad_(), sigma_d=sigma_d.double().requires_grad_()), base)
+    save(
+        out,
+        tuned.replace(
+            means=changes["means"].requires_grad_(), sigma_d=sigma_d.double().requires_grad_()
+        ),
+        base,
+    )
     _, rows = read_back(out)
     own = [name for name in vertex.dtype.names if name != "growth_d"]
     added = ["clod_paper", "sigma_d"]  # of CONFIG, what is not the default, but for max_sv
     added += ["growth_d"] if growth_d is not None else []
-    assert list(rows.dtype.names) == own + added and {rows.dtype[name].str for name in added} == {"<f4"}
+    assert list(rows.dtype.names) == own + added and {rows.dtype[name].str for name in added} == {
+        "<f4"
+    }
     for name in own:
         assert rows.dtype[name] == vertex.dtype[name]
         unchanged = rows[name].astype(np.float32) == f32[name] if seed % 2 else slice(None)
-        assert rows[name][unchanged].tobytes() == vertex[name].astype(rows.dtype[name])[unchanged].tobytes(), name
+        assert (
+            rows[name][unchanged].tobytes()
+            == vertex[name].astype(rows.dtype[name])[unchanged].tobytes()
+        ), name
     assert source.read_bytes() == before
     again = load(out)
     assert again.gaussians == tuned and again.notes == ()
@@ -101,11 +128,24 @@ def test_header_of_an_extended_file(tmp_path: Path) -> None:
     save(tmp_path / "out.ply", base.gaussians.replace(attenuation=config), base, version="7.8.9")
     assert load(tmp_path / "out.ply").gaussians.attenuation == config
     lines, rows = read_back(tmp_path / "out.ply")
-    assert lines[:4] == ["ply", "format binary_little_endian 1.0", "element vertex 2", "comment a photo"]
-    assert sum("clod_adapter max_sv" in line for line in lines) == 1 and not any("odd" in line for line in lines)
-    for line in (f"reference_distance {float(config.reference_distance)!r}", "form paper", "version 7.8.9"):
+    assert lines[:4] == [
+        "ply",
+        "format binary_little_endian 1.0",
+        "element vertex 2",
+        "comment a photo",
+    ]
+    assert sum("clod_adapter max_sv" in line for line in lines) == 1 and not any(
+        "odd" in line for line in lines
+    )
+    for line in (
+        f"reference_distance {float(config.reference_distance)!r}",
+        "form paper",
+        "version 7.8.9",
+    ):
         assert f"comment clod_adapter {line}" in lines
-    assert lines[-1] == "property float sigma_d" and sorted(rows.dtype.names) == sorted({*rows.dtype.names})
+    assert lines[-1] == "property float sigma_d" and sorted(rows.dtype.names) == sorted(
+        {*rows.dtype.names}
+    )
 
 
 def test_unusable_rows_are_dropped_and_counted(tmp_path: Path) -> None:
@@ -115,7 +155,8 @@ def test_unusable_rows_are_dropped_and_counted(tmp_path: Path) -> None:
     vertex["masks_0"][[8, 13, 14]] = 2, -0.5, -20  # MaskGaussian's
     vertex["x"][0] = np.nan
     vertex["f_rest_8"][1] = np.inf
-    vertex["opacity"][[2, 3, 4, 9]] = np.nan, -np.inf, np.inf, 1e300  # the last is +inf as a float32
+    # the last is +inf as a float32
+    vertex["opacity"][[2, 3, 4, 9]] = np.nan, -np.inf, np.inf, 1e300
     vertex["scale_1"][5] = -np.inf
     for name in ("rot_0", "rot_1", "rot_2", "rot_3"):
         vertex[name][[6, 12]] = 0, 1e-25
@@ -124,7 +165,9 @@ def test_unusable_rows_are_dropped_and_counted(tmp_path: Path) -> None:
     vertex["y"][10] = 1e300
     vertex["growth_d"][11] = np.inf
     checkpoint = load(write_rows(tmp_path / "in.ply", vertex))
-    np.testing.assert_array_equal(checkpoint.gaussians.means[:, 1], vertex["y"][[4, 8, 9]].astype("f4"))
+    np.testing.assert_array_equal(
+        checkpoint.gaussians.means[:, 1], vertex["y"][[4, 8, 9]].astype("f4")
+    )
     assert checkpoint.gaussians.opacities[0] == 1
     assert checkpoint.notes[:4] == (
         "2 of 15 Gaussians dropped: MaskGaussian existence probability below 0.5",
@@ -145,11 +188,22 @@ def test_refused_saves(tmp_path: Path) -> None:
         (out, g.replace(shN=torch.zeros(3, 0, 3)), "degree 0"),
         (out, g.replace(opacity_logits=torch.full((3,), torch.inf)), "opacity_logits"),
         (tmp_path / "in.ply", g, "is the input file"),
-    ]  # fmt: skip
-    dial, bad = g.replace(sigma_d=torch.ones(3), attenuation=CONFIG), torch.tensor([1.0, torch.inf, torch.nan])
+    ]
+    dial, bad = (
+        g.replace(sigma_d=torch.ones(3), attenuation=CONFIG),
+        torch.tensor([1.0, torch.inf, torch.nan]),
+    )
     refused += [
-        (out, dial.replace(sigma_d=bad), "sigma_d holds a new value that is not finite; use a large number"),
-        (out, dial.replace(growth_d=bad), "growth_d holds a new value that is not finite; use 0 for no growth"),
+        (
+            out,
+            dial.replace(sigma_d=bad),
+            "sigma_d holds a new value that is not finite; use a large number",
+        ),
+        (
+            out,
+            dial.replace(growth_d=bad),
+            "growth_d holds a new value that is not finite; use 0 for no growth",
+        ),
         (out, g.replace(means=bad.expand(3, 3)), "means holds a new value that is not finite"),
     ]
     for path, changed, message in refused:
@@ -175,17 +229,27 @@ def test_other_formats_keep_what_the_base_says(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("order", ["<", ">", "ascii"])
-def test_rows_are_those_of_the_file_whatever_happens_to_it_later(tmp_path: Path, order: str) -> None:
-    """The fingerprint is of the whole file; elements around the rows, with lists too, do not matter."""
-    camera = PlyElement.describe(np.zeros(3, [("fx", "f8"), ("n", "i2")]), "intrinsic", comments=["of the camera"])
-    face = PlyElement.describe(np.array([([0, 1],)], [("corners", "O")]), "face", val_types={"corners": "i4"})
+def test_rows_are_those_of_the_file_whatever_happens_to_it_later(
+    tmp_path: Path, order: str
+) -> None:
+    """The fingerprint is of the whole file; elements around the rows, with lists too, do not
+    matter.
+    """
+    camera = PlyElement.describe(
+        np.zeros(3, [("fx", "f8"), ("n", "i2")]), "intrinsic", comments=["of the camera"]
+    )
+    face = PlyElement.describe(
+        np.array([([0, 1],)], [("corners", "O")]), "face", val_types={"corners": "i4"}
+    )
     vertex = random_rows(50, [*needed(), "label", "time"], types={"label": "u1", "time": "f8"})
     path = tmp_path / "in.ply"
     write_elements(path, [camera, PlyElement.describe(vertex, "vertex"), face], order)
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
     found = load(str(path), activated="none")
     path.write_bytes(bytes(path.stat().st_size))
-    assert found.path == path and found.fingerprint == digest and found.comments == ("of the camera",)
+    assert (
+        found.path == path and found.fingerprint == digest and found.comments == ("of the camera",)
+    )
     assert found.notes == ("not carried over to outputs: element intrinsic, element face",)
     assert found.vertex.dtype == vertex.dtype and found.vertex.dtype.isnative
     for name in vertex.dtype.names:
@@ -209,9 +273,13 @@ def test_columns_with_the_prefix_of_cloudcompare(tmp_path: Path, order: str, pre
     """All but the position have it; outputs have none."""
     rows = random_rows(9, needed(1))
     plain = load(write_rows(tmp_path / "plain.ply", rows), activated="none")
-    rows.dtype.names = tuple(name if name in "xyz" else f"{prefix}{name}" for name in rows.dtype.names)
+    rows.dtype.names = tuple(
+        name if name in "xyz" else f"{prefix}{name}" for name in rows.dtype.names
+    )
     found = load(write_rows(tmp_path / "in.ply", rows, order), activated="none")
-    assert found.gaussians == plain.gaussians and found.vertex.dtype.names == plain.vertex.dtype.names
+    assert (
+        found.gaussians == plain.gaussians and found.vertex.dtype.names == plain.vertex.dtype.names
+    )
     assert found.notes == (UNPREFIXED,)
     save(tmp_path / "out.ply", found.gaussians, found)
     assert load(tmp_path / "out.ply", activated="none").vertex.dtype == plain.vertex.dtype
@@ -224,7 +292,9 @@ def test_rgb_of_nerfstudio(tmp_path: Path) -> None:
     rows["red"] = [0, 51, 102, 204, 255]
     found = load(write_rows(tmp_path / "in.ply", rows))
     assert found.gaussians.sh_degree == 0 and found.notes == (COLOURED,)
-    np.testing.assert_allclose(0.5 + SH_C0 * found.gaussians.sh0[:, 0, 0], [0, 0.2, 0.4, 0.8, 1], atol=1e-6)
+    np.testing.assert_allclose(
+        0.5 + SH_C0 * found.gaussians.sh0[:, 0, 0], [0, 0.2, 0.4, 0.8, 1], atol=1e-6
+    )
     save(tmp_path / "out.ply", found.gaussians, found)
     again = load(tmp_path / "out.ply")
     assert again.gaussians == found.gaussians and again.vertex.dtype.names == (*needed(), "label")

@@ -1,4 +1,6 @@
-"""Files that are no splats, damaged or hostile: an error that names the file, in one line, and little memory."""
+"""Files that are no splats, damaged or hostile: an error that names the file, in one line, and
+little memory.
+"""
 
 import gzip
 import io
@@ -22,22 +24,37 @@ from safetensors.torch import save_file
 from clod_adapter.errors import ClodError
 from clod_adapter.io.checkpoint import load
 from clod_adapter.io.file_formats import FORMATS, check_readable, write
-from formats import PACKED, change_glb, model, needed, random_rows, with_columns, write_elements, write_rows
+from formats import (
+    PACKED,
+    change_glb,
+    model,
+    needed,
+    random_rows,
+    with_columns,
+    write_elements,
+    write_rows,
+)
 from scenes import gaussians
 
-pytestmark = pytest.mark.usefixtures("without_splat_transform")  # its own errors: test_splat_transform.py
+# its own errors: test_splat_transform.py
+pytestmark = pytest.mark.usefixtures("without_splat_transform")
 KHR = "KHR_gaussian_splatting"
 LFS = b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 248\n"
 Content = bytes | np.ndarray | Callable[[Path], object]
-Table = tuple[tuple[str, Content, str], ...]  # name of the file, what it holds, the message after the name
+# name of the file, what it holds, the message after the name
+Table = tuple[tuple[str, Content, str], ...]
 
 
 def rows(*names: str, count: int = 2, without: tuple[str, ...] = (), **types: str) -> np.ndarray:
-    return random_rows(count, [name for name in (names or needed(1)) if name not in without], types=types)
+    return random_rows(
+        count, [name for name in names or needed(1) if name not in without], types=types
+    )
 
 
 def filled(name: str, value: float) -> np.ndarray:
-    return with_columns(rows(count=3), **{column: value for column in needed(1) if column.startswith(name)})
+    return with_columns(
+        rows(count=3), **{column: value for column in needed(1) if column.startswith(name)}
+    )
 
 
 def with_a_list(path: Path) -> None:
@@ -48,7 +65,8 @@ def with_a_list(path: Path) -> None:
 
 def header(form: str, count: object, before: str = "", after: str = "") -> bytes:
     properties = "".join(f"property float {name}\n" for name in needed())
-    return f"ply\nformat {form} 1.0\n{before}element vertex {count}\n{properties}{after}end_header\n".encode()
+    vertex = f"{before}element vertex {count}\n{properties}{after}"
+    return f"ply\nformat {form} 1.0\n{vertex}end_header\n".encode()
 
 
 def packed(old: bytes, new: bytes) -> bytes:
@@ -69,25 +87,41 @@ def claiming(count: int) -> bytes:
 
 
 def with_record(columns: Any, values: int) -> Callable[[Path], object]:
-    """An .spz of a model of 40 whose record of the dial names these columns and has so many values."""
+    """An .spz of a model of 40 whose record of the dial names these columns and has so many
+    values.
+    """
 
     def make(path: Path) -> None:
         write(path, model(0))
         data, at = gzip.decompress(path.read_bytes()), 16 + 40 * 20 + 12
         size = struct.unpack_from("<I", data, at + 8)[0]
-        text = json.dumps(json.loads(data[at + 12 : at + 12 + size]) | {"columns": columns}).encode()
+        text = json.dumps(
+            json.loads(data[at + 12 : at + 12 + size]) | {"columns": columns}
+        ).encode()
         body = struct.pack("<I", len(text)) + text + bytes(2 * values)
-        path.write_bytes(gzip.compress(data[:at] + struct.pack("<II", 0x434C0001, len(body)) + body))
+        path.write_bytes(
+            gzip.compress(data[:at] + struct.pack("<II", 0x434C0001, len(body)) + body)
+        )
 
     return make
 
 
-def tensors(metadata: dict[str, str] | None = None, **changes: torch.Tensor | None) -> Callable[[Path], object]:
+def tensors(
+    metadata: dict[str, str] | None = None, **changes: torch.Tensor | None
+) -> Callable[[Path], object]:
     """A .safetensors of five Gaussians with some tensors changed or left out."""
-    about = {"clod_adapter": json.dumps({"format": "clod-model", "format_version": 1, "package_version": "0"})}
+    about = {
+        "clod_adapter": json.dumps(
+            {"format": "clod-model", "format_version": 1, "package_version": "0"}
+        )
+    }
 
     def make(path: Path) -> None:
-        kept = {name: tensor for name, tensor in (gaussians(5, 1, 0).tensors() | changes).items() if tensor is not None}
+        kept = {
+            name: tensor
+            for name, tensor in (gaussians(5, 1, 0).tensors() | changes).items()
+            if tensor is not None
+        }
         save_file(kept, path, about if metadata is None else metadata)
 
     return make
@@ -95,9 +129,13 @@ def tensors(metadata: dict[str, str] | None = None, **changes: torch.Tensor | No
 
 def splats(count: int = 12, **changes: Any) -> dict[str, Any]:
     shapes = {
-        "means": (count, 3), "quats": (count, 4), "scales": (count, 3), "opacities": (count,), "sh0": (count, 1, 3),
+        "means": (count, 3),
+        "quats": (count, 4),
+        "scales": (count, 3),
+        "opacities": (count,),
+        "sh0": (count, 1, 3),
         "shN": (count, 15, 3),
-    }  # fmt: skip
+    }
     return {"splats": {name: torch.zeros(shape) for name, shape in shapes.items()} | changes}
 
 
@@ -150,7 +188,7 @@ OTHER_KINDS: Table = (
     ("a.ckpt", b"PK\x03\x04rest", "Nerfstudio.*ns-export gaussian-splat"),
     ("chkpnt30000.pth", b"PK\x03\x04rest", "Inria.*point_cloud.ply"),
     ("meta.json", b"{}", "SOG.*splat-transform"),
-)  # fmt: skip
+)
 OF_PLY: tuple[tuple[Content, str], ...] = (
     (rows("packed_position", "packed_rotation"), "compressed PLY without its element chunk"),
     (rows(*needed(1), "f_offset_0", "f_anchor_feat_0"), "Scaffold-GS"),
@@ -161,34 +199,69 @@ OF_PLY: tuple[tuple[Content, str], ...] = (
     (rows(*needed(1), "f_rest_9", without=("f_rest_4",)), "property f_rest_4 is missing"),
     (rows(x="i4"), "property x is not float"),
     (rows(count=0), "no usable Gaussian"),
-    (filled("x", np.nan), "no usable Gaussian.*of 3 rows"), (filled("rot", 0), "no usable Gaussian.*of 3 rows"),
-    (lambda path: write_elements(path, [PlyElement.describe(rows(), "point")]), "no vertex element.*point"),
+    (filled("x", np.nan), "no usable Gaussian.*of 3 rows"),
+    (filled("rot", 0), "no usable Gaussian.*of 3 rows"),
+    (
+        lambda path: write_elements(path, [PlyElement.describe(rows(), "point")]),
+        "no vertex element.*point",
+    ),
     (with_a_list, "property bones is a list"),
-    (b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty float x\nelement face 999999999\n"
-     b"property list uchar int vertex_indices\nend_header\n", "mesh or a point cloud"),  # without reading its faces
-    *((header(LITTLE, count) + bytes(300), "header is damaged")
-      for count in (-1, "nan", "0x10", "1_0", "9" * 21, "9" * 5000, "2.0", "+3", "")),
-    *((header("ascii", 3) + f"{GOOD}{bad}\n{GOOD}".encode(), "damaged or truncated")
-      for bad in ("1.0 " * 13, "1.0 " * 15, "1.0 " * 13 + "x", "1.0 " * 13 + "\u0661")),
-    (header(LITTLE, 1, f"element face 1\n{LIST}") + bytes(100), "no usable Gaussian"),  # lists before it are read
-    (header("ascii", 1).replace(b"float x", b"float \x1b[2J"), "a name that is not printable ASCII"),
+    (
+        b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty float x\nelement face"
+        b" 999999999\n"
+        # without reading its faces
+        b"property list uchar int vertex_indices\nend_header\n",
+        "mesh or a point cloud",
+    ),
+    *(
+        (header(LITTLE, count) + bytes(300), "header is damaged")
+        for count in (-1, "nan", "0x10", "1_0", "9" * 21, "9" * 5000, "2.0", "+3", "")
+    ),
+    *(
+        (header("ascii", 3) + f"{GOOD}{bad}\n{GOOD}".encode(), "damaged or truncated")
+        for bad in ("1.0 " * 13, "1.0 " * 15, "1.0 " * 13 + "x", "1.0 " * 13 + "\u0661")
+    ),
+    # lists before it are read
+    (header(LITTLE, 1, f"element face 1\n{LIST}") + bytes(100), "no usable Gaussian"),
+    (
+        header("ascii", 1).replace(b"float x", b"float \x1b[2J"),
+        "a name that is not printable ASCII",
+    ),
     (b"ply\nformat ascii 1.0\n" + b"comment x\n" * 200_000 + b"end_header\n", "no end"),
-    *((header(form, count) + b"0 " * 24, rf"is truncated.*claims {count} of vertex.*the file has")
-      for form, count in (("ascii", 1 << 31), (LITTLE, (1 << 64) - 1), (BIG, 10))),
+    *(
+        (header(form, count) + b"0 " * 24, rf"is truncated.*claims {count} of vertex.*the file has")
+        for form, count in (("ascii", 1 << 31), (LITTLE, (1 << 64) - 1), (BIG, 10))
+    ),
     # before the test's time limit, in which no loop counts that far
-    *((header(form, 1, before, after) + body, "")
-      for form, body, kind in (("ascii", GOOD.encode(), "property uchar a\n"), ("ascii", GOOD.encode(), LIST),
-                               (LITTLE, bytes(56), ""), (BIG, bytes(56), LIST))
-      for other in [f"element a {1 << 40}\n{kind}"] for before, after in ((other, ""), ("", other))),
-    (header("ascii", 1) + b"0 " * 13 + b"1" * (1 << 23), "damaged or truncated .a row of more than"),
+    *(
+        (header(form, 1, before, after) + body, "")
+        for form, body, kind in (
+            ("ascii", GOOD.encode(), "property uchar a\n"),
+            ("ascii", GOOD.encode(), LIST),
+            (LITTLE, bytes(56), ""),
+            (BIG, bytes(56), LIST),
+        )
+        for other in [f"element a {1 << 40}\n{kind}"]
+        for before, after in ((other, ""), ("", other))
+    ),
+    (
+        header("ascii", 1) + b"0 " * 13 + b"1" * (1 << 23),
+        "damaged or truncated .a row of more than",
+    ),
     (packed(b"property float max_scale_y", b"property float max_scale_q"), "no max_scale_y"),
-    (packed(b"property uint packed_color", b"property int packed_color"), "no packed_color of type u4"),
+    (
+        packed(b"property uint packed_color", b"property int packed_color"),
+        "no packed_color of type u4",
+    ),
     (packed(b"property uchar f_rest_4", b"property uchar f_rest_9"), "no f_rest_4"),
     (packed(b"property float min_r", b"property list uchar float min_r"), "has a list"),
-    (packed(b"element vertex 300", b"element vertex 299"), "(300 harmonics for 299 Gaussians|damaged)"),
+    (
+        packed(b"element vertex 300", b"element vertex 299"),
+        "(300 harmonics for 299 Gaussians|damaged)",
+    ),
     (packed(b"element chunk 2", b"element chunk 1"), "is damaged: 300 Gaussians need 2 chunks"),
     (packed(b"element vertex 300", b"element vertex 3000000"), "is truncated"),
-)  # fmt: skip
+)
 OF_GLB: tuple[tuple[Callable[[dict[str, Any]], object], str], ...] = (
     (lambda g: g["accessors"][0].update(count=1 << 60), "more than the file"),
     (lambda g: g["accessors"][0].update(count=3), "of different lengths"),
@@ -197,30 +270,48 @@ OF_GLB: tuple[tuple[Callable[[dict[str, Any]], object], str], ...] = (
     (lambda g: g["buffers"][0].update(uri="../secret"), "in another file"),
     (lambda g: g["accessors"][0].update(sparse={}), "sparse"),
     (lambda g: g["meshes"][0]["primitives"][0].pop("extensions"), "so it is a mesh"),
-    (lambda g: g["meshes"][0]["primitives"][0]["extensions"][KHR].update(extensions={"x": {}}), "compressed"),
+    (
+        lambda g: g["meshes"][0]["primitives"][0]["extensions"][KHR].update(extensions={"x": {}}),
+        "compressed",
+    ),
     (lambda g: g["nodes"][0].update(rotation=[0, 1, 0, 0]), "scaled or turned"),
     (lambda g: g["nodes"].append({"children": [0]}), "scaled or turned"),
     (lambda g: g.pop("accessors"), "damaged"),
 )
 OF_SPZ: tuple[tuple[Content, str], ...] = (
-    (gzip.compress(bytes(1 << 26), mtime=0), "unpacks to more"), (claiming(9_999_999), "truncated"),
-    (claiming(1 << 31), "no SPZ file of version"), (claiming(0), "no Gaussians"),
+    (gzip.compress(bytes(1 << 26), mtime=0), "unpacks to more"),
+    (claiming(9_999_999), "truncated"),
+    (claiming(1 << 31), "no SPZ file of version"),
+    (claiming(0), "no Gaussians"),
     (gzip.compress(b"short", mtime=0), "truncated"),
-    *((with_record(columns, values), "its record of sigma_d is damaged") for columns, values in (
-        (["sigma_d", "growth_d"], 40), (["sigma_d"], 80), (["growth_d", "sigma_d"], 80), (7, 40))),
-)  # fmt: skip
+    *(
+        (with_record(columns, values), "its record of sigma_d is damaged")
+        for columns, values in (
+            (["sigma_d", "growth_d"], 40),
+            (["sigma_d"], 80),
+            (["growth_d", "sigma_d"], 80),
+            (7, 40),
+        )
+    ),
+)
 OF_SAFETENSORS = (
-    (tensors(means=torch.ones(4, 3)), "quats has shape"), (tensors(shN=torch.ones(5, 2, 3)), "shN has 2 coefficients"),
+    (tensors(means=torch.ones(4, 3)), "quats has shape"),
+    (tensors(shN=torch.ones(5, 2, 3)), "shN has 2 coefficients"),
     (tensors(quats=torch.ones(5, 4, dtype=torch.int32)), "not of floating-point"),
-    (tensors(quats=None), "has no tensor 'quats'"), (tensors({}), "not a model of clod-adapter"),
-)  # fmt: skip
+    (tensors(quats=None), "has no tensor 'quats'"),
+    (tensors({}), "not a model of clod-adapter"),
+)
 OF_PT = (
-    ([1], "no dictionary 'splats'.*list"), ({"model": 1}, "no dictionary 'splats'.*'model'"),
-    ({"splats": [1]}, "no dictionary 'splats'"), ({"splats": {}}, "no 'means'"),
+    ([1], "no dictionary 'splats'.*list"),
+    ({"model": 1}, "no dictionary 'splats'.*'model'"),
+    ({"splats": [1]}, "no dictionary 'splats'"),
+    ({"splats": {}}, "no 'means'"),
     (splats(shN=None, features=torch.zeros(12, 32)), "no 'shN'; with appearance"),
     (splats(quats=torch.zeros(11, 4)), "quats has shape .11, 4., expected .12, 4."),
-    (splats(means=torch.tensor(1.0)), "shape"), (splats(means=torch.zeros(12, 3).int()), "no plain tensor"),
-    (splats(means=torch.eye(3).to_sparse()), "more than tensors"), (splats(0), "of 0 rows"),
+    (splats(means=torch.tensor(1.0)), "shape"),
+    (splats(means=torch.zeros(12, 3).int()), "no plain tensor"),
+    (splats(means=torch.eye(3).to_sparse()), "more than tensors"),
+    (splats(0), "of 0 rows"),
     (splats() | {"clod_adapter": 3}, "settings are damaged .*not int"),
     (splats() | {"clod_adapter": "[" * 100_000}, "settings are damaged"),
     (splats() | {"clod_adapter": '{"format": "clod-model"}'}, "settings are damaged"),
@@ -231,8 +322,11 @@ OF_PT = (
     (splats(means=torch.zeros(3, 3, device="meta")), "no plain tensor|more than tensors"),
     (splats(means=Call(bytearray, 1 << 33)), "no plain tensor|more than tensors"),
     (splats(means=Call(os.mkdir, "ran")), "more than tensors, and is not unpickled"),
-    (splats(means=Call(eval, "__import__('os').mkdir('ran')")), "more than tensors, and is not unpickled"),
-)  # fmt: skip
+    (
+        splats(means=Call(eval, "__import__('os').mkdir('ran')")),
+        "more than tensors, and is not unpickled",
+    ),
+)
 REFUSED: Table = (
     *OTHER_KINDS,
     *(("in.ply", *each) for each in OF_PLY),
@@ -247,11 +341,16 @@ REFUSED: Table = (
 
 
 @pytest.mark.parametrize("suffix", sorted({Path(name).suffix for name, _, _ in REFUSED}))
-def test_damaged_and_hostile_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str) -> None:
-    """In one printable line. Nothing is allocated for what a file claims, and none of its code runs."""
+def test_damaged_and_hostile_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str
+) -> None:
+    """In one printable line. Nothing is allocated for what a file claims, and none of its code
+    runs.
+    """
     monkeypatch.chdir(tmp_path)
     write_rows(tmp_path / "whole.ply", random_rows(9, needed()), "ascii")
-    load(tmp_path / "whole.ply", activated="none")  # so that nothing is imported while it is measured
+    # so that nothing is imported while it is measured
+    load(tmp_path / "whole.ply", activated="none")
     for name, content, message in REFUSED:
         if Path(name).suffix != suffix:
             continue
@@ -278,9 +377,14 @@ def test_what_is_no_file_of_the_format(tmp_path: Path, suffix: str) -> None:
     for name, content in (("empty", b""), ("pointer", LFS), ("other", b"an unknown format")):
         (tmp_path / f"{name}{suffix}").write_bytes(content)
     for name, message in (
-        ("missing", "cannot be read .No such file"), ("folder", "cannot be read"), ("pipe", "not a regular file"),
-        ("empty", "is empty"), ("pointer", "is a Git LFS pointer"), ("other", ""),
-    ):  # fmt: skip
-        for read in (load,) if name == "other" else (check_readable, load):  # of some kinds splat-transform tells
+        ("missing", "cannot be read .No such file"),
+        ("folder", "cannot be read"),
+        ("pipe", "not a regular file"),
+        ("empty", "is empty"),
+        ("pointer", "is a Git LFS pointer"),
+        ("other", ""),
+    ):
+        # of some kinds splat-transform tells
+        for read in (load,) if name == "other" else (check_readable, load):
             with pytest.raises(ClodError, match=f"{name}{suffix}: .*{message}"):
                 read(tmp_path / f"{name}{suffix}")

@@ -1,4 +1,6 @@
-"""Scenes as ``load_scene`` gives them: COLMAP models, photographs that are missing or distorted, what is held out."""
+"""Scenes as ``load_scene`` gives them: COLMAP models, photographs that are missing or distorted,
+what is held out.
+"""
 
 import importlib
 import math
@@ -51,11 +53,14 @@ def test_scene_round_trips(tmp_path: Path, form: str) -> None:
     loaded = load_scene(str(tmp_path), progress=lambda now: progress.append((now.done, now.total)))
     assert loaded.notes == () and progress == [(k + 1, 10) for k in range(10)]
     assert dict(loaded.left_out) == {
-        "undistortion": "all 10 cameras are pinholes", "scaling": "all 10 photographs are used at full resolution",
-    }  # fmt: skip
+        "undistortion": "all 10 cameras are pinholes",
+        "scaling": "all 10 photographs are used at full resolution",
+    }
     order = sorted(range(10), key=lambda i: names[i])
     assert [view.camera.name for view in loaded.test] == [names[order[0]], names[order[8]]]
-    assert [view.camera.name for view in loaded.train] == [names[i] for i in order if i not in (order[0], order[8])]
+    assert [view.camera.name for view in loaded.train] == [
+        names[i] for i in order if i not in (order[0], order[8])
+    ]
     for view in (*loaded.train, *loaded.test):
         i = names.index(view.camera.name)
         torch.testing.assert_close(view.camera.viewmat, cameras[i].viewmat, atol=1e-6, rtol=0)
@@ -72,7 +77,10 @@ def test_train_and_test_split(tmp_path: Path) -> None:
         loaded = load_scene(tmp_path / str(count), test_every=every)
         assert (len(loaded.train), len(loaded.test)) == (train, count - train)
     (tmp_path / "2" / "images" / max(names)).unlink()
-    for folder, every, message in (("1", 1, "test_every is 1"), ("2", 8, "no photograph to train on")):
+    for folder, every, message in (
+        ("1", 1, "test_every is 1"),
+        ("2", 8, "no photograph to train on"),
+    ):
         with pytest.raises(ClodError, match=message):
             load_scene(tmp_path / folder, test_every=every)
     with pytest.raises(Stopped):
@@ -89,8 +97,12 @@ def test_split_of_the_scene_is_used(tmp_path: Path) -> None:
         (tmp_path / "sparse" / "0" / "test.txt").write_text("\n".join(listed) + "\n")
         loaded, cameras = load_scene(tmp_path), load_cameras(tmp_path, training=True)[0]
         held_out = [view.camera.name for view in loaded.test]
-        assert loaded.notes == (note,) and held_out == (listed[:2] if len(listed) == 3 else [names[0], names[8]])
-        assert [camera.name for camera in cameras] == [name for name in names if name not in held_out]
+        assert loaded.notes == (note,) and held_out == (
+            listed[:2] if len(listed) == 3 else [names[0], names[8]]
+        )
+        assert [camera.name for camera in cameras] == [
+            name for name in names if name not in held_out
+        ]
 
 
 def test_model_and_images_are_found_in_other_folders(tmp_path: Path) -> None:
@@ -145,24 +157,61 @@ write = Path.write_bytes
 @pytest.mark.parametrize(
     ("form", "change", "message"),
     [
-        ("text", lambda at: write(at / "images.txt", b"\n1 nonsense\n"),
-         "images.txt: is truncated or damaged .line 2 is neither an image"),
-        ("text", lambda at: write(at / "cameras.txt", b"2 PINHOLE 40 30 33 33 20 15\n"), "camera 1, .*not in cameras"),
-        ("text", lambda at: write(at / "cameras.txt", b"1 PINHOLE 40 30 33 33 20\n"), "camera 1 has 3 parameters"),
-        ("text", lambda at: write(at / "cameras.txt", b"1 PINHOLE 40 30 %b 33 20 15\n" % (b"1" * 10_000)),
-         "cameras.txt: .*a number of more than 1,000 digits"),
-        ("text", lambda at: write(at / "images.txt", (at / "images.txt").read_bytes().replace(b"sub/b.png", b"a.png")),
-         "has image a.png more than once"),
-        *(("text", lambda at, w=w: write(at / "images.txt", b"1 %b 0 0 0 0 0 0 1 a.png\n" % w), "has no rotation")
-          for w in (b"0", b"nan")),
-        *(("binary", lambda at, lens=lens: model_of(at.parents[1], *lens, **SIZE), f"image 'a.png' has .*{message}")
-          for *lens, message in (
-              ("EQUIRECTANGULAR", [160, 120], "EQUIRECTANGULAR, no perspective camera"),
-              ("OPENCV", [140, 140, 80, 60, math.nan, 0, 0, 0], "not usable"),
-              ("SIMPLE_RADIAL", [-140, 80, 60, 0.1], "not usable"), ("PINHOLE", [0, 140, 80, 60], "not usable"))),
+        (
+            "text",
+            lambda at: write(at / "images.txt", b"\n1 nonsense\n"),
+            "images.txt: is truncated or damaged .line 2 is neither an image",
+        ),
+        (
+            "text",
+            lambda at: write(at / "cameras.txt", b"2 PINHOLE 40 30 33 33 20 15\n"),
+            "camera 1, .*not in cameras",
+        ),
+        (
+            "text",
+            lambda at: write(at / "cameras.txt", b"1 PINHOLE 40 30 33 33 20\n"),
+            "camera 1 has 3 parameters",
+        ),
+        (
+            "text",
+            lambda at: write(
+                at / "cameras.txt", b"1 PINHOLE 40 30 %b 33 20 15\n" % (b"1" * 10_000)
+            ),
+            "cameras.txt: .*a number of more than 1,000 digits",
+        ),
+        (
+            "text",
+            lambda at: write(
+                at / "images.txt", (at / "images.txt").read_bytes().replace(b"sub/b.png", b"a.png")
+            ),
+            "has image a.png more than once",
+        ),
+        *(
+            (
+                "text",
+                lambda at, w=w: write(at / "images.txt", b"1 %b 0 0 0 0 0 0 1 a.png\n" % w),
+                "has no rotation",
+            )
+            for w in (b"0", b"nan")
+        ),
+        *(
+            (
+                "binary",
+                lambda at, lens=lens: model_of(at.parents[1], *lens, **SIZE),
+                f"image 'a.png' has .*{message}",
+            )
+            for *lens, message in (
+                ("EQUIRECTANGULAR", [160, 120], "EQUIRECTANGULAR, no perspective camera"),
+                ("OPENCV", [140, 140, 80, 60, math.nan, 0, 0, 0], "not usable"),
+                ("SIMPLE_RADIAL", [-140, 80, 60, 0.1], "not usable"),
+                ("PINHOLE", [0, 140, 80, 60], "not usable"),
+            )
+        ),
     ],
-)  # fmt: skip
-def test_unusable_models_are_refused(tmp_path: Path, form: str, change: Callable[[Path], Any], message: str) -> None:
+)
+def test_unusable_models_are_refused(
+    tmp_path: Path, form: str, change: Callable[[Path], Any], message: str
+) -> None:
     change(model_of(tmp_path, **PINHOLES, form=form))
     with pytest.raises(ClodError, match=message):
         load_scene(tmp_path)
@@ -170,11 +219,18 @@ def test_unusable_models_are_refused(tmp_path: Path, form: str, change: Callable
 
 def test_text_models_of_other_programs(tmp_path: Path) -> None:
     """Without blank lines or points, with names that have spaces and quaternions of any length."""
-    write_model(tmp_path, [camera(0), camera(1), camera(2)], names := ["a b.png", "c.png", "d  e 2.png"])
+    write_model(
+        tmp_path, [camera(0), camera(1), camera(2)], names := ["a b.png", "c.png", "d  e 2.png"]
+    )
     write_images(tmp_path / "images", names)
     folder = tmp_path / "sparse" / "0"
     pycolmap.Reconstruction(str(folder)).write_text(str(folder))
-    for file in (*folder.glob("*.bin"), folder / "points3D.txt", folder / "rigs.txt", folder / "frames.txt"):
+    for file in (
+        *folder.glob("*.bin"),
+        folder / "points3D.txt",
+        folder / "rigs.txt",
+        folder / "frames.txt",
+    ):
         file.unlink()
     file, header, images = folder / "images.txt", list[str](), list[str]()
     for line in file.read_text().splitlines():
@@ -191,7 +247,9 @@ def test_text_models_of_other_programs(tmp_path: Path) -> None:
             viewmat = camera(names.index(view.camera.name)).viewmat
             torch.testing.assert_close(view.camera.viewmat, viewmat, atol=1e-6, rtol=0)
     file.write_text("\n".join([*header, *images[1:]]))
-    assert load_scene(tmp_path).notes == ("images.txt has 2 images, but its header says 3: it may be incomplete",)
+    assert load_scene(tmp_path).notes == (
+        "images.txt has 2 images, but its header says 3: it may be incomplete",
+    )
 
 
 def test_without_pycolmap_the_error_says_where_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -205,12 +263,18 @@ def test_missing_images_are_noted_or_refused(tmp_path: Path) -> None:
     for name in names[2:11]:
         (tmp_path / "images" / name).unlink()
     loaded = load_scene(tmp_path)
-    missing = "9 of 18 photographs are missing and left out (sub/003.png, sub/004.png, sub/005.png, ...)"
+    missing = (
+        "9 of 18 photographs are missing and left out (sub/003.png, sub/004.png, sub/005.png, ...)"
+    )
     assert loaded.notes == (missing,)
-    assert [view.camera.name for view in loaded.test] == [names[0], names[16]]  # the 8th is missing, the rest stay
+    # the 8th is missing, the rest stay
+    assert [view.camera.name for view in loaded.test] == [names[0], names[16]]
     assert [view.camera.name for view in loaded.train] == [names[1], *names[11:16], names[17]]
     (tmp_path / "images" / names[0]).unlink()
-    text = r"10 of 18 images of the model are missing \(sub/001.png, sub/003.png, sub/004.png, \.\.\.\), more than half"
+    text = (
+        r"10 of 18 images of the model are missing \(sub/001.png, sub/003.png, sub/004.png,"
+        r" \.\.\.\), more than half"
+    )
     with pytest.raises(ClodError, match=text):
         load_scene(tmp_path)
 
@@ -219,7 +283,8 @@ def test_masks_are_noted(tmp_path: Path) -> None:
     write_scene(tmp_path, 2)
     write_images(tmp_path / "masks", ["sub/001.png.png", "sub/002.png.png"])
     note = (
-        f"the masks in {tmp_path / 'masks'} are not used: where the checkpoint is empty under them, put them into the"
+        f"the masks in {tmp_path / 'masks'} are not used: where the checkpoint is empty under them,"
+        " put them into the"
     )
     for folder in (tmp_path, tmp_path / "sparse" / "0"):
         assert load_scene(folder).notes == (f"{note} photographs' alpha channel",)
@@ -241,15 +306,20 @@ def test_smaller_copies_replace_missing_images(tmp_path: Path) -> None:
     torch.testing.assert_close(loaded.test[0].camera.K[:2] * 2, camera(2, focal=30.0).K[:2])
     for file in (tmp_path / "images_2" / "sub").iterdir():
         file.unlink()
-    with pytest.raises(ClodError, match="images: 3 of 3 images of the model"):  # the raw ones are of other cameras
+    # the raw ones are of other cameras
+    with pytest.raises(ClodError, match="images: 3 of 3 images of the model"):
         load_scene(tmp_path)
 
 
 def test_photographs_of_another_suffix_or_case_are_found(tmp_path: Path) -> None:
-    """One for each name: of two that differ in nothing else, or are claimed by two names, none is taken."""
+    """One for each name: of two that differ in nothing else, or are claimed by two names, none is
+    taken.
+    """
     names = ["a.JPG", "b.png", "C/c.png", "d.png", "d.jpg", "e.png", "f.png"]
     write_model(tmp_path, [camera(i) for i in range(7)], names)
-    write_images(tmp_path / "images", ["A.png", "b.PNG", "C/c.tif", "d.webp", "e.jpg", "e.bmp", "f.png"])
+    write_images(
+        tmp_path / "images", ["A.png", "b.PNG", "C/c.tif", "d.webp", "e.jpg", "e.bmp", "f.png"]
+    )
     loaded = load_scene(tmp_path)
     found = sorted([*loaded.train, *loaded.test], key=lambda view: view.camera.name)
     assert [view.camera.name for view in found] == ["C/c.png", "a.JPG", "b.png", "f.png"]
@@ -264,7 +334,9 @@ def test_photographs_of_another_suffix_or_case_are_found(tmp_path: Path) -> None
 def test_wide_images_are_scaled_with_their_intrinsics(tmp_path: Path) -> None:
     write_scene(tmp_path, 3)
     loaded = load_scene(tmp_path, max_width=15)
-    assert loaded.notes == ("3 of 3 images scaled from 40x30 to 15x11 (Pillow bicubic, as in Inria's code)",)
+    assert loaded.notes == (
+        "3 of 3 images scaled from 40x30 to 15x11 (Pillow bicubic, as in Inria's code)",
+    )
     view = loaded.train[0]
     assert tuple(view.image.shape) == (11, 15, 3) and view.camera.name == "sub/002.png"
     scale = torch.tensor([[15 / 40], [11 / 30], [1.0]])
@@ -278,12 +350,16 @@ def capture_of(folder: Path, kind: str, params: list[float]) -> Path:
     """A scene of one photograph, of ``seen``, by this lens."""
     model_of(folder, kind, params, **SIZE)
     (folder / "images").mkdir()
-    Image.fromarray(seen(pycolmap.Camera(model=kind, params=params, **SIZE))).save(folder / "images" / "a.png")
+    Image.fromarray(seen(pycolmap.Camera(model=kind, params=params, **SIZE))).save(
+        folder / "images" / "a.png"
+    )
     return folder
 
 
 def ideal(view: View, across: float = 0.0, down: float = 0.0) -> np.ndarray:
-    """What the pinhole camera of the view would have seen, or one whose axis is these pixels beside."""
+    """What the pinhole camera of the view would have seen, or one whose axis is these pixels
+    beside.
+    """
     K = view.camera.K.double().numpy()
     params = [K[0, 0], K[1, 1], K[0, 2] + across, K[1, 2] + down]
     size = {"width": view.camera.width, "height": view.camera.height}
@@ -291,11 +367,16 @@ def ideal(view: View, across: float = 0.0, down: float = 0.0) -> np.ndarray:
 
 
 @pytest.mark.parametrize("kind", LENSES)
-def test_undistorted_image_is_that_of_the_pinhole_camera(tmp_path: Path, cache: Path, kind: str) -> None:
+def test_undistorted_image_is_that_of_the_pinhole_camera(
+    tmp_path: Path, cache: Path, kind: str
+) -> None:
     loaded = load_scene(capture_of(tmp_path / "scene", kind, LENSES[kind]))
     view = loaded.train[0]
     right = psnr_of(view.image.numpy(), ideal(view))
-    shifted = [psnr_of(view.image.numpy(), ideal(view, *by)) for by in ((0.1, 0), (-0.1, 0), (0, 0.1), (0, -0.1))]
+    shifted = [
+        psnr_of(view.image.numpy(), ideal(view, *by))
+        for by in ((0.1, 0), (-0.1, 0), (0, 0.1), (0, -0.1))
+    ]
     assert right > 45 and right > max(shifted), (right, shifted)
     assert "undistortion" not in dict(loaded.left_out)
     folder = next((cache / "clod-adapter" / "undistorted").iterdir())
@@ -303,7 +384,9 @@ def test_undistorted_image_is_that_of_the_pinhole_camera(tmp_path: Path, cache: 
     assert loaded.notes == (f"1 of 1 images undistorted {into}",)
 
 
-def test_cached_images_are_reused(tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cached_images_are_reused(
+    tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """While the photograph, its camera and the width are the same; a damaged one is made again."""
     scene = capture_of(tmp_path / "scene", "OPENCV", LENSES["OPENCV"])
     first = load_scene(scene, max_width=100)
@@ -312,21 +395,27 @@ def test_cached_images_are_reused(tmp_path: Path, cache: Path, monkeypatch: pyte
         info, changed = PngInfo(), Image.new("RGB", kept.size, (1, 2, 3))
         info.add_text("clod-adapter", kept.info["clod-adapter"])
     changed.save(file, pnginfo=info)
-    assert load_scene(scene, max_width=100).train[0].image.unique().tolist() == [1, 2, 3]  # the cached one is read
+    # the cached one is read
+    assert load_scene(scene, max_width=100).train[0].image.unique().tolist() == [1, 2, 3]
     file.write_bytes(file.read_bytes()[:-50])
     again = load_scene(scene, max_width=100)
-    assert again.train[0].image.equal(first.train[0].image) and again.train[0].camera.K.equal(first.train[0].camera.K)
+    assert again.train[0].image.equal(first.train[0].image) and again.train[0].camera.K.equal(
+        first.train[0].camera.K
+    )
     assert again.notes == first.notes and len(list(cache.rglob("*.png"))) == 1
     load_scene(scene, max_width=90)
     os.utime(scene / "images" / "a.png", ns=(1, 1))
     load_scene(scene, max_width=100)
-    model_of(tmp_path / "other", "OPENCV", [*LENSES["OPENCV"][:4], 0.01, 0, 0, 0], **SIZE)  # calibrated again
+    # calibrated again
+    model_of(tmp_path / "other", "OPENCV", [*LENSES["OPENCV"][:4], 0.01, 0, 0, 0], **SIZE)
     shutil.copytree(tmp_path / "other" / "sparse", scene / "sparse", dirs_exist_ok=True)
     load_scene(scene, max_width=100)
     assert len(list(cache.rglob("*.png"))) == 4
 
 
-def test_cache_folder_must_be_writable(tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cache_folder_must_be_writable(
+    tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     scene = capture_of(tmp_path / "scene", "OPENCV", LENSES["OPENCV"])
     (scene / "images" / "a.png").write_bytes(b"not read")
     message = "undistorted photographs cannot be kept there .*set XDG_CACHE_HOME"
@@ -340,7 +429,9 @@ def test_cache_folder_must_be_writable(tmp_path: Path, cache: Path, monkeypatch:
     monkeypatch.delenv("XDG_CACHE_HOME")
     monkeypatch.delenv("HOME", raising=False)
     monkeypatch.setattr(os, "getuid", lambda: 2**31 - 5)  # nobody's
-    with pytest.raises(ClodError, match="no home folder to keep undistorted photographs in; set XDG_CACHE_HOME"):
+    with pytest.raises(
+        ClodError, match="no home folder to keep undistorted photographs in; set XDG_CACHE_HOME"
+    ):
         load_scene(scene)
 
 
@@ -348,10 +439,18 @@ def test_cameras_equal_those_of_load_scene(capture: Any) -> None:
     scene = load_scene(capture.scene, origin=(origin := (10.0, -20.0, 30.0)))
     views = sorted([*scene.train, *scene.test], key=lambda view: view.camera.name)
     cameras, notes = load_cameras(capture.scene, origin)
-    assert notes == [] and [camera.name for camera in cameras] == [view.camera.name for view in views]
+    assert notes == [] and [camera.name for camera in cameras] == [
+        view.camera.name for view in views
+    ]
     for found, view in zip(cameras, views, strict=True):
-        assert torch.equal(found.viewmat, view.camera.viewmat) and torch.equal(found.K, view.camera.K)
-        assert (found.width, found.height, found.near) == (view.camera.width, view.camera.height, view.camera.near)
+        assert torch.equal(found.viewmat, view.camera.viewmat) and torch.equal(
+            found.K, view.camera.K
+        )
+        assert (found.width, found.height, found.near) == (
+            view.camera.width,
+            view.camera.height,
+            view.camera.near,
+        )
     training = [found.name for found in load_cameras(capture.scene, training=True)[0]]
     assert training == [view.camera.name for view in scene.train] and len(training) == 8
 
@@ -369,7 +468,9 @@ def test_files_of_a_colmap_scene(tmp_path: Path) -> None:
     (tmp_path / "dataparser_transforms.json").write_text("{}")
     files = {str(path.relative_to(tmp_path)) for path in (tmp_path / "sparse" / "0").iterdir()}
     photographs = {f"images/sub/{k:03}.png" for k in (1, 2, 3)} | {"images_2/sub/001.png"}
-    assert len(files) >= 3 and there(tmp_path) == files | photographs | {"dataparser_transforms.json"}
+    assert len(files) >= 3 and there(tmp_path) == files | photographs | {
+        "dataparser_transforms.json"
+    }
     for name in ("images", "images_2"):  # other folders of inputs do not stand for those
         (tmp_path / name).rename(tmp_path / name.replace("images", "cam"))
     (tmp_path / "masks").mkdir()

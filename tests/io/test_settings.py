@@ -1,5 +1,6 @@
-"""Settings in files: one reader, which every format and the adapter use; in a PLY comments, and columns for tools that
-drop comments; the screen-space filter as other programs state it."""
+"""Settings in files: one reader, which every format and the adapter use; in a PLY comments, and
+columns for tools that drop comments; the screen-space filter as other programs state it.
+"""
 
 import gzip
 import json
@@ -50,24 +51,38 @@ def written(path: Path, screen_filter: ScreenFilter = CLASSIC) -> Path:
     return path
 
 
-def read(path: Path) -> tuple[AttenuationConfig | None, ScreenFilter, Calibration | None, list[str]]:
+def read(
+    path: Path,
+) -> tuple[AttenuationConfig | None, ScreenFilter, Calibration | None, list[str]]:
     if path.name.startswith("adapter"):
         adapter = load_adapter(path)
         return adapter.attenuation, adapter.screen_filter, adapter.calibration, list(adapter.notes)
     base = load(path)
-    notes = [note for note in base.notes if "opacity = +inf" not in note and "quantised" not in note]
+    notes = [
+        note for note in base.notes if "opacity = +inf" not in note and "quantised" not in note
+    ]
     return base.gaussians.attenuation, base.gaussians.screen_filter, base.calibration, notes
 
 
-@pytest.mark.parametrize("kind", ["a.ply", "a.glb", "a.spz", "a.safetensors", "a.pt", "adapter.safetensors"])
+@pytest.mark.parametrize(
+    "kind", ["a.ply", "a.glb", "a.spz", "a.safetensors", "a.pt", "adapter.safetensors"]
+)
 def test_every_format_uses_the_reader(tmp_path: Path, kind: str) -> None:
     path, ply = tmp_path / kind, kind == "a.ply"
     for screen_filter in (CLASSIC, ScreenFilter(variance=0.123456789, compensate=True)):
         assert read(written(path, screen_filter)) == (ATTENUATION, screen_filter, CALIBRATION, [])
     damage = f"{kind}: its settings are damaged .*MESSAGE.*; restore them, or export"
-    with pytest.raises(ClodError, match=damage.replace("MESSAGE", "compensate is .*, it must be true or false")):
-        read(change_setting(path, *(("0.123456789", "True", "Yess") if ply else ("compensate", "true", "7e+2"))))
-    with pytest.raises(ClodError, match=damage.replace("MESSAGE", "reference_distance is -3.21, it must be")):
+    with pytest.raises(
+        ClodError, match=damage.replace("MESSAGE", "compensate is .*, it must be true or false")
+    ):
+        read(
+            change_setting(
+                path, *(("0.123456789", "True", "Yess") if ply else ("compensate", "true", "7e+2"))
+            )
+        )
+    with pytest.raises(
+        ClodError, match=damage.replace("MESSAGE", "reference_distance is -3.21, it must be")
+    ):
         read(change_setting(written(path), "reference_distance", "3.217", "-3.21"))
     notes = ["settings unknown to this version ignored: 'max_sx'"]
     notes += ["settings that are missing have their defaults: max_sv"]
@@ -75,14 +90,25 @@ def test_every_format_uses_the_reader(tmp_path: Path, kind: str) -> None:
     assert read(change_setting(written(path), "", "max_sv", "max_sx")) == wanted
     total = "calibrated_with" if ply else "total"
     *found, (note,) = read(change_setting(written(path), total, "40", "-4"))
-    assert found == [ATTENUATION, CLASSIC, None] and re.search("unusable and ignored.*not positive", note)
+    assert found == [ATTENUATION, CLASSIC, None] and re.search(
+        "unusable and ignored.*not positive", note
+    )
     if kind != "adapter.safetensors":
         *found, (note,) = read(change_setting(written(path), total, "40", "41"))
-        assert found[2] is None and note == "the calibration is of 41 Gaussians and ignored, these are 40"
+        assert (
+            found[2] is None
+            and note == "the calibration is of 41 Gaussians and ignored, these are 40"
+        )
     if not ply:
         with pytest.raises(ClodError, match=f"{kind}: its format 9 is too new.*upgrade"):
-            read(change_setting(written(path), "format_version", "3" if "adapter" in kind else "1", "9"))
-        old, new = ("clod-adapter", "clod-strange") if "adapter" in kind else ("clod-model", "clod-other")
+            read(
+                change_setting(
+                    written(path), "format_version", "3" if "adapter" in kind else "1", "9"
+                )
+            )
+        old, new = (
+            ("clod-adapter", "clod-strange") if "adapter" in kind else ("clod-model", "clod-other")
+        )
         with pytest.raises(ClodError, match=f"{kind}: is not an? .*'{new}'"):
             read(change_setting(written(path), "", old, new))
 
@@ -94,11 +120,17 @@ def described(path: Path, *comments: str) -> Path:
 
 def test_damaged_settings_are_refused(tmp_path: Path) -> None:
     for comment, message in (
-        ("max_sv banana", "could not convert string to float: 'banana'"), ("form theirs", "form is theirs, it must be"),
-        ("max_sv 0.4", "max_sv is 0.4, it must be"), ("scene_distance nan", "scene_distance is nan"),
-        ("screen_filter 0.3", "no 'compensate'"), ("screen_filter -1 True", "variance is -1.0, it must be between"),
-    ):  # fmt: skip
-        with pytest.raises(ClodError, match=f"a.ply: its settings are damaged .*{message}.*; restore them, or export"):
+        ("max_sv banana", "could not convert string to float: 'banana'"),
+        ("form theirs", "form is theirs, it must be"),
+        ("max_sv 0.4", "max_sv is 0.4, it must be"),
+        ("scene_distance nan", "scene_distance is nan"),
+        ("screen_filter 0.3", "no 'compensate'"),
+        ("screen_filter -1 True", "variance is -1.0, it must be between"),
+    ):
+        with pytest.raises(
+            ClodError,
+            match=f"a.ply: its settings are damaged .*{message}.*; restore them, or export",
+        ):
             load(described(tmp_path / "a.ply", "max_sv 5", comment))
 
 
@@ -116,12 +148,16 @@ def test_damaged_settings_are_refused(tmp_path: Path) -> None:
 def test_a_calibration_of_absurd_numbers_is_ignored(tmp_path: Path, old: str, new: str) -> None:
     """With a note; nothing is rendered in its size."""
     places = (Viewpoint(1, 0, -5, 1, 0, 0, 1, 0, -1, 0, 0.7),)
-    write(tmp_path / "a.ply", model(0), Metadata(calibration=replace(CALIBRATION, viewpoints=places)))
+    write(
+        tmp_path / "a.ply", model(0), Metadata(calibration=replace(CALIBRATION, viewpoints=places))
+    )
     data = (tmp_path / "a.ply").read_bytes()
     assert data.count(old.encode()) == 1
     (tmp_path / "a.ply").write_bytes(data.replace(old.encode(), new.encode()))
     found = load(tmp_path / "a.ply")
-    assert found.calibration is None and any("calibration is unusable and ignored" in note for note in found.notes)
+    assert found.calibration is None and any(
+        "calibration is unusable and ignored" in note for note in found.notes
+    )
 
 
 def with_a_cut(path: Path) -> Path:
@@ -134,25 +170,44 @@ def with_a_cut(path: Path) -> Path:
 
 def test_a_dial_of_the_earlier_form_is_refused(tmp_path: Path) -> None:
     """By a comment, by a column where comments were dropped, and by JSON."""
-    made: list[Callable[[], Path]] = [partial(described, tmp_path / "a.ply", "tau 0.02", "max_sv 5")]
-    made += [partial(with_a_cut, tmp_path / name) for name in ("a.safetensors", "adapter.safetensors")]
+    made: list[Callable[[], Path]] = [
+        partial(described, tmp_path / "a.ply", "tau 0.02", "max_sv 5")
+    ]
+    made += [
+        partial(with_a_cut, tmp_path / name) for name in ("a.safetensors", "adapter.safetensors")
+    ]
     for name, value in {"tau": 0.01, "eps": 1e-7, "hard_cut": 1, "max": 1}.items():
-        made.append(partial(without_comments, written(tmp_path / "b.ply"), **{f"clod_{name}": value}))
+        made.append(
+            partial(without_comments, written(tmp_path / "b.ply"), **{f"clod_{name}": value})
+        )
     for make in made:
         path = make()
-        with pytest.raises(ClodError, match=f"^{path}: its dial is of an earlier form.*; adapt its checkpoint again"):
+        with pytest.raises(
+            ClodError,
+            match=f"^{path}: its dial is of an earlier form.*; adapt its checkpoint again",
+        ):
             read(path)
 
 
-@pytest.mark.parametrize("screen_filter", [*FILTERS.values(), ScreenFilter(variance=0.123, compensate=True)], ids=str)
-def test_columns_and_the_flag_of_an_spz_store_the_filter(tmp_path: Path, screen_filter: ScreenFilter) -> None:
+@pytest.mark.parametrize(
+    "screen_filter", [*FILTERS.values(), ScreenFilter(variance=0.123, compensate=True)], ids=str
+)
+def test_columns_and_the_flag_of_an_spz_store_the_filter(
+    tmp_path: Path, screen_filter: ScreenFilter
+) -> None:
     """In a PLY with a dial; a plain one has no columns but those of Inria's layout."""
     write(tmp_path / "a.ply", model(1).replace(screen_filter=screen_filter))
     found = load(without_comments(tmp_path / "a.ply"))
-    assert found.gaussians.screen_filter == screen_filter and found.filter_known and found.comments == ()
+    assert (
+        found.gaussians.screen_filter == screen_filter
+        and found.filter_known
+        and found.comments == ()
+    )
     plain = detach(found.gaussians)
     write(tmp_path / "b.ply", plain)
-    assert not any(name.startswith("clod_") for name in load(tmp_path / "b.ply").vertex.dtype.names or ())
+    assert not any(
+        name.startswith("clod_") for name in load(tmp_path / "b.ply").vertex.dtype.names or ()
+    )
     write(tmp_path / "a.spz", plain)
     data = bytearray(gzip.decompress((tmp_path / "a.spz").read_bytes()))
     assert data[14] & 1 == screen_filter.compensate
@@ -168,9 +223,15 @@ def test_columns_of_other_programs_and_damaged_columns(tmp_path: Path) -> None:
     assert found.gaussians.screen_filter == FILTERS["mip"] and not found.filter_known
     write(tmp_path / "a.ply", model(1))
     for columns, message in (
-        ({"clod_screen_variance": -1.0}, r"rewritten.ply: its settings are damaged \(variance is -1.0"),
+        (
+            {"clod_screen_variance": -1.0},
+            r"rewritten.ply: its settings are damaged \(variance is -1.0",
+        ),
         ({"clod_reference_distance": np.nan}, "clod_reference_distance"),
-        ({"clod_paper": np.arange(40) % 2}, "property clod_paper must be one value for all rows and has several"),
+        (
+            {"clod_paper": np.arange(40) % 2},
+            "property clod_paper must be one value for all rows and has several",
+        ),
     ):
         with pytest.raises(ClodError, match=message):
             load(without_comments(tmp_path / "a.ply", **columns))
@@ -180,10 +241,14 @@ def test_comments_of_other_programs(tmp_path: Path) -> None:
     """Brush, whose filter has 0.1 px^2, splat-transform and Postshot; outputs contradict none."""
     for comments, name in (
         (("SplatRenderMode: default", "antialiased 0", "not antialiased 1"), "off"),
-        (("Exported from Brush", "SplatRenderMode: mip"), "mip"), (("x", "SplatRenderMode: mip"), "on"),
+        (("Exported from Brush", "SplatRenderMode: mip"), "mip"),
+        (("x", "SplatRenderMode: mip"), "on"),
         (("x", "antialiased 1"), "on"),
-    ):  # fmt: skip
-        found = load(write_rows(tmp_path / "a.ply", random_rows(40, needed()), comments=comments), activated="none")
+    ):
+        found = load(
+            write_rows(tmp_path / "a.ply", random_rows(40, needed()), comments=comments),
+            activated="none",
+        )
         assert found.gaussians.screen_filter == FILTERS[name] and not found.filter_known
         for other in FILTERS.values():
             save(tmp_path / "b.ply", found.gaussians.replace(screen_filter=other), found)
@@ -195,9 +260,11 @@ def test_comments_of_other_programs(tmp_path: Path) -> None:
 
 USUAL = AttenuationConfig(reference_distance=3.0)
 EACH = {
-    "usual": USUAL, "unit": replace(USUAL, scene_distance=7.0), "no reference": AttenuationConfig(max_sv=2.0),
+    "usual": USUAL,
+    "unit": replace(USUAL, scene_distance=7.0),
+    "no reference": AttenuationConfig(max_sv=2.0),
     "paper": AttenuationConfig(form="paper", reference_distance=0.123456789),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("growth", [False, True])
@@ -213,16 +280,23 @@ def test_dial_survives_a_rewrite_without_comments(tmp_path: Path, name: str, gro
     path = without_comments(tmp_path / "a.ply")
     again, wanted = load(path).gaussians, in_world_units(g)
     assert again.attenuation is not None and wanted.attenuation is not None
-    assert again == wanted.replace(attenuation=again.attenuation) and again.attenuation.form == config.form
+    assert (
+        again == wanted.replace(attenuation=again.attenuation)
+        and again.attenuation.form == config.form
+    )
     reference = wanted.attenuation.reference_distance if growth else 0
     assert again.attenuation.reference_distance == pytest.approx(reference, rel=1e-6)
     found = inspect(path)
     assert found.splat is not None and found.splat.dial is not None and found.splat.extra == ()
-    assert growth or name != "paper" or any("read from columns: form" in note for note in found.notes)
+    assert (
+        growth or name != "paper" or any("read from columns: form" in note for note in found.notes)
+    )
 
 
 def test_file_without_settings_has_a_note(tmp_path: Path) -> None:
-    """The file keeps six tenths at s = 1 from its reference distance; sigma_d is multiplied by ``factor``."""
+    """The file keeps six tenths at s = 1 from its reference distance; sigma_d is multiplied by
+    ``factor``.
+    """
     for factor, begin, parts in (
         (1.0, "its dial is not", ["world units: keeps 60% at s = 1"]),
         (0.05, "warning: ", ["keeps 0% at s = 1", "likely not what was adapted"]),
@@ -256,5 +330,9 @@ def test_columns_that_change_the_picture(tmp_path: Path, names: list[str], metho
     splats = to_gsplat(gaussians(5, 0, 0)) | {name: torch.zeros(5) for name in names}
     torch.save({"step": 1, "splats": splats}, tmp_path / "a.pt")
     for path in (write_rows(tmp_path / "a.ply", rows), tmp_path / "a.pt"):
-        found = [note for note in load(path, activated="none").notes if note.startswith("warning: ")]
-        assert len(found) == bool(method) and all(method in note and names[0] in note for note in found)
+        found = [
+            note for note in load(path, activated="none").notes if note.startswith("warning: ")
+        ]
+        assert len(found) == bool(method) and all(
+            method in note and names[0] in note for note in found
+        )

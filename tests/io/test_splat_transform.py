@@ -1,4 +1,6 @@
-"""Finding and running splat-transform, with substitutes that fail in every way, and reading what it converts."""
+"""Finding and running splat-transform, with substitutes that fail in every way, and reading what it
+converts.
+"""
 
 import shlex
 import sys
@@ -17,12 +19,17 @@ from scenes import gaussians
 
 BEGIN = "import os, sys, time\nwords = sys.argv[1:]\nsys.stdout.reconfigure(encoding='utf-8')"
 # What it answers to questions about itself, before it runs.
-ANSWERS = "if '--version' in words or '--list-gpus' in words: sys.exit(print('splat-transform v3.7.2 (abc)'))"
+ANSWERS = (
+    "if '--version' in words or '--list-gpus' in words: sys.exit(print('splat-transform v3.7.2"
+    " (abc)'))"
+)
 
 
 @pytest.fixture
 def tool(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
-    """Makes a substitute that runs these lines of Python with ``words``; the environment names it."""
+    """Makes a substitute that runs these lines of Python with ``words``; the environment names
+    it.
+    """
 
     def make(*lines: str) -> None:
         script = tmp_path / "with space" / "tool.py"
@@ -42,7 +49,10 @@ def test_find(tool: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Non
         ("print('splat-transform v2.7.1')", "splat-transform is 2.7.1, 3.7 or newer is needed; "),
         ("print('splat-transform v3.6.9')", "is 3.6.9, 3.7 or newer"),
         ("print('something v9.9.9')", "does not run as splat-transform; it needs Node 22; "),
-        ("sys.exit('SyntaxError: in an old Node')", "does not run as splat-transform; it needs Node 22; "),
+        (
+            "sys.exit('SyntaxError: in an old Node')",
+            "does not run as splat-transform; it needs Node 22; ",
+        ),
     ):
         tool(line)
         with pytest.raises(ClodError) as error:
@@ -51,7 +61,10 @@ def test_find(tool: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Non
     monkeypatch.setenv("PATH", str(tmp_path))
     for named, message in (
         ("", "^splat-transform is not installed; in a folder of its own: npm install"),
-        ("nowhere/tool -g 0", "^nowhere/tool, which CLOD_SPLAT_TRANSFORM names, is not installed; "),
+        (
+            "nowhere/tool -g 0",
+            "^nowhere/tool, which CLOD_SPLAT_TRANSFORM names, is not installed; ",
+        ),
         ("a 'b", "which is no command"),
     ):
         monkeypatch.setenv(VARIABLE, named)
@@ -68,7 +81,11 @@ def test_run(tmp_path: Path, tool: Any) -> None:
     assert len(ticks) > 1 and ticks == sorted(ticks) and ticks[-1] <= seconds
     replace(found, gpu=True).run(Path("-a.ply"), out, timeout=60)
     assert out.read_text() == f"-w {Path.cwd() / '-a.ply'}"
-    log = ["print('splat-transform v3.7.0')", "print('  \\u2717 Error: no room')", "print('    at f (x.mjs:1)')"]
+    log = [
+        "print('splat-transform v3.7.0')",
+        "print('  \\u2717 Error: no room')",
+        "print('    at f (x.mjs:1)')",
+    ]
     for lines, message in (
         ([*log, "print('\\u2717 failed in 0.1s')", "sys.exit(1)"], "Error: no room"),
         (["sys.stderr.write('first\\nlast\\n')", "sys.exit(3)"], "last"),
@@ -83,7 +100,11 @@ def test_converted_files(tmp_path: Path, tool: Any, monkeypatch: pytest.MonkeyPa
     was = gaussians(5, 1, 0)
     save(tmp_path / "plain.ply", was)
     seen, plain = repr(str(tmp_path / "seen")), repr(str(tmp_path / "plain.ply"))
-    tool(ANSWERS, f"open({seen}, 'w').write(' '.join(words))", f"import shutil; shutil.copy({plain}, words[-1])")
+    tool(
+        ANSWERS,
+        f"open({seen}, 'w').write(' '.join(words))",
+        f"import shutil; shutil.copy({plain}, words[-1])",
+    )
     for name in ("a.KSPLAT", "a.spz"):
         path = tmp_path / name
         path.write_bytes(b"NGSP, if it is an SPZ: of version 4")
@@ -99,5 +120,7 @@ def test_converted_files(tmp_path: Path, tool: Any, monkeypatch: pytest.MonkeyPa
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.delenv(VARIABLE)
     for read in (check_readable, load):
-        with pytest.raises(ClodError, match="a.sog: .*npm install node@22 @playcanvas/splat-transform"):
+        with pytest.raises(
+            ClodError, match="a.sog: .*npm install node@22 @playcanvas/splat-transform"
+        ):
             read(tmp_path / "a.sog")

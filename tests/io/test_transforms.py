@@ -1,4 +1,6 @@
-"""Scenes of nerfstudio, instant-ngp and Blender; and nerfstudio's frames, made here as its source makes them."""
+"""Scenes of nerfstudio, instant-ngp and Blender; and nerfstudio's frames, made here as its source
+makes them.
+"""
 
 import json
 import math
@@ -19,7 +21,16 @@ from clod_adapter.errors import ClodError
 from clod_adapter.io.scene.folder import UNUSED, scene_files
 from clod_adapter.io.scene.load import load_cameras, load_scene
 from models import write_model
-from photographs import INTRINSICS, camera, model_of, pixels, pose, to_world, write_frames, write_images
+from photographs import (
+    INTRINSICS,
+    camera,
+    model_of,
+    pixels,
+    pose,
+    to_world,
+    write_frames,
+    write_images,
+)
 
 
 def frame(i: int, **rest: Any) -> dict[str, Any]:
@@ -27,9 +38,20 @@ def frame(i: int, **rest: Any) -> dict[str, Any]:
 
 
 def test_nerfstudio_file(tmp_path: Path) -> None:
-    frames = [frame(i) for i in reversed(range(10))]  # sorted by name, whatever the order in the file
+    # sorted by name, whatever the order in the file
+    frames = [frame(i) for i in reversed(range(10))]
     frames[0]["fl_x"] = 33.0  # its own camera
-    write_frames(tmp_path, frames, camera_model="OPENCV", k1=0, k2=0, p1=0, p2=0, ply_file_path="no.ply", **INTRINSICS)
+    write_frames(
+        tmp_path,
+        frames,
+        camera_model="OPENCV",
+        k1=0,
+        k2=0,
+        p1=0,
+        p2=0,
+        ply_file_path="no.ply",
+        **INTRINSICS,
+    )
     write_images(tmp_path, [f"images/{i:03d}.png" for i in range(10)])
     loaded = load_scene(tmp_path)
     assert loaded.notes == ()
@@ -44,25 +66,37 @@ def test_nerfstudio_file(tmp_path: Path) -> None:
 
 
 def test_blender_files(tmp_path: Path) -> None:
-    """Names without an extension, a field of view and no size, and files for training and testing."""
+    """Names without an extension, a field of view and no size, and files for training and
+    testing.
+    """
     angle = 2 * math.atan(20 / 50)
     for split, count in (("train", 3), ("test", 2), ("val", 1)):
         names = [f"./{split}/r_{i}" for i in range(count)]
-        frames = [{"file_path": name, "rotation": 0.01, "transform_matrix": to_world(2)} for name in names]
+        frames = [
+            {"file_path": name, "rotation": 0.01, "transform_matrix": to_world(2)} for name in names
+        ]
         write_frames(tmp_path, frames, f"transforms_{split}.json", camera_angle_x=angle)
         write_images(tmp_path, [f"{name}.png" for name in names])
     loaded = load_scene(tmp_path)
-    assert [view.camera.name for view in loaded.train] == ["train/r_0.png", "train/r_1.png", "train/r_2.png"]
+    assert [view.camera.name for view in loaded.train] == [
+        "train/r_0.png",
+        "train/r_1.png",
+        "train/r_2.png",
+    ]
     assert [view.camera.name for view in loaded.test] == ["test/r_0.png", "test/r_1.png"]
     assert loaded.notes == ("held out are the photographs of transforms_test.json",)
-    torch.testing.assert_close(loaded.train[0].camera.K, torch.tensor([[50.0, 0, 20], [0, 50, 15], [0, 0, 1]]))
+    torch.testing.assert_close(
+        loaded.train[0].camera.K, torch.tensor([[50.0, 0, 20], [0, 50, 15], [0, 0, 1]])
+    )
     (tmp_path / "transforms_test.json").unlink()
     loaded = load_scene(tmp_path)
     assert ([view.camera.name for view in loaded.test], len(loaded.train)) == (["train/r_0.png"], 2)
 
 
 def test_lists_of_nerfstudio_are_its_split(tmp_path: Path) -> None:
-    """What it does not train on is held out, in a list or in none; paths without an extension as in the frames."""
+    """What it does not train on is held out, in a list or in none; paths without an extension as in
+    the frames.
+    """
     names = [f"./images/{i}" for i in range(6)]
     frames = [{"file_path": name, "transform_matrix": to_world(i)} for i, name in enumerate(names)]
     write_images(tmp_path, [f"{name}.png" for name in names])
@@ -71,17 +105,26 @@ def test_lists_of_nerfstudio_are_its_split(tmp_path: Path) -> None:
         write_frames(tmp_path, frames, **INTRINSICS, **lists)
         loaded = load_scene(tmp_path)
         assert [view.camera.name for view in loaded.test] == [f"images/{i}.png" for i in want]
-        assert loaded.notes == ("held out are 2 photographs, those of the lists of transforms.json",)
+        assert loaded.notes == (
+            "held out are 2 photographs, those of the lists of transforms.json",
+        )
     write_frames(tmp_path, frames, **INTRINSICS, test_filenames=[3])
     with pytest.raises(ClodError, match="transforms.json: test_filenames is no list of file names"):
         load_scene(tmp_path)
 
 
 def test_instant_ngp_file(tmp_path: Path) -> None:
-    """Angles in place of focal lengths; one focal length for both axes; JPEGs under names without an extension."""
+    """Angles in place of focal lengths; one focal length for both axes; JPEGs under names without
+    an extension.
+    """
     angles = {"camera_angle_x": 1.0, "camera_angle_y": 0.8}
     one = write_frames(tmp_path / "one", [frame(0)], aabb_scale=16, w=40, h=30, **angles)
-    two = write_frames(tmp_path / "two", [frame(0), {**frame(1), "file_path": "images/ä.001"}], fl_x=30.0, scale=0.3)
+    two = write_frames(
+        tmp_path / "two",
+        [frame(0), {**frame(1), "file_path": "images/ä.001"}],
+        fl_x=30.0,
+        scale=0.3,
+    )
     write_images(one, ["images/000.png"])
     write_images(two, ["images/000.png", "images/ä.001.jpg"])
     K = load_scene(one).train[0].camera.K
@@ -97,7 +140,9 @@ def test_size_of_a_photograph_of_another_suffix(tmp_path: Path) -> None:
     write_images(tmp_path, ["a.png", "b.WEBP"])
     loaded = load_scene(tmp_path)
     assert (loaded.train[0].camera.width, loaded.test[0].camera.width) == (40, 40)
-    assert loaded.notes == (f"2 of 2 photographs have another suffix or case, such as a.png in {tmp_path.name}",)
+    assert loaded.notes == (
+        f"2 of 2 photographs have another suffix or case, such as a.png in {tmp_path.name}",
+    )
 
 
 LENS = {"k1": -0.15, "k2": 0.05, "p1": 0.004, "p2": -0.003}
@@ -114,19 +159,27 @@ ROUND = {"k1": 0.03, "k2": -0.01, "k3": 0.002, "k4": 0.001}
     ],
 )
 def test_distorted_photographs_are_undistorted(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, message: dict[str, Any], model: str, params: list[float]
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    message: dict[str, Any],
+    model: str,
+    params: list[float],
 ) -> None:
     """As those of a COLMAP model with the same lens."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     size, views = {"fl_x": 120, "fl_y": 122, "cx": 82, "cy": 58, "w": 160, "h": 120}, []
-    write_frames(tmp_path / "a", [{"file_path": "a.png", "transform_matrix": to_world(0)}], **size, **message)
+    write_frames(
+        tmp_path / "a", [{"file_path": "a.png", "transform_matrix": to_world(0)}], **size, **message
+    )
     model_of(tmp_path / "b", model, [120, 122, 82, 58, *params], 160, 120)
     for scene in (tmp_path / "a", tmp_path / "b"):
         Image.fromarray(pixels(0, 160, 120)).save(scene / "a.png")
         loaded = load_scene(scene)
         views.append(loaded.train[0])
         assert f"undistorted from {model} into" in loaded.notes[0]
-    assert torch.equal(views[0].image, views[1].image) and torch.equal(views[0].camera.K, views[1].camera.K)
+    assert torch.equal(views[0].image, views[1].image) and torch.equal(
+        views[0].camera.K, views[1].camera.K
+    )
 
 
 def test_colmap_model_takes_precedence(tmp_path: Path) -> None:
@@ -137,15 +190,21 @@ def test_colmap_model_takes_precedence(tmp_path: Path) -> None:
     assert loaded.notes == ("the cameras are the COLMAP model's, not those of transforms.json",)
     assert loaded.train[0].camera.K[0, 0] == 33
     deeper = write_frames(tmp_path / "images", [{**frame(0), "file_path": "a"}], **INTRINSICS)
-    assert load_scene(deeper).train[0].camera.K[0, 0] == 30  # nearer than the model beside the folder
+    # nearer than the model beside the folder
+    assert load_scene(deeper).train[0].camera.K[0, 0] == 30
 
 
 def test_missing_photographs_and_unused_entries_are_noted(tmp_path: Path) -> None:
     frames = [frame(i, mask_path="masks/0.png") for i in range(10)]
-    write_frames(tmp_path, frames, fl_x=30.0, applied_transform=[[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]])
+    write_frames(
+        tmp_path, frames, fl_x=30.0, applied_transform=[[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]
+    )
     write_images(tmp_path, [f"images/{i:03d}.png" for i in range(10) if i != 3])
     assert load_scene(tmp_path).notes == (
-        "transforms.json turned COLMAP's world (applied_transform): a checkpoint of the turned one is needed",
+        (
+            "transforms.json turned COLMAP's world (applied_transform): a checkpoint of the turned"
+            " one is needed"
+        ),
         f"the masks of transforms.json are {UNUSED}",
         "1 of 10 photographs are missing and left out (images/003.png)",
     )
@@ -159,17 +218,25 @@ def test_missing_photographs_and_unused_entries_are_noted(tmp_path: Path) -> Non
 def test_paths_of_another_machine_end_in_the_folder(tmp_path: Path, start: str) -> None:
     """A file of the whole path, outside of the folder, is never read."""
     scene, names = tmp_path / "scene", [f"images/{i}" for i in range(3)]
-    frames = [{"file_path": start + name, "transform_matrix": to_world(i)} for i, name in enumerate(names)]
+    frames = [
+        {"file_path": start + name, "transform_matrix": to_world(i)} for i, name in enumerate(names)
+    ]
     write_frames(scene, frames, **INTRINSICS, test_filenames=[start + names[1]])
     write_images(tmp_path, [f"{name}.png" for name in names])
     with pytest.raises(
-        ClodError, match="transforms.json: image name .* leaves the images folder .*; put the photograph"
+        ClodError,
+        match="transforms.json: image name .* leaves the images folder .*; put the photograph",
     ):
         load_scene(scene)
     write_images(scene, [f"{name}.png" for name in names])
     loaded = load_scene(scene)
-    assert [view.camera.name for view in (*loaded.train, *loaded.test)] == [f"images/{i}.png" for i in (0, 2, 1)]
-    assert "paths of transforms.json lead out of its folder: photographs are those in it" in loaded.notes
+    assert [view.camera.name for view in (*loaded.train, *loaded.test)] == [
+        f"images/{i}.png" for i in (0, 2, 1)
+    ]
+    assert (
+        "paths of transforms.json lead out of its folder: photographs are those in it"
+        in loaded.notes
+    )
 
 
 def changed(row: int, column: int, value: float) -> dict[str, Any]:
@@ -181,65 +248,111 @@ def changed(row: int, column: int, value: float) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        *(({"file_path": name}, "image name .*leaves the images folder") for name in (
-            "../a.png", "sub/../../a.png", "/etc/a.png", "..\\a.png", "C:\\a.png", "")),
-        *(({"file_path": name}, "image name .*is no file's name") for name in (
-            "a" * 300 + ".png", "a/" * 2500 + "b.png", "\u00e9" * 130, "\x1b[2J.png")),
+        *(
+            ({"file_path": name}, "image name .*leaves the images folder")
+            for name in ("../a.png", "sub/../../a.png", "/etc/a.png", "..\\a.png", "C:\\a.png", "")
+        ),
+        *(
+            ({"file_path": name}, "image name .*is no file's name")
+            for name in ("a" * 300 + ".png", "a/" * 2500 + "b.png", "\u00e9" * 130, "\x1b[2J.png")
+        ),
         ({"file_path": "\ud800.png"}, "is not UTF-8"),
         ({"file_path": 3}, "frame 0 has no file_path"),
         ({"transform_matrix": None}, "frame a.png: transform_matrix is no 3x4 or 4x4 matrix"),
-        *(({"transform_matrix": matrix}, "no 3x4 or 4x4 matrix of finite") for matrix in (
-            "none", [[1, 0, 0], [0, 1, 0]], [[10**400, 0, 0, 0]] * 4)),
+        *(
+            ({"transform_matrix": matrix}, "no 3x4 or 4x4 matrix of finite")
+            for matrix in ("none", [[1, 0, 0], [0, 1, 0]], [[10**400, 0, 0, 0]] * 4)
+        ),
         (changed(0, 0, math.nan), "no 3x4 or 4x4 matrix of finite"),
         (changed(0, 3, 1e12), "'a.png' has a camera or pose that is not usable"),
-        *((changed(*entry), "frame a.png: transform_matrix is no rotation") for entry in (
-            (0, 0, 1e200), (0, 0, 1.1), (1, 1, -1), (3, 0, 1))),
+        *(
+            (changed(*entry), "frame a.png: transform_matrix is no rotation")
+            for entry in ((0, 0, 1e200), (0, 0, 1.1), (1, 1, -1), (3, 0, 1))
+        ),
         *(({"fl_x": value}, "fl_x is no number") for value in ("wide", math.inf)),
-        *((change, "neither fl_x nor camera_angle_x") for change in ({"fl_x": -30}, {"fl_x": 0, "camera_angle_x": 4})),
+        *(
+            (change, "neither fl_x nor camera_angle_x")
+            for change in ({"fl_x": -30}, {"fl_x": 0, "camera_angle_x": 4})
+        ),
         ({"w": 1e30}, "w is no number between"),
         ({"cx": [1]}, "cx is no number"),
         ({"k1": math.nan}, "k1 is no number"),
         ({"k4": 0.1}, "k4 of a camera that is no fisheye"),
         ({"camera_model": "EQUIRECTANGULAR"}, "camera_model 'EQUIRECTANGULAR' is not known"),
         ({"camera_model": {"a": 1}}, "camera_model .* is not known"),
-        *((content, "transforms.json: .*no JSON or damaged") for content in (
-            b"", b'{"frames": [', b"\xff\xfe\x00", b"[" * 100_000)),
-        (b'{"frames": ' + b"9" * 10_000 + b"}", "transforms.json: .*a number of more than 1,000 digits"),
-        (b"[]", "transforms.json: is no JSON object"), (b'{"frames": [3]}', "frame 0 has no file_path"),
-        *((content, "transforms.json: .*no list of frames") for content in (b'{"frames": []}', b'{"frames": {}}')),
+        *(
+            (content, "transforms.json: .*no JSON or damaged")
+            for content in (b"", b'{"frames": [', b"\xff\xfe\x00", b"[" * 100_000)
+        ),
+        (
+            b'{"frames": ' + b"9" * 10_000 + b"}",
+            "transforms.json: .*a number of more than 1,000 digits",
+        ),
+        (b"[]", "transforms.json: is no JSON object"),
+        (b'{"frames": [3]}', "frame 0 has no file_path"),
+        *(
+            (content, "transforms.json: .*no list of frames")
+            for content in (b'{"frames": []}', b'{"frames": {}}')
+        ),
         (b"{", "transforms.json: is larger than 256 MB"),
     ],
-)  # fmt: skip
-def test_invalid_files_and_frames_are_refused(tmp_path: Path, change: dict[str, Any] | bytes, message: str) -> None:
+)
+def test_invalid_files_and_frames_are_refused(
+    tmp_path: Path, change: dict[str, Any] | bytes, message: str
+) -> None:
     if isinstance(change, bytes):
         (tmp_path / "transforms.json").write_bytes(change)
-        os.truncate(tmp_path / "transforms.json", 300 * 2**20 if "256 MB" in message else len(change))
+        os.truncate(
+            tmp_path / "transforms.json", 300 * 2**20 if "256 MB" in message else len(change)
+        )
     else:
-        write_frames(tmp_path, [{"file_path": "a.png", "transform_matrix": to_world(0), **INTRINSICS, **change}])
+        write_frames(
+            tmp_path,
+            [{"file_path": "a.png", "transform_matrix": to_world(0), **INTRINSICS, **change}],
+        )
     with pytest.raises(ClodError, match=message) as caught:
         load_scene(tmp_path)
     assert str(caught.value).isprintable()
 
 
 def test_camera_without_a_size_is_left_out(tmp_path: Path) -> None:
-    frames = [{"file_path": f"{k}.png", "transform_matrix": torch.eye(4).tolist()} for k in range(2)]
+    frames = [
+        {"file_path": f"{k}.png", "transform_matrix": torch.eye(4).tolist()} for k in range(2)
+    ]
     frames[1] |= {"w": 20, "h": 10}
     write_frames(tmp_path, frames, camera_angle_x=1.0)
     cameras, notes = load_cameras(tmp_path)
     assert [camera.name for camera in cameras] == ["1.png"]
     assert notes == ["1 of 2 cameras left out: neither transforms.json nor a photograph has a size"]
     write_frames(tmp_path, frames[:1], camera_angle_x=1.0)
-    with pytest.raises(ClodError, match="transforms.json: has no size of a photograph.*put them beside it, or w"):
+    with pytest.raises(
+        ClodError, match="transforms.json: has no size of a photograph.*put them beside it, or w"
+    ):
         load_cameras(tmp_path)
 
 
 def test_files_of_transforms_scenes(tmp_path: Path) -> None:
-    train = {"frames": [{"file_path": "./train/r_0", "mask_path": "masks/0.png"}, {"file_path": "rgb\\ü.jpg"}, 7]}
-    test = {"frames": [{"file_path": "test/r_0.png", "depth_file_path": "depth/0.tif"}, {"file_path": "a\0\ud800"}]}
+    train = {
+        "frames": [
+            {"file_path": "./train/r_0", "mask_path": "masks/0.png"},
+            {"file_path": "rgb\\ü.jpg"},
+            7,
+        ]
+    }
+    test = {
+        "frames": [
+            {"file_path": "test/r_0.png", "depth_file_path": "depth/0.tif"},
+            {"file_path": "a\0\ud800"},
+        ]
+    }
     (tmp_path / "transforms_train.json").write_text(json.dumps(train))
     (tmp_path / "transforms_test.json").write_text(json.dumps(test))
     (tmp_path / "transforms.json").write_text("no JSON")
-    names = [*map(file_name, ["train/r_0.png", "rgb/ü.jpg", "masks/0.png", "test/r_0.png", "depth/0.tif"])]
+    names = [
+        *map(
+            file_name, ["train/r_0.png", "rgb/ü.jpg", "masks/0.png", "test/r_0.png", "depth/0.tif"]
+        )
+    ]
     for name in [*names, "train/r_1.png"]:
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_bytes(b"")
@@ -254,8 +367,12 @@ APPLIED = {  # how nerfstudio turned COLMAP's world: today, and before
 }
 
 
-def trained(poses: np.ndarray, applied: Any, applied_scale: float = 1.0) -> tuple[np.ndarray, dict[str, Any]]:
-    """Poses after nerfstudio's ``auto_orient_and_center_poses`` by default, and its dataparser_transforms.json."""
+def trained(
+    poses: np.ndarray, applied: Any, applied_scale: float = 1.0
+) -> tuple[np.ndarray, dict[str, Any]]:
+    """Poses after nerfstudio's ``auto_orient_and_center_poses`` by default, and its
+    dataparser_transforms.json.
+    """
     centre, up = poses[:, :3, 3].mean(0), poses[:, :3, 1].mean(0)
     up /= np.linalg.norm(up)
     v, cosine = np.cross(up, [0, 0, 1.0]), up[2]
@@ -271,36 +388,58 @@ def trained(poses: np.ndarray, applied: Any, applied_scale: float = 1.0) -> tupl
 
 
 def in_colmap(count: int, seed: int) -> np.ndarray:
-    """``[N, 4, 4]`` camera to world of COLMAP, in OpenGL's axes, as nerfstudio has them before it turns the world."""
+    """``[N, 4, 4]`` camera to world of COLMAP, in OpenGL's axes, as nerfstudio has them before it
+    turns the world.
+    """
     return np.array([to_world(seed + i) for i in range(count)])
 
 
 def write_data(folder: Path, poses: np.ndarray, **rest: Any) -> None:
-    frames = [{"file_path": name, "transform_matrix": p.tolist()} for name, p in zip(NAMES, poses, strict=False)]
+    frames = [
+        {"file_path": name, "transform_matrix": p.tolist()}
+        for name, p in zip(NAMES, poses, strict=False)
+    ]
     write_images(folder, NAMES[: len(poses)])
     write_frames(folder, frames, **INTRINSICS, **rest)
 
 
-@settings(deadline=None, max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(st.sampled_from(["today", "older", "none"]), st.integers(0, 50), st.sampled_from([1.0, 0.25, None]))
+@settings(
+    deadline=None, max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(
+    st.sampled_from(["today", "older", "none"]),
+    st.integers(0, 50),
+    st.sampled_from([1.0, 0.25, None]),
+)
 @example("today", 0, None)
 @example("older", 0, None)
-def test_cameras_of_nerfstudio(tmp_path: Path, turn: str, seed: int, applied_scale: float | None) -> None:
+def test_cameras_of_nerfstudio(
+    tmp_path: Path, turn: str, seed: int, applied_scale: float | None
+) -> None:
     """Of its transforms.json; or, without a scale, of a COLMAP model, whose own world is turned."""
     applied = APPLIED.get(turn)
     poses = in_colmap(9, seed)
-    turned = poses if applied is None else np.vstack([applied, [0, 0, 0, 1.0]]) @ poses  # as ns-process-data
+    # as ns-process-data
+    turned = poses if applied is None else np.vstack([applied, [0, 0, 0, 1.0]]) @ poses
     up = turned[:, :3, 1].mean(0)
-    assume(up[2] > -0.9 * np.linalg.norm(up))  # near half a turn nerfstudio's own matrix is no rotation
+    # near half a turn nerfstudio's own matrix is no rotation
+    assume(up[2] > -0.9 * np.linalg.norm(up))
     want, written = trained(turned, applied, applied_scale or 1.0)
     shutil.rmtree(tmp_path / "scene", ignore_errors=True)
     scene = tmp_path / "scene"
     if applied_scale is None:
-        write_model(scene, [camera(seed + i) for i in range(9)], [Path(name).name for name in NAMES])
+        write_model(
+            scene, [camera(seed + i) for i in range(9)], [Path(name).name for name in NAMES]
+        )
         write_images(scene, NAMES)
     else:
         rest = {} if applied is None else {"applied_transform": applied}
-        write_data(scene, turned, **rest, **({} if applied_scale == 1 else {"applied_scale": applied_scale}))
+        write_data(
+            scene,
+            turned,
+            **rest,
+            **({} if applied_scale == 1 else {"applied_scale": applied_scale}),
+        )
     (scene / "dataparser_transforms.json").write_text(json.dumps(written))
     loaded = load_scene(scene)
     views = sorted((*loaded.train, *loaded.test), key=lambda view: view.camera.name)
@@ -318,16 +457,23 @@ def test_cameras_of_nerfstudio(tmp_path: Path, turn: str, seed: int, applied_sca
         ("{}", "transform is no 3x4 or 4x4 matrix"),
         ('{"transform": [[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0]]}', "transform is no rotation"),
         ('{"transform": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, -1, 0]]}', "transform is no rotation"),
-        *((f'{{"transform": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]], "scale": {scale}}}', "scale is no number")
-          for scale in ("0", "NaN", "[1]")),
+        *(
+            (
+                f'{{"transform": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]], "scale": {scale}}}',
+                "scale is no number",
+            )
+            for scale in ("0", "NaN", "[1]")
+        ),
     ],
-)  # fmt: skip
+)
 def test_damaged_frame_of_nerfstudio_is_refused(tmp_path: Path, content: str, message: str) -> None:
     write_data(tmp_path, in_colmap(3, 0))
     (tmp_path / "dataparser_transforms.json").write_text(content)
     with pytest.raises(ClodError, match=f"dataparser_transforms.json: {message}"):
         load_scene(tmp_path)
-    (tmp_path / "dataparser_transforms.json").write_text(json.dumps(trained(in_colmap(3, 0), None)[1]))
+    (tmp_path / "dataparser_transforms.json").write_text(
+        json.dumps(trained(in_colmap(3, 0), None)[1])
+    )
     for extra in ({"applied_transform": [[1]]}, {"applied_scale": -1}):
         write_data(tmp_path, in_colmap(3, 0), **extra)
         with pytest.raises(ClodError, match=f"transforms.json: {next(iter(extra))} is"):

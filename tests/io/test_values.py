@@ -1,4 +1,6 @@
-"""Values that are read as others than are stored: activated ones, Mip-Splatting's, coordinates far from 0."""
+"""Values that are read as others than are stored: activated ones, Mip-Splatting's, coordinates far
+from 0.
+"""
 
 from pathlib import Path
 
@@ -44,15 +46,23 @@ def test_activated_values_need_the_option(tmp_path: Path, what: tuple[str, ...])
     assert plain.notes == ()
     path = write_rows(tmp_path / "in.ply", activate(vertex, *what))
     choice = "both" if len(what) == 2 else what[0]
-    with pytest.raises(ClodError, match=rf"in.ply: has {what[0]} from .* --activated {choice}, if not,") as caught:
+    with pytest.raises(
+        ClodError, match=rf"in.ply: has {what[0]} from .* --activated {choice}, if not,"
+    ) as caught:
         load(path)
     assert all(f"{name} from" in str(caught.value) for name in what)
     base = load(path, activated=choice)
-    torch.testing.assert_close(base.gaussians.opacity_logits, plain.gaussians.opacity_logits, atol=1e-3, rtol=1e-4)
-    torch.testing.assert_close(base.gaussians.log_scales, plain.gaussians.log_scales, atol=1e-5, rtol=1e-5)
+    torch.testing.assert_close(
+        base.gaussians.opacity_logits, plain.gaussians.opacity_logits, atol=1e-3, rtol=1e-4
+    )
+    torch.testing.assert_close(
+        base.gaussians.log_scales, plain.gaussians.log_scales, atol=1e-5, rtol=1e-5
+    )
     assert len(base.notes) == len(what) and base.comments == base.notes
     unchanged = load(path, activated="none")
-    np.testing.assert_array_equal(unchanged.gaussians.opacity_logits, activate(vertex, *what)["opacity"])
+    np.testing.assert_array_equal(
+        unchanged.gaussians.opacity_logits, activate(vertex, *what)["opacity"]
+    )
     assert unchanged.notes == () and base.fingerprint == f"{choice}:{unchanged.fingerprint}"
 
 
@@ -75,22 +85,34 @@ def test_mip_splatting_is_fused(tmp_path: Path) -> None:
     vertex["scale_0"][4], vertex["scale_1"][5] = -80, -200
     size = np.exp(np.stack([vertex[name].astype(np.float64) for name in SCALES], 1))
     wide = size**2 + vertex["filter_3D"].astype(np.float64)[:, None] ** 2
-    opacities = np.sqrt((size**2).prod(1) / wide.prod(1)) / (1 + np.exp(-vertex["opacity"].astype(np.float64)))
+    opacities = np.sqrt((size**2).prod(1) / wide.prod(1)) / (
+        1 + np.exp(-vertex["opacity"].astype(np.float64))
+    )
     base = load(write_rows(tmp_path / "in.ply", vertex))
     g, kept = base.gaussians, np.isfinite(vertex["filter_3D"])
     assert len(g) == 38 and g.screen_filter == FILTERS["mip"]
     assert g.opacity_logits.isfinite().all() and g.log_scales.isfinite().all()
-    assert g.opacity_logits[0] == vertex["opacity"][0] and g.opacity_logits[2] == vertex["opacity"][2]
+    assert (
+        g.opacity_logits[0] == vertex["opacity"][0] and g.opacity_logits[2] == vertex["opacity"][2]
+    )
     usual = np.arange(40) != 1  # a filter of 1e30
     np.testing.assert_allclose(g.scales[usual[kept]], np.sqrt(wide)[kept & usual], rtol=2e-6)
-    np.testing.assert_allclose(g.opacities[usual[kept]], opacities[kept & usual], rtol=2e-6, atol=1e-37)
+    np.testing.assert_allclose(
+        g.opacities[usual[kept]], opacities[kept & usual], rtol=2e-6, atol=1e-37
+    )
     # In logs, where the opacity itself would be 0: a Gaussian thinner than float64 can square.
-    log = -90 - sum(np.log(wide[5]) / 2 - np.array([vertex[name][5] for name in SCALES], np.float64))
+    log = -90 - sum(
+        np.log(wide[5]) / 2 - np.array([vertex[name][5] for name in SCALES], np.float64)
+    )
     np.testing.assert_allclose(g.opacity_logits[5], log, rtol=1e-6)
     assert base.comments == base.notes[:1] and "filter_3D is fused" in base.comments[0]
     save(tmp_path / "out.ply", with_dial(g, torch.rand(38), AttenuationConfig()), base)
     out = load(tmp_path / "out.ply")
-    assert "filter_3D" not in out.vertex.dtype.names and out.notes == () and base.comments[0] in out.comments
+    assert (
+        "filter_3D" not in out.vertex.dtype.names
+        and out.notes == ()
+        and base.comments[0] in out.comments
+    )
     assert torch.equal(out.gaussians.log_scales, g.log_scales)
     assert torch.equal(out.gaussians.opacity_logits, g.opacity_logits)
     for name in names:
@@ -102,7 +124,9 @@ def test_activated_opacities_extreme_values(tmp_path: Path) -> None:
     vertex["opacity"][:5] = 0, 1, 1.5, -0.05, np.nan  # Taming-3DGS activates by the absolute value
     base = load(write_rows(tmp_path / "in.ply", vertex), activated="opacity")
     assert len(base.gaussians) == 39 and base.gaussians.opacity_logits.isfinite().all()
-    torch.testing.assert_close(base.gaussians.opacities[:4], torch.tensor([0, 1, 1, 0.05]), atol=1e-7, rtol=1e-5)
+    torch.testing.assert_close(
+        base.gaussians.opacities[:4], torch.tensor([0, 1, 1, 0.05]), atol=1e-7, rtol=1e-5
+    )
     assert "1 above 1 taken as 1" in base.notes[0]
     with pytest.raises(ClodError, match="activated is 'yes'.*none, opacity, scales, both"):
         load(tmp_path / "in.ply", activated="yes")  # type: ignore[arg-type]
@@ -112,15 +136,21 @@ def test_activated_opacities_extreme_values(tmp_path: Path) -> None:
 
 
 def test_own_outputs_need_no_option(tmp_path: Path) -> None:
-    """An opaque result, as every logit may be above 0 after tuning; its adapter knows how its base was read."""
+    """An opaque result, as every logit may be above 0 after tuning; its adapter knows how its base
+    was read.
+    """
     path = write_rows(tmp_path / "in.ply", activate(inria(40), "opacity", "scales"))
     base = load(path, activated="both")
     g = base.gaussians
-    tuned = with_dial(g.replace(opacity_logits=g.opacity_logits.abs()), torch.rand(40), AttenuationConfig())
+    tuned = with_dial(
+        g.replace(opacity_logits=g.opacity_logits.abs()), torch.rand(40), AttenuationConfig()
+    )
     adapter = extract(g, tuned, fingerprint=base.fingerprint, config={})
     save(tmp_path / "out.ply", adapter.apply(g, load(path, activated="both").fingerprint), base)
     out = load(tmp_path / "out.ply")
-    torch.testing.assert_close(out.gaussians.opacity_logits, g.opacity_logits.abs(), atol=2e-2, rtol=1e-3)
+    torch.testing.assert_close(
+        out.gaussians.opacity_logits, g.opacity_logits.abs(), atol=2e-2, rtol=1e-3
+    )
     assert out.comments[:2] == base.notes
     with pytest.raises(ClodError, match="different base.*trained on both:"):
         adapter.apply(g, load(path, activated="none").fingerprint)
@@ -132,7 +162,9 @@ UTM = np.array([437_123.25, -4_481_010.5, 1_000.0])
 def moved(path: Path, out: Path, kind: str) -> Path:
     """The file's coordinates UTM away, as columns of ``kind``."""
     old = PlyData.read(str(path))["vertex"].data
-    new = old.astype([(name, kind if name in "xyz" else old.dtype[name]) for name in old.dtype.names])
+    new = old.astype(
+        [(name, kind if name in "xyz" else old.dtype[name]) for name in old.dtype.names]
+    )
     for axis, by in zip("xyz", UTM, strict=True):
         new[axis] = old[axis].astype("f8") + by
     return write_rows(out, new)
@@ -156,7 +188,9 @@ def test_round_trip_of_distant_scenes_is_exact(tmp_path: Path, kind: str) -> Non
     clod.save(tmp_path / "near.ply", base)
     far = clod.load(moved(tmp_path / "near.ply", tmp_path / "far.ply", kind))
     stored = np.stack([far.vertex[axis].astype("f8") for axis in "xyz"], 1)
-    np.testing.assert_allclose(far.gaussians.means.double().numpy() + far.origin, stored, rtol=0, atol=3e-7)
+    np.testing.assert_allclose(
+        far.gaussians.means.double().numpy() + far.origin, stored, rtol=0, atol=3e-7
+    )
     if kind == "f8":  # the picture is that of the scene near 0
         apart = (far.gaussians.means - base.means).double().numpy() + far.origin - UTM
         assert np.abs(apart).max() < 1e-6
@@ -169,9 +203,13 @@ def test_round_trip_of_distant_scenes_is_exact(tmp_path: Path, kind: str) -> Non
     out = PlyData.read(str(tmp_path / "out.ply"))["vertex"].data
     written = np.stack([out[axis] for axis in "xyz"], 1)
     assert written.dtype == np.float64 and (written[50:] == stored[50:]).all()
-    np.testing.assert_allclose(written[:50], tuned[:50].double().numpy() + far.origin, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(
+        written[:50], tuned[:50].double().numpy() + far.origin, rtol=0, atol=1e-9
+    )
     again = clod.load(tmp_path / "out.ply", origin=far.origin)
     assert again.gaussians.means.equal(tuned) and again.origin == far.origin
-    adapter = clod.extract(far.gaussians, clod.with_dial(far.gaussians), fingerprint="", config={}, origin=far.origin)
+    adapter = clod.extract(
+        far.gaussians, clod.with_dial(far.gaussians), fingerprint="", config={}, origin=far.origin
+    )
     clod.save_adapter(tmp_path / "far.safetensors", adapter)
     assert clod.load_adapter(tmp_path / "far.safetensors").origin == far.origin

@@ -1,4 +1,6 @@
-"""Threads of kernels and files, recycled memory, the cache of compiled kernels, and their failures."""
+"""Threads of kernels and files, recycled memory, the cache of compiled kernels, and their
+failures.
+"""
 
 import gc
 import os
@@ -26,16 +28,28 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def test_disabled_compilation_is_an_error(capture: Any, tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "clod_adapter", str(capture.ply), "--out", str(tmp_path / "dial.ply")]
+    command = [
+        sys.executable,
+        "-m",
+        "clod_adapter",
+        str(capture.ply),
+        "--out",
+        str(tmp_path / "dial.ply"),
+    ]
     environment = os.environ | {"NUMBA_DISABLE_JIT": "1"}
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 2 and os.listdir(tmp_path) == []
     last = done.stderr.splitlines()[-1]
-    assert last == "clod-adapt: error: NUMBA_DISABLE_JIT is set, and the kernels run compiled only; unset it"
+    assert (
+        last == "clod-adapt: error: NUMBA_DISABLE_JIT is set, and the kernels run compiled only;"
+        " unset it"
+    )
 
 
 def test_cache_survives_full_disks_and_processes_killed_while_writing(tmp_path: Path) -> None:
-    """A process prints the result of a kernel for ``[1.0]``, 1 + its version, of which the stamp tells."""
+    """A process prints the result of a kernel for ``[1.0]``, 1 + its version, of which the stamp
+    tells.
+    """
 
     def printed(version: int, before: str = "") -> str:
         (tmp_path / "sums.py").write_text(
@@ -49,15 +63,21 @@ def test_cache_survives_full_disks_and_processes_killed_while_writing(tmp_path: 
         code = f"import sums, os, numpy\n{before}\nprint(sums.f(numpy.ones(1)))"
         paths = map(str, (tmp_path, os.environ.get("PYTHONPATH", ""), ROOT))
         environment = os.environ | {
-            "NUMBA_CACHE_DIR": str(tmp_path / "cache"), "PYTHONDONTWRITEBYTECODE": "1",
+            "NUMBA_CACHE_DIR": str(tmp_path / "cache"),
+            "PYTHONDONTWRITEBYTECODE": "1",
             "PYTHONPATH": os.pathsep.join(paths),
-        }  # fmt: skip
-        done = subprocess.run([sys.executable, "-c", code], env=environment, text=True, stdout=-1, check=False)
+        }
+        done = subprocess.run(
+            [sys.executable, "-c", code], env=environment, text=True, stdout=-1, check=False
+        )
         return done.stdout.strip()
 
     assert printed(1) == "2.0"
     assert printed(5, "os.replace = lambda *a: os._exit(9)") == ""
-    assert printed(5, "def full(*_): raise OSError(28, 'No space left on device')\nos.replace = full") == "6.0"
+    assert (
+        printed(5, "def full(*_): raise OSError(28, 'No space left on device')\nos.replace = full")
+        == "6.0"
+    )
 
 
 SHAPE = (120, 160, 3)
@@ -96,7 +116,9 @@ def test_held_memory_is_not_used_again(holder: str) -> None:
     held = HOLDERS[holder](tensor)
     del tensor
     others = [recycled(SHAPE) for _ in range(IDLE)]
-    assert all(other.data_ptr() >= end or other.data_ptr() + 4 * other.numel() <= first for other in others)
+    assert all(
+        other.data_ptr() >= end or other.data_ptr() + 4 * other.numel() <= first for other in others
+    )
     del held
     gc.collect()
     assert recycled(SHAPE).data_ptr() == first  # and then it is
@@ -132,7 +154,9 @@ def test_results_come_in_order() -> None:
         return number, threading.get_ident()
 
     found = list(in_order([partial(late, number) for number in range(20)], 3))
-    assert [number for number, _ in found] == list(range(20)) and len({thread for _, thread in found}) == 3
+    assert [number for number, _ in found] == list(range(20)) and len(
+        {thread for _, thread in found}
+    ) == 3
     assert list(in_order([], 3)) == []
 
 
@@ -163,7 +187,10 @@ def test_kernels_run_again_after_threads_were_refused(monkeypatch: pytest.Monkey
     shared.cache_clear()
     with monkeypatch.context() as patch:
         patch.setattr(threading.Thread, "start", refuse)
-        for run in (lambda: threads.run(kernel, 3, torch.zeros(3)), lambda: list(in_order([int], 2))):
+        for run in (
+            lambda: threads.run(kernel, 3, torch.zeros(3)),
+            lambda: list(in_order([int], 2)),
+        ):
             with pytest.raises(MemoryError, match="a thread cannot be started: too little memory"):
                 run()
     threads.run(kernel, 3, out := torch.zeros(3))

@@ -1,4 +1,6 @@
-"""Compiled functions against plain ones in float64: the elementary functions, the count term, the losses."""
+"""Compiled functions against plain ones in float64: the elementary functions, the count term, the
+losses.
+"""
 
 import math
 from itertools import product
@@ -24,22 +26,32 @@ CONFIG = AdaptConfig(max_sv=7.0)
 
 @settings(deadline=None, max_examples=30)
 @given(
-    n=st.sampled_from([1, 15, 16, 17, 33, 400]), s=st.sampled_from([1.0, 2.5, 10.0]), seed=st.integers(0, 99),
-    share=st.sampled_from([0.02, 0.4, 1.0]), workers=st.sampled_from([1, 3]),
-)  # fmt: skip
-def test_both_forms_of_the_count_term_agree(n: int, s: float, seed: int, share: float, workers: int) -> None:
+    n=st.sampled_from([1, 15, 16, 17, 33, 400]),
+    s=st.sampled_from([1.0, 2.5, 10.0]),
+    seed=st.integers(0, 99),
+    share=st.sampled_from([0.02, 0.4, 1.0]),
+    workers=st.sampled_from([1, 3]),
+)
+def test_both_forms_of_the_count_term_agree(
+    n: int, s: float, seed: int, share: float, workers: int
+) -> None:
     random = torch.Generator().manual_seed(seed)
     d = 2 * torch.rand(n, generator=random)
     sigma = s * d * (torch.randn(n, generator=random) / 4).exp()
     with torch_threads(workers):
         got = count_gradient(d, sigma, s, 0.1, CONFIG, share)
     want = count_gradient(d.double(), sigma.double(), s, 0.1, CONFIG, share)
-    torch.testing.assert_close(got.double(), want, rtol=1e-4, atol=1e-6 * max(float(want.abs().max()), 1e-9))
+    torch.testing.assert_close(
+        got.double(), want, rtol=1e-4, atol=1e-6 * max(float(want.abs().max()), 1e-9)
+    )
     assert n < 33 or want.any()
 
 
 def test_the_count_term_of_extreme_values_is_finite() -> None:
-    edges = torch.tensor([0.0, 1e-30, 1e-6, 1.0, 1e6, 1e9]), torch.tensor([-1.0, 0.0, 1e-30, 1e-4, 1.0, 1e9, math.inf])
+    edges = (
+        torch.tensor([0.0, 1e-30, 1e-6, 1.0, 1e6, 1e9]),
+        torch.tensor([-1.0, 0.0, 1e-30, 1e-4, 1.0, 1e9, math.inf]),
+    )
     for dtype, share in product((torch.float32, torch.float64), (0.01, 1.0)):
         d, sigma = torch.cartesian_prod(*(edge.to(dtype) for edge in edges)).unbind(1)
         found = count_gradient(d, sigma, 3.0, 0.1, CONFIG, share)
@@ -53,9 +65,13 @@ def elementary(function, x, out):
 
 
 def test_errors_of_exp2_and_log2() -> None:
-    """Of exp2 relative, over what blending needs, [-126, 0], and above. Of log2 absolute, beside one and a half units
-    of the result (tests/other_libm); for every fifth mantissa of two octaves and all normal exponents."""
-    some = np.concatenate([np.linspace(-126, 127, 1_000_001), -np.logspace(-30, 2.1, 100_001)]).astype(np.float32)
+    """Of exp2 relative, over what blending needs, [-126, 0], and above. Of log2 absolute, beside
+    one and a half units of the result (tests/other_libm); for every fifth mantissa of two octaves
+    and all normal exponents.
+    """
+    some = np.concatenate(
+        [np.linspace(-126, 127, 1_000_001), -np.logspace(-30, 2.1, 100_001)]
+    ).astype(np.float32)
     octaves = np.float32(0.5).view(np.uint32) + np.arange(0, 1 << 24, 5, dtype=np.uint32)
     every = np.arange(0x00800000, np.float32(3.4e38).view(np.uint32), 997, dtype=np.uint32)
     inputs = some[some >= -126], np.concatenate([octaves, every]).view(np.float32)
@@ -64,7 +80,9 @@ def test_errors_of_exp2_and_log2() -> None:
         found, want = np.empty_like(x), exact(x.astype(np.float64))
         elementary(function, x, found)
         errors, units = np.abs(found - want), np.spacing(np.abs(want).astype(np.float32))
-        assert (errors / want < 3e-7).all() if function == 0 else (errors - 1.5 * units < 1e-7).all()
+        assert (
+            (errors / want < 3e-7).all() if function == 0 else (errors - 1.5 * units < 1e-7).all()
+        )
 
 
 # Smaller than the window of 11, one larger, multiples of 16 and not.
@@ -72,27 +90,36 @@ SIZES = [(1, 1), (3, 7), (11, 11), (12, 16), (33, 50), (17, 101)]
 
 
 def pair(height: int, width: int, seed: int = 0) -> tuple[Tensor, Tensor]:
-    """A smooth photograph with black and white parts, and a render of it that also leaves [0, 1]."""
+    """A smooth photograph with black and white parts, and a render of it that also leaves
+    [0, 1].
+    """
     g = torch.Generator().manual_seed(seed)
     y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     waves = torch.sin(x[..., None] / torch.tensor([3.0, 5.0, 9.0]) + y[..., None] / 4)
     clean = (0.5 + 0.8 * waves).clamp(0, 1)
     target = (clean * 255).round().to(torch.uint8)
     image = clean + 0.1 * torch.randn(height, width, 3, generator=g)
-    image[:, : width // 4] = clean[:, : width // 4].round()  # exactly the photograph where it is black
+    # exactly the photograph where it is black
+    image[:, : width // 4] = clean[:, : width // 4].round()
     return image, target
 
 
-def value_and_gradient(function, image: Tensor, target: Tensor, weight: float) -> tuple[Tensor, Tensor]:
+def value_and_gradient(
+    function, image: Tensor, target: Tensor, weight: float
+) -> tuple[Tensor, Tensor]:
     leaf = image.clone().requires_grad_()
     loss = function(leaf, target, weight)
     (gradient,) = torch.autograd.grad(loss, leaf)
     return loss.detach(), gradient
 
 
-@pytest.mark.parametrize(("size", "weight"), [(size, (0.0, 0.2, 1.0)[k % 3]) for k, size in enumerate(SIZES)])
+@pytest.mark.parametrize(
+    ("size", "weight"), [(size, (0.0, 0.2, 1.0)[k % 3]) for k, size in enumerate(SIZES)]
+)
 def test_fused_loss_matches_the_plain_loss(size: tuple[int, int], weight: float) -> None:
-    """In float32, against float64: the value within 2e-6, the gradient within 1e-4 of its length."""
+    """In float32, against float64: the value within 2e-6, the gradient within 1e-4 of its
+    length.
+    """
     image, target = pair(*size)
     loss, gradient = value_and_gradient(photometric_loss, image, target, weight)
     want, expected = value_and_gradient(photometric_loss, image.double(), target, weight)
@@ -112,13 +139,18 @@ def test_threads_and_strides_change_nothing() -> None:
             loss, gradient = value_and_gradient(photometric_loss, image, target, 0.2)
         torch.testing.assert_close(loss, want[0], rtol=1e-6, atol=0)
         assert torch.equal(gradient, want[1])
-    wide, turned = torch.stack([image, image * 0], -1)[..., 0], target.transpose(0, 1).contiguous().transpose(0, 1)
+    wide, turned = (
+        torch.stack([image, image * 0], -1)[..., 0],
+        target.transpose(0, 1).contiguous().transpose(0, 1),
+    )
     assert all(map(torch.equal, value_and_gradient(photometric_loss, wide, turned, 0.2), want))
     _, scaled = value_and_gradient(lambda *a: 8 * photometric_loss(*a), image, target, 0.2)
     assert torch.equal(scaled, 8 * want[1])
 
 
-@pytest.mark.parametrize(("size", "darker"), [(size, (1, 40)[k % 2]) for k, size in enumerate(SIZES)])
+@pytest.mark.parametrize(
+    ("size", "darker"), [(size, (1, 40)[k % 2]) for k, size in enumerate(SIZES)]
+)
 def test_training_and_report_metrics_agree(size: tuple[int, int], darker: int) -> None:
     image, target = pair(*size)
     target = target // darker
@@ -127,17 +159,28 @@ def test_training_and_report_metrics_agree(size: tuple[int, int], darker: int) -
     assert value == pytest.approx(losses.psnr(image, target), rel=1e-6)
     fused = 1 - losses.photometric_loss(shown, target, 1.0).item()
     plain = losses.ssim_plain(shown.double(), photo.double()).item()
-    assert similarity == pytest.approx(fused, abs=1e-5) and similarity == pytest.approx(plain, abs=1e-5)
+    assert similarity == pytest.approx(fused, abs=1e-5) and similarity == pytest.approx(
+        plain, abs=1e-5
+    )
 
 
 @pytest.mark.parametrize("function", [losses.psnr, lambda *given: losses.psnr_ssim(*given)[0]])
 def test_psnr_of_known_images(function) -> None:
     black = torch.zeros(12, 12, 3, dtype=torch.uint8)
-    assert function(torch.full((12, 12, 3), 0.5), black) == pytest.approx(20 * math.log10(2), abs=1e-6)
+    assert function(torch.full((12, 12, 3), 0.5), black) == pytest.approx(
+        20 * math.log10(2), abs=1e-6
+    )
     image = torch.zeros(12, 12, 3)
     assert function(image, black) == math.inf
     image[3, 4, 1] = math.nan
     assert math.isnan(function(image, black))
-    stripes = torch.tensor([0, 255], dtype=torch.uint8).repeat(6, 3)[..., None].expand(6, 6, 3).contiguous()
+    stripes = (
+        torch.tensor([0, 255], dtype=torch.uint8)
+        .repeat(6, 3)[..., None]
+        .expand(6, 6, 3)
+        .contiguous()
+    )
     beyond = torch.where(stripes > 0, 7.0, -3.0)  # renders are clamped first
-    assert function(beyond, stripes) == math.inf and losses.psnr_ssim(beyond, stripes)[1] == pytest.approx(1, abs=1e-6)
+    assert function(beyond, stripes) == math.inf and losses.psnr_ssim(beyond, stripes)[
+        1
+    ] == pytest.approx(1, abs=1e-6)

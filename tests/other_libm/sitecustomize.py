@@ -1,11 +1,13 @@
-"""Another machine's elementary functions: their results differ from this machine's by one unit in the last place.
+"""Another machine's elementary functions: their results differ from this machine's by one unit in
+the last place.
 
     OTHER_LIBM=0 PYTHONPATH=tests/other_libm python -m pytest tests/equation
 
-The value of OTHER_LIBM is a seed, which says for each result whether it moves up or down; equal results move alike.
-Powers of two, whole numbers below 1024, infinities and NaN stay, so no sigmoid exceeds 1. ``math``, NumPy's functions,
-torch's on the CPU and the kernels' are moved, each in its own way, as libraries differ. Python runs this file at its
-start, also in processes that a test starts.
+The value of OTHER_LIBM is a seed, which says for each result whether it moves up or down; equal
+results move alike. Powers of two, whole numbers below 1024, infinities and NaN stay, so no sigmoid
+exceeds 1. ``math``, NumPy's functions, torch's on the CPU and the kernels' are moved, each in its
+own way, as libraries differ. Python runs this file at its start, also in processes that a test
+starts.
 """
 
 import importlib.machinery
@@ -21,11 +23,13 @@ from types import ModuleType
 from typing import Any
 
 SEED = os.environ.get("OTHER_LIBM")
-WHOLE = 1024  # smaller whole numbers and powers of two are exact everywhere: log2(8), exp(0), sigmoid(0)
+# smaller whole numbers and powers of two are exact everywhere: log2(8), exp(0), sigmoid(0)
+WHOLE = 1024
 COMMON = "exp exp2 expm1 log log2 log10 log1p sin cos tan sinh cosh tanh"
 MATH = f"{COMMON} pow asin acos atan atan2".split()
 NUMPY = f"{COMMON} arcsin arccos arctan arctan2 hypot logaddexp".split()
-TORCH = f"{COMMON} pow asin acos atan atan2 hypot logaddexp sigmoid log_sigmoid_forward softplus logit".split()
+OF_TORCH = "pow asin acos atan atan2 hypot logaddexp sigmoid log_sigmoid_forward softplus logit"
+TORCH = f"{COMMON} {OF_TORCH}".split()
 EXACT = (-2, -1, -0.5, 0, 0.5, 1, 2, 3)  # powers that are products, roots or quotients
 
 
@@ -34,18 +38,26 @@ def salt(library: str) -> int:
 
 
 def move(values: Any, library: str) -> None:
-    """Moves the floats of a contiguous 1-D array, in place; part by part, which needs little memory."""
+    """Moves the floats of a contiguous 1-D array, in place; part by part, which needs little
+    memory.
+    """
     import numpy as np
 
     if values.dtype not in (np.float32, np.float64):
         return
-    kind, factor = (np.uint32, 0x9E3779B1) if values.dtype == np.float32 else (np.uint64, 0x9E3779B97F4A7C15)
+    kind, factor = (
+        (np.uint32, 0x9E3779B1) if values.dtype == np.float32 else (np.uint64, 0x9E3779B97F4A7C15)
+    )
     last, digits = kind(8 * values.itemsize - 1), kind((1 << np.finfo(values.dtype).nmant) - 1)
     for first in range(0, values.size, 1 << 14):
         part = values[first : first + (1 << 14)]
         with np.errstate(all="ignore"):
             bits = part.view(kind)
-            stays = (bits & digits == 0) | np.isnan(part) | ((np.abs(part) < WHOLE) & (part == np.floor(part)))
+            stays = (
+                (bits & digits == 0)
+                | np.isnan(part)
+                | ((np.abs(part) < WHOLE) & (part == np.floor(part)))
+            )
             up = (bits + kind(salt(library))) * kind(factor) >> last == 1
             towards = np.where(up, np.inf, -np.inf).astype(part.dtype)
             part[:] = np.where(stays, part, np.nextafter(part, towards))
@@ -56,9 +68,15 @@ def change_math() -> None:
         @wraps(function)
         def other(*args: Any) -> float:
             x = function(*args)
-            if not math.isfinite(x) or math.frexp(abs(x))[0] == 0.5 or (abs(x) < WHOLE and x.is_integer()):
+            if (
+                not math.isfinite(x)
+                or math.frexp(abs(x))[0] == 0.5
+                or (abs(x) < WHOLE and x.is_integer())
+            ):
                 return x
-            return math.nextafter(x, math.inf if zlib.crc32(x.hex().encode(), salt("math")) & 1 else -math.inf)
+            return math.nextafter(
+                x, math.inf if zlib.crc32(x.hex().encode(), salt("math")) & 1 else -math.inf
+            )
 
         return other
 
@@ -104,7 +122,11 @@ def change_torch(torch: ModuleType) -> None:
 
         def other(keys: Any, *args: Any, **kwargs: Any) -> Any:
             found = kernel.call_boxed(keys, *args, **kwargs)
-            if not (name.startswith("aten::pow") and isinstance(args[1], int | float) and args[1] in EXACT):
+            if not (
+                name.startswith("aten::pow")
+                and isinstance(args[1], int | float)
+                and args[1] in EXACT
+            ):
                 moved(found[0] if isinstance(found, tuple) else found)
             return found
 
@@ -142,7 +164,9 @@ def change_kernels(elementary: ModuleType) -> None:
                 floor = elementary.call_llvm(builder, "llvm.floor.v16f32", elementary.VECTOR, [y])
                 digits = builder.and_(bits, constant(elementary.INTEGERS, (1 << 23) - 1))
                 power = builder.icmp_unsigned("==", digits, constant(elementary.INTEGERS, 0))
-                return builder.select(builder.or_(power, builder.fcmp_unordered("==", y, floor)), y, other)
+                return builder.select(
+                    builder.or_(power, builder.fcmp_unordered("==", y, floor)), y, other
+                )
 
             return signature, code
 
@@ -152,7 +176,8 @@ def change_kernels(elementary: ModuleType) -> None:
 
 
 def change_stamp(compiling: ModuleType) -> None:
-    compiling._STAMP += f"{SEED} {zlib.crc32(Path(__file__).read_bytes())}"  # compiled code of its own
+    # compiled code of its own
+    compiling._STAMP += f"{SEED} {zlib.crc32(Path(__file__).read_bytes())}"
 
 
 class Finder:

@@ -1,5 +1,6 @@
-"""Every backend agrees with the float64 reference in images and gradients; and the reference with plain loops: scipy's
-rotations, mpmath's harmonics, finite differences of a pinhole."""
+"""Every backend agrees with the float64 reference in images and gradients; and the reference with
+plain loops: scipy's rotations, mpmath's harmonics, finite differences of a pinhole.
+"""
 
 import dataclasses
 import math
@@ -20,7 +21,9 @@ from scenes import camera, in_front, scene
 
 
 def harmonics(direction: np.ndarray) -> np.ndarray:
-    """sqrt(2) Im Y_lm for m < 0 and Re for m > 0, with the Condon-Shortley phase, in the order of l, then m."""
+    """sqrt(2) Im Y_lm for m < 0 and Re for m > 0, with the Condon-Shortley phase, in the order of
+    l, then m.
+    """
     polar, azimuth = np.arccos(direction[2]), np.arctan2(direction[1], direction[0])
     found = []
     for degree, m in ((at, m) for at in range(5) for m in range(-at, at + 1)):
@@ -29,7 +32,9 @@ def harmonics(direction: np.ndarray) -> np.ndarray:
     return np.array(found)
 
 
-def drawn(some: Parameters, view: Camera, screen_filter: ScreenFilter) -> tuple[np.ndarray, np.ndarray]:
+def drawn(
+    some: Parameters, view: Camera, screen_filter: ScreenFilter
+) -> tuple[np.ndarray, np.ndarray]:
     """Image and alpha, one Gaussian after another, those in front first."""
     world, K, eye = (x.double().numpy() for x in (view.viewmat, view.K, view.position))
     means, quats, scales, opacities, sh0, shN = (x.double().numpy() for x in some.values())
@@ -45,7 +50,11 @@ def drawn(some: Parameters, view: Camera, screen_filter: ScreenFilter) -> tuple[
         rotation = Rotation.from_quat(quats[i, [1, 2, 3, 0]]).as_matrix()
         half = np.stack(steps, 1) @ world[:3, :3] @ rotation @ np.diag(scales[i])
         covariance = half @ half.T + screen_filter.variance * np.eye(2)
-        shown = np.sqrt(np.linalg.det(half @ half.T) / np.linalg.det(covariance)) if screen_filter.compensate else 1
+        shown = (
+            np.sqrt(np.linalg.det(half @ half.T) / np.linalg.det(covariance))
+            if screen_filter.compensate
+            else 1
+        )
         offsets = np.stack([x, y], -1) - pixel(points[i])
         power = -0.5 * np.einsum("hwi,ij,hwj->hw", offsets, np.linalg.inv(covariance), offsets)
         alpha = np.minimum(opacities[i] * shown * np.exp(power), 0.999)
@@ -59,16 +68,24 @@ def drawn(some: Parameters, view: Camera, screen_filter: ScreenFilter) -> tuple[
     return image + through[..., None] * BACKGROUND.double().numpy(), 1 - through
 
 
-@pytest.mark.parametrize("screen_filter", [CLASSIC, ScreenFilter(variance=0.7, compensate=True)], ids=str)
+@pytest.mark.parametrize(
+    "screen_filter", [CLASSIC, ScreenFilter(variance=0.7, compensate=True)], ids=str
+)
 def test_images_are_those_of_plain_loops(screen_filter: ScreenFilter) -> None:
     """Of 80 Gaussians within the picture; a part of its pixels ends."""
     view, some = camera(41, 31), scene(80, 4, 3, size=0.3)
-    places = torch.rand(80, 3, generator=torch.Generator().manual_seed(0)) - torch.tensor([0.5, 0.5, -2.0])
-    some["means"] = in_front(view, places * torch.cat([0.8 * places[:, 2:].expand(80, 2), torch.ones(80, 1)], 1))
+    places = torch.rand(80, 3, generator=torch.Generator().manual_seed(0)) - torch.tensor(
+        [0.5, 0.5, -2.0]
+    )
+    some["means"] = in_front(
+        view, places * torch.cat([0.8 * places[:, 2:].expand(80, 2), torch.ones(80, 1)], 1)
+    )
     some["opacities"][::2] = 0.95
     want = drawn(some, view, screen_filter)
     twin = {name: value.double() for name, value in some.items()}
-    found = reference.rasterize(**twin, camera=view, background=BACKGROUND.double(), screen_filter=screen_filter)
+    found = reference.rasterize(
+        **twin, camera=view, background=BACKGROUND.double(), screen_filter=screen_filter
+    )
     for mine, expected in zip(found, want, strict=True):
         np.testing.assert_allclose(mine, expected, atol=1e-7)
     assert (want[1] > 0.999).any() and (want[1] < 0.99).any()
@@ -91,16 +108,24 @@ def test_counts_around_sixteen(rasterize: Splat, n: int) -> None:
     """The kernels take sixteen Gaussians at a time; here all are in the image."""
     view, some = camera(), scene(n, 3, n, size=0.15)
     z = 2 + 2 * torch.rand(n, 1)
-    some["means"] = in_front(view, torch.cat([(torch.rand(n, 2) - 0.5) * torch.tensor([0.9, 0.7]) * z, z], 1))
+    some["means"] = in_front(
+        view, torch.cat([(torch.rand(n, 2) - 0.5) * torch.tensor([0.9, 0.7]) * z, z], 1)
+    )
     some["opacities"] = 0.1 + 0.3 * torch.rand(n)
     with torch_threads(2):
         assert_agrees(rasterize, some, view)
 
 
 @pytest.mark.parametrize(
-    "view", [camera(1, 1), camera(3, 200), camera(200, 3), *(camera(50, 40, fov=fov) for fov in (5.0, 150.0)),
-             camera(50, 40, off_centre=(1.3, -0.2))],
-)  # fmt: skip
+    "view",
+    [
+        camera(1, 1),
+        camera(3, 200),
+        camera(200, 3),
+        *(camera(50, 40, fov=fov) for fov in (5.0, 150.0)),
+        camera(50, 40, off_centre=(1.3, -0.2)),
+    ],
+)
 def test_sizes_and_lenses(rasterize: Splat, view: Camera) -> None:
     """With the wide one, centres are far outside the image, where the Jacobian's ray is clamped."""
     assert_agrees(rasterize, scene(120, 1, 7, size=0.3), view, cut=0.05)
@@ -125,7 +150,9 @@ def test_near_the_camera_plane(rasterize: Splat, near: float) -> None:
 
 @pytest.mark.parametrize("saturated", [False, True])
 def test_opaque_layers(rasterize: Splat, saturated: bool) -> None:
-    """Gaussians behind the end of a pixel are not drawn; at opacity 1 alpha is clamped and has no gradient."""
+    """Gaussians behind the end of a pixel are not drawn; at opacity 1 alpha is clamped and has no
+    gradient.
+    """
     some = scene(300 if saturated else 1500, 1, 0, size=1.0 if saturated else 0.3)
     some["opacities"] = torch.ones(300) if saturated else 0.9 + 0.1 * some["opacities"]
     assert_agrees(rasterize, some, camera(26, 19), cut=0.05 if saturated else ON_A_CUT)
@@ -136,9 +163,13 @@ def test_opaque_layers(rasterize: Splat, saturated: bool) -> None:
     [((1.0, 1e-6, 1e-6), 0), ((0.3, 3e-7, 3e-7), 1), ((0.3, 0.3, 3e-7), 2)],
     ids=["needle", "short", "disc"],
 )
-def test_axis_ratio_of_a_million(rasterize: Splat, scales: tuple[float, float, float], seed: int) -> None:
-    """Bounds of a needle are wider: its exponent is a small difference of terms of up to ``61^2 / (2 x 0.3) = 6,200``,
-    each rounded by ``2^-24`` of itself in float32, in all by about 1e-3."""
+def test_axis_ratio_of_a_million(
+    rasterize: Splat, scales: tuple[float, float, float], seed: int
+) -> None:
+    """Bounds of a needle are wider: its exponent is a small difference of terms of up to
+    ``61^2 / (2 x 0.3) = 6,200``, each rounded by ``2^-24`` of itself in float32, in all by about
+    1e-3.
+    """
     some = scene(80, 1, seed)
     some["scales"] = torch.tensor(scales).repeat(80, 1)
     wider = {} if scales[1] > 1e-3 else {"image": 1e-3, "gradient": 1e-2}
@@ -167,13 +198,18 @@ def test_thousands_in_one_tile(rasterize: Splat) -> None:
 @pytest.mark.parametrize(
     ("scales", "screen_filter"),
     [
-        (0.005, FILTERS["on"]), (0.02, FILTERS["mip"]), (0.02, ScreenFilter(variance=2.0)),
-        ((1.0, 1e-6, 1e-6), FILTERS["on"]), ((0.3, 0.3, 3e-7), FILTERS["on"]),
+        (0.005, FILTERS["on"]),
+        (0.02, FILTERS["mip"]),
+        (0.02, ScreenFilter(variance=2.0)),
+        ((1.0, 1e-6, 1e-6), FILTERS["on"]),
+        ((0.3, 0.3, 3e-7), FILTERS["on"]),
     ],
     ids=str,
-)  # fmt: skip
+)
 def test_screen_filters(rasterize: Splat, scales: Any, screen_filter: ScreenFilter) -> None:
-    """From a tenth of a pixel to several; needles, which have no area and are not drawn, and discs from the edge."""
+    """From a tenth of a pixel to several; needles, which have no area and are not drawn, and discs
+    from the edge.
+    """
     view, image, cut = camera(70, 50), IMAGE, 0.04
     some = scene(200, 1, 11, size=scales if isinstance(scales, float) else 1.0)
     if isinstance(scales, tuple):
@@ -183,7 +219,9 @@ def test_screen_filters(rasterize: Splat, scales: Any, screen_filter: ScreenFilt
 
 
 def test_an_ellipse_beyond_the_range_of_integers(rasterize: Splat) -> None:
-    """The centre is 1e12 pixels away, the long axis crosses the image; all pixels are finite and in range."""
+    """The centre is 1e12 pixels away, the long axis crosses the image; all pixels are finite and in
+    range.
+    """
     far = 1e8
     view = Camera(torch.eye(4), torch.tensor([[100.0, 0, 64], [0, 100.0, 64], [0, 0, 1]]), 128, 128)
     some = scene(20, 0, 0)
@@ -193,4 +231,9 @@ def test_an_ellipse_beyond_the_range_of_integers(rasterize: Splat) -> None:
     some["quats"][7] = torch.tensor([math.cos(math.pi / 8), 0.0, 0.0, math.sin(math.pi / 8)])
     some["opacities"][7] = 0.9
     image, alpha = rasterize(**some, camera=view, background=BACKGROUND)
-    assert image.isfinite().all() and alpha.isfinite().all() and (alpha >= 0).all() and (alpha <= 1).all()
+    assert (
+        image.isfinite().all()
+        and alpha.isfinite().all()
+        and (alpha >= 0).all()
+        and (alpha <= 1).all()
+    )

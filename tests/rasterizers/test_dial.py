@@ -1,5 +1,6 @@
-"""The CPU's kernels have the dial in them: they draw, keep and differentiate what the default ``draw`` composes, and
-what the reference does in float64."""
+"""The CPU's kernels have the dial in them: they draw, keep and differentiate what the default
+``draw`` composes, and what the reference does in float64.
+"""
 
 import math
 
@@ -26,7 +27,9 @@ Found = tuple[Tensor, Tensor, dict[str, Tensor]]
 def results(rasterizer: Rasterizer, model: Gaussians, s: float, *frozen: str) -> Found:
     """Image and alpha, and the gradients of a random weighting of them, by attribute."""
     random = torch.Generator().manual_seed(3)
-    leaves = {name: x.clone().requires_grad_(name not in frozen) for name, x in model.tensors().items()}
+    leaves = {
+        name: x.clone().requires_grad_(name not in frozen) for name, x in model.tensors().items()
+    }
     leaves["background"] = torch.tensor([0.2, 0.4, 0.6]).to(model.means).requires_grad_()
     drawn = {name: x for name, x in leaves.items() if name != "background"}
     image, alpha = rasterizer.draw(model.replace(**drawn), VIEW, s, background=leaves["background"])
@@ -39,7 +42,9 @@ def results(rasterizer: Rasterizer, model: Gaussians, s: float, *frozen: str) ->
 def away_from_thresholds(model: Gaussians, s: float) -> Gaussians:
     """Without rows that rounding may cull, or draw with less than 1/255."""
     sure = (dial(model, VIEW, s).drawn - 1 / 255).abs() > 1e-5
-    return model.select(sure & (dial(model, VIEW, s * 0.99999).keep == dial(model, VIEW, s * 1.00001).keep))
+    return model.select(
+        sure & (dial(model, VIEW, s * 0.99999).keep == dial(model, VIEW, s * 1.00001).keep)
+    )
 
 
 def assert_same(model: Gaussians, s: float, *frozen: str) -> dict[str, Tensor]:
@@ -52,7 +57,9 @@ def assert_same(model: Gaussians, s: float, *frozen: str) -> dict[str, Tensor]:
             torch.testing.assert_close(found, expected, rtol=0, atol=5e-3, check_dtype=False)
             assert found.numel() == 0 or float((found - expected).abs().mean()) < 3e-5
         for name, expected in want.items():  # one pixel with 1/255 more or less changes a few
-            assert float((slopes[name] - expected).norm()) <= 5e-3 * float(expected.norm()) + 1e-6, name
+            assert (
+                float((slopes[name] - expected).norm()) <= 5e-3 * float(expected.norm()) + 1e-6
+            ), name
         kept = KERNELS.kept(model, VIEW, s)
         assert torch.equal(kept, rasterizer.kept(exact, VIEW, s)) and kept.dtype == torch.bool
     return slopes
@@ -67,10 +74,16 @@ def test_counts_around_sixteen(n: int) -> None:
 
 @settings(max_examples=20, deadline=None)
 @given(
-    s=st.sampled_from([0.0, 1.0, 1.7, 6.0, 40.0]), form=st.sampled_from(FORMS), grows=st.booleans(),
-    seed=st.integers(0, 99), reference=st.sampled_from([0.0, 2.0]), mip=st.booleans(),
-)  # fmt: skip
-def test_any_settings(grows: bool, s: float, seed: int, reference: float, mip: bool, form: str) -> None:
+    s=st.sampled_from([0.0, 1.0, 1.7, 6.0, 40.0]),
+    form=st.sampled_from(FORMS),
+    grows=st.booleans(),
+    seed=st.integers(0, 99),
+    reference=st.sampled_from([0.0, 2.0]),
+    mip=st.booleans(),
+)
+def test_any_settings(
+    grows: bool, s: float, seed: int, reference: float, mip: bool, form: str
+) -> None:
     model = dialled(90, 0, seed, reference_distance=reference, max_sv=45.0, form=form)
     model = model.replace(screen_filter=ScreenFilter(compensate=mip))
     if grows:
@@ -83,7 +96,10 @@ def test_the_end_of_the_reach() -> None:
     model = dialled(3000, 0, 5)
     far = (model.means - VIEW.position).norm(dim=1) * 2 / 3
     faint = model.replace(sigma_d=far / torch.linspace(0.9, 1.01, 3000))[::10]
-    assert 0.8 < KERNELS.kept(faint, VIEW, 2.0).float().mean() < 0.95 and assert_same(faint, 2.0)["sigma_d"].any()
+    assert (
+        0.8 < KERNELS.kept(faint, VIEW, 2.0).float().mean() < 0.95
+        and assert_same(faint, 2.0)["sigma_d"].any()
+    )
     share = 1 + torch.linspace(-1e-5, 1e-5, 3000)
     kept = KERNELS.kept(model.replace(sigma_d=far / share), VIEW, 2.0)
     sure = (share - 1).abs() > 1e-6
@@ -101,7 +117,10 @@ def test_frozen_attributes_and_models_without_a_dial() -> None:
 def test_extreme_values() -> None:
     """Sigma, opacities and growth at their limits, and a Gaussian in the camera's centre."""
     sigmas = [0.0, -1.0, 1e-30, 1e-4, 1.0, SIGMA_MAX, 1e30, math.inf]
-    logits, growths = [-math.inf, -200.0, -4.0, 0.0, 3.0, 90.0, math.inf], [-1e30, -5.0, 0.0, 1.0, 30.0, 1e30]
+    logits, growths = (
+        [-math.inf, -200.0, -4.0, 0.0, 3.0, 90.0, math.inf],
+        [-1e30, -5.0, 0.0, 1.0, 30.0, 1e30],
+    )
     rows = torch.cartesian_prod(*(torch.tensor(x) for x in (sigmas, logits, growths)))
     for s in (0.0, 1.0, 5.0):
         model = dialled(len(rows), 0, 3).replace(sigma_d=rows[:, 0], opacity_logits=rows[:, 1])
@@ -119,9 +138,13 @@ def test_extreme_values() -> None:
 
 @pytest.mark.parametrize("rasterizer", [KERNELS, COMPOSED], ids=["kernels", "composed"])
 def test_a_row_with_infinite_sigma_has_no_dial(rasterizer: Rasterizer) -> None:
-    """It is drawn as without a dial, however far the dial is turned, and its opacity has that gradient."""
+    """It is drawn as without a dial, however far the dial is turned, and its opacity has that
+    gradient.
+    """
     model = gaussians(60, 0, 1)
-    fixed = dialled(60, 0, 1, max_sv=45.0).replace(sigma_d=torch.full((60,), math.inf), growth_d=torch.zeros(60))
+    fixed = dialled(60, 0, 1, max_sv=45.0).replace(
+        sigma_d=torch.full((60,), math.inf), growth_d=torch.zeros(60)
+    )
     image, alpha, slopes = results(rasterizer, fixed, 40.0)
     wanted, want_alpha, want = results(rasterizer, model, 1.0)
     assert torch.equal(image, wanted) and torch.equal(alpha, want_alpha)
@@ -135,12 +158,19 @@ def test_distances_of_another_camera_and_a_growth_that_is_not_finite() -> None:
     model, other = dialled(50, 0, 1), camera(45, 37, fov=70)
     found = [each.draw(model, VIEW, 2.0, seen_from=other)[0] for each in (KERNELS, COMPOSED)]
     assert torch.equal(*found)
-    assert KERNELS.draw(model.replace(growth_d=torch.full((50,), math.nan)), VIEW, 2.0)[1].sum() == 0
+    assert (
+        KERNELS.draw(model.replace(growth_d=torch.full((50,), math.nan)), VIEW, 2.0)[1].sum() == 0
+    )
 
 
 def test_gradients_beyond_the_trained_rows_are_0() -> None:
     model = away_from_thresholds(dialled(90, 1, 2).replace(growth_d=torch.full((90,), 0.5)), 2.0)
-    want, leaves = results(KERNELS, model, 2.0)[2], {k: x.clone().requires_grad_() for k, x in model.tensors().items()}
+    want, leaves = (
+        results(KERNELS, model, 2.0)[2],
+        {k: x.clone().requires_grad_() for k, x in model.tensors().items()},
+    )
     image, _ = KERNELS.draw(model.replace(**leaves), VIEW, 2.0, trained=40)
-    for name, slope in zip(leaves, torch.autograd.grad(image.sum(), list(leaves.values())), strict=True):
+    for name, slope in zip(
+        leaves, torch.autograd.grad(image.sum(), list(leaves.values())), strict=True
+    ):
         assert not slope[40:].any() and bool(slope[:40].any()) == bool(want[name][:40].any()), name

@@ -1,4 +1,6 @@
-"""The page is self-contained and escapes its texts; its charts have log axes, and labels that do not collide."""
+"""The page is self-contained and escapes its texts; its charts have log axes, and labels that do
+not collide.
+"""
 
 import base64
 import io
@@ -21,47 +23,99 @@ NASTY = r'a <b> & "c" $\co$ </script>'
 
 
 def row(s: float, psnr: float | None = 20.0, ms: float = 3.0) -> dict[str, Any]:
-    return {"virtual_scale": s, "psnr": psnr, "ssim": 0.9, "kept": 10 / s, "kept_share": 0.5, "in_view": 9,
-            "frame_ms": ms}  # fmt: skip
+    return {
+        "virtual_scale": s,
+        "psnr": psnr,
+        "ssim": 0.9,
+        "kept": 10 / s,
+        "kept_share": 0.5,
+        "in_view": 9,
+        "frame_ms": ms,
+    }
 
 
 def report(**changes: Any) -> dict[str, Any]:
     made = {"what": NASTY, "verdict": "kept", "measured": "-", "why": NASTY}
     return {
-        "command": "adapt", "version": "1", "model": NASTY, "scene": NASTY, "base_count": 10, "steps": 9,
-        "interrupted": False, "seconds": {"train": 60.0, "total": 215.4}, "machine": {"cpu": NASTY}, "device": "cpu",
-        "notes": [NASTY], "config": {"seed": 1}, "plan": {"decisions": [made]},
-        "rows": [row(s, 30 - s, 20 / s) for s in (1, 2, 5)], "base_rows": [row(1, 29.5, 25)],
+        "command": "adapt",
+        "version": "1",
+        "model": NASTY,
+        "scene": NASTY,
+        "base_count": 10,
+        "steps": 9,
+        "interrupted": False,
+        "seconds": {"train": 60.0, "total": 215.4},
+        "machine": {"cpu": NASTY},
+        "device": "cpu",
+        "notes": [NASTY],
+        "config": {"seed": 1},
+        "plan": {"decisions": [made]},
+        "rows": [row(s, 30 - s, 20 / s) for s in (1, 2, 5)],
+        "base_rows": [row(1, 29.5, 25)],
         "detached_row": row(1, 19),
-    } | changes  # fmt: skip
+    } | changes
 
 
-def test_page_is_self_contained_and_escaped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    frames = [Picture(np.full((6, 8, 3), level, np.float32), NASTY, NASTY) for level in (0.0, 0.5, 1.0)]
-    training = {"views": 2, "base_psnr": 29.0, "curves": [{"label": NASTY, "points": [{"seconds": 2, "psnr": 20}] * 2}]}
-    written = write_page(tmp_path / "page.html", report(), frames, {"photograph": frames[0]}, training)
-    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(path.name for path in written.values())
+def test_page_is_self_contained_and_escaped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    frames = [
+        Picture(np.full((6, 8, 3), level, np.float32), NASTY, NASTY) for level in (0.0, 0.5, 1.0)
+    ]
+    training = {
+        "views": 2,
+        "base_psnr": 29.0,
+        "curves": [{"label": NASTY, "points": [{"seconds": 2, "psnr": 20}] * 2}],
+    }
+    written = write_page(
+        tmp_path / "page.html", report(), frames, {"photograph": frames[0]}, training
+    )
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(
+        path.name for path in written.values()
+    )
     text = (tmp_path / "page.html").read_text(encoding="utf-8")
     visible = text.partition('<script type="application/json"')[0]
     assert "a <b>" not in visible and "a &lt;b&gt; &amp;" in visible and "9 steps on" in visible
-    assert "3:35 minutes in all" in visible and "29.00 dB" in visible and "base, unadapted" in visible
-    assert not re.search(r"<link|<iframe|<script[^>]* src|https?://(?!www\.w3\.org)|@import|url\((?!#)", text)
-    assert all(url.startswith(("data:", "#")) for url in re.findall(r'\b(?:src|href)="([^"]*)"', text))
+    assert (
+        "3:35 minutes in all" in visible and "29.00 dB" in visible and "base, unadapted" in visible
+    )
+    assert not re.search(
+        r"<link|<iframe|<script[^>]* src|https?://(?!www\.w3\.org)|@import|url\((?!#)", text
+    )
+    assert all(
+        url.startswith(("data:", "#")) for url in re.findall(r'\b(?:src|href)="([^"]*)"', text)
+    )
     names = re.findall(r'\bid="([^"]+)"', text)
     assert len(names) == len(set(names)) > 10
     assert ".tiles > div {" in visible
-    assert {"var(--ink)", "var(--quiet)", "var(--series-1)"} <= set(re.findall(r"var\([^)]*\)", text.split("<svg")[1]))
+    assert {"var(--ink)", "var(--quiet)", "var(--series-1)"} <= set(
+        re.findall(r"var\([^)]*\)", text.split("<svg")[1])
+    )
     stored = re.search(r'<script type="application/json" id="data">(.*?)</script>', text, re.S)
-    assert stored and json.loads(stored[1]) == {"report": report(), "training": training} and "<" not in stored[1]
-    assert re.findall(r'<img [^>]*data-name="([^"]*)" data-title', text) == ["", "", "", "photograph"]
+    assert (
+        stored
+        and json.loads(stored[1]) == {"report": report(), "training": training}
+        and "<" not in stored[1]
+    )
+    assert re.findall(r'<img [^>]*data-name="([^"]*)" data-title', text) == [
+        "",
+        "",
+        "",
+        "photograph",
+    ]
     for png in (written["rendering"], written["adapting"]):
         pixels = np.asarray(Image.open(png).convert("RGB"))
         assert min(pixels.shape[:2]) > 500 and 0.005 < (pixels < 128).any(2).mean() < 0.3
     own = report(rows=[], base_rows=[], detached_row=None, teacher="checkpoint")
     write_page(tmp_path / "page.html", own, frames, {"base": frames[0]})
     text = (tmp_path / "page.html").read_text(encoding="utf-8")
-    assert all(part in text for part in ("Nothing was measured", "steps on synthetic views", "hold for base"))
-    assert re.findall(r"\S+ photograph", text[: text.index("Settings and machine")]) == ["without photograph"]
+    assert all(
+        part in text
+        for part in ("Nothing was measured", "steps on synthetic views", "hold for base")
+    )
+    assert re.findall(r"\S+ photograph", text[: text.index("Settings and machine")]) == [
+        "without photograph"
+    ]
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     with pytest.raises(ClodError, match="pip install matplotlib"):
         write_page(tmp_path / "other.html", report(), [], {})
@@ -71,26 +125,37 @@ def test_page_is_self_contained_and_escaped(tmp_path: Path, monkeypatch: pytest.
 def test_images_are_embedded() -> None:
     """Bytes and floats keep their pixels; wide ones are scaled down."""
     ramp = np.linspace(0, 255, 32 * 24 * 3).reshape(24, 32, 3)
-    images = ramp.astype(np.uint8), (ramp / 255).astype(np.float32), np.zeros((300, 2000, 3), np.uint8)
+    images = (
+        ramp.astype(np.uint8),
+        (ramp / 255).astype(np.float32),
+        np.zeros((300, 2000, 3), np.uint8),
+    )
     urls = [Picture(each, "").url.removeprefix("data:image/webp;base64,") for each in images]
     *ramps, wide = (Image.open(io.BytesIO(base64.b64decode(url))) for url in urls)
     assert wide.size == (1000, 150)
-    assert all(np.abs(np.asarray(each.convert("RGB")).astype(float) - ramp).mean() < 4 for each in ramps)
+    assert all(
+        np.abs(np.asarray(each.convert("RGB")).astype(float) - ramp).mean() < 4 for each in ramps
+    )
 
 
 def test_charts() -> None:
-    """Log axes with PSNR on the right; where dial values are near each other, not all have labels."""
+    """Log axes with PSNR on the right; where dial values are near each other, not all have
+    labels.
+    """
     dials = (1.0, 1.01, 1.02, 2.0, 4.0)
     series = [
-        Series("dial", [row(s, 30 - s, 20 / s) for s in dials], dial=True), Series("base", [row(1, 29.5, 25)]),
-    ]  # fmt: skip
+        Series("dial", [row(s, 30 - s, 20 / s) for s in dials], dial=True),
+        Series("base", [row(1, 29.5, 25)]),
+    ]
     with new_figure((6, 4)) as figure:
         draw_rendering(figure.subplots(), series)
         figure.canvas.draw()
         (left,) = figure.axes
         assert left.get_xscale() == "log" and left.yaxis_inverted()
         dial, base = left.get_lines()
-        assert dial.get_xdata().tolist() == [20 / s for s in dials] and base.get_linestyle() == "None"
+        assert (
+            dial.get_xdata().tolist() == [20 / s for s in dials] and base.get_linestyle() == "None"
+        )
         assert dial.get_ydata().tolist() == [30 - s for s in dials]
         labels = [text for text in left.texts if text.get_text().startswith("s = ")]
         assert sorted(text.get_text() for text in labels) == ["s = 1", "s = 2", "s = 4"]
@@ -102,20 +167,34 @@ def test_charts() -> None:
 
 
 def test_series_of_reports() -> None:
-    """The dial, the base and its pruned versions, other files, and the file without its dial; rows without a PSNR."""
+    """The dial, the base and its pruned versions, other files, and the file without its dial; rows
+    without a PSNR.
+    """
     compared = {
-        "rows": [row(1), row(3), row(5, None)], "base_row": row(1, 22), "detached_row": row(1, 19),
-        "ranked": [{"by": by, "row": row(1, psnr)} for psnr in (21, 17) for by in ("opacity", "removal error")],
+        "rows": [row(1), row(3), row(5, None)],
+        "base_row": row(1, 22),
+        "detached_row": row(1, 19),
+        "ranked": [
+            {"by": by, "row": row(1, psnr)}
+            for psnr in (21, 17)
+            for by in ("opacity", "removal error")
+        ],
         "against": [
             {"model": "x/a.ply", "label": "x_a", "theirs": row(1)},
             *({"model": "y/a.ply", "label": "y_a", "theirs": row(s)} for s in (1, 3)),
         ],
-    }  # fmt: skip
-    assert {one.label: (one.dial, [r["psnr"] for r in one.rows]) for one in series_of(compared)} == {
-        "dial, one file": (True, [20, 20]), "base, unadapted": (False, [22]),
-        "base pruned by opacity": (False, [21, 17]), "base pruned by removal error": (False, [21, 17]),
-        "x_a": (False, [20]), "y_a": (True, [20, 20]), "plain viewer, no dial": (False, [19]),
-    }  # fmt: skip
+    }
+    assert {
+        one.label: (one.dial, [r["psnr"] for r in one.rows]) for one in series_of(compared)
+    } == {
+        "dial, one file": (True, [20, 20]),
+        "base, unadapted": (False, [22]),
+        "base pruned by opacity": (False, [21, 17]),
+        "base pruned by removal error": (False, [21, 17]),
+        "x_a": (False, [20]),
+        "y_a": (True, [20, 20]),
+        "plain viewer, no dial": (False, [19]),
+    }
     (plain,) = series_of({"rows": [row(1), row(2)], "attenuation": None})
     assert (plain.label, plain.dial) == ("the file, no dial", False)
     assert series_of({"rows": [], "base_rows": [], "detached_row": None}) == []

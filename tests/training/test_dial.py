@@ -25,7 +25,9 @@ def trainable(base: Gaussians, form: str = "gsplat") -> torch.nn.ParameterDict:
     if form == "splatfacto":
         named["features_dc"], named["features_rest"] = named.pop("sh0")[:, 0], named.pop("shN")
         named["opacities"] = named["opacities"][:, None]
-    return torch.nn.ParameterDict({name: torch.nn.Parameter(value.clone()) for name, value in named.items()})
+    return torch.nn.ParameterDict(
+        {name: torch.nn.Parameter(value.clone()) for name, value in named.items()}
+    )
 
 
 def loss_of(dial: Dial, scene: Scene, s: float) -> Tensor:
@@ -38,7 +40,8 @@ def test_the_objective_is_that_of_adapt(captured: Pair) -> None:
     base, scene = captured
     splats, s = trainable(base), 2.3
     dial = attach(splats, scene, seed=3)
-    counted = (OURS.counted * MAX_SV) ** np.random.default_rng(3).random(2)[1]  # the first is of the dial values
+    # the first is of the dial values
+    counted = (OURS.counted * MAX_SV) ** np.random.default_rng(3).random(2)[1]
     dial.loss(s, loss_of(dial, scene, s)).backward()
     run = Trainer(dial.gaussians(), scene.train, AdaptConfig(lr_shN=1e-3))
     names = {"log_scales": "scales", "opacity_logits": "opacities"}
@@ -46,15 +49,22 @@ def test_the_objective_is_that_of_adapt(captured: Pair) -> None:
         own: Any = getattr(dial, name, None)
         found = (splats[names.get(name, name)] if own is None else own).grad
         assert gradient.abs().max() > 0, name
-        torch.testing.assert_close(found, gradient, rtol=1e-3, atol=1e-5 * float(gradient.abs().max()), msg=name)
+        torch.testing.assert_close(
+            found, gradient, rtol=1e-3, atol=1e-5 * float(gradient.abs().max()), msg=name
+        )
     term = dial.count_loss(s, torch.tensor(0.3))
-    kept = attenuate(base.opacity_logits, dial.sigma_d, dial.typical, s, dial.attenuation).keep.float().mean()
+    kept = (
+        attenuate(base.opacity_logits, dial.sigma_d, dial.typical, s, dial.attenuation)
+        .keep.float()
+        .mean()
+    )
     wanted = 0.3 * dial.config.reg_weight * (kept.item() / dial.target_share(s) - 1) ** 2
     assert term.item() == pytest.approx(wanted, rel=1e-3)
     assert dial.count_loss(0.5, torch.tensor(0.3)) == 0 and dial.target_share(0.5) == 1
 
 
-@pytest.mark.filterwarnings("error")  # of numbers read from tensors in a graph: the initialization needs none
+# of numbers read from tensors in a graph: the initialization needs none
+@pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("form", ["gsplat", "splatfacto"])
 def test_trainers_tensors_are_used_as_they_are(captured: Pair, form: str) -> None:
     base, scene = captured
@@ -76,7 +86,9 @@ def test_rates_and_ranges_of_the_parameters(captured: Pair) -> None:
     rates = {group["name"]: group["lr"] for group in dial.param_groups(splats=True)}
     assert rates["sh0"] == 2 and rates["shN"] == 0 and rates["opacities"] == 2 * config.lr_opacities
     assert rates["log_sigma"] == 2 * config.lr_sigma and rates["growth_d"] == 2 * config.lr_growth
-    grown = attach(dial.gaussians().replace(growth_d=torch.zeros(len(base)).requires_grad_()), scene)
+    grown = attach(
+        dial.gaussians().replace(growth_d=torch.zeros(len(base)).requires_grad_()), scene
+    )
     named = {group["name"]: group["params"][0] for group in grown.param_groups(splats=True)}
     assert named["growth_d"] is grown.growth_d  # and not the file's
     with torch.no_grad():
@@ -92,10 +104,17 @@ def test_what_does_not_fit_is_refused(captured: Pair) -> None:
     dial = attach(splats, scene)
     splats.update(trainable(base.select(torch.arange(len(base)) < 5)))
     for call, message in (
-        (lambda: attach(base, scene, form="paper"), "call adapt"), (lambda: attach(base, []), "no training views"),
-        (lambda: attach({"means": base.means}, scene), "needs quats, scales, opacities, sh0 too, it has means"),
+        (lambda: attach(base, scene, form="paper"), "call adapt"),
+        (lambda: attach(base, []), "no training views"),
+        (
+            lambda: attach({"means": base.means}, scene),
+            "needs quats, scales, opacities, sh0 too, it has means",
+        ),
         (dial.gaussians, "5 splats now, but the dial is for 300"),
-        (lambda: attach(base, scene).param_groups(splats=True), "no splat requires a gradient: attach copies"),
-    ):  # fmt: skip
+        (
+            lambda: attach(base, scene).param_groups(splats=True),
+            "no splat requires a gradient: attach copies",
+        ),
+    ):
         with pytest.raises(ClodError, match=message):
             call()

@@ -1,4 +1,6 @@
-"""Near and far Gaussians: the equation, merging, training, and files, of which plain viewers show the checkpoint."""
+"""Near and far Gaussians: the equation, merging, training, and files, of which plain viewers show
+the checkpoint.
+"""
 
 from pathlib import Path
 
@@ -35,7 +37,9 @@ def adapted(both: tuple[clod.Gaussians, clod.Scene]) -> clod.Gaussians:
 
 
 def test_far_ones_take_over_from_near_ones() -> None:
-    """Continuously, at near_distance; opacities of both sum to the near one's where the far one does not fade yet."""
+    """Continuously, at near_distance; opacities of both sum to the near one's where the far one
+    does not fade yet.
+    """
     config = AttenuationConfig(near_distance=2.0)
     d, s = torch.linspace(0, 4, 4001, dtype=torch.float64), 1.5
     near, far = (
@@ -43,7 +47,9 @@ def test_far_ones_take_over_from_near_ones() -> None:
         for sigma in (0.0, 1e6)
     )
     assert torch.allclose(near.drawn + far.drawn, torch.tensor(0.8, dtype=torch.float64), atol=1e-9)
-    assert torch.equal(near.keep, d * s < 2) and torch.equal(far.keep, (d * s / 2).square() * 5 - 4 > 0)
+    assert torch.equal(near.keep, d * s < 2) and torch.equal(
+        far.keep, (d * s / 2).square() * 5 - 4 > 0
+    )
     slopes = torch.stack([near.drawn, far.drawn]).diff(dim=1).abs() / d.clamp(min=1e-9).log().diff()
     assert float(slopes[:, 1:].max()) <= 10 * 0.8 + 1e-6
 
@@ -53,13 +59,19 @@ def test_rasterizers_agree(adapted: clod.Gaussians) -> None:
         for s in (0.0, 1.0, 2.0, 4.0):
             ours, theirs = (one.draw(adapted, camera, s)[0] for one in (cpu.RASTERIZER, PLAIN))
             assert float((ours - theirs).abs().max()) < 2e-3
-            assert torch.equal(cpu.RASTERIZER.kept(adapted, camera, s), PLAIN.kept(adapted, camera, s))
+            assert torch.equal(
+                cpu.RASTERIZER.kept(adapted, camera, s), PLAIN.kept(adapted, camera, s)
+            )
 
 
 def test_merging_keeps_mass_and_centre() -> None:
     some = gaussians(400, 1, 3)
     few = merge(some, torch.ones(400), 100)
-    assert len(few) == 100 and few.sh_degree == 1 and all(x.isfinite().all() for x in few.tensors().values())
+    assert (
+        len(few) == 100
+        and few.sh_degree == 1
+        and all(x.isfinite().all() for x in few.tensors().values())
+    )
     assert torch.allclose(few.means.mean(0), some.means.mean(0), atol=0.3)
     assert_equal(merge(some, torch.ones(400), 400), merge(some, torch.ones(400), 500))
     twins = some.select(torch.arange(50).repeat(2))
@@ -69,7 +81,9 @@ def test_merging_keeps_mass_and_centre() -> None:
     }
 
 
-def test_near_ones_are_the_checkpoint(adapted: clod.Gaussians, both: tuple[clod.Gaussians, clod.Scene]) -> None:
+def test_near_ones_are_the_checkpoint(
+    adapted: clod.Gaussians, both: tuple[clod.Gaussians, clod.Scene]
+) -> None:
     base, scene = both
     assert adapted.whole == len(base) < len(adapted) and adapted.near is not None
     assert_equal(clod.detach(adapted), base)
@@ -85,7 +99,10 @@ def test_files(adapted: clod.Gaussians, tmp_path: Path, suffix: str) -> None:
     assert found.whole == adapted.whole and found.attenuation == adapted.attenuation
     exact = suffix in (".ply", ".safetensors", ".pt")
     assert torch.allclose(
-        found.opacity_logits, adapted.opacity_logits, atol=0 if exact else 0.5, rtol=0 if exact else 0.1
+        found.opacity_logits,
+        adapted.opacity_logits,
+        atol=0 if exact else 0.5,
+        rtol=0 if exact else 0.1,
     )
     if suffix == ".ply":
         assert_equal(found, adapted)
@@ -97,18 +114,26 @@ def test_the_adapter_has_the_far_ones(
     adapted: clod.Gaussians, both: tuple[clod.Gaussians, clod.Scene], tmp_path: Path
 ) -> None:
     adapter = clod.extract(both[0], adapted, fingerprint="0" * 64, config={})
-    assert not adapter.updates and {*adapter.added} == {*ATTRIBUTES} and adapter.base_count == len(both[0])
+    assert (
+        not adapter.updates
+        and {*adapter.added} == {*ATTRIBUTES}
+        and adapter.base_count == len(both[0])
+    )
     clod.save_adapter(tmp_path / "a.safetensors", adapter)
     assert_equal(clod.load_adapter(tmp_path / "a.safetensors").apply(both[0]), adapted)
 
 
-def test_counts_and_baking(adapted: clod.Gaussians, both: tuple[clod.Gaussians, clod.Scene]) -> None:
+def test_counts_and_baking(
+    adapted: clod.Gaussians, both: tuple[clod.Gaussians, clod.Scene]
+) -> None:
     cameras = [view.camera for view in both[1].train]
     found = dial_for(adapted, keep=80, cameras=cameras, baked=True).virtual_scale
     assert 60 < len(bake(adapted, found, cameras=cameras)) <= 80
     camera, s = cameras[0], 1.7
     assert torch.allclose(
-        clod.render(bake(adapted, s, camera), camera).image, clod.render(adapted, camera, s).image, atol=1e-3
+        clod.render(bake(adapted, s, camera), camera).image,
+        clod.render(adapted, camera, s).image,
+        atol=1e-3,
     )
     with pytest.raises(clod.ClodError, match="have no order"):
         order_by_extinction(adapted, cameras)

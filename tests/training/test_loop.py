@@ -38,12 +38,17 @@ def test_training_improves_psnr(captured: Pair, trained: Gaussians) -> None:
     base, scene = captured
     before = adapt(base, scene, config_of(iters=0)).gaussians
     for views in (scene.train, scene.test):
-        rows = zip(*(evaluate(each, views, (1.5, 2.0, 3.0, 5.0)) for each in (before, trained)), strict=True)
+        rows = zip(
+            *(evaluate(each, views, (1.5, 2.0, 3.0, 5.0)) for each in (before, trained)),
+            strict=True,
+        )
         assert all(new.psnr > old.psnr + 0.5 for old, new in rows)
     plain = adapt(base, scene, config_of(iters=120, growth="off")).gaussians
     found, wanted = (evaluate(one, scene.test, (1.0, 5.0)) for one in (trained, plain))
     assert found[1].psnr > wanted[1].psnr + 0.1 and found[0].psnr > wanted[0].psnr - 0.3
-    assert [row.kept_share for row in found] == pytest.approx([row.kept_share for row in wanted], abs=0.03)
+    assert [row.kept_share for row in found] == pytest.approx(
+        [row.kept_share for row in wanted], abs=0.03
+    )
 
 
 def test_zero_steps_return_the_initialization(captured: Pair) -> None:
@@ -51,9 +56,12 @@ def test_zero_steps_return_the_initialization(captured: Pair) -> None:
     result = adapt(base, scene, config_of(iters=0))
     want = with_far(base, scene.train, config_of())
     assert result.steps == 0 and not result.interrupted
-    assert all(torch.equal(getattr(result.gaussians, name), getattr(want, name)) for name in ATTRIBUTES)
+    assert all(
+        torch.equal(getattr(result.gaussians, name), getattr(want, name)) for name in ATTRIBUTES
+    )
     assert_equal(detach(result.gaussians), base)
-    torch.testing.assert_close(result.gaussians.sigma_d, want.sigma_d, rtol=1e-5, atol=0)  # by way of its logarithm
+    # by way of its logarithm
+    torch.testing.assert_close(result.gaussians.sigma_d, want.sigma_d, rtol=1e-5, atol=0)
     assert result.gaussians.attenuation == want.attenuation and want.attenuation.scene_distance == 1
     assert want.attenuation.reference_distance == pytest.approx(scene_distance(base, scene.train))
     # At SIGMA_MAX no gradient reaches sigma_d, so a dial of with_dial is initialized, too.
@@ -61,19 +69,27 @@ def test_zero_steps_return_the_initialization(captured: Pair) -> None:
 
 
 def test_a_second_run_continues_from_sigma_d(captured: Pair, trained: Gaussians) -> None:
-    """No importance pass; the unit is the file's reference distance, or the views' where another tool dropped it."""
+    """No importance pass; the unit is the file's reference distance, or the views' where another
+    tool dropped it.
+    """
     first, phases, config = trained, list[Phase](), config_of(iters=1, max_sv=3.0)
     unknown = first.replace(attenuation=replace(first.attenuation, reference_distance=0.0))
     for given, want in (
-        (first, first.attenuation.reference_distance), (unknown, scene_distance(first, captured[1].train)),
-    ):  # fmt: skip
+        (first, first.attenuation.reference_distance),
+        (unknown, scene_distance(first, captured[1].train)),
+    ):
         result = adapt(given, captured[1], config, lambda now: phases.append(now.phase)).gaussians
         found = result.attenuation.reference_distance
         assert found == pytest.approx(want) and want > 2 and set(phases) == {Phase.TRAINING}
-        assert result.attenuation == replace(first.attenuation, max_sv=3.0, reference_distance=found)
+        assert result.attenuation == replace(
+            first.attenuation, max_sv=3.0, reference_distance=found
+        )
         far = first.sigma_d > 0
-        assert (result.sigma_d / first.sigma_d)[far].log().abs().max() <= 5.1e-2  # a step of log sigma
-        assert (result.growth_d - first.growth_d).abs().max() <= 1.01e-2 and first.growth_d.unique().numel() > 50
+        # a step of log sigma
+        assert (result.sigma_d / first.sigma_d)[far].log().abs().max() <= 5.1e-2
+        assert (
+            result.growth_d - first.growth_d
+        ).abs().max() <= 1.01e-2 and first.growth_d.unique().numel() > 50
     other = with_dial(captured[0], torch.full((len(captured[0]),), 1.5), AttenuationConfig())
     with pytest.raises(ClodError, match="dial has no far Gaussians"):
         adapt(other, captured[1], config)
@@ -87,7 +103,9 @@ def test_result_is_the_mean_of_the_last_steps(captured: Pair) -> None:
     sigma_d = with_distance(found, states[9].attenuation.scene_distance).sigma_d
     for name, got in (*found.tensors().items(), ("log_sigma", sigma_d.log())):
         if name != "sigma_d":
-            mean = torch.stack([states[step].tensors[f"parameter.{name}"] for step in (9, 10)]).mean(0)
+            mean = torch.stack(
+                [states[step].tensors[f"parameter.{name}"] for step in (9, 10)]
+            ).mean(0)
             torch.testing.assert_close(got, mean)
 
 
@@ -99,7 +117,8 @@ def test_time_budget_ends_training(captured: Pair) -> None:
     assert adapt(*captured, config_of(iters=3, time_budget=60.0)).steps == 3
     result = adapt(*captured, config, None, replace(states[3], seconds=0.18))
     assert 3 < result.steps < 10_000 and 0.2 <= result.seconds < 5
-    assert adapt(*captured, config_of(batch=4096, time_budget=0.2)).seconds < 3  # within the first step
+    # within the first step
+    assert adapt(*captured, config_of(batch=4096, time_budget=0.2)).seconds < 3
 
 
 def test_a_listener_that_stops_returns_the_result_so_far(captured: Pair) -> None:
@@ -141,16 +160,23 @@ def test_bad_inputs_are_refused(captured: Pair) -> None:
         for name, value in (("sh0", math.inf), ("opacity_logits", math.nan)):
             values = getattr(base, name).clone()
             values[5:7] = value
-            with pytest.raises(ClodError, match=rf"{name} is not finite in 2 rows \(the first is 5\); leave out"):
+            with pytest.raises(
+                ClodError, match=rf"{name} is not finite in 2 rows \(the first is 5\); leave out"
+            ):
                 run(base.replace(**{name: values}), scene, config_of(iters=1))
     huge = torch.full_like(base.sh0, 1e38)
     huge[7] = 2e38
-    for config in (config_of(iters=1), AdaptConfig.paper(iters=1)):  # looked at before training, or by its first step
-        with pytest.raises(ClodError, match="not finite.* the largest sh0 is 2e.38, in row 7: leave out such rows"):
+    # looked at before training, or by its first step
+    for config in (config_of(iters=1), AdaptConfig.paper(iters=1)):
+        with pytest.raises(
+            ClodError, match="not finite.* the largest sh0 is 2e.38, in row 7: leave out such rows"
+        ):
             adapt(base.replace(sh0=huge), Scene(scene.train[:1], ()), config)
 
 
-def test_a_row_with_a_nonfinite_gradient_is_not_stepped(captured: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_row_with_a_nonfinite_gradient_is_not_stepped(
+    captured: Pair, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Only in that step: other rows move, and so does the row in later steps."""
 
     def spoil(found: Any) -> Any:
@@ -160,10 +186,18 @@ def test_a_row_with_a_nonfinite_gradient_is_not_stepped(captured: Pair, monkeypa
     base, scene = captured
     change_step(monkeypatch, 1, spoil)
     seen, config = list[Gaussians](), config_of(iters=12)
-    result = adapt(base, scene, config, lambda p: seen.append(copy.deepcopy(p.gaussians())) if p.state else None)
-    assert result.held == 2 and all(value.isfinite().all() for value in result.gaussians.tensors().values())
+    result = adapt(
+        base,
+        scene,
+        config,
+        lambda p: seen.append(copy.deepcopy(p.gaussians())) if p.state else None,
+    )
+    assert result.held == 2 and all(
+        value.isfinite().all() for value in result.gaussians.tensors().values()
+    )
     first, after, last = (
-        each.sigma_d[len(base) :] for each in (with_far(base, scene.train, config), seen[0], result.gaussians)
+        each.sigma_d[len(base) :]
+        for each in (with_far(base, scene.train, config), seen[0], result.gaussians)
     )
     moved = (after / first - 1).abs() > 1e-5
     assert not moved[3:5].any() and moved.any() and (last[3:5] != first[3:5]).all()
@@ -172,14 +206,24 @@ def test_a_row_with_a_nonfinite_gradient_is_not_stepped(captured: Pair, monkeypa
 def test_growth_begins_at_the_median_distance_in_the_second_nearest_view(captured: Pair) -> None:
     base, scene = captured
     nearest, second = sorted(scene.train, key=lambda view: scene_distance(base, [view]))[:2]
-    assert scene_distance(base, scene.train) == scene_distance(base, [second]) > scene_distance(base, [nearest])
-    median = (base.means - second.camera.position).norm(dim=1)[in_frustum(base.means, second.camera)].median()
+    assert (
+        scene_distance(base, scene.train)
+        == scene_distance(base, [second])
+        > scene_distance(base, [nearest])
+    )
+    median = (
+        (base.means - second.camera.position)
+        .norm(dim=1)[in_frustum(base.means, second.camera)]
+        .median()
+    )
     assert scene_distance(base, [second]) == pytest.approx(float(median), rel=1e-5)
 
 
 def test_settings_as_keywords(captured: Pair) -> None:
     adapted = adapt(*captured, config_of(iters=3), max_sv=7, growth="off")
-    assert repr(adapted).startswith("Adapted(Gaussians(300 and 240 far, SH degree 1, dial to 7, cpu), 3 steps, ")
+    assert repr(adapted).startswith(
+        "Adapted(Gaussians(300 and 240 far, SH degree 1, dial to 7, cpu), 3 steps, "
+    )
     assert adapted.gaussians.growth_d is None
     with pytest.raises(TypeError, match="max_vs"):
         adapt(*captured, max_vs=7)
@@ -192,8 +236,12 @@ def test_numpy_that_raises_changes_nothing(captured: Pair) -> None:
     assert_equal(strict.gaussians, adapt(*captured, config_of(iters=3), max_sv=3).gaussians)
 
 
-def test_a_bar_by_default(captured: Pair, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    """On a terminal or in a notebook; not elsewhere, not with a listener of one's own, and not with False."""
+def test_a_bar_by_default(
+    captured: Pair, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """On a terminal or in a notebook; not elsewhere, not with a listener of one's own, and not with
+    False.
+    """
     adapt(*captured, iters=1)
     assert capsys.readouterr().err == ""
     monkeypatch.setitem(sys.modules, "ipykernel", ModuleType("ipykernel"))
@@ -214,7 +262,9 @@ def test_a_group_of_one_changes_no_bit() -> None:
         assert_equal(found.gaussians, want.gaussians)
         assert found.waiting > 0 and want.waiting == want.exchanging == 0 and found.lost is None
         peers.size = 3
-        with pytest.raises(ClodError, match="batch is 2, it must be at least 3, a view for each of the processes"):
+        with pytest.raises(
+            ClodError, match="batch is 2, it must be at least 3, a view for each of the processes"
+        ):
             adapt(base, scene, config, group=peers)
 
 

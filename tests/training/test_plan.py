@@ -8,7 +8,17 @@ from statistics import fmean
 import pytest
 import torch
 
-from clod_adapter import AdaptConfig, ClodError, Decision, Gaussians, Override, Plan, Scene, make_plan, render
+from clod_adapter import (
+    AdaptConfig,
+    ClodError,
+    Decision,
+    Gaussians,
+    Override,
+    Plan,
+    Scene,
+    make_plan,
+    render,
+)
 from clod_adapter.adapter import detach
 from clod_adapter.initialization.importance import removal_error
 from clod_adapter.training.far import supposed_error
@@ -41,9 +51,20 @@ def test_sh_degrees_are_kept_or_left_out(visible: Pair) -> None:
     faint = base.replace(shN=1e-5 * base.shN)
     plan = make_plan(faint, scene, CONFIG)
     assert verdicts(plan)["SH degree 1"] == "left out" and plan.sh_degree == 0
-    assert plan.start.sh_degree == 0 and torch.equal(detach(plan.adapt(scene).gaussians).shN, faint.shN)
-    empty = make_plan(base.replace(shN=torch.zeros(len(base), 15, 3)), scene, CONFIG, Override(keep=ALL - {"bands"}))
-    assert empty.decisions[0].what == "SH degree 1 to 3" and empty.decisions[0].number == 0 and empty.sh_degree == 0
+    assert plan.start.sh_degree == 0 and torch.equal(
+        detach(plan.adapt(scene).gaussians).shN, faint.shN
+    )
+    empty = make_plan(
+        base.replace(shN=torch.zeros(len(base), 15, 3)),
+        scene,
+        CONFIG,
+        Override(keep=ALL - {"bands"}),
+    )
+    assert (
+        empty.decisions[0].what == "SH degree 1 to 3"
+        and empty.decisions[0].number == 0
+        and empty.sh_degree == 0
+    )
     # A view that gains makes up for none that loses.
     strong, cameras = base.replace(shN=20 * base.shN), [view.camera for view in scene.train[:4]]
     mixed = (*photograph(strong, cameras[:2]), *photograph(strong.without_bands(0), cameras[2:]))
@@ -56,43 +77,62 @@ def test_the_far_end_is_told(visible: Pair) -> None:
     """The share that the start keeps at max_sv, and the max_sv at which few are kept."""
     plan = make_plan(*visible, CONFIG)
     (told,) = (f"{one.what} {one.why}" for one in plan.decisions if "at s = 4" in one.what)
-    kept, few, farther = map(int, re.search(r"(\d+)% at .*?(\d+)% with --max-sv (\d+)", told).groups())
+    kept, few, farther = map(
+        int, re.search(r"(\d+)% at .*?(\d+)% with --max-sv (\d+)", told).groups()
+    )
     start = plan.start
 
     def percent(s: float) -> float:
-        return 100 * fmean(int(render(start, view.camera, s).kept.sum()) / start.whole for view in visible[1].train)
+        return 100 * fmean(
+            int(render(start, view.camera, s).kept.sum()) / start.whole for view in visible[1].train
+        )
 
-    assert percent(4.0) == pytest.approx(kept, abs=0.51) and percent(farther + 1) <= few < percent(farther / 1.2)
+    assert percent(4.0) == pytest.approx(kept, abs=0.51) and percent(farther + 1) <= few < percent(
+        farther / 1.2
+    )
 
 
 def test_impossible_overrides_are_refused() -> None:
-    with pytest.raises(ClodError, match=r"'colour' is not part of a plan; the names are bands, means"):
+    with pytest.raises(
+        ClodError, match=r"'colour' is not part of a plan; the names are bands, means"
+    ):
         Override(keep=frozenset({"colour"}))
     with pytest.raises(ClodError, match="'quats' is both kept and left out"):
         Override(frozenset({"quats", "bands"}), frozenset({"quats"}))
 
 
 def test_a_resumed_plan_gives_the_same_bits(visible: Pair) -> None:
-    """A plan that is made again is the same, and resumes to the same bits; what is frozen is unchanged."""
+    """A plan that is made again is the same, and resumes to the same bits; what is frozen is
+    unchanged.
+    """
     base, scene = visible
-    plan, again = (make_plan(base, scene, CONFIG, Override(leave_out=frozenset({"means", "scales"}))) for _ in "ab")
+    plan, again = (
+        make_plan(base, scene, CONFIG, Override(leave_out=frozenset({"means", "scales"})))
+        for _ in "ab"
+    )
     states = dict[int, TrainingState]()
     assert plan.decisions == again.decisions and json.loads(json.dumps(plan.as_dict()))["decisions"]
     whole = plan.adapt(scene, states_of({12}, states)).gaussians
     found = again.adapt(scene, resume=states[12]).gaussians
     assert_equal(found, whole)
     assert_equal(detach(found), base)
-    assert torch.equal(found.means, plan.start.means) and not torch.equal(found.quats, plan.start.quats)
+    assert torch.equal(found.means, plan.start.means) and not torch.equal(
+        found.quats, plan.start.quats
+    )
 
 
 def test_what_no_placed_camera_shows_is_supposed_to_matter() -> None:
-    """As much as shown Gaussians of its opacity and size; what is opaque all over has no derivative, and is shown."""
+    """As much as shown Gaussians of its opacity and size; what is opaque all over has no
+    derivative, and is shown.
+    """
     base = gaussians(200, 0, 0, size=0.1)
     base.means[:20] += torch.tensor([0.0, 80.0, 0.0])
     error = removal_error(base, photograph(base, ring(6, 40, 30)))
     error[30], base.opacity_logits[30] = 0.0, math.inf
     found = supposed_error(base, error)
     assert (
-        (error[:20] == 0).all() and (found[:20] > 0).all() and torch.equal(found[20:][error[20:] > 0], error[error > 0])
+        (error[:20] == 0).all()
+        and (found[:20] > 0).all()
+        and torch.equal(found[20:][error[20:] > 0], error[error > 0])
     )
     assert found[30] == 0 and 0.1 < found[:20].median() / found[20:].median() < 10

@@ -1,4 +1,6 @@
-"""Pseudo views, renders of the checkpoint as target images, and the cameras that are placed for them."""
+"""Pseudo views, renders of the checkpoint as target images, and the cameras that are placed for
+them.
+"""
 
 import math
 
@@ -12,7 +14,13 @@ import scenes
 from clod_adapter.initialization.importance import coverage
 from clod_adapter.training import camera_placement, pseudo_views
 from clod_adapter.training.camera_placement import FIELD, HEIGHT, WIDTH, place_cameras
-from clod_adapter.training.pseudo_views import FARTHER, MOVED, PseudoView, add_pseudo_views, render_pseudo_views
+from clod_adapter.training.pseudo_views import (
+    FARTHER,
+    MOVED,
+    PseudoView,
+    add_pseudo_views,
+    render_pseudo_views,
+)
 from clod_adapter.training.schedule import ViewSampler
 
 
@@ -24,12 +32,23 @@ def blob() -> clod.Gaussians:
 def test_images_are_renders_of_the_checkpoint(blob: clod.Gaussians) -> None:
     """Renders of a file with a dial are at s = 1."""
     cameras, told = scenes.ring(9, 40, 30), []
-    own = clod.with_dial(blob, torch.full((len(blob),), 0.3), clod.AttenuationConfig(scene_distance=4.0))
-    scene = render_pseudo_views(own, cameras, progress=lambda now: told.append((now.done, now.total)))
-    assert [view.camera for view in scene.test] == [cameras[0], cameras[8]] and len(scene.train) == 7
-    image, plain = ((clod.render(g, cameras[1]).image.clamp(0, 1) * 255).round().byte() for g in (own, blob))
+    own = clod.with_dial(
+        blob, torch.full((len(blob),), 0.3), clod.AttenuationConfig(scene_distance=4.0)
+    )
+    scene = render_pseudo_views(
+        own, cameras, progress=lambda now: told.append((now.done, now.total))
+    )
+    assert [view.camera for view in scene.test] == [cameras[0], cameras[8]] and len(
+        scene.train
+    ) == 7
+    image, plain = (
+        (clod.render(g, cameras[1]).image.clamp(0, 1) * 255).round().byte() for g in (own, blob)
+    )
     assert torch.equal(scene.train[0].image, image) and not torch.equal(image, plain)
-    assert "7 pseudo views to train on, 2 held out, 40x30" in scene.notes[0] and told == [(1, 2), (2, 2)]
+    assert "7 pseudo views to train on, 2 held out, 40x30" in scene.notes[0] and told == [
+        (1, 2),
+        (2, 2),
+    ]
     assert render_pseudo_views(own, cameras[:1]).test == ()
 
 
@@ -37,15 +56,21 @@ def test_each_step_renders_the_checkpoint_from_another_camera(blob: clod.Gaussia
     """A photograph stays where it is."""
     cameras = scenes.ring(3, 40, 30)
     (photograph,) = scenes.photograph(blob, cameras[:1])
-    sampler = ViewSampler((*render_pseudo_views(blob, cameras).train, photograph), clod.AdaptConfig())
+    sampler = ViewSampler(
+        (*render_pseudo_views(blob, cameras).train, photograph), clod.AdaptConfig()
+    )
     drawn = [sampler.draw(k, 0.0).view for k in range(9)]
     assert sum(view is photograph for view in drawn) == 3
     for view in drawn:
         assert torch.equal(view.image, clod.render(blob, view.camera).pixels)
-        assert view is photograph or all(not torch.equal(view.camera.viewmat, camera.viewmat) for camera in cameras)
+        assert view is photograph or all(
+            not torch.equal(view.camera.viewmat, camera.viewmat) for camera in cameras
+        )
 
 
-def test_few_photographs_get_pseudo_views(blob: clod.Gaussians, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_few_photographs_get_pseudo_views(
+    blob: clod.Gaussians, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(pseudo_views, "ADDED", 9)
     monkeypatch.setattr(pseudo_views, "MANY", 12)
     around = scenes.photograph(blob, scenes.ring(12, 80, 60))
@@ -54,31 +79,46 @@ def test_few_photographs_get_pseudo_views(blob: clod.Gaussians, monkeypatch: pyt
     scene = add_pseudo_views(blob, clod.Scene(around[:1], around[1:]))
     assert scene.train[0] is around[0] and len(scene.train) == 1 + 9 and scene.test == around[1:]
     assert "only 1 photographs to train on: 9 pseudo views" in scene.notes[-1]
-    assert [torch.equal(view.camera.viewmat, around[0].camera.viewmat) for view in scene.train].count(True) == 1 + 4
+    assert [
+        torch.equal(view.camera.viewmat, around[0].camera.viewmat) for view in scene.train
+    ].count(True) == 1 + 4
     assert len(add_pseudo_views(blob, clod.Scene(around[1:], ())).train) == 11 + 11 + 4
-    faint = blob.replace(opacity_logits=torch.full((len(blob),), -4.6))  # too faint to place a camera by
+    # too faint to place a camera by
+    faint = blob.replace(opacity_logits=torch.full((len(blob),), -4.6))
     scene = add_pseudo_views(faint, clod.Scene(around[:2], ()))
     assert scene.train == around[:2] and "no pseudo views can be added" in scene.notes[-1]
     assert clod.adapt(faint, scene, clod.AdaptConfig(iters=1)).steps == 1
 
 
 def test_moved_cameras_have_the_documented_offsets(blob: clod.Gaussians) -> None:
-    """Of position, direction and focal length; some step back along their direction of view, up to FARTHER reaches."""
+    """Of position, direction and focal length; some step back along their direction of view, up to
+    FARTHER reaches.
+    """
     camera, rng = scenes.ring(1, 40, 30)[0], np.random.default_rng(0)
-    near, back = ([PseudoView(camera, blob, 3.0, far).moved(rng).camera for _ in range(500)] for far in (0.0, 1.0))
-    steps = torch.stack([each.viewmat.double() @ camera.viewmat.double().inverse() for each in near])
+    near, back = (
+        [PseudoView(camera, blob, 3.0, far).moved(rng).camera for _ in range(500)]
+        for far in (0.0, 1.0)
+    )
+    steps = torch.stack(
+        [each.viewmat.double() @ camera.viewmat.double().inverse() for each in near]
+    )
     assert steps[:, :3, 3].std(0).tolist() == pytest.approx([MOVED * 3.0] * 3, rel=0.2)
     angles = ((steps.diagonal(dim1=1, dim2=2).sum(1) - 2) / 2).clamp(-1, 1).acos()
     assert angles.square().mean().sqrt() == pytest.approx(pseudo_views.TURNED * 3**0.5, rel=0.2)
     zooms = torch.stack([each.K / camera.K for each in near])[:, [0, 1], [0, 1]].log()
-    assert torch.equal(zooms[:, 0], zooms[:, 1]) and 0.9 < zooms.abs().max() / pseudo_views.ZOOMED <= 1.001
+    assert (
+        torch.equal(zooms[:, 0], zooms[:, 1])
+        and 0.9 < zooms.abs().max() / pseudo_views.ZOOMED <= 1.001
+    )
     eyes = torch.stack([each.position for each in back])
     behind = (camera.position - eyes) @ camera.viewmat[2, :3] / 3.0
     assert behind.min() > -6 * MOVED and FARTHER / 2 < behind.max() < FARTHER - 1 + 6 * MOVED
 
 
 def ball(n: int, seen_from: Tensor) -> clod.Gaussians:
-    """An opaque sphere of small discs and a far floater; SH degree 1, as after training, on the seen half alone."""
+    """An opaque sphere of small discs and a far floater; SH degree 1, as after training, on the
+    seen half alone.
+    """
     k = torch.arange(n) + 0.5
     z, turn = 1 - 2 * k / n, math.pi * (1 + 5**0.5) * k
     means = torch.stack([(1 - z * z).sqrt() * turn.cos(), (1 - z * z).sqrt() * turn.sin(), z], 1)
@@ -86,7 +126,10 @@ def ball(n: int, seen_from: Tensor) -> clod.Gaussians:
     logs = torch.full((n + 1, 3), 0.05).log()
     logs[-1] = math.log(300.0)
     facing = (torch.nn.functional.normalize(means, dim=1) @ seen_from).clamp(min=0)
-    shN = facing[:, None, None] * torch.stack([-seen_from[1], seen_from[2], -seen_from[0]])[None, :, None]
+    shN = (
+        facing[:, None, None]
+        * torch.stack([-seen_from[1], seen_from[2], -seen_from[0]])[None, :, None]
+    )
     quats, sh0 = torch.tensor([[1.0, 0, 0, 0]]).repeat(n + 1, 1), torch.zeros(n + 1, 1, 3)
     return clod.Gaussians(means, quats, logs, torch.full((n + 1,), 3.0), sh0, shN.repeat(1, 1, 3))
 
@@ -94,20 +137,29 @@ def ball(n: int, seen_from: Tensor) -> clod.Gaussians:
 def test_placed_cameras_are_valid_and_see_the_scene(blob: clod.Gaussians) -> None:
     told: list[tuple[int, int]] = []
     cameras = place_cameras(blob, views=12, progress=lambda now: told.append((now.done, now.total)))
-    assert told[-1][0] == told[-1][1] == len(told) and len({c.name for c in cameras}) == len(cameras) == 12
+    assert (
+        told[-1][0] == told[-1][1] == len(told)
+        and len({c.name for c in cameras}) == len(cameras) == 12
+    )
     for camera in cameras:
         rotation = camera.viewmat[:3, :3]
         assert torch.det(rotation) == pytest.approx(1, abs=1e-5)
         assert torch.allclose(rotation @ rotation.T, torch.eye(3), atol=1e-5)
         assert (camera.width, camera.height) == (WIDTH, HEIGHT)
-        assert 2 * math.degrees(math.atan(WIDTH / 2 / float(camera.K[0, 0]))) == pytest.approx(FIELD)
+        assert 2 * math.degrees(math.atan(WIDTH / 2 / float(camera.K[0, 0]))) == pytest.approx(
+            FIELD
+        )
         assert clod.render(blob, camera).alpha.mean() > 0.02
-    one, two, other = (torch.stack([c.viewmat for c in place_cameras(blob, views=4, seed=k)]) for k in (1, 1, 2))
+    one, two, other = (
+        torch.stack([c.viewmat for c in place_cameras(blob, views=4, seed=k)]) for k in (1, 1, 2)
+    )
     assert len(one) == 4 and torch.equal(one, two) and not torch.equal(one, other)
 
 
 def test_a_scene_gets_as_many_cameras_as_show_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A row of spheres needs more cameras than one sphere; nearly every disc is shown in the end."""
+    """A row of spheres needs more cameras than one sphere; nearly every disc is shown in the
+    end.
+    """
     monkeypatch.setattr(camera_placement, "VIEWS", 8)
     monkeypatch.setattr(camera_placement, "MOST", 40)
     one = ball(200, torch.eye(3)[2]).select(torch.arange(200)).without_bands(0)
@@ -121,7 +173,9 @@ def test_a_scene_gets_as_many_cameras_as_show_it(monkeypatch: pytest.MonkeyPatch
 
 
 @pytest.mark.parametrize(("axis", "few"), [(0, False), (2, True)])
-def test_cameras_face_the_side_where_sh_was_trained(axis: int, few: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cameras_face_the_side_where_sh_was_trained(
+    axis: int, few: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Also where a sample of the Gaussians decides."""
     side = torch.eye(3)[axis]
     truth = ball(1500, side)
@@ -129,4 +183,7 @@ def test_cameras_face_the_side_where_sh_was_trained(axis: int, few: bool, monkey
         monkeypatch.setattr(camera_placement, "SAMPLE", 500)
     positions = torch.stack([c.position for c in place_cameras(truth, views=12)])
     assert (torch.nn.functional.normalize(positions, dim=1) @ side).mean() > 0.4
-    assert torch.cdist(positions, truth.means[:-1]).min() > 3 * 0.05 and positions.norm(dim=1).min() > 1
+    assert (
+        torch.cdist(positions, truth.means[:-1]).min() > 3 * 0.05
+        and positions.norm(dim=1).min() > 1
+    )

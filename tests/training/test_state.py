@@ -1,5 +1,6 @@
-"""A result depends neither on where its run was interrupted and resumed, nor on unit, place and direction of a scene,
-nor on what is far from it or set of torch."""
+"""A result depends neither on where its run was interrupted and resumed, nor on unit, place and
+direction of a scene, nor on what is far from it or set of torch.
+"""
 
 import copy
 import math
@@ -32,29 +33,40 @@ Pair = tuple[Gaussians, Scene]
 
 RATES = ("means", "quats", "scales", "opacities", "sh0", "shN")
 RESUMED = {
-    "ours": {}, "paper": vars(AdaptConfig.paper(iters=12, max_sv=4.0)),
+    "ours": {},
+    "paper": vars(AdaptConfig.paper(iters=12, max_sv=4.0)),
     "sigma_d alone": {"growth": "off", **{f"lr_{name}": 0.0 for name in RATES}},
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("form", RESUMED)
 def test_a_resumed_run_ends_with_the_same_bits(captured: Pair, form: str) -> None:
-    """From states within and at the end of a round of views, and before, during and after averaging."""
+    """From states within and at the end of a round of views, and before, during and after
+    averaging.
+    """
     base, scene = captured
     if form == "sigma_d alone":
         base = base.replace(shN=torch.zeros_like(base.shN))
     if form == "paper":
-        base = with_dial(base, torch.full((len(base),), 1.5), AttenuationConfig(form="paper", max_sv=3.0))
+        base = with_dial(
+            base, torch.full((len(base),), 1.5), AttenuationConfig(form="paper", max_sv=3.0)
+        )
     config, states = config_of(**{"iters": 12, **RESUMED[form]}), dict[int, TrainingState]()
     whole = adapt(base, scene, config, states_of({1, 6, 10, 11}, states))
     if form == "sigma_d alone":
         start = adapt(base, scene, replace(config, iters=0)).gaussians
-        assert all(torch.equal(getattr(whole.gaussians, name), getattr(start, name)) for name in ATTRIBUTES)
+        assert all(
+            torch.equal(getattr(whole.gaussians, name), getattr(start, name)) for name in ATTRIBUTES
+        )
     seen: list[Progress] = []
     for steps, state in states.items():
         again = adapt(base, scene, config, seen.append, copy.deepcopy(state))
         assert_equal(again.gaussians, whole.gaussians)
-        assert (again.steps, again.interrupted, again.start_seconds) == (12, False, whole.start_seconds), steps
+        assert (again.steps, again.interrupted, again.start_seconds) == (
+            12,
+            False,
+            whole.start_seconds,
+        ), steps
         assert again.seconds > state.seconds
     done = [p.done for p in seen if p.phase == Phase.TRAINING]
     assert done[:11] == list(range(2, 13))
@@ -91,10 +103,15 @@ TURN = Rotation.from_quat([-0.7, 0.1, 0.5, 0.5])
 
 @pytest.fixture(scope="module")
 def pair() -> Pair:
-    """Photographs of Gaussians without SH degrees, which a turned scene would have to turn, and a perturbed copy."""
+    """Photographs of Gaussians without SH degrees, which a turned scene would have to turn, and a
+    perturbed copy.
+    """
     truth, random = gaussians(400, 0, 0, size=0.15), torch.Generator().manual_seed(1)
     by = {"means": 0.01, "log_scales": 0.1, "sh0": 0.1, "opacity_logits": 0.3}
-    changed = {n: t + by.get(n, 0.0) * torch.randn(t.shape, generator=random) for n, t in truth.tensors().items()}
+    changed = {
+        n: t + by.get(n, 0.0) * torch.randn(t.shape, generator=random)
+        for n, t in truth.tensors().items()
+    }
     seen = photograph(truth, ring(16, 48, 36))
     return truth.replace(**changed), Scene(tuple(v for k, v in enumerate(seen) if k % 4), seen[::4])
 
@@ -109,11 +126,15 @@ def results(base: Gaussians, scene: Scene) -> list[tuple[float, float]]:
 def placed(base: Gaussians, scene: Scene, scale: float, shift: float) -> Pair:
     """The scene turned by TURN, ``scale`` times as large and moved by ``shift``."""
     turn, quats = torch.from_numpy(TURN.as_matrix()), base.quats.double().roll(-1, 1)
-    means, quats = scale * base.means.double() @ turn.T + shift, (TURN * Rotation.from_quat(quats)).as_quat()
+    means, quats = (
+        scale * base.means.double() @ turn.T + shift,
+        (TURN * Rotation.from_quat(quats)).as_quat(),
+    )
     moved = base.replace(
-        means=means.float(), quats=torch.from_numpy(quats).float().roll(1, 1),
+        means=means.float(),
+        quats=torch.from_numpy(quats).float().roll(1, 1),
         log_scales=base.log_scales + math.log(scale),
-    )  # fmt: skip
+    )
 
     def change(view: View) -> View:
         viewmat = view.camera.viewmat.double()
@@ -121,14 +142,21 @@ def placed(base: Gaussians, scene: Scene, scale: float, shift: float) -> Pair:
         viewmat[:3, 3] = scale * viewmat[:3, 3] - viewmat[:3, :3].sum(1) * shift
         return View(replace(view.camera, viewmat=viewmat.float()), view.image)
 
-    return moved, in_its_unit(Scene(*(tuple(map(change, views)) for views in (scene.train, scene.test))))
+    return moved, in_its_unit(
+        Scene(*(tuple(map(change, views)) for views in (scene.train, scene.test)))
+    )
 
 
 def test_unit_direction_and_place(pair: Pair) -> None:
-    """Within the noise of roundings, large in a scene so small; farther away, ``Checkpoint.origin`` is for float32."""
+    """Within the noise of roundings, large in a scene so small; farther away, ``Checkpoint.origin``
+    is for float32.
+    """
     found, wanted = results(*placed(*pair, 1024.0, 1024.0 * 100)), results(*pair)
     for (psnr, kept), (other, share) in zip(found, wanted, strict=True):
-        assert psnr == pytest.approx(other, abs=0.5) and kept == pytest.approx(share, abs=0.02), (found, wanted)
+        assert psnr == pytest.approx(other, abs=0.5) and kept == pytest.approx(share, abs=0.02), (
+            found,
+            wanted,
+        )
 
 
 def test_a_far_camera_changes_no_length(pair: Pair) -> None:
@@ -138,7 +166,10 @@ def test_a_far_camera_changes_no_length(pair: Pair) -> None:
     cameras, usual = ([view.camera for view in some] for some in (views, scene.train))
     assert scene_distance(base, views) == pytest.approx(scene_distance(base, scene.train), rel=0.05)
     assert reaches(base, cameras)[: len(usual)] == pytest.approx(reaches(base, usual), rel=0.1)
-    found, wanted = (typical_distance(base.means, each, AttenuationConfig()).median() for each in (cameras, usual))
+    found, wanted = (
+        typical_distance(base.means, each, AttenuationConfig()).median()
+        for each in (cameras, usual)
+    )
     assert float(found) == pytest.approx(float(wanted), rel=0.05)
 
 
@@ -152,8 +183,14 @@ def session_of(capture: Any) -> tuple[list[Tensor], str]:
     (row,) = clod.evaluate(adapted, scene.test, [2.0])
     plan = clod.make_plan(base, scene)
     baked = clod.bake(adapted, 2, cameras=cameras)
-    dialled = [attached.sigma_d, clod.place_cameras(base, views=2)[0].viewmat, *baked.tensors().values()]
-    return [*adapted.tensors().values(), image, *dialled], repr((plan.decisions, row.psnr, row.kept))
+    dialled = [
+        attached.sigma_d,
+        clod.place_cameras(base, views=2)[0].viewmat,
+        *baked.tensors().values(),
+    ]
+    return [*adapted.tensors().values(), image, *dialled], repr(
+        (plan.decisions, row.psnr, row.kept)
+    )
 
 
 @contextmanager

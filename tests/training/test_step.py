@@ -1,4 +1,6 @@
-"""What a step is made of: views and dial values of the schedule, the target-count curve, and Adam on some rows."""
+"""What a step is made of: views and dial values of the schedule, the target-count curve, and Adam
+on some rows.
+"""
 
 import math
 from dataclasses import replace
@@ -11,7 +13,13 @@ from clod_adapter import View
 from clod_adapter.config import AdaptConfig
 from clod_adapter.training.optimizer import RowAdam
 from clod_adapter.training.schedule import OURS, PAPER, Schedule, ViewSampler
-from clod_adapter.training.target_count import SHARPNESS, count_gradient, count_slope, target_curve, target_share
+from clod_adapter.training.target_count import (
+    SHARPNESS,
+    count_gradient,
+    count_slope,
+    target_curve,
+    target_share,
+)
 from scenes import capture
 
 VIEWS = capture(n=20)[1].train
@@ -30,11 +38,15 @@ def test_dial_values_follow_the_schedule() -> None:
         sampler = ViewSampler(VIEWS, AdaptConfig(max_sv=4.0), schedule)
         samples = [sampler.draw(k, share_done) for k in range(480)]
         names = [sample.view.camera.name for sample in samples]  # each view once a round
-        assert all(len({*names[k : k + len(VIEWS)]}) == len(VIEWS) for k in range(0, 480, len(VIEWS)))
+        assert all(
+            len({*names[k : k + len(VIEWS)]}) == len(VIEWS) for k in range(0, 480, len(VIEWS))
+        )
         return torch.tensor([sample.dial for sample in samples], dtype=torch.float64)
 
     for stretch in drawn(Schedule(full=0.25)).split(120):
-        assert abs(int((stretch <= 1).sum()) - 30) <= 1 and abs(int((stretch == 0).sum()) - 7.5) <= 1
+        assert (
+            abs(int((stretch <= 1).sum()) - 30) <= 1 and abs(int((stretch == 0).sum()) - 7.5) <= 1
+        )
         assert_uniform(stretch[stretch > 1].log() / math.log(OURS.rendered * 4.0))
     assert_uniform((drawn(PAPER) - 1) / 3)
     assert abs(int((drawn(Schedule(full=0.5, full_final=0.5), 0.5) <= 1).sum()) - 0.375 * 480) <= 1
@@ -43,10 +55,20 @@ def test_dial_values_follow_the_schedule() -> None:
 
 def test_first_steps_have_photographs_of_half_the_size() -> None:
     """Unless these would be small, or the step is at s = 1."""
-    whole = replace(VIEWS[0].camera, width=301, height=258, K=torch.tensor([[90.0, 0, 150], [0, 90, 129], [0, 0, 1]]))
+    whole = replace(
+        VIEWS[0].camera,
+        width=301,
+        height=258,
+        K=torch.tensor([[90.0, 0, 150], [0, 90, 129], [0, 0, 1]]),
+    )
     image = torch.randint(256, (258, 301, 3), generator=torch.Generator().manual_seed(0)).byte()
     large, small = View(whole, image), View(replace(whole, height=255), image[:255])
-    cases = ((large, 0.49, 0.0, True), (large, 0.5, 0.0, False), (small, 0.0, 0.0, False), (large, 0.0, 1.0, False))
+    cases = (
+        (large, 0.49, 0.0, True),
+        (large, 0.5, 0.0, False),
+        (small, 0.0, 0.0, False),
+        (large, 0.0, 1.0, False),
+    )
     for view, share_done, full, expected in cases:
         schedule = Schedule(coarse=0.5, full=full)
         sample = ViewSampler((view,), AdaptConfig(), schedule).draw(0, share_done)
@@ -82,9 +104,11 @@ def test_count_gradient_penalises_excess_and_deficit() -> None:
         assert (gradient(log_sigma, d, s, reg_weight=0.0) == 0).all()
     one = torch.ones(1)
     assert count_gradient(one, 6 * one, 5.0, 1.0, CONFIG, target_share(5.0, 1, CONFIG)).item() == 0
-    for gone in (-9.2, -100.0):  # where none is near its reach: at the floor that training has, and at 0
+    # where none is near its reach: at the floor that training has, and at 0
+    for gone in (-9.2, -100.0):
         assert (gradient(torch.full((N,), gone), d, 2.0) < 0).all()
-    mixed = torch.where(torch.arange(N) % 2 == 0, 5.0, -9.2)  # half are kept, where the curve at s = 6 has 7 %
+    # half are kept, where the curve at s = 6 has 7 %
+    mixed = torch.where(torch.arange(N) % 2 == 0, 5.0, -9.2)
     assert (gradient(mixed, d, 6.0) >= 0).all() and (gradient(mixed, d, 6.0)[1::2] < 1e-20).all()
 
 
@@ -107,14 +131,23 @@ def test_shares_are_of_all_gaussians() -> None:
     assert found[0].abs().max() > 0 and torch.allclose(*found, rtol=1e-5, atol=0)
 
 
-SHAPES = {"means": (3,), "quats": (4,), "opacity_logits": (), "sh0": (1, 3), "shN": (24, 3), "none": (0, 3)}
+SHAPES = {
+    "means": (3,),
+    "quats": (4,),
+    "opacity_logits": (),
+    "sh0": (1, 3),
+    "shN": (24, 3),
+    "none": (0, 3),
+}
 TENTHS = dict.fromkeys(SHAPES, 0.1)
 
 
 class PlainRowAdam(RowAdam):
     """RowAdam without the fused kernel."""
 
-    def _step_fused(self, gradients: dict[str, Tensor], rows: Tensor, rates: dict[str, float]) -> None:
+    def _step_fused(
+        self, gradients: dict[str, Tensor], rows: Tensor, rates: dict[str, float]
+    ) -> None:
         self._step_plain(gradients, rows, rates)
 
 
@@ -129,7 +162,9 @@ def gradients(n: int, seed: int) -> dict[str, Tensor]:
     out = {}
     for name, shape in SHAPES.items():
         size = 10 ** (8 * torch.rand(n, *[1] * len(shape), generator=g) - 6)
-        out[name] = torch.randn(n, *shape, generator=g) * size * (torch.rand(n, *shape, generator=g) > 0.1)
+        out[name] = (
+            torch.randn(n, *shape, generator=g) * size * (torch.rand(n, *shape, generator=g) > 0.1)
+        )
     return out
 
 
@@ -139,9 +174,10 @@ def everything(n: int) -> Tensor:
 
 @pytest.mark.parametrize("kind", [RowAdam, PlainRowAdam])
 @pytest.mark.parametrize(
-    ("steps", "beta1", "beta2", "epsilon"), [(12, 0.9, 0.999, 1e-15), (90, 0.5, 0.8, 1e-2)],
+    ("steps", "beta1", "beta2", "epsilon"),
+    [(12, 0.9, 0.999, 1e-15), (90, 0.5, 0.8, 1e-2)],
     ids=["defaults", "past the last bias correction that is stored, the 79th"],
-)  # fmt: skip
+)
 def test_all_rows_match_torch_adam(
     kind: type[RowAdam], steps: int, beta1: float, beta2: float, epsilon: float, n: int = 57
 ) -> None:
@@ -163,9 +199,16 @@ def test_all_rows_match_torch_adam(
 
 @pytest.mark.parametrize("kind", [RowAdam, PlainRowAdam])
 @pytest.mark.parametrize(("more", "filler"), [(0, torch.inf), (11, torch.nan)])
-def test_only_selected_rows_are_stepped(kind: type[RowAdam], more: int, filler: float, n: int = 40) -> None:
-    """Other rows keep every bit, and their gradients are ignored; so do rows behind a leading part."""
-    larger, alone = parameters(n + more), {name: value[:n] for name, value in parameters(n + more).items()}
+def test_only_selected_rows_are_stepped(
+    kind: type[RowAdam], more: int, filler: float, n: int = 40
+) -> None:
+    """Other rows keep every bit, and their gradients are ignored; so do rows behind a leading
+    part.
+    """
+    larger, alone = (
+        parameters(n + more),
+        {name: value[:n] for name, value in parameters(n + more).items()},
+    )
     larger["means"][5] = torch.nan
     before = {name: value.clone().view(torch.int32) for name, value in larger.items()}
     rows = torch.zeros(n, dtype=torch.bool)
@@ -174,12 +217,19 @@ def test_only_selected_rows_are_stepped(kind: type[RowAdam], more: int, filler: 
     optimizers = kind({name: value[:n] for name, value in larger.items()}), kind(own)
     for step in range(3):
         given = {name: gradient + 1 for name, gradient in gradients(n, step).items()}
-        optimizers[1].step({name: value[rows] for name, value in given.items()}, everything(3), TENTHS)
+        optimizers[1].step(
+            {name: value[rows] for name, value in given.items()}, everything(3), TENTHS
+        )
         for value in given.values():
             value[~rows] = filler
         optimizers[0].step(given, rows, TENTHS)
         optimizers[0].step(given, torch.zeros_like(rows), TENTHS)  # of no rows
     for name, value in larger.items():
-        bits, others = value.view(torch.int32), torch.cat([~rows, torch.ones(more, dtype=torch.bool)])
+        bits, others = (
+            value.view(torch.int32),
+            torch.cat([~rows, torch.ones(more, dtype=torch.bool)]),
+        )
         assert torch.equal(bits[others], before[name][others]), name  # in place
-        assert (bits[~others] != before[name][~others]).all() and torch.equal(value[~others], own[name]), name
+        assert (bits[~others] != before[name][~others]).all() and torch.equal(
+            value[~others], own[name]
+        ), name

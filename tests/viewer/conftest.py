@@ -1,4 +1,6 @@
-"""Fixtures for the page in a browser: one browser context for all tests, and one server per shown file."""
+"""Fixtures for the page in a browser: one browser context for all tests, and one server per shown
+file.
+"""
 
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -16,7 +18,9 @@ from shown import SIZE, Shown, fold, serve, take
 
 @pytest.fixture(scope="session")
 def tabs(chromium: Any) -> Iterator[Any]:
-    """The browser context of all tabs; a context per test would double the time to the first frame."""
+    """The browser context of all tabs; a context per test would double the time to the first
+    frame.
+    """
     with chromium.new_context() as context:
         context.set_default_timeout(10_000)
         yield context
@@ -24,12 +28,19 @@ def tabs(chromium: Any) -> Iterator[Any]:
 
 @pytest.fixture
 def show(tabs: Any) -> Iterator[Callable[..., Shown]]:
-    """Opens a tab with the files of a ``clod-adapt view`` command line; an error in its console fails the test."""
+    """Opens a tab with the files of a ``clod-adapt view`` command line; an error in its console
+    fails the test.
+    """
     with ExitStack() as stack:
         opened: list[tuple[Shown, str]] = []
 
         def start(
-            *words: object, url: str = "", state: str = "", viewport: Any = SIZE, context: Any = tabs, script: str = ""
+            *words: object,
+            url: str = "",
+            state: str = "",
+            viewport: Any = SIZE,
+            context: Any = tabs,
+            script: str = "",
         ) -> Shown:
             url = url or stack.enter_context(serve(*words))
             shown = Shown(context.new_page())
@@ -84,9 +95,13 @@ def tab_of_model(tabs: Any, model: Path) -> Iterator[Shown]:
 
 @pytest.fixture
 def shown(tab_of_model: Shown, model: Path) -> Iterator[Shown]:
-    """The tab of ``tab_of_model``, reset to that file: opening a tab for each test would take a second."""
+    """The tab of ``tab_of_model``, reset to that file: opening a tab for each test would take a
+    second.
+    """
     fold(tab_of_model, False)
-    tab_of_model.page.evaluate("document.activeElement.blur(), document.getElementById('target').value = ''")
+    tab_of_model.page.evaluate(
+        "document.activeElement.blur(), document.getElementById('target').value = ''"
+    )
     take(tab_of_model, model)
     yield tab_of_model
     assert tab_of_model.errors == []

@@ -1,4 +1,6 @@
-"""The dial in Spark and PlayCanvas: the pages of viewers/examples in a browser, with the engines from npm."""
+"""The dial in Spark and PlayCanvas: the pages of viewers/examples in a browser, with the engines
+from npm.
+"""
 
 import io
 import json
@@ -23,23 +25,28 @@ from clod_adapter.equation.attenuation import attenuate
 ROOT = Path(__file__).parents[2]
 KIT = ROOT / "viewers" / "kit"
 SIZE = {"width": 192, "height": 144}  # of its pictures
-# Cameras of these viewers look along -z with y up, and the pages turn the splat half a turn about x.
+# Cameras of these viewers look along -z with y up, and the pages turn the splat half a turn about
+# x.
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 PLACE = {
-    "spark": """([m, fov]) => {
+    "spark": (
+        """([m, fov]) => {
         controls.enabled = false;
         controls.update = () => {};
         camera.matrix.fromArray(m).decompose(camera.position, camera.quaternion, camera.scale);
         camera.fov = fov;
         camera.updateProjectionMatrix();
-    }""",
-    "playcanvas": """([m, fov]) => {
+    }"""
+    ),
+    "playcanvas": (
+        """([m, fov]) => {
         const matrix = new pc.Mat4();
         matrix.set(m);
         camera.setPosition(matrix.getTranslation());
         camera.setRotation(new pc.Quat().setFromMat4(matrix));
         camera.camera.fov = fov;
-    }""",
+    }"""
+    ),
 }
 
 
@@ -59,16 +66,24 @@ def opened(tabs: Any, viewer: str, file: Path) -> Iterator[Any]:
 
     def answer(route: Any) -> None:
         host, path = route.request.url.split("://")[1].split("?")[0].split("/", 1)
-        found = ROOT / path if host == "example" else modules / re.sub(r"@\d[\d.]*", "", path.removeprefix("npm/"))
+        found = (
+            ROOT / path
+            if host == "example"
+            else modules / re.sub(r"@\d[\d.]*", "", path.removeprefix("npm/"))
+        )
         found = file if path == file.name else found
-        kind = {".html": "text/html", ".js": "text/javascript", ".mjs": "text/javascript"}.get(found.suffix, "")
+        kind = {".html": "text/html", ".js": "text/javascript", ".mjs": "text/javascript"}.get(
+            found.suffix, ""
+        )
         route.fulfill(body=found.read_bytes(), content_type=kind or "application/octet-stream")
 
     page = tabs.new_page()
     page.set_viewport_size(SIZE)
     page.set_default_timeout(60_000)
     page.route(re.compile("https://"), answer)
-    page.goto(f"https://example/viewers/examples/{viewer}.html?file=/{file.name}", wait_until="commit")
+    page.goto(
+        f"https://example/viewers/examples/{viewer}.html?file=/{file.name}", wait_until="commit"
+    )
     yield page
     page.close()
 
@@ -93,10 +108,17 @@ def settled(page: Any) -> np.ndarray:
 
 
 def assert_the_wgsl_of_playcanvas_gives_the_equation(page: Any, about: dict[str, Any]) -> None:
-    """The modifier alone, as software lacks the engine's WebGPU; ``uniform NAME: TYPE;`` is a struct's member."""
+    """The modifier alone, as software lacks the engine's WebGPU; ``uniform NAME: TYPE;`` is a
+    struct's member.
+    """
     shown = clod_adapter.load(KIT / "kit.ply").gaussians
     camera = clod_adapter.Camera(torch.tensor(about["world_to_camera"]), torch.eye(3), 8, 8)
-    columns = (shown.means, shown.opacities[:, None], shown.sigma_d[:, None], shown.growth_d[:, None])
+    columns = (
+        shown.means,
+        shown.opacities[:, None],
+        shown.sigma_d[:, None],
+        shown.growth_d[:, None],
+    )
     rows, eye = torch.cat(columns, 1)[::20].tolist(), ", ".join(map(str, camera.position.tolist()))
     statements = """
         let center = vec3f(rows[at], rows[at + 1], rows[at + 2]);
@@ -110,7 +132,9 @@ def assert_the_wgsl_of_playcanvas_gives_the_equation(page: Any, about: dict[str,
         rows[at] = color.a;
         rows[at + 1] = scale.x;"""
     page.evaluate("app.autoRender = false")
-    wgsl = page.evaluate("import('/viewers/playcanvas.js').then(({ modifier }) => modifier(dial.file).wgsl)")
+    wgsl = page.evaluate(
+        "import('/viewers/playcanvas.js').then(({ modifier }) => modifier(dial.file).wgsl)"
+    )
     members = re.findall(r"uniform (\w+: \w+);", wgsl)
     body = re.sub(r"uniform \w+: \w+;", "", wgsl).replace("uniform.", "given.")
     for s in (0.0, 3.0):
@@ -122,16 +146,22 @@ def assert_the_wgsl_of_playcanvas_gives_the_equation(page: Any, about: dict[str,
             {body}"""
         alpha, scale = torch.tensor(browser.compute(page, source, statements, rows))[:, :2].T
         want = attenuate(
-            shown.opacity_logits, shown.sigma_d, (shown.means, camera), s, shown.attenuation,
+            shown.opacity_logits,
+            shown.sigma_d,
+            (shown.means, camera),
+            s,
+            shown.attenuation,
             growth_d=shown.growth_d,
-        )  # fmt: skip
+        )
         drawn, growth = want.drawn[::20], want.growth[::20]
         torch.testing.assert_close(alpha, drawn, rtol=1e-4, atol=1e-6)
         torch.testing.assert_close(scale[alpha > 0], growth[alpha > 0], rtol=1e-4, atol=0)
 
 
 @pytest.mark.parametrize(("viewer", "suffix"), [("spark", "spz"), ("playcanvas", "ply")])
-def test_the_dial_is_as_exact_as_the_viewer(tabs: Any, viewer: str, suffix: str, tmp_path: Path) -> None:
+def test_the_dial_is_as_exact_as_the_viewer(
+    tabs: Any, viewer: str, suffix: str, tmp_path: Path
+) -> None:
     about = json.loads((KIT / "cameras.json").read_text())["cameras"][0]
     undialled = 0.0
     with opened(tabs, viewer, KIT / f"kit.{suffix}") as page:
@@ -140,8 +170,12 @@ def test_the_dial_is_as_exact_as_the_viewer(tabs: Any, viewer: str, suffix: str,
         place(page, viewer, about)
         for frame in about["frames"][::2]:
             page.evaluate("(s) => dial.set(s)", frame["s"])
-            assert page.evaluate("dial.kept") == pytest.approx(frame["kept"], rel=0.005 if suffix == "spz" else 0)
-            psnr = peak_signal_noise_ratio(read_picture(KIT / frame["picture"]), settled(page), data_range=255)
+            assert page.evaluate("dial.kept") == pytest.approx(
+                frame["kept"], rel=0.005 if suffix == "spz" else 0
+            )
+            psnr = peak_signal_noise_ratio(
+                read_picture(KIT / frame["picture"]), settled(page), data_range=255
+            )
             undialled = undialled or psnr
             assert psnr > max(undialled - 1, 25), (frame["s"], psnr, undialled)
             if viewer == "spark":  # drops opacities below its 8 bits
@@ -153,7 +187,10 @@ def test_the_dial_is_as_exact_as_the_viewer(tabs: Any, viewer: str, suffix: str,
         page.evaluate("dial.set(2)")
         page.wait_for_timeout(200)
         assert page.evaluate("dial.s") == 2
-        script = "import('/viewers/dial.js').then((m) => m.readDial(Uint8Array.from(given))).catch(String)"
+        script = (
+            "import('/viewers/dial.js').then((m) =>"
+            " m.readDial(Uint8Array.from(given))).catch(String)"
+        )
         for model, error in (
             (scenes.gaussians(50, 0, 7), "the file has no sigma_d, so no dial; adapt it with"),
             (scenes.dialled(50, 0, 7, form="paper"), "the paper's form, which viewers do not draw"),

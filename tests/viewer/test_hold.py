@@ -1,4 +1,6 @@
-"""A held frame rate: the law in JavaScript, and the page on a simulated GPU, whose time follows the Gaussians drawn."""
+"""A held frame rate: the law in JavaScript, and the page on a simulated GPU, whose time follows the
+Gaussians drawn.
+"""
 
 import base64
 from collections.abc import Iterator
@@ -53,7 +55,9 @@ def frames(shown: Shown, script: str) -> list[list[float]]:
 
 
 def turned(shown: Shown, load: float) -> list[list[float]]:
-    """The same for a change of the load, which shows at the next change of the page: the wipe's, from none to none."""
+    """The same for a change of the load, which shows at the next change of the page: the wipe's,
+    from none to none.
+    """
     return frames(shown, f"window.load = {load}, clod.setWipe(null)")
 
 
@@ -95,19 +99,31 @@ def test_the_law_is_that_of_python(tab_of_model: Shown) -> None:
 
 
 def test_the_dial_follows_a_load_that_is_switched_on_and_off(held: Shown) -> None:
-    """Within 15 frames; the page then draws no more. A rate that is out of reach ends at the largest dial value."""
+    """Within 15 frames; the page then draws no more. A rate that is out of reach ends at the
+    largest dial value.
+    """
     before = dial_of(held)
     assert 1 < before < 3
     for load in (1.6, 1.0):
         dials, times = zip(*turned(held, load), strict=True)
-        assert len(times) < 50 and all(0.9 * BUDGET < each < 1.1 * BUDGET for each in times[15:] or times[-1:]), times
-        assert all(max(a, b) <= 1.1 * min(a, b) + 0.01 for a, b in pairwise(dials))  # the text has two decimals
+        assert len(times) < 50 and all(
+            0.9 * BUDGET < each < 1.1 * BUDGET for each in times[15:] or times[-1:]
+        ), times
+        # the text has two decimals
+        assert all(max(a, b) <= 1.1 * min(a, b) + 0.01 for a, b in pairwise(dials))
         assert dials[-1] > 1.4 * before if load > 1 else dials[-1] < 1.2 * before, (before, dials)
-    drawn = "(window.trace.length = 0, new Promise((later) => setTimeout(later, 300)).then(() => window.trace.length))"
+    drawn = (
+        "(window.trace.length = 0, new Promise((later) => setTimeout(later, 300)).then(() =>"
+        " window.trace.length))"
+    )
     assert held.page.evaluate(drawn) == 0
-    assert float(held.text("#frame").removesuffix(" ms per frame")) == pytest.approx(times[-1], abs=0.6)
+    assert float(held.text("#frame").removesuffix(" ms per frame")) == pytest.approx(
+        times[-1], abs=0.6
+    )
     turned(held, 20)
-    assert dial_of(held) == 5 and "s = 5, the largest trained value, is too slow" in held.text("#target-note")
+    assert dial_of(held) == 5 and "s = 5, the largest trained value, is too slow" in held.text(
+        "#target-note"
+    )
     turned(held, 1)
     assert dial_of(held) < 5 and held.text("#target-note") == ""
     change = "(rate) => { rate.value = 30; rate.dispatchEvent(new Event('change')); }"
@@ -118,7 +134,11 @@ def test_the_dial_follows_a_load_that_is_switched_on_and_off(held: Shown) -> Non
 
 def test_the_dial_by_hand_ends_it(simulated: Shown) -> None:
     shown = simulated
-    for end in ("document.getElementById('hold').click()", "clod.setEquation(false)", "location.hash = '#dial=3'"):
+    for end in (
+        "document.getElementById('hold').click()",
+        "clod.setEquation(false)",
+        "location.hash = '#dial=3'",
+    ):
         shown.run("(clod.setDial(1), clod.setEquation(true))")
         shown.page.keyboard.press("r")
         assert shown.page.is_checked("#hold")
@@ -139,7 +159,11 @@ def test_a_file_opens_with_a_held_rate(tabs: Any, model: Path, tmp_path: Path) -
     url = (tmp_path / "page.html").as_uri()
     slow = opened(tabs, url, 2)
     dials, times = zip(*slow.page.evaluate("window.trace"), strict=True)
-    assert times[0] == 44 and times[-1] == pytest.approx(0.8 * 1000 / 30, rel=0.1) and 1 < dial_of(slow) < 5
+    assert (
+        times[0] == 44
+        and times[-1] == pytest.approx(0.8 * 1000 / 30, rel=0.1)
+        and 1 < dial_of(slow) < 5
+    )
     assert all(b <= 1.1 * max(a, 1) + 0.01 for a, b in pairwise(map(float, dials[2:])))
     assert slow.page.is_checked("#hold") and slow.page.input_value("#rate") == "30"
     linked = opened(tabs, f"{url}#dial=0", 2)

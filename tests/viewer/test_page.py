@@ -29,22 +29,33 @@ NAME = "<img src=x onerror=clod=1><script>clod=1<!script>&amp;'\".ply"
 
 def test_parts_are_built_from_these_sources() -> None:
     """After a change of the sources: npm ci && npm run build, in clod_adapter/viewer/web."""
-    texts = {name: (VIEWER / "static" / name).read_text() for name in ("page.html", "viewer.css", "viewer.js")}
+    texts = {
+        name: (VIEWER / "static" / name).read_text()
+        for name in ("page.html", "viewer.css", "viewer.js")
+    }
     for name, text in texts.items():
         assert not re.search(r"""(?:src|href)=["']?https?:|@import|url\(["']?https?:""", text), name
-    assert not re.search("</script|<!--", texts["viewer.js"]) and "</style" not in texts["viewer.css"]
+    assert (
+        not re.search("</script|<!--", texts["viewer.js"]) and "</style" not in texts["viewer.css"]
+    )
     web = VIEWER / "web"
     if not web.is_dir():
         pytest.skip("only a checkout contains the sources of the page")
     lines = (VIEWER / "static" / "SOURCES.sha256").read_text(encoding="utf-8").splitlines()
-    listed = {(web / name).resolve(): digest for digest, name in (line.split("  ") for line in lines)}
+    listed = {
+        (web / name).resolve(): digest for digest, name in (line.split("  ") for line in lines)
+    }
     assert {path for path in (web / "src").rglob("*.*") if path.is_file()} <= set(listed)
     for path, digest in listed.items():
-        assert hashlib.sha256(path.read_bytes()).hexdigest() == digest, f"{path} has changed since: build again"
+        assert hashlib.sha256(path.read_bytes()).hexdigest() == digest, (
+            f"{path} has changed since: build again"
+        )
 
 
 def test_the_text_of_one_file(tmp_path: Path) -> None:
-    """A picture of the first camera, a policy that allows no connection, and no names of folders."""
+    """A picture of the first camera, a policy that allows no connection, and no names of
+    folders.
+    """
     clod_adapter.save(tmp_path / "model.ply", clod_adapter.with_dial(scenes.gaussians(50, 1, 0)))
     saved, cameras = clod_adapter.load(tmp_path / "model.ply"), scenes.ring(2, 1000, 500)
     out = tmp_path / "out" / "page.html"
@@ -53,12 +64,21 @@ def test_the_text_of_one_file(tmp_path: Path) -> None:
     assert [each.name for each in out.parent.iterdir()] == ["page.html"] and losses
     text = out.read_text(encoding="utf-8")
     policy = re.search('<meta http-equiv="Content-Security-Policy" content="([^"]*)">', text)
-    assert policy and "default-src 'none'" in policy[1] and "'self'" not in policy[1] and "unsafe" not in policy[1]
+    assert (
+        policy
+        and "default-src 'none'" in policy[1]
+        and "'self'" not in policy[1]
+        and "unsafe" not in policy[1]
+    )
     assert str(tmp_path) not in text
     (poster,) = re.findall('<img id="poster" alt="" src="data:image/jpeg;base64,([^"]*)">', text)
     picture = np.asarray(Image.open(io.BytesIO(base64.b64decode(poster))), dtype=float)
     wanted = render(shown, cameras[0].resized(512, 256), 2.0).pixels.numpy()
-    assert len(poster) < 60_000 and picture.shape == wanted.shape and np.abs(picture - wanted).mean() < 3
+    assert (
+        len(poster) < 60_000
+        and picture.shape == wanted.shape
+        and np.abs(picture - wanted).mean() < 3
+    )
     page.write_viewer_page(tmp_path / "alone.html", saved)
     text = (tmp_path / "alone.html").read_text(encoding="utf-8")
     assert '<img id="poster"' not in text  # no viewpoint is stored
@@ -73,31 +93,43 @@ def test_the_exact_file_is_a_plain_ply(capture: Any, tmp_path: Path) -> None:
     loaded = clod_adapter.load(tmp_path / "a.ply")
     payload = page.Payload.of(replace(loaded, path=Path("b\udcff.ply")))
     (tmp_path / "payload.ply").write_bytes(b"".join(payload.blocks()))
-    assert (tmp_path / "payload.ply").stat().st_size == payload.size and payload.name == "b\\xff.ply"
+    assert (
+        tmp_path / "payload.ply"
+    ).stat().st_size == payload.size and payload.name == "b\\xff.ply"
     read = clod_adapter.load(tmp_path / "payload.ply")
     scenes.assert_equal(read.gaussians, loaded.gaussians.replace(shN=loaded.gaussians.shN[:, :8]))
     assert {kind for kind, _ in read.vertex.dtype.fields.values()} == {np.dtype("<f4")}
 
 
 @pytest.mark.parametrize("exact", [False, True])
-def test_a_page_of_one_file(show: Any, save: Any, monkeypatch: pytest.MonkeyPatch, exact: bool) -> None:
-    """What Python reads of its SPZ or PLY, with growth, in units that float16 does not hold, and an opacity of 1; its
-    dB near its cameras only. Large data are divided among several elements, because browsers limit a text's size."""
+def test_a_page_of_one_file(
+    show: Any, save: Any, monkeypatch: pytest.MonkeyPatch, exact: bool
+) -> None:
+    """What Python reads of its SPZ or PLY, with growth, in units that float16 does not hold, and an
+    opacity of 1; its dB near its cameras only. Large data are divided among several elements,
+    because browsers limit a text's size.
+    """
     monkeypatch.setattr(page, "PART", 15_000)
     size, model = 1000.0, scenes.dialled(1000, 3, 4, scene_distance=1.0, reference_distance=3.0)
     far = model.replace(
-        means=size * model.means, log_scales=model.log_scales + float(np.log(size)), sigma_d=size * model.sigma_d,
+        means=size * model.means,
+        log_scales=model.log_scales + float(np.log(size)),
+        sigma_d=size * model.sigma_d,
         growth_d=torch.linspace(-0.5, 1, 1000),
         attenuation=replace(model.attenuation, reference_distance=3 * size),
-    )  # fmt: skip
+    )
     path, row = save(far), CalibrationRow(1.0, 900.0, 31.5, 0.9, 4.0)
-    calibrated = replace(clod_adapter.load(path), calibration=Calibration((row,), 1000, 2, 8, 6, "a machine"))
+    calibrated = replace(
+        clod_adapter.load(path), calibration=Calibration((row,), 1000, 2, 8, 6, "a machine")
+    )
     calibrated.gaussians.opacity_logits[3] = torch.inf
     camera = scenes.camera(320, 240)
     viewmat = camera.viewmat.clone()
     viewmat[:3, 3] *= size
     seen, out = replace(camera, viewmat=viewmat), path.with_suffix(".html")
-    read, _ = page.write_viewer_page(out, calibrated, cameras=[seen], virtual_scale=1.0, exact=exact)
+    read, _ = page.write_viewer_page(
+        out, calibrated, cameras=[seen], virtual_scale=1.0, exact=exact
+    )
     assert out.read_text(encoding="utf-8").count('id="clod-model"') > 2
     shown = show(url=out.as_uri())
     assert shown.text("#quality") == "31.5 dB"
@@ -114,16 +146,35 @@ def test_a_page_of_one_file(show: Any, save: Any, monkeypatch: pytest.MonkeyPatc
 
 def test_a_file_without_sigma_d_has_no_dial(show: Any, save: Any, plain: Gaussians) -> None:
     """The page shows the reason, and the file's name as text; a name does not end its element."""
-    config = b"".join(page.document(page.page_config([{"name": f"</script>{NAME}"}], None, [], 1.0))).decode()
-    assert json.loads(re.findall('id="clod-config">(.*?)</script>', config)[0])["title"] == f"</script>{NAME}"
+    config = b"".join(
+        page.document(page.page_config([{"name": f"</script>{NAME}"}], None, [], 1.0))
+    ).decode()
+    assert (
+        json.loads(re.findall('id="clod-config">(.*?)</script>', config)[0])["title"]
+        == f"</script>{NAME}"
+    )
     shown = show(save(plain, NAME))
-    assert shown.text("#title") == NAME and shown.page.title() == NAME and shown.page.query_selector("img") is None
-    assert all(shown.page.is_disabled(f"#{name}") for name in ("dial", "target", "equation", "hold", "rate"))
-    assert f"{NAME} has no sigma_d" in shown.text("#no-dial") and f"clod-adapt {NAME}" in shown.text("#no-dial")
+    assert (
+        shown.text("#title") == NAME
+        and shown.page.title() == NAME
+        and shown.page.query_selector("img") is None
+    )
+    assert all(
+        shown.page.is_disabled(f"#{name}")
+        for name in ("dial", "target", "equation", "hold", "rate")
+    )
+    assert f"{NAME} has no sigma_d" in shown.text(
+        "#no-dial"
+    ) and f"clod-adapt {NAME}" in shown.text("#no-dial")
     for key in "]re":
         shown.page.keyboard.press(key)
-    assert shown.counts()["kept"] == 400 and shown.picture().max() > 50 and not shown.page.is_checked("#hold")
-    shown.page.evaluate("location.hash = '#wipe=0.5&dial=3'")  # a link with a comparison, which needs a dial
+    assert (
+        shown.counts()["kept"] == 400
+        and shown.picture().max() > 50
+        and not shown.page.is_checked("#hold")
+    )
+    # a link with a comparison, which needs a dial
+    shown.page.evaluate("location.hash = '#wipe=0.5&dial=3'")
     shown.run("clod.whenDrawn()")
     assert not shown.page.is_checked("#compare")
 
@@ -142,7 +193,9 @@ FEW = """const real = WebGL2RenderingContext.prototype.getParameter;
         ("WebGL2", "HTMLCanvasElement.prototype.getContext = () => null"),
     ],
 )
-def test_a_page_that_cannot_show_its_model_says_why(tabs: Any, model: Path, error: str, script: str) -> None:
+def test_a_page_that_cannot_show_its_model_says_why(
+    tabs: Any, model: Path, error: str, script: str
+) -> None:
     """Keys have no effect then; without WebGL there is no panel either."""
     with serve(model) as url, closing(tabs.new_page()) as tab:
         if not script:

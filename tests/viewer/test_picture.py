@@ -1,5 +1,6 @@
-"""The browser's picture equals ``clod_adapter.render`` at the same camera and dial value; files that it reads itself
-as Python does, and those that it leaves to Python."""
+"""The browser's picture equals ``clod_adapter.render`` at the same camera and dial value; files
+that it reads itself as Python does, and those that it leaves to Python.
+"""
 
 import gzip
 import re
@@ -32,7 +33,9 @@ def finer(model: Gaussians, by: float, **changes: Any) -> Gaussians:
 
 
 def grown(count: int, degree: int, power: float, by: float, **settings: Any) -> Gaussians:
-    """With growth of both signs; some Gaussians have their centre outside the picture and grow into it."""
+    """With growth of both signs; some Gaussians have their centre outside the picture and grow into
+    it.
+    """
     model = scenes.dialled(count, degree, 7, **settings)
     return finer(model, by, growth_d=torch.linspace(-1, power, count))
 
@@ -51,16 +54,29 @@ CASES: dict[str, tuple[Gaussians, tuple[float, ...], Camera]] = {
     "degree 3": (scenes.dialled(500, 3, 7), (1.0, 3.0), VIEW),
     "compensated": (finer(scenes.dialled(500, 1, 7), 2, screen_filter=FILTERS["on"]), (2.0,), VIEW),
     "another unit, wide blur": (
-        finer(scenes.dialled(500, 1, 7, scene_distance=2.0), 2, screen_filter=WIDE), (2.0,), VIEW
+        finer(scenes.dialled(500, 1, 7, scene_distance=2.0), 2, screen_filter=WIDE),
+        (2.0,),
+        VIEW,
     ),
     "growth": (
-        grown(1500, 0, 1.5, 1, max_sv=10.0, reference_distance=4.5), (1.0, 8.0), scenes.camera(320, 240, fov=40)
+        grown(1500, 0, 1.5, 1, max_sv=10.0, reference_distance=4.5),
+        (1.0, 8.0),
+        scenes.camera(320, 240, fov=40),
     ),
-    # By factors up to 1e8: quads of that size would be drawn inexactly; they end at the picture's farthest corner.
-    "far beyond the picture": (grown(300, 0, 5, 0, max_sv=40.0, reference_distance=2.0), (20.0,), VIEW),
+    # By factors up to 1e8: quads of that size would be drawn inexactly; they end at the picture's
+    # farthest corner.
+    "far beyond the picture": (
+        grown(300, 0, 5, 0, max_sv=40.0, reference_distance=2.0),
+        (20.0,),
+        VIEW,
+    ),
     "millimetres": small(1e-3),
-    "off centre": (scenes.dialled(500, 0, 7), (1.0,), scenes.camera(180, 240, fov=100, off_centre=(0.1, 0.9))),
-}  # fmt: skip
+    "off centre": (
+        scenes.dialled(500, 0, 7),
+        (1.0,),
+        scenes.camera(180, 240, fov=100, off_centre=(0.1, 0.9)),
+    ),
+}
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -71,7 +87,8 @@ def test_the_picture_and_the_count(shown: Shown, save: Any, name: str) -> None:
     for s in dials:
         shown.run("clod.setDial(given)", s)
         assert_same(shown, render(model, camera, s))
-        if name in ("growth", "another unit, wide blur"):  # the measure tells them from models without it
+        # the measure tells them from models without it
+        if name in ("growth", "another unit, wide blur"):
             other = model.replace(growth_d=None, screen_filter=FILTERS["off"])
             with pytest.raises(AssertionError):
                 assert_alike(shown.picture(), render(other, camera, s).pixels.numpy())
@@ -81,7 +98,9 @@ def test_the_picture_and_the_count(shown: Shown, save: Any, name: str) -> None:
 
 
 def test_wipe_shows_both_sides(show: Any, save: Any) -> None:
-    """The base, or the same file without its dial, which is then on at the left; by a switch, and by C."""
+    """The base, or the same file without its dial, which is then on at the left; by a switch, and
+    by C.
+    """
     gaussians = scenes.dialled(600, 0, 7)
     base = gaussians.replace(sigma_d=None, attenuation=None, sh0=-gaussians.sh0)
     shown = show(save(gaussians), "--base", save(base, "base.ply"), "--sv", 3, viewport=TALL)
@@ -112,12 +131,17 @@ def test_ply_and_spz_are_shown_as_python_reads_them(
     for name, saved in (("usual.ply", model), ("usual.spz", model), ("plain.spz", plain)):
         write(tmp_path / name, saved.replace(screen_filter=FILTERS["mip"]))
     write(tmp_path / "tag.ply", finer(plain, 2.0))
-    data, rows = (tmp_path / "usual.ply").read_bytes(), PlyData.read(tmp_path / "usual.ply", mmap=False)["vertex"]
+    data, rows = (
+        (tmp_path / "usual.ply").read_bytes(),
+        PlyData.read(tmp_path / "usual.ply", mmap=False)["vertex"],
+    )
     (tmp_path / "bare.ply").write_bytes(re.sub(rb"(?m)^comment .*\n", b"", data))
     doubles = rows.data.astype([(name, "f8") for name in rows.data.dtype.names])
     write_rows(tmp_path / "doubles.ply", doubles, ">", rows.comments)
     tagged = re.sub(rb"(?m)^comment clod_adapter .*\n", b"", (tmp_path / "tag.ply").read_bytes())
-    (tmp_path / "tag.ply").write_bytes(tagged.replace(b"format", b"comment SplatRenderMode: mip\nformat", 1))
+    (tmp_path / "tag.ply").write_bytes(
+        tagged.replace(b"format", b"comment SplatRenderMode: mip\nformat", 1)
+    )
     for path in sorted(tmp_path.glob("*.*")):
         found = clod_adapter.load(path).gaussians
         take(shown, path)
@@ -128,7 +152,9 @@ def test_ply_and_spz_are_shown_as_python_reads_them(
         assert_same(shown, render(found, VIEW, s))
 
 
-def test_other_files_are_errors_and_the_picture_stays(shown: Shown, model: Path, tmp_path: Path) -> None:
+def test_other_files_are_errors_and_the_picture_stays(
+    shown: Shown, model: Path, tmp_path: Path
+) -> None:
     data = model.read_bytes()
     write(tmp_path / "a.glb", clod_adapter.load(model).gaussians)
     header, _, _ = data.partition(b"end_header")
@@ -136,9 +162,21 @@ def test_other_files_are_errors_and_the_picture_stays(shown: Shown, model: Path,
     refused = (
         ("a.glb", (tmp_path / "a.glb").read_bytes(), python),
         ("a.sog", b"PK\3\4" + bytes(60), python),
-        ("ascii.ply", header.replace(b"binary_little_endian", b"ascii") + b"end_header\n1 2\n", python),
-        ("mip.ply", data.replace(b"property float x\n", b"property float filter_3D\nproperty float x\n"), python),
-        ("mesh.ply", b"ply\nformat binary_little_endian 1.0\nelement vertex 0\nend_header\n", "x is missing"),
+        (
+            "ascii.ply",
+            header.replace(b"binary_little_endian", b"ascii") + b"end_header\n1 2\n",
+            python,
+        ),
+        (
+            "mip.ply",
+            data.replace(b"property float x\n", b"property float filter_3D\nproperty float x\n"),
+            python,
+        ),
+        (
+            "mesh.ply",
+            b"ply\nformat binary_little_endian 1.0\nelement vertex 0\nend_header\n",
+            "x is missing",
+        ),
         ("cut.ply", data[:-100], "truncated"),
         ("head.ply", data[:300], "truncated"),
         ("empty.ply", b"", "empty"),
@@ -149,34 +187,59 @@ def test_other_files_are_errors_and_the_picture_stays(shown: Shown, model: Path,
     before = shown.picture()
     for name, content, error in refused:
         drop(shown, name, content)
-        assert error.format(name) in message(shown, name) and shown.text("#title") == "model.ply", name
+        assert error.format(name) in message(shown, name) and shown.text("#title") == "model.ply", (
+            name
+        )
     assert np.array_equal(shown.picture(), before)
 
 
-def test_other_forms_of_the_dial_are_refused_with_a_remedy(shown: Shown, model: Path, tmp_path: Path) -> None:
-    """The paper's, and that of files from before every Gaussian had a reach; by comments, columns and documents."""
+def test_other_forms_of_the_dial_are_refused_with_a_remedy(
+    shown: Shown, model: Path, tmp_path: Path
+) -> None:
+    """The paper's, and that of files from before every Gaussian had a reach; by comments, columns
+    and documents.
+    """
     loaded = clod_adapter.load(model)
     paper = replace(loaded.gaussians.attenuation, form="paper")
     write(tmp_path / "paper.spz", loaded.gaussians.replace(attenuation=paper))
-    ours, column, data = b"comment clod_adapter form ours\n", b"property float nx\n", model.read_bytes()
+    ours, column, data = (
+        b"comment clod_adapter form ours\n",
+        b"property float nx\n",
+        model.read_bytes(),
+    )
     assert ours in data and column in data
-    of_paper, earlier = "without --form paper", "its dial is of an earlier form; adapt its checkpoint again"
+    of_paper, earlier = (
+        "without --form paper",
+        "its dial is of an earlier form; adapt its checkpoint again",
+    )
     for name, content, error in (
         ("paper.spz", (tmp_path / "paper.spz").read_bytes(), of_paper),
         ("paper.ply", data.replace(ours, b"comment clod_adapter form paper\n"), of_paper),
-        ("column.ply", data.replace(ours, b"").replace(column, b"property float clod_tau\n"), earlier),
+        (
+            "column.ply",
+            data.replace(ours, b"").replace(column, b"property float clod_tau\n"),
+            earlier,
+        ),
         ("comment.ply", data.replace(ours, b"comment clod_adapter cut soft\n"), earlier),
     ):
         drop(shown, name, content)
         said = message(shown, name)
         assert error in said and "opens every format" not in said, (name, said)
-    with pytest.raises(ClodError, match="the paper's form, which viewers do not draw; adapt it without --form paper"):
+    with pytest.raises(
+        ClodError,
+        match="the paper's form, which viewers do not draw; adapt it without --form paper",
+    ):
         Payload.of(replace(loaded, gaussians=loaded.gaussians.replace(attenuation=paper)))
 
 
-def test_the_last_of_two_dropped_files_is_shown(show: Any, save: Any, model: Path, gaussians: Gaussians) -> None:
+def test_the_last_of_two_dropped_files_is_shown(
+    show: Any, save: Any, model: Path, gaussians: Gaussians
+) -> None:
     """At the dial value of the command line, or the largest trained one of the file."""
-    less = save(gaussians.replace(attenuation=replace(gaussians.attenuation, max_sv=2.0))[torch.arange(9)], "less.ply")
+    less = save(
+        gaussians.replace(attenuation=replace(gaussians.attenuation, max_sv=2.0))[torch.arange(9)],
+        "less.ply",
+    )
     shown = show(model, "--sv", 3)
     drop(shown, "slow.ply", model.read_bytes(), wait=300)
     drop(shown, "less.ply", less.read_bytes())

@@ -15,7 +15,12 @@ from clod_adapter.viewer.server import Response, Server
 
 BLOCKS = (b"a" * 1000, b"b" * 24)
 RESPONSES = {
-    "/": Response("text/html; charset=utf-8", 5, lambda: (b"hello",), "default-src 'none'; script-src 'sha256-x'"),
+    "/": Response(
+        "text/html; charset=utf-8",
+        5,
+        lambda: (b"hello",),
+        "default-src 'none'; script-src 'sha256-x'",
+    ),
     "/files/model": Response("application/octet-stream", 1024, lambda: BLOCKS),
 }
 
@@ -43,7 +48,9 @@ def server() -> Iterator[Server]:
         yield server
 
 
-def request(server: Server, path: str, method: str = "GET", **headers: str) -> tuple[int, dict[str, str], bytes]:
+def request(
+    server: Server, path: str, method: str = "GET", **headers: str
+) -> tuple[int, dict[str, str], bytes]:
     connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=10)
     try:
         connection.request(method, path, headers=headers)
@@ -54,30 +61,49 @@ def request(server: Server, path: str, method: str = "GET", **headers: str) -> t
 
 
 SAFE = {
-    "cache-control": "no-store", "x-content-type-options": "nosniff", "cross-origin-resource-policy": "same-origin",
-}  # fmt: skip
+    "cache-control": "no-store",
+    "x-content-type-options": "nosniff",
+    "cross-origin-resource-policy": "same-origin",
+}
 REQUESTS: tuple[tuple[str, str, str | None, int], ...] = (  # method, path, Host, status
     *(("GET", path, None, 200) for path in ("/?any=thing", "/files/model")),
     ("HEAD", "/files/model", None, 200),
-    *(("GET", path, None, 404) for path in ("/files/", "/files/base", "/files/../", "/etc/passwd", "/%2e%2e/", "*")),
+    *(
+        ("GET", path, None, 404)
+        for path in ("/files/", "/files/base", "/files/../", "/etc/passwd", "/%2e%2e/", "*")
+    ),
     *((method, "/", None, 501) for method in ("POST", "PUT", "DELETE", "OPTIONS", "CONNECT")),
-    *(("GET", "/files/model", host, 421) for host in ("evil.example:80", "127.0.0.1.evil.example", "0.0.0.0", "")),
+    *(
+        ("GET", "/files/model", host, 421)
+        for host in ("evil.example:80", "127.0.0.1.evil.example", "0.0.0.0", "")
+    ),
     ("GET", "/", "localhost:9@evil.example", 421),
     *(("GET", "/", host, 200) for host in ("localhost", "LOCALHOST:8000", "127.0.0.1:1")),
 )
 
 
 def test_responses(server: Server) -> None:
-    assert server.socket.getsockname()[0] == "127.0.0.1" and server.url == f"http://127.0.0.1:{server.port}/"
+    assert (
+        server.socket.getsockname()[0] == "127.0.0.1"
+        and server.url == f"http://127.0.0.1:{server.port}/"
+    )
     for method, path, host, wanted in REQUESTS:
-        status, headers, body = request(server, path, method, **({} if host is None else {"Host": host}))
+        status, headers, body = request(
+            server, path, method, **({} if host is None else {"Host": host})
+        )
         assert status == wanted and headers.items() >= SAFE.items(), (method, path, host, status)
-        assert "access-control-allow-origin" not in headers and "python" not in headers["server"].lower()
+        assert (
+            "access-control-allow-origin" not in headers
+            and "python" not in headers["server"].lower()
+        )
         if method == "GET" and status == 200:
             page = path.startswith("/files")
             assert body == (b"".join(BLOCKS) if page else b"hello")
             scripts = "" if page else "; script-src 'sha256-x'"
-            assert headers["content-security-policy"] == f"default-src 'none'{scripts}; frame-ancestors 'none'"
+            assert (
+                headers["content-security-policy"]
+                == f"default-src 'none'{scripts}; frame-ancestors 'none'"
+            )
         else:
             assert BLOCKS[0] not in body
     with pytest.raises(ClodError, match=f"^port {server.port} of 127.0.0.1 .*choose another"):
@@ -88,7 +114,10 @@ def test_a_busy_page_gets_the_rest_later(monkeypatch: pytest.MonkeyPatch) -> Non
     """It takes no bytes for longer than an idle connection is kept."""
     monkeypatch.setattr(served._Handler, "timeout", 0.1)
     size = 1 << 25
-    with running({"/": Response("text/html", size, lambda: (bytes(size),))}) as server, asking(server) as connection:
+    with (
+        running({"/": Response("text/html", size, lambda: (bytes(size),))}) as server,
+        asking(server) as connection,
+    ):
         time.sleep(0.4)
         found = 0
         while found < size and (data := connection.recv(1 << 20)):
@@ -97,7 +126,9 @@ def test_a_busy_page_gets_the_rest_later(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 def test_disconnected_and_closed(capfd: pytest.CaptureFixture[str]) -> None:
-    """Closing waits for running responses: a thread that holds a tensor as the interpreter exits aborts the process."""
+    """Closing waits for running responses: a thread that holds a tensor as the interpreter exits
+    aborts the process.
+    """
     ended: list[int] = []
 
     def endless() -> Iterator[bytes]:

@@ -1,4 +1,6 @@
-"""Keys, pointer, touch, typed counts, links and lists; orbit centre, up axis, framing, animations, pictures, videos."""
+"""Keys, pointer, touch, typed counts, links and lists; orbit centre, up axis, framing, animations,
+pictures, videos.
+"""
 
 import io
 from dataclasses import replace
@@ -57,7 +59,9 @@ def target(shown: Shown, text: str) -> str:
 
 
 def test_the_count_box(shown: Shown, gaussians: Gaussians) -> None:
-    """A count sets the dial value of ``dial_for``; its note ends with the state that it is about. Keys wait."""
+    """A count sets the dial value of ``dial_for``; its note ends with the state that it is about.
+    Keys wait.
+    """
     camera = scenes.camera(320, 240)
     wanted = clod_adapter.dial_for(gaussians, keep=280, cameras=[camera]).virtual_scale
     fold(shown, True)
@@ -65,9 +69,14 @@ def test_the_count_box(shown: Shown, gaussians: Gaussians) -> None:
     before = shown.picture()
     shown.page.focus("#target")
     shown.page.keyboard.type("wasdech0")
-    assert shown.page.input_value("#target") == "wasdech0" and np.array_equal(shown.picture(), before)
+    assert shown.page.input_value("#target") == "wasdech0" and np.array_equal(
+        shown.picture(), before
+    )
     for text in ("0", "1.5", "many"):
-        assert "Enter a number of Gaussians" in target(shown, text) and shown.text("#dial-value") == "s = 1.00"
+        assert (
+            "Enter a number of Gaussians" in target(shown, text)
+            and shown.text("#dial-value") == "s = 1.00"
+        )
     assert "keeps" in target(shown, "1,000,000")
     shown.run("clod.setEquation(false)")
     assert "keeps 280 in this view" in target(shown, "280")
@@ -110,14 +119,28 @@ def test_pointer_touch_and_wheel_move_the_camera(chromium: Any, show: Any, model
 
 
 def test_files_and_cameras_are_listed(show: Any, gaussians: Gaussians, tmp_path: Path) -> None:
-    """Switched by keys, lists and a link: view and base stay, and the dial value where the file has it."""
-    second = gaussians.replace(sh0=-gaussians.sh0, attenuation=replace(gaussians.attenuation, max_sv=2.0))
+    """Switched by keys, lists and a link: view and base stay, and the dial value where the file has
+    it.
+    """
+    second = gaussians.replace(
+        sh0=-gaussians.sh0, attenuation=replace(gaussians.attenuation, max_sv=2.0)
+    )
     models = {"a.ply": gaussians, "b.glb": second, "c.ply": scenes.dialled(9, 1, 5)}
     for name, model in models.items():
         write(tmp_path / name, model)
-    cameras = [replace(camera, name=f"{k}.jpg") for k, camera in enumerate(scenes.ring(3, 320, 240))]
+    cameras = [
+        replace(camera, name=f"{k}.jpg") for k, camera in enumerate(scenes.ring(3, 320, 240))
+    ]
     write_model(tmp_path, cameras, [camera.name for camera in cameras])
-    words = [*(tmp_path / name for name in models), "--base", tmp_path / "a.ply", "--images", tmp_path, "--sv", 3]
+    words = [
+        *(tmp_path / name for name in models),
+        "--base",
+        tmp_path / "a.ply",
+        "--images",
+        tmp_path,
+        "--sv",
+        3,
+    ]
     shown = show(*words, viewport=TALL)
     assert shown.page.locator("#files option").all_inner_texts() == list(models)
     links = {"0.jpg": shown.link()}
@@ -151,7 +174,10 @@ def test_files_and_cameras_are_listed(show: Any, gaussians: Gaussians, tmp_path:
 
 def link(shown: Shown) -> dict[str, np.ndarray]:
     parts = shown.link().lstrip("#").split("&")
-    return {name: np.array([float(v) for v in text.split(",")]) for name, text in (part.split("=") for part in parts)}
+    return {
+        name: np.array([float(v) for v in text.split(",")])
+        for name, text in (part.split("=") for part in parts)
+    }
 
 
 def forward(view: dict[str, np.ndarray]) -> np.ndarray:
@@ -163,23 +189,33 @@ def points(means: Any, size: float, sh0: Any = None) -> Gaussians:
     means = torch.as_tensor(means, dtype=torch.float32)
     model, opaque = scenes.gaussians(len(means), 0, 1), torch.full((len(means),), 6.0)
     return model.replace(
-        means=means, log_scales=torch.full_like(means, float(np.log(size))), opacity_logits=opaque,
+        means=means,
+        log_scales=torch.full_like(means, float(np.log(size))),
+        opacity_logits=opaque,
         sh0=model.sh0 if sh0 is None else torch.as_tensor(sh0, dtype=torch.float32)[:, None],
-    )  # fmt: skip
+    )
 
 
 def ground(angle: float) -> tuple[Gaussians, np.ndarray]:
-    """A ground, of which two thirds are flat and lie along it, turned about x by an angle from minus y; its normal."""
-    turn = np.array([[1, 0, 0], [0, np.cos(angle), -np.sin(angle)], [0, np.sin(angle), np.cos(angle)]])
+    """A ground, of which two thirds are flat and lie along it, turned about x by an angle from
+    minus y; its normal.
+    """
+    turn = np.array(
+        [[1, 0, 0], [0, np.cos(angle), -np.sin(angle)], [0, np.sin(angle), np.cos(angle)]]
+    )
     model = points(np.random.default_rng(0).uniform(-1, 1, (1000, 3)) * [2, 0.02, 2] @ turn.T, 0.01)
     flat = torch.arange(1000)[:, None] % 3 > 0
     scales = torch.where(flat, torch.tensor([0.0, -3.0, 0.0]), torch.tensor([-2.0, 0.0, 0.0]))
-    quats = torch.where(flat, torch.tensor([np.cos(angle / 2), np.sin(angle / 2), 0.0, 0.0]), model.quats).float()
+    quats = torch.where(
+        flat, torch.tensor([np.cos(angle / 2), np.sin(angle / 2), 0.0, 0.0]), model.quats
+    ).float()
     return model.replace(log_scales=model.log_scales + scales, quats=quats), turn @ [0, -1, 0]
 
 
 def test_the_up_axis(shown: Shown, show: Any, save: Any, tmp_path: Path) -> None:
-    """That of a tilted ground; that of the photographs' cameras, if any; or a chosen one, which a link keeps."""
+    """That of a tilted ground; that of the photographs' cameras, if any; or a chosen one, which a
+    link keeps.
+    """
 
     def up_of(view: dict[str, np.ndarray], tilt: float) -> np.ndarray:
         return np.asarray(-np.cos(tilt) * view["axes"][3:] - np.sin(tilt) * forward(view))
@@ -189,18 +225,31 @@ def test_the_up_axis(shown: Shown, show: Any, save: Any, tmp_path: Path) -> None
         take(shown, path := save(model))
         assert up_of(link(shown), np.arctan(0.5)) @ normal > np.cos(np.radians(5))
     assert shown.page.text_content("#up option") == "found from the scene"
-    shown.page.eval_on_selector("#up", "(up) => { up.value = '0,0,1'; up.dispatchEvent(new Event('change')); }")
+    shown.page.eval_on_selector(
+        "#up", "(up) => { up.value = '0,0,1'; up.dispatchEvent(new Event('change')); }"
+    )
     chosen = link(shown)
-    assert chosen["up"].tolist() == [0, 0, 1] and abs(chosen["axes"][2]) < 1e-6 and forward(chosen)[2] < 0
-    cameras = [replace(camera, name=f"{k}.jpg") for k, camera in enumerate(scenes.ring(3, 320, 240))]
+    assert (
+        chosen["up"].tolist() == [0, 0, 1]
+        and abs(chosen["axes"][2]) < 1e-6
+        and forward(chosen)[2] < 0
+    )
+    cameras = [
+        replace(camera, name=f"{k}.jpg") for k, camera in enumerate(scenes.ring(3, 320, 240))
+    ]
     write_model(tmp_path, cameras, [camera.name for camera in cameras])
     with_cameras = show(path, "--images", tmp_path)
     assert with_cameras.page.text_content("#up option") == "as in the photographs"
     before = link(with_cameras)["axes"]
     with_cameras.page.keyboard.press("ArrowLeft")
-    turned, up = link(with_cameras)["axes"], -sum(camera.viewmat[1, :3].numpy() for camera in cameras)
+    turned, up = (
+        link(with_cameras)["axes"],
+        -sum(camera.viewmat[1, :3].numpy() for camera in cameras),
+    )
     assert abs((turned - before)[:3] @ up) < 1e-4 < np.abs(turned - before).max()
-    with_cameras.page.evaluate("hash => { location.hash = hash }", shown.page.evaluate("location.hash"))
+    with_cameras.page.evaluate(
+        "hash => { location.hash = hash }", shown.page.evaluate("location.hash")
+    )
     with_cameras.until("document.getElementById('up').value === '0,0,1'")
     with_cameras.page.keyboard.press("ArrowLeft")
     assert abs(link(with_cameras)["axes"][2]) < 1e-6
@@ -208,24 +257,39 @@ def test_the_up_axis(shown: Shown, show: Any, save: Any, tmp_path: Path) -> None
 
 def test_placed_cameras_are_levelled(show: Any, model: Path, tmp_path: Path) -> None:
     saved, viewmat = clod_adapter.load(model), scenes.looking(torch.tensor([1.0, 0.5, 0.5]))
-    tilted = Camera(viewmat[[1, 0, 2, 3]] * torch.tensor([[-1.0], [1], [1], [1]]), torch.eye(3), 4, 3)
+    tilted = Camera(
+        viewmat[[1, 0, 2, 3]] * torch.tensor([[-1.0], [1], [1], [1]]), torch.eye(3), 4, 3
+    )
     place = viewpoint_of(tilted, saved.gaussians.means, saved.gaussians.attenuation)
-    measured = Calibration((CalibrationRow(1.0, 9.0, 30.0, 0.9, 1.0),), 400, 1, 400, 300, "a", "checkpoint", (place,))
+    measured = Calibration(
+        (CalibrationRow(1.0, 9.0, 30.0, 0.9, 1.0),), 400, 1, 400, 300, "a", "checkpoint", (place,)
+    )
     write_viewer_page(tmp_path / "page.html", replace(saved, calibration=measured))
-    fast = "WebGL2RenderingContext.prototype.readPixels = () => {}"  # frames whose time is hardly more than 0
+    # frames whose time is hardly more than 0
+    fast = "WebGL2RenderingContext.prototype.readPixels = () => {}"
     shown = show(url=(tmp_path / "page.html").as_uri(), script=fast)
-    assert shown.text("#dial-value") == "all" and np.allclose(link(shown)["axes"][:3], viewmat[0, :3], atol=1e-4)
+    assert shown.text("#dial-value") == "all" and np.allclose(
+        link(shown)["axes"][:3], viewmat[0, :3], atol=1e-4
+    )
 
 
 @pytest.mark.parametrize("photographs", [True, False])
-def test_the_picture_and_the_panel_fit_the_window(show: Any, save: Any, tmp_path: Path, photographs: bool) -> None:
-    """On a phone, also lying, and a desktop: red balls at the picture's corners are not behind the panel."""
+def test_the_picture_and_the_panel_fit_the_window(
+    show: Any, save: Any, tmp_path: Path, photographs: bool
+) -> None:
+    """On a phone, also lying, and a desktop: red balls at the picture's corners are not behind the
+    panel.
+    """
     camera = replace(scenes.camera(320, 240, off_centre=(0.5, 0.5)), name="0.jpg")
     corners = torch.tensor([[x, y, 1.0] for x in (13.0, 307.0) for y in (13.0, 227.0)])
     where = camera.position + (corners @ torch.linalg.inv(camera.K).T * 3) @ camera.viewmat[:3, :3]
     path = save(points(where, 0.02, [[1.5, -1.7, -1.7]] * 4))
     write_model(tmp_path, [camera], ["0.jpg"])
-    shown = show(path, *(("--images", tmp_path) if photographs else ()), viewport={"width": 390, "height": 844})
+    shown = show(
+        path,
+        *(("--images", tmp_path) if photographs else ()),
+        viewport={"width": 390, "height": 844},
+    )
     for width, height in ((390, 844), (900, 420), (1280, 800)):
         shown.page.set_viewport_size({"width": width, "height": height})
         shown.until(f"document.getElementById('canvas').clientWidth === {width}")
@@ -234,13 +298,27 @@ def test_the_picture_and_the_panel_fit_the_window(show: Any, save: Any, tmp_path
             shown.page.click("#fold")
         shown.page.keyboard.press("0")
         red = shown.picture()[..., 0] > 100
-        box = shown.page.evaluate("document.getElementById('panel').getBoundingClientRect().toJSON()")
-        assert box["left"] >= 0 and box["right"] <= width and box["top"] >= 0 and box["bottom"] <= height
+        box = shown.page.evaluate(
+            "document.getElementById('panel').getBoundingClientRect().toJSON()"
+        )
+        assert (
+            box["left"] >= 0
+            and box["right"] <= width
+            and box["top"] >= 0
+            and box["bottom"] <= height
+        )
         red[int(box["top"]) : int(box["bottom"]), int(box["left"]) : int(box["right"])] = False
         rows, columns = np.nonzero(red)
-        lower, right = rows > (rows.min() + rows.max()) / 2, columns > (columns.min() + columns.max()) / 2
+        lower, right = (
+            rows > (rows.min() + rows.max()) / 2,
+            columns > (columns.min() + columns.max()) / 2,
+        )
         assert len({*zip(lower.tolist(), right.tolist(), strict=True)}) == 4, width
-        assert min(rows.min(), columns.min()) > 0 and rows.max() < height - 1 and columns.max() < width - 1
+        assert (
+            min(rows.min(), columns.min()) > 0
+            and rows.max() < height - 1
+            and columns.max() < width - 1
+        )
 
 
 SELECTED = """() => {
@@ -255,8 +333,12 @@ SELECTED = """() => {
 
 
 def test_the_path_and_the_turntable(show: Any, model: Path, tmp_path: Path) -> None:
-    """The path begins again at its end; Space or a drag stops it. The turntable rotates about the pivot and up axis."""
-    cameras = [replace(camera, name=f"{k}.jpg") for k, camera in enumerate(scenes.ring(80, 320, 240)[:3])]
+    """The path begins again at its end; Space or a drag stops it. The turntable rotates about the
+    pivot and up axis.
+    """
+    cameras = [
+        replace(camera, name=f"{k}.jpg") for k, camera in enumerate(scenes.ring(80, 320, 240)[:3])
+    ]
     write_model(tmp_path, cameras, [camera.name for camera in cameras])
     shown, playing = show(model, "--images", tmp_path), "document.querySelector('#play.playing')"
     views = [link(shown)]
@@ -267,7 +349,9 @@ def test_the_path_and_the_turntable(show: Any, model: Path, tmp_path: Path) -> N
     start, turned, stopped = views
     assert np.array_equal(link(shown)["eye"], stopped["eye"])
     pivots = [view["eye"] + view["distance"] * forward(view) for view in views]
-    assert np.allclose(pivots[0], pivots[2], atol=1e-4) and not np.allclose(start["eye"], turned["eye"], atol=1e-2)
+    assert np.allclose(pivots[0], pivots[2], atol=1e-4) and not np.allclose(
+        start["eye"], turned["eye"], atol=1e-2
+    )
     shown.page.keyboard.press("0")
     shown.page.keyboard.press("Space")
     shown.page.evaluate(SELECTED)  # in each frame: the last camera is there for one
@@ -290,7 +374,9 @@ def test_pictures_and_videos_are_saved(shown: Shown) -> None:
     with shown.page.expect_download() as download:
         shown.page.keyboard.press("x")
     assert download.value.suggested_filename == "model_s2.00.png"
-    saved = np.asarray(Image.open(io.BytesIO(Path(download.value.path()).read_bytes())).convert("RGB"))
+    saved = np.asarray(
+        Image.open(io.BytesIO(Path(download.value.path()).read_bytes())).convert("RGB")
+    )
     assert np.array_equal(saved, picture)
     record = "document.getElementById('record').click()"
     shown.page.evaluate(record)

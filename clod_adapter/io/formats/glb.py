@@ -1,10 +1,11 @@
-"""glTF binary files with ``KHR_gaussian_splatting`` (Khronos, ratified 2026), with ``_SIGMA_D`` and ``_GROWTH_D``
-where there is a dial.
+"""glTF binary files with ``KHR_gaussian_splatting`` (Khronos, ratified 2026), with ``_SIGMA_D`` and
+``_GROWTH_D`` where there is a dial.
 
-One POINTS primitive, every attribute float32: activated opacities and scales, rotations of unit length as xyzw, a VEC3
-for each harmonic up to degree 3; and 8-bit ``COLOR_0`` for readers without the extension. The values are the
-checkpoint's: glTF's y is up and its x goes left, so the node has a half turn about z, and a translation where there is
-an origin. ``asset.extras.clod_adapter`` holds the document (``settings.document``).
+One POINTS primitive, every attribute float32: activated opacities and scales, rotations of unit
+length as xyzw, a VEC3 for each harmonic up to degree 3; and 8-bit ``COLOR_0`` for readers without
+the extension. The values are the checkpoint's: glTF's y is up and its x goes left, so the node has
+a half turn about z, and a translation where there is an origin. ``asset.extras.clod_adapter`` holds
+the document (``settings.document``).
 """
 
 import json
@@ -31,54 +32,78 @@ EXTENSION = "KHR_gaussian_splatting"
 DIAL = {SIGMA: "_SIGMA_D", GROWTH: "_GROWTH_D", OPACITY: "_OPACITY_D"}
 COLOR_SPACE = "srgb_rec709_display"
 DEGREE = 3  # the highest that the extension has
-HALF_TURN = [0.0, 0.0, 1.0, 0.0]  # about z, as xyzw: x right, y down becomes x left, y up; as splat-transform has it
+# about z, as xyzw: x right, y down becomes x left, y up; as splat-transform has it
+HALF_TURN = [0.0, 0.0, 1.0, 0.0]
 _LIMIT = 1 << 32  # bytes of a file, whose header says how many in 32 bits
 _FLOAT, _BYTE = 5126, 5121
 
 
 def harmonics(degree: int) -> list[str]:
-    """The attributes of the spherical harmonics up to a degree, 0 first, in the order of ``Gaussians.shN``."""
-    return [f"{EXTENSION}:SH_DEGREE_{band}_COEF_{index}" for band in range(degree + 1) for index in range(2 * band + 1)]
+    """The attributes of the spherical harmonics up to a degree, 0 first, in the order of
+    ``Gaussians.shN``.
+    """
+    return [
+        f"{EXTENSION}:SH_DEGREE_{band}_COEF_{index}"
+        for band in range(degree + 1)
+        for index in range(2 * band + 1)
+    ]
 
 
 _JSON, _BIN = 0x4E4F534A, 0x004E4942
-# Component types: those that the extension allows in the place of floats, whose largest value stands for 1, and these.
+# Component types: those that the extension allows in the place of floats, whose largest value
+# stands for 1, and these.
 _KINDS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", _FLOAT: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 _ATTRIBUTES = {
-    "means": ("POSITION", 3), "quats": (f"{EXTENSION}:ROTATION", 4), "log_scales": (f"{EXTENSION}:SCALE", 3),
-    "opacity_logits": (f"{EXTENSION}:OPACITY", 1), "sh0": (harmonics(0)[0], 3),
-}  # fmt: skip
+    "means": ("POSITION", 3),
+    "quats": (f"{EXTENSION}:ROTATION", 4),
+    "log_scales": (f"{EXTENSION}:SCALE", 3),
+    "opacity_logits": (f"{EXTENSION}:OPACITY", 1),
+    "sh0": (harmonics(0)[0], 3),
+}
 _REMEDY = "export it again, as a .ply"
 _DAMAGED = "is damaged or no such .glb", _REMEDY
 IDENTITY = [0.0, 0.0, 0.0, 1.0]  # as xyzw
 _FAINTEST = -100.0  # logit of an opacity that float32 has rounded to 0
-_LOGARITHMS = r"splat-transform 2\.([0-2]\.\d+|3\.[01])"  # a program that wrote SCALE so, whatever its range
+# a program that wrote SCALE so, whatever its range
+_LOGARITHMS = r"splat-transform 2\.([0-2]\.\d+|3\.[01])"
 _STRAY = 0.01  # the largest share of values beyond the extension's range that are only damaged
 
 
 def write(path: Path, gaussians: Gaussians, metadata: Metadata) -> tuple[str, ...]:
     """Writes with float32's rounding of the activations."""
     arrays, degree = arrays_of(path, gaussians), min(gaussians.sh_degree, DEGREE)
-    sh0, opacities = arrays["sh0"].reshape(-1, 3), values.sigmoid(arrays["opacity_logits"]).astype(np.float32)
+    sh0, opacities = (
+        arrays["sh0"].reshape(-1, 3),
+        values.sigmoid(arrays["opacity_logits"]).astype(np.float32),
+    )
     columns: dict[str, np.ndarray] = {
         "POSITION": arrays["means"],
         "COLOR_0": values.colours_of(sh0, opacities),
-        f"{EXTENSION}:ROTATION": np.ascontiguousarray(np.roll(values.normalized(arrays["quats"]), -1, axis=1)),
+        f"{EXTENSION}:ROTATION": np.ascontiguousarray(
+            np.roll(values.normalized(arrays["quats"]), -1, axis=1)
+        ),
         f"{EXTENSION}:SCALE": values.scales_of(path, arrays["log_scales"]),
         f"{EXTENSION}:OPACITY": opacities,
         harmonics(0)[0]: sh0,
     }
-    columns |= {name: np.ascontiguousarray(arrays["shN"][:, k]) for k, name in enumerate(harmonics(degree)[1:])}
+    columns |= {
+        name: np.ascontiguousarray(arrays["shN"][:, k])
+        for k, name in enumerate(harmonics(degree)[1:])
+    }
     columns |= {DIAL[name]: arrays[name] for name in dial_columns(arrays)}
     accessors, views, offset = dict[str, dict[str, Any]](), list[dict[str, Any]](), 0
     for name, array in columns.items():
         kind = "SCALAR" if array.ndim == 1 else f"VEC{array.shape[1]}"
         accessors[name] = {"bufferView": len(views), "count": len(array), "type": kind}
-        views.append({"buffer": 0, "byteOffset": offset, "byteLength": array.nbytes, "target": 34962})
+        views.append(
+            {"buffer": 0, "byteOffset": offset, "byteLength": array.nbytes, "target": 34962}
+        )
         offset += array.nbytes
     x, y, z = metadata.origin
-    node = {"rotation": HALF_TURN} | ({"translation": [0.0 - x, 0.0 - y, z]} if any(metadata.origin) else {})
+    node = {"rotation": HALF_TURN} | (
+        {"translation": [0.0 - x, 0.0 - y, z]} if any(metadata.origin) else {}
+    )
     extras = {KEY: json.loads(document(MODEL, metadata))}
     parts = [array.data for array in columns.values()]
     write_points(path, gaussians.means, accessors, node, views, parts, extras=extras)
@@ -87,38 +112,65 @@ def write(path: Path, gaussians: Gaussians, metadata: Metadata) -> tuple[str, ..
 
 
 def write_points(
-    path: Path, means: torch.Tensor, accessors: dict[str, dict[str, Any]], node: dict[str, Any],
-    views: list[dict[str, Any]], parts: Sequence[memoryview | bytes], extensions: dict[str, Any] | None = None,
+    path: Path,
+    means: torch.Tensor,
+    accessors: dict[str, dict[str, Any]],
+    node: dict[str, Any],
+    views: list[dict[str, Any]],
+    parts: Sequence[memoryview | bytes],
+    extensions: dict[str, Any] | None = None,
     **asset: Any,
-) -> None:  # fmt: skip
+) -> None:
     """Writes one POINTS primitive, and the parts of its buffer one after another.
 
-    ``accessors`` are by attribute, without component type and bounds; ``extensions``, which readers must know, those of
-    KHR_gaussian_splatting.
+    ``accessors`` are by attribute, without component type and bounds; ``extensions``, which readers
+    must know, those of KHR_gaussian_splatting.
     """
     for name, accessor in accessors.items():
-        accessor |= {"componentType": _FLOAT} if name != "COLOR_0" else {"componentType": _BYTE, "normalized": True}
+        accessor |= (
+            {"componentType": _FLOAT}
+            if name != "COLOR_0"
+            else {"componentType": _BYTE, "normalized": True}
+        )
     accessors["POSITION"] |= {"min": means.amin(0).tolist(), "max": means.amax(0).tolist()}
     how = {
-        "kernel": "ellipse", "colorSpace": COLOR_SPACE, "projection": "perspective",
-        "sortingMethod": "cameraDistance", **({"extensions": extensions} if extensions else {}),
-    }  # fmt: skip
-    attributes, used = {name: index for index, name in enumerate(accessors)}, [EXTENSION, *(extensions or {})]
+        "kernel": "ellipse",
+        "colorSpace": COLOR_SPACE,
+        "projection": "perspective",
+        "sortingMethod": "cameraDistance",
+        **({"extensions": extensions} if extensions else {}),
+    }
+    attributes, used = (
+        {name: index for index, name in enumerate(accessors)},
+        [EXTENSION, *(extensions or {})],
+    )
     size = sum(memoryview(part).nbytes for part in parts)
     if size >= _LIMIT - (1 << 20):
-        raise ClodError(f"{path}: {size:,} bytes are more than a .glb can hold; keep fewer Gaussians or write a .ply")
+        raise ClodError(
+            f"{path}: {size:,} bytes are more than a .glb can hold; keep fewer Gaussians or write a"
+            " .ply"
+        )
     gltf = {
         "asset": {"version": "2.0", "generator": f"clod-adapter {package_version()}", **asset},
-        "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0, **node}],
-        "meshes": [{"primitives": [{"attributes": attributes, "mode": 0, "extensions": {EXTENSION: how}}]}],
-        "accessors": list(accessors.values()), "buffers": [{"byteLength": size}], "bufferViews": views,
-        "extensionsUsed": used, **({"extensionsRequired": used} if extensions else {}),
-    }  # fmt: skip
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, **node}],
+        "meshes": [
+            {"primitives": [{"attributes": attributes, "mode": 0, "extensions": {EXTENSION: how}}]}
+        ],
+        "accessors": list(accessors.values()),
+        "buffers": [{"byteLength": size}],
+        "bufferViews": views,
+        "extensionsUsed": used,
+        **({"extensionsRequired": used} if extensions else {}),
+    }
     text = json.dumps(gltf, separators=(",", ":"), allow_nan=False).encode()
     text += b" " * (-len(text) % 4)
     padded = size + -size % 4
     with open(path, "wb") as file:
-        file.write(struct.pack("<4sIIII", b"glTF", 2, 28 + len(text) + padded, len(text), _JSON) + text)
+        file.write(
+            struct.pack("<4sIIII", b"glTF", 2, 28 + len(text) + padded, len(text), _JSON) + text
+        )
         file.write(struct.pack("<II", padded, _BIN))
         file.writelines(parts)
         file.write(bytes(padded - size))
@@ -135,26 +187,37 @@ def has_dial(path: Path) -> bool:
 def read(path: Path, data: bytes) -> Source:
     """Reads the first primitive with the extension, into the axes of checkpoints: y down.
 
-    Under a node without a rotation the values are in glTF's own axes, and are turned here; files of this package have
-    the half turn in the node and store the checkpoint's values.
+    Under a node without a rotation the values are in glTF's own axes, and are turned here; files of
+    this package have the half turn in the node and store the checkpoint's values.
     """
     with refused_if_damaged(path, *_DAMAGED):
         gltf, binary = _chunks(path, memoryview(data))
         (mesh, primitive), *others = _find(path, gltf)
         there = primitive["attributes"]
         degree = max(k for k in range(DEGREE + 1) if harmonics(k)[-1] in there)
-        names = _ATTRIBUTES | {name: (DIAL[name], 1) for name in dial_columns([n for n in DIAL if DIAL[n] in there])}
-        arrays = {key: _values(path, gltf, binary, there[name], width) for key, (name, width) in names.items()}
+        names = _ATTRIBUTES | {
+            name: (DIAL[name], 1) for name in dial_columns([n for n in DIAL if DIAL[n] in there])
+        }
+        arrays = {
+            key: _values(path, gltf, binary, there[name], width)
+            for key, (name, width) in names.items()
+        }
         rest = [_values(path, gltf, binary, there[name], 3) for name in harmonics(degree)[1:]]
         if len({len(each) for each in (*arrays.values(), *rest)}) > 1:
             raise ClodError(f"{path}: its attributes are of different lengths; {_REMEDY}")
         text = gltf["asset"].get("extras", {}).get(KEY)
         turned, moved = _placed(path, gltf, mesh)
     space = primitive["extensions"][EXTENSION].get("colorSpace", COLOR_SPACE)
-    notes = [f"its colours are in {space!r:.40}, and taken as {COLOR_SPACE}"] if space != COLOR_SPACE else []
+    notes = (
+        [f"its colours are in {space!r:.40}, and taken as {COLOR_SPACE}"]
+        if space != COLOR_SPACE
+        else []
+    )
     notes += [f"{len(others)} more primitives with Gaussians in it are left out"] if others else []
     metadata = parse_metadata(path, text, dial=SIGMA in arrays)
-    arrays["shN"] = np.stack(rest, 1) if rest else np.zeros((len(arrays["means"]), 0, 3), np.float32)
+    arrays["shN"] = (
+        np.stack(rest, 1) if rest else np.zeros((len(arrays["means"]), 0, 3), np.float32)
+    )
     stored, changed = _stored(arrays, str(gltf["asset"].get("generator")))
     notes += changed
     stored = stored if turned else half_turn(stored, "z")
@@ -168,7 +231,9 @@ def read(path: Path, data: bytes) -> Source:
 
 def _chunks(path: Path, data: memoryview) -> tuple[dict[str, Any], memoryview]:
     """The JSON and the binary chunk."""
-    version, length, size, kind = struct.unpack_from("<IIII", data, 4) if len(data) >= 20 else (0, 0, 0, 0)
+    version, length, size, kind = (
+        struct.unpack_from("<IIII", data, 4) if len(data) >= 20 else (0, 0, 0, 0)
+    )
     whole = version == 2 and kind == _JSON and max(length, 20 + size) <= len(data)
     more = struct.unpack_from("<I", data, 20 + size)[0] if whole and 28 + size <= length else 0
     if not whole or (more and 28 + size + more > len(data)):
@@ -178,22 +243,36 @@ def _chunks(path: Path, data: memoryview) -> tuple[dict[str, Any], memoryview]:
 
 def _find(path: Path, gltf: dict[str, Any]) -> list[tuple[int, dict[str, Any]]]:
     """The primitives with Gaussians, at least one, each after the number of its mesh."""
-    every = ((number, each) for number, mesh in enumerate(gltf.get("meshes", [])) for each in mesh["primitives"])
+    every = (
+        (number, each)
+        for number, mesh in enumerate(gltf.get("meshes", []))
+        for each in mesh["primitives"]
+    )
     found = [(number, each) for number, each in every if EXTENSION in each.get("extensions", {})]
     if not found:
-        raise ClodError(f"{path}: has no Gaussians ({EXTENSION}), so it is a mesh; give a checkpoint of Gaussians")
+        raise ClodError(
+            f"{path}: has no Gaussians ({EXTENSION}), so it is a mesh; give a checkpoint of"
+            " Gaussians"
+        )
     first = found[0][1]
     compressed = first["extensions"][EXTENSION].get("extensions")
     if compressed or any(name not in first["attributes"] for name, _ in _ATTRIBUTES.values()):
-        raise ClodError(f"{path}: its Gaussians are compressed, or have no spherical harmonics; export them as a .ply")
+        raise ClodError(
+            f"{path}: its Gaussians are compressed, or have no spherical harmonics; export them as"
+            " a .ply"
+        )
     return found
 
 
-def _values(path: Path, gltf: dict[str, Any], binary: memoryview, number: int, width: int) -> np.ndarray:
+def _values(
+    path: Path, gltf: dict[str, Any], binary: memoryview, number: int, width: int
+) -> np.ndarray:
     """``[N, width]`` float32, the values of an accessor; ``[N]`` where the width is 1."""
     accessor = gltf["accessors"][_whole(number)]
     if "sparse" in accessor or _WIDTHS[accessor["type"]] != width:
-        raise ClodError(f"{path}: an attribute is sparse or of type {accessor['type']!r:.20}; {_REMEDY}")
+        raise ClodError(
+            f"{path}: an attribute is sparse or of type {accessor['type']!r:.20}; {_REMEDY}"
+        )
     kind = np.dtype(_KINDS[accessor["componentType"]])
     view = gltf["bufferViews"][_whole(accessor["bufferView"])]
     if _whole(view["buffer"]) or "uri" in gltf["buffers"][0] or view.get("extensions"):
@@ -203,8 +282,12 @@ def _values(path: Path, gltf: dict[str, Any], binary: memoryview, number: int, w
     data = binary[_whole(view.get("byteOffset", 0)) :][: _whole(view["byteLength"])]
     size = kind.itemsize * width
     if not count or stride < size or start + (count - 1) * stride + size > len(data):
-        raise ClodError(f"{path}: an attribute has no values, or more than the file; copy or export it again")
-    found = np.ndarray((count, width), kind, data, start, (stride, kind.itemsize)).astype(np.float32)
+        raise ClodError(
+            f"{path}: an attribute has no values, or more than the file; copy or export it again"
+        )
+    found = np.ndarray((count, width), kind, data, start, (stride, kind.itemsize)).astype(
+        np.float32
+    )
     if accessor.get("normalized") and kind.kind != "f":
         found = np.maximum(found / np.float32(np.iinfo(kind).max), -1)
     return found[:, 0] if width == 1 else found
@@ -217,7 +300,9 @@ def _whole(value: Any) -> int:
 
 
 def _placed(path: Path, gltf: dict[str, Any], mesh: int) -> tuple[bool, Origin]:
-    """Whether the node of the mesh makes the half turn, and its translation as an origin in the axes of checkpoints."""
+    """Whether the node of the mesh makes the half turn, and its translation as an origin in the
+    axes of checkpoints.
+    """
     nodes: list[dict[str, Any]] = gltf.get("nodes", [])
     number = next((number for number, node in enumerate(nodes) if node.get("mesh") == mesh), -1)
     node = nodes[number] if number >= 0 else {}
@@ -225,16 +310,28 @@ def _placed(path: Path, gltf: dict[str, Any], mesh: int) -> tuple[bool, Origin]:
     rotation = [float(value) for value in node.get("rotation", IDENTITY)]
     scale = [float(value) for value in node.get("scale", [1, 1, 1])]
     turned = np.allclose(np.abs(rotation), HALF_TURN)
-    if below or "matrix" in node or scale != [1, 1, 1] or not (turned or np.allclose(np.abs(rotation), IDENTITY)):
-        raise ClodError(f"{path}: its node is scaled or turned, which is not undone; apply that and export it again")
+    if (
+        below
+        or "matrix" in node
+        or scale != [1, 1, 1]
+        or not (turned or np.allclose(np.abs(rotation), IDENTITY))
+    ):
+        raise ClodError(
+            f"{path}: its node is scaled or turned, which is not undone; apply that and export it"
+            " again"
+        )
     x, y, z = (float(value) for value in node.get("translation", [0, 0, 0]))
     if not np.isfinite([x, y, z]).all():
         raise ClodError(f"{path}: its node has a translation that is not finite; export it again")
     return turned, (0.0 - x, 0.0 - y, z)
 
 
-def _stored(arrays: dict[str, np.ndarray], generator: str) -> tuple[dict[str, np.ndarray], list[str]]:
-    """The values as checkpoints store them, and a line for each that the extension does not allow."""
+def _stored(
+    arrays: dict[str, np.ndarray], generator: str
+) -> tuple[dict[str, np.ndarray], list[str]]:
+    """The values as checkpoints store them, and a line for each that the extension does not
+    allow.
+    """
     scales, opacities, notes = arrays["log_scales"], arrays["opacity_logits"], list[str]()
     if re.fullmatch(_LOGARITHMS, generator) or _beyond(scales, np.inf):
         notes.append("its SCALE is not linear, as glTF has it, and is read as logarithms")

@@ -1,7 +1,9 @@
-"""Checkpoints of gsplat's trainer, ``.pt``: the only format that is a pickle, of which only tensors are read.
+"""Checkpoints of gsplat's trainer, ``.pt``: the only format that is a pickle, of which only tensors
+are read.
 
-Files of this package have ``sigma_d`` and ``growth_d`` among the ``splats`` too, and the JSON document as text under
-``clod_adapter`` (``settings.document``). The trainer and its viewers read the tensors that they know, by name.
+Files of this package have ``sigma_d`` and ``growth_d`` among the ``splats`` too, and the JSON
+document as text under ``clod_adapter`` (``settings.document``). The trainer and its viewers read
+the tensors that they know, by name.
 """
 
 from __future__ import annotations
@@ -18,16 +20,28 @@ import numpy as np
 
 from clod_adapter.errors import ClodError, refused_if_damaged
 from clod_adapter.io.file_formats import KEY, START, read_bytes, refuse
-from clod_adapter.io.settings import MODEL, WARNING, Metadata, Source, document, of_another_method, parse_metadata
+from clod_adapter.io.settings import (
+    MODEL,
+    WARNING,
+    Metadata,
+    Source,
+    document,
+    of_another_method,
+    parse_metadata,
+)
 from clod_adapter.io.values import SIGMA, arrays_of, dial_columns
 
 if TYPE_CHECKING:
     from clod_adapter.gaussians import Gaussians
 
 FRAME = "gsplat's trainer may have normalised the coordinates; photographs must be in the same"
-# What the trainer corrects for each photograph, by the names of its modules in a checkpoint, and the remedy.
+# What the trainer corrects for each photograph, by the names of its modules in a checkpoint, and
+# the remedy.
 _CORRECTIONS = {
-    "pose_adjust": ("cameras", "give the corrected cameras with the photographs, or train without --pose_opt"),
+    "pose_adjust": (
+        "cameras",
+        "give the corrected cameras with the photographs, or train without --pose_opt",
+    ),
     "post_processing": ("colours", "train without that, or expect a lower PSNR"),
     "app_module": ("colours", "train without --app_opt, or expect a lower PSNR"),
 }
@@ -36,10 +50,14 @@ _PLAIN = r"collections OrderedDict|torch\._utils _rebuild_(tensor_v2|parameter)|
 
 
 def check(path: Path) -> None:
-    """Refuses, without torch, what is not a file of ``torch.save``, or would unpack to more than it is."""
+    """Refuses, without torch, what is not a file of ``torch.save``, or would unpack to more than it
+    is.
+    """
     start = read_bytes(path, START)
     if start.startswith(b"\x80"):
-        raise ClodError(f"{path}: is a pickle in PyTorch's format before 1.6; load it and torch.save it again")
+        raise ClodError(
+            f"{path}: is a pickle in PyTorch's format before 1.6; load it and torch.save it again"
+        )
     if not start.startswith(b"PK"):
         refuse(path, start, "is no file of torch.save; export the checkpoint as a PLY")
     with refused_if_damaged(path), zipfile.ZipFile(path) as archive:
@@ -48,15 +66,20 @@ def check(path: Path) -> None:
         stored = all(entry.compress_type == zipfile.ZIP_STORED for entry in entries)
         whole = stored and sum(entry.file_size for entry in entries) <= path.stat().st_size
         if not whole or len(pickles) != 1 or pickles[0].file_size > _PICKLE_LIMIT:
-            raise ClodError(f"{path}: is a zip archive that torch.save does not write; export a PLY instead")
-        # A pickle that names anything but what plain tensors need: ``weights_only`` runs no code either, but lets a
-        # hundred bytes of it ask for gigabytes.
+            raise ClodError(
+                f"{path}: is a zip archive that torch.save does not write; export a PLY instead"
+            )
+        # A pickle that names anything but what plain tensors need: ``weights_only`` runs no code
+        # either, but lets a hundred bytes of it ask for gigabytes.
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of odd escapes in it
             for opcode, argument, _ in pickletools.genops(archive.read(pickles[0])):
                 named = opcode.name in ("GLOBAL", "INST", "STACK_GLOBAL")
                 if named and not re.fullmatch(_PLAIN, str(argument)):
-                    raise ClodError(f"{path}: holds {argument}, more than tensors, and is not unpickled; export a PLY")
+                    raise ClodError(
+                        f"{path}: holds {argument}, more than tensors, and is not unpickled; export"
+                        " a PLY"
+                    )
 
 
 def has_dial(path: Path) -> bool:
@@ -67,12 +90,16 @@ def has_dial(path: Path) -> bool:
 
 
 def read(path: Path, data: bytes) -> Source:
-    """Reads a checkpoint of gsplat's trainer, or one written here; with ``weights_only``, so that no code runs."""
+    """Reads a checkpoint of gsplat's trainer, or one written here; with ``weights_only``, so that
+    no code runs.
+    """
     import torch  # here: check does without it
 
     from clod_adapter.integrations.splats import NAMES
 
-    refused = refused_if_damaged(path, "is damaged, or holds more than tensors", "export the checkpoint as a PLY")
+    refused = refused_if_damaged(
+        path, "is damaged, or holds more than tensors", "export the checkpoint as a PLY"
+    )
     with refused, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         checkpoint = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
@@ -80,30 +107,50 @@ def read(path: Path, data: bytes) -> Source:
     if isinstance(checkpoint, dict):
         found, splats = ", ".join(map(repr, list(checkpoint)[:5])), checkpoint.get("splats")
     if not isinstance(splats, dict):
-        raise ClodError(f"{path}: has no dictionary 'splats', as gsplat's trainer writes (but {found}); export a PLY")
+        raise ClodError(
+            f"{path}: has no dictionary 'splats', as gsplat's trainer writes (but {found}); export"
+            " a PLY"
+        )
     wanted = (*NAMES, *dial_columns(splats))
     arrays = {NAMES.get(name, name): _values(path, name, splats, len(data)) for name in wanted}
     metadata = parse_metadata(path, checkpoint.get(KEY), dial=SIGMA in arrays)
     notes = [] if metadata.described else [FRAME]
     for name, (what, remedy) in _CORRECTIONS.items():
         if name in checkpoint:
-            about = f"trained with {what} corrected for each photograph ({name}), which is not applied"
+            about = (
+                f"trained with {what} corrected for each photograph ({name}), which is not applied"
+            )
             notes.append(f"{WARNING}{about}; {remedy}")
     notes += of_another_method(splats)
     return Source(arrays, metadata, tuple(notes), metadata.about, not metadata.described)
 
 
 def _values(path: Path, name: str, splats: dict[str, Any], size: int) -> np.ndarray:
-    """A parameter as float32, unless it is none or claims more values than the file's ``size`` in bytes."""
+    """A parameter as float32, unless it is none or claims more values than the file's ``size`` in
+    bytes.
+    """
     import torch
 
     value = splats.get(name)
     if value is None:
-        more = "; with appearance optimisation its trainer stores no colours" if "features" in splats else ""
-        raise ClodError(f"{path}: splats has no {name!r}{more}; export it as a PLY with spherical harmonics")
-    usable = isinstance(value, torch.Tensor) and value.device.type == "cpu" and value.layout == torch.strided
+        more = (
+            "; with appearance optimisation its trainer stores no colours"
+            if "features" in splats
+            else ""
+        )
+        raise ClodError(
+            f"{path}: splats has no {name!r}{more}; export it as a PLY with spherical harmonics"
+        )
+    usable = (
+        isinstance(value, torch.Tensor)
+        and value.device.type == "cpu"
+        and value.layout == torch.strided
+    )
     if not usable or not value.is_floating_point() or value.nbytes > size:
-        raise ClodError(f"{path}: splats[{name!r}] is no plain tensor of numbers; export the checkpoint as a PLY")
+        raise ClodError(
+            f"{path}: splats[{name!r}] is no plain tensor of numbers; export the checkpoint as"
+            " a PLY"
+        )
     return value.detach().float().numpy()
 
 
@@ -116,7 +163,8 @@ def write(path: Path, gaussians: Gaussians, metadata: Metadata) -> tuple[str, ..
     arrays = arrays_of(path, gaussians)
     names = NAMES | {name: name for name in dial_columns(arrays)}
     splats = {name: torch.from_numpy(arrays[ours]) for name, ours in names.items()}
-    # By way of memory, as the entries of a file are named after it, and this one's name is temporary.
+    # By way of memory, as the entries of a file are named after it, and this one's name is
+    # temporary.
     buffer = io.BytesIO()
     torch.save({"step": 0, "splats": splats, KEY: document(MODEL, metadata)}, buffer)
     path.write_bytes(buffer.getbuffer())

@@ -1,8 +1,9 @@
 """``.splat``: the 32-byte rows of antimatter15's web viewer, which many others read.
 
-A row is the position and the standard deviations, three float32 each, then four bytes of RGBA and four of the rotation
-(wxyz, ``128 q + 128``). Colours are those of SH degree 0; higher degrees and the dial are not stored. The largest
-and most opaque come first (by volume times opacity), as viewers draw what has arrived.
+A row is the position and the standard deviations, three float32 each, then four bytes of RGBA and
+four of the rotation (wxyz, ``128 q + 128``). Colours are those of SH degree 0; higher degrees and
+the dial are not stored. The largest and most opaque come first (by volume times opacity), as
+viewers draw what has arrived.
 """
 
 from pathlib import Path
@@ -24,26 +25,42 @@ def write(path: Path, gaussians: Gaussians, metadata: Metadata) -> tuple[str, ..
     opacities = values.sigmoid(arrays["opacity_logits"])
     # As logarithms, in which no volume is too small.
     with np.errstate(divide="ignore"):
-        order = np.argsort(-(arrays["log_scales"].astype(np.float64).sum(1) + np.log(opacities)), kind="stable")
+        order = np.argsort(
+            -(arrays["log_scales"].astype(np.float64).sum(1) + np.log(opacities)), kind="stable"
+        )
     rows = np.empty(len(gaussians), _ROW)
     rows["means"], rows["scales"] = arrays["means"], values.scales_of(path, arrays["log_scales"])
     rows["rgba"] = values.colours_of(arrays["sh0"], opacities)
     rows["quats"] = values.bytes_of(128 * values.normalized(arrays["quats"]) + 128)
     path.write_bytes(rows[order].tobytes())
-    notes = ["colours, opacities and rotations are rounded to 8 bits, and the rows are in another order"]
+    notes = [
+        "colours, opacities and rotations are rounded to 8 bits, and the rows are in another order"
+    ]
     notes += ["view-dependent colour is dropped"] if arrays["shN"].any() else []
-    return (*notes, *(["the origin is dropped: coordinates are relative to it"] if any(metadata.origin) else []))
+    return (
+        *notes,
+        *(
+            ["the origin is dropped: coordinates are relative to it"]
+            if any(metadata.origin)
+            else []
+        ),
+    )
 
 
 def read(path: Path, data: bytes) -> Source:
     """Reads rows as ``write`` writes them; SH degree 0."""
     if not data or len(data) % _ROW.itemsize:
-        raise ClodError(f"{path}: {len(data)} bytes are not a .splat file, whose rows have 32; copy or export it again")
+        raise ClodError(
+            f"{path}: {len(data)} bytes are not a .splat file, whose rows have 32; copy or export"
+            " it again"
+        )
     rows = np.frombuffer(data, _ROW)
     arrays = {
-        "means": rows["means"].copy(), "log_scales": values.logs_of(rows["scales"]),
+        "means": rows["means"].copy(),
+        "log_scales": values.logs_of(rows["scales"]),
         "quats": (rows["quats"].astype(np.float32) - 128) / 128,
-        "opacity_logits": values.logits_of_bytes(rows["rgba"][:, 3]), "shN": np.zeros((len(rows), 0, 3)),
+        "opacity_logits": values.logits_of_bytes(rows["rgba"][:, 3]),
+        "shN": np.zeros((len(rows), 0, 3)),
         "sh0": values.sh0_of(rows["rgba"][:, None, :3]),
-    }  # fmt: skip
+    }
     return Source(arrays, Metadata(), (QUANTISED,))

@@ -1,6 +1,8 @@
-"""Finds and runs splat-transform, PlayCanvas's converter of splat files: an optional tool that needs Node.
+"""Finds and runs splat-transform, PlayCanvas's converter of splat files: an optional tool that
+needs Node.
 
-It compresses to SOG and compressed PLY, makes streaming sets, merges Gaussians, and reads what is not read here.
+It compresses to SOG and compressed PLY, makes streaming sets, merges Gaussians, and reads what is
+not read here.
 """
 
 from __future__ import annotations
@@ -30,22 +32,34 @@ INSTALL = "npm install node@22 @playcanvas/splat-transform@3.7"
 _PATH = "PATH=FOLDER/node_modules/node/bin:FOLDER/node_modules/.bin:$PATH"
 HELP = f"in a folder of its own: {INSTALL}; then {_PATH}, or the command in {VARIABLE}"
 ASKING = 30.0  # seconds that a question about itself may take
-LIMIT, LIMIT_EACH = 600.0, 0.02  # seconds after which a run has hung, and per Gaussian; ten times what was measured
+# seconds after which a run has hung, and per Gaussian; ten times what was measured
+LIMIT, LIMIT_EACH = 600.0, 0.02
 LIMIT_CONVERT = 1800.0  # seconds; five million Gaussians take about a minute
 TICK = 0.2  # seconds between two checks for its end
-# Without a GPU, where a round of SOG's clustering of spherical harmonics takes minutes, and its usual ten take an hour.
-# Two rounds more give 0.02 dB.
+# Without a GPU, where a round of SOG's clustering of spherical harmonics takes minutes, and its
+# usual ten take an hour. Two rounds more give 0.02 dB.
 ON_CPU = ("-g", "cpu", "-i", "1")
 _TEXT: dict[str, Any] = {
-    "stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "encoding": "utf-8",
+    "stdin": subprocess.DEVNULL,
+    "stdout": subprocess.PIPE,
+    "stderr": subprocess.STDOUT,
+    "encoding": "utf-8",
     "errors": "replace",
-}  # fmt: skip
-LEAVES, SMALLEST = 128, 8  # fewest leaves of a large set, and thousands (1,024) of Gaussians below which none is cut
+}
+# fewest leaves of a large set, and thousands (1,024) of Gaussians below which none is cut
+LEAVES, SMALLEST = 128, 8
 
 
 def cutting_options(count: int) -> tuple[str, ...]:
-    """Options for the leaves of a streaming set; by default the tool cuts what is wider than 16 units of length."""
-    return "--lod-chunk-extent", "0", "--lod-chunk-min", str(max(SMALLEST, count // (1024 * LEAVES)))
+    """Options for the leaves of a streaming set; by default the tool cuts what is wider than 16
+    units of length.
+    """
+    return (
+        "--lod-chunk-extent",
+        "0",
+        "--lod-chunk-min",
+        str(max(SMALLEST, count // (1024 * LEAVES))),
+    )
 
 
 @dataclass(frozen=True)
@@ -54,16 +68,25 @@ class SplatTransform:
 
     command: tuple[str, ...]  # how it is started
     version: str  # three numbers
-    gpu: bool = False  # whether it sees one; else it clusters spherical harmonics on the CPU, in one round
+    # whether it sees one; else it clusters spherical harmonics on the CPU, in one round
+    gpu: bool = False
 
     @classmethod
     def find(cls) -> SplatTransform:
-        """The one in the environment's ``CLOD_SPLAT_TRANSFORM``, a command with its words, or on the PATH."""
+        """The one in the environment's ``CLOD_SPLAT_TRANSFORM``, a command with its words, or on
+        the PATH.
+        """
         given = os.environ.get(VARIABLE, "")
         try:  # a path with spaces in it that is there needs no quotes
-            name, *more = [given] if given and shutil.which(given) else shlex.split(given) or ["splat-transform"]
+            name, *more = (
+                [given]
+                if given and shutil.which(given)
+                else shlex.split(given) or ["splat-transform"]
+            )
         except ValueError as error:
-            raise ClodError(f"{VARIABLE} is {given!r}, which is no command ({error}); {HELP}") from error
+            raise ClodError(
+                f"{VARIABLE} is {given!r}, which is no command ({error}); {HELP}"
+            ) from error
         program = shutil.which(name)
         if program is None:
             where = f"{name}, which {VARIABLE} names, is" if given else "splat-transform is"
@@ -71,26 +94,39 @@ class SplatTransform:
         command = (program, *more)
         version = re.search(r"splat-transform v((\d+)\.(\d+)\.\d+)", _ask(command, "--version"))
         if version is None:
-            raise ClodError(f"{shlex.join(command)} does not run as splat-transform; it needs Node 22; {HELP}")
+            raise ClodError(
+                f"{shlex.join(command)} does not run as splat-transform; it needs Node 22; {HELP}"
+            )
         if (int(version[2]), int(version[3])) < NEEDED:
-            raise ClodError(f"splat-transform is {version[1]}, {'.'.join(map(str, NEEDED))} or newer is needed; {HELP}")
+            raise ClodError(
+                f"splat-transform is {version[1]}, {'.'.join(map(str, NEEDED))} or newer is needed;"
+                f" {HELP}"
+            )
         gpu = re.search(r"(?m)^\s*\[\d+\] \S", _ask(command, "--list-gpus")) is not None
         return cls(command, version[1], gpu)
 
-    def run(self, *words: str | Path, timeout: float, progress: Callable[[float], None] | None = None) -> float:
-        """Runs it with these words, replacing outputs; the seconds it took. An exception, as of Ctrl-C, ends the tool.
+    def run(
+        self, *words: str | Path, timeout: float, progress: Callable[[float], None] | None = None
+    ) -> float:
+        """Runs it with these words, replacing outputs; the seconds it took. An exception, as of
+        Ctrl-C, ends the tool.
 
-        A Path is made absolute, to be no option and no address. ``progress`` is called with the seconds so far.
+        A Path is made absolute, to be no option and no address. ``progress`` is called with the
+        seconds so far.
         """
         given = [str(word.absolute()) if isinstance(word, Path) else word for word in words]
         began = time.perf_counter()
-        process = subprocess.Popen([*self.command, "-w", *(() if self.gpu else ON_CPU), *given], **_TEXT)
+        process = subprocess.Popen(
+            [*self.command, "-w", *(() if self.gpu else ON_CPU), *given], **_TEXT
+        )
         try:
             output = None
             while output is None:
                 taken = time.perf_counter() - began
                 if taken > timeout:
-                    raise ClodError(f"splat-transform was ended, it took longer than {timeout:.0f} s")
+                    raise ClodError(
+                        f"splat-transform was ended, it took longer than {timeout:.0f} s"
+                    )
                 if progress:
                     progress(taken)
                 with suppress(subprocess.TimeoutExpired):
@@ -99,7 +135,8 @@ class SplatTransform:
             process.kill()
             process.communicate()
             raise
-        if process.returncode:  # the line with the error, or the last one; without the stack trace and the duration
+        # the line with the error, or the last one; without the stack trace and the duration
+        if process.returncode:
             lines = [line.strip(" \t✗·▸") for line in output.splitlines()]
             lines = [line for line in lines if line and not line.startswith(("at ", "failed in "))]
             reason = ([line for line in lines if "Error" in line] or lines or ["no output"])[-1]
@@ -113,9 +150,12 @@ def check(path: Path) -> SplatTransform:
     try:
         return SplatTransform.find()
     except ClodError as error:
-        version = " of version 4" if path.suffix.lower() == ".spz" else ""  # earlier ones are read here
+        # earlier ones are read here
+        version = " of version 4" if path.suffix.lower() == ".spz" else ""
         what = f"{path.suffix}{version} is read through splat-transform ({error})"
-        raise ClodError(f"{path}: {what}; better still, adapt the PLY that it was made from") from error
+        raise ClodError(
+            f"{path}: {what}; better still, adapt the PLY that it was made from"
+        ) from error
 
 
 def read(path: Path, _: bytes) -> Source:
@@ -131,7 +171,10 @@ def read(path: Path, _: bytes) -> Source:
         except ClodError as error:
             raise ClodError(f"{path}: cannot be read ({error}); copy or export it again") from error
         arrays = ply.read(converted, read_bytes(converted)).arrays
-    note = f"quantised: {path.suffix} stores positions, scales, rotations and colours in a few bits each"
+    note = (
+        f"quantised: {path.suffix} stores positions, scales, rotations and colours in a few bits"
+        " each"
+    )
     return Source(arrays, Metadata(), (note, f"read through splat-transform {tool.version}"))
 
 

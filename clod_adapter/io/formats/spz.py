@@ -1,17 +1,23 @@
 """SPZ files (Niantic), version 3, and in a record of our own the dial where there is one.
 
-One gzip stream: a 16-byte header, then one array after another: positions in 24-bit fixed point, opacities, colours
-and logarithms of scales in bytes, rotations in four bytes, spherical harmonics in bytes, as the reference
-(``load-spz.cc``) reads them. It writes harmonics with 5 bits at degree 1 and 4 above, rounding halves up; 6 bits,
-rounded to the nearest, take a third more space for 13 dB (docs/formats.md).
+One gzip stream: a 16-byte header, then one array after another: positions in 24-bit fixed point,
+opacities, colours and logarithms of scales in bytes, rotations in four bytes, spherical harmonics
+in bytes, as the reference (``load-spz.cc``) reads them. It writes harmonics with 5 bits at degree 1
+and 4 above, rounding halves up; 6 bits, rounded to the nearest, take a third more space for 13 dB
+(docs/formats.md).
 
-Records of vendors follow, flagged in the header: type, length, bytes; readers skip unknown types. Two are written:
+Records of vendors follow, flagged in the header: type, length, bytes; readers skip unknown types.
+Two are written:
 
-- Adobe's of the axes: a checkpoint's (x right, y down, z ahead). The format's own are OpenGL's, but the reference's
-  ``ply_to_spz``, splat-transform, SuperSplat and gsply all leave those of the PLY: turned, it would be upside down;
-- ours, ``RECORD``: the length of the JSON document (``settings.document``) as uint32, the document, then the dial's
-  columns as float16, to 5e-4: sigma_d, or those that the document names as ``"columns": ["sigma_d", "growth_d"]``.
-  Larger values become 65504. Of sigma_d that is no end in practice: ``(d s / 65504)^4`` of an opacity is gone.
+- Adobe's of the axes: a checkpoint's (x right, y down, z ahead). The format's own are OpenGL's, but
+the reference's
+  ``ply_to_spz``, splat-transform, SuperSplat and gsply all leave those of the PLY: turned, it would
+  be upside down;
+- ours, ``RECORD``: the length of the JSON document (``settings.document``) as uint32, the document,
+then the dial's
+  columns as float16, to 5e-4: sigma_d, or those that the document names as
+  ``"columns": ["sigma_d", "growth_d"]``. Larger values become 65504. Of sigma_d that is no end in
+  practice: ``(d s / 65504)^4`` of an opacity is gone.
 """
 
 import json
@@ -26,14 +32,27 @@ import numpy as np
 import torch
 
 from clod_adapter.config import CLASSIC, SH_COUNTS
-from clod_adapter.equation.units import estimated_distance, in_world_units, known_distance, with_distance
+from clod_adapter.equation.units import (
+    estimated_distance,
+    in_world_units,
+    known_distance,
+    with_distance,
+)
 from clod_adapter.errors import ClodError, refused_if_damaged
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io import values
 from clod_adapter.io.file_formats import NEW_SPZ, START, read_bytes
 from clod_adapter.io.formats import splat_transform
 from clod_adapter.io.settings import DAMAGED, MODEL, TAG, Metadata, Source, document, parse_metadata
-from clod_adapter.io.values import GROWTH, OPACITY, SIGMA, arrays_of, bytes_of, dial_columns, half_turn
+from clod_adapter.io.values import (
+    GROWTH,
+    OPACITY,
+    SIGMA,
+    arrays_of,
+    bytes_of,
+    dial_columns,
+    half_turn,
+)
 
 HEADER = struct.Struct("<IIIBBBB")  # magic, version, count, SH degree, fractional bits, flags, 0
 MAGIC, VERSION = 0x5053474E, 3
@@ -41,15 +60,20 @@ RECORD = 0x434C0001  # vendor "CL", its first extension
 COLUMNS = "columns"  # of the record, in the document
 AXES = 0xADBE0003  # SPZ_ADOBE_coordinate_system
 RDF = 6  # right, down, forward
-ANTIALIASED, EXTENDED = 1, 2  # flags: of a filter that compensates opacities, of records after the arrays
+# flags: of a filter that compensates opacities, of records after the arrays
+ANTIALIASED, EXTENDED = 1, 2
 MOST = 10_000_000  # Gaussians that the reference reads
 DEGREE = 3  # the highest that all readers know
 COLOR = 0.15  # of the range of bytes to one of sh0
 MAGNITUDE = 511 * math.sqrt(2)  # of the three components of a rotation that are not the largest
 _STEP = 4  # of the harmonics, which have 6 bits
 _MOST = float(np.finfo(np.float16).max)
-_FAR = 25.0  # world units: a reference distance, from which on some sigma_d that fade at high dial values exceed that
-QUANTISED = "quantised: positions in 24 bits, scales, opacities and harmonics in 8, rotations in 10 or 8"
+# world units: a reference distance, from which on some sigma_d that fade at high dial values exceed
+# that
+_FAR = 25.0
+QUANTISED = (
+    "quantised: positions in 24 bits, scales, opacities and harmonics in 8, rotations in 10 or 8"
+)
 _BOMB = 64  # times its size that a file may unpack to; Gaussians that differ at all come to 10
 _CONVERT = "convert it: splat-transform IN.spz OUT.ply"
 _TURNS = {RDF: "", 4: "x", 7: "z"}  # right, up, back; left, up, forward
@@ -59,17 +83,21 @@ _SMALL = 1 << 24  # bytes that any file may
 def write(path: Path, gaussians: Gaussians, metadata: Metadata) -> tuple[str, ...]:
     """Writes with the format's quantisation, about 8 bits.
 
-    Positions have as many of their 24 bits for the fraction as they leave, 20 at most. A few Gaussians at an enormous
-    distance, as many checkpoints have them, would leave the rest too few: see ``_nearer``.
+    Positions have as many of their 24 bits for the fraction as they leave, 20 at most. A few
+    Gaussians at an enormous distance, as many checkpoints have them, would leave the rest too few:
+    see ``_nearer``.
     """
     config = gaussians.attenuation
-    if config is not None and config.form == "ours":  # in world units float16 would cut a large sigma_d off
+    # in world units float16 would cut a large sigma_d off
+    if config is not None and config.form == "ours":
         distance = known_distance(config) or estimated_distance(gaussians.means)
         gaussians = with_distance(gaussians, distance) if distance > _FAR else gaussians
     arrays, bits, moved = _nearer(arrays_of(path, gaussians))
     if len(gaussians) > MOST or bits < 1:
         these = f"these are {len(gaussians):,} within {float(gaussians.means.abs().max()):.4g}"
-        raise ClodError(f"{path}: has room for {MOST:,} Gaussians within 4,000,000 of 0, {these}; write a .ply")
+        raise ClodError(
+            f"{path}: has room for {MOST:,} Gaussians within 4,000,000 of 0, {these}; write a .ply"
+        )
     degree = min(gaussians.sh_degree, DEGREE)
     flags = EXTENDED | (ANTIALIASED if gaussians.screen_filter.compensate else 0)
     header = HEADER.pack(MAGIC, VERSION, len(gaussians), degree, bits, flags, 0)
@@ -79,19 +107,25 @@ def write(path: Path, gaussians: Gaussians, metadata: Metadata) -> tuple[str, ..
         columns = list(dial_columns(arrays))
         named = {COLUMNS: columns} if len(columns) > 1 else {}  # sigma_d alone needs no name
         text = document(MODEL, metadata, **named).encode()
-        halves = b"".join(np.clip(arrays[name], -_MOST, _MOST).astype("<f2").tobytes() for name in columns)
-        parts.append(struct.pack("<III", RECORD, 4 + len(text) + len(halves), len(text)) + text + halves)
+        halves = b"".join(
+            np.clip(arrays[name], -_MOST, _MOST).astype("<f2").tobytes() for name in columns
+        )
+        parts.append(
+            struct.pack("<III", RECORD, 4 + len(text) + len(halves), len(text)) + text + halves
+        )
     gzip = zlib.compressobj(wbits=31)
     path.write_bytes(gzip.compress(b"".join(parts)) + gzip.flush())
     return (*moved, *_losses(arrays, bits, degree))
 
 
 def _nearer(arrays: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], int, tuple[str, ...]]:
-    """The arrays, the bits of the fraction that they leave, and a line if the farthest were moved for it.
+    """The arrays, the bits of the fraction that they leave, and a line if the farthest were moved
+    for it.
 
-    What is beyond 8 times the distance that 99 % keep to (rounded up to a power of two) is moved towards 0 and made
-    smaller by the same factor, and its sigma_d with it: from 0 it looks as before, from nearby very nearly. Its growth
-    ``(d s / r)^h`` is less at the smaller distance, by ``factor^h``; its scales are divided by that.
+    What is beyond 8 times the distance that 99 % keep to (rounded up to a power of two) is moved
+    towards 0 and made smaller by the same factor, and its sigma_d with it: from 0 it looks as
+    before, from nearby very nearly. Its growth ``(d s / r)^h`` is less at the smaller distance, by
+    ``factor^h``; its scales are divided by that.
     """
     reach = np.abs(arrays["means"]).max(1).astype(np.float64)
     most = min(float(reach.max()), 8 * float(np.quantile(reach, 0.99)))
@@ -100,18 +134,38 @@ def _nearer(arrays: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], int, 
     moved = int((factor < 1).sum())
     if not moved:
         return arrays, bits, ()
-    nearer = {**arrays, "means": arrays["means"] * factor, "log_scales": arrays["log_scales"] + np.log(factor)}
+    nearer = {
+        **arrays,
+        "means": arrays["means"] * factor,
+        "log_scales": arrays["log_scales"] + np.log(factor),
+    }
     if SIGMA in arrays:
         nearer[SIGMA] = arrays[SIGMA] * factor[:, 0]
     if GROWTH in arrays:
         nearer["log_scales"] -= arrays[GROWTH][:, None] * np.log(factor)
-    return nearer, bits, (f"the {moved} farthest are moved to {2.0 ** (23 - bits):g} from 0, and made as much smaller",)
+    return (
+        nearer,
+        bits,
+        (
+            (
+                f"the {moved} farthest are moved to {2.0 ** (23 - bits):g} from 0, and made as much"
+                " smaller"
+            ),
+        ),
+    )
 
 
 def _packed(arrays: dict[str, np.ndarray], bits: int, degree: int) -> list[bytes]:
     # Far beyond what a byte has room for, but not so far that it overflows.
-    sh0, harmonics = np.clip(arrays["sh0"], -9, 9), np.clip(arrays["shN"][:, : (degree + 1) ** 2 - 1], -9, 9)
-    fixed = np.round(arrays["means"].astype(np.float64) * 2.0**bits).clip(-(2**23), 2**23 - 1).astype("<i4")
+    sh0, harmonics = (
+        np.clip(arrays["sh0"], -9, 9),
+        np.clip(arrays["shN"][:, : (degree + 1) ** 2 - 1], -9, 9),
+    )
+    fixed = (
+        np.round(arrays["means"].astype(np.float64) * 2.0**bits)
+        .clip(-(2**23), 2**23 - 1)
+        .astype("<i4")
+    )
     parts = [
         np.ascontiguousarray(fixed[..., None].view(np.uint8)[..., :3]),
         bytes_of(255 * values.sigmoid(arrays["opacity_logits"])),
@@ -124,7 +178,9 @@ def _packed(arrays: dict[str, np.ndarray], bits: int, degree: int) -> list[bytes
 
 
 def _packed_quats(quats: np.ndarray) -> np.ndarray:
-    """``[N]`` uint32: the largest component's index in xyzw, then of each other a sign and 9 bits, over sqrt(1/2)."""
+    """``[N]`` uint32: the largest component's index in xyzw, then of each other a sign and 9 bits,
+    over sqrt(1/2).
+    """
     xyzw = np.roll(values.normalized(quats), -1, axis=1).astype(np.float64)
     rows, largest = np.arange(len(xyzw)), np.abs(xyzw).argmax(1)
     xyzw *= np.where(xyzw[rows, largest] < 0, -1.0, 1.0)[:, None]
@@ -137,7 +193,10 @@ def _packed_quats(quats: np.ndarray) -> np.ndarray:
 
 
 def _losses(arrays: dict[str, np.ndarray], bits: int, degree: int) -> tuple[str, ...]:
-    notes = [f"positions are rounded to {2.0**-bits:.1g}, colours, opacities, scales and rotations to about 8 bits"]
+    notes = [
+        f"positions are rounded to {2.0**-bits:.1g}, colours, opacities, scales and rotations to"
+        " about 8 bits"
+    ]
     if arrays["shN"][:, (degree + 1) ** 2 - 1 :].any():
         notes.append(f"spherical harmonics above degree {DEGREE} are dropped")
     beyond = {
@@ -150,7 +209,10 @@ def _losses(arrays: dict[str, np.ndarray], bits: int, degree: int) -> tuple[str,
 
 def has_dial(path: Path) -> bool:
     """Reads all of the file, which is never much."""
-    return not read_bytes(path, START).startswith(NEW_SPZ) and SIGMA in read(path, read_bytes(path)).arrays
+    return (
+        not read_bytes(path, START).startswith(NEW_SPZ)
+        and SIGMA in read(path, read_bytes(path)).arrays
+    )
 
 
 def read(path: Path, data: bytes) -> Source:
@@ -159,8 +221,17 @@ def read(path: Path, data: bytes) -> Source:
         return splat_transform.read(path, data)
     data = _unpacked(path, data)
     magic, version, count, degree, bits, flags, _ = HEADER.unpack_from(data)
-    if magic != MAGIC or version not in (2, 3) or degree not in SH_COUNTS or bits > 24 or count > MOST:
-        raise ClodError(f"{path}: is no SPZ file of version 2 or 3 (version {version}, {count} Gaussians); {_CONVERT}")
+    if (
+        magic != MAGIC
+        or version not in (2, 3)
+        or degree not in SH_COUNTS
+        or bits > 24
+        or count > MOST
+    ):
+        raise ClodError(
+            f"{path}: is no SPZ file of version 2 or 3 (version {version}, {count} Gaussians);"
+            f" {_CONVERT}"
+        )
     sizes = 9, 1, 3, 3, 4 if version == 3 else 3, 3 * (SH_COUNTS[degree] - 1)
     end = HEADER.size + count * sum(sizes)
     if not count or end > len(data):
@@ -170,19 +241,25 @@ def read(path: Path, data: bytes) -> Source:
     records = _records(data[end:]) if flags & EXTENDED else {}
     stored, dial = _ours(path, records[RECORD], count) if RECORD in records else (None, {})
     metadata = parse_metadata(path, stored, dial=bool(dial))
-    axes = int.from_bytes(records.get(AXES, bytes([RDF])), "little")  # without a record as converters write them
+    # without a record as converters write them
+    axes = int.from_bytes(records.get(AXES, bytes([RDF])), "little")
     if axes not in _TURNS:
-        raise ClodError(f"{path}: its axes are of kind {axes}, which this reader does not know; {_CONVERT}")
+        raise ClodError(
+            f"{path}: its axes are of kind {axes}, which this reader does not know; {_CONVERT}"
+        )
     arrays = _unquantized(parts, bits)
     arrays = (half_turn(arrays, _TURNS[axes]) if _TURNS[axes] else arrays) | dial
     if dial:  # whose sigma_d is in units of the reference distance where that is large
         own = {name: array for name, array in arrays.items() if name != OPACITY}
-        tensors: dict[str, Any] = {name: torch.from_numpy(array).float() for name, array in own.items()}
+        tensors: dict[str, Any] = {
+            name: torch.from_numpy(array).float() for name, array in own.items()
+        }
         gaussians = in_world_units(Gaussians(**tensors, attenuation=metadata.attenuation))
         arrays[SIGMA] = gaussians.tensors()[SIGMA].numpy()
         metadata = replace(metadata, attenuation=gaussians.attenuation)
     antialiased = flags & ANTIALIASED and not (metadata.screen_filter or CLASSIC).compensate
-    comments = (*metadata.about, TAG) if antialiased else metadata.about  # of another program, which states no variance
+    # of another program, which states no variance
+    comments = (*metadata.about, TAG) if antialiased else metadata.about
     return Source(arrays, metadata, (QUANTISED,), comments)
 
 
@@ -192,7 +269,10 @@ def _unpacked(path: Path, data: bytes) -> bytes:
     with refused_if_damaged(path):
         unpacked = gzip.decompress(data, limit)
     if not gzip.eof or len(unpacked) < HEADER.size:
-        raise ClodError(f"{path}: is truncated, or unpacks to more than {limit:,} bytes, as no splat; export it again")
+        raise ClodError(
+            f"{path}: is truncated, or unpacks to more than {limit:,} bytes, as no splat; export it"
+            " again"
+        )
     return unpacked
 
 

@@ -1,17 +1,21 @@
-"""3D Tiles 1.1 (OGC 22-025r4): ``tileset.json`` over ``.glb`` files of several levels, for CesiumJS.
+"""3D Tiles 1.1 (OGC 22-025r4): ``tileset.json`` over ``.glb`` files of several levels, for
+CesiumJS.
 
-CesiumJS 1.145 draws Gaussians only from glTF with ``KHR_gaussian_splatting_compression_spz_2``, named in the index: a
-buffer with the bytes of an SPZ file, attributes without data, and a node with a ``matrix``.
+CesiumJS 1.145 draws Gaussians only from glTF with ``KHR_gaussian_splatting_compression_spz_2``,
+named in the index: a buffer with the bytes of an SPZ file, attributes without data, and a node with
+a ``matrix``.
 
-The root has the coarsest level of the whole scene. Its children are cells of at most LARGEST Gaussians of the finest
-level, each a chain of tiles from the next finer level to the finest; a tile replaces its parent (refine REPLACE).
-A tile with ``geometricError`` g is shown from the distance ``g f / ALLOWED`` on, with a focal length of f pixels (OGC
-22-025r4, "Geometric error"). So g is ALLOWED / FOCAL times the distance at which its level begins. That of the index,
-of showing nothing, is ALLOWED diagonals of the root's box and the root's own error: a set is drawn until it is about
+The root has the coarsest level of the whole scene. Its children are cells of at most LARGEST
+Gaussians of the finest level, each a chain of tiles from the next finer level to the finest; a tile
+replaces its parent (refine REPLACE). A tile with ``geometricError`` g is shown from the distance
+``g f / ALLOWED`` on, with a focal length of f pixels (OGC 22-025r4, "Geometric error"). So g is
+ALLOWED / FOCAL times the distance at which its level begins. That of the index, of showing nothing,
+is ALLOWED diagonals of the root's box and the root's own error: a set is drawn until it is about
 one pixel large.
 
-Viewers turn glTF's y-up axes into z-up ones, (x, y, z) to (x, -z, y), after the node's half turn. So a point (x, y, z)
-of the model is at (-x, -z, -y) of the tile set, in which the bounding boxes are.
+Viewers turn glTF's y-up axes into z-up ones, (x, y, z) to (x, -z, y), after the node's half turn.
+So a point (x, y, z) of the model is at (-x, -z, -y) of the tile set, in which the bounding boxes
+are.
 """
 
 import json
@@ -39,11 +43,14 @@ STRAY = 0.02  # share of the centres that may be outside of a tile's box, along 
 Rows = list[np.ndarray]  # the row numbers of each level
 
 
-def write_tileset(folder: Path, levels: Sequence[tuple[float, Gaussians]], *, origin: Origin) -> tuple[str, ...]:
+def write_tileset(
+    folder: Path, levels: Sequence[tuple[float, Gaussians]], *, origin: Origin
+) -> tuple[str, ...]:
     """Writes ``tileset.json`` and its tiles to an existing folder; what the files do not store.
 
     Args:
-        levels: distance in world units at which each begins, and its Gaussians, without a dial; the finest first.
+        levels: distance in world units at which each begins, and its Gaussians, without a dial; the
+            finest first.
     """
     notes, errors = list[str](), [ALLOWED / FOCAL * begins for begins, _ in levels]
     detail = [gaussians for _, gaussians in levels]
@@ -54,7 +61,11 @@ def write_tileset(folder: Path, levels: Sequence[tuple[float, Gaussians]], *, or
         box = {"box": _box(centres, rows, origin)}
         found: dict[str, Any] = {"boundingVolume": box, "geometricError": errors[level]}
         if len(rows[level]):
-            notes.extend(write_tile(folder / name, detail[level].select(torch.from_numpy(rows[level])), origin))
+            notes.extend(
+                write_tile(
+                    folder / name, detail[level].select(torch.from_numpy(rows[level])), origin
+                )
+            )
             found["content"] = {"uri": name}
         return found | ({"children": children} if children else {})
 
@@ -71,7 +82,8 @@ def write_tileset(folder: Path, levels: Sequence[tuple[float, Gaussians]], *, or
         "asset": {"version": "1.1", "generator": f"clod-adapter {package_version()}"},
         "extensionsUsed": ["3DTILES_content_gltf"],
         "extensions": {"3DTILES_content_gltf": extensions},
-        "geometricError": errors[coarsest] + ALLOWED * 2 * float(np.linalg.norm(root["boundingVolume"]["box"][3:])),
+        "geometricError": errors[coarsest]
+        + ALLOWED * 2 * float(np.linalg.norm(root["boundingVolume"]["box"][3:])),
         "root": root,
     }
     (folder / TILESET).write_text(json.dumps(index, indent=1), encoding="utf-8")
@@ -85,10 +97,15 @@ def write_tile(path: Path, gaussians: Gaussians, origin: Origin) -> tuple[str, .
     data = packed.read_bytes()
     packed.unlink()
     shapes = {
-        "POSITION": "VEC3", "COLOR_0": "VEC4", f"{EXTENSION}:SCALE": "VEC3", f"{EXTENSION}:ROTATION": "VEC4",
-    }  # fmt: skip
+        "POSITION": "VEC3",
+        "COLOR_0": "VEC4",
+        f"{EXTENSION}:SCALE": "VEC3",
+        f"{EXTENSION}:ROTATION": "VEC4",
+    }
     shapes |= dict.fromkeys(harmonics(min(gaussians.sh_degree, DEGREE))[1:], "VEC3")
-    accessors: dict[str, Any] = {name: {"count": len(gaussians), "type": shape} for name, shape in shapes.items()}
+    accessors: dict[str, Any] = {
+        name: {"count": len(gaussians), "type": shape} for name, shape in shapes.items()
+    }
     x, y, z = origin
     node = {"matrix": [-1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1, 0, -x, -y, z, 1]}  # a half turn about z
     views = [{"buffer": 0, "byteLength": len(data)}]
@@ -112,11 +129,15 @@ def _cells(centres: Sequence[np.ndarray], rows: Rows) -> Iterator[Rows]:
 
 
 def _box(centres: Sequence[np.ndarray], rows: Rows, origin: Origin) -> list[float]:
-    """A box around the centres of all levels but STRAY of them, as 3D Tiles has it: the centre and three half axes.
+    """A box around the centres of all levels but STRAY of them, as 3D Tiles has it: the centre and
+    three half axes.
 
-    Viewers take the distance to the box for the choice of levels. Floaters far off would put the viewer inside.
+    Viewers take the distance to the box for the choice of levels. Floaters far off would put the
+    viewer inside.
     """
     points = np.concatenate([centre[each] for centre, each in zip(centres, rows, strict=True)])
-    turned = -(np.quantile(points, [STRAY / 2, 1 - STRAY / 2], 0) + np.array(origin))[::-1, [0, 2, 1]]
+    turned = -(np.quantile(points, [STRAY / 2, 1 - STRAY / 2], 0) + np.array(origin))[
+        ::-1, [0, 2, 1]
+    ]
     centre, half = turned.mean(0), (turned[1] - turned[0]) / 2
     return [*centre.tolist(), *np.diag(half).ravel().tolist()]

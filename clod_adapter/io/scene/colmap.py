@@ -25,12 +25,15 @@ try:
     import pycolmap
 except ModuleNotFoundError as error:
     fix = "pip install pycolmap; on arm64 Linux conda install -c conda-forge pycolmap"
-    raise ClodError(f"cameras and photographs are read with pycolmap, which is not installed: {fix}") from error
+    raise ClodError(
+        f"cameras and photographs are read with pycolmap, which is not installed: {fix}"
+    ) from error
 
 TEST_EVERY = 8  # one view in this many is held out
 DAMAGED = "is truncated or damaged"
 START = 4096  # bytes of a text file that hold its header
-SPLIT = "test.txt"  # beside a model, the names of its test images, as Inria's and Hierarchical-3DGS's code has it
+# beside a model, the names of its test images, as Inria's and Hierarchical-3DGS's code has it
+SPLIT = "test.txt"
 HUGE = 1e9  # world units and pixels; larger values are damage, and may not fit float32
 
 
@@ -41,7 +44,8 @@ class PosedImage:
     name: str  # its path in the folder of photographs, parts joined by /
     viewmat: np.ndarray  # ``[4, 4]`` float64, world to camera, OpenCV axes
     camera: pycolmap.Camera  # any of COLMAP's perspective models; pixel centres lie at +0.5
-    held_out: bool | None = None  # whether the scene marks it for testing; None where the scene marks none
+    # whether the scene marks it for testing; None where the scene marks none
+    held_out: bool | None = None
 
     @property
     def is_pinhole(self) -> bool:
@@ -49,7 +53,9 @@ class PosedImage:
         return self.camera.is_perspective_pinhole() and self.camera.is_undistorted()
 
     def relative_to(self, origin: Sequence[float]) -> PosedImage:
-        """In a world with its origin at ``origin [3]``; in float64, as float32 lacks digits far from 0."""
+        """In a world with its origin at ``origin [3]``; in float64, as float32 lacks digits far
+        from 0.
+        """
         viewmat = self.viewmat.copy()
         viewmat[:3, 3] += viewmat[:3, :3] @ np.asarray(origin, np.float64)
         return replace(self, viewmat=viewmat)
@@ -65,14 +71,20 @@ class Image(NamedTuple):
 
 
 def held_out(images: Sequence[PosedImage], test_every: int) -> set[str]:
-    """Names of the test images: those that the scene marks, else the 0th and every ``test_every``-th of several."""
+    """Names of the test images: those that the scene marks, else the 0th and every
+    ``test_every``-th of several.
+    """
     if any(image.held_out is not None for image in images):
         return {image.name for image in images if image.held_out}
     return {image.name for image in images[::test_every]} if len(images) > 1 else set()
 
 
-def marked(images: list[PosedImage], testing: Set[str], source: str) -> tuple[list[PosedImage], list[str]]:
-    """The images, those of these names held out, and a note; unchanged where the names are those of all or none."""
+def marked(
+    images: list[PosedImage], testing: Set[str], source: str
+) -> tuple[list[PosedImage], list[str]]:
+    """The images, those of these names held out, and a note; unchanged where the names are those of
+    all or none.
+    """
     count = sum(image.name in testing for image in images)
     if not 0 < count < len(images):
         some = "all" if count else "none"
@@ -82,15 +94,23 @@ def marked(images: list[PosedImage], testing: Set[str], source: str) -> tuple[li
 
 
 def check_posed(image: PosedImage, source: Path) -> PosedImage:
-    """The image; refuses a camera or pose that is not finite, too large, or cannot become a pinhole."""
+    """The image; refuses a camera or pose that is not finite, too large, or cannot become a
+    pinhole.
+    """
     camera = image.camera
     if not camera.is_perspective_pinhole() and not camera.is_perspective_fisheye():
-        what = f"has camera model {camera.model_name}, no perspective camera; cut perspective views from it first"
+        what = (
+            f"has camera model {camera.model_name}, no perspective camera; cut perspective views"
+            " from it first"
+        )
         raise ClodError(f"{source}: image {image.name!r} {what}")
     lengths = [camera.focal_length_x, camera.focal_length_y, camera.width, camera.height]
     numbers = np.abs([*image.viewmat.ravel(), *camera.params, *lengths])
     if not (numbers < HUGE).all() or min(lengths) <= 0:  # a comparison with NaN is false
-        raise ClodError(f"{source}: image {image.name!r} has a camera or pose that is not usable; export it again")
+        raise ClodError(
+            f"{source}: image {image.name!r} has a camera or pose that is not usable; export it"
+            " again"
+        )
     return image
 
 
@@ -106,17 +126,24 @@ def read_colmap(model: Path) -> tuple[list[PosedImage], list[str]]:
     for name, quat, translation, camera in records:
         name_parts(name, path)
         if camera not in cameras:
-            raise ClodError(f"{path}: image {name!r} has camera {camera}, which is not in cameras{form}; export both")
+            raise ClodError(
+                f"{path}: image {name!r} has camera {camera}, which is not in cameras{form}; export"
+                " both"
+            )
         viewmat = np.eye(4)
         with refused_if_damaged(path, f"image {name!r} has no rotation"):
-            viewmat[:3, :3] = Rotation.from_quat(np.roll(quat, -1)).as_matrix()  # of any length; scipy has w last
+            # of any length; scipy has w last
+            viewmat[:3, :3] = Rotation.from_quat(np.roll(quat, -1)).as_matrix()
         viewmat[:3, 3] = translation
         posed.append(check_posed(PosedImage(name, viewmat, cameras[camera]), model))
     if not posed:
         raise ClodError(f"{model}: the model has no registered image; run COLMAP's mapper again")
     notes = []
     if stated is not None and int(stated[1]) != len(posed):
-        notes.append(f"{path.name} has {len(posed)} images, but its header says {int(stated[1])}: it may be incomplete")
+        notes.append(
+            f"{path.name} has {len(posed)} images, but its header says {int(stated[1])}: it may be"
+            " incomplete"
+        )
     if (split := model / SPLIT).is_file():
         lines = read_bytes(split).decode("utf-8-sig", "surrogateescape").splitlines()
         posed, more = marked(posed, {line.strip() for line in lines}, SPLIT)
@@ -125,7 +152,9 @@ def read_colmap(model: Path) -> tuple[list[PosedImage], list[str]]:
 
 
 def load_points(folder: str | Path, origin: Sequence[float] = NOWHERE) -> torch.Tensor:
-    """``[M, 3]`` float64, the points of the scene's COLMAP model less ``origin``; none without a model."""
+    """``[M, 3]`` float64, the points of the scene's COLMAP model less ``origin``; none without a
+    model.
+    """
     model, points = find_cameras(Path(folder)), list[Sequence[float]]()
     path = next((file for form in FORMS if (file := model / f"points3D{form}").is_file()), None)
     if path is not None:
@@ -137,7 +166,9 @@ def load_points(folder: str | Path, origin: Sequence[float] = NOWHERE) -> torch.
 def _cameras(path: Path) -> dict[int, pycolmap.Camera]:
     cameras = {}
     with refused_if_damaged(path, DAMAGED):
-        for camera, params in (_camera_records if path.suffix == ".bin" else _cameras_in_text)(path):
+        for camera, params in (_camera_records if path.suffix == ".bin" else _cameras_in_text)(
+            path
+        ):
             if len(params) != len(camera.params):
                 raise ValueError(f"camera {camera.camera_id} has {len(params)} parameters")
             camera.params = params
@@ -146,7 +177,9 @@ def _cameras(path: Path) -> dict[int, pycolmap.Camera]:
 
 
 class _Records:
-    """The values of a binary file, from its start on; COLMAP's own reader reads past the end of a cut one."""
+    """The values of a binary file, from its start on; COLMAP's own reader reads past the end of a
+    cut one.
+    """
 
     def __init__(self, path: Path) -> None:
         self.data, self.at = read_bytes(path), 0
@@ -171,7 +204,9 @@ def _camera_records(path: Path) -> Iterator[tuple[pycolmap.Camera, list[float]]]
     records = _Records(path)
     for _ in range(*records.take("Q")):
         number, kind, width, height = records.take("IiQQ")
-        camera = pycolmap.Camera.create_from_model_id(number, pycolmap.CameraModelId(kind), 1.0, width, height)
+        camera = pycolmap.Camera.create_from_model_id(
+            number, pycolmap.CameraModelId(kind), 1.0, width, height
+        )
         yield camera, list(records.take(f"{len(camera.params)}d"))
 
 
@@ -203,12 +238,16 @@ def _lines(path: Path) -> Iterator[tuple[int, bytes]]:
 def _cameras_in_text(path: Path) -> Iterator[tuple[pycolmap.Camera, list[float]]]:
     for _, line in _lines(path):
         number, kind, width, height, *params = line.split()
-        camera = pycolmap.Camera.create_from_model_name(int(number), kind.decode(), 1.0, int(width), int(height))
+        camera = pycolmap.Camera.create_from_model_name(
+            int(number), kind.decode(), 1.0, int(width), int(height)
+        )
         yield camera, [float(value) for value in params]
 
 
 def _images_in_text(path: Path) -> Iterator[Image]:
-    """An image's line is followed by one of its keypoints, which is blank or missing where there are none."""
+    """An image's line is followed by one of its keypoints, which is blank or missing where there
+    are none.
+    """
     may_be_keypoints = False
     for number, line in _lines(path):
         if may_be_keypoints and _is_keypoints(line):
@@ -216,9 +255,13 @@ def _images_in_text(path: Path) -> Iterator[Image]:
             continue
         fields = line.split(maxsplit=9)  # a name may have spaces
         if len(fields) < 10:
-            raise ValueError(f"line {number} is neither an image with its camera and name nor keypoints of one")
+            raise ValueError(
+                f"line {number} is neither an image with its camera and name nor keypoints of one"
+            )
         pose = [float(value) for value in fields[1:8]]
-        yield Image(fields[9].decode("utf-8", "surrogateescape"), pose[:4], pose[4:], int(fields[8]))
+        yield Image(
+            fields[9].decode("utf-8", "surrogateescape"), pose[:4], pose[4:], int(fields[8])
+        )
         may_be_keypoints = True
 
 

@@ -23,10 +23,15 @@ PATHS = ("file_path", "mask_path", "depth_file_path")  # of a frame
 PHOTOGRAPHS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp")
 ENDINGS = ("", ".png", ".jpg", ".jpeg")  # that the path of a frame may omit
 MAX_BYTES = 256 * 2**20  # a hundred thousand frames have a tenth of that
-SMALLER = ("images_2", "images_4", "images_8")  # copies at a part of the size, as Mip-NeRF 360 and Inria's code have
+# copies at a part of the size, as Mip-NeRF 360 and Inria's code have
+SMALLER = ("images_2", "images_4", "images_8")
 RAW = "input"  # Inria's name for the photographs before they are undistorted into images
 MASKS = ("masks", "mask")
-UNUSED = "not used: where the checkpoint is empty under them, put them into the photographs' alpha channel"  # of masks
+# of masks
+UNUSED = (
+    "not used: where the checkpoint is empty under them, put them into the photographs' alpha"
+    " channel"
+)
 MISSING = 0.5  # the share of photographs that may be missing
 MOST_PARTS = 8  # of the end of a path from another machine
 LONGEST_NAME, LONGEST_PART = 4000, 255  # characters of a path, bytes of one of its parts
@@ -35,27 +40,47 @@ LONGEST_NAME, LONGEST_PART = 4000, 255  # characters of a path, bytes of one of 
 def find_cameras(folder: Path) -> Path:
     """The folder of a COLMAP model, or the transforms file of a scene.
 
-    Looked for in this order: a model in sparse/0, sparse/1, ..., sparse and ``folder``; TRANSFORMS there; nerfstudio's
-    colmap/sparse/0; and a model in sparse beside ``folder``, which may be the images' own.
+    Looked for in this order: a model in sparse/0, sparse/1, ..., sparse and ``folder``; TRANSFORMS
+    there; nerfstudio's colmap/sparse/0; and a model in sparse beside ``folder``, which may be the
+    images' own.
     """
     files = [folder / name for name in TRANSFORMS if (folder / name).is_file()]
     own, beside = models_in(folder / "sparse"), models_in(folder.resolve().parent / "sparse")
-    for each in (*own, *models_in(folder), *files, *models_in(folder / "colmap" / "sparse"), *beside):
+    for each in (
+        *own,
+        *models_in(folder),
+        *files,
+        *models_in(folder / "colmap" / "sparse"),
+        *beside,
+    ):
         return each
-    what = "no COLMAP model (cameras, images; .bin or .txt) in it, sparse or sparse/0, and no transforms.json"
-    raise ClodError(f"{folder}: {what}; give the folder that holds images/ and sparse/0, or transforms.json")
+    what = (
+        "no COLMAP model (cameras, images; .bin or .txt) in it, sparse or sparse/0, and no"
+        " transforms.json"
+    )
+    raise ClodError(
+        f"{folder}: {what}; give the folder that holds images/ and sparse/0, or transforms.json"
+    )
 
 
 def models_in(folder: Path) -> list[Path]:
     """COLMAP's models in the numbered folders of this one, by number, and in itself."""
-    numbered = sorted((each for each in folder.glob("*") if each.name.isdecimal()), key=lambda each: int(each.name))
+    numbered = sorted(
+        (each for each in folder.glob("*") if each.name.isdecimal()),
+        key=lambda each: int(each.name),
+    )
     return [each for each in (*numbered, folder) if form_of(each)]
 
 
 def form_of(folder: Path) -> str:
     """Which of FORMS a folder's COLMAP model has, empty without one; trainers need no points."""
     return next(
-        (form for form in FORMS if all((folder / f"{name}{form}").is_file() for name in ("cameras", "images"))), ""
+        (
+            form
+            for form in FORMS
+            if all((folder / f"{name}{form}").is_file() for name in ("cameras", "images"))
+        ),
+        "",
     )
 
 
@@ -73,41 +98,59 @@ def find_photographs(
 ) -> tuple[list[Path | None], list[str]]:
     """The files of these names, None for those that are missing, and notes.
 
-    All are from the one of ``photograph_folders`` that has most of them; ``input`` is one of these only with ``raw``:
-    where the cameras are pinholes, Inria's code made them together with other photographs.
+    All are from the one of ``photograph_folders`` that has most of them; ``input`` is one of these
+    only with ``raw``: where the cameras are pinholes, Inria's code made them together with other
+    photographs.
     """
     parts = [name_parts(name, cameras) for name in names]
     if twice := [name for name, count in Counter(names).items() if count > 1]:
         raise ClodError(f"{cameras}: has image {twice[0]} more than once; export it again")
-    roots = [each for each in photograph_folders(folder, cameras) if raw or each.name != RAW or each == folder]
+    roots = [
+        each
+        for each in photograph_folders(folder, cameras)
+        if raw or each.name != RAW or each == folder
+    ]
     found = [(*find_files(root, parts), root) for root in roots]
-    paths, others, root = min(found, key=lambda candidates: (candidates[0].count(None), len(candidates[1])))
+    paths, others, root = min(
+        found, key=lambda candidates: (candidates[0].count(None), len(candidates[1]))
+    )
     notes = []
     if others:
         example = as_text(f"{others[0].name} in {root.name}")
-        notes.append(f"{len(others)} of {len(names)} photographs have another suffix or case, such as {example}")
+        notes.append(
+            f"{len(others)} of {len(names)} photographs have another suffix or case, such as"
+            f" {example}"
+        )
     if root.name in (*SMALLER, RAW) and root != folder:
         notes.append(f"the photographs are those in {root.name}, as there are more than in images")
     bases = dict.fromkeys((folder, root.parent)) if cameras.is_dir() and root != folder else ()
     masks = [each for base in bases for name in MASKS if any((each := base / name).glob("*"))]
     notes += [f"the masks in {each} are {UNUSED}" for each in masks]
-    missing = [as_text(str(Path(*each))) for each, path in zip(parts, paths, strict=True) if path is None]
+    missing = [
+        as_text(str(Path(*each))) for each, path in zip(parts, paths, strict=True) if path is None
+    ]
     if missing:
         some = f"({', '.join(missing[:3])}{', ...' if len(missing) > 3 else ''})"
         if root.is_dir() and not os.access(root, os.X_OK):
             raise ClodError(f"{root}: cannot be read; check its permissions")
         if len(missing) > MISSING * len(names):
             lists = cameras.name if cameras.is_file() else "the model"
-            what = f"{len(missing)} of {len(names)} images of {lists} are missing {some}, more than half"
+            what = (
+                f"{len(missing)} of {len(names)} images of {lists} are missing {some}, more than"
+                " half"
+            )
             raise ClodError(f"{root}: {what}; put them there under these names")
         notes.append(f"{len(missing)} of {len(names)} photographs are missing and left out {some}")
     return paths, notes
 
 
-def find_files(root: Path, parts: Sequence[tuple[str, ...]]) -> tuple[list[Path | None], list[Path]]:
+def find_files(
+    root: Path, parts: Sequence[tuple[str, ...]]
+) -> tuple[list[Path | None], list[Path]]:
     """The files of these names, and which of them have another suffix or case.
 
-    In place of a missing one that is the only photograph of the same name otherwise, if no other name stands for it.
+    In place of a missing one that is the only photograph of the same name otherwise, if no other
+    name stands for it.
     """
     named = [root.joinpath(*map(file_name, each)) for each in parts]
     missing = [path for path in named if not isfile(path)]
@@ -117,9 +160,15 @@ def find_files(root: Path, parts: Sequence[tuple[str, ...]]) -> tuple[list[Path 
             if path.suffix.lower() in PHOTOGRAPHS:
                 there[_without_suffix(path)].append(path)
     count = Counter(map(_without_suffix, named))
-    others = {path: there[key][0] for path in missing if len(there[key := _without_suffix(path)]) == count[key] == 1}
+    others = {
+        path: there[key][0]
+        for path in missing
+        if len(there[key := _without_suffix(path)]) == count[key] == 1
+    }
     absent = set(missing) - set(others)
-    return [None if path in absent else others.get(path, path) for path in named], list(others.values())
+    return [None if path in absent else others.get(path, path) for path in named], list(
+        others.values()
+    )
 
 
 def _without_suffix(path: Path) -> Path:
@@ -127,23 +176,32 @@ def _without_suffix(path: Path) -> Path:
 
 
 def name_parts(name: str, cameras: Path, home: Path | None = None) -> tuple[str, ...]:
-    """The parts of a photograph's name, split at / and at the \\ of files made on Windows; refuses what is no name.
+    """The parts of a photograph's name, split at / and at the \\ of files made on Windows; refuses
+    what is no name.
 
     Of a path that leads out of ``home``, the longest end that is a file there, with one of ENDINGS.
     """
     if as_text(name) != name:
-        raise ClodError(f"{cameras}: image name {as_text(name)[:80]!r} is not UTF-8; rename the photograph, there too")
+        raise ClodError(
+            f"{cameras}: image name {as_text(name)[:80]!r} is not UTF-8; rename the photograph,"
+            " there too"
+        )
     path = PureWindowsPath(name)
     longest = max((len(part.encode()) for part in path.parts), default=0)
     control = any(sign < " " or "\x7f" <= sign <= "\x9f" for sign in name)
     if control or len(name) > LONGEST_NAME or longest > LONGEST_PART:
-        raise ClodError(f"{cameras}: image name {name[:40]!r} ({len(name)} characters) is no file's name; rename it")
+        raise ClodError(
+            f"{cameras}: image name {name[:40]!r} ({len(name)} characters) is no file's name;"
+            " rename it"
+        )
     if path.parts and not leaves(name):
         return path.parts
     if home is not None:
         for count in range(min(MOST_PARTS, len(path.parts) - 1), 0, -1):
             end = path.parts[-count:]
-            if ".." not in end and any(isfile(home / file_name("/".join(end) + ending)) for ending in ENDINGS):
+            if ".." not in end and any(
+                isfile(home / file_name("/".join(end) + ending)) for ending in ENDINGS
+            ):
                 return end
     what = f"image name {name[:80]!r} leaves the images folder or is no name"
     raise ClodError(f"{cameras}: {what}; put the photograph there, or correct the name")
@@ -156,21 +214,32 @@ def leaves(name: str) -> bool:
 
 
 def scene_files(folder: Path) -> Iterator[Path]:
-    """What no output may overwrite: the model or the transforms, photographs, masks and depths; some may not exist."""
+    """What no output may overwrite: the model or the transforms, photographs, masks and depths;
+    some may not exist.
+    """
     cameras = find_cameras(folder)
     home = cameras if cameras.is_dir() else cameras.parent
     yield from (each / name for each in dict.fromkeys((folder, home)) for name in DESCRIPTIONS)
     if cameras.is_file():
-        yield from (home / name for each in DESCRIPTIONS for name in _names_in_json(cameras.with_name(each)))
+        yield from (
+            home / name for each in DESCRIPTIONS for name in _names_in_json(cameras.with_name(each))
+        )
         return
     yield from (path for path in cameras.glob("*") if path.suffix in (".bin", ".txt"))
-    named = [each for each in photograph_folders(folder, cameras) if each.name in ("images", *SMALLER, RAW)]
-    for each in [path for path in named if any(path.glob("*"))] or [folder]:  # glob passes over what cannot be read
+    named = [
+        each
+        for each in photograph_folders(folder, cameras)
+        if each.name in ("images", *SMALLER, RAW)
+    ]
+    # glob passes over what cannot be read
+    for each in [path for path in named if any(path.glob("*"))] or [folder]:
         yield from (path for path in each.rglob("*") if path.suffix.lower() in PHOTOGRAPHS)
 
 
 def _names_in_json(path: Path) -> Iterator[str]:
-    """What the frames of a transforms file name; nothing of a damaged one, which its reader refuses."""
+    """What the frames of a transforms file name; nothing of a damaged one, which its reader
+    refuses.
+    """
     try:
         frames = read_json(path).get("frames")
     except ClodError:
@@ -184,7 +253,10 @@ def _names_in_json(path: Path) -> Iterator[str]:
 def read_json(path: Path) -> dict[str, Any]:
     """The object in a JSON file."""
     if path.is_file() and path.stat().st_size > MAX_BYTES:
-        raise ClodError(f"{path}: is larger than {MAX_BYTES >> 20} MB, so it is no list of cameras; check the path")
+        raise ClodError(
+            f"{path}: is larger than {MAX_BYTES >> 20} MB, so it is no list of cameras; check the"
+            " path"
+        )
     text = read_bytes(path)
     refuse_long_numbers(path, text)
     with refused_if_damaged(path, "is no JSON or damaged", "export it again"):

@@ -1,4 +1,6 @@
-"""Photographs as pinhole cameras have them: decoded to 8-bit RGB, undistorted (cached) and scaled."""
+"""Photographs as pinhole cameras have them: decoded to 8-bit RGB, undistorted (cached) and
+scaled.
+"""
 
 import hashlib
 import json
@@ -21,40 +23,53 @@ from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.file_formats import read_bytes
 from clod_adapter.io.scene.colmap import HUGE, PosedImage
 
-Note = tuple[str, str]  # a change to a photograph, with {} for what differs between photographs, and that
-# Of a pinhole camera: 8-bit RGB at the size that is used, ``[3, 3]`` the intrinsics, and the changes.
+# a change to a photograph, with {} for what differs between photographs, and that
+Note = tuple[str, str]
+# Of a pinhole camera: 8-bit RGB at the size that is used, ``[3, 3]`` the intrinsics, and the
+# changes.
 Photograph = tuple[Image.Image, np.ndarray, list[Note]]
 
-# Pillow opens files by content, and starts another program for some (PostScript). JPEG includes the MPO of phones.
+# Pillow opens files by content, and starts another program for some (PostScript). JPEG includes the
+# MPO of phones.
 FORMATS = ("PNG", "JPEG", "TIFF", "WEBP", "BMP")
 OTHERS = {
-    b"ftyphei": "HEIC", b"ftypmif1": "HEIC", b"ftypavif": "AVIF", b"jP  ": "JPEG 2000", b"GIF8": "GIF",
-    b"%!PS": "PostScript", b"%PDF": "PDF",
-}  # by what is in their first 12 bytes, for the message  # fmt: skip
+    b"ftyphei": "HEIC",
+    b"ftypmif1": "HEIC",
+    b"ftypavif": "AVIF",
+    b"jP  ": "JPEG 2000",
+    b"GIF8": "GIF",
+    b"%!PS": "PostScript",
+    b"%PDF": "PDF",
+}  # by what is in their first 12 bytes, for the message
 
 LARGE = 1 << 26  # pixels; a larger photograph is reduced first
 BAND = 64  # rows of the reduced photograph that are made at a time
 REDUCED = f"have more than {LARGE / 1e6:.0f} million pixels, which takes long: reduced first"
 Turn = Image.Transpose
-_TURNS = {5: Turn.TRANSPOSE, 6: Turn.ROTATE_270, 7: Turn.TRANSVERSE, 8: Turn.ROTATE_90}  # of EXIF: sides are swapped
+# of EXIF: sides are swapped
+_TURNS = {5: Turn.TRANSPOSE, 6: Turn.ROTATE_270, 7: Turn.TRANSVERSE, 8: Turn.ROTATE_90}
 _ORIENTATION, _BITS, _PLANES = 0x0112, 258, 284  # tags of EXIF and TIFF
 SCALED = "scaled {} (Pillow bicubic, as in Inria's code)"
 _ONE_LARGE = threading.Lock()  # of more than LARGE pixels one at a time
 _KEY = "clod-adapter"  # of the text in a cached PNG
 
 
-def read_image(path: Path, width: int, height: int, max_width: int) -> tuple[Image.Image, list[Note]]:
+def read_image(
+    path: Path, width: int, height: int, max_width: int
+) -> tuple[Image.Image, list[Note]]:
     """The file as 8-bit RGB in the shape of its camera, and notes on the changes.
 
-    16 bits per channel are reduced to 8, grey becomes RGB, transparency is composited over black. Colour profiles are
-    not applied. The EXIF rotation is not either, as COLMAP does not, unless the photograph has its camera's shape only
-    once it is turned: then the model was made from turned copies.
+    16 bits per channel are reduced to 8, grey becomes RGB, transparency is composited over black.
+    Colour profiles are not applied. The EXIF rotation is not either, as COLMAP does not, unless the
+    photograph has its camera's shape only once it is turned: then the model was made from turned
+    copies.
 
-    A photograph of more than LARGE pixels is first reduced by an integer factor, to ``2 max_width`` or more: a JPEG
-    by its decoder, others by the mean over squares of pixels.
+    A photograph of more than LARGE pixels is first reduced by an integer factor, to ``2 max_width``
+    or more: a JPEG by its decoder, others by the mean over squares of pixels.
 
     Args:
-        width, height: the camera's; the photograph may be of another size, but not of another shape.
+        width, height: the camera's; the photograph may be of another size, but not of another
+            shape.
         max_width: its final width at most.
     """
     notes: list[Note] = []
@@ -93,29 +108,42 @@ def _opened(path: Path) -> Iterator[Image.Image]:
         except UnidentifiedImageError as error:
             start, unknown = read_bytes(path, 12), f"damaged or none of {', '.join(FORMATS)}"
             kind = next((name for mark, name in OTHERS.items() if mark in start), unknown)
-            raise ClodError(f"{path}: cannot be decoded, is {kind}; export it as JPEG or PNG") from error
+            raise ClodError(
+                f"{path}: cannot be decoded, is {kind}; export it as JPEG or PNG"
+            ) from error
         except Image.DecompressionBombError as error:
-            raise ClodError(f"{path}: has more than the 178 million pixels that are read; scale it down") from error
+            raise ClodError(
+                f"{path}: has more than the 178 million pixels that are read; scale it down"
+            ) from error
 
 
 def _same_shape(size: tuple[int, int], width: int, height: int) -> bool:
-    return abs(size[0] * height / (size[1] * width) - 1) <= 0.01  # a scaled copy is rounded to whole pixels
+    # a scaled copy is rounded to whole pixels
+    return abs(size[0] * height / (size[1] * width) - 1) <= 0.01
 
 
 def _rgb(path: Path, source: Image.Image, factor: int, notes: list[Note]) -> Image.Image:
     """The photograph in 8-bit RGB, its width and height divided by ``factor``."""
     tags: dict[int, Any] = getattr(source, "tag_v2", {})  # a TIFF's
-    if tags.get(_PLANES) == 2 and max(tags.get(_BITS) or (8,)) > 8:  # Pillow would take each byte for a pixel
-        raise ClodError(f"{path}: has more than 8 bits in planes of one colour each; convert it to 8 bits")
+    # Pillow would take each byte for a pixel
+    if tags.get(_PLANES) == 2 and max(tags.get(_BITS) or (8,)) > 8:
+        raise ClodError(
+            f"{path}: has more than 8 bits in planes of one colour each; convert it to 8 bits"
+        )
     deep = source.mode.startswith("I;16") or (source.mode == "I" and source.format == "PNG")
     if source.mode in ("I", "F") and not deep:
-        raise ClodError(f"{path}: has 32 bits per channel, whose range is not known; convert it to 8 bits")
+        raise ClodError(
+            f"{path}: has 32 bits per channel, whose range is not known; convert it to 8 bits"
+        )
     if source.mode == "CMYK":
         notes.append(("are CMYK: brought to RGB without their colour profile", ""))
     if factor == 1:
         return _converted(source, deep, notes)
     source.load()
-    small, rows = Image.new("RGB", (-(-source.width // factor), -(-source.height // factor))), factor * BAND
+    small, rows = (
+        Image.new("RGB", (-(-source.width // factor), -(-source.height // factor))),
+        factor * BAND,
+    )
     for top in range(0, source.height, rows):  # no copy of the whole is made
         band = source.crop((0, top, source.width, min(top + rows, source.height)))
         small.paste(_converted(band, deep, notes).reduce(factor), (0, top // factor))
@@ -124,7 +152,8 @@ def _rgb(path: Path, source: Image.Image, factor: int, notes: list[Note]) -> Ima
 
 def _converted(source: Image.Image, deep: bool, notes: list[Note]) -> Image.Image:
     if deep:
-        values = np.asarray(source).astype(np.uint32)  # grey; 16-bit colour Pillow has brought to 8 bits itself
+        # grey; 16-bit colour Pillow has brought to 8 bits itself
+        values = np.asarray(source).astype(np.uint32)
         return Image.fromarray(((values + 128) // 257).astype(np.uint8)).convert("RGB")
     if "A" not in source.getbands() and "transparency" not in source.info:
         if source.mode != "RGB":
@@ -139,7 +168,8 @@ def _converted(source: Image.Image, deep: bool, notes: list[Note]) -> Image.Imag
 
 
 def photograph(image: PosedImage, path: Path, max_width: int, cache: Path | None) -> Photograph:
-    """The photograph of a pinhole camera, no wider than ``max_width``; an undistorted one is kept in ``cache``.
+    """The photograph of a pinhole camera, no wider than ``max_width``; an undistorted one is kept
+    in ``cache``.
 
     There it is a PNG named by a hash of what it was made from, which a later run reads.
     """
@@ -147,9 +177,17 @@ def photograph(image: PosedImage, path: Path, max_width: int, cache: Path | None
         return _made(image, path, max_width)
     state, camera = path.stat(), image.camera
     made_of = (
-        str(path.resolve()), state.st_size, state.st_mtime_ns, camera.model_name, camera.width, camera.height,
-        camera.params.tolist(), max_width, pycolmap.__version__, PIL.__version__,
-    )  # fmt: skip
+        str(path.resolve()),
+        state.st_size,
+        state.st_mtime_ns,
+        camera.model_name,
+        camera.width,
+        camera.height,
+        camera.params.tolist(),
+        max_width,
+        pycolmap.__version__,
+        PIL.__version__,
+    )
     file = cache / f"{hashlib.sha256(repr(made_of).encode()).hexdigest()[:32]}.png"
     pixels: Image.Image | None = None
     # Absent, or damaged: Pillow raises many kinds.
@@ -164,7 +202,11 @@ def photograph(image: PosedImage, path: Path, max_width: int, cache: Path | None
         with atomic_path(file) as temporary:
             pixels.save(temporary, pnginfo=about, compress_level=1)
     lens = f"from {camera.model_name} into {cache}"
-    return pixels, K, [*notes, ("undistorted {}, which may be deleted; the sources are untouched", lens)]
+    return (
+        pixels,
+        K,
+        [*notes, ("undistorted {}, which may be deleted; the sources are untouched", lens)],
+    )
 
 
 def _made(image: PosedImage, path: Path, max_width: int) -> Photograph:
@@ -174,15 +216,23 @@ def _made(image: PosedImage, path: Path, max_width: int) -> Photograph:
         camera = copy(image.camera)
         pixels, notes = read_image(path, camera.width, camera.height, max_width)
         if pixels.size != (camera.width, camera.height):
-            sizes = f"{pixels.width}x{pixels.height} where the model has {camera.width}x{camera.height}"
+            sizes = (
+                f"{pixels.width}x{pixels.height} where the model has {camera.width}x{camera.height}"
+            )
             notes.append(("are {}: intrinsics scaled", sizes))
-            # With pixel centres at +0.5, in COLMAP as here, the principal point scales like the focal length.
+            # With pixel centres at +0.5, in COLMAP as here, the principal point scales like the
+            # focal length.
             camera.rescale(*pixels.size)
         if not image.is_pinhole:
-            # As ``colmap image_undistorter`` by default: bilinear, the same focal length, and no blank pixel.
-            with refused_if_damaged(path, "COLMAP cannot undistort it", "check its camera's parameters"):
+            # As ``colmap image_undistorter`` by default: bilinear, the same focal length, and no
+            # blank pixel.
+            with refused_if_damaged(
+                path, "COLMAP cannot undistort it", "check its camera's parameters"
+            ):
                 bitmap = pycolmap.Bitmap.from_array(np.asarray(pixels))
-                bitmap, camera = pycolmap.undistort_image(pycolmap.UndistortCameraOptions(), bitmap, camera)
+                bitmap, camera = pycolmap.undistort_image(
+                    pycolmap.UndistortCameraOptions(), bitmap, camera
+                )
                 pixels = Image.fromarray(bitmap.to_array())
         width, height = pixels.size
         if width > max_width:
@@ -191,14 +241,21 @@ def _made(image: PosedImage, path: Path, max_width: int) -> Photograph:
             notes.append((SCALED, f"from {width}x{height} to {size[0]}x{size[1]}"))
         if large:
             release()  # or this thread keeps memory that the next one allocates again
-    K = np.array([[pixels.width / width], [pixels.height / height], [1.0]]) * camera.calibration_matrix()
+    K = (
+        np.array([[pixels.width / width], [pixels.height / height], [1.0]])
+        * camera.calibration_matrix()
+    )
     if not 0 < min(K[0, 0], K[1, 1]) <= np.abs(K).max() < HUGE:
-        raise ClodError(f"{path}: its camera is not usable once undistorted; check the camera's parameters")
+        raise ClodError(
+            f"{path}: its camera is not usable once undistorted; check the camera's parameters"
+        )
     return pixels, K, notes
 
 
 def cache_folder(scene: Path) -> Path:
-    """The folder of a scene's undistorted photographs in ``$XDG_CACHE_HOME`` or ``~/.cache``; created if missing."""
+    """The folder of a scene's undistorted photographs in ``$XDG_CACHE_HOME`` or ``~/.cache``;
+    created if missing.
+    """
     try:
         caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
         folder = caches / "clod-adapter" / "undistorted" / scene.resolve().name
@@ -206,8 +263,12 @@ def cache_folder(scene: Path) -> Path:
         if not os.access(folder, os.W_OK | os.X_OK):
             raise PermissionError(13, "Permission denied")
     except RuntimeError as error:
-        raise ClodError("no home folder to keep undistorted photographs in; set XDG_CACHE_HOME to a folder") from error
+        raise ClodError(
+            "no home folder to keep undistorted photographs in; set XDG_CACHE_HOME to a folder"
+        ) from error
     except OSError as error:
         what = f"undistorted photographs cannot be kept there ({error.strerror or error})"
-        raise ClodError(f"{folder}: {what}; set XDG_CACHE_HOME to a folder that can be written to") from error
+        raise ClodError(
+            f"{folder}: {what}; set XDG_CACHE_HOME to a folder that can be written to"
+        ) from error
     return folder

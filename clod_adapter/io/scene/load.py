@@ -35,22 +35,25 @@ def load_scene(
     origin: Sequence[float] = NOWHERE,
     progress: Listener | None = None,
 ) -> Scene:
-    """Reads posed photographs: a COLMAP model (binary or text, any version) or a transforms.json, and its images.
+    """Reads posed photographs: a COLMAP model (binary or text, any version) or a transforms.json,
+    and its images.
 
-    A model is looked for in ``sparse/0``, ``sparse`` and ``folder``, and is taken where there is a ``transforms.json``
-    (nerfstudio, instant-ngp, Blender's synthetic scenes) too. A model's images are looked for in ``images`` and
-    ``folder``, then beside the model and its parent, then in ``images_2``, ``images_4``, ``images_8`` and, for
-    distorted cameras, ``input``. What was done to the photographs is in the scene's notes.
+    A model is looked for in ``sparse/0``, ``sparse`` and ``folder``, and is taken where there is a
+    ``transforms.json`` (nerfstudio, instant-ngp, Blender's synthetic scenes) too. A model's images
+    are looked for in ``images`` and ``folder``, then beside the model and its parent, then in
+    ``images_2``, ``images_4``, ``images_8`` and, for distorted cameras, ``input``. What was done to
+    the photographs is in the scene's notes.
 
-    Where the folder has nerfstudio's ``dataparser_transforms.json``, the cameras are brought into the frame that it
-    trained in, in which it exports its splats (``dataparser``).
+    Where the folder has nerfstudio's ``dataparser_transforms.json``, the cameras are brought into
+    the frame that it trained in, in which it exports its splats (``dataparser``).
 
-    Views are sorted by image name; of those that the scene lists, present or not, the 0th, 8th, 16th... are held out,
-    as Inria's code does (``llffhold``). A single image is for training. With ``transforms_train.json`` and
-    ``transforms_test.json`` those of the latter are held out instead.
+    Views are sorted by image name; of those that the scene lists, present or not, the 0th, 8th,
+    16th... are held out, as Inria's code does (``llffhold``). A single image is for training. With
+    ``transforms_train.json`` and ``transforms_test.json`` those of the latter are held out instead.
 
-    Photographs of a distorted camera are undistorted by COLMAP into the user's cache folder, where a later run finds
-    them. A photograph of another size than its camera has that camera's intrinsics, scaled.
+    Photographs of a distorted camera are undistorted by COLMAP into the user's cache folder, where
+    a later run finds them. A photograph of another size than its camera has that camera's
+    intrinsics, scaled.
 
     Args:
         folder: usually the one with ``images/`` and ``sparse/0/``.
@@ -58,30 +61,41 @@ def load_scene(
         max_width: wider images are scaled down to this many pixels, with Pillow's bicubic filter as
             in Inria's code; the intrinsics are scaled too, and a note states it.
         most: reads at most so many photographs, evenly spread.
-        origin: ``[3]`` what the cameras' world is to be relative to, in its units: ``Checkpoint.origin``.
+        origin: ``[3]`` what the cameras' world is to be relative to, in its units:
+            ``Checkpoint.origin``.
         progress: called in ``Phase.PHOTOGRAPHS`` after each image.
 
     Raises:
-        ClodError: no usable cameras; images that are damaged, of another shape than their camera, or named outside
-            their folder; more than half of them missing, or all that are for training.
+        ClodError: no usable cameras; images that are damaged, of another shape than their camera,
+            or named outside their folder; more than half of them missing, or all that are for
+            training.
     """
     if test_every < 2 or max_width < 1:
-        raise ClodError(f"test_every is {test_every}, max_width {max_width}; they must be at least 2 and 1")
+        raise ClodError(
+            f"test_every is {test_every}, max_width {max_width}; they must be at least 2 and 1"
+        )
     folder = Path(folder)
     cameras, images, notes = _posed(folder)
     if not cameras.is_file() and (folder / "transforms.json").is_file():
         notes.append("the cameras are the COLMAP model's, not those of transforms.json")
     names = [image.name for image in images]
-    paths, more = find_photographs(folder, cameras, names, raw=not all(image.is_pinhole for image in images))
+    paths, more = find_photographs(
+        folder, cameras, names, raw=not all(image.is_pinhole for image in images)
+    )
     notes += more
     present = [(image, path) for image, path in zip(images, paths, strict=True) if path is not None]
     testing = held_out(images, test_every)
     if not any(image.name not in testing for image, _ in present):
-        raise ClodError(f"{folder}: has no photograph to train on, as all that are there are held out; add more")
+        raise ClodError(
+            f"{folder}: has no photograph to train on, as all that are there are held out; add more"
+        )
     chosen = spread(present, most or len(present))
     pinholes = all(image.is_pinhole for image, _ in chosen)
     undistorted = None if pinholes else cache_folder(folder)
-    loads = [partial(_load_view, image.relative_to(origin), path, undistorted, max_width) for image, path in chosen]
+    loads = [
+        partial(_load_view, image.relative_to(origin), path, undistorted, max_width)
+        for image, path in chosen
+    ]
     views, done = _load(loads, progress)
     train = tuple(view for view in views if view.camera.name not in testing)
     test = tuple(view for view in views if view.camera.name in testing)
@@ -90,7 +104,9 @@ def load_scene(
         left_out.append(("undistortion", f"all {len(views)} cameras are pinholes"))
     if not any(what in (REDUCED, SCALED) for what, _ in done):
         left_out.append(("scaling", f"all {len(views)} photographs are used at full resolution"))
-    return in_its_unit(Scene(train, test, (*notes, *_summary(done, len(views))), tuple(left_out), folder))
+    return in_its_unit(
+        Scene(train, test, (*notes, *_summary(done, len(views))), tuple(left_out), folder)
+    )
 
 
 def load_cameras(
@@ -98,19 +114,31 @@ def load_cameras(
 ) -> tuple[list[Camera], list[str]]:
     """The cameras that ``load_scene`` would give photographs to, sorted by name, and notes.
 
-    A distorted one is the pinhole of the same focal length and centre. With ``training`` without those held out. Of a
-    transforms.json without sizes, cameras whose photograph is missing too are left out.
+    A distorted one is the pinhole of the same focal length and centre. With ``training`` without
+    those held out. Of a transforms.json without sizes, cameras whose photograph is missing too are
+    left out.
     """
     folder = Path(folder)
     source, images, notes = _posed(folder)
     testing = held_out(images, TEST_EVERY) if training else set()
-    sized = [image.relative_to(origin) for image in images if min(image.camera.width, image.camera.height) > 1]
-    cameras = [_pinhole(one, one.camera.calibration_matrix(), one.camera.width, one.camera.height) for one in sized]
+    sized = [
+        image.relative_to(origin)
+        for image in images
+        if min(image.camera.width, image.camera.height) > 1
+    ]
+    cameras = [
+        _pinhole(one, one.camera.calibration_matrix(), one.camera.width, one.camera.height)
+        for one in sized
+    ]
     if unsized := len(images) - len(cameras):
-        notes.append(f"{unsized} of {len(images)} cameras left out: neither {source.name} nor a photograph has a size")
+        notes.append(
+            f"{unsized} of {len(images)} cameras left out: neither {source.name} nor a photograph"
+            " has a size"
+        )
     if not cameras:
         raise ClodError(
-            f"{source}: has no size of a photograph, and none is there; put them beside it, or w and h in it"
+            f"{source}: has no size of a photograph, and none is there; put them beside it, or w"
+            " and h in it"
         )
     return [camera for camera in with_near_planes(cameras) if camera.name not in testing], notes
 
@@ -126,20 +154,25 @@ def _posed(folder: Path) -> tuple[Path, list[PosedImage], list[str]]:
 
 
 def _other_models(model: Path) -> list[str]:
-    """A note for each model beside this one, of photographs that COLMAP could not join to its own."""
+    """A note for each model beside this one, of photographs that COLMAP could not join to its
+    own.
+    """
     notes = []
     for other in models_in(model.parent):
         with suppress(ClodError):  # a damaged one is no choice
             if other != model:
                 count = len(read_colmap(other)[0])
                 notes.append(
-                    f"{other} is another model, of {count} images: give this folder if the checkpoint is of it"
+                    f"{other} is another model, of {count} images: give this folder if the"
+                    " checkpoint is of it"
                 )
     return notes
 
 
 def _load(loads: Sequence[Load], progress: Listener | None) -> tuple[list[View], list[Note]]:
-    """The views of the images, and notes. Each worker holds one photograph of full size at a time."""
+    """The views of the images, and notes. Each worker holds one photograph of full size at a
+    time.
+    """
     views, notes = list[View](), list[Note]()
     workers = min(MOST_AT_ONCE, max(2, torch.get_num_threads()))
     with warnings.catch_warnings(), closing(in_order(loads, workers)) as found:
@@ -162,10 +195,18 @@ def _summary(notes: Sequence[Note], total: int) -> list[str]:
     return lines
 
 
-def _load_view(image: PosedImage, path: Path, cache: Path | None, max_width: int) -> tuple[View, list[Note]]:
+def _load_view(
+    image: PosedImage, path: Path, cache: Path | None, max_width: int
+) -> tuple[View, list[Note]]:
     pixels, K, notes = photograph(image, path, max_width, cache)
     return View(_pinhole(image, K, *pixels.size), torch.from_numpy(np.array(pixels))), notes
 
 
 def _pinhole(image: PosedImage, K: np.ndarray, width: int, height: int) -> Camera:
-    return Camera(torch.from_numpy(image.viewmat).float(), torch.from_numpy(K).float(), width, height, image.name)
+    return Camera(
+        torch.from_numpy(image.viewmat).float(),
+        torch.from_numpy(K).float(),
+        width,
+        height,
+        image.name,
+    )

@@ -1,4 +1,6 @@
-"""Cameras as nerfstudio, instant-ngp and Blender's synthetic scenes have them: ``transforms.json``."""
+"""Cameras as nerfstudio, instant-ngp and Blender's synthetic scenes have them:
+``transforms.json``.
+"""
 
 import math
 from collections import ChainMap
@@ -16,13 +18,31 @@ import pycolmap
 from clod_adapter._support.text import file_name
 from clod_adapter.errors import ClodError
 from clod_adapter.io.scene.colmap import HUGE, PosedImage, check_posed, marked
-from clod_adapter.io.scene.folder import DATAPARSER, ENDINGS, UNUSED, find_files, leaves, name_parts, read_json
+from clod_adapter.io.scene.folder import (
+    DATAPARSER,
+    ENDINGS,
+    UNUSED,
+    find_files,
+    leaves,
+    name_parts,
+    read_json,
+)
 from clod_adapter.io.scene.images import image_size
 
 FISHEYE = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
-PERSPECTIVE = ("", "SIMPLE_PINHOLE", "PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+PERSPECTIVE = (
+    "",
+    "SIMPLE_PINHOLE",
+    "PINHOLE",
+    "PERSPECTIVE",
+    "SIMPLE_RADIAL",
+    "RADIAL",
+    "OPENCV",
+    "FULL_OPENCV",
+)
 
-LISTS = ("train_filenames", "val_filenames", "test_filenames")  # nerfstudio's, in its transforms.json
+# nerfstudio's, in its transforms.json
+LISTS = ("train_filenames", "val_filenames", "test_filenames")
 
 
 def read_transforms(path: Path) -> tuple[list[PosedImage], list[str]]:
@@ -32,15 +52,17 @@ def read_transforms(path: Path) -> tuple[list[PosedImage], list[str]]:
 
         viewmat = inverse(transform_matrix diag(1, -1, -1, 1))
 
-    The intrinsics are ``fl_x, fl_y, cx, cy, w, h``, or follow from ``camera_angle_x`` and the photograph's size, each
-    in the frame or for all frames; the distortion is OpenCV's, ``k1 k2 p1 p2 k3``, or its fisheye's, ``k1 k2 k3 k4``.
-    A ``file_path`` without an extension gets .png, .jpg or .jpeg, the first that is there.
+    The intrinsics are ``fl_x, fl_y, cx, cy, w, h``, or follow from ``camera_angle_x`` and the
+    photograph's size, each in the frame or for all frames; the distortion is OpenCV's,
+    ``k1 k2 p1 p2 k3``, or its fisheye's, ``k1 k2 k3 k4``. A ``file_path`` without an extension gets
+    .png, .jpg or .jpeg, the first that is there.
 
-    The frames of ``transforms_train.json`` are for training and those of ``transforms_test.json`` beside it, where
-    it is there, are held out; else those that the lists ``train_filenames``, ``val_filenames`` and ``test_filenames``
-    of one file hold out.
+    The frames of ``transforms_train.json`` are for training and those of ``transforms_test.json``
+    beside it, where it is there, are held out; else those that the lists ``train_filenames``,
+    ``val_filenames`` and ``test_filenames`` of one file hold out.
 
-    Source: nerfstudio's documentation, "Data conventions"; instant-ngp's ``scripts/colmap2nerf.py``.
+    Source: nerfstudio's documentation, "Data conventions"; instant-ngp's
+    ``scripts/colmap2nerf.py``.
     """
     test = path.with_name(path.name.replace("train", "test"))
     both = test != path and test.is_file()
@@ -55,7 +77,9 @@ def _frames(path: Path, held_out: bool | None) -> tuple[list[PosedImage], list[s
     content = read_json(path)
     frames = content.get("frames")
     if not isinstance(frames, list) or not frames:
-        raise ClodError(f"{path}: has no list of frames; give nerfstudio's or instant-ngp's transforms.json")
+        raise ClodError(
+            f"{path}: has no list of frames; give nerfstudio's or instant-ngp's transforms.json"
+        )
     listed = []
     for number, frame in enumerate(frames):
         if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
@@ -63,7 +87,8 @@ def _frames(path: Path, held_out: bool | None) -> tuple[list[PosedImage], list[s
         listed.append("/".join(name_parts(frame["file_path"], path, path.parent)))
     # isfile, as it is False for what can be no path
     names = [
-        next((each + end for end in ENDINGS if isfile(path.parent / file_name(each + end))), each) for each in listed
+        next((each + end for end in ENDINGS if isfile(path.parent / file_name(each + end))), each)
+        for each in listed
     ]
     files, _ = find_files(path.parent, [tuple(name.split("/")) for name in names])
     images, is_test = [], _split(path, content)
@@ -81,14 +106,19 @@ def _frames(path: Path, held_out: bool | None) -> tuple[list[PosedImage], list[s
     if any(leaves(frame["file_path"]) for frame in frames):
         notes.append(f"paths of {path.name} lead out of its folder: photographs are those in it")
     if "applied_transform" in content and not path.with_name(DATAPARSER).is_file():
-        notes.append(f"{path.name} turned COLMAP's world (applied_transform): a checkpoint of the turned one is needed")
+        notes.append(
+            f"{path.name} turned COLMAP's world (applied_transform): a checkpoint of the turned one"
+            " is needed"
+        )
     if any("mask_path" in frame for frame in frames):
         notes.append(f"the masks of {path.name} are {UNUSED}")
     return images, notes
 
 
 def _split(path: Path, content: Mapping[str, Any]) -> Callable[[str], bool] | None:
-    """Whether nerfstudio's lists hold out a photograph: it does not train on it; None without lists."""
+    """Whether nerfstudio's lists hold out a photograph: it does not train on it; None without
+    lists.
+    """
     lists = {}
     for key in LISTS:
         if (given := content.get(key)) is not None:
@@ -101,16 +131,21 @@ def _split(path: Path, content: Mapping[str, Any]) -> Callable[[str], bool] | No
 
 
 def read_pose(where: object, values: Mapping[str, Any], key: str) -> np.ndarray:
-    """``[4, 4]`` float64: the rotation nearest to the file's rounded one, and translation under ``key``, 3x4 or 4x4."""
+    """``[4, 4]`` float64: the rotation nearest to the file's rounded one, and translation under
+    ``key``, 3x4 or 4x4.
+    """
     pose: np.ndarray = np.zeros(0)
     with suppress(TypeError, ValueError, OverflowError):
         pose = np.array(values.get(key), np.float64)
     if pose.shape not in ((4, 4), (3, 4)) or not np.isfinite(pose).all():
-        raise ClodError(f"{where}: {key} is no 3x4 or 4x4 matrix of finite numbers; copy or export it again")
+        raise ClodError(
+            f"{where}: {key} is no 3x4 or 4x4 matrix of finite numbers; copy or export it again"
+        )
     whole, turn = np.vstack([pose[:3], [0.0, 0.0, 0.0, 1.0]]), pose[:3, :3]
     with np.errstate(over="ignore", invalid="ignore"):
         off = np.abs(turn.T @ turn - np.eye(3)).max()
-    # A file may have few digits, but a scale or a mirror image would give a picture of another scene.
+    # A file may have few digits, but a scale or a mirror image would give a picture of another
+    # scene.
     if not off < 0.01 or np.linalg.det(turn) < 0 or not np.array_equal(pose, whole[: len(pose)]):
         raise ClodError(f"{where}: {key} is no rotation and translation; copy or export it again")
     left, _, right = np.linalg.svd(turn)
@@ -118,7 +153,9 @@ def read_pose(where: object, values: Mapping[str, Any], key: str) -> np.ndarray:
     return whole
 
 
-def _number(where: object, values: Mapping[str, Any], key: str, default: float, above: float = -HUGE) -> float:
+def _number(
+    where: object, values: Mapping[str, Any], key: str, default: float, above: float = -HUGE
+) -> float:
     given, value = default if values.get(key) is None else values[key], math.nan
     with suppress(TypeError, ValueError, OverflowError):
         value = float(given)
@@ -135,18 +172,27 @@ def _camera(where: str, photograph: Path | None, values: Mapping[str, Any]) -> p
         width, height = image_size(photograph) if photograph else (1, 1)
     fx = number("fl_x", 0) or _focal(width, number("camera_angle_x", 0))
     if fx <= 0:
-        raise ClodError(f"{where}: has neither fl_x nor camera_angle_x above 0; export the file again")
+        raise ClodError(
+            f"{where}: has neither fl_x nor camera_angle_x above 0; export the file again"
+        )
     fy = number("fl_y", 0) or _focal(height, number("camera_angle_y", 0)) or fx
     params = [fx, fy, number("cx", width / 2), number("cy", height / 2)]
     k1, k2, k3, k4, p1, p2 = (number(key, 0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
     model = str(values.get("camera_model") or "")
     if model in FISHEYE or (model in PERSPECTIVE and values.get("is_fisheye")):
-        return pycolmap.Camera(model="OPENCV_FISHEYE", width=width, height=height, params=[*params, k1, k2, k3, k4])
-    if model not in PERSPECTIVE or k4:  # of k4 some writers mean a power of the radius, some a divisor
+        return pycolmap.Camera(
+            model="OPENCV_FISHEYE", width=width, height=height, params=[*params, k1, k2, k3, k4]
+        )
+    # of k4 some writers mean a power of the radius, some a divisor
+    if model not in PERSPECTIVE or k4:
         what = "k4 of a camera that is no fisheye" if k4 else f"camera_model {model[:40]!r}"
-        raise ClodError(f"{where}: {what} is not known; give the COLMAP model that the file was made from")
+        raise ClodError(
+            f"{where}: {what} is not known; give the COLMAP model that the file was made from"
+        )
     params += [k1, k2, p1, p2, *([k3, 0, 0, 0] if k3 else [])]
-    return pycolmap.Camera(model="FULL_OPENCV" if k3 else "OPENCV", width=width, height=height, params=params)
+    return pycolmap.Camera(
+        model="FULL_OPENCV" if k3 else "OPENCV", width=width, height=height, params=params
+    )
 
 
 def _focal(pixels: int, angle: float) -> float:
@@ -154,26 +200,34 @@ def _focal(pixels: int, angle: float) -> float:
     return pixels / (2 * math.tan(angle / 2)) if 0 < angle < math.pi else 0.0
 
 
-def in_trained_frame(folder: Path, cameras: Path, images: list[PosedImage]) -> tuple[list[PosedImage], list[str]]:
-    """The images in the frame that nerfstudio trained in, and a note; unchanged without its file in ``folder``.
+def in_trained_frame(
+    folder: Path, cameras: Path, images: list[PosedImage]
+) -> tuple[list[PosedImage], list[str]]:
+    """The images in the frame that nerfstudio trained in, and a note; unchanged without its file in
+    ``folder``.
 
-    nerfstudio rotates, moves and scales its cameras, and exports its splats in that frame. With ``transform``, the 3x4
-    matrix ``[R | t]``, and ``scale`` of dataparser_transforms.json, a point ``x`` of the world of its data is there
+    nerfstudio rotates, moves and scales its cameras, and exports its splats in that frame. With
+    ``transform``, the 3x4 matrix ``[R | t]``, and ``scale`` of dataparser_transforms.json, a point
+    ``x`` of the world of its data is there
 
         x_trained = scale (R x + t)
 
-    and a camera ``[R_c | t_c]`` becomes ``[R_c R^T | scale (t_c - R_c R^T t)]``. Cameras are brought into the splat's
-    frame, not the splat into theirs, which is exact for the harmonics too.
+    and a camera ``[R_c | t_c]`` becomes ``[R_c R^T | scale (t_c - R_c R^T t)]``. Cameras are
+    brought into the splat's frame, not the splat into theirs, which is exact for the harmonics too.
 
-    Source: nerfstudio 1.1, ``base_dataparser.save_dataparser_transform`` and ``nerfstudio_dataparser``, which
-    multiplies ``transform`` by the ``applied_transform`` of a transforms.json, and ``scale`` by its ``applied_scale``.
-    These are taken out again, as the poses of that file have them already.
+    Source: nerfstudio 1.1, ``base_dataparser.save_dataparser_transform`` and
+    ``nerfstudio_dataparser``, which multiplies ``transform`` by the ``applied_transform`` of a
+    transforms.json, and ``scale`` by its ``applied_scale``. These are taken out again, as the poses
+    of that file have them already.
     """
     path = folder / DATAPARSER
     if not path.is_file():
         return images, []
     values = read_json(path)
-    pose, scale = read_pose(path, values, "transform"), _number(path, values, "scale", 1.0, 1 / HUGE)
+    pose, scale = (
+        read_pose(path, values, "transform"),
+        _number(path, values, "scale", 1.0, 1 / HUGE),
+    )
     if cameras.is_file():
         applied = read_json(cameras)
         if applied.get("applied_transform") is not None:
@@ -184,5 +238,8 @@ def in_trained_frame(folder: Path, cameras: Path, images: list[PosedImage]) -> t
         viewmat = image.viewmat @ back
         viewmat[:3, 3] *= scale
         brought.append(check_posed(replace(image, viewmat=viewmat), cameras))
-    note = f"the cameras are brought into the frame of {DATAPARSER}: the splat must be what nerfstudio exported"
+    note = (
+        f"the cameras are brought into the frame of {DATAPARSER}: the splat must be what nerfstudio"
+        " exported"
+    )
     return brought, [note]

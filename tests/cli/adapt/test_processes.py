@@ -1,4 +1,6 @@
-"""Several processes: the result of one; a killed process, an interrupt or bad input ends all of them."""
+"""Several processes: the result of one; a killed process, an interrupt or bad input ends all of
+them.
+"""
 
 import json
 import os
@@ -26,35 +28,55 @@ def words(capture: Any) -> list[Any]:
     return [capture.ply, "--images", capture.scene]
 
 
-def test_time_budget_ends_all_after_the_same_step(server: Server, words: list[Any], tmp_path: Path) -> None:
+def test_time_budget_ends_all_after_the_same_step(
+    server: Server, words: list[Any], tmp_path: Path
+) -> None:
     """By the clock of the first process; that of the second is far ahead."""
-    ahead = "import clod_adapter.training.loop as t; at = t.time.perf_counter; t.time.perf_counter = lambda: 1e3 * at()"
+    ahead = (
+        "import clod_adapter.training.loop as t; at = t.time.perf_counter; t.time.perf_counter ="
+        " lambda: 1e3 * at()"
+    )
     run = Launched(server, tmp_path / "run", *words, *LONG, "--time-budget", 0.3, before={1: ahead})
     assert run.wait() == [0, 0], run.log(0)
     assert 1 <= run.report()["steps"] < 4000 and not run.report()["interrupted"]
 
 
-def test_signals_of_the_launcher_do_not_end_the_writing(server: Server, words: list[Any], tmp_path: Path) -> None:
+def test_signals_of_the_launcher_do_not_end_the_writing(
+    server: Server, words: list[Any], tmp_path: Path
+) -> None:
     """It sends them after a lost process, and repeats its own, until the process ends."""
     pressed = (
-        "import argparse; from clod_adapter import pipeline; from clod_adapter.cli.adapt import run\n"
-        "def pressing(real):\n"
-        "    def call(*arguments, **more):\n"
-        "        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGTERM): signal.raise_signal(number)\n"
-        "        return real(*arguments, **more)\n"
-        "    return call\n"
-        "run.explain = pressing(run.explain)\n"
-        "pipeline.save_adapter = pressing(pipeline.save_adapter)\n"
-        "run.print_summary = pressing(run.print_summary)\n"
-        "main.json = argparse.Namespace(dumps=pressing(json.dumps))"
+        "import argparse; from clod_adapter import pipeline; from clod_adapter.cli.adapt import"
+        " run\ndef pressing(real):\n    def call(*arguments, **more):\n        for number in"
+        " (signal.SIGTERM, signal.SIGINT, signal.SIGTERM): signal.raise_signal(number)\n       "
+        " return real(*arguments, **more)\n    return call\nrun.explain ="
+        " pressing(run.explain)\npipeline.save_adapter ="
+        " pressing(pipeline.save_adapter)\nrun.print_summary ="
+        " pressing(run.print_summary)\nmain.json = argparse.Namespace(dumps=pressing(json.dumps))"
     )
-    run = Launched(server, tmp_path / "run", *words, *LONG, "--quiet", "--json", before={0: pressed}, wait=STATE)
+    run = Launched(
+        server,
+        tmp_path / "run",
+        *words,
+        *LONG,
+        "--quiet",
+        "--json",
+        before={0: pressed},
+        wait=STATE,
+    )
     os.kill(run.pids[1], signal.SIGKILL)
     assert run.wait() == [0, -signal.SIGKILL], run.log(0)
     report = run.report()
-    assert json.loads(run.log(0))["steps"] == report["steps"] == load_state(run.folder / STATE)[0].steps > 0
+    assert (
+        json.loads(run.log(0))["steps"]
+        == report["steps"]
+        == load_state(run.folder / STATE)[0].steps
+        > 0
+    )
     assert report["interrupted"] and report["rows"] == []
-    assert f"training ended at step {report['steps']}: a process of the group has ended" in str(report["notes"])
+    assert f"training ended at step {report['steps']}: a process of the group has ended" in str(
+        report["notes"]
+    )
 
 
 BREAK = """
@@ -69,43 +91,65 @@ Trainer.gradient_sum = pull
 
 
 def test_two_give_the_result_of_one(server: Server, words: list[Any], tmp_path: Path) -> None:
-    """Within the rounding of sums in another order, also resumed after an error of the second process in a step."""
+    """Within the rounding of sums in another order, also resumed after an error of the second
+    process in a step.
+    """
     alone = Launched(server, tmp_path / "alone", *words, *TINY, size=1)
     run = Launched(server, tmp_path / "run", *words, *TINY, before={1: BREAK})
     assert run.wait() == [0, 2], run.log(0)
     report = run.report()
     assert report["steps"] == 4 and report["interrupted"] and run.log(1) == "", run.log(0)
-    assert "; process 1: no room for this view" in run.log(0) and load_state(run.folder / STATE)[0].steps == 4
+    assert (
+        "; process 1: no room for this view" in run.log(0)
+        and load_state(run.folder / STATE)[0].steps == 4
+    )
     again = Launched(server, run.folder, *words, *TINY, "--resume")
-    assert again.wait() == [0, 0] and alone.wait() == [0], again.log(0) + again.log(1) + alone.log(0)
+    assert again.wait() == [0, 0] and alone.wait() == [0], (
+        again.log(0) + again.log(1) + alone.log(0)
+    )
     report, want = again.report(), alone.report()
     assert report["processes"].items() >= {"count": 2, "backend": "gloo", "batch": 2}.items()
     assert report["processes"]["exchange_seconds"] > 0 and want["processes"]["count"] == 1
     assert (report["resumed_from"], report["steps"], report["interrupted"]) == (4, 12, False)
     assert again.log(0).count("2 processes (gloo): 2 views a step, 12 steps") == 1
     assert again.log(1) == "" and not (run.folder / STATE).exists()
-    assert [row["psnr"] for row in report["rows"]] == pytest.approx([row["psnr"] for row in want["rows"]], abs=1e-3)
-    found, wanted = (clod_adapter.load(each.folder / "dial.ply").gaussians for each in (again, alone))
+    assert [row["psnr"] for row in report["rows"]] == pytest.approx(
+        [row["psnr"] for row in want["rows"]], abs=1e-3
+    )
+    found, wanted = (
+        clod_adapter.load(each.folder / "dial.ply").gaussians for each in (again, alone)
+    )
     assert found.attenuation == wanted.attenuation and len(report["rows"]) > 1
     for name, tensor in wanted.tensors().items():
         torch.testing.assert_close(found.tensors()[name], tensor, rtol=1e-4, atol=1e-4)
 
 
-def test_process_lost_before_the_first_step(server: Server, words: list[Any], tmp_path: Path) -> None:
+def test_process_lost_before_the_first_step(
+    server: Server, words: list[Any], tmp_path: Path
+) -> None:
     """Nothing is written."""
     lost = "def adapt(*_, **__): raise MemoryError('no room')\nprocesses.adapt = adapt"
     run = Launched(server, tmp_path / "run", *words, *TINY, before={1: lost})
-    assert run.wait() == [2, 2] and run.log(1) == "" and list(run.folder.iterdir()) == [], run.log(0)
+    assert run.wait() == [2, 2] and run.log(1) == "" and list(run.folder.iterdir()) == [], run.log(
+        0
+    )
     log = run.log(0)
-    assert log.count("error:") == 1 and "; process 1: no room; this was before the first step, so start again\n" in log
+    assert (
+        log.count("error:") == 1
+        and "; process 1: no room; this was before the first step, so start again\n" in log
+    )
 
 
-def test_interrupt_stops_all_after_the_same_step(server: Server, words: list[Any], tmp_path: Path) -> None:
+def test_interrupt_stops_all_after_the_same_step(
+    server: Server, words: list[Any], tmp_path: Path
+) -> None:
     run = Launched(server, tmp_path / "run", *words, *LONG, wait=STATE)
     os.kill(run.pids[1], signal.SIGINT)  # either process
     assert run.wait() == [0, 0], run.log(0)
     report = run.report()
-    assert report["interrupted"] and load_state(run.folder / STATE)[0].steps == report["steps"], run.log(0)
+    assert report["interrupted"] and load_state(run.folder / STATE)[0].steps == report["steps"], (
+        run.log(0)
+    )
     assert "gone" not in str(report["notes"]) and run.log(1) == ""
 
 
@@ -116,7 +160,11 @@ def test_bad_input_is_reported_once(server: Server, words: list[Any], tmp_path: 
     ):
         run = Launched(server, tmp_path / "run", *given)
         assert run.wait()[0] == 2 and run.log(0).count("\n") == 1, run.log(0)
-        assert f"clod-adapt: error: {message}" in run.log(0) and run.log(1) == "" and not list(run.folder.iterdir())
+        assert (
+            f"clod-adapt: error: {message}" in run.log(0)
+            and run.log(1) == ""
+            and not list(run.folder.iterdir())
+        )
 
 
 AGENT = """
@@ -124,10 +172,13 @@ from torch.distributed.launcher.api import LaunchConfig, elastic_launch
 from clod_adapter.training.trainer import Trainer
 real = Trainer.gradient_sum
 def pull(*arguments):
-    if os.environ['RANK'] == '1' and os.path.exists('dial.resume.safetensors'): os.kill(os.getpid(), signal.SIGKILL)
+    if os.environ['RANK'] == '1' and os.path.exists('dial.resume.safetensors'):
+        os.kill(os.getpid(), signal.SIGKILL)
     return real(*arguments)
 Trainer.gradient_sum = pull
-config = LaunchConfig(1, 1, 2, rdzv_backend='c10d', rdzv_endpoint='localhost:0', start_method='fork', max_restarts=0)
+config = LaunchConfig(
+    1, 1, 2, rdzv_backend='c10d', rdzv_endpoint='localhost:0', start_method='fork', max_restarts=0
+)
 elastic_launch(config, lambda: os._exit(main.main(about['words'])))()
 """
 
@@ -157,7 +208,11 @@ def test_rank_and_default_steps_from_the_environment(monkeypatch: pytest.MonkeyP
         with pytest.raises(ClodError, match="inconsistent .*; start the processes with torchrun"):
             launch_of(rank)
     steps = AdaptConfig().steps
-    for words, size, want in (((), 1, (1, steps)), ((), 4, (4, round(steps / 4))), (("--iters", "100"), 4, (4, 100))):
+    for words, size, want in (
+        ((), 1, (1, steps)),
+        ((), 4, (4, round(steps / 4))),
+        (("--iters", "100"), 4, (4, 100)),
+    ):
         launch_of("0", size)
         config = make_config(build_parser("").parse_args(["x.ply", *words]))
         assert (config.batch, config.for_views(1).iters) == want, words

@@ -30,14 +30,39 @@ from runs import OUTPUTS, STATE, change_step, fail, names, pressing, results
 from scenes import capture as small_capture
 
 CONFIG, QUIET = AdaptConfig(iters=3, max_sv=3.0), Console(quiet=True)
-HASHES = {"base_sha256": "of the base", "views_sha256": "of the views", "overruled": {"--with": ["means"]}}
-VALUES = [None, True, "", [[]], {"a": []}, [1, 2], 5, 0.5, 2**31, 2**64, -1, 10**400, 1e308, math.inf, math.nan]
+HASHES = {
+    "base_sha256": "of the base",
+    "views_sha256": "of the views",
+    "overruled": {"--with": ["means"]},
+}
+VALUES = [
+    None,
+    True,
+    "",
+    [[]],
+    {"a": []},
+    [1, 2],
+    5,
+    0.5,
+    2**31,
+    2**64,
+    -1,
+    10**400,
+    1e308,
+    math.inf,
+    math.nan,
+]
 
 
 @pytest.fixture(scope="module")
-def state(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Any, dict[str, torch.Tensor], Any]:
+def state(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> tuple[Path, Any, dict[str, torch.Tensor], Any]:
     """The file of a state after two of three steps, the base and scene, and what is in it."""
-    path, pair = tmp_path_factory.mktemp("saved") / STATE, small_capture(40, views=4, width=16, height=12)
+    path, pair = (
+        tmp_path_factory.mktemp("saved") / STATE,
+        small_capture(40, views=4, width=16, height=12),
+    )
     saver = Saver(path, CONFIG, QUIET, GracefulStop(), resume=False)
     saver.identify("base.ply", "images", **HASHES)
     adapt(*pair, CONFIG, saver.saving(lambda now: now.done < 2 or not now.state))
@@ -47,17 +72,31 @@ def state(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Any, dict[str
 
 def places(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
     """The paths of all entries of a JSON document, at any depth."""
-    below = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
-    return [*([path] if path else []), *(place for key, each in below for place in places(each, (*path, key)))]
+    below = (
+        value.items()
+        if isinstance(value, dict)
+        else enumerate(value)
+        if isinstance(value, list)
+        else ()
+    )
+    return [
+        *([path] if path else []),
+        *(place for key, each in below for place in places(each, (*path, key))),
+    ]
 
 
 @settings(max_examples=40, deadline=None)
 @given(data=st.data())
 def test_damaged_states_are_refused_or_harmless(state: Any, data: Any) -> None:
-    """Entries of another type or out of range, or missing, at any depth; tensors of other shapes, types or values."""
+    """Entries of another type or out of range, or missing, at any depth; tensors of other shapes,
+    types or values.
+    """
     path, pair, tensors, about = state[0], state[1], dict(state[2]), copy.deepcopy(state[3])
     name = data.draw(st.sampled_from(sorted(tensors)))
-    how, changed = data.draw(st.sampled_from(["entry", "type", "shape", "value"])), tensors[name].clone()
+    how, changed = (
+        data.draw(st.sampled_from(["entry", "type", "shape", "value"])),
+        tensors[name].clone(),
+    )
     if how == "entry":
         *way, last = data.draw(st.sampled_from(places(about)))
         parent = reduce(lambda above, key: above[key], way, about)
@@ -65,16 +104,26 @@ def test_damaged_states_are_refused_or_harmless(state: Any, data: Any) -> None:
         if data.draw(st.booleans()):
             del parent[last]
     if how == "value":
-        values = [math.nan, math.inf, -3e38, 3e38, -1.0, 0.0] if changed.is_floating_point() else [2**31 - 1, -1, 0]
-        changed.view(-1)[data.draw(st.integers(0, changed.numel() - 1))] = data.draw(st.sampled_from(values))
-    tensors[name] = changed.double() if how == "type" else changed[:-1] if how == "shape" else changed
+        values = (
+            [math.nan, math.inf, -3e38, 3e38, -1.0, 0.0]
+            if changed.is_floating_point()
+            else [2**31 - 1, -1, 0]
+        )
+        changed.view(-1)[data.draw(st.integers(0, changed.numel() - 1))] = data.draw(
+            st.sampled_from(values)
+        )
+    tensors[name] = (
+        changed.double() if how == "type" else changed[:-1] if how == "shape" else changed
+    )
     save_file(tensors, path, {KEY: json.dumps(about)})
     try:
         saver = Saver(path, CONFIG, QUIET, GracefulStop(), resume=True)
         saver.identify("base.ply", "images", **HASHES)
         found = adapt(*pair, CONFIG, resume=saver.state).gaussians.tensors()
     except ClodError as error:
-        assert "\n" not in str(error) and ("start over" in str(error) or "use " in str(error)), error
+        assert "\n" not in str(error) and ("start over" in str(error) or "use " in str(error)), (
+            error
+        )
     else:
         assert all(value.isfinite().all() for value in found.values()), about
 
@@ -83,14 +132,22 @@ TINY = "--iters 12 --max-sv 4 --out dial.ply"
 ADAPT = f"BASE --images SCENE {TINY}"
 
 
-def test_states_of_other_runs_are_refused(clod: Any, capture: Any, tmp_path: Path, monkeypatch: Any) -> None:
-    """Of other settings, inputs or versions, or damaged; of the same inputs with other names they are not."""
+def test_states_of_other_runs_are_refused(
+    clod: Any, capture: Any, tmp_path: Path, monkeypatch: Any
+) -> None:
+    """Of other settings, inputs or versions, or damaged; of the same inputs with other names they
+    are not.
+    """
 
     def refused(message: str, *words: str) -> None:
         assert f"error: {STATE}: {message}" in clod(*words, code=2).err
 
     with monkeypatch.context() as patch:  # the second save is aborted
-        patch.setattr(listeners, "save_state", pressing(listeners.save_state, signal.SIGINT, signal.SIGTERM, at=2))
+        patch.setattr(
+            listeners,
+            "save_state",
+            pressing(listeners.save_state, signal.SIGINT, signal.SIGTERM, at=2),
+        )
         clod(ADAPT, code=130)
     state = (tmp_path / STATE).read_bytes()
     capture.write(tmp_path / "other.ply", capture.gaussians.select(torch.arange(300) < 299))
@@ -119,8 +176,12 @@ def test_states_of_other_runs_are_refused(clod: Any, capture: Any, tmp_path: Pat
     assert f"resuming {STATE} from step 1" in clod(f"moved.ply --images moved {TINY} --resume").err
 
 
-def test_without_a_state_training_starts_over(clod: Any, tmp_path: Path, state: Any, monkeypatch: Any) -> None:
-    """An earlier state stays until a new one replaces it; a state that cannot be saved costs nothing else."""
+def test_without_a_state_training_starts_over(
+    clod: Any, tmp_path: Path, state: Any, monkeypatch: Any
+) -> None:
+    """An earlier state stays until a new one replaces it; a state that cannot be saved costs
+    nothing else.
+    """
     done = clod(ADAPT, "--resume --json")
     assert f"there is no {STATE} to resume from: starting from the beginning" in done.err
     assert done.report["resumed_from"] is None and names(tmp_path) == OUTPUTS
@@ -132,12 +193,16 @@ def test_without_a_state_training_starts_over(clod: Any, tmp_path: Path, state: 
             patch.setattr(listeners, name, value)
         done = clod(ADAPT, "--seed 4")
     assert done.err.count(f"will not find it: {STATE}: cannot be written: No space") == 1
-    assert names(tmp_path) == sorted([*OUTPUTS, STATE]) and (tmp_path / STATE).read_bytes() == before
+    assert (
+        names(tmp_path) == sorted([*OUTPUTS, STATE]) and (tmp_path / STATE).read_bytes() == before
+    )
     done = clod(ADAPT, "--seed 4")
     assert f"{STATE} has step 2 of an interrupted run" in done.err and names(tmp_path) == OUTPUTS
 
 
-def test_a_state_that_cannot_be_removed_is_a_note(clod: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_state_that_cannot_be_removed_is_a_note(
+    clod: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     unlink = Path.unlink
 
     def refuse(path: Path, missing_ok: bool = False) -> None:
@@ -151,12 +216,15 @@ def test_a_state_that_cannot_be_removed_is_a_note(clod: Any, monkeypatch: pytest
 
 
 @pytest.mark.parametrize(
-    ("step", "save", "oldest", "share"), [(0.1, 0.1, 15.0, 0.015), (25.0, 3.0, 80.0, 0.15), (1.0, 30.0, 220.0, 0.2)]
+    ("step", "save", "oldest", "share"),
+    [(0.1, 0.1, 15.0, 0.015), (25.0, 3.0, 80.0, 0.15), (1.0, 30.0, 220.0, 0.2)],
 )
 def test_the_state_is_recent_and_saving_takes_a_small_share_of_the_time(
     monkeypatch: pytest.MonkeyPatch, step: float, save: float, oldest: float, share: float
 ) -> None:
-    """Seconds of a step and of a save; the largest age of the state, unless a save takes very long, and the share."""
+    """Seconds of a step and of a save; the largest age of the state, unless a save takes very long,
+    and the share.
+    """
     clock, saved, ages = 0.0, [0.0], [0.0]
 
     def save_state(path: Path, state: float, run_of: Any) -> None:
@@ -167,7 +235,9 @@ def test_the_state_is_recent_and_saving_takes_a_small_share_of_the_time(
 
     monkeypatch.setattr("clod_adapter.cli.adapt.listeners.time.perf_counter", lambda: clock)
     monkeypatch.setattr(listeners, "save_state", save_state)
-    follow = Saver(Path(STATE), CONFIG, QUIET, GracefulStop(), resume=False).saving(lambda progress: None)
+    follow = Saver(Path(STATE), CONFIG, QUIET, GracefulStop(), resume=False).saving(
+        lambda progress: None
+    )
     for done in range(1, 601):
         clock += step
         follow(Progress(Phase.TRAINING, done, 600, clock, state=lambda now=clock: now))
@@ -180,16 +250,28 @@ def test_the_state_is_recent_and_saving_takes_a_small_share_of_the_time(
     [(fail, [STATE]), (lambda found: replace(found, loss=math.nan), sorted([*OUTPUTS, STATE]))],
     ids=["step", "loss"],
 )
-def test_resuming_after_an_error(clod: Any, dialled: Path, tmp_path: Path, change: Any, files: list[str]) -> None:
+def test_resuming_after_an_error(
+    clod: Any, dialled: Path, tmp_path: Path, change: Any, files: list[str]
+) -> None:
     """The same command with --resume then writes the files of a run without an error."""
     with pytest.MonkeyPatch.context() as patch:
         change_step(patch, 6, change)
         done = clod(ADAPT, "--quiet" if change is fail else "--json", code=1)
-    assert names(tmp_path) == files and f"--resume resumes from step 5, which is in {STATE}\n" in done.err, done
-    assert ("please report it" in done.err) == ("ZeroDivisionError: of ours" in done.err) == (change is fail)
+    assert (
+        names(tmp_path) == files
+        and f"--resume resumes from step 5, which is in {STATE}\n" in done.err
+    ), done
+    assert (
+        ("please report it" in done.err)
+        == ("ZeroDivisionError: of ours" in done.err)
+        == (change is fail)
+    )
     if change is not fail:
         report = done.report
         assert report["interrupted"] and report["steps"] == 5 and len(report["rows"]) > 2
-        assert any("the result so far is written: the loss of step 6 is not finite" in n for n in report["notes"])
+        assert any(
+            "the result so far is written: the loss of step 6 is not finite" in n
+            for n in report["notes"]
+        )
     assert f"resuming {STATE} from step 5" in clod(ADAPT, "--resume").err
     assert names(tmp_path) == OUTPUTS and results(tmp_path) == results(dialled.parent)

@@ -1,4 +1,6 @@
-"""``clod-adapt PLY --images DIR``: files, report and what is printed; its plan, stored, overridden, applied."""
+"""``clod-adapt PLY --images DIR``: files, report and what is printed; its plan, stored, overridden,
+applied.
+"""
 
 import json
 import re
@@ -39,55 +41,109 @@ def adapted(run_in: Any, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path
 
 
 def test_writes_three_files(adapted: tuple[Path, Any], capture: Any, dialled: Path) -> None:
-    """The same seed gives the same bits. The report agrees with them at both ends of the dial and without it."""
+    """The same seed gives the same bits. The report agrees with them at both ends of the dial and
+    without it.
+    """
     folder, done = adapted
-    assert names(folder) == OUTPUTS and len({path.stat().st_mode for path in folder.iterdir()}) == 1, done
-    report, data = json.loads((folder / "dial.json").read_text()), (folder / "dial.ply").read_bytes()
+    assert (
+        names(folder) == OUTPUTS and len({path.stat().st_mode for path in folder.iterdir()}) == 1
+    ), done
+    report, data = (
+        json.loads((folder / "dial.json").read_text()),
+        (folder / "dial.ply").read_bytes(),
+    )
     want = {
-        "command": "adapt", "model": str(capture.ply), "scene": str(capture.scene), "base_count": 300, "sh_degree": 1,
-        "steps": 12, "interrupted": False, "notes": [], "screen_filter": {"variance": 0.3, "compensate": False},
+        "command": "adapt",
+        "model": str(capture.ply),
+        "scene": str(capture.scene),
+        "base_count": 300,
+        "sh_degree": 1,
+        "steps": 12,
+        "interrupted": False,
+        "notes": [],
+        "screen_filter": {"variance": 0.3, "compensate": False},
         "outputs": {"ply": "dial.ply", "adapter": "dial.safetensors", "report": "dial.json"},
-        "adapter_bytes": (folder / "dial.safetensors").stat().st_size, "ply_bytes": len(data),
-    }  # fmt: skip
+        "adapter_bytes": (folder / "dial.safetensors").stat().st_size,
+        "ply_bytes": len(data),
+    }
     assert report.items() >= want.items()
     assert (report["alignment"]["guess"], report["alignment"]["explained"]) == (None, 1)
-    assert set(report["config"]) == set(AdaptConfig.__dataclass_fields__) and report["config"]["max_sv"] == 4
+    assert (
+        set(report["config"]) == set(AdaptConfig.__dataclass_fields__)
+        and report["config"]["max_sv"] == 4
+    )
     assert set(report["machine"]) >= {"cpu", "cores", "python", "torch", "numba"}
-    assert set(report["seconds"]) == {"load", "kernels", "plan", "start", "train", "evaluate", "total"}
+    assert set(report["seconds"]) == {
+        "load",
+        "kernels",
+        "plan",
+        "start",
+        "train",
+        "evaluate",
+        "total",
+    }
     assert [row["virtual_scale"] for row in report["rows"]] == [1, 1.5, 2, 3, 4]
     shares = [row["kept_share"] for row in report["rows"]]
     assert shares == sorted(shares, reverse=True) and 0 < shares[-1] < 0.5
-    assert columns(folder / "dial.ply")[-3:] == ["sigma_d", "growth_d", "opacity_d"] and b"screen_filter" not in data
+    assert (
+        columns(folder / "dial.ply")[-3:] == ["sigma_d", "growth_d", "opacity_d"]
+        and b"screen_filter" not in data
+    )
     assert results(folder) == results(dialled.parent)
-    model, views = clod_adapter.load(folder / "dial.ply"), clod_adapter.load_scene(capture.scene).test
+    model, views = (
+        clod_adapter.load(folder / "dial.ply"),
+        clod_adapter.load_scene(capture.scene).test,
+    )
     (plain,) = clod_adapter.evaluate(clod_adapter.detach(model.gaussians), views, [1.0])
     ends = clod_adapter.evaluate(model.gaussians, views, [1.0, 4.0])
-    for ours, row in zip((report["detached_row"], *report["rows"][::4]), (plain, *ends), strict=True):
+    for ours, row in zip(
+        (report["detached_row"], *report["rows"][::4]), (plain, *ends), strict=True
+    ):
         assert {**ours, "frame_ms": 0} == {**row.as_dict(), "frame_ms": 0}
     stored = model.calibration
-    assert stored is not None and stored == clod_adapter.load_adapter(folder / "dial.safetensors").calibration
+    assert (
+        stored is not None
+        and stored == clod_adapter.load_adapter(folder / "dial.safetensors").calibration
+    )
     assert stored.as_dict() == report["calibration"] and stored.machine == machine_name()
     for row, measured in zip(stored.rows, report["rows"], strict=True):
         assert vars(row).items() <= measured.items()
     assert (stored.total, stored.views, stored.width, stored.height) == (540, 2, 64, 48)
 
 
-def test_prints_progress_a_table_next_commands_and_a_loss(adapted: tuple[Path, Any], capture: Any) -> None:
+def test_prints_progress_a_table_next_commands_and_a_loss(
+    adapted: tuple[Path, Any], capture: Any
+) -> None:
     folder, done = adapted
     table = [line.split() for line in done.out.splitlines()[1:9]]
     assert [line[0] for line in table] == ["dial", "base", "1", "1.5", "2", "3", "4", "plain"]
     assert len({len(line) for line in done.out.splitlines()[1:9]}) == 1  # aligned
     view, *images = done.out.replace("\\\n", "").split("next:\n")[1].splitlines()
     scene = f"--images {shlex.quote(str(capture.scene))}"
-    assert shlex.split(view) == shlex.split(f"clod-adapt view dial.ply --base {shlex.quote(str(capture.ply))} {scene}")
-    assert [shlex.split(line) for line in images] == [shlex.split(f"clod-adapt eval dial.ply {scene} --sv 1 4")]
-    assert "300 Gaussians, SH degree 1" in done.err and "8 photographs to train on, 2 held out, 64x48" in done.err
+    assert shlex.split(view) == shlex.split(
+        f"clod-adapt view dial.ply --base {shlex.quote(str(capture.ply))} {scene}"
+    )
+    assert [shlex.split(line) for line in images] == [
+        shlex.split(f"clod-adapt eval dial.ply {scene} --sv 1 4")
+    ]
+    assert (
+        "300 Gaussians, SH degree 1" in done.err
+        and "8 photographs to train on, 2 held out, 64x48" in done.err
+    )
     assert "trained 12 steps" in done.err and "\r" not in done.err
-    for line in (r"training   8%, \d.* left, 1/12", r"importance  50%, \d.* left, \d+/\d+", r"base: [\d.]+ dB on .*"):
+    for line in (
+        r"training   8%, \d.* left, 1/12",
+        r"importance  50%, \d.* left, \d+/\d+",
+        r"base: [\d.]+ dB on .*",
+    ):
         assert re.search(f"^{line}$", done.err, re.M), done
     report = json.loads((folder / "dial.json").read_text())
-    lost = report["base_rows"][0]["psnr"] - report["rows"][0]["psnr"]  # more than is accepted: the exit code is 1
-    assert f"s = 1 is {lost:.2f} dB below the base" in report["loss"] and "train longer (--iters)" in report["loss"]
+    # more than is accepted: the exit code is 1
+    lost = report["base_rows"][0]["psnr"] - report["rows"][0]["psnr"]
+    assert (
+        f"s = 1 is {lost:.2f} dB below the base" in report["loss"]
+        and "train longer (--iters)" in report["loss"]
+    )
     assert done.err.endswith(f"\nwarning: {report['loss']}\n")
 
 
@@ -102,15 +158,28 @@ def test_forecast_of_time_and_memory(clod: Any) -> None:
 
 
 def test_dial_of_the_checkpoint_is_continued(clod: Any, dialled: Path) -> None:
-    """Its growth is dropped with --growth off, which a note says; a dial without growth starts with exponents of 0."""
+    """Its growth is dropped with --growth off, which a note says; a dial without growth starts with
+    exponents of 0.
+    """
     for model, more, note, stored in (
         (dialled, "", "sigma_d and growth_d", ["sigma_d", "growth_d", "opacity_d"]),
-        (dialled, "--growth off", "sigma_d; its growth_d is dropped, as growth is off", ["sigma_d", "opacity_d"]),
+        (
+            dialled,
+            "--growth off",
+            "sigma_d; its growth_d is dropped, as growth is off",
+            ["sigma_d", "opacity_d"],
+        ),
         ("off.ply", "", "sigma_d", ["sigma_d", "growth_d", "opacity_d"]),
     ):
-        done = clod(model, "--images SCENE --device cpu --max-sv 4 --out dial.ply --json --quiet --iters 0", more)
+        done = clod(
+            model,
+            "--images SCENE --device cpu --max-sv 4 --out dial.ply --json --quiet --iters 0",
+            more,
+        )
         noted = f"{model} has a dial already: continuing from its {note}"
-        assert done.err == "" and noted in done.report["notes"] and done.report["device"] == "cpu", done
+        assert (
+            done.err == "" and noted in done.report["notes"] and done.report["device"] == "cpu"
+        ), done
         assert columns(Path("dial.ply"))[-len(stored) :] == stored and rebuilt(clod, model)
         if more:
             assert clod_adapter.load_adapter("dial.safetensors").growth_d is None
@@ -131,16 +200,32 @@ def test_without_held_out_photographs(clod: Any, capture: Any, tmp_path: Path) -
 
 def test_without_photographs(clod: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The target images are renders of the base, rounded to bytes."""
-    monkeypatch.setattr(pseudo_views, "place_cameras", partial(pseudo_views.place_cameras, views=16))
-    monkeypatch.setattr("clod_adapter.cli.adapt.run.ENOUGH", (50.0, 25.0))  # dB, more than the result has
+    monkeypatch.setattr(
+        pseudo_views, "place_cameras", partial(pseudo_views.place_cameras, views=16)
+    )
+    # dB, more than the result has
+    monkeypatch.setattr("clod_adapter.cli.adapt.run.ENOUGH", (50.0, 25.0))
     done = clod("BASE", TINY, "--json")
     report = done.report
-    assert report["scene"] is None and report["teacher"] == "checkpoint" and report["seconds"]["place"] > 0
+    assert (
+        report["scene"] is None
+        and report["teacher"] == "checkpoint"
+        and report["seconds"]["place"] > 0
+    )
     (note,) = report["notes"]
-    assert note in done.err and "no photographs: 14 pseudo views to train on, 2 held out, 62x46, " in note
-    assert "held-out photographs" not in done.err and "--images" not in done.err.split("next:\n")[1].split("warning")[0]
+    assert (
+        note in done.err
+        and "no photographs: 14 pseudo views to train on, 2 held out, 62x46, " in note
+    )
+    assert (
+        "held-out photographs" not in done.err
+        and "--images" not in done.err.split("next:\n")[1].split("warning")[0]
+    )
     full = report["rows"][0]["psnr"]
-    assert report["base_rows"][0]["psnr"] > 50 > full > report["rows"][-1]["psnr"] and len(report["rows"]) == 5
+    assert (
+        report["base_rows"][0]["psnr"] > 50 > full > report["rows"][-1]["psnr"]
+        and len(report["rows"]) == 5
+    )
     assert f"s = 1 has {full:.2f} dB against" in report["loss"] and names(tmp_path) == OUTPUTS
     assert rebuilt(clod, "BASE") and report["calibration"]["against"] == "checkpoint"
     (note, *_) = clod("export dial.ply --psnr-drop 1 -o plain.ply --json").report["notes"]
@@ -156,7 +241,9 @@ def test_ci_banana(clod: Any, ci_banana: Path) -> None:
         "--iters 5 --max-sv 3 --out dial.ply --json",
     )
     report = clod(*words).report
-    assert report["base_count"] == 20_000 and report["base_rows"][0]["psnr"] == pytest.approx(25.81, abs=0.02)
+    assert report["base_count"] == 20_000 and report["base_rows"][0]["psnr"] == pytest.approx(
+        25.81, abs=0.02
+    )
     assert report["rows"][-1]["kept_share"] < 0.3
 
 
@@ -166,8 +253,13 @@ def test_unusual_inputs(clod: Any, capture: Any, tmp_path: Path) -> None:
     for k in range(1, 5):
         (tmp_path / "few" / "images" / f"{k:03}.png").unlink()
     report = clod("BASE --images few --iters 2 --out dial.ply --json").report
-    assert any("photographs to train on" in note and "8 pseudo views" in note for note in report["notes"])
-    assert any("4 of 10 photographs are missing and left out (001.png, " in note for note in report["notes"])
+    assert any(
+        "photographs to train on" in note and "8 pseudo views" in note for note in report["notes"]
+    )
+    assert any(
+        "4 of 10 photographs are missing and left out (001.png, " in note
+        for note in report["notes"]
+    )
     logits = torch.full_like(capture.gaussians.opacity_logits, -20.6)
     capture.write(tmp_path / "none.ply", capture.gaussians.replace(opacity_logits=logits))
     done = clod("none.ply --out dial.ply --quiet", code=2)
@@ -179,10 +271,16 @@ SHORT = "--images SCENE --iters 24 --max-sv 4 --out dial.ply --json"
 
 @pytest.fixture
 def wasteful(capture: Any, tmp_path: Path) -> Path:
-    """The capture's checkpoint with a degree that does nothing, and 50 Gaussians that no camera sees among the rest."""
+    """The capture's checkpoint with a degree that does nothing, and 50 Gaussians that no camera
+    sees among the rest.
+    """
     base = capture.gaussians
-    far = base.select(torch.arange(50)).replace(means=base.means[:50] + torch.tensor([0.0, 90.0, 0.0]))
-    values = {name: torch.cat([far.tensors()[name], value]) for name, value in base.tensors().items()}
+    far = base.select(torch.arange(50)).replace(
+        means=base.means[:50] + torch.tensor([0.0, 90.0, 0.0])
+    )
+    values = {
+        name: torch.cat([far.tensors()[name], value]) for name, value in base.tensors().items()
+    }
     values["shN"] = torch.cat([values["shN"], 1e-5 * torch.ones(350, 5, 3)], 1)
     return Path(capture.write(tmp_path / "wasteful.ply", base.replace(**values)))
 
@@ -201,9 +299,13 @@ def test_the_plan_is_printed_and_stored(clod: Any, wasteful: Path) -> None:
     assert re.search(r"kept +\d+\.\d+ dB +--without bands$", table["SH degree 1 to 2"])
     assert table.pop("does not apply: undistortion, scaling")  # one line for both
     assert not {"exposure", "alpha", "masks"} & set(table), done  # of which the scene has none
-    assert not {"means", "quats", "scales", "opacities", "sh0"} & set(table), done  # listed only if frozen
+    # listed only if frozen
+    assert not {"means", "quats", "scales", "opacities", "sh0"} & set(table), done
     stored, seconds = decisions(done), done.report["plan"]["seconds"]
-    assert list(stored) == [*table, "undistortion", "scaling"] and stored["far Gaussians"]["number"] == 280
+    assert (
+        list(stored) == [*table, "undistortion", "scaling"]
+        and stored["far Gaussians"]["number"] == 280
+    )
     assert set(seconds) == {"bands", "start"} and done.report["seconds"]["plan"] > 0
     base, whole = (clod_adapter.load(path).gaussians for path in (wasteful, "dial.ply"))
     assert (whole.whole, len(whole)) == (350, 630) and clod_adapter.detach(whole) == base

@@ -1,4 +1,6 @@
-"""Checkpoints that do not match the photographs; ``--antialiasing``: stored, detected or requested."""
+"""Checkpoints that do not match the photographs; ``--antialiasing``: stored, detected or
+requested.
+"""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -20,8 +22,12 @@ from runs import names, rebuilt
 FAST = "--iters 3 --max-sv 4 --out dial.ply --json"
 
 
-def scene_of(capture: Any, folder: Path, shown: Callable[[View], torch.Tensor], count: int = 9) -> Path:
-    """The first of the capture's cameras with other photographs, which ``shown`` gives as pixels."""
+def scene_of(
+    capture: Any, folder: Path, shown: Callable[[View], torch.Tensor], count: int = 9
+) -> Path:
+    """The first of the capture's cameras with other photographs, which ``shown`` gives as
+    pixels.
+    """
     scene = load_scene(capture.scene)
     views = [*scene.test, *scene.train][:count]
     write_model(folder, [view.camera for view in views], [view.camera.name for view in views])
@@ -33,25 +39,36 @@ def scene_of(capture: Any, folder: Path, shown: Callable[[View], torch.Tensor], 
 
 @pytest.fixture
 def turned(capture: Any, tmp_path: Path) -> Path:
-    """The checkpoint with y and z negated: half a turn about x; without harmonics, which would turn too."""
+    """The checkpoint with y and z negated: half a turn about x; without harmonics, which would turn
+    too.
+    """
     g = capture.gaussians
     w, x, y, z = g.quats.unbind(-1)
     quats, means = torch.stack([-x, w, -z, y], -1), g.means * torch.tensor([1.0, -1, -1])
-    return capture.write(tmp_path / "turned.ply", g.replace(means=means, quats=quats, shN=0 * g.shN))
+    return capture.write(
+        tmp_path / "turned.ply", g.replace(means=means, quats=quats, shN=0 * g.shN)
+    )
 
 
-def test_cameras_are_moved_into_another_frame_in_every_command(clod: Any, capture: Any, turned: Path) -> None:
+def test_cameras_are_moved_into_another_frame_in_every_command(
+    clod: Any, capture: Any, turned: Path
+) -> None:
     done = clod(turned, "--images SCENE", FAST)
     said = f"the cameras are moved into the frame of {turned} (axes x, -y, -z): renders have"
     report = done.report
     assert done.err.count(said) == 1 and any(said in note for note in report["notes"]), done
     found, frame = report["alignment"], report["alignment"]["frame"]
     assert frame["psnr"] > found["mean_colour_psnr"] + 6 > found["psnr"] + 6
-    # The stored viewpoints are training cameras in the file's frame, x_cameras = scale R x_file + offset.
+    # The stored viewpoints are training cameras in the file's frame, x_cameras = scale R
+    # x_file + offset.
     rotation, offset = torch.tensor(frame["rotation"]), torch.tensor(frame["offset"])
-    centres = torch.tensor([[view[axis] for axis in "xyz"] for view in report["calibration"]["viewpoints"]])
+    centres = torch.tensor(
+        [[view[axis] for axis in "xyz"] for view in report["calibration"]["viewpoints"]]
+    )
     back = frame["scale"] * centres @ rotation.T + offset
-    poses = torch.stack([torch.linalg.inv(view.camera.viewmat) for view in load_scene(capture.scene).train])
+    poses = torch.stack(
+        [torch.linalg.inv(view.camera.viewmat) for view in load_scene(capture.scene).train]
+    )
     assert torch.cdist(back, poses[:, :3, 3]).min(1).values.max() < 1e-3
     again = clod("eval dial.ply --images SCENE --json")
     assert "(axes x, -y, -z)" in again.err
@@ -59,10 +76,17 @@ def test_cameras_are_moved_into_another_frame_in_every_command(clod: Any, captur
     assert "(axes x, -y, -z)" in clod("export dial.ply --images SCENE --sv 2 -o baked.ply").err
 
 
-def test_another_scene_is_refused_and_nothing_is_written(clod: Any, capture: Any, turned: Path, tmp_path: Path) -> None:
-    random, scene = torch.Generator().manual_seed(2), scene_of(capture, tmp_path / "scene", lambda view: view.image, 2)
+def test_another_scene_is_refused_and_nothing_is_written(
+    clod: Any, capture: Any, turned: Path, tmp_path: Path
+) -> None:
+    random, scene = (
+        torch.Generator().manual_seed(2),
+        scene_of(capture, tmp_path / "scene", lambda view: view.image, 2),
+    )
     means, sh0 = (torch.randn(shape, generator=random) for shape in ((300, 3), (300, 1, 3)))
-    lost = capture.write(tmp_path / "lost.ply", capture.gaussians.replace(means=means + 1e4, sh0=sh0))
+    lost = capture.write(
+        tmp_path / "lost.ply", capture.gaussians.replace(means=means + 1e4, sh0=sh0)
+    )
     before = names(tmp_path)
     done = clod(lost, "--images", scene, FAST, code=2)
     assert f"error: {lost}: does not match {scene}" in done.err and "are in view" in done.err, done
@@ -72,7 +96,9 @@ def test_another_scene_is_refused_and_nothing_is_written(clod: Any, capture: Any
     assert names(tmp_path) == before
 
 
-def test_white_background_is_refused_unless_allowed(clod: Any, capture: Any, tmp_path: Path) -> None:
+def test_white_background_is_refused_unless_allowed(
+    clod: Any, capture: Any, tmp_path: Path
+) -> None:
     few = capture.gaussians.select(torch.arange(300) < 40)  # so that there is a background
     ply = capture.write(tmp_path / "few.ply", few)
 
@@ -88,8 +114,12 @@ def test_white_background_is_refused_unless_allowed(clod: Any, capture: Any, tmp
     assert any(note.startswith("warning: ") for note in notes) and alignment["frame"] is None
 
 
-@pytest.mark.parametrize(("said", "share"), [("another exposure", 0.2), ("have a single colour each", 0)])
-def test_other_photographs_have_a_warning(clod: Any, capture: Any, tmp_path: Path, said: str, share: float) -> None:
+@pytest.mark.parametrize(
+    ("said", "share"), [("another exposure", 0.2), ("have a single colour each", 0)]
+)
+def test_other_photographs_have_a_warning(
+    clod: Any, capture: Any, tmp_path: Path, said: str, share: float
+) -> None:
     scene_of(capture, tmp_path / "scene", lambda view: (share * view.image).byte())
     done = clod("BASE --images scene", FAST)
     assert said in done.err and said in done.report["notes"][0], done
@@ -97,7 +127,9 @@ def test_other_photographs_have_a_warning(clod: Any, capture: Any, tmp_path: Pat
 
 @pytest.fixture(scope="module")
 def trained(capture: Any, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """A checkpoint of small Gaussians without metadata on antialiasing, and antialiased photographs."""
+    """A checkpoint of small Gaussians without metadata on antialiasing, and antialiased
+    photographs.
+    """
     folder = tmp_path_factory.mktemp("antialiased")
     small = capture.gaussians.replace(log_scales=capture.gaussians.log_scales - 0.8)
     shown = small.replace(screen_filter=FILTERS["on"])
@@ -105,8 +137,12 @@ def trained(capture: Any, tmp_path_factory: pytest.TempPathFactory) -> tuple[Pat
     return capture.write(folder / "base.ply", small), scene
 
 
-def test_adapting_detects_and_stores_the_filter(clod: Any, trained: tuple[Path, Path], tmp_path: Path) -> None:
-    """The viewer draws the base with the filter of the model, without photographs and metadata in the base's file."""
+def test_adapting_detects_and_stores_the_filter(
+    clod: Any, trained: tuple[Path, Path], tmp_path: Path
+) -> None:
+    """The viewer draws the base with the filter of the model, without photographs and metadata in
+    the base's file.
+    """
     ply, scene = trained
     report = (done := clod(ply, "--images", scene, FAST)).report
     assert "trained with antialiasing: " in done.err and "--antialiasing off overrides" in done.err
@@ -115,7 +151,9 @@ def test_adapting_detects_and_stores_the_filter(clod: Any, trained: tuple[Path, 
     assert report["base_rows"][0]["psnr"] > 45  # the photographs are its renders, rounded to bytes
     found = clod_adapter.load("dial.ply")
     assert found.gaussians.screen_filter == FILTERS["on"] and found.filter_known
-    assert clod_adapter.load_adapter("dial.safetensors").screen_filter == FILTERS["on"] and rebuilt(clod, ply)
+    assert clod_adapter.load_adapter("dial.safetensors").screen_filter == FILTERS["on"] and rebuilt(
+        clod, ply
+    )
     for more, want in ((), FILTERS["on"]), (("--antialiasing", "off"), FILTERS["off"]):
         words = ["dial.ply", "--base", str(ply), *more]
         answers, _ = make_page(build_parser("view").parse_args(words), Console(quiet=True))
@@ -131,10 +169,16 @@ def test_eval_and_render_use_the_detected_filter(clod: Any, trained: tuple[Path,
         words = (ply, "--images", scene, "--json", more)
         report = clod("eval", *words, "--sv 1 --against", ply, "--base", ply).report
         drawn = clod("render", *words, "-o pictures").report
-        psnr = [report["rows"][0]["psnr"], report["base_row"]["psnr"], report["against"][0]["theirs"]["psnr"]]
+        psnr = [
+            report["rows"][0]["psnr"],
+            report["base_row"]["psnr"],
+            report["against"][0]["theirs"]["psnr"],
+        ]
         found[more] = [*psnr, drawn["pictures"][0]["psnr"][0]]
         for each in (report, drawn):
-            assert any("was trained with antialiasing" in note for note in each["notes"]) == (more == ""), each["notes"]
+            assert any("was trained with antialiasing" in note for note in each["notes"]) == (
+                more == ""
+            ), each["notes"]
     assert min(found[""]) > 45 > 35 > max(found["--antialiasing off"]), found
 
 
@@ -148,7 +192,11 @@ def test_option_overrides_the_file(clod: Any, trained: tuple[Path, Path]) -> Non
 
 
 def test_exports_store_the_filter_or_note_its_loss(clod: Any, trained: tuple[Path, Path]) -> None:
-    for out, stores, notes in (("a.ply", True, True), ("a.spz", True, False), ("a.splat", False, True)):
+    for out, stores, notes in (
+        ("a.ply", True, True),
+        ("a.spz", True, False),
+        ("a.splat", False, True),
+    ):
         done = clod("export", trained[0], "--antialiasing on --json -o", out)
         found = [note for note in done.report["notes"] if "trained antialiased" in note]
         assert bool(found) == notes and all(note in done.err for note in found), done

@@ -1,4 +1,6 @@
-"""Inputs in formats of other tools; devices; kernels, compiled before times are measured; the pages of ``--report``."""
+"""Inputs in formats of other tools; devices; kernels, compiled before times are measured; the pages
+of ``--report``.
+"""
 
 import json
 import re
@@ -25,20 +27,30 @@ from runs import names, rebuilt
 TINY = "--images SCENE --iters 2 --max-sv 4 --out dial.ply"
 
 
-def test_values_that_look_activated_need_the_option(clod: Any, capture: Any, tmp_path: Path) -> None:
-    """It is for the checkpoint, not for the adapted file. With the right option the renders match."""
+def test_values_that_look_activated_need_the_option(
+    clod: Any, capture: Any, tmp_path: Path
+) -> None:
+    """It is for the checkpoint, not for the adapted file. With the right option the renders
+    match.
+    """
     ply = PlyData.read(str(capture.ply), mmap=False)
     vertex = ply["vertex"].data
     vertex["opacity"] = 1 / (1 + np.exp(-vertex["opacity"].astype(np.float64)))
     for name in ("scale_0", "scale_1", "scale_2"):
         vertex[name] = np.exp(vertex[name])
     ply.write(str(tmp_path / "in.ply"))
-    assert "--activated both" in clod("in.ply", TINY, code=2).err.splitlines()[-1] and names(tmp_path) == ["in.ply"]
+    assert "--activated both" in clod("in.ply", TINY, code=2).err.splitlines()[-1] and names(
+        tmp_path
+    ) == ["in.ply"]
     assert "opacity taken as activated" in clod("in.ply", TINY, "--activated both").err
     assert rebuilt(clod, "in.ply", "--activated both")
-    (note, *_) = clod("apply in.ply dial.safetensors --out x.ply --activated both --json").report["notes"]
+    (note, *_) = clod("apply in.ply dial.safetensors --out x.ply --activated both --json").report[
+        "notes"
+    ]
     assert "opacity taken as activated" in note
-    report = clod("eval dial.ply --images SCENE --sv 1 --base in.ply --activated both --json").report
+    report = clod(
+        "eval dial.ply --images SCENE --sv 1 --base in.ply --activated both --json"
+    ).report
     assert report["base_row"]["psnr"] > 40
 
 
@@ -58,22 +70,39 @@ def test_devices(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     assert pick_device("auto", Console()) == pick_device("cpu", Console()) == torch.device("cpu")
     assert capsys.readouterr() == ("", "")
-    for build, why in ((None, "torch .* is built without CUDA: install torch"), ("12.4", "torch finds no NVIDIA GPU")):
+    for build, why in (
+        (None, "torch .* is built without CUDA: install torch"),
+        ("12.4", "torch finds no NVIDIA GPU"),
+    ):
         monkeypatch.setattr(torch.version, "cuda", build)
         refused(why)
-    for name, value in (("is_available", True), ("current_device", 0), ("get_device_name", "NVIDIA Test 1")):
+    for name, value in (
+        ("is_available", True),
+        ("current_device", 0),
+        ("get_device_name", "NVIDIA Test 1"),
+    ):
         monkeypatch.setattr(torch.cuda, name, lambda *_, value=value: value)
-    with monkeypatch.context() as patch:  # torch has no code for its compute capability: the first operation fails
-        patch.setattr(torch, "ones", Mock(side_effect=RuntimeError("CUDA error: no kernel image is available")))
+    # torch has no code for its compute capability: the first operation fails
+    with monkeypatch.context() as patch:
+        patch.setattr(
+            torch,
+            "ones",
+            Mock(side_effect=RuntimeError("CUDA error: no kernel image is available")),
+        )
         refused(r"torch cannot compute on it .*doctor")
     monkeypatch.setattr(torch, "ones", lambda *_, **__: torch.zeros(1))
     monkeypatch.setattr(inputs, "unusable", lambda: None)
     capsys.readouterr()
-    assert pick_device("auto", Console()) == pick_device("cuda", Console()) == torch.device("cuda", 0)
+    assert (
+        pick_device("auto", Console()) == pick_device("cuda", Console()) == torch.device("cuda", 0)
+    )
     assert capsys.readouterr().err.splitlines() == ["on NVIDIA Test 1"] * 2
     monkeypatch.setattr(inputs, "unusable", lambda: "gsplat is absent: pip install gsplat==1.5.3")
     assert pick_device("auto", Console()) == torch.device("cpu")
-    assert "on the CPU, although there is a GPU: gsplat is absent: pip install" in capsys.readouterr().err
+    assert (
+        "on the CPU, although there is a GPU: gsplat is absent: pip install"
+        in capsys.readouterr().err
+    )
     refused("gsplat is absent: pip install gsplat==1.5.3")
 
 
@@ -102,8 +131,14 @@ def page_of(path: Path) -> tuple[str, dict[str, Any]]:
 def test_adapt(clod: Any, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     report = clod(ADAPT, "--json").report
-    files = {"page": "dial.html", "rendering": "dial_rendering.png", "adapting": "dial_adapting.png"}
-    assert report["outputs"].items() >= files.items() and all((tmp_path / f).is_file() for f in files.values())
+    files = {
+        "page": "dial.html",
+        "rendering": "dial_rendering.png",
+        "adapting": "dial_adapting.png",
+    }
+    assert report["outputs"].items() >= files.items() and all(
+        (tmp_path / f).is_file() for f in files.values()
+    )
     text, page = page_of(tmp_path / "dial.html")
     assert all(page["report"][name] == report[name] for name in ("rows", "base_rows", "plan"))
     curves = page["training"]["curves"]
@@ -115,7 +150,9 @@ def test_adapt(clod: Any, tmp_path: Path) -> None:
         assert len(set(psnr)) == 5 and psnr[-1] == rows[dial]["psnr"]  # each of its own time
     trained = report["seconds"]["start"] + report["seconds"]["train"]
     assert curves[0]["points"][-1]["seconds"] == pytest.approx(trained, abs=0.05)
-    assert "take over in the distance" in text and "base.ply, a trained splat of 300 Gaussians" in text
+    assert (
+        "take over in the distance" in text and "base.ply, a trained splat of 300 Gaussians" in text
+    )
     assert text.count("<svg") == 4
     assert text.count('data-name=""') == pages.FRAMES and text.count('data-name="base"') == 1
 
