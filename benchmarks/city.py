@@ -21,7 +21,10 @@ from PIL import Image
 
 Where = Literal["near", "far", "mixed"]
 # metres; square metres of surface of a lot; Gaussians on each
-PITCH, HOUSE, AREA, DENSITY = 24.0, 12.0, 1050.0, 5.0
+PITCH = 24.0
+HOUSE = 12.0
+AREA = 1050.0
+DENSITY = 5.0
 SKY = 0.03  # share of the Gaussians
 # of a checkpoint, off the truth
 PERTURBED = {"means": 0.02, "log_scales": 0.15, "opacity_logits": 0.5, "sh0": 0.12}

@@ -186,7 +186,10 @@ class Process:
             stderr=subprocess.PIPE,
             env=os.environ | {"PYTHONPATH": str(ROOT)} | dict(environment or {}),
         )
-        self.out, self.line, self.lines, self.ended = "", "", list[str](), False
+        self.out = ""
+        self.line = ""
+        self.lines = list[str]()
+        self.ended = False
         self.moments, self.cpu, self.memory = (
             dict[str, float](),
             dict[str, float](),

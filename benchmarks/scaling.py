@@ -30,7 +30,11 @@ FILE, CITIES = "scaling.jsonl", CACHE / "scaling"
 # exponents are fitted from FROM on
 FLOOR, SIZES, FROM = 1000, (10_000, 100_000, 1_000_000, 5_000_000), 100_000
 # The last fifth of STEPS has photographs of full size.
-IMAGES, WIDTH, HEIGHT, STEPS, MAX_SV = 10, 640, 400, 20, 3
+IMAGES = 10
+WIDTH = 640
+HEIGHT = 400
+STEPS = 20
+MAX_SV = 3
 # Loading, importance and the pruning order by themselves; the report has all of "start".
 PARTS = """
 import json, sys, time, torch

@@ -165,12 +165,10 @@ def gradients(
     """``[runs, N]``: gradient by ``x`` of the loss at these dial values and, with ``count``, of the
     count term.
     """
-    settings, n, total, pull = (
-        CONFIG.attenuation(1.0),
-        len(task.start),
-        torch.zeros(()),
-        torch.zeros_like(x),
-    )
+    settings = CONFIG.attenuation(1.0)
+    n = len(task.start)
+    total = torch.zeros(())
+    pull = torch.zeros_like(x)
     leaf = x.requires_grad_()
     sigma = (leaf.exp() if log else leaf).flatten()
     logits, distances = task.logits.repeat(len(x)), task.distances.repeat(len(x))

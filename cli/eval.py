@@ -143,7 +143,10 @@ class Comparisons:
     def __init__(
         self, model: Gaussians, scene: Scene, console: Console, stop: GracefulStop
     ) -> None:
-        self.model, self.scene, self.console, self.stop = model, scene, console, stop
+        self.model = model
+        self.scene = scene
+        self.console = console
+        self.stop = stop
         self.report: dict[str, Any] = {"base_row": None, "ranked": [], "against": [], "popping": []}
         self.tables: dict[str, list[tuple[str, Row]]] = {}
         self.popping: list[tuple[str, Popping]] = []

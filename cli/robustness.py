@@ -154,12 +154,10 @@ def execute(args: Namespace) -> dict[str, Any]:
     from .shared.inputs import align_shown, prepare_kernels, read_inputs
     from .shared.measure import Stopwatch
 
-    console, watch, stop, required = (
-        Console(args.quiet),
-        Stopwatch(),
-        GracefulStop(),
-        not args.misaligned_ok,
-    )
+    console = Console(args.quiet)
+    watch = Stopwatch()
+    stop = GracefulStop()
+    required = not args.misaligned_ok
     checkpoints, scene = read_inputs(args, args.ply, console, training=True, required=required)
     for each in checkpoints[1:]:
         if align_shown(each, scene, console, required=required)[1]["frame"]:

@@ -110,12 +110,10 @@ def assert_agrees(
     others.
     """
     looser = getattr(rasterize, "looser", 1.0)  # a backend in float32 with fast intrinsics
-    image, gradient, cut, nudge = (
-        image * looser,
-        gradient * looser,
-        cut * looser**0.5,
-        nudge * looser**0.5,
-    )
+    image = image * looser
+    gradient = gradient * looser
+    cut = cut * looser**0.5
+    nudge = nudge * looser**0.5
     twin = {
         name: (value if rows is None else value[rows]).double() for name, value in scene.items()
     }

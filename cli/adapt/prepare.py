@@ -71,7 +71,10 @@ class Run:
 
     def read(self) -> None:
         """Reads checkpoint and photographs, or places cameras."""
-        args, console, watch, views = self.args, self.console, self.watch, list[View]()
+        args = self.args
+        console = self.console
+        watch = self.watch
+        views = list[View]()
         with watch.time("load"):
             device = inputs.pick_device(args.device, console)
             base = inputs.read_checkpoint(args.ply, console, args.activated, device=device)
@@ -160,7 +163,10 @@ def forecast(run: Run, plan: Plan) -> None:
     """Estimates time and peak memory of the rest of a run in one process, unless it is short, from
     a few steps.
     """
-    config, views, base, state = plan.config, len(run.scene.test), run.base, run.saver.state
+    config = plan.config
+    views = len(run.scene.test)
+    base = run.base
+    state = run.saver.state
     steps = config.steps - (state.steps if state else 0)
     if steps < LONG or launched().size > 1:
         return

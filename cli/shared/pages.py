@@ -62,7 +62,10 @@ class AdaptPage:
     def __init__(
         self, base: Gaussians, scene: Scene, config: AdaptConfig, console: Console
     ) -> None:
-        self.base, self.scene, self.config, self.console = base, scene, config, console
+        self.base = base
+        self.scene = scene
+        self.config = config
+        self.console = console
         self.due = [0.0, *SNAPSHOTS]
         # seconds of the training, and the state then
         self.snapshots: list[tuple[float, Gaussians]] = []

@@ -38,22 +38,18 @@ def adam_rows(
     ``1 / sqrt(1 - beta2^n)``; the last entry holds for all larger n. ``units``, ``[N]`` or ``[1]``
     for all, multiplies a row's rate.
     """
-    width, most, rate, each = (
-        parameter.shape[1],
-        corrections.shape[1] - 1,
-        float32(rate),
-        int64(len(units) > 1),
-    )
+    width = parameter.shape[1]
+    most = corrections.shape[1] - 1
+    rate = float32(rate)
+    each = int64(len(units) > 1)
     beta1, beta2, epsilon = splat(float32(beta1)), splat(float32(beta2)), float32(epsilon)
     rest1, rest2 = splat(ONE) - beta1, splat(ONE) - beta2
     begin, end = len(parameter) * worker // workers, len(parameter) * (worker + 1) // workers
     lengths, factors = scratch(float32, ROOM), scratch(float32, ROOM)
-    parameter, first, second, gradient = (
-        pointer(parameter),
-        pointer(first),
-        pointer(second),
-        pointer(gradient),
-    )
+    parameter = pointer(parameter)
+    first = pointer(first)
+    second = pointer(second)
+    gradient = pointer(gradient)
     for start in range(begin, end, 16):
         stop, some = min(start + 16, end), False
         for row in range(start, stop):

@@ -125,19 +125,18 @@ def blend(
     ``room[worker]`` holds FORWARD_STATE floats of scratch (on the stack, LLVM would take minutes to
     compile it).
     """
-    count, tiles, records, entries = len(tiles), pointer(tiles), pointer(records), pointer(entries)
-    offsets, background, image, alpha = (
-        pointer(offsets),
-        pointer(background),
-        pointer(image),
-        pointer(alpha),
-    )
-    state, live, masks, cursor = (
-        pointer(room[worker]),
-        scratch(uint64, WORDS),
-        pointer(masks),
-        pointer(cursor),
-    )
+    count = len(tiles)
+    tiles = pointer(tiles)
+    records = pointer(records)
+    entries = pointer(entries)
+    offsets = pointer(offsets)
+    background = pointer(background)
+    image = pointer(image)
+    alpha = pointer(alpha)
+    state = pointer(room[worker])
+    live = scratch(uint64, WORDS)
+    masks = pointer(masks)
+    cursor = pointer(cursor)
     zero = splat(c.ZERO)
     while True:
         turn = count_up(cursor)
@@ -258,20 +257,19 @@ def blend_gradient(
     s dx^2, s dx dy, s dy^2. Runs front to back like the forward pass with a running remainder of
     v . C, so nothing is stored per pixel and Gaussian. Each pair has its own slot.
     """
-    count, tiles, records, entries = len(tiles), pointer(tiles), pointer(records), pointer(entries)
+    count = len(tiles)
+    tiles = pointer(tiles)
+    records = pointer(records)
+    entries = pointer(entries)
     entry_slots, offsets, pair_sums = pointer(entry_slots), pointer(offsets), pointer(pair_sums)
-    image, alpha, v_image, v_alpha = (
-        pointer(image),
-        pointer(alpha),
-        pointer(v_image),
-        pointer(v_alpha),
-    )
-    state, live, masks, cursor = (
-        pointer(room[worker]),
-        scratch(uint64, WORDS),
-        pointer(masks),
-        pointer(cursor),
-    )
+    image = pointer(image)
+    alpha = pointer(alpha)
+    v_image = pointer(v_image)
+    v_alpha = pointer(v_alpha)
+    state = pointer(room[worker])
+    live = scratch(uint64, WORDS)
+    masks = pointer(masks)
+    cursor = pointer(cursor)
     zero, one, most = splat(c.ZERO), splat(c.ONE), splat(c.ALPHA_MAX)
     while True:
         turn = count_up(cursor)

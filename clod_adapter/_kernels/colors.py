@@ -30,7 +30,10 @@ C40, C41, C42 = (
 )
 C43, C44 = float32(-0.6690465435572892), float32(0.10578554691520431)
 C46, C48 = float32(0.47308734787878004), float32(0.6258357354491761)
-F2, F3, F4, F7 = float32(2), float32(3), float32(4), float32(7)
+F2 = float32(2)
+F3 = float32(3)
+F4 = float32(4)
+F7 = float32(7)
 F6, F30, F35 = float32(6), float32(30), float32(35)
 
 
@@ -43,7 +46,12 @@ def sh_basis(degree, x, y, z, out):
     out[1], out[2], out[3] = -C1 * y, C1 * z, -C1 * x
     if degree < 2:
         return
-    xx, yy, zz, xy, yz, xz = x * x, y * y, z * z, x * y, y * z, x * z
+    xx = x * x
+    yy = y * y
+    zz = z * z
+    xy = x * y
+    yz = y * z
+    xz = x * z
     out[4], out[5], out[7] = C20 * xy, -C20 * yz, -C20 * xz
     out[6], out[8] = C22 * (F2 * zz - xx - yy), C24 * (xx - yy)
     if degree < 3:
@@ -72,7 +80,12 @@ def sh_basis_gradient(degree, x, y, z, v):
         gy += C20 * (x * v[4] - z * v[5]) - F2 * C22 * y * v[6] - F2 * C24 * y * v[8]
         gz += C20 * (-y * v[5] - x * v[7]) + F4 * C22 * z * v[6]
     if degree >= 3:
-        xx, yy, zz, xy, yz, xz = x * x, y * y, z * z, x * y, y * z, x * z
+        xx = x * x
+        yy = y * y
+        zz = z * z
+        xy = x * y
+        yz = y * z
+        xz = x * z
         gx += (
             F6 * C30 * xy * v[9] + C31 * yz * v[10] - F2 * C32 * xy * v[11] - F6 * C33 * xz * v[12]
         )

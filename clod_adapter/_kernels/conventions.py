@@ -13,7 +13,10 @@ LOG2E, LOG2_255, TWO_LN2 = (
     float32(7.994353436858858),
     float32(1.3862943611198906),
 )
-HALF, ZERO, ONE, TWO = float32(0.5), float32(0), float32(1), float32(2)
+HALF = float32(0.5)
+ZERO = float32(0)
+ONE = float32(1)
+TWO = float32(2)
 HUGE = float32(3e38)  # larger values are dropped as not finite
 
 # Columns of a record, the 64 bytes the blending loops read of a visible Gaussian. The exponent of
@@ -32,8 +35,18 @@ CAMERA = COMPENSATE + 1
 # quaternion (4), scales (3). Then camera point (3), rotation (9), U = J R_view (6), P = U R S (6),
 # blurred covariance (3), its determinant, unit quaternion (4), 1 / |quaternion|, determinant of P
 # P^T.
-MEAN, STORED, SCALE, POINT, ROT, UMAT, PMAT = 0, 3, 7, 10, 13, 22, 28
-COV, COVDET, QUAT, QINV, RAWDET = 34, 37, 38, 42, 43
+MEAN = 0
+STORED = 3
+SCALE = 7
+POINT = 10
+ROT = 13
+UMAT = 22
+PMAT = 28
+COV = 34
+COVDET = 37
+QUAT = 38
+QINV = 42
+RAWDET = 43
 WORKSPACE = 44 + 16  # load_rows always fills sixteen vectors
 
 TILE = 64  # pixels: sixteen blocks of four
@@ -46,5 +59,11 @@ AHEAD = 4
 
 # Gradients of sixteen Gaussians as vectors: sums over pixels (9), P (6), rotation matrix (9), then
 # what is stored: scales (3), quaternion (4), mean (3), SH degree 0 (3).
-SUMS, V_P, V_ROT, V_SCALE, V_QUAT, V_MEAN, V_SH0 = 0, 9, 15, 24, 27, 31, 34
+SUMS = 0
+V_P = 9
+V_ROT = 15
+V_SCALE = 24
+V_QUAT = 27
+V_MEAN = 31
+V_SH0 = 34
 GRADIENTS = 37 + 16

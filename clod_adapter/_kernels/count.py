@@ -25,7 +25,10 @@ def load_squares(i, many, sigma, d, dial2):
 def count_kept(worker, workers, sigma, d, dial2, counts):
     """``counts[worker]``: how many of this worker's rows are kept at the distances ``d [N]``."""
     first, last = len(sigma) * worker // workers, len(sigma) * (worker + 1) // workers
-    sigma, d, square, total = pointer(sigma), pointer(d), float32(dial2), 0
+    sigma = pointer(sigma)
+    d = pointer(d)
+    square = float32(dial2)
+    total = 0
     for i in range(first, last, 16):
         reach, far2 = load_squares(i, last - i, sigma, d, square)
         total += ones(bits_of(both(survives(reach, far2, float32(0)), first_lanes(last - i))))

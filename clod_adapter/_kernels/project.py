@@ -60,14 +60,12 @@ def covariance(cam, w):
             w[c.PMAT + 3 * row + k] = along * w[c.SCALE + k]
     # P P^T with and without blur, and determinants as sums of squares, exact for needles.
     blur = cam[c.BLUR]
-    p0, p1, p2, p3, p4, p5 = (
-        w[c.PMAT],
-        w[c.PMAT + 1],
-        w[c.PMAT + 2],
-        w[c.PMAT + 3],
-        w[c.PMAT + 4],
-        w[c.PMAT + 5],
-    )
+    p0 = w[c.PMAT]
+    p1 = w[c.PMAT + 1]
+    p2 = w[c.PMAT + 2]
+    p3 = w[c.PMAT + 3]
+    p4 = w[c.PMAT + 4]
+    p5 = w[c.PMAT + 5]
     xx, yy = p0 * p0 + p1 * p1 + p2 * p2, p3 * p3 + p4 * p4 + p5 * p5
     w[c.COV], w[c.COV + 1], w[c.COV + 2] = xx + blur, p0 * p3 + p1 * p4 + p2 * p5, yy + blur
     cx, cy, cz = p1 * p5 - p2 * p4, p2 * p3 - p0 * p5, p0 * p4 - p1 * p3
@@ -79,7 +77,10 @@ def covariance(cam, w):
 @part
 def rotation(w):
     """Rotation matrix, row-major, of the unit quaternion."""
-    q0, q1, q2, q3 = w[c.QUAT], w[c.QUAT + 1], w[c.QUAT + 2], w[c.QUAT + 3]
+    q0 = w[c.QUAT]
+    q1 = w[c.QUAT + 1]
+    q2 = w[c.QUAT + 2]
+    q3 = w[c.QUAT + 3]
     w[c.ROT] = c.ONE - c.TWO * (q2 * q2 + q3 * q3)
     w[c.ROT + 1] = c.TWO * (q1 * q2 - q0 * q3)
     w[c.ROT + 2] = c.TWO * (q1 * q3 + q0 * q2)
@@ -192,27 +193,24 @@ def project(
     ones. Where ``sigma`` or ``growth`` is empty, there is no dial, or no growth. After its N
     records, ``records`` has a spare one for each worker.
     """
-    n, spare, dialled, grows = (
-        len(opacities),
-        len(opacities) + worker,
-        len(sigma) > 0,
-        len(growth) > 0,
-    )
+    n = len(opacities)
+    spare = len(opacities) + worker
+    dialled = len(sigma) > 0
+    grows = len(growth) > 0
     first, last = n * worker // workers, n * (worker + 1) // workers
-    means, quats, scales, opacities = (
-        pointer(means),
-        pointer(quats),
-        pointer(scales),
-        pointer(opacities),
-    )
-    sigma, growth, sh0, shN = pointer(sigma), pointer(growth), pointer(sh0), pointer(shN)
-    cam, dial, records, depths, ids = (
-        pointer(cam),
-        pointer(dial),
-        pointer(records),
-        pointer(depths),
-        pointer(ids),
-    )
+    means = pointer(means)
+    quats = pointer(quats)
+    scales = pointer(scales)
+    opacities = pointer(opacities)
+    sigma = pointer(sigma)
+    growth = pointer(growth)
+    sh0 = pointer(sh0)
+    shN = pointer(shN)
+    cam = pointer(cam)
+    dial = pointer(dial)
+    records = pointer(records)
+    depths = pointer(depths)
+    ids = pointer(ids)
     w, rows, queue = scratch(f32x16, WORKSPACE), scratch(int64, 16), scratch(int64, 32)
     i = packed = first
     queued = 0

@@ -52,13 +52,11 @@ def compensation_gradient(w, g, k, t0, t1):
     ``t0, t1`` is the column of K P. The gradient with respect to log c equals that with respect to
     log opacity.
     """
-    p0, p1, u0, u1, inverse = (
-        w[c.PMAT + k],
-        w[c.PMAT + 3 + k],
-        splat(c.ZERO),
-        splat(c.ZERO),
-        c.ONE / w[c.RAWDET],
-    )
+    p0 = w[c.PMAT + k]
+    p1 = w[c.PMAT + 3 + k]
+    u0 = splat(c.ZERO)
+    u1 = splat(c.ZERO)
+    inverse = c.ONE / w[c.RAWDET]
     for j in range(3):
         if j != k:
             cross = p0 * w[c.PMAT + 3 + j] - w[c.PMAT + j] * p1
@@ -99,7 +97,11 @@ def point_gradient(w, g, v_x, v_y, cam):
 @part
 def quat_gradient(w, g):
     """Gradient of the stored quaternion from that of the rotation matrix."""
-    q0, q1, q2, q3, r = w[c.QUAT], w[c.QUAT + 1], w[c.QUAT + 2], w[c.QUAT + 3], c.V_ROT
+    q0 = w[c.QUAT]
+    q1 = w[c.QUAT + 1]
+    q2 = w[c.QUAT + 2]
+    q3 = w[c.QUAT + 3]
+    r = c.V_ROT
     x, y, z = g[r + 7] - g[r + 5], g[r + 2] - g[r + 6], g[r + 3] - g[r + 1]
     xy, xz, yz = g[r + 3] + g[r + 1], g[r + 6] + g[r + 2], g[r + 7] + g[r + 5]
     v0 = c.TWO * (q1 * x + q2 * y + q3 * z)
@@ -213,12 +215,10 @@ def project_gradient(
     """
     w, g = scratch(f32x16, WORKSPACE), scratch(f32x16, GRADIENTS)
     sh, basis = scratch(f32x16, 80), scratch(f32x16, 25)
-    rows, packed, lanes, sums = (
-        scratch(int64, 16),
-        scratch(int64, 16),
-        scratch(int64, 16),
-        scratch(float32, 256),
-    )
+    rows = scratch(int64, 16)
+    packed = scratch(int64, 16)
+    lanes = scratch(int64, 16)
+    sums = scratch(float32, 256)
     shaped, colored, tuned = len(v_means) > 0, len(v_sh0) > 0, len(v_shN) > 0
     dialled, grows, terms = (
         len(sigma) > 0,
@@ -227,25 +227,19 @@ def project_gradient(
     )
     first, last = len(opacities) * worker // workers, len(opacities) * (worker + 1) // workers
     end = first + counts[worker]
-    means, quats, scales, opacities = (
-        pointer(means),
-        pointer(quats),
-        pointer(scales),
-        pointer(opacities),
-    )
-    sigma, growth, shN, cam, dial = (
-        pointer(sigma),
-        pointer(growth),
-        pointer(shN),
-        pointer(cam),
-        pointer(dial),
-    )
-    records, packed_ids, slots, pair_sums = (
-        pointer(records),
-        pointer(packed_ids),
-        pointer(slots),
-        pointer(pair_sums),
-    )
+    means = pointer(means)
+    quats = pointer(quats)
+    scales = pointer(scales)
+    opacities = pointer(opacities)
+    sigma = pointer(sigma)
+    growth = pointer(growth)
+    shN = pointer(shN)
+    cam = pointer(cam)
+    dial = pointer(dial)
+    records = pointer(records)
+    packed_ids = pointer(packed_ids)
+    slots = pointer(slots)
+    pair_sums = pointer(pair_sums)
     v_means, v_quats, v_scales = pointer(v_means), pointer(v_quats), pointer(v_scales)
     v_opacities, v_sigma, v_growth = pointer(v_opacities), pointer(v_sigma), pointer(v_growth)
     v_sh0, v_shN = pointer(v_sh0), pointer(v_shN)

@@ -50,13 +50,11 @@ def ssim_slopes(worker, workers, x, y, width, g_mean, g_square, g_product, sums)
     over the pixels.
     """
     channels, height, step = x.shape
-    x, y, g_mean, g_square, g_product = (
-        pointer(x),
-        pointer(y),
-        pointer(g_mean),
-        pointer(g_square),
-        pointer(g_product),
-    )
+    x = pointer(x)
+    y = pointer(y)
+    g_mean = pointer(g_mean)
+    g_square = pointer(g_square)
+    g_product = pointer(g_product)
     lines, zero = np.zeros(6 * step, np.float32), splat(float32(0))
     c1, c2, two = splat(C1), splat(C2), splat(TWO)
     result = 0.0
@@ -107,13 +105,11 @@ def loss_gradient(
     of |x - y|.
     """
     channels, height, step = x.shape
-    x, y, g_mean, g_square, g_product = (
-        pointer(x),
-        pointer(y),
-        pointer(g_mean),
-        pointer(g_square),
-        pointer(g_product),
-    )
+    x = pointer(x)
+    y = pointer(y)
+    g_mean = pointer(g_mean)
+    g_square = pointer(g_square)
+    g_product = pointer(g_product)
     lines, out, zero = np.zeros(3 * step, np.float32), np.empty(step, np.float32), splat(float32(0))
     two, weight = splat(TWO), splat(float32(-dssim))
     result = 0.0

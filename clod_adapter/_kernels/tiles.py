@@ -119,12 +119,10 @@ def list_tiles(
     ``slots[2 p + 1]`` are those of the record p.
     """
     first, last = len(order) * worker // workers, len(order) * (worker + 1) // workers
-    listed, cursor, records, order = (
-        len(slots) > 0,
-        pointer(histogram[worker]),
-        pointer(records),
-        pointer(order),
-    )
+    listed = len(slots) > 0
+    cursor = pointer(histogram[worker])
+    records = pointer(records)
+    order = pointer(order)
     slots, entries, entry_slots = pointer(slots), pointer(entries), pointer(entry_slots)
     found, slot = scratch(float32, 32), totals[worker]
     for j in range(first, last):

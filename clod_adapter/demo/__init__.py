@@ -82,7 +82,10 @@ def dial_strip(
     each enlarged.
     """
     height, width = panels[0].image.shape[:2]
-    left, right, top, bottom = crop[0], crop[0] + crop[2], crop[1], crop[1] + crop[3]
+    left = crop[0]
+    right = crop[0] + crop[2]
+    top = crop[1]
+    bottom = crop[1] + crop[3]
     tall, cell = [height / width, crop[3] / crop[2]], 2.6  # inches
     with new_figure((len(panels) * cell, cell * sum(tall) + 1.1), layout="constrained") as figure:
         figure.suptitle(title, fontsize=11, weight="bold", x=0.01, ha="left")

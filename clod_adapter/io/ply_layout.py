@@ -41,7 +41,10 @@ COLUMN = "clod_"
 RGB = ("red", "green", "blue")
 # Comments of the calibration: machine; total, views, width, height, reference; one for each row and
 # each viewpoint.
-MACHINE, EXTENT, ROW, VIEWPOINT = "calibrated_on", "calibrated_with", "calibrated", "viewpoint"
+MACHINE = "calibrated_on"
+EXTENT = "calibrated_with"
+ROW = "calibrated"
+VIEWPOINT = "viewpoint"
 DIAL = "attenuation"
 # Of the columns of settings: group, field, and what a column of 1 stands for where the setting is
 # no number.

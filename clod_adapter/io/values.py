@@ -25,7 +25,10 @@ if TYPE_CHECKING:
 
 Activated = Literal["none", "opacity", "scales", "both"]
 Arrays = dict[str, np.ndarray]
-SIGMA, GROWTH, FILTER_3D, MASKS = "sigma_d", "growth_d", "filter_3D", "masks"
+SIGMA = "sigma_d"
+GROWTH = "growth_d"
+FILTER_3D = "filter_3D"
+MASKS = "masks"
 # of far Gaussians, whose ``opacity`` is INVISIBLE: without the dial near ones alone are drawn
 OPACITY = "opacity_d"
 INVISIBLE = -20.0  # logit

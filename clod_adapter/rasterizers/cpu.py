@@ -31,7 +31,10 @@ def camera_vector(camera: Camera, screen_filter: ScreenFilter = CLASSIC) -> np.n
     """Camera and screen-space filter in the layout of the kernels (``_kernels/conventions.py``)."""
     out = np.empty(conventions.CAMERA, np.float32)
     viewmat, K = (x.detach().cpu().double().numpy() for x in (camera.viewmat, camera.K))
-    fx, fy, cx, cy = (float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
+    fx = float(K[0, 0])
+    fy = float(K[1, 1])
+    cx = float(K[0, 2])
+    cy = float(K[1, 2])
     out[:16] = viewmat.reshape(-1)
     out[16:22] = fx, fy, cx, cy, camera.width, camera.height
     margin_x, margin_y = 0.15 * camera.width / fx, 0.15 * camera.height / fy

@@ -123,7 +123,12 @@ def sh_basis(directions: Tensor) -> Tensor:
     of 3DGS.
     """
     x, y, z = directions.unbind(1)
-    xx, yy, zz, xy, yz, xz = x * x, y * y, z * z, x * y, y * z, x * z
+    xx = x * x
+    yy = y * y
+    zz = z * z
+    xy = x * y
+    yz = y * z
+    xz = x * z
     return torch.stack(
         [
             torch.full_like(x, SH_C0),

@@ -18,8 +18,14 @@ from clod_adapter._support.text import package_version
 from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import atomic_path
 
-INK, QUIET, GRID, PAPER = "#1c1c1e", "#6b6b70", "#e4e4e7", "#ffffff"
-BLUE, ORANGE, GREEN, PURPLE = "#1f5fa8", "#c2571a", "#2d7d5a", "#7a4fa3"
+INK = "#1c1c1e"
+QUIET = "#6b6b70"
+GRID = "#e4e4e7"
+PAPER = "#ffffff"
+BLUE = "#1f5fa8"
+ORANGE = "#c2571a"
+GREEN = "#2d7d5a"
+PURPLE = "#7a4fa3"
 SERIES = (BLUE, ORANGE, GREEN, PURPLE, QUIET)  # in the order that lines are drawn
 DPI = 200
 STYLE: dict[Any, Any] = {

@@ -137,12 +137,10 @@ def _initialized(
 def _train(trainer: Trainer, progress: Listener | None) -> Adapted:
     """Steps until the steps or the time budget are used up, or something ends training early."""
     group, lost, failed = trainer.group, None, None
-    began, going, first, stop = (
-        time.perf_counter() - trainer.seconds,
-        True,
-        trainer.done + 1,
-        GracefulStop(),
-    )
+    began = time.perf_counter() - trainer.seconds
+    going = True
+    first = trainer.done + 1
+    stop = GracefulStop()
     before = (group.waiting, group.exchanging) if group else (0.0, 0.0)
 
     def tell(error: str | None = None) -> bool:

@@ -22,7 +22,10 @@ from clod_adapter.training.camera_placement import SAMPLE, place_cameras
 # To fewer than MANY photographs ADDED pseudo views are added: up to half of them at the cameras of
 # the photographs, at most NEAR at each, from where they are moved WIDER; the others at placed
 # cameras.
-MANY, ADDED, NEAR, WIDER = 64, 96, 4, 2.0
+MANY = 64
+ADDED = 96
+NEAR = 4
+WIDER = 2.0
 TEST_EVERY = 8  # as with photographs
 # Standard deviations of the random offset of a camera, of its distance to the scene, and of its
 # direction, radians; and the largest change of log focal length.

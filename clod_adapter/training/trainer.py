@@ -97,7 +97,10 @@ class Trainer:
         }
         # the whole shN of a base whose empty degrees were removed
         self.empty_sh: Tensor | None = None
-        self.done, self.seconds, self.start_seconds, self.loss = 0, 0.0, 0.0, math.nan
+        self.done = 0
+        self.seconds = 0.0
+        self.start_seconds = 0.0
+        self.loss = math.nan
         self.mean: dict[str, Tensor] = {}
         self.averaged = 0
         self.held = torch.zeros(self.count, dtype=torch.bool, device=start.means.device)

@@ -16,7 +16,10 @@ from clod_adapter.config import AttenuationConfig
 from clod_adapter.errors import ClodError
 from gsplat_versions import FUNCTIONS
 
-N, WIDTH, HEIGHT, CAMERAS = 5, 20, 12, 3
+N = 5
+WIDTH = 20
+HEIGHT = 12
+CAMERAS = 3
 VERSIONS = gsplat_versions.signatures()
 WHOLE = AttenuationConfig()
 OF_SCENE = {

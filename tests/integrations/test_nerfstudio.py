@@ -38,7 +38,10 @@ from clod_adapter.render import render
 from photographs import write_frames
 
 ROOT = Path(__file__).parents[2]
-N, WIDTH, HEIGHT, STEPS = 60, 32, 24, 16
+N = 60
+WIDTH = 32
+HEIGHT = 24
+STEPS = 16
 
 
 @pytest.fixture
@@ -85,12 +88,10 @@ def configured(method: Any, folder: Path, load_dir: Path) -> Any:
     model.random_init, model.num_random, model.sh_degree = True, 10, 1
     model.background_color = "black"
     # all off
-    model.warmup_length, model.refine_every, model.stop_split_at, model.cull_alpha_thresh = (
-        0,
-        2,
-        10**6,
-        0.5,
-    )
+    model.warmup_length = 0
+    model.refine_every = 2
+    model.stop_split_at = 10**6
+    model.cull_alpha_thresh = 0.5
     config.load_dir, config.output_dir, config.max_num_iterations = (
         load_dir,
         folder / "outputs",

@@ -213,7 +213,10 @@ def test_screen_filters(rasterize: Splat, scales: Any, screen_filter: ScreenFilt
     view, image, cut = camera(70, 50), IMAGE, 0.04
     some = scene(200, 1, 11, size=scales if isinstance(scales, float) else 1.0)
     if isinstance(scales, tuple):
-        some, view, image, cut = scene(80, 1, 3), camera(), 3e-4, ON_A_CUT
+        some = scene(80, 1, 3)
+        view = camera()
+        image = 3e-4
+        cut = ON_A_CUT
         some["scales"] = torch.tensor(scales).repeat(80, 1)
     assert_agrees(rasterize, some, view, screen_filter=screen_filter, image=image, cut=cut)
 

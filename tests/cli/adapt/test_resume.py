@@ -91,7 +91,10 @@ def test_damaged_states_are_refused_or_harmless(state: Any, data: Any) -> None:
     """Entries of another type or out of range, or missing, at any depth; tensors of other shapes,
     types or values.
     """
-    path, pair, tensors, about = state[0], state[1], dict(state[2]), copy.deepcopy(state[3])
+    path = state[0]
+    pair = state[1]
+    tensors = dict(state[2])
+    about = copy.deepcopy(state[3])
     name = data.draw(st.sampled_from(sorted(tensors)))
     how, changed = (
         data.draw(st.sampled_from(["entry", "type", "shape", "value"])),
