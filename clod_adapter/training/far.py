@@ -42,6 +42,7 @@ from clod_adapter.training.pseudo_views import PseudoView
 # checkpoint's own from the nearest ones on. Of a checkpoint that is itself the truth none is
 # better, and fewer far ones do for small budgets.
 SHARE, NEARER = 0.8, 0.05
+FEW_SHARE = 1.0  # beside few photographs: what training cannot learn anew is not merged away
 PLACED_SHARE, PLACED_NEARER = 0.4, 0.5
 LONGER = 1.2  # times near_distance, the smallest reach
 SAMPLE = 20_000  # Gaussians whose distances tell near_distance
@@ -69,8 +70,11 @@ def with_far(
     if has_dial(base):
         raise ClodError(WITHOUT_FAR)
     views = spread(views, MOST_VIEWS)
-    placed = all(isinstance(view, PseudoView) for view in views)
+    pseudo = [isinstance(view, PseudoView) for view in views]
+    placed = all(pseudo)
     share, nearer = (PLACED_SHARE, PLACED_NEARER) if placed else (SHARE, NEARER)
+    if any(pseudo) and not placed:
+        share = FEW_SHARE
     cameras = [view.camera for view in views]
     attenuation = config.attenuation(scene_distance(base, views))
     some = base.means[:: len(base) // SAMPLE + 1]
