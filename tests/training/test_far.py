@@ -2,6 +2,7 @@
 the checkpoint.
 """
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -52,6 +53,16 @@ def test_far_ones_take_over_from_near_ones() -> None:
     )
     slopes = torch.stack([near.drawn, far.drawn]).diff(dim=1).abs() / d.clamp(min=1e-9).log().diff()
     assert float(slopes[:, 1:].max()) <= 10 * 0.8 + 1e-6
+
+
+def test_few_photographs_merge_nothing_away(both: tuple[clod.Gaussians, clod.Scene]) -> None:
+    """Beside few photographs there are as many far Gaussians as near ones, else fewer."""
+    base, scene = both
+    few = clod.add_pseudo_views(base, replace(scene, train=scene.train[:4]))
+    assert len(few.train) > 4
+    start = clod.make_plan(base, few, config_of()).start
+    assert len(start) == 2 * len(base)
+    assert len(clod.make_plan(base, scene, config_of()).start) < len(start)
 
 
 def test_rasterizers_agree(adapted: clod.Gaussians) -> None:
