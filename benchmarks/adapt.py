@@ -1,7 +1,7 @@
 """Quality, count and seconds of adapted checkpoints, by dial value.
 
-    python benchmarks/adapt.py plush_half bonsai146 --set max_sv=20.0 --label "max_sv 20" --seeds 0
-    1 2 python benchmarks/adapt.py --table                     # the rows as a Markdown table
+    python benchmarks/adapt.py plush_half --set max_sv=20.0 --label "max_sv 20" --seeds 0 1 2
+    python benchmarks/adapt.py --table    # the rows as a Markdown table
 
 A scene is a folder of the shared data, followed by the name of the checkpoint where it is not
 ``pretrained``. Each run adds one row to ``results/adapt.jsonl``: settings, commit, machine, the

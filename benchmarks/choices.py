@@ -1,11 +1,10 @@
 """Choices of the method against their alternatives: PSNR at equal shares of the Gaussians, one
 change at a time.
 
-    python benchmarks/choices.py plush_half bonsai146 --names SHARE NEARER full python
-    benchmarks/choices.py demo --names SHARE full                           # the folder of
-    clod-adapt demo python benchmarks/choices.py SCENE.ply --names PLACED_SHARE PLACED_NEARER      #
-    without photographs python benchmarks/choices.py --table
-    # the rows as a Markdown table
+    python benchmarks/choices.py plush_half bonsai146 --names SHARE NEARER full
+    python benchmarks/choices.py demo --names SHARE full    # the folder of clod-adapt demo
+    python benchmarks/choices.py SCENE.ply --names PLACED_SHARE PLACED_NEARER    # no photographs
+    python benchmarks/choices.py --table    # the rows as a Markdown table
 
 A scene is a folder of the shared data, one of the demo, or a file, whose placed cameras and renders
 are used. Each run adds one row to ``results/choices.jsonl``; "default" changes nothing. A choice is

@@ -1,10 +1,11 @@
 """Quality after adapting a base that was trained to its end, with few photographs, on held-out
 photographs.
 
-    python benchmarks/converged.py FOLDER [FOLDER ...] --record       # folders with images/,
-    sparse/0/ and base.ply python benchmarks/converged.py plush_half bonsai146 --every 3 --record
+    # folders with images/, sparse/0/ and base.ply
+    python benchmarks/converged.py FOLDER [FOLDER ...] --record
+    python benchmarks/converged.py plush_half bonsai146 --every 3 --record
     python benchmarks/converged.py plush_half bonsai146 --every 3 --base pretrained.ply --record
-    python benchmarks/converged.py --table                            # the rows as a Markdown table
+    python benchmarks/converged.py --table    # the rows as a Markdown table
 
 Runs the default command on ``base.ply``. With ``--every`` the folders are captures of the shared
 data, of which that part of the photographs, by name, is copied to a folder in ``benchmarks/cache``;

@@ -1,10 +1,12 @@
 """All checks for an NVIDIA GPU in one command; with small sizes they also run on the CPU.
 
-    python benchmarks/gpu.py                         # needs torch with CUDA, gsplat 1.5.3 and the
-    shared data python benchmarks/gpu.py --device cpu --small    # the same code, in seconds
+    # needs torch with CUDA, gsplat 1.5.3 and the shared data
+    python benchmarks/gpu.py
+    python benchmarks/gpu.py --device cpu --small    # the same code, in seconds
 
-``tests``: the contract of every backend, the gsplat integration and the optimizer. ``plush``:
-plush_half adapted on the GPU and on the CPU with the same settings: seconds, and held-out quality.
+``tests``: the contract of every backend, the gsplat integration and the optimizer.
+``plush``: plush_half adapted on the GPU and on the CPU with the same settings: seconds, and
+held-out quality.
 ``city``: a synthetic city adapted (peak memory), then near and far frames in turn with plain gsplat
 on the same file: times, the dial's share, PSNR.
 

@@ -1,26 +1,26 @@
 """Runs the test suite under conditions in which processors, users, shells and folders differ, and
 prints one table.
 
-    python benchmarks/portability.py --record                          # all conditions: an hour on
-    two idle cores python benchmarks/portability.py plain no_root+c_locale --tests tests/io   # one,
-    and two of them at once
+    python benchmarks/portability.py --record    # all conditions: an hour on two idle cores
+    # one, and two of them at once
+    python benchmarks/portability.py plain no_root+c_locale --tests tests/io
 
 Run by another virtual environment's Python it tests the versions that are installed there. The
 exit code is 1 where a test failed or a condition could not be had. The conditions:
 
 - ``plain``: as ``make test`` runs it;
 - ``aten_default``, ``aten_avx2``, ``mkl_compatible``, ``numba_generic``: vector instructions of
-older processors;
+  older processors;
 - ``libm_0``, ``libm_1``, ``libm_2``: other last bits of exp, log and the like
-(``tests/other_libm``);
+  (``tests/other_libm``);
 - ``one_thread``, ``one_core``: a single thread; as many as otherwise, on one core;
 - ``no_root``: for root, in a user namespace without root's rights; for others ``plain`` is that;
 - ``ignored_sigint``, ``blocked_signals``: as a script's background job, and below a program that
-blocks signals;
+  blocks signals;
 - ``c_locale``: ASCII as the encoding of files and of the terminal, and a day's time zone away from
-Greenwich;
+  Greenwich;
 - ``folders``: temporary files, home and kernel cache in folders with spaces and other letters in
-their names;
+  their names;
 """
 
 from __future__ import annotations

@@ -7,7 +7,7 @@
 - ``specialist``: the merged file, tuned for that count alone;
 - ``tuned``: the whole base, tuned for as many steps;
 - ``prefix``: one file whose prefixes are the counts, by removal error, tuned with random prefixes
-(``tuning.tune``);
+  (``tuning.tune``);
 - ``ranking``: prefixes by removal error without tuning;
 - ``kept``: no rival, but what ``export --keep`` writes of one adapted file, a plain file per count.
 

@@ -1,8 +1,8 @@
 """Time and memory of the commands by the number of Gaussians.
 
-    python benchmarks/scaling.py            # some 15 minutes, 12 GB of memory, 8 GB of disk python
-    benchmarks/scaling.py --only adapt --sizes 100000 1000000 python benchmarks/scaling.py --table
-    # the tables of docs/performance.md, from the stored rows
+    python benchmarks/scaling.py    # some 15 minutes, 12 GB of memory, 8 GB of disk
+    python benchmarks/scaling.py --only adapt --sizes 100000 1000000
+    python benchmarks/scaling.py --table    # the tables of docs/performance.md, from stored rows
 
 Runs each command in its own process on synthetic towns, which are kept in benchmarks/cache.
 Measures wall and CPU seconds and peak memory. A town of 1000 Gaussians gives the start-up cost.

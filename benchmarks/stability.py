@@ -1,10 +1,9 @@
 """Numerical stability: the equation against 50 digits, stiffness, extreme scenes, popping. For
 docs/performance.md.
 
-    python benchmarks/stability.py                   # everything, then the tables and the pictures
-    python benchmarks/stability.py --only scenes     # one part; the rows of the others stay python
-    benchmarks/stability.py --page            # the tables and the pictures again, from the stored
-    rows
+    python benchmarks/stability.py    # everything, then the tables and the pictures
+    python benchmarks/stability.py --only scenes    # one part; the rows of the others stay
+    python benchmarks/stability.py --page    # the tables and the pictures, from the stored rows
 
 Rows go to ``results/stability.jsonl``, where they replace those of the parts that were run. The
 tables of docs/performance.md are printed, its pictures are written.

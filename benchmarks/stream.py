@@ -1,10 +1,11 @@
 """The dial against streamed sets of levels, both drawn as a viewer draws them: PSNR at equal
 budgets.
 
-    python benchmarks/stream.py SCENE.ply --record                                # without
-    photographs python benchmarks/stream.py SCENE.ply --author LEVEL.ply ... --record         # and
-    the levels that its author ships python benchmarks/stream.py SCENE.ply --images FOLDER --record
-    # with photographs python benchmarks/stream.py --table
+    python benchmarks/stream.py SCENE.ply --record    # without photographs
+    python benchmarks/stream.py SCENE.ply --images FOLDER --record    # with photographs
+    # and the levels that its author ships
+    python benchmarks/stream.py SCENE.ply --author LEVEL.ply ... --record
+    python benchmarks/stream.py --table
 
 SCENE is adapted without options. Its rivals are sets whose finest level is SCENE itself: halved
 again and again by splat-transform (``make peers``) in both its ways, and the author's own.

@@ -1,8 +1,8 @@
 """Held-out error against seconds of training: ours, the paper's form, prefixes, a specialist for
 each dial value.
 
-    python benchmarks/tradeoff.py plush_half python benchmarks/tradeoff.py plush_half --plot     #
-    docs/images/error_vs_time.png, from the stored rows
+    python benchmarks/tradeoff.py plush_half
+    python benchmarks/tradeoff.py plush_half --plot    # docs/images/error_vs_time.png, stored rows
 
 Each number of steps is a separate run with its own schedule. A specialist is the base merged to the
 count that ours keeps at that dial value, by the better of splat-transform's methods, then tuned for

@@ -1,13 +1,12 @@
 """Budgets: the dial value for a number of Gaussians, a PSNR drop, or a frame rate.
 
 - A count needs no measurement. From one camera a Gaussian is kept iff s is below its extinction
-scale ``sigma_d / d``,
-  so the dial that keeps n lies between the n-th and the (n+1)-th largest; for the mean over V
-  cameras, of the pooled scales and n V. Exact but for scales that are equal.
+  scale ``sigma_d / d``, so the dial that keeps n lies between the n-th and the (n+1)-th largest;
+  for the mean over V cameras, of the pooled scales and n V. Exact but for scales that are equal.
 - PSNR is read from the calibration table that is stored with the file (``calibration.py``).
 - Frame rates depend on the machine, the image size and the load: frames are timed, from cameras.
-The table's times are
-  used only where they are passed in, or (``clod-adapt export``) where nothing can be timed.
+  The table's times are used only where they are passed in, or (``clod-adapt export``) where nothing
+  can be timed.
 
 A budget that s = 1 meets gives 1 and a note. Only a count is met beyond ``max_sv``, where nothing
 was trained, with a note.

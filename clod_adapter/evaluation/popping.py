@@ -9,11 +9,12 @@ of step k, step k changes it by
 
 A fade changes the image in proportion to the length of the step, a jump by a constant amount:
 
-    ratio       = max change / mean change              1 if all steps are equal, n for one switch
-    within n steps persistence = max change / max change over 2 steps  1/2 for a fade, 1 for a jump
-    or a flicker, about 0.7 if many
-                  (I_c(k+1) - I_c(k-1))                 small jumps at different places add up in
-                  every step
+    ratio       = max change / mean change
+    persistence = max change / max change over 2 steps  (I_c(k+1) - I_c(k-1))
+
+The ratio is 1 if all steps are equal, and n for one switch within n steps. The persistence is 1/2
+for a fade, 1 for a jump or a flicker, about 0.7 if many small jumps at different places add up in
+every step.
 
 ``max change (2 - 1 / persistence)`` approximates the largest change in the limit of short steps. A
 single Gaussian hardly changes the root mean square, so the largest change of a pixel is measured

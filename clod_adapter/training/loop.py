@@ -53,9 +53,9 @@ def adapt(
 
     - ``progress`` returns False. In a group of processes all of them end after the same step.
     - Ctrl-C, or another signal whose handler is Python's default one. The step under way is
-    completed first, so the
-      parameters are those of a whole step; a second Ctrl-C raises KeyboardInterrupt at once. Before
-      the first step is complete, a Ctrl-C raises KeyboardInterrupt as everywhere.
+      completed first, so the parameters are those of a whole step; a second Ctrl-C raises
+      KeyboardInterrupt at once. Before the first step is complete, a Ctrl-C raises
+      KeyboardInterrupt as everywhere.
     - A process of the group is lost, or the loss of a step is not finite.
 
     Any other error during a step is raised, after a last call of ``progress``. The result is finite

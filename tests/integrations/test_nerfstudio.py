@@ -3,14 +3,12 @@ viewer and its export.
 
 Skipped where nerfstudio is absent. Without CUDA, open3d and pymeshlab, beside the packages of dev:
 
-    pip install --no-deps nerfstudio==1.1.5 gsplat==1.4.0 nerfacc==0.5.2 torchmetrics pytorch-msssim
-    timm==0.6.7 \\
-        viser==0.2.7 tyro==0.9.8 tensorboard==2.14.1 "protobuf<=3.20.3" tensorly lightning-utilities
-        comet_ml wandb
-    pip install opencv-python-headless scikit-learn xatlas trimesh splines appdirs pyquaternion
-    rawpy fpsample h5py \\
-        pathos av gdown plotly python-socketio msgpack msgpack-numpy shtab docstring-parser
-        typeguard msgspec yourdfpy
+    pip install --no-deps nerfstudio==1.1.5 gsplat==1.4.0 nerfacc==0.5.2 torchmetrics \\
+        pytorch-msssim timm==0.6.7 viser==0.2.7 tyro==0.9.8 tensorboard==2.14.1 \\
+        "protobuf<=3.20.3" tensorly lightning-utilities comet_ml wandb
+    pip install opencv-python-headless scikit-learn xatlas trimesh splines appdirs pyquaternion \\
+        rawpy fpsample h5py pathos av gdown plotly python-socketio msgpack msgpack-numpy shtab \\
+        docstring-parser typeguard msgspec yourdfpy
 
 gsplat's kernels are torch (``gsplat_in_torch``); open3d, pymeshlab and the weights of LPIPS are
 absent.

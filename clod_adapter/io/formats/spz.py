@@ -10,12 +10,10 @@ Records of vendors follow, flagged in the header: type, length, bytes; readers s
 Two are written:
 
 - Adobe's of the axes: a checkpoint's (x right, y down, z ahead). The format's own are OpenGL's, but
-the reference's
-  ``ply_to_spz``, splat-transform, SuperSplat and gsply all leave those of the PLY: turned, it would
-  be upside down;
+  the reference's ``ply_to_spz``, splat-transform, SuperSplat and gsply all leave those of the PLY:
+  turned, it would be upside down;
 - ours, ``RECORD``: the length of the JSON document (``settings.document``) as uint32, the document,
-then the dial's
-  columns as float16, to 5e-4: sigma_d, or those that the document names as
+  then the dial's columns as float16, to 5e-4: sigma_d, or those that the document names as
   ``"columns": ["sigma_d", "growth_d"]``. Larger values become 65504. Of sigma_d that is no end in
   practice: ``(d s / 65504)^4`` of an opacity is gone.
 """
