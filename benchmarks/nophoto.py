@@ -14,7 +14,7 @@ from dataclasses import asdict
 
 import clod_adapter as clod
 from adapt import at_shares
-from clod_adapter.training.pseudo_views import add_pseudo_views, render_pseudo_views
+from clod_adapter.training.pseudo_views import with_pseudo_views
 from common import append, arguments, checkpoint, stored, table
 from common import photographs as photographs_of
 
@@ -47,10 +47,9 @@ def run(scene: str, kind: str, config: clod.AdaptConfig, few: int | None) -> Non
         photographs = clod.Scene(train, photographs.test)
     base_row = clod.evaluate(base, photographs.test, [1.0])[0]
     began, views = time.perf_counter(), photographs
-    if kind == "placed":
-        views = render_pseudo_views(base, clod.place_cameras(base, seed=config.seed))
-    if kind == "complemented":
-        views = add_pseudo_views(base, photographs, config.seed)
+    if kind != "photographs":
+        shown = None if kind == "placed" else photographs
+        views = with_pseudo_views(base, shown, config.seed)
     seconds = time.perf_counter() - began
     plan = clod.make_plan(base, views, config)
     adapted = plan.adapt(views)

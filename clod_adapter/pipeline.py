@@ -13,12 +13,12 @@ from clod_adapter.cameras import Scene
 from clod_adapter.config import PLACED_MAX_SV, AdaptConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.calibrate import calibrate, report_dials, with_frame_times
-from clod_adapter.evaluation.evaluate import Row, evaluate
+from clod_adapter.evaluation.evaluate import Row, evaluate_all
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.adapter_file import save_adapter
 from clod_adapter.io.atomic import atomic_paths
 from clod_adapter.io.checkpoint import Checkpoint, save
-from clod_adapter.progress import Listener
+from clod_adapter.progress import Listener, Stopped
 from clod_adapter.training.plan import Override, Plan
 from clod_adapter.training.planner import make_plan
 from clod_adapter.training.pseudo_views import with_pseudo_views
@@ -99,8 +99,8 @@ def adapt_checkpoint(
         scene: posed photographs; without them the checkpoint's own renders are the truth.
         config: by default ``AdaptConfig()``, without photographs with max_sv PLACED_MAX_SV.
         override: decisions of the plan that are fixed in advance.
-        progress: called after each step of each phase; stops if it returns False, in training with
-            the result so far.
+        progress: called after each step of each phase; stops if it returns False. In training the
+            result so far is kept, and in the measurements after it the result without these.
         misaligned_ok: train although the checkpoint does not match the photographs.
 
     Raises:
@@ -108,20 +108,26 @@ def adapt_checkpoint(
         Stopped: ``progress`` returned False before training.
     """
     notes, alignment, against = list[str](), None, "checkpoint" if scene is None else "photographs"
-    config = config or (AdaptConfig() if scene else AdaptConfig(max_sv=PLACED_MAX_SV))
+    if config is None:
+        config = AdaptConfig(max_sv=PLACED_MAX_SV) if scene is None else AdaptConfig()
     if scene is not None:
         scene, alignment = align(base, scene, notes.append, required=not misaligned_ok)
         base = detect_filter(base, [*scene.test, *scene.train], notes.append)
     scene = with_pseudo_views(base.gaussians, scene, config.seed, progress)
     config = config.for_views(len(scene.train))
-    base_rows = evaluate(base.gaussians, scene.test, [1.0], progress=progress) if scene.test else []
+    base_rows = evaluate_all(base.gaussians, scene.test, [1.0], progress) if scene.test else []
     plan = make_plan(base.gaussians, scene, config, override, progress)
     adapted = plan.adapt(scene, progress)
     notes += [*base.notes, *scene.notes, *adapted.notes]
     result = extract_result(base, scene, against, plan, adapted, config)
     result = replace(result, base_rows=base_rows, alignment=alignment)
     if scene.test and not adapted.interrupted:
-        result = calibrated(_measured(result, config.max_sv, progress), notes.append)
+        try:
+            result = calibrated(
+                _measured(result, config.max_sv, progress, notes.append), notes.append
+            )
+        except Stopped as stopped:
+            notes.append(f"the result is not measured: {stopped}")
     return replace(result, notes=tuple(dict.fromkeys(notes)))
 
 
@@ -148,16 +154,16 @@ def calibrated(result: Result, note: Note) -> Result:
     return replace(result, adapter=replace(result.adapter, calibration=found))
 
 
-def _measured(result: Result, max_sv: float, progress: Listener | None) -> Result:
+def _measured(result: Result, max_sv: float, progress: Listener | None, note: Note) -> Result:
     """The result with its rows on the held-out views, and with frame times that can be compared."""
     views, plain = result.scene.test, detach(result.gaussians)
+    rows = evaluate_all(result.gaussians, views, report_dials(max_sv), progress)
     measured = [
         (result.base.gaussians, result.base_rows),
-        (
-            result.gaussians,
-            evaluate(result.gaussians, views, report_dials(max_sv), progress=progress),
-        ),
-        (plain, evaluate(plain, views, [1.0], progress=progress)),
+        (result.gaussians, rows),
+        (plain, evaluate_all(plain, views, [1.0], progress)),
     ]
-    (base_rows, rows, plain_rows), _ = with_frame_times(measured, views, progress)
+    (base_rows, rows, plain_rows), notes = with_frame_times(measured, views, progress)
+    for line in notes:
+        note(line)
     return replace(result, base_rows=base_rows, rows=rows, plain=plain_rows)

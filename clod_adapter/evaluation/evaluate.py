@@ -17,7 +17,7 @@ from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.frame_times import timed_frame
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.losses import psnr_ssim
-from clod_adapter.progress import Listener, Phase, Progress
+from clod_adapter.progress import Listener, Phase, Progress, Stopped
 from clod_adapter.render import render
 
 SCORED = 4  # views whose SSIM is computed at a time: each takes 83 bytes a pixel
@@ -96,6 +96,24 @@ def evaluate(
         rows.append(Row(virtual_scale, psnr, ssim, kept, share, in_view, frame_ms))
         if stopped:
             break
+    return rows
+
+
+def evaluate_all(
+    gaussians: Gaussians,
+    views: Sequence[View],
+    virtual_scales: Sequence[float],
+    progress: Listener | None = None,
+) -> list[Row]:
+    """``evaluate`` of every dial value.
+
+    Raises:
+        ClodError: as ``evaluate``.
+        Stopped: ``progress`` returned False before the last row.
+    """
+    rows = evaluate(gaussians, views, virtual_scales, progress=progress)
+    if len(rows) < len(virtual_scales):
+        raise Stopped(f"stopped after {len(rows)} of {len(virtual_scales)} rows")
     return rows
 
 

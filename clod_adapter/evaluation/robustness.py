@@ -13,7 +13,7 @@ from clod_adapter.adapter import Adapter, detach, extract
 from clod_adapter.cameras import Scene, View
 from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
-from clod_adapter.evaluation.evaluate import evaluate
+from clod_adapter.evaluation.evaluate import evaluate_all
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.checkpoint import Checkpoint
 from clod_adapter.progress import Listener, Phase, Stopped, tell, within
@@ -67,7 +67,7 @@ def adapt_at_range(
         origin=file.origin,
     )
     result = adapter.apply(base)
-    rows = _rows(result, scene.test, virtual_scales, progress)
+    rows = [row.as_dict() for row in evaluate_all(result, scene.test, virtual_scales, progress)]
     return CellResult(rows, distribution(result), adapter, adapted.start_seconds + adapted.seconds)
 
 
@@ -80,23 +80,10 @@ def baseline(
     for k, share in enumerate(shares):
         # in their own order
         pruned = base.select(order[: max(1, round(share * len(base)))].sort().values)
-        (row,) = _rows(
-            pruned, views, [1.0], within(progress, k * len(views), len(shares) * len(views))
-        )
-        rows.append(row | {"kept_share": len(pruned) / len(base)})
+        part = within(progress, k * len(views), len(shares) * len(views))
+        (row,) = evaluate_all(pruned, views, [1.0], part)
+        rows.append(row.as_dict() | {"kept_share": len(pruned) / len(base)})
     return CellResult(rows, distribution(base))
-
-
-def _rows(
-    gaussians: Gaussians,
-    views: Sequence[View],
-    virtual_scales: Sequence[float],
-    progress: Listener | None,
-) -> list[dict[str, float]]:
-    rows = evaluate(gaussians, views, virtual_scales, progress=progress)
-    if len(rows) < len(virtual_scales):
-        raise Stopped(f"stopped after {len(rows)} of {len(virtual_scales)} rows")
-    return [row.as_dict() for row in rows]
 
 
 def distribution(gaussians: Gaussians) -> dict[str, Any]:

@@ -71,17 +71,19 @@ def with_far(
         raise ClodError(WITHOUT_FAR)
     views = spread(views, MOST_VIEWS)
     pseudo = [isinstance(view, PseudoView) for view in views]
-    placed = all(pseudo)
-    share, nearer = (PLACED_SHARE, PLACED_NEARER) if placed else (SHARE, NEARER)
-    if any(pseudo) and not placed:
-        share = FEW_SHARE
+    if all(pseudo):
+        share, nearer = PLACED_SHARE, PLACED_NEARER
+    elif any(pseudo):
+        share, nearer = FEW_SHARE, NEARER
+    else:
+        share, nearer = SHARE, NEARER
     cameras = [view.camera for view in views]
     attenuation = config.attenuation(scene_distance(base, views))
     some = base.means[:: len(base) // SAMPLE + 1]
     distances = torch.cat([normalized_distances(some, camera, attenuation) for camera in cameras])
     near = float(distances.kthvalue(max(round(nearer * len(distances)), 1)).values)
     error = removal_error(base, views, seed=config.seed, progress=progress)
-    if placed:  # such cameras do not show everything
+    if all(pseudo):  # such cameras do not show everything
         error = supposed_error(base, error)
     far = merge(base, error.sqrt() * base.opacities, max(round(share * len(base)), 1), progress)
     pruned = pruning_order(far, importance(far, views, config, progress), progress)

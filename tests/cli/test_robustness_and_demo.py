@@ -22,6 +22,7 @@ from clod_adapter import demo as gallery
 from clod_adapter.cli.adapt import listeners
 from clod_adapter.cli.adapt import run as adapt_run
 from clod_adapter.evaluation import robustness as experiment
+from clod_adapter.progress import Phase, Progress
 from clod_adapter.report.page import Picture
 from clod_adapter.training import pseudo_views
 from runs import names, pressing, results
@@ -59,11 +60,33 @@ def test_the_command_a_cell_and_python_train_the_same(
     assert clod_adapter.load("python.ply").calibration.rows[0].psnr == result.rows[0].psnr
 
 
-def test_the_command_and_python_train_the_same_without_photographs(clod: Any, capture: Any) -> None:
+def test_the_command_and_python_train_the_same_without_photographs(
+    clod: Any, capture: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        pseudo_views, "place_cameras", partial(pseudo_views.place_cameras, views=16)
+    )
     clod("BASE --iters 3 --out dial.ply --accept-loss")
     settings = clod_adapter.AdaptConfig(iters=3, max_sv=config.PLACED_MAX_SV)
     clod_adapter.adapt_checkpoint(load(capture.ply), config=settings).save("python.ply")
     assert results(Path(), "python") == results(Path())
+
+
+@pytest.mark.parametrize("phase", [Phase.EVALUATION, Phase.FRAME_TIMES])
+def test_a_stop_after_training_keeps_the_result(capture: Any, tmp_path: Path, phase: Phase) -> None:
+    trained = list[bool]()
+
+    def progress(done: Progress) -> bool:
+        trained.append(done.phase is Phase.TRAINING)
+        return not (any(trained) and done.phase is phase)
+
+    scene = load_scene(capture.scene)
+    settings = clod_adapter.AdaptConfig(iters=3)
+    result = clod_adapter.adapt_checkpoint(load(capture.ply), scene, settings, progress=progress)
+    assert result.adapted.steps == 3 and not result.rows and result.base_rows
+    assert any("not measured" in note for note in result.notes)
+    result.save(tmp_path / "stopped.ply")
+    assert load(tmp_path / "stopped.ply").gaussians == result.gaussians
 
 
 def stamps(folder: Path) -> dict[str, int]:
