@@ -68,7 +68,7 @@ def run(page: Any, shader: str, table: str) -> list[float]:
         SHADERS.joinpath(shader).read_text(encoding="utf-8"),
         [row[:4] for row in STORED[table]],
     )
-    if shader.endswith("glsl"):
+    if not shader.endswith("wgsl"):  # the HLSL is of what both languages have
         return list(page.evaluate(WEBGL, [source, CALLS[table], rows]))
     statements = "let a = vec4f(rows[at], rows[at + 1], rows[at + 2], rows[at + 3]);"
     return [
@@ -88,7 +88,7 @@ def page(chromium: Any) -> Iterator[Any]:
         yield page
 
 
-@pytest.mark.parametrize("shader", ["attenuation.glsl", "attenuation.wgsl"])
+@pytest.mark.parametrize("shader", ["attenuation.glsl", "attenuation.hlsl", "attenuation.wgsl"])
 def test_shaders_match_the_golden_values(page: Any, shader: str) -> None:
     for table in ("rows", "near_rows"):
         for got, row in zip(run(page, shader, table), STORED[table], strict=True):

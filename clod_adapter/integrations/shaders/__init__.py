@@ -1,4 +1,4 @@
-"""The equation for renderers in other languages: ``attenuation.glsl``, ``attenuation.wgsl``,
+"""The equation for renderers in other languages: ``attenuation.glsl``, ``.hlsl`` and ``.wgsl``,
 ``golden.json``.
 
 ``golden.json`` has test cases for such functions, with the names of its columns. A float32 result
