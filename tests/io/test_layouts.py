@@ -101,6 +101,16 @@ def test_glb_in_pygltflib(tmp_path: Path) -> None:
     assert node.rotation == [0, 0, 1, 0] and node.translation == [-ORIGIN[0], -ORIGIN[1], ORIGIN[2]]
 
 
+def test_glb_under_a_scaled_node(tmp_path: Path) -> None:
+    """The scale is applied, which a note says."""
+    plain = gaussians(5, 2, 0)
+    write(tmp_path / "a.glb", plain)
+    found = load(change_glb(tmp_path / "a.glb", lambda g: g["nodes"][0].update(scale=[2, 2, 2])))
+    torch.testing.assert_close(found.gaussians.means, plain.means * 2)
+    torch.testing.assert_close(found.gaussians.scales, plain.scales * 2, rtol=1e-5, atol=0)
+    assert any("scales it by 2" in note for note in found.notes)
+
+
 def test_glb_of_another_program(tmp_path: Path) -> None:
     """Interleaved, in short integers, moved, without metadata: sigma_d then has the default
     settings.
@@ -117,6 +127,18 @@ def test_glb_of_another_program(tmp_path: Path) -> None:
     )
     assert moved.origin == NOWHERE
     change_glb(path, lambda g: g["nodes"][0].pop("translation"))
+    # glTF's y up from z up as an exporter nests it: a parent turns, another turns back and moves
+    quarter = [0.0, 0.0, 0.5**0.5, 0.5**0.5]
+    nested = [
+        {"children": [2], "rotation": quarter, "translation": [1.0, 2.0, 3.0]},
+        {"matrix": [0, 1, 0, 0, -1, 0, 0, 0, 0, 0, 1, 0, 4, 0, 0, 1], "mesh": 0},
+        {"children": [1], "scale": [1, 1, 1]},
+    ]
+    change_glb(path, lambda g: g.update(nodes=nested))
+    torch.testing.assert_close(
+        load(path).gaussians.means, model(0, 5).means + torch.tensor([-1.0, -6.0, 3.0])
+    )
+    change_glb(path, lambda g: g.update(nodes=[{"mesh": 0, "rotation": [0, 0, 1, 0]}]))
     rows = np.zeros(
         5, [("position", "<f4", 3), ("rotation", "<i2", 4), ("opacity", "u1"), ("pad", "u1", 3)]
     )

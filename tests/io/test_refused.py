@@ -274,8 +274,12 @@ OF_GLB: tuple[tuple[Callable[[dict[str, Any]], object], str], ...] = (
         lambda g: g["meshes"][0]["primitives"][0]["extensions"][KHR].update(extensions={"x": {}}),
         "compressed",
     ),
-    (lambda g: g["nodes"][0].update(rotation=[0, 1, 0, 0]), "scaled or turned"),
-    (lambda g: g["nodes"].append({"children": [0]}), "scaled or turned"),
+    (lambda g: g["nodes"][0].update(rotation=[0, 1, 0, 0]), "turned, mirrored or stretched"),
+    (lambda g: g["nodes"][0].update(scale=[1, 1, 2]), "turned, mirrored or stretched"),
+    (lambda g: g["nodes"][0].update(scale=[1, 1, -1]), "turned, mirrored or stretched"),
+    (lambda g: g["nodes"][0].update(scale=[2, 2, 2]), "scales a dial by 2"),
+    (lambda g: g["nodes"][0].update(children=[0]), "in a circle"),
+    (lambda g: g["nodes"][0].update(translation=[float("inf")] * 3), "not finite"),
     (lambda g: g.pop("accessors"), "damaged"),
 )
 OF_SPZ: tuple[tuple[Content, str], ...] = (

@@ -206,7 +206,7 @@ def read(path: Path, data: bytes) -> Source:
         if len({len(each) for each in (*arrays.values(), *rest)}) > 1:
             raise ClodError(f"{path}: its attributes are of different lengths; {_REMEDY}")
         text = gltf["asset"].get("extras", {}).get(KEY)
-        turned, moved = _placed(path, gltf, mesh)
+        scale, turned, moved = _placed(path, gltf, mesh)
     space = primitive["extensions"][EXTENSION].get("colorSpace", COLOR_SPACE)
     notes = (
         [f"its colours are in {space!r:.40}, and taken as {COLOR_SPACE}"]
@@ -221,6 +221,12 @@ def read(path: Path, data: bytes) -> Source:
     stored, changed = _stored(arrays, str(gltf["asset"].get("generator")))
     notes += changed
     stored = stored if turned else half_turn(stored, "z")
+    if scale != 1 and SIGMA in arrays:
+        raise ClodError(f"{path}: its node scales a dial by {scale:g}; take the scale away")
+    if scale != 1:
+        stored["means"] = stored["means"] * np.float32(scale)
+        stored["log_scales"] = stored["log_scales"] + np.float32(np.log(scale))
+        notes.append(f"its node scales it by {scale:g}, which is applied")
     if moved != metadata.origin:  # another program moved the node
         wide = stored["means"].astype(np.float64) + moved
         near = not any(origin_of(wide))  # float32 has enough digits
@@ -299,31 +305,51 @@ def _whole(value: Any) -> int:
     return value
 
 
-def _placed(path: Path, gltf: dict[str, Any], mesh: int) -> tuple[bool, Origin]:
-    """Whether the node of the mesh makes the half turn, and its translation as an origin in the
-    axes of checkpoints.
+def _placed(path: Path, gltf: dict[str, Any], mesh: int) -> tuple[float, bool, Origin]:
+    """How the nodes above a mesh place it: their scale, whether they make the half turn, and their
+    translation as an origin in the axes of checkpoints.
     """
     nodes: list[dict[str, Any]] = gltf.get("nodes", [])
-    number = next((number for number, node in enumerate(nodes) if node.get("mesh") == mesh), -1)
-    node = nodes[number] if number >= 0 else {}
-    below = any(number in other.get("children", []) for other in nodes)
-    rotation = [float(value) for value in node.get("rotation", IDENTITY)]
-    scale = [float(value) for value in node.get("scale", [1, 1, 1])]
-    turned = np.allclose(np.abs(rotation), HALF_TURN)
-    if (
-        below
-        or "matrix" in node
-        or scale != [1, 1, 1]
-        or not (turned or np.allclose(np.abs(rotation), IDENTITY))
-    ):
+    parents = {child: number for number, node in enumerate(nodes) for child in _children(node)}
+    number = next((number for number, node in enumerate(nodes) if node.get("mesh") == mesh), None)
+    placed, steps = np.eye(4), 0
+    while number is not None and steps <= len(nodes):
+        placed = _matrix(path, nodes[number]) @ placed
+        number, steps = parents.get(number), steps + 1
+    if number is not None:
+        raise ClodError(f"{path}: its nodes are above each other in a circle; export it again")
+    linear = placed[:3, :3]
+    scale = float(np.cbrt(np.linalg.det(linear)))
+    turned = linear[0, 0] < 0
+    straight = np.diag([-1.0, -1.0, 1.0] if turned else [1.0, 1.0, 1.0])
+    if scale <= 0 or not np.allclose(linear, scale * straight, rtol=0, atol=1e-5 * scale):
         raise ClodError(
-            f"{path}: its node is scaled or turned, which is not undone; apply that and export it"
-            " again"
+            f"{path}: its node is turned, mirrored or stretched, which is not undone; apply that"
+            " and export it again"
         )
-    x, y, z = (float(value) for value in node.get("translation", [0, 0, 0]))
-    if not np.isfinite([x, y, z]).all():
-        raise ClodError(f"{path}: its node has a translation that is not finite; export it again")
-    return turned, (0.0 - x, 0.0 - y, z)
+    x, y, z = map(float, placed[:3, 3])
+    # a rounded scale of 1 changes no value
+    return (1.0 if abs(scale - 1) < 1e-6 else scale), bool(turned), (0.0 - x, 0.0 - y, z)
+
+
+def _children(node: dict[str, Any]) -> list[int]:
+    return [_whole(child) for child in node.get("children", [])]
+
+
+def _matrix(path: Path, node: dict[str, Any]) -> np.ndarray:
+    """``[4, 4]`` of a node, from its own axes into its parent's."""
+    from scipy.spatial.transform import Rotation
+
+    if "matrix" in node:  # by columns
+        matrix = np.array(node["matrix"], np.float64).reshape(4, 4).T
+    else:
+        matrix = np.eye(4)
+        matrix[:3, :3] = Rotation.from_quat(node.get("rotation", IDENTITY)).as_matrix()
+        matrix[:3, :3] *= np.array(node.get("scale", [1, 1, 1]), np.float64)
+        matrix[:3, 3] = node.get("translation", [0, 0, 0])
+    if not np.isfinite(matrix).all():
+        raise ClodError(f"{path}: its node has numbers that are not finite; export it again")
+    return matrix
 
 
 def _stored(
