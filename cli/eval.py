@@ -78,7 +78,7 @@ def check(args: Namespace) -> None:
 def outputs(args: Namespace) -> Outputs:
     if not args.report:
         return Outputs()
-    page, *charts = common.page_files(Path(args.report), ["rendering"])
+    page, *charts = common.page_files(Path(args.report))
     return Outputs([page], charts, inputs=paths(args), scene=args.images)
 
 

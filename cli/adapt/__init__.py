@@ -62,9 +62,7 @@ def check(args: Namespace) -> None:
 def outputs(args: Namespace) -> Outputs:
     files = AdaptFiles.of(args.ply, args.out)
     check_ply_name(files.ply, "--out")
-    page = (
-        page_files(files.ply.with_suffix(".html"), ["rendering", "adapting"]) if args.report else []
-    )
+    page = page_files(files.ply.with_suffix(".html"), "adapting") if args.report else []
     named, default = ([], [files.ply]) if args.out is None else ([files.ply], [])
     derived = [*default, files.adapter, files.report, files.state, *page]
     return Outputs(named, derived, inputs=[args.ply], scene=args.images)
@@ -91,7 +89,7 @@ outputs (existing files are replaced):
   OUT.safetensors  the adapter: "clod-adapt apply" rebuilds OUT.ply from it
   OUT.json         the report: settings, machine, times, and quality on held-out
                    photographs (every 8th by name) per dial value
-  OUT.html, OUT_rendering.png, OUT_adapting.png
+  OUT.html, OUT_count.png, OUT_rendering.png, OUT_adapting.png
                    with --report: a self-contained page and its charts; needs
                    matplotlib (pip install matplotlib)
 The same seed gives the same Gaussians, bit for bit, on as many threads; so does

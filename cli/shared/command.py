@@ -24,7 +24,7 @@ from clod_adapter.config import (
 from clod_adapter.errors import ClodError
 from clod_adapter.io.file_formats import PLY, check_readable, file_has_dial, format_of
 from clod_adapter.io.scene.folder import find_cameras
-from clod_adapter.report.charts import chart_file, check_matplotlib
+from clod_adapter.report.charts import QUANTITIES, chart_file, check_matplotlib
 
 from .console import Console
 from .process import check_printed, launched
@@ -208,12 +208,12 @@ def given_budget(args: Namespace) -> tuple[str, str, list[float]] | None:
     return None
 
 
-def page_files(path: Path, charts: list[str]) -> list[Path]:
+def page_files(path: Path, *more: str) -> list[Path]:
     """The files of a page and its charts; refuses a page that cannot be written."""
     check_matplotlib()
     if path.suffix.lower() != ".html":
         raise ClodError(f"{path}: --report names the page to write, so it must end in .html")
-    return [path, *(chart_file(path, name) for name in charts)]
+    return [path, *(chart_file(path, name) for name in (*QUANTITIES, *more))]
 
 
 def check_dials(args: Namespace, model: str) -> None:

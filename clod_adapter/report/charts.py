@@ -1,5 +1,5 @@
-"""The common style of figures, and charts of error against rendering time and adapting time, as PNG
-or SVG.
+"""The common style of figures, and charts of error against the number of Gaussians, rendering time
+and adapting time, as PNG or SVG.
 
 Their series are rows that ``clod-adapt --json`` and ``clod-adapt eval --json`` print. matplotlib is
 an optional dependency, imported when a figure is drawn.
@@ -7,6 +7,7 @@ an optional dependency, imported when a figure is drawn.
 
 import importlib.util
 import io
+import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -48,10 +49,12 @@ STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",  # keeps text as text in a page
 }
 Draw = Callable[[Any], None]  # of the axes of an empty figure
-SIZE, NARROW = (7.2, 4.1), (4.0, 4.0)  # inches; NARROW for phones
+SIZE, NARROW = (7.2, 4.1), (4.0, 4.0)  # inches, without the legend; NARROW for phones
 MARGINS = (0.75, 0.5, 0.65, 0.1)  # left, bottom, right and top of the axes, inches
+COLUMN, LINE = 2.4, 0.19  # of the legend, inches
 MARKERS = "oDs^vPX"
 ROOM = (38, 11)  # points that a label takes
+FEWEST_TICKS, MOST_TICKS = 3, 9
 BASE = "base, unadapted"
 
 
@@ -97,17 +100,30 @@ def chart_file(page: Path, name: str) -> Path:
 
 @contextmanager
 def chart(draw: Draw, size: tuple[float, float]) -> Iterator[Any]:
-    """A figure with the chart in fixed margins, whose layout takes no time."""
+    """A figure with the chart in fixed margins, whose layout takes no time; higher than ``size`` by
+    the legend.
+    """
     (left, bottom, right, top), (width, height) = MARGINS, size
     with new_figure(size) as figure:
-        place = (
-            left / width,
-            bottom / height,
-            1 - (left + right) / width,
-            1 - (bottom + top) / height,
+        axes = figure.add_subplot()
+        draw(axes)
+        entries = len(axes.get_legend().get_texts())
+        above = top + LINE * -(-entries // _columns(axes))
+        figure.set_size_inches(width, height + above)
+        axes.set_position(
+            (
+                left / width,
+                bottom / (height + above),
+                1 - (left + right) / width,
+                (height - bottom) / (height + above),
+            )
         )
-        draw(figure.add_axes(place))
         yield figure
+
+
+def _columns(axes: Any) -> int:
+    """How many columns of a legend have room."""
+    return max(int(axes.figure.get_size_inches()[0] / COLUMN), 1)
 
 
 def inline_svg(draw: Draw, name: str, label: str) -> list[str]:
@@ -134,20 +150,26 @@ def inline_svg(draw: Draw, name: str, label: str) -> list[str]:
     return found
 
 
-def draw_rendering(axes: Any, series: Sequence[Series]) -> None:
-    """Draws error against milliseconds per frame: lines for files with a dial, points for
-    others.
-    """
+QUANTITIES = {
+    "rendering": ("frame_ms", "milliseconds per frame (log scale)"),
+    "count": ("kept", "Gaussians drawn, thousands (log scale)"),
+}
+
+
+def draw_rows(axes: Any, series: Sequence[Series], quantity: str) -> None:
+    """Draws error against one of QUANTITIES: lines for files with a dial, points for others."""
+    key, label = QUANTITIES[quantity]
+    unit_of_axis = 1000 if quantity == "count" else 1
     notes = list[tuple[str, tuple[float, float]]]()
     for k, one in enumerate(series):
-        points = [(row["frame_ms"], row["psnr"]) for row in one.rows]
+        points = [(row[key] / unit_of_axis, row["psnr"]) for row in one.rows]
         _line(axes, k, one.label, points, linestyle="-" if one.dial else "none")
         if one.dial:
             notes += [
                 (f"s = {row['virtual_scale']:g}", at)
                 for row, at in zip(one.rows, points, strict=True)
             ]
-    _finish(axes, "milliseconds per frame (log scale)")
+    _finish(axes, label)
     # Labels of points, without those that would cover another; the first and the last come first.
     unit, placed = axes.figure.dpi / 72, list[Any]()
     for text, at in sorted(notes, key=lambda note: note not in (notes[0], notes[-1])):
@@ -201,13 +223,28 @@ def _finish(axes: Any, label: str) -> None:
     axes.invert_yaxis()
     axes.secondary_yaxis("right").set_ylabel("PSNR (dB)")
     axes.set_ylabel("mean squared error, thousandths (log scale)")
+    axes.set_yticks(_round_errors(*axes.get_ylim()))
     axes.yaxis.set_major_formatter(lambda psnr, _: f"{1e3 * error(psnr):.3g}")
     left, far = axes.get_xlim()
     label_log(axes.xaxis, "{:,g}", (1, 2, 5) if far / left > 20 else (1, 1.5, 2, 3, 4, 5, 7))
-    axes.legend(loc="best")
+    # above the axes it covers nothing
+    axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=_columns(axes), borderaxespad=0)
     axes.annotate(
         "better", (0.012, 0.018), xycoords="axes fraction", fontsize=8, color=QUIET, style="italic"
     )
+
+
+def _round_errors(low: float, high: float) -> list[float]:
+    """The PSNR of round errors, in the densest of some series of which few are in the range."""
+    low, high = sorted((low, high))
+    decades = range(math.floor(-high / 10), math.ceil(-low / 10) + 1)
+    ticks = list[float]()
+    for steps in ((1,), (1, 2, 5), (1, 1.5, 2, 3, 4, 5, 7), [k / 10 for k in range(10, 100)]):
+        every = [-10 * math.log10(step) - 10 * decade for decade in decades for step in steps]
+        ticks = [psnr for psnr in every if low <= psnr <= high]
+        if len(ticks) >= FEWEST_TICKS:
+            break
+    return ticks[:: -(-len(ticks) // MOST_TICKS)] if ticks else ticks
 
 
 def check_matplotlib() -> None:

@@ -72,9 +72,10 @@ def write_page(
     path, own, series = Path(path), own_teacher(report), charts.series_of(report)
     # Against its own renders, the base has only rounding errors, far below the range of the charts.
     drawn = [one for one in series if not (own and one.label == charts.BASE)]
-    draws: dict[str, charts.Draw] = (
-        {"rendering": partial(charts.draw_rendering, series=drawn)} if drawn else {}
-    )
+    draws: dict[str, charts.Draw] = {
+        name: partial(charts.draw_rows, series=drawn, quantity=name)
+        for name in (charts.QUANTITIES if drawn else ())
+    }
     if training:
         base_psnr = None if own else training["base_psnr"]
         draws["adapting"] = partial(

@@ -15,7 +15,7 @@ import pytest
 from PIL import Image
 
 from clod_adapter.errors import ClodError
-from clod_adapter.report.charts import Series, draw_rendering, new_figure, series_of
+from clod_adapter.report.charts import Series, draw_rows, new_figure, series_of
 from clod_adapter.report.page import Picture, write_page
 
 pytest.importorskip("matplotlib")
@@ -148,7 +148,7 @@ def test_charts() -> None:
         Series("base", [row(1, 29.5, 25)]),
     ]
     with new_figure((6, 4)) as figure:
-        draw_rendering(figure.subplots(), series)
+        draw_rows(figure.subplots(), series, "rendering")
         figure.canvas.draw()
         (left,) = figure.axes
         assert left.get_xscale() == "log" and left.yaxis_inverted()
@@ -164,6 +164,10 @@ def test_charts() -> None:
         for tick, label in zip(left.get_yticks(), left.get_yticklabels(), strict=True):
             assert float(label.get_text()) == pytest.approx(1e3 * 10 ** (-tick / 10), rel=0.01)
         assert len(left.get_yticks()) >= 3
+        errors = [1e3 * 10 ** (-tick / 10) for tick in left.get_yticks()]
+        assert errors == pytest.approx([round(each, 1) for each in errors])
+        legend = left.get_legend().get_window_extent()
+        assert legend.y0 >= left.get_window_extent().y1  # above the curves
 
 
 def test_series_of_reports() -> None:

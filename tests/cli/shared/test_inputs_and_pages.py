@@ -134,6 +134,7 @@ def test_adapt(clod: Any, tmp_path: Path) -> None:
     files = {
         "page": "dial.html",
         "rendering": "dial_rendering.png",
+        "count": "dial_count.png",
         "adapting": "dial_adapting.png",
     }
     assert report["outputs"].items() >= files.items() and all(
@@ -153,7 +154,7 @@ def test_adapt(clod: Any, tmp_path: Path) -> None:
     assert (
         "take over in the distance" in text and "base.ply, a trained splat of 300 Gaussians" in text
     )
-    assert text.count("<svg") == 4
+    assert text.count("<svg") == 6
     assert text.count('data-name=""') == pages.FRAMES and text.count('data-name="base"') == 1
 
 
@@ -161,7 +162,11 @@ def test_eval(clod: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     """Without matplotlib the page is refused before any work."""
     pytest.importorskip("matplotlib")
     report = clod("eval DIAL --images SCENE --report look.html --json --base BASE").report
-    assert report["outputs"] == {"page": "look.html", "rendering": "look_rendering.png"}
+    assert report["outputs"] == {
+        "page": "look.html",
+        "rendering": "look_rendering.png",
+        "count": "look_count.png",
+    }
     text, page = page_of(tmp_path / "look.html")
     assert page["report"]["rows"] == report["rows"] and page["training"] is None
     assert 'data-name="base"' in text and "hold for base" in text
