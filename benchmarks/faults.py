@@ -93,7 +93,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder) / ROOT.name
         shutil.copytree(ROOT, copy, ignore=LEFT_OUT, symlinks=True)
-        # else the installed one is imported
+        # without the link the installed one is imported
         (copy / "clod_adapter" / "cli").symlink_to(copy / "cli")
         for name, entry in faults(args.faults):
             began = time.perf_counter()

@@ -173,7 +173,7 @@ def forecast(run: Run, plan: Plan) -> None:
     with run.console.status("timing a few steps ..."):
         each, fixed = time_steps(plan.start, run.scene, config, min(max(steps // 40, 16), 24))
     release()
-    # with saving the state
+    # a fiftieth more for saving the state
     training = fixed + min(1.02 * steps * each, config.time_budget or math.inf)
     dials, frame = (
         len(report_dials(config.max_sv)) + 1,

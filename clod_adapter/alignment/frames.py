@@ -172,7 +172,7 @@ def _gsplat(viewmats: Tensor, points: Tensor | None) -> Iterator[Frame]:
     poses = torch.linalg.inv(viewmats)
     rotation = _turning(-poses[:, :3, 1].mean(0), viewmats.new_tensor([0.0, -1, 0]))
     centres, forward = poses[:, :3, 3] @ rotation.T, poses[:, :3, 2] @ rotation.T
-    # as numpy's median
+    # quantile(0.5) is numpy's median; torch's takes the lower of two
     focus = (centres - (forward * centres).sum(1, keepdim=True) * forward).quantile(0.5, dim=0)
     distance = float((centres - focus).norm(dim=1).quantile(0.5))
     if distance == 0:

@@ -41,7 +41,7 @@ class Guess:
 
     frame: Frame
     psnr: float  # pooled, of the renders in that frame
-    # as far above the photographs' mean colours as files in their own frame are (DOUBTFUL)
+    # whether the PSNR is as far above that of the mean colours as that of files in their own frame
     clear: bool
 
 

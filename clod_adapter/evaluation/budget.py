@@ -216,7 +216,7 @@ def _for_count(
             )
             pools.append(gaussians.sigma_d[own].double() / distances(k)[own])
         pooled = torch.cat(pools)
-        # that is to be culled
+        # the first one to be culled
         first = float(pooled.kthvalue(len(pooled) - (wanted - fewest)).values)
         return DialValue(min(first * (1 + ROUNDING), largest), note)
     low, high = 1.0, largest

@@ -55,7 +55,7 @@ def _of_gsplat(typed: Typed) -> Typed:
     """
     name = typed.__name__
     projection = inspect.signature(gsplat.fully_fused_projection).parameters
-    # else that projection culls opacity 0
+    # a projection that knows opacities culls those of 0 itself
     hide = not (name == "rasterization" and "opacities" in projection)
 
     @functools.wraps(typed)

@@ -35,7 +35,7 @@ PER_CAMERA = (
     "thin_prism_coeffs",
     "rays",
 )
-# and the SH degree of each
+# arguments by Gaussian or by view and Gaussian, and the SH degree of each
 PER_EITHER = {"colors": "sh_degree", "extra_signals": "extra_signals_sh_degree"}
 GRADIENTS = ("means2d", "gradient_2dgs")
 

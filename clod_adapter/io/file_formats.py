@@ -186,7 +186,7 @@ def check_start(path: Path) -> None:
         refuse(path, start, f"is not a {suffix} file by its first bytes; copy or export it again")
     if suffix == ".spz" and start.startswith(NEW_SPZ):
         _call("formats.splat_transform.check", path)
-    # else any bytes are one
+    # a .splat has no header, so other bytes are known by size alone
     if suffix == ".splat" and (path.stat().st_size % 32 or start.startswith(b"ply")):
         refuse(
             path, start, "is not a .splat file, whose rows have 32 bytes; copy or export it again"

@@ -156,7 +156,7 @@ def _elements(data: bytes, head: Head) -> dict[str, np.ndarray]:
         # CR ends a line too
         lines = io.TextIOWrapper(io.BytesIO(data if head.ply.text else b""), "latin-1")
         if any(len(line) == _LONGEST for line in iter(lambda: lines.readline(_LONGEST), "")):
-            # which would be copied several times
+            # the parser copies a row several times
             raise ValueError(f"a row of more than {_LONGEST:,} characters")
         with warnings.catch_warnings(), np.errstate(over="ignore"):
             warnings.simplefilter("ignore")  # of text that is beyond float32's range
