@@ -20,11 +20,10 @@ import torch
 from PIL import Image
 
 Where = Literal["near", "far", "mixed"]
-# metres; square metres of surface of a lot; Gaussians on each
-PITCH = 24.0
-HOUSE = 12.0
-AREA = 1050.0
-DENSITY = 5.0
+PITCH = 24.0  # metres
+HOUSE = 12.0  # metres
+AREA = 1050.0  # square metres of surface of a lot
+DENSITY = 5.0  # Gaussians on each square metre
 SKY = 0.03  # share of the Gaussians
 # of a checkpoint, off the truth
 PERTURBED = {"means": 0.02, "log_scales": 0.15, "opacity_logits": 0.5, "sh0": 0.12}

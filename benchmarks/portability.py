@@ -2,7 +2,7 @@
 prints one table.
 
     python benchmarks/portability.py --record    # all conditions: an hour on two idle cores
-    # one, and two of them at once
+    # one condition, and two of them at once
     python benchmarks/portability.py plain no_root+c_locale --tests tests/io
 
 Run by another virtual environment's Python it tests the versions that are installed there. The

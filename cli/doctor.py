@@ -110,7 +110,7 @@ def execute(args: Namespace) -> dict[str, Any]:
                 with redirect_stdout(io.StringIO()):  # gsplat prints
                     ok, found, fix = check()
             except Exception as error:  # any is a result: the code belongs to other projects
-                # within the dispatching of a compiled function
+                # a Ctrl-C within the dispatching of a compiled function
                 if isinstance(error.__cause__, KeyboardInterrupt):
                     raise
                 ok, found, fix = False, f"{type(error).__name__}: {first_line(error)}", ""

@@ -65,11 +65,10 @@ def main(
             view.camera.width,
             view.camera.height,
             sh_degree=base.gaussians.sh_degree,
-            # dial
-            sigma_d=dial.sigma_d,
-            growth_d=dial.growth_d,
-            attenuation=dial.attenuation,
-            virtual_scale=s,
+            sigma_d=dial.sigma_d,  # dial
+            growth_d=dial.growth_d,  # dial
+            attenuation=dial.attenuation,  # dial
+            virtual_scale=s,  # dial
         )
         loss = photometric_loss(renders[0], view.image.to(device), 0.2)
         loss = dial.loss(s, loss)  # dial

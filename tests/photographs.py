@@ -14,7 +14,7 @@ from clod_adapter.cameras import Camera
 from models import write_model
 
 SIZE = {"width": 160, "height": 120}
-# of a transforms file
+# intrinsics of a transforms file
 INTRINSICS = {"fl_x": 30.0, "fl_y": 31.0, "cx": 19.25, "cy": 15.5, "w": 40, "h": 30}
 LENSES = {
     "SIMPLE_RADIAL": [140, 82, 58, -0.12],

@@ -125,7 +125,7 @@ def check(args: Namespace) -> None:
             folder and out.exists() and not out.is_dir(),
             f"{out}: is a file; with {folder}, --out must name a new folder",
         ),
-        # ".", never replaced
+        # "." is never replaced
         (folder and not out.name, f"{out}: is the current folder; --out must name a new one"),
     )
     suffix = "" if folder else suffix_of(out)

@@ -46,9 +46,8 @@ def read_checkpoint(
         checkpoint = load(path, activated=activated, origin=origin)
     gaussians = checkpoint.gaussians
     columns, drawn = " and ".join(dial_columns(gaussians.tensors())), gaussians.screen_filter
-    more = f", with {columns}" * bool(columns) + f", drawn with {drawn.description}" * (
-        drawn != CLASSIC
-    )
+    more = f", with {columns}" * bool(columns)
+    more += f", drawn with {drawn.description}" * (drawn != CLASSIC)
     far = f" and {len(gaussians) - gaussians.whole:,} far" if gaussians.near is not None else ""
     console.say(
         f"{path}: {gaussians.whole:,}{far} Gaussians, SH degree {gaussians.sh_degree}{more}"

@@ -151,7 +151,7 @@ def add_records(rows, filled, packed, spare, means, opacity, cam, w, records, de
     record, centre, targets = scratch(f32x16, RECORD), scratch(float32, 48), scratch(int64, 16)
     valid = covariance(cam, w)
     centres(means, rows, cam, centre)
-    # in float32 too, not only in float64
+    # beyond the near plane in float32 too, not only in float64
     valid = both(valid, ge(load(centre, 32), splat(cam[c.NEAR])))
     valid = both(valid, both(make_records(w, centre, opacity, cam, record), first_lanes(filled)))
     bits = bits_of(valid)

@@ -7,10 +7,9 @@ import numpy as np
 from clod_adapter._kernels import threads
 
 ROWS = 1 << 17  # rows whose neighbours are in memory at a time
-CROWD = 64  # Gaussians with equal centres, from which on these are displaced,
-# by this share of their size: a k-d tree cannot split equal points, and compares each with all
-# others
-JITTER = 1e-6
+# Gaussians with equal centres, from which on they are displaced, and by which share of their size:
+# a k-d tree cannot split equal points, and compares each with all others.
+CROWD, JITTER = 64, 1e-6
 
 
 def nearest(centres: np.ndarray, count: int) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:

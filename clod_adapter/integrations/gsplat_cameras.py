@@ -130,7 +130,7 @@ def _cameras(given: dict[str, Any], shape: torch.Size) -> Iterator[dict[str, Any
         places = dict.fromkeys(PER_GAUSSIAN, batch) | dict.fromkeys(PER_CAMERA, camera)
         for name, degree in PER_EITHER.items():
             if isinstance(value := given.get(name), Tensor):
-                # of N rows, or of N rows of K coefficients
+                # before N rows, or before N rows of K coefficients
                 leading = value.dim() - (2 if given[degree] is None else 3)
                 places[name] = camera if leading == len(shape) else batch if leading else ...
         yield {
@@ -181,7 +181,7 @@ def _joined_meta(metas: Sequence[dict[str, Any]], shape: torch.Size) -> dict[str
             if name in counted:
                 values = [ids + start for ids, start in zip(values, counted[name], strict=False)]
             of_images = name == "isect_offsets" or value.dim() == 4
-            # of the Inria wrappers
+            # means2d of the Inria wrappers has none
             without_camera = name == "means2d" and value.dim() == 2 and not packed
             joined[name] = (torch.stack if without_camera else torch.cat)(values)
             if of_images or not (packed or name in counted):

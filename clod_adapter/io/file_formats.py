@@ -186,14 +186,13 @@ def check_start(path: Path) -> None:
         refuse(path, start, f"is not a {suffix} file by its first bytes; copy or export it again")
     if suffix == ".spz" and start.startswith(NEW_SPZ):
         _call("formats.splat_transform.check", path)
-    # a .splat has no header, so other bytes are known by size alone
+    # a .splat has no header: other files are known by their size, and a PLY by its first bytes
     if suffix == ".splat" and (path.stat().st_size % 32 or start.startswith(b"ply")):
         refuse(
             path, start, "is not a .splat file, whose rows have 32 bytes; copy or export it again"
         )
-    if suffix == ".safetensors" and '"clod-adapter"' in _call(
-        "tensor_file.read_tensor_header", path
-    )[1].get(KEY, ""):
+    header = _call("tensor_file.read_tensor_header", path)[1] if suffix == ".safetensors" else {}
+    if '"clod-adapter"' in header.get(KEY, ""):
         raise ClodError(
             f"{path}: is an adapter, not a model; clod-adapt apply BASE.ply {path.name} -o OUT.ply"
         )

@@ -35,7 +35,7 @@ from clod_adapter.io.values import (
 MASK_COLUMNS = ("masks_0", "masks_1")
 HEADER_LIMIT = 1 << 20  # bytes
 _LONGEST = 1 << 20  # characters of a row of text
-# by CloudCompare, by 3dgsconverter
+# prefixes by CloudCompare and by 3dgsconverter
 _PREFIXED = rb"(?<=[\r\n])(property[ \t]+\w+[ \t]+)(?:scal(?:ar)?_)+"
 UNPREFIXED = (
     "saved by CloudCompare: its properties are read, and written, without the prefix scalar_"

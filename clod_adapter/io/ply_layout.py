@@ -55,7 +55,7 @@ _SETTINGS: dict[str, tuple[str, str, Any]] = {
     "screen_variance": (FILTER, "variance", None),
     "compensate": (FILTER, "compensate", True),
 }
-# of ``settings.EARLIER``
+# the columns of ``settings.EARLIER``
 _EARLIER = {"clod_tau", "clod_eps", "clod_hard_cut", "clod_max", "clod_quantile"}
 _USUAL = {DIAL: asdict(AttenuationConfig()), FILTER: asdict(CLASSIC)}
 _INSTEAD = {SIGMA: "use a large number for no end", GROWTH: "use 0 for no growth"}
@@ -268,7 +268,7 @@ def write_rows(
         for name in own
     ]
     kind = np.dtype(kinds + [(name, np.dtype("f4")) for name in (*constants, *dial)])
-    # of which plyfile makes a header without the rows
+    # plyfile makes a header of this without the rows
     one = np.broadcast_to(np.zeros((), kind), len(gaussians))
     element = PlyElement.describe(one, "vertex", comments=write_comments(metadata))
     with open(path, "wb") as file, np.errstate(over="ignore", invalid="ignore"):

@@ -41,7 +41,7 @@ KINDS = {
         ),
     ),
 }
-# for ``refused_if_damaged``
+# what is wrong and what to do, for ``refused_if_damaged``
 DAMAGED = "its settings are damaged", "restore them, or export the file again"
 # Settings of a dial before every Gaussian had a reach.
 EARLIER = {"tau", "eps", "cut", "normalizer"}

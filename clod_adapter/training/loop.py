@@ -90,7 +90,7 @@ def adapt(
     lean = base if config.lr_shN > 0 else base.without_empty_bands()
     views = usable_views(lean, scene.train)
     with shown(False if progress is None and group and group.rank else progress) as listener:
-        # of a resumed run too: the same again
+        # for a resumed run too, the same again
         begun = _initialized(lean, views, config, listener, group)
         trainer = Trainer(begun, views, config, group)
         trainer.empty_sh = None if lean is base else base.shN.clone()

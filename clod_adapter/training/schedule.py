@@ -22,7 +22,7 @@ class Schedule:
 
     full: float = 0.5  # share of the steps at s = 0 and s = 1 at first
     unattenuated: float = 0.25  # of these: at s = 0, where every Gaussian is as it is stored
-    # of itself, to which that falls linearly: s = 1 is learned before the far end
+    # the share that full falls to linearly: s = 1 is learned before the far end
     full_final: float = 0.4
     # share of the training in which steps beyond s = 1 have photographs of half the size
     coarse: float = 0.9

@@ -239,7 +239,7 @@ def read(path: Path, data: bytes) -> Source:
     records = _records(data[end:]) if flags & EXTENDED else {}
     stored, dial = _ours(path, records[RECORD], count) if RECORD in records else (None, {})
     metadata = parse_metadata(path, stored, dial=bool(dial))
-    # without a record as converters write them
+    # the axes; a file without a record has those that converters write
     axes = int.from_bytes(records.get(AXES, bytes([RDF])), "little")
     if axes not in _TURNS:
         raise ClodError(
@@ -256,7 +256,7 @@ def read(path: Path, data: bytes) -> Source:
         arrays[SIGMA] = gaussians.tensors()[SIGMA].numpy()
         metadata = replace(metadata, attenuation=gaussians.attenuation)
     antialiased = flags & ANTIALIASED and not (metadata.screen_filter or CLASSIC).compensate
-    # of another program, which states no variance
+    # the file is then another program's, which states no variance
     comments = (*metadata.about, TAG) if antialiased else metadata.about
     return Source(arrays, metadata, (QUANTISED,), comments)
 

@@ -27,7 +27,7 @@ MAX_BYTES = 256 * 2**20  # a hundred thousand frames have a tenth of that
 SMALLER = ("images_2", "images_4", "images_8")
 RAW = "input"  # Inria's name for the photographs before they are undistorted into images
 MASKS = ("masks", "mask")
-# of masks
+# what is said of masks
 UNUSED = (
     "not used: where the checkpoint is empty under them, put them into the photographs' alpha"
     " channel"

@@ -46,7 +46,7 @@ LARGE = 1 << 26  # pixels; a larger photograph is reduced first
 BAND = 64  # rows of the reduced photograph that are made at a time
 REDUCED = f"have more than {LARGE / 1e6:.0f} million pixels, which takes long: reduced first"
 Turn = Image.Transpose
-# of EXIF: sides are swapped
+# EXIF orientations that swap the sides
 _TURNS = {5: Turn.TRANSPOSE, 6: Turn.ROTATE_270, 7: Turn.TRANSVERSE, 8: Turn.ROTATE_90}
 _ORIENTATION, _BITS, _PLANES = 0x0112, 258, 284  # tags of EXIF and TIFF
 SCALED = "scaled {} (Pillow bicubic, as in Inria's code)"
