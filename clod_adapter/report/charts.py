@@ -162,12 +162,14 @@ def draw_rows(axes: Any, series: Sequence[Series], quantity: str) -> None:
     unit_of_axis = 1000 if quantity == "count" else 1
     notes = list[tuple[str, tuple[float, float]]]()
     for k, one in enumerate(series):
-        points = [(row[key] / unit_of_axis, row["psnr"]) for row in one.rows]
+        rows = [row for row in one.rows if row[key] > 0]  # a log axis has no 0
+        if not rows:
+            continue
+        points = [(row[key] / unit_of_axis, row["psnr"]) for row in rows]
         _line(axes, k, one.label, points, linestyle="-" if one.dial else "none")
         if one.dial:
             notes += [
-                (f"s = {row['virtual_scale']:g}", at)
-                for row, at in zip(one.rows, points, strict=True)
+                (f"s = {row['virtual_scale']:g}", at) for row, at in zip(rows, points, strict=True)
             ]
     _finish(axes, label)
     # Labels of points, without those that would cover another; the first and the last come first.
@@ -235,7 +237,7 @@ def _finish(axes: Any, label: str) -> None:
 
 
 def _round_errors(low: float, high: float) -> list[float]:
-    """The PSNR of round errors, in the densest of some series of which few are in the range."""
+    """The PSNR of round errors: of the coarsest series of steps with FEWEST_TICKS in the range."""
     low, high = sorted((low, high))
     decades = range(math.floor(-high / 10), math.ceil(-low / 10) + 1)
     ticks = list[float]()

@@ -170,6 +170,17 @@ def test_charts() -> None:
         assert legend.y0 >= left.get_window_extent().y1  # above the curves
 
 
+def test_a_chart_by_count_leaves_out_nothing_drawn() -> None:
+    """A log axis has no 0."""
+    empty = row(40, 5) | {"kept": 0}
+    series = [Series("dial", [row(1, 30), row(2, 25), empty], dial=True), Series("base", [empty])]
+    with new_figure((6, 4)) as figure:
+        draw_rows(figure.subplots(), series, "count")
+        figure.canvas.draw()
+        (dial,) = figure.axes[0].get_lines()
+        assert dial.get_ydata().tolist() == [30, 25]
+
+
 def test_series_of_reports() -> None:
     """The dial, the base and its pruned versions, other files, and the file without its dial; rows
     without a PSNR.
