@@ -107,8 +107,8 @@ def chart(draw: Draw, size: tuple[float, float]) -> Iterator[Any]:
     with new_figure(size) as figure:
         axes = figure.add_subplot()
         draw(axes)
-        entries = len(axes.get_legend().get_texts())
-        above = top + LINE * -(-entries // _columns(axes))
+        lines = math.ceil(len(axes.get_legend().get_texts()) / _columns(axes))
+        above = top + LINE * lines
         figure.set_size_inches(width, height + above)
         axes.set_position(
             (
@@ -150,22 +150,22 @@ def inline_svg(draw: Draw, name: str, label: str) -> list[str]:
     return found
 
 
+# by the name of the chart: the value of a row, the unit of the axis, its label
 QUANTITIES = {
-    "rendering": ("frame_ms", "milliseconds per frame (log scale)"),
-    "count": ("kept", "Gaussians drawn, thousands (log scale)"),
+    "rendering": ("frame_ms", 1, "milliseconds per frame (log scale)"),
+    "count": ("kept", 1000, "Gaussians drawn, thousands (log scale)"),
 }
 
 
 def draw_rows(axes: Any, series: Sequence[Series], quantity: str) -> None:
     """Draws error against one of QUANTITIES: lines for files with a dial, points for others."""
-    key, label = QUANTITIES[quantity]
-    unit_of_axis = 1000 if quantity == "count" else 1
+    key, unit, label = QUANTITIES[quantity]
     notes = list[tuple[str, tuple[float, float]]]()
     for k, one in enumerate(series):
         rows = [row for row in one.rows if row[key] > 0]  # a log axis has no 0
         if not rows:
             continue
-        points = [(row[key] / unit_of_axis, row["psnr"]) for row in rows]
+        points = [(row[key] / unit, row["psnr"]) for row in rows]
         _line(axes, k, one.label, points, linestyle="-" if one.dial else "none")
         if one.dial:
             notes += [
@@ -173,9 +173,9 @@ def draw_rows(axes: Any, series: Sequence[Series], quantity: str) -> None:
             ]
     _finish(axes, label)
     # Labels of points, without those that would cover another; the first and the last come first.
-    unit, placed = axes.figure.dpi / 72, list[Any]()
+    point, placed = axes.figure.dpi / 72, list[Any]()
     for text, at in sorted(notes, key=lambda note: note not in (notes[0], notes[-1])):
-        x, y = axes.transData.transform(at) / unit
+        x, y = axes.transData.transform(at) / point
         if all(abs(x - other[0]) > ROOM[0] or abs(y - other[1]) > ROOM[1] for other in placed):
             placed.append((x, y))
             axes.annotate(
@@ -246,7 +246,7 @@ def _round_errors(low: float, high: float) -> list[float]:
         ticks = [psnr for psnr in every if low <= psnr <= high]
         if len(ticks) >= FEWEST_TICKS:
             break
-    return ticks[:: -(-len(ticks) // MOST_TICKS)] if ticks else ticks
+    return ticks[:: max(math.ceil(len(ticks) / MOST_TICKS), 1)]
 
 
 def check_matplotlib() -> None:

@@ -44,6 +44,13 @@ def shorter(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(search, "MOST_TRIALS", 8)
 
 
+@pytest.fixture
+def few_placed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without photographs 16 cameras are placed."""
+    few = partial(pseudo_views.place_cameras, views=16)
+    monkeypatch.setattr(pseudo_views, "place_cameras", few)
+
+
 class Done(NamedTuple):
     """What a run printed."""
 

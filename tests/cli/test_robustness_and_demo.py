@@ -60,12 +60,8 @@ def test_the_command_a_cell_and_python_train_the_same(
     assert clod_adapter.load("python.ply").calibration.rows[0].psnr == result.rows[0].psnr
 
 
-def test_the_command_and_python_train_the_same_without_photographs(
-    clod: Any, capture: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(
-        pseudo_views, "place_cameras", partial(pseudo_views.place_cameras, views=16)
-    )
+@pytest.mark.usefixtures("few_placed")
+def test_the_command_and_python_train_the_same_without_photographs(clod: Any, capture: Any) -> None:
     clod("BASE --iters 3 --out dial.ply --accept-loss")
     settings = clod_adapter.AdaptConfig(iters=3, max_sv=config.PLACED_MAX_SV)
     clod_adapter.adapt_checkpoint(load(capture.ply), config=settings).save("python.ply")

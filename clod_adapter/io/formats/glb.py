@@ -221,9 +221,9 @@ def read(path: Path, data: bytes) -> Source:
     stored, changed = _stored(arrays, str(gltf["asset"].get("generator")))
     notes += changed
     stored = stored if turned else half_turn(stored, "z")
-    if scale != 1 and SIGMA in arrays:
-        raise ClodError(f"{path}: its node scales a dial by {scale:g}; take the scale away")
     if scale != 1:
+        if SIGMA in arrays:
+            raise ClodError(f"{path}: its node scales a dial by {scale:g}; take the scale away")
         stored["means"] = stored["means"] * np.float32(scale)
         stored["log_scales"] = stored["log_scales"] + np.float32(np.log(scale))
         notes.append(f"its node scales it by {scale:g}, which is applied")
@@ -310,12 +310,17 @@ def _placed(path: Path, gltf: dict[str, Any], mesh: int) -> tuple[float, bool, O
     translation as an origin in the axes of checkpoints.
     """
     nodes: list[dict[str, Any]] = gltf.get("nodes", [])
-    parents = {child: number for number, node in enumerate(nodes) for child in _children(node)}
+    parents = {
+        _whole(child): number
+        for number, node in enumerate(nodes)
+        for child in node.get("children", [])
+    }
     number = next((number for number, node in enumerate(nodes) if node.get("mesh") == mesh), None)
-    placed, steps = np.eye(4), 0
-    while number is not None and steps <= len(nodes):
-        placed = _matrix(path, nodes[number]) @ placed
-        number, steps = parents.get(number), steps + 1
+    placed = np.eye(4)
+    for _ in nodes:  # at most as many are above each other
+        if number is not None:
+            placed = _matrix(path, nodes[number]) @ placed
+            number = parents.get(number)
     if number is not None:
         raise ClodError(f"{path}: its nodes are above each other in a circle; export it again")
     linear = placed[:3, :3]
@@ -330,10 +335,6 @@ def _placed(path: Path, gltf: dict[str, Any], mesh: int) -> tuple[float, bool, O
     x, y, z = map(float, placed[:3, 3])
     # a rounded scale of 1 changes no value
     return (1.0 if abs(scale - 1) < 1e-6 else scale), bool(turned), (0.0 - x, 0.0 - y, z)
-
-
-def _children(node: dict[str, Any]) -> list[int]:
-    return [_whole(child) for child in node.get("children", [])]
 
 
 def _matrix(path: Path, node: dict[str, Any]) -> np.ndarray:

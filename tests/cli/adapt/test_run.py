@@ -6,7 +6,6 @@ import json
 import re
 import shlex
 import shutil
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,6 @@ import clod_adapter
 from clod_adapter._support.machine import machine_name
 from clod_adapter.cli import adapt
 from clod_adapter.config import AdaptConfig
-from clod_adapter.training import pseudo_views
 from clod_adapter.training.plan import NAMES
 from models import write_model
 from runs import OUTPUTS, names, rebuilt, results
@@ -198,11 +196,9 @@ def test_without_held_out_photographs(clod: Any, capture: Any, tmp_path: Path) -
     clod("eval dial.ply --images one", code=2)
 
 
+@pytest.mark.usefixtures("few_placed")
 def test_without_photographs(clod: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The target images are renders of the base, rounded to bytes."""
-    monkeypatch.setattr(
-        pseudo_views, "place_cameras", partial(pseudo_views.place_cameras, views=16)
-    )
     # dB, more than the result has
     monkeypatch.setattr("clod_adapter.cli.adapt.run.ENOUGH", (50.0, 25.0))
     done = clod("BASE", TINY, "--json")
