@@ -8,6 +8,7 @@ from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
+from refusals import refused
 
 from clod_adapter._support.text import as_text, file_name
 from clod_adapter.errors import ClodError
@@ -67,7 +68,7 @@ def test_failure_keeps_only_the_old_files(tmp_path: Path, error: BaseException) 
         first.write_bytes(b"new")
         temporary.write_bytes(b"half")
         raise error
-    with pytest.raises(ClodError, match="cannot be written"), atomic_paths(*finals) as (first, _):
+    with refused("cannot be written"), atomic_paths(*finals) as (first, _):
         first.write_bytes(b"new")  # and the other not at all
     assert [final.read_bytes() for final in finals] == [b"old", b"old"] and len(
         os.listdir(tmp_path)
@@ -86,7 +87,7 @@ def test_several_files_are_replaced_together(
     old, absent, last = (tmp_path / name for name in ("old", "absent", "last"))
     old.write_bytes(b"old")
     with (
-        pytest.raises(ClodError, match=r"last: cannot be written"),
+        refused(r"last: cannot be written"),
         atomic_paths(old, absent, last) as temporaries,
     ):
         for temporary in temporaries:
@@ -113,7 +114,7 @@ def test_unwritable_targets_are_refused(tmp_path: Path, monkeypatch: pytest.Monk
         if message == "not writable":
             # root may write anywhere, so chmod proves nothing
             monkeypatch.setattr(os, "access", lambda *_: False)
-        with pytest.raises(ClodError, match=message), atomic_path(path):
+        with refused(message), atomic_path(path):
             raise AssertionError("the body must not run")
     assert target.read_text() == "earlier" and list(tmp_path.iterdir()) == [target.parent]
 
@@ -137,7 +138,7 @@ def test_lock_keeps_other_processes_out_until_its_own_is_killed(tmp_path: Path) 
     remove_leftovers(final)  # as a second run would
     for path, name in ((final, final), (tmp_path / "OUT.ply", Path("all"))):
         with (
-            pytest.raises(ClodError, match=f"^{name}: another run is writing it; wait for that"),
+            refused(f"^{name}: another run is writing it; wait for that"),
             output_lock(path, of=name),
         ):
             raise AssertionError("the body must not run")

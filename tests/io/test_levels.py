@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from torch.testing import assert_close
 
 import scenes
 from clod_adapter import load
@@ -81,8 +82,8 @@ def test_index_and_tiles(tmp_path: Path) -> None:
             and tile.get("children", True)
         )
         gltf, found = read_tile(tmp_path / tile["content"]["uri"], tmp_path)
-        torch.testing.assert_close(found.means, want.means, rtol=0, atol=1e-4)
-        torch.testing.assert_close(found.log_scales, want.log_scales, rtol=0, atol=0.04)
+        assert_close(found.means, want.means, rtol=0, atol=1e-4)
+        assert_close(found.log_scales, want.log_scales, rtol=0, atol=0.04)
         primitive = gltf["meshes"][0]["primitives"][0]
         assert primitive["extensions"]["KHR_gaussian_splatting"]["extensions"] == {
             tileset.SPZ: {"bufferView": 0}
@@ -143,6 +144,6 @@ def test_cells_hold_every_gaussian_once(tmp_path: Path, monkeypatch: pytest.Monk
             read_tile(tmp_path / tile["content"]["uri"], tmp_path)[1].means for tile in of_level
         ]
         assert all(len(part) <= 100 for part in parts) and sum(map(len, parts)) == len(want)
-        torch.testing.assert_close(
+        assert_close(
             torch.cat(parts).double().sum(0), want.means.double().sum(0), rtol=0, atol=0.02
         )

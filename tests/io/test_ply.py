@@ -7,10 +7,12 @@ import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
 from plyfile import PlyElement
+from refusals import refused
+from torch.testing import assert_close
 
 from clod_adapter.config import SH_COUNTS, AttenuationConfig
-from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import SH_C0
 from clod_adapter.inspection.report import inspect
 from clod_adapter.io.checkpoint import Checkpoint, load, save
@@ -78,7 +80,7 @@ def test_every_layout_round_trips(
     bands = SH_COUNTS[degree] - 1
     columns |= {f"f_rest_{c * bands + k}": g.shN[:, k, c] for k in range(bands) for c in range(3)}
     for name, values in (columns | {"opacity": g.opacity_logits}).items():
-        np.testing.assert_array_equal(values, f32[name])
+        assert_array_equal(values, f32[name])
 
     generator, changes = torch.Generator().manual_seed(seed), {}
     for name, old in g.tensors().items():
@@ -165,9 +167,7 @@ def test_unusable_rows_are_dropped_and_counted(tmp_path: Path) -> None:
     vertex["y"][10] = 1e300
     vertex["growth_d"][11] = np.inf
     checkpoint = load(write_rows(tmp_path / "in.ply", vertex))
-    np.testing.assert_array_equal(
-        checkpoint.gaussians.means[:, 1], vertex["y"][[4, 8, 9]].astype("f4")
-    )
+    assert_array_equal(checkpoint.gaussians.means[:, 1], vertex["y"][[4, 8, 9]].astype("f4"))
     assert checkpoint.gaussians.opacities[0] == 1
     assert checkpoint.notes[:4] == (
         "2 of 15 Gaussians dropped: MaskGaussian existence probability below 0.5",
@@ -183,7 +183,7 @@ def test_unusable_rows_are_dropped_and_counted(tmp_path: Path) -> None:
 def test_refused_saves(tmp_path: Path) -> None:
     base = load(write_rows(tmp_path / "in.ply", random_rows(3, needed(1))))
     g, out = base.gaussians, tmp_path / "out.ply"
-    refused = [
+    cases = [
         (out, g.select(torch.tensor([0, 2])), "Gaussians .2, SH degree 1, .* do not fit"),
         (out, g.replace(shN=torch.zeros(3, 0, 3)), "degree 0"),
         (out, g.replace(opacity_logits=torch.full((3,), torch.inf)), "opacity_logits"),
@@ -193,7 +193,7 @@ def test_refused_saves(tmp_path: Path) -> None:
         g.replace(sigma_d=torch.ones(3), attenuation=CONFIG),
         torch.tensor([1.0, torch.inf, torch.nan]),
     )
-    refused += [
+    cases += [
         (
             out,
             dial.replace(sigma_d=bad),
@@ -206,10 +206,10 @@ def test_refused_saves(tmp_path: Path) -> None:
         ),
         (out, g.replace(means=bad.expand(3, 3)), "means holds a new value that is not finite"),
     ]
-    for path, changed, message in refused:
-        with pytest.raises(ClodError, match=message):
+    for path, changed, message in cases:
+        with refused(message):
             save(path, changed, base)
-    with pytest.raises(ClodError, match="out.ply: there are no Gaussians"):
+    with refused("out.ply: there are no Gaussians"):
         save(out, g.select(torch.zeros(3, dtype=torch.bool)))
     assert list(tmp_path.iterdir()) == [tmp_path / "in.ply"]
 
@@ -222,8 +222,8 @@ def test_other_formats_keep_what_the_base_says(tmp_path: Path) -> None:
     save(tmp_path / "out.pt", some, base)
     again = load(tmp_path / "out.pt", origin=(10.0, 20.0, 3.0))
     assert again.comments == ("from a trainer",)
-    torch.testing.assert_close(again.gaussians.means, some.means)
-    with pytest.raises(ClodError, match="never overwritten"):
+    assert_close(again.gaussians.means, some.means)
+    with refused("never overwritten"):
         save(tmp_path / "out.pt", again.gaussians, again)
     assert repr(again) == f"Checkpoint('{tmp_path}/out.pt', 9, SH degree 1, dial to 7 with growth)"
 
@@ -253,7 +253,7 @@ def test_rows_are_those_of_the_file_whatever_happens_to_it_later(
     assert found.notes == ("not carried over to outputs: element intrinsic, element face",)
     assert found.vertex.dtype == vertex.dtype and found.vertex.dtype.isnative
     for name in vertex.dtype.names:
-        np.testing.assert_array_equal(found.vertex[name], vertex[name])
+        assert_array_equal(found.vertex[name], vertex[name])
 
 
 @pytest.mark.parametrize("order", ["<", "ascii"])
@@ -292,9 +292,7 @@ def test_rgb_of_nerfstudio(tmp_path: Path) -> None:
     rows["red"] = [0, 51, 102, 204, 255]
     found = load(write_rows(tmp_path / "in.ply", rows))
     assert found.gaussians.sh_degree == 0 and found.notes == (COLOURED,)
-    np.testing.assert_allclose(
-        0.5 + SH_C0 * found.gaussians.sh0[:, 0, 0], [0, 0.2, 0.4, 0.8, 1], atol=1e-6
-    )
+    assert_allclose(0.5 + SH_C0 * found.gaussians.sh0[:, 0, 0], [0, 0.2, 0.4, 0.8, 1], atol=1e-6)
     save(tmp_path / "out.ply", found.gaussians, found)
     again = load(tmp_path / "out.ply")
     assert again.gaussians == found.gaussians and again.vertex.dtype.names == (*needed(), "label")

@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 import torch
 from plyfile import PlyData
+from refusals import refused
 from safetensors.torch import load_file, save_file
 
 from clod_adapter.adapter import detach, extract, with_dial
 from clod_adapter.calibration import Calibration, Viewpoint
 from clod_adapter.config import CLASSIC, FILTERS, AttenuationConfig, ScreenFilter
 from clod_adapter.equation.units import estimated_distance, in_world_units
-from clod_adapter.errors import ClodError
 from clod_adapter.inspection.report import inspect
 from clod_adapter.integrations.splats import to_gsplat
 from clod_adapter.io.adapter_file import load_adapter, save_adapter
@@ -72,17 +72,13 @@ def test_every_format_uses_the_reader(tmp_path: Path, kind: str) -> None:
     for screen_filter in (CLASSIC, ScreenFilter(variance=0.123456789, compensate=True)):
         assert read(written(path, screen_filter)) == (ATTENUATION, screen_filter, CALIBRATION, [])
     damage = f"{kind}: its settings are damaged .*MESSAGE.*; restore them, or export"
-    with pytest.raises(
-        ClodError, match=damage.replace("MESSAGE", "compensate is .*, it must be true or false")
-    ):
+    with refused(damage.replace("MESSAGE", "compensate is .*, it must be true or false")):
         read(
             change_setting(
                 path, *(("0.123456789", "True", "Yess") if ply else ("compensate", "true", "7e+2"))
             )
         )
-    with pytest.raises(
-        ClodError, match=damage.replace("MESSAGE", "reference_distance is -3.21, it must be")
-    ):
+    with refused(damage.replace("MESSAGE", "reference_distance is -3.21, it must be")):
         read(change_setting(written(path), "reference_distance", "3.217", "-3.21"))
     notes = ["settings unknown to this version ignored: 'max_sx'"]
     notes += ["settings that are missing have their defaults: max_sv"]
@@ -100,7 +96,7 @@ def test_every_format_uses_the_reader(tmp_path: Path, kind: str) -> None:
             and note == "the calibration is of 41 Gaussians and ignored, these are 40"
         )
     if not ply:
-        with pytest.raises(ClodError, match=f"{kind}: its format 9 is too new.*upgrade"):
+        with refused(f"{kind}: its format 9 is too new.*upgrade"):
             read(
                 change_setting(
                     written(path), "format_version", "3" if "adapter" in kind else "1", "9"
@@ -109,7 +105,7 @@ def test_every_format_uses_the_reader(tmp_path: Path, kind: str) -> None:
         old, new = (
             ("clod-adapter", "clod-strange") if "adapter" in kind else ("clod-model", "clod-other")
         )
-        with pytest.raises(ClodError, match=f"{kind}: is not an? .*'{new}'"):
+        with refused(f"{kind}: is not an? .*'{new}'"):
             read(change_setting(written(path), "", old, new))
 
 
@@ -127,10 +123,7 @@ def test_damaged_settings_are_refused(tmp_path: Path) -> None:
         ("screen_filter 0.3", "no 'compensate'"),
         ("screen_filter -1 True", "variance is -1.0, it must be between"),
     ):
-        with pytest.raises(
-            ClodError,
-            match=f"a.ply: its settings are damaged .*{message}.*; restore them, or export",
-        ):
+        with refused(f"a.ply: its settings are damaged .*{message}.*; restore them, or export"):
             load(described(tmp_path / "a.ply", "max_sv 5", comment))
 
 
@@ -182,10 +175,7 @@ def test_a_dial_of_the_earlier_form_is_refused(tmp_path: Path) -> None:
         )
     for make in made:
         path = make()
-        with pytest.raises(
-            ClodError,
-            match=f"^{path}: its dial is of an earlier form.*; adapt its checkpoint again",
-        ):
+        with refused(f"^{path}: its dial is of an earlier form.*; adapt its checkpoint again"):
             read(path)
 
 
@@ -233,7 +223,7 @@ def test_columns_of_other_programs_and_damaged_columns(tmp_path: Path) -> None:
             "property clod_paper must be one value for all rows and has several",
         ),
     ):
-        with pytest.raises(ClodError, match=message):
+        with refused(message):
             load(without_comments(tmp_path / "a.ply", **columns))
 
 
