@@ -33,12 +33,19 @@ def save_adapter(path: str | Path, adapter: Adapter) -> None:
     Raises:
         ClodError: its config is not plain JSON, or the file cannot be written.
     """
-    a, tensors = adapter, {**dial_tensors(adapter), **adapter.updates}
-    tensors |= {ADDED + name: tensor for name, tensor in a.added.items()}
-    settings = Metadata(a.attenuation, a.screen_filter, a.calibration, a.origin, version=a.version)
-    about: dict[str, Any] = {"base_sha256": a.base_fingerprint, "config": a.config}
+    tensors = {**dial_tensors(adapter), **adapter.updates}
+    tensors |= {ADDED + name: tensor for name, tensor in adapter.added.items()}
+    settings = Metadata(
+        adapter.attenuation,
+        adapter.screen_filter,
+        adapter.calibration,
+        adapter.origin,
+        version=adapter.version,
+    )
     try:
-        text = document(ADAPTER, settings, **about)
+        text = document(
+            ADAPTER, settings, base_sha256=adapter.base_fingerprint, config=adapter.config
+        )
     except (TypeError, ValueError) as error:
         raise ClodError(
             f"the adapter's config is not plain JSON ({error}); use finite numbers and strings"
@@ -59,11 +66,8 @@ def load_adapter(path: str | Path) -> Adapter:
     about, settings = _description(path, metadata)
     assert settings.attenuation is not None
     with refused_if_damaged(path, "its tensors or settings are damaged", DAMAGED[1]):
-        added = {
-            name.removeprefix(ADDED): tensors.pop(name)
-            for name in [*tensors]
-            if name.startswith(ADDED)
-        }
+        names = [name for name in tensors if name.startswith(ADDED)]
+        added = {name.removeprefix(ADDED): tensors.pop(name) for name in names}
         return Adapter(
             added=added,
             sigma_d=tensors.pop("sigma_d"),

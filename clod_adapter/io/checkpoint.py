@@ -1,8 +1,9 @@
 """Checkpoints: a reader of every format."""
 
+import re
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -79,7 +80,8 @@ class Checkpoint:
         calibration.
         """
         stored = self.calibration.viewpoints if self.calibration else ()
-        return tuple(viewpoint.moved([-value for value in self.origin]) for viewpoint in stored)
+        back = [-value for value in self.origin]
+        return tuple(viewpoint.moved(back) for viewpoint in stored)
 
     @property
     def cameras(self) -> list[Camera]:
@@ -89,7 +91,10 @@ class Checkpoint:
         size = self.calibration.width, self.calibration.height
         seen = [viewpoint for viewpoint in self.viewpoints if viewpoint.fov > 0]
         return with_near_planes(
-            [camera_of(each, *size, f"viewpoint {k + 1}") for k, each in enumerate(seen)]
+            [
+                camera_of(viewpoint, *size, f"viewpoint {number}")
+                for number, viewpoint in enumerate(seen, start=1)
+            ]
         )
 
     @property
@@ -106,13 +111,13 @@ class Checkpoint:
         Raises:
             ClodError: the file has no sigma_d, or the dial is negative or not finite.
         """
-        own = self.gaussians
-        if own.sigma_d is None or own.attenuation is None:
+        gaussians = self.gaussians
+        if gaussians.sigma_d is None or gaussians.attenuation is None:
             raise ClodError(
                 f"{self.path}: it has no sigma_d, so there is no dial; clod-adapt adapt gives"
                 " it one"
             )
-        return Hook(own.sigma_d, own.attenuation, virtual_scale, own.growth_d)
+        return Hook(gaussians.sigma_d, gaussians.attenuation, virtual_scale, gaussians.growth_d)
 
 
 @torch.inference_mode(False)  # training takes no inference tensors
@@ -147,31 +152,31 @@ def load(
     path = Path(path)
     source = read_source(path)
     metadata, dial = source.metadata, SIGMA in source.arrays
-    found = prepared(
+    values = prepared(
         path,
         source.arrays,
         activated if source.activation_unknown else "none",
         metadata.origin,
         origin,
     )
-    arrays, rows, total = found.arrays, source.rows, len(found.keep)
-    if not found.keep.all():
-        arrays = {name: array[found.keep] for name, array in arrays.items()}
-        rows = None if rows is None else rows[found.keep]
+    arrays, rows, total = values.arrays, source.rows, len(values.keep)
+    if not values.keep.all():
+        arrays = {name: array[values.keep] for name, array in arrays.items()}
+        rows = None if rows is None else rows[values.keep]
     screen_filter = stated_filter(source)
     tensors: dict[str, Any] = {name: torch.from_numpy(array) for name, array in arrays.items()}
     gaussians = Gaussians(
         **tensors, attenuation=metadata.attenuation if dial else None, screen_filter=screen_filter
     )
     dropped = [
-        f"{lost} of {total} Gaussians dropped: {reason}" for reason, lost in found.dropped.items()
+        f"{lost} of {total} Gaussians dropped: {reason}" for reason, lost in values.dropped.items()
     ]
-    notes = [*found.changes, *dropped]
+    notes = [*values.changes, *dropped]
     if arrays["opacity_logits"].max() == np.inf:  # else no mask is made
         opaque = np.count_nonzero(arrays["opacity_logits"] == np.inf)
         notes.append(f"{opaque} Gaussians have opacity = +inf and are taken as fully opaque")
-    if any(found.origin):
-        where = ", ".join(f"{value:.10g}" for value in found.origin)
+    if any(values.origin):
+        where = ", ".join(f"{value:.10g}" for value in values.origin)
         notes.append(f"far from 0: read relative to ({where}); outputs have x, y, z as double")
     notes += metadata.notes
     if gaussians.attenuation is not None and not metadata.described:
@@ -179,20 +184,17 @@ def load(
     calibration, mismatch = matching_calibration(metadata, len(gaussians)) if dial else (None, [])
     about = [comment for comment in source.comments if not comment.startswith(PREFIX)]
     if source.head is None:
-        printable = [
-            "".join(c if c.isascii() and c.isprintable() else "?" for c in line) for line in about
-        ]
-        about = tagged(printable, screen_filter)
-    comments, cut = that_fit([*about, *found.changes])
+        about = tagged([re.sub("[^ -~]", "?", line) for line in about], screen_filter)
+    comments, cut = that_fit([*about, *values.changes])
     return Checkpoint(
         gaussians,
         rows,
         comments,
         (*notes, *mismatch, *source.notes, *cut),
-        source.sha256 if found.activated == "none" else f"{found.activated}:{source.sha256}",
+        source.sha256 if values.activated == "none" else f"{values.activated}:{source.sha256}",
         path,
         calibration,
-        found.origin,
+        values.origin,
         filter_known=dial or metadata.screen_filter is not None,
     )
 
@@ -251,25 +253,29 @@ def save(
             again; for another format than PLY also sigma_d that it does not carry.
     """
     path = Path(path)
-    about, origin, vertex = (
-        (base.comments, base.origin, base.vertex) if base else ((), NOWHERE, None)
-    )
-    metadata = Metadata(calibration=calibration, origin=origin, about=about, version=version or "")
+    metadata = Metadata(calibration=calibration, version=version or "")
+    rows = None
     if base is not None:
-        inputs = [base.path, *ranks_of(base.path).values()]
-        if path.is_file() and any(each.is_file() and path.samefile(each) for each in inputs):
-            raise ClodError(
-                f"{path}: is the input file, which is never overwritten; choose another output"
-            )
-        if (
-            len(base.gaussians) not in (len(gaussians), gaussians.whole)
-            or gaussians.sh_degree != base.gaussians.sh_degree
-        ):
-            what = (
-                f"Gaussians ({gaussians.summary}) do not fit their base {base.path}"
-                f" ({base.gaussians.summary})"
-            )
-            raise ClodError(f"{path}: {what}; save with the checkpoint they came from")
-    writer = partial(write_rows, base=vertex) if format_of(path) is PLY else None
+        _check_base(path, gaussians, base)
+        metadata = replace(metadata, origin=base.origin, about=base.comments)
+        rows = base.vertex
+    writer = partial(write_rows, base=rows) if format_of(path) is PLY else None
     for note in write(path, gaussians, metadata, writer=writer):
         warnings.warn(f"{path}: {note}", stacklevel=2)
+
+
+def _check_base(path: Path, gaussians: Gaussians, base: Checkpoint) -> None:
+    """Refuses to overwrite the base, and Gaussians that do not come from it."""
+    inputs = [base.path, *ranks_of(base.path).values()]
+    if path.is_file() and any(file.is_file() and path.samefile(file) for file in inputs):
+        raise ClodError(
+            f"{path}: is the input file, which is never overwritten; choose another output"
+        )
+    if (
+        len(base.gaussians) not in (len(gaussians), gaussians.whole)
+        or gaussians.sh_degree != base.gaussians.sh_degree
+    ):
+        raise ClodError(
+            f"{path}: Gaussians ({gaussians.summary}) do not fit their base {base.path}"
+            f" ({base.gaussians.summary}); save with the checkpoint they came from"
+        )

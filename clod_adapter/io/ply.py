@@ -8,6 +8,7 @@ from __future__ import annotations
 import io
 import re
 import warnings
+from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,7 +19,7 @@ from clod_adapter.errors import ClodError, refused_if_damaged
 from clod_adapter.io import file_formats
 from clod_adapter.io.ply_layout import RGB, column_map, is_coloured, ply_metadata, with_harmonics
 from clod_adapter.io.ply_layout import write as write
-from clod_adapter.io.ply_packed import NOTE, check_packed, is_packed, unpack
+from clod_adapter.io.ply_packed import NOTE, check_packed, column_types, is_packed, unpack
 from clod_adapter.io.settings import Source, of_another_method
 from clod_adapter.io.values import (
     FILTER_3D,
@@ -92,10 +93,9 @@ def read_head(path: Path, data: bytes | None = None) -> Head:
             f"{path}: the PLY header is damaged (a row count is not a number); export the file"
             " again"
         )
-    comments = *ply.comments, *(comment for element in ply for comment in element.comments)
-    return Head(
-        ply, tuple(zip(ply, map(int, counts), strict=True)), text, end.end(), comments, notes
-    )
+    elements = tuple(zip(ply, map(int, counts), strict=True))
+    comments = tuple(chain(ply.comments, *(element.comments for element in ply)))
+    return Head(ply, elements, text, end.end(), comments, notes)
 
 
 def _in_ascii(line: re.Match[bytes]) -> bytes:
@@ -133,9 +133,11 @@ def read(path: Path, data: bytes) -> Source:
         notes.append(COLOURED)
     arrays = _arrays(rows, degree)
     metadata = ply_metadata(path, head.comments, rows, dial=SIGMA in arrays)
-    parts = [f"element {element.name}" for element in head.ply if element.name != "vertex"]
-    parts += ["obj_info"] if head.ply.obj_info else []
-    notes += [f"not carried over to outputs: {', '.join(parts)}"] if parts else []
+    lost = [f"element {element.name}" for element in head.ply if element.name != "vertex"]
+    if head.ply.obj_info:
+        lost.append("obj_info")
+    if lost:
+        notes.append(f"not carried over to outputs: {', '.join(lost)}")
     return Source(arrays, metadata, tuple(notes), head.comments, not metadata.described, rows, head)
 
 
@@ -145,14 +147,15 @@ def _elements(data: bytes, head: Head) -> dict[str, np.ndarray]:
     plyfile reads text, and binary lists row by row: elements from the first with lists on are left
     out where the Gaussians stand before it.
     """
-    at, found = head.size, dict[str, np.ndarray]()
+    elements: dict[str, np.ndarray] = {}
+    at = head.size
     for element, count in () if head.ply.text else head.elements:
-        if any(isinstance(each, PlyListProperty) for each in element.properties):
+        if "list" in column_types(element).values():
             break
         kind = np.dtype(element.dtype(head.ply.byte_order))
-        found[element.name] = np.frombuffer(data, kind, count, at)
+        elements[element.name] = np.frombuffer(data, kind, count, at)
         at += count * kind.itemsize
-    if "vertex" not in found:
+    if "vertex" not in elements:
         # CR ends a line too
         lines = io.TextIOWrapper(io.BytesIO(data if head.ply.text else b""), "latin-1")
         if any(len(line) == _LONGEST for line in iter(lambda: lines.readline(_LONGEST), "")):
@@ -161,10 +164,11 @@ def _elements(data: bytes, head: Head) -> dict[str, np.ndarray]:
         with warnings.catch_warnings(), np.errstate(over="ignore"):
             warnings.simplefilter("ignore")  # of text that is beyond float32's range
             # a copy if it was changed
-            whole = data if data.startswith(head.text) else head.text + data[head.size :]
-            found = {each.name: each.data for each in PlyData.read(io.BytesIO(whole))}
+            content = data if data.startswith(head.text) else head.text + data[head.size :]
+            elements = {element.name: element.data for element in PlyData.read(io.BytesIO(content))}
     return {
-        name: rows.astype(rows.dtype.newbyteorder("="), copy=False) for name, rows in found.items()
+        name: rows.astype(rows.dtype.newbyteorder("="), copy=False)
+        for name, rows in elements.items()
     }
 
 
@@ -176,24 +180,22 @@ def _arrays(rows: np.ndarray, sh_degree: int) -> Arrays:
     groups = column_map(sh_degree) | dial_columns(names)
     groups |= {MASKS: MASK_COLUMNS} if set(MASK_COLUMNS) <= set(names) else {}
     groups |= {FILTER_3D: (FILTER_3D,)} if FILTER_3D in names else {}
-    kinds = {"means": np.float64} if "f8" in {rows.dtype[name].str[1:] for name in "xyz"} else {}
-    found = {
-        key: np.empty((len(rows), len(group)), kinds.get(key, np.float32))
-        for key, group in groups.items()
-    }
+    arrays: Arrays = {key: np.empty((len(rows), len(group)), "f4") for key, group in groups.items()}
+    if any(rows.dtype[name].itemsize == 8 for name in "xyz"):
+        arrays["means"] = np.empty((len(rows), 3))
     with np.errstate(over="ignore", invalid="ignore"):  # invalid: a NaN that signals
         for start in range(0, len(rows), ROWS):  # a block stays in cache, which is 8 times faster
             block = rows[start : start + ROWS]
             for key, group in groups.items():
-                target = found[key][start : start + ROWS]
+                target = arrays[key][start : start + ROWS]
                 for column, name in enumerate(group):
                     target[:, column] = block[name]
     for name in ("opacity_logits", SIGMA, GROWTH, OPACITY):
-        if name in found:
-            found[name] = found[name][:, 0]
-    return found | {
-        name: found[name].reshape(len(rows), len(groups[name]) // 3, 3) for name in ("sh0", "shN")
-    }
+        if name in arrays:
+            arrays[name] = arrays[name][:, 0]
+    for name in ("sh0", "shN"):
+        arrays[name] = arrays[name].reshape(len(rows), len(groups[name]) // 3, 3)
+    return arrays
 
 
 def _check_length(path: Path, head: Head, length: int) -> None:
@@ -211,11 +213,10 @@ def _check_length(path: Path, head: Head, length: int) -> None:
         )
     if least > length:
         rows = ", ".join(f"{count} of {element.name}" for element, count in head.elements)
-        what = (
-            f"is truncated or damaged: its header claims {rows}, {least} bytes or more, and the"
-            f" file has {length}"
+        raise ClodError(
+            f"{path}: is truncated or damaged: its header claims {rows}, {least} bytes or more, and"
+            f" the file has {length}; copy or export it again"
         )
-        raise ClodError(f"{path}: {what}; copy or export it again")
 
 
 def sh_degree_of(path: Path, header: PlyData) -> int:
@@ -225,26 +226,24 @@ def sh_degree_of(path: Path, header: PlyData) -> int:
     if is_packed(header):
         return check_packed(path, header)
     if "vertex" not in header:
-        found = ", ".join(element.name for element in header) or "none"
+        names = ", ".join(element.name for element in header) or "none"
         raise ClodError(
-            f"{path}: has no vertex element (elements: {found}); give a splat in Inria's 3DGS"
+            f"{path}: has no vertex element (elements: {names}); give a splat in Inria's 3DGS"
             " layout"
         )
-    properties = header["vertex"].properties
-    types = {p.name: "list" if isinstance(p, PlyListProperty) else p.val_dtype for p in properties}
-    if anchors := sorted(
-        name for name in types if re.fullmatch(r"f_offset_\d+|f_anchor_feat_\d+", name)
-    ):
-        what = (
-            f"property {anchors[0]} is of Scaffold-GS or Octree-GS, where a network makes Gaussians"
-            " for each view"
-        )
+    types = column_types(header["vertex"])
+    anchors = [name for name in types if re.fullmatch(r"f_offset_\d+|f_anchor_feat_\d+", name)]
+    if anchors:
         raise ClodError(
-            f"{path}: {what}; use a checkpoint of 3DGS or of a method that keeps plain Gaussians"
+            f"{path}: property {min(anchors)} is of Scaffold-GS or Octree-GS, where a network makes"
+            " Gaussians for each view; use a checkpoint of 3DGS or of a method that keeps plain"
+            " Gaussians"
         )
     if not types.keys() & {"f_dc_0", "scale_0"}:
-        what = "properties f_dc_0 and scale_0 are missing, so this is a mesh or a point cloud"
-        raise ClodError(f"{path}: {what}; give the point_cloud.ply that a 3DGS trainer writes")
+        raise ClodError(
+            f"{path}: properties f_dc_0 and scale_0 are missing, so this is a mesh or a point"
+            " cloud; give the point_cloud.ply that a 3DGS trainer writes"
+        )
     if {"scale_0", "scale_1"} <= types.keys() and "scale_2" not in types:
         raise ClodError(
             f"{path}: has no property scale_2, so this is a 2DGS file of flat disks; use a 3DGS"
@@ -253,7 +252,7 @@ def sh_degree_of(path: Path, header: PlyData) -> int:
     if is_coloured(types) and all(types[name] == "u1" for name in RGB):
         types |= dict.fromkeys(column_map(0)["sh0"], "f4")
     degree = degree_of(path, sum(re.fullmatch(r"f_rest_\d+", name) is not None for name in types))
-    for name in (name for group in column_map(degree).values() for name in group):
+    for name in chain(*column_map(degree).values()):
         if types.get(name) not in ("f4", "f8"):
             what = "is not float or double" if name in types else "is missing"
             raise ClodError(

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Container, Iterable
 from dataclasses import asdict, astuple, fields, replace
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -70,7 +71,7 @@ def column_map(sh_degree: int) -> dict[str, tuple[str, ...]]:
         "log_scales": tuple(f"scale_{i}" for i in range(3)),
         "opacity_logits": ("opacity",),
         "sh0": tuple(f"f_dc_{c}" for c in range(3)),
-        "shN": tuple(f"f_rest_{c * bands + k}" for k in range(bands) for c in range(3)),
+        "shN": tuple(f"f_rest_{c * bands + k}" for k, c in product(range(bands), range(3))),
     }
 
 
@@ -90,12 +91,11 @@ def with_harmonics(rows: np.ndarray) -> np.ndarray:
     names = {
         name: f"f_dc_{RGB.index(name)}" if name in RGB else name for name in rows.dtype.names or ()
     }
-    found = np.empty(
-        len(rows), [(new, "f4" if old in RGB else rows.dtype[old]) for old, new in names.items()]
-    )
+    kinds = [(new, "f4" if old in RGB else rows.dtype[old]) for old, new in names.items()]
+    harmonic_rows = np.empty(len(rows), kinds)
     for old, new in names.items():
-        found[new] = sh0_of(rows[old]) if old in RGB else rows[old]
-    return found
+        harmonic_rows[new] = sh0_of(rows[old]) if old in RGB else rows[old]
+    return harmonic_rows
 
 
 def inria_dtype(sh_degree: int, dial: Iterable[str] = ()) -> np.dtype:
@@ -115,10 +115,11 @@ def ply_metadata(
     ours = any(comment.startswith(PREFIX) for comment in comments)
     values = columns | _stored_settings(comments)
     values[DIAL] = columns[DIAL] | values[DIAL]
-    found = read_metadata(path, values, dial=dial, described=ours)
-    names = ", ".join([] if ours else columns[DIAL])
-    notes = (f"settings of the dial read from columns: {names}",) if names else ()
-    return replace(found, notes=(*notes, *found.notes))
+    metadata = read_metadata(path, values, dial=dial, described=ours)
+    if ours or not columns[DIAL]:
+        return metadata
+    note = f"settings of the dial read from columns: {', '.join(columns[DIAL])}"
+    return replace(metadata, notes=(note, *metadata.notes))
 
 
 def write_comments(metadata: Metadata) -> list[str]:
@@ -129,25 +130,16 @@ def write_comments(metadata: Metadata) -> list[str]:
     gives the same double. Some readers do not take long comments, so each row of the calibration
     has its own.
     """
-    dial, screen_filter, c = (
-        metadata.attenuation,
-        metadata.screen_filter or CLASSIC,
-        metadata.calibration,
-    )
+    screen_filter = metadata.screen_filter or CLASSIC
     lines = [f"version {metadata.version or package_version()}"]
-    lines += [
-        f"{name} {type(usual)(getattr(dial, name))}" for name, usual in _USUAL[DIAL].items() if dial
-    ]
-    lines += (
-        [f"{FILTER} {screen_filter.variance} {screen_filter.compensate}"]
-        if screen_filter != CLASSIC
-        else []
-    )
-    if c is not None:
-        lines += [
-            f"{MACHINE} {c.machine}",
-            f"{EXTENT} {c.total} {c.views} {c.width} {c.height} {c.against}",
-        ]
+    if metadata.attenuation is not None:
+        for name, usual in _USUAL[DIAL].items():
+            lines.append(f"{name} {type(usual)(getattr(metadata.attenuation, name))}")
+    if screen_filter != CLASSIC:
+        lines.append(f"{FILTER} {screen_filter.variance} {screen_filter.compensate}")
+    if (c := metadata.calibration) is not None:
+        lines.append(f"{MACHINE} {c.machine}")
+        lines.append(f"{EXTENT} {c.total} {c.views} {c.width} {c.height} {c.against}")
         lines += [f"{ROW} {' '.join(map(repr, astuple(row)))}" for row in c.rows]
         lines += [f"{VIEWPOINT} {' '.join(map(repr, astuple(place)))}" for place in c.viewpoints]
     about = [line for line in metadata.about if not line.startswith(PREFIX)]
@@ -158,27 +150,32 @@ def _stored_settings(comments: Iterable[str]) -> dict[str, Any]:
     """The settings in the comments, as ``settings.read_metadata`` takes them; the last of equal
     names counts.
     """
-    found: dict[str, list[list[str]]] = {}
-    for name, *words in (
-        line[len(PREFIX) :].split() or [""] for line in comments if line.startswith(PREFIX)
-    ):
-        found.setdefault(name, []).append(words)
-    values = dict[str, Any]()
-    if FILTER in found:
-        values[FILTER] = dict(zip(_USUAL[FILTER], found.pop(FILTER)[-1], strict=False))
+    stored: dict[str, list[list[str]]] = {}
+    for line in comments:
+        if line.startswith(PREFIX):
+            name, *words = line[len(PREFIX) :].split() or [""]
+            stored.setdefault(name, []).append(words)
+    values: dict[str, Any] = {}
+    if FILTER in stored:
+        values[FILTER] = dict(zip(_USUAL[FILTER], stored.pop(FILTER)[-1], strict=False))
     measured: dict[str, Any] = {
-        name: [
-            dict(zip((field.name for field in fields(kind)), words, strict=False))
-            for words in found.pop(key, [])
-        ]
-        for name, key, kind in (("rows", ROW, CalibrationRow), ("viewpoints", VIEWPOINT, Viewpoint))
+        "rows": _by_field(CalibrationRow, stored.pop(ROW, [])),
+        "viewpoints": _by_field(Viewpoint, stored.pop(VIEWPOINT, [])),
     }
-    settings = {name: " ".join(lines[-1]) for name, lines in found.items() if lines[-1]}
+    settings = {name: " ".join(lines[-1]) for name, lines in stored.items() if lines[-1]}
     extent = settings.pop(EXTENT, "").split(maxsplit=4)
     measured |= zip(("total", "views", "width", "height", "against"), extent, strict=False)
-    measured |= {"machine": settings.pop(MACHINE)} if MACHINE in settings else {}
-    values |= {"calibration": measured} if any(measured.values()) else {}
+    if MACHINE in settings:
+        measured["machine"] = settings.pop(MACHINE)
+    if any(measured.values()):
+        values["calibration"] = measured
     return values | {"package_version": settings.pop("version", ""), DIAL: settings}
+
+
+def _by_field(kind: type, lines: Iterable[list[str]]) -> list[dict[str, str]]:
+    """The words of each line by the fields of a dataclass."""
+    names = [field.name for field in fields(kind)]
+    return [dict(zip(names, words, strict=False)) for words in lines]
 
 
 def constants_of(metadata: Metadata, *, growth: bool) -> dict[str, float]:
@@ -187,41 +184,42 @@ def constants_of(metadata: Metadata, *, growth: bool) -> dict[str, float]:
     """
     if metadata.attenuation is None:  # a plain file has the columns of Inria's layout and no others
         return {}
-    stored, found = (
-        {DIAL: asdict(metadata.attenuation), FILTER: asdict(metadata.screen_filter or CLASSIC)},
-        {},
-    )
+    settings = {
+        DIAL: asdict(metadata.attenuation),
+        FILTER: asdict(metadata.screen_filter or CLASSIC),
+    }
+    columns = {}
     for name, (group, field, word) in _SETTINGS.items():
-        value = stored[group][field]
-        if (
-            value != _USUAL[group][field]
-            and word in (None, value)
-            and (growth or field != "reference_distance")
-        ):
-            found[COLUMN + name] = value if word is None else 1.0
-    return found
+        value = settings[group][field]
+        needed = growth or field != "reference_distance"
+        if needed and value != _USUAL[group][field] and word in (None, value):
+            columns[COLUMN + name] = value if word is None else 1.0
+    return columns
 
 
 def _constant_settings(path: Path, vertex: np.ndarray) -> dict[str, Any]:
     """The settings in the columns, as ``settings.read_metadata`` takes them; the inverse of
     ``constants_of``.
     """
-    found: dict[str, dict[str, Any]] = {DIAL: {}, FILTER: {}}
-    there = (vertex.dtype.names or ()) if len(vertex) else ()
-    if _EARLIER & {*there}:
+    settings: dict[str, dict[str, Any]] = {DIAL: {}, FILTER: {}}
+    columns = (vertex.dtype.names or ()) if len(vertex) else ()
+    if _EARLIER & {*columns}:
         raise ClodError(f"{path}: {EARLIER_FORM}")
     for name, (group, field, word) in _SETTINGS.items():
-        if COLUMN + name in there:
+        if COLUMN + name in columns:
             column = vertex[COLUMN + name]
             if not (column == column[0]).all():
-                what = f"property {COLUMN}{name} must be one value for all rows and has several"
                 raise ClodError(
-                    f"{path}: {what}, so files of different settings were merged; give one of them"
+                    f"{path}: property {COLUMN}{name} must be one value for all rows and has"
+                    " several, so files of different settings were merged; give one of them"
                 )
-            if word is None or column[0]:
-                # The shortest decimal of a float32, which is the number that was written.
-                found[group][field] = float(str(np.float32(column[0]))) if word is None else word
-    return {DIAL: found[DIAL]} | ({FILTER: _USUAL[FILTER] | found[FILTER]} if found[FILTER] else {})
+            if word is None:  # the shortest decimal of a float32 is the number that was written
+                settings[group][field] = float(str(np.float32(column[0])))
+            elif column[0]:
+                settings[group][field] = word
+    if settings[FILTER]:
+        return settings | {FILTER: _USUAL[FILTER] | settings[FILTER]}
+    return {DIAL: settings[DIAL]}
 
 
 def write(path: Path, gaussians: Gaussians, metadata: Metadata) -> tuple[str, ...]:
@@ -236,11 +234,9 @@ def write(path: Path, gaussians: Gaussians, metadata: Metadata) -> tuple[str, ..
         opacity_logits=gaussians.opacity_logits.masked_fill(opaque, OPAQUE)
     )
     write_rows(path, gaussians, metadata)
-    return (
-        (f"{int(opaque.sum())} opacities of +inf are written as {OPAQUE:g}, which is 1 too",)
-        if opaque.any()
-        else ()
-    )
+    count = int(opaque.sum())
+    note = f"{count} opacities of +inf are written as {OPAQUE:g}, which is 1 too"
+    return (note,) if count else ()
 
 
 def write_rows(
@@ -254,20 +250,19 @@ def write_rows(
         base: ``[N]`` rows of the file that the first N Gaussians come from; None for Inria's
             layout. The others are far Gaussians (``values.OPACITY``), whose other columns are 0.
     """
-    tensors, origin = hidden(gaussians), metadata.origin
-    constants, dial = (
-        constants_of(metadata, growth=gaussians.growth_d is not None),
-        dial_columns(tensors),
-    )
+    tensors = hidden(gaussians)
+    origin = metadata.origin
+    constants = constants_of(metadata, growth=gaussians.growth_d is not None)
+    dial = dial_columns(tensors)
     layout = inria_dtype(gaussians.sh_degree) if base is None else base.dtype
     # growth_d alone is foreign
     gone = {FILTER_3D, *((SIGMA, GROWTH, OPACITY) if dial else dial_columns(layout.names or ()))}
-    own = [name for name in layout.names or () if name not in gone and not name.startswith(COLUMN)]
-    kinds = [
-        (name, np.dtype("f8") if any(origin) and name in ("x", "y", "z") else layout[name])
-        for name in own
-    ]
-    kind = np.dtype(kinds + [(name, np.dtype("f4")) for name in (*constants, *dial)])
+    kept = [name for name in layout.names or () if name not in gone and not name.startswith(COLUMN)]
+    kinds = {name: layout[name] for name in kept}
+    if any(origin):
+        kinds |= dict.fromkeys("xyz", np.dtype("f8"))
+    kinds |= dict.fromkeys((*constants, *dial), np.dtype("f4"))
+    kind = np.dtype(list(kinds.items()))
     # plyfile makes a header of this without the rows
     one = np.broadcast_to(np.zeros((), kind), len(gaussians))
     element = PlyElement.describe(one, "vertex", comments=write_comments(metadata))
@@ -276,24 +271,26 @@ def write_rows(
         for start in range(0, len(gaussians), ROWS):
             part = slice(start, start + ROWS)
             block = np.zeros(len(gaussians.means[part]), kind)
-            given = block[:0] if base is None else base[part]
-            for name in own if len(given) else ():
-                block[name][: len(given)] = given[name]
+            if base is not None:
+                given = base[part]
+                for name in kept:
+                    block[name][: len(given)] = given[name]
             for name, value in constants.items():
                 block[name] = value
             for attribute, group in (column_map(gaussians.sh_degree) | dial).items():
                 values = tensors[attribute][part].float().cpu().numpy().reshape(len(block), -1)
                 for k, name in enumerate(group):
                     shift = origin[k] if attribute == "means" else 0.0
-                    new, changed = values[:, k], np.ones(len(block), bool)
+                    new = values[:, k]
+                    changed = np.ones(len(block), bool)
                     if base is not None and name not in dial:
                         old = (block[name] - shift if shift else block[name]).astype(np.float32)
                         changed = new.view(np.uint32) != old.view(np.uint32)
                     new = new[changed]
-                    opaque = (
-                        new == np.inf if attribute == "opacity_logits" and base is None else False
-                    )
-                    if not (np.isfinite(new) | opaque).all():
+                    usable = np.isfinite(new)
+                    if attribute == "opacity_logits" and base is None:
+                        usable |= new == np.inf
+                    if not usable.all():
                         fix = _INSTEAD.get(attribute, "the tuning has diverged")
                         raise ClodError(
                             f"{path}: {attribute} holds a new value that is not finite; {fix}"

@@ -11,10 +11,11 @@ Source: splat-transform 3.7, ``read-ply``; gsplat, ``exporter.splat2ply_bytes_co
 """
 
 from collections.abc import Mapping
+from itertools import product
 from pathlib import Path
 
 import numpy as np
-from plyfile import PlyData, PlyListProperty
+from plyfile import PlyData, PlyElement, PlyListProperty
 
 from clod_adapter.config import SH_COUNTS
 from clod_adapter.errors import ClodError
@@ -23,14 +24,21 @@ from clod_adapter.io.values import Arrays, degree_of
 BLOCK = 256
 _BITS = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 _AXES = ("x", "y", "z")
-_RANGES = tuple(
-    f"{end}_{what}{axis}" for what in ("", "scale_") for end in ("min", "max") for axis in _AXES
-)
-_COLOURS = tuple(f"{end}_{channel}" for end in ("min", "max") for channel in "rgb")
+_ENDS = ("min", "max")
+_RANGES = tuple(f"{end}_{what}{axis}" for what, end, axis in product(("", "scale_"), _ENDS, _AXES))
+_COLOURS = {f"{end}_{channel}" for end, channel in product(_ENDS, "rgb")}
 NOTE = (
     "quantised: positions and scales in 11 bits a block, rotations in 10, colours, harmonics and"
     " opacities in 8"
 )
+
+
+def column_types(element: PlyElement) -> dict[str, str]:
+    """The types of the properties by name; "list" of a list."""
+    return {
+        p.name: "list" if isinstance(p, PlyListProperty) else p.val_dtype
+        for p in element.properties
+    }
 
 
 def is_packed(header: PlyData) -> bool:
@@ -56,7 +64,8 @@ def unpack(path: Path, elements: Mapping[str, np.ndarray], degree: int) -> Array
 
     chunks, packed, table = elements["chunk"], elements["vertex"], elements.get("sh")
     count, bands = len(packed), SH_COUNTS[degree] - 1
-    if len(chunks) < (needed := -(-count // BLOCK)):
+    needed = -(-count // BLOCK)
+    if len(chunks) < needed:
         raise ClodError(
             f"{path}: is damaged: {count} Gaussians need {needed} chunks, not {len(chunks)}; copy"
             " it again"
@@ -68,24 +77,20 @@ def unpack(path: Path, elements: Mapping[str, np.ndarray], degree: int) -> Array
 
     def within(name: str, share: np.ndarray) -> np.ndarray:
         """Values at shares of the ranges of their blocks."""
-        low, high = (chunks[f"{end}_{name}"][np.arange(count) // BLOCK] for end in ("min", "max"))
+        low, high = (chunks[f"{end}_{name}"][np.arange(count) // BLOCK] for end in _ENDS)
         return low * (1 - share) + high * share  # type: ignore[no-any-return]
+
+    def vectors(what: str, bits: np.ndarray) -> np.ndarray:
+        """``[N, 3]`` positions or scales."""
+        shares = zip(_AXES, _shares(bits, (11, 10, 11)), strict=True)
+        return np.stack([within(what + axis, share) for axis, share in shares], 1)
 
     # ranges that are not finite: their rows are dropped later
     with np.errstate(invalid="ignore", over="ignore"):
-        means, log_scales = (
-            np.stack(
-                list(
-                    map(
-                        within, (what + axis for axis in _AXES), _shares(packed[bits], (11, 10, 11))
-                    )
-                ),
-                1,
-            )
-            for what, bits in (("", "packed_position"), ("scale_", "packed_scale"))
-        )
+        means = vectors("", packed["packed_position"])
+        log_scales = vectors("scale_", packed["packed_scale"])
         *colours, opacity = _shares(packed["packed_color"], (8, 8, 8, 8))
-        if set(_COLOURS) <= set(chunks.dtype.names or ()):
+        if _COLOURS.issubset(chunks.dtype.names or ()):
             colours = [
                 within(channel, share) for channel, share in zip("rgb", colours, strict=True)
             ]
@@ -100,7 +105,7 @@ def unpack(path: Path, elements: Mapping[str, np.ndarray], degree: int) -> Array
         "means": means,
         "log_scales": log_scales,
         "sh0": (np.stack(colours, 1)[:, None] - 0.5) / SH_C0,
-        "quats": np.ascontiguousarray(_rotations(packed["packed_rotation"]).T.astype(np.float32)),
+        "quats": _rotations(packed["packed_rotation"]),
         "opacity_logits": np.log(opacity / (1 - opacity)).astype(np.float32),
         "shN": harmonics,
     }
@@ -111,10 +116,7 @@ def _require(path: Path, header: PlyData, element: str, names: tuple[str, ...], 
         raise ClodError(
             f"{path}: is a compressed PLY without its element {element}; export it again"
         )
-    types = {
-        p.name: "list" if isinstance(p, PlyListProperty) else p.val_dtype
-        for p in header[element].properties
-    }
+    types = column_types(header[element])
     if "list" in types.values():
         raise ClodError(
             f"{path}: element {element} of a compressed PLY has a list; export it again"
@@ -130,26 +132,22 @@ def _shares(bits: np.ndarray, widths: tuple[int, ...]) -> list[np.ndarray]:
     """The parts of ``[N]`` uint32, highest first, each over the largest it can be: ``[N]`` in
     [0, 1].
     """
-    shift, found = 32, []
+    shift = 32
+    shares = []
     for width in widths:
         shift -= width
         largest = np.uint32((1 << width) - 1)
-        found.append(((bits >> np.uint32(shift)) & largest).astype(np.float32) / largest)
-    return found
+        shares.append(((bits >> np.uint32(shift)) & largest).astype(np.float32) / largest)
+    return shares
 
 
 def _rotations(bits: np.ndarray) -> np.ndarray:
-    """``[4, N]`` unit quaternions, wxyz."""
+    """``[N, 4]`` float32 unit quaternions, wxyz."""
     small = (np.stack(_shares(bits << np.uint32(2), (10, 10, 10))) - 0.5) * np.float32(np.sqrt(2))
     largest = np.sqrt(np.maximum(0, 1 - (small**2).sum(0)))
     missing = bits >> np.uint32(30)
-    return np.stack(
-        [
-            np.where(
-                missing == part,
-                largest,
-                np.where(missing > part, small[min(part, 2)], small[max(part - 1, 0)]),
-            )
-            for part in range(4)
-        ]
-    )
+    quats = np.empty((len(bits), 4), np.float32)
+    for part in range(4):
+        stored = np.where(missing > part, small[min(part, 2)], small[max(part - 1, 0)])
+        quats[:, part] = np.where(missing == part, largest, stored)
+    return quats

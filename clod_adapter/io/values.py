@@ -45,11 +45,9 @@ def dial_columns(names: Container[str]) -> dict[str, tuple[str, ...]]:
     """The dial's columns among ``names``, by attribute; growth_d without a sigma_d is another
     tool's.
     """
-    return (
-        {name: (name,) for name in (SIGMA, GROWTH, OPACITY) if name in names}
-        if SIGMA in names
-        else {}
-    )
+    if SIGMA not in names:
+        return {}
+    return {name: (name,) for name in (SIGMA, GROWTH, OPACITY) if name in names}
 
 
 def degree_of(path: Path, rest: int) -> int:
@@ -100,7 +98,8 @@ def prepared(
         FILTER_3D: (1,),
     }
     for name, array in arrays.items():
-        if array.shape != (shape := (*count, *shapes.get(name, ()))):
+        shape = (*count, *shapes.get(name, ()))
+        if array.shape != shape:
             raise ClodError(
                 f"{path}: {name} has shape {array.shape}, expected {shape}; export it again"
             )
@@ -109,15 +108,14 @@ def prepared(
             f"{path}: shN has {rest[0]} coefficients, which fit no SH degree; export it again"
         )
     if OPACITY in arrays:
-        far = arrays[SIGMA] > 0
-        shown = {"opacity_logits": np.where(far, arrays[OPACITY], arrays["opacity_logits"])}
-        arrays = {name: array for name, array in arrays.items() if name != OPACITY} | shown
-    narrow = {
-        name: np.ascontiguousarray(array, np.float32)
+        arrays = dict(arrays)
+        far_logits = arrays.pop(OPACITY)
+        arrays["opacity_logits"] = np.where(arrays[SIGMA] > 0, far_logits, arrays["opacity_logits"])
+    stored = {
+        name: array if name == "means" else np.ascontiguousarray(array, np.float32)
         for name, array in arrays.items()
-        if name != "means"
     }
-    values, was, changes = _as_logits(path, {**arrays, **narrow}, activated)
+    values, was, changes = _as_logits(path, stored, activated)
     if origin is None:
         origin = at if any(at) else origin_of(values["means"])
     values["means"] = np.ascontiguousarray(relative(values["means"], at, origin))
@@ -141,24 +139,23 @@ def _as_logits(
     require(
         activated in (None, *choices), "activated", repr(activated), f"one of {', '.join(choices)}"
     )
-    found = in_question(arrays) if activated != "none" else {}
-    if found and activated is None:
-        ranges = " and ".join(
-            f"{name} from {low:.4g} to {high:.4g}" for name, (low, high) in found.items()
+    ranges = in_question(arrays) if activated != "none" else {}
+    if ranges and activated is None:
+        where = " and ".join(
+            f"{name} from {low:.4g} to {high:.4g}" for name, (low, high) in ranges.items()
         )
-        what = (
-            f"has {ranges}, which looks activated where a 3DGS file has logits (opacity) and"
-            " logarithms (scales)"
+        raise ClodError(
+            f"{path}: has {where}, which looks activated where a 3DGS file has logits (opacity) and"
+            f" logarithms (scales); if it is, give --activated {choice_of(ranges)}, if not,"
+            " --activated none (activated= in Python)"
         )
-        fix = (
-            f"give --activated {choice_of(found)}, if not, --activated none (activated= in Python)"
-        )
-        raise ClodError(f"{path}: {what}; if it is, {fix}")
-    taken, notes = [name for name in found if activated in (name, "both")], list[str]()
+    taken = [name for name in ranges if activated in (name, "both")]
+    notes = []
     if "opacity" in taken:
         # the absolute value is Taming-3DGS's activation
         opacity = np.abs(arrays["opacity_logits"].astype(np.float64))
-        more = f" ({above} above 1 taken as 1)" if (above := int((opacity > 1).sum())) else ""
+        above = int((opacity > 1).sum())
+        more = f" ({above} above 1 taken as 1)" if above else ""
         arrays["opacity_logits"] = logit(np.clip(opacity, _TINY, _OPAQUE)).astype(np.float32)
         notes.append(f"opacity taken as activated, and stored as logits{more}")
     if "scales" in taken:
@@ -176,14 +173,13 @@ def in_question(arrays: Mapping[str, np.ndarray]) -> dict[str, tuple[float, floa
     """The range of "opacity" and of "scales", where it looks activated: at least ``_FEW`` values,
     none too small.
     """
-    found, opacity = dict[str, tuple[float, float]](), arrays["opacity_logits"]
-    # At most half of the values above 1: not true of logits whose faint ones were pruned.
-    faint = (
-        {"opacity": (opacity[:, None], _FAINTEST)}
-        if 2 * np.count_nonzero(opacity > 1) <= len(opacity)
-        else {}
-    )
-    for name, (values, least) in {**faint, "scales": (arrays["log_scales"], 0.0)}.items():
+    ranges: dict[str, tuple[float, float]] = {}
+    opacity = arrays["opacity_logits"]
+    candidates = [("opacity", opacity[:, None], _FAINTEST), ("scales", arrays["log_scales"], 0.0)]
+    # Logits whose faint ones were pruned have more than half of their values above 1.
+    if 2 * np.count_nonzero(opacity > 1) > len(opacity):
+        candidates = candidates[1:]
+    for name, values, least in candidates:
         low, high, count = np.inf, -np.inf, 0
         for start in range(0, len(values), ROWS):
             block = values[start : start + ROWS]
@@ -191,24 +187,22 @@ def in_question(arrays: Mapping[str, np.ndarray]) -> dict[str, tuple[float, floa
             low, high = float(block.min(initial=low)), float(block.max(initial=high))
             count += len(block)
         if count >= _FEW and low >= least and (low < high or high == 1):
-            found[name] = low, high
-    return found
+            ranges[name] = low, high
+    return ranges
 
 
-def choice_of(found: Iterable[str]) -> Activated:
+def choice_of(names: Iterable[str]) -> Activated:
     """The choice of ``Activated`` for these values."""
-    names: list[Any] = list(found)
-    return "both" if len(names) == 2 else names[0] if names else "none"
+    choices: list[Any] = [*names, "none"]
+    return "both" if len(choices) == 3 else choices[0]
 
 
 def _fused(arrays: Arrays, filter_3d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """With the filter ``f``: scales ``sqrt(s^2 + f^2)``, opacity
     ``a sqrt(det(s^2) / det(s^2 + f^2))``, in logs.
     """
-    scales, logits = (
-        arrays["log_scales"].astype(np.float64),
-        arrays["opacity_logits"][:, None].astype(np.float64),
-    )
+    scales = arrays["log_scales"].astype(np.float64)
+    logits = arrays["opacity_logits"][:, None].astype(np.float64)
     # values that are not finite stay so; their rows are dropped later
     with np.errstate(all="ignore"):
         size = np.log(np.abs(filter_3d.astype(np.float64)))
@@ -217,9 +211,8 @@ def _fused(arrays: Arrays, filter_3d: np.ndarray) -> tuple[np.ndarray, np.ndarra
         # log(1 - a), of a near 1 from the logit itself where there is no filter
         fused = np.where(log_opacity < 0, log_opacity - np.log(-np.expm1(log_opacity)), np.inf)
         unfiltered = (wider == scales).all(1, keepdims=True)
-        return wider.astype(np.float32), np.where(unfiltered, logits, fused)[:, 0].astype(
-            np.float32
-        )
+        opacity = np.where(unfiltered, logits, fused)[:, 0]
+        return wider.astype(np.float32), opacity.astype(np.float32)
 
 
 def _usable(arrays: Arrays) -> tuple[np.ndarray, dict[str, int]]:
@@ -228,29 +221,27 @@ def _usable(arrays: Arrays) -> tuple[np.ndarray, dict[str, int]]:
     """
     from clod_adapter._kernels import QUAT_MAX, QUAT_MIN  # here: a header is checked without numba
 
-    keep, unlikely = (
-        np.ones(len(arrays["means"]), bool),
-        "MaskGaussian existence probability below 0.5",
-    )
-    dropped = dict.fromkeys(
-        (unlikely, "a value is not finite", "rotation is zero or not of a usable length"), 0
-    )
+    keep = np.ones(len(arrays["means"]), bool)
+    dropped = {
+        "MaskGaussian existence probability below 0.5": 0,
+        "a value is not finite": 0,
+        "rotation is zero or not of a usable length": 0,
+    }
     for start in range(0, len(keep), ROWS):
         block = {name: values[start : start + ROWS] for name, values in arrays.items()}
         exists, finite = np.ones((2, len(block["means"])), bool)
         if MASKS in block:  # sigmoid(first - second) >= 0.5; NaN is for the next rule
             exists = ~(block[MASKS][:, 0] < block[MASKS][:, 1])
         for name, values in block.items():
-            usable = (
-                np.isfinite(values) | (values == np.inf)
-                if name == "opacity_logits"
-                else np.isfinite(values)
-            )
+            usable = np.isfinite(values)
+            if name == "opacity_logits":
+                usable |= values == np.inf
             if not usable.all():  # which is far faster than by rows
                 finite &= usable.reshape(len(usable), -1).all(1)
         with np.errstate(over="ignore", invalid="ignore"):
             length = np.sqrt(np.square(block["quats"]).sum(1))  # that rasterizers divide by
-        kept, rotated = keep[start : start + ROWS], (length >= QUAT_MIN) & (length <= QUAT_MAX)
+        rotated = (length >= QUAT_MIN) & (length <= QUAT_MAX)
+        kept = keep[start : start + ROWS]
         for reason, rule in zip(dropped, (exists, finite, rotated), strict=True):
             dropped[reason] += int((kept & ~rule).sum())
             kept &= rule
@@ -261,10 +252,8 @@ def hidden(gaussians: Gaussians) -> dict[str, Tensor]:
     """``Gaussians.tensors`` as files store them: far ones are INVISIBLE, and OPACITY has their own
     logits.
     """
-    tensors, near = (
-        {name: tensor.detach() for name, tensor in gaussians.tensors().items()},
-        gaussians.near,
-    )
+    tensors = {name: tensor.detach() for name, tensor in gaussians.tensors().items()}
+    near = gaussians.near
     if near is not None:
         logits = tensors["opacity_logits"]
         tensors["opacity_logits"] = logits.masked_fill(~near, INVISIBLE)
@@ -276,11 +265,10 @@ def arrays_of(path: Path, gaussians: Gaussians) -> Arrays:
     """The float32 arrays of ``hidden``; refuses values that ``load`` would drop."""
     arrays = _on_the_host(gaussians.tensors())
     if dropped := _usable(arrays)[1]:
-        spoilt = [name for name, array in arrays.items() if not np.isfinite(array).all()] or [
-            "quats"
-        ]
+        spoilt = [name for name, array in arrays.items() if not np.isfinite(array).all()]
+        names = ", ".join(spoilt or ["quats"])
         raise ClodError(
-            f"{path}: {', '.join(spoilt)}: {', '.join(dropped)}; drop such rows first, as load does"
+            f"{path}: {names}: {', '.join(dropped)}; drop such rows first, as load does"
         )
     return _on_the_host(hidden(gaussians))  # without copies, on a CPU
 
@@ -289,6 +277,12 @@ def _on_the_host(tensors: Mapping[str, Tensor]) -> Arrays:
     return {
         name: tensor.detach().float().cpu().contiguous().numpy() for name, tensor in tensors.items()
     }
+
+
+def dropped_harmonics(arrays: Arrays, degree: int) -> tuple[str, ...]:
+    """A line where the harmonics above a degree, which a format does not store, are not 0."""
+    lost = arrays["shN"][:, SH_COUNTS[degree] - 1 :].any()
+    return (f"spherical harmonics above degree {degree} are dropped",) if lost else ()
 
 
 def half_turn(arrays: Mapping[str, np.ndarray], axis: str) -> dict[str, np.ndarray]:
@@ -301,11 +295,11 @@ def half_turn(arrays: Mapping[str, np.ndarray], axis: str) -> dict[str, np.ndarr
     x, y, z = (np.float32(1 if name == axis else -1) for name in "xyz")
     # Of degree and order: odd in y for a negative order, in x for an odd one (else an even one), in
     # z where they differ by an odd number.
-    orders = [(degree, order) for degree in range(1, 5) for order in range(-degree, degree + 1)]
-    harmonics = [
-        x ** ((abs(m) - (m < 0)) % 2) * y ** int(m < 0) * z ** ((degree - m) % 2)
-        for degree, m in orders
-    ]
+    harmonics = []
+    for degree in range(1, 5):
+        for m in range(-degree, degree + 1):
+            sign = x ** ((abs(m) - (m < 0)) % 2) * y ** int(m < 0) * z ** ((degree - m) % 2)
+            harmonics.append(sign)
     bands = arrays["shN"].shape[1]
     return {
         **arrays,

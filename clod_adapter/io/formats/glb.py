@@ -42,11 +42,10 @@ def harmonics(degree: int) -> list[str]:
     """The attributes of the spherical harmonics up to a degree, 0 first, in the order of
     ``Gaussians.shN``.
     """
-    return [
-        f"{EXTENSION}:SH_DEGREE_{band}_COEF_{index}"
-        for band in range(degree + 1)
-        for index in range(2 * band + 1)
-    ]
+    names: list[str] = []
+    for band in range(degree + 1):
+        names += [f"{EXTENSION}:SH_DEGREE_{band}_COEF_{index}" for index in range(2 * band + 1)]
+    return names
 
 
 _JSON, _BIN = 0x4E4F534A, 0x004E4942
@@ -72,11 +71,10 @@ _STRAY = 0.01  # the largest share of values beyond the extension's range that a
 
 def write(path: Path, gaussians: Gaussians, metadata: Metadata) -> tuple[str, ...]:
     """Writes with float32's rounding of the activations."""
-    arrays, degree = arrays_of(path, gaussians), min(gaussians.sh_degree, DEGREE)
-    sh0, opacities = (
-        arrays["sh0"].reshape(-1, 3),
-        values.sigmoid(arrays["opacity_logits"]).astype(np.float32),
-    )
+    arrays = arrays_of(path, gaussians)
+    degree = min(gaussians.sh_degree, DEGREE)
+    sh0 = arrays["sh0"].reshape(-1, 3)
+    opacities = values.sigmoid(arrays["opacity_logits"]).astype(np.float32)
     columns: dict[str, np.ndarray] = {
         "POSITION": arrays["means"],
         "COLOR_0": values.colours_of(sh0, opacities),
@@ -87,12 +85,12 @@ def write(path: Path, gaussians: Gaussians, metadata: Metadata) -> tuple[str, ..
         f"{EXTENSION}:OPACITY": opacities,
         harmonics(0)[0]: sh0,
     }
-    columns |= {
-        name: np.ascontiguousarray(arrays["shN"][:, k])
-        for k, name in enumerate(harmonics(degree)[1:])
-    }
+    for k, name in enumerate(harmonics(degree)[1:]):
+        columns[name] = np.ascontiguousarray(arrays["shN"][:, k])
     columns |= {DIAL[name]: arrays[name] for name in dial_columns(arrays)}
-    accessors, views, offset = dict[str, dict[str, Any]](), list[dict[str, Any]](), 0
+    accessors: dict[str, dict[str, Any]] = {}
+    views: list[dict[str, Any]] = []
+    offset = 0
     for name, array in columns.items():
         kind = "SCALAR" if array.ndim == 1 else f"VEC{array.shape[1]}"
         accessors[name] = {"bufferView": len(views), "count": len(array), "type": kind}
@@ -100,15 +98,14 @@ def write(path: Path, gaussians: Gaussians, metadata: Metadata) -> tuple[str, ..
             {"buffer": 0, "byteOffset": offset, "byteLength": array.nbytes, "target": 34962}
         )
         offset += array.nbytes
-    x, y, z = metadata.origin
-    node = {"rotation": HALF_TURN} | (
-        {"translation": [0.0 - x, 0.0 - y, z]} if any(metadata.origin) else {}
-    )
+    node = {"rotation": HALF_TURN}
+    if any(metadata.origin):
+        x, y, z = metadata.origin
+        node["translation"] = [0.0 - x, 0.0 - y, z]
     extras = {KEY: json.loads(document(MODEL, metadata))}
     parts = [array.data for array in columns.values()]
     write_points(path, gaussians.means, accessors, node, views, parts, extras=extras)
-    lost = arrays["shN"][:, (degree + 1) ** 2 - 1 :].any()
-    return (f"spherical harmonics above degree {DEGREE} are dropped",) if lost else ()
+    return values.dropped_harmonics(arrays, DEGREE)
 
 
 def write_points(
@@ -126,24 +123,23 @@ def write_points(
     ``accessors`` are by attribute, without component type and bounds; ``extensions``, which readers
     must know, those of KHR_gaussian_splatting.
     """
-    for name, accessor in accessors.items():
-        accessor |= (
-            {"componentType": _FLOAT}
-            if name != "COLOR_0"
-            else {"componentType": _BYTE, "normalized": True}
-        )
+    for accessor in accessors.values():
+        accessor["componentType"] = _FLOAT
+    accessors["COLOR_0"] |= {"componentType": _BYTE, "normalized": True}
     accessors["POSITION"] |= {"min": means.amin(0).tolist(), "max": means.amax(0).tolist()}
-    how = {
+    how: dict[str, Any] = {
         "kernel": "ellipse",
         "colorSpace": COLOR_SPACE,
         "projection": "perspective",
         "sortingMethod": "cameraDistance",
-        **({"extensions": extensions} if extensions else {}),
     }
-    attributes, used = (
-        {name: index for index, name in enumerate(accessors)},
-        [EXTENSION, *(extensions or {})],
-    )
+    used = [EXTENSION]
+    required = {}
+    if extensions:
+        how["extensions"] = extensions
+        used += extensions
+        required = {"extensionsRequired": used}
+    attributes = {name: index for index, name in enumerate(accessors)}
     size = sum(memoryview(part).nbytes for part in parts)
     if size >= _LIMIT - (1 << 20):
         raise ClodError(
@@ -162,7 +158,7 @@ def write_points(
         "buffers": [{"byteLength": size}],
         "bufferViews": views,
         "extensionsUsed": used,
-        **({"extensionsRequired": used} if extensions else {}),
+        **required,
     }
     text = json.dumps(gltf, separators=(",", ":"), allow_nan=False).encode()
     text += b" " * (-len(text) % 4)
@@ -193,27 +189,26 @@ def read(path: Path, data: bytes) -> Source:
     with refused_if_damaged(path, *_DAMAGED):
         gltf, binary = _chunks(path, memoryview(data))
         (mesh, primitive), *others = _find(path, gltf)
-        there = primitive["attributes"]
-        degree = max(k for k in range(DEGREE + 1) if harmonics(k)[-1] in there)
-        names = _ATTRIBUTES | {
-            name: (DIAL[name], 1) for name in dial_columns([n for n in DIAL if DIAL[n] in there])
-        }
+        attributes = primitive["attributes"]
+        degree = max(k for k in range(DEGREE + 1) if harmonics(k)[-1] in attributes)
+        names = dict(_ATTRIBUTES)
+        for name in dial_columns([name for name in DIAL if DIAL[name] in attributes]):
+            names[name] = DIAL[name], 1
         arrays = {
-            key: _values(path, gltf, binary, there[name], width)
+            key: _values(path, gltf, binary, attributes[name], width)
             for key, (name, width) in names.items()
         }
-        rest = [_values(path, gltf, binary, there[name], 3) for name in harmonics(degree)[1:]]
-        if len({len(each) for each in (*arrays.values(), *rest)}) > 1:
+        rest = [_values(path, gltf, binary, attributes[name], 3) for name in harmonics(degree)[1:]]
+        if len(set(map(len, (*arrays.values(), *rest)))) > 1:
             raise ClodError(f"{path}: its attributes are of different lengths; {_REMEDY}")
         text = gltf["asset"].get("extras", {}).get(KEY)
         scale, turned, moved = _placed(path, gltf, mesh)
     space = primitive["extensions"][EXTENSION].get("colorSpace", COLOR_SPACE)
-    notes = (
-        [f"its colours are in {space!r:.40}, and taken as {COLOR_SPACE}"]
-        if space != COLOR_SPACE
-        else []
-    )
-    notes += [f"{len(others)} more primitives with Gaussians in it are left out"] if others else []
+    notes = []
+    if space != COLOR_SPACE:
+        notes.append(f"its colours are in {space!r:.40}, and taken as {COLOR_SPACE}")
+    if others:
+        notes.append(f"{len(others)} more primitives with Gaussians in it are left out")
     metadata = parse_metadata(path, text, dial=SIGMA in arrays)
     arrays["shN"] = (
         np.stack(rest, 1) if rest else np.zeros((len(arrays["means"]), 0, 3), np.float32)
@@ -237,9 +232,9 @@ def read(path: Path, data: bytes) -> Source:
 
 def _chunks(path: Path, data: memoryview) -> tuple[dict[str, Any], memoryview]:
     """The JSON and the binary chunk."""
-    version, length, size, kind = (
-        struct.unpack_from("<IIII", data, 4) if len(data) >= 20 else (0, 0, 0, 0)
-    )
+    head = bytes(data[:20]).ljust(20, b"\0")
+    version, length = struct.unpack_from("<II", head, 4)
+    size, kind = struct.unpack_from("<II", head, 12)
     whole = version == 2 and kind == _JSON and max(length, 20 + size) <= len(data)
     more = struct.unpack_from("<I", data, 20 + size)[0] if whole and 28 + size <= length else 0
     if not whole or (more and 28 + size + more > len(data)):
@@ -249,25 +244,24 @@ def _chunks(path: Path, data: memoryview) -> tuple[dict[str, Any], memoryview]:
 
 def _find(path: Path, gltf: dict[str, Any]) -> list[tuple[int, dict[str, Any]]]:
     """The primitives with Gaussians, at least one, each after the number of its mesh."""
-    every = (
-        (number, each)
-        for number, mesh in enumerate(gltf.get("meshes", []))
-        for each in mesh["primitives"]
-    )
-    found = [(number, each) for number, each in every if EXTENSION in each.get("extensions", {})]
-    if not found:
+    primitives = []
+    for number, mesh in enumerate(gltf.get("meshes", [])):
+        for primitive in mesh["primitives"]:
+            if EXTENSION in primitive.get("extensions", {}):
+                primitives.append((number, primitive))
+    if not primitives:
         raise ClodError(
             f"{path}: has no Gaussians ({EXTENSION}), so it is a mesh; give a checkpoint of"
             " Gaussians"
         )
-    first = found[0][1]
+    first = primitives[0][1]
     compressed = first["extensions"][EXTENSION].get("extensions")
     if compressed or any(name not in first["attributes"] for name, _ in _ATTRIBUTES.values()):
         raise ClodError(
             f"{path}: its Gaussians are compressed, or have no spherical harmonics; export them as"
             " a .ply"
         )
-    return found
+    return primitives
 
 
 def _values(
@@ -283,20 +277,20 @@ def _values(
     view = gltf["bufferViews"][_whole(accessor["bufferView"])]
     if _whole(view["buffer"]) or "uri" in gltf["buffers"][0] or view.get("extensions"):
         raise ClodError(f"{path}: its data are compressed, or in another file; {_REMEDY}")
-    stride = _whole(view.get("byteStride", kind.itemsize * width))
-    start, count = _whole(accessor.get("byteOffset", 0)), _whole(accessor["count"])
-    data = binary[_whole(view.get("byteOffset", 0)) :][: _whole(view["byteLength"])]
     size = kind.itemsize * width
+    stride = _whole(view.get("byteStride", size))
+    start = _whole(accessor.get("byteOffset", 0))
+    count = _whole(accessor["count"])
+    data = binary[_whole(view.get("byteOffset", 0)) :][: _whole(view["byteLength"])]
     if not count or stride < size or start + (count - 1) * stride + size > len(data):
         raise ClodError(
             f"{path}: an attribute has no values, or more than the file; copy or export it again"
         )
-    found = np.ndarray((count, width), kind, data, start, (stride, kind.itemsize)).astype(
-        np.float32
-    )
+    stored = np.ndarray((count, width), kind, data, start, (stride, kind.itemsize))
+    numbers = stored.astype(np.float32)
     if accessor.get("normalized") and kind.kind != "f":
-        found = np.maximum(found / np.float32(np.iinfo(kind).max), -1)
-    return found[:, 0] if width == 1 else found
+        numbers = np.maximum(numbers / np.float32(np.iinfo(kind).max), -1)
+    return numbers[:, 0] if width == 1 else numbers
 
 
 def _whole(value: Any) -> int:
@@ -310,18 +304,16 @@ def _placed(path: Path, gltf: dict[str, Any], mesh: int) -> tuple[float, bool, O
     translation as an origin in the axes of checkpoints.
     """
     nodes: list[dict[str, Any]] = gltf.get("nodes", [])
-    parents = {
-        _whole(child): number
-        for number, node in enumerate(nodes)
-        for child in node.get("children", [])
-    }
-    number = next((number for number, node in enumerate(nodes) if node.get("mesh") == mesh), None)
+    parents: dict[int, int] = {}
+    for number, node in enumerate(nodes):
+        parents |= dict.fromkeys(map(_whole, node.get("children", [])), number)
+    above = next((number for number, node in enumerate(nodes) if node.get("mesh") == mesh), None)
     placed = np.eye(4)
     for _ in nodes:  # at most as many are above each other
-        if number is not None:
-            placed = _matrix(path, nodes[number]) @ placed
-            number = parents.get(number)
-    if number is not None:
+        if above is not None:
+            placed = _matrix(path, nodes[above]) @ placed
+            above = parents.get(above)
+    if above is not None:
         raise ClodError(f"{path}: its nodes are above each other in a circle; export it again")
     linear = placed[:3, :3]
     scale = float(np.cbrt(np.linalg.det(linear)))
@@ -359,7 +351,9 @@ def _stored(
     """The values as checkpoints store them, and a line for each that the extension does not
     allow.
     """
-    scales, opacities, notes = arrays["log_scales"], arrays["opacity_logits"], list[str]()
+    scales = arrays["log_scales"]
+    opacities = arrays["opacity_logits"]
+    notes = []
     if re.fullmatch(_LOGARITHMS, generator) or _beyond(scales, np.inf):
         notes.append("its SCALE is not linear, as glTF has it, and is read as logarithms")
     else:

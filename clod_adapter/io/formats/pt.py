@@ -103,12 +103,14 @@ def read(path: Path, data: bytes) -> Source:
     with refused, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         checkpoint = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
-    found, splats = type(checkpoint).__name__, None
+    content = type(checkpoint).__name__
+    splats = None
     if isinstance(checkpoint, dict):
-        found, splats = ", ".join(map(repr, list(checkpoint)[:5])), checkpoint.get("splats")
+        content = ", ".join(map(repr, list(checkpoint)[:5]))
+        splats = checkpoint.get("splats")
     if not isinstance(splats, dict):
         raise ClodError(
-            f"{path}: has no dictionary 'splats', as gsplat's trainer writes (but {found}); export"
+            f"{path}: has no dictionary 'splats', as gsplat's trainer writes (but {content}); export"
             " a PLY"
         )
     wanted = (*NAMES, *dial_columns(splats))
@@ -117,10 +119,10 @@ def read(path: Path, data: bytes) -> Source:
     notes = [] if metadata.described else [FRAME]
     for name, (what, remedy) in _CORRECTIONS.items():
         if name in checkpoint:
-            about = (
-                f"trained with {what} corrected for each photograph ({name}), which is not applied"
+            notes.append(
+                f"{WARNING}trained with {what} corrected for each photograph ({name}), which is not"
+                f" applied; {remedy}"
             )
-            notes.append(f"{WARNING}{about}; {remedy}")
     notes += of_another_method(splats)
     return Source(arrays, metadata, tuple(notes), metadata.about, not metadata.described)
 

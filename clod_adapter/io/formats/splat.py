@@ -36,15 +36,11 @@ def write(path: Path, gaussians: Gaussians, metadata: Metadata) -> tuple[str, ..
     notes = [
         "colours, opacities and rotations are rounded to 8 bits, and the rows are in another order"
     ]
-    notes += ["view-dependent colour is dropped"] if arrays["shN"].any() else []
-    return (
-        *notes,
-        *(
-            ["the origin is dropped: coordinates are relative to it"]
-            if any(metadata.origin)
-            else []
-        ),
-    )
+    if arrays["shN"].any():
+        notes.append("view-dependent colour is dropped")
+    if any(metadata.origin):
+        notes.append("the origin is dropped: coordinates are relative to it")
+    return tuple(notes)
 
 
 def read(path: Path, data: bytes) -> Source:

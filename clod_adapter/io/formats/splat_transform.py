@@ -54,12 +54,8 @@ def cutting_options(count: int) -> tuple[str, ...]:
     """Options for the leaves of a streaming set; by default the tool cuts what is wider than 16
     units of length.
     """
-    return (
-        "--lod-chunk-extent",
-        "0",
-        "--lod-chunk-min",
-        str(max(SMALLEST, count // (1024 * LEAVES))),
-    )
+    least = max(SMALLEST, count // (1024 * LEAVES))
+    return ("--lod-chunk-extent", "0", "--lod-chunk-min", str(least))
 
 
 @dataclass(frozen=True)

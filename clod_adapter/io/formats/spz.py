@@ -113,7 +113,7 @@ def write(path: Path, gaussians: Gaussians, metadata: Metadata) -> tuple[str, ..
         )
     gzip = zlib.compressobj(wbits=31)
     path.write_bytes(gzip.compress(b"".join(parts)) + gzip.flush())
-    return (*moved, *_losses(arrays, bits, degree))
+    return (*moved, *_losses(arrays, bits))
 
 
 def _nearer(arrays: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], int, tuple[str, ...]]:
@@ -141,29 +141,17 @@ def _nearer(arrays: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], int, 
         nearer[SIGMA] = arrays[SIGMA] * factor[:, 0]
     if GROWTH in arrays:
         nearer["log_scales"] -= arrays[GROWTH][:, None] * np.log(factor)
-    return (
-        nearer,
-        bits,
-        (
-            (
-                f"the {moved} farthest are moved to {2.0 ** (23 - bits):g} from 0, and made as much"
-                " smaller"
-            ),
-        ),
-    )
+    end = 2.0 ** (23 - bits)
+    note = f"the {moved} farthest are moved to {end:g} from 0, and made as much smaller"
+    return nearer, bits, (note,)
 
 
 def _packed(arrays: dict[str, np.ndarray], bits: int, degree: int) -> list[bytes]:
     # Far beyond what a byte has room for, but not so far that it overflows.
-    sh0, harmonics = (
-        np.clip(arrays["sh0"], -9, 9),
-        np.clip(arrays["shN"][:, : (degree + 1) ** 2 - 1], -9, 9),
-    )
-    fixed = (
-        np.round(arrays["means"].astype(np.float64) * 2.0**bits)
-        .clip(-(2**23), 2**23 - 1)
-        .astype("<i4")
-    )
+    sh0 = np.clip(arrays["sh0"], -9, 9)
+    harmonics = np.clip(arrays["shN"][:, : SH_COUNTS[degree] - 1], -9, 9)
+    steps = np.round(arrays["means"].astype(np.float64) * 2.0**bits)
+    fixed = steps.clip(-(2**23), 2**23 - 1).astype("<i4")
     parts = [
         np.ascontiguousarray(fixed[..., None].view(np.uint8)[..., :3]),
         bytes_of(255 * values.sigmoid(arrays["opacity_logits"])),
@@ -180,7 +168,8 @@ def _packed_quats(quats: np.ndarray) -> np.ndarray:
     over sqrt(1/2).
     """
     xyzw = np.roll(values.normalized(quats), -1, axis=1).astype(np.float64)
-    rows, largest = np.arange(len(xyzw)), np.abs(xyzw).argmax(1)
+    rows = np.arange(len(xyzw))
+    largest = np.abs(xyzw).argmax(1)
     xyzw *= np.where(xyzw[rows, largest] < 0, -1.0, 1.0)[:, None]
     packed = largest.astype(np.uint32)
     for axis in range(4):
@@ -190,19 +179,19 @@ def _packed_quats(quats: np.ndarray) -> np.ndarray:
     return packed.astype("<u4")
 
 
-def _losses(arrays: dict[str, np.ndarray], bits: int, degree: int) -> tuple[str, ...]:
+def _losses(arrays: dict[str, np.ndarray], bits: int) -> list[str]:
     notes = [
         f"positions are rounded to {2.0**-bits:.1g}, colours, opacities, scales and rotations to"
-        " about 8 bits"
+        " about 8 bits",
+        *values.dropped_harmonics(arrays, DEGREE),
     ]
-    if arrays["shN"][:, (degree + 1) ** 2 - 1 :].any():
-        notes.append(f"spherical harmonics above degree {DEGREE} are dropped")
-    beyond = {
-        "harmonics beyond 1": np.abs(arrays["shN"]).max(initial=0) > 1.01,
-        "colours beyond the range": np.abs(arrays["sh0"]).max() > 0.51 / COLOR,
-        "scales beyond e^-10 to e^5.9": (np.abs(arrays["log_scales"] + 2.03125) > 8).any(),
-    }
-    return (*notes, *(f"{what} are cut to it" for what, there in beyond.items() if there))
+    if np.abs(arrays["shN"]).max(initial=0) > 1.01:
+        notes.append("harmonics beyond 1 are cut to it")
+    if np.abs(arrays["sh0"]).max() > 0.51 / COLOR:
+        notes.append("colours beyond the range are cut to it")
+    if (np.abs(arrays["log_scales"] + 2.03125) > 8).any():
+        notes.append("scales beyond e^-10 to e^5.9 are cut to it")
+    return notes
 
 
 def has_dial(path: Path) -> bool:
@@ -218,7 +207,8 @@ def read(path: Path, data: bytes) -> Source:
     if data.startswith(NEW_SPZ):
         return splat_transform.read(path, data)
     data = _unpacked(path, data)
-    magic, version, count, degree, bits, flags, _ = HEADER.unpack_from(data)
+    magic, version, count = struct.unpack_from("<III", data)
+    degree, bits, flags = data[12:15]
     if (
         magic != MAGIC
         or version not in (2, 3)
@@ -248,9 +238,10 @@ def read(path: Path, data: bytes) -> Source:
     arrays = _unquantized(parts, bits)
     arrays = (half_turn(arrays, _TURNS[axes]) if _TURNS[axes] else arrays) | dial
     if dial:  # whose sigma_d is in units of the reference distance where that is large
-        own = {name: array for name, array in arrays.items() if name != OPACITY}
         tensors: dict[str, Any] = {
-            name: torch.from_numpy(array).float() for name, array in own.items()
+            name: torch.from_numpy(array).float()
+            for name, array in arrays.items()
+            if name != OPACITY
         }
         gaussians = in_world_units(Gaussians(**tensors, attenuation=metadata.attenuation))
         arrays[SIGMA] = gaussians.tensors()[SIGMA].numpy()
@@ -276,13 +267,14 @@ def _unpacked(path: Path, data: bytes) -> bytes:
 
 def _records(data: bytes) -> dict[int, bytes]:
     """The records after the arrays by their types, as far as they are whole."""
-    found, start = {}, 0
+    records = {}
+    start = 0
     while start + 8 <= len(data):
         kind, size = struct.unpack_from("<II", data, start)
         start += 8 + size
         if start <= len(data):
-            found[kind] = data[start - size : start]
-    return found
+            records[kind] = data[start - size : start]
+    return records
 
 
 def _ours(path: Path, body: bytes, count: int) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
@@ -300,7 +292,8 @@ def _ours(path: Path, body: bytes, count: int) -> tuple[dict[str, Any], dict[str
 
 
 def _unquantized(parts: list[np.ndarray], bits: int) -> dict[str, np.ndarray]:
-    means, opacities, colors, scales, quats, harmonics = parts
+    means, opacities, colors = parts[:3]
+    scales, quats, harmonics = parts[3:]
     wide = np.zeros((len(means), 3, 4), np.uint8)
     wide[..., 1:] = means.reshape(-1, 3, 3)
     fixed = wide.view("<i4")[..., 0] >> 8  # with the sign
@@ -320,7 +313,8 @@ def _rotations(quats: np.ndarray) -> np.ndarray:
         xyz = quats / 127.5 - 1
         return np.concatenate([np.sqrt(np.maximum(0, 1 - (xyz**2).sum(1, keepdims=True))), xyz], 1)
     packed = np.ascontiguousarray(quats).view("<u4")[:, 0]
-    largest, xyzw = packed >> 30, np.zeros((len(packed), 4), np.float64)
+    largest = packed >> 30
+    xyzw = np.zeros((len(packed), 4), np.float64)
     for axis in (3, 2, 1, 0):
         there = largest != axis
         value = (packed & 511) / MAGNITUDE

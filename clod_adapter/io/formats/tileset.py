@@ -52,31 +52,32 @@ def write_tileset(
         levels: distance in world units at which each begins, and its Gaussians, without a dial; the
             finest first.
     """
-    notes, errors = list[str](), [ALLOWED / FOCAL * begins for begins, _ in levels]
+    notes: list[str] = []
+    errors = [ALLOWED / FOCAL * begins for begins, _ in levels]
     detail = [gaussians for _, gaussians in levels]
     centres = [level.means.cpu().double().numpy() for level in detail]
 
     def tile(level: int, rows: Rows, name: str, children: list[dict[str, Any]]) -> dict[str, Any]:
         """A tile and its file; without one where it has no Gaussians."""
         box = {"box": _box(centres, rows, origin)}
-        found: dict[str, Any] = {"boundingVolume": box, "geometricError": errors[level]}
+        entry: dict[str, Any] = {"boundingVolume": box, "geometricError": errors[level]}
         if len(rows[level]):
-            notes.extend(
-                write_tile(
-                    folder / name, detail[level].select(torch.from_numpy(rows[level])), origin
-                )
-            )
-            found["content"] = {"uri": name}
-        return found | ({"children": children} if children else {})
+            gaussians = detail[level].select(torch.from_numpy(rows[level]))
+            notes.extend(write_tile(folder / name, gaussians, origin))
+            entry["content"] = {"uri": name}
+        if children:
+            entry["children"] = children
+        return entry
 
-    coarsest, chains = len(levels) - 1, []
-    whole = [np.arange(len(each)) for each in centres]
-    for cell, rows in enumerate(_cells(centres, whole)):
+    coarsest = len(levels) - 1
+    chains = []
+    scene = [np.arange(len(points)) for points in centres]
+    for cell, rows in enumerate(_cells(centres, scene)):
         chain: list[dict[str, Any]] = []
         for level in range(coarsest):
             chain = [tile(level, rows, f"{cell}_{level}.glb", chain)]
         chains += chain
-    root = tile(coarsest, whole, "root.glb", chains) | {"refine": "REPLACE"}
+    root = tile(coarsest, scene, "root.glb", chains) | {"refine": "REPLACE"}
     extensions = {"extensionsUsed": [EXTENSION, SPZ], "extensionsRequired": [EXTENSION, SPZ]}
     index = {
         "asset": {"version": "1.1", "generator": f"clod-adapter {package_version()}"},

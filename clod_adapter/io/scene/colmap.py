@@ -87,8 +87,8 @@ def marked(
     """
     count = sum(image.name in testing for image in images)
     if not 0 < count < len(images):
-        some = "all" if count else "none"
-        return images, [f"{source} holds out {some} of the photographs and is not used"]
+        extent = "all" if count else "none"
+        return images, [f"{source} holds out {extent} of the photographs and is not used"]
     note = f"held out are {count} photographs, those of {source}"
     return [replace(image, held_out=image.name in testing) for image in images], [note]
 
@@ -99,11 +99,10 @@ def check_posed(image: PosedImage, source: Path) -> PosedImage:
     """
     camera = image.camera
     if not camera.is_perspective_pinhole() and not camera.is_perspective_fisheye():
-        what = (
-            f"has camera model {camera.model_name}, no perspective camera; cut perspective views"
-            " from it first"
+        raise ClodError(
+            f"{source}: image {image.name!r} has camera model {camera.model_name}, no perspective"
+            " camera; cut perspective views from it first"
         )
-        raise ClodError(f"{source}: image {image.name!r} {what}")
     lengths = [camera.focal_length_x, camera.focal_length_y, camera.width, camera.height]
     numbers = np.abs([*image.viewmat.ravel(), *camera.params, *lengths])
     if not (numbers < HUGE).all() or min(lengths) <= 0:  # a comparison with NaN is false
@@ -144,7 +143,8 @@ def read_colmap(model: Path) -> tuple[list[PosedImage], list[str]]:
             f"{path.name} has {len(posed)} images, but its header says {int(stated[1])}: it may be"
             " incomplete"
         )
-    if (split := model / SPLIT).is_file():
+    split = model / SPLIT
+    if split.is_file():
         lines = read_bytes(split).decode("utf-8-sig", "surrogateescape").splitlines()
         posed, more = marked(posed, {line.strip() for line in lines}, SPLIT)
         notes += more
@@ -166,9 +166,8 @@ def load_points(folder: str | Path, origin: Sequence[float] = NOWHERE) -> torch.
 def _cameras(path: Path) -> dict[int, pycolmap.Camera]:
     cameras = {}
     with refused_if_damaged(path, DAMAGED):
-        for camera, params in (_camera_records if path.suffix == ".bin" else _cameras_in_text)(
-            path
-        ):
+        records = _camera_records(path) if path.suffix == ".bin" else _cameras_in_text(path)
+        for camera, params in records:
             if len(params) != len(camera.params):
                 raise ValueError(f"camera {camera.camera_id} has {len(params)} parameters")
             camera.params = params
@@ -182,7 +181,8 @@ class _Records:
     """
 
     def __init__(self, path: Path) -> None:
-        self.data, self.at = read_bytes(path), 0
+        self.data = read_bytes(path)
+        self.at = 0
 
     def take(self, layout: str) -> tuple[Any, ...]:
         values = struct.unpack_from(f"<{layout}", self.data, self.at)
@@ -203,9 +203,9 @@ class _Records:
 def _camera_records(path: Path) -> Iterator[tuple[pycolmap.Camera, list[float]]]:
     records = _Records(path)
     for _ in range(*records.take("Q")):
-        number, kind, width, height = records.take("IiQQ")
+        number, kind, *size = records.take("IiQQ")
         camera = pycolmap.Camera.create_from_model_id(
-            number, pycolmap.CameraModelId(kind), 1.0, width, height
+            number, pycolmap.CameraModelId(kind), 1.0, *size
         )
         yield camera, list(records.take(f"{len(camera.params)}d"))
 
@@ -221,9 +221,10 @@ def _images(path: Path) -> Iterator[Image]:
 def _points(path: Path) -> Iterator[Sequence[float]]:
     records = _Records(path)
     for _ in range(*records.take("Q")):
-        _, x, y, z, *_, observations = records.take("Q3d3BdQ")  # id, position, colour, error
-        yield x, y, z
-        records.skip(8 * observations)
+        # number, position, colour, error, count of observations
+        point = records.take("Q3d3BdQ")
+        yield point[1:4]
+        records.skip(8 * point[-1])
 
 
 def _lines(path: Path) -> Iterator[tuple[int, bytes]]:
@@ -237,11 +238,12 @@ def _lines(path: Path) -> Iterator[tuple[int, bytes]]:
 
 def _cameras_in_text(path: Path) -> Iterator[tuple[pycolmap.Camera, list[float]]]:
     for _, line in _lines(path):
-        number, kind, width, height, *params = line.split()
+        number, kind, *rest = line.split()
+        width, height = map(int, rest[:2])
         camera = pycolmap.Camera.create_from_model_name(
-            int(number), kind.decode(), 1.0, int(width), int(height)
+            int(number), kind.decode(), 1.0, width, height
         )
-        yield camera, [float(value) for value in params]
+        yield camera, [float(value) for value in rest[2:]]
 
 
 def _images_in_text(path: Path) -> Iterator[Image]:
