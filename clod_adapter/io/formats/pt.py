@@ -110,8 +110,8 @@ def read(path: Path, data: bytes) -> Source:
         splats = checkpoint.get("splats")
     if not isinstance(splats, dict):
         raise ClodError(
-            f"{path}: has no dictionary 'splats', as gsplat's trainer writes (but {content}); export"
-            " a PLY"
+            f"{path}: has no dictionary 'splats', as gsplat's trainer writes (but {content});"
+            " export a PLY"
         )
     wanted = (*NAMES, *dial_columns(splats))
     arrays = {NAMES.get(name, name): _values(path, name, splats, len(data)) for name in wanted}

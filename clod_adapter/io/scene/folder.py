@@ -7,6 +7,7 @@ import json
 import os
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
+from itertools import product
 from os.path import isfile
 from pathlib import Path, PureWindowsPath
 from typing import Any
@@ -26,6 +27,7 @@ MAX_BYTES = 256 * 2**20  # a hundred thousand frames have a tenth of that
 # copies at a part of the size, as Mip-NeRF 360 and Inria's code have
 SMALLER = ("images_2", "images_4", "images_8")
 RAW = "input"  # Inria's name for the photographs before they are undistorted into images
+NAMES = ("images", *SMALLER, RAW)  # of folders of photographs, the likeliest first
 MASKS = ("masks", "mask")
 # what is said of masks
 UNUSED = (
@@ -44,44 +46,35 @@ def find_cameras(folder: Path) -> Path:
     there; nerfstudio's colmap/sparse/0; and a model in sparse beside ``folder``, which may be the
     images' own.
     """
-    files = [folder / name for name in TRANSFORMS if (folder / name).is_file()]
-    own, beside = models_in(folder / "sparse"), models_in(folder.resolve().parent / "sparse")
-    for each in (
-        *own,
+    candidates = [
+        *models_in(folder / "sparse"),
         *models_in(folder),
-        *files,
+        *(folder / name for name in TRANSFORMS if (folder / name).is_file()),
         *models_in(folder / "colmap" / "sparse"),
-        *beside,
-    ):
-        return each
-    what = (
-        "no COLMAP model (cameras, images; .bin or .txt) in it, sparse or sparse/0, and no"
-        " transforms.json"
-    )
-    raise ClodError(
-        f"{folder}: {what}; give the folder that holds images/ and sparse/0, or transforms.json"
-    )
+        *models_in(folder.resolve().parent / "sparse"),
+    ]
+    if not candidates:
+        raise ClodError(
+            f"{folder}: no COLMAP model (cameras, images; .bin or .txt) in it, sparse or sparse/0,"
+            " and no transforms.json; give the folder that holds images/ and sparse/0, or"
+            " transforms.json"
+        )
+    return candidates[0]
 
 
 def models_in(folder: Path) -> list[Path]:
     """COLMAP's models in the numbered folders of this one, by number, and in itself."""
-    numbered = sorted(
-        (each for each in folder.glob("*") if each.name.isdecimal()),
-        key=lambda each: int(each.name),
-    )
-    return [each for each in (*numbered, folder) if form_of(each)]
+    numbered = [path for path in folder.glob("*") if path.name.isdecimal()]
+    numbered.sort(key=lambda path: int(path.name))
+    return [path for path in (*numbered, folder) if form_of(path)]
 
 
 def form_of(folder: Path) -> str:
     """Which of FORMS a folder's COLMAP model has, empty without one; trainers need no points."""
-    return next(
-        (
-            form
-            for form in FORMS
-            if all((folder / f"{name}{form}").is_file() for name in ("cameras", "images"))
-        ),
-        "",
-    )
+    for form in FORMS:
+        if (folder / f"cameras{form}").is_file() and (folder / f"images{form}").is_file():
+            return form
+    return ""
 
 
 def photograph_folders(folder: Path, cameras: Path) -> list[Path]:
@@ -89,8 +82,8 @@ def photograph_folders(folder: Path, cameras: Path) -> list[Path]:
     if cameras.is_file():
         return [cameras.parent]
     bases = folder, cameras.parent, cameras.parent.parent
-    named = [base / name for name in ("images", *SMALLER, RAW) for base in bases]
-    return [named[0], folder, *named[1:]]
+    first, *others = [base / name for name, base in product(NAMES, bases)]
+    return [first, folder, *others]
 
 
 def find_photographs(
@@ -105,15 +98,12 @@ def find_photographs(
     parts = [name_parts(name, cameras) for name in names]
     if twice := [name for name, count in Counter(names).items() if count > 1]:
         raise ClodError(f"{cameras}: has image {twice[0]} more than once; export it again")
-    roots = [
-        each
-        for each in photograph_folders(folder, cameras)
-        if raw or each.name != RAW or each == folder
+    candidates = [
+        (*find_files(root, parts), root)
+        for root in photograph_folders(folder, cameras)
+        if raw or root.name != RAW or root == folder
     ]
-    found = [(*find_files(root, parts), root) for root in roots]
-    paths, others, root = min(
-        found, key=lambda candidates: (candidates[0].count(None), len(candidates[1]))
-    )
+    paths, others, root = min(candidates, key=lambda files: (files[0].count(None), len(files[1])))
     notes = []
     if others:
         example = as_text(f"{others[0].name} in {root.name}")
@@ -123,24 +113,25 @@ def find_photographs(
         )
     if root.name in (*SMALLER, RAW) and root != folder:
         notes.append(f"the photographs are those in {root.name}, as there are more than in images")
-    bases = dict.fromkeys((folder, root.parent)) if cameras.is_dir() and root != folder else ()
-    masks = [each for base in bases for name in MASKS if any((each := base / name).glob("*"))]
-    notes += [f"the masks in {each} are {UNUSED}" for each in masks]
+    if cameras.is_dir() and root != folder:
+        for base, name in product(dict.fromkeys((folder, root.parent)), MASKS):
+            if any((base / name).glob("*")):
+                notes.append(f"the masks in {base / name} are {UNUSED}")
     missing = [
-        as_text(str(Path(*each))) for each, path in zip(parts, paths, strict=True) if path is None
+        as_text(str(Path(*name))) for name, path in zip(parts, paths, strict=True) if path is None
     ]
     if missing:
-        some = f"({', '.join(missing[:3])}{', ...' if len(missing) > 3 else ''})"
+        examples = f"({', '.join(missing[:3])}{', ...' if len(missing) > 3 else ''})"
         if root.is_dir() and not os.access(root, os.X_OK):
             raise ClodError(f"{root}: cannot be read; check its permissions")
+        share = f"{len(missing)} of {len(names)}"
         if len(missing) > MISSING * len(names):
             lists = cameras.name if cameras.is_file() else "the model"
-            what = (
-                f"{len(missing)} of {len(names)} images of {lists} are missing {some}, more than"
-                " half"
+            raise ClodError(
+                f"{root}: {share} images of {lists} are missing {examples}, more than half; put"
+                " them there under these names"
             )
-            raise ClodError(f"{root}: {what}; put them there under these names")
-        notes.append(f"{len(missing)} of {len(names)} photographs are missing and left out {some}")
+        notes.append(f"{share} photographs are missing and left out {examples}")
     return paths, notes
 
 
@@ -152,23 +143,22 @@ def find_files(
     In place of a missing one that is the only photograph of the same name otherwise, if no other
     name stands for it.
     """
-    named = [root.joinpath(*map(file_name, each)) for each in parts]
+    named = [root.joinpath(*map(file_name, name)) for name in parts]
     missing = [path for path in named if not isfile(path)]
-    there = defaultdict[Path, list[Path]](list)
+    photographs = defaultdict[Path, list[Path]](list)
     for folder in {path.parent for path in missing}:
         for path in folder.glob("*"):
             if path.suffix.lower() in PHOTOGRAPHS:
-                there[_without_suffix(path)].append(path)
+                photographs[_without_suffix(path)].append(path)
     count = Counter(map(_without_suffix, named))
-    others = {
-        path: there[key][0]
-        for path in missing
-        if len(there[key := _without_suffix(path)]) == count[key] == 1
-    }
-    absent = set(missing) - set(others)
-    return [None if path in absent else others.get(path, path) for path in named], list(
-        others.values()
-    )
+    files: dict[Path, Path | None] = dict.fromkeys(missing)
+    others = []
+    for path in files:
+        key = _without_suffix(path)
+        if len(photographs[key]) == count[key] == 1:
+            files[path] = photographs[key][0]
+            others += photographs[key]
+    return [files.get(path, path) for path in named], others
 
 
 def _without_suffix(path: Path) -> Path:
@@ -199,12 +189,20 @@ def name_parts(name: str, cameras: Path, home: Path | None = None) -> tuple[str,
     if home is not None:
         for count in range(min(MOST_PARTS, len(path.parts) - 1), 0, -1):
             end = path.parts[-count:]
-            if ".." not in end and any(
-                isfile(home / file_name("/".join(end) + ending)) for ending in ENDINGS
-            ):
+            if ".." not in end and with_ending(home, "/".join(end)):
                 return end
-    what = f"image name {name[:80]!r} leaves the images folder or is no name"
-    raise ClodError(f"{cameras}: {what}; put the photograph there, or correct the name")
+    raise ClodError(
+        f"{cameras}: image name {name[:80]!r} leaves the images folder or is no name; put the"
+        " photograph there, or correct the name"
+    )
+
+
+def with_ending(folder: Path, name: str) -> str | None:
+    """The name with the first of ENDINGS that makes it a file's; None where none does."""
+    for ending in ENDINGS:
+        if isfile(folder / file_name(name + ending)):  # False for what can be no path
+            return name + ending
+    return None
 
 
 def leaves(name: str) -> bool:
@@ -219,21 +217,21 @@ def scene_files(folder: Path) -> Iterator[Path]:
     """
     cameras = find_cameras(folder)
     home = cameras if cameras.is_dir() else cameras.parent
-    yield from (each / name for each in dict.fromkeys((folder, home)) for name in DESCRIPTIONS)
+    for base in dict.fromkeys((folder, home)):
+        yield from (base / name for name in DESCRIPTIONS)
     if cameras.is_file():
-        yield from (
-            home / name for each in DESCRIPTIONS for name in _names_in_json(cameras.with_name(each))
-        )
+        for name in DESCRIPTIONS:
+            yield from (home / named for named in _names_in_json(cameras.with_name(name)))
         return
-    yield from (path for path in cameras.glob("*") if path.suffix in (".bin", ".txt"))
-    named = [
-        each
-        for each in photograph_folders(folder, cameras)
-        if each.name in ("images", *SMALLER, RAW)
-    ]
+    yield from (path for path in cameras.glob("*") if path.suffix in FORMS)
     # glob passes over what cannot be read
-    for each in [path for path in named if any(path.glob("*"))] or [folder]:
-        yield from (path for path in each.rglob("*") if path.suffix.lower() in PHOTOGRAPHS)
+    roots = [
+        path
+        for path in photograph_folders(folder, cameras)
+        if path.name in NAMES and any(path.glob("*"))
+    ]
+    for root in roots or [folder]:
+        yield from (path for path in root.rglob("*") if path.suffix.lower() in PHOTOGRAPHS)
 
 
 def _names_in_json(path: Path) -> Iterator[str]:

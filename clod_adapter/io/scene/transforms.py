@@ -8,24 +8,22 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
-from os.path import isfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pycolmap
 
-from clod_adapter._support.text import file_name
 from clod_adapter.errors import ClodError
 from clod_adapter.io.scene.colmap import HUGE, PosedImage, check_posed, marked
 from clod_adapter.io.scene.folder import (
     DATAPARSER,
-    ENDINGS,
     UNUSED,
     find_files,
     leaves,
     name_parts,
     read_json,
+    with_ending,
 )
 from clod_adapter.io.scene.images import image_size
 
@@ -85,23 +83,21 @@ def _frames(path: Path, held_out: bool | None) -> tuple[list[PosedImage], list[s
         if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
             raise ClodError(f"{path}: frame {number} has no file_path; export the file again")
         listed.append("/".join(name_parts(frame["file_path"], path, path.parent)))
-    # isfile, as it is False for what can be no path
-    names = [
-        next((each + end for end in ENDINGS if isfile(path.parent / file_name(each + end))), each)
-        for each in listed
-    ]
+    names = [with_ending(path.parent, name) or name for name in listed]
     files, _ = find_files(path.parent, [tuple(name.split("/")) for name in names])
-    images, is_test = [], _split(path, content)
-    testing = {name for each, name in zip(listed, names, strict=True) if is_test and is_test(each)}
+    is_test = _split(path, content)
+    images = []
     for frame, name, file in zip(frames, names, files, strict=True):
         where = f"{path}: frame {name}"
         camera = _camera(where, file, ChainMap(frame, content))
-        pose, viewmat = read_pose(where, frame, "transform_matrix"), np.eye(4)
+        pose = read_pose(where, frame, "transform_matrix")
+        viewmat = np.eye(4)
         viewmat[:3, :3] = (pose[:3, :3] @ np.diag([1.0, -1.0, -1.0])).T
         viewmat[:3, 3] = -viewmat[:3, :3] @ pose[:3, 3]
         images.append(check_posed(PosedImage(name, viewmat, camera, held_out), path))
-    notes = list[str]()
+    notes: list[str] = []
     if is_test and held_out is None:
+        testing = {name for key, name in zip(listed, names, strict=True) if is_test(key)}
         images, notes = marked(images, testing, f"the lists of {path.name}")
     if any(leaves(frame["file_path"]) for frame in frames):
         notes.append(f"paths of {path.name} lead out of its folder: photographs are those in it")
@@ -121,7 +117,8 @@ def _split(path: Path, content: Mapping[str, Any]) -> Callable[[str], bool] | No
     """
     lists = {}
     for key in LISTS:
-        if (given := content.get(key)) is not None:
+        given = content.get(key)
+        if given is not None:
             if not isinstance(given, list) or not all(isinstance(name, str) for name in given):
                 raise ClodError(f"{path}: {key} is no list of file names; correct or remove it")
             lists[key] = {"/".join(name_parts(name, path, path.parent)) for name in given}
@@ -141,27 +138,31 @@ def read_pose(where: object, values: Mapping[str, Any], key: str) -> np.ndarray:
         raise ClodError(
             f"{where}: {key} is no 3x4 or 4x4 matrix of finite numbers; copy or export it again"
         )
-    whole, turn = np.vstack([pose[:3], [0.0, 0.0, 0.0, 1.0]]), pose[:3, :3]
+    square = np.vstack([pose[:3], [0.0, 0.0, 0.0, 1.0]])
+    turn = pose[:3, :3]
     with np.errstate(over="ignore", invalid="ignore"):
         off = np.abs(turn.T @ turn - np.eye(3)).max()
     # A file may have few digits, but a scale or a mirror image would give a picture of another
     # scene.
-    if not off < 0.01 or np.linalg.det(turn) < 0 or not np.array_equal(pose, whole[: len(pose)]):
+    if not off < 0.01 or np.linalg.det(turn) < 0 or not np.array_equal(pose, square[: len(pose)]):
         raise ClodError(f"{where}: {key} is no rotation and translation; copy or export it again")
     left, _, right = np.linalg.svd(turn)
-    whole[:3, :3] = left @ right
-    return whole
+    square[:3, :3] = left @ right
+    return square
 
 
 def _number(
     where: object, values: Mapping[str, Any], key: str, default: float, above: float = -HUGE
 ) -> float:
-    given, value = default if values.get(key) is None else values[key], math.nan
+    given = default if values.get(key) is None else values[key]
+    value = math.nan
     with suppress(TypeError, ValueError, OverflowError):
         value = float(given)
     if isinstance(given, bool) or not above < value < HUGE:
-        what = f"{key} is no number between {above:g} and {HUGE:g}, but {given!r:.40}"
-        raise ClodError(f"{where}: {what}; copy or export the file again")
+        raise ClodError(
+            f"{where}: {key} is no number between {above:g} and {HUGE:g}, but {given!r:.40}; copy"
+            " or export the file again"
+        )
     return value
 
 
@@ -177,11 +178,13 @@ def _camera(where: str, photograph: Path | None, values: Mapping[str, Any]) -> p
         )
     fy = number("fl_y", 0) or _focal(height, number("camera_angle_y", 0)) or fx
     params = [fx, fy, number("cx", width / 2), number("cy", height / 2)]
-    k1, k2, k3, k4, p1, p2 = (number(key, 0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    radial = [number(key, 0) for key in ("k1", "k2", "k3", "k4")]
+    tangential = [number(key, 0) for key in ("p1", "p2")]
+    k3, k4 = radial[2:]
     model = str(values.get("camera_model") or "")
     if model in FISHEYE or (model in PERSPECTIVE and values.get("is_fisheye")):
         return pycolmap.Camera(
-            model="OPENCV_FISHEYE", width=width, height=height, params=[*params, k1, k2, k3, k4]
+            model="OPENCV_FISHEYE", width=width, height=height, params=params + radial
         )
     # of k4 some writers mean a power of the radius, some a divisor
     if model not in PERSPECTIVE or k4:
@@ -189,10 +192,12 @@ def _camera(where: str, photograph: Path | None, values: Mapping[str, Any]) -> p
         raise ClodError(
             f"{where}: {what} is not known; give the COLMAP model that the file was made from"
         )
-    params += [k1, k2, p1, p2, *([k3, 0, 0, 0] if k3 else [])]
-    return pycolmap.Camera(
-        model="FULL_OPENCV" if k3 else "OPENCV", width=width, height=height, params=params
-    )
+    params += radial[:2] + tangential
+    model = "OPENCV"
+    if k3:
+        params += [k3, 0, 0, 0]
+        model = "FULL_OPENCV"
+    return pycolmap.Camera(model=model, width=width, height=height, params=params)
 
 
 def _focal(pixels: int, angle: float) -> float:
@@ -224,16 +229,15 @@ def in_trained_frame(
     if not path.is_file():
         return images, []
     values = read_json(path)
-    pose, scale = (
-        read_pose(path, values, "transform"),
-        _number(path, values, "scale", 1.0, 1 / HUGE),
-    )
+    pose = read_pose(path, values, "transform")
+    scale = _number(path, values, "scale", 1.0, 1 / HUGE)
     if cameras.is_file():
         applied = read_json(cameras)
         if applied.get("applied_transform") is not None:
             pose = pose @ np.linalg.inv(read_pose(cameras, applied, "applied_transform"))
         scale /= _number(cameras, applied, "applied_scale", 1.0, 1 / HUGE)
-    back, brought = np.linalg.inv(pose), []
+    back = np.linalg.inv(pose)
+    brought = []
     for image in images:
         viewmat = image.viewmat @ back
         viewmat[:3, 3] *= scale
