@@ -74,7 +74,8 @@ def output_lock(final: Path, *, of: Path | None = None) -> Iterator[None]:
 
     # some file systems ignore case
     path = final.parent / f"{_mark(final.with_name(final.name.casefold()))}lock"
-    lock, name = FileLock(path, timeout=0), of or final
+    lock = FileLock(path, timeout=0)
+    name = of or final
     try:
         lock.acquire()
     except (OSError, NotImplementedError) as error:

@@ -91,9 +91,9 @@ def check_suffix(path: Path) -> None:
             f"{path}: is written by clod-adapt export alone: save a .ply, then clod-adapt export it"
         )
     if path.suffix.lower() not in WRITABLE:
-        found = path.suffix or "no suffix"
         raise ClodError(
-            f"{path}: {found} is no format to write; choose one of {', '.join(WRITABLE)}"
+            f"{path}: {path.suffix or 'no suffix'} is no format to write; choose one of"
+            f" {', '.join(WRITABLE)}"
         )
 
 
@@ -122,17 +122,16 @@ def read_source(path: Path) -> Source:
         _call("ranks.check_ranks", path, ranks)
     if len(ranks) < 2:
         return source
-    joined: Source = _call(
-        "ranks.joined", path, [source if each == path else _read(each) for each in ranks.values()]
-    )
+    parts = [source if rank == path else _read(rank) for rank in ranks.values()]
+    joined: Source = _call("ranks.joined", path, parts)
     return joined
 
 
 def _read(path: Path) -> Source:
     check_readable(path)
     data = read_bytes(path)  # once, and not mapped: another program may write the file meanwhile
-    found: Source = _call(f"{format_of(path).module}.read", path, data)
-    return found._replace(sha256=hashlib.sha256(data).hexdigest())
+    source: Source = _call(f"{format_of(path).module}.read", path, data)
+    return source._replace(sha256=hashlib.sha256(data).hexdigest())
 
 
 def write(
@@ -164,10 +163,9 @@ def write(
     stored = replace(
         metadata or Metadata(), attenuation=g.attenuation, screen_filter=g.screen_filter
     )
+    writer = writer or partial(_call, f"{form.module}.write")
     with atomic_path(path) as temporary:
-        notes: tuple[str, ...] = (writer or partial(_call, f"{form.module}.write"))(
-            temporary, g, stored
-        )
+        notes = writer(temporary, g, stored)
         check_written(temporary)
     return notes
 
@@ -180,7 +178,8 @@ _START: dict[str, tuple[bytes, ...]] = {".glb": (b"glTF",), ".spz": (b"\x1f\x8b"
 
 def check_start(path: Path) -> None:
     """Refuses a file whose first bytes are not of its suffix's format."""
-    suffix, start = path.suffix.lower(), read_bytes(path, START)
+    suffix = path.suffix.lower()
+    start = read_bytes(path, START)
     refuse_known(path, start)
     if suffix in _START and not start.startswith(_START[suffix]):
         refuse(path, start, f"is not a {suffix} file by its first bytes; copy or export it again")

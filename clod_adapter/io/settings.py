@@ -35,10 +35,8 @@ KINDS = {
     MODEL: (1, "is not a model but {}; clod-adapt apply makes one of an adapter"),
     ADAPTER: (
         3,
-        (
-            "is not an adapter but {}; give what clod-adapt wrote beside its PLY; a 'clod-model'"
-            " needs none"
-        ),
+        "is not an adapter but {}; give what clod-adapt wrote beside its PLY; a 'clod-model' needs"
+        " none",
     ),
 }
 # what is wrong and what to do, for ``refused_if_damaged``
@@ -126,7 +124,8 @@ def _attenuation(
     kinds: dict[str, Any] = {field.name: type(field.default) for field in fields(AttenuationConfig)}
     values = {name: kind(stored[name]) for name, kind in kinds.items() if name in stored}
     _note_unknown(stored, kinds, notes)
-    if missing := [name for name in kinds if name not in stored] * described:
+    missing = [name for name in kinds if name not in stored]
+    if missing and described:
         notes.append(f"settings that are missing have their defaults: {', '.join(missing)}")
     return AttenuationConfig(**values)
 
@@ -174,11 +173,13 @@ def of_another_method(names: Iterable[str]) -> list[str]:
     """
     lines = []
     for pattern, method in _METHODS.items():
-        found = [name for name in names if re.fullmatch(pattern, name)]
-        if found:
-            some = ", ".join(found[:3]) + ", ..." * (len(found) > 3)
-            about = f"{some} of {method}, are not drawn, so the picture is not the trained one"
-            lines.append(f"{WARNING}{about}; adapt a checkpoint of plain Gaussians")
+        extra = [name for name in names if re.fullmatch(pattern, name)]
+        if extra:
+            examples = ", ".join(extra[:3]) + ", ..." * (len(extra) > 3)
+            lines.append(
+                f"{WARNING}{examples} of {method}, are not drawn, so the picture is not the trained"
+                " one; adapt a checkpoint of plain Gaussians"
+            )
     return lines
 
 
@@ -186,7 +187,8 @@ def that_fit(lines: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """The lines of a file's history that every output has room for, the last ones first; and a note
     on the others.
     """
-    kept, room = list[str](), _INHERITED
+    kept: list[str] = []
+    room = _INHERITED
     for line in reversed(lines):
         if len(line) + _OVERHEAD <= room:
             kept.append(line)
@@ -201,10 +203,10 @@ def that_fit(lines: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
 
 def matching_calibration(metadata: Metadata, count: int) -> tuple[Calibration | None, list[str]]:
     """The calibration if it was measured on ``count`` Gaussians; else None and a note."""
-    found = metadata.calibration
-    if found is None or found.total == count:
-        return found, []
-    return None, [f"the calibration is of {found.total} Gaussians and ignored, these are {count}"]
+    stored = metadata.calibration
+    if stored is None or stored.total == count:
+        return stored, []
+    return None, [f"the calibration is of {stored.total} Gaussians and ignored, these are {count}"]
 
 
 def document(kind: str, metadata: Metadata, **more: Any) -> str:
@@ -212,21 +214,21 @@ def document(kind: str, metadata: Metadata, **more: Any) -> str:
 
     Its keys are sorted, so that equal models give equal files.
     """
-    dial, calibration, screen_filter = (
-        metadata.attenuation,
-        metadata.calibration,
-        metadata.screen_filter or CLASSIC,
-    )
-    optional: dict[str, Any] = {
+    values: dict[str, Any] = {
+        "format": kind,
+        "format_version": KINDS[kind][0],
         "package_version": metadata.version or package_version(),
-        "attenuation": asdict(dial) if dial else None,
-        FILTER: asdict(screen_filter) if screen_filter != CLASSIC else None,
-        "origin": list(metadata.origin) if any(metadata.origin) else None,
-        "calibration": calibration.as_dict() if calibration else None,
-        "about": list(metadata.about),
     }
-    values = {name: value for name, value in optional.items() if value}
-    values |= {"format": kind, "format_version": KINDS[kind][0]}
+    if metadata.attenuation:
+        values["attenuation"] = asdict(metadata.attenuation)
+    if metadata.screen_filter not in (None, CLASSIC):
+        values[FILTER] = asdict(metadata.screen_filter)
+    if any(metadata.origin):
+        values["origin"] = list(metadata.origin)
+    if metadata.calibration:
+        values["calibration"] = metadata.calibration.as_dict()
+    if metadata.about:
+        values["about"] = list(metadata.about)
     return json.dumps(values | more, sort_keys=True, allow_nan=False)
 
 
@@ -245,12 +247,10 @@ def parse_document(path: Path, text: str | bytes | dict[str, Any], kind: str) ->
     version, wrong = KINDS[kind]
     with refused_if_damaged(path, *DAMAGED):
         values: dict[str, Any] = text if isinstance(text, dict) else json.loads(text)
-        found, newer = (
-            values["format"],
-            values["format"] == kind and values["format_version"] > version,
-        )
-    if found != kind:
-        raise ClodError(f"{path}: {wrong.format(f'{found!r:.40}')}")
+        stored = values["format"]
+        newer = stored == kind and values["format_version"] > version
+    if stored != kind:
+        raise ClodError(f"{path}: {wrong.format(f'{stored!r:.40}')}")
     if newer:
         raise ClodError(
             f"{path}: its format {values['format_version']!r:.20} is too new; upgrade clod-adapter"
@@ -285,7 +285,8 @@ def stated_filter(source: Source) -> ScreenFilter:
     """The screen-space filter that a file states, or that other programs' comments and columns
     imply.
     """
-    metadata, compensated = source.metadata, is_antialiased(source.comments)
+    metadata = source.metadata
+    compensated = is_antialiased(source.comments)
     if metadata.screen_filter is not None:
         return metadata.screen_filter
     if "sigma_d" in source.arrays or (metadata.described and source.head is None):

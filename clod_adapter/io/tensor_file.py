@@ -36,10 +36,12 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[s
     makes files that only their owner can read.
     """
     arrays = {name: tensor.detach().cpu().contiguous().numpy() for name, tensor in tensors.items()}
-    header, at = dict[str, Any](__metadata__=dict(metadata)), 0
+    header: dict[str, Any] = {"__metadata__": dict(metadata)}
+    at = 0
     names = sorted(arrays, key=lambda name: (-arrays[name].itemsize, name))
     for name in names:
-        array, end = arrays[name], at + arrays[name].nbytes
+        array = arrays[name]
+        end = at + array.nbytes
         kind = (
             "BOOL" if array.dtype.kind == "b" else f"{array.dtype.kind.upper()}{8 * array.itemsize}"
         )
@@ -75,8 +77,11 @@ def parse_tensors(path: Path, data: bytes) -> tuple[dict[str, Tensor], dict[str,
 def read_tensor_header(path: Path) -> tuple[list[str], dict[str, str]]:
     """The names of the tensors and the metadata, without torch."""
     refuse_known(path, read_bytes(path, START))
-    refused = refused_if_damaged(path, *_DAMAGED)
-    with refused, open(path, "rb") as file, safe_open(_name_of(file), framework="np") as tensors:
+    with (
+        refused_if_damaged(path, *_DAMAGED),
+        open(path, "rb") as file,
+        safe_open(_name_of(file), framework="np") as tensors,
+    ):
         return list(tensors.keys()), tensors.metadata() or {}
 
 
@@ -109,12 +114,14 @@ def read(path: Path, data: bytes) -> Source:
             " wrote"
         )
     metadata = parse_metadata(path, stored[KEY], dial=SIGMA in tensors)
-    if missing := [name for name in ATTRIBUTES if name not in tensors]:
-        raise ClodError(f"{path}: has no tensor {missing[0]!r}; export it again")
-    wanted = (*ATTRIBUTES, *dial_columns(tensors))
-    if odd := [name for name in wanted if not tensors[name].is_floating_point()]:
-        raise ClodError(
-            f"{path}: tensor {odd[0]!r} is not of floating-point numbers; export it again"
-        )
-    arrays = {name: tensors[name].float().numpy() for name in wanted}
+    names = (*ATTRIBUTES, *dial_columns(tensors))
+    for name in ATTRIBUTES:
+        if name not in tensors:
+            raise ClodError(f"{path}: has no tensor {name!r}; export it again")
+    for name in names:
+        if not tensors[name].is_floating_point():
+            raise ClodError(
+                f"{path}: tensor {name!r} is not of floating-point numbers; export it again"
+            )
+    arrays = {name: tensors[name].float().numpy() for name in names}
     return Source(arrays, metadata, comments=metadata.about)

@@ -97,10 +97,12 @@ def read(path: Path, data: bytes) -> Source:
 
     from clod_adapter.integrations.splats import NAMES
 
-    refused = refused_if_damaged(
-        path, "is damaged, or holds more than tensors", "export the checkpoint as a PLY"
-    )
-    with refused, warnings.catch_warnings():
+    with (
+        refused_if_damaged(
+            path, "is damaged, or holds more than tensors", "export the checkpoint as a PLY"
+        ),
+        warnings.catch_warnings(),
+    ):
         warnings.simplefilter("ignore")
         checkpoint = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
     content = type(checkpoint).__name__

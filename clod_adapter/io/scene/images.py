@@ -79,8 +79,10 @@ def read_image(
         turn = _TURNS.get(source.getexif().get(_ORIENTATION, 1)) if turned else None
         shape = size if turn is None else size[::-1]
         if not _same_shape(shape, width, height):
-            what = f"is {shape[0]}x{shape[1]}, its camera {width}x{height}, another shape"
-            raise ClodError(f"{path}: {what}; give the images the model was made from")
+            raise ClodError(
+                f"{path}: is {shape[0]}x{shape[1]}, its camera {width}x{height}, another shape;"
+                " give the images the model was made from"
+            )
         factor = max(1, shape[0] // (2 * max_width)) if size[0] * size[1] > LARGE else 1
         if factor > 1:
             source.draft(source.mode, (size[0] // factor, size[1] // factor))  # of JPEG alone
@@ -106,8 +108,9 @@ def _opened(path: Path) -> Iterator[Image.Image]:
             with Image.open(path, formats=FORMATS) as source:
                 yield source
         except UnidentifiedImageError as error:
-            start, unknown = read_bytes(path, 12), f"damaged or none of {', '.join(FORMATS)}"
-            kind = next((name for mark, name in OTHERS.items() if mark in start), unknown)
+            start = read_bytes(path, 12)
+            names = [name for mark, name in OTHERS.items() if mark in start]
+            kind = names[0] if names else f"damaged or none of {', '.join(FORMATS)}"
             raise ClodError(
                 f"{path}: cannot be decoded, is {kind}; export it as JPEG or PNG"
             ) from error
@@ -140,10 +143,8 @@ def _rgb(path: Path, source: Image.Image, factor: int, notes: list[Note]) -> Ima
     if factor == 1:
         return _converted(source, deep, notes)
     source.load()
-    small, rows = (
-        Image.new("RGB", (-(-source.width // factor), -(-source.height // factor))),
-        factor * BAND,
-    )
+    small = Image.new("RGB", (-(-source.width // factor), -(-source.height // factor)))
+    rows = factor * BAND
     for top in range(0, source.height, rows):  # no copy of the whole is made
         band = source.crop((0, top, source.width, min(top + rows, source.height)))
         small.paste(_converted(band, deep, notes).reduce(factor), (0, top // factor))
@@ -202,11 +203,8 @@ def photograph(image: PosedImage, path: Path, max_width: int, cache: Path | None
         with atomic_path(file) as temporary:
             pixels.save(temporary, pnginfo=about, compress_level=1)
     lens = f"from {camera.model_name} into {cache}"
-    return (
-        pixels,
-        K,
-        [*notes, ("undistorted {}, which may be deleted; the sources are untouched", lens)],
-    )
+    notes.append(("undistorted {}, which may be deleted; the sources are untouched", lens))
+    return pixels, K, notes
 
 
 def _made(image: PosedImage, path: Path, max_width: int) -> Photograph:
@@ -241,10 +239,8 @@ def _made(image: PosedImage, path: Path, max_width: int) -> Photograph:
             notes.append((SCALED, f"from {width}x{height} to {size[0]}x{size[1]}"))
         if large:
             release()  # or this thread keeps memory that the next one allocates again
-    K = (
-        np.array([[pixels.width / width], [pixels.height / height], [1.0]])
-        * camera.calibration_matrix()
-    )
+    scale = np.array([[pixels.width / width], [pixels.height / height], [1.0]])
+    K = scale * camera.calibration_matrix()
     if not 0 < min(K[0, 0], K[1, 1]) <= np.abs(K).max() < HUGE:
         raise ClodError(
             f"{path}: its camera is not usable once undistorted; check the camera's parameters"
@@ -267,8 +263,8 @@ def cache_folder(scene: Path) -> Path:
             "no home folder to keep undistorted photographs in; set XDG_CACHE_HOME to a folder"
         ) from error
     except OSError as error:
-        what = f"undistorted photographs cannot be kept there ({error.strerror or error})"
         raise ClodError(
-            f"{folder}: {what}; set XDG_CACHE_HOME to a folder that can be written to"
+            f"{folder}: undistorted photographs cannot be kept there ({error.strerror or error});"
+            " set XDG_CACHE_HOME to a folder that can be written to"
         ) from error
     return folder

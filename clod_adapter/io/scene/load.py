@@ -79,9 +79,8 @@ def load_scene(
     if not cameras.is_file() and (folder / "transforms.json").is_file():
         notes.append("the cameras are the COLMAP model's, not those of transforms.json")
     names = [image.name for image in images]
-    paths, more = find_photographs(
-        folder, cameras, names, raw=not all(image.is_pinhole for image in images)
-    )
+    distorted = not all(image.is_pinhole for image in images)
+    paths, more = find_photographs(folder, cameras, names, raw=distorted)
     notes += more
     present = [(image, path) for image, path in zip(images, paths, strict=True) if path is not None]
     testing = held_out(images, test_every)
@@ -99,7 +98,7 @@ def load_scene(
     views, done = _load(loads, progress)
     train = tuple(view for view in views if view.camera.name not in testing)
     test = tuple(view for view in views if view.camera.name in testing)
-    left_out = list[tuple[str, str]]()
+    left_out: list[tuple[str, str]] = []
     if pinholes:
         left_out.append(("undistortion", f"all {len(views)} cameras are pinholes"))
     if not any(what in (REDUCED, SCALED) for what, _ in done):
@@ -127,10 +126,11 @@ def load_cameras(
         if min(image.camera.width, image.camera.height) > 1
     ]
     cameras = [
-        _pinhole(one, one.camera.calibration_matrix(), one.camera.width, one.camera.height)
-        for one in sized
+        _pinhole(image, image.camera.calibration_matrix(), image.camera.width, image.camera.height)
+        for image in sized
     ]
-    if unsized := len(images) - len(cameras):
+    if len(cameras) < len(images):
+        unsized = len(images) - len(cameras)
         notes.append(
             f"{unsized} of {len(images)} cameras left out: neither {source.name} nor a photograph"
             " has a size"
@@ -146,7 +146,8 @@ def load_cameras(
 def _posed(folder: Path) -> tuple[Path, list[PosedImage], list[str]]:
     """The model or transforms file, its images, and notes."""
     cameras = find_cameras(folder)
-    images, notes = (read_transforms if cameras.is_file() else read_colmap)(cameras)
+    read = read_transforms if cameras.is_file() else read_colmap
+    images, notes = read(cameras)
     if cameras.is_dir() and cameras != folder:
         notes += _other_models(cameras)
     images, more = in_trained_frame(folder, cameras, images)
@@ -173,12 +174,13 @@ def _load(loads: Sequence[Load], progress: Listener | None) -> tuple[list[View],
     """The views of the images, and notes. Each worker holds one photograph of full size at a
     time.
     """
-    views, notes = list[View](), list[Note]()
+    views: list[View] = []
+    notes: list[Note] = []
     workers = min(MOST_AT_ONCE, max(2, torch.get_num_threads()))
-    with warnings.catch_warnings(), closing(in_order(loads, workers)) as found:
+    with warnings.catch_warnings(), closing(in_order(loads, workers)) as loaded:
         # Large, but below the size at which it is refused: photographs are no attack.
         warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-        for view, remarks in found:
+        for view, remarks in loaded:
             views.append(view)
             notes += remarks
             tell(progress, Phase.PHOTOGRAPHS, len(views), len(loads))
@@ -189,7 +191,7 @@ def _summary(notes: Sequence[Note], total: int) -> list[str]:
     """One line for each thing done, however many sizes it was done to."""
     lines = []
     for what, count in Counter(what for what, _ in notes).items():
-        details = list(dict.fromkeys(detail for each, detail in notes if each == what))
+        details = list(dict.fromkeys(detail for change, detail in notes if change == what))
         others = f" (and {len(details) - 1} more)" if len(details) > 1 else ""
         lines.append(f"{count} of {total} images {what.format(details[0] + others)}")
     return lines
