@@ -23,6 +23,7 @@ from scipy.spatial.transform import Rotation
 from clod_adapter.calibration import Calibration, CalibrationRow
 from clod_adapter.config import SH_COUNTS, AttenuationConfig
 from clod_adapter.gaussians import Gaussians
+from clod_adapter.io.checkpoint import Checkpoint, load, save
 from scenes import gaussians
 
 ATTENUATION = AttenuationConfig(reference_distance=3.217, max_sv=7.0)
@@ -134,6 +135,13 @@ def change_setting(path: Path, name: str, old: str, new: str) -> Path:
     else:
         path.write_bytes(changed(path.read_bytes()))
     return path
+
+
+def resaved(base: Checkpoint, gaussians: Gaussians | None = None) -> Checkpoint:
+    """What is read of the PLY that is saved from a base, or from its Gaussians once tuned."""
+    path = base.path.with_name("out.ply")
+    save(path, gaussians or base.gaussians, base)
+    return load(path, activated="none")
 
 
 def write_rows(

@@ -10,7 +10,7 @@ import pycolmap
 import torch
 from PIL import Image
 
-from clod_adapter.cameras import Camera
+from clod_adapter.cameras import Camera, Scene, View
 from models import write_model
 
 SIZE = {"width": 160, "height": 120}
@@ -71,6 +71,15 @@ def write_frames(
     folder.mkdir(exist_ok=True)
     (folder / file).write_text(json.dumps({**rest, "frames": frames}))
     return folder
+
+
+def names_of(views: Sequence[View]) -> list[str]:
+    return [view.camera.name for view in views]
+
+
+def views_of(scene: Scene) -> list[View]:
+    """Those for training and for testing, sorted by name."""
+    return sorted((*scene.train, *scene.test), key=lambda view: view.camera.name)
 
 
 def model_of(

@@ -36,6 +36,7 @@ from formats import (
     covariances,
     inria_rows,
     model,
+    resaved,
     rows_by_place,
     splat_transform,
     turned,
@@ -53,11 +54,8 @@ def test_glb_in_pygltflib(tmp_path: Path) -> None:
     gltf = pygltflib.GLTF2().load(str(tmp_path / "a.glb"))
     (mesh,), (node,) = gltf.meshes, gltf.nodes
     (primitive,) = mesh.primitives
-    assert (
-        primitive.mode == pygltflib.POINTS
-        and gltf.extensionsUsed == [KHR]
-        and not gltf.extensionsRequired
-    )
+    assert primitive.mode == pygltflib.POINTS
+    assert gltf.extensionsUsed == [KHR] and not gltf.extensionsRequired
     assert primitive.extensions[KHR] == {
         "kernel": "ellipse",
         "colorSpace": "srgb_rec709_display",
@@ -68,18 +66,19 @@ def test_glb_in_pygltflib(tmp_path: Path) -> None:
         gltf.asset.extras["clod_adapter"]["attenuation"]["reference_distance"]
         == ATTENUATION.reference_distance
     )
-    found, blob = {}, gltf.binary_blob()
-    for name, number in (
-        (name, number) for name, number in vars(primitive.attributes).items() if number is not None
-    ):
-        accessor, view = gltf.accessors[number], gltf.bufferViews[gltf.accessors[number].bufferView]
+    found = {}
+    blob = gltf.binary_blob()
+    attributes = vars(primitive.attributes)
+    for name in [name for name in attributes if attributes[name] is not None]:
+        accessor = gltf.accessors[attributes[name]]
+        view = gltf.bufferViews[accessor.bufferView]
         kind = {pygltflib.FLOAT: "<f4", pygltflib.UNSIGNED_BYTE: "u1"}[accessor.componentType]
         data = blob[view.byteOffset : view.byteOffset + view.byteLength]
         found[name] = np.frombuffer(data, kind).reshape(accessor.count, -1)
         assert view.byteOffset % 4 == 0 and bool(accessor.normalized) == (name == "COLOR_0")
     position = gltf.accessors[primitive.attributes.POSITION]
     assert position.min == g.means.amin(0).tolist() and position.max == g.means.amax(0).tolist()
-    assert set(found) == {
+    names = {
         "POSITION",
         "COLOR_0",
         "_SIGMA_D",
@@ -87,8 +86,10 @@ def test_glb_in_pygltflib(tmp_path: Path) -> None:
         f"{KHR}:ROTATION",
         f"{KHR}:SCALE",
         f"{KHR}:OPACITY",
-        *(f"{KHR}:SH_DEGREE_{d}_COEF_{k}" for d in range(4) for k in range(2 * d + 1)),
     }
+    for degree in range(4):
+        names |= {f"{KHR}:SH_DEGREE_{degree}_COEF_{k}" for k in range(2 * degree + 1)}
+    assert set(found) == names
     assert_allclose(found[f"{KHR}:SCALE"], g.scales, rtol=1e-6)
     assert_allclose(found[f"{KHR}:OPACITY"][:, 0], g.opacities, rtol=1e-6)
     unit = (g.quats.double() / g.quats.double().norm(dim=1, keepdim=True))[:, [1, 2, 3, 0]]
@@ -140,11 +141,9 @@ def test_glb_of_another_program(tmp_path: Path) -> None:
     rows = np.zeros(
         5, [("position", "<f4", 3), ("rotation", "<i2", 4), ("opacity", "u1"), ("pad", "u1", 3)]
     )
-    rows["position"], rows["rotation"], rows["opacity"] = (
-        np.arange(15).reshape(5, 3),
-        [0, 0, 0, 32767],
-        255,
-    )
+    rows["position"] = np.arange(15).reshape(5, 3)
+    rows["rotation"] = 0, 0, 0, 32767
+    rows["opacity"] = 255
 
     def interleave(g: dict[str, Any]) -> None:
         primitive, accessors = g["meshes"][0]["primitives"][0], g["accessors"]
@@ -154,12 +153,12 @@ def test_glb_of_another_program(tmp_path: Path) -> None:
             (f"{KHR}:ROTATION", 12, 5122),
             (f"{KHR}:OPACITY", 20, 5121),
         ):
-            where = {
-                "bufferView": len(g["bufferViews"]),
-                "byteOffset": offset,
-                "componentType": kind,
-            }
-            accessors[names[name]].update(where, normalized=kind != 5126)
+            accessors[names[name]].update(
+                bufferView=len(g["bufferViews"]),
+                byteOffset=offset,
+                componentType=kind,
+                normalized=kind != 5126,
+            )
         view = {
             "buffer": 0,
             "byteOffset": g["buffers"][0]["byteLength"],
@@ -220,8 +219,9 @@ def test_header_and_record_of_an_spz(tmp_path: Path) -> None:
     g = model(1)
     write(tmp_path / "a.spz", g)
     data = spz(tmp_path / "a.spz")
-    magic, version, count, degree, bits, flags, reserved = struct.unpack_from("<IIIBBBB", data)
-    assert (data[:4], version, count, degree, flags, reserved) == (b"NGSP", 3, 40, 1, 2, 0)
+    version, count = struct.unpack_from("<II", data, 4)
+    degree, _, *flags = data[12:16]
+    assert (data[:4], version, count, degree, flags) == (b"NGSP", 3, 40, 1, [2, 0])
     end = 16 + 40 * (9 + 1 + 3 + 3 + 4 + 9)
     assert struct.unpack_from("<III", data, end) == (0xADBE0003, 4, 6)  # right, down, forward
     kind, size, text = struct.unpack_from("<III", data, end + 12)
@@ -368,8 +368,7 @@ def test_checkpoint_of_gsplat(tmp_path: Path, degree: int) -> None:
         assert torch.equal(tensor, values[name][torch.arange(12) != 3].float()), name
     write(tmp_path / "own.pt", base.gaussians)
     assert torch.load(tmp_path / "own.pt")["step"] == 0  # which gsplat's trainer and viewer expect
-    save(tmp_path / "out.ply", base.gaussians, base)
-    again = load(tmp_path / "out.ply")
+    again = resaved(base)
     assert again.gaussians == base.gaussians and again.vertex.dtype.names[3:6] == ("nx", "ny", "nz")
 
 

@@ -4,6 +4,7 @@ streaming sets.
 
 import json
 import struct
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from clod_adapter import load
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.formats import tileset
 from clod_adapter.io.formats.tileset import TILESET, write_tileset
-from clod_adapter.origin import NOWHERE
+from clod_adapter.origin import NOWHERE, Origin
 
 BEGINS = [0.0, 0.25, 1.0]
 
@@ -27,11 +28,23 @@ def levels(n: int = 400) -> list[Gaussians]:
     return [whole, whole[::4], whole[::16]]
 
 
+def written(
+    folder: Path,
+    given: list[Gaussians],
+    begins: Sequence[float] = BEGINS,
+    origin: Origin = NOWHERE,
+) -> dict[str, Any]:
+    """The index of a set of these levels."""
+    notes = write_tileset(folder, [*zip(begins, given, strict=True)], origin=origin)
+    assert any("rounded" in note for note in notes)
+    return json.loads((folder / TILESET).read_text())
+
+
 def tiles_of(tile: dict[str, Any], depth: int = 0) -> list[tuple[int, dict[str, Any]]]:
-    return [
-        (depth, tile),
-        *(each for child in tile.get("children", ()) for each in tiles_of(child, depth + 1)),
-    ]
+    tiles = [(depth, tile)]
+    for child in tile.get("children", ()):
+        tiles += tiles_of(child, depth + 1)
+    return tiles
 
 
 def read_tile(path: Path, folder: Path) -> tuple[dict[str, Any], Gaussians]:
@@ -52,9 +65,7 @@ def test_index_and_tiles(tmp_path: Path) -> None:
     of levels, coarsest first; errors descend; what is packed is what was given.
     """
     given = levels()
-    notes = write_tileset(tmp_path, [*zip(BEGINS, given, strict=True)], origin=NOWHERE)
-    assert any("rounded" in note for note in notes)
-    index = json.loads((tmp_path / TILESET).read_text())
+    index = written(tmp_path, given)
     assert set(index) <= {"asset", "extensionsUsed", "extensions", "geometricError", "root"}
     assert index["asset"]["version"] == "1.1" and index["root"]["refine"] == "REPLACE"
     assert set(index["extensions"]) == set(index["extensionsUsed"])
@@ -103,8 +114,7 @@ def test_a_set_is_drawn_until_it_is_a_pixel(tmp_path: Path) -> None:
     """
     for size in (0.02, 500.0):
         given = [level.replace(means=level.means * size) for level in levels()]
-        write_tileset(tmp_path, [*zip((0.0, 1e-6, 2e-6), given, strict=True)], origin=NOWHERE)
-        index = json.loads((tmp_path / TILESET).read_text())
+        index = written(tmp_path, given, (0.0, 1e-6, 2e-6))
         halves = np.diag(np.reshape(index["root"]["boundingVolume"]["box"], (4, 3))[1:])
         # of the box, where that error is 16
         pixels = 2 * float(np.linalg.norm(halves)) * 16 / index["geometricError"]
@@ -117,8 +127,7 @@ def test_boxes_are_where_viewers_place_the_gaussians(tmp_path: Path) -> None:
     """
     given = [level.replace(means=level.means * torch.tensor([3.0, 1.0, 0.5])) for level in levels()]
     given[0].means[0] = 1e4
-    write_tileset(tmp_path, [*zip(BEGINS, given, strict=True)], origin=(1000.0, -2000.0, 50.0))
-    root = json.loads((tmp_path / TILESET).read_text())["root"]
+    root = written(tmp_path, given, origin=(1000.0, -2000.0, 50.0))["root"]
     gltf, _ = read_tile(tmp_path / "0_0.glb", tmp_path)
     matrix = np.array(gltf["nodes"][0]["matrix"], float).reshape(4, 4).T
     placed = given[0].means.double().numpy() @ matrix[:3, :3].T + matrix[:3, 3]
@@ -133,8 +142,7 @@ def test_cells_hold_every_gaussian_once(tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.setattr(tileset, "LARGEST", 60)
     given = levels()
     given[0].means[:100] = given[0].means[0]  # more in one place than a cell holds
-    write_tileset(tmp_path, [*zip(BEGINS, given, strict=True)], origin=NOWHERE)
-    root = json.loads((tmp_path / TILESET).read_text())["root"]
+    root = written(tmp_path, given)["root"]
     assert len(root["children"]) >= 6
     for level, want in enumerate(given[:2]):
         of_level = [

@@ -74,7 +74,15 @@ def packed(old: bytes, new: bytes) -> bytes:
     return PACKED.read_bytes().replace(old, new)
 
 
-def glb(change: Callable[[dict[str, Any]], object]) -> Callable[[Path], object]:
+Change = Callable[[dict[str, Any]], object]
+
+
+def first(section: str, **changes: Any) -> Change:
+    """Changes the first accessor, buffer, view or node of a glTF."""
+    return lambda gltf: gltf[section][0].update(changes)
+
+
+def glb(change: Change) -> Callable[[Path], object]:
     def make(path: Path) -> None:
         write(path, model(0, 5))
         change_glb(path, change)
@@ -117,11 +125,8 @@ def tensors(
     }
 
     def make(path: Path) -> None:
-        kept = {
-            name: tensor
-            for name, tensor in (gaussians(5, 1, 0).tensors() | changes).items()
-            if tensor is not None
-        }
+        values = gaussians(5, 1, 0).tensors() | changes
+        kept = {name: tensor for name, tensor in values.items() if tensor is not None}
         save_file(kept, path, about if metadata is None else metadata)
 
     return make
@@ -164,10 +169,17 @@ def archive(kind: int, names: int) -> Callable[[Path], object]:
     return make
 
 
+def claiming_rows(form: str, body: bytes, kind: str) -> tuple[tuple[bytes, str], ...]:
+    """Another element of 2^40 rows before and after the vertex; refused before the test's time
+    limit, in which no loop counts that far.
+    """
+    other = f"element a {1 << 40}\n{kind}"
+    return (header(form, 1, other) + body, ""), (header(form, 1, "", other) + body, "")
+
+
 LITTLE, BIG, GOOD = "binary_little_endian", "binary_big_endian", "1.0 " * 14 + "\n"
 LIST = "property list uchar int a\n"
 OTHER_KINDS: Table = (
-    ("a.ply", LFS, "Git LFS pointer.*git lfs pull"),
     ("a.ply", b"\r\n<!DOCTYPE html><html>", "web page.*download the file itself"),
     ("a.ply", b"<?xml version='1.0'?><Error>", "XML document"),
     ("a.ply", gzip.compress(b"ply\n", mtime=0), "gzip.*gunzip"),
@@ -232,18 +244,10 @@ OF_PLY: tuple[tuple[Content, str], ...] = (
         (header(form, count) + b"0 " * 24, rf"is truncated.*claims {count} of vertex.*the file has")
         for form, count in (("ascii", 1 << 31), (LITTLE, (1 << 64) - 1), (BIG, 10))
     ),
-    # before the test's time limit, in which no loop counts that far
-    *(
-        (header(form, 1, before, after) + body, "")
-        for form, body, kind in (
-            ("ascii", GOOD.encode(), "property uchar a\n"),
-            ("ascii", GOOD.encode(), LIST),
-            (LITTLE, bytes(56), ""),
-            (BIG, bytes(56), LIST),
-        )
-        for other in [f"element a {1 << 40}\n{kind}"]
-        for before, after in ((other, ""), ("", other))
-    ),
+    *claiming_rows("ascii", GOOD.encode(), "property uchar a\n"),
+    *claiming_rows("ascii", GOOD.encode(), LIST),
+    *claiming_rows(LITTLE, bytes(56), ""),
+    *claiming_rows(BIG, bytes(56), LIST),
     (
         header("ascii", 1) + b"0 " * 13 + b"1" * (1 << 23),
         "damaged or truncated .a row of more than",
@@ -262,24 +266,24 @@ OF_PLY: tuple[tuple[Content, str], ...] = (
     (packed(b"element chunk 2", b"element chunk 1"), "is damaged: 300 Gaussians need 2 chunks"),
     (packed(b"element vertex 300", b"element vertex 3000000"), "is truncated"),
 )
-OF_GLB: tuple[tuple[Callable[[dict[str, Any]], object], str], ...] = (
-    (lambda g: g["accessors"][0].update(count=1 << 60), "more than the file"),
-    (lambda g: g["accessors"][0].update(count=3), "of different lengths"),
-    (lambda g: g["accessors"][0].update(count=-1), "is no count"),
-    (lambda g: g["bufferViews"][0].update(byteStride=0), "more than the file"),
-    (lambda g: g["buffers"][0].update(uri="../secret"), "in another file"),
-    (lambda g: g["accessors"][0].update(sparse={}), "sparse"),
+OF_GLB: tuple[tuple[Change, str], ...] = (
+    (first("accessors", count=1 << 60), "more than the file"),
+    (first("accessors", count=3), "of different lengths"),
+    (first("accessors", count=-1), "is no count"),
+    (first("bufferViews", byteStride=0), "more than the file"),
+    (first("buffers", uri="../secret"), "in another file"),
+    (first("accessors", sparse={}), "sparse"),
     (lambda g: g["meshes"][0]["primitives"][0].pop("extensions"), "so it is a mesh"),
     (
         lambda g: g["meshes"][0]["primitives"][0]["extensions"][KHR].update(extensions={"x": {}}),
         "compressed",
     ),
-    (lambda g: g["nodes"][0].update(rotation=[0, 1, 0, 0]), "turned, mirrored or stretched"),
-    (lambda g: g["nodes"][0].update(scale=[1, 1, 2]), "turned, mirrored or stretched"),
-    (lambda g: g["nodes"][0].update(scale=[1, 1, -1]), "turned, mirrored or stretched"),
-    (lambda g: g["nodes"][0].update(scale=[2, 2, 2]), "scales a dial by 2"),
-    (lambda g: g["nodes"][0].update(children=[0]), "in a circle"),
-    (lambda g: g["nodes"][0].update(translation=[float("inf")] * 3), "not finite"),
+    (first("nodes", rotation=[0, 1, 0, 0]), "turned, mirrored or stretched"),
+    (first("nodes", scale=[1, 1, 2]), "turned, mirrored or stretched"),
+    (first("nodes", scale=[1, 1, -1]), "turned, mirrored or stretched"),
+    (first("nodes", scale=[2, 2, 2]), "scales a dial by 2"),
+    (first("nodes", children=[0]), "in a circle"),
+    (first("nodes", translation=[float("inf")] * 3), "not finite"),
     (lambda g: g.pop("accessors"), "damaged"),
 )
 OF_SPZ: tuple[tuple[Content, str], ...] = (
@@ -385,7 +389,7 @@ def test_what_is_no_file_of_the_format(tmp_path: Path, suffix: str) -> None:
         ("folder", "cannot be read"),
         ("pipe", "not a regular file"),
         ("empty", "is empty"),
-        ("pointer", "is a Git LFS pointer"),
+        ("pointer", "is a Git LFS pointer.*git lfs pull"),
         ("other", ""),
     ):
         # of some kinds splat-transform tells

@@ -7,7 +7,6 @@ import math
 import os
 import shutil
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +28,18 @@ from clod_adapter.io.scene.folder import scene_files
 from clod_adapter.io.scene.load import load_cameras, load_scene
 from clod_adapter.progress import Stopped
 from models import write_model
-from photographs import LENSES, SIZE, camera, model_of, pixels, seen, write_images, write_scene
+from photographs import (
+    LENSES,
+    SIZE,
+    camera,
+    model_of,
+    names_of,
+    pixels,
+    seen,
+    views_of,
+    write_images,
+    write_scene,
+)
 
 
 @pytest.fixture(autouse=True)
@@ -59,10 +69,8 @@ def test_scene_round_trips(tmp_path: Path, form: str) -> None:
         "scaling": "all 10 photographs are used at full resolution",
     }
     order = sorted(range(10), key=lambda i: names[i])
-    assert [view.camera.name for view in loaded.test] == [names[order[0]], names[order[8]]]
-    assert [view.camera.name for view in loaded.train] == [
-        names[i] for i in order if i not in (order[0], order[8])
-    ]
+    assert names_of(loaded.test) == [names[order[0]], names[order[8]]]
+    assert names_of(loaded.train) == [names[i] for i in order if i not in (order[0], order[8])]
     for view in (*loaded.train, *loaded.test):
         i = names.index(view.camera.name)
         assert_close(view.camera.viewmat, cameras[i].viewmat, atol=1e-6, rtol=0)
@@ -98,7 +106,7 @@ def test_split_of_the_scene_is_used(tmp_path: Path) -> None:
     ):
         (tmp_path / "sparse" / "0" / "test.txt").write_text("\n".join(listed) + "\n")
         loaded, cameras = load_scene(tmp_path), load_cameras(tmp_path, training=True)[0]
-        held_out = [view.camera.name for view in loaded.test]
+        held_out = names_of(loaded.test)
         assert loaded.notes == (note,) and held_out == (
             listed[:2] if len(listed) == 3 else [names[0], names[8]]
         )
@@ -153,69 +161,51 @@ def test_records_beyond_the_file_are_refused(tmp_path: Path, file: str) -> None:
             (load_points if file == "points3D" else load_scene)(tmp_path)
 
 
-write = Path.write_bytes
+IMAGE = b"%d %b 0 0 0 0 0 0 1 a.png\n\n"
 
 
 @pytest.mark.parametrize(
-    ("form", "change", "message"),
+    ("file", "content", "message"),
     [
         (
-            "text",
-            lambda at: write(at / "images.txt", b"\n1 nonsense\n"),
+            "images",
+            b"\n1 nonsense\n",
             "images.txt: is truncated or damaged .line 2 is neither an image",
         ),
+        ("images", IMAGE % (1, b"1") + IMAGE % (2, b"1"), "has image a.png more than once"),
+        ("images", IMAGE % (1, b"0"), "has no rotation"),
+        ("images", IMAGE % (1, b"nan"), "has no rotation"),
+        ("cameras", b"2 PINHOLE 40 30 33 33 20 15\n", "camera 1, .*not in cameras"),
+        ("cameras", b"1 PINHOLE 40 30 33 33 20\n", "camera 1 has 3 parameters"),
         (
-            "text",
-            lambda at: write(at / "cameras.txt", b"2 PINHOLE 40 30 33 33 20 15\n"),
-            "camera 1, .*not in cameras",
-        ),
-        (
-            "text",
-            lambda at: write(at / "cameras.txt", b"1 PINHOLE 40 30 33 33 20\n"),
-            "camera 1 has 3 parameters",
-        ),
-        (
-            "text",
-            lambda at: write(
-                at / "cameras.txt", b"1 PINHOLE 40 30 %b 33 20 15\n" % (b"1" * 10_000)
-            ),
+            "cameras",
+            b"1 PINHOLE 40 30 %b 33 20 15\n" % (b"1" * 10_000),
             "cameras.txt: .*a number of more than 1,000 digits",
-        ),
-        (
-            "text",
-            lambda at: write(
-                at / "images.txt", (at / "images.txt").read_bytes().replace(b"sub/b.png", b"a.png")
-            ),
-            "has image a.png more than once",
-        ),
-        *(
-            (
-                "text",
-                lambda at, w=w: write(at / "images.txt", b"1 %b 0 0 0 0 0 0 1 a.png\n" % w),
-                "has no rotation",
-            )
-            for w in (b"0", b"nan")
-        ),
-        *(
-            (
-                "binary",
-                lambda at, lens=lens: model_of(at.parents[1], *lens, **SIZE),
-                f"image 'a.png' has .*{message}",
-            )
-            for *lens, message in (
-                ("EQUIRECTANGULAR", [160, 120], "EQUIRECTANGULAR, no perspective camera"),
-                ("OPENCV", [140, 140, 80, 60, math.nan, 0, 0, 0], "not usable"),
-                ("SIMPLE_RADIAL", [-140, 80, 60, 0.1], "not usable"),
-                ("PINHOLE", [0, 140, 80, 60], "not usable"),
-            )
         ),
     ],
 )
-def test_unusable_models_are_refused(
-    tmp_path: Path, form: str, change: Callable[[Path], Any], message: str
+def test_unusable_text_models_are_refused(
+    tmp_path: Path, file: str, content: bytes, message: str
 ) -> None:
-    change(model_of(tmp_path, **PINHOLES, form=form))
+    (model_of(tmp_path, **PINHOLES, form="text") / f"{file}.txt").write_bytes(content)
     with refused(message):
+        load_scene(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("kind", "params", "message"),
+    [
+        ("EQUIRECTANGULAR", [160, 120], "EQUIRECTANGULAR, no perspective camera"),
+        ("OPENCV", [140, 140, 80, 60, math.nan, 0, 0, 0], "not usable"),
+        ("SIMPLE_RADIAL", [-140, 80, 60, 0.1], "not usable"),
+        ("PINHOLE", [0, 140, 80, 60], "not usable"),
+    ],
+)
+def test_unusable_lenses_are_refused(
+    tmp_path: Path, kind: str, params: list[float], message: str
+) -> None:
+    model_of(tmp_path, kind, params, **SIZE)
+    with refused(f"image 'a.png' has .*{message}"):
         load_scene(tmp_path)
 
 
@@ -270,8 +260,8 @@ def test_missing_images_are_noted_or_refused(tmp_path: Path) -> None:
     )
     assert loaded.notes == (missing,)
     # the 8th is missing, the rest stay
-    assert [view.camera.name for view in loaded.test] == [names[0], names[16]]
-    assert [view.camera.name for view in loaded.train] == [names[1], *names[11:16], names[17]]
+    assert names_of(loaded.test) == [names[0], names[16]]
+    assert names_of(loaded.train) == [names[1], *names[11:16], names[17]]
     (tmp_path / "images" / names[0]).unlink()
     text = (
         r"10 of 18 images of the model are missing \(sub/001.png, sub/003.png, sub/004.png,"
@@ -323,8 +313,8 @@ def test_photographs_of_another_suffix_or_case_are_found(tmp_path: Path) -> None
         tmp_path / "images", ["A.png", "b.PNG", "C/c.tif", "d.webp", "e.jpg", "e.bmp", "f.png"]
     )
     loaded = load_scene(tmp_path)
-    found = sorted([*loaded.train, *loaded.test], key=lambda view: view.camera.name)
-    assert [view.camera.name for view in found] == ["C/c.png", "a.JPG", "b.png", "f.png"]
+    found = views_of(loaded)
+    assert names_of(found) == ["C/c.png", "a.JPG", "b.png", "f.png"]
     for view, seed in zip(found, (2, 0, 1, 6), strict=True):
         assert_array_equal(view.image, pixels(seed))
     assert loaded.notes == (
@@ -437,11 +427,9 @@ def test_cache_folder_must_be_writable(
 
 def test_cameras_equal_those_of_load_scene(capture: Any) -> None:
     scene = load_scene(capture.scene, origin=(origin := (10.0, -20.0, 30.0)))
-    views = sorted([*scene.train, *scene.test], key=lambda view: view.camera.name)
+    views = views_of(scene)
     cameras, notes = load_cameras(capture.scene, origin)
-    assert notes == [] and [camera.name for camera in cameras] == [
-        view.camera.name for view in views
-    ]
+    assert notes == [] and [camera.name for camera in cameras] == names_of(views)
     for found, view in zip(cameras, views, strict=True):
         assert torch.equal(found.viewmat, view.camera.viewmat) and torch.equal(
             found.K, view.camera.K
@@ -452,7 +440,7 @@ def test_cameras_equal_those_of_load_scene(capture: Any) -> None:
             view.camera.near,
         )
     training = [found.name for found in load_cameras(capture.scene, training=True)[0]]
-    assert training == [view.camera.name for view in scene.train] and len(training) == 8
+    assert training == names_of(scene.train) and len(training) == 8
 
 
 def there(folder: Path) -> set[str]:

@@ -27,16 +27,19 @@ from photographs import (
     INTRINSICS,
     camera,
     model_of,
+    names_of,
     pixels,
     pose,
     to_world,
+    views_of,
     write_frames,
     write_images,
 )
 
 
-def frame(i: int, **rest: Any) -> dict[str, Any]:
-    return {"file_path": f"images/{i:03d}.png", "transform_matrix": to_world(i), **rest}
+def frame(i: int, path: str = "", **rest: Any) -> dict[str, Any]:
+    name = path or f"images/{i:03d}.png"
+    return {"file_path": name, "transform_matrix": to_world(i), **rest}
 
 
 def test_nerfstudio_file(tmp_path: Path) -> None:
@@ -57,7 +60,7 @@ def test_nerfstudio_file(tmp_path: Path) -> None:
     write_images(tmp_path, [f"images/{i:03d}.png" for i in range(10)])
     loaded = load_scene(tmp_path)
     assert loaded.notes == ()
-    assert [view.camera.name for view in loaded.test] == ["images/000.png", "images/008.png"]
+    assert names_of(loaded.test) == ["images/000.png", "images/008.png"]
     for view in (*loaded.train, *loaded.test):
         i = int(view.camera.name[7:10])
         assert_close(view.camera.viewmat, pose(i), atol=1e-5, rtol=0)
@@ -74,23 +77,21 @@ def test_blender_files(tmp_path: Path) -> None:
     angle = 2 * math.atan(20 / 50)
     for split, count in (("train", 3), ("test", 2), ("val", 1)):
         names = [f"./{split}/r_{i}" for i in range(count)]
-        frames = [
-            {"file_path": name, "rotation": 0.01, "transform_matrix": to_world(2)} for name in names
-        ]
+        frames = [frame(2, name, rotation=0.01) for name in names]
         write_frames(tmp_path, frames, f"transforms_{split}.json", camera_angle_x=angle)
         write_images(tmp_path, [f"{name}.png" for name in names])
     loaded = load_scene(tmp_path)
-    assert [view.camera.name for view in loaded.train] == [
+    assert names_of(loaded.train) == [
         "train/r_0.png",
         "train/r_1.png",
         "train/r_2.png",
     ]
-    assert [view.camera.name for view in loaded.test] == ["test/r_0.png", "test/r_1.png"]
+    assert names_of(loaded.test) == ["test/r_0.png", "test/r_1.png"]
     assert loaded.notes == ("held out are the photographs of transforms_test.json",)
     assert_close(loaded.train[0].camera.K, torch.tensor([[50.0, 0, 20], [0, 50, 15], [0, 0, 1]]))
     (tmp_path / "transforms_test.json").unlink()
     loaded = load_scene(tmp_path)
-    assert ([view.camera.name for view in loaded.test], len(loaded.train)) == (["train/r_0.png"], 2)
+    assert (names_of(loaded.test), len(loaded.train)) == (["train/r_0.png"], 2)
 
 
 def test_lists_of_nerfstudio_are_its_split(tmp_path: Path) -> None:
@@ -98,13 +99,13 @@ def test_lists_of_nerfstudio_are_its_split(tmp_path: Path) -> None:
     the frames.
     """
     names = [f"./images/{i}" for i in range(6)]
-    frames = [{"file_path": name, "transform_matrix": to_world(i)} for i, name in enumerate(names)]
+    frames = [frame(i, name) for i, name in enumerate(names)]
     write_images(tmp_path, [f"{name}.png" for name in names])
     both = {"val_filenames": names[1:2], "test_filenames": names[4:5]}
     for lists, want in (({"train_filenames": names[2:], **both}, [0, 1]), (both, [1, 4])):
         write_frames(tmp_path, frames, **INTRINSICS, **lists)
         loaded = load_scene(tmp_path)
-        assert [view.camera.name for view in loaded.test] == [f"images/{i}.png" for i in want]
+        assert names_of(loaded.test) == [f"images/{i}.png" for i in want]
         assert loaded.notes == (
             "held out are 2 photographs, those of the lists of transforms.json",
         )
@@ -121,7 +122,7 @@ def test_instant_ngp_file(tmp_path: Path) -> None:
     one = write_frames(tmp_path / "one", [frame(0)], aabb_scale=16, w=40, h=30, **angles)
     two = write_frames(
         tmp_path / "two",
-        [frame(0), {**frame(1), "file_path": "images/ä.001"}],
+        [frame(0), frame(1, "images/ä.001")],
         fl_x=30.0,
         scale=0.3,
     )
@@ -135,8 +136,7 @@ def test_instant_ngp_file(tmp_path: Path) -> None:
 
 
 def test_size_of_a_photograph_of_another_suffix(tmp_path: Path) -> None:
-    frames = [{"file_path": name, "transform_matrix": to_world(0)} for name in ("a.jpg", "b")]
-    write_frames(tmp_path, frames, fl_x=30.0)
+    write_frames(tmp_path, [frame(0, "a.jpg"), frame(0, "b")], fl_x=30.0)
     write_images(tmp_path, ["a.png", "b.WEBP"])
     loaded = load_scene(tmp_path)
     assert (loaded.train[0].camera.width, loaded.test[0].camera.width) == (40, 40)
@@ -168,9 +168,7 @@ def test_distorted_photographs_are_undistorted(
     """As those of a COLMAP model with the same lens."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     size, views = {"fl_x": 120, "fl_y": 122, "cx": 82, "cy": 58, "w": 160, "h": 120}, []
-    write_frames(
-        tmp_path / "a", [{"file_path": "a.png", "transform_matrix": to_world(0)}], **size, **message
-    )
+    write_frames(tmp_path / "a", [frame(0, "a.png")], **size, **message)
     model_of(tmp_path / "b", model, [120, 122, 82, 58, *params], 160, 120)
     for scene in (tmp_path / "a", tmp_path / "b"):
         Image.fromarray(pixels(0, 160, 120)).save(scene / "a.png")
@@ -189,7 +187,7 @@ def test_colmap_model_takes_precedence(tmp_path: Path) -> None:
     loaded = load_scene(tmp_path)
     assert loaded.notes == ("the cameras are the COLMAP model's, not those of transforms.json",)
     assert loaded.train[0].camera.K[0, 0] == 33
-    deeper = write_frames(tmp_path / "images", [{**frame(0), "file_path": "a"}], **INTRINSICS)
+    deeper = write_frames(tmp_path / "images", [frame(0, "a")], **INTRINSICS)
     # nearer than the model beside the folder
     assert load_scene(deeper).train[0].camera.K[0, 0] == 30
 
@@ -218,18 +216,14 @@ def test_missing_photographs_and_unused_entries_are_noted(tmp_path: Path) -> Non
 def test_paths_of_another_machine_end_in_the_folder(tmp_path: Path, start: str) -> None:
     """A file of the whole path, outside of the folder, is never read."""
     scene, names = tmp_path / "scene", [f"images/{i}" for i in range(3)]
-    frames = [
-        {"file_path": start + name, "transform_matrix": to_world(i)} for i, name in enumerate(names)
-    ]
+    frames = [frame(i, start + name) for i, name in enumerate(names)]
     write_frames(scene, frames, **INTRINSICS, test_filenames=[start + names[1]])
     write_images(tmp_path, [f"{name}.png" for name in names])
     with refused("transforms.json: image name .* leaves the images folder .*; put the photograph"):
         load_scene(scene)
     write_images(scene, [f"{name}.png" for name in names])
     loaded = load_scene(scene)
-    assert [view.camera.name for view in (*loaded.train, *loaded.test)] == [
-        f"images/{i}.png" for i in (0, 2, 1)
-    ]
+    assert names_of((*loaded.train, *loaded.test)) == [f"images/{i}.png" for i in (0, 2, 1)]
     assert (
         "paths of transforms.json lead out of its folder: photographs are those in it"
         in loaded.notes
@@ -303,20 +297,14 @@ def test_invalid_files_and_frames_are_refused(
             tmp_path / "transforms.json", 300 * 2**20 if "256 MB" in message else len(change)
         )
     else:
-        write_frames(
-            tmp_path,
-            [{"file_path": "a.png", "transform_matrix": to_world(0), **INTRINSICS, **change}],
-        )
+        write_frames(tmp_path, [frame(0, "a.png") | INTRINSICS | change])
     with refused(message) as caught:
         load_scene(tmp_path)
     assert str(caught.value).isprintable()
 
 
 def test_camera_without_a_size_is_left_out(tmp_path: Path) -> None:
-    frames = [
-        {"file_path": f"{k}.png", "transform_matrix": torch.eye(4).tolist()} for k in range(2)
-    ]
-    frames[1] |= {"w": 20, "h": 10}
+    frames = [frame(0, "0.png"), frame(1, "1.png", w=20, h=10)]
     write_frames(tmp_path, frames, camera_angle_x=1.0)
     cameras, notes = load_cameras(tmp_path)
     assert [camera.name for camera in cameras] == ["1.png"]
@@ -437,7 +425,7 @@ def test_cameras_of_nerfstudio(
         )
     (scene / "dataparser_transforms.json").write_text(json.dumps(written))
     loaded = load_scene(scene)
-    views = sorted((*loaded.train, *loaded.test), key=lambda view: view.camera.name)
+    views = views_of(loaded)
     found = torch.linalg.inv(torch.stack([view.camera.viewmat.double() for view in views])).numpy()
     assert_allclose(found[:, :3, :3] * [1, -1, -1], want[:, :3, :3], atol=2e-5)
     assert_allclose(found[:, :3, 3], want[:, :3, 3], atol=2e-5)
@@ -448,16 +436,11 @@ def test_cameras_of_nerfstudio(
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ("[1, 2]", "is no JSON object"),
         ("{}", "transform is no 3x4 or 4x4 matrix"),
         ('{"transform": [[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0]]}', "transform is no rotation"),
-        ('{"transform": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, -1, 0]]}', "transform is no rotation"),
-        *(
-            (
-                f'{{"transform": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]], "scale": {scale}}}',
-                "scale is no number",
-            )
-            for scale in ("0", "NaN", "[1]")
+        (
+            '{"transform": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]], "scale": 0}',
+            "scale is no number",
         ),
     ],
 )

@@ -17,7 +17,7 @@ from clod_adapter.adapter import extract, with_dial
 from clod_adapter.config import FILTERS, AttenuationConfig
 from clod_adapter.io.checkpoint import load, save
 from clod_adapter.origin import NOWHERE, origin_of
-from formats import needed, random_rows, write_rows
+from formats import needed, random_rows, resaved, write_rows
 from scenes import gaussians
 
 SCALES = ("scale_0", "scale_1", "scale_2")
@@ -63,8 +63,10 @@ def test_activated_values_need_the_option(tmp_path: Path, what: tuple[str, ...])
 
 
 def test_usual_values_need_no_option(tmp_path: Path) -> None:
-    few, same = activate(inria(9), "opacity", "scales"), inria(40)
-    same["opacity"], same["scale_0"], same["scale_1"], same["scale_2"] = 0.5, 0.5, 0.5, 0.5
+    few = activate(inria(9), "opacity", "scales")
+    same = inria(40)
+    for name in ("opacity", *SCALES):
+        same[name] = 0.5
     pruned = inria(200)
     for vertex in (few, same, pruned[pruned["opacity"] > 0]):
         loaded = load(write_rows(tmp_path / "in.ply", vertex))
@@ -100,8 +102,7 @@ def test_mip_splatting_is_fused(tmp_path: Path) -> None:
     )
     assert_allclose(g.opacity_logits[5], log, rtol=1e-6)
     assert base.comments == base.notes[:1] and "filter_3D is fused" in base.comments[0]
-    save(tmp_path / "out.ply", with_dial(g, torch.rand(38), AttenuationConfig()), base)
-    out = load(tmp_path / "out.ply")
+    out = resaved(base, with_dial(g, torch.rand(38), AttenuationConfig()))
     assert (
         "filter_3D" not in out.vertex.dtype.names
         and out.notes == ()
