@@ -76,8 +76,8 @@ class Checkpoint:
 
     @property
     def viewpoints(self) -> tuple[Viewpoint, ...]:
-        """Those of the calibration, relative to the origin as the Gaussians are; empty without a
-        calibration.
+        """Viewpoints of the calibration, relative to the origin as the Gaussians are; empty without
+        a calibration.
         """
         stored = self.calibration.viewpoints if self.calibration else ()
         back = [-value for value in self.origin]
@@ -201,8 +201,7 @@ def load(
 
 @torch.no_grad()
 def plausibility(arrays: Mapping[str, np.ndarray], config: AttenuationConfig) -> list[str]:
-    """Of a dial without settings, a line with the share that it keeps at s = 1 from the nominal
-    distance.
+    """States the share that a dial without settings keeps at s = 1 from the nominal distance.
 
     A warning where that is too small, as of a file whose positions were enlarged. Nothing for the
     paper's form, which is invariant to scale.

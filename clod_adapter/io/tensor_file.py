@@ -99,7 +99,7 @@ def write(path: Path, gaussians: Gaussians, metadata: Metadata) -> tuple[str, ..
 
 
 def has_dial(path: Path) -> bool:
-    """By the names of the tensors."""
+    """Whether one of the tensors is sigma_d."""
     return SIGMA in read_tensor_header(path)[0]
 
 

@@ -170,7 +170,7 @@ def _as_logits(
 
 
 def in_question(arrays: Mapping[str, np.ndarray]) -> dict[str, tuple[float, float]]:
-    """The range of "opacity" and of "scales", where it looks activated: at least ``_FEW`` values,
+    """The ranges of "opacity" and of "scales", where it looks activated: at least ``_FEW`` values,
     none too small.
     """
     ranges: dict[str, tuple[float, float]] = {}
@@ -198,8 +198,8 @@ def choice_of(names: Iterable[str]) -> Activated:
 
 
 def _fused(arrays: Arrays, filter_3d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """With the filter ``f``: scales ``sqrt(s^2 + f^2)``, opacity
-    ``a sqrt(det(s^2) / det(s^2 + f^2))``, in logs.
+    """Scales ``sqrt(s^2 + f^2)`` and opacities ``a sqrt(det(s^2) / det(s^2 + f^2))`` with the
+    filter ``f``, in logs.
     """
     scales = arrays["log_scales"].astype(np.float64)
     logits = arrays["opacity_logits"][:, None].astype(np.float64)
@@ -357,7 +357,7 @@ def sh0_of(levels: np.ndarray) -> np.ndarray:
 
 
 def bytes_of(values: np.ndarray) -> np.ndarray:
-    """Rounded to 0 to 255."""
+    """Levels of 0 to 255, rounded."""
     return np.clip(np.round(values), 0, 255).astype(np.uint8)
 
 

@@ -31,7 +31,7 @@ def test_temporaries_of_a_file_are_removed(tmp_path: Path) -> None:
 
 
 def test_file_appears_only_after_success(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Also where the folder cannot be flushed."""
+    """A folder that cannot be flushed does not matter."""
     final = tmp_path / ("x" * 251 + ".ply")  # as long as a name may be
     with atomic_path(final) as temporary, atomic_path(temporary) as nested:
         assert temporary.parent == tmp_path and temporary.suffix == ".ply"
@@ -79,8 +79,8 @@ def test_failure_keeps_only_the_old_files(tmp_path: Path, error: BaseException) 
 def test_several_files_are_replaced_together(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, links: bool
 ) -> None:
-    """Where a folder was made in place of the last one, the others stay as they were; also without
-    hard links.
+    """A folder made in place of the last one keeps the others as they were; also without hard
+    links.
     """
     if not links:
         monkeypatch.setattr(os, "link", Mock(side_effect=OSError(1, "Operation not permitted")))

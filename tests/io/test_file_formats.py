@@ -90,7 +90,7 @@ def read(path: Path) -> None:
 
 
 def same(kind: str, g: Gaussians, again: Gaussians) -> None:
-    """To the precision of the format."""
+    """Compares to the precision of the format."""
     *losses, sigma, angle = LOSSES.get(kind, EXACT)
     bands = again.shN.shape[1]
     assert bands == min(g.shN.shape[1], 24 if kind not in LOSSES else 15)
@@ -112,8 +112,8 @@ def same(kind: str, g: Gaussians, again: Gaussians) -> None:
     "kind", [".glb of splat-transform", ".spz of splat-transform", ".compressed.ply"]
 )
 def test_files_of_splat_transform(capture: Any, kind: str) -> None:
-    """Of version 3.7: a .glb in glTF's axes under a node without a rotation; an .spz of version 3;
-    two blocks.
+    """Files of version 3.7: a .glb in glTF's axes under a node without a rotation; an .spz of
+    version 3; two blocks.
     """
     found = load(PACKED.with_name(f"capture{kind.split()[0]}"))
     rows = rows_by_place(capture.gaussians.means.numpy(), found.gaussians.means.numpy())
@@ -123,7 +123,7 @@ def test_files_of_splat_transform(capture: Any, kind: str) -> None:
 
 
 def test_an_older_compressed_ply(tmp_path: Path) -> None:
-    """Of SH degree 0; its colours are in [0, 1] and have no ranges."""
+    """A file of SH degree 0; its colours are in [0, 1] and have no ranges."""
     now = load(PACKED).gaussians
     chunks, vertex, _ = PlyData.read(str(PACKED), mmap=False).elements
     older = chunks.data[[name for name in chunks.data.dtype.names if name[4:] not in "rgb"]]
@@ -142,7 +142,7 @@ def test_an_older_compressed_ply(tmp_path: Path) -> None:
     ("turn", "far", "growth"), [(0, False, False), (2, True, True), (4, False, True)]
 )
 def test_dial_round_trips(tmp_path: Path, suffix: str, turn: int, far: bool, growth: bool) -> None:
-    """At each SH degree with one format or another."""
+    """Each SH degree occurs with one format or another."""
     degree = (DIAL.index(suffix) + turn) % 5
     g, origin = model(degree, growth=growth), ORIGIN if far else NOWHERE
     path = tmp_path / f"a{suffix.upper()}"
@@ -227,8 +227,8 @@ def test_refused_write_leaves_no_file(tmp_path: Path, suffix: str) -> None:
 def test_damage_raises_only_clod_error(
     tmp_path: Path, kind: str, data: st.DataObject, inside: bool
 ) -> None:
-    """Of the file, or ``inside`` of the contents of an SPZ before compression, or of the pickle in
-    a .pt.
+    """Damage of the file, or ``inside`` of the contents of an SPZ before compression, or of the
+    pickle in a .pt.
     """
     source = tmp_path / f"a{kind}"
     whole = (source if source.exists() else any_file(tmp_path, kind)).read_bytes()
@@ -267,7 +267,9 @@ def test_truncation_is_refused(tmp_path: Path, kind: str) -> None:
 
 
 def test_long_history_is_cut(tmp_path: Path) -> None:
-    """To what every format has room for, the last lines first, so that the outputs can be read."""
+    """Every format has room for what is left, the last lines first, so that the outputs can be
+    read.
+    """
     lines = [*["x" * 1000] * 100, "y" * 70_000, *map(str, range(500)), "last"]
     write(tmp_path / "plain.ply", detach(model(0)))
     plain = PlyData.read(tmp_path / "plain.ply", mmap=False)

@@ -54,7 +54,7 @@ CASES: tuple[tuple[Image.Image, str, dict[str, Any], np.ndarray, list[str]], ...
 
 
 def test_kinds_of_image(tmp_path: Path) -> None:
-    """By content, whatever the name."""
+    """The content decides, whatever the name."""
     for image, kind, options, want, noted in CASES:
         image.save(tmp_path / "a.jpg", kind, **options)
         got, notes = read(tmp_path / "a.jpg")
@@ -127,8 +127,8 @@ def reduced(
 def test_large_image_is_reduced_to_block_means(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
 ) -> None:
-    """By 3, so that it is at least twice as wide as what is made of it; in bands, of which the last
-    one is cut.
+    """Reduced by 3, so that it is at least twice as wide as what is made of it; in bands, of which
+    the last one is cut.
     """
     width, height = 200, 3 * BAND + 70
     rgb = pixels(3, width, height)

@@ -189,7 +189,7 @@ def test_glb_of_another_program(tmp_path: Path) -> None:
 def test_logarithms_and_logits_in_a_glb(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, activation: str
 ) -> None:
-    """As splat-transform 2.3 and JSplat wrote them; a stray value beyond the range is damaged."""
+    """Splat-transform 2.3 and JSplat wrote them so; a stray value beyond the range is damaged."""
     path, g = tmp_path / "a.glb", detach(gaussians(300, 0, 0))
     right, linear = g.scales, g.scales.clone() if name == "SCALE" else g.opacities
     linear.view(-1)[0] = -1
@@ -204,7 +204,7 @@ def test_logarithms_and_logits_in_a_glb(
 
 
 def test_logarithms_by_the_generator_of_a_glb(tmp_path: Path) -> None:
-    """Of a scene in large units, whose logarithms are all above 0."""
+    """A scene in large units, whose logarithms are all above 0."""
     path, g = tmp_path / "a.glb", detach(gaussians(30, 0, 0))
     write(path, g)
     change_glb(path, lambda gltf: gltf["asset"].update(generator="splat-transform 2.3.1"))
@@ -324,7 +324,7 @@ def test_far_positions_of_an_spz(tmp_path: Path) -> None:
 
 
 def test_losses_of_a_splat(tmp_path: Path) -> None:
-    """Of a row, and of the file, where the largest come first."""
+    """The bytes of a row, and the order of a file, where the largest come first."""
     g = detach(model(0)).select(torch.arange(1))
     assert len(write(tmp_path / "a.splat", g)) == 1
     data = (tmp_path / "a.splat").read_bytes()
@@ -350,7 +350,9 @@ def test_losses_of_a_splat(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("degree", [0, 3])
 def test_checkpoint_of_gsplat(tmp_path: Path, degree: int) -> None:
-    """Also with other number types and strides, other entries, and a row that is not finite."""
+    """A checkpoint with other number types and strides, other entries, and a row that is not
+    finite.
+    """
     g = gaussians(12, degree, 0)
     values = to_gsplat(g) | {"means": g.means.double(), "quats": g.quats.half().T.contiguous().T}
     values["scales"][3] = torch.nan

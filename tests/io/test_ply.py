@@ -257,7 +257,7 @@ def test_rows_are_those_of_the_file_whatever_happens_to_it_later(
 
 @pytest.mark.parametrize("order", ["<", "ascii"])
 def test_comments_beyond_ascii(tmp_path: Path, order: str) -> None:
-    """As CloudCompare writes a date in the user's language; outputs have question marks there."""
+    """CloudCompare writes a date in the user's language; outputs have question marks there."""
     path = write_rows(tmp_path / "in.ply", random_rows(5, needed()), order, ("made on @",))
     path.write_bytes(path.read_bytes().replace(b"@", "M\u00e4rz \x1b[2J".encode(), 1))
     found = load(path)
@@ -283,7 +283,7 @@ def test_columns_with_the_prefix_of_cloudcompare(tmp_path: Path, order: str, pre
 
 
 def test_rgb_of_nerfstudio(tmp_path: Path) -> None:
-    """In the place of harmonics, which outputs have."""
+    """Colours stand in the place of harmonics, which outputs have."""
     columns = [*needed()[:3], "red", "green", "blue", *needed()[6:], "label"]
     rows = random_rows(5, columns, types=dict.fromkeys(("red", "green", "blue"), "u1"))
     rows["red"] = [0, 51, 102, 204, 255]

@@ -352,8 +352,8 @@ REFUSED: Table = (
 def test_damaged_and_hostile_files(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str
 ) -> None:
-    """In one printable line. Nothing is allocated for what a file claims, and none of its code
-    runs.
+    """The error is one printable line. Nothing is allocated for what a file claims, and none of its
+    code runs.
     """
     monkeypatch.chdir(tmp_path)
     write_rows(tmp_path / "whole.ply", random_rows(9, needed()), "ascii")

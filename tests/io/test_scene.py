@@ -210,7 +210,9 @@ def test_unusable_lenses_are_refused(
 
 
 def test_text_models_of_other_programs(tmp_path: Path) -> None:
-    """Without blank lines or points, with names that have spaces and quaternions of any length."""
+    """Files without blank lines or points, with names that have spaces and quaternions of any
+    length.
+    """
     write_model(
         tmp_path, [camera(0), camera(1), camera(2)], names := ["a b.png", "c.png", "d  e 2.png"]
     )
@@ -349,8 +351,8 @@ def capture_of(folder: Path, kind: str, params: list[float]) -> Path:
 
 
 def ideal(view: View, across: float = 0.0, down: float = 0.0) -> np.ndarray:
-    """What the pinhole camera of the view would have seen, or one whose axis is these pixels
-    beside.
+    """The picture that the pinhole camera of the view would have seen, or one whose axis is these
+    pixels beside.
     """
     K = view.camera.K.double().numpy()
     params = [K[0, 0], K[1, 1], K[0, 2] + across, K[1, 2] + down]
@@ -379,7 +381,7 @@ def test_undistorted_image_is_that_of_the_pinhole_camera(
 def test_cached_images_are_reused(
     tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """While the photograph, its camera and the width are the same; a damaged one is made again."""
+    """The photograph, its camera and the width must be the same; a damaged one is made again."""
     scene = capture_of(tmp_path / "scene", "OPENCV", LENSES["OPENCV"])
     first = load_scene(scene, max_width=100)
     (file,) = cache.rglob("*.png")

@@ -140,7 +140,7 @@ def test_damaged_settings_are_refused(tmp_path: Path) -> None:
     ],
 )
 def test_a_calibration_of_absurd_numbers_is_ignored(tmp_path: Path, old: str, new: str) -> None:
-    """With a note; nothing is rendered in its size."""
+    """A note says so; nothing is rendered in its size."""
     places = (Viewpoint(1, 0, -5, 1, 0, 0, 1, 0, -1, 0, 0.7),)
     write(
         tmp_path / "a.ply", model(0), Metadata(calibration=replace(CALIBRATION, viewpoints=places))
@@ -163,7 +163,7 @@ def with_a_cut(path: Path) -> Path:
 
 
 def test_a_dial_of_the_earlier_form_is_refused(tmp_path: Path) -> None:
-    """By a comment, by a column where comments were dropped, and by JSON."""
+    """The form shows in a comment, in a column where comments were dropped, and in JSON."""
     made: list[Callable[[], Path]] = [
         partial(described, tmp_path / "a.ply", "tau 0.02", "max_sv 5")
     ]
@@ -186,7 +186,9 @@ def test_a_dial_of_the_earlier_form_is_refused(tmp_path: Path) -> None:
 def test_columns_and_the_flag_of_an_spz_store_the_filter(
     tmp_path: Path, screen_filter: ScreenFilter
 ) -> None:
-    """In a PLY with a dial; a plain one has no columns but those of Inria's layout."""
+    """A PLY with a dial has columns of settings; a plain one has no columns but those of Inria's
+    layout.
+    """
     write(tmp_path / "a.ply", model(1).replace(screen_filter=screen_filter))
     found = load(without_comments(tmp_path / "a.ply"))
     assert (

@@ -95,8 +95,8 @@ def test_blender_files(tmp_path: Path) -> None:
 
 
 def test_lists_of_nerfstudio_are_its_split(tmp_path: Path) -> None:
-    """What it does not train on is held out, in a list or in none; paths without an extension as in
-    the frames.
+    """Photographs that it does not train on are held out, in a list or in none; paths without an
+    extension as in the frames.
     """
     names = [f"./images/{i}" for i in range(6)]
     frames = [frame(i, name) for i, name in enumerate(names)]
@@ -165,7 +165,7 @@ def test_distorted_photographs_are_undistorted(
     model: str,
     params: list[float],
 ) -> None:
-    """As those of a COLMAP model with the same lens."""
+    """They equal those of a COLMAP model with the same lens."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     size, views = {"fl_x": 120, "fl_y": 122, "cx": 82, "cy": 58, "w": 160, "h": 120}, []
     write_frames(tmp_path / "a", [frame(0, "a.png")], **size, **message)
@@ -399,7 +399,9 @@ def write_data(folder: Path, poses: np.ndarray, **rest: Any) -> None:
 def test_cameras_of_nerfstudio(
     tmp_path: Path, turn: str, seed: int, applied_scale: float | None
 ) -> None:
-    """Of its transforms.json; or, without a scale, of a COLMAP model, whose own world is turned."""
+    """Cameras of its transforms.json; or, without a scale, of a COLMAP model, whose own world is
+    turned.
+    """
     applied = APPLIED.get(turn)
     poses = in_colmap(9, seed)
     # as ns-process-data

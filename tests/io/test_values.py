@@ -75,7 +75,7 @@ def test_usual_values_need_no_option(tmp_path: Path) -> None:
 
 
 def test_mip_splatting_is_fused(tmp_path: Path) -> None:
-    """By the formula of its renderer, here in float64; extreme values are finite."""
+    """The formula is its renderer's, here in float64; extreme values are finite."""
     vertex, names = inria(40, "filter_3D"), [*needed()[:6], *needed()[-4:]]
     vertex["filter_3D"] = np.exp(np.random.default_rng(1).normal(size=40) - 2.5)
     vertex["filter_3D"][:9] = 0, 1e30, 1e-30, 0.1, 0.1, 0.1, np.nan, np.inf, -0.1

@@ -173,7 +173,7 @@ def write_points(
 
 
 def has_dial(path: Path) -> bool:
-    """By the attributes of the primitive; the file is mapped, and its values are not read."""
+    """Whether the primitive has a sigma_d; the file is mapped, and its values are not read."""
     with refused_if_damaged(path, *_DAMAGED):
         gltf, _ = _chunks(path, np.memmap(path, np.uint8, "r").data)
         (_, primitive), *_ = _find(path, gltf)
@@ -300,8 +300,8 @@ def _whole(value: Any) -> int:
 
 
 def _placed(path: Path, gltf: dict[str, Any], mesh: int) -> tuple[float, bool, Origin]:
-    """How the nodes above a mesh place it: their scale, whether they make the half turn, and their
-    translation as an origin in the axes of checkpoints.
+    """The placement of a mesh by the nodes above it: their scale, whether they make the half turn,
+    and their translation as an origin in the axes of checkpoints.
     """
     nodes: list[dict[str, Any]] = gltf.get("nodes", [])
     parents: dict[int, int] = {}
@@ -330,7 +330,7 @@ def _placed(path: Path, gltf: dict[str, Any], mesh: int) -> tuple[float, bool, O
 
 
 def _matrix(path: Path, node: dict[str, Any]) -> np.ndarray:
-    """``[4, 4]`` of a node, from its own axes into its parent's."""
+    """``[4, 4]`` transformation of a node, from its own axes into its parent's."""
     from scipy.spatial.transform import Rotation
 
     if "matrix" in node:  # by columns

@@ -83,7 +83,7 @@ def check(path: Path) -> None:
 
 
 def has_dial(path: Path) -> bool:
-    """By the names in the pickle, which is not unpickled."""
+    """Whether the pickle, which is not unpickled, names a sigma_d."""
     with zipfile.ZipFile(path) as archive:
         (name,) = (name for name in archive.namelist() if name.endswith("/data.pkl"))
         return any(argument == SIGMA for _, argument, _ in pickletools.genops(archive.read(name)))

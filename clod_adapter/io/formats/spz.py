@@ -195,7 +195,7 @@ def _losses(arrays: dict[str, np.ndarray], bits: int) -> list[str]:
 
 
 def has_dial(path: Path) -> bool:
-    """Reads all of the file, which is never much."""
+    """Whether the file has a sigma_d; all of it is read, which is never much."""
     return (
         not read_bytes(path, START).startswith(NEW_SPZ)
         and SIGMA in read(path, read_bytes(path)).arrays

@@ -124,9 +124,14 @@ def _cells(centres: Sequence[np.ndarray], rows: Rows) -> Iterator[Rows]:
     plane = float(np.median(inside[:, axis]))
     if not (inside[:, axis] < plane).any():
         plane = float(inside[inside[:, axis] > plane, axis].min())
-    low = [points[each, axis] < plane for points, each in zip(centres, rows, strict=True)]
-    yield from _cells(centres, [each[mask] for each, mask in zip(rows, low, strict=True)])
-    yield from _cells(centres, [each[~mask] for each, mask in zip(rows, low, strict=True)])
+    low: Rows = []
+    high: Rows = []
+    for points, level in zip(centres, rows, strict=True):
+        below = points[level, axis] < plane
+        low.append(level[below])
+        high.append(level[~below])
+    yield from _cells(centres, low)
+    yield from _cells(centres, high)
 
 
 def _box(centres: Sequence[np.ndarray], rows: Rows, origin: Origin) -> list[float]:
@@ -136,9 +141,8 @@ def _box(centres: Sequence[np.ndarray], rows: Rows, origin: Origin) -> list[floa
     Viewers take the distance to the box for the choice of levels. Floaters far off would put the
     viewer inside.
     """
-    points = np.concatenate([centre[each] for centre, each in zip(centres, rows, strict=True)])
-    turned = -(np.quantile(points, [STRAY / 2, 1 - STRAY / 2], 0) + np.array(origin))[
-        ::-1, [0, 2, 1]
-    ]
+    points = np.concatenate([centre[level] for centre, level in zip(centres, rows, strict=True)])
+    ends = np.quantile(points, [STRAY / 2, 1 - STRAY / 2], 0) + np.array(origin)
+    turned = -ends[::-1, [0, 2, 1]]
     centre, half = turned.mean(0), (turned[1] - turned[0]) / 2
     return [*centre.tolist(), *np.diag(half).ravel().tolist()]

@@ -53,8 +53,8 @@ class PosedImage:
         return self.camera.is_perspective_pinhole() and self.camera.is_undistorted()
 
     def relative_to(self, origin: Sequence[float]) -> PosedImage:
-        """In a world with its origin at ``origin [3]``; in float64, as float32 lacks digits far
-        from 0.
+        """The image in a world with its origin at ``origin [3]``; in float64, as float32 lacks
+        digits far from 0.
         """
         viewmat = self.viewmat.copy()
         viewmat[:3, 3] += viewmat[:3, :3] @ np.asarray(origin, np.float64)

@@ -78,7 +78,7 @@ def form_of(folder: Path) -> str:
 
 
 def photograph_folders(folder: Path, cameras: Path) -> list[Path]:
-    """Where the photographs of ``find_cameras(folder)`` may be, the likeliest first."""
+    """Folders where the photographs of ``find_cameras(folder)`` may be, the likeliest first."""
     if cameras.is_file():
         return [cameras.parent]
     bases = folder, cameras.parent, cameras.parent.parent
@@ -212,8 +212,8 @@ def leaves(name: str) -> bool:
 
 
 def scene_files(folder: Path) -> Iterator[Path]:
-    """What no output may overwrite: the model or the transforms, photographs, masks and depths;
-    some may not exist.
+    """Files that no output may overwrite: the model or the transforms, photographs, masks and
+    depths; some may not exist.
     """
     cameras = find_cameras(folder)
     home = cameras if cameras.is_dir() else cameras.parent
@@ -235,9 +235,7 @@ def scene_files(folder: Path) -> Iterator[Path]:
 
 
 def _names_in_json(path: Path) -> Iterator[str]:
-    """What the frames of a transforms file name; nothing of a damaged one, which its reader
-    refuses.
-    """
+    """Names in the frames of a transforms file; none of a damaged one, which its reader refuses."""
     try:
         frames = read_json(path).get("frames")
     except ClodError:

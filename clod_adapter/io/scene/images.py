@@ -194,7 +194,8 @@ def photograph(image: PosedImage, path: Path, max_width: int, cache: Path | None
     # Absent, or damaged: Pillow raises many kinds.
     with suppress(Exception), Image.open(file, formats=["PNG"]) as source:
         about = json.loads(source.info[_KEY])
-        K, notes = np.array(about["K"]), [(what, each) for what, each in about["notes"]]
+        K = np.array(about["K"])
+        notes = [(what, detail) for what, detail in about["notes"]]
         pixels = source.convert("RGB")
     if pixels is None:
         pixels, K, notes = _made(image, path, max_width)
