@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from plyfile import PlyData, PlyElement
 from scipy.spatial.transform import Rotation
@@ -31,6 +32,12 @@ CALIBRATION = Calibration((CalibrationRow(1, 30, 29.1, 0.9, 2.5),), 40, 3, 64, 4
 ORIGIN = (5.1e5, -4096.0, 0.25)
 # of the fixture ``capture``
 PACKED = Path(__file__).parent / "io" / "of_splat_transform" / "capture.compressed.ply"
+
+
+def examples(count: int) -> settings:
+    """Settings of a property test that uses a fixture, such as tmp_path, for all its examples."""
+    shared = [HealthCheck.function_scoped_fixture]
+    return settings(deadline=None, max_examples=count, suppress_health_check=shared)
 
 
 def model(degree: int = 3, count: int = 40, *, growth: bool = True) -> Gaussians:

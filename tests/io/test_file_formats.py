@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 import torch
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.lib.recfunctions import repack_fields
 from plyfile import PlyData, PlyElement
@@ -32,6 +32,7 @@ from formats import (
     ORIGIN,
     PACKED,
     damaged,
+    examples,
     model,
     rows_by_place,
     turned,
@@ -220,9 +221,7 @@ def test_refused_write_leaves_no_file(tmp_path: Path, suffix: str) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@settings(
-    deadline=None, max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+@examples(15)
 @given(data=st.data(), inside=st.booleans())
 def test_damage_raises_only_clod_error(
     tmp_path: Path, kind: str, data: st.DataObject, inside: bool

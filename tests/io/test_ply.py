@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 from plyfile import PlyElement
@@ -17,7 +17,7 @@ from clod_adapter.gaussians import SH_C0
 from clod_adapter.inspection.report import inspect
 from clod_adapter.io.checkpoint import Checkpoint, load, save
 from clod_adapter.io.ply import COLOURED, UNPREFIXED
-from formats import model, needed, random_rows, resaved, write_elements, write_rows
+from formats import examples, model, needed, random_rows, resaved, write_elements, write_rows
 
 CONFIG = AttenuationConfig(form="paper", max_sv=7.0)
 
@@ -48,9 +48,7 @@ def files(draw: st.DrawFn) -> tuple[np.ndarray, str, int]:
     return vertex, draw(st.sampled_from(["<", ">", "ascii"])), degree
 
 
-@settings(
-    deadline=None, max_examples=20, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+@examples(20)
 @given(files(), st.integers(0, 1000))
 def test_every_layout_round_trips(
     tmp_path: Path, file: tuple[np.ndarray, str, int], seed: int

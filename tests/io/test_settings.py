@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -69,45 +70,38 @@ def read(
     "kind", ["a.ply", "a.glb", "a.spz", "a.safetensors", "a.pt", "adapter.safetensors"]
 )
 def test_every_format_uses_the_reader(tmp_path: Path, kind: str) -> None:
-    path, ply = tmp_path / kind, kind == "a.ply"
-    for screen_filter in (CLASSIC, ScreenFilter(variance=0.123456789, compensate=True)):
+    path, ply, adapter = tmp_path / kind, kind == "a.ply", kind == "adapter.safetensors"
+
+    def changed(name: str, old: str, new: str, **filters: ScreenFilter) -> Any:
+        return read(change_setting(written(path, **filters), name, old, new))
+
+    other = ScreenFilter(variance=0.123456789, compensate=True)
+    for screen_filter in (CLASSIC, other):
         assert read(written(path, screen_filter)) == (ATTENUATION, screen_filter, CALIBRATION, [])
-    damage = f"{kind}: its settings are damaged .*MESSAGE.*; restore them, or export"
-    with refused(damage.replace("MESSAGE", "compensate is .*, it must be true or false")):
-        read(
-            change_setting(
-                path, *(("0.123456789", "True", "Yess") if ply else ("compensate", "true", "7e+2"))
-            )
-        )
-    with refused(damage.replace("MESSAGE", "reference_distance is -3.21, it must be")):
-        read(change_setting(written(path), "reference_distance", "3.217", "-3.21"))
+    damage = f"{kind}: its settings are damaged .*{{}}.*; restore them, or export"
+    with refused(damage.format("compensate is .*, it must be true or false")):
+        change = ("0.123456789", "True", "Yess") if ply else ("compensate", "true", "7e+2")
+        changed(*change, screen_filter=other)
+    with refused(damage.format("reference_distance is -3.21, it must be")):
+        changed("reference_distance", "3.217", "-3.21")
     notes = ["settings unknown to this version ignored: 'max_sx'"]
     notes += ["settings that are missing have their defaults: max_sv"]
     wanted = replace(ATTENUATION, max_sv=5.0), CLASSIC, CALIBRATION, notes
-    assert read(change_setting(written(path), "", "max_sv", "max_sx")) == wanted
+    assert changed("", "max_sv", "max_sx") == wanted
     total = "calibrated_with" if ply else "total"
-    *found, (note,) = read(change_setting(written(path), total, "40", "-4"))
-    assert found == [ATTENUATION, CLASSIC, None] and re.search(
-        "unusable and ignored.*not positive", note
-    )
-    if kind != "adapter.safetensors":
-        *found, (note,) = read(change_setting(written(path), total, "40", "41"))
-        assert (
-            found[2] is None
-            and note == "the calibration is of 41 Gaussians and ignored, these are 40"
-        )
+    *settings, (note,) = changed(total, "40", "-4")
+    assert settings == [ATTENUATION, CLASSIC, None]
+    assert re.search("unusable and ignored.*not positive", note)
+    if not adapter:
+        *settings, (note,) = changed(total, "40", "41")
+        assert settings[2] is None
+        assert note == "the calibration is of 41 Gaussians and ignored, these are 40"
     if not ply:
         with refused(f"{kind}: its format 9 is too new.*upgrade"):
-            read(
-                change_setting(
-                    written(path), "format_version", "3" if "adapter" in kind else "1", "9"
-                )
-            )
-        old, new = (
-            ("clod-adapter", "clod-strange") if "adapter" in kind else ("clod-model", "clod-other")
-        )
+            changed("format_version", "3" if adapter else "1", "9")
+        old, new = ("clod-adapter", "clod-strange") if adapter else ("clod-model", "clod-other")
         with refused(f"{kind}: is not an? .*'{new}'"):
-            read(change_setting(written(path), "", old, new))
+            changed("", old, new)
 
 
 def described(path: Path, *comments: str) -> Path:

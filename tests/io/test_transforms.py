@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from hypothesis import HealthCheck, assume, example, given, settings
+from hypothesis import assume, example, given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
@@ -22,6 +22,7 @@ from torch.testing import assert_close
 from clod_adapter._support.text import file_name
 from clod_adapter.io.scene.folder import UNUSED, scene_files
 from clod_adapter.io.scene.load import load_cameras, load_scene
+from formats import examples
 from models import write_model
 from photographs import (
     INTRINSICS,
@@ -386,9 +387,7 @@ def write_data(folder: Path, poses: np.ndarray, **rest: Any) -> None:
     write_frames(folder, frames, **INTRINSICS, **rest)
 
 
-@settings(
-    deadline=None, max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+@examples(15)
 @given(
     st.sampled_from(["today", "older", "none"]),
     st.integers(0, 50),
