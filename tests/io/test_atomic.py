@@ -70,9 +70,8 @@ def test_failure_keeps_only_the_old_files(tmp_path: Path, error: BaseException) 
         raise error
     with refused("cannot be written"), atomic_paths(*finals) as (first, _):
         first.write_bytes(b"new")  # and the other not at all
-    assert [final.read_bytes() for final in finals] == [b"old", b"old"] and len(
-        os.listdir(tmp_path)
-    ) == 2
+    assert [final.read_bytes() for final in finals] == [b"old", b"old"]
+    assert len(os.listdir(tmp_path)) == 2
 
 
 @pytest.mark.parametrize("links", [True, False])

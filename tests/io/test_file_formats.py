@@ -168,11 +168,9 @@ def test_dial_round_trips(tmp_path: Path, suffix: str, turn: int, far: bool, gro
     write(tmp_path / f"b{suffix}", g, Metadata(calibration=CALIBRATION, origin=origin, about=ABOUT))
     assert path.read_bytes() == (tmp_path / f"b{suffix}").read_bytes()
     seen = inspect(path)
-    assert (
-        seen.splat is not None
-        and seen.splat.dial is not None
-        and seen.splat.dial.calibration == CALIBRATION
-    )
+    assert seen.splat is not None
+    assert seen.splat.dial is not None
+    assert seen.splat.dial.calibration == CALIBRATION
     assert seen.splat.dial_columns == "sigma_d" + growth * " and growth_d"
     save(tmp_path / "out.ply", found.gaussians, found, calibration=found.calibration)
     again = load(tmp_path / "out.ply", origin=found.origin)
@@ -188,10 +186,8 @@ def test_model_without_dial_round_trips(tmp_path: Path, suffix: str) -> None:
     assert not file_has_dial(path)
     found = load(path)
     rows = torch.from_numpy(rows_by_place(g.means.numpy(), found.gaussians.means.numpy()))
-    assert (
-        found.gaussians.sigma_d is None
-        and (found.gaussians.means[rows] - g.means).abs().max() <= 2.0**-20
-    )
+    assert found.gaussians.sigma_d is None
+    assert (found.gaussians.means[rows] - g.means).abs().max() <= 2.0**-20
     assert any("quantised" in note for note in found.notes) == (suffix in (".spz", ".splat"))
     seen = inspect(path)
     assert seen.splat is not None and seen.splat.dial is None

@@ -88,9 +88,8 @@ def test_exif_rotation_is_applied_if_the_camera_has_the_rotated_shape(
     # what is at the top left once turned
     a, b = {5: (0, 0), 6: (-1, 0), 7: (-1, -1), 8: (0, -1)}[orientation]
     assert_array_equal(turned[0, 0], pixels(0)[a, b])
-    assert turned.shape == (40, 30, 3) and notes == [
-        "rotated by their EXIF orientation, as the cameras are"
-    ]
+    assert turned.shape == (40, 30, 3)
+    assert notes == ["rotated by their EXIF orientation, as the cameras are"]
 
 
 @pytest.mark.parametrize("name", ["a.jpg", "a.png", "a.tif", "a.webp", "a.heic", "absent.png"])
@@ -116,10 +115,8 @@ def reduced(
 ) -> np.ndarray:
     monkeypatch.setattr(images, "LARGE", 1000)
     image, notes = read_image(path, width, height, max_width)
-    assert (
-        len(notes) == len(set(notes))
-        and sum("takes long: reduced first" in what for what, _ in notes) == 1
-    )
+    assert len(notes) == len(set(notes))
+    assert sum("takes long: reduced first" in what for what, _ in notes) == 1
     return np.asarray(image).astype(float)
 
 

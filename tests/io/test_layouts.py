@@ -177,10 +177,8 @@ def test_glb_of_another_program(tmp_path: Path) -> None:
     path.write_bytes(head + struct.pack("<II", len(body), 0x004E4942) + body)
     found = load(path)
     assert_array_equal(found.gaussians.means, rows["position"] * [-1, -1, 1])
-    assert (
-        found.gaussians.quats.tolist() == [[1, 0, 0, 0]] * 5
-        and found.gaussians.opacity_logits.isposinf().all()
-    )
+    assert found.gaussians.quats.tolist() == [[1, 0, 0, 0]] * 5
+    assert found.gaussians.opacity_logits.isposinf().all()
     colours, others = found.notes[-2:]
     assert "'lin_rec709_display'" in colours and others.startswith("1 more primitives")
 
@@ -342,10 +340,8 @@ def test_losses_of_a_splat(tmp_path: Path) -> None:
     again = load(tmp_path / "a.splat").gaussians
     rows = rows_by_place(again.means.numpy(), g.means.numpy())
     weights = (g.scales.prod(1) * g.opacities)[rows]
-    assert (
-        turned(again.quats, g.quats[rows]) < 0.02
-        and (weights[1:] <= weights[:-1] * (1 + 1e-5)).all()
-    )
+    assert turned(again.quats, g.quats[rows]) < 0.02
+    assert (weights[1:] <= weights[:-1] * (1 + 1e-5)).all()
 
 
 @pytest.mark.parametrize("degree", [0, 3])
@@ -360,11 +356,9 @@ def test_checkpoint_of_gsplat(tmp_path: Path, degree: int) -> None:
     extra = {"app_module": torch.nn.Linear(2, 2).state_dict(), "optimizer": [torch.zeros(3)]}
     torch.save({"step": 6999, "splats": splats, **extra}, tmp_path / "a.PT")
     base = load(tmp_path / "a.PT")
-    assert (
-        base.gaussians.sh_degree == degree
-        and base.gaussians.sigma_d is None
-        and "normalised" in base.notes[1]
-    )
+    assert base.gaussians.sh_degree == degree
+    assert base.gaussians.sigma_d is None
+    assert "normalised" in base.notes[1]
     assert "1 of 12 Gaussians dropped" in base.notes[0] and len(base.fingerprint) == 64
     for name, tensor in to_gsplat(base.gaussians).items():
         assert torch.equal(tensor, values[name][torch.arange(12) != 3].float()), name
@@ -390,10 +384,8 @@ def test_ranks_of_several_gpus(tmp_path: Path, name: str) -> None:
     for other in (name.replace("_r", "0_r"), name.replace("{}", "_").replace("ws3", "ws4")):
         (tmp_path / other.format(9)).write_bytes(b"another")
     found = [load(path) for path in paths]
-    assert (
-        all(each.gaussians == g for each in found)
-        and len({each.fingerprint for each in found}) == 1
-    )
+    assert all(each.gaussians == g for each in found)
+    assert len({each.fingerprint for each in found}) == 1
     assert found[0].notes[-1] == "its 3 ranks, in files beside it, are read as one checkpoint"
     with refused("is the input file"):
         save(paths[2], g, found[0])

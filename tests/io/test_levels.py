@@ -74,10 +74,8 @@ def test_index_and_tiles(tmp_path: Path) -> None:
     chain = [tile for _, tile in tiles_of(index["root"])]
     # on a screen of 1,080 lines, 60 degrees high
     begins = [tile["geometricError"] * 935 / 16 for tile in chain]
-    assert (
-        begins == pytest.approx(BEGINS[::-1])
-        and index["geometricError"] >= chain[0]["geometricError"]
-    )
+    assert begins == pytest.approx(BEGINS[::-1])
+    assert index["geometricError"] >= chain[0]["geometricError"]
     assert sorted(path.name for path in tmp_path.iterdir()) == [
         "0_0.glb",
         "0_1.glb",
@@ -87,11 +85,9 @@ def test_index_and_tiles(tmp_path: Path) -> None:
     for tile, want in zip(chain, given[::-1], strict=True):
         assert set(tile) - {"content", "children", "refine"} == {"boundingVolume", "geometricError"}
         (box,) = tile["boundingVolume"].values()
-        assert (
-            len(box) == 12
-            and all(isinstance(number, float) for number in box)
-            and tile.get("children", True)
-        )
+        assert len(box) == 12
+        assert all(isinstance(number, float) for number in box)
+        assert tile.get("children", True)
         gltf, found = read_tile(tmp_path / tile["content"]["uri"], tmp_path)
         assert_close(found.means, want.means, rtol=0, atol=1e-4)
         assert_close(found.log_scales, want.log_scales, rtol=0, atol=0.04)

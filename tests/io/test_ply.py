@@ -55,16 +55,14 @@ def test_every_layout_round_trips(
 ) -> None:
     """Bit for bit, but for values that change; growth_d without sigma_d is a column like others."""
     vertex, kind, degree = file
-    source, out = (
-        write_rows(tmp_path / "in.ply", vertex, kind, ("made by hand",)),
-        tmp_path / "out.ply",
-    )
+    source = write_rows(tmp_path / "in.ply", vertex, kind, ("made by hand",))
+    out = tmp_path / "out.ply"
     before = source.read_bytes()
     base = load(source)
     g = base.gaussians
-    assert (
-        g.sh_degree == degree and g.sigma_d is g.growth_d is None and g.means.dtype == torch.float32
-    )
+    assert g.sh_degree == degree
+    assert g.sigma_d is g.growth_d is None
+    assert g.means.dtype == torch.float32
     assert base.notes == ()
     save(out, g, base)
     assert read_back(out)[1].dtype.names == vertex.dtype.names
@@ -98,9 +96,8 @@ def test_every_layout_round_trips(
     own = [name for name in vertex.dtype.names if name != "growth_d"]
     added = ["clod_paper", "sigma_d"]  # of CONFIG, what is not the default, but for max_sv
     added += ["growth_d"] if growth_d is not None else []
-    assert list(rows.dtype.names) == own + added and {rows.dtype[name].str for name in added} == {
-        "<f4"
-    }
+    assert list(rows.dtype.names) == own + added
+    assert {rows.dtype[name].str for name in added} == {"<f4"}
     for name in own:
         assert rows.dtype[name] == vertex.dtype[name]
         unchanged = rows[name].astype(np.float32) == f32[name] if seed % 2 else slice(None)
@@ -134,18 +131,16 @@ def test_header_of_an_extended_file(tmp_path: Path) -> None:
         "element vertex 2",
         "comment a photo",
     ]
-    assert sum("clod_adapter max_sv" in line for line in lines) == 1 and not any(
-        "odd" in line for line in lines
-    )
+    assert sum("clod_adapter max_sv" in line for line in lines) == 1
+    assert not any("odd" in line for line in lines)
     for line in (
         f"reference_distance {float(config.reference_distance)!r}",
         "form paper",
         "version 7.8.9",
     ):
         assert f"comment clod_adapter {line}" in lines
-    assert lines[-1] == "property float sigma_d" and sorted(rows.dtype.names) == sorted(
-        {*rows.dtype.names}
-    )
+    assert lines[-1] == "property float sigma_d"
+    assert sorted(rows.dtype.names) == sorted({*rows.dtype.names})
 
 
 def test_unusable_rows_are_dropped_and_counted(tmp_path: Path) -> None:
@@ -186,10 +181,8 @@ def test_refused_saves(tmp_path: Path) -> None:
         (out, g.replace(opacity_logits=torch.full((3,), torch.inf)), "opacity_logits"),
         (tmp_path / "in.ply", g, "is the input file"),
     ]
-    dial, bad = (
-        g.replace(sigma_d=torch.ones(3), attenuation=CONFIG),
-        torch.tensor([1.0, torch.inf, torch.nan]),
-    )
+    dial = g.replace(sigma_d=torch.ones(3), attenuation=CONFIG)
+    bad = torch.tensor([1.0, torch.inf, torch.nan])
     cases += [
         (
             out,
@@ -244,9 +237,9 @@ def test_rows_are_those_of_the_file_whatever_happens_to_it_later(
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
     found = load(str(path), activated="none")
     path.write_bytes(bytes(path.stat().st_size))
-    assert (
-        found.path == path and found.fingerprint == digest and found.comments == ("of the camera",)
-    )
+    assert found.path == path
+    assert found.fingerprint == digest
+    assert found.comments == ("of the camera",)
     assert found.notes == ("not carried over to outputs: element intrinsic, element face",)
     assert found.vertex.dtype == vertex.dtype and found.vertex.dtype.isnative
     for name in vertex.dtype.names:
@@ -273,9 +266,8 @@ def test_columns_with_the_prefix_of_cloudcompare(tmp_path: Path, order: str, pre
         name if name in "xyz" else f"{prefix}{name}" for name in rows.dtype.names
     )
     found = load(write_rows(tmp_path / "in.ply", rows, order), activated="none")
-    assert (
-        found.gaussians == plain.gaussians and found.vertex.dtype.names == plain.vertex.dtype.names
-    )
+    assert found.gaussians == plain.gaussians
+    assert found.vertex.dtype.names == plain.vertex.dtype.names
     assert found.notes == (UNPREFIXED,)
     assert resaved(found).vertex.dtype == plain.vertex.dtype
 

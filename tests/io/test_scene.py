@@ -107,9 +107,8 @@ def test_split_of_the_scene_is_used(tmp_path: Path) -> None:
         (tmp_path / "sparse" / "0" / "test.txt").write_text("\n".join(listed) + "\n")
         loaded, cameras = load_scene(tmp_path), load_cameras(tmp_path, training=True)[0]
         held_out = names_of(loaded.test)
-        assert loaded.notes == (note,) and held_out == (
-            listed[:2] if len(listed) == 3 else [names[0], names[8]]
-        )
+        assert loaded.notes == (note,)
+        assert held_out == (listed[:2] if len(listed) == 3 else [names[0], names[8]])
         assert [camera.name for camera in cameras] == [
             name for name in names if name not in held_out
         ]
@@ -142,9 +141,8 @@ def test_other_models_are_found_and_noted(tmp_path: Path) -> None:
     write_model(tmp_path, [camera(0), camera(1)], names[:2])
     (sparse / "0").rename(sparse / "2")
     (note,) = (loaded := load_scene(tmp_path)).notes
-    assert len(loaded.train) == 1 and note.startswith(
-        f"{sparse / '10'} is another model, of 3 images: give this folder"
-    )
+    assert len(loaded.train) == 1
+    assert note.startswith(f"{sparse / '10'} is another model, of 3 images: give this folder")
     assert (loaded := load_scene(sparse / "10")).notes == () and len(loaded.train) == 2
     (sparse / "10" / "images.bin").write_bytes(b"damaged")
     assert load_scene(tmp_path).notes == ()
@@ -393,9 +391,8 @@ def test_cached_images_are_reused(
     assert load_scene(scene, max_width=100).train[0].image.unique().tolist() == [1, 2, 3]
     file.write_bytes(file.read_bytes()[:-50])
     again = load_scene(scene, max_width=100)
-    assert again.train[0].image.equal(first.train[0].image) and again.train[0].camera.K.equal(
-        first.train[0].camera.K
-    )
+    assert again.train[0].image.equal(first.train[0].image)
+    assert again.train[0].camera.K.equal(first.train[0].camera.K)
     assert again.notes == first.notes and len(list(cache.rglob("*.png"))) == 1
     load_scene(scene, max_width=90)
     os.utime(scene / "images" / "a.png", ns=(1, 1))
@@ -433,9 +430,8 @@ def test_cameras_equal_those_of_load_scene(capture: Any) -> None:
     cameras, notes = load_cameras(capture.scene, origin)
     assert notes == [] and [camera.name for camera in cameras] == names_of(views)
     for found, view in zip(cameras, views, strict=True):
-        assert torch.equal(found.viewmat, view.camera.viewmat) and torch.equal(
-            found.K, view.camera.K
-        )
+        assert torch.equal(found.viewmat, view.camera.viewmat)
+        assert torch.equal(found.K, view.camera.K)
         assert (found.width, found.height, found.near) == (
             view.camera.width,
             view.camera.height,
@@ -458,9 +454,8 @@ def test_files_of_a_colmap_scene(tmp_path: Path) -> None:
     (tmp_path / "dataparser_transforms.json").write_text("{}")
     files = {str(path.relative_to(tmp_path)) for path in (tmp_path / "sparse" / "0").iterdir()}
     photographs = {f"images/sub/{k:03}.png" for k in (1, 2, 3)} | {"images_2/sub/001.png"}
-    assert len(files) >= 3 and there(tmp_path) == files | photographs | {
-        "dataparser_transforms.json"
-    }
+    assert len(files) >= 3
+    assert there(tmp_path) == files | photographs | {"dataparser_transforms.json"}
     for name in ("images", "images_2"):  # other folders of inputs do not stand for those
         (tmp_path / name).rename(tmp_path / name.replace("images", "cam"))
     (tmp_path / "masks").mkdir()

@@ -143,9 +143,8 @@ def test_a_calibration_of_absurd_numbers_is_ignored(tmp_path: Path, old: str, ne
     assert data.count(old.encode()) == 1
     (tmp_path / "a.ply").write_bytes(data.replace(old.encode(), new.encode()))
     found = load(tmp_path / "a.ply")
-    assert found.calibration is None and any(
-        "calibration is unusable and ignored" in note for note in found.notes
-    )
+    assert found.calibration is None
+    assert any("calibration is unusable and ignored" in note for note in found.notes)
 
 
 def with_a_cut(path: Path) -> Path:
@@ -185,11 +184,9 @@ def test_columns_and_the_flag_of_an_spz_store_the_filter(
     """
     write(tmp_path / "a.ply", model(1).replace(screen_filter=screen_filter))
     found = load(without_comments(tmp_path / "a.ply"))
-    assert (
-        found.gaussians.screen_filter == screen_filter
-        and found.filter_known
-        and found.comments == ()
-    )
+    assert found.gaussians.screen_filter == screen_filter
+    assert found.filter_known
+    assert found.comments == ()
     plain = detach(found.gaussians)
     write(tmp_path / "b.ply", plain)
     assert not any(
@@ -266,10 +263,8 @@ def test_dial_survives_a_rewrite_without_comments(tmp_path: Path, name: str, gro
     path = without_comments(tmp_path / "a.ply")
     again, wanted = load(path).gaussians, in_world_units(g)
     assert again.attenuation is not None and wanted.attenuation is not None
-    assert (
-        again == wanted.replace(attenuation=again.attenuation)
-        and again.attenuation.form == config.form
-    )
+    assert again == wanted.replace(attenuation=again.attenuation)
+    assert again.attenuation.form == config.form
     reference = wanted.attenuation.reference_distance if growth else 0
     assert again.attenuation.reference_distance == pytest.approx(reference, rel=1e-6)
     found = inspect(path)
@@ -319,6 +314,5 @@ def test_columns_that_change_the_picture(tmp_path: Path, names: list[str], metho
         found = [
             note for note in load(path, activated="none").notes if note.startswith("warning: ")
         ]
-        assert len(found) == bool(method) and all(
-            method in note and names[0] in note for note in found
-        )
+        assert len(found) == bool(method)
+        assert all(method in note and names[0] in note for note in found)

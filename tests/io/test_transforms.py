@@ -176,9 +176,8 @@ def test_distorted_photographs_are_undistorted(
         loaded = load_scene(scene)
         views.append(loaded.train[0])
         assert f"undistorted from {model} into" in loaded.notes[0]
-    assert torch.equal(views[0].image, views[1].image) and torch.equal(
-        views[0].camera.K, views[1].camera.K
-    )
+    assert torch.equal(views[0].image, views[1].image)
+    assert torch.equal(views[0].camera.K, views[1].camera.K)
 
 
 def test_colmap_model_takes_precedence(tmp_path: Path) -> None:

@@ -90,9 +90,8 @@ def test_mip_splatting_is_fused(tmp_path: Path) -> None:
     g, kept = base.gaussians, np.isfinite(vertex["filter_3D"])
     assert len(g) == 38 and g.screen_filter == FILTERS["mip"]
     assert g.opacity_logits.isfinite().all() and g.log_scales.isfinite().all()
-    assert (
-        g.opacity_logits[0] == vertex["opacity"][0] and g.opacity_logits[2] == vertex["opacity"][2]
-    )
+    assert g.opacity_logits[0] == vertex["opacity"][0]
+    assert g.opacity_logits[2] == vertex["opacity"][2]
     usual = np.arange(40) != 1  # a filter of 1e30
     assert_allclose(g.scales[usual[kept]], np.sqrt(wide)[kept & usual], rtol=2e-6)
     assert_allclose(g.opacities[usual[kept]], opacities[kept & usual], rtol=2e-6, atol=1e-37)
@@ -103,11 +102,9 @@ def test_mip_splatting_is_fused(tmp_path: Path) -> None:
     assert_allclose(g.opacity_logits[5], log, rtol=1e-6)
     assert base.comments == base.notes[:1] and "filter_3D is fused" in base.comments[0]
     out = resaved(base, with_dial(g, torch.rand(38), AttenuationConfig()))
-    assert (
-        "filter_3D" not in out.vertex.dtype.names
-        and out.notes == ()
-        and base.comments[0] in out.comments
-    )
+    assert "filter_3D" not in out.vertex.dtype.names
+    assert out.notes == ()
+    assert base.comments[0] in out.comments
     assert torch.equal(out.gaussians.log_scales, g.log_scales)
     assert torch.equal(out.gaussians.opacity_logits, g.opacity_logits)
     for name in names:
