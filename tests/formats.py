@@ -148,7 +148,7 @@ def resaved(base: Checkpoint, gaussians: Gaussians | None = None) -> Checkpoint:
     """What is read of the PLY that is saved from a base, or from its Gaussians once tuned."""
     path = base.path.with_name("out.ply")
     save(path, gaussians or base.gaussians, base)
-    return load(path, activated="none")
+    return load(path)
 
 
 def write_rows(
