@@ -108,11 +108,9 @@ def test_with_dial_and_detach() -> None:
     base, sigma_d = gaussians(), torch.rand(6)
     on, chosen = with_dial(base), with_dial(base, sigma_d, CONFIG)
     assert on.attenuation == with_dial(base, sigma_d).attenuation == AttenuationConfig()
-    assert (
-        (on.sigma_d == SIGMA_MAX).all()
-        and chosen.sigma_d is sigma_d
-        and chosen.attenuation is CONFIG
-    )
+    assert (on.sigma_d == SIGMA_MAX).all()
+    assert chosen.sigma_d is sigma_d
+    assert chosen.attenuation is CONFIG
     grown = with_dial(base, sigma_d, CONFIG, torch.rand(6))
     assert detach(grown) == detach(on) == base and with_dial(grown, sigma_d, CONFIG) == chosen
 
@@ -198,14 +196,12 @@ def test_adapter_round_trips(tmp_path: Path, n: int, reference: float, growth: b
         STORED,
         "ab" * 32,
     )
-    assert (
-        torch.equal(loaded.sigma_d, saved.sigma_d) and loaded.updates.keys() == saved.updates.keys()
-    )
+    assert torch.equal(loaded.sigma_d, saved.sigma_d)
+    assert loaded.updates.keys() == saved.updates.keys()
     assert torch.equal(loaded.growth_d, saved.growth_d) if growth else loaded.growth_d is None
     for name, update in saved.updates.items():
-        assert loaded.updates[name].dtype == update.dtype and torch.equal(
-            loaded.updates[name], update
-        )
+        assert loaded.updates[name].dtype == update.dtype
+        assert torch.equal(loaded.updates[name], update)
     save_adapter(tmp_path / "b.safetensors", loaded)
     assert (tmp_path / "a.safetensors").read_bytes() == (tmp_path / "b.safetensors").read_bytes()
 
@@ -257,14 +253,11 @@ def test_invalid_files_are_refused(tmp_path: Path) -> None:
     save_adapter(path, adapter())
     with safe_open(path, framework="pt") as file:
         about, tensors = json.loads(file.metadata()["clod_adapter"]), load_file(path)
-    assert (
-        about["format"] == "clod-adapter"
-        and about["format_version"] == 3
-        and "package_version" in about
-    )
-    assert (
-        about["base_sha256"] == "ab" * 32 and about["attenuation"]["reference_distance"] == 0.1 / 3
-    )
+    assert about["format"] == "clod-adapter"
+    assert about["format_version"] == 3
+    assert "package_version" in about
+    assert about["base_sha256"] == "ab" * 32
+    assert about["attenuation"]["reference_distance"] == 0.1 / 3
     texts = "[" * 100_000, '{"format": ' * 50_000, "1" * 10_000, "nul", '"\\ud800"'
     for change, message in (
         *CHANGES,

@@ -114,9 +114,8 @@ def test_round_trips(tmp_path: Path, calibration: Calibration) -> None:
     base = gaussians(4, 0, 0)
     dialled = with_dial(base, torch.ones(4))
     save(tmp_path / "a.ply", dialled, calibration=calibration)
-    assert (
-        load(tmp_path / "a.ply").calibration == calibration and load(tmp_path / "a.ply").notes == ()
-    )
+    assert load(tmp_path / "a.ply").calibration == calibration
+    assert load(tmp_path / "a.ply").notes == ()
     adapter = replace(extract(base, dialled, fingerprint="", config={}), calibration=calibration)
     save_adapter(tmp_path / "a.safetensors", adapter)
     assert load_adapter(tmp_path / "a.safetensors").calibration == calibration
@@ -182,9 +181,8 @@ def test_stored_viewpoints_are_cameras_again(tmp_path: Path) -> None:
     for places in (viewpoints, (Viewpoint(1.5, 2.5, 3.5, 4.5),)):
         save(tmp_path / "a.ply", dialled, calibration=Calibration(**GOOD, viewpoints=places))
         stored = load(tmp_path / "a.ply")
-        assert stored.viewpoints == places and len(stored.cameras) == len(places) - (
-            len(places) == 1
-        )
+        assert stored.viewpoints == places
+        assert len(stored.cameras) == len(places) - (len(places) == 1)
         for camera, found in zip(cameras, stored.cameras, strict=False):
             assert torch.allclose(found.viewmat, camera.viewmat, atol=1e-5)
             assert float(found.K[1, 1]) / found.height == pytest.approx(

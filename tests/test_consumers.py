@@ -135,9 +135,8 @@ def test_everything_follows_sigma_d_in_its_unit(name: str) -> None:
     """
     consumer, model = CONSUMERS[name], model_of()
     before = consumer(model)
-    assert model.sigma_d is not None and not same(
-        consumer(model.replace(sigma_d=model.sigma_d.flip(0))), before
-    )
+    assert model.sigma_d is not None
+    assert not same(consumer(model.replace(sigma_d=model.sigma_d.flip(0))), before)
     assert agree(consumer(in_world_units(model)), before, 1e-4)
 
 
@@ -231,9 +230,8 @@ def test_training_stays_there(there: Gaussians, monkeypatch: pytest.MonkeyPatch)
         for x in whole.tensors().values()
     )
     monkeypatch.setattr(importlib.import_module("clod_adapter.evaluation.frame_times"), "PASSES", 2)
-    assert whole.whole == len(plain) and all(
-        taken > 0 for _, taken in frame_times(there, CAMERAS[:1])[0]
-    )
+    assert whole.whole == len(plain)
+    assert all(taken > 0 for _, taken in frame_times(there, CAMERAS[:1])[0])
 
 
 def test_a_step_waits_for_the_device_once(

@@ -96,9 +96,8 @@ def test_budgets(run: Any, dialled: Path, capture: Any) -> None:
         "30 frames",
         "60 frames",
     ]
-    assert len(printed) == 9 and all(
-        line.startswith(name) for line, name in zip(printed, names, strict=True)
-    )
+    assert len(printed) == 9
+    assert all(line.startswith(name) for line, name in zip(printed, names, strict=True))
     found = [float(line.partition("s = ")[2].split()[0]) for line in (printed[0], *printed[3:6])]
     assert 1 < found[0] < 4 and 1 <= found[1] <= found[2] <= found[3] <= 4
     # a tenth is less than the far end keeps, and that is said
@@ -167,9 +166,8 @@ def test_the_slider_turns_the_dial_while_it_trains(
     assert picture.shape == (360, 480, 3) and picture.any()
     assert re.fullmatch(r"\d\d of 300, step 2", server.gui.add_text.return_value.value)
     written = clod_adapter.load("slider.ply").gaussians
-    assert written.attenuation.max_sv == 5 and not torch.equal(
-        written.means, capture.gaussians.means
-    )
+    assert written.attenuation.max_sv == 5
+    assert not torch.equal(written.means, capture.gaussians.means)
 
 
 def test_bad_arguments_are_refused(run: Any) -> None:

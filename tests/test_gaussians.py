@@ -51,9 +51,8 @@ def test_rounding_between_cameras_has_no_extent() -> None:
     turning = ring(10, 8, 6)
     for each in turning:
         each.viewmat[:3, 3] = -each.viewmat[:3, :3] @ torch.tensor([3.0, -2.0, 1.5])
-    assert (
-        len({tuple(each.position.tolist()) for each in turning}) > 1 and camera_extent(turning) == 0
-    )
+    assert len({tuple(each.position.tolist()) for each in turning}) > 1
+    assert camera_extent(turning) == 0
     views = tuple(View(c, torch.zeros(6, 8, 3, dtype=torch.uint8)) for c in turning)
     assert in_its_unit(Scene(views, ())).train[0].camera.near == NEAR
 
@@ -94,14 +93,11 @@ def test_arrays_become_tensors() -> None:
     view = photograph(gaussians(5, 0, 0), ring(1, 20, 16))[0]
     arrays = view.camera.viewmat.double().numpy(), view.camera.K.double().numpy()
     again = View(Camera(*arrays, 20, 16), view.image.numpy()[:, ::-1])
-    assert (
-        torch.equal(again.camera.viewmat, view.camera.viewmat)
-        and again.camera.K.dtype == torch.float32
-    )
+    assert torch.equal(again.camera.viewmat, view.camera.viewmat)
+    assert again.camera.K.dtype == torch.float32
     assert torch.equal(again.image, view.image.flip(1))
-    assert repr(again) == "View('', 20x16)" and repr(Scene((again,), ())).endswith(
-        "0 held out, 20x16)"
-    )
+    assert repr(again) == "View('', 20x16)"
+    assert repr(Scene((again,), ())).endswith("0 held out, 20x16)")
 
 
 CONFIG = AttenuationConfig()

@@ -64,11 +64,9 @@ def test_rendering_no_gaussians() -> None:
         with_dial(none, attenuation=AttenuationConfig(form="paper")),
     ):
         rendering = render(some, camera(), 2.0)
-        assert (
-            rendering.kept.shape == (0,)
-            and (rendering.image == 0).all()
-            and (rendering.alpha == 0).all()
-        )
+        assert rendering.kept.shape == (0,)
+        assert (rendering.image == 0).all()
+        assert (rendering.alpha == 0).all()
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -77,16 +75,13 @@ def test_a_dial_of_0_shows_the_file_without_its_dial(form: str) -> None:
     found, want = render(own, view, 0.0).image, render(detach(own), view).image
     torch.testing.assert_close(found, want, rtol=0, atol=0 if form == "ours" else 1e-6)
     shown = dial(own, view, 0.0)
-    assert (
-        bool(shown.keep.all())
-        and torch.equal(shown.drawn, own.opacities)
-        and bool((shown.growth == 1).all())
-    )
+    assert bool(shown.keep.all())
+    assert torch.equal(shown.drawn, own.opacities)
+    assert bool((shown.growth == 1).all())
     faded = [dial(own, view, s) for s in (0.0, 1e-4, 0.3, 0.6, 1 - 1e-4, 1.0, 2.0)]
     for nearer, farther in zip(faded, faded[1:], strict=False):
-        assert bool((farther.drawn <= nearer.drawn).all()) and bool(
-            (farther.keep <= nearer.keep).all()
-        )
+        assert bool((farther.drawn <= nearer.drawn).all())
+        assert bool((farther.keep <= nearer.keep).all())
 
 
 WORLD = AttenuationConfig(scene_distance=4.0)
@@ -115,10 +110,8 @@ def spread(**settings: str) -> Gaussians:
 def test_baked_image_matches_render_from_its_camera(form: str) -> None:
     some = spread(form=form)
     want, baked = render(some, camera(), 2.5), bake(some, 2.5, camera())
-    assert (
-        baked.sigma_d is baked.growth_d is baked.attenuation is None
-        and baked.opacity_logits.isfinite().all()
-    )
+    assert baked.sigma_d is baked.growth_d is baked.attenuation is None
+    assert baked.opacity_logits.isfinite().all()
     assert len(baked) == want.kept.sum() and 0 < len(baked) < 300
     torch.testing.assert_close(render(baked, camera()).image, want.image, atol=2e-5, rtol=0)
 

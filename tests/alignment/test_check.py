@@ -47,12 +47,10 @@ def test_an_aligned_file_fits_under_any_exposure(pair: tuple[Gaussians, list[Vie
     base, views = pair
     found = check_alignment(base, views)
     assert found.fits and not found.on_white and found.views == 8
-    assert (
-        found.explained == 1
-        and found.correlation > 0.9
-        and found.margin > 6
-        and 0 < found.in_view <= 1
-    )
+    assert found.explained == 1
+    assert found.correlation > 0.9
+    assert found.margin > 6
+    assert 0 < found.in_view <= 1
     darker = [View(view.camera, (view.image * 0.4).round().to(torch.uint8)) for view in views]
     assert check_alignment(base, darker).fits
 
@@ -104,12 +102,10 @@ def test_another_frame_is_named(pair: tuple[Gaussians, list[View]], says: str) -
     elsewhere = FRAMES[says](views)
     found = check_alignment(base, elsewhere)
     guess = guess_frame(base, elsewhere, found)
-    assert (
-        not found.fits
-        and guess is not None
-        and guess.psnr > found.mean_colour_psnr + 3
-        and guess.clear
-    )
+    assert not found.fits
+    assert guess is not None
+    assert guess.psnr > found.mean_colour_psnr + 3
+    assert guess.clear
     assert says in re.sub(r"-?\d+(\.\d+)?", rounded, guess.frame.description)
     back = scene_in(Scene(tuple(elsewhere), ()), guess.frame)
     assert check_alignment(base, back.train).psnr > check_alignment(base, views).psnr - 1

@@ -33,9 +33,8 @@ def test_rows_and_default_dial_values(clod: Any, capture: Any, dialled: Path) ->
     """The defaults are within the trained range; a plain file has one picture and no popping."""
     done = clod(EVAL)
     report = done.report
-    assert [row["virtual_scale"] for row in report["rows"]] == [1, 2, 3, 4] and report[
-        "notes"
-    ] == []
+    assert [row["virtual_scale"] for row in report["rows"]] == [1, 2, 3, 4]
+    assert report["notes"] == []
     assert (report["model"], report["scene"], report["base_count"]) == (
         str(dialled),
         str(capture.scene),
@@ -49,13 +48,11 @@ def test_rows_and_default_dial_values(clod: Any, capture: Any, dialled: Path) ->
     (note,) = (done := clod(EVAL, "--sv 8")).report["notes"]
     assert note.startswith("trained up to s = 4;") and note in done.err
     report = (done := clod("eval BASE --images SCENE --popping --json")).report
-    assert report["popping"] == [] and any(
-        "popping is not measured" in note for note in report["notes"]
-    )
+    assert report["popping"] == []
+    assert any("popping is not measured" in note for note in report["notes"])
     assert [row["virtual_scale"] for row in report["rows"]] == [1, 2, 3, 5]
-    assert {row["kept_share"] for row in report["rows"]} == {1.0} and len(
-        {row["psnr"] for row in report["rows"]}
-    ) == 1
+    assert {row["kept_share"] for row in report["rows"]} == {1.0}
+    assert len({row["psnr"] for row in report["rows"]}) == 1
     assert report["attenuation"] is None and "has no sigma_d" in done.err
     done = clod("eval BASE --images SCENE --quiet")
     assert len(done.out.splitlines()) == 5 and done.err == ""
@@ -63,11 +60,9 @@ def test_rows_and_default_dial_values(clod: Any, capture: Any, dialled: Path) ->
 
 def test_base_by_rank_and_popping(clod: Any, capture: Any) -> None:
     report = (done := clod(EVAL, "--sv 1 4 --base BASE --popping")).report
-    assert (
-        report["base"] == str(capture.ply)
-        and report["base_row"]["kept"] == 300
-        and report["interrupted"] is False
-    )
+    assert report["base"] == str(capture.ply)
+    assert report["base_row"]["kept"] == 300
+    assert report["interrupted"] is False
     kept = {row["virtual_scale"]: round(row["kept"]) for row in report["rows"]}
     assert [
         (entry["virtual_scale"], entry["by"], entry["row"]["kept"]) for entry in report["ranked"]
@@ -82,13 +77,11 @@ def test_base_by_rank_and_popping(clod: Any, capture: Any) -> None:
     assert by_opacity == pytest.approx(want.psnr, abs=1e-4) and by_error > by_opacity
     block = done.err[done.err.index("pruned to the same counts") :].splitlines()[2:]
     by = ["opacity", "removal"]  # and error
-    assert [line.split()[0] for line in block[:7]] == ["base", "s=1", *by, "s=4", *by] and report[
-        "against"
-    ] == []
+    assert [line.split()[0] for line in block[:7]] == ["base", "s=1", *by, "s=4", *by]
+    assert report["against"] == []
     moved = ["dial, 000.png", "dial, 008.png", "camera, 002.png to 006.png, s = 4"]
-    assert [
-        entry["moved"] for entry in report["popping"]
-    ] == moved and f"\n{moved[2]}\n" in done.err
+    assert [entry["moved"] for entry in report["popping"]] == moved
+    assert f"\n{moved[2]}\n" in done.err
     assert all(
         entry["steps"] == len(entry["changes"]) == 200 and entry["ratio"] > 1
         for entry in report["popping"]
@@ -109,13 +102,12 @@ def test_against_at_matched_counts(clod: Any, capture: Any, dialled: Path, tmp_p
     assert pairs[0][0] == count == pytest.approx(pairs[0][1], abs=1)
     assert pairs[1][0] == 300 > pairs[1][1] == report["rows"][0]["kept"]
     (note,) = [note for note in report["notes"] if "keeps 300 Gaussians" in note]
-    assert (
-        note in done.err and "at most" in note and "the dial value with the same count" in done.err
-    )
+    assert note in done.err
+    assert "at most" in note
+    assert "the dial value with the same count" in done.err
     for own, row in zip(report["against"][2:], report["rows"], strict=True):  # compared with itself
-        assert own["theirs"]["psnr"] == row["psnr"] and own["ours"]["kept"] == pytest.approx(
-            row["kept"], rel=2e-3
-        )
+        assert own["theirs"]["psnr"] == row["psnr"]
+        assert own["ours"]["kept"] == pytest.approx(row["kept"], rel=2e-3)
 
 
 def test_interrupt_keeps_finished_comparisons(clod: Any, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -168,10 +160,8 @@ def test_eval_at_a_budget(clod: Any, dialled: Path) -> None:
     ]
     report = clod(EVAL, "--psnr-drop", drop, 90).report
     found, last = report["rows"]
-    assert (
-        found["virtual_scale"] == pytest.approx(rows[2].virtual_scale)
-        and last["virtual_scale"] == 4
-    )
+    assert found["virtual_scale"] == pytest.approx(rows[2].virtual_scale)
+    assert last["virtual_scale"] == 4
     assert rows[0].psnr - found["psnr"] == pytest.approx(drop, abs=0.02)
     assert "largest dial value measured" in report["notes"][1]
     report = clod(EVAL, "--fps 1").report
@@ -201,9 +191,8 @@ def test_device_presets_are_counts(
     clod: Any, capture: Any, dialled: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """For export the count of the file, for view and a page the dial value that they open at."""
-    assert [*DEVICES] == ["quest3", "phone", "laptop", "desktop"] and sorted(DEVICES.values()) == [
-        *DEVICES.values()
-    ]
+    assert [*DEVICES] == ["quest3", "phone", "laptop", "desktop"]
+    assert sorted(DEVICES.values()) == [*DEVICES.values()]
     monkeypatch.setitem(DEVICES, "quest3", 120)
     report = clod("export DIAL --device-preset quest3 -o few.ply --json").report
     assert 115 <= report["outputs"][0]["count"] == len(load("few.ply").gaussians) <= 120
@@ -220,9 +209,8 @@ def test_device_presets_are_counts(
         int(clod_adapter.render(model, each.camera, opening).kept.sum())
         for each in scene.train + scene.test
     ]
-    assert sum(kept) / len(kept) == pytest.approx(120, abs=3) and any(
-        "quest3" in note for note in report["notes"]
-    )
+    assert sum(kept) / len(kept) == pytest.approx(120, abs=3)
+    assert any("quest3" in note for note in report["notes"])
 
 
 RENDER = "render DIAL --images SCENE --json -o"

@@ -67,9 +67,8 @@ def test_baking(clod: Any, capture: Any, dialled: Path) -> None:
     (output,), data = done.report["outputs"], Path("x.ply").read_bytes()
     assert output == {"file": "x.ply", "virtual_scale": 2, "count": len(want), "bytes": len(data)}
     assert done.report["notes"] == [] and "baked for 8 training cameras; lossy" in done.err
-    assert (
-        f"{len(want)} of 300 Gaussians, s = 2\n" in done.err and "scales include growth" in done.err
-    )
+    assert f"{len(want)} of 300 Gaussians, s = 2\n" in done.err
+    assert "scales include growth" in done.err
     assert len(want) < 300 and load("x.ply").gaussians == want
     # SIBR takes the count from the third line, and rows of float32 in Inria's order without gaps.
     head, _, rows = data.partition(b"end_header\n")
@@ -103,9 +102,8 @@ def test_baking(clod: Any, capture: Any, dialled: Path) -> None:
     assert "exact at the camera of 003.png only" in done.err
     assert any("for the camera at (" in comment for comment in plain.comments)
     report = clod(there, "--fps 1 -o fast.ply").report  # timed here, at that camera
-    assert report["outputs"][0]["virtual_scale"] == 1 and any(
-        "frames timed here" in note for note in report["notes"]
-    )
+    assert report["outputs"][0]["virtual_scale"] == 1
+    assert any("frames timed here" in note for note in report["notes"])
 
     save("old.ply", model)  # as before cameras were stored
     (note,) = clod("export old.ply --sv 2 -o x.ply --json").report["notes"]
@@ -135,19 +133,15 @@ def test_sets_have_a_level_for_each_band_of_distances(
     counts, begins = ([level[name] for level in output["levels"]] for name in ("count", "begins"))
     near = model.attenuation.near_distance
     assert begins[:3] == [0.0, near, 2 * near] and f"level 1 begins at {near:.4g}" in done.err
-    assert (
-        counts[0] == model.whole
-        and counts == sorted(counts, reverse=True)
-        and counts[-1] >= 0.01 * model.whole
-    )
+    assert counts[0] == model.whole
+    assert counts == sorted(counts, reverse=True)
+    assert counts[-1] >= 0.01 * model.whole
     levels = clod_adapter.bake_levels(model, 2.0)
     assert levels[0].gaussians == clod_adapter.detach(model)
     for k, level in enumerate(levels[1:], 1):
         reached = model.sigma_d > near * 2 ** (k - 0.5)
-        assert (
-            torch.equal(level.gaussians.means, model.means[reached])
-            and len(level.gaussians) == counts[k]
-        )
+        assert torch.equal(level.gaussians.means, model.means[reached])
+        assert len(level.gaussians) == counts[k]
     root = json.loads((tmp_path / "tiles" / "tileset.json").read_text())["root"]
     assert root["geometricError"] > root["children"][0]["geometricError"] >= 0
 
@@ -162,10 +156,8 @@ def test_a_lower_sh_degree_is_fitted(clod: Any, capture: Any) -> None:
     report = clod("export rich.ply --sh-degree 1 --images SCENE -o x.ply --json").report
     (note,) = (note for note in report["notes"] if "--sh-degree 1" in note)
     fitted, cut = load("x.ply").gaussians, base.without_bands(1)
-    assert (
-        fitted.sh_degree == 1
-        and "against those with degree 3 (fitted to 8 training cameras)" in note
-    )
+    assert fitted.sh_degree == 1
+    assert "against those with degree 3 (fitted to 8 training cameras)" in note
 
     def error(shown: clod_adapter.Gaussians) -> float:
         cameras = [view.camera for view in views.train]
@@ -217,10 +209,8 @@ def test_losses_are_noted(clod: Any, dialled: Path, tmp_path: Path) -> None:
         tmp_path / "labelled.ply", with_columns(element.data, label=7), comments=element.comments
     )
     assert clod("export labelled.ply -o x.ply --json").report["notes"] == ["columns dropped: label"]
-    assert (
-        load("x.ply").gaussians == model.gaussians
-        and load("x.ply").vertex.dtype == model.vertex.dtype
-    )
+    assert load("x.ply").gaussians == model.gaussians
+    assert load("x.ply").vertex.dtype == model.vertex.dtype
     far = element.data.astype([(n, "f8" if n in "xyz" else t) for n, t in element.data.dtype.descr])
     far["x"] += 437_000.0
     there = tuple(viewpoint.moved([437_000.0, 0, 0]) for viewpoint in model.calibration.viewpoints)
@@ -247,9 +237,8 @@ def test_order_by_extinction(clod: Any, capture: Any, dialled: Path) -> None:
     assert any("rows in the order" in comment for comment in ordered.comments)
     n = len(clod_adapter.bake(model.gaussians, 3.0, cameras=cameras))
     clod(words, "-o first.ply --keep", n)
-    assert n < 300 and torch.equal(
-        load("first.ply").gaussians.means, model.gaussians.means[rows[:n]]
-    )
+    assert n < 300
+    assert torch.equal(load("first.ply").gaussians.means, model.gaussians.means[rows[:n]])
     clod(words, "--camera 003 --sv 2 -o one.ply")
     camera = next(camera for camera in cameras if camera.name == "003.png")
     ordered = model.gaussians.select(clod_adapter.order_by_extinction(model.gaussians, [camera]))
@@ -262,30 +251,28 @@ def test_splat_transform(clod: Any, dialled: Path, tmp_path: Path, tool: Any) ->
     notes = done.report["notes"]
     assert " took " in done.err and "splat-transform rounds values and sorts the Gaussians" in notes
     assert any("without a GPU" in note for note in notes) and files(tmp_path) == ["x.sog"]
-    assert said["words"][:5] == ["-w", "-g", "cpu", "-i", "1"] and said["words"][-1].endswith(
-        "packed.sog"
-    )
+    assert said["words"][:5] == ["-w", "-g", "cpu", "-i", "1"]
+    assert said["words"][-1].endswith("packed.sog")
     assert said["sizes"][0] > 92 * done.report["outputs"][0]["count"]
     tool("(out.parent / '0_0').mkdir(); (out.parent / '0_0' / 'a.webp').write_text('1234')")
     (tmp_path / "-o").mkdir()  # empty; not an option of the tool
     (output,) = clod(EXPORT, "--lod-meta --out=-o").report["outputs"]
     levels = clod_adapter.bake_levels(load(dialled).gaussians)
     counts = [len(level.gaussians) for level in levels]
-    assert [level["count"] for level in output["levels"]] == counts and output["count"] == sum(
-        counts
-    )
+    assert [level["count"] for level in output["levels"]] == counts
+    assert output["count"] == sum(counts)
     assert files(tmp_path / "-o") == ["0_0", "0_0/a.webp", "lod-meta.json"]
     text = Path(output["file"]).read_text()
     words = json.loads(text)["words"][5:]
-    assert output["bytes"] == len(text) + 4 and words[:4] == [
+    assert output["bytes"] == len(text) + 4
+    assert words[:4] == [
         "--lod-chunk-extent",
         "0",
         "--lod-chunk-min",
         "8",
     ]
-    assert words[5::3] == ["-l"] * len(levels) and words[6::3] == [
-        str(k) for k in range(len(levels))
-    ]
+    assert words[5::3] == ["-l"] * len(levels)
+    assert words[6::3] == [str(k) for k in range(len(levels))]
     assert words[-1].endswith("/lod-meta.json")
 
 
@@ -318,9 +305,8 @@ def test_the_real_tool(clod: Any, dialled: Path, tmp_path: Path) -> None:
     clod("export DIAL --lod-meta --multiplier 2 -o out")
     meta = json.loads((tmp_path / "out" / "lod-meta.json").read_text())
     levels = clod_adapter.bake_levels(load(dialled).gaussians, 2.0)
-    assert meta["counts"] == [len(level.gaussians) for level in levels] and meta[
-        "lodLevels"
-    ] == len(levels)
+    assert meta["counts"] == [len(level.gaussians) for level in levels]
+    assert meta["lodLevels"] == len(levels)
     assert all((tmp_path / "out" / name).is_file() for name in meta["filenames"])
     assert not [name for name in files(tmp_path) if "tmp" in name]
 
@@ -340,15 +326,11 @@ def test_page_holds_the_splat_and_its_dial(clod: Any, dialled: Path, tmp_path: P
     (output,) = done.report["outputs"]
     assert config["model"]["name"] == dialled.name and config["virtual_scale"] == 4
     assert any("dial ends at s = 4" in note for note in done.report["notes"])
-    assert (
-        "Gaussians, initial dial value s = 4" in done.err
-        and " of " not in done.err.splitlines()[-1]
-    )
+    assert "Gaussians, initial dial value s = 4" in done.err
+    assert " of " not in done.err.splitlines()[-1]
     assert [camera["name"] for camera in config["cameras"]] == [f"{k:03}.png" for k in range(10)]
-    assert (
-        held.gaussians.whole == output["count"] == 300
-        and output["bytes"] == Path("page.html").stat().st_size
-    )
+    assert held.gaussians.whole == output["count"] == 300
+    assert output["bytes"] == Path("page.html").stat().st_size
     assert held.gaussians.sigma_d is not None and held.calibration is not None
     said = re.search(r"PSNR of (\S+) dB against the exact file \(s = 1\)", done.err)
     assert said and float(said[1]) > 40 and [*tmp_path.glob(".tmp-*")] == []

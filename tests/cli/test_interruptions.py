@@ -105,20 +105,14 @@ def test_one_interrupt_of_training_writes_the_result_so_far(
     os.kill(child, signal.SIGCONT)
     code, log = server.wait(child), log_of(tmp_path)
     report = json.loads((tmp_path / "dial.json").read_text())
-    assert (
-        code == 0
-        and report["interrupted"]
-        and report["resumed_from"] is None
-        and "interrupted after" in log
-    ), log
-    assert (
-        names(tmp_path) == sorted([*OUTPUTS, STATE])
-        and load_state(tmp_path / STATE)[0].steps == report["steps"]
-    )
-    assert (
-        f"--resume resumes from step {report['steps']}, which is in {STATE}" in log
-        and "SIGTERM" not in log
-    )
+    assert code == 0, log
+    assert report["interrupted"], log
+    assert report["resumed_from"] is None, log
+    assert "interrupted after" in log, log
+    assert names(tmp_path) == sorted([*OUTPUTS, STATE])
+    assert load_state(tmp_path / STATE)[0].steps == report["steps"]
+    assert f"--resume resumes from step {report['steps']}, which is in {STATE}" in log
+    assert "SIGTERM" not in log
     assert_whole(tmp_path)
     assert f"resuming {STATE} from step {report['steps']}" in server.run(
         tmp_path, *words, "--resume"
@@ -164,10 +158,8 @@ def test_signals_at_a_moment(
         )
     else:
         assert done.err.rstrip().endswith(said), done
-    assert (
-        signal.getsignal(INT) is signal.default_int_handler
-        and signal.getsignal(TERM) is signal.SIG_DFL
-    )
+    assert signal.getsignal(INT) is signal.default_int_handler
+    assert signal.getsignal(TERM) is signal.SIG_DFL
 
 
 @pytest.mark.parametrize("number", [INT, TERM])
@@ -203,14 +195,10 @@ def test_interrupts_of_the_measurement(
     monkeypatch.setattr(measure, "evaluate", evaluate)
     report = (done := clod(*words, "--json")).report
     assert [row["virtual_scale"] for row in report["rows"]] == [1, 1.5, 2]
-    assert (
-        "measurements were interrupted" in report["notes"][0] in done.err
-        and report["interrupted"] is False
-    )
-    assert (
-        report["calibration"] is None
-        and clod_adapter.load(tmp_path / "dial.ply").calibration is None
-    )
+    assert "measurements were interrupted" in report["notes"][0] in done.err
+    assert report["interrupted"] is False
+    assert report["calibration"] is None
+    assert clod_adapter.load(tmp_path / "dial.ply").calibration is None
     assert names(tmp_path) == BOTH
     monkeypatch.setattr(*SAVING, pressing(listeners.save_state, INT))
     done = clod(*words, code=130)
@@ -230,7 +218,6 @@ def test_closed_terminal_does_not_end_the_writing(
     os.close(other)
     os.close(terminal)
     assert server.wait(child) == 0
-    assert (
-        json.loads((tmp_path / "dial.json").read_text())["interrupted"] and names(tmp_path) == BOTH
-    )
+    assert json.loads((tmp_path / "dial.json").read_text())["interrupted"]
+    assert names(tmp_path) == BOTH
     assert_whole(tmp_path)

@@ -101,11 +101,9 @@ def test_help(clod: Any, command: str, monkeypatch: pytest.MonkeyPatch) -> None:
     assert not {"positional arguments", "options"} & set(titles)
     if not command:
         assert all(f"clod-adapt {other}" in done.out for other in COMMANDS)
-        assert (
-            (first := clod()).out.count("\n") == 5
-            and "clod-adapt PLY --images DIR" in first.out
-            and first.err == ""
-        )
+        assert (first := clod()).out.count("\n") == 5
+        assert "clod-adapt PLY --images DIR" in first.out
+        assert first.err == ""
         assert clod("--version").out.split() == ["clod-adapt", package_version()]
 
 
@@ -195,19 +193,14 @@ def test_json_without_torch() -> None:
     code += "runpy.run_module('clod_adapter', run_name='__main__')"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     report = json.loads(done.stdout)
-    assert (
-        set(report) == {"command", "version", "draws", "exit_code", "findings"}
-        and report["draws"] == []
-    )
-    assert done.returncode == report["exit_code"] == 1 and "Traceback" not in done.stderr, (
-        done.stderr
-    )
+    assert set(report) == {"command", "version", "draws", "exit_code", "findings"}
+    assert report["draws"] == []
+    assert done.returncode == report["exit_code"] == 1, done.stderr
+    assert "Traceback" not in done.stderr, done.stderr
     found = {each["name"]: each for each in report["findings"]}
-    assert (
-        [*found] == NAMES
-        and found["torch"]["fix"].startswith("pip install")
-        and not found["cpu"]["ok"]
-    )
+    assert [*found] == NAMES
+    assert found["torch"]["fix"].startswith("pip install")
+    assert not found["cpu"]["ok"]
     assert (
         done.stderr.splitlines()[-1]
         == "no rendering backend works: fix torch first, then the CPU backend"

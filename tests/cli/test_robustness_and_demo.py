@@ -206,15 +206,11 @@ def test_demo(clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.Monke
     done = clod("demo --out=-odd")
     assert f"everything is in {folder}" in done.out and "clod-adapt YOURS.ply" in done.out, done
     found = clod("demo --out=-odd --quiet --json").report
-    assert (
-        found["command"] == "demo"
-        and found["folder"] == "-odd"
-        and found["scene"] == "-odd/capture"
-    )
-    assert (
-        found["pictures"] == {"dial": "-odd/dial.png", "curve": "-odd/curve.png"}
-        and found["config"]["max_sv"] == 5
-    )
+    assert found["command"] == "demo"
+    assert found["folder"] == "-odd"
+    assert found["scene"] == "-odd/capture"
+    assert found["pictures"] == {"dial": "-odd/dial.png", "curve": "-odd/curve.png"}
+    assert found["config"]["max_sv"] == 5
     made = {"capture", "base.ply", "gallery.ply", "gallery.safetensors", "gallery.json"}
     assert {*names(folder)} == made | PICTURES
     # nothing is measured

@@ -62,11 +62,9 @@ def test_full_disk_while_adapting(clod: Any, dialled: Path, tmp_path: Path) -> N
     with room(ply + 5000):
         report = (done := clod(words, "--report --json")).report
     assert "the page was not written: " in done.err and "page" not in report["outputs"]
-    assert (
-        report["rows"]
-        and report["seconds"]["page"] > 0
-        and "the page was not" in report["notes"][-1]
-    )
+    assert report["rows"]
+    assert report["seconds"]["page"] > 0
+    assert "the page was not" in report["notes"][-1]
     assert report == json.loads((tmp_path / "dial.json").read_text())
     now = contents(tmp_path)
     assert now.keys() == earlier.keys() and not any(now[name] == earlier[name] for name in now)
@@ -95,11 +93,9 @@ def test_full_disk_while_measuring(clod: Any, tmp_path: Path) -> None:
     """The rows are not lost with the page."""
     with room(1000):
         done = clod("eval DIAL --images SCENE --sv 1 --report x.html --json --quiet", code=2)
-    assert (
-        "cannot be written" in done.report["error"]
-        and done.report["rows"]
-        and not contents(tmp_path)
-    )
+    assert "cannot be written" in done.report["error"]
+    assert done.report["rows"]
+    assert not contents(tmp_path)
     assert done.err == f"clod-adapt: error: {done.report['error']}\n"
 
 
@@ -146,9 +142,10 @@ def test_without_permission(
     log = log_of(tmp_path)
     if NO_ROOT and code == 1 and not log:
         pytest.skip("root cannot give up its rights here")
-    assert (
-        code == 2 and log.count("\n") == 1 and said in log and names(tmp_path / "out") == before
-    ), log
+    assert code == 2, log
+    assert log.count("\n") == 1, log
+    assert said in log, log
+    assert names(tmp_path / "out") == before, log
 
 
 COMMANDS = """

@@ -57,11 +57,9 @@ def test_serves_until_it_is_interrupted(
     report = json.loads(log_of(tmp_path))
     assert report["url"] == f"http://127.0.0.1:{report['port']}/" and report["cameras"] == 10
     config = config_of(fetch(report["url"]))
-    assert (
-        config["title"] == "dial.ply"
-        and config["virtual_scale"] == 2
-        and len(config["cameras"]) == 10
-    )
+    assert config["title"] == "dial.ply"
+    assert config["virtual_scale"] == 2
+    assert len(config["cameras"]) == 10
     for name, file in ("model", dialled), ("base", capture.ply):
         assert config[name]["href"] == f"/files/{name}"
         assert_holds(fetch(f"{report['url']}files/{name}"), file, tmp_path)
@@ -138,9 +136,8 @@ def test_a_plain_file_fits_on_a_screen(clod: Any, capture: Any) -> None:
     done = clod("inspect BASE")
     lines = done.out.splitlines()
     assert len(lines) <= 24 and all(len(line) <= 120 for line in lines[1:]) and done.err == ""
-    assert lines[0].startswith(f"{capture.ply} (") and lines[2].startswith(
-        "looks like   Inria's trainer"
-    )
+    assert lines[0].startswith(f"{capture.ply} (")
+    assert lines[2].startswith("looks like   Inria's trainer")
     assert lines[3] == "Gaussians    300" and "dial         none: no sigma_d" in lines
     at = next(
         k
@@ -160,17 +157,16 @@ def test_a_plain_file_fits_on_a_screen(clod: Any, capture: Any) -> None:
 def test_a_dial_and_its_calibration(clod: Any, dialled: Path) -> None:
     text, report = clod("inspect DIAL").out, clod("inspect DIAL --json").report
     lines, splat = text.splitlines(), report["splat"]
-    assert (
-        "written by   clod-adapter" in text
-        and "s = 1 to 4, distances in world units" in text
-        and len(lines) <= 32
-    )
+    assert "written by   clod-adapter" in text
+    assert "s = 1 to 4, distances in world units" in text
+    assert len(lines) <= 32
     at = next(k for k, line in enumerate(lines) if "Gaussians" in line and "PSNR" in line)
     first, *_, last = table = [line.split() for line in lines[at + 1 : at + 8]]
     assert (first[0], last[0]) == ("1", "4") and all(len(row) == 5 for row in table)
     assert report["command"] == "inspect" and report["path"] == str(dialled)
     assert report["oddities"] == [] and "anomalies" not in report
-    assert splat["count"] == splat["total"] == 540 and splat["columns"][-1] == [
+    assert splat["count"] == splat["total"] == 540
+    assert splat["columns"][-1] == [
         "opacity_d",
         "float32",
     ]
@@ -191,12 +187,10 @@ def test_a_dial_and_its_calibration(clod: Any, dialled: Path) -> None:
 
 def test_adapter(clod: Any) -> None:
     text, about = clod("inspect ADAPTER").out, clod("inspect ADAPTER --json").report["about"]
-    assert (
-        "an adapter" in text
-        and "with SHA-256 " in text
-        and "max_sv 4" in text
-        and "\ngrowth_d " in text
-    )
+    assert "an adapter" in text
+    assert "with SHA-256 " in text
+    assert "max_sv 4" in text
+    assert "\ngrowth_d " in text
     assert "\ndial         sigma_d and growth_d, s = 1 to 4" in text and len(about["growth"]) == 5
     assert about["updates"] == {}
     assert about["count"] == 540 and about["config"]["iters"] == 12

@@ -209,9 +209,8 @@ def test_every_field_of_the_reports_is_explained(
     assert main([*words, "--base", base, "--against", base, "--json"]) == 0
     measured = json.loads(capsys.readouterr().out)
     adapted = json.loads(desk.joinpath("pretrained_clod.json").read_text(encoding="utf-8"))
-    assert {"rows", "alignment", "frame_ms"} <= set(keys(adapted)) and {"ranked", "moved"} <= set(
-        keys(measured)
-    )
+    assert {"rows", "alignment", "frame_ms"} <= set(keys(adapted))
+    assert {"ranked", "moved"} <= set(keys(measured))
     missing = (set(keys(adapted)) | set(keys(measured))) - explained
     assert not missing, f"docs/python.md does not explain {sorted(missing)}"
 
@@ -281,9 +280,8 @@ def test_no_line_installs_clod_adapter_from_the_index() -> None:
 
 def test_help_names_the_installed_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ((folder, patterns),) = PROJECT["tool"]["setuptools"]["data-files"].items()
-    assert patterns == ["docs/*.md"] and all(
-        url.startswith("https://") for url in PROJECT["project"]["urls"].values()
-    )
+    assert patterns == ["docs/*.md"]
+    assert all(url.startswith("https://") for url in PROJECT["project"]["urls"].values())
     assert command.manual() == ROOT / "docs" / "index.md"  # of the checkout
     monkeypatch.setattr(
         command, "__file__", str(tmp_path / "lib" / "cli" / "shared" / "command.py")

@@ -142,9 +142,8 @@ def test_frames_are_interleaved_and_few_where_they_are_slow(clock: Clock) -> Non
     )
     assert seen == [(k, PASSES) for k in range(1, PASSES + 1)]
     timed = drawn[-PASSES * 9 * 3 :]  # nine cameras: every third is one of at most four
-    assert len({name for name, _ in drawn}) == 3 <= VIEWS and [s for _, s in timed] == [*DIALS] * (
-        3 * PASSES
-    )
+    assert len({name for name, _ in drawn}) == 3 <= VIEWS
+    assert [s for _, s in timed] == [*DIALS] * (3 * PASSES)
     assert {s for _, s in drawn[: -len(timed)]} == {1.0}  # the warm-up, with the slowest
     drawn = clock(lambda frame, s: 1.0)
     of_one()
@@ -190,9 +189,8 @@ def test_counts_are_exact_up_to_ties(
     assume(wanted >= views)
     solved = dial_for(some, keep=wanted / views, cameras=cameras)
     found = kept(some, cameras, solved.virtual_scale)
-    assert solved.virtual_scale >= 1 and (solved.virtual_scale <= MAX_SV) == (
-        solved.note == ""
-    ) == (wanted >= fewest)
+    assert solved.virtual_scale >= 1
+    assert (solved.virtual_scale <= MAX_SV) == (solved.note == "") == (wanted >= fewest)
     # At most what was asked for; and where it is less, more would stay at the next smaller dial
     # value in float32.
     assert found <= wanted, (seed, found, wanted)

@@ -49,21 +49,18 @@ def test_popping_of_a_fade_and_of_a_switch() -> None:
     positions = [k / 10 for k in range(11)]
     fade = sweep(lambda _, j: torch.tensor([[[j / 100] * 3, [0.0] * 3]]), positions)
     assert fade.steps == 10 and fade.mean == pytest.approx(2.55 / math.sqrt(2), rel=1e-4)
-    assert fade.ratio == pytest.approx(1, abs=1e-4) and fade.persistence == pytest.approx(
-        0.5, abs=1e-4
-    )
-    assert fade.pixel == pytest.approx(2.55, rel=1e-4) and fade.pixel_persistence == pytest.approx(
-        0.5, abs=1e-4
-    )
+    assert fade.ratio == pytest.approx(1, abs=1e-4)
+    assert fade.persistence == pytest.approx(0.5, abs=1e-4)
+    assert fade.pixel == pytest.approx(2.55, rel=1e-4)
+    assert fade.pixel_persistence == pytest.approx(0.5, abs=1e-4)
     switch = sweep(lambda _, j: torch.full((1, 2, 3), 0.5 * (j >= 4)), positions)
     assert switch.largest == switch.pixel == 127.5 and switch.at == switch.pixel_at == 0.4
     assert switch.ratio == pytest.approx(10) and switch.persistence == switch.pixel_persistence == 1
     assert list(switch.changes) == [0, 0, 0, 127.5, *[0] * 6]
     # There and back at every step: over two steps nothing is left, which must not make it a fade.
     flicker = sweep(lambda _, j: torch.full((1, 1, 3), 0.2 * (j % 2)), [0, 1, 2, 3])
-    assert (
-        flicker.ratio == pytest.approx(1) and flicker.persistence == flicker.pixel_persistence == 1
-    )
+    assert flicker.ratio == pytest.approx(1)
+    assert flicker.persistence == flicker.pixel_persistence == 1
     both = sweep(lambda _, j: torch.full((1, 1, 3), 0.01 * j + 0.2 * (j >= 4)), positions)
     # the jump alone
     assert both.pixel * (2 - 1 / both.pixel_persistence) == pytest.approx(0.2 * 255, rel=1e-4)

@@ -36,11 +36,9 @@ def seen(path: Path) -> tuple[Inspection, Splat]:
     """The result for a splat, which can be printed and be written as JSON."""
     found = inspect(path)
     json.dumps(jsonable(found.as_dict()), allow_nan=False)
-    assert (
-        all(line.isprintable() for line in lines_of(found))
-        and found.splat is not None
-        and found.about is None
-    )
+    assert all(line.isprintable() for line in lines_of(found))
+    assert found.splat is not None
+    assert found.about is None
     return found, found.splat
 
 
@@ -69,9 +67,8 @@ def test_a_plain_file(tmp_path: Path) -> None:
         )
     scales = np.sort(np.exp(np.stack([vertex[f"scale_{k}"] for k in range(3)])), 0)
     opacities = 1 / (1 + np.exp(-vertex["opacity"].astype(float)))
-    assert v.scale.median == pytest.approx(np.median(scales)) and v.scale.greatest == pytest.approx(
-        scales.max()
-    )
+    assert v.scale.median == pytest.approx(np.median(scales))
+    assert v.scale.greatest == pytest.approx(scales.max())
     assert v.opacity.median == pytest.approx(np.median(opacities))
     assert v.fainter_than_visible == (opacities < 1 / 255).mean()
     assert v.needles == (scales[2] > 10 * scales[1]).mean()
@@ -140,9 +137,8 @@ def test_values_that_look_activated_are_read_as_activated(tmp_path: Path) -> Non
     vertex = table()
     opacity = vertex["opacity"] = 1 / (1 + np.exp(-vertex["opacity"]))
     found, splat = seen(write_rows(tmp_path / "a.ply", vertex))
-    assert [o.kind for o in found.anomalies] == [
-        "activated"
-    ] and "--activated opacity" in found.anomalies[0].says
+    assert [o.kind for o in found.anomalies] == ["activated"]
+    assert "--activated opacity" in found.anomalies[0].says
     assert splat.opacity.median == pytest.approx(np.median(opacity), rel=1e-5)
 
 
@@ -193,14 +189,11 @@ def test_a_dial(tmp_path: Path) -> None:
     )
     save(tmp_path / "a.ply", g, calibration=CALIBRATION)
     (found, splat), names = seen(tmp_path / "a.ply"), "sigma_d and growth_d"
-    assert (
-        splat.dial is not None
-        and splat.dial.calibration == CALIBRATION
-        and splat.dial.attenuation == ATTENUATION
-    )
-    assert found.what == f"an adapted splat, with {names}, PLY" and "clod-adapter" in (
-        found.writer or ""
-    )
+    assert splat.dial is not None
+    assert splat.dial.calibration == CALIBRATION
+    assert splat.dial.attenuation == ATTENUATION
+    assert found.what == f"an adapted splat, with {names}, PLY"
+    assert "clod-adapter" in (found.writer or "")
     assert splat.sigma is not None and splat.sigma.least > 0 and splat.comments == splat.extra == ()
     rows = [line.split() for line in lines_of(found) if line.startswith("growth_d")]
     assert rows == [["growth_d", "-1", "-0.96", "1", "2.96", "3"]]

@@ -48,9 +48,8 @@ def test_far_ones_take_over_from_near_ones() -> None:
         for sigma in (0.0, 1e6)
     )
     assert torch.allclose(near.drawn + far.drawn, torch.tensor(0.8, dtype=torch.float64), atol=1e-9)
-    assert torch.equal(near.keep, d * s < 2) and torch.equal(
-        far.keep, (d * s / 2).square() * 5 - 4 > 0
-    )
+    assert torch.equal(near.keep, d * s < 2)
+    assert torch.equal(far.keep, (d * s / 2).square() * 5 - 4 > 0)
     slopes = torch.stack([near.drawn, far.drawn]).diff(dim=1).abs() / d.clamp(min=1e-9).log().diff()
     assert float(slopes[:, 1:].max()) <= 10 * 0.8 + 1e-6
 
@@ -78,11 +77,9 @@ def test_rasterizers_agree(adapted: clod.Gaussians) -> None:
 def test_merging_keeps_mass_and_centre() -> None:
     some = gaussians(400, 1, 3)
     few = merge(some, torch.ones(400), 100)
-    assert (
-        len(few) == 100
-        and few.sh_degree == 1
-        and all(x.isfinite().all() for x in few.tensors().values())
-    )
+    assert len(few) == 100
+    assert few.sh_degree == 1
+    assert all(x.isfinite().all() for x in few.tensors().values())
     assert torch.allclose(few.means.mean(0), some.means.mean(0), atol=0.3)
     assert_equal(merge(some, torch.ones(400), 400), merge(some, torch.ones(400), 500))
     twins = some.select(torch.arange(50).repeat(2))
@@ -125,11 +122,9 @@ def test_the_adapter_has_the_far_ones(
     adapted: clod.Gaussians, both: tuple[clod.Gaussians, clod.Scene], tmp_path: Path
 ) -> None:
     adapter = clod.extract(both[0], adapted, fingerprint="0" * 64, config={})
-    assert (
-        not adapter.updates
-        and {*adapter.added} == {*ATTRIBUTES}
-        and adapter.base_count == len(both[0])
-    )
+    assert not adapter.updates
+    assert {*adapter.added} == {*ATTRIBUTES}
+    assert adapter.base_count == len(both[0])
     clod.save_adapter(tmp_path / "a.safetensors", adapter)
     assert_equal(clod.load_adapter(tmp_path / "a.safetensors").apply(both[0]), adapted)
 

@@ -87,9 +87,8 @@ def test_a_second_run_continues_from_sigma_d(captured: Pair, trained: Gaussians)
         far = first.sigma_d > 0
         # a step of log sigma
         assert (result.sigma_d / first.sigma_d)[far].log().abs().max() <= 5.1e-2
-        assert (
-            result.growth_d - first.growth_d
-        ).abs().max() <= 1.01e-2 and first.growth_d.unique().numel() > 50
+        assert (result.growth_d - first.growth_d).abs().max() <= 1.01e-2
+        assert first.growth_d.unique().numel() > 50
     other = with_dial(captured[0], torch.full((len(captured[0]),), 1.5), AttenuationConfig())
     with pytest.raises(ClodError, match="dial has no far Gaussians"):
         adapt(other, captured[1], config)
@@ -192,9 +191,8 @@ def test_a_row_with_a_nonfinite_gradient_is_not_stepped(
         config,
         lambda p: seen.append(copy.deepcopy(p.gaussians())) if p.state else None,
     )
-    assert result.held == 2 and all(
-        value.isfinite().all() for value in result.gaussians.tensors().values()
-    )
+    assert result.held == 2
+    assert all(value.isfinite().all() for value in result.gaussians.tensors().values())
     first, after, last = (
         each.sigma_d[len(base) :]
         for each in (with_far(base, scene.train, config), seen[0], result.gaussians)

@@ -51,20 +51,17 @@ def test_sh_degrees_are_kept_or_left_out(visible: Pair) -> None:
     faint = base.replace(shN=1e-5 * base.shN)
     plan = make_plan(faint, scene, CONFIG)
     assert verdicts(plan)["SH degree 1"] == "left out" and plan.sh_degree == 0
-    assert plan.start.sh_degree == 0 and torch.equal(
-        detach(plan.adapt(scene).gaussians).shN, faint.shN
-    )
+    assert plan.start.sh_degree == 0
+    assert torch.equal(detach(plan.adapt(scene).gaussians).shN, faint.shN)
     empty = make_plan(
         base.replace(shN=torch.zeros(len(base), 15, 3)),
         scene,
         CONFIG,
         Override(keep=ALL - {"bands"}),
     )
-    assert (
-        empty.decisions[0].what == "SH degree 1 to 3"
-        and empty.decisions[0].number == 0
-        and empty.sh_degree == 0
-    )
+    assert empty.decisions[0].what == "SH degree 1 to 3"
+    assert empty.decisions[0].number == 0
+    assert empty.sh_degree == 0
     # A view that gains makes up for none that loses.
     strong, cameras = base.replace(shN=20 * base.shN), [view.camera for view in scene.train[:4]]
     mixed = (*photograph(strong, cameras[:2]), *photograph(strong.without_bands(0), cameras[2:]))
@@ -87,9 +84,8 @@ def test_the_far_end_is_told(visible: Pair) -> None:
             int(render(start, view.camera, s).kept.sum()) / start.whole for view in visible[1].train
         )
 
-    assert percent(4.0) == pytest.approx(kept, abs=0.51) and percent(farther + 1) <= few < percent(
-        farther / 1.2
-    )
+    assert percent(4.0) == pytest.approx(kept, abs=0.51)
+    assert percent(farther + 1) <= few < percent(farther / 1.2)
 
 
 def test_impossible_overrides_are_refused() -> None:
@@ -116,9 +112,8 @@ def test_a_resumed_plan_gives_the_same_bits(visible: Pair) -> None:
     found = again.adapt(scene, resume=states[12]).gaussians
     assert_equal(found, whole)
     assert_equal(detach(found), base)
-    assert torch.equal(found.means, plan.start.means) and not torch.equal(
-        found.quats, plan.start.quats
-    )
+    assert torch.equal(found.means, plan.start.means)
+    assert not torch.equal(found.quats, plan.start.quats)
 
 
 def test_what_no_placed_camera_shows_is_supposed_to_matter() -> None:
@@ -130,9 +125,7 @@ def test_what_no_placed_camera_shows_is_supposed_to_matter() -> None:
     error = removal_error(base, photograph(base, ring(6, 40, 30)))
     error[30], base.opacity_logits[30] = 0.0, math.inf
     found = supposed_error(base, error)
-    assert (
-        (error[:20] == 0).all()
-        and (found[:20] > 0).all()
-        and torch.equal(found[20:][error[20:] > 0], error[error > 0])
-    )
+    assert (error[:20] == 0).all()
+    assert (found[:20] > 0).all()
+    assert torch.equal(found[20:][error[20:] > 0], error[error > 0])
     assert found[30] == 0 and 0.1 < found[:20].median() / found[20:].median() < 10

@@ -38,14 +38,14 @@ def test_images_are_renders_of_the_checkpoint(blob: clod.Gaussians) -> None:
     scene = render_pseudo_views(
         own, cameras, progress=lambda now: told.append((now.done, now.total))
     )
-    assert [view.camera for view in scene.test] == [cameras[0], cameras[8]] and len(
-        scene.train
-    ) == 7
+    assert [view.camera for view in scene.test] == [cameras[0], cameras[8]]
+    assert len(scene.train) == 7
     image, plain = (
         (clod.render(g, cameras[1]).image.clamp(0, 1) * 255).round().byte() for g in (own, blob)
     )
     assert torch.equal(scene.train[0].image, image) and not torch.equal(image, plain)
-    assert "7 pseudo views to train on, 2 held out, 40x30" in scene.notes[0] and told == [
+    assert "7 pseudo views to train on, 2 held out, 40x30" in scene.notes[0]
+    assert told == [
         (1, 2),
         (2, 2),
     ]
@@ -106,10 +106,8 @@ def test_moved_cameras_have_the_documented_offsets(blob: clod.Gaussians) -> None
     angles = ((steps.diagonal(dim1=1, dim2=2).sum(1) - 2) / 2).clamp(-1, 1).acos()
     assert angles.square().mean().sqrt() == pytest.approx(pseudo_views.TURNED * 3**0.5, rel=0.2)
     zooms = torch.stack([each.K / camera.K for each in near])[:, [0, 1], [0, 1]].log()
-    assert (
-        torch.equal(zooms[:, 0], zooms[:, 1])
-        and 0.9 < zooms.abs().max() / pseudo_views.ZOOMED <= 1.001
-    )
+    assert torch.equal(zooms[:, 0], zooms[:, 1])
+    assert 0.9 < zooms.abs().max() / pseudo_views.ZOOMED <= 1.001
     eyes = torch.stack([each.position for each in back])
     behind = (camera.position - eyes) @ camera.viewmat[2, :3] / 3.0
     assert behind.min() > -6 * MOVED and FARTHER / 2 < behind.max() < FARTHER - 1 + 6 * MOVED
@@ -137,10 +135,8 @@ def ball(n: int, seen_from: Tensor) -> clod.Gaussians:
 def test_placed_cameras_are_valid_and_see_the_scene(blob: clod.Gaussians) -> None:
     told: list[tuple[int, int]] = []
     cameras = place_cameras(blob, views=12, progress=lambda now: told.append((now.done, now.total)))
-    assert (
-        told[-1][0] == told[-1][1] == len(told)
-        and len({c.name for c in cameras}) == len(cameras) == 12
-    )
+    assert told[-1][0] == told[-1][1] == len(told)
+    assert len({c.name for c in cameras}) == len(cameras) == 12
     for camera in cameras:
         rotation = camera.viewmat[:3, :3]
         assert torch.det(rotation) == pytest.approx(1, abs=1e-5)
@@ -183,7 +179,5 @@ def test_cameras_face_the_side_where_sh_was_trained(
         monkeypatch.setattr(camera_placement, "SAMPLE", 500)
     positions = torch.stack([c.position for c in place_cameras(truth, views=12)])
     assert (torch.nn.functional.normalize(positions, dim=1) @ side).mean() > 0.4
-    assert (
-        torch.cdist(positions, truth.means[:-1]).min() > 3 * 0.05
-        and positions.norm(dim=1).min() > 1
-    )
+    assert torch.cdist(positions, truth.means[:-1]).min() > 3 * 0.05
+    assert positions.norm(dim=1).min() > 1

@@ -153,7 +153,11 @@ def test_unit_direction_and_place(pair: Pair) -> None:
     """
     found, wanted = results(*placed(*pair, 1024.0, 1024.0 * 100)), results(*pair)
     for (psnr, kept), (other, share) in zip(found, wanted, strict=True):
-        assert psnr == pytest.approx(other, abs=0.5) and kept == pytest.approx(share, abs=0.02), (
+        assert psnr == pytest.approx(other, abs=0.5), (
+            found,
+            wanted,
+        )
+        assert kept == pytest.approx(share, abs=0.02), (
             found,
             wanted,
         )

@@ -44,9 +44,8 @@ def test_dial_values_follow_the_schedule() -> None:
         return torch.tensor([sample.dial for sample in samples], dtype=torch.float64)
 
     for stretch in drawn(Schedule(full=0.25)).split(120):
-        assert (
-            abs(int((stretch <= 1).sum()) - 30) <= 1 and abs(int((stretch == 0).sum()) - 7.5) <= 1
-        )
+        assert abs(int((stretch <= 1).sum()) - 30) <= 1
+        assert abs(int((stretch == 0).sum()) - 7.5) <= 1
         assert_uniform(stretch[stretch > 1].log() / math.log(OURS.rendered * 4.0))
     assert_uniform((drawn(PAPER) - 1) / 3)
     assert abs(int((drawn(Schedule(full=0.5, full_final=0.5), 0.5) <= 1).sum()) - 0.375 * 480) <= 1
@@ -230,6 +229,5 @@ def test_only_selected_rows_are_stepped(
             torch.cat([~rows, torch.ones(more, dtype=torch.bool)]),
         )
         assert torch.equal(bits[others], before[name][others]), name  # in place
-        assert (bits[~others] != before[name][~others]).all() and torch.equal(
-            value[~others], own[name]
-        ), name
+        assert (bits[~others] != before[name][~others]).all(), name
+        assert torch.equal(value[~others], own[name]), name

@@ -35,9 +35,8 @@ def test_parts_are_built_from_these_sources() -> None:
     }
     for name, text in texts.items():
         assert not re.search(r"""(?:src|href)=["']?https?:|@import|url\(["']?https?:""", text), name
-    assert (
-        not re.search("</script|<!--", texts["viewer.js"]) and "</style" not in texts["viewer.css"]
-    )
+    assert not re.search("</script|<!--", texts["viewer.js"])
+    assert "</style" not in texts["viewer.css"]
     web = VIEWER / "web"
     if not web.is_dir():
         pytest.skip("only a checkout contains the sources of the page")
@@ -64,21 +63,17 @@ def test_the_text_of_one_file(tmp_path: Path) -> None:
     assert [each.name for each in out.parent.iterdir()] == ["page.html"] and losses
     text = out.read_text(encoding="utf-8")
     policy = re.search('<meta http-equiv="Content-Security-Policy" content="([^"]*)">', text)
-    assert (
-        policy
-        and "default-src 'none'" in policy[1]
-        and "'self'" not in policy[1]
-        and "unsafe" not in policy[1]
-    )
+    assert policy
+    assert "default-src 'none'" in policy[1]
+    assert "'self'" not in policy[1]
+    assert "unsafe" not in policy[1]
     assert str(tmp_path) not in text
     (poster,) = re.findall('<img id="poster" alt="" src="data:image/jpeg;base64,([^"]*)">', text)
     picture = np.asarray(Image.open(io.BytesIO(base64.b64decode(poster))), dtype=float)
     wanted = render(shown, cameras[0].resized(512, 256), 2.0).pixels.numpy()
-    assert (
-        len(poster) < 60_000
-        and picture.shape == wanted.shape
-        and np.abs(picture - wanted).mean() < 3
-    )
+    assert len(poster) < 60_000
+    assert picture.shape == wanted.shape
+    assert np.abs(picture - wanted).mean() < 3
     page.write_viewer_page(tmp_path / "alone.html", saved)
     text = (tmp_path / "alone.html").read_text(encoding="utf-8")
     assert '<img id="poster"' not in text  # no viewpoint is stored
@@ -93,9 +88,8 @@ def test_the_exact_file_is_a_plain_ply(capture: Any, tmp_path: Path) -> None:
     loaded = clod_adapter.load(tmp_path / "a.ply")
     payload = page.Payload.of(replace(loaded, path=Path("b\udcff.ply")))
     (tmp_path / "payload.ply").write_bytes(b"".join(payload.blocks()))
-    assert (
-        tmp_path / "payload.ply"
-    ).stat().st_size == payload.size and payload.name == "b\\xff.ply"
+    assert (tmp_path / "payload.ply").stat().st_size == payload.size
+    assert payload.name == "b\\xff.ply"
     read = clod_adapter.load(tmp_path / "payload.ply")
     scenes.assert_equal(read.gaussians, loaded.gaussians.replace(shN=loaded.gaussians.shN[:, :8]))
     assert {kind for kind, _ in read.vertex.dtype.fields.values()} == {np.dtype("<f4")}
@@ -154,25 +148,20 @@ def test_a_file_without_sigma_d_has_no_dial(show: Any, save: Any, plain: Gaussia
         == f"</script>{NAME}"
     )
     shown = show(save(plain, NAME))
-    assert (
-        shown.text("#title") == NAME
-        and shown.page.title() == NAME
-        and shown.page.query_selector("img") is None
-    )
+    assert shown.text("#title") == NAME
+    assert shown.page.title() == NAME
+    assert shown.page.query_selector("img") is None
     assert all(
         shown.page.is_disabled(f"#{name}")
         for name in ("dial", "target", "equation", "hold", "rate")
     )
-    assert f"{NAME} has no sigma_d" in shown.text(
-        "#no-dial"
-    ) and f"clod-adapt {NAME}" in shown.text("#no-dial")
+    assert f"{NAME} has no sigma_d" in shown.text("#no-dial")
+    assert f"clod-adapt {NAME}" in shown.text("#no-dial")
     for key in "]re":
         shown.page.keyboard.press(key)
-    assert (
-        shown.counts()["kept"] == 400
-        and shown.picture().max() > 50
-        and not shown.page.is_checked("#hold")
-    )
+    assert shown.counts()["kept"] == 400
+    assert shown.picture().max() > 50
+    assert not shown.page.is_checked("#hold")
     # a link with a comparison, which needs a dial
     shown.page.evaluate("location.hash = '#wipe=0.5&dial=3'")
     shown.run("clod.whenDrawn()")

@@ -187,9 +187,8 @@ def test_other_files_are_errors_and_the_picture_stays(
     before = shown.picture()
     for name, content, error in refused:
         drop(shown, name, content)
-        assert error.format(name) in message(shown, name) and shown.text("#title") == "model.ply", (
-            name
-        )
+        assert error.format(name) in message(shown, name), name
+        assert shown.text("#title") == "model.ply", name
     assert np.array_equal(shown.picture(), before)
 
 

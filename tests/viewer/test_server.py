@@ -83,19 +83,15 @@ REQUESTS: tuple[tuple[str, str, str | None, int], ...] = (  # method, path, Host
 
 
 def test_responses(server: Server) -> None:
-    assert (
-        server.socket.getsockname()[0] == "127.0.0.1"
-        and server.url == f"http://127.0.0.1:{server.port}/"
-    )
+    assert server.socket.getsockname()[0] == "127.0.0.1"
+    assert server.url == f"http://127.0.0.1:{server.port}/"
     for method, path, host, wanted in REQUESTS:
         status, headers, body = request(
             server, path, method, **({} if host is None else {"Host": host})
         )
         assert status == wanted and headers.items() >= SAFE.items(), (method, path, host, status)
-        assert (
-            "access-control-allow-origin" not in headers
-            and "python" not in headers["server"].lower()
-        )
+        assert "access-control-allow-origin" not in headers
+        assert "python" not in headers["server"].lower()
         if method == "GET" and status == 200:
             page = path.startswith("/files")
             assert body == (b"".join(BLOCKS) if page else b"hello")

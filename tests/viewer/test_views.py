@@ -69,14 +69,11 @@ def test_the_count_box(shown: Shown, gaussians: Gaussians) -> None:
     before = shown.picture()
     shown.page.focus("#target")
     shown.page.keyboard.type("wasdech0")
-    assert shown.page.input_value("#target") == "wasdech0" and np.array_equal(
-        shown.picture(), before
-    )
+    assert shown.page.input_value("#target") == "wasdech0"
+    assert np.array_equal(shown.picture(), before)
     for text in ("0", "1.5", "many"):
-        assert (
-            "Enter a number of Gaussians" in target(shown, text)
-            and shown.text("#dial-value") == "s = 1.00"
-        )
+        assert "Enter a number of Gaussians" in target(shown, text)
+        assert shown.text("#dial-value") == "s = 1.00"
     assert "keeps" in target(shown, "1,000,000")
     shown.run("clod.setEquation(false)")
     assert "keeps 280 in this view" in target(shown, "280")
@@ -229,11 +226,9 @@ def test_the_up_axis(shown: Shown, show: Any, save: Any, tmp_path: Path) -> None
         "#up", "(up) => { up.value = '0,0,1'; up.dispatchEvent(new Event('change')); }"
     )
     chosen = link(shown)
-    assert (
-        chosen["up"].tolist() == [0, 0, 1]
-        and abs(chosen["axes"][2]) < 1e-6
-        and forward(chosen)[2] < 0
-    )
+    assert chosen["up"].tolist() == [0, 0, 1]
+    assert abs(chosen["axes"][2]) < 1e-6
+    assert forward(chosen)[2] < 0
     cameras = [
         replace(camera, name=f"{k}.jpg") for k, camera in enumerate(scenes.ring(3, 320, 240))
     ]
@@ -268,9 +263,8 @@ def test_placed_cameras_are_levelled(show: Any, model: Path, tmp_path: Path) -> 
     # frames whose time is hardly more than 0
     fast = "WebGL2RenderingContext.prototype.readPixels = () => {}"
     shown = show(url=(tmp_path / "page.html").as_uri(), script=fast)
-    assert shown.text("#dial-value") == "all" and np.allclose(
-        link(shown)["axes"][:3], viewmat[0, :3], atol=1e-4
-    )
+    assert shown.text("#dial-value") == "all"
+    assert np.allclose(link(shown)["axes"][:3], viewmat[0, :3], atol=1e-4)
 
 
 @pytest.mark.parametrize("photographs", [True, False])
@@ -301,12 +295,10 @@ def test_the_picture_and_the_panel_fit_the_window(
         box = shown.page.evaluate(
             "document.getElementById('panel').getBoundingClientRect().toJSON()"
         )
-        assert (
-            box["left"] >= 0
-            and box["right"] <= width
-            and box["top"] >= 0
-            and box["bottom"] <= height
-        )
+        assert box["left"] >= 0
+        assert box["right"] <= width
+        assert box["top"] >= 0
+        assert box["bottom"] <= height
         red[int(box["top"]) : int(box["bottom"]), int(box["left"]) : int(box["right"])] = False
         rows, columns = np.nonzero(red)
         lower, right = (
@@ -314,11 +306,9 @@ def test_the_picture_and_the_panel_fit_the_window(
             columns > (columns.min() + columns.max()) / 2,
         )
         assert len({*zip(lower.tolist(), right.tolist(), strict=True)}) == 4, width
-        assert (
-            min(rows.min(), columns.min()) > 0
-            and rows.max() < height - 1
-            and columns.max() < width - 1
-        )
+        assert min(rows.min(), columns.min()) > 0
+        assert rows.max() < height - 1
+        assert columns.max() < width - 1
 
 
 SELECTED = """() => {
@@ -349,9 +339,8 @@ def test_the_path_and_the_turntable(show: Any, model: Path, tmp_path: Path) -> N
     start, turned, stopped = views
     assert np.array_equal(link(shown)["eye"], stopped["eye"])
     pivots = [view["eye"] + view["distance"] * forward(view) for view in views]
-    assert np.allclose(pivots[0], pivots[2], atol=1e-4) and not np.allclose(
-        start["eye"], turned["eye"], atol=1e-2
-    )
+    assert np.allclose(pivots[0], pivots[2], atol=1e-4)
+    assert not np.allclose(start["eye"], turned["eye"], atol=1e-2)
     shown.page.keyboard.press("0")
     shown.page.keyboard.press("Space")
     shown.page.evaluate(SELECTED)  # in each frame: the last camera is there for one

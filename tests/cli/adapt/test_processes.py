@@ -99,14 +99,11 @@ def test_two_give_the_result_of_one(server: Server, words: list[Any], tmp_path: 
     assert run.wait() == [0, 2], run.log(0)
     report = run.report()
     assert report["steps"] == 4 and report["interrupted"] and run.log(1) == "", run.log(0)
-    assert (
-        "; process 1: no room for this view" in run.log(0)
-        and load_state(run.folder / STATE)[0].steps == 4
-    )
+    assert "; process 1: no room for this view" in run.log(0)
+    assert load_state(run.folder / STATE)[0].steps == 4
     again = Launched(server, run.folder, *words, *TINY, "--resume")
-    assert again.wait() == [0, 0] and alone.wait() == [0], (
-        again.log(0) + again.log(1) + alone.log(0)
-    )
+    assert again.wait() == [0, 0], again.log(0) + again.log(1) + alone.log(0)
+    assert alone.wait() == [0], again.log(0) + again.log(1) + alone.log(0)
     report, want = again.report(), alone.report()
     assert report["processes"].items() >= {"count": 2, "backend": "gloo", "batch": 2}.items()
     assert report["processes"]["exchange_seconds"] > 0 and want["processes"]["count"] == 1
@@ -130,14 +127,12 @@ def test_process_lost_before_the_first_step(
     """Nothing is written."""
     lost = "def adapt(*_, **__): raise MemoryError('no room')\nprocesses.adapt = adapt"
     run = Launched(server, tmp_path / "run", *words, *TINY, before={1: lost})
-    assert run.wait() == [2, 2] and run.log(1) == "" and list(run.folder.iterdir()) == [], run.log(
-        0
-    )
+    assert run.wait() == [2, 2], run.log(0)
+    assert run.log(1) == "", run.log(0)
+    assert list(run.folder.iterdir()) == [], run.log(0)
     log = run.log(0)
-    assert (
-        log.count("error:") == 1
-        and "; process 1: no room; this was before the first step, so start again\n" in log
-    )
+    assert log.count("error:") == 1
+    assert "; process 1: no room; this was before the first step, so start again\n" in log
 
 
 def test_interrupt_stops_all_after_the_same_step(
@@ -147,9 +142,8 @@ def test_interrupt_stops_all_after_the_same_step(
     os.kill(run.pids[1], signal.SIGINT)  # either process
     assert run.wait() == [0, 0], run.log(0)
     report = run.report()
-    assert report["interrupted"] and load_state(run.folder / STATE)[0].steps == report["steps"], (
-        run.log(0)
-    )
+    assert report["interrupted"], run.log(0)
+    assert load_state(run.folder / STATE)[0].steps == report["steps"], run.log(0)
     assert "gone" not in str(report["notes"]) and run.log(1) == ""
 
 
@@ -160,11 +154,9 @@ def test_bad_input_is_reported_once(server: Server, words: list[Any], tmp_path: 
     ):
         run = Launched(server, tmp_path / "run", *given)
         assert run.wait()[0] == 2 and run.log(0).count("\n") == 1, run.log(0)
-        assert (
-            f"clod-adapt: error: {message}" in run.log(0)
-            and run.log(1) == ""
-            and not list(run.folder.iterdir())
-        )
+        assert f"clod-adapt: error: {message}" in run.log(0)
+        assert run.log(1) == ""
+        assert not list(run.folder.iterdir())
 
 
 AGENT = """

@@ -124,9 +124,8 @@ def test_damaged_states_are_refused_or_harmless(state: Any, data: Any) -> None:
         saver.identify("base.ply", "images", **HASHES)
         found = adapt(*pair, CONFIG, resume=saver.state).gaussians.tensors()
     except ClodError as error:
-        assert "\n" not in str(error) and ("start over" in str(error) or "use " in str(error)), (
-            error
-        )
+        assert "\n" not in str(error), error
+        assert "start over" in str(error) or "use " in str(error), error
     else:
         assert all(value.isfinite().all() for value in found.values()), about
 
@@ -196,9 +195,8 @@ def test_without_a_state_training_starts_over(
             patch.setattr(listeners, name, value)
         done = clod(ADAPT, "--seed 4")
     assert done.err.count(f"will not find it: {STATE}: cannot be written: No space") == 1
-    assert (
-        names(tmp_path) == sorted([*OUTPUTS, STATE]) and (tmp_path / STATE).read_bytes() == before
-    )
+    assert names(tmp_path) == sorted([*OUTPUTS, STATE])
+    assert (tmp_path / STATE).read_bytes() == before
     done = clod(ADAPT, "--seed 4")
     assert f"{STATE} has step 2 of an interrupted run" in done.err and names(tmp_path) == OUTPUTS
 
@@ -260,10 +258,8 @@ def test_resuming_after_an_error(
     with pytest.MonkeyPatch.context() as patch:
         change_step(patch, 6, change)
         done = clod(ADAPT, "--quiet" if change is fail else "--json", code=1)
-    assert (
-        names(tmp_path) == files
-        and f"--resume resumes from step 5, which is in {STATE}\n" in done.err
-    ), done
+    assert names(tmp_path) == files, done
+    assert f"--resume resumes from step 5, which is in {STATE}\n" in done.err, done
     assert (
         ("please report it" in done.err)
         == ("ZeroDivisionError: of ours" in done.err)

@@ -43,9 +43,8 @@ def test_writes_three_files(adapted: tuple[Path, Any], capture: Any, dialled: Pa
     without it.
     """
     folder, done = adapted
-    assert (
-        names(folder) == OUTPUTS and len({path.stat().st_mode for path in folder.iterdir()}) == 1
-    ), done
+    assert names(folder) == OUTPUTS, done
+    assert len({path.stat().st_mode for path in folder.iterdir()}) == 1, done
     report, data = (
         json.loads((folder / "dial.json").read_text()),
         (folder / "dial.ply").read_bytes(),
@@ -66,10 +65,8 @@ def test_writes_three_files(adapted: tuple[Path, Any], capture: Any, dialled: Pa
     }
     assert report.items() >= want.items()
     assert (report["alignment"]["guess"], report["alignment"]["explained"]) == (None, 1)
-    assert (
-        set(report["config"]) == set(AdaptConfig.__dataclass_fields__)
-        and report["config"]["max_sv"] == 4
-    )
+    assert set(report["config"]) == set(AdaptConfig.__dataclass_fields__)
+    assert report["config"]["max_sv"] == 4
     assert set(report["machine"]) >= {"cpu", "cores", "python", "torch", "numba"}
     assert set(report["seconds"]) == {
         "load",
@@ -83,10 +80,8 @@ def test_writes_three_files(adapted: tuple[Path, Any], capture: Any, dialled: Pa
     assert [row["virtual_scale"] for row in report["rows"]] == [1, 1.5, 2, 3, 4]
     shares = [row["kept_share"] for row in report["rows"]]
     assert shares == sorted(shares, reverse=True) and 0 < shares[-1] < 0.5
-    assert (
-        columns(folder / "dial.ply")[-3:] == ["sigma_d", "growth_d", "opacity_d"]
-        and b"screen_filter" not in data
-    )
+    assert columns(folder / "dial.ply")[-3:] == ["sigma_d", "growth_d", "opacity_d"]
+    assert b"screen_filter" not in data
     assert results(folder) == results(dialled.parent)
     model, views = (
         clod_adapter.load(folder / "dial.ply"),
@@ -99,10 +94,8 @@ def test_writes_three_files(adapted: tuple[Path, Any], capture: Any, dialled: Pa
     ):
         assert {**ours, "frame_ms": 0} == {**row.as_dict(), "frame_ms": 0}
     stored = model.calibration
-    assert (
-        stored is not None
-        and stored == clod_adapter.load_adapter(folder / "dial.safetensors").calibration
-    )
+    assert stored is not None
+    assert stored == clod_adapter.load_adapter(folder / "dial.safetensors").calibration
     assert stored.as_dict() == report["calibration"] and stored.machine == machine_name()
     for row, measured in zip(stored.rows, report["rows"], strict=True):
         assert vars(row).items() <= measured.items()
@@ -124,10 +117,8 @@ def test_prints_progress_a_table_next_commands_and_a_loss(
     assert [shlex.split(line) for line in images] == [
         shlex.split(f"clod-adapt eval dial.ply {scene} --sv 1 4")
     ]
-    assert (
-        "300 Gaussians, SH degree 1" in done.err
-        and "8 photographs to train on, 2 held out, 64x48" in done.err
-    )
+    assert "300 Gaussians, SH degree 1" in done.err
+    assert "8 photographs to train on, 2 held out, 64x48" in done.err
     assert "trained 12 steps" in done.err and "\r" not in done.err
     for line in (
         r"training   8%, \d.* left, 1/12",
@@ -138,10 +129,8 @@ def test_prints_progress_a_table_next_commands_and_a_loss(
     report = json.loads((folder / "dial.json").read_text())
     # more than is accepted: the exit code is 1
     lost = report["base_rows"][0]["psnr"] - report["rows"][0]["psnr"]
-    assert (
-        f"s = 1 is {lost:.2f} dB below the base" in report["loss"]
-        and "train longer (--iters)" in report["loss"]
-    )
+    assert f"s = 1 is {lost:.2f} dB below the base" in report["loss"]
+    assert "train longer (--iters)" in report["loss"]
     assert done.err.endswith(f"\nwarning: {report['loss']}\n")
 
 
@@ -175,9 +164,9 @@ def test_dial_of_the_checkpoint_is_continued(clod: Any, dialled: Path) -> None:
             more,
         )
         noted = f"{model} has a dial already: continuing from its {note}"
-        assert (
-            done.err == "" and noted in done.report["notes"] and done.report["device"] == "cpu"
-        ), done
+        assert done.err == "", done
+        assert noted in done.report["notes"], done
+        assert done.report["device"] == "cpu", done
         assert columns(Path("dial.ply"))[-len(stored) :] == stored and rebuilt(clod, model)
         if more:
             assert clod_adapter.load_adapter("dial.safetensors").growth_d is None
@@ -203,25 +192,17 @@ def test_without_photographs(clod: Any, tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.setattr("clod_adapter.cli.adapt.run.ENOUGH", (50.0, 25.0))
     done = clod("BASE", TINY, "--json")
     report = done.report
-    assert (
-        report["scene"] is None
-        and report["teacher"] == "checkpoint"
-        and report["seconds"]["place"] > 0
-    )
+    assert report["scene"] is None
+    assert report["teacher"] == "checkpoint"
+    assert report["seconds"]["place"] > 0
     (note,) = report["notes"]
-    assert (
-        note in done.err
-        and "no photographs: 14 pseudo views to train on, 2 held out, 62x46, " in note
-    )
-    assert (
-        "held-out photographs" not in done.err
-        and "--images" not in done.err.split("next:\n")[1].split("warning")[0]
-    )
+    assert note in done.err
+    assert "no photographs: 14 pseudo views to train on, 2 held out, 62x46, " in note
+    assert "held-out photographs" not in done.err
+    assert "--images" not in done.err.split("next:\n")[1].split("warning")[0]
     full = report["rows"][0]["psnr"]
-    assert (
-        report["base_rows"][0]["psnr"] > 50 > full > report["rows"][-1]["psnr"]
-        and len(report["rows"]) == 5
-    )
+    assert report["base_rows"][0]["psnr"] > 50 > full > report["rows"][-1]["psnr"]
+    assert len(report["rows"]) == 5
     assert f"s = 1 has {full:.2f} dB against" in report["loss"] and names(tmp_path) == OUTPUTS
     assert rebuilt(clod, "BASE") and report["calibration"]["against"] == "checkpoint"
     (note, *_) = clod("export dial.ply --psnr-drop 1 -o plain.ply --json").report["notes"]
@@ -237,9 +218,8 @@ def test_ci_banana(clod: Any, ci_banana: Path) -> None:
         "--iters 5 --max-sv 3 --out dial.ply --json",
     )
     report = clod(*words).report
-    assert report["base_count"] == 20_000 and report["base_rows"][0]["psnr"] == pytest.approx(
-        25.81, abs=0.02
-    )
+    assert report["base_count"] == 20_000
+    assert report["base_rows"][0]["psnr"] == pytest.approx(25.81, abs=0.02)
     assert report["rows"][-1]["kept_share"] < 0.3
 
 
@@ -298,10 +278,8 @@ def test_the_plan_is_printed_and_stored(clod: Any, wasteful: Path) -> None:
     # listed only if frozen
     assert not {"means", "quats", "scales", "opacities", "sh0"} & set(table), done
     stored, seconds = decisions(done), done.report["plan"]["seconds"]
-    assert (
-        list(stored) == [*table, "undistortion", "scaling"]
-        and stored["far Gaussians"]["number"] == 280
-    )
+    assert list(stored) == [*table, "undistortion", "scaling"]
+    assert stored["far Gaussians"]["number"] == 280
     assert set(seconds) == {"bands", "start"} and done.report["seconds"]["plan"] > 0
     base, whole = (clod_adapter.load(path).gaussians for path in (wasteful, "dial.ply"))
     assert (whole.whole, len(whole)) == (350, 630) and clod_adapter.detach(whole) == base

@@ -39,9 +39,8 @@ def test_values_that_look_activated_need_the_option(
     for name in ("scale_0", "scale_1", "scale_2"):
         vertex[name] = np.exp(vertex[name])
     ply.write(str(tmp_path / "in.ply"))
-    assert "--activated both" in clod("in.ply", TINY, code=2).err.splitlines()[-1] and names(
-        tmp_path
-    ) == ["in.ply"]
+    assert "--activated both" in clod("in.ply", TINY, code=2).err.splitlines()[-1]
+    assert names(tmp_path) == ["in.ply"]
     assert "opacity taken as activated" in clod("in.ply", TINY, "--activated both").err
     assert rebuilt(clod, "in.ply", "--activated both")
     (note, *_) = clod("apply in.ply dial.safetensors --out x.ply --activated both --json").report[
@@ -137,9 +136,8 @@ def test_adapt(clod: Any, tmp_path: Path) -> None:
         "count": "dial_count.png",
         "adapting": "dial_adapting.png",
     }
-    assert report["outputs"].items() >= files.items() and all(
-        (tmp_path / f).is_file() for f in files.values()
-    )
+    assert report["outputs"].items() >= files.items()
+    assert all((tmp_path / f).is_file() for f in files.values())
     text, page = page_of(tmp_path / "dial.html")
     assert all(page["report"][name] == report[name] for name in ("rows", "base_rows", "plan"))
     curves = page["training"]["curves"]
@@ -151,9 +149,8 @@ def test_adapt(clod: Any, tmp_path: Path) -> None:
         assert len(set(psnr)) == 5 and psnr[-1] == rows[dial]["psnr"]  # each of its own time
     trained = report["seconds"]["start"] + report["seconds"]["train"]
     assert curves[0]["points"][-1]["seconds"] == pytest.approx(trained, abs=0.05)
-    assert (
-        "take over in the distance" in text and "base.ply, a trained splat of 300 Gaussians" in text
-    )
+    assert "take over in the distance" in text
+    assert "base.ply, a trained splat of 300 Gaussians" in text
     assert text.count("<svg") == 6
     assert text.count('data-name=""') == pages.FRAMES and text.count('data-name="base"') == 1
 
