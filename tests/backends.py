@@ -63,7 +63,8 @@ def torch_threads(count: int) -> Iterator[None]:
     """Sets the number of torch's threads, which kernels then use for few rows too, and restores it
     at the end.
     """
-    before, few = torch.get_num_threads(), cpu.FEW
+    before = torch.get_num_threads()
+    few = cpu.FEW
     torch.set_num_threads(count)
     cpu.FEW = 0
     try:

@@ -103,10 +103,8 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
         sh0=normal(300, 1, 3),
         shN=normal(300, 3, 3) * 0.1,
     )
-    cameras, names = (
-        [_camera(2 * math.pi * i / 10) for i in range(10)],
-        [f"{i:03}.png" for i in range(10)],
-    )
+    cameras = [_camera(2 * math.pi * i / 10) for i in range(10)]
+    names = [f"{i:03}.png" for i in range(10)]
     write_model(scene, cameras, names)
     for camera, name in zip(cameras, names, strict=True):
         Image.fromarray(render(gaussians, camera).pixels.numpy()).save(scene / "images" / name)

@@ -93,10 +93,8 @@ def damaged(whole: bytes, data: st.DataObject) -> bytes:
     )
     for _ in range(data.draw(st.integers(1, 4))):
         end = min(data.draw(st.sampled_from([16, 64, 1024, len(whole)])), len(whole))
-        at, value = (
-            data.draw(st.integers(0, end - 1)),
-            data.draw(st.binary(min_size=1, max_size=1) | words),
-        )
+        at = data.draw(st.integers(0, end - 1))
+        value = data.draw(st.binary(min_size=1, max_size=1) | words)
         changed[at : at + len(value)] = value
     return bytes(changed)
 
@@ -207,10 +205,8 @@ def random_rows(
     count: int, names: Sequence[str], seed: int = 0, types: dict[str, str] | None = None
 ) -> np.ndarray:
     """Normal values in columns of float32 or of ``types``."""
-    rng, rows = (
-        np.random.default_rng(seed),
-        np.empty(count, [(name, (types or {}).get(name, "f4")) for name in names]),
-    )
+    rng = np.random.default_rng(seed)
+    rows = np.empty(count, [(name, (types or {}).get(name, "f4")) for name in names])
     for name in names:
         rows[name] = (
             rng.integers(0, 99, count) if rows.dtype[name].kind in "iu" else rng.normal(size=count)

@@ -14,7 +14,9 @@ import pytest
 import torch
 from torch import Tensor
 
-ALPHA_MIN, ALPHA_MAX, TRANSMITTANCE_MIN = 1 / 255, 0.999, 1e-4
+ALPHA_MIN = 1 / 255
+ALPHA_MAX = 0.999
+TRANSMITTANCE_MIN = 1e-4
 
 
 def install(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -174,7 +176,8 @@ def rasterize_to_pixels(
     canvas = torch.stack(
         [_blend([values[ids] for values in table], x.to(colors), y.to(colors)) for ids in rows]
     )
-    drawn, alphas = canvas[..., :-1], canvas[..., -1:]
+    drawn = canvas[..., :-1]
+    alphas = canvas[..., -1:]
     if backgrounds is not None:
         drawn = drawn + (1 - alphas) * backgrounds.reshape(len(canvas), 1, 1, -1)
     return drawn.unflatten(0, images), alphas.unflatten(0, images)
@@ -183,7 +186,8 @@ def rasterize_to_pixels(
 def _blend(table: list[Tensor], x: Tensor, y: Tensor) -> Tensor:
     """Colours and alpha ``[H, W, D + 1]`` of Gaussians in order of depth."""
     centres, conics, opacities, colors = table
-    dx, dy = x[..., None] - centres[:, 0], y[..., None] - centres[:, 1]
+    dx = x[..., None] - centres[:, 0]
+    dy = y[..., None] - centres[:, 1]
     a, b, c = conics.unbind(-1)
     alpha = (opacities * torch.exp(-(0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy))).clamp(
         max=ALPHA_MAX

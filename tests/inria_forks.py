@@ -81,8 +81,10 @@ def settings_of(kind: Any, view: Camera, **others: Any) -> Any:
 
 def _draw(settings: Any, given: dict[str, Any]) -> dict[str, Any]:
     """Every result of any fork; ``radii`` and ``touched`` have a row per Gaussian."""
-    width, height = settings.image_width, settings.image_height
-    fx, fy = width / (2 * settings.tanfovx), height / (2 * settings.tanfovy)
+    width = settings.image_width
+    height = settings.image_height
+    fx = width / (2 * settings.tanfovx)
+    fy = height / (2 * settings.tanfovy)
     K = torch.tensor([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1]])
     depths = given["means3D"] @ settings.viewmatrix[:3, 2] + settings.viewmatrix[3, 2]
     seen = depths > NEAREST

@@ -31,7 +31,8 @@ class Result(NamedTuple):
 
 
 def weights(camera: Camera) -> tuple[Tensor, Tensor]:
-    g, size = torch.Generator().manual_seed(0), (camera.height, camera.width)
+    g = torch.Generator().manual_seed(0)
+    size = (camera.height, camera.width)
     return torch.randn(*size, 3, generator=g), torch.randn(*size, generator=g)
 
 
@@ -71,7 +72,9 @@ def on_a_cut(
             **scene, camera=camera, background=behind, screen_filter=screen_filter
         )[0]
 
-    images, seen, blend = [], [], reference.blend
+    images = []
+    seen = []
+    blend = reference.blend
     for factor in (1 - nudge, 1 + nudge):
         with pytest.MonkeyPatch.context() as patch:
             images.append(
@@ -140,7 +143,8 @@ def assert_agrees(
         if rows is not None and name != "background":
             assert (got[~rows] == 0).all(), f"rows that are not drawn have a gradient of {name}"
             got = got[rows]
-        error, length = (got - expected).norm().item(), expected.norm().item()
+        error = (got - expected).norm().item()
+        length = expected.norm().item()
         assert error <= gradient * length, (
             f"gradient of {name} is off by {error:.1e} of {length:.1e}"
         )

@@ -226,7 +226,8 @@ def change_step(patch: pytest.MonkeyPatch, at: int, change: Callable[[Any], Any]
     """Replaces the gradients of the ``at``-th step by ``change`` of them, not in the kernels' runs
     of one step.
     """
-    real, steps = Trainer.gradient_sum, count(1)
+    real = Trainer.gradient_sum
+    steps = count(1)
 
     def changed(self: Trainer, *given: Any) -> Any:
         found = real(self, *given)

@@ -59,7 +59,8 @@ def scene(n: int, degree: int, seed: int, *, size: float = 0.08) -> dict[str, Te
 def gaussians(n: int, degree: int, seed: int, *, size: float = 0.08) -> Gaussians:
     """The same Gaussians as a checkpoint stores them."""
     s = scene(n, degree, seed, size=size)
-    logs, logits = s["scales"].log(), s["opacities"].logit()
+    logs = s["scales"].log()
+    logits = s["opacities"].logit()
     return Gaussians(s["means"], s["quats"], logs, logits, s["sh0"], s["shN"])
 
 

@@ -96,7 +96,8 @@ def assert_alike(picture: np.ndarray, wanted: np.ndarray) -> None:
 
 def assert_same(shown: Shown, wanted: Rendering) -> None:
     """Asserts that the page shows the picture of our renderer and counts the same Gaussians."""
-    counts, kept = shown.counts(), int(wanted.kept.sum())
+    counts = shown.counts()
+    kept = int(wanted.kept.sum())
     assert_alike(shown.picture(), wanted.pixels.numpy())
     assert abs(counts["kept"] - kept) <= COUNTS * kept and counts["total"] == len(wanted.kept)
 

@@ -105,8 +105,10 @@ def test_with_dial_and_detach() -> None:
     """Without sigma_d the dial has no effect and can be removed exactly; with it, its tensor is
     used as it is.
     """
-    base, sigma_d = gaussians(), torch.rand(6)
-    on, chosen = with_dial(base), with_dial(base, sigma_d, CONFIG)
+    base = gaussians()
+    sigma_d = torch.rand(6)
+    on = with_dial(base)
+    chosen = with_dial(base, sigma_d, CONFIG)
     assert on.attenuation == with_dial(base, sigma_d).attenuation == AttenuationConfig()
     assert (on.sigma_d == SIGMA_MAX).all()
     assert chosen.sigma_d is sigma_d
@@ -120,17 +122,17 @@ def test_extracting_ignores_a_dial_of_the_base_and_drops_graphs() -> None:
     old = with_dial(base, torch.ones(6), growth_d=torch.ones(6))
     leaves = {name: torch.rand(6).requires_grad_() for name in DIAL}
     result = adapt(base, ["sh0"]).replace(sh0=(base.sh0 + 1).requires_grad_(), **leaves)
-    fresh, again = extract(base, result), extract(old, result.replace(growth_d=None))
+    fresh = extract(base, result)
+    again = extract(old, result.replace(growth_d=None))
     assert bits(fresh.apply(old)) == bits(fresh.apply(base)) and again.apply(old).growth_d is None
     assert not any(value.requires_grad for value in fresh.apply(base).tensors().values())
 
 
 def test_other_input_is_refused() -> None:
-    base, full = gaussians(), partial(torch.full, (6,))
-    adapter, small = (
-        extract(base, adapt(base, ["shN"])),
-        extract(gaussians(3), with_dial(gaussians(3))),
-    )
+    base = gaussians()
+    full = partial(torch.full, (6,))
+    adapter = extract(base, adapt(base, ["shN"]))
+    small = extract(gaussians(3), with_dial(gaussians(3)))
     refused = {
         "different base.*SHA-256 is bbbb": lambda: adapter.apply(base, "b" * 64),
         "different base.*7 Gaussians, the adapter 6": lambda: adapter.apply(gaussians(7)),
@@ -252,7 +254,8 @@ def test_invalid_files_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "a"
     save_adapter(path, adapter())
     with safe_open(path, framework="pt") as file:
-        about, tensors = json.loads(file.metadata()["clod_adapter"]), load_file(path)
+        about = json.loads(file.metadata()["clod_adapter"])
+        tensors = load_file(path)
     assert about["format"] == "clod-adapter"
     assert about["format_version"] == 3
     assert "package_version" in about
@@ -264,7 +267,8 @@ def test_invalid_files_are_refused(tmp_path: Path) -> None:
         *((text, "settings are damaged") for text in texts),
         (None, "not an adapter"),
     ):
-        text, kept = json.dumps(about), tensors
+        text = json.dumps(about)
+        kept = tensors
         if isinstance(change, dict) and change.keys() <= about.keys():
             text = json.dumps(about | change)
         elif isinstance(change, dict):

@@ -8,7 +8,8 @@ import torch
 
 from clod_adapter import Camera, ClodError
 
-VIEWMAT, K = torch.eye(4), torch.tensor([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]])
+VIEWMAT = torch.eye(4)
+K = torch.tensor([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]])
 
 
 def changed(matrix: torch.Tensor, row: int, column: int, value: float) -> torch.Tensor:
@@ -18,7 +19,7 @@ def changed(matrix: torch.Tensor, row: int, column: int, value: float) -> torch.
 
 
 @pytest.mark.parametrize(
-    ("given", "message"),
+    "given, message",
     [
         ({"viewmat": "a"}, "viewmat is 'a', it must be an array of numbers"),
         ({"viewmat": [[1], [1, 2]]}, "must be an array of numbers"),

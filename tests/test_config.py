@@ -84,7 +84,8 @@ def test_the_papers_form() -> None:
     )
 
 
-number, positive = st.floats(-1e6, 1e6, allow_nan=False), st.floats(1e-9, 1e6)
+number = st.floats(-1e6, 1e6, allow_nan=False)
+positive = st.floats(1e-9, 1e6)
 rows = st.lists(
     st.tuples(st.floats(1, 300, exclude_min=True), number, number, number, positive), max_size=9
 )
@@ -96,10 +97,8 @@ def tables(draw: st.DrawFn) -> Calibration:
         values[0]: values
         for values in [(1.0, *draw(st.tuples(number, number, number)), 2.5), *draw(rows)]
     }
-    machine, against = (
-        draw(st.text(min_size=1, max_size=40)),
-        draw(st.sampled_from(["photographs", "checkpoint"])),
-    )
+    machine = draw(st.text(min_size=1, max_size=40))
+    against = draw(st.sampled_from(["photographs", "checkpoint"]))
     some = [Row(s, psnr, ssim, kept, 0.5, 1.0, ms) for s, kept, psnr, ssim, ms in found.values()]
     places = draw(st.lists(st.builds(Viewpoint, number, number, number, positive), max_size=3))
     about = {"total": 4, "views": 13, "size": (640, 480), "machine": machine, "against": against}
@@ -148,7 +147,7 @@ PLACE = Viewpoint(1.5, 2.5, 3.5, 4.5, look_z=1.0, up_y=-1.0, fov=0.8)
 
 
 @pytest.mark.parametrize(
-    ("good", "bad", "said"),
+    "good, bad, said",
     [
         *(
             (Calibration(**GOOD), {"rows": rows}, "ascend from 1")
@@ -174,7 +173,8 @@ def test_bad_values_are_refused(good: Any, bad: dict[str, Any], said: str) -> No
 
 
 def test_stored_viewpoints_are_cameras_again(tmp_path: Path) -> None:
-    cameras, dialled = ring(3, 40, 30), with_dial(gaussians(4, 0, 0), torch.ones(4))
+    cameras = ring(3, 40, 30)
+    dialled = with_dial(gaussians(4, 0, 0), torch.ones(4))
     viewpoints = tuple(
         viewpoint_of(camera, torch.randn(50, 3), AttenuationConfig()) for camera in cameras
     )

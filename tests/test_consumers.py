@@ -133,7 +133,8 @@ def test_everything_follows_sigma_d_in_its_unit(name: str) -> None:
     """Reaches of other Gaussians change the result; the same ones in another unit do not, to
     rounding.
     """
-    consumer, model = CONSUMERS[name], model_of()
+    consumer = CONSUMERS[name]
+    model = model_of()
     before = consumer(model)
     assert model.sigma_d is not None
     assert not same(consumer(model.replace(sigma_d=model.sigma_d.flip(0))), before)
@@ -220,7 +221,8 @@ def test_results_are_there_and_those_of_the_cpu(
 
 def test_training_stays_there(there: Gaussians, monkeypatch: pytest.MonkeyPatch) -> None:
     """By a plan, whose left-out parts are restored."""
-    plain, views = detach(there), views_of(there)[:1]
+    plain = detach(there)
+    views = views_of(there)[:1]
     scene = Scene(views, ())
     plan = make_plan(plain, scene, SHORT)
     whole = plan.adapt(scene).gaussians

@@ -57,7 +57,7 @@ def test_rounding_between_cameras_has_no_extent() -> None:
     assert in_its_unit(Scene(views, ())).train[0].camera.near == NEAR
 
 
-@pytest.mark.parametrize(("radius", "near"), [(1e-4, 1e-6), (0.5, 5e-3), (2.0, NEAR), (1e4, NEAR)])
+@pytest.mark.parametrize("radius, near", [(1e-4, 1e-6), (0.5, 5e-3), (2.0, NEAR), (1e4, NEAR)])
 def test_near_plane_of_small_scenes(radius: float, near: float) -> None:
     views = tuple(
         View(c, torch.zeros(6, 8, 3, dtype=torch.uint8)) for c in ring(8, 8, 6, radius=radius)
@@ -70,9 +70,11 @@ def test_near_plane_of_small_scenes(radius: float, near: float) -> None:
 
 def test_halved_views_are_means_of_four_pixels() -> None:
     """With the camera of the half size, and a filter with which renders are close to such means."""
-    some, whole = gaussians(300, 1, 0, size=0.2), ring(1, 121, 90)[0]
+    some = gaussians(300, 1, 0, size=0.2)
+    whole = ring(1, 121, 90)[0]
     view = photograph(some, [whole])[0]
-    half, image = view.halved(), view.image[:90, :120].double()
+    half = view.halved()
+    image = view.image[:90, :120].double()
     assert (half.camera.width, half.camera.height) == (60, 45)
     assert (
         float(
@@ -133,12 +135,13 @@ def test_wrong_shapes_are_named() -> None:
             plain(**changes)
 
 
-@pytest.mark.parametrize(("degree", "used"), [(0, 0), (1, 0), (2, 1), (3, 3), (4, 1)])
+@pytest.mark.parametrize("degree, used", [(0, 0), (1, 0), (2, 1), (3, 3), (4, 1)])
 def test_empty_sh_degrees_are_removed(degree: int, used: int) -> None:
     """The highest degrees that are 0 are removed; one coefficient keeps its degree and all
     below.
     """
-    some, bands = gaussians(7, degree, 0), (used + 1) ** 2 - 1
+    some = gaussians(7, degree, 0)
+    bands = (used + 1) ** 2 - 1
     some.shN[:, max(used**2 - 1, 0) :] = 0
     if used:
         some.shN[4, bands - 1, 2] = -1e-30

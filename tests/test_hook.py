@@ -34,8 +34,11 @@ def hook_of(model: Gaussians, virtual_scale: float = 3.0) -> Hook:
 
 def test_mixed_and_strided_arrays_are_accepted() -> None:
     """Mixed numpy and torch, integers, negative strides, the other byte order, and lists."""
-    model, size = adapted(form="paper"), (64, 48)
-    means, a, K = model.means.numpy(), model.opacities.numpy(), camera().K.numpy()
+    model = adapted(form="paper")
+    size = (64, 48)
+    means = model.means.numpy()
+    a = model.opacities.numpy()
+    K = camera().K.numpy()
     pose = np.array([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 2], [0, 0, 0, 1]])
     hook = hook_of(model)
     want = hook(means, a, pose * 1.0, K, *size)
@@ -52,7 +55,8 @@ def test_mixed_and_strided_arrays_are_accepted() -> None:
 
 
 def test_gradients_reach_opacities_sigma_d_and_growth_d_only() -> None:
-    model, view = adapted(), camera()
+    model = adapted()
+    view = camera()
     given = (model.opacities, model.sigma_d, model.growth_d, model.means)
     keep = hook_of(model, 2.0)(model.means, model.opacities, view.viewmat)[1]
     a, sigma, growth, means = (tensor[keep].double().requires_grad_() for tensor in given)
@@ -69,7 +73,8 @@ def test_gradients_reach_opacities_sigma_d_and_growth_d_only() -> None:
 
 
 def test_bad_arguments_are_refused(tmp_path: Path) -> None:
-    model, view = adapted(form="paper"), camera()
+    model = adapted(form="paper")
+    view = camera()
     with pytest.raises(ClodError, match="the paper's form needs K, width and height"):
         hook_of(model)(model.means, model.opacities, view.viewmat)
     with pytest.raises(ClodError, match=r"for 200 Gaussians, but means is \(199, 3\)"):
@@ -136,7 +141,8 @@ class Renderer:
 
     def follow(self, loads: list[float], measured: Callable[[int], float]) -> list[float]:
         """Dial values of frames with these loads, whose times are multiplied by ``measured``."""
-        frames, dial = list[tuple[float, float]](), self.start
+        frames = list[tuple[float, float]]()
+        dial = self.start
         for number, load in enumerate(loads):
             frames.append((dial, self.ms(dial, load) * measured(number)))
             dial = next_dial(frames, BUDGET, MAX_SV)
@@ -166,10 +172,8 @@ def test_it_does_not_oscillate_under_noise_of_20_percent() -> None:
     budget.
     """
     for exponent, fixed, seed in product(EXPONENTS, FIXED, range(2)):
-        renderer, noise = (
-            Renderer(exponent, fixed, start=3.0),
-            np.random.default_rng(seed).lognormal(0.0, 0.2, 400),
-        )
+        renderer = Renderer(exponent, fixed, start=3.0)
+        noise = np.random.default_rng(seed).lognormal(0.0, 0.2, 400)
         dials = np.array(
             renderer.follow([1.0] * 400, lambda frame, noise=noise: float(noise[frame]))
         )

@@ -99,7 +99,8 @@ def test_imports_fall() -> None:
     """No file imports itself by way of others. Its package, whose __init__ runs first, does not
     import it back.
     """
-    wrong, graph = [], dict[str, set[str]]()
+    wrong = []
+    graph = dict[str, set[str]]()
     for path in SOURCES:
         own = module_of(path)
         found = imports_of(path)

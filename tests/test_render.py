@@ -41,7 +41,8 @@ CONFIG = AttenuationConfig(scene_distance=3.0)
 @pytest.mark.filterwarnings("ignore:virtual_scale")
 def test_a_disabled_adapter_is_the_base() -> None:
     """Bit for bit: without a dial at any s, and with a dial without decay at s = 1."""
-    base, view = gaussians(300, 1, 0), camera()
+    base = gaussians(300, 1, 0)
+    view = camera()
     want = render(base, view)
     assert want.image.abs().sum() > 0 and want.kept.all()
     for found in (
@@ -71,8 +72,10 @@ def test_rendering_no_gaussians() -> None:
 
 @pytest.mark.parametrize("form", FORMS)
 def test_a_dial_of_0_shows_the_file_without_its_dial(form: str) -> None:
-    own, view = dialled(400, 1, 3, form=form).replace(growth_d=torch.linspace(0, 1, 400)), camera()
-    found, want = render(own, view, 0.0).image, render(detach(own), view).image
+    own = dialled(400, 1, 3, form=form).replace(growth_d=torch.linspace(0, 1, 400))
+    view = camera()
+    found = render(own, view, 0.0).image
+    want = render(detach(own), view).image
     torch.testing.assert_close(found, want, rtol=0, atol=0 if form == "ours" else 1e-6)
     shown = dial(own, view, 0.0)
     assert bool(shown.keep.all())
@@ -109,7 +112,8 @@ def spread(**settings: str) -> Gaussians:
 @pytest.mark.parametrize("form", FORMS)
 def test_baked_image_matches_render_from_its_camera(form: str) -> None:
     some = spread(form=form)
-    want, baked = render(some, camera(), 2.5), bake(some, 2.5, camera())
+    want = render(some, camera(), 2.5)
+    baked = bake(some, 2.5, camera())
     assert baked.sigma_d is baked.growth_d is baked.attenuation is None
     assert baked.opacity_logits.isfinite().all()
     assert len(baked) == want.kept.sum() and 0 < len(baked) < 300
@@ -117,7 +121,9 @@ def test_baked_image_matches_render_from_its_camera(form: str) -> None:
 
 
 def test_several_cameras_share_one_distance_per_gaussian() -> None:
-    some, cameras, s = spread(), ring(3, 61, 45), 3.0
+    some = spread()
+    cameras = ring(3, 61, 45)
+    s = 3.0
     assert some.sigma_d is not None and some.attenuation is not None
     d = (
         torch.stack([normalized_distances(some.means, each, WORLD).log() for each in cameras])
@@ -140,7 +146,8 @@ def test_several_cameras_share_one_distance_per_gaussian() -> None:
 
 @pytest.mark.parametrize("form", FORMS)
 def test_autocast_changes_nothing(form: str) -> None:
-    some, view = spread(form=form), camera()
+    some = spread(form=form)
+    view = camera()
     for rasterizer in (None, Rasterizer(reference.rasterize)):
         want = render(some, view, 2.0, rasterizer=rasterizer)
         with torch.autocast("cpu"):
@@ -152,7 +159,8 @@ NO_DIALS: Any = (-0.001, math.inf, math.nan, "5", None, [1.0], torch.ones(2), 10
 
 
 def test_bad_arguments_are_refused() -> None:
-    some, plain = spread(), gaussians(3, 0, 0)
+    some = spread()
+    plain = gaussians(3, 0, 0)
     wrong: Any = "a.ply"
     for message, call in {
         **{
@@ -182,9 +190,12 @@ def test_bad_arguments_are_refused() -> None:
             call()
 
 
-N, VIEW, DEFAULTS = 20, camera(24, 18), AttenuationConfig()
+N = 20
+VIEW = camera(24, 18)
+DEFAULTS = AttenuationConfig()
 MODEL = with_dial(gaussians(N, 1, 0), torch.ones(N), DEFAULTS, torch.ones(N))
-HOOK, WHOLE = Hook(MODEL.sigma_d, DEFAULTS, 2.0, MODEL.growth_d), torch.ones(N, dtype=torch.int64)
+HOOK = Hook(MODEL.sigma_d, DEFAULTS, 2.0, MODEL.growth_d)
+WHOLE = torch.ones(N, dtype=torch.int64)
 Drawing = Callable[..., Any]
 
 
@@ -194,7 +205,8 @@ def draws(monkeypatch: pytest.MonkeyPatch) -> dict[str, Drawing]:
     of the dial alone.
     """
     given = {**scene(N, 1, 0), "opacities": MODEL.opacities}
-    colors, points = torch.cat([given.pop("sh0"), given.pop("shN")], 1), given["means"]
+    colors = torch.cat([given.pop("sh0"), given.pop("shN")], 1)
+    points = given["means"]
     ours = fresh_copy(
         monkeypatch, "gsplat", "gsplat", gsplat_versions.module("1.5.3")
     ).rasterization
@@ -238,7 +250,7 @@ def test_a_dial_value_without_a_dial_is_warned_of(draws: dict[str, Drawing], nam
 
 @pytest.mark.parametrize("name", ["gsplat", "inria"])
 @pytest.mark.parametrize(
-    ("given", "message"),
+    "given, message",
     [
         (
             {"growth_d": MODEL.growth_d, "sigma_d": MODEL.sigma_d},
@@ -264,7 +276,7 @@ def test_drop_ins_refuse(
 
 
 @pytest.mark.parametrize(
-    ("call", "message"),
+    "call, message",
     [
         (
             lambda: MODEL.replace(means=MODEL.means.long()),

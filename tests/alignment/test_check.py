@@ -137,7 +137,8 @@ def test_frames_of_trainers(pair: tuple[Gaussians, list[View]]) -> None:
     assert len(of_gsplat) == 5  # without the points, and with each sign of their axes
     for frame in of_gsplat[1:]:
         # The map that takes the cameras there, from where the first one is in both.
-        back, there = torch.linalg.inv(frame.of(viewmats)), torch.linalg.inv(viewmats)
+        back = torch.linalg.inv(frame.of(viewmats))
+        there = torch.linalg.inv(viewmats)
         scale = (back[0, :3, 3] - back[1, :3, 3]).norm() / (
             there[0, :3, 3] - there[1, :3, 3]
         ).norm()
@@ -162,7 +163,7 @@ def seen_with(name: str, views: int = 5) -> tuple[Gaussians, tuple[View, ...]]:
     )
 
 
-@pytest.mark.parametrize(("name", "expected"), [("off", "on"), ("on", "mip"), ("mip", "off")])
+@pytest.mark.parametrize("name, expected", [("off", "on"), ("on", "mip"), ("mip", "off")])
 def test_the_filter_of_the_photographs_is_found(name: str, expected: str) -> None:
     base, views = seen_with(name)
     chosen, psnr = compare_filters(base, views, expected)

@@ -74,7 +74,8 @@ def run_in(capture: Any, dialled: Path) -> Callable[..., Done]:
     shared = dict(zip(("BASE", "SCENE", "DIAL", "ADAPTER"), places, strict=True))
 
     def run(folder: Path, *words: object, code: int = 0, accept: bool = True) -> Done:
-        out, err = io.StringIO(), io.StringIO()
+        out = io.StringIO()
+        err = io.StringIO()
         parts = [
             part for word in words for part in (word.split() if isinstance(word, str) else [word])
         ]

@@ -243,7 +243,7 @@ ERRORS = [
 ]
 
 
-@pytest.mark.parametrize(("line", "said", "existing"), [(*row, "")[:3] for row in ERRORS])
+@pytest.mark.parametrize("line, said, existing", [(*row, "")[:3] for row in ERRORS])
 def test_errors(run_in: Any, folder: Path, line: str, said: str, existing: str) -> None:
     """The line is the last one of stderr; with --json also the one object on stdout."""
     with given(folder, existing):
@@ -267,7 +267,7 @@ def outputs_of(line: str) -> Outputs:
 
 
 @pytest.mark.parametrize(
-    ("first", "second", "said"),
+    "first, second, said",
     [
         (f"base.ply {TINY} -o two.ply", "export dial.ply -o two.safetensors", "two.safetensors"),
         (

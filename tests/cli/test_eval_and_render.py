@@ -70,7 +70,8 @@ def test_base_by_rank_and_popping(clod: Any, capture: Any) -> None:
     assert all(
         entry["row"]["kept_share"] == entry["row"]["kept"] / 300 for entry in report["ranked"]
     )
-    base, views = capture.gaussians, clod_adapter.load_scene(capture.scene).test
+    base = capture.gaussians
+    views = clod_adapter.load_scene(capture.scene).test
     top = base.opacity_logits.argsort(descending=True)[: kept[4]]
     (want,) = clod_adapter.evaluate(base.select(top), views, [1.0])
     by_opacity, by_error = (entry["row"]["psnr"] for entry in report["ranked"][2:])
@@ -149,7 +150,8 @@ def test_eval_at_a_budget(clod: Any, dialled: Path) -> None:
     with notes.
     """
     rows = load(dialled).calibration.rows
-    middle, drop = round(rows[0].kept * 0.4 + rows[-1].kept * 0.6), rows[0].psnr - rows[2].psnr
+    middle = round(rows[0].kept * 0.4 + rows[-1].kept * 0.6)
+    drop = rows[0].psnr - rows[2].psnr
     report = clod(EVAL, "--keep", middle, 300).report
     found, whole = report["rows"]
     s = found["virtual_scale"]
@@ -172,7 +174,8 @@ def test_eval_at_a_budget(clod: Any, dialled: Path) -> None:
 
 
 def test_baking_to_a_budget(clod: Any, dialled: Path) -> None:
-    model, table = load(dialled), load(dialled).calibration
+    model = load(dialled)
+    table = load(dialled).calibration
     rows = tuple(replace(row, frame_ms=8 / row.virtual_scale) for row in table.rows)
     elsewhere = replace(table, rows=rows, machine="another", width=640, height=480)
     save("there.ply", model.gaussians, model, calibration=elsewhere)
@@ -204,7 +207,8 @@ def test_device_presets_are_counts(
     answers, report = view.make_page(args, view.Console(True))
     page = b"".join(answers["/"].blocks()).decode()
     opening = float(re.findall(r'"virtual_scale": ([\d.]+)}', page)[-1])
-    model, scene = load(dialled).gaussians, clod_adapter.load_scene(capture.scene)
+    model = load(dialled).gaussians
+    scene = clod_adapter.load_scene(capture.scene)
     kept = [
         int(clod_adapter.render(model, each.camera, opening).kept.sum())
         for each in scene.train + scene.test
@@ -220,12 +224,11 @@ def test_an_image_per_view(clod: Any, capture: Any, dialled: Path, tmp_path: Pat
     """Of the held-out views, of all, or of one, for which a count is solved."""
     done = clod(RENDER, "out/here --sv 1 3 --beside")
     assert done.report["virtual_scales"] == [1, 3] and not done.report["interrupted"]
-    files, pictures = (
-        sorted(path.name for path in (tmp_path / "out" / "here").iterdir()),
-        done.report["pictures"],
-    )
+    files = sorted(path.name for path in (tmp_path / "out" / "here").iterdir())
+    pictures = done.report["pictures"]
     assert files == ["000.png", "008.png"] == [Path(picture["file"]).name for picture in pictures]
-    scene, gaussians = clod_adapter.load_scene(capture.scene), clod_adapter.load(dialled).gaussians
+    scene = clod_adapter.load_scene(capture.scene)
+    gaussians = clod_adapter.load(dialled).gaussians
     for held_out, picture in zip(scene.test, pictures, strict=True):
         pixels = np.asarray(Image.open(picture["file"]))
         assert pixels.shape == (48, 3 * 64, 3) and (pixels[:, :64] == held_out.image.numpy()).all()

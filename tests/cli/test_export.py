@@ -63,7 +63,8 @@ def files(folder: Path) -> list[str]:
 
 
 def test_baking(clod: Any, capture: Any, dialled: Path) -> None:
-    done, want = clod(EXPORT, "--sv 2 -o x.ply"), baked(dialled, 2.0)
+    done = clod(EXPORT, "--sv 2 -o x.ply")
+    want = baked(dialled, 2.0)
     (output,), data = done.report["outputs"], Path("x.ply").read_bytes()
     assert output == {"file": "x.ply", "virtual_scale": 2, "count": len(want), "bytes": len(data)}
     assert done.report["notes"] == [] and "baked for 8 training cameras; lossy" in done.err
@@ -80,18 +81,18 @@ def test_baking(clod: Any, capture: Any, dialled: Path) -> None:
     assert rows == inria_rows(want).tobytes()
     report = clod(EXPORT, "--sv 2 --images SCENE -o x.ply").report
     cameras = [view.camera for view in clod_adapter.load_scene(capture.scene).train]
-    model, again = load(dialled).gaussians, load("x.ply").gaussians
+    model = load(dialled).gaussians
+    again = load("x.ply").gaussians
     assert report["cameras"] == 8
     torch.testing.assert_close(
         again.opacity_logits, clod_adapter.bake(model, 2.0, cameras=cameras).opacity_logits
     )
 
-    there, camera = (
-        f"{EXPORT} --camera 003 --images SCENE",
-        next(each for each in cameras if each.name == "003.png"),
-    )
+    there = f"{EXPORT} --camera 003 --images SCENE"
+    camera = next(each for each in cameras if each.name == "003.png")
     n = sum(int(clod_adapter.render(model, camera, s).kept.sum()) for s in (4.0, 1.0)) // 2
-    done, plain = clod(there, "-o one.ply --keep", n), load("one.ply")
+    done = clod(there, "-o one.ply --keep", n)
+    plain = load("one.ply")
     (output,) = done.report["outputs"]
     assert done.report["camera"] == "003.png" and output["count"] == n == len(plain.gaussians)
     # there the image is the dial's
@@ -155,7 +156,8 @@ def test_a_lower_sh_degree_is_fitted(clod: Any, capture: Any) -> None:
     capture.write("rich.ply", base)
     report = clod("export rich.ply --sh-degree 1 --images SCENE -o x.ply --json").report
     (note,) = (note for note in report["notes"] if "--sh-degree 1" in note)
-    fitted, cut = load("x.ply").gaussians, base.without_bands(1)
+    fitted = load("x.ply").gaussians
+    cut = base.without_bands(1)
     assert fitted.sh_degree == 1
     assert "against those with degree 3 (fitted to 8 training cameras)" in note
 
@@ -177,7 +179,8 @@ def test_a_lower_sh_degree_is_fitted(clod: Any, capture: Any) -> None:
 
 @pytest.mark.parametrize("suffix", [".ply", ".glb", ".splat"])
 def test_formats(clod: Any, dialled: Path, suffix: str) -> None:
-    model, kept = load(dialled), suffix != ".splat"
+    model = load(dialled)
+    kept = suffix != ".splat"
     done = clod(EXPORT, f"-o x{suffix}", "" if kept else "--sv 1")
     (output,), again = done.report["outputs"], load(f"x{suffix}")
     assert output["bytes"] == Path(f"x{suffix}").stat().st_size and ("lossy" in done.err) != kept
@@ -204,7 +207,8 @@ def test_losses_are_noted(clod: Any, dialled: Path, tmp_path: Path) -> None:
         {"file": "x.splat", "virtual_scale": None, "count": 300, "bytes": 300 * 32}
     ]
     assert "view-dependent colour is dropped" in report["notes"]
-    model, element = load(dialled), PlyData.read(str(dialled), mmap=False)["vertex"]
+    model = load(dialled)
+    element = PlyData.read(str(dialled), mmap=False)["vertex"]
     write_rows(
         tmp_path / "labelled.ply", with_columns(element.data, label=7), comments=element.comments
     )
@@ -218,7 +222,8 @@ def test_losses_are_noted(clod: Any, dialled: Path, tmp_path: Path) -> None:
         model.gaussians.attenuation, calibration=replace(model.calibration, viewpoints=there)
     )
     write_rows(tmp_path / "far.ply", far, comments=write_comments(settings))
-    report, again = clod("export far.ply --sv 2 -o x.ply --json").report, load("x.ply")
+    report = clod("export far.ply --sv 2 -o x.ply --json").report
+    again = load("x.ply")
     assert any("x, y and z are doubles" in note for note in report["notes"])
     assert len(again.gaussians) == len(baked("far.ply", 2.0)) == len(baked(dialled, 2.0))
     assert 436_000 < again.vertex["x"].mean() < 438_000
@@ -227,12 +232,15 @@ def test_losses_are_noted(clod: Any, dialled: Path, tmp_path: Path) -> None:
 def test_order_by_extinction(clod: Any, capture: Any, dialled: Path) -> None:
     """Of a dial without near and far Gaussians, which have no order."""
     assert "have no order" in clod(EXPORT, "--order extinction -o x.ply", code=2).err
-    scene, config = clod_adapter.load_scene(capture.scene), clod_adapter.AdaptConfig(max_sv=4.0)
+    scene = clod_adapter.load_scene(capture.scene)
+    config = clod_adapter.AdaptConfig(max_sv=4.0)
     clod_adapter.save("dial.ply", initialize(capture.gaussians, scene.train, config))
-    model, words = load("dial.ply"), "export dial.ply --images SCENE --json --order extinction"
+    model = load("dial.ply")
+    words = "export dial.ply --images SCENE --json --order extinction"
     cameras = [view.camera for view in scene.train]
     rows = clod_adapter.order_by_extinction(model.gaussians, cameras)
-    report, ordered = clod(words, "-o ordered.ply").report, load("ordered.ply")
+    report = clod(words, "-o ordered.ply").report
+    ordered = load("ordered.ply")
     assert report["order"] == "extinction" and ordered.gaussians == model.gaussians.select(rows)
     assert any("rows in the order" in comment for comment in ordered.comments)
     n = len(clod_adapter.bake(model.gaussians, 3.0, cameras=cameras))
@@ -247,7 +255,8 @@ def test_order_by_extinction(clod: Any, capture: Any, dialled: Path) -> None:
 
 def test_splat_transform(clod: Any, dialled: Path, tmp_path: Path, tool: Any) -> None:
     tool()
-    done, said = clod(EXPORT, "--sv 4 -o x.sog"), json.loads(Path("x.sog").read_text())
+    done = clod(EXPORT, "--sv 4 -o x.sog")
+    said = json.loads(Path("x.sog").read_text())
     notes = done.report["notes"]
     assert " took " in done.err and "splat-transform rounds values and sorts the Gaussians" in notes
     assert any("without a GPU" in note for note in notes) and files(tmp_path) == ["x.sog"]
@@ -315,7 +324,8 @@ def test_the_real_tool(clod: Any, dialled: Path, tmp_path: Path) -> None:
 def test_page_holds_the_splat_and_its_dial(clod: Any, dialled: Path, tmp_path: Path) -> None:
     def page(*words: str, held: str) -> tuple[Any, Any, Any]:
         """What was printed, the settings of the page, and the splat in it."""
-        done, text = clod(EXPORT, "-o page.html", *words), Path("page.html").read_text("utf-8")
+        done = clod(EXPORT, "-o page.html", *words)
+        text = Path("page.html").read_text("utf-8")
         data, config = (
             re.findall(f'id="clod-{part}">(.*?)</script>', text)[0] for part in ("model", "config")
         )

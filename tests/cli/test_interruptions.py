@@ -103,7 +103,8 @@ def test_one_interrupt_of_training_writes_the_result_so_far(
     assert contents(tmp_path / STATE) == before
     os.kill(child, signal.SIGINT)
     os.kill(child, signal.SIGCONT)
-    code, log = server.wait(child), log_of(tmp_path)
+    code = server.wait(child)
+    log = log_of(tmp_path)
     report = json.loads((tmp_path / "dial.json").read_text())
     assert code == 0, log
     assert report["interrupted"], log
@@ -121,8 +122,10 @@ def test_one_interrupt_of_training_writes_the_result_so_far(
     assert json.loads((tmp_path / "dial.json").read_text())["resumed_from"] == report["steps"]
 
 
-INT, TERM = signal.SIGINT, signal.SIGTERM
-SAVING, BOTH = (listeners, "save_state"), sorted([*OUTPUTS, STATE])  # while training
+INT = signal.SIGINT
+TERM = signal.SIGTERM
+SAVING = (listeners, "save_state")
+BOTH = sorted([*OUTPUTS, STATE])  # while training
 ABORTED = f"--resume resumes from step {ITERS}, which is in {STATE}\nclod-adapt: interrupted"
 # where signals arrive, which, exit code, files, and the report's "interrupted" or the end of stderr
 MOMENTS = [
@@ -135,7 +138,7 @@ MOMENTS = [
 ]
 
 
-@pytest.mark.parametrize(("place", "numbers", "code", "files", "said"), MOMENTS)
+@pytest.mark.parametrize("place, numbers, code, files, said", MOMENTS)
 def test_signals_at_a_moment(
     clod: Any,
     words: Any,

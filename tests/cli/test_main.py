@@ -34,7 +34,7 @@ BUG = (
 
 
 @pytest.mark.parametrize(
-    ("error", "code", "said"),
+    "error, code, said",
     [
         (
             OSError(28, "No space left on device", "a/file"),

@@ -49,7 +49,8 @@ def test_the_command_a_cell_and_python_train_the_same(
     monkeypatch.setattr(pseudo_views, "MANY", 64)
     clod("BASE --images SCENE --iters 3 --max-sv 3 --out dial.ply")
     clod("robustness BASE --images SCENE --iters 3 --max-sv 3 --out out")
-    base, scene = load(capture.ply), load_scene(capture.scene)
+    base = load(capture.ply)
+    scene = load_scene(capture.scene)
     result = clod_adapter.adapt_checkpoint(
         base, scene, clod_adapter.AdaptConfig(iters=3, max_sv=3.0)
     )
@@ -94,7 +95,8 @@ def test_outputs_of_all_cells(
 ) -> None:
     monkeypatch.setattr("clod_adapter.cli.shared.console.LINE_EVERY", 0)
     done = run("--json")
-    report, folder = done.report, tmp_path / "robustness"
+    report = done.report
+    folder = tmp_path / "robustness"
     assert names(folder) == ["cells", *OUTPUTS]
     assert report == json.loads((folder / "robustness.json").read_text())
     cells = {(cell["checkpoint"], cell["max_sv"]): cell["rows"] for cell in report["cells"]}
@@ -119,7 +121,8 @@ def test_outputs_of_all_cells(
     assert Image.open(folder / "robustness.png").size[0] > 2000
     clod("apply plain.ply robustness/cells/plain_sv3.safetensors -o x.ply")
     scene = clod_adapter.load_scene(report["scene"])
-    base, shares = clod_adapter.load("plain.ply").gaussians, experiment.BASELINE_SHARES
+    base = clod_adapter.load("plain.ply").gaussians
+    shares = experiment.BASELINE_SHARES
     assert [row["kept"] for row in cells["plain", None]] == [round(300 * share) for share in shares]
     few = base[base.opacities.argsort(descending=True)[: round(300 * shares[-1])]]
     assert clod_adapter.evaluate(few, scene.test, [1.0])[0].psnr == pytest.approx(
@@ -189,7 +192,8 @@ def test_demo(clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.Monke
     monkeypatch.setattr(config, "STEPS", 2)
     monkeypatch.setattr(config, "STEPS_PER_VIEW", 0)
     monkeypatch.setattr(adapt_run, "LOST", (99.0, 99.0))  # two steps cannot keep full quality
-    folder, state = tmp_path / "-odd", Path("-odd/gallery.resume.safetensors")
+    folder = tmp_path / "-odd"
+    state = Path("-odd/gallery.resume.safetensors")
     with monkeypatch.context() as patch:
         patch.setattr(
             listeners,
@@ -224,10 +228,12 @@ def test_scene_and_base_of_the_package(tmp_path: Path) -> None:
     """The base is trained to its end, and packing it and the photographs cost little."""
     files = [Path(gallery.__file__).with_name(name) for name in ("base.spz", "capture.zip")]
     assert files[0].stat().st_size < 2e6 and sum(path.stat().st_size for path in files) < 3e6
-    capture, base = tmp_path / "capture", tmp_path / "base.ply"
+    capture = tmp_path / "capture"
+    base = tmp_path / "base.ply"
     for _ in range(2):  # what exists is left
         gallery.unpack(capture, base)
-    scene, checkpoint = load_scene(capture), load(base)
+    scene = load_scene(capture)
+    checkpoint = load(base)
     assert (len(scene.train), len(scene.test), checkpoint.notes, scene.notes) == (70, 10, (), ())
     assert evaluate(checkpoint.gaussians, scene.test[:2], [0])[0].psnr > 30
 

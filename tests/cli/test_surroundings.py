@@ -71,7 +71,7 @@ def test_full_disk_while_adapting(clod: Any, dialled: Path, tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize(
-    ("size", "line"),
+    "size, line",
     [
         (2000, "export DIAL -o x.ply"),
         (2000, "export DIAL -o x.html"),
@@ -105,7 +105,7 @@ NO_ROOT = "" if os.geteuid() else "import ctypes; assert ctypes.CDLL(None).unsha
 
 
 @pytest.mark.parametrize(
-    ("path", "mode", "said"),
+    "path, mode, said",
     [
         ("base.ply", 0, "base.ply: cannot be read (Permission denied); check the path"),
         (

@@ -98,7 +98,8 @@ def test_dial_values_and_files_of_a_page(
         "ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nend_header\n"
     )
     answers, report, config = page_of(tmp_path, tmp_path / "more" / "lod2.ply")
-    entries, folder = [config["model"], *config["others"]], tmp_path.name
+    entries = [config["model"], *config["others"]]
+    folder = tmp_path.name
     assert [entry["name"] for entry in entries] == [
         f"{folder}/lod2.ply",
         f"{folder}/lod10.ply",
@@ -155,8 +156,10 @@ def test_a_plain_file_fits_on_a_screen(clod: Any, capture: Any) -> None:
 
 
 def test_a_dial_and_its_calibration(clod: Any, dialled: Path) -> None:
-    text, report = clod("inspect DIAL").out, clod("inspect DIAL --json").report
-    lines, splat = text.splitlines(), report["splat"]
+    text = clod("inspect DIAL").out
+    report = clod("inspect DIAL --json").report
+    lines = text.splitlines()
+    splat = report["splat"]
     assert "written by   clod-adapter" in text
     assert "s = 1 to 4, distances in world units" in text
     assert len(lines) <= 32
@@ -186,7 +189,8 @@ def test_a_dial_and_its_calibration(clod: Any, dialled: Path) -> None:
 
 
 def test_adapter(clod: Any) -> None:
-    text, about = clod("inspect ADAPTER").out, clod("inspect ADAPTER --json").report["about"]
+    text = clod("inspect ADAPTER").out
+    about = clod("inspect ADAPTER --json").report["about"]
     assert "an adapter" in text
     assert "with SHA-256 " in text
     assert "max_sv 4" in text

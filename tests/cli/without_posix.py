@@ -84,7 +84,8 @@ def watch(event, given):
                 )
 
 
-READ, busy = os.open, False
+READ = os.open
+busy = False
 for module, names in ((os, ABSENT), (signal, SIGNALS)):
     for name in names:
         delattr(module, name)

@@ -165,7 +165,8 @@ def run(words: list[str]) -> None:
 @pytest.mark.parametrize("page", PAGES, ids=IDS)
 def test_named_options_exist(page: Path) -> None:
     """Also of commands that are not run; each reason for not running a block stands above it."""
-    written, text = blocks(page), page.read_text(encoding="utf-8")
+    written = blocks(page)
+    text = page.read_text(encoding="utf-8")
     said = [command.split() for command in spoken(page, "clod-adapt")]
     for words in [*said, *(words for block in written for words in block.commands())]:
         if words[0] == "clod-adapt":
@@ -183,7 +184,8 @@ def test_named_options_exist(page: Path) -> None:
     assert text.count("<!-- not run:") == sum(bool(block.reason) for block in written), page.name
 
 
-DOCS, RESULTS = ROOT / "docs", ROOT / "benchmarks" / "results"
+DOCS = ROOT / "docs"
+RESULTS = ROOT / "benchmarks" / "results"
 
 
 def keys(value: Any) -> Iterator[str]:

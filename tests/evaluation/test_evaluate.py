@@ -96,7 +96,8 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     """
 
     def install(cost: Callable[[int, float], float]) -> list[tuple[str, float]]:
-        drawn, now = list[tuple[str, float]](), [0.0]
+        drawn = list[tuple[str, float]]()
+        now = [0.0]
 
         def draw(some: Gaussians, camera: Camera, s: float) -> None:
             now[0] += cost(len(drawn), s)
@@ -183,8 +184,10 @@ def kept(some: Gaussians, cameras: Sequence[Camera], s: float) -> int:
 def test_counts_are_exact_up_to_ties(
     n: int, seed: int, views: int, share: float, form: str
 ) -> None:
-    some, cameras = adapted(n, seed, form), ring(views, 48, 36)
-    most, fewest = kept(some, cameras, 1.0), kept(some, cameras, MAX_SV)
+    some = adapted(n, seed, form)
+    cameras = ring(views, 48, 36)
+    most = kept(some, cameras, 1.0)
+    fewest = kept(some, cameras, MAX_SV)
     wanted = fewest + round(share * (most - fewest if share > 0 else fewest))
     assume(wanted >= views)
     solved = dial_for(some, keep=wanted / views, cameras=cameras)
@@ -246,7 +249,8 @@ def test_a_frame_rate_is_reached_for_good() -> None:
 
 
 def test_bad_arguments_are_refused() -> None:
-    some, camera = adapted(5, 0), ring(1, 48, 36)
+    some = adapted(5, 0)
+    camera = ring(1, 48, 36)
     refused: tuple[tuple[dict[str, float], str], ...] = (
         ({}, "exactly one of keep, psnr_drop and fps"),
         ({"keep": 3, "fps": 3}, "exactly one of keep, psnr_drop and fps"),

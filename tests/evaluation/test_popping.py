@@ -69,7 +69,8 @@ def test_popping_of_a_fade_and_of_a_switch() -> None:
 
 
 def test_dial_sweep_measures_its_renders() -> None:
-    some, camera = dialled(), ring(3, 32, 24)[1]
+    some = dialled()
+    camera = ring(3, 32, 24)[1]
     seen = []
     result = dial_popping(
         some, camera, 3.0, steps=4, progress=lambda now: seen.append((now.done, now.total))
@@ -84,7 +85,8 @@ def test_dial_sweep_measures_its_renders() -> None:
 
 
 def test_camera_motion_alone_is_no_change() -> None:
-    some, cameras = dialled(), ring(12, 32, 24)[:3]
+    some = dialled()
+    cameras = ring(12, 32, 24)[:3]
     still = path_popping(some.replace(sigma_d=torch.full((200,), 1e9)), cameras, 3.0, steps=6)
     assert still.largest == 0 and still.pixel == 0
     moved = path_popping(some, cameras, 3.0, steps=6)
@@ -113,7 +115,8 @@ def adversary(form: str) -> tuple[Gaussians, list[Camera]]:
     behind them, of which one is far away and comes into view once the camera has turned.
     """
     camera = ring(1, 32, 24)[0]
-    forward, right = camera.viewmat[2, :3], camera.viewmat[0, :3]
+    forward = camera.viewmat[2, :3]
+    right = camera.viewmat[0, :3]
     means = torch.cat(
         [torch.zeros(4, 3), torch.stack([forward, 2 * forward, 60 * forward + 40 * right])]
     )
@@ -123,10 +126,8 @@ def adversary(form: str) -> tuple[Gaussians, list[Camera]]:
         opacity_logits=torch.full((7,), 3.0),
         sh0=torch.tensor([1.7] * 4 + [-1.7] * 3)[:, None, None].expand(7, 1, 3),
     )
-    config, ends = (
-        AttenuationConfig(form=form, scene_distance=4.0),
-        torch.tensor([2.2] * 4 + [3.0, 4.0, 5.0]),
-    )
+    config = AttenuationConfig(form=form, scene_distance=4.0)
+    ends = torch.tensor([2.2] * 4 + [3.0, 4.0, 5.0])
     sigma = ends * normalized_distances(means, camera, config)
     if form == "paper":
         sigma = sigma / (2 * (some.opacities / (TAU * ends)).log()).sqrt()
@@ -166,12 +167,14 @@ def lines_of_sight(seed: int) -> tuple[Gaussians, Camera]:
     little less than T_MIN at s = 1, and more as they fade. On the first line, a black one fades in
     front of a white one that ends the pixel.
     """
-    random, rows = np.random.default_rng(seed), []
+    random = np.random.default_rng(seed)
+    rows = []
     for x, y in product(range(-44, 48, 8), range(-32, 36, 8)):
         count = 2 if not rows else random.integers(2, 5)
         decades = random.dirichlet(np.ones(count)) * random.uniform(4, 4.4)
         for opacity in 1 - 10**-decades:
-            depth, reach = random.uniform(2, 3), random.uniform(1, 2.5)
+            depth = random.uniform(2, 3)
+            reach = random.uniform(1, 2.5)
             rows.append(
                 [x, y, depth, opacity, depth * reach, random.integers(2), random.uniform(-1, 1)]
             )

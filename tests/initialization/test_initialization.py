@@ -88,7 +88,7 @@ def distances_of(some: Gaussians, views: tuple[View, ...]) -> Tensor:
     return typical_distance(some.means, [view.camera for view in views], some.attenuation)
 
 
-@pytest.mark.parametrize(("share", "exponent"), [(0.51, 1.5), (0.8, 2.5), (1.0, 1.5)])
+@pytest.mark.parametrize("share, exponent", [(0.51, 1.5), (0.8, 2.5), (1.0, 1.5)])
 def test_kept_shares_follow_the_target_curve(share: float, exponent: float, n: int = 1000) -> None:
     """At the distances of the initialization, ``1 / (s^p + (1/share - 1) s^-p)``, to one
     Gaussian.
@@ -104,10 +104,8 @@ def test_initialization_culls_in_the_pruning_order() -> None:
     """In which one that a neighbour replaces goes earlier than by its removal error alone."""
     some, views = dialled(200)
     assert some.sigma_d is not None
-    error, found = (
-        removal_error(some, views, seed=0),
-        (some.sigma_d / distances_of(some, views)).argsort(),
-    )
+    error = removal_error(some, views, seed=0)
+    found = (some.sigma_d / distances_of(some, views)).argsort()
     order = pruning.pruning_order(some, error.sqrt() * some.opacities).position
     assert torch.equal(found[100:180], order.argsort()[100:180])
     assert not torch.equal(order.argsort()[100:180], error.argsort(stable=True)[100:180])
@@ -115,12 +113,16 @@ def test_initialization_culls_in_the_pruning_order() -> None:
 
 def plainly(some: Gaussians, worth: Tensor) -> list[int]:
     """The order computed round by round and pair by pair."""
-    worths, left, order = worth.double().tolist(), list(range(len(some))), []
-    centres, colours = some.means.double(), 0.5 + SH_C0 * some.sh0[:, 0].double()
+    worths = worth.double().tolist()
+    left = list(range(len(some)))
+    order = []
+    centres = some.means.double()
+    colours = 0.5 + SH_C0 * some.sh0[:, 0].double()
     sizes = some.log_scales.double().exp().amax(1)
 
     def unlike(i: int, j: int) -> float:
-        apart, reach = (centres[i] - centres[j]).square().sum(), (sizes[i] + sizes[j]).square()
+        apart = (centres[i] - centres[j]).square().sum()
+        reach = (sizes[i] + sizes[j]).square()
         return float(
             (colours[i] - colours[j]).square().sum()
             + COLOUR_FLOOR**2
@@ -149,9 +151,10 @@ def plainly(some: Gaussians, worth: Tensor) -> list[int]:
     return order + left
 
 
-@pytest.mark.parametrize(("n", "seed"), [(0, 0), (1, 0), (2, 0), (60, 1)])
+@pytest.mark.parametrize("n, seed", [(0, 0), (1, 0), (2, 0), (60, 1)])
 def test_order_matches_the_plain_implementation(n: int, seed: int) -> None:
-    some, seen = gaussians(n, 1, seed), []
+    some = gaussians(n, 1, seed)
+    seen = []
     worth = torch.rand(n, generator=torch.Generator().manual_seed(seed))
     order = pruning.pruning_order(
         some, worth, lambda now: seen.append((now.done, now.total))
@@ -162,7 +165,8 @@ def test_order_matches_the_plain_implementation(n: int, seed: int) -> None:
 
 def test_coincident_gaussians_are_moved_apart() -> None:
     """A k-d tree cannot separate coincident points and would compare all pairs."""
-    some, seen = gaussians(2000, 0, 0), []
+    some = gaussians(2000, 0, 0)
+    seen = []
     alike = some.replace(means=torch.zeros(2000, 3), sh0=torch.zeros(2000, 1, 3))
     # Of no worth and no size at all: ties, and nothing to divide by.
     for one in (alike, alike.replace(log_scales=torch.full((2000, 3), -400.0))):
@@ -177,9 +181,11 @@ MAX_SV = 5.0
 
 
 def test_exponents_are_in_range_and_0_without_descendants() -> None:
-    some, d = gaussians(400, 0, 0), torch.full((400,), 0.9)
+    some = gaussians(400, 0, 0)
+    d = torch.full((400,), 0.9)
     order = pruning.pruning_order(some, torch.rand(400, generator=torch.Generator().manual_seed(0)))
-    config, sigma_d = AttenuationConfig(max_sv=MAX_SV), d * (1 + 9 * (order.position + 1) / 400)
+    config = AttenuationConfig(max_sv=MAX_SV)
+    sigma_d = d * (1 + 9 * (order.position + 1) / 400)
     found = pruning.initial_growth(
         some.replace(sigma_d=sigma_d, attenuation=config), order.substitute, d
     )

@@ -38,7 +38,8 @@ def loss_of(dial: Dial, scene: Scene, s: float) -> Tensor:
 def test_the_objective_is_that_of_adapt(captured: Pair) -> None:
     """All gradients, of the splats too, at one view and dial value."""
     base, scene = captured
-    splats, s = trainable(base), 2.3
+    splats = trainable(base)
+    s = 2.3
     dial = attach(splats, scene, seed=3)
     # the first is of the dial values
     counted = (OURS.counted * MAX_SV) ** np.random.default_rng(3).random(2)[1]

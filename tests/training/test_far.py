@@ -42,7 +42,8 @@ def test_far_ones_take_over_from_near_ones() -> None:
     does not fade yet.
     """
     config = AttenuationConfig(near_distance=2.0)
-    d, s = torch.linspace(0, 4, 4001, dtype=torch.float64), 1.5
+    d = torch.linspace(0, 4, 4001, dtype=torch.float64)
+    s = 1.5
     near, far = (
         attenuate(torch.full_like(d, 0.8), torch.full_like(d, sigma), d, s, config, activated=True)
         for sigma in (0.0, 1e6)
@@ -135,7 +136,8 @@ def test_counts_and_baking(
     cameras = [view.camera for view in both[1].train]
     found = dial_for(adapted, keep=80, cameras=cameras, baked=True).virtual_scale
     assert 60 < len(bake(adapted, found, cameras=cameras)) <= 80
-    camera, s = cameras[0], 1.7
+    camera = cameras[0]
+    s = 1.7
     assert torch.allclose(
         clod.render(bake(adapted, s, camera), camera).image,
         clod.render(adapted, camera, s).image,

@@ -72,7 +72,9 @@ def test_a_second_run_continues_from_sigma_d(captured: Pair, trained: Gaussians)
     """No importance pass; the unit is the file's reference distance, or the views' where another
     tool dropped it.
     """
-    first, phases, config = trained, list[Phase](), config_of(iters=1, max_sv=3.0)
+    first = trained
+    phases = list[Phase]()
+    config = config_of(iters=1, max_sv=3.0)
     unknown = first.replace(attenuation=replace(first.attenuation, reference_distance=0.0))
     for given, want in (
         (first, first.attenuation.reference_distance),
@@ -110,7 +112,8 @@ def test_result_is_the_mean_of_the_last_steps(captured: Pair) -> None:
 
 def test_time_budget_ends_training(captured: Pair) -> None:
     """The budget includes the time of an earlier part of the run."""
-    config, states = config_of(iters=10_000_000, time_budget=0.2), dict[int, TrainingState]()
+    config = config_of(iters=10_000_000, time_budget=0.2)
+    states = dict[int, TrainingState]()
     result = adapt(*captured, config, states_of({3}, states))
     assert 0 < result.steps < 10_000 and 0.2 <= result.seconds < 5 and not result.interrupted
     assert adapt(*captured, config_of(iters=3, time_budget=60.0)).steps == 3
@@ -184,7 +187,8 @@ def test_a_row_with_a_nonfinite_gradient_is_not_stepped(
 
     base, scene = captured
     change_step(monkeypatch, 1, spoil)
-    seen, config = list[Gaussians](), config_of(iters=12)
+    seen = list[Gaussians]()
+    config = config_of(iters=12)
     result = adapt(
         base,
         scene,

@@ -29,7 +29,8 @@ from scenes import assert_equal, gaussians, photograph, ring
 
 Pair = tuple[Gaussians, Scene]
 CONFIG = AdaptConfig(iters=20, max_sv=4.0, start_share=0.62)
-ALL, LIMIT = frozenset(NAMES), 0.02
+ALL = frozenset(NAMES)
+LIMIT = 0.02
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +64,8 @@ def test_sh_degrees_are_kept_or_left_out(visible: Pair) -> None:
     assert empty.decisions[0].number == 0
     assert empty.sh_degree == 0
     # A view that gains makes up for none that loses.
-    strong, cameras = base.replace(shN=20 * base.shN), [view.camera for view in scene.train[:4]]
+    strong = base.replace(shN=20 * base.shN)
+    cameras = [view.camera for view in scene.train[:4]]
     mixed = (*photograph(strong, cameras[:2]), *photograph(strong.without_bands(0), cameras[2:]))
     assert make_plan(strong, Scene(mixed, ()), CONFIG).sh_degree == 1
     plan = make_plan(base.without_bands(0), scene, CONFIG, Override(keep=ALL))

@@ -31,7 +31,8 @@ def blob() -> clod.Gaussians:
 
 def test_images_are_renders_of_the_checkpoint(blob: clod.Gaussians) -> None:
     """Renders of a file with a dial are at s = 1."""
-    cameras, told = scenes.ring(9, 40, 30), []
+    cameras = scenes.ring(9, 40, 30)
+    told = []
     own = clod.with_dial(
         blob, torch.full((len(blob),), 0.3), clod.AttenuationConfig(scene_distance=4.0)
     )
@@ -94,7 +95,8 @@ def test_moved_cameras_have_the_documented_offsets(blob: clod.Gaussians) -> None
     """Of position, direction and focal length; some step back along their direction of view, up to
     FARTHER reaches.
     """
-    camera, rng = scenes.ring(1, 40, 30)[0], np.random.default_rng(0)
+    camera = scenes.ring(1, 40, 30)[0]
+    rng = np.random.default_rng(0)
     near, back = (
         [PseudoView(camera, blob, 3.0, far).moved(rng).camera for _ in range(500)]
         for far in (0.0, 1.0)
@@ -118,7 +120,8 @@ def ball(n: int, seen_from: Tensor) -> clod.Gaussians:
     seen half alone.
     """
     k = torch.arange(n) + 0.5
-    z, turn = 1 - 2 * k / n, math.pi * (1 + 5**0.5) * k
+    z = 1 - 2 * k / n
+    turn = math.pi * (1 + 5**0.5) * k
     means = torch.stack([(1 - z * z).sqrt() * turn.cos(), (1 - z * z).sqrt() * turn.sin(), z], 1)
     means = torch.cat([means, torch.tensor([[0.0, 0.0, 1e4]])])
     logs = torch.full((n + 1, 3), 0.05).log()
@@ -128,7 +131,8 @@ def ball(n: int, seen_from: Tensor) -> clod.Gaussians:
         facing[:, None, None]
         * torch.stack([-seen_from[1], seen_from[2], -seen_from[0]])[None, :, None]
     )
-    quats, sh0 = torch.tensor([[1.0, 0, 0, 0]]).repeat(n + 1, 1), torch.zeros(n + 1, 1, 3)
+    quats = torch.tensor([[1.0, 0, 0, 0]]).repeat(n + 1, 1)
+    sh0 = torch.zeros(n + 1, 1, 3)
     return clod.Gaussians(means, quats, logs, torch.full((n + 1,), 3.0), sh0, shN.repeat(1, 1, 3))
 
 
@@ -162,13 +166,14 @@ def test_a_scene_gets_as_many_cameras_as_show_it(monkeypatch: pytest.MonkeyPatch
     street = {name: torch.cat([value] * 8) for name, value in one.tensors().items()}
     street["means"] = torch.cat([one.means + torch.tensor([8.0 * x, 0.0, 0.0]) for x in range(8)])
     many = clod.Gaussians(**street)
-    few, more = place_cameras(one), place_cameras(many)
+    few = place_cameras(one)
+    more = place_cameras(many)
     assert 8 <= len(few) < len(more) <= 40 and len({c.name for c in more}) == len(more)
     seen = torch.stack([coverage(many, many.opacities, camera) for camera in more]).amax(0)
     assert float((seen >= 0.5).float().mean()) > 0.9
 
 
-@pytest.mark.parametrize(("axis", "few"), [(0, False), (2, True)])
+@pytest.mark.parametrize("axis, few", [(0, False), (2, True)])
 def test_cameras_face_the_side_where_sh_was_trained(
     axis: int, few: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -51,7 +51,8 @@ def test_a_resumed_run_ends_with_the_same_bits(captured: Pair, form: str) -> Non
         base = with_dial(
             base, torch.full((len(base),), 1.5), AttenuationConfig(form="paper", max_sv=3.0)
         )
-    config, states = config_of(**{"iters": 12, **RESUMED[form]}), dict[int, TrainingState]()
+    config = config_of(**{"iters": 12, **RESUMED[form]})
+    states = dict[int, TrainingState]()
     whole = adapt(base, scene, config, states_of({1, 6, 10, 11}, states))
     if form == "sigma_d alone":
         start = adapt(base, scene, replace(config, iters=0)).gaussians
@@ -81,7 +82,8 @@ def default_handler() -> Iterator[None]:
 
 def test_an_interrupt_within_the_update_completes_the_step(monkeypatch: pytest.MonkeyPatch) -> None:
     given = *capture(60, views=4, width=16, height=12), AdaptConfig(iters=12, max_sv=3.0)
-    whole, states = adapt(*given).gaussians, list[Any]()
+    whole = adapt(*given).gaussians
+    states = list[Any]()
     monkeypatch.setattr(trainer, "spoilt_rows", pressing(trainer.spoilt_rows, signal.SIGINT, at=5))
     found = adapt(*given, lambda now: states.append(now.state) if now.state else None)
     assert found.interrupted and found.signalled and found.steps == 5
@@ -90,7 +92,8 @@ def test_an_interrupt_within_the_update_completes_the_step(monkeypatch: pytest.M
 
 
 def test_other_handlers_are_not_affected() -> None:
-    heard, stop = list[int](), GracefulStop()
+    heard = list[int]()
+    stop = GracefulStop()
     signal.signal(signal.SIGINT, lambda number, frame: heard.append(number))
     with stop.listening(in_place_of=signal.default_int_handler):
         signal.raise_signal(signal.SIGINT)
@@ -106,7 +109,8 @@ def pair() -> Pair:
     """Photographs of Gaussians without SH degrees, which a turned scene would have to turn, and a
     perturbed copy.
     """
-    truth, random = gaussians(400, 0, 0, size=0.15), torch.Generator().manual_seed(1)
+    truth = gaussians(400, 0, 0, size=0.15)
+    random = torch.Generator().manual_seed(1)
     by = {"means": 0.01, "log_scales": 0.1, "sh0": 0.1, "opacity_logits": 0.3}
     changed = {
         n: t + by.get(n, 0.0) * torch.randn(t.shape, generator=random)
@@ -125,11 +129,10 @@ def results(base: Gaussians, scene: Scene) -> list[tuple[float, float]]:
 
 def placed(base: Gaussians, scene: Scene, scale: float, shift: float) -> Pair:
     """The scene turned by TURN, ``scale`` times as large and moved by ``shift``."""
-    turn, quats = torch.from_numpy(TURN.as_matrix()), base.quats.double().roll(-1, 1)
-    means, quats = (
-        scale * base.means.double() @ turn.T + shift,
-        (TURN * Rotation.from_quat(quats)).as_quat(),
-    )
+    turn = torch.from_numpy(TURN.as_matrix())
+    quats = base.quats.double().roll(-1, 1)
+    means = scale * base.means.double() @ turn.T + shift
+    quats = (TURN * Rotation.from_quat(quats)).as_quat()
     moved = base.replace(
         means=means.float(),
         quats=torch.from_numpy(quats).float().roll(1, 1),
@@ -151,7 +154,8 @@ def test_unit_direction_and_place(pair: Pair) -> None:
     """Within the noise of roundings, large in a scene so small; farther away, ``Checkpoint.origin``
     is for float32.
     """
-    found, wanted = results(*placed(*pair, 1024.0, 1024.0 * 100)), results(*pair)
+    found = results(*placed(*pair, 1024.0, 1024.0 * 100))
+    wanted = results(*pair)
     for (psnr, kept), (other, share) in zip(found, wanted, strict=True):
         assert psnr == pytest.approx(other, abs=0.5), (
             found,
@@ -179,7 +183,8 @@ def test_a_far_camera_changes_no_length(pair: Pair) -> None:
 
 def session_of(capture: Any) -> tuple[list[Tensor], str]:
     """Of a session from files to a baked dial value."""
-    base, scene = clod.load(capture.ply).gaussians, clod.load_scene(capture.scene)
+    base = clod.load(capture.ply).gaussians
+    scene = clod.load_scene(capture.scene)
     adapted = clod.adapt(base, scene, clod.AdaptConfig(iters=4, max_sv=3), progress=False).gaussians
     cameras = [view.camera for view in scene.train]
     image = clod.render(adapted, cameras[0], virtual_scale=2).image

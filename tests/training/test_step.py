@@ -61,7 +61,8 @@ def test_first_steps_have_photographs_of_half_the_size() -> None:
         K=torch.tensor([[90.0, 0, 150], [0, 90, 129], [0, 0, 1]]),
     )
     image = torch.randint(256, (258, 301, 3), generator=torch.Generator().manual_seed(0)).byte()
-    large, small = View(whole, image), View(replace(whole, height=255), image[:255])
+    large = View(whole, image)
+    small = View(replace(whole, height=255), image[:255])
     cases = (
         (large, 0.49, 0.0, True),
         (large, 0.5, 0.0, False),
@@ -173,7 +174,7 @@ def everything(n: int) -> Tensor:
 
 @pytest.mark.parametrize("kind", [RowAdam, PlainRowAdam])
 @pytest.mark.parametrize(
-    ("steps", "beta1", "beta2", "epsilon"),
+    "steps, beta1, beta2, epsilon",
     [(12, 0.9, 0.999, 1e-15), (90, 0.5, 0.8, 1e-2)],
     ids=["defaults", "past the last bias correction that is stored, the 79th"],
 )
@@ -181,7 +182,8 @@ def test_all_rows_match_torch_adam(
     kind: type[RowAdam], steps: int, beta1: float, beta2: float, epsilon: float, n: int = 57
 ) -> None:
     """In units: the rates of rows are multiplied by them."""
-    ours, theirs = parameters(n), {name: p.requires_grad_() for name, p in parameters(n).items()}
+    ours = parameters(n)
+    theirs = {name: p.requires_grad_() for name, p in parameters(n).items()}
     units = torch.linspace(0.1, 2, n)
     optimizer = kind(ours, beta1=beta1, beta2=beta2, epsilon=epsilon, units={"means": units})
     adam = torch.optim.Adam(theirs.values(), lr=0.02, betas=(beta1, beta2), eps=epsilon)
@@ -197,17 +199,15 @@ def test_all_rows_match_torch_adam(
 
 
 @pytest.mark.parametrize("kind", [RowAdam, PlainRowAdam])
-@pytest.mark.parametrize(("more", "filler"), [(0, torch.inf), (11, torch.nan)])
+@pytest.mark.parametrize("more, filler", [(0, torch.inf), (11, torch.nan)])
 def test_only_selected_rows_are_stepped(
     kind: type[RowAdam], more: int, filler: float, n: int = 40
 ) -> None:
     """Other rows keep every bit, and their gradients are ignored; so do rows behind a leading
     part.
     """
-    larger, alone = (
-        parameters(n + more),
-        {name: value[:n] for name, value in parameters(n + more).items()},
-    )
+    larger = parameters(n + more)
+    alone = {name: value[:n] for name, value in parameters(n + more).items()}
     larger["means"][5] = torch.nan
     before = {name: value.clone().view(torch.int32) for name, value in larger.items()}
     rows = torch.zeros(n, dtype=torch.bool)
@@ -224,10 +224,8 @@ def test_only_selected_rows_are_stepped(
         optimizers[0].step(given, rows, TENTHS)
         optimizers[0].step(given, torch.zeros_like(rows), TENTHS)  # of no rows
     for name, value in larger.items():
-        bits, others = (
-            value.view(torch.int32),
-            torch.cat([~rows, torch.ones(more, dtype=torch.bool)]),
-        )
+        bits = value.view(torch.int32)
+        others = torch.cat([~rows, torch.ones(more, dtype=torch.bool)])
         assert torch.equal(bits[others], before[name][others]), name  # in place
         assert (bits[~others] != before[name][~others]).all(), name
         assert torch.equal(value[~others], own[name]), name

@@ -100,10 +100,12 @@ def read_picture(file: Any) -> np.ndarray:
 
 def settled(page: Any) -> np.ndarray:
     """The picture, once it has stopped changing: both viewers sort in a worker."""
-    before, picture = b"", page.screenshot()
+    before = b""
+    picture = page.screenshot()
     while picture != before:
         page.wait_for_timeout(250)
-        before, picture = picture, page.screenshot()
+        before = picture
+        picture = page.screenshot()
     return read_picture(io.BytesIO(picture))
 
 
@@ -119,7 +121,8 @@ def assert_the_wgsl_of_playcanvas_gives_the_equation(page: Any, about: dict[str,
         shown.sigma_d[:, None],
         shown.growth_d[:, None],
     )
-    rows, eye = torch.cat(columns, 1)[::20].tolist(), ", ".join(map(str, camera.position.tolist()))
+    rows = torch.cat(columns, 1)[::20].tolist()
+    eye = ", ".join(map(str, camera.position.tolist()))
     statements = """
         let center = vec3f(rows[at], rows[at + 1], rows[at + 2]);
         let far = rows[at + 4] > 0.0;  // whose opacity the engine does not know
@@ -153,12 +156,13 @@ def assert_the_wgsl_of_playcanvas_gives_the_equation(page: Any, about: dict[str,
             shown.attenuation,
             growth_d=shown.growth_d,
         )
-        drawn, growth = want.drawn[::20], want.growth[::20]
+        drawn = want.drawn[::20]
+        growth = want.growth[::20]
         torch.testing.assert_close(alpha, drawn, rtol=1e-4, atol=1e-6)
         torch.testing.assert_close(scale[alpha > 0], growth[alpha > 0], rtol=1e-4, atol=0)
 
 
-@pytest.mark.parametrize(("viewer", "suffix"), [("spark", "spz"), ("playcanvas", "ply")])
+@pytest.mark.parametrize("viewer, suffix", [("spark", "spz"), ("playcanvas", "ply")])
 def test_the_dial_is_as_exact_as_the_viewer(
     tabs: Any, viewer: str, suffix: str, tmp_path: Path
 ) -> None:

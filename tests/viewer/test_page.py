@@ -56,7 +56,8 @@ def test_the_text_of_one_file(tmp_path: Path) -> None:
     folders.
     """
     clod_adapter.save(tmp_path / "model.ply", clod_adapter.with_dial(scenes.gaussians(50, 1, 0)))
-    saved, cameras = clod_adapter.load(tmp_path / "model.ply"), scenes.ring(2, 1000, 500)
+    saved = clod_adapter.load(tmp_path / "model.ply")
+    cameras = scenes.ring(2, 1000, 500)
     out = tmp_path / "out" / "page.html"
     out.parent.mkdir()
     shown, losses = page.write_viewer_page(out, saved, cameras=cameras, virtual_scale=2.0)
@@ -104,7 +105,8 @@ def test_a_page_of_one_file(
     because browsers limit a text's size.
     """
     monkeypatch.setattr(page, "PART", 15_000)
-    size, model = 1000.0, scenes.dialled(1000, 3, 4, scene_distance=1.0, reference_distance=3.0)
+    size = 1000.0
+    model = scenes.dialled(1000, 3, 4, scene_distance=1.0, reference_distance=3.0)
     far = model.replace(
         means=size * model.means,
         log_scales=model.log_scales + float(np.log(size)),
@@ -112,7 +114,8 @@ def test_a_page_of_one_file(
         growth_d=torch.linspace(-0.5, 1, 1000),
         attenuation=replace(model.attenuation, reference_distance=3 * size),
     )
-    path, row = save(far), CalibrationRow(1.0, 900.0, 31.5, 0.9, 4.0)
+    path = save(far)
+    row = CalibrationRow(1.0, 900.0, 31.5, 0.9, 4.0)
     calibrated = replace(
         clod_adapter.load(path), calibration=Calibration((row,), 1000, 2, 8, 6, "a machine")
     )
@@ -120,7 +123,8 @@ def test_a_page_of_one_file(
     camera = scenes.camera(320, 240)
     viewmat = camera.viewmat.clone()
     viewmat[:3, 3] *= size
-    seen, out = replace(camera, viewmat=viewmat), path.with_suffix(".html")
+    seen = replace(camera, viewmat=viewmat)
+    out = path.with_suffix(".html")
     read, _ = page.write_viewer_page(
         out, calibrated, cameras=[seen], virtual_scale=1.0, exact=exact
     )
@@ -175,7 +179,7 @@ FEW = """const real = WebGL2RenderingContext.prototype.getParameter;
 
 
 @pytest.mark.parametrize(
-    ("error", "script"),
+    "error, script",
     [
         ("model.ply: the PLY header has no end_header line", ""),
         ("this graphics device holds at most 0 of the 400 Gaussians", FEW),

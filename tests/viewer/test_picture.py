@@ -25,7 +25,8 @@ from clod_adapter.viewer.page import Payload
 from formats import write_rows
 from shown import TALL, Shown, assert_alike, assert_same, drop, message, take
 
-VIEW, WIDE = scenes.camera(320, 240), ScreenFilter(variance=2.0)
+VIEW = scenes.camera(320, 240)
+WIDE = ScreenFilter(variance=2.0)
 
 
 def finer(model: Gaussians, by: float, **changes: Any) -> Gaussians:
@@ -131,10 +132,8 @@ def test_ply_and_spz_are_shown_as_python_reads_them(
     for name, saved in (("usual.ply", model), ("usual.spz", model), ("plain.spz", plain)):
         write(tmp_path / name, saved.replace(screen_filter=FILTERS["mip"]))
     write(tmp_path / "tag.ply", finer(plain, 2.0))
-    data, rows = (
-        (tmp_path / "usual.ply").read_bytes(),
-        PlyData.read(tmp_path / "usual.ply", mmap=False)["vertex"],
-    )
+    data = (tmp_path / "usual.ply").read_bytes()
+    rows = PlyData.read(tmp_path / "usual.ply", mmap=False)["vertex"]
     (tmp_path / "bare.ply").write_bytes(re.sub(rb"(?m)^comment .*\n", b"", data))
     doubles = rows.data.astype([(name, "f8") for name in rows.data.dtype.names])
     write_rows(tmp_path / "doubles.ply", doubles, ">", rows.comments)
@@ -201,16 +200,12 @@ def test_other_forms_of_the_dial_are_refused_with_a_remedy(
     loaded = clod_adapter.load(model)
     paper = replace(loaded.gaussians.attenuation, form="paper")
     write(tmp_path / "paper.spz", loaded.gaussians.replace(attenuation=paper))
-    ours, column, data = (
-        b"comment clod_adapter form ours\n",
-        b"property float nx\n",
-        model.read_bytes(),
-    )
+    ours = b"comment clod_adapter form ours\n"
+    column = b"property float nx\n"
+    data = model.read_bytes()
     assert ours in data and column in data
-    of_paper, earlier = (
-        "without --form paper",
-        "its dial is of an earlier form; adapt its checkpoint again",
-    )
+    of_paper = "without --form paper"
+    earlier = "its dial is of an earlier form; adapt its checkpoint again"
     for name, content, error in (
         ("paper.spz", (tmp_path / "paper.spz").read_bytes(), of_paper),
         ("paper.ply", data.replace(ours, b"comment clod_adapter form paper\n"), of_paper),

@@ -88,7 +88,8 @@ def test_the_count_box(shown: Shown, gaussians: Gaussians) -> None:
 
 def test_pointer_touch_and_wheel_move_the_camera(chromium: Any, show: Any, model: Path) -> None:
     shown = show(model, context=chromium.new_context(has_touch=True))
-    protocol, mouse = shown.page.context.new_cdp_session(shown.page), shown.page.mouse
+    protocol = shown.page.context.new_cdp_session(shown.page)
+    mouse = shown.page.mouse
 
     def drag() -> None:
         mouse.move(100, 60)
@@ -156,7 +157,8 @@ def test_files_and_cameras_are_listed(show: Any, gaussians: Gaussians, tmp_path:
     assert shown.text("#dial-value") == "s = 2.00"
     shown.run("clod.setWipe(0.4)")
     assert shown.text("#wipe-right") == "base · 400"
-    linked, of_second = shown.link(), shown.picture()
+    linked = shown.link()
+    of_second = shown.picture()
     shown.run("clod.setWipe(null)")
     drop(shown, "dropped.ply", (tmp_path / "c.ply").read_bytes())
     shown.until("document.title === 'dropped.ply'")
@@ -184,7 +186,8 @@ def forward(view: dict[str, np.ndarray]) -> np.ndarray:
 def points(means: Any, size: float, sh0: Any = None) -> Gaussians:
     """Opaque balls."""
     means = torch.as_tensor(means, dtype=torch.float32)
-    model, opaque = scenes.gaussians(len(means), 0, 1), torch.full((len(means),), 6.0)
+    model = scenes.gaussians(len(means), 0, 1)
+    opaque = torch.full((len(means),), 6.0)
     return model.replace(
         means=means,
         log_scales=torch.full_like(means, float(np.log(size))),
@@ -237,10 +240,8 @@ def test_the_up_axis(shown: Shown, show: Any, save: Any, tmp_path: Path) -> None
     assert with_cameras.page.text_content("#up option") == "as in the photographs"
     before = link(with_cameras)["axes"]
     with_cameras.page.keyboard.press("ArrowLeft")
-    turned, up = (
-        link(with_cameras)["axes"],
-        -sum(camera.viewmat[1, :3].numpy() for camera in cameras),
-    )
+    turned = link(with_cameras)["axes"]
+    up = -sum(camera.viewmat[1, :3].numpy() for camera in cameras)
     assert abs((turned - before)[:3] @ up) < 1e-4 < np.abs(turned - before).max()
     with_cameras.page.evaluate(
         "hash => { location.hash = hash }", shown.page.evaluate("location.hash")
@@ -251,7 +252,8 @@ def test_the_up_axis(shown: Shown, show: Any, save: Any, tmp_path: Path) -> None
 
 
 def test_placed_cameras_are_levelled(show: Any, model: Path, tmp_path: Path) -> None:
-    saved, viewmat = clod_adapter.load(model), scenes.looking(torch.tensor([1.0, 0.5, 0.5]))
+    saved = clod_adapter.load(model)
+    viewmat = scenes.looking(torch.tensor([1.0, 0.5, 0.5]))
     tilted = Camera(
         viewmat[[1, 0, 2, 3]] * torch.tensor([[-1.0], [1], [1], [1]]), torch.eye(3), 4, 3
     )
@@ -301,10 +303,8 @@ def test_the_picture_and_the_panel_fit_the_window(
         assert box["bottom"] <= height
         red[int(box["top"]) : int(box["bottom"]), int(box["left"]) : int(box["right"])] = False
         rows, columns = np.nonzero(red)
-        lower, right = (
-            rows > (rows.min() + rows.max()) / 2,
-            columns > (columns.min() + columns.max()) / 2,
-        )
+        lower = rows > (rows.min() + rows.max()) / 2
+        right = columns > (columns.min() + columns.max()) / 2
         assert len({*zip(lower.tolist(), right.tolist(), strict=True)}) == 4, width
         assert min(rows.min(), columns.min()) > 0
         assert rows.max() < height - 1
@@ -330,7 +330,8 @@ def test_the_path_and_the_turntable(show: Any, model: Path, tmp_path: Path) -> N
         replace(camera, name=f"{k}.jpg") for k, camera in enumerate(scenes.ring(80, 320, 240)[:3])
     ]
     write_model(tmp_path, cameras, [camera.name for camera in cameras])
-    shown, playing = show(model, "--images", tmp_path), "document.querySelector('#play.playing')"
+    shown = show(model, "--images", tmp_path)
+    playing = "document.querySelector('#play.playing')"
     views = [link(shown)]
     for _ in range(2):
         shown.page.keyboard.press("t")

@@ -104,7 +104,8 @@ def test_two_give_the_result_of_one(server: Server, words: list[Any], tmp_path: 
     again = Launched(server, run.folder, *words, *TINY, "--resume")
     assert again.wait() == [0, 0], again.log(0) + again.log(1) + alone.log(0)
     assert alone.wait() == [0], again.log(0) + again.log(1) + alone.log(0)
-    report, want = again.report(), alone.report()
+    report = again.report()
+    want = alone.report()
     assert report["processes"].items() >= {"count": 2, "backend": "gloo", "batch": 2}.items()
     assert report["processes"]["exchange_seconds"] > 0 and want["processes"]["count"] == 1
     assert (report["resumed_from"], report["steps"], report["interrupted"]) == (4, 12, False)
@@ -181,7 +182,8 @@ def test_torchrun_with_a_killed_process(server: Server, words: list[Any], tmp_pa
     folder.mkdir()
     assert server.wait(server.start(folder, *words, *LONG, before=AGENT, OMP_NUM_THREADS=1)) == 1
     run = Launched(server, folder, size=0)
-    log, report = log_of(folder), run.report()
+    log = log_of(folder)
+    report = run.report()
     assert "a process of the group has ended" in log and log.count("2 processes (gloo)") == 1, log
     assert report["interrupted"] and report["steps"] == load_state(folder / STATE)[0].steps
 

@@ -29,7 +29,8 @@ from clod_adapter.training.state import KEY
 from runs import OUTPUTS, STATE, change_step, fail, names, pressing, results
 from scenes import capture as small_capture
 
-CONFIG, QUIET = AdaptConfig(iters=3, max_sv=3.0), Console(quiet=True)
+CONFIG = AdaptConfig(iters=3, max_sv=3.0)
+QUIET = Console(quiet=True)
 HASHES = {
     "base_sha256": "of the base",
     "views_sha256": "of the views",
@@ -59,10 +60,8 @@ def state(
     tmp_path_factory: pytest.TempPathFactory,
 ) -> tuple[Path, Any, dict[str, torch.Tensor], Any]:
     """The file of a state after two of three steps, the base and scene, and what is in it."""
-    path, pair = (
-        tmp_path_factory.mktemp("saved") / STATE,
-        small_capture(40, views=4, width=16, height=12),
-    )
+    path = tmp_path_factory.mktemp("saved") / STATE
+    pair = small_capture(40, views=4, width=16, height=12)
     saver = Saver(path, CONFIG, QUIET, GracefulStop(), resume=False)
     saver.identify("base.ply", "images", **HASHES)
     adapt(*pair, CONFIG, saver.saving(lambda now: now.done < 2 or not now.state))
@@ -96,10 +95,8 @@ def test_damaged_states_are_refused_or_harmless(state: Any, data: Any) -> None:
     tensors = dict(state[2])
     about = copy.deepcopy(state[3])
     name = data.draw(st.sampled_from(sorted(tensors)))
-    how, changed = (
-        data.draw(st.sampled_from(["entry", "type", "shape", "value"])),
-        tensors[name].clone(),
-    )
+    how = data.draw(st.sampled_from(["entry", "type", "shape", "value"]))
+    changed = tensors[name].clone()
     if how == "entry":
         *way, last = data.draw(st.sampled_from(places(about)))
         parent = reduce(lambda above, key: above[key], way, about)
@@ -217,7 +214,7 @@ def test_a_state_that_cannot_be_removed_is_a_note(
 
 
 @pytest.mark.parametrize(
-    ("step", "save", "oldest", "share"),
+    "step, save, oldest, share",
     [(0.1, 0.1, 15.0, 0.015), (25.0, 3.0, 80.0, 0.15), (1.0, 30.0, 220.0, 0.2)],
 )
 def test_the_state_is_recent_and_saving_takes_a_small_share_of_the_time(
@@ -226,7 +223,9 @@ def test_the_state_is_recent_and_saving_takes_a_small_share_of_the_time(
     """Seconds of a step and of a save; the largest age of the state, unless a save takes very long,
     and the share.
     """
-    clock, saved, ages = 0.0, [0.0], [0.0]
+    clock = 0.0
+    saved = [0.0]
+    ages = [0.0]
 
     def save_state(path: Path, state: float, run_of: Any) -> None:
         nonlocal clock
@@ -247,7 +246,7 @@ def test_the_state_is_recent_and_saving_takes_a_small_share_of_the_time(
 
 
 @pytest.mark.parametrize(
-    ("change", "files"),
+    "change, files",
     [(fail, [STATE]), (lambda found: replace(found, loss=math.nan), sorted([*OUTPUTS, STATE]))],
     ids=["step", "loss"],
 )

@@ -45,10 +45,8 @@ def test_writes_three_files(adapted: tuple[Path, Any], capture: Any, dialled: Pa
     folder, done = adapted
     assert names(folder) == OUTPUTS, done
     assert len({path.stat().st_mode for path in folder.iterdir()}) == 1, done
-    report, data = (
-        json.loads((folder / "dial.json").read_text()),
-        (folder / "dial.ply").read_bytes(),
-    )
+    report = json.loads((folder / "dial.json").read_text())
+    data = (folder / "dial.ply").read_bytes()
     want = {
         "command": "adapt",
         "model": str(capture.ply),
@@ -83,10 +81,8 @@ def test_writes_three_files(adapted: tuple[Path, Any], capture: Any, dialled: Pa
     assert columns(folder / "dial.ply")[-3:] == ["sigma_d", "growth_d", "opacity_d"]
     assert b"screen_filter" not in data
     assert results(folder) == results(dialled.parent)
-    model, views = (
-        clod_adapter.load(folder / "dial.ply"),
-        clod_adapter.load_scene(capture.scene).test,
-    )
+    model = clod_adapter.load(folder / "dial.ply")
+    views = clod_adapter.load_scene(capture.scene).test
     (plain,) = clod_adapter.evaluate(clod_adapter.detach(model.gaussians), views, [1.0])
     ends = clod_adapter.evaluate(model.gaussians, views, [1.0, 4.0])
     for ours, row in zip(
@@ -277,7 +273,8 @@ def test_the_plan_is_printed_and_stored(clod: Any, wasteful: Path) -> None:
     assert not {"exposure", "alpha", "masks"} & set(table), done  # of which the scene has none
     # listed only if frozen
     assert not {"means", "quats", "scales", "opacities", "sh0"} & set(table), done
-    stored, seconds = decisions(done), done.report["plan"]["seconds"]
+    stored = decisions(done)
+    seconds = done.report["plan"]["seconds"]
     assert list(stored) == [*table, "undistortion", "scaling"]
     assert stored["far Gaussians"]["number"] == 280
     assert set(seconds) == {"bands", "start"} and done.report["seconds"]["plan"] > 0

@@ -44,7 +44,8 @@ def turned(capture: Any, tmp_path: Path) -> Path:
     """
     g = capture.gaussians
     w, x, y, z = g.quats.unbind(-1)
-    quats, means = torch.stack([-x, w, -z, y], -1), g.means * torch.tensor([1.0, -1, -1])
+    quats = torch.stack([-x, w, -z, y], -1)
+    means = g.means * torch.tensor([1.0, -1, -1])
     return capture.write(
         tmp_path / "turned.ply", g.replace(means=means, quats=quats, shN=0 * g.shN)
     )
@@ -57,11 +58,13 @@ def test_cameras_are_moved_into_another_frame_in_every_command(
     said = f"the cameras are moved into the frame of {turned} (axes x, -y, -z): renders have"
     report = done.report
     assert done.err.count(said) == 1 and any(said in note for note in report["notes"]), done
-    found, frame = report["alignment"], report["alignment"]["frame"]
+    found = report["alignment"]
+    frame = report["alignment"]["frame"]
     assert frame["psnr"] > found["mean_colour_psnr"] + 6 > found["psnr"] + 6
     # The stored viewpoints are training cameras in the file's frame, x_cameras = scale R
     # x_file + offset.
-    rotation, offset = torch.tensor(frame["rotation"]), torch.tensor(frame["offset"])
+    rotation = torch.tensor(frame["rotation"])
+    offset = torch.tensor(frame["offset"])
     centres = torch.tensor(
         [[view[axis] for axis in "xyz"] for view in report["calibration"]["viewpoints"]]
     )
@@ -79,10 +82,8 @@ def test_cameras_are_moved_into_another_frame_in_every_command(
 def test_another_scene_is_refused_and_nothing_is_written(
     clod: Any, capture: Any, turned: Path, tmp_path: Path
 ) -> None:
-    random, scene = (
-        torch.Generator().manual_seed(2),
-        scene_of(capture, tmp_path / "scene", lambda view: view.image, 2),
-    )
+    random = torch.Generator().manual_seed(2)
+    scene = scene_of(capture, tmp_path / "scene", lambda view: view.image, 2)
     means, sh0 = (torch.randn(shape, generator=random) for shape in ((300, 3), (300, 1, 3)))
     lost = capture.write(
         tmp_path / "lost.ply", capture.gaussians.replace(means=means + 1e4, sh0=sh0)
@@ -110,12 +111,13 @@ def test_white_background_is_refused_unless_allowed(
     assert "over white the renders have" in done.err and "transparent background" in done.err, done
     done = clod(*words, "--misaligned-ok")
     assert f"warning: {ply}: does not match" in done.err and "to train anyway" not in done.err, done
-    notes, alignment = done.report["notes"], done.report["alignment"]
+    notes = done.report["notes"]
+    alignment = done.report["alignment"]
     assert any(note.startswith("warning: ") for note in notes) and alignment["frame"] is None
 
 
 @pytest.mark.parametrize(
-    ("said", "share"), [("another exposure", 0.2), ("have a single colour each", 0)]
+    "said, share", [("another exposure", 0.2), ("have a single colour each", 0)]
 )
 def test_other_photographs_have_a_warning(
     clod: Any, capture: Any, tmp_path: Path, said: str, share: float

@@ -107,7 +107,8 @@ def test_devices(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[
 
 def test_adapting_compiles_nothing_more(capture: Any, capsys: pytest.CaptureFixture[str]) -> None:
     """For any SH degree; without compiling nothing is printed."""
-    base, scene = capture.gaussians, clod_adapter.load_scene(capture.scene)
+    base = capture.gaussians
+    scene = clod_adapter.load_scene(capture.scene)
     prepare_kernels(Console(quiet=True))
     with install_recorder("numba:compile") as compiled:
         prepare_kernels(Console())
