@@ -32,7 +32,7 @@ READS = (
     "unique_consecutive",
     "unique_dim",
 )
-_log: list[str] = []
+_log = []
 
 
 class Walled(Tensor):

@@ -32,7 +32,7 @@ def install(monkeypatch: pytest.MonkeyPatch) -> None:
     ) -> Tensor:
         return _torch_impl._spherical_harmonics(degree, dirs, coeffs)
 
-    replaced: dict[str, Any] = {
+    replaced = {
         "fully_fused_projection": fully_fused_projection,
         "isect_tiles": isect_tiles,
         "isect_offset_encode": _torch_impl._isect_offset_encode,

@@ -32,10 +32,10 @@ def module(
     """The module ``gsplat`` of this version; ``draw`` gets a function's name, the version and the
     arguments.
     """
-    made: Any = ModuleType("gsplat")
+    made = ModuleType("gsplat")
     made.__version__ = version
     for name, parameters in signatures()[version].items():
-        space: dict[str, Any] = {"_draw": draw, "_version": version}
+        space = {"_draw": draw, "_version": version}
         declared = re.sub(r"=([A-Z]\w+\.\w+)", r"='\1'", parameters)
         exec(f"def {name}({declared}):\n    return _draw({name!r}, _version, locals())", space)
         setattr(made, name, space[name])

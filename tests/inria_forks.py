@@ -51,13 +51,13 @@ def module(name: str) -> Any:
             drawn = _draw(self.raster_settings, self.given)
             return tuple(drawn[result] for result in results.split())
 
-    forward: Any = GaussianRasterizer.forward
+    forward = GaussianRasterizer.forward
     parameters = [
         Parameter(each, Parameter.POSITIONAL_OR_KEYWORD, default=None)
         for each in ("self", *call.split())
     ]
     forward.__signature__ = Signature(parameters)
-    made: Any = ModuleType("diff_gaussian_rasterization")
+    made = ModuleType("diff_gaussian_rasterization")
     made.GaussianRasterizer = GaussianRasterizer
     made.GaussianRasterizationSettings = namedtuple(
         "GaussianRasterizationSettings", f"{SETTINGS} {settings}"

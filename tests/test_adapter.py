@@ -6,7 +6,6 @@ import json
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -233,7 +232,7 @@ def test_tensor_files_are_safetensors(tmp_path: Path) -> None:
 
 
 # of tensors, None for one that is absent, or of settings
-CHANGES: tuple[tuple[dict[str, Any], str], ...] = (
+CHANGES = (
     ({"extra": torch.ones(5)}, "updates has 'extra'"),
     ({"means": torch.ones(4, 3)}, "5 rows"),
     ({"means": torch.ones(5, 3, dtype=torch.int32)}, "float16 or float32"),

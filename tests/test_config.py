@@ -22,7 +22,7 @@ from scenes import gaussians, ring
 
 BOTH = {"form": ["theirs"], "max_sv": [0.99, math.inf, math.nan]}
 RATES = ("sigma", "growth", "means", "quats", "scales", "opacities", "sh0", "shN")
-TABLES: dict[type, dict[str, list[Any]]] = {
+TABLES = {
     AdaptConfig: BOTH
     | {
         "max_sv": [*BOTH["max_sv"], 1e7],
@@ -135,7 +135,7 @@ def test_rows_of_an_evaluation() -> None:
 
 
 ROW = CalibrationRow(1.0, 10.0, 30.0, 0.9, 5.0)
-GOOD: dict[str, Any] = {
+GOOD = {
     "rows": (ROW,),
     "total": 4,
     "views": 1,

@@ -100,7 +100,7 @@ def popping(model: Gaussians) -> list[Any]:
     ]
 
 
-CONSUMERS: dict[str, Callable[[Gaussians], list[Any]]] = {
+CONSUMERS = {
     "render": rendering,
     "evaluate": evaluation,
     "objective": objective(CONFIG),
@@ -197,7 +197,7 @@ def own_loop(model: Gaussians) -> list[Any]:
     return [loss.detach(), *(group["params"][0].grad for group in groups)]
 
 
-RUNS: dict[str, Callable[[Gaussians], list[Any]]] = CONSUMERS | {
+RUNS = CONSUMERS | {
     "a loop of one's own": own_loop,
     "the paper's objective": papers_objective,
     "alignment": lambda model: [check_alignment(model, views_of(model)).psnr],

@@ -141,7 +141,7 @@ class Renderer:
 
     def follow(self, loads: list[float], measured: Callable[[int], float]) -> list[float]:
         """Dial values of frames with these loads, whose times are multiplied by ``measured``."""
-        frames = list[tuple[float, float]]()
+        frames = []
         dial = self.start
         for number, load in enumerate(loads):
             frames.append((dial, self.ms(dial, load) * measured(number)))

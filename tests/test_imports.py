@@ -17,7 +17,7 @@ PACKAGE = "clod_adapter"
 
 # Lowest first. A unit is a module or package of clod_adapter, of clod_adapter/io, or of cli; it
 # imports from rows above its own and from itself, never from beside it.
-ORDER: list[set[str]] = [
+ORDER = [
     {"_support", "origin"},
     {"errors"},
     {"_kernels", "config"},
@@ -79,7 +79,7 @@ def imports_of(path: Path) -> dict[str, int]:
     """The lines of every import from the package in a file, at any depth, by module (as by
     ``module_of``).
     """
-    found = list[tuple[str, int]]()
+    found = []
     here = f"{PACKAGE}.{module_of(path.parent / '__init__.py')}".rstrip(".")
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
@@ -100,7 +100,7 @@ def test_imports_fall() -> None:
     import it back.
     """
     wrong = []
-    graph = dict[str, set[str]]()
+    graph = {}
     for path in SOURCES:
         own = module_of(path)
         found = imports_of(path)

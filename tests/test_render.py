@@ -155,13 +155,13 @@ def test_autocast_changes_nothing(form: str) -> None:
         assert torch.equal(found.image, want.image) and torch.equal(found.kept, want.kept)
 
 
-NO_DIALS: Any = (-0.001, math.inf, math.nan, "5", None, [1.0], torch.ones(2), 10**400)
+NO_DIALS = (-0.001, math.inf, math.nan, "5", None, [1.0], torch.ones(2), 10**400)
 
 
 def test_bad_arguments_are_refused() -> None:
     some = spread()
     plain = gaussians(3, 0, 0)
-    wrong: Any = "a.ply"
+    wrong = "a.ply"
     for message, call in {
         **{
             f"virtual_scale is {re.escape(str(s))}": partial(render, plain, camera(), s)

@@ -122,7 +122,7 @@ def test_frames_are_timed_together(clod: Any, monkeypatch: pytest.MonkeyPatch) -
     """Those of base, result and plain file; frames take 1000/s ms, and those of the k-th model k
     times that.
     """
-    seen = list[list[int]]()
+    seen = []
 
     def times(models: Sequence[Model], cameras: Any, progress: Any) -> FrameTimes:
         seen.append([len(some) for some, _ in models])

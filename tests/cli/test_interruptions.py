@@ -48,7 +48,7 @@ def undisturbed(server: Server, words: list[Any], tmp_path_factory: pytest.TempP
 
 def assert_whole(folder: Path) -> None:
     """Outputs can be read, and all other files have the name of a temporary file."""
-    readers: list[Any] = [
+    readers = [
         lambda path: json.loads(path.read_text()),
         clod_adapter.load,
         clod_adapter.load_adapter,

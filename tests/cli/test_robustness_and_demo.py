@@ -71,7 +71,7 @@ def test_the_command_and_python_train_the_same_without_photographs(clod: Any, ca
 
 @pytest.mark.parametrize("phase", [Phase.EVALUATION, Phase.FRAME_TIMES])
 def test_a_stop_after_training_keeps_the_result(capture: Any, tmp_path: Path, phase: Phase) -> None:
-    trained = list[bool]()
+    trained = []
 
     def progress(done: Progress) -> bool:
         trained.append(done.phase is Phase.TRAINING)

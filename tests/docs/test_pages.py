@@ -122,7 +122,7 @@ def test_blocks_run_in_the_order_of_the_page(
     shutil.copytree(desk, tmp_path, dirs_exist_ok=True)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(clod_adapter, "AdaptConfig", short)
-    names: dict[str, Any] = {"__name__": "__main__"}
+    names = {"__name__": "__main__"}
     for block in blocks(page):
         assert block.language in LANGUAGES, (
             f"{block.place}: {block.language or 'no language'}; text is not run"

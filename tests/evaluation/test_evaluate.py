@@ -96,7 +96,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     """
 
     def install(cost: Callable[[int, float], float]) -> list[tuple[str, float]]:
-        drawn = list[tuple[str, float]]()
+        drawn = []
         now = [0.0]
 
         def draw(some: Gaussians, camera: Camera, s: float) -> None:
@@ -137,7 +137,7 @@ def test_drift_and_interruptions_do_not_zigzag(clock: Clock) -> None:
 
 def test_frames_are_interleaved_and_few_where_they_are_slow(clock: Clock) -> None:
     drawn = clock(lambda frame, s: 0.01)
-    seen = list[tuple[int, int]]()
+    seen = []
     assert of_one(progress=lambda now: seen.append((now.done, now.total))).milliseconds == (
         (pytest.approx(10),) * 9,
     )
@@ -251,7 +251,7 @@ def test_a_frame_rate_is_reached_for_good() -> None:
 def test_bad_arguments_are_refused() -> None:
     some = adapted(5, 0)
     camera = ring(1, 48, 36)
-    refused: tuple[tuple[dict[str, float], str], ...] = (
+    refused = (
         ({}, "exactly one of keep, psnr_drop and fps"),
         ({"keep": 3, "fps": 3}, "exactly one of keep, psnr_drop and fps"),
         ({"keep": 0}, "keep is 0, it must be a positive, finite number"),
@@ -262,7 +262,7 @@ def test_bad_arguments_are_refused() -> None:
     for budgets, message in refused:
         with pytest.raises(ClodError, match=message):
             dial_for(some, cameras=camera, **budgets)
-    wrong: Any
+
     for wrong in ("5", [1.0], torch.ones(2), 10**400):
         with pytest.raises(
             ClodError, match=re.escape(f"keep is {wrong}, it must be a positive, finite number")

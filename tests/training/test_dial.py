@@ -1,7 +1,5 @@
 """The dial as a component of a loop of one's own."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 import torch
@@ -47,7 +45,7 @@ def test_the_objective_is_that_of_adapt(captured: Pair) -> None:
     run = Trainer(dial.gaussians(), scene.train, AdaptConfig(lr_shN=1e-3))
     names = {"log_scales": "scales", "opacity_logits": "opacities"}
     for name, gradient in run.gradient_sum([Sample(scene.train[0], s, counted)]).gradients.items():
-        own: Any = getattr(dial, name, None)
+        own = getattr(dial, name, None)
         found = (splats[names.get(name, name)] if own is None else own).grad
         assert gradient.abs().max() > 0, name
         torch.testing.assert_close(

@@ -21,7 +21,7 @@ from clod_adapter.equation.units import with_distance
 from clod_adapter.initialization.importance import scene_distance
 from clod_adapter.training.distributed import joined
 from clod_adapter.training.far import with_far
-from clod_adapter.training.loop import TrainingState, adapt
+from clod_adapter.training.loop import adapt
 from runs import change_step, config_of, states_of
 from scenes import assert_equal, capture, gaussians, photograph, ring
 
@@ -73,7 +73,7 @@ def test_a_second_run_continues_from_sigma_d(captured: Pair, trained: Gaussians)
     tool dropped it.
     """
     first = trained
-    phases = list[Phase]()
+    phases = []
     config = config_of(iters=1, max_sv=3.0)
     unknown = first.replace(attenuation=replace(first.attenuation, reference_distance=0.0))
     for given, want in (
@@ -98,7 +98,7 @@ def test_a_second_run_continues_from_sigma_d(captured: Pair, trained: Gaussians)
 
 def test_result_is_the_mean_of_the_last_steps(captured: Pair) -> None:
     """The mean is over the parameters, so over log sigma_d; the steps do not change."""
-    states: dict[int, TrainingState] = {}
+    states = {}
     found = adapt(*captured, config_of(iters=10), states_of({9, 10}, states)).gaussians
     found = found.select(~found.near)
     sigma_d = with_distance(found, states[9].attenuation.scene_distance).sigma_d
@@ -113,7 +113,7 @@ def test_result_is_the_mean_of_the_last_steps(captured: Pair) -> None:
 def test_time_budget_ends_training(captured: Pair) -> None:
     """The budget includes the time of an earlier part of the run."""
     config = config_of(iters=10_000_000, time_budget=0.2)
-    states = dict[int, TrainingState]()
+    states = {}
     result = adapt(*captured, config, states_of({3}, states))
     assert 0 < result.steps < 10_000 and 0.2 <= result.seconds < 5 and not result.interrupted
     assert adapt(*captured, config_of(iters=3, time_budget=60.0)).steps == 3
@@ -124,7 +124,7 @@ def test_time_budget_ends_training(captured: Pair) -> None:
 
 
 def test_a_listener_that_stops_returns_the_result_so_far(captured: Pair) -> None:
-    states = list[Gaussians]()
+    states = []
 
     def stop(p: Progress) -> bool:
         if p.phase == Phase.TRAINING:
@@ -187,7 +187,7 @@ def test_a_row_with_a_nonfinite_gradient_is_not_stepped(
 
     base, scene = captured
     change_step(monkeypatch, 1, spoil)
-    seen = list[Gaussians]()
+    seen = []
     config = config_of(iters=12)
     result = adapt(
         base,

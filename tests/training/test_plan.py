@@ -23,7 +23,6 @@ from clod_adapter.adapter import detach
 from clod_adapter.initialization.importance import removal_error
 from clod_adapter.training.far import supposed_error
 from clod_adapter.training.plan import NAMES, NOT_NEEDED
-from clod_adapter.training.state import TrainingState
 from runs import states_of
 from scenes import assert_equal, gaussians, photograph, ring
 
@@ -108,7 +107,7 @@ def test_a_resumed_plan_gives_the_same_bits(visible: Pair) -> None:
         make_plan(base, scene, CONFIG, Override(leave_out=frozenset({"means", "scales"})))
         for _ in "ab"
     )
-    states = dict[int, TrainingState]()
+    states = {}
     assert plan.decisions == again.decisions and json.loads(json.dumps(plan.as_dict()))["decisions"]
     whole = plan.adapt(scene, states_of({12}, states)).gaussians
     found = again.adapt(scene, resume=states[12]).gaussians

@@ -137,7 +137,7 @@ def ball(n: int, seen_from: Tensor) -> clod.Gaussians:
 
 
 def test_placed_cameras_are_valid_and_see_the_scene(blob: clod.Gaussians) -> None:
-    told: list[tuple[int, int]] = []
+    told = []
     cameras = place_cameras(blob, views=12, progress=lambda now: told.append((now.done, now.total)))
     assert told[-1][0] == told[-1][1] == len(told)
     assert len({c.name for c in cameras}) == len(cameras) == 12

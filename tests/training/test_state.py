@@ -21,10 +21,9 @@ from clod_adapter.adapter import ATTRIBUTES, with_dial
 from clod_adapter.cameras import in_its_unit
 from clod_adapter.equation.distances import typical_distance
 from clod_adapter.initialization.importance import scene_distance
-from clod_adapter.progress import GracefulStop, Phase, Progress
+from clod_adapter.progress import GracefulStop, Phase
 from clod_adapter.training import trainer
 from clod_adapter.training.pseudo_views import reaches
-from clod_adapter.training.state import TrainingState
 from runs import config_of, pressing, states_of
 from scenes import assert_equal, capture, gaussians, photograph, ring
 
@@ -52,14 +51,14 @@ def test_a_resumed_run_ends_with_the_same_bits(captured: Pair, form: str) -> Non
             base, torch.full((len(base),), 1.5), AttenuationConfig(form="paper", max_sv=3.0)
         )
     config = config_of(**{"iters": 12, **RESUMED[form]})
-    states = dict[int, TrainingState]()
+    states = {}
     whole = adapt(base, scene, config, states_of({1, 6, 10, 11}, states))
     if form == "sigma_d alone":
         start = adapt(base, scene, replace(config, iters=0)).gaussians
         assert all(
             torch.equal(getattr(whole.gaussians, name), getattr(start, name)) for name in ATTRIBUTES
         )
-    seen: list[Progress] = []
+    seen = []
     for steps, state in states.items():
         again = adapt(base, scene, config, seen.append, copy.deepcopy(state))
         assert_equal(again.gaussians, whole.gaussians)
@@ -83,7 +82,7 @@ def default_handler() -> Iterator[None]:
 def test_an_interrupt_within_the_update_completes_the_step(monkeypatch: pytest.MonkeyPatch) -> None:
     given = *capture(60, views=4, width=16, height=12), AdaptConfig(iters=12, max_sv=3.0)
     whole = adapt(*given).gaussians
-    states = list[Any]()
+    states = []
     monkeypatch.setattr(trainer, "spoilt_rows", pressing(trainer.spoilt_rows, signal.SIGINT, at=5))
     found = adapt(*given, lambda now: states.append(now.state) if now.state else None)
     assert found.interrupted and found.signalled and found.steps == 5
@@ -92,7 +91,7 @@ def test_an_interrupt_within_the_update_completes_the_step(monkeypatch: pytest.M
 
 
 def test_other_handlers_are_not_affected() -> None:
-    heard = list[int]()
+    heard = []
     stop = GracefulStop()
     signal.signal(signal.SIGINT, lambda number, frame: heard.append(number))
     with stop.listening(in_place_of=signal.default_int_handler):

@@ -32,7 +32,7 @@ def show(tabs: Any) -> Iterator[Callable[..., Shown]]:
     fails the test.
     """
     with ExitStack() as stack:
-        opened: list[tuple[Shown, str]] = []
+        opened = []
 
         def start(
             *words: object,

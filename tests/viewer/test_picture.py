@@ -51,7 +51,7 @@ def small(size: float) -> tuple[Gaussians, tuple[float, ...], Camera]:
 
 
 # Model, dial values and camera; each differs from the others in what is named.
-CASES: dict[str, tuple[Gaussians, tuple[float, ...], Camera]] = {
+CASES = {
     "degree 3": (scenes.dialled(500, 3, 7), (1.0, 3.0), VIEW),
     "compensated": (finer(scenes.dialled(500, 1, 7), 2, screen_filter=FILTERS["on"]), (2.0,), VIEW),
     "another unit, wide blur": (

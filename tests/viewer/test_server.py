@@ -65,7 +65,7 @@ SAFE = {
     "x-content-type-options": "nosniff",
     "cross-origin-resource-policy": "same-origin",
 }
-REQUESTS: tuple[tuple[str, str, str | None, int], ...] = (  # method, path, Host, status
+REQUESTS = (  # method, path, Host, status
     *(("GET", path, None, 200) for path in ("/?any=thing", "/files/model")),
     ("HEAD", "/files/model", None, 200),
     *(
@@ -125,7 +125,7 @@ def test_disconnected_and_closed(capfd: pytest.CaptureFixture[str]) -> None:
     """Closing waits for running responses: a thread that holds a tensor as the interpreter exits
     aborts the process.
     """
-    ended: list[int] = []
+    ended = []
 
     def endless() -> Iterator[bytes]:
         try:
