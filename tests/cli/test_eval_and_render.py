@@ -15,6 +15,7 @@ import torch
 from PIL import Image
 
 import clod_adapter
+from clod_adapter import load_scene, render
 from clod_adapter.cli import render as command
 from clod_adapter.cli import view
 from clod_adapter.cli.main import build_parser
@@ -71,7 +72,7 @@ def test_base_by_rank_and_popping(clod: Any, capture: Any) -> None:
         entry["row"]["kept_share"] == entry["row"]["kept"] / 300 for entry in report["ranked"]
     )
     base = capture.gaussians
-    views = clod_adapter.load_scene(capture.scene).test
+    views = load_scene(capture.scene).test
     top = base.opacity_logits.argsort(descending=True)[: kept[4]]
     (want,) = clod_adapter.evaluate(base.select(top), views, [1.0])
     by_opacity, by_error = (entry["row"]["psnr"] for entry in report["ranked"][2:])
@@ -208,10 +209,9 @@ def test_device_presets_are_counts(
     page = b"".join(answers["/"].blocks()).decode()
     opening = float(re.findall(r'"virtual_scale": ([\d.]+)}', page)[-1])
     model = load(dialled).gaussians
-    scene = clod_adapter.load_scene(capture.scene)
+    scene = load_scene(capture.scene)
     kept = [
-        int(clod_adapter.render(model, each.camera, opening).kept.sum())
-        for each in scene.train + scene.test
+        int(render(model, each.camera, opening).kept.sum()) for each in scene.train + scene.test
     ]
     assert sum(kept) / len(kept) == pytest.approx(120, abs=3)
     assert any("quest3" in note for note in report["notes"])
@@ -227,13 +227,13 @@ def test_an_image_per_view(clod: Any, capture: Any, dialled: Path, tmp_path: Pat
     files = sorted(path.name for path in (tmp_path / "out" / "here").iterdir())
     pictures = done.report["pictures"]
     assert files == ["000.png", "008.png"] == [Path(picture["file"]).name for picture in pictures]
-    scene = clod_adapter.load_scene(capture.scene)
+    scene = load_scene(capture.scene)
     gaussians = clod_adapter.load(dialled).gaussians
     for held_out, picture in zip(scene.test, pictures, strict=True):
         pixels = np.asarray(Image.open(picture["file"]))
         assert pixels.shape == (48, 3 * 64, 3) and (pixels[:, :64] == held_out.image.numpy()).all()
         for k, s in enumerate((1.0, 3.0)):
-            want = clod_adapter.render(gaussians, held_out.camera, s)
+            want = render(gaussians, held_out.camera, s)
             shown = pixels[:, 64 * (k + 1) : 64 * (k + 2)]
             assert np.abs(shown - 255 * want.image.clamp(0, 1).numpy()).max() <= 0.51
             assert picture["kept"][k] == want.kept.sum()
@@ -261,7 +261,7 @@ def test_interrupts(
 
 def test_image_names(capture: Any) -> None:
     """Names that are equal without their suffixes keep them."""
-    of = clod_adapter.load_scene(capture.scene).test[0]
+    of = load_scene(capture.scene).test[0]
     for names, files in (
         (("ä.jpg", "b/ä.jpg", "c\\ä.JPG"), ["ä.png", "b/ä.png", "c/ä.png"]),
         (("a.jpg", "a.png"), ["a.jpg.png", "a.png.png"]),

@@ -16,7 +16,16 @@ from plyfile import PlyData
 
 import clod_adapter
 import scenes
-from clod_adapter import ClodError, load, save
+from clod_adapter import (
+    ClodError,
+    bake,
+    bake_levels,
+    load,
+    load_scene,
+    order_by_extinction,
+    render,
+    save,
+)
 from clod_adapter.harmonics import with_sh_degree
 from clod_adapter.initialization.importance import initialize
 from clod_adapter.io.formats import splat_transform
@@ -55,7 +64,7 @@ def tool(
 
 def baked(path: Path | str, s: float) -> Any:
     model = load(path)
-    return clod_adapter.bake(model.gaussians, s, cameras=model.viewpoints)
+    return bake(model.gaussians, s, cameras=model.viewpoints)
 
 
 def files(folder: Path) -> list[str]:
@@ -80,26 +89,24 @@ def test_baking(clod: Any, capture: Any, dialled: Path) -> None:
     ]
     assert rows == inria_rows(want).tobytes()
     report = clod(EXPORT, "--sv 2 --images SCENE -o x.ply").report
-    cameras = [view.camera for view in clod_adapter.load_scene(capture.scene).train]
+    cameras = [view.camera for view in load_scene(capture.scene).train]
     model = load(dialled).gaussians
     again = load("x.ply").gaussians
     assert report["cameras"] == 8
     torch.testing.assert_close(
-        again.opacity_logits, clod_adapter.bake(model, 2.0, cameras=cameras).opacity_logits
+        again.opacity_logits, bake(model, 2.0, cameras=cameras).opacity_logits
     )
 
     there = f"{EXPORT} --camera 003 --images SCENE"
     camera = next(each for each in cameras if each.name == "003.png")
-    n = sum(int(clod_adapter.render(model, camera, s).kept.sum()) for s in (4.0, 1.0)) // 2
+    n = sum(int(render(model, camera, s).kept.sum()) for s in (4.0, 1.0)) // 2
     done = clod(there, "-o one.ply --keep", n)
     plain = load("one.ply")
     (output,) = done.report["outputs"]
     assert done.report["camera"] == "003.png" and output["count"] == n == len(plain.gaussians)
     # there the image is the dial's
-    want = clod_adapter.render(model, camera, output["virtual_scale"])
-    torch.testing.assert_close(
-        clod_adapter.render(plain.gaussians, camera).image, want.image, atol=2e-5, rtol=0
-    )
+    want = render(model, camera, output["virtual_scale"])
+    torch.testing.assert_close(render(plain.gaussians, camera).image, want.image, atol=2e-5, rtol=0)
     assert "exact at the camera of 003.png only" in done.err
     assert any("for the camera at (" in comment for comment in plain.comments)
     report = clod(there, "--fps 1 -o fast.ply").report  # timed here, at that camera
@@ -112,7 +119,7 @@ def test_baking(clod: Any, capture: Any, dialled: Path) -> None:
         note
         == "old.ply stores no cameras: baked for 16 placed ones; --images gives a better result"
     )
-    want = clod_adapter.bake(model, 2.0, cameras=clod_adapter.place_cameras(model, views=16))
+    want = bake(model, 2.0, cameras=clod_adapter.place_cameras(model, views=16))
     assert torch.equal(load("x.ply").gaussians.means, want.means)
 
 
@@ -137,7 +144,7 @@ def test_sets_have_a_level_for_each_band_of_distances(
     assert counts[0] == model.whole
     assert counts == sorted(counts, reverse=True)
     assert counts[-1] >= 0.01 * model.whole
-    levels = clod_adapter.bake_levels(model, 2.0)
+    levels = bake_levels(model, 2.0)
     assert levels[0].gaussians == clod_adapter.detach(model)
     for k, level in enumerate(levels[1:], 1):
         reached = model.sigma_d > near * 2 ** (k - 0.5)
@@ -151,7 +158,7 @@ def test_a_lower_sh_degree_is_fitted(clod: Any, capture: Any) -> None:
     """Nearer to the renders of all degrees than one that is cut; what needs no higher degree stays
     as it is.
     """
-    views = clod_adapter.load_scene(capture.scene)
+    views = load_scene(capture.scene)
     base = scenes.gaussians(300, 3, 0).replace(means=capture.gaussians.means)
     capture.write("rich.ply", base)
     report = clod("export rich.ply --sh-degree 1 --images SCENE -o x.ply --json").report
@@ -163,10 +170,7 @@ def test_a_lower_sh_degree_is_fitted(clod: Any, capture: Any) -> None:
 
     def error(shown: clod_adapter.Gaussians) -> float:
         cameras = [view.camera for view in views.train]
-        pairs = (
-            (clod_adapter.render(each, camera).image for each in (shown, base))
-            for camera in cameras
-        )
+        pairs = ((render(each, camera).image for each in (shown, base)) for camera in cameras)
         return sum(float((one - other).square().mean()) for one, other in pairs)
 
     assert error(fitted) < 0.7 * error(cut)
@@ -232,25 +236,25 @@ def test_losses_are_noted(clod: Any, dialled: Path, tmp_path: Path) -> None:
 def test_order_by_extinction(clod: Any, capture: Any, dialled: Path) -> None:
     """Of a dial without near and far Gaussians, which have no order."""
     assert "have no order" in clod(EXPORT, "--order extinction -o x.ply", code=2).err
-    scene = clod_adapter.load_scene(capture.scene)
+    scene = load_scene(capture.scene)
     config = clod_adapter.AdaptConfig(max_sv=4.0)
-    clod_adapter.save("dial.ply", initialize(capture.gaussians, scene.train, config))
+    save("dial.ply", initialize(capture.gaussians, scene.train, config))
     model = load("dial.ply")
     words = "export dial.ply --images SCENE --json --order extinction"
     cameras = [view.camera for view in scene.train]
-    rows = clod_adapter.order_by_extinction(model.gaussians, cameras)
+    rows = order_by_extinction(model.gaussians, cameras)
     report = clod(words, "-o ordered.ply").report
     ordered = load("ordered.ply")
     assert report["order"] == "extinction" and ordered.gaussians == model.gaussians.select(rows)
     assert any("rows in the order" in comment for comment in ordered.comments)
-    n = len(clod_adapter.bake(model.gaussians, 3.0, cameras=cameras))
+    n = len(bake(model.gaussians, 3.0, cameras=cameras))
     clod(words, "-o first.ply --keep", n)
     assert n < 300
     assert torch.equal(load("first.ply").gaussians.means, model.gaussians.means[rows[:n]])
     clod(words, "--camera 003 --sv 2 -o one.ply")
     camera = next(camera for camera in cameras if camera.name == "003.png")
-    ordered = model.gaussians.select(clod_adapter.order_by_extinction(model.gaussians, [camera]))
-    assert load("one.ply").gaussians == clod_adapter.bake(ordered, 2.0, camera)
+    ordered = model.gaussians.select(order_by_extinction(model.gaussians, [camera]))
+    assert load("one.ply").gaussians == bake(ordered, 2.0, camera)
 
 
 def test_splat_transform(clod: Any, dialled: Path, tmp_path: Path, tool: Any) -> None:
@@ -266,7 +270,7 @@ def test_splat_transform(clod: Any, dialled: Path, tmp_path: Path, tool: Any) ->
     tool("(out.parent / '0_0').mkdir(); (out.parent / '0_0' / 'a.webp').write_text('1234')")
     (tmp_path / "-o").mkdir()  # empty; not an option of the tool
     (output,) = clod(EXPORT, "--lod-meta --out=-o").report["outputs"]
-    levels = clod_adapter.bake_levels(load(dialled).gaussians)
+    levels = bake_levels(load(dialled).gaussians)
     counts = [len(level.gaussians) for level in levels]
     assert [level["count"] for level in output["levels"]] == counts
     assert output["count"] == sum(counts)
@@ -313,7 +317,7 @@ def test_the_real_tool(clod: Any, dialled: Path, tmp_path: Path) -> None:
         pytest.skip(str(error))
     clod("export DIAL --lod-meta --multiplier 2 -o out")
     meta = json.loads((tmp_path / "out" / "lod-meta.json").read_text())
-    levels = clod_adapter.bake_levels(load(dialled).gaussians, 2.0)
+    levels = bake_levels(load(dialled).gaussians, 2.0)
     assert meta["counts"] == [len(level.gaussians) for level in levels]
     assert meta["lodLevels"] == len(levels)
     assert all((tmp_path / "out" / name).is_file() for name in meta["filenames"])

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 import clod_adapter
-from clod_adapter import pipeline
+from clod_adapter import load, pipeline
 from clod_adapter.cli.adapt import listeners
 from clod_adapter.cli.shared import measure
 from clod_adapter.training import planner
@@ -50,7 +50,7 @@ def assert_whole(folder: Path) -> None:
     """Outputs can be read, and all other files have the name of a temporary file."""
     readers = [
         lambda path: json.loads(path.read_text()),
-        clod_adapter.load,
+        load,
         clod_adapter.load_adapter,
     ]
     known = dict(zip(OUTPUTS, readers, strict=True)) | {STATE: load_state}
@@ -201,7 +201,7 @@ def test_interrupts_of_the_measurement(
     assert "measurements were interrupted" in report["notes"][0] in done.err
     assert report["interrupted"] is False
     assert report["calibration"] is None
-    assert clod_adapter.load(tmp_path / "dial.ply").calibration is None
+    assert load(tmp_path / "dial.ply").calibration is None
     assert names(tmp_path) == BOTH
     monkeypatch.setattr(*SAVING, pressing(listeners.save_state, INT))
     done = clod(*words, code=130)

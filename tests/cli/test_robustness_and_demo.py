@@ -17,7 +17,7 @@ import pytest
 from PIL import Image
 
 import clod_adapter
-from clod_adapter import config, evaluate, load, load_scene, pipeline
+from clod_adapter import AdaptConfig, adapt_checkpoint, config, evaluate, load, load_scene, pipeline
 from clod_adapter import demo as gallery
 from clod_adapter.cli.adapt import listeners
 from clod_adapter.cli.adapt import run as adapt_run
@@ -51,21 +51,19 @@ def test_the_command_a_cell_and_python_train_the_same(
     clod("robustness BASE --images SCENE --iters 3 --max-sv 3 --out out")
     base = load(capture.ply)
     scene = load_scene(capture.scene)
-    result = clod_adapter.adapt_checkpoint(
-        base, scene, clod_adapter.AdaptConfig(iters=3, max_sv=3.0)
-    )
+    result = adapt_checkpoint(base, scene, AdaptConfig(iters=3, max_sv=3.0))
     for written in ("dial.safetensors", "out/cells/base_sv3.safetensors"):
         assert clod_adapter.load_adapter(written).apply(base.gaussians) == result.gaussians
     result.save("python.ply")
     assert results(Path(), "python") == results(Path())
-    assert clod_adapter.load("python.ply").calibration.rows[0].psnr == result.rows[0].psnr
+    assert load("python.ply").calibration.rows[0].psnr == result.rows[0].psnr
 
 
 @pytest.mark.usefixtures("few_placed")
 def test_the_command_and_python_train_the_same_without_photographs(clod: Any, capture: Any) -> None:
     clod("BASE --iters 3 --out dial.ply --accept-loss")
-    settings = clod_adapter.AdaptConfig(iters=3, max_sv=config.PLACED_MAX_SV)
-    clod_adapter.adapt_checkpoint(load(capture.ply), config=settings).save("python.ply")
+    settings = AdaptConfig(iters=3, max_sv=config.PLACED_MAX_SV)
+    adapt_checkpoint(load(capture.ply), config=settings).save("python.ply")
     assert results(Path(), "python") == results(Path())
 
 
@@ -78,8 +76,8 @@ def test_a_stop_after_training_keeps_the_result(capture: Any, tmp_path: Path, ph
         return not (any(trained) and done.phase is phase)
 
     scene = load_scene(capture.scene)
-    settings = clod_adapter.AdaptConfig(iters=3)
-    result = clod_adapter.adapt_checkpoint(load(capture.ply), scene, settings, progress=progress)
+    settings = AdaptConfig(iters=3)
+    result = adapt_checkpoint(load(capture.ply), scene, settings, progress=progress)
     assert result.adapted.steps == 3 and not result.rows and result.base_rows
     assert any("not measured" in note for note in result.notes)
     result.save(tmp_path / "stopped.ply")
@@ -120,15 +118,15 @@ def test_outputs_of_all_cells(
         assert [float(row["psnr"]) for row in rows] == [row["psnr"] for row in found]
     assert Image.open(folder / "robustness.png").size[0] > 2000
     clod("apply plain.ply robustness/cells/plain_sv3.safetensors -o x.ply")
-    scene = clod_adapter.load_scene(report["scene"])
-    base = clod_adapter.load("plain.ply").gaussians
+    scene = load_scene(report["scene"])
+    base = load("plain.ply").gaussians
     shares = experiment.BASELINE_SHARES
     assert [row["kept"] for row in cells["plain", None]] == [round(300 * share) for share in shares]
     few = base[base.opacities.argsort(descending=True)[: round(300 * shares[-1])]]
-    assert clod_adapter.evaluate(few, scene.test, [1.0])[0].psnr == pytest.approx(
+    assert evaluate(few, scene.test, [1.0])[0].psnr == pytest.approx(
         cells["plain", None][-1]["psnr"]
     )
-    (again,) = clod_adapter.evaluate(clod_adapter.load("x.ply").gaussians, scene.test, [3.0])
+    (again,) = evaluate(load("x.ply").gaussians, scene.test, [3.0])
     assert again.psnr == cells["plain", 3][-1]["psnr"]
     lines = re.findall(r"^(\w+) \((\d)/6\) training +\d+%, .* left", done.err, re.M)
     assert list(dict.fromkeys(lines))[0] == ("plain_sv1", "2") and len(set(lines)) == 4

@@ -11,7 +11,6 @@ import pytest
 import torch
 from plyfile import PlyData, PlyElement
 
-import scenes
 from clod_adapter import AttenuationConfig, ClodError, load, save, with_dial
 from clod_adapter.cli.inspect import lines_of
 from clod_adapter.cli.shared.outputs import jsonable
@@ -22,13 +21,14 @@ from clod_adapter.io.ply_layout import inria_dtype
 from clod_adapter.origin import NOWHERE
 from clod_adapter.training.state import TrainingState, save_state
 from formats import CALIBRATION, PACKED, inria_rows, with_columns, write_rows
+from scenes import gaussians
 
 ATTENUATION = AttenuationConfig(max_sv=6.0, reference_distance=3.5)
 
 
 def table(n: int = 300, degree: int = 1, seed: int = 0) -> np.ndarray:
     """Rows in Inria's layout, with unit quaternions and nonzero values in every column."""
-    g = scenes.gaussians(n, degree, seed)
+    g = gaussians(n, degree, seed)
     return inria_rows(g.replace(quats=torch.nn.functional.normalize(g.quats)))
 
 
@@ -187,9 +187,7 @@ def test_other_trainers_encodings_and_coordinates(tmp_path: Path) -> None:
 
 
 def test_a_dial(tmp_path: Path) -> None:
-    g = with_dial(
-        scenes.gaussians(40, 1, 0), attenuation=ATTENUATION, growth_d=torch.linspace(-1, 3, 40)
-    )
+    g = with_dial(gaussians(40, 1, 0), attenuation=ATTENUATION, growth_d=torch.linspace(-1, 3, 40))
     save(tmp_path / "a.ply", g, calibration=CALIBRATION)
     (found, splat), names = seen(tmp_path / "a.ply"), "sigma_d and growth_d"
     assert splat.dial is not None

@@ -11,6 +11,7 @@ import torch
 from plyfile import PlyData
 
 import clod_adapter as clod
+from clod_adapter import Gaussians, Scene, adapt, detach, make_plan, render
 from clod_adapter.adapter import ATTRIBUTES
 from clod_adapter.bake import bake, order_by_extinction
 from clod_adapter.config import AttenuationConfig
@@ -28,13 +29,13 @@ PLAIN = Rasterizer(reference.rasterize)
 
 
 @pytest.fixture(scope="module")
-def both() -> tuple[clod.Gaussians, clod.Scene]:
+def both() -> tuple[Gaussians, Scene]:
     return capture()
 
 
 @pytest.fixture(scope="module")
-def adapted(both: tuple[clod.Gaussians, clod.Scene]) -> clod.Gaussians:
-    return clod.adapt(*both, config_of(iters=40)).gaussians
+def adapted(both: tuple[Gaussians, Scene]) -> Gaussians:
+    return adapt(*both, config_of(iters=40)).gaussians
 
 
 def test_far_ones_take_over_from_near_ones() -> None:
@@ -55,17 +56,17 @@ def test_far_ones_take_over_from_near_ones() -> None:
     assert float(slopes[:, 1:].max()) <= 10 * 0.8 + 1e-6
 
 
-def test_few_photographs_merge_nothing_away(both: tuple[clod.Gaussians, clod.Scene]) -> None:
+def test_few_photographs_merge_nothing_away(both: tuple[Gaussians, Scene]) -> None:
     """Beside few photographs there are as many far Gaussians as near ones, else fewer."""
     base, scene = both
     few = clod.add_pseudo_views(base, replace(scene, train=scene.train[:4]))
     assert len(few.train) > 4
-    start = clod.make_plan(base, few, config_of()).start
+    start = make_plan(base, few, config_of()).start
     assert len(start) == 2 * len(base)
-    assert len(clod.make_plan(base, scene, config_of()).start) < len(start)
+    assert len(make_plan(base, scene, config_of()).start) < len(start)
 
 
-def test_rasterizers_agree(adapted: clod.Gaussians) -> None:
+def test_rasterizers_agree(adapted: Gaussians) -> None:
     for camera in ring(3, 48, 32):
         for s in (0.0, 1.0, 2.0, 4.0):
             ours, theirs = (one.draw(adapted, camera, s)[0] for one in (cpu.RASTERIZER, PLAIN))
@@ -90,18 +91,16 @@ def test_merging_keeps_mass_and_centre() -> None:
     }
 
 
-def test_near_ones_are_the_checkpoint(
-    adapted: clod.Gaussians, both: tuple[clod.Gaussians, clod.Scene]
-) -> None:
+def test_near_ones_are_the_checkpoint(adapted: Gaussians, both: tuple[Gaussians, Scene]) -> None:
     base, scene = both
     assert adapted.whole == len(base) < len(adapted) and adapted.near is not None
-    assert_equal(clod.detach(adapted), base)
+    assert_equal(detach(adapted), base)
     camera = scene.test[0].camera
-    assert torch.equal(clod.render(adapted, camera, 0.0).image, clod.render(base, camera).image)
+    assert torch.equal(render(adapted, camera, 0.0).image, render(base, camera).image)
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".safetensors", ".pt", ".glb", ".spz"])
-def test_files(adapted: clod.Gaussians, tmp_path: Path, suffix: str) -> None:
+def test_files(adapted: Gaussians, tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"a{suffix}"
     write(path, adapted, Metadata())
     found = clod.load(path).gaussians
@@ -120,7 +119,7 @@ def test_files(adapted: clod.Gaussians, tmp_path: Path, suffix: str) -> None:
 
 
 def test_the_adapter_has_the_far_ones(
-    adapted: clod.Gaussians, both: tuple[clod.Gaussians, clod.Scene], tmp_path: Path
+    adapted: Gaussians, both: tuple[Gaussians, Scene], tmp_path: Path
 ) -> None:
     adapter = clod.extract(both[0], adapted, fingerprint="0" * 64, config={})
     assert not adapter.updates
@@ -130,17 +129,15 @@ def test_the_adapter_has_the_far_ones(
     assert_equal(clod.load_adapter(tmp_path / "a.safetensors").apply(both[0]), adapted)
 
 
-def test_counts_and_baking(
-    adapted: clod.Gaussians, both: tuple[clod.Gaussians, clod.Scene]
-) -> None:
+def test_counts_and_baking(adapted: Gaussians, both: tuple[Gaussians, Scene]) -> None:
     cameras = [view.camera for view in both[1].train]
     found = dial_for(adapted, keep=80, cameras=cameras, baked=True).virtual_scale
     assert 60 < len(bake(adapted, found, cameras=cameras)) <= 80
     camera = cameras[0]
     s = 1.7
     assert torch.allclose(
-        clod.render(bake(adapted, s, camera), camera).image,
-        clod.render(adapted, camera, s).image,
+        render(bake(adapted, s, camera), camera).image,
+        render(adapted, camera, s).image,
         atol=1e-3,
     )
     with pytest.raises(clod.ClodError, match="have no order"):
@@ -148,8 +145,8 @@ def test_counts_and_baking(
 
 
 def test_a_second_run_continues_with_the_far_ones(
-    adapted: clod.Gaussians, both: tuple[clod.Gaussians, clod.Scene]
+    adapted: Gaussians, both: tuple[Gaussians, Scene]
 ) -> None:
-    again = clod.adapt(adapted, both[1], config_of(iters=5)).gaussians
+    again = adapt(adapted, both[1], config_of(iters=5)).gaussians
     assert len(again) == len(adapted) and not torch.equal(again.means, adapted.means)
-    assert_equal(clod.detach(again), both[0])
+    assert_equal(detach(again), both[0])

@@ -11,6 +11,7 @@ from torch import Tensor
 
 import clod_adapter as clod
 import scenes
+from clod_adapter import AdaptConfig, Gaussians, Scene, render
 from clod_adapter.initialization.importance import coverage
 from clod_adapter.training import camera_placement, pseudo_views
 from clod_adapter.training.camera_placement import FIELD, HEIGHT, WIDTH, place_cameras
@@ -22,16 +23,17 @@ from clod_adapter.training.pseudo_views import (
     render_pseudo_views,
 )
 from clod_adapter.training.schedule import ViewSampler
+from scenes import ring
 
 
 @pytest.fixture(scope="module")
-def blob() -> clod.Gaussians:
+def blob() -> Gaussians:
     return scenes.gaussians(400, 1, 0, size=0.05)
 
 
-def test_images_are_renders_of_the_checkpoint(blob: clod.Gaussians) -> None:
+def test_images_are_renders_of_the_checkpoint(blob: Gaussians) -> None:
     """Renders of a file with a dial are at s = 1."""
-    cameras = scenes.ring(9, 40, 30)
+    cameras = ring(9, 40, 30)
     told = []
     own = clod.with_dial(
         blob, torch.full((len(blob),), 0.3), clod.AttenuationConfig(scene_distance=4.0)
@@ -42,7 +44,7 @@ def test_images_are_renders_of_the_checkpoint(blob: clod.Gaussians) -> None:
     assert [view.camera for view in scene.test] == [cameras[0], cameras[8]]
     assert len(scene.train) == 7
     image, plain = (
-        (clod.render(g, cameras[1]).image.clamp(0, 1) * 255).round().byte() for g in (own, blob)
+        (render(g, cameras[1]).image.clamp(0, 1) * 255).round().byte() for g in (own, blob)
     )
     assert torch.equal(scene.train[0].image, image) and not torch.equal(image, plain)
     assert "7 pseudo views to train on, 2 held out, 40x30" in scene.notes[0]
@@ -53,49 +55,45 @@ def test_images_are_renders_of_the_checkpoint(blob: clod.Gaussians) -> None:
     assert render_pseudo_views(own, cameras[:1]).test == ()
 
 
-def test_each_step_renders_the_checkpoint_from_another_camera(blob: clod.Gaussians) -> None:
+def test_each_step_renders_the_checkpoint_from_another_camera(blob: Gaussians) -> None:
     """A photograph stays where it is."""
-    cameras = scenes.ring(3, 40, 30)
+    cameras = ring(3, 40, 30)
     (photograph,) = scenes.photograph(blob, cameras[:1])
-    sampler = ViewSampler(
-        (*render_pseudo_views(blob, cameras).train, photograph), clod.AdaptConfig()
-    )
+    sampler = ViewSampler((*render_pseudo_views(blob, cameras).train, photograph), AdaptConfig())
     drawn = [sampler.draw(k, 0.0).view for k in range(9)]
     assert sum(view is photograph for view in drawn) == 3
     for view in drawn:
-        assert torch.equal(view.image, clod.render(blob, view.camera).pixels)
+        assert torch.equal(view.image, render(blob, view.camera).pixels)
         assert view is photograph or all(
             not torch.equal(view.camera.viewmat, camera.viewmat) for camera in cameras
         )
 
 
-def test_few_photographs_get_pseudo_views(
-    blob: clod.Gaussians, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_few_photographs_get_pseudo_views(blob: Gaussians, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pseudo_views, "ADDED", 9)
     monkeypatch.setattr(pseudo_views, "MANY", 12)
-    around = scenes.photograph(blob, scenes.ring(12, 80, 60))
-    enough = clod.Scene(around, ())
+    around = scenes.photograph(blob, ring(12, 80, 60))
+    enough = Scene(around, ())
     assert add_pseudo_views(blob, enough) == enough
-    scene = add_pseudo_views(blob, clod.Scene(around[:1], around[1:]))
+    scene = add_pseudo_views(blob, Scene(around[:1], around[1:]))
     assert scene.train[0] is around[0] and len(scene.train) == 1 + 9 and scene.test == around[1:]
     assert "only 1 photographs to train on: 9 pseudo views" in scene.notes[-1]
     assert [
         torch.equal(view.camera.viewmat, around[0].camera.viewmat) for view in scene.train
     ].count(True) == 1 + 4
-    assert len(add_pseudo_views(blob, clod.Scene(around[1:], ())).train) == 11 + 11 + 4
+    assert len(add_pseudo_views(blob, Scene(around[1:], ())).train) == 11 + 11 + 4
     # too faint to place a camera by
     faint = blob.replace(opacity_logits=torch.full((len(blob),), -4.6))
-    scene = add_pseudo_views(faint, clod.Scene(around[:2], ()))
+    scene = add_pseudo_views(faint, Scene(around[:2], ()))
     assert scene.train == around[:2] and "no pseudo views can be added" in scene.notes[-1]
-    assert clod.adapt(faint, scene, clod.AdaptConfig(iters=1)).steps == 1
+    assert clod.adapt(faint, scene, AdaptConfig(iters=1)).steps == 1
 
 
-def test_moved_cameras_have_the_documented_offsets(blob: clod.Gaussians) -> None:
+def test_moved_cameras_have_the_documented_offsets(blob: Gaussians) -> None:
     """Of position, direction and focal length; some step back along their direction of view, up to
     FARTHER reaches.
     """
-    camera = scenes.ring(1, 40, 30)[0]
+    camera = ring(1, 40, 30)[0]
     rng = np.random.default_rng(0)
     near, back = (
         [PseudoView(camera, blob, 3.0, far).moved(rng).camera for _ in range(500)]
@@ -115,7 +113,7 @@ def test_moved_cameras_have_the_documented_offsets(blob: clod.Gaussians) -> None
     assert behind.min() > -6 * MOVED and FARTHER / 2 < behind.max() < FARTHER - 1 + 6 * MOVED
 
 
-def ball(n: int, seen_from: Tensor) -> clod.Gaussians:
+def ball(n: int, seen_from: Tensor) -> Gaussians:
     """An opaque sphere of small discs and a far floater; SH degree 1, as after training, on the
     seen half alone.
     """
@@ -133,10 +131,10 @@ def ball(n: int, seen_from: Tensor) -> clod.Gaussians:
     )
     quats = torch.tensor([[1.0, 0, 0, 0]]).repeat(n + 1, 1)
     sh0 = torch.zeros(n + 1, 1, 3)
-    return clod.Gaussians(means, quats, logs, torch.full((n + 1,), 3.0), sh0, shN.repeat(1, 1, 3))
+    return Gaussians(means, quats, logs, torch.full((n + 1,), 3.0), sh0, shN.repeat(1, 1, 3))
 
 
-def test_placed_cameras_are_valid_and_see_the_scene(blob: clod.Gaussians) -> None:
+def test_placed_cameras_are_valid_and_see_the_scene(blob: Gaussians) -> None:
     told = []
     cameras = place_cameras(blob, views=12, progress=lambda now: told.append((now.done, now.total)))
     assert told[-1][0] == told[-1][1] == len(told)
@@ -149,7 +147,7 @@ def test_placed_cameras_are_valid_and_see_the_scene(blob: clod.Gaussians) -> Non
         assert 2 * math.degrees(math.atan(WIDTH / 2 / float(camera.K[0, 0]))) == pytest.approx(
             FIELD
         )
-        assert clod.render(blob, camera).alpha.mean() > 0.02
+        assert render(blob, camera).alpha.mean() > 0.02
     one, two, other = (
         torch.stack([c.viewmat for c in place_cameras(blob, views=4, seed=k)]) for k in (1, 1, 2)
     )
@@ -165,7 +163,7 @@ def test_a_scene_gets_as_many_cameras_as_show_it(monkeypatch: pytest.MonkeyPatch
     one = ball(200, torch.eye(3)[2]).select(torch.arange(200)).without_bands(0)
     street = {name: torch.cat([value] * 8) for name, value in one.tensors().items()}
     street["means"] = torch.cat([one.means + torch.tensor([8.0 * x, 0.0, 0.0]) for x in range(8)])
-    many = clod.Gaussians(**street)
+    many = Gaussians(**street)
     few = place_cameras(one)
     more = place_cameras(many)
     assert 8 <= len(few) < len(more) <= 40 and len({c.name for c in more}) == len(more)

@@ -16,7 +16,16 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 import clod_adapter as clod
-from clod_adapter import AdaptConfig, AttenuationConfig, Gaussians, Scene, View, adapt, evaluate
+from clod_adapter import (
+    AdaptConfig,
+    AttenuationConfig,
+    Gaussians,
+    Scene,
+    View,
+    adapt,
+    evaluate,
+    make_plan,
+)
 from clod_adapter.adapter import ATTRIBUTES, with_dial
 from clod_adapter.cameras import in_its_unit
 from clod_adapter.equation.distances import typical_distance
@@ -121,7 +130,7 @@ def pair() -> Pair:
 
 def results(base: Gaussians, scene: Scene) -> list[tuple[float, float]]:
     """PSNR and share kept on the held-out views, at s = 1, 2 and 4."""
-    plan = clod.make_plan(base, scene, CONFIG)
+    plan = make_plan(base, scene, CONFIG)
     rows = evaluate(plan.adapt(scene).gaussians, scene.test, (1.0, 2.0, 4.0))
     return [(row.psnr, row.kept_share) for row in rows]
 
@@ -184,12 +193,12 @@ def session_of(capture: Any) -> tuple[list[Tensor], str]:
     """Of a session from files to a baked dial value."""
     base = clod.load(capture.ply).gaussians
     scene = clod.load_scene(capture.scene)
-    adapted = clod.adapt(base, scene, clod.AdaptConfig(iters=4, max_sv=3), progress=False).gaussians
+    adapted = adapt(base, scene, AdaptConfig(iters=4, max_sv=3), progress=False).gaussians
     cameras = [view.camera for view in scene.train]
     image = clod.render(adapted, cameras[0], virtual_scale=2).image
     attached = clod.attach(base, cameras)
-    (row,) = clod.evaluate(adapted, scene.test, [2.0])
-    plan = clod.make_plan(base, scene)
+    (row,) = evaluate(adapted, scene.test, [2.0])
+    plan = make_plan(base, scene)
     baked = clod.bake(adapted, 2, cameras=cameras)
     dialled = [
         attached.sigma_d,

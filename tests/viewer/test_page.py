@@ -17,10 +17,12 @@ from PIL import Image
 
 import clod_adapter
 import scenes
+from clod_adapter import load
 from clod_adapter.calibration import Calibration, CalibrationRow
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.render import render
 from clod_adapter.viewer import page
+from scenes import dialled
 from shown import Shown, assert_same, serve
 
 VIEWER = Path(clod_adapter.__file__).parent / "viewer"
@@ -56,7 +58,7 @@ def test_the_text_of_one_file(tmp_path: Path) -> None:
     folders.
     """
     clod_adapter.save(tmp_path / "model.ply", clod_adapter.with_dial(scenes.gaussians(50, 1, 0)))
-    saved = clod_adapter.load(tmp_path / "model.ply")
+    saved = load(tmp_path / "model.ply")
     cameras = scenes.ring(2, 1000, 500)
     out = tmp_path / "out" / "page.html"
     out.parent.mkdir()
@@ -82,16 +84,16 @@ def test_the_text_of_one_file(tmp_path: Path) -> None:
 
 def test_the_exact_file_is_a_plain_ply(capture: Any, tmp_path: Path) -> None:
     """In blocks of rows, without empty SH degrees and rows that were dropped."""
-    model = scenes.dialled(20_000, 3, 3, scene_distance=1.0)
+    model = dialled(20_000, 3, 3, scene_distance=1.0)
     model = model.replace(shN=model.shN.where(torch.arange(15)[:, None] < 8, 0))
     model.means[7, 1] = torch.nan
     capture.write(tmp_path / "a.ply", model)
-    loaded = clod_adapter.load(tmp_path / "a.ply")
+    loaded = load(tmp_path / "a.ply")
     payload = page.Payload.of(replace(loaded, path=Path("b\udcff.ply")))
     (tmp_path / "payload.ply").write_bytes(b"".join(payload.blocks()))
     assert (tmp_path / "payload.ply").stat().st_size == payload.size
     assert payload.name == "b\\xff.ply"
-    read = clod_adapter.load(tmp_path / "payload.ply")
+    read = load(tmp_path / "payload.ply")
     scenes.assert_equal(read.gaussians, loaded.gaussians.replace(shN=loaded.gaussians.shN[:, :8]))
     assert {kind for kind, _ in read.vertex.dtype.fields.values()} == {np.dtype("<f4")}
 
@@ -106,7 +108,7 @@ def test_a_page_of_one_file(
     """
     monkeypatch.setattr(page, "PART", 15_000)
     size = 1000.0
-    model = scenes.dialled(1000, 3, 4, scene_distance=1.0, reference_distance=3.0)
+    model = dialled(1000, 3, 4, scene_distance=1.0, reference_distance=3.0)
     far = model.replace(
         means=size * model.means,
         log_scales=model.log_scales + float(np.log(size)),
@@ -116,9 +118,7 @@ def test_a_page_of_one_file(
     )
     path = save(far)
     row = CalibrationRow(1.0, 900.0, 31.5, 0.9, 4.0)
-    calibrated = replace(
-        clod_adapter.load(path), calibration=Calibration((row,), 1000, 2, 8, 6, "a machine")
-    )
+    calibrated = replace(load(path), calibration=Calibration((row,), 1000, 2, 8, 6, "a machine"))
     calibrated.gaussians.opacity_logits[3] = torch.inf
     camera = scenes.camera(320, 240)
     viewmat = camera.viewmat.clone()

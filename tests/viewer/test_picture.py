@@ -13,8 +13,8 @@ import pytest
 import torch
 from plyfile import PlyData
 
-import clod_adapter
 import scenes
+from clod_adapter import load
 from clod_adapter.cameras import Camera
 from clod_adapter.config import FILTERS, ScreenFilter
 from clod_adapter.errors import ClodError
@@ -23,6 +23,7 @@ from clod_adapter.io.file_formats import write
 from clod_adapter.render import render
 from clod_adapter.viewer.page import Payload
 from formats import write_rows
+from scenes import dialled
 from shown import TALL, Shown, assert_alike, assert_same, drop, message, take
 
 VIEW = scenes.camera(320, 240)
@@ -37,13 +38,13 @@ def grown(count: int, degree: int, power: float, by: float, **settings: Any) -> 
     """With growth of both signs; some Gaussians have their centre outside the picture and grow into
     it.
     """
-    model = scenes.dialled(count, degree, 7, **settings)
+    model = dialled(count, degree, 7, **settings)
     return finer(model, by, growth_d=torch.linspace(-1, power, count))
 
 
 def small(size: float) -> tuple[Gaussians, tuple[float, ...], Camera]:
     """In another unit of length, with a nearer near plane."""
-    model = scenes.dialled(500, 0, 7, scene_distance=3 * size)
+    model = dialled(500, 0, 7, scene_distance=3 * size)
     viewmat = VIEW.viewmat.clone()
     viewmat[:3, 3] *= size
     model = finer(model, -float(np.log(size)), means=size * model.means)
@@ -52,10 +53,10 @@ def small(size: float) -> tuple[Gaussians, tuple[float, ...], Camera]:
 
 # Model, dial values and camera; each differs from the others in what is named.
 CASES = {
-    "degree 3": (scenes.dialled(500, 3, 7), (1.0, 3.0), VIEW),
-    "compensated": (finer(scenes.dialled(500, 1, 7), 2, screen_filter=FILTERS["on"]), (2.0,), VIEW),
+    "degree 3": (dialled(500, 3, 7), (1.0, 3.0), VIEW),
+    "compensated": (finer(dialled(500, 1, 7), 2, screen_filter=FILTERS["on"]), (2.0,), VIEW),
     "another unit, wide blur": (
-        finer(scenes.dialled(500, 1, 7, scene_distance=2.0), 2, screen_filter=WIDE),
+        finer(dialled(500, 1, 7, scene_distance=2.0), 2, screen_filter=WIDE),
         (2.0,),
         VIEW,
     ),
@@ -73,7 +74,7 @@ CASES = {
     ),
     "millimetres": small(1e-3),
     "off centre": (
-        scenes.dialled(500, 0, 7),
+        dialled(500, 0, 7),
         (1.0,),
         scenes.camera(180, 240, fov=100, off_centre=(0.1, 0.9)),
     ),
@@ -102,7 +103,7 @@ def test_wipe_shows_both_sides(show: Any, save: Any) -> None:
     """The base, or the same file without its dial, which is then on at the left; by a switch, and
     by C.
     """
-    gaussians = scenes.dialled(600, 0, 7)
+    gaussians = dialled(600, 0, 7)
     base = gaussians.replace(sigma_d=None, attenuation=None, sh0=-gaussians.sh0)
     shown = show(save(gaussians), "--base", save(base, "base.ply"), "--sv", 3, viewport=TALL)
     left = render(gaussians, VIEW, 3.0).pixels.numpy()
@@ -142,7 +143,7 @@ def test_ply_and_spz_are_shown_as_python_reads_them(
         tagged.replace(b"format", b"comment SplatRenderMode: mip\nformat", 1)
     )
     for path in sorted(tmp_path.glob("*.*")):
-        found = clod_adapter.load(path).gaussians
+        found = load(path).gaussians
         take(shown, path)
         shown.camera(VIEW)
         s = 4.0 if found.attenuation else 1.0
@@ -155,7 +156,7 @@ def test_other_files_are_errors_and_the_picture_stays(
     shown: Shown, model: Path, tmp_path: Path
 ) -> None:
     data = model.read_bytes()
-    write(tmp_path / "a.glb", clod_adapter.load(model).gaussians)
+    write(tmp_path / "a.glb", load(model).gaussians)
     header, _, _ = data.partition(b"end_header")
     python = "clod-adapt view {} opens every format"
     refused = (
@@ -197,7 +198,7 @@ def test_other_forms_of_the_dial_are_refused_with_a_remedy(
     """The paper's, and that of files from before every Gaussian had a reach; by comments, columns
     and documents.
     """
-    loaded = clod_adapter.load(model)
+    loaded = load(model)
     paper = replace(loaded.gaussians.attenuation, form="paper")
     write(tmp_path / "paper.spz", loaded.gaussians.replace(attenuation=paper))
     ours = b"comment clod_adapter form ours\n"

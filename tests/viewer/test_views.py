@@ -21,6 +21,7 @@ from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.file_formats import write
 from clod_adapter.viewer.page import write_viewer_page
 from models import write_model
+from scenes import ring
 from shown import TALL, Shown, drop, fold, take
 
 
@@ -126,9 +127,7 @@ def test_files_and_cameras_are_listed(show: Any, gaussians: Gaussians, tmp_path:
     models = {"a.ply": gaussians, "b.glb": second, "c.ply": scenes.dialled(9, 1, 5)}
     for name, model in models.items():
         write(tmp_path / name, model)
-    cameras = [
-        replace(camera, name=f"{k}.jpg") for k, camera in enumerate(scenes.ring(3, 320, 240))
-    ]
+    cameras = [replace(camera, name=f"{k}.jpg") for k, camera in enumerate(ring(3, 320, 240))]
     write_model(tmp_path, cameras, [camera.name for camera in cameras])
     words = [
         *(tmp_path / name for name in models),
@@ -232,9 +231,7 @@ def test_the_up_axis(shown: Shown, show: Any, save: Any, tmp_path: Path) -> None
     assert chosen["up"].tolist() == [0, 0, 1]
     assert abs(chosen["axes"][2]) < 1e-6
     assert forward(chosen)[2] < 0
-    cameras = [
-        replace(camera, name=f"{k}.jpg") for k, camera in enumerate(scenes.ring(3, 320, 240))
-    ]
+    cameras = [replace(camera, name=f"{k}.jpg") for k, camera in enumerate(ring(3, 320, 240))]
     write_model(tmp_path, cameras, [camera.name for camera in cameras])
     with_cameras = show(path, "--images", tmp_path)
     assert with_cameras.page.text_content("#up option") == "as in the photographs"
@@ -326,9 +323,7 @@ def test_the_path_and_the_turntable(show: Any, model: Path, tmp_path: Path) -> N
     """The path begins again at its end; Space or a drag stops it. The turntable rotates about the
     pivot and up axis.
     """
-    cameras = [
-        replace(camera, name=f"{k}.jpg") for k, camera in enumerate(scenes.ring(80, 320, 240)[:3])
-    ]
+    cameras = [replace(camera, name=f"{k}.jpg") for k, camera in enumerate(ring(80, 320, 240)[:3])]
     write_model(tmp_path, cameras, [camera.name for camera in cameras])
     shown = show(model, "--images", tmp_path)
     playing = "document.querySelector('#play.playing')"

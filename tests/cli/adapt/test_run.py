@@ -13,7 +13,7 @@ import pytest
 import torch
 from PIL import Image
 
-import clod_adapter
+from clod_adapter import detach, evaluate, load, load_adapter, load_scene
 from clod_adapter._support.machine import machine_name
 from clod_adapter.cli import adapt
 from clod_adapter.config import AdaptConfig
@@ -25,7 +25,7 @@ TINY = "--iters 12 --max-sv 4 --out dial.ply"
 
 
 def columns(path: Path | str) -> list[str]:
-    return list(clod_adapter.load(path).vertex.dtype.names)
+    return list(load(path).vertex.dtype.names)
 
 
 @pytest.fixture(scope="module")
@@ -81,17 +81,17 @@ def test_writes_three_files(adapted: tuple[Path, Any], capture: Any, dialled: Pa
     assert columns(folder / "dial.ply")[-3:] == ["sigma_d", "growth_d", "opacity_d"]
     assert b"screen_filter" not in data
     assert results(folder) == results(dialled.parent)
-    model = clod_adapter.load(folder / "dial.ply")
-    views = clod_adapter.load_scene(capture.scene).test
-    (plain,) = clod_adapter.evaluate(clod_adapter.detach(model.gaussians), views, [1.0])
-    ends = clod_adapter.evaluate(model.gaussians, views, [1.0, 4.0])
+    model = load(folder / "dial.ply")
+    views = load_scene(capture.scene).test
+    (plain,) = evaluate(detach(model.gaussians), views, [1.0])
+    ends = evaluate(model.gaussians, views, [1.0, 4.0])
     for ours, row in zip(
         (report["detached_row"], *report["rows"][::4]), (plain, *ends), strict=True
     ):
         assert {**ours, "frame_ms": 0} == {**row.as_dict(), "frame_ms": 0}
     stored = model.calibration
     assert stored is not None
-    assert stored == clod_adapter.load_adapter(folder / "dial.safetensors").calibration
+    assert stored == load_adapter(folder / "dial.safetensors").calibration
     assert stored.as_dict() == report["calibration"] and stored.machine == machine_name()
     for row, measured in zip(stored.rows, report["rows"], strict=True):
         assert vars(row).items() <= measured.items()
@@ -165,14 +165,14 @@ def test_dial_of_the_checkpoint_is_continued(clod: Any, dialled: Path) -> None:
         assert done.report["device"] == "cpu", done
         assert columns(Path("dial.ply"))[-len(stored) :] == stored and rebuilt(clod, model)
         if more:
-            assert clod_adapter.load_adapter("dial.safetensors").growth_d is None
+            assert load_adapter("dial.safetensors").growth_d is None
             shutil.copy("dial.ply", "off.ply")
-    growth_d = clod_adapter.load("dial.ply").gaussians.growth_d
+    growth_d = load("dial.ply").gaussians.growth_d
     assert growth_d is not None and not growth_d.any()
 
 
 def test_without_held_out_photographs(clod: Any, capture: Any, tmp_path: Path) -> None:
-    view = clod_adapter.load_scene(capture.scene).train[0]
+    view = load_scene(capture.scene).train[0]
     (tmp_path / "one" / "images").mkdir(parents=True)
     write_model(tmp_path / "one", [view.camera], ["a.png"])
     Image.fromarray(view.image.numpy()).save(tmp_path / "one" / "images" / "a.png")
@@ -278,8 +278,8 @@ def test_the_plan_is_printed_and_stored(clod: Any, wasteful: Path) -> None:
     assert list(stored) == [*table, "undistortion", "scaling"]
     assert stored["far Gaussians"]["number"] == 280
     assert set(seconds) == {"bands", "start"} and done.report["seconds"]["plan"] > 0
-    base, whole = (clod_adapter.load(path).gaussians for path in (wasteful, "dial.ply"))
-    assert (whole.whole, len(whole)) == (350, 630) and clod_adapter.detach(whole) == base
+    base, whole = (load(path).gaussians for path in (wasteful, "dial.ply"))
+    assert (whole.whole, len(whole)) == (350, 630) and detach(whole) == base
     assert rebuilt(clod, wasteful)
 
 
@@ -292,5 +292,5 @@ def test_overrides(clod: Any, wasteful: Path) -> None:
     others = {name: d["verdict"] for name, d in stored.items() if d["name"] not in ("bands", "")}
     assert others == {"means": "frozen", "quats": "frozen"}
     assert re.search(r"^  quats +frozen +- +--with quats$", done.err, re.M), done
-    adapter = clod_adapter.load_adapter("dial.safetensors")
+    adapter = load_adapter("dial.safetensors")
     assert not adapter.updates and len(adapter.added["means"]) == 280

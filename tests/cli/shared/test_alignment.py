@@ -11,7 +11,7 @@ import torch
 from PIL import Image
 
 import clod_adapter
-from clod_adapter import View, load_scene, render
+from clod_adapter import View, load, load_scene, render
 from clod_adapter.cli.main import build_parser
 from clod_adapter.cli.shared.console import Console
 from clod_adapter.cli.view import make_page
@@ -151,7 +151,7 @@ def test_adapting_detects_and_stores_the_filter(
     (note,) = [note for note in report["notes"] if "antialiasing" in note]
     assert note in done.err and report["screen_filter"] == {"variance": 0.3, "compensate": True}
     assert report["base_rows"][0]["psnr"] > 45  # the photographs are its renders, rounded to bytes
-    found = clod_adapter.load("dial.ply")
+    found = load("dial.ply")
     assert found.gaussians.screen_filter == FILTERS["on"] and found.filter_known
     assert clod_adapter.load_adapter("dial.safetensors").screen_filter == FILTERS["on"]
     assert rebuilt(clod, ply)
@@ -160,7 +160,7 @@ def test_adapting_detects_and_stores_the_filter(
         answers, _ = make_page(build_parser("view").parse_args(words), Console(quiet=True))
         for name in ("model", "base"):
             (tmp_path / "served.ply").write_bytes(b"".join(answers[f"/files/{name}"].blocks()))
-            assert clod_adapter.load(tmp_path / "served.ply").gaussians.screen_filter == want
+            assert load(tmp_path / "served.ply").gaussians.screen_filter == want
 
 
 def test_eval_and_render_use_the_detected_filter(clod: Any, trained: tuple[Path, Path]) -> None:
@@ -201,4 +201,4 @@ def test_exports_store_the_filter_or_note_its_loss(clod: Any, trained: tuple[Pat
         done = clod("export", trained[0], "--antialiasing on --json -o", out)
         found = [note for note in done.report["notes"] if "trained antialiased" in note]
         assert bool(found) == notes and all(note in done.err for note in found), done
-        assert not stores or clod_adapter.load(out).gaussians.screen_filter == FILTERS["on"]
+        assert not stores or load(out).gaussians.screen_filter == FILTERS["on"]
