@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
-from itertools import count
+from itertools import chain, count
 from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
@@ -68,12 +68,9 @@ for line in sys.stdin:
 
 def accepted(words: Sequence[object]) -> list[str]:
     """The words of a command, as text; adapting, which takes few steps here, accepts its loss."""
-    found = [str(word) for word in words]
-    return (
-        [*found, "--accept-loss"]
-        if found and Path(found[0]).suffix and "--help" not in found
-        else found
-    )
+    texts = list(map(str, words))
+    adapts = texts and Path(texts[0]).suffix and "--help" not in texts
+    return [*texts, "--accept-loss"] if adapts else texts
 
 
 class Server:
@@ -180,12 +177,8 @@ def log_of(folder: Path, rank: object = "") -> str:
 
 
 def contents(*roots: Path) -> dict[Path, bytes]:
-    return {
-        file: file.read_bytes()
-        for root in roots
-        for file in (root, *root.rglob("*"))
-        if file.is_file()
-    }
+    paths = chain(roots, *(root.rglob("*") for root in roots))
+    return {path: path.read_bytes() for path in paths if path.is_file()}
 
 
 def results(folder: Path, name: str = "dial") -> dict[str, bytes]:
@@ -230,8 +223,9 @@ def change_step(patch: pytest.MonkeyPatch, at: int, change: Callable[[Any], Any]
     steps = count(1)
 
     def changed(self: Trainer, *given: Any) -> Any:
-        found = real(self, *given)
-        return change(found) if self.config.iters > 1 and next(steps) == at else found
+        gradients = real(self, *given)
+        chosen = self.config.iters > 1 and next(steps) == at
+        return change(gradients) if chosen else gradients
 
     patch.setattr(Trainer, "gradient_sum", changed)
 

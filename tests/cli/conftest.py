@@ -62,6 +62,11 @@ class Done(NamedTuple):
         """The object of ``--json``."""
         return json.loads(self.out)
 
+    def note(self, part: str) -> str:
+        """The one note of ``--json`` that has this part."""
+        (note,) = (note for note in self.report["notes"] if part in note)
+        return note
+
 
 @pytest.fixture(scope="session")
 def run_in(capture: Any, dialled: Path) -> Callable[..., Done]:
@@ -76,10 +81,10 @@ def run_in(capture: Any, dialled: Path) -> Callable[..., Done]:
     def run(folder: Path, *words: object, code: int = 0, accept: bool = True) -> Done:
         out = io.StringIO()
         err = io.StringIO()
-        parts = [
-            part for word in words for part in (word.split() if isinstance(word, str) else [word])
-        ]
-        given = [str(shared.get(part, part)) for part in parts]
+        given = []
+        for word in words:
+            parts = word.split() if isinstance(word, str) else [word]
+            given += [str(shared.get(part, part)) for part in parts]
         with pytest.MonkeyPatch.context() as patch, redirect_stdout(out), redirect_stderr(err):
             patch.chdir(folder)
             try:
