@@ -33,7 +33,7 @@ from formats import inria_rows, write_rows
 from models import write_model
 from runs import accepted
 from scenes import capture as perturbed
-from scenes import looking
+from scenes import looking, seeded
 
 fake_gpu.register()
 frame_times.NOISY = math.inf  # whether a note is given depends on the load
@@ -94,7 +94,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
     folder = tmp_path_factory.mktemp("capture")
     scene = folder / "scene"
     (scene / "images").mkdir(parents=True)
-    normal = partial(torch.randn, generator=torch.Generator().manual_seed(1))
+    normal = partial(torch.randn, generator=seeded(1))
     gaussians = Gaussians(
         means=normal(300, 3),
         quats=normal(300, 4),

@@ -25,7 +25,7 @@ from clod_adapter.calibration import Calibration, CalibrationRow
 from clod_adapter.config import SH_COUNTS, AttenuationConfig
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.checkpoint import Checkpoint, load, save
-from scenes import gaussians
+from scenes import gaussians, seeded
 
 ATTENUATION = AttenuationConfig(reference_distance=3.217, max_sv=7.0)
 CALIBRATION = Calibration((CalibrationRow(1, 30, 29.1, 0.9, 2.5),), 40, 3, 64, 48, "a machine")
@@ -45,7 +45,7 @@ def model(degree: int = 3, count: int = 40, *, growth: bool = True) -> Gaussians
     growth_d of -1 to 3.
     """
     g = gaussians(count, degree, seed=degree)
-    sigma = torch.rand(count, generator=torch.Generator().manual_seed(1)) * 4
+    sigma = torch.rand(count, generator=seeded(1)) * 4
     sigma[:4] = torch.tensor([1e9, 0.0, 1e-3, 65504.0])
     logits = g.opacity_logits.clone()
     logits[0] = torch.inf

@@ -16,6 +16,7 @@ from torch import Tensor
 from clod_adapter.cameras import Camera
 from clod_adapter.config import CLASSIC, ScreenFilter
 from clod_adapter.rasterizers import Splat, reference
+from scenes import seeded
 
 IMAGE, GRADIENT, ON_A_CUT = 2e-5, 5e-4, 0.02
 BACKGROUND = torch.tensor([0.2, 0.5, 0.7])
@@ -31,7 +32,7 @@ class Result(NamedTuple):
 
 
 def weights(camera: Camera) -> tuple[Tensor, Tensor]:
-    g = torch.Generator().manual_seed(0)
+    g = seeded(0)
     size = (camera.height, camera.width)
     return torch.randn(*size, 3, generator=g), torch.randn(*size, generator=g)
 

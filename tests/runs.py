@@ -1,5 +1,5 @@
-"""Shared by tests of the command: file names, injected errors and interrupts, processes that start
-fast.
+"""Shared by tests of the command and of training: file names, expected and injected errors,
+interrupts, processes that start fast.
 """
 
 import copy
@@ -18,7 +18,7 @@ import pytest
 import torch.distributed as dist
 
 import clod_adapter
-from clod_adapter import AdaptConfig, Progress
+from clod_adapter import AdaptConfig, ClodError, Progress
 from clod_adapter.training.state import TrainingState
 from clod_adapter.training.trainer import Trainer
 from scenes import stripped
@@ -166,6 +166,11 @@ class Launched:
         assert clod_adapter.load(self.folder / "dial.ply").gaussians.sigma_d is not None
         clod_adapter.load_adapter(self.folder / "dial.safetensors")
         return json.loads((self.folder / "dial.json").read_text())
+
+
+def rejects(message: str) -> Any:
+    """Expects an error of ours with this message, a regular expression."""
+    return pytest.raises(ClodError, match=message)
 
 
 def names(folder: Path) -> list[str]:

@@ -11,6 +11,10 @@ from torch import Tensor
 from clod_adapter import AttenuationConfig, Camera, Gaussians, Scene, View, render
 
 
+def seeded(seed: int) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
 def camera(
     width: int = 61,
     height: int = 45,
@@ -21,7 +25,8 @@ def camera(
     """At (0.3, -0.2, -3), looking roughly along +z, principal point at ``off_centre`` shares of the
     image.
     """
-    yaw, pitch = 0.12, -0.07
+    yaw = 0.12
+    pitch = -0.07
     ry = torch.tensor(
         [[math.cos(yaw), 0, math.sin(yaw)], [0, 1, 0], [-math.sin(yaw), 0, math.cos(yaw)]]
     )
@@ -45,7 +50,7 @@ def in_front(view: Camera, points: Tensor) -> Tensor:
 
 def scene(n: int, degree: int, seed: int, *, size: float = 0.08) -> dict[str, Tensor]:
     """Activated float32 parameters of n Gaussians in front of, beside and behind the camera."""
-    normal = partial(torch.randn, generator=torch.Generator().manual_seed(seed))
+    normal = partial(torch.randn, generator=seeded(seed))
     return {
         "means": normal(n, 3) * torch.tensor([1.5, 1.2, 1.5]),
         "quats": normal(n, 4),
@@ -66,7 +71,7 @@ def gaussians(n: int, degree: int, seed: int, *, size: float = 0.08) -> Gaussian
 
 def dialled(n: int, degree: int, seed: int, **settings: Any) -> Gaussians:
     """Gaussians with a sigma_d log-normal around e, and 0 in every 50th row."""
-    sigma_d = (torch.randn(n, generator=torch.Generator().manual_seed(seed + 1)) + 1).exp()
+    sigma_d = (torch.randn(n, generator=seeded(seed + 1)) + 1).exp()
     sigma_d[::50] = 0.0
     attenuation = AttenuationConfig(**{"scene_distance": 3.0} | settings)
     return gaussians(n, degree, seed).replace(sigma_d=sigma_d, attenuation=attenuation)
@@ -110,7 +115,7 @@ def capture(
     out.
     """
     truth = gaussians(n, 1, seed, size=0.15)
-    g = torch.Generator().manual_seed(seed + 1)
+    g = seeded(seed + 1)
 
     def near(values: Tensor, by: float) -> Tensor:
         return values + by * torch.randn(values.shape, generator=g)

@@ -31,7 +31,7 @@ from clod_adapter.training.pseudo_views import PseudoView, render_pseudo_views
 from clod_adapter.training.schedule import Sample
 from clod_adapter.training.trainer import Trainer
 from fake_gpu import fake_gpu, waits
-from scenes import gaussians, photograph, ring
+from scenes import gaussians, photograph, ring, seeded
 
 N, DIAL = 120, 2.0
 CAMERAS = ring(3, 24, 18)
@@ -39,7 +39,7 @@ CONFIG = AdaptConfig(max_sv=4.0)
 
 
 def model_of() -> Gaussians:
-    sigma_d = 0.3 + 4 * torch.rand(N, generator=torch.Generator().manual_seed(1))
+    sigma_d = 0.3 + 4 * torch.rand(N, generator=seeded(1))
     settings = AttenuationConfig(scene_distance=4.0, reference_distance=4.0, max_sv=4.0)
     return with_dial(gaussians(N, 1, 0, size=0.15), sigma_d, settings, torch.linspace(-0.5, 1, N))
 

@@ -129,7 +129,7 @@ def test_a_loop_of_gsplat_trains_a_dial(
     """
     gsplat_in_torch.install(monkeypatch)
     torch.manual_seed(0)  # the order of the views
-    source = EXAMPLES[7].read_text(encoding="utf-8")
+    source = EXAMPLES[7].read_text("utf-8")
     assert 0 < len(re.findall(r"# dial\b", source)) <= 20
     runpy.run_path(str(EXAMPLES[7]))["main"](
         str(capture.ply), str(capture.scene), str(tmp_path / "d.ply"), "cpu", 24
@@ -180,7 +180,7 @@ def test_bad_arguments_are_refused(run: Any) -> None:
 
 
 def test_the_readme_lists_every_example() -> None:
-    listed = re.findall(r"\]\((.+?)\)", (FOLDER / "README.md").read_text(encoding="utf-8"))
+    listed = re.findall(r"\]\((.+?)\)", (FOLDER / "README.md").read_text("utf-8"))
     assert listed == [path.name for path in EXAMPLES.values()]
     assert list(EXAMPLES) == list(range(1, len(EXAMPLES) + 1))
 
@@ -226,9 +226,7 @@ def test_plush_and_city_small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -
     words = "gpu.py --device cpu --small --only plush city --count 1000 --results"
     monkeypatch.setattr(sys, "argv", [*words.split(), str(out)])
     gpu.main()
-    plush, adapted, *frames = [
-        json.loads(line) for line in out.read_text(encoding="utf-8").splitlines()
-    ]
+    plush, adapted, *frames = [json.loads(line) for line in out.read_text("utf-8").splitlines()]
     assert (plush["benchmark"], plush["on"], plush["count"]) == ("gpu plush", "cpu", 1000)
     assert plush["train_seconds"] > 0 and adapted["peak_bytes"] > adapted["base_bytes"] > 0
     assert [(r["where"], r["virtual_scale"]) for r in frames] == [

@@ -9,25 +9,24 @@ import numpy as np
 import pytest
 import torch
 
-from clod_adapter import AttenuationConfig, ClodError, Gaussians, render
+from clod_adapter import AttenuationConfig, Gaussians, render
 from clod_adapter.cameras import NEAR, Camera, Scene, View, camera_extent, in_its_unit
 from clod_adapter.config import CLASSIC
+from runs import rejects
 from scenes import camera, gaussians, photograph, ring
 
 
 def test_bad_cameras_and_images_are_named() -> None:
     good = dataclasses.replace(camera(), name="x.png")
     for change in ({"viewmat": torch.eye(3)}, {"K": torch.eye(4)}, {"width": 0}, {"height": -1}):
-        with pytest.raises(ClodError, match=r"camera 'x\.png'"):
+        with rejects(r"camera 'x\.png'"):
             dataclasses.replace(good, **change)
     for image in (
         torch.zeros(45, 61, 3),
         torch.zeros(61, 45, 3).byte(),
         torch.zeros(45, 61).byte(),
     ):
-        with pytest.raises(
-            ClodError, match=r"view 'x\.png': image must be uint8 of shape \(45, 61, 3\)"
-        ):
+        with rejects(r"view 'x\.png': image must be uint8 of shape \(45, 61, 3\)"):
             View(good, image)
 
 
@@ -126,12 +125,10 @@ def test_wrong_shapes_are_named() -> None:
         ("sigma_d", (4,)),
         ("growth_d", (5, 1)),
     ):
-        with pytest.raises(
-            ClodError, match=rf"Gaussians.{name} has shape {re.escape(str(shape))}, expected"
-        ):
+        with rejects(rf"Gaussians.{name} has shape {re.escape(str(shape))}, expected"):
             adapted().replace(**{name: torch.zeros(shape)})
     for changes in ({"sigma_d": torch.ones(5)}, {"attenuation": CONFIG}):
-        with pytest.raises(ClodError, match="both sigma_d and attenuation"):
+        with rejects("both sigma_d and attenuation"):
             plain(**changes)
 
 
@@ -171,10 +168,7 @@ def test_rows_by_brackets() -> None:
     "rows", [2, torch.ones(4, dtype=torch.bool), [5], torch.zeros(2, 2, dtype=torch.long)]
 )
 def test_other_rows_are_refused(rows: object) -> None:
-    with pytest.raises(
-        ClodError,
-        match="give a slice, indices .M. or a mask .5.|there are 5 Gaussians, and index 5",
-    ):
+    with rejects("give a slice, indices .M. or a mask .5.|there are 5 Gaussians, and index 5"):
         adapted()[rows]
 
 

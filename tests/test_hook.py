@@ -14,16 +14,17 @@ import pytest
 import torch
 
 import clod_adapter
-from clod_adapter import AttenuationConfig, ClodError, Gaussians, Hook
+from clod_adapter import AttenuationConfig, Gaussians, Hook
 from clod_adapter.frame_rate import next_dial
-from scenes import camera, gaussians
+from runs import rejects
+from scenes import camera, gaussians, seeded
 
 N = 200
 
 
 def adapted(**settings: Any) -> Gaussians:
     plain = gaussians(N, 1, 0)
-    sigma_d, growth_d = torch.rand(2, N, generator=torch.Generator().manual_seed(1)) * 1.5
+    sigma_d, growth_d = torch.rand(2, N, generator=seeded(1)) * 1.5
     attenuation = AttenuationConfig(scene_distance=3.0, **settings)
     return plain.replace(sigma_d=sigma_d, growth_d=growth_d - 0.5, attenuation=attenuation)
 
@@ -75,14 +76,14 @@ def test_gradients_reach_opacities_sigma_d_and_growth_d_only() -> None:
 def test_bad_arguments_are_refused(tmp_path: Path) -> None:
     model = adapted(form="paper")
     view = camera()
-    with pytest.raises(ClodError, match="the paper's form needs K, width and height"):
+    with rejects("the paper's form needs K, width and height"):
         hook_of(model)(model.means, model.opacities, view.viewmat)
-    with pytest.raises(ClodError, match=r"for 200 Gaussians, but means is \(199, 3\)"):
+    with rejects(r"for 200 Gaussians, but means is \(199, 3\)"):
         hook_of(model)(model.means[1:], model.opacities, view.viewmat, view.K, 64, 48)
-    with pytest.raises(ClodError, match="virtual_scale is -0.5"):
+    with rejects("virtual_scale is -0.5"):
         hook_of(model, -0.5)
     clod_adapter.save(tmp_path / "plain.ply", gaussians(5, 0, 0))
-    with pytest.raises(ClodError, match="plain.ply: it has no sigma_d, so there is no dial"):
+    with rejects("plain.ply: it has no sigma_d, so there is no dial"):
         clod_adapter.load(tmp_path / "plain.ply").hook(virtual_scale=3)
 
 

@@ -81,7 +81,7 @@ def imports_of(path: Path) -> dict[str, int]:
     """
     found = []
     here = f"{PACKAGE}.{module_of(path.parent / '__init__.py')}".rstrip(".")
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in ast.walk(ast.parse(path.read_text("utf-8"))):
         if isinstance(node, ast.Import):
             found += [(alias.name, node.lineno) for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
@@ -171,9 +171,9 @@ def test_imports_are_light_and_on_first_use() -> None:
 
 
 def test_every_package_is_installed() -> None:
-    listed = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"][
-        "setuptools"
-    ]["packages"]
+    listed = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"]["setuptools"][
+        "packages"
+    ]
     folders = {
         f"{PACKAGE}.{module_of(path)}".rstrip(".") for path in SOURCES if path.name == "__init__.py"
     }

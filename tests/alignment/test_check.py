@@ -17,7 +17,7 @@ from clod_adapter.alignment.check import check_alignment, compare_filters
 from clod_adapter.alignment.frames import NERFSTUDIO_TURNS, into_file, known_frames
 from clod_adapter.alignment.search import guess_frame, scene_in
 from clod_adapter.config import FILTERS
-from scenes import gaussians, photograph, ring
+from scenes import gaussians, photograph, ring, seeded
 
 EYE = torch.eye(3, dtype=torch.float64)
 NONE = torch.zeros(3, dtype=torch.float64)
@@ -116,10 +116,7 @@ def test_frames_of_trainers(pair: tuple[Gaussians, list[View]]) -> None:
     viewmats = torch.stack(
         [v.camera.viewmat.double() for v in in_world(views, 3.0, FLIP, NONE + 2)]
     )
-    points = (
-        torch.randn(500, 3, generator=torch.Generator().manual_seed(1)) * torch.tensor([1.0, 5, 2])
-        + 3
-    )
+    points = torch.randn(500, 3, generator=seeded(1)) * torch.tensor([1.0, 5, 2]) + 3
     frames = known_frames(viewmats, points)
     # nerfstudio's: the cameras' mean is the origin, their mean up is z, and their farthest
     # coordinate is 1.
@@ -157,7 +154,7 @@ def seen_with(name: str, views: int = 5) -> tuple[Gaussians, tuple[View, ...]]:
     a pixel at most.
     """
     fine = gaussians(1500, 0, 0, size=0.025)
-    noisy = fine.sh0 + 0.1 * torch.randn(fine.sh0.shape, generator=torch.Generator().manual_seed(1))
+    noisy = fine.sh0 + 0.1 * torch.randn(fine.sh0.shape, generator=seeded(1))
     return fine.replace(sh0=noisy), photograph(
         fine.replace(screen_filter=FILTERS[name]), ring(views, 48, 36)
     )

@@ -226,7 +226,7 @@ def test_an_image_per_view(clod, capture, dialled, tmp_path):
             want = render(gaussians, held_out.camera, s)
             assert np.abs(pixels - 255 * want.image.clamp(0, 1).numpy()).max() <= 0.51
             assert kept == want.kept.sum()
-    assert re.search(r"s = 3: [\d.]+ of 300 Gaussians, \d+\.\d\d dB", done.err), done
+    assert re.search(r"s = 3: [\d.]+ of 300 Gaussians, \d+\.\d\d dB", done.err)
     n = pictures[0]["kept"][1]
     (picture,) = clod(RENDER, "one --views 000 --keep", n).report["pictures"]
     assert picture["view"] == "000.png" and picture["kept"] == [n]

@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 import torch
 from plyfile import PlyData
+from torch.testing import assert_close
 
 import clod_adapter
 import scenes
@@ -93,9 +94,7 @@ def test_baking(clod: Any, capture: Any, dialled: Path) -> None:
     model = load(dialled).gaussians
     again = load("x.ply").gaussians
     assert report["cameras"] == 8
-    torch.testing.assert_close(
-        again.opacity_logits, bake(model, 2.0, cameras=cameras).opacity_logits
-    )
+    assert_close(again.opacity_logits, bake(model, 2.0, cameras=cameras).opacity_logits)
 
     there = f"{EXPORT} --camera 003 --images SCENE"
     camera = next(each for each in cameras if each.name == "003.png")
@@ -106,7 +105,7 @@ def test_baking(clod: Any, capture: Any, dialled: Path) -> None:
     assert done.report["camera"] == "003.png" and output["count"] == n == len(plain.gaussians)
     # there the image is the dial's
     want = render(model, camera, output["virtual_scale"])
-    torch.testing.assert_close(render(plain.gaussians, camera).image, want.image, atol=2e-5, rtol=0)
+    assert_close(render(plain.gaussians, camera).image, want.image, atol=2e-5, rtol=0)
     assert "exact at the camera of 003.png only" in done.err
     assert any("for the camera at (" in comment for comment in plain.comments)
     report = clod(there, "--fps 1 -o fast.ply").report  # timed here, at that camera
@@ -307,7 +306,7 @@ def test_failure_of_the_tool_leaves_no_file(
         monkeypatch.setattr(splat_transform, "LIMIT", limit)
         tool(behave)
         done = clod("export DIAL", words, code=code)
-        assert done.err.endswith(said) and files(tmp_path) == [], done
+        assert done.err.endswith(said) and files(tmp_path) == []
 
 
 def test_the_real_tool(clod: Any, dialled: Path, tmp_path: Path) -> None:

@@ -109,7 +109,7 @@ def test_one_interrupt_of_training_writes_the_result_so_far(
     assert code == 0, log
     assert report["interrupted"], log
     assert report["resumed_from"] is None, log
-    assert "interrupted after" in log, log
+    assert "interrupted after" in log
     assert names(tmp_path) == sorted([*OUTPUTS, STATE])
     assert load_state(tmp_path / STATE)[0].steps == report["steps"]
     assert f"--resume resumes from step {report['steps']}, which is in {STATE}" in log
@@ -160,7 +160,7 @@ def test_signals_at_a_moment(
             bool(done.report["rows"]) == bool(done.report["calibration"]) == (place[1] != "extract")
         )
     else:
-        assert done.err.rstrip().endswith(said), done
+        assert done.err.rstrip().endswith(said)
     assert signal.getsignal(INT) is signal.default_int_handler
     assert signal.getsignal(TERM) is signal.SIG_DFL
 

@@ -60,7 +60,7 @@ def test_errors_of_the_work(
     monkeypatch.setattr("clod_adapter.cli.shared.inputs.load", Mock(side_effect=error))
     done = clod("eval BASE --images SCENE --json --quiet", code=code)
     lines = done.err.splitlines()
-    assert done.report["code"] == code and lines[-1].endswith(done.report["error"]), done
+    assert done.report["code"] == code and lines[-1].endswith(done.report["error"])
     assert re.match(f"clod-adapt: {said}", lines[-1]), done
     assert (lines[0] == "Traceback (most recent call last):") == (code == 1) == (len(lines) > 1)
     assert code != 1 or str(error) in lines[-2]

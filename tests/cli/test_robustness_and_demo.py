@@ -202,11 +202,11 @@ def test_demo(clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.Monke
     with monkeypatch.context() as patch:
         patch.setattr(listeners, "package_version", lambda: "0.0.7")
         done = clod("demo --out=-odd", code=2)
-    assert f"{state}: is of " in done.err and "delete it to start over" in done.err, done
+    assert f"{state}: is of " in done.err and "delete it to start over" in done.err
     assert "--resume" not in done.err and state.exists()
     assert clod("demo --out=-odd --json").report["resumed_from"] == 1 and not state.exists()
     done = clod("demo --out=-odd")
-    assert f"everything is in {folder}" in done.out and "clod-adapt YOURS.ply" in done.out, done
+    assert f"everything is in {folder}" in done.out and "clod-adapt YOURS.ply" in done.out
     found = clod("demo --out=-odd --quiet --json").report
     assert found["command"] == "demo"
     assert found["folder"] == "-odd"

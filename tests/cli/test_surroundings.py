@@ -40,7 +40,7 @@ def room(size: int) -> Iterator[None]:
 
 def assert_one_error(done: Any) -> None:
     (error,) = (line for line in done.err.splitlines() if line.startswith("clod-adapt: error: "))
-    assert "cannot be written" in error and done.out == "", done
+    assert "cannot be written" in error and done.out == ""
 
 
 def test_full_disk_while_adapting(clod: Any, dialled: Path, tmp_path: Path) -> None:
@@ -143,8 +143,8 @@ def test_without_permission(
     if NO_ROOT and code == 1 and not log:
         pytest.skip("root cannot give up its rights here")
     assert code == 2, log
-    assert log.count("\n") == 1, log
-    assert said in log, log
+    assert log.count("\n") == 1
+    assert said in log
     assert names(tmp_path / "out") == before, log
 
 
@@ -199,7 +199,7 @@ def test_names_that_are_not_utf8(clod: Any, capture: Any, dialled: Path, tmp_pat
     for line in OF_ODD_NAMES.strip().splitlines():
         words = line.replace("ODD", str(folder / ODD)).replace("OUT", str(folder / "out" / ODD))
         done = clod(words, "--quiet --json")
-        assert "gr\\xfcn/gr\\xfcn" in json.dumps(done.report).replace("\\\\", "\\"), done
+        assert "gr\\xfcn/gr\\xfcn" in json.dumps(done.report).replace("\\\\", "\\")
     for path in folder.glob("out/*.[hj][ts][mo][ln]"):  # pages and reports
         assert "gr\\xfcn" in path.read_text("utf-8").replace("\\\\", "\\"), path
 
@@ -234,5 +234,5 @@ def test_photographs_that_are_none_start_no_program(
         )
         assert done.err.endswith(
             f"images/001.png: cannot be decoded, is {found}; export it as JPEG or PNG\n"
-        ), done
+        )
         assert done.err.count("\n") == 1 and not started.called, kind

@@ -64,7 +64,7 @@ class Block(NamedTuple):
 
 
 def blocks(page: Path) -> list[Block]:
-    text = page.read_text(encoding="utf-8")
+    text = page.read_text("utf-8")
     found = []
     for match in FENCE.finditer(text):
         marker = re.search(r"<!-- not run: ([^>]+?) -->\s*\Z", text[: match.start()])
@@ -76,7 +76,7 @@ def blocks(page: Path) -> list[Block]:
 
 def spoken(page: Path, program: str) -> list[str]:
     """Complete commands of a program with options, within sentences and in indented blocks."""
-    text = FENCE.sub("", page.read_text(encoding="utf-8"))
+    text = FENCE.sub("", page.read_text("utf-8"))
     spans = [" ".join(span.split()) for span in re.findall(r"`([^`]+)`", text)]
     lines = [line.strip() for line in text.splitlines() if line.startswith("    ")]
     said = [
@@ -166,17 +166,17 @@ def run(words: list[str]) -> None:
 def test_named_options_exist(page: Path) -> None:
     """Also of commands that are not run; each reason for not running a block stands above it."""
     written = blocks(page)
-    text = page.read_text(encoding="utf-8")
+    text = page.read_text("utf-8")
     said = [command.split() for command in spoken(page, "clod-adapt")]
     for words in [*said, *(words for block in written for words in block.commands())]:
         if words[0] == "clod-adapt":
             words = words[1 : words.index(">")] if ">" in words else words[1:]
             name = words[0] if words and words[0] in COMMANDS else ""
             build_parser(name).parse_args(words[1:] if name else words)
-    shared = (ROOT / "benchmarks" / "common.py").read_text(encoding="utf-8")
+    shared = (ROOT / "benchmarks" / "common.py").read_text("utf-8")
     for line in spoken(page, "python benchmarks/"):
         script, *words = line.split()[1:]
-        source = (ROOT / script).read_text(encoding="utf-8") + shared
+        source = (ROOT / script).read_text("utf-8") + shared
         for option in re.findall(r"--[a-z][a-z-]*", " ".join(words)):
             assert f'"{option}"' in source, f"{page.name}: {line}: no {option}"
     for block in written:
@@ -202,7 +202,7 @@ def keys(value: Any) -> Iterator[str]:
 def test_every_field_of_the_reports_is_explained(
     desk: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    explained = set(re.findall(r"`([a-z_0-9]+)`", (DOCS / "python.md").read_text(encoding="utf-8")))
+    explained = set(re.findall(r"`([a-z_0-9]+)`", (DOCS / "python.md").read_text("utf-8")))
     model, base, scene = (
         str(desk / name) for name in ("pretrained_clod.ply", "pretrained.ply", "scene")
     )
@@ -210,7 +210,7 @@ def test_every_field_of_the_reports_is_explained(
     capsys.readouterr()
     assert main([*words, "--base", base, "--against", base, "--json"]) == 0
     measured = json.loads(capsys.readouterr().out)
-    adapted = json.loads(desk.joinpath("pretrained_clod.json").read_text(encoding="utf-8"))
+    adapted = json.loads(desk.joinpath("pretrained_clod.json").read_text("utf-8"))
     assert {"rows", "alignment", "frame_ms"} <= set(keys(adapted))
     assert {"ranked", "moved"} <= set(keys(measured))
     missing = (set(keys(adapted)) | set(keys(measured))) - explained
@@ -219,7 +219,7 @@ def test_every_field_of_the_reports_is_explained(
 
 def tables(page: str) -> list[list[list[str]]]:
     """The tables of a page, as rows of cells without emphasis."""
-    found = re.findall(r"(?:^\|.*\|\n)+", (DOCS / page).read_text(encoding="utf-8"), re.MULTILINE)
+    found = re.findall(r"(?:^\|.*\|\n)+", (DOCS / page).read_text("utf-8"), re.MULTILINE)
     lines = [[line for line in table.splitlines() if "---" not in line] for table in found]
     return [
         [[cell.strip(" *") for cell in line.strip("|").split("|")] for line in table]
@@ -248,7 +248,7 @@ def test_qualities_in_tables_are_measured() -> None:
     for file in RESULTS.glob("*.jsonl"):
         found |= {
             each
-            for line in file.read_text(encoding="utf-8").splitlines()
+            for line in file.read_text("utf-8").splitlines()
             for each in measured(json.loads(line))
         }
     with (RESULTS / "robustness.csv").open(encoding="utf-8") as stream:
@@ -270,14 +270,12 @@ SOURCES = [
     ROOT / "README.md",
     *(path for folder in ("cli", "clod_adapter") for path in (ROOT / folder).rglob("*.py")),
 ]
-PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
 
 
 def test_no_line_installs_clod_adapter_from_the_index() -> None:
     for path in (*SOURCES, *(ROOT / "docs").glob("*.md")):
-        assert not re.search(r"pip install[^`\n]*clod-adapter", path.read_text(encoding="utf-8")), (
-            path
-        )
+        assert not re.search(r"pip install[^`\n]*clod-adapter", path.read_text("utf-8")), path
 
 
 def test_help_names_the_installed_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -304,9 +302,7 @@ FETCHED = re.compile(r"<(?!a\s|link\s[^>]*rel=\"?canonical)[^>]*\s(?:src|href)=\
 def anchors(page: Path) -> set[str]:
     """The anchors of a page's headings, as Markdown's toc extension and GitHub make them."""
     found = set()
-    for title in re.findall(
-        r"^#+ +(.+?) *$", FENCE.sub("", page.read_text(encoding="utf-8")), re.MULTILINE
-    ):
+    for title in re.findall(r"^#+ +(.+?) *$", FENCE.sub("", page.read_text("utf-8")), re.MULTILINE):
         plain = (
             re.sub(r"[^\w\s-]", "", re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", title)).strip().lower()
         )
@@ -315,7 +311,7 @@ def anchors(page: Path) -> set[str]:
 
 
 def test_links_and_pictures_exist() -> None:
-    texts = {page: page.read_text(encoding="utf-8") for page in PAGES}
+    texts = {page: page.read_text("utf-8") for page in PAGES}
     for page, text in texts.items():
         for target in (one or other for one, other in LINK.findall(FENCE.sub("", text))):
             if target.startswith(("https://", "http://")):
@@ -350,14 +346,14 @@ def test_the_built_site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
     ]
     assert done.exit_code == 0 and not warned, done.output
     for page in site.glob("*.html"):
-        fetched = FETCHED.findall(page.read_text(encoding="utf-8"))
+        fetched = FETCHED.findall(page.read_text("utf-8"))
         far = [url for url in fetched if re.match(r"([a-z]+:)?//", url)]
         assert fetched and not far, f"{page.name} fetches {far}"
     for style in site.rglob("*.css"):
-        assert not re.search(
-            r"url\([\"']?(https?:)?//|@import", style.read_text(encoding="utf-8")
-        ), style.name
-    index = json.loads((site / "search" / "search_index.json").read_text(encoding="utf-8"))
+        assert not re.search(r"url\([\"']?(https?:)?//|@import", style.read_text("utf-8")), (
+            style.name
+        )
+    index = json.loads((site / "search" / "search_index.json").read_text("utf-8"))
     entries = {entry["location"] for entry in index["docs"]}
     pages = {f"{page.stem}.html" for page in DOCS.glob("*.md")} | {
         "commands.html",

@@ -29,16 +29,14 @@ from clod_adapter.evaluation.popping import dial_popping, path, path_popping, sw
 from clod_adapter.gaussians import SH_C0
 from clod_adapter.rasterizers import for_device
 from clod_adapter.rasterizers.protocol import T_MIN
-from scenes import gaussians, ring
+from scenes import gaussians, ring, seeded
 
 
 def dialled() -> Gaussians:
     """Gaussians that end at different dial values; scene distance 4, where the ring of cameras
     is.
     """
-    reaches = torch.linspace(0.3, 4, 200)[
-        torch.randperm(200, generator=torch.Generator().manual_seed(3))
-    ]
+    reaches = torch.linspace(0.3, 4, 200)[torch.randperm(200, generator=seeded(3))]
     return with_dial(gaussians(200, 1, 0, size=0.2), reaches, AttenuationConfig(scene_distance=4.0))
 
 

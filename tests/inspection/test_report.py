@@ -11,7 +11,7 @@ import pytest
 import torch
 from plyfile import PlyData, PlyElement
 
-from clod_adapter import AttenuationConfig, ClodError, load, save, with_dial
+from clod_adapter import AttenuationConfig, load, save, with_dial
 from clod_adapter.cli.inspect import lines_of
 from clod_adapter.cli.shared.outputs import jsonable
 from clod_adapter.inspection.report import Inspection, inspect, looks_like
@@ -21,6 +21,7 @@ from clod_adapter.io.ply_layout import inria_dtype
 from clod_adapter.origin import NOWHERE
 from clod_adapter.training.state import TrainingState, save_state
 from formats import CALIBRATION, PACKED, inria_rows, with_columns, write_rows
+from runs import rejects
 from scenes import gaussians
 
 ATTENUATION = AttenuationConfig(max_sv=6.0, reference_distance=3.5)
@@ -132,7 +133,7 @@ def test_anomalies_are_counted(tmp_path: Path) -> None:
     v = seen(write_rows(tmp_path / "b.ply", vertex))[1]
     assert v.doubles == 599 and v.far == v.giant == 0
     vertex["x"] = np.nan
-    with pytest.raises(ClodError, match="c.ply: no usable Gaussian in it, of 600 rows"):
+    with rejects("c.ply: no usable Gaussian in it, of 600 rows"):
         inspect(write_rows(tmp_path / "c.ply", vertex))
 
 

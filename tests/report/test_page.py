@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from clod_adapter.errors import ClodError
 from clod_adapter.report.charts import Series, draw_rows, new_figure, series_of
 from clod_adapter.report.page import Picture, write_page
+from runs import rejects
 
 pytest.importorskip("matplotlib")
 NASTY = r'a <b> & "c" $\co$ </script>'
@@ -73,7 +73,7 @@ def test_page_is_self_contained_and_escaped(
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(
         path.name for path in written.values()
     )
-    text = (tmp_path / "page.html").read_text(encoding="utf-8")
+    text = (tmp_path / "page.html").read_text("utf-8")
     visible = text.partition('<script type="application/json"')[0]
     assert "a <b>" not in visible and "a &lt;b&gt; &amp;" in visible and "9 steps on" in visible
     assert "3:35 minutes in all" in visible
@@ -106,7 +106,7 @@ def test_page_is_self_contained_and_escaped(
         assert min(pixels.shape[:2]) > 500 and 0.005 < (pixels < 128).any(2).mean() < 0.3
     own = report(rows=[], base_rows=[], detached_row=None, teacher="checkpoint")
     write_page(tmp_path / "page.html", own, frames, {"base": frames[0]})
-    text = (tmp_path / "page.html").read_text(encoding="utf-8")
+    text = (tmp_path / "page.html").read_text("utf-8")
     assert all(
         part in text
         for part in ("Nothing was measured", "steps on synthetic views", "hold for base")
@@ -115,7 +115,7 @@ def test_page_is_self_contained_and_escaped(
         "without photograph"
     ]
     monkeypatch.setitem(sys.modules, "matplotlib", None)
-    with pytest.raises(ClodError, match="pip install matplotlib"):
+    with rejects("pip install matplotlib"):
         write_page(tmp_path / "other.html", report(), [], {})
     assert not (tmp_path / "other.html").exists()
 

@@ -4,14 +4,16 @@ import numpy as np
 import pytest
 import torch
 from torch import Tensor
+from torch.testing import assert_close
 
 import clod_adapter as clod
-from clod_adapter import AdaptConfig, ClodError, Gaussians, Scene
+from clod_adapter import AdaptConfig, Gaussians, Scene
 from clod_adapter.equation.attenuation import attenuate
 from clod_adapter.losses import photometric_loss
 from clod_adapter.training.dial import SIGMA_RANGE, Dial, attach
 from clod_adapter.training.schedule import OURS, Sample
 from clod_adapter.training.trainer import Trainer
+from runs import rejects
 
 Pair = tuple[Gaussians, Scene]
 MAX_SV = 5.0
@@ -48,9 +50,7 @@ def test_the_objective_is_that_of_adapt(captured: Pair) -> None:
         own = getattr(dial, name, None)
         found = (splats[names.get(name, name)] if own is None else own).grad
         assert gradient.abs().max() > 0, name
-        torch.testing.assert_close(
-            found, gradient, rtol=1e-3, atol=1e-5 * float(gradient.abs().max()), msg=name
-        )
+        assert_close(found, gradient, rtol=1e-3, atol=1e-5 * float(gradient.abs().max()), msg=name)
     term = dial.count_loss(s, torch.tensor(0.3))
     kept = (
         attenuate(base.opacity_logits, dial.sigma_d, dial.typical, s, dial.attenuation)
@@ -93,7 +93,7 @@ def test_rates_and_ranges_of_the_parameters(captured: Pair) -> None:
     with torch.no_grad():
         dial.log_sigma[0], dial.log_sigma[1], dial.growth_d[0] = -100, 100, 9
     dial.sample()
-    torch.testing.assert_close(dial.sigma_d[:2], torch.tensor(SIGMA_RANGE))
+    assert_close(dial.sigma_d[:2], torch.tensor(SIGMA_RANGE))
     assert dial.growth_d[0].item() == 3
 
 
@@ -115,5 +115,5 @@ def test_what_does_not_fit_is_refused(captured: Pair) -> None:
             "no splat requires a gradient: attach copies",
         ),
     ):
-        with pytest.raises(ClodError, match=message):
+        with rejects(message):
             call()

@@ -34,7 +34,7 @@ from clod_adapter.progress import GracefulStop, Phase
 from clod_adapter.training import trainer
 from clod_adapter.training.pseudo_views import reaches
 from runs import config_of, pressing, states_of
-from scenes import assert_equal, capture, gaussians, photograph, ring
+from scenes import assert_equal, capture, gaussians, photograph, ring, seeded
 
 Pair = tuple[Gaussians, Scene]
 
@@ -118,7 +118,7 @@ def pair() -> Pair:
     perturbed copy.
     """
     truth = gaussians(400, 0, 0, size=0.15)
-    random = torch.Generator().manual_seed(1)
+    random = seeded(1)
     by = {"means": 0.01, "log_scales": 0.1, "sh0": 0.1, "opacity_logits": 0.3}
     changed = {
         n: t + by.get(n, 0.0) * torch.randn(t.shape, generator=random)

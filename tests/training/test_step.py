@@ -8,6 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 from torch import Tensor
+from torch.testing import assert_close
 
 from clod_adapter import View
 from clod_adapter.config import AdaptConfig
@@ -20,7 +21,7 @@ from clod_adapter.training.target_count import (
     target_curve,
     target_share,
 )
-from scenes import capture
+from scenes import capture, seeded
 
 VIEWS = capture(n=20)[1].train
 
@@ -60,7 +61,7 @@ def test_first_steps_have_photographs_of_half_the_size() -> None:
         height=258,
         K=torch.tensor([[90.0, 0, 150], [0, 90, 129], [0, 0, 1]]),
     )
-    image = torch.randint(256, (258, 301, 3), generator=torch.Generator().manual_seed(0)).byte()
+    image = torch.randint(256, (258, 301, 3), generator=seeded(0)).byte()
     large = View(whole, image)
     small = View(replace(whole, height=255), image[:255])
     cases = (
@@ -81,7 +82,7 @@ N = 2000
 
 def some() -> tuple[Tensor, Tensor]:
     """log sigma_d and normalised distances."""
-    log_sigma, d = torch.randn(2, N, generator=torch.Generator().manual_seed(0))
+    log_sigma, d = torch.randn(2, N, generator=seeded(0))
     return 1 + 0.8 * log_sigma, (0.3 * d).exp()
 
 
@@ -98,7 +99,7 @@ def test_count_gradient_penalises_excess_and_deficit() -> None:
         excess = float((d * s < log_sigma.exp()).float().mean()) / share - 1
         want = 0.1 * 2 * CONFIG.reg_weight * excess / share * count_slope(d * s, log_sigma.exp())
         assert excess > 0.1
-        torch.testing.assert_close(gradient(log_sigma, d, s), want, rtol=1e-4, atol=1e-9)
+        assert_close(gradient(log_sigma, d, s), want, rtol=1e-4, atol=1e-9)
         few = gradient(log_sigma - 3, d, s)
         assert few.max() <= 0 and (few[d * s > (log_sigma - 3).exp()] < 0).all()
         assert (gradient(log_sigma, d, s, reg_weight=0.0) == 0).all()
@@ -117,7 +118,7 @@ def test_count_slope_is_that_of_a_soft_count() -> None:
     soft = 1 / (1 + (2 * d / log_sigma.requires_grad_().exp()) ** SHARPNESS)
     (want,) = torch.autograd.grad(soft.mean(), log_sigma)
     assert (want > 0.1 * want.max()).sum() > 100
-    torch.testing.assert_close(count_slope(2 * d, log_sigma.detach().exp()), want)
+    assert_close(count_slope(2 * d, log_sigma.detach().exp()), want)
     assert (count_slope(d, 0 * d) == 0).all()
 
 
@@ -152,13 +153,13 @@ class PlainRowAdam(RowAdam):
 
 
 def parameters(n: int, seed: int = 0) -> dict[str, Tensor]:
-    g = torch.Generator().manual_seed(seed)
+    g = seeded(seed)
     return {name: torch.randn(n, *shape, generator=g) for name, shape in SHAPES.items()}
 
 
 def gradients(n: int, seed: int) -> dict[str, Tensor]:
     """Gradients over many orders of magnitude, with some zeros."""
-    g = torch.Generator().manual_seed(seed)
+    g = seeded(seed)
     out = {}
     for name, shape in SHAPES.items():
         size = 10 ** (8 * torch.rand(n, *[1] * len(shape), generator=g) - 6)
@@ -195,7 +196,7 @@ def test_all_rows_match_torch_adam(
     close = {"rtol": 1e-5, "atol": 1e-5} if steps > 12 else {"rtol": 2e-6, "atol": 2e-6}
     for name, start in parameters(n).items():
         moved = (theirs[name] - start).detach() * (units[:, None] if name == "means" else 1)
-        torch.testing.assert_close(ours[name], start + moved, **close)
+        assert_close(ours[name], start + moved, **close)
 
 
 @pytest.mark.parametrize("kind", [RowAdam, PlainRowAdam])

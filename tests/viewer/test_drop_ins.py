@@ -16,6 +16,7 @@ import pytest
 import torch
 from PIL import Image
 from skimage.metrics import peak_signal_noise_ratio
+from torch.testing import assert_close
 
 import browser
 import clod_adapter
@@ -158,8 +159,8 @@ def assert_the_wgsl_of_playcanvas_gives_the_equation(page: Any, about: dict[str,
         )
         drawn = want.drawn[::20]
         growth = want.growth[::20]
-        torch.testing.assert_close(alpha, drawn, rtol=1e-4, atol=1e-6)
-        torch.testing.assert_close(scale[alpha > 0], growth[alpha > 0], rtol=1e-4, atol=0)
+        assert_close(alpha, drawn, rtol=1e-4, atol=1e-6)
+        assert_close(scale[alpha > 0], growth[alpha > 0], rtol=1e-4, atol=0)
 
 
 @pytest.mark.parametrize("viewer, suffix", [("spark", "spz"), ("playcanvas", "ply")])

@@ -42,7 +42,7 @@ def test_parts_are_built_from_these_sources() -> None:
     web = VIEWER / "web"
     if not web.is_dir():
         pytest.skip("only a checkout contains the sources of the page")
-    lines = (VIEWER / "static" / "SOURCES.sha256").read_text(encoding="utf-8").splitlines()
+    lines = (VIEWER / "static" / "SOURCES.sha256").read_text("utf-8").splitlines()
     listed = {
         (web / name).resolve(): digest for digest, name in (line.split("  ") for line in lines)
     }
@@ -64,7 +64,7 @@ def test_the_text_of_one_file(tmp_path: Path) -> None:
     out.parent.mkdir()
     shown, losses = page.write_viewer_page(out, saved, cameras=cameras, virtual_scale=2.0)
     assert [each.name for each in out.parent.iterdir()] == ["page.html"] and losses
-    text = out.read_text(encoding="utf-8")
+    text = out.read_text("utf-8")
     policy = re.search('<meta http-equiv="Content-Security-Policy" content="([^"]*)">', text)
     assert policy
     assert "default-src 'none'" in policy[1]
@@ -78,7 +78,7 @@ def test_the_text_of_one_file(tmp_path: Path) -> None:
     assert picture.shape == wanted.shape
     assert np.abs(picture - wanted).mean() < 3
     page.write_viewer_page(tmp_path / "alone.html", saved)
-    text = (tmp_path / "alone.html").read_text(encoding="utf-8")
+    text = (tmp_path / "alone.html").read_text("utf-8")
     assert '<img id="poster"' not in text  # no viewpoint is stored
 
 
@@ -128,7 +128,7 @@ def test_a_page_of_one_file(
     read, _ = page.write_viewer_page(
         out, calibrated, cameras=[seen], virtual_scale=1.0, exact=exact
     )
-    assert out.read_text(encoding="utf-8").count('id="clod-model"') > 2
+    assert out.read_text("utf-8").count('id="clod-model"') > 2
     shown = show(url=out.as_uri())
     assert shown.text("#quality") == "31.5 dB"
     here = shown.link()

@@ -17,12 +17,12 @@ import scenes
 from clod_adapter import load
 from clod_adapter.cameras import Camera
 from clod_adapter.config import FILTERS, ScreenFilter
-from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.file_formats import write
 from clod_adapter.render import render
 from clod_adapter.viewer.page import Payload
 from formats import write_rows
+from runs import rejects
 from scenes import dialled
 from shown import TALL, Shown, assert_alike, assert_same, drop, message, take
 
@@ -220,10 +220,7 @@ def test_other_forms_of_the_dial_are_refused_with_a_remedy(
         drop(shown, name, content)
         said = message(shown, name)
         assert error in said and "opens every format" not in said, (name, said)
-    with pytest.raises(
-        ClodError,
-        match="the paper's form, which viewers do not draw; adapt it without --form paper",
-    ):
+    with rejects("the paper's form, which viewers do not draw; adapt it without --form paper"):
         Payload.of(replace(loaded, gaussians=loaded.gaussians.replace(attenuation=paper)))
 
 

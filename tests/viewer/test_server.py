@@ -9,9 +9,9 @@ from contextlib import contextmanager
 
 import pytest
 
-from clod_adapter.errors import ClodError
 from clod_adapter.viewer import server as served
 from clod_adapter.viewer.server import Response, Server
+from runs import rejects
 
 BLOCKS = (b"a" * 1000, b"b" * 24)
 RESPONSES = {
@@ -102,7 +102,7 @@ def test_responses(server: Server) -> None:
             )
         else:
             assert BLOCKS[0] not in body
-    with pytest.raises(ClodError, match=f"^port {server.port} of 127.0.0.1 .*choose another"):
+    with rejects(f"^port {server.port} of 127.0.0.1 .*choose another"):
         Server({}, server.port)
 
 

@@ -12,12 +12,12 @@ import pytest
 import torch
 
 import clod_adapter
-from clod_adapter import AdaptConfig, ClodError
+from clod_adapter import AdaptConfig
 from clod_adapter.cli.main import build_parser
 from clod_adapter.cli.shared.command import make_config
 from clod_adapter.cli.shared.process import Launch, launched
 from clod_adapter.training.state import load_state
-from runs import STATE, Launched, Server, log_of
+from runs import STATE, Launched, Server, log_of, rejects
 
 TINY = ("--max-sv", 4, "--out", "dial.ply", "--batch", 2, "--iters", 12)
 LONG = (*TINY[:-1], 4000)  # does not end by itself
@@ -184,7 +184,7 @@ def test_torchrun_with_a_killed_process(server: Server, words: list[Any], tmp_pa
     run = Launched(server, folder, size=0)
     log = log_of(folder)
     report = run.report()
-    assert "a process of the group has ended" in log and log.count("2 processes (gloo)") == 1, log
+    assert "a process of the group has ended" in log and log.count("2 processes (gloo)") == 1
     assert report["interrupted"] and report["steps"] == load_state(folder / STATE)[0].steps
 
 
@@ -199,7 +199,7 @@ def test_rank_and_default_steps_from_the_environment(monkeypatch: pytest.MonkeyP
     assert launch_of("1") == Launch()
     assert launch_of("1", MASTER_ADDR="localhost", MASTER_PORT="1") == Launch(1, 4, 0, 1)
     for rank in ("4", "-1", "one"):
-        with pytest.raises(ClodError, match="inconsistent .*; start the processes with torchrun"):
+        with rejects("inconsistent .*; start the processes with torchrun"):
             launch_of(rank)
     steps = AdaptConfig().steps
     for words, size, want in (

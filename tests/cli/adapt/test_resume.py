@@ -258,7 +258,7 @@ def test_resuming_after_an_error(
         change_step(patch, 6, change)
         done = clod(ADAPT, "--quiet" if change is fail else "--json", code=1)
     assert names(tmp_path) == files, done
-    assert f"--resume resumes from step 5, which is in {STATE}\n" in done.err, done
+    assert f"--resume resumes from step 5, which is in {STATE}\n" in done.err
     assert (
         ("please report it" in done.err)
         == ("ZeroDivisionError: of ours" in done.err)

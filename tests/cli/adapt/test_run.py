@@ -121,7 +121,7 @@ def test_prints_progress_a_table_next_commands_and_a_loss(
         r"importance  50%, \d.* left, \d+/\d+",
         r"base: [\d.]+ dB on .*",
     ):
-        assert re.search(f"^{line}$", done.err, re.M), done
+        assert re.search(f"^{line}$", done.err, re.M)
     report = json.loads((folder / "dial.json").read_text())
     # more than is accepted: the exit code is 1
     lost = report["base_rows"][0]["psnr"] - report["rows"][0]["psnr"]
@@ -134,7 +134,7 @@ def test_forecast_of_time_and_memory(clod: Any) -> None:
     """In a line before training, and with what the run took in the report."""
     done = clod("BASE --images SCENE --max-sv 2 --out dial.ply --json --iters 100")
     found = done.report["forecast"]
-    assert re.search(r"^forecast: \d+ seconds, \d.* [MG]B \(100 steps\)$", done.err, re.M), done
+    assert re.search(r"^forecast: \d+ seconds, \d.* [MG]B \(100 steps\)$", done.err, re.M)
     assert done.err.index("\nforecast: ") < done.err.index("\ntrained 100 steps")
     assert found["steps"] == 100 and found["seconds"] > 0 and found["actual_seconds"] > 0
     assert found["bytes"] == pytest.approx(found["actual_bytes"], rel=1 / 3)
@@ -160,9 +160,9 @@ def test_dial_of_the_checkpoint_is_continued(clod: Any, dialled: Path) -> None:
             more,
         )
         noted = f"{model} has a dial already: continuing from its {note}"
-        assert done.err == "", done
-        assert noted in done.report["notes"], done
-        assert done.report["device"] == "cpu", done
+        assert done.err == ""
+        assert noted in done.report["notes"]
+        assert done.report["device"] == "cpu"
         assert columns(Path("dial.ply"))[-len(stored) :] == stored and rebuilt(clod, model)
         if more:
             assert load_adapter("dial.safetensors").growth_d is None
@@ -291,6 +291,6 @@ def test_overrides(clod: Any, wasteful: Path) -> None:
     assert stored["SH degrees"]["verdict"] == "kept"
     others = {name: d["verdict"] for name, d in stored.items() if d["name"] not in ("bands", "")}
     assert others == {"means": "frozen", "quats": "frozen"}
-    assert re.search(r"^  quats +frozen +- +--with quats$", done.err, re.M), done
+    assert re.search(r"^  quats +frozen +- +--with quats$", done.err, re.M)
     adapter = load_adapter("dial.safetensors")
     assert not adapter.updates and len(adapter.added["means"]) == 280

@@ -18,6 +18,7 @@ from clod_adapter.cli.view import make_page
 from clod_adapter.config import FILTERS
 from models import write_model
 from runs import names, rebuilt
+from scenes import seeded
 
 FAST = "--iters 3 --max-sv 4 --out dial.ply --json"
 
@@ -57,7 +58,7 @@ def test_cameras_are_moved_into_another_frame_in_every_command(
     done = clod(turned, "--images SCENE", FAST)
     said = f"the cameras are moved into the frame of {turned} (axes x, -y, -z): renders have"
     report = done.report
-    assert done.err.count(said) == 1 and any(said in note for note in report["notes"]), done
+    assert done.err.count(said) == 1 and any(said in note for note in report["notes"])
     found = report["alignment"]
     frame = report["alignment"]["frame"]
     assert frame["psnr"] > found["mean_colour_psnr"] + 6 > found["psnr"] + 6
@@ -82,7 +83,7 @@ def test_cameras_are_moved_into_another_frame_in_every_command(
 def test_another_scene_is_refused_and_nothing_is_written(
     clod: Any, capture: Any, turned: Path, tmp_path: Path
 ) -> None:
-    random = torch.Generator().manual_seed(2)
+    random = seeded(2)
     scene = scene_of(capture, tmp_path / "scene", lambda view: view.image, 2)
     means, sh0 = (torch.randn(shape, generator=random) for shape in ((300, 3), (300, 1, 3)))
     lost = capture.write(
@@ -90,10 +91,10 @@ def test_another_scene_is_refused_and_nothing_is_written(
     )
     before = names(tmp_path)
     done = clod(lost, "--images", scene, FAST, code=2)
-    assert f"error: {lost}: does not match {scene}" in done.err and "are in view" in done.err, done
+    assert f"error: {lost}: does not match {scene}" in done.err and "are in view" in done.err
     assert "--misaligned-ok" in done.err.splitlines()[-1]
     done = clod("robustness BASE", turned, "--images SCENE", FAST, code=2)
-    assert f"error: {turned}: in another frame than {capture.ply}" in done.err, done
+    assert f"error: {turned}: in another frame than {capture.ply}" in done.err
     assert names(tmp_path) == before
 
 
@@ -108,9 +109,9 @@ def test_white_background_is_refused_unless_allowed(
 
     words = (ply, "--images", scene_of(capture, tmp_path / "white", over_white), FAST)
     done = clod(*words, code=2)
-    assert "over white the renders have" in done.err and "transparent background" in done.err, done
+    assert "over white the renders have" in done.err and "transparent background" in done.err
     done = clod(*words, "--misaligned-ok")
-    assert f"warning: {ply}: does not match" in done.err and "to train anyway" not in done.err, done
+    assert f"warning: {ply}: does not match" in done.err and "to train anyway" not in done.err
     notes = done.report["notes"]
     alignment = done.report["alignment"]
     assert any(note.startswith("warning: ") for note in notes) and alignment["frame"] is None
@@ -124,7 +125,7 @@ def test_other_photographs_have_a_warning(
 ) -> None:
     scene_of(capture, tmp_path / "scene", lambda view: (share * view.image).byte())
     done = clod("BASE --images scene", FAST)
-    assert said in done.err and said in done.report["notes"][0], done
+    assert said in done.err and said in done.report["notes"][0]
 
 
 @pytest.fixture(scope="module")
@@ -200,5 +201,5 @@ def test_exports_store_the_filter_or_note_its_loss(clod: Any, trained: tuple[Pat
     ):
         done = clod("export", trained[0], "--antialiasing on --json -o", out)
         found = [note for note in done.report["notes"] if "trained antialiased" in note]
-        assert bool(found) == notes and all(note in done.err for note in found), done
+        assert bool(found) == notes and all(note in done.err for note in found)
         assert not stores or load(out).gaussians.screen_filter == FILTERS["on"]

@@ -20,9 +20,8 @@ import clod_adapter
 from clod_adapter.cli.shared import inputs, pages
 from clod_adapter.cli.shared.console import Console
 from clod_adapter.cli.shared.inputs import pick_device, prepare_kernels
-from clod_adapter.errors import ClodError
 from formats import PACKED
-from runs import names, rebuilt
+from runs import names, rebuilt, rejects
 
 TINY = "--images SCENE --iters 2 --max-sv 4 --out dial.ply"
 
@@ -63,7 +62,7 @@ def test_devices(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[
     """Without a GPU nothing is printed; a GPU is named, or the reason that it is not used."""
 
     def refused(said: str) -> None:
-        with pytest.raises(ClodError, match=rf"--device cuda: {said}.*or use --device cpu"):
+        with rejects(rf"--device cuda: {said}.*or use --device cpu"):
             pick_device("cuda", Console())
 
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
@@ -124,7 +123,7 @@ ADAPT = "BASE --images SCENE --iters 16 --max-sv 4 --out dial.ply --report"
 
 def page_of(path: Path) -> tuple[str, dict[str, Any]]:
     """Its text, and the data in it."""
-    text = path.read_text(encoding="utf-8")
+    text = path.read_text("utf-8")
     return text, json.loads(re.findall(r'id="data">(.*?)</script>', text, re.S)[0])
 
 
