@@ -8,7 +8,8 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from itertools import chain, count
 from pathlib import Path
 from typing import Any
@@ -218,6 +219,14 @@ def pressing(real: Callable[..., Any], *numbers: int, at: int = 1) -> Callable[.
         return real(*given, **rest)
 
     return pressed
+
+
+@contextmanager
+def pressed(place: Any, name: str, *numbers: int, at: int = 1) -> Iterator[None]:
+    """Within the context a function, ``place.name``, is interrupted as by ``pressing``."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(place, name, pressing(getattr(place, name), *numbers, at=at))
+        yield
 
 
 def change_step(patch: pytest.MonkeyPatch, at: int, change: Callable[[Any], Any]) -> None:

@@ -62,6 +62,12 @@ class Done(NamedTuple):
         """The object of ``--json``."""
         return json.loads(self.out)
 
+    @property
+    def output(self) -> Any:
+        """The one output of ``--json``."""
+        (output,) = self.report["outputs"]
+        return output
+
     def note(self, part: str) -> str:
         """The one note of ``--json`` that has this part."""
         (note,) = (note for note in self.report["notes"] if part in note)

@@ -5,7 +5,7 @@ import json
 import re
 import shlex
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,15 +15,17 @@ import torch
 from plyfile import PlyData
 from torch.testing import assert_close
 
-import clod_adapter
-import scenes
 from clod_adapter import (
+    AdaptConfig,
+    Camera,
     ClodError,
     bake,
     bake_levels,
+    detach,
     load,
     load_scene,
     order_by_extinction,
+    place_cameras,
     render,
     save,
 )
@@ -33,10 +35,11 @@ from clod_adapter.io.formats import splat_transform
 from clod_adapter.io.ply_layout import write_comments
 from clod_adapter.io.settings import Metadata
 from formats import inria_rows, with_columns, write_rows
+from scenes import gaussians
 
 EXPORT = "export DIAL --json"
 TOOL = """
-import json, pathlib, sys
+import json, os, pathlib, signal, sys, time
 words = sys.argv[1:]
 if words == ["--version"]:
     print("node:v22.1.0;splat-transform v3.7.0")
@@ -72,54 +75,55 @@ def files(folder: Path) -> list[str]:
     return sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
 
 
-def test_baking(clod: Any, capture: Any, dialled: Path) -> None:
+def test_baking(clod, capture, dialled):
     done = clod(EXPORT, "--sv 2 -o x.ply")
     want = baked(dialled, 2.0)
-    (output,), data = done.report["outputs"], Path("x.ply").read_bytes()
-    assert output == {"file": "x.ply", "virtual_scale": 2, "count": len(want), "bytes": len(data)}
+    data = Path("x.ply").read_bytes()
+    size = len(data)
+    assert done.output == {"file": "x.ply", "virtual_scale": 2, "count": len(want), "bytes": size}
     assert done.report["notes"] == [] and "baked for 8 training cameras; lossy" in done.err
     assert f"{len(want)} of 300 Gaussians, s = 2\n" in done.err
     assert "scales include growth" in done.err
     assert len(want) < 300 and load("x.ply").gaussians == want
     # SIBR takes the count from the third line, and rows of float32 in Inria's order without gaps.
     head, _, rows = data.partition(b"end_header\n")
-    assert head.split(b"\n")[:3] == [
-        b"ply",
-        b"format binary_little_endian 1.0",
-        b"element vertex %d" % len(want),
-    ]
-    assert rows == inria_rows(want).tobytes()
+    lines = b"ply\nformat binary_little_endian 1.0\nelement vertex %d\n" % len(want)
+    assert head.startswith(lines) and rows == inria_rows(want).tobytes()
+
+
+def test_baking_for_other_cameras(clod, capture, dialled):
+    """Those of a scene, one of them, and placed ones for a file without cameras."""
     report = clod(EXPORT, "--sv 2 --images SCENE -o x.ply").report
     cameras = [view.camera for view in load_scene(capture.scene).train]
     model = load(dialled).gaussians
-    again = load("x.ply").gaussians
+    want = bake(model, 2.0, cameras=cameras)
     assert report["cameras"] == 8
-    assert_close(again.opacity_logits, bake(model, 2.0, cameras=cameras).opacity_logits)
+    assert_close(load("x.ply").gaussians.opacity_logits, want.opacity_logits)
 
     there = f"{EXPORT} --camera 003 --images SCENE"
-    camera = next(each for each in cameras if each.name == "003.png")
+    camera = camera_003(cameras)
     n = sum(int(render(model, camera, s).kept.sum()) for s in (4.0, 1.0)) // 2
     done = clod(there, "-o one.ply --keep", n)
     plain = load("one.ply")
-    (output,) = done.report["outputs"]
-    assert done.report["camera"] == "003.png" and output["count"] == n == len(plain.gaussians)
+    assert done.report["camera"] == "003.png" and done.output["count"] == n == len(plain.gaussians)
     # there the image is the dial's
-    want = render(model, camera, output["virtual_scale"])
+    want = render(model, camera, done.output["virtual_scale"])
     assert_close(render(plain.gaussians, camera).image, want.image, atol=2e-5, rtol=0)
     assert "exact at the camera of 003.png only" in done.err
     assert any("for the camera at (" in comment for comment in plain.comments)
-    report = clod(there, "--fps 1 -o fast.ply").report  # timed here, at that camera
-    assert report["outputs"][0]["virtual_scale"] == 1
-    assert any("frames timed here" in note for note in report["notes"])
+    done = clod(there, "--fps 1 -o fast.ply")  # timed here, at that camera
+    assert done.output["virtual_scale"] == 1 and done.note("frames timed here")
 
     save("old.ply", model)  # as before cameras were stored
     (note,) = clod("export old.ply --sv 2 -o x.ply --json").report["notes"]
-    assert (
-        note
-        == "old.ply stores no cameras: baked for 16 placed ones; --images gives a better result"
-    )
-    want = bake(model, 2.0, cameras=clod_adapter.place_cameras(model, views=16))
+    unknown = "old.ply stores no cameras: baked for 16 placed ones; --images gives a better result"
+    assert note == unknown
+    want = bake(model, 2.0, cameras=place_cameras(model, views=16))
     assert torch.equal(load("x.ply").gaussians.means, want.means)
+
+
+def camera_003(cameras: Sequence[Camera]) -> Camera:
+    return next(camera for camera in cameras if camera.name == "003.png")
 
 
 def test_levels(clod: Any, dialled: Path, tmp_path: Path) -> None:
@@ -129,22 +133,20 @@ def test_levels(clod: Any, dialled: Path, tmp_path: Path) -> None:
     assert [load(name).gaussians for name in names] == [baked(dialled, s) for s in (1.0, 2.5, 4.0)]
 
 
-def test_sets_have_a_level_for_each_band_of_distances(
-    clod: Any, dialled: Path, tmp_path: Path
-) -> None:
+def test_sets_have_a_level_for_each_band_of_distances(clod, dialled, tmp_path):
     """The finest is the checkpoint; in others are those that reach the middle of the band, as large
     as there.
     """
     done = clod(EXPORT, "--3dtiles --multiplier 2 -o tiles")
-    (output,), model = done.report["outputs"], load(dialled).gaussians
-    counts, begins = ([level[name] for level in output["levels"]] for name in ("count", "begins"))
+    model = load(dialled).gaussians
+    counts = [level["count"] for level in done.output["levels"]]
+    begins = [level["begins"] for level in done.output["levels"]]
     near = model.attenuation.near_distance
     assert begins[:3] == [0.0, near, 2 * near] and f"level 1 begins at {near:.4g}" in done.err
-    assert counts[0] == model.whole
     assert counts == sorted(counts, reverse=True)
-    assert counts[-1] >= 0.01 * model.whole
+    assert counts[0] == model.whole and counts[-1] >= 0.01 * model.whole
     levels = bake_levels(model, 2.0)
-    assert levels[0].gaussians == clod_adapter.detach(model)
+    assert levels[0].gaussians == detach(model)
     for k, level in enumerate(levels[1:], 1):
         reached = model.sigma_d > near * 2 ** (k - 0.5)
         assert torch.equal(level.gaussians.means, model.means[reached])
@@ -153,160 +155,144 @@ def test_sets_have_a_level_for_each_band_of_distances(
     assert root["geometricError"] > root["children"][0]["geometricError"] >= 0
 
 
-def test_a_lower_sh_degree_is_fitted(clod: Any, capture: Any) -> None:
+def test_a_lower_sh_degree_is_fitted(clod, capture):
     """Nearer to the renders of all degrees than one that is cut; what needs no higher degree stays
     as it is.
     """
-    views = load_scene(capture.scene)
-    base = scenes.gaussians(300, 3, 0).replace(means=capture.gaussians.means)
+    cameras = [view.camera for view in load_scene(capture.scene).train]
+    base = gaussians(300, 3, 0).replace(means=capture.gaussians.means)
     capture.write("rich.ply", base)
-    report = clod("export rich.ply --sh-degree 1 --images SCENE -o x.ply --json").report
-    (note,) = (note for note in report["notes"] if "--sh-degree 1" in note)
+    done = clod("export rich.ply --sh-degree 1 --images SCENE -o x.ply --json")
+    assert "against those with degree 3 (fitted to 8 training cameras)" in done.note("degree 1")
     fitted = load("x.ply").gaussians
-    cut = base.without_bands(1)
     assert fitted.sh_degree == 1
-    assert "against those with degree 3 (fitted to 8 training cameras)" in note
 
-    def error(shown: clod_adapter.Gaussians) -> float:
-        cameras = [view.camera for view in views.train]
-        pairs = ((render(each, camera).image for each in (shown, base)) for camera in cameras)
-        return sum(float((one - other).square().mean()) for one, other in pairs)
+    def error(model):
+        total = 0.0
+        for camera in cameras:
+            change = render(model, camera).image - render(base, camera).image
+            total += float(change.square().mean())
+        return total
 
-    assert error(fitted) < 0.7 * error(cut)
+    assert error(fitted) < 0.7 * error(base.without_bands(1))
     plain = base.replace(shN=torch.cat([base.shN[:, :3], torch.zeros(300, 12, 3)], 1))
-    assert torch.allclose(
-        with_sh_degree(plain, 1, [view.camera for view in views.train]).shN, plain.shN[:, :3]
-    )
+    assert torch.allclose(with_sh_degree(plain, 1, cameras).shN, plain.shN[:, :3])
     assert "has degree 1, and stays as it is" in clod("export x.ply --sh-degree 2 -o y.ply").err
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".glb", ".splat"])
-def test_formats(clod: Any, dialled: Path, suffix: str) -> None:
+def test_formats(clod, dialled, suffix):
     model = load(dialled)
     kept = suffix != ".splat"
     done = clod(EXPORT, f"-o x{suffix}", "" if kept else "--sv 1")
-    (output,), again = done.report["outputs"], load(f"x{suffix}")
+    output = done.output
+    again = load(f"x{suffix}")
     assert output["bytes"] == Path(f"x{suffix}").stat().st_size and ("lossy" in done.err) != kept
     assert output["virtual_scale"] == (None if kept else 1) and (output["count"] == 300 or not kept)
     assert (again.gaussians.sigma_d is not None) == (again.gaussians.growth_d is not None) == kept
     if suffix == ".ply":
-        assert (again.gaussians, again.calibration, again.notes) == (
-            model.gaussians,
-            model.calibration,
-            (),
-        )
+        assert again.gaussians == model.gaussians and again.notes == ()
+        assert again.calibration == model.calibration
     clod(EXPORT, f"--sv 2 -o baked{suffix}")
     clod(f"export baked{suffix} -o again.ply")
     header = Path("again.ply").read_bytes().partition(b"end_header")[0].decode()
     assert header.count("comment baked at s = 2 by clod-adapter for 8 training cameras\n") == kept
 
 
-def test_losses_are_noted(clod: Any, dialled: Path, tmp_path: Path) -> None:
+def test_losses_are_noted(clod, dialled):
     """Harmonics and foreign columns; positions far from 0 become doubles. Columns of settings are
     not dropped.
     """
-    report = clod("export BASE -o x.splat --json").report
-    assert report["outputs"] == [
-        {"file": "x.splat", "virtual_scale": None, "count": 300, "bytes": 300 * 32}
-    ]
-    assert "view-dependent colour is dropped" in report["notes"]
+    done = clod("export BASE -o x.splat --json")
+    wanted = {"file": "x.splat", "virtual_scale": None, "count": 300, "bytes": 300 * 32}
+    assert done.output == wanted and done.note("view-dependent colour is dropped")
     model = load(dialled)
     element = PlyData.read(str(dialled), mmap=False)["vertex"]
-    write_rows(
-        tmp_path / "labelled.ply", with_columns(element.data, label=7), comments=element.comments
-    )
+    labelled = with_columns(element.data, label=7)
+    write_rows(Path("labelled.ply"), labelled, comments=element.comments)
     assert clod("export labelled.ply -o x.ply --json").report["notes"] == ["columns dropped: label"]
     assert load("x.ply").gaussians == model.gaussians
     assert load("x.ply").vertex.dtype == model.vertex.dtype
     far = element.data.astype([(n, "f8" if n in "xyz" else t) for n, t in element.data.dtype.descr])
     far["x"] += 437_000.0
     there = tuple(viewpoint.moved([437_000.0, 0, 0]) for viewpoint in model.calibration.viewpoints)
-    settings = Metadata(
-        model.gaussians.attenuation, calibration=replace(model.calibration, viewpoints=there)
-    )
-    write_rows(tmp_path / "far.ply", far, comments=write_comments(settings))
-    report = clod("export far.ply --sv 2 -o x.ply --json").report
+    calibration = replace(model.calibration, viewpoints=there)
+    settings = Metadata(model.gaussians.attenuation, calibration=calibration)
+    write_rows(Path("far.ply"), far, comments=write_comments(settings))
+    assert clod("export far.ply --sv 2 -o x.ply --json").note("x, y and z are doubles")
     again = load("x.ply")
-    assert any("x, y and z are doubles" in note for note in report["notes"])
     assert len(again.gaussians) == len(baked("far.ply", 2.0)) == len(baked(dialled, 2.0))
     assert 436_000 < again.vertex["x"].mean() < 438_000
 
 
-def test_order_by_extinction(clod: Any, capture: Any, dialled: Path) -> None:
+def test_order_by_extinction(clod, capture):
     """Of a dial without near and far Gaussians, which have no order."""
     assert "have no order" in clod(EXPORT, "--order extinction -o x.ply", code=2).err
     scene = load_scene(capture.scene)
-    config = clod_adapter.AdaptConfig(max_sv=4.0)
-    save("dial.ply", initialize(capture.gaussians, scene.train, config))
-    model = load("dial.ply")
+    save("dial.ply", initialize(capture.gaussians, scene.train, AdaptConfig(max_sv=4.0)))
+    model = load("dial.ply").gaussians
     words = "export dial.ply --images SCENE --json --order extinction"
     cameras = [view.camera for view in scene.train]
-    rows = order_by_extinction(model.gaussians, cameras)
+    rows = order_by_extinction(model, cameras)
     report = clod(words, "-o ordered.ply").report
     ordered = load("ordered.ply")
-    assert report["order"] == "extinction" and ordered.gaussians == model.gaussians.select(rows)
+    assert report["order"] == "extinction" and ordered.gaussians == model[rows]
     assert any("rows in the order" in comment for comment in ordered.comments)
-    n = len(bake(model.gaussians, 3.0, cameras=cameras))
+    n = len(bake(model, 3.0, cameras=cameras))
     clod(words, "-o first.ply --keep", n)
-    assert n < 300
-    assert torch.equal(load("first.ply").gaussians.means, model.gaussians.means[rows[:n]])
+    assert n < 300 and torch.equal(load("first.ply").gaussians.means, model.means[rows[:n]])
     clod(words, "--camera 003 --sv 2 -o one.ply")
-    camera = next(camera for camera in cameras if camera.name == "003.png")
-    ordered = model.gaussians.select(order_by_extinction(model.gaussians, [camera]))
+    camera = camera_003(cameras)
+    ordered = model[order_by_extinction(model, [camera])]
     assert load("one.ply").gaussians == bake(ordered, 2.0, camera)
 
 
-def test_splat_transform(clod: Any, dialled: Path, tmp_path: Path, tool: Any) -> None:
+def test_splat_transform(clod, dialled, tmp_path, tool):
     tool()
     done = clod(EXPORT, "--sv 4 -o x.sog")
     said = json.loads(Path("x.sog").read_text())
-    notes = done.report["notes"]
-    assert " took " in done.err and "splat-transform rounds values and sorts the Gaussians" in notes
-    assert any("without a GPU" in note for note in notes) and files(tmp_path) == ["x.sog"]
+    assert " took " in done.err and done.note("without a GPU") and files(tmp_path) == ["x.sog"]
+    assert done.note("splat-transform rounds values and sorts the Gaussians")
     assert said["words"][:5] == ["-w", "-g", "cpu", "-i", "1"]
     assert said["words"][-1].endswith("packed.sog")
-    assert said["sizes"][0] > 92 * done.report["outputs"][0]["count"]
+    assert said["sizes"][0] > 92 * done.output["count"]
     tool("(out.parent / '0_0').mkdir(); (out.parent / '0_0' / 'a.webp').write_text('1234')")
     (tmp_path / "-o").mkdir()  # empty; not an option of the tool
-    (output,) = clod(EXPORT, "--lod-meta --out=-o").report["outputs"]
-    levels = bake_levels(load(dialled).gaussians)
-    counts = [len(level.gaussians) for level in levels]
+    output = clod(EXPORT, "--lod-meta --out=-o").output
+    counts = [len(level.gaussians) for level in bake_levels(load(dialled).gaussians)]
     assert [level["count"] for level in output["levels"]] == counts
     assert output["count"] == sum(counts)
     assert files(tmp_path / "-o") == ["0_0", "0_0/a.webp", "lod-meta.json"]
     text = Path(output["file"]).read_text()
     words = json.loads(text)["words"][5:]
     assert output["bytes"] == len(text) + 4
-    assert words[:4] == [
-        "--lod-chunk-extent",
-        "0",
-        "--lod-chunk-min",
-        "8",
-    ]
-    assert words[5::3] == ["-l"] * len(levels)
-    assert words[6::3] == [str(k) for k in range(len(levels))]
+    assert words[:4] == ["--lod-chunk-extent", "0", "--lod-chunk-min", "8"]
+    assert words[5::3] == ["-l"] * len(counts)
+    assert words[6::3] == [str(k) for k in range(len(counts))]
     assert words[-1].endswith("/lod-meta.json")
 
 
-def test_failure_of_the_tool_leaves_no_file(
-    clod: Any, tmp_path: Path, tool: Any, monkeypatch: Any
-) -> None:
-    monkeypatch.setattr(splat_transform, "LIMIT_EACH", 0.0)
-    interrupt = "import os, signal, time; os.kill(os.getppid(), signal.SIGINT); time.sleep(60)"
-    for words, behave, limit, code, said in (
+@pytest.mark.parametrize(
+    "words, behave, limit, code, said",
+    [
+        ("--sv 2 -o x.sog", "time.sleep(60)", 0.5, 2, "was ended, it took longer than 0 s\n"),
         (
-            "--sv 2 -o x.sog",
-            "import time; time.sleep(60)",
-            0.5,
-            2,
-            "was ended, it took longer than 0 s\n",
+            "--lod-meta -o out",
+            "os.kill(os.getppid(), signal.SIGINT); time.sleep(60)",
+            60.0,
+            130,
+            "interrupted\n",
         ),
-        ("--lod-meta -o out", interrupt, 60.0, 130, "interrupted\n"),
-    ):
-        monkeypatch.setattr(splat_transform, "LIMIT", limit)
-        tool(behave)
-        done = clod("export DIAL", words, code=code)
-        assert done.err.endswith(said) and files(tmp_path) == []
+    ],
+)
+def test_failure_of_the_tool_leaves_no_file(
+    clod, tmp_path, tool, monkeypatch, words, behave, limit, code, said
+):
+    monkeypatch.setattr(splat_transform, "LIMIT_EACH", 0.0)
+    monkeypatch.setattr(splat_transform, "LIMIT", limit)
+    tool(behave)
+    done = clod("export DIAL", words, code=code)
+    assert done.err.endswith(said) and files(tmp_path) == [], done
 
 
 def test_the_real_tool(clod: Any, dialled: Path, tmp_path: Path) -> None:
@@ -324,28 +310,25 @@ def test_the_real_tool(clod: Any, dialled: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("without_splat_transform")
-def test_page_holds_the_splat_and_its_dial(clod: Any, dialled: Path, tmp_path: Path) -> None:
-    def page(*words: str, held: str) -> tuple[Any, Any, Any]:
+def test_page_holds_the_splat_and_its_dial(clod, dialled, tmp_path):
+    def page(*words, name):
         """What was printed, the settings of the page, and the splat in it."""
         done = clod(EXPORT, "-o page.html", *words)
         text = Path("page.html").read_text("utf-8")
-        data, config = (
-            re.findall(f'id="clod-{part}">(.*?)</script>', text)[0] for part in ("model", "config")
-        )
-        Path(held).write_bytes(base64.b64decode(data))
-        return done, json.loads(config), load(held)
+        config, data = re.findall(r'id="clod-(?:model|config)">(.*?)</script>', text)
+        Path(name).write_bytes(base64.b64decode(data))
+        return done, json.loads(config), load(name)
 
-    done, config, held = page("--sv 9 --images SCENE", held="held.spz")
-    (output,) = done.report["outputs"]
+    done, config, held = page("--sv 9 --images SCENE", name="held.spz")
     assert config["model"]["name"] == dialled.name and config["virtual_scale"] == 4
-    assert any("dial ends at s = 4" in note for note in done.report["notes"])
+    assert done.note("dial ends at s = 4")
     assert "Gaussians, initial dial value s = 4" in done.err
     assert " of " not in done.err.splitlines()[-1]
     assert [camera["name"] for camera in config["cameras"]] == [f"{k:03}.png" for k in range(10)]
-    assert held.gaussians.whole == output["count"] == 300
-    assert output["bytes"] == Path("page.html").stat().st_size
+    assert held.gaussians.whole == done.output["count"] == 300
+    assert done.output["bytes"] == Path("page.html").stat().st_size
     assert held.gaussians.sigma_d is not None and held.calibration is not None
     said = re.search(r"PSNR of (\S+) dB against the exact file \(s = 1\)", done.err)
     assert said and float(said[1]) > 40 and [*tmp_path.glob(".tmp-*")] == []
-    done, _, held = page("--exact", held="held.ply")
+    done, _, held = page("--exact", name="held.ply")
     assert "PSNR" not in done.err and held.gaussians == load(dialled).gaussians

@@ -12,30 +12,31 @@ from typing import Any
 
 import pytest
 
-import clod_adapter
-from clod_adapter import load, pipeline
+from clod_adapter import load, load_adapter, pipeline
 from clod_adapter.cli.adapt import listeners
 from clod_adapter.cli.shared import measure
 from clod_adapter.training import planner
 from clod_adapter.training.state import load_state
-from runs import OUTPUTS, STATE, Server, contents, log_of, names, pressing, results, wait_for
+from runs import (
+    OUTPUTS,
+    STATE,
+    Server,
+    contents,
+    log_of,
+    names,
+    pressed,
+    pressing,
+    results,
+    wait_for,
+)
 
 ITERS = 24
 
 
 @pytest.fixture(scope="module")
-def words(capture: Any) -> list[Any]:
-    return [
-        capture.ply,
-        "--images",
-        capture.scene,
-        "--iters",
-        ITERS,
-        "--max-sv",
-        4,
-        "--out",
-        "dial.ply",
-    ]
+def words(capture: Any) -> list[str]:
+    line = f"{capture.ply} --images {capture.scene} --iters {ITERS} --max-sv 4 --out dial.ply"
+    return line.split()
 
 
 @pytest.fixture(scope="module")
@@ -48,24 +49,31 @@ def undisturbed(server: Server, words: list[Any], tmp_path_factory: pytest.TempP
 
 def assert_whole(folder: Path) -> None:
     """Outputs can be read, and all other files have the name of a temporary file."""
-    readers = [
-        lambda path: json.loads(path.read_text()),
-        load,
-        clod_adapter.load_adapter,
-    ]
-    known = dict(zip(OUTPUTS, readers, strict=True)) | {STATE: load_state}
+    readers = {
+        ".json": lambda path: json.loads(path.read_text()),
+        ".ply": load,
+        ".safetensors": load_adapter,
+    }
     for path in folder.iterdir():
-        assert path.name in known or path.name.startswith(".tmp-")
-        known.get(path.name, Path.stat)(path)
+        if path.name == STATE:
+            load_state(path)
+        elif not path.name.startswith(".tmp-"):
+            assert path.name in OUTPUTS
+            readers[path.suffix](path)
+
+
+def report_in(folder: Path) -> Any:
+    return json.loads((folder / "dial.json").read_text())
 
 
 def assert_same(folder: Path, want: Path) -> None:
     """The same bits, except measured times, and no other files."""
     assert names(folder) == OUTPUTS, log_of(folder)
     assert results(folder) == results(want)
-    found, wanted = (json.loads((path / "dial.json").read_text()) for path in (folder, want))
-    assert [row["psnr"] for row in found["rows"]] == [row["psnr"] for row in wanted["rows"]]
-    assert found["steps"] == wanted["steps"] and not found["interrupted"]
+    report = report_in(folder)
+    wanted = report_in(want)
+    assert [row["psnr"] for row in report["rows"]] == [row["psnr"] for row in wanted["rows"]]
+    assert report["steps"] == wanted["steps"] and not report["interrupted"]
 
 
 def test_kills(
@@ -90,8 +98,8 @@ def test_kills(
 
 
 def test_one_interrupt_of_training_writes_the_result_so_far(
-    server: Server, words: list[Any], undisturbed: Path, tmp_path: Path, clod: Any
-) -> None:
+    server, words, undisturbed, tmp_path, clod
+):
     """The state is written too, and the log has only the command's lines. No other run may write
     there before.
     """
@@ -105,27 +113,22 @@ def test_one_interrupt_of_training_writes_the_result_so_far(
     os.kill(child, signal.SIGCONT)
     code = server.wait(child)
     log = log_of(tmp_path)
-    report = json.loads((tmp_path / "dial.json").read_text())
-    assert code == 0, log
-    assert report["interrupted"], log
-    assert report["resumed_from"] is None, log
-    assert "interrupted after" in log
-    assert names(tmp_path) == sorted([*OUTPUTS, STATE])
-    assert load_state(tmp_path / STATE)[0].steps == report["steps"]
-    assert f"--resume resumes from step {report['steps']}, which is in {STATE}" in log
-    assert "SIGTERM" not in log
+    report = report_in(tmp_path)
+    steps = report["steps"]
+    assert code == 0 and "interrupted after" in log and "SIGTERM" not in log
+    assert report["interrupted"] and report["resumed_from"] is None
+    assert names(tmp_path) == BOTH and load_state(tmp_path / STATE)[0].steps == steps
+    assert f"--resume resumes from step {steps}, which is in {STATE}" in log
     assert_whole(tmp_path)
-    assert f"resuming {STATE} from step {report['steps']}" in server.run(
-        tmp_path, *words, "--resume"
-    )
+    assert f"resuming {STATE} from step {steps}" in server.run(tmp_path, *words, "--resume")
     assert_same(tmp_path, undisturbed)
-    assert json.loads((tmp_path / "dial.json").read_text())["resumed_from"] == report["steps"]
+    assert report_in(tmp_path)["resumed_from"] == steps
 
 
 INT = signal.SIGINT
 TERM = signal.SIGTERM
-SAVING = (listeners, "save_state")
-BOTH = sorted([*OUTPUTS, STATE])  # while training
+SAVING = (listeners, "save_state")  # while training
+BOTH = sorted([*OUTPUTS, STATE])
 ABORTED = f"--resume resumes from step {ITERS}, which is in {STATE}\nclod-adapt: interrupted"
 # where signals arrive, which, exit code, files, and the report's "interrupted" or the end of stderr
 MOMENTS = [
@@ -139,26 +142,15 @@ MOMENTS = [
 
 
 @pytest.mark.parametrize("place, numbers, code, files, said", MOMENTS)
-def test_signals_at_a_moment(
-    clod: Any,
-    words: Any,
-    tmp_path: Path,
-    monkeypatch: Any,
-    place: Any,
-    numbers: Any,
-    code: int,
-    files: Any,
-    said: Any,
-) -> None:
+def test_signals_at_a_moment(clod, words, tmp_path, place, numbers, code, files, said):
     """Warnings may be repeated, as launchers do; a second Ctrl-C or SIGTERM aborts."""
-    monkeypatch.setattr(*place, pressing(getattr(*place), *numbers))
-    done = clod(*words, "--json --report" if files == OUTPUTS else "--json", code=code)
+    with pressed(*place, *numbers):
+        done = clod(*words, "--json --report" if files == OUTPUTS else "--json", code=code)
     assert names(tmp_path) == files, done
     if code == 0:
-        assert done.report["interrupted"] == said and "page" not in done.report["outputs"]
-        assert (
-            bool(done.report["rows"]) == bool(done.report["calibration"]) == (place[1] != "extract")
-        )
+        report = done.report
+        assert report["interrupted"] == said and "page" not in report["outputs"]
+        assert bool(report["rows"]) == bool(report["calibration"]) == (place[1] != "extract")
     else:
         assert done.err.rstrip().endswith(said)
     assert signal.getsignal(INT) is signal.default_int_handler
@@ -166,45 +158,39 @@ def test_signals_at_a_moment(
 
 
 @pytest.mark.parametrize("number", [INT, TERM])
-def test_ignored_signals(
-    clod: Any, words: list[Any], monkeypatch: pytest.MonkeyPatch, number: int
-) -> None:
+def test_ignored_signals(clod, words, number):
     """They stay ignored, as in a background job of a script or below nohup; SIGTERM still ends
     training.
     """
-    monkeypatch.setattr(*SAVING, pressing(listeners.save_state, number))
     before = signal.signal(number, signal.SIG_IGN)
     try:
-        assert clod(*words, "--json").report["interrupted"] == (number == TERM)
+        with pressed(*SAVING, number):
+            assert clod(*words, "--json").report["interrupted"] == (number == TERM)
         assert signal.getsignal(number) is signal.SIG_IGN
     finally:
         signal.signal(number, before)
 
 
-def test_interrupts_of_the_measurement(
-    clod: Any, words: list[Any], tmp_path: Path, monkeypatch: Any
-) -> None:
+def test_interrupts_of_the_measurement(clod, words, tmp_path, monkeypatch):
     """The first one keeps the finished rows; one after an interrupt of training aborts, as its
     message says.
     """
     real = measure.evaluate
 
-    def evaluate(gaussians: Any, views: Any, dials: list[float], progress: Any, **rest: Any) -> Any:
-        pressed = pressing(progress, INT, at=3 * len(views) + 1)
-        return real(
-            gaussians, views, dials, progress=pressed if len(dials) == 5 else progress, **rest
-        )
+    def evaluate(gaussians, views, dials, progress, **rest):
+        if len(dials) == 5:
+            progress = pressing(progress, INT, at=3 * len(views) + 1)
+        return real(gaussians, views, dials, progress=progress, **rest)
 
     monkeypatch.setattr(measure, "evaluate", evaluate)
-    report = (done := clod(*words, "--json")).report
+    done = clod(*words, "--json")
+    report = done.report
     assert [row["virtual_scale"] for row in report["rows"]] == [1, 1.5, 2]
     assert "measurements were interrupted" in report["notes"][0] in done.err
-    assert report["interrupted"] is False
-    assert report["calibration"] is None
-    assert load(tmp_path / "dial.ply").calibration is None
-    assert names(tmp_path) == BOTH
-    monkeypatch.setattr(*SAVING, pressing(listeners.save_state, INT))
-    done = clod(*words, code=130)
+    assert report["interrupted"] is False and report["calibration"] is None
+    assert load("dial.ply").calibration is None and names(tmp_path) == BOTH
+    with pressed(*SAVING, INT):
+        done = clod(*words, code=130)
     assert "Ctrl-C again aborts without writing" in done.err and "interrupted after" in done.err
 
 
@@ -221,6 +207,6 @@ def test_closed_terminal_does_not_end_the_writing(
     os.close(other)
     os.close(terminal)
     assert server.wait(child) == 0
-    assert json.loads((tmp_path / "dial.json").read_text())["interrupted"]
+    assert report_in(tmp_path)["interrupted"]
     assert names(tmp_path) == BOTH
     assert_whole(tmp_path)

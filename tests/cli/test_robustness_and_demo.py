@@ -9,6 +9,7 @@ import shutil
 import signal
 from collections.abc import Callable
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ from clod_adapter.evaluation import robustness as experiment
 from clod_adapter.progress import Phase, Progress
 from clod_adapter.report.page import Picture
 from clod_adapter.training import pseudo_views
-from runs import names, pressing, results
+from runs import names, pressed, results
 
 pytest.importorskip("matplotlib")
 OUTPUTS = ["robustness.csv", "robustness.json", "robustness.png"]
@@ -88,73 +89,63 @@ def stamps(folder: Path) -> dict[str, int]:
     return {path.name: path.stat().st_mtime_ns for path in (folder / "cells").iterdir()}
 
 
-def test_outputs_of_all_cells(
-    run: Any, clod: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_outputs_of_all_cells(run, clod, monkeypatch):
     monkeypatch.setattr("clod_adapter.cli.shared.console.LINE_EVERY", 0)
     done = run("--json")
     report = done.report
-    folder = tmp_path / "robustness"
+    folder = Path("robustness")
     assert names(folder) == ["cells", *OUTPUTS]
     assert report == json.loads((folder / "robustness.json").read_text())
-    cells = {(cell["checkpoint"], cell["max_sv"]): cell["rows"] for cell in report["cells"]}
-    assert list(cells) == [
-        (name, max_sv) for name in ("plain", "masked") for max_sv in (None, 1, 3)
-    ]
     assert report["missing"] == [] and not report["interrupted"]
+    cells = {(cell["checkpoint"], cell["max_sv"]): cell["rows"] for cell in report["cells"]}
+    assert list(cells) == [*product(("plain", "masked"), (None, 1, 3))]
+    shares = experiment.BASELINE_SHARES
     for (_, max_sv), rows in cells.items():
-        dials = [row["virtual_scale"] for row in rows]
-        assert dials == (
-            [1.0] * len(experiment.BASELINE_SHARES) if max_sv is None else [1, 1.5, 2, 3]
-        )
+        dials = [1, 1.5, 2, 3] if max_sv else [1.0] * len(shares)
+        assert [row["virtual_scale"] for row in rows] == dials
     with open(folder / "robustness.csv", newline="", encoding="utf-8") as file:
         table = list(csv.DictReader(file))
-    assert len(table) == 2 * (len(experiment.BASELINE_SHARES) + 8)
-    within = {"1.0": "TFFF", "3.0": "TTTT", "base": " " * len(experiment.BASELINE_SHARES)}
-    for max_sv, want in within.items():
-        rows = [row for row in table if (row["checkpoint"], row["max_sv"]) == ("masked", max_sv)]
-        assert "".join(row["within_range"][:1] or " " for row in rows) == want
-        found = cells["masked", None if max_sv == "base" else float(max_sv)]
-        assert [float(row["psnr"]) for row in rows] == [row["psnr"] for row in found]
+    assert len(table) == 2 * (len(shares) + 8)
+    for max_sv, within in ((1, "TFFF"), (3, "TTTT"), (None, " " * len(shares))):
+        name = f"{max_sv:.1f}" if max_sv else "base"
+        rows = [row for row in table if (row["checkpoint"], row["max_sv"]) == ("masked", name)]
+        assert "".join(row["within_range"][:1] or " " for row in rows) == within
+        wanted = [row["psnr"] for row in cells["masked", max_sv]]
+        assert [float(row["psnr"]) for row in rows] == wanted
     assert Image.open(folder / "robustness.png").size[0] > 2000
-    clod("apply plain.ply robustness/cells/plain_sv3.safetensors -o x.ply")
     scene = load_scene(report["scene"])
     base = load("plain.ply").gaussians
-    shares = experiment.BASELINE_SHARES
-    assert [row["kept"] for row in cells["plain", None]] == [round(300 * share) for share in shares]
+    pruned = cells["plain", None]
+    assert [row["kept"] for row in pruned] == [round(300 * share) for share in shares]
     few = base[base.opacities.argsort(descending=True)[: round(300 * shares[-1])]]
-    assert evaluate(few, scene.test, [1.0])[0].psnr == pytest.approx(
-        cells["plain", None][-1]["psnr"]
-    )
-    (again,) = evaluate(load("x.ply").gaussians, scene.test, [3.0])
-    assert again.psnr == cells["plain", 3][-1]["psnr"]
+    (row,) = evaluate(few, scene.test, [1.0])
+    assert row.psnr == pytest.approx(pruned[-1]["psnr"])
+    clod("apply plain.ply robustness/cells/plain_sv3.safetensors -o x.ply")
+    (row,) = evaluate(load("x.ply").gaussians, scene.test, [3.0])
+    assert row.psnr == cells["plain", 3][-1]["psnr"]
     lines = re.findall(r"^(\w+) \((\d)/6\) training +\d+%, .* left", done.err, re.M)
-    assert list(dict.fromkeys(lines))[0] == ("plain_sv1", "2") and len(set(lines)) == 4
+    assert lines[0] == ("plain_sv1", "2") and len(set(lines)) == 4
 
 
 @pytest.mark.usefixtures("blank_figure")
-def test_interrupted_unfinished_and_changed_cells(
-    run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_interrupted_unfinished_and_changed_cells(run):
     """Finished cells stay; unfinished and changed ones run again. An interrupt of the first one
     writes nothing.
     """
-    folder = tmp_path / "robustness"
-    with monkeypatch.context() as patch:
-        patch.setattr(experiment, "baseline", pressing(experiment.baseline, signal.SIGINT))
+    folder = Path("robustness")
+    with pressed(experiment, "baseline", signal.SIGINT):
         run(code=130)
     assert not folder.exists()
-    with monkeypatch.context() as patch:
-        patch.setattr(
-            experiment, "adapt_at_range", pressing(experiment.adapt_at_range, signal.SIGINT, at=2)
-        )
-        report = (done := run("--json")).report
+    with pressed(experiment, "adapt_at_range", signal.SIGINT, at=2):
+        done = run("--json")
+    report = done.report
     assert report["interrupted"] and "plain_sv3 was not finished" in done.err
     assert [cell["max_sv"] for cell in report["cells"]] == [None, 1]
     assert report["missing"] == ["plain_sv3", "masked_base", "masked_sv1", "masked_sv3"]
     assert all((folder / name).exists() for name in OUTPUTS)
-    finished = (done := run("--json --quiet")).report
-    assert finished["missing"] == [] and finished["cells"][:2] == report["cells"] and done.err == ""
+    done = run("--json --quiet")
+    assert done.report["missing"] == [] and done.report["cells"][:2] == report["cells"]
+    assert done.err == ""
     before = stamps(folder)
     assert len(before) == 10
     (folder / "cells" / "masked_sv1.safetensors").unlink()
@@ -165,9 +156,9 @@ def test_interrupted_unfinished_and_changed_cells(
     # baselines do not depend on the seed
     assert "1 of 6 cells are done already: plain_base" in run("--seed 1").err
     # of a photograph that is trained on
-    Image.new("RGB", (64, 48)).save(tmp_path / "scene" / "images" / "003.png")
-    monkeypatch.setattr(experiment, "baseline", pressing(experiment.baseline, signal.SIGINT))
-    run("--seed 1", code=130)
+    Image.new("RGB", (64, 48)).save("scene/images/003.png")
+    with pressed(experiment, "baseline", signal.SIGINT):
+        run("--seed 1", code=130)
 
 
 PICTURES = {"dial.png", "curve.png"}
@@ -192,12 +183,7 @@ def test_demo(clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.Monke
     monkeypatch.setattr(adapt_run, "LOST", (99.0, 99.0))  # two steps cannot keep full quality
     folder = tmp_path / "-odd"
     state = Path("-odd/gallery.resume.safetensors")
-    with monkeypatch.context() as patch:
-        patch.setattr(
-            listeners,
-            "save_state",
-            pressing(listeners.save_state, signal.SIGINT, signal.SIGTERM, at=2),
-        )
+    with pressed(listeners, "save_state", signal.SIGINT, signal.SIGTERM, at=2):
         clod("demo --out=-odd", code=130)
     with monkeypatch.context() as patch:
         patch.setattr(listeners, "package_version", lambda: "0.0.7")
@@ -216,8 +202,8 @@ def test_demo(clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.Monke
     made = {"capture", "base.ply", "gallery.ply", "gallery.safetensors", "gallery.json"}
     assert {*names(folder)} == made | PICTURES
     # nothing is measured
-    monkeypatch.setattr(pipeline, "extract", pressing(pipeline.extract, signal.SIGINT))
-    done = clod("demo --out=-odd --json")
+    with pressed(pipeline, "extract", signal.SIGINT):
+        done = clod("demo --out=-odd --json")
     assert done.report["pictures"] == {} and "no figures" in done.err
     assert not PICTURES & {*names(folder)}
 

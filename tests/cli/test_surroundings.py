@@ -161,10 +161,9 @@ export dial.ply -o plain.html
 def test_commands_without_posix(capture: Any, tmp_path: Path) -> None:
     """Files that are open are not renamed or removed."""
     paths = {"base.ply": str(capture.ply), "scene": str(capture.scene)}
-    commands = [
-        [*(paths.get(w, w) for w in line.split()), "--quiet"]
-        for line in COMMANDS.strip().splitlines()
-    ]
+    commands = []
+    for line in COMMANDS.strip().splitlines():
+        commands.append([paths.get(word, word) for word in f"{line} --quiet".split()])
     program = Path(__file__).with_name("without_posix.py")
     words = [sys.executable, str(program), json.dumps(commands)]
     done = subprocess.run(

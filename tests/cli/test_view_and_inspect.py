@@ -5,6 +5,7 @@
 import json
 import os
 import re
+import shutil
 import signal
 import socket
 import urllib.request
@@ -40,19 +41,8 @@ def assert_holds(data: bytes, file: Path, folder: Path) -> None:
 def test_serves_until_it_is_interrupted(
     server: Server, capture: Any, dialled: Path, tmp_path: Path
 ) -> None:
-    words = [
-        dialled,
-        "--base",
-        capture.ply,
-        "--images",
-        capture.scene,
-        "--sv",
-        2,
-        "--no-browser",
-        "--json",
-        "--quiet",
-    ]
-    process = server.start(tmp_path, "view", *words)
+    line = f"view {dialled} --base {capture.ply} --images {capture.scene} --sv 2 --no-browser"
+    process = server.start(tmp_path, *line.split(), "--json", "--quiet")
     wait_for(Path(f"{tmp_path}.log"), "\n")
     report = json.loads(log_of(tmp_path))
     assert report["url"] == f"http://127.0.0.1:{report['port']}/" and report["cameras"] == 10
@@ -88,24 +78,18 @@ def test_dial_values_and_files_of_a_page(
         (note,) = [note for note in report["notes"] if said in note]
         assert config["virtual_scale"] == opens and note in capsys.readouterr().err
     (tmp_path / "more").mkdir()
-    for name, file in (
-        ("lod10.ply", dialled),
-        ("lod2.ply", dialled),
-        ("more/lod2.ply", capture.ply),
-    ):
-        (tmp_path / name).write_bytes(file.read_bytes())
+    files = {"lod2.ply": dialled, "lod10.ply": dialled, "more/lod2.ply": capture.ply}
+    for name, file in files.items():
+        shutil.copy(file, tmp_path / name)
     (tmp_path / "points.ply").write_text(
         "ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nend_header\n"
     )
     answers, report, config = page_of(tmp_path, tmp_path / "more" / "lod2.ply")
     entries = [config["model"], *config["others"]]
     folder = tmp_path.name
-    assert [entry["name"] for entry in entries] == [
-        f"{folder}/lod2.ply",
-        f"{folder}/lod10.ply",
-        "more/lod2.ply",
-    ]
-    for entry, file in zip(entries, (dialled, dialled, capture.ply), strict=True):
+    names = f"{folder}/lod2.ply {folder}/lod10.ply more/lod2.ply"
+    assert [entry["name"] for entry in entries] == names.split()
+    for entry, file in zip(entries, files.values(), strict=True):
         assert_holds(b"".join(answers[entry["href"]].blocks()), file, tmp_path)
     assert report["model"].endswith("lod2.ply") and len(report["files"]) == 3
 
@@ -133,59 +117,45 @@ def test_interrupts_and_browsers(clod: Any, monkeypatch: pytest.MonkeyPatch) -> 
     )
 
 
-def test_a_plain_file_fits_on_a_screen(clod: Any, capture: Any) -> None:
+def test_a_plain_file_fits_on_a_screen(clod, capture):
     done = clod("inspect BASE")
     lines = done.out.splitlines()
-    assert len(lines) <= 24 and all(len(line) <= 120 for line in lines[1:]) and done.err == ""
+    assert len(lines) <= 24 and max(map(len, lines[1:])) <= 120 and done.err == ""
     assert lines[0].startswith(f"{capture.ply} (")
     assert lines[2].startswith("looks like   Inria's trainer")
     assert lines[3] == "Gaussians    300" and "dial         none: no sigma_d" in lines
-    at = next(
-        k
-        for k, line in enumerate(lines)
-        if line.split() == ["least", "1", "%", "median", "99", "%", "greatest"]
-    )
-    assert [line.split()[0] for line in lines[at + 1 : at + 6]] == [
-        "x",
-        "y",
-        "z",
-        "scale",
-        "opacity",
-    ]
-    assert len({len(line) for line in lines[at : at + 6]}) == 1
+    titles = ["least", "1", "%", "median", "99", "%", "greatest"]
+    at = next(k for k, line in enumerate(lines) if line.split() == titles)
+    table = lines[at : at + 6]
+    assert [line.split()[0] for line in table[1:]] == ["x", "y", "z", "scale", "opacity"]
+    assert len({len(line) for line in table}) == 1
 
 
-def test_a_dial_and_its_calibration(clod: Any, dialled: Path) -> None:
+def test_a_dial_and_its_calibration(clod, dialled):
     text = clod("inspect DIAL").out
     report = clod("inspect DIAL --json").report
     lines = text.splitlines()
     splat = report["splat"]
-    assert "written by   clod-adapter" in text
+    assert "written by   clod-adapter" in text and len(lines) <= 32
     assert "s = 1 to 4, distances in world units" in text
-    assert len(lines) <= 32
     at = next(k for k, line in enumerate(lines) if "Gaussians" in line and "PSNR" in line)
-    first, *_, last = table = [line.split() for line in lines[at + 1 : at + 8]]
-    assert (first[0], last[0]) == ("1", "4") and all(len(row) == 5 for row in table)
+    table = [line.split() for line in lines[at + 1 : at + 8]]
+    assert table[0][0] == "1" and table[-1][0] == "4" and {len(row) for row in table} == {5}
     assert report["command"] == "inspect" and report["path"] == str(dialled)
     assert report["oddities"] == [] and "anomalies" not in report
     assert splat["count"] == splat["total"] == 540
-    assert splat["columns"][-1] == [
-        "opacity_d",
-        "float32",
-    ]
+    assert splat["columns"][-1] == ["opacity_d", "float32"]
     assert (
-        {"least", "low", "median", "high", "greatest"}
-        == set(splat["sigma"])
+        set(splat["sigma"])
         == set(splat["growth"])
+        == set(["least", "low", "median", "high", "greatest"])
     )
     assert splat["dial"]["attenuation"]["max_sv"] == 4 and len(splat["position"]) == 3
     told = json.loads(dialled.with_suffix(".json").read_text())
     assert splat["dial"]["calibration"] == told["calibration"]
     clod("export DIAL --sv 2 -o x.ply")
-    assert (
-        "\nsays         baked at s = 2 by clod-adapter for 8 training cameras\n"
-        in clod("inspect x.ply").out
-    )
+    comment = "\nsays         baked at s = 2 by clod-adapter for 8 training cameras\n"
+    assert comment in clod("inspect x.ply").out
 
 
 def test_adapter(clod: Any) -> None:

@@ -14,37 +14,16 @@ import sys
 from importlib import import_module
 from importlib.abc import MetaPathFinder
 
-for other in (
-    "filelock",
-    "numba",
-    "plyfile",
-    "pycolmap",
-    "safetensors.torch",
-    "skimage.metrics",
-    "torch",
-    "tqdm",
-):
-    import_module(other)  # these look at sys.platform, and use what Linux has
-ABSENT = (
-    "sched_getaffinity",
-    "sched_setaffinity",
-    "posix_fadvise",
-    "posix_fallocate",
-    "fork",
-    "getuid",
-    "geteuid",
-    "setsid",
-    "killpg",
-    "mkfifo",
-    "fchmod",
-    "chown",
-    "getloadavg",
-    "sysconf",
-    "pread",
-    "pwrite",
-)
-SIGNALS = ("SIGHUP", "SIGUSR1", "SIGUSR2", "SIGXCPU", "SIGKILL", "pthread_sigmask", "setitimer")
-MODULES = ("fcntl", "resource", "termios", "pwd", "grp", "pty", "tty")
+# these look at sys.platform, and use what Linux has
+USED = "filelock numba plyfile pycolmap safetensors.torch skimage.metrics torch tqdm"
+for other in USED.split():
+    import_module(other)
+ABSENT = """
+sched_getaffinity sched_setaffinity posix_fadvise posix_fallocate fork getuid geteuid setsid killpg
+mkfifo fchmod chown getloadavg sysconf pread pwrite
+"""
+SIGNALS = "SIGHUP SIGUSR1 SIGUSR2 SIGXCPU SIGKILL pthread_sigmask setitimer"
+MODULES = ["fcntl", "resource", "termios", "pwd", "grp", "pty", "tty"]
 
 
 class Absent(MetaPathFinder):
@@ -87,7 +66,7 @@ def watch(event, given):
 READ = os.open
 busy = False
 for module, names in ((os, ABSENT), (signal, SIGNALS)):
-    for name in names:
+    for name in names.split():
         delattr(module, name)
 for name in MODULES:
     sys.modules.pop(name, None)

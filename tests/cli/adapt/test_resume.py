@@ -5,6 +5,7 @@ import json
 import math
 import shutil
 import signal
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import reduce
 from pathlib import Path
@@ -26,7 +27,7 @@ from clod_adapter.cli.adapt.listeners import Saver
 from clod_adapter.cli.shared.console import Console
 from clod_adapter.progress import GracefulStop
 from clod_adapter.training.state import KEY
-from runs import OUTPUTS, STATE, change_step, fail, names, pressing, results
+from runs import OUTPUTS, STATE, change_step, fail, names, pressed, results
 from scenes import capture as small_capture
 
 CONFIG = AdaptConfig(iters=3, max_sv=3.0)
@@ -69,19 +70,15 @@ def state(
         return path, pair, load_file(path), json.loads(file.metadata()[KEY])
 
 
-def places(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
+def places(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
     """The paths of all entries of a JSON document, at any depth."""
-    below = (
-        value.items()
-        if isinstance(value, dict)
-        else enumerate(value)
-        if isinstance(value, list)
-        else ()
-    )
-    return [
-        *([path] if path else []),
-        *(place for key, each in below for place in places(each, (*path, key))),
-    ]
+    if path:
+        yield path
+    if isinstance(value, list):
+        value = dict(enumerate(value))
+    if isinstance(value, dict):
+        for key, entry in value.items():
+            yield from places(entry, (*path, key))
 
 
 @settings(max_examples=40, deadline=None)
@@ -98,7 +95,7 @@ def test_damaged_states_are_refused_or_harmless(state: Any, data: Any) -> None:
     how = data.draw(st.sampled_from(["entry", "type", "shape", "value"]))
     changed = tensors[name].clone()
     if how == "entry":
-        *way, last = data.draw(st.sampled_from(places(about)))
+        *way, last = data.draw(st.sampled_from([*places(about)]))
         parent = reduce(lambda above, key: above[key], way, about)
         parent[last] = data.draw(st.sampled_from(VALUES))
         if data.draw(st.booleans()):
@@ -141,12 +138,7 @@ def test_states_of_other_runs_are_refused(
     def refused(message: str, *words: str) -> None:
         assert f"error: {STATE}: {message}" in clod(*words, code=2).err
 
-    with monkeypatch.context() as patch:  # the second save is aborted
-        patch.setattr(
-            listeners,
-            "save_state",
-            pressing(listeners.save_state, signal.SIGINT, signal.SIGTERM, at=2),
-        )
+    with pressed(listeners, "save_state", signal.SIGINT, signal.SIGTERM, at=2):
         clod(ADAPT, code=130)
     state = (tmp_path / STATE).read_bytes()
     capture.write(tmp_path / "other.ply", capture.gaussians.select(torch.arange(300) < 299))

@@ -66,15 +66,9 @@ def test_writes_three_files(adapted: tuple[Path, Any], capture: Any, dialled: Pa
     assert set(report["config"]) == set(AdaptConfig.__dataclass_fields__)
     assert report["config"]["max_sv"] == 4
     assert set(report["machine"]) >= {"cpu", "cores", "python", "torch", "numba"}
-    assert set(report["seconds"]) == {
-        "load",
-        "kernels",
-        "plan",
-        "start",
-        "train",
-        "evaluate",
-        "total",
-    }
+    assert set(report["seconds"]) == set(
+        ["load", "kernels", "plan", "start", "train", "evaluate", "total"]
+    )
     assert [row["virtual_scale"] for row in report["rows"]] == [1, 1.5, 2, 3, 4]
     shares = [row["kept_share"] for row in report["rows"]]
     assert shares == sorted(shares, reverse=True) and 0 < shares[-1] < 0.5
@@ -90,7 +84,6 @@ def test_writes_three_files(adapted: tuple[Path, Any], capture: Any, dialled: Pa
     ):
         assert {**ours, "frame_ms": 0} == {**row.as_dict(), "frame_ms": 0}
     stored = model.calibration
-    assert stored is not None
     assert stored == load_adapter(folder / "dial.safetensors").calibration
     assert stored.as_dict() == report["calibration"] and stored.machine == machine_name()
     for row, measured in zip(stored.rows, report["rows"], strict=True):
@@ -140,30 +133,21 @@ def test_forecast_of_time_and_memory(clod: Any) -> None:
     assert found["bytes"] == pytest.approx(found["actual_bytes"], rel=1 / 3)
 
 
-def test_dial_of_the_checkpoint_is_continued(clod: Any, dialled: Path) -> None:
+def test_dial_of_the_checkpoint_is_continued(clod, dialled):
     """Its growth is dropped with --growth off, which a note says; a dial without growth starts with
     exponents of 0.
     """
+    line = "--images SCENE --device cpu --max-sv 4 --out dial.ply --json --quiet --iters 0"
+    dropped = "sigma_d; its growth_d is dropped, as growth is off"
     for model, more, note, stored in (
         (dialled, "", "sigma_d and growth_d", ["sigma_d", "growth_d", "opacity_d"]),
-        (
-            dialled,
-            "--growth off",
-            "sigma_d; its growth_d is dropped, as growth is off",
-            ["sigma_d", "opacity_d"],
-        ),
+        (dialled, "--growth off", dropped, ["sigma_d", "opacity_d"]),
         ("off.ply", "", "sigma_d", ["sigma_d", "growth_d", "opacity_d"]),
     ):
-        done = clod(
-            model,
-            "--images SCENE --device cpu --max-sv 4 --out dial.ply --json --quiet --iters 0",
-            more,
-        )
+        done = clod(model, line, more)
         noted = f"{model} has a dial already: continuing from its {note}"
-        assert done.err == ""
-        assert noted in done.report["notes"]
-        assert done.report["device"] == "cpu"
-        assert columns(Path("dial.ply"))[-len(stored) :] == stored and rebuilt(clod, model)
+        assert done.err == "" and noted in done.report["notes"] and done.report["device"] == "cpu"
+        assert columns("dial.ply")[-len(stored) :] == stored and rebuilt(clod, model)
         if more:
             assert load_adapter("dial.safetensors").growth_d is None
             shutil.copy("dial.ply", "off.ply")
@@ -205,35 +189,26 @@ def test_without_photographs(clod: Any, tmp_path: Path, monkeypatch: pytest.Monk
     assert "without photographs, against renders of the checkpoint" in note
 
 
-def test_ci_banana(clod: Any, ci_banana: Path) -> None:
+def test_ci_banana(clod, ci_banana):
     """A real capture."""
-    words = (
-        ci_banana / "pretrained.ply",
-        "--images",
-        ci_banana / "images",
-        "--iters 5 --max-sv 3 --out dial.ply --json",
-    )
+    base = ci_banana / "pretrained.ply"
+    words = (base, "--images", ci_banana / "images", "--iters 5 --max-sv 3 --out dial.ply --json")
     report = clod(*words).report
     assert report["base_count"] == 20_000
     assert report["base_rows"][0]["psnr"] == pytest.approx(25.81, abs=0.02)
     assert report["rows"][-1]["kept_share"] < 0.3
 
 
-def test_unusual_inputs(clod: Any, capture: Any, tmp_path: Path) -> None:
+def test_unusual_inputs(clod, capture):
     """Few photographs get pseudo views; invisible Gaussians cannot do without any."""
-    shutil.copytree(capture.scene, tmp_path / "few")
+    shutil.copytree(capture.scene, "few")
     for k in range(1, 5):
-        (tmp_path / "few" / "images" / f"{k:03}.png").unlink()
-    report = clod("BASE --images few --iters 2 --out dial.ply --json").report
-    assert any(
-        "photographs to train on" in note and "8 pseudo views" in note for note in report["notes"]
-    )
-    assert any(
-        "4 of 10 photographs are missing and left out (001.png, " in note
-        for note in report["notes"]
-    )
+        Path(f"few/images/{k:03}.png").unlink()
+    done = clod("BASE --images few --iters 2 --out dial.ply --json")
+    assert "8 pseudo views" in done.note("photographs to train on")
+    assert done.note("4 of 10 photographs are missing and left out (001.png, ")
     logits = torch.full_like(capture.gaussians.opacity_logits, -20.6)
-    capture.write(tmp_path / "none.ply", capture.gaussians.replace(opacity_logits=logits))
+    capture.write("none.ply", capture.gaussians.replace(opacity_logits=logits))
     done = clod("none.ply --out dial.ply --quiet", code=2)
     assert done.err.count("\n") == 1 and "no camera can be placed" in done.err
 
