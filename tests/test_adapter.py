@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -82,26 +83,28 @@ def test_applying_an_adapter_gives_the_result(
         assert ((found - new).abs() <= 2.0**-10 * (new - old).abs() + 1e-6).all()
 
 
-def test_the_type_of_a_difference() -> None:
-    """Differences in float16; new values in float32 where a difference overflows or underflows
-    float16.
-    """
-    for unit, step, dtype in (
+@pytest.mark.parametrize(
+    "unit, step, dtype",
+    [
         (1.0, 0.01, torch.float16),
         (1.0, 1e6, torch.float32),
         (1e-4, 1e-7, torch.float32),
-    ):
-        base = gaussians(50)
-        base = base.replace(means=unit * base.means)
-        adapted = adapt(base, ["means"], step)
-        adapter = extract(base, adapted)
-        assert {name: update.dtype for name, update in adapter.updates.items()} == {"means": dtype}
-        assert (
-            dtype == torch.float16 or bits(adapter.apply(base))["means"] == bits(adapted)["means"]
-        )
+    ],
+)
+def test_the_type_of_a_difference(unit, step, dtype):
+    """Differences in float16; new values in float32 where a difference overflows or underflows
+    float16.
+    """
+    base = gaussians(50)
+    base = base.replace(means=unit * base.means)
+    adapted = adapt(base, ["means"], step)
+    adapter = extract(base, adapted)
+    assert {name: update.dtype for name, update in adapter.updates.items()} == {"means": dtype}
+    if dtype == torch.float32:
+        assert bits(adapter.apply(base))["means"] == bits(adapted)["means"]
 
 
-def test_with_dial_and_detach() -> None:
+def test_with_dial_and_detach():
     """Without sigma_d the dial has no effect and can be removed exactly; with it, its tensor is
     used as it is.
     """
@@ -111,8 +114,7 @@ def test_with_dial_and_detach() -> None:
     chosen = with_dial(base, sigma_d, CONFIG)
     assert on.attenuation == with_dial(base, sigma_d).attenuation == AttenuationConfig()
     assert (on.sigma_d == SIGMA_MAX).all()
-    assert chosen.sigma_d is sigma_d
-    assert chosen.attenuation is CONFIG
+    assert chosen.sigma_d is sigma_d and chosen.attenuation is CONFIG
     grown = with_dial(base, sigma_d, CONFIG, torch.rand(6))
     assert detach(grown) == detach(on) == base and with_dial(grown, sigma_d, CONFIG) == chosen
 
@@ -128,41 +130,34 @@ def test_extracting_ignores_a_dial_of_the_base_and_drops_graphs() -> None:
     assert not any(value.requires_grad for value in fresh.apply(base).tensors().values())
 
 
-def test_other_input_is_refused() -> None:
+def test_other_input_is_refused():
     base = gaussians()
     full = partial(torch.full, (6,))
     adapter = extract(base, adapt(base, ["shN"]))
-    small = extract(gaussians(3), with_dial(gaussians(3)))
-    refused = {
+    infinite = base.replace(sh0=torch.full((6, 1, 3), torch.inf))
+    grown = with_dial(base, full(1.0), growth_d=full(torch.inf))
+    for message, call in {
         "different base.*SHA-256 is bbbb": lambda: adapter.apply(base, "b" * 64),
         "different base.*7 Gaussians, the adapter 6": lambda: adapter.apply(gaussians(7)),
         "different base.*shN": lambda: adapter.apply(gaussians(bands=3)),
         "no sigma_d": lambda: extract(base, base),
         "means is float32": lambda: extract(base, with_dial(gaussians(5))),
         "sigma_d holds .* diverged": lambda: extract(base, with_dial(base, full(torch.nan))),
-        "growth_d holds": lambda: extract(
-            base, with_dial(base, full(1.0), growth_d=full(torch.inf))
-        ),
-        "sh0 holds a new": lambda: extract(
-            base, with_dial(base.replace(sh0=torch.full((6, 1, 3), torch.inf)))
-        ),
-        "'colour'": lambda: replace(small, updates={"colour": torch.ones(3)}),
-    }
-    for message, call in refused.items():
+        "growth_d holds": lambda: extract(base, grown),
+        "sh0 holds a new": lambda: extract(base, with_dial(infinite)),
+        "'colour'": lambda: replace(adapter, updates={"colour": torch.ones(6)}),
+    }.items():
         with rejects(message):
             call()
 
 
-def test_arrays_become_tensors_and_repr_is_short() -> None:
+def test_arrays_become_tensors_and_repr_is_short():
     base = gaussians()
     columns = {"sigma_d": np.ones(6, np.float32), "growth_d": np.zeros(6, np.float32)}
     update = {"means": np.full((6, 3), 0.5, np.float16)}
     adapter = Adapter(**columns, attenuation=CONFIG, updates=update, base_fingerprint="", config={})
     torch.testing.assert_close(adapter.apply(base).means, base.means + 0.5)
-    assert (
-        repr(adapter)
-        == f"Adapter(6 Gaussians, dial to {CONFIG.max_sv:g} with growth, updates of means)"
-    )
+    assert repr(adapter) == "Adapter(6 Gaussians, dial to 5 with growth, updates of means)"
 
 
 STORED = {"steps": 3, "lr": 0.1, "names": ["a", None], "nested": {"b": True}, "ü": "é"}
@@ -187,25 +182,22 @@ def adapter(
     deadline=None, max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 @given(st.integers(0, 20), st.floats(0, 1e30), st.booleans())
-def test_adapter_round_trips(tmp_path: Path, n: int, reference: float, growth: bool) -> None:
-    saved = replace(
-        adapter(n, STORED, reference), growth_d=torch.linspace(-1, 3, n) if growth else None
-    )
-    save_adapter(tmp_path / "a.safetensors", saved)
-    loaded = load_adapter(str(tmp_path / "a.safetensors"))
-    assert (loaded.attenuation, loaded.config, loaded.base_fingerprint) == (
-        saved.attenuation,
-        STORED,
-        "ab" * 32,
-    )
-    assert torch.equal(loaded.sigma_d, saved.sigma_d)
+def test_adapter_round_trips(tmp_path, n, reference, growth):
+    first = tmp_path / "a.safetensors"
+    second = tmp_path / "b.safetensors"
+    growth_d = torch.linspace(-1, 3, n) if growth else None
+    saved = replace(adapter(n, STORED, reference), growth_d=growth_d)
+    save_adapter(first, saved)
+    loaded = load_adapter(str(first))
+    assert loaded.attenuation == saved.attenuation and loaded.config == STORED
+    assert loaded.base_fingerprint == "ab" * 32 and torch.equal(loaded.sigma_d, saved.sigma_d)
+    assert torch.equal(loaded.growth_d, growth_d) if growth else loaded.growth_d is None
     assert loaded.updates.keys() == saved.updates.keys()
-    assert torch.equal(loaded.growth_d, saved.growth_d) if growth else loaded.growth_d is None
     for name, update in saved.updates.items():
-        assert loaded.updates[name].dtype == update.dtype
-        assert torch.equal(loaded.updates[name], update)
-    save_adapter(tmp_path / "b.safetensors", loaded)
-    assert (tmp_path / "a.safetensors").read_bytes() == (tmp_path / "b.safetensors").read_bytes()
+        again = loaded.updates[name]
+        assert again.dtype == update.dtype and torch.equal(again, update)
+    save_adapter(second, loaded)
+    assert first.read_bytes() == second.read_bytes()
 
 
 def test_tensor_files_are_safetensors(tmp_path: Path) -> None:

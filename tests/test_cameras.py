@@ -39,6 +39,7 @@ def changed(matrix: torch.Tensor, row: int, column: int, value: float) -> torch.
         ({"K": changed(K, 0, 0, 0.0)}, "a focal length that is not positive"),
         ({"K": changed(K, 0, 1, 3.0)}, "a K with skew"),
         ({"K": changed(K, 2, 2, 2.0)}, "a K with skew, or whose last row is not 0, 0, 1"),
+        ({"width": 0, "name": "x.png"}, r"camera 'x\.png' has size 0x48"),
     ],
 )
 def test_what_is_no_pinhole_is_refused(given: dict[str, Any], message: str) -> None:

@@ -74,15 +74,10 @@ def test_every_field_has_help_and_a_default(kind: type) -> None:
         kind(0.5)
 
 
-def test_the_papers_form() -> None:
+def test_the_papers_form():
     paper = AdaptConfig.paper(max_sv=7, reg_weight=0.0)
-    assert (paper.form, paper.max_sv, paper.iters, paper.lr_sigma, paper.reg_weight) == (
-        "paper",
-        7,
-        1600,
-        1e-2,
-        0,
-    )
+    assert paper.form == "paper" and paper.max_sv == 7 and paper.iters == 1600
+    assert paper.lr_sigma == 1e-2 and paper.reg_weight == 0
 
 
 number = st.floats(-1e6, 1e6, allow_nan=False)
@@ -94,16 +89,21 @@ rows = st.lists(
 
 @st.composite
 def tables(draw: st.DrawFn) -> Calibration:
-    found = {
-        values[0]: values
-        for values in [(1.0, *draw(st.tuples(number, number, number)), 2.5), *draw(rows)]
-    }
-    machine = draw(st.text(min_size=1, max_size=40))
-    against = draw(st.sampled_from(["photographs", "checkpoint"]))
-    some = [Row(s, psnr, ssim, kept, 0.5, 1.0, ms) for s, kept, psnr, ssim, ms in found.values()]
-    places = draw(st.lists(st.builds(Viewpoint, number, number, number, positive), max_size=3))
-    about = {"total": 4, "views": 13, "size": (640, 480), "machine": machine, "against": against}
-    return Calibration.of(some, **about, viewpoints=places)
+    values = [(1.0, *draw(st.tuples(number, number, number)), 2.5), *draw(rows)]
+    measured = []
+    for s, kept, psnr, ssim, ms in {row[0]: row for row in values}.values():
+        measured.append(Row(s, psnr, ssim, kept, 0.5, 1.0, ms))
+    return Calibration.of(
+        measured,
+        total=4,
+        views=13,
+        size=(640, 480),
+        machine=draw(st.text(min_size=1, max_size=40)),
+        against=draw(st.sampled_from(["photographs", "checkpoint"])),
+        viewpoints=draw(
+            st.lists(st.builds(Viewpoint, number, number, number, positive), max_size=3)
+        ),
+    )
 
 
 @settings(
@@ -123,16 +123,13 @@ def test_round_trips(tmp_path: Path, calibration: Calibration) -> None:
     assert header.isascii() and max(map(len, header.splitlines())) < 200
 
 
-def test_rows_of_an_evaluation() -> None:
-    some = [Row(s, 30 - s, 0.9, 100 / s, 1 / s, 50 / s, 10 / s) for s in (2.0, 1.0)]
-    found = Calibration.of(
-        some, total=100, views=3, size=(64, 48), machine=" AMD\tRyzen\u2122  9\n"
-    )
-    assert found.rows == (
-        CalibrationRow(1.0, 100.0, 29.0, 0.9, 10.0),
-        CalibrationRow(2.0, 50.0, 28.0, 0.9, 5.0),
-    )
-    assert (found.machine, found.width, found.height) == ("AMD Ryzen? 9", 64, 48)
+def test_rows_of_an_evaluation():
+    rows = [Row(s, 30 - s, 0.9, 100 / s, 1 / s, 50 / s, 10 / s) for s in (2.0, 1.0)]
+    machine = " AMD\tRyzen\u2122  9\n"
+    table = Calibration.of(rows, total=100, views=3, size=(64, 48), machine=machine)
+    near = CalibrationRow(1.0, 100.0, 29.0, 0.9, 10.0)
+    assert table.rows == (near, CalibrationRow(2.0, 50.0, 28.0, 0.9, 5.0))
+    assert table.machine == "AMD Ryzen? 9" and table.width == 64 and table.height == 48
 
 
 ROW = CalibrationRow(1.0, 10.0, 30.0, 0.9, 5.0)
@@ -173,19 +170,18 @@ def test_bad_values_are_refused(good: Any, bad: dict[str, Any], said: str) -> No
         replace(good, **bad)
 
 
-def test_stored_viewpoints_are_cameras_again(tmp_path: Path) -> None:
+def test_stored_viewpoints_are_cameras_again(tmp_path):
+    path = tmp_path / "a.ply"
     cameras = ring(3, 40, 30)
     dialled = with_dial(gaussians(4, 0, 0), torch.ones(4))
-    viewpoints = tuple(
-        viewpoint_of(camera, torch.randn(50, 3), AttenuationConfig()) for camera in cameras
-    )
-    for places in (viewpoints, (Viewpoint(1.5, 2.5, 3.5, 4.5),)):
-        save(tmp_path / "a.ply", dialled, calibration=Calibration(**GOOD, viewpoints=places))
-        stored = load(tmp_path / "a.ply")
-        assert stored.viewpoints == places
-        assert len(stored.cameras) == len(places) - (len(places) == 1)
-        for camera, found in zip(cameras, stored.cameras, strict=False):
-            assert torch.allclose(found.viewmat, camera.viewmat, atol=1e-5)
-            assert float(found.K[1, 1]) / found.height == pytest.approx(
-                float(camera.K[1, 1]) / 30, rel=1e-5
-            )
+    points = torch.randn(50, 3)
+    viewpoints = tuple(viewpoint_of(camera, points, AttenuationConfig()) for camera in cameras)
+    # one without a direction is no camera
+    for places, count in ((viewpoints, 3), ((Viewpoint(1.5, 2.5, 3.5, 4.5),), 0)):
+        save(path, dialled, calibration=Calibration(**GOOD, viewpoints=places))
+        stored = load(path)
+        assert stored.viewpoints == places and len(stored.cameras) == count
+        for camera, again in zip(cameras, stored.cameras, strict=False):
+            assert torch.allclose(again.viewmat, camera.viewmat, atol=1e-5)
+            focal = float(camera.K[1, 1]) / 30
+            assert float(again.K[1, 1]) / again.height == pytest.approx(focal, rel=1e-5)

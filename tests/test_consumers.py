@@ -6,6 +6,7 @@ simulated one (``fake_gpu``).
 import importlib
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from itertools import chain
 from typing import Any
 
 import pytest
@@ -55,7 +56,7 @@ def rendering(model: Gaussians) -> list[Any]:
 
 def evaluation(model: Gaussians) -> list[Any]:
     rows = evaluate(model, views_of(model), [1.0, DIAL])
-    return [value for row in rows for value in (row.psnr, row.ssim, row.kept, row.in_view)]
+    return list(chain(*((row.psnr, row.ssim, row.kept, row.in_view) for row in rows)))
 
 
 def objective(config: AdaptConfig) -> Callable[[Gaussians], list[Any]]:
@@ -68,13 +69,11 @@ def objective(config: AdaptConfig) -> Callable[[Gaussians], list[Any]]:
 
 
 def papers_objective(model: Gaussians) -> list[Any]:
-    assert model.attenuation is not None
     paper = model.replace(growth_d=None, attenuation=replace(model.attenuation, form="paper"))
     return objective(AdaptConfig.paper(max_sv=4.0))(paper)
 
 
 def objective_of_far_ones(model: Gaussians) -> list[Any]:
-    assert model.attenuation is not None
     far = model.replace(attenuation=replace(model.attenuation, near_distance=5.0))
     return objective(CONFIG)(with_near(detach(model), far))
 
@@ -123,29 +122,27 @@ def same(these: list[Any], those: list[Any]) -> bool:
 
 def agree(these: list[Any], those: list[Any], within: float) -> bool:
     """To this share of each result."""
-    pairs = zip(these, those, strict=True)
-    found = ([torch.as_tensor(each).cpu().double() for each in pair] for pair in pairs)
-    return all(float((a - b).norm()) <= within * float(b.norm()) + 1e-6 for a, b in found)
+    for pair in zip(these, those, strict=True):
+        a, b = (torch.as_tensor(value).cpu().double() for value in pair)
+        if (a - b).norm() > within * b.norm() + 1e-6:
+            return False
+    return True
 
 
 @pytest.mark.parametrize("name", CONSUMERS)
-def test_everything_follows_sigma_d_in_its_unit(name: str) -> None:
+def test_everything_follows_sigma_d_in_its_unit(name):
     """Reaches of other Gaussians change the result; the same ones in another unit do not, to
     rounding.
     """
     consumer = CONSUMERS[name]
     model = model_of()
     before = consumer(model)
-    assert model.sigma_d is not None
     assert not same(consumer(model.replace(sigma_d=model.sigma_d.flip(0))), before)
     assert agree(consumer(in_world_units(model)), before, 1e-4)
 
 
 # Growth is no part of the culling rule.
-WITHOUT_GROWTH = {
-    "order_by_extinction",
-    *(name for name in CONSUMERS if name.startswith("dial_for")),
-}
+WITHOUT_GROWTH = {"order_by_extinction", *(name for name in CONSUMERS if "dial_for" in name)}
 
 
 @pytest.mark.parametrize("name", CONSUMERS)
@@ -219,20 +216,17 @@ def test_results_are_there_and_those_of_the_cpu(
     assert agree(found, RUNS[name](there.cpu()), 2e-2)
 
 
-def test_training_stays_there(there: Gaussians, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_training_stays_there(there, monkeypatch):
     """By a plan, whose left-out parts are restored."""
     plain = detach(there)
-    views = views_of(there)[:1]
-    scene = Scene(views, ())
+    scene = Scene(views_of(there)[:1], ())
     plan = make_plan(plain, scene, SHORT)
-    whole = plan.adapt(scene).gaussians
-    assert not torch.equal(whole.means.cpu(), plan.start.means.cpu())
-    assert all(
-        x.device == plain.means.device and bool(x.isfinite().all())
-        for x in whole.tensors().values()
-    )
+    trained = plan.adapt(scene).gaussians
+    assert not torch.equal(trained.means.cpu(), plan.start.means.cpu())
+    assert trained.whole == len(plain)
+    for values in trained.tensors().values():
+        assert values.device == plain.means.device and bool(values.isfinite().all())
     monkeypatch.setattr(importlib.import_module("clod_adapter.evaluation.frame_times"), "PASSES", 2)
-    assert whole.whole == len(plain)
     assert all(taken > 0 for _, taken in frame_times(there, CAMERAS[:1])[0])
 
 

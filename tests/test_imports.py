@@ -54,7 +54,9 @@ ORDER = [
     {"cli.main"},
     {"__main__"},
 ]
-LEVELS = {unit: level for level, units in enumerate(ORDER) for unit in units}
+LEVELS = {}
+for level, units in enumerate(ORDER):
+    LEVELS |= dict.fromkeys(units, level)
 SOURCES = sorted([*(ROOT / PACKAGE).rglob("*.py"), *(ROOT / "cli").rglob("*.py")])
 
 
@@ -95,21 +97,21 @@ def imports_of(path: Path) -> dict[str, int]:
     }
 
 
-def test_imports_fall() -> None:
+def test_imports_fall():
     """No file imports itself by way of others. Its package, whose __init__ runs first, does not
     import it back.
     """
     wrong = []
     graph = {}
     for path in SOURCES:
-        own = module_of(path)
-        found = imports_of(path)
-        graph[own] = found.keys() - {own}
-        for target, line in found.items():
-            if unit_of(target) != unit_of(own) and LEVELS[unit_of(target)] >= LEVELS[unit_of(own)]:
-                wrong.append(
-                    f"{path.relative_to(ROOT)}:{line} imports {target}, which is not below it"
-                )
+        module = module_of(path)
+        unit = unit_of(module)
+        imports = imports_of(path)
+        graph[module] = imports.keys() - {module}
+        for target, line in imports.items():
+            if unit_of(target) != unit and LEVELS[unit_of(target)] >= LEVELS[unit]:
+                place = f"{path.relative_to(ROOT)}:{line}"
+                wrong.append(f"{place} imports {target}, which is not below it")
     assert not wrong, "\n".join(wrong)
     TopologicalSorter(graph).prepare()  # raises CycleError
 
@@ -160,43 +162,31 @@ assert not hasattr(clod, "nonsense")
 """
 
 
-def test_imports_are_light_and_on_first_use() -> None:
+def test_imports_are_light_and_on_first_use():
     """Hook and drop-ins need torch and numpy alone; functions stay functions beside submodules of
     the same name.
     """
-    done = subprocess.run(
-        [sys.executable, "-c", STEPS], cwd=ROOT, capture_output=True, text=True, check=False
-    )
+    words = [sys.executable, "-c", STEPS]
+    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
 
 
-def test_every_package_is_installed() -> None:
-    listed = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"]["setuptools"][
-        "packages"
-    ]
-    folders = {
-        f"{PACKAGE}.{module_of(path)}".rstrip(".") for path in SOURCES if path.name == "__init__.py"
-    }
-    assert set(listed) == folders, "list the package in pyproject.toml, [tool.setuptools] packages"
-    homeless = [
-        str(p.relative_to(ROOT)) for p in SOURCES if not (p.parent / "__init__.py").exists()
-    ]
+def test_every_package_is_installed():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
+    packages = {path.parent for path in SOURCES if path.name == "__init__.py"}
+    folders = {f"{PACKAGE}.{module_of(path / '__init__.py')}".rstrip(".") for path in packages}
+    listed = set(project["tool"]["setuptools"]["packages"])
+    assert listed == folders, "list the package in pyproject.toml, [tool.setuptools] packages"
+    homeless = [str(path.relative_to(ROOT)) for path in SOURCES if path.parent not in packages]
     assert not homeless, f"in a folder without __init__.py: {homeless}"
 
 
-def test_no_machine_paths() -> None:
+def test_no_machine_paths():
     if shutil.which("git") is None or not (ROOT / ".git").exists():
         pytest.skip("not a git checkout, so there is no list of tracked files")
     listing = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
-    files = (
-        subprocess.run(listing, cwd=ROOT, capture_output=True, check=True)
-        .stdout.decode()
-        .split("\0")
-    )
+    names = subprocess.run(listing, cwd=ROOT, capture_output=True, check=True).stdout.decode()
+    files = [ROOT / name for name in names.split("\0") if (ROOT / name).is_file()]
     pattern = re.compile(rb"(?<![\w./~-])/(?:work|root)/")
-    found = [
-        name
-        for name in files
-        if name and (ROOT / name).is_file() and pattern.search((ROOT / name).read_bytes())
-    ]
-    assert not found, f"absolute paths of somebody's machine in {found}"
+    naming = [path for path in files if pattern.search(path.read_bytes())]
+    assert not naming, f"absolute paths of somebody's machine in {naming}"

@@ -8,7 +8,6 @@ import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -40,35 +39,29 @@ CONFIG = AttenuationConfig(scene_distance=3.0)
 
 
 @pytest.mark.filterwarnings("ignore:virtual_scale")
-def test_a_disabled_adapter_is_the_base() -> None:
+def test_a_disabled_adapter_is_the_base():
     """Bit for bit: without a dial at any s, and with a dial without decay at s = 1."""
     base = gaussians(300, 1, 0)
     view = camera()
     want = render(base, view)
     assert want.image.abs().sum() > 0 and want.kept.all()
-    for found in (
+    for rendering in (
         render(detach(with_dial(base, torch.ones(300), CONFIG)), view, 3.0),
         *(render(with_dial(base, attenuation=config), view) for config in (None, CONFIG)),
         *(render(base, view, s) for s in (1.0, 2.0, 7.0)),
     ):
-        assert all(
-            torch.equal(getattr(found, name), getattr(want, name))
-            for name in ("image", "alpha", "kept")
-        )
+        for name in ("image", "alpha", "kept"):
+            assert torch.equal(getattr(rendering, name), getattr(want, name))
 
 
 @pytest.mark.filterwarnings("ignore:virtual_scale")
-def test_rendering_no_gaussians() -> None:
+def test_rendering_no_gaussians():
     none = gaussians(0, 1, 0)
-    for some in (
-        none,
-        with_dial(none),
-        with_dial(none, attenuation=AttenuationConfig(form="paper")),
-    ):
-        rendering = render(some, camera(), 2.0)
+    of_paper = with_dial(none, attenuation=AttenuationConfig(form="paper"))
+    for model in (none, with_dial(none), of_paper):
+        rendering = render(model, camera(), 2.0)
         assert rendering.kept.shape == (0,)
-        assert (rendering.image == 0).all()
-        assert (rendering.alpha == 0).all()
+        assert not rendering.image.any() and not rendering.alpha.any()
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -121,28 +114,25 @@ def test_baked_image_matches_render_from_its_camera(form: str) -> None:
     assert_close(render(baked, camera()).image, want.image, atol=2e-5, rtol=0)
 
 
-def test_several_cameras_share_one_distance_per_gaussian() -> None:
-    some = spread()
+def test_several_cameras_share_one_distance_per_gaussian():
+    model = spread()
     cameras = ring(3, 61, 45)
     s = 3.0
-    assert some.sigma_d is not None and some.attenuation is not None
-    d = (
-        torch.stack([normalized_distances(some.means, each, WORLD).log() for each in cameras])
-        .mean(0)
-        .exp()
-    )
-    given = (some.opacity_logits, some.sigma_d, d)
-    kept, shown, grown = (
-        attenuate(*given, x, some.attenuation, growth_d=some.growth_d) for x in (s, s**0.75, s**0.9)
-    )
-    baked = bake(some, s, cameras=cameras)
-    assert torch.equal(baked.means, some.means[kept.keep]) and 0 < len(baked) < 300
-    assert_close(baked.opacities, shown.drawn[kept.keep], atol=1e-6, rtol=1e-5)
-    assert_close(
-        baked.scales, (some.scales * grown.growth[:, None])[kept.keep], atol=1e-6, rtol=1e-5
-    )
-    places = [viewpoint_of(each, some.means, WORLD) for each in cameras]
-    assert torch.equal(bake(some, s, cameras=places).means, baked.means)
+    logs = [normalized_distances(model.means, camera, WORLD).log() for camera in cameras]
+    d = torch.stack(logs).mean(0).exp()
+
+    def at(s):
+        given = (model.opacity_logits, model.sigma_d, d, s, model.attenuation)
+        return attenuate(*given, growth_d=model.growth_d)
+
+    keep = at(s).keep
+    baked = bake(model, s, cameras=cameras)
+    assert torch.equal(baked.means, model.means[keep]) and 0 < len(baked) < 300
+    assert_close(baked.opacities, at(s**0.75).drawn[keep], atol=1e-6, rtol=1e-5)
+    scales = model.scales * at(s**0.9).growth[:, None]
+    assert_close(baked.scales, scales[keep], atol=1e-6, rtol=1e-5)
+    places = [viewpoint_of(camera, model.means, WORLD) for camera in cameras]
+    assert torch.equal(bake(model, s, cameras=places).means, baked.means)
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -249,18 +239,15 @@ def test_a_dial_value_without_a_dial_is_warned_of(draws: dict[str, Drawing], nam
         draws[name]()
 
 
+GROWTH = "growth_d needs sigma_d and attenuation"
+
+
 @pytest.mark.parametrize("name", ["gsplat", "inria"])
 @pytest.mark.parametrize(
     "given, message",
     [
-        (
-            {"growth_d": MODEL.growth_d, "sigma_d": MODEL.sigma_d},
-            "growth_d needs sigma_d and attenuation",
-        ),
-        (
-            {"growth_d": MODEL.growth_d, "attenuation": DEFAULTS},
-            "growth_d needs sigma_d and attenuation",
-        ),
+        ({"growth_d": MODEL.growth_d, "sigma_d": MODEL.sigma_d}, GROWTH),
+        ({"growth_d": MODEL.growth_d, "attenuation": DEFAULTS}, GROWTH),
         ({"virtual_scale": -1}, "virtual_scale is -1, it must be a finite number of at least 0"),
         (
             {"sigma_d": MODEL.sigma_d, "opacities": WHOLE},
@@ -269,9 +256,7 @@ def test_a_dial_value_without_a_dial_is_warned_of(draws: dict[str, Drawing], nam
         ({"sigma_d": WHOLE}, "sigma_d is torch.int64, it must be floating point"),
     ],
 )
-def test_drop_ins_refuse(
-    draws: dict[str, Drawing], name: str, given: dict[str, Any], message: str
-) -> None:
+def test_drop_ins_refuse(draws, name, given, message):
     with rejects(message):
         draws[name](**given)
 
@@ -281,7 +266,7 @@ def test_drop_ins_refuse(
     [
         (
             lambda: MODEL.replace(means=MODEL.means.long()),
-            "Gaussians.means is torch.int64, it must be floating point",
+            "Gaussians.means is torch.int64, it must",
         ),
         (lambda: MODEL.replace(opacity_logits=WHOLE), "Gaussians.opacity_logits is torch.int64"),
         (lambda: HOOK(MODEL.means, WHOLE, VIEW.viewmat), "opacities is torch.int64"),
@@ -289,21 +274,23 @@ def test_drop_ins_refuse(
             lambda: HOOK(MODEL.means.long().numpy(), MODEL.opacities.numpy(), VIEW.viewmat),
             "means is torch.int64",
         ),
-        *(
-            (partial(save, name, MODEL), f"{name}: {message}")
-            for name, message in (
-                ("x.foo", ".foo is no format to write; choose one of .ply, .glb, "),
-                ("x", "no suffix is no format"),
-                ("x.ksplat", ".ksplat is no format"),
-                ("x.sog", "is written by clod-adapt export alone: save a .ply"),
-            )
-        ),
     ],
 )
-def test_calls_are_refused(
-    call: Callable[[], Any], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_calls_are_refused(call, message):
     with rejects(message):
         call()
+
+
+@pytest.mark.parametrize(
+    "name, message",
+    [
+        ("x.foo", ".foo is no format to write; choose one of .ply, .glb, "),
+        ("x", "no suffix is no format"),
+        ("x.ksplat", ".ksplat is no format"),
+        ("x.sog", "is written by clod-adapt export alone: save a .ply"),
+    ],
+)
+def test_files_that_save_does_not_write(name, message, tmp_path):
+    with rejects(f"{name}: {message}"):
+        save(tmp_path / name, MODEL)
     assert not list(tmp_path.iterdir())
