@@ -174,6 +174,11 @@ def rejects(message: str) -> Any:
     return pytest.raises(ClodError, match=message)
 
 
+def counted(steps: list[tuple[int, int]]) -> Callable[[Progress], None]:
+    """A progress callback that notes how much is done, of how much."""
+    return lambda now: steps.append((now.done, now.total))
+
+
 def names(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
 

@@ -14,7 +14,8 @@ level, and what is not drawn behind the end of a pixel, in either picture, T_MIN
 
 import dataclasses
 import math
-from itertools import product
+from functools import partial
+from itertools import pairwise, product
 
 import numpy as np
 import pytest
@@ -29,6 +30,7 @@ from clod_adapter.evaluation.popping import dial_popping, path, path_popping, sw
 from clod_adapter.gaussians import SH_C0
 from clod_adapter.rasterizers import for_device
 from clod_adapter.rasterizers.protocol import T_MIN
+from runs import counted
 from scenes import gaussians, ring, seeded
 
 
@@ -40,45 +42,38 @@ def dialled() -> Gaussians:
     return with_dial(gaussians(200, 1, 0, size=0.2), reaches, AttenuationConfig(scene_distance=4.0))
 
 
-def test_popping_of_a_fade_and_of_a_switch() -> None:
+def test_popping_of_a_fade_and_of_a_switch():
     """Grey rising by 1/100 a step on one of two pixels; and black that becomes grey 1/2 in one
     step.
     """
     positions = [k / 10 for k in range(11)]
+    about = partial(pytest.approx, rel=1e-4)
     fade = sweep(lambda _, j: torch.tensor([[[j / 100] * 3, [0.0] * 3]]), positions)
-    assert fade.steps == 10 and fade.mean == pytest.approx(2.55 / math.sqrt(2), rel=1e-4)
-    assert fade.ratio == pytest.approx(1, abs=1e-4)
-    assert fade.persistence == pytest.approx(0.5, abs=1e-4)
-    assert fade.pixel == pytest.approx(2.55, rel=1e-4)
-    assert fade.pixel_persistence == pytest.approx(0.5, abs=1e-4)
+    assert fade.steps == 10 and fade.mean == about(2.55 / math.sqrt(2))
+    assert fade.ratio == about(1) and fade.persistence == about(0.5)
+    assert fade.pixel == about(2.55) and fade.pixel_persistence == about(0.5)
     switch = sweep(lambda _, j: torch.full((1, 2, 3), 0.5 * (j >= 4)), positions)
     assert switch.largest == switch.pixel == 127.5 and switch.at == switch.pixel_at == 0.4
     assert switch.ratio == pytest.approx(10) and switch.persistence == switch.pixel_persistence == 1
     assert list(switch.changes) == [0, 0, 0, 127.5, *[0] * 6]
     # There and back at every step: over two steps nothing is left, which must not make it a fade.
     flicker = sweep(lambda _, j: torch.full((1, 1, 3), 0.2 * (j % 2)), [0, 1, 2, 3])
-    assert flicker.ratio == pytest.approx(1)
-    assert flicker.persistence == flicker.pixel_persistence == 1
+    assert flicker.ratio == about(1) and flicker.persistence == flicker.pixel_persistence == 1
     both = sweep(lambda _, j: torch.full((1, 1, 3), 0.01 * j + 0.2 * (j >= 4)), positions)
     # the jump alone
-    assert both.pixel * (2 - 1 / both.pixel_persistence) == pytest.approx(0.2 * 255, rel=1e-4)
+    assert both.pixel * (2 - 1 / both.pixel_persistence) == about(0.2 * 255)
     white = sweep(lambda _, j: torch.full((1, 1, 3), 1.0 + j), [0, 1, 2])  # nothing is brighter
     assert white.largest == white.pixel == 0 and math.isnan(white.ratio)
 
 
-def test_dial_sweep_measures_its_renders() -> None:
-    some = dialled()
+def test_dial_sweep_measures_its_renders():
+    model = dialled()
     camera = ring(3, 32, 24)[1]
-    seen = []
-    result = dial_popping(
-        some, camera, 3.0, steps=4, progress=lambda now: seen.append((now.done, now.total))
-    )
-    images = [render(some, camera, 3 ** (k / 4)).image.clamp(0, 1) for k in range(5)]
-    want = [
-        255 * float((b - a).square().mean().sqrt())
-        for a, b in zip(images[:-1], images[1:], strict=True)
-    ]
-    assert result.changes == pytest.approx(want) and seen == [(k, 4) for k in range(1, 5)]
+    steps = []
+    result = dial_popping(model, camera, 3.0, steps=4, progress=counted(steps))
+    images = [render(model, camera, 3 ** (k / 4)).image.clamp(0, 1) for k in range(5)]
+    want = [255 * float((b - a).square().mean().sqrt()) for a, b in pairwise(images)]
+    assert result.changes == pytest.approx(want) and steps == [(k, 4) for k in range(1, 5)]
     assert result.at == pytest.approx(3 ** ((want.index(max(want)) + 1) / 4))
 
 
@@ -177,10 +172,11 @@ def lines_of_sight(seed: int) -> tuple[Gaussians, Camera]:
                 [x, y, depth, opacity, depth * reach, random.integers(2), random.uniform(-1, 1)]
             )
     rows[:2] = [[-44, -32, 2, 0.93, 6.6, 0, 0], [-44, -32, 3, 0.9997, SIGMA_MAX, 1, 0]]
-    x, y, depths, opacities, reaches, white, growth_d = torch.tensor(
-        np.array(rows), dtype=torch.float32
-    ).unbind(1)
-    means = torch.stack([x / 100, y / 100, torch.ones_like(x)], 1) * depths[:, None]
+    xy, columns = torch.tensor(np.array(rows), dtype=torch.float32).split((2, 5), dim=1)
+    row_columns = columns.unbind(1)
+    depths, opacities, reaches = row_columns[:3]
+    white, growth_d = row_columns[3:]
+    means = torch.cat([xy / 100, torch.ones(len(rows), 1)], 1) * depths[:, None]
     some = gaussians(len(rows), 0, 0).replace(
         means=means,
         log_scales=(0.005 * depths).log()[:, None].repeat(1, 3),

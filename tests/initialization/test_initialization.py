@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from clod_adapter import AdaptConfig, AttenuationConfig, Gaussians, View
+from clod_adapter.adapter import with_dial
 from clod_adapter.equation.attenuation import dial
 from clod_adapter.equation.distances import typical_distance
 from clod_adapter.gaussians import SH_C0
@@ -23,7 +24,7 @@ from clod_adapter.initialization.pruning_order import (
     SHARE,
 )
 from clod_adapter.render import splat
-from runs import rejects
+from runs import counted, rejects
 from scenes import gaussians, photograph, ring, seeded
 
 REVERSED = torch.diag(torch.tensor([-1.0, 1, -1, 1]))  # looks the other way
@@ -85,7 +86,7 @@ def dialled(n: int, **settings: float) -> tuple[Gaussians, tuple[View, ...]]:
 
 
 def distances_of(some: Gaussians, views: tuple[View, ...]) -> Tensor:
-    assert some.attenuation is not None
+
     return typical_distance(some.means, [view.camera for view in views], some.attenuation)
 
 
@@ -104,7 +105,7 @@ def test_kept_shares_follow_the_target_curve(share: float, exponent: float, n: i
 def test_initialization_culls_in_the_pruning_order() -> None:
     """In which one that a neighbour replaces goes earlier than by its removal error alone."""
     some, views = dialled(200)
-    assert some.sigma_d is not None
+
     error = removal_error(some, views, seed=0)
     found = (some.sigma_d / distances_of(some, views)).argsort()
     order = pruning.pruning_order(some, error.sqrt() * some.opacities).position
@@ -139,12 +140,10 @@ def plainly(some: Gaussians, worth: Tensor) -> list[int]:
             )
             heirs[i] = min(near[:NEIGHBOURS], key=lambda j: unlike(i, j))
         ranked = sorted(left, key=lambda i: worths[i] * unlike(i, heirs[i]))
-        leaving = [
-            i
-            for i in ranked[: max(int(REMOVED * len(left)), 1)]
-            if ranked.index(heirs[i]) > ranked.index(i)
-        ]
-        leaving = [i for i in leaving if i not in [heirs[j] for j in leaving]]
+        first = ranked[: max(int(REMOVED * len(left)), 1)]
+        leaving = [i for i in first if ranked.index(heirs[i]) > ranked.index(i)]
+        inheriting = {heirs[i] for i in leaving}
+        leaving = [i for i in leaving if i not in inheriting]
         for i in leaving:
             worths[heirs[i]] += worths[i]
         order += leaving
@@ -153,57 +152,48 @@ def plainly(some: Gaussians, worth: Tensor) -> list[int]:
 
 
 @pytest.mark.parametrize("n, seed", [(0, 0), (1, 0), (2, 0), (60, 1)])
-def test_order_matches_the_plain_implementation(n: int, seed: int) -> None:
-    some = gaussians(n, 1, seed)
-    seen = []
+def test_order_matches_the_plain_implementation(n, seed):
+    model = gaussians(n, 1, seed)
+    steps = []
     worth = torch.rand(n, generator=seeded(seed))
-    order = pruning.pruning_order(
-        some, worth, lambda now: seen.append((now.done, now.total))
-    ).position
-    assert order.argsort().tolist() == plainly(some, worth), f"n {n}, seed {seed}"
-    assert n < 60 or (seen == sorted(seen) and 0 < seen[0][0] < 30 and seen[-1] == (60, 60))
+    order = pruning.pruning_order(model, worth, counted(steps)).position
+    assert order.argsort().tolist() == plainly(model, worth)
+    assert n < 60 or (steps == sorted(steps) and 0 < steps[0][0] < 30 and steps[-1] == (60, 60))
 
 
-def test_coincident_gaussians_are_moved_apart() -> None:
+def test_coincident_gaussians_are_moved_apart():
     """A k-d tree cannot separate coincident points and would compare all pairs."""
-    some = gaussians(2000, 0, 0)
-    seen = []
-    alike = some.replace(means=torch.zeros(2000, 3), sh0=torch.zeros(2000, 1, 3))
+    model = gaussians(2000, 0, 0)
+    alike = model.replace(means=torch.zeros(2000, 3), sh0=torch.zeros(2000, 1, 3))
     # Of no worth and no size at all: ties, and nothing to divide by.
     for one in (alike, alike.replace(log_scales=torch.full((2000, 3), -400.0))):
-        seen.clear()
-        order = pruning.pruning_order(
-            one, torch.zeros(2000), lambda now: seen.append((now.done, now.total))
-        ).position
-        assert order.sort().values.equal(torch.arange(2000)) and len(seen) < 300
+        steps = []
+        order = pruning.pruning_order(one, torch.zeros(2000), counted(steps)).position
+        assert order.sort().values.equal(torch.arange(2000)) and len(steps) < 300
 
 
 MAX_SV = 5.0
 
 
-def test_exponents_are_in_range_and_0_without_descendants() -> None:
-    some = gaussians(400, 0, 0)
+def test_exponents_are_in_range_and_0_without_descendants():
+    model = gaussians(400, 0, 0)
     d = torch.full((400,), 0.9)
-    order = pruning.pruning_order(some, torch.rand(400, generator=seeded(0)))
-    config = AttenuationConfig(max_sv=MAX_SV)
+    order = pruning.pruning_order(model, torch.rand(400, generator=seeded(0)))
     sigma_d = d * (1 + 9 * (order.position + 1) / 400)
-    found = pruning.initial_growth(
-        some.replace(sigma_d=sigma_d, attenuation=config), order.substitute, d
-    )
+    dialled = with_dial(model, sigma_d, AttenuationConfig(max_sv=MAX_SV))
+    growth = pruning.initial_growth(dialled, order.substitute, d)
     alone = torch.ones(400, dtype=torch.bool)
     alone[order.substitute[order.substitute != torch.arange(400)]] = False
-    assert found.dtype == torch.float32 and found.min() >= 0 and found.max() <= MOST * SHARE
-    assert not found[alone].any() and (found[~alone] > 0).sum() > 50
+    assert growth.dtype == torch.float32 and growth.min() >= 0 and growth.max() <= MOST * SHARE
+    assert not growth[alone].any() and (growth[~alone] > 0).sum() > 50
+    views = photograph(model, ring(2, 16, 12))
     for iters in (0, 1):  # growth begins with 0 where it is trained
-        grown = initialize(
-            some, photograph(some, ring(2, 16, 12)), AdaptConfig(iters=iters)
-        ).growth_d
+        grown = initialize(model, views, AdaptConfig(iters=iters)).growth_d
         assert bool(grown.any()) == (iters == 0)
 
 
-def test_a_dial_of_another_form_is_refused() -> None:
+def test_a_dial_of_another_form_is_refused():
     """Its numbers mean something else."""
-    some = gaussians(20, 0, 0)
-    adapted = initialize(some, photograph(some, ring(2, 16, 12)), AdaptConfig(iters=1))
+    adapted, views = dialled(20, iters=1)
     with rejects("has the form ours; adapt with the same"):
-        initialize(adapted, photograph(some, ring(2, 16, 12)), AdaptConfig.paper())
+        initialize(adapted, views, AdaptConfig.paper())

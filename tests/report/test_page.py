@@ -7,6 +7,7 @@ import io
 import json
 import re
 import sys
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -188,8 +189,7 @@ def test_series_of_reports() -> None:
         "detached_row": row(1, 19),
         "ranked": [
             {"by": by, "row": row(1, psnr)}
-            for psnr in (21, 17)
-            for by in ("opacity", "removal error")
+            for psnr, by in product((21, 17), ("opacity", "removal error"))
         ],
         "against": [
             {"model": "x/a.ply", "label": "x_a", "theirs": row(1)},
