@@ -85,11 +85,7 @@ def test_applying_an_adapter_gives_the_result(
 
 @pytest.mark.parametrize(
     "unit, step, dtype",
-    [
-        (1.0, 0.01, torch.float16),
-        (1.0, 1e6, torch.float32),
-        (1e-4, 1e-7, torch.float32),
-    ],
+    [(1.0, 0.01, torch.float16), (1.0, 1e6, torch.float32), (1e-4, 1e-7, torch.float32)],
 )
 def test_the_type_of_a_difference(unit, step, dtype):
     """Differences in float16; new values in float32 where a difference overflows or underflows

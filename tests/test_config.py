@@ -133,14 +133,7 @@ def test_rows_of_an_evaluation():
 
 
 ROW = CalibrationRow(1.0, 10.0, 30.0, 0.9, 5.0)
-GOOD = {
-    "rows": (ROW,),
-    "total": 4,
-    "views": 1,
-    "width": 8,
-    "height": 8,
-    "machine": "m",
-}
+GOOD = {"rows": (ROW,), "total": 4, "views": 1, "width": 8, "height": 8, "machine": "m"}
 PLACE = Viewpoint(1.5, 2.5, 3.5, 4.5, look_z=1.0, up_y=-1.0, fov=0.8)
 
 

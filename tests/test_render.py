@@ -17,15 +17,7 @@ from torch.testing import assert_close
 import gsplat_versions
 import inria_forks
 from backends import fresh_copy
-from clod_adapter import (
-    AttenuationConfig,
-    Gaussians,
-    Hook,
-    bake,
-    order_by_extinction,
-    render,
-    save,
-)
+from clod_adapter import AttenuationConfig, Gaussians, Hook, bake, order_by_extinction, render, save
 from clod_adapter.adapter import detach, with_dial
 from clod_adapter.config import FORMS
 from clod_adapter.equation.attenuation import attenuate, dial

@@ -136,9 +136,7 @@ def test_counts_and_baking(adapted: Gaussians, both: tuple[Gaussians, Scene]) ->
     camera = cameras[0]
     s = 1.7
     assert torch.allclose(
-        render(bake(adapted, s, camera), camera).image,
-        render(adapted, camera, s).image,
-        atol=1e-3,
+        render(bake(adapted, s, camera), camera).image, render(adapted, camera, s).image, atol=1e-3
     )
     with rejects("have no order"):
         order_by_extinction(adapted, cameras)

@@ -267,8 +267,5 @@ def test_a_group_of_one_changes_no_bit() -> None:
 
 def test_several_processes_need_a_torch_that_does_not_hang(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch, "__version__", TorchVersion("2.6.0+cu124"))
-    with (
-        joined(dist.HashStore(), 0, 1),
-        rejects(r"need torch 2.9 or newer, and this is 2.6.0\+"),
-    ):
+    with joined(dist.HashStore(), 0, 1), rejects(r"need torch 2.9 or newer, and this is 2.6.0\+"):
         joined(dist.HashStore(), 0, 2).__enter__()

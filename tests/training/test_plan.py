@@ -8,16 +8,7 @@ from statistics import fmean
 import pytest
 import torch
 
-from clod_adapter import (
-    AdaptConfig,
-    Decision,
-    Gaussians,
-    Override,
-    Plan,
-    Scene,
-    make_plan,
-    render,
-)
+from clod_adapter import AdaptConfig, Decision, Gaussians, Override, Plan, Scene, make_plan, render
 from clod_adapter.adapter import detach
 from clod_adapter.initialization.importance import removal_error
 from clod_adapter.training.far import supposed_error

@@ -48,10 +48,7 @@ def test_images_are_renders_of_the_checkpoint(blob: Gaussians) -> None:
     )
     assert torch.equal(scene.train[0].image, image) and not torch.equal(image, plain)
     assert "7 pseudo views to train on, 2 held out, 40x30" in scene.notes[0]
-    assert told == [
-        (1, 2),
-        (2, 2),
-    ]
+    assert told == [(1, 2), (2, 2)]
     assert render_pseudo_views(own, cameras[:1]).test == ()
 
 

@@ -165,14 +165,8 @@ def test_unit_direction_and_place(pair: Pair) -> None:
     found = results(*placed(*pair, 1024.0, 1024.0 * 100))
     wanted = results(*pair)
     for (psnr, kept), (other, share) in zip(found, wanted, strict=True):
-        assert psnr == pytest.approx(other, abs=0.5), (
-            found,
-            wanted,
-        )
-        assert kept == pytest.approx(share, abs=0.02), (
-            found,
-            wanted,
-        )
+        assert psnr == pytest.approx(other, abs=0.5), (found, wanted)
+        assert kept == pytest.approx(share, abs=0.02), (found, wanted)
 
 
 def test_a_far_camera_changes_no_length(pair: Pair) -> None:
