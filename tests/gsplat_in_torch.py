@@ -172,10 +172,12 @@ def rasterize_to_pixels(
     images = isect_offsets.shape[:-2]
     bounds = [*isect_offsets[..., 0, 0].flatten().tolist(), len(flatten_ids)]
     y, x = torch.meshgrid(*(torch.arange(n) + 0.5 for n in (height, width)), indexing="ij")
-    rows = [flatten_ids[begin:end].long() for begin, end in pairwise(bounds)]
-    canvas = torch.stack(
-        [_blend([values[ids] for values in table], x.to(colors), y.to(colors)) for ids in rows]
-    )
+    canvases = []
+    for begin, end in pairwise(bounds):
+        ids = flatten_ids[begin:end].long()
+        rows = [values[ids] for values in table]
+        canvases.append(_blend(x.to(colors), y.to(colors), *rows))
+    canvas = torch.stack(canvases)
     drawn = canvas[..., :-1]
     alphas = canvas[..., -1:]
     if backgrounds is not None:
@@ -183,9 +185,11 @@ def rasterize_to_pixels(
     return drawn.unflatten(0, images), alphas.unflatten(0, images)
 
 
-def _blend(table: list[Tensor], x: Tensor, y: Tensor) -> Tensor:
+def _blend(
+    x: Tensor, y: Tensor, centres: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor
+) -> Tensor:
     """Colours and alpha ``[H, W, D + 1]`` of Gaussians in order of depth."""
-    centres, conics, opacities, colors = table
+
     dx = x[..., None] - centres[:, 0]
     dy = y[..., None] - centres[:, 1]
     a, b, c = conics.unbind(-1)

@@ -95,14 +95,14 @@ def _draw(settings: Any, given: dict[str, Any]) -> dict[str, Any]:
     compensate = bool(kernel or getattr(settings, "antialiasing", None))
     screen_filter = ScreenFilter(variance=kernel or 0.3, compensate=compensate)
     names = ("means3D", "rotations", "scales", "opacities", "shs")
-    means, quats, scales, opacities, shs = (given[name][seen] for name in names)
+    rows = {name: given[name][seen] for name in names}
     image, alpha = rasterize(
-        means,
-        quats,
-        scales,
-        opacities[:, 0],
-        shs[:, :1],
-        shs[:, 1:],
+        rows["means3D"],
+        rows["rotations"],
+        rows["scales"],
+        rows["opacities"][:, 0],
+        rows["shs"][:, :1],
+        rows["shs"][:, 1:],
         screen_filter=screen_filter,
         camera=Camera(settings.viewmatrix.T, K, width, height),
         background=settings.bg,

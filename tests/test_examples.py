@@ -6,6 +6,8 @@ import json
 import re
 import runpy
 import sys
+from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 from unittest.mock import MagicMock
@@ -71,35 +73,23 @@ def test_training_and_rendering(run: Any, capture: Any, monkeypatch: pytest.Monk
         assert {picture.size for picture in pictures} == {size}
         assert len({picture.tobytes() for picture in pictures}) == 4
     for dial in (1, 2, 3, 5):
-        own, theirs = (
-            np.asarray(Image.open(f"{stem}{dial}.png"), float)
-            for stem in ("dial_sv", "dial_gsplat_sv")
-        )
+        own = np.asarray(Image.open(f"dial_sv{dial}.png"), float)
+        theirs = np.asarray(Image.open(f"dial_gsplat_sv{dial}.png"), float)
         assert np.abs(own - theirs).mean() < 0.1
-    scene = clod_adapter.load_scene(capture.scene)
-    monkeypatch.setattr(
-        clod_adapter, "load_scene", lambda folder, origin: clod_adapter.Scene(scene.train, (), ())
-    )
+    scene = replace(load_scene(capture.scene), test=())
+    monkeypatch.setattr(clod_adapter, "load_scene", lambda folder, origin: scene)
     assert "of 300 Gaussians" in run(2, "dial.ply", capture.scene)  # without held-out views
 
 
-def test_budgets(run: Any, dialled: Path, capture: Any) -> None:
+def test_budgets(run, dialled, capture):
     printed = run(5, dialled, capture.scene).splitlines()
-    names = [
-        "50% of",
-        "25% of",
-        "10% of",
-        "0.1 dB",
-        "0.5 dB",
-        "1 dB",
-        "10 frames",
-        "30 frames",
-        "60 frames",
-    ]
-    assert len(printed) == 9
-    assert all(line.startswith(name) for line, name in zip(printed, names, strict=True))
-    found = [float(line.partition("s = ")[2].split()[0]) for line in (printed[0], *printed[3:6])]
-    assert 1 < found[0] < 4 and 1 <= found[1] <= found[2] <= found[3] <= 4
+    names = "50% of,25% of,10% of,0.1 dB,0.5 dB,1 dB,10 frames,30 frames,60 frames"
+    for line, name in zip(printed, names.split(","), strict=True):
+        assert line.startswith(name)
+    half, *drops = (
+        float(line.partition("s = ")[2].split()[0]) for line in (printed[0], *printed[3:6])
+    )
+    assert 1 < half < 4 and [1, *drops, 4] == sorted([1, *drops, 4])
     # a tenth is less than the far end keeps, and that is said
     assert "(beyond s = 4, " in printed[2]
 
@@ -110,9 +100,8 @@ def test_adapter_is_applied_and_removed(
     printed = run(6, capture.ply, dialled.with_suffix(".safetensors"), "again.ply")
     assert "changed: sigma_d, far Gaussians" in printed and f"{capture.ply}, bit for bit" in printed
     assert (tmp_path / "again.ply").read_bytes() == dialled.read_bytes()
-    other = capture.write(
-        tmp_path / "other.ply", capture.gaussians.replace(sh0=capture.gaussians.sh0 + 1)
-    )
+    brighter = capture.gaussians.replace(sh0=capture.gaussians.sh0 + 1)
+    other = capture.write(tmp_path / "other.ply", brighter)
     with pytest.raises(SystemExit, match="a different base was given"):
         run(6, other, dialled.with_suffix(".safetensors"), "other_again.ply")
     assert not (tmp_path / "other_again.ply").exists()
@@ -155,13 +144,9 @@ def test_the_slider_turns_the_dial_while_it_trains(
         clod_adapter.load_scene(capture.scene).train[0].camera.viewmat.numpy()
     )
     server = viser.ViserServer.return_value
-    client = MagicMock()
+    client = MagicMock(**{"camera.aspect": 4 / 3, "camera.fov": 0.9})
     server.get_clients.side_effect = [{0: client}, {0: client}, KeyboardInterrupt]
-    server.gui.add_slider.return_value.value, client.camera.aspect, client.camera.fov = (
-        5.0,
-        4 / 3,
-        0.9,
-    )
+    server.gui.add_slider.return_value.value = 5.0
     run(8, capture.ply, capture.scene)
     (picture,) = client.scene.set_background_image.call_args.args
     assert picture.shape == (360, 480, 3) and picture.any()
@@ -185,17 +170,18 @@ def test_the_readme_lists_every_example() -> None:
     assert list(EXAMPLES) == list(range(1, len(EXAMPLES) + 1))
 
 
-def test_a_written_town_can_be_loaded_and_trained(tmp_path: Path) -> None:
+def test_a_written_town_can_be_loaded_and_trained(tmp_path):
     city.write_city(tmp_path / "city", 4000, 9, 64, 40)
     base = load(tmp_path / "city" / "city.ply")
     scene = load_scene(tmp_path / "city")
     assert (len(base.gaussians), len(scene.train), len(scene.test), base.notes) == (4000, 7, 2, ())
     view = scene.train[0]
     with torch.no_grad():
-        truth = render(city.city(4000), view.camera).image
-        error = psnr(render(base.gaussians, view.camera).image, view.image)
-        of_truth = psnr(truth, view.image)
-    assert of_truth > 45 > 35 > error > 15
+        truth, quality = (
+            psnr(render(gaussians, view.camera).image, view.image)
+            for gaussians in (city.city(4000), base.gaussians)
+        )
+    assert truth > 45 > 35 > quality > 15
 
 
 def test_a_table_is_markdown() -> None:
@@ -221,18 +207,17 @@ def test_an_exponent_is_that_of_the_power() -> None:
     assert scaling.exponent([(n, 3 * n**0.5) for n in scaling.SIZES]) == pytest.approx(0.5)
 
 
-def test_plush_and_city_small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_plush_and_city_small(monkeypatch, tmp_path):
     out = tmp_path / "gpu.jsonl"
-    words = "gpu.py --device cpu --small --only plush city --count 1000 --results"
-    monkeypatch.setattr(sys, "argv", [*words.split(), str(out)])
+    words = f"gpu.py --device cpu --small --only plush city --count 1000 --results {out}"
+    monkeypatch.setattr(sys, "argv", words.split())
     gpu.main()
-    plush, adapted, *frames = [json.loads(line) for line in out.read_text("utf-8").splitlines()]
+    plush, adapted, *frames = map(json.loads, out.read_text("utf-8").splitlines())
     assert (plush["benchmark"], plush["on"], plush["count"]) == ("gpu plush", "cpu", 1000)
     assert plush["train_seconds"] > 0 and adapted["peak_bytes"] > adapted["base_bytes"] > 0
-    assert [(r["where"], r["virtual_scale"]) for r in frames] == [
-        (w, s) for w in ("near", "far") for s in (1, 3, 7)
-    ]
-    assert all(min(row["ms"].values()) > 0 for row in frames)
+    places = [(frame["where"], frame["virtual_scale"]) for frame in frames]
+    assert places == [*product(("near", "far"), (1, 3, 7))]
+    assert all(min(frame["ms"].values()) > 0 for frame in frames)
     assert frames[0]["kept"] > frames[1]["kept"] and frames[0]["psnr_full"] > frames[1]["psnr_full"]
 
 

@@ -51,16 +51,11 @@ class Block(NamedTuple):
         """The words of each line of a shell block, without comments, continued lines put
         together.
         """
-        lines = (
-            self.text.replace("\\\n", " ").splitlines()
-            if self.language in ("sh", "console")
-            else []
-        )
-        return [
-            words
-            for line in lines
-            if (words := shlex.split(line.removeprefix("$ "), comments=True))
-        ]
+        if self.language not in ("sh", "console"):
+            return []
+        lines = self.text.replace("\\\n", " ").splitlines()
+        commands = (shlex.split(line.removeprefix("$ "), comments=True) for line in lines)
+        return [words for words in commands if words]
 
 
 def blocks(page: Path) -> list[Block]:
@@ -79,12 +74,9 @@ def spoken(page: Path, program: str) -> list[str]:
     text = FENCE.sub("", page.read_text("utf-8"))
     spans = [" ".join(span.split()) for span in re.findall(r"`([^`]+)`", text)]
     lines = [line.strip() for line in text.splitlines() if line.startswith("    ")]
-    said = [
-        each.partition("  #")[0].strip()
-        for each in [*spans, *lines]
-        if each.startswith(f"{program} ")
-    ]
-    return [each for each in said if " -" in each and "..." not in each]
+    commands = [text.partition("  #")[0].strip() for text in [*spans, *lines]]
+    complete = [text for text in commands if " -" in text and "..." not in text]
+    return [text for text in complete if text.startswith(f"{program} ")]
 
 
 @pytest.fixture(scope="session")
@@ -167,8 +159,10 @@ def test_named_options_exist(page: Path) -> None:
     """Also of commands that are not run; each reason for not running a block stands above it."""
     written = blocks(page)
     text = page.read_text("utf-8")
-    said = [command.split() for command in spoken(page, "clod-adapt")]
-    for words in [*said, *(words for block in written for words in block.commands())]:
+    commands = [command.split() for command in spoken(page, "clod-adapt")]
+    for block in written:
+        commands += block.commands()
+    for words in commands:
         if words[0] == "clod-adapt":
             words = words[1 : words.index(">")] if ">" in words else words[1:]
             name = words[0] if words and words[0] in COMMANDS else ""
@@ -203,12 +197,10 @@ def test_every_field_of_the_reports_is_explained(
     desk: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     explained = set(re.findall(r"`([a-z_0-9]+)`", (DOCS / "python.md").read_text("utf-8")))
-    model, base, scene = (
-        str(desk / name) for name in ("pretrained_clod.ply", "pretrained.ply", "scene")
-    )
-    words = ["eval", model, "--images", scene, "--sv", "1", "3", "--popping", "--quiet"]
+    base = desk / "pretrained.ply"
+    line = f"eval {desk}/pretrained_clod.ply --images {desk}/scene --sv 1 3 --popping --quiet"
     capsys.readouterr()
-    assert main([*words, "--base", base, "--against", base, "--json"]) == 0
+    assert main(f"{line} --base {base} --against {base} --json".split()) == 0
     measured = json.loads(capsys.readouterr().out)
     adapted = json.loads(desk.joinpath("pretrained_clod.json").read_text("utf-8"))
     assert {"rows", "alignment", "frame_ms"} <= set(keys(adapted))
@@ -217,14 +209,10 @@ def test_every_field_of_the_reports_is_explained(
     assert not missing, f"docs/python.md does not explain {sorted(missing)}"
 
 
-def tables(page: str) -> list[list[list[str]]]:
-    """The tables of a page, as rows of cells without emphasis."""
-    found = re.findall(r"(?:^\|.*\|\n)+", (DOCS / page).read_text("utf-8"), re.MULTILINE)
-    lines = [[line for line in table.splitlines() if "---" not in line] for table in found]
-    return [
-        [[cell.strip(" *") for cell in line.strip("|").split("|")] for line in table]
-        for table in lines
-    ]
+def cells(page: str) -> list[str]:
+    """The cells of the tables of a page, without emphasis."""
+    rows = re.findall(r"^\|(.*)\|$", (DOCS / page).read_text("utf-8"), re.MULTILINE)
+    return [cell.strip(" *") for cell in "|".join(rows).split("|")]
 
 
 def measured(value: Any) -> Iterator[str]:
@@ -242,39 +230,30 @@ def measured(value: Any) -> Iterator[str]:
             yield from measured(entry)
 
 
-def test_qualities_in_tables_are_measured() -> None:
+def test_qualities_in_tables_are_measured():
     """A number of decibels, with or without the share kept, is one of benchmarks/results."""
-    found = set()
+    results = []
     for file in RESULTS.glob("*.jsonl"):
-        found |= {
-            each
-            for line in file.read_text("utf-8").splitlines()
-            for each in measured(json.loads(line))
-        }
+        results += map(json.loads, file.read_text("utf-8").splitlines())
     with (RESULTS / "robustness.csv").open(encoding="utf-8") as stream:
-        found |= set(measured(list(csv.DictReader(stream))))
-    cells = [
-        cell
-        for page in ("method.md", "performance.md")
-        for rows in tables(page)
-        for row in rows
-        for cell in row
-    ]
-    told = [
-        cell.replace(" %", "%") for cell in cells if re.fullmatch(r"\d\d\.\d\d( @ \d+ ?%)?", cell)
-    ]
-    assert len(told) > 50 and not {*told} - found
+        results += csv.DictReader(stream)
+    written = cells("method.md") + cells("performance.md")
+    quality = re.compile(r"\d\d\.\d\d( @ \d+ ?%)?")
+    told = {cell.replace(" %", "%") for cell in written if quality.fullmatch(cell)}
+    assert len(told) > 50 and not told - set(measured(results))
 
 
 SOURCES = [
     ROOT / "README.md",
-    *(path for folder in ("cli", "clod_adapter") for path in (ROOT / folder).rglob("*.py")),
+    *(ROOT / "docs").glob("*.md"),
+    *(ROOT / "cli").rglob("*.py"),
+    *(ROOT / "clod_adapter").rglob("*.py"),
 ]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
 
 
 def test_no_line_installs_clod_adapter_from_the_index() -> None:
-    for path in (*SOURCES, *(ROOT / "docs").glob("*.md")):
+    for path in SOURCES:
         assert not re.search(r"pip install[^`\n]*clod-adapter", path.read_text("utf-8")), path
 
 
@@ -283,9 +262,8 @@ def test_help_names_the_installed_page(tmp_path: Path, monkeypatch: pytest.Monke
     assert patterns == ["docs/*.md"]
     assert all(url.startswith("https://") for url in PROJECT["project"]["urls"].values())
     assert command.manual() == ROOT / "docs" / "index.md"  # of the checkout
-    monkeypatch.setattr(
-        command, "__file__", str(tmp_path / "lib" / "cli" / "shared" / "command.py")
-    )
+    elsewhere = tmp_path / "lib" / "cli" / "shared" / "command.py"
+    monkeypatch.setattr(command, "__file__", str(elsewhere))
     monkeypatch.setattr(sysconfig, "get_path", lambda name: str(tmp_path))
     monkeypatch.setattr(command, "getuserbase", lambda: str(tmp_path))
     assert "manual:" not in command.parser_of(adapt, "clod-adapt").format_help()
@@ -303,9 +281,8 @@ def anchors(page: Path) -> set[str]:
     """The anchors of a page's headings, as Markdown's toc extension and GitHub make them."""
     found = set()
     for title in re.findall(r"^#+ +(.+?) *$", FENCE.sub("", page.read_text("utf-8")), re.MULTILINE):
-        plain = (
-            re.sub(r"[^\w\s-]", "", re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", title)).strip().lower()
-        )
+        text = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", title)
+        plain = re.sub(r"[^\w\s-]", "", text).strip().lower()
         found.add(re.sub(r"[-\s]+", "-", plain))
     return found
 
@@ -320,10 +297,9 @@ def test_links_and_pictures_exist() -> None:
             found = (page.parent / file).resolve() if file else page
             assert found.exists(), f"{page.name}: {target}: no such file"
             assert not anchor or anchor in anchors(found), f"{page.name}: {target}: no such heading"
+    written = "".join(texts.values())
     for picture in (DOCS / "images").iterdir():
-        assert picture.suffix == ".svg" or any(picture.name in text for text in texts.values()), (
-            picture.name
-        )
+        assert picture.suffix == ".svg" or picture.name in written
 
 
 def test_the_built_site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -336,14 +312,9 @@ def test_the_built_site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setenv("NO_MKDOCS_2_WARNING", "1")
     monkeypatch.setattr(sys, "argv", ["make.py"])
     runpy.run_path("docs/make.py", run_name="__main__")
-    done = CliRunner().invoke(
-        import_module("mkdocs.__main__").cli, ["build", "--site-dir", str(site)]
-    )
-    warned = [
-        line
-        for line in done.output.splitlines()
-        if line.startswith("WARNING") and "griffe: " not in line
-    ]
+    build = import_module("mkdocs.__main__").cli
+    done = CliRunner().invoke(build, ["build", "--site-dir", str(site)])
+    warned = re.search("^WARNING(?!.*griffe: )", done.output, re.MULTILINE)
     assert done.exit_code == 0 and not warned, done.output
     for page in site.glob("*.html"):
         fetched = FETCHED.findall(page.read_text("utf-8"))
@@ -355,11 +326,8 @@ def test_the_built_site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
         )
     index = json.loads((site / "search" / "search_index.json").read_text("utf-8"))
     entries = {entry["location"] for entry in index["docs"]}
-    pages = {f"{page.stem}.html" for page in DOCS.glob("*.md")} | {
-        "commands.html",
-        "settings.html",
-        "names.html",
-    }
+    generated = {"commands.html", "settings.html", "names.html"}
+    pages = {f"{page.stem}.html" for page in DOCS.glob("*.md")} | generated
     assert pages == {entry.partition("#")[0] for entry in entries}
     named = {f"names.html#{clod_adapter._homes[name]}.{name}" for name in clod_adapter.__all__}
     assert named | {f"commands.html#clod-adapt-{name}" for name in COMMANDS} <= entries

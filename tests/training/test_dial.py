@@ -47,17 +47,15 @@ def test_the_objective_is_that_of_adapt(captured: Pair) -> None:
     run = Trainer(dial.gaussians(), scene.train, AdaptConfig(lr_shN=1e-3))
     names = {"log_scales": "scales", "opacity_logits": "opacities"}
     for name, gradient in run.gradient_sum([Sample(scene.train[0], s, counted)]).gradients.items():
-        own = getattr(dial, name, None)
-        found = (splats[names.get(name, name)] if own is None else own).grad
-        assert gradient.abs().max() > 0, name
-        assert_close(found, gradient, rtol=1e-3, atol=1e-5 * float(gradient.abs().max()), msg=name)
+        leaf = getattr(dial, name, None)
+        leaf = splats[names.get(name, name)] if leaf is None else leaf
+        largest = float(gradient.abs().max())
+        assert largest > 0, name
+        assert_close(leaf.grad, gradient, rtol=1e-3, atol=1e-5 * largest, msg=name)
     term = dial.count_loss(s, torch.tensor(0.3))
-    kept = (
-        attenuate(base.opacity_logits, dial.sigma_d, dial.typical, s, dial.attenuation)
-        .keep.float()
-        .mean()
-    )
-    wanted = 0.3 * dial.config.reg_weight * (kept.item() / dial.target_share(s) - 1) ** 2
+    given = (base.opacity_logits, dial.sigma_d, dial.typical, s, dial.attenuation)
+    kept = attenuate(*given).keep.float().mean().item()
+    wanted = 0.3 * dial.config.reg_weight * (kept / dial.target_share(s) - 1) ** 2
     assert term.item() == pytest.approx(wanted, rel=1e-3)
     assert dial.count_loss(0.5, torch.tensor(0.3)) == 0 and dial.target_share(0.5) == 1
 

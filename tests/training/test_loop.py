@@ -5,9 +5,7 @@ import math
 import sys
 from dataclasses import replace
 from types import ModuleType
-from typing import Any
 
-import numpy as np
 import pytest
 import torch
 import torch.distributed as dist
@@ -34,81 +32,76 @@ def trained(captured: Pair) -> Gaussians:
     return adapt(*captured, config_of(iters=120)).gaussians
 
 
-def test_training_improves_psnr(captured: Pair, trained: Gaussians) -> None:
+def test_training_improves_psnr(captured, trained):
     """At every dial value; growth at the far end, and no count depends on it."""
     base, scene = captured
     before = adapt(base, scene, config_of(iters=0)).gaussians
+    dials = (1.5, 2.0, 3.0, 5.0)
     for views in (scene.train, scene.test):
-        rows = zip(
-            *(evaluate(each, views, (1.5, 2.0, 3.0, 5.0)) for each in (before, trained)),
-            strict=True,
-        )
+        rows = zip(evaluate(before, views, dials), evaluate(trained, views, dials), strict=True)
         assert all(new.psnr > old.psnr + 0.5 for old, new in rows)
     plain = adapt(base, scene, config_of(iters=120, growth="off")).gaussians
-    found, wanted = (evaluate(one, scene.test, (1.0, 5.0)) for one in (trained, plain))
-    assert found[1].psnr > wanted[1].psnr + 0.1 and found[0].psnr > wanted[0].psnr - 0.3
-    assert [row.kept_share for row in found] == pytest.approx(
-        [row.kept_share for row in wanted], abs=0.03
-    )
+    near, far = evaluate(trained, scene.test, (1.0, 5.0))
+    plain_near, plain_far = evaluate(plain, scene.test, (1.0, 5.0))
+    assert far.psnr > plain_far.psnr + 0.1 and near.psnr > plain_near.psnr - 0.3
+    assert near.kept_share == pytest.approx(plain_near.kept_share, abs=0.03)
+    assert far.kept_share == pytest.approx(plain_far.kept_share, abs=0.03)
 
 
-def test_zero_steps_return_the_initialization(captured: Pair) -> None:
+def test_zero_steps_return_the_initialization(captured):
     base, scene = captured
     result = adapt(base, scene, config_of(iters=0))
+    start = result.gaussians
     want = with_far(base, scene.train, config_of())
     assert result.steps == 0 and not result.interrupted
-    assert all(
-        torch.equal(getattr(result.gaussians, name), getattr(want, name)) for name in ATTRIBUTES
-    )
-    assert_equal(detach(result.gaussians), base)
+    for name in ATTRIBUTES:
+        assert torch.equal(getattr(start, name), getattr(want, name))
+    assert_equal(detach(start), base)
     # by way of its logarithm
-    assert_close(result.gaussians.sigma_d, want.sigma_d, rtol=1e-5, atol=0)
-    assert result.gaussians.attenuation == want.attenuation and want.attenuation.scene_distance == 1
+    assert_close(start.sigma_d, want.sigma_d, rtol=1e-5, atol=0)
+    assert start.attenuation == want.attenuation and want.attenuation.scene_distance == 1
     assert want.attenuation.reference_distance == pytest.approx(scene_distance(base, scene.train))
     # At SIGMA_MAX no gradient reaches sigma_d, so a dial of with_dial is initialized, too.
-    assert_equal(adapt(with_dial(base), scene, config_of(iters=0)).gaussians, result.gaussians)
+    assert_equal(adapt(with_dial(base), scene, config_of(iters=0)).gaussians, start)
 
 
-def test_a_second_run_continues_from_sigma_d(captured: Pair, trained: Gaussians) -> None:
+def test_a_second_run_continues_from_sigma_d(captured, trained):
     """No importance pass; the unit is the file's reference distance, or the views' where another
     tool dropped it.
     """
-    first = trained
+    _, scene = captured
     phases = []
     config = config_of(iters=1, max_sv=3.0)
-    unknown = first.replace(attenuation=replace(first.attenuation, reference_distance=0.0))
+    attenuation = trained.attenuation
+    unknown = trained.replace(attenuation=replace(attenuation, reference_distance=0.0))
     for given, want in (
-        (first, first.attenuation.reference_distance),
-        (unknown, scene_distance(first, captured[1].train)),
+        (trained, attenuation.reference_distance),
+        (unknown, scene_distance(trained, scene.train)),
     ):
-        result = adapt(given, captured[1], config, lambda now: phases.append(now.phase)).gaussians
-        found = result.attenuation.reference_distance
-        assert found == pytest.approx(want) and want > 2 and set(phases) == {Phase.TRAINING}
-        assert result.attenuation == replace(
-            first.attenuation, max_sv=3.0, reference_distance=found
-        )
-        far = first.sigma_d > 0
+        result = adapt(given, scene, config, lambda now: phases.append(now.phase)).gaussians
+        distance = result.attenuation.reference_distance
+        assert distance == pytest.approx(want) and want > 2 and set(phases) == {Phase.TRAINING}
+        assert result.attenuation == replace(attenuation, max_sv=3.0, reference_distance=distance)
+        far = trained.sigma_d > 0
         # a step of log sigma
-        assert (result.sigma_d / first.sigma_d)[far].log().abs().max() <= 5.1e-2
-        assert (result.growth_d - first.growth_d).abs().max() <= 1.01e-2
-        assert first.growth_d.unique().numel() > 50
+        assert (result.sigma_d / trained.sigma_d)[far].log().abs().max() <= 5.1e-2
+        assert (result.growth_d - trained.growth_d).abs().max() <= 1.01e-2
+        assert trained.growth_d.unique().numel() > 50
     other = with_dial(captured[0], torch.full((len(captured[0]),), 1.5), AttenuationConfig())
     with rejects("dial has no far Gaussians"):
-        adapt(other, captured[1], config)
+        adapt(other, scene, config)
 
 
-def test_result_is_the_mean_of_the_last_steps(captured: Pair) -> None:
+def test_result_is_the_mean_of_the_last_steps(captured):
     """The mean is over the parameters, so over log sigma_d; the steps do not change."""
     states = {}
-    found = adapt(*captured, config_of(iters=10), states_of({9, 10}, states)).gaussians
-    found = found.select(~found.near)
-    sigma_d = with_distance(found, states[9].attenuation.scene_distance).sigma_d
-    for name, got in (*found.tensors().items(), ("log_sigma", sigma_d.log())):
+    result = adapt(*captured, config_of(iters=10), states_of({9, 10}, states)).gaussians
+    result = result.select(~result.near)
+    sigma_d = with_distance(result, states[9].attenuation.scene_distance).sigma_d
+    for name, values in (*result.tensors().items(), ("log_sigma", sigma_d.log())):
         if name != "sigma_d":
-            mean = torch.stack(
-                [states[step].tensors[f"parameter.{name}"] for step in (9, 10)]
-            ).mean(0)
-            assert_close(got, mean)
+            last, before = (states[step].tensors[f"parameter.{name}"] for step in (10, 9))
+            assert_close(values, (last + before) / 2)
 
 
 def test_time_budget_ends_training(captured: Pair) -> None:
@@ -173,49 +166,42 @@ def test_bad_inputs_are_refused(captured: Pair) -> None:
             adapt(base.replace(sh0=huge), Scene(scene.train[:1], ()), config)
 
 
-def test_a_row_with_a_nonfinite_gradient_is_not_stepped(
-    captured: Pair, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_row_with_a_nonfinite_gradient_is_not_stepped(captured, monkeypatch):
     """Only in that step: other rows move, and so does the row in later steps."""
 
-    def spoil(found: Any) -> Any:
-        found.gradients["means"][3, 1], found.gradients["log_sigma"][4] = math.nan, -math.inf
-        return found
+    def spoil(result):
+        result.gradients["means"][3, 1] = math.nan
+        result.gradients["log_sigma"][4] = -math.inf
+        return result
 
     base, scene = captured
     change_step(monkeypatch, 1, spoil)
-    seen = []
+    steps = []
+
+    def keep(progress):
+        if progress.state:
+            steps.append(copy.deepcopy(progress.gaussians()))
+
     config = config_of(iters=12)
-    result = adapt(
-        base,
-        scene,
-        config,
-        lambda p: seen.append(copy.deepcopy(p.gaussians())) if p.state else None,
-    )
+    result = adapt(base, scene, config, keep)
     assert result.held == 2
     assert all(value.isfinite().all() for value in result.gaussians.tensors().values())
-    first, after, last = (
-        each.sigma_d[len(base) :]
-        for each in (with_far(base, scene.train, config), seen[0], result.gaussians)
-    )
+    start = with_far(base, scene.train, config)
+    models = (start, steps[0], result.gaussians)
+    first, after, last = (model.sigma_d[len(base) :] for model in models)
     moved = (after / first - 1).abs() > 1e-5
     assert not moved[3:5].any() and moved.any() and (last[3:5] != first[3:5]).all()
 
 
-def test_growth_begins_at_the_median_distance_in_the_second_nearest_view(captured: Pair) -> None:
+def test_growth_begins_at_the_median_distance_in_the_second_nearest_view(captured):
     base, scene = captured
-    nearest, second = sorted(scene.train, key=lambda view: scene_distance(base, [view]))[:2]
-    assert (
-        scene_distance(base, scene.train)
-        == scene_distance(base, [second])
-        > scene_distance(base, [nearest])
-    )
-    median = (
-        (base.means - second.camera.position)
-        .norm(dim=1)[in_frustum(base.means, second.camera)]
-        .median()
-    )
-    assert scene_distance(base, [second]) == pytest.approx(float(median), rel=1e-5)
+    nearest, second = sorted(scene_distance(base, [view]) for view in scene.train)[:2]
+    assert scene_distance(base, scene.train) == second > nearest
+    for view in scene.train:
+        if scene_distance(base, [view]) == second:
+            distances = (base.means - view.camera.position).norm(dim=1)
+            median = distances[in_frustum(base.means, view.camera)].median()
+            assert second == pytest.approx(float(median), rel=1e-5)
 
 
 def test_settings_as_keywords(captured: Pair) -> None:
@@ -226,13 +212,6 @@ def test_settings_as_keywords(captured: Pair) -> None:
     assert adapted.gaussians.growth_d is None
     with pytest.raises(TypeError, match="max_vs"):
         adapt(*captured, max_vs=7)
-
-
-@pytest.mark.filterwarnings("error")
-def test_numpy_that_raises_changes_nothing(captured: Pair) -> None:
-    with np.errstate(all="raise"):
-        strict = adapt(*captured, config_of(iters=3), max_sv=3)
-    assert_equal(strict.gaussians, adapt(*captured, config_of(iters=3), max_sv=3).gaussians)
 
 
 def test_a_bar_by_default(

@@ -43,12 +43,8 @@ def test_sh_degrees_are_kept_or_left_out(visible: Pair) -> None:
     assert verdicts(plan)["SH degree 1"] == "left out" and plan.sh_degree == 0
     assert plan.start.sh_degree == 0
     assert torch.equal(detach(plan.adapt(scene).gaussians).shN, faint.shN)
-    empty = make_plan(
-        base.replace(shN=torch.zeros(len(base), 15, 3)),
-        scene,
-        CONFIG,
-        Override(keep=ALL - {"bands"}),
-    )
+    black = base.replace(shN=torch.zeros(len(base), 15, 3))
+    empty = make_plan(black, scene, CONFIG, Override(keep=ALL - {"bands"}))
     assert empty.decisions[0].what == "SH degree 1 to 3"
     assert empty.decisions[0].number == 0
     assert empty.sh_degree == 0
@@ -61,19 +57,17 @@ def test_sh_degrees_are_kept_or_left_out(visible: Pair) -> None:
     assert plan.decisions[0] == Decision("SH degrees", NOT_NEEDED, None, "", "there are none")
 
 
-def test_the_far_end_is_told(visible: Pair) -> None:
+def test_the_far_end_is_told(visible):
     """The share that the start keeps at max_sv, and the max_sv at which few are kept."""
     plan = make_plan(*visible, CONFIG)
     (told,) = (f"{one.what} {one.why}" for one in plan.decisions if "at s = 4" in one.what)
-    kept, few, farther = map(
-        int, re.search(r"(\d+)% at .*?(\d+)% with --max-sv (\d+)", told).groups()
-    )
+    numbers = re.search(r"(\d+)% at .*?(\d+)% with --max-sv (\d+)", told).groups()
+    kept, few, farther = map(int, numbers)
     start = plan.start
 
-    def percent(s: float) -> float:
-        return 100 * fmean(
-            int(render(start, view.camera, s).kept.sum()) / start.whole for view in visible[1].train
-        )
+    def percent(s):
+        counts = [int(render(start, view.camera, s).kept.sum()) for view in visible[1].train]
+        return 100 * fmean(counts) / start.whole
 
     assert percent(4.0) == pytest.approx(kept, abs=0.51)
     assert percent(farther + 1) <= few < percent(farther / 1.2)
@@ -86,23 +80,22 @@ def test_impossible_overrides_are_refused() -> None:
         Override(frozenset({"quats", "bands"}), frozenset({"quats"}))
 
 
-def test_a_resumed_plan_gives_the_same_bits(visible: Pair) -> None:
+def test_a_resumed_plan_gives_the_same_bits(visible):
     """A plan that is made again is the same, and resumes to the same bits; what is frozen is
     unchanged.
     """
     base, scene = visible
-    plan, again = (
-        make_plan(base, scene, CONFIG, Override(leave_out=frozenset({"means", "scales"})))
-        for _ in "ab"
-    )
+    frozen = Override(leave_out=frozenset({"means", "scales"}))
+    plan = make_plan(base, scene, CONFIG, frozen)
+    again = make_plan(base, scene, CONFIG, frozen)
     states = {}
     assert plan.decisions == again.decisions and json.loads(json.dumps(plan.as_dict()))["decisions"]
     whole = plan.adapt(scene, states_of({12}, states)).gaussians
-    found = again.adapt(scene, resume=states[12]).gaussians
-    assert_equal(found, whole)
-    assert_equal(detach(found), base)
-    assert torch.equal(found.means, plan.start.means)
-    assert not torch.equal(found.quats, plan.start.quats)
+    resumed = again.adapt(scene, resume=states[12]).gaussians
+    assert_equal(resumed, whole)
+    assert_equal(detach(resumed), base)
+    assert torch.equal(resumed.means, plan.start.means)
+    assert not torch.equal(resumed.quats, plan.start.quats)
 
 
 def test_what_no_placed_camera_shows_is_supposed_to_matter() -> None:

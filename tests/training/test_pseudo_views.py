@@ -11,7 +11,7 @@ from torch import Tensor
 
 import clod_adapter as clod
 import scenes
-from clod_adapter import AdaptConfig, Gaussians, Scene, render
+from clod_adapter import AdaptConfig, AttenuationConfig, Gaussians, Scene, render, with_dial
 from clod_adapter.initialization.importance import coverage
 from clod_adapter.training import camera_placement, pseudo_views
 from clod_adapter.training.camera_placement import FIELD, HEIGHT, WIDTH, place_cameras
@@ -23,6 +23,7 @@ from clod_adapter.training.pseudo_views import (
     render_pseudo_views,
 )
 from clod_adapter.training.schedule import ViewSampler
+from runs import counted
 from scenes import ring
 
 
@@ -31,25 +32,19 @@ def blob() -> Gaussians:
     return scenes.gaussians(400, 1, 0, size=0.05)
 
 
-def test_images_are_renders_of_the_checkpoint(blob: Gaussians) -> None:
+def test_images_are_renders_of_the_checkpoint(blob):
     """Renders of a file with a dial are at s = 1."""
     cameras = ring(9, 40, 30)
-    told = []
-    own = clod.with_dial(
-        blob, torch.full((len(blob),), 0.3), clod.AttenuationConfig(scene_distance=4.0)
-    )
-    scene = render_pseudo_views(
-        own, cameras, progress=lambda now: told.append((now.done, now.total))
-    )
+    steps = []
+    dialled = with_dial(blob, torch.full((len(blob),), 0.3), AttenuationConfig(scene_distance=4.0))
+    scene = render_pseudo_views(dialled, cameras, progress=counted(steps))
     assert [view.camera for view in scene.test] == [cameras[0], cameras[8]]
-    assert len(scene.train) == 7
-    image, plain = (
-        (render(g, cameras[1]).image.clamp(0, 1) * 255).round().byte() for g in (own, blob)
-    )
-    assert torch.equal(scene.train[0].image, image) and not torch.equal(image, plain)
+    assert len(scene.train) == 7 and steps == [(1, 2), (2, 2)]
+    image = scene.train[0].image
+    assert torch.equal(image, render(dialled, cameras[1]).pixels)
+    assert not torch.equal(image, render(blob, cameras[1]).pixels)
     assert "7 pseudo views to train on, 2 held out, 40x30" in scene.notes[0]
-    assert told == [(1, 2), (2, 2)]
-    assert render_pseudo_views(own, cameras[:1]).test == ()
+    assert render_pseudo_views(dialled, cameras[:1]).test == ()
 
 
 def test_each_step_renders_the_checkpoint_from_another_camera(blob: Gaussians) -> None:
@@ -75,9 +70,8 @@ def test_few_photographs_get_pseudo_views(blob: Gaussians, monkeypatch: pytest.M
     scene = add_pseudo_views(blob, Scene(around[:1], around[1:]))
     assert scene.train[0] is around[0] and len(scene.train) == 1 + 9 and scene.test == around[1:]
     assert "only 1 photographs to train on: 9 pseudo views" in scene.notes[-1]
-    assert [
-        torch.equal(view.camera.viewmat, around[0].camera.viewmat) for view in scene.train
-    ].count(True) == 1 + 4
+    place = around[0].camera.viewmat
+    assert sum(torch.equal(view.camera.viewmat, place) for view in scene.train) == 1 + 4
     assert len(add_pseudo_views(blob, Scene(around[1:], ())).train) == 11 + 11 + 4
     # too faint to place a camera by
     faint = blob.replace(opacity_logits=torch.full((len(blob),), -4.6))
@@ -92,20 +86,21 @@ def test_moved_cameras_have_the_documented_offsets(blob: Gaussians) -> None:
     """
     camera = ring(1, 40, 30)[0]
     rng = np.random.default_rng(0)
-    near, back = (
-        [PseudoView(camera, blob, 3.0, far).moved(rng).camera for _ in range(500)]
-        for far in (0.0, 1.0)
-    )
-    steps = torch.stack(
-        [each.viewmat.double() @ camera.viewmat.double().inverse() for each in near]
-    )
+
+    def moved(far):
+        view = PseudoView(camera, blob, 3.0, far)
+        return [view.moved(rng).camera for _ in range(500)]
+
+    near = moved(0.0)
+    inverse = camera.viewmat.double().inverse()
+    steps = torch.stack([placed.viewmat.double() @ inverse for placed in near])
     assert steps[:, :3, 3].std(0).tolist() == pytest.approx([MOVED * 3.0] * 3, rel=0.2)
     angles = ((steps.diagonal(dim1=1, dim2=2).sum(1) - 2) / 2).clamp(-1, 1).acos()
     assert angles.square().mean().sqrt() == pytest.approx(pseudo_views.TURNED * 3**0.5, rel=0.2)
     zooms = torch.stack([each.K / camera.K for each in near])[:, [0, 1], [0, 1]].log()
     assert torch.equal(zooms[:, 0], zooms[:, 1])
     assert 0.9 < zooms.abs().max() / pseudo_views.ZOOMED <= 1.001
-    eyes = torch.stack([each.position for each in back])
+    eyes = torch.stack([placed.position for placed in moved(1.0)])
     behind = (camera.position - eyes) @ camera.viewmat[2, :3] / 3.0
     assert behind.min() > -6 * MOVED and FARTHER / 2 < behind.max() < FARTHER - 1 + 6 * MOVED
 
@@ -132,9 +127,9 @@ def ball(n: int, seen_from: Tensor) -> Gaussians:
 
 
 def test_placed_cameras_are_valid_and_see_the_scene(blob: Gaussians) -> None:
-    told = []
-    cameras = place_cameras(blob, views=12, progress=lambda now: told.append((now.done, now.total)))
-    assert told[-1][0] == told[-1][1] == len(told)
+    steps = []
+    cameras = place_cameras(blob, views=12, progress=counted(steps))
+    assert steps[-1] == (len(steps), len(steps))
     assert len({c.name for c in cameras}) == len(cameras) == 12
     for camera in cameras:
         rotation = camera.viewmat[:3, :3]
@@ -145,10 +140,12 @@ def test_placed_cameras_are_valid_and_see_the_scene(blob: Gaussians) -> None:
             FIELD
         )
         assert render(blob, camera).alpha.mean() > 0.02
-    one, two, other = (
-        torch.stack([c.viewmat for c in place_cameras(blob, views=4, seed=k)]) for k in (1, 1, 2)
-    )
-    assert len(one) == 4 and torch.equal(one, two) and not torch.equal(one, other)
+
+    def poses(seed):
+        return torch.stack([c.viewmat for c in place_cameras(blob, views=4, seed=seed)])
+
+    one = poses(1)
+    assert len(one) == 4 and torch.equal(one, poses(1)) and not torch.equal(one, poses(2))
 
 
 def test_a_scene_gets_as_many_cameras_as_show_it(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -51,6 +51,9 @@ PLACE = {
 }
 
 
+KINDS = {".html": "text/html", ".js": "text/javascript", ".mjs": "text/javascript"}
+
+
 def engines() -> Path:
     """The folder that npm installed the viewers into, beside splat-transform."""
     tool = shutil.which("splat-transform")
@@ -67,24 +70,18 @@ def opened(tabs: Any, viewer: str, file: Path) -> Iterator[Any]:
 
     def answer(route: Any) -> None:
         host, path = route.request.url.split("://")[1].split("?")[0].split("/", 1)
-        found = (
-            ROOT / path
-            if host == "example"
-            else modules / re.sub(r"@\d[\d.]*", "", path.removeprefix("npm/"))
-        )
-        found = file if path == file.name else found
-        kind = {".html": "text/html", ".js": "text/javascript", ".mjs": "text/javascript"}.get(
-            found.suffix, ""
-        )
-        route.fulfill(body=found.read_bytes(), content_type=kind or "application/octet-stream")
+        source = modules / re.sub(r"@\d[\d.]*", "", path.removeprefix("npm/"))
+        if host == "example":
+            source = file if path == file.name else ROOT / path
+        kind = KINDS.get(source.suffix, "application/octet-stream")
+        route.fulfill(body=source.read_bytes(), content_type=kind)
 
     page = tabs.new_page()
     page.set_viewport_size(SIZE)
     page.set_default_timeout(60_000)
     page.route(re.compile("https://"), answer)
-    page.goto(
-        f"https://example/viewers/examples/{viewer}.html?file=/{file.name}", wait_until="commit"
-    )
+    address = f"https://example/viewers/examples/{viewer}.html?file=/{file.name}"
+    page.goto(address, wait_until="commit")
     yield page
     page.close()
 
@@ -175,12 +172,10 @@ def test_the_dial_is_as_exact_as_the_viewer(
         place(page, viewer, about)
         for frame in about["frames"][::2]:
             page.evaluate("(s) => dial.set(s)", frame["s"])
-            assert page.evaluate("dial.kept") == pytest.approx(
-                frame["kept"], rel=0.005 if suffix == "spz" else 0
-            )
-            psnr = peak_signal_noise_ratio(
-                read_picture(KIT / frame["picture"]), settled(page), data_range=255
-            )
+            within = 0.005 if suffix == "spz" else 0
+            assert page.evaluate("dial.kept") == pytest.approx(frame["kept"], rel=within)
+            wanted = read_picture(KIT / frame["picture"])
+            psnr = peak_signal_noise_ratio(wanted, settled(page), data_range=255)
             undialled = undialled or psnr
             assert psnr > max(undialled - 1, 25), (frame["s"], psnr, undialled)
             if viewer == "spark":  # drops opacities below its 8 bits

@@ -124,10 +124,11 @@ def test_the_dial_follows_a_load_that_is_switched_on_and_off(held: Shown) -> Non
     assert "s = 5, the largest trained value, is too slow" in held.text("#target-note")
     turned(held, 1)
     assert dial_of(held) < 5 and held.text("#target-note") == ""
-    change = "(rate) => { rate.value = 30; rate.dispatchEvent(new Event('change')); }"
-    frames(held, f"({change})(document.getElementById('rate'))")  # more time for a frame
+    rate = "document.getElementById('rate')"
+    # more time for a frame
+    frames(held, f"({rate}.value = 30, {rate}.dispatchEvent(new Event('change')))")
     assert dial_of(held) == 1
-    held.page.evaluate("document.getElementById('rate').value = 60")
+    held.page.evaluate(f"{rate}.value = 60")
 
 
 def test_the_dial_by_hand_ends_it(simulated: Shown) -> None:

@@ -43,9 +43,8 @@ def test_parts_are_built_from_these_sources() -> None:
     if not web.is_dir():
         pytest.skip("only a checkout contains the sources of the page")
     lines = (VIEWER / "static" / "SOURCES.sha256").read_text("utf-8").splitlines()
-    listed = {
-        (web / name).resolve(): digest for digest, name in (line.split("  ") for line in lines)
-    }
+    pairs = (line.split("  ") for line in lines)
+    listed = {(web / name).resolve(): digest for digest, name in pairs}
     assert {path for path in (web / "src").rglob("*.*") if path.is_file()} <= set(listed)
     for path, digest in listed.items():
         assert hashlib.sha256(path.read_bytes()).hexdigest() == digest, (
@@ -144,13 +143,10 @@ def test_a_page_of_one_file(
 
 def test_a_file_without_sigma_d_has_no_dial(show: Any, save: Any, plain: Gaussians) -> None:
     """The page shows the reason, and the file's name as text; a name does not end its element."""
-    config = b"".join(
-        page.document(page.page_config([{"name": f"</script>{NAME}"}], None, [], 1.0))
-    ).decode()
-    assert (
-        json.loads(re.findall('id="clod-config">(.*?)</script>', config)[0])["title"]
-        == f"</script>{NAME}"
-    )
+    title = f"</script>{NAME}"
+    document = page.document(page.page_config([{"name": title}], None, [], 1.0))
+    (config,) = re.findall('id="clod-config">(.*?)</script>', b"".join(document).decode())
+    assert json.loads(config)["title"] == title
     shown = show(save(plain, NAME))
     assert shown.text("#title") == NAME
     assert shown.page.title() == NAME

@@ -192,36 +192,32 @@ def test_other_files_are_errors_and_the_picture_stays(
     assert np.array_equal(shown.picture(), before)
 
 
-def test_other_forms_of_the_dial_are_refused_with_a_remedy(
-    shown: Shown, model: Path, tmp_path: Path
-) -> None:
+def test_other_forms_of_the_dial_are_refused_with_a_remedy(shown, model, tmp_path):
     """The paper's, and that of files from before every Gaussian had a reach; by comments, columns
     and documents.
     """
     loaded = load(model)
-    paper = replace(loaded.gaussians.attenuation, form="paper")
-    write(tmp_path / "paper.spz", loaded.gaussians.replace(attenuation=paper))
+    attenuation = replace(loaded.gaussians.attenuation, form="paper")
+    paper = loaded.gaussians.replace(attenuation=attenuation)
+    write(tmp_path / "paper.spz", paper)
     ours = b"comment clod_adapter form ours\n"
     column = b"property float nx\n"
     data = model.read_bytes()
     assert ours in data and column in data
     of_paper = "without --form paper"
     earlier = "its dial is of an earlier form; adapt its checkpoint again"
+    with_column = data.replace(ours, b"").replace(column, b"property float clod_tau\n")
     for name, content, error in (
         ("paper.spz", (tmp_path / "paper.spz").read_bytes(), of_paper),
         ("paper.ply", data.replace(ours, b"comment clod_adapter form paper\n"), of_paper),
-        (
-            "column.ply",
-            data.replace(ours, b"").replace(column, b"property float clod_tau\n"),
-            earlier,
-        ),
+        ("column.ply", with_column, earlier),
         ("comment.ply", data.replace(ours, b"comment clod_adapter cut soft\n"), earlier),
     ):
         drop(shown, name, content)
         said = message(shown, name)
-        assert error in said and "opens every format" not in said, (name, said)
+        assert error in said and "opens every format" not in said, name
     with rejects("the paper's form, which viewers do not draw; adapt it without --form paper"):
-        Payload.of(replace(loaded, gaussians=loaded.gaussians.replace(attenuation=paper)))
+        Payload.of(replace(loaded, gaussians=paper))
 
 
 def test_the_last_of_two_dropped_files_is_shown(

@@ -3,7 +3,9 @@ pictures, videos.
 """
 
 import io
+from collections.abc import Sequence
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +29,13 @@ from shown import TALL, Shown, drop, fold, take
 
 def differ(one: np.ndarray, other: np.ndarray) -> bool:
     return bool(np.abs(one.astype(int) - other).mean() > 0.3)
+
+
+def photographed(folder: Path, cameras: Sequence[Camera]) -> list[Camera]:
+    """Cameras with names, written to a folder as those of photographs."""
+    named = [replace(camera, name=f"{k}.jpg") for k, camera in enumerate(cameras)]
+    write_model(folder, named, [camera.name for camera in named])
+    return named
 
 
 def test_keys_move_the_dial(shown: Shown) -> None:
@@ -127,17 +136,9 @@ def test_files_and_cameras_are_listed(show: Any, gaussians: Gaussians, tmp_path:
     models = {"a.ply": gaussians, "b.glb": second, "c.ply": scenes.dialled(9, 1, 5)}
     for name, model in models.items():
         write(tmp_path / name, model)
-    cameras = [replace(camera, name=f"{k}.jpg") for k, camera in enumerate(ring(3, 320, 240))]
-    write_model(tmp_path, cameras, [camera.name for camera in cameras])
-    words = [
-        *(tmp_path / name for name in models),
-        "--base",
-        tmp_path / "a.ply",
-        "--images",
-        tmp_path,
-        "--sv",
-        3,
-    ]
+    photographed(tmp_path, ring(3, 320, 240))
+    files = [tmp_path / name for name in models]
+    words = [*files, "--base", files[0], "--images", tmp_path, "--sv", 3]
     shown = show(*words, viewport=TALL)
     assert shown.page.locator("#files option").all_inner_texts() == list(models)
     links = {"0.jpg": shown.link()}
@@ -171,11 +172,8 @@ def test_files_and_cameras_are_listed(show: Any, gaussians: Gaussians, tmp_path:
 
 
 def link(shown: Shown) -> dict[str, np.ndarray]:
-    parts = shown.link().lstrip("#").split("&")
-    return {
-        name: np.array([float(v) for v in text.split(",")])
-        for name, text in (part.split("=") for part in parts)
-    }
+    pairs = (part.split("=") for part in shown.link().lstrip("#").split("&"))
+    return {name: np.array(text.split(","), float) for name, text in pairs}
 
 
 def forward(view: dict[str, np.ndarray]) -> np.ndarray:
@@ -231,8 +229,7 @@ def test_the_up_axis(shown: Shown, show: Any, save: Any, tmp_path: Path) -> None
     assert chosen["up"].tolist() == [0, 0, 1]
     assert abs(chosen["axes"][2]) < 1e-6
     assert forward(chosen)[2] < 0
-    cameras = [replace(camera, name=f"{k}.jpg") for k, camera in enumerate(ring(3, 320, 240))]
-    write_model(tmp_path, cameras, [camera.name for camera in cameras])
+    cameras = photographed(tmp_path, ring(3, 320, 240))
     with_cameras = show(path, "--images", tmp_path)
     assert with_cameras.page.text_content("#up option") == "as in the photographs"
     before = link(with_cameras)["axes"]
@@ -267,22 +264,17 @@ def test_placed_cameras_are_levelled(show: Any, model: Path, tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("photographs", [True, False])
-def test_the_picture_and_the_panel_fit_the_window(
-    show: Any, save: Any, tmp_path: Path, photographs: bool
-) -> None:
+def test_the_picture_and_the_panel_fit_the_window(show, save, tmp_path, photographs):
     """On a phone, also lying, and a desktop: red balls at the picture's corners are not behind the
     panel.
     """
-    camera = replace(scenes.camera(320, 240, off_centre=(0.5, 0.5)), name="0.jpg")
-    corners = torch.tensor([[x, y, 1.0] for x in (13.0, 307.0) for y in (13.0, 227.0)])
+    camera = scenes.camera(320, 240, off_centre=(0.5, 0.5))
+    corners = torch.tensor([[x, y, 1.0] for x, y in product((13.0, 307.0), (13.0, 227.0))])
     where = camera.position + (corners @ torch.linalg.inv(camera.K).T * 3) @ camera.viewmat[:3, :3]
     path = save(points(where, 0.02, [[1.5, -1.7, -1.7]] * 4))
-    write_model(tmp_path, [camera], ["0.jpg"])
-    shown = show(
-        path,
-        *(("--images", tmp_path) if photographs else ()),
-        viewport={"width": 390, "height": 844},
-    )
+    photographed(tmp_path, [camera])
+    words = ("--images", tmp_path) if photographs else ()
+    shown = show(path, *words, viewport={"width": 390, "height": 844})
     for width, height in ((390, 844), (900, 420), (1280, 800)):
         shown.page.set_viewport_size({"width": width, "height": height})
         shown.until(f"document.getElementById('canvas').clientWidth === {width}")
@@ -291,21 +283,17 @@ def test_the_picture_and_the_panel_fit_the_window(
             shown.page.click("#fold")
         shown.page.keyboard.press("0")
         red = shown.picture()[..., 0] > 100
-        box = shown.page.evaluate(
-            "document.getElementById('panel').getBoundingClientRect().toJSON()"
-        )
-        assert box["left"] >= 0
-        assert box["right"] <= width
-        assert box["top"] >= 0
-        assert box["bottom"] <= height
+        panel = "document.getElementById('panel').getBoundingClientRect().toJSON()"
+        box = shown.page.evaluate(panel)
+        assert box["left"] >= 0 and box["right"] <= width
+        assert box["top"] >= 0 and box["bottom"] <= height
         red[int(box["top"]) : int(box["bottom"]), int(box["left"]) : int(box["right"])] = False
-        rows, columns = np.nonzero(red)
-        lower = rows > (rows.min() + rows.max()) / 2
-        right = columns > (columns.min() + columns.max()) / 2
-        assert len({*zip(lower.tolist(), right.tolist(), strict=True)}) == 4, width
-        assert min(rows.min(), columns.min()) > 0
-        assert rows.max() < height - 1
-        assert columns.max() < width - 1
+        places = np.argwhere(red)
+        first = places.min(0)
+        last = places.max(0)
+        corners = places > (first + last) / 2
+        assert len(np.unique(corners, axis=0)) == 4, width
+        assert first.min() > 0 and (last < np.array([height, width]) - 1).all()
 
 
 SELECTED = """() => {

@@ -44,8 +44,7 @@ def turned(capture: Any, tmp_path: Path) -> Path:
     too.
     """
     g = capture.gaussians
-    w, x, y, z = g.quats.unbind(-1)
-    quats = torch.stack([-x, w, -z, y], -1)
+    quats = g.quats[:, [1, 0, 3, 2]] * torch.tensor([-1.0, 1, -1, 1])
     means = g.means * torch.tensor([1.0, -1, -1])
     return capture.write(
         tmp_path / "turned.ply", g.replace(means=means, quats=quats, shN=0 * g.shN)
@@ -66,9 +65,8 @@ def test_cameras_are_moved_into_another_frame_in_every_command(
     # x_file + offset.
     rotation = torch.tensor(frame["rotation"])
     offset = torch.tensor(frame["offset"])
-    centres = torch.tensor(
-        [[view[axis] for axis in "xyz"] for view in report["calibration"]["viewpoints"]]
-    )
+    viewpoints = report["calibration"]["viewpoints"]
+    centres = torch.tensor([(view["x"], view["y"], view["z"]) for view in viewpoints])
     back = frame["scale"] * centres @ rotation.T + offset
     poses = torch.stack(
         [torch.linalg.inv(view.camera.viewmat) for view in load_scene(capture.scene).train]

@@ -144,7 +144,8 @@ def test_adapt(clod: Any, tmp_path: Path) -> None:
     assert [curve["label"] for curve in curves] == ["s = 1", "s = 3", "s = 4"]
     rows = {row["virtual_scale"]: row for row in report["rows"]}
     for curve, dial in zip(curves, (1, 3, 4), strict=True):
-        seconds, psnr = ([point[name] for point in curve["points"]] for name in ("seconds", "psnr"))
+        seconds = [point["seconds"] for point in curve["points"]]
+        psnr = [point["psnr"] for point in curve["points"]]
         assert seconds == sorted(seconds) and len(seconds) == 5  # steps 1, 2, 4, 8 and 16, the end
         assert len(set(psnr)) == 5 and psnr[-1] == rows[dial]["psnr"]  # each of its own time
     trained = report["seconds"]["start"] + report["seconds"]["train"]
