@@ -40,7 +40,7 @@ frame_times.NOISY = math.inf  # whether a note is given depends on the load
 pseudo_views.MANY = 8  # the tests' captures have eight, which are few by the measure of real ones
 
 
-def pytest_sessionstart(session: pytest.Session) -> None:
+def pytest_sessionstart(session: pytest.Session):
     """Compiles the kernels; of several test processes the first does, and the others load them."""
     if run := getattr(session.config, "workerinput", {}).get("testrunuid"):
         with FileLock(Path(tempfile.gettempdir()) / f"clod-{run}.lock"):
@@ -71,7 +71,7 @@ def chromium() -> Iterator[Any]:
 
 
 @pytest.fixture
-def without_splat_transform(monkeypatch: pytest.MonkeyPatch) -> None:
+def without_splat_transform(monkeypatch):
     """Hides splat-transform, which otherwise packs every exported page and takes seconds."""
     monkeypatch.setenv(VARIABLE, "there-is-none")
 
@@ -89,7 +89,7 @@ class Capture:
 
 
 @pytest.fixture(scope="session")
-def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
+def capture(tmp_path_factory) -> Capture:
     """300 Gaussians in Inria's layout, photographed from a circle around them."""
     folder = tmp_path_factory.mktemp("capture")
     scene = folder / "scene"
@@ -117,7 +117,7 @@ def captured() -> tuple[Gaussians, Scene]:
 
 
 @pytest.fixture(scope="session")
-def dialled(capture: Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def dialled(capture: Capture, tmp_path_factory) -> Path:
     """The capture's checkpoint with a dial up to 4 and its calibration, as clod-adapt writes it."""
     path = tmp_path_factory.mktemp("dialled") / "dial.ply"
     words = f"{capture.ply} --images {capture.scene} --iters 12 --max-sv 4 --out {path} --quiet"

@@ -5,7 +5,6 @@ a tensor file.
 import json
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -63,9 +62,7 @@ def adapt(
     st.sampled_from([0, 3, 15]),
     st.booleans(),
 )
-def test_applying_an_adapter_gives_the_result(
-    names: list[str], scale: float, seed: int, bands: int, growth: bool
-) -> None:
+def test_applying_an_adapter_gives_the_result(names, scale, seed, bands, growth):
     base = gaussians(seed=seed, bands=bands)
     adapted = adapt(base, names, scale, seed + 1, growth)
     before = bits(base)
@@ -115,7 +112,7 @@ def test_with_dial_and_detach():
     assert detach(grown) == detach(on) == base and with_dial(grown, sigma_d, CONFIG) == chosen
 
 
-def test_extracting_ignores_a_dial_of_the_base_and_drops_graphs() -> None:
+def test_extracting_ignores_a_dial_of_the_base_and_drops_graphs():
     base = gaussians()
     old = with_dial(base, torch.ones(6), growth_d=torch.ones(6))
     leaves = {name: torch.rand(6).requires_grad_() for name in DIAL}
@@ -196,7 +193,7 @@ def test_adapter_round_trips(tmp_path, n, reference, growth):
     assert first.read_bytes() == second.read_bytes()
 
 
-def test_tensor_files_are_safetensors(tmp_path: Path) -> None:
+def test_tensor_files_are_safetensors(tmp_path):
     """Types in any order, a transposed and an empty tensor, a scalar, text that is not ASCII; for
     all to read.
     """
@@ -238,7 +235,7 @@ CHANGES = (
 )
 
 
-def test_invalid_files_are_refused(tmp_path: Path) -> None:
+def test_invalid_files_are_refused(tmp_path):
     path = tmp_path / "a"
     save_adapter(path, adapter())
     with safe_open(path, framework="pt") as file:
@@ -268,7 +265,7 @@ def test_invalid_files_are_refused(tmp_path: Path) -> None:
             load_adapter(path)
 
 
-def test_config_must_be_json_and_version_is_kept(tmp_path: Path) -> None:
+def test_config_must_be_json_and_version_is_kept(tmp_path):
     for value in ({1, 2}, torch.ones(1), float("nan"), object()):
         with rejects("not plain JSON"):
             save_adapter(tmp_path / "a", adapter(config={"x": value}))

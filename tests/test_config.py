@@ -5,8 +5,6 @@ adapter and PLY.
 import math
 import re
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -45,7 +43,7 @@ TABLES = {
 
 
 @pytest.mark.parametrize("kind", TABLES)
-def test_impossible_values_are_named(kind: type) -> None:
+def test_impossible_values_are_named(kind):
     for name, values in TABLES[kind].items():
         for value in values:
             with rejects(re.escape(f"{name} is {value}, it must be ")):
@@ -53,20 +51,20 @@ def test_impossible_values_are_named(kind: type) -> None:
 
 
 @pytest.mark.parametrize("kind", TABLES)
-def test_values_of_other_types_are_named(kind: type) -> None:
+def test_values_of_other_types_are_named(kind):
     for name, default in vars(kind()).items():
         for value in ([1], 10**400, {}, b"5", *(["5"] if not isinstance(default, str) else [])):
             with rejects(re.escape(f"{name} is {value}, it must be ")):
                 kind(**{name: value})
 
 
-def test_limits_are_accepted() -> None:
+def test_limits_are_accepted():
     edges = {"max_sv": 1.0, "iters": 0, "time_budget": 0.1, "start_share": 1.0, "exponent": 0.1}
     AdaptConfig(**edges, reg_weight=0.0, ssim_weight=1.0, lr_means=0.0)
 
 
 @pytest.mark.parametrize("kind", TABLES)
-def test_every_field_has_help_and_a_default(kind: type) -> None:
+def test_every_field_has_help_and_a_default(kind):
     texts = field_descriptions(kind)
     assert all(len(text) > 10 and text == text.strip().rstrip(".") for text in texts.values())
     assert list(texts) == list(vars(kind()))
@@ -110,7 +108,7 @@ def tables(draw: st.DrawFn) -> Calibration:
     deadline=None, max_examples=6, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 @given(tables())
-def test_round_trips(tmp_path: Path, calibration: Calibration) -> None:
+def test_round_trips(tmp_path, calibration):
     base = gaussians(4, 0, 0)
     dialled = with_dial(base, torch.ones(4))
     save(tmp_path / "a.ply", dialled, calibration=calibration)
@@ -158,7 +156,7 @@ PLACE = Viewpoint(1.5, 2.5, 3.5, 4.5, look_z=1.0, up_y=-1.0, fov=0.8)
         *((PLACE, bad, "the direction of a viewpoint is") for bad in ({"up_x": 7.0}, {"fov": -1})),
     ],
 )
-def test_bad_values_are_refused(good: Any, bad: dict[str, Any], said: str) -> None:
+def test_bad_values_are_refused(good, bad, said):
     with rejects(said):
         replace(good, **bad)
 

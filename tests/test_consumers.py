@@ -78,11 +78,11 @@ def objective_of_far_ones(model: Gaussians) -> list[Any]:
     return objective(CONFIG)(with_near(detach(model), far))
 
 
-def budget(**given: Any) -> Callable[[Gaussians], list[Any]]:
+def budget(**given) -> Callable[[Gaussians], list[Any]]:
     return lambda model: [dial_for(model, keep=float(n), **given).virtual_scale for n in (20, 25)]
 
 
-def baked(**given: Any) -> Callable[[Gaussians], list[Any]]:
+def baked(**given) -> Callable[[Gaussians], list[Any]]:
     return lambda model: list(bake(model, DIAL, **given).tensors().values())
 
 
@@ -146,7 +146,7 @@ WITHOUT_GROWTH = {"order_by_extinction", *(name for name in CONSUMERS if "dial_f
 
 
 @pytest.mark.parametrize("name", CONSUMERS)
-def test_everything_grows_by_one_function(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_everything_grows_by_one_function(name, monkeypatch):
     """Other factors change whatever draws by the default ``draw`` (tests/rasterizers/test_dial.py),
     and no count.
     """
@@ -162,14 +162,14 @@ def test_everything_grows_by_one_function(name: str, monkeypatch: pytest.MonkeyP
 SHORT = replace(CONFIG, iters=1)
 
 
-def on_the_cpu(*given: Any) -> tuple[Tensor, ...]:
+def on_the_cpu(*given) -> tuple[Tensor, ...]:
     """The CPU's kernels in place of gsplat's, which take long in torch on the simulated device."""
     moved = [each.cpu() if isinstance(each, Tensor) else each for each in given]
     return tuple(each.to(given[0].device) for each in cpu.rasterize(*moved))
 
 
 @pytest.fixture
-def there(monkeypatch: pytest.MonkeyPatch) -> Iterator[Gaussians]:
+def there(monkeypatch) -> Iterator[Gaussians]:
     """Gaussians with a dial, on the device."""
     pytest.importorskip("gsplat", reason="pip install gsplat==1.5.3")
     if torch.cuda.is_available():
@@ -205,9 +205,7 @@ RUNS = CONSUMERS | {
 
 
 @pytest.mark.parametrize("name", RUNS)
-def test_results_are_there_and_those_of_the_cpu(
-    there: Gaussians, name: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_results_are_there_and_those_of_the_cpu(there, name, monkeypatch):
     """To the difference of two rasterizers."""
     if name in ("render", "objective"):
         monkeypatch.setitem(BACKENDS, "gpu", lambda: Rasterizer(cuda.rasterize))
@@ -230,9 +228,7 @@ def test_training_stays_there(there, monkeypatch):
     assert all(taken > 0 for _, taken in frame_times(there, CAMERAS[:1])[0])
 
 
-def test_a_step_waits_for_the_device_once(
-    there: Gaussians, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_step_waits_for_the_device_once(there, monkeypatch):
     """At its end, for the loss; the rasterizer aside: gsplat itself asks how many rows and tiles
     there are.
     """

@@ -9,7 +9,6 @@ import sys
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
-from typing import Any
 from unittest.mock import MagicMock
 
 import city
@@ -32,7 +31,7 @@ EXAMPLES = {int(path.name[:2]): path for path in sorted(FOLDER.glob("[0-9]*.py")
 
 
 @pytest.fixture
-def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Any:
+def run(tmp_path, monkeypatch, capsys):
     """Runs an example by its number in the test's folder, with 5 steps of training; returns what it
     printed.
     """
@@ -42,7 +41,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureF
         clod_adapter, "adapt", lambda base, scene, config: adapt(base, scene, type(config)(iters=5))
     )
 
-    def start(number: int, *words: object) -> str:
+    def start(number: int, *words) -> str:
         monkeypatch.setattr(sys, "argv", [EXAMPLES[number].name, *map(str, words)])
         runpy.run_path(str(EXAMPLES[number]), run_name="__main__")
         return capsys.readouterr().out
@@ -50,7 +49,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureF
     return start
 
 
-def test_training_and_rendering(run: Any, capture: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_training_and_rendering(run, capture, monkeypatch):
     """Pictures by the library, by gsplat, with torch in place of its kernels, and by a renderer of
     one's own.
     """
@@ -58,7 +57,7 @@ def test_training_and_rendering(run: Any, capture: Any, monkeypatch: pytest.Monk
     printed = run(1, capture.ply, capture.scene, "dial.ply")
     assert "dial 5:" in printed and clod_adapter.load("dial.ply").gaussians.sigma_d is not None
 
-    def by_gsplat() -> str:
+    def by_gsplat():
         runpy.run_path(str(EXAMPLES[3]))["main"]("dial.ply", str(capture.scene), "cpu")
         return "of 300 Gaussians"
 
@@ -94,9 +93,7 @@ def test_budgets(run, dialled, capture):
     assert "(beyond s = 4, " in printed[2]
 
 
-def test_adapter_is_applied_and_removed(
-    run: Any, dialled: Path, capture: Any, tmp_path: Path
-) -> None:
+def test_adapter_is_applied_and_removed(run, dialled, capture, tmp_path):
     printed = run(6, capture.ply, dialled.with_suffix(".safetensors"), "again.ply")
     assert "changed: sigma_d, far Gaussians" in printed and f"{capture.ply}, bit for bit" in printed
     assert (tmp_path / "again.ply").read_bytes() == dialled.read_bytes()
@@ -107,12 +104,7 @@ def test_adapter_is_applied_and_removed(
     assert not (tmp_path / "other_again.ply").exists()
 
 
-def test_a_loop_of_gsplat_trains_a_dial(
-    capture: Any,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_a_loop_of_gsplat_trains_a_dial(capture, tmp_path, monkeypatch, capsys):
     """With torch in place of its kernels; in at most 20 lines more than the loop has without a
     dial.
     """
@@ -132,9 +124,7 @@ def test_a_loop_of_gsplat_trains_a_dial(
     assert len(rows) == 2 and model.growth_d.abs().max() > 0.05 and len(model) == 300
 
 
-def test_the_slider_turns_the_dial_while_it_trains(
-    run: Any, capture: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_slider_turns_the_dial_while_it_trains(run, capture, monkeypatch):
     """With mocks in place of viser; it is interrupted in the third step."""
     viser = MagicMock()
     monkeypatch.setitem(sys.modules, "viser", viser)
@@ -156,7 +146,7 @@ def test_the_slider_turns_the_dial_while_it_trains(
     assert not torch.equal(written.means, capture.gaussians.means)
 
 
-def test_bad_arguments_are_refused(run: Any) -> None:
+def test_bad_arguments_are_refused(run):
     for number in (1, 2, 5, 6):
         with pytest.raises(SystemExit, match=f"python examples/{EXAMPLES[number].name}"):
             run(number)
@@ -164,7 +154,7 @@ def test_bad_arguments_are_refused(run: Any) -> None:
             run(number, "missing.ply", "nowhere")
 
 
-def test_the_readme_lists_every_example() -> None:
+def test_the_readme_lists_every_example():
     listed = re.findall(r"\]\((.+?)\)", (FOLDER / "README.md").read_text("utf-8"))
     assert listed == [path.name for path in EXAMPLES.values()]
     assert list(EXAMPLES) == list(range(1, len(EXAMPLES) + 1))
@@ -184,12 +174,12 @@ def test_a_written_town_can_be_loaded_and_trained(tmp_path):
     assert truth > 45 > 35 > quality > 15
 
 
-def test_a_table_is_markdown() -> None:
+def test_a_table_is_markdown():
     lines = common.table(["scene", "dB"], [["plush", 29.0], ["banana", 25.8]], 1).splitlines()
     assert lines == ["| scene | dB |", "|---|---:|", "| plush | 29.0 |", "| banana | 25.8 |"]
 
 
-def test_a_process_is_timed_by_its_messages() -> None:
+def test_a_process_is_timed_by_its_messages():
     code = (
         "import sys, time; print('half', file=sys.stderr, flush=True); time.sleep(1.5);"
         " print('done')"
@@ -203,7 +193,7 @@ def test_a_process_is_timed_by_its_messages() -> None:
         common.Process([sys.executable, "-c", "raise SystemExit(3)"])
 
 
-def test_an_exponent_is_that_of_the_power() -> None:
+def test_an_exponent_is_that_of_the_power():
     assert scaling.exponent([(n, 3 * n**0.5) for n in scaling.SIZES]) == pytest.approx(0.5)
 
 
@@ -221,7 +211,7 @@ def test_plush_and_city_small(monkeypatch, tmp_path):
     assert frames[0]["kept"] > frames[1]["kept"] and frames[0]["psnr_full"] > frames[1]["psnr_full"]
 
 
-def test_hostile_surroundings(capture: Any) -> None:
+def test_hostile_surroundings(capture):
     every = (*hostile.streams(), *hostile.folders(), *hostile.options(), *hostile.environments())
     cases = [case for case in every if "--json >&-" in case.line or "cd gone" in case.line]
     found = {case.line: hostile.failures(case, inputs=Path(capture.ply).parent) for case in cases}

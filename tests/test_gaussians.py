@@ -77,7 +77,7 @@ def test_halved_views_are_means_of_four_pixels():
     assert errors[1] < errors[0] / 4
 
 
-def test_arrays_become_tensors() -> None:
+def test_arrays_become_tensors():
     view = photograph(gaussians(5, 0, 0), ring(1, 20, 16))[0]
     arrays = view.camera.viewmat.double().numpy(), view.camera.K.double().numpy()
     again = View(Camera(*arrays, 20, 16), view.image.numpy()[:, ::-1])
@@ -91,7 +91,7 @@ def test_arrays_become_tensors() -> None:
 CONFIG = AttenuationConfig()
 
 
-def plain(**changes: object) -> Gaussians:
+def plain(**changes) -> Gaussians:
     return gaussians(5, 2, 0).replace(**changes)
 
 
@@ -99,7 +99,7 @@ def adapted() -> Gaussians:
     return plain(sigma_d=torch.arange(5.0), attenuation=CONFIG)
 
 
-def test_wrong_shapes_are_named() -> None:
+def test_wrong_shapes_are_named():
     for name, shape in (
         ("means", (5, 2)),
         ("quats", (5, 3)),
@@ -120,7 +120,7 @@ def test_wrong_shapes_are_named() -> None:
 
 
 @pytest.mark.parametrize("degree, used", [(0, 0), (1, 0), (2, 1), (3, 3), (4, 1)])
-def test_empty_sh_degrees_are_removed(degree: int, used: int) -> None:
+def test_empty_sh_degrees_are_removed(degree, used):
     """The highest degrees that are 0 are removed; one coefficient keeps its degree and all
     below.
     """
@@ -134,7 +134,7 @@ def test_empty_sh_degrees_are_removed(degree: int, used: int) -> None:
     assert found is some if used == degree else torch.equal(found.means, some.means)
 
 
-def test_rows_by_brackets() -> None:
+def test_rows_by_brackets():
     some = adapted()
     for rows, wanted in (
         (slice(3), [0, 1, 2]),
@@ -154,12 +154,12 @@ def test_rows_by_brackets() -> None:
 @pytest.mark.parametrize(
     "rows", [2, torch.ones(4, dtype=torch.bool), [5], torch.zeros(2, 2, dtype=torch.long)]
 )
-def test_other_rows_are_refused(rows: object) -> None:
+def test_other_rows_are_refused(rows):
     with rejects("give a slice, indices .M. or a mask .5.|there are 5 Gaussians, and index 5"):
         adapted()[rows]
 
 
-def test_gaussians_are_compared_as_a_whole() -> None:
+def test_gaussians_are_compared_as_a_whole():
     some = adapted()
     assert some == some.replace(
         **{name: value.double().numpy() for name, value in some.tensors().items()}
@@ -176,7 +176,7 @@ def test_gaussians_are_compared_as_a_whole() -> None:
         assert (some == other) is False
 
 
-def test_repr_is_short_and_devices_have_names() -> None:
+def test_repr_is_short_and_devices_have_names():
     some = adapted()
     assert repr(plain()) == "Gaussians(5, SH degree 2, no dial, cpu)"
     assert (

@@ -6,8 +6,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise, product
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -22,7 +20,7 @@ from scenes import camera, gaussians, seeded
 N = 200
 
 
-def adapted(**settings: Any) -> Gaussians:
+def adapted(**settings) -> Gaussians:
     plain = gaussians(N, 1, 0)
     sigma_d, growth_d = torch.rand(2, N, generator=seeded(1)) * 1.5
     attenuation = AttenuationConfig(scene_distance=3.0, **settings)
@@ -33,7 +31,7 @@ def hook_of(model: Gaussians, virtual_scale: float = 3.0) -> Hook:
     return Hook(model.sigma_d, model.attenuation, virtual_scale, model.growth_d)
 
 
-def test_mixed_and_strided_arrays_are_accepted() -> None:
+def test_mixed_and_strided_arrays_are_accepted():
     """Mixed numpy and torch, integers, negative strides, the other byte order, and lists."""
     model = adapted(form="paper")
     size = (64, 48)
@@ -75,7 +73,7 @@ def test_gradients_reach_opacities_sigma_d_and_growth_d_only():
     assert torch.autograd.grad(total, [means, viewmat], allow_unused=True) == (None, None)
 
 
-def test_bad_arguments_are_refused(tmp_path: Path) -> None:
+def test_bad_arguments_are_refused(tmp_path):
     model = adapted(form="paper")
     view = camera()
     with rejects("the paper's form needs K, width and height"):
@@ -89,7 +87,7 @@ def test_bad_arguments_are_refused(tmp_path: Path) -> None:
         clod_adapter.load(tmp_path / "plain.ply").hook(virtual_scale=3)
 
 
-def test_hold_moves_the_dial_by_the_times_it_takes() -> None:
+def test_hold_moves_the_dial_by_the_times_it_takes():
     start = hook_of(adapted(), 2.0)
     hold = start.hold(milliseconds=10)
     for _ in range(8):

@@ -57,7 +57,7 @@ def test_rendering_no_gaussians():
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_a_dial_of_0_shows_the_file_without_its_dial(form: str) -> None:
+def test_a_dial_of_0_shows_the_file_without_its_dial(form):
     own = dialled(400, 1, 3, form=form).replace(growth_d=torch.linspace(0, 1, 400))
     view = camera()
     found = render(own, view, 0.0).image
@@ -76,7 +76,7 @@ def test_a_dial_of_0_shows_the_file_without_its_dial(form: str) -> None:
 WORLD = AttenuationConfig(scene_distance=4.0)
 
 
-def test_a_dial_without_effect_changes_nothing() -> None:
+def test_a_dial_without_effect_changes_nothing():
     some = gaussians(50, 0, 1)
     # more than opaque is left, no number is not
     some.opacity_logits[:2] = torch.tensor([22.0, math.inf])
@@ -96,7 +96,7 @@ def spread(**settings: str) -> Gaussians:
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_baked_image_matches_render_from_its_camera(form: str) -> None:
+def test_baked_image_matches_render_from_its_camera(form):
     some = spread(form=form)
     want = render(some, camera(), 2.5)
     baked = bake(some, 2.5, camera())
@@ -128,7 +128,7 @@ def test_several_cameras_share_one_distance_per_gaussian():
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_autocast_changes_nothing(form: str) -> None:
+def test_autocast_changes_nothing(form):
     some = spread(form=form)
     view = camera()
     for rasterizer in (None, Rasterizer(reference.rasterize)):
@@ -141,7 +141,7 @@ def test_autocast_changes_nothing(form: str) -> None:
 NO_DIALS = (-0.001, math.inf, math.nan, "5", None, [1.0], torch.ones(2), 10**400)
 
 
-def test_bad_arguments_are_refused() -> None:
+def test_bad_arguments_are_refused():
     some = spread()
     plain = gaussians(3, 0, 0)
     wrong = "a.ply"
@@ -183,7 +183,7 @@ Drawing = Callable[..., Any]
 
 
 @pytest.fixture
-def draws(monkeypatch: pytest.MonkeyPatch) -> dict[str, Drawing]:
+def draws(monkeypatch) -> dict[str, Drawing]:
     """The drop-ins for gsplat and for Inria's rasterizer, and the renderer, called with arguments
     of the dial alone.
     """
@@ -221,7 +221,7 @@ def draws(monkeypatch: pytest.MonkeyPatch) -> dict[str, Drawing]:
 
 
 @pytest.mark.parametrize("name", ["gsplat", "inria", "render"])
-def test_a_dial_value_without_a_dial_is_warned_of(draws: dict[str, Drawing], name: str) -> None:
+def test_a_dial_value_without_a_dial_is_warned_of(draws, name):
     message = "virtual_scale is 3, but there is no sigma_d: all .* drawn as they are"
     with pytest.warns(UserWarning, match=message) as told:
         draws[name](virtual_scale=3)

@@ -43,7 +43,7 @@ def in_world(views: Sequence[View], scale: float, rotation: Tensor, offset: Tens
     return posed(views, lambda pose: into_file(pose.double()[None], *back)[0])
 
 
-def test_an_aligned_file_fits_under_any_exposure(pair: tuple[Gaussians, list[View]]) -> None:
+def test_an_aligned_file_fits_under_any_exposure(pair):
     base, views = pair
     found = check_alignment(base, views)
     assert found.fits and not found.on_white and found.views == 8
@@ -55,7 +55,7 @@ def test_an_aligned_file_fits_under_any_exposure(pair: tuple[Gaussians, list[Vie
     assert check_alignment(base, darker).fits
 
 
-def test_measures_match_their_definitions(pair: tuple[Gaussians, list[View]]) -> None:
+def test_measures_match_their_definitions(pair):
     base, views = pair
     wrong = base.replace(means=base.means.roll(1, 1))
     found = check_alignment(wrong, views)
@@ -88,7 +88,7 @@ def rounded(number: re.Match[str]) -> str:
 
 
 @pytest.mark.parametrize("says", FRAMES)
-def test_another_frame_is_named(pair: tuple[Gaussians, list[View]], says: str) -> None:
+def test_another_frame_is_named(pair, says):
     base, views = pair
     elsewhere = FRAMES[says](views)
     found = check_alignment(base, elsewhere)
@@ -102,7 +102,7 @@ def test_another_frame_is_named(pair: tuple[Gaussians, list[View]], says: str) -
     assert check_alignment(base, back.train).psnr > check_alignment(base, views).psnr - 1
 
 
-def test_frames_of_trainers(pair: tuple[Gaussians, list[View]]) -> None:
+def test_frames_of_trainers(pair):
     _, views = pair
     viewmats = torch.stack(
         [v.camera.viewmat.double() for v in in_world(views, 3.0, FLIP, NONE + 2)]
@@ -152,7 +152,7 @@ def seen_with(name: str, views: int = 5) -> tuple[Gaussians, tuple[View, ...]]:
 
 
 @pytest.mark.parametrize("name, expected", [("off", "on"), ("on", "mip"), ("mip", "off")])
-def test_the_filter_of_the_photographs_is_found(name: str, expected: str) -> None:
+def test_the_filter_of_the_photographs_is_found(name, expected):
     base, views = seen_with(name)
     chosen, psnr = compare_filters(base, views, expected)
     (row,) = evaluate(base.replace(screen_filter=FILTERS["mip"]), views, [1.0])
@@ -160,7 +160,7 @@ def test_the_filter_of_the_photographs_is_found(name: str, expected: str) -> Non
     assert chosen == name == max(psnr, key=psnr.__getitem__) and psnr.keys() == FILTERS.keys()
 
 
-def test_expected_filter_is_kept_without_a_clear_difference() -> None:
+def test_expected_filter_is_kept_without_a_clear_difference():
     """The Gaussians are so large that filters hardly change them."""
     truth = gaussians(100, 0, 2, size=0.4)
     views = photograph(truth.replace(screen_filter=FILTERS["on"]), ring(4, 48, 36))
@@ -168,7 +168,7 @@ def test_expected_filter_is_kept_without_a_clear_difference() -> None:
     assert all(compare_filters(base, views, expected)[0] == expected for expected in FILTERS)
 
 
-def test_a_filter_must_be_better_in_most_views() -> None:
+def test_a_filter_must_be_better_in_most_views():
     """Two of five photographs have another filter, which is better in the mean but not in most
     views.
     """

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import redirect_stderr, redirect_stdout
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import pytest
 
@@ -33,7 +33,7 @@ def signals_arrive() -> Iterator[None]:
 
 
 @pytest.fixture(autouse=True)
-def shorter(monkeypatch: pytest.MonkeyPatch) -> None:
+def shorter(monkeypatch):
     """Cameras are placed for small images, few are added, and the search for another frame gives up
     early.
     """
@@ -45,7 +45,7 @@ def shorter(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def few_placed(monkeypatch: pytest.MonkeyPatch) -> None:
+def few_placed(monkeypatch):
     """Without photographs 16 cameras are placed."""
     few = partial(pseudo_views.place_cameras, views=16)
     monkeypatch.setattr(pseudo_views, "place_cameras", few)
@@ -58,12 +58,12 @@ class Done(NamedTuple):
     err: str
 
     @property
-    def report(self) -> Any:
+    def report(self):
         """The object of ``--json``."""
         return json.loads(self.out)
 
     @property
-    def output(self) -> Any:
+    def output(self):
         """The one output of ``--json``."""
         (output,) = self.report["outputs"]
         return output
@@ -75,7 +75,7 @@ class Done(NamedTuple):
 
 
 @pytest.fixture(scope="session")
-def run_in(capture: Any, dialled: Path) -> Callable[..., Done]:
+def run_in(capture, dialled: Path) -> Callable[..., Done]:
     """Runs ``clod-adapt`` in a folder, in this process, to the exit code ``code``; it ``accept``s
     its loss.
 
@@ -84,7 +84,7 @@ def run_in(capture: Any, dialled: Path) -> Callable[..., Done]:
     places = (capture.ply, capture.scene, dialled, dialled.with_suffix(".safetensors"))
     shared = dict(zip(("BASE", "SCENE", "DIAL", "ADAPTER"), places, strict=True))
 
-    def run(folder: Path, *words: object, code: int = 0, accept: bool = True) -> Done:
+    def run(folder: Path, *words, code: int = 0, accept: bool = True) -> Done:
         out = io.StringIO()
         err = io.StringIO()
         given = []
@@ -105,16 +105,14 @@ def run_in(capture: Any, dialled: Path) -> Callable[..., Done]:
 
 
 @pytest.fixture
-def clod(
-    run_in: Callable[..., Done], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> Callable[..., Done]:
+def clod(run_in: Callable[..., Done], tmp_path, monkeypatch) -> Callable[..., Done]:
     """``run_in`` with the test's folder, which is the current one."""
     monkeypatch.chdir(tmp_path)
     return partial(run_in, tmp_path)
 
 
 @pytest.fixture
-def blank_figure(monkeypatch: pytest.MonkeyPatch) -> None:
+def blank_figure(monkeypatch):
     """Replaces the figure of ``clod-adapt robustness``, which takes a second to draw, by an empty
     file.
     """

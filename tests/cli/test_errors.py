@@ -13,7 +13,6 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import pytest
 from PIL import Image
@@ -26,7 +25,7 @@ from runs import contents
 
 
 @pytest.fixture(scope="module")
-def folder(capture: Any, dialled: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(capture, dialled: Path, tmp_path_factory) -> Path:
     """Two scenes, a checkpoint, the files of an adapted one, a dial without calibration, and files
     of other kinds.
     """
@@ -244,13 +243,13 @@ ERRORS = [
 
 
 @pytest.mark.parametrize("line, said, existing", [(*row, "")[:3] for row in ERRORS])
-def test_errors(run_in: Any, folder: Path, line: str, said: str, existing: str) -> None:
+def test_errors(run_in, folder, line, said, existing):
     """The line is the last one of stderr; with --json also the one object on stdout."""
     with given(folder, existing):
         refused(run_in, folder, said, line)
 
 
-def refused(run_in: Any, folder: Path, said: str, line: str) -> None:
+def refused(run_in, folder: Path, said: str, line: str):
     before = contents(folder)
     done = run_in(folder, line, code=2)
     (error,) = (each for each in done.err.splitlines() if "error" in each)
@@ -280,9 +279,7 @@ def outputs_of(line: str) -> Outputs:
         ("export dial.ply -o two.ply", "export dial.ply -o two.spz", ""),
     ],
 )
-def test_two_runs_at_once(
-    run_in: Any, folder: Path, monkeypatch: Any, first: str, second: str, said: str
-) -> None:
+def test_two_runs_at_once(run_in, folder, monkeypatch, first, second, said):
     monkeypatch.chdir(folder)
     with claimed(outputs_of(first)):
         if said:
@@ -292,7 +289,7 @@ def test_two_runs_at_once(
                 pass
 
 
-def test_earlier_outputs_are_replaced(clod: Any, dialled: Path, tmp_path: Path) -> None:
+def test_earlier_outputs_are_replaced(clod, dialled, tmp_path):
     """And a foreign file, if the command line names it."""
     for suffix in (".safetensors", ".json"):
         shutil.copy(dialled.with_suffix(suffix), tmp_path / f"out{suffix}")
@@ -315,7 +312,7 @@ view base.ply --device-preset phone
 """
 
 
-def test_help_errors_and_inspect_do_not_import_torch(folder: Path) -> None:
+def test_help_errors_and_inspect_do_not_import_torch(folder):
     """``--help`` not even numpy, which takes 0.1 s. Idle threads of OpenMP are set to wait before
     torch reads that.
     """

@@ -8,7 +8,6 @@ from dataclasses import replace
 from itertools import product
 from pathlib import Path
 from statistics import fmean
-from typing import Any
 
 import numpy as np
 import pytest
@@ -107,7 +106,7 @@ def test_against_at_matched_counts(clod, capture, dialled, tmp_path):
         assert entry["ours"]["kept"] == pytest.approx(row["kept"], rel=2e-3)
 
 
-def test_interrupt_keeps_finished_comparisons(clod: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_interrupt_keeps_finished_comparisons(clod, monkeypatch):
     monkeypatch.setattr(module, "evaluate", pressing(module.evaluate, signal.SIGINT, at=3))
     report = clod(EVAL, "--sv 1 2 --base BASE --popping").report
     assert report["interrupted"] is True and len(report["rows"]) == 2 and report["popping"] == []

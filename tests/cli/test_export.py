@@ -8,7 +8,6 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -53,12 +52,10 @@ elif words != ["--list-gpus"]:
 
 
 @pytest.fixture
-def tool(
-    tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
-) -> Callable[[str], None]:
+def tool(tmp_path_factory, monkeypatch) -> Callable[[str], None]:
     """A stand-in for splat-transform that stores its arguments and runs ``behave``."""
 
-    def make(behave: str = "pass") -> None:
+    def make(behave: str = "pass"):
         script = tmp_path_factory.mktemp("tool") / "tool.py"
         script.write_text(TOOL.replace("BEHAVE", behave))
         monkeypatch.setenv("CLOD_SPLAT_TRANSFORM", shlex.join([sys.executable, str(script)]))
@@ -66,7 +63,7 @@ def tool(
     return make
 
 
-def baked(path: Path | str, s: float) -> Any:
+def baked(path: Path | str, s: float):
     model = load(path)
     return bake(model.gaussians, s, cameras=model.viewpoints)
 
@@ -126,7 +123,7 @@ def camera_003(cameras: Sequence[Camera]) -> Camera:
     return next(camera for camera in cameras if camera.name == "003.png")
 
 
-def test_levels(clod: Any, dialled: Path, tmp_path: Path) -> None:
+def test_levels(clod, dialled, tmp_path):
     outputs = clod(EXPORT, "--levels 1,2.5,4 -o some.set.ply").report["outputs"]
     names = ["some.set_s1.ply", "some.set_s2.5.ply", "some.set_s4.ply"]
     assert files(tmp_path) == names == [output["file"] for output in outputs]
@@ -295,7 +292,7 @@ def test_failure_of_the_tool_leaves_no_file(
     assert done.err.endswith(said) and files(tmp_path) == [], done
 
 
-def test_the_real_tool(clod: Any, dialled: Path, tmp_path: Path) -> None:
+def test_the_real_tool(clod, dialled, tmp_path):
     try:
         splat_transform.SplatTransform.find()
     except ClodError as error:

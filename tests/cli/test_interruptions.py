@@ -34,20 +34,20 @@ ITERS = 24
 
 
 @pytest.fixture(scope="module")
-def words(capture: Any) -> list[str]:
+def words(capture) -> list[str]:
     line = f"{capture.ply} --images {capture.scene} --iters {ITERS} --max-sv 4 --out dial.ply"
     return line.split()
 
 
 @pytest.fixture(scope="module")
-def undisturbed(server: Server, words: list[Any], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def undisturbed(server: Server, words: list[Any], tmp_path_factory) -> Path:
     """The folder of an uninterrupted run."""
     folder = tmp_path_factory.mktemp("undisturbed")
     server.run(folder, *words)
     return folder
 
 
-def assert_whole(folder: Path) -> None:
+def assert_whole(folder: Path):
     """Outputs can be read, and all other files have the name of a temporary file."""
     readers = {
         ".json": lambda path: json.loads(path.read_text()),
@@ -62,11 +62,11 @@ def assert_whole(folder: Path) -> None:
             readers[path.suffix](path)
 
 
-def report_in(folder: Path) -> Any:
+def report_in(folder: Path):
     return json.loads((folder / "dial.json").read_text())
 
 
-def assert_same(folder: Path, want: Path) -> None:
+def assert_same(folder: Path, want: Path):
     """The same bits, except measured times, and no other files."""
     assert names(folder) == OUTPUTS, log_of(folder)
     assert results(folder) == results(want)
@@ -76,9 +76,7 @@ def assert_same(folder: Path, want: Path) -> None:
     assert report["steps"] == wanted["steps"] and not report["interrupted"]
 
 
-def test_kills(
-    server: Server, words: list[Any], capture: Any, undisturbed: Path, tmp_path: Path
-) -> None:
+def test_kills(server, words, capture, undisturbed, tmp_path):
     """A run that replaces earlier files is killed soon after a state was saved, and later, and
     resumed.
     """
@@ -194,9 +192,7 @@ def test_interrupts_of_the_measurement(clod, words, tmp_path, monkeypatch):
     assert "Ctrl-C again aborts without writing" in done.err and "interrupted after" in done.err
 
 
-def test_closed_terminal_does_not_end_the_writing(
-    server: Server, words: list[Any], tmp_path: Path
-) -> None:
+def test_closed_terminal_does_not_end_the_writing(server, words, tmp_path):
     """It sends SIGHUP, and writing to it is an error."""
     terminal, other = pty.openpty()
     before = f"os.setsid(); terminal = os.open({os.ttyname(other)!r}, os.O_RDWR); "

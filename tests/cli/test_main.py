@@ -10,7 +10,6 @@ import sys
 import webbrowser
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 from unittest.mock import Mock
 
 import pytest
@@ -51,9 +50,7 @@ BUG = (
         (ImportError("libtorch_cpu.so: failed to map segment from shared object"), 2, LITTLE),
     ],
 )
-def test_errors_of_the_work(
-    clod: Any, monkeypatch: Any, error: BaseException, code: int, said: str
-) -> None:
+def test_errors_of_the_work(clod, monkeypatch, error, code, said):
     """One line, with --json also an object on stdout; below a traceback only where the error is
     ours.
     """
@@ -68,7 +65,7 @@ def test_errors_of_the_work(
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="Linux has this device")
 @pytest.mark.parametrize("words", ["inspect PLY --json", "--help"])
-def test_results_that_cannot_be_printed_are_an_error(capture: Any, words: str) -> None:
+def test_results_that_cannot_be_printed_are_an_error(capture, words):
     command = [
         sys.executable,
         "-m",
@@ -85,7 +82,7 @@ def test_results_that_cannot_be_printed_are_an_error(capture: Any, words: str) -
 
 
 @pytest.mark.parametrize("command", ["", *COMMANDS])
-def test_help(clod: Any, command: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_help(clod, command, monkeypatch):
     """Options are grouped: inputs come first and general options last; none is outside a group."""
     monkeypatch.setenv("COLUMNS", "80")
     done = clod(command, "--help")
@@ -112,7 +109,7 @@ class Terminal(io.StringIO):
         return True
 
 
-def test_bar_fits_the_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bar_fits_the_terminal(monkeypatch):
     monkeypatch.setattr(sys, "stderr", terminal := Terminal())
     monkeypatch.setattr("tqdm.std._screen_shape_wrapper", lambda: lambda file: (30, 24))
     with Console().meter("training") as meter:
@@ -124,9 +121,7 @@ def test_bar_fits_the_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "\n" not in terminal.getvalue() and not lines[-1].strip()  # cleared at the end
 
 
-def test_progress_lines_without_a_terminal(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_progress_lines_without_a_terminal(capsys, monkeypatch):
     now = 0.0
     monkeypatch.setattr(
         "clod_adapter.cli.shared.console.time", SimpleNamespace(perf_counter=lambda: now)
@@ -153,7 +148,7 @@ def test_progress_lines_without_a_terminal(
         assert duration(seconds) == text
 
 
-def test_status_and_quiet(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_status_and_quiet(monkeypatch):
     """A status is shown on a terminal, until the block ends."""
     for quiet, stream in ((False, Terminal()), (True, Terminal()), (False, io.StringIO())):
         monkeypatch.setattr(sys, "stderr", stream)
@@ -169,7 +164,7 @@ def test_status_and_quiet(monkeypatch: pytest.MonkeyPatch) -> None:
 NAMES = ["torch", "cpu", "gsplat", "browser"]
 
 
-def test_lines_of_this_machine(clod: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lines_of_this_machine(clod, monkeypatch):
     for browser, ok in (
         (webbrowser.GenericBrowser("lynx"), "off "),
         (webbrowser.BackgroundBrowser("firefox"), "ok "),
@@ -184,7 +179,7 @@ def test_lines_of_this_machine(clod: Any, monkeypatch: pytest.MonkeyPatch) -> No
     assert last.startswith("rendering and training backends: cpu")
 
 
-def test_json_without_torch() -> None:
+def test_json_without_torch():
     """Run as a module, as by torchrun."""
     code = (
         "import sys, runpy; sys.modules['torch'] = None; sys.argv = ['clod-adapt', 'doctor',"
@@ -210,8 +205,8 @@ def test_json_without_torch() -> None:
 @pytest.mark.parametrize(
     "change", [lambda image: image.roll(1, 1), lambda image: image * torch.nan]
 )
-def test_a_wrong_image_is_reported(clod: Any, monkeypatch: pytest.MonkeyPatch, change: Any) -> None:
-    def rasterize(**given: Any) -> tuple[torch.Tensor, torch.Tensor]:
+def test_a_wrong_image_is_reported(clod, monkeypatch, change):
+    def rasterize(**given):
         image, alpha = reference.rasterize(**given)
         return change(image), alpha
 

@@ -23,7 +23,7 @@ from clod_adapter import demo as gallery
 from clod_adapter.cli.adapt import listeners
 from clod_adapter.cli.adapt import run as adapt_run
 from clod_adapter.evaluation import robustness as experiment
-from clod_adapter.progress import Phase, Progress
+from clod_adapter.progress import Phase
 from clod_adapter.report.page import Picture
 from clod_adapter.training import pseudo_views
 from runs import names, pressed, results
@@ -33,7 +33,7 @@ OUTPUTS = ["robustness.csv", "robustness.json", "robustness.png"]
 
 
 @pytest.fixture
-def run(clod: Any, capture: Any, tmp_path: Path) -> Callable[..., Any]:
+def run(clod, capture, tmp_path) -> Callable[..., Any]:
     """Runs the command on two checkpoints, the second without the faintest Gaussians."""
     shutil.copytree(capture.scene, tmp_path / "scene")
     capture.write(tmp_path / "plain.ply", capture.gaussians)
@@ -43,9 +43,7 @@ def run(clod: Any, capture: Any, tmp_path: Path) -> Callable[..., Any]:
     return partial(clod, "robustness plain.ply masked.ply --images scene --max-sv 3 1 --iters 3")
 
 
-def test_the_command_a_cell_and_python_train_the_same(
-    clod: Any, capture: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_command_a_cell_and_python_train_the_same(clod, capture, monkeypatch):
     """Bit for bit, on few photographs."""
     monkeypatch.setattr(pseudo_views, "MANY", 64)
     clod("BASE --images SCENE --iters 3 --max-sv 3 --out dial.ply")
@@ -61,7 +59,7 @@ def test_the_command_a_cell_and_python_train_the_same(
 
 
 @pytest.mark.usefixtures("few_placed")
-def test_the_command_and_python_train_the_same_without_photographs(clod: Any, capture: Any) -> None:
+def test_the_command_and_python_train_the_same_without_photographs(clod, capture):
     clod("BASE --iters 3 --out dial.ply --accept-loss")
     settings = AdaptConfig(iters=3, max_sv=config.PLACED_MAX_SV)
     adapt_checkpoint(load(capture.ply), config=settings).save("python.ply")
@@ -69,10 +67,10 @@ def test_the_command_and_python_train_the_same_without_photographs(clod: Any, ca
 
 
 @pytest.mark.parametrize("phase", [Phase.EVALUATION, Phase.FRAME_TIMES])
-def test_a_stop_after_training_keeps_the_result(capture: Any, tmp_path: Path, phase: Phase) -> None:
+def test_a_stop_after_training_keeps_the_result(capture, tmp_path, phase):
     trained = []
 
-    def progress(done: Progress) -> bool:
+    def progress(done):
         trained.append(done.phase is Phase.TRAINING)
         return not (any(trained) and done.phase is phase)
 
@@ -164,12 +162,12 @@ def test_interrupted_unfinished_and_changed_cells(run):
 PICTURES = {"dial.png", "curve.png"}
 
 
-def test_demo(clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_demo(clod, capture, tmp_path, monkeypatch):
     """It names its files and the next command, resumes without naming --resume, and reports no
     figure not drawn.
     """
 
-    def unpack(scene: Path, base: Path) -> None:
+    def unpack(scene, base):
         shutil.copytree(capture.scene, scene, dirs_exist_ok=True)
         shutil.copyfile(capture.ply, base)
 
@@ -208,7 +206,7 @@ def test_demo(clod: Any, capture: Any, tmp_path: Path, monkeypatch: pytest.Monke
     assert not PICTURES & {*names(folder)}
 
 
-def test_scene_and_base_of_the_package(tmp_path: Path) -> None:
+def test_scene_and_base_of_the_package(tmp_path):
     """The base is trained to its end, and packing it and the photographs cost little."""
     files = [Path(gallery.__file__).with_name(name) for name in ("base.spz", "capture.zip")]
     assert files[0].stat().st_size < 2e6 and sum(path.stat().st_size for path in files) < 3e6
@@ -222,7 +220,7 @@ def test_scene_and_base_of_the_package(tmp_path: Path) -> None:
     assert evaluate(checkpoint.gaussians, scene.test[:2], [0])[0].psnr > 30
 
 
-def test_strip_shows_every_panel(tmp_path: Path) -> None:
+def test_strip_shows_every_panel(tmp_path):
     colours = [(200, 30, 30), (30, 160, 30), (30, 30, 200)]
     images = [np.full((30, 40, 3), colour, np.uint8) for colour in colours]
     panels = [

@@ -13,12 +13,11 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 from unittest.mock import Mock
 
 import pytest
 
-from runs import STATE, Server, contents, log_of, names
+from runs import STATE, contents, log_of, names
 
 if sys.platform == "win32":
     pytest.skip("limits are those of POSIX", allow_module_level=True)
@@ -38,12 +37,12 @@ def room(size: int) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
-def assert_one_error(done: Any) -> None:
+def assert_one_error(done):
     (error,) = (line for line in done.err.splitlines() if line.startswith("clod-adapt: error: "))
     assert "cannot be written" in error and done.out == ""
 
 
-def test_full_disk_while_adapting(clod: Any, dialled: Path, tmp_path: Path) -> None:
+def test_full_disk_while_adapting(clod, dialled, tmp_path):
     """One line, and unchanged files of an earlier run. Without room for the page the others are
     complete.
     """
@@ -82,14 +81,14 @@ def test_full_disk_while_adapting(clod: Any, dialled: Path, tmp_path: Path) -> N
         (1000, "robustness BASE --images SCENE --iters 0 --max-sv 2 -o out"),
     ],
 )
-def test_full_disk(clod: Any, tmp_path: Path, size: int, line: str) -> None:
+def test_full_disk(clod, tmp_path, size, line):
     (tmp_path / "x.html").write_bytes(b"earlier")
     with room(size):
         assert_one_error(clod(line, code=2))
     assert contents(tmp_path) == {tmp_path / "x.html": b"earlier"}
 
 
-def test_full_disk_while_measuring(clod: Any, tmp_path: Path) -> None:
+def test_full_disk_while_measuring(clod, tmp_path):
     """The rows are not lost with the page."""
     with room(1000):
         done = clod("eval DIAL --images SCENE --sv 1 --report x.html --json --quiet", code=2)
@@ -127,9 +126,7 @@ NO_ROOT = "" if os.geteuid() else "import ctypes; assert ctypes.CDLL(None).unsha
         (f"out/{STATE}", 0, f"{STATE}: is write-protected; choose another output, or chmod u+w"),
     ],
 )
-def test_without_permission(
-    server: Server, capture: Any, tmp_path: Path, path: str, mode: int, said: str
-) -> None:
+def test_without_permission(server, capture, tmp_path, path, mode, said):
     """As of another user: one line, before any work."""
     shutil.copytree(capture.scene.parent, tmp_path, dirs_exist_ok=True)
     (tmp_path / "out").mkdir()
@@ -158,7 +155,7 @@ export dial.ply -o plain.html
 
 
 @pytest.mark.usefixtures("without_splat_transform")
-def test_commands_without_posix(capture: Any, tmp_path: Path) -> None:
+def test_commands_without_posix(capture, tmp_path):
     """Files that are open are not renamed or removed."""
     paths = {"base.ply": str(capture.ply), "scene": str(capture.scene)}
     commands = []
@@ -185,7 +182,7 @@ robustness ODD.ply --images ODD --iters 2 --max-sv 2 -o OUT_cells
 
 
 @pytest.mark.usefixtures("without_splat_transform", "blank_figure")
-def test_names_that_are_not_utf8(clod: Any, capture: Any, dialled: Path, tmp_path: Path) -> None:
+def test_names_that_are_not_utf8(clod, capture, dialled, tmp_path):
     """Of a scene, its checkpoint and a file with a dial, their folder, and all outputs."""
     folder = tmp_path / ODD
     try:
@@ -218,9 +215,7 @@ CONTENT = {
 }
 
 
-def test_photographs_that_are_none_start_no_program(
-    clod: Any, capture: Any, tmp_path: Path, monkeypatch: Any
-) -> None:
+def test_photographs_that_are_none_start_no_program(clod, capture, tmp_path, monkeypatch):
     monkeypatch.setattr(subprocess, "Popen", started := Mock(side_effect=OSError))
     shutil.copytree(capture.scene, tmp_path / "scene")
     for kind, content in CONTENT.items():

@@ -11,15 +11,12 @@ import socket
 import urllib.request
 import webbrowser
 from pathlib import Path
-from typing import Any
 from unittest.mock import Mock
-
-import pytest
 
 import clod_adapter
 from clod_adapter.cli import view
 from clod_adapter.cli.main import build_parser
-from runs import Server, log_of, wait_for
+from runs import log_of, wait_for
 
 
 def fetch(url: str) -> bytes:
@@ -27,20 +24,18 @@ def fetch(url: str) -> bytes:
         return bytes(response.read())
 
 
-def config_of(page: bytes) -> Any:
+def config_of(page: bytes):
     """The settings that a page holds."""
     return json.loads(re.findall(r'id="clod-config">(.*?)</script>', page.decode(), re.DOTALL)[0])
 
 
-def assert_holds(data: bytes, file: Path, folder: Path) -> None:
+def assert_holds(data: bytes, file: Path, folder: Path):
     (folder / "served.ply").write_bytes(data)
     served, shown = (clod_adapter.load(path).gaussians for path in (folder / "served.ply", file))
     assert len(served) == len(shown) and (served.attenuation is None) == (shown.attenuation is None)
 
 
-def test_serves_until_it_is_interrupted(
-    server: Server, capture: Any, dialled: Path, tmp_path: Path
-) -> None:
+def test_serves_until_it_is_interrupted(server, capture, dialled, tmp_path):
     line = f"view {dialled} --base {capture.ply} --images {capture.scene} --sv 2 --no-browser"
     process = server.start(tmp_path, *line.split(), "--json", "--quiet")
     wait_for(Path(f"{tmp_path}.log"), "\n")
@@ -57,14 +52,12 @@ def test_serves_until_it_is_interrupted(
     assert server.wait(process) == 0 and log_of(tmp_path).count("\n") == 1
 
 
-def test_dial_values_and_files_of_a_page(
-    capture: Any, dialled: Path, tmp_path: Path, capsys: Any
-) -> None:
+def test_dial_values_and_files_of_a_page(capture, dialled, tmp_path, capsys):
     """Of a folder the splats by name, numbers by value; files of one name have those of their
     folders. With notes.
     """
 
-    def page_of(*words: object) -> tuple[Any, Any, Any]:
+    def page_of(*words):
         args = build_parser("view").parse_args([*map(str, words)])
         view.check(args)
         answers, report = view.make_page(args, view.Console(False))
@@ -94,7 +87,7 @@ def test_dial_values_and_files_of_a_page(
     assert report["model"].endswith("lod2.ply") and len(report["files"]) == 3
 
 
-def test_interrupts_and_browsers(clod: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_interrupts_and_browsers(clod, monkeypatch):
     """One that opens a window is opened; an interrupt right after the address ends the command as
     usual.
     """
@@ -158,7 +151,7 @@ def test_a_dial_and_its_calibration(clod, dialled):
     assert comment in clod("inspect x.ply").out
 
 
-def test_adapter(clod: Any) -> None:
+def test_adapter(clod):
     text = clod("inspect ADAPTER").out
     about = clod("inspect ADAPTER --json").report["about"]
     assert "an adapter" in text

@@ -18,7 +18,7 @@ from contextlib import redirect_stdout
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -80,7 +80,7 @@ def spoken(page: Path, program: str) -> list[str]:
 
 
 @pytest.fixture(scope="session")
-def desk(capture: Any, dialled: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def desk(capture, dialled: Path, tmp_path_factory) -> Path:
     """``scene/``, ``pretrained.ply``, ``pretrained_mask.ply`` (MaskGaussian's old layout),
     ``pretrained_clod.*``, and ``demo/`` with the demo's file names.
     """
@@ -107,9 +107,7 @@ SKIPPED = ("pip", "make", "clod-adapt demo")
 
 @pytest.mark.usefixtures("without_splat_transform")
 @pytest.mark.parametrize("page", PAGES, ids=IDS)
-def test_blocks_run_in_the_order_of_the_page(
-    page: Path, desk: Path, tmp_path: Path, monkeypatch: Any
-) -> None:
+def test_blocks_run_in_the_order_of_the_page(page, desk, tmp_path, monkeypatch):
     """Training is shortened."""
     shutil.copytree(desk, tmp_path, dirs_exist_ok=True)
     monkeypatch.chdir(tmp_path)
@@ -132,12 +130,12 @@ def test_blocks_run_in_the_order_of_the_page(
             pytest.fail(f"{block.place}: {error}")
 
 
-def short(**settings: Any) -> AdaptConfig:
+def short(**settings) -> AdaptConfig:
     config = AdaptConfig(**settings)
     return replace(config, iters=min(config.steps, STEPS))
 
 
-def run(words: list[str]) -> None:
+def run(words: list[str]):
     words, out = (words[:-2], Path(words[-1])) if ">" in words else (words, Path("said.txt"))
     assert words[0] in ("clod-adapt", "python"), (
         f"{words[0]}: not known; mark the block with <!-- not run: REASON -->"
@@ -155,7 +153,7 @@ def run(words: list[str]) -> None:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=IDS)
-def test_named_options_exist(page: Path) -> None:
+def test_named_options_exist(page):
     """Also of commands that are not run; each reason for not running a block stands above it."""
     written = blocks(page)
     text = page.read_text("utf-8")
@@ -182,7 +180,7 @@ DOCS = ROOT / "docs"
 RESULTS = ROOT / "benchmarks" / "results"
 
 
-def keys(value: Any) -> Iterator[str]:
+def keys(value) -> Iterator[str]:
     """The keys of all objects in a value, except in ``config``, which the settings page lists."""
     if isinstance(value, dict):
         for name, entry in value.items():
@@ -193,9 +191,7 @@ def keys(value: Any) -> Iterator[str]:
             yield from keys(entry)
 
 
-def test_every_field_of_the_reports_is_explained(
-    desk: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_every_field_of_the_reports_is_explained(desk, capsys):
     explained = set(re.findall(r"`([a-z_0-9]+)`", (DOCS / "python.md").read_text("utf-8")))
     base = desk / "pretrained.ply"
     line = f"eval {desk}/pretrained_clod.ply --images {desk}/scene --sv 1 3 --popping --quiet"
@@ -215,7 +211,7 @@ def cells(page: str) -> list[str]:
     return [cell.strip(" *") for cell in "|".join(rows).split("|")]
 
 
-def measured(value: Any) -> Iterator[str]:
+def measured(value) -> Iterator[str]:
     """The qualities in results, at any depth, in the forms that the pages write."""
     if isinstance(value, list):
         for entry in value:
@@ -252,12 +248,12 @@ SOURCES = [
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
 
 
-def test_no_line_installs_clod_adapter_from_the_index() -> None:
+def test_no_line_installs_clod_adapter_from_the_index():
     for path in SOURCES:
         assert not re.search(r"pip install[^`\n]*clod-adapter", path.read_text("utf-8")), path
 
 
-def test_help_names_the_installed_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_help_names_the_installed_page(tmp_path, monkeypatch):
     ((folder, patterns),) = PROJECT["tool"]["setuptools"]["data-files"].items()
     assert patterns == ["docs/*.md"]
     assert all(url.startswith("https://") for url in PROJECT["project"]["urls"].values())
@@ -287,7 +283,7 @@ def anchors(page: Path) -> set[str]:
     return found
 
 
-def test_links_and_pictures_exist() -> None:
+def test_links_and_pictures_exist():
     texts = {page: page.read_text("utf-8") for page in PAGES}
     for page, text in texts.items():
         for target in (one or other for one, other in LINK.findall(FENCE.sub("", text))):
@@ -302,7 +298,7 @@ def test_links_and_pictures_exist() -> None:
         assert picture.suffix == ".svg" or picture.name in written
 
 
-def test_the_built_site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_built_site(tmp_path, monkeypatch):
     """Built as by ``make docs``; a broken link is an error. Its search covers all pages and public
     names.
     """

@@ -7,7 +7,6 @@ import random
 import re
 from collections.abc import Callable, Sequence
 from statistics import fmean
-from typing import Any
 
 import pytest
 import torch
@@ -44,7 +43,7 @@ def row_of_four() -> Gaussians:
     return with_dial(some, torch.full((4,), 3.0), AttenuationConfig())
 
 
-def test_counts_follow_the_reach() -> None:
+def test_counts_follow_the_reach():
     view = View(camera(), torch.zeros(45, 61, 3, dtype=torch.uint8))
     rows = evaluate(row_of_four(), [view, view], [1.0, 1.6, 4.0])
     assert [row.kept for row in rows] == [2, 1, 0]
@@ -72,7 +71,7 @@ def test_rows_are_means_over_renders():
         assert 0 < row.kept_share == row.kept / 200 < 1 and row.in_view < row.kept
 
 
-def test_bad_calls_are_named() -> None:
+def test_bad_calls_are_named():
     views = [View(camera(20, 16), torch.zeros(16, 20, 3, dtype=torch.uint8))]
     for held_out, dials, message in (
         ([], [1.0], "no held-out views"),
@@ -89,7 +88,7 @@ Clock = Callable[[Callable[[int, float], float]], list[tuple[str, float]]]
 
 
 @pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+def clock(monkeypatch) -> Clock:
     """Renders in no time; the clock advances by ``cost(frame, s)`` seconds. Returns the frames that
     are drawn.
     """
@@ -98,7 +97,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
         drawn = []
         now = [0.0]
 
-        def draw(some: Gaussians, camera: Camera, s: float) -> None:
+        def draw(some: Gaussians, camera: Camera, s: float):
             now[0] += cost(len(drawn), s)
             drawn.append((camera.name, s))
 
@@ -109,7 +108,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     return install
 
 
-def of_one(**options: Any) -> FrameTimes:
+def of_one(**options) -> FrameTimes:
     some = with_dial(gaussians(20, 0, 0), torch.ones(20), AttenuationConfig(max_sv=7.0))
     return time_frames([(some, DIALS)], ring(9, 48, 36), **options)
 
@@ -147,7 +146,7 @@ def test_frames_are_interleaved_and_few_where_they_are_slow(clock):
     assert len({name for name, _ in drawn[2:]}) == 1 and 3 * 9 <= len(drawn) <= 3 * 9 + 3
 
 
-def test_a_listener_stops_the_timing() -> None:
+def test_a_listener_stops_the_timing():
     with pytest.raises(Stopped):
         of_one(progress=lambda now: False)
 
@@ -226,7 +225,7 @@ def test_a_psnr_drop_is_linear_in_log_s(psnr, drop, wanted):
     assert drop < 3 or solved.note.startswith("only 1.75 dB are lost at s = 4")
 
 
-def test_a_frame_rate_is_reached_for_good() -> None:
+def test_a_frame_rate_is_reached_for_good():
     for times, fps, wanted in (
         ([20, 10, 5], 1000 / 15, math.sqrt(2)),
         ([20, 10, 12, 5], 1000 / 11, 4 * 2 ** (1 / 7)),  # not in passing

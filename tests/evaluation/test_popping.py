@@ -77,7 +77,7 @@ def test_dial_sweep_measures_its_renders():
     assert result.at == pytest.approx(3 ** ((want.index(max(want)) + 1) / 4))
 
 
-def test_camera_motion_alone_is_no_change() -> None:
+def test_camera_motion_alone_is_no_change():
     some = dialled()
     cameras = ring(12, 32, 24)[:3]
     still = path_popping(some.replace(sigma_d=torch.full((200,), 1e9)), cameras, 3.0, steps=6)
@@ -90,7 +90,7 @@ def test_camera_motion_alone_is_no_change() -> None:
     )
 
 
-def test_path_passes_through_the_cameras_at_equal_steps() -> None:
+def test_path_passes_through_the_cameras_at_equal_steps():
     cameras = [dataclasses.replace(camera, near=1e-4) for camera in ring(8, 32, 24)[:3]]
     found = path(cameras, 40)
     assert len(found) == 41 and {camera.near for camera in found} == {1e-4}
@@ -130,7 +130,7 @@ def adversary(form: str) -> tuple[Gaussians, list[Camera]]:
     return some, [camera, dataclasses.replace(camera, viewmat=turn @ camera.viewmat)]
 
 
-def test_a_dial_pops_nowhere_and_the_papers_form_does() -> None:
+def test_a_dial_pops_nowhere_and_the_papers_form_does():
     pixels = {}
     for form, steps in product(FORMS, (120, 240)):
         some, cameras = adversary(form)
@@ -140,7 +140,7 @@ def test_a_dial_pops_nowhere_and_the_papers_form_does() -> None:
     assert pixels["paper", 240] > 0.9 * pixels["paper", 120] > 5
 
 
-def test_a_camera_that_turns_changes_nothing() -> None:
+def test_a_camera_that_turns_changes_nothing():
     """In the paper's form, a far Gaussian that enters the view changes the unit, and with it all
     opacities, at once.
     """
@@ -191,7 +191,7 @@ def lines_of_sight(seed: int) -> tuple[Gaussians, Camera]:
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_no_pixel_jumps_where_it_ends(seed: int) -> None:
+def test_no_pixel_jumps_where_it_ends(seed):
     """As the dial turns, and as a camera moves back that the distances are from, in 250 steps that
     double d s.
     """
@@ -199,7 +199,7 @@ def test_no_pixel_jumps_where_it_ends(seed: int) -> None:
     assert dial_popping(some, view, 2.0, steps=250).pixel <= most(4, math.log(2) / 250)
     places = [2 ** (k / 250) for k in range(251)]
 
-    def picture(_: int, j: int) -> torch.Tensor:
+    def picture(_, j):
         back = torch.eye(4)
         back[2, 3] = 2 * (places[j] - 1)
         return for_device(torch.device("cpu")).draw(

@@ -41,7 +41,7 @@ def changes(some: Gaussians, view: View) -> Tensor:
     ).double()
 
 
-def test_removal_error_is_unbiased(draws: int = 100) -> None:
+def test_removal_error_is_unbiased(draws=100):
     """To 5 standard deviations: with random signs z, ``(sum z v)^2`` has mean |v|^2, variance 2
     (|v|^4 - sum v^4).
     """
@@ -62,7 +62,7 @@ def test_removal_error_is_unbiased(draws: int = 100) -> None:
     assert (spread < 0.15 * exact + 1e-9).all()
 
 
-def test_removal_error_depends_on_the_seed_alone() -> None:
+def test_removal_error_depends_on_the_seed_alone():
     some = gaussians(100, 1, 0)
     # outside of every view
     some = some.replace(means=torch.cat([some.means[:75], some.means[75:] + 1e3]))
@@ -91,7 +91,7 @@ def distances_of(some: Gaussians, views: tuple[View, ...]) -> Tensor:
 
 
 @pytest.mark.parametrize("share, exponent", [(0.51, 1.5), (0.8, 2.5), (1.0, 1.5)])
-def test_kept_shares_follow_the_target_curve(share: float, exponent: float, n: int = 1000) -> None:
+def test_kept_shares_follow_the_target_curve(share, exponent, n=1000):
     """At the distances of the initialization, ``1 / (s^p + (1/share - 1) s^-p)``, to one
     Gaussian.
     """
@@ -102,7 +102,7 @@ def test_kept_shares_follow_the_target_curve(share: float, exponent: float, n: i
         assert abs(kept.sum().item() - n * want) <= 1, f"s {s}"
 
 
-def test_initialization_culls_in_the_pruning_order() -> None:
+def test_initialization_culls_in_the_pruning_order():
     """In which one that a neighbour replaces goes earlier than by its removal error alone."""
     some, views = dialled(200)
 

@@ -8,7 +8,6 @@ import json
 import re
 import sys
 from itertools import product
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -35,7 +34,7 @@ def row(s: float, psnr: float | None = 20.0, ms: float = 3.0) -> dict[str, Any]:
     }
 
 
-def report(**changes: Any) -> dict[str, Any]:
+def report(**changes) -> dict[str, Any]:
     made = {"what": NASTY, "verdict": "kept", "measured": "-", "why": NASTY}
     return {
         "command": "adapt",
@@ -57,9 +56,7 @@ def report(**changes: Any) -> dict[str, Any]:
     } | changes
 
 
-def test_page_is_self_contained_and_escaped(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_page_is_self_contained_and_escaped(tmp_path, monkeypatch):
     frames = [
         Picture(np.full((6, 8, 3), level, np.float32), NASTY, NASTY) for level in (0.0, 0.5, 1.0)
     ]
@@ -121,7 +118,7 @@ def test_page_is_self_contained_and_escaped(
     assert not (tmp_path / "other.html").exists()
 
 
-def test_images_are_embedded() -> None:
+def test_images_are_embedded():
     """Bytes and floats keep their pixels; wide ones are scaled down."""
     ramp = np.linspace(0, 255, 32 * 24 * 3).reshape(24, 32, 3)
     images = (
@@ -137,7 +134,7 @@ def test_images_are_embedded() -> None:
     )
 
 
-def test_charts() -> None:
+def test_charts():
     """Log axes with PSNR on the right; where dial values are near each other, not all have
     labels.
     """
@@ -168,7 +165,7 @@ def test_charts() -> None:
         assert legend.y0 >= left.get_window_extent().y1  # above the curves
 
 
-def test_a_chart_by_count_leaves_out_nothing_drawn() -> None:
+def test_a_chart_by_count_leaves_out_nothing_drawn():
     """A log axis has no 0."""
     empty = row(40, 5) | {"kept": 0}
     series = [Series("dial", [row(1, 30), row(2, 25), empty], dial=True), Series("base", [empty])]
@@ -179,7 +176,7 @@ def test_a_chart_by_count_leaves_out_nothing_drawn() -> None:
         assert dial.get_ydata().tolist() == [30, 25]
 
 
-def test_series_of_reports() -> None:
+def test_series_of_reports():
     """The dial, the base and its pruned versions, other files, and the file without its dial; rows
     without a PSNR.
     """

@@ -35,7 +35,7 @@ def loss_of(dial: Dial, scene: Scene, s: float) -> Tensor:
     return photometric_loss(image, scene.train[0].image, dial.config.ssim_weight)
 
 
-def test_the_objective_is_that_of_adapt(captured: Pair) -> None:
+def test_the_objective_is_that_of_adapt(captured):
     """All gradients, of the splats too, at one view and dial value."""
     base, scene = captured
     splats = trainable(base)
@@ -63,7 +63,7 @@ def test_the_objective_is_that_of_adapt(captured: Pair) -> None:
 # of numbers read from tensors in a graph: the initialization needs none
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("form", ["gsplat", "splatfacto"])
-def test_trainers_tensors_are_used_as_they_are(captured: Pair, form: str) -> None:
+def test_trainers_tensors_are_used_as_they_are(captured, form):
     base, scene = captured
     splats = trainable(base, form)
     dial = attach(splats, [view.camera for view in scene.train], growth="off")
@@ -76,7 +76,7 @@ def test_trainers_tensors_are_used_as_they_are(captured: Pair, form: str) -> Non
     assert dial.gaussians().means.data_ptr() == splats["means"].data_ptr()
 
 
-def test_rates_and_ranges_of_the_parameters(captured: Pair) -> None:
+def test_rates_and_ranges_of_the_parameters(captured):
     base, scene = captured
     config = AdaptConfig(batch=4, lr_sh0=1.0)
     dial = attach(trainable(base), scene, config)
@@ -95,7 +95,7 @@ def test_rates_and_ranges_of_the_parameters(captured: Pair) -> None:
     assert dial.growth_d[0].item() == 3
 
 
-def test_what_does_not_fit_is_refused(captured: Pair) -> None:
+def test_what_does_not_fit_is_refused(captured):
     base, scene = captured
     splats = trainable(base)
     dial = attach(splats, scene)

@@ -3,7 +3,6 @@ the checkpoint.
 """
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -38,7 +37,7 @@ def adapted(both: tuple[Gaussians, Scene]) -> Gaussians:
     return adapt(*both, config_of(iters=40)).gaussians
 
 
-def test_far_ones_take_over_from_near_ones() -> None:
+def test_far_ones_take_over_from_near_ones():
     """Continuously, at near_distance; opacities of both sum to the near one's where the far one
     does not fade yet.
     """
@@ -56,7 +55,7 @@ def test_far_ones_take_over_from_near_ones() -> None:
     assert float(slopes[:, 1:].max()) <= 10 * 0.8 + 1e-6
 
 
-def test_few_photographs_merge_nothing_away(both: tuple[Gaussians, Scene]) -> None:
+def test_few_photographs_merge_nothing_away(both):
     """Beside few photographs there are as many far Gaussians as near ones, else fewer."""
     base, scene = both
     few = clod.add_pseudo_views(base, replace(scene, train=scene.train[:4]))
@@ -66,7 +65,7 @@ def test_few_photographs_merge_nothing_away(both: tuple[Gaussians, Scene]) -> No
     assert len(make_plan(base, scene, config_of()).start) < len(start)
 
 
-def test_rasterizers_agree(adapted: Gaussians) -> None:
+def test_rasterizers_agree(adapted):
     for camera in ring(3, 48, 32):
         for s in (0.0, 1.0, 2.0, 4.0):
             ours, theirs = (one.draw(adapted, camera, s)[0] for one in (cpu.RASTERIZER, PLAIN))
@@ -76,7 +75,7 @@ def test_rasterizers_agree(adapted: Gaussians) -> None:
             )
 
 
-def test_merging_keeps_mass_and_centre() -> None:
+def test_merging_keeps_mass_and_centre():
     some = gaussians(400, 1, 3)
     few = merge(some, torch.ones(400), 100)
     assert len(few) == 100 and few.sh_degree == 1
@@ -89,7 +88,7 @@ def test_merging_keeps_mass_and_centre() -> None:
     assert places[0] == places[1]
 
 
-def test_near_ones_are_the_checkpoint(adapted: Gaussians, both: tuple[Gaussians, Scene]) -> None:
+def test_near_ones_are_the_checkpoint(adapted, both):
     base, scene = both
     assert adapted.whole == len(base) < len(adapted) and adapted.near is not None
     assert_equal(detach(adapted), base)
@@ -98,7 +97,7 @@ def test_near_ones_are_the_checkpoint(adapted: Gaussians, both: tuple[Gaussians,
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".safetensors", ".pt", ".glb", ".spz"])
-def test_files(adapted: Gaussians, tmp_path: Path, suffix: str) -> None:
+def test_files(adapted, tmp_path, suffix):
     path = tmp_path / f"a{suffix}"
     write(path, adapted, Metadata())
     found = clod.load(path).gaussians
@@ -111,9 +110,7 @@ def test_files(adapted: Gaussians, tmp_path: Path, suffix: str) -> None:
         assert np.array_equal(opacity <= -20, ~adapted.near.numpy())
 
 
-def test_the_adapter_has_the_far_ones(
-    adapted: Gaussians, both: tuple[Gaussians, Scene], tmp_path: Path
-) -> None:
+def test_the_adapter_has_the_far_ones(adapted, both, tmp_path):
     adapter = clod.extract(both[0], adapted, fingerprint="0" * 64, config={})
     assert not adapter.updates
     assert {*adapter.added} == {*ATTRIBUTES}
@@ -133,9 +130,7 @@ def test_counts_and_baking(adapted, both):
         order_by_extinction(adapted, cameras)
 
 
-def test_a_second_run_continues_with_the_far_ones(
-    adapted: Gaussians, both: tuple[Gaussians, Scene]
-) -> None:
+def test_a_second_run_continues_with_the_far_ones(adapted, both):
     again = adapt(adapted, both[1], config_of(iters=5)).gaussians
     assert len(again) == len(adapted) and not torch.equal(again.means, adapted.means)
     assert_equal(detach(again), both[0])

@@ -12,7 +12,7 @@ import torch.distributed as dist
 from torch.testing import assert_close
 from torch.torch_version import TorchVersion
 
-from clod_adapter import Gaussians, Phase, Progress, Scene, Stopped, evaluate, make_plan
+from clod_adapter import Gaussians, Phase, Scene, Stopped, evaluate, make_plan
 from clod_adapter.adapter import ATTRIBUTES, detach, with_dial
 from clod_adapter.config import AdaptConfig, AttenuationConfig
 from clod_adapter.equation.distances import in_frustum
@@ -104,7 +104,7 @@ def test_result_is_the_mean_of_the_last_steps(captured):
             assert_close(values, (last + before) / 2)
 
 
-def test_time_budget_ends_training(captured: Pair) -> None:
+def test_time_budget_ends_training(captured):
     """The budget includes the time of an earlier part of the run."""
     config = config_of(iters=10_000_000, time_budget=0.2)
     states = {}
@@ -117,10 +117,10 @@ def test_time_budget_ends_training(captured: Pair) -> None:
     assert adapt(*captured, config_of(batch=4096, time_budget=0.2)).seconds < 3
 
 
-def test_a_listener_that_stops_returns_the_result_so_far(captured: Pair) -> None:
+def test_a_listener_that_stops_returns_the_result_so_far(captured):
     states = []
 
-    def stop(p: Progress) -> bool:
+    def stop(p):
         if p.phase == Phase.TRAINING:
             states.append(copy.deepcopy(p.gaussians()))
         return p.done != 5 or p.phase != Phase.TRAINING
@@ -134,7 +134,7 @@ def test_a_listener_that_stops_returns_the_result_so_far(captured: Pair) -> None
     assert not any(value.requires_grad for value in result.gaussians.tensors().values())
 
 
-def test_degenerate_scenes(captured: Pair) -> None:
+def test_degenerate_scenes(captured):
     """One Gaussian, one that is never seen, and coincident cameras."""
     views = photograph(gaussians(20, 0, 0), ring(2, 20, 16))
     for means in ([[0.0, 0.0, 0.0]], [[1e3, 0.0, 0.0]]):
@@ -146,7 +146,7 @@ def test_degenerate_scenes(captured: Pair) -> None:
     assert not found.means.equal(base.means)
 
 
-def test_bad_inputs_are_refused(captured: Pair) -> None:
+def test_bad_inputs_are_refused(captured):
     base, scene = captured
     for run in (adapt, make_plan):
         with rejects("no training views"):
@@ -204,7 +204,7 @@ def test_growth_begins_at_the_median_distance_in_the_second_nearest_view(capture
             assert second == pytest.approx(float(median), rel=1e-5)
 
 
-def test_settings_as_keywords(captured: Pair) -> None:
+def test_settings_as_keywords(captured):
     adapted = adapt(*captured, config_of(iters=3), max_sv=7, growth="off")
     assert repr(adapted).startswith(
         "Adapted(Gaussians(300 and 240 far, SH degree 1, dial to 7, cpu), 3 steps, "
@@ -214,9 +214,7 @@ def test_settings_as_keywords(captured: Pair) -> None:
         adapt(*captured, max_vs=7)
 
 
-def test_a_bar_by_default(
-    captured: Pair, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_bar_by_default(captured, monkeypatch, capsys):
     """On a terminal or in a notebook; not elsewhere, not with a listener of one's own, and not with
     False.
     """
@@ -231,7 +229,7 @@ def test_a_bar_by_default(
     assert capsys.readouterr().err == ""
 
 
-def test_a_group_of_one_changes_no_bit() -> None:
+def test_a_group_of_one_changes_no_bit():
     base, scene = capture(n=60, views=4)
     config = AdaptConfig(iters=3, batch=2)
     want = adapt(base, scene, config)
@@ -244,7 +242,7 @@ def test_a_group_of_one_changes_no_bit() -> None:
             adapt(base, scene, config, group=peers)
 
 
-def test_several_processes_need_a_torch_that_does_not_hang(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_several_processes_need_a_torch_that_does_not_hang(monkeypatch):
     monkeypatch.setattr(torch, "__version__", TorchVersion("2.6.0+cu124"))
     with joined(dist.HashStore(), 0, 1), rejects(r"need torch 2.9 or newer, and this is 2.6.0\+"):
         joined(dist.HashStore(), 0, 2).__enter__()

@@ -33,7 +33,7 @@ def verdicts(plan: Plan) -> dict[str, str]:
     return {decision.what: decision.verdict for decision in plan.decisions}
 
 
-def test_sh_degrees_are_kept_or_left_out(visible: Pair) -> None:
+def test_sh_degrees_are_kept_or_left_out(visible):
     base, scene = visible
     plan = make_plan(base, scene, CONFIG)
     assert list(verdicts(plan).items())[:2] == [("SH degree 1", "kept"), ("far Gaussians", "added")]
@@ -73,7 +73,7 @@ def test_the_far_end_is_told(visible):
     assert percent(farther + 1) <= few < percent(farther / 1.2)
 
 
-def test_impossible_overrides_are_refused() -> None:
+def test_impossible_overrides_are_refused():
     with rejects(r"'colour' is not part of a plan; the names are bands, means"):
         Override(keep=frozenset({"colour"}))
     with rejects("'quats' is both kept and left out"):
@@ -98,7 +98,7 @@ def test_a_resumed_plan_gives_the_same_bits(visible):
     assert not torch.equal(resumed.quats, plan.start.quats)
 
 
-def test_what_no_placed_camera_shows_is_supposed_to_matter() -> None:
+def test_what_no_placed_camera_shows_is_supposed_to_matter():
     """As much as shown Gaussians of its opacity and size; what is opaque all over has no
     derivative, and is shown.
     """

@@ -47,7 +47,7 @@ def test_images_are_renders_of_the_checkpoint(blob):
     assert render_pseudo_views(dialled, cameras[:1]).test == ()
 
 
-def test_each_step_renders_the_checkpoint_from_another_camera(blob: Gaussians) -> None:
+def test_each_step_renders_the_checkpoint_from_another_camera(blob):
     """A photograph stays where it is."""
     cameras = ring(3, 40, 30)
     (photograph,) = scenes.photograph(blob, cameras[:1])
@@ -61,7 +61,7 @@ def test_each_step_renders_the_checkpoint_from_another_camera(blob: Gaussians) -
         )
 
 
-def test_few_photographs_get_pseudo_views(blob: Gaussians, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_few_photographs_get_pseudo_views(blob, monkeypatch):
     monkeypatch.setattr(pseudo_views, "ADDED", 9)
     monkeypatch.setattr(pseudo_views, "MANY", 12)
     around = scenes.photograph(blob, ring(12, 80, 60))
@@ -80,7 +80,7 @@ def test_few_photographs_get_pseudo_views(blob: Gaussians, monkeypatch: pytest.M
     assert clod.adapt(faint, scene, AdaptConfig(iters=1)).steps == 1
 
 
-def test_moved_cameras_have_the_documented_offsets(blob: Gaussians) -> None:
+def test_moved_cameras_have_the_documented_offsets(blob):
     """Of position, direction and focal length; some step back along their direction of view, up to
     FARTHER reaches.
     """
@@ -126,7 +126,7 @@ def ball(n: int, seen_from: Tensor) -> Gaussians:
     return Gaussians(means, quats, logs, torch.full((n + 1,), 3.0), sh0, shN.repeat(1, 1, 3))
 
 
-def test_placed_cameras_are_valid_and_see_the_scene(blob: Gaussians) -> None:
+def test_placed_cameras_are_valid_and_see_the_scene(blob):
     steps = []
     cameras = place_cameras(blob, views=12, progress=counted(steps))
     assert steps[-1] == (len(steps), len(steps))
@@ -148,7 +148,7 @@ def test_placed_cameras_are_valid_and_see_the_scene(blob: Gaussians) -> None:
     assert len(one) == 4 and torch.equal(one, poses(1)) and not torch.equal(one, poses(2))
 
 
-def test_a_scene_gets_as_many_cameras_as_show_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_scene_gets_as_many_cameras_as_show_it(monkeypatch):
     """A row of spheres needs more cameras than one sphere; nearly every disc is shown in the
     end.
     """
@@ -166,9 +166,7 @@ def test_a_scene_gets_as_many_cameras_as_show_it(monkeypatch: pytest.MonkeyPatch
 
 
 @pytest.mark.parametrize("axis, few", [(0, False), (2, True)])
-def test_cameras_face_the_side_where_sh_was_trained(
-    axis: int, few: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_cameras_face_the_side_where_sh_was_trained(axis, few, monkeypatch):
     """Also where a sample of the Gaussians decides."""
     side = torch.eye(3)[axis]
     truth = ball(1500, side)

@@ -8,7 +8,6 @@ import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -49,7 +48,7 @@ RESUMED = {
 
 
 @pytest.mark.parametrize("form", RESUMED)
-def test_a_resumed_run_ends_with_the_same_bits(captured: Pair, form: str) -> None:
+def test_a_resumed_run_ends_with_the_same_bits(captured, form):
     """From states within and at the end of a round of views, and before, during and after
     averaging.
     """
@@ -85,7 +84,7 @@ def default_handler() -> Iterator[None]:
     signal.signal(signal.SIGINT, before)
 
 
-def test_an_interrupt_within_the_update_completes_the_step(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interrupt_within_the_update_completes_the_step(monkeypatch):
     given = *capture(60, views=4, width=16, height=12), AdaptConfig(iters=12, max_sv=3.0)
     whole = adapt(*given).gaussians
     states = []
@@ -96,7 +95,7 @@ def test_an_interrupt_within_the_update_completes_the_step(monkeypatch: pytest.M
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
-def test_other_handlers_are_not_affected() -> None:
+def test_other_handlers_are_not_affected():
     heard = []
     stop = GracefulStop()
     signal.signal(signal.SIGINT, lambda number, frame: heard.append(number))
@@ -164,7 +163,7 @@ def test_unit_direction_and_place(pair):
         assert psnr == pytest.approx(other, abs=0.5) and kept == pytest.approx(share, abs=0.02)
 
 
-def test_a_far_camera_changes_no_length(pair: Pair) -> None:
+def test_a_far_camera_changes_no_length(pair):
     """Where growth begins, offsets of pseudo views, and typical distances: to a few per cent."""
     base, scene = pair
     views = (*scene.train, *photograph(base, ring(1, 48, 36, radius=120.0)))
@@ -179,7 +178,7 @@ def test_a_far_camera_changes_no_length(pair: Pair) -> None:
     assert median(cameras) == pytest.approx(median(usual), rel=0.05)
 
 
-def session_of(capture: Any) -> tuple[list[Tensor], str]:
+def session_of(capture) -> tuple[list[Tensor], str]:
     """Of a session from files to a baked dial value."""
     base = clod.load(capture.ply).gaussians
     scene = clod.load_scene(capture.scene)
@@ -209,7 +208,7 @@ def doubles() -> Iterator[None]:
         torch.set_default_dtype(torch.float32)
 
 
-def test_results_do_not_depend_on_torchs_modes(capture: Any) -> None:
+def test_results_do_not_depend_on_torchs_modes(capture):
     tensors, texts = session_of(capture)
     for mode in (torch.inference_mode(), doubles(), np.errstate(all="raise")):
         with mode:

@@ -26,16 +26,16 @@ from scenes import capture, seeded
 VIEWS = capture(n=20)[1].train
 
 
-def assert_uniform(values: torch.Tensor) -> None:
+def assert_uniform(values: torch.Tensor):
     """In [0, 1], and more evenly than random numbers would be."""
     values = values.sort().values.double()
     assert (values - torch.linspace(0, 1, len(values))).abs().max() < 3 / len(values)
 
 
-def test_dial_values_follow_the_schedule() -> None:
+def test_dial_values_follow_the_schedule():
     """1, or 0, in a falling share of the steps, else (log-)uniform from 1 on; in every stretch."""
 
-    def drawn(schedule: Schedule, share_done: float = 0.0) -> torch.Tensor:
+    def drawn(schedule, share_done=0.0):
         sampler = ViewSampler(VIEWS, AdaptConfig(max_sv=4.0), schedule)
         samples = [sampler.draw(k, share_done) for k in range(480)]
         names = [sample.view.camera.name for sample in samples]  # each view once a round
@@ -53,7 +53,7 @@ def test_dial_values_follow_the_schedule() -> None:
     assert ViewSampler(VIEWS, AdaptConfig(max_sv=1.0)).draw(0, 0.0)[1:] == (1.0, None, False)
 
 
-def test_first_steps_have_photographs_of_half_the_size() -> None:
+def test_first_steps_have_photographs_of_half_the_size():
     """Unless these would be small, or the step is at s = 1."""
     whole = replace(
         VIEWS[0].camera,
@@ -91,7 +91,7 @@ def gradient(log_sigma: Tensor, d: Tensor, s: float, **changes: float) -> Tensor
     return count_gradient(d, log_sigma.exp(), s, 0.1, config, target_share(s, N, config))
 
 
-def test_count_gradient_penalises_excess_and_deficit() -> None:
+def test_count_gradient_penalises_excess_and_deficit():
     """The gradient is that of the squared excess; it is 0 for a single remaining Gaussian."""
     log_sigma, d = some()
     for s in (1.5, 6.0):
@@ -113,7 +113,7 @@ def test_count_gradient_penalises_excess_and_deficit() -> None:
     assert (gradient(mixed, d, 6.0) >= 0).all() and (gradient(mixed, d, 6.0)[1::2] < 1e-20).all()
 
 
-def test_count_slope_is_that_of_a_soft_count() -> None:
+def test_count_slope_is_that_of_a_soft_count():
     log_sigma, d = (x.double() for x in some())
     soft = 1 / (1 + (2 * d / log_sigma.requires_grad_().exp()) ** SHARPNESS)
     (want,) = torch.autograd.grad(soft.mean(), log_sigma)
@@ -122,7 +122,7 @@ def test_count_slope_is_that_of_a_soft_count() -> None:
     assert (count_slope(d, 0 * d) == 0).all()
 
 
-def test_shares_are_of_all_gaussians() -> None:
+def test_shares_are_of_all_gaussians():
     """Where far ones alone are counted: as if the others, which are culled, were counted too."""
     (log_sigma, d), found, s = some(), [], 3.0
     log_sigma[40:65] = -9.2
@@ -146,9 +146,7 @@ TENTHS = dict.fromkeys(SHAPES, 0.1)
 class PlainRowAdam(RowAdam):
     """RowAdam without the fused kernel."""
 
-    def _step_fused(
-        self, gradients: dict[str, Tensor], rows: Tensor, rates: dict[str, float]
-    ) -> None:
+    def _step_fused(self, gradients: dict[str, Tensor], rows: Tensor, rates: dict[str, float]):
         self._step_plain(gradients, rows, rates)
 
 
@@ -179,9 +177,7 @@ def everything(n: int) -> Tensor:
     [(12, 0.9, 0.999, 1e-15), (90, 0.5, 0.8, 1e-2)],
     ids=["defaults", "past the last bias correction that is stored, the 79th"],
 )
-def test_all_rows_match_torch_adam(
-    kind: type[RowAdam], steps: int, beta1: float, beta2: float, epsilon: float, n: int = 57
-) -> None:
+def test_all_rows_match_torch_adam(kind, steps, beta1, beta2, epsilon, n=57):
     """In units: the rates of rows are multiplied by them."""
     ours = parameters(n)
     theirs = {name: p.requires_grad_() for name, p in parameters(n).items()}
@@ -201,9 +197,7 @@ def test_all_rows_match_torch_adam(
 
 @pytest.mark.parametrize("kind", [RowAdam, PlainRowAdam])
 @pytest.mark.parametrize("more, filler", [(0, torch.inf), (11, torch.nan)])
-def test_only_selected_rows_are_stepped(
-    kind: type[RowAdam], more: int, filler: float, n: int = 40
-) -> None:
+def test_only_selected_rows_are_stepped(kind, more, filler, n=40):
     """Other rows keep every bit, and their gradients are ignored; so do rows behind a leading
     part.
     """

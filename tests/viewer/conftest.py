@@ -17,7 +17,7 @@ from shown import SIZE, Shown, fold, serve, take
 
 
 @pytest.fixture(scope="session")
-def tabs(chromium: Any) -> Iterator[Any]:
+def tabs(chromium) -> Iterator[Any]:
     """The browser context of all tabs; a context per test would double the time to the first
     frame.
     """
@@ -27,7 +27,7 @@ def tabs(chromium: Any) -> Iterator[Any]:
 
 
 @pytest.fixture
-def show(tabs: Any) -> Iterator[Callable[..., Shown]]:
+def show(tabs) -> Iterator[Callable[..., Shown]]:
     """Opens a tab with the files of a ``clod-adapt view`` command line; an error in its console
     fails the test.
     """
@@ -35,12 +35,7 @@ def show(tabs: Any) -> Iterator[Callable[..., Shown]]:
         opened = []
 
         def start(
-            *words: object,
-            url: str = "",
-            state: str = "",
-            viewport: Any = SIZE,
-            context: Any = tabs,
-            script: str = "",
+            *words, url: str = "", state: str = "", viewport=SIZE, context=tabs, script: str = ""
         ) -> Shown:
             url = url or stack.enter_context(serve(*words))
             shown = Shown(context.new_page())
@@ -58,7 +53,7 @@ def show(tabs: Any) -> Iterator[Callable[..., Shown]]:
 
 
 @pytest.fixture
-def save(tmp_path: Path) -> Callable[..., Path]:
+def save(tmp_path) -> Callable[..., Path]:
     def write(gaussians: Gaussians, name: str = "model.ply") -> Path:
         clod_adapter.save(tmp_path / name, gaussians)
         return tmp_path / name
@@ -78,14 +73,14 @@ def plain(gaussians: Gaussians) -> Gaussians:
 
 
 @pytest.fixture(scope="session")
-def model(gaussians: Gaussians, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def model(gaussians: Gaussians, tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("viewer") / "model.ply"
     clod_adapter.save(path, gaussians)
     return path
 
 
 @pytest.fixture(scope="session")
-def tab_of_model(tabs: Any, model: Path) -> Iterator[Shown]:
+def tab_of_model(tabs, model: Path) -> Iterator[Shown]:
     with serve(model) as url:
         shown = Shown(tabs.new_page())
         shown.page.set_viewport_size(SIZE)

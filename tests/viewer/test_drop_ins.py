@@ -64,11 +64,11 @@ def engines() -> Path:
 
 
 @contextmanager
-def opened(tabs: Any, viewer: str, file: Path) -> Iterator[Any]:
+def opened(tabs, viewer: str, file: Path) -> Iterator[Any]:
     """The example page of a viewer with a file; nothing is fetched from a network."""
     modules = engines()
 
-    def answer(route: Any) -> None:
+    def answer(route):
         host, path = route.request.url.split("://")[1].split("?")[0].split("/", 1)
         source = modules / re.sub(r"@\d[\d.]*", "", path.removeprefix("npm/"))
         if host == "example":
@@ -86,17 +86,17 @@ def opened(tabs: Any, viewer: str, file: Path) -> Iterator[Any]:
     page.close()
 
 
-def place(page: Any, viewer: str, camera: dict[str, Any]) -> None:
+def place(page, viewer: str, camera: dict[str, Any]):
     to_world = FLIP @ np.linalg.inv(camera["world_to_camera"]) @ FLIP
     fov = 2 * np.degrees(np.arctan(camera["height"] / 2 / camera["focal"]))
     page.evaluate(PLACE[viewer], [to_world.T.ravel().tolist(), fov])
 
 
-def read_picture(file: Any) -> np.ndarray:
+def read_picture(file) -> np.ndarray:
     return np.asarray(Image.open(file, formats=["PNG"]).convert("RGB"), np.float64)
 
 
-def settled(page: Any) -> np.ndarray:
+def settled(page) -> np.ndarray:
     """The picture, once it has stopped changing: both viewers sort in a worker."""
     before = b""
     picture = page.screenshot()
@@ -107,7 +107,7 @@ def settled(page: Any) -> np.ndarray:
     return read_picture(io.BytesIO(picture))
 
 
-def assert_the_wgsl_of_playcanvas_gives_the_equation(page: Any, about: dict[str, Any]) -> None:
+def assert_the_wgsl_of_playcanvas_gives_the_equation(page, about: dict[str, Any]):
     """The modifier alone, as software lacks the engine's WebGPU; ``uniform NAME: TYPE;`` is a
     struct's member.
     """
@@ -161,9 +161,7 @@ def assert_the_wgsl_of_playcanvas_gives_the_equation(page: Any, about: dict[str,
 
 
 @pytest.mark.parametrize("viewer, suffix", [("spark", "spz"), ("playcanvas", "ply")])
-def test_the_dial_is_as_exact_as_the_viewer(
-    tabs: Any, viewer: str, suffix: str, tmp_path: Path
-) -> None:
+def test_the_dial_is_as_exact_as_the_viewer(tabs, viewer, suffix, tmp_path):
     about = json.loads((KIT / "cameras.json").read_text())["cameras"][0]
     undialled = 0.0
     with opened(tabs, viewer, KIT / f"kit.{suffix}") as page:

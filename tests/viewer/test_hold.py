@@ -6,7 +6,6 @@ import base64
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -33,7 +32,7 @@ GPU = """
 """
 
 
-def opened(tabs: Any, url: str, load: float) -> Shown:
+def opened(tabs, url: str, load: float) -> Shown:
     page = tabs.new_page()
     page.set_viewport_size({"width": 200, "height": 150})  # fast in software
     page.add_init_script(GPU.replace("load: 1", f"load: {load}"))
@@ -41,7 +40,7 @@ def opened(tabs: Any, url: str, load: float) -> Shown:
 
 
 @pytest.fixture(scope="module")
-def simulated(tabs: Any, model: Path) -> Iterator[Shown]:
+def simulated(tabs, model: Path) -> Iterator[Shown]:
     with serve(model) as url:
         shown = opened(tabs, url, 1)
         yield shown
@@ -74,7 +73,7 @@ def dial_of(shown: Shown) -> float:
     return float(shown.text("#dial-value").removeprefix("s = "))
 
 
-def test_the_law_is_that_of_python(tab_of_model: Shown) -> None:
+def test_the_law_is_that_of_python(tab_of_model):
     """On frames with steps of the load, noise, outliers, and a time of 0."""
     random = np.random.default_rng(0)
     load = np.repeat([1.0, 2.5, 0.3, 0.9], 20) * random.lognormal(0, 0.2, 80)
@@ -98,7 +97,7 @@ def test_the_law_is_that_of_python(tab_of_model: Shown) -> None:
     assert len({dial for _, dial in want}) > 20
 
 
-def test_the_dial_follows_a_load_that_is_switched_on_and_off(held: Shown) -> None:
+def test_the_dial_follows_a_load_that_is_switched_on_and_off(held):
     """Within 15 frames; the page then draws no more. A rate that is out of reach ends at the
     largest dial value.
     """
@@ -131,7 +130,7 @@ def test_the_dial_follows_a_load_that_is_switched_on_and_off(held: Shown) -> Non
     held.page.evaluate(f"{rate}.value = 60")
 
 
-def test_the_dial_by_hand_ends_it(simulated: Shown) -> None:
+def test_the_dial_by_hand_ends_it(simulated):
     shown = simulated
     for end in (
         "document.getElementById('hold').click()",
@@ -152,7 +151,7 @@ def test_the_dial_by_hand_ends_it(simulated: Shown) -> None:
         assert (1 < dial_of(shown) < 3) if moved else shown.text("#dial-value") == "all"
 
 
-def test_a_file_opens_with_a_held_rate(tabs: Any, model: Path, tmp_path: Path) -> None:
+def test_a_file_opens_with_a_held_rate(tabs, model, tmp_path):
     """30 frames per second, from everything on, unless a link has a dial value."""
     write_viewer_page(tmp_path / "page.html", clod_adapter.load(model))
     url = (tmp_path / "page.html").as_uri()

@@ -8,7 +8,6 @@ import re
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +18,6 @@ import clod_adapter
 import scenes
 from clod_adapter import load
 from clod_adapter.calibration import Calibration, CalibrationRow
-from clod_adapter.gaussians import Gaussians
 from clod_adapter.render import render
 from clod_adapter.viewer import page
 from scenes import dialled
@@ -29,7 +27,7 @@ VIEWER = Path(clod_adapter.__file__).parent / "viewer"
 NAME = "<img src=x onerror=clod=1><script>clod=1<!script>&amp;'\".ply"
 
 
-def test_parts_are_built_from_these_sources() -> None:
+def test_parts_are_built_from_these_sources():
     """After a change of the sources: npm ci && npm run build, in clod_adapter/viewer/web."""
     texts = {
         name: (VIEWER / "static" / name).read_text()
@@ -52,7 +50,7 @@ def test_parts_are_built_from_these_sources() -> None:
         )
 
 
-def test_the_text_of_one_file(tmp_path: Path) -> None:
+def test_the_text_of_one_file(tmp_path):
     """A picture of the first camera, a policy that allows no connection, and no names of
     folders.
     """
@@ -81,7 +79,7 @@ def test_the_text_of_one_file(tmp_path: Path) -> None:
     assert '<img id="poster"' not in text  # no viewpoint is stored
 
 
-def test_the_exact_file_is_a_plain_ply(capture: Any, tmp_path: Path) -> None:
+def test_the_exact_file_is_a_plain_ply(capture, tmp_path):
     """In blocks of rows, without empty SH degrees and rows that were dropped."""
     model = dialled(20_000, 3, 3, scene_distance=1.0)
     model = model.replace(shN=model.shN.where(torch.arange(15)[:, None] < 8, 0))
@@ -98,9 +96,7 @@ def test_the_exact_file_is_a_plain_ply(capture: Any, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("exact", [False, True])
-def test_a_page_of_one_file(
-    show: Any, save: Any, monkeypatch: pytest.MonkeyPatch, exact: bool
-) -> None:
+def test_a_page_of_one_file(show, save, monkeypatch, exact):
     """What Python reads of its SPZ or PLY, with growth, in units that float16 does not hold, and an
     opacity of 1; its dB near its cameras only. Large data are divided among several elements,
     because browsers limit a text's size.
@@ -141,7 +137,7 @@ def test_a_page_of_one_file(
         assert_same(shown, render(read, seen, s))
 
 
-def test_a_file_without_sigma_d_has_no_dial(show: Any, save: Any, plain: Gaussians) -> None:
+def test_a_file_without_sigma_d_has_no_dial(show, save, plain):
     """The page shows the reason, and the file's name as text; a name does not end its element."""
     title = f"</script>{NAME}"
     document = page.document(page.page_config([{"name": title}], None, [], 1.0))
@@ -182,9 +178,7 @@ FEW = """const real = WebGL2RenderingContext.prototype.getParameter;
         ("WebGL2", "HTMLCanvasElement.prototype.getContext = () => null"),
     ],
 )
-def test_a_page_that_cannot_show_its_model_says_why(
-    tabs: Any, model: Path, error: str, script: str
-) -> None:
+def test_a_page_that_cannot_show_its_model_says_why(tabs, model, error, script):
     """Keys have no effect then; without WebGL there is no panel either."""
     with serve(model) as url, closing(tabs.new_page()) as tab:
         if not script:

@@ -5,8 +5,6 @@ that it reads itself as Python does, and those that it leaves to Python.
 import gzip
 import re
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -24,17 +22,17 @@ from clod_adapter.viewer.page import Payload
 from formats import write_rows
 from runs import rejects
 from scenes import dialled
-from shown import TALL, Shown, assert_alike, assert_same, drop, message, take
+from shown import TALL, assert_alike, assert_same, drop, message, take
 
 VIEW = scenes.camera(320, 240)
 WIDE = ScreenFilter(variance=2.0)
 
 
-def finer(model: Gaussians, by: float, **changes: Any) -> Gaussians:
+def finer(model: Gaussians, by: float, **changes) -> Gaussians:
     return model.replace(log_scales=model.log_scales - by, **changes)
 
 
-def grown(count: int, degree: int, power: float, by: float, **settings: Any) -> Gaussians:
+def grown(count: int, degree: int, power: float, by: float, **settings) -> Gaussians:
     """With growth of both signs; some Gaussians have their centre outside the picture and grow into
     it.
     """
@@ -82,7 +80,7 @@ CASES = {
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_the_picture_and_the_count(shown: Shown, save: Any, name: str) -> None:
+def test_the_picture_and_the_count(shown, save, name):
     model, dials, camera = CASES[name]
     take(shown, save(model))
     shown.camera(camera)
@@ -99,7 +97,7 @@ def test_the_picture_and_the_count(shown: Shown, save: Any, name: str) -> None:
     assert_same(shown, render(bare, camera))
 
 
-def test_wipe_shows_both_sides(show: Any, save: Any) -> None:
+def test_wipe_shows_both_sides(show, save):
     """The base, or the same file without its dial, which is then on at the left; by a switch, and
     by C.
     """
@@ -124,9 +122,7 @@ def test_wipe_shows_both_sides(show: Any, save: Any) -> None:
     assert shown.page.input_value("#wipe") == "0"
 
 
-def test_ply_and_spz_are_shown_as_python_reads_them(
-    shown: Shown, gaussians: Gaussians, plain: Gaussians, tmp_path: Path
-) -> None:
+def test_ply_and_spz_are_shown_as_python_reads_them(shown, gaussians, plain, tmp_path):
     """With and without our comments, which other tools remove; in other types."""
     settings = replace(gaussians.attenuation, reference_distance=1.5, max_sv=6.0)
     model = finer(gaussians, 2.0, growth_d=torch.linspace(-1, 1, 400), attenuation=settings)
@@ -152,9 +148,7 @@ def test_ply_and_spz_are_shown_as_python_reads_them(
         assert_same(shown, render(found, VIEW, s))
 
 
-def test_other_files_are_errors_and_the_picture_stays(
-    shown: Shown, model: Path, tmp_path: Path
-) -> None:
+def test_other_files_are_errors_and_the_picture_stays(shown, model, tmp_path):
     data = model.read_bytes()
     write(tmp_path / "a.glb", load(model).gaussians)
     header, _, _ = data.partition(b"end_header")
@@ -220,9 +214,7 @@ def test_other_forms_of_the_dial_are_refused_with_a_remedy(shown, model, tmp_pat
         Payload.of(replace(loaded, gaussians=paper))
 
 
-def test_the_last_of_two_dropped_files_is_shown(
-    show: Any, save: Any, model: Path, gaussians: Gaussians
-) -> None:
+def test_the_last_of_two_dropped_files_is_shown(show, save, model, gaussians):
     """At the dial value of the command line, or the largest trained one of the file."""
     less = save(
         gaussians.replace(attenuation=replace(gaussians.attenuation, max_sv=2.0))[torch.arange(9)],

@@ -82,7 +82,7 @@ REQUESTS = (  # method, path, Host, status
 )
 
 
-def test_responses(server: Server) -> None:
+def test_responses(server):
     assert server.socket.getsockname()[0] == "127.0.0.1"
     assert server.url == f"http://127.0.0.1:{server.port}/"
     for method, path, host, wanted in REQUESTS:
@@ -106,7 +106,7 @@ def test_responses(server: Server) -> None:
         Server({}, server.port)
 
 
-def test_a_busy_page_gets_the_rest_later(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_busy_page_gets_the_rest_later(monkeypatch):
     """It takes no bytes for longer than an idle connection is kept."""
     monkeypatch.setattr(served._Handler, "timeout", 0.1)
     size = 1 << 25
@@ -121,13 +121,13 @@ def test_a_busy_page_gets_the_rest_later(monkeypatch: pytest.MonkeyPatch) -> Non
         assert found >= size
 
 
-def test_disconnected_and_closed(capfd: pytest.CaptureFixture[str]) -> None:
+def test_disconnected_and_closed(capfd):
     """Closing waits for running responses: a thread that holds a tensor as the interpreter exits
     aborts the process.
     """
     ended = []
 
-    def endless() -> Iterator[bytes]:
+    def endless():
         try:
             while True:
                 yield bytes(1 << 20)

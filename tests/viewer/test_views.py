@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -38,7 +37,7 @@ def photographed(folder: Path, cameras: Sequence[Camera]) -> list[Camera]:
     return named
 
 
-def test_keys_move_the_dial(shown: Shown) -> None:
+def test_keys_move_the_dial(shown):
     full = shown.counts()["kept"]
     assert shown.text("#dial-value") == "s = 1.00"
     for _ in range(10):
@@ -68,7 +67,7 @@ def target(shown: Shown, text: str) -> str:
     return shown.text("#target-note")
 
 
-def test_the_count_box(shown: Shown, gaussians: Gaussians) -> None:
+def test_the_count_box(shown, gaussians):
     """A count sets the dial value of ``dial_for``; its note ends with the state that it is about.
     Keys wait.
     """
@@ -96,18 +95,18 @@ def test_the_count_box(shown: Shown, gaussians: Gaussians) -> None:
         assert shown.text("#target-note") == "", change
 
 
-def test_pointer_touch_and_wheel_move_the_camera(chromium: Any, show: Any, model: Path) -> None:
+def test_pointer_touch_and_wheel_move_the_camera(chromium, show, model):
     shown = show(model, context=chromium.new_context(has_touch=True))
     protocol = shown.page.context.new_cdp_session(shown.page)
     mouse = shown.page.mouse
 
-    def drag() -> None:
+    def drag():
         mouse.move(100, 60)
         mouse.down()
         mouse.move(150, 80, steps=3)
         mouse.up()
 
-    def touch(*moves: tuple[tuple[int, int], ...]) -> None:
+    def touch(*moves):
         for kind, points in zip(("touchStart", "touchMove", "touchEnd"), (*moves, ()), strict=True):
             where = [{"x": x, "y": y, "id": k} for k, (x, y) in enumerate(points)]
             protocol.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": where})
@@ -126,7 +125,7 @@ def test_pointer_touch_and_wheel_move_the_camera(chromium: Any, show: Any, model
     assert np.array_equal(shown.picture(), fitted)
 
 
-def test_files_and_cameras_are_listed(show: Any, gaussians: Gaussians, tmp_path: Path) -> None:
+def test_files_and_cameras_are_listed(show, gaussians, tmp_path):
     """Switched by keys, lists and a link: view and base stay, and the dial value where the file has
     it.
     """
@@ -180,7 +179,7 @@ def forward(view: dict[str, np.ndarray]) -> np.ndarray:
     return np.cross(view["axes"][:3], view["axes"][3:])
 
 
-def points(means: Any, size: float, sh0: Any = None) -> Gaussians:
+def points(means, size: float, sh0=None) -> Gaussians:
     """Opaque balls."""
     means = torch.as_tensor(means, dtype=torch.float32)
     model = scenes.gaussians(len(means), 0, 1)
@@ -209,12 +208,12 @@ def ground(angle: float) -> tuple[Gaussians, np.ndarray]:
     return model.replace(log_scales=model.log_scales + scales, quats=quats), turn @ [0, -1, 0]
 
 
-def test_the_up_axis(shown: Shown, show: Any, save: Any, tmp_path: Path) -> None:
+def test_the_up_axis(shown, show, save, tmp_path):
     """That of a tilted ground; that of the photographs' cameras, if any; or a chosen one, which a
     link keeps.
     """
 
-    def up_of(view: dict[str, np.ndarray], tilt: float) -> np.ndarray:
+    def up_of(view, tilt):
         return np.asarray(-np.cos(tilt) * view["axes"][3:] - np.sin(tilt) * forward(view))
 
     for angle in np.radians([-80, 25]):  # z up, and y down
@@ -245,7 +244,7 @@ def test_the_up_axis(shown: Shown, show: Any, save: Any, tmp_path: Path) -> None
     assert abs(link(with_cameras)["axes"][2]) < 1e-6
 
 
-def test_placed_cameras_are_levelled(show: Any, model: Path, tmp_path: Path) -> None:
+def test_placed_cameras_are_levelled(show, model, tmp_path):
     saved = clod_adapter.load(model)
     viewmat = scenes.looking(torch.tensor([1.0, 0.5, 0.5]))
     tilted = Camera(
@@ -307,7 +306,7 @@ SELECTED = """() => {
 }"""
 
 
-def test_the_path_and_the_turntable(show: Any, model: Path, tmp_path: Path) -> None:
+def test_the_path_and_the_turntable(show, model, tmp_path):
     """The path begins again at its end; Space or a drag stops it. The turntable rotates about the
     pivot and up axis.
     """
@@ -341,7 +340,7 @@ def test_the_path_and_the_turntable(show: Any, model: Path, tmp_path: Path) -> N
     shown.until(f"{playing} === null")
 
 
-def test_pictures_and_videos_are_saved(shown: Shown) -> None:
+def test_pictures_and_videos_are_saved(shown):
     shown.run("clod.setDial(2)")
     picture = shown.picture()
     with shown.page.expect_download() as download:

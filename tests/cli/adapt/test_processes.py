@@ -5,7 +5,6 @@ them.
 import json
 import os
 import signal
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -17,20 +16,18 @@ from clod_adapter.cli.main import build_parser
 from clod_adapter.cli.shared.command import make_config
 from clod_adapter.cli.shared.process import Launch, launched
 from clod_adapter.training.state import load_state
-from runs import STATE, Launched, Server, log_of, rejects
+from runs import STATE, Launched, log_of, rejects
 
 TINY = ("--max-sv", 4, "--out", "dial.ply", "--batch", 2, "--iters", 12)
 LONG = (*TINY[:-1], 4000)  # does not end by itself
 
 
 @pytest.fixture(scope="module")
-def words(capture: Any) -> list[Any]:
+def words(capture) -> list[Any]:
     return [capture.ply, "--images", capture.scene]
 
 
-def test_time_budget_ends_all_after_the_same_step(
-    server: Server, words: list[Any], tmp_path: Path
-) -> None:
+def test_time_budget_ends_all_after_the_same_step(server, words, tmp_path):
     """By the clock of the first process; that of the second is far ahead."""
     ahead = (
         "import clod_adapter.training.loop as t; at = t.time.perf_counter; t.time.perf_counter ="
@@ -41,9 +38,7 @@ def test_time_budget_ends_all_after_the_same_step(
     assert 1 <= run.report()["steps"] < 4000 and not run.report()["interrupted"]
 
 
-def test_signals_of_the_launcher_do_not_end_the_writing(
-    server: Server, words: list[Any], tmp_path: Path
-) -> None:
+def test_signals_of_the_launcher_do_not_end_the_writing(server, words, tmp_path):
     """It sends them after a lost process, and repeats its own, until the process ends."""
     pressed = (
         "import argparse; from clod_adapter import pipeline; from clod_adapter.cli.adapt import"
@@ -90,7 +85,7 @@ Trainer.gradient_sum = pull
 """
 
 
-def test_two_give_the_result_of_one(server: Server, words: list[Any], tmp_path: Path) -> None:
+def test_two_give_the_result_of_one(server, words, tmp_path):
     """Within the rounding of sums in another order, also resumed after an error of the second
     process in a step.
     """
@@ -122,9 +117,7 @@ def test_two_give_the_result_of_one(server: Server, words: list[Any], tmp_path: 
         torch.testing.assert_close(found.tensors()[name], tensor, rtol=1e-4, atol=1e-4)
 
 
-def test_process_lost_before_the_first_step(
-    server: Server, words: list[Any], tmp_path: Path
-) -> None:
+def test_process_lost_before_the_first_step(server, words, tmp_path):
     """Nothing is written."""
     lost = "def adapt(*_, **__): raise MemoryError('no room')\nprocesses.adapt = adapt"
     run = Launched(server, tmp_path / "run", *words, *TINY, before={1: lost})
@@ -136,9 +129,7 @@ def test_process_lost_before_the_first_step(
     assert "; process 1: no room; this was before the first step, so start again\n" in log
 
 
-def test_interrupt_stops_all_after_the_same_step(
-    server: Server, words: list[Any], tmp_path: Path
-) -> None:
+def test_interrupt_stops_all_after_the_same_step(server, words, tmp_path):
     run = Launched(server, tmp_path / "run", *words, *LONG, wait=STATE)
     os.kill(run.pids[1], signal.SIGINT)  # either process
     assert run.wait() == [0, 0], run.log(0)
@@ -148,7 +139,7 @@ def test_interrupt_stops_all_after_the_same_step(
     assert "gone" not in str(report["notes"]) and run.log(1) == ""
 
 
-def test_bad_input_is_reported_once(server: Server, words: list[Any], tmp_path: Path) -> None:
+def test_bad_input_is_reported_once(server, words, tmp_path):
     for given, message in (
         ([*words, "--batch", 1], "--batch is 1, it must be at least 2: a view for each process"),
         (["eval", "nowhere.ply", "--images", "scene"], "only adapting takes several processes"),
@@ -176,7 +167,7 @@ elastic_launch(config, lambda: os._exit(main.main(about['words'])))()
 """
 
 
-def test_torchrun_with_a_killed_process(server: Server, words: list[Any], tmp_path: Path) -> None:
+def test_torchrun_with_a_killed_process(server, words, tmp_path):
     """By torchrun's agent, which sends SIGTERM to the first process once the second is gone."""
     folder = tmp_path / "run"
     folder.mkdir()
@@ -188,10 +179,10 @@ def test_torchrun_with_a_killed_process(server: Server, words: list[Any], tmp_pa
     assert report["interrupted"] and report["steps"] == load_state(folder / STATE)[0].steps
 
 
-def test_rank_and_default_steps_from_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rank_and_default_steps_from_the_environment(monkeypatch):
     """Any number of processes takes the same number of views by default."""
 
-    def launch_of(rank: str, size: int = 4, **address: str) -> Launch:
+    def launch_of(rank, size=4, **address):
         for name, value in {"RANK": rank, "WORLD_SIZE": size, **address}.items():
             monkeypatch.setenv(name, str(value))
         return launched()

@@ -57,9 +57,7 @@ VALUES = [
 
 
 @pytest.fixture(scope="module")
-def state(
-    tmp_path_factory: pytest.TempPathFactory,
-) -> tuple[Path, Any, dict[str, torch.Tensor], Any]:
+def state(tmp_path_factory) -> tuple[Path, Any, dict[str, torch.Tensor], Any]:
     """The file of a state after two of three steps, the base and scene, and what is in it."""
     path = tmp_path_factory.mktemp("saved") / STATE
     pair = small_capture(40, views=4, width=16, height=12)
@@ -70,7 +68,7 @@ def state(
         return path, pair, load_file(path), json.loads(file.metadata()[KEY])
 
 
-def places(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+def places(value, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
     """The paths of all entries of a JSON document, at any depth."""
     if path:
         yield path
@@ -83,7 +81,7 @@ def places(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
 
 @settings(max_examples=40, deadline=None)
 @given(data=st.data())
-def test_damaged_states_are_refused_or_harmless(state: Any, data: Any) -> None:
+def test_damaged_states_are_refused_or_harmless(state, data):
     """Entries of another type or out of range, or missing, at any depth; tensors of other shapes,
     types or values.
     """
@@ -128,14 +126,12 @@ TINY = "--iters 12 --max-sv 4 --out dial.ply"
 ADAPT = f"BASE --images SCENE {TINY}"
 
 
-def test_states_of_other_runs_are_refused(
-    clod: Any, capture: Any, tmp_path: Path, monkeypatch: Any
-) -> None:
+def test_states_of_other_runs_are_refused(clod, capture, tmp_path, monkeypatch):
     """Of other settings, inputs or versions, or damaged; of the same inputs with other names they
     are not.
     """
 
-    def refused(message: str, *words: str) -> None:
+    def refused(message, *words):
         assert f"error: {STATE}: {message}" in clod(*words, code=2).err
 
     with pressed(listeners, "save_state", signal.SIGINT, signal.SIGTERM, at=2):
@@ -167,9 +163,7 @@ def test_states_of_other_runs_are_refused(
     assert f"resuming {STATE} from step 1" in clod(f"moved.ply --images moved {TINY} --resume").err
 
 
-def test_without_a_state_training_starts_over(
-    clod: Any, tmp_path: Path, state: Any, monkeypatch: Any
-) -> None:
+def test_without_a_state_training_starts_over(clod, tmp_path, state, monkeypatch):
     """An earlier state stays until a new one replaces it; a state that cannot be saved costs
     nothing else.
     """
@@ -190,12 +184,10 @@ def test_without_a_state_training_starts_over(
     assert f"{STATE} has step 2 of an interrupted run" in done.err and names(tmp_path) == OUTPUTS
 
 
-def test_a_state_that_cannot_be_removed_is_a_note(
-    clod: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_state_that_cannot_be_removed_is_a_note(clod, monkeypatch):
     unlink = Path.unlink
 
-    def refuse(path: Path, missing_ok: bool = False) -> None:
+    def refuse(path, missing_ok=False):
         if path.name == STATE:
             raise PermissionError(1, "Operation not permitted", str(path))
         unlink(path, missing_ok)
@@ -210,8 +202,8 @@ def test_a_state_that_cannot_be_removed_is_a_note(
     [(0.1, 0.1, 15.0, 0.015), (25.0, 3.0, 80.0, 0.15), (1.0, 30.0, 220.0, 0.2)],
 )
 def test_the_state_is_recent_and_saving_takes_a_small_share_of_the_time(
-    monkeypatch: pytest.MonkeyPatch, step: float, save: float, oldest: float, share: float
-) -> None:
+    monkeypatch, step, save, oldest, share
+):
     """Seconds of a step and of a save; the largest age of the state, unless a save takes very long,
     and the share.
     """
@@ -219,7 +211,7 @@ def test_the_state_is_recent_and_saving_takes_a_small_share_of_the_time(
     saved = [0.0]
     ages = [0.0]
 
-    def save_state(path: Path, state: float, run_of: Any) -> None:
+    def save_state(path, state, run_of):
         nonlocal clock
         clock += save
         ages.append(clock - saved[-1])  # of the file that is replaced now
@@ -242,9 +234,7 @@ def test_the_state_is_recent_and_saving_takes_a_small_share_of_the_time(
     [(fail, [STATE]), (lambda found: replace(found, loss=math.nan), sorted([*OUTPUTS, STATE]))],
     ids=["step", "loss"],
 )
-def test_resuming_after_an_error(
-    clod: Any, dialled: Path, tmp_path: Path, change: Any, files: list[str]
-) -> None:
+def test_resuming_after_an_error(clod, dialled, tmp_path, change, files):
     """The same command with --resume then writes the files of a run without an error."""
     with pytest.MonkeyPatch.context() as patch:
         change_step(patch, 6, change)

@@ -29,7 +29,7 @@ def columns(path: Path | str) -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def adapted(run_in: Any, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Any]:
+def adapted(run_in, tmp_path_factory) -> tuple[Path, Any]:
     """A run that loses more than is accepted, with a line of progress per step."""
     folder = tmp_path_factory.mktemp("adapted")
     with pytest.MonkeyPatch.context() as patch:
@@ -38,7 +38,7 @@ def adapted(run_in: Any, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path
     return folder, done
 
 
-def test_writes_three_files(adapted: tuple[Path, Any], capture: Any, dialled: Path) -> None:
+def test_writes_three_files(adapted, capture, dialled):
     """The same seed gives the same bits. The report agrees with them at both ends of the dial and
     without it.
     """
@@ -91,9 +91,7 @@ def test_writes_three_files(adapted: tuple[Path, Any], capture: Any, dialled: Pa
     assert (stored.total, stored.views, stored.width, stored.height) == (540, 2, 64, 48)
 
 
-def test_prints_progress_a_table_next_commands_and_a_loss(
-    adapted: tuple[Path, Any], capture: Any
-) -> None:
+def test_prints_progress_a_table_next_commands_and_a_loss(adapted, capture):
     folder, done = adapted
     table = [line.split() for line in done.out.splitlines()[1:9]]
     assert [line[0] for line in table] == ["dial", "base", "1", "1.5", "2", "3", "4", "plain"]
@@ -123,7 +121,7 @@ def test_prints_progress_a_table_next_commands_and_a_loss(
     assert done.err.endswith(f"\nwarning: {report['loss']}\n")
 
 
-def test_forecast_of_time_and_memory(clod: Any) -> None:
+def test_forecast_of_time_and_memory(clod):
     """In a line before training, and with what the run took in the report."""
     done = clod("BASE --images SCENE --max-sv 2 --out dial.ply --json --iters 100")
     found = done.report["forecast"]
@@ -155,7 +153,7 @@ def test_dial_of_the_checkpoint_is_continued(clod, dialled):
     assert growth_d is not None and not growth_d.any()
 
 
-def test_without_held_out_photographs(clod: Any, capture: Any, tmp_path: Path) -> None:
+def test_without_held_out_photographs(clod, capture, tmp_path):
     view = load_scene(capture.scene).train[0]
     (tmp_path / "one" / "images").mkdir(parents=True)
     write_model(tmp_path / "one", [view.camera], ["a.png"])
@@ -166,7 +164,7 @@ def test_without_held_out_photographs(clod: Any, capture: Any, tmp_path: Path) -
 
 
 @pytest.mark.usefixtures("few_placed")
-def test_without_photographs(clod: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_photographs(clod, tmp_path, monkeypatch):
     """The target images are renders of the base, rounded to bytes."""
     # dB, more than the result has
     monkeypatch.setattr("clod_adapter.cli.adapt.run.ENOUGH", (50.0, 25.0))
@@ -217,7 +215,7 @@ SHORT = "--images SCENE --iters 24 --max-sv 4 --out dial.ply --json"
 
 
 @pytest.fixture
-def wasteful(capture: Any, tmp_path: Path) -> Path:
+def wasteful(capture, tmp_path) -> Path:
     """The capture's checkpoint with a degree that does nothing, and 50 Gaussians that no camera
     sees among the rest.
     """
@@ -232,11 +230,11 @@ def wasteful(capture: Any, tmp_path: Path) -> Path:
     return Path(capture.write(tmp_path / "wasteful.ply", base.replace(**values)))
 
 
-def decisions(done: Any) -> dict[str, dict[str, Any]]:
+def decisions(done) -> dict[str, dict[str, Any]]:
     return {decision["what"]: decision for decision in done.report["plan"]["decisions"]}
 
 
-def test_the_plan_is_printed_and_stored(clod: Any, wasteful: Path) -> None:
+def test_the_plan_is_printed_and_stored(clod, wasteful):
     """What is left out of the training is in the file unchanged."""
     done = clod(wasteful, SHORT)
     lines = re.findall(r"^plan: .*?^trained 24 steps", done.err, re.M | re.S)[0].splitlines()
@@ -258,7 +256,7 @@ def test_the_plan_is_printed_and_stored(clod: Any, wasteful: Path) -> None:
     assert rebuilt(clod, wasteful)
 
 
-def test_overrides(clod: Any, wasteful: Path) -> None:
+def test_overrides(clod, wasteful):
     """Whose names are the options' too."""
     assert adapt.NAMES == NAMES
     done = clod(wasteful, SHORT, "--with bands --without quats --with sh0 --without means")

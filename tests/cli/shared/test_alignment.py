@@ -4,7 +4,6 @@ requested.
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -23,9 +22,7 @@ from scenes import seeded
 FAST = "--iters 3 --max-sv 4 --out dial.ply --json"
 
 
-def scene_of(
-    capture: Any, folder: Path, shown: Callable[[View], torch.Tensor], count: int = 9
-) -> Path:
+def scene_of(capture, folder: Path, shown: Callable[[View], torch.Tensor], count: int = 9) -> Path:
     """The first of the capture's cameras with other photographs, which ``shown`` gives as
     pixels.
     """
@@ -39,7 +36,7 @@ def scene_of(
 
 
 @pytest.fixture
-def turned(capture: Any, tmp_path: Path) -> Path:
+def turned(capture, tmp_path) -> Path:
     """The checkpoint with y and z negated: half a turn about x; without harmonics, which would turn
     too.
     """
@@ -51,9 +48,7 @@ def turned(capture: Any, tmp_path: Path) -> Path:
     )
 
 
-def test_cameras_are_moved_into_another_frame_in_every_command(
-    clod: Any, capture: Any, turned: Path
-) -> None:
+def test_cameras_are_moved_into_another_frame_in_every_command(clod, capture, turned):
     done = clod(turned, "--images SCENE", FAST)
     said = f"the cameras are moved into the frame of {turned} (axes x, -y, -z): renders have"
     report = done.report
@@ -78,9 +73,7 @@ def test_cameras_are_moved_into_another_frame_in_every_command(
     assert "(axes x, -y, -z)" in clod("export dial.ply --images SCENE --sv 2 -o baked.ply").err
 
 
-def test_another_scene_is_refused_and_nothing_is_written(
-    clod: Any, capture: Any, turned: Path, tmp_path: Path
-) -> None:
+def test_another_scene_is_refused_and_nothing_is_written(clod, capture, turned, tmp_path):
     random = seeded(2)
     scene = scene_of(capture, tmp_path / "scene", lambda view: view.image, 2)
     means, sh0 = (torch.randn(shape, generator=random) for shape in ((300, 3), (300, 1, 3)))
@@ -96,13 +89,11 @@ def test_another_scene_is_refused_and_nothing_is_written(
     assert names(tmp_path) == before
 
 
-def test_white_background_is_refused_unless_allowed(
-    clod: Any, capture: Any, tmp_path: Path
-) -> None:
+def test_white_background_is_refused_unless_allowed(clod, capture, tmp_path):
     few = capture.gaussians.select(torch.arange(300) < 40)  # so that there is a background
     ply = capture.write(tmp_path / "few.ply", few)
 
-    def over_white(view: View) -> torch.Tensor:
+    def over_white(view):
         return render(few, view.camera, background=torch.ones(3)).pixels
 
     words = (ply, "--images", scene_of(capture, tmp_path / "white", over_white), FAST)
@@ -118,16 +109,14 @@ def test_white_background_is_refused_unless_allowed(
 @pytest.mark.parametrize(
     "said, share", [("another exposure", 0.2), ("have a single colour each", 0)]
 )
-def test_other_photographs_have_a_warning(
-    clod: Any, capture: Any, tmp_path: Path, said: str, share: float
-) -> None:
+def test_other_photographs_have_a_warning(clod, capture, tmp_path, said, share):
     scene_of(capture, tmp_path / "scene", lambda view: (share * view.image).byte())
     done = clod("BASE --images scene", FAST)
     assert said in done.err and said in done.report["notes"][0]
 
 
 @pytest.fixture(scope="module")
-def trained(capture: Any, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+def trained(capture, tmp_path_factory) -> tuple[Path, Path]:
     """A checkpoint of small Gaussians without metadata on antialiasing, and antialiased
     photographs.
     """
@@ -138,9 +127,7 @@ def trained(capture: Any, tmp_path_factory: pytest.TempPathFactory) -> tuple[Pat
     return capture.write(folder / "base.ply", small), scene
 
 
-def test_adapting_detects_and_stores_the_filter(
-    clod: Any, trained: tuple[Path, Path], tmp_path: Path
-) -> None:
+def test_adapting_detects_and_stores_the_filter(clod, trained, tmp_path):
     """The viewer draws the base with the filter of the model, without photographs and metadata in
     the base's file.
     """
@@ -162,7 +149,7 @@ def test_adapting_detects_and_stores_the_filter(
             assert load(tmp_path / "served.ply").gaussians.screen_filter == want
 
 
-def test_eval_and_render_use_the_detected_filter(clod: Any, trained: tuple[Path, Path]) -> None:
+def test_eval_and_render_use_the_detected_filter(clod, trained):
     ply, scene = trained
     found = {}
     for more in ("", "--antialiasing off"):
@@ -182,7 +169,7 @@ def test_eval_and_render_use_the_detected_filter(clod: Any, trained: tuple[Path,
     assert min(found[""]) > 45 > 35 > max(found["--antialiasing off"]), found
 
 
-def test_option_overrides_the_file(clod: Any, trained: tuple[Path, Path]) -> None:
+def test_option_overrides_the_file(clod, trained):
     """The result of adapting stores the filter of the option; a note names an override of it."""
     ply, scene = trained
     assert "by the photographs" not in clod(ply, "--images", scene, FAST, "--antialiasing mip").err
@@ -191,7 +178,7 @@ def test_option_overrides_the_file(clod: Any, trained: tuple[Path, Path]) -> Non
     assert "the file has 0.1 px^2 of blur, opacities compensated" in note and note in told.err
 
 
-def test_exports_store_the_filter_or_note_its_loss(clod: Any, trained: tuple[Path, Path]) -> None:
+def test_exports_store_the_filter_or_note_its_loss(clod, trained):
     for out, stores, notes in (
         ("a.ply", True, True),
         ("a.spz", True, False),

@@ -26,9 +26,7 @@ from runs import names, rebuilt, rejects
 TINY = "--images SCENE --iters 2 --max-sv 4 --out dial.ply"
 
 
-def test_values_that_look_activated_need_the_option(
-    clod: Any, capture: Any, tmp_path: Path
-) -> None:
+def test_values_that_look_activated_need_the_option(clod, capture, tmp_path):
     """It is for the checkpoint, not for the adapted file. With the right option the renders
     match.
     """
@@ -52,16 +50,16 @@ def test_values_that_look_activated_need_the_option(
     assert report["base_row"]["psnr"] > 40
 
 
-def test_a_compressed_file_is_adapted(clod: Any, tmp_path: Path) -> None:
+def test_a_compressed_file_is_adapted(clod, tmp_path):
     shutil.copy(PACKED, tmp_path / "base.compressed.ply")
     assert "note: base.compressed.ply: quantised" in clod("base.compressed.ply", TINY).err
     assert rebuilt(clod, "base.compressed.ply")
 
 
-def test_devices(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_devices(monkeypatch, capsys):
     """Without a GPU nothing is printed; a GPU is named, or the reason that it is not used."""
 
-    def refused(said: str) -> None:
+    def refused(said):
         with rejects(rf"--device cuda: {said}.*or use --device cpu"):
             pick_device("cuda", Console())
 
@@ -104,7 +102,7 @@ def test_devices(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[
     refused("gsplat is absent: pip install gsplat==1.5.3")
 
 
-def test_adapting_compiles_nothing_more(capture: Any, capsys: pytest.CaptureFixture[str]) -> None:
+def test_adapting_compiles_nothing_more(capture, capsys):
     """For any SH degree; without compiling nothing is printed."""
     base = capture.gaussians
     scene = clod_adapter.load_scene(capture.scene)
@@ -127,7 +125,7 @@ def page_of(path: Path) -> tuple[str, dict[str, Any]]:
     return text, json.loads(re.findall(r'id="data">(.*?)</script>', text, re.S)[0])
 
 
-def test_adapt(clod: Any, tmp_path: Path) -> None:
+def test_adapt(clod, tmp_path):
     pytest.importorskip("matplotlib")
     report = clod(ADAPT, "--json").report
     files = {
@@ -156,7 +154,7 @@ def test_adapt(clod: Any, tmp_path: Path) -> None:
     assert text.count('data-name=""') == pages.FRAMES and text.count('data-name="base"') == 1
 
 
-def test_eval(clod: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_eval(clod, tmp_path, monkeypatch):
     """Without matplotlib the page is refused before any work."""
     pytest.importorskip("matplotlib")
     report = clod("eval DIAL --images SCENE --report look.html --json --base BASE").report
