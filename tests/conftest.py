@@ -8,11 +8,10 @@ import clod_adapter  # noqa: F401
 import math
 import os
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -21,7 +20,7 @@ from PIL import Image
 
 import browser
 import fake_gpu
-from clod_adapter import Camera, Gaussians, Scene, detach, render
+from clod_adapter import Camera, Gaussians, detach, render
 from clod_adapter.cli.main import main
 from clod_adapter.cli.shared.console import Console
 from clod_adapter.cli.shared.inputs import prepare_kernels
@@ -40,7 +39,7 @@ frame_times.NOISY = math.inf  # whether a note is given depends on the load
 pseudo_views.MANY = 8  # the tests' captures have eight, which are few by the measure of real ones
 
 
-def pytest_sessionstart(session: pytest.Session):
+def pytest_sessionstart(session):
     """Compiles the kernels; of several test processes the first does, and the others load them."""
     if run := getattr(session.config, "workerinput", {}).get("testrunuid"):
         with FileLock(Path(tempfile.gettempdir()) / f"clod-{run}.lock"):
@@ -49,7 +48,7 @@ def pytest_sessionstart(session: pytest.Session):
 
 
 @pytest.fixture
-def ci_banana() -> Path:
+def ci_banana():
     """A small real scene of the shared data: CLOD_SHARED_DATA, or shared/data beside the
     checkout.
     """
@@ -62,7 +61,7 @@ def ci_banana() -> Path:
 
 
 @pytest.fixture(scope="session")
-def chromium() -> Iterator[Any]:
+def chromium():
     """The one browser of a test process (Playwright allows no second); skips where there is
     none.
     """
@@ -89,7 +88,7 @@ class Capture:
 
 
 @pytest.fixture(scope="session")
-def capture(tmp_path_factory) -> Capture:
+def capture(tmp_path_factory):
     """300 Gaussians in Inria's layout, photographed from a circle around them."""
     folder = tmp_path_factory.mktemp("capture")
     scene = folder / "scene"
@@ -112,12 +111,12 @@ def capture(tmp_path_factory) -> Capture:
 
 
 @pytest.fixture(scope="module")
-def captured() -> tuple[Gaussians, Scene]:
+def captured():
     return perturbed()
 
 
 @pytest.fixture(scope="session")
-def dialled(capture: Capture, tmp_path_factory) -> Path:
+def dialled(capture, tmp_path_factory):
     """The capture's checkpoint with a dial up to 4 and its calibration, as clod-adapt writes it."""
     path = tmp_path_factory.mktemp("dialled") / "dial.ply"
     words = f"{capture.ply} --images {capture.scene} --iters 12 --max-sv 4 --out {path} --quiet"
@@ -125,11 +124,11 @@ def dialled(capture: Capture, tmp_path_factory) -> Path:
     return path
 
 
-def _write_inria(path: Path, gaussians: Gaussians) -> Path:
+def _write_inria(path, gaussians):
     return write_rows(path, inria_rows(detach(gaussians)))
 
 
-def _camera(angle: float) -> Camera:
+def _camera(angle):
     viewmat = looking(-torch.tensor([math.sin(angle), 0.1, math.cos(angle)]))
     viewmat[:3, 3] = torch.tensor([0.0, 0.0, 5.0])
     return Camera(viewmat, torch.tensor([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]]), 64, 48)

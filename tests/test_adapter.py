@@ -26,7 +26,7 @@ CONFIG = AttenuationConfig(reference_distance=3.5)
 extract = partial(adapters.extract, fingerprint="a" * 64, config={})
 
 
-def gaussians(n: int = 6, seed: int = 0, bands: int = 8) -> Gaussians:
+def gaussians(n=6, seed=0, bands=8):
     """The first is opaque, at -0 and at denormal coordinates."""
     g = seeded(seed)
     shapes = ((n, 3), (n, 4), (n, 3), (n,), (n, 1, 3), (n, bands, 3))
@@ -35,16 +35,14 @@ def gaussians(n: int = 6, seed: int = 0, bands: int = 8) -> Gaussians:
     return made
 
 
-def bits(g: Gaussians) -> dict[str, list[int]]:
+def bits(g):
     return {
         name: value.detach().view(torch.int32).flatten().tolist()
         for name, value in g.tensors().items()
     }
 
 
-def adapt(
-    base: Gaussians, names: list[str], scale: float = 0.01, seed: int = 1, growth: bool = True
-) -> Gaussians:
+def adapt(base, names, scale=0.01, seed=1, growth=True):
     """With other values of these attributes, but in the first row."""
     g = seeded(seed)
     changes = {name: getattr(base, name).clone() for name in names}
@@ -156,9 +154,7 @@ def test_arrays_become_tensors_and_repr_is_short():
 STORED = {"steps": 3, "lr": 0.1, "names": ["a", None], "nested": {"b": True}, "ü": "é"}
 
 
-def adapter(
-    n: int = 5, config: dict[str, object] | None = None, reference: float = 0.1 / 3
-) -> Adapter:
+def adapter(n=5, config=None, reference=0.1 / 3):
     generator = seeded(n)
     updates = {
         "means": torch.randn(n, 3, generator=generator).half(),

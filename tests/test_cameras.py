@@ -12,7 +12,7 @@ VIEWMAT = torch.eye(4)
 K = torch.tensor([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]])
 
 
-def changed(matrix: torch.Tensor, row: int, column: int, value: float) -> torch.Tensor:
+def changed(matrix, row, column, value):
     found = matrix.clone()
     found[row, column] = value
     return found

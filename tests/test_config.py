@@ -86,7 +86,7 @@ rows = st.lists(
 
 
 @st.composite
-def tables(draw: st.DrawFn) -> Calibration:
+def tables(draw):
     values = [(1.0, *draw(st.tuples(number, number, number)), 2.5), *draw(rows)]
     measured = []
     for s, kept, psnr, ssim, ms in {row[0]: row for row in values}.values():

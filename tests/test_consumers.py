@@ -4,17 +4,15 @@ simulated one (``fake_gpu``).
 """
 
 import importlib
-from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import chain
-from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
 import gsplat_in_torch
-from clod_adapter import Hook, Scene, View, attach, dial_for, evaluate, make_plan, render
+from clod_adapter import Hook, Scene, attach, dial_for, evaluate, make_plan, render
 from clod_adapter.adapter import detach, with_dial
 from clod_adapter.alignment.check import check_alignment
 from clod_adapter.bake import bake, order_by_extinction
@@ -23,7 +21,7 @@ from clod_adapter.equation import attenuation
 from clod_adapter.equation.units import in_world_units
 from clod_adapter.evaluation.budget import frame_times, matching_dial
 from clod_adapter.evaluation.popping import dial_popping, path_popping
-from clod_adapter.gaussians import Gaussians, with_near
+from clod_adapter.gaussians import with_near
 from clod_adapter.initialization.importance import for_training
 from clod_adapter.integrations.splats import from_gsplat, to_gsplat
 from clod_adapter.rasterizers import BACKENDS, Rasterizer, cpu, cuda
@@ -39,28 +37,28 @@ CAMERAS = ring(3, 24, 18)
 CONFIG = AdaptConfig(max_sv=4.0)
 
 
-def model_of() -> Gaussians:
+def model_of():
     sigma_d = 0.3 + 4 * torch.rand(N, generator=seeded(1))
     settings = AttenuationConfig(scene_distance=4.0, reference_distance=4.0, max_sv=4.0)
     return with_dial(gaussians(N, 1, 0, size=0.15), sigma_d, settings, torch.linspace(-0.5, 1, N))
 
 
-def views_of(model: Gaussians) -> tuple[View, ...]:
+def views_of(model):
     return photograph(detach(model).cpu(), CAMERAS)
 
 
-def rendering(model: Gaussians) -> list[Any]:
+def rendering(model):
     found = render(model, CAMERAS[0], DIAL)
     return [found.image, found.alpha, found.kept]
 
 
-def evaluation(model: Gaussians) -> list[Any]:
+def evaluation(model):
     rows = evaluate(model, views_of(model), [1.0, DIAL])
     return list(chain(*((row.psnr, row.ssim, row.kept, row.in_view) for row in rows)))
 
 
-def objective(config: AdaptConfig) -> Callable[[Gaussians], list[Any]]:
-    def gradients(model: Gaussians) -> list[Any]:
+def objective(config):
+    def gradients(model):
         run = Trainer(model, views_of(model), config)
         found = run.gradient_sum([Sample(views_of(model)[0], DIAL, 3.0)])
         return [found.loss, found.kept, *found.gradients.values()]
@@ -68,31 +66,31 @@ def objective(config: AdaptConfig) -> Callable[[Gaussians], list[Any]]:
     return gradients
 
 
-def papers_objective(model: Gaussians) -> list[Any]:
+def papers_objective(model):
     paper = model.replace(growth_d=None, attenuation=replace(model.attenuation, form="paper"))
     return objective(AdaptConfig.paper(max_sv=4.0))(paper)
 
 
-def objective_of_far_ones(model: Gaussians) -> list[Any]:
+def objective_of_far_ones(model):
     far = model.replace(attenuation=replace(model.attenuation, near_distance=5.0))
     return objective(CONFIG)(with_near(detach(model), far))
 
 
-def budget(**given) -> Callable[[Gaussians], list[Any]]:
+def budget(**given):
     return lambda model: [dial_for(model, keep=float(n), **given).virtual_scale for n in (20, 25)]
 
 
-def baked(**given) -> Callable[[Gaussians], list[Any]]:
+def baked(**given):
     return lambda model: list(bake(model, DIAL, **given).tensors().values())
 
 
-def hook(model: Gaussians) -> list[Any]:
+def hook(model):
     own = model.cpu()  # the hook follows the means
     dialled = Hook(own.sigma_d, own.attenuation, DIAL, own.growth_d)  # type: ignore[arg-type]
     return list(dialled(model.means, model.opacities, CAMERAS[0].viewmat))
 
 
-def popping(model: Gaussians) -> list[Any]:
+def popping(model):
     return [
         dial_popping(model, CAMERAS[0], DIAL, steps=2).mean,
         path_popping(model, CAMERAS[:2], DIAL, steps=2).mean,
@@ -115,12 +113,12 @@ CONSUMERS = {
 }
 
 
-def same(these: list[Any], those: list[Any]) -> bool:
+def same(these, those):
     pairs = list(zip(these, those, strict=True))
     return all(torch.equal(a, b) if isinstance(a, Tensor) else a == b for a, b in pairs)
 
 
-def agree(these: list[Any], those: list[Any], within: float) -> bool:
+def agree(these, those, within):
     """To this share of each result."""
     for pair in zip(these, those, strict=True):
         a, b = (torch.as_tensor(value).cpu().double() for value in pair)
@@ -162,14 +160,14 @@ def test_everything_grows_by_one_function(name, monkeypatch):
 SHORT = replace(CONFIG, iters=1)
 
 
-def on_the_cpu(*given) -> tuple[Tensor, ...]:
+def on_the_cpu(*given):
     """The CPU's kernels in place of gsplat's, which take long in torch on the simulated device."""
     moved = [each.cpu() if isinstance(each, Tensor) else each for each in given]
     return tuple(each.to(given[0].device) for each in cpu.rasterize(*moved))
 
 
 @pytest.fixture
-def there(monkeypatch) -> Iterator[Gaussians]:
+def there(monkeypatch):
     """Gaussians with a dial, on the device."""
     pytest.importorskip("gsplat", reason="pip install gsplat==1.5.3")
     if torch.cuda.is_available():
@@ -181,7 +179,7 @@ def there(monkeypatch) -> Iterator[Gaussians]:
         yield model_of().to(device)
 
 
-def own_loop(model: Gaussians) -> list[Any]:
+def own_loop(model):
     """Loss and gradients of a dial that a training loop of one's own learns."""
     splats = torch.nn.ParameterDict(
         {n: torch.nn.Parameter(x.clone()) for n, x in to_gsplat(detach(model)).items()}

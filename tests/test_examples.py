@@ -41,7 +41,7 @@ def run(tmp_path, monkeypatch, capsys):
         clod_adapter, "adapt", lambda base, scene, config: adapt(base, scene, type(config)(iters=5))
     )
 
-    def start(number: int, *words) -> str:
+    def start(number, *words):
         monkeypatch.setattr(sys, "argv", [EXAMPLES[number].name, *map(str, words)])
         runpy.run_path(str(EXAMPLES[number]), run_name="__main__")
         return capsys.readouterr().out

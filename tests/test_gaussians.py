@@ -4,13 +4,12 @@ SH degrees.
 
 import dataclasses
 import re
-from collections.abc import Sequence
 
 import numpy as np
 import pytest
 import torch
 
-from clod_adapter import AttenuationConfig, Gaussians, render
+from clod_adapter import AttenuationConfig, render
 from clod_adapter.cameras import NEAR, Camera, Scene, View, camera_extent, in_its_unit
 from clod_adapter.config import CLASSIC
 from runs import rejects
@@ -39,7 +38,7 @@ def test_extent_of_cameras():
     assert camera_extent([*cameras, far]) <= 3.3 * 1e6 / 9 * 1.01
 
 
-def black(cameras: Sequence[Camera]) -> tuple[View, ...]:
+def black(cameras):
     return tuple(View(camera, torch.zeros(6, 8, 3, dtype=torch.uint8)) for camera in cameras)
 
 
@@ -91,11 +90,11 @@ def test_arrays_become_tensors():
 CONFIG = AttenuationConfig()
 
 
-def plain(**changes) -> Gaussians:
+def plain(**changes):
     return gaussians(5, 2, 0).replace(**changes)
 
 
-def adapted() -> Gaussians:
+def adapted():
     return plain(sigma_d=torch.arange(5.0), attenuation=CONFIG)
 
 

@@ -3,7 +3,6 @@ renderers.
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise, product
 
@@ -12,7 +11,7 @@ import pytest
 import torch
 
 import clod_adapter
-from clod_adapter import AttenuationConfig, Gaussians, Hook
+from clod_adapter import AttenuationConfig, Hook
 from clod_adapter.frame_rate import next_dial
 from runs import rejects
 from scenes import camera, gaussians, seeded
@@ -20,14 +19,14 @@ from scenes import camera, gaussians, seeded
 N = 200
 
 
-def adapted(**settings) -> Gaussians:
+def adapted(**settings):
     plain = gaussians(N, 1, 0)
     sigma_d, growth_d = torch.rand(2, N, generator=seeded(1)) * 1.5
     attenuation = AttenuationConfig(scene_distance=3.0, **settings)
     return plain.replace(sigma_d=sigma_d, growth_d=growth_d - 0.5, attenuation=attenuation)
 
 
-def hook_of(model: Gaussians, virtual_scale: float = 3.0) -> Hook:
+def hook_of(model, virtual_scale=3.0):
     return Hook(model.sigma_d, model.attenuation, virtual_scale, model.growth_d)
 
 
@@ -125,22 +124,22 @@ class Renderer:
     fixed: float
     start: float
 
-    def ms(self, dial: float, load: float = 1.0) -> float:
+    def ms(self, dial, load=1.0):
         return (
             load * BUDGET * (self.fixed + (1 - self.fixed) * (dial / self.start) ** -self.exponent)
         )
 
-    def best(self, load: float) -> float:
+    def best(self, load):
         """The dial value in [1, MAX_SV] whose time is the budget, or the nearest to it."""
         rest = (1 / load - self.fixed) / (1 - self.fixed)
         wanted = self.start * rest ** (-1 / self.exponent) if rest > 0 else math.inf
         return min(max(wanted, 1.0), MAX_SV)
 
-    def off(self, dial: float, load: float) -> float:
+    def off(self, dial, load):
         """Distance of the noiseless log time from the best in range."""
         return abs(math.log(self.ms(dial, load) / self.ms(self.best(load), load)))
 
-    def follow(self, loads: Sequence[float], noise: Sequence[float]) -> list[float]:
+    def follow(self, loads, noise):
         """Dial values of frames with these loads, whose times are multiplied by ``noise``."""
         frames = []
         dial = self.start

@@ -60,7 +60,7 @@ for level, units in enumerate(ORDER):
 SOURCES = sorted([*(ROOT / PACKAGE).rglob("*.py"), *(ROOT / "cli").rglob("*.py")])
 
 
-def module_of(path: Path) -> str:
+def module_of(path):
     """Dotted name below the package: ``io.checkpoint``, ``cli.main``, and an empty one for the
     package itself.
     """
@@ -71,13 +71,13 @@ def module_of(path: Path) -> str:
 MODULES = {module_of(path) for path in SOURCES}
 
 
-def unit_of(module: str) -> str:
+def unit_of(module):
     """``io.formats`` of ``io.formats.glb``, ``training`` of ``training.loop``."""
     parts = module.split(".")
     return ".".join(parts[: 2 if parts[0] in ("io", "cli") else 1])
 
 
-def imports_of(path: Path) -> dict[str, int]:
+def imports_of(path):
     """The lines of every import from the package in a file, at any depth, by module (as by
     ``module_of``).
     """

@@ -17,7 +17,7 @@ from torch.testing import assert_close
 import gsplat_versions
 import inria_forks
 from backends import fresh_copy
-from clod_adapter import AttenuationConfig, Gaussians, Hook, bake, order_by_extinction, render, save
+from clod_adapter import AttenuationConfig, Hook, bake, order_by_extinction, render, save
 from clod_adapter.adapter import detach, with_dial
 from clod_adapter.config import FORMS
 from clod_adapter.equation.attenuation import attenuate, dial
@@ -85,7 +85,7 @@ def test_a_dial_without_effect_changes_nothing():
     assert torch.equal(baked.opacity_logits[2:], some.opacity_logits[2:])
 
 
-def spread(**settings: str) -> Gaussians:
+def spread(**settings):
     """Gaussians at many distances from ``camera()``, some of which are culled, and most of which
     grow.
     """
@@ -183,7 +183,7 @@ Drawing = Callable[..., Any]
 
 
 @pytest.fixture
-def draws(monkeypatch) -> dict[str, Drawing]:
+def draws(monkeypatch):
     """The drop-ins for gsplat and for Inria's rasterizer, and the renderer, called with arguments
     of the dial alone.
     """

@@ -4,15 +4,13 @@ filter is found.
 
 import math
 import re
-from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import pytest
 import torch
-from torch import Tensor
 
 import scenes
-from clod_adapter import Gaussians, Scene, View, evaluate, render
+from clod_adapter import Scene, View, evaluate, render
 from clod_adapter.alignment.check import check_alignment, compare_filters
 from clod_adapter.alignment.frames import NERFSTUDIO_TURNS, into_file, known_frames
 from clod_adapter.alignment.search import guess_frame, scene_in
@@ -25,19 +23,19 @@ FLIP = torch.diag(torch.tensor([1.0, -1, -1], dtype=torch.float64))
 
 
 @pytest.fixture(scope="module")
-def pair() -> tuple[Gaussians, list[View]]:
+def pair():
     base, scene = scenes.capture(n=250, views=8, width=60, height=44)
     return base, [*scene.test, *scene.train]
 
 
-def posed(views: Sequence[View], change: Callable[[Tensor], Tensor]) -> list[View]:
+def posed(views, change):
     return [
         View(replace(view.camera, viewmat=change(view.camera.viewmat).float()), view.image)
         for view in views
     ]
 
 
-def in_world(views: Sequence[View], scale: float, rotation: Tensor, offset: Tensor) -> list[View]:
+def in_world(views, scale, rotation, offset):
     """The views in the world ``x' = scale rotation x + offset``, which is not the file's."""
     back = rotation.T, 1 / scale, -rotation.T @ offset / scale
     return posed(views, lambda pose: into_file(pose.double()[None], *back)[0])
@@ -82,7 +80,7 @@ FRAMES = {
 }
 
 
-def rounded(number: re.Match[str]) -> str:
+def rounded(number):
     """The number to two digits; the search is accurate to about a per cent."""
     return f"{float(f'{float(number[0]):.2g}'):g}"
 
@@ -140,7 +138,7 @@ def test_frames_of_trainers(pair):
         assert spread.diag().tolist() == sorted(spread.diag().tolist(), reverse=True)
 
 
-def seen_with(name: str, views: int = 5) -> tuple[Gaussians, tuple[View, ...]]:
+def seen_with(name, views=5):
     """A checkpoint that names no filter, and photographs of it drawn with ``name``: of Gaussians of
     a pixel at most.
     """

@@ -3,7 +3,6 @@
 import io
 import json
 import signal
-from collections.abc import Callable, Iterator
 from contextlib import redirect_stderr, redirect_stdout
 from functools import partial
 from pathlib import Path
@@ -19,7 +18,7 @@ from runs import Server, accepted
 
 
 @pytest.fixture(scope="session", autouse=True)
-def signals_arrive() -> Iterator[None]:
+def signals_arrive():
     """Signals reach the tests and their child processes, also if the shell ignores or blocks
     them.
     """
@@ -68,14 +67,14 @@ class Done(NamedTuple):
         (output,) = self.report["outputs"]
         return output
 
-    def note(self, part: str) -> str:
+    def note(self, part):
         """The one note of ``--json`` that has this part."""
         (note,) = (note for note in self.report["notes"] if part in note)
         return note
 
 
 @pytest.fixture(scope="session")
-def run_in(capture, dialled: Path) -> Callable[..., Done]:
+def run_in(capture, dialled):
     """Runs ``clod-adapt`` in a folder, in this process, to the exit code ``code``; it ``accept``s
     its loss.
 
@@ -84,7 +83,7 @@ def run_in(capture, dialled: Path) -> Callable[..., Done]:
     places = (capture.ply, capture.scene, dialled, dialled.with_suffix(".safetensors"))
     shared = dict(zip(("BASE", "SCENE", "DIAL", "ADAPTER"), places, strict=True))
 
-    def run(folder: Path, *words, code: int = 0, accept: bool = True) -> Done:
+    def run(folder, *words, code=0, accept=True):
         out = io.StringIO()
         err = io.StringIO()
         given = []
@@ -105,7 +104,7 @@ def run_in(capture, dialled: Path) -> Callable[..., Done]:
 
 
 @pytest.fixture
-def clod(run_in: Callable[..., Done], tmp_path, monkeypatch) -> Callable[..., Done]:
+def clod(run_in, tmp_path, monkeypatch):
     """``run_in`` with the test's folder, which is the current one."""
     monkeypatch.chdir(tmp_path)
     return partial(run_in, tmp_path)
@@ -123,7 +122,7 @@ def blank_figure(monkeypatch):
 
 
 @pytest.fixture(scope="session")
-def server() -> Iterator[Server]:
+def server():
     """Starts ``clod-adapt`` in processes that need no seconds to start."""
     server = Server()
     yield server

@@ -10,22 +10,20 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
 import pytest
 from PIL import Image
 
 import clod_adapter
 from clod_adapter.cli.main import COMMANDS, build_parser, command_of
-from clod_adapter.cli.shared.outputs import Outputs, claimed
+from clod_adapter.cli.shared.outputs import claimed
 from clod_adapter.io.file_formats import FORMATS, WRITABLE, write
 from runs import contents
 
 
 @pytest.fixture(scope="module")
-def folder(capture, dialled: Path, tmp_path_factory) -> Path:
+def folder(capture, dialled, tmp_path_factory):
     """Two scenes, a checkpoint, the files of an adapted one, a dial without calibration, and files
     of other kinds.
     """
@@ -61,7 +59,7 @@ def folder(capture, dialled: Path, tmp_path_factory) -> Path:
 
 
 @contextmanager
-def given(folder: Path, existing: str) -> Iterator[None]:
+def given(folder, existing):
     """A file of each word: ``NAME`` is foreign, ``NAME>FILE`` a symbolic link, ``NAME~FILE`` a hard
     one.
     """
@@ -249,7 +247,7 @@ def test_errors(run_in, folder, line, said, existing):
         refused(run_in, folder, said, line)
 
 
-def refused(run_in, folder: Path, said: str, line: str):
+def refused(run_in, folder, said, line):
     before = contents(folder)
     done = run_in(folder, line, code=2)
     (error,) = (each for each in done.err.splitlines() if "error" in each)
@@ -259,7 +257,7 @@ def refused(run_in, folder: Path, said: str, line: str):
     assert contents(folder) == before
 
 
-def outputs_of(line: str) -> Outputs:
+def outputs_of(line):
     words = line.split()
     name = words[0] if words[0] in COMMANDS else ""
     return command_of(name).outputs(build_parser(name).parse_args(words[1:] if name else words))

@@ -5,7 +5,6 @@ import json
 import re
 import shlex
 import sys
-from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,7 +15,6 @@ from torch.testing import assert_close
 
 from clod_adapter import (
     AdaptConfig,
-    Camera,
     ClodError,
     bake,
     bake_levels,
@@ -52,10 +50,10 @@ elif words != ["--list-gpus"]:
 
 
 @pytest.fixture
-def tool(tmp_path_factory, monkeypatch) -> Callable[[str], None]:
+def tool(tmp_path_factory, monkeypatch):
     """A stand-in for splat-transform that stores its arguments and runs ``behave``."""
 
-    def make(behave: str = "pass"):
+    def make(behave="pass"):
         script = tmp_path_factory.mktemp("tool") / "tool.py"
         script.write_text(TOOL.replace("BEHAVE", behave))
         monkeypatch.setenv("CLOD_SPLAT_TRANSFORM", shlex.join([sys.executable, str(script)]))
@@ -63,12 +61,12 @@ def tool(tmp_path_factory, monkeypatch) -> Callable[[str], None]:
     return make
 
 
-def baked(path: Path | str, s: float):
+def baked(path, s):
     model = load(path)
     return bake(model.gaussians, s, cameras=model.viewpoints)
 
 
-def files(folder: Path) -> list[str]:
+def files(folder):
     return sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
 
 
@@ -119,7 +117,7 @@ def test_baking_for_other_cameras(clod, capture, dialled):
     assert torch.equal(load("x.ply").gaussians.means, want.means)
 
 
-def camera_003(cameras: Sequence[Camera]) -> Camera:
+def camera_003(cameras):
     return next(camera for camera in cameras if camera.name == "003.png")
 
 

@@ -7,8 +7,6 @@ import os
 import pty
 import signal
 import time
-from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -17,37 +15,26 @@ from clod_adapter.cli.adapt import listeners
 from clod_adapter.cli.shared import measure
 from clod_adapter.training import planner
 from clod_adapter.training.state import load_state
-from runs import (
-    OUTPUTS,
-    STATE,
-    Server,
-    contents,
-    log_of,
-    names,
-    pressed,
-    pressing,
-    results,
-    wait_for,
-)
+from runs import OUTPUTS, STATE, contents, log_of, names, pressed, pressing, results, wait_for
 
 ITERS = 24
 
 
 @pytest.fixture(scope="module")
-def words(capture) -> list[str]:
+def words(capture):
     line = f"{capture.ply} --images {capture.scene} --iters {ITERS} --max-sv 4 --out dial.ply"
     return line.split()
 
 
 @pytest.fixture(scope="module")
-def undisturbed(server: Server, words: list[Any], tmp_path_factory) -> Path:
+def undisturbed(server, words, tmp_path_factory):
     """The folder of an uninterrupted run."""
     folder = tmp_path_factory.mktemp("undisturbed")
     server.run(folder, *words)
     return folder
 
 
-def assert_whole(folder: Path):
+def assert_whole(folder):
     """Outputs can be read, and all other files have the name of a temporary file."""
     readers = {
         ".json": lambda path: json.loads(path.read_text()),
@@ -62,11 +49,11 @@ def assert_whole(folder: Path):
             readers[path.suffix](path)
 
 
-def report_in(folder: Path):
+def report_in(folder):
     return json.loads((folder / "dial.json").read_text())
 
 
-def assert_same(folder: Path, want: Path):
+def assert_same(folder, want):
     """The same bits, except measured times, and no other files."""
     assert names(folder) == OUTPUTS, log_of(folder)
     assert results(folder) == results(want)

@@ -7,11 +7,9 @@ import json
 import re
 import shutil
 import signal
-from collections.abc import Callable
 from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -33,7 +31,7 @@ OUTPUTS = ["robustness.csv", "robustness.json", "robustness.png"]
 
 
 @pytest.fixture
-def run(clod, capture, tmp_path) -> Callable[..., Any]:
+def run(clod, capture, tmp_path):
     """Runs the command on two checkpoints, the second without the faintest Gaussians."""
     shutil.copytree(capture.scene, tmp_path / "scene")
     capture.write(tmp_path / "plain.ply", capture.gaussians)
@@ -83,7 +81,7 @@ def test_a_stop_after_training_keeps_the_result(capture, tmp_path, phase):
     assert load(tmp_path / "stopped.ply").gaussians == result.gaussians
 
 
-def stamps(folder: Path) -> dict[str, int]:
+def stamps(folder):
     return {path.name: path.stat().st_mtime_ns for path in (folder / "cells").iterdir()}
 
 

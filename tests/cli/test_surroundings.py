@@ -10,7 +10,6 @@ import shutil
 import struct
 import subprocess
 import sys
-from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from unittest.mock import Mock
@@ -25,7 +24,7 @@ import resource
 
 
 @contextmanager
-def room(size: int) -> Iterator[None]:
+def room(size):
     """Within the block files have at most so many bytes; a longer write fails, as on a full
     disk.
     """

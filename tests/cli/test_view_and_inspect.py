@@ -19,17 +19,17 @@ from clod_adapter.cli.main import build_parser
 from runs import log_of, wait_for
 
 
-def fetch(url: str) -> bytes:
+def fetch(url):
     with urllib.request.urlopen(url, timeout=10) as response:
         return bytes(response.read())
 
 
-def config_of(page: bytes):
+def config_of(page):
     """The settings that a page holds."""
     return json.loads(re.findall(r'id="clod-config">(.*?)</script>', page.decode(), re.DOTALL)[0])
 
 
-def assert_holds(data: bytes, file: Path, folder: Path):
+def assert_holds(data, file, folder):
     (folder / "served.ply").write_bytes(data)
     served, shown = (clod_adapter.load(path).gaussians for path in (folder / "served.ply", file))
     assert len(served) == len(shown) and (served.attenuation is None) == (shown.attenuation is None)

@@ -13,7 +13,6 @@ import sys
 import sysconfig
 import textwrap
 import tomllib
-from collections.abc import Iterator
 from contextlib import redirect_stdout
 from dataclasses import replace
 from importlib import import_module
@@ -47,7 +46,7 @@ class Block(NamedTuple):
     text: str
     reason: str
 
-    def commands(self) -> list[list[str]]:
+    def commands(self):
         """The words of each line of a shell block, without comments, continued lines put
         together.
         """
@@ -58,7 +57,7 @@ class Block(NamedTuple):
         return [words for words in commands if words]
 
 
-def blocks(page: Path) -> list[Block]:
+def blocks(page):
     text = page.read_text("utf-8")
     found = []
     for match in FENCE.finditer(text):
@@ -69,7 +68,7 @@ def blocks(page: Path) -> list[Block]:
     return found
 
 
-def spoken(page: Path, program: str) -> list[str]:
+def spoken(page, program):
     """Complete commands of a program with options, within sentences and in indented blocks."""
     text = FENCE.sub("", page.read_text("utf-8"))
     spans = [" ".join(span.split()) for span in re.findall(r"`([^`]+)`", text)]
@@ -80,7 +79,7 @@ def spoken(page: Path, program: str) -> list[str]:
 
 
 @pytest.fixture(scope="session")
-def desk(capture, dialled: Path, tmp_path_factory) -> Path:
+def desk(capture, dialled, tmp_path_factory):
     """``scene/``, ``pretrained.ply``, ``pretrained_mask.ply`` (MaskGaussian's old layout),
     ``pretrained_clod.*``, and ``demo/`` with the demo's file names.
     """
@@ -130,12 +129,12 @@ def test_blocks_run_in_the_order_of_the_page(page, desk, tmp_path, monkeypatch):
             pytest.fail(f"{block.place}: {error}")
 
 
-def short(**settings) -> AdaptConfig:
+def short(**settings):
     config = AdaptConfig(**settings)
     return replace(config, iters=min(config.steps, STEPS))
 
 
-def run(words: list[str]):
+def run(words):
     words, out = (words[:-2], Path(words[-1])) if ">" in words else (words, Path("said.txt"))
     assert words[0] in ("clod-adapt", "python"), (
         f"{words[0]}: not known; mark the block with <!-- not run: REASON -->"
@@ -180,7 +179,7 @@ DOCS = ROOT / "docs"
 RESULTS = ROOT / "benchmarks" / "results"
 
 
-def keys(value) -> Iterator[str]:
+def keys(value):
     """The keys of all objects in a value, except in ``config``, which the settings page lists."""
     if isinstance(value, dict):
         for name, entry in value.items():
@@ -205,13 +204,13 @@ def test_every_field_of_the_reports_is_explained(desk, capsys):
     assert not missing, f"docs/python.md does not explain {sorted(missing)}"
 
 
-def cells(page: str) -> list[str]:
+def cells(page):
     """The cells of the tables of a page, without emphasis."""
     rows = re.findall(r"^\|(.*)\|$", (DOCS / page).read_text("utf-8"), re.MULTILINE)
     return [cell.strip(" *") for cell in "|".join(rows).split("|")]
 
 
-def measured(value) -> Iterator[str]:
+def measured(value):
     """The qualities in results, at any depth, in the forms that the pages write."""
     if isinstance(value, list):
         for entry in value:
@@ -273,7 +272,7 @@ LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)|(?:href|src)=\"([^\"]+)\"")
 FETCHED = re.compile(r"<(?!a\s|link\s[^>]*rel=\"?canonical)[^>]*\s(?:src|href)=\"?([^\s\">]+)")
 
 
-def anchors(page: Path) -> set[str]:
+def anchors(page):
     """The anchors of a page's headings, as Markdown's toc extension and GitHub make them."""
     found = set()
     for title in re.findall(r"^#+ +(.+?) *$", FENCE.sub("", page.read_text("utf-8")), re.MULTILINE):

@@ -5,7 +5,7 @@ budgets: solved dial values keep the counts asked for, and interpolate known cur
 import math
 import random
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from statistics import fmean
 
 import pytest
@@ -13,28 +13,19 @@ import torch
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
-from clod_adapter import (
-    AttenuationConfig,
-    Camera,
-    Gaussians,
-    Stopped,
-    View,
-    dial_for,
-    evaluate,
-    render,
-)
+from clod_adapter import AttenuationConfig, Stopped, View, dial_for, evaluate, render
 from clod_adapter.adapter import with_dial
 from clod_adapter.calibration import Calibration, CalibrationRow
 from clod_adapter.config import FORMS
 from clod_adapter.equation.attenuation import dial
 from clod_adapter.evaluation import frame_times
-from clod_adapter.evaluation.frame_times import PASSES, VIEWS, FrameTimes, time_frames
+from clod_adapter.evaluation.frame_times import PASSES, VIEWS, time_frames
 from clod_adapter.losses import psnr_ssim
 from runs import counted, rejects
 from scenes import camera, gaussians, in_front, photograph, ring, seeded
 
 
-def row_of_four() -> Gaussians:
+def row_of_four():
     """Four Gaussians at camera depths 1, 2, 4 and 8, the last far outside the image; each has a
     reach of 3.
     """
@@ -88,16 +79,16 @@ Clock = Callable[[Callable[[int, float], float]], list[tuple[str, float]]]
 
 
 @pytest.fixture
-def clock(monkeypatch) -> Clock:
+def clock(monkeypatch):
     """Renders in no time; the clock advances by ``cost(frame, s)`` seconds. Returns the frames that
     are drawn.
     """
 
-    def install(cost: Callable[[int, float], float]) -> list[tuple[str, float]]:
+    def install(cost):
         drawn = []
         now = [0.0]
 
-        def draw(some: Gaussians, camera: Camera, s: float):
+        def draw(some, camera, s):
             now[0] += cost(len(drawn), s)
             drawn.append((camera.name, s))
 
@@ -108,7 +99,7 @@ def clock(monkeypatch) -> Clock:
     return install
 
 
-def of_one(**options) -> FrameTimes:
+def of_one(**options):
     some = with_dial(gaussians(20, 0, 0), torch.ones(20), AttenuationConfig(max_sv=7.0))
     return time_frames([(some, DIALS)], ring(9, 48, 36), **options)
 
@@ -154,7 +145,7 @@ def test_a_listener_stops_the_timing():
 MAX_SV = 6.0
 
 
-def adapted(n: int, seed: int, form: str = "ours") -> Gaussians:
+def adapted(n, seed, form="ours"):
     """Gaussians that are culled at dial values within, below and above the range."""
     generator = seeded(seed)
     sigma = (torch.randn(n, generator=generator) * 0.8 + 0.4).exp()
@@ -162,7 +153,7 @@ def adapted(n: int, seed: int, form: str = "ours") -> Gaussians:
     return with_dial(gaussians(n, 0, seed), sigma, attenuation)
 
 
-def kept(some: Gaussians, cameras: Sequence[Camera], s: float) -> int:
+def kept(some, cameras, s):
     return sum(int(dial(some, camera, s).keep.sum()) for camera in cameras)
 
 
@@ -197,7 +188,7 @@ def test_counts_are_exact_up_to_ties(n, seed, views, share, form):
     assert wanted - count <= max(1, 0.001 * wanted) + ties
 
 
-def table(psnr: Sequence[float], times: Sequence[float] = ()) -> Calibration:
+def table(psnr, times=()):
     dials = [2.0**k for k in range(len(psnr))]
     times = times or [10.0 / s for s in dials]
     rows = tuple(

@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 import torch
 
-from clod_adapter import AttenuationConfig, Camera, Gaussians, render, with_dial
+from clod_adapter import AttenuationConfig, Camera, render, with_dial
 from clod_adapter.config import FORMS
 from clod_adapter.equation.attenuation import SIGMA_MAX
 from clod_adapter.equation.distances import normalized_distances
@@ -34,7 +34,7 @@ from runs import counted
 from scenes import gaussians, ring, seeded
 
 
-def dialled() -> Gaussians:
+def dialled():
     """Gaussians that end at different dial values; scene distance 4, where the ring of cameras
     is.
     """
@@ -103,7 +103,7 @@ def test_path_passes_through_the_cameras_at_equal_steps():
     assert (centres - cameras[1].position).norm(dim=1).min() < 0.51 * gaps.max()
 
 
-def adversary(form: str) -> tuple[Gaussians, list[Camera]]:
+def adversary(form):
     """Four coincident opaque white Gaussians that end together at s = 2.2, and three black ones
     behind them, of which one is far away and comes into view once the camera has turned.
     """
@@ -150,12 +150,12 @@ def test_a_camera_that_turns_changes_nothing():
         assert max(pixels) < 0.05 if form == "ours" else pixels[1] > 0.9 * pixels[0] > 20
 
 
-def most(count: int, step: float) -> float:
+def most(count, step):
     """The largest change of a pixel with so many Gaussians, whose growth_d is at most 1."""
     return count * (255 * (4 + 2 / math.e) * step + 1) + 2 * 255 * T_MIN
 
 
-def lines_of_sight(seed: int) -> tuple[Gaussians, Camera]:
+def lines_of_sight(seed):
     """Two to four Gaussians on each of 108 lines of sight, black or white, that let through a
     little less than T_MIN at s = 1, and more as they fade. On the first line, a black one fades in
     front of a white one that ends the pixel.

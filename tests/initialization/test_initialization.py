@@ -6,9 +6,8 @@ import dataclasses
 
 import pytest
 import torch
-from torch import Tensor
 
-from clod_adapter import AdaptConfig, AttenuationConfig, Gaussians, View
+from clod_adapter import AdaptConfig, AttenuationConfig, View
 from clod_adapter.adapter import with_dial
 from clod_adapter.equation.attenuation import dial
 from clod_adapter.equation.distances import typical_distance
@@ -30,7 +29,7 @@ from scenes import gaussians, photograph, ring, seeded
 REVERSED = torch.diag(torch.tensor([-1.0, 1, -1, 1]))  # looks the other way
 
 
-def changes(some: Gaussians, view: View) -> Tensor:
+def changes(some, view):
     """``[N, pixels]`` of removing each Gaussian alone; an image is linear in each opacity where
     nothing is clamped.
     """
@@ -79,13 +78,13 @@ def test_removal_error_depends_on_the_seed_alone():
         usable_views(gaussians(20, 0, 0), [blind])
 
 
-def dialled(n: int, **settings: float) -> tuple[Gaussians, tuple[View, ...]]:
+def dialled(n, **settings):
     """An initialized dial, and the views that it is from."""
     views = photograph(gaussians(n, 0, 0), ring(3, 20, 16))
     return initialize(gaussians(n, 0, 0), views, AdaptConfig(**settings)), views
 
 
-def distances_of(some: Gaussians, views: tuple[View, ...]) -> Tensor:
+def distances_of(some, views):
 
     return typical_distance(some.means, [view.camera for view in views], some.attenuation)
 
@@ -113,7 +112,7 @@ def test_initialization_culls_in_the_pruning_order():
     assert not torch.equal(order.argsort()[100:180], error.argsort(stable=True)[100:180])
 
 
-def plainly(some: Gaussians, worth: Tensor) -> list[int]:
+def plainly(some, worth):
     """The order computed round by round and pair by pair."""
     worths = worth.double().tolist()
     left = list(range(len(some)))
@@ -122,7 +121,7 @@ def plainly(some: Gaussians, worth: Tensor) -> list[int]:
     colours = 0.5 + SH_C0 * some.sh0[:, 0].double()
     sizes = some.log_scales.double().exp().amax(1)
 
-    def unlike(i: int, j: int) -> float:
+    def unlike(i, j):
         apart = (centres[i] - centres[j]).square().sum()
         reach = (sizes[i] + sizes[j]).square()
         return float(

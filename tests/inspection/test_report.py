@@ -4,7 +4,6 @@ refuses.
 
 import json
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,8 +13,7 @@ from plyfile import PlyData, PlyElement
 from clod_adapter import AttenuationConfig, load, save, with_dial
 from clod_adapter.cli.inspect import lines_of
 from clod_adapter.cli.shared.outputs import jsonable
-from clod_adapter.inspection.report import Inspection, inspect, looks_like
-from clod_adapter.inspection.statistics import Splat
+from clod_adapter.inspection.report import inspect, looks_like
 from clod_adapter.io.ply import read_head
 from clod_adapter.io.ply_layout import inria_dtype
 from clod_adapter.origin import NOWHERE
@@ -27,13 +25,13 @@ from scenes import gaussians
 ATTENUATION = AttenuationConfig(max_sv=6.0, reference_distance=3.5)
 
 
-def table(n: int = 300, degree: int = 1, seed: int = 0) -> np.ndarray:
+def table(n=300, degree=1, seed=0):
     """Rows in Inria's layout, with unit quaternions and nonzero values in every column."""
     g = gaussians(n, degree, seed)
     return inria_rows(g.replace(quats=torch.nn.functional.normalize(g.quats)))
 
 
-def seen(path: Path) -> tuple[Inspection, Splat]:
+def seen(path):
     """The result for a splat, which can be printed and be written as JSON."""
     found = inspect(path)
     json.dumps(jsonable(found.as_dict()), allow_nan=False)
@@ -43,7 +41,7 @@ def seen(path: Path) -> tuple[Inspection, Splat]:
     return found, found.splat
 
 
-def kinds(found: Inspection) -> dict[str, int]:
+def kinds(found):
     return {anomaly.kind: anomaly.count for anomaly in found.anomalies}
 
 

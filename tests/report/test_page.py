@@ -8,7 +8,6 @@ import json
 import re
 import sys
 from itertools import product
-from typing import Any
 
 import numpy as np
 import pytest
@@ -22,7 +21,7 @@ pytest.importorskip("matplotlib")
 NASTY = r'a <b> & "c" $\co$ </script>'
 
 
-def row(s: float, psnr: float | None = 20.0, ms: float = 3.0) -> dict[str, Any]:
+def row(s, psnr=20.0, ms=3.0):
     return {
         "virtual_scale": s,
         "psnr": psnr,
@@ -34,7 +33,7 @@ def row(s: float, psnr: float | None = 20.0, ms: float = 3.0) -> dict[str, Any]:
     }
 
 
-def report(**changes) -> dict[str, Any]:
+def report(**changes):
     made = {"what": NASTY, "verdict": "kept", "measured": "-", "why": NASTY}
     return {
         "command": "adapt",

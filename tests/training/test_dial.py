@@ -3,14 +3,13 @@
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 from torch.testing import assert_close
 
 import clod_adapter as clod
 from clod_adapter import AdaptConfig, Gaussians, Scene
 from clod_adapter.equation.attenuation import attenuate
 from clod_adapter.losses import photometric_loss
-from clod_adapter.training.dial import SIGMA_RANGE, Dial, attach
+from clod_adapter.training.dial import SIGMA_RANGE, attach
 from clod_adapter.training.schedule import OURS, Sample
 from clod_adapter.training.trainer import Trainer
 from runs import rejects
@@ -19,7 +18,7 @@ Pair = tuple[Gaussians, Scene]
 MAX_SV = 5.0
 
 
-def trainable(base: Gaussians, form: str = "gsplat") -> torch.nn.ParameterDict:
+def trainable(base, form="gsplat"):
     """Copies of the Gaussians' tensors as a trainer holds them."""
     named = clod.to_gsplat(base)
     if form == "splatfacto":
@@ -30,7 +29,7 @@ def trainable(base: Gaussians, form: str = "gsplat") -> torch.nn.ParameterDict:
     )
 
 
-def loss_of(dial: Dial, scene: Scene, s: float) -> Tensor:
+def loss_of(dial, scene, s):
     image = clod.render(dial.gaussians(), scene.train[0].camera, s).image
     return photometric_loss(image, scene.train[0].image, dial.config.ssim_weight)
 

@@ -10,7 +10,7 @@ import torch
 from plyfile import PlyData
 
 import clod_adapter as clod
-from clod_adapter import Gaussians, Scene, adapt, detach, make_plan, render
+from clod_adapter import adapt, detach, make_plan, render
 from clod_adapter.adapter import ATTRIBUTES
 from clod_adapter.bake import bake, order_by_extinction
 from clod_adapter.config import AttenuationConfig
@@ -28,12 +28,12 @@ PLAIN = Rasterizer(reference.rasterize)
 
 
 @pytest.fixture(scope="module")
-def both() -> tuple[Gaussians, Scene]:
+def both():
     return capture()
 
 
 @pytest.fixture(scope="module")
-def adapted(both: tuple[Gaussians, Scene]) -> Gaussians:
+def adapted(both):
     return adapt(*both, config_of(iters=40)).gaussians
 
 

@@ -28,7 +28,7 @@ Pair = tuple[Gaussians, Scene]
 
 
 @pytest.fixture(scope="module")
-def trained(captured: Pair) -> Gaussians:
+def trained(captured):
     return adapt(*captured, config_of(iters=120)).gaussians
 
 

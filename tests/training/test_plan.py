@@ -8,7 +8,7 @@ from statistics import fmean
 import pytest
 import torch
 
-from clod_adapter import AdaptConfig, Decision, Gaussians, Override, Plan, Scene, make_plan, render
+from clod_adapter import AdaptConfig, Decision, Gaussians, Override, Scene, make_plan, render
 from clod_adapter.adapter import detach
 from clod_adapter.initialization.importance import removal_error
 from clod_adapter.training.far import supposed_error
@@ -23,13 +23,13 @@ LIMIT = 0.02
 
 
 @pytest.fixture(scope="module")
-def visible(captured: Pair) -> Pair:
+def visible(captured):
     """A capture without unseen Gaussians."""
     base, scene = captured
     return base.select(removal_error(base, scene.train) > 0), scene
 
 
-def verdicts(plan: Plan) -> dict[str, str]:
+def verdicts(plan):
     return {decision.what: decision.verdict for decision in plan.decisions}
 
 

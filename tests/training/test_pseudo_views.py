@@ -7,7 +7,6 @@ import math
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
 import clod_adapter as clod
 import scenes
@@ -28,7 +27,7 @@ from scenes import ring
 
 
 @pytest.fixture(scope="module")
-def blob() -> Gaussians:
+def blob():
     return scenes.gaussians(400, 1, 0, size=0.05)
 
 
@@ -105,7 +104,7 @@ def test_moved_cameras_have_the_documented_offsets(blob):
     assert behind.min() > -6 * MOVED and FARTHER / 2 < behind.max() < FARTHER - 1 + 6 * MOVED
 
 
-def ball(n: int, seen_from: Tensor) -> Gaussians:
+def ball(n, seen_from):
     """An opaque sphere of small discs and a far floater; SH degree 1, as after training, on the
     seen half alone.
     """

@@ -5,7 +5,6 @@ direction of a scene, nor on what is far from it or set of torch.
 import copy
 import math
 import signal
-from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 
@@ -13,7 +12,6 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
-from torch import Tensor
 
 import clod_adapter as clod
 from clod_adapter import (
@@ -78,7 +76,7 @@ def test_a_resumed_run_ends_with_the_same_bits(captured, form):
 
 
 @pytest.fixture(autouse=True)
-def default_handler() -> Iterator[None]:
+def default_handler():
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
@@ -109,7 +107,7 @@ TURN = Rotation.from_quat([-0.7, 0.1, 0.5, 0.5])
 
 
 @pytest.fixture(scope="module")
-def pair() -> Pair:
+def pair():
     """Photographs of Gaussians without SH degrees, which a turned scene would have to turn, and a
     perturbed copy.
     """
@@ -124,14 +122,14 @@ def pair() -> Pair:
     return truth.replace(**changed), Scene(tuple(v for k, v in enumerate(seen) if k % 4), seen[::4])
 
 
-def results(base: Gaussians, scene: Scene) -> list[tuple[float, float]]:
+def results(base, scene):
     """PSNR and share kept on the held-out views, at s = 1, 2 and 4."""
     plan = make_plan(base, scene, CONFIG)
     rows = evaluate(plan.adapt(scene).gaussians, scene.test, (1.0, 2.0, 4.0))
     return [(row.psnr, row.kept_share) for row in rows]
 
 
-def placed(base: Gaussians, scene: Scene, scale: float, shift: float) -> Pair:
+def placed(base, scene, scale, shift):
     """The scene turned by TURN, ``scale`` times as large and moved by ``shift``."""
     turn = torch.from_numpy(TURN.as_matrix())
     quats = base.quats.double().roll(-1, 1)
@@ -143,7 +141,7 @@ def placed(base: Gaussians, scene: Scene, scale: float, shift: float) -> Pair:
         log_scales=base.log_scales + math.log(scale),
     )
 
-    def change(view: View) -> View:
+    def change(view):
         viewmat = view.camera.viewmat.double()
         viewmat[:3, :3] = viewmat[:3, :3] @ turn.T
         viewmat[:3, 3] = scale * viewmat[:3, 3] - viewmat[:3, :3].sum(1) * shift
@@ -178,7 +176,7 @@ def test_a_far_camera_changes_no_length(pair):
     assert median(cameras) == pytest.approx(median(usual), rel=0.05)
 
 
-def session_of(capture) -> tuple[list[Tensor], str]:
+def session_of(capture):
     """Of a session from files to a baked dial value."""
     base = clod.load(capture.ply).gaussians
     scene = clod.load_scene(capture.scene)
@@ -200,7 +198,7 @@ def session_of(capture) -> tuple[list[Tensor], str]:
 
 
 @contextmanager
-def doubles() -> Iterator[None]:
+def doubles():
     torch.set_default_dtype(torch.float64)
     try:
         yield

@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-from torch import Tensor
 from torch.testing import assert_close
 
 from clod_adapter import View
@@ -26,7 +25,7 @@ from scenes import capture, seeded
 VIEWS = capture(n=20)[1].train
 
 
-def assert_uniform(values: torch.Tensor):
+def assert_uniform(values):
     """In [0, 1], and more evenly than random numbers would be."""
     values = values.sort().values.double()
     assert (values - torch.linspace(0, 1, len(values))).abs().max() < 3 / len(values)
@@ -80,13 +79,13 @@ CONFIG = AdaptConfig(max_sv=6.0)
 N = 2000
 
 
-def some() -> tuple[Tensor, Tensor]:
+def some():
     """log sigma_d and normalised distances."""
     log_sigma, d = torch.randn(2, N, generator=seeded(0))
     return 1 + 0.8 * log_sigma, (0.3 * d).exp()
 
 
-def gradient(log_sigma: Tensor, d: Tensor, s: float, **changes: float) -> Tensor:
+def gradient(log_sigma, d, s, **changes):
     config = replace(CONFIG, **changes)
     return count_gradient(d, log_sigma.exp(), s, 0.1, config, target_share(s, N, config))
 
@@ -146,16 +145,16 @@ TENTHS = dict.fromkeys(SHAPES, 0.1)
 class PlainRowAdam(RowAdam):
     """RowAdam without the fused kernel."""
 
-    def _step_fused(self, gradients: dict[str, Tensor], rows: Tensor, rates: dict[str, float]):
+    def _step_fused(self, gradients, rows, rates):
         self._step_plain(gradients, rows, rates)
 
 
-def parameters(n: int, seed: int = 0) -> dict[str, Tensor]:
+def parameters(n, seed=0):
     g = seeded(seed)
     return {name: torch.randn(n, *shape, generator=g) for name, shape in SHAPES.items()}
 
 
-def gradients(n: int, seed: int) -> dict[str, Tensor]:
+def gradients(n, seed):
     """Gradients over many orders of magnitude, with some zeros."""
     g = seeded(seed)
     out = {}
@@ -167,7 +166,7 @@ def gradients(n: int, seed: int) -> dict[str, Tensor]:
     return out
 
 
-def everything(n: int) -> Tensor:
+def everything(n):
     return torch.ones(n, dtype=torch.bool)
 
 

@@ -2,22 +2,18 @@
 file.
 """
 
-from collections.abc import Callable, Iterator
 from contextlib import ExitStack
-from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
 
 import clod_adapter
 import scenes
-from clod_adapter.gaussians import Gaussians
 from shown import SIZE, Shown, fold, serve, take
 
 
 @pytest.fixture(scope="session")
-def tabs(chromium) -> Iterator[Any]:
+def tabs(chromium):
     """The browser context of all tabs; a context per test would double the time to the first
     frame.
     """
@@ -27,16 +23,14 @@ def tabs(chromium) -> Iterator[Any]:
 
 
 @pytest.fixture
-def show(tabs) -> Iterator[Callable[..., Shown]]:
+def show(tabs):
     """Opens a tab with the files of a ``clod-adapt view`` command line; an error in its console
     fails the test.
     """
     with ExitStack() as stack:
         opened = []
 
-        def start(
-            *words, url: str = "", state: str = "", viewport=SIZE, context=tabs, script: str = ""
-        ) -> Shown:
+        def start(*words, url="", state="", viewport=SIZE, context=tabs, script=""):
             url = url or stack.enter_context(serve(*words))
             shown = Shown(context.new_page())
             stack.callback(shown.page.close)
@@ -53,8 +47,8 @@ def show(tabs) -> Iterator[Callable[..., Shown]]:
 
 
 @pytest.fixture
-def save(tmp_path) -> Callable[..., Path]:
-    def write(gaussians: Gaussians, name: str = "model.ply") -> Path:
+def save(tmp_path):
+    def write(gaussians, name="model.ply"):
         clod_adapter.save(tmp_path / name, gaussians)
         return tmp_path / name
 
@@ -62,25 +56,25 @@ def save(tmp_path) -> Callable[..., Path]:
 
 
 @pytest.fixture(scope="session")
-def gaussians() -> Gaussians:
+def gaussians():
     """400 Gaussians of SH degree 1 with a dial."""
     return scenes.dialled(400, 1, 5).replace(sigma_d=torch.linspace(0.1, 15, 400))
 
 
 @pytest.fixture(scope="session")
-def plain(gaussians: Gaussians) -> Gaussians:
+def plain(gaussians):
     return gaussians.replace(sigma_d=None, attenuation=None)
 
 
 @pytest.fixture(scope="session")
-def model(gaussians: Gaussians, tmp_path_factory) -> Path:
+def model(gaussians, tmp_path_factory):
     path = tmp_path_factory.mktemp("viewer") / "model.ply"
     clod_adapter.save(path, gaussians)
     return path
 
 
 @pytest.fixture(scope="session")
-def tab_of_model(tabs, model: Path) -> Iterator[Shown]:
+def tab_of_model(tabs, model):
     with serve(model) as url:
         shown = Shown(tabs.new_page())
         shown.page.set_viewport_size(SIZE)
@@ -89,7 +83,7 @@ def tab_of_model(tabs, model: Path) -> Iterator[Shown]:
 
 
 @pytest.fixture
-def shown(tab_of_model: Shown, model: Path) -> Iterator[Shown]:
+def shown(tab_of_model, model):
     """The tab of ``tab_of_model``, reset to that file: opening a tab for each test would take a
     second.
     """

@@ -6,10 +6,8 @@ import io
 import json
 import re
 import shutil
-from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -54,7 +52,7 @@ PLACE = {
 KINDS = {".html": "text/html", ".js": "text/javascript", ".mjs": "text/javascript"}
 
 
-def engines() -> Path:
+def engines():
     """The folder that npm installed the viewers into, beside splat-transform."""
     tool = shutil.which("splat-transform")
     modules = Path(tool).parents[1] if tool else Path()
@@ -64,7 +62,7 @@ def engines() -> Path:
 
 
 @contextmanager
-def opened(tabs, viewer: str, file: Path) -> Iterator[Any]:
+def opened(tabs, viewer, file):
     """The example page of a viewer with a file; nothing is fetched from a network."""
     modules = engines()
 
@@ -86,17 +84,17 @@ def opened(tabs, viewer: str, file: Path) -> Iterator[Any]:
     page.close()
 
 
-def place(page, viewer: str, camera: dict[str, Any]):
+def place(page, viewer, camera):
     to_world = FLIP @ np.linalg.inv(camera["world_to_camera"]) @ FLIP
     fov = 2 * np.degrees(np.arctan(camera["height"] / 2 / camera["focal"]))
     page.evaluate(PLACE[viewer], [to_world.T.ravel().tolist(), fov])
 
 
-def read_picture(file) -> np.ndarray:
+def read_picture(file):
     return np.asarray(Image.open(file, formats=["PNG"]).convert("RGB"), np.float64)
 
 
-def settled(page) -> np.ndarray:
+def settled(page):
     """The picture, once it has stopped changing: both viewers sort in a worker."""
     before = b""
     picture = page.screenshot()
@@ -107,7 +105,7 @@ def settled(page) -> np.ndarray:
     return read_picture(io.BytesIO(picture))
 
 
-def assert_the_wgsl_of_playcanvas_gives_the_equation(page, about: dict[str, Any]):
+def assert_the_wgsl_of_playcanvas_gives_the_equation(page, about):
     """The modifier alone, as software lacks the engine's WebGPU; ``uniform NAME: TYPE;`` is a
     struct's member.
     """

@@ -3,7 +3,6 @@ Gaussians drawn.
 """
 
 import base64
-from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
 
@@ -32,7 +31,7 @@ GPU = """
 """
 
 
-def opened(tabs, url: str, load: float) -> Shown:
+def opened(tabs, url, load):
     page = tabs.new_page()
     page.set_viewport_size({"width": 200, "height": 150})  # fast in software
     page.add_init_script(GPU.replace("load: 1", f"load: {load}"))
@@ -40,20 +39,20 @@ def opened(tabs, url: str, load: float) -> Shown:
 
 
 @pytest.fixture(scope="module")
-def simulated(tabs, model: Path) -> Iterator[Shown]:
+def simulated(tabs, model):
     with serve(model) as url:
         shown = opened(tabs, url, 1)
         yield shown
         shown.page.close()
 
 
-def frames(shown: Shown, script: str) -> list[list[float]]:
+def frames(shown, script):
     """The dial value and the time of the frames from ``script`` until the page draws no more."""
     shown.run(f"(window.trace.length = 0, {script})")
     return [list(map(float, frame)) for frame in shown.page.evaluate("window.trace")]
 
 
-def turned(shown: Shown, load: float) -> list[list[float]]:
+def turned(shown, load):
     """The same for a change of the load, which shows at the next change of the page: the wipe's,
     from none to none.
     """
@@ -61,7 +60,7 @@ def turned(shown: Shown, load: float) -> list[list[float]]:
 
 
 @pytest.fixture
-def held(simulated: Shown) -> Iterator[Shown]:
+def held(simulated):
     """The page holding 60 frames per second by its switch since s = 1, settled."""
     simulated.run("clod.setDial(1)")
     frames(simulated, "window.load = 1, document.getElementById('hold').click()")
@@ -69,7 +68,7 @@ def held(simulated: Shown) -> Iterator[Shown]:
     assert simulated.errors == []
 
 
-def dial_of(shown: Shown) -> float:
+def dial_of(shown):
     return float(shown.text("#dial-value").removeprefix("s = "))
 
 

@@ -13,9 +13,7 @@ from plyfile import PlyData
 
 import scenes
 from clod_adapter import load
-from clod_adapter.cameras import Camera
 from clod_adapter.config import FILTERS, ScreenFilter
-from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.file_formats import write
 from clod_adapter.render import render
 from clod_adapter.viewer.page import Payload
@@ -28,11 +26,11 @@ VIEW = scenes.camera(320, 240)
 WIDE = ScreenFilter(variance=2.0)
 
 
-def finer(model: Gaussians, by: float, **changes) -> Gaussians:
+def finer(model, by, **changes):
     return model.replace(log_scales=model.log_scales - by, **changes)
 
 
-def grown(count: int, degree: int, power: float, by: float, **settings) -> Gaussians:
+def grown(count, degree, power, by, **settings):
     """With growth of both signs; some Gaussians have their centre outside the picture and grow into
     it.
     """
@@ -40,7 +38,7 @@ def grown(count: int, degree: int, power: float, by: float, **settings) -> Gauss
     return finer(model, by, growth_d=torch.linspace(-1, power, count))
 
 
-def small(size: float) -> tuple[Gaussians, tuple[float, ...], Camera]:
+def small(size):
     """In another unit of length, with a nearer near plane."""
     model = dialled(500, 0, 7, scene_distance=3 * size)
     viewmat = VIEW.viewmat.clone()

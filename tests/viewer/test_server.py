@@ -4,7 +4,6 @@ import http.client
 import socket
 import threading
 import time
-from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 
 import pytest
@@ -26,7 +25,7 @@ RESPONSES = {
 
 
 @contextmanager
-def running(responses: Mapping[str, Response]) -> Iterator[Server]:
+def running(responses):
     with Server(responses) as server:
         thread = threading.Thread(target=server.serve_forever, args=(0.01,))
         thread.start()
@@ -36,21 +35,19 @@ def running(responses: Mapping[str, Response]) -> Iterator[Server]:
 
 
 @contextmanager
-def asking(server: Server) -> Iterator[socket.socket]:
+def asking(server):
     with socket.create_connection(("127.0.0.1", server.port)) as connection:
         connection.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
         yield connection
 
 
 @pytest.fixture(scope="module")
-def server() -> Iterator[Server]:
+def server():
     with running(RESPONSES) as server:
         yield server
 
 
-def request(
-    server: Server, path: str, method: str = "GET", **headers: str
-) -> tuple[int, dict[str, str], bytes]:
+def request(server, path, method="GET", **headers):
     connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=10)
     try:
         connection.request(method, path, headers=headers)

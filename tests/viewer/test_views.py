@@ -3,7 +3,6 @@ pictures, videos.
 """
 
 import io
-from collections.abc import Sequence
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -18,19 +17,18 @@ import scenes
 from clod_adapter.calibration import Calibration, CalibrationRow
 from clod_adapter.cameras import Camera
 from clod_adapter.equation.distances import viewpoint_of
-from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.file_formats import write
 from clod_adapter.viewer.page import write_viewer_page
 from models import write_model
 from scenes import ring
-from shown import TALL, Shown, drop, fold, take
+from shown import TALL, drop, fold, take
 
 
-def differ(one: np.ndarray, other: np.ndarray) -> bool:
+def differ(one, other):
     return bool(np.abs(one.astype(int) - other).mean() > 0.3)
 
 
-def photographed(folder: Path, cameras: Sequence[Camera]) -> list[Camera]:
+def photographed(folder, cameras):
     """Cameras with names, written to a folder as those of photographs."""
     named = [replace(camera, name=f"{k}.jpg") for k, camera in enumerate(cameras)]
     write_model(folder, named, [camera.name for camera in named])
@@ -58,7 +56,7 @@ def test_keys_move_the_dial(shown):
     assert shown.text("#dial-value") == "s = 2.00"
 
 
-def target(shown: Shown, text: str) -> str:
+def target(shown, text):
     """The page's note after a count is entered."""
     shown.page.fill("#target", text)
     shown.page.evaluate("document.getElementById('target-note').textContent = ''")
@@ -170,16 +168,16 @@ def test_files_and_cameras_are_listed(show, gaussians, tmp_path):
     assert opened.page.title() == "b.glb" and not differ(opened.picture(), of_second)
 
 
-def link(shown: Shown) -> dict[str, np.ndarray]:
+def link(shown):
     pairs = (part.split("=") for part in shown.link().lstrip("#").split("&"))
     return {name: np.array(text.split(","), float) for name, text in pairs}
 
 
-def forward(view: dict[str, np.ndarray]) -> np.ndarray:
+def forward(view):
     return np.cross(view["axes"][:3], view["axes"][3:])
 
 
-def points(means, size: float, sh0=None) -> Gaussians:
+def points(means, size, sh0=None):
     """Opaque balls."""
     means = torch.as_tensor(means, dtype=torch.float32)
     model = scenes.gaussians(len(means), 0, 1)
@@ -192,7 +190,7 @@ def points(means, size: float, sh0=None) -> Gaussians:
     )
 
 
-def ground(angle: float) -> tuple[Gaussians, np.ndarray]:
+def ground(angle):
     """A ground, of which two thirds are flat and lie along it, turned about x by an angle from
     minus y; its normal.
     """

@@ -5,7 +5,6 @@ them.
 import json
 import os
 import signal
-from typing import Any
 
 import pytest
 import torch
@@ -23,7 +22,7 @@ LONG = (*TINY[:-1], 4000)  # does not end by itself
 
 
 @pytest.fixture(scope="module")
-def words(capture) -> list[Any]:
+def words(capture):
     return [capture.ply, "--images", capture.scene]
 
 

@@ -5,11 +5,9 @@ import json
 import math
 import shutil
 import signal
-from collections.abc import Iterator
 from dataclasses import replace
 from functools import reduce
 from pathlib import Path
-from typing import Any
 from unittest.mock import Mock
 
 import pytest
@@ -57,7 +55,7 @@ VALUES = [
 
 
 @pytest.fixture(scope="module")
-def state(tmp_path_factory) -> tuple[Path, Any, dict[str, torch.Tensor], Any]:
+def state(tmp_path_factory):
     """The file of a state after two of three steps, the base and scene, and what is in it."""
     path = tmp_path_factory.mktemp("saved") / STATE
     pair = small_capture(40, views=4, width=16, height=12)
@@ -68,7 +66,7 @@ def state(tmp_path_factory) -> tuple[Path, Any, dict[str, torch.Tensor], Any]:
         return path, pair, load_file(path), json.loads(file.metadata()[KEY])
 
 
-def places(value, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+def places(value, path=()):
     """The paths of all entries of a JSON document, at any depth."""
     if path:
         yield path

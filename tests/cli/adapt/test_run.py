@@ -7,7 +7,6 @@ import re
 import shlex
 import shutil
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -24,12 +23,12 @@ from runs import OUTPUTS, names, rebuilt, results
 TINY = "--iters 12 --max-sv 4 --out dial.ply"
 
 
-def columns(path: Path | str) -> list[str]:
+def columns(path):
     return list(load(path).vertex.dtype.names)
 
 
 @pytest.fixture(scope="module")
-def adapted(run_in, tmp_path_factory) -> tuple[Path, Any]:
+def adapted(run_in, tmp_path_factory):
     """A run that loses more than is accepted, with a line of progress per step."""
     folder = tmp_path_factory.mktemp("adapted")
     with pytest.MonkeyPatch.context() as patch:
@@ -215,7 +214,7 @@ SHORT = "--images SCENE --iters 24 --max-sv 4 --out dial.ply --json"
 
 
 @pytest.fixture
-def wasteful(capture, tmp_path) -> Path:
+def wasteful(capture, tmp_path):
     """The capture's checkpoint with a degree that does nothing, and 50 Gaussians that no camera
     sees among the rest.
     """
@@ -230,7 +229,7 @@ def wasteful(capture, tmp_path) -> Path:
     return Path(capture.write(tmp_path / "wasteful.ply", base.replace(**values)))
 
 
-def decisions(done) -> dict[str, dict[str, Any]]:
+def decisions(done):
     return {decision["what"]: decision for decision in done.report["plan"]["decisions"]}
 
 

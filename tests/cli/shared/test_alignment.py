@@ -2,15 +2,12 @@
 requested.
 """
 
-from collections.abc import Callable
-from pathlib import Path
-
 import pytest
 import torch
 from PIL import Image
 
 import clod_adapter
-from clod_adapter import View, load, load_scene, render
+from clod_adapter import load, load_scene, render
 from clod_adapter.cli.main import build_parser
 from clod_adapter.cli.shared.console import Console
 from clod_adapter.cli.view import make_page
@@ -22,7 +19,7 @@ from scenes import seeded
 FAST = "--iters 3 --max-sv 4 --out dial.ply --json"
 
 
-def scene_of(capture, folder: Path, shown: Callable[[View], torch.Tensor], count: int = 9) -> Path:
+def scene_of(capture, folder, shown, count=9):
     """The first of the capture's cameras with other photographs, which ``shown`` gives as
     pixels.
     """
@@ -36,7 +33,7 @@ def scene_of(capture, folder: Path, shown: Callable[[View], torch.Tensor], count
 
 
 @pytest.fixture
-def turned(capture, tmp_path) -> Path:
+def turned(capture, tmp_path):
     """The checkpoint with y and z negated: half a turn about x; without harmonics, which would turn
     too.
     """
@@ -116,7 +113,7 @@ def test_other_photographs_have_a_warning(clod, capture, tmp_path, said, share):
 
 
 @pytest.fixture(scope="module")
-def trained(capture, tmp_path_factory) -> tuple[Path, Path]:
+def trained(capture, tmp_path_factory):
     """A checkpoint of small Gaussians without metadata on antialiasing, and antialiased
     photographs.
     """

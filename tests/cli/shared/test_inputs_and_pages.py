@@ -6,8 +6,6 @@ import json
 import re
 import shutil
 import sys
-from pathlib import Path
-from typing import Any
 from unittest.mock import Mock
 
 import numpy as np
@@ -119,7 +117,7 @@ def test_adapting_compiles_nothing_more(capture, capsys):
 ADAPT = "BASE --images SCENE --iters 16 --max-sv 4 --out dial.ply --report"
 
 
-def page_of(path: Path) -> tuple[str, dict[str, Any]]:
+def page_of(path):
     """Its text, and the data in it."""
     text = path.read_text("utf-8")
     return text, json.loads(re.findall(r'id="data">(.*?)</script>', text, re.S)[0])
