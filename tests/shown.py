@@ -54,7 +54,7 @@ class Shown:
         waiting = (
             f"async (given) => {{ const r = await {script}; await clod.whenDrawn(); return r }}"
         )
-        return self.page.evaluate(waiting, *arguments)
+        return self.evaluate(waiting, *arguments)
 
     def until(self, condition: str) -> None:
         """Waits until it holds. Not Playwright's wait_for_function, which the page's policy forbids
@@ -67,7 +67,18 @@ class Shown:
             const look = () => ({condition}) ? found() : setTimeout(look, 20);
             look();
         }})"""
-        self.page.evaluate(script)
+        self.evaluate(script)
+
+    def evaluate(self, script: str, *arguments: object) -> Any:
+        return self.page.evaluate(script, *arguments)
+
+    def press(self, key: str) -> None:
+        self.page.keyboard.press(key)
+
+    @property
+    def dial(self) -> str:
+        """The dial value, as the page writes it."""
+        return self.text("#dial-value")
 
     def text(self, selector: str) -> str:
         return str(self.page.inner_text(selector))
@@ -82,11 +93,11 @@ class Shown:
 
     def link(self) -> str:
         """The state of the page, as the part of its address that L adds."""
-        self.page.keyboard.press("l")
-        return str(self.page.evaluate("location.hash"))
+        self.press("l")
+        return str(self.evaluate("location.hash"))
 
     def counts(self) -> dict[str, int]:
-        return dict(self.page.evaluate("clod.whenDrawn().then(clod.counts)"))
+        return dict(self.evaluate("clod.whenDrawn().then(clod.counts)"))
 
 
 def assert_alike(picture: np.ndarray, wanted: np.ndarray) -> None:
@@ -117,7 +128,7 @@ def drop(shown: Shown, name: str, data: bytes, *, wait: int = 0) -> None:
         Object.defineProperty(event, "dataTransfer", { value: { files: [file] } });
         document.body.dispatchEvent(event);
     }"""
-    shown.page.evaluate(script, [name, base64.b64encode(data).decode(), wait])
+    shown.evaluate(script, [name, base64.b64encode(data).decode(), wait])
 
 
 def message(shown: Shown, name: str) -> str:

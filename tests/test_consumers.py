@@ -17,7 +17,6 @@ from clod_adapter.adapter import detach, with_dial
 from clod_adapter.alignment.check import check_alignment
 from clod_adapter.bake import bake, order_by_extinction
 from clod_adapter.config import AdaptConfig, AttenuationConfig
-from clod_adapter.equation import attenuation
 from clod_adapter.equation.units import in_world_units
 from clod_adapter.evaluation.budget import frame_times, matching_dial
 from clod_adapter.evaluation.popping import dial_popping, path_popping
@@ -127,34 +126,22 @@ def agree(these, those, within):
     return True
 
 
+# Growth is no part of the culling rule.
+WITHOUT_GROWTH = {"order_by_extinction", *(name for name in CONSUMERS if "dial_for" in name)}
+
+
 @pytest.mark.parametrize("name", CONSUMERS)
-def test_everything_follows_sigma_d_in_its_unit(name):
+def test_everything_follows_sigma_d_in_its_unit_and_growth(name):
     """Reaches of other Gaussians change the result; the same ones in another unit do not, to
-    rounding.
+    rounding. Growth changes whatever draws, and no count.
     """
     consumer = CONSUMERS[name]
     model = model_of()
     before = consumer(model)
     assert not same(consumer(model.replace(sigma_d=model.sigma_d.flip(0))), before)
     assert agree(consumer(in_world_units(model)), before, 1e-4)
-
-
-# Growth is no part of the culling rule.
-WITHOUT_GROWTH = {"order_by_extinction", *(name for name in CONSUMERS if "dial_for" in name)}
-
-
-@pytest.mark.parametrize("name", CONSUMERS)
-def test_everything_grows_by_one_function(name, monkeypatch):
-    """Other factors change whatever draws by the default ``draw`` (tests/rasterizers/test_dial.py),
-    and no count.
-    """
-    monkeypatch.setitem(BACKENDS, "cpu", lambda: Rasterizer(cpu.rasterize))
-    consumer = CONSUMERS[name]
-    before = consumer(model_of())
-    # The function's own code, as an edit of its source would change it for whoever has imported it.
-    changed = (lambda growth_d, d, s, r: (3 * growth_d.to(d)).exp()).__code__
-    monkeypatch.setattr(attenuation.growth_factors, "__code__", changed)
-    assert same(consumer(model_of()), before) == (name in WITHOUT_GROWTH)
+    grown = consumer(model.replace(growth_d=model.growth_d + 0.5))
+    assert same(grown, before) == (name in WITHOUT_GROWTH)
 
 
 SHORT = replace(CONFIG, iters=1)

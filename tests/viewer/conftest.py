@@ -88,7 +88,7 @@ def shown(tab_of_model, model):
     second.
     """
     fold(tab_of_model, False)
-    tab_of_model.page.evaluate(
+    tab_of_model.evaluate(
         "document.activeElement.blur(), document.getElementById('target').value = ''"
     )
     take(tab_of_model, model)

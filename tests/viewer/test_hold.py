@@ -49,7 +49,7 @@ def simulated(tabs, model):
 def frames(shown, script):
     """The dial value and the time of the frames from ``script`` until the page draws no more."""
     shown.run(f"(window.trace.length = 0, {script})")
-    return [list(map(float, frame)) for frame in shown.page.evaluate("window.trace")]
+    return [list(map(float, frame)) for frame in shown.evaluate("window.trace")]
 
 
 def turned(shown, load):
@@ -69,7 +69,7 @@ def held(simulated):
 
 
 def dial_of(shown):
-    return float(shown.text("#dial-value").removeprefix("s = "))
+    return float(shown.dial.removeprefix("s = "))
 
 
 def test_the_law_is_that_of_python(tab_of_model):
@@ -113,7 +113,7 @@ def test_the_dial_follows_a_load_that_is_switched_on_and_off(held):
         "(window.trace.length = 0, new Promise((later) => setTimeout(later, 300)).then(() =>"
         " window.trace.length))"
     )
-    assert held.page.evaluate(drawn) == 0
+    assert held.evaluate(drawn) == 0
     assert float(held.text("#frame").removesuffix(" ms per frame")) == pytest.approx(
         times[-1], abs=0.6
     )
@@ -126,7 +126,7 @@ def test_the_dial_follows_a_load_that_is_switched_on_and_off(held):
     # more time for a frame
     frames(held, f"({rate}.value = 30, {rate}.dispatchEvent(new Event('change')))")
     assert dial_of(held) == 1
-    held.page.evaluate(f"{rate}.value = 60")
+    held.evaluate(f"{rate}.value = 60")
 
 
 def test_the_dial_by_hand_ends_it(simulated):
@@ -137,17 +137,17 @@ def test_the_dial_by_hand_ends_it(simulated):
         "location.hash = '#dial=3'",
     ):
         shown.run("(clod.setDial(1), clod.setEquation(true))")
-        shown.page.keyboard.press("r")
+        shown.press("r")
         assert shown.page.is_checked("#hold")
-        shown.page.evaluate(f"() => {{ {end} }}")
+        shown.evaluate(f"() => {{ {end} }}")
         shown.until("!document.getElementById('hold').checked")
         shown.run("clod.whenDrawn()")
-        dial = shown.text("#dial-value")
-        assert len(turned(shown, 3)) == 1 and shown.text("#dial-value") == dial, end
+        dial = shown.dial
+        assert len(turned(shown, 3)) == 1 and shown.dial == dial, end
     for load, moved in ((1, True), (0.1, False)):
         shown.run("clod.setDial(0)")
         frames(shown, f"window.load = {load}, clod.setHold(60)")
-        assert (1 < dial_of(shown) < 3) if moved else shown.text("#dial-value") == "all"
+        assert (1 < dial_of(shown) < 3) if moved else shown.dial == "all"
 
 
 def test_a_file_opens_with_a_held_rate(tabs, model, tmp_path):
@@ -155,14 +155,14 @@ def test_a_file_opens_with_a_held_rate(tabs, model, tmp_path):
     write_viewer_page(tmp_path / "page.html", clod_adapter.load(model))
     url = (tmp_path / "page.html").as_uri()
     slow = opened(tabs, url, 2)
-    dials, times = zip(*slow.page.evaluate("window.trace"), strict=True)
+    dials, times = zip(*slow.evaluate("window.trace"), strict=True)
     assert times[0] == 44
     assert times[-1] == pytest.approx(0.8 * 1000 / 30, rel=0.1)
     assert 1 < dial_of(slow) < 5
     assert all(b <= 1.1 * max(a, 1) + 0.01 for a, b in pairwise(map(float, dials[2:])))
     assert slow.page.is_checked("#hold") and slow.page.input_value("#rate") == "30"
     linked = opened(tabs, f"{url}#dial=0", 2)
-    assert linked.text("#dial-value") == "all" and not linked.page.is_checked("#hold")
+    assert linked.dial == "all" and not linked.page.is_checked("#hold")
     assert linked.errors == slow.errors == []
     for each in (slow, linked):
         each.page.close()

@@ -129,7 +129,7 @@ def test_a_page_of_one_file(show, save, monkeypatch, exact):
     here = shown.link()
     away = re.sub("eye=[^&]*", f"eye={40 * size},0,{-40 * size}", here)
     for view, quality in ((away, ""), (here, "31.5 dB")):
-        shown.page.evaluate("hash => { location.hash = hash }", view)
+        shown.evaluate("hash => { location.hash = hash }", view)
         shown.until(f"document.getElementById('quality').textContent === '{quality}'")
     shown.camera(seen)
     for s in (1.0, 3.0):
@@ -154,12 +154,12 @@ def test_a_file_without_sigma_d_has_no_dial(show, save, plain):
     assert f"{NAME} has no sigma_d" in shown.text("#no-dial")
     assert f"clod-adapt {NAME}" in shown.text("#no-dial")
     for key in "]re":
-        shown.page.keyboard.press(key)
+        shown.press(key)
     assert shown.counts()["kept"] == 400
     assert shown.picture().max() > 50
     assert not shown.page.is_checked("#hold")
     # a link with a comparison, which needs a dial
-    shown.page.evaluate("location.hash = '#wipe=0.5&dial=3'")
+    shown.evaluate("location.hash = '#wipe=0.5&dial=3'")
     shown.run("clod.whenDrawn()")
     assert not shown.page.is_checked("#compare")
 

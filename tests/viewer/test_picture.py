@@ -109,14 +109,14 @@ def test_wipe_shows_both_sides(show, save):
         shown.run("clod.setWipe(0.4)")
         both = np.concatenate([left[:, :128], render(right, VIEW).pixels.numpy()[:, 128:]], axis=1)
         assert_alike(shown.picture(), both)
-        shown.page.keyboard.press("c")
+        shown.press("c")
         assert_same(shown, render(gaussians, VIEW, 3.0))
         take(shown, save(gaussians))
         shown.run("clod.setEquation(false)")
-    shown.page.keyboard.press("c")
+    shown.press("c")
     assert shown.page.is_checked("#equation") and "dial off" in shown.text("#wipe-right")
     shown.page.focus("#wipe")
-    shown.page.keyboard.press("Home")
+    shown.press("Home")
     assert shown.page.input_value("#wipe") == "0"
 
 
@@ -224,6 +224,6 @@ def test_the_last_of_two_dropped_files_is_shown(show, save, model, gaussians):
     shown.until("document.title === 'less.ply'")
     shown.page.wait_for_timeout(500)
     assert shown.text("#title") == "less.ply" and shown.counts()["total"] == 9
-    assert shown.text("#dial-value") == "s = 2.00"
+    assert shown.dial == "s = 2.00"
     take(shown, model)
-    assert shown.text("#dial-value") == "s = 3.00"
+    assert shown.dial == "s = 3.00"

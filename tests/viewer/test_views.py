@@ -37,30 +37,30 @@ def photographed(folder, cameras):
 
 def test_keys_move_the_dial(shown):
     full = shown.counts()["kept"]
-    assert shown.text("#dial-value") == "s = 1.00"
+    assert shown.dial == "s = 1.00"
     for _ in range(10):
-        shown.page.keyboard.press("]")
+        shown.press("]")
     fewer = shown.counts()["kept"]
-    shown.page.keyboard.press("[")
+    shown.press("[")
     assert fewer < shown.counts()["kept"] < full
     shown.page.focus("#dial")
-    shown.page.keyboard.press("End")
-    assert shown.text("#dial-value") == "s = 5.00" and shown.counts()["kept"] < fewer
-    shown.page.keyboard.press("Home")
-    assert shown.text("#dial-value") == "all" and shown.counts()["kept"] == 400 > full
+    shown.press("End")
+    assert shown.dial == "s = 5.00" and shown.counts()["kept"] < fewer
+    shown.press("Home")
+    assert shown.dial == "all" and shown.counts()["kept"] == 400 > full
     shown.run("clod.setDial(2)")
-    shown.page.keyboard.press("e")
+    shown.press("e")
     assert shown.counts()["kept"] == 400 and not shown.page.is_checked("#equation")
-    assert shown.text("#dial-value") == "off"
-    shown.page.keyboard.press("e")
-    assert shown.text("#dial-value") == "s = 2.00"
+    assert shown.dial == "off"
+    shown.press("e")
+    assert shown.dial == "s = 2.00"
 
 
 def target(shown, text):
     """The page's note after a count is entered."""
     shown.page.fill("#target", text)
-    shown.page.evaluate("document.getElementById('target-note').textContent = ''")
-    shown.page.keyboard.press("Enter")
+    shown.evaluate("document.getElementById('target-note').textContent = ''")
+    shown.press("Enter")
     shown.until("document.getElementById('target-note').textContent !== ''")
     return shown.text("#target-note")
 
@@ -80,16 +80,16 @@ def test_the_count_box(shown, gaussians):
     assert np.array_equal(shown.picture(), before)
     for text in ("0", "1.5", "many"):
         assert "Enter a number of Gaussians" in target(shown, text)
-        assert shown.text("#dial-value") == "s = 1.00"
+        assert shown.dial == "s = 1.00"
     assert "keeps" in target(shown, "1,000,000")
     shown.run("clod.setEquation(false)")
     assert "keeps 280 in this view" in target(shown, "280")
     assert shown.counts()["kept"] == 280 and shown.page.is_checked("#equation")
-    assert float(shown.text("#dial-value").removeprefix("s = ")) == pytest.approx(wanted, rel=0.02)
+    assert float(shown.dial.removeprefix("s = ")) == pytest.approx(wanted, rel=0.02)
     for change in ("]", "ArrowLeft"):
         assert "keeps" in target(shown, "280")
-        shown.page.evaluate("document.activeElement.blur()")
-        shown.page.keyboard.press(change)
+        shown.evaluate("document.activeElement.blur()")
+        shown.press(change)
         assert shown.text("#target-note") == "", change
 
 
@@ -119,7 +119,7 @@ def test_pointer_touch_and_wheel_move_the_camera(chromium, show, model):
         move()
         assert differ(shown.picture(), before)
         before = shown.picture()
-    shown.page.keyboard.press("0")
+    shown.press("0")
     assert np.array_equal(shown.picture(), fitted)
 
 
@@ -140,18 +140,18 @@ def test_files_and_cameras_are_listed(show, gaussians, tmp_path):
     assert shown.page.locator("#files option").all_inner_texts() == list(models)
     links = {"0.jpg": shown.link()}
     for key, name in (("n", "1.jpg"), ("n", "2.jpg"), ("n", "0.jpg"), ("p", "2.jpg")):
-        shown.page.keyboard.press(key)
+        shown.press(key)
         assert shown.page.input_value("#camera") == name
         assert links.setdefault(name, shown.link()) == shown.link()
     assert len({*links.values()}) == 3
     shown.page.select_option("#camera", "1.jpg")
     assert shown.link() == links["1.jpg"]
-    shown.page.evaluate("document.activeElement.blur()")
-    shown.page.keyboard.press("ArrowRight")
+    shown.evaluate("document.activeElement.blur()")
+    shown.press("ArrowRight")
     assert shown.page.input_value("#camera") == "free view"
-    shown.page.keyboard.press("2")
+    shown.press("2")
     shown.until("document.title === 'b.glb'")
-    assert shown.text("#dial-value") == "s = 2.00"
+    assert shown.dial == "s = 2.00"
     shown.run("clod.setWipe(0.4)")
     assert shown.text("#wipe-right") == "base · 400"
     linked = shown.link()
@@ -160,8 +160,8 @@ def test_files_and_cameras_are_listed(show, gaussians, tmp_path):
     drop(shown, "dropped.ply", (tmp_path / "c.ply").read_bytes())
     shown.until("document.title === 'dropped.ply'")
     assert shown.text("#title") == "dropped.ply" and shown.page.input_value("#files") == ""
-    assert shown.counts()["total"] == 9 and shown.text("#dial-value") == "s = 3.00"
-    shown.page.keyboard.press("1")
+    assert shown.counts()["total"] == 9 and shown.dial == "s = 3.00"
+    shown.press("1")
     shown.until("document.title === 'a.ply'")
     assert shown.text("#compare-with") == "Compare with the base"
     opened = show(*words, state=linked, viewport=TALL)
@@ -230,15 +230,13 @@ def test_the_up_axis(shown, show, save, tmp_path):
     with_cameras = show(path, "--images", tmp_path)
     assert with_cameras.page.text_content("#up option") == "as in the photographs"
     before = link(with_cameras)["axes"]
-    with_cameras.page.keyboard.press("ArrowLeft")
+    with_cameras.press("ArrowLeft")
     turned = link(with_cameras)["axes"]
     up = -sum(camera.viewmat[1, :3].numpy() for camera in cameras)
     assert abs((turned - before)[:3] @ up) < 1e-4 < np.abs(turned - before).max()
-    with_cameras.page.evaluate(
-        "hash => { location.hash = hash }", shown.page.evaluate("location.hash")
-    )
+    with_cameras.evaluate("hash => { location.hash = hash }", shown.evaluate("location.hash"))
     with_cameras.until("document.getElementById('up').value === '0,0,1'")
-    with_cameras.page.keyboard.press("ArrowLeft")
+    with_cameras.press("ArrowLeft")
     assert abs(link(with_cameras)["axes"][2]) < 1e-6
 
 
@@ -256,7 +254,7 @@ def test_placed_cameras_are_levelled(show, model, tmp_path):
     # frames whose time is hardly more than 0
     fast = "WebGL2RenderingContext.prototype.readPixels = () => {}"
     shown = show(url=(tmp_path / "page.html").as_uri(), script=fast)
-    assert shown.text("#dial-value") == "all"
+    assert shown.dial == "all"
     assert np.allclose(link(shown)["axes"][:3], viewmat[0, :3], atol=1e-4)
 
 
@@ -278,10 +276,10 @@ def test_the_picture_and_the_panel_fit_the_window(show, save, tmp_path, photogra
         shown.page.wait_for_timeout(50)
         if width == 1280:
             shown.page.click("#fold")
-        shown.page.keyboard.press("0")
+        shown.press("0")
         red = shown.picture()[..., 0] > 100
         panel = "document.getElementById('panel').getBoundingClientRect().toJSON()"
-        box = shown.page.evaluate(panel)
+        box = shown.evaluate(panel)
         assert box["left"] >= 0 and box["right"] <= width
         assert box["top"] >= 0 and box["bottom"] <= height
         red[int(box["top"]) : int(box["bottom"]), int(box["left"]) : int(box["right"])] = False
@@ -314,7 +312,7 @@ def test_the_path_and_the_turntable(show, model, tmp_path):
     playing = "document.querySelector('#play.playing')"
     views = [link(shown)]
     for _ in range(2):
-        shown.page.keyboard.press("t")
+        shown.press("t")
         shown.page.wait_for_timeout(300)
         views.append(link(shown))
     start, turned, stopped = views
@@ -322,17 +320,17 @@ def test_the_path_and_the_turntable(show, model, tmp_path):
     pivots = [view["eye"] + view["distance"] * forward(view) for view in views]
     assert np.allclose(pivots[0], pivots[2], atol=1e-4)
     assert not np.allclose(start["eye"], turned["eye"], atol=1e-2)
-    shown.page.keyboard.press("0")
-    shown.page.keyboard.press("Space")
-    shown.page.evaluate(SELECTED)  # in each frame: the last camera is there for one
+    shown.press("0")
+    shown.press("Space")
+    shown.evaluate(SELECTED)  # in each frame: the last camera is there for one
     shown.until("window.selected.join().includes('1,2,0')")
-    assert shown.page.evaluate(f"{playing} !== null")
-    shown.page.keyboard.press("Space")
-    assert shown.page.evaluate(f"{playing} === null")
+    assert shown.evaluate(f"{playing} !== null")
+    shown.press("Space")
+    assert shown.evaluate(f"{playing} === null")
     still = link(shown)["eye"]
     shown.page.wait_for_timeout(200)
     assert np.array_equal(link(shown)["eye"], still)
-    shown.page.keyboard.press("Space")
+    shown.press("Space")
     shown.page.mouse.move(300, 60)
     shown.page.mouse.wheel(0, 50)
     shown.until(f"{playing} === null")
@@ -342,18 +340,18 @@ def test_pictures_and_videos_are_saved(shown):
     shown.run("clod.setDial(2)")
     picture = shown.picture()
     with shown.page.expect_download() as download:
-        shown.page.keyboard.press("x")
+        shown.press("x")
     assert download.value.suggested_filename == "model_s2.00.png"
     saved = np.asarray(
         Image.open(io.BytesIO(Path(download.value.path()).read_bytes())).convert("RGB")
     )
     assert np.array_equal(saved, picture)
     record = "document.getElementById('record').click()"
-    shown.page.evaluate(record)
+    shown.evaluate(record)
     shown.page.wait_for_timeout(1000)  # an encoder on a busy machine has no picture sooner
     assert shown.page.text_content("#record") == "Stop recording"
     with shown.page.expect_download() as download:
-        shown.page.evaluate(record)
+        shown.evaluate(record)
     data = Path(download.value.path()).read_bytes()
     assert len(data) > 1000 and (data[4:8] == b"ftyp" or data[:4] == b"\x1aE\xdf\xa3")
     assert shown.page.text_content("#record") == "Record video"
