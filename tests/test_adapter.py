@@ -242,23 +242,22 @@ def test_invalid_files_are_refused(tmp_path):
     assert "package_version" in about
     assert about["base_sha256"] == "ab" * 32
     assert about["attenuation"]["reference_distance"] == 0.1 / 3
-    texts = "[" * 100_000, '{"format": ' * 50_000, "1" * 10_000, "nul", '"\\ud800"'
-    for change, message in (
-        *CHANGES,
-        *((text, "settings are damaged") for text in texts),
-        (None, "not an adapter"),
-    ):
-        text = json.dumps(about)
-        kept = tensors
-        if isinstance(change, dict) and change.keys() <= about.keys():
-            text = json.dumps(about | change)
-        elif isinstance(change, dict):
-            kept = {name: value for name, value in (tensors | change).items() if value is not None}
-        else:
-            text = change or ""
-        save_file(kept, path, {"clod_adapter": text} if change else None)
+
+    def rejected(message, tensors, text):
+        save_file(tensors, path, text and {"clod_adapter": text})
         with rejects(message):
             load_adapter(path)
+
+    for change, message in CHANGES:
+        if change.keys() <= about.keys():
+            rejected(message, tensors, json.dumps(about | change))
+        else:
+            changed = (tensors | change).items()
+            present = {name: value for name, value in changed if value is not None}
+            rejected(message, present, json.dumps(about))
+    for text in ("[" * 100_000, '{"format": ' * 50_000, "1" * 10_000, "nul", '"\\ud800"'):
+        rejected("settings are damaged", tensors, text)
+    rejected("not an adapter", tensors, None)
 
 
 def test_config_must_be_json_and_version_is_kept(tmp_path):

@@ -38,9 +38,8 @@ def test_dial_values_follow_the_schedule():
         sampler = ViewSampler(VIEWS, AdaptConfig(max_sv=4.0), schedule)
         samples = [sampler.draw(k, share_done) for k in range(480)]
         names = [sample.view.camera.name for sample in samples]  # each view once a round
-        assert all(
-            len({*names[k : k + len(VIEWS)]}) == len(VIEWS) for k in range(0, 480, len(VIEWS))
-        )
+        count = len(VIEWS)
+        assert all(len({*names[k : k + count]}) == count for k in range(0, 480, count))
         return torch.tensor([sample.dial for sample in samples], dtype=torch.float64)
 
     for stretch in drawn(Schedule(full=0.25)).split(120):
@@ -52,27 +51,23 @@ def test_dial_values_follow_the_schedule():
     assert ViewSampler(VIEWS, AdaptConfig(max_sv=1.0)).draw(0, 0.0)[1:] == (1.0, None, False)
 
 
-def test_first_steps_have_photographs_of_half_the_size():
+@pytest.mark.parametrize(
+    "height, share_done, full, halved",
+    [
+        (258, 0.49, 0.0, True),
+        (258, 0.5, 0.0, False),
+        (255, 0.0, 0.0, False),
+        (258, 0.0, 1.0, False),
+    ],
+)
+def test_first_steps_have_photographs_of_half_the_size(height, share_done, full, halved):
     """Unless these would be small, or the step is at s = 1."""
-    whole = replace(
-        VIEWS[0].camera,
-        width=301,
-        height=258,
-        K=torch.tensor([[90.0, 0, 150], [0, 90, 129], [0, 0, 1]]),
-    )
-    image = torch.randint(256, (258, 301, 3), generator=seeded(0)).byte()
-    large = View(whole, image)
-    small = View(replace(whole, height=255), image[:255])
-    cases = (
-        (large, 0.49, 0.0, True),
-        (large, 0.5, 0.0, False),
-        (small, 0.0, 0.0, False),
-        (large, 0.0, 1.0, False),
-    )
-    for view, share_done, full, expected in cases:
-        schedule = Schedule(coarse=0.5, full=full)
-        sample = ViewSampler((view,), AdaptConfig(), schedule).draw(0, share_done)
-        assert sample.halved == expected and (sample.view is view) != expected
+    K = torch.tensor([[90.0, 0, 150], [0, 90, 129], [0, 0, 1]])
+    camera = replace(VIEWS[0].camera, width=301, height=height, K=K)
+    view = View(camera, torch.randint(256, (height, 301, 3), generator=seeded(0)).byte())
+    schedule = Schedule(coarse=0.5, full=full)
+    sample = ViewSampler((view,), AdaptConfig(), schedule).draw(0, share_done)
+    assert sample.halved == halved and (sample.view is view) != halved
 
 
 CONFIG = AdaptConfig(max_sv=6.0)
@@ -123,12 +118,15 @@ def test_count_slope_is_that_of_a_soft_count():
 
 def test_shares_are_of_all_gaussians():
     """Where far ones alone are counted: as if the others, which are culled, were counted too."""
-    (log_sigma, d), found, s = some(), [], 3.0
+    log_sigma, d = some()
     log_sigma[40:65] = -9.2
-    for count, total in ((65, None), (40, 65)):
-        given = d[:count], log_sigma[:count].exp(), s, 0.3, CONFIG
-        found.append(count_gradient(*given, target_share(s, count, CONFIG, total))[:40])
-    assert found[0].abs().max() > 0 and torch.allclose(*found, rtol=1e-5, atol=0)
+
+    def of_first(count, total=None):
+        share = target_share(3.0, count, CONFIG, total)
+        return count_gradient(d[:count], log_sigma[:count].exp(), 3.0, 0.3, CONFIG, share)[:40]
+
+    assert of_first(65).abs().max() > 0
+    assert torch.allclose(of_first(65), of_first(40, 65), rtol=1e-5, atol=0)
 
 
 SHAPES = {
@@ -160,10 +158,13 @@ def gradients(n, seed):
     out = {}
     for name, shape in SHAPES.items():
         size = 10 ** (8 * torch.rand(n, *[1] * len(shape), generator=g) - 6)
-        out[name] = (
-            torch.randn(n, *shape, generator=g) * size * (torch.rand(n, *shape, generator=g) > 0.1)
-        )
+        values = torch.randn(n, *shape, generator=g) * size
+        out[name] = values * (torch.rand(n, *shape, generator=g) > 0.1)
     return out
+
+
+def part(values, rows):
+    return {name: value[rows] for name, value in values.items()}
 
 
 def everything(n):
@@ -200,26 +201,25 @@ def test_only_selected_rows_are_stepped(kind, more, filler, n=40):
     """Other rows keep every bit, and their gradients are ignored; so do rows behind a leading
     part.
     """
+    chosen = torch.tensor([2, 17, 31])
+    rows = torch.zeros(n, dtype=torch.bool)
+    rows[chosen] = True
     larger = parameters(n + more)
-    alone = {name: value[:n] for name, value in parameters(n + more).items()}
+    alone = part(larger, chosen)
     larger["means"][5] = torch.nan
     before = {name: value.clone().view(torch.int32) for name, value in larger.items()}
-    rows = torch.zeros(n, dtype=torch.bool)
-    rows[[31, 2, 17]] = True
-    own = {name: value[rows].clone() for name, value in alone.items()}
-    optimizers = kind({name: value[:n] for name, value in larger.items()}), kind(own)
+    optimizer = kind(part(larger, slice(n)))
+    of_alone = kind(alone)
     for step in range(3):
         given = {name: gradient + 1 for name, gradient in gradients(n, step).items()}
-        optimizers[1].step(
-            {name: value[rows] for name, value in given.items()}, everything(3), TENTHS
-        )
+        of_alone.step(part(given, chosen), everything(3), TENTHS)
         for value in given.values():
             value[~rows] = filler
-        optimizers[0].step(given, rows, TENTHS)
-        optimizers[0].step(given, torch.zeros_like(rows), TENTHS)  # of no rows
+        optimizer.step(given, rows, TENTHS)
+        optimizer.step(given, torch.zeros_like(rows), TENTHS)  # of no rows
+    others = torch.cat([~rows, everything(more)])
     for name, value in larger.items():
         bits = value.view(torch.int32)
-        others = torch.cat([~rows, torch.ones(more, dtype=torch.bool)])
         assert torch.equal(bits[others], before[name][others]), name  # in place
-        assert (bits[~others] != before[name][~others]).all(), name
-        assert torch.equal(value[~others], own[name]), name
+        assert (bits[chosen] != before[name][chosen]).all(), name
+        assert torch.equal(value[chosen], alone[name]), name
