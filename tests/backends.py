@@ -6,9 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from types import ModuleType
-from typing import Any
 
-import pytest
 import torch
 from torch import Tensor
 
@@ -28,8 +26,8 @@ class Backend:
     looser: float = 1.0
     drops_last: bool = False  # leaves out the Gaussian that ends a pixel, as gsplat does
 
-    def __call__(self, *args: Any, **kwargs: Any) -> tuple[Tensor, Tensor]:
-        def place(x: Any) -> Any:
+    def __call__(self, *args, **kwargs) -> tuple[Tensor, Tensor]:
+        def place(x):
             return x.to(self.device, self.dtype) if isinstance(x, Tensor) else x
 
         rasterize = importlib.import_module(f"clod_adapter.rasterizers.{self.module}").rasterize
@@ -74,9 +72,7 @@ def torch_threads(count: int) -> Iterator[None]:
         cpu.FEW = few
 
 
-def fresh_copy(
-    monkeypatch: pytest.MonkeyPatch, name: str, package: str, installed: ModuleType | None
-) -> ModuleType:
+def fresh_copy(monkeypatch, name: str, package: str, installed: ModuleType | None) -> ModuleType:
     """A second copy of ``clod_adapter.integrations.NAME``, imported with ``package`` replaced or
     absent.
     """

@@ -63,7 +63,7 @@ COMPUTE = """async ([source, statements, table]) => {
 }"""
 
 
-def compute(page: Any, source: str, statements: str, table: Sequence[Sequence[float]]) -> Any:
+def compute(page, source: str, statements: str, table: Sequence[Sequence[float]]):
     """The table after ``statements``; the page is from a secure place, such as loopback. Skips
     without WebGPU.
     """

@@ -55,13 +55,11 @@ class Walled(Tensor):
         return made
 
     @classmethod
-    def __torch_dispatch__(
-        cls, function: Any, types: Any, args: Any = (), kwargs: Any = None
-    ) -> Any:
+    def __torch_dispatch__(cls, function, types, args=(), kwargs=None):
         return _run(function, args, kwargs or {})
 
 
-def _run(function: Any, args: Any, kwargs: dict[str, Any]) -> Any:
+def _run(function, args, kwargs: dict[str, Any]):
     tensors = [x for x in tree_flatten((args, kwargs))[0] if isinstance(x, Tensor)]
     walled = [x for x in tensors if isinstance(x, Walled)]
     outside = [x for x in tensors if not isinstance(x, Walled) and x.dim()]
@@ -86,7 +84,7 @@ def _run(function: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     )
 
 
-def _waits(function: Any, args: Any, kwargs: dict[str, Any], walled: list[Any]) -> bool:
+def _waits(function, args, kwargs: dict[str, Any], walled: list[Any]) -> bool:
     """Whether the host waits for the device: it reads a value or a size, or copies and is not told
     to go on.
     """
@@ -119,18 +117,14 @@ def waits() -> Iterator[list[str]]:
 
 
 class _Dispatch(TorchDispatchMode):
-    def __torch_dispatch__(
-        self, function: Any, types: Any, args: Any = (), kwargs: Any = None
-    ) -> Any:
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
         return _run(function, args, kwargs or {})
 
 
 class _Functions(TorchFunctionMode):
     """Handles calls that dispatch does not see: ``torch.tensor`` with a device, and ``tolist``."""
 
-    def __torch_function__(
-        self, function: Any, types: Any, args: Any = (), kwargs: Any = None
-    ) -> Any:
+    def __torch_function__(self, function, types, args=(), kwargs=None):
         kwargs = kwargs or {}
         if function is torch.tensor and kwargs.get("device") is not None:
             device = kwargs.pop("device")

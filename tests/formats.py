@@ -99,7 +99,7 @@ def damaged(whole: bytes, data: st.DataObject) -> bytes:
     return bytes(changed)
 
 
-def splat_transform(*arguments: str | Path) -> None:
+def splat_transform(*arguments: str | Path):
     """Runs splat-transform, from PATH or $CLOD_SPLAT_TRANSFORM; skips the test if it is missing."""
     command = os.environ.get("CLOD_SPLAT_TRANSFORM") or shutil.which("splat-transform")
     if command is None:
@@ -165,7 +165,7 @@ def write_elements(path: Path, elements: Sequence[PlyElement], order: str = "<")
     return path
 
 
-def without_comments(path: Path, **columns: Any) -> Path:
+def without_comments(path: Path, **columns) -> Path:
     """The file as another tool writes it: without its comments, some columns added or changed in
     every row.
     """
@@ -173,7 +173,7 @@ def without_comments(path: Path, **columns: Any) -> Path:
     return write_rows(path.with_name("rewritten.ply"), rows)
 
 
-def with_columns(old: np.ndarray, **columns: Any) -> np.ndarray:
+def with_columns(old: np.ndarray, **columns) -> np.ndarray:
     added = [(name, "f4") for name in columns if name not in old.dtype.names]
     rows = np.zeros(len(old), old.dtype.descr + added)
     for name in rows.dtype.names or ():

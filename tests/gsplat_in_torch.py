@@ -19,7 +19,7 @@ ALPHA_MAX = 0.999
 TRANSMITTANCE_MIN = 1e-4
 
 
-def install(monkeypatch: pytest.MonkeyPatch) -> None:
+def install(monkeypatch):
     """Replaces the kernels in gsplat and its rendering module; skips the test where there is no
     gsplat.
     """

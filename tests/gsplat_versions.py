@@ -26,9 +26,7 @@ def signatures() -> dict[str, dict[str, str]]:
     return {version: common | own for version, own in found.items()}
 
 
-def module(
-    version: str, draw: Callable[[str, str, dict[str, Any]], Any] = lambda *given: given
-) -> Any:
+def module(version: str, draw: Callable[[str, str, dict[str, Any]], Any] = lambda *given: given):
     """The module ``gsplat`` of this version; ``draw`` gets a function's name, the version and the
     arguments.
     """

@@ -32,7 +32,7 @@ FORKS = {  # settings in addition to SETTINGS, parameters of the call, results
 }
 
 
-def module(name: str) -> Any:
+def module(name: str):
     """The module ``diff_gaussian_rasterization`` of this fork; its rasterizer notes the arguments
     in ``given``.
     """
@@ -41,11 +41,11 @@ def module(name: str) -> Any:
     class GaussianRasterizer(nn.Module):
         given: dict[str, Any]
 
-        def __init__(self, raster_settings: Any) -> None:
+        def __init__(self, raster_settings):
             super().__init__()
             self.raster_settings = raster_settings
 
-        def forward(self, *args: Any, **kwargs: Any) -> tuple[Tensor, ...]:
+        def forward(self, *args, **kwargs) -> tuple[Tensor, ...]:
             self.given = dict(zip(call.split(), args, strict=False)) | kwargs
             assert set(self.given) <= set(call.split())
             drawn = _draw(self.raster_settings, self.given)
@@ -65,7 +65,7 @@ def module(name: str) -> Any:
     return made
 
 
-def settings_of(kind: Any, view: Camera, **others: Any) -> Any:
+def settings_of(kind, view: Camera, **others):
     """The fork's settings for a camera whose principal point is the image's middle."""
     values = {
         "image_height": view.height,
@@ -79,7 +79,7 @@ def settings_of(kind: Any, view: Camera, **others: Any) -> Any:
     return kind(**{name: (values | others).get(name) for name in kind._fields})
 
 
-def _draw(settings: Any, given: dict[str, Any]) -> dict[str, Any]:
+def _draw(settings, given: dict[str, Any]) -> dict[str, Any]:
     """Every result of any fork; ``radii`` and ``touched`` have a row per Gaussian."""
     width = settings.image_width
     height = settings.image_height

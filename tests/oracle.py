@@ -65,7 +65,7 @@ def on_a_cut(
     to the clamp.
     """
 
-    def draw(patch: pytest.MonkeyPatch, **constants: object) -> Tensor:
+    def draw(patch: pytest.MonkeyPatch, **constants) -> Tensor:
         for name, value in constants.items():
             patch.setattr(reference, name, value)
         behind = BACKGROUND.double()
@@ -109,7 +109,7 @@ def assert_agrees(
     nudge: float = 1e-4,
     rows: Tensor | None = None,
     screen_filter: ScreenFilter = CLASSIC,
-) -> None:
+):
     """Asserts agreement; with ``rows``, with the picture of those alone, and gradients of 0 for the
     others.
     """
@@ -151,7 +151,7 @@ def assert_agrees(
         )
 
 
-def assert_same(a: Result, b: Result, **tolerance: Any) -> None:
+def assert_same(a: Result, b: Result, **tolerance):
     """Asserts equality: bit for bit, or within ``torch.testing.assert_close``'s tolerances."""
     pairs = [("image", a.image, b.image), ("alpha", a.alpha, b.alpha)]
     for name, x, y in [

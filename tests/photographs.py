@@ -53,7 +53,7 @@ def write_scene(folder: Path, count: int = 10) -> tuple[list[Camera], list[str]]
     return cameras, names
 
 
-def write_images(folder: Path, names: Sequence[str]) -> None:
+def write_images(folder: Path, names: Sequence[str]):
     """The ``pixels`` of 0, 1, 2, ..."""
     for i, name in enumerate(names):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
@@ -65,9 +65,7 @@ def to_world(seed: int) -> list[list[float]]:
     return (np.linalg.inv(pose(seed).double().numpy()) @ np.diag([1.0, -1.0, -1.0, 1.0])).tolist()
 
 
-def write_frames(
-    folder: Path, frames: list[Any], file: str = "transforms.json", **rest: Any
-) -> Path:
+def write_frames(folder: Path, frames: list[Any], file: str = "transforms.json", **rest) -> Path:
     folder.mkdir(exist_ok=True)
     (folder / file).write_text(json.dumps({**rest, "frames": frames}))
     return folder

@@ -77,7 +77,7 @@ def accepted(words: Sequence[object]) -> list[str]:
 class Server:
     """Runs ``clod-adapt`` in forked processes, which start quickly."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.process = subprocess.Popen(
             [sys.executable, "-c", SERVER],
             text=True,
@@ -87,18 +87,11 @@ class Server:
         )
         assert self.process.stdout.readline() == "ready\n"
 
-    def ask(self, **about: Any) -> int:
+    def ask(self, **about) -> int:
         self.process.stdin.write(json.dumps(about) + "\n")
         return int(self.process.stdout.readline())
 
-    def start(
-        self,
-        folder: Path,
-        *words: object,
-        rank: object = "",
-        before: str = "",
-        **environment: object,
-    ) -> int:
+    def start(self, folder: Path, *words, rank="", before: str = "", **environment) -> int:
         """The process's id, valid until it is waited for; ``before`` is code that it runs first."""
         return self.ask(
             folder=str(folder),
@@ -111,7 +104,7 @@ class Server:
     def wait(self, pid: int) -> int:
         return self.ask(wait=pid)
 
-    def run(self, folder: Path, *words: object) -> str:
+    def run(self, folder: Path, *words) -> str:
         """What was printed."""
         assert self.wait(self.start(folder, *words)) == 0, log_of(folder)
         return log_of(folder)
@@ -123,14 +116,8 @@ class Launched:
     """
 
     def __init__(
-        self,
-        server: Server,
-        folder: Path,
-        *words: object,
-        size: int = 2,
-        before: Any = None,
-        wait: str = "",
-    ) -> None:
+        self, server: Server, folder: Path, *words, size: int = 2, before=None, wait: str = ""
+    ):
         folder.mkdir(exist_ok=True)
         self.server, self.folder = server, folder
         self.store = dist.TCPStore("localhost", 0, is_master=True, wait_for_workers=False)
@@ -169,7 +156,7 @@ class Launched:
         return json.loads((self.folder / "dial.json").read_text())
 
 
-def rejects(message: str) -> Any:
+def rejects(message: str):
     """Expects an error of ours with this message, a regular expression."""
     return pytest.raises(ClodError, match=message)
 
@@ -183,7 +170,7 @@ def names(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
 
 
-def log_of(folder: Path, rank: object = "") -> str:
+def log_of(folder: Path, rank="") -> str:
     return Path(f"{folder}{rank}.log").read_text()
 
 
@@ -200,13 +187,13 @@ def results(folder: Path, name: str = "dial") -> dict[str, bytes]:
     }
 
 
-def rebuilt(clod: Callable[..., Any], base: object, *more: str) -> bool:
+def rebuilt(clod: Callable[..., Any], base, *more: str) -> bool:
     """Whether ``apply`` gives ``dial.ply`` from its adapter, bit for bit."""
     clod("apply", base, "dial.safetensors -o same.ply", *more)
     return Path("same.ply").read_bytes() == Path("dial.ply").read_bytes()
 
 
-def wait_for(path: Path, text: str = "") -> None:
+def wait_for(path: Path, text: str = ""):
     """Until the file exists and has this text."""
     until = time.monotonic() + 60
     while not path.exists() or (text and text not in path.read_text()):
@@ -218,7 +205,7 @@ def pressing(real: Callable[..., Any], *numbers: int, at: int = 1) -> Callable[.
     """``real``, interrupted by these signals at the beginning of its ``at``-th call."""
     calls = count(1)
 
-    def pressed(*given: Any, **rest: Any) -> Any:
+    def pressed(*given, **rest):
         for number in numbers if next(calls) == at else ():
             signal.raise_signal(number)
         return real(*given, **rest)
@@ -227,21 +214,21 @@ def pressing(real: Callable[..., Any], *numbers: int, at: int = 1) -> Callable[.
 
 
 @contextmanager
-def pressed(place: Any, name: str, *numbers: int, at: int = 1) -> Iterator[None]:
+def pressed(place, name: str, *numbers: int, at: int = 1) -> Iterator[None]:
     """Within the context a function, ``place.name``, is interrupted as by ``pressing``."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(place, name, pressing(getattr(place, name), *numbers, at=at))
         yield
 
 
-def change_step(patch: pytest.MonkeyPatch, at: int, change: Callable[[Any], Any]) -> None:
+def change_step(patch: pytest.MonkeyPatch, at: int, change: Callable[[Any], Any]):
     """Replaces the gradients of the ``at``-th step by ``change`` of them, not in the kernels' runs
     of one step.
     """
     real = Trainer.gradient_sum
     steps = count(1)
 
-    def changed(self: Trainer, *given: Any) -> Any:
+    def changed(self: Trainer, *given):
         gradients = real(self, *given)
         chosen = self.config.iters > 1 and next(steps) == at
         return change(gradients) if chosen else gradients
@@ -249,7 +236,7 @@ def change_step(patch: pytest.MonkeyPatch, at: int, change: Callable[[Any], Any]
     patch.setattr(Trainer, "gradient_sum", changed)
 
 
-def config_of(**changes: Any) -> AdaptConfig:
+def config_of(**changes) -> AdaptConfig:
     """Fixed settings, so that the tests do not depend on the defaults."""
     settings = {
         "start_share": 0.6,
@@ -268,7 +255,7 @@ def config_of(**changes: Any) -> AdaptConfig:
 def states_of(steps: set[int], found: dict[int, TrainingState]) -> Callable[[Progress], None]:
     """A progress callback that keeps the states after these steps."""
 
-    def keep(progress: Progress) -> None:
+    def keep(progress: Progress):
         if progress.state and progress.done in steps:
             found[progress.done] = copy.deepcopy(progress.state())
 

@@ -3,7 +3,6 @@
 import math
 import re
 from functools import partial
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -69,7 +68,7 @@ def gaussians(n: int, degree: int, seed: int, *, size: float = 0.08) -> Gaussian
     return Gaussians(s["means"], s["quats"], logs, logits, s["sh0"], s["shN"])
 
 
-def dialled(n: int, degree: int, seed: int, **settings: Any) -> Gaussians:
+def dialled(n: int, degree: int, seed: int, **settings) -> Gaussians:
     """Gaussians with a sigma_d log-normal around e, and 0 in every 50th row."""
     sigma_d = (torch.randn(n, generator=seeded(seed + 1)) + 1).exp()
     sigma_d[::50] = 0.0
@@ -130,7 +129,7 @@ def capture(
     return base, Scene(tuple(v for k, v in enumerate(seen) if k % 4), seen[::4])
 
 
-def assert_equal(a: Gaussians, b: Gaussians) -> None:
+def assert_equal(a: Gaussians, b: Gaussians):
     """Asserts that both have the same bits and the same attenuation settings."""
     assert a.tensors().keys() == b.tensors().keys() and a.attenuation == b.attenuation
     for name, value in a.tensors().items():

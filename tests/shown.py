@@ -38,7 +38,7 @@ class Shown:
     errors: list[str] = field(default_factory=list)
     asked: list[str] = field(default_factory=list)
 
-    def __post_init__(self) -> None:
+    def __post_init__(self):
         self.page.on(
             "console", lambda message: message.type == "error" and self.errors.append(message.text)
         )
@@ -50,13 +50,13 @@ class Shown:
         self.run("clod.ready")
         return self
 
-    def run(self, script: str, *arguments: object) -> Any:
+    def run(self, script: str, *arguments):
         waiting = (
             f"async (given) => {{ const r = await {script}; await clod.whenDrawn(); return r }}"
         )
         return self.evaluate(waiting, *arguments)
 
-    def until(self, condition: str) -> None:
+    def until(self, condition: str):
         """Waits until it holds. Not Playwright's wait_for_function, which the page's policy forbids
         to evaluate.
         """
@@ -69,10 +69,10 @@ class Shown:
         }})"""
         self.evaluate(script)
 
-    def evaluate(self, script: str, *arguments: object) -> Any:
+    def evaluate(self, script: str, *arguments):
         return self.page.evaluate(script, *arguments)
 
-    def press(self, key: str) -> None:
+    def press(self, key: str):
         self.page.keyboard.press(key)
 
     @property
@@ -83,7 +83,7 @@ class Shown:
     def text(self, selector: str) -> str:
         return str(self.page.inner_text(selector))
 
-    def camera(self, camera: Camera) -> None:
+    def camera(self, camera: Camera):
         self.run("clod.setCamera(given)", camera_entry(camera))
 
     def picture(self) -> np.ndarray:
@@ -100,12 +100,12 @@ class Shown:
         return dict(self.evaluate("clod.whenDrawn().then(clod.counts)"))
 
 
-def assert_alike(picture: np.ndarray, wanted: np.ndarray) -> None:
+def assert_alike(picture: np.ndarray, wanted: np.ndarray):
     """Asserts a PSNR of at least WITHIN between two pictures ``[H, W, 3]`` uint8."""
     assert peak_signal_noise_ratio(wanted, picture) >= WITHIN
 
 
-def assert_same(shown: Shown, wanted: Rendering) -> None:
+def assert_same(shown: Shown, wanted: Rendering):
     """Asserts that the page shows the picture of our renderer and counts the same Gaussians."""
     counts = shown.counts()
     kept = int(wanted.kept.sum())
@@ -113,7 +113,7 @@ def assert_same(shown: Shown, wanted: Rendering) -> None:
     assert abs(counts["kept"] - kept) <= COUNTS * kept and counts["total"] == len(wanted.kept)
 
 
-def drop(shown: Shown, name: str, data: bytes, *, wait: int = 0) -> None:
+def drop(shown: Shown, name: str, data: bytes, *, wait: int = 0):
     """Drops a file on the page that can be read after ``wait`` milliseconds; a name without a
     suffix never can be.
     """
@@ -140,14 +140,14 @@ def message(shown: Shown, name: str) -> str:
     return said
 
 
-def fold(shown: Shown, open: bool) -> None:
+def fold(shown: Shown, open: bool):
     shown.page.set_viewport_size(TALL if open else SIZE)
     expanded = json.dumps(str(open).lower())
     script = f"fold => fold.getAttribute('aria-expanded') === {expanded} || fold.click()"
     shown.page.eval_on_selector("#fold", script)
 
 
-def take(shown: Shown, path: Path) -> None:
+def take(shown: Shown, path: Path):
     """Shows another file in the tab, by the page's own function, and waits until it is drawn."""
     script = (
         "clod.load(Uint8Array.from(atob(given[1]), (letter) => letter.charCodeAt(0)).buffer,"
@@ -157,7 +157,7 @@ def take(shown: Shown, path: Path) -> None:
 
 
 @contextmanager
-def serve(*words: object) -> Iterator[str]:
+def serve(*words) -> Iterator[str]:
     """The address of a server of ``clod-adapt view`` with these arguments, by default at s = 1,
     where it stays.
     """
