@@ -227,6 +227,5 @@ def test_a_step_waits_for_the_device_once(there, monkeypatch):
     for share_done in (0.1, 0.9):
         with waits() as found:
             trainer.step(share_done)
-        assert [place for place in found if not place.startswith("rasterizers/")] == [
-            "training/trainer.py:step"
-        ]
+        places = [place for place in found if not place.startswith("rasterizers/")]
+        assert places == ["training/trainer.py:step"]

@@ -160,9 +160,8 @@ def test_other_rows_are_refused(rows):
 
 def test_gaussians_are_compared_as_a_whole():
     some = adapted()
-    assert some == some.replace(
-        **{name: value.double().numpy() for name, value in some.tensors().items()}
-    )
+    arrays = {name: value.double().numpy() for name, value in some.tensors().items()}
+    assert some == some.replace(**arrays)
     for other in (
         some[:4],
         some.replace(means=some.means + 1),
@@ -178,9 +177,7 @@ def test_gaussians_are_compared_as_a_whole():
 def test_repr_is_short_and_devices_have_names():
     some = adapted()
     assert repr(plain()) == "Gaussians(5, SH degree 2, no dial, cpu)"
-    assert (
-        repr(some.replace(growth_d=torch.ones(5)))
-        == "Gaussians(5, SH degree 2, dial to 5 with growth, cpu)"
-    )
+    grown = some.replace(growth_d=torch.ones(5))
+    assert repr(grown) == "Gaussians(5, SH degree 2, dial to 5 with growth, cpu)"
     assert repr(some.to("meta")) == "Gaussians(5, SH degree 2, dial to 5, meta)"
     assert some.cpu().means.device.type == "cpu"

@@ -329,9 +329,7 @@ def test_help_errors_and_inspect_do_not_import_torch(folder):
     )
     words = [sys.executable, "-c", script, json.dumps(lines)]
     environment = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
-    done = subprocess.run(
-        words, cwd=folder, env=environment, capture_output=True, text=True, check=False
-    )
+    done = subprocess.run(words, cwd=folder, env=environment, capture_output=True, text=True)
     wanted = [
         0 if line[-1] in ("--help", "--version") or line[0] == "inspect" else 2 for line in lines
     ]

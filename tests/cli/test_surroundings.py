@@ -162,9 +162,7 @@ def test_commands_without_posix(capture, tmp_path):
         commands.append([paths.get(word, word) for word in f"{line} --quiet".split()])
     program = Path(__file__).with_name("without_posix.py")
     words = [sys.executable, str(program), json.dumps(commands)]
-    done = subprocess.run(
-        words, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=300
-    )
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stdout + done.stderr
     assert {"dial.ply", "dial.json", "pictures", "plain.spz", "plain.html"} <= set(names(tmp_path))
     assert (tmp_path / "again.ply").read_bytes() == (tmp_path / "dial.ply").read_bytes()
@@ -220,12 +218,8 @@ def test_photographs_that_are_none_start_no_program(clod, capture, tmp_path, mon
     for kind, content in CONTENT.items():
         (tmp_path / "scene" / "images" / "001.png").write_bytes(content)
         done = clod("eval BASE --images scene --quiet", code=2)
-        found = (
-            kind
-            if kind in ("PostScript", "GIF")
-            else "damaged or none of PNG, JPEG, TIFF, WEBP, BMP"
-        )
-        assert done.err.endswith(
-            f"images/001.png: cannot be decoded, is {found}; export it as JPEG or PNG\n"
-        )
+        unknown = "damaged or none of PNG, JPEG, TIFF, WEBP, BMP"
+        why = kind if kind in ("PostScript", "GIF") else unknown
+        said = f"images/001.png: cannot be decoded, is {why}; export it as JPEG or PNG\n"
+        assert done.err.endswith(said)
         assert done.err.count("\n") == 1 and not started.called, kind

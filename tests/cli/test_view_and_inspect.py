@@ -97,17 +97,13 @@ def test_interrupts_and_browsers(clod, monkeypatch):
     monkeypatch.setenv("BROWSER", "editor")  # a program whose end is not waited for
     monkeypatch.setattr(webbrowser, "get", lambda: webbrowser.GenericBrowser("editor"))
     assert isinstance(view.find_browser(), webbrowser.BackgroundBrowser)
-    monkeypatch.setattr(
-        webbrowser, "get", Mock(side_effect=webbrowser.Error("could not locate runnable browser"))
-    )
+    error = webbrowser.Error("could not locate runnable browser")
+    monkeypatch.setattr(webbrowser, "get", Mock(side_effect=error))
     assert view.find_browser() is None
     with socket.create_server(("127.0.0.1", 0)) as taken:
         done = clod("view BASE --no-browser --port", taken.getsockname()[1], code=2)
-    assert re.search(
-        r"^clod-adapt: error: .*port \d+ of 127.0.0.1 is not available .*choose another",
-        done.err,
-        re.M,
-    )
+    said = r"^clod-adapt: error: .*port \d+ of 127.0.0.1 is not available .*choose another"
+    assert re.search(said, done.err, re.M)
 
 
 def test_a_plain_file_fits_on_a_screen(clod, capture):
@@ -138,11 +134,8 @@ def test_a_dial_and_its_calibration(clod, dialled):
     assert report["oddities"] == [] and "anomalies" not in report
     assert splat["count"] == splat["total"] == 540
     assert splat["columns"][-1] == ["opacity_d", "float32"]
-    assert (
-        set(splat["sigma"])
-        == set(splat["growth"])
-        == set(["least", "low", "median", "high", "greatest"])
-    )
+    quantiles = {"least", "low", "median", "high", "greatest"}
+    assert set(splat["sigma"]) == set(splat["growth"]) == quantiles
     assert splat["dial"]["attenuation"]["max_sv"] == 4 and len(splat["position"]) == 3
     told = json.loads(dialled.with_suffix(".json").read_text())
     assert splat["dial"]["calibration"] == told["calibration"]

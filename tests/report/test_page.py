@@ -56,61 +56,41 @@ def report(**changes):
 
 
 def test_page_is_self_contained_and_escaped(tmp_path, monkeypatch):
-    frames = [
-        Picture(np.full((6, 8, 3), level, np.float32), NASTY, NASTY) for level in (0.0, 0.5, 1.0)
-    ]
-    training = {
-        "views": 2,
-        "base_psnr": 29.0,
-        "curves": [{"label": NASTY, "points": [{"seconds": 2, "psnr": 20}] * 2}],
-    }
-    written = write_page(
-        tmp_path / "page.html", report(), frames, {"photograph": frames[0]}, training
-    )
-    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(
-        path.name for path in written.values()
-    )
-    text = (tmp_path / "page.html").read_text("utf-8")
+    path = tmp_path / "page.html"
+    levels = [np.full((6, 8, 3), level, np.float32) for level in (0.0, 0.5, 1.0)]
+    frames = [Picture(level, NASTY, NASTY) for level in levels]
+    curve = {"label": NASTY, "points": [{"seconds": 2, "psnr": 20}] * 2}
+    training = {"views": 2, "base_psnr": 29.0, "curves": [curve]}
+    written = write_page(path, report(), frames, {"photograph": frames[0]}, training)
+    assert set(tmp_path.iterdir()) == set(written.values())
+    text = path.read_text("utf-8")
     visible = text.partition('<script type="application/json"')[0]
     assert "a <b>" not in visible and "a &lt;b&gt; &amp;" in visible and "9 steps on" in visible
-    assert "3:35 minutes in all" in visible
-    assert "29.00 dB" in visible
-    assert "base, unadapted" in visible
-    assert not re.search(
-        r"<link|<iframe|<script[^>]* src|https?://(?!www\.w3\.org)|@import|url\((?!#)", text
-    )
-    assert all(
-        url.startswith(("data:", "#")) for url in re.findall(r'\b(?:src|href)="([^"]*)"', text)
-    )
+    for part in ("3:35 minutes in all", "29.00 dB", "base, unadapted", ".tiles > div {"):
+        assert part in visible
+    foreign = r"<link|<iframe|<script[^>]* src|https?://(?!www\.w3\.org)|@import|url\((?!#)"
+    assert not re.search(foreign, text)
+    urls = re.findall(r'\b(?:src|href)="([^"]*)"', text)
+    assert all(url.startswith(("data:", "#")) for url in urls)
     names = re.findall(r'\bid="([^"]+)"', text)
     assert len(names) == len(set(names)) > 10
-    assert ".tiles > div {" in visible
-    assert {"var(--ink)", "var(--quiet)", "var(--series-1)"} <= set(
-        re.findall(r"var\([^)]*\)", text.split("<svg")[1])
-    )
-    stored = re.search(r'<script type="application/json" id="data">(.*?)</script>', text, re.S)
-    assert stored
-    assert json.loads(stored[1]) == {"report": report(), "training": training}
-    assert "<" not in stored[1]
-    assert re.findall(r'<img [^>]*data-name="([^"]*)" data-title', text) == [
-        "",
-        "",
-        "",
-        "photograph",
-    ]
+    colours = re.findall(r"var\([^)]*\)", text.split("<svg")[1])
+    assert {"var(--ink)", "var(--quiet)", "var(--series-1)"} <= set(colours)
+    data = '<script type="application/json" id="data">(.*?)</script>'
+    (stored,) = re.findall(data, text, re.S)
+    assert json.loads(stored) == {"report": report(), "training": training} and "<" not in stored
+    shown = re.findall(r'<img [^>]*data-name="([^"]*)" data-title', text)
+    assert shown == ["", "", "", "photograph"]
     for png in (written["rendering"], written["adapting"]):
         pixels = np.asarray(Image.open(png).convert("RGB"))
         assert min(pixels.shape[:2]) > 500 and 0.005 < (pixels < 128).any(2).mean() < 0.3
     own = report(rows=[], base_rows=[], detached_row=None, teacher="checkpoint")
-    write_page(tmp_path / "page.html", own, frames, {"base": frames[0]})
-    text = (tmp_path / "page.html").read_text("utf-8")
-    assert all(
-        part in text
-        for part in ("Nothing was measured", "steps on synthetic views", "hold for base")
-    )
-    assert re.findall(r"\S+ photograph", text[: text.index("Settings and machine")]) == [
-        "without photograph"
-    ]
+    write_page(path, own, frames, {"base": frames[0]})
+    text = path.read_text("utf-8")
+    for part in ("Nothing was measured", "steps on synthetic views", "hold for base"):
+        assert part in text
+    told = text.partition("Settings and machine")[0]
+    assert re.findall(r"\S+ photograph", told) == ["without photograph"]
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     with rejects("pip install matplotlib"):
         write_page(tmp_path / "other.html", report(), [], {})
@@ -128,9 +108,8 @@ def test_images_are_embedded():
     urls = [Picture(each, "").url.removeprefix("data:image/webp;base64,") for each in images]
     *ramps, wide = (Image.open(io.BytesIO(base64.b64decode(url))) for url in urls)
     assert wide.size == (1000, 150)
-    assert all(
-        np.abs(np.asarray(each.convert("RGB")).astype(float) - ramp).mean() < 4 for each in ramps
-    )
+    for image in ramps:
+        assert np.abs(np.asarray(image.convert("RGB"), float) - ramp).mean() < 4
 
 
 def test_charts():

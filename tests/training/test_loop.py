@@ -206,9 +206,8 @@ def test_growth_begins_at_the_median_distance_in_the_second_nearest_view(capture
 
 def test_settings_as_keywords(captured):
     adapted = adapt(*captured, config_of(iters=3), max_sv=7, growth="off")
-    assert repr(adapted).startswith(
-        "Adapted(Gaussians(300 and 240 far, SH degree 1, dial to 7, cpu), 3 steps, "
-    )
+    text = "Adapted(Gaussians(300 and 240 far, SH degree 1, dial to 7, cpu), 3 steps, "
+    assert repr(adapted).startswith(text)
     assert adapted.gaussians.growth_d is None
     with pytest.raises(TypeError, match="max_vs"):
         adapt(*captured, max_vs=7)

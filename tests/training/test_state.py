@@ -54,17 +54,15 @@ def test_a_resumed_run_ends_with_the_same_bits(captured, form):
     if form == "sigma_d alone":
         base = base.replace(shN=torch.zeros_like(base.shN))
     if form == "paper":
-        base = with_dial(
-            base, torch.full((len(base),), 1.5), AttenuationConfig(form="paper", max_sv=3.0)
-        )
+        reaches = torch.full((len(base),), 1.5)
+        base = with_dial(base, reaches, AttenuationConfig(form="paper", max_sv=3.0))
     config = config_of(**{"iters": 12, **RESUMED[form]})
     states = {}
     whole = adapt(base, scene, config, states_of({1, 6, 10, 11}, states))
     if form == "sigma_d alone":
         start = adapt(base, scene, replace(config, iters=0)).gaussians
-        assert all(
-            torch.equal(getattr(whole.gaussians, name), getattr(start, name)) for name in ATTRIBUTES
-        )
+        for name in ATTRIBUTES:
+            assert torch.equal(getattr(whole.gaussians, name), getattr(start, name))
     seen = []
     for state in states.values():
         again = adapt(base, scene, config, seen.append, copy.deepcopy(state))

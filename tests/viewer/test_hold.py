@@ -114,9 +114,8 @@ def test_the_dial_follows_a_load_that_is_switched_on_and_off(held):
         " window.trace.length))"
     )
     assert held.evaluate(drawn) == 0
-    assert float(held.text("#frame").removesuffix(" ms per frame")) == pytest.approx(
-        times[-1], abs=0.6
-    )
+    shown = float(held.text("#frame").removesuffix(" ms per frame"))
+    assert shown == pytest.approx(times[-1], abs=0.6)
     turned(held, 20)
     assert dial_of(held) == 5
     assert "s = 5, the largest trained value, is too slow" in held.text("#target-note")

@@ -120,9 +120,8 @@ def test_a_page_of_one_file(show, save, monkeypatch, exact):
     viewmat[:3, 3] *= size
     seen = replace(camera, viewmat=viewmat)
     out = path.with_suffix(".html")
-    read, _ = page.write_viewer_page(
-        out, calibrated, cameras=[seen], virtual_scale=1.0, exact=exact
-    )
+    options = {"cameras": [seen], "virtual_scale": 1.0, "exact": exact}
+    read, _ = page.write_viewer_page(out, calibrated, **options)
     assert out.read_text("utf-8").count('id="clod-model"') > 2
     shown = show(url=out.as_uri())
     assert shown.text("#quality") == "31.5 dB"
@@ -147,10 +146,8 @@ def test_a_file_without_sigma_d_has_no_dial(show, save, plain):
     assert shown.text("#title") == NAME
     assert shown.page.title() == NAME
     assert shown.page.query_selector("img") is None
-    assert all(
-        shown.page.is_disabled(f"#{name}")
-        for name in ("dial", "target", "equation", "hold", "rate")
-    )
+    for name in ("dial", "target", "equation", "hold", "rate"):
+        assert shown.page.is_disabled(f"#{name}")
     assert f"{NAME} has no sigma_d" in shown.text("#no-dial")
     assert f"clod-adapt {NAME}" in shown.text("#no-dial")
     for key in "]re":

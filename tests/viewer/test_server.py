@@ -83,9 +83,8 @@ def test_responses(server):
     assert server.socket.getsockname()[0] == "127.0.0.1"
     assert server.url == f"http://127.0.0.1:{server.port}/"
     for method, path, host, wanted in REQUESTS:
-        status, headers, body = request(
-            server, path, method, **({} if host is None else {"Host": host})
-        )
+        given = {} if host is None else {"Host": host}
+        status, headers, body = request(server, path, method, **given)
         assert status == wanted and headers.items() >= SAFE.items(), (method, path, host, status)
         assert "access-control-allow-origin" not in headers
         assert "python" not in headers["server"].lower()
@@ -93,10 +92,8 @@ def test_responses(server):
             page = path.startswith("/files")
             assert body == (b"".join(BLOCKS) if page else b"hello")
             scripts = "" if page else "; script-src 'sha256-x'"
-            assert (
-                headers["content-security-policy"]
-                == f"default-src 'none'{scripts}; frame-ancestors 'none'"
-            )
+            policy = f"default-src 'none'{scripts}; frame-ancestors 'none'"
+            assert headers["content-security-policy"] == policy
         else:
             assert BLOCKS[0] not in body
     with rejects(f"^port {server.port} of 127.0.0.1 .*choose another"):

@@ -9,8 +9,7 @@ import signal
 import pytest
 import torch
 
-import clod_adapter
-from clod_adapter import AdaptConfig
+from clod_adapter import AdaptConfig, load
 from clod_adapter.cli.main import build_parser
 from clod_adapter.cli.shared.command import make_config
 from clod_adapter.cli.shared.process import Launch, launched
@@ -61,16 +60,11 @@ def test_signals_of_the_launcher_do_not_end_the_writing(server, words, tmp_path)
     os.kill(run.pids[1], signal.SIGKILL)
     assert run.wait() == [0, -signal.SIGKILL], run.log(0)
     report = run.report()
-    assert (
-        json.loads(run.log(0))["steps"]
-        == report["steps"]
-        == load_state(run.folder / STATE)[0].steps
-        > 0
-    )
+    steps = report["steps"]
+    assert json.loads(run.log(0))["steps"] == load_state(run.folder / STATE)[0].steps == steps > 0
     assert report["interrupted"] and report["rows"] == []
-    assert f"training ended at step {report['steps']}: a process of the group has ended" in str(
-        report["notes"]
-    )
+    note = f"training ended at step {steps}: a process of the group has ended"
+    assert note in str(report["notes"])
 
 
 BREAK = """
@@ -105,12 +99,10 @@ def test_two_give_the_result_of_one(server, words, tmp_path):
     assert (report["resumed_from"], report["steps"], report["interrupted"]) == (4, 12, False)
     assert again.log(0).count("2 processes (gloo): 2 views a step, 12 steps") == 1
     assert again.log(1) == "" and not (run.folder / STATE).exists()
-    assert [row["psnr"] for row in report["rows"]] == pytest.approx(
-        [row["psnr"] for row in want["rows"]], abs=1e-3
-    )
-    found, wanted = (
-        clod_adapter.load(each.folder / "dial.ply").gaussians for each in (again, alone)
-    )
+    psnr = [row["psnr"] for row in want["rows"]]
+    assert [row["psnr"] for row in report["rows"]] == pytest.approx(psnr, abs=1e-3)
+    found = load(again.folder / "dial.ply").gaussians
+    wanted = load(alone.folder / "dial.ply").gaussians
     assert found.attenuation == wanted.attenuation and len(report["rows"]) > 1
     for name, tensor in wanted.tensors().items():
         torch.testing.assert_close(found.tensors()[name], tensor, rtol=1e-4, atol=1e-4)

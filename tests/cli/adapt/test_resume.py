@@ -239,17 +239,11 @@ def test_resuming_after_an_error(clod, dialled, tmp_path, change, files):
         done = clod(ADAPT, "--quiet" if change is fail else "--json", code=1)
     assert names(tmp_path) == files, done
     assert f"--resume resumes from step 5, which is in {STATE}\n" in done.err
-    assert (
-        ("please report it" in done.err)
-        == ("ZeroDivisionError: of ours" in done.err)
-        == (change is fail)
-    )
+    for said in ("please report it", "ZeroDivisionError: of ours"):
+        assert (said in done.err) == (change is fail)
     if change is not fail:
         report = done.report
         assert report["interrupted"] and report["steps"] == 5 and len(report["rows"]) > 2
-        assert any(
-            "the result so far is written: the loss of step 6 is not finite" in n
-            for n in report["notes"]
-        )
+        assert done.note("the result so far is written: the loss of step 6 is not finite")
     assert f"resuming {STATE} from step 5" in clod(ADAPT, "--resume").err
     assert names(tmp_path) == OUTPUTS and results(tmp_path) == results(dialled.parent)

@@ -65,9 +65,8 @@ def test_writes_three_files(adapted, capture, dialled):
     assert set(report["config"]) == set(AdaptConfig.__dataclass_fields__)
     assert report["config"]["max_sv"] == 4
     assert set(report["machine"]) >= {"cpu", "cores", "python", "torch", "numba"}
-    assert set(report["seconds"]) == set(
-        ["load", "kernels", "plan", "start", "train", "evaluate", "total"]
-    )
+    steps = {"load", "kernels", "plan", "start", "train", "evaluate", "total"}
+    assert set(report["seconds"]) == steps
     assert [row["virtual_scale"] for row in report["rows"]] == [1, 1.5, 2, 3, 4]
     shares = [row["kept_share"] for row in report["rows"]]
     assert shares == sorted(shares, reverse=True) and 0 < shares[-1] < 0.5
@@ -76,12 +75,11 @@ def test_writes_three_files(adapted, capture, dialled):
     assert results(folder) == results(dialled.parent)
     model = load(folder / "dial.ply")
     views = load_scene(capture.scene).test
-    (plain,) = evaluate(detach(model.gaussians), views, [1.0])
-    ends = evaluate(model.gaussians, views, [1.0, 4.0])
-    for ours, row in zip(
-        (report["detached_row"], *report["rows"][::4]), (plain, *ends), strict=True
-    ):
-        assert {**ours, "frame_ms": 0} == {**row.as_dict(), "frame_ms": 0}
+    measured = evaluate(detach(model.gaussians), views, [1.0])
+    measured += evaluate(model.gaussians, views, [1.0, 4.0])
+    reported = (report["detached_row"], *report["rows"][::4])
+    for entry, row in zip(reported, measured, strict=True):
+        assert {**entry, "frame_ms": 0} == {**row.as_dict(), "frame_ms": 0}
     stored = model.calibration
     assert stored == load_adapter(folder / "dial.safetensors").calibration
     assert stored.as_dict() == report["calibration"] and stored.machine == machine_name()
@@ -92,17 +90,16 @@ def test_writes_three_files(adapted, capture, dialled):
 
 def test_prints_progress_a_table_next_commands_and_a_loss(adapted, capture):
     folder, done = adapted
-    table = [line.split() for line in done.out.splitlines()[1:9]]
-    assert [line[0] for line in table] == ["dial", "base", "1", "1.5", "2", "3", "4", "plain"]
-    assert len({len(line) for line in done.out.splitlines()[1:9]}) == 1  # aligned
-    view, *images = done.out.replace("\\\n", "").split("next:\n")[1].splitlines()
+    table = done.out.splitlines()[1:9]
+    first = [line.split()[0] for line in table]
+    assert first == ["dial", "base", "1", "1.5", "2", "3", "4", "plain"]
+    assert len(set(map(len, table))) == 1  # aligned
+    view, measure = done.out.replace("\\\n", "").split("next:\n")[1].splitlines()
     scene = f"--images {shlex.quote(str(capture.scene))}"
-    assert shlex.split(view) == shlex.split(
-        f"clod-adapt view dial.ply --base {shlex.quote(str(capture.ply))} {scene}"
-    )
-    assert [shlex.split(line) for line in images] == [
-        shlex.split(f"clod-adapt eval dial.ply {scene} --sv 1 4")
-    ]
+    base = shlex.quote(str(capture.ply))
+    wanted = f"clod-adapt view dial.ply --base {base} {scene}"
+    assert shlex.split(view) == shlex.split(wanted)
+    assert shlex.split(measure) == shlex.split(f"clod-adapt eval dial.ply {scene} --sv 1 4")
     assert "300 Gaussians, SH degree 1" in done.err
     assert "8 photographs to train on, 2 held out, 64x48" in done.err
     assert "trained 12 steps" in done.err and "\r" not in done.err

@@ -38,14 +38,10 @@ def test_values_that_look_activated_need_the_option(clod, capture, tmp_path):
     assert names(tmp_path) == ["in.ply"]
     assert "opacity taken as activated" in clod("in.ply", TINY, "--activated both").err
     assert rebuilt(clod, "in.ply", "--activated both")
-    (note, *_) = clod("apply in.ply dial.safetensors --out x.ply --activated both --json").report[
-        "notes"
-    ]
-    assert "opacity taken as activated" in note
-    report = clod(
-        "eval dial.ply --images SCENE --sv 1 --base in.ply --activated both --json"
-    ).report
-    assert report["base_row"]["psnr"] > 40
+    done = clod("apply in.ply dial.safetensors --out x.ply --activated both --json")
+    assert done.note("opacity taken as activated")
+    done = clod("eval dial.ply --images SCENE --sv 1 --base in.ply --activated both --json")
+    assert done.report["base_row"]["psnr"] > 40
 
 
 def test_a_compressed_file_is_adapted(clod, tmp_path):
@@ -77,26 +73,19 @@ def test_devices(monkeypatch, capsys):
     ):
         monkeypatch.setattr(torch.cuda, name, lambda *_, value=value: value)
     # torch has no code for its compute capability: the first operation fails
-    with monkeypatch.context() as patch:
-        patch.setattr(
-            torch,
-            "ones",
-            Mock(side_effect=RuntimeError("CUDA error: no kernel image is available")),
-        )
-        refused(r"torch cannot compute on it .*doctor")
+    error = RuntimeError("CUDA error: no kernel image is available")
+    monkeypatch.setattr(torch, "ones", Mock(side_effect=error))
+    refused(r"torch cannot compute on it .*doctor")
     monkeypatch.setattr(torch, "ones", lambda *_, **__: torch.zeros(1))
     monkeypatch.setattr(inputs, "unusable", lambda: None)
     capsys.readouterr()
-    assert (
-        pick_device("auto", Console()) == pick_device("cuda", Console()) == torch.device("cuda", 0)
-    )
+    for name in ("auto", "cuda"):
+        assert pick_device(name, Console()) == torch.device("cuda", 0)
     assert capsys.readouterr().err.splitlines() == ["on NVIDIA Test 1"] * 2
     monkeypatch.setattr(inputs, "unusable", lambda: "gsplat is absent: pip install gsplat==1.5.3")
     assert pick_device("auto", Console()) == torch.device("cpu")
-    assert (
-        "on the CPU, although there is a GPU: gsplat is absent: pip install"
-        in capsys.readouterr().err
-    )
+    why = "on the CPU, although there is a GPU: gsplat is absent: pip install"
+    assert why in capsys.readouterr().err
     refused("gsplat is absent: pip install gsplat==1.5.3")
 
 
@@ -126,12 +115,8 @@ def page_of(path):
 def test_adapt(clod, tmp_path):
     pytest.importorskip("matplotlib")
     report = clod(ADAPT, "--json").report
-    files = {
-        "page": "dial.html",
-        "rendering": "dial_rendering.png",
-        "count": "dial_count.png",
-        "adapting": "dial_adapting.png",
-    }
+    pictures = {name: f"dial_{name}.png" for name in ("rendering", "count", "adapting")}
+    files = {"page": "dial.html"} | pictures
     assert report["outputs"].items() >= files.items()
     assert all((tmp_path / f).is_file() for f in files.values())
     text, page = page_of(tmp_path / "dial.html")
@@ -156,11 +141,8 @@ def test_eval(clod, tmp_path, monkeypatch):
     """Without matplotlib the page is refused before any work."""
     pytest.importorskip("matplotlib")
     report = clod("eval DIAL --images SCENE --report look.html --json --base BASE").report
-    assert report["outputs"] == {
-        "page": "look.html",
-        "rendering": "look_rendering.png",
-        "count": "look_count.png",
-    }
+    pictures = {name: f"look_{name}.png" for name in ("rendering", "count")}
+    assert report["outputs"] == {"page": "look.html"} | pictures
     text, page = page_of(tmp_path / "look.html")
     assert page["report"]["rows"] == report["rows"] and page["training"] is None
     assert 'data-name="base"' in text and "hold for base" in text
