@@ -123,31 +123,31 @@ def test_empty_sh_degrees_are_removed(degree, used):
     """The highest degrees that are 0 are removed; one coefficient keeps its degree and all
     below.
     """
-    some = gaussians(7, degree, 0)
+    model = gaussians(7, degree, 0)
     bands = (used + 1) ** 2 - 1
-    some.shN[:, max(used**2 - 1, 0) :] = 0
+    model.shN[:, max(used**2 - 1, 0) :] = 0
     if used:
-        some.shN[4, bands - 1, 2] = -1e-30
-    found = some.without_empty_bands()
-    assert found.sh_degree == used and torch.equal(found.shN, some.shN[:, :bands])
-    assert found is some if used == degree else torch.equal(found.means, some.means)
+        model.shN[4, bands - 1, 2] = -1e-30
+    found = model.without_empty_bands()
+    assert found.sh_degree == used and torch.equal(found.shN, model.shN[:, :bands])
+    assert found is model if used == degree else torch.equal(found.means, model.means)
 
 
 def test_rows_by_brackets():
-    some = adapted()
+    model = adapted()
     for rows, wanted in (
         (slice(3), [0, 1, 2]),
         (slice(None, None, 2), [0, 2, 4]),
         ([3, 0], [3, 0]),
         (np.array([4, -1]), [4, 4]),
         (np.array([0, 1, 1, 0, 0], bool), [1, 2]),
-        (some.sigma_d > 2.5, [3, 4]),
+        (model.sigma_d > 2.5, [3, 4]),
         ([], []),
     ):
-        found = some[rows]
+        found = model[rows]
         assert found.attenuation is CONFIG and len(found) == len(wanted)
         for name, value in found.tensors().items():
-            assert torch.equal(value, getattr(some, name)[wanted]), name
+            assert torch.equal(value, getattr(model, name)[wanted]), name
 
 
 @pytest.mark.parametrize(
@@ -159,25 +159,25 @@ def test_other_rows_are_refused(rows):
 
 
 def test_gaussians_are_compared_as_a_whole():
-    some = adapted()
-    arrays = {name: value.double().numpy() for name, value in some.tensors().items()}
-    assert some == some.replace(**arrays)
+    model = adapted()
+    arrays = {name: value.double().numpy() for name, value in model.tensors().items()}
+    assert model == model.replace(**arrays)
     for other in (
-        some[:4],
-        some.replace(means=some.means + 1),
-        some.replace(means=some.means.double()),
+        model[:4],
+        model.replace(means=model.means + 1),
+        model.replace(means=model.means.double()),
         plain(),
         "text",
-        some.replace(growth_d=torch.ones(5)),
-        some.replace(attenuation=AttenuationConfig(max_sv=2)),
+        model.replace(growth_d=torch.ones(5)),
+        model.replace(attenuation=AttenuationConfig(max_sv=2)),
     ):
-        assert (some == other) is False
+        assert (model == other) is False
 
 
 def test_repr_is_short_and_devices_have_names():
-    some = adapted()
+    model = adapted()
     assert repr(plain()) == "Gaussians(5, SH degree 2, no dial, cpu)"
-    grown = some.replace(growth_d=torch.ones(5))
+    grown = model.replace(growth_d=torch.ones(5))
     assert repr(grown) == "Gaussians(5, SH degree 2, dial to 5 with growth, cpu)"
-    assert repr(some.to("meta")) == "Gaussians(5, SH degree 2, dial to 5, meta)"
-    assert some.cpu().means.device.type == "cpu"
+    assert repr(model.to("meta")) == "Gaussians(5, SH degree 2, dial to 5, meta)"
+    assert model.cpu().means.device.type == "cpu"

@@ -77,12 +77,12 @@ WORLD = AttenuationConfig(scene_distance=4.0)
 
 
 def test_a_dial_without_effect_changes_nothing():
-    some = gaussians(50, 0, 1)
+    model = gaussians(50, 0, 1)
     # more than opaque is left, no number is not
-    some.opacity_logits[:2] = torch.tensor([22.0, math.inf])
-    baked = bake(with_dial(some), 1.0, cameras=[camera(), camera()])
+    model.opacity_logits[:2] = torch.tensor([22.0, math.inf])
+    baked = bake(with_dial(model), 1.0, cameras=[camera(), camera()])
     assert baked.opacity_logits[:2].tolist() == [22, 20]
-    assert torch.equal(baked.opacity_logits[2:], some.opacity_logits[2:])
+    assert torch.equal(baked.opacity_logits[2:], model.opacity_logits[2:])
 
 
 def spread(**settings):
@@ -90,16 +90,16 @@ def spread(**settings):
     grow.
     """
     sigma, growth = torch.rand(2, 300, generator=seeded(2))
-    some = with_dial(gaussians(300, 1, 7), 5 * sigma + 0.1, replace(WORLD, **settings))
-    some.opacity_logits[:30:10] = math.inf
-    return some.replace(growth_d=1.5 * growth - 0.25)
+    model = with_dial(gaussians(300, 1, 7), 5 * sigma + 0.1, replace(WORLD, **settings))
+    model.opacity_logits[:30:10] = math.inf
+    return model.replace(growth_d=1.5 * growth - 0.25)
 
 
 @pytest.mark.parametrize("form", FORMS)
 def test_baked_image_matches_render_from_its_camera(form):
-    some = spread(form=form)
-    want = render(some, camera(), 2.5)
-    baked = bake(some, 2.5, camera())
+    model = spread(form=form)
+    want = render(model, camera(), 2.5)
+    baked = bake(model, 2.5, camera())
     assert baked.sigma_d is baked.growth_d is baked.attenuation is None
     assert baked.opacity_logits.isfinite().all()
     assert len(baked) == want.kept.sum() and 0 < len(baked) < 300
@@ -129,12 +129,12 @@ def test_several_cameras_share_one_distance_per_gaussian():
 
 @pytest.mark.parametrize("form", FORMS)
 def test_autocast_changes_nothing(form):
-    some = spread(form=form)
+    model = spread(form=form)
     view = camera()
     for rasterizer in (None, Rasterizer(reference.rasterize)):
-        want = render(some, view, 2.0, rasterizer=rasterizer)
+        want = render(model, view, 2.0, rasterizer=rasterizer)
         with torch.autocast("cpu"):
-            found = render(some, view, 2.0, rasterizer=rasterizer)
+            found = render(model, view, 2.0, rasterizer=rasterizer)
         assert torch.equal(found.image, want.image) and torch.equal(found.kept, want.kept)
 
 
@@ -142,7 +142,7 @@ NO_DIALS = (-0.001, math.inf, math.nan, "5", None, [1.0], torch.ones(2), 10**400
 
 
 def test_bad_arguments_are_refused():
-    some = spread()
+    model = spread()
     plain = gaussians(3, 0, 0)
     wrong = "a.ply"
     for message, call in {
@@ -150,7 +150,7 @@ def test_bad_arguments_are_refused():
             f"virtual_scale is {re.escape(str(s))}": partial(render, plain, camera(), s)
             for s in NO_DIALS
         },
-        **{f"scale is {re.escape(str(s))}": partial(render, some, camera(), s) for s in NO_DIALS},
+        **{f"scale is {re.escape(str(s))}": partial(render, model, camera(), s) for s in NO_DIALS},
         "gaussians is a str, it must be of type Gaussians": lambda: render(wrong, camera()),
         "camera is a str, it must be of type Camera": lambda: render(plain, wrong),
         "background is 'a.ply', it must be an array of numbers": lambda: render(
@@ -160,13 +160,13 @@ def test_bad_arguments_are_refused():
         "background": lambda: render(plain, camera(), background=torch.ones(1)),
         "opacities": lambda: splat(plain, plain.opacities[:2], camera()),
         "no sigma_d": lambda: bake(plain, 1.0),
-        "virtual_scale is -0.5": lambda: bake(some, -0.5, camera()),
-        "no Gaussian is kept at s = 200": lambda: bake(some, 200.0, camera()),
-        "either camera or cameras": lambda: bake(some, 2.0),
+        "virtual_scale is -0.5": lambda: bake(model, -0.5, camera()),
+        "no Gaussian is kept at s = 200": lambda: bake(model, 200.0, camera()),
+        "either camera or cameras": lambda: bake(model, 2.0),
         "paper's form rows have no order": lambda: order_by_extinction(
             spread(form="paper"), [camera()]
         ),
-        "no camera is given": lambda: order_by_extinction(some, []),
+        "no camera is given": lambda: order_by_extinction(model, []),
         "no pruning order": lambda: order_by_extinction(plain, [camera()]),
     }.items():
         with rejects(message):

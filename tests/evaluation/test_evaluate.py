@@ -30,8 +30,8 @@ def row_of_four():
     reach of 3.
     """
     means = in_front(camera(), torch.tensor([[0.0, 0, 1], [0, 0, 2], [0, 0, 4], [80, 0, 8]]))
-    some = gaussians(4, 0, 0).replace(means=means, opacity_logits=torch.full((4,), 2.0))
-    return with_dial(some, torch.full((4,), 3.0), AttenuationConfig())
+    model = gaussians(4, 0, 0).replace(means=means, opacity_logits=torch.full((4,), 2.0))
+    return with_dial(model, torch.full((4,), 3.0), AttenuationConfig())
 
 
 def test_counts_follow_the_reach():
@@ -88,7 +88,7 @@ def clock(monkeypatch):
         drawn = []
         now = [0.0]
 
-        def draw(some, camera, s):
+        def draw(model, camera, s):
             now[0] += cost(len(drawn), s)
             drawn.append((camera.name, s))
 
@@ -100,8 +100,8 @@ def clock(monkeypatch):
 
 
 def of_one(**options):
-    some = with_dial(gaussians(20, 0, 0), torch.ones(20), AttenuationConfig(max_sv=7.0))
-    return time_frames([(some, DIALS)], ring(9, 48, 36), **options)
+    model = with_dial(gaussians(20, 0, 0), torch.ones(20), AttenuationConfig(max_sv=7.0))
+    return time_frames([(model, DIALS)], ring(9, 48, 36), **options)
 
 
 def test_drift_and_interruptions_do_not_zigzag(clock):
@@ -153,8 +153,8 @@ def adapted(n, seed, form="ours"):
     return with_dial(gaussians(n, 0, seed), sigma, attenuation)
 
 
-def kept(some, cameras, s):
-    return sum(int(dial(some, camera, s).keep.sum()) for camera in cameras)
+def kept(model, cameras, s):
+    return sum(int(dial(model, camera, s).keep.sum()) for camera in cameras)
 
 
 @settings(deadline=None, max_examples=30)

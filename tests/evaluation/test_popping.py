@@ -78,12 +78,12 @@ def test_dial_sweep_measures_its_renders():
 
 
 def test_camera_motion_alone_is_no_change():
-    some = dialled()
+    model = dialled()
     cameras = ring(12, 32, 24)[:3]
-    still = path_popping(some.replace(sigma_d=torch.full((200,), 1e9)), cameras, 3.0, steps=6)
+    still = path_popping(model.replace(sigma_d=torch.full((200,), 1e9)), cameras, 3.0, steps=6)
     assert still.largest == 0 and still.pixel == 0
-    moved = path_popping(some, cameras, 3.0, steps=6)
-    images = torch.stack([render(some, camera, 3.0).image for camera in path(cameras, 6)])
+    moved = path_popping(model, cameras, 3.0, steps=6)
+    images = torch.stack([render(model, camera, 3.0).image for camera in path(cameras, 6)])
     motion = 255 * (images[1:] - images[:-1]).square().mean((1, 2, 3)).sqrt()
     changes = torch.tensor(moved.changes)
     assert (changes > 0).all() and (changes < 0.7 * motion).all()
@@ -112,7 +112,7 @@ def adversary(form):
     means = torch.cat(
         [torch.zeros(4, 3), torch.stack([forward, 2 * forward, 60 * forward + 40 * right])]
     )
-    some = gaussians(7, 0, 0).replace(
+    model = gaussians(7, 0, 0).replace(
         means=means,
         log_scales=torch.full((7, 3), math.log(0.4)),
         opacity_logits=torch.full((7,), 3.0),
@@ -122,18 +122,18 @@ def adversary(form):
     ends = torch.tensor([2.2] * 4 + [3.0, 4.0, 5.0])
     sigma = ends * normalized_distances(means, camera, config)
     if form == "paper":
-        sigma = sigma / (2 * (some.opacities / (TAU * ends)).log()).sqrt()
+        sigma = sigma / (2 * (model.opacities / (TAU * ends)).log()).sqrt()
     turn = torch.eye(4)
     turn[[0, 0, 2, 2], [0, 2, 0, 2]] = torch.tensor([0.8, -0.6, 0.6, 0.8])
-    some = with_dial(some, sigma, config).replace(growth_d=torch.ones(7))
-    return some, [camera, dataclasses.replace(camera, viewmat=turn @ camera.viewmat)]
+    model = with_dial(model, sigma, config).replace(growth_d=torch.ones(7))
+    return model, [camera, dataclasses.replace(camera, viewmat=turn @ camera.viewmat)]
 
 
 def test_a_dial_pops_nowhere_and_the_papers_form_does():
     pixels = {}
     for form, steps in product(FORMS, (120, 240)):
-        some, cameras = adversary(form)
-        pixels[form, steps] = dial_popping(some, cameras[0], 5.0, steps=steps).pixel
+        model, cameras = adversary(form)
+        pixels[form, steps] = dial_popping(model, cameras[0], 5.0, steps=steps).pixel
         assert form == "paper" or pixels[form, steps] <= most(7, math.log(5) / steps)
     assert pixels["ours", 240] < 0.6 * pixels["ours", 120]
     assert pixels["paper", 240] > 0.9 * pixels["paper", 120] > 5
@@ -144,8 +144,8 @@ def test_a_camera_that_turns_changes_nothing():
     opacities, at once.
     """
     for form in FORMS:
-        some, cameras = adversary(form)
-        pixels = [path_popping(some, cameras, 2.0, steps=steps).pixel for steps in (10, 20)]
+        model, cameras = adversary(form)
+        pixels = [path_popping(model, cameras, 2.0, steps=steps).pixel for steps in (10, 20)]
         assert max(pixels) < 0.05 if form == "ours" else pixels[1] > 0.9 * pixels[0] > 20
 
 
@@ -171,22 +171,19 @@ def lines_of_sight(seed):
                 [x, y, depth, opacity, depth * reach, random.integers(2), random.uniform(-1, 1)]
             )
     rows[:2] = [[-44, -32, 2, 0.93, 6.6, 0, 0], [-44, -32, 3, 0.9997, SIGMA_MAX, 1, 0]]
-    xy, columns = torch.tensor(np.array(rows), dtype=torch.float32).split((2, 5), dim=1)
-    row_columns = columns.unbind(1)
-    depths, opacities, reaches = row_columns[:3]
-    white, growth_d = row_columns[3:]
-    means = torch.cat([xy / 100, torch.ones(len(rows), 1)], 1) * depths[:, None]
-    some = gaussians(len(rows), 0, 0).replace(
+    table = torch.tensor(np.array(rows), dtype=torch.float32)
+    depths, opacities, reaches = table[:, 2:5].unbind(1)
+    white, growth_d = table[:, 5:].unbind(1)
+    means = torch.cat([table[:, :2] / 100, torch.ones(len(rows), 1)], 1) * depths[:, None]
+    model = gaussians(len(rows), 0, 0).replace(
         means=means,
         log_scales=(0.005 * depths).log()[:, None].repeat(1, 3),
         opacity_logits=opacities.logit(),
         sh0=((white - 0.5) / SH_C0)[:, None, None].repeat(1, 1, 3),
     )
     K = torch.tensor([[100.0, 0, 48.5], [0, 100, 36.5], [0, 0, 1]])
-    some = with_dial(some, reaches, AttenuationConfig(reference_distance=2.0)).replace(
-        growth_d=growth_d
-    )
-    return some, Camera(torch.eye(4), K, 96, 72)
+    attenuation = AttenuationConfig(reference_distance=2.0)
+    return with_dial(model, reaches, attenuation, growth_d), Camera(torch.eye(4), K, 96, 72)
 
 
 @pytest.mark.parametrize("seed", [0, 1])
@@ -194,15 +191,15 @@ def test_no_pixel_jumps_where_it_ends(seed):
     """As the dial turns, and as a camera moves back that the distances are from, in 250 steps that
     double d s.
     """
-    some, view = lines_of_sight(seed)
-    assert dial_popping(some, view, 2.0, steps=250).pixel <= most(4, math.log(2) / 250)
+    model, view = lines_of_sight(seed)
+    assert dial_popping(model, view, 2.0, steps=250).pixel <= most(4, math.log(2) / 250)
     places = [2 ** (k / 250) for k in range(251)]
 
     def picture(_, j):
         back = torch.eye(4)
         back[2, 3] = 2 * (places[j] - 1)
         return for_device(torch.device("cpu")).draw(
-            some, view, seen_from=dataclasses.replace(view, viewmat=back)
+            model, view, seen_from=dataclasses.replace(view, viewmat=back)
         )[0]
 
     with torch.no_grad():

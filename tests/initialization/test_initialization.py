@@ -29,14 +29,14 @@ from scenes import gaussians, photograph, ring, seeded
 REVERSED = torch.diag(torch.tensor([-1.0, 1, -1, 1]))  # looks the other way
 
 
-def changes(some, view):
+def changes(model, view):
     """``[N, pixels]`` of removing each Gaussian alone; an image is linear in each opacity where
     nothing is clamped.
     """
-    whole, _ = splat(some, some.opacities, view.camera)
-    without = some.opacities.repeat(len(some), 1).fill_diagonal_(0)
+    whole, _ = splat(model, model.opacities, view.camera)
+    without = model.opacities.repeat(len(model), 1).fill_diagonal_(0)
     return torch.stack(
-        [(splat(some, each, view.camera)[0] - whole).flatten() for each in without]
+        [(splat(model, each, view.camera)[0] - whole).flatten() for each in without]
     ).double()
 
 
@@ -44,13 +44,13 @@ def test_removal_error_is_unbiased(draws=100):
     """To 5 standard deviations: with random signs z, ``(sum z v)^2`` has mean |v|^2, variance 2
     (|v|^4 - sum v^4).
     """
-    some = gaussians(15, 1, 0, size=0.4)
-    some = some.replace(opacity_logits=(0.02 + 0.3 * some.opacities).logit())
-    views = photograph(some, ring(3, 16, 12))
-    v = [changes(some, view) for view in views]
+    model = gaussians(15, 1, 0, size=0.4)
+    model = model.replace(opacity_logits=(0.02 + 0.3 * model.opacities).logit())
+    views = photograph(model, ring(3, 16, 12))
+    v = [changes(model, view) for view in views]
     exact = sum(x.square().sum(1) for x in v) / 3
     variance = sum(2 * (x.square().sum(1).square() - x.pow(4).sum(1)) for x in v) / 9
-    found = torch.stack([removal_error(some, views, seed=k) for k in range(draws)]).double()
+    found = torch.stack([removal_error(model, views, seed=k) for k in range(draws)]).double()
     error = (found.mean(0) - exact).abs()
     spread = (variance / draws).sqrt()
     assert (exact > 0).sum() > 10
@@ -62,18 +62,18 @@ def test_removal_error_is_unbiased(draws=100):
 
 
 def test_removal_error_depends_on_the_seed_alone():
-    some = gaussians(100, 1, 0)
+    model = gaussians(100, 1, 0)
     # outside of every view
-    some = some.replace(means=torch.cat([some.means[:75], some.means[75:] + 1e3]))
-    (view,) = photograph(some, ring(1, 20, 16))
-    both = removal_error(some, [view, view], seed=3)
-    assert torch.equal(both, removal_error(some, [view, view], seed=3))
-    assert not torch.equal(both, removal_error(some, [view, view], seed=4))
+    model = model.replace(means=torch.cat([model.means[:75], model.means[75:] + 1e3]))
+    (view,) = photograph(model, ring(1, 20, 16))
+    both = removal_error(model, [view, view], seed=3)
+    assert torch.equal(both, removal_error(model, [view, view], seed=3))
+    assert not torch.equal(both, removal_error(model, [view, view], seed=4))
     assert (both[75:] == 0).all() and (both[:75] > 0).any()
     blind = View(
         dataclasses.replace(view.camera, viewmat=REVERSED @ view.camera.viewmat), view.image
     )
-    assert usable_views(some.select(torch.arange(75)), [view, blind, view]) == (view, view)
+    assert usable_views(model.select(torch.arange(75)), [view, blind, view]) == (view, view)
     with rejects("in front of any of the 1 training cameras"):
         usable_views(gaussians(20, 0, 0), [blind])
 
@@ -84,9 +84,9 @@ def dialled(n, **settings):
     return initialize(gaussians(n, 0, 0), views, AdaptConfig(**settings)), views
 
 
-def distances_of(some, views):
+def distances_of(model, views):
 
-    return typical_distance(some.means, [view.camera for view in views], some.attenuation)
+    return typical_distance(model.means, [view.camera for view in views], model.attenuation)
 
 
 @pytest.mark.parametrize("share, exponent", [(0.51, 1.5), (0.8, 2.5), (1.0, 1.5)])
@@ -94,32 +94,32 @@ def test_kept_shares_follow_the_target_curve(share, exponent, n=1000):
     """At the distances of the initialization, ``1 / (s^p + (1/share - 1) s^-p)``, to one
     Gaussian.
     """
-    some, views = dialled(n, start_share=share, exponent=exponent)
+    model, views = dialled(n, start_share=share, exponent=exponent)
     for s in (1.0, 1.2, 1.7, 2.0, 3.0, 5.0, 7.0, 15.0):
-        kept = dial(some, distances_of(some, views), s).keep
+        kept = dial(model, distances_of(model, views), s).keep
         want = 1 / (s**exponent + (1 / share - 1) * s**-exponent)
         assert abs(kept.sum().item() - n * want) <= 1, f"s {s}"
 
 
 def test_initialization_culls_in_the_pruning_order():
     """In which one that a neighbour replaces goes earlier than by its removal error alone."""
-    some, views = dialled(200)
+    model, views = dialled(200)
 
-    error = removal_error(some, views, seed=0)
-    found = (some.sigma_d / distances_of(some, views)).argsort()
-    order = pruning.pruning_order(some, error.sqrt() * some.opacities).position
+    error = removal_error(model, views, seed=0)
+    found = (model.sigma_d / distances_of(model, views)).argsort()
+    order = pruning.pruning_order(model, error.sqrt() * model.opacities).position
     assert torch.equal(found[100:180], order.argsort()[100:180])
     assert not torch.equal(order.argsort()[100:180], error.argsort(stable=True)[100:180])
 
 
-def plainly(some, worth):
+def plainly(model, worth):
     """The order computed round by round and pair by pair."""
     worths = worth.double().tolist()
-    left = list(range(len(some)))
+    left = list(range(len(model)))
     order = []
-    centres = some.means.double()
-    colours = 0.5 + SH_C0 * some.sh0[:, 0].double()
-    sizes = some.log_scales.double().exp().amax(1)
+    centres = model.means.double()
+    colours = 0.5 + SH_C0 * model.sh0[:, 0].double()
+    sizes = model.log_scales.double().exp().amax(1)
 
     def unlike(i, j):
         apart = (centres[i] - centres[j]).square().sum()

@@ -75,15 +75,15 @@ def test_rasterizers_agree(adapted):
 
 
 def test_merging_keeps_mass_and_centre():
-    some = gaussians(400, 1, 3)
-    few = merge(some, torch.ones(400), 100)
+    model = gaussians(400, 1, 3)
+    few = merge(model, torch.ones(400), 100)
     assert len(few) == 100 and few.sh_degree == 1
     assert all(x.isfinite().all() for x in few.tensors().values())
-    assert torch.allclose(few.means.mean(0), some.means.mean(0), atol=0.3)
-    assert_equal(merge(some, torch.ones(400), 400), merge(some, torch.ones(400), 500))
-    twins = some.select(torch.arange(50).repeat(2))
+    assert torch.allclose(few.means.mean(0), model.means.mean(0), atol=0.3)
+    assert_equal(merge(model, torch.ones(400), 400), merge(model, torch.ones(400), 500))
+    twins = model.select(torch.arange(50).repeat(2))
     one = merge(twins, torch.ones(100), 50)
-    places = [{*map(tuple, g.means.round(decimals=4).tolist())} for g in (one, some[:50])]
+    places = [{*map(tuple, g.means.round(decimals=4).tolist())} for g in (one, model[:50])]
     assert places[0] == places[1]
 
 

@@ -74,7 +74,7 @@ CONFIG = AdaptConfig(max_sv=6.0)
 N = 2000
 
 
-def some():
+def reaches_and_distances():
     """log sigma_d and normalised distances."""
     log_sigma, d = torch.randn(2, N, generator=seeded(0))
     return 1 + 0.8 * log_sigma, (0.3 * d).exp()
@@ -87,7 +87,7 @@ def gradient(log_sigma, d, s, **changes):
 
 def test_count_gradient_penalises_excess_and_deficit():
     """The gradient is that of the squared excess; it is 0 for a single remaining Gaussian."""
-    log_sigma, d = some()
+    log_sigma, d = reaches_and_distances()
     for s in (1.5, 6.0):
         share = target_curve(s, CONFIG.share, CONFIG.exponent)
         excess = float((d * s < log_sigma.exp()).float().mean()) / share - 1
@@ -108,7 +108,7 @@ def test_count_gradient_penalises_excess_and_deficit():
 
 
 def test_count_slope_is_that_of_a_soft_count():
-    log_sigma, d = (x.double() for x in some())
+    log_sigma, d = (x.double() for x in reaches_and_distances())
     soft = 1 / (1 + (2 * d / log_sigma.requires_grad_().exp()) ** SHARPNESS)
     (want,) = torch.autograd.grad(soft.mean(), log_sigma)
     assert (want > 0.1 * want.max()).sum() > 100
@@ -118,7 +118,7 @@ def test_count_slope_is_that_of_a_soft_count():
 
 def test_shares_are_of_all_gaussians():
     """Where far ones alone are counted: as if the others, which are culled, were counted too."""
-    log_sigma, d = some()
+    log_sigma, d = reaches_and_distances()
     log_sigma[40:65] = -9.2
 
     def of_first(count, total=None):
