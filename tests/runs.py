@@ -205,12 +205,12 @@ def pressing(real: Callable[..., Any], *numbers: int, at: int = 1) -> Callable[.
     """``real``, interrupted by these signals at the beginning of its ``at``-th call."""
     calls = count(1)
 
-    def pressed(*given, **rest):
+    def interrupted(*given, **rest):
         for number in numbers if next(calls) == at else ():
             signal.raise_signal(number)
         return real(*given, **rest)
 
-    return pressed
+    return interrupted
 
 
 @contextmanager
