@@ -19,7 +19,7 @@ import pytest
 import torch.distributed as dist
 
 import clod_adapter
-from clod_adapter import AdaptConfig, ClodError, Progress
+from clod_adapter import AdaptConfig, Progress
 from clod_adapter.training.state import TrainingState
 from clod_adapter.training.trainer import Trainer
 from scenes import stripped
@@ -154,11 +154,6 @@ class Launched:
         assert clod_adapter.load(self.folder / "dial.ply").gaussians.sigma_d is not None
         clod_adapter.load_adapter(self.folder / "dial.safetensors")
         return json.loads((self.folder / "dial.json").read_text())
-
-
-def rejects(message: str):
-    """Expects an error of ours with this message, a regular expression."""
-    return pytest.raises(ClodError, match=message)
 
 
 def counted(steps: list[tuple[int, int]]) -> Callable[[Progress], None]:

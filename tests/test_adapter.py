@@ -11,6 +11,7 @@ import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from refusals import refused
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
@@ -19,7 +20,6 @@ from clod_adapter import adapter as adapters
 from clod_adapter.adapter import ATTRIBUTES, DIAL, SIGMA_MAX, Adapter, detach, with_dial
 from clod_adapter.io.adapter_file import load_adapter, save_adapter
 from clod_adapter.io.tensor_file import read_tensors, write_tensors
-from runs import rejects
 from scenes import seeded
 
 CONFIG = AttenuationConfig(reference_distance=3.5)
@@ -138,7 +138,7 @@ def test_other_input_is_refused():
         "sh0 holds a new": lambda: extract(base, with_dial(infinite)),
         "'colour'": lambda: replace(adapter, updates={"colour": torch.ones(6)}),
     }.items():
-        with rejects(message):
+        with refused(message):
             call()
 
 
@@ -245,7 +245,7 @@ def test_invalid_files_are_refused(tmp_path):
 
     def rejected(message, tensors, text):
         save_file(tensors, path, text and {"clod_adapter": text})
-        with rejects(message):
+        with refused(message):
             load_adapter(path)
 
     for change, message in CHANGES:
@@ -262,7 +262,7 @@ def test_invalid_files_are_refused(tmp_path):
 
 def test_config_must_be_json_and_version_is_kept(tmp_path):
     for value in ({1, 2}, torch.ones(1), float("nan"), object()):
-        with rejects("not plain JSON"):
+        with refused("not plain JSON"):
             save_adapter(tmp_path / "a", adapter(config={"x": value}))
     assert list(tmp_path.iterdir()) == []
     save_adapter(tmp_path / "a", replace(adapter(), version="7.8.9"))

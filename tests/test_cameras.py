@@ -4,9 +4,9 @@ import math
 
 import pytest
 import torch
+from refusals import refused
 
 from clod_adapter import Camera
-from runs import rejects
 
 VIEWMAT = torch.eye(4)
 K = torch.tensor([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]])
@@ -42,5 +42,5 @@ def changed(matrix, row, column, value):
     ],
 )
 def test_what_is_no_pinhole_is_refused(given, message):
-    with rejects(message):
+    with refused(message):
         Camera(**{"viewmat": VIEWMAT, "K": K, "width": 64, "height": 48} | given)

@@ -10,13 +10,13 @@ import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from refusals import refused
 
 from clod_adapter import extract, load, load_adapter, save, save_adapter, with_dial
 from clod_adapter.calibration import Calibration, CalibrationRow, Viewpoint
 from clod_adapter.config import AdaptConfig, AttenuationConfig, ScreenFilter, field_descriptions
 from clod_adapter.equation.distances import viewpoint_of
 from clod_adapter.evaluation.evaluate import Row
-from runs import rejects
 from scenes import gaussians, ring
 
 BOTH = {"form": ["theirs"], "max_sv": [0.99, math.inf, math.nan]}
@@ -46,7 +46,7 @@ TABLES = {
 def test_impossible_values_are_named(kind):
     for name, values in TABLES[kind].items():
         for value in values:
-            with rejects(re.escape(f"{name} is {value}, it must be ")):
+            with refused(re.escape(f"{name} is {value}, it must be ")):
                 kind(**{name: value})
 
 
@@ -54,7 +54,7 @@ def test_impossible_values_are_named(kind):
 def test_values_of_other_types_are_named(kind):
     for name, default in vars(kind()).items():
         for value in ([1], 10**400, {}, b"5", *(["5"] if not isinstance(default, str) else [])):
-            with rejects(re.escape(f"{name} is {value}, it must be ")):
+            with refused(re.escape(f"{name} is {value}, it must be ")):
                 kind(**{name: value})
 
 
@@ -157,7 +157,7 @@ PLACE = Viewpoint(1.5, 2.5, 3.5, 4.5, look_z=1.0, up_y=-1.0, fov=0.8)
     ],
 )
 def test_bad_values_are_refused(good, bad, said):
-    with rejects(said):
+    with refused(said):
         replace(good, **bad)
 
 

@@ -8,11 +8,11 @@ import re
 import numpy as np
 import pytest
 import torch
+from refusals import refused
 
 from clod_adapter import AttenuationConfig, render
 from clod_adapter.cameras import NEAR, Camera, Scene, View, camera_extent, in_its_unit
 from clod_adapter.config import CLASSIC
-from runs import rejects
 from scenes import camera, gaussians, photograph, ring
 
 
@@ -20,7 +20,7 @@ def test_bad_images_are_named():
     view = dataclasses.replace(camera(), name="x.png")
     right = torch.zeros(45, 61, 3)
     for image in (right, right.byte().transpose(0, 1), right[..., 0].byte()):
-        with rejects(r"view 'x\.png': image must be uint8 of shape \(45, 61, 3\)"):
+        with refused(r"view 'x\.png': image must be uint8 of shape \(45, 61, 3\)"):
             View(view, image)
 
 
@@ -111,10 +111,10 @@ def test_wrong_shapes_are_named():
         ("sigma_d", (4,)),
         ("growth_d", (5, 1)),
     ):
-        with rejects(rf"Gaussians.{name} has shape {re.escape(str(shape))}, expected"):
+        with refused(rf"Gaussians.{name} has shape {re.escape(str(shape))}, expected"):
             adapted().replace(**{name: torch.zeros(shape)})
     for changes in ({"sigma_d": torch.ones(5)}, {"attenuation": CONFIG}):
-        with rejects("both sigma_d and attenuation"):
+        with refused("both sigma_d and attenuation"):
             plain(**changes)
 
 
@@ -154,7 +154,7 @@ def test_rows_by_brackets():
     "rows", [2, torch.ones(4, dtype=torch.bool), [5], torch.zeros(2, 2, dtype=torch.long)]
 )
 def test_other_rows_are_refused(rows):
-    with rejects("give a slice, indices .M. or a mask .5.|there are 5 Gaussians, and index 5"):
+    with refused("give a slice, indices .M. or a mask .5.|there are 5 Gaussians, and index 5"):
         adapted()[rows]
 
 

@@ -9,11 +9,11 @@ from itertools import pairwise, product
 import numpy as np
 import pytest
 import torch
+from refusals import refused
 
 import clod_adapter
 from clod_adapter import AttenuationConfig, Hook
 from clod_adapter.frame_rate import next_dial
-from runs import rejects
 from scenes import camera, gaussians, seeded
 
 N = 200
@@ -75,14 +75,14 @@ def test_gradients_reach_opacities_sigma_d_and_growth_d_only():
 def test_bad_arguments_are_refused(tmp_path):
     model = adapted(form="paper")
     view = camera()
-    with rejects("the paper's form needs K, width and height"):
+    with refused("the paper's form needs K, width and height"):
         hook_of(model)(model.means, model.opacities, view.viewmat)
-    with rejects(r"for 200 Gaussians, but means is \(199, 3\)"):
+    with refused(r"for 200 Gaussians, but means is \(199, 3\)"):
         hook_of(model)(model.means[1:], model.opacities, view.viewmat, view.K, 64, 48)
-    with rejects("virtual_scale is -0.5"):
+    with refused("virtual_scale is -0.5"):
         hook_of(model, -0.5)
     clod_adapter.save(tmp_path / "plain.ply", gaussians(5, 0, 0))
-    with rejects("plain.ply: it has no sigma_d, so there is no dial"):
+    with refused("plain.ply: it has no sigma_d, so there is no dial"):
         clod_adapter.load(tmp_path / "plain.ply").hook(virtual_scale=3)
 
 

@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 import torch
+from refusals import refused
 from torch.testing import assert_close
 
 import gsplat_versions
@@ -24,7 +25,6 @@ from clod_adapter.equation.attenuation import attenuate, dial
 from clod_adapter.equation.distances import normalized_distances, viewpoint_of
 from clod_adapter.rasterizers import Rasterizer, reference
 from clod_adapter.render import splat
-from runs import rejects
 from scenes import camera, dialled, gaussians, ring, scene, seeded
 
 CONFIG = AttenuationConfig(scene_distance=3.0)
@@ -169,7 +169,7 @@ def test_bad_arguments_are_refused():
         "no camera is given": lambda: order_by_extinction(model, []),
         "no pruning order": lambda: order_by_extinction(plain, [camera()]),
     }.items():
-        with rejects(message):
+        with refused(message):
             call()
 
 
@@ -249,7 +249,7 @@ GROWTH = "growth_d needs sigma_d and attenuation"
     ],
 )
 def test_drop_ins_refuse(draws, name, given, message):
-    with rejects(message):
+    with refused(message):
         draws[name](**given)
 
 
@@ -269,7 +269,7 @@ def test_drop_ins_refuse(draws, name, given, message):
     ],
 )
 def test_calls_are_refused(call, message):
-    with rejects(message):
+    with refused(message):
         call()
 
 
@@ -283,6 +283,6 @@ def test_calls_are_refused(call, message):
     ],
 )
 def test_files_that_save_does_not_write(name, message, tmp_path):
-    with rejects(f"{name}: {message}"):
+    with refused(f"{name}: {message}"):
         save(tmp_path / name, MODEL)
     assert not list(tmp_path.iterdir())

@@ -12,6 +12,7 @@ import pytest
 import torch
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
+from refusals import refused
 
 from clod_adapter import AttenuationConfig, Stopped, View, dial_for, evaluate, render
 from clod_adapter.adapter import with_dial
@@ -21,7 +22,7 @@ from clod_adapter.equation.attenuation import dial
 from clod_adapter.evaluation import frame_times
 from clod_adapter.evaluation.frame_times import PASSES, VIEWS, time_frames
 from clod_adapter.losses import psnr_ssim
-from runs import counted, rejects
+from runs import counted
 from scenes import camera, gaussians, in_front, photograph, ring, seeded
 
 
@@ -70,7 +71,7 @@ def test_bad_calls_are_named():
         (views, [1.0, -0.5], "virtual_scale is -0.5"),
         (views, [1.0, math.nan], "virtual_scale is nan"),
     ):
-        with rejects(message):
+        with refused(message):
             evaluate(row_of_four(), held_out, dials)
 
 
@@ -227,7 +228,7 @@ def test_a_frame_rate_is_reached_for_good():
         solved = dial_for(adapted(3, 0), fps=fps, calibration=calibration)
         assert solved.virtual_scale == pytest.approx(wanted, rel=1e-12)
         assert solved.note == ("s = 1 draws 50 frames a second already" if fps == 30 else "")
-        with rejects("at s = [48], .* takes 5.0 ms, 200 a second"):
+        with refused("at s = [48], .* takes 5.0 ms, 200 a second"):
             dial_for(adapted(3, 0), fps=201, calibration=calibration)
 
 
@@ -252,7 +253,7 @@ def test_bad_arguments_are_refused():
         ({"keep": 1, "cameras": ()}, "no camera"),
         ({"fps": 1, "cameras": ()}, "a calibration or cam"),
     ):
-        with rejects(message):
+        with refused(message):
             dial_for(model, **{"cameras": cameras} | arguments)
-    with rejects("no sigma_d"):
+    with refused("no sigma_d"):
         dial_for(gaussians(3, 0, 0), keep=1, cameras=cameras)

@@ -6,6 +6,7 @@ import dataclasses
 
 import pytest
 import torch
+from refusals import refused
 
 from clod_adapter import AdaptConfig, AttenuationConfig, View
 from clod_adapter.adapter import with_dial
@@ -23,7 +24,7 @@ from clod_adapter.initialization.pruning_order import (
     SHARE,
 )
 from clod_adapter.render import splat
-from runs import counted, rejects
+from runs import counted
 from scenes import gaussians, photograph, ring, seeded
 
 REVERSED = torch.diag(torch.tensor([-1.0, 1, -1, 1]))  # looks the other way
@@ -74,7 +75,7 @@ def test_removal_error_depends_on_the_seed_alone():
         dataclasses.replace(view.camera, viewmat=REVERSED @ view.camera.viewmat), view.image
     )
     assert usable_views(model.select(torch.arange(75)), [view, blind, view]) == (view, view)
-    with rejects("in front of any of the 1 training cameras"):
+    with refused("in front of any of the 1 training cameras"):
         usable_views(gaussians(20, 0, 0), [blind])
 
 
@@ -194,5 +195,5 @@ def test_exponents_are_in_range_and_0_without_descendants():
 def test_a_dial_of_another_form_is_refused():
     """Its numbers mean something else."""
     adapted, views = dialled(20, iters=1)
-    with rejects("has the form ours; adapt with the same"):
+    with refused("has the form ours; adapt with the same"):
         initialize(adapted, views, AdaptConfig.paper())

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from plyfile import PlyElement
+from refusals import refused
 
 from clod_adapter import AttenuationConfig, load, save, with_dial
 from clod_adapter.cli.inspect import lines_of
@@ -19,7 +20,6 @@ from clod_adapter.io.ply_layout import inria_dtype
 from clod_adapter.origin import NOWHERE
 from clod_adapter.training.state import TrainingState, save_state
 from formats import CALIBRATION, PACKED, inria_rows, with_columns, write_elements, write_rows
-from runs import rejects
 from scenes import gaussians
 
 ATTENUATION = AttenuationConfig(max_sv=6.0, reference_distance=3.5)
@@ -119,7 +119,7 @@ def test_anomalies_are_counted(seen_rows, tmp_path):
     _, splat = seen_rows(vertex)
     assert splat.doubles == 599 and splat.far == splat.giant == 0
     vertex["x"] = np.nan
-    with rejects("c.ply: no usable Gaussian in it, of 600 rows"):
+    with refused("c.ply: no usable Gaussian in it, of 600 rows"):
         inspect(write_rows(tmp_path / "c.ply", vertex))
 
 

@@ -12,10 +12,10 @@ from itertools import product
 import numpy as np
 import pytest
 from PIL import Image
+from refusals import refused
 
 from clod_adapter.report.charts import Series, draw_rows, new_figure, series_of
 from clod_adapter.report.page import Picture, write_page
-from runs import rejects
 
 pytest.importorskip("matplotlib")
 NASTY = r'a <b> & "c" $\co$ </script>'
@@ -92,7 +92,7 @@ def test_page_is_self_contained_and_escaped(tmp_path, monkeypatch):
     told = text.partition("Settings and machine")[0]
     assert re.findall(r"\S+ photograph", told) == ["without photograph"]
     monkeypatch.setitem(sys.modules, "matplotlib", None)
-    with rejects("pip install matplotlib"):
+    with refused("pip install matplotlib"):
         write_page(tmp_path / "other.html", report(), [], {})
     assert not (tmp_path / "other.html").exists()
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from refusals import refused
 from torch.testing import assert_close
 
 import clod_adapter as clod
@@ -12,7 +13,6 @@ from clod_adapter.losses import photometric_loss
 from clod_adapter.training.dial import SIGMA_RANGE, attach
 from clod_adapter.training.schedule import OURS, Sample
 from clod_adapter.training.trainer import Trainer
-from runs import rejects
 
 Pair = tuple[Gaussians, Scene]
 MAX_SV = 5.0
@@ -112,5 +112,5 @@ def test_what_does_not_fit_is_refused(captured):
             "no splat requires a gradient: attach copies",
         ),
     ):
-        with rejects(message):
+        with refused(message):
             call()

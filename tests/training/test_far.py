@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from plyfile import PlyData
+from refusals import refused
 
 import clod_adapter as clod
 from clod_adapter import adapt, detach, make_plan, render
@@ -21,7 +22,7 @@ from clod_adapter.io.file_formats import write
 from clod_adapter.io.settings import Metadata
 from clod_adapter.rasterizers import cpu, reference
 from clod_adapter.rasterizers.protocol import Rasterizer
-from runs import config_of, rejects
+from runs import config_of
 from scenes import assert_equal, capture, gaussians, ring
 
 PLAIN = Rasterizer(reference.rasterize)
@@ -125,7 +126,7 @@ def test_counts_and_baking(adapted, both):
     camera = cameras[0]
     baked = render(bake(adapted, 1.7, camera), camera).image
     assert torch.allclose(baked, render(adapted, camera, 1.7).image, atol=1e-3)
-    with rejects("have no order"):
+    with refused("have no order"):
         order_by_extinction(adapted, cameras)
 
 

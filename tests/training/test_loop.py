@@ -9,6 +9,7 @@ from types import ModuleType
 import pytest
 import torch
 import torch.distributed as dist
+from refusals import refused
 from torch.testing import assert_close
 from torch.torch_version import TorchVersion
 
@@ -21,7 +22,7 @@ from clod_adapter.initialization.importance import scene_distance
 from clod_adapter.training.distributed import joined
 from clod_adapter.training.far import with_far
 from clod_adapter.training.loop import adapt
-from runs import change_step, config_of, rejects, states_of
+from runs import change_step, config_of, states_of
 from scenes import assert_equal, capture, gaussians, photograph, ring
 
 Pair = tuple[Gaussians, Scene]
@@ -88,7 +89,7 @@ def test_a_second_run_continues_from_sigma_d(captured, trained):
         assert (result.growth_d - trained.growth_d).abs().max() <= 1.01e-2
         assert trained.growth_d.unique().numel() > 50
     other = with_dial(captured[0], torch.full((len(captured[0]),), 1.5), AttenuationConfig())
-    with rejects("dial has no far Gaussians"):
+    with refused("dial has no far Gaussians"):
         adapt(other, scene, config)
 
 
@@ -149,20 +150,20 @@ def test_degenerate_scenes(captured):
 def test_bad_inputs_are_refused(captured):
     base, scene = captured
     for run in (adapt, make_plan):
-        with rejects("no training views"):
+        with refused("no training views"):
             run(base, Scene((), scene.test))
-        with rejects("no Gaussians"):
+        with refused("no Gaussians"):
             run(gaussians(0, 1, 0), scene)
         for name, value in (("sh0", math.inf), ("opacity_logits", math.nan)):
             values = getattr(base, name).clone()
             values[5:7] = value
-            with rejects(rf"{name} is not finite in 2 rows \(the first is 5\); leave out"):
+            with refused(rf"{name} is not finite in 2 rows \(the first is 5\); leave out"):
                 run(base.replace(**{name: values}), scene, config_of(iters=1))
     huge = torch.full_like(base.sh0, 1e38)
     huge[7] = 2e38
     # looked at before training, or by its first step
     for config in (config_of(iters=1), AdaptConfig.paper(iters=1)):
-        with rejects("not finite.* the largest sh0 is 2e.38, in row 7: leave out such rows"):
+        with refused("not finite.* the largest sh0 is 2e.38, in row 7: leave out such rows"):
             adapt(base.replace(sh0=huge), Scene(scene.train[:1], ()), config)
 
 
@@ -237,11 +238,11 @@ def test_a_group_of_one_changes_no_bit():
         assert_equal(found.gaussians, want.gaussians)
         assert found.waiting > 0 and want.waiting == want.exchanging == 0 and found.lost is None
         peers.size = 3
-        with rejects("batch is 2, it must be at least 3, a view for each of the processes"):
+        with refused("batch is 2, it must be at least 3, a view for each of the processes"):
             adapt(base, scene, config, group=peers)
 
 
 def test_several_processes_need_a_torch_that_does_not_hang(monkeypatch):
     monkeypatch.setattr(torch, "__version__", TorchVersion("2.6.0+cu124"))
-    with joined(dist.HashStore(), 0, 1), rejects(r"need torch 2.9 or newer, and this is 2.6.0\+"):
+    with joined(dist.HashStore(), 0, 1), refused(r"need torch 2.9 or newer, and this is 2.6.0\+"):
         joined(dist.HashStore(), 0, 2).__enter__()

@@ -7,13 +7,14 @@ from statistics import fmean
 
 import pytest
 import torch
+from refusals import refused
 
 from clod_adapter import AdaptConfig, Decision, Gaussians, Override, Scene, make_plan, render
 from clod_adapter.adapter import detach
 from clod_adapter.initialization.importance import removal_error
 from clod_adapter.training.far import supposed_error
 from clod_adapter.training.plan import NAMES, NOT_NEEDED
-from runs import rejects, states_of
+from runs import states_of
 from scenes import assert_equal, gaussians, photograph, ring
 
 Pair = tuple[Gaussians, Scene]
@@ -74,9 +75,9 @@ def test_the_far_end_is_told(visible):
 
 
 def test_impossible_overrides_are_refused():
-    with rejects(r"'colour' is not part of a plan; the names are bands, means"):
+    with refused(r"'colour' is not part of a plan; the names are bands, means"):
         Override(keep=frozenset({"colour"}))
-    with rejects("'quats' is both kept and left out"):
+    with refused("'quats' is both kept and left out"):
         Override(frozenset({"quats", "bands"}), frozenset({"quats"}))
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from plyfile import PlyData
+from refusals import refused
 
 import scenes
 from clod_adapter import load
@@ -18,7 +19,6 @@ from clod_adapter.io.file_formats import write
 from clod_adapter.render import render
 from clod_adapter.viewer.page import Payload
 from formats import write_rows
-from runs import rejects
 from scenes import dialled
 from shown import TALL, assert_alike, assert_same, drop, message, take
 
@@ -208,7 +208,7 @@ def test_other_forms_of_the_dial_are_refused_with_a_remedy(shown, model, tmp_pat
         drop(shown, name, content)
         said = message(shown, name)
         assert error in said and "opens every format" not in said, name
-    with rejects("the paper's form, which viewers do not draw; adapt it without --form paper"):
+    with refused("the paper's form, which viewers do not draw; adapt it without --form paper"):
         Payload.of(replace(loaded, gaussians=paper))
 
 

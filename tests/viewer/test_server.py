@@ -7,10 +7,10 @@ import time
 from contextlib import contextmanager
 
 import pytest
+from refusals import refused
 
 from clod_adapter.viewer import server as served
 from clod_adapter.viewer.server import Response, Server
-from runs import rejects
 
 BLOCKS = (b"a" * 1000, b"b" * 24)
 RESPONSES = {
@@ -96,7 +96,7 @@ def test_responses(server):
             assert headers["content-security-policy"] == policy
         else:
             assert BLOCKS[0] not in body
-    with rejects(f"^port {server.port} of 127.0.0.1 .*choose another"):
+    with refused(f"^port {server.port} of 127.0.0.1 .*choose another"):
         Server({}, server.port)
 
 

@@ -8,13 +8,14 @@ import signal
 
 import pytest
 import torch
+from refusals import refused
 
 from clod_adapter import AdaptConfig, load
 from clod_adapter.cli.main import build_parser
 from clod_adapter.cli.shared.command import make_config
 from clod_adapter.cli.shared.process import Launch, launched
 from clod_adapter.training.state import load_state
-from runs import STATE, Launched, log_of, rejects
+from runs import STATE, Launched, log_of
 
 TINY = ("--max-sv", 4, "--out", "dial.ply", "--batch", 2, "--iters", 12)
 LONG = (*TINY[:-1], 4000)  # does not end by itself
@@ -181,7 +182,7 @@ def test_rank_and_default_steps_from_the_environment(monkeypatch):
     assert launch_of("1") == Launch()
     assert launch_of("1", MASTER_ADDR="localhost", MASTER_PORT="1") == Launch(1, 4, 0, 1)
     for rank in ("4", "-1", "one"):
-        with rejects("inconsistent .*; start the processes with torchrun"):
+        with refused("inconsistent .*; start the processes with torchrun"):
             launch_of(rank)
     steps = AdaptConfig().steps
     for words, size, want in (

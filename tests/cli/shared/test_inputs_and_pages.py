@@ -19,7 +19,7 @@ from clod_adapter.cli.shared import inputs, pages
 from clod_adapter.cli.shared.console import Console
 from clod_adapter.cli.shared.inputs import pick_device, prepare_kernels
 from formats import PACKED
-from runs import names, rebuilt, rejects
+from runs import names, rebuilt
 
 TINY = "--images SCENE --iters 2 --max-sv 4 --out dial.ply"
 
@@ -54,7 +54,7 @@ def test_devices(monkeypatch, capsys):
     """Without a GPU nothing is printed; a GPU is named, or the reason that it is not used."""
 
     def refused(said):
-        with rejects(rf"--device cuda: {said}.*or use --device cpu"):
+        with refused(rf"--device cuda: {said}.*or use --device cpu"):
             pick_device("cuda", Console())
 
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
