@@ -47,35 +47,34 @@ if TYPE_CHECKING:
 
 # Imported on first use: torch takes a second or two, which the command's --help and most of its
 # errors do without.
-_homes = {
-    name: f"{__name__}.{home}"
-    for home, names in {
-        "adapter": ("Adapter", "detach", "extract", "with_dial"),
-        "evaluation.budget": ("DialValue", "dial_for"),
-        "calibration": ("Calibration",),
-        "cameras": ("Camera", "Scene", "View"),
-        "config": ("AdaptConfig", "AttenuationConfig", "ScreenFilter"),
-        "errors": ("ClodError",),
-        "evaluation.evaluate": ("evaluate",),
-        "bake": ("bake", "bake_levels", "order_by_extinction"),
-        "gaussians": ("Gaussians",),
-        "hook": ("Hold", "Hook"),
-        "integrations.splats": ("from_gsplat", "to_gsplat"),
-        "io.adapter_file": ("load_adapter", "save_adapter"),
-        "io.scene.load": ("load_scene",),
-        "io.checkpoint": ("Checkpoint", "load", "save"),
-        "training.camera_placement": ("place_cameras",),
-        "training.pseudo_views": ("add_pseudo_views", "render_pseudo_views"),
-        "training.plan": ("Decision", "Override", "Plan"),
-        "training.planner": ("make_plan",),
-        "pipeline": ("Result", "adapt_checkpoint"),
-        "progress": ("Phase", "Progress", "Stopped"),
-        "render": ("Rendering", "render"),
-        "training.dial": ("Dial", "attach"),
-        "training.loop": ("Adapted", "adapt"),
-    }.items()
-    for name in names
+_names = {
+    "adapter": "Adapter detach extract with_dial",
+    "bake": "bake bake_levels order_by_extinction",
+    "calibration": "Calibration",
+    "cameras": "Camera Scene View",
+    "config": "AdaptConfig AttenuationConfig ScreenFilter",
+    "errors": "ClodError",
+    "evaluation.budget": "DialValue dial_for",
+    "evaluation.evaluate": "evaluate",
+    "gaussians": "Gaussians",
+    "hook": "Hold Hook",
+    "integrations.splats": "from_gsplat to_gsplat",
+    "io.adapter_file": "load_adapter save_adapter",
+    "io.checkpoint": "Checkpoint load save",
+    "io.scene.load": "load_scene",
+    "pipeline": "Result adapt_checkpoint",
+    "progress": "Phase Progress Stopped",
+    "render": "Rendering render",
+    "training.camera_placement": "place_cameras",
+    "training.dial": "Dial attach",
+    "training.loop": "Adapted adapt",
+    "training.plan": "Decision Override Plan",
+    "training.planner": "make_plan",
+    "training.pseudo_views": "add_pseudo_views render_pseudo_views",
 }
+_homes = dict[str, str]()
+for _home in _names:
+    _homes |= dict.fromkeys(_names[_home].split(), f"{__name__}.{_home}")
 
 
 class _Lazy(ModuleType):

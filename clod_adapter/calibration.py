@@ -7,7 +7,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import astuple, dataclass, replace
-from itertools import pairwise
+from itertools import chain, pairwise
 from typing import Any
 
 from clod_adapter.config import FARTHEST, require
@@ -116,14 +116,11 @@ class Calibration:
         dials = [row.virtual_scale for row in self.rows]
         if dials[:1] != [1] or any(b <= a for a, b in pairwise(dials)):
             raise ClodError(f"calibration has dial values {dials}, they must ascend from 1")
-        if not all(math.isfinite(value) for row in self.rows for value in astuple(row)):
+        if not all(map(math.isfinite, chain.from_iterable(map(astuple, self.rows)))):
             raise ClodError("calibration has a value that is not finite")
-        if (
-            min(self.total, self.views, self.width, self.height) < 1
-            or min(row.frame_ms for row in self.rows) <= 0
-        ):
-            raise ClodError("calibration has a count, size or frame time that is not positive")
         counts = self.total, self.views, self.width, self.height
+        if min(counts) < 1 or min(row.frame_ms for row in self.rows) <= 0:
+            raise ClodError("calibration has a count, size or frame time that is not positive")
         require(
             max(counts) <= LARGEST,
             "a count or size of a calibration",
@@ -157,45 +154,35 @@ class Calibration:
 
         Rows may be in any order, and the machine's name any text; the other fields are passed on.
         """
-        found = [
-            CalibrationRow(*map(float, (r.virtual_scale, r.kept, r.psnr, r.ssim, r.frame_ms)))
-            for r in rows
-        ]
-        ascending = tuple(
-            {
-                row.virtual_scale: row for row in sorted(found, key=lambda r: r.virtual_scale)
-            }.values()
-        )
+        by_dial = {
+            float(r.virtual_scale): CalibrationRow(
+                *map(float, (r.virtual_scale, r.kept, r.psnr, r.ssim, r.frame_ms))
+            )
+            for r in sorted(rows, key=lambda r: r.virtual_scale)
+        }
         name = _plain(machine.encode("ascii", "replace").decode()) or "unknown"
-        return cls(ascending, width=size[0], height=size[1], machine=name, **others)
+        return cls(tuple(by_dial.values()), width=size[0], height=size[1], machine=name, **others)
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Calibration:
         """The inverse of ``as_dict``; ClodError, KeyError, TypeError or ValueError where it is
         none.
         """
-        rows = tuple(
-            CalibrationRow(**{name: float(value) for name, value in row.items()})
-            for row in values["rows"]
-        )
+        rows = tuple(CalibrationRow(**_floats(row)) for row in values["rows"])
         counts = {name: int(values[name]) for name in ("total", "views", "width", "height")}
         # files of earlier versions have no such key
         against = str(values.get("against", AGAINST[0]))
-        viewpoints = tuple(
-            Viewpoint(**{k: float(v) for k, v in row.items()})
-            for row in values.get("viewpoints", ())
-        )
+        viewpoints = tuple(Viewpoint(**_floats(row)) for row in values.get("viewpoints", ()))
         return cls(
             rows, machine=str(values["machine"]), against=against, viewpoints=viewpoints, **counts
         )
 
     def as_dict(self) -> dict[str, Any]:
         """The table as plain JSON values."""
-        lists = {
-            name: [dict(vars(row)) for row in getattr(self, name)]
-            for name in ("rows", "viewpoints")
+        return vars(self) | {
+            "rows": [dict(vars(row)) for row in self.rows],
+            "viewpoints": [dict(vars(viewpoint)) for viewpoint in self.viewpoints],
         }
-        return {**vars(self), **lists}
 
 
 def crossing(dials: Sequence[float], values: Sequence[float], target: float) -> float | None:
@@ -212,7 +199,10 @@ def crossing(dials: Sequence[float], values: Sequence[float], target: float) -> 
     return dials[last] * (dials[last + 1] / dials[last]) ** share
 
 
+def _floats(row: dict[str, Any]) -> dict[str, float]:
+    return {name: float(value) for name, value in row.items()}
+
+
 def _plain(text: str) -> str:
-    return " ".join("".join(letter if letter.isprintable() else " " for letter in text).split())[
-        :MOST
-    ].strip()
+    printable = "".join(letter if letter.isprintable() else " " for letter in text)
+    return " ".join(printable.split())[:MOST].strip()

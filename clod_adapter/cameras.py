@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from itertools import chain
+from itertools import chain, product
 from numbers import Integral
 from operator import mul
 from pathlib import Path
@@ -112,7 +112,9 @@ def _check_matrices(name: str, viewmat: list[list[float]], K: list[list[float]])
     """Refuses what is no pinhole camera."""
     (fx, skew, _), (other_skew, fy, _), last = K
     axes = [row[:3] for row in viewmat[:3]]
-    bent = max(abs(sum(map(mul, axes[i], axes[j])) - (i == j)) for i in range(3) for j in range(3))
+    bent = max(
+        abs(sum(map(mul, axes[i], axes[j])) - (i == j)) for i, j in product(range(3), repeat=2)
+    )
     moves = bent < BENT and viewmat[3] == [0, 0, 0, 1]
     for ok, what in (
         (all(map(math.isfinite, chain(*viewmat, *K))), "a value that is not finite"),
@@ -159,9 +161,9 @@ class View:
         camera = self.camera.halved()
 
         def image() -> Tensor:
-            whole, rows, columns = self.image, 2 * camera.height, 2 * camera.width
-            corners = [whole[y:rows:2, x:columns:2].short() for y in (0, 1) for x in (0, 1)]
-            return (sum(corners[1:], corners[0] + 2) >> 2).to(torch.uint8)
+            pixels = self.image[: 2 * camera.height, : 2 * camera.width]
+            pairs = pixels[::2].short() + pixels[1::2]
+            return ((pairs[:, ::2] + pairs[:, 1::2] + 2) >> 2).to(torch.uint8)
 
         return StoredView(camera, image)
 
@@ -267,13 +269,9 @@ def with_near_planes(cameras: Sequence[Camera]) -> list[Camera]:
 def in_its_unit(scene: Scene) -> Scene:
     """The scene with the near planes of ``with_near_planes``."""
     views = (*scene.train, *scene.test)
-    moved = [
-        view.at(own)
-        for view, own in zip(views, with_near_planes([v.camera for v in views]), strict=True)
-    ]
-    return replace(
-        scene, train=tuple(moved[: len(scene.train)]), test=tuple(moved[len(scene.train) :])
-    )
+    cameras = with_near_planes([view.camera for view in views])
+    moved = tuple(view.at(camera) for view, camera in zip(views, cameras, strict=True))
+    return replace(scene, train=moved[: len(scene.train)], test=moved[len(scene.train) :])
 
 
 def spread(views: Sequence[T], most: int) -> Sequence[T]:

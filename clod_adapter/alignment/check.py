@@ -96,7 +96,7 @@ def check_alignment(gaussians: Gaussians, views: Sequence[View]) -> Alignment:
     table = compare_renders(gaussians, views)
     if not len(table):
         return Alignment(0, in_view, *[math.nan] * 5)
-    error, over_white, constant, *_ = table.mean(0).tolist()
+    error, over_white, constant = table.mean(0).tolist()[:3]
     return Alignment(
         views=len(table),
         in_view=in_view,
@@ -133,7 +133,7 @@ def compare_renders(gaussians: Gaussians, views: Sequence[View]) -> Tensor:
 
 def correlation(table: Tensor) -> float:
     """Of renders and photographs in ``compare_renders``, in [-1, 1]; 0 without any."""
-    _, _, constant, rendered, shared = table.mean(0).tolist()
+    constant, rendered, shared = table.mean(0).tolist()[2:]
     return shared / math.sqrt(constant * rendered) if rendered > 0 else 0.0
 
 

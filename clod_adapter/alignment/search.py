@@ -60,9 +60,8 @@ def guess_frame(
     """
     if len(gaussians) == 0 or found.views == 0:
         return None
-    every = torch.stack(
-        [camera.viewmat.double() for camera in cameras or [view.camera for view in views]]
-    )
+    cameras = cameras or [view.camera for view in views]
+    every = torch.stack([camera.viewmat.double() for camera in cameras])
     score = _small(gaussians, views, *COARSE)
 
     def measured(frame: Frame) -> Guess | None:
@@ -122,17 +121,16 @@ def _search(
     Climbs to the nearest maximum from the best scale about the origin, and from the best ones about
     the points that all and most cameras look at, with the median of the Gaussians moved there.
     """
-    middle, found = gaussians.means.double().median(dim=0).values.cpu(), []  # where cameras are
+    middle = gaussians.means.double().median(dim=0).values.cpu()  # where cameras are
+    centres = torch.linalg.inv(viewmats)[:, :3, 3]
+    climbs = []
     for towards, rounds in ((0.0, 1), (1.0, 1), (1.0, ROUNDS)):
         focus = focus_of(viewmats, rounds)
-        unit = float(
-            (torch.linalg.inv(viewmats)[:, :3, 3] - focus).norm(dim=1).quantile(0.5).clamp(min=1e-9)
-        )
+        unit = float((centres - focus).norm(dim=1).quantile(0.5).clamp(min=1e-9))
         places = [_placed(scale, towards * (focus - scale * middle)) for scale in SCALES]
-        found.append(
-            (*_climb(score, max(places, key=score), focus, unit, (0.1, 0.02)), focus, unit)
-        )
-    best, frame, focus, unit = max(found, key=lambda start: start[0])
+        start = max(places, key=score)
+        climbs.append((_climb(score, start, focus, unit, (0.1, 0.02)), focus, unit))
+    (best, frame), focus, unit = max(climbs, key=lambda climb: climb[0][0])
     if not best >= LOWEST_CORRELATION:
         return None
     for width, most, steps in FINER:

@@ -39,7 +39,9 @@ def with_frame_times(
     """The rows of each model with frame times that can be compared (``time_frames``), and notes on
     them.
     """
-    jobs = [(model, sorted({row.virtual_scale for row in rows})) for model, rows in measured]
+    jobs = []
+    for model, rows in measured:
+        jobs.append((model, sorted({row.virtual_scale for row in rows})))
     times = time_frames(jobs, [view.camera for view in views], progress)
     found = list[list[Row]]()
     for (_, rows), (_, dials), taken in zip(measured, jobs, times.milliseconds, strict=True):

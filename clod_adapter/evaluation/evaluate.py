@@ -6,6 +6,7 @@ import statistics
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -81,19 +82,26 @@ def evaluate(
     render(gaussians, views[0].camera, max(dials))  # compiled and warm before the clock starts
     rows = list[Row]()
     for i, virtual_scale in enumerate(virtual_scales):
-        found = []
-        for measured in _measured(gaussians, views, dials[i]):
-            found.append(measured)
-            done = Progress(
-                Phase.EVALUATION, i * len(views) + len(found), len(virtual_scales) * len(views)
-            )
-            stopped = progress is not None and progress(done) is False
-            if stopped and len(found) < len(views):
+        measured = list[_Measured]()
+        for measured_view in _measured(gaussians, views, dials[i]):
+            measured.append(measured_view)
+            done = i * len(views) + len(measured)
+            now = Progress(Phase.EVALUATION, done, len(virtual_scales) * len(views))
+            stopped = progress is not None and progress(now) is False
+            if stopped and len(measured) < len(views):
                 return rows
-        times, *columns = zip(*found, strict=True)
-        psnr, ssim, kept, in_view = map(statistics.fmean, columns)
-        share, frame_ms = kept / max(gaussians.whole, 1), 1e3 * statistics.median(times)
-        rows.append(Row(virtual_scale, psnr, ssim, kept, share, in_view, frame_ms))
+        kept = statistics.fmean(view.kept for view in measured)
+        rows.append(
+            Row(
+                virtual_scale,
+                psnr=statistics.fmean(view.psnr for view in measured),
+                ssim=statistics.fmean(view.ssim for view in measured),
+                kept=kept,
+                kept_share=kept / max(gaussians.whole, 1),
+                in_view=statistics.fmean(view.in_view for view in measured),
+                frame_ms=1e3 * statistics.median(view.seconds for view in measured),
+            )
+        )
         if stopped:
             break
     return rows
@@ -117,22 +125,31 @@ def evaluate_all(
     return rows
 
 
+class _Measured(NamedTuple):
+    """One view at one dial value: the time of its frame, and ``Row``'s other numbers."""
+
+    seconds: float
+    psnr: float
+    ssim: float
+    kept: int
+    in_view: int
+
+
 def _measured(
     gaussians: Gaussians, views: Sequence[View], virtual_scale: float
-) -> Iterator[tuple[float, ...]]:
-    """For each view seconds, PSNR, SSIM, and Gaussians kept and in the image; PSNR and SSIM of
-    several at a time.
-    """
+) -> Iterator[_Measured]:
+    """Renders each view; PSNR and SSIM are computed of several at a time."""
     workers = min(torch.get_num_threads(), SCORED)
     with ThreadPoolExecutor(workers) as pool:
         for first in range(0, len(views), workers):
-            some = views[first : first + workers]
-            found = [timed_frame(gaussians, view.camera, virtual_scale) for view in some]
+            scored = views[first : first + workers]
+            frames = [timed_frame(gaussians, view.camera, virtual_scale) for view in scored]
             scores = pool.map(
                 psnr_ssim,
-                [rendering.image for rendering, _ in found],
-                [view.image for view in some],
+                [rendering.image for rendering, _ in frames],
+                [view.image for view in scored],
             )
-            for view, (rendering, seconds), score in zip(some, found, scores, strict=True):
-                inside = rendering.kept & in_frustum(gaussians.means, view.camera)
-                yield seconds, *score, int(rendering.kept.sum()), int(inside.sum())
+            for (rendering, seconds), score in zip(frames, scores, strict=True):
+                kept = rendering.kept
+                inside = kept & in_frustum(gaussians.means, rendering.camera)
+                yield _Measured(seconds, *score, int(kept.sum()), int(inside.sum()))

@@ -11,7 +11,7 @@ import statistics
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import accumulate, pairwise
+from itertools import chain, product
 
 import torch
 
@@ -66,28 +66,29 @@ def time_frames(
     """
     if not cameras:
         raise ClodError("frames a second need a calibration or cameras to time frames from")
-    lean = [(model.without_empty_bands(), dials) for model, dials in models]
-    jobs = [(model, 1.0 if model.sigma_d is None else s) for model, dials in lean for s in dials]
+    jobs = list[tuple[Gaussians, float]]()
+    for model, dials in models:
+        model = model.without_empty_bands()
+        jobs += [(model, 1.0 if model.sigma_d is None else s) for s in dials]
     slowest = _warm_up(*jobs[0], cameras[0])
     views = cameras[:: -(-len(cameras) // VIEWS)]
     if slowest * len(views) * len(jobs) > SECONDS / FEWEST:
         views = views[len(views) // 2 :][:1]
     began, passes = time.perf_counter(), list[list[float]]()
     while len(passes) < PASSES and (len(passes) < FEWEST or time.perf_counter() - began < SECONDS):
-        taken = [[timed_frame(model, view, s)[1] for model, s in jobs] for view in views]
-        passes.append([1e3 * statistics.fmean(each) for each in zip(*taken, strict=True)])
+        seconds = [timed_frame(model, view, s)[1] for view, (model, s) in product(views, jobs)]
+        passes.append([1e3 * statistics.fmean(seconds[k :: len(jobs)]) for k in range(len(jobs))])
         tell(progress, Phase.FRAME_TIMES, len(passes), PASSES)
-    ends = [0, *accumulate(len(dials) for _, dials in models)]
-    found = tuple(
-        tuple(settled([each[first:end] for each in passes])) for first, end in pairwise(ends)
-    )
-    quartiles = [
-        statistics.quantiles(column, n=4, method="inclusive")
-        for column in zip(*passes, strict=True)
-    ]
-    return FrameTimes(
-        found, statistics.median((high - low) / middle for low, middle, high in quartiles)
-    )
+    milliseconds, first = [], 0
+    for _, dials in models:
+        end = first + len(dials)
+        milliseconds.append(tuple(settled([times[first:end] for times in passes])))
+        first = end
+    spreads = []
+    for column in zip(*passes, strict=True):
+        low, middle, high = statistics.quantiles(column, n=4, method="inclusive")
+        spreads.append((high - low) / middle)
+    return FrameTimes(tuple(milliseconds), statistics.median(spreads))
 
 
 def settled(passes: Sequence[Sequence[float]]) -> list[float]:
@@ -104,7 +105,8 @@ def settled(passes: Sequence[Sequence[float]]) -> list[float]:
             levels[-2]
         ):
             levels[-2:] = [levels[-2] + levels[-1]]
-    return [statistics.fmean(level) for level in levels for _ in level]
+    means = [[statistics.fmean(level)] * len(level) for level in levels]
+    return list(chain.from_iterable(means))
 
 
 def _warm_up(gaussians: Gaussians, virtual_scale: float, camera: Camera) -> float:
