@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, replace
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -163,15 +164,14 @@ class Comparisons:
             removal = removal_error(base, views, progress=self.stop.heeding(meter))
         values = {"opacity": base.opacity_logits, "removal error": removal}
         orders = {by: each.argsort(descending=True, stable=True) for by, each in values.items()}
-        jobs = [(row, by, order) for row in rows for by, order in orders.items()]
+        jobs = list(product(rows, orders))
         with self.console.meter("base") as meter:
             whole = self._row(base, 1.0, meter.part(0, len(jobs) + 1, "all"))
             table = self.tables[PRUNED] = [("base", whole)]
             self.report["base_row"] = whole.as_dict()
-            for i, (ours, by, order) in enumerate(jobs, 1):
-                row = self._row(
-                    base.select(order[: round(ours.kept)]), 1.0, meter.part(i, len(jobs) + 1, by)
-                )
+            for i, (ours, by) in enumerate(jobs, 1):
+                pruned = base.select(orders[by][: round(ours.kept)])
+                row = self._row(pruned, 1.0, meter.part(i, len(jobs) + 1, by))
                 row = replace(row, kept_share=row.kept / len(base))  # of the whole base
                 model = (f"s={ours.virtual_scale:g}", ours)
                 table += [*([] if model in table else [model]), (by, row)]
@@ -185,14 +185,13 @@ class Comparisons:
 
         cameras = [view.camera for view in self.scene.test]
         dials = [row.virtual_scale for row in rows]
-        named = zip(others.items(), labels(list(others)), strict=True)
-        jobs = [
-            (*each, name, s)
-            for each, name in named
-            for s in (dials if each[1].sigma_d is not None else [1.0])
-        ]
+        names = dict(zip(others, labels(list(others)), strict=True))
+        jobs = list[tuple[str, float]]()
+        for path, other in others.items():
+            jobs += [(path, s) for s in (dials if other.sigma_d is not None else [1.0])]
         with self.console.meter("compare") as meter:
-            for i, (path, other, name, s) in enumerate(jobs):
+            for i, (path, s) in enumerate(jobs):
+                other = others[path]
                 count = mean_kept(other, cameras, s)
                 same = matching_dial(self.model, cameras, count)
                 if abs((kept := mean_kept(self.model, cameras, same)) - count) > CLOSE * count:
@@ -203,15 +202,16 @@ class Comparisons:
                 listener = meter.part(i, len(jobs), path)
                 theirs, ours = self._row(other, s, listener), self._row(self.model, same, listener)
                 self.tables.setdefault(MATCHED, []).extend(
-                    [(name, theirs), (f"s={ours.virtual_scale:.4g}", ours)]
+                    [(names[path], theirs), (f"s={ours.virtual_scale:.4g}", ours)]
                 )
-                found = {
-                    "model": path,
-                    "label": name,
-                    "theirs": theirs.as_dict(),
-                    "ours": ours.as_dict(),
-                }
-                self.report["against"].append(found)
+                self.report["against"].append(
+                    {
+                        "model": path,
+                        "label": names[path],
+                        "theirs": theirs.as_dict(),
+                        "ours": ours.as_dict(),
+                    }
+                )
 
     def pop(self, max_sv: float) -> None:
         from clod_adapter.evaluation.popping import dial_popping, path_popping
@@ -222,16 +222,12 @@ class Comparisons:
             )
             return
         test = [view.camera for view in self.scene.test]
-        some = [
-            test[(2 * k + 1) * len(test) // (2 * POPPING_VIEWS)]
-            for k in range(min(POPPING_VIEWS, len(test)))
-        ]
-        jobs: list[Any] = [
-            (f"dial, {each.name}", partial(dial_popping, self.model, each, max_sv)) for each in some
-        ]
-        ordered = sorted(
-            [*test, *(view.camera for view in self.scene.train)], key=lambda camera: camera.name
-        )
+        jobs = list[Any]()
+        for k in range(min(POPPING_VIEWS, len(test))):
+            camera = test[(2 * k + 1) * len(test) // (2 * POPPING_VIEWS)]
+            jobs.append((f"dial, {camera.name}", partial(dial_popping, self.model, camera, max_sv)))
+        cameras = [*test, *(view.camera for view in self.scene.train)]
+        ordered = sorted(cameras, key=lambda camera: camera.name)
         # the middle of the capture
         walk = ordered[max((len(ordered) - PATH_CAMERAS) // 2, 0) :][:PATH_CAMERAS]
         if len(walk) > 1:
@@ -239,9 +235,9 @@ class Comparisons:
             jobs.append((f"camera, {walk[0].name} to {walk[-1].name}, s = {max_sv:g}", path))
         with self.console.meter("popping") as meter:
             for i, (moved, sweep) in enumerate(jobs):
-                found = sweep(progress=self.stop.heeding(meter.part(i, len(jobs), moved)))
-                self.popping.append((moved, found))
-                self.report["popping"].append({"moved": moved, **vars(found)})
+                popping = sweep(progress=self.stop.heeding(meter.part(i, len(jobs), moved)))
+                self.popping.append((moved, popping))
+                self.report["popping"].append({"moved": moved, **vars(popping)})
 
     def _row(self, gaussians: Gaussians, virtual_scale: float, listener: Listener) -> Row:
         from clod_adapter.evaluation.evaluate import evaluate

@@ -106,12 +106,9 @@ def splat_lines(splat: Splat) -> list[str]:
 
 
 def spread_table(rows: Sequence[tuple[str, Spread]]) -> list[str]:
-    names = ("least", "1 %", "median", "99 %", "greatest")
-    lines = [_line("", "".join(f"{name:>11}" for name in names))]
-    return lines + [
-        _line(name, "".join(f"{number:>11.4g}" for number in astuple(spread)))
-        for name, spread in rows
-    ]
+    lines = [_line("", ("{:>11}" * 5).format("least", "1 %", "median", "99 %", "greatest"))]
+    numbers = "{:>11.4g}" * 5
+    return lines + [_line(name, numbers.format(*astuple(spread))) for name, spread in rows]
 
 
 def calibration_lines(calibration: Calibration | None) -> list[str]:

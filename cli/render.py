@@ -84,7 +84,8 @@ def execute(args: Namespace) -> dict[str, Any]:
     )
     print(f"wrote {len(pictures)} image{'s' * (len(pictures) != 1)} to {out}")
     for k, dial in enumerate(dials):
-        kept, error = (fmean(picture[key][k] for picture in pictures) for key in ("kept", "psnr"))
+        kept = fmean(picture["kept"][k] for picture in pictures)
+        error = fmean(picture["psnr"][k] for picture in pictures)
         about = (
             f"{kept:,.0f} of {gaussians.whole:,} Gaussians, {error:.2f} dB, means over the images"
         )

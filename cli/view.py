@@ -1,5 +1,7 @@
 """``clod-adapt view``: serves the page that shows a file, on the loopback address until Ctrl-C."""
 
+from __future__ import annotations
+
 import json
 import os
 import re
@@ -9,19 +11,22 @@ from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from clod_adapter._support.text import as_text, package_version
 from clod_adapter.errors import ClodError
 from clod_adapter.io.file_formats import FORMATS, check_readable
+from clod_adapter.origin import Origin
 from clod_adapter.progress import Stopped
 
 from .shared import command as common
 from .shared.console import Console
 from .shared.outputs import jsonable
 from .shared.process import interrupt_as_stopped
+
+if TYPE_CHECKING:
+    from clod_adapter.io.checkpoint import Checkpoint
 
 MODEL, BASE = "/files/model", "/files/base"
 # they would take over the terminal
@@ -57,19 +62,17 @@ def view_files(given: Sequence[str]) -> list[str]:
     """The files to show: those given, and of a folder the checkpoints in it, by name, numbers by
     their value.
     """
-    return [
-        file
-        for path in given
-        for file in (_files_in(Path(path)) if Path(path).is_dir() else [path])
-    ]
+    files = list[str]()
+    for path in given:
+        files += _files_in(Path(path)) if Path(path).is_dir() else [path]
+    return files
 
 
 def _files_in(folder: Path) -> list[str]:
-    def natural(path: Path) -> list[tuple[int, str]]:
-        return [
-            (int(part), "") if part.isdigit() else (0, part)
-            for part in re.split(r"(\d+)", path.name)
-        ]
+    def natural(path: Path) -> list[Any]:
+        """Text and numbers in turn."""
+        parts = re.split(r"(\d+)", path.name)
+        return [int(part) if k % 2 else part for k, part in enumerate(parts)]
 
     splats = []
     for path in sorted(folder.iterdir(), key=natural):
@@ -125,16 +128,13 @@ def make_page(args: Namespace, console: Console) -> tuple[dict[str, Any], dict[s
     from .shared.inputs import read_cameras, read_checkpoint, with_filter
     from .shared.measure import solve_dials
 
-    files, read = (
-        view_files(args.models),
-        partial(read_checkpoint, console=console, activated=args.activated),
-    )
-    model = with_filter(read(files[0]), args, console)
-    models = [
-        model,
-        *(with_filter(read(path, origin=model.origin), args, console) for path in files[1:]),
-    ]
-    base = with_filter(read(args.base, origin=model.origin), args, console) if args.base else None
+    def read(path: str, origin: Origin | None = None) -> Checkpoint:
+        return with_filter(read_checkpoint(path, console, args.activated, origin), args, console)
+
+    files = view_files(args.models)
+    model = read(files[0])
+    models = [model, *(read(path, model.origin) for path in files[1:])]
+    base = read(args.base, model.origin) if args.base else None
     if args.device_preset and args.images is None and not model.viewpoints:
         raise ClodError(
             f"{model.path}: stores no cameras, which --device-preset needs; give --images"

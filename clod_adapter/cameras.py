@@ -167,16 +167,6 @@ class View:
 
         return StoredView(camera, image)
 
-    def columns(self, first: int, end: int) -> View:
-        """The columns ``[first, end)`` of the photograph, with the camera for them; made when they
-        are read.
-        """
-        K = self.camera.K.clone()
-        K[0, 2] -= first
-        return StoredView(
-            replace(self.camera, K=K, width=end - first), lambda: self.image[:, first:end]
-        )
-
 
 class StoredView(View):
     """A view that reads its photograph, by ``image``, on every access; a pickle or a copy is a View

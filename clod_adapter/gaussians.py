@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from clod_adapter._support.arrays import float_tensor
 from clod_adapter.config import CLASSIC, SH_COUNTS, AttenuationConfig, ScreenFilter, require
@@ -287,14 +288,10 @@ def with_near(near: Gaussians, far: Gaussians) -> Gaussians:
 
     The result has the SH degree of ``near``, which is that of ``far`` or a higher one.
     """
-    own = {
-        name: value for name, value in near.tensors().items() if name not in ("sigma_d", "growth_d")
-    }
-    theirs = far.tensors()
-    rest = own["shN"].new_zeros(len(far), *own["shN"].shape[1:])
-    rest[:, : far.shN.shape[1]] = far.shN
-    own |= {name: near.means.new_zeros(len(near)) for name in theirs.keys() - own.keys()}
-    theirs["shN"] = rest
-    return far.replace(
-        **{name: torch.cat([value, theirs[name].to(value)]) for name, value in own.items()}
-    )
+    joined = far.tensors()
+    joined["shN"] = pad(far.shN, (0, 0, 0, near.shN.shape[1] - far.shN.shape[1]))
+    for name, value in joined.items():
+        dial = name in ("sigma_d", "growth_d")
+        first = near.means.new_zeros(len(near)) if dial else getattr(near, name)
+        joined[name] = torch.cat([first, value.to(first)])
+    return far.replace(**joined)

@@ -66,7 +66,9 @@ def ssim_plain(image: Tensor, target: Tensor) -> Tensor:
         return conv2d(planes, taps[None, None, :, None], padding=(WINDOW // 2, 0))
 
     x, y = (v.permute(2, 0, 1)[:, None] for v in (image, target))
-    mx, my, xx, yy, xy = blur(torch.cat([x, y, x * x, y * y, x * y])).split(3)
+    blurred = blur(torch.cat([x, y, x * x, y * y, x * y]))
+    mx, my = blurred[:6].split(3)
+    xx, yy, xy = blurred[6:].split(3)
     similarity = (2 * mx * my + C1) * (2 * (xy - mx * my) + C2)
     return (similarity / ((mx * mx + my * my + C1) * (xx - mx * mx + yy - my * my + C2))).mean()
 

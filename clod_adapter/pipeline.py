@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from clod_adapter.adapter import Adapter, detach, extract
+from clod_adapter.adapter import Adapter, detach
 from clod_adapter.alignment.align import Note, align, detect_filter
 from clod_adapter.cameras import Scene
 from clod_adapter.config import PLACED_MAX_SV, AdaptConfig
@@ -22,7 +22,7 @@ from clod_adapter.progress import Listener, Stopped
 from clod_adapter.training.plan import Override, Plan
 from clod_adapter.training.planner import make_plan
 from clod_adapter.training.pseudo_views import with_pseudo_views
-from clod_adapter.training.state import Adapted
+from clod_adapter.training.state import Adapted, extract_adapter
 
 
 @dataclass(frozen=True)
@@ -137,8 +137,7 @@ def extract_result(
     """The result of a training, without measurements: the adapter, and the adapter applied to the
     base.
     """
-    facts: Any = {"fingerprint": base.fingerprint, "config": asdict(config), "origin": base.origin}
-    adapter = extract(base.gaussians, adapted.gaussians, **facts)
+    adapter = extract_adapter(base, adapted, config)
     return Result(base, scene, against, plan, adapted, adapter, adapter.apply(base.gaussians))
 
 

@@ -10,7 +10,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import Enum
 from types import FrameType
 from typing import TYPE_CHECKING, Any, Literal
@@ -33,7 +33,6 @@ class Phase(str, Enum):
     PHOTOGRAPHS = "photographs"
     CAMERAS = "placing cameras"
     PSEUDO_VIEWS = "pseudo views"
-    FINGERPRINT = "photographs' hash"
     SH_DEGREES = "SH degrees"
     IMPORTANCE = "importance"
     MERGING = "merging"
@@ -91,17 +90,6 @@ def tell(listener: Listener | None, phase: Phase, done: int, total: int) -> None
     """Calls the listener; raises Stopped if it returns False."""
     if listener is not None and listener(Progress(phase, done, total)) is False:
         raise Stopped(f"stopped at {phase} {done}/{total}")
-
-
-def within(
-    listener: Listener | None, before: int, total: int, phase: Phase | None = None
-) -> Listener | None:
-    """The listener of a part of a phase of ``total`` steps, ``before`` of which come first."""
-    if listener is None:
-        return None
-    return lambda now: listener(
-        replace(now, phase=phase or now.phase, done=before + now.done, total=total)
-    )
 
 
 @contextmanager

@@ -136,9 +136,9 @@ class Saver:
         self.due = now + max(SAVE_EVERY, min(cost / SAVE_COST, OLDEST), cost / MOST_COST)
 
     @contextmanager
-    def rescuing(self, how: str = "--resume") -> Iterator[None]:
+    def rescuing(self) -> Iterator[None]:
         """After an error within the block says on stderr, also with ``--quiet``, from which step
-        ``how`` resumes.
+        ``--resume`` resumes.
         """
         try:
             yield
@@ -154,7 +154,7 @@ class Saver:
             if self.saved is not None:
                 with suppress(OSError):  # stderr is closed, or on the disk that is full
                     print(
-                        f"{how} resumes from step {self.saved}, which is in {self.path}",
+                        f"--resume resumes from step {self.saved}, which is in {self.path}",
                         file=sys.stderr,
                     )
             raise

@@ -11,12 +11,14 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, NamedTuple, cast
 
 import torch
 
-from clod_adapter.cameras import Scene
+from clod_adapter.cameras import Scene, View
+from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
+from clod_adapter.gaussians import Gaussians
 from clod_adapter.progress import GracefulStop, Stopped
 from clod_adapter.training.distributed import (
     PATIENCE,
@@ -43,6 +45,16 @@ CALL, REASON = "clod/call", "clod/reason{}"
 POLL_EVERY = 0.05  # seconds between checks for work
 
 
+class Job(NamedTuple):
+    """What ``adapt`` is given, and the device of the first process's Gaussians."""
+
+    start: Gaussians
+    views: tuple[View, ...]
+    config: AdaptConfig
+    state: TrainingState | None
+    device: str
+
+
 @contextmanager
 def leading() -> Iterator[None]:
     """Within the block the first process may give the others a job; after it they end."""
@@ -67,9 +79,11 @@ def together(
         yield None
         return
     start, config = plan.start, plan.config
-    device, each = start.means.device.type, f"{config.batch} views a step, {config.steps:,} steps"
-    job = (start, scene.train, config, state, device)  # what ``adapt`` is given, and where it is
-    display.console.say(f"{launch.size} processes ({BACKENDS[device]}): {each}")
+    job = Job(start, scene.train, config, state, start.means.device.type)
+    display.console.say(
+        f"{launch.size} processes ({BACKENDS[job.device]}): {config.batch} views a step,"
+        f" {config.steps:,} steps"
+    )
     _store().set(CALL, "train")
     try:
         # it would wait for ten minutes
@@ -111,17 +125,17 @@ def take_part() -> None:
 
 
 def _train(group: ProcessGroup, launch: Launch, stop: GracefulStop) -> None:
-    job: Any = group.broadcast(None)
-    start, views, config, state, device = job
-    if device == "cuda":  # one for each process on this machine
+    job: Job = group.broadcast(cast(Job, None))
+    if job.device == "cuda":  # one for each process on this machine
         if (gpus := torch.cuda.device_count()) < launch.local_size:
             raise ClodError(
                 f"{launch.local_size} processes on a machine with {gpus} GPUs; start as many as"
                 " there are"
             )
         torch.cuda.set_device(launch.local_rank)
-    scene = Scene(teachers_to(views, device), ())
-    adapt(start.to(device), scene, config, stop.heeding(), state, group=group)
+    scene = Scene(teachers_to(job.views, job.device), ())
+    start = job.start.to(job.device)
+    adapt(start, scene, job.config, stop.heeding(), job.state, group=group)
 
 
 def explain(lost: str) -> str:

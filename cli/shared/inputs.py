@@ -155,7 +155,9 @@ def pick_views(scene: Scene, wanted: Sequence[str]) -> list[View]:
     if list(wanted) == ["held-out"]:
         return list(scene.test or scene.train)  # a single photograph is not held out
     cameras = [view.camera for view in views]
-    chosen = {camera.name for name in wanted for camera in named(cameras, name, "--views")}
+    chosen = set[str]()
+    for name in wanted:
+        chosen.update(camera.name for camera in named(cameras, name, "--views"))
     return [view for view in views if view.camera.name in chosen]
 
 

@@ -85,17 +85,15 @@ def choose_dials(given: list[float] | None, model: Checkpoint, console: Console)
     dial.
     """
     attenuation = model.gaussians.attenuation
-    trained = attenuation.max_sv if attenuation else None
-    dials = given or [s for s in DIALS if trained is None or s < trained] + (
-        [trained] if trained else []
-    )
-    if max(dials) > (trained or 1):
-        untrained = f"trained up to s = {trained or 0:g}; larger dial values were not trained"
-        console.note(
-            untrained
-            if trained
-            else f"{model.path} has no sigma_d, so every dial value renders all of it"
-        )
+    if attenuation is None:
+        dials = given or list(DIALS)
+        if max(dials) > 1:
+            console.note(f"{model.path} has no sigma_d, so every dial value renders all of it")
+        return dials
+    trained = attenuation.max_sv
+    dials = given or [*(s for s in DIALS if s < trained), trained]
+    if max(dials) > trained:
+        console.note(f"trained up to s = {trained:g}; larger dial values were not trained")
     return dials
 
 

@@ -11,6 +11,7 @@ import re
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -173,9 +174,8 @@ def _inputs(outputs: Outputs) -> Iterator[tuple[Path, str]]:
     """The files that must not be overwritten, and what they are."""
     for file in map(Path, outputs.inputs):
         yield from ((each, "an input file") for each in (file, *ranks_of(file).values()))
-        for beside in (
-            name.with_suffix(suffix) for name in (file, file.resolve()) for suffix in SUFFIXES
-        ):
+        for name, suffix in product((file, file.resolve()), SUFFIXES):
+            beside = name.with_suffix(suffix)
             if BESIDE.search(_beginning(beside)):
                 yield beside, "the adapter, state or report of an input"
     if outputs.scene is not None:

@@ -4,21 +4,22 @@ or its baseline.
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 
-from clod_adapter.adapter import Adapter, detach, extract
+from clod_adapter.adapter import Adapter, detach
 from clod_adapter.cameras import Scene, View
 from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.evaluate import evaluate_all
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.checkpoint import Checkpoint
-from clod_adapter.progress import Listener, Phase, Stopped, tell, within
+from clod_adapter.progress import Listener, Progress, Stopped
 from clod_adapter.training.planner import make_plan
 from clod_adapter.training.pseudo_views import PseudoView, add_pseudo_views
+from clod_adapter.training.state import extract_adapter
 
 # Shares of the unadapted base that its baseline keeps.
 BASELINE_SHARES = (1.0, 0.8, 0.62, 0.48, 0.35, 0.25, 0.18, 0.12, 0.08, 0.05)
@@ -59,13 +60,7 @@ def adapt_at_range(
         )
     if adapted.interrupted:
         raise Stopped(f"stopped at step {adapted.steps}")
-    adapter = extract(
-        base,
-        adapted.gaussians,
-        fingerprint=file.fingerprint,
-        config=asdict(config),
-        origin=file.origin,
-    )
+    adapter = extract_adapter(replace(file, gaussians=base), adapted, config)
     result = adapter.apply(base)
     rows = [row.as_dict() for row in evaluate_all(result, scene.test, virtual_scales, progress)]
     return CellResult(rows, distribution(result), adapter, adapted.start_seconds + adapted.seconds)
@@ -75,13 +70,17 @@ def baseline(
     base: Gaussians, views: Sequence[View], shares: Sequence[float], progress: Listener
 ) -> CellResult:
     """The unadapted base with only its most opaque Gaussians: one row per share."""
-    base, rows = detach(base), []
+    base, rows = detach(base), list[dict[str, float]]()
     order = base.opacity_logits.argsort(descending=True, stable=True)
-    for k, share in enumerate(shares):
+
+    def tell_all(now: Progress) -> bool | None:
+        done = len(rows) * len(views) + now.done
+        return progress(replace(now, done=done, total=len(shares) * len(views)))
+
+    for share in shares:
         # in their own order
         pruned = base.select(order[: max(1, round(share * len(base)))].sort().values)
-        part = within(progress, k * len(views), len(shares) * len(views))
-        (row,) = evaluate_all(pruned, views, [1.0], part)
+        (row,) = evaluate_all(pruned, views, [1.0], tell_all)
         rows.append(row.as_dict() | {"kept_share": len(pruned) / len(base)})
     return CellResult(rows, distribution(base))
 
@@ -102,17 +101,15 @@ def distribution(gaussians: Gaussians) -> dict[str, Any]:
     return found
 
 
-def scene_fingerprint(scene: Scene, progress: Listener | None = None) -> str:
+def scene_fingerprint(scene: Scene) -> str:
     """SHA-256, hex, of photographs' pixels, cameras and split; a pseudo view's pixels are those of
     its checkpoint.
     """
-    digest, done = hashlib.sha256(), 0
+    digest = hashlib.sha256()
     for views in (scene.train, scene.test):
         digest.update(f"{len(views)};".encode())
         for view in views:
             pixels = () if isinstance(view, PseudoView) else (view.image,)
             for tensor in (view.camera.viewmat, view.camera.K, *pixels):
                 digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
-            done += 1
-            tell(progress, Phase.FINGERPRINT, done, len(scene.train) + len(scene.test))
     return digest.hexdigest()

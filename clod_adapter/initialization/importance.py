@@ -113,9 +113,8 @@ def usable_views(base: Gaussians, views: Sequence[View]) -> tuple[View, ...]:
     """
     found = []
     for view in views:
-        depths = base.means @ view.camera.viewmat[2, :3].to(base.means) + view.camera.viewmat[
-            2, 3
-        ].to(base.means)
+        row = view.camera.viewmat[2].to(base.means)
+        depths = base.means @ row[:3] + row[3]
         if bool((depths >= view.camera.near).any()):
             found.append(view)
     if not found:

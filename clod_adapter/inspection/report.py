@@ -173,14 +173,8 @@ def looks_like(head: Head) -> str | None:
 
 def extra_columns(names: Sequence[str], sh_degree: int) -> tuple[str, ...]:
     """The properties of a PLY without a meaning here."""
-    known = {name for group in column_map(sh_degree).values() for name in group}
-    known |= {
-        *NORMALS,
-        *dial_columns(names),
-        *MASK_COLUMNS,
-        FILTER_3D,
-        *(RGB if is_coloured(names) else ()),
-    }
+    known = {*NORMALS, *dial_columns(names), *MASK_COLUMNS, FILTER_3D}
+    known.update(*column_map(sh_degree).values(), RGB if is_coloured(names) else ())
     return tuple(name for name in names if name not in known and not name.startswith(COLUMN))
 
 

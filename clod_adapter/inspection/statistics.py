@@ -30,12 +30,16 @@ class Spread:
 
     @classmethod
     def of(cls, values: np.ndarray) -> Spread:
-        """Of at least one value."""
+        """Summarize a non-empty array."""
         with np.errstate(invalid="ignore"):  # between two infinite ones
             low, median, high = (
                 float(value) for value in np.quantile(values, (BULK[0], 0.5, BULK[1]))
             )
         return cls(float(values.min()), low, median, high, float(values.max()))
+
+    def moved(self, by: float) -> Spread:
+        """The spread of the values plus ``by``."""
+        return Spread(*(value + by for value in astuple(self)))
 
 
 @dataclass(frozen=True)
@@ -99,7 +103,6 @@ def values_of(found: Prepared) -> dict[str, Any]:
     middle = np.array([[spread.median] for spread in position])
     distance = np.linalg.norm(means.astype(np.float64) - middle, axis=0)
     diagonal = float(np.linalg.norm([spread.high - spread.low for spread in position]))
-    moved = zip(position, found.origin, strict=True)
     same = means[:, np.lexsort(means)]
     used = [
         k + 1 for k in range(found.arrays["shN"].shape[1]) if found.arrays["shN"][:, k][keep].any()
@@ -108,7 +111,7 @@ def values_of(found: Prepared) -> dict[str, Any]:
         total=len(keep),
         count=int(keep.sum()),
         dropped=found.dropped,
-        position=tuple(Spread(*(value + by for value in astuple(each))) for each, by in moved),
+        position=tuple(map(Spread.moved, position, found.origin)),
         used_sh_degree=next(
             degree for degree, count in SH_COUNTS.items() if count > max(used, default=0)
         ),

@@ -134,15 +134,13 @@ class ClodSplatfactoModel(SplatfactoModel):  # type: ignore[misc]
         return losses
 
     def get_param_groups(self) -> dict[str, list[Parameter]]:
-        groups = super().get_param_groups()
-        groups = {
-            name: values
-            for name, values in groups.items()
-            if all(value.requires_grad for value in values)
-        }
-        return groups | {
-            name: [value] for name, value in (self.dial.named_parameters() if self.dial else ())
-        }
+        groups = dict[str, list[Parameter]]()
+        for name, values in super().get_param_groups().items():
+            if all(value.requires_grad for value in values):
+                groups[name] = values
+        for name, value in self.dial.named_parameters() if self.dial else ():
+            groups[name] = [value]
+        return groups
 
     def step_cb(self, optimizers: Optimizers, step: int) -> None:
         super().step_cb(optimizers, TRAINED + step)

@@ -31,12 +31,15 @@ def camera_of(camera: Any) -> Camera:
     rotation = pose[:, :3] * pose.new_tensor([1.0, -1.0, -1.0])
     viewmat = torch.eye(4, dtype=torch.float32)
     viewmat[:3, :3], viewmat[:3, 3] = rotation.T, -rotation.T @ pose[:, 3]
-    fx, fy, cx, cy, width, height = (
-        float(getattr(camera, name).flatten()[0])
-        for name in ("fx", "fy", "cx", "cy", "width", "height")
+
+    def number(name: str) -> float:
+        return float(getattr(camera, name).flatten()[0])
+
+    K = torch.tensor(
+        [[number("fx"), 0.0, number("cx")], [0.0, number("fy"), number("cy")], [0.0, 0.0, 1.0]],
+        dtype=torch.float32,
     )
-    K = torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]], dtype=torch.float32)
-    return Camera(viewmat, K, int(width), int(height))
+    return Camera(viewmat, K, int(number("width")), int(number("height")))
 
 
 def shown(
@@ -125,10 +128,13 @@ def write_ply(
         np.float32
     )
     values = torch.cat([gaussians.means, gaussians.opacity_logits[:, None]], 1).detach().numpy()
-    own = enumerate(row.tobytes() for row in values)
-    rows = [next((i for i, mine in own if mine == each.tobytes()), -1) for each in exported]
-    if -1 in rows:
-        raise ClodError(
-            f"{path}: nerfstudio exports other rows than those of the dial; nothing is written"
-        )
+    of_dial = enumerate(row.tobytes() for row in values)
+    rows = []
+    for wanted in map(np.ndarray.tobytes, exported):
+        row = next((number for number, row in of_dial if row == wanted), None)
+        if row is None:
+            raise ClodError(
+                f"{path}: nerfstudio exports other rows than those of the dial; nothing is written"
+            )
+        rows.append(row)
     save(path, gaussians[rows])

@@ -12,6 +12,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -89,8 +90,12 @@ def series_of(report: Mapping[str, Any]) -> list[Series]:
     found = [model, Series(BASE, base)]
     found += [Series(label, rows, one and len(rows) > 1) for (label, one), rows in others.items()]
     found.append(Series("plain viewer, no dial", [report.get("detached_row") or {}]))
-    complete = [replace(s, rows=[r for r in s.rows if r and r["psnr"] is not None]) for s in found]
-    return [series for series in complete if series.rows]
+    complete = []
+    for series in found:
+        rows = [row for row in series.rows if row and row["psnr"] is not None]
+        if rows:
+            complete.append(replace(series, rows=rows))
+    return complete
 
 
 def chart_file(page: Path, name: str) -> Path:
@@ -242,7 +247,7 @@ def _round_errors(low: float, high: float) -> list[float]:
     decades = range(math.floor(-high / 10), math.ceil(-low / 10) + 1)
     ticks = list[float]()
     for steps in ((1,), (1, 2, 5), (1, 1.5, 2, 3, 4, 5, 7), [k / 10 for k in range(10, 100)]):
-        every = [-10 * math.log10(step) - 10 * decade for decade in decades for step in steps]
+        every = (-10 * math.log10(step) - 10 * decade for decade, step in product(decades, steps))
         ticks = [psnr for psnr in every if low <= psnr <= high]
         if len(ticks) >= FEWEST_TICKS:
             break

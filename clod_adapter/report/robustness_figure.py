@@ -44,7 +44,9 @@ def robustness_figure(path: str | Path, cells: Sequence[Mapping[str, Any]], titl
             grid[-1], ("Gaussians kept (log scale)",) * 2 + PANELS[2:], strict=True
         ):
             panel.set_xlabel(label)
-        lines = {line.get_label(): line for axes in grid[:, 0] for line in axes.get_lines()}
+        lines = dict[str, Any]()
+        for axes in grid[:, 0]:
+            lines |= {line.get_label(): line for line in axes.get_lines()}
         labels = sorted(lines, key=lambda label: label == BEYOND)
         figure.legend(
             [lines[label] for label in labels], labels, loc="outside lower left", ncols=len(labels)
@@ -88,11 +90,12 @@ def _distribution(axes: Any, cells: Sequence[Mapping[str, Any]], key: str, style
         return
     # The decades of sigma_d whose bins hold a thousandth of the Gaussians or more.
     axes.set_ylim(bottom=0)
-    histograms = [cell["distribution"][key] for cell in cells if key in cell["distribution"]]
-    bins = [
-        each for h in histograms for each in zip(pairwise(h["edges"]), h["shares"], strict=True)
-    ]
-    if used := [edge for ends, share in bins if share > 1e-3 for edge in ends]:
+    used = list[float]()
+    for cell in cells:
+        if histogram := cell["distribution"].get(key):
+            for ends, share in zip(pairwise(histogram["edges"]), histogram["shares"], strict=True):
+                used += ends if share > 1e-3 else ()
+    if used:
         low, high = math.floor(min(used)), math.ceil(max(used))
         axes.set_xlim(low, high)
         axes.set_xticks(range(low, high + 1), [f"{10.0**k:g}" for k in range(low, high + 1)])

@@ -58,19 +58,18 @@ class RowAdam:
             name: (units or {}).get(name, one.to(p.device)) for name, p in parameters.items()
         }
         self.beta1, self.beta2, self.epsilon = beta1, beta2, epsilon
-        kinds = ("first", "second")
-        self.moments = {
-            kind: {name: torch.zeros_like(p) for name, p in parameters.items()} for kind in kinds
-        }
-        some = next(iter(parameters.values()))
-        self.steps = torch.zeros(len(some), dtype=torch.int32, device=some.device)
+        self.moments = dict[str, dict[str, Tensor]]()
+        for kind in ("first", "second"):
+            self.moments[kind] = {name: torch.zeros_like(p) for name, p in parameters.items()}
+        (rows, *_), device = next((p.shape, p.device) for p in parameters.values())
+        self.steps = torch.zeros(rows, dtype=torch.int32, device=device)
         # After so many steps of its own a row's bias corrections are 1 in float32.
         last = math.ceil(-25 * math.log(2) / math.log(max(beta1, beta2)))
         count = np.arange(1, last + 2)
         with np.errstate(under="ignore"):
             corrections = 1 / (1 - beta1**count), 1 / np.sqrt(1 - beta2**count)
         table = np.pad(np.stack(corrections), ((0, 0), (1, 0))).astype(np.float32)
-        self._corrections = torch.from_numpy(table).to(some.device)
+        self._corrections = torch.from_numpy(table).to(device)
 
     @torch.no_grad()
     def step(self, gradients: dict[str, Tensor], rows: Tensor, rates: dict[str, float]) -> None:

@@ -8,10 +8,12 @@ from typing import Any
 
 from torch import Tensor
 
-from clod_adapter.config import AttenuationConfig
+from clod_adapter.adapter import Adapter, extract
+from clod_adapter.config import AdaptConfig, AttenuationConfig
 from clod_adapter.errors import ClodError, refused_if_damaged
 from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.atomic import atomic_path
+from clod_adapter.io.checkpoint import Checkpoint
 from clod_adapter.io.file_formats import refuse_irregular
 from clod_adapter.io.tensor_file import read_tensors, write_tensors
 
@@ -50,11 +52,8 @@ class TrainingState:
     start_seconds: float
 
     def __post_init__(self) -> None:
-        times = (self.seconds, self.start_seconds)
-        possible = 0 <= self.averaged <= self.steps < 2**31 and all(
-            0 <= seconds < math.inf for seconds in times
-        )
-        if not possible:
+        counted = 0 <= self.averaged <= self.steps < 2**31
+        if not (counted and 0 <= self.seconds < math.inf and 0 <= self.start_seconds < math.inf):
             raise StateRefused(
                 "the training state has impossible counts of steps or seconds; start over"
             )
@@ -63,11 +62,7 @@ class TrainingState:
         """Refuses a state of another run than that with tensors ``own``, and values that training
         cannot produce.
         """
-        shapes = [
-            {name: (t.shape, t.dtype) for name, t in tensors.items()}
-            for tensors in (own, self.tensors)
-        ]
-        if shapes[0] != shapes[1]:
+        if _layout(own) != _layout(self.tensors):
             raise StateRefused(OTHER_RUN)
         for name, values in self.tensors.items():
             kind, _, attribute = name.partition(".")
@@ -83,6 +78,10 @@ class TrainingState:
                 raise StateRefused(
                     f"the training state has impossible values of {name}; start over"
                 )
+
+
+def _layout(tensors: dict[str, Tensor]) -> dict[str, tuple[Any, ...]]:
+    return {name: (tensor.shape, tensor.dtype) for name, tensor in tensors.items()}
 
 
 @dataclass(frozen=True)
@@ -136,6 +135,17 @@ class Adapted:
         return f"Adapted({self.gaussians!r}, {self.steps:,} steps, {self.seconds:.1f} s{ended})"
 
 
+def extract_adapter(base: Checkpoint, adapted: Adapted, config: AdaptConfig) -> Adapter:
+    """The adapter of a training of ``base`` with ``config``."""
+    return extract(
+        base.gaussians,
+        adapted.gaussians,
+        fingerprint=base.fingerprint,
+        config=asdict(config),
+        origin=base.origin,
+    )
+
+
 def save_state(path: str | Path, state: TrainingState, belongs: dict[str, Any]) -> None:
     """Writes a state, and plain JSON that identifies its run; loading gives the same bits."""
     # Not asdict of the whole, which would copy the tensors.
@@ -156,10 +166,8 @@ def load_state(path: str | Path) -> tuple[TrainingState, dict[str, Any]]:
     ):
         tensors, metadata = read_tensors(path)
         about = json.loads(metadata[KEY])
-        belongs, attenuation = (
-            dict(about.pop("belongs")),
-            AttenuationConfig(**about.pop("attenuation")),
-        )
+        belongs = dict(about.pop("belongs"))
+        attenuation = AttenuationConfig(**about.pop("attenuation"))
         random, order = dict(about.pop("random")), tuple(map(int, about.pop("order")))
         counts: Any = {
             name: (int if name in ("averaged", "steps") else float)(n) for name, n in about.items()

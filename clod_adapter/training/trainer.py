@@ -7,6 +7,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from clod_adapter._kernels.threads import torch_on_one_thread
 from clod_adapter.adapter import ATTRIBUTES
@@ -160,7 +161,9 @@ class Trainer:
             name: value.detach().requires_grad_(name in self.stepped)
             for name, value in self.parameters.items()
         }
-        shown = self._shown(leaves, halved)
+        shown = self._assembled(leaves)
+        if halved:
+            shown = shown.replace(screen_filter=self.screen_filter.halved())
         rasterizer = for_device(shown.means.device)
         kept = rasterizer.kept(shown, view.camera, s)[first]
         image = rasterizer.draw(shown, view.camera, s, trained=self.count)[0]
@@ -175,11 +178,6 @@ class Trainer:
         for at, weighted in self.dial.counts(s, counted, plain):
             gradients[decay] = gradients[decay] + self.dial.count_gradient(parameter, at, weighted)
         return GradientSum(gradients, kept, plain)
-
-    def _shown(self, parameters: dict[str, Tensor], halved: bool) -> Gaussians:
-        """Gaussians of these parameters, as they are drawn."""
-        found = self._assembled(parameters)
-        return found.replace(screen_filter=self.screen_filter.halved()) if halved else found
 
     def _update(self, found: GradientSum, share_done: float) -> None:
         """Moves the rows whose gradients are finite; none if the loss is not, without asking
@@ -239,11 +237,8 @@ class Trainer:
         found = self._assembled(self.parameters | self.averages())
         found = found if self.order is None else found.select(self.order)
         if self.empty_sh is not None:
-            # far ones
-            added = self.empty_sh.new_zeros(
-                len(found) - len(self.empty_sh), *self.empty_sh.shape[1:]
-            )
-            found = found.replace(shN=torch.cat([self.empty_sh, added]))
+            far = len(found) - len(self.empty_sh)
+            found = found.replace(shN=pad(self.empty_sh, (0, 0, 0, 0, 0, far)))
         return in_world_units(found)
 
     def averages(self) -> dict[str, Tensor]:

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from functools import cache, cached_property
 from importlib.resources import files
 from io import BytesIO
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -129,23 +130,25 @@ def _along_curve(means: Tensor) -> Tensor:
     points = means.detach().double().cpu().numpy()
     low, high = np.quantile(points, (0.01, 0.99), axis=0)
     cells = (1023 * (points - low) / np.maximum(high - low, 1e-300)).clip(0, 1023).astype(np.int64)
-    code = sum(((cells[:, k] >> bit) & 1) << (3 * bit + k) for bit in range(10) for k in range(3))
+    code = sum(
+        ((cells[:, k] >> bit) & 1) << (3 * bit + k) for bit, k in product(range(10), range(3))
+    )
     return torch.from_numpy(np.argsort(code, kind="stable")).to(means.device)
+
+
+def _digits(row: list[float]) -> list[float]:
+    """The numbers with the digits that float32 has."""
+    return [float(f"{value:.9g}") for value in row]
 
 
 def camera_entry(camera: Camera, placed: bool = False) -> Entry:
     """A camera of the page's configuration. ``placed``: it is not a photograph's; the page levels
     it.
     """
-
-    def digits(matrix: Tensor) -> list[list[float]]:
-        # full float32 precision
-        return [[float(f"{value:.9g}") for value in row] for row in matrix.tolist()]
-
     return {
         "name": camera.name,
-        "viewmat": digits(camera.viewmat),
-        "K": digits(camera.K),
+        "viewmat": list(map(_digits, camera.viewmat.tolist())),
+        "K": list(map(_digits, camera.K.tolist())),
         "width": camera.width,
         "height": camera.height,
         "near": camera.near,
