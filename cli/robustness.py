@@ -92,13 +92,10 @@ class Cell:
     @property
     def key(self) -> dict[str, Any]:
         """Everything that the result depends on, as JSON."""
-        drawn, config = (
-            self.checkpoint.gaussians.screen_filter,
-            asdict(self.config) if self.config else None,
-        )
+        drawn = self.checkpoint.gaussians.screen_filter
         return {
             "version": package_version(),
-            "config": config,
+            "config": self.config and asdict(self.config),
             "points": list(self.points),
             "checkpoint_sha256": self.checkpoint.fingerprint,
             "scene_sha256": self.scene_sha256,
@@ -108,15 +105,12 @@ class Cell:
     def read(self) -> dict[str, Any] | None:
         """The finished cell, or None if there is none with this key."""
         try:
-            found = json.loads(self.file.read_text(encoding="utf-8"))
+            cell = json.loads(self.file.read_text(encoding="utf-8"))
         except (OSError, ValueError):
             return None
-        same = isinstance(found, dict) and found.get("key") == self.key
-        return (
-            found
-            if same and (self.config is None or self.file.with_suffix(ADAPTER).is_file())
-            else None
-        )
+        same = isinstance(cell, dict) and cell.get("key") == self.key
+        complete = self.config is None or self.file.with_suffix(ADAPTER).is_file()
+        return cell if same and complete else None
 
     def run(self, scene: Scene, progress: Listener) -> dict[str, Any]:
         """Measures; writes the adapter and then the rows."""

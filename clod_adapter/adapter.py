@@ -75,7 +75,7 @@ class Adapter:
         count = self.sigma_d.numel()
         for name, column in dial_tensors(self).items():
             sound = column.shape == (count,) and column.dtype == torch.float32
-            require(sound, f"Adapter.{name}", _kind(column), f"float32 [{count}]")
+            require(sound, f"Adapter.{name}", kind_of(column), f"float32 [{count}]")
             if not column.isfinite().all():
                 raise ClodError(
                     f"Adapter.{name} holds a value that is not finite; the training has diverged"
@@ -94,7 +94,7 @@ class Adapter:
             require(
                 sound,
                 f"Adapter.updates[{name!r}]",
-                _kind(update),
+                kind_of(update),
                 f"float16 or float32 of {count} rows",
             )
         if self.added:
@@ -147,8 +147,8 @@ class Adapter:
             old = getattr(base, name)
             if update.shape != old.shape:
                 raise ClodError(
-                    f"a different base was given: {name} is {_kind(old)}, the adapter's"
-                    f" {_kind(update)}"
+                    f"a different base was given: {name} is {kind_of(old)}, the adapter's"
+                    f" {kind_of(update)}"
                 )
             update = update.to(old.device)
             # old, not old + 0, where nothing changed: that would turn -0 into 0
@@ -192,6 +192,12 @@ def extract(
 
     Raises:
         ClodError: ``adapted`` has no dial, is not finite, or is not the same Gaussians as ``base``.
+
+    Example:
+        >>> base, model = clod.load("base.ply"), clod.load("model.ply")
+        >>> sha256 = base.fingerprint
+        >>> adapter = clod.extract(base.gaussians, model.gaussians, fingerprint=sha256, config={})
+        >>> clod.save_adapter("model.safetensors", adapter)
     """
     adapted = in_world_units(adapted)
     if adapted.attenuation is None:
@@ -206,8 +212,8 @@ def extract(
         old, new = getattr(base, name).detach().float(), getattr(near, name).detach().float()
         if old.shape != new.shape:
             raise ClodError(
-                f"{name} is {_kind(new)}, in the base {_kind(old)}; give the Gaussians that were"
-                " adapted"
+                f"{name} is {kind_of(new)}, in the base {kind_of(old)}; give the Gaussians that"
+                " were adapted"
             )
         if not torch.equal(old, new):
             updates[name] = _update(name, old, new).cpu()
@@ -239,6 +245,10 @@ def with_dial(
 
     Args:
         sigma_d: ``[N]`` world units; growth_d: ``[N]`` exponents, or None for no growth.
+
+    Example:
+        >>> base = clod.load("base.ply").gaussians
+        >>> model = clod.with_dial(base, torch.full([len(base)], 20.0))
     """
     if sigma_d is None:
         sigma_d = torch.full_like(gaussians.opacity_logits, SIGMA_MAX, dtype=torch.float32)
@@ -250,6 +260,9 @@ def with_dial(
 def detach(gaussians: Gaussians) -> Gaussians:
     """The Gaussians without their dial, as s = 0 shows them: the near ones, if others take over
     from these.
+
+    Example:
+        >>> plain = clod.detach(clod.load("model.ply").gaussians)
     """
     gaussians = gaussians if gaussians.near is None else gaussians.select(gaussians.near)
     return gaussians.replace(sigma_d=None, growth_d=None, attenuation=None)
@@ -267,5 +280,6 @@ def _update(name: str, old: Tensor, new: Tensor) -> Tensor:
     return delta if delta.isfinite().all() and error <= HALF_ERROR * largest else new.clone()
 
 
-def _kind(tensor: Tensor) -> str:
+def kind_of(tensor: Tensor) -> str:
+    """``float32 [100, 3]``."""
     return f"{str(tensor.dtype).removeprefix('torch.')} {list(tensor.shape)}"

@@ -54,6 +54,11 @@ def bake(
     Raises:
         ClodError: no dial, neither or both of camera and cameras, or a value negative, not finite
             or that keeps none.
+
+    Example:
+        >>> model = clod.load("model.ply")
+        >>> small = clod.bake(model.gaussians, 3, cameras=model.viewpoints)
+        >>> clod.save("small.ply", small)
     """
     if gaussians.sigma_d is None or gaussians.attenuation is None:
         raise ClodError("the Gaussians have no sigma_d, so there is no dial value to bake")
@@ -96,6 +101,11 @@ def bake_levels(gaussians: Gaussians, multiplier: float = MULTIPLIER) -> list[Le
     Raises:
         ClodError: no dial, the paper's form, whose distances depend on the view, or a multiplier
             that is not above 1.
+
+    Example:
+        >>> model = clod.load("model.ply")
+        >>> for k, level in enumerate(clod.bake_levels(model.gaussians)):
+        ...     clod.save(f"level_{k}.ply", level.gaussians)
     """
     attenuation = gaussians.attenuation
     if gaussians.sigma_d is None or attenuation is None or attenuation.form == "paper":
@@ -146,6 +156,12 @@ def order_by_extinction(gaussians: Gaussians, cameras: Sequence[Place]) -> Tenso
 
     Raises:
         ClodError: no dial, no camera, or the paper's form.
+
+    Example:
+        >>> base, scene = clod.load("base.ply"), clod.load_scene("scene")
+        >>> model = clod.attach(base.gaussians, scene).gaussians()
+        >>> rows = clod.order_by_extinction(model, [view.camera for view in scene.train])
+        >>> first = model[rows[:1000]]
     """
     if gaussians.sigma_d is None or gaussians.attenuation is None:
         raise ClodError("the Gaussians have no sigma_d, so there is no pruning order")

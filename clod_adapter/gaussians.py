@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -179,7 +180,7 @@ class Gaussians:
 
     @property
     def sh_degree(self) -> int:
-        return {k - 1: d for d, k in SH_COUNTS.items()}[self.shN.shape[1]]
+        return math.isqrt(self.shN.shape[1])  # d^2 + 2 d coefficients
 
     @property
     def scales(self) -> Tensor:

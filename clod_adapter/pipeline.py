@@ -90,11 +90,6 @@ def adapt_checkpoint(
     views are added to few photographs or take the place of none, a plan is made, the dial is
     learned and measured.
 
-        base = clod.load("pretrained.ply")
-        scene = clod.load_scene("scene/", origin=base.origin)
-        result = clod.adapt_checkpoint(base, scene, clod.AdaptConfig(max_sv=5))
-        result.save("model.ply")
-
     Args:
         scene: posed photographs; without them the checkpoint's own renders are the truth.
         config: by default ``AdaptConfig()``, without photographs with max_sv PLACED_MAX_SV.
@@ -106,6 +101,12 @@ def adapt_checkpoint(
     Raises:
         ClodError: as ``align``, ``make_plan`` and ``adapt``.
         Stopped: ``progress`` returned False before training.
+
+    Example:
+        >>> base = clod.load("base.ply")
+        >>> scene = clod.load_scene("scene", origin=base.origin)
+        >>> result = clod.adapt_checkpoint(base, scene, clod.AdaptConfig(max_sv=5))
+        >>> result.save("model.ply")
     """
     notes, alignment, against = list[str](), None, "checkpoint" if scene is None else "photographs"
     if config is None:

@@ -87,6 +87,11 @@ def render(
 
     Raises:
         ClodError: the dial is negative or not finite, or an argument is of another type.
+
+    Example:
+        >>> model, scene = clod.load("model.ply"), clod.load_scene("scene")
+        >>> rendering = clod.render(model.gaussians, scene.test[0].camera, virtual_scale=3)
+        >>> print(rendering.image.shape, int(rendering.kept.sum()))
     """
     for name, value, kind in (("gaussians", gaussians, Gaussians), ("camera", camera, Camera)):
         require(

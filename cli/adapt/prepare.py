@@ -175,10 +175,8 @@ def forecast(run: Run, plan: Plan) -> None:
     release()
     # a fiftieth more for saving the state
     training = fixed + min(1.02 * steps * each, config.time_budget or math.inf)
-    dials, frame = (
-        len(report_dials(config.max_sv)) + 1,
-        run.base_rows[0].frame_ms / 1e3 if run.base_rows else 0.0,
-    )
+    dials = len(report_dials(config.max_sv)) + 1
+    frame = run.base_rows[0].frame_ms / 1e3 if run.base_rows else 0.0
     measuring = CHEAPER * dials * (run.base_seconds + 15 * frame)
     peak = peak_bytes()
     if run.args.report:  # curves of seven states at three dial values, 15 pictures and the charts

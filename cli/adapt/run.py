@@ -216,17 +216,14 @@ def judge(run: Run, result: Result) -> tuple[str, bool]:
     if run.against == "photographs":
         lost = result.base_rows[0].psnr - full[0]
         line = f"s = 1 is {lost:.2f} dB below the base on the held-out photographs"
-        more, bad, failed = "", not lost <= LOST[0], not lost <= LOST[1]
+        more = ""
+        good, passed = (lost <= limit for limit in LOST)
     else:
         line = f"s = 1 has {full[0]:.2f} dB against the checkpoint's own renderings"
-        more, bad, failed = (
-            ", or give the photographs (--images)",
-            not full[0] >= ENOUGH[0],
-            not full[0] >= ENOUGH[1],
-        )
-    return (
-        f"{line}:\ntrain longer (--iters){more}, or show s = 0, which is the base" if bad else ""
-    ), failed
+        more = ", or give the photographs (--images)"
+        good, passed = (full[0] >= limit for limit in ENOUGH)
+    advice = f"train longer (--iters){more}, or show s = 0, which is the base"
+    return "" if good else f"{line}:\n{advice}", not passed
 
 
 def print_summary(run: Run, result: Result, taken: dict[str, float]) -> None:

@@ -201,18 +201,14 @@ class Export:
         names = (self.model.vertex.dtype.names if self.model.vertex is not None else None) or ()
         if dropped := extra_columns(names, self.gaussians.sh_degree):
             self.console.note(f"columns dropped: {', '.join(dropped)}")
-        drawn, dialled = (
-            self.gaussians.screen_filter,
-            self.gaussians.sigma_d is not None and not self.dials,
-        )
+        screen_filter = self.gaussians.screen_filter
+        has_dial = self.gaussians.sigma_d is not None and not self.dials
         stored = not self.args.folder and suffix_of(Path(self.args.out)) in STORE_FILTER
-        if drawn.compensate and not dialled and not stored:
-            options = 'antiAlias in PlayCanvas, rasterize_mode="antialiased" in gsplat'
-            about = (
-                f"trained antialiased ({drawn.description}): most readers need an option for it:"
-                f" {options}"
+        if screen_filter.compensate and not has_dial and not stored:
+            self.console.note(
+                f"trained antialiased ({screen_filter.description}): most readers need an option"
+                ' for it: antiAlias in PlayCanvas, rasterize_mode="antialiased" in gsplat'
             )
-            self.console.note(about)
 
     def write(self) -> list[dict[str, Any]]:
         """Writes all files of the command, all or none; a description of each."""
@@ -322,10 +318,8 @@ class Export:
         self.console.note(f"{about}; --exact keeps all digits")
 
     def _transform(self, words: list[str | Path], out: Path, count: int) -> None:
-        tool, text = (
-            splat_transform.SplatTransform.find(),
-            f"splat-transform packs {count:,} Gaussians",
-        )
+        tool = splat_transform.SplatTransform.find()
+        text = f"splat-transform packs {count:,} Gaussians"
         with self.console.status(f"{text} ...") as show:
             limit = splat_transform.LIMIT + splat_transform.LIMIT_EACH * count
             seconds = tool.run(

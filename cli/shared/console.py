@@ -100,10 +100,9 @@ class Meter:
 
     def update(self, share: float, text: str = "") -> None:
         """Shows the ``share`` that is done, in [0, 1], followed by ``text``."""
-        now, text = (
-            time.perf_counter(),
-            text if len(text) <= TEXT else f"{text[: TEXT - 3].rstrip()}...",
-        )
+        now = time.perf_counter()
+        if len(text) > TEXT:
+            text = f"{text[: TEXT - 3].rstrip()}..."
         if self.bar is not None:
             self.bar.set_postfix_str(text, refresh=False)
             self.bar.update(min(share, 1.0) - self.bar.n)

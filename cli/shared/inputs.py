@@ -139,7 +139,7 @@ def with_filter(
     gaussians, name = checkpoint.gaussians, args.antialiasing
     if name == "auto":
         with console.status("comparing screen-space filters with the photographs ..."):
-            return detect_filter(checkpoint, views, console.note)
+            return detect_filter(checkpoint, views, console.note, "--antialiasing")
     stored = gaussians.screen_filter
     if checkpoint.filter_known and FILTERS[name] != stored:
         had = f"the file has {stored.description}"
@@ -234,7 +234,8 @@ def align_shown(
 ) -> tuple[Scene, dict[str, Any]]:
     """``align``, with a status line on a terminal."""
     with console.status("comparing the checkpoint with the photographs ..."):
-        return align(checkpoint, scene, console.note, required=required)
+        override = "use --misaligned-ok"
+        return align(checkpoint, scene, console.note, required=required, override=override)
 
 
 def read_cameras(

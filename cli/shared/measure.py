@@ -156,15 +156,13 @@ def solve_dials(
     if budget is None:
         return args.sv
     name, option, values = budget
-    whole, calibration = (
-        [camera for camera in cameras if isinstance(camera, Camera)],
-        model.calibration,
-    )
+    renderable = [camera for camera in cameras if isinstance(camera, Camera)]
+    calibration = model.calibration
     times, machine = None, ""
-    if name == "fps" and whole:
+    if name == "fps" and renderable:
         prepare_kernels(console, model.gaussians.means.device, training=False)
         with console.meter("timing") as meter:
-            times, notes = frame_times(model.gaussians, whole, progress=meter)
+            times, notes = frame_times(model.gaussians, renderable, progress=meter)
         (first, slow), (last, fast) = times[0], times[-1]
         console.note(
             f"frames timed here: {slow:.1f} ms at s = {first:g}, {fast:.1f} ms at s = {last:g}",

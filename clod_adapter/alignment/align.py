@@ -27,10 +27,18 @@ WORDS = {
 
 
 def align(
-    checkpoint: Checkpoint, scene: Scene, note: Note, *, required: bool
+    checkpoint: Checkpoint,
+    scene: Scene,
+    note: Note,
+    *,
+    required: bool,
+    override: str = "pass misaligned_ok=True",
 ) -> tuple[Scene, dict[str, Any]]:
     """The scene with its cameras in the checkpoint's frame, if that fits clearly; and measurements
     for the report.
+
+    Args:
+        override: how the user says that a fit is not ``required``, for the error.
 
     Raises:
         ClodError: the checkpoint fits in no frame, and that is ``required``; if not, there is a
@@ -43,7 +51,7 @@ def align(
     elif guess or not found.fits:
         message = f"{ply}: does not match {images}: {mismatch(found, guess)}"
         if required:
-            raise ClodError(f"{message}; use --misaligned-ok to train anyway")
+            raise ClodError(f"{message}; {override} to train anyway")
         note(f"warning: {message}")
     elif required and not found.views:
         note(f"warning: the photographs in {images}, to train on, have a single colour each")
@@ -102,9 +110,13 @@ def mismatch(found: Alignment, guess: Guess | None) -> str:
     return f"{facts}; give the checkpoint of this scene, in the cameras' frame"
 
 
-def detect_filter(checkpoint: Checkpoint, views: Sequence[View], note: Note) -> Checkpoint:
+def detect_filter(
+    checkpoint: Checkpoint, views: Sequence[View], note: Note, option: str = ""
+) -> Checkpoint:
     """The checkpoint with its file's screen-space filter; if that has none, with the one that fits
     ``views`` best.
+
+    ``option`` is one of the command line that overrides this, for the note.
     """
     if checkpoint.filter_known or not views:
         return checkpoint
@@ -114,5 +126,6 @@ def detect_filter(checkpoint: Checkpoint, views: Sequence[View], note: Note) -> 
     if name != expected:
         found = ", ".join(f"{psnr[each]:.2f} dB {WORDS[each]}" for each in (name, expected))
         trained = f"{checkpoint.path}: by the photographs it was trained {WORDS[name]}: {found}"
-        note(f"{trained}; rendered so (--antialiasing {expected} overrides it)")
+        override = f" ({option} {expected} overrides it)" if option else ""
+        note(f"{trained}; rendered so{override}")
     return replace(checkpoint, gaussians=gaussians.replace(screen_filter=FILTERS[name]))

@@ -78,6 +78,11 @@ def dial_for(
         ClodError: not exactly one budget, a budget that is not positive, no dial, no data for the
             budget, or one that no dial value reaches, or of a frame rate the largest trained one;
             the message gives its value there.
+
+    Example:
+        >>> model = clod.load("model.ply")
+        >>> dial = clod.dial_for(model.gaussians, keep=2000, cameras=model.viewpoints)
+        >>> print(dial.virtual_scale, dial.note)
     """
     budgets = {"keep": keep, "psnr_drop": psnr_drop, "fps": fps}
     given = {name: value for name, value in budgets.items() if value is not None}

@@ -89,9 +89,8 @@ def _interest(view: View) -> float:
     the mean difference of neighbouring blocks of BLOCK pixels.
     """
     image = view.image.float().mean(2)
-    detail, coarse = (
-        _change(pixels) for pixels in (image, avg_pool2d(image[None], min(BLOCK, *image.shape))[0])
-    )
+    detail = _change(image)
+    coarse = _change(avg_pool2d(image[None], min(BLOCK, *image.shape))[0])
     return float(image.std()) * detail**2 / max(coarse, 1e-6)
 
 

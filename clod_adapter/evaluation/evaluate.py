@@ -67,6 +67,11 @@ def evaluate(
 
     Raises:
         ClodError: no views, no dial values, or one below 1 or not finite.
+
+    Example:
+        >>> model, scene = clod.load("model.ply"), clod.load_scene("scene")
+        >>> for row in clod.evaluate(model.gaussians, scene.test, [1, 3]):
+        ...     print(row.virtual_scale, row.psnr, row.kept)
     """
     views = [views] if isinstance(views, View) else views
     virtual_scales = list(np.atleast_1d(virtual_scales))

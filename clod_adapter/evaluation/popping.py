@@ -138,10 +138,8 @@ def path(cameras: Sequence[Camera], steps: int) -> list[Camera]:
     require(steps >= 2, "steps", steps, "at least 2")
     if len(cameras) < 2:
         raise ClodError(f"a camera path needs at least two cameras, not {len(cameras)}")
-    first, viewmats = (
-        cameras[0],
-        torch.stack([camera.viewmat.detach().double().cpu() for camera in cameras]).numpy(),
-    )
+    first = cameras[0]
+    viewmats = np.stack([camera.viewmat.detach().double().cpu().numpy() for camera in cameras])
     centres = -np.einsum("nji,nj->ni", viewmats[:, :3, :3], viewmats[:, :3, 3])
     lengths = np.linalg.norm(np.diff(centres, axis=0), axis=1)
     lengths = np.maximum(lengths, 1e-9 * lengths.sum() or 1.0)

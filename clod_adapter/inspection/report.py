@@ -4,6 +4,7 @@ out.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -88,10 +89,8 @@ def inspect(path: str | Path) -> Inspection:
             part = {name: rows.arrays[name][rows.keep] for name in ("means", "sigma_d")}
             notes += plausibility(part, metadata.attenuation)
         notes += mismatch
-    degree, encoding = (
-        next(d for d, n in SH_COUNTS.items() if n == rows.arrays["shN"].shape[1] + 1),
-        "",
-    )
+    degree = math.isqrt(rows.arrays["shN"].shape[1])
+    encoding = ""
     columns: tuple[tuple[str, str], ...] = ()
     if head:
         columns = tuple(
@@ -241,58 +240,46 @@ def left_out_of(splat: Splat, notes: Sequence[str], changes: Sequence[str]) -> t
 
 def _inspect_tensors(path: Path) -> Inspection | None:
     """Inspects an adapter or a state; None where it is neither."""
+    from clod_adapter.adapter import kind_of
     from clod_adapter.io.adapter_file import load_adapter
     from clod_adapter.io.file_formats import KEY
     from clod_adapter.io.tensor_file import read_tensor_header
     from clod_adapter.training.state import KEY as STATE_KEY
     from clod_adapter.training.state import load_state
 
-    metadata, size = read_tensor_header(path)[1], path.stat().st_size
+    metadata = read_tensor_header(path)[1]
+    writer, notes = None, tuple[str, ...]()
+    about: dict[str, Any]
     if STATE_KEY in metadata:
+        what = "the state of an interrupted run, for --resume"
         state, belongs = load_state(path)
-        count = next((len(t) for t in state.tensors.values() if t.ndim), 0)
         about = {
             "kind": "state",
             "writer": None,
-            "count": count,
+            "count": next((len(t) for t in state.tensors.values() if t.ndim), 0),
             "steps": state.steps,
             "seconds": state.seconds,
             "loss": state.loss,
             "belongs": belongs,
             "attenuation": state.attenuation,
         }
-        return Inspection(
-            str(path), size, "the state of an interrupted run, for --resume", None, (), about=about
-        )
-    if KEY not in metadata or f'"{ADAPTER}"' not in metadata[KEY]:
-        return None
-    adapter = load_adapter(path)
-    kinds = {
-        name: f"{str(t.dtype).removeprefix('torch.')} {list(t.shape)}"
-        for name, t in adapter.updates.items()
-    }
-    growth = None if adapter.growth_d is None else Spread.of(adapter.growth_d.numpy())
-    writer, what = (
-        f"clod-adapter {adapter.version}",
-        "an adapter: what clod-adapt learned, without its checkpoint",
-    )
-    return Inspection(
-        str(path),
-        size,
-        what,
-        writer,
-        adapter.notes,
-        about={
+    elif f'"{ADAPTER}"' in metadata.get(KEY, ""):
+        what = "an adapter: what clod-adapt learned, without its checkpoint"
+        adapter = load_adapter(path)
+        writer, notes = f"clod-adapter {adapter.version}", adapter.notes
+        about = {
             "kind": "adapter",
             "writer": writer,
             "count": len(adapter.sigma_d),
             "base": adapter.base_fingerprint,
             "attenuation": adapter.attenuation,
             "config": adapter.config,
-            "updates": kinds,
+            "updates": {name: kind_of(update) for name, update in adapter.updates.items()},
             "origin": list(adapter.origin),
             "sigma": Spread.of(adapter.sigma_d.numpy()),
-            "growth": growth,
+            "growth": None if adapter.growth_d is None else Spread.of(adapter.growth_d.numpy()),
             "calibration": adapter.calibration,
-        },
-    )
+        }
+    else:
+        return None
+    return Inspection(str(path), path.stat().st_size, what, writer, notes, about=about)

@@ -98,9 +98,7 @@ def write_page(
     few = dict.fromkeys(round(k * (len(frames) - 1) / 3) for k in range(4))
     strip = [*others.values(), *(frames[k] for k in few)] if frames else []
     source = files("clod_adapter.report")
-    template, style, script = (
-        (source / n).read_text("utf-8") for n in ("page.html", "style.css", "dial.js")
-    )
+    template = (source / "page.html").read_text("utf-8")
     page = (
         jinja2.Environment(autoescape=True)
         .from_string(template)
@@ -120,8 +118,8 @@ def write_page(
             settings=settings,
             charts={name: partial(charts.inline_svg, draw, name) for name, draw in draws.items()},
             data=script_json({"report": report, "training": training}),
-            style=style,
-            script=script,
+            style=(source / "style.css").read_text("utf-8"),
+            script=(source / "dial.js").read_text("utf-8"),
         )
     )
     outputs = {name: charts.chart_file(path, name) for name in draws}

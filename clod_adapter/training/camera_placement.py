@@ -74,6 +74,11 @@ def place_cameras(
     Raises:
         ClodError: no Gaussian is visible and finite, or no camera sees anything.
         Stopped: ``progress`` returned False.
+
+    Example:
+        >>> base = clod.load("base.ply")
+        >>> cameras = clod.place_cameras(base.gaussians, views=8)
+        >>> image = clod.render(base.gaussians, cameras[0]).image
     """
     require(views is None or views >= 1, "views", views, "at least 1")
     placement = _Placement(detach(gaussians), seed, field, progress)
@@ -108,11 +113,9 @@ class _Placement:
         footprint = _quantile(sizes, SMALL) * WIDTH * self.zoom / SMALL_PIXELS
         from_centre = (means - means.median(0).values).norm(dim=1)
         self.reach = min(footprint, FAR * _quantile(from_centre, 0.5)) or footprint
-        self.generator, self.progress, self.judged = (
-            torch.Generator().manual_seed(seed),
-            progress,
-            0,
-        )
+        self.generator = torch.Generator().manual_seed(seed)
+        self.progress = progress
+        self.judged = 0  # candidates so far
         # Each row stands for growth^2 of the checkpoint's.
         self.weight = (
             self.few.opacities if self.growth is None else self.few.opacities * self.growth**2

@@ -152,14 +152,12 @@ class Dial(nn.Module):
                 raise ClodError(f"no splat requires a gradient: {remedy}")
             # growth_d is the dial's own
             found |= {name: value for name, value in tuned.items() if name not in found}
-        named = [
-            (name, value, rates.get(ATTRIBUTE_OF.get(name, name))) for name, value in found.items()
-        ]
-        return [
-            {"params": [value], "lr": rate, "name": name}
-            for name, value, rate in named
-            if rate is not None
-        ]
+        groups = []
+        for name, value in found.items():
+            rate = rates.get(ATTRIBUTE_OF.get(name, name))
+            if rate is not None:
+                groups.append({"params": [value], "lr": rate, "name": name})
+        return groups
 
     def sample(self) -> float:
         """The next dial value, by ``schedule`` over ``config.steps`` calls.
@@ -169,10 +167,9 @@ class Dial(nn.Module):
         meet the same dial values each round.
         """
         self.clamp()
+        number = self._sampled
         self._sampled += 1
-        return self.sampler.dial(
-            self._sampled - 1, min((self._sampled - 1) / max(self.config.steps, 1), 1.0)
-        )
+        return self.sampler.dial(number, min(number / max(self.config.steps, 1), 1.0))
 
     def forward(self, camera: Camera, virtual_scale: float) -> Attenuated:
         """The opacities ``drawn [N]`` and the factor ``growth [N]`` of the scales, for one camera
@@ -301,6 +298,13 @@ def attach(
 
     Raises:
         ClodError: as ``adapt``; or the config has the paper's form.
+
+    Example:
+        >>> base, scene = clod.load("base.ply"), clod.load_scene("scene")
+        >>> dial = clod.attach(base.gaussians, scene, max_sv=5)
+        >>> optimizer = torch.optim.Adam(dial.param_groups())
+        >>> s = dial.sample()
+        >>> attenuated = dial(scene.train[0].camera, s)  # rasterize, then dial.loss(s, loss)
     """
     config = replace(config or AdaptConfig(), **settings)
     if config.form != "ours":

@@ -81,6 +81,12 @@ def adapt(
             fit or is damaged (StateRefused), fewer views a step than processes, or a process was
             lost before the first step.
         Stopped: ``progress`` returned False before training.
+
+    Example:
+        >>> base = clod.load("base.ply")
+        >>> scene = clod.load_scene("scene", origin=base.origin)
+        >>> adapted = clod.adapt(base.gaussians, scene, max_sv=5)
+        >>> clod.save("model.ply", adapted.gaussians, base)
     """
     config = replace(config or AdaptConfig(), **settings)
     config = config.for_views(len(scene.train))

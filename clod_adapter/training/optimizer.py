@@ -125,10 +125,8 @@ class RowAdam:
         for name, parameter in self.parameters.items():
             values = (parameter, *(each[name] for each in self.moments.values()))
             x, first, second = (each.view(len(each), math.prod(each.shape[1:])) for each in values)
-            gradient, lengths = (
-                gradients[name].reshape(x.shape),
-                length * self._units[name][:, None],
-            )
+            gradient = gradients[name].reshape(x.shape)
+            lengths = length * self._units[name][:, None]
             m = self.beta1 * first + (1 - self.beta1) * gradient
             v = self.beta2 * second + (1 - self.beta2) * gradient * gradient
             moved = x - rates[name] * lengths * m / (v.sqrt() * correction + self.epsilon)

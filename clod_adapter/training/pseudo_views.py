@@ -90,6 +90,11 @@ def render_pseudo_views(
     Args:
         gaussians: the teacher, rendered at s = 1.
         progress: called in ``Phase.PSEUDO_VIEWS`` after each view that is held out.
+
+    Example:
+        >>> base = clod.load("base.ply")
+        >>> cameras = clod.place_cameras(base.gaussians)
+        >>> scene = clod.render_pseudo_views(base.gaussians, cameras)
     """
     teacher = gaussians.without_empty_bands()
     held_out = range(0, len(cameras), TEST_EVERY) if len(cameras) > 1 else range(0)
@@ -131,6 +136,11 @@ def add_pseudo_views(
 
     They hold what the photographs do not show: fine-tuned on 33 photographs alone a checkpoint lost
     0.8 dB on others.
+
+    Example:
+        >>> base, scene = clod.load("base.ply"), clod.load_scene("scene")
+        >>> more = clod.add_pseudo_views(base.gaussians, scene)
+        >>> print(len(scene.train), len(more.train), more.notes)
     """
     photographs = scene.train
     if not 0 < len(photographs) < MANY:

@@ -83,10 +83,8 @@ class Trainer:
         self.sampler, self.screen_filter = self.dial.sampler, start.screen_filter
         self.sampler.views = views
         # Of culled Gaussians too the count term has a gradient.
-        everywhere, parts = (
-            {self.dial.decay, *self.dial.everywhere},
-            {"kept": dict[str, Tensor](), "all": {}},
-        )
+        everywhere = {self.dial.decay, *self.dial.everywhere}
+        parts = {"kept": dict[str, Tensor](), "all": {}}
         for name, value in self.trained().items():
             parts["all" if name in everywhere else "kept"][name] = value
         beta1, beta2 = BETA1**config.batch, BETA2**config.batch
@@ -224,12 +222,11 @@ class Trainer:
         self.sampler.restore(state.random, state.order)
         for name, tensor in own.items():
             tensor.copy_(state.tensors[name])
-        self.loss, self.averaged = state.loss, state.averaged
-        self.done, self.seconds, self.start_seconds = (
-            state.steps,
-            state.seconds,
-            state.start_seconds,
-        )
+        self.loss = state.loss
+        self.averaged = state.averaged
+        self.done = state.steps
+        self.seconds = state.seconds
+        self.start_seconds = state.start_seconds
         require_finite(self.gaussians(), "the training state", "start over")
 
     def gaussians(self) -> Gaussians:

@@ -191,12 +191,10 @@ def write_viewer_page(
     ``virtual_scale`` is as in ``page_config``; ``exact`` includes float32, not SPZ. Returns the
     Gaussians as the page shows them, and a line for each loss.
     """
-    shown, placed, payload = (
-        cameras or model.cameras,
-        model.placed and not cameras,
-        Payload.of(model),
-    )
-    entries = [camera_entry(each, placed) for each in shown]
+    payload = Payload.of(model)
+    placed = model.placed and not cameras
+    cameras = cameras or model.cameras
+    entries = [camera_entry(camera, placed) for camera in cameras]
     config = page_config([{"name": payload.name, "element": ELEMENT}], None, entries, virtual_scale)
     with atomic_path(path) as temporary:
         if exact:
@@ -204,7 +202,7 @@ def write_viewer_page(
         else:
             data, found, notes = payload.packed(f"{temporary}.spz")
         opening = virtual_scale if virtual_scale is not None else 0.0 if placed else 1.0
-        poster = _poster(found, shown[0], opening) if shown else ""
+        poster = _poster(found, cameras[0], opening) if cameras else ""
         meta = f'<meta http-equiv="Content-Security-Policy" content="{policy()}">\n'
         with open(temporary, "wb") as file:
             file.writelines(document(config, _elements(data), meta, poster))
