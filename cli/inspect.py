@@ -97,8 +97,8 @@ def splat_lines(splat: Splat) -> list[str]:
         if each is not None
     ]
     lines += ["", *spread_table(rows), ""]
-    faint = f"{splat.fainter_than_visible:.1%} fainter than 1/255"
-    lines.append(_line("shares", f"{faint}; {splat.needles:.1%} needles"))
+    shares = f"{splat.fainter_than_visible:.1%} fainter than 1/255; {splat.needles:.1%} needles"
+    lines.append(_line("shares", shares))
     if splat.dial is None:
         return [*lines, _line("dial", "none: no sigma_d")]
     lines.append(_line("dial", f"{splat.dial_columns}, {_settings(splat.dial.attenuation)}"))

@@ -15,7 +15,7 @@ from clod_adapter.config import CLASSIC, AttenuationConfig, ScreenFilter, requir
 from clod_adapter.equation.attenuation import SIGMA_MAX
 from clod_adapter.equation.units import in_world_units
 from clod_adapter.errors import ClodError
-from clod_adapter.gaussians import Gaussians, with_near
+from clod_adapter.gaussians import Gaussians, describe_dial, with_near
 from clod_adapter.origin import NOWHERE, Origin
 
 HALF_ERROR = 2e-3  # the rounding that a difference may suffer, as a share of the largest
@@ -106,12 +106,9 @@ class Adapter:
             )
 
     def __repr__(self) -> str:
-        dial = (
-            f"dial to {self.attenuation.max_sv:g}{'' if self.growth_d is None else ' with growth'}"
-        )
+        updates = ", ".join(self.updates) or "nothing"
         return (
-            f"Adapter({len(self.sigma_d):,} Gaussians, {dial}, updates of"
-            f" {', '.join(self.updates) or 'nothing'})"
+            f"Adapter({len(self.sigma_d):,} Gaussians, {describe_dial(self)}, updates of {updates})"
         )
 
     @property

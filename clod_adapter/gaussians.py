@@ -6,6 +6,7 @@ import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -165,12 +166,7 @@ class Gaussians:
     @property
     def summary(self) -> str:
         """``120,000, SH degree 3, dial to 5 with growth``."""
-        dial = "no dial"
-        if self.attenuation is not None:
-            dial = (
-                "dial to"
-                f" {self.attenuation.max_sv:g}{'' if self.growth_d is None else ' with growth'}"
-            )
+        dial = "no dial" if self.attenuation is None else describe_dial(self)
         count = (
             f"{len(self):,}"
             if self.near is None
@@ -233,6 +229,12 @@ class Gaussians:
     def cpu(self) -> Gaussians:
         """A copy in main memory."""
         return self.to("cpu")
+
+
+def describe_dial(owner: Any) -> str:
+    """``dial to 5 with growth``, of Gaussians or an adapter."""
+    growth = "" if owner.growth_d is None else " with growth"
+    return f"dial to {owner.attenuation.max_sv:g}{growth}"
 
 
 class LossNotFinite(Exception):

@@ -22,6 +22,11 @@ def psnr(image: Tensor, target: Tensor) -> float:
     is NaN.
     """
     error = float((image.detach().clamp(0, 1) - unit(target, image)).double().square().mean())
+    return decibels(error)
+
+
+def decibels(error: float) -> float:
+    """PSNR in dB of a mean squared error of colours in [0, 1]."""
     return math.inf if error == 0 else -10 * math.log10(error)
 
 

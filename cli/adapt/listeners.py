@@ -25,10 +25,6 @@ SAVE_EVERY, OLDEST = 5.0, 50.0
 SAVE_COST, MOST_COST = 0.015, 0.2
 
 
-def settings_key(config: AdaptConfig) -> dict[str, Any]:
-    return {"version": package_version(), "config": asdict(config)}
-
-
 class Saver:
     """Saves the training state of one run; finds that of an earlier one, of the same settings, with
     ``resume``.
@@ -40,7 +36,7 @@ class Saver:
         self, path: Path, config: AdaptConfig, console: Console, stop: GracefulStop, resume: bool
     ) -> None:
         self.path, self.console, self.stop = path, console, stop
-        self.run_of = settings_key(config)
+        self.run_of: dict[str, Any] = {"version": package_version(), "config": asdict(config)}
         self.state: TrainingState | None = None  # the one to resume from
         # the step that is in the file; None if the file is not of this run
         self.saved: int | None = None

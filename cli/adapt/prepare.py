@@ -113,17 +113,14 @@ class Run:
         self.saver.identify(
             self.args.ply,
             self.args.images or "the pseudo views",
-            base_sha256=self.checkpoint(),
+            # the Gaussians depend on the options for reading too
+            base_sha256=f"{self.base.fingerprint}, {self.base.gaussians.screen_filter}",
             views_sha256=scene_fingerprint(self.scene),
             overruled={
                 "--with": sorted(self.args.keep_in),
                 "--without": sorted(self.args.leave_out),
             },
         )
-
-    def checkpoint(self) -> str:
-        """Identifies the Gaussians, which depend on the options for reading too."""
-        return f"{self.base.fingerprint}, {self.base.gaussians.screen_filter}"
 
     def measure_base(self) -> None:
         """Measures the base on the held-out views."""

@@ -63,13 +63,9 @@ def train(run: Run, page: AdaptPage | None) -> tuple[Plan, Adapted]:
     with closing(display), together(plan, scene, saver.state, display) as group:
         adapted = plan.adapt(scene, saver.saving(show), saver.state, group)
     saver.keep()
-    how = (
-        "ended after"
-        if adapted.failed
-        else "interrupted after"
-        if adapted.interrupted
-        else "trained"
-    )
+    how = "trained"
+    if adapted.interrupted:
+        how = "ended after" if adapted.failed else "interrupted after"
     run.console.say(f"{how} {adapted.steps} steps, {duration(adapted.seconds)}")
     release()
     return plan, adapted

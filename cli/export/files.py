@@ -150,8 +150,10 @@ class Export:
                 return cameras, f"{len(cameras)} training cameras"
             found = inputs.named(cameras, args.camera, "--camera")
             if len(found) > 1:
-                both = f"{found[0].name} and {found[1].name}"
-                raise ClodError(f"--camera: {args.camera!r} matches {both}; give the full name")
+                raise ClodError(
+                    f"--camera: {args.camera!r} matches {found[0].name} and {found[1].name}; give"
+                    " the full name"
+                )
             self.camera = found[0]
             return found, "one camera"
         if model.viewpoints:
@@ -163,8 +165,10 @@ class Export:
             raise ClodError(
                 f"{model.path}: no cameras stored to bake for, and {error}; give --images"
             ) from error
-        placed = f"baked for {len(cameras)} placed ones; --images gives a better result"
-        self.console.note(f"{model.path} stores no cameras: {placed}")
+        self.console.note(
+            f"{model.path} stores no cameras: baked for {len(cameras)} placed ones; --images gives"
+            " a better result"
+        )
         return cameras, f"{len(cameras)} placed cameras"
 
     def _reduce_sh_degree(self, sh_degree: int) -> None:
@@ -178,12 +182,11 @@ class Export:
             )
             return
         inputs.prepare_kernels(self.console, before.means.device, training=False)
-        found = self._agreement(after, before)
-        about = (
-            f"--sh-degree {sh_degree}: renders have a PSNR of {found:.1f} dB against those with"
-            " degree"
+        self.console.note(
+            f"--sh-degree {sh_degree}: renders have a PSNR of"
+            f" {self._agreement(after, before):.1f} dB against those with degree"
+            f" {before.sh_degree} (fitted to {self.about})"
         )
-        self.console.note(f"{about} {before.sh_degree} (fitted to {self.about})")
         self.model = replace(self.model, gaussians=after, vertex=None)
 
     def _agreement(self, shown: Gaussians, exact: Gaussians) -> float:
@@ -313,9 +316,11 @@ class Export:
         if self.args.exact:
             return
         with self.console.status("comparing with the exact values ..."):
-            found = self._agreement(shown, self.gaussians)
-        about = f"renders of the page have a PSNR of {found:.1f} dB against the exact file (s = 1)"
-        self.console.note(f"{about}; --exact keeps all digits")
+            agreement = self._agreement(shown, self.gaussians)
+        self.console.note(
+            f"renders of the page have a PSNR of {agreement:.1f} dB against the exact file (s = 1);"
+            " --exact keeps all digits"
+        )
 
     def _transform(self, words: list[str | Path], out: Path, count: int) -> None:
         tool = splat_transform.SplatTransform.find()

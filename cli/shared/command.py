@@ -188,7 +188,8 @@ def as_option(name: str) -> str:
 def initial_dial(virtual_scale: float, dial: AttenuationConfig | None, console: Console) -> float:
     """The initial dial value of a page."""
     if dial is None:
-        console.note(*[f"no sigma_d, so s = {virtual_scale:g} has no effect"] * (virtual_scale > 1))
+        if virtual_scale > 1:
+            console.note(f"no sigma_d, so s = {virtual_scale:g} has no effect")
         return 1.0
     if virtual_scale > dial.max_sv:
         console.note(
@@ -271,8 +272,9 @@ SETTINGS: dict[str, tuple[str, Any, str | None]] = {
 def add_settings(options: _ActionsContainer, without: Sequence[str] = ()) -> None:
     """Adds the options except the fields in ``without``, which a command has in another form."""
     helps, defaults = field_descriptions(AdaptConfig), AdaptConfig()
-    for name in [name for name in SETTINGS if name not in without]:
-        metavar, kind, shown = SETTINGS[name]
+    for name, (metavar, kind, shown) in SETTINGS.items():
+        if name in without:
+            continue
         default = getattr(defaults, name) if shown is None else None
         text = helps[name] + (shown or ("" if default is None else f" (default: {default:g})"))
         options.add_argument(

@@ -142,8 +142,10 @@ def with_filter(
             return detect_filter(checkpoint, views, console.note, "--antialiasing")
     stored = gaussians.screen_filter
     if checkpoint.filter_known and FILTERS[name] != stored:
-        had = f"the file has {stored.description}"
-        console.note(f"{checkpoint.path}: rendered {WORDS[name]} (--antialiasing); {had}")
+        console.note(
+            f"{checkpoint.path}: rendered {WORDS[name]} (--antialiasing); the file has"
+            f" {stored.description}"
+        )
     return replace(checkpoint, gaussians=gaussians.replace(screen_filter=FILTERS[name]))
 
 

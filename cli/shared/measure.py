@@ -108,12 +108,10 @@ def measure(
     """The rows of the dial values; those that were finished when ``stop`` heard a signal, none
     without views.
     """
+    if stop.requests or not views:
+        return []
     with console.meter(label) as meter:
-        return (
-            evaluate(gaussians, views, dials, progress=stop.heeding(meter))
-            if views and not stop.requests
-            else []
-        )
+        return evaluate(gaussians, views, dials, progress=stop.heeding(meter))
 
 
 def comparable(

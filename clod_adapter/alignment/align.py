@@ -92,10 +92,9 @@ def mismatch(found: Alignment, guess: Guess | None) -> str:
     share = f"{found.in_view:.2g}" if 0 < found.in_view < 0.01 else f"{found.in_view:.0%}"
     facts = f"{share} of its Gaussians are in view"
     if found.views:
-        mean = f"their mean colours {found.mean_colour_psnr:.1f} dB"
         facts = (
-            f"renders have a PSNR of {found.psnr:.1f} dB against {found.views} photographs, {mean};"
-            f" {facts}"
+            f"renders have a PSNR of {found.psnr:.1f} dB against {found.views} photographs, their"
+            f" mean colours {found.mean_colour_psnr:.1f} dB; {facts}"
         )
     if found.on_white:
         return (

@@ -19,7 +19,7 @@ from clod_adapter.cameras import View, spread
 from clod_adapter.config import FILTERS
 from clod_adapter.equation.distances import in_frustum
 from clod_adapter.gaussians import Gaussians
-from clod_adapter.losses import unit
+from clod_adapter.losses import decibels, unit
 from clod_adapter.render import render
 
 MOST_VIEWS = 8
@@ -100,9 +100,9 @@ def check_alignment(gaussians: Gaussians, views: Sequence[View]) -> Alignment:
     return Alignment(
         views=len(table),
         in_view=in_view,
-        psnr=_decibels(error),
-        mean_colour_psnr=_decibels(constant),
-        white_psnr=_decibels(over_white),
+        psnr=decibels(error),
+        mean_colour_psnr=decibels(constant),
+        white_psnr=decibels(over_white),
         correlation=correlation(table),
         explained=float((table[:, 0] < table[:, 2]).float().mean()),
     )
@@ -135,10 +135,6 @@ def correlation(table: Tensor) -> float:
     """Of renders and photographs in ``compare_renders``, in [-1, 1]; 0 without any."""
     constant, rendered, shared = table.mean(0).tolist()[2:]
     return shared / math.sqrt(constant * rendered) if rendered > 0 else 0.0
-
-
-def _decibels(error: float) -> float:
-    return math.inf if error == 0 else -10 * math.log10(error)
 
 
 @torch.no_grad()

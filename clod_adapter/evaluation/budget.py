@@ -122,7 +122,7 @@ def dial_for_times(times: Sequence[tuple[float, float]], fps: float) -> DialValu
     """The smallest dial value from which frames take at most ``1000 / fps`` ms, by (dial value, ms)
     that ascend.
     """
-    dials, taken = [s for s, _ in times], [ms for _, ms in times]
+    dials, taken = zip(*times, strict=True)
     found = crossing(dials, taken, 1e3 / fps)
     if found is None:
         raise ClodError(
@@ -209,8 +209,10 @@ def _for_count(
             largest *= 2
             fewest = count(largest)
         if fewest > wanted:
-            remain = f"{fewest / len(views):,.0f} remain at any dial value"
-            raise ClodError(f"{keep:,.0f} Gaussians are out of reach: {remain}")
+            raise ClodError(
+                f"{keep:,.0f} Gaussians are out of reach: {fewest / len(views):,.0f} remain at any"
+                " dial value"
+            )
     if config.form == "ours" and gaussians.near is None:
         assert gaussians.sigma_d is not None
         pools = []  # of those that are culled within the range of the dial

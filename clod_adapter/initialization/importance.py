@@ -166,8 +166,10 @@ def removal_error(
         total += (gradient * opacities.detach()).square()
         tell(progress, Phase.IMPORTANCE, done, len(views))
     if (bad := bad_rows(total)) is not None:
-        much = f"the image error of removing each of {int(bad.sum()):,} Gaussians is not finite"
-        raise ClodError(f"{much}; {largest_colour(gaussians)}")
+        raise ClodError(
+            f"the image error of removing each of {int(bad.sum()):,} Gaussians is not finite;"
+            f" {largest_colour(gaussians)}"
+        )
     return total / max(len(views), 1)
 
 

@@ -34,6 +34,7 @@ from clod_adapter.nerfstudio.splatfacto import (
     new_dial,
     shown,
     state_of,
+    trained_rates,
     write_ply,
 )
 from clod_adapter.training.dial import Dial
@@ -99,9 +100,9 @@ class ClodSplatfactoModel(SplatfactoModel):  # type: ignore[misc]
         own = self.config
         config = AdaptConfig(max_sv=own.max_sv, exponent=own.exponent, ssim_weight=own.ssim_lambda)
         self.dial = new_dial(self.gauss_params, cameras, config, saved).to(self.device)
-        groups = {group["name"] for group in self.dial.param_groups(splats=True) if group["lr"] > 0}
+        rates = trained_rates(self.dial)
         for name, parameter in self.gauss_params.items():
-            parameter.requires_grad_(name in groups)
+            parameter.requires_grad_(name in rates)
 
     @property
     def means(self) -> Tensor:
@@ -155,14 +156,11 @@ class ClodPipeline(VanillaPipeline):  # type: ignore[misc]
     """
 
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
-        saved = {
-            name.removeprefix(OWN): value
-            for name, value in loaded_state.items()
-            if name.startswith(OWN)
-        }
-        super().load_pipeline(
-            {name: value for name, value in loaded_state.items() if not name.startswith(OWN)}, step
-        )
+        others, saved = dict[str, Any](), dict[str, Any]()
+        for name, value in loaded_state.items():
+            part = saved if name.startswith(OWN) else others
+            part[name.removeprefix(OWN)] = value
+        super().load_pipeline(others, step)
         cameras = self.datamanager.train_dataset.cameras
         self.model.attach([camera_of(cameras[i : i + 1]) for i in range(len(cameras))], saved)
         self._export_with_dial()
@@ -214,14 +212,11 @@ class ClodTrainer(Trainer):  # type: ignore[misc]
         dial = self.pipeline.model.dial
         if dial is None:  # before the checkpoint is loaded
             return Optimizers({}, {})
-        rates = {
-            group["name"]: group["lr"]
-            for group in dial.param_groups(splats=True)
-            if group["lr"] > 0
-        }
         steps, final = self.config.max_num_iterations, OURS.lr_final
-        own = {name: decaying(rate, final * rate, steps) for name, rate in rates.items()}
-        return Optimizers(self.config.optimizers | own, self.pipeline.get_param_groups())
+        optimizers = {
+            name: decaying(rate, final * rate, steps) for name, rate in trained_rates(dial).items()
+        }
+        return Optimizers(self.config.optimizers | optimizers, self.pipeline.get_param_groups())
 
     def _load_checkpoint(self) -> None:
         """Of splatfacto: its Gaussians, for a new dial from step 0. Of this method: everything,

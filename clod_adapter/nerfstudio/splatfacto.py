@@ -102,6 +102,12 @@ def state_of(dial: Dial) -> dict[str, Any]:
     return {**dial.state_dict(), SETTINGS: asdict(dial.attenuation)}
 
 
+def trained_rates(dial: Dial) -> dict[str, float]:
+    """Those of the parameters, of splats and dial, that are trained."""
+    groups = dial.param_groups(splats=True)
+    return {group["name"]: group["lr"] for group in groups if group["lr"] > 0}
+
+
 def chosen(default: float) -> float:
     """The dial value of ``CLOD_VIRTUAL_SCALE``, or the default."""
     text = os.environ.get(VIRTUAL_SCALE, "")

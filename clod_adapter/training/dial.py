@@ -9,7 +9,6 @@ and prune before.
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import torch
@@ -88,7 +87,7 @@ class Dial(nn.Module):
         if start.near is not None:
             self.schedule, config = FAR, replace(config, start_share=1.0)
             self.trained, self.total = len(start) - start.whole, start.whole
-        self._target = partial(target_share, count=self.trained, config=config, total=self.total)
+        self._counted = config
         self.register_parameter(self.decay, nn.Parameter(self.parameter_of(start.sigma_d)))
         growth_d = start.growth_d
         self.growth_d = (
@@ -148,8 +147,10 @@ class Dial(nn.Module):
                 name: value for name, value in own.items() if getattr(value, "requires_grad", False)
             }
             if not tuned:
-                remedy = "attach copies with requires_grad_(), or leave out splats=True"
-                raise ClodError(f"no splat requires a gradient: {remedy}")
+                raise ClodError(
+                    "no splat requires a gradient: attach copies with requires_grad_(), or leave"
+                    " out splats=True"
+                )
             # growth_d is the dial's own
             found |= {name: value for name, value in tuned.items() if name not in found}
         groups = []
@@ -243,14 +244,14 @@ class Dial(nn.Module):
         """``[trained]`` the count term's gradient of ``log_sigma`` at one dial value, of the
         trained rows.
         """
-        sigma, target = self.sigma_of(parameter), self._target(virtual_scale)
+        sigma, target = self.sigma_of(parameter), self.target_share(virtual_scale)
         return count_gradient(self.typical, sigma, virtual_scale, loss, self.config, target)
 
     def target_share(self, virtual_scale: float) -> float:
         """The share of the splats that the target-count curve keeps at s, in (0, 1]; 1 below
         s = 1.
         """
-        return self._target(virtual_scale)
+        return target_share(virtual_scale, self.trained, self._counted, self.total)
 
     def gaussians(self) -> Gaussians:
         """The splats with this dial, for ``render`` in the loop and ``save`` after it: gradients
@@ -263,8 +264,10 @@ class Dial(nn.Module):
         current = given if isinstance(given, Gaussians) else from_gsplat(given)
         count = len(getattr(self, self.decay))
         if len(current) != count:
-            now = f"there are {len(current)} splats now, but the dial is for {count}"
-            raise ClodError(f"{now}; attach it after densification and pruning")
+            raise ClodError(
+                f"there are {len(current)} splats now, but the dial is for {count}; attach it after"
+                " densification and pruning"
+            )
         return current.replace(
             sigma_d=self.sigma_d, attenuation=self.attenuation, growth_d=self.growth_d
         )

@@ -98,15 +98,15 @@ def adapt(
     with shown(False if progress is None and group and group.rank else progress) as listener:
         # for a resumed run too, the same again
         begun = _initialized(lean, views, config, listener, group)
-        trainer = Trainer(begun, views, config, group)
-        trainer.empty_sh = None if lean is base else base.shN.clone()
+        empty_sh = None if lean is base else base.shN.clone()
+        trainer = Trainer(begun, views, config, group, empty_sh)
         trainer.start_seconds = time.perf_counter() - began
         if resume is not None:
             try:
                 trainer.restore(resume)
             except ClodError as error:
                 raise StateRefused(str(error)) from error
-        del resume, begun, base, lean  # the trainer has copies
+        del resume, begun, base, lean, empty_sh  # the trainer has copies
         return _train(trainer, listener)
 
 

@@ -27,7 +27,7 @@ from clod_adapter.training.optimizer import (
     own_sizes,
 )
 from clod_adapter.training.paper import form_of
-from clod_adapter.training.schedule import Sample
+from clod_adapter.training.schedule import Sample, ViewSampler
 from clod_adapter.training.state import TrainingState
 
 # Adam's decay rates per view. A batch takes their powers and multiplies learning rates by its
@@ -39,6 +39,9 @@ BETA1, BETA2 = 0.9, 0.999
 class Trainer:
     """Holds everything that training steps change. The start has a growth_d if the config has
     growth.
+
+    Args:
+        empty_sh: the whole shN of a base whose empty degrees were removed.
 
     Attributes:
         count: the number of trained rows, the first ones.
@@ -57,6 +60,7 @@ class Trainer:
         views: tuple[View, ...],
         config: AdaptConfig,
         group: ProcessGroup | None = None,
+        empty_sh: Tensor | None = None,
     ) -> None:
         # of the result's rows, where far ones come first in training
         self.order: Tensor | None = None
@@ -71,17 +75,20 @@ class Trainer:
             for n in ATTRIBUTES
             if n == "opacity_logits" or self.rates[n] > 0 and getattr(start, n).numel()
         ]
-        own: dict[str, Any] = {"dtype": torch.float32, "memory_format": torch.contiguous_format}
-        attributes: Any = {
-            name: getattr(start, name).detach().to(**own, copy=name in tuned) for name in ATTRIBUTES
-        }
+        attributes: Any = {}
+        for name in ATTRIBUTES:
+            attributes[name] = (
+                getattr(start, name)
+                .detach()
+                .to(torch.float32, memory_format=torch.contiguous_format, copy=name in tuned)
+            )
         splats = Gaussians(**attributes, screen_filter=start.screen_filter)
         self.dial = form(splats, start, [view.camera for view in views], config)
         dials = {name: value.detach() for name, value in self.dial.named_parameters()}
         self.parameters, self.stepped = attributes | dials, (*tuned, *dials)
         self.config, self.group, self.count = config, group, self.dial.trained
-        self.sampler, self.screen_filter = self.dial.sampler, start.screen_filter
-        self.sampler.views = views
+        self.sampler = ViewSampler(views, config, self.dial.schedule)
+        self.screen_filter = start.screen_filter
         # Of culled Gaussians too the count term has a gradient.
         everywhere = {self.dial.decay, *self.dial.everywhere}
         parts = {"kept": dict[str, Tensor](), "all": {}}
@@ -94,8 +101,7 @@ class Trainer:
             for rows, p in parts.items()
             if p
         }
-        # the whole shN of a base whose empty degrees were removed
-        self.empty_sh: Tensor | None = None
+        self.empty_sh = empty_sh
         self.done = 0
         self.seconds = 0.0
         self.start_seconds = 0.0
@@ -117,13 +123,14 @@ class Trainer:
         numbers = range(self.done * self.config.batch, (self.done + 1) * self.config.batch)
         samples = [self.sampler.draw(number, share_done) for number in numbers]
         try:  # if it fails, the next step samples the same views again
-            own = self.group.share(samples) if self.group else samples
-            found = self.gradient_sum(own, until)
-            found = self.group.sum(found) if self.group else found
+            if self.group:
+                gradients = self.group.sum(self.gradient_sum(self.group.share(samples), until))
+            else:
+                gradients = self.gradient_sum(samples, until)
             self._updating = True
-            self._update(found, share_done)
+            self._update(gradients, share_done)
             # the host waits for a GPU, as else only gsplat does
-            loss = float(found.loss) / found.views
+            loss = float(gradients.loss) / gradients.views
             if not math.isfinite(loss):
                 self._updating = False
                 names = ", ".join(
@@ -145,12 +152,12 @@ class Trainer:
         """The gradients summed over the first sample and those begun before ``until``
         (``perf_counter``).
         """
-        found = self._of_view(samples[0])
+        total = self._of_view(samples[0])
         for sample in samples[1:]:
             if time.perf_counter() >= until:
                 break
-            found += self._of_view(sample)
-        return found
+            total += self._of_view(sample)
+        return total
 
     def _of_view(self, sample: Sample) -> GradientSum:
         """Renders one view at its dial value, and differentiates the objective."""
@@ -177,20 +184,21 @@ class Trainer:
             gradients[decay] = gradients[decay] + self.dial.count_gradient(parameter, at, weighted)
         return GradientSum(gradients, kept, plain)
 
-    def _update(self, found: GradientSum, share_done: float) -> None:
+    def _update(self, total: GradientSum, share_done: float) -> None:
         """Moves the rows whose gradients are finite; none if the loss is not, without asking
         which.
         """
-        learned, spoilt = torch.as_tensor(found.loss).isfinite(), spoilt_rows(found.gradients)
+        learned = torch.as_tensor(total.loss).isfinite()
+        spoilt = spoilt_rows(total.gradients)
         self.held |= learned & spoilt
         finite = spoilt.logical_not_().logical_and_(learned)
         rates = {
             name: rate * self.dial.schedule.lr_final**share_done
             for name, rate in self.rates.items()
         }
-        moved = {"kept": found.kept.logical_and_(finite), "all": finite}
+        moved = {"kept": total.kept.logical_and_(finite), "all": finite}
         for rows, optimizer in self.optimizers.items():
-            optimizer.step(found.gradients, moved[rows], rates)
+            optimizer.step(total.gradients, moved[rows], rates)
         self.dial.clamp()
 
     def state(self) -> TrainingState:
@@ -217,10 +225,10 @@ class Trainer:
         """
         if state.averaged:
             self.mean = {name: torch.empty_like(value) for name, value in self.trained().items()}
-        own = self._changing()
-        state.check(own)
+        changing = self._changing()
+        state.check(changing)
         self.sampler.restore(state.random, state.order)
-        for name, tensor in own.items():
+        for name, tensor in changing.items():
             tensor.copy_(state.tensors[name])
         self.loss = state.loss
         self.averaged = state.averaged
@@ -231,12 +239,13 @@ class Trainer:
 
     def gaussians(self) -> Gaussians:
         """The result so far, in world units: the mean where there is one, else the parameters."""
-        found = self._assembled(self.parameters | self.averages())
-        found = found if self.order is None else found.select(self.order)
+        gaussians = self._assembled(self.parameters | self.averages())
+        if self.order is not None:
+            gaussians = gaussians.select(self.order)
         if self.empty_sh is not None:
-            far = len(found) - len(self.empty_sh)
-            found = found.replace(shN=pad(self.empty_sh, (0, 0, 0, 0, 0, far)))
-        return in_world_units(found)
+            far = len(gaussians) - len(self.empty_sh)
+            gaussians = gaussians.replace(shN=pad(self.empty_sh, (0, 0, 0, 0, 0, far)))
+        return in_world_units(gaussians)
 
     def averages(self) -> dict[str, Tensor]:
         """The mean parameters, of all rows; none before there is a mean."""
@@ -263,10 +272,10 @@ class Trainer:
 
     def _changing(self) -> dict[str, Tensor]:
         """All tensors that steps change, named as in ``TrainingState``."""
-        found = {f"parameter.{name}": value for name, value in self.trained().items()}
+        tensors = {f"parameter.{name}": value for name, value in self.trained().items()}
         for rows, optimizer in self.optimizers.items():
             for kind, values in optimizer.moments.items():
-                found |= {f"{kind}.{name}": value for name, value in values.items()}
-            found[f"steps.{rows}"] = optimizer.steps
-        found |= {f"mean.{name}": value for name, value in self.mean.items()}
-        return found
+                tensors |= {f"{kind}.{name}": value for name, value in values.items()}
+            tensors[f"steps.{rows}"] = optimizer.steps
+        tensors |= {f"mean.{name}": value for name, value in self.mean.items()}
+        return tensors
