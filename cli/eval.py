@@ -250,7 +250,7 @@ class Comparisons:
         return rows[0]
 
     def text(self) -> str:
-        """For the console; empty without comparisons."""
+        """The tables for the console; empty without comparisons."""
         from .shared.measure import popping_table, table
 
         parts = [f"{title}:\n{table(rows)}" for title, rows in self.tables.items()]

@@ -223,6 +223,6 @@ def _synchronize() -> None:
 
 
 def _matrix(values: Any) -> Tensor:
-    """In float32 at least: integers and float16 are too coarse for a camera."""
+    """The matrix in float32 at least: integers and float16 are too coarse for a camera."""
     matrix = tensor_of(values)
     return matrix.to(torch.promote_types(matrix.dtype, torch.float32))

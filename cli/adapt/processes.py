@@ -105,7 +105,7 @@ def together(
 
 
 def take_part() -> None:
-    """What a process that is not the first does: trains silently, if there is a job."""
+    """Trains silently, if there is a job, in a process that is not the first."""
     launch, stop = launched(), GracefulStop(aborts=False)
     _use_threads(launch.local_size)
     # A process that is lost is reported by the first one, or by the launcher.

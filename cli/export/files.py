@@ -81,7 +81,7 @@ def export(args: Namespace) -> dict[str, Any]:
 
 
 def line_of(output: dict[str, Any], total: int) -> str:
-    """What was written, in a line, of a model of ``total`` Gaussians."""
+    """Describes an output of a model of ``total`` Gaussians in a line."""
     line = f"wrote {output['file']} ({size(output['bytes'])}): {output['count']:,}"
     if levels := output.get("levels"):
         shown = ", ".join(f"{level['count']:,} from {level['begins']:.3g}" for level in levels)
@@ -200,7 +200,7 @@ class Export:
         return fmean(psnr(render(shown, each).image, render(exact, each).pixels) for each in views)
 
     def note_losses(self) -> None:
-        """Of columns, and of the screen-space filter where most readers do not find it."""
+        """Notes dropped columns, and a screen-space filter that most readers do not find."""
         names = (self.model.vertex.dtype.names if self.model.vertex is not None else None) or ()
         if dropped := extra_columns(names, self.gaussians.sh_degree):
             self.console.note(f"columns dropped: {', '.join(dropped)}")

@@ -72,11 +72,11 @@ class Parser(ArgumentParser):
 
     @property
     def version(self) -> str:
-        """What --version prints."""
+        """The text of --version."""
         return f"{self.prog} {package_version()}"
 
     def exit(self, status: int = 0, message: str | None = None) -> NoReturn:
-        """After --help and --version."""
+        """Exits after --help and --version."""
         check_printed()
         super().exit(status, message)
 

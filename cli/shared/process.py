@@ -150,7 +150,7 @@ class Launch(NamedTuple):
 
 
 def launched() -> Launch:
-    """By the environment variables of torchrun; a single process without them."""
+    """Reads the environment variables of torchrun; a single process without them."""
     if not all(name in os.environ for name in NEEDED):
         return Launch()
     names = {"RANK": 0, "WORLD_SIZE": 1, "LOCAL_RANK": 0, "LOCAL_WORLD_SIZE": 1}

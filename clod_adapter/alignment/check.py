@@ -132,7 +132,7 @@ def compare_renders(gaussians: Gaussians, views: Sequence[View]) -> Tensor:
 
 
 def correlation(table: Tensor) -> float:
-    """Of renders and photographs in ``compare_renders``, in [-1, 1]; 0 without any."""
+    """The correlation of renders and photographs, by ``compare_renders``; 0 without any."""
     constant, rendered, shared = table.mean(0).tolist()[2:]
     return shared / math.sqrt(constant * rendered) if rendered > 0 else 0.0
 

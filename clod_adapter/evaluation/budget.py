@@ -177,8 +177,8 @@ def _for_count(
     baked: bool,
     keep: float,
 ) -> DialValue:
-    """Of the Gaussians at the distances of each camera, or ``baked``: at one distance over all
-    cameras.
+    """Counts Gaussians at their distances from each camera, or with ``baked`` at one distance over
+    all cameras.
     """
     views = [cameras] if baked or not cameras else [[camera] for camera in cameras]
     largest, wanted = config.max_sv, math.floor(keep * len(views))

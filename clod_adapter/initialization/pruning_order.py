@@ -112,7 +112,7 @@ def _substitutes(
 def _most_similar(
     rows: np.ndarray, near: np.ndarray, apart: np.ndarray, channels: np.ndarray, sizes: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Of the neighbours ``near [K, n]`` of ``rows [n]`` the most similar, and its dissimilarity."""
+    """The most similar of the neighbours ``near [K, n]`` of ``rows [n]``, and its dissimilarity."""
     substitute, least = near[0].copy(), np.full(len(rows), np.inf)
     own, size = channels[:, rows], sizes[rows]
     with np.errstate(invalid="ignore"):  # inf - inf

@@ -20,7 +20,7 @@ FAINT = 1 / 255  # opacity that rasterizers leave out
 
 @dataclass(frozen=True)
 class Spread:
-    """Of some values: the least, the middle 98 %, the median, the greatest."""
+    """Quantiles of values: the least, the middle 98 %, the median, the greatest."""
 
     least: float
     low: float

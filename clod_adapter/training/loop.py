@@ -93,20 +93,20 @@ def adapt(
     require_trainable(base, scene, config, group.size if group else 1)
     began = time.perf_counter()
     # Empty higher SH degrees that are not tuned stay empty, so they are not rendered.
-    lean = base if config.lr_shN > 0 else base.without_empty_bands()
-    views = usable_views(lean, scene.train)
+    reduced = base if config.lr_shN > 0 else base.without_empty_bands()
+    views = usable_views(reduced, scene.train)
     with shown(False if progress is None and group and group.rank else progress) as listener:
         # for a resumed run too, the same again
-        begun = _initialized(lean, views, config, listener, group)
-        empty_sh = None if lean is base else base.shN.clone()
-        trainer = Trainer(begun, views, config, group, empty_sh)
+        start = _initialized(reduced, views, config, listener, group)
+        empty_sh = None if reduced is base else base.shN.clone()
+        trainer = Trainer(start, views, config, group, empty_sh)
         trainer.start_seconds = time.perf_counter() - began
         if resume is not None:
             try:
                 trainer.restore(resume)
             except ClodError as error:
                 raise StateRefused(str(error)) from error
-        del resume, begun, base, lean, empty_sh  # the trainer has copies
+        del resume, start, base, reduced, empty_sh  # the trainer has copies
         return _train(trainer, listener)
 
 
@@ -128,16 +128,16 @@ def time_steps(
 
 
 def _initialized(
-    lean: Gaussians,
+    reduced: Gaussians,
     views: tuple[View, ...],
     config: AdaptConfig,
     progress: Listener | None = None,
     group: ProcessGroup | None = None,
 ) -> Gaussians:
     """What training begins with: of a group, which may round differently, the first process's."""
-    begun = for_training(form_of(config).begin(lean, views, config, progress))
-    found: Any = {name: getattr(begun, name) for name in (*begun.tensors(), "attenuation")}
-    return begun.replace(**(group.broadcast(found) if group else found)).to(lean.means.device)
+    start = for_training(form_of(config).begin(reduced, views, config, progress))
+    found: Any = {name: getattr(start, name) for name in (*start.tensors(), "attenuation")}
+    return start.replace(**(group.broadcast(found) if group else found)).to(reduced.means.device)
 
 
 def _train(trainer: Trainer, progress: Listener | None) -> Adapted:

@@ -135,7 +135,7 @@ class RowAdam:
 
 
 def learning_rates(config: AdaptConfig, decay: str) -> dict[str, float]:
-    """By parameter, for a batch; that of means is in units of ``own_sizes``."""
+    """Learning rate of each parameter, for a batch; that of means is in units of ``own_sizes``."""
     rates = {ours: getattr(config, f"lr_{name}") for name, ours in NAMES.items()}
     rates |= {decay: config.lr_sigma, "growth_d": config.lr_growth}
     return {name: rate * math.sqrt(config.batch) for name, rate in rates.items()}

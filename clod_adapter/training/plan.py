@@ -106,19 +106,19 @@ class Plan:
             adapted, gaussians=self.restore_excluded(adapted.gaussians), start_seconds=start_seconds
         )
 
-    def restore_excluded(self, lean: Gaussians) -> Gaussians:
-        """``lean``, which training works on, together with the SH degrees that were left out, of
+    def restore_excluded(self, trained: Gaussians) -> Gaussians:
+        """``trained``, which training works on, together with the SH degrees that were left out, of
         the base's rows.
         """
         base = self.base
         if self.sh_degree == base.sh_degree:
-            return lean
-        if lean.near is not None:
-            return with_near(detach(base), lean.select(~lean.near))
+            return trained
+        if trained.near is not None:
+            return with_near(detach(base), trained.select(~trained.near))
         harmonics = base.shN.detach().clone()
         if self.config.lr_shN > 0:
-            harmonics[:, : lean.shN.shape[1]] = lean.shN
-        return lean.replace(shN=harmonics)
+            harmonics[:, : trained.shN.shape[1]] = trained.shN
+        return trained.replace(shN=harmonics)
 
     def as_dict(self) -> dict[str, Any]:
         """Plain JSON."""

@@ -173,7 +173,7 @@ def _views(
 
 
 def reaches(gaussians: Gaussians, cameras: Sequence[Camera]) -> list[float]:
-    """Of each camera its distance to the scene, world units: the median in its image, or over the
+    """Distance of each camera to the scene, world units: the median in its image, or over the
     cameras if less.
 
     A camera that looks past the scene has the background's.
