@@ -120,7 +120,7 @@ MOMENTS = [
     ((planner, "sh_degree_losses"), [INT], 130, [], "clod-adapt: interrupted"),
     (SAVING, [signal.SIGUSR1] * 3, 0, BOTH, True),
     (SAVING, [signal.SIGHUP] * 3, 0, BOTH, True),
-    ((pipeline, "extract"), [INT], 0, BOTH, False),
+    ((pipeline, "extract_adapter"), [INT], 0, BOTH, False),
     ((pipeline, "save_adapter"), [INT, TERM], 130, [STATE], ABORTED),
     ((pipeline, "save"), [INT], 0, OUTPUTS, False),  # the files without the page
 ]
@@ -135,7 +135,7 @@ def test_signals_at_a_moment(clod, words, tmp_path, place, numbers, code, files,
     if code == 0:
         report = done.report
         assert report["interrupted"] == said and "page" not in report["outputs"]
-        assert bool(report["rows"]) == bool(report["calibration"]) == (place[1] != "extract")
+        assert bool(report["rows"]) == bool(report["calibration"]) == (place[1] != "extract_adapter")
     else:
         assert done.err.rstrip().endswith(said)
     assert signal.getsignal(INT) is signal.default_int_handler

@@ -198,7 +198,7 @@ def test_demo(clod, capture, tmp_path, monkeypatch):
     made = {"capture", "base.ply", "gallery.ply", "gallery.safetensors", "gallery.json"}
     assert {*names(folder)} == made | PICTURES
     # nothing is measured
-    with pressed(pipeline, "extract", signal.SIGINT):
+    with pressed(pipeline, "extract_adapter", signal.SIGINT):
         done = clod("demo --out=-odd --json")
     assert done.report["pictures"] == {} and "no figures" in done.err
     assert not PICTURES & {*names(folder)}
