@@ -135,7 +135,8 @@ def test_signals_at_a_moment(clod, words, tmp_path, place, numbers, code, files,
     if code == 0:
         report = done.report
         assert report["interrupted"] == said and "page" not in report["outputs"]
-        assert bool(report["rows"]) == bool(report["calibration"]) == (place[1] != "extract_adapter")
+        measured = place[1] != "extract_adapter"
+        assert bool(report["rows"]) == bool(report["calibration"]) == measured
     else:
         assert done.err.rstrip().endswith(said)
     assert signal.getsignal(INT) is signal.default_int_handler
