@@ -70,7 +70,7 @@ def adam_rows(
                     lengths[k], factors[k] = length, factor
         for k in range(0, 16 * width, 16):
             factor, at = load(factors, k), width * start + k
-            chosen = gt(factor, splat(ZERO))
+            chosen = gt(factor, ZERO)
             if anywhere(chosen):
                 g = load_where(chosen, gradient, at)
                 m = fma(beta1, load_where(chosen, first, at), rest1 * g)

@@ -51,7 +51,7 @@ def start_tile(ox, oy, width, height, state, stride, live):
             live[block // 64] |= uint64(1) << uint64(block % 64)
         left, below = splat(float32(width - x)), splat(float32(height - y))
         inside = both(gt(left, load(LANE_X, 0)), gt(below, load(LANE_Y, 0)))
-        store(state, block * stride, select(inside, splat(c.ONE), splat(-c.ONE)))
+        store(state, block * stride, select(inside, c.ONE, -c.ONE))
 
 
 @part
@@ -69,8 +69,8 @@ def find_blocks(records, r, ox, oy, masks, at):
     touches.
     """
     low, high = spans(records, r, ox, oy, float32(BLOCK))
-    low = vmin(vmax(low, splat(c.ZERO)), splat(LAST + c.ONE))
-    set_spans(masks, at, low, vmax(vmin(high, splat(LAST)), splat(-c.ONE)))
+    low = vmin(vmax(low, c.ZERO), LAST + c.ONE)
+    set_spans(masks, at, low, vmax(vmin(high, LAST), -c.ONE))
 
 
 @part
@@ -94,10 +94,10 @@ def meet(shape, t, block):
     qa, qb, qc, log, base_x, base_y = shape
     dx, dy = base_x + splat(BLOCK_X[block]), base_y + splat(BLOCK_Y[block])
     raw = exp2(fma(dx, fma(qa, dx, qb * dy), fma(qc * dy, dy, log)))
-    a = vmin(raw, splat(c.ALPHA_MAX))
-    mask = both(ge(a, splat(c.ALPHA_MIN)), gt(t, splat(c.ZERO)))
+    a = vmin(raw, c.ALPHA_MAX)
+    mask = both(ge(a, c.ALPHA_MIN), gt(t, c.ZERO))
     after = t - t * a
-    return dx, dy, raw, a, after, mask, both(mask, ge(splat(c.T_MIN), after))
+    return dx, dy, raw, a, after, mask, both(mask, ge(c.T_MIN, after))
 
 
 @kernel
@@ -188,7 +188,7 @@ def write_tile(ox, oy, width, height, state, background, image, alpha):
             continue
         t = vabs(load(state, at))
         for channel in range(3):
-            color = fma(t, splat(background[channel]), load(state, at + 16 + 16 * channel))
+            color = fma(t, background[channel], load(state, at + 16 + 16 * channel))
             store(part, 16 * channel, color)
         store(part, 48, splat(float32(1)) - t)
         for lane in range(16):

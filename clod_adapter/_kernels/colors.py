@@ -171,8 +171,8 @@ def color(first, found, means, sh0, shN, degree, cam, records, depths, ids):
         for k in range(terms):
             red, green = fma(basis[k + 1], sh[3 * k], red), fma(basis[k + 1], sh[3 * k + 1], green)
             blue = fma(basis[k + 1], sh[3 * k + 2], blue)
-        finite = gt(splat(HUGE), vabs(red) + vabs(green) + vabs(blue))
-        w[0], w[1], w[2] = vmax(red, splat(ZERO)), vmax(green, splat(ZERO)), vmax(blue, splat(ZERO))
+        finite = gt(HUGE, vabs(red) + vabs(green) + vabs(blue))
+        w[0], w[1], w[2] = vmax(red, ZERO), vmax(green, ZERO), vmax(blue, ZERO)
         store_rows(records, targets, RECORD, RED, 3, w, 0)
         bits = bits_of(finite)
         for lane in range(16):

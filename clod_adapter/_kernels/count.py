@@ -51,5 +51,5 @@ def count_slope(worker, workers, sigma, d, dial2, lift, penalty, out):
             odds = odds * odds
         slope = odds / ((ONE + odds) * (ONE + odds))
         store_some(
-            out, i, last - i, scale * select(gt(reach2, far2), slope, vmax(slope, splat(least)))
+            out, i, last - i, scale * select(gt(reach2, far2), slope, vmax(slope, least))
         )

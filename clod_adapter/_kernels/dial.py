@@ -42,8 +42,8 @@ def squared_distance(w, cam):
 @part
 def squared_reach(sigma, far2):
     """``R^2``; 1 where d s, of which ``far2`` is the square, is 0."""
-    sigma = vmax(sigma, splat(c.ZERO))
-    return select(gt(far2, splat(c.ZERO)), sigma * sigma, splat(c.ONE))
+    sigma = vmax(sigma, c.ZERO)
+    return select(gt(far2, c.ZERO), sigma * sigma, c.ONE)
 
 
 @part
@@ -57,22 +57,22 @@ def survives(sigma, far2, near2):
     """Which of sixteen rows the dial keeps."""
     end2 = squared_reach(sigma, far2)
     if near2 > c.ZERO:
-        far = gt(sigma, splat(c.ZERO))
-        begun = select(far, takeover(far2, near2), splat(c.ONE))
-        return both(gt(begun, splat(c.ZERO)), gt(select(far, end2, splat(c.ONE / near2)), far2))
+        far = gt(sigma, c.ZERO)
+        begun = select(far, takeover(far2, near2), c.ONE)
+        return both(gt(begun, c.ZERO), gt(select(far, end2, c.ONE / near2), far2))
     return gt(end2, far2)
 
 
 @part
 def squared_share(sigma, far2):
     """``t^2``, at most 1."""
-    return vmin(far2 / squared_reach(sigma, far2), splat(c.ONE))
+    return vmin(far2 / squared_reach(sigma, far2), c.ONE)
 
 
 @part
 def reciprocal_opacity(logit):
     """``1 / sigmoid(logit)``."""
-    return c.ONE + exp2(vmin(-logit * c.LOG2E, splat(FARTHEST_EXPONENT)))
+    return c.ONE + exp2(vmin(-logit * c.LOG2E, FARTHEST_EXPONENT))
 
 
 @part
@@ -84,12 +84,12 @@ def kept(at, many, means, opacities, sigma, cam, dial, dialled):
     """
     if dial[ACTIVATED] > c.ZERO:
         opacity = load_some(opacities, at, many)
-        shown = both(ge(opacity, splat(c.ALPHA_MIN)), gt(splat(c.HUGE), opacity))
+        shown = both(ge(opacity, c.ALPHA_MIN), gt(c.HUGE, opacity))
     else:
         w = scratch(f32x16, 3)
         load_triples(means, at, many, w)
         depth = cam[8] * w[0] + cam[9] * w[1] + cam[10] * w[2] + cam[11]
-        shown = ge(depth, splat(NEARLY * cam[c.NEAR]))
+        shown = ge(depth, NEARLY * cam[c.NEAR])
         if dialled:
             far2 = squared_distance(w, cam) * dial[RATE2]
             shown = both(shown, survives(load_some(sigma, at, many), far2, dial[NEAR2]))
@@ -128,22 +128,22 @@ def drawn(rows, opacities, sigma, growth, cam, dial, dialled, grows, w):
         share2 = squared_share(reach, far2)
         fade = c.ONE - share2 * share2
         if dial[NEAR2] > c.ZERO:
-            taken = vmin(splat(c.ONE), vmax(splat(c.ZERO), takeover(far2, dial[NEAR2])))
-            fade = select(gt(reach, splat(c.ZERO)), fade * taken, c.ONE - taken)
+            taken = vmin(c.ONE, vmax(c.ZERO, takeover(far2, dial[NEAR2])))
+            fade = select(gt(reach, c.ZERO), fade * taken, c.ONE - taken)
         opacity = opacity * fade
         if grows:
             size = gather(growth, rows) * log2_magnification(distance2, dial)
             # NaN stays, and is not drawn
-            size = vmin(splat(LOG2_GROWTH_MAX), vmax(splat(-LOG2_GROWTH_MAX), size))
+            size = vmin(LOG2_GROWTH_MAX, vmax(-LOG2_GROWTH_MAX, size))
     for k in range(c.SCALE, c.SCALE + 3):
-        w[k] = exp2(vmin(w[k] * c.LOG2E + size, splat(FARTHEST_EXPONENT)))
+        w[k] = exp2(vmin(w[k] * c.LOG2E + size, FARTHEST_EXPONENT))
     return opacity
 
 
 @part
 def log2_magnification(distance2, dial):
     """``log2 m``, of squared distances in world units^2."""
-    return c.HALF * log2(vmax(distance2 * dial[GROWTH_RATE2], splat(c.ONE)))
+    return c.HALF * log2(vmax(distance2 * dial[GROWTH_RATE2], c.ONE))
 
 
 @part
@@ -167,7 +167,7 @@ def dial_gradient(rows, given, cam, dial, dialled, grows, shaped, w, g):
     if dial[ACTIVATED] > c.ZERO:
         scatter(v_opacities, rows, g[c.SUMS + 3] / opacity)
         return
-    odds = exp2(vmin(-opacity * c.LOG2E, splat(FARTHEST_EXPONENT)))  # (1 - a) / a
+    odds = exp2(vmin(-opacity * c.LOG2E, FARTHEST_EXPONENT))  # (1 - a) / a
     total = g[c.SUMS + 3]
     if shaped:
         for k in range(c.V_SCALE, c.V_SCALE + 3):
@@ -176,12 +176,12 @@ def dial_gradient(rows, given, cam, dial, dialled, grows, shaped, w, g):
         reach, distance2 = gather(sigma, rows), squared_distance(w, cam)
         share2 = squared_share(reach, distance2 * dial[RATE2])
         share4 = share2 * share2
-        fading = both(gt(share4, splat(c.ZERO)), gt(splat(c.ONE), share4))
+        fading = both(gt(share4, c.ZERO), gt(c.ONE, share4))
         slope = FOUR * share4 / ((c.ONE - share4) * reach)
-        scatter(v_sigma, rows, select(fading, total * slope, splat(c.ZERO)))
+        scatter(v_sigma, rows, select(fading, total * slope, c.ZERO))
         if grows and shaped:
             magnification = log2_magnification(distance2, dial)
-            inside = gt(splat(LOG2_GROWTH_MAX), vabs(gather(growth, rows) * magnification))
+            inside = gt(LOG2_GROWTH_MAX, vabs(gather(growth, rows) * magnification))
             size = LN2 * magnification * (g[c.V_SCALE] + g[c.V_SCALE + 1] + g[c.V_SCALE + 2])
-            scatter(v_growth, rows, select(inside, size, splat(c.ZERO)))
+            scatter(v_growth, rows, select(inside, size, c.ZERO))
     scatter(v_opacities, rows, total * odds / (c.ONE + odds))

@@ -41,15 +41,15 @@ def covariance(cam, w):
         )
     norm2 = w[c.STORED] * w[c.STORED] + w[c.STORED + 1] * w[c.STORED + 1]
     norm2 = norm2 + w[c.STORED + 2] * w[c.STORED + 2] + w[c.STORED + 3] * w[c.STORED + 3]
-    valid = both(ge(norm2, splat(c.QUAT_MIN2)), ge(splat(c.QUAT_MAX2), norm2))
-    valid = both(ge(w[c.POINT + 2], splat(cam[c.NEAR])), valid)
+    valid = both(ge(norm2, c.QUAT_MIN2), ge(c.QUAT_MAX2, norm2))
+    valid = both(ge(w[c.POINT + 2], cam[c.NEAR]), valid)
     w[c.QINV] = c.ONE / vsqrt(norm2)
     for d in range(4):
         w[c.QUAT + d] = w[c.STORED + d] * w[c.QINV]
     rotation(w)
     iz = c.ONE / w[c.POINT + 2]
-    rx = vmin(vmax(w[c.POINT] * iz, splat(cam[c.LOW_X])), splat(cam[c.HIGH_X]))
-    ry = vmin(vmax(w[c.POINT + 1] * iz, splat(cam[c.LOW_Y])), splat(cam[c.HIGH_Y]))
+    rx = vmin(vmax(w[c.POINT] * iz, cam[c.LOW_X]), cam[c.HIGH_X])
+    ry = vmin(vmax(w[c.POINT + 1] * iz, cam[c.LOW_Y]), cam[c.HIGH_Y])
     for k in range(3):
         w[c.UMAT + k] = cam[c.FX] * iz * (splat(cam[k]) - rx * cam[8 + k])
         w[c.UMAT + 3 + k] = cam[c.FY] * iz * (splat(cam[4 + k]) - ry * cam[8 + k])
@@ -71,7 +71,7 @@ def covariance(cam, w):
     cx, cy, cz = p1 * p5 - p2 * p4, p2 * p3 - p0 * p5, p0 * p4 - p1 * p3
     w[c.RAWDET] = cx * cx + cy * cy + cz * cz
     w[c.COVDET] = w[c.RAWDET] + blur * (xx + yy) + blur * blur
-    return both(valid, gt(splat(c.HUGE), w[c.COVDET]))
+    return both(valid, gt(c.HUGE, w[c.COVDET]))
 
 
 @part
@@ -128,16 +128,16 @@ def make_records(w, centre, opacity, cam, record):
     record[c.QB], record[c.DET] = -(c.LOG2E * w[c.COV + 1] * idet), c.LOG2E * c.LOG2E * idet
     if cam[c.COMPENSATE] > c.ZERO:  # NaN for an infinite covariance, which is not drawn
         opacity = opacity * vsqrt(w[c.RAWDET] * idet)
-    drawn = ge(opacity, splat(c.ALPHA_MIN))
+    drawn = ge(opacity, c.ALPHA_MIN)
     record[c.LOG] = log2(opacity)
     record[c.RED] = record[c.GREEN] = record[c.BLUE] = splat(c.ZERO)
-    reach = vmax(record[c.LOG] + c.LOG2_255, splat(c.ZERO))
+    reach = vmax(record[c.LOG] + c.LOG2_255, c.ZERO)
     rx, ry = vsqrt(c.TWO_LN2 * reach * w[c.COV]), vsqrt(c.TWO_LN2 * reach * w[c.COV + 2])
     record[c.REACH], record[c.RX] = reach, rx
-    record[c.X0] = vmax(vceil(mx - rx - c.HALF - c.SLACK), splat(c.ZERO))
-    record[c.X1] = vmin(vfloor(mx + rx - c.HALF + c.SLACK), splat(cam[c.WIDTH] - c.ONE))
-    record[c.Y0] = vmax(vceil(my - ry - c.HALF - c.SLACK), splat(c.ZERO))
-    record[c.Y1] = vmin(vfloor(my + ry - c.HALF + c.SLACK), splat(cam[c.HEIGHT] - c.ONE))
+    record[c.X0] = vmax(vceil(mx - rx - c.HALF - c.SLACK), c.ZERO)
+    record[c.X1] = vmin(vfloor(mx + rx - c.HALF + c.SLACK), cam[c.WIDTH] - c.ONE)
+    record[c.Y0] = vmax(vceil(my - ry - c.HALF - c.SLACK), c.ZERO)
+    record[c.Y1] = vmin(vfloor(my + ry - c.HALF + c.SLACK), cam[c.HEIGHT] - c.ONE)
     return both(drawn, both(ge(record[c.X1], record[c.X0]), ge(record[c.Y1], record[c.Y0])))
 
 
@@ -152,7 +152,7 @@ def add_records(rows, filled, packed, spare, means, opacity, cam, w, records, de
     valid = covariance(cam, w)
     centres(means, rows, cam, centre)
     # beyond the near plane in float32 too, not only in float64
-    valid = both(valid, ge(load(centre, 32), splat(cam[c.NEAR])))
+    valid = both(valid, ge(load(centre, 32), cam[c.NEAR]))
     valid = both(valid, both(make_records(w, centre, opacity, cam, record), first_lanes(filled)))
     bits = bits_of(valid)
     if bits == uint64(0):

@@ -72,8 +72,8 @@ def point_gradient(w, g, v_x, v_y, cam):
     """
     x, y, iz = w[c.POINT], w[c.POINT + 1], c.ONE / w[c.POINT + 2]
     rx, ry = x * iz, y * iz
-    clamped_x = vmin(vmax(rx, splat(cam[c.LOW_X])), splat(cam[c.HIGH_X]))
-    clamped_y = vmin(vmax(ry, splat(cam[c.LOW_Y])), splat(cam[c.HIGH_Y]))
+    clamped_x = vmin(vmax(rx, cam[c.LOW_X]), cam[c.HIGH_X])
+    clamped_y = vmin(vmax(ry, cam[c.LOW_Y]), cam[c.HIGH_Y])
     j00 = j02 = j11 = j12 = splat(c.ZERO)
     for d in range(3):
         u0 = u1 = splat(c.ZERO)
@@ -87,8 +87,8 @@ def point_gradient(w, g, v_x, v_y, cam):
     v_z = -(fx * rx * v_x + fy * ry * v_y) - iz * (
         fx * (j00 - clamped_x * j02) + fy * (j11 - clamped_y * j12)
     )
-    v_rx = select(eq(clamped_x, rx), -(fx * j02 * iz), splat(c.ZERO))
-    v_ry = select(eq(clamped_y, ry), -(fy * j12 * iz), splat(c.ZERO))
+    v_rx = select(eq(clamped_x, rx), -(fx * j02 * iz), c.ZERO)
+    v_ry = select(eq(clamped_y, ry), -(fy * j12 * iz), c.ZERO)
     v_x, v_y, v_z = fx * v_x + v_rx, fy * v_y + v_ry, v_z - v_rx * rx - v_ry * ry
     for d in range(3):
         g[c.V_MEAN + d] = g[c.V_MEAN + d] + (cam[d] * v_x + cam[4 + d] * v_y + cam[8 + d] * v_z)
@@ -171,8 +171,7 @@ def add_slots(pair_sums, slots, records, packed, lanes, sums, g):
     load_rows(records, packed, c.RECORD, c.RED, 3, g, c.SUMS + c.PAIR)
     for k in range(3):  # a colour clamped at 0 has no gradient
         g[c.SUMS + k] = select(
-            gt(g[c.SUMS + c.PAIR + k], splat(c.ZERO)), g[c.SUMS + k], splat(c.ZERO)
-        )
+            gt(g[c.SUMS + c.PAIR + k], c.ZERO), g[c.SUMS + k], c.ZERO)
 
 
 @kernel

@@ -74,9 +74,13 @@ def store(typingctx, array, index, value):
 
 
 def spread(builder, value, kind=VECTOR):
-    """Sixteen copies of a number; a vector as it is."""
+    """Sixteen copies of a number, rounded to float32 for floats; a vector as it is."""
     if value.type == kind:
         return value
+    if kind == VECTOR and isinstance(value.type, ir.IntType):
+        value = builder.sitofp(value, kind.element)
+    elif value.type == ir.DoubleType():
+        value = builder.fptrunc(value, kind.element)
     one = builder.insert_element(
         ir.Constant(kind, ir.Undefined), value, ir.Constant(ir.IntType(32), 0)
     )
@@ -105,10 +109,11 @@ def _operators(name, kinds, flags, *operators):
 
 
 # Not ``overload``: inlining hundreds of operators takes numba minutes.
-_pairs, _loose = (
-    ((f32x16, f32x16), (f32x16, types.float32), (types.float32, f32x16)),
-    ("nsz", "contract"),
-)
+_numbers = types.float32, types.float64, types.int64
+_pairs = [(f32x16, f32x16)]
+for _number in _numbers:
+    _pairs += [(f32x16, _number), (_number, f32x16)]
+_loose = "nsz", "contract"
 _operators("fadd", _pairs, _loose, operator.add, operator.iadd)
 _operators("fsub", _pairs, _loose, operator.sub, operator.isub)
 _operators("fmul", _pairs, _loose, operator.mul, operator.imul)
@@ -117,15 +122,26 @@ _operators("fneg", ((f32x16,),), (), operator.neg)
 
 
 def operation(result, *kinds):
-    """Makes a function of a builder and LLVM values an intrinsic from ``kinds`` to ``result``."""
+    """Makes a function of a builder and LLVM values an intrinsic from ``kinds`` to ``result``.
+
+    Where it takes a vector, it takes a number for sixteen copies of it.
+    """
 
     def intrinsic_of(build):
         def codegen(context, builder, signature, args):
-            found = build(builder, *args)
-            return context.get_dummy_value() if found is None else found
+            values = [
+                spread(builder, arg) if kind == f32x16 else arg
+                for arg, kind in zip(args, kinds, strict=True)
+            ]
+            result = build(builder, *values)
+            return context.get_dummy_value() if result is None else result
 
         def typed(typingctx, *args):
-            return result(*kinds), codegen
+            given = [
+                arg if kind == f32x16 and arg in _numbers else kind
+                for arg, kind in zip(args, kinds, strict=True)
+            ]
+            return result(*given), codegen
 
         names = [f"given_{k}" for k in range(1 + len(kinds))]
         parameters = [Parameter(name, Parameter.POSITIONAL_OR_KEYWORD) for name in names]
@@ -142,8 +158,8 @@ def llvm_function(name, count):
     )
 
 
-# Sixteen copies of a float32.
-splat = operation(f32x16, types.float32)(spread)
+# Sixteen copies of a number.
+splat = operation(f32x16, f32x16)(lambda builder, vector: vector)
 # fmuladd fuses where the processor can and is two operations where it cannot.
 fma = llvm_function("fmuladd", 3)
 

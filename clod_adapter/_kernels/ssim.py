@@ -40,7 +40,7 @@ def blur_row(lines, line, length):
     """Horizontal blur of 16 columns from ``line`` of a row buffer."""
     out = splat(float32(0))
     for tap in range(11):
-        out = fma(splat(TAPS[tap]), load(lines, line + length + tap - RADIUS), out)
+        out = fma(TAPS[tap], load(lines, line + length + tap - RADIUS), out)
     return out
 
 

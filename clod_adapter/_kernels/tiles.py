@@ -23,8 +23,8 @@ def spans(records, r, ox, oy, side):
     """
     my, rx, b = splat(records[r + c.MY]), splat(records[r + c.RX]), splat(records[r + c.QB])
     row = load(ROWS, 0) * side + (float32(oy) + c.HALF)
-    top = vmax(row, splat(records[r + c.Y0] + c.HALF)) - my
-    bottom = vmin(row + (side - c.ONE), splat(records[r + c.Y1] + c.HALF)) - my
+    top = vmax(row, records[r + c.Y0] + c.HALF) - my
+    bottom = vmin(row + (side - c.ONE), records[r + c.Y1] + c.HALF) - my
     tip = splat(-records[r + c.QB] / (records[r + c.QC] * c.TWO) * records[r + c.RX])
     zero, half = splat(c.ZERO), splat(c.HALF / records[r + c.QA])
     det = splat(records[r + c.DET])  # 4 QA QC - QB^2, from the covariance, where it does not cancel
@@ -36,11 +36,11 @@ def spans(records, r, ox, oy, side):
     x0 = select(eq(left, zero - tip), zero - rx, (zero - wide - b * left) * half)
     mx = splat(records[r + c.MX] - c.HALF)
     each = splat(c.ONE / side)
-    low = vfloor((vmax(vceil(mx + x0 - c.SLACK), splat(records[r + c.X0])) - float32(ox)) * each)
-    high = vfloor((vmin(vfloor(mx + x1 + c.SLACK), splat(records[r + c.X1])) - float32(ox)) * each)
+    low = vfloor((vmax(vceil(mx + x0 - c.SLACK), records[r + c.X0]) - float32(ox)) * each)
+    high = vfloor((vmin(vfloor(mx + x1 + c.SLACK), records[r + c.X1]) - float32(ox)) * each)
     # of cells: the columns of a needle may have crossed by rounding
     touched = both(ge(bottom, top), ge(high, low))
-    return select(touched, low, zero), select(touched, high, splat(-c.ONE))
+    return select(touched, low, zero), select(touched, high, -c.ONE)
 
 
 @kernel
