@@ -3,7 +3,6 @@
 from numba import float32, int64
 
 from clod_adapter._kernels.compiling import kernel
-from clod_adapter._kernels.conventions import ONE, ZERO
 from clod_adapter._kernels.elementary import vsqrt
 from clod_adapter._kernels.pointers import load_where, pointer, scratch, store_where
 from clod_adapter._kernels.simd import anywhere, fma, gt, load, splat
@@ -43,7 +42,7 @@ def adam_rows(
     rate = float32(rate)
     each = int64(len(units) > 1)
     beta1, beta2, epsilon = splat(float32(beta1)), splat(float32(beta2)), float32(epsilon)
-    rest1, rest2 = splat(ONE) - beta1, splat(ONE) - beta2
+    rest1, rest2 = 1 - beta1, 1 - beta2
     begin, end = len(parameter) * worker // workers, len(parameter) * (worker + 1) // workers
     lengths, factors = scratch(float32, ROOM), scratch(float32, ROOM)
     parameter = pointer(parameter)
@@ -57,7 +56,7 @@ def adam_rows(
         if not some:
             continue
         for k in range(16 * width):
-            factors[k] = ZERO
+            factors[k] = 0
         for row in range(start, stop):
             if mask[row]:
                 steps[row] += counted
@@ -70,7 +69,7 @@ def adam_rows(
                     lengths[k], factors[k] = length, factor
         for k in range(0, 16 * width, 16):
             factor, at = load(factors, k), width * start + k
-            chosen = gt(factor, ZERO)
+            chosen = gt(factor, 0)
             if anywhere(chosen):
                 g = load_where(chosen, gradient, at)
                 m = fma(beta1, load_where(chosen, first, at), rest1 * g)

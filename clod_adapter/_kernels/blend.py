@@ -10,8 +10,25 @@ of the pixel would change at once when it or one before it fades.
 import numpy as np
 from numba import float32, uint64
 
-from clod_adapter._kernels import conventions as c
 from clod_adapter._kernels.compiling import kernel, part
+from clod_adapter._kernels.conventions import (
+    AHEAD,
+    ALPHA_MAX,
+    ALPHA_MIN,
+    BLUE,
+    GREEN,
+    LOG,
+    MX,
+    MY,
+    PAIR,
+    QA,
+    QB,
+    QC,
+    RECORD,
+    RED,
+    T_MIN,
+    TILE,
+)
 from clod_adapter._kernels.elementary import exp2, lowest, set_spans, vabs
 from clod_adapter._kernels.pointers import count_up, pointer, prefetch, scratch, store_sums
 from clod_adapter._kernels.simd import (
@@ -49,9 +66,8 @@ def start_tile(ox, oy, width, height, state, stride, live):
         x, y = ox + (block % ACROSS) * BLOCK, oy + (block // ACROSS) * BLOCK
         if x < width and y < height:
             live[block // 64] |= uint64(1) << uint64(block % 64)
-        left, below = splat(float32(width - x)), splat(float32(height - y))
-        inside = both(gt(left, load(LANE_X, 0)), gt(below, load(LANE_Y, 0)))
-        store(state, block * stride, select(inside, c.ONE, -c.ONE))
+        inside = both(gt(width - x, load(LANE_X, 0)), gt(height - y, load(LANE_Y, 0)))
+        store(state, block * stride, select(inside, 1, -1))
 
 
 @part
@@ -69,18 +85,18 @@ def find_blocks(records, r, ox, oy, masks, at):
     touches.
     """
     low, high = spans(records, r, ox, oy, float32(BLOCK))
-    low = vmin(vmax(low, c.ZERO), LAST + c.ONE)
-    set_spans(masks, at, low, vmax(vmin(high, LAST), -c.ONE))
+    low = vmin(vmax(low, 0), LAST + 1)
+    set_spans(masks, at, low, vmax(vmin(high, LAST), -1))
 
 
 @part
 def spread(records, r, ox, oy):
     """Of the record at ``r``, the same in every lane: what ``meet`` takes, and the colour."""
-    qa, qb, qc = splat(-records[r + c.QA]), splat(-records[r + c.QB]), splat(-records[r + c.QC])
-    base_x = load(LANE_X, 0) + splat(float32(ox) - records[r + c.MX])
-    base_y = load(LANE_Y, 0) + splat(float32(oy) - records[r + c.MY])
-    shape = qa, qb, qc, splat(records[r + c.LOG]), base_x, base_y
-    return shape, splat(records[r + c.RED]), splat(records[r + c.GREEN]), splat(records[r + c.BLUE])
+    qa, qb, qc = splat(-records[r + QA]), splat(-records[r + QB]), splat(-records[r + QC])
+    base_x = load(LANE_X, 0) + (float32(ox) - records[r + MX])
+    base_y = load(LANE_Y, 0) + (float32(oy) - records[r + MY])
+    shape = qa, qb, qc, splat(records[r + LOG]), base_x, base_y
+    return shape, splat(records[r + RED]), splat(records[r + GREEN]), splat(records[r + BLUE])
 
 
 @part
@@ -92,12 +108,12 @@ def meet(shape, t, block):
     the transmittance behind the Gaussian, which pixels blend it, and which are finished by it.
     """
     qa, qb, qc, log, base_x, base_y = shape
-    dx, dy = base_x + splat(BLOCK_X[block]), base_y + splat(BLOCK_Y[block])
+    dx, dy = base_x + BLOCK_X[block], base_y + BLOCK_Y[block]
     raw = exp2(fma(dx, fma(qa, dx, qb * dy), fma(qc * dy, dy, log)))
-    a = vmin(raw, c.ALPHA_MAX)
-    mask = both(ge(a, c.ALPHA_MIN), gt(t, c.ZERO))
+    a = vmin(raw, ALPHA_MAX)
+    mask = both(ge(a, ALPHA_MIN), gt(t, 0))
     after = t - t * a
-    return dx, dy, raw, a, after, mask, both(mask, ge(c.T_MIN, after))
+    return dx, dy, raw, a, after, mask, both(mask, ge(T_MIN, after))
 
 
 @kernel
@@ -137,23 +153,22 @@ def blend(
     live = scratch(uint64, WORDS)
     masks = pointer(masks)
     cursor = pointer(cursor)
-    zero = splat(c.ZERO)
     while True:
         turn = count_up(cursor)
         if turn >= count:
             break
         tile = tiles[turn]
-        ox, oy = (tile % across) * c.TILE, (tile // across) * c.TILE
+        ox, oy = (tile % across) * TILE, (tile // across) * TILE
         for k in range(FORWARD_STATE):
-            state[k] = float32(0)
+            state[k] = 0
         start_tile(ox, oy, width, height, state, 64, live)
         for entry in range(offsets[tile], offsets[tile + 1]):
             if none_set(live, 0):
                 for k in range(entry * WORDS, offsets[tile + 1] * WORDS):
                     masks[k] = uint64(0)
                 break
-            r = entries[entry] * c.RECORD
-            prefetch(records, entries[min(entry + c.AHEAD, offsets[tile + 1] - 1)] * c.RECORD)
+            r = entries[entry] * RECORD
+            prefetch(records, entries[min(entry + AHEAD, offsets[tile + 1] - 1)] * RECORD)
             shape, red, green, blue = spread(records, r, ox, oy)
             find_blocks(records, r, ox, oy, masks, entry * WORDS)
             for word in range(WORDS):
@@ -165,14 +180,14 @@ def blend(
                     at = block * 64
                     t = load(state, at)
                     _, _, _, a, after, keep, done = meet(shape, t, block)
-                    weight = select(keep, t * a, zero)
+                    weight = select(keep, t * a, 0)
                     store(state, at + 16, fma(weight, red, load(state, at + 16)))
                     store(state, at + 32, fma(weight, green, load(state, at + 32)))
                     store(state, at + 48, fma(weight, blue, load(state, at + 48)))
                     t = select(keep, after, t)
                     if anywhere(done):
-                        t = select(done, zero - t, t)
-                        if not anywhere(gt(t, zero)):
+                        t = select(done, 0 - t, t)
+                        if not anywhere(gt(t, 0)):
                             live[word] &= ~(uint64(1) << uint64(block % 64))
                     store(state, at, t)
         write_tile(ox, oy, width, height, state, background, image, alpha)
@@ -190,7 +205,7 @@ def write_tile(ox, oy, width, height, state, background, image, alpha):
         for channel in range(3):
             color = fma(t, background[channel], load(state, at + 16 + 16 * channel))
             store(part, 16 * channel, color)
-        store(part, 48, splat(float32(1)) - t)
+        store(part, 48, 1 - t)
         for lane in range(16):
             if x + lane % 4 < width and y + lane // 4 < height:
                 pixel = (y + lane // 4) * width + x + lane % 4
@@ -270,28 +285,27 @@ def blend_gradient(
     live = scratch(uint64, WORDS)
     masks = pointer(masks)
     cursor = pointer(cursor)
-    zero, one, most = splat(c.ZERO), splat(c.ONE), splat(c.ALPHA_MAX)
     while True:
         turn = count_up(cursor)
         if turn >= count:
             break
         tile = tiles[turn]
-        ox, oy = (tile % across) * c.TILE, (tile // across) * c.TILE
-        if ox + c.TILE > width or oy + c.TILE > height:
+        ox, oy = (tile % across) * TILE, (tile // across) * TILE
+        if ox + TILE > width or oy + TILE > height:
             for k in range(BACKWARD_STATE):  # pixels outside have weight 0, but 0 times NaN is NaN
-                state[k] = float32(0)
+                state[k] = 0
         start_tile(ox, oy, width, height, state, 80, live)
         read_tile(ox, oy, width, height, image, alpha, v_image, v_alpha, state)
         for entry in range(offsets[tile], offsets[tile + 1]):
             slot = entry_slots[entry]
             if none_set(masks, entry * WORDS):
-                for k in range(c.PAIR):
-                    pair_sums[slot * c.PAIR + k] = float32(0)
+                for k in range(PAIR):
+                    pair_sums[slot * PAIR + k] = 0
                 continue
-            r = entries[entry] * c.RECORD
-            prefetch(records, entries[min(entry + c.AHEAD, offsets[tile + 1] - 1)] * c.RECORD)
+            r = entries[entry] * RECORD
+            prefetch(records, entries[min(entry + AHEAD, offsets[tile + 1] - 1)] * RECORD)
             shape, red, green, blue = spread(records, r, ox, oy)
-            s_r = s_g = s_b = s_0 = s_x = s_y = s_xx = s_xy = s_yy = zero
+            s_r = s_g = s_b = s_0 = s_x = s_y = s_xx = s_xy = s_yy = splat(0)
             for word in range(WORDS):
                 bits = masks[entry * WORDS + word]
                 while bits != uint64(0):
@@ -300,7 +314,7 @@ def blend_gradient(
                     at = block * 80
                     t = load(state, at)
                     dx, dy, raw, a, after, keep, done = meet(shape, t, block)
-                    weight = select(keep, t * a, zero)
+                    weight = select(keep, t * a, 0)
                     v_r, v_g, v_b = load(state, at + 32), load(state, at + 48), load(state, at + 64)
                     q = fma(v_r, red, fma(v_g, green, v_b * blue))
                     if colored:
@@ -311,13 +325,13 @@ def blend_gradient(
                         )
                     rest = load(state, at + 16) - weight * q
                     store(state, at + 16, rest)
-                    v_a = t * q - rest / (one - a)
-                    s = select(both(keep, ge(most, raw)), v_a * a, zero)
+                    v_a = t * q - rest / (1 - a)
+                    s = select(both(keep, ge(ALPHA_MAX, raw)), v_a * a, 0)
                     s_0 = s_0 + s
                     if shaped:
                         sx, sy = s * dx, s * dy
                         s_x, s_y = s_x + sx, s_y + sy
                         s_xx, s_xy, s_yy = fma(sx, dx, s_xx), fma(sx, dy, s_xy), fma(sy, dy, s_yy)
-                    after = select(done, zero - after, after)
+                    after = select(done, 0 - after, after)
                     store(state, at, select(keep, after, t))
-            store_sums(pair_sums, slot * c.PAIR, s_r, s_g, s_b, s_0, s_x, s_y, s_xx, s_xy, s_yy)
+            store_sums(pair_sums, slot * PAIR, s_r, s_g, s_b, s_0, s_x, s_y, s_xx, s_xy, s_yy)

@@ -5,7 +5,7 @@ Gaussians at a time.
 from numba import float32, int64, uint64
 
 from clod_adapter._kernels.compiling import part
-from clod_adapter._kernels.conventions import EYE, HALF, HUGE, MEAN, ONE, RECORD, RED, ZERO
+from clod_adapter._kernels.conventions import EYE, HUGE, MEAN, RECORD, RED
 from clod_adapter._kernels.elementary import bits_of, vabs, vsqrt
 from clod_adapter._kernels.pointers import load_rows, scratch, store_rows
 from clod_adapter._kernels.simd import f32x16, fma, gt, splat, vmax
@@ -30,11 +30,6 @@ C40, C41, C42 = (
 )
 C43, C44 = float32(-0.6690465435572892), float32(0.10578554691520431)
 C46, C48 = float32(0.47308734787878004), float32(0.6258357354491761)
-F2 = float32(2)
-F3 = float32(3)
-F4 = float32(4)
-F7 = float32(7)
-F6, F30, F35 = float32(6), float32(30), float32(35)
 
 
 @part
@@ -53,32 +48,32 @@ def sh_basis(degree, x, y, z, out):
     yz = y * z
     xz = x * z
     out[4], out[5], out[7] = C20 * xy, -C20 * yz, -C20 * xz
-    out[6], out[8] = C22 * (F2 * zz - xx - yy), C24 * (xx - yy)
+    out[6], out[8] = C22 * (2 * zz - xx - yy), C24 * (xx - yy)
     if degree < 3:
         return
-    four = F4 * zz - xx - yy
-    out[9], out[10], out[11] = C30 * y * (F3 * xx - yy), C31 * xy * z, C32 * y * four
-    out[12], out[13] = C33 * z * (F2 * zz - F3 * xx - F3 * yy), C32 * x * four
-    out[14], out[15] = C35 * z * (xx - yy), C30 * x * (xx - F3 * yy)
+    four = 4 * zz - xx - yy
+    out[9], out[10], out[11] = C30 * y * (3 * xx - yy), C31 * xy * z, C32 * y * four
+    out[12], out[13] = C33 * z * (2 * zz - 3 * xx - 3 * yy), C32 * x * four
+    out[14], out[15] = C35 * z * (xx - yy), C30 * x * (xx - 3 * yy)
     if degree < 4:
         return
-    out[16], out[17] = C40 * xy * (xx - yy), C41 * yz * (F3 * xx - yy)
-    out[18], out[19] = C42 * xy * (F7 * zz - ONE), C43 * yz * (F7 * zz - F3)
-    out[20], out[21] = C44 * (zz * (F35 * zz - F30) + F3), C43 * xz * (F7 * zz - F3)
-    out[22], out[23] = C46 * (xx - yy) * (F7 * zz - ONE), C41 * xz * (xx - F3 * yy)
-    out[24] = C48 * (xx * (xx - F3 * yy) - yy * (F3 * xx - yy))
+    out[16], out[17] = C40 * xy * (xx - yy), C41 * yz * (3 * xx - yy)
+    out[18], out[19] = C42 * xy * (7 * zz - 1), C43 * yz * (7 * zz - 3)
+    out[20], out[21] = C44 * (zz * (35 * zz - 30) + 3), C43 * xz * (7 * zz - 3)
+    out[22], out[23] = C46 * (xx - yy) * (7 * zz - 1), C41 * xz * (xx - 3 * yy)
+    out[24] = C48 * (xx * (xx - 3 * yy) - yy * (3 * xx - yy))
 
 
 @part
 def sh_basis_gradient(degree, x, y, z, v):
     """Gradient of ``sum_k v[k] * basis_k`` with respect to (x, y, z) as free variables."""
-    gx = gy = gz = splat(float32(0))
+    gx = gy = gz = splat(0)
     if degree >= 1:
         gx, gy, gz = -C1 * v[3], -C1 * v[1], C1 * v[2]
     if degree >= 2:
-        gx += C20 * (y * v[4] - z * v[7]) - F2 * C22 * x * v[6] + F2 * C24 * x * v[8]
-        gy += C20 * (x * v[4] - z * v[5]) - F2 * C22 * y * v[6] - F2 * C24 * y * v[8]
-        gz += C20 * (-y * v[5] - x * v[7]) + F4 * C22 * z * v[6]
+        gx += C20 * (y * v[4] - z * v[7]) - 2 * C22 * x * v[6] + 2 * C24 * x * v[8]
+        gy += C20 * (x * v[4] - z * v[5]) - 2 * C22 * y * v[6] - 2 * C24 * y * v[8]
+        gz += C20 * (-y * v[5] - x * v[7]) + 4 * C22 * z * v[6]
     if degree >= 3:
         xx = x * x
         yy = y * y
@@ -86,48 +81,44 @@ def sh_basis_gradient(degree, x, y, z, v):
         xy = x * y
         yz = y * z
         xz = x * z
+        gx += 6 * C30 * xy * v[9] + C31 * yz * v[10] - 2 * C32 * xy * v[11] - 6 * C33 * xz * v[12]
         gx += (
-            F6 * C30 * xy * v[9] + C31 * yz * v[10] - F2 * C32 * xy * v[11] - F6 * C33 * xz * v[12]
+            C32 * (4 * zz - 3 * xx - yy) * v[13]
+            + 2 * C35 * xz * v[14]
+            + 3 * C30 * (xx - yy) * v[15]
         )
-        gx += (
-            C32 * (F4 * zz - F3 * xx - yy) * v[13]
-            + F2 * C35 * xz * v[14]
-            + F3 * C30 * (xx - yy) * v[15]
-        )
+        gy += 3 * C30 * (xx - yy) * v[9] + C31 * xz * v[10] + C32 * (4 * zz - xx - 3 * yy) * v[11]
         gy += (
-            F3 * C30 * (xx - yy) * v[9] + C31 * xz * v[10] + C32 * (F4 * zz - xx - F3 * yy) * v[11]
+            -6 * C33 * yz * v[12]
+            - 2 * C32 * xy * v[13]
+            - 2 * C35 * yz * v[14]
+            - 6 * C30 * xy * v[15]
         )
-        gy += (
-            -F6 * C33 * yz * v[12]
-            - F2 * C32 * xy * v[13]
-            - F2 * C35 * yz * v[14]
-            - F6 * C30 * xy * v[15]
-        )
-        gz += C31 * xy * v[10] + F4 * F2 * C32 * yz * v[11] + F3 * C33 * (F2 * zz - xx - yy) * v[12]
-        gz += F4 * F2 * C32 * xz * v[13] + C35 * (xx - yy) * v[14]
+        gz += C31 * xy * v[10] + 8 * C32 * yz * v[11] + 3 * C33 * (2 * zz - xx - yy) * v[12]
+        gz += 8 * C32 * xz * v[13] + C35 * (xx - yy) * v[14]
     if degree >= 4:
-        seven = F7 * zz
+        seven = 7 * zz
         gx += (
-            C40 * y * (F3 * xx - yy) * v[16]
-            + F6 * C41 * xy * z * v[17]
-            + C42 * y * (seven - ONE) * v[18]
+            C40 * y * (3 * xx - yy) * v[16]
+            + 6 * C41 * xy * z * v[17]
+            + C42 * y * (seven - 1) * v[18]
         )
-        gx += C43 * z * (seven - F3) * v[21] + F2 * C46 * x * (seven - ONE) * v[22]
-        gx += F3 * C41 * z * (xx - yy) * v[23] + F4 * C48 * x * (xx - F3 * yy) * v[24]
+        gx += C43 * z * (seven - 3) * v[21] + 2 * C46 * x * (seven - 1) * v[22]
+        gx += 3 * C41 * z * (xx - yy) * v[23] + 4 * C48 * x * (xx - 3 * yy) * v[24]
         gy += (
-            C40 * x * (xx - F3 * yy) * v[16]
-            + F3 * C41 * z * (xx - yy) * v[17]
-            + C42 * x * (seven - ONE) * v[18]
+            C40 * x * (xx - 3 * yy) * v[16]
+            + 3 * C41 * z * (xx - yy) * v[17]
+            + C42 * x * (seven - 1) * v[18]
         )
-        gy += C43 * z * (seven - F3) * v[19] - F2 * C46 * y * (seven - ONE) * v[22]
-        gy += -F6 * C41 * xy * z * v[23] + F4 * C48 * y * (yy - F3 * xx) * v[24]
+        gy += C43 * z * (seven - 3) * v[19] - 2 * C46 * y * (seven - 1) * v[22]
+        gy += -6 * C41 * xy * z * v[23] + 4 * C48 * y * (yy - 3 * xx) * v[24]
         gz += (
-            C41 * y * (F3 * xx - yy) * v[17]
-            + F2 * F7 * C42 * xy * z * v[18]
-            + C43 * y * (F3 * seven - F3) * v[19]
+            C41 * y * (3 * xx - yy) * v[17]
+            + 14 * C42 * xy * z * v[18]
+            + C43 * y * (3 * seven - 3) * v[19]
         )
-        gz += C44 * z * (F4 * F35 * zz - F2 * F30) * v[20] + C43 * x * (F3 * seven - F3) * v[21]
-        gz += F2 * F7 * C46 * z * (xx - yy) * v[22] + C41 * x * (xx - F3 * yy) * v[23]
+        gz += C44 * z * (140 * zz - 60) * v[20] + C43 * x * (3 * seven - 3) * v[21]
+        gz += 14 * C46 * z * (xx - yy) * v[22] + C41 * x * (xx - 3 * yy) * v[23]
     return gx, gy, gz
 
 
@@ -135,7 +126,7 @@ def sh_basis_gradient(degree, x, y, z, v):
 def view_direction(w, cam, out):
     """Unit directions from the camera to the Gaussians into ``out[:3]``; returns 1 / distance."""
     x, y, z = w[MEAN] - cam[EYE], w[MEAN + 1] - cam[EYE + 1], w[MEAN + 2] - cam[EYE + 2]
-    inverse = ONE / vsqrt(x * x + y * y + z * z)
+    inverse = 1 / vsqrt(x * x + y * y + z * z)
     out[0], out[1], out[2] = x * inverse, y * inverse, z * inverse
     return inverse
 
@@ -167,12 +158,12 @@ def color(first, found, means, sh0, shN, degree, cam, records, depths, ids):
         sh_basis(degree, sh[0], sh[1], sh[2], basis)
         load_rows(sh0, rows, 3, 0, 3, w, 0)
         load_sh(shN, rows, terms, sh)
-        red, green, blue = HALF + basis[0] * w[0], HALF + basis[0] * w[1], HALF + basis[0] * w[2]
+        red, green, blue = 0.5 + basis[0] * w[0], 0.5 + basis[0] * w[1], 0.5 + basis[0] * w[2]
         for k in range(terms):
             red, green = fma(basis[k + 1], sh[3 * k], red), fma(basis[k + 1], sh[3 * k + 1], green)
             blue = fma(basis[k + 1], sh[3 * k + 2], blue)
         finite = gt(HUGE, vabs(red) + vabs(green) + vabs(blue))
-        w[0], w[1], w[2] = vmax(red, ZERO), vmax(green, ZERO), vmax(blue, ZERO)
+        w[0], w[1], w[2] = vmax(red, 0), vmax(green, 0), vmax(blue, 0)
         store_rows(records, targets, RECORD, RED, 3, w, 0)
         bits = bits_of(finite)
         for lane in range(16):

@@ -4,32 +4,38 @@ from numba import float32
 
 import clod_adapter._kernels as limits
 
-ALPHA_MIN, ALPHA_MAX, T_MIN = (
-    float32(v) for v in (limits.ALPHA_MIN, limits.ALPHA_MAX, limits.T_MIN)
-)
-QUAT_MIN2, QUAT_MAX2 = float32(limits.QUAT_MIN**2), float32(limits.QUAT_MAX**2)
-LOG2E, LOG2_255, TWO_LN2 = (
-    float32(1.4426950408889634),
-    float32(7.994353436858858),
-    float32(1.3862943611198906),
-)
-HALF = float32(0.5)
-ZERO = float32(0)
-ONE = float32(1)
-TWO = float32(2)
+ALPHA_MIN = float32(limits.ALPHA_MIN)
+ALPHA_MAX = float32(limits.ALPHA_MAX)
+T_MIN = float32(limits.T_MIN)
+QUAT_MIN2 = float32(limits.QUAT_MIN**2)
+QUAT_MAX2 = float32(limits.QUAT_MAX**2)
+LOG2E = float32(1.4426950408889634)
+LOG2_255 = float32(7.994353436858858)
+TWO_LN2 = float32(1.3862943611198906)
 HUGE = float32(3e38)  # larger values are dropped as not finite
 
 # Columns of a record, the 64 bytes the blending loops read of a visible Gaussian. The exponent of
 # its alpha is in powers of two: log2 alpha = LOG - (QA dx^2 + QB dx dy + QC dy^2).
-MX, MY, QA, QB, QC, LOG, RED, GREEN, BLUE, REACH, RX, DET, X0, Y0, X1, Y1 = range(16)
+MX, MY = 0, 1
+QA, QB, QC = 2, 3, 4
+LOG = 5
+RED, GREEN, BLUE = 6, 7, 8
+REACH, RX, DET = 9, 10, 11
+X0, Y0 = 12, 13
+X1, Y1 = 14, 15
 RECORD = 16
 
 # A camera: viewmat row-major (16), fx, fy, cx, cy, width, height, ray clamp low x, high x, low y,
 # high y, centre in world coordinates (3), near plane; then the screen-space filter: its variance
 # (px^2), and 1 if opacities are compensated for it.
-FX, FY, CX, CY, WIDTH, HEIGHT, LOW_X, HIGH_X, LOW_Y, HIGH_Y, EYE = range(16, 27)
-NEAR, BLUR, COMPENSATE = range(EYE + 3, EYE + 6)
-CAMERA = COMPENSATE + 1
+FX, FY = 16, 17
+CX, CY = 18, 19
+WIDTH, HEIGHT = 20, 21
+LOW_X, HIGH_X = 22, 23
+LOW_Y, HIGH_Y = 24, 25
+EYE = 26
+NEAR, BLUR, COMPENSATE = 29, 30, 31
+CAMERA = 32
 
 # The workspace of sixteen Gaussians: vectors with one lane per Gaussian. As stored: mean (3),
 # quaternion (4), scales (3). Then camera point (3), rotation (9), U = J R_view (6), P = U R S (6),

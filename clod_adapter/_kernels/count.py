@@ -5,11 +5,10 @@ at a time.
 from numba import float32
 
 from clod_adapter._kernels.compiling import kernel, part
-from clod_adapter._kernels.conventions import ONE
 from clod_adapter._kernels.dial import squared_reach, survives
 from clod_adapter._kernels.elementary import bits_of, ones
 from clod_adapter._kernels.pointers import first_lanes, load_some, pointer, store_some
-from clod_adapter._kernels.simd import both, gt, select, splat, vmax, vmin
+from clod_adapter._kernels.simd import both, gt, select, vmax, vmin
 
 DOUBLINGS = 5  # of the exponent 1 of t: 2^5 is target_count.SHARPNESS
 
@@ -49,7 +48,5 @@ def count_slope(worker, workers, sigma, d, dial2, lift, penalty, out):
         odds = vmin(far2 / reach2, reach2 / far2)
         for _ in range(DOUBLINGS - 1):
             odds = odds * odds
-        slope = odds / ((ONE + odds) * (ONE + odds))
-        store_some(
-            out, i, last - i, scale * select(gt(reach2, far2), slope, vmax(slope, least))
-        )
+        slope = odds / ((1 + odds) * (1 + odds))
+        store_some(out, i, last - i, scale * select(gt(reach2, far2), slope, vmax(slope, least)))

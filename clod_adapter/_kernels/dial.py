@@ -7,8 +7,17 @@ one at its end may be judged otherwise than by the equation, with an opacity of 
 
 from numba import float32, uint64
 
-from clod_adapter._kernels import conventions as c
 from clod_adapter._kernels.compiling import kernel, part
+from clod_adapter._kernels.conventions import (
+    ALPHA_MIN,
+    EYE,
+    HUGE,
+    LOG2E,
+    NEAR,
+    SCALE,
+    SUMS,
+    V_SCALE,
+)
 from clod_adapter._kernels.elementary import bits_of, exp2, log2, vabs
 from clod_adapter._kernels.pointers import (
     first_lanes,
@@ -23,11 +32,13 @@ from clod_adapter._kernels.simd import both, f32x16, ge, gt, select, splat, vmax
 
 # A dial: (s / D)^2 and (s / (D r))^2, in 1 / world units^2, 1 / H^2 (0 without near Gaussians), and
 # 1 where scales and opacities are activated and there is no dial.
-RATE2, GROWTH_RATE2, NEAR2, ACTIVATED = range(4)
-DIAL = ACTIVATED + 1
+RATE2, GROWTH_RATE2 = 0, 1
+NEAR2, ACTIVATED = 2, 3
+DIAL = 4
 
-LN2, FOUR, TAKEOVER = float32(0.6931471805599453), float32(4), float32(5)  # attenuation.TAKEOVER
-FARTHEST_EXPONENT = float32(126)  # of exp2
+LN2 = float32(0.6931471805599453)
+TAKEOVER = 5  # attenuation.TAKEOVER
+FARTHEST_EXPONENT = 126  # of exp2
 LOG2_GROWTH_MAX = float32(20 * 1.4426950408889634)  # attenuation.LOG_GROWTH_MAX
 NEARLY = float32(0.99)  # of the near plane: the projection decides exactly
 
@@ -35,44 +46,44 @@ NEARLY = float32(0.99)  # of the near plane: the projection decides exactly
 @part
 def squared_distance(w, cam):
     """From the camera's centre to the centres ``w[:3]``, world units^2."""
-    dx, dy, dz = w[0] - cam[c.EYE], w[1] - cam[c.EYE + 1], w[2] - cam[c.EYE + 2]
+    dx, dy, dz = w[0] - cam[EYE], w[1] - cam[EYE + 1], w[2] - cam[EYE + 2]
     return dx * dx + dy * dy + dz * dz
 
 
 @part
 def squared_reach(sigma, far2):
     """``R^2``; 1 where d s, of which ``far2`` is the square, is 0."""
-    sigma = vmax(sigma, c.ZERO)
-    return select(gt(far2, c.ZERO), sigma * sigma, c.ONE)
+    sigma = vmax(sigma, 0)
+    return select(gt(far2, 0), sigma * sigma, 1)
 
 
 @part
 def takeover(far2, near2):
     """w, before it is clamped to [0, 1]."""
-    return far2 * near2 * TAKEOVER - (TAKEOVER - c.ONE)
+    return far2 * near2 * TAKEOVER - (TAKEOVER - 1)
 
 
 @part
 def survives(sigma, far2, near2):
     """Which of sixteen rows the dial keeps."""
     end2 = squared_reach(sigma, far2)
-    if near2 > c.ZERO:
-        far = gt(sigma, c.ZERO)
-        begun = select(far, takeover(far2, near2), c.ONE)
-        return both(gt(begun, c.ZERO), gt(select(far, end2, c.ONE / near2), far2))
+    if near2 > 0:
+        far = gt(sigma, 0)
+        begun = select(far, takeover(far2, near2), 1)
+        return both(gt(begun, 0), gt(select(far, end2, 1 / near2), far2))
     return gt(end2, far2)
 
 
 @part
 def squared_share(sigma, far2):
     """``t^2``, at most 1."""
-    return vmin(far2 / squared_reach(sigma, far2), c.ONE)
+    return vmin(far2 / squared_reach(sigma, far2), 1)
 
 
 @part
 def reciprocal_opacity(logit):
     """``1 / sigmoid(logit)``."""
-    return c.ONE + exp2(vmin(-logit * c.LOG2E, FARTHEST_EXPONENT))
+    return 1 + exp2(vmin(-logit * LOG2E, FARTHEST_EXPONENT))
 
 
 @part
@@ -82,14 +93,14 @@ def kept(at, many, means, opacities, sigma, cam, dial, dialled):
 
     Activated opacities are 1/255 at least.
     """
-    if dial[ACTIVATED] > c.ZERO:
+    if dial[ACTIVATED] > 0:
         opacity = load_some(opacities, at, many)
-        shown = both(ge(opacity, c.ALPHA_MIN), gt(c.HUGE, opacity))
+        shown = both(ge(opacity, ALPHA_MIN), gt(HUGE, opacity))
     else:
         w = scratch(f32x16, 3)
         load_triples(means, at, many, w)
         depth = cam[8] * w[0] + cam[9] * w[1] + cam[10] * w[2] + cam[11]
-        shown = ge(depth, NEARLY * cam[c.NEAR])
+        shown = ge(depth, NEARLY * cam[NEAR])
         if dialled:
             far2 = squared_distance(w, cam) * dial[RATE2]
             shown = both(shown, survives(load_some(sigma, at, many), far2, dial[NEAR2]))
@@ -118,32 +129,32 @@ def drawn(rows, opacities, sigma, growth, cam, dial, dialled, grows, w):
 
     Activated ones stay as they are.
     """
-    opacity, size = gather(opacities, rows), splat(c.ZERO)
-    if dial[ACTIVATED] > c.ZERO:
+    opacity, size = gather(opacities, rows), splat(0)
+    if dial[ACTIVATED] > 0:
         return opacity
-    opacity = c.ONE / reciprocal_opacity(opacity)
+    opacity = 1 / reciprocal_opacity(opacity)
     if dialled:
         distance2 = squared_distance(w, cam)
         reach, far2 = gather(sigma, rows), distance2 * dial[RATE2]
         share2 = squared_share(reach, far2)
-        fade = c.ONE - share2 * share2
-        if dial[NEAR2] > c.ZERO:
-            taken = vmin(c.ONE, vmax(c.ZERO, takeover(far2, dial[NEAR2])))
-            fade = select(gt(reach, c.ZERO), fade * taken, c.ONE - taken)
+        fade = 1 - share2 * share2
+        if dial[NEAR2] > 0:
+            taken = vmin(1, vmax(0, takeover(far2, dial[NEAR2])))
+            fade = select(gt(reach, 0), fade * taken, 1 - taken)
         opacity = opacity * fade
         if grows:
             size = gather(growth, rows) * log2_magnification(distance2, dial)
             # NaN stays, and is not drawn
             size = vmin(LOG2_GROWTH_MAX, vmax(-LOG2_GROWTH_MAX, size))
-    for k in range(c.SCALE, c.SCALE + 3):
-        w[k] = exp2(vmin(w[k] * c.LOG2E + size, FARTHEST_EXPONENT))
+    for k in range(SCALE, SCALE + 3):
+        w[k] = exp2(vmin(w[k] * LOG2E + size, FARTHEST_EXPONENT))
     return opacity
 
 
 @part
 def log2_magnification(distance2, dial):
     """``log2 m``, of squared distances in world units^2."""
-    return c.HALF * log2(vmax(distance2 * dial[GROWTH_RATE2], c.ONE))
+    return 0.5 * log2(vmax(distance2 * dial[GROWTH_RATE2], 1))
 
 
 @part
@@ -164,24 +175,24 @@ def dial_gradient(rows, given, cam, dial, dialled, grows, shaped, w, g):
     """
     opacities, sigma, growth, v_opacities, v_sigma, v_growth = given
     opacity = gather(opacities, rows)
-    if dial[ACTIVATED] > c.ZERO:
-        scatter(v_opacities, rows, g[c.SUMS + 3] / opacity)
+    if dial[ACTIVATED] > 0:
+        scatter(v_opacities, rows, g[SUMS + 3] / opacity)
         return
-    odds = exp2(vmin(-opacity * c.LOG2E, FARTHEST_EXPONENT))  # (1 - a) / a
-    total = g[c.SUMS + 3]
+    odds = exp2(vmin(-opacity * LOG2E, FARTHEST_EXPONENT))  # (1 - a) / a
+    total = g[SUMS + 3]
     if shaped:
-        for k in range(c.V_SCALE, c.V_SCALE + 3):
-            g[k] = g[k] * w[c.SCALE + k - c.V_SCALE]
+        for k in range(V_SCALE, V_SCALE + 3):
+            g[k] = g[k] * w[SCALE + k - V_SCALE]
     if dialled:
         reach, distance2 = gather(sigma, rows), squared_distance(w, cam)
         share2 = squared_share(reach, distance2 * dial[RATE2])
         share4 = share2 * share2
-        fading = both(gt(share4, c.ZERO), gt(c.ONE, share4))
-        slope = FOUR * share4 / ((c.ONE - share4) * reach)
-        scatter(v_sigma, rows, select(fading, total * slope, c.ZERO))
+        fading = both(gt(share4, 0), gt(1, share4))
+        slope = 4 * share4 / ((1 - share4) * reach)
+        scatter(v_sigma, rows, select(fading, total * slope, 0))
         if grows and shaped:
             magnification = log2_magnification(distance2, dial)
             inside = gt(LOG2_GROWTH_MAX, vabs(gather(growth, rows) * magnification))
-            size = LN2 * magnification * (g[c.V_SCALE] + g[c.V_SCALE + 1] + g[c.V_SCALE + 2])
-            scatter(v_growth, rows, select(inside, size, c.ZERO))
-    scatter(v_opacities, rows, total * odds / (c.ONE + odds))
+            size = LN2 * magnification * (g[V_SCALE] + g[V_SCALE + 1] + g[V_SCALE + 2])
+            scatter(v_growth, rows, select(inside, size, 0))
+    scatter(v_opacities, rows, total * odds / (1 + odds))

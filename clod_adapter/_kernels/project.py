@@ -8,10 +8,61 @@ dropped. Sixteen Gaussians at a time, one per lane.
 
 from numba import float32, float64, int64, uint64
 
-from clod_adapter._kernels import conventions as c
 from clod_adapter._kernels.colors import color
 from clod_adapter._kernels.compiling import kernel, part
-from clod_adapter._kernels.conventions import RECORD, WORKSPACE
+from clod_adapter._kernels.conventions import (
+    ALPHA_MIN,
+    BLUE,
+    BLUR,
+    COMPENSATE,
+    COV,
+    COVDET,
+    CX,
+    CY,
+    DET,
+    FX,
+    FY,
+    GREEN,
+    HEIGHT,
+    HIGH_X,
+    HIGH_Y,
+    HUGE,
+    LOG,
+    LOG2_255,
+    LOG2E,
+    LOW_X,
+    LOW_Y,
+    MEAN,
+    MX,
+    MY,
+    NEAR,
+    PMAT,
+    POINT,
+    QA,
+    QB,
+    QC,
+    QINV,
+    QUAT,
+    QUAT_MAX2,
+    QUAT_MIN2,
+    RAWDET,
+    REACH,
+    RECORD,
+    RED,
+    ROT,
+    RX,
+    SCALE,
+    SLACK,
+    STORED,
+    TWO_LN2,
+    UMAT,
+    WIDTH,
+    WORKSPACE,
+    X0,
+    X1,
+    Y0,
+    Y1,
+)
 from clod_adapter._kernels.dial import drawn, kept
 from clod_adapter._kernels.elementary import bits_of, log2, lowest, vceil, vfloor, vsqrt
 from clod_adapter._kernels.pointers import first_lanes, load_rows, pointer, scratch, store_rows
@@ -21,9 +72,9 @@ from clod_adapter._kernels.simd import both, f32x16, ge, gt, load, splat, vmax, 
 @part
 def load_stored(means, quats, scales, rows, w):
     """Loads what is stored of sixteen rows into the workspace ``w``."""
-    load_rows(means, rows, 3, 0, 3, w, c.MEAN)
-    load_rows(quats, rows, 4, 0, 4, w, c.STORED)
-    load_rows(scales, rows, 3, 0, 3, w, c.SCALE)
+    load_rows(means, rows, 3, 0, 3, w, MEAN)
+    load_rows(quats, rows, 4, 0, 4, w, STORED)
+    load_rows(scales, rows, 3, 0, 3, w, SCALE)
 
 
 @part
@@ -33,63 +84,63 @@ def covariance(cam, w):
     """
     for d in range(3):
         row = 4 * d
-        w[c.POINT + d] = (
-            cam[row] * w[c.MEAN]
-            + cam[row + 1] * w[c.MEAN + 1]
-            + cam[row + 2] * w[c.MEAN + 2]
+        w[POINT + d] = (
+            cam[row] * w[MEAN]
+            + cam[row + 1] * w[MEAN + 1]
+            + cam[row + 2] * w[MEAN + 2]
             + cam[row + 3]
         )
-    norm2 = w[c.STORED] * w[c.STORED] + w[c.STORED + 1] * w[c.STORED + 1]
-    norm2 = norm2 + w[c.STORED + 2] * w[c.STORED + 2] + w[c.STORED + 3] * w[c.STORED + 3]
-    valid = both(ge(norm2, c.QUAT_MIN2), ge(c.QUAT_MAX2, norm2))
-    valid = both(ge(w[c.POINT + 2], cam[c.NEAR]), valid)
-    w[c.QINV] = c.ONE / vsqrt(norm2)
+    norm2 = w[STORED] * w[STORED] + w[STORED + 1] * w[STORED + 1]
+    norm2 = norm2 + w[STORED + 2] * w[STORED + 2] + w[STORED + 3] * w[STORED + 3]
+    valid = both(ge(norm2, QUAT_MIN2), ge(QUAT_MAX2, norm2))
+    valid = both(ge(w[POINT + 2], cam[NEAR]), valid)
+    w[QINV] = 1 / vsqrt(norm2)
     for d in range(4):
-        w[c.QUAT + d] = w[c.STORED + d] * w[c.QINV]
+        w[QUAT + d] = w[STORED + d] * w[QINV]
     rotation(w)
-    iz = c.ONE / w[c.POINT + 2]
-    rx = vmin(vmax(w[c.POINT] * iz, cam[c.LOW_X]), cam[c.HIGH_X])
-    ry = vmin(vmax(w[c.POINT + 1] * iz, cam[c.LOW_Y]), cam[c.HIGH_Y])
+    iz = 1 / w[POINT + 2]
+    rx = vmin(vmax(w[POINT] * iz, cam[LOW_X]), cam[HIGH_X])
+    ry = vmin(vmax(w[POINT + 1] * iz, cam[LOW_Y]), cam[HIGH_Y])
     for k in range(3):
-        w[c.UMAT + k] = cam[c.FX] * iz * (splat(cam[k]) - rx * cam[8 + k])
-        w[c.UMAT + 3 + k] = cam[c.FY] * iz * (splat(cam[4 + k]) - ry * cam[8 + k])
+        w[UMAT + k] = cam[FX] * iz * (cam[k] - rx * cam[8 + k])
+        w[UMAT + 3 + k] = cam[FY] * iz * (cam[4 + k] - ry * cam[8 + k])
     for row in range(2):
-        u = c.UMAT + 3 * row
+        u = UMAT + 3 * row
         for k in range(3):
-            along = w[u] * w[c.ROT + k] + w[u + 1] * w[c.ROT + 3 + k] + w[u + 2] * w[c.ROT + 6 + k]
-            w[c.PMAT + 3 * row + k] = along * w[c.SCALE + k]
+            along = w[u] * w[ROT + k] + w[u + 1] * w[ROT + 3 + k] + w[u + 2] * w[ROT + 6 + k]
+            w[PMAT + 3 * row + k] = along * w[SCALE + k]
     # P P^T with and without blur, and determinants as sums of squares, exact for needles.
-    blur = cam[c.BLUR]
-    p0 = w[c.PMAT]
-    p1 = w[c.PMAT + 1]
-    p2 = w[c.PMAT + 2]
-    p3 = w[c.PMAT + 3]
-    p4 = w[c.PMAT + 4]
-    p5 = w[c.PMAT + 5]
+    blur = cam[BLUR]
+    p0 = w[PMAT]
+    p1 = w[PMAT + 1]
+    p2 = w[PMAT + 2]
+    p3 = w[PMAT + 3]
+    p4 = w[PMAT + 4]
+    p5 = w[PMAT + 5]
     xx, yy = p0 * p0 + p1 * p1 + p2 * p2, p3 * p3 + p4 * p4 + p5 * p5
-    w[c.COV], w[c.COV + 1], w[c.COV + 2] = xx + blur, p0 * p3 + p1 * p4 + p2 * p5, yy + blur
+    w[COV], w[COV + 1], w[COV + 2] = xx + blur, p0 * p3 + p1 * p4 + p2 * p5, yy + blur
     cx, cy, cz = p1 * p5 - p2 * p4, p2 * p3 - p0 * p5, p0 * p4 - p1 * p3
-    w[c.RAWDET] = cx * cx + cy * cy + cz * cz
-    w[c.COVDET] = w[c.RAWDET] + blur * (xx + yy) + blur * blur
-    return both(valid, gt(c.HUGE, w[c.COVDET]))
+    w[RAWDET] = cx * cx + cy * cy + cz * cz
+    w[COVDET] = w[RAWDET] + blur * (xx + yy) + blur * blur
+    return both(valid, gt(HUGE, w[COVDET]))
 
 
 @part
 def rotation(w):
     """Rotation matrix, row-major, of the unit quaternion."""
-    q0 = w[c.QUAT]
-    q1 = w[c.QUAT + 1]
-    q2 = w[c.QUAT + 2]
-    q3 = w[c.QUAT + 3]
-    w[c.ROT] = c.ONE - c.TWO * (q2 * q2 + q3 * q3)
-    w[c.ROT + 1] = c.TWO * (q1 * q2 - q0 * q3)
-    w[c.ROT + 2] = c.TWO * (q1 * q3 + q0 * q2)
-    w[c.ROT + 3] = c.TWO * (q1 * q2 + q0 * q3)
-    w[c.ROT + 4] = c.ONE - c.TWO * (q1 * q1 + q3 * q3)
-    w[c.ROT + 5] = c.TWO * (q2 * q3 - q0 * q1)
-    w[c.ROT + 6] = c.TWO * (q1 * q3 - q0 * q2)
-    w[c.ROT + 7] = c.TWO * (q2 * q3 + q0 * q1)
-    w[c.ROT + 8] = c.ONE - c.TWO * (q1 * q1 + q2 * q2)
+    q0 = w[QUAT]
+    q1 = w[QUAT + 1]
+    q2 = w[QUAT + 2]
+    q3 = w[QUAT + 3]
+    w[ROT] = 1 - 2 * (q2 * q2 + q3 * q3)
+    w[ROT + 1] = 2 * (q1 * q2 - q0 * q3)
+    w[ROT + 2] = 2 * (q1 * q3 + q0 * q2)
+    w[ROT + 3] = 2 * (q1 * q2 + q0 * q3)
+    w[ROT + 4] = 1 - 2 * (q1 * q1 + q3 * q3)
+    w[ROT + 5] = 2 * (q2 * q3 - q0 * q1)
+    w[ROT + 6] = 2 * (q1 * q3 - q0 * q2)
+    w[ROT + 7] = 2 * (q2 * q3 + q0 * q1)
+    w[ROT + 8] = 1 - 2 * (q1 * q1 + q2 * q2)
 
 
 @part
@@ -104,11 +155,9 @@ def centres(means, rows, cam, out):
         x, y, z = float64(means[at]), float64(means[at + 1]), float64(means[at + 2])
         depth = cam[8] * x + cam[9] * y + cam[10] * z + cam[11]
         inverse = float64(1) / depth
-        out[lane] = (
-            cam[c.FX] * (cam[0] * x + cam[1] * y + cam[2] * z + cam[3]) * inverse + cam[c.CX]
-        )
+        out[lane] = cam[FX] * (cam[0] * x + cam[1] * y + cam[2] * z + cam[3]) * inverse + cam[CX]
         out[16 + lane] = (
-            cam[c.FY] * (cam[4] * x + cam[5] * y + cam[6] * z + cam[7]) * inverse + cam[c.CY]
+            cam[FY] * (cam[4] * x + cam[5] * y + cam[6] * z + cam[7]) * inverse + cam[CY]
         )
         out[32 + lane] = depth
 
@@ -119,26 +168,26 @@ def make_records(w, centre, opacity, cam, record):
     pixel centre.
     """
     mx, my = load(centre, 0), load(centre, 16)
-    idet = c.ONE / w[c.COVDET]
-    record[c.MX], record[c.MY] = mx, my
-    record[c.QA], record[c.QC] = (
-        c.HALF * c.LOG2E * w[c.COV + 2] * idet,
-        c.HALF * c.LOG2E * w[c.COV] * idet,
+    idet = 1 / w[COVDET]
+    record[MX], record[MY] = mx, my
+    record[QA], record[QC] = (
+        0.5 * LOG2E * w[COV + 2] * idet,
+        0.5 * LOG2E * w[COV] * idet,
     )
-    record[c.QB], record[c.DET] = -(c.LOG2E * w[c.COV + 1] * idet), c.LOG2E * c.LOG2E * idet
-    if cam[c.COMPENSATE] > c.ZERO:  # NaN for an infinite covariance, which is not drawn
-        opacity = opacity * vsqrt(w[c.RAWDET] * idet)
-    drawn = ge(opacity, c.ALPHA_MIN)
-    record[c.LOG] = log2(opacity)
-    record[c.RED] = record[c.GREEN] = record[c.BLUE] = splat(c.ZERO)
-    reach = vmax(record[c.LOG] + c.LOG2_255, c.ZERO)
-    rx, ry = vsqrt(c.TWO_LN2 * reach * w[c.COV]), vsqrt(c.TWO_LN2 * reach * w[c.COV + 2])
-    record[c.REACH], record[c.RX] = reach, rx
-    record[c.X0] = vmax(vceil(mx - rx - c.HALF - c.SLACK), c.ZERO)
-    record[c.X1] = vmin(vfloor(mx + rx - c.HALF + c.SLACK), cam[c.WIDTH] - c.ONE)
-    record[c.Y0] = vmax(vceil(my - ry - c.HALF - c.SLACK), c.ZERO)
-    record[c.Y1] = vmin(vfloor(my + ry - c.HALF + c.SLACK), cam[c.HEIGHT] - c.ONE)
-    return both(drawn, both(ge(record[c.X1], record[c.X0]), ge(record[c.Y1], record[c.Y0])))
+    record[QB], record[DET] = -(LOG2E * w[COV + 1] * idet), LOG2E * LOG2E * idet
+    if cam[COMPENSATE] > 0:  # NaN for an infinite covariance, which is not drawn
+        opacity = opacity * vsqrt(w[RAWDET] * idet)
+    drawn = ge(opacity, ALPHA_MIN)
+    record[LOG] = log2(opacity)
+    record[RED] = record[GREEN] = record[BLUE] = splat(0)
+    reach = vmax(record[LOG] + LOG2_255, 0)
+    rx, ry = vsqrt(TWO_LN2 * reach * w[COV]), vsqrt(TWO_LN2 * reach * w[COV + 2])
+    record[REACH], record[RX] = reach, rx
+    record[X0] = vmax(vceil(mx - rx - 0.5 - SLACK), 0)
+    record[X1] = vmin(vfloor(mx + rx - 0.5 + SLACK), cam[WIDTH] - 1)
+    record[Y0] = vmax(vceil(my - ry - 0.5 - SLACK), 0)
+    record[Y1] = vmin(vfloor(my + ry - 0.5 + SLACK), cam[HEIGHT] - 1)
+    return both(drawn, both(ge(record[X1], record[X0]), ge(record[Y1], record[Y0])))
 
 
 @part
@@ -152,7 +201,7 @@ def add_records(rows, filled, packed, spare, means, opacity, cam, w, records, de
     valid = covariance(cam, w)
     centres(means, rows, cam, centre)
     # beyond the near plane in float32 too, not only in float64
-    valid = both(valid, ge(load(centre, 32), cam[c.NEAR]))
+    valid = both(valid, ge(load(centre, 32), cam[NEAR]))
     valid = both(valid, both(make_records(w, centre, opacity, cam, record), first_lanes(filled)))
     bits = bits_of(valid)
     if bits == uint64(0):

@@ -4,10 +4,39 @@ Gaussian.
 
 from numba import float32, int64
 
-from clod_adapter._kernels import conventions as c
 from clod_adapter._kernels.colors import C0, load_sh, sh_basis, sh_basis_gradient, view_direction
 from clod_adapter._kernels.compiling import kernel, part
-from clod_adapter._kernels.conventions import GRADIENTS, WORKSPACE
+from clod_adapter._kernels.conventions import (
+    BLUR,
+    COV,
+    COVDET,
+    FX,
+    FY,
+    GRADIENTS,
+    HIGH_X,
+    HIGH_Y,
+    LOW_X,
+    LOW_Y,
+    PAIR,
+    PMAT,
+    POINT,
+    QINV,
+    QUAT,
+    RAWDET,
+    RECORD,
+    RED,
+    ROT,
+    SCALE,
+    SUMS,
+    UMAT,
+    V_MEAN,
+    V_P,
+    V_QUAT,
+    V_ROT,
+    V_SCALE,
+    V_SH0,
+    WORKSPACE,
+)
 from clod_adapter._kernels.dial import dial_gradient, drawn
 from clod_adapter._kernels.pointers import load_rows, pointer, scratch, store_rows
 from clod_adapter._kernels.project import covariance, load_stored
@@ -17,30 +46,30 @@ from clod_adapter._kernels.simd import eq, f32x16, gt, load, select, splat, stor
 @part
 def covariance_gradient(w, g, cam, compensated):
     """Gradients of scales, rotation matrix and mean from the sums over pixels."""
-    idet = c.ONE / w[c.COVDET]
-    a, b, e = w[c.COV + 2] * idet, -(w[c.COV + 1] * idet), w[c.COV] * idet
+    idet = 1 / w[COVDET]
+    a, b, e = w[COV + 2] * idet, -(w[COV + 1] * idet), w[COV] * idet
     # dL/dP = K M (K P) with the conic K = [[a, b], [b, e]] and the second moments M of the sums. K
     # P comes from K = adj(P P^T + blur) / det term by term: for a needle, K times the long column
     # of P would cancel.
     for k in range(3):
-        p0, p1 = w[c.PMAT + k], w[c.PMAT + 3 + k]
-        t0, t1 = cam[c.BLUR] * p0, cam[c.BLUR] * p1
+        p0, p1 = w[PMAT + k], w[PMAT + 3 + k]
+        t0, t1 = cam[BLUR] * p0, cam[BLUR] * p1
         for j in range(3):
             if j != k:  # else it is 0, except for the rounding of a fused product
-                cross = p0 * w[c.PMAT + 3 + j] - w[c.PMAT + j] * p1
-                t0 += w[c.PMAT + 3 + j] * cross
-                t1 -= w[c.PMAT + j] * cross
+                cross = p0 * w[PMAT + 3 + j] - w[PMAT + j] * p1
+                t0 += w[PMAT + 3 + j] * cross
+                t1 -= w[PMAT + j] * cross
         t0, t1 = t0 * idet, t1 * idet
-        m0, m1 = g[c.SUMS + 6] * t0 + g[c.SUMS + 7] * t1, g[c.SUMS + 7] * t0 + g[c.SUMS + 8] * t1
-        g[c.V_P + k], g[c.V_P + 3 + k] = a * m0 + b * m1, b * m0 + e * m1
+        m0, m1 = g[SUMS + 6] * t0 + g[SUMS + 7] * t1, g[SUMS + 7] * t0 + g[SUMS + 8] * t1
+        g[V_P + k], g[V_P + 3 + k] = a * m0 + b * m1, b * m0 + e * m1
         if compensated is not None:
             compensation_gradient(w, g, k, t0, t1)
-        g[c.V_SCALE + k] = splat(c.ZERO)
+        g[V_SCALE + k] = splat(0)
         for d in range(3):
-            v = w[c.UMAT + d] * g[c.V_P + k] + w[c.UMAT + 3 + d] * g[c.V_P + 3 + k]
-            g[c.V_SCALE + k] = g[c.V_SCALE + k] + v * w[c.ROT + 3 * d + k]
-            g[c.V_ROT + 3 * d + k] = v * w[c.SCALE + k]
-    v_x, v_y = a * g[c.SUMS + 4] + b * g[c.SUMS + 5], b * g[c.SUMS + 4] + e * g[c.SUMS + 5]
+            v = w[UMAT + d] * g[V_P + k] + w[UMAT + 3 + d] * g[V_P + 3 + k]
+            g[V_SCALE + k] = g[V_SCALE + k] + v * w[ROT + 3 * d + k]
+            g[V_ROT + 3 * d + k] = v * w[SCALE + k]
+    v_x, v_y = a * g[SUMS + 4] + b * g[SUMS + 5], b * g[SUMS + 4] + e * g[SUMS + 5]
     point_gradient(w, g, v_x, v_y, cam)
 
 
@@ -52,17 +81,17 @@ def compensation_gradient(w, g, k, t0, t1):
     ``t0, t1`` is the column of K P. The gradient with respect to log c equals that with respect to
     log opacity.
     """
-    p0 = w[c.PMAT + k]
-    p1 = w[c.PMAT + 3 + k]
-    u0 = splat(c.ZERO)
-    u1 = splat(c.ZERO)
-    inverse = c.ONE / w[c.RAWDET]
+    p0 = w[PMAT + k]
+    p1 = w[PMAT + 3 + k]
+    u0 = splat(0)
+    u1 = splat(0)
+    inverse = 1 / w[RAWDET]
     for j in range(3):
         if j != k:
-            cross = p0 * w[c.PMAT + 3 + j] - w[c.PMAT + j] * p1
-            u0, u1 = u0 + w[c.PMAT + 3 + j] * cross, u1 - w[c.PMAT + j] * cross
-    g[c.V_P + k] = g[c.V_P + k] + g[c.SUMS + 3] * (u0 * inverse - t0)
-    g[c.V_P + 3 + k] = g[c.V_P + 3 + k] + g[c.SUMS + 3] * (u1 * inverse - t1)
+            cross = p0 * w[PMAT + 3 + j] - w[PMAT + j] * p1
+            u0, u1 = u0 + w[PMAT + 3 + j] * cross, u1 - w[PMAT + j] * cross
+    g[V_P + k] = g[V_P + k] + g[SUMS + 3] * (u0 * inverse - t0)
+    g[V_P + 3 + k] = g[V_P + 3 + k] + g[SUMS + 3] * (u1 * inverse - t1)
 
 
 @part
@@ -70,47 +99,47 @@ def point_gradient(w, g, v_x, v_y, cam):
     """Adds the gradients through the projected centre and through the Jacobian to that of the
     mean.
     """
-    x, y, iz = w[c.POINT], w[c.POINT + 1], c.ONE / w[c.POINT + 2]
+    x, y, iz = w[POINT], w[POINT + 1], 1 / w[POINT + 2]
     rx, ry = x * iz, y * iz
-    clamped_x = vmin(vmax(rx, cam[c.LOW_X]), cam[c.HIGH_X])
-    clamped_y = vmin(vmax(ry, cam[c.LOW_Y]), cam[c.HIGH_Y])
-    j00 = j02 = j11 = j12 = splat(c.ZERO)
+    clamped_x = vmin(vmax(rx, cam[LOW_X]), cam[HIGH_X])
+    clamped_y = vmin(vmax(ry, cam[LOW_Y]), cam[HIGH_Y])
+    j00 = j02 = j11 = j12 = splat(0)
     for d in range(3):
-        u0 = u1 = splat(c.ZERO)
+        u0 = u1 = splat(0)
         for k in range(3):
-            q = w[c.ROT + 3 * d + k] * w[c.SCALE + k]
-            u0, u1 = u0 + g[c.V_P + k] * q, u1 + g[c.V_P + 3 + k] * q
+            q = w[ROT + 3 * d + k] * w[SCALE + k]
+            u0, u1 = u0 + g[V_P + k] * q, u1 + g[V_P + 3 + k] * q
         j00, j02 = j00 + u0 * cam[d], j02 + u0 * cam[8 + d]
         j11, j12 = j11 + u1 * cam[4 + d], j12 + u1 * cam[8 + d]
-    fx, fy = cam[c.FX] * iz, cam[c.FY] * iz
+    fx, fy = cam[FX] * iz, cam[FY] * iz
     # The projected centre, then the factor 1/z of all four entries of the Jacobian.
     v_z = -(fx * rx * v_x + fy * ry * v_y) - iz * (
         fx * (j00 - clamped_x * j02) + fy * (j11 - clamped_y * j12)
     )
-    v_rx = select(eq(clamped_x, rx), -(fx * j02 * iz), c.ZERO)
-    v_ry = select(eq(clamped_y, ry), -(fy * j12 * iz), c.ZERO)
+    v_rx = select(eq(clamped_x, rx), -(fx * j02 * iz), 0)
+    v_ry = select(eq(clamped_y, ry), -(fy * j12 * iz), 0)
     v_x, v_y, v_z = fx * v_x + v_rx, fy * v_y + v_ry, v_z - v_rx * rx - v_ry * ry
     for d in range(3):
-        g[c.V_MEAN + d] = g[c.V_MEAN + d] + (cam[d] * v_x + cam[4 + d] * v_y + cam[8 + d] * v_z)
+        g[V_MEAN + d] = g[V_MEAN + d] + (cam[d] * v_x + cam[4 + d] * v_y + cam[8 + d] * v_z)
 
 
 @part
 def quat_gradient(w, g):
     """Gradient of the stored quaternion from that of the rotation matrix."""
-    q0 = w[c.QUAT]
-    q1 = w[c.QUAT + 1]
-    q2 = w[c.QUAT + 2]
-    q3 = w[c.QUAT + 3]
-    r = c.V_ROT
+    q0 = w[QUAT]
+    q1 = w[QUAT + 1]
+    q2 = w[QUAT + 2]
+    q3 = w[QUAT + 3]
+    r = V_ROT
     x, y, z = g[r + 7] - g[r + 5], g[r + 2] - g[r + 6], g[r + 3] - g[r + 1]
     xy, xz, yz = g[r + 3] + g[r + 1], g[r + 6] + g[r + 2], g[r + 7] + g[r + 5]
-    v0 = c.TWO * (q1 * x + q2 * y + q3 * z)
-    v1 = c.TWO * (q2 * xy + q3 * xz + q0 * x - c.TWO * q1 * (g[r + 4] + g[r + 8]))
-    v2 = c.TWO * (q1 * xy + q3 * yz + q0 * y - c.TWO * q2 * (g[r] + g[r + 8]))
-    v3 = c.TWO * (q1 * xz + q2 * yz + q0 * z - c.TWO * q3 * (g[r] + g[r + 4]))
+    v0 = 2 * (q1 * x + q2 * y + q3 * z)
+    v1 = 2 * (q2 * xy + q3 * xz + q0 * x - 2 * q1 * (g[r + 4] + g[r + 8]))
+    v2 = 2 * (q1 * xy + q3 * yz + q0 * y - 2 * q2 * (g[r] + g[r + 8]))
+    v3 = 2 * (q1 * xz + q2 * yz + q0 * z - 2 * q3 * (g[r] + g[r + 4]))
     along = v0 * q0 + v1 * q1 + v2 * q2 + v3 * q3
-    g[c.V_QUAT], g[c.V_QUAT + 1] = (v0 - along * q0) * w[c.QINV], (v1 - along * q1) * w[c.QINV]
-    g[c.V_QUAT + 2], g[c.V_QUAT + 3] = (v2 - along * q2) * w[c.QINV], (v3 - along * q3) * w[c.QINV]
+    g[V_QUAT], g[V_QUAT + 1] = (v0 - along * q0) * w[QINV], (v1 - along * q1) * w[QINV]
+    g[V_QUAT + 2], g[V_QUAT + 3] = (v2 - along * q2) * w[QINV], (v3 - along * q3) * w[QINV]
 
 
 @part
@@ -121,7 +150,7 @@ def color_gradient(w, g, shN, rows, degree, cam, sh, basis, tuned, v_shN):
     inverse = view_direction(w, cam, sh)
     x, y, z = sh[0], sh[1], sh[2]
     sh_basis(degree, x, y, z, basis)
-    red, green, blue = g[c.SUMS], g[c.SUMS + 1], g[c.SUMS + 2]
+    red, green, blue = g[SUMS], g[SUMS + 1], g[SUMS + 2]
     terms = (degree + 1) * (degree + 1) - 1
     load_sh(shN, rows, terms, sh)
     for k in range(terms):
@@ -133,15 +162,15 @@ def color_gradient(w, g, shN, rows, degree, cam, sh, basis, tuned, v_shN):
             store_rows(v_shN, rows, 3 * terms, first, min(3 * terms - first, 16), sh, first)
     gx, gy, gz = sh_basis_gradient(degree, x, y, z, basis)
     along = gx * x + gy * y + gz * z
-    g[c.V_MEAN], g[c.V_MEAN + 1] = (gx - along * x) * inverse, (gy - along * y) * inverse
-    g[c.V_MEAN + 2] = (gz - along * z) * inverse
+    g[V_MEAN], g[V_MEAN + 1] = (gx - along * x) * inverse, (gy - along * y) * inverse
+    g[V_MEAN + 2] = (gz - along * z) * inverse
 
 
 @part
 def clear(values, first, last, width):
     """Sets the rows from ``first`` up to ``last``, of ``width`` elements, to 0."""
     for k in range(first * width, last * width):
-        values[k] = c.ZERO
+        values[k] = 0
 
 
 @part
@@ -163,15 +192,14 @@ def add_slots(pair_sums, slots, records, packed, lanes, sums, g):
     ``sums [16, 16]``.
     """
     for lane in range(16):
-        total = splat(c.ZERO)
+        total = splat(0)
         for slot in range(slots[2 * packed[lane]], slots[2 * packed[lane] + 1]):
-            total = total + load(pair_sums, slot * c.PAIR)
+            total = total + load(pair_sums, slot * PAIR)
         store(sums, 16 * lane, total)
-    load_rows(sums, lanes, 16, 0, c.PAIR, g, c.SUMS)
-    load_rows(records, packed, c.RECORD, c.RED, 3, g, c.SUMS + c.PAIR)
+    load_rows(sums, lanes, 16, 0, PAIR, g, SUMS)
+    load_rows(records, packed, RECORD, RED, 3, g, SUMS + PAIR)
     for k in range(3):  # a colour clamped at 0 has no gradient
-        g[c.SUMS + k] = select(
-            gt(g[c.SUMS + c.PAIR + k], c.ZERO), g[c.SUMS + k], c.ZERO)
+        g[SUMS + k] = select(gt(g[SUMS + PAIR + k], 0), g[SUMS + k], 0)
 
 
 @kernel
@@ -275,16 +303,16 @@ def project_gradient(
             covariance(cam, w)
             covariance_gradient(w, g, cam, compensated)
             quat_gradient(w, g)
-            store_rows(v_means, rows, 3, 0, 3, g, c.V_MEAN)
-            store_rows(v_quats, rows, 4, 0, 4, g, c.V_QUAT)
+            store_rows(v_means, rows, 3, 0, 3, g, V_MEAN)
+            store_rows(v_quats, rows, 4, 0, 4, g, V_QUAT)
         given = opacities, sigma, growth, v_opacities, v_sigma, v_growth
         dial_gradient(rows, given, cam, dial, dialled, grows, shaped, w, g)
         if shaped:
-            store_rows(v_scales, rows, 3, 0, 3, g, c.V_SCALE)
+            store_rows(v_scales, rows, 3, 0, 3, g, V_SCALE)
         if colored:
             for k in range(3):
-                g[c.V_SH0 + k] = C0 * g[c.SUMS + k]
-            store_rows(v_sh0, rows, 3, 0, 3, g, c.V_SH0)
+                g[V_SH0 + k] = C0 * g[SUMS + k]
+            store_rows(v_sh0, rows, 3, 0, 3, g, V_SH0)
     no_gradient(
         done, last, shaped, colored, terms, v_means, v_quats, v_scales, v_opacities, v_sh0, v_shN
     )

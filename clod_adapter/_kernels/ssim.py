@@ -16,7 +16,7 @@ RADIUS, PAD = 5, 16
 _taps = np.exp(-((np.arange(11) - RADIUS) ** 2) / (2 * 1.5**2))
 TAPS = (_taps / _taps.sum()).astype(np.float32)
 C1, C2 = float32(0.01**2), float32(0.03**2)
-TWO, BYTE = float32(2), float32(1 / 255)
+BYTE = float32(1 / 255)
 
 
 def stride(width: int) -> int:
@@ -38,7 +38,7 @@ def to_planes(worker, workers, image, target, x, y):
 @part
 def blur_row(lines, line, length):
     """Horizontal blur of 16 columns from ``line`` of a row buffer."""
-    out = splat(float32(0))
+    out = splat(0)
     for tap in range(11):
         out = fma(TAPS[tap], load(lines, line + length + tap - RADIUS), out)
     return out
@@ -55,8 +55,7 @@ def ssim_slopes(worker, workers, x, y, width, g_mean, g_square, g_product, sums)
     g_mean = pointer(g_mean)
     g_square = pointer(g_square)
     g_product = pointer(g_product)
-    lines, zero = np.zeros(6 * step, np.float32), splat(float32(0))
-    c1, c2, two = splat(C1), splat(C2), splat(TWO)
+    lines, zero = np.zeros(6 * step, np.float32), splat(0)
     result = 0.0
     for task in range(
         channels * height * worker // workers, channels * height * (worker + 1) // workers
@@ -65,7 +64,7 @@ def ssim_slopes(worker, workers, x, y, width, g_mean, g_square, g_product, sums)
         for at in range(PAD, step - PAD, 16):
             m_x = m_y = m_xx = m_yy = m_xy = zero
             for near in range(max(row - RADIUS, 0), min(row + RADIUS, height - 1) + 1):
-                tap, where = splat(TAPS[near - row + RADIUS]), (channel * height + near) * step + at
+                tap, where = TAPS[near - row + RADIUS], (channel * height + near) * step + at
                 p, q = load(x, where), load(y, where)
                 tp, tq = tap * p, tap * q
                 m_x, m_y = m_x + tp, m_y + tq
@@ -80,20 +79,20 @@ def ssim_slopes(worker, workers, x, y, width, g_mean, g_square, g_product, sums)
             sxx = blur_row(lines, 2 * step, at) - mx * mx
             syy = blur_row(lines, 3 * step, at) - my * my
             sxy = blur_row(lines, 4 * step, at) - mx * my
-            a, b = fma(two * mx, my, c1), fma(two, sxy, c2)
-            c, d = fma(mx, mx, fma(my, my, c1)), sxx + syy + c2
-            inverse = float32(1) / (c * d)
+            a, b = fma(2 * mx, my, C1), fma(2, sxy, C2)
+            c, d = fma(mx, mx, fma(my, my, C1)), sxx + syy + C2
+            inverse = 1 / (c * d)
             value = a * b * inverse
             where = task * step + at
             store(lines, 5 * step + at, value)
-            store(g_mean, where, two * (my * (b - a) - value * mx * (d - c)) * inverse)
-            store(g_square, where, zero - value * c * inverse)
-            store(g_product, where, two * a * inverse)
+            store(g_mean, where, 2 * (my * (b - a) - value * mx * (d - c)) * inverse)
+            store(g_square, where, 0 - value * c * inverse)
+            store(g_product, where, 2 * a * inverse)
         for column in range(width):
             result += lines[5 * step + PAD + column]
         # Lanes beyond the image must not contribute to the gradient.
         for column in range(task * step + PAD + width, (task + 1) * step - PAD):
-            g_mean[column] = g_square[column] = g_product[column] = float32(0)
+            g_mean[column] = g_square[column] = g_product[column] = 0
     sums[worker] = result
 
 
@@ -110,8 +109,8 @@ def loss_gradient(
     g_mean = pointer(g_mean)
     g_square = pointer(g_square)
     g_product = pointer(g_product)
-    lines, out, zero = np.zeros(3 * step, np.float32), np.empty(step, np.float32), splat(float32(0))
-    two, weight = splat(TWO), splat(float32(-dssim))
+    lines, out, zero = np.zeros(3 * step, np.float32), np.empty(step, np.float32), splat(0)
+    weight = float32(-dssim)
     result = 0.0
     for task in range(
         channels * height * worker // workers, channels * height * (worker + 1) // workers
@@ -120,7 +119,7 @@ def loss_gradient(
         for at in range(PAD, step - PAD, 16):
             m, s, p = zero, zero, zero
             for near in range(max(row - RADIUS, 0), min(row + RADIUS, height - 1) + 1):
-                tap, where = splat(TAPS[near - row + RADIUS]), (channel * height + near) * step + at
+                tap, where = TAPS[near - row + RADIUS], (channel * height + near) * step + at
                 m, s = fma(tap, load(g_mean, where), m), fma(tap, load(g_square, where), s)
                 p = fma(tap, load(g_product, where), p)
             store(lines, at, m)
@@ -128,7 +127,7 @@ def loss_gradient(
             store(lines, 2 * step + at, p)
         for at in range(PAD, step - PAD, 16):
             where = task * step + at
-            inner = fma(two * load(x, where), blur_row(lines, step, at), blur_row(lines, 0, at))
+            inner = fma(2 * load(x, where), blur_row(lines, step, at), blur_row(lines, 0, at))
             store(out, at, weight * fma(load(y, where), blur_row(lines, 2 * step, at), inner))
         for column in range(width):
             difference = x[task * step + PAD + column] - y[task * step + PAD + column]

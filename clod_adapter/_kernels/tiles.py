@@ -3,8 +3,25 @@
 import numpy as np
 from numba import float32
 
-from clod_adapter._kernels import conventions as c
 from clod_adapter._kernels.compiling import kernel, part
+from clod_adapter._kernels.conventions import (
+    AHEAD,
+    DET,
+    MX,
+    MY,
+    QA,
+    QB,
+    QC,
+    REACH,
+    RECORD,
+    RX,
+    SLACK,
+    TILE,
+    X0,
+    X1,
+    Y0,
+    Y1,
+)
 from clod_adapter._kernels.elementary import vceil, vfloor, vsqrt
 from clod_adapter._kernels.pointers import pointer, prefetch, scratch
 from clod_adapter._kernels.simd import both, eq, ge, load, select, splat, store, vmax, vmin
@@ -21,26 +38,25 @@ def spans(records, r, ox, oy, side):
     1/255. In a row of cells it is widest at its own leftmost and rightmost points where those lie
     in it, else at the nearer edge.
     """
-    my, rx, b = splat(records[r + c.MY]), splat(records[r + c.RX]), splat(records[r + c.QB])
-    row = load(ROWS, 0) * side + (float32(oy) + c.HALF)
-    top = vmax(row, records[r + c.Y0] + c.HALF) - my
-    bottom = vmin(row + (side - c.ONE), records[r + c.Y1] + c.HALF) - my
-    tip = splat(-records[r + c.QB] / (records[r + c.QC] * c.TWO) * records[r + c.RX])
-    zero, half = splat(c.ZERO), splat(c.HALF / records[r + c.QA])
-    det = splat(records[r + c.DET])  # 4 QA QC - QB^2, from the covariance, where it does not cancel
-    reach = splat(float32(4) * records[r + c.QA] * records[r + c.REACH])
-    right, left = vmin(vmax(tip, top), bottom), vmin(vmax(zero - tip, top), bottom)
-    wide = vsqrt(vmax(reach - det * right * right, zero))
-    x1 = select(eq(right, tip), rx, (wide - b * right) * half)
-    wide = vsqrt(vmax(reach - det * left * left, zero))
-    x0 = select(eq(left, zero - tip), zero - rx, (zero - wide - b * left) * half)
-    mx = splat(records[r + c.MX] - c.HALF)
-    each = splat(c.ONE / side)
-    low = vfloor((vmax(vceil(mx + x0 - c.SLACK), records[r + c.X0]) - float32(ox)) * each)
-    high = vfloor((vmin(vfloor(mx + x1 + c.SLACK), records[r + c.X1]) - float32(ox)) * each)
-    # of cells: the columns of a needle may have crossed by rounding
+    mx, my, rx = records[r + MX] - 0.5, records[r + MY], records[r + RX]
+    qa, qb, qc = records[r + QA], records[r + QB], records[r + QC]
+    row = load(ROWS, 0) * side + (float32(oy) + 0.5)
+    top = vmax(row, records[r + Y0] + 0.5) - my
+    bottom = vmin(row + (side - 1), records[r + Y1] + 0.5) - my
+    tip = splat(-qb / (qc * float32(2)) * rx)
+    det = records[r + DET]  # 4 QA QC - QB^2, from the covariance, where it does not cancel
+    reach = float32(4) * qa * records[r + REACH]
+    right, left = vmin(vmax(tip, top), bottom), vmin(vmax(0 - tip, top), bottom)
+    wide = vsqrt(vmax(reach - det * right * right, 0))
+    x1 = select(eq(right, tip), rx, (wide - qb * right) * (0.5 / qa))
+    wide = vsqrt(vmax(reach - det * left * left, 0))
+    x0 = select(eq(left, 0 - tip), -rx, (0 - wide - qb * left) * (0.5 / qa))
+    low = (vmax(vceil(mx + x0 - SLACK), records[r + X0]) - float32(ox)) * (1 / side)
+    high = (vmin(vfloor(mx + x1 + SLACK), records[r + X1]) - float32(ox)) * (1 / side)
+    low, high = vfloor(low), vfloor(high)  # of cells
+    # the columns of a needle may have crossed by rounding
     touched = both(ge(bottom, top), ge(high, low))
-    return select(touched, low, zero), select(touched, high, -c.ONE)
+    return select(touched, low, 0), select(touched, high, -1)
 
 
 @kernel
@@ -81,11 +97,11 @@ def tiles_across(records, r, ty, y0, y1, found):
 
     ``found [32]`` keeps those of sixteen rows, for calls with ascending ``ty``.
     """
-    first, last = np.int32(records[r + c.X0]) // c.TILE, np.int32(records[r + c.X1]) // c.TILE
-    lane = (ty - y0 // c.TILE) % 16
-    if first < last or y0 // c.TILE < y1 // c.TILE:
+    first, last = np.int32(records[r + X0]) // TILE, np.int32(records[r + X1]) // TILE
+    lane = (ty - y0 // TILE) % 16
+    if first < last or y0 // TILE < y1 // TILE:
         if lane == 0:
-            low, high = spans(records, r, 0, ty * c.TILE, float32(c.TILE))
+            low, high = spans(records, r, 0, ty * TILE, float32(TILE))
             store(found, 0, low)
             store(found, 16, high)
         first, last = np.int32(found[lane]), np.int32(found[16 + lane])
@@ -126,13 +142,13 @@ def list_tiles(
     slots, entries, entry_slots = pointer(slots), pointer(entries), pointer(entry_slots)
     found, slot = scratch(float32, 32), totals[worker]
     for j in range(first, last):
-        prefetch(records, order[min(j + c.AHEAD, last - 1)] * c.RECORD)
+        prefetch(records, order[min(j + AHEAD, last - 1)] * RECORD)
         p = order[j]
-        r = p * c.RECORD
-        y0, y1 = np.int32(records[r + c.Y0]), np.int32(records[r + c.Y1])
+        r = p * RECORD
+        y0, y1 = np.int32(records[r + Y0]), np.int32(records[r + Y1])
         if listed:
             slots[2 * p] = slot
-        for ty in range(y0 // c.TILE, y1 // c.TILE + 1):
+        for ty in range(y0 // TILE, y1 // TILE + 1):
             low, high = tiles_across(records, r, ty, y0, y1, found)
             for tx in range(low, high + 1):
                 at = cursor[ty * across + tx]
