@@ -4,7 +4,7 @@ from numba import float32, int64
 
 from clod_adapter._kernels.compiling import kernel
 from clod_adapter._kernels.elementary import vsqrt
-from clod_adapter._kernels.pointers import load_where, pointer, scratch, store_where
+from clod_adapter._kernels.pointers import load_where, pointer, scratch, share, store_where
 from clod_adapter._kernels.simd import anywhere, fma, gt, load, splat
 
 # numbers of sixteen rows: at most the harmonics of degree 4, the highest that Gaussians have
@@ -43,7 +43,7 @@ def adam_rows(
     each = int64(len(units) > 1)
     beta1, beta2, epsilon = splat(float32(beta1)), splat(float32(beta2)), float32(epsilon)
     rest1, rest2 = 1 - beta1, 1 - beta2
-    begin, end = len(parameter) * worker // workers, len(parameter) * (worker + 1) // workers
+    begin, end = share(worker, workers, len(parameter))
     lengths, factors = scratch(float32, ROOM), scratch(float32, ROOM)
     parameter = pointer(parameter)
     first = pointer(first)

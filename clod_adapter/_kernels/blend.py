@@ -7,6 +7,8 @@ The Gaussian that finishes a pixel is drawn: were it left out, as gsplat and Inr
 of the pixel would change at once when it or one before it fades.
 """
 
+from typing import Any, NamedTuple
+
 import numpy as np
 from numba import float32, uint64
 
@@ -30,7 +32,14 @@ from clod_adapter._kernels.conventions import (
     TILE,
 )
 from clod_adapter._kernels.elementary import exp2, lowest, set_spans, vabs
-from clod_adapter._kernels.pointers import count_up, pointer, prefetch, scratch, store_sums
+from clod_adapter._kernels.pointers import (
+    count_up,
+    pointer,
+    pointers,
+    prefetch,
+    scratch,
+    store_sums,
+)
 from clod_adapter._kernels.simd import (
     anywhere,
     both,
@@ -58,15 +67,15 @@ LAST = float32(ACROSS - 1)
 
 
 @part
-def start_tile(ox, oy, width, height, state, stride, live):
+def start_tile(ox, oy, tiles, state, stride, live):
     """Marks blocks with pixels in the image as live, pixels outside as finished."""
     for word in range(WORDS):
         live[word] = uint64(0)
     for block in range(BLOCKS):
         x, y = ox + (block % ACROSS) * BLOCK, oy + (block // ACROSS) * BLOCK
-        if x < width and y < height:
+        if x < tiles.width and y < tiles.height:
             live[block // 64] |= uint64(1) << uint64(block % 64)
-        inside = both(gt(width - x, load(LANE_X, 0)), gt(height - y, load(LANE_Y, 0)))
+        inside = both(gt(tiles.width - x, load(LANE_X, 0)), gt(tiles.height - y, load(LANE_Y, 0)))
         store(state, block * stride, select(inside, 1, -1))
 
 
@@ -89,79 +98,84 @@ def find_blocks(records, r, ox, oy, masks, at):
     set_spans(masks, at, low, vmax(vmin(high, LAST), -1))
 
 
+class Spread(NamedTuple):
+    """A record with the same numbers in every lane."""
+
+    minus_qa: Any
+    minus_qb: Any
+    minus_qc: Any
+    log: Any
+    base_x: Any  # offsets from its centre to the pixels of the tile's first block
+    base_y: Any
+    red: Any
+    green: Any
+    blue: Any
+
+
 @part
 def spread(records, r, ox, oy):
-    """Of the record at ``r``, the same in every lane: what ``meet`` takes, and the colour."""
-    qa, qb, qc = splat(-records[r + QA]), splat(-records[r + QB]), splat(-records[r + QC])
-    base_x = load(LANE_X, 0) + (float32(ox) - records[r + MX])
-    base_y = load(LANE_Y, 0) + (float32(oy) - records[r + MY])
-    shape = qa, qb, qc, splat(records[r + LOG]), base_x, base_y
-    return shape, splat(records[r + RED]), splat(records[r + GREEN]), splat(records[r + BLUE])
+    """The record at ``r`` in a tile that begins at (ox, oy)."""
+    return Spread(
+        splat(-records[r + QA]),
+        splat(-records[r + QB]),
+        splat(-records[r + QC]),
+        splat(records[r + LOG]),
+        load(LANE_X, 0) + (float32(ox) - records[r + MX]),
+        load(LANE_Y, 0) + (float32(oy) - records[r + MY]),
+        splat(records[r + RED]),
+        splat(records[r + GREEN]),
+        splat(records[r + BLUE]),
+    )
+
+
+class Meeting(NamedTuple):
+    """What a Gaussian does to the pixels of a block."""
+
+    dx: Any  # offsets of the pixels from the centre
+    dy: Any
+    unlimited: Any  # alpha before its limit
+    alpha: Any
+    after: Any  # the transmittance behind it
+    blends: Any  # which pixels blend it
+    ends: Any  # which pixels it finishes
 
 
 @part
-def meet(shape, t, block):
-    """What a Gaussian does to the pixels of a block with transmittances ``t``.
-
-    ``shape`` is of its exponent ``-QA, -QB, -QC, LOG``, and the offsets from its centre to the
-    pixels of the tile's first block. Returns the pixels' offsets, alpha before and after its limit,
-    the transmittance behind the Gaussian, which pixels blend it, and which are finished by it.
-    """
-    qa, qb, qc, log, base_x, base_y = shape
-    dx, dy = base_x + BLOCK_X[block], base_y + BLOCK_Y[block]
-    raw = exp2(fma(dx, fma(qa, dx, qb * dy), fma(qc * dy, dy, log)))
-    a = vmin(raw, ALPHA_MAX)
-    mask = both(ge(a, ALPHA_MIN), gt(t, 0))
-    after = t - t * a
-    return dx, dy, raw, a, after, mask, both(mask, ge(T_MIN, after))
+def meet(g, t, block):
+    """The ``Meeting`` of a Gaussian with the pixels of a block, whose transmittances are ``t``."""
+    dx, dy = g.base_x + BLOCK_X[block], g.base_y + BLOCK_Y[block]
+    along_x = fma(g.minus_qa, dx, g.minus_qb * dy)
+    unlimited = exp2(fma(dx, along_x, fma(g.minus_qc * dy, dy, g.log)))
+    alpha = vmin(unlimited, ALPHA_MAX)
+    blends = both(ge(alpha, ALPHA_MIN), gt(t, 0))
+    after = t - t * alpha
+    ends = both(blends, ge(T_MIN, after))
+    return Meeting(dx, dy, unlimited, alpha, after, blends, ends)
 
 
 @kernel
-def blend(
-    worker,
-    workers,
-    records,
-    entries,
-    offsets,
-    across,
-    width,
-    height,
-    tiles,
-    masks,
-    cursor,
-    room,
-    background,
-    image,
-    alpha,
-):
-    """Forward pass: writes ``image [H, W, 3]`` and ``alpha [H, W]``. An atomic cursor assigns
-    ``tiles`` to workers.
+def blend(worker, workers, tiles, cursor, room, background, picture):
+    """Forward pass: writes the picture and the masks of ``tiles``. An atomic cursor assigns tiles
+    to workers.
 
-    ``masks`` receives WORDS words per entry, one bit for each block of the tile that blends it.
     ``room[worker]`` holds FORWARD_STATE floats of scratch (on the stack, LLVM would take minutes to
     compile it).
     """
-    count = len(tiles)
-    tiles = pointer(tiles)
-    records = pointer(records)
-    entries = pointer(entries)
-    offsets = pointer(offsets)
-    background = pointer(background)
-    image = pointer(image)
-    alpha = pointer(alpha)
-    state = pointer(room[worker])
+    count = len(tiles.order)
+    tiles, picture = pointers(tiles), pointers(picture)
+    records, entries = tiles.records, tiles.entries
+    offsets, masks = tiles.offsets, tiles.masks
+    cursor, background, state = pointer(cursor), pointer(background), pointer(room[worker])
     live = scratch(uint64, WORDS)
-    masks = pointer(masks)
-    cursor = pointer(cursor)
     while True:
         turn = count_up(cursor)
         if turn >= count:
             break
-        tile = tiles[turn]
-        ox, oy = (tile % across) * TILE, (tile // across) * TILE
+        tile = tiles.order[turn]
+        ox, oy = (tile % tiles.across) * TILE, (tile // tiles.across) * TILE
         for k in range(FORWARD_STATE):
             state[k] = 0
-        start_tile(ox, oy, width, height, state, 64, live)
+        start_tile(ox, oy, tiles, state, 64, live)
         for entry in range(offsets[tile], offsets[tile + 1]):
             if none_set(live, 0):
                 for k in range(entry * WORDS, offsets[tile + 1] * WORDS):
@@ -169,7 +183,7 @@ def blend(
                 break
             r = entries[entry] * RECORD
             prefetch(records, entries[min(entry + AHEAD, offsets[tile + 1] - 1)] * RECORD)
-            shape, red, green, blue = spread(records, r, ox, oy)
+            g = spread(records, r, ox, oy)
             find_blocks(records, r, ox, oy, masks, entry * WORDS)
             for word in range(WORDS):
                 bits = masks[entry * WORDS + word] & live[word]
@@ -179,23 +193,24 @@ def blend(
                     bits &= bits - uint64(1)
                     at = block * 64
                     t = load(state, at)
-                    _, _, _, a, after, keep, done = meet(shape, t, block)
-                    weight = select(keep, t * a, 0)
-                    store(state, at + 16, fma(weight, red, load(state, at + 16)))
-                    store(state, at + 32, fma(weight, green, load(state, at + 32)))
-                    store(state, at + 48, fma(weight, blue, load(state, at + 48)))
-                    t = select(keep, after, t)
-                    if anywhere(done):
-                        t = select(done, 0 - t, t)
+                    met = meet(g, t, block)
+                    weight = select(met.blends, t * met.alpha, 0)
+                    store(state, at + 16, fma(weight, g.red, load(state, at + 16)))
+                    store(state, at + 32, fma(weight, g.green, load(state, at + 32)))
+                    store(state, at + 48, fma(weight, g.blue, load(state, at + 48)))
+                    t = select(met.blends, met.after, t)
+                    if anywhere(met.ends):
+                        t = select(met.ends, 0 - t, t)
                         if not anywhere(gt(t, 0)):
                             live[word] &= ~(uint64(1) << uint64(block % 64))
                     store(state, at, t)
-        write_tile(ox, oy, width, height, state, background, image, alpha)
+        write_tile(ox, oy, tiles, state, background, picture)
 
 
 @part
-def write_tile(ox, oy, width, height, state, background, image, alpha):
-    """Composites the tile over the background into the image."""
+def write_tile(ox, oy, tiles, state, background, picture):
+    """Composites the tile over the background into the picture."""
+    width, height = tiles.width, tiles.height
     part = scratch(float32, 64)
     for block in range(BLOCKS):
         x, y, at = ox + BLOCK * (block % ACROSS), oy + BLOCK * (block // ACROSS), block * 64
@@ -209,33 +224,36 @@ def write_tile(ox, oy, width, height, state, background, image, alpha):
         for lane in range(16):
             if x + lane % 4 < width and y + lane // 4 < height:
                 pixel = (y + lane // 4) * width + x + lane % 4
-                alpha[pixel] = part[48 + lane]
+                picture.alpha[pixel] = part[48 + lane]
                 for channel in range(3):
-                    image[3 * pixel + channel] = part[16 * channel + lane]
+                    picture.image[3 * pixel + channel] = part[16 * channel + lane]
 
 
 @part
-def read_tile(ox, oy, width, height, image, alpha, v_image, v_alpha, state):
+def read_tile(ox, oy, tiles, picture, gradients, state):
     """Loads for each pixel the remainder of v . C behind the current Gaussian, and v of the three
     channels.
     """
+    width, height = tiles.width, tiles.height
     part = scratch(float32, 80)
     for block in range(BLOCKS):
         x, y, at = ox + BLOCK * (block % ACROSS), oy + BLOCK * (block // ACROSS), block * 80
         if x >= width or y >= height:
             continue
-        whole = x + BLOCK <= width and y + BLOCK <= height
+        inside = x + BLOCK <= width and y + BLOCK <= height
         for lane in range(16):
-            if whole or (x + lane % 4 < width and y + lane // 4 < height):
-                own = (y + lane // 4) * width + x + lane % 4
-                left = part[lane] = -v_alpha[own] * (float32(1) - alpha[own])
+            if inside or (x + lane % 4 < width and y + lane // 4 < height):
+                pixel = (y + lane // 4) * width + x + lane % 4
+                left = -gradients.alpha[pixel] * (float32(1) - picture.alpha[pixel])
+                part[lane] = left
                 for channel in range(3):
-                    slope = v_image[3 * own + channel]
+                    slope = gradients.image[3 * pixel + channel]
+                    color = picture.image[3 * pixel + channel]
                     state[at + 32 + 16 * channel + lane] = slope
-                    part[16 + 16 * channel + lane] = image[3 * own + channel]
-                    left += slope * image[3 * own + channel]
+                    part[16 + 16 * channel + lane] = color
+                    left += slope * color
                 state[at + 16 + lane] = left
-        if whole:  # in vectors: the last bits of the result have always been these
+        if inside:  # in vectors: the last bits of the result have always been these
             rest = load(part, 0)
             for channel in range(2, -1, -1):
                 rest = fma(load(state, at + 32 + 16 * channel), load(part, 16 + 16 * channel), rest)
@@ -246,21 +264,12 @@ def read_tile(ox, oy, width, height, image, alpha, v_image, v_alpha, state):
 def blend_gradient(
     worker,
     workers,
-    records,
-    entries,
-    offsets,
-    across,
-    width,
-    height,
     tiles,
-    masks,
     cursor,
     room,
     entry_slots,
-    image,
-    alpha,
-    v_image,
-    v_alpha,
+    picture,
+    gradients,
     shaped,
     colored,
     pair_sums,
@@ -272,30 +281,24 @@ def blend_gradient(
     s dx^2, s dx dy, s dy^2. Runs front to back like the forward pass with a running remainder of
     v . C, so nothing is stored per pixel and Gaussian. Each pair has its own slot.
     """
-    count = len(tiles)
-    tiles = pointer(tiles)
-    records = pointer(records)
-    entries = pointer(entries)
-    entry_slots, offsets, pair_sums = pointer(entry_slots), pointer(offsets), pointer(pair_sums)
-    image = pointer(image)
-    alpha = pointer(alpha)
-    v_image = pointer(v_image)
-    v_alpha = pointer(v_alpha)
-    state = pointer(room[worker])
+    count = len(tiles.order)
+    tiles, picture, gradients = pointers(tiles), pointers(picture), pointers(gradients)
+    records, entries = tiles.records, tiles.entries
+    offsets, masks = tiles.offsets, tiles.masks
+    entry_slots, pair_sums = pointer(entry_slots), pointer(pair_sums)
+    cursor, state = pointer(cursor), pointer(room[worker])
     live = scratch(uint64, WORDS)
-    masks = pointer(masks)
-    cursor = pointer(cursor)
     while True:
         turn = count_up(cursor)
         if turn >= count:
             break
-        tile = tiles[turn]
-        ox, oy = (tile % across) * TILE, (tile // across) * TILE
-        if ox + TILE > width or oy + TILE > height:
+        tile = tiles.order[turn]
+        ox, oy = (tile % tiles.across) * TILE, (tile // tiles.across) * TILE
+        if ox + TILE > tiles.width or oy + TILE > tiles.height:
             for k in range(BACKWARD_STATE):  # pixels outside have weight 0, but 0 times NaN is NaN
                 state[k] = 0
-        start_tile(ox, oy, width, height, state, 80, live)
-        read_tile(ox, oy, width, height, image, alpha, v_image, v_alpha, state)
+        start_tile(ox, oy, tiles, state, 80, live)
+        read_tile(ox, oy, tiles, picture, gradients, state)
         for entry in range(offsets[tile], offsets[tile + 1]):
             slot = entry_slots[entry]
             if none_set(masks, entry * WORDS):
@@ -304,7 +307,7 @@ def blend_gradient(
                 continue
             r = entries[entry] * RECORD
             prefetch(records, entries[min(entry + AHEAD, offsets[tile + 1] - 1)] * RECORD)
-            shape, red, green, blue = spread(records, r, ox, oy)
+            g = spread(records, r, ox, oy)
             s_r = s_g = s_b = s_0 = s_x = s_y = s_xx = s_xy = s_yy = splat(0)
             for word in range(WORDS):
                 bits = masks[entry * WORDS + word]
@@ -313,25 +316,24 @@ def blend_gradient(
                     bits &= bits - uint64(1)
                     at = block * 80
                     t = load(state, at)
-                    dx, dy, raw, a, after, keep, done = meet(shape, t, block)
-                    weight = select(keep, t * a, 0)
+                    met = meet(g, t, block)
+                    dx, dy = met.dx, met.dy
+                    weight = select(met.blends, t * met.alpha, 0)
                     v_r, v_g, v_b = load(state, at + 32), load(state, at + 48), load(state, at + 64)
-                    q = fma(v_r, red, fma(v_g, green, v_b * blue))
+                    q = fma(v_r, g.red, fma(v_g, g.green, v_b * g.blue))
                     if colored:
-                        s_r, s_g, s_b = (
-                            fma(weight, v_r, s_r),
-                            fma(weight, v_g, s_g),
-                            fma(weight, v_b, s_b),
-                        )
+                        s_r = fma(weight, v_r, s_r)
+                        s_g = fma(weight, v_g, s_g)
+                        s_b = fma(weight, v_b, s_b)
                     rest = load(state, at + 16) - weight * q
                     store(state, at + 16, rest)
-                    v_a = t * q - rest / (1 - a)
-                    s = select(both(keep, ge(ALPHA_MAX, raw)), v_a * a, 0)
+                    v_a = t * q - rest / (1 - met.alpha)
+                    s = select(both(met.blends, ge(ALPHA_MAX, met.unlimited)), v_a * met.alpha, 0)
                     s_0 = s_0 + s
                     if shaped:
                         sx, sy = s * dx, s * dy
                         s_x, s_y = s_x + sx, s_y + sy
                         s_xx, s_xy, s_yy = fma(sx, dx, s_xx), fma(sx, dy, s_xy), fma(sy, dy, s_yy)
-                    after = select(done, 0 - after, after)
-                    store(state, at, select(keep, after, t))
+                    after = select(met.ends, 0 - met.after, met.after)
+                    store(state, at, select(met.blends, after, t))
             store_sums(pair_sums, slot * PAIR, s_r, s_g, s_b, s_0, s_x, s_y, s_xx, s_xy, s_yy)

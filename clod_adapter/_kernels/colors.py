@@ -141,37 +141,38 @@ def load_sh(shN, rows, terms, w):
 
 
 @part
-def color(first, found, means, sh0, shN, degree, cam, records, depths, ids):
-    """Writes the colours ``max(0, 0.5 + SH)`` of the packed records; returns how many remain: only
-    finite ones.
+def color(first, count, stored, drawing, packed):
+    """Writes the colours ``max(0, 0.5 + SH)`` of ``count`` packed records from ``first`` on;
+    returns how many remain: only finite ones.
     """
+    records, depths, ids = packed.records, packed.depths, packed.ids
     w, sh, basis = scratch(f32x16, 16), scratch(f32x16, 80), scratch(f32x16, 25)
     rows, targets = scratch(int64, 16), scratch(int64, 16)
-    terms = (degree + 1) * (degree + 1) - 1
-    packed = first
-    for start in range(first, first + found, 16):
+    terms = (drawing.degree + 1) * (drawing.degree + 1) - 1
+    end = first + count
+    kept = first
+    for start in range(first, end, 16):
         for lane in range(16):
-            targets[lane] = min(start + lane, first + found - 1)
+            targets[lane] = min(start + lane, end - 1)
             rows[lane] = ids[targets[lane]]
-        load_rows(means, rows, 3, 0, 3, w, MEAN)
-        view_direction(w, cam, sh)
-        sh_basis(degree, sh[0], sh[1], sh[2], basis)
-        load_rows(sh0, rows, 3, 0, 3, w, 0)
-        load_sh(shN, rows, terms, sh)
+        load_rows(stored.means, rows, 3, 0, 3, w, MEAN)
+        view_direction(w, drawing.cam, sh)
+        sh_basis(drawing.degree, sh[0], sh[1], sh[2], basis)
+        load_rows(stored.sh0, rows, 3, 0, 3, w, 0)
+        load_sh(stored.shN, rows, terms, sh)
         red, green, blue = 0.5 + basis[0] * w[0], 0.5 + basis[0] * w[1], 0.5 + basis[0] * w[2]
         for k in range(terms):
-            red, green = fma(basis[k + 1], sh[3 * k], red), fma(basis[k + 1], sh[3 * k + 1], green)
+            red = fma(basis[k + 1], sh[3 * k], red)
+            green = fma(basis[k + 1], sh[3 * k + 1], green)
             blue = fma(basis[k + 1], sh[3 * k + 2], blue)
-        finite = gt(HUGE, vabs(red) + vabs(green) + vabs(blue))
+        finite = bits_of(gt(HUGE, vabs(red) + vabs(green) + vabs(blue)))
         w[0], w[1], w[2] = vmax(red, 0), vmax(green, 0), vmax(blue, 0)
         store_rows(records, targets, RECORD, RED, 3, w, 0)
-        bits = bits_of(finite)
-        for lane in range(16):
-            at = start + lane
-            if at < first + found and (bits >> uint64(lane)) & uint64(1):
-                if packed < at:
-                    depths[packed], ids[packed] = depths[at], ids[at]
+        for at in range(start, min(start + 16, end)):
+            if (finite >> uint64(at - start)) & uint64(1):
+                if kept < at:
+                    depths[kept], ids[kept] = depths[at], ids[at]
                     for k in range(RECORD):
-                        records[packed * RECORD + k] = records[at * RECORD + k]
-                packed += 1
-    return packed - first
+                        records[kept * RECORD + k] = records[at * RECORD + k]
+                kept += 1
+    return kept - first

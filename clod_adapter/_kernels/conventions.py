@@ -1,4 +1,8 @@
-"""Constants of gsplat's conventions, and the layouts of records, cameras and workspaces."""
+"""Constants of gsplat's conventions, the kernels' arguments, and the layouts of records, cameras
+and workspaces.
+"""
+
+from typing import Any, NamedTuple
 
 from numba import float32
 
@@ -73,3 +77,61 @@ V_QUAT = 27
 V_MEAN = 31
 V_SH0 = 34
 GRADIENTS = 37 + 16
+
+
+class Stored(NamedTuple):
+    """Arrays of N Gaussians, or their gradients, in the order of the rasterizer's inputs.
+
+    ``sigma`` is empty without a dial, ``growth`` without growth. Scales and opacities are
+    logarithms and logits as stored, or activated ones, as the dial says.
+    """
+
+    means: Any  # [N, 3]
+    quats: Any  # [N, 4]
+    scales: Any  # [N, 3]
+    opacities: Any  # [N]
+    sigma: Any  # [N]
+    growth: Any  # [N]
+    sh0: Any  # flat, 3 N
+    shN: Any  # flat, as sh0
+
+
+class Drawing(NamedTuple):
+    """How Gaussians are drawn."""
+
+    cam: Any  # a camera, as above
+    dial: Any  # as in ``dial.py``
+    degree: int  # of the spherical harmonics
+    fades: bool  # there is a sigma
+    grows: bool  # there is a growth
+
+
+class Packed(NamedTuple):
+    """The visible Gaussians: worker w packed ``counts[w]`` of them, from the first row of its part
+    of the N rows on, in row order.
+    """
+
+    records: Any  # flat, RECORD N, then a spare record for each worker
+    depths: Any  # [N] float32
+    ids: Any  # [N] int32, the rows
+    counts: Any  # [workers] int64
+
+
+class Tiles(NamedTuple):
+    """The tiles of an image, and the records that each blends, front to back."""
+
+    records: Any
+    entries: Any  # [M] int32, numbers of records
+    offsets: Any  # [tiles + 1] int64: those of tile t are from ``offsets[t]`` on
+    masks: Any  # [M, WORDS] uint64: a bit for each block of the tile that blends the entry
+    order: Any  # [tiles] int64, the order of work
+    across: int  # tiles in a row
+    width: int  # pixels
+    height: int
+
+
+class Picture(NamedTuple):
+    """An image and its alpha, or their gradients."""
+
+    image: Any  # [H, W, 3]
+    alpha: Any  # [H, W]

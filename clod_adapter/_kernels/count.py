@@ -7,7 +7,7 @@ from numba import float32
 from clod_adapter._kernels.compiling import kernel, part
 from clod_adapter._kernels.dial import squared_reach, survives
 from clod_adapter._kernels.elementary import bits_of, ones
-from clod_adapter._kernels.pointers import first_lanes, load_some, pointer, store_some
+from clod_adapter._kernels.pointers import first_lanes, load_some, pointer, share, store_some
 from clod_adapter._kernels.simd import both, gt, select, vmax, vmin
 
 DOUBLINGS = 5  # of the exponent 1 of t: 2^5 is target_count.SHARPNESS
@@ -23,7 +23,7 @@ def load_squares(i, many, sigma, d, dial2):
 @kernel
 def count_kept(worker, workers, sigma, d, dial2, counts):
     """``counts[worker]``: how many of this worker's rows are kept at the distances ``d [N]``."""
-    first, last = len(sigma) * worker // workers, len(sigma) * (worker + 1) // workers
+    first, last = share(worker, workers, len(sigma))
     sigma = pointer(sigma)
     d = pointer(d)
     square = float32(dial2)
@@ -39,7 +39,7 @@ def count_slope(worker, workers, sigma, d, dial2, lift, penalty, out):
     """``out [N]``: ``penalty w / (1 + w)^2``, ``w = min(t, 1/t)^(2^DOUBLINGS)``; where a row is
     culled, at least ``penalty lift``.
     """
-    first, last = len(sigma) * worker // workers, len(sigma) * (worker + 1) // workers
+    first, last = share(worker, workers, len(sigma))
     sigma, d, out = pointer(sigma), pointer(d), pointer(out)
     square, least, scale = float32(dial2), float32(lift), float32(penalty)
     for i in range(first, last, 16):

@@ -27,6 +27,7 @@ from clod_adapter._kernels.pointers import (
     pointer,
     scatter,
     scratch,
+    share,
 )
 from clod_adapter._kernels.simd import both, f32x16, ge, gt, select, splat, vmax, vmin
 
@@ -87,30 +88,31 @@ def reciprocal_opacity(logit):
 
 
 @part
-def kept(at, many, means, opacities, sigma, cam, dial, dialled):
+def kept(at, many, stored, drawing):
     """The bits of those of ``many`` <= 16 rows from ``at`` on that are in front of the camera and
     not culled.
 
     Activated opacities are 1/255 at least.
     """
+    cam, dial = drawing.cam, drawing.dial
     if dial[ACTIVATED] > 0:
-        opacity = load_some(opacities, at, many)
+        opacity = load_some(stored.opacities, at, many)
         shown = both(ge(opacity, ALPHA_MIN), gt(HUGE, opacity))
     else:
         w = scratch(f32x16, 3)
-        load_triples(means, at, many, w)
+        load_triples(stored.means, at, many, w)
         depth = cam[8] * w[0] + cam[9] * w[1] + cam[10] * w[2] + cam[11]
         shown = ge(depth, NEARLY * cam[NEAR])
-        if dialled:
+        if drawing.fades:
             far2 = squared_distance(w, cam) * dial[RATE2]
-            shown = both(shown, survives(load_some(sigma, at, many), far2, dial[NEAR2]))
+            shown = both(shown, survives(load_some(stored.sigma, at, many), far2, dial[NEAR2]))
     return bits_of(both(shown, first_lanes(many)))
 
 
 @kernel
 def mark_kept(worker, workers, means, sigma, cam, dial, out):
     """``out [N]`` uint8: 1 for rows that the dial keeps, in front of the camera or not."""
-    first, last = len(sigma) * worker // workers, len(sigma) * (worker + 1) // workers
+    first, last = share(worker, workers, len(sigma))
     means, sigma, out = pointer(means), pointer(sigma), pointer(out)
     cam, dial, w = pointer(cam), pointer(dial), scratch(f32x16, 3)
     for i in range(first, last, 16):
@@ -123,27 +125,28 @@ def mark_kept(worker, workers, means, sigma, cam, dial, out):
 
 
 @part
-def drawn(rows, opacities, sigma, growth, cam, dial, dialled, grows, w):
+def drawn(rows, stored, drawing, w):
     """The drawn opacities of sixteen rows, whose centres and logarithms of scales ``w`` holds;
     makes these scales.
 
     Activated ones stay as they are.
     """
-    opacity, size = gather(opacities, rows), splat(0)
+    dial = drawing.dial
+    opacity, size = gather(stored.opacities, rows), splat(0)
     if dial[ACTIVATED] > 0:
         return opacity
     opacity = 1 / reciprocal_opacity(opacity)
-    if dialled:
-        distance2 = squared_distance(w, cam)
-        reach, far2 = gather(sigma, rows), distance2 * dial[RATE2]
+    if drawing.fades:
+        distance2 = squared_distance(w, drawing.cam)
+        reach, far2 = gather(stored.sigma, rows), distance2 * dial[RATE2]
         share2 = squared_share(reach, far2)
         fade = 1 - share2 * share2
         if dial[NEAR2] > 0:
             taken = vmin(1, vmax(0, takeover(far2, dial[NEAR2])))
             fade = select(gt(reach, 0), fade * taken, 1 - taken)
         opacity = opacity * fade
-        if grows:
-            size = gather(growth, rows) * log2_magnification(distance2, dial)
+        if drawing.grows:
+            size = gather(stored.growth, rows) * log2_magnification(distance2, dial)
             # NaN stays, and is not drawn
             size = vmin(LOG2_GROWTH_MAX, vmax(-LOG2_GROWTH_MAX, size))
     for k in range(SCALE, SCALE + 3):
@@ -158,7 +161,7 @@ def log2_magnification(distance2, dial):
 
 
 @part
-def dial_gradient(rows, given, cam, dial, dialled, grows, shaped, w, g):
+def dial_gradient(rows, stored, drawing, shaped, w, g, gradients):
     """Gradients of logit, sigma and growth of sixteen rows; makes those of the scales in ``g`` of
     their logarithms.
 
@@ -170,29 +173,28 @@ def dial_gradient(rows, given, cam, dial, dialled, grows, shaped, w, g):
         dL/dlogscale = dL/dscale scale
         dL/dgrowth   = sum of dL/dlogscale, times log m         0 where the growth is clamped
 
-    Of activated ones, that of the opacity alone. ``given`` are the three, and where their gradients
-    go.
+    Of activated ones, that of the opacity alone.
     """
-    opacities, sigma, growth, v_opacities, v_sigma, v_growth = given
-    opacity = gather(opacities, rows)
+    dial = drawing.dial
+    opacity = gather(stored.opacities, rows)
     if dial[ACTIVATED] > 0:
-        scatter(v_opacities, rows, g[SUMS + 3] / opacity)
+        scatter(gradients.opacities, rows, g[SUMS + 3] / opacity)
         return
     odds = exp2(vmin(-opacity * LOG2E, FARTHEST_EXPONENT))  # (1 - a) / a
     total = g[SUMS + 3]
     if shaped:
         for k in range(V_SCALE, V_SCALE + 3):
             g[k] = g[k] * w[SCALE + k - V_SCALE]
-    if dialled:
-        reach, distance2 = gather(sigma, rows), squared_distance(w, cam)
+    if drawing.fades:
+        reach, distance2 = gather(stored.sigma, rows), squared_distance(w, drawing.cam)
         share2 = squared_share(reach, distance2 * dial[RATE2])
         share4 = share2 * share2
         fading = both(gt(share4, 0), gt(1, share4))
         slope = 4 * share4 / ((1 - share4) * reach)
-        scatter(v_sigma, rows, select(fading, total * slope, 0))
-        if grows and shaped:
+        scatter(gradients.sigma, rows, select(fading, total * slope, 0))
+        if drawing.grows and shaped:
             magnification = log2_magnification(distance2, dial)
-            inside = gt(LOG2_GROWTH_MAX, vabs(gather(growth, rows) * magnification))
+            inside = gt(LOG2_GROWTH_MAX, vabs(gather(stored.growth, rows) * magnification))
             size = LN2 * magnification * (g[V_SCALE] + g[V_SCALE + 1] + g[V_SCALE + 2])
-            scatter(v_growth, rows, select(inside, size, 0))
-    scatter(v_opacities, rows, total * odds / (1 + odds))
+            scatter(gradients.growth, rows, select(inside, size, 0))
+    scatter(gradients.opacities, rows, total * odds / (1 + odds))

@@ -43,6 +43,24 @@ def pointer(typingctx, array):
     return types.CPointer(array.dtype)(array), codegen
 
 
+@intrinsic
+def pointers(typingctx, arguments):
+    """A named tuple with ``pointer`` of its arrays, and what else it holds."""
+    kinds = [
+        types.CPointer(kind.dtype) if isinstance(kind, types.Array) else kind for kind in arguments
+    ]
+    result = types.BaseTuple.from_types(kinds, arguments.instance_class)
+
+    def codegen(context, builder, signature, args):
+        values = cgutils.unpack_tuple(builder, args[0])
+        for k, kind in enumerate(arguments):
+            if isinstance(kind, types.Array):
+                values[k] = context.make_array(kind)(context, builder, values[k]).data
+        return context.make_tuple(builder, result, values)
+
+    return result(arguments), codegen
+
+
 @intrinsic(prefer_literal=True)
 def scratch(typingctx, kind, size):
     """A pointer to a constant number of ``kind`` on the stack; LLVM keeps small ones in
@@ -71,6 +89,12 @@ def prefetch(builder, values, index):
 def count_up(builder, counter):
     """Atomically adds 1 to ``counter[0]`` and returns its old value."""
     return builder.atomic_rmw("add", counter, ir.Constant(I64, 1), "monotonic")
+
+
+@part
+def share(worker, workers, n):
+    """The first of n rows that a worker takes, and the first that the next one takes."""
+    return n * worker // workers, n * (worker + 1) // workers
 
 
 def _vector_at(builder, values, *indices):

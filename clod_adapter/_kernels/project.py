@@ -65,16 +65,23 @@ from clod_adapter._kernels.conventions import (
 )
 from clod_adapter._kernels.dial import drawn, kept
 from clod_adapter._kernels.elementary import bits_of, log2, lowest, vceil, vfloor, vsqrt
-from clod_adapter._kernels.pointers import first_lanes, load_rows, pointer, scratch, store_rows
+from clod_adapter._kernels.pointers import (
+    first_lanes,
+    load_rows,
+    pointers,
+    scratch,
+    share,
+    store_rows,
+)
 from clod_adapter._kernels.simd import both, f32x16, ge, gt, load, splat, vmax, vmin
 
 
 @part
-def load_stored(means, quats, scales, rows, w):
+def load_stored(stored, rows, w):
     """Loads what is stored of sixteen rows into the workspace ``w``."""
-    load_rows(means, rows, 3, 0, 3, w, MEAN)
-    load_rows(quats, rows, 4, 0, 4, w, STORED)
-    load_rows(scales, rows, 3, 0, 3, w, SCALE)
+    load_rows(stored.means, rows, 3, 0, 3, w, MEAN)
+    load_rows(stored.quats, rows, 4, 0, 4, w, STORED)
+    load_rows(stored.scales, rows, 3, 0, 3, w, SCALE)
 
 
 @part
@@ -191,9 +198,9 @@ def make_records(w, centre, opacity, cam, record):
 
 
 @part
-def add_records(rows, filled, packed, spare, means, opacity, cam, w, records, depths, ids):
+def add_records(rows, filled, at, spare, means, opacity, cam, w, packed):
     """Packs those of the first ``filled`` of sixteen ``rows`` that reach a pixel centre, from the
-    record ``packed`` on.
+    record ``at`` on.
 
     ``w`` holds what is stored of the rows. Returns the number of the next record.
     """
@@ -205,67 +212,28 @@ def add_records(rows, filled, packed, spare, means, opacity, cam, w, records, de
     valid = both(valid, both(make_records(w, centre, opacity, cam, record), first_lanes(filled)))
     bits = bits_of(valid)
     if bits == uint64(0):
-        return packed
+        return at
     for lane in range(16):
         targets[lane] = spare
         if (bits >> uint64(lane)) & uint64(1):
-            depths[packed], ids[packed], targets[lane] = centre[32 + lane], rows[lane], packed
-            packed += 1
-    store_rows(records, targets, RECORD, 0, RECORD, record, 0)
-    return packed
+            packed.depths[at], packed.ids[at], targets[lane] = centre[32 + lane], rows[lane], at
+            at += 1
+    store_rows(packed.records, targets, RECORD, 0, RECORD, record, 0)
+    return at
 
 
 @kernel
-def project(
-    worker,
-    workers,
-    means,
-    quats,
-    scales,
-    opacities,
-    sigma,
-    growth,
-    sh0,
-    shN,
-    degree,
-    cam,
-    dial,
-    records,
-    depths,
-    ids,
-    counts,
-):
-    """Writes records, depths and row numbers of this worker's visible Gaussians, packed from its
-    first row.
-
-    Scales and opacities are logarithms and logits as stored, drawn at the ``dial``, or activated
-    ones. Where ``sigma`` or ``growth`` is empty, there is no dial, or no growth. After its N
-    records, ``records`` has a spare one for each worker.
-    """
-    n = len(opacities)
-    spare = len(opacities) + worker
-    dialled = len(sigma) > 0
-    grows = len(growth) > 0
-    first, last = n * worker // workers, n * (worker + 1) // workers
-    means = pointer(means)
-    quats = pointer(quats)
-    scales = pointer(scales)
-    opacities = pointer(opacities)
-    sigma = pointer(sigma)
-    growth = pointer(growth)
-    sh0 = pointer(sh0)
-    shN = pointer(shN)
-    cam = pointer(cam)
-    dial = pointer(dial)
-    records = pointer(records)
-    depths = pointer(depths)
-    ids = pointer(ids)
+def project(worker, workers, stored, drawing, packed):
+    """Packs this worker's visible Gaussians."""
+    n = len(stored.opacities)
+    first, last = share(worker, workers, n)
+    stored, drawing, packed = pointers(stored), pointers(drawing), pointers(packed)
     w, rows, queue = scratch(f32x16, WORKSPACE), scratch(int64, 16), scratch(int64, 32)
-    i = packed = first
+    i = at = first
     queued = 0
     while i < last or queued > 0:
         while i < last and queued < 16:
-            bits = kept(i, min(last - i, 16), means, opacities, sigma, cam, dial, dialled)
+            bits = kept(i, min(last - i, 16), stored, drawing)
             while bits != uint64(0):
                 queue[queued] = i + lowest(bits)
                 queued += 1
@@ -279,11 +247,9 @@ def project(
         for k in range(16):
             queue[k] = queue[16 + k]
         queued -= filled
-        load_stored(means, quats, scales, rows, w)
-        opacity = drawn(rows, opacities, sigma, growth, cam, dial, dialled, grows, w)
-        packed = add_records(
-            rows, filled, packed, spare, means, opacity, cam, w, records, depths, ids
+        load_stored(stored, rows, w)
+        opacity = drawn(rows, stored, drawing, w)
+        at = add_records(
+            rows, filled, at, n + worker, stored.means, opacity, drawing.cam, w, packed
         )
-    counts[worker] = color(
-        first, packed - first, means, sh0, shN, degree, cam, records, depths, ids
-    )
+    packed.counts[worker] = color(first, at - first, stored, drawing, packed)

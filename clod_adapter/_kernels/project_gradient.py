@@ -38,7 +38,7 @@ from clod_adapter._kernels.conventions import (
     WORKSPACE,
 )
 from clod_adapter._kernels.dial import dial_gradient, drawn
-from clod_adapter._kernels.pointers import load_rows, pointer, scratch, store_rows
+from clod_adapter._kernels.pointers import load_rows, pointer, pointers, scratch, share, store_rows
 from clod_adapter._kernels.project import covariance, load_stored
 from clod_adapter._kernels.simd import eq, f32x16, gt, load, select, splat, store, vmax, vmin
 
@@ -143,11 +143,12 @@ def quat_gradient(w, g):
 
 
 @part
-def color_gradient(w, g, shN, rows, degree, cam, sh, basis, tuned, v_shN):
+def color_gradient(w, g, shN, rows, drawing, sh, basis, tuned, v_shN):
     """Gradients of the harmonics above degree 0 if ``tuned``, and of the mean through the
     direction.
     """
-    inverse = view_direction(w, cam, sh)
+    degree = drawing.degree
+    inverse = view_direction(w, drawing.cam, sh)
     x, y, z = sh[0], sh[1], sh[2]
     sh_basis(degree, x, y, z, basis)
     red, green, blue = g[SUMS], g[SUMS + 1], g[SUMS + 2]
@@ -174,145 +175,83 @@ def clear(values, first, last, width):
 
 
 @part
-def no_gradient(
-    first, last, shaped, colored, terms, v_means, v_quats, v_scales, v_opacities, v_sh0, v_shN
-):
+def no_gradient(first, last, shaped, colored, terms, gradients):
     """Sets the gradients of the rows from ``first`` up to ``last``, which are not visible, to 0."""
-    clear(v_opacities, first, last, 1)
-    clear(v_means, first, last, 3 * shaped)
-    clear(v_quats, first, last, 4 * shaped)
-    clear(v_scales, first, last, 3 * shaped)
-    clear(v_sh0, first, last, 3 * colored)
-    clear(v_shN, first, last, 3 * terms)
+    clear(gradients.opacities, first, last, 1)
+    clear(gradients.means, first, last, 3 * shaped)
+    clear(gradients.quats, first, last, 4 * shaped)
+    clear(gradients.scales, first, last, 3 * shaped)
+    clear(gradients.sh0, first, last, 3 * colored)
+    clear(gradients.shN, first, last, 3 * terms)
 
 
 @part
-def add_slots(pair_sums, slots, records, packed, lanes, sums, g):
+def add_slots(pair_sums, slots, records, places, lanes, sums, g):
     """Sums the slots of sixteen packed Gaussians into ``g[SUMS]`` and into the rows of
     ``sums [16, 16]``.
     """
     for lane in range(16):
         total = splat(0)
-        for slot in range(slots[2 * packed[lane]], slots[2 * packed[lane] + 1]):
+        for slot in range(slots[2 * places[lane]], slots[2 * places[lane] + 1]):
             total = total + load(pair_sums, slot * PAIR)
         store(sums, 16 * lane, total)
     load_rows(sums, lanes, 16, 0, PAIR, g, SUMS)
-    load_rows(records, packed, RECORD, RED, 3, g, SUMS + PAIR)
+    load_rows(records, places, RECORD, RED, 3, g, SUMS + PAIR)
     for k in range(3):  # a colour clamped at 0 has no gradient
         g[SUMS + k] = select(gt(g[SUMS + PAIR + k], 0), g[SUMS + k], 0)
 
 
 @kernel
 def project_gradient(
-    worker,
-    workers,
-    means,
-    quats,
-    scales,
-    opacities,
-    sigma,
-    growth,
-    shN,
-    degree,
-    cam,
-    dial,
-    records,
-    packed_ids,
-    counts,
-    slots,
-    pair_sums,
-    compensated,
-    trained,
-    v_means,
-    v_quats,
-    v_scales,
-    v_opacities,
-    v_sigma,
-    v_growth,
-    v_sh0,
-    v_shN,
+    worker, workers, stored, drawing, packed, slots, pair_sums, compensated, trained, gradients
 ):
     """Sums the slots of each visible Gaussian and computes the gradients of what ``project`` takes,
     in row order.
 
     They are 0 from the row ``trained`` on. ``compensated`` is True if the camera's filter
     compensates opacities, else None, a separate type for which numba compiles the kernel without
-    compensation. Empty ``v_means``, ``v_quats`` and ``v_scales`` skip these gradients, an empty
-    ``v_sh0`` or ``v_shN`` its own.
+    compensation. Empty gradients of means, quats and scales are skipped together, and empty ones of
+    sh0 or shN each.
     """
     w, g = scratch(f32x16, WORKSPACE), scratch(f32x16, GRADIENTS)
     sh, basis = scratch(f32x16, 80), scratch(f32x16, 25)
-    rows = scratch(int64, 16)
-    packed = scratch(int64, 16)
-    lanes = scratch(int64, 16)
+    rows, places, lanes = scratch(int64, 16), scratch(int64, 16), scratch(int64, 16)
     sums = scratch(float32, 256)
-    shaped, colored, tuned = len(v_means) > 0, len(v_sh0) > 0, len(v_shN) > 0
-    dialled, grows, terms = (
-        len(sigma) > 0,
-        len(growth) > 0,
-        (degree + 1) * (degree + 1) - 1 if tuned else 0,
-    )
-    first, last = len(opacities) * worker // workers, len(opacities) * (worker + 1) // workers
-    end = first + counts[worker]
-    means = pointer(means)
-    quats = pointer(quats)
-    scales = pointer(scales)
-    opacities = pointer(opacities)
-    sigma = pointer(sigma)
-    growth = pointer(growth)
-    shN = pointer(shN)
-    cam = pointer(cam)
-    dial = pointer(dial)
-    records = pointer(records)
-    packed_ids = pointer(packed_ids)
-    slots = pointer(slots)
-    pair_sums = pointer(pair_sums)
-    v_means, v_quats, v_scales = pointer(v_means), pointer(v_quats), pointer(v_scales)
-    v_opacities, v_sigma, v_growth = pointer(v_opacities), pointer(v_sigma), pointer(v_growth)
-    v_sh0, v_shN = pointer(v_sh0), pointer(v_shN)
-    while end > first and packed_ids[end - 1] >= trained:
+    shaped, colored = len(gradients.means) > 0, len(gradients.sh0) > 0
+    tuned = len(gradients.shN) > 0
+    terms = (drawing.degree + 1) * (drawing.degree + 1) - 1 if tuned else 0
+    first, last = share(worker, workers, len(stored.opacities))
+    end = first + packed.counts[worker]
+    stored, drawing, packed = pointers(stored), pointers(drawing), pointers(packed)
+    slots, pair_sums, gradients = pointer(slots), pointer(pair_sums), pointers(gradients)
+    while end > first and packed.ids[end - 1] >= trained:
         end -= 1
-    clear(v_sigma, first, last, int64(dialled))
-    clear(v_growth, first, last, int64(grows))
+    clear(gradients.sigma, first, last, int64(drawing.fades))
+    clear(gradients.growth, first, last, int64(drawing.grows))
     done = first
     for start in range(first, end, 16):
         for lane in range(16):
-            packed[lane], lanes[lane] = min(start + lane, end - 1), lane
-            row = rows[lane] = packed_ids[packed[lane]]
+            places[lane], lanes[lane] = min(start + lane, end - 1), lane
+            row = rows[lane] = packed.ids[places[lane]]
             if row > done:
-                no_gradient(
-                    done,
-                    row,
-                    shaped,
-                    colored,
-                    terms,
-                    v_means,
-                    v_quats,
-                    v_scales,
-                    v_opacities,
-                    v_sh0,
-                    v_shN,
-                )
+                no_gradient(done, row, shaped, colored, terms, gradients)
             done = max(done, row + 1)
-        add_slots(pair_sums, slots, records, packed, lanes, sums, g)
-        load_stored(means, quats, scales, rows, w)
-        drawn(rows, opacities, sigma, growth, cam, dial, dialled, grows, w)
+        add_slots(pair_sums, slots, packed.records, places, lanes, sums, g)
+        load_stored(stored, rows, w)
+        drawn(rows, stored, drawing, w)
         if shaped or tuned:
-            color_gradient(w, g, shN, rows, degree, cam, sh, basis, tuned, v_shN)
+            color_gradient(w, g, stored.shN, rows, drawing, sh, basis, tuned, gradients.shN)
         if shaped:
-            covariance(cam, w)
-            covariance_gradient(w, g, cam, compensated)
+            covariance(drawing.cam, w)
+            covariance_gradient(w, g, drawing.cam, compensated)
             quat_gradient(w, g)
-            store_rows(v_means, rows, 3, 0, 3, g, V_MEAN)
-            store_rows(v_quats, rows, 4, 0, 4, g, V_QUAT)
-        given = opacities, sigma, growth, v_opacities, v_sigma, v_growth
-        dial_gradient(rows, given, cam, dial, dialled, grows, shaped, w, g)
+            store_rows(gradients.means, rows, 3, 0, 3, g, V_MEAN)
+            store_rows(gradients.quats, rows, 4, 0, 4, g, V_QUAT)
+        dial_gradient(rows, stored, drawing, shaped, w, g, gradients)
         if shaped:
-            store_rows(v_scales, rows, 3, 0, 3, g, V_SCALE)
+            store_rows(gradients.scales, rows, 3, 0, 3, g, V_SCALE)
         if colored:
             for k in range(3):
                 g[V_SH0 + k] = C0 * g[SUMS + k]
-            store_rows(v_sh0, rows, 3, 0, 3, g, V_SH0)
-    no_gradient(
-        done, last, shaped, colored, terms, v_means, v_quats, v_scales, v_opacities, v_sh0, v_shN
-    )
+            store_rows(gradients.sh0, rows, 3, 0, 3, g, V_SH0)
+    no_gradient(done, last, shaped, colored, terms, gradients)

@@ -23,7 +23,7 @@ from clod_adapter._kernels.conventions import (
     Y1,
 )
 from clod_adapter._kernels.elementary import vceil, vfloor, vsqrt
-from clod_adapter._kernels.pointers import pointer, prefetch, scratch
+from clod_adapter._kernels.pointers import pointer, prefetch, scratch, share
 from clod_adapter._kernels.simd import both, eq, ge, load, select, splat, store, vmax, vmin
 
 ROWS = np.arange(16, dtype=np.float32)
@@ -134,7 +134,7 @@ def list_tiles(
     Gaussians in depth order, and the slot that receives the pair's gradient. ``slots[2 p]`` to
     ``slots[2 p + 1]`` are those of the record p.
     """
-    first, last = len(order) * worker // workers, len(order) * (worker + 1) // workers
+    first, last = share(worker, workers, len(order))
     listed = len(slots) > 0
     cursor = pointer(histogram[worker])
     records = pointer(records)

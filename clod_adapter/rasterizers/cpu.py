@@ -3,6 +3,7 @@ threads.
 """
 
 import math
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from clod_adapter._kernels import blend, conventions, dial, threads, tiles
+from clod_adapter._kernels.conventions import Drawing, Packed, Picture, Stored, Tiles
 from clod_adapter._kernels.memory import recycled, recycled_array
 from clod_adapter._kernels.project import project
 from clod_adapter._kernels.project_gradient import project_gradient
@@ -65,169 +67,146 @@ def workers_for(rows: int) -> int:
 
 
 class Frame:
-    """State of the forward pass for the backward pass: projection, depth order and tile lists.
-
-    ``arrays`` are as the kernel ``project`` takes them.
-    """
+    """State of the forward pass for the backward pass: projection, depth order and tile lists."""
 
     def __init__(
-        self,
-        arrays: list[np.ndarray],
-        degree: int,
-        camera: Camera,
-        screen_filter: ScreenFilter,
-        dial: np.ndarray,
+        self, stored: Stored, camera: Camera, screen_filter: ScreenFilter, dial: np.ndarray
     ) -> None:
-        n, workers = len(arrays[0]), workers_for(len(arrays[0]))
-        self.camera, self.compensated = (
+        n = len(stored.means)
+        workers = workers_for(n)
+        terms = len(stored.shN) // max(3 * n, 1)
+        self.compensated = screen_filter.compensate or None
+        self.drawing = Drawing(
             camera_vector(camera, screen_filter),
-            screen_filter.compensate or None,
+            dial,
+            degree=math.isqrt(terms + 1) - 1,
+            fades=len(stored.sigma) > 0,
+            grows=len(stored.growth) > 0,
         )
-        self.records = recycled_array(((n + workers) * conventions.RECORD,), np.float32)
-        self.packed_ids, self.counts = recycled_array((n,), np.int32), np.zeros(workers, np.int64)
-        depths, packed = recycled_array((n,), np.float32), (self.packed_ids, self.counts)
-        threads.run(
-            project, workers, *arrays, degree, self.camera, dial, self.records, depths, *packed
+        self.packed = Packed(
+            recycled_array(((n + workers) * conventions.RECORD,), np.float32),
+            recycled_array((n,), np.float32),
+            recycled_array((n,), np.int32),
+            np.zeros(workers, np.int64),
         )
-        keys, order, *others = (
-            recycled_array((int(self.counts.sum()),), kind) for kind in (np.uint32, np.int32) * 2
-        )
-        order = tiles.depth_order(depths.view(np.uint32), self.counts, keys, order, *others)
+        threads.run(project, workers, stored, self.drawing, self.packed)
+        order = self._depth_order()
         across, down = -(-camera.width // conventions.TILE), -(-camera.height // conventions.TILE)
         offsets, listing = np.empty(across * down + 1, np.int64), workers_for(len(order))
-        histogram, totals = (
-            np.zeros((listing, across * down), np.int64),
-            np.zeros(listing, np.int64),
-        )
-        given = self.records, order, across, histogram, totals
-        threads.run(tiles.list_tiles, listing, *given, *[np.empty(0, np.int32)] * 3)
+        histogram = np.zeros((listing, across * down), np.int64)
+        totals = np.zeros(listing, np.int64)
+        listed = self.packed.records, order, across, histogram, totals
+        threads.run(tiles.list_tiles, listing, *listed, *[np.empty(0, np.int32)] * 3)
         total = tiles.tile_offsets(histogram, offsets, totals)
         self.slots, entries = recycled_array((2 * n,), np.int32), recycled_array((total,), np.int32)
         self.entry_slots = recycled_array((total,), np.int32)
-        threads.run(tiles.list_tiles, listing, *given, self.slots, entries, self.entry_slots)
-        # Longest lists first: no thread starts a long tile when the others are done.
-        order, masks = (
-            np.argsort(-np.diff(offsets), kind="stable"),
+        threads.run(tiles.list_tiles, listing, *listed, self.slots, entries, self.entry_slots)
+        self.tiles = Tiles(
+            self.packed.records,
+            entries,
+            offsets,
             recycled_array((total * blend.WORDS,), np.uint64),
+            # Longest lists first: no thread starts a long tile when the others are done.
+            np.argsort(-np.diff(offsets), kind="stable"),
+            across,
+            camera.width,
+            camera.height,
         )
-        self.workers, self.size, lists = (
-            threads.worker_count(),
-            (camera.height, camera.width),
-            (entries, offsets),
-        )
-        self.blended = self.records, *lists, across, camera.width, camera.height, order, masks
+
+    def _depth_order(self) -> np.ndarray:
+        """The packed records, near ones first."""
+        count = int(self.packed.counts.sum())
+        keys, keys_other = (recycled_array((count,), np.uint32) for _ in range(2))
+        order, order_other = (recycled_array((count,), np.int32) for _ in range(2))
+        depths = self.packed.depths.view(np.uint32)
+        return tiles.depth_order(depths, self.packed.counts, keys, order, keys_other, order_other)  # type: ignore[no-any-return]
 
     def blend(self, background: np.ndarray) -> tuple[Tensor, Tensor]:
         """The image and its alpha."""
-        image, alpha = recycled((*self.size, 3)), recycled(self.size)
-        self._run(blend.blend, blend.FORWARD_STATE, background, image.numpy(), alpha.numpy())
+        size = self.tiles.height, self.tiles.width
+        image, alpha = recycled((*size, 3)), recycled(size)
+        picture = Picture(image.numpy(), alpha.numpy())
+        self._run(blend.blend, blend.FORWARD_STATE, background, picture)
         return image, alpha
 
     def blend_gradient(
-        self,
-        image: Tensor,
-        alpha: Tensor,
-        v_image: Tensor,
-        v_alpha: Tensor,
-        shaped: bool,
-        colored: bool,
+        self, picture: Picture, gradients: Picture, shaped: bool, colored: bool
     ) -> np.ndarray:
         """The sums over pixels of each pair of Gaussian and tile, those of shape and colour if
         asked for.
         """
         # Reads of the last pair are sixteen floats wide too.
         sums = recycled_array((len(self.entry_slots) * conventions.PAIR + 16,), np.float32)
-        given = [x.contiguous().numpy() for x in (image, alpha, v_image, v_alpha)]
-        self._run(
-            blend.blend_gradient,
-            blend.BACKWARD_STATE,
-            self.entry_slots,
-            *given,
-            shaped,
-            colored,
-            sums,
-        )
+        arguments = self.entry_slots, picture, gradients, shaped, colored, sums
+        self._run(blend.blend_gradient, blend.BACKWARD_STATE, *arguments)
         return sums
 
-    def _run(self, kernel: Any, state: int, *own: Any) -> None:
+    def _run(self, kernel: Any, state: int, *arguments: Any) -> None:
         """Runs a kernel over all tiles, with ``state`` floats of scratch for each worker."""
-        room = recycled_array((self.workers, state), np.float32)
-        threads.run(kernel, self.workers, *self.blended, np.zeros(1, np.int64), room, *own)
+        workers = threads.worker_count()
+        room = recycled_array((workers, state), np.float32)
+        threads.run(kernel, workers, self.tiles, np.zeros(1, np.int64), room, *arguments)
 
 
-def _arrays(tensors: Any) -> list[np.ndarray]:
+def _arrays(tensors: Iterable[Tensor]) -> Iterator[np.ndarray]:
     """Contiguous float32 arrays; those of harmonics flat."""
-    arrays = [x.detach().contiguous().numpy() for x in tensors]
-    return [array.reshape(-1) if array.ndim == 3 else array for array in arrays]
+    for tensor in tensors:
+        array = tensor.detach().contiguous().numpy()
+        yield array.reshape(-1) if array.ndim == 3 else array
 
 
 class _Picture(torch.autograd.Function):
-    """Of Gaussians as they are stored, at one dial value, or of activated ones, as ``dialling``
-    says.
+    """Gaussians as they are stored, at one dial value, or activated ones, as ``dial`` says.
 
-    Without a dial, ``sigma_d`` is empty, without growth its exponents.
+    ``inputs`` are the tensors of ``Stored``. Without a dial, sigma is empty, without growth its
+    exponents.
     """
 
     @staticmethod
     def forward(  # type: ignore[no-untyped-def]
-        ctx: Any,
-        means,
-        quats,
-        scales,
-        opacities,
-        sigma_d,
-        growth_d,
-        sh0,
-        shN,
-        background,
-        camera,
-        screen_filter,
-        dialling,
-        trained,
+        ctx: Any, camera, screen_filter, dial, trained, background, *inputs
     ):
-        inputs = (means, quats, scales, opacities, sigma_d, growth_d, sh0, shN)
-        ctx.degree = math.isqrt(shN.shape[1] + 1) - 1
-        frame = Frame(_arrays(inputs), ctx.degree, camera, screen_filter, dialling)
+        frame = Frame(Stored(*_arrays(inputs)), camera, screen_filter, dial)
         image, alpha = frame.blend(background.detach().contiguous().numpy())
-        ctx.frame, ctx.dialling, ctx.trained = frame, dialling, trained
-        ctx.save_for_backward(*inputs, background, image, alpha)
+        ctx.frame, ctx.trained = frame, trained
+        ctx.save_for_backward(image, alpha, *inputs)
         return image, alpha
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, *gradients: Tensor):  # type: ignore[no-untyped-def, override]
-        *inputs, _background, image, alpha = ctx.saved_tensors
-        frame, need = ctx.frame, ctx.needs_input_grad
+    def backward(ctx: Any, *slopes: Tensor):  # type: ignore[no-untyped-def, override]
+        image, alpha, *inputs = ctx.saved_tensors
+        frame: Frame = ctx.frame
+        need = Stored(*ctx.needs_input_grad[5:])
         # Unused sums are skipped. Above SH degree 0, a mean changes the colour too.
-        shaped = any(need[:3]) or need[5]
-        colored = any(need[6:8]) or (shaped and ctx.degree > 0)
-        pair_sums = frame.blend_gradient(image, alpha, *gradients, shaped, colored)
-        wanted = [shaped] * 3 + [True] * 3 + [need[6], need[7]]
-        found = [
-            recycled(x.shape if want else (0, *x.shape[1:]))
-            for x, want in zip(inputs, wanted, strict=True)
+        shaped = need.means or need.quats or need.scales or need.growth
+        colored = need.sh0 or need.shN or (shaped and frame.drawing.degree > 0)
+        pair_sums = frame.blend_gradient(
+            Picture(*_arrays((image, alpha))), Picture(*_arrays(slopes)), shaped, colored
+        )
+        written = need._replace(means=shaped, quats=shaped, scales=shaped)
+        written = written._replace(opacities=True, sigma=True, growth=True)
+        gradients = [
+            recycled(x.shape if wanted else (0, *x.shape[1:]))
+            for x, wanted in zip(inputs, written, strict=True)
         ]
-        *arrays, _sh0, shN = _arrays(inputs)
         threads.run(
             project_gradient,
-            len(frame.counts),
-            *arrays,
-            shN,
-            ctx.degree,
-            frame.camera,
-            ctx.dialling,
-            frame.records,
-            frame.packed_ids,
-            frame.counts,
+            len(frame.packed.counts),
+            Stored(*_arrays(inputs)),
+            frame.drawing,
+            frame.packed,
             frame.slots,
             pair_sums,
             frame.compensated,
             ctx.trained,
-            *_arrays(found),
+            Stored(*_arrays(gradients)),
         )
-        slopes = [g if asked else None for g, asked in zip(found, need, strict=False)]
-        behind = ((1 - alpha)[..., None] * gradients[0]).sum((0, 1)) if need[8] else None
-        return *slopes, behind, None, None, None, None
+        behind = None
+        if ctx.needs_input_grad[4]:
+            behind = ((1 - alpha)[..., None] * slopes[0]).sum((0, 1))
+        asked = [g if needed else None for g, needed in zip(gradients, need, strict=True)]
+        return None, None, None, None, behind, *asked
 
 
 class _Compiled(Rasterizer):
@@ -258,19 +237,14 @@ class _Compiled(Rasterizer):
             **(g.tensors() | {"sigma_d": sigma_d, "growth_d": growth_d, "background": background}),
         )
         return _Picture.apply(  # type: ignore[no-any-return, no-untyped-call]
-            g.means,
-            g.quats,
-            g.log_scales,
-            g.opacity_logits,
-            sigma_d,
-            growth_d,
-            g.sh0,
-            g.shN,
-            background,
             camera,
             g.screen_filter,
             _dial_vector(g, virtual_scale),
             len(g) if trained is None else trained,
+            background,
+            *Stored(
+                g.means, g.quats, g.log_scales, g.opacity_logits, sigma_d, growth_d, g.sh0, g.shN
+            ),
         )
 
     @torch.no_grad()
@@ -326,19 +300,12 @@ def rasterize(
         background=background,
     )
     return _Picture.apply(  # type: ignore[no-any-return, no-untyped-call]
-        means,
-        quats,
-        scales,
-        opacities,
-        NOTHING,
-        NOTHING,
-        sh0,
-        shN,
-        background,
         camera,
         screen_filter,
         ACTIVATED,
         len(means),
+        background,
+        *Stored(means, quats, scales, opacities, NOTHING, NOTHING, sh0, shN),
     )
 
 
