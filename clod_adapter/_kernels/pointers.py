@@ -2,6 +2,9 @@
 per row.
 """
 
+from itertools import product
+
+import numpy as np
 from llvmlite import ir
 from numba import float32, types
 from numba.core import cgutils
@@ -22,11 +25,9 @@ from clod_adapter._kernels.simd import (
 )
 
 I32, I64, NOTHING = ir.IntType(32), ir.IntType(64), ir.VoidType()
-FLOATS, NUMBERS, VECTORS = (
-    types.CPointer(float32),
-    types.CPointer(types.int64),
-    types.CPointer(f32x16),
-)
+FLOATS = types.CPointer(float32)
+NUMBERS = types.CPointer(types.int64)
+VECTORS = types.CPointer(f32x16)
 
 
 @intrinsic
@@ -105,13 +106,13 @@ def _vector_at(builder, values, *indices):
 
 
 def _masked_load(builder, address, mask):
-    given = [address, ir.Constant(I32, 4), mask, ir.Constant(VECTOR, [0.0] * LANES)]
-    return call_llvm(builder, "llvm.masked.load.v16f32.p0v16f32", VECTOR, given)
+    arguments = [address, ir.Constant(I32, 4), mask, ir.Constant(VECTOR, [0.0] * LANES)]
+    return call_llvm(builder, "llvm.masked.load.v16f32.p0v16f32", VECTOR, arguments)
 
 
 def _masked_store(builder, address, mask, value):
-    given = [value, address, ir.Constant(I32, 4), mask]
-    call_llvm(builder, "llvm.masked.store.v16f32.p0v16f32", NOTHING, given)
+    arguments = [value, address, ir.Constant(I32, 4), mask]
+    call_llvm(builder, "llvm.masked.store.v16f32.p0v16f32", NOTHING, arguments)
 
 
 @operation(f32x16, mask16, FLOATS, types.int64)
@@ -170,11 +171,11 @@ def scatter(values, rows, vector):
 def _transposed(builder, rows):
     """The 16x16 transpose: lane i of vector j is lane j of vector i of ``rows``."""
     half = LANES // 2
-    low = ir.Constant(INTEGERS, [lane for k in range(half) for lane in (k, LANES + k)])
-    high = ir.Constant(INTEGERS, [lane for k in range(half, LANES) for lane in (k, LANES + k)])
+    alternating = np.arange(2 * LANES).reshape(2, LANES).T.reshape(2, LANES).tolist()
+    low, high = (ir.Constant(INTEGERS, lanes) for lanes in alternating)
     for _ in range(4):
-        pairs = [(rows[i], rows[i + half]) for i in range(half)]
-        rows = [builder.shuffle_vector(*pair, order) for pair in pairs for order in (low, high)]
+        pairs = zip(rows[:half], rows[half:], strict=True)
+        rows = [builder.shuffle_vector(*pair, order) for pair, order in product(pairs, (low, high))]
     return rows
 
 
@@ -197,25 +198,19 @@ def load_rows(builder, source, rows, width, first, count, lanes, at):
     ``rows`` are their sixteen numbers. The vectors up to at + 15 are overwritten.
     """
     mask = _first(builder, count)
-    found = [
-        _masked_load(builder, address, mask)
-        for address in _addresses(builder, source, rows, width, first)
-    ]
-    for vector, address in zip(
-        _transposed(builder, found), _lanes(builder, lanes, at), strict=True
-    ):
+    addresses = _addresses(builder, source, rows, width, first)
+    columns = _transposed(builder, [_masked_load(builder, x, mask) for x in addresses])
+    for vector, address in zip(columns, _lanes(builder, lanes, at), strict=True):
         builder.store(vector, address, align=4)
 
 
 @operation(types.none, FLOATS, NUMBERS, *[types.int64] * 3, VECTORS, types.int64)
 def store_rows(builder, destination, rows, width, first, count, lanes, at):
     """The inverse of ``load_rows``; of rows that are listed twice the last is stored."""
-    mask, found = (
-        _first(builder, count),
-        [builder.load(x, align=4) for x in _lanes(builder, lanes, at)],
-    )
+    mask = _first(builder, count)
+    columns = [builder.load(x, align=4) for x in _lanes(builder, lanes, at)]
     addresses = _addresses(builder, destination, rows, width, first)
-    for address, row in zip(addresses, _transposed(builder, found), strict=True):
+    for address, row in zip(addresses, _transposed(builder, columns), strict=True):
         _masked_store(builder, address, mask, row)
 
 
@@ -248,11 +243,12 @@ def load_triples(source, row, count, lanes):
 def store_sums(builder, values, index, *given):
     """``values[index : index + 9]`` = the sums over the lanes of the nine vectors."""
     vectors, nine = list(given), _first(builder, ir.Constant(I64, len(given)))
-    halves = [ir.Constant(INTEGERS, list(range(k, 2 * LANES, 2))) for k in range(2)]
+    even, odd = (ir.Constant(INTEGERS, list(range(k, 2 * LANES, 2))) for k in range(2))
     while len(vectors) > 1:  # adds neighbouring lanes until one vector holds all the sums, in order
         vectors = [*vectors, vectors[-1]] if len(vectors) % 2 else vectors
         pairs = zip(vectors[::2], vectors[1::2], strict=True)
         vectors = [
-            builder.fadd(*(builder.shuffle_vector(a, b, half) for half in halves)) for a, b in pairs
+            builder.fadd(builder.shuffle_vector(a, b, even), builder.shuffle_vector(a, b, odd))
+            for a, b in pairs
         ]
     _masked_store(builder, _vector_at(builder, values, index), nine, vectors[0])

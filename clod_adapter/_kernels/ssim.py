@@ -5,11 +5,13 @@ that blurs along a row need no edge cases. Rows beyond the image are skipped, wh
 padding.
 """
 
+from typing import Any, NamedTuple
+
 import numpy as np
 from numba import float32
 
 from clod_adapter._kernels.compiling import kernel, part
-from clod_adapter._kernels.pointers import pointer
+from clod_adapter._kernels.pointers import pointers, share
 from clod_adapter._kernels.simd import fma, load, splat, store
 
 RADIUS, PAD = 5, 16
@@ -19,20 +21,31 @@ C1, C2 = float32(0.01**2), float32(0.03**2)
 BYTE = float32(1 / 255)
 
 
+class Planes(NamedTuple):
+    """Planes of a render x, a photograph y, and what the SSIM of a pixel changes by."""
+
+    x: Any
+    y: Any
+    mean: Any  # the blurred x
+    square: Any  # the blurred x^2
+    product: Any  # the blurred x y
+
+
 def stride(width: int) -> int:
     """Floats a padded row takes."""
     return 2 * PAD + -(-width // 16) * 16
 
 
 @kernel
-def to_planes(worker, workers, image, target, x, y):
+def to_planes(worker, workers, image, target, planes):
     """Copies two ``[H, W, 3]`` images into planes; the uint8 ``target`` is scaled to [0, 1]."""
     height, width = image.shape[0], image.shape[1]
-    for row in range(height * worker // workers, height * (worker + 1) // workers):
+    for row in range(*share(worker, workers, height)):
         for column in range(width):
             for channel in range(3):
-                x[channel, row, PAD + column] = image[row, column, channel]
-                y[channel, row, PAD + column] = float32(target[row, column, channel]) * BYTE
+                planes.x[channel, row, PAD + column] = image[row, column, channel]
+                byte = float32(target[row, column, channel])
+                planes.y[channel, row, PAD + column] = byte * BYTE
 
 
 @part
@@ -45,27 +58,21 @@ def blur_row(lines, line, length):
 
 
 @kernel
-def ssim_slopes(worker, workers, x, y, width, g_mean, g_square, g_product, sums):
+def ssim_slopes(worker, workers, planes, width, sums):
     """Derivatives of each pixel's SSIM by the blurred x, x^2 and x y; ``sums[worker]``: sum of SSIM
     over the pixels.
     """
-    channels, height, step = x.shape
-    x = pointer(x)
-    y = pointer(y)
-    g_mean = pointer(g_mean)
-    g_square = pointer(g_square)
-    g_product = pointer(g_product)
+    channels, height, step = planes.x.shape
+    planes = pointers(planes)
     lines, zero = np.zeros(6 * step, np.float32), splat(0)
     result = 0.0
-    for task in range(
-        channels * height * worker // workers, channels * height * (worker + 1) // workers
-    ):
+    for task in range(*share(worker, workers, channels * height)):
         channel, row = task // height, task % height
         for at in range(PAD, step - PAD, 16):
             m_x = m_y = m_xx = m_yy = m_xy = zero
             for near in range(max(row - RADIUS, 0), min(row + RADIUS, height - 1) + 1):
                 tap, where = TAPS[near - row + RADIUS], (channel * height + near) * step + at
-                p, q = load(x, where), load(y, where)
+                p, q = load(planes.x, where), load(planes.y, where)
                 tp, tq = tap * p, tap * q
                 m_x, m_y = m_x + tp, m_y + tq
                 m_xx, m_yy, m_xy = fma(tp, p, m_xx), fma(tq, q, m_yy), fma(tp, q, m_xy)
@@ -85,52 +92,52 @@ def ssim_slopes(worker, workers, x, y, width, g_mean, g_square, g_product, sums)
             value = a * b * inverse
             where = task * step + at
             store(lines, 5 * step + at, value)
-            store(g_mean, where, 2 * (my * (b - a) - value * mx * (d - c)) * inverse)
-            store(g_square, where, 0 - value * c * inverse)
-            store(g_product, where, 2 * a * inverse)
+            store(planes.mean, where, 2 * (my * (b - a) - value * mx * (d - c)) * inverse)
+            store(planes.square, where, 0 - value * c * inverse)
+            store(planes.product, where, 2 * a * inverse)
         for column in range(width):
             result += lines[5 * step + PAD + column]
         # Lanes beyond the image must not contribute to the gradient.
         for column in range(task * step + PAD + width, (task + 1) * step - PAD):
-            g_mean[column] = g_square[column] = g_product[column] = 0
+            planes.mean[column] = planes.square[column] = planes.product[column] = 0
     sums[worker] = result
 
 
 @kernel
-def loss_gradient(
-    worker, workers, x, y, width, g_mean, g_square, g_product, l1, dssim, v_image, sums
-):
+def loss_gradient(worker, workers, planes, width, l1, dssim, v_image, sums):
     """Gradient of ``l1 sum |x - y| - dssim sum SSIM`` by x, as ``[H, W, 3]``; ``sums[worker]``: sum
     of |x - y|.
     """
-    channels, height, step = x.shape
-    x = pointer(x)
-    y = pointer(y)
-    g_mean = pointer(g_mean)
-    g_square = pointer(g_square)
-    g_product = pointer(g_product)
+    channels, height, step = planes.x.shape
+    planes = pointers(planes)
     lines, out, zero = np.zeros(3 * step, np.float32), np.empty(step, np.float32), splat(0)
     weight = float32(-dssim)
     result = 0.0
-    for task in range(
-        channels * height * worker // workers, channels * height * (worker + 1) // workers
-    ):
+    for task in range(*share(worker, workers, channels * height)):
         channel, row = task // height, task % height
         for at in range(PAD, step - PAD, 16):
             m, s, p = zero, zero, zero
             for near in range(max(row - RADIUS, 0), min(row + RADIUS, height - 1) + 1):
                 tap, where = TAPS[near - row + RADIUS], (channel * height + near) * step + at
-                m, s = fma(tap, load(g_mean, where), m), fma(tap, load(g_square, where), s)
-                p = fma(tap, load(g_product, where), p)
+                m, s = (
+                    fma(tap, load(planes.mean, where), m),
+                    fma(tap, load(planes.square, where), s),
+                )
+                p = fma(tap, load(planes.product, where), p)
             store(lines, at, m)
             store(lines, step + at, s)
             store(lines, 2 * step + at, p)
         for at in range(PAD, step - PAD, 16):
             where = task * step + at
-            inner = fma(2 * load(x, where), blur_row(lines, step, at), blur_row(lines, 0, at))
-            store(out, at, weight * fma(load(y, where), blur_row(lines, 2 * step, at), inner))
+            inner = fma(
+                2 * load(planes.x, where), blur_row(lines, step, at), blur_row(lines, 0, at)
+            )
+            store(
+                out, at, weight * fma(load(planes.y, where), blur_row(lines, 2 * step, at), inner)
+            )
         for column in range(width):
-            difference = x[task * step + PAD + column] - y[task * step + PAD + column]
+            pixel = task * step + PAD + column
+            difference = planes.x[pixel] - planes.y[pixel]
             result += abs(difference)
             v_image[row, column, channel] = out[PAD + column] + float32(l1) * float32(
                 np.sign(difference)

@@ -73,24 +73,20 @@ def rasterize(
     screen_filter: ScreenFilter = CLASSIC,
 ) -> tuple[Tensor, Tensor]:
     """See ``clod_adapter.rasterizers.Splat``; of float32 tensors alone."""
-    given = {
-        "means": means,
-        "quats": quats,
-        "scales": scales,
-        "opacities": opacities,
-        "sh0": sh0,
-        "shN": shN,
-        "background": background,
+    geometry = {"means": means, "quats": quats, "scales": scales, "opacities": opacities}
+    tensors = geometry | {"sh0": sh0, "shN": shN}
+    on_gpu = {
+        name: tensor
+        for name, tensor in (tensors | {"background": background}).items()
+        if tensor.is_cuda
     }
-    require_float32("CUDA", **{name: tensor for name, tensor in given.items() if tensor.is_cuda})
+    require_float32("CUDA", **on_gpu)
     rows = drawable(quats, opacities).nonzero()[:, 0]
-    geometry = [_Rows.apply(rows, x) for x in (means, quats, scales, opacities)]
+    geometry = {name: _Rows.apply(rows, x) for name, x in geometry.items()}
     drawn = _project(geometry, sh0, shN, rows, camera, screen_filter) if len(rows) else None
     if drawn is None or len(drawn["means2d"]) == 0:
         # Nothing to draw; the gradients are 0.
-        nothing = sum(
-            _Rows.apply(rows[:0], x).sum() for x in (means, quats, scales, opacities, sh0, shN)
-        )
+        nothing = sum(_Rows.apply(rows[:0], x).sum() for x in tensors.values())
         empty = nothing + means.new_zeros(camera.height, camera.width)
         return background + empty[..., None], empty
     image, alpha = _blend(drawn, camera)
@@ -98,7 +94,7 @@ def rasterize(
 
 
 def _project(
-    geometry: list[Tensor],
+    geometry: dict[str, Tensor],
     sh0: Tensor,
     shN: Tensor,
     rows: Tensor,
@@ -108,19 +104,19 @@ def _project(
     """Inputs of gsplat's tiles and pixels: one row for each Gaussian in the image, in row order."""
     import gsplat
 
-    means, quats, scales, opacities = geometry
+    means, opacities = geometry["means"], geometry["opacities"]
     # In one transfer to the device.
     parts = (camera.viewmat.flatten(), camera.K.flatten(), camera.position)
     flat = torch.cat([part.detach().to(means.dtype) for part in parts]).to(
         means.device, non_blocking=True
     )
     viewmat, K, eye = flat[:16].view(1, 4, 4), flat[16:25].view(1, 3, 3), flat[25:]
-    *found, radii, means2d, depths, conics, compensations = _call(
+    projected = _call(
         gsplat.fully_fused_projection,
         means,
         None,
-        quats,
-        scales,
+        geometry["quats"],
+        geometry["scales"],
         viewmat,
         K,
         camera.width,
@@ -136,7 +132,9 @@ def _project(
         opacities=opacities.detach(),
     )
     # of cameras, Gaussians; 1.5.3 has batches before them, 1.6.0 also the bounds of each image
-    ids = found[:3][-1]
+    ids = projected[:-5][:3][-1]
+    radii, means2d, depths = projected[-5:-2]
+    conics, compensations = projected[-2:]
     harmonics = torch.cat([_Rows.apply(rows[ids], x) for x in (sh0, shN)], 1)
     degree, centres = math.isqrt(harmonics.shape[1]) - 1, _Rows.apply(ids, means)
     # 1.6.0 finds the directions itself
@@ -144,17 +142,19 @@ def _project(
         colors = 0.5 + gsplat.spherical_harmonics(degree, centres, viewmat, harmonics)[0]
     else:
         colors = 0.5 + gsplat.spherical_harmonics(degree, centres - eye, harmonics)
-    shown = _Rows.apply(ids, opacities) * (1 if compensations is None else compensations)
+    opacities = _Rows.apply(ids, opacities)
+    if compensations is not None:
+        opacities = opacities * compensations
     # Rows with values that are not finite are not drawn; the kernels would draw them opaque.
-    sound = (means2d.sum(1) + conics.sum(1) + colors.sum(1) + shown).detach().isfinite()
-    rows_of = sound[:, None]
+    finite = (means2d.sum(1) + conics.sum(1) + colors.sum(1) + opacities).detach().isfinite()
+    finite_rows = finite[:, None]
     return {
-        "means2d": means2d.where(rows_of, 0),
-        "conics": conics.where(rows_of, 0),
+        "means2d": means2d.where(finite_rows, 0),
+        "conics": conics.where(finite_rows, 0),
         "radii": radii,
         "depths": depths,
-        "colors": colors.where(rows_of, 0).clamp(min=0),
-        "opacities": shown.where(sound, 0),
+        "colors": colors.where(finite_rows, 0).clamp(min=0),
+        "opacities": opacities.where(finite, 0),
     }
 
 

@@ -68,7 +68,8 @@ def project(
 
 def rotations(quats: Tensor) -> Tensor:
     """``[n, 3, 3]`` of quaternions wxyz of any length above 0."""
-    w, x, y, z = (quats / quats.norm(dim=1, keepdim=True)).unbind(1)
+    w, *axis = (quats / quats.norm(dim=1, keepdim=True)).unbind(1)
+    x, y, z = axis
     return torch.stack(
         [
             1 - 2 * (y * y + z * z),
