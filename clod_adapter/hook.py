@@ -91,12 +91,12 @@ class Hook:
         camera = Camera(
             _matrix(viewmat), _matrix(np.eye(3) if K is None else K), width, height, near=near
         )
-        shown = tensor_of(opacities)
-        result = self.attenuate(tensor_of(means), shown, camera)
-        found: Any = result.drawn.reshape(shown.shape).to(shown.dtype), result.keep, result.growth
-        return (
-            found if isinstance(means, Tensor) else tuple(each.detach().numpy() for each in found)
-        )
+        given = tensor_of(opacities)
+        drawn, keep, growth = self.attenuate(tensor_of(means), given, camera)
+        result: Any = drawn.reshape(given.shape).to(given.dtype), keep, growth
+        if isinstance(means, Tensor):
+            return result  # type: ignore[no-any-return]
+        return tuple(tensor.detach().numpy() for tensor in result)  # type: ignore[return-value]
 
     def attenuate(self, means: Tensor, opacities: Tensor, camera: Camera) -> Attenuated:
         """The same for a ``Camera``, with everything that ``attenuation.attenuate`` returns."""

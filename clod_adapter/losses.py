@@ -42,13 +42,13 @@ def psnr_ssim(image: Tensor, target: Tensor) -> tuple[float, float]:
     from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
     clamped = image.detach().clamp(0, 1).cpu()
-    shown, photograph = clamped.numpy(), unit(target, clamped).numpy()
+    render, photograph = clamped.numpy(), unit(target, clamped).numpy()
     with np.errstate(divide="ignore"):  # equal images
-        value = peak_signal_noise_ratio(photograph, shown, data_range=1)
+        value = peak_signal_noise_ratio(photograph, render, data_range=1)
     border = [(WINDOW // 2, WINDOW // 2)] * 2 + [(0, 0)]
     similarity = structural_similarity(
         np.pad(photograph, border),
-        np.pad(shown, border),
+        np.pad(render, border),
         gaussian_weights=True,
         sigma=SIGMA,
         use_sample_covariance=False,

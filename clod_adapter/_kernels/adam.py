@@ -40,20 +40,18 @@ def adam_rows(
     width = parameter.shape[1]
     most = corrections.shape[1] - 1
     rate = float32(rate)
-    each = int64(len(units) > 1)
+    stride = int64(len(units) > 1)
     beta1, beta2, epsilon = splat(float32(beta1)), splat(float32(beta2)), float32(epsilon)
     rest1, rest2 = 1 - beta1, 1 - beta2
     begin, end = share(worker, workers, len(parameter))
     lengths, factors = scratch(float32, ROOM), scratch(float32, ROOM)
-    parameter = pointer(parameter)
-    first = pointer(first)
-    second = pointer(second)
-    gradient = pointer(gradient)
+    parameter, gradient = pointer(parameter), pointer(gradient)
+    first, second = pointer(first), pointer(second)
     for start in range(begin, end, 16):
-        stop, some = min(start + 16, end), False
+        stop, any_marked = min(start + 16, end), False
         for row in range(start, stop):
-            some |= mask[row]
-        if not some:
+            any_marked |= mask[row]
+        if not any_marked:
             continue
         for k in range(16 * width):
             factors[k] = 0
@@ -61,10 +59,8 @@ def adam_rows(
             if mask[row]:
                 steps[row] += counted
                 count = min(steps[row], most)
-                length, factor = (
-                    rate * units[each * row] * corrections[0, count],
-                    corrections[1, count],
-                )
+                length = rate * units[stride * row] * corrections[0, count]
+                factor = corrections[1, count]
                 for k in range(width * (row - start), width * (row - start + 1)):
                     lengths[k], factors[k] = length, factor
         for k in range(0, 16 * width, 16):

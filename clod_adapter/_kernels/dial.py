@@ -97,16 +97,16 @@ def kept(at, many, stored, drawing):
     cam, dial = drawing.cam, drawing.dial
     if dial[ACTIVATED] > 0:
         opacity = load_some(stored.opacities, at, many)
-        shown = both(ge(opacity, ALPHA_MIN), gt(HUGE, opacity))
+        visible = both(ge(opacity, ALPHA_MIN), gt(HUGE, opacity))
     else:
         w = scratch(f32x16, 3)
         load_triples(stored.means, at, many, w)
         depth = cam[8] * w[0] + cam[9] * w[1] + cam[10] * w[2] + cam[11]
-        shown = ge(depth, NEARLY * cam[NEAR])
+        visible = ge(depth, NEARLY * cam[NEAR])
         if drawing.fades:
             far2 = squared_distance(w, cam) * dial[RATE2]
-            shown = both(shown, survives(load_some(stored.sigma, at, many), far2, dial[NEAR2]))
-    return bits_of(both(shown, first_lanes(many)))
+            visible = both(visible, survives(load_some(stored.sigma, at, many), far2, dial[NEAR2]))
+    return bits_of(both(visible, first_lanes(many)))
 
 
 @kernel

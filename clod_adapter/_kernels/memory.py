@@ -27,15 +27,15 @@ def recycled(shape: torch.Size | tuple[int, ...]) -> Tensor:
     step = 1 << max(size.bit_length() - 4, 0)
     room = -(-size // step) * step  # up to an eighth larger, so that similar sizes share memory
     try:
-        whole = _idle[room].pop()
+        buffer = _idle[room].pop()
         with contextlib.suppress(ValueError):
             _recent.remove(room)
     except (KeyError, IndexError):
         unaligned = np.empty(room + 16, np.float32)
-        whole = unaligned[-unaligned.ctypes.data % 64 // 4 :][:room]
-    array = whole[:size].reshape(shape)
+        buffer = unaligned[-unaligned.ctypes.data % 64 // 4 :][:room]
+    array = buffer[:size].reshape(shape)
     # torch keeps a reference to this object as long as a tensor uses its memory.
-    weakref.finalize(array, _give_back, whole).atexit = False
+    weakref.finalize(array, _give_back, buffer).atexit = False
     return torch.from_numpy(array)
 
 
@@ -46,11 +46,11 @@ def recycled_array(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
     return recycled((size * np.dtype(dtype).itemsize // 4,)).numpy().view(dtype).reshape(shape)
 
 
-def _give_back(whole: np.ndarray) -> None:
+def _give_back(buffer: np.ndarray) -> None:
     # No lock: this runs where the last tensor is freed, perhaps within ``recycled``. Each operation
     # is atomic.
-    _idle.setdefault(len(whole), []).append(whole)
-    _recent.append(len(whole))
+    _idle.setdefault(len(buffer), []).append(buffer)
+    _recent.append(len(buffer))
     while len(_recent) > IDLE or sum(_recent) > IDLE_FLOATS:
         with contextlib.suppress(IndexError):  # already in use again
             _idle[_recent.popleft()].pop(0)

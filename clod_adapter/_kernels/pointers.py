@@ -153,10 +153,10 @@ def store_some(values, index, count, vector):
 @part
 def gather(values, rows):
     """``values[rows[lane]]`` in each lane."""
-    found = scratch(float32, 16)
+    lanes = scratch(float32, 16)
     for lane in range(16):
-        found[lane] = values[rows[lane]]
-    return load(found, 0)
+        lanes[lane] = values[rows[lane]]
+    return load(lanes, 0)
 
 
 @part

@@ -102,10 +102,10 @@ def _operators(name, kinds, flags, *operators):
     def lower(context, builder, signature, args):
         return getattr(builder, name)(*(spread(builder, arg) for arg in args), flags=flags)
 
-    for each in operators:
-        infer_global(each)(Typing)
+    for function in operators:
+        infer_global(function)(Typing)
         for kind in kinds:
-            lower_builtin(each, *kind)(lower)
+            lower_builtin(function, *kind)(lower)
 
 
 # Not ``overload``: inlining hundreds of operators takes numba minutes.
@@ -133,8 +133,8 @@ def operation(result, *kinds):
                 spread(builder, arg) if kind == f32x16 else arg
                 for arg, kind in zip(args, kinds, strict=True)
             ]
-            result = build(builder, *values)
-            return context.get_dummy_value() if result is None else result
+            made = build(builder, *values)
+            return context.get_dummy_value() if made is None else made
 
         def typed(typingctx, *args):
             given = [

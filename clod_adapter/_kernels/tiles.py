@@ -91,20 +91,20 @@ def depth_order(depths, counts, keys, order, keys_other, order_other):
 
 
 @part
-def tiles_across(records, r, ty, y0, y1, found):
+def tiles_across(records, r, ty, y0, y1, columns):
     """First and last column of tiles that the record at ``r`` touches in the tile row ``ty``; none:
     last < first.
 
-    ``found [32]`` keeps those of sixteen rows, for calls with ascending ``ty``.
+    ``columns [32]`` keeps those of sixteen rows, for calls with ascending ``ty``.
     """
     first, last = np.int32(records[r + X0]) // TILE, np.int32(records[r + X1]) // TILE
     lane = (ty - y0 // TILE) % 16
     if first < last or y0 // TILE < y1 // TILE:
         if lane == 0:
             low, high = spans(records, r, 0, ty * TILE, float32(TILE))
-            store(found, 0, low)
-            store(found, 16, high)
-        first, last = np.int32(found[lane]), np.int32(found[16 + lane])
+            store(columns, 0, low)
+            store(columns, 16, high)
+        first, last = np.int32(columns[lane]), np.int32(columns[16 + lane])
     return first, last
 
 
@@ -140,7 +140,7 @@ def list_tiles(
     records = pointer(records)
     order = pointer(order)
     slots, entries, entry_slots = pointer(slots), pointer(entries), pointer(entry_slots)
-    found, slot = scratch(float32, 32), totals[worker]
+    columns, slot = scratch(float32, 32), totals[worker]
     for j in range(first, last):
         prefetch(records, order[min(j + AHEAD, last - 1)] * RECORD)
         p = order[j]
@@ -149,7 +149,7 @@ def list_tiles(
         if listed:
             slots[2 * p] = slot
         for ty in range(y0 // TILE, y1 // TILE + 1):
-            low, high = tiles_across(records, r, ty, y0, y1, found)
+            low, high = tiles_across(records, r, ty, y0, y1, columns)
             for tx in range(low, high + 1):
                 at = cursor[ty * across + tx]
                 cursor[ty * across + tx] = at + 1

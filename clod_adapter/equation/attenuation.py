@@ -117,8 +117,8 @@ def attenuate(
     check_dial(virtual_scale)
     virtual_scale = float(virtual_scale)  # of a numpy array
     if sigma_d is None or config is None:
-        shown = opacities if activated else opacities.sigmoid()
-        return Attenuated(shown, torch.ones_like(shown, dtype=torch.bool), torch.ones_like(shown))
+        a = opacities if activated else opacities.sigmoid()
+        return Attenuated(a, torch.ones_like(a, dtype=torch.bool), torch.ones_like(a))
     d = normalized_distances(*seen_from, config) if isinstance(seen_from, tuple) else seen_from
     named = {"opacities" if activated else "opacity_logits": opacities, "sigma_d": sigma_d, "d": d}
     opacities, sigma, d = conform(**named)
@@ -127,13 +127,13 @@ def attenuate(
     else:
         conform(sigma_d=sigma_d, growth_d=growth_d)
         growth = growth_factors(growth_d, d, virtual_scale, growth_distance(config))
-    shown = opacities if activated else opacities.sigmoid()
+    a = opacities if activated else opacities.sigmoid()
     far = d.detach().double() * virtual_scale
     if config.form == "paper":
-        fade, keep = paper_fade(shown, sigma, far, virtual_scale)
+        fade, keep = paper_fade(a, sigma, far, virtual_scale)
     else:
         fade, keep = reach_fade(sigma, far, config.near_distance / config.scene_distance)
-    return Attenuated(shown * fade.to(shown), keep, growth)
+    return Attenuated(a * fade.to(a), keep, growth)
 
 
 def reach_fade(sigma_d: Tensor, far: Tensor, near: float = 0.0) -> tuple[Tensor, Tensor]:
@@ -218,11 +218,11 @@ def warn_of_no_dial(virtual_scale: float, remedy: str, stacklevel: int = 3) -> N
     """
     check_dial(virtual_scale)
     if virtual_scale > 1:
-        much = (
+        warnings.warn(
             f"virtual_scale is {virtual_scale:g}, but there is no sigma_d: all Gaussians are drawn"
-            " as they are"
+            f" as they are; {remedy}",
+            stacklevel=stacklevel,
         )
-        warnings.warn(f"{much}; {remedy}", stacklevel=stacklevel)
 
 
 def conform(**tensors: Tensor) -> list[Tensor]:
@@ -237,9 +237,7 @@ def conform(**tensors: Tensor) -> list[Tensor]:
         require(tensor.is_floating_point(), name, tensor.dtype, "floating point: .float()")
     shapes = {name: tuple(t.shape) for name, t in tensors.items()}
     if len(set(shapes.values())) != 1 or any(len(shape) != 1 for shape in shapes.values()):
-        raise ClodError(
-            "expected one shape [N], got "
-            + ", ".join(f"{name} {shape}" for name, shape in shapes.items())
-        )
+        listed = ", ".join(f"{name} {shape}" for name, shape in shapes.items())
+        raise ClodError(f"expected one shape [N], got {listed}")
     dtype = reduce(torch.promote_types, (t.dtype for t in tensors.values()), torch.float32)
     return [t.to(dtype) for t in tensors.values()]

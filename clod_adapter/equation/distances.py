@@ -61,11 +61,8 @@ def normalizing_distance(
         return torch.full((), value, dtype=distances.dtype, device=distances.device)
     inside = in_frustum(means, camera)
     # Without a selection, for whose size the host would wait for a GPU.
-    return (
-        distances.where(inside | ~inside.any(), 0)
-        .max()
-        .clamp(min=torch.finfo(distances.dtype).tiny)
-    )
+    largest = distances.where(inside | ~inside.any(), 0).max()
+    return largest.clamp(min=torch.finfo(distances.dtype).tiny)
 
 
 def in_frustum(means: Tensor, camera: Camera) -> Tensor:
@@ -91,15 +88,15 @@ def camera_unit(means: Tensor, camera: Camera, config: AttenuationConfig) -> flo
 
 
 def median_distance(means: Tensor, camera: Camera) -> float:
-    """Of the centres ``means [N, 3]`` in the image, or of all if there is none; world units, 1 for
-    no centres.
+    """Median distance of the centres ``means [N, 3]`` in the image, or of all if there is none;
+    world units, 1 for no centres.
     """
     inside = in_frustum(means, camera)
     distances = (means - camera.position.to(means)).norm(dim=1)
     visible = distances[inside] if bool(inside.any()) else distances
-    return (
-        float(visible.median().clamp(min=torch.finfo(visible.dtype).tiny)) if len(visible) else 1.0
-    )
+    if len(visible) == 0:
+        return 1.0
+    return float(visible.median().clamp(min=torch.finfo(visible.dtype).tiny))
 
 
 def viewpoint_of(camera: Camera, means: Tensor, config: AttenuationConfig) -> Viewpoint:
@@ -169,11 +166,9 @@ def _without_outliers(means: Tensor, places: Sequence[Place]) -> Sequence[Place]
 
 
 def position_of(place: Place, means: Tensor) -> Tensor:
-    return (
-        place.position.to(means)
-        if isinstance(place, Camera)
-        else means.new_tensor([place.x, place.y, place.z])
-    )
+    if isinstance(place, Camera):
+        return place.position.to(means)
+    return means.new_tensor([place.x, place.y, place.z])
 
 
 def _from(place: Place, means: Tensor, config: AttenuationConfig) -> Tensor:

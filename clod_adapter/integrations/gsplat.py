@@ -59,24 +59,19 @@ def _of_gsplat(typed: Typed) -> Typed:
     hide = not (name == "rasterization" and "opacities" in projection)
 
     @functools.wraps(typed)
-    def dialled(*args: Any, **kwargs: Any) -> Any:
-        function, own = (
-            getattr(gsplat, name),
-            {each: kwargs.pop(each, default) for each, default in DIAL.items()},
-        )
-        settings = dropped_in(**own)
+    def attenuated(*args: Any, **kwargs: Any) -> Any:
+        function = getattr(gsplat, name)
+        dial = {key: kwargs.pop(key, default) for key, default in DIAL.items()}
+        settings = dropped_in(**dial)
         if settings is None:
             return function(*args, **kwargs)
         bound = inspect.signature(function).bind(*args, **kwargs)
         bound.apply_defaults()
-        given = (
-            bound.arguments
-            | bound.arguments.pop("kwargs", {})
-            | {each: own[each] for each in PER_ROW}
-        )
-        return render(function, given, own["virtual_scale"], settings, hide)
+        arguments = bound.arguments | bound.arguments.pop("kwargs", {})
+        arguments |= {key: dial[key] for key in PER_ROW}
+        return render(function, arguments, dial["virtual_scale"], settings, hide)
 
-    return dialled  # type: ignore[return-value]
+    return attenuated  # type: ignore[return-value]
 
 
 @_of_gsplat

@@ -58,18 +58,15 @@ def render(
         )
     for name in PER_ROW:
         if given[name] is not None and given[name].shape != given["opacities"].shape:
-            shapes = (
+            raise ClodError(
                 f"{name} is {tuple(given[name].shape)} and opacities"
-                f" {tuple(given['opacities'].shape)}"
+                f" {tuple(given['opacities'].shape)}; both must be [..., N]"
             )
-            raise ClodError(f"{shapes}; both must be [..., N]")
     shape = given["viewmats"].shape[:-2]
     one = partial(_one_camera, function, virtual_scale=virtual_scale, config=config, hide=hide)
-    return (
-        one(given)
-        if math.prod(shape) == 1
-        else _joined([one(each) for each in _cameras(given, shape)], shape)
-    )
+    if math.prod(shape) == 1:
+        return one(given)
+    return _joined([one(arguments) for arguments in _cameras(given, shape)], shape)
 
 
 def _one_camera(
@@ -93,23 +90,19 @@ def _one_camera(
         sigma_d.flatten(), config, virtual_scale, None if growth_d is None else growth_d.flatten()
     )
     opacities, means = given["opacities"], given["means"]
-    shown = hook.attenuate(means.reshape(-1, 3), opacities.flatten(), camera)
-    arguments["opacities"] = shown.drawn.to(opacities).reshape(opacities.shape)
+    attenuated = hook.attenuate(means.reshape(-1, 3), opacities.flatten(), camera)
+    arguments["opacities"] = attenuated.drawn.to(opacities).reshape(opacities.shape)
     if growth_d is not None:
-        name, growth = (
-            ("scales", shown.growth)
-            if given.get("covars") is None
-            else ("covars", shown.growth.square())
-        )
-        old = given[name]
-        arguments[name] = old * growth.to(old).reshape(
-            opacities.shape + (1,) * (old.dim() - opacities.dim())
-        )
+        name, growth = "scales", attenuated.growth
+        if given.get("covars") is not None:
+            name, growth = "covars", growth.square()
+        sizes = given[name]
+        further = (1,) * (sizes.dim() - opacities.dim())
+        arguments[name] = sizes * growth.to(sizes).reshape(opacities.shape + further)
     if hide and not given.get("sparse_grad"):  # sparse gradients do not pass through where
         behind = (camera.position - camera.viewmat[2, :3]).detach().to(means)
-        arguments["means"] = torch.where(
-            shown.keep.reshape(opacities.shape)[..., None], means, behind
-        )
+        keep = attenuated.keep.reshape(opacities.shape)
+        arguments["means"] = torch.where(keep[..., None], means, behind)
     return function(**arguments)
 
 

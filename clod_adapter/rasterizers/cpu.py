@@ -33,10 +33,8 @@ def camera_vector(camera: Camera, screen_filter: ScreenFilter = CLASSIC) -> np.n
     """Camera and screen-space filter in the layout of the kernels (``_kernels/conventions.py``)."""
     out = np.empty(conventions.CAMERA, np.float32)
     viewmat, K = (x.detach().cpu().double().numpy() for x in (camera.viewmat, camera.K))
-    fx = float(K[0, 0])
-    fy = float(K[1, 1])
-    cx = float(K[0, 2])
-    cy = float(K[1, 2])
+    fx, fy = float(K[0, 0]), float(K[1, 1])
+    cx, cy = float(K[0, 2]), float(K[1, 2])
     out[:16] = viewmat.reshape(-1)
     out[16:22] = fx, fy, cx, cy, camera.width, camera.height
     margin_x, margin_y = 0.15 * camera.width / fx, 0.15 * camera.height / fy
@@ -44,10 +42,8 @@ def camera_vector(camera: Camera, screen_filter: ScreenFilter = CLASSIC) -> np.n
     out[24:26] = -(cy / fy + margin_y), (camera.height - cy) / fy + margin_y
     out[26:29] = -viewmat[:3, 3] @ viewmat[:3, :3]
     out[conventions.NEAR] = camera.near
-    out[conventions.BLUR], out[conventions.COMPENSATE] = (
-        screen_filter.variance,
-        screen_filter.compensate,
-    )
+    out[conventions.BLUR] = screen_filter.variance
+    out[conventions.COMPENSATE] = screen_filter.compensate
     return out
 
 
@@ -255,14 +251,16 @@ class _Compiled(Rasterizer):
             or _composed(gaussians)
         ):
             return super().kept(gaussians, camera, virtual_scale)
-        found = np.empty(len(gaussians), np.uint8)
-        given = _arrays((gaussians.means, gaussians.sigma_d.float()))
-        settings = (
-            camera_vector(camera, gaussians.screen_filter),
+        marks = np.empty(len(gaussians), np.uint8)
+        threads.run(
+            dial.mark_kept,
+            workers_for(len(marks)),
+            *_arrays((gaussians.means, gaussians.sigma_d.float())),
+            camera_vector(camera),
             _dial_vector(gaussians, virtual_scale),
+            marks,
         )
-        threads.run(dial.mark_kept, workers_for(len(found)), *given, *settings, found)
-        return torch.from_numpy(found).view(torch.bool)
+        return torch.from_numpy(marks).view(torch.bool)
 
 
 def _composed(gaussians: Gaussians) -> bool:

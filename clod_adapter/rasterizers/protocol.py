@@ -80,12 +80,12 @@ class Rasterizer:
         ``seen_from`` is the camera of the dial's distances, where it is another. The first
         ``trained`` rows alone need gradients.
         """
-        dialled, g = dial(gaussians, seen_from or camera, virtual_scale), gaussians
+        attenuated, g = dial(gaussians, seen_from or camera, virtual_scale), gaussians
         return self.splat(
             g.means,
             g.quats,
-            g.scales * dialled.growth[:, None],
-            dialled.drawn,
+            g.scales * attenuated.growth[:, None],
+            attenuated.drawn,
             g.sh0,
             g.shN,
             camera,
@@ -104,10 +104,10 @@ def behind(gaussians: Gaussians, background: Tensor | np.ndarray | None = None) 
     """The background ``[3]`` as a tensor; black where None is given."""
     if background is None:
         return torch.zeros(3, dtype=torch.float32, device=gaussians.means.device)
-    found = numbers_of("background", background)
-    if found.shape != (3,):  # a kernel would read past its end
-        raise ClodError(f"background is {tuple(found.shape)} and must be (3,)")
-    return found
+    color = numbers_of("background", background)
+    if color.shape != (3,):  # a kernel would read past its end
+        raise ClodError(f"background is {tuple(color.shape)} and must be (3,)")
+    return color
 
 
 def drawable(quats: Tensor, opacities: Tensor) -> Tensor:

@@ -98,8 +98,8 @@ def blurred(half: Tensor, opacities: Tensor, screen_filter: ScreenFilter) -> tup
         return covariance, opacities
     unblurred = torch.linalg.cross(half[:, 0], half[:, 1]).square().sum(1)
     ratio = unblurred / torch.linalg.det(covariance)
-    shown = ratio > 0  # the derivative of the square root at 0 is infinite
-    compensated = opacities * ratio.where(shown, 1).sqrt().where(shown, 0)
+    has_area = ratio > 0  # the derivative of the square root at 0 is infinite
+    compensated = opacities * ratio.where(has_area, 1).sqrt().where(has_area, 0)
     return covariance, compensated.where(compensated >= ALPHA_MIN, 0)
 
 

@@ -67,11 +67,8 @@ def test_drawn_opacities_and_their_gradients_match_mpmath(dtype: torch.dtype, sc
     leaves = logits.requires_grad_(), sigma.requires_grad_()
     out = attenuate(logits, sigma, d, scale, OURS)
     by_logit, by_sigma = torch.autograd.grad(out.drawn.sum(), leaves)
-    want = []
-    slopes = []
-    of_sigma = []
-    kept = []
-    allowed = []
+    want, slopes, of_sigma = [], [], []
+    kept, allowed = [], []
     eps = torch.finfo(dtype).eps
     for x, reach, distance in zip(logits.tolist(), sigma.tolist(), d.tolist(), strict=True):
         a, far = opacity(x), mpf(distance) * mpf(scale)
@@ -260,10 +257,8 @@ def test_growth_and_its_slope_match_mpmath(dtype: torch.dtype, scale: float, rea
     out = growth_factors(h.requires_grad_(), d, scale, reach)
     (slope,) = torch.autograd.grad(out.sum(), h)
     eps = torch.finfo(dtype).eps
-    want = []
-    slopes = []
-    allowed = []
-    of_slopes = []
+    want, slopes = [], []
+    allowed, of_slopes = [], []
     for a, b in zip(h.tolist(), d.tolist(), strict=True):
         log_m = max(mpmath.log(mpf(b) * scale / mpf(reach)), ZERO) if b else ZERO
         log_g = a * log_m

@@ -70,10 +70,9 @@ def arguments(
     """
     copies = [scene(N, 1, seed, size=0.2) for seed in range(math.prod(batch))]
     parts = [each | {"colors": torch.cat([each.pop("sh0"), each.pop("shN")], 1)} for each in copies]
-    given = {
-        key: torch.stack([part[key] for part in parts]).reshape(*batch, *x.shape)
-        for key, x in parts[0].items()
-    }
+    given = {}
+    for key, x in parts[0].items():
+        given[key] = torch.stack([part[key] for part in parts]).reshape(*batch, *x.shape)
     views = ring(cameras * len(copies), WIDTH, HEIGHT) if cameras > 1 else [camera(WIDTH, HEIGHT)]
     given |= {
         "viewmats": torch.stack([view.viewmat for view in views]),

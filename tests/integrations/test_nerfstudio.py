@@ -67,7 +67,7 @@ def write_capture(folder: Path) -> Gaussians:
     for view in (*scene.train, *scene.test):
         Image.fromarray(view.image.numpy()).save(folder / view.camera.name)
         pose = torch.linalg.inv(view.camera.viewmat) * torch.tensor([1.0, -1.0, -1.0, 1.0])
-        fl_x, _, cx, _, fl_y, cy, *_ = view.camera.K.flatten().tolist()
+        (fl_x, _, cx), (_, fl_y, cy), _ = view.camera.K.tolist()
         frame = {"file_path": view.camera.name, "transform_matrix": pose.tolist()}
         frames.append(frame | {"fl_x": fl_x, "fl_y": fl_y, "cx": cx, "cy": cy})
     write_frames(folder, frames, w=WIDTH, h=HEIGHT, camera_model="OPENCV")
