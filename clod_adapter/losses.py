@@ -111,33 +111,17 @@ class _FusedLoss(torch.autograd.Function):
         l1, dssim = (1 - ssim_weight) / image.numel(), ssim_weight / image.numel()
         (height, width, _), workers = image.shape, threads.worker_count()
         shape = (3, height, kernels.stride(width))
-        x, y, *slopes = (recycled(shape).numpy() for _ in range(5))
-        for plane in (x, y):
+        planes = kernels.Planes(*(recycled(shape).numpy() for _ in range(5)))
+        for plane in (planes.x, planes.y):
             # lanes beyond the image; margins of the other planes are not read
             plane[:, :, kernels.PAD + width :] = 0
         sums, differences = np.zeros(workers), np.zeros(workers)
         gradient = torch.empty(height, width, 3, dtype=torch.float32, device="cpu")
-        threads.run(
-            kernels.to_planes,
-            workers,
-            image.detach().contiguous().numpy(),
-            target.contiguous().numpy(),
-            x,
-            y,
-        )
-        threads.run(kernels.ssim_slopes, workers, x, y, width, *slopes, sums)
-        threads.run(
-            kernels.loss_gradient,
-            workers,
-            x,
-            y,
-            width,
-            *slopes,
-            l1,
-            dssim,
-            gradient.numpy(),
-            differences,
-        )
+        images = (tensor.detach().contiguous().numpy() for tensor in (image, target))
+        threads.run(kernels.to_planes, workers, *images, planes)
+        threads.run(kernels.ssim_slopes, workers, planes, width, sums)
+        written = gradient.numpy(), differences
+        threads.run(kernels.loss_gradient, workers, planes, width, l1, dssim, *written)
         ctx.save_for_backward(gradient)
         difference, similarity = float(differences.sum()), float(sums.sum())
         return torch.tensor(l1 * difference + ssim_weight - dssim * similarity, dtype=torch.float32)
