@@ -44,6 +44,9 @@ from clod_adapter.training.pseudo_views import PseudoView
 SHARE, NEARER = 0.8, 0.05
 FEW_SHARE = 1.0  # beside few photographs: what training cannot learn anew is not merged away
 PLACED_SHARE, PLACED_NEARER = 0.4, 0.5
+# Exponent of the importance in merging. A dense checkpoint has many Gaussians that no placed view
+# shows larger than a pixel: these are merged first, and those that matter stay as they are.
+PLACED_CONTRAST = 3.0
 LONGER = 1.2  # times near_distance, the smallest reach
 SAMPLE = 20_000  # Gaussians whose distances tell near_distance
 WITHOUT_FAR = (
@@ -71,12 +74,11 @@ def with_far(
         raise ClodError(WITHOUT_FAR)
     views = spread(views, MOST_VIEWS)
     pseudo = [isinstance(view, PseudoView) for view in views]
+    share, nearer, contrast = SHARE, NEARER, 1.0
     if all(pseudo):
-        share, nearer = PLACED_SHARE, PLACED_NEARER
+        share, nearer, contrast = PLACED_SHARE, PLACED_NEARER, PLACED_CONTRAST
     elif any(pseudo):
-        share, nearer = FEW_SHARE, NEARER
-    else:
-        share, nearer = SHARE, NEARER
+        share = FEW_SHARE
     cameras = [view.camera for view in views]
     attenuation = config.attenuation(scene_distance(base, views))
     some = base.means[:: len(base) // SAMPLE + 1]
@@ -85,7 +87,8 @@ def with_far(
     error = removal_error(base, views, seed=config.seed, progress=progress)
     if all(pseudo):  # such cameras do not show everything
         error = supposed_error(base, error)
-    far = merge(base, error.sqrt() * base.opacities, max(round(share * len(base)), 1), progress)
+    weights = (error.sqrt() * base.opacities).double() ** contrast
+    far = merge(base, weights, max(round(share * len(base)), 1), progress)
     pruned = pruning_order(far, importance(far, views, config, progress), progress)
     distances = typical_distance(far.means, cameras, attenuation)
     reach = reach_of(pruned, distances, replace(config, start_share=1.0), len(base)).clamp(
