@@ -1,11 +1,12 @@
 """Cameras for a checkpoint without photographs, placed from its Gaussians alone.
 
-Two properties tell where photographs looked. Gaussians are a pixel or two large in their nearest
-cameras, so the smallest give the distance of the cameras (``reach``). And only photographs change
-the higher SH degrees from 0, so their colour is strong in the directions from which a Gaussian was
-photographed.
+Three properties tell where photographs looked. Gaussians are a pixel or two large in their nearest
+cameras, so the smallest give the distance of the cameras (``reach``). Only photographs change the
+higher SH degrees from 0, so their colour is strong in the directions from which a Gaussian was
+photographed. And photographers stand within what they photograph: behind a camera outside a
+building, or below the ground, there is nothing.
 
-Candidate cameras look at random Gaussians from random directions. Each is scored by two small
+Candidate cameras look at random Gaussians from random directions. Each is scored by three small
 renderings (``_score``), and as many again are tried near the best. Of the good ones, cameras far
 from each other are chosen. No up direction, scene type or unit is needed.
 """
@@ -40,6 +41,7 @@ STEP = 0.2
 LOOK = (80, 60)  # size of the renderings that a candidate is scored by
 # a tenth of the Gaussians is at most this many pixels large in the nearest cameras
 SMALL, SMALL_PIXELS = 0.1, 2.0
+NEARER = 0.15  # of the reach: nearer, on average, no camera looks at the scene
 FAR = 4.0  # cameras stand at most this many times as far away as the scene is large
 VISIBLE = 0.05  # Gaussians of lower opacity are ignored
 SAMPLE = 200_000  # Gaussians that are rendered, about
@@ -129,7 +131,7 @@ class _Placement:
 
         def ranked(cameras: Iterable[Camera]) -> list[tuple[float, Camera]]:
             for camera in cameras:
-                scored.append((_score(self.few, self.growth, camera), camera))
+                scored.append((_score(self.few, self.growth, camera, self.reach), camera))
                 tell(self.progress, Phase.CAMERAS, start + len(scored), start + 2 * tries)
             return sorted(
                 (each for each in scored if each[0] > -math.inf), key=lambda each: -each[0]
@@ -256,12 +258,13 @@ def _sample(gaussians: Gaussians, rows: Tensor, seed: int) -> tuple[Gaussians, T
     )
 
 
-def _score(gaussians: Gaussians, growth: Tensor | None, camera: Camera) -> float:
-    """How likely a photograph was taken from here, ``log h - 0.5 p - 2 e``; -inf if the rendering
-    is empty.
+def _score(gaussians: Gaussians, growth: Tensor | None, camera: Camera, reach: float) -> float:
+    """How likely a photograph was taken from here, ``log h - 0.5 p - 2 e - 1.5 b``; -inf if the
+    rendering is empty, or the mean log distance that of less than NEARER of the reach.
 
     h is the mean magnitude of the higher SH degrees' colour, p the mean log size in pixels without
-    ``growth`` (both weighted by alpha), e the share of pixels that are not covered.
+    ``growth`` (both weighted by alpha), e the share of pixels that are not covered, b that of the
+    opposite view.
     """
     higher = torch.zeros_like(gaussians.sh0)  # the colour is then 0.5 + that of the higher degrees
     bands, alpha = splat(gaussians.replace(sh0=higher), gaussians.opacities, camera, growth=growth)
@@ -269,19 +272,30 @@ def _score(gaussians: Gaussians, growth: Tensor | None, camera: Camera) -> float
     if covered < 0.1 * alpha.numel():
         return -math.inf
     row = camera.viewmat[2].to(gaussians.means)
-    depths = gaussians.means @ row[:3] + row[3]
-    pixels = (
-        gaussians.scales.amax(1) * WIDTH / camera.width * camera.K[0, 0] / depths.clamp(min=1e-6)
-    )
-    # positive, as colours are
-    shade = (pixels.clamp(1e-3, 1e4).log() + 7)[:, None, None].expand(-1, 1, 3)
-    plain = gaussians.replace(sh0=(shade - 0.5) / SH_C0, shN=gaussians.shN[:, :0])
-    sizes, _ = splat(plain, gaussians.opacities, camera, growth=growth)
-    size = float(sizes[..., 0].sum()) / covered - 7
-    empty = float((alpha < 0.9).float().mean())
+    depths = (gaussians.means @ row[:3] + row[3]).clamp(min=1e-6)
+    pixels = gaussians.scales.amax(1) * WIDTH / camera.width * camera.K[0, 0] / depths
+    # positive, as colours are, and three; the last is not read
+    shades = torch.stack([pixels, depths / reach, depths], 1).clamp(1e-3, 1e4).log() + 7
+    plain = gaussians.replace(sh0=(shades[:, None] - 0.5) / SH_C0, shN=gaussians.shN[:, :0])
+    shaded, _ = splat(plain, gaussians.opacities, camera, growth=growth)
+    size, distance, _ = (shaded.sum((0, 1)) / covered - 7).tolist()
+    if distance < math.log(NEARER):
+        return -math.inf
+    _, alpha_behind = splat(plain, gaussians.opacities, _opposite(camera), growth=growth)
     strength = (
         float((bands - 0.5 * alpha[..., None]).abs().mean(2).sum()) / covered
         if gaussians.sh_degree
         else 1.0
     )
-    return math.log(strength + 1e-4) - 0.5 * size - 2 * empty
+    return math.log(strength + 1e-4) - 0.5 * size - 2 * _empty(alpha) - 1.5 * _empty(alpha_behind)
+
+
+def _opposite(camera: Camera) -> Camera:
+    """From the same place, a quarter of the horizon, backwards."""
+    turn = torch.diag(camera.viewmat.new_tensor([-1.0, 1.0, -1.0, 1.0]))
+    return replace(camera, viewmat=turn @ camera.viewmat, K=_intrinsics(0.5, *LOOK))
+
+
+def _empty(alpha: Tensor) -> float:
+    """The share of the pixels that are not covered."""
+    return float((alpha < 0.9).float().mean())

@@ -173,3 +173,11 @@ def test_cameras_face_the_side_where_sh_was_trained(axis, few, monkeypatch):
     assert (torch.nn.functional.normalize(positions, dim=1) @ side).mean() > 0.4
     assert torch.cdist(positions, truth.means[:-1]).min() > 3 * 0.05
     assert positions.norm(dim=1).min() > 1
+
+
+def test_cameras_stand_within_a_closed_room():
+    """Seen from outside its back is opaque too, but behind such a camera there is nothing."""
+    walls = ball(1500, torch.eye(3)[2]).select(torch.arange(1500)).without_bands(0)
+    walls.log_scales[::8] = math.log(0.004)
+    positions = torch.stack([camera.position for camera in place_cameras(walls, views=12)])
+    assert (positions.norm(dim=1) < 1).float().mean() > 0.8
