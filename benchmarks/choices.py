@@ -32,6 +32,7 @@ ALTERNATIVES: dict[str, tuple[Any, ...]] = {
     "NEARER": (0.3, 0.5),
     "PLACED_SHARE": (0.8,),
     "PLACED_NEARER": (0.05, 0.2),
+    "PLACED_CONTRAST": (1.0,),
     "LONGER": (1.0,),
     "full": (0.0, 0.5),
     "coarse": (0.0, 0.9),
