@@ -19,7 +19,6 @@ from unittest.mock import patch
 
 import clod_adapter as clod
 from adapt import SHARES, at_shares
-from clod_adapter.config import PLACED_MAX_SV
 from clod_adapter.training import dial, far
 from clod_adapter.training.pseudo_views import with_pseudo_views
 from clod_adapter.training.schedule import FAR
@@ -31,7 +30,7 @@ ALTERNATIVES: dict[str, tuple[Any, ...]] = {
     "SHARE": (0.4, 0.6),
     "NEARER": (0.3, 0.5),
     "PLACED_SHARE": (0.8,),
-    "PLACED_NEARER": (0.05, 0.2),
+    "PLACED_NEARER": (0.2, 0.5),
     "PLACED_CONTRAST": (1.0,),
     "LONGER": (1.0,),
     "full": (0.0, 0.5),
@@ -43,6 +42,7 @@ ALTERNATIVES: dict[str, tuple[Any, ...]] = {
     "lr_growth": (0.006, 0.024),
     "lr_opacities": (0.05, 0.2),
     "lr_means": (0.03, 0.12),
+    "exponent": (1.5, 2.0),
 }
 
 
@@ -72,7 +72,7 @@ def opened(scene: str) -> tuple[clod.Gaussians, clod.Scene]:
 
 def measure(scene: str, base: clod.Gaussians, views: clod.Scene, name: str, value: Any) -> None:
     """Adapts with one change, and adds the row."""
-    settings: dict[str, Any] = {"max_sv": PLACED_MAX_SV if scene.endswith(".ply") else MAX_SV}
+    settings: dict[str, Any] = {} if scene.endswith(".ply") else {"max_sv": MAX_SV}
     change: AbstractContextManager[Any] = nullcontext()
     if hasattr(far, name):
         change = patch.object(far, name, value)
@@ -81,7 +81,8 @@ def measure(scene: str, base: clod.Gaussians, views: clod.Scene, name: str, valu
     elif name != "default":
         settings[name] = value
     with change:
-        plan = clod.make_plan(base, views, clod.AdaptConfig(**settings))
+        make = clod.AdaptConfig.placed if scene.endswith(".ply") else clod.AdaptConfig
+        plan = clod.make_plan(base, views, make(**settings))
         adapted = plan.adapt(views)
     result = adapted.gaussians
     append(

@@ -16,8 +16,7 @@ GROWTHS = ("on", "off")
 FARTHEST = 3e38  # world units: a float32, as which distances are divided by it
 LONGEST = 1e6  # dial value of training: its powers stay finite
 STEPS, STEPS_PER_VIEW = 2500, 24.0  # of training, by default, with one view a step
-# without photographs, by default: the budgets of viewers of large scenes lie there
-PLACED_MAX_SV = 8.0
+PLACED_MAX_SV, PLACED_EXPONENT = 8.0, 1.75  # defaults without photographs
 MULTIPLIER = 3.0  # of the distances at which levels of a set begin: PlayCanvas's default
 # Gaussians that viewers draw at most on a device, by their makers; docs/formats.md has the sources.
 DEVICES = {"quest3": 500_000, "phone": 1_000_000, "laptop": 2_000_000, "desktop": 4_000_000}
@@ -279,6 +278,16 @@ class AdaptConfig:
             "lr_opacities": 5e-2,
             "lr_sh0": 2e-3,
         }
+        return cls(**{**own, **changes})
+
+    @classmethod
+    def placed(cls, **changes: Any) -> AdaptConfig:
+        """The defaults without photographs; then ``changes``.
+
+        The dial goes up to the budgets that viewers of large scenes have, and counts fall faster,
+        as near Gaussians, the checkpoint's own, reach farther (``training/far.py``).
+        """
+        own: dict[str, Any] = {"max_sv": PLACED_MAX_SV, "exponent": PLACED_EXPONENT}
         return cls(**{**own, **changes})
 
     @property

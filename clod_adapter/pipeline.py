@@ -10,7 +10,7 @@ from typing import Any
 from clod_adapter.adapter import Adapter, detach
 from clod_adapter.alignment.align import Note, align, detect_filter
 from clod_adapter.cameras import Scene
-from clod_adapter.config import PLACED_MAX_SV, AdaptConfig
+from clod_adapter.config import AdaptConfig
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.calibrate import calibrate, report_dials, with_frame_times
 from clod_adapter.evaluation.evaluate import Row, evaluate_all
@@ -92,7 +92,7 @@ def adapt_checkpoint(
 
     Args:
         scene: posed photographs; without them the checkpoint's own renders are the truth.
-        config: by default ``AdaptConfig()``, without photographs with max_sv PLACED_MAX_SV.
+        config: by default ``AdaptConfig()``, without photographs ``AdaptConfig.placed()``.
         override: decisions of the plan that are fixed in advance.
         progress: called after each step of each phase; stops if it returns False. In training the
             result so far is kept, and in the measurements after it the result without these.
@@ -110,7 +110,7 @@ def adapt_checkpoint(
     """
     notes, alignment, against = list[str](), None, "checkpoint" if scene is None else "photographs"
     if config is None:
-        config = AdaptConfig(max_sv=PLACED_MAX_SV) if scene is None else AdaptConfig()
+        config = AdaptConfig.placed() if scene is None else AdaptConfig()
     if scene is not None:
         scene, alignment = align(base, scene, notes.append, required=not misaligned_ok)
         base = detect_filter(base, [*scene.test, *scene.train], notes.append)

@@ -260,7 +260,11 @@ def check_inputs(scene: str | None, *paths: str) -> None:
 # Training settings, by field of AdaptConfig: metavar, type, and what help says of a default that
 # depends on another option or on the scene.
 SETTINGS: dict[str, tuple[str, Any, str | None]] = {
-    "max_sv": ("S", float, f" (default: 5, without photographs {PLACED_MAX_SV:g})"),
+    "max_sv": (
+        "S",
+        float,
+        f" (default: 5; {PLACED_MAX_SV:g} without photographs or --form)",
+    ),
     "iters": ("N", int, ""),
     "batch": ("N", int, " (default: 1 per process)"),
     "time_budget": ("SEC", float, None),
@@ -289,11 +293,10 @@ def add_settings(options: _ActionsContainer, without: Sequence[str] = ()) -> Non
 
 def make_config(args: Namespace) -> AdaptConfig:
     """The settings; the error of a value out of range names the option."""
-    make, size = AdaptConfig.paper if args.form == "paper" else AdaptConfig, launched().size
+    forms = {"paper": AdaptConfig.paper, "ours": AdaptConfig if args.images else AdaptConfig.placed}
+    make, size = forms[args.form], launched().size
     try:
         given = {name: value for name in SETTINGS if (value := getattr(args, name)) is not None}
-        if args.images is None:
-            given.setdefault("max_sv", PLACED_MAX_SV)
         config = make(**{"batch": size} | given)
     except ClodError as error:
         name, _, rest = str(error).partition(" ")

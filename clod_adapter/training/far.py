@@ -43,7 +43,7 @@ from clod_adapter.training.pseudo_views import PseudoView
 # better, and fewer far ones do for small budgets.
 SHARE, NEARER = 0.8, 0.05
 FEW_SHARE = 1.0  # beside few photographs: what training cannot learn anew is not merged away
-PLACED_SHARE, PLACED_NEARER = 0.4, 0.5
+PLACED_SHARE, PLACED_NEARER = 0.4, 0.6
 # Exponent of the importance in merging. A dense checkpoint has many Gaussians that no placed view
 # shows larger than a pixel: these are merged first, and those that matter stay as they are.
 PLACED_CONTRAST = 3.0

@@ -59,7 +59,7 @@ def test_the_command_a_cell_and_python_train_the_same(clod, capture, monkeypatch
 @pytest.mark.usefixtures("few_placed")
 def test_the_command_and_python_train_the_same_without_photographs(clod, capture):
     clod("BASE --iters 3 --out dial.ply --accept-loss")
-    settings = AdaptConfig(iters=3, max_sv=config.PLACED_MAX_SV)
+    settings = AdaptConfig.placed(iters=3)
     adapt_checkpoint(load(capture.ply), config=settings).save("python.ply")
     assert results(Path(), "python") == results(Path())
 
