@@ -263,7 +263,7 @@ SETTINGS: dict[str, tuple[str, Any, str | None]] = {
     "max_sv": (
         "S",
         float,
-        f" (default: 5; {PLACED_MAX_SV:g} without photographs or --form)",
+        f" (default: 5; without photographs {PLACED_MAX_SV:g}, of our form)",
     ),
     "iters": ("N", int, ""),
     "batch": ("N", int, " (default: 1 per process)"),
