@@ -26,7 +26,7 @@ from scenes import camera, gaussians, ring
 CONFIG, PAPER = AttenuationConfig(scene_distance=4.0), AttenuationConfig(form="paper")
 
 
-def test_the_typical_distance_is_a_geometric_mean() -> None:
+def test_the_typical_distance_is_a_geometric_mean():
     means, cameras = gaussians(30, 0, 0).means, ring(3, 8, 6)
     logs = [normalized_distances(means, each, CONFIG).log() for each in cameras]
     torch.testing.assert_close(typical_distance(means, cameras, CONFIG), (sum(logs) / 3).exp())
@@ -40,7 +40,7 @@ def test_the_typical_distance_is_a_geometric_mean() -> None:
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_a_viewpoint_is_equivalent_to_its_camera(form: str) -> None:
+def test_a_viewpoint_is_equivalent_to_its_camera(form):
     config = AttenuationConfig(scene_distance=4.0, form=form)
     means, cameras = gaussians(200, 0, 1).means, ring(3, 61, 45)
     places = [viewpoint_of(each, means, config) for each in cameras]
@@ -51,7 +51,7 @@ def test_a_viewpoint_is_equivalent_to_its_camera(form: str) -> None:
     torch.testing.assert_close(typical_distance(means, back, config), want, rtol=1e-5, atol=0)
 
 
-def test_distances_are_divided_by_the_unit_of_the_form() -> None:
+def test_distances_are_divided_by_the_unit_of_the_form():
     """At depth 1 of this camera at z = -2 the image is x in [-0.5, 0.5) and y in [-0.4, 0.4)."""
     viewmat = torch.eye(4)
     viewmat[2, 3] = 2.0
@@ -85,9 +85,7 @@ def test_distances_are_divided_by_the_unit_of_the_form() -> None:
 
 @settings(deadline=None, max_examples=30)
 @given(st.floats(1e-6, 1e6), st.floats(1, 20), st.sampled_from(FORMS), st.sampled_from([0.0, 2.5]))
-def test_changing_the_unit_keeps_the_dial(
-    distance: float, s: float, form: str, known: float
-) -> None:
+def test_changing_the_unit_keeps_the_dial(distance, s, form, known):
     config = AttenuationConfig(form=form, scene_distance=3.7, max_sv=20.0, reference_distance=known)
     some = with_dial(gaussians(400, 0, 3), torch.logspace(-2, 2, 400), config)
     some = some.replace(
@@ -105,7 +103,7 @@ def test_changing_the_unit_keeps_the_dial(
     torch.testing.assert_close(with_distance(other, 3.7).sigma_d, some.sigma_d, rtol=1e-15, atol=0)
 
 
-def test_what_stands_for_infinity_keeps_its_sigma() -> None:
+def test_what_stands_for_infinity_keeps_its_sigma():
     sigma = torch.tensor([0.0, -1.0, SIGMA_MAX, 2.0, 9e8, math.inf])
     some = with_dial(gaussians(6, 0, 0), sigma, AttenuationConfig(scene_distance=8.0))
     there = in_world_units(some)
@@ -121,7 +119,7 @@ def test_what_stands_for_infinity_keeps_its_sigma() -> None:
     assert there.attenuation == AttenuationConfig(reference_distance=8.0)
 
 
-def test_nominal_distance_is_that_of_the_training_views() -> None:
+def test_nominal_distance_is_that_of_the_training_views():
     means = gaussians(500, 0, 1).means
     config = AttenuationConfig()
     assert nominal_distance(means, config) == units.estimated_distance(means)

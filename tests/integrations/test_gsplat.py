@@ -8,7 +8,6 @@ import math
 import weakref
 from enum import Enum
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 import torch
@@ -26,7 +25,7 @@ WHOLE = AttenuationConfig()  # changes no opacity where the reach is infinite
 
 
 @pytest.fixture(params=["cpu", "cuda"])
-def tools(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
+def tools(request, monkeypatch):
     gsplat = pytest.importorskip("gsplat", reason="pip install gsplat==1.5.3")
     if request.param == "cuda" and not torch.cuda.is_available():
         pytest.skip("no CUDA device")
@@ -39,13 +38,13 @@ def tools(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Si
     )
 
 
-def takes(function: str, argument: str) -> bool:
+def takes(function, argument):
     import gsplat
 
     return argument in inspect.signature(getattr(gsplat, function)).parameters
 
 
-def test_the_stored_signatures_are_the_installed_ones() -> None:
+def test_the_stored_signatures_are_the_installed_ones():
     """What the stand-ins of the versions are made of."""
     gsplat = pytest.importorskip("gsplat", reason="pip install gsplat==1.5.3")
     stored = gsplat_versions.module({"1.5.1": "1.5.0"}.get(gsplat.__version__, gsplat.__version__))
@@ -62,9 +61,7 @@ def test_the_stored_signatures_are_the_installed_ones() -> None:
             )
 
 
-def arguments(
-    cameras: int, batch: tuple[int, ...] = (), device: str = "cpu"
-) -> tuple[dict[str, Any], dict[str, Any]]:
+def arguments(cameras, batch=(), device="cpu"):
     """Arguments of the Gaussians, with colours of SH degree 1, and of the cameras, with batch
     dimensions.
     """
@@ -89,9 +86,7 @@ def arguments(
     ("cameras", "batch", "packed"),
     [(1, (), False), (3, (), True), (3, (2,), True), (3, (2,), False)],
 )
-def test_without_attenuation_results_are_gsplats(
-    tools: SimpleNamespace, cameras: int, batch: tuple[int, ...], packed: bool
-) -> None:
+def test_without_attenuation_results_are_gsplats(tools, cameras, batch, packed):
     """Images and every value of meta, where all cameras are drawn in one call, and statistics of
     densification.
     """
@@ -134,9 +129,7 @@ def test_without_attenuation_results_are_gsplats(
     ("cameras", "packed", "form", "growing"),
     [(1, True, "ours", ""), (3, True, "paper", "scales"), (3, False, "ours", "covars")],
 )
-def test_attenuated_results_match_gsplat_per_camera(
-    tools: SimpleNamespace, cameras: int, packed: bool, form: str, growing: str
-) -> None:
+def test_attenuated_results_match_gsplat_per_camera(tools, cameras, packed, form, growing):
     config = AttenuationConfig(form=form, scene_distance=6.0)
     given, views = arguments(cameras, device=tools.device)
     if growing == "covars":
@@ -200,7 +193,7 @@ def test_attenuated_results_match_gsplat_per_camera(
         torch.testing.assert_close(getattr(points[0], kind), want, rtol=1e-3, atol=1e-4)
 
 
-def test_memory_is_released(tools: SimpleNamespace) -> None:
+def test_memory_is_released(tools):
     """Gradient hooks create no reference cycle, with or without a backward pass."""
     given, views = arguments(2, device=tools.device)
     given["means"].requires_grad_()

@@ -4,12 +4,10 @@ shader functions.
 
 import json
 import re
-from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import fields
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -62,7 +60,7 @@ WEBGL = """([source, call, rows]) => {
 }"""
 
 
-def run(page: Any, shader: str, table: str) -> list[float]:
+def run(page, shader, table):
     """The shader's result for every golden row of a table, of four inputs each."""
     source, rows = (
         SHADERS.joinpath(shader).read_text(encoding="utf-8"),
@@ -78,7 +76,7 @@ def run(page: Any, shader: str, table: str) -> list[float]:
 
 
 @pytest.fixture(scope="module")
-def page(chromium: Any) -> Iterator[Any]:
+def page(chromium):
     """A page from a secure place, as WebGPU needs it; nothing is fetched."""
     with closing(chromium.new_page()) as page:
         page.route(
@@ -89,7 +87,7 @@ def page(chromium: Any) -> Iterator[Any]:
 
 
 @pytest.mark.parametrize("shader", ["attenuation.glsl", "attenuation.hlsl", "attenuation.wgsl"])
-def test_shaders_match_the_golden_values(page: Any, shader: str) -> None:
+def test_shaders_match_the_golden_values(page, shader):
     for table in ("rows", "near_rows"):
         for got, row in zip(run(page, shader, table), STORED[table], strict=True):
             opacity, *_, want = row
@@ -101,22 +99,20 @@ def test_shaders_match_the_golden_values(page: Any, shader: str) -> None:
         assert abs(got - row[-1]) <= STORED["tolerance"] * row[-1], (row, got)
 
 
-def my_opacity(
-    opacity: float, sigma: float, distance: float, scale: float, near: float = 0.0
-) -> float:
+def my_opacity(opacity, sigma, distance, scale, near=0.0):
     row = torch.tensor([[opacity], [sigma], [distance]], dtype=torch.float64)
     return float(
         attenuate(*row, scale, AttenuationConfig(near_distance=near), activated=True).drawn
     )
 
 
-def my_scale(growth: float, distance: float, scale: float, start: float) -> float:
+def my_scale(growth, distance, scale, start):
     return float(
         growth_factors(*torch.tensor([[growth], [distance]], dtype=torch.float64), scale, start)
     )
 
 
-def test_golden_values_match_the_equation() -> None:
+def test_golden_values_match_the_equation():
     """The inputs are usual, extreme and near the end of the reach, all exact in float32; the last
     columns are the equation's in float64, equal to rounding, since exp differs between
     processors.
@@ -132,12 +128,12 @@ ROOT = Path(__file__).resolve().parents[2]
 PAGE = (ROOT / "docs" / "writing_a_renderer.md").read_text(encoding="utf-8")
 
 
-def block(word: str) -> str:
+def block(word):
     (found,) = (text for text in re.findall(r"```python\n(.*?)```", PAGE, re.S) if word in text)
     return str(found)
 
 
-def test_the_code_of_the_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_code_of_the_page_runs(tmp_path, monkeypatch):
     """The golden loop, which refuses functions that are off; the hook; and a held frame time, with
     20 ms a frame.
     """
@@ -153,7 +149,7 @@ def test_the_code_of_the_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPat
                 block("golden"),
                 own | {name: lambda *row, function=function: function(*row) * 1.001},
             )
-    names: dict[str, Any] = {
+    names = {
         "means": adapted.means,
         "opacities": adapted.opacities,
         "viewmat": torch.eye(4),
@@ -179,7 +175,7 @@ def test_the_code_of_the_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert names["hold"].hook.virtual_scale == pytest.approx(3.63)
 
 
-def test_defaults_of_the_page_match_the_reader() -> None:
+def test_defaults_of_the_page_match_the_reader():
     told = dict(
         re.findall(r"`(\w+)`\s+\(`?(?:default )?([\w./-]+)`?\)", PAGE.split("2. **Activate**")[0])
     )

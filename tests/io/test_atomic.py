@@ -15,7 +15,7 @@ from clod_adapter.errors import ClodError
 from clod_adapter.io.atomic import atomic_path, atomic_paths, output_lock, remove_leftovers
 
 
-def test_temporaries_of_a_file_are_removed(tmp_path: Path) -> None:
+def test_temporaries_of_a_file_are_removed(tmp_path):
     """Nested ones too, but none of another file."""
     final, other = tmp_path / "out.ply", tmp_path / "other.ply"
     final.write_bytes(b"final")
@@ -30,7 +30,7 @@ def test_temporaries_of_a_file_are_removed(tmp_path: Path) -> None:
     assert final.read_bytes() == b"new"
 
 
-def test_file_appears_only_after_success(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_file_appears_only_after_success(tmp_path, monkeypatch):
     """A folder that cannot be flushed does not matter."""
     final = tmp_path / ("x" * 251 + ".ply")  # as long as a name may be
     with atomic_path(final) as temporary, atomic_path(temporary) as nested:
@@ -39,7 +39,7 @@ def test_file_appears_only_after_success(tmp_path: Path, monkeypatch: pytest.Mon
         assert not final.exists()
     fsync = os.fsync
 
-    def refuse(handle: int) -> None:
+    def refuse(handle):
         if stat.S_ISDIR(os.fstat(handle).st_mode):
             raise OSError(22, "Invalid argument")
         fsync(handle)
@@ -52,7 +52,7 @@ def test_file_appears_only_after_success(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(28, "No space left")])
-def test_failure_keeps_only_the_old_files(tmp_path: Path, error: BaseException) -> None:
+def test_failure_keeps_only_the_old_files(tmp_path, error):
     finals = tmp_path / "a", tmp_path / "out"
     with atomic_paths(*finals) as temporaries:
         for temporary in temporaries:
@@ -75,9 +75,7 @@ def test_failure_keeps_only_the_old_files(tmp_path: Path, error: BaseException) 
 
 
 @pytest.mark.parametrize("links", [True, False])
-def test_several_files_are_replaced_together(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, links: bool
-) -> None:
+def test_several_files_are_replaced_together(tmp_path, monkeypatch, links):
     """A folder made in place of the last one keeps the others as they were; also without hard
     links.
     """
@@ -95,7 +93,7 @@ def test_several_files_are_replaced_together(
     assert old.read_bytes() == b"old" and sorted(os.listdir(tmp_path)) == ["last", "old"]
 
 
-def test_unwritable_targets_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unwritable_targets_are_refused(tmp_path, monkeypatch):
     """A write-protected file is not replaced, although a rename needs the folder's permission
     only.
     """
@@ -128,7 +126,7 @@ with output_lock(Path(sys.argv[1])):
 """
 
 
-def test_lock_keeps_other_processes_out_until_its_own_is_killed(tmp_path: Path) -> None:
+def test_lock_keeps_other_processes_out_until_its_own_is_killed(tmp_path):
     final = tmp_path / "out.ply"
     holder = subprocess.Popen(
         [sys.executable, "-c", HOLD, str(final)], stdout=subprocess.PIPE, text=True
@@ -161,10 +159,10 @@ def test_lock_keeps_other_processes_out_until_its_own_is_killed(tmp_path: Path) 
         ("ä\udcff\ud800.ply", "ä\\udcff\\ud800.ply"),
     ],
 )
-def test_names_as_text(name: str, text: str) -> None:
+def test_names_as_text(name, text):
     assert as_text(name) == text and text.encode()
 
 
-def test_names_on_disk_and_in_errors() -> None:
+def test_names_on_disk_and_in_errors():
     assert os.fsencode(file_name("gärten/日本.ply")) == "gärten/日本.ply".encode()
     assert str(ClodError("a\udcff.ply: is damaged\x1b[2J")) == "a\\xff.ply: is damaged [2J"

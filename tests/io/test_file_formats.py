@@ -5,7 +5,6 @@ import re
 import shutil
 import zipfile
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -19,7 +18,7 @@ from torch.testing import assert_close
 import scenes
 from clod_adapter.adapter import detach, extract
 from clod_adapter.errors import ClodError
-from clod_adapter.gaussians import SH_C0, Gaussians
+from clod_adapter.gaussians import SH_C0
 from clod_adapter.inspection.report import inspect
 from clod_adapter.io.adapter_file import load_adapter, save_adapter
 from clod_adapter.io.checkpoint import load, save
@@ -44,7 +43,7 @@ DIAL = tuple(suffix for suffix in WRITABLE if FORMATS[suffix].carries_sigma)
 KINDS = (*WRITABLE, ".ascii.ply", ".big.ply", ".compressed.ply", ".adapter.safetensors")
 
 
-def of(suffix: str, degree: int = 1, count: int = 40) -> Gaussians:
+def of(suffix, degree=1, count=40):
     return model(degree, count) if suffix in DIAL else detach(model(degree, count))
 
 
@@ -69,7 +68,7 @@ LOSSES = {
 }
 
 
-def any_file(folder: Path, kind: str) -> Path:
+def any_file(folder, kind):
     path, g = folder / f"a{kind}", of(kind, 0, 5) if kind in WRITABLE else model(0, 5)
     if kind == ".compressed.ply":
         return Path(shutil.copy(PACKED, path))
@@ -86,11 +85,11 @@ def any_file(folder: Path, kind: str) -> Path:
     return path
 
 
-def read(path: Path) -> None:
+def read(path):
     load_adapter(path) if "adapter" in path.name else load(path, activated="none")
 
 
-def same(kind: str, g: Gaussians, again: Gaussians) -> None:
+def same(kind, g, again):
     """Compares to the precision of the format."""
     *losses, sigma, angle = LOSSES.get(kind, EXACT)
     bands = again.shN.shape[1]
@@ -112,7 +111,7 @@ def same(kind: str, g: Gaussians, again: Gaussians) -> None:
 @pytest.mark.parametrize(
     "kind", [".glb of splat-transform", ".spz of splat-transform", ".compressed.ply"]
 )
-def test_files_of_splat_transform(capture: Any, kind: str) -> None:
+def test_files_of_splat_transform(capture, kind):
     """Files of version 3.7: a .glb in glTF's axes under a node without a rotation; an .spz of
     version 3; two blocks.
     """
@@ -123,7 +122,7 @@ def test_files_of_splat_transform(capture: Any, kind: str) -> None:
     assert any("quantised" in note for note in found.notes) == (".glb" not in kind)
 
 
-def test_an_older_compressed_ply(tmp_path: Path) -> None:
+def test_an_older_compressed_ply(tmp_path):
     """A file of SH degree 0; its colours are in [0, 1] and have no ranges."""
     now = load(PACKED).gaussians
     chunks, vertex, _ = PlyData.read(str(PACKED), mmap=False).elements
@@ -142,7 +141,7 @@ def test_an_older_compressed_ply(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("turn", "far", "growth"), [(0, False, False), (2, True, True), (4, False, True)]
 )
-def test_dial_round_trips(tmp_path: Path, suffix: str, turn: int, far: bool, growth: bool) -> None:
+def test_dial_round_trips(tmp_path, suffix, turn, far, growth):
     """Each SH degree occurs with one format or another."""
     degree = (DIAL.index(suffix) + turn) % 5
     g, origin = model(degree, growth=growth), ORIGIN if far else NOWHERE
@@ -180,7 +179,7 @@ def test_dial_round_trips(tmp_path: Path, suffix: str, turn: int, far: bool, gro
 
 
 @pytest.mark.parametrize("suffix", WRITABLE)
-def test_model_without_dial_round_trips(tmp_path: Path, suffix: str) -> None:
+def test_model_without_dial_round_trips(tmp_path, suffix):
     g, path = detach(model(1)), tmp_path / f"a{suffix}"
     write(path, g)
     assert not file_has_dial(path)
@@ -195,7 +194,7 @@ def test_model_without_dial_round_trips(tmp_path: Path, suffix: str) -> None:
 
 
 @pytest.mark.parametrize("suffix", WRITABLE)
-def test_refused_write_leaves_no_file(tmp_path: Path, suffix: str) -> None:
+def test_refused_write_leaves_no_file(tmp_path, suffix):
     plain = detach(model(1))
     unfit = [
         (plain.select(torch.zeros(40, dtype=torch.bool)), "no Gaussians to write"),
@@ -219,9 +218,7 @@ def test_refused_write_leaves_no_file(tmp_path: Path, suffix: str) -> None:
 @pytest.mark.parametrize("kind", KINDS)
 @examples(15)
 @given(data=st.data(), inside=st.booleans())
-def test_damage_raises_only_clod_error(
-    tmp_path: Path, kind: str, data: st.DataObject, inside: bool
-) -> None:
+def test_damage_raises_only_clod_error(tmp_path, kind, data, inside):
     """Damage of the file, or ``inside`` of the contents of an SPZ before compression, or of the
     pickle in a .pt.
     """
@@ -243,7 +240,7 @@ def test_damage_raises_only_clod_error(
         assert str(error).isprintable() and str(path) in str(error)
 
 
-def test_adapter_is_refused_as_model(tmp_path: Path) -> None:
+def test_adapter_is_refused_as_model(tmp_path):
     path = any_file(tmp_path, ".adapter.safetensors")
     for opened in (check_readable, load):
         with refused(f"{path}: is an adapter, not a model; clod-adapt apply BASE.ply"):
@@ -251,7 +248,7 @@ def test_adapter_is_refused_as_model(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_truncation_is_refused(tmp_path: Path, kind: str) -> None:
+def test_truncation_is_refused(tmp_path, kind):
     whole, path = any_file(tmp_path, kind).read_bytes(), tmp_path / f"cut{kind}"
     # An ascii file that ends within its last number is a whole file with another number.
     least = len(whole) - whole.rstrip().rfind(b" ") if kind == ".ascii.ply" else 1
@@ -261,7 +258,7 @@ def test_truncation_is_refused(tmp_path: Path, kind: str) -> None:
             read(path)
 
 
-def test_long_history_is_cut(tmp_path: Path) -> None:
+def test_long_history_is_cut(tmp_path):
     """Every format has room for what is left, the last lines first, so that the outputs can be
     read.
     """
@@ -286,14 +283,14 @@ def test_long_history_is_cut(tmp_path: Path) -> None:
         assert not any("not carried over" in note for note in again.notes)
 
 
-def test_what_cannot_be_read_again_is_not_written(tmp_path: Path) -> None:
+def test_what_cannot_be_read_again_is_not_written(tmp_path):
     (tmp_path / "a.ply").write_bytes(b"earlier")
     with refused(f"^{tmp_path}/a.ply: is not written, because it could not be read again: "):
         write(tmp_path / "a.ply", model(0), Metadata(about=("x" * 1000,) * 1100))
     assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"earlier"]
 
 
-def test_text_is_made_ascii_and_infinite_opacity_finite(tmp_path: Path) -> None:
+def test_text_is_made_ascii_and_infinite_opacity_finite(tmp_path):
     write(
         tmp_path / "a.safetensors", model(0), Metadata(about=("caf\u00e9", "clod_adapter max_sv 2"))
     )

@@ -1,6 +1,3 @@
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
@@ -14,7 +11,7 @@ from photographs import pixels
 GREY = pixels(0)[..., 0]
 
 
-def read(path: Path, width: int = 40, height: int = 30) -> tuple[np.ndarray, list[str]]:
+def read(path, width=40, height=30):
     image, notes = read_image(path, width, height, 1600)
     assert image.mode == "RGB"
     return np.asarray(image), [what for what, _ in notes]
@@ -25,7 +22,7 @@ DEEP = np.random.default_rng(0).integers(0, 65536, (30, 40), dtype=np.uint16)
 DEEP[0, :3] = 0, 65535, 128  # the ends, and the last value that is nearest to black
 FLAT = np.full((30, 40, 3), 99, np.uint8)
 OVER_BLACK = ["have transparency: laid over black"]
-CASES: tuple[tuple[Image.Image, str, dict[str, Any], np.ndarray, list[str]], ...] = (
+CASES = (
     (Image.fromarray(GREY), "PNG", {}, GREY, []),
     (Image.fromarray(GREY).convert("P"), "PNG", {}, GREY, []),
     (Image.fromarray(GREY > 99), "PNG", {}, ALPHA, []),
@@ -53,7 +50,7 @@ CASES: tuple[tuple[Image.Image, str, dict[str, Any], np.ndarray, list[str]], ...
 )
 
 
-def test_kinds_of_image(tmp_path: Path) -> None:
+def test_kinds_of_image(tmp_path):
     """The content decides, whatever the name."""
     for image, kind, options, want, noted in CASES:
         image.save(tmp_path / "a.jpg", kind, **options)
@@ -62,7 +59,7 @@ def test_kinds_of_image(tmp_path: Path) -> None:
         assert error.max() <= (kind in ("MPO", "WEBP")) and notes == noted, (image.mode, kind)
 
 
-def test_separate_planes_and_32_bits_are_refused(tmp_path: Path) -> None:
+def test_separate_planes_and_32_bits_are_refused(tmp_path):
     for kind in (np.float32, np.int32):
         Image.fromarray(GREY.astype(kind)).save(tmp_path / "a.tif")
         with refused("a.tif: has 32 bits per channel"):
@@ -75,9 +72,7 @@ def test_separate_planes_and_32_bits_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("orientation", [5, 6, 7, 8])
-def test_exif_rotation_is_applied_if_the_camera_has_the_rotated_shape(
-    tmp_path: Path, orientation: int
-) -> None:
+def test_exif_rotation_is_applied_if_the_camera_has_the_rotated_shape(tmp_path, orientation):
     exif = Image.Exif()
     exif[0x0112] = orientation
     Image.fromarray(pixels(0)).save(tmp_path / "a.png", exif=exif)
@@ -93,7 +88,7 @@ def test_exif_rotation_is_applied_if_the_camera_has_the_rotated_shape(
 
 
 @pytest.mark.parametrize("name", ["a.jpg", "a.png", "a.tif", "a.webp", "a.heic", "absent.png"])
-def test_what_cannot_be_decoded_is_refused(tmp_path: Path, name: str) -> None:
+def test_what_cannot_be_decoded_is_refused(tmp_path, name):
     path, message = tmp_path / name, f"{name}: cannot be decoded"
     if name == "a.heic":
         path.write_bytes(b"\0\0\0\x18ftypheic" + bytes(100))
@@ -110,9 +105,7 @@ def test_what_cannot_be_decoded_is_refused(tmp_path: Path, name: str) -> None:
             image_size(path)
 
 
-def reduced(
-    path: Path, monkeypatch: pytest.MonkeyPatch, width: int, height: int, max_width: int
-) -> np.ndarray:
+def reduced(path, monkeypatch, width, height, max_width):
     monkeypatch.setattr(images, "LARGE", 1000)
     image, notes = read_image(path, width, height, max_width)
     assert len(notes) == len(set(notes))
@@ -121,9 +114,7 @@ def reduced(
 
 
 @pytest.mark.parametrize("kind", ["RGB", "L", "RGBA", "P", "I;16", "CMYK"])
-def test_large_image_is_reduced_to_block_means(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
-) -> None:
+def test_large_image_is_reduced_to_block_means(tmp_path, monkeypatch, kind):
     """Reduced by 3, so that it is at least twice as wide as what is made of it; in bands, of which
     the last one is cut.
     """
@@ -149,9 +140,7 @@ def test_large_image_is_reduced_to_block_means(
     assert np.abs(got[: height // 3, : width // 3] - want).max() <= 1
 
 
-def test_large_jpeg_is_reduced_while_decoding(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_large_jpeg_is_reduced_while_decoding(tmp_path, monkeypatch):
     ramp = np.linspace(0, 255, 400 * 300).reshape(300, 400).astype(np.uint8)
     exif = Image.Exif()
     exif[0x0112] = 6
@@ -162,7 +151,7 @@ def test_large_jpeg_is_reduced_while_decoding(
     assert np.abs(got - whole.reshape(100, 4, 75, 4, 3).mean((1, 3))).max() < 4
 
 
-def test_wrong_shape_is_refused(tmp_path: Path) -> None:
+def test_wrong_shape_is_refused(tmp_path):
     Image.fromarray(GREY).save(tmp_path / "a.png")
     for height in (30, 40):  # a turned one, too, as there is no EXIF
         with refused(f"a.png: is 40x30, its camera 30x{height}, another shape"):

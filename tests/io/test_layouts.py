@@ -7,8 +7,6 @@ import json
 import shutil
 import struct
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -21,7 +19,7 @@ from clod_adapter.adapter import detach
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.equation.attenuation import growth_distance, growth_factors
 from clod_adapter.equation.distances import normalized_distances
-from clod_adapter.gaussians import SH_C0, Gaussians
+from clod_adapter.gaussians import SH_C0
 from clod_adapter.integrations.splats import to_gsplat
 from clod_adapter.io import values
 from clod_adapter.io.checkpoint import load, save
@@ -47,7 +45,7 @@ from scenes import camera, gaussians
 KHR = "KHR_gaussian_splatting"
 
 
-def test_glb_in_pygltflib(tmp_path: Path) -> None:
+def test_glb_in_pygltflib(tmp_path):
     pygltflib = pytest.importorskip("pygltflib", reason="pygltflib is not installed")
     g = model(3)
     write(tmp_path / "a.glb", g, Metadata(origin=ORIGIN))
@@ -104,7 +102,7 @@ def test_glb_in_pygltflib(tmp_path: Path) -> None:
     assert node.rotation == [0, 0, 1, 0] and node.translation == [-ORIGIN[0], -ORIGIN[1], ORIGIN[2]]
 
 
-def test_glb_under_a_scaled_node(tmp_path: Path) -> None:
+def test_glb_under_a_scaled_node(tmp_path):
     """The scale is applied, which a note says."""
     plain = gaussians(5, 2, 0)
     write(tmp_path / "a.glb", plain)
@@ -114,7 +112,7 @@ def test_glb_under_a_scaled_node(tmp_path: Path) -> None:
     assert any("scales it by 2" in note for note in found.notes)
 
 
-def test_glb_of_another_program(tmp_path: Path) -> None:
+def test_glb_of_another_program(tmp_path):
     """Interleaved, in short integers, moved, without metadata: sigma_d then has the default
     settings.
     """
@@ -145,7 +143,7 @@ def test_glb_of_another_program(tmp_path: Path) -> None:
     rows["rotation"] = 0, 0, 0, 32767
     rows["opacity"] = 255
 
-    def interleave(g: dict[str, Any]) -> None:
+    def interleave(g):
         primitive, accessors = g["meshes"][0]["primitives"][0], g["accessors"]
         names = primitive["attributes"]
         for name, offset, kind in (
@@ -184,9 +182,7 @@ def test_glb_of_another_program(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("name", "activation"), [("SCALE", "scales_of"), ("OPACITY", "sigmoid")])
-def test_logarithms_and_logits_in_a_glb(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, activation: str
-) -> None:
+def test_logarithms_and_logits_in_a_glb(tmp_path, monkeypatch, name, activation):
     """Splat-transform 2.3 and JSplat wrote them so; a stray value beyond the range is damaged."""
     path, g = tmp_path / "a.glb", detach(gaussians(300, 0, 0))
     right, linear = g.scales, g.scales.clone() if name == "SCALE" else g.opacities
@@ -201,7 +197,7 @@ def test_logarithms_and_logits_in_a_glb(
         assert_close(found.gaussians.opacities[1:], g.opacities[1:])
 
 
-def test_logarithms_by_the_generator_of_a_glb(tmp_path: Path) -> None:
+def test_logarithms_by_the_generator_of_a_glb(tmp_path):
     """A scene in large units, whose logarithms are all above 0."""
     path, g = tmp_path / "a.glb", detach(gaussians(30, 0, 0))
     write(path, g)
@@ -209,11 +205,11 @@ def test_logarithms_by_the_generator_of_a_glb(tmp_path: Path) -> None:
     assert_close(load(path).gaussians.log_scales, g.scales)
 
 
-def spz(path: Path) -> bytearray:
+def spz(path):
     return bytearray(gzip.decompress(path.read_bytes()))
 
 
-def test_header_and_record_of_an_spz(tmp_path: Path) -> None:
+def test_header_and_record_of_an_spz(tmp_path):
     g = model(1)
     write(tmp_path / "a.spz", g)
     data = spz(tmp_path / "a.spz")
@@ -232,7 +228,7 @@ def test_header_and_record_of_an_spz(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("axes", "signs"), [(4, [1.0, -1, -1]), (7, [-1.0, -1, 1])])
-def test_axes_of_an_spz(tmp_path: Path, axes: int, signs: list[float]) -> None:
+def test_axes_of_an_spz(tmp_path, axes, signs):
     """Ellipsoids, and colours along every direction; a wrong sign in one changes them."""
     write(tmp_path / "a.spz", gaussians(40, 3, 3))
     data, ours = spz(tmp_path / "a.spz"), load(tmp_path / "a.spz").gaussians
@@ -250,7 +246,7 @@ def test_axes_of_an_spz(tmp_path: Path, axes: int, signs: list[float]) -> None:
     assert_close(*drawn, atol=1e-5, rtol=1e-5)
 
 
-def test_spz_of_version_2(tmp_path: Path) -> None:
+def test_spz_of_version_2(tmp_path):
     """Rotations in three bytes: x, y, z of unit length with w >= 0."""
     rows = (
         struct.pack("<IIIBBBB", 0x5053474E, 2, 2, 0, 12, 0, 0)
@@ -264,7 +260,7 @@ def test_spz_of_version_2(tmp_path: Path) -> None:
     assert g.opacity_logits.isfinite().all()
 
 
-def grown(g: Gaussians, s: float) -> torch.Tensor:
+def grown(g, s):
     """``[N, 3]`` logarithms of the scales that a camera at 0 sees."""
     assert g.attenuation is not None and g.growth_d is not None
     from_0 = replace(camera(), viewmat=torch.eye(4))
@@ -279,7 +275,7 @@ def grown(g: Gaussians, s: float) -> torch.Tensor:
     ("typical", "known", "step"),
     [(3e-3, True, 2.0**-20), (250.0, False, 2.0**-13), (40_000.0, True, 2.0**-6)],
 )
-def test_units_of_an_spz(tmp_path: Path, typical: float, known: bool, step: float) -> None:
+def test_units_of_an_spz(tmp_path, typical, known, step):
     """Positions use the available bits; a sigma_d of large units is not clipped to float16; the
     growth is the same.
     """
@@ -300,7 +296,7 @@ def test_units_of_an_spz(tmp_path: Path, typical: float, known: bool, step: floa
         assert (grown(again, s) - grown(g, s)).abs().max() <= 0.04
 
 
-def test_far_positions_of_an_spz(tmp_path: Path) -> None:
+def test_far_positions_of_an_spz(tmp_path):
     """A few are moved closer, with the same direction, angular size and fading seen from 0."""
     path, g = tmp_path / "a.spz", model(0, 400).replace(growth_d=torch.full((400,), 0.25))
     with refused("within 4,000,000 of 0"):
@@ -321,7 +317,7 @@ def test_far_positions_of_an_spz(tmp_path: Path) -> None:
         assert (close - size)[9].abs().max() <= 0.04
 
 
-def test_losses_of_a_splat(tmp_path: Path) -> None:
+def test_losses_of_a_splat(tmp_path):
     """The bytes of a row, and the order of a file, where the largest come first."""
     g = detach(model(0)).select(torch.arange(1))
     assert len(write(tmp_path / "a.splat", g)) == 1
@@ -345,7 +341,7 @@ def test_losses_of_a_splat(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("degree", [0, 3])
-def test_checkpoint_of_gsplat(tmp_path: Path, degree: int) -> None:
+def test_checkpoint_of_gsplat(tmp_path, degree):
     """A checkpoint with other number types and strides, other entries, and a row that is not
     finite.
     """
@@ -369,7 +365,7 @@ def test_checkpoint_of_gsplat(tmp_path: Path, degree: int) -> None:
 
 
 @pytest.mark.parametrize("name", ["ckpt_29999_rank{}.pt", "point_cloud_rk{}_ws3.ply"])
-def test_ranks_of_several_gpus(tmp_path: Path, name: str) -> None:
+def test_ranks_of_several_gpus(tmp_path, name):
     """Any of them is all of them; a file of another run or number does not matter, a missing or odd
     one is refused.
     """
@@ -407,7 +403,7 @@ def test_ranks_of_several_gpus(tmp_path: Path, name: str) -> None:
 @pytest.mark.parametrize(
     ("name", "what"), [("pose_adjust", "cameras"), ("post_processing", "colours")]
 )
-def test_corrections_of_gsplat_are_not_applied(tmp_path: Path, name: str, what: str) -> None:
+def test_corrections_of_gsplat_are_not_applied(tmp_path, name, what):
     """A warning says so."""
     module = {"embeds.weight": torch.zeros(3, 9)}
     torch.save({"splats": to_gsplat(gaussians(12, 0, 0)), name: module}, tmp_path / "a.pt")
@@ -416,7 +412,7 @@ def test_corrections_of_gsplat_are_not_applied(tmp_path: Path, name: str, what: 
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".spz"])
-def test_splat_transform_reads_files(tmp_path: Path, suffix: str) -> None:
+def test_splat_transform_reads_files(tmp_path, suffix):
     """It keeps the dial's columns of a PLY bit for bit and in order, but drops the comments with
     the settings.
     """

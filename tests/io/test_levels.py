@@ -4,9 +4,6 @@ streaming sets.
 
 import json
 import struct
-from collections.abc import Sequence
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -15,39 +12,33 @@ from torch.testing import assert_close
 
 import scenes
 from clod_adapter import load
-from clod_adapter.gaussians import Gaussians
 from clod_adapter.io.formats import tileset
 from clod_adapter.io.formats.tileset import TILESET, write_tileset
-from clod_adapter.origin import NOWHERE, Origin
+from clod_adapter.origin import NOWHERE
 
 BEGINS = [0.0, 0.25, 1.0]
 
 
-def levels(n: int = 400) -> list[Gaussians]:
+def levels(n=400):
     whole = scenes.gaussians(n, 2, 0)
     return [whole, whole[::4], whole[::16]]
 
 
-def written(
-    folder: Path,
-    given: list[Gaussians],
-    begins: Sequence[float] = BEGINS,
-    origin: Origin = NOWHERE,
-) -> dict[str, Any]:
+def written(folder, given, begins=BEGINS, origin=NOWHERE):
     """The index of a set of these levels."""
     notes = write_tileset(folder, [*zip(begins, given, strict=True)], origin=origin)
     assert any("rounded" in note for note in notes)
     return json.loads((folder / TILESET).read_text())
 
 
-def tiles_of(tile: dict[str, Any], depth: int = 0) -> list[tuple[int, dict[str, Any]]]:
+def tiles_of(tile, depth=0):
     tiles = [(depth, tile)]
     for child in tile.get("children", ()):
         tiles += tiles_of(child, depth + 1)
     return tiles
 
 
-def read_tile(path: Path, folder: Path) -> tuple[dict[str, Any], Gaussians]:
+def read_tile(path, folder):
     """The JSON of a tile, and its Gaussians by the reader of .spz."""
     data = path.read_bytes()
     assert struct.unpack_from("<4sII", data) == (b"glTF", 2, len(data)) and len(data) % 4 == 0
@@ -60,7 +51,7 @@ def read_tile(path: Path, folder: Path) -> tuple[dict[str, Any], Gaussians]:
     return gltf, load(found).gaussians
 
 
-def test_index_and_tiles(tmp_path: Path) -> None:
+def test_index_and_tiles(tmp_path):
     """Properties and ranges of tileset.schema.json and tile.schema.json of 3D Tiles 1.1; one chain
     of levels, coarsest first; errors descend; what is packed is what was given.
     """
@@ -104,7 +95,7 @@ def test_index_and_tiles(tmp_path: Path) -> None:
         )
 
 
-def test_a_set_is_drawn_until_it_is_a_pixel(tmp_path: Path) -> None:
+def test_a_set_is_drawn_until_it_is_a_pixel(tmp_path):
     """Viewers draw nothing where the index's error covers at most 16 pixels, whatever the levels'
     errors.
     """
@@ -117,7 +108,7 @@ def test_a_set_is_drawn_until_it_is_a_pixel(tmp_path: Path) -> None:
         assert 0.9 < pixels < 1.1
 
 
-def test_boxes_are_where_viewers_place_the_gaussians(tmp_path: Path) -> None:
+def test_boxes_are_where_viewers_place_the_gaussians(tmp_path):
     """The node's matrix, then glTF's y-up axes into z-up ones, with a large origin; floaters are
     left out.
     """
@@ -134,7 +125,7 @@ def test_boxes_are_where_viewers_place_the_gaussians(tmp_path: Path) -> None:
     assert (np.diag(box[1:]) < 20).all() and (box[1:] == np.diag(np.diag(box[1:]))).all()
 
 
-def test_cells_hold_every_gaussian_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cells_hold_every_gaussian_once(tmp_path, monkeypatch):
     monkeypatch.setattr(tileset, "LARGEST", 60)
     given = levels()
     given[0].means[:100] = given[0].means[0]  # more in one place than a cell holds

@@ -22,7 +22,7 @@ from formats import examples, model, needed, random_rows, resaved, write_element
 CONFIG = AttenuationConfig(form="paper", max_sv=7.0)
 
 
-def read_back(path: Path) -> tuple[list[str], np.ndarray]:
+def read_back(path):
     """The header's lines and the rows, by hand, as a strict reader sees them."""
     head, body = path.read_bytes().split(b"end_header\n", 1)
     lines = head.decode("ascii").splitlines()
@@ -34,7 +34,7 @@ def read_back(path: Path) -> tuple[list[str], np.ndarray]:
 
 
 @st.composite
-def files(draw: st.DrawFn) -> tuple[np.ndarray, str, int]:
+def files(draw):
     degree = draw(st.integers(0, 4))
     names = needed(degree)
     names += ["nx", "ny", "nz"] if draw(st.booleans()) else []
@@ -50,9 +50,7 @@ def files(draw: st.DrawFn) -> tuple[np.ndarray, str, int]:
 
 @examples(20)
 @given(files(), st.integers(0, 1000))
-def test_every_layout_round_trips(
-    tmp_path: Path, file: tuple[np.ndarray, str, int], seed: int
-) -> None:
+def test_every_layout_round_trips(tmp_path, file, seed):
     """Bit for bit, but for values that change; growth_d without sigma_d is a column like others."""
     vertex, kind, degree = file
     source = write_rows(tmp_path / "in.ply", vertex, kind, ("made by hand",))
@@ -116,7 +114,7 @@ def test_every_layout_round_trips(
             assert load(source).gaussians == g
 
 
-def test_header_of_an_extended_file(tmp_path: Path) -> None:
+def test_header_of_an_extended_file(tmp_path):
     vertex = random_rows(2, ["sigma_d", *needed(0)])
     comments = ("a photo", "clod_adapter max_sv 4.125", "clod_adapter odd 1")
     base = load(write_rows(tmp_path / "in.ply", vertex, comments=comments))
@@ -143,7 +141,7 @@ def test_header_of_an_extended_file(tmp_path: Path) -> None:
     assert sorted(rows.dtype.names) == sorted({*rows.dtype.names})
 
 
-def test_unusable_rows_are_dropped_and_counted(tmp_path: Path) -> None:
+def test_unusable_rows_are_dropped_and_counted(tmp_path):
     names = ["masks_0", *needed(1), "nx", "sigma_d", "growth_d", "masks_1"]
     vertex = random_rows(15, names, types={"y": "f8", "opacity": "f8"})
     vertex["masks_0"], vertex["masks_1"] = 0, 0  # 0 keeps the row
@@ -172,7 +170,7 @@ def test_unusable_rows_are_dropped_and_counted(tmp_path: Path) -> None:
     assert read_back(tmp_path / "out.ply")[1]["opacity"][2] == 1e300
 
 
-def test_refused_saves(tmp_path: Path) -> None:
+def test_refused_saves(tmp_path):
     base = load(write_rows(tmp_path / "in.ply", random_rows(3, needed(1))))
     g, out = base.gaussians, tmp_path / "out.ply"
     cases = [
@@ -204,7 +202,7 @@ def test_refused_saves(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [tmp_path / "in.ply"]
 
 
-def test_other_formats_keep_what_the_base_says(tmp_path: Path) -> None:
+def test_other_formats_keep_what_the_base_says(tmp_path):
     some = model(1, 9)
     with pytest.warns(UserWarning, match="out.spz: quantised|out.spz: .*rounded"):
         save(tmp_path / "out.spz", some)
@@ -219,9 +217,7 @@ def test_other_formats_keep_what_the_base_says(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("order", ["<", ">", "ascii"])
-def test_rows_are_those_of_the_file_whatever_happens_to_it_later(
-    tmp_path: Path, order: str
-) -> None:
+def test_rows_are_those_of_the_file_whatever_happens_to_it_later(tmp_path, order):
     """The fingerprint is of the whole file; elements around the rows, with lists too, do not
     matter.
     """
@@ -247,7 +243,7 @@ def test_rows_are_those_of_the_file_whatever_happens_to_it_later(
 
 
 @pytest.mark.parametrize("order", ["<", "ascii"])
-def test_comments_beyond_ascii(tmp_path: Path, order: str) -> None:
+def test_comments_beyond_ascii(tmp_path, order):
     """CloudCompare writes a date in the user's language; outputs have question marks there."""
     path = write_rows(tmp_path / "in.ply", random_rows(5, needed()), order, ("made on @",))
     path.write_bytes(path.read_bytes().replace(b"@", "M\u00e4rz \x1b[2J".encode(), 1))
@@ -258,7 +254,7 @@ def test_comments_beyond_ascii(tmp_path: Path, order: str) -> None:
 
 @pytest.mark.parametrize("order", ["<", "ascii"])
 @pytest.mark.parametrize("prefix", ["scalar_", "scal_"])
-def test_columns_with_the_prefix_of_cloudcompare(tmp_path: Path, order: str, prefix: str) -> None:
+def test_columns_with_the_prefix_of_cloudcompare(tmp_path, order, prefix):
     """All but the position have it; outputs have none."""
     rows = random_rows(9, needed(1))
     plain = load(write_rows(tmp_path / "plain.ply", rows), activated="none")
@@ -272,7 +268,7 @@ def test_columns_with_the_prefix_of_cloudcompare(tmp_path: Path, order: str, pre
     assert resaved(found).vertex.dtype == plain.vertex.dtype
 
 
-def test_rgb_of_nerfstudio(tmp_path: Path) -> None:
+def test_rgb_of_nerfstudio(tmp_path):
     """Colours stand in the place of harmonics, which outputs have."""
     columns = [*needed()[:3], "red", "green", "blue", *needed()[6:], "label"]
     rows = random_rows(5, columns, types=dict.fromkeys(("red", "green", "blue"), "u1"))

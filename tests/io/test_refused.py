@@ -9,11 +9,9 @@ import os
 import struct
 import tracemalloc
 import zipfile
-from collections.abc import Callable
 from copy import copy
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -40,66 +38,60 @@ from scenes import gaussians
 pytestmark = pytest.mark.usefixtures("without_splat_transform")
 KHR = "KHR_gaussian_splatting"
 LFS = b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 248\n"
-Content = bytes | np.ndarray | Callable[[Path], object]
-# name of the file, what it holds, the message after the name
-Table = tuple[tuple[str, Content, str], ...]
 
 
-def rows(*names: str, count: int = 2, without: tuple[str, ...] = (), **types: str) -> np.ndarray:
+def rows(*names, count=2, without=(), **types):
     return random_rows(
         count, [name for name in names or needed(1) if name not in without], types=types
     )
 
 
-def filled(name: str, value: float) -> np.ndarray:
+def filled(name, value):
     return with_columns(
         rows(count=3), **{column: value for column in needed(1) if column.startswith(name)}
     )
 
 
-def with_a_list(path: Path) -> None:
+def with_a_list(path):
     lists = np.ones(2, [(name, "f4") for name in needed()] + [("bones", "O")])
     lists["bones"] = [np.array([1], "i4"), np.array([2, 3], "i4")]
     write_rows(path, lists)
 
 
-def header(form: str, count: object, before: str = "", after: str = "") -> bytes:
+def header(form, count, before="", after=""):
     properties = "".join(f"property float {name}\n" for name in needed())
     vertex = f"{before}element vertex {count}\n{properties}{after}"
     return f"ply\nformat {form} 1.0\n{vertex}end_header\n".encode()
 
 
-def packed(old: bytes, new: bytes) -> bytes:
+def packed(old, new):
     assert old in PACKED.read_bytes()
     return PACKED.read_bytes().replace(old, new)
 
 
-Change = Callable[[dict[str, Any]], object]
-
-
-def first(section: str, **changes: Any) -> Change:
+def first(section, **changes):
     """Changes the first accessor, buffer, view or node of a glTF."""
     return lambda gltf: gltf[section][0].update(changes)
 
 
-def glb(change: Change) -> Callable[[Path], object]:
-    def make(path: Path) -> None:
+def glb(change):
+    def make(path):
         write(path, model(0, 5))
         change_glb(path, change)
 
     return make
 
 
-def claiming(count: int) -> bytes:
+def claiming(count):
     return gzip.compress(struct.pack("<IIIBBBB", 0x5053474E, 3, count, 3, 12, 0, 0), mtime=0)
 
 
-def with_record(columns: Any, values: int) -> Callable[[Path], object]:
+def with_record(columns, values):
     """An .spz of a model of 40 whose record of the dial names these columns and has so many
     values.
     """
 
-    def make(path: Path) -> None:
+    def make(path):
         write(path, model(0))
         data, at = gzip.decompress(path.read_bytes()), 16 + 40 * 20 + 12
         size = struct.unpack_from("<I", data, at + 8)[0]
@@ -114,9 +106,7 @@ def with_record(columns: Any, values: int) -> Callable[[Path], object]:
     return make
 
 
-def tensors(
-    metadata: dict[str, str] | None = None, **changes: torch.Tensor | None
-) -> Callable[[Path], object]:
+def tensors(metadata=None, **changes):
     """A .safetensors of five Gaussians with some tensors changed or left out."""
     about = {
         "clod_adapter": json.dumps(
@@ -124,7 +114,7 @@ def tensors(
         )
     }
 
-    def make(path: Path) -> None:
+    def make(path):
         values = gaussians(5, 1, 0).tensors() | changes
         kept = {name: tensor for name, tensor in values.items() if tensor is not None}
         save_file(kept, path, about if metadata is None else metadata)
@@ -132,7 +122,7 @@ def tensors(
     return make
 
 
-def splats(count: int = 12, **changes: Any) -> dict[str, Any]:
+def splats(count=12, **changes):
     shapes = {
         "means": (count, 3),
         "quats": (count, 4),
@@ -145,17 +135,17 @@ def splats(count: int = 12, **changes: Any) -> dict[str, Any]:
 
 
 class Call:
-    def __init__(self, *what: Any) -> None:
+    def __init__(self, *what):
         self.what = what
 
-    def __reduce__(self) -> Any:
+    def __reduce__(self):
         return self.what[0], self.what[1:]
 
 
-def archive(kind: int, names: int) -> Callable[[Path], object]:
+def archive(kind, names):
     """A .pt packed again, with so many names of the same megabyte."""
 
-    def make(path: Path) -> None:
+    def make(path):
         torch.save(splats(), path)
         buffer = io.BytesIO(path.read_bytes())
         with zipfile.ZipFile(buffer) as old, zipfile.ZipFile(path, "w", kind) as new:
@@ -169,7 +159,7 @@ def archive(kind: int, names: int) -> Callable[[Path], object]:
     return make
 
 
-def claiming_rows(form: str, body: bytes, kind: str) -> tuple[tuple[bytes, str], ...]:
+def claiming_rows(form, body, kind):
     """Another element of 2^40 rows before and after the vertex; refused before the test's time
     limit, in which no loop counts that far.
     """
@@ -179,7 +169,8 @@ def claiming_rows(form: str, body: bytes, kind: str) -> tuple[tuple[bytes, str],
 
 LITTLE, BIG, GOOD = "binary_little_endian", "binary_big_endian", "1.0 " * 14 + "\n"
 LIST = "property list uchar int a\n"
-OTHER_KINDS: Table = (
+# name of the file, what it holds, the message after the name
+OTHER_KINDS = (
     ("a.ply", b"\r\n<!DOCTYPE html><html>", "web page.*download the file itself"),
     ("a.ply", b"<?xml version='1.0'?><Error>", "XML document"),
     ("a.ply", gzip.compress(b"ply\n", mtime=0), "gzip.*gunzip"),
@@ -201,7 +192,7 @@ OTHER_KINDS: Table = (
     ("chkpnt30000.pth", b"PK\x03\x04rest", "Inria.*point_cloud.ply"),
     ("meta.json", b"{}", "SOG.*splat-transform"),
 )
-OF_PLY: tuple[tuple[Content, str], ...] = (
+OF_PLY = (
     (rows("packed_position", "packed_rotation"), "compressed PLY without its element chunk"),
     (rows(*needed(1), "f_offset_0", "f_anchor_feat_0"), "Scaffold-GS"),
     (rows(without=("scale_2",)), "2DGS"),
@@ -266,7 +257,7 @@ OF_PLY: tuple[tuple[Content, str], ...] = (
     (packed(b"element chunk 2", b"element chunk 1"), "is damaged: 300 Gaussians need 2 chunks"),
     (packed(b"element vertex 300", b"element vertex 3000000"), "is truncated"),
 )
-OF_GLB: tuple[tuple[Change, str], ...] = (
+OF_GLB = (
     (first("accessors", count=1 << 60), "more than the file"),
     (first("accessors", count=3), "of different lengths"),
     (first("accessors", count=-1), "is no count"),
@@ -286,7 +277,7 @@ OF_GLB: tuple[tuple[Change, str], ...] = (
     (first("nodes", translation=[float("inf")] * 3), "not finite"),
     (lambda g: g.pop("accessors"), "damaged"),
 )
-OF_SPZ: tuple[tuple[Content, str], ...] = (
+OF_SPZ = (
     (gzip.compress(bytes(1 << 26), mtime=0), "unpacks to more"),
     (claiming(9_999_999), "truncated"),
     (claiming(1 << 31), "no SPZ file of version"),
@@ -335,7 +326,7 @@ OF_PT = (
         "more than tensors, and is not unpickled",
     ),
 )
-REFUSED: Table = (
+REFUSED = (
     *OTHER_KINDS,
     *(("in.ply", *each) for each in OF_PLY),
     *(("a.glb", glb(change), message) for change, message in OF_GLB),
@@ -349,9 +340,7 @@ REFUSED: Table = (
 
 
 @pytest.mark.parametrize("suffix", sorted({Path(name).suffix for name, _, _ in REFUSED}))
-def test_damaged_and_hostile_files(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str
-) -> None:
+def test_damaged_and_hostile_files(tmp_path, monkeypatch, suffix):
     """The error is one printable line. Nothing is allocated for what a file claims, and none of its
     code runs.
     """
@@ -379,7 +368,7 @@ def test_damaged_and_hostile_files(
 
 
 @pytest.mark.parametrize("suffix", FORMATS)
-def test_what_is_no_file_of_the_format(tmp_path: Path, suffix: str) -> None:
+def test_what_is_no_file_of_the_format(tmp_path, suffix):
     (tmp_path / f"folder{suffix}").mkdir()
     os.mkfifo(tmp_path / f"pipe{suffix}")
     for name, content in (("empty", b""), ("pointer", LFS), ("other", b"an unknown format")):

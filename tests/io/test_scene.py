@@ -7,8 +7,6 @@ import math
 import os
 import shutil
 import sys
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pycolmap
@@ -21,7 +19,6 @@ from refusals import refused
 from skimage.metrics import peak_signal_noise_ratio as psnr_of
 from torch.testing import assert_close
 
-from clod_adapter.cameras import View
 from clod_adapter.io.scene import colmap
 from clod_adapter.io.scene.colmap import load_points
 from clod_adapter.io.scene.folder import scene_files
@@ -43,17 +40,17 @@ from photographs import (
 
 
 @pytest.fixture(autouse=True)
-def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def cache(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     return tmp_path / "cache"
 
 
-PINHOLES: dict[str, Any] = {"kind": "PINHOLE", "params": [9, 9, 4, 3], "width": 8, "height": 6}
+PINHOLES = {"kind": "PINHOLE", "params": [9, 9, 4, 3], "width": 8, "height": 6}
 PINHOLES |= {"names": ("a.png", "sub/b.png")}
 
 
 @pytest.mark.parametrize("form", ["binary", "text", "before rigs"])
-def test_scene_round_trips(tmp_path: Path, form: str) -> None:
+def test_scene_round_trips(tmp_path, form):
     cameras, names = write_scene(tmp_path)
     folder = tmp_path / "sparse" / "0"
     if form == "text":
@@ -61,7 +58,7 @@ def test_scene_round_trips(tmp_path: Path, form: str) -> None:
     for pattern in {"text": ["*.bin"], "before rigs": ["rigs.bin", "frames.bin"]}.get(form, ()):
         for file in folder.glob(pattern):
             file.unlink()
-    progress: list[tuple[int, int]] = []
+    progress = []
     loaded = load_scene(str(tmp_path), progress=lambda now: progress.append((now.done, now.total)))
     assert loaded.notes == () and progress == [(k + 1, 10) for k in range(10)]
     assert dict(loaded.left_out) == {
@@ -79,7 +76,7 @@ def test_scene_round_trips(tmp_path: Path, form: str) -> None:
         assert_array_equal(view.image, pixels(i))
 
 
-def test_train_and_test_split(tmp_path: Path) -> None:
+def test_train_and_test_split(tmp_path):
     for count in (10, 1, 2):
         (tmp_path / str(count)).mkdir()
         names = write_scene(tmp_path / str(count), count)[1]
@@ -97,7 +94,7 @@ def test_train_and_test_split(tmp_path: Path) -> None:
         load_scene(tmp_path / "10", progress=lambda now: False)
 
 
-def test_split_of_the_scene_is_used(tmp_path: Path) -> None:
+def test_split_of_the_scene_is_used(tmp_path):
     names = sorted(write_scene(tmp_path, 10)[1])
     for listed, note in (
         ([names[2], names[9], "other.png"], "held out are 2 photographs, those of test.txt"),
@@ -114,7 +111,7 @@ def test_split_of_the_scene_is_used(tmp_path: Path) -> None:
         ]
 
 
-def test_model_and_images_are_found_in_other_folders(tmp_path: Path) -> None:
+def test_model_and_images_are_found_in_other_folders(tmp_path):
     write_scene(tmp_path, 2)
     folder = tmp_path / "sparse" / "0"
     assert len(load_scene(folder).train) == 1  # images beside the model's parent
@@ -129,7 +126,7 @@ def test_model_and_images_are_found_in_other_folders(tmp_path: Path) -> None:
         load_scene(tmp_path / "images" / "deeper")
 
 
-def test_other_models_are_found_and_noted(tmp_path: Path) -> None:
+def test_other_models_are_found_and_noted(tmp_path):
     """nerfstudio's folder; and the parts that COLMAP makes of photographs which it cannot join."""
     names, sparse = write_scene(tmp_path, 3)[1], tmp_path / "sparse"
     (sparse / "0").rename(sparse / "10")
@@ -149,7 +146,7 @@ def test_other_models_are_found_and_noted(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("file", ["cameras", "images", "points3D"])
-def test_records_beyond_the_file_are_refused(tmp_path: Path, file: str) -> None:
+def test_records_beyond_the_file_are_refused(tmp_path, file):
     path = model_of(tmp_path, **PINHOLES) / f"{file}.bin"
     data = path.read_bytes()
     counts = [count.to_bytes(8, "little") + data[8:] for count in (1 << 31, (1 << 64) - 1)]
@@ -182,9 +179,7 @@ IMAGE = b"%d %b 0 0 0 0 0 0 1 a.png\n\n"
         ),
     ],
 )
-def test_unusable_text_models_are_refused(
-    tmp_path: Path, file: str, content: bytes, message: str
-) -> None:
+def test_unusable_text_models_are_refused(tmp_path, file, content, message):
     (model_of(tmp_path, **PINHOLES, form="text") / f"{file}.txt").write_bytes(content)
     with refused(message):
         load_scene(tmp_path)
@@ -199,15 +194,13 @@ def test_unusable_text_models_are_refused(
         ("PINHOLE", [0, 140, 80, 60], "not usable"),
     ],
 )
-def test_unusable_lenses_are_refused(
-    tmp_path: Path, kind: str, params: list[float], message: str
-) -> None:
+def test_unusable_lenses_are_refused(tmp_path, kind, params, message):
     model_of(tmp_path, kind, params, **SIZE)
     with refused(f"image 'a.png' has .*{message}"):
         load_scene(tmp_path)
 
 
-def test_text_models_of_other_programs(tmp_path: Path) -> None:
+def test_text_models_of_other_programs(tmp_path):
     """Files without blank lines or points, with names that have spaces and quaternions of any
     length.
     """
@@ -244,13 +237,13 @@ def test_text_models_of_other_programs(tmp_path: Path) -> None:
     )
 
 
-def test_without_pycolmap_the_error_says_where_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_pycolmap_the_error_says_where_it_is(monkeypatch):
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     with refused("conda install -c conda-forge pycolmap$"):
         importlib.reload(colmap)
 
 
-def test_missing_images_are_noted_or_refused(tmp_path: Path) -> None:
+def test_missing_images_are_noted_or_refused(tmp_path):
     names = sorted(write_scene(tmp_path, 18)[1])
     for name in names[2:11]:
         (tmp_path / "images" / name).unlink()
@@ -271,7 +264,7 @@ def test_missing_images_are_noted_or_refused(tmp_path: Path) -> None:
         load_scene(tmp_path)
 
 
-def test_masks_are_noted(tmp_path: Path) -> None:
+def test_masks_are_noted(tmp_path):
     write_scene(tmp_path, 2)
     write_images(tmp_path / "masks", ["sub/001.png.png", "sub/002.png.png"])
     note = (
@@ -282,7 +275,7 @@ def test_masks_are_noted(tmp_path: Path) -> None:
         assert load_scene(folder).notes == (f"{note} photographs' alpha channel",)
 
 
-def test_smaller_copies_replace_missing_images(tmp_path: Path) -> None:
+def test_smaller_copies_replace_missing_images(tmp_path):
     write_scene(tmp_path, 3)
     (tmp_path / "images").rename(tmp_path / "images_2")
     (tmp_path / "input" / "sub").mkdir(parents=True)
@@ -303,7 +296,7 @@ def test_smaller_copies_replace_missing_images(tmp_path: Path) -> None:
         load_scene(tmp_path)
 
 
-def test_photographs_of_another_suffix_or_case_are_found(tmp_path: Path) -> None:
+def test_photographs_of_another_suffix_or_case_are_found(tmp_path):
     """One for each name: of two that differ in nothing else, or are claimed by two names, none is
     taken.
     """
@@ -323,7 +316,7 @@ def test_photographs_of_another_suffix_or_case_are_found(tmp_path: Path) -> None
     )
 
 
-def test_wide_images_are_scaled_with_their_intrinsics(tmp_path: Path) -> None:
+def test_wide_images_are_scaled_with_their_intrinsics(tmp_path):
     write_scene(tmp_path, 3)
     loaded = load_scene(tmp_path, max_width=15)
     assert loaded.notes == (
@@ -338,7 +331,7 @@ def test_wide_images_are_scaled_with_their_intrinsics(tmp_path: Path) -> None:
     assert load_scene(tmp_path, max_width=40).notes == ()
 
 
-def capture_of(folder: Path, kind: str, params: list[float]) -> Path:
+def capture_of(folder, kind, params):
     """A scene of one photograph, of ``seen``, by this lens."""
     model_of(folder, kind, params, **SIZE)
     (folder / "images").mkdir()
@@ -348,7 +341,7 @@ def capture_of(folder: Path, kind: str, params: list[float]) -> Path:
     return folder
 
 
-def ideal(view: View, across: float = 0.0, down: float = 0.0) -> np.ndarray:
+def ideal(view, across=0.0, down=0.0):
     """The picture that the pinhole camera of the view would have seen, or one whose axis is these
     pixels beside.
     """
@@ -359,9 +352,7 @@ def ideal(view: View, across: float = 0.0, down: float = 0.0) -> np.ndarray:
 
 
 @pytest.mark.parametrize("kind", LENSES)
-def test_undistorted_image_is_that_of_the_pinhole_camera(
-    tmp_path: Path, cache: Path, kind: str
-) -> None:
+def test_undistorted_image_is_that_of_the_pinhole_camera(tmp_path, cache, kind):
     loaded = load_scene(capture_of(tmp_path / "scene", kind, LENSES[kind]))
     view = loaded.train[0]
     right = psnr_of(view.image.numpy(), ideal(view))
@@ -376,9 +367,7 @@ def test_undistorted_image_is_that_of_the_pinhole_camera(
     assert loaded.notes == (f"1 of 1 images undistorted {into}",)
 
 
-def test_cached_images_are_reused(
-    tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_cached_images_are_reused(tmp_path, cache, monkeypatch):
     """The photograph, its camera and the width must be the same; a damaged one is made again."""
     scene = capture_of(tmp_path / "scene", "OPENCV", LENSES["OPENCV"])
     first = load_scene(scene, max_width=100)
@@ -404,9 +393,7 @@ def test_cached_images_are_reused(
     assert len(list(cache.rglob("*.png"))) == 4
 
 
-def test_cache_folder_must_be_writable(
-    tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_cache_folder_must_be_writable(tmp_path, cache, monkeypatch):
     scene = capture_of(tmp_path / "scene", "OPENCV", LENSES["OPENCV"])
     (scene / "images" / "a.png").write_bytes(b"not read")
     message = "undistorted photographs cannot be kept there .*set XDG_CACHE_HOME"
@@ -424,7 +411,7 @@ def test_cache_folder_must_be_writable(
         load_scene(scene)
 
 
-def test_cameras_equal_those_of_load_scene(capture: Any) -> None:
+def test_cameras_equal_those_of_load_scene(capture):
     scene = load_scene(capture.scene, origin=(origin := (10.0, -20.0, 30.0)))
     views = views_of(scene)
     cameras, notes = load_cameras(capture.scene, origin)
@@ -441,11 +428,11 @@ def test_cameras_equal_those_of_load_scene(capture: Any) -> None:
     assert training == names_of(scene.train) and len(training) == 8
 
 
-def there(folder: Path) -> set[str]:
+def there(folder):
     return {str(path.relative_to(folder)) for path in scene_files(folder) if path.is_file()}
 
 
-def test_files_of_a_colmap_scene(tmp_path: Path) -> None:
+def test_files_of_a_colmap_scene(tmp_path):
     """All that no output may overwrite, and nothing else in the scene's folder."""
     write_scene(tmp_path, 3)
     (tmp_path / "rendered.png").write_bytes(b"not of the scene")

@@ -5,11 +5,8 @@ columns for tools that drop comments; the screen-space filter as other programs 
 import gzip
 import json
 import re
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +16,7 @@ from refusals import refused
 from safetensors.torch import load_file, save_file
 
 from clod_adapter.adapter import detach, extract, with_dial
-from clod_adapter.calibration import Calibration, Viewpoint
+from clod_adapter.calibration import Viewpoint
 from clod_adapter.config import CLASSIC, FILTERS, AttenuationConfig, ScreenFilter
 from clod_adapter.equation.units import estimated_distance, in_world_units
 from clod_adapter.inspection.report import inspect
@@ -43,7 +40,7 @@ from formats import (
 from scenes import gaussians
 
 
-def written(path: Path, screen_filter: ScreenFilter = CLASSIC) -> Path:
+def written(path, screen_filter=CLASSIC):
     g = model(0).replace(screen_filter=screen_filter)
     if path.name.startswith("adapter"):
         adapter = extract(detach(g), g.replace(growth_d=None), fingerprint="0", config={})
@@ -53,9 +50,7 @@ def written(path: Path, screen_filter: ScreenFilter = CLASSIC) -> Path:
     return path
 
 
-def read(
-    path: Path,
-) -> tuple[AttenuationConfig | None, ScreenFilter, Calibration | None, list[str]]:
+def read(path):
     if path.name.startswith("adapter"):
         adapter = load_adapter(path)
         return adapter.attenuation, adapter.screen_filter, adapter.calibration, list(adapter.notes)
@@ -69,10 +64,10 @@ def read(
 @pytest.mark.parametrize(
     "kind", ["a.ply", "a.glb", "a.spz", "a.safetensors", "a.pt", "adapter.safetensors"]
 )
-def test_every_format_uses_the_reader(tmp_path: Path, kind: str) -> None:
+def test_every_format_uses_the_reader(tmp_path, kind):
     path, ply, adapter = tmp_path / kind, kind == "a.ply", kind == "adapter.safetensors"
 
-    def changed(name: str, old: str, new: str, **filters: ScreenFilter) -> Any:
+    def changed(name, old, new, **filters):
         return read(change_setting(written(path, **filters), name, old, new))
 
     other = ScreenFilter(variance=0.123456789, compensate=True)
@@ -104,12 +99,12 @@ def test_every_format_uses_the_reader(tmp_path: Path, kind: str) -> None:
             changed("", old, new)
 
 
-def described(path: Path, *comments: str) -> Path:
+def described(path, *comments):
     rows = random_rows(40, [*needed(), "sigma_d"])
     return write_rows(path, rows, comments=[f"clod_adapter {comment}" for comment in comments])
 
 
-def test_damaged_settings_are_refused(tmp_path: Path) -> None:
+def test_damaged_settings_are_refused(tmp_path):
     for comment, message in (
         ("max_sv banana", "could not convert string to float: 'banana'"),
         ("form theirs", "form is theirs, it must be"),
@@ -133,7 +128,7 @@ def test_damaged_settings_are_refused(tmp_path: Path) -> None:
         ("calibrated 1 ", f"calibrated {'9' * 310} "),
     ],
 )
-def test_a_calibration_of_absurd_numbers_is_ignored(tmp_path: Path, old: str, new: str) -> None:
+def test_a_calibration_of_absurd_numbers_is_ignored(tmp_path, old, new):
     """A note says so; nothing is rendered in its size."""
     places = (Viewpoint(1, 0, -5, 1, 0, 0, 1, 0, -1, 0, 0.7),)
     write(
@@ -147,7 +142,7 @@ def test_a_calibration_of_absurd_numbers_is_ignored(tmp_path: Path, old: str, ne
     assert any("calibration is unusable and ignored" in note for note in found.notes)
 
 
-def with_a_cut(path: Path) -> Path:
+def with_a_cut(path):
     """A safetensors file whose JSON has a setting of the earlier form."""
     about = json.loads(read_tensor_header(written(path))[1]["clod_adapter"])
     about["attenuation"]["cut"] = "soft"
@@ -155,11 +150,9 @@ def with_a_cut(path: Path) -> Path:
     return path
 
 
-def test_a_dial_of_the_earlier_form_is_refused(tmp_path: Path) -> None:
+def test_a_dial_of_the_earlier_form_is_refused(tmp_path):
     """The form shows in a comment, in a column where comments were dropped, and in JSON."""
-    made: list[Callable[[], Path]] = [
-        partial(described, tmp_path / "a.ply", "tau 0.02", "max_sv 5")
-    ]
+    made = [partial(described, tmp_path / "a.ply", "tau 0.02", "max_sv 5")]
     made += [
         partial(with_a_cut, tmp_path / name) for name in ("a.safetensors", "adapter.safetensors")
     ]
@@ -176,9 +169,7 @@ def test_a_dial_of_the_earlier_form_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "screen_filter", [*FILTERS.values(), ScreenFilter(variance=0.123, compensate=True)], ids=str
 )
-def test_columns_and_the_flag_of_an_spz_store_the_filter(
-    tmp_path: Path, screen_filter: ScreenFilter
-) -> None:
+def test_columns_and_the_flag_of_an_spz_store_the_filter(tmp_path, screen_filter):
     """A PLY with a dial has columns of settings; a plain one has no columns but those of Inria's
     layout.
     """
@@ -201,7 +192,7 @@ def test_columns_and_the_flag_of_an_spz_store_the_filter(
     assert other.gaussians.screen_filter == FILTERS["on"] and not other.filter_known
 
 
-def test_columns_of_other_programs_and_damaged_columns(tmp_path: Path) -> None:
+def test_columns_of_other_programs_and_damaged_columns(tmp_path):
     write(tmp_path / "a.ply", detach(model(1)))
     found = load(without_comments(tmp_path / "a.ply", filter_3D=0.01))  # of Mip-Splatting
     assert found.gaussians.screen_filter == FILTERS["mip"] and not found.filter_known
@@ -221,7 +212,7 @@ def test_columns_of_other_programs_and_damaged_columns(tmp_path: Path) -> None:
             load(without_comments(tmp_path / "a.ply", **columns))
 
 
-def test_comments_of_other_programs(tmp_path: Path) -> None:
+def test_comments_of_other_programs(tmp_path):
     """Brush, whose filter has 0.1 px^2, splat-transform and Postshot; outputs contradict none."""
     for comments, name in (
         (("SplatRenderMode: default", "antialiased 0", "not antialiased 1"), "off"),
@@ -252,7 +243,7 @@ EACH = {
 
 @pytest.mark.parametrize("growth", [False, True])
 @pytest.mark.parametrize("name", EACH)
-def test_dial_survives_a_rewrite_without_comments(tmp_path: Path, name: str, growth: bool) -> None:
+def test_dial_survives_a_rewrite_without_comments(tmp_path, name, growth):
     config, growth_d = EACH[name], torch.linspace(-1, 3, 400) if growth else None
     g = with_dial(gaussians(400, 1, 2), torch.logspace(-1, 1.3, 400), config, growth_d)
     save(tmp_path / "a.ply", g)
@@ -274,7 +265,7 @@ def test_dial_survives_a_rewrite_without_comments(tmp_path: Path, name: str, gro
     )
 
 
-def test_file_without_settings_has_a_note(tmp_path: Path) -> None:
+def test_file_without_settings_has_a_note(tmp_path):
     """The file keeps six tenths at s = 1 from its reference distance; sigma_d is multiplied by
     ``factor``.
     """
@@ -305,7 +296,7 @@ def test_file_without_settings_has_a_note(tmp_path: Path) -> None:
         (["label", "confidence", "obj_dc_0", "nx"], ""),
     ],
 )
-def test_columns_that_change_the_picture(tmp_path: Path, names: list[str], method: str) -> None:
+def test_columns_that_change_the_picture(tmp_path, names, method):
     """A warning names the method, of a PLY and of gsplat's checkpoint; other columns have none."""
     rows = random_rows(5, [*needed(), *names])
     splats = to_gsplat(gaussians(5, 0, 0)) | {name: torch.zeros(5) for name in names}

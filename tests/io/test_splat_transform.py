@@ -6,7 +6,6 @@ import shlex
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -27,12 +26,12 @@ ANSWERS = (
 
 
 @pytest.fixture
-def tool(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+def tool(tmp_path, monkeypatch):
     """Makes a substitute that runs these lines of Python with ``words``; the environment names
     it.
     """
 
-    def make(*lines: str) -> None:
+    def make(*lines):
         script = tmp_path / "with space" / "tool.py"
         script.parent.mkdir(exist_ok=True)
         script.write_text("\n".join([BEGIN, *lines]))
@@ -41,7 +40,7 @@ def tool(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     return make
 
 
-def test_find(tool: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_find(tool, monkeypatch, tmp_path):
     for gpus, has_gpu in (("[0] A GPU", True), ("No GPU adapters found.", False)):
         tool(f"print('splat-transform v3.7.2 (abc)' if words == ['--version'] else {gpus!r})")
         found = SplatTransform.find()
@@ -73,7 +72,7 @@ def test_find(tool: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Non
             SplatTransform.find()
 
 
-def test_run(tmp_path: Path, tool: Any) -> None:
+def test_run(tmp_path, tool):
     out, ticks = tmp_path / "out", list[float]()
     tool(ANSWERS, "open(words[-1], 'w').write(' '.join(words[:-1]))", "time.sleep(0.5)")
     found = SplatTransform.find()
@@ -97,7 +96,7 @@ def test_run(tmp_path: Path, tool: Any) -> None:
             found.run(timeout=60)
 
 
-def test_converted_files(tmp_path: Path, tool: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_converted_files(tmp_path, tool, monkeypatch):
     was = gaussians(5, 1, 0)
     save(tmp_path / "plain.ply", was)
     seen, plain = repr(str(tmp_path / "seen")), repr(str(tmp_path / "plain.ply"))

@@ -7,7 +7,6 @@ import math
 import os
 import shutil
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -38,12 +37,12 @@ from photographs import (
 )
 
 
-def frame(i: int, path: str = "", **rest: Any) -> dict[str, Any]:
+def frame(i, path="", **rest):
     name = path or f"images/{i:03d}.png"
     return {"file_path": name, "transform_matrix": to_world(i), **rest}
 
 
-def test_nerfstudio_file(tmp_path: Path) -> None:
+def test_nerfstudio_file(tmp_path):
     # sorted by name, whatever the order in the file
     frames = [frame(i) for i in reversed(range(10))]
     frames[0]["fl_x"] = 33.0  # its own camera
@@ -71,7 +70,7 @@ def test_nerfstudio_file(tmp_path: Path) -> None:
         assert_array_equal(view.image, pixels(i))
 
 
-def test_blender_files(tmp_path: Path) -> None:
+def test_blender_files(tmp_path):
     """Names without an extension, a field of view and no size, and files for training and
     testing.
     """
@@ -95,7 +94,7 @@ def test_blender_files(tmp_path: Path) -> None:
     assert (names_of(loaded.test), len(loaded.train)) == (["train/r_0.png"], 2)
 
 
-def test_lists_of_nerfstudio_are_its_split(tmp_path: Path) -> None:
+def test_lists_of_nerfstudio_are_its_split(tmp_path):
     """Photographs that it does not train on are held out, in a list or in none; paths without an
     extension as in the frames.
     """
@@ -115,7 +114,7 @@ def test_lists_of_nerfstudio_are_its_split(tmp_path: Path) -> None:
         load_scene(tmp_path)
 
 
-def test_instant_ngp_file(tmp_path: Path) -> None:
+def test_instant_ngp_file(tmp_path):
     """Angles in place of focal lengths; one focal length for both axes; JPEGs under names without
     an extension.
     """
@@ -136,7 +135,7 @@ def test_instant_ngp_file(tmp_path: Path) -> None:
     assert view.camera.K.tolist() == [[30, 0, 20], [0, 30, 15], [0, 0, 1]]
 
 
-def test_size_of_a_photograph_of_another_suffix(tmp_path: Path) -> None:
+def test_size_of_a_photograph_of_another_suffix(tmp_path):
     write_frames(tmp_path, [frame(0, "a.jpg"), frame(0, "b")], fl_x=30.0)
     write_images(tmp_path, ["a.png", "b.WEBP"])
     loaded = load_scene(tmp_path)
@@ -159,13 +158,7 @@ ROUND = {"k1": 0.03, "k2": -0.01, "k3": 0.002, "k4": 0.001}
         ({"is_fisheye": True, **ROUND}, "OPENCV_FISHEYE", [*ROUND.values()]),
     ],
 )
-def test_distorted_photographs_are_undistorted(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    message: dict[str, Any],
-    model: str,
-    params: list[float],
-) -> None:
+def test_distorted_photographs_are_undistorted(tmp_path, monkeypatch, message, model, params):
     """They equal those of a COLMAP model with the same lens."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     size, views = {"fl_x": 120, "fl_y": 122, "cx": 82, "cy": 58, "w": 160, "h": 120}, []
@@ -180,7 +173,7 @@ def test_distorted_photographs_are_undistorted(
     assert torch.equal(views[0].camera.K, views[1].camera.K)
 
 
-def test_colmap_model_takes_precedence(tmp_path: Path) -> None:
+def test_colmap_model_takes_precedence(tmp_path):
     model_of(tmp_path, "PINHOLE", [33, 33, 20, 15])
     write_frames(tmp_path, [frame(0)], **INTRINSICS)
     write_images(tmp_path, ["images/a.png"])
@@ -192,7 +185,7 @@ def test_colmap_model_takes_precedence(tmp_path: Path) -> None:
     assert load_scene(deeper).train[0].camera.K[0, 0] == 30
 
 
-def test_missing_photographs_and_unused_entries_are_noted(tmp_path: Path) -> None:
+def test_missing_photographs_and_unused_entries_are_noted(tmp_path):
     frames = [frame(i, mask_path="masks/0.png") for i in range(10)]
     write_frames(
         tmp_path, frames, fl_x=30.0, applied_transform=[[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]
@@ -213,7 +206,7 @@ def test_missing_photographs_and_unused_entries_are_noted(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("start", ["/home/other/scene/", "C:\\scenes\\", "../", "../scene/./"])
-def test_paths_of_another_machine_end_in_the_folder(tmp_path: Path, start: str) -> None:
+def test_paths_of_another_machine_end_in_the_folder(tmp_path, start):
     """A file of the whole path, outside of the folder, is never read."""
     scene, names = tmp_path / "scene", [f"images/{i}" for i in range(3)]
     frames = [frame(i, start + name) for i, name in enumerate(names)]
@@ -230,7 +223,7 @@ def test_paths_of_another_machine_end_in_the_folder(tmp_path: Path, start: str) 
     )
 
 
-def changed(row: int, column: int, value: float) -> dict[str, Any]:
+def changed(row, column, value):
     matrix = np.eye(4)
     matrix[row, column] = value
     return {"transform_matrix": matrix.tolist()}
@@ -288,9 +281,7 @@ def changed(row: int, column: int, value: float) -> dict[str, Any]:
         (b"{", "transforms.json: is larger than 256 MB"),
     ],
 )
-def test_invalid_files_and_frames_are_refused(
-    tmp_path: Path, change: dict[str, Any] | bytes, message: str
-) -> None:
+def test_invalid_files_and_frames_are_refused(tmp_path, change, message):
     if isinstance(change, bytes):
         (tmp_path / "transforms.json").write_bytes(change)
         os.truncate(
@@ -303,7 +294,7 @@ def test_invalid_files_and_frames_are_refused(
     assert str(caught.value).isprintable()
 
 
-def test_camera_without_a_size_is_left_out(tmp_path: Path) -> None:
+def test_camera_without_a_size_is_left_out(tmp_path):
     frames = [frame(0, "0.png"), frame(1, "1.png", w=20, h=10)]
     write_frames(tmp_path, frames, camera_angle_x=1.0)
     cameras, notes = load_cameras(tmp_path)
@@ -314,7 +305,7 @@ def test_camera_without_a_size_is_left_out(tmp_path: Path) -> None:
         load_cameras(tmp_path)
 
 
-def test_files_of_transforms_scenes(tmp_path: Path) -> None:
+def test_files_of_transforms_scenes(tmp_path):
     train = {
         "frames": [
             {"file_path": "./train/r_0", "mask_path": "masks/0.png"},
@@ -350,9 +341,7 @@ APPLIED = {  # how nerfstudio turned COLMAP's world: today, and before
 }
 
 
-def trained(
-    poses: np.ndarray, applied: Any, applied_scale: float = 1.0
-) -> tuple[np.ndarray, dict[str, Any]]:
+def trained(poses, applied, applied_scale=1.0):
     """Poses after nerfstudio's ``auto_orient_and_center_poses`` by default, and its
     dataparser_transforms.json.
     """
@@ -370,14 +359,14 @@ def trained(
     return oriented, {"transform": transform.tolist(), "scale": float(scale * applied_scale)}
 
 
-def in_colmap(count: int, seed: int) -> np.ndarray:
+def in_colmap(count, seed):
     """``[N, 4, 4]`` camera to world of COLMAP, in OpenGL's axes, as nerfstudio has them before it
     turns the world.
     """
     return np.array([to_world(seed + i) for i in range(count)])
 
 
-def write_data(folder: Path, poses: np.ndarray, **rest: Any) -> None:
+def write_data(folder, poses, **rest):
     frames = [
         {"file_path": name, "transform_matrix": p.tolist()}
         for name, p in zip(NAMES, poses, strict=False)
@@ -394,9 +383,7 @@ def write_data(folder: Path, poses: np.ndarray, **rest: Any) -> None:
 )
 @example("today", 0, None)
 @example("older", 0, None)
-def test_cameras_of_nerfstudio(
-    tmp_path: Path, turn: str, seed: int, applied_scale: float | None
-) -> None:
+def test_cameras_of_nerfstudio(tmp_path, turn, seed, applied_scale):
     """Cameras of its transforms.json; or, without a scale, of a COLMAP model, whose own world is
     turned.
     """
@@ -444,7 +431,7 @@ def test_cameras_of_nerfstudio(
         ),
     ],
 )
-def test_damaged_frame_of_nerfstudio_is_refused(tmp_path: Path, content: str, message: str) -> None:
+def test_damaged_frame_of_nerfstudio_is_refused(tmp_path, content, message):
     write_data(tmp_path, in_colmap(3, 0))
     (tmp_path / "dataparser_transforms.json").write_text(content)
     with refused(f"dataparser_transforms.json: {message}"):

@@ -2,8 +2,6 @@
 from 0.
 """
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
@@ -23,7 +21,7 @@ from scenes import gaussians
 SCALES = ("scale_0", "scale_1", "scale_2")
 
 
-def inria(count: int, *extra: str) -> np.ndarray:
+def inria(count, *extra):
     """Rows as a trainer writes them: logits on both sides of 0, small scales."""
     vertex = random_rows(count, [*needed(), *extra])
     vertex["opacity"] *= 3
@@ -32,7 +30,7 @@ def inria(count: int, *extra: str) -> np.ndarray:
     return vertex
 
 
-def activate(vertex: np.ndarray, *what: str) -> np.ndarray:
+def activate(vertex, *what):
     vertex = vertex.copy()
     if "opacity" in what:
         vertex["opacity"] = 1 / (1 + np.exp(-vertex["opacity"].astype(np.float64)))
@@ -42,7 +40,7 @@ def activate(vertex: np.ndarray, *what: str) -> np.ndarray:
 
 
 @pytest.mark.parametrize("what", [("opacity",), ("scales",), ("opacity", "scales")], ids="+".join)
-def test_activated_values_need_the_option(tmp_path: Path, what: tuple[str, ...]) -> None:
+def test_activated_values_need_the_option(tmp_path, what):
     vertex = inria(40)
     plain = load(write_rows(tmp_path / "plain.ply", vertex))
     assert plain.notes == ()
@@ -62,7 +60,7 @@ def test_activated_values_need_the_option(tmp_path: Path, what: tuple[str, ...])
     assert unchanged.notes == () and base.fingerprint == f"{choice}:{unchanged.fingerprint}"
 
 
-def test_usual_values_need_no_option(tmp_path: Path) -> None:
+def test_usual_values_need_no_option(tmp_path):
     few = activate(inria(9), "opacity", "scales")
     same = inria(40)
     for name in ("opacity", *SCALES):
@@ -74,7 +72,7 @@ def test_usual_values_need_no_option(tmp_path: Path) -> None:
         assert loaded.notes == () and ":" not in loaded.fingerprint
 
 
-def test_mip_splatting_is_fused(tmp_path: Path) -> None:
+def test_mip_splatting_is_fused(tmp_path):
     """The formula is its renderer's, here in float64; extreme values are finite."""
     vertex, names = inria(40, "filter_3D"), [*needed()[:6], *needed()[-4:]]
     vertex["filter_3D"] = np.exp(np.random.default_rng(1).normal(size=40) - 2.5)
@@ -111,7 +109,7 @@ def test_mip_splatting_is_fused(tmp_path: Path) -> None:
         assert_array_equal(out.vertex[name], vertex[name][kept])
 
 
-def test_activated_opacities_extreme_values(tmp_path: Path) -> None:
+def test_activated_opacities_extreme_values(tmp_path):
     vertex = activate(inria(40), "opacity")
     vertex["opacity"][:5] = 0, 1, 1.5, -0.05, np.nan  # Taming-3DGS activates by the absolute value
     base = load(write_rows(tmp_path / "in.ply", vertex), activated="opacity")
@@ -125,7 +123,7 @@ def test_activated_opacities_extreme_values(tmp_path: Path) -> None:
         load(write_rows(tmp_path / "in.ply", vertex))
 
 
-def test_own_outputs_need_no_option(tmp_path: Path) -> None:
+def test_own_outputs_need_no_option(tmp_path):
     """An opaque result, as every logit may be above 0 after tuning; its adapter knows how its base
     was read.
     """
@@ -147,7 +145,7 @@ def test_own_outputs_need_no_option(tmp_path: Path) -> None:
 UTM = np.array([437_123.25, -4_481_010.5, 1_000.0])
 
 
-def moved(path: Path, out: Path, kind: str) -> Path:
+def moved(path, out, kind):
     """The file's coordinates UTM away, as columns of ``kind``."""
     old = PlyData.read(str(path))["vertex"].data
     new = old.astype(
@@ -158,7 +156,7 @@ def moved(path: Path, out: Path, kind: str) -> Path:
     return write_rows(out, new)
 
 
-def test_only_distant_scenes_have_an_origin() -> None:
+def test_only_distant_scenes_have_an_origin():
     near = np.random.default_rng(0).normal(size=(500, 3))
     floater = np.concatenate([near, [[1e9, 0, 0]]])
     none = (near, near + 40, floater, near[:1] + UTM, np.zeros((0, 3)), np.full((3, 3), np.nan))
@@ -171,7 +169,7 @@ def test_only_distant_scenes_have_an_origin() -> None:
 
 
 @pytest.mark.parametrize("kind", ["f4", "f8"])
-def test_round_trip_of_distant_scenes_is_exact(tmp_path: Path, kind: str) -> None:
+def test_round_trip_of_distant_scenes_is_exact(tmp_path, kind):
     base = gaussians(200, 1, 0)
     clod.save(tmp_path / "near.ply", base)
     far = clod.load(moved(tmp_path / "near.ply", tmp_path / "far.ply", kind))

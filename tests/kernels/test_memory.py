@@ -9,11 +9,9 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -27,7 +25,7 @@ from clod_adapter._support.workers import in_order, shared
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def test_disabled_compilation_is_an_error(capture: Any, tmp_path: Path) -> None:
+def test_disabled_compilation_is_an_error(capture, tmp_path):
     command = [
         sys.executable,
         "-m",
@@ -46,12 +44,12 @@ def test_disabled_compilation_is_an_error(capture: Any, tmp_path: Path) -> None:
     )
 
 
-def test_cache_survives_full_disks_and_processes_killed_while_writing(tmp_path: Path) -> None:
+def test_cache_survives_full_disks_and_processes_killed_while_writing(tmp_path):
     """A process prints the result of a kernel for ``[1.0]``, 1 + its version, of which the stamp
     tells.
     """
 
-    def printed(version: int, before: str = "") -> str:
+    def printed(version, before=""):
         (tmp_path / "sums.py").write_text(
             "from clod_adapter._kernels import compiling\n"
             f"VERSION, compiling._STAMP = {version}.0, '{version}'\n"
@@ -81,7 +79,7 @@ def test_cache_survives_full_disks_and_processes_killed_while_writing(tmp_path: 
 
 
 SHAPE = (120, 160, 3)
-HOLDERS: dict[str, Callable[[Tensor], Any]] = {
+HOLDERS = {
     "slice": lambda t: t[5:, 3],
     "storage": lambda t: t.untyped_storage(),
     "numpy view of a view": lambda t: t[7:].numpy()[1:].reshape(-1)[5:],
@@ -92,13 +90,13 @@ HOLDERS: dict[str, Callable[[Tensor], Any]] = {
 
 
 @pytest.fixture(autouse=True)
-def nothing_idle() -> Iterator[None]:
+def nothing_idle():
     release()
     yield
     release()
 
 
-def test_shapes_and_alignment() -> None:
+def test_shapes_and_alignment():
     for shape in [(), (100_000, 0, 3), (16_383,), (16_384,), torch.Size((9, 9999))] * 3:
         tensor = recycled(shape)
         assert tensor.shape == shape and tensor.dtype == torch.float32 and tensor.is_contiguous()
@@ -110,7 +108,7 @@ def test_shapes_and_alignment() -> None:
 
 
 @pytest.mark.parametrize("holder", HOLDERS)
-def test_held_memory_is_not_used_again(holder: str) -> None:
+def test_held_memory_is_not_used_again(holder):
     tensor = recycled(SHAPE).fill_(7)
     first, end = tensor.data_ptr(), tensor.data_ptr() + 4 * tensor.numel()
     held = HOLDERS[holder](tensor)
@@ -127,11 +125,11 @@ def test_held_memory_is_not_used_again(holder: str) -> None:
     assert {recycled(SHAPE).data_ptr() for _ in range(IDLE)} <= before
 
 
-def test_threads_never_get_the_same_memory() -> None:
+def test_threads_never_get_the_same_memory():
     """Each fills tensors with a number, which is unchanged until another thread releases them."""
     passed = deque[tuple[Tensor, float]]()
 
-    def work(k: int) -> None:
+    def work(k):
         for turn in range(300):
             tensor, number = recycled(((20_000, 20_001, 40_000)[turn % 3],)), float(k * 300 + turn)
             passed.append((tensor.fill_(number), number))
@@ -148,8 +146,8 @@ def test_threads_never_get_the_same_memory() -> None:
         sys.setswitchinterval(before)
 
 
-def test_results_come_in_order() -> None:
-    def late(number: int) -> tuple[int, int]:
+def test_results_come_in_order():
+    def late(number):
         time.sleep(0.01 * (number % 3))
         return number, threading.get_ident()
 
@@ -160,10 +158,10 @@ def test_results_come_in_order() -> None:
     assert list(in_order([], 3)) == []
 
 
-def test_an_error_is_raised_after_started_calls_end() -> None:
+def test_an_error_is_raised_after_started_calls_end():
     done, asked = [], []
 
-    def call(number: int) -> None:
+    def call(number):
         if number == 1:
             raise ValueError("one")
         time.sleep(0.05)
@@ -177,11 +175,11 @@ def test_an_error_is_raised_after_started_calls_end() -> None:
     assert len(done) == count
 
 
-def test_kernels_run_again_after_threads_were_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    def kernel(worker: int, count: int, out: torch.Tensor) -> None:
+def test_kernels_run_again_after_threads_were_refused(monkeypatch):
+    def kernel(worker, count, out):
         out[worker] = count
 
-    def refuse(_: threading.Thread) -> None:
+    def refuse(_):
         raise RuntimeError("can't start new thread")
 
     shared.cache_clear()

@@ -11,7 +11,6 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numba import njit
-from torch import Tensor
 
 from backends import torch_threads
 from clod_adapter import losses
@@ -32,9 +31,7 @@ CONFIG = AdaptConfig(max_sv=7.0)
     share=st.sampled_from([0.02, 0.4, 1.0]),
     workers=st.sampled_from([1, 3]),
 )
-def test_both_forms_of_the_count_term_agree(
-    n: int, s: float, seed: int, share: float, workers: int
-) -> None:
+def test_both_forms_of_the_count_term_agree(n, s, seed, share, workers):
     random = torch.Generator().manual_seed(seed)
     d = 2 * torch.rand(n, generator=random)
     sigma = s * d * (torch.randn(n, generator=random) / 4).exp()
@@ -47,7 +44,7 @@ def test_both_forms_of_the_count_term_agree(
     assert n < 33 or want.any()
 
 
-def test_the_count_term_of_extreme_values_is_finite() -> None:
+def test_the_count_term_of_extreme_values_is_finite():
     edges = (
         torch.tensor([0.0, 1e-30, 1e-6, 1.0, 1e6, 1e9]),
         torch.tensor([-1.0, 0.0, 1e-30, 1e-4, 1.0, 1e9, math.inf]),
@@ -64,7 +61,7 @@ def elementary(function, x, out):
         store(out, at, exp2(load(x, at)) if function == 0 else log2(load(x, at)))
 
 
-def test_errors_of_exp2_and_log2() -> None:
+def test_errors_of_exp2_and_log2():
     """Of exp2 relative, over what blending needs, [-126, 0], and above. Of log2 absolute, beside
     one and a half units of the result (tests/other_libm); for every fifth mantissa of two octaves
     and all normal exponents.
@@ -89,7 +86,7 @@ def test_errors_of_exp2_and_log2() -> None:
 SIZES = [(1, 1), (3, 7), (11, 11), (12, 16), (33, 50), (17, 101)]
 
 
-def pair(height: int, width: int, seed: int = 0) -> tuple[Tensor, Tensor]:
+def pair(height, width, seed=0):
     """A smooth photograph with black and white parts, and a render of it that also leaves
     [0, 1].
     """
@@ -104,9 +101,7 @@ def pair(height: int, width: int, seed: int = 0) -> tuple[Tensor, Tensor]:
     return image, target
 
 
-def value_and_gradient(
-    function, image: Tensor, target: Tensor, weight: float
-) -> tuple[Tensor, Tensor]:
+def value_and_gradient(function, image, target, weight):
     leaf = image.clone().requires_grad_()
     loss = function(leaf, target, weight)
     (gradient,) = torch.autograd.grad(loss, leaf)
@@ -116,7 +111,7 @@ def value_and_gradient(
 @pytest.mark.parametrize(
     ("size", "weight"), [(size, (0.0, 0.2, 1.0)[k % 3]) for k, size in enumerate(SIZES)]
 )
-def test_fused_loss_matches_the_plain_loss(size: tuple[int, int], weight: float) -> None:
+def test_fused_loss_matches_the_plain_loss(size, weight):
     """In float32, against float64: the value within 2e-6, the gradient within 1e-4 of its
     length.
     """
@@ -131,7 +126,7 @@ def test_fused_loss_matches_the_plain_loss(size: tuple[int, int], weight: float)
     assert error <= 1e-4 * expected.norm().item()
 
 
-def test_threads_and_strides_change_nothing() -> None:
+def test_threads_and_strides_change_nothing():
     image, target = pair(33, 50)
     want = value_and_gradient(photometric_loss, image, target, 0.2)
     for count in (1, 3):
@@ -151,7 +146,7 @@ def test_threads_and_strides_change_nothing() -> None:
 @pytest.mark.parametrize(
     ("size", "darker"), [(size, (1, 40)[k % 2]) for k, size in enumerate(SIZES)]
 )
-def test_training_and_report_metrics_agree(size: tuple[int, int], darker: int) -> None:
+def test_training_and_report_metrics_agree(size, darker):
     image, target = pair(*size)
     target = target // darker
     shown, photo = image.clamp(0, 1), target / 255
@@ -165,7 +160,7 @@ def test_training_and_report_metrics_agree(size: tuple[int, int], darker: int) -
 
 
 @pytest.mark.parametrize("function", [losses.psnr, lambda *given: losses.psnr_ssim(*given)[0]])
-def test_psnr_of_known_images(function) -> None:
+def test_psnr_of_known_images(function):
     black = torch.zeros(12, 12, 3, dtype=torch.uint8)
     assert function(torch.full((12, 12, 3), 0.5), black) == pytest.approx(
         20 * math.log10(2), abs=1e-6

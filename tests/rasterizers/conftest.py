@@ -4,11 +4,11 @@ import pytest
 import torch
 
 import gsplat_in_torch
-from backends import BACKENDS, Backend
+from backends import BACKENDS
 
 
 @pytest.fixture(params=BACKENDS)
-def rasterize(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Backend:
+def rasterize(request, monkeypatch):
     backend = BACKENDS[request.param]
     if backend.module == "cuda":
         pytest.importorskip("gsplat", reason="pip install gsplat==1.5.3")

@@ -5,7 +5,6 @@ plain loops: scipy's rotations, mpmath's harmonics, finite differences of a pinh
 import dataclasses
 import math
 from types import SimpleNamespace
-from typing import Any
 
 import mpmath
 import numpy as np
@@ -15,12 +14,12 @@ from scipy.spatial.transform import Rotation
 
 from clod_adapter.cameras import Camera
 from clod_adapter.config import CLASSIC, FILTERS, ScreenFilter
-from clod_adapter.rasterizers import Splat, reference
-from oracle import BACKGROUND, IMAGE, ON_A_CUT, Parameters, assert_agrees
+from clod_adapter.rasterizers import reference
+from oracle import BACKGROUND, IMAGE, ON_A_CUT, assert_agrees
 from scenes import camera, in_front, scene
 
 
-def harmonics(direction: np.ndarray) -> np.ndarray:
+def harmonics(direction):
     """sqrt(2) Im Y_lm for m < 0 and Re for m > 0, with the Condon-Shortley phase, in the order of
     l, then m.
     """
@@ -34,16 +33,14 @@ def harmonics(direction: np.ndarray) -> np.ndarray:
     return np.array(values)
 
 
-def drawn(
-    some: Parameters, view: Camera, screen_filter: ScreenFilter
-) -> tuple[np.ndarray, np.ndarray]:
+def drawn(some, view, screen_filter):
     """Image and alpha, one Gaussian after another, those in front first."""
     world, K, eye = (x.double().numpy() for x in (view.viewmat, view.K, view.position))
     g = SimpleNamespace(**{name: x.double().numpy() for name, x in some.items()})
     y, x = np.mgrid[: view.height, : view.width] + 0.5
     image, through = np.zeros((view.height, view.width, 3)), np.ones((view.height, view.width))
 
-    def pixel(point: np.ndarray) -> np.ndarray:
+    def pixel(point):
         return (K @ point)[:2] / point[2]
 
     points = g.means @ world[:3, :3].T + world[:3, 3]
@@ -73,7 +70,7 @@ def drawn(
 @pytest.mark.parametrize(
     "screen_filter", [CLASSIC, ScreenFilter(variance=0.7, compensate=True)], ids=str
 )
-def test_images_are_those_of_plain_loops(screen_filter: ScreenFilter) -> None:
+def test_images_are_those_of_plain_loops(screen_filter):
     """Of 80 Gaussians within the picture; a part of its pixels ends."""
     view, some = camera(41, 31), scene(80, 4, 3, size=0.3)
     places = torch.rand(80, 3, generator=torch.Generator().manual_seed(0)) - torch.tensor(
@@ -98,7 +95,7 @@ SIZES = [(61, 45), (33, 70), (97, 31), (64, 64), (5, 7)]
 
 
 @pytest.mark.parametrize("degree", range(5))
-def test_random_scenes(rasterize: Splat, degree: int) -> None:
+def test_random_scenes(rasterize, degree):
     seed, (width, height) = degree % 2, SIZES[degree]
     size = (0.05, 0.1, 0.3)[degree % 3]
     view = camera(width, height, off_centre=(0.52, 0.47) if seed else (0.31, 0.72))
@@ -115,13 +112,13 @@ def test_random_scenes(rasterize: Splat, degree: int) -> None:
         camera(50, 40, off_centre=(1.3, -0.2)),
     ],
 )
-def test_sizes_and_lenses(rasterize: Splat, view: Camera) -> None:
+def test_sizes_and_lenses(rasterize, view):
     """With the wide one, centres are far outside the image, where the Jacobian's ray is clamped."""
     assert_agrees(rasterize, scene(120, 1, 7, size=0.3), view, cut=0.05)
 
 
 @pytest.mark.parametrize("near", [1e-6, 3.0])
-def test_near_the_camera_plane(rasterize: Splat, near: float) -> None:
+def test_near_the_camera_plane(rasterize, near):
     """Centres just before, on and just beyond the near plane; those before it are not drawn."""
     view, unit = camera(40, 30), near / 0.01
     some = scene(60, 2, 3)
@@ -138,7 +135,7 @@ def test_near_the_camera_plane(rasterize: Splat, near: float) -> None:
 
 
 @pytest.mark.parametrize("saturated", [False, True])
-def test_opaque_layers(rasterize: Splat, saturated: bool) -> None:
+def test_opaque_layers(rasterize, saturated):
     """Gaussians behind the end of a pixel are not drawn; at opacity 1 alpha is clamped and has no
     gradient.
     """
@@ -152,9 +149,7 @@ def test_opaque_layers(rasterize: Splat, saturated: bool) -> None:
     [((1.0, 1e-6, 1e-6), 0), ((0.3, 3e-7, 3e-7), 1), ((0.3, 0.3, 3e-7), 2)],
     ids=["needle", "short", "disc"],
 )
-def test_axis_ratio_of_a_million(
-    rasterize: Splat, scales: tuple[float, float, float], seed: int
-) -> None:
+def test_axis_ratio_of_a_million(rasterize, scales, seed):
     """Bounds of a needle are wider: its exponent is a small difference of terms of up to
     ``61^2 / (2 x 0.3) = 6,200``, each rounded by ``2^-24`` of itself in float32, in all by about
     1e-3.
@@ -166,7 +161,7 @@ def test_axis_ratio_of_a_million(
 
 
 @pytest.mark.parametrize(("axes", "length"), [(1, 1e-8), (3, 0.0), (3, 1e3), (1, 1e4)])
-def test_extreme_scales(rasterize: Splat, axes: int, length: float) -> None:
+def test_extreme_scales(rasterize, axes, length):
     if axes == 1 and length >= 100 and getattr(rasterize, "looser", 1.0) > 1:
         pytest.skip("gsplat takes the determinant in float32, where that of such a needle cancels")
     some = scene(100, 1, 5)
@@ -176,7 +171,7 @@ def test_extreme_scales(rasterize: Splat, axes: int, length: float) -> None:
     assert_agrees(rasterize, some, camera(), image=IMAGE if axes == 3 or length < 1 else 1e-4)
 
 
-def test_thousands_in_one_tile(rasterize: Splat) -> None:
+def test_thousands_in_one_tile(rasterize):
     some = scene(20_000, 1, 2, size=0.02)
     some["means"] *= 0.5
     some["opacities"] = some["opacities"] * 0.02 + 1 / 255
@@ -195,7 +190,7 @@ def test_thousands_in_one_tile(rasterize: Splat) -> None:
     ],
     ids=str,
 )
-def test_screen_filters(rasterize: Splat, scales: Any, screen_filter: ScreenFilter) -> None:
+def test_screen_filters(rasterize, scales, screen_filter):
     """From a tenth of a pixel to several; needles, which have no area and are not drawn, and discs
     from the edge.
     """
@@ -210,7 +205,7 @@ def test_screen_filters(rasterize: Splat, scales: Any, screen_filter: ScreenFilt
     assert_agrees(rasterize, some, view, screen_filter=screen_filter, image=image, cut=cut)
 
 
-def test_an_ellipse_beyond_the_range_of_integers(rasterize: Splat) -> None:
+def test_an_ellipse_beyond_the_range_of_integers(rasterize):
     """The centre is 1e12 pixels away, the long axis crosses the image; all pixels are finite and in
     range.
     """

@@ -8,17 +8,15 @@ import re
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from types import ModuleType
-from typing import Any
 
 import pytest
 import torch
-from torch import Tensor
+from refusals import refused
 
 import gsplat_in_torch as kernels
 import gsplat_versions
-from backends import Backend, torch_threads
+from backends import torch_threads
 from clod_adapter.config import FILTERS
-from clod_adapter.errors import ClodError
 from clod_adapter.rasterizers import cpu, cuda, for_device
 from oracle import BACKGROUND, Result, assert_same, differentiate, weights
 from scenes import camera, scene
@@ -26,20 +24,18 @@ from scenes import camera, scene
 FIELDS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 
 
-def test_for_device(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_for_device(monkeypatch):
     assert for_device(torch.device("cpu")) is cpu.RASTERIZER
-    with pytest.raises(ClodError, match="no rasterizer for device meta"):
+    with refused("no rasterizer for device meta"):
         for_device(torch.device("meta"))
     monkeypatch.setattr(cuda, "unusable", lambda: None)
     assert for_device(torch.device("cuda:1")).splat is cuda.rasterize
     monkeypatch.setattr(cuda, "unusable", lambda: "gsplat is not there: pip install gsplat==1.5.3")
-    with pytest.raises(
-        ClodError, match=r"no rasterizer for the GPU: .*pip install gsplat==1.5.3; or use the CPU"
-    ):
+    with refused(r"no rasterizer for the GPU: .*pip install gsplat==1.5.3; or use the CPU"):
         for_device(torch.device("cuda"))
 
 
-def test_same_input_same_bits(rasterize: Backend) -> None:
+def test_same_input_same_bits(rasterize):
     view, some = camera(130, 97), scene(300 if rasterize.stands_in else 2000, 2, 1)
     given, results = {name: value.clone() for name, value in some.items()}, {}
     for count in (1, 1, 2, 2, 3):
@@ -54,7 +50,7 @@ def test_same_input_same_bits(rasterize: Backend) -> None:
     assert all(torch.equal(some[name], given[name]) for name in some)
 
 
-def test_several_forward_passes_keep_their_own_state(rasterize: Backend) -> None:
+def test_several_forward_passes_keep_their_own_state(rasterize):
     """Backward passes in any order and repeated, with images and gradients large enough for
     recycled memory.
     """
@@ -85,13 +81,13 @@ def test_several_forward_passes_keep_their_own_state(rasterize: Backend) -> None
         )
 
 
-def test_non_contiguous_tensors(rasterize: Backend) -> None:
+def test_non_contiguous_tensors(rasterize):
     """Strided inputs and incoming gradients; those of ``image.sum()`` are expanded, and alpha's are
     absent.
     """
     view, some = camera(), scene(200, 2, 0)
 
-    def strided(x: Tensor) -> Tensor:
+    def strided(x):
         return torch.stack([x, torch.full_like(x, math.nan)], -1)[..., 0]
 
     leaves = {
@@ -110,12 +106,12 @@ def test_non_contiguous_tensors(rasterize: Backend) -> None:
         )
 
 
-def test_calls_from_two_threads(rasterize: Backend) -> None:
+def test_calls_from_two_threads(rasterize):
     """As when a viewer draws during training."""
     cases = [(scene(400, 1, seed), camera(*size)) for seed, size in enumerate([(61, 45), (97, 31)])]
     want = [differentiate(rasterize, some, view, weights(view)) for some, view in cases]
 
-    def work(k: int) -> None:
+    def work(k):
         some, view = cases[k]
         for _ in range(3 if rasterize.stands_in else 15):
             assert_same(
@@ -129,7 +125,7 @@ def test_calls_from_two_threads(rasterize: Backend) -> None:
 @pytest.mark.parametrize(
     "case", ["none", "behind", "beside", "below 1/255", "opacity 0", "at the camera's centre"]
 )
-def test_an_empty_view_is_the_background(rasterize: Backend, case: str) -> None:
+def test_an_empty_view_is_the_background(rasterize, case):
     view, some = camera(), scene(0 if case == "none" else 50, 2, 0)
     if case in ("behind", "beside"):
         move = [0.0, 0.0, -20.0] if case == "behind" else [300.0, 0.0, 0.0]
@@ -151,9 +147,7 @@ def test_an_empty_view_is_the_background(rasterize: Backend, case: str) -> None:
     "case",
     ["below 1/255", "zero quaternion", "short quaternion", "compensated to below 1/255", *FIELDS],
 )
-def test_invisible_rows_and_those_that_are_not_finite_are_skipped(
-    rasterize: Backend, case: str
-) -> None:
+def test_invisible_rows_and_those_that_are_not_finite_are_skipped(rasterize, case):
     gone, below = torch.arange(300) % 11 < 5, math.nextafter(1 / 255, 0) - 1e-9
     values = (
         ((slice(None), math.nan), (0, math.inf), (0, -math.inf), (-1, math.nan))
@@ -186,9 +180,7 @@ def test_invisible_rows_and_those_that_are_not_finite_are_skipped(
 
 @pytest.mark.parametrize("screen_filter", ["off", "on"])
 @pytest.mark.parametrize("name", ["means", "scales", "quats", "opacities"])
-def test_extreme_rows_give_finite_results(
-    rasterize: Backend, screen_filter: str, name: str
-) -> None:
+def test_extreme_rows_give_finite_results(rasterize, screen_filter, name):
     view = camera()
     for value, columns in (
         (1e10, 0),
@@ -226,13 +218,7 @@ def test_extreme_rows_give_finite_results(
         ("", 1, ImportError("No module named 'gsplat'"), "gsplat.*pip install gsplat==1.5.3"),
     ],
 )
-def test_unusable_says_what_gsplat_lacks(
-    monkeypatch: pytest.MonkeyPatch,
-    version: str,
-    kernels: Any,
-    error: Exception | None,
-    reason: str,
-) -> None:
+def test_unusable_says_what_gsplat_lacks(monkeypatch, version, kernels, error, reason):
     top, package, backend = (
         ModuleType(name) for name in ("gsplat", "gsplat.cuda", "gsplat.cuda._backend")
     )
@@ -241,7 +227,7 @@ def test_unusable_says_what_gsplat_lacks(
         monkeypatch.setitem(sys.modules, module.__name__, module)
     real = builtins.__import__
 
-    def importing(name: str, *args: Any, **kwargs: Any) -> Any:
+    def importing(name, *args, **kwargs):
         if error and name == "gsplat":
             raise error
         return real(name, *args, **kwargs)
@@ -255,7 +241,7 @@ def test_unusable_says_what_gsplat_lacks(
     assert found is not None and re.search(reason, found) and "\n" not in found
 
 
-def kernel(name: str, version: str, given: dict[str, Any]) -> Any:
+def kernel(name, version, given):
     """A kernel in torch by a version's interface: its arguments, and the order of its results."""
     from gsplat.cuda import _torch_impl
 
@@ -284,14 +270,14 @@ def kernel(name: str, version: str, given: dict[str, Any]) -> Any:
 
 
 @pytest.mark.parametrize("version", gsplat_versions.signatures())
-def test_every_version_draws_the_same(monkeypatch: pytest.MonkeyPatch, version: str) -> None:
+def test_every_version_draws_the_same(monkeypatch, version):
     """Image and gradients; without opacities in the projection, as in 1.4.0, splats end a tenth
     nearer.
     """
     pytest.importorskip("gsplat", minversion="1.5.3", reason="pip install gsplat==1.5.3")
     pytest.importorskip("gsplat.cuda._torch_impl")
 
-    def drawn() -> list[Tensor]:
+    def drawn():
         some = {name: x.double().requires_grad_() for name, x in scene(120, 2, 3).items()}
         behind = torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64)
         image, alpha = cuda.rasterize(
@@ -304,7 +290,7 @@ def test_every_version_draws_the_same(monkeypatch: pytest.MonkeyPatch, version: 
             *(x.grad for x in some.values() if x.grad is not None),
         ]
 
-    def of(installed: str) -> list[Tensor]:
+    def of(installed):
         monkeypatch.setitem(sys.modules, "gsplat", gsplat_versions.module(installed, kernel))
         return drawn()
 

@@ -8,12 +8,10 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from torch import Tensor
 
 from backends import torch_threads
 from clod_adapter.config import FORMS, ScreenFilter
 from clod_adapter.equation.attenuation import SIGMA_MAX, dial
-from clod_adapter.gaussians import Gaussians
 from clod_adapter.rasterizers import Rasterizer, cpu, for_device, reference
 from scenes import camera, dialled, gaussians
 
@@ -21,10 +19,9 @@ VIEW = camera(45, 37)
 KERNELS, COMPOSED = for_device(torch.device("cpu")), Rasterizer(cpu.rasterize)
 EXACT = Rasterizer(reference.rasterize)
 SHAPE, COLOUR = ("means", "quats", "log_scales", "growth_d"), ("sh0", "shN")
-Found = tuple[Tensor, Tensor, dict[str, Tensor]]
 
 
-def results(rasterizer: Rasterizer, model: Gaussians, s: float, *frozen: str) -> Found:
+def results(rasterizer, model, s, *frozen):
     """Image and alpha, and the gradients of a random weighting of them, by attribute."""
     random = torch.Generator().manual_seed(3)
     leaves = {
@@ -39,7 +36,7 @@ def results(rasterizer: Rasterizer, model: Gaussians, s: float, *frozen: str) ->
     return image.detach(), alpha.detach(), dict(zip(asked, slopes, strict=True))
 
 
-def away_from_thresholds(model: Gaussians, s: float) -> Gaussians:
+def away_from_thresholds(model, s):
     """Without rows that rounding may cull, or draw with less than 1/255."""
     sure = (dial(model, VIEW, s).drawn - 1 / 255).abs() > 1e-5
     return model.select(
@@ -47,7 +44,7 @@ def away_from_thresholds(model: Gaussians, s: float) -> Gaussians:
     )
 
 
-def assert_same(model: Gaussians, s: float, *frozen: str) -> dict[str, Tensor]:
+def assert_same(model, s, *frozen):
     model = away_from_thresholds(model, s)
     *pictures, slopes = results(KERNELS, model, s, *frozen)
     double = model.replace(**{name: x.double() for name, x in model.tensors().items()})
@@ -66,7 +63,7 @@ def assert_same(model: Gaussians, s: float, *frozen: str) -> dict[str, Tensor]:
 
 
 @pytest.mark.parametrize("n", [0, 1, 15, 16, 17, 33, 200])
-def test_counts_around_sixteen(n: int) -> None:
+def test_counts_around_sixteen(n):
     with torch_threads(3):
         slopes = assert_same(dialled(n, 2, n).replace(growth_d=torch.linspace(-1, 2, n)), 2.0)
     assert n < 33 or all(bool(slope.any()) for slope in slopes.values())
@@ -81,9 +78,7 @@ def test_counts_around_sixteen(n: int) -> None:
     reference=st.sampled_from([0.0, 2.0]),
     mip=st.booleans(),
 )
-def test_any_settings(
-    grows: bool, s: float, seed: int, reference: float, mip: bool, form: str
-) -> None:
+def test_any_settings(grows, s, seed, reference, mip, form):
     model = dialled(90, 0, seed, reference_distance=reference, max_sv=45.0, form=form)
     model = model.replace(screen_filter=ScreenFilter(compensate=mip))
     if grows:
@@ -91,7 +86,7 @@ def test_any_settings(
     assert_same(model, s)
 
 
-def test_the_end_of_the_reach() -> None:
+def test_the_end_of_the_reach():
     """Gaussians at 0.9 to 1.01 of their reaches; and which are kept, to the rounding of float32."""
     model = dialled(3000, 0, 5)
     far = (model.means - VIEW.position).norm(dim=1) * 2 / 3
@@ -106,7 +101,7 @@ def test_the_end_of_the_reach() -> None:
     assert torch.equal(kept[sure], (share < 1)[sure])
 
 
-def test_frozen_attributes_and_models_without_a_dial() -> None:
+def test_frozen_attributes_and_models_without_a_dial():
     model = dialled(120, 1, 4).replace(growth_d=torch.full((120,), 0.5))
     for frozen in (SHAPE, COLOUR, (*SHAPE, *COLOUR), ("sigma_d", "opacity_logits"), SHAPE[:3]):
         assert_same(model, 2.0, *frozen)
@@ -114,7 +109,7 @@ def test_frozen_attributes_and_models_without_a_dial() -> None:
     assert_same(gaussians(100, 0, 0).replace(screen_filter=ScreenFilter(compensate=True)), 1.0)
 
 
-def test_extreme_values() -> None:
+def test_extreme_values():
     """Sigma, opacities and growth at their limits, and a Gaussian in the camera's centre."""
     sigmas = [0.0, -1.0, 1e-30, 1e-4, 1.0, SIGMA_MAX, 1e30, math.inf]
     logits, growths = (
@@ -137,7 +132,7 @@ def test_extreme_values() -> None:
 
 
 @pytest.mark.parametrize("rasterizer", [KERNELS, COMPOSED], ids=["kernels", "composed"])
-def test_a_row_with_infinite_sigma_has_no_dial(rasterizer: Rasterizer) -> None:
+def test_a_row_with_infinite_sigma_has_no_dial(rasterizer):
     """It is drawn as without a dial, however far the dial is turned, and its opacity has that
     gradient.
     """
@@ -154,7 +149,7 @@ def test_a_row_with_infinite_sigma_has_no_dial(rasterizer: Rasterizer) -> None:
     assert bool(rasterizer.kept(fixed, VIEW, 40.0).all())
 
 
-def test_distances_of_another_camera_and_a_growth_that_is_not_finite() -> None:
+def test_distances_of_another_camera_and_a_growth_that_is_not_finite():
     model, other = dialled(50, 0, 1), camera(45, 37, fov=70)
     found = [each.draw(model, VIEW, 2.0, seen_from=other)[0] for each in (KERNELS, COMPOSED)]
     assert torch.equal(*found)
@@ -163,7 +158,7 @@ def test_distances_of_another_camera_and_a_growth_that_is_not_finite() -> None:
     )
 
 
-def test_gradients_beyond_the_trained_rows_are_0() -> None:
+def test_gradients_beyond_the_trained_rows_are_0():
     model = away_from_thresholds(dialled(90, 1, 2).replace(growth_d=torch.full((90,), 0.5)), 2.0)
     want, leaves = (
         results(KERNELS, model, 2.0)[2],
