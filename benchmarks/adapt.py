@@ -15,7 +15,7 @@ from statistics import fmean
 from typing import Any
 
 import clod_adapter as clod
-from common import Row, append, arguments, checkpoint, photographs, stored, table
+from common import Row, append, arguments, checkpoint, photographs, quality, stored, table
 
 FILE = "adapt.jsonl"
 DIALS = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0, 10.0, 14.0)
@@ -45,10 +45,10 @@ def _setting(text: str) -> tuple[str, Any]:
         return name, value
 
 
-def run(scene: str, label: str, config: clod.AdaptConfig, changed: dict[str, Any]) -> None:
+def run(scene: str, label: str, config: clod.AdaptConfig, changed: Row) -> None:
     base, views = checkpoint(scene), photographs(scene)
     dials = sorted({s for s in DIALS if s < config.max_sv} | {config.max_sv})
-    base_row = clod.evaluate(base.gaussians, views.test, [1.0])[0]
+    (base_row,) = quality(base.gaussians, views.test, 1.0)
     plan = clod.make_plan(base.gaussians, views, config)
     adapted = plan.adapt(views)
     adapter = clod.extract(
@@ -64,8 +64,8 @@ def run(scene: str, label: str, config: clod.AdaptConfig, changed: dict[str, Any
             "changed": changed,
             "config": asdict(config),
             "base_count": len(base.gaussians),
-            "base": base_row.as_dict(),
-            "rows": [row.as_dict() for row in clod.evaluate(result, views.test, dials)],
+            "base": base_row,
+            "rows": quality(result, views.test, dials),
             "at_shares": at_shares(result, views.test),
             "steps": adapted.steps,
             "share": plan.config.share,
@@ -75,53 +75,46 @@ def run(scene: str, label: str, config: clod.AdaptConfig, changed: dict[str, Any
     )
 
 
-def at_shares(model: clod.Gaussians, views: Sequence[clod.View]) -> list[dict[str, float]]:
+def at_shares(model: clod.Gaussians, views: Sequence[clod.View]) -> list[Row]:
     """Rows at the dial values that keep SHARES of the Gaussians, as far as the dial goes."""
-    found = []
+    cameras = [view.camera for view in views]
+    rows = []
     for share in SHARES:
         try:
-            solved = clod.dial_for(
-                model, keep=share * model.whole, cameras=[view.camera for view in views]
-            )
+            solved = clod.dial_for(model, keep=share * model.whole, cameras=cameras)
         except clod.ClodError:
             continue  # out of the dial's reach
         if not solved.note:
-            found.append(
-                {"share": share, **clod.evaluate(model, views, [solved.virtual_scale])[0].as_dict()}
-            )
-    return found
+            (row,) = quality(model, views, solved.virtual_scale)
+            rows.append({"share": share, **row})
+    return rows
+
+
+def psnr_at(row: Row, share: float) -> float | None:
+    """PSNR of ``at_shares`` in a stored row; None where the dial does not go as far."""
+    return next((point["psnr"] for point in row["at_shares"] if point["share"] == share), None)
 
 
 def print_table() -> None:
     """PSNR at s = 1 and at the matched shares, means over the seeds, a line a setting."""
     groups: dict[tuple[str, str, int], dict[int, Row]] = {}
     for row in stored(FILE):
-        groups.setdefault((row["scene"], row["label"], row["steps"]), {})[row["config"]["seed"]] = (
-            row
-        )
+        by_seed = groups.setdefault((row["scene"], row["label"], row["steps"]), {})
+        by_seed[row["config"]["seed"]] = row
     lines = []
-    for (scene, label, steps), seeds in groups.items():
-        rows = list(seeds.values())
-        full = [fmean(row["rows"][0][key] for row in rows) for key in ("psnr", "kept_share")]
-        found = [
-            [r["psnr"] for row in rows for r in row["at_shares"] if r["share"] == share]
-            for share in SHARES
-        ]
-        cells = [f"{fmean(psnr):.2f}" if len(psnr) == len(rows) else "" for psnr in found]
-        seconds = fmean(row["start_seconds"] + row["train_seconds"] for row in rows)
-        head = [scene, label, steps, len(rows), f"{seconds:.0f}", f"{rows[0]['base']['psnr']:.2f}"]
-        lines.append([*head, f"{full[0]:.2f} @ {full[1]:.0%}", *cells])
-    heads = [
-        "scene",
-        "settings",
-        "steps",
-        "seeds",
-        "seconds",
-        "base",
-        "s = 1",
-        *(f"{share:.0%}" for share in SHARES),
-    ]
-    print(table(heads, lines))
+    for key, by_seed in groups.items():
+        runs = list(by_seed.values())
+        seconds = fmean(run["start_seconds"] + run["train_seconds"] for run in runs)
+        psnr = fmean(run["rows"][0]["psnr"] for run in runs)
+        kept = fmean(run["rows"][0]["kept_share"] for run in runs)
+        line = [*key, len(runs), f"{seconds:.0f}", f"{runs[0]['base']['psnr']:.2f}"]
+        line.append(f"{psnr:.2f} @ {kept:.0%}")
+        for share in SHARES:
+            matched = [psnr_at(run, share) for run in runs]
+            line.append("" if None in matched else f"{fmean(matched):.2f}")
+        lines.append(line)
+    heads = ["scene", "settings", "steps", "seeds", "seconds", "base", "s = 1"]
+    print(table([*heads, *(f"{share:.0%}" for share in SHARES)], lines))
 
 
 if __name__ == "__main__":

@@ -16,10 +16,11 @@ and tuned further on those that are left.
 
 import json
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 
 import clod_adapter as clod
-from common import CACHE, COMMAND, Process, Row, append, arguments, capture, stored, table
+from common import CACHE, Row, append, arguments, capture, clod_adapt, quality, stored, table
 from from_points import thin, write_base
 from tuning import Tuning, tune
 
@@ -29,7 +30,7 @@ ITERS, FINAL = 1500, 0.01  # of tuning a checkpoint further
 
 
 def main() -> None:
-    parser = arguments(__doc__, table=print_table, record=FILE)
+    parser = arguments(__doc__, table=lambda: print_table(stored(FILE)), record=FILE)
     parser.add_argument("folders", nargs="+", metavar="FOLDER")
     parser.add_argument(
         "--every", type=int, metavar="K", help="captures, of which one photograph in K is used"
@@ -53,11 +54,10 @@ def make(source: Path, every: int, start: str | None) -> Path:
     if start is None:
         write_base(folder)
     else:
-        begun = clod.load(source / start)
-        tuned, _ = tune(
-            begun.gaussians, clod.load_scene(folder).train, Tuning(iters=ITERS, final=FINAL)
-        )
-        clod.save(base, tuned, begun)
+        pretrained = clod.load(source / start)
+        views = clod.load_scene(folder).train
+        tuned, _ = tune(pretrained.gaussians, views, Tuning(iters=ITERS, final=FINAL))
+        clod.save(base, tuned, pretrained)
     return folder
 
 
@@ -66,11 +66,11 @@ def run(folder: Path, *, record: bool) -> None:
     base, scene = clod.load(folder / "base.ply"), clod.load_scene(folder)
     with tempfile.TemporaryDirectory() as place:
         out = Path(place) / "dial.ply"
-        process = Process(
-            [*COMMAND, base.path, "--images", folder, "--out", out, "--accept-loss", "--quiet"]
+        process = clod_adapt(
+            base.path, "--images", folder, "--out", out, "--accept-loss", "--quiet"
         )
         report = json.loads(out.with_suffix(".json").read_text(encoding="utf-8"))
-        rows = clod.evaluate(clod.load(out).gaussians, scene.test, DIALS)
+        rows = quality(clod.load(out).gaussians, scene.test, DIALS)
     row: Row = {
         "benchmark": "converged",
         "name": folder.name,
@@ -78,46 +78,27 @@ def run(folder: Path, *, record: bool) -> None:
         "held_out": len(scene.test),
         "gaussians": len(base.gaussians),
         "base": report["base_rows"][0],
-        "rows": [each.as_dict() for each in rows],
+        "rows": rows,
         "steps": report["steps"],
         "seconds": round(process.seconds, 1),
     }
     if record:
         append(FILE, row)
-    print(table(HEADS, [cells(row)]))
+    print_table([row])
 
 
-HEADS = [
-    "scene",
-    "photographs",
-    "Gaussians",
-    "base",
-    *(f"s = {s:g}" for s in DIALS),
-    "steps",
-    "seconds",
-]
+def psnr_ssim(point: Row) -> str:
+    return f"{point['psnr']:.2f} / {point['ssim']:.3f}"
 
 
-def cells(row: Row) -> list[object]:
-    quality = [
-        f"{each['psnr']:.2f} / {each['ssim']:.3f} @ {each['kept_share']:.0%}"
-        for each in row["rows"]
-    ]
-    base = f"{row['base']['psnr']:.2f} / {row['base']['ssim']:.3f}"
-    seconds = f"{row['seconds']:.0f}"
-    return [
-        row["name"],
-        row["photographs"],
-        f"{row['gaussians']:,}",
-        base,
-        *quality,
-        row["steps"],
-        seconds,
-    ]
-
-
-def print_table() -> None:
-    print(table(HEADS, map(cells, stored(FILE))))
+def print_table(rows: Sequence[Row]) -> None:
+    lines = []
+    for row in rows:
+        line = [row["name"], row["photographs"], f"{row['gaussians']:,}", psnr_ssim(row["base"])]
+        line += [f"{psnr_ssim(point)} @ {point['kept_share']:.0%}" for point in row["rows"]]
+        lines.append([*line, row["steps"], f"{row['seconds']:.0f}"])
+    dials = (f"s = {s:g}" for s in DIALS)
+    print(table(["scene", "photographs", "Gaussians", "base", *dials, "steps", "seconds"], lines))
 
 
 if __name__ == "__main__":

@@ -14,12 +14,11 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from statistics import fmean
-from typing import Any
 
 import clod_adapter as clod
 from clod_adapter.initialization.importance import initialize, usable_views
 from clod_adapter.io.file_formats import FORMATS, WRITABLE, write
-from common import append, arguments, checkpoint, photographs, stored, table
+from common import Row, append, arguments, checkpoint, photographs, stored, table
 
 import torch
 
@@ -38,15 +37,11 @@ def run(scene: str, config: clod.AdaptConfig) -> None:
     base, views = checkpoint(scene).gaussians, photographs(scene)
     model = initialize(base, usable_views(base, views.train), config, lambda *_: None)
     cameras = [view.camera for view in views.test]
-    baked = {s: clod.bake(model, s, cameras=[view.camera for view in views.train]) for s in DIALS}
+    trained_on = [view.camera for view in views.train]
+    baked = {s: clod.bake(model, s, cameras=trained_on) for s in DIALS}
     for suffix in WRITABLE:
         dial = FORMATS[suffix].carries_sigma
-        row: dict[str, Any] = {
-            "benchmark": "formats",
-            "scene": scene,
-            "suffix": suffix,
-            "dial": dial,
-        }
+        row = {"benchmark": "formats", "scene": scene, "suffix": suffix, "dial": dial}
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / f"model{suffix}"
             for s in DIALS:
@@ -56,9 +51,11 @@ def run(scene: str, config: clod.AdaptConfig) -> None:
         append(FILE, row)
 
 
-def round_trip(path: Path, gaussians: clod.Gaussians) -> dict[str, Any]:
+def round_trip(path: Path, gaussians: clod.Gaussians) -> Row:
     """The size, and the largest relative error of sigma_d, of those of at least 1e-4."""
-    notes, again, error = write(path, gaussians), clod.load(path).gaussians, None
+    notes = write(path, gaussians)
+    again = clod.load(path).gaussians
+    error = None
     if gaussians.sigma_d is not None and again.sigma_d is not None:
         # SPZ moves the farthest nearer
         there = (again.means - gaussians.means).abs().amax(1) <= 1e-3
@@ -76,21 +73,22 @@ def round_trip(path: Path, gaussians: clod.Gaussians) -> dict[str, Any]:
 @torch.no_grad()
 def pictures(
     gaussians: clod.Gaussians, again: clod.Gaussians, cameras: Sequence[clod.Camera], s: float
-) -> dict[str, Any]:
+) -> Row:
     """PSNR between the two, the mean over the views."""
     decibels = []
     for camera in cameras:
-        ours, theirs = (clod.render(each, camera, virtual_scale=s) for each in (gaussians, again))
-        error = float((ours.image.clamp(0, 1) - theirs.image.clamp(0, 1)).double().square().mean())
+        before, after = (
+            clod.render(model, camera, virtual_scale=s).image.clamp(0, 1)
+            for model in (gaussians, again)
+        )
+        error = float((before - after).double().square().mean())
         decibels += [-10 * math.log10(error)] if error > 0 else []
     return {"psnr": round(fmean(decibels), 2) if len(decibels) == len(cameras) else None}
 
 
 def print_table() -> None:
     keys = ("scene", "suffix", "bytes_per_gaussian", "sigma_error")
-    lines = [
-        [*(row[key] for key in keys), row["s1"]["psnr"], row["s5"]["psnr"]] for row in stored(FILE)
-    ]
+    lines = [[*map(row.get, keys), row["s1"]["psnr"], row["s5"]["psnr"]] for row in stored(FILE)]
     print(table([*keys, "PSNR at s = 1", "at s = 5"], lines))
 
 

@@ -9,9 +9,7 @@ A failure is another exit code, a traceback or a warning, an error that is not o
 input that changed, or other new files than expected.
 """
 
-import argparse
 import gzip
-import hashlib
 import io
 import json
 import math
@@ -33,9 +31,9 @@ from pathlib import Path
 
 import clod_adapter
 from clod_adapter.gaussians import Gaussians
+from common import arguments
 from models import write_model
 
-# isort: split
 import torch
 from PIL import Image
 
@@ -76,60 +74,112 @@ def streams() -> Iterator[Case]:
     yield Case("clod-adapt export base.ply -o new.spz >&-", 0, ("new.spz",))
 
 
+VARIABLES = """
+NUMBA_NUM_THREADS=0
+NUMBA_NUM_THREADS=x
+OMP_NUM_THREADS=abc
+TMPDIR=/missing
+-u HOME
+HOME=
+COLUMNS=0
+COLUMNS=1
+COLUMNS=x
+TERM=
+LANG=xx_YY.z
+LC_ALL=C
+PYTHONOPTIMIZE=2
+PYTHONWARNINGS=error
+PYTHONIOENCODING=ascii
+PYTHONUTF8=0
+XDG_CACHE_HOME=/proc/x
+NUMBA_CACHE_DIR=/proc/x
+CUDA_VISIBLE_DEVICES=x
+RANK=x
+WORLD_SIZE=3
+-i PATH="$PATH"
+"""
+PATHS = r"""
+base.ply -o ""
+base.ply --out=
+base.ply --images ""
+""
+inspect ""
+export base.ply -o ""
+base.ply -o /proc/x.ply
+base.ply -o /dev/null
+inspect /dev/zero
+inspect /proc/self/mem
+inspect .
+inspect /proc/self/environ
+base.ply --images /proc/self
+base.ply --images /dev
+inspect "$(printf "a%.0s" $(seq 5000))"
+inspect $'a\nb.ply'
+inspect $'\xff.ply'
+export base.ply -o new
+export base.ply -o new.zip
+export base.ply -o missing/new.ply
+"""
+ADAPT = """
+--iters nan
+--iters 1e3
+--iters -1
+--iters 0x10
+--max-sv nan
+--max-sv inf
+--max-sv 0
+--max-sv 1e400
+--batch 0
+--batch 1000000
+--batch 1.5
+--seed -1
+--seed 99999999999999999999
+--time-budget 0
+--time-budget nan
+--time-budget inf
+--memory 0
+--memory nan
+--memory 8XB
+--memory 1e400GB
+--with x
+--missing
+--iters $(printf 1%.0s $(seq 100000))
+--max-sv
+"""
+EVALUATE = """
+--sv nan
+--sv inf
+--sv -1
+--keep 0
+--keep nan
+--psnr-drop 0
+--fps inf
+--sv
+"""
+EXPORT = """
+--levels nan
+--levels 1,,2
+--levels 1,1
+--camera ../x --images scene
+--order x
+"""
+
+
+def of_lines(command: str, lines: str) -> Iterator[Case]:
+    """The command with the words of each line, all refused."""
+    for words in lines.strip().splitlines():
+        yield Case(f"{command} {words}")
+
+
 def environments() -> Iterator[Case]:
-    for variables in (
-        "NUMBA_NUM_THREADS=0",
-        "NUMBA_NUM_THREADS=x",
-        "OMP_NUM_THREADS=abc",
-        "TMPDIR=/missing",
-        "-u HOME",
-        "HOME=",
-        "COLUMNS=0",
-        "COLUMNS=1",
-        "COLUMNS=x",
-        "TERM=",
-        "LANG=xx_YY.z",
-        "LC_ALL=C",
-        "PYTHONOPTIMIZE=2",
-        "PYTHONWARNINGS=error",
-        "PYTHONIOENCODING=ascii",
-        "PYTHONUTF8=0",
-        "XDG_CACHE_HOME=/proc/x",
-        "NUMBA_CACHE_DIR=/proc/x",
-        "CUDA_VISIBLE_DEVICES=x",
-        "RANK=x",
-        "WORLD_SIZE=3",
-        '-i PATH="$PATH"',
-    ):
+    for variables in VARIABLES.strip().splitlines():
         yield Case(f"env {variables} clod-adapt {EVAL}", 0)
     yield Case(f"env TMPDIR=/missing HOME=/missing clod-adapt {SCENE}", 0, FILES)
 
 
 def folders() -> Iterator[Case]:
     yield Case("mkdir gone; cd gone; rmdir ../gone; clod-adapt inspect ../base.ply")
-    for words in (
-        'base.ply -o ""',
-        "base.ply --out=",
-        'base.ply --images ""',
-        '""',
-        'inspect ""',
-        'export base.ply -o ""',
-        "base.ply -o /proc/x.ply",
-        "base.ply -o /dev/null",
-        "inspect /dev/zero",
-        "inspect /proc/self/mem",
-        "inspect .",
-        "inspect /proc/self/environ",
-        "base.ply --images /proc/self",
-        "base.ply --images /dev",
-        'inspect "$(printf "a%.0s" $(seq 5000))"',
-        "inspect $'a\\nb.ply'",
-        "inspect $'\\xff.ply'",
-        "export base.ply -o new",
-        "export base.ply -o new.zip",
-        "export base.ply -o missing/new.ply",
-    ):
-        yield Case(f"clod-adapt {words}")
+    yield from of_lines("clod-adapt", PATHS)
     yield Case("mkfifo p.ply; timeout 20 clod-adapt inspect p.ply; code=$?; rm p.ply; exit $code")
     yield Case(
         "ln -s loop.ply loop.ply; clod-adapt inspect loop.ply; code=$?; rm loop.ply; exit $code"
@@ -137,52 +187,9 @@ def folders() -> Iterator[Case]:
 
 
 def options() -> Iterator[Case]:
-    for words in (
-        "--iters nan",
-        "--iters 1e3",
-        "--iters -1",
-        "--iters 0x10",
-        "--max-sv nan",
-        "--max-sv inf",
-        "--max-sv 0",
-        "--max-sv 1e400",
-        "--batch 0",
-        "--batch 1000000",
-        "--batch 1.5",
-        "--seed -1",
-        "--seed 99999999999999999999",
-        "--time-budget 0",
-        "--time-budget nan",
-        "--time-budget inf",
-        "--memory 0",
-        "--memory nan",
-        "--memory 8XB",
-        "--memory 1e400GB",
-        "--with x",
-        "--missing",
-        "--iters $(printf 1%.0s $(seq 100000))",
-        "--max-sv",
-    ):
-        yield Case(f"clod-adapt base.ply --images scene -o new.ply {words}")
-    for words in (
-        "--sv nan",
-        "--sv inf",
-        "--sv -1",
-        "--keep 0",
-        "--keep nan",
-        "--psnr-drop 0",
-        "--fps inf",
-        "--sv",
-    ):
-        yield Case(f"clod-adapt eval base.ply --images scene {words}")
-    for words in (
-        "--levels nan",
-        "--levels 1,,2",
-        "--levels 1,1",
-        "--camera ../x --images scene",
-        "--order x",
-    ):
-        yield Case(f"clod-adapt export base.ply -o new.ply {words}")
+    yield from of_lines("clod-adapt base.ply --images scene -o new.ply", ADAPT)
+    yield from of_lines("clod-adapt eval base.ply --images scene", EVALUATE)
+    yield from of_lines("clod-adapt export base.ply -o new.ply", EXPORT)
     for port in ("-1", "65536", "nan"):
         yield Case(f"clod-adapt view base.ply --no-browser --port {port}")
 
@@ -191,17 +198,14 @@ def damaged(folder: Path, per_file: int) -> Iterator[Case]:
     """Files and scenes that lie about what they contain, and random damage to sound ones; each is
     inspected or read.
     """
-    ply, packed = (folder.parent / "base.ply").read_bytes(), zipped({"meta.json": b"{}"})
+    base = folder.parent / "base.ply"
+    suffixes = (".spz", ".glb", ".splat", ".pt", ".safetensors")
     spz = partial(struct.pack, "<IIIBBBB", 0x5053474E)
     contents = {
         "bomb.sog": zipped({"meta.json": b" " * 50_000_000}),
         "up.sog": zipped({"../../x": b"", "meta.json": b"{}"}),
-        "ply.spz": ply,
-        "ply.glb": ply,
-        "ply.splat": ply,
-        "ply.pt": ply,
-        "ply.safetensors": ply,
-        "sog.ply": packed,
+        **{f"ply{suffix}": base.read_bytes() for suffix in suffixes},
+        "sog.ply": zipped({"meta.json": b"{}"}),
         "count.spz": gzip.compress(spz(3, 2**31, 3, 12, 0, 0)),
         "odd.splat": bytes(33),
         "bomb.spz": gzip.compress(spz(3, 3, 0, 12, 0, 0) + bytes(100_000_000)),
@@ -214,12 +218,13 @@ def damaged(folder: Path, per_file: int) -> Iterator[Case]:
     for name, data in contents.items():
         (folder / name).write_bytes(data)
         yield Case(f"clod-adapt inspect {folder}/{name}")
-    chance, sound = random.Random(0), clod_adapter.load(folder.parent / "base.ply").gaussians
+    chance, gaussians = random.Random(0), clod_adapter.load(base).gaussians
     for suffix in (".ply", ".spz", ".glb", ".splat", ".safetensors", ".pt"):
+        sound = folder / f"sound{suffix}"
         with warnings.catch_warnings(action="ignore"):  # of rounding
-            clod_adapter.save(folder / f"sound{suffix}", sound)
+            clod_adapter.save(sound, gaussians)
         for number in range(per_file):
-            data = bytearray((folder / f"sound{suffix}").read_bytes())
+            data = bytearray(sound.read_bytes())
             # half of them in the first bytes, where headers are
             for _ in range(chance.choice((1, 4, 30))):
                 at = chance.randrange(len(data) if chance.random() < 0.5 else min(len(data), 600))
@@ -227,10 +232,7 @@ def damaged(folder: Path, per_file: int) -> Iterator[Case]:
             cut = chance.randrange(len(data)) if chance.random() < 0.2 else len(data)
             (folder / f"damaged{number}{suffix}").write_bytes(data[:cut])
             yield Case(f"clod-adapt inspect {folder}/damaged{number}{suffix}", None)
-    pose, photograph = (
-        [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 5], [0, 0, 0, 1]],
-        folder.parent / "scene/images/000.png",
-    )
+    pose = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 5], [0, 0, 0, 1]]
     frame = {"file_path": "a.png", "transform_matrix": pose, "fl_x": 30, "w": 64, "h": 48}
     changes = (
         {"file_path": "../../etc/passwd.png"},
@@ -245,24 +247,22 @@ def damaged(folder: Path, per_file: int) -> Iterator[Case]:
         scene = folder / f"transforms{number}"
         scene.mkdir()
         (scene / "transforms.json").write_text(json.dumps({"frames": [frame | change]}))
-        shutil.copyfile(photograph, scene / "a.png")
+        shutil.copyfile(folder.parent / "scene/images/000.png", scene / "a.png")
         yield Case(f"clod-adapt base.ply --images {scene} -o new.ply")
 
 
 def zipped(files: dict[str, bytes]) -> bytes:
-    found = io.BytesIO()
-    with zipfile.ZipFile(found, "w", zipfile.ZIP_DEFLATED) as archive:
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, data in files.items():
             archive.writestr(name, data)
-    return found.getvalue()
+    return file.getvalue()
 
 
 def glb(document: bytes) -> bytes:
     document += b" " * (-len(document) % 4)
-    return (
-        struct.pack("<IIIII", 0x46546C67, 2, 20 + len(document), len(document), 0x4E4F534A)
-        + document
-    )
+    sizes = (20 + len(document), len(document))
+    return struct.pack("<IIIII", 0x46546C67, 2, *sizes, 0x4E4F534A) + document
 
 
 def write_inputs(folder: Path) -> None:
@@ -278,10 +278,8 @@ def write_inputs(folder: Path) -> None:
         torch.zeros(200, 0, 3),
     )
     clod_adapter.save(folder / "base.ply", gaussians)
-    cameras, names = (
-        clod_adapter.place_cameras(gaussians)[:10],
-        [f"{number:03}.png" for number in range(10)],
-    )
+    cameras = clod_adapter.place_cameras(gaussians)[:10]
+    names = [f"{number:03}.png" for number in range(10)]
     (folder / "scene" / "images").mkdir(parents=True)
     write_model(folder / "scene", cameras, names)
     for camera, name in zip(cameras, names, strict=True):
@@ -304,40 +302,38 @@ def failures(case: Case, inputs: Path) -> list[str]:
         except subprocess.TimeoutExpired:
             return [f"takes more than {SECONDS} s"]
         after = contents(folder)
-    said, found = done.stderr.decode(errors="replace"), list[str]()
+    stderr = done.stderr.decode(errors="replace")
+    wrong = []
     if done.returncode not in ((0, 2) if case.code is None else (case.code,)):
-        found.append(f"exit code {done.returncode}")
-    if match := NOISE.search(said):
-        found.append(f"prints {match[0]}")
-    lines = [line for line in said.splitlines() if line]
+        wrong.append(f"exit code {done.returncode}")
+    if match := NOISE.search(stderr):
+        wrong.append(f"prints {match[0]}")
+    lines = [line for line in stderr.splitlines() if line]
     errors = [line for line in lines if line.startswith("clod-adapt: error: ")]
     if done.returncode == 2 and case.told and (errors != lines[-1:] or len(errors[0]) > 11_000):
-        found.append("no error in one last line")
-    if any(after.get(name) != data for name, data in before.items()):
-        found.append("changes an input")
-    if (new := {name for name in after.keys() - before.keys() if "/" not in name}) != set(case.new):
-        found.append(f"leaves {sorted(new)}")
-    return [*found, *lines[-5:]] if found else []
+        wrong.append("no error in one last line")
+    if not before.items() <= after.items():
+        wrong.append("changes an input")
+    new = {name for name in after.keys() - before.keys() if "/" not in name}
+    if new != set(case.new):
+        wrong.append(f"leaves {sorted(new)}")
+    return [*wrong, *lines[-5:]] if wrong else []
 
 
 def contents(folder: Path) -> dict[str, bytes]:
     files = (path for path in folder.rglob("*") if path.is_file())
-    return {
-        str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).digest() for path in files
-    }
+    return {str(path.relative_to(folder)): path.read_bytes() for path in files}
 
 
 def cases(inputs: Path, per_file: int) -> list[Case]:
     """All cases; the files that they read are written beside the inputs."""
-    (inputs / "files").mkdir()
-    groups = (streams(), environments(), folders(), options(), damaged(inputs / "files", per_file))
-    return [case for group in groups for case in group]
+    files = inputs / "files"
+    files.mkdir()
+    return [*streams(), *environments(), *folders(), *options(), *damaged(files, per_file)]
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = arguments(__doc__)
     parser.add_argument("--only", default="", help="only the lines with this text")
     parser.add_argument(
         "--files", type=int, default=10, help="files of each format that are damaged at random"
@@ -346,17 +342,14 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name, ThreadPoolExecutor(os.cpu_count()) as pool:
         write_inputs(inputs := Path(name))
         chosen = [case for case in cases(inputs, args.files) if args.only in case.line]
-        wrong = 0
-        for case, found in zip(
-            chosen, pool.map(partial(failures, inputs=inputs), chosen), strict=True
-        ):
-            if found:
-                wrong += 1
-                print(
-                    f"{case.line[:200]}\n  " + "\n  ".join(line[:300] for line in found), flush=True
-                )
-    print(f"{len(chosen)} cases, {wrong} failures")
-    sys.exit(wrong > 0)
+        failed = 0
+        results = pool.map(partial(failures, inputs=inputs), chosen)
+        for case, lines in zip(chosen, results, strict=True):
+            if lines:
+                failed += 1
+                print(case.line[:200], *(line[:300] for line in lines), sep="\n  ", flush=True)
+    print(f"{len(chosen)} cases, {failed} failures")
+    sys.exit(failed > 0)
 
 
 if __name__ == "__main__":

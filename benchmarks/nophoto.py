@@ -13,9 +13,9 @@ import time
 from dataclasses import asdict
 
 import clod_adapter as clod
-from adapt import at_shares
+from adapt import at_shares, psnr_at
 from clod_adapter.training.pseudo_views import with_pseudo_views
-from common import append, arguments, checkpoint, stored, table
+from common import append, arguments, checkpoint, quality, stored, table
 from common import photographs as photographs_of
 
 FILE = "nophoto.jsonl"
@@ -33,11 +33,10 @@ def main() -> None:
     parser.add_argument(
         "--iters", type=int, help="training steps (default: by the number of views, as clod-adapt)"
     )
-    parser.add_argument("--max-sv", type=float, default=7.0)
     args = parser.parse_args()
     for scene in args.scenes:
         for kind in args.kinds:
-            run(scene, kind, clod.AdaptConfig(iters=args.iters, max_sv=args.max_sv), args.few)
+            run(scene, kind, clod.AdaptConfig(iters=args.iters, max_sv=DIALS[-1]), args.few)
 
 
 def run(scene: str, kind: str, config: clod.AdaptConfig, few: int | None) -> None:
@@ -45,16 +44,13 @@ def run(scene: str, kind: str, config: clod.AdaptConfig, few: int | None) -> Non
     if few:
         train = photographs.train[:: max(len(photographs.train) // few, 1)][:few]
         photographs = clod.Scene(train, photographs.test)
-    base_row = clod.evaluate(base, photographs.test, [1.0])[0]
-    began, views = time.perf_counter(), photographs
+    (base_row,) = quality(base, photographs.test, 1.0)
+    began = time.perf_counter()
+    views = photographs
     if kind != "photographs":
-        shown = None if kind == "placed" else photographs
-        views = with_pseudo_views(base, shown, config.seed)
+        views = with_pseudo_views(base, None if kind == "placed" else photographs, config.seed)
     seconds = time.perf_counter() - began
-    plan = clod.make_plan(base, views, config)
-    adapted = plan.adapt(views)
-    result = adapted.gaussians
-    rows = clod.evaluate(result, photographs.test, [s for s in DIALS if s <= config.max_sv])
+    adapted = clod.make_plan(base, views, config).adapt(views)
     append(
         FILE,
         {
@@ -64,9 +60,9 @@ def run(scene: str, kind: str, config: clod.AdaptConfig, few: int | None) -> Non
             "config": asdict(config),
             "views": len(views.train),
             "photographs": len(photographs.train),
-            "base": base_row.as_dict(),
-            "rows": [row.as_dict() for row in rows],
-            "at_shares": at_shares(result, photographs.test),
+            "base": base_row,
+            "rows": quality(adapted.gaussians, photographs.test, DIALS),
+            "at_shares": at_shares(adapted.gaussians, photographs.test),
             "steps": adapted.steps,
             "views_seconds": round(seconds, 2),
             "train_seconds": round(adapted.seconds, 2),
@@ -77,27 +73,14 @@ def run(scene: str, kind: str, config: clod.AdaptConfig, few: int | None) -> Non
 def print_table() -> None:
     lines = []
     for row in stored(FILE):
-        cells = [f"{r['psnr']:.2f} @ {r['kept_share']:.1%}" for r in row["rows"]]
-        cells += [""] * (len(DIALS) - len(cells))
-        cells.append(next((f"{r['psnr']:.2f}" for r in row["at_shares"] if r["share"] == 0.12), ""))
-        head = [
-            row["scene"],
-            row["steps"],
-            row["photographs"],
-            row["kind"],
-            f"{row['base']['psnr']:.2f}",
-        ]
-        lines.append([*head, *cells])
-    heads = [
-        "scene",
-        "steps",
-        "photographs",
-        "views",
-        "base",
-        *(f"s = {s:g}" for s in DIALS),
-        "12 %",
-    ]
-    print(table(heads, lines))
+        line = [row["scene"], row["steps"], row["photographs"], row["kind"]]
+        line.append(f"{row['base']['psnr']:.2f}")
+        line += [f"{point['psnr']:.2f} @ {point['kept_share']:.1%}" for point in row["rows"]]
+        matched = psnr_at(row, 0.12)
+        line.append("" if matched is None else f"{matched:.2f}")
+        lines.append(line)
+    heads = ["scene", "steps", "photographs", "views", "base"]
+    print(table([*heads, *(f"s = {s:g}" for s in DIALS), "12 %"], lines))
 
 
 if __name__ == "__main__":

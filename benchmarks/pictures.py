@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import clod_adapter as clod
-from clod_adapter.demo import CROP, VIEW, dial_strip, measured
+from clod_adapter.demo import VIEW, dial_strip, measured
 from clod_adapter.evaluation.budget import matching_dial
 from clod_adapter.io.atomic import atomic_path
 from common import ROOT, arguments
@@ -50,22 +50,16 @@ def dial(folder: Path) -> bytes:
     s = matching_dial(model, [view.camera], SHARE * len(base))
     with tempfile.TemporaryDirectory() as made:
         file = Path(made) / "dial.png"
-        dial_strip(file, measured(base, model, [s], view), TITLE, crop=CROP)
+        dial_strip(file, measured(base, model, [s], view), TITLE)
         return file.read_bytes()
 
 
 def viewer(chromium: Any, folder: Path) -> bytes:
     """The page in dark."""
-    camera = clod.load_scene(folder / "capture").test[VIEW].camera
-    words = [
-        folder / "gallery.ply",
-        "--base",
-        folder / "base.ply",
-        "--images",
-        folder / "capture",
-        "--sv",
-        DIAL,
-    ]
+    capture = folder / "capture"
+    camera = clod.load_scene(capture).test[VIEW].camera
+    words = [folder / "gallery.ply", "--base", folder / "base.ply", "--images", capture]
+    words += ["--sv", DIAL]
     with serve(*words) as url, chromium.new_context(viewport=SIZE, color_scheme="dark") as context:
         shown = Shown(context.new_page()).ready(url)
         cameras = shown.run(

@@ -25,41 +25,26 @@ def main() -> None:
 
 
 def run(name: str) -> None:
-    torchrun = [
-        sys.executable,
-        "-m",
-        "torch.distributed.run",
-        "--standalone",
-        "--nproc-per-node",
-        2,
-        "-m",
-    ]
+    torchrun = "-m torch.distributed.run --standalone --nproc-per-node 2 -m clod_adapter"
     runs = {
         "one view": (COMMAND, {"iters": 300, "batch": 1}),
         "two views": (COMMAND, {"iters": 150, "batch": 2}),
-        "two processes": ((*torchrun, "clod_adapter"), {"iters": 150, "batch": 2}),
+        "two processes": ((sys.executable, *torchrun.split()), {"iters": 150, "batch": 2}),
     }
+    base = capture(name) / "pretrained.ply"
     with tempfile.TemporaryDirectory() as folder:
-        found, files = {}, []
-        for label, (command, options) in runs.items():
+        rows, files = {}, []
+        for label, (command, settings) in runs.items():
             out = Path(folder) / f"{label}.ply".replace(" ", "_")
-            words = [
-                capture(name) / "pretrained.ply",
-                "--images",
-                capture(name),
-                "--out",
-                out,
-                "--quiet",
-            ]
-            run = Process(
-                [*command, *words, *(w for k, v in options.items() for w in (f"--{k}", v))]
-            )
+            words = [base, "--images", capture(name), "--out", out, "--quiet"]
+            for option, value in settings.items():
+                words += [f"--{option}", value]
+            run = Process([*command, *words])
             report = json.loads(out.with_suffix(".json").read_text(encoding="utf-8"))
-            found[label] = options | run.cost() | {"rows": report["rows"]}
+            rows[label] = settings | run.cost() | {"rows": report["rows"]}
             files.append(clod.load(out).gaussians)
-        append(
-            FILE, {"what": "processes", "scene": name, "runs": found, "alike": files[1] == files[2]}
-        )
+    alike = files[1] == files[2]
+    append(FILE, {"what": "processes", "scene": name, "runs": rows, "alike": alike})
 
 
 if __name__ == "__main__":

@@ -18,25 +18,21 @@ import tempfile
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 import clod_adapter as clod
-from clod_adapter.initialization.importance import removal_error
 from common import (
-    COMMAND,
-    Process,
     Row,
     append,
     arguments,
     capture,
     checkpoint,
-    falling,
-    head,
+    clod_adapt,
     photographs,
+    quality,
     stored,
     table,
 )
-from tuning import MERGINGS, Tuning, find_tool, merge, tune
+from tuning import MERGINGS, Tuning, by_importance, find_tool, merge, tune
 
 FILE = "rivals.jsonl"
 RIVALS = ("merging", "specialist", "tuned", "prefix", "ranking", "kept")
@@ -54,11 +50,14 @@ def main() -> None:
     args = parser.parse_args()
     for scene in args.scenes:
         base, views = checkpoint(scene), photographs(scene)
-        (untouched,) = clod.evaluate(base.gaussians, views.test, [1.0])
+        (untouched,) = quality(base.gaussians, views.test, 1.0)
         for rival in args.only:
             folder = capture(scene.partition("/")[0])
             for label, files, more in contest(rival, base, folder, views, args.iters):
-                rows = [measured(each, share, views) for share, each in files.items()]
+                rows = []
+                for share, gaussians in files.items():
+                    (row,) = quality(gaussians, views.test, 1.0)
+                    rows.append({"share": share, "count": len(gaussians), **row})
                 append(
                     FILE,
                     {
@@ -67,38 +66,30 @@ def main() -> None:
                         "rival": rival,
                         "label": label,
                         "base_count": len(base.gaussians),
-                        "base": untouched.as_dict(),
+                        "base": untouched,
                         "rows": rows,
                         **more,
                     },
                 )
 
 
-def measured(gaussians: clod.Gaussians, share: float, views: clod.Scene) -> Row:
-    (row,) = clod.evaluate(gaussians, views.test, [1.0])
-    return {"share": share, "count": len(gaussians), **row.as_dict()}
-
-
 def contest(
     rival: str, base: clod.Checkpoint, folder: Path, views: clod.Scene, iters: int
-) -> Iterator[tuple[str, Mapping[float, clod.Gaussians], dict[str, Any]]]:
+) -> Iterator[tuple[str, Mapping[float, clod.Gaussians], Row]]:
     """For each row: label, file by share, and what else is recorded."""
-    some, train, config = (
-        base.gaussians,
-        views.train,
-        Tuning(iters=iters, prefixes=rival == "prefix"),
-    )
-    counts = {share: max(round(share * len(some)), 1) for share in SHARES}
+    gaussians = base.gaussians
+    train = views.train
+    config = Tuning(iters=iters, prefixes=rival == "prefix")
+    counts = {share: max(round(share * len(gaussians)), 1) for share in SHARES}
     about = {"config": asdict(config), "steps": iters}
     if rival == "merging":
         for method in MERGINGS:
-            merged = {share: merge(base, count, method) for share, count in counts.items()}
+            files, seconds = {}, []
+            for share, count in counts.items():
+                files[share], merging = merge(base, count, method)
+                seconds.append(merging)
             label = f"splat-transform {find_tool().version} {method}"
-            yield (
-                label,
-                {s: m[0] for s, m in merged.items()},
-                {"merge_seconds": [m[1] for m in merged.values()]},
-            )
+            yield label, files, {"merge_seconds": seconds}
     elif rival == "specialist":
         for share, count in counts.items():
             start, merging = merge(base, count)
@@ -106,21 +97,21 @@ def contest(
             more = {"train_seconds": seconds, "merge_seconds": merging}
             yield f"merged {MERGINGS[0]}, then tuned", {share: tuned}, about | more
     elif rival == "tuned":
-        tuned, seconds = tune(some, train, config)
+        tuned, seconds = tune(gaussians, train, config)
         yield "tuned base", {1.0: tuned}, about | {"train_seconds": seconds}
     elif rival == "prefix":
-        tuned, seconds = tune(some.select(falling(removal_error(some, train))), train, config)
-        files = {share: head(tuned, count) for share, count in ({1.0: len(some)} | counts).items()}
+        tuned, seconds = tune(by_importance(gaussians, train), train, config)
+        files = {1.0: tuned} | prefixes(tuned, counts)
         yield "prefixes by removal error, lengths log", files, about | {"train_seconds": seconds}
     elif rival == "kept":
         yield f"export --keep of one file, max_sv {MAX_SV}", kept(base, folder, counts), {}
     else:
-        ranked = some.select(falling(removal_error(some, train)))
-        yield (
-            "untouched, by removal error",
-            {share: head(ranked, count) for share, count in counts.items()},
-            {},
-        )
+        ranked = by_importance(gaussians, train)
+        yield "untouched, by removal error", prefixes(ranked, counts), {}
+
+
+def prefixes(gaussians: clod.Gaussians, counts: Mapping[float, int]) -> dict[float, clod.Gaussians]:
+    return {share: gaussians[:count] for share, count in counts.items()}
 
 
 def kept(
@@ -129,27 +120,26 @@ def kept(
     """By share, the plain file that ``export --keep`` writes after the default command."""
     with tempfile.TemporaryDirectory() as place:
         dial, plain = Path(place) / "dial.ply", Path(place) / "plain.ply"
-        Process(
-            [*COMMAND, base.path, "--images", folder, "--max-sv", MAX_SV, "--out", dial, "--quiet"]
-        )
+        settings = ("--max-sv", MAX_SV, "--quiet")
+        clod_adapt(base.path, "--images", folder, *settings, "--out", dial)
         files = {}
         for share, count in counts.items():
-            Process([*COMMAND, "export", dial, "--keep", count, "--out", plain])
+            clod_adapt("export", dial, "--keep", count, "--out", plain)
             files[share] = clod.load(plain).gaussians
     return files
 
 
 def print_table() -> None:
     """PSNR per share, a line for a rival; of equal ones the last row."""
-    shares, lines = (1.0, *SHARES), dict[tuple[str, str], dict[float, float]]()
+    shares = (1.0, *SHARES)
+    lines: dict[tuple[str, str], dict[float, str]] = {}
     for row in stored(FILE):
-        found = lines.setdefault((row["scene"], f"{row['rival']}: {row['label']}"), {})
-        found.update({point["share"]: point["psnr"] for point in row["rows"]})
-    cells = [
-        [*key, *(f"{found[share]:.2f}" if share in found else "" for share in shares)]
-        for key, found in lines.items()
-    ]
-    print(table(["scene", "rival", *(f"{share:.0%}" for share in shares)], cells))
+        cells = lines.setdefault(
+            (row["scene"], f"{row['rival']}: {row['label']}"), dict.fromkeys(shares, "")
+        )
+        cells |= {point["share"]: f"{point['psnr']:.2f}" for point in row["rows"]}
+    heads = ["scene", "rival", *(f"{share:.0%}" for share in shares)]
+    print(table(heads, [[*key, *cells.values()] for key, cells in lines.items()]))
 
 
 if __name__ == "__main__":

@@ -22,13 +22,15 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 from city import write_city
-from common import CACHE, COMMAND, Process, Row, append, arguments, stored, table
+from common import CACHE, Process, Row, append, arguments, clod_adapt, stored, table
 
 import numpy as np
 
-FILE, CITIES = "scaling.jsonl", CACHE / "scaling"
-# exponents are fitted from FROM on
-FLOOR, SIZES, FROM = 1000, (10_000, 100_000, 1_000_000, 5_000_000), 100_000
+FILE = "scaling.jsonl"
+CITIES = CACHE / "scaling"
+FLOOR = 1000
+SIZES = (10_000, 100_000, 1_000_000, 5_000_000)
+FROM = 100_000  # from which on exponents are fitted
 # The last fifth of STEPS has photographs of full size.
 IMAGES = 10
 WIDTH = 640
@@ -70,12 +72,9 @@ def main() -> None:
     run_adapt(town(FLOOR))  # compiles the kernels
     for count in args.sizes:
         for command in [args.only] if args.only else RUNS:
-            found = RUNS[command](town(count))
-            busy = round(os.getloadavg()[0], 2)
-            append(
-                FILE,
-                {"series": "count", "command": command, "gaussians": count, "busy": busy, **found},
-            )
+            cost = RUNS[command](town(count))
+            about = {"command": command, "gaussians": count, "busy": round(os.getloadavg()[0], 2)}
+            append(FILE, {"series": "count", **about, **cost})
 
 
 def town(count: int) -> Path:
@@ -96,34 +95,26 @@ def dial_of(folder: Path) -> Path:
 def run_adapt(folder: Path) -> Row:
     """A few steps."""
     out = dial_of(folder)
-    words = [
-        folder / "city.ply",
-        "--images",
-        folder,
-        "--iters",
-        STEPS,
-        "--max-sv",
-        MAX_SV,
-        "--out",
-        out,
-    ]
-    run = Process([*COMMAND, *words])
+    settings = ("--iters", STEPS, "--max-sv", MAX_SV)
+    run = clod_adapt(folder / "city.ply", "--images", folder, *settings, "--out", out)
     seconds = json.loads(out.with_suffix(".json").read_text(encoding="utf-8"))["seconds"]
     return {**run.cost(), "step_seconds": seconds["train"] / STEPS, "phases": seconds}
 
 
 def run_export(folder: Path) -> Row:
     with tempfile.TemporaryDirectory(dir=CITIES) as out:
-        return Process(
-            [*COMMAND, "export", dial_of(folder), "-o", Path(out) / "plain.ply", "--sv", 1.5]
-        ).cost()
+        plain = Path(out) / "plain.ply"
+        return clod_adapt("export", dial_of(folder), "-o", plain, "--sv", 1.5).cost()
+
+
+def run_eval(folder: Path) -> Row:
+    return clod_adapt("eval", dial_of(folder), "--images", folder, "--sv", 1, MAX_SV).cost()
 
 
 def run_view(folder: Path) -> Row:
     """Until a page would have all of the model; no browser."""
-    run = Process(
-        [*COMMAND, "view", dial_of(folder), "--images", folder, "--no-browser"], until="http://"
-    )
+    words = (dial_of(folder), "--images", folder, "--no-browser")
+    run = clod_adapt("view", *words, until="http://")
     with urllib.request.urlopen(run.line.split()[0] + "files/model") as answer:
         while answer.read(1 << 20):
             pass
@@ -137,21 +128,15 @@ RUNS: dict[str, Callable[[Path], Row]] = {
     "adapt": lambda folder: (
         run_adapt(folder) | json.loads(Process([sys.executable, "-c", PARTS, folder]).out)
     ),
-    "eval": (
-        lambda folder: Process(
-            [*COMMAND, "eval", dial_of(folder), "--images", folder, "--sv", 1, MAX_SV]
-        ).cost()
-    ),
+    "eval": run_eval,
     "export": run_export,
-    "inspect": lambda folder: Process([*COMMAND, "inspect", dial_of(folder)]).cost(),
+    "inspect": lambda folder: clod_adapt("inspect", dial_of(folder)).cost(),
     "view": run_view,
 }
 
 
 def exponent(points: Sequence[tuple[float, float]]) -> float:
-    """Of the power of x that y follows, by least squares in logarithms; NaN of fewer than two
-    points.
-    """
+    """Power of x that y follows, by least squares in logarithms; NaN of fewer than two points."""
     usable = [point for point in points if point[1] > 0]
     return float(np.polyfit(*np.log(usable).T, 1)[0]) if len(usable) > 1 else math.nan
 
@@ -162,40 +147,26 @@ def print_tables() -> None:
     """
     last = {(row["command"], row["gaussians"]): row for row in stored(FILE) if "command" in row}
     sizes = sorted({count for _, count in last})
-    parts = [(command, "") for command in RUNS] + [
-        ("adapt", part) for part in ("load", "importance", "order", "step")
-    ]
+    clocks = {command: (command, "seconds", "cpu_seconds") for command in RUNS}
+    for part in ("load", "importance", "order", "step"):
+        clocks[part] = ("adapt", f"{part}_seconds", f"{part}_cpu")
     lines, peaks = [], []
-    for command, part in parts:
+    for name, (command, wall, cpu) in clocks.items():
         rows = [last[command, n] for n in sizes if (command, n) in last]
-        powers = []
-        for clock in ("seconds", "cpu" if part else "cpu_seconds"):
-            times = [
-                (row["gaussians"], row.get(f"{part}_{clock}" if part else clock, math.nan))
-                for row in rows
-            ]
-            floor = dict(times).get(FLOOR, 0.0)
-            powers.append(exponent([(n, t - floor) for n, t in times if n >= FROM]))
-        cells = [
-            f"{row.get(f'{part}_seconds' if part else 'seconds', math.nan):.3g}" for row in rows
-        ]
-        lines.append(
-            [
-                part or command,
-                *cells,
-                *(f"{power:.2f}" if power == power else "" for power in powers),
-            ]
-        )
-        if not part and len(rows) > 1:
+        line = [name, *(f"{row.get(wall, math.nan):.3g}" for row in rows)]
+        for clock in (wall, cpu):
+            times = {row["gaussians"]: row.get(clock, math.nan) for row in rows}
+            floor = times.get(FLOOR, 0.0)
+            power = exponent([(n, time - floor) for n, time in times.items() if n >= FROM])
+            line.append("" if math.isnan(power) else f"{power:.2f}")
+        lines.append(line)
+        if name == command and len(rows) > 1:
             (n, low), (m, high) = ((row["gaussians"], row["peak_bytes"]) for row in rows[-2:])
-            peaks.append(
-                [command, f"{low / 1e9:.2f}", f"{high / 1e9:.2f}", f"{(high - low) / (m - n):,.0f}"]
-            )
-    print(
-        table(["seconds", *(f"{size:,}" for size in sizes), "exponent", "of CPU seconds"], lines),
-        end="\n\n",
-    )
-    print(table(["peak, GB", *(f"{size:,}" for size in sizes[-2:]), "bytes per Gaussian"], peaks))
+            more = (high - low) / (m - n)
+            peaks.append([command, f"{low / 1e9:.2f}", f"{high / 1e9:.2f}", f"{more:,.0f}"])
+    columns = [f"{size:,}" for size in sizes]
+    print(table(["seconds", *columns, "exponent", "of CPU seconds"], lines), end="\n\n")
+    print(table(["peak, GB", *columns[-2:], "bytes per Gaussian"], peaks))
 
 
 if __name__ == "__main__":

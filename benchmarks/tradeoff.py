@@ -12,12 +12,13 @@ tuned with random prefixes, of which the same counts are measured. Each run adds
 """
 
 import time
+from collections.abc import Callable
+from functools import partial
 
 import clod_adapter as clod
-from clod_adapter.initialization.importance import removal_error
 from clod_adapter.report.charts import draw_training, new_figure, save_figure
-from common import ROOT, Row, append, arguments, checkpoint, falling, head, photographs, stored
-from tuning import Tuning, merge, tune
+from common import ROOT, Row, append, arguments, checkpoint, photographs, quality, stored
+from tuning import Tuning, by_importance, merge, tune
 
 FILE = "tradeoff.jsonl"
 PICTURE = ROOT / "docs" / "images" / "error_vs_time.png"
@@ -42,17 +43,10 @@ def main() -> None:
     args = parser.parse_args()
     if not args.plot:
         base, views = checkpoint(args.scene), photographs(args.scene)
-        (untouched,) = clod.evaluate(base.gaussians, views.test, [1.0])
+        (untouched,) = quality(base.gaussians, views.test, 1.0)
         for method in args.only:
             for iters in args.iters:
-                made = (
-                    dial
-                    if method in ("ours", "paper")
-                    else specialists
-                    if method == "specialist"
-                    else prefixes
-                )
-                seconds, rows = made(args.scene, method, base, views, iters)
+                seconds, rows = METHODS[method](args.scene, base, views, iters)
                 append(
                     FILE,
                     {
@@ -63,55 +57,63 @@ def main() -> None:
                         "seed": 0,
                         "max_sv": MAX_SV,
                         "seconds": seconds,
-                        "base": untouched.as_dict(),
+                        "base": untouched,
                         "rows": rows,
                     },
                 )
     plot(args.scene)
 
 
-Found = tuple[list[float], list[Row]]  # seconds to the file of each dial value, and its row
+Runs = tuple[list[float], list[Row]]  # seconds to the file of each dial value, and its row
 
 
-def dial(scene: str, method: str, base: clod.Checkpoint, views: clod.Scene, iters: int) -> Found:
-    config = (clod.AdaptConfig if method == "ours" else clod.AdaptConfig.paper)(
-        max_sv=MAX_SV, iters=iters, seed=0
-    )
-    done = clod.adapt(base.gaussians, views, config)
-    rows = clod.evaluate(done.gaussians, views.test, DIALS)
-    return [done.start_seconds + done.seconds] * len(rows), [row.as_dict() for row in rows]
+def dial(
+    config_of: Callable[..., clod.AdaptConfig],
+    scene: str,
+    base: clod.Checkpoint,
+    views: clod.Scene,
+    iters: int,
+) -> Runs:
+    adapted = clod.adapt(base.gaussians, views, config_of(max_sv=MAX_SV, iters=iters))
+    seconds = adapted.start_seconds + adapted.seconds
+    return [seconds] * len(DIALS), quality(adapted.gaussians, views.test, DIALS)
 
 
-def specialists(
-    scene: str, method: str, base: clod.Checkpoint, views: clod.Scene, iters: int
-) -> Found:
+def specialists(scene: str, base: clod.Checkpoint, views: clod.Scene, iters: int) -> Runs:
     """Merging is within the time."""
     seconds, rows = [], []
     for s, count in zip(DIALS, counts(scene), strict=True):
         start, merging = merge(base, count, "--decimate") if s > 1 else (base.gaussians, 0.0)
-        tuned, spent = tune(start, views.train, Tuning(iters=iters))
+        tuned, tuning = tune(start, views.train, Tuning(iters=iters))
         rows.append(row_of(tuned, views, s, len(base.gaussians)))
-        seconds.append(merging + spent)
+        seconds.append(merging + tuning)
     return seconds, rows
 
 
-def prefixes(
-    scene: str, method: str, base: clod.Checkpoint, views: clod.Scene, iters: int
-) -> Found:
+def prefixes(scene: str, base: clod.Checkpoint, views: clod.Scene, iters: int) -> Runs:
     """Ordering is within the time."""
     began = time.perf_counter()
-    start = base.gaussians.select(falling(removal_error(base.gaussians, views.train)))
+    start = by_importance(base.gaussians, views.train)
     ordering = time.perf_counter() - began
-    tuned, spent = tune(start, views.train, Tuning(iters=iters, prefixes=True))
-    files = zip(DIALS, (head(tuned, count) for count in counts(scene)), strict=True)
-    return [ordering + spent] * len(DIALS), [
-        row_of(file, views, s, len(base.gaussians)) for s, file in files
+    tuned, tuning = tune(start, views.train, Tuning(iters=iters, prefixes=True))
+    rows = [
+        row_of(tuned[:count], views, s, len(base.gaussians))
+        for s, count in zip(DIALS, counts(scene), strict=True)
     ]
+    return [ordering + tuning] * len(DIALS), rows
+
+
+METHODS = {
+    "ours": partial(dial, clod.AdaptConfig),
+    "paper": partial(dial, clod.AdaptConfig.paper),
+    "prefix": prefixes,
+    "specialist": specialists,
+}
 
 
 def row_of(file: clod.Gaussians, views: clod.Scene, s: float, count: int) -> Row:
-    (row,) = clod.evaluate(file, views.test, [1.0])
-    return row.as_dict() | {"virtual_scale": s, "kept_share": len(file) / count}
+    (row,) = quality(file, views.test, 1.0)
+    return row | {"virtual_scale": s, "kept_share": len(file) / count}
 
 
 def counts(scene: str) -> list[int]:
@@ -123,22 +125,20 @@ def counts(scene: str) -> list[int]:
     return [round(row["kept"]) for row in longest["rows"]]
 
 
-def curves(scene: str, k: int) -> dict[str, list[Row]]:
-    """Points by method at the k-th dial value, by rising time; of equal runs the last."""
+def curves(scene: str, k: int) -> list[Row]:
+    """Lines by method at the k-th dial value, by rising time; of equal runs the last."""
     last = {(row["method"], row["iters"]): row for row in stored(FILE) if row["scene"] == scene}
-    points = {
-        method: [
-            {
-                "seconds": row["seconds"][k],
-                "psnr": row["rows"][k]["psnr"],
-                "share": row["rows"][k]["kept_share"],
-            }
-            for (name, _), row in sorted(last.items())
-            if name == method
-        ]
-        for method in LABELS
-    }
-    return {method: found for method, found in points.items() if found}
+    points: dict[str, list[Row]] = {method: [] for method in LABELS}
+    for (method, _), row in sorted(last.items()):
+        point = row["rows"][k]
+        points[method].append(
+            {"seconds": row["seconds"][k], "psnr": point["psnr"], "share": point["kept_share"]}
+        )
+    return [
+        {"label": f"{LABELS[method]} ({line[-1]['share']:.0%} kept)", "points": line}
+        for method, line in points.items()
+        if line
+    ]
 
 
 def plot(scene: str) -> None:
@@ -148,11 +148,7 @@ def plot(scene: str) -> None:
         title = f"{scene}: held-out error against time of training, {base['kept']:,.0f} Gaussians"
         figure.suptitle(title, fontsize=11.5, weight="bold", x=0.008, ha="left")
         for k, (axes, s) in enumerate(zip(figure.subplots(1, len(DIALS)), DIALS, strict=True)):
-            lines = [
-                {"label": f"{LABELS[method]} ({points[-1]['share']:.0%} kept)", "points": points}
-                for method, points in curves(scene, k).items()
-            ]
-            draw_training(axes, lines, base["psnr"])
+            draw_training(axes, curves(scene, k), base["psnr"])
             axes.set_title(f"s = {s:g}", loc="left", fontsize=10, weight="bold")
         save_figure(figure, PICTURE)
     print(PICTURE)

@@ -13,6 +13,7 @@ import clod_adapter as clod
 from clod_adapter._kernels.threads import torch_on_one_thread
 from clod_adapter.adapter import ATTRIBUTES, detach
 from clod_adapter.cameras import camera_extent
+from clod_adapter.initialization.importance import removal_error
 from clod_adapter.io.formats.splat_transform import SplatTransform
 from clod_adapter.losses import photometric_loss
 from clod_adapter.render import splat
@@ -59,27 +60,24 @@ def tune(
     ``start`` is then in the order of importance. Drawn with the screen-space filter of ``start``.
     """
     start = detach(start)
-    own = {"dtype": torch.float32, "copy": True, "memory_format": torch.contiguous_format}
-    parameters = {name: getattr(start, name).detach().to(**own) for name in ATTRIBUTES}
+    copied = {"dtype": torch.float32, "copy": True, "memory_format": torch.contiguous_format}
+    parameters = {name: getattr(start, name).detach().to(**copied) for name in ATTRIBUTES}
     rates = RATES | {"means": RATES["means"] * camera_extent([view.camera for view in views])}
     tuned = [name for name in ATTRIBUTES if parameters[name].numel()]
-    optimizer, random = (
-        RowAdam({name: parameters[name] for name in tuned}),
-        np.random.default_rng(config.seed),
-    )
-    everyone, order = torch.ones(len(start), dtype=torch.bool), list[int]()
-    _gradients(start, parameters, tuned, views[0], len(start) if config.prefixes else None)
+    optimizer = RowAdam({name: parameters[name] for name in tuned})
+    random = np.random.default_rng(config.seed)
+    all_rows = torch.ones(len(start), dtype=torch.bool)
+    order: list[int] = []
+    prefix = len(start) if config.prefixes else None
+    _gradients(start, parameters, tuned, views[0], prefix)  # compiled before the clock starts
     began = time.perf_counter()
     for step in tqdm(range(config.iters), leave=False):
         order = order or random.permutation(len(views)).tolist()
-        prefix = (
-            max(round(config.shortest ** random.random() * len(start)), 1)
-            if config.prefixes
-            else None
-        )
+        if config.prefixes:
+            prefix = max(round(config.shortest ** random.random() * len(start)), 1)
         gradients = _gradients(start, parameters, tuned, views[order.pop()], prefix)
         share = config.final ** (step / config.iters)
-        optimizer.step(gradients, everyone, {name: rate * share for name, rate in rates.items()})
+        optimizer.step(gradients, all_rows, {name: rate * share for name, rate in rates.items()})
     return start.replace(**parameters), time.perf_counter() - began
 
 
@@ -101,8 +99,13 @@ def _gradients(
         inside = torch.arange(len(gaussians)) < prefix
         image, _ = splat(gaussians, torch.where(inside, gaussians.opacities, 0), view.camera)
         loss = loss + photometric_loss(image, view.image)
-    found = torch.autograd.grad(loss, [leaves[name] for name in tuned])
-    return dict(zip(tuned, found, strict=True))
+    gradients = torch.autograd.grad(loss, [leaves[name] for name in tuned])
+    return dict(zip(tuned, gradients, strict=True))
+
+
+def by_importance(gaussians: clod.Gaussians, views: tuple[clod.View, ...]) -> clod.Gaussians:
+    """The Gaussians by falling removal error, equal ones in their order."""
+    return gaussians[removal_error(gaussians, views).argsort(descending=True, stable=True)]
 
 
 def find_tool() -> SplatTransform:

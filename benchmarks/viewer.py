@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import clod_adapter as clod
-from common import CACHE, COMMAND, ROOT, Process, Row, append, arguments, capture
+from common import CACHE, ROOT, Row, append, arguments, capture, clod_adapt
 
 import numpy as np
 import torch
@@ -43,7 +43,9 @@ def measure(chromium: Any, name: str) -> Row:
     with serve(path) as url, chromium.new_context(viewport=size) as context:
         context.set_default_timeout(300_000)
         shown = Shown(context.new_page()).ready(url)
-        rows = [each for camera in cameras for each in compare(shown, model.gaussians, camera)]
+        rows = []
+        for camera in cameras:
+            rows += compare(shown, model.gaussians, camera)
         return {
             "capture": name,
             "gaussians": len(model.gaussians),
@@ -62,12 +64,9 @@ def compare(shown: Shown, gaussians: clod.Gaussians, camera: clod.Camera) -> lis
     for dial in (*DIALS, None):
         shown.run(f"clod.setEquation({str(dial is not None).lower()})")
         shown.run("clod.setDial(given)", dial or 1.0)
+        drawn = gaussians if dial else clod.detach(gaussians)
         with torch.no_grad():
-            wanted = (
-                clod.render(gaussians, camera, dial)
-                if dial
-                else clod.render(clod.detach(gaussians), camera)
-            )
+            wanted = clod.render(drawn, camera, dial or 1.0)
         error = float(((shown.picture().astype(np.float64) - wanted.pixels.numpy()) ** 2).mean())
         rows.append(
             {
@@ -86,18 +85,9 @@ def adapted(name: str) -> Path:
     path = CACHE / f"viewer-{name}.ply"
     if not path.exists():
         CACHE.mkdir(exist_ok=True)
-        words = [
-            capture(name) / "pretrained.ply",
-            "--images",
-            capture(name),
-            "--max-sv",
-            5,
-            "--iters",
-            100,
-            "-o",
-            path,
-        ]
-        Process([*COMMAND, *words])
+        folder = capture(name)
+        settings = ("--max-sv", 5, "--iters", 100)
+        clod_adapt(folder / "pretrained.ply", "--images", folder, *settings, "-o", path)
     return path
 
 
