@@ -38,14 +38,16 @@ def city(count: int, *, seed: int = 0, sh_degree: int = 3) -> Gaussians:
     """``count`` Gaussians, at least 1000; the same ones for the same arguments."""
     if count < 1000:
         raise SystemExit(f"a town needs at least 1000 Gaussians, not {count}")
-    random, far, size = np.random.default_rng(seed), round(SKY * count), lots(count) * PITCH
+    random = np.random.default_rng(seed)
+    far = round(SKY * count)
+    size = lots(count) * PITCH
     points, normals, colours = surfaces(count - far, random)
     up = random.normal(size=(far, 3))
     up /= np.linalg.norm(up, axis=1, keepdims=True)
-    points, normals = np.concatenate([points, 3 * size * up]), np.concatenate([normals, up])
-    colours = np.concatenate(
-        [colours, np.array([0.5, 0.6, 0.65]) - 0.25 * up[:, 1:2] * [0.4, 0.7, 1]]
-    )
+    points = np.concatenate([points, 3 * size * up])
+    normals = np.concatenate([normals, up])
+    sky = np.array([0.5, 0.6, 0.65]) - 0.25 * up[:, 1:2] * [0.4, 0.7, 1]
+    colours = np.concatenate([colours, sky])
     spacing = np.sqrt(lots(count) ** 2 * AREA / (count - far))
     flat = np.full(count, 0.7 * spacing)
     flat[count - far :] = 1.3 * math.sqrt(4 * math.pi * (3 * size) ** 2 / far)
@@ -53,55 +55,40 @@ def city(count: int, *, seed: int = 0, sh_degree: int = 3) -> Gaussians:
     log_scales = np.log(np.stack([flat, flat, 0.08 * flat], 1)) + 0.15 * noise
     higher = random.normal(scale=0.03, size=(count, SH_COUNTS[sh_degree] - 1, 3))
     logits = np.where(np.arange(count) < count - far, 2.6 + 1.2 * noise[:, 0], 3.0)
-    means, quats, log_scales, logits, sh0, shN = (
-        torch.from_numpy(np.ascontiguousarray(each, np.float32))
-        for each in (
-            points,
-            facing(normals),
-            log_scales,
-            logits,
-            ((colours - 0.5) / SH_C0)[:, None],
-            higher,
-        )
-    )
-    return Gaussians(means, quats, log_scales, logits, sh0, shN)
+    sh0 = ((colours - 0.5) / SH_C0)[:, None]
+    attributes = (points, facing(normals), log_scales, logits, sh0, higher)
+    return Gaussians(*(torch.from_numpy(values).float() for values in attributes))
 
 
 def surfaces(count: int, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Points, normals and colours on the plain and on the houses' walls and roofs."""
     side = lots(count)
-    lot, kind, along = (
-        random.integers(0, side**2, count),
-        random.random(count),
-        random.uniform(-0.5, 0.5, (count, 2)),
-    )
-    height, hue = random.uniform(6, 14, side**2)[lot], random.uniform(0.35, 0.85, (side**2, 3))[lot]
+    lot = random.integers(0, side**2, count)
+    kind = random.random(count)
+    along = random.uniform(-0.5, 0.5, (count, 2))
+    height = random.uniform(6, 14, side**2)[lot]
+    hue = random.uniform(0.35, 0.85, (side**2, 3))[lot]
     centre = PITCH * (np.stack([lot % side, lot // side], 1) - (side - 1) / 2)
     ground, roof = kind < 0.5, kind > 0.86
     turned = (4 * (kind - 0.5) / 0.36).astype(int).clip(0, 3)  # which of the four walls
     outward = np.stack([np.cos(turned * np.pi / 2), np.sin(turned * np.pi / 2)], 1).round()
     wall = HOUSE * (outward / 2 + along[:, :1] * outward[:, ::-1])
-    level = np.where(
-        (ground | roof)[:, None], np.where(ground, PITCH, HOUSE)[:, None] * along, wall
-    )
-    depth = np.where(ground, 0, np.where(roof, height, (along[:, 1] + 0.5) * height))
-    points = np.stack([centre[:, 0] + level[:, 0], -depth, centre[:, 1] + level[:, 1]], 1)
     upward = (ground | roof)[:, None]
-    normals = np.where(upward, [0.0, -1, 0], np.stack([outward[:, 0], 0 * depth, outward[:, 1]], 1))
+    level = np.where(upward, np.where(ground, PITCH, HOUSE)[:, None] * along, wall)
+    depth = np.where(ground, 0, np.where(roof, height, (along[:, 1] + 0.5) * height))
+    points = np.insert(centre + level, 1, -depth, 1)
+    normals = np.where(upward, [0.0, -1, 0], np.insert(outward, 1, 0, 1))
     pattern = 0.08 * np.sin(points @ np.array([[1.1, 0.3, 2.0], [2.3, 1.7, 0.4], [0.6, 2.9, 1.5]]))
     base = np.where(ground[:, None], [0.42, 0.44, 0.4], np.where(roof[:, None], 0.7 * hue, hue))
-    return (
-        points,
-        normals,
-        (base + pattern + 0.03 * random.normal(size=(count, 3))).clip(0.02, 0.98),
-    )
+    colours = base + pattern + 0.03 * random.normal(size=(count, 3))
+    return points, normals, colours.clip(0.02, 0.98)
 
 
 def facing(normals: np.ndarray) -> np.ndarray:
     """Quaternions that turn z to the normals."""
-    z = np.where(normals[:, 2:] < -0.999, [0.0, 1, 0, 0], 0)
-    quats = np.stack([1 + normals[:, 2], -normals[:, 1], normals[:, 0], 0 * normals[:, 0]], 1)
-    quats = np.where(normals[:, 2:] < -0.999, z, quats)
+    x, y, z = normals.T
+    quats = np.stack([1 + z, -y, x, 0 * x], 1)
+    quats[z < -0.999] = [0, 1, 0, 0]
     return quats / np.linalg.norm(quats, axis=1, keepdims=True)
 
 
@@ -111,7 +98,9 @@ def city_cameras(
     """``n`` cameras, named ``view_0000.png`` on: "near" in the streets, "far" in the air, or the
     two in turn.
     """
-    random, size, cameras = np.random.default_rng(seed + 1), lots(count) * PITCH, []
+    random = np.random.default_rng(seed + 1)
+    size = lots(count) * PITCH
+    cameras = []
     for k in range(n):
         if where == "near" or (where == "mixed" and k % 2 == 0):
             street = PITCH * (random.integers(0, lots(count) + 1) - lots(count) / 2)
@@ -124,15 +113,15 @@ def city_cameras(
             turn, pitch = random.uniform(0, 2 * np.pi), math.radians(random.uniform(28, 50))
             target = np.array([*random.uniform(-0.2, 0.2, 2) * size, 0])[[0, 2, 1]]
             away = random.uniform(0.6, 1.1) * max(size, 30)
-            eye = target + away * np.array(
-                [
-                    math.cos(pitch) * math.cos(turn),
-                    -math.sin(pitch),
-                    math.cos(pitch) * math.sin(turn),
-                ]
-            )
+            eye = target + away * direction(turn, pitch)
         cameras.append(look_at(eye, target, width, height, f"view_{k:04d}.png"))
     return cameras
+
+
+def direction(turn: float, rise: float) -> np.ndarray:
+    """A unit vector, by radians about the vertical and above the ground."""
+    level = math.cos(rise)
+    return np.array([level * math.cos(turn), -math.sin(rise), level * math.sin(turn)])
 
 
 def look_at(eye: np.ndarray, target: np.ndarray, width: int, height: int, name: str) -> clod.Camera:
@@ -173,12 +162,10 @@ def write_city(folder: str | Path, count: int, images: int, width: int, height: 
         (part / "images").mkdir(parents=True)
         for camera in cameras:
             with torch.no_grad():
-                Image.fromarray(clod.render(truth, camera).pixels.numpy()).save(
-                    part / "images" / camera.name
-                )
-        some = np.linspace(0, count * (1 - SKY), 2000, endpoint=False).astype(np.int64)
-        colours = ((0.5 + SH_C0 * truth.sh0[some, 0].numpy()).clip(0, 1) * 255).astype(np.uint8)
-        write_model(
-            part, cameras, [camera.name for camera in cameras], truth.means[some].numpy(), colours
-        )
+                pixels = clod.render(truth, camera).pixels.numpy()
+            Image.fromarray(pixels).save(part / "images" / camera.name)
+        rows = np.linspace(0, count * (1 - SKY), 2000, endpoint=False).astype(np.int64)
+        points = truth.means[rows].numpy()
+        colours = ((0.5 + SH_C0 * truth.sh0[rows, 0].numpy()).clip(0, 1) * 255).astype(np.uint8)
+        write_model(part, cameras, [camera.name for camera in cameras], points, colours)
         clod.save(part / "city.ply", perturb(truth))

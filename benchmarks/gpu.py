@@ -32,12 +32,11 @@ from clod_adapter.equation.attenuation import dial
 from clod_adapter.losses import psnr
 from clod_adapter.rasterizers import cuda, wait_for
 from clod_adapter.render import splat
-from common import ROOT, append, arguments, checkpoint, outcomes, photographs
+from common import ROOT, Row, append, arguments, checkpoint, outcomes, photographs, quality
 
 import torch
 from torch import Tensor
 
-CHECKS = ("tests", "plush", "city")
 DIALS = (1.0, 3.0, 7.0)
 TESTS = (
     "tests/rasterizers",
@@ -71,7 +70,7 @@ def main() -> None:
         action="store_true",
         help="a tiny city, also in place of plush_half, and few tests",
     )
-    parser.add_argument("--only", nargs="+", choices=CHECKS, default=CHECKS)
+    parser.add_argument("--only", nargs="+", choices=CHECKS, default=list(CHECKS))
     parser.add_argument("--count", type=int, help="Gaussians of the city")
     parser.add_argument("--results", default="gpu.jsonl", help="the file, in results/ or anywhere")
     args = parser.parse_args()
@@ -79,101 +78,87 @@ def main() -> None:
         if not torch.cuda.is_available():
             sys.exit("torch sees no GPU here: give --device cpu --small to try the script")
         cuda.require_gsplat()
-    size, device = SMALL if args.small else Size(), torch.device(args.device)
+    size = SMALL if args.small else Size()
     size = replace(size, count=args.count or size.count)
-    checks: dict[str, Callable[[], list[dict[str, Any]]]] = {
-        "tests": lambda: [run_tests(args.small)],
-        "plush": lambda: adapt_plush(device, size, args.small),
-        "city": lambda: measure_city(device, size),
-    }
     for name in args.only:
-        for row in checks[name]():
-            append(
-                args.results,
-                {"benchmark": f"gpu {name}", "device": args.device, "size": asdict(size), **row},
-            )
+        about = {"benchmark": f"gpu {name}", "device": args.device, "size": asdict(size)}
+        for row in CHECKS[name](torch.device(args.device), size, args.small):
+            append(args.results, {**about, **row})
 
 
-def run_tests(small: bool) -> dict[str, Any]:
-    """Counts of passed, failed and skipped tests, and the names of failed ones."""
+def run_tests(device: torch.device, size: Size, small: bool) -> list[Row]:
+    """Counts of all, failed and skipped tests, and the names of failed ones."""
     few = ["-k", "test_for_device or test_no_gaussians"] if small else []
+    began = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
-        report, began = Path(folder) / "report.xml", time.perf_counter()
-        command = [
-            sys.executable,
-            "-m",
-            "pytest",
-            "-p",
-            "no:xdist",
-            "-q",
-            f"--junitxml={report}",
-            *TESTS,
-            *few,
-        ]
+        report = Path(folder) / "report.xml"
+        options = ["-p", "no:xdist", "-q", f"--junitxml={report}"]
         subprocess.run(
-            command,
+            [sys.executable, "-m", "pytest", *options, *TESTS, *few],
             cwd=ROOT,
             stdout=sys.stderr,
             check=False,
             env={**os.environ, "PYTHONPATH": str(ROOT)},
         )
-        found = outcomes(report)
-    cases = found.pop("passed") + found["failed"] + found["skipped"]
-    return {"cases": cases, **found, "seconds": round(time.perf_counter() - began, 1)}
+        counts = outcomes(report)
+    cases = counts.pop("passed") + counts["failed"] + counts["skipped"]
+    return [{"cases": cases, **counts, "seconds": round(time.perf_counter() - began, 1)}]
 
 
-def adapt_plush(device: torch.device, size: Size, small: bool) -> list[dict[str, Any]]:
+def adapt_plush(device: torch.device, size: Size, small: bool) -> list[Row]:
     """A row a device."""
     if small:
         base, scene = synthetic(size, torch.device("cpu"))
     else:
         base, scene = checkpoint("plush_half").gaussians, photographs("plush_half")
-    config = clod.AdaptConfig(**({"iters": size.plush_steps} if size.plush_steps else {}))
+    config = clod.AdaptConfig(iters=size.plush_steps)
     rows = []
     for place in dict.fromkeys([device, torch.device("cpu")]):
-        own = base.to(place)
+        gaussians = base.to(place)
         # compiled before the clock starts
-        clod.adapt(own, clod.Scene(scene.train[:1], ()), clod.AdaptConfig(iters=1))
-        reset_peak(place)
-        adapted = clod.adapt(own, scene, config)
-        wait_for(place)
-        base_row = clod.evaluate(own, scene.test, [1.0])[0]
-        found = clod.evaluate(adapted.gaussians, scene.test, [1.0, 3.0, config.max_sv])
+        clod.adapt(gaussians, clod.Scene(scene.train[:1], ()), clod.AdaptConfig(iters=1))
+        model, cost = timed_adapt(gaussians, scene, config)
+        (base_row,) = quality(gaussians, scene.test, 1.0)
         rows.append(
             {
                 "on": place.type,
                 "scene": "synthetic" if small else "plush_half",
-                "config": asdict(config),
-                "count": len(own),
-                "start_seconds": round(adapted.start_seconds, 2),
-                "train_seconds": round(adapted.seconds, 3),
-                "peak_bytes": peak(place),
-                "base": base_row.as_dict(),
-                "rows": [row.as_dict() for row in found],
+                "count": len(gaussians),
+                **cost,
+                "base": base_row,
+                "rows": quality(model, scene.test, [1.0, 3.0, config.max_sv]),
             }
         )
     return rows
 
 
-def measure_city(device: torch.device, size: Size) -> list[dict[str, Any]]:
-    """A row for the adaptation, and one for each of near and far at each dial value."""
-    base, scene = synthetic(size, device)
-    base, config = base.to(device), clod.AdaptConfig(iters=size.steps, max_sv=DIALS[-1])
-    reset_peak(device)
+def timed_adapt(
+    base: clod.Gaussians, scene: clod.Scene, config: clod.AdaptConfig
+) -> tuple[clod.Gaussians, Row]:
+    device = base.means.device
+    if device.type == "cuda":
+        torch.cuda.reset_peak_memory_stats(device)
     adapted = clod.adapt(base, scene, config)
     wait_for(device)
-    rows: list[dict[str, Any]] = [
-        {
-            "what": "adapt",
-            "config": asdict(config),
-            "start_seconds": round(adapted.start_seconds, 2),
-            "train_seconds": round(adapted.seconds, 3),
-            "peak_bytes": peak(device),
-            "base_bytes": sum(x.nbytes for x in base.tensors().values()),
-        }
-    ]
+    cost = {
+        "config": asdict(config),
+        "start_seconds": round(adapted.start_seconds, 2),
+        "train_seconds": round(adapted.seconds, 3),
+        "peak_bytes": peak(device),
+    }
+    return adapted.gaussians, cost
+
+
+def measure_city(device: torch.device, size: Size, small: bool) -> list[Row]:
+    """A row for the adaptation, and one for each of near and far at each dial value."""
+    base, scene = synthetic(size, device)
+    base = base.to(device)
+    config = clod.AdaptConfig(iters=size.steps, max_sv=DIALS[-1])
+    model, cost = timed_adapt(base, scene, config)
+    base_bytes = sum(tensor.nbytes for tensor in base.tensors().values())
+    rows = [{"what": "adapt", **cost, "base_bytes": base_bytes}]
     del base
-    model, truth = adapted.gaussians, city(size.count)
+    truth = city(size.count)
     for where in ("near", "far"):
         cameras = city_cameras(4, size.width, size.height, where=where, count=size.count, seed=9)
         targets = photograph(truth, cameras, device)
@@ -184,12 +169,13 @@ def measure_city(device: torch.device, size: Size) -> list[dict[str, Any]]:
 @torch.no_grad()
 def frames(
     model: clod.Gaussians, views: list[clod.View], where: str, s: float, repeats: int
-) -> dict[str, Any]:
+) -> Row:
     """Medians in milliseconds, ours and plain in turn, over the views; and PSNR of the pictures."""
-    device, plain = model.means.device, plain_frames(model)
+    device = model.means.device
+    plain = plain_frame(model)
     jobs: dict[str, Callable[[clod.Camera], Any]] = {
         "ours": lambda camera: clod.render(model, camera, s).image,
-        **plain,
+        "plain": plain,
         "dial": lambda camera: dial(model, camera, s),
     }
     times: dict[str, list[float]] = {name: [] for name in jobs}
@@ -204,50 +190,50 @@ def frames(
             wait_for(device)
             times[name].append((time.perf_counter() - began) * 1e3)
     ms = {name: median(taken) for name, taken in times.items()}
-    shown = [clod.render(model, view.camera, s) for view in views]
-    full = [next(iter(plain.values()))(view.camera) for view in views]
-    pixels = [(picture.clamp(0, 1) * 255).round().to(torch.uint8).cpu() for picture in full]
+    kept, psnr_full, psnr_truth = [], [], []
+    for view in views:
+        frame = clod.render(model, view.camera, s)
+        full = (plain(view.camera).clamp(0, 1) * 255).round().to(torch.uint8).cpu()
+        kept.append(int(frame.kept.sum()))
+        psnr_full.append(psnr(frame.image, full))
+        psnr_truth.append(psnr(frame.image, view.image))
     return {
         "what": "frames",
         "where": where,
         "virtual_scale": s,
-        "kept": fmean(int(p.kept.sum()) for p in shown),
+        "kept": fmean(kept),
         "ms": ms,
-        "faster": {name: ms[name] / ms["ours"] for name in plain},
+        "faster": {"plain": ms["plain"] / ms["ours"]},
         "dial_share": ms["dial"] / ms["ours"],
-        "psnr_full": fmean(psnr(p.image, f) for p, f in zip(shown, pixels, strict=True)),
-        "psnr_truth": fmean(
-            psnr(p.image, view.image) for p, view in zip(shown, views, strict=True)
-        ),
+        "psnr_full": fmean(psnr_full),
+        "psnr_truth": fmean(psnr_truth),
     }
 
 
-def plain_frames(model: clod.Gaussians) -> dict[str, Callable[[clod.Camera], Tensor]]:
+def plain_frame(model: clod.Gaussians) -> Callable[[clod.Camera], Tensor]:
     """The file without its dial, activated beforehand, as a viewer that does not know the dial
     draws it.
     """
     scales, opacities = model.scales, model.opacities
     if model.means.device.type == "cpu":
-        return {"plain": lambda camera: splat(model, opacities, camera)[0]}
+        return lambda camera: splat(model, opacities, camera)[0]
     import gsplat
 
     colors = torch.cat([model.sh0, model.shN], 1)
 
-    return {
-        "plain": lambda camera: gsplat.rasterization(
-            model.means,
-            model.quats,
-            scales,
-            opacities,
-            colors,
-            camera.viewmat.to(scales)[None],
-            camera.K.to(scales)[None],
-            camera.width,
-            camera.height,
-            near_plane=camera.near,
-            sh_degree=model.sh_degree,
-        )[0][0]
-    }
+    return lambda camera: gsplat.rasterization(
+        model.means,
+        model.quats,
+        scales,
+        opacities,
+        colors,
+        camera.viewmat.to(scales)[None],
+        camera.K.to(scales)[None],
+        camera.width,
+        camera.height,
+        near_plane=camera.near,
+        sh_degree=model.sh_degree,
+    )[0][0]
 
 
 def synthetic(size: Size, device: torch.device) -> tuple[clod.Gaussians, clod.Scene]:
@@ -262,22 +248,24 @@ def synthetic(size: Size, device: torch.device) -> tuple[clod.Gaussians, clod.Sc
 def photograph(
     truth: clod.Gaussians, cameras: list[clod.Camera], device: torch.device
 ) -> list[clod.View]:
-    there = truth.to(device)
-    return [clod.View(camera, clod.render(there, camera).pixels.cpu()) for camera in cameras]
-
-
-def reset_peak(device: torch.device) -> None:
-    if device.type == "cuda":
-        torch.cuda.reset_peak_memory_stats(device)
+    truth = truth.to(device)
+    return [clod.View(camera, clod.render(truth, camera).pixels.cpu()) for camera in cameras]
 
 
 def peak(device: torch.device) -> int:
-    """Bytes: of torch's allocations on a GPU since ``reset_peak``; on the CPU of the process,
+    """Bytes: of torch's allocations on a GPU since the last reset; on the CPU of the process,
     ever.
     """
     if device.type == "cuda":
         return torch.cuda.max_memory_allocated(device)
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+
+
+CHECKS: dict[str, Callable[[torch.device, Size, bool], list[Row]]] = {
+    "tests": run_tests,
+    "plush": adapt_plush,
+    "city": measure_city,
+}
 
 
 if __name__ == "__main__":

@@ -10,18 +10,19 @@ are those of ``clod_adapter.render``; a test compares them.
 
 import json
 import math
-from collections.abc import Iterator
 
 import clod_adapter as clod
-from common import ROOT, arguments
+from common import ROOT, Row, arguments
 
 import torch
 from PIL import Image
 
 KIT = ROOT / "viewers" / "kit"
-COUNT, SHARE = 2000, 0.25  # Gaussians; of their full enlargement
+COUNT = 2000
+SHARE = 0.25  # of the full enlargement
 DIALS = (0.0, 1.0, 3.0, 5.0)
-VIEWS, WIDTH = (1, 3), 192
+VIEWS = (1, 3)
+WIDTH = 192
 
 
 def main() -> None:
@@ -37,14 +38,14 @@ def main() -> None:
     KIT.mkdir(exist_ok=True)
     for suffix in ("ply", "spz", "glb"):
         clod.save(KIT / f"kit.{suffix}", few)
-    cameras = [resized(scene.test[k].camera) for k in VIEWS]
-    about = {"background": [0, 0, 0], "dials": DIALS, "cameras": list(described(few, cameras))}
+    cameras = [pictured(few, number, scene.test[k].camera) for number, k in enumerate(VIEWS)]
+    about = {"background": [0, 0, 0], "dials": DIALS, "cameras": cameras}
     (KIT / "cameras.json").write_text(json.dumps(about, indent=1) + "\n")
 
 
 def resized(camera: clod.Camera) -> clod.Camera:
-    """Of WIDTH pixels, with square pixels and the principal point in the middle, as viewers have
-    them.
+    """The camera with WIDTH square pixels and the principal point in the middle, as viewers have
+    it.
     """
     height = round(camera.height * WIDTH / camera.width)
     focal = float(camera.K[0, 0]) * WIDTH / camera.width
@@ -52,21 +53,22 @@ def resized(camera: clod.Camera) -> clod.Camera:
     return clod.Camera(camera.viewmat, K, WIDTH, height)
 
 
-def described(gaussians: clod.Gaussians, cameras: list[clod.Camera]) -> Iterator[dict[str, object]]:
-    for k, camera in enumerate(cameras):
-        frames = []
-        for s in DIALS:
-            shown = clod.render(gaussians, camera, s)
-            name = f"camera{k}_s{s:g}.png"
-            Image.fromarray(shown.pixels.numpy()).save(KIT / name, optimize=True)
-            frames.append({"s": s, "kept": int(shown.kept.sum()), "picture": name})
-        yield {
-            "world_to_camera": camera.viewmat.tolist(),
-            "focal": float(camera.K[0, 0]),
-            "width": camera.width,
-            "height": camera.height,
-            "frames": frames,
-        }
+def pictured(gaussians: clod.Gaussians, number: int, camera: clod.Camera) -> Row:
+    """Writes the pictures of a camera; what cameras.json has of it."""
+    camera = resized(camera)
+    frames = []
+    for s in DIALS:
+        frame = clod.render(gaussians, camera, s)
+        name = f"camera{number}_s{s:g}.png"
+        Image.fromarray(frame.pixels.numpy()).save(KIT / name, optimize=True)
+        frames.append({"s": s, "kept": int(frame.kept.sum()), "picture": name})
+    return {
+        "world_to_camera": camera.viewmat.tolist(),
+        "focal": float(camera.K[0, 0]),
+        "width": camera.width,
+        "height": camera.height,
+        "frames": frames,
+    }
 
 
 if __name__ == "__main__":

@@ -18,6 +18,9 @@ import tempfile
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+from functools import partial
+from itertools import product
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -25,16 +28,18 @@ from typing import Any
 import workloads
 from clod_adapter.rasterizers import cpu, reference
 from common import ROOT, Row, append, arguments
-from workloads import Workload
+from workloads import Size, Workload
 
 import torch
 from torch import Tensor
 
 FILE = "rasterize.jsonl"
 YARDSTICK = Path(os.environ.get("CLOD_YARDSTICK", ROOT.parent / "shared" / "yardstick"))
-THREADS, WARM, REPEATS = 2, 2, 15
+THREADS = 2
+WARM = 2
+REPEATS = 15
 SHARES = (1.0, 0.5, 0.25, 0.1)
-SMALL = (3000, 160, 107, 1)  # Gaussians, width, height and seed of the comparison in float64
+SMALL = workloads.Size(3000, 160, 107, 1)  # of the comparison in float64
 Jobs = dict[str, Callable[[], Any]]
 JOBS: Jobs = {}  # of a worker's process
 
@@ -57,26 +62,26 @@ def speed() -> list[Row]:
     """All times of each workload."""
     with tempfile.TemporaryDirectory() as folder:
         library, rows = build_yardstick(YARDSTICK, Path(folder)), []
-        for name, (count, width, height, _) in workloads.SIZES.items():
-            workers = {"": worker(our_jobs, name)}
+        for name, size in workloads.SIZES.items():
+            workers = {"": worker(our_jobs, size)}
             if library:
-                workers["yardstick_"] = worker(yardstick_jobs, name, library)
-            steps = [
-                {who: pool.submit(_run, "step").result() for who, pool in workers.items()}
-                for _ in range(REPEATS + WARM)
-            ]
+                workers["yardstick_"] = worker(yardstick_jobs, size, library)
+            steps: dict[str, list[list[float]]] = {"": [], "yardstick_": []}
+            for _ in range(REPEATS + WARM):
+                for who, pool in workers.items():
+                    steps[who].append(pool.submit(_run, "step").result())
             frames = [workers[""].submit(_run, "frames").result() for _ in range(REPEATS + WARM)]
             row = {
                 "workload": name,
-                "gaussians": count,
-                "width": width,
-                "height": height,
+                "gaussians": size.count,
+                "width": size.width,
+                "height": size.height,
                 "repeats": REPEATS,
             }
-            for who in ("", "yardstick_"):
-                for k, what in enumerate(("forward", "both")):
-                    row[f"{who}{what}_ms"] = middle([step[who][k] for step in steps if who in step])
-            ways = [(way, share) for way in ("rows removed", "opacity 0") for share in SHARES]
+            for who, times in steps.items():
+                row[f"{who}forward_ms"] = middle([forward for forward, _ in times])
+                row[f"{who}both_ms"] = middle([both for _, both in times])
+            ways = product(("rows removed", "opacity 0"), SHARES)
             row["kept"] = [
                 {"way": way, "share": share, "ms": middle(times)}
                 for (way, share), times in zip(ways, zip(*frames, strict=True), strict=True)
@@ -109,18 +114,16 @@ def middle(times: Sequence[float]) -> float | None:
     return round(median(times[WARM:]), 2) if times[WARM:] else None
 
 
-def our_jobs(name: str) -> Jobs:
+def our_jobs(size: Size) -> Jobs:
     """A step; and frames of the most opaque: the others' rows removed, then their opacities 0, as
     the dial does.
     """
-    workload = workloads.make(name)
+    workload = workloads.make(size)
     draw, leaves = ours(workload)
     rank = workload.opacities.argsort(descending=True).argsort()
-    keep = [rank < share * len(rank) for share in SHARES]
-    fewer = [workload.changed("", rows) for rows in keep]
-    fewer += [
-        workload.changed("", opacities=torch.where(rows, workload.opacities, 0)) for rows in keep
-    ]
+    kept = [rank < share * len(rank) for share in SHARES]
+    fewer = [workload.at(rows) for rows in kept]
+    fewer += [replace(workload, opacities=workload.opacities.where(rows, 0)) for rows in kept]
     frames = [ours(part)[0] for part in fewer]
     return {
         "step": lambda: timed_step(draw, leaves, workload.weights),
@@ -131,10 +134,8 @@ def our_jobs(name: str) -> Jobs:
 def ours(workload: Workload) -> tuple[Callable[[], Tensor], list[Tensor]]:
     """A function that draws the workload with our rasterizer, and the leaves of its gradients."""
     leaves = {name: value.clone().requires_grad_() for name, value in workload.parameters().items()}
-    background = torch.zeros(3)
-    return lambda: cpu.rasterize(**leaves, camera=workload.camera, background=background)[0], list(
-        leaves.values()
-    )
+    draw = partial(cpu.rasterize, **leaves, camera=workload.camera, background=torch.zeros(3))
+    return lambda: draw()[0], list(leaves.values())
 
 
 def timed_step(draw: Callable[[], Tensor], leaves: list[Tensor], weights: Tensor) -> list[float]:
@@ -157,23 +158,21 @@ def timed_frame(draw: Callable[[], Tensor]) -> float:
     return (time.perf_counter() - began) * 1e3
 
 
-def yardstick_jobs(name: str, library: Path) -> Jobs:
-    binding, workload = load_module(YARDSTICK / "binding.py"), workloads.make(name)
-    kernel, camera = binding.Lib(str(library), THREADS), workload.camera
-    fields = ("means", "scales", "quats", "opacities", "sh")
-    leaves = {field: getattr(workload, field).clone().requires_grad_() for field in fields}
-    scene = {
-        **leaves,
-        "viewmat": camera.viewmat,
-        "K": camera.K,
-        "W": camera.width,
-        "H": camera.height,
+def yardstick_jobs(size: Size, library: Path) -> Jobs:
+    binding = load_module(YARDSTICK / "binding.py")
+    kernel = binding.Lib(str(library), THREADS)
+    workload = workloads.make(size)
+    camera = workload.camera
+    leaves = {
+        field: getattr(workload, field).clone().requires_grad_() for field in workloads.FIELDS
     }
-    return {
-        "step": lambda: timed_step(
-            lambda: binding.render(kernel, scene)[0], list(leaves.values()), workload.weights
-        )
-    }
+    pose = {"viewmat": camera.viewmat, "K": camera.K}
+    scene = {**leaves, **pose, "W": camera.width, "H": camera.height}
+
+    def draw() -> Tensor:
+        return binding.render(kernel, scene)[0]
+
+    return {"step": lambda: timed_step(draw, list(leaves.values()), workload.weights)}
 
 
 def build_yardstick(source: Path, folder: Path) -> Path | None:
@@ -190,21 +189,12 @@ def build_yardstick(source: Path, folder: Path) -> Path | None:
         return None
     theirs = load_module(source / "workload.py")
     for name, size in workloads.SIZES.items():
-        different = workloads.differences(workloads.make(name), theirs.make(*size))
+        different = workloads.differences(workloads.make(size), theirs.make(*size))
         if different:
             sys.exit(f"{name} is not the yardstick's: {', '.join(different)} differ")
     library = folder / "libyardstick.so"
-    options = [
-        "-O3",
-        "-march=native",
-        "-ffast-math",
-        "-std=c++17",
-        "-fopenmp",
-        "-shared",
-        "-fPIC",
-        "-DTS=32",
-    ]
-    subprocess.run(["g++", *options, str(source / "kernel.cpp"), "-o", str(library)], check=True)
+    options = "-O3 -march=native -ffast-math -std=c++17 -fopenmp -shared -fPIC -DTS=32".split()
+    subprocess.run(["g++", *options, source / "kernel.cpp", "-o", library], check=True)
     return library
 
 
@@ -224,17 +214,18 @@ def accuracy() -> list[Row]:
     Float32 rounding may decide otherwise whether an alpha reaches 1/255 or a pixel ends: those
     pixels are ``flipped``.
     """
-    scene = workloads.make("small", SMALL)
+    scene = workloads.make(SMALL)
     exact, expected = differentiate(scene, reference.rasterize, torch.float64)
-    image, found = differentiate(scene, cpu.rasterize, torch.float32)
+    image, gradients = differentiate(scene, cpu.rasterize, torch.float32)
     torch.set_num_threads(1)
     single, alone = differentiate(scene, cpu.rasterize, torch.float32)
     error = (image - exact).abs().amax(-1)
     flipped = error > 1e-4
-    apart = {
-        name: ((found[name] - expected[name]).norm() / expected[name].norm()).item()
-        for name in found
-    }
+    alike = torch.equal(single, image)
+    errors = {}
+    for name, gradient in gradients.items():
+        errors[name] = ((gradient - expected[name]).norm() / expected[name].norm()).item()
+        alike &= torch.equal(alone[name], gradient)
     return [
         {
             "workload": "small",
@@ -242,9 +233,8 @@ def accuracy() -> list[Row]:
             "pixels": error.numel(),
             "flipped": int(flipped.sum()),
             "error": error[~flipped].max().item(),
-            "gradient_errors": apart,
-            "one_thread_alike": torch.equal(single, image)
-            and all(torch.equal(alone[n], found[n]) for n in found),
+            "gradient_errors": errors,
+            "one_thread_alike": alike,
         }
     ]
 
@@ -255,8 +245,8 @@ def differentiate(
     """The image, and the gradients of its weighted sum."""
     leaves = {name: value.to(dtype).requires_grad_() for name, value in scene.parameters().items()}
     image = draw(**leaves, camera=scene.camera, background=torch.zeros(3, dtype=dtype))[0]
-    found = torch.autograd.grad((image * scene.weights).sum(), list(leaves.values()))
-    return image.detach(), dict(zip(leaves, found, strict=True))
+    gradients = torch.autograd.grad((image * scene.weights).sum(), list(leaves.values()))
+    return image.detach(), dict(zip(leaves, gradients, strict=True))
 
 
 if __name__ == "__main__":

@@ -14,15 +14,13 @@ import json
 import math
 import tempfile
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
-from statistics import fmean
 
 import clod_adapter as clod
-from city import HOUSE, PITCH, SKY, city, city_cameras, look_at, lots, perturb
+from city import HOUSE, PITCH, SKY, city, city_cameras, direction, look_at, lots, perturb
 from clod_adapter.config import FILTERS
 from clod_adapter.io.atomic import atomic_path
-from common import CACHE, COMMAND, Process, Row, append, arguments, stored, table
+from common import CACHE, Row, append, arguments, clod_adapt, stored, table
 from tuning import Tuning, tune
 
 import numpy as np
@@ -56,22 +54,12 @@ def main() -> None:
 
 def measure(count: int) -> Row:
     folder = made(count)
+    base = folder / "base.ply"
     truth = town(count)
     with tempfile.TemporaryDirectory() as place:
         out = Path(place) / "dial.ply"
-        run = Process(
-            [
-                *COMMAND,
-                folder / "base.ply",
-                "--images",
-                folder,
-                "--out",
-                out,
-                "--json",
-                "--accept-loss",
-            ]
-        )
-        shown = {"base": clod.load(folder / "base.ply").gaussians, "dial": clod.load(out).gaussians}
+        run = clod_adapt(base, "--images", folder, "--out", out, "--json", "--accept-loss")
+        models = {"base": clod.load(base).gaussians, "dial": clod.load(out).gaussians}
     row: Row = {
         "benchmark": "walk",
         "count": count,
@@ -82,9 +70,9 @@ def measure(count: int) -> Row:
     for distance in DISTANCES:
         camera = walker(count, distance)
         view = clod.View(camera, supersampled(truth, camera))
-        for name, gaussians in shown.items():
-            (found,) = clod.evaluate(gaussians, view, 1.0)
-            row[name].append({"psnr": round(found.psnr, 3), "in_view": found.in_view})
+        for name, gaussians in models.items():
+            (quality,) = clod.evaluate(gaussians, view, 1.0)
+            row[name].append({"psnr": round(quality.psnr, 3), "in_view": quality.in_view})
     return row
 
 
@@ -117,17 +105,14 @@ def photographers(count: int) -> list[clod.Camera]:
     """A third each in the streets, in the air, and on all sides as far away as the walk."""
     third = PHOTOGRAPHS // 3
     random = np.random.default_rng(2)
-    found = city_cameras(PHOTOGRAPHS - third, *SIZE, count=count)
+    cameras = city_cameras(PHOTOGRAPHS - third, *SIZE, count=count)
     for _ in range(third):
         turn = random.uniform(0, 2 * math.pi)
         rise = math.radians(random.uniform(15, 40))
         away = DISTANCES[-1] * math.exp(random.uniform(math.log(0.3), 0.1))
-        direction = np.array(
-            [math.cos(rise) * math.cos(turn), -math.sin(rise), math.cos(rise) * math.sin(turn)]
-        )
-        found.append(look_at(away * direction, np.zeros(3), *SIZE, "far"))
-    random.shuffle(found)  # every 8th is held out
-    return found
+        cameras.append(look_at(away * direction(turn, rise), np.zeros(3), *SIZE, "far"))
+    random.shuffle(cameras)  # every 8th is held out
+    return cameras
 
 
 def walker(count: int, distance: float) -> clod.Camera:
@@ -146,58 +131,58 @@ def walker(count: int, distance: float) -> clod.Camera:
 
 def summary(row: Row) -> str:
     """A Markdown table by band of distance, means over its frames."""
+    distances = np.array(row["distances"])
     lines = []
     nearest = 0.0
     for name, farthest in BANDS.items():
-        inside = [
-            k for k, distance in enumerate(row["distances"]) if nearest < distance <= farthest
-        ]
-        base = [row["base"][k] for k in inside]
-        dial = [row["dial"][k] for k in inside]
-        psnr = fmean(each["psnr"] for each in base)
-        gain = fmean(each["psnr"] for each in dial) - psnr
-        share = sum(each["in_view"] for each in dial) / sum(each["in_view"] for each in base)
-        lines.append([name, f"{psnr:.2f}", f"{gain:+.2f}", f"{share:.0%}"])
+        inside = (nearest < distances) & (distances <= farthest)
+        base_psnr, base_in_view = means(row["base"], inside)
+        dial_psnr, dial_in_view = means(row["dial"], inside)
+        share = dial_in_view / base_in_view
+        lines.append([name, f"{base_psnr:.2f}", f"{dial_psnr - base_psnr:+.2f}", f"{share:.0%}"])
         nearest = farthest
-    return table(
-        ["from the door", "base, dB", "dial, dB against it", "Gaussians in view"], lines, 1
-    )
+    heads = ["from the door", "base, dB", "dial, dB against it", "Gaussians in view"]
+    return table(heads, lines, 1)
+
+
+def means(frames: list[Row], rows: np.ndarray) -> np.ndarray:
+    """Mean PSNR and number of Gaussians in view."""
+    return np.array([(frame["psnr"], frame["in_view"]) for frame in frames])[rows].mean(0)
 
 
 @torch.no_grad()
-def supersampled(shown: clod.Gaussians, camera: clod.Camera) -> torch.Tensor:
+def supersampled(gaussians: clod.Gaussians, camera: clod.Camera) -> torch.Tensor:
     """``[H, W, 3]`` uint8, a render with SAMPLES by SAMPLES samples in a pixel."""
-    K = camera.K * torch.tensor([[SAMPLES], [SAMPLES], [1.0]])
-    image = clod.render(
-        shown, replace(camera, K=K, width=SAMPLES * camera.width, height=SAMPLES * camera.height)
-    ).image
+    larger = camera.resized(SAMPLES * camera.width, SAMPLES * camera.height)
+    image = clod.render(gaussians, larger).image
     image = image.clamp(0, 1).reshape(camera.height, SAMPLES, camera.width, SAMPLES, 3).mean((1, 3))
     return (255 * image).round().to(torch.uint8)
 
 
-def write_photographs(shown: clod.Gaussians, cameras: Sequence[clod.Camera], folder: Path) -> Path:
-    """A folder of photographs with their transforms.json."""
+def write_photographs(
+    gaussians: clod.Gaussians, cameras: Sequence[clod.Camera], folder: Path
+) -> None:
+    """Writes photographs to a folder, with their transforms.json."""
     (folder / "images").mkdir(parents=True)
+    flip = torch.diag(torch.tensor([1.0, -1, -1, 1])).double()
     frames = []
     for k, camera in enumerate(cameras):
         name = f"images/{k:04}.png"
-        Image.fromarray(supersampled(shown, camera).numpy()).save(folder / name)
-        pose = (
-            torch.linalg.inv(camera.viewmat.double())
-            @ torch.diag(torch.tensor([1.0, -1, -1, 1])).double()
+        Image.fromarray(supersampled(gaussians, camera).numpy()).save(folder / name)
+        (fl_x, _, cx), (_, fl_y, cy), _ = camera.K.tolist()
+        frames.append(
+            {
+                "file_path": name,
+                "transform_matrix": (torch.linalg.inv(camera.viewmat.double()) @ flip).tolist(),
+                "fl_x": fl_x,
+                "fl_y": fl_y,
+                "cx": cx,
+                "cy": cy,
+                "w": camera.width,
+                "h": camera.height,
+            }
         )
-        K = camera.K.tolist()
-        size = {
-            "fl_x": K[0][0],
-            "fl_y": K[1][1],
-            "cx": K[0][2],
-            "cy": K[1][2],
-            "w": camera.width,
-            "h": camera.height,
-        }
-        frames.append({"file_path": name, "transform_matrix": pose.tolist(), **size})
     (folder / "transforms.json").write_text(json.dumps({"frames": frames}), "utf-8")
-    return folder
 
 
 if __name__ == "__main__":

@@ -7,7 +7,8 @@ compares.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 from clod_adapter.cameras import Camera
 from clod_adapter.gaussians import SH_C0
@@ -16,8 +17,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-# Gaussians, width, height, seed.
-SIZES = {"W1": (50_000, 480, 320, 1), "W2": (300_000, 960, 640, 2)}
+
+class Size(NamedTuple):
+    count: int  # Gaussians
+    width: int
+    height: int
+    seed: int
+
+
+SIZES = {"W1": Size(50_000, 480, 320, 1), "W2": Size(300_000, 960, 640, 2)}
+FIELDS = ("means", "quats", "scales", "opacities", "sh")
 Array = np.ndarray
 
 
@@ -27,7 +36,6 @@ class Workload:
     ``(image * weights).sum()``.
     """
 
-    name: str
     means: Tensor
     quats: Tensor
     scales: Tensor
@@ -38,25 +46,22 @@ class Workload:
 
     def parameters(self) -> dict[str, Tensor]:
         """What a rasterizer takes, by name: views or copies, all contiguous."""
-        sh0, shN = self.sh[:, :1].contiguous(), self.sh[:, 1:].contiguous()
-        fields = {name: getattr(self, name) for name in ("means", "quats", "scales", "opacities")}
-        return {**fields, "sh0": sh0, "shN": shN}
-
-    def changed(self, name: str, rows: Tensor | slice = slice(None), **fields: Tensor) -> Workload:
-        """Those rows under another name, with some fields replaced."""
-        old = {
-            f: getattr(self, f)[rows].contiguous()
-            for f in ("means", "quats", "scales", "opacities", "sh")
+        fields = {name: getattr(self, name) for name in FIELDS[:-1]}
+        return {
+            **fields,
+            "sh0": self.sh[:, :1].contiguous(),
+            "shN": self.sh[:, 1:].contiguous(),
         }
-        return Workload(name, **{**old, **fields}, camera=self.camera, weights=self.weights)
+
+    def at(self, rows: Tensor) -> Workload:
+        """Those rows."""
+        return replace(self, **{name: getattr(self, name)[rows] for name in FIELDS})
 
 
-def make(name: str, size: tuple[int, int, int, int] | None = None) -> Workload:
-    """W1, W2 or one of another size; the draws come in a fixed order, which the numbers depend
-    on.
-    """
-    count, width, height, seed = size or SIZES[name]
-    draw = np.random.default_rng(seed)
+def make(size: Size) -> Workload:
+    """A workload; the draws come in a fixed order, which the numbers depend on."""
+    draw = np.random.default_rng(size.seed)
+    count, width, height = size[:3]
     rotation, translation, focal = _pose(width)
     points = _surface_points(draw, count)
     depths = np.maximum((points @ rotation.T + translation)[:, 2], 0.3)
@@ -68,7 +73,6 @@ def make(name: str, size: tuple[int, int, int, int] | None = None) -> Workload:
     viewmat = np.block([[rotation, translation[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]])
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
     return Workload(
-        name,
         *map(_tensor, (points, quats, pixels * depths[:, None] / focal, opacities, sh)),
         Camera(_tensor(viewmat), _tensor(K), width, height),
         _tensor(weights),
@@ -87,11 +91,8 @@ def _pose(width: int) -> tuple[Array, Array, float]:
         [[1, 0, 0], [0, np.cos(pitch), -np.sin(pitch)], [0, np.sin(pitch), np.cos(pitch)]]
     )
     rotation = about_x @ about_y
-    return (
-        rotation,
-        -rotation @ np.array([0.3, -0.2, -4.2]),
-        0.5 * width / np.tan(np.radians(60) / 2),
-    )
+    translation = -rotation @ np.array([0.3, -0.2, -4.2])
+    return rotation, translation, 0.5 * width / np.tan(np.radians(60) / 2)
 
 
 def _surface_points(draw: np.random.Generator, count: int) -> Array:
@@ -113,10 +114,8 @@ def _surface_points(draw: np.random.Generator, count: int) -> Array:
     rows, axes = np.arange(len(faces)), draw.integers(0, 3, len(faces))
     faces[rows, axes] = np.sign(faces[rows, axes])
     which = draw.integers(0, 2, len(faces))
-    centres, halves = (
-        np.array([[-0.2, 1.3, -1.2], [-2.2, 0, 1.8]]),
-        np.array([[0.5, 0.6, 0.4], [0.5, 1.2, 0.5]]),
-    )
+    centres = np.array([[-0.2, 1.3, -1.2], [-2.2, 0, 1.8]])
+    halves = np.array([[0.5, 0.6, 0.4], [0.5, 1.2, 0.5]])
     points[kinds == 6] = centres[which] + faces * halves[which]
     return points + draw.normal(scale=0.015, size=points.shape)
 
@@ -148,30 +147,13 @@ def _colors(draw: np.random.Generator, points: Array) -> Array:
     base = 0.5 + waves + 0.08 * draw.normal(size=points.shape)
     sh = np.empty((len(points), 16, 3))
     sh[:, 0] = (base - 0.5) / SH_C0
-    sh[:, 1:] = (
-        draw.normal(size=(len(points), 15, 3))
-        * np.repeat([0.10, 0.06, 0.04], [3, 5, 7])[None, :, None]
-    )
+    spread = np.repeat([0.10, 0.06, 0.04], [3, 5, 7])
+    sh[:, 1:] = draw.normal(size=(len(points), 15, 3)) * spread[:, None]
     return sh
 
 
 def differences(ours: Workload, theirs: dict[str, Array | int]) -> list[str]:
     """Names of the yardstick's arrays that are not ours bit for bit."""
-    camera = ours.camera
-    mine = {
-        "means": ours.means,
-        "scales": ours.scales,
-        "quats": ours.quats,
-        "opacities": ours.opacities,
-        "sh": ours.sh,
-        "viewmat": camera.viewmat,
-        "K": camera.K,
-        "G": ours.weights,
-        "width": camera.width,
-        "height": camera.height,
-    }
-    return [
-        name
-        for name, value in mine.items()
-        if not np.array_equal(np.asarray(value), np.asarray(theirs[name]))
-    ]
+    mine = {name: getattr(ours, name) for name in FIELDS} | {"G": ours.weights}
+    mine |= {name: getattr(ours.camera, name) for name in ("viewmat", "K", "width", "height")}
+    return [name for name, value in mine.items() if not np.array_equal(value, theirs[name])]
