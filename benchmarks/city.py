@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Literal
 
 import clod_adapter as clod
-from clod_adapter.config import SH_COUNTS
 from clod_adapter.gaussians import SH_C0, Gaussians
 from clod_adapter.io.atomic import atomic_path
 from models import write_model
@@ -34,11 +33,11 @@ def lots(count: int) -> int:
     return max(math.ceil(math.sqrt(count / (DENSITY * AREA))), 1)
 
 
-def city(count: int, *, seed: int = 0, sh_degree: int = 3) -> Gaussians:
-    """``count`` Gaussians, at least 1000; the same ones for the same arguments."""
+def city(count: int) -> Gaussians:
+    """``count`` Gaussians, at least 1000; always the same ones."""
     if count < 1000:
         raise SystemExit(f"a town needs at least 1000 Gaussians, not {count}")
-    random = np.random.default_rng(seed)
+    random = np.random.default_rng(0)
     far = round(SKY * count)
     size = lots(count) * PITCH
     points, normals, colours = surfaces(count - far, random)
@@ -53,7 +52,7 @@ def city(count: int, *, seed: int = 0, sh_degree: int = 3) -> Gaussians:
     flat[count - far :] = 1.3 * math.sqrt(4 * math.pi * (3 * size) ** 2 / far)
     noise = random.standard_normal((count, 3))
     log_scales = np.log(np.stack([flat, flat, 0.08 * flat], 1)) + 0.15 * noise
-    higher = random.normal(scale=0.03, size=(count, SH_COUNTS[sh_degree] - 1, 3))
+    higher = random.normal(scale=0.03, size=(count, 15, 3))
     logits = np.where(np.arange(count) < count - far, 2.6 + 1.2 * noise[:, 0], 3.0)
     sh0 = ((colours - 0.5) / SH_C0)[:, None]
     attributes = (points, facing(normals), log_scales, logits, sh0, higher)
@@ -139,11 +138,11 @@ def look_at(eye: np.ndarray, target: np.ndarray, width: int, height: int, name: 
     )
 
 
-def perturb(truth: Gaussians, seed: int = 0) -> Gaussians:
+def perturb(truth: Gaussians) -> Gaussians:
     """A checkpoint with the errors of training: the truth slightly blurred and displaced. In place;
     returned.
     """
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(0)
     size = truth.log_scales[:, :2].mean(1, keepdim=True).exp()
     for name, by in PERTURBED.items():
         values = getattr(truth, name)

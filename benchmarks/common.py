@@ -189,6 +189,11 @@ class Process:
         return times | {"peak_bytes": self.peak_bytes}
 
 
+def report_of(out: Path) -> Row:
+    """The report that the command writes beside an adapted file."""
+    return json.loads(out.with_suffix(".json").read_text("utf-8"))
+
+
 def clod_adapt(*words: object, until: str = "") -> Process:
     """The command with these words, in a process of its own."""
     return Process([*COMMAND, *words], until=until)

@@ -14,13 +14,23 @@ points (``from_points.py``), or, with ``--base``, is that checkpoint, trained on
 and tuned further on those that are left.
 """
 
-import json
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
 import clod_adapter as clod
-from common import CACHE, Row, append, arguments, capture, clod_adapt, quality, stored, table
+from common import (
+    CACHE,
+    Row,
+    append,
+    arguments,
+    capture,
+    clod_adapt,
+    quality,
+    report_of,
+    stored,
+    table,
+)
 from from_points import thin, write_base
 from tuning import Tuning, tune
 
@@ -69,7 +79,7 @@ def run(folder: Path, *, record: bool) -> None:
         process = clod_adapt(
             base.path, "--images", folder, "--out", out, "--accept-loss", "--quiet"
         )
-        report = json.loads(out.with_suffix(".json").read_text(encoding="utf-8"))
+        report = report_of(out)
         rows = quality(clod.load(out).gaussians, scene.test, DIALS)
     row: Row = {
         "benchmark": "converged",

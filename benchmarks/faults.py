@@ -20,9 +20,8 @@ import time
 import tomllib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
-from common import ROOT, SHARED, append, arguments
+from common import ROOT, SHARED, Row, append, arguments
 
 FILE = "faults.jsonl"
 LISTS = ROOT / "benchmarks" / "faults"
@@ -31,7 +30,7 @@ LEFT_OUT = shutil.ignore_patterns(
 )
 
 
-def faults(words: Sequence[str]) -> Iterator[tuple[str, dict[str, Any]]]:
+def faults(words: Sequence[str]) -> Iterator[tuple[str, Row]]:
     """The faults named, all without words: ``ROOM/NAME`` and the entry."""
     for path in sorted(LISTS.glob("*.toml")):
         for entry in tomllib.loads(path.read_text(encoding="utf-8"))["fault"]:
@@ -42,13 +41,13 @@ def faults(words: Sequence[str]) -> Iterator[tuple[str, dict[str, Any]]]:
 
 def misfits(words: Sequence[str]) -> list[str]:
     """A line for each of the faults that no longer applies."""
-    found = []
+    lines = []
     for name, entry in faults(words):
         path = ROOT / entry["file"]
         count = path.read_text(encoding="utf-8").count(entry["before"]) if path.exists() else 0
         if count != 1:
-            found.append(f"{name}: its 'before' occurs {count} times in {entry['file']}, not once")
-    return found
+            lines.append(f"{name}: its 'before' occurs {count} times in {entry['file']}, not once")
+    return lines
 
 
 def first_failure(copy: Path, tests: Sequence[str]) -> tuple[str, str]:
@@ -67,14 +66,14 @@ def first_failure(copy: Path, tests: Sequence[str]) -> tuple[str, str]:
     return next(failed, lines[-1]) if done.returncode else "", lines[-1]
 
 
-def run(copy: Path, entry: dict[str, Any], whole: bool) -> tuple[str, str]:
+def run(copy: Path, entry: Row, whole: bool) -> tuple[str, str]:
     """What catches the fault, and the counts, as by ``first_failure``."""
     path = copy / entry["file"]
     text = path.read_text(encoding="utf-8")
     path.write_text(text.replace(entry["before"], entry["after"]), encoding="utf-8")
     try:
-        found = first_failure(copy, entry["tests"])
-        return first_failure(copy, ["tests"]) if whole and not found[0] else found
+        by, counts = first_failure(copy, entry["tests"])
+        return first_failure(copy, ["tests"]) if whole and not by else (by, counts)
     finally:
         path.write_text(text, encoding="utf-8")
 
@@ -102,10 +101,8 @@ def main() -> None:
             print(f"{name:40} {by or f'NOT CAUGHT ({counts})'}", flush=True)
             if args.record:
                 seconds = round(time.perf_counter() - began, 1)
-                append(
-                    FILE,
-                    {"benchmark": "faults", "fault": name, "caught_by": by, "seconds": seconds},
-                )
+                about = {"benchmark": "faults", "fault": name}
+                append(FILE, {**about, "caught_by": by, "seconds": seconds})
     sys.exit(bool(missed))
 
 

@@ -8,7 +8,6 @@ number of Gaussians: rounds of tuning, after each of which transparent Gaussians
 ones, as in 3DGS as Markov Chain Monte Carlo (arXiv 2404.09591).
 """
 
-import argparse
 import shutil
 import sys
 import tempfile
@@ -17,6 +16,7 @@ from pathlib import Path
 
 import clod_adapter as clod
 from clod_adapter.gaussians import SH_C0
+from common import arguments
 from tuning import Tuning, tune
 
 import numpy as np
@@ -26,16 +26,16 @@ from PIL import Image, ImageOps
 from scipy.spatial import cKDTree
 
 COUNT = 60_000
-# rounds that end with a relocation, steps of each, and of the last one
-ROUNDS, ROUND, LAST = 8, 250, 1500
+ROUNDS = 8  # that end with a relocation
+ROUND = 250  # steps of each
+LAST = 1500  # steps after them
 TRANSPARENT = 0.05  # opacity below which a Gaussian is moved
-OPACITY, SH_COEFFICIENTS = 0.3, 15
+OPACITY = 0.3
+SH_COEFFICIENTS = 15
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = arguments(__doc__)
     parser.add_argument("photographs", type=Path)
     parser.add_argument("folder", type=Path)
     parser.add_argument(
@@ -48,9 +48,8 @@ def main() -> None:
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as place:
         posed = Path(place) / "posed"
-        find_cameras(
-            sorted(args.photographs.iterdir())[:: args.every], args.size, Path(place), posed
-        )
+        photographs = sorted(args.photographs.iterdir())[:: args.every]
+        find_cameras(photographs, args.size, Path(place), posed)
         thin(posed, args.folder, args.thin)
     write_base(args.folder)
 
@@ -93,21 +92,19 @@ def thin(source: Path, folder: Path, every: int) -> None:
 
 
 def write_base(folder: Path) -> None:
-    """Trains and writes ``folder/base.ply``."""
-    base, seconds = train_base(folder)
-    clod.save(folder / "base.ply", base)
-    print(f"{folder / 'base.ply'}: trained in {seconds:.0f} s", file=sys.stderr)
-
-
-def train_base(folder: Path, seed: int = 0) -> tuple[clod.Gaussians, float]:
-    """The base of a folder with ``images/`` and ``sparse/0/``, and the seconds of its training."""
-    views, random = clod.load_scene(folder).train, np.random.default_rng(seed)
-    gaussians, seconds = initial(pycolmap.Reconstruction(str(folder / "sparse" / "0")), random), 0.0
+    """Trains ``folder/base.ply`` from ``images/`` and ``sparse/0/`` there."""
+    base = folder / "base.ply"
+    views = clod.load_scene(folder).train
+    random = np.random.default_rng(0)
+    gaussians = initial(pycolmap.Reconstruction(str(folder / "sparse" / "0")), random)
+    seconds = 0.0
     for k in range(ROUNDS):
-        gaussians, taken = tune(gaussians, views, Tuning(iters=ROUND, seed=seed + k, final=1.0))
-        gaussians, seconds = relocated(gaussians, random), seconds + taken
-    gaussians, taken = tune(gaussians, views, Tuning(iters=LAST, seed=seed + ROUNDS, final=0.01))
-    return gaussians, seconds + taken
+        tuned, taken = tune(gaussians, views, Tuning(iters=ROUND, seed=k, final=1.0))
+        gaussians = relocated(tuned, random)
+        seconds += taken
+    tuned, taken = tune(gaussians, views, Tuning(iters=LAST, seed=ROUNDS, final=0.01))
+    clod.save(base, tuned)
+    print(f"{base}: trained in {seconds + taken:.0f} s", file=sys.stderr)
 
 
 def initial(model: pycolmap.Reconstruction, random: np.random.Generator) -> clod.Gaussians:
@@ -118,9 +115,8 @@ def initial(model: pycolmap.Reconstruction, random: np.random.Generator) -> clod
     rgb = np.array([point.color for point in model.points3D.values()]) / 255
     distances = cKDTree(xyz).query(xyz, 4)[0][:, 1:].mean(1)
     rows = random.permutation(np.resize(random.permutation(len(xyz)), COUNT))
-    sizes = np.maximum(distances[rows], 1e-6 * np.ptp(xyz)) * min(
-        1.0, (len(xyz) / COUNT) ** (1 / 3)
-    )
+    closer = min(1.0, (len(xyz) / COUNT) ** (1 / 3))
+    sizes = np.maximum(distances[rows], 1e-6 * np.ptp(xyz)) * closer
     means = xyz[rows] + random.normal(size=(COUNT, 3)) * sizes[:, None]
     return clod.Gaussians(
         means=means.astype(np.float32),

@@ -34,9 +34,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import reduce
 from pathlib import Path
-from typing import Any
 
-from common import ROOT, SHARED, append, arguments, outcomes
+from common import ROOT, SHARED, Row, append, arguments, outcomes
 
 FILE = "portability.jsonl"
 SPACED = os.fsdecode("a folder, spàced".encode())  # under an ASCII locale too
@@ -54,16 +53,7 @@ class Condition:
     prefix: tuple[str, ...] = ()
 
     def __add__(self, other: Condition) -> Condition:
-        both = self.environment | other.environment
-        paths = [
-            each.environment["PYTHONPATH"]
-            for each in (self, other)
-            if "PYTHONPATH" in each.environment
-        ]
-        return Condition(
-            both | ({"PYTHONPATH": os.pathsep.join(paths)} if paths else {}),
-            self.prefix + other.prefix,
-        )
+        return Condition(self.environment | other.environment, self.prefix + other.prefix)
 
 
 CONDITIONS = {
@@ -92,7 +82,7 @@ CONDITIONS = {
 }
 
 
-def run(name: str, tests: Sequence[str], parallel: Sequence[str] = PARALLEL) -> dict[str, Any]:
+def run(name: str, tests: Sequence[str]) -> Row:
     """Counts and seconds of the tests under a condition; ``failures`` names those that failed, or
     says why none ran.
 
@@ -100,27 +90,18 @@ def run(name: str, tests: Sequence[str], parallel: Sequence[str] = PARALLEL) -> 
         name: of a condition, or of several at once, joined by +.
         tests: paths in the checkout; all of its tests where there are none.
     """
-    names = name.split("+")
-    condition = reduce(Condition.__add__, (CONDITIONS[each] for each in names))
+    condition = reduce(Condition.__add__, map(CONDITIONS.get, name.split("+")))
     with tempfile.TemporaryDirectory() as outer:
         work = Path(outer) / SPACED
         for folder in ("tmp", "home", "cache"):
             (work / folder).mkdir(parents=True)
         report = Path(outer) / "report.xml"
-        words = [
-            *condition.prefix,
-            sys.executable,
-            "-m",
-            "pytest",
-            *parallel,
-            f"--junitxml={report}",
-            *tests,
-        ]
+        pytest = [sys.executable, "-m", "pytest", *PARALLEL, f"--junitxml={report}", *tests]
         environment = {key: value.format(work=work) for key, value in condition.environment.items()}
         environment["CLOD_SHARED_DATA"] = str(SHARED)  # the default is relative to the checkout
         began = time.perf_counter()
         done = subprocess.run(
-            words,
+            [*condition.prefix, *pytest],
             cwd=ROOT,
             env=os.environ | environment,
             stdout=subprocess.PIPE,
@@ -130,10 +111,11 @@ def run(name: str, tests: Sequence[str], parallel: Sequence[str] = PARALLEL) -> 
             check=False,
         )
         seconds = round(time.perf_counter() - began, 1)
-        found = outcomes(report) if report.exists() else {"failures": [done.stdout.strip()[-200:]]}
-    if done.returncode != 0 and not found["failures"]:
-        found["failures"] = [f"exit code {done.returncode}: {done.stdout.strip()[-200:]}"]
-    return {"passed": 0, "failed": 1, "skipped": 0, **found, "seconds": seconds}
+        end = done.stdout.strip()[-200:]
+        result = outcomes(report) if report.exists() else {"failures": [end]}
+    if done.returncode != 0 and not result["failures"]:
+        result["failures"] = [f"exit code {done.returncode}: {end}"]
+    return {"passed": 0, "failed": 1, "skipped": 0, **result, "seconds": seconds}
 
 
 def main() -> None:
@@ -143,31 +125,23 @@ def main() -> None:
         "--tests", nargs="+", default=[], metavar="PATH", help="default: all of them"
     )
     args = parser.parse_args()
-    if unknown := {each for name in args.conditions for each in name.split("+")} - set(CONDITIONS):
+    unknown = set("+".join(args.conditions or CONDITIONS).split("+")) - set(CONDITIONS)
+    if unknown:
         parser.error(
             f"there is no condition {', '.join(sorted(unknown))}; there are {', '.join(CONDITIONS)}"
         )
     print(f"{'condition':16} {'passed':>7} {'failed':>7} {'skipped':>7} {'seconds':>8}", flush=True)
     failed = False
     for name in args.conditions or CONDITIONS:
-        found = run(name, args.tests)
-        failed |= bool(found["failures"])
-        print(
-            f"{name:16} {found['passed']:7} {found['failed']:7} {found['skipped']:7}"
-            f" {found['seconds']:8}"
-        )
-        print(
-            "\n".join(f"    {line}" for line in found["failures"]),
-            end="\n" * bool(found["failures"]),
-            flush=True,
-        )
+        result = run(name, args.tests)
+        failed |= bool(result["failures"])
+        counts = f"{result['passed']:7} {result['failed']:7} {result['skipped']:7}"
+        print(f"{name:16} {counts} {result['seconds']:8}", flush=True)
+        for line in result["failures"]:
+            print(f"    {line}", flush=True)
         if args.record:
-            about = {
-                "benchmark": "portability",
-                "condition": name,
-                "tests": args.tests or ["tests"],
-            }
-            append(FILE, {**about, **found})
+            about = {"condition": name, "tests": args.tests or ["tests"]}
+            append(FILE, {"benchmark": "portability", **about, **result})
     sys.exit(failed)
 
 

@@ -6,13 +6,12 @@ Runs the command with one view a step, with two, and with two processes of one v
 compares the last two files. Rows go to ``results/processes.jsonl``.
 """
 
-import json
 import sys
 import tempfile
 from pathlib import Path
 
 import clod_adapter as clod
-from common import COMMAND, Process, append, arguments, capture
+from common import COMMAND, Process, append, arguments, capture, report_of
 
 FILE = "processes.jsonl"
 
@@ -40,7 +39,7 @@ def run(name: str) -> None:
             for option, value in settings.items():
                 words += [f"--{option}", value]
             run = Process([*command, *words])
-            report = json.loads(out.with_suffix(".json").read_text(encoding="utf-8"))
+            report = report_of(out)
             rows[label] = settings | run.cost() | {"rows": report["rows"]}
             files.append(clod.load(out).gaussians)
     alike = files[1] == files[2]

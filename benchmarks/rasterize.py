@@ -193,8 +193,8 @@ def build_yardstick(source: Path, folder: Path) -> Path | None:
         if different:
             sys.exit(f"{name} is not the yardstick's: {', '.join(different)} differ")
     library = folder / "libyardstick.so"
-    options = "-O3 -march=native -ffast-math -std=c++17 -fopenmp -shared -fPIC -DTS=32".split()
-    subprocess.run(["g++", *options, source / "kernel.cpp", "-o", library], check=True)
+    options = "-O3 -march=native -ffast-math -std=c++17 -fopenmp -shared -fPIC -DTS=32"
+    subprocess.run(["g++", *options.split(), source / "kernel.cpp", "-o", library], check=True)
     return library
 
 

@@ -22,7 +22,7 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 from city import write_city
-from common import CACHE, Process, Row, append, arguments, clod_adapt, stored, table
+from common import CACHE, Process, Row, append, arguments, clod_adapt, report_of, stored, table
 
 import numpy as np
 
@@ -97,7 +97,7 @@ def run_adapt(folder: Path) -> Row:
     out = dial_of(folder)
     settings = ("--iters", STEPS, "--max-sv", MAX_SV)
     run = clod_adapt(folder / "city.ply", "--images", folder, *settings, "--out", out)
-    seconds = json.loads(out.with_suffix(".json").read_text(encoding="utf-8"))["seconds"]
+    seconds = report_of(out)["seconds"]
     return {**run.cost(), "step_seconds": seconds["train"] / STEPS, "phases": seconds}
 
 

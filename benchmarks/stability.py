@@ -11,13 +11,14 @@ tables of docs/performance.md are printed, its pictures are written.
 
 import json
 import time
+from itertools import chain
 
 import stability_equation
 import stability_popping
 import stability_scenes
 import stability_stiffness
 from clod_adapter.cli.shared.outputs import jsonable
-from common import RESULTS, ROOT, about, arguments, stored
+from common import RESULTS, ROOT, Row, about, arguments, stored
 
 FILE, IMAGES = "stability.jsonl", ROOT / "docs" / "images"
 PARTS = {
@@ -37,20 +38,23 @@ def main() -> None:
         "--page", action="store_true", help="run nothing, print the tables of the stored rows"
     )
     args = parser.parse_args()
-    rows = {part: [row for row in stored(FILE) if row["part"] == part] for part in PARTS}
+    rows: dict[str, list[Row]] = {part: [] for part in PARTS}
+    for row in stored(FILE):
+        rows[row["part"]].append(row)
     for part in () if args.page else args.only:
         started = time.perf_counter()
-        found = PARTS[part].measure()
+        measured = PARTS[part].measure()
         head = {**about(), "part_seconds": round(time.perf_counter() - started, 1)}
-        rows[part] = [jsonable({**head, **row}) for row in found]
-        lines = [json.dumps(row) for part in PARTS for row in rows[part]]
+        rows[part] = [jsonable({**head, "part": part, **row}) for row in measured]
+        lines = map(json.dumps, chain.from_iterable(rows.values()))
         (RESULTS / FILE).write_text("\n".join(lines) + "\n", encoding="utf-8")
     for part in args.only:
-        if own := rows[part]:
-            head = f"## {part}: commit {own[0]['commit']}, {own[0]['part_seconds']} s"
-            print(f"{head}\n\n{PARTS[part].tables(own)}\n", flush=True)
-            if hasattr(PARTS[part], "picture"):
-                PARTS[part].picture(own, IMAGES / f"stability_{part}.png")
+        if rows[part]:
+            first = rows[part][0]
+            head = f"## {part}: commit {first['commit']}, {first['part_seconds']} s"
+            print(f"{head}\n\n{PARTS[part].tables(rows[part])}\n", flush=True)
+            if part == "stiffness":
+                stability_stiffness.picture(rows[part], IMAGES / "stability_stiffness.png")
 
 
 if __name__ == "__main__":

@@ -6,11 +6,12 @@ number may be off by that number.
 """
 
 import math
+from collections import Counter
 from typing import Any
 
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.equation.attenuation import LOG_GROWTH_MAX, SIGMA_MAX, attenuate
-from common import table
+from common import Row, table
 
 import mpmath
 import numpy as np
@@ -37,18 +38,15 @@ class Tally:
     """Errors of the quantities in one dtype."""
 
     def __init__(self, dtype: str) -> None:
-        self.dtype, self.info, self.rows = (
-            dtype,
-            torch.finfo(DTYPES[dtype]),
-            dict[str, dict[str, Any]](),
-        )
+        self.dtype = dtype
+        self.info = torch.finfo(DTYPES[dtype])
+        self.rows: dict[str, Row] = {}
 
     def add(self, name: str, got: float, want: Any, allowed: float, scale: Any = None) -> None:
         """Counts the error of a number, relative to it or to ``scale``."""
         row = self.rows.setdefault(
             name,
             {
-                "part": "equation",
                 "quantity": name,
                 "dtype": self.dtype,
                 "bound": BOUNDS[name],
@@ -59,32 +57,28 @@ class Tally:
                 "worst_of_bound": 0.0,
             },
         )
-        error, size = math.inf, abs(want if scale is None else scale)
-        if math.isfinite(got):
-            off = abs(mpf(got) - want)
-            error = (
-                0.0
-                if off <= self.info.tiny
-                else float(off / (self.info.eps * size))
-                if size
-                else math.inf
-            )
+        size = abs(want if scale is None else scale)
+        off = abs(mpf(got) - want)
+        if off <= self.info.tiny:
+            error = 0.0
+        else:
+            error = float(off / (self.info.eps * size)) if size and math.isfinite(got) else math.inf
         row["points"] += 1
         row["nan"] += math.isnan(got)
         row["failed"] += not error <= allowed
-        row["worst"], row["worst_of_bound"] = (
-            max(row["worst"], error),
-            max(row["worst_of_bound"], error / allowed),
-        )
+        row["worst"] = max(row["worst"], error)
+        row["worst_of_bound"] = max(row["worst_of_bound"], error / allowed)
 
 
-def measure() -> list[dict[str, Any]]:
-    tallies = [Tally(dtype) for dtype in DTYPES]
-    for tally in tallies:
+def measure() -> list[Row]:
+    rows: list[Row] = []
+    for dtype in DTYPES:
+        tally = Tally(dtype)
         for k, s in enumerate(DIALS):
             check_opacities(tally, np.random.default_rng(k), s)
             check_growth(tally, np.random.default_rng(k), s)
-    return [row for tally in tallies for row in tally.rows.values()]
+        rows += tally.rows.values()
+    return rows
 
 
 def rounded(dtype: str, values: Any) -> Tensor:
@@ -100,52 +94,41 @@ def check_opacities(tally: Tally, random: np.random.Generator, s: float) -> None
     """Drawn opacities and gradients, from far inside the reach to just beyond it; what is culled
     must be 0.
     """
-    logits = rounded(
-        tally.dtype,
-        some_of(random, random.uniform(-80, 80, POINTS), random.uniform(-12, 12, POINTS)),
-    )
-    sigma = rounded(
-        tally.dtype,
-        some_of(random, 10.0 ** random.uniform(-12, 9, POINTS), np.full(POINTS, SIGMA_MAX)),
-    )
+    logits = some_of(random, random.uniform(-80, 80, POINTS), random.uniform(-12, 12, POINTS))
+    logits = rounded(tally.dtype, logits)
+    sigma = some_of(random, 10.0 ** random.uniform(-12, 9, POINTS), np.full(POINTS, SIGMA_MAX))
+    sigma = rounded(tally.dtype, sigma)
     near = 10.0 ** random.uniform(-7, 0, POINTS)
     d = rounded(tally.dtype, sigma.double().numpy() / s * some_of(random, near, 1 - near, 1 + near))
-    out = attenuate(
-        logits.requires_grad_(), sigma.requires_grad_(), d, s, AttenuationConfig()
-    ).drawn
-    slopes = torch.autograd.grad(out.sum(), (logits, sigma))
-    columns = (column.detach().tolist() for column in (logits, sigma, d, out, *slopes))
-    for logit, reach, distance, shown, by_logit, by_sigma in zip(*columns, strict=True):
+    leaves = (logits.requires_grad_(), sigma.requires_grad_())
+    drawn = attenuate(*leaves, d, s, AttenuationConfig()).drawn
+    slopes = torch.autograd.grad(drawn.sum(), leaves)
+    columns = (column.detach().tolist() for column in (*leaves, d, drawn, *slopes))
+    for logit, reach, distance, opacity, by_logit, by_sigma in zip(*columns, strict=True):
         t = mpf(distance) * mpf(s) / mpf(reach)
         if abs(t - 1) < EXACT:
             continue  # both answers are right
-        a, allowed = (
-            1 / (1 + mpmath.exp(-mpf(logit))),
-            2 + EXACT / tally.info.eps / max(float(1 - t), EXACT),
-        )
+        a = 1 / (1 + mpmath.exp(-mpf(logit)))
+        allowed = 2 + EXACT / tally.info.eps / max(float(1 - t), EXACT)
         want = a * (1 - t**4) if t < 1 else mpf(0)
-        tally.add("drawn opacity", shown, want, allowed)
-        tally.add(
-            "its gradient by logit, relative to it", by_logit, want * (1 - a), allowed, scale=want
-        )
-        tally.add(
-            "its gradient by sigma_d", by_sigma, 4 * a * t**4 / mpf(reach) if t < 1 else mpf(0), 6
-        )
+        slope = want * (1 - a)
+        tally.add("drawn opacity", opacity, want, allowed)
+        tally.add("its gradient by logit, relative to it", by_logit, slope, allowed, scale=want)
+        slope = 4 * a * t**4 / mpf(reach) if t < 1 else mpf(0)
+        tally.add("its gradient by sigma_d", by_sigma, slope, 6)
 
 
 def check_growth(tally: Tally, random: np.random.Generator, s: float) -> None:
     exponents = some_of(random, random.uniform(-1, 3, POINTS), random.uniform(-20, 20, POINTS))
-    h, d = (
-        rounded(tally.dtype, exponents),
-        rounded(tally.dtype, 10.0 ** random.uniform(-2, 4, POINTS)),
-    )
-    zero, r = torch.zeros_like(h), 0.3
+    h = rounded(tally.dtype, exponents)
+    d = rounded(tally.dtype, 10.0 ** random.uniform(-2, 4, POINTS))
+    zero = torch.zeros_like(h)
+    r = 0.3
     config = AttenuationConfig(reference_distance=r)
     got = attenuate(zero, zero, d, s, config, growth_d=h.requires_grad_()).growth
     (slope,) = torch.autograd.grad(got.sum(), h)
-    for exp, dist, grown, steep in zip(
-        h.tolist(), d.tolist(), got.tolist(), slope.tolist(), strict=True
-    ):
+    columns = (column.tolist() for column in (h, d, got, slope))
+    for exp, dist, grown, steep in zip(*columns, strict=True):
         log_m = max(mpmath.log(mpf(dist) * mpf(s) / mpf(r)), mpf(0))
         log_g, allowed = mpf(exp) * log_m, 4 + 2 * abs(exp) * (1 + float(log_m))
         if abs(abs(log_g) - LOG_GROWTH_MAX) > tally.info.eps * allowed:
@@ -156,20 +139,12 @@ def check_growth(tally: Tally, random: np.random.Generator, s: float) -> None:
             tally.add("its gradient by growth_d", steep, want * log_m * inside, allowed)
 
 
-def tables(rows: list[dict[str, Any]]) -> str:
+def tables(rows: list[Row]) -> str:
     """Points, worst errors and shares of the bounds."""
-    points, nan, failed = (sum(row[key] for row in rows) for key in ("points", "nan", "failed"))
-    lines = []
-    for name, bound in BOUNDS.items():
-        found = {row["dtype"]: row for row in rows if row["quantity"] == name}
-        lines.append(
-            [
-                name,
-                bound,
-                *(f"{found[d]['worst']:.2g} ({found[d]['worst_of_bound']:.0%})" for d in DTYPES),
-            ]
-        )
-    return (
-        f"{points:,} points: {nan} NaN, {failed} past the"
-        f" bound\n\n{table(['', 'bound', *DTYPES], lines, 2)}"
-    )
+    total = Counter[str]()
+    lines = {name: [name, bound] for name, bound in BOUNDS.items()}
+    for row in rows:
+        total.update({key: row[key] for key in ("points", "nan", "failed")})
+        lines[row["quantity"]].append(f"{row['worst']:.2g} ({row['worst_of_bound']:.0%})")
+    counts = f"{total['points']:,} points: {total['nan']} NaN, {total['failed']} past the bound"
+    return f"{counts}\n\n{table(['', 'bound', *DTYPES], lines.values(), 2)}"

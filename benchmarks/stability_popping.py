@@ -9,19 +9,19 @@ turns. A fade changes in proportion to the step's length (slope 1), a pop by the
 
 import math
 from itertools import product
-from typing import Any
 
 import clod_adapter as clod
 from clod_adapter.config import FORMS
 from clod_adapter.equation.attenuation import SIGMA_MAX
 from clod_adapter.equation.distances import normalized_distances
 from clod_adapter.equation.paper import TAU
-from clod_adapter.evaluation.popping import dial_popping, path_popping
+from clod_adapter.evaluation.popping import Popping, dial_popping, path_popping
 from clod_adapter.gaussians import SH_C0, Gaussians
-from common import table
+from common import Row, table
 
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
 STEPS = (20, 40, 80, 160)
 SWEEPS = {
@@ -30,39 +30,41 @@ SWEEPS = {
     "turn": "a camera that turns, s = 2",
     "path": "a camera that moves, s = 2",
 }
-OTHERS, TOGETHER, SCALE = 120, 4, 2.0
+OTHERS = 120  # Gaussians that are not made to pop
+TOGETHER = 4  # that end together
+SCALE = 2.0
+WIDTH = 48
+HEIGHT = 36
 GROWTH = 0.75  # growth_d that preserves area
 DISTANCE = 4.0  # of the camera from the middle
 
 
-def measure() -> list[dict[str, Any]]:
+def measure() -> list[Row]:
     rows = []
     for form, growth in (*product(FORMS, [0.0]), ("ours", GROWTH)):
-        some, cameras = scene(form)
-        some = some.replace(growth_d=torch.full((len(some),), growth))
+        gaussians, cameras = scene(form)
+        gaussians = gaussians.replace(growth_d=torch.full((len(gaussians),), growth))
         for sweep, steps in product(SWEEPS, STEPS):
-            found = _sweep(some, cameras, sweep, steps)
-            row = {
-                "part": "popping",
-                "form": form,
-                "growth": growth,
-                "sweep": sweep,
-                "steps": steps,
-                "pixel": found.pixel,
-                "persistence": found.pixel_persistence,
-            }
+            popping = _sweep(gaussians, cameras, sweep, steps)
+            row = {"form": form, "growth": growth, "sweep": sweep, "steps": steps}
+            row |= {"pixel": popping.pixel, "persistence": popping.pixel_persistence}
             rows.append(row)
     return rows
 
 
 def scene(form: str) -> tuple[Gaussians, dict[str, list[clod.Camera]]]:
     """The Gaussians, and by name of the sweep the cameras it goes through."""
-    draw, n = torch.Generator().manual_seed(0), OTHERS + TOGETHER + 3
-    together, (front, back, far) = slice(OTHERS, OTHERS + TOGETHER), range(n - 3, n)
-    eye, line = torch.tensor([0.0, 0.0, -DISTANCE]), torch.tensor([-0.25, 0.15, 1.0])
+    draw = torch.Generator().manual_seed(0)
+    n = OTHERS + TOGETHER + 3
+    together = slice(OTHERS, OTHERS + TOGETHER)
+    front, back, far = range(n - 3, n)
+    eye = torch.tensor([0.0, 0.0, -DISTANCE])
+    line = torch.tensor([-0.25, 0.15, 1.0])
     means = torch.randn(n, 3, generator=draw) * torch.tensor([1.2, 0.9, 1.2])
-    means[together], means[far] = torch.tensor([0.3, 0.2, -0.5]), torch.tensor([30.0, 0.0, 40.0])
-    means[front], means[back] = eye + line, eye + 1.2 * line
+    means[together] = torch.tensor([0.3, 0.2, -0.5])
+    means[far] = torch.tensor([30.0, 0.0, 40.0])
+    means[front] = eye + line
+    means[back] = eye + 1.2 * line
     log_scales = 0.5 * torch.randn(n, 3, generator=draw) + math.log(0.08)
     log_scales[together] = log_scales[far] = math.log(0.25)
     log_scales[front] = log_scales[back] = math.log(0.02)
@@ -93,35 +95,36 @@ def scene(form: str) -> tuple[Gaussians, dict[str, list[clod.Camera]]]:
     return clod.with_dial(plain, sigma, settings), cameras
 
 
-def _looking(eye: Tensor, at: Tensor, width: int = 48, height: int = 36) -> clod.Camera:
-    forward = torch.nn.functional.normalize(at - eye, dim=0)
-    right = torch.nn.functional.normalize(
-        torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0]), forward), dim=0
-    )
+def _looking(eye: Tensor, at: Tensor) -> clod.Camera:
+    forward = normalize(at - eye, dim=0)
+    right = normalize(torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0]), forward), dim=0)
     viewmat = torch.eye(4)
     viewmat[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward])
     viewmat[:3, 3] = -viewmat[:3, :3] @ eye
-    K = torch.tensor([[1.1 * width, 0, width / 2], [0, 1.1 * width, height / 2], [0, 0, 1.0]])
-    return clod.Camera(viewmat, K, width, height)
+    K = torch.tensor([[1.1 * WIDTH, 0, WIDTH / 2], [0, 1.1 * WIDTH, HEIGHT / 2], [0, 0, 1.0]])
+    return clod.Camera(viewmat, K, WIDTH, HEIGHT)
 
 
-def _sweep(some: Gaussians, cameras: dict[str, list[clod.Camera]], sweep: str, steps: int) -> Any:
+def _sweep(
+    gaussians: Gaussians, cameras: dict[str, list[clod.Camera]], sweep: str, steps: int
+) -> Popping:
     if sweep in ("turn", "path"):
-        return path_popping(some, cameras[sweep], SCALE, steps=steps)
-    assert some.attenuation is not None
+        return path_popping(gaussians, cameras[sweep], SCALE, steps=steps)
     if sweep == "pair":  # the others stay, for the paper's unit of distances
-        rest = torch.arange(len(some)) < len(some) - 3
-        some = some.replace(opacity_logits=some.opacity_logits.where(~rest, -20))
-    return dial_popping(some, cameras["dial"][0], some.attenuation.max_sv, steps=steps)
+        logits = gaussians.opacity_logits.clone()
+        logits[:-3] = -20
+        gaussians = gaussians.replace(opacity_logits=logits)
+    return dial_popping(gaussians, cameras["dial"][0], gaussians.attenuation.max_sv, steps=steps)
 
 
-def tables(rows: list[dict[str, Any]]) -> str:
+def tables(rows: list[Row]) -> str:
     """Largest change of a pixel in the longest and the shortest steps."""
-    ends, lines = [(name, steps) for name in SWEEPS for steps in (min(STEPS), max(STEPS))], []
-    for form, growth in dict.fromkeys((row["form"], row["growth"]) for row in rows):
-        own = {
-            (r["sweep"], r["steps"]): r for r in rows if (r["form"], r["growth"]) == (form, growth)
-        }
-        name = f"{form}, growth_d {growth:g}" if growth else form
-        lines.append([name, *(f"{own[end]['pixel']:.1f}" for end in ends)])
-    return table(["form", *(f"{name}: 1/{steps}" for name, steps in ends)], lines)
+    lines: dict[str, list[str]] = {}
+    ends = []
+    for row in rows:
+        if row["steps"] in (min(STEPS), max(STEPS)):
+            growth = f", growth_d {row['growth']:g}" if row["growth"] else ""
+            name = row["form"] + growth
+            lines.setdefault(name, [name]).append(f"{row['pixel']:.1f}")
+            ends.append(f"{row['sweep']}: 1/{row['steps']}")
+    return table(["form", *dict.fromkeys(ends)], list(lines.values()))

@@ -13,7 +13,7 @@ gradient.
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -37,7 +37,7 @@ from clod_adapter.training.dial import SIGMA_RANGE, Dial
 from clod_adapter.training.optimizer import RowAdam
 from clod_adapter.training.schedule import OURS
 from clod_adapter.training.target_count import count_gradient, target_share
-from common import table
+from common import Row, table
 
 import numpy as np
 import torch
@@ -47,7 +47,8 @@ CONFIG = clod.AdaptConfig(growth="off")
 DIALS = tuple(CONFIG.max_sv ** (k / 11) for k in range(12))
 RATES = tuple(10 ** (k / 2) for k in range(-8, 1))  # 1e-4 to 1 in half decades
 WRONG = 4.0  # decades, each way
-STEPS, LENGTHS = 600, (30, 100, 300, 1000)
+STEPS = 600
+LENGTHS = (30, 100, 300, 1000)
 STARTS = ("0", "1e4 times too small", "1e4 times too large", "SIGMA_MAX")
 CONVERGED = 0.25  # of the start's error
 Stepper = Callable[[list[Tensor], list[float]], None]
@@ -70,11 +71,12 @@ def _torch_optimizer(
 
 
 def _row_adam(runs: list[Tensor]) -> Stepper:
-    names, rows = list(map(str, range(len(runs)))), torch.ones(len(runs[0]), dtype=torch.bool)
-    optimizer = RowAdam(dict(zip(names, runs, strict=True)))
-    return lambda gradients, rates: optimizer.step(
-        dict(zip(names, gradients, strict=True)), rows, dict(zip(names, rates, strict=True))
-    )
+    def named(values: Iterable[Any]) -> dict[str, Any]:
+        return {str(run): value for run, value in enumerate(values)}
+
+    rows = torch.ones(len(runs[0]), dtype=torch.bool)
+    optimizer = RowAdam(named(runs))
+    return lambda gradients, rates: optimizer.step(named(gradients), rows, named(rates))
 
 
 # AdamW is left out: its decay pulls sigma_d towards 0 (log sigma_d: 1), which nothing about a dial
@@ -102,13 +104,17 @@ class Problem:
     start: Tensor
     wanted: Tensor
 
+    def parameter(self, log: bool) -> Tensor:
+        """What training starts with: sigma_d, or its logarithm."""
+        sigma = self.start.clamp(*SIGMA_RANGE)
+        return sigma.log() if log else sigma
+
     def error(self, sigma: Tensor) -> float:
         """Root mean square over Gaussians and dial values of the opacity they are drawn with, less
         the right one.
         """
-        return float(
-            (drawn(self.logits, sigma, self.distances) - self.wanted).square().mean().sqrt()
-        )
+        opacities = drawn(self.logits, sigma, self.distances)
+        return float((opacities - self.wanted).square().mean().sqrt())
 
 
 def drawn(logits: Tensor, sigma: Tensor, distances: Tensor) -> Tensor:
@@ -131,26 +137,24 @@ def problem(n: int = 192) -> Problem:
 
 @torch_on_one_thread()
 def fit(
-    task: Problem, optimizer: str, log: bool, rates: Sequence[float], steps: int, count: bool = True
+    task: Problem, optimizer: str, log: bool, rates: Sequence[float], steps: int
 ) -> tuple[list[Tensor], float]:
     """sigma_d after training, at dial value 1 and another one a step; and seconds. One run a rate,
     all at once.
     """
     limits = tuple(map(math.log, SIGMA_RANGE)) if log else SIGMA_RANGE
-    x = task.start.clamp(*SIGMA_RANGE)
-    runs = [(x.log() if log else x).clone() for _ in rates]
-    step, means, random = (
-        OPTIMIZERS[optimizer][0](runs),
-        torch.zeros(len(rates), len(x)),
-        np.random.default_rng(0),
-    )
-    began, averaged = time.perf_counter(), 0
+    start = task.parameter(log)
+    runs = [start.clone() for _ in rates]
+    step = OPTIMIZERS[optimizer][0](runs)
+    means = torch.zeros(len(rates), len(start))
+    random = np.random.default_rng(0)
+    began = time.perf_counter()
+    averaged = 0
     for k in range(steps):
         fall = OURS.lr_final ** (k / steps)
-        found = gradients(
-            task, torch.stack(runs), log, (0, int(random.integers(1, len(DIALS)))), count
-        )
-        step(list(found), [rate * fall for rate in rates])
+        dials = (0, int(random.integers(1, len(DIALS))))
+        slopes = gradients(task, torch.stack(runs), log, dials)
+        step(list(slopes), [rate * fall for rate in rates])
         for x in runs:
             x.clamp_(*limits)
         if k >= (1 - OURS.average) * steps:
@@ -174,13 +178,15 @@ def gradients(
     logits, distances = task.logits.repeat(len(x)), task.distances.repeat(len(x))
     for k in dials:
         s = DIALS[k]
-        dialled = attenuate(logits, sigma, distances, s, settings)
-        losses = (dialled.drawn.view(-1, n) - task.wanted[k]).square().mean(1)
+        opacities = attenuate(logits, sigma, distances, s, settings).drawn
+        losses = (opacities.view(-1, n) - task.wanted[k]).square().mean(1)
         weight = (1 - Dial.weight_slope * s / CONFIG.max_sv) ** 2
         total = total + weight * losses.sum()
-        for run, loss in enumerate((weight * losses.detach()).tolist() if count else []):
-            own, target = sigma.detach()[run * n : (run + 1) * n], target_share(s, n, CONFIG)
-            pull[run] += count_gradient(task.distances, own, s, loss, CONFIG, target)
+        if count:
+            target = target_share(s, n, CONFIG)
+            runs = zip(sigma.detach().view(-1, n), (weight * losses.detach()).tolist(), strict=True)
+            for run, (values, loss) in enumerate(runs):
+                pull[run] += count_gradient(task.distances, values, s, loss, CONFIG, target)
     (gradient,) = torch.autograd.grad(total, leaf)
     return gradient + (pull if log else pull / x.detach())
 
@@ -189,118 +195,90 @@ def stuck(task: Problem, log: bool, count: bool) -> Tensor:
     """``[N]`` bool, Gaussians that are drawn wrongly at first, and get no gradient at any dial
     value.
     """
-    sigma = task.start.clamp(*SIGMA_RANGE)
-    x = (sigma.log() if log else sigma)[None]
-    moved = torch.stack(
-        [gradients(task, x.clone(), log, (k,), count)[0] for k in range(len(DIALS))]
-    ).any(0)
-    wrong = (drawn(task.logits, sigma, task.distances) - task.wanted).abs().amax(0) > 0.01
+    x = task.parameter(log)[None]
+    slopes = [gradients(task, x.clone(), log, (k,), count)[0] for k in range(len(DIALS))]
+    moved = torch.stack(slopes).any(0)
+    opacities = drawn(task.logits, task.parameter(False), task.distances)
+    wrong = (opacities - task.wanted).abs().amax(0) > 0.01
     return wrong & ~moved
 
 
-def measure() -> list[dict[str, Any]]:
+def measure() -> list[Row]:
     task, rows = problem(), []
     for optimizer, log in product(OPTIMIZERS, (True, False)):
-        own = {
-            "part": "stiffness",
-            "what": "equation",
-            "optimizer": optimizer,
-            "parameter": "log" if log else "linear",
-        }
+        parameter = "log" if log else "linear"
+        about = {"what": "equation", "optimizer": optimizer, "parameter": parameter}
         # compiled, and imported by torch, before the clock starts
         fit(task, optimizer, log, (1e-4,), 2)
         errors = [task.error(sigma) for sigma in fit(task, optimizer, log, RATES, STEPS)[0]]
-        rows += [
-            own | {"rate": rate, "steps": STEPS, "error": e}
-            for rate, e in zip(RATES, errors, strict=True)
-        ]
+        for rate, error in zip(RATES, errors, strict=True):
+            rows.append(about | {"rate": rate, "steps": STEPS, "error": error})
         best = RATES[int(np.nanargmin(errors))]
         for steps in LENGTHS:
             (sigma,), seconds = fit(task, optimizer, log, (best,), steps)
-            rows.append(
-                own | {"rate": best, "steps": steps, "error": task.error(sigma), "seconds": seconds}
-            )
-    rows.append({"part": "stiffness", "what": "start", "error": task.error(task.start)})
+            cost = {"error": task.error(sigma), "seconds": seconds}
+            rows.append(about | {"rate": best, "steps": steps} | cost)
+    rows.append({"what": "start", "error": task.error(task.start)})
     kind = torch.arange(len(task.right)) % len(STARTS)
-    ends = torch.stack(
-        [task.right * 0, task.right / 1e4, task.right * 1e4, torch.full_like(task.right, SIGMA_MAX)]
-    )
+    right = task.right
+    ends = torch.stack([right * 0, right / 1e4, right * 1e4, torch.full_like(right, SIGMA_MAX)])
     bad = replace(task, start=ends.gather(0, kind[None])[0])
     for log, count in ((False, False), (True, False), (True, True)):
         name = f"{'log' if log else 'linear'} sigma_d{', count term (default)' if count else ''}"
         counts = kind[stuck(bad, log, count)].bincount(minlength=len(STARTS)).tolist()
-        rows.append(
-            {
-                "part": "stiffness",
-                "what": "stuck",
-                "method": name,
-                "of": len(kind),
-                "counts": counts,
-            }
-        )
+        rows.append({"what": "stuck", "method": name, "of": len(kind), "counts": counts})
     return rows
 
 
-def curves(rows: list[dict[str, Any]], timed: bool) -> dict[tuple[str, str], list[dict[str, Any]]]:
+def curves(rows: list[Row], timed: bool) -> dict[tuple[str, str], list[Row]]:
     """Rows by optimizer and parameter: over the learning rates; or, timed, over the steps at the
     best one.
     """
-    found: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    lines: dict[tuple[str, str], list[Row]] = {}
     for row in rows:
         if row["what"] == "equation" and ("seconds" in row) == timed:
-            found.setdefault((row["optimizer"], row["parameter"]), []).append(row)
-    return found
+            lines.setdefault((row["optimizer"], row["parameter"]), []).append(row)
+    return lines
 
 
-def tables(rows: list[dict[str, Any]]) -> str:
+def tables(rows: list[Row]) -> str:
     """Error and learning rates that converge; Gaussians that are stuck."""
     (start,) = (row["error"] for row in rows if row["what"] == "start")
     timed, lines = curves(rows, True), []
-    for key, own in curves(rows, False).items():
-        best = min(own, key=lambda row: row["error"])
-        good = [f"{row['rate']:.2g}" for row in own if row["error"] <= CONVERGED * start]
-        first = next(
-            (f"{row['seconds']:.2f}" for row in timed[key] if row["error"] <= CONVERGED * start), ""
-        )
+    for key, line in curves(rows, False).items():
+        best = min(line, key=lambda row: row["error"])
+        good = [f"{row['rate']:.2g}" for row in line if row["error"] <= CONVERGED * start]
         span = " to ".join(dict.fromkeys((good[0], good[-1]))) if good else "none"
-        lines.append([*key, f"{best['error']:.3f}", f"{best['rate']:.2g}", span, first])
-    heads = [
-        "optimizer",
-        "sigma_d",
-        "best error",
-        "at",
-        "learning rates that converge",
-        "seconds to it",
-    ]
-    left = [[row["method"], *row["counts"]] for row in rows if row["what"] == "stuck"]
-    (each,) = {row["of"] // len(STARTS) for row in rows if row["what"] == "stuck"}
-    return "\n\n".join(
-        [
-            table(heads, lines),
-            f"RMS error at the start: {start:.2f}",
-            table([f"without a gradient, of {each} that begin at", *STARTS], left),
-        ]
-    )
+        seconds = [row["seconds"] for row in timed[key] if row["error"] <= CONVERGED * start]
+        fastest = f"{seconds[0]:.2f}" if seconds else ""
+        lines.append([*key, f"{best['error']:.3f}", f"{best['rate']:.2g}", span, fastest])
+    heads = ["optimizer", "sigma_d", "best error", "at"]
+    heads += ["learning rates that converge", "seconds to it"]
+    stuck = [row for row in rows if row["what"] == "stuck"]
+    count = stuck[0]["of"] // len(STARTS)
+    stuck_heads = [f"without a gradient, of {count} that begin at", *STARTS]
+    stuck_lines = [[row["method"], *row["counts"]] for row in stuck]
+    error = f"RMS error at the start: {start:.2f}"
+    return f"{table(heads, lines)}\n\n{error}\n\n{table(stuck_heads, stuck_lines)}"
 
 
-def picture(rows: list[dict[str, Any]], path: Path) -> None:
+def picture(rows: list[Row], path: Path) -> None:
     """Error by learning rate on the left, by seconds at the best one on the right; dots for linear
     sigma_d.
     """
     with new_figure((10.4, 4.6), layout="constrained") as figure:
         panels = figure.subplots(1, 2, sharey=True)
         for axes, timed, along in zip(panels, (False, True), ("rate", "seconds"), strict=True):
-            for (optimizer, parameter), own in curves(rows, timed).items():
+            for (optimizer, parameter), line in curves(rows, timed).items():
                 ours = (optimizer, parameter) == ("RowAdam", "log")
+                label = f"{optimizer} (default)" if ours else optimizer
                 axes.plot(
-                    [row[along] for row in own],
-                    [row["error"] for row in own],
+                    [row[along] for row in line],
+                    [row["error"] for row in line],
                     color=OPTIMIZERS[optimizer][1],
                     linestyle="-" if parameter == "log" else ":",
                     linewidth=2.6 if ours else 1.3,
-                    label=optimizer + (" (default)" if ours else "")
-                    if parameter == "log"
-                    else None,
+                    label=label if parameter == "log" else None,
                 )
             axes.set(xscale="log", yscale="log")
             label_log(axes.xaxis, "{:g}", subs=(1,))
@@ -311,10 +289,6 @@ def picture(rows: list[dict[str, Any]], path: Path) -> None:
         )
         panels[1].set_xlabel("seconds of training at the best learning rate")
         panels[0].plot([], [], color=QUIET, linestyle=":", label="linear sigma_d")
-        figure.legend(
-            *panels[0].get_legend_handles_labels(),
-            loc="outside lower center",
-            frameon=False,
-            ncols=4,
-        )
+        entries = panels[0].get_legend_handles_labels()
+        figure.legend(*entries, loc="outside lower center", frameon=False, ncols=4)
         save_figure(figure, path)
