@@ -182,7 +182,7 @@ class Process:
         if self.process.returncode:
             self.errors.seek(0)
             command = " ".join(self.words)
-            sys.exit(f"exit code {self.process.returncode}: {command}\n{self.errors.read()}")
+            sys.exit(f"exit code {self.process.returncode}: {command}\n{self.errors.read().rstrip()}")
 
     def cost(self) -> Row:
         times = {"seconds": round(self.seconds, 3), "cpu_seconds": round(self.cpu_seconds, 3)}
