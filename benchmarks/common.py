@@ -181,8 +181,8 @@ class Process:
         self.process.returncode = os.waitstatus_to_exitcode(status)
         if self.process.returncode:
             self.errors.seek(0)
-            command = " ".join(self.words)
-            sys.exit(f"exit code {self.process.returncode}: {command}\n{self.errors.read().rstrip()}")
+            said = self.errors.read().rstrip()
+            sys.exit(f"exit code {self.process.returncode}: {' '.join(self.words)}\n{said}")
 
     def cost(self) -> Row:
         times = {"seconds": round(self.seconds, 3), "cpu_seconds": round(self.cpu_seconds, 3)}

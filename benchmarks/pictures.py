@@ -1,7 +1,7 @@
 """The pictures of the dial and the viewer for README and docs, of the demo's scene.
 
-clod-adapt demo                  # makes demo/base.ply, demo/gallery.ply and demo/capture
-python benchmarks/pictures.py    # dial.webp and viewer.webp in docs/images
+    clod-adapt demo                  # makes demo/base.ply, demo/gallery.ply and demo/capture
+    python benchmarks/pictures.py    # dial.webp and viewer.webp in docs/images
 
 The dial's picture has numbers of the view shown, measured then. The other is of a headless
 Chromium.

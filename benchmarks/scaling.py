@@ -31,11 +31,10 @@ CITIES = CACHE / "scaling"
 FLOOR = 1000
 SIZES = (10_000, 100_000, 1_000_000, 5_000_000)
 FROM = 100_000  # from which on exponents are fitted
-# The last fifth of STEPS has photographs of full size.
 IMAGES = 10
 WIDTH = 640
 HEIGHT = 400
-STEPS = 20
+STEPS = 20  # of which the last fifth has photographs of full size
 MAX_SV = 3
 # Loading, importance and the pruning order by themselves; the report has all of "start".
 PARTS = """
