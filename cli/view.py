@@ -28,7 +28,7 @@ from .shared.process import interrupt_as_stopped
 if TYPE_CHECKING:
     from clod_adapter.io.checkpoint import Checkpoint
 
-MODEL, BASE = "/files/model", "/files/base"
+MODEL, BASE, CONVERTER = "/files/model", "/files/base", "/convert"
 # they would take over the terminal
 IN_TERMINAL = ("lynx", "w3m", "links", "links2", "elinks", "www-browser")
 
@@ -121,15 +121,24 @@ def execute(args: Namespace) -> None:
 
 
 def make_page(args: Namespace, console: Console) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The server's ``Response``s by path, and the report."""
+    """What the server answers by path, and the report."""
     from clod_adapter.viewer.page import Payload, camera_entry, document, page_config, policy
-    from clod_adapter.viewer.server import Response
+    from clod_adapter.viewer.server import MOST_BYTES, Response
 
     from .shared.inputs import read_cameras, read_checkpoint, with_filter
     from .shared.measure import solve_dials
 
     def read(path: str, origin: Origin | None = None) -> Checkpoint:
         return with_filter(read_checkpoint(path, console, args.activated, origin), args, console)
+
+    def answer(payload: Payload) -> Response:
+        return Response("application/octet-stream", payload.size, payload.blocks)
+
+    def convert(path: Path) -> Response:
+        """A file that was dropped on the page."""
+        quiet = Console(quiet=True)
+        checkpoint = read_checkpoint(str(path), quiet, args.activated)
+        return answer(Payload.of(with_filter(checkpoint, args, quiet)))
 
     files = view_files(args.models)
     model = read(files[0])
@@ -156,13 +165,15 @@ def make_page(args: Namespace, console: Console) -> tuple[dict[str, Any], dict[s
     base_entry = {"name": payloads[BASE].name, "href": BASE} if base else None
     shown, placed = cameras or model.cameras, model.placed and not cameras
     config = page_config(
-        entries, base_entry, [camera_entry(each, placed) for each in shown], opening
+        entries,
+        base_entry,
+        [camera_entry(each, placed) for each in shown],
+        opening,
+        {"href": CONVERTER, "limit": MOST_BYTES},
     )
     page = b"".join(document(config))
-    answers = {
-        path: Response("application/octet-stream", each.size, each.blocks)
-        for path, each in payloads.items()
-    }
+    answers: dict[str, Any] = {path: answer(payload) for path, payload in payloads.items()}
+    answers[CONVERTER] = convert
     answers["/"] = Response(
         "text/html; charset=utf-8", len(page), lambda: (page,), policy("'self'")
     )
@@ -203,7 +214,8 @@ The page opens at s = 1 with photographs, else with everything shown, and holds
 30 frames per second by the dial if half of that is in reach; --sv sets a value
 that stays. It compares MODEL.ply with BASE.ply, or with itself without the
 dial, on the two sides of a line, and with --images jumps between the scene's
-cameras. Drop another file on it to open that. The address holds the view.
+cameras. Drop another file on it, of any format, to open that. The address holds
+the view.
 
 Other machines cannot reach the page, and it loads nothing from the network. To
 see it from another machine, forward the port (-t passes Ctrl-C on):

@@ -161,9 +161,10 @@ def page_config(
     base: Entry | None,
     cameras: Sequence[Entry],
     virtual_scale: float | None,
+    converter: Entry | None = None,
 ) -> Entry:
     """The page's configuration. Models and ``base`` have a ``name``, and ``href`` or ``element``
-    for their data.
+    for their data; ``converter`` has the ``href`` of the server's, and the ``limit`` of its bytes.
 
     ``virtual_scale`` is the first dial value; None for 1 with photographs, else 0 (everything), and
     then what suits the device.
@@ -175,6 +176,7 @@ def page_config(
         "others": models[1:],
         "cameras": cameras,
         "virtual_scale": virtual_scale,
+        "converter": converter,
     }
 
 

@@ -4,7 +4,9 @@ that it reads itself as Python does, and those that it leaves to Python.
 
 import gzip
 import re
+import shutil
 from dataclasses import replace
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -17,8 +19,8 @@ from clod_adapter import load
 from clod_adapter.config import FILTERS, ScreenFilter
 from clod_adapter.io.file_formats import write
 from clod_adapter.render import render
-from clod_adapter.viewer.page import Payload
-from formats import write_rows
+from clod_adapter.viewer.page import Payload, write_viewer_page
+from formats import PACKED, splat_transform, write_rows
 from scenes import dialled
 from shown import TALL, assert_alike, assert_same, drop, message, take
 
@@ -146,29 +148,75 @@ def test_ply_and_spz_are_shown_as_python_reads_them(shown, gaussians, plain, tmp
         assert_same(shown, render(found, VIEW, s))
 
 
-def test_other_files_are_errors_and_the_picture_stays(shown, model, tmp_path):
+def ascii_ply(data):
+    """An ascii PLY with a header like this one's, without its rows."""
+    header, _, _ = data.partition(b"end_header")
+    return header.replace(b"binary_little_endian", b"ascii") + b"end_header\n1 2\n"
+
+
+MESH = b"ply\nformat binary_little_endian 1.0\nelement vertex 0\nend_header\n"
+
+
+def test_the_server_reads_files_of_other_formats(show, model, gaussians, plain, tmp_path):
+    """They are shown as ``clod-adapt view`` shows them; none remains; errors are one line."""
+    for name, saved in (("a b&.glb", gaussians), ("a.splat", plain), ("a.safetensors", gaussians)):
+        write(tmp_path / name, finer(saved, 2.0))
+    rows = PlyData.read(model, mmap=False)
+    rows.text = True
+    rows.write(tmp_path / "ascii.ply")
+    shutil.copy(PACKED, tmp_path)
+    folder = tmp_path / "temporary"
+    folder.mkdir()
+    with patch("tempfile.tempdir", str(folder)):
+        shown = show(model)
+        for path in sorted(path for path in tmp_path.glob("*.*") if path != model):
+            drop(shown, path.name, path.read_bytes())
+            shown.until(f"document.title === '{path.name}'")
+            shown.camera(VIEW)
+            assert_same(shown, render(load(path).gaussians, VIEW, 1.0))
+        before = shown.picture()
+        refused = (
+            ("cut.glb", (tmp_path / "a b&.glb").read_bytes()[:200], "truncated"),
+            ("page.sog", b"<!doctype html>", "page.sog: is a web page"),
+            ("ö b.lcc", b"something", "ö b.lcc: is an LCC file"),
+            ("a.txt", b"something", "a.txt: "),
+            ("mesh.ply", MESH, "mesh.ply: "),
+        )
+        for name, content, error in refused:
+            drop(shown, name, content)
+            said = message(shown, name)
+            assert error in said.splitlines()[0] and str(folder) not in said, said
+        assert np.array_equal(shown.picture(), before)
+        assert list(folder.iterdir()) == []
+    assert all("422" in error for error in shown.errors) and len(shown.errors) == len(refused)
+    shown.errors.clear()
+
+
+def test_a_sog_is_read_by_the_server(show, model, tmp_path):
+    splat_transform("-g", "cpu", "-i", "1", model, tmp_path / "a.sog")
+    shown = show(model, "--sv", 0)
+    drop(shown, "a.sog", (tmp_path / "a.sog").read_bytes())
+    shown.until("document.title === 'a.sog'")
+    assert shown.counts()["total"] == 400 and shown.page.is_disabled("#dial")
+
+
+def test_other_files_are_errors_and_the_picture_stays(show, model, tmp_path):
+    """Of a page without a server."""
+    write_viewer_page(tmp_path / "page.html", load(model), exact=True, virtual_scale=1.0)
+    shown = show(url=(tmp_path / "page.html").as_uri())
     data = model.read_bytes()
     write(tmp_path / "a.glb", load(model).gaussians)
-    header, _, _ = data.partition(b"end_header")
     python = "clod-adapt view {} opens every format"
     refused = (
         ("a.glb", (tmp_path / "a.glb").read_bytes(), python),
         ("a.sog", b"PK\3\4" + bytes(60), python),
-        (
-            "ascii.ply",
-            header.replace(b"binary_little_endian", b"ascii") + b"end_header\n1 2\n",
-            python,
-        ),
+        ("ascii.ply", ascii_ply(data), python),
         (
             "mip.ply",
             data.replace(b"property float x\n", b"property float filter_3D\nproperty float x\n"),
             python,
         ),
-        (
-            "mesh.ply",
-            b"ply\nformat binary_little_endian 1.0\nelement vertex 0\nend_header\n",
-            "x is missing",
-        ),
+        ("mesh.ply", MESH, "x is missing"),
         ("cut.ply", data[:-100], "truncated"),
         ("head.ply", data[:300], "truncated"),
         ("empty.ply", b"", "empty"),

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 import pytest
 from refusals import refused
 
+from clod_adapter.errors import ClodError
 from clod_adapter.viewer import server as served
 from clod_adapter.viewer.server import Response, Server
 
@@ -47,10 +48,10 @@ def server():
         yield server
 
 
-def request(server, path, method="GET", **headers):
+def request(server, path, method="GET", body=None, **headers):
     connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=10)
     try:
-        connection.request(method, path, headers=headers)
+        connection.request(method, path, body, headers)
         response = connection.getresponse()
         return response.status, {k.lower(): v for k, v in response.getheaders()}, response.read()
     finally:
@@ -98,6 +99,54 @@ def test_responses(server):
             assert BLOCKS[0] not in body
     with refused(f"^port {server.port} of 127.0.0.1 .*choose another"):
         Server({}, server.port)
+
+
+def test_only_the_page_sends_files(monkeypatch):
+    """A file is converted if it is from the page, has a length and is not too long; what is cut is
+    not. The file is then gone.
+    """
+    given = []
+
+    def convert(path):
+        given.append((path, path.read_bytes()))
+        if path.suffix == ".bad":
+            raise ClodError(f"{path}: is\nbad")
+        return RESPONSES["/files/model"]
+
+    monkeypatch.setattr(served, "MOST_BYTES", 9)
+    with running({"/": RESPONSES["/"], "/convert": convert}) as server:
+        page = {"Origin": f"http://127.0.0.1:{server.port}"}
+        for path, headers, wanted in (
+            ("/convert", {}, 403),
+            ("/convert", {"Origin": "null"}, 403),
+            ("/convert", {"Origin": "https://evil.example"}, 403),
+            ("/convert", {"Origin": f"http://localhost:{server.port}"}, 403),
+            ("/convert", {"Origin": "http://evil.example", "Host": "evil.example"}, 421),
+            ("/", page, 501),
+            ("/none", page, 501),
+            ("/convert", page | {"Content-Length": "10"}, 413),
+            ("/convert", page | {"Content-Length": "-1"}, 411),
+            ("/convert", page | {"Transfer-Encoding": "chunked"}, 411),
+        ):
+            assert request(server, path, "POST", **headers)[0] == wanted, (path, headers)
+        assert request(server, "/convert")[0] == 404
+        with socket.create_connection(("127.0.0.1", server.port)) as connection:
+            head = "POST /convert HTTP/1.1\r\nHost: localhost\r\nOrigin: http://localhost\r\n"
+            connection.sendall(f"{head}Content-Length: 9\r\n\r\nshort".encode())
+            connection.shutdown(socket.SHUT_WR)
+            assert connection.recv(100) == b""
+        assert given == []
+        query = "/convert?name=%C3%B6%2F..%2Fa.splat"
+        status, _, body = request(server, query, "POST", b"123456789", **page)
+        assert status == 200 and body == b"".join(BLOCKS)
+        status, headers, body = request(server, "/convert?name=%C3%B6.bad", "POST", b"1", **page)
+        assert status == 422 and body.decode() == "ö.bad: is bad"
+        assert headers["content-type"].startswith("text/plain")
+    assert [(path.suffix, data) for path, data in given] == [
+        (".splat", b"123456789"),
+        (".bad", b"1"),
+    ]
+    assert not any(path.exists() or path.parent.exists() for path, _ in given)
 
 
 def test_a_busy_page_gets_the_rest_later(monkeypatch):

@@ -18,19 +18,30 @@ function included(id) {
   }));
 }
 
-async function download(href) {
-  const response = await fetch(href).catch(() => { throw new Error("the server does not answer; start clod-adapt view again"); });
+async function download(href, request) {
+  const response = await fetch(href, request).catch(() => { throw new Error("the server does not answer; start clod-adapt view again"); });
   if (response.ok) return response.blob();
-  throw new Error(`the server answered ${response.status} ${response.statusText}`);
+  const isReason = response.headers.get("Content-Type").startsWith("text/plain"); // server.py's, of a file
+  throw new Error(isReason ? await response.text() : `the server answered ${response.status} ${response.statusText}`);
 }
 
-/** What a file, a Blob, holds (viewers/read.js), with its name. */
-async function readFile(blob, name) {
+/** What a file, a Blob, holds (viewers/read.js), with its name; `convert(blob, name)` reads other formats. */
+async function readFile(blob, name, convert = null) {
   const failed = (message) => { throw new Error(`${name}: ${message}`); };
   const bytes = await blob.arrayBuffer().catch(() => failed("the browser cannot read it: it is a folder or too large"));
-  const read = await readGaussians(new Uint8Array(bytes)).catch(({ message }) =>
-    failed(/(again|paper)$/.test(message) ? message : `${message}; clod-adapt view ${name} opens every format`));
+  const read = await readGaussians(new Uint8Array(bytes)).catch(({ message }) => {
+    if (/(again|paper)$/.test(message)) return failed(message);
+    return convert?.(blob, name) ?? failed(`${message}; clod-adapt view ${name} opens every format`);
+  });
   return { ...read, name };
+}
+
+/** What the server of `clod-adapt view` reads of a file; a page without a server has no converter. */
+async function convert(blob, name) {
+  const { href, limit } = config.converter;
+  if (blob.size > limit) throw new Error(`${name}: has more than ${limit / 2 ** 30} GiB; clod-adapt view ${name} opens it`);
+  const response = await download(`${href}?${new URLSearchParams({ name })}`, { method: "POST", body: blob });
+  return readFile(response, name);
 }
 
 /** Shows another scene: at the page's dial value, else s = 1 for photographs or everything, and what the device holds. */
@@ -78,7 +89,7 @@ async function settle() {
   ui.showNote(`Dial not moved: under ${OPENING / 2} fps at any value`);
 }
 
-export const load = (blob, name) => open(name, () => readFile(blob, name), (read) => {
+export const load = (blob, name) => open(name, () => readFile(blob, name, config.converter && convert), (read) => {
   viewer.file = null;
   show(read, null, []);
   ui.showName(name, null);
