@@ -18,16 +18,22 @@ export function attach(app, entity, camera) {
     entity.getWorldTransform().clone().invert().transformPoint(world(), place);
     return [place.x, place.y, place.z];
   };
-  let scale = 1, last = "";
+  let scale = 1, last = "", isStale = false;
   const update = () => {
     const { x, y, z } = world(), transform = entity.getWorldTransform(), state = `${scale} ${x} ${y} ${z} ${transform.data}`;
     if (state === last) return; // what the work buffer has is right
-    last = state;
+    [last, isStale] = [state, true];
     gsplat.setParameter("uClodEye", [x, y, z]);
     gsplat.setParameter("uClodScale", [scale, 1 / transform.getScale().x]);
     gsplat.workBufferUpdate = WORKBUFFER_UPDATE_ONCE;
   };
   app.on("prerender", update);
+  // The engine forgets a sort that becomes due while it sorts: after a change it sorts once more, from the frame on that
+  // follows the one which takes the order.
+  app.scene.on("gsplat:sorted", () => {
+    if (isStale) app.once("postrender", () => (gsplat.workBufferUpdate = WORKBUFFER_UPDATE_ONCE));
+    isStale = false;
+  });
   const { gl, wgpu } = app.graphicsDevice, time = (draw) => timed(gl ?? wgpu, draw);
   const dial = new Dial(file, { eye, show: (value) => (scale = value), time });
   const render = app.render.bind(app);

@@ -62,8 +62,10 @@ def engines():
 
 
 @contextmanager
-def opened(tabs, viewer, file):
-    """The example page of a viewer with a file; nothing is fetched from a network."""
+def opened(tabs, viewer, file, script=""):
+    """The example page of a viewer with a file; nothing is fetched from a network. ``script`` runs
+    before the page's.
+    """
     modules = engines()
 
     def answer(route):
@@ -78,16 +80,18 @@ def opened(tabs, viewer, file):
     page.set_viewport_size(SIZE)
     page.set_default_timeout(60_000)
     page.route(re.compile("https://"), answer)
+    page.add_init_script(script)
     address = f"https://example/viewers/examples/{viewer}.html?file=/{file.name}"
     page.goto(address, wait_until="commit")
     yield page
     page.close()
 
 
-def place(page, viewer, camera):
+def placed(camera):
+    """The argument of ``PLACE``."""
     to_world = FLIP @ np.linalg.inv(camera["world_to_camera"]) @ FLIP
     fov = 2 * np.degrees(np.arctan(camera["height"] / 2 / camera["focal"]))
-    page.evaluate(PLACE[viewer], [to_world.T.ravel().tolist(), fov])
+    return [to_world.T.ravel().tolist(), fov]
 
 
 def read_picture(file):
@@ -165,7 +169,7 @@ def test_the_dial_is_as_exact_as_the_viewer(tabs, viewer, suffix, tmp_path):
     with opened(tabs, viewer, KIT / f"kit.{suffix}") as page:
         page.wait_for_function("window.dial")
         page.evaluate("document.forms[0].hidden = true")
-        place(page, viewer, about)
+        page.evaluate(PLACE[viewer], placed(about))
         for frame in about["frames"][::2]:
             page.evaluate("(s) => dial.set(s)", frame["s"])
             within = 0.005 if suffix == "spz" else 0
@@ -196,3 +200,17 @@ def test_the_dial_is_as_exact_as_the_viewer(tabs, viewer, suffix, tmp_path):
             assert error in page.evaluate(f"(given) => {script}", data)
         if viewer == "playcanvas":
             assert_the_wgsl_of_playcanvas_gives_the_equation(page, about)
+
+
+def test_playcanvas_draws_a_change_that_comes_while_it_sorts(tabs):
+    """In the frame after ``attach``, of which the engine sorts the first one."""
+    about = json.loads((KIT / "cameras.json").read_text())["cameras"][0]
+    change = f"({PLACE['playcanvas']})({json.dumps(placed(about))}); dial.set(2);"
+    attached = f"set() {{ requestAnimationFrame(() => {{ {change} window.changed = true; }}) }}"
+    script = f"Object.defineProperty(window, 'splat', {{ {attached} }})"  # named last by the page
+    with opened(tabs, "playcanvas", KIT / "kit.ply", script) as page:
+        page.wait_for_function("window.changed")
+        page.evaluate("document.forms[0].hidden = true")
+        picture = settled(page)
+        page.evaluate("dial.set(2.0001)")
+        assert peak_signal_noise_ratio(settled(page), picture, data_range=255) > 50
