@@ -1,10 +1,14 @@
 // Holding a frame rate: the law of clod_adapter/frame_rate.py, which has its equation, and its use for an animation.
 
-const FRAMES = 20, NEWEST = 3, EXPONENT = 0.75, NEAR = 0.15, DEAD_BAND = 0.03, OUTLIER = 3, STEP = Math.log(1.1);
+export const NEWEST = 3, EXPONENT = 0.75;
+const FRAMES = 20, NEAR = 0.15, DEAD_BAND = 0.03, OUTLIER = 3, STEP = Math.log(1.1);
 const WORK = 0.8; // of a refresh interval is the budget of a frame; the browser composes the page in the rest
 const REST = 80, UNCHANGED = 10; // after a change, at most REST frames are drawn for measuring; one that leaves the dial counts as UNCHANGED
 
-function median(values) {
+/** Milliseconds of a frame's work at `fps` frames per second. */
+export const budgetOf = (fps) => (WORK * 1000) / fps;
+
+export function median(values) {
   const sorted = Float64Array.from(values).sort(), middle = sorted.length >> 1;
   return sorted.length % 2 ? sorted[middle] : (sorted[middle - 1] + sorted[middle]) / 2;
 }
@@ -32,7 +36,7 @@ export function nextDial(frames, milliseconds, maxSv) {
 
 /** Follows frames of an animation that is drawn after changes only, at `fps` frames per second. */
 export function createHold(fps) {
-  const milliseconds = (WORK * 1000) / fps;
+  const milliseconds = budgetOf(fps);
   let frames = [], left = REST;
   return {
     /** The displayed state has changed: further frames are measured. */

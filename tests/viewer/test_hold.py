@@ -160,8 +160,16 @@ def test_a_file_opens_with_a_held_rate(tabs, model, tmp_path):
     assert 1 < dial_of(slow) < 5
     assert all(b <= 1.1 * max(a, 1) + 0.01 for a, b in pairwise(map(float, dials[2:])))
     assert slow.page.is_checked("#hold") and slow.page.input_value("#rate") == "30"
+    hopeless = opened(tabs, url, 30)
+    few = hopeless.evaluate("window.trace")
+    assert len(few) <= 10 and max(dial for dial, _ in few) == 5
+    assert hopeless.dial == "all" and not hopeless.page.is_checked("#hold")
+    assert hopeless.text("#target-note") == "Dial not moved: under 15 fps at any value"
+    # the largest dial value is fast enough, from where the dial then moves
+    late = opened(tabs, url, 10)
+    assert 1 < dial_of(late) < 5 and late.page.is_checked("#hold")
     linked = opened(tabs, f"{url}#dial=0", 2)
     assert linked.dial == "all" and not linked.page.is_checked("#hold")
-    assert linked.errors == slow.errors == []
-    for each in (slow, linked):
+    for each in (slow, hopeless, late, linked):
+        assert each.errors == []
         each.page.close()

@@ -1,4 +1,5 @@
 // The files that the page shows: those of its server or its own, and dropped ones.
+import { EXPONENT, budgetOf } from "../../../../viewers/frame_rate.js";
 import { readGaussians } from "../../../../viewers/read.js";
 import { config, elements, state, ui, viewer } from "./page.js";
 import * as stage from "./stage.js";
@@ -55,7 +56,7 @@ function show(read, base, cameras) {
   reset();
   state.dial = ui.clampDial(dial ?? (viewer.photographs.length ? 1 : 0));
   ui.changed();
-  viewer.opening = dial === null && Boolean(read.settings);
+  viewer.opening = dial === null && read.settings ? state.dial : null;
 }
 
 let asked = 0; // files, the last of which is shown
@@ -76,17 +77,29 @@ async function open(name, read, present) {
   } finally {
     if (number === asked) ui.showProgress(null);
   }
-  if (viewer.opening) await settle();
+  if (viewer.opening !== null) await settle(number);
 }
 
-/** Moves the dial from where a file was opened to what holds a frame rate, unless no dial value has half of it. */
-async function settle() {
-  const { dial } = state;
+/** Moves the dial from where a file was opened to what holds a frame rate, unless no dial value has half of it.
+ *  Where frames are so slow that the dial would take long to get there, the largest value tells first. */
+async function settle(number) {
+  const dial = viewer.opening, { maxDial } = stage.model, slow = 2 * budgetOf(OPENING);
+  const isOpening = () => viewer.opening !== null && number === asked;
+  const keep = () => {
+    ui.setDial(dial);
+    ui.showNote(`Dial not moved: under ${OPENING / 2} fps at any value`);
+  };
+  state.dial = dial;
+  const isSlow = (await stage.measure()) > slow * maxDial ** EXPONENT;
+  if (isSlow && isOpening()) {
+    state.dial = maxDial;
+    ui.update();
+    if ((await stage.measure()) > slow && isOpening()) return keep();
+  }
+  if (!isOpening()) return;
   ui.setHold(OPENING);
   await stage.whenDrawn();
-  if (!stage.hold?.outOfReach(stage.model.maxDial, Math.log(2))) return;
-  ui.setDial(dial);
-  ui.showNote(`Dial not moved: under ${OPENING / 2} fps at any value`);
+  if (stage.hold?.outOfReach(maxDial, Math.log(2))) keep();
 }
 
 export const load = (blob, name) => open(name, () => readFile(blob, name, config.converter && convert), (read) => {

@@ -11,7 +11,7 @@ export const state = { dial: 1, equation: true, wipe: null }; // wipe: share of 
 
 export const viewer = {
   files: [config.model, ...config.others], file: 0, // file: a number, null for a dropped one
-  cameras: [], cameraNumber: 0, up: "", flying: false, recording: null, opening: false, // opening: the dial moves to what the device holds
+  cameras: [], cameraNumber: 0, up: "", flying: false, recording: null, opening: null, // opening: the dial value from which the dial moves to what the device holds
   get photographs() { return viewer.cameras.filter(({ placed }) => !placed); },
 };
 

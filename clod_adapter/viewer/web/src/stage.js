@@ -1,5 +1,5 @@
 // What is shown: a model, or two divided by a wipe. A frame is drawn after a change, and while a held frame rate settles.
-import { createHold } from "../../../../viewers/frame_rate.js";
+import { NEWEST, createHold, median } from "../../../../viewers/frame_rate.js";
 import { findPanel, viewOf } from "./camera.js";
 import { createModel } from "./model.js";
 import { elements, state, ui } from "./page.js";
@@ -7,6 +7,7 @@ import { createRenderer } from "./renderer.js";
 
 export let model = null, base = null, hold = null, frameMs = null;
 let renderer = null, sides = [], version = 0, drawnVersion = -1, frame = 0, moving = false;
+const SLOW = 500; // milliseconds of a frame that alone tells enough
 let warm = false; // a frame has been drawn; the first one compiles the shaders
 const callbacks = []; // of whenDrawn
 
@@ -103,6 +104,17 @@ async function requestOrder({ side, model: of, dial, attenuated }, seen, current
   side.version = current;
   side.busy = false;
   schedule();
+}
+
+/** The milliseconds of a frame of the present state: the median of a few, or of one that is slow. */
+export async function measure() {
+  const times = [];
+  while (times.length < NEWEST && !(times[0] > SLOW)) {
+    change();
+    await whenDrawn();
+    times.push(frameMs);
+  }
+  return median(times);
 }
 
 /** Holds so many frames per second by the dial; null ends that. */

@@ -85,7 +85,7 @@ function setDial(dial) {
 
 /** Holds a frame rate by the dial, frames per second; null ends that. */
 function setHold(fps) {
-  viewer.opening = false;
+  viewer.opening = null;
   if (fps) [state.equation, elements.rate.value] = [true, fps];
   stage.setHold(fps);
   changed();
