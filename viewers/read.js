@@ -73,7 +73,7 @@ function readPly(bytes) {
     opacityLogits: read("opacity"), sh0: numbered("f_dc", 3), shN: read(...rest), sigmaD: hasDial ? read("sigma_d") : null,
     opacityD: hasDial && columns.has("opacity_d") ? read("opacity_d") : null,
     growthD: hasDial && columns.has("growth_d") ? read("growth_d") : null, settings: hasDial ? readSettings(comments, constants) : null,
-    screenFilter: readScreenFilter(comments, constants, hasDial), calibration: readCalibration(comments, count),
+    screenFilter: readScreenFilter(comments, constants, hasDial), ...readCalibration(comments, count),
   };
 }
 
@@ -106,11 +106,13 @@ function readScreenFilter(comments, { screen_variance: width, compensate: compen
   return { variance: compensate && comments.includes("Exported from Brush") ? 0.1 : 0.3, compensate };
 }
 
-/** Rows {virtual_scale, psnr}; none without a table, or if the number of Gaussians is not the table's. */
+/** calibration: rows {virtual_scale, psnr}, none without a table, or if the number of Gaussians is not the table's;
+ *  against: what the PSNR is against. */
 function readCalibration(comments, total) {
-  const found = entries(comments), numbers = (wanted) => found.filter(([name]) => name === wanted).map(([, value]) => value.split(" ").map(Number));
-  if (numbers("calibrated_with")[0]?.[0] !== total) return [];
-  return numbers("calibrated").map(([virtual_scale, , psnr]) => ({ virtual_scale, psnr }));
+  const words = (wanted) => entries(comments).filter(([name]) => name === wanted).map(([, value]) => value.split(" "));
+  const [counted, , , , against = "photographs"] = words("calibrated_with")[0] ?? [];
+  const rows = Number(counted) === total ? words("calibrated") : [];
+  return { calibration: rows.map(([virtual_scale, , psnr]) => ({ virtual_scale: Number(virtual_scale), psnr: Number(psnr) })), against };
 }
 
 /** [name, value] of each of our comments. */

@@ -28,7 +28,7 @@ export async function readSpz(file) {
     sh0: read(3, (k) => (bytes[colours + k] / 255 - 0.5) / COLOR), logScales: read(3, (k) => bytes[scales + k] / 16 - 10),
     shN: read(shSize, (k) => (bytes[harmonics + k] - 128) / 128),
     screenFilter: screenFilter ?? { variance: 0.3, compensate: (bytes[14] & ANTIALIASED) > 0 },
-    calibration: calibration?.total === count ? calibration.rows : [],
+    calibration: calibration?.total === count ? calibration.rows : [], against: calibration?.against ?? "photographs",
   };
 }
 

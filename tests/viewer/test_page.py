@@ -124,10 +124,10 @@ def test_a_page_of_one_file(show, save, monkeypatch, exact):
     read, _ = page.write_viewer_page(out, calibrated, **options)
     assert out.read_text("utf-8").count('id="clod-model"') > 2
     shown = show(url=out.as_uri())
-    assert shown.text("#quality") == "31.5 dB"
+    assert shown.text("#quality") == "31.5 dB to the photographs"
     here = shown.link()
     away = re.sub("eye=[^&]*", f"eye={40 * size},0,{-40 * size}", here)
-    for view, quality in ((away, ""), (here, "31.5 dB")):
+    for view, quality in ((away, ""), (here, "31.5 dB to the photographs")):
         shown.evaluate("hash => { location.hash = hash }", view)
         shown.until(f"document.getElementById('quality').textContent === '{quality}'")
     shown.camera(seen)

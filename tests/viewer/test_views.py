@@ -78,7 +78,7 @@ def test_the_count_box(shown, gaussians):
     shown.page.keyboard.type("wasdech0")
     assert shown.page.input_value("#target") == "wasdech0"
     assert np.array_equal(shown.picture(), before)
-    for text in ("0", "1.5", "many"):
+    for text in ("0", "1.5", "0.0015k", "k", "20%%", "many"):
         assert "Enter a number of Gaussians" in target(shown, text)
         assert shown.dial == "s = 1.00"
     assert "keeps" in target(shown, "1,000,000")
@@ -86,11 +86,25 @@ def test_the_count_box(shown, gaussians):
     assert "keeps 280 in this view" in target(shown, "280")
     assert shown.counts()["kept"] == 280 and shown.page.is_checked("#equation")
     assert float(shown.dial.removeprefix("s = ")) == pytest.approx(wanted, rel=0.02)
+    for text, count in (("0.28k", 280), ("70 %", 280), ("0.00028M", 280)):
+        assert f"keeps {count} in this view" in target(shown, text), text
     for change in ("]", "ArrowLeft"):
         assert "keeps" in target(shown, "280")
         shown.evaluate("document.activeElement.blur()")
         shown.press(change)
-        assert shown.text("#target-note") == "", change
+        assert shown.text("#target-note") == shown.page.input_value("#target") == "", change
+
+
+def test_narrow_phones(show, model):
+    """The help opens at its start, and lists show their text."""
+    shown = show(model, viewport={"width": 320, "height": 480})
+    shown.page.click("#fold")
+    width = "document.getElementById('rate').clientWidth"
+    assert shown.evaluate(width) > 60
+    shown.page.click("#help-open")
+    assert shown.evaluate("document.getElementById('help').scrollTop") == 0
+    shown.page.keyboard.press("Tab")
+    assert shown.evaluate("document.activeElement.textContent") == "Close"
 
 
 def test_pointer_touch_and_wheel_move_the_camera(chromium, show, model):

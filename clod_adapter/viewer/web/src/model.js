@@ -11,14 +11,14 @@ const FLAT = Math.log(2); // a flat Gaussian's least scale is at most half the n
 const BESIDE = Math.cos(Math.PI / 5), SURE = 0.3; // share of the flat ones beside the axis, by chance 0.19
 
 export function createModel(gl, read) {
-  const { name, count, degree, means, logScales: s, sigmaD, growthD, settings, screenFilter, calibration } = read;
+  const { name, count, degree, means, logScales: s, sigmaD, growthD, settings, screenFilter, calibration, against } = read;
   const { records, sh } = upload(gl, read), extent = extentOf(read), worker = startWorker();
   const scales = Float32Array.from({ length: count }, (_, i) => Math.exp(Math.max(s[3 * i], s[3 * i + 1], s[3 * i + 2])));
   const blur = screenFilter.variance, attenuation = settings, maxDial = settings?.max_sv ?? 1;
   const whole = settings ? wholeCount(count, sigmaD, settings) : count;
   worker.request("model", { means, scales, sigmaD, growthD, attenuation, blur }, [means.buffer, scales.buffer]);
   return {
-    name, attenuation, maxDial, screenFilter, calibration, count, degree, records, sh, extent, whole,
+    name, attenuation, maxDial, screenFilter, calibration, against, count, degree, records, sh, extent, whole,
     /** {rows, drawn, kept}: the rows to draw, farthest first. */
     order: (shown) => worker.request("order", shown),
     dialFor: (view, target) => worker.request("dialFor", { view, target, maxDial }),

@@ -57,15 +57,21 @@ function updateFrame() {
   elements.frame.textContent = frameMs === null ? "" : `${frameMs.toFixed(frameMs < 10 ? 1 : 0)} ms per frame`;
   const tells = model?.attenuation && state.equation && (!viewer.cameras.length || isNear(viewer.cameras));
   const psnr = tells ? psnrAt(model.calibration, state.dial) : null;
-  elements.quality.textContent = psnr === null ? "" : `${psnr.toFixed(1)} dB`;
+  elements.quality.textContent = psnr === null ? "" : `${psnr.toFixed(1)} dB to the ${model.against}`;
   if (state.wipe === null) return;
   elements.wipeLeft.textContent = `${model.attenuation ? named() : model.name} · ${integer(kept)}`;
   elements.wipeRight.textContent = `${base ? "base" : "dial off"} · ${integer(stage.counts(1).kept)}`;
 }
 
-/** Shows a changed state, and removes the note, which was of the former one. */
-function changed() {
+/** Removes the note and the number to keep, unless it is being typed: they were of a former view or dial value. */
+function forget() {
   showNote("");
+  if (document.activeElement !== elements.target) elements.target.value = "";
+}
+
+/** Shows a changed state. */
+function changed() {
+  forget();
   stage.change();
   update();
 }
@@ -104,14 +110,23 @@ function setWipe(position) {
   changed();
 }
 
+/** The number of Gaussians that a text such as 20,000, 20k or 20% asks for; NaN for another text. */
+function countOf(text) {
+  const plain = text.trim().replaceAll(/[\s,_.'](?=\d{3}(?!\d))/g, "");
+  const [, number, unit = ""] = /^(\d*\.?\d+)\s*([km%]?)$/i.exec(plain) ?? [];
+  const count = number * { "": 1, k: 1e3, m: 1e6, "%": stage.counts().total / 100 }[unit.toLowerCase()];
+  return unit === "%" ? Math.round(count) : Number(count.toFixed(6)); // 1.1 * 1e3 is no integer
+}
+
 /** Sets the dial value that keeps a typed number of Gaussians in this view. */
 async function setTarget({ value }) {
-  const target = Number(value.replaceAll(/[\s,_.'](?=\d{3}(?!\d))/g, ""));
   if (!value.trim()) return showNote("");
-  if (!(Number.isInteger(target) && target > 0)) return showNote("Enter a number of Gaussians, such as 20000");
+  const target = countOf(value);
+  if (!(Number.isInteger(target) && target > 0)) return showNote("Enter a number of Gaussians, such as 20000, 20k or 20%");
   const { dial, kept } = await stage.model.dialFor(stage.view(), target), count = integer(kept);
   state.equation = true;
   setDial(dial);
+  elements.target.value = value;
   showNote(`s = ${dial.toFixed(3)}${kept > target ? ", the largest trained value," : ""} keeps ${count} in this view`);
 }
 
@@ -185,6 +200,6 @@ function showProgress(text) {
 }
 
 Object.assign(ui, {
-  changed, clampDial, heldFrame, listCameras, setDial, setEquation, setHold, setWipe, showFile, showMessage, showName, showNote,
+  changed, clampDial, forget, heldFrame, listCameras, setDial, setEquation, setHold, setWipe, showFile, showMessage, showName, showNote,
   showProgress, start, update, updateFrame,
 });

@@ -51,7 +51,7 @@ export function setUp(value) {
 
 function moved() {
   stage.change(true);
-  ui.showNote(""); // it was of another view
+  ui.forget();
 }
 
 export function movedByHand() {
