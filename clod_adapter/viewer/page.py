@@ -8,9 +8,10 @@ whatever the file, or SPZ.
 
 import base64
 import hashlib
+import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from importlib.resources import files
 from io import BytesIO
@@ -44,6 +45,11 @@ ELEMENT = "clod-model"  # id of the elements with the splats
 PART = 3 << 24  # bytes of a script element, a multiple of 3; browsers limit strings to about 5e8
 # of the picture shown while the page loads: pixels, and of JPEG
 POSTER_SIDE, POSTER_QUALITY = 512, 60
+# of up_axis, as in web/src/model.js: first guesses; least logarithm between a flat Gaussian's least
+# two scales; cosine within which it faces the axis; share of the flat ones that do; steps
+UPS = ((0.0, -1.0, 0.0), (0.0, 0.0, 1.0))
+FLAT, BESIDE, SURE, UP_STEPS = math.log(2), math.cos(math.pi / 5), 0.3, 10
+MAX_PITCH = 0.995  # cosine of a camera's axis and up, beyond which it is not levelled
 
 Entry = Mapping[str, Any]
 
@@ -204,7 +210,8 @@ def write_viewer_page(
         else:
             data, found, notes = payload.packed(f"{temporary}.spz")
         opening = virtual_scale if virtual_scale is not None else 0.0 if placed else 1.0
-        poster = _poster(found, cameras[0], opening) if cameras else ""
+        first = cameras[:1] if not placed else [levelled(cameras[0], up_axis(found))]
+        poster = _poster(found, first[0], opening) if first else ""
         meta = f'<meta http-equiv="Content-Security-Policy" content="{policy()}">\n'
         with open(temporary, "wb") as file:
             file.writelines(document(config, _elements(data), meta, poster))
@@ -224,6 +231,47 @@ def _poster(gaussians: Gaussians, camera: Camera, virtual_scale: float) -> str:
     image.save(buffer, "JPEG", quality=POSTER_QUALITY)
     text = base64.b64encode(buffer.getvalue()).decode("ascii")
     return f'<img id="poster" alt="" src="data:image/jpeg;base64,{text}">'
+
+
+def levelled(camera: Camera, axis: np.ndarray) -> Camera:
+    """The camera rolled until ``axis`` is up, as web/src/camera.js does with placed ones; unchanged
+    if it looks along it.
+    """
+    ahead = camera.viewmat[2, :3]
+    up = ahead.new_tensor(axis)
+    if abs(float(ahead @ up)) >= MAX_PITCH:
+        return camera
+    right = torch.nn.functional.normalize(torch.linalg.cross(-up, ahead), dim=0)
+    rotation = torch.stack([right, torch.linalg.cross(ahead, right), ahead])
+    viewmat = camera.viewmat.clone()
+    viewmat[:3, :3] = rotation
+    viewmat[:3, 3] = -rotation @ camera.position
+    return replace(camera, viewmat=viewmat)
+
+
+def up_axis(gaussians: Gaussians) -> np.ndarray:
+    """The direction that flat Gaussians face, a ground or a table, as in web/src/model.js."""
+    from scipy.spatial.transform import Rotation  # here: pages without a placed camera need none
+
+    g = gaussians.to("cpu")
+    means, scales = g.means.double().numpy(), np.sort(g.log_scales.numpy(), axis=1)
+    offsets = np.linalg.norm(means - np.median(means, axis=0), axis=1)
+    used = (scales[:, 0] + FLAT < scales[:, 1]) & (offsets <= np.quantile(offsets, 0.98))
+    if not used.any():
+        return np.array(UPS[0])
+    axes = Rotation.from_quat(g.quats.double().numpy()[used][:, [1, 2, 3, 0]]).as_matrix()
+    thin = g.log_scales.numpy()[used].argmin(axis=1)
+    normals, weights = axes[np.arange(len(axes)), :, thin], g.opacities.double().numpy()[used]
+    for up in np.array(UPS):
+        for _ in range(UP_STEPS):
+            cosines = normals @ up
+            near = np.abs(cosines) > BESIDE
+            if near.any():
+                total = (weights * np.sign(cosines))[near] @ normals[near]
+                up = total / np.linalg.norm(total)
+        if weights[near].sum() > SURE * weights.sum():
+            return up
+    return np.array(UPS[0])
 
 
 def policy(connect: str = "") -> str:

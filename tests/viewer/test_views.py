@@ -2,7 +2,9 @@
 pictures, videos.
 """
 
+import base64
 import io
+import re
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -11,14 +13,16 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from skimage.metrics import peak_signal_noise_ratio
 
 import clod_adapter
 import scenes
 from clod_adapter.calibration import Calibration, CalibrationRow
 from clod_adapter.cameras import Camera
-from clod_adapter.equation.distances import viewpoint_of
+from clod_adapter.equation.distances import camera_of, viewpoint_of
 from clod_adapter.io.file_formats import write
-from clod_adapter.viewer.page import write_viewer_page
+from clod_adapter.render import render
+from clod_adapter.viewer.page import up_axis, write_viewer_page
 from models import write_model
 from scenes import ring
 from shown import TALL, drop, fold, take
@@ -182,6 +186,29 @@ def test_files_and_cameras_are_listed(show, gaussians, tmp_path):
     assert opened.page.title() == "b.glb" and not differ(opened.picture(), of_second)
 
 
+def test_another_scene_opens_in_its_own_view(show, gaussians, tmp_path):
+    """A level of the same scene in the view that is there."""
+    other = gaussians.replace(
+        means=5 * gaussians.means + 40,
+        log_scales=gaussians.log_scales + np.log(5),
+        sigma_d=5 * gaussians.sigma_d,
+    )
+    models = {"a.ply": gaussians, "b.ply": gaussians[:200], "c.ply": other}
+    for name, model in models.items():
+        write(tmp_path / name, model)
+    photographed(tmp_path, ring(3, 320, 240))
+    shown = show(*(tmp_path / name for name in models), "--images", tmp_path)
+    shown.press("n")
+    second = link(shown)["eye"]
+    for key, name, cameras in (("2", "b.ply", 3), ("3", "c.ply", 0), ("1", "a.ply", 3)):
+        shown.press(key)
+        shown.until(f"document.title === '{name}'")
+        shown.run("clod.whenDrawn()")
+        assert shown.page.locator("#camera option").count() == cameras + 1
+        assert shown.picture().max() > 50
+        assert np.array_equal(link(shown)["eye"], second) == (name == "b.ply")
+
+
 def link(shown):
     pairs = (part.split("=") for part in shown.link().lstrip("#").split("&"))
     return {name: np.array(text.split(","), float) for name, text in pairs}
@@ -232,6 +259,7 @@ def test_the_up_axis(shown, show, save, tmp_path):
         model, normal = ground(angle)
         take(shown, path := save(model))
         assert up_of(link(shown), np.arctan(0.5)) @ normal > np.cos(np.radians(5))
+        assert up_axis(model) @ normal > np.cos(np.radians(5))  # of a poster
     assert shown.page.text_content("#up option") == "found from the scene"
     shown.page.eval_on_selector(
         "#up", "(up) => { up.value = '0,0,1'; up.dispatchEvent(new Event('change')); }"
@@ -265,11 +293,18 @@ def test_placed_cameras_are_levelled(show, model, tmp_path):
         (CalibrationRow(1.0, 9.0, 30.0, 0.9, 1.0),), 400, 1, 400, 300, "a", "checkpoint", (place,)
     )
     write_viewer_page(tmp_path / "page.html", replace(saved, calibration=measured))
+    poster = re.findall('jpeg;base64,([^"]*)', (tmp_path / "page.html").read_text("utf-8"))
+    picture = Image.open(io.BytesIO(base64.b64decode(poster[0])))
+    level = replace(camera_of(place, 400, 300, ""), viewmat=viewmat)
+    wanted = render(saved.gaussians, level, 0.0).pixels.numpy()
+    assert peak_signal_noise_ratio(wanted, np.asarray(picture)) > 30
     # frames whose time is hardly more than 0
     fast = "WebGL2RenderingContext.prototype.readPixels = () => {}"
     shown = show(url=(tmp_path / "page.html").as_uri(), script=fast)
     assert shown.dial == "all"
     assert np.allclose(link(shown)["axes"][:3], viewmat[0, :3], atol=1e-4)
+    shown.run("clod.setDial(1)")
+    assert shown.text("#quality") == "30.0 dB to the checkpoint"
 
 
 @pytest.mark.parametrize("photographs", [True, False])

@@ -3,6 +3,7 @@ import { EXPONENT, budgetOf } from "../../../../viewers/frame_rate.js";
 import { readGaussians } from "../../../../viewers/read.js";
 import { config, elements, state, ui, viewer } from "./page.js";
 import * as stage from "./stage.js";
+import { add } from "./vector.js";
 import { applyLink, reset } from "./views.js";
 
 const OPENING = 30; // frames per second that are held when a file opens
@@ -45,15 +46,33 @@ async function convert(blob, name) {
   return readFile(response, name);
 }
 
-/** Shows another scene: at the page's dial value, else s = 1 for photographs or everything, and what the device holds. */
+let home = null; // extent of the first file
+
+/** The cameras of the page, if it shows the scene of its first file. */
+function ownCameras() {
+  home ??= stage.model.extent;
+  return isAlike(home, stage.model.extent) ? config.cameras : [];
+}
+
+/** Whether two extents may be of one scene, as those of its levels. */
+const isAlike = (one, other) => Math.abs(Math.log(one.radius / other.radius)) < Math.log(2)
+  && Math.hypot(...add(one.centre, other.centre, -1)) < Math.max(one.radius, other.radius) / 2;
+
+/** Shows a scene from its own start. */
+function look(cameras) {
+  Object.assign(viewer, { cameras, up: "" });
+  ui.listCameras();
+  reset();
+}
+
+/** Shows another scene: at the page's dial value, else s = 1 for photographs or everything, and what the device holds.
+ *  `cameras()`: of the scene that is there. */
 function show(read, base, cameras) {
   const dial = config.virtual_scale;
   Object.assign(state, { dial: 1, equation: true, wipe: null });
   stage.setHold(null);
   stage.show(read, base);
-  Object.assign(viewer, { cameras, up: "" });
-  ui.listCameras();
-  reset();
+  look(cameras());
   state.dial = ui.clampDial(dial ?? (viewer.photographs.length ? 1 : 0));
   ui.changed();
   viewer.opening = dial === null && read.settings ? state.dial : null;
@@ -104,7 +123,7 @@ async function settle(number) {
 
 export const load = (blob, name) => open(name, () => readFile(blob, name, config.converter && convert), (read) => {
   viewer.file = null;
-  show(read, null, []);
+  show(read, null, () => []);
   ui.showName(name, null);
 });
 
@@ -112,8 +131,12 @@ export const load = (blob, name) => open(name, () => readFile(blob, name, config
 export async function openEntry(number) {
   const entry = viewer.files[number], base = stage.base ? null : config.base, isFirst = !stage.model;
   await open(entry.name, () => Promise.all([fetchModel(entry), base && fetchModel(base)]), async ([read, readBase]) => {
-    if (isFirst || viewer.file === null) show(read, readBase, config.cameras);
-    else stage.show(read, readBase ?? undefined);
+    const before = stage.model?.extent;
+    if (isFirst || viewer.file === null) show(read, readBase, ownCameras);
+    else {
+      stage.show(read, readBase ?? undefined);
+      if (!isAlike(before, stage.model.extent)) look(ownCameras());
+    }
     viewer.file = number;
     ui.showName(entry.name, number);
     if (read.settings) state.dial = ui.clampDial(state.dial);
