@@ -33,6 +33,17 @@ export function constants({ settings }) {
   };
 }
 
+const attached = new WeakSet();
+
+/** Marks the mesh or entity of a dial; refuses one that has a dial. */
+export function claim(object) {
+  if (attached.has(object)) throw new Error("it has a dial already; use what the first attach returned");
+  attached.add(object);
+}
+
+/** Frees what `claim` marked, where attaching failed. */
+export const release = (object) => attached.delete(object);
+
 /** Turns the dial of a model in a viewer. `eye()`: the camera in the file's coordinates; `show(s)`: draws with s;
  *  `time(draw)`: milliseconds of a frame's work, or a promise of these. */
 export class Dial {
@@ -45,8 +56,13 @@ export class Dial {
 
   // The public methods are described in types.d.ts.
   set(value) {
+    const largest = this.file.settings.max_sv, keep = value?.keep;
+    if (typeof value === "number" ? !(value >= 0 && value <= largest) : !(Number.isInteger(keep) && keep >= 0)) {
+      const given = JSON.stringify(value) ?? value;
+      throw new RangeError(`the dial is set to a number from 0 to ${largest} or to {keep: a number of Gaussians}, not to ${given}`);
+    }
     this.#hold = null;
-    this.#turn(typeof value === "number" ? value : dialForCount(this.#bands(), value.keep, this.file.settings.max_sv));
+    this.#turn(typeof value === "number" ? value : dialForCount(this.#bands(), keep, largest));
   }
 
   get kept() {
@@ -54,6 +70,7 @@ export class Dial {
   }
 
   hold(fps) {
+    if (!(fps > 0 && fps < Infinity)) throw new RangeError(`a frame rate is a number above 0, not ${fps}`);
     this.#hold = createHold(fps);
   }
 
@@ -67,7 +84,6 @@ export class Dial {
   }
 
   #turn(s) {
-    if (!(s >= 0 && s < Infinity)) throw new RangeError(`the dial is a number from 0 on, not ${s}`);
     if (s !== this.s) this.show((this.s = s));
   }
 

@@ -1,7 +1,7 @@
 // The dial in Spark (three.js): mesh.objectModifiers, with the library's GLSL.
 import { dyno } from "@sparkjsdev/spark";
 import { DataTexture, FloatType, RGBAFormat } from "three";
-import { Dial, constants, readDial, texels } from "./dial.js";
+import { Dial, claim, constants, readDial, release, texels } from "./dial.js";
 import { glsl } from "./shaders.js";
 import { timed } from "./frame_rate.js";
 
@@ -9,8 +9,11 @@ const WIDTH = 2048; // of the texture
 
 /** Attaches the dial of an adapted PLY or SPZ, whose `bytes` the SplatMesh was made from (without `lod`). */
 export async function attach(mesh, bytes, renderer) {
-  const [file] = await Promise.all([readDial(bytes), mesh.initialized]);
-  if (mesh.splats.getNumSplats() !== file.count) throw new Error(`the mesh has not the ${file.count} splats of the file; load it without lod`);
+  claim(mesh);
+  const file = await read(mesh, bytes).catch((error) => {
+    release(mesh);
+    throw error;
+  });
   const height = Math.ceil(file.count / WIDTH);
   const texture = new DataTexture(texels(file, 4 * WIDTH * height), WIDTH, height, RGBAFormat, FloatType);
   texture.needsUpdate = true;
@@ -27,6 +30,12 @@ export async function attach(mesh, bytes, renderer) {
     mesh.updateVersion();
   };
   return new Dial(file, { eye: () => eye.value.toArray(), show, time: (draw) => timed(renderer.getContext(), draw) });
+}
+
+async function read(mesh, bytes) {
+  const [file] = await Promise.all([readDial(bytes), mesh.initialized]);
+  if (mesh.splats.getNumSplats() === file.count) return file;
+  throw new Error(`the mesh has not the ${file.count} splats of the file; load it without lod`);
 }
 
 function attenuated(file) {

@@ -18,15 +18,11 @@ export interface Dial {
   readonly s: number;
   /** The number of Gaussians that the dial keeps for the camera. */
   readonly kept: number;
-  /** Turns the dial to a value, or to the smallest one from 1 on that keeps at most so many Gaussians from here. */
+  /** Turns the dial to a value from 0 to `file.settings.max_sv`, or to the smallest one from 1 on that keeps at most so
+   *  many Gaussians from here. Throws a RangeError for anything else. */
   set(value: number | { keep: number }): void;
-  /** Turns the dial with the time of frames, until `set` is called. */
+  /** Turns the dial with the time of whole frames, until `set` is called; so do all dials that hold a rate, together. */
   hold(fps: number): void;
   /** Calls `draw()` at once, and measures it while a frame rate is held; in Spark wrap your render call in it. */
   frame(draw: () => void): Promise<void>;
 }
-
-/** From clod-adapter/spark: `mesh` was made from `bytes`, without `lod`. */
-export function attach(mesh: object, bytes: ArrayBuffer | Uint8Array, renderer: object): Promise<Dial>;
-/** From clod-adapter/playcanvas: `entity` has a gsplat with an adapted PLY; distances are from `camera`. */
-export function attach(app: object, entity: object, camera: object): Dial;

@@ -39,6 +39,7 @@ PLACE = {
     ),
     "playcanvas": (
         """([m, fov]) => {
+        controls.enabled = false;
         const matrix = new pc.Mat4();
         matrix.set(m);
         camera.setPosition(matrix.getTranslation());
@@ -180,6 +181,23 @@ def test_the_dial_is_as_exact_as_the_viewer(tabs, viewer, suffix, tmp_path):
             assert psnr > max(undialled - 1, 25), (frame["s"], psnr, undialled)
             if viewer == "spark":  # drops opacities below its 8 bits
                 assert page.evaluate("spark.activeSplats") == pytest.approx(frame["kept"], rel=0.05)
+        for value in ("5.01", "-1", "NaN", "'3'", "undefined", "{ keep: 'x' }", "{ keep: 0.5 }"):
+            refused = page.evaluate(
+                f"() => {{ try {{ dial.set({value}) }} catch (e) {{ return `${{e}}` }} }}"
+            )
+            assert "RangeError: the dial is set to a number from 0 to 5 or to {keep" in refused, (
+                value
+            )
+        assert page.evaluate("dial.s") == frame["s"]
+        again = (
+            "attach(app, splat, camera)"
+            if viewer == "playcanvas"
+            else "attach(mesh, bytes, renderer)"
+        )
+        said = page.evaluate(
+            f"async () => {{ try {{ await {again} }} catch (e) {{ return e.message }} }}"
+        )
+        assert said == "it has a dial already; use what the first attach returned"
         page.evaluate("dial.set({ keep: 600 })")
         assert page.evaluate("dial.kept") == 600
         page.evaluate("dial.hold(2000)")  # out of reach
@@ -200,6 +218,69 @@ def test_the_dial_is_as_exact_as_the_viewer(tabs, viewer, suffix, tmp_path):
             assert error in page.evaluate(f"(given) => {script}", data)
         if viewer == "playcanvas":
             assert_the_wgsl_of_playcanvas_gives_the_equation(page, about)
+
+
+@pytest.mark.parametrize("viewer", ["spark", "playcanvas"])
+def test_the_examples_follow_the_pointer_and_the_window(tabs, viewer):
+    with opened(tabs, viewer, KIT / "kit.ply") as page:
+        page.wait_for_function("window.dial")
+        assert page.get_attribute("input", "max") == "5"
+        before = settled(page)
+        page.mouse.move(100, 100)
+        page.mouse.down()
+        page.mouse.move(160, 110, steps=5)
+        page.mouse.up()
+        assert np.abs(settled(page) - before).mean() > 1
+        page.set_viewport_size({"width": 300, "height": 120})
+        canvas = "document.querySelector('canvas')"
+        page.wait_for_function(f"{canvas}.clientWidth === 300 && {canvas}.clientHeight === 120")
+
+
+@pytest.mark.parametrize("viewer", ["spark", "playcanvas"])
+def test_the_examples_show_errors(tabs, viewer, tmp_path):
+    clod_adapter.save(tmp_path / "plain.ply", scenes.gaussians(50, 0, 7))
+    with opened(tabs, viewer, tmp_path / "plain.ply") as page:
+        page.wait_for_function("document.querySelector('p').textContent")
+        assert "the file has no sigma_d, so no dial" in page.inner_text("p")
+        assert page.is_hidden("form")
+        page.route("https://example/none.ply", lambda route: route.fulfill(status=404))
+        page.goto(page.url.replace("plain.ply", "none.ply"))
+        page.wait_for_function("document.querySelector('p').textContent")
+        assert "none.ply: " in page.inner_text("p")
+
+
+def test_dials_that_hold_a_rate_share_the_frame(tabs):
+    """They turn together, until the frame is fast enough."""
+    script = """async () => {
+        const { Dial, readDial } = await import("/viewers/dial.js");
+        const file = await readDial(await (await fetch("/kit.ply")).arrayBuffer());
+        const cost = ({ s }) => 20 * s ** -0.75;
+        const time = async (draw) => { await draw(); return cost(one) + cost(other); };
+        const viewer = { eye: () => [0, 0, 3], show() {}, time };
+        const [one, other] = [new Dial(file, viewer), new Dial(file, viewer)];
+        for (const dial of [one, other]) dial.hold(40);
+        for (let k = 0; k < 60; k++) await one.frame(() => other.frame(() => {}));
+        return [one.s, other.s, cost(one) + cost(other)];
+    }"""
+    with opened(tabs, "playcanvas", KIT / "kit.ply") as page:
+        page.wait_for_function("window.dial")
+        one, other, milliseconds = page.evaluate(script)
+        assert one == pytest.approx(other, rel=0.1)
+        assert milliseconds == pytest.approx(0.8 * 1000 / 40, rel=0.1)
+
+
+def test_each_module_of_the_package_has_its_types():
+    package = json.loads((KIT.parent / "package.json").read_text())
+    assert set(package["exports"]) == {".", "./spark", "./playcanvas"}
+    for entry in package["exports"].values():
+        exported = set(re.findall(r"export (?:async )?function (\w+)", read(entry["default"])))
+        typed = set(re.findall(r"export function (\w+)", read(entry["types"])))
+        assert typed and typed <= exported
+        assert "object" not in re.sub(r"/\*.*?\*/", "", read(entry["types"]), flags=re.DOTALL)
+
+
+def read(name):
+    return (KIT.parent / name).read_text()
 
 
 def test_playcanvas_draws_a_change_that_comes_while_it_sorts(tabs):
