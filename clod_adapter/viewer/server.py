@@ -156,9 +156,10 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _convert(self, convert: Converter, length: int, name: str) -> None:
         """Answers with the conversion of the request's body, a file of this name."""
-        suffix = re.sub(r"[^.\w]", "", Path(name).suffix, flags=re.ASCII)
+        # readers go by the suffix and, for one rank of a checkpoint, by the name
+        plain = re.sub(r"[^\w.-]", "_", name, flags=re.ASCII)[-100:].lstrip(".") or "file"
         with TemporaryDirectory(prefix="clod-adapt-") as folder:
-            file = Path(folder) / f"dropped{suffix}"
+            file = Path(folder) / plain
             try:
                 if not self._receive(file, length):
                     self.close_connection = True

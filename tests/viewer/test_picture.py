@@ -159,7 +159,12 @@ MESH = b"ply\nformat binary_little_endian 1.0\nelement vertex 0\nend_header\n"
 
 def test_the_server_reads_files_of_other_formats(show, model, gaussians, plain, tmp_path):
     """They are shown as ``clod-adapt view`` shows them; none remains; errors are one line."""
-    for name, saved in (("a b&.glb", gaussians), ("a.splat", plain), ("a.safetensors", gaussians)):
+    for name, saved in (
+        ("a b&.glb", gaussians),
+        ("a.splat", plain),
+        ("a.safetensors", gaussians),
+        ("a.pt", plain),
+    ):
         write(tmp_path / name, finer(saved, 2.0))
     rows = PlyData.read(model, mmap=False)
     rows.text = True
