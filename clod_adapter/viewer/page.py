@@ -48,7 +48,8 @@ POSTER_SIDE, POSTER_QUALITY = 512, 60
 # of up_axis, as in web/src/model.js: first guesses; least logarithm between a flat Gaussian's least
 # two scales; cosine within which it faces the axis; share of the flat ones that do; steps
 UPS = ((0.0, -1.0, 0.0), (0.0, 0.0, 1.0))
-FLAT, BESIDE, SURE, UP_STEPS = math.log(2), math.cos(math.pi / 5), 0.3, 10
+FLAT, BESIDE = math.log(2), math.cos(math.pi / 5)
+SURE, UP_STEPS = 0.3, 10
 MAX_PITCH = 0.995  # cosine of a camera's axis and up, beyond which it is not levelled
 
 Entry = Mapping[str, Any]
