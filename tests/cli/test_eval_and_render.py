@@ -195,7 +195,7 @@ def test_device_presets_are_counts(clod, capture, dialled, monkeypatch):
     words = f"{dialled} --images {capture.scene} --device-preset quest3".split()
     answers, report = view.make_page(build_parser("view").parse_args(words), view.Console(True))
     page = b"".join(answers["/"].blocks()).decode()
-    opening = float(re.findall(r'"virtual_scale": ([\d.]+)}', page)[-1])
+    opening = float(re.findall(r'"virtual_scale": ([\d.]+)[,}]', page)[-1])
     model = load(dialled).gaussians
     scene = load_scene(capture.scene)
     views = scene.train + scene.test

@@ -13,6 +13,7 @@ import pytest
 import torch
 from numba.core.event import install_recorder
 from plyfile import PlyData
+from refusals import refused
 
 import clod_adapter
 from clod_adapter.cli.shared import inputs, pages
@@ -53,7 +54,7 @@ def test_a_compressed_file_is_adapted(clod, tmp_path):
 def test_devices(monkeypatch, capsys):
     """Without a GPU nothing is printed; a GPU is named, or the reason that it is not used."""
 
-    def refused(said):
+    def cuda_is_refused(said):
         with refused(rf"--device cuda: {said}.*or use --device cpu"):
             pick_device("cuda", Console())
 
@@ -65,7 +66,7 @@ def test_devices(monkeypatch, capsys):
         ("12.4", "torch finds no NVIDIA GPU"),
     ):
         monkeypatch.setattr(torch.version, "cuda", build)
-        refused(why)
+        cuda_is_refused(why)
     for name, value in (
         ("is_available", True),
         ("current_device", 0),
@@ -75,7 +76,7 @@ def test_devices(monkeypatch, capsys):
     # torch has no code for its compute capability: the first operation fails
     error = RuntimeError("CUDA error: no kernel image is available")
     monkeypatch.setattr(torch, "ones", Mock(side_effect=error))
-    refused(r"torch cannot compute on it .*doctor")
+    cuda_is_refused(r"torch cannot compute on it .*doctor")
     monkeypatch.setattr(torch, "ones", lambda *_, **__: torch.zeros(1))
     monkeypatch.setattr(inputs, "unusable", lambda: None)
     capsys.readouterr()
@@ -86,7 +87,7 @@ def test_devices(monkeypatch, capsys):
     assert pick_device("auto", Console()) == torch.device("cpu")
     why = "on the CPU, although there is a GPU: gsplat is absent: pip install"
     assert why in capsys.readouterr().err
-    refused("gsplat is absent: pip install gsplat==1.5.3")
+    cuda_is_refused("gsplat is absent: pip install gsplat==1.5.3")
 
 
 def test_adapting_compiles_nothing_more(capture, capsys):
