@@ -36,7 +36,8 @@ def main() -> None:
     args = parser.parse_args()
     for scene in args.scenes:
         for kind in args.kinds:
-            run(scene, kind, clod.AdaptConfig(iters=args.iters, max_sv=DIALS[-1]), args.few)
+            make = clod.AdaptConfig.placed if kind == "placed" else clod.AdaptConfig
+            run(scene, kind, make(iters=args.iters, max_sv=DIALS[-1]), args.few)
 
 
 def run(scene: str, kind: str, config: clod.AdaptConfig, few: int | None) -> None:
