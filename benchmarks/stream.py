@@ -24,6 +24,7 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import clod_adapter as clod
 from common import COMMAND, Process, Row, append, arguments, stored, table
@@ -150,6 +151,15 @@ class Dial:
         )
 
 
+class Cut(NamedTuple):
+    """A node of the tree that is cut at a coordinate; a leaf is its number."""
+
+    axis: int
+    at: float
+    below: "Cut | int"
+    above: "Cut | int"
+
+
 class Frames:
     """The nodes of a scene: a k-d tree of the checkpoint's centres, the same for every set."""
 
@@ -162,7 +172,7 @@ class Frames:
             np.stack([box.max(0) for box in boxes]),
         )
 
-    def _cut(self, rows: np.ndarray) -> object:
+    def _cut(self, rows: np.ndarray) -> Cut | int:
         points = self.means[rows]
         axis = int(np.argmax(np.ptp(points, axis=0)))
         at = float(np.median(points[:, axis]))
@@ -170,17 +180,16 @@ class Frames:
         if len(rows) <= LEAF or low.all():
             self.leaves.append(rows)
             return len(self.leaves) - 1
-        return axis, at, self._cut(rows[low]), self._cut(rows[~low])
+        return Cut(axis, at, self._cut(rows[low]), self._cut(rows[~low]))
 
     def nodes(self, means: np.ndarray) -> np.ndarray:
         """``[N]`` the leaf of each centre."""
         found, todo = np.empty(len(means), np.int64), [(self.tree, np.arange(len(means)))]
         while todo:
             node, rows = todo.pop()
-            if isinstance(node, tuple):
-                axis, at, below, above = node
-                low = means[rows, axis] <= at
-                todo += [(below, rows[low]), (above, rows[~low])]
+            if isinstance(node, Cut):
+                low = means[rows, node.axis] <= node.at
+                todo += [(node.below, rows[low]), (node.above, rows[~low])]
             else:
                 found[rows] = node
         return found
@@ -215,9 +224,9 @@ class Levels:
         level = chosen(low)
         shown = [torch.from_numpy(level[nodes] == k) for k, nodes in enumerate(self.nodes)]
         parts = [gaussians.select(rows) for gaussians, rows in zip(self.levels, shown, strict=True)]
-        joined = {
-            name: torch.cat([part.tensors()[name] for part in parts]) for name in parts[0].tensors()
-        }
+        joined = dict[str, torch.Tensor]()
+        for name in parts[0].tensors():
+            joined[name] = torch.cat([part.tensors()[name] for part in parts])
         return parts[0].replace(**joined), 1.0, int(self.counts[level, every].sum())
 
 

@@ -202,9 +202,9 @@ def _products(vectors: np.ndarray) -> np.ndarray:
 
 
 def _log_determinants(covariances: np.ndarray) -> np.ndarray:
-    """Of covariances ``[6, N]``."""
-    xx, yy, zz, xy, xz, yz = covariances
-    xx, yy, zz = xx + THINNEST, yy + THINNEST, zz + THINNEST
+    """``[N]`` of covariances ``[6, N]``."""
+    xx, yy, zz = covariances[:3] + THINNEST
+    xy, xz, yz = covariances[3:]
     determinant = xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)
     return np.log(np.maximum(determinant, np.finfo(np.float64).tiny))
 
