@@ -97,6 +97,20 @@ class Camera:
         """``[3]`` the camera centre in world units, ``-R^T t``."""
         return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
 
+    def depths(self, means: Tensor) -> Tensor:
+        """``[N]`` distances of the centres ``means [N, 3]`` along the optical axis, world units."""
+        row = self.viewmat[2].to(means)
+        return means @ row[:3] + row[3]
+
+
+def looking(eye: Tensor, forward: Tensor, down: Tensor) -> Tensor:
+    """``[4, 4]`` viewmat at ``eye`` along the unit vector ``forward``, with ``down`` below."""
+    right = torch.nn.functional.normalize(torch.linalg.cross(down, forward), dim=0)
+    viewmat = torch.eye(4, dtype=forward.dtype)
+    viewmat[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward])
+    viewmat[:3, 3] = -viewmat[:3, :3] @ eye
+    return viewmat
+
 
 def numbers_of(name: str, values: Any) -> Tensor:
     """``float_tensor`` of an argument; ClodError, with its name, where it is no array of

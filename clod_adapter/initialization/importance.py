@@ -113,9 +113,7 @@ def usable_views(base: Gaussians, views: Sequence[View]) -> tuple[View, ...]:
     """
     found = []
     for view in views:
-        row = view.camera.viewmat[2].to(base.means)
-        depths = base.means @ row[:3] + row[3]
-        if bool((depths >= view.camera.near).any()):
+        if bool((view.camera.depths(base.means) >= view.camera.near).any()):
             found.append(view)
     if not found:
         raise ClodError(

@@ -22,7 +22,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from clod_adapter.adapter import detach
-from clod_adapter.cameras import Camera, near_plane
+from clod_adapter.cameras import Camera, looking, near_plane
 from clod_adapter.config import require
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import SH_C0, Gaussians, spoilt_rows
@@ -214,13 +214,8 @@ def _looking(eye: Tensor, target: Tensor, zoom: float) -> Camera:
     down = torch.tensor(
         [0.0, 1.0, 0.0] if abs(float(forward[1])) < 0.99 else [0.0, 0.0, 1.0], dtype=torch.float32
     )
-    right = F.normalize(torch.linalg.cross(down, forward), dim=0)
-    viewmat = torch.eye(4, dtype=torch.float32)
-    viewmat[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward])
-    viewmat[:3, 3] = -viewmat[:3, :3] @ eye
-    return Camera(
-        viewmat, _intrinsics(zoom, *LOOK), *LOOK, near=near_plane(float((target - eye).norm()))
-    )
+    near = near_plane(float((target - eye).norm()))
+    return Camera(looking(eye, forward, down), _intrinsics(zoom, *LOOK), *LOOK, near=near)
 
 
 def _intrinsics(zoom: float, width: int, height: int) -> Tensor:
@@ -266,27 +261,25 @@ def _score(gaussians: Gaussians, growth: Tensor | None, camera: Camera, reach: f
     ``growth`` (both weighted by alpha), e the share of pixels that are not covered, b that of the
     opposite view.
     """
-    higher = torch.zeros_like(gaussians.sh0)  # the colour is then 0.5 + that of the higher degrees
-    bands, alpha = splat(gaussians.replace(sh0=higher), gaussians.opacities, camera, growth=growth)
-    covered = float(alpha.sum())
-    if covered < 0.1 * alpha.numel():
-        return -math.inf
-    row = camera.viewmat[2].to(gaussians.means)
-    depths = (gaussians.means @ row[:3] + row[3]).clamp(min=1e-6)
+    depths = camera.depths(gaussians.means).clamp(min=1e-6)
     pixels = gaussians.scales.amax(1) * WIDTH / camera.width * camera.K[0, 0] / depths
     # positive, as colours are, and three; the last is not read
     shades = torch.stack([pixels, depths / reach, depths], 1).clamp(1e-3, 1e4).log() + 7
     plain = gaussians.replace(sh0=(shades[:, None] - 0.5) / SH_C0, shN=gaussians.shN[:, :0])
-    shaded, _ = splat(plain, gaussians.opacities, camera, growth=growth)
+    shaded, alpha = splat(plain, gaussians.opacities, camera, growth=growth)
+    covered = float(alpha.sum())
+    if covered < 0.1 * alpha.numel():
+        return -math.inf
     size, distance, _ = (shaded.sum((0, 1)) / covered - 7).tolist()
     if distance < math.log(NEARER):
         return -math.inf
     _, alpha_behind = splat(plain, gaussians.opacities, _opposite(camera), growth=growth)
-    strength = (
-        float((bands - 0.5 * alpha[..., None]).abs().mean(2).sum()) / covered
-        if gaussians.sh_degree
-        else 1.0
-    )
+    strength = 1.0
+    if gaussians.sh_degree:
+        # the colour is then 0.5 + that of the higher degrees
+        higher = gaussians.replace(sh0=torch.zeros_like(gaussians.sh0))
+        bands, _ = splat(higher, gaussians.opacities, camera, growth=growth)
+        strength = float((bands - 0.5 * alpha[..., None]).abs().mean(2).sum()) / covered
     return math.log(strength + 1e-4) - 0.5 * size - 2 * _empty(alpha) - 1.5 * _empty(alpha_behind)
 
 

@@ -27,7 +27,7 @@ from torch import Tensor
 
 from clod_adapter._support.text import as_text, script_json
 from clod_adapter.calibration import Calibration
-from clod_adapter.cameras import Camera
+from clod_adapter.cameras import Camera, looking
 from clod_adapter.errors import ClodError
 from clod_adapter.gaussians import OPAQUE, Gaussians
 from clod_adapter.io.atomic import atomic_path
@@ -37,6 +37,7 @@ from clod_adapter.io.ply_layout import inria_dtype, write_comments
 from clod_adapter.io.settings import Metadata
 from clod_adapter.io.values import dial_columns
 from clod_adapter.origin import NOWHERE, Origin
+from clod_adapter.rasterizers.reference import rotations
 from clod_adapter.render import render
 
 BLOCK_ROWS = 1 << 14
@@ -242,25 +243,18 @@ def levelled(camera: Camera, axis: np.ndarray) -> Camera:
     up = ahead.new_tensor(axis)
     if abs(float(ahead @ up)) >= MAX_PITCH:
         return camera
-    right = torch.nn.functional.normalize(torch.linalg.cross(-up, ahead), dim=0)
-    rotation = torch.stack([right, torch.linalg.cross(ahead, right), ahead])
-    viewmat = camera.viewmat.clone()
-    viewmat[:3, :3] = rotation
-    viewmat[:3, 3] = -rotation @ camera.position
-    return replace(camera, viewmat=viewmat)
+    return replace(camera, viewmat=looking(camera.position, ahead, -up))
 
 
 def up_axis(gaussians: Gaussians) -> np.ndarray:
     """The direction that flat Gaussians face, a ground or a table, as in web/src/model.js."""
-    from scipy.spatial.transform import Rotation  # here: pages without a placed camera need none
-
     g = gaussians.to("cpu")
     means, scales = g.means.double().numpy(), np.sort(g.log_scales.numpy(), axis=1)
     offsets = np.linalg.norm(means - np.median(means, axis=0), axis=1)
     used = (scales[:, 0] + FLAT < scales[:, 1]) & (offsets <= np.quantile(offsets, 0.98))
     if not used.any():
         return np.array(UPS[0])
-    axes = Rotation.from_quat(g.quats.double().numpy()[used][:, [1, 2, 3, 0]]).as_matrix()
+    axes = rotations(g.quats[torch.from_numpy(used)].double()).numpy()
     thin = g.log_scales.numpy()[used].argmin(axis=1)
     normals, weights = axes[np.arange(len(axes)), :, thin], g.opacities.double().numpy()[used]
     for up in np.array(UPS):
