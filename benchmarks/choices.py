@@ -13,6 +13,7 @@ a constant of ``training/far.py``, a field of ``schedule.FAR``, or a field of ``
 
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -72,17 +73,18 @@ def opened(scene: str) -> tuple[clod.Gaussians, clod.Scene]:
 
 def measure(scene: str, base: clod.Gaussians, views: clod.Scene, name: str, value: Any) -> None:
     """Adapts with one change, and adds the row."""
-    settings: dict[str, Any] = {} if scene.endswith(".ply") else {"max_sv": MAX_SV}
+    make = partial(clod.AdaptConfig, max_sv=MAX_SV)
+    if scene.endswith(".ply"):
+        make = partial(clod.AdaptConfig.placed)
     change: AbstractContextManager[Any] = nullcontext()
     if hasattr(far, name):
         change = patch.object(far, name, value)
     elif hasattr(FAR, name):
         change = patch.object(dial, "FAR", replace(FAR, **{name: value}))
     elif name != "default":
-        settings[name] = value
+        make = partial(make, **{name: value})
     with change:
-        make = clod.AdaptConfig.placed if scene.endswith(".ply") else clod.AdaptConfig
-        plan = clod.make_plan(base, views, make(**settings))
+        plan = clod.make_plan(base, views, make())
         adapted = plan.adapt(views)
     result = adapted.gaussians
     append(

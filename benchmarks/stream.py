@@ -27,6 +27,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import clod_adapter as clod
+from clod_adapter.losses import decibels
 from common import COMMAND, Process, Row, append, arguments, stored, table
 from tuning import TIMEOUT, find_tool
 
@@ -133,7 +134,7 @@ def measured(shown: "Dial | Levels", views: Sequence[clod.View], budget: float, 
             image = clod.render(gaussians, view.camera, virtual_scale=s).image.clamp(0, 1)
         errors.append(float((image - view.image / 255).square().mean()))
         counts.append(count)
-    psnr = -10 * math.log10(float(np.mean(errors)))
+    psnr = decibels(float(np.mean(errors)))
     return {"level": f"{budget:.0%}", "share": float(np.mean(counts)) / whole, "psnr": psnr}
 
 

@@ -260,11 +260,7 @@ def check_inputs(scene: str | None, *paths: str) -> None:
 # Training settings, by field of AdaptConfig: metavar, type, and what help says of a default that
 # depends on another option or on the scene.
 SETTINGS: dict[str, tuple[str, Any, str | None]] = {
-    "max_sv": (
-        "S",
-        float,
-        f" (default: 5; without photographs {PLACED_MAX_SV:g}, of our form)",
-    ),
+    "max_sv": ("S", float, f" (default: 5; without photographs {PLACED_MAX_SV:g}, of our form)"),
     "iters": ("N", int, ""),
     "batch": ("N", int, " (default: 1 per process)"),
     "time_budget": ("SEC", float, None),
