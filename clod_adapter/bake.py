@@ -180,11 +180,6 @@ def order_by_extinction(gaussians: Gaussians, cameras: Sequence[Place]) -> Tenso
     return scales.argsort(descending=True, stable=True)
 
 
-def baked_rows(gaussians: Gaussians, distances: Tensor, virtual_scale: float) -> Tensor:
-    """``[N]`` bool, those that ``bake`` keeps at distances ``[N]`` over several cameras."""
-    return _of_several(gaussians, distances, virtual_scale)[0].keep
-
-
 def _of_several(
     gaussians: Gaussians, distances: Tensor, virtual_scale: float
 ) -> tuple[Attenuated, Attenuated]:

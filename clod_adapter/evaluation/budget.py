@@ -1,8 +1,7 @@
 """Budgets: the dial value for a number of Gaussians, a PSNR drop, or a frame rate.
 
-- A count needs no measurement. From one camera a Gaussian is kept iff s is below its extinction
-  scale ``sigma_d / d``, so the dial that keeps n lies between the n-th and the (n+1)-th largest;
-  for the mean over V cameras, of the pooled scales and n V. Exact but for scales that are equal.
+- A count needs no measurement: from one camera a Gaussian is kept between two dial values, and the
+  count is bisected. Exact but for dial values that are equal.
 - PSNR is read from the calibration table that is stored with the file (``calibration.py``).
 - Frame rates depend on the machine, the image size and the load: frames are timed, from cameras.
   The table's times are used only where they are passed in, or (``clod-adapt export``) where nothing
@@ -21,11 +20,10 @@ from statistics import fmean
 import torch
 from torch import Tensor
 
-from clod_adapter.bake import baked_rows
 from clod_adapter.calibration import Calibration, crossing
 from clod_adapter.cameras import Camera
 from clod_adapter.config import AttenuationConfig, number, require
-from clod_adapter.equation.attenuation import dial
+from clod_adapter.equation.attenuation import TAKEOVER, dial
 from clod_adapter.equation.distances import Place, typical_distance
 from clod_adapter.errors import ClodError
 from clod_adapter.evaluation.frame_times import time_frames
@@ -34,7 +32,7 @@ from clod_adapter.progress import Listener
 
 TIMED_DIALS = 6
 BEYOND = 1e6  # times max_sv, where the search for a count ends
-ROUNDING = 1e-15  # of extinction scales and products d s in float64
+PRECISION = 1e-12  # of the dial value that meets a count
 
 
 @dataclass(frozen=True)
@@ -184,15 +182,20 @@ def _for_count(
     largest, wanted = config.max_sv, math.floor(keep * len(views))
 
     @lru_cache(maxsize=1)  # all at once would be views times Gaussians
-    def distances(k: int) -> Tensor:
-        return typical_distance(gaussians.means, views[k], config)
+    def between(k: int) -> tuple[Tensor, Tensor]:
+        distances = typical_distance(gaussians.means, views[k], config)
+        return _kept_between(gaussians, distances, config, baked)
 
     def count(virtual_scale: float) -> int:
-        if baked:
-            return int(baked_rows(gaussians, distances(0), virtual_scale).sum())
-        return sum(
-            int(dial(gaussians, distances(k), virtual_scale).keep.sum()) for k in range(len(views))
-        )
+        kept = 0
+        for k, view in enumerate(views):
+            if config.form == "paper":  # whose cut depends on opacity
+                distances = typical_distance(gaussians.means, view, config)
+                kept += int(dial(gaussians, distances, virtual_scale).keep.sum())
+            else:
+                begin, end = between(k)
+                kept += int(((begin < virtual_scale) & (virtual_scale < end)).sum())
+        return kept
 
     most, fewest = count(1.0), count(largest)
     if wanted >= most:
@@ -213,24 +216,28 @@ def _for_count(
                 f"{keep:,.0f} Gaussians are out of reach: {fewest / len(views):,.0f} remain at any"
                 " dial value"
             )
-    if config.form == "ours" and gaussians.near is None:
-        assert gaussians.sigma_d is not None
-        pools = []  # of those that are culled within the range of the dial
-        for k in range(len(views)):
-            own = (
-                dial(gaussians, distances(k), 1.0).keep
-                & ~dial(gaussians, distances(k), largest).keep
-            )
-            pools.append(gaussians.sigma_d[own].double() / distances(k)[own])
-        pooled = torch.cat(pools)
-        # the first one to be culled
-        first = float(pooled.kthvalue(len(pooled) - (wanted - fewest)).values)
-        return DialValue(min(first * (1 + ROUNDING), largest), note)
     low, high = 1.0, largest
-    while high / low > 1 + 1e-9:
+    while high / low > 1 + PRECISION:
         middle = math.sqrt(low * high)
         low, high = (low, middle) if count(middle) <= wanted else (middle, high)
     return DialValue(high, note)
+
+
+def _kept_between(
+    gaussians: Gaussians, distances: Tensor, config: AttenuationConfig, baked: bool
+) -> tuple[Tensor, Tensor]:
+    """``[N]`` twice, float64: the dial values between which each is kept at its distance ``[N]``,
+    the end excluded; in the equation, or with ``baked`` in a plain file.
+    """
+    assert gaussians.sigma_d is not None
+    d = distances.double()
+    begin, end = torch.zeros_like(d), (gaussians.sigma_d.double() / d).masked_fill(d == 0, math.inf)
+    if (near := gaussians.near) is None:
+        return begin, end
+    taken_over = config.near_distance / config.scene_distance
+    first = taken_over * math.sqrt(1 - (0.5 if baked else 1) / TAKEOVER)
+    last = first if baked else taken_over
+    return torch.where(near, begin, first / d), torch.where(near, last / d, end)
 
 
 @torch.no_grad()
