@@ -50,12 +50,13 @@ def by_dial(rows: Sequence[Row]) -> list[tuple[str, Row]]:
 
 
 def table(marked: Sequence[tuple[str, Row]]) -> str:
-    """A table of labelled rows."""
+    """A table of labelled rows; beside a frame time half the range of the passes."""
     width = max(6, *(len(label) for label, _ in marked))
-    lines = [f"{'dial':>{width}}  PSNR dB    SSIM        kept            in view  frame ms"]
+    lines = [f"{'dial':>{width}}  PSNR dB    SSIM        kept            in view      frame ms"]
     for label, row in marked:
-        kept = f"{row.kept:10,.0f}  {row.kept_share:6.1%}  {row.in_view:9,.0f}  {row.frame_ms:8.1f}"
-        lines.append(f"{label:>{width}}  {row.psnr:7.2f}  {row.ssim:.4f}  {kept}")
+        kept = f"{row.kept:10,.0f}  {row.kept_share:6.1%}  {row.in_view:9,.0f}  {row.frame_ms:6.1f}"
+        spread = "" if row.frame_ms_range is None else f"±{row.frame_ms_range / 2:.1f}"
+        lines.append(f"{label:>{width}}  {row.psnr:7.2f}  {row.ssim:.4f}  {kept} {spread:5}")
     return "\n".join(lines)
 
 

@@ -44,9 +44,15 @@ def with_frame_times(
         jobs.append((model, sorted({row.virtual_scale for row in rows})))
     times = time_frames(jobs, [view.camera for view in views], progress)
     found = list[list[Row]]()
-    for (_, rows), (_, dials), taken in zip(measured, jobs, times.milliseconds, strict=True):
-        milliseconds = dict(zip(dials, taken, strict=True))
-        found.append([replace(row, frame_ms=milliseconds[row.virtual_scale]) for row in rows])
+    for (_, rows), (_, dials), *taken in zip(
+        measured, jobs, times.milliseconds, times.ranges, strict=True
+    ):
+        by_dial = dict(zip(dials, zip(*taken, strict=True), strict=True))
+        timed = list[Row]()
+        for row in rows:
+            middle, between = by_dial[row.virtual_scale]
+            timed.append(replace(row, frame_ms=middle, frame_ms_range=between))
+        found.append(timed)
     return found, times.notes
 
 

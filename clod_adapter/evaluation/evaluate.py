@@ -33,8 +33,9 @@ class Row:
         psnr: dB; ssim: in [-1, 1] (``losses.psnr_ssim``).
         kept: Gaussians the dial leaves in, of all; kept_share: that divided by all.
         in_view: kept Gaussians whose centre is in the image.
-        frame_ms: median time of a frame, milliseconds; ``frame_times.time_frames`` has times to
-            compare.
+        frame_ms: median time of a frame, milliseconds.
+        frame_ms_range: between the quartiles of several passes, where ``frame_times.time_frames``
+            measured times that can be compared.
     """
 
     virtual_scale: float
@@ -44,9 +45,11 @@ class Row:
     kept_share: float
     in_view: float
     frame_ms: float
+    frame_ms_range: float | None = None
 
     def as_dict(self) -> dict[str, float]:
-        return asdict(self)
+        """The fields that were measured."""
+        return {name: value for name, value in asdict(self).items() if value is not None}
 
 
 @torch.no_grad()

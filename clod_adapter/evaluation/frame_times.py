@@ -2,16 +2,15 @@
 times.
 
 One pass renders every dial value of every model from every view: a change of the clock rate or the
-load meets all. A time is the median over the passes, after a warm-up with the slowest dial value.
-Where it is above that of the dial value before it, which draws more, and the passes do not agree on
-that, both get their mean.
+load meets all. A time is the median over the passes, after a warm-up with the slowest dial value,
+and has the range of the passes beside it.
 """
 
 import statistics
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import chain, product
+from itertools import product
 
 import torch
 
@@ -28,32 +27,35 @@ VIEWS, PASSES, FEWEST = 3, 5, 3
 SECONDS = 10.0
 # the warm-up ends with two frames whose times differ by a tenth
 WARM_FRAMES, WARM_SECONDS, STEADY = 8, 2.0, 0.1
-RISE = 0.05  # an increase of the time in every pass is real if it is at least this large
-NOISY = 0.2  # a larger spread of the passes is reported
+NOISY = 0.2  # a larger range of the passes, as a share of the time, is reported
 
 Model = tuple[Gaussians, Sequence[float]]  # and the dial values, ascending, to time it at
 
 
 @dataclass(frozen=True)
 class FrameTimes:
-    """Milliseconds per frame of each dial value of each model: means over the views, medians over
-    the passes.
+    """Milliseconds per frame of each dial value of each model.
 
-    ``spread`` is the interquartile range of the passes over their median; the median over the dial
-    values.
+    Attributes:
+        milliseconds: means over the views, medians over the passes.
+        ranges: of the passes, between their quartiles.
     """
 
     milliseconds: tuple[tuple[float, ...], ...]
-    spread: float
+    ranges: tuple[tuple[float, ...], ...]
 
     @property
     def notes(self) -> list[str]:
         """A note if the machine was too busy for these times."""
-        if self.spread <= NOISY:
+        shares = list[float]()
+        for times, ranges in zip(self.milliseconds, self.ranges, strict=True):
+            shares += [between / time for time, between in zip(times, ranges, strict=True)]
+        middle = statistics.median(shares)
+        if middle <= NOISY:
             return []
         return [
-            f"frame times are rough: they varied by {self.spread:.0%}, as this machine was busy"
-            " with other work"
+            f"frame times are rough: they varied by {middle:.0%}, as this machine was busy with"
+            " other work"
         ]
 
 
@@ -79,34 +81,13 @@ def time_frames(
         seconds = [timed_frame(model, view, s)[1] for view, (model, s) in product(views, jobs)]
         passes.append([1e3 * statistics.fmean(seconds[k :: len(jobs)]) for k in range(len(jobs))])
         tell(progress, Phase.FRAME_TIMES, len(passes), PASSES)
-    milliseconds, first = [], 0
+    columns = zip(*passes, strict=True)
+    milliseconds, ranges = [], []
     for _, dials in models:
-        end = first + len(dials)
-        milliseconds.append(tuple(settled([times[first:end] for times in passes])))
-        first = end
-    spreads = []
-    for column in zip(*passes, strict=True):
-        low, middle, high = statistics.quantiles(column, n=4, method="inclusive")
-        spreads.append((high - low) / middle)
-    return FrameTimes(tuple(milliseconds), statistics.median(spreads))
-
-
-def settled(passes: Sequence[Sequence[float]]) -> list[float]:
-    """``[K]`` medians of ``[P, K]`` times; without increases from one to the next on which the
-    passes do not agree.
-    """
-    levels = list[list[float]]()  # of equal times
-    for k, column in enumerate(zip(*passes, strict=True)):
-        levels.append([statistics.median(column)])
-        # fewer Gaussians, which have grown
-        if not k or all(each[k] > (1 + RISE) * each[k - 1] for each in passes):
-            start = len(levels) - 1
-        while len(levels) > start + 1 and statistics.fmean(levels[-1]) > statistics.fmean(
-            levels[-2]
-        ):
-            levels[-2:] = [levels[-2] + levels[-1]]
-    means = [[statistics.fmean(level)] * len(level) for level in levels]
-    return list(chain.from_iterable(means))
+        quartiles = [statistics.quantiles(next(columns), n=4, method="inclusive") for _ in dials]
+        milliseconds.append(tuple(middle for _, middle, _ in quartiles))
+        ranges.append(tuple(high - low for low, _, high in quartiles))
+    return FrameTimes(tuple(milliseconds), tuple(ranges))
 
 
 def _warm_up(gaussians: Gaussians, virtual_scale: float, camera: Camera) -> float:

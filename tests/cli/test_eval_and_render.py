@@ -25,7 +25,16 @@ from clod_adapter.io.checkpoint import load, save
 from runs import names, pressing
 
 EVAL = "eval DIAL --images SCENE --json"
-ROW = {"virtual_scale", "psnr", "ssim", "kept", "kept_share", "in_view", "frame_ms"}
+ROW = {
+    "virtual_scale",
+    "psnr",
+    "ssim",
+    "kept",
+    "kept_share",
+    "in_view",
+    "frame_ms",
+    "frame_ms_range",
+}
 
 
 def test_rows_and_default_dial_values(clod, capture, dialled):
@@ -121,10 +130,11 @@ def test_frames_are_timed_together(clod, monkeypatch):
 
     def times(models, cameras, progress):
         counts.append([len(gaussians) for gaussians, _ in models])
-        milliseconds = []
+        milliseconds, ranges = [], []
         for k, (_, dials) in enumerate(models, 1):
             milliseconds.append(tuple(1000 * k / s for s in dials))
-        return FrameTimes(tuple(milliseconds), 0.5)
+            ranges.append(tuple(500 * k / s for s in dials))
+        return FrameTimes(tuple(milliseconds), tuple(ranges))
 
     monkeypatch.setattr(calibrate, "time_frames", times)
     monkeypatch.setattr(frame_times, "NOISY", 0.2)
@@ -133,10 +143,13 @@ def test_frames_are_timed_together(clod, monkeypatch):
     stored = load("dial.ply").calibration.rows
     assert [row.frame_ms * row.virtual_scale for row in stored] == pytest.approx([2000] * 5)
     assert done.report["base_rows"][0]["frame_ms"] == 1000
+    assert done.report["base_rows"][0]["frame_ms_range"] == 500
     assert done.report["detached_row"]["frame_ms"] == 3000
     assert done.note("frame times are rough: they varied by 50%")
     assert done.err.count("frame times are rough") == 1
-    rows = clod("eval dial.ply --images SCENE --sv 3 1 --json").report["rows"]
+    done = clod("eval dial.ply --images SCENE --sv 3 1 --json")
+    assert " 333.3 ±83.3" in done.err + done.out
+    rows = done.report["rows"]
     assert [(row["virtual_scale"], round(row["frame_ms"])) for row in rows] == [(3, 333), (1, 1000)]
 
 

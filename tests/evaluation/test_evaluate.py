@@ -105,7 +105,7 @@ def of_one(**options):
     return time_frames([(model, DIALS)], ring(9, 48, 36), **options)
 
 
-def test_drift_and_interruptions_do_not_zigzag(clock):
+def test_drift_and_interruptions_show_in_the_range(clock):
     """Frames take 20/s ms; 3 times that at first, a half more at the end, and one in twelve is
     interrupted.
     """
@@ -117,17 +117,19 @@ def test_drift_and_interruptions_do_not_zigzag(clock):
         return interruption + (0.05 if chance.random() < 1 / 12 else 0)
 
     clock(cost)
-    (times,) = of_one().milliseconds
-    assert sorted(times, reverse=True) == [*times]
-    scaled = [taken * s for taken, s in zip(times, DIALS, strict=True)]
-    assert max(scaled) < 1.7 * min(scaled) and 20 < times[0] < 40
+    found = of_one()
+    times, ranges = found.milliseconds[0], found.ranges[0]
+    for time, between, s in zip(times, ranges, DIALS, strict=True):
+        assert 20 / s < time < 20 / s + 2 * between + 20
+        assert between > 0.02 * time
 
 
 def test_frames_are_interleaved_and_few_where_they_are_slow(clock):
     drawn = clock(lambda frame, s: 0.01)
     steps = []
-    (times,) = of_one(progress=counted(steps)).milliseconds
-    assert times == (pytest.approx(10),) * 9
+    found = of_one(progress=counted(steps))
+    assert found.milliseconds == ((pytest.approx(10),) * 9,)
+    assert found.ranges == ((pytest.approx(0),) * 9,) and found.notes == []
     assert steps == [(k, PASSES) for k in range(1, PASSES + 1)]
     count = PASSES * 9 * 3  # nine cameras: every third is one of at most four
     assert len({name for name, _ in drawn}) == 3 <= VIEWS
