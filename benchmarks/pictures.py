@@ -14,8 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import clod_adapter as clod
-from clod_adapter.demo import VIEW, dial_strip, measured
-from clod_adapter.evaluation.budget import matching_dial
+from clod_adapter.demo import TITLE, VIEW, compared, dial_strip
 from clod_adapter.io.atomic import atomic_path
 from common import ROOT, arguments
 
@@ -28,8 +27,6 @@ from shown import Shown, serve  # noqa: E402
 IMAGES = ROOT / "docs" / "images"
 SIZE = {"width": 1280, "height": 800}
 DIAL = 5.0
-SHARE = 0.2  # of the Gaussians, beside all
-TITLE = "The base, and the dial at a fifth of its Gaussians"
 
 
 def main() -> None:
@@ -44,13 +41,12 @@ def main() -> None:
 
 
 def dial(folder: Path) -> bytes:
-    """A held-out view of the base beside a fifth of its Gaussians, with a part of each enlarged."""
+    """The strip of the demo."""
     base, model = (clod.load(folder / name).gaussians for name in ("base.ply", "gallery.ply"))
-    view = clod.load_scene(folder / "capture").test[VIEW]
-    s = matching_dial(model, [view.camera], SHARE * len(base))
+    panels = compared(base, model, clod.load_scene(folder / "capture"))
     with tempfile.TemporaryDirectory() as made:
         file = Path(made) / "dial.png"
-        dial_strip(file, measured(base, model, [s], view), TITLE)
+        dial_strip(file, panels, TITLE)
         return file.read_bytes()
 
 

@@ -11,10 +11,14 @@ from typing import Any
 import numpy as np
 import torch
 
-from clod_adapter.cameras import View
+from clod_adapter.cameras import Scene, spread
+from clod_adapter.config import AdaptConfig
+from clod_adapter.evaluation.budget import matching_dial
 from clod_adapter.evaluation.evaluate import evaluate
 from clod_adapter.evaluation.frame_times import time_frames
 from clod_adapter.gaussians import Gaussians
+from clod_adapter.initialization.importance import MOST_VIEWS, importance
+from clod_adapter.initialization.merging import merge
 from clod_adapter.io.atomic import atomic_path
 from clod_adapter.io.checkpoint import load, save
 from clod_adapter.io.scene.load import load_scene
@@ -22,7 +26,8 @@ from clod_adapter.render import render
 from clod_adapter.report.charts import BLUE, INK, ORANGE, label_log, new_figure, save_figure
 from clod_adapter.report.page import Picture
 
-DIALS = (1.0, 2.0, 3.0, 5.0)
+SHARE = 0.2  # of the Gaussians, beside all
+TITLE = "A held-out view: the checkpoint, and two ways to draw a fifth of its Gaussians"
 VIEW = 0  # the held-out view on the strip: across the whole room
 CROP = (150, 150, 150, 75)  # left, top, width and height of the part shown enlarged, pixels
 
@@ -45,33 +50,51 @@ def unpack(capture: Path, base: Path) -> None:
 def draw(
     capture: Path, base: Path, model: Path, report: Mapping[str, Any], pictures: Mapping[str, Path]
 ) -> None:
-    """Draws a held-out view of the base and at several dial values, and the quality curve of all
+    """Draws a held-out view of the base, the dial and the merged base, and their quality over all
     held-out views.
     """
-    view, gaussians = load_scene(capture).test[VIEW], load(model).gaussians
-    panels = [Picture(view.image.numpy(), "photograph", "held out from training")]
-    panels += measured(load(base).gaussians, gaussians, DIALS, view)
-    dial_strip(pictures["dial"], panels, "One file, one dial: a held-out view")
+    scene, original = load_scene(capture), load(base).gaussians
+    strip = compared(original, load(model).gaussians, scene)
+    dial_strip(pictures["dial"], strip, TITLE)
+    merged = []
+    for rival in merged_to([round(row["kept"]) for row in report["rows"]], original, scene):
+        merged += [row.as_dict() for row in evaluate(rival, scene.test, 1.0)]
     with new_figure((6.4, 5.6), layout="constrained") as figure:
-        quality_curve(figure, report["rows"], report["base_rows"][0])
+        quality_curve(figure, report["rows"], merged, report["base_rows"][0])
         save_figure(figure, pictures["curve"])
 
 
-@torch.no_grad()
-def measured(
-    base: Gaussians, model: Gaussians, dials: Sequence[float], view: View
-) -> list[Picture]:
-    """Panels of the base and of the ascending dial values."""
-    times = time_frames([(base, [1.0]), (model, dials)], [view.camera]).milliseconds
-    shown = [("base", base, 1.0), *((f"s = {s:.3g}", model, s) for s in dials)]
+def merged_to(counts: Sequence[int], base: Gaussians, scene: Scene) -> list[Gaussians]:
+    """The base merged to each of ``counts`` by importance for the photographs, without training."""
+    weights = importance(base, spread(scene.train, MOST_VIEWS), AdaptConfig())
+    return [merge(base, weights, count) for count in counts]
+
+
+def compared(base: Gaussians, model: Gaussians, scene: Scene) -> list[Picture]:
+    """Panels of one held-out view: the base, the dial at SHARE of the Gaussians, and the base
+    merged to as many. Frame times are left out where the machine is busy.
+    """
+    view = scene.test[VIEW]
+    s = matching_dial(model, [view.camera], SHARE * len(base))
+    (row,) = evaluate(model, [view], s)
+    (merged,) = merged_to([round(row.kept)], base, scene)
+    shown = [
+        ("the checkpoint", base, 1.0),
+        (f"the dial at s = {s:.2g}", model, s),
+        ("the checkpoint, merged to as many", merged, 1.0),
+    ]
+    times = time_frames([(gaussians, [s]) for _, gaussians, s in shown], [view.camera])
     panels = []
-    for (title, gaussians, s), taken in zip(shown, (*times[0], *times[1]), strict=True):
-        (row,) = evaluate(gaussians, [view], [s])
-        detail = (
-            f"{row.kept:,.0f} Gaussians ({row.kept_share:.0%})\n{row.psnr:.1f} dB,  {taken:.1f} ms"
-            " a frame"
-        )
-        panels.append(Picture(render(gaussians, view.camera, s).image.numpy(), title, detail))
+    for (title, gaussians, s), (taken,), (between,) in zip(
+        shown, times.milliseconds, times.ranges, strict=True
+    ):
+        (row,) = evaluate(gaussians, [view], s)
+        detail = f"{row.kept:,.0f} Gaussians, {row.psnr:.1f} dB"
+        if not times.notes:
+            detail += f"\n{taken:.1f} ± {between / 2:.1f} ms a frame"
+        with torch.no_grad():
+            image = render(gaussians, view.camera, s).image
+        panels.append(Picture(image.numpy(), title, detail))
     return panels
 
 
@@ -106,32 +129,32 @@ def dial_strip(
 
 
 def quality_curve(
-    figure: Any, rows: Sequence[Mapping[str, float]], base_row: Mapping[str, float]
+    figure: Any,
+    rows: Sequence[Mapping[str, float]],
+    merged: Sequence[Mapping[str, float]],
+    base_row: Mapping[str, float],
 ) -> None:
-    """Draws PSNR, and below it SSIM, against the number of Gaussians kept, one labelled point per
-    dial value.
+    """Draws PSNR, and below it SSIM, against the number of Gaussians kept: the dial, one labelled
+    point per dial value, and the merged base.
     """
     title = "Quality against Gaussians, mean over the held-out views"
     figure.suptitle(title, fontsize=11, weight="bold", x=0.02, ha="left")
     both = figure.subplots(2, 1, sharex=True, height_ratios=[1.5, 1])
-    for axes, key, label, colour in zip(
-        both, ("psnr", "ssim"), ("PSNR (dB)", "SSIM"), (BLUE, ORANGE), strict=True
-    ):
+    for axes, key, label in zip(both, ("psnr", "ssim"), ("PSNR (dB)", "SSIM"), strict=True):
         axes.set_xscale("log")
         axes.margins(x=0.1, y=0.16)
-        points = [("base", (base_row["kept"], base_row[key]))]
-        points += [(f"{row['virtual_scale']:g}", (row["kept"], row[key])) for row in rows]
-        axes.plot(
-            *zip(*(point for _, point in points[1:]), strict=True),
-            "-o",
-            color=colour,
-            linewidth=1.8,
-        )
-        axes.plot(*points[0][1], "D", color="white", markeredgecolor=INK, markersize=7, zorder=1)
-        for text, point in points:
+        for name, some, colour in (("the dial", rows, BLUE), ("merged", merged, ORANGE)):
+            kept, values = [row["kept"] for row in some], [row[key] for row in some]
+            axes.plot(kept, values, "-o", color=colour, linewidth=1.8, label=name)
+        points = [("base", base_row), *((f"{row['virtual_scale']:g}", row) for row in rows)]
+        for text, row in points:
+            place = row["kept"], row[key]
             axes.annotate(
-                text, point, (-4, 5), textcoords="offset points", ha="right", fontsize=8.5
+                text, place, (-4, 5), textcoords="offset points", ha="right", fontsize=8.5
             )
+        place = base_row["kept"], base_row[key]
+        axes.plot(*place, "D", color="white", markeredgecolor=INK, markersize=7, zorder=1)
         axes.set_ylabel(label)
+    both[0].legend(loc="lower right", frameon=False)
     axes.set_xlabel("Gaussians kept (log scale); the numbers are dial values")
     label_log(axes.xaxis)
