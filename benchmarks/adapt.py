@@ -1,7 +1,6 @@
 """Quality, count and seconds of adapted checkpoints, by dial value.
 
     python benchmarks/adapt.py plush_half --set max_sv=20.0 --label "max_sv 20" --seeds 0 1 2
-    python benchmarks/adapt.py --table    # the rows as a Markdown table
 
 A scene is a folder of the shared data, followed by the name of the checkpoint where it is not
 ``pretrained``. Each run adds one row to ``results/adapt.jsonl``: settings, commit, machine, the
@@ -11,19 +10,30 @@ base and the dial.
 import ast
 from collections.abc import Sequence
 from dataclasses import asdict
-from statistics import fmean
+from itertools import product
 from typing import Any
 
 import clod_adapter as clod
-from common import Row, append, arguments, checkpoint, photographs, quality, stored, table
+from common import (
+    Row,
+    Table,
+    append,
+    arguments,
+    checkpoint,
+    last,
+    photographs,
+    psnr_kept,
+    quality,
+)
 
 FILE = "adapt.jsonl"
 DIALS = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0, 10.0, 14.0)
+LENGTHS = (1, 2, 3, 5, 7, 10, 20)  # of the table
 SHARES = (0.62, 0.35, 0.12, 0.05, 0.02)  # of the base's Gaussians, where the file is also measured
 
 
 def main() -> None:
-    parser = arguments(__doc__, table=print_table)
+    parser = arguments(__doc__)
     parser.add_argument("scenes", nargs="*")
     parser.add_argument(
         "--set", action="append", default=[], metavar="NAME=VALUE", help="a field of AdaptConfig"
@@ -90,31 +100,21 @@ def at_shares(model: clod.Gaussians, views: Sequence[clod.View]) -> list[Row]:
     return rows
 
 
-def psnr_at(row: Row, share: float) -> float | None:
-    """PSNR of ``at_shares`` in a stored row; None where the dial does not go as far."""
-    return next((point["psnr"] for point in row["at_shares"] if point["share"] == share), None)
-
-
-def print_table() -> None:
-    """PSNR at s = 1 and at the matched shares, means over the seeds, a line a setting."""
-    groups: dict[tuple[str, str, int], dict[int, Row]] = {}
-    for row in stored(FILE):
-        by_seed = groups.setdefault((row["scene"], row["label"], row["steps"]), {})
-        by_seed[row["config"]["seed"]] = row
+def page_table() -> Table:
+    """Dials of two lengths on two captures."""
+    found = last(FILE, "scene", "label")
+    shown = {}
+    for scene, length in product(("plush_half", "bonsai146"), (7, 20)):
+        if (scene, f"max_sv {length}") in found:
+            shown[f"{scene}, {length}"] = found[scene, f"max_sv {length}"]
     lines = []
-    for key, by_seed in groups.items():
-        runs = list(by_seed.values())
-        seconds = fmean(run["start_seconds"] + run["train_seconds"] for run in runs)
-        psnr = fmean(run["rows"][0]["psnr"] for run in runs)
-        kept = fmean(run["rows"][0]["kept_share"] for run in runs)
-        line = [*key, len(runs), f"{seconds:.0f}", f"{runs[0]['base']['psnr']:.2f}"]
-        line.append(f"{psnr:.2f} @ {kept:.0%}")
-        for share in SHARES:
-            matched = [psnr_at(run, share) for run in runs]
-            line.append("" if None in matched else f"{fmean(matched):.2f}")
-        lines.append(line)
-    heads = ["scene", "settings", "steps", "seeds", "seconds", "base", "s = 1"]
-    print(table([*heads, *(f"{share:.0%}" for share in SHARES)], lines))
+    for s in LENGTHS:
+        cells = [f"s = {s}"]
+        for row in shown.values():
+            at = {point["virtual_scale"]: psnr_kept(point) for point in row["rows"]}
+            cells.append(at.get(s, ""))
+        lines.append(cells)
+    return Table(["dial", *shown], lines, shown.values())
 
 
 if __name__ == "__main__":

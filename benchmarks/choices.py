@@ -4,7 +4,6 @@ change at a time.
     python benchmarks/choices.py plush_half bonsai146 --names SHARE NEARER full
     python benchmarks/choices.py demo --names SHARE full    # the folder of clod-adapt demo
     python benchmarks/choices.py SCENE.ply --names PLACED_SHARE PLACED_NEARER    # no photographs
-    python benchmarks/choices.py --table    # the rows as a Markdown table
 
 A scene is a folder of the shared data, one of the demo, or a file, whose placed cameras and renders
 are used. Each run adds one row to ``results/choices.jsonl``; "default" changes nothing. A choice is
@@ -19,11 +18,21 @@ from typing import Any
 from unittest.mock import patch
 
 import clod_adapter as clod
-from adapt import SHARES, at_shares
+from adapt import at_shares
 from clod_adapter.training import dial, far
 from clod_adapter.training.pseudo_views import with_pseudo_views
 from clod_adapter.training.schedule import FAR
-from common import Row, append, arguments, checkpoint, photographs, stored, table
+from common import (
+    Table,
+    append,
+    arguments,
+    by_scene,
+    checkpoint,
+    last,
+    photographs,
+    psnr_at,
+    psnr_kept,
+)
 from stream import rendered
 
 FILE, MAX_SV = "choices.jsonl", 7.0  # of captures, as adapt.jsonl has them
@@ -45,10 +54,25 @@ ALTERNATIVES: dict[str, tuple[Any, ...]] = {
     "lr_means": (0.03, 0.12),
     "exponent": (1.5, 2.0),
 }
+SHOWN = {  # in the table
+    ("default", None): "default",
+    ("SHARE", 0.6): "0.6 times as many far ones",
+    ("SHARE", 0.4): "0.4 times",
+    ("NEARER", 0.3): "from the 30th percentile of the distances on",
+    ("NEARER", 0.5): "from the median on",
+    ("full", 0.0): "no steps at s = 1",
+    ("full", 0.5): "half of the first steps at s = 1",
+    ("coarse", 0.0): "no step with photographs of half the size",
+    ("coarse", 0.9): "nine tenths of the steps",
+    ("growth", "off"): "no growth",
+    ("average", 0.0): "no mean of the last steps",
+    ("lr_means", 0.03): "half the rate of means",
+    ("lr_means", 0.12): "twice",
+}
 
 
 def main() -> None:
-    parser = arguments(__doc__, table=print_table)
+    parser = arguments(__doc__)
     parser.add_argument("scenes", nargs="*")
     parser.add_argument("--names", nargs="+", choices=ALTERNATIVES, default=list(ALTERNATIVES))
     args = parser.parse_args()
@@ -102,18 +126,23 @@ def measure(scene: str, base: clod.Gaussians, views: clod.Scene, name: str, valu
     )
 
 
-def print_table() -> None:
-    """The last row of each scene, choice and value."""
-    last = {(row["scene"], row["choice"], row["value"]): row for row in stored(FILE)}
-    heads = ["scene", "choice", "s = 1", *(f"{share:.0%}" for share in SHARES)]
-    print(table(heads, map(cells, last.values())))
-
-
-def cells(row: Row) -> list[str]:
-    choice = row["choice"] if row["value"] is None else f"{row['choice']} = {row['value']}"
-    found = {each["share"]: f"{each['psnr']:.2f}" for each in row["at_shares"]}
-    full = f"{row['full']['psnr']:.2f} @ {row['full']['kept_share']:.0%}"
-    return [row["scene"], choice, full, *(found.get(share, "") for share in SHARES)]
+def page_table() -> Table:
+    """The choices of SHOWN on three captures."""
+    scenes, shares = ("plush_half", "demo", "ci_banana"), (0.35, 0.12)
+    found = last(FILE, "scene", "choice", "value")
+    rows, lines = [], []
+    for choice, label in SHOWN.items():
+        line = [label]
+        for scene in scenes:
+            row = found.get((scene, *choice))
+            if row is None:
+                line += [""] * (1 + len(shares))
+            else:
+                rows.append(row)
+                line.append(psnr_kept(row["full"]))
+                line += [psnr_at(row["at_shares"], share) for share in shares]
+        lines.append(line)
+    return Table(["", *by_scene(scenes, shares)], lines, rows)
 
 
 if __name__ == "__main__":

@@ -9,7 +9,8 @@ import sys
 import tempfile
 import time
 import xml.etree.ElementTree as xml
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -25,26 +26,11 @@ COMMAND = (sys.executable, "-m", "clod_adapter.cli.main")
 Row = dict[str, Any]
 
 
-class _Call(argparse.Action):
-    """Calls ``const`` and exits, as ``--help`` does."""
-
-    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
-        self.const()
-        parser.exit()
-
-
-def arguments(
-    doc: str | None, *, table: Callable[[], None] | None = None, record: str = ""
-) -> argparse.ArgumentParser:
-    """A parser with the module's docstring; with ``--table``, and with ``--record`` for a file of
-    results.
-    """
+def arguments(doc: str | None, *, record: str = "") -> argparse.ArgumentParser:
+    """A parser with the module's docstring, and with ``--record`` for a file of results."""
     parser = argparse.ArgumentParser(
         description=doc, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    if table:
-        help_ = "print the stored rows as a Markdown table, run nothing"
-        parser.add_argument("--table", action=_Call, nargs=0, const=table, help=help_)
     if record:
         parser.add_argument(
             "--record", action="store_true", help=f"add the rows to results/{record}"
@@ -76,8 +62,8 @@ def quality(gaussians: clod.Gaussians, views: Sequence[clod.View], dials: Any) -
 
 
 def commit() -> str:
-    """The commit of the package that is measured, with a + where it or the benchmarks differ; empty
-    without git.
+    """The last commit of the package that is measured, with a + where it or the benchmarks differ;
+    empty without git. Commits of rows and pages do not change it.
     """
     checkout = Path(clod.__file__).parents[1]
     if not shutil.which("git") or not (checkout / ".git").exists():
@@ -88,8 +74,9 @@ def commit() -> str:
             ["git", *words], cwd=checkout, capture_output=True, text=True, check=True
         ).stdout.strip()
 
-    changed = git("status", "--porcelain", "--", "clod_adapter", "cli", "benchmarks/*.py")
-    return git("rev-parse", "--short", "HEAD") + ("+" if changed else "")
+    measured = ("--", "clod_adapter", "cli")
+    changed = git("status", "--porcelain", *measured, "benchmarks/*.py")
+    return git("log", "-1", "--format=%h", *measured) + ("+" if changed else "")
 
 
 def about() -> Row:
@@ -113,14 +100,68 @@ def stored(file: str) -> list[Row]:
     return [json.loads(line) for line in lines]
 
 
-def table(
-    heads: Sequence[str], rows: Iterable[Sequence[object]], numbers_from: int | None = None
-) -> str:
-    """A Markdown table; columns from ``numbers_from`` on are aligned to the right."""
-    left = len(heads) if numbers_from is None else numbers_from
-    marks = ["---"] * left + ["---:"] * (len(heads) - left)
-    lines = [f"| {' | '.join(map(str, cells))} |" for cells in (heads, *rows)]
-    return "\n".join([lines[0], f"|{'|'.join(marks)}|", *lines[1:]])
+def last(file: str, *names: str, **where: object) -> dict[tuple[Any, ...], Row]:
+    """The last row of each combination of these values, among the rows that have those of
+    ``where``.
+    """
+    found = {}
+    for row in stored(file):
+        if all(row.get(name) == value for name, value in where.items()):
+            found[tuple(row.get(name) for name in names)] = row
+    return found
+
+
+@dataclass
+class Table:
+    """A table of a page, and the rows that it is made of; columns from ``numbers_from`` on are
+    aligned to the right.
+    """
+
+    heads: Sequence[str]
+    lines: Iterable[Sequence[object]]
+    rows: Iterable[Row]
+    numbers_from: int | None = None
+
+    def markdown(self) -> str:
+        left = len(self.heads) if self.numbers_from is None else self.numbers_from
+        marks = ["---"] * left + ["---:"] * (len(self.heads) - left)
+        lines = [f"| {' | '.join(map(str, cells))} |" for cells in (self.heads, *self.lines)]
+        lines.insert(1, f"|{'|'.join(marks)}|")
+        return "\n".join(lines).replace("  ", " ")
+
+
+def psnr_kept(row: Row) -> str:
+    return f"{row['psnr']:.2f} @ {100 * row['kept_share']:.0f} %"
+
+
+def psnr_at(points: Iterable[Row], share: float) -> str:
+    """PSNR of the point with this share; empty where there is none."""
+    return "".join(f"{point['psnr']:.2f}" for point in points if point["share"] == share)
+
+
+def percent(shares: Iterable[float]) -> list[str]:
+    return [f"{100 * share:.0f} %" for share in shares]
+
+
+def by_scene(scenes: Iterable[str], shares: Sequence[float]) -> list[str]:
+    """Heads: s = 1 and the shares of each scene."""
+    heads = []
+    for scene in scenes:
+        heads += [f"{scene}: s = 1", *percent(shares)]
+    return heads
+
+
+def with_best(lines: dict[str, list[float | None]], form: str) -> list[list[str]]:
+    """The lines with their labels, in which the largest number of each column is bold."""
+    best = [max(filter(None, column)) for column in zip(*lines.values(), strict=True)]
+    written = []
+    for label, values in lines.items():
+        cells = [label]
+        for value, most in zip(values, best, strict=True):
+            text = "" if value is None else format(value, form)
+            cells.append(f"**{text}**" if value == most else text)
+        written.append(cells)
+    return written
 
 
 def outcomes(report: Path) -> Row:

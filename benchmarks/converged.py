@@ -5,7 +5,6 @@ photographs.
     python benchmarks/converged.py FOLDER [FOLDER ...] --record
     python benchmarks/converged.py plush_half bonsai146 --every 3 --record
     python benchmarks/converged.py plush_half bonsai146 --every 3 --base pretrained.ply --record
-    python benchmarks/converged.py --table    # the rows as a Markdown table
 
 Runs the default command on ``base.ply``. With ``--every`` the folders are captures of the shared
 data, of which that part of the photographs, by name, is copied to a folder in ``benchmarks/cache``;
@@ -14,22 +13,23 @@ points (``from_points.py``), or, with ``--base``, is that checkpoint, trained on
 and tuned further on those that are left.
 """
 
+import json
 import tempfile
-from collections.abc import Sequence
 from pathlib import Path
 
 import clod_adapter as clod
 from common import (
     CACHE,
     Row,
+    Table,
     append,
     arguments,
     capture,
     clod_adapt,
+    last,
+    psnr_kept,
     quality,
     report_of,
-    stored,
-    table,
 )
 from from_points import thin, write_base
 from tuning import Tuning, tune
@@ -37,10 +37,16 @@ from tuning import Tuning, tune
 FILE = "converged.jsonl"
 DIALS = (1.0, 2.0, 5.0)
 ITERS, FINAL = 1500, 0.01  # of tuning a checkpoint further
+SHOWN = {  # in the table
+    "plush_half-3-points": "plush_half",
+    "bonsai146-3-points": "bonsai146",
+    "room": "a room",
+    "pot": "a potted plant",
+}
 
 
 def main() -> None:
-    parser = arguments(__doc__, table=lambda: print_table(stored(FILE)), record=FILE)
+    parser = arguments(__doc__, record=FILE)
     parser.add_argument("folders", nargs="+", metavar="FOLDER")
     parser.add_argument(
         "--every", type=int, metavar="K", help="captures, of which one photograph in K is used"
@@ -94,21 +100,20 @@ def run(folder: Path, *, record: bool) -> None:
     }
     if record:
         append(FILE, row)
-    print_table([row])
+    else:
+        print(json.dumps(row))
 
 
-def psnr_ssim(point: Row) -> str:
-    return f"{point['psnr']:.2f} / {point['ssim']:.3f}"
-
-
-def print_table(rows: Sequence[Row]) -> None:
-    lines = []
-    for row in rows:
-        line = [row["name"], row["photographs"], f"{row['gaussians']:,}", psnr_ssim(row["base"])]
-        line += [f"{psnr_ssim(point)} @ {point['kept_share']:.0%}" for point in row["rows"]]
-        lines.append([*line, row["steps"], f"{row['seconds']:.0f}"])
-    dials = (f"s = {s:g}" for s in DIALS)
-    print(table(["scene", "photographs", "Gaussians", "base", *dials, "steps", "seconds"], lines))
+def page_table() -> Table:
+    """Bases that were trained on few photographs alone."""
+    rows, lines = [], []
+    for (name,), row in last(FILE, "name").items():
+        if name in SHOWN:
+            rows.append(row)
+            label = f"{SHOWN[name]}, {row['photographs']}"
+            lines.append([label, f"{row['base']['psnr']:.2f}", *map(psnr_kept, row["rows"])])
+    heads = ["capture, photographs", "base", *(f"s = {s:g}" for s in DIALS)]
+    return Table(heads, lines, rows)
 
 
 if __name__ == "__main__":

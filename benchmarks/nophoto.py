@@ -2,7 +2,6 @@
 
     python benchmarks/nophoto.py plush_half bonsai146 --kinds photographs placed
     python benchmarks/nophoto.py plush_half --few 12 --kinds complemented
-    python benchmarks/nophoto.py --table                  # the rows as a Markdown table
 
 The kinds of views: ``photographs``, ``placed`` (placed cameras, renders of the checkpoint) and
 ``complemented`` (few photographs and pseudo views, as clod-adapt combines them). Each run adds one
@@ -13,18 +12,23 @@ import time
 from dataclasses import asdict
 
 import clod_adapter as clod
-from adapt import at_shares, psnr_at
+from adapt import at_shares
 from clod_adapter.training.pseudo_views import with_pseudo_views
-from common import append, arguments, checkpoint, quality, stored, table
+from common import Table, append, arguments, by_scene, checkpoint, last, psnr_at, quality
 from common import photographs as photographs_of
 
 FILE = "nophoto.jsonl"
 KINDS = ("photographs", "placed", "complemented")
+SHOWN = {  # in the table
+    "photographs": "photographs",
+    "complemented": "12 photographs and pseudo views",
+    "placed": "none",
+}
 DIALS = (1.0, 2.0, 3.0, 5.0, 7.0)
 
 
 def main() -> None:
-    parser = arguments(__doc__, table=print_table)
+    parser = arguments(__doc__)
     parser.add_argument("scenes", nargs="*")
     parser.add_argument("--kinds", nargs="+", choices=KINDS, default=KINDS[:2])
     parser.add_argument(
@@ -71,17 +75,20 @@ def run(scene: str, kind: str, config: clod.AdaptConfig, few: int | None) -> Non
     )
 
 
-def print_table() -> None:
-    lines = []
-    for row in stored(FILE):
-        line = [row["scene"], row["steps"], row["photographs"], row["kind"]]
-        line.append(f"{row['base']['psnr']:.2f}")
-        line += [f"{point['psnr']:.2f} @ {point['kept_share']:.1%}" for point in row["rows"]]
-        matched = psnr_at(row, 0.12)
-        line.append("" if matched is None else f"{matched:.2f}")
+def page_table() -> Table:
+    """PSNR by the views that are trained on."""
+    scenes, shares = ("plush_half", "bonsai146"), (0.35, 0.12)
+    found = last(FILE, "scene", "kind")
+    rows, lines = [], []
+    for kind, label in SHOWN.items():
+        line = [label]
+        for scene in scenes:
+            row = found[scene, kind]
+            rows.append(row)
+            line.append(f"{row['rows'][0]['psnr']:.2f}")
+            line += [psnr_at(row["at_shares"], share) for share in shares]
         lines.append(line)
-    heads = ["scene", "steps", "photographs", "views", "base"]
-    print(table([*heads, *(f"s = {s:g}" for s in DIALS), "12 %"], lines))
+    return Table(["training views", *by_scene(scenes, shares)], lines, rows)
 
 
 if __name__ == "__main__":

@@ -27,7 +27,7 @@ from typing import Any
 
 import workloads
 from clod_adapter.rasterizers import cpu, reference
-from common import ROOT, Row, append, arguments
+from common import ROOT, Row, Table, append, arguments, last
 from workloads import Size, Workload
 
 import torch
@@ -56,6 +56,18 @@ def main() -> None:
         print(json.dumps(row, indent=1), flush=True)
         if args.record:
             append(FILE, {"benchmark": "rasterize", "kind": kind, **row})
+
+
+def page_table() -> Table:
+    """Milliseconds of ours, and in brackets of the yardstick."""
+    found = last(FILE, "workload", kind="speed")
+    heads, lines = [""], {"forward": ["forward"], "both": ["forward + backward"]}
+    for (name,), row in found.items():
+        size = workloads.SIZES[name]
+        heads.append(f"{name}: {size.count:,} at {size.width}x{size.height}")
+        for part, line in lines.items():
+            line.append(f"{row[f'{part}_ms']:.3g} (C++ {row[f'yardstick_{part}_ms']:.3g})")
+    return Table(heads, lines.values(), found.values())
 
 
 def speed() -> list[Row]:

@@ -1,7 +1,6 @@
 """Other methods on the same checkpoint and photographs, at fixed shares of the base's Gaussians.
 
     python benchmarks/rivals.py plush_half bonsai146 --iters 1500
-    python benchmarks/rivals.py --table                    # the rows as a Markdown table
 
 - ``merging``: ``splat-transform``, both of its methods, without training, one file per count;
 - ``specialist``: the merged file, tuned for that count alone;
@@ -19,18 +18,23 @@ from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from pathlib import Path
 
+import adapt
 import clod_adapter as clod
 from common import (
     Row,
+    Table,
     append,
     arguments,
     capture,
     checkpoint,
     clod_adapt,
+    last,
+    percent,
     photographs,
+    psnr_kept,
     quality,
     stored,
-    table,
+    with_best,
 )
 from tuning import MERGINGS, Tuning, by_importance, find_tool, merge, tune
 
@@ -38,10 +42,20 @@ FILE = "rivals.jsonl"
 RIVALS = ("merging", "specialist", "tuned", "prefix", "ranking", "kept")
 MAX_SV = 20  # of the adapted file
 SHARES = (0.62, 0.35, 0.12, 0.05, 0.02)
+OURS = "ours, one file"
+SHOWN = {  # in the table, by rival and end of the label
+    ("kept", ""): "exported from it, a plain file each",
+    ("specialist", ""): "specialist, a file each",
+    ("prefix", ""): "prefixes, one file",
+    ("merging", "--decimate"): "merging, uniform",
+    ("merging", "--decimate-adaptive"): "merging, adaptive",
+    ("ranking", ""): "pruned",
+    ("tuned", ""): "whole base, fine-tuned",
+}
 
 
 def main() -> None:
-    parser = arguments(__doc__, table=print_table)
+    parser = arguments(__doc__)
     parser.add_argument("scenes", nargs="*")
     parser.add_argument(
         "--only", nargs="+", choices=RIVALS, default=RIVALS, help="some of the rivals"
@@ -129,17 +143,36 @@ def kept(
     return files
 
 
-def print_table() -> None:
-    """PSNR per share, a line for a rival; of equal ones the last row."""
-    shares = (1.0, *SHARES)
-    lines: dict[tuple[str, str], dict[float, str]] = {}
-    for row in stored(FILE):
-        cells = lines.setdefault(
-            (row["scene"], f"{row['rival']}: {row['label']}"), dict.fromkeys(shares, "")
-        )
-        cells |= {point["share"]: f"{point['psnr']:.2f}" for point in row["rows"]}
-    heads = ["scene", "rival", *(f"{share:.0%}" for share in shares)]
-    print(table(heads, [[*key, *cells.values()] for key, cells in lines.items()]))
+def page_table(scene: str) -> Table:
+    """PSNR at the shares; the best of each but the whole is bold."""
+    (ours,) = last(adapt.FILE, "scene", scene=scene, label=f"max_sv {MAX_SV}").values()
+    points = {(OURS, point["share"]): (ours, point["psnr"]) for point in ours["at_shares"]}
+    for row in (row for row in stored(FILE) if row["scene"] == scene):
+        label = label_of(row)
+        for point in row["rows"]:
+            points[label, point["share"]] = (row, point["psnr"])
+        if row["rival"] == "ranking":
+            points[label, 1.0] = (row, row["base"]["psnr"])
+    full = {OURS: psnr_kept(ours["rows"][0])}
+    lines: dict[str, list[float | None]] = {}
+    for label in (OURS, *SHOWN.values()):
+        if (label, 1.0) in points:
+            full[label] = f"{points[label, 1.0][1]:.2f}"
+        found = [points.get((label, share)) for share in SHARES]
+        lines[label] = [each and each[1] for each in found]
+    written = []
+    for label, *cells in with_best(lines, ".2f"):
+        written.append([label, full.get(label, ""), *cells])
+    heads = [f"{scene} ({ours['base_count']:,})", "full or s = 1", *percent(SHARES)]
+    return Table(heads, written, [row for row, _ in points.values()])
+
+
+def label_of(row: Row) -> str:
+    """How the table calls a rival."""
+    for (rival, end), label in SHOWN.items():
+        if row["rival"] == rival and row["label"].endswith(end):
+            return label
+    raise ValueError(f"{row['rival']}: {row['label']}: not in SHOWN")
 
 
 if __name__ == "__main__":

@@ -2,7 +2,6 @@
 
     python benchmarks/scaling.py    # some 15 minutes, 12 GB of memory, 8 GB of disk
     python benchmarks/scaling.py --only adapt --sizes 100000 1000000
-    python benchmarks/scaling.py --table    # the tables of docs/performance.md, from stored rows
 
 Runs each command in its own process on synthetic towns, which are kept in benchmarks/cache.
 Measures wall and CPU seconds and peak memory. A town of 1000 Gaussians gives the start-up cost.
@@ -22,7 +21,7 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 from city import write_city
-from common import CACHE, Process, Row, append, arguments, clod_adapt, report_of, stored, table
+from common import CACHE, Process, Row, Table, append, arguments, clod_adapt, last, report_of
 
 import numpy as np
 
@@ -36,6 +35,12 @@ WIDTH = 640
 HEIGHT = 400
 STEPS = 20  # of which the last fifth has photographs of full size
 MAX_SV = 3
+PARTS_SHOWN = {
+    "load": "load",
+    "importance": "importance",
+    "order": "pruning order",
+    "step": "a step",
+}
 # Loading, importance and the pruning order by themselves; the report has all of "start".
 PARTS = """
 import json, sys, time, torch
@@ -61,7 +66,7 @@ print(json.dumps({name: round(value, 3) for name, value in spent.items()}))
 
 
 def main() -> None:
-    parser = arguments(__doc__, table=print_tables)
+    parser = arguments(__doc__)
     parser.add_argument("--only", choices=RUNS, help="one command")
     parser.add_argument(
         "--sizes", nargs="+", type=int, default=[FLOOR, *SIZES], help="numbers of Gaussians"
@@ -140,18 +145,16 @@ def exponent(points: Sequence[tuple[float, float]]) -> float:
     return float(np.polyfit(*np.log(usable).T, 1)[0]) if len(usable) > 1 else math.nan
 
 
-def print_tables() -> None:
-    """Seconds by size with the exponents above start-up, from FROM on; peaks, and bytes a Gaussian
-    between the last.
-    """
-    last = {(row["command"], row["gaussians"]): row for row in stored(FILE) if "command" in row}
-    sizes = sorted({count for _, count in last})
+def page_table() -> Table:
+    """Seconds by size, with the exponents above start-up, from FROM on."""
+    found = last(FILE, "command", "gaussians", series="count")
+    sizes = sorted({count for _, count in found})
     clocks = {command: (command, "seconds", "cpu_seconds") for command in RUNS}
-    for part in ("load", "importance", "order", "step"):
-        clocks[part] = ("adapt", f"{part}_seconds", f"{part}_cpu")
-    lines, peaks = [], []
+    for part, name in PARTS_SHOWN.items():
+        clocks[name] = ("adapt", f"{part}_seconds", f"{part}_cpu")
+    lines = []
     for name, (command, wall, cpu) in clocks.items():
-        rows = [last[command, n] for n in sizes if (command, n) in last]
+        rows = [found[command, size] for size in sizes if (command, size) in found]
         line = [name, *(f"{row.get(wall, math.nan):.3g}" for row in rows)]
         for clock in (wall, cpu):
             times = {row["gaussians"]: row.get(clock, math.nan) for row in rows}
@@ -159,13 +162,18 @@ def print_tables() -> None:
             power = exponent([(n, time - floor) for n, time in times.items() if n >= FROM])
             line.append("" if math.isnan(power) else f"{power:.2f}")
         lines.append(line)
-        if name == command and len(rows) > 1:
-            (n, low), (m, high) = ((row["gaussians"], row["peak_bytes"]) for row in rows[-2:])
-            more = (high - low) / (m - n)
-            peaks.append([command, f"{low / 1e9:.2f}", f"{high / 1e9:.2f}", f"{more:,.0f}"])
-    columns = [f"{size:,}" for size in sizes]
-    print(table(["seconds", *columns, "exponent", "of CPU seconds"], lines), end="\n\n")
-    print(table(["peak, GB", *columns[-2:], "bytes per Gaussian"], peaks))
+    heads = ["seconds", *(f"{size:,}" for size in sizes), "exponent", "of CPU seconds"]
+    return Table(heads, lines, found.values())
+
+
+def memory_table() -> Table:
+    """Peak memory at the largest size, and bytes a Gaussian from the one before."""
+    found, lines = last(FILE, "command", "gaussians", series="count"), []
+    less, most = sorted({count for _, count in found})[-2:]
+    for command in RUNS:
+        low, high = (found[command, count]["peak_bytes"] for count in (less, most))
+        lines.append([command, f"{high / 1e9:.1f}", f"{(high - low) / (most - less):,.0f}"])
+    return Table(["", f"GB at {most:,}", "bytes per Gaussian"], lines, found.values())
 
 
 if __name__ == "__main__":

@@ -6,12 +6,11 @@ number may be off by that number.
 """
 
 import math
-from collections import Counter
 from typing import Any
 
 from clod_adapter.config import AttenuationConfig
 from clod_adapter.equation.attenuation import LOG_GROWTH_MAX, SIGMA_MAX, attenuate
-from common import Row, table
+from common import Row, Table
 
 import mpmath
 import numpy as np
@@ -139,12 +138,9 @@ def check_growth(tally: Tally, random: np.random.Generator, s: float) -> None:
             tally.add("its gradient by growth_d", steep, want * log_m * inside, allowed)
 
 
-def tables(rows: list[Row]) -> str:
-    """Points, worst errors and shares of the bounds."""
-    total = Counter[str]()
+def page_table(rows: list[Row]) -> Table:
+    """Worst errors and shares of the bounds."""
     lines = {name: [name, bound] for name, bound in BOUNDS.items()}
     for row in rows:
-        total.update({key: row[key] for key in ("points", "nan", "failed")})
         lines[row["quantity"]].append(f"{row['worst']:.2g} ({row['worst_of_bound']:.0%})")
-    counts = f"{total['points']:,} points: {total['nan']} NaN, {total['failed']} past the bound"
-    return f"{counts}\n\n{table(['', 'bound', *DTYPES], lines.values(), 2)}"
+    return Table(["", "bound", *DTYPES], lines.values(), rows, 2)

@@ -17,7 +17,7 @@ from clod_adapter.equation.distances import normalized_distances
 from clod_adapter.equation.paper import TAU
 from clod_adapter.evaluation.popping import Popping, dial_popping, path_popping
 from clod_adapter.gaussians import SH_C0, Gaussians
-from common import Row, table
+from common import Row, Table
 
 import torch
 from torch import Tensor
@@ -36,6 +36,11 @@ SCALE = 2.0
 WIDTH = 48
 HEIGHT = 36
 GROWTH = 0.75  # growth_d that preserves area
+SHOWN = {  # in the table
+    ("ours", 0.0): "ours",
+    ("ours", GROWTH): f"with growth_d {GROWTH:g}",
+    ("paper", 0.0): "the paper's",
+}
 DISTANCE = 4.0  # of the camera from the middle
 
 
@@ -117,14 +122,14 @@ def _sweep(
     return dial_popping(gaussians, cameras["dial"][0], gaussians.attenuation.max_sv, steps=steps)
 
 
-def tables(rows: list[Row]) -> str:
+def page_table(rows: list[Row]) -> Table:
     """Largest change of a pixel in the longest and the shortest steps."""
-    lines: dict[str, list[str]] = {}
-    ends = []
+    lines = {label: [label] for label in SHOWN.values()}
+    ends = (min(STEPS), max(STEPS))
     for row in rows:
-        if row["steps"] in (min(STEPS), max(STEPS)):
-            growth = f", growth_d {row['growth']:g}" if row["growth"] else ""
-            name = row["form"] + growth
-            lines.setdefault(name, [name]).append(f"{row['pixel']:.1f}")
-            ends.append(f"{row['sweep']}: 1/{row['steps']}")
-    return table(["form", *dict.fromkeys(ends)], list(lines.values()))
+        if row["steps"] in ends:
+            lines[SHOWN[row["form"], row["growth"]]].append(f"{row['pixel']:.1f}")
+    heads = ["form"]
+    for sweep in SWEEPS:
+        heads += [f"{sweep}: 1/{ends[0]}", f"1/{ends[1]}"]
+    return Table(heads, lines.values(), rows)

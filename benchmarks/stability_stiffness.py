@@ -37,7 +37,7 @@ from clod_adapter.training.dial import SIGMA_RANGE, Dial
 from clod_adapter.training.optimizer import RowAdam
 from clod_adapter.training.schedule import OURS
 from clod_adapter.training.target_count import count_gradient, target_share
-from common import Row, table
+from common import Row, Table
 
 import numpy as np
 import torch
@@ -241,25 +241,23 @@ def curves(rows: list[Row], timed: bool) -> dict[tuple[str, str], list[Row]]:
     return lines
 
 
-def tables(rows: list[Row]) -> str:
-    """Error and learning rates that converge; Gaussians that are stuck."""
+def page_table(rows: list[Row]) -> Table:
+    """Error and learning rates that converge of the logarithm; optimizers that are alike share a
+    line.
+    """
     (start,) = (row["error"] for row in rows if row["what"] == "start")
-    timed, lines = curves(rows, True), []
-    for key, line in curves(rows, False).items():
-        best = min(line, key=lambda row: row["error"])
-        good = [f"{row['rate']:.2g}" for row in line if row["error"] <= CONVERGED * start]
-        span = " to ".join(dict.fromkeys((good[0], good[-1]))) if good else "none"
-        seconds = [row["seconds"] for row in timed[key] if row["error"] <= CONVERGED * start]
-        fastest = f"{seconds[0]:.2f}" if seconds else ""
-        lines.append([*key, f"{best['error']:.3f}", f"{best['rate']:.2g}", span, fastest])
-    heads = ["optimizer", "sigma_d", "best error", "at"]
-    heads += ["learning rates that converge", "seconds to it"]
-    stuck = [row for row in rows if row["what"] == "stuck"]
-    count = stuck[0]["of"] // len(STARTS)
-    stuck_heads = [f"without a gradient, of {count} that begin at", *STARTS]
-    stuck_lines = [[row["method"], *row["counts"]] for row in stuck]
-    error = f"RMS error at the start: {start:.2f}"
-    return f"{table(heads, lines)}\n\n{error}\n\n{table(stuck_heads, stuck_lines)}"
+    alike: dict[tuple[str, str], list[str]] = {}
+    for (optimizer, parameter), line in curves(rows, False).items():
+        if parameter == "log":
+            good = [f"{row['rate']:.2g}" for row in line if row["error"] <= CONVERGED * start]
+            span = " to ".join(dict.fromkeys((good[0], good[-1]))) if good else "none"
+            error = f"{min(row['error'] for row in line):.3f}"
+            alike.setdefault((error, span), []).append(optimizer)
+    heads = ["optimizer, on `log sigma_d`", "best error", "learning rates that converge"]
+    lines = []
+    for cells, names in alike.items():
+        lines.append([", ".join(names).replace("RowAdam", "RowAdam (default)"), *cells])
+    return Table(heads, lines, rows)
 
 
 def picture(rows: list[Row], path: Path) -> None:

@@ -5,7 +5,6 @@ budgets.
     python benchmarks/stream.py SCENE.ply --images FOLDER --record    # with photographs
     # and the levels that its author ships
     python benchmarks/stream.py SCENE.ply --author LEVEL.ply ... --record
-    python benchmarks/stream.py --table
 
 SCENE is adapted without options. Its rivals are sets whose finest level is SCENE itself: halved
 again and again by splat-transform (``make peers``) in both its ways, and the author's own.
@@ -28,7 +27,7 @@ from typing import NamedTuple
 
 import clod_adapter as clod
 from clod_adapter.losses import decibels
-from common import COMMAND, Process, Row, append, arguments, stored, table
+from common import COMMAND, Process, Row, Table, append, arguments, last, percent, with_best
 from tuning import TIMEOUT, find_tool
 
 import numpy as np
@@ -38,10 +37,21 @@ FILE, VIEWS, SEED = "stream.jsonl", 16, 77
 BUDGETS, MULTIPLIERS = (0.4, 0.18, 0.08, 0.04), (1.6, 2.0, 3.0)
 LEAF, HALVED = 8192, 6  # Gaussians of a node; times that SCENE is halved
 SETS = {"halved": "--decimate", "halved adaptively": "--decimate-adaptive"}
+SCENES = {  # of the tables
+    "taebak4": "an aerial scene of 212,464",
+    "garden2": "a garden of 843,068 by another author",
+    "showroom3": "a showroom of 747,000 by that author",
+}
+SHOWN = {
+    "dial": "this dial, one file",
+    "lod-meta": "this file's levels, `export --lod-meta`",
+    "halved": "halved uniformly",
+    "halved adaptively": "halved adaptively",
+}
 
 
 def main() -> None:
-    parser = arguments(__doc__, table=print_table, record=FILE)
+    parser = arguments(__doc__, record=FILE)
     parser.add_argument("scene", type=Path)
     parser.add_argument(
         "--author", nargs="+", type=Path, default=[], help="coarser levels, the finest first"
@@ -253,15 +263,17 @@ def own_levels(adapted: Path, multiplier: float, folder: Path) -> list[Path]:
     return files
 
 
-def print_table() -> None:
-    """The last row of each method and budget."""
-    last = {(row["scene"], row["method"], row.get("level")): row for row in stored(FILE)}
-    methods = dict.fromkeys((row["scene"], row["method"]) for row in last.values() if "psnr" in row)
-    lines = []
-    for scene, method in methods:
-        cells = [last.get((scene, method, f"{budget:.0%}")) for budget in BUDGETS]
-        lines.append([scene, method, *(f"{cell['psnr']:.1f}" if cell else "" for cell in cells)])
-    print(table(["scene", "method", *(f"{budget:.0%}" for budget in BUDGETS)], lines))
+def page_table(scene: str) -> Table:
+    """The methods at each budget; the best is bold."""
+    found = last(FILE, "method", "level", scene=scene)
+    rows: list[Row] = []
+    lines: dict[str, list[float | None]] = {}
+    for method, label in SHOWN.items():
+        line = [found[method, f"{budget:.0%}"] for budget in BUDGETS]
+        rows += line
+        lines[label] = [row["psnr"] for row in line]
+    heads = [f"{SCENES[scene]} (`{scene}`), budget", *percent(BUDGETS)]
+    return Table(heads, with_best(lines, ".1f"), rows)
 
 
 if __name__ == "__main__":

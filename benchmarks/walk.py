@@ -2,7 +2,6 @@
 its base.
 
     python benchmarks/walk.py --record     # adds a row to results/walk.jsonl
-    python benchmarks/walk.py --table      # the last row as a Markdown table
 
 The town is ``city.py``'s, and the checkpoint the perturbed town, tuned on photographs from the
 streets, from the air and from as far as the walk; both are kept in ``benchmarks/cache``. The
@@ -20,7 +19,7 @@ import clod_adapter as clod
 from city import HOUSE, PITCH, SKY, city, city_cameras, direction, look_at, lots, perturb
 from clod_adapter.config import FILTERS
 from clod_adapter.io.atomic import atomic_path
-from common import CACHE, Row, append, arguments, clod_adapt, stored, table
+from common import CACHE, Row, Table, append, arguments, clod_adapt, stored
 from tuning import Tuning, tune
 
 import numpy as np
@@ -41,7 +40,7 @@ BANDS = {"within 12 m": 12.0, "12 to 40 m": 40.0, "40 to 120 m": 120.0, "beyond"
 
 
 def main() -> None:
-    parser = arguments(__doc__, table=lambda: print(*map(summary, stored(FILE)[-1:])), record=FILE)
+    parser = arguments(__doc__, record=FILE)
     parser.add_argument(
         "--count", type=int, default=COUNT, help=f"Gaussians of the town (default: {COUNT})"
     )
@@ -49,7 +48,7 @@ def main() -> None:
     row = measure(args.count)
     if args.record:
         append(FILE, row)
-    print(summary(row))
+    print(page_table(row).markdown())
 
 
 def measure(count: int) -> Row:
@@ -129,8 +128,9 @@ def walker(count: int, distance: float) -> clod.Camera:
     return look_at(eye, door, *SIZE, f"{distance:g} m")
 
 
-def summary(row: Row) -> str:
-    """A Markdown table by band of distance, means over its frames."""
+def page_table(row: Row | None = None) -> Table:
+    """Means over the frames of each band of distance, of the last row."""
+    row = row or stored(FILE)[-1]
     distances = np.array(row["distances"])
     lines = []
     nearest = 0.0
@@ -139,10 +139,11 @@ def summary(row: Row) -> str:
         base_psnr, base_in_view = means(row["base"], inside)
         dial_psnr, dial_in_view = means(row["dial"], inside)
         share = dial_in_view / base_in_view
-        lines.append([name, f"{base_psnr:.2f}", f"{dial_psnr - base_psnr:+.2f}", f"{share:.0%}"])
+        gain = f"{dial_psnr - base_psnr:+.2f}"
+        lines.append([name, f"{base_psnr:.1f}", gain, f"{100 * share:.0f} %"])
         nearest = farthest
     heads = ["from the door", "base, dB", "dial, dB against it", "Gaussians in view"]
-    return table(heads, lines, 1)
+    return Table(heads, lines, [row], 1)
 
 
 def means(frames: list[Row], rows: np.ndarray) -> np.ndarray:

@@ -175,7 +175,8 @@ def test_a_written_town_can_be_loaded_and_trained(tmp_path):
 
 
 def test_a_table_is_markdown():
-    lines = common.table(["scene", "dB"], [["plush", 29.0], ["banana", 25.8]], 1).splitlines()
+    table = common.Table(["scene", "dB"], [["plush", 29.0], ["banana", 25.8]], [], 1)
+    lines = table.markdown().splitlines()
     assert lines == ["| scene | dB |", "|---|---:|", "| plush | 29.0 |", "| banana | 25.8 |"]
 
 
