@@ -1,0 +1,170 @@
+"""Each file format: bytes per Gaussian, the error of sigma_d, and PSNR against the PLY.
+
+    python benchmarks/file_formats.py plush_half
+
+A checkpoint gets a sigma_d without training (``importance.initialize``), is written in each format
+that stores one and read again. PSNR is between the renders at s and those of the PLY, as means over
+the held-out views, in floating point; null where they are equal. ``.splat`` stores no sigma_d: a
+model baked at s is written and compared. Each format adds one row to ``results/formats.jsonl``.
+"""
+
+import math
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from statistics import fmean
+
+import clod_adapter as clod
+from clod_adapter.initialization.importance import initialize, usable_views
+from clod_adapter.io.file_formats import FORMATS, WRITABLE, write
+from clod_adapter.losses import decibels
+from common import Row, Table, append, arguments, checkpoint, last, photographs
+
+import torch
+
+FILE = "formats.jsonl"
+DIALS = (1.0, 5.0)
+HEADS = [
+    "format",
+    "sigma_d, growth_d",
+    "settings, calibration, origin",
+    "bytes per Gaussian (SH 3)",
+    "error of sigma_d",
+    "image against the PLY's, s = 1 / s = 5",
+    "read by",
+]
+SHOWN = {  # in the table: the dial, settings, PSNR of the pictures, readers
+    ".ply": (
+        "last columns, float32",
+        "header comments; non-default settings also as columns",
+        "",
+        (
+            "Spark, PlayCanvas, mkkellogg, gsplat, brush; splat-transform keeps all columns "
+            "and drops the comments; gsply drops both; SIBR needs a plain file"
+        ),
+    ),
+    ".glb": (
+        "attributes `_SIGMA_D`, `_GROWTH_D`, float32",
+        "`asset.extras.clod_adapter`",
+        "{least} dB or more",
+        (
+            "PlayCanvas 2.23 (without the dial) and readers of `KHR_gaussian_splatting`; "
+            "other glTF viewers show coloured points"
+        ),
+    ),
+    ".spz": (
+        "own record, float16",
+        "in the same record",
+        "{near} / {far} dB",
+        (
+            "every reader of SPZ version 3 (splat-transform, gsply, Niantic's library, "
+            "Spark 2.2), without the dial"
+        ),
+    ),
+    ".safetensors": (
+        "tensors `sigma_d`, `growth_d`, float32",
+        "metadata",
+        "",
+        "the safetensors library; no viewer",
+    ),
+    ".pt": (
+        'tensors `splats["sigma_d"]`, `splats["growth_d"]`, float32',
+        "string `clod_adapter`",
+        "",
+        "gsplat's trainer and viewer",
+    ),
+    ".splat": (
+        "none: one dial value, baked",
+        "none",
+        "{both} dB against the baked PLY",
+        "most web viewers (Spark 2.2), splat-transform",
+    ),
+}
+
+
+def main() -> None:
+    parser = arguments(__doc__)
+    parser.add_argument("scenes", nargs="*")
+    for scene in parser.parse_args().scenes:
+        run(scene, clod.AdaptConfig(max_sv=max(DIALS)))
+
+
+def run(scene: str, config: clod.AdaptConfig) -> None:
+    base, views = checkpoint(scene).gaussians, photographs(scene)
+    model = initialize(base, usable_views(base, views.train), config, lambda *_: None)
+    cameras = [view.camera for view in views.test]
+    trained_on = [view.camera for view in views.train]
+    baked = {s: clod.bake(model, s, cameras=trained_on) for s in DIALS}
+    for suffix in WRITABLE:
+        dial = FORMATS[suffix].carries_sigma
+        row = {"scene": scene, "suffix": suffix, "dial": dial}
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / f"model{suffix}"
+            for s in DIALS:
+                source = model if dial else baked[s]
+                row |= round_trip(path, source) if s == 1 or not dial else {}
+                row[f"s{s:g}"] = pictures(source, clod.load(path).gaussians, cameras, s)
+        append(FILE, row)
+
+
+def round_trip(path: Path, gaussians: clod.Gaussians) -> Row:
+    """The size, and the largest relative error of sigma_d, of those of at least 1e-4."""
+    notes = write(path, gaussians)
+    again = clod.load(path).gaussians
+    error = None
+    if gaussians.sigma_d is not None and again.sigma_d is not None:
+        # SPZ moves the farthest nearer
+        there = (again.means - gaussians.means).abs().amax(1) <= 1e-3
+        old, new = gaussians.sigma_d.double()[there], again.sigma_d.double()[there]
+        error = float(((new - old) / old)[old >= 1e-4].abs().max())
+    return {
+        "count": len(gaussians),
+        "sh_degree": gaussians.sh_degree,
+        "notes": notes,
+        "sigma_error": error,
+        "bytes_per_gaussian": round(path.stat().st_size / len(gaussians), 2),
+    }
+
+
+@torch.no_grad()
+def pictures(
+    gaussians: clod.Gaussians, again: clod.Gaussians, cameras: Sequence[clod.Camera], s: float
+) -> Row:
+    """PSNR between the two, the mean over the views."""
+    found = []
+    for camera in cameras:
+        before, after = (
+            clod.render(model, camera, virtual_scale=s).image.clamp(0, 1)
+            for model in (gaussians, again)
+        )
+        found.append(decibels(float((before - after).double().square().mean())))
+    mean = fmean(found)
+    return {"psnr": round(mean, 2) if mean < math.inf else None}
+
+
+def page_table() -> Table:
+    """Bytes, errors and PSNR over the captures."""
+    found, lines = last(FILE, "suffix", "scene"), []
+    for suffix, (dial, settings, pictures, readers) in SHOWN.items():
+        rows = [row for (each, _), row in found.items() if each == suffix]
+        near = [row["s1"]["psnr"] for row in rows]
+        far = [row["s5"]["psnr"] for row in rows]
+        image = "identical"
+        if any(near + far):
+            spans = {"near": span(near), "far": span(far), "both": span(near + far)}
+            image = pictures.format(least=f"{min(near + far):.0f}", **spans)
+        error = max(row["sigma_error"] or 0 for row in rows)
+        size = span([row["bytes_per_gaussian"] for row in rows])
+        off = f"{error:.0e}".replace("e-0", "e-") if error else "0"
+        lines.append(
+            [f"`{suffix}`", dial, settings, size, off if rows[0]["dial"] else "", image, readers]
+        )
+    return Table(HEADS, lines, found.values())
+
+
+def span(values: Sequence[float]) -> str:
+    return " to ".join(dict.fromkeys((f"{min(values):.0f}", f"{max(values):.0f}")))
+
+
+if __name__ == "__main__":
+    main()
