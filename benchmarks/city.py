@@ -12,11 +12,10 @@ from typing import Literal
 import clod_adapter as clod
 from clod_adapter.gaussians import SH_C0, Gaussians
 from clod_adapter.io.atomic import atomic_path
-from models import write_model
+from models import write_photographs
 
 import numpy as np
 import torch
-from PIL import Image
 
 Where = Literal["near", "far", "mixed"]
 PITCH = 24.0  # metres
@@ -158,13 +157,10 @@ def write_city(folder: str | Path, count: int, images: int, width: int, height: 
     """
     truth, cameras = city(count), city_cameras(images, width, height, count=count)
     with atomic_path(folder) as part:
-        (part / "images").mkdir(parents=True)
-        for camera in cameras:
-            with torch.no_grad():
-                pixels = clod.render(truth, camera).pixels.numpy()
-            Image.fromarray(pixels).save(part / "images" / camera.name)
+        with torch.no_grad():
+            pictures = [clod.render(truth, camera).pixels.numpy() for camera in cameras]
         rows = np.linspace(0, count * (1 - SKY), 2000, endpoint=False).astype(np.int64)
         points = truth.means[rows].numpy()
         colours = ((0.5 + SH_C0 * truth.sh0[rows, 0].numpy()).clip(0, 1) * 255).astype(np.uint8)
-        write_model(part, cameras, [camera.name for camera in cameras], points, colours)
+        write_photographs(part, cameras, pictures, points, colours)
         clod.save(part / "city.ply", perturb(truth))

@@ -32,10 +32,9 @@ from pathlib import Path
 import clod_adapter
 from clod_adapter.gaussians import Gaussians
 from common import arguments
-from models import write_model
+from models import write_photographs
 
 import torch
-from PIL import Image
 
 SCENE = "base.ply --images scene --iters 2 --max-sv 2 --accept-loss -o new.ply"
 EVAL = "eval base.ply --images scene --sv 1 --quiet"
@@ -247,7 +246,7 @@ def damaged(folder: Path, per_file: int) -> Iterator[Case]:
         scene = folder / f"transforms{number}"
         scene.mkdir()
         (scene / "transforms.json").write_text(json.dumps({"frames": [frame | change]}))
-        shutil.copyfile(folder.parent / "scene/images/000.png", scene / "a.png")
+        shutil.copyfile(folder.parent / "scene/images/0000.png", scene / "a.png")
         yield Case(f"clod-adapt base.ply --images {scene} -o new.ply")
 
 
@@ -279,12 +278,8 @@ def write_inputs(folder: Path) -> None:
     )
     clod_adapter.save(folder / "base.ply", gaussians)
     cameras = clod_adapter.place_cameras(gaussians)[:10]
-    names = [f"{number:03}.png" for number in range(10)]
-    (folder / "scene" / "images").mkdir(parents=True)
-    write_model(folder / "scene", cameras, names)
-    for camera, name in zip(cameras, names, strict=True):
-        pixels = clod_adapter.render(gaussians, camera).pixels
-        Image.fromarray(pixels.numpy()).save(folder / "scene" / "images" / name)
+    pictures = [clod_adapter.render(gaussians, camera).pixels.numpy() for camera in cameras]
+    write_photographs(folder / "scene", cameras, pictures)
 
 
 def failures(case: Case, inputs: Path) -> list[str]:

@@ -7,6 +7,7 @@ from clod_adapter.cameras import Camera
 
 import numpy as np
 import pycolmap
+from PIL import Image
 
 
 def write_model(
@@ -35,3 +36,18 @@ def write_model(
     target = folder / "sparse" / "0"
     target.mkdir(parents=True, exist_ok=True)
     model.write_binary(str(target))
+
+
+def write_photographs(
+    folder: Path,
+    cameras: Sequence[Camera],
+    pictures: Iterable[np.ndarray],
+    points: Iterable[np.ndarray] = (),
+    colors: Iterable[np.ndarray] = (),
+) -> None:
+    """Writes pictures and their model, as ``write_model`` does, named by their numbers."""
+    names = [f"{number:04}.png" for number in range(len(cameras))]
+    (folder / "images").mkdir(parents=True)
+    for name, picture in zip(names, pictures, strict=True):
+        Image.fromarray(picture).save(folder / "images" / name)
+    write_model(folder, cameras, names, points, colors)

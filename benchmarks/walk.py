@@ -12,7 +12,6 @@ unperturbed town.
 import json
 import math
 import tempfile
-from collections.abc import Sequence
 from pathlib import Path
 
 import clod_adapter as clod
@@ -20,11 +19,11 @@ from city import HOUSE, PITCH, SKY, city, city_cameras, direction, look_at, lots
 from clod_adapter.config import FILTERS
 from clod_adapter.io.atomic import atomic_path
 from common import CACHE, Row, Table, append, arguments, clod_adapt, stored
+from models import write_photographs
 from tuning import Tuning, tune
 
 import numpy as np
 import torch
-from PIL import Image
 
 FILE = "walk.jsonl"
 COUNT = 80_000
@@ -46,9 +45,7 @@ def main() -> None:
     )
     args = parser.parse_args()
     row = measure(args.count)
-    if args.record:
-        append(FILE, row)
-    print(page_table(row).markdown())
+    append(FILE, row, args.record)
 
 
 def measure(count: int) -> Row:
@@ -60,7 +57,6 @@ def measure(count: int) -> Row:
         run = clod_adapt(base, "--images", folder, "--out", out, "--json", "--accept-loss")
         models = {"base": clod.load(base).gaussians, "dial": clod.load(out).gaussians}
     row: Row = {
-        "benchmark": "walk",
         "count": count,
         "steps": json.loads(run.out)["steps"],
         **run.cost(),
@@ -94,7 +90,9 @@ def made(count: int) -> Path:
         CACHE.mkdir(parents=True, exist_ok=True)
         truth = town(count)
         with atomic_path(folder) as part:
-            write_photographs(truth, photographers(count), part)
+            cameras = photographers(count)
+            pictures = (supersampled(truth, camera).numpy() for camera in cameras)
+            write_photographs(part, cameras, pictures)
             tuned, _ = tune(perturb(truth), clod.load_scene(part).train, Tuning(iters=STEPS))
             clod.save(part / "base.ply", tuned)
     return folder
@@ -128,9 +126,9 @@ def walker(count: int, distance: float) -> clod.Camera:
     return look_at(eye, door, *SIZE, f"{distance:g} m")
 
 
-def page_table(row: Row | None = None) -> Table:
+def page_table() -> Table:
     """Means over the frames of each band of distance, of the last row."""
-    row = row or stored(FILE)[-1]
+    row = stored(FILE)[-1]
     distances = np.array(row["distances"])
     lines = []
     nearest = 0.0
@@ -158,32 +156,6 @@ def supersampled(gaussians: clod.Gaussians, camera: clod.Camera) -> torch.Tensor
     image = clod.render(gaussians, larger).image
     image = image.clamp(0, 1).reshape(camera.height, SAMPLES, camera.width, SAMPLES, 3).mean((1, 3))
     return (255 * image).round().to(torch.uint8)
-
-
-def write_photographs(
-    gaussians: clod.Gaussians, cameras: Sequence[clod.Camera], folder: Path
-) -> None:
-    """Writes photographs to a folder, with their transforms.json."""
-    (folder / "images").mkdir(parents=True)
-    flip = torch.diag(torch.tensor([1.0, -1, -1, 1])).double()
-    frames = []
-    for k, camera in enumerate(cameras):
-        name = f"images/{k:04}.png"
-        Image.fromarray(supersampled(gaussians, camera).numpy()).save(folder / name)
-        (fl_x, _, cx), (_, fl_y, cy), _ = camera.K.tolist()
-        frames.append(
-            {
-                "file_path": name,
-                "transform_matrix": (torch.linalg.inv(camera.viewmat.double()) @ flip).tolist(),
-                "fl_x": fl_x,
-                "fl_y": fl_y,
-                "cx": cx,
-                "cy": cy,
-                "w": camera.width,
-                "h": camera.height,
-            }
-        )
-    (folder / "transforms.json").write_text(json.dumps({"frames": frames}), "utf-8")
 
 
 if __name__ == "__main__":
