@@ -3,11 +3,9 @@ budgets.
 
     python benchmarks/stream.py SCENE.ply --record    # without photographs
     python benchmarks/stream.py SCENE.ply --images FOLDER --record    # with photographs
-    # and the levels that its author ships
-    python benchmarks/stream.py SCENE.ply --author LEVEL.ply ... --record
 
 SCENE is adapted without options. Its rivals are sets whose finest level is SCENE itself: halved
-again and again by splat-transform (``make peers``) in both its ways, and the author's own.
+again and again by splat-transform (``make peers``) in both its ways.
 ``export --lod-meta`` of the adapted file is drawn too. A set is drawn by the rule of PlayCanvas
 2.23 (gsplat-octree-instance.js, gsplat-budget-balancer.js): a node's distance is that of the
 nearest point of its box; level b >= 1 begins at K multiplier^(b - 1); in each frame one K for all
@@ -22,6 +20,7 @@ import math
 import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
@@ -53,78 +52,56 @@ SHOWN = {
 def main() -> None:
     parser = arguments(__doc__, record=FILE)
     parser.add_argument("scene", type=Path)
-    parser.add_argument(
-        "--author", nargs="+", type=Path, default=[], help="coarser levels, the finest first"
-    )
     parser.add_argument("--images", type=Path, help="photographs; without it there are none")
     parser.add_argument(
         "--adapted", type=Path, help="the file of an earlier run, which is not run again"
     )
-    parser.add_argument("--only-dial", action="store_true", help="draw no sets")
     args = parser.parse_args()
+    base = clod.load(args.scene).gaussians
+    views = clod.load_scene(args.images).test if args.images else rendered(base)
+    scene = args.images.name if args.images else args.scene.stem
     with tempfile.TemporaryDirectory() as temporary:
-        for row in compared(
-            args.scene, args.author, args.images, args.adapted, args.only_dial, Path(temporary)
-        ):
-            row = {"benchmark": "stream", "scene": args.scene.stem, **row}
-            if args.images:
-                row["scene"] = args.images.name
-            if args.record:
-                append(FILE, row)
-            else:
-                print(json.dumps(row), flush=True)
+        folder = Path(temporary)
+        out = args.adapted or folder / "adapted.ply"
+        if args.adapted is None:
+            words = ["--images", args.images] if args.images else []
+            run = Process([*COMMAND, args.scene, *words, "--out", out, "--json", "--accept-loss"])
+            row = {"method": "run", "steps": json.loads(run.out)["steps"], **run.cost()}
+            append(FILE, {"scene": scene, **row}, args.record)
+        for row in chain(of_dial(base, out, views), of_sets(base, args.scene, out, views, folder)):
+            append(FILE, {"scene": scene, **row}, args.record)
 
 
-def compared(
-    scene: Path,
-    author: list[Path],
-    images: Path | None,
-    adapted: Path | None,
-    only_dial: bool,
-    folder: Path,
-) -> Iterator[Row]:
-    """The rows: the run, the dial at 1, 2 and 5, and then each method at each budget."""
-    base, out = clod.load(scene).gaussians, adapted or folder / "adapted.ply"
-    views = clod.load_scene(images).test if images else rendered(base)
-    if adapted is None:
-        words = ["--images", images] if images else []
-        run = Process([*COMMAND, scene, *words, "--out", out, "--json", "--accept-loss"])
-        yield {"method": "run", "steps": json.loads(run.out)["steps"], **run.cost()}
-    dial = clod.load(out).gaussians
+def of_dial(base: clod.Gaussians, adapted: Path, views: Sequence[clod.View]) -> Iterator[Row]:
+    """The dial at 1, 2 and 5, and at each budget."""
+    dial = clod.load(adapted).gaussians
     for s in (0.0, 1.0, 2.0, 5.0):
         (row,) = clod.evaluate(clod.detach(dial) if s == 0 else dial, views, [max(s, 1.0)])
-        yield {
-            "method": "dial",
-            "level": f"s = {s:g}",
-            "share": row.kept / len(base),
-            "psnr": row.psnr,
-        }
-    shown = Dial(dial)
+        share = row.kept / len(base)
+        yield {"method": "dial", "level": f"s = {s:g}", "share": share, "psnr": row.psnr}
     for budget in BUDGETS:
-        yield {"method": "dial", **measured(shown, views, budget, len(base))}
-    if only_dial:
-        return
+        yield {"method": "dial", **measured(Dial(dial), views, budget, len(base))}
+
+
+def of_sets(
+    base: clod.Gaussians, scene: Path, adapted: Path, views: Sequence[clod.View], folder: Path
+) -> Iterator[Row]:
+    """Each set at each budget, with the multiplier that is best there."""
     frames, sets = Frames(base), dict[str, dict[float, list[Path]]]()
     for name, option in SETS.items():
         sets[name] = dict.fromkeys(MULTIPLIERS, [scene, *halved(scene, option, folder / name)])
-    if author:
-        sets["author"] = dict.fromkeys(MULTIPLIERS, [scene, *author])
     sets["lod-meta"] = {
-        each: own_levels(out, each, folder / f"own{each:g}") for each in MULTIPLIERS
+        each: own_levels(adapted, each, folder / f"own{each:g}") for each in MULTIPLIERS
     }
     for name, files in sets.items():
         found = dict[str, Row]()
         for multiplier, levels in files.items():
             drawn = Levels([clod.load(file).gaussians for file in levels], multiplier, frames)
             for budget in BUDGETS:
-                row = {
-                    "method": name,
-                    **measured(drawn, views, budget, len(base)),
-                    "multiplier": multiplier,
-                }
-                found[row["level"]] = max(
-                    row, found.get(row["level"], row), key=lambda each: each["psnr"]
-                )
+                row = {"method": name, **measured(drawn, views, budget, len(base))}
+                row["multiplier"] = multiplier
+                best = found.setdefault(row["level"], row)
+                found[row["level"]] = max(best, row, key=lambda each: each["psnr"])
         yield from found.values()
 
 
