@@ -8,7 +8,6 @@ gradients, and of frames of the most opaque Gaussians.
 """
 
 import importlib.util
-import json
 import multiprocessing
 import os
 import shutil
@@ -20,7 +19,6 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from functools import partial
-from itertools import product
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -53,9 +51,7 @@ def main() -> None:
     torch.set_num_threads(THREADS)
     kind = "accuracy" if args.accuracy else "speed"
     for row in accuracy() if args.accuracy else speed():
-        print(json.dumps(row, indent=1), flush=True)
-        if args.record:
-            append(FILE, {"benchmark": "rasterize", "kind": kind, **row})
+        append(FILE, {"kind": kind, **row}, args.record)
 
 
 def page_table() -> Table:
@@ -93,10 +89,9 @@ def speed() -> list[Row]:
             for who, times in steps.items():
                 row[f"{who}forward_ms"] = middle([forward for forward, _ in times])
                 row[f"{who}both_ms"] = middle([both for _, both in times])
-            ways = product(("rows removed", "opacity 0"), SHARES)
             row["kept"] = [
-                {"way": way, "share": share, "ms": middle(times)}
-                for (way, share), times in zip(ways, zip(*frames, strict=True), strict=True)
+                {"share": share, "ms": middle(times)}
+                for share, times in zip(SHARES, zip(*frames, strict=True), strict=True)
             ]
             rows.append(row | {"render_ms": row["kept"][0]["ms"]})
             for pool in workers.values():
@@ -127,15 +122,12 @@ def middle(times: Sequence[float]) -> float | None:
 
 
 def our_jobs(size: Size) -> Jobs:
-    """A step; and frames of the most opaque: the others' rows removed, then their opacities 0, as
-    the dial does.
-    """
+    """A step; and frames of the most opaque, with opacities 0 of the others, as the dial does."""
     workload = workloads.make(size)
     draw, leaves = ours(workload)
     rank = workload.opacities.argsort(descending=True).argsort()
     kept = [rank < share * len(rank) for share in SHARES]
-    fewer = [workload.at(rows) for rows in kept]
-    fewer += [replace(workload, opacities=workload.opacities.where(rows, 0)) for rows in kept]
+    fewer = (replace(workload, opacities=workload.opacities.where(rows, 0)) for rows in kept)
     frames = [ours(part)[0] for part in fewer]
     return {
         "step": lambda: timed_step(draw, leaves, workload.weights),

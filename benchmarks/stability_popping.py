@@ -8,9 +8,11 @@ turns. A fade changes in proportion to the step's length (slope 1), a pop by the
 """
 
 import math
+from dataclasses import replace
 from itertools import product
 
 import clod_adapter as clod
+from city import look_at
 from clod_adapter.config import FORMS
 from clod_adapter.equation.attenuation import SIGMA_MAX
 from clod_adapter.equation.distances import normalized_distances
@@ -21,7 +23,6 @@ from common import Row, Table
 
 import torch
 from torch import Tensor
-from torch.nn.functional import normalize
 
 STEPS = (20, 40, 80, 160)
 SWEEPS = {
@@ -101,13 +102,9 @@ def scene(form: str) -> tuple[Gaussians, dict[str, list[clod.Camera]]]:
 
 
 def _looking(eye: Tensor, at: Tensor) -> clod.Camera:
-    forward = normalize(at - eye, dim=0)
-    right = normalize(torch.linalg.cross(torch.tensor([0.0, 1.0, 0.0]), forward), dim=0)
-    viewmat = torch.eye(4)
-    viewmat[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward])
-    viewmat[:3, 3] = -viewmat[:3, :3] @ eye
+    camera = look_at(eye.double().numpy(), at.double().numpy(), WIDTH, HEIGHT, "")
     K = torch.tensor([[1.1 * WIDTH, 0, WIDTH / 2], [0, 1.1 * WIDTH, HEIGHT / 2], [0, 0, 1.0]])
-    return clod.Camera(viewmat, K, WIDTH, HEIGHT)
+    return replace(camera, K=K)
 
 
 def _sweep(
