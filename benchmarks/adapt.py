@@ -68,7 +68,6 @@ def run(scene: str, label: str, config: clod.AdaptConfig, changed: Row) -> None:
     append(
         FILE,
         {
-            "benchmark": "adapt",
             "scene": scene,
             "label": label,
             "changed": changed,

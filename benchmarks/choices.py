@@ -114,7 +114,6 @@ def measure(scene: str, base: clod.Gaussians, views: clod.Scene, name: str, valu
     append(
         FILE,
         {
-            "benchmark": "choices",
             "scene": Path(scene).stem,
             "choice": name,
             "value": value,

@@ -84,13 +84,14 @@ def about() -> Row:
     return {"commit": commit(), "machine": machine()}
 
 
-def append(file: str, row: Row) -> None:
-    """Adds a row to ``results/<file>`` and prints it to stderr."""
-    text = json.dumps(jsonable({**about(), **row}))
-    RESULTS.mkdir(exist_ok=True)
-    with open(RESULTS / file, "a", encoding="utf-8") as out:
-        out.write(text + "\n")
+def append(file: str, row: Row, record: bool = True) -> None:
+    """Prints a row to stderr, and adds it to ``results/<file>`` unless ``record`` is false."""
+    text = json.dumps(jsonable({**about(), "benchmark": Path(file).stem, **row}))
     print(text, file=sys.stderr, flush=True)
+    if record:
+        RESULTS.mkdir(exist_ok=True)
+        with open(RESULTS / file, "a", encoding="utf-8") as out:
+            out.write(text + "\n")
 
 
 def stored(file: str) -> list[Row]:

@@ -13,7 +13,6 @@ points (``from_points.py``), or, with ``--base``, is that checkpoint, trained on
 and tuned further on those that are left.
 """
 
-import json
 import tempfile
 from pathlib import Path
 
@@ -88,7 +87,6 @@ def run(folder: Path, *, record: bool) -> None:
         report = report_of(out)
         rows = quality(clod.load(out).gaussians, scene.test, DIALS)
     row: Row = {
-        "benchmark": "converged",
         "name": folder.name,
         "photographs": len(scene.train),
         "held_out": len(scene.test),
@@ -98,10 +96,7 @@ def run(folder: Path, *, record: bool) -> None:
         "steps": report["steps"],
         "seconds": round(process.seconds, 1),
     }
-    if record:
-        append(FILE, row)
-    else:
-        print(json.dumps(row))
+    append(FILE, row, record)
 
 
 def page_table() -> Table:

@@ -34,14 +34,11 @@ def main() -> None:
     parser.add_argument(
         "--few", type=int, metavar="K", help="of the photographs to train on, only K, evenly spread"
     )
-    parser.add_argument(
-        "--iters", type=int, help="training steps (default: by the number of views, as clod-adapt)"
-    )
     args = parser.parse_args()
     for scene in args.scenes:
         for kind in args.kinds:
             make = clod.AdaptConfig.placed if kind == "placed" else clod.AdaptConfig
-            run(scene, kind, make(iters=args.iters, max_sv=DIALS[-1]), args.few)
+            run(scene, kind, make(max_sv=DIALS[-1]), args.few)
 
 
 def run(scene: str, kind: str, config: clod.AdaptConfig, few: int | None) -> None:
@@ -59,7 +56,6 @@ def run(scene: str, kind: str, config: clod.AdaptConfig, few: int | None) -> Non
     append(
         FILE,
         {
-            "benchmark": "nophoto",
             "scene": scene,
             "kind": kind,
             "config": asdict(config),

@@ -141,7 +141,7 @@ def main() -> None:
             print(f"    {line}", flush=True)
         if args.record:
             about = {"condition": name, "tests": args.tests or ["tests"]}
-            append(FILE, {"benchmark": "portability", **about, **result})
+            append(FILE, about | result)
     sys.exit(failed)
 
 

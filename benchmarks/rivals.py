@@ -75,7 +75,6 @@ def main() -> None:
                 append(
                     FILE,
                     {
-                        "benchmark": "rivals",
                         "scene": scene,
                         "rival": rival,
                         "label": label,

@@ -50,7 +50,6 @@ def main() -> None:
                 append(
                     FILE,
                     {
-                        "benchmark": "tradeoff",
                         "scene": args.scene,
                         "method": method,
                         "iters": iters,
