@@ -1,11 +1,13 @@
 """Writes the pages of the site into build/pages: those of this folder, and the reference, made from
-the code.
+the code. Ends where a table of a page is not what the rows of the benchmarks give.
 
 python docs/make.py        # then mkdocs build, as make docs does
 """
 
 import argparse
 import shutil
+import subprocess
+import sys
 from itertools import groupby
 from pathlib import Path
 
@@ -14,6 +16,7 @@ from clod_adapter.cli.main import COMMANDS, PROG, build_parser, command_of
 from clod_adapter.config import AdaptConfig, AttenuationConfig, field_descriptions
 
 HERE = Path(__file__).resolve().parent
+TABLES = HERE.parent / "benchmarks" / "results.py"
 OUT = HERE.parent / "build" / "pages"
 SETTINGS = """\
 # Settings
@@ -110,6 +113,8 @@ PAGES = {"commands.md": commands_page, "settings.md": settings_page, "names.md":
 
 
 def main() -> None:
+    if subprocess.run([sys.executable, TABLES, "--check"], check=False).returncode:
+        sys.exit(1)
     shutil.rmtree(OUT, ignore_errors=True)
     shutil.copytree(HERE, OUT, ignore=shutil.ignore_patterns("*.py", "__pycache__"))
     for name, make in PAGES.items():
