@@ -3,6 +3,9 @@
 #   make demo    install and run the demo
 #   make test    install, then lint, format check, types, tests
 #   make docs    install what the documentation needs, and build it as a site in build/docs
+#   make results       run the benchmarks whose rows are not of this commit, an evening on two cores, and write the tables
+#                      of the pages; make results ONLY="stream nophoto" runs some. benchmarks/results.py --list has all
+#   make results-long  run the benchmarks that take half an hour or more each
 #   make peers   install what some tests compare with and otherwise skip: Node 22, splat-transform, Spark, PlayCanvas; by npm, 400 MB
 #   make clean   remove .venv and everything that was built or cached; what the demo made, in demo/, stays
 #
@@ -11,12 +14,13 @@
 #           is much smaller: make demo PIP_ARGS="--extra-index-url https://download.pytorch.org/whl/cpu"
 PYTHON ?= python3
 PIP_ARGS ?=
+ONLY ?=
 
 VENV := .venv
 BIN := $(VENV)/bin
 PEERS := $(VENV)/peers
 
-.PHONY: demo test docs peers clean
+.PHONY: demo test docs results results-long peers clean
 
 demo: $(VENV)/.installed-demo
 	$(BIN)/clod-adapt demo
@@ -31,6 +35,12 @@ docs: $(VENV)/.installed-docs
 	$(BIN)/python docs/make.py
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 	@echo "open build/docs/index.html"
+
+results: $(VENV)/.installed-dev
+	PATH="$(CURDIR)/$(PEERS)/node_modules/.bin:$$PATH" $(BIN)/python benchmarks/results.py $(ONLY)
+
+results-long: $(VENV)/.installed-dev
+	PATH="$(CURDIR)/$(PEERS)/node_modules/.bin:$$PATH" $(BIN)/python benchmarks/results.py --long $(ONLY)
 
 peers: $(PEERS)/.installed
 
