@@ -37,10 +37,10 @@ docs: $(VENV)/.installed-docs
 	@echo "open build/docs/index.html"
 
 results: $(VENV)/.installed-dev
-	PATH="$(CURDIR)/$(PEERS)/node_modules/.bin:$$PATH" $(BIN)/python benchmarks/results.py $(ONLY)
+	$(BIN)/python benchmarks/results.py $(ONLY)
 
 results-long: $(VENV)/.installed-dev
-	PATH="$(CURDIR)/$(PEERS)/node_modules/.bin:$$PATH" $(BIN)/python benchmarks/results.py --long $(ONLY)
+	$(BIN)/python benchmarks/results.py --long $(ONLY)
 
 peers: $(PEERS)/.installed
 
