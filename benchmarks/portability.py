@@ -1,5 +1,4 @@
-"""Runs the test suite under conditions in which processors, users, shells and folders differ, and
-prints one table.
+"""Runs the test suite under conditions in which processors, users, shells and folders differ.
 
     python benchmarks/portability.py --record    # all conditions: an hour on two idle cores
     # one condition, and two of them at once
@@ -130,18 +129,11 @@ def main() -> None:
         parser.error(
             f"there is no condition {', '.join(sorted(unknown))}; there are {', '.join(CONDITIONS)}"
         )
-    print(f"{'condition':16} {'passed':>7} {'failed':>7} {'skipped':>7} {'seconds':>8}", flush=True)
     failed = False
     for name in args.conditions or CONDITIONS:
         result = run(name, args.tests)
         failed |= bool(result["failures"])
-        counts = f"{result['passed']:7} {result['failed']:7} {result['skipped']:7}"
-        print(f"{name:16} {counts} {result['seconds']:8}", flush=True)
-        for line in result["failures"]:
-            print(f"    {line}", flush=True)
-        if args.record:
-            about = {"condition": name, "tests": args.tests or ["tests"]}
-            append(FILE, about | result)
+        append(FILE, {"condition": name, "tests": args.tests or ["tests"], **result}, args.record)
     sys.exit(failed)
 
 

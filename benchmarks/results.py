@@ -157,13 +157,14 @@ def main() -> int:
 def list_all() -> int:
     """Prints every task, and the tables that no page can have, or has, between marks."""
     print(*map(listed, tasks()), sep="\n")
-    short, long = (sum(task.minutes for task in chosen([], each)) for each in (False, True))
-    print(f"make results: {short} minutes on two cores; make results-long: {long}")
-    marked = {found[2] for page in PAGES for found in MARKED.finditer(page.read_text("utf-8"))}
+    for target, long in (("results", False), ("results-long", True)):
+        minutes = sum(task.minutes for task in chosen([], long))
+        print(f"make {target}: {minutes} minutes on two cores")
+    pages = "".join(page.read_text("utf-8") for page in PAGES)
     for name, make in TABLES.items():
         if len(origins(make().rows)) > 1:
             print(f"table {name}: rows of several commits: run {name}")
-        elif name not in marked:
+        elif f"<!-- table: {name} -->" not in pages:
             print(f"table {name}: rows of one commit; no page has its marks")
     return 0
 

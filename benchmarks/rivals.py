@@ -20,6 +20,7 @@ from pathlib import Path
 
 import adapt
 import clod_adapter as clod
+from adapt import SHARES
 from common import (
     Row,
     Table,
@@ -41,8 +42,6 @@ from tuning import MERGINGS, Tuning, by_importance, find_tool, merge, tune
 FILE = "rivals.jsonl"
 RIVALS = ("merging", "specialist", "tuned", "prefix", "ranking", "kept")
 MAX_SV = 20  # of the adapted file
-SHARES = (0.62, 0.35, 0.12, 0.05, 0.02)
-OURS = "ours, one file"
 SHOWN = {  # in the table, by rival and end of the label
     ("kept", ""): "exported from it, a plain file each",
     ("specialist", ""): "specialist, a file each",
@@ -145,33 +144,27 @@ def kept(
 def page_table(scene: str) -> Table:
     """PSNR at the shares; the best of each but the whole is bold."""
     (ours,) = last(adapt.FILE, "scene", scene=scene, label=f"max_sv {MAX_SV}").values()
-    points = {(OURS, point["share"]): (ours, point["psnr"]) for point in ours["at_shares"]}
-    for row in (row for row in stored(FILE) if row["scene"] == scene):
-        label = label_of(row)
-        for point in row["rows"]:
-            points[label, point["share"]] = (row, point["psnr"])
-        if row["rival"] == "ranking":
-            points[label, 1.0] = (row, row["base"]["psnr"])
-    full = {OURS: psnr_kept(ours["rows"][0])}
-    lines: dict[str, list[float | None]] = {}
-    for label in (OURS, *SHOWN.values()):
-        if (label, 1.0) in points:
-            full[label] = f"{points[label, 1.0][1]:.2f}"
-        found = [points.get((label, share)) for share in SHARES]
-        lines[label] = [each and each[1] for each in found]
-    written = []
-    for label, *cells in with_best(lines, ".2f"):
-        written.append([label, full.get(label, ""), *cells])
+    found = {label: dict[float, float]() for label in ("ours, one file", *SHOWN.values())}
+    found["ours, one file"] = {point["share"]: point["psnr"] for point in ours["at_shares"]}
+    found["pruned"] = {1.0: ours["base"]["psnr"]}
+    rows = {}
+    for row in stored(FILE):
+        if row["scene"] == scene:
+            way = row["label"].split()[-1] if row["rival"] == "merging" else ""
+            label = SHOWN[row["rival"], way]
+            for point in row["rows"]:
+                found[label][point["share"]] = point["psnr"]
+                rows[label, point["share"]] = row
+    shares = {}
+    for label, line in found.items():
+        shares[label] = [line.get(share) for share in SHARES]
+    lines = []
+    for label, *cells in with_best(shares, ".2f"):
+        full = f"{found[label][1.0]:.2f}" if 1.0 in found[label] else ""
+        lines.append([label, full, *cells])
+    lines[0][1] = psnr_kept(ours["rows"][0])
     heads = [f"{scene} ({ours['base_count']:,})", "full or s = 1", *percent(SHARES)]
-    return Table(heads, written, [row for row, _ in points.values()])
-
-
-def label_of(row: Row) -> str:
-    """How the table calls a rival."""
-    for (rival, end), label in SHOWN.items():
-        if row["rival"] == rival and row["label"].endswith(end):
-            return label
-    raise ValueError(f"{row['rival']}: {row['label']}: not in SHOWN")
+    return Table(heads, lines, [ours, *rows.values()])
 
 
 if __name__ == "__main__":
