@@ -3,9 +3,10 @@ budgets.
 
     python benchmarks/stream.py SCENE.ply --record    # without photographs
     python benchmarks/stream.py SCENE.ply --images FOLDER --record    # with photographs
+    python benchmarks/stream.py SCENE.ply --author LEVEL.ply ... --record    # its author's, too
 
 SCENE is adapted without options. Its rivals are sets whose finest level is SCENE itself: halved
-again and again by splat-transform (``make peers``) in both its ways.
+again and again by splat-transform (``make peers``) in both its ways, and the author's own.
 ``export --lod-meta`` of the adapted file is drawn too. A set is drawn by the rule of PlayCanvas
 2.23 (gsplat-octree-instance.js, gsplat-budget-balancer.js): a node's distance is that of the
 nearest point of its box; level b >= 1 begins at K multiplier^(b - 1); in each frame one K for all
@@ -40,19 +41,25 @@ SCENES = {  # of the tables
     "taebak4": "an aerial scene of 212,464",
     "garden2": "a garden of 843,068 by another author",
     "showroom3": "a showroom of 747,000 by that author",
+    "plush_half": "a plush toy, 120,000, photographs",
+    "bonsai146": "a table in a room, 150,000, photographs",
 }
 SHOWN = {
     "dial": "this dial, one file",
     "lod-meta": "this file's levels, `export --lod-meta`",
     "halved": "halved uniformly",
     "halved adaptively": "halved adaptively",
+    "author": "its author's levels",
 }
+Files = dict[float, list[Path]]
 
 
 def main() -> None:
     parser = arguments(__doc__, record=FILE)
     parser.add_argument("scene", type=Path)
     parser.add_argument("--images", type=Path, help="photographs; without it there are none")
+    levels = {"nargs": "+", "type": Path, "default": []}
+    parser.add_argument("--author", **levels, help="coarser levels, the finest first")
     parser.add_argument(
         "--adapted", type=Path, help="the file of an earlier run, which is not run again"
     )
@@ -68,7 +75,8 @@ def main() -> None:
             run = Process([*COMMAND, args.scene, *words, "--out", out, "--json", "--accept-loss"])
             row = {"method": "run", "steps": json.loads(run.out)["steps"], **run.cost()}
             append(FILE, {"scene": scene, **row}, args.record)
-        for row in chain(of_dial(base, out, views), of_sets(base, args.scene, out, views, folder)):
+        sets = sets_of(args.scene, args.author, out, folder)
+        for row in chain(of_dial(base, out, views), of_sets(base, sets, views)):
             append(FILE, {"scene": scene, **row}, args.record)
 
 
@@ -83,16 +91,24 @@ def of_dial(base: clod.Gaussians, adapted: Path, views: Sequence[clod.View]) -> 
         yield {"method": "dial", **measured(Dial(dial), views, budget, len(base))}
 
 
-def of_sets(
-    base: clod.Gaussians, scene: Path, adapted: Path, views: Sequence[clod.View], folder: Path
-) -> Iterator[Row]:
-    """Each set at each budget, with the multiplier that is best there."""
-    frames, sets = Frames(base), dict[str, dict[float, list[Path]]]()
+def sets_of(scene: Path, author: list[Path], adapted: Path, folder: Path) -> dict[str, Files]:
+    """The levels of each set for each multiplier, the finest first."""
+    sets = dict[str, Files]()
     for name, option in SETS.items():
         sets[name] = dict.fromkeys(MULTIPLIERS, [scene, *halved(scene, option, folder / name)])
+    if author:
+        sets["author"] = dict.fromkeys(MULTIPLIERS, [scene, *author])
     sets["lod-meta"] = {
         each: own_levels(adapted, each, folder / f"own{each:g}") for each in MULTIPLIERS
     }
+    return sets
+
+
+def of_sets(
+    base: clod.Gaussians, sets: dict[str, Files], views: Sequence[clod.View]
+) -> Iterator[Row]:
+    """Each set at each budget, with the multiplier that is best there."""
+    frames = Frames(base)
     for name, files in sets.items():
         found = dict[str, Row]()
         for multiplier, levels in files.items():
@@ -246,9 +262,10 @@ def page_table(scene: str) -> Table:
     rows: list[Row] = []
     lines: dict[str, list[float | None]] = {}
     for method, label in SHOWN.items():
-        line = [found[method, f"{budget:.0%}"] for budget in BUDGETS]
+        line = [found[key] for budget in BUDGETS if (key := (method, f"{budget:.0%}")) in found]
         rows += line
-        lines[label] = [row["psnr"] for row in line]
+        if line:
+            lines[label] = [row["psnr"] for row in line]
     heads = [f"{SCENES[scene]} (`{scene}`), budget", *percent(BUDGETS)]
     return Table(heads, with_best(lines, ".1f"), rows)
 
