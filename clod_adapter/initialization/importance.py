@@ -47,9 +47,13 @@ def initialize(
                 f"the dial has the form {base.attenuation.form}; adapt with the same, or give a"
                 " plain file"
             )
-        known = known_distance(base.attenuation) or scene_distance(base, spread(views, MOST_VIEWS))
-        own = replace(base.attenuation, max_sv=config.max_sv, reference_distance=known)
-        return in_world_units(with_growth(base.replace(attenuation=own), config, base.growth_d))
+        distance = known_distance(base.attenuation) or scene_distance(
+            base, spread(views, MOST_VIEWS)
+        )
+        settings = replace(base.attenuation, max_sv=config.max_sv, reference_distance=distance)
+        return in_world_units(
+            with_growth(base.replace(attenuation=settings), config, base.growth_d)
+        )
     views = spread(views, MOST_VIEWS)
     attenuation = config.attenuation(scene_distance(base, views))
     pruned = pruning_order(base, importance(base, views, config, progress), progress)
@@ -95,9 +99,10 @@ def for_training(initial: Gaussians) -> Gaussians:
     unless that is 1.
     """
     assert initial.attenuation is not None
-    known = known_distance(initial.attenuation) or 1.0
+    distance = known_distance(initial.attenuation) or 1.0
     return with_distance(
-        initial.replace(attenuation=replace(initial.attenuation, reference_distance=known)), known
+        initial.replace(attenuation=replace(initial.attenuation, reference_distance=distance)),
+        distance,
     )
 
 
@@ -111,17 +116,17 @@ def usable_views(base: Gaussians, views: Sequence[View]) -> tuple[View, ...]:
     """The views with at least one Gaussian's centre beyond their near plane; the others render
     nothing.
     """
-    found = []
+    usable = []
     for view in views:
         if bool((view.camera.depths(base.means) >= view.camera.near).any()):
-            found.append(view)
-    if not found:
+            usable.append(view)
+    if not usable:
         raise ClodError(
             f"no Gaussian is in front of any of the {len(views)} training cameras: checkpoint and"
             " cameras are not of one scene, or not in one coordinate frame; give the photographs"
             " and poses it was trained on"
         )
-    return tuple(found)
+    return tuple(usable)
 
 
 def scene_distance(base: Gaussians, views: Sequence[View]) -> float:
@@ -157,8 +162,8 @@ def removal_error(
             opacities,
             view.camera.halved() if small else view.camera,
         )
-        drawn = torch.randint(0, 2, image.shape, generator=generator, dtype=torch.uint8)
-        signs = drawn.to(image.device).to(image) * 2 - 1
+        bits = torch.randint(0, 2, image.shape, generator=generator, dtype=torch.uint8)
+        signs = bits.to(image.device).to(image) * 2 - 1
         # as grad_outputs they would import sympy
         (gradient,) = torch.autograd.grad((image * signs).sum(), opacities)
         total += (gradient * opacities.detach()).square()

@@ -124,8 +124,8 @@ def gaussians_of(mixture: Mixture, like: Gaussians) -> Gaussians:
     tensors = {
         name: torch.from_numpy(np.ascontiguousarray(x, np.float32)) for name, x in arrays.items()
     }
-    found: Any = {name: x.to(like.means) for name, x in tensors.items()}
-    return Gaussians(**found, screen_filter=like.screen_filter)
+    fields: Any = {name: x.to(like.means) for name, x in tensors.items()}
+    return Gaussians(**fields, screen_filter=like.screen_filter)
 
 
 _ENTRIES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
@@ -135,12 +135,12 @@ def _groups(mixture: Mixture, weights: np.ndarray, count: int) -> np.ndarray:
     """``[N]`` the number of each one's group: pairs, the cheapest first, until ``count`` groups
     remain, or singles.
     """
-    partner, left = np.arange(len(mixture)), len(mixture)
+    partner, remaining = np.arange(len(mixture)), len(mixture)
     for first, second in _cheapest(mixture, weights):
-        some = slice(left - count)
-        partner[first[some]], partner[second[some]] = second[some], first[some]
-        left -= len(first[some])
-        if left <= count:
+        pairs = slice(remaining - count)
+        partner[first[pairs]], partner[second[pairs]] = second[pairs], first[pairs]
+        remaining -= len(first[pairs])
+        if remaining <= count:
             break
     return np.unique(np.minimum(np.arange(len(mixture)), partner), return_inverse=True)[1]
 
@@ -160,11 +160,11 @@ def _cheapest(mixture: Mixture, weights: np.ndarray) -> Iterator[tuple[np.ndarra
         edges, first = np.arange(len(i)), np.full(len(mixture), len(i))
         np.minimum.at(first, i, edges)
         np.minimum.at(first, j, edges)
-        taken = (first[i] == edges) & (first[j] == edges)
-        yield i[taken], j[taken]
-        free[i[taken]] = free[j[taken]] = False
-        left = free[i] & free[j]
-        i, j = i[left], j[left]
+        cheapest = (first[i] == edges) & (first[j] == edges)
+        yield i[cheapest], j[cheapest]
+        free[i[cheapest]] = free[j[cheapest]] = False
+        both_free = free[i] & free[j]
+        i, j = i[both_free], j[both_free]
 
 
 def _neighbours(mixture: Mixture) -> tuple[np.ndarray, np.ndarray]:
@@ -181,19 +181,19 @@ def _cost(mixture: Mixture, first: np.ndarray, second: np.ndarray) -> np.ndarray
     """Of merging two: the entropy of the merged shape above the mean of both, and the squared
     difference of colours.
     """
-    found, entropy = np.empty(len(first)), _log_determinants(mixture.covariances.T)
+    cost, entropy = np.empty(len(first)), _log_determinants(mixture.covariances.T)
     for start in range(0, len(first), EDGES):
-        part = slice(start, start + EDGES)
-        i, j = first[part], second[part]
+        block = slice(start, start + EDGES)
+        i, j = first[block], second[block]
         p = mixture.mass[i] / (mixture.mass[i] + mixture.mass[j])
         q = 1 - p
         merged = p * mixture.covariances[i].T + q * mixture.covariances[j].T
         merged += p * q * _products((mixture.means[i] - mixture.means[j]).T)
         shape = _log_determinants(merged) - p * entropy[i] - q * entropy[j]
-        found[part] = shape / 2 + COLOUR * np.square(
+        cost[block] = shape / 2 + COLOUR * np.square(
             mixture.harmonics[i] - mixture.harmonics[j]
         ).sum(1)
-    return found
+    return cost
 
 
 def _products(vectors: np.ndarray) -> np.ndarray:

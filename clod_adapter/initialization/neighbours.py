@@ -21,9 +21,9 @@ def nearest(centres: np.ndarray, count: int) -> Iterator[tuple[np.ndarray, np.nd
     """
     from scipy.spatial import cKDTree  # only here: it takes a fifth of a second to import
 
-    tree, wanted = cKDTree(centres), min(count + 1, len(centres))
+    tree, neighbours = cKDTree(centres), min(count + 1, len(centres))
     for rows in np.array_split(tree.indices, -(-len(centres) // ROWS)):
-        yield rows, *tree.query(centres[rows], wanted, workers=threads.worker_count())
+        yield rows, *tree.query(centres[rows], neighbours, workers=threads.worker_count())
 
 
 def without_crowds(centres: np.ndarray, sizes: np.ndarray) -> np.ndarray:

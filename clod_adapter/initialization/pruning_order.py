@@ -63,17 +63,19 @@ def pruning_order(
     )
     weights, order = importance.detach().double().cpu().numpy().copy(), np.empty(count, np.int64)
     centres = without_crowds(gaussians.means.detach().double().cpu().numpy(), sizes)
-    favoured, left, gone = np.arange(count), np.arange(count), 0
-    while len(left) > 1:
-        substitute, difference = _substitutes(centres[left], colours[left], sizes[left])
-        removed = _removed(weights[left] * difference, substitute)
-        np.add.at(weights, left[substitute[removed]], weights[left[removed]])
-        order[left[removed]] = gone + np.arange(len(removed))
-        favoured[left[removed]] = left[substitute[removed]]
-        gone += len(removed)
-        left = np.delete(left, removed)
-        tell(progress, Phase.PRUNING_ORDER, gone, count)
-    order[left] = gone
+    favoured, remaining, removed_count = np.arange(count), np.arange(count), 0
+    while len(remaining) > 1:
+        substitute, difference = _substitutes(
+            centres[remaining], colours[remaining], sizes[remaining]
+        )
+        removed = _removed(weights[remaining] * difference, substitute)
+        np.add.at(weights, remaining[substitute[removed]], weights[remaining[removed]])
+        order[remaining[removed]] = removed_count + np.arange(len(removed))
+        favoured[remaining[removed]] = remaining[substitute[removed]]
+        removed_count += len(removed)
+        remaining = np.delete(remaining, removed)
+        tell(progress, Phase.PRUNING_ORDER, removed_count, count)
+    order[remaining] = removed_count
     tell(progress, Phase.PRUNING_ORDER, count, count)
     return PruningOrder(
         *(torch.from_numpy(rows).to(importance.device) for rows in (order, favoured))
@@ -100,30 +102,34 @@ def _substitutes(
     """The most similar neighbour of each, and its dissimilarity."""
     substitute, difference = np.empty(len(centres), np.int64), np.empty(len(centres))
     channels = np.ascontiguousarray(colours.T)
-    for part, apart, near in nearest(centres, NEIGHBOURS):
-        for at in range(0, len(part), BLOCK):
-            rows, these = part[at : at + BLOCK], slice(at, at + BLOCK)
+    for tree_rows, distances, near in nearest(centres, NEIGHBOURS):
+        for at in range(0, len(tree_rows), BLOCK):
+            rows, block = tree_rows[at : at + BLOCK], slice(at, at + BLOCK)
             substitute[rows], difference[rows] = _most_similar(
-                rows, near[these].T, apart[these].T, channels, sizes
+                rows, near[block].T, distances[block].T, channels, sizes
             )
     return substitute, difference
 
 
 def _most_similar(
-    rows: np.ndarray, near: np.ndarray, apart: np.ndarray, channels: np.ndarray, sizes: np.ndarray
+    rows: np.ndarray,
+    near: np.ndarray,
+    distances: np.ndarray,
+    channels: np.ndarray,
+    sizes: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """The most similar of the neighbours ``near [K, n]`` of ``rows [n]``, and its dissimilarity."""
     substitute, least = near[0].copy(), np.full(len(rows), np.inf)
-    own, size = channels[:, rows], sizes[rows]
+    colours, size = channels[:, rows], sizes[rows]
     with np.errstate(invalid="ignore"):  # inf - inf
-        for other, distance in zip(near, np.square(apart), strict=True):
-            red, green, blue = np.square(own - channels[:, other])
-            reach = np.square(size + sizes[other])
-            found = red + green + blue + COLOUR_FLOOR**2
-            found += APART * distance / np.maximum(distance + reach, np.finfo(float).tiny)
-            found = np.nan_to_num(found, nan=DIFFERENT, posinf=DIFFERENT)
-            better = (found < least) & (other != rows)
-            substitute[better], least[better] = other[better], found[better]
+        for neighbour, distance in zip(near, np.square(distances), strict=True):
+            red, green, blue = np.square(colours - channels[:, neighbour])
+            reach = np.square(size + sizes[neighbour])
+            dissimilarity = red + green + blue + COLOUR_FLOOR**2
+            dissimilarity += APART * distance / np.maximum(distance + reach, np.finfo(float).tiny)
+            dissimilarity = np.nan_to_num(dissimilarity, nan=DIFFERENT, posinf=DIFFERENT)
+            better = (dissimilarity < least) & (neighbour != rows)
+            substitute[better], least[better] = neighbour[better], dissimilarity[better]
     return substitute, least
 
 
@@ -146,16 +152,16 @@ def initial_growth(gaussians: Gaussians, substitutes: Tensor, distances: Tensor)
     for k in range(1, DIALS):
         s = config.max_sv ** (k / (DIALS - 1))
         kept = extinction > s
-        stands_for = torch.zeros_like(area).index_add_(
+        covered_area = torch.zeros_like(area).index_add_(
             0, _kept_substitutes(kept, substitutes), area
         )
-        wanted = (stands_for / area).clamp(min=1).log().div_(2).nan_to_num_(0.0, 0.0)
+        needed = (covered_area / area).clamp(min=1).log().div_(2).nan_to_num_(0.0, 0.0)
         available = (
             growth_factors(torch.ones_like(distances), distances, s, growth_distance(config))
             .double()
             .log()
         )
-        total += kept * wanted * available
+        total += kept * needed * available
         weight += kept * available.square()
     exponents = (total / weight.clamp(min=1e-12)).clamp_(0, MOST)
     return exponents.mul_(SHARE).to(gaussians.opacity_logits)
@@ -165,11 +171,11 @@ def _kept_substitutes(kept: Tensor, substitutes: Tensor) -> Tensor:
     """``[N]`` the first kept one of each Gaussian, its substitute, the substitute of that and so
     on.
     """
-    own = torch.arange(len(kept), device=kept.device)
-    found = torch.where(kept, own, substitutes)
+    rows = torch.arange(len(kept), device=kept.device)
+    substitute = torch.where(kept, rows, substitutes)
     # each time chains are twice as long; there may be circles of removed ones
     for _ in range(len(kept).bit_length()):
-        if torch.equal(further := found[found], found):
+        if torch.equal(further := substitute[substitute], substitute):
             break
-        found = further
-    return found
+        substitute = further
+    return substitute
