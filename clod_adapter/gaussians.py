@@ -245,11 +245,11 @@ def bad_rows(values: Tensor) -> Tensor | None:
     """``[N]`` bool, the rows of ``values [N, ...]`` with a value that is not finite; None if there
     is none.
     """
-    bad = spoilt_rows({"": values})
+    bad = nonfinite_rows({"": values})
     return bad if bool(bad.any()) else None
 
 
-def spoilt_rows(gradients: dict[str, Tensor]) -> Tensor:
+def nonfinite_rows(gradients: dict[str, Tensor]) -> Tensor:
     """``[N]`` bool, the rows that are bad in any of the gradients ``[N, ...]``."""
     tensors = list(gradients.values())  # their sums take one pass without extra memory
     if tensors[0].device.type == "cpu" and all(bool(tensor.sum().isfinite()) for tensor in tensors):

@@ -25,7 +25,7 @@ from clod_adapter.adapter import detach
 from clod_adapter.cameras import Camera, looking, near_plane
 from clod_adapter.config import require
 from clod_adapter.errors import ClodError
-from clod_adapter.gaussians import SH_C0, Gaussians, spoilt_rows
+from clod_adapter.gaussians import SH_C0, Gaussians, nonfinite_rows
 from clod_adapter.initialization.importance import coverage
 from clod_adapter.progress import Listener, Phase, tell
 from clod_adapter.render import splat
@@ -84,20 +84,20 @@ def place_cameras(
     """
     require(views is None or views >= 1, "views", views, "at least 1")
     placement = _Placement(detach(gaussians), seed, field, progress)
-    found = placement.round(views or VIEWS)
+    cameras = placement.round(views or VIEWS)
     while (
         views is None
-        and len(found) + VIEWS <= MOST
-        and placement.shown_share(found[-VIEWS:]) < SHOWN
+        and len(cameras) + VIEWS <= MOST
+        and placement.shown_share(cameras[-VIEWS:]) < SHOWN
     ):
         try:
-            found += placement.round(VIEWS)
+            cameras += placement.round(VIEWS)
         except ClodError:  # what is left cannot be shown
             break
-    for k, camera in enumerate(found):
+    for k, camera in enumerate(cameras):
         K = _intrinsics(float(camera.K[0, 0]) / camera.width, WIDTH, HEIGHT)
-        found[k] = replace(camera, K=K, width=WIDTH, height=HEIGHT, name=f"placed_{k:03}")
-    return found
+        cameras[k] = replace(camera, K=K, width=WIDTH, height=HEIGHT, name=f"placed_{k:03}")
+    return cameras
 
 
 class _Placement:
@@ -134,7 +134,8 @@ class _Placement:
                 scored.append((_score(self.few, self.growth, camera, self.reach), camera))
                 tell(self.progress, Phase.CAMERAS, start + len(scored), start + 2 * tries)
             return sorted(
-                (each for each in scored if each[0] > -math.inf), key=lambda each: -each[0]
+                (candidate for candidate in scored if candidate[0] > -math.inf),
+                key=lambda candidate: -candidate[0],
             )
 
         good = ranked(self._towards(tries))[: max(round(BEST * tries), 1)]
@@ -142,10 +143,10 @@ class _Placement:
             raise ClodError(
                 "no camera can be placed: the checkpoint is empty from every candidate camera"
             )
-        least, found = good[-1][0], ranked(self._beside([camera for _, camera in good], tries))
+        least, candidates = good[-1][0], ranked(self._beside([camera for _, camera in good], tries))
         self.judged += len(scored)
-        enough = max(views, sum(value >= least for value, _ in found))
-        return self._spread([camera for _, camera in found[:enough]], views)
+        enough = max(views, sum(value >= least for value, _ in candidates))
+        return self._spread([camera for _, camera in candidates[:enough]], views)
 
     def _towards(self, count: int) -> Iterator[Camera]:
         """Cameras towards rows, preferably small opaque ones, from uniform directions, at half to
@@ -155,8 +156,8 @@ class _Placement:
         # torch.multinomial has a limit of 2^24 weights.
         interest = self.weight * self.hidden / self.few.scales.amax(1).clamp(min=1e-12)
         ends = interest.double().cumsum(0).cpu()  # cameras are placed on the CPU
-        drawn = torch.searchsorted(ends, random(count, dtype=torch.float64) * ends[-1])
-        targets = means[drawn.clamp(max=len(means) - 1).to(means.device)].cpu()
+        rows = torch.searchsorted(ends, random(count, dtype=torch.float64) * ends[-1])
+        targets = means[rows.clamp(max=len(means) - 1).to(means.device)].cpu()
         sides = F.normalize(
             torch.randn(count, 3, generator=self.generator, dtype=torch.float32), dim=1
         )
@@ -178,12 +179,12 @@ class _Placement:
         places = torch.stack(
             [torch.cat([c.position / self.reach, c.viewmat[2, :3]]) for c in cameras]
         )
-        taken = [0]
+        chosen = [0]
         gap = (places - places[0]).norm(dim=1)
-        while len(taken) < min(count, len(cameras)):
-            taken.append(int(gap.argmax()))
-            gap = gap.minimum((places - places[taken[-1]]).norm(dim=1))
-        return [cameras[k] for k in taken]
+        while len(chosen) < min(count, len(cameras)):
+            chosen.append(int(gap.argmax()))
+            gap = gap.minimum((places - places[chosen[-1]]).norm(dim=1))
+        return [cameras[k] for k in chosen]
 
     def shown_share(self, cameras: Sequence[Camera]) -> float:
         """The share of the Gaussians, by opacity, that these cameras and those before show: COVERED
@@ -200,7 +201,7 @@ def _usable(gaussians: Gaussians) -> Tensor:
     Gaussian.
     """
     others = {n: v for n, v in gaussians.tensors().items() if n != "opacity_logits"}
-    rows = (gaussians.opacities > VISIBLE) & ~spoilt_rows(others)
+    rows = (gaussians.opacities > VISIBLE) & ~nonfinite_rows(others)
     if not rows.any():
         raise ClodError(
             "no camera can be placed: the checkpoint has no Gaussian that is visible and finite"
@@ -247,8 +248,8 @@ def _sample(gaussians: Gaussians, rows: Tensor, seed: int) -> tuple[Gaussians, T
     random = torch.rand(
         len(rows), generator=torch.Generator().manual_seed(seed), dtype=torch.float64
     )
-    drawn = random.to(share.device) < share
-    return gaussians.select(rows[drawn]).without_empty_bands(), share[drawn].rsqrt().to(
+    selected = random.to(share.device) < share
+    return gaussians.select(rows[selected]).without_empty_bands(), share[selected].rsqrt().to(
         gaussians.means
     )
 

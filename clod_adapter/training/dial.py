@@ -79,7 +79,7 @@ class Dial(nn.Module):
         super().__init__()
         assert start.sigma_d is not None and start.attenuation is not None
         # a ParameterDict that is an attribute would be a part of the module
-        self._given = (splats,)
+        self._splats = (splats,)
         # Far Gaussians come first: they alone are trained, and their target counts are shares of
         # the near ones' number.
         self.trained, self.total = len(start), len(start)
@@ -99,7 +99,7 @@ class Dial(nn.Module):
             : self.trained
         ]
         self.register_buffer("typical", typical, persistent=False)
-        self._own_size = float(own_sizes(start.log_scales).median())
+        self._median_size = float(own_sizes(start.log_scales).median())
         self.sampler, self._sampled = ViewSampler((), config, self.schedule), 0
 
     @staticmethod
@@ -138,13 +138,15 @@ class Dial(nn.Module):
             ClodError: ``splats``, and none requires a gradient, as of a file that was read.
         """
         rates = learning_rates(self.config, self.decay)
-        rates["means"] *= self._own_size  # an optimizer has one rate for all rows
-        found: dict[str, Any] = dict(self.named_parameters())
+        rates["means"] *= self._median_size  # an optimizer has one rate for all rows
+        parameters: dict[str, Any] = dict(self.named_parameters())
         if splats:
-            (given,) = self._given
-            own = given.tensors() if isinstance(given, Gaussians) else given
+            (attached,) = self._splats
+            candidates = attached.tensors() if isinstance(attached, Gaussians) else attached
             tuned = {
-                name: value for name, value in own.items() if getattr(value, "requires_grad", False)
+                name: value
+                for name, value in candidates.items()
+                if getattr(value, "requires_grad", False)
             }
             if not tuned:
                 raise ClodError(
@@ -152,9 +154,9 @@ class Dial(nn.Module):
                     " out splats=True"
                 )
             # growth_d is the dial's own
-            found |= {name: value for name, value in tuned.items() if name not in found}
+            parameters |= {name: value for name, value in tuned.items() if name not in parameters}
         groups = []
-        for name, value in found.items():
+        for name, value in parameters.items():
             rate = rates.get(ATTRIBUTE_OF.get(name, name))
             if rate is not None:
                 groups.append({"params": [value], "lr": rate, "name": name})
@@ -192,10 +194,10 @@ class Dial(nn.Module):
         Args:
             rendering_loss: 0-d, of an image rendered at s.
         """
-        found = self.weight(virtual_scale) * rendering_loss
+        total = self.weight(virtual_scale) * rendering_loss
         for at, loss in self.counts(virtual_scale, self.sampler.counted(), rendering_loss):
-            found = found + self.count_loss(at, loss)
-        return found
+            total = total + self.count_loss(at, loss)
+        return total
 
     def weight(self, virtual_scale: float) -> float:
         """``w_s = max(0, 1 - k s / max_sv)^2``, the weight of the loss at the dial value s."""
@@ -212,15 +214,15 @@ class Dial(nn.Module):
         """
         if counted is None:
             return []
-        here = [(virtual_scale, self.weight(virtual_scale) * loss)] if virtual_scale >= 1 else []
-        return [*here, (counted, loss)]
+        at_virtual_scale = (
+            [(virtual_scale, self.weight(virtual_scale) * loss)] if virtual_scale >= 1 else []
+        )
+        return [*at_virtual_scale, (counted, loss)]
 
     def objective(
-        self, loss: Tensor, shown: Gaussians, camera: Camera, virtual_scale: float
+        self, loss: Tensor, gaussians: Gaussians, camera: Camera, virtual_scale: float
     ) -> Tensor:
-        """0-d, what ``adapt`` differentiates, of the photometric loss of a rendering of
-        ``shown``.
-        """
+        """0-d, what ``adapt`` differentiates: the weighted photometric ``loss`` of a rendering."""
         return self.weight(virtual_scale) * loss
 
     def count_loss(self, virtual_scale: float, rendering_loss: Tensor) -> Tensor:
@@ -260,8 +262,8 @@ class Dial(nn.Module):
         Raises:
             ClodError: their number has changed.
         """
-        (given,) = self._given
-        current = given if isinstance(given, Gaussians) else from_gsplat(given)
+        (splats,) = self._splats
+        current = splats if isinstance(splats, Gaussians) else from_gsplat(splats)
         count = len(getattr(self, self.decay))
         if len(current) != count:
             raise ClodError(
@@ -312,9 +314,10 @@ def attach(
     config = replace(config or AdaptConfig(), **settings)
     if config.form != "ours":
         raise ClodError(f"attach has no form {config.form}: call adapt, or leave the form out")
-    given = scene.train if isinstance(scene, Scene) else scene
+    views_or_cameras = scene.train if isinstance(scene, Scene) else scene
     views = tuple(
-        each if isinstance(each, View) else StoredView(each, _no_photograph) for each in given
+        item if isinstance(item, View) else StoredView(item, _no_photograph)
+        for item in views_or_cameras
     )
     base = splats if isinstance(splats, Gaussians) else from_gsplat(splats)
     base = base.replace(**{name: value.detach() for name, value in base.tensors().items()})

@@ -57,19 +57,19 @@ class ProcessGroup:
 
     def agree(self, share_done: float, going: bool) -> tuple[float, bool]:
         """The first process's ``share_done``, and whether all processes continue."""
-        said = torch.tensor(
+        numbers = torch.tensor(
             [share_done if self.rank == 0 else -math.inf, 0.0 if going else 1.0],
             dtype=torch.float64,
         )
-        self._meet(said, "MAX")
-        return float(said[0]), not said[1]
+        self._meet(numbers, "MAX")
+        return float(numbers[0]), not numbers[1]
 
-    def sum(self, own: GradientSum) -> GradientSum:
+    def sum(self, total: GradientSum) -> GradientSum:
         """The sum over all processes; overwrites the gradients given."""
-        loss = torch.tensor([float(own.loss), own.views], dtype=torch.float64)
+        loss = torch.tensor([float(total.loss), total.views], dtype=torch.float64)
         self._meet(loss)
-        gradients = {name: gradient.contiguous() for name, gradient in own.gradients.items()}
-        kept = own.kept.to(torch.uint8)
+        gradients = {name: gradient.contiguous() for name, gradient in total.gradients.items()}
+        kept = total.kept.to(torch.uint8)
         # All at once and in place. Sending only the rows kept, or one packed message, takes longer:
         # on loopback a million Gaussians take 80 ms, packed 150 ms, only the rows kept 300 ms.
         with self._timed("exchanging"):
@@ -97,22 +97,22 @@ class ProcessGroup:
             sent = torch.empty(int(size), dtype=torch.uint8)
             if self.rank == 0:
                 sent = torch.frombuffer(file.getbuffer(), dtype=torch.uint8)
-            for part in sent.split(CHUNK):
-                dist.broadcast(part, 0)
+            for chunk in sent.split(CHUNK):
+                dist.broadcast(chunk, 0)
         if self.rank == 0:
             return value
         return cast(
             T, torch.load(io.BytesIO(sent.numpy().data), map_location="cpu", weights_only=False)
         )
 
-    def _meet(self, said: Tensor | None = None, how: str = "SUM") -> None:
+    def _meet(self, numbers: Tensor | None = None, operation: str = "SUM") -> None:
         """Waits for all processes and reduces a few numbers, on the CPU: gloo reports a lost
         process at once.
         """
         with self._timed("waiting"):
             dist.all_reduce(
-                torch.zeros(1, dtype=torch.float32) if said is None else said,
-                getattr(dist.ReduceOp, how),
+                torch.zeros(1, dtype=torch.float32) if numbers is None else numbers,
+                getattr(dist.ReduceOp, operation),
             )
 
     @contextmanager
@@ -181,5 +181,5 @@ def _losses() -> Iterator[None]:
     except (torch.cuda.OutOfMemoryError, ProcessLost):
         raise
     except RuntimeError as error:
-        what = re.sub(r"^\[[^]]*\] *", "", str(error).partition("\n")[0]).partition(". ")[0]
-        raise ProcessLost(f"a process of the group has ended ({what})") from error
+        reason = re.sub(r"^\[[^]]*\] *", "", str(error).partition("\n")[0]).partition(". ")[0]
+        raise ProcessLost(f"a process of the group has ended ({reason})") from error

@@ -136,8 +136,8 @@ def _initialized(
 ) -> Gaussians:
     """What training begins with: of a group, which may round differently, the first process's."""
     start = for_training(form_of(config).begin(reduced, views, config, progress))
-    found: Any = {name: getattr(start, name) for name in (*start.tensors(), "attenuation")}
-    return start.replace(**(group.broadcast(found) if group else found)).to(reduced.means.device)
+    fields: Any = {name: getattr(start, name) for name in (*start.tensors(), "attenuation")}
+    return start.replace(**(group.broadcast(fields) if group else fields)).to(reduced.means.device)
 
 
 def _train(trainer: Trainer, progress: Listener | None) -> Adapted:
@@ -177,8 +177,8 @@ def _train(trainer: Trainer, progress: Listener | None) -> Adapted:
             tell(lost)
         except LossNotFinite as error:
             if trainer.done == 0:
-                more = largest_colour(trainer.gaussians())
-                raise ClodError(f"{error}, so nothing can be learned; {more}") from error
+                remedy = largest_colour(trainer.gaussians())
+                raise ClodError(f"{error}, so nothing can be learned; {remedy}") from error
             going, failed = False, str(error)
             tell(failed)
         trainer.seconds = time.perf_counter() - began
@@ -194,19 +194,19 @@ def _train(trainer: Trainer, progress: Listener | None) -> Adapted:
         lost,
         *waited,
         failed,
-        int(trainer.held.sum()),
+        int(trainer.ever_nonfinite.sum()),
         signalled,
     )
 
 
 def _progress(trainer: Trainer, error: str | None = None) -> Progress:
-    used = trainer.seconds / (trainer.config.time_budget or math.inf)
+    time_share = trainer.seconds / (trainer.config.time_budget or math.inf)
     return Progress(
         Phase.TRAINING,
         trainer.done,
         trainer.config.steps,
         trainer.seconds,
-        used,
+        time_share,
         trainer.loss,
         trainer.gaussians,
         trainer.state,

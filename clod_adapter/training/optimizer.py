@@ -53,9 +53,9 @@ class RowAdam:
         units: dict[str, Tensor] | None = None,
     ):
         self.parameters = parameters
-        one = torch.ones(1, dtype=torch.float32)
+        no_scaling = torch.ones(1, dtype=torch.float32)
         self._units = {
-            name: (units or {}).get(name, one.to(p.device)) for name, p in parameters.items()
+            name: (units or {}).get(name, no_scaling.to(p.device)) for name, p in parameters.items()
         }
         self.beta1, self.beta2, self.epsilon = beta1, beta2, epsilon
         self.moments = dict[str, dict[str, Tensor]]()
@@ -92,19 +92,19 @@ class RowAdam:
         for name, parameter in self.parameters.items():
             tensors = (
                 parameter,
-                *(each[name] for each in self.moments.values()),
+                *(moments[name] for moments in self.moments.values()),
                 gradients[name].contiguous(),
             )
             flat = [x.view(len(x), math.prod(x.shape[1:])).numpy() for x in tensors]
             counted = 0 if jobs else 1
-            own = (
+            row_arrays = (
                 rows.numpy(),
                 self.steps.numpy(),
                 counted,
                 self._corrections.numpy(),
                 self._units[name].numpy(),
             )
-            jobs.append((*flat, *own, rates[name]))
+            jobs.append((*flat, *row_arrays, rates[name]))
 
         def adam(worker: int, workers: int) -> None:
             for job in jobs:
@@ -124,13 +124,17 @@ class RowAdam:
         ].unsqueeze(2)
         for name, parameter in self.parameters.items():
             values = (parameter, *(each[name] for each in self.moments.values()))
-            x, first, second = (each.view(len(each), math.prod(each.shape[1:])) for each in values)
-            gradient = gradients[name].reshape(x.shape)
+            flat_parameter, first, second = (
+                each.view(len(each), math.prod(each.shape[1:])) for each in values
+            )
+            gradient = gradients[name].reshape(flat_parameter.shape)
             lengths = length * self._units[name][:, None]
             m = self.beta1 * first + (1 - self.beta1) * gradient
             v = self.beta2 * second + (1 - self.beta2) * gradient * gradient
-            moved = x - rates[name] * lengths * m / (v.sqrt() * correction + self.epsilon)
-            for old, new in ((first, m), (second, v), (x, moved)):
+            moved = flat_parameter - rates[name] * lengths * m / (
+                v.sqrt() * correction + self.epsilon
+            )
+            for old, new in ((first, m), (second, v), (flat_parameter, moved)):
                 old.copy_(torch.where(rows[:, None], new, old))
 
 

@@ -71,17 +71,21 @@ class PaperDial(Dial):
         return sigma_d.detach().float().clamp(*SIGMA_RANGE)
 
     def objective(
-        self, loss: Tensor, shown: Gaussians, camera: Camera, virtual_scale: float
+        self, loss: Tensor, gaussians: Gaussians, camera: Camera, virtual_scale: float
     ) -> Tensor:
         if self.config.reg_weight > 0 and virtual_scale >= 1:
-            loss = loss + self.count_term(shown, camera, virtual_scale)
+            loss = loss + self.count_term(gaussians, camera, virtual_scale)
         return self.weight(virtual_scale) * loss
 
-    def count_term(self, shown: Gaussians, camera: Camera, virtual_scale: float) -> Tensor:
+    def count_term(self, gaussians: Gaussians, camera: Camera, virtual_scale: float) -> Tensor:
         """0-d, ``lambda L_reg``."""
-        assert shown.sigma_d is not None
-        far = normalized_distances(shown.means, camera, self.attenuation).double() * virtual_scale
-        count = soft_count(shown.opacity_logits, shown.sigma_d, far, virtual_scale, SOFTNESS)
+        assert gaussians.sigma_d is not None
+        far = (
+            normalized_distances(gaussians.means, camera, self.attenuation).double() * virtual_scale
+        )
+        count = soft_count(
+            gaussians.opacity_logits, gaussians.sigma_d, far, virtual_scale, SOFTNESS
+        )
         excess = (count - virtual_scale**-self.config.exponent).clamp(min=0)
         return self.config.reg_weight * (virtual_scale - 1) ** 2 * excess**2
 

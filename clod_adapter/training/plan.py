@@ -129,6 +129,6 @@ class Plan:
         return {"decisions": decisions, "seconds": seconds}
 
 
-def psnr_change(this: float, that: float) -> float:
+def psnr_change(psnr: float, reference: float) -> float:
     """dB between two PSNR; 0 where both are infinite."""
-    return 0.0 if this == that else this - that
+    return 0.0 if psnr == reference else psnr - reference

@@ -91,12 +91,14 @@ def _sh_degree(
         return 0, [Decision("SH degrees", "left out", None, "", REQUESTED, "bands")]
     degree, decisions = highest, list[Decision]()
     for band, loss in sh_degree_losses(base, views, LIMIT):
-        what, them = (f"{band}", "it") if band == highest else (f"{band} to {highest}", "them")
-        why = f"change without {them}, {_counted(len(views))}"
+        degrees, pronoun = (
+            (f"{band}", "it") if band == highest else (f"{band} to {highest}", "them")
+        )
+        why = f"change without {pronoun}, {_counted(len(views))}"
         if loss < LIMIT:  # one decision for all that are left out
             degree, decisions = band - 1, []
         verdict = "left out" if loss < LIMIT else "kept"
-        decisions.append(Decision(f"SH degree {what}", verdict, loss, "dB", why, "bands"))
+        decisions.append(Decision(f"SH degree {degrees}", verdict, loss, "dB", why, "bands"))
         tell(progress, Phase.SH_DEGREES, highest - band + 1, highest)
     return degree, decisions
 
@@ -142,17 +144,17 @@ def sh_degree_losses(
     Ends after the first degree that is not below ``limit``. Degrees whose coefficients are all 0
     have effect 0 without rendering.
     """
-    used = base.without_empty_bands().sh_degree
-    yield from ((degree, 0.0) for degree in range(base.sh_degree, used, -1))
+    highest = base.without_empty_bands().sh_degree
+    yield from ((degree, 0.0) for degree in range(base.sh_degree, highest, -1))
 
     def quality(degree: int) -> list[float]:
-        less = base.without_bands(degree)
-        return [psnr(render(less, view.camera).image, view.image) for view in views]
+        reduced = base.without_bands(degree)
+        return [psnr(render(reduced, view.camera).image, view.image) for view in views]
 
-    with_all = quality(used) if used else []
-    for degree in range(used, 0, -1):
+    expected = quality(highest) if highest else []
+    for degree in range(highest, 0, -1):
         change = fmean(
-            abs(psnr_change(a, b)) for a, b in zip(with_all, quality(degree - 1), strict=True)
+            abs(psnr_change(a, b)) for a, b in zip(expected, quality(degree - 1), strict=True)
         )
         yield degree, change
         if not change < limit:

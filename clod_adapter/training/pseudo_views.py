@@ -145,12 +145,12 @@ def add_pseudo_views(
     photographs = scene.train
     if not 0 < len(photographs) < MANY:
         return scene
-    each = max(min(NEAR, ADDED // 2 // len(photographs)), 1)
+    nearby = max(min(NEAR, ADDED // 2 // len(photographs)), 1)
     few = f"only {len(photographs)} photographs to train on"
     try:
         placed = place_cameras(
             gaussians,
-            views=max(ADDED - each * len(photographs), ADDED // 2),
+            views=max(ADDED - nearby * len(photographs), ADDED // 2),
             seed=seed,
             field=_field(photographs[0].camera),
             progress=progress,
@@ -160,16 +160,16 @@ def add_pseudo_views(
         return replace(scene, notes=(*scene.notes, note))
     teacher = gaussians.without_empty_bands()  # one for all: it may be a copy
     near = _views(teacher, [view.camera for view in photographs], wider=WIDER)
-    own = (*each * near, *_views(teacher, placed))
-    note = f"{few}: {len(own)} pseudo views, the checkpoint's own renderings, are added"
-    return replace(scene, train=(*photographs, *own), notes=(*scene.notes, note))
+    pseudo_views = (*nearby * near, *_views(teacher, placed))
+    note = f"{few}: {len(pseudo_views)} pseudo views, the checkpoint's own renderings, are added"
+    return replace(scene, train=(*photographs, *pseudo_views), notes=(*scene.notes, note))
 
 
 def _views(
     teacher: Gaussians, cameras: Sequence[Camera], *, wider: float = 1.0, backed: float = 0.0
 ) -> list[PseudoView]:
-    found = zip(cameras, reaches(teacher, cameras), strict=True)
-    return [PseudoView(camera, teacher, wider * reach, backed) for camera, reach in found]
+    pairs = zip(cameras, reaches(teacher, cameras), strict=True)
+    return [PseudoView(camera, teacher, wider * reach, backed) for camera, reach in pairs]
 
 
 def reaches(gaussians: Gaussians, cameras: Sequence[Camera]) -> list[float]:
@@ -178,19 +178,19 @@ def reaches(gaussians: Gaussians, cameras: Sequence[Camera]) -> list[float]:
 
     A camera that looks past the scene has the background's.
     """
-    some = gaussians.means[:: len(gaussians) // SAMPLE + 1]
-    medians = [median_distance(some, camera) for camera in cameras]
+    sample = gaussians.means[:: len(gaussians) // SAMPLE + 1]
+    medians = [median_distance(sample, camera) for camera in cameras]
     most = median(medians)
-    return [min(each, most) for each in medians]
+    return [min(distance, most) for distance in medians]
 
 
 def teachers_to(views: Sequence[View], device: str) -> tuple[View, ...]:
     """The views with their teachers on ``device``: equal ones once, as a checkpoint is large."""
-    own = {id(view.teacher): view.teacher for view in views if isinstance(view, PseudoView)}
-    there = {number: teacher.to(device) for number, teacher in own.items()}
+    teachers = {id(view.teacher): view.teacher for view in views if isinstance(view, PseudoView)}
+    on_device = {number: teacher.to(device) for number, teacher in teachers.items()}
     return tuple(
         (
-            PseudoView(view.camera, there[id(view.teacher)], view.reach, view.backed)
+            PseudoView(view.camera, on_device[id(view.teacher)], view.reach, view.backed)
             if isinstance(view, PseudoView)
             else view
         )

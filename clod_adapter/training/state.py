@@ -58,11 +58,11 @@ class TrainingState:
                 "the training state has impossible counts of steps or seconds; start over"
             )
 
-    def check(self, own: dict[str, Tensor]) -> None:
-        """Refuses a state of another run than that with tensors ``own``, and values that training
-        cannot produce.
+    def check(self, expected: dict[str, Tensor]) -> None:
+        """Refuses a state of another run than that with tensors ``expected``, and values that
+        training cannot produce.
         """
-        if _layout(own) != _layout(self.tensors):
+        if _layout(expected) != _layout(self.tensors):
             raise StateRefused(OTHER_RUN)
         for name, values in self.tensors.items():
             kind, _, attribute = name.partition(".")
@@ -73,7 +73,7 @@ class TrainingState:
             elif kind == "first":  # Adam's is at most 7.3 times the root of the second
                 sound = values.abs() <= 10 * self.tensors[f"second.{attribute}"].sqrt() + 1e-15
             else:  # an infinite opacity does not change
-                sound = values.isfinite() | (values == own[f"parameter.{attribute}"])
+                sound = values.isfinite() | (values == expected[f"parameter.{attribute}"])
             if not bool(sound.all()):
                 raise StateRefused(
                     f"the training state has impossible values of {name}; start over"
@@ -118,17 +118,17 @@ class Adapted:
     @property
     def notes(self) -> list[str]:
         """What ended training early, and what it did not move, a line each."""
-        found = list[str]()
+        lines = list[str]()
         if self.lost:
-            found.append(f"training ended at step {self.steps}: {self.lost}")
+            lines.append(f"training ended at step {self.steps}: {self.lost}")
         if self.failed:
-            found.append(f"training ended early, and the result so far is written: {self.failed}")
+            lines.append(f"training ended early, and the result so far is written: {self.failed}")
         if self.held:
-            found.append(
+            lines.append(
                 f"{self.held:,} Gaussians were not moved by some steps: their gradients were not"
                 " finite"
             )
-        return found
+        return lines
 
     def __repr__(self) -> str:
         ended = ", interrupted" if self.interrupted else ""

@@ -15,7 +15,7 @@ from clod_adapter.cameras import View
 from clod_adapter.config import AdaptConfig
 from clod_adapter.equation.units import in_world_units
 from clod_adapter.errors import ClodError
-from clod_adapter.gaussians import Gaussians, LossNotFinite, require_finite, spoilt_rows
+from clod_adapter.gaussians import Gaussians, LossNotFinite, nonfinite_rows, require_finite
 from clod_adapter.losses import photometric_loss
 from clod_adapter.rasterizers import for_device
 from clod_adapter.training.distributed import ProcessGroup
@@ -47,11 +47,11 @@ class Trainer:
         count: the number of trained rows, the first ones.
         parameters: tensors by name, those of the dial too; ``stepped``: names of those that are
             trained.
-        mean: of the trained parameters over the last steps, by the schedule; averaged: how many
-            steps it has.
+        mean: the mean of the trained parameters over the last steps, by the schedule; averaged: how
+            many steps it has.
         loss: running mean of the photometric loss, NaN before the first step.
-        held: ``[trained]`` bool, rows that some step did not move because their gradient was not
-            finite.
+        ever_nonfinite: ``[trained]`` bool, rows that some step did not move because their gradient
+            was not finite.
     """
 
     def __init__(
@@ -62,7 +62,7 @@ class Trainer:
         group: ProcessGroup | None = None,
         empty_sh: Tensor | None = None,
     ) -> None:
-        # of the result's rows, where far ones come first in training
+        # Places of the result's rows in training, where far ones come first.
         self.order: Tensor | None = None
         if start.near is not None:
             far_first = start.near.int().argsort(stable=True)
@@ -89,17 +89,17 @@ class Trainer:
         self.config, self.group, self.count = config, group, self.dial.trained
         self.sampler = ViewSampler(views, config, self.dial.schedule)
         self.screen_filter = start.screen_filter
-        # Of culled Gaussians too the count term has a gradient.
+        # The count term has a gradient of culled Gaussians too.
         everywhere = {self.dial.decay, *self.dial.everywhere}
-        parts = {"kept": dict[str, Tensor](), "all": {}}
+        parameters_by_rows = {"kept": dict[str, Tensor](), "all": {}}
         for name, value in self.trained().items():
-            parts["all" if name in everywhere else "kept"][name] = value
+            parameters_by_rows["all" if name in everywhere else "kept"][name] = value
         beta1, beta2 = BETA1**config.batch, BETA2**config.batch
         units = {"means": own_sizes(start.log_scales[: self.count])}
         self.optimizers = {
-            rows: RowAdam(p, beta1=beta1, beta2=beta2, units=units)
-            for rows, p in parts.items()
-            if p
+            rows: RowAdam(parameters, beta1=beta1, beta2=beta2, units=units)
+            for rows, parameters in parameters_by_rows.items()
+            if parameters
         }
         self.empty_sh = empty_sh
         self.done = 0
@@ -108,7 +108,7 @@ class Trainer:
         self.loss = math.nan
         self.mean: dict[str, Tensor] = {}
         self.averaged = 0
-        self.held = torch.zeros(self.count, dtype=torch.bool, device=start.means.device)
+        self.ever_nonfinite = torch.zeros(self.count, dtype=torch.bool, device=start.means.device)
         self._updating = False
 
     @torch_on_one_thread()
@@ -166,39 +166,42 @@ class Trainer:
             name: value.detach().requires_grad_(name in self.stepped)
             for name, value in self.parameters.items()
         }
-        shown = self._assembled(leaves)
+        gaussians = self._assembled(leaves)
         if halved:
-            shown = shown.replace(screen_filter=self.screen_filter.halved())
-        rasterizer = for_device(shown.means.device)
-        kept = rasterizer.kept(shown, view.camera, s)[first]
-        image = rasterizer.draw(shown, view.camera, s, trained=self.count)[0]
+            gaussians = gaussians.replace(screen_filter=self.screen_filter.halved())
+        rasterizer = for_device(gaussians.means.device)
+        kept = rasterizer.kept(gaussians, view.camera, s)[first]
+        image = rasterizer.draw(gaussians, view.camera, s, trained=self.count)[0]
         loss = photometric_loss(image, view.image, self.config.ssim_weight)
-        total = self.dial.objective(loss, shown, view.camera, s)
-        found = torch.autograd.grad(total, [leaves[name] for name in self.stepped])
+        total = self.dial.objective(loss, gaussians, view.camera, s)
+        stepped_gradients = torch.autograd.grad(total, [leaves[name] for name in self.stepped])
         gradients = {
-            name: gradient[first] for name, gradient in zip(self.stepped, found, strict=True)
+            name: gradient[first]
+            for name, gradient in zip(self.stepped, stepped_gradients, strict=True)
         }
-        plain, decay = loss.detach().double(), self.dial.decay
+        unweighted, decay = loss.detach().double(), self.dial.decay
         parameter = self.parameters[decay][first]
-        for at, weighted in self.dial.counts(s, counted, plain):
-            gradients[decay] = gradients[decay] + self.dial.count_gradient(parameter, at, weighted)
-        return GradientSum(gradients, kept, plain)
+        for counted_dial, weighted in self.dial.counts(s, counted, unweighted):
+            gradients[decay] = gradients[decay] + self.dial.count_gradient(
+                parameter, counted_dial, weighted
+            )
+        return GradientSum(gradients, kept, unweighted)
 
     def _update(self, total: GradientSum, share_done: float) -> None:
         """Moves the rows whose gradients are finite; none if the loss is not, without asking
         which.
         """
-        learned = torch.as_tensor(total.loss).isfinite()
-        spoilt = spoilt_rows(total.gradients)
-        self.held |= learned & spoilt
-        finite = spoilt.logical_not_().logical_and_(learned)
+        loss_finite = torch.as_tensor(total.loss).isfinite()
+        nonfinite = nonfinite_rows(total.gradients)
+        self.ever_nonfinite |= loss_finite & nonfinite
+        finite = nonfinite.logical_not_().logical_and_(loss_finite)
         rates = {
             name: rate * self.dial.schedule.lr_final**share_done
             for name, rate in self.rates.items()
         }
-        moved = {"kept": total.kept.logical_and_(finite), "all": finite}
+        moved_rows = {"kept": total.kept.logical_and_(finite), "all": finite}
         for rows, optimizer in self.optimizers.items():
-            optimizer.step(total.gradients, moved[rows], rates)
+            optimizer.step(total.gradients, moved_rows[rows], rates)
         self.dial.clamp()
 
     def state(self) -> TrainingState:

@@ -84,7 +84,9 @@ def test_an_interrupt_within_the_update_completes_the_step(monkeypatch):
     given = *capture(60, views=4, width=16, height=12), AdaptConfig(iters=12, max_sv=3.0)
     whole = adapt(*given).gaussians
     states = []
-    monkeypatch.setattr(trainer, "spoilt_rows", pressing(trainer.spoilt_rows, signal.SIGINT, at=5))
+    monkeypatch.setattr(
+        trainer, "nonfinite_rows", pressing(trainer.nonfinite_rows, signal.SIGINT, at=5)
+    )
     found = adapt(*given, lambda now: states.append(now.state) if now.state else None)
     assert found.interrupted and found.signalled and found.steps == 5
     assert_equal(adapt(*given, resume=states[-1]()).gaussians, whole)
