@@ -92,7 +92,7 @@ def _description(path: Path, metadata: dict[str, str]) -> tuple[dict[str, Any], 
         )
     about = parse_document(path, metadata[KEY], ADAPTER)
     with refused_if_damaged(path, *DAMAGED):
-        for name, wanted in (("base_sha256", str), ("package_version", str), ("config", dict)):
-            if not isinstance(about[name], wanted):
-                raise TypeError(f"{name} is {about[name]!r:.40}, not a {wanted.__name__}")
+        for name, kind in (("base_sha256", str), ("package_version", str), ("config", dict)):
+            if not isinstance(about[name], kind):
+                raise TypeError(f"{name} is {about[name]!r:.40}, not a {kind.__name__}")
     return about, read_metadata(path, about, dial=True)

@@ -143,8 +143,8 @@ def _replace(targets: Sequence[Path], temporaries: Sequence[Path]) -> None:
     """Renames all; where one cannot be, those before it are again what they were."""
     earlier = {target: _temporary(target) for target in targets[:-1] if target.exists()}
     try:
-        for target, kept in earlier.items():
-            _keep(target, kept)
+        for target, backup in earlier.items():
+            _keep(target, backup)
         # One call from C, so that no Ctrl-C comes between two of them.
         list(map(os.replace, list(map(str, temporaries)), list(map(str, targets))))
     except OSError:
@@ -155,16 +155,16 @@ def _replace(targets: Sequence[Path], temporaries: Sequence[Path]) -> None:
                 _remove(target)
         raise
     finally:
-        for kept in earlier.values():
-            _remove(kept)
+        for backup in earlier.values():
+            _remove(backup)
 
 
-def _keep(target: Path, kept: Path) -> None:
+def _keep(target: Path, backup: Path) -> None:
     """Gives the file a second name, or where the file system has no links, a copy."""
     try:
-        os.link(target, kept)
+        os.link(target, backup)
     except OSError:
-        shutil.copy2(target, kept)
+        shutil.copy2(target, backup)
 
 
 def _flush(path: Path) -> None:

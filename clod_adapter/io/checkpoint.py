@@ -89,11 +89,11 @@ class Checkpoint:
         if self.calibration is None:
             return []
         size = self.calibration.width, self.calibration.height
-        seen = [viewpoint for viewpoint in self.viewpoints if viewpoint.fov > 0]
+        looking = [viewpoint for viewpoint in self.viewpoints if viewpoint.fov > 0]
         return with_near_planes(
             [
                 camera_of(viewpoint, *size, f"viewpoint {number}")
-                for number, viewpoint in enumerate(seen, start=1)
+                for number, viewpoint in enumerate(looking, start=1)
             ]
         )
 
@@ -210,10 +210,10 @@ def plausibility(arrays: Mapping[str, np.ndarray], config: AttenuationConfig) ->
         return []
     means, sigma_d = (torch.from_numpy(arrays[name]) for name in ("means", SIGMA))
     d = nominal_distance(means, config)
-    kept = reach_fade(sigma_d, torch.full_like(sigma_d, d, dtype=torch.float64))[1]
-    share = float(kept.double().mean())
-    read = f"read as sigma_d in world units: keeps {share:.0%} at s = 1"
-    about = f"its dial is not described in the file; {read} from {d:.3g} away"
+    is_kept = reach_fade(sigma_d, torch.full_like(sigma_d, d, dtype=torch.float64))[1]
+    share = float(is_kept.double().mean())
+    reading = f"read as sigma_d in world units: keeps {share:.0%} at s = 1"
+    about = f"its dial is not described in the file; {reading} from {d:.3g} away"
     if share < DOUBTFUL:
         remedy = "give the file as clod-adapt wrote it, before another tool rewrote or rescaled it"
         return [f"{WARNING}{about}, likely not what was adapted; {remedy}"]

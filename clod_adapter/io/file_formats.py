@@ -122,8 +122,8 @@ def read_source(path: Path) -> Source:
         _call("ranks.check_ranks", path, ranks)
     if len(ranks) < 2:
         return source
-    parts = [source if rank == path else _read(rank) for rank in ranks.values()]
-    joined: Source = _call("ranks.joined", path, parts)
+    sources = [source if rank == path else _read(rank) for rank in ranks.values()]
+    joined: Source = _call("ranks.joined", path, sources)
     return joined
 
 
@@ -277,15 +277,15 @@ def refuse_known(path: Path, start: bytes) -> None:
     if not start:
         raise ClodError(f"{path}: is empty; copy or export it again")
     text = start.lstrip()[:64].lower()
-    for magic, what, remedy in CONTENTS:
+    for magic, content, remedy in CONTENTS:
         if text.startswith(magic):
-            raise ClodError(f"{path}: is {what}; {remedy}")
+            raise ClodError(f"{path}: is {content}; {remedy}")
 
 
 def refuse(path: Path, start: bytes, otherwise: str) -> NoReturn:
     """Refuses a file, with its kind by the tables, or else with the message ``otherwise``."""
     refuse_known(path, start)
-    for key, (what, remedy) in OTHERS.items():
+    for key, (content, remedy) in OTHERS.items():
         if key == path.suffix.lower() or (isinstance(key, bytes) and start.startswith(key)):
-            raise ClodError(f"{path}: is {what}; {remedy.format(suffix=path.suffix)}")
+            raise ClodError(f"{path}: is {content}; {remedy.format(suffix=path.suffix)}")
     raise ClodError(f"{path}: {otherwise}")

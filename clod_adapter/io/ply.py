@@ -254,9 +254,9 @@ def sh_degree_of(path: Path, header: PlyData) -> int:
     degree = degree_of(path, sum(re.fullmatch(r"f_rest_\d+", name) is not None for name in types))
     for name in chain(*column_map(degree).values()):
         if types.get(name) not in ("f4", "f8"):
-            what = "is not float or double" if name in types else "is missing"
+            fault = "is not float or double" if name in types else "is missing"
             raise ClodError(
-                f"{path}: property {name} {what}; export the file again in Inria's 3DGS layout"
+                f"{path}: property {name} {fault}; export the file again in Inria's 3DGS layout"
             )
     if lists := [name for name, kind in types.items() if kind == "list"]:
         raise ClodError(

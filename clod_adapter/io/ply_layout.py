@@ -101,8 +101,8 @@ def with_harmonics(rows: np.ndarray) -> np.ndarray:
 def inria_dtype(sh_degree: int, dial: Iterable[str] = ()) -> np.dtype:
     """The rows that Inria's trainer writes, normals included, and the dial's columns."""
     groups = column_map(sh_degree)
-    rest = (f"f_rest_{k}" for k in range(len(groups["shN"])))  # the map lists them by coefficient
-    names = [*groups["means"], "nx", "ny", "nz", *groups["sh0"], *rest]
+    higher = (f"f_rest_{k}" for k in range(len(groups["shN"])))  # the map lists them by coefficient
+    names = [*groups["means"], "nx", "ny", "nz", *groups["sh0"], *higher]
     names += [*groups["opacity_logits"], *groups["log_scales"], *groups["quats"], *dial]
     return np.dtype([(name, "f4") for name in names])
 
@@ -256,29 +256,31 @@ def write_rows(
     dial = dial_columns(tensors)
     layout = inria_dtype(gaussians.sh_degree) if base is None else base.dtype
     # growth_d alone is foreign
-    gone = {FILTER_3D, *((SIGMA, GROWTH, OPACITY) if dial else dial_columns(layout.names or ()))}
-    kept = [name for name in layout.names or () if name not in gone and not name.startswith(COLUMN)]
-    kinds = {name: layout[name] for name in kept}
+    dropped = {FILTER_3D, *((SIGMA, GROWTH, OPACITY) if dial else dial_columns(layout.names or ()))}
+    copied = [
+        name for name in layout.names or () if name not in dropped and not name.startswith(COLUMN)
+    ]
+    kinds = {name: layout[name] for name in copied}
     if any(origin):
         kinds |= dict.fromkeys("xyz", np.dtype("f8"))
     kinds |= dict.fromkeys((*constants, *dial), np.dtype("f4"))
     kind = np.dtype(list(kinds.items()))
     # plyfile makes a header of this without the rows
-    one = np.broadcast_to(np.zeros((), kind), len(gaussians))
-    element = PlyElement.describe(one, "vertex", comments=write_comments(metadata))
+    placeholder = np.broadcast_to(np.zeros((), kind), len(gaussians))
+    element = PlyElement.describe(placeholder, "vertex", comments=write_comments(metadata))
     with open(path, "wb") as file, np.errstate(over="ignore", invalid="ignore"):
         file.write(f"{PlyData([element], byte_order='<').header}\n".encode("ascii"))
         for start in range(0, len(gaussians), ROWS):
-            part = slice(start, start + ROWS)
-            block = np.zeros(len(gaussians.means[part]), kind)
+            rows = slice(start, start + ROWS)
+            block = np.zeros(len(gaussians.means[rows]), kind)
             if base is not None:
-                given = base[part]
-                for name in kept:
-                    block[name][: len(given)] = given[name]
+                base_block = base[rows]
+                for name in copied:
+                    block[name][: len(base_block)] = base_block[name]
             for name, value in constants.items():
                 block[name] = value
             for attribute, group in (column_map(gaussians.sh_degree) | dial).items():
-                values = tensors[attribute][part].float().cpu().numpy().reshape(len(block), -1)
+                values = tensors[attribute][rows].float().cpu().numpy().reshape(len(block), -1)
                 for k, name in enumerate(group):
                     shift = origin[k] if attribute == "means" else 0.0
                     new = values[:, k]

@@ -52,10 +52,10 @@ def check_packed(path: Path, header: PlyData) -> int:
     """The SH degree of such a file, by its header."""
     _require(path, header, "chunk", _RANGES, "f4")
     _require(path, header, "vertex", _BITS, "u4")
-    rest = len(header["sh"].properties) if "sh" in header else 0
-    if rest:
-        _require(path, header, "sh", tuple(f"f_rest_{k}" for k in range(rest)), "u1")
-    return degree_of(path, rest)
+    coefficients = len(header["sh"].properties) if "sh" in header else 0
+    if coefficients:
+        _require(path, header, "sh", tuple(f"f_rest_{k}" for k in range(coefficients)), "u1")
+    return degree_of(path, coefficients)
 
 
 def unpack(path: Path, elements: Mapping[str, np.ndarray], degree: int) -> Arrays:
@@ -80,10 +80,10 @@ def unpack(path: Path, elements: Mapping[str, np.ndarray], degree: int) -> Array
         low, high = (chunks[f"{end}_{name}"][np.arange(count) // BLOCK] for end in _ENDS)
         return low * (1 - share) + high * share  # type: ignore[no-any-return]
 
-    def vectors(what: str, bits: np.ndarray) -> np.ndarray:
+    def vectors(prefix: str, bits: np.ndarray) -> np.ndarray:
         """``[N, 3]`` positions or scales."""
         shares = zip(_AXES, _shares(bits, (11, 10, 11)), strict=True)
-        return np.stack([within(what + axis, share) for axis, share in shares], 1)
+        return np.stack([within(prefix + axis, share) for axis, share in shares], 1)
 
     # ranges that are not finite: their rows are dropped later
     with np.errstate(invalid="ignore", over="ignore"):
@@ -147,7 +147,9 @@ def _rotations(bits: np.ndarray) -> np.ndarray:
     largest = np.sqrt(np.maximum(0, 1 - (small**2).sum(0)))
     missing = bits >> np.uint32(30)
     quats = np.empty((len(bits), 4), np.float32)
-    for part in range(4):
-        stored = np.where(missing > part, small[min(part, 2)], small[max(part - 1, 0)])
-        quats[:, part] = np.where(missing == part, largest, stored)
+    for component in range(4):
+        stored = np.where(
+            missing > component, small[min(component, 2)], small[max(component - 1, 0)]
+        )
+        quats[:, component] = np.where(missing == component, largest, stored)
     return quats

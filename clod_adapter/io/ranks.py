@@ -20,19 +20,19 @@ def ranks_of(path: Path) -> dict[int, Path]:
     """The files of the same checkpoint in its folder, itself too, by rank; empty where its name has
     no rank.
     """
-    named = _NAME.fullmatch(path.name)
-    if not named:
+    match = _NAME.fullmatch(path.name)
+    if not match:
         return {}
-    beside = path.parent.glob(f"{escape(named['before'])}*{escape(named['after'])}")
+    beside = path.parent.glob(f"{escape(match['before'])}*{escape(match['after'])}")
     names = [_NAME.fullmatch(file.name) for file in beside]
     ranks = {int(name["rank"]): path.with_name(name[0]) for name in names if name}
-    return dict(sorted((ranks | {int(named["rank"]): path}).items()))
+    return dict(sorted((ranks | {int(match["rank"]): path}).items()))
 
 
 def check_ranks(path: Path, ranks: dict[int, Path]) -> None:
     """Refuses a checkpoint of which a rank is missing; Grendel-GS has their number in its names."""
-    named = _NAME.fullmatch(path.name)
-    count = max(int((named and named["count"]) or 0), max(ranks) + 1)
+    match = _NAME.fullmatch(path.name)
+    count = max(int((match and match["count"]) or 0), max(ranks) + 1)
     if missing := set(range(count)) - ranks.keys():
         raise ClodError(
             f"{path}: is of a checkpoint of several GPUs, whose rank {min(missing)} is not beside"
@@ -40,19 +40,19 @@ def check_ranks(path: Path, ranks: dict[int, Path]) -> None:
         )
 
 
-def joined(path: Path, parts: Sequence[Source]) -> Source:
+def joined(path: Path, sources: Sequence[Source]) -> Source:
     """The sources of all ranks as one."""
     import numpy as np  # here: names are checked without it
 
-    first = parts[0]
+    first = sources[0]
     with refused_if_damaged(
         path, "does not fit the other ranks beside it", "put those of one run into a folder"
     ):
         arrays = {}
         for name in first.arrays:
-            arrays[name] = np.concatenate([part.arrays[name] for part in parts])
-        parts_rows = [part.rows for part in parts if part.rows is not None]
-        rows = np.concatenate(parts_rows) if parts_rows else None
-    digest = hashlib.sha256("".join(part.sha256 for part in parts).encode()).hexdigest()
-    note = f"its {len(parts)} ranks, in files beside it, are read as one checkpoint"
+            arrays[name] = np.concatenate([source.arrays[name] for source in sources])
+        source_rows = [source.rows for source in sources if source.rows is not None]
+        rows = np.concatenate(source_rows) if source_rows else None
+    digest = hashlib.sha256("".join(source.sha256 for source in sources).encode()).hexdigest()
+    note = f"its {len(sources)} ranks, in files beside it, are read as one checkpoint"
     return first._replace(arrays=arrays, rows=rows, notes=(*first.notes, note), sha256=digest)

@@ -144,8 +144,8 @@ def _calibration(stored: Any, notes: list[str]) -> Calibration | None:
         return None
 
 
-def _note_unknown(stored: Mapping[str, Any], known: Any, notes: list[str]) -> None:
-    if unknown := [name for name in stored if name not in known]:
+def _note_unknown(stored: Mapping[str, Any], known_names: Any, notes: list[str]) -> None:
+    if unknown := [name for name in stored if name not in known_names]:
         notes.append(f"settings unknown to this version ignored: {', '.join(map(repr, unknown))}")
 
 
@@ -187,18 +187,18 @@ def that_fit(lines: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """The lines of a file's history that every output has room for, the last ones first; and a note
     on the others.
     """
-    kept: list[str] = []
+    fitting: list[str] = []
     room = _INHERITED
     for line in reversed(lines):
         if len(line) + _OVERHEAD <= room:
-            kept.append(line)
+            fitting.append(line)
             room -= len(line) + _OVERHEAD
-    gone = len(lines) - len(kept)
+    left_out_count = len(lines) - len(fitting)
     note = (
-        f"{gone} of {len(lines)} comments are not carried over to outputs, which hold"
+        f"{left_out_count} of {len(lines)} comments are not carried over to outputs, which hold"
         f" {_INHERITED:,} characters"
     )
-    return tuple(reversed(kept)), (note,) if gone else ()
+    return tuple(reversed(fitting)), (note,) if left_out_count else ()
 
 
 def matching_calibration(metadata: Metadata, count: int) -> tuple[Calibration | None, list[str]]:
@@ -209,7 +209,7 @@ def matching_calibration(metadata: Metadata, count: int) -> tuple[Calibration | 
     return None, [f"the calibration is of {stored.total} Gaussians and ignored, these are {count}"]
 
 
-def document(kind: str, metadata: Metadata, **more: Any) -> str:
+def document(kind: str, metadata: Metadata, **further: Any) -> str:
     """JSON that ``parse_document`` and ``read_metadata`` invert, without what is not set.
 
     Its keys are sorted, so that equal models give equal files.
@@ -229,7 +229,7 @@ def document(kind: str, metadata: Metadata, **more: Any) -> str:
         values["calibration"] = metadata.calibration.as_dict()
     if metadata.about:
         values["about"] = list(metadata.about)
-    return json.dumps(values | more, sort_keys=True, allow_nan=False)
+    return json.dumps(values | further, sort_keys=True, allow_nan=False)
 
 
 def parse_metadata(
@@ -277,8 +277,8 @@ def tagged(comments: Sequence[str], screen_filter: ScreenFilter) -> list[str]:
     """
     if is_antialiased(comments) == screen_filter.compensate:
         return list(comments)
-    rest = [comment for comment in comments if not re.fullmatch(_EITHER, comment)]
-    return [*rest, TAG] if screen_filter.compensate else rest
+    consistent = [comment for comment in comments if not re.fullmatch(_EITHER, comment)]
+    return [*consistent, TAG] if screen_filter.compensate else consistent
 
 
 def stated_filter(source: Source) -> ScreenFilter:

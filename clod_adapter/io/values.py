@@ -55,9 +55,9 @@ def degree_of(path: Path, rest: int) -> int:
     degrees = {3 * (count - 1): degree for degree, count in SH_COUNTS.items()}
     if rest in degrees:
         return degrees[rest]
-    wanted = ", ".join(map(str, degrees))
+    allowed = ", ".join(map(str, degrees))
     raise ClodError(
-        f"{path}: {rest} f_rest_* properties fit no SH degree ({wanted} do); export the file again"
+        f"{path}: {rest} f_rest_* properties fit no SH degree ({allowed} do); export the file again"
     )
 
 
@@ -87,13 +87,13 @@ def prepared(
         origin: what the means are to be relative to; None for ``at``, or what ``origin_of`` finds
             where that is 0.
     """
-    count, rest = arrays["means"].shape[:1], arrays["shN"].shape[1:2]
+    count, coefficients = arrays["means"].shape[:1], arrays["shN"].shape[1:2]
     shapes: dict[str, tuple[int, ...]] = {
         "means": (3,),
         "quats": (4,),
         "log_scales": (3,),
         "sh0": (1, 3),
-        "shN": (*rest, 3),
+        "shN": (*coefficients, 3),
         MASKS: (2,),
         FILTER_3D: (1,),
     }
@@ -103,9 +103,10 @@ def prepared(
             raise ClodError(
                 f"{path}: {name} has shape {array.shape}, expected {shape}; export it again"
             )
-    if rest[0] + 1 not in SH_COUNTS.values():
+    if coefficients[0] + 1 not in SH_COUNTS.values():
         raise ClodError(
-            f"{path}: shN has {rest[0]} coefficients, which fit no SH degree; export it again"
+            f"{path}: shN has {coefficients[0]} coefficients, which fit no SH degree; export it"
+            " again"
         )
     if OPACITY in arrays:
         arrays = dict(arrays)
@@ -149,16 +150,16 @@ def _as_logits(
             f" logarithms (scales); if it is, give --activated {choice_of(ranges)}, if not,"
             " --activated none (activated= in Python)"
         )
-    taken = [name for name in ranges if activated in (name, "both")]
+    activated_names = [name for name in ranges if activated in (name, "both")]
     notes = []
-    if "opacity" in taken:
+    if "opacity" in activated_names:
         # the absolute value is Taming-3DGS's activation
         opacity = np.abs(arrays["opacity_logits"].astype(np.float64))
         above = int((opacity > 1).sum())
-        more = f" ({above} above 1 taken as 1)" if above else ""
+        clipped = f" ({above} above 1 taken as 1)" if above else ""
         arrays["opacity_logits"] = logit(np.clip(opacity, _TINY, _OPAQUE)).astype(np.float32)
-        notes.append(f"opacity taken as activated, and stored as logits{more}")
-    if "scales" in taken:
+        notes.append(f"opacity taken as activated, and stored as logits{clipped}")
+    if "scales" in activated_names:
         arrays["log_scales"] = logs_of(arrays["log_scales"]).astype(np.float32)
         notes.append("scales taken as activated, and stored as logarithms")
     if FILTER_3D in arrays:
@@ -166,7 +167,7 @@ def _as_logits(
         notes.append(
             "Mip-Splatting's filter_3D is fused into scale and opacity, and left out of outputs"
         )
-    return arrays, choice_of(taken), notes
+    return arrays, choice_of(activated_names), notes
 
 
 def in_question(arrays: Mapping[str, np.ndarray]) -> dict[str, tuple[float, float]]:
@@ -241,10 +242,10 @@ def _usable(arrays: Arrays) -> tuple[np.ndarray, dict[str, int]]:
         with np.errstate(over="ignore", invalid="ignore"):
             length = np.sqrt(np.square(block["quats"]).sum(1))  # that rasterizers divide by
         rotated = (length >= QUAT_MIN) & (length <= QUAT_MAX)
-        kept = keep[start : start + ROWS]
+        keep_block = keep[start : start + ROWS]
         for reason, rule in zip(dropped, (exists, finite, rotated), strict=True):
-            dropped[reason] += int((kept & ~rule).sum())
-            kept &= rule
+            dropped[reason] += int((keep_block & ~rule).sum())
+            keep_block &= rule
     return keep, {reason: lost for reason, lost in dropped.items() if lost}
 
 

@@ -103,8 +103,8 @@ def write(path: Path, gaussians: Gaussians, metadata: Metadata) -> tuple[str, ..
         x, y, z = metadata.origin
         node["translation"] = [0.0 - x, 0.0 - y, z]
     extras = {KEY: json.loads(document(MODEL, metadata))}
-    parts = [array.data for array in columns.values()]
-    write_points(path, gaussians.means, accessors, node, views, parts, extras=extras)
+    buffers = [array.data for array in columns.values()]
+    write_points(path, gaussians.means, accessors, node, views, buffers, extras=extras)
     return values.dropped_harmonics(arrays, DEGREE)
 
 
@@ -114,7 +114,7 @@ def write_points(
     accessors: dict[str, dict[str, Any]],
     node: dict[str, Any],
     views: list[dict[str, Any]],
-    parts: Sequence[memoryview | bytes],
+    buffers: Sequence[memoryview | bytes],
     extensions: dict[str, Any] | None = None,
     **asset: Any,
 ) -> None:
@@ -127,37 +127,36 @@ def write_points(
         accessor["componentType"] = _FLOAT
     accessors["COLOR_0"] |= {"componentType": _BYTE, "normalized": True}
     accessors["POSITION"] |= {"min": means.amin(0).tolist(), "max": means.amax(0).tolist()}
-    how: dict[str, Any] = {
+    splats: dict[str, Any] = {
         "kernel": "ellipse",
         "colorSpace": COLOR_SPACE,
         "projection": "perspective",
         "sortingMethod": "cameraDistance",
     }
-    used = [EXTENSION]
+    extensions_used = [EXTENSION]
     required = {}
     if extensions:
-        how["extensions"] = extensions
-        used += extensions
-        required = {"extensionsRequired": used}
+        splats["extensions"] = extensions
+        extensions_used += extensions
+        required = {"extensionsRequired": extensions_used}
     attributes = {name: index for index, name in enumerate(accessors)}
-    size = sum(memoryview(part).nbytes for part in parts)
+    size = sum(memoryview(buffer).nbytes for buffer in buffers)
     if size >= _LIMIT - (1 << 20):
         raise ClodError(
             f"{path}: {size:,} bytes are more than a .glb can hold; keep fewer Gaussians or write a"
             " .ply"
         )
+    primitive = {"attributes": attributes, "mode": 0, "extensions": {EXTENSION: splats}}
     gltf = {
         "asset": {"version": "2.0", "generator": f"clod-adapter {package_version()}", **asset},
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0, **node}],
-        "meshes": [
-            {"primitives": [{"attributes": attributes, "mode": 0, "extensions": {EXTENSION: how}}]}
-        ],
+        "meshes": [{"primitives": [primitive]}],
         "accessors": list(accessors.values()),
         "buffers": [{"byteLength": size}],
         "bufferViews": views,
-        "extensionsUsed": used,
+        "extensionsUsed": extensions_used,
         **required,
     }
     text = json.dumps(gltf, separators=(",", ":"), allow_nan=False).encode()
@@ -168,7 +167,7 @@ def write_points(
             struct.pack("<4sIIII", b"glTF", 2, 28 + len(text) + padded, len(text), _JSON) + text
         )
         file.write(struct.pack("<II", padded, _BIN))
-        file.writelines(parts)
+        file.writelines(buffers)
         file.write(bytes(padded - size))
 
 
@@ -198,8 +197,10 @@ def read(path: Path, data: bytes) -> Source:
             key: _values(path, gltf, binary, attributes[name], width)
             for key, (name, width) in names.items()
         }
-        rest = [_values(path, gltf, binary, attributes[name], 3) for name in harmonics(degree)[1:]]
-        if len(set(map(len, (*arrays.values(), *rest)))) > 1:
+        coefficients = [
+            _values(path, gltf, binary, attributes[name], 3) for name in harmonics(degree)[1:]
+        ]
+        if len(set(map(len, (*arrays.values(), *coefficients)))) > 1:
             raise ClodError(f"{path}: its attributes are of different lengths; {_REMEDY}")
         text = gltf["asset"].get("extras", {}).get(KEY)
         scale, turned, moved = _placed(path, gltf, mesh)
@@ -211,7 +212,9 @@ def read(path: Path, data: bytes) -> Source:
         notes.append(f"{len(others)} more primitives with Gaussians in it are left out")
     metadata = parse_metadata(path, text, dial=SIGMA in arrays)
     arrays["shN"] = (
-        np.stack(rest, 1) if rest else np.zeros((len(arrays["means"]), 0, 3), np.float32)
+        np.stack(coefficients, 1)
+        if coefficients
+        else np.zeros((len(arrays["means"]), 0, 3), np.float32)
     )
     stored, changed = _stored(arrays, str(gltf["asset"].get("generator")))
     notes += changed
@@ -223,10 +226,10 @@ def read(path: Path, data: bytes) -> Source:
         stored["log_scales"] = stored["log_scales"] + np.float32(np.log(scale))
         notes.append(f"its node scales it by {scale:g}, which is applied")
     if moved != metadata.origin:  # another program moved the node
-        wide = stored["means"].astype(np.float64) + moved
-        near = not any(origin_of(wide))  # float32 has enough digits
-        stored["means"] = wide if near else stored["means"]
-        metadata = replace(metadata, origin=NOWHERE if near else moved)
+        world_means = stored["means"].astype(np.float64) + moved
+        fits_float32 = not any(origin_of(world_means))  # float32 has enough digits
+        stored["means"] = world_means if fits_float32 else stored["means"]
+        metadata = replace(metadata, origin=NOWHERE if fits_float32 else moved)
     return Source(stored, metadata, tuple(notes), metadata.about)
 
 
@@ -235,11 +238,13 @@ def _chunks(path: Path, data: memoryview) -> tuple[dict[str, Any], memoryview]:
     head = bytes(data[:20]).ljust(20, b"\0")
     version, length = struct.unpack_from("<II", head, 4)
     size, kind = struct.unpack_from("<II", head, 12)
-    whole = version == 2 and kind == _JSON and max(length, 20 + size) <= len(data)
-    more = struct.unpack_from("<I", data, 20 + size)[0] if whole and 28 + size <= length else 0
-    if not whole or (more and 28 + size + more > len(data)):
+    is_whole = version == 2 and kind == _JSON and max(length, 20 + size) <= len(data)
+    binary_size = (
+        struct.unpack_from("<I", data, 20 + size)[0] if is_whole and 28 + size <= length else 0
+    )
+    if not is_whole or (binary_size and 28 + size + binary_size > len(data)):
         raise ClodError(f"{path}: is truncated, or no glTF 2.0; copy or export it again")
-    return json.loads(bytes(data[20 : 20 + size])), data[28 + size : 28 + size + more]
+    return json.loads(bytes(data[20 : 20 + size])), data[28 + size : 28 + size + binary_size]
 
 
 def _find(path: Path, gltf: dict[str, Any]) -> list[tuple[int, dict[str, Any]]]:
@@ -362,8 +367,8 @@ def _stored(
         notes.append("its OPACITY is not within 0 and 1, as glTF has it, and is read as logits")
     else:
         opacities = np.maximum(values.logit(np.clip(opacities, 0, 1)), _FAINTEST)
-    named = {"log_scales": scales, "opacity_logits": opacities, "sh0": arrays["sh0"][:, None]}
-    return {**arrays, **named, "quats": np.roll(arrays["quats"], 1, axis=1)}, notes
+    stored = {"log_scales": scales, "opacity_logits": opacities, "sh0": arrays["sh0"][:, None]}
+    return {**arrays, **stored, "quats": np.roll(arrays["quats"], 1, axis=1)}, notes
 
 
 def _beyond(numbers: np.ndarray, most: float) -> bool:

@@ -64,8 +64,8 @@ def check(path: Path) -> None:
         entries = archive.infolist()
         pickles = [entry for entry in entries if entry.filename.endswith("/data.pkl")]
         stored = all(entry.compress_type == zipfile.ZIP_STORED for entry in entries)
-        whole = stored and sum(entry.file_size for entry in entries) <= path.stat().st_size
-        if not whole or len(pickles) != 1 or pickles[0].file_size > _PICKLE_LIMIT:
+        fits = stored and sum(entry.file_size for entry in entries) <= path.stat().st_size
+        if not fits or len(pickles) != 1 or pickles[0].file_size > _PICKLE_LIMIT:
             raise ClodError(
                 f"{path}: is a zip archive that torch.save does not write; export a PLY instead"
             )
@@ -115,15 +115,15 @@ def read(path: Path, data: bytes) -> Source:
             f"{path}: has no dictionary 'splats', as gsplat's trainer writes (but {content});"
             " export a PLY"
         )
-    wanted = (*NAMES, *dial_columns(splats))
-    arrays = {NAMES.get(name, name): _values(path, name, splats, len(data)) for name in wanted}
+    names = (*NAMES, *dial_columns(splats))
+    arrays = {NAMES.get(name, name): _values(path, name, splats, len(data)) for name in names}
     metadata = parse_metadata(path, checkpoint.get(KEY), dial=SIGMA in arrays)
     notes = [] if metadata.described else [FRAME]
-    for name, (what, remedy) in _CORRECTIONS.items():
+    for name, (correction, remedy) in _CORRECTIONS.items():
         if name in checkpoint:
             notes.append(
-                f"{WARNING}trained with {what} corrected for each photograph ({name}), which is not"
-                f" applied; {remedy}"
+                f"{WARNING}trained with {correction} corrected for each photograph ({name}), which"
+                f" is not applied; {remedy}"
             )
     notes += of_another_method(splats)
     return Source(arrays, metadata, tuple(notes), metadata.about, not metadata.described)
@@ -137,13 +137,13 @@ def _values(path: Path, name: str, splats: dict[str, Any], size: int) -> np.ndar
 
     value = splats.get(name)
     if value is None:
-        more = (
+        hint = (
             "; with appearance optimisation its trainer stores no colours"
             if "features" in splats
             else ""
         )
         raise ClodError(
-            f"{path}: splats has no {name!r}{more}; export it as a PLY with spherical harmonics"
+            f"{path}: splats has no {name!r}{hint}; export it as a PLY with spherical harmonics"
         )
     usable = (
         isinstance(value, torch.Tensor)

@@ -72,22 +72,22 @@ class SplatTransform:
         """The one in the environment's ``CLOD_SPLAT_TRANSFORM``, a command with its words, or on
         the PATH.
         """
-        given = os.environ.get(VARIABLE, "")
+        setting = os.environ.get(VARIABLE, "")
         try:  # a path with spaces in it that is there needs no quotes
-            name, *more = (
-                [given]
-                if given and shutil.which(given)
-                else shlex.split(given) or ["splat-transform"]
+            name, *options = (
+                [setting]
+                if setting and shutil.which(setting)
+                else shlex.split(setting) or ["splat-transform"]
             )
         except ValueError as error:
             raise ClodError(
-                f"{VARIABLE} is {given!r}, which is no command ({error}); {HELP}"
+                f"{VARIABLE} is {setting!r}, which is no command ({error}); {HELP}"
             ) from error
         program = shutil.which(name)
         if program is None:
-            where = f"{name}, which {VARIABLE} names, is" if given else "splat-transform is"
+            where = f"{name}, which {VARIABLE} names, is" if setting else "splat-transform is"
             raise ClodError(f"{where} not installed; {HELP}")
-        command = (program, *more)
+        command = (program, *options)
         version = re.search(r"splat-transform v((\d+)\.(\d+)\.\d+)", _ask(command, "--version"))
         if version is None:
             raise ClodError(
@@ -110,21 +110,21 @@ class SplatTransform:
         A Path is made absolute, to be no option and no address. ``progress`` is called with the
         seconds so far.
         """
-        given = [str(word.absolute()) if isinstance(word, Path) else word for word in words]
+        words_as_text = [str(word.absolute()) if isinstance(word, Path) else word for word in words]
         began = time.perf_counter()
         process = subprocess.Popen(
-            [*self.command, "-w", *(() if self.gpu else ON_CPU), *given], **_TEXT
+            [*self.command, "-w", *(() if self.gpu else ON_CPU), *words_as_text], **_TEXT
         )
         try:
             output = None
             while output is None:
-                taken = time.perf_counter() - began
-                if taken > timeout:
+                seconds = time.perf_counter() - began
+                if seconds > timeout:
                     raise ClodError(
                         f"splat-transform was ended, it took longer than {timeout:.0f} s"
                     )
                 if progress:
-                    progress(taken)
+                    progress(seconds)
                 with suppress(subprocess.TimeoutExpired):
                     output, _ = process.communicate(timeout=TICK)
         except BaseException:
@@ -148,9 +148,9 @@ def check(path: Path) -> SplatTransform:
     except ClodError as error:
         # earlier ones are read here
         version = " of version 4" if path.suffix.lower() == ".spz" else ""
-        what = f"{path.suffix}{version} is read through splat-transform ({error})"
+        needed = f"{path.suffix}{version} is read through splat-transform ({error})"
         raise ClodError(
-            f"{path}: {what}; better still, adapt the PLY that it was made from"
+            f"{path}: {needed}; better still, adapt the PLY that it was made from"
         ) from error
 
 

@@ -92,27 +92,27 @@ def write(path: Path, gaussians: Gaussians, metadata: Metadata) -> tuple[str, ..
         gaussians = with_distance(gaussians, distance) if distance > _FAR else gaussians
     arrays, bits, moved = _nearer(arrays_of(path, gaussians))
     if len(gaussians) > MOST or bits < 1:
-        these = f"these are {len(gaussians):,} within {float(gaussians.means.abs().max()):.4g}"
+        actual = f"these are {len(gaussians):,} within {float(gaussians.means.abs().max()):.4g}"
         raise ClodError(
-            f"{path}: has room for {MOST:,} Gaussians within 4,000,000 of 0, {these}; write a .ply"
+            f"{path}: has room for {MOST:,} Gaussians within 4,000,000 of 0, {actual}; write a .ply"
         )
     degree = min(gaussians.sh_degree, DEGREE)
     flags = EXTENDED | (ANTIALIASED if gaussians.screen_filter.compensate else 0)
     header = HEADER.pack(MAGIC, VERSION, len(gaussians), degree, bits, flags, 0)
-    parts = [header, *_packed(arrays, bits, degree), struct.pack("<III", AXES, 4, RDF)]
+    sections = [header, *_packed(arrays, bits, degree), struct.pack("<III", AXES, 4, RDF)]
     metadata = replace(metadata, attenuation=gaussians.attenuation)
     if metadata != Metadata(screen_filter=CLASSIC):
         columns = list(dial_columns(arrays))
-        named = {COLUMNS: columns} if len(columns) > 1 else {}  # sigma_d alone needs no name
-        text = document(MODEL, metadata, **named).encode()
+        column_names = {COLUMNS: columns} if len(columns) > 1 else {}  # sigma_d alone needs no name
+        text = document(MODEL, metadata, **column_names).encode()
         halves = b"".join(
             np.clip(arrays[name], -_MOST, _MOST).astype("<f2").tobytes() for name in columns
         )
-        parts.append(
+        sections.append(
             struct.pack("<III", RECORD, 4 + len(text) + len(halves), len(text)) + text + halves
         )
     gzip = zlib.compressobj(wbits=31)
-    path.write_bytes(gzip.compress(b"".join(parts)) + gzip.flush())
+    path.write_bytes(gzip.compress(b"".join(sections)) + gzip.flush())
     return (*moved, *_losses(arrays, bits))
 
 
@@ -152,7 +152,7 @@ def _packed(arrays: dict[str, np.ndarray], bits: int, degree: int) -> list[bytes
     harmonics = np.clip(arrays["shN"][:, : SH_COUNTS[degree] - 1], -9, 9)
     steps = np.round(arrays["means"].astype(np.float64) * 2.0**bits)
     fixed = steps.clip(-(2**23), 2**23 - 1).astype("<i4")
-    parts = [
+    columns = [
         np.ascontiguousarray(fixed[..., None].view(np.uint8)[..., :3]),
         bytes_of(255 * values.sigmoid(arrays["opacity_logits"])),
         bytes_of(255 * (COLOR * sh0 + 0.5)),
@@ -160,7 +160,7 @@ def _packed(arrays: dict[str, np.ndarray], bits: int, degree: int) -> list[bytes
         _packed_quats(arrays["quats"]),
         bytes_of(128 + _STEP * np.round(128 / _STEP * harmonics)),
     ]
-    return [part.tobytes() for part in parts]
+    return [column.tobytes() for column in columns]
 
 
 def _packed_quats(quats: np.ndarray) -> np.ndarray:
@@ -174,8 +174,8 @@ def _packed_quats(quats: np.ndarray) -> np.ndarray:
     packed = largest.astype(np.uint32)
     for axis in range(4):
         level = np.floor(MAGNITUDE * np.abs(xyzw[:, axis]) + 0.5).clip(max=511).astype(np.uint32)
-        more = (packed << 10) | (np.uint32(512) * (xyzw[:, axis] < 0)) | level
-        packed = np.where(largest == axis, packed, more)
+        longer = (packed << 10) | (np.uint32(512) * (xyzw[:, axis] < 0)) | level
+        packed = np.where(largest == axis, packed, longer)
     return packed.astype("<u4")
 
 
@@ -225,7 +225,9 @@ def read(path: Path, data: bytes) -> Source:
     if not count or end > len(data):
         raise ClodError(f"{path}: has no Gaussians or is truncated; copy or export it again")
     table = np.frombuffer(data[HEADER.size : end], np.uint8)
-    parts = [part.reshape(count, -1) for part in np.split(table, count * np.cumsum(sizes)[:-1])]
+    columns = [
+        column.reshape(count, -1) for column in np.split(table, count * np.cumsum(sizes)[:-1])
+    ]
     records = _records(data[end:]) if flags & EXTENDED else {}
     stored, dial = _ours(path, records[RECORD], count) if RECORD in records else (None, {})
     metadata = parse_metadata(path, stored, dial=bool(dial))
@@ -235,7 +237,7 @@ def read(path: Path, data: bytes) -> Source:
         raise ClodError(
             f"{path}: its axes are of kind {axes}, which this reader does not know; {_CONVERT}"
         )
-    arrays = _unquantized(parts, bits)
+    arrays = _unquantized(columns, bits)
     arrays = (half_turn(arrays, _TURNS[axes]) if _TURNS[axes] else arrays) | dial
     if dial:  # whose sigma_d is in units of the reference distance where that is large
         tensors: dict[str, Any] = {
@@ -284,16 +286,16 @@ def _ours(path: Path, body: bytes, count: int) -> tuple[dict[str, Any], dict[str
     with refused_if_damaged(path, *DAMAGED):
         stored = json.loads(text)
         names = stored.get(COLUMNS, [SIGMA])
-        known = list(dial_columns(names)) if isinstance(names, list) else []
-    if not known or names != known or len(halves) not in (0, 2 * count * len(names)):
+        known_names = list(dial_columns(names)) if isinstance(names, list) else []
+    if not known_names or names != known_names or len(halves) not in (0, 2 * count * len(names)):
         raise ClodError(f"{path}: its record of sigma_d is damaged; copy or export it again")
     table = np.frombuffer(halves, "<f2").astype(np.float32).reshape(-1, count)
     return stored, dict(zip(names, table, strict=False))  # no rows without a dial
 
 
-def _unquantized(parts: list[np.ndarray], bits: int) -> dict[str, np.ndarray]:
-    means, opacities, colors = parts[:3]
-    scales, quats, harmonics = parts[3:]
+def _unquantized(columns: list[np.ndarray], bits: int) -> dict[str, np.ndarray]:
+    means, opacities, colors = columns[:3]
+    scales, quats, harmonics = columns[3:]
     wide = np.zeros((len(means), 3, 4), np.uint8)
     wide[..., 1:] = means.reshape(-1, 3, 3)
     fixed = wide.view("<i4")[..., 0] >> 8  # with the sign
@@ -316,9 +318,9 @@ def _rotations(quats: np.ndarray) -> np.ndarray:
     largest = packed >> 30
     xyzw = np.zeros((len(packed), 4), np.float64)
     for axis in (3, 2, 1, 0):
-        there = largest != axis
+        stored = largest != axis
         value = (packed & 511) / MAGNITUDE
-        xyzw[:, axis] = np.where(there, np.where(packed & 512, -value, value), 0)
-        packed = np.where(there, packed >> 10, packed)
+        xyzw[:, axis] = np.where(stored, np.where(packed & 512, -value, value), 0)
+        packed = np.where(stored, packed >> 10, packed)
     xyzw[np.arange(len(xyzw)), largest] = np.sqrt(np.maximum(0, 1 - (xyzw**2).sum(1)))
     return np.roll(xyzw, 1, axis=1).astype(np.float32)

@@ -146,8 +146,8 @@ def read_colmap(model: Path) -> tuple[list[PosedImage], list[str]]:
     split = model / SPLIT
     if split.is_file():
         lines = read_bytes(split).decode("utf-8-sig", "surrogateescape").splitlines()
-        posed, more = marked(posed, {line.strip() for line in lines}, SPLIT)
-        notes += more
+        posed, split_notes = marked(posed, {line.strip() for line in lines}, SPLIT)
+        notes += split_notes
     return posed, notes
 
 
@@ -238,12 +238,12 @@ def _lines(path: Path) -> Iterator[tuple[int, bytes]]:
 
 def _cameras_in_text(path: Path) -> Iterator[tuple[pycolmap.Camera, list[float]]]:
     for _, line in _lines(path):
-        number, kind, *rest = line.split()
-        width, height = map(int, rest[:2])
+        number, kind, *values = line.split()
+        width, height = map(int, values[:2])
         camera = pycolmap.Camera.create_from_model_name(
             int(number), kind.decode(), 1.0, width, height
         )
-        yield camera, [float(value) for value in rest[2:]]
+        yield camera, [float(value) for value in values[2:]]
 
 
 def _images_in_text(path: Path) -> Iterator[Image]:

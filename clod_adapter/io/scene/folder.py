@@ -95,11 +95,11 @@ def find_photographs(
     only with ``raw``: where the cameras are pinholes, Inria's code made them together with other
     photographs.
     """
-    parts = [name_parts(name, cameras) for name in names]
+    split_names = [name_parts(name, cameras) for name in names]
     if twice := [name for name, count in Counter(names).items() if count > 1]:
         raise ClodError(f"{cameras}: has image {twice[0]} more than once; export it again")
     candidates = [
-        (*find_files(root, parts), root)
+        (*find_files(root, split_names), root)
         for root in photograph_folders(folder, cameras)
         if raw or root.name != RAW or root == folder
     ]
@@ -118,7 +118,9 @@ def find_photographs(
             if any((base / name).glob("*")):
                 notes.append(f"the masks in {base / name} are {UNUSED}")
     missing = [
-        as_text(str(Path(*name))) for name, path in zip(parts, paths, strict=True) if path is None
+        as_text(str(Path(*name)))
+        for name, path in zip(split_names, paths, strict=True)
+        if path is None
     ]
     if missing:
         examples = f"({', '.join(missing[:3])}{', ...' if len(missing) > 3 else ''})"
@@ -136,21 +138,21 @@ def find_photographs(
 
 
 def find_files(
-    root: Path, parts: Sequence[tuple[str, ...]]
+    root: Path, split_names: Sequence[tuple[str, ...]]
 ) -> tuple[list[Path | None], list[Path]]:
     """The files of these names, and which of them have another suffix or case.
 
     In place of a missing one that is the only photograph of the same name otherwise, if no other
     name stands for it.
     """
-    named = [root.joinpath(*map(file_name, name)) for name in parts]
-    missing = [path for path in named if not isfile(path)]
+    expected = [root.joinpath(*map(file_name, name)) for name in split_names]
+    missing = [path for path in expected if not isfile(path)]
     photographs = defaultdict[Path, list[Path]](list)
     for folder in {path.parent for path in missing}:
         for path in folder.glob("*"):
             if path.suffix.lower() in PHOTOGRAPHS:
                 photographs[_without_suffix(path)].append(path)
-    count = Counter(map(_without_suffix, named))
+    count = Counter(map(_without_suffix, expected))
     files: dict[Path, Path | None] = dict.fromkeys(missing)
     others = []
     for path in files:
@@ -158,7 +160,7 @@ def find_files(
         if len(photographs[key]) == count[key] == 1:
             files[path] = photographs[key][0]
             others += photographs[key]
-    return [files.get(path, path) for path in named], others
+    return [files.get(path, path) for path in expected], others
 
 
 def _without_suffix(path: Path) -> Path:
@@ -177,7 +179,7 @@ def name_parts(name: str, cameras: Path, home: Path | None = None) -> tuple[str,
             " there too"
         )
     path = PureWindowsPath(name)
-    longest = max((len(part.encode()) for part in path.parts), default=0)
+    longest = max((len(component.encode()) for component in path.parts), default=0)
     control = any(sign < " " or "\x7f" <= sign <= "\x9f" for sign in name)
     if control or len(name) > LONGEST_NAME or longest > LONGEST_PART:
         raise ClodError(
@@ -221,7 +223,7 @@ def scene_files(folder: Path) -> Iterator[Path]:
         yield from (base / name for name in DESCRIPTIONS)
     if cameras.is_file():
         for name in DESCRIPTIONS:
-            yield from (home / named for named in _names_in_json(cameras.with_name(name)))
+            yield from (home / listed for listed in _names_in_json(cameras.with_name(name)))
         return
     yield from (path for path in cameras.glob("*") if path.suffix in FORMS)
     # glob passes over what cannot be read

@@ -177,7 +177,7 @@ def photograph(image: PosedImage, path: Path, max_width: int, cache: Path | None
     if cache is None or image.is_pinhole:
         return _made(image, path, max_width)
     state, camera = path.stat(), image.camera
-    made_of = (
+    ingredients = (
         str(path.resolve()),
         state.st_size,
         state.st_mtime_ns,
@@ -189,13 +189,13 @@ def photograph(image: PosedImage, path: Path, max_width: int, cache: Path | None
         pycolmap.__version__,
         PIL.__version__,
     )
-    file = cache / f"{hashlib.sha256(repr(made_of).encode()).hexdigest()[:32]}.png"
+    file = cache / f"{hashlib.sha256(repr(ingredients).encode()).hexdigest()[:32]}.png"
     pixels: Image.Image | None = None
     # Absent, or damaged: Pillow raises many kinds.
     with suppress(Exception), Image.open(file, formats=["PNG"]) as source:
         about = json.loads(source.info[_KEY])
         K = np.array(about["K"])
-        notes = [(what, detail) for what, detail in about["notes"]]
+        notes = [(change, detail) for change, detail in about["notes"]]
         pixels = source.convert("RGB")
     if pixels is None:
         pixels, K, notes = _made(image, path, max_width)

@@ -80,8 +80,8 @@ def load_scene(
         notes.append("the cameras are the COLMAP model's, not those of transforms.json")
     names = [image.name for image in images]
     distorted = not all(image.is_pinhole for image in images)
-    paths, more = find_photographs(folder, cameras, names, raw=distorted)
-    notes += more
+    paths, file_notes = find_photographs(folder, cameras, names, raw=distorted)
+    notes += file_notes
     present = [(image, path) for image, path in zip(images, paths, strict=True) if path is not None]
     testing = held_out(images, test_every)
     if not any(image.name not in testing for image, _ in present):
@@ -101,7 +101,7 @@ def load_scene(
     left_out: list[tuple[str, str]] = []
     if pinholes:
         left_out.append(("undistortion", f"all {len(views)} cameras are pinholes"))
-    if not any(what in (REDUCED, SCALED) for what, _ in done):
+    if not any(change in (REDUCED, SCALED) for change, _ in done):
         left_out.append(("scaling", f"all {len(views)} photographs are used at full resolution"))
     return in_its_unit(
         Scene(train, test, (*notes, *_summary(done, len(views))), tuple(left_out), folder)
@@ -146,12 +146,12 @@ def load_cameras(
 def _posed(folder: Path) -> tuple[Path, list[PosedImage], list[str]]:
     """The model or transforms file, its images, and notes."""
     cameras = find_cameras(folder)
-    read = read_transforms if cameras.is_file() else read_colmap
-    images, notes = read(cameras)
+    reader = read_transforms if cameras.is_file() else read_colmap
+    images, notes = reader(cameras)
     if cameras.is_dir() and cameras != folder:
         notes += _other_models(cameras)
-    images, more = in_trained_frame(folder, cameras, images)
-    return cameras, images, notes + more
+    images, frame_notes = in_trained_frame(folder, cameras, images)
+    return cameras, images, notes + frame_notes
 
 
 def _other_models(model: Path) -> list[str]:
@@ -159,12 +159,12 @@ def _other_models(model: Path) -> list[str]:
     own.
     """
     notes = []
-    for other in models_in(model.parent):
+    for folder in models_in(model.parent):
         with suppress(ClodError):  # a damaged one is no choice
-            if other != model:
-                count = len(read_colmap(other)[0])
+            if folder != model:
+                count = len(read_colmap(folder)[0])
                 notes.append(
-                    f"{other} is another model, of {count} images: give this folder if the"
+                    f"{folder} is another model, of {count} images: give this folder if the"
                     " checkpoint is of it"
                 )
     return notes
@@ -190,10 +190,12 @@ def _load(loads: Sequence[Load], progress: Listener | None) -> tuple[list[View],
 def _summary(notes: Sequence[Note], total: int) -> list[str]:
     """One line for each thing done, however many sizes it was done to."""
     lines = []
-    for what, count in Counter(what for what, _ in notes).items():
-        details = list(dict.fromkeys(detail for change, detail in notes if change == what))
+    for change, count in Counter(change for change, _ in notes).items():
+        details = list(
+            dict.fromkeys(detail for other_change, detail in notes if other_change == change)
+        )
         others = f" (and {len(details) - 1} more)" if len(details) > 1 else ""
-        lines.append(f"{count} of {total} images {what.format(details[0] + others)}")
+        lines.append(f"{count} of {total} images {change.format(details[0] + others)}")
     return lines
 
 

@@ -63,9 +63,9 @@ def read_transforms(path: Path) -> tuple[list[PosedImage], list[str]]:
     ``scripts/colmap2nerf.py``.
     """
     test = path.with_name(path.name.replace("train", "test"))
-    both = test != path and test.is_file()
-    images, notes = _frames(path, False if both else None)
-    if both:
+    has_test = test != path and test.is_file()
+    images, notes = _frames(path, False if has_test else None)
+    if has_test:
         images += _frames(test, True)[0]
         notes.append(f"held out are the photographs of {test.name}")
     return sorted(images, key=lambda image: image.name), notes
@@ -117,11 +117,11 @@ def _split(path: Path, content: Mapping[str, Any]) -> Callable[[str], bool] | No
     """
     lists = {}
     for key in LISTS:
-        given = content.get(key)
-        if given is not None:
-            if not isinstance(given, list) or not all(isinstance(name, str) for name in given):
+        listed = content.get(key)
+        if listed is not None:
+            if not isinstance(listed, list) or not all(isinstance(name, str) for name in listed):
                 raise ClodError(f"{path}: {key} is no list of file names; correct or remove it")
-            lists[key] = {"/".join(name_parts(name, path, path.parent)) for name in given}
+            lists[key] = {"/".join(name_parts(name, path, path.parent)) for name in listed}
     if "train_filenames" in lists:
         return lambda name: name not in lists["train_filenames"]
     return (lambda name: any(name in names for names in lists.values())) if lists else None
@@ -154,13 +154,13 @@ def read_pose(where: object, values: Mapping[str, Any], key: str) -> np.ndarray:
 def _number(
     where: object, values: Mapping[str, Any], key: str, default: float, above: float = -HUGE
 ) -> float:
-    given = default if values.get(key) is None else values[key]
+    stated = default if values.get(key) is None else values[key]
     value = math.nan
     with suppress(TypeError, ValueError, OverflowError):
-        value = float(given)
-    if isinstance(given, bool) or not above < value < HUGE:
+        value = float(stated)
+    if isinstance(stated, bool) or not above < value < HUGE:
         raise ClodError(
-            f"{where}: {key} is no number between {above:g} and {HUGE:g}, but {given!r:.40}; copy"
+            f"{where}: {key} is no number between {above:g} and {HUGE:g}, but {stated!r:.40}; copy"
             " or export the file again"
         )
     return value
@@ -188,9 +188,9 @@ def _camera(where: str, photograph: Path | None, values: Mapping[str, Any]) -> p
         )
     # of k4 some writers mean a power of the radius, some a divisor
     if model not in PERSPECTIVE or k4:
-        what = "k4 of a camera that is no fisheye" if k4 else f"camera_model {model[:40]!r}"
+        feature = "k4 of a camera that is no fisheye" if k4 else f"camera_model {model[:40]!r}"
         raise ClodError(
-            f"{where}: {what} is not known; give the COLMAP model that the file was made from"
+            f"{where}: {feature} is not known; give the COLMAP model that the file was made from"
         )
     params += radial[:2] + tangential
     model = "OPENCV"
