@@ -44,24 +44,24 @@ def align(
         ClodError: the checkpoint fits in no frame, and that is ``required``; if not, there is a
             note.
     """
-    found, guess = compare_frames(checkpoint, scene, note)
+    alignment, guess = compare_frames(checkpoint, scene, note)
     ply, images, frame = checkpoint.path, scene.folder or "the photographs", None
     if guess and guess.clear:
         scene, frame = scene_in(scene, guess.frame), guess.frame.as_dict() | {"psnr": guess.psnr}
-    elif guess or not found.fits:
-        message = f"{ply}: does not match {images}: {mismatch(found, guess)}"
+    elif guess or not alignment.fits:
+        message = f"{ply}: does not match {images}: {mismatch(alignment, guess)}"
         if required:
             raise ClodError(f"{message}; {override} to train anyway")
         note(f"warning: {message}")
-    elif required and not found.views:
+    elif required and not alignment.views:
         note(f"warning: the photographs in {images}, to train on, have a single colour each")
-    elif required and found.margin < 0:
+    elif required and alignment.margin < 0:
         note(
             f"warning: {ply} matches the photographs in {images}, but some differ more from it than"
             " from their own mean colours; check for another exposure, views that it does not"
             " cover, or a poor checkpoint"
         )
-    return scene, asdict(found) | {"guess": guess and guess.frame.description, "frame": frame}
+    return scene, asdict(alignment) | {"guess": guess and guess.frame.description, "frame": frame}
 
 
 def compare_frames(
@@ -73,32 +73,34 @@ def compare_frames(
     ``cameras`` are all of the scene's, if its photographs are not.
     """
     views = [*scene.test, *scene.train]
-    found = check_alignment(checkpoint.gaussians, views)
-    if not found.doubtful:
-        return found, None
+    alignment = check_alignment(checkpoint.gaussians, views)
+    if not alignment.doubtful:
+        return alignment, None
     points = load_points(scene.folder, checkpoint.origin) if scene.folder else None
-    guess = guess_frame(checkpoint.gaussians, views, found, points, cameras)
+    guess = guess_frame(checkpoint.gaussians, views, alignment, points, cameras)
     if guess and guess.clear:
         note(
             f"{scene.folder or 'the photographs'}: the cameras are moved into the frame of"
             f" {checkpoint.path} ({guess.frame.name}): renders have {guess.psnr:.1f} dB there,"
-            f" {found.psnr:.1f} dB as given"
+            f" {alignment.psnr:.1f} dB as given"
         )
-    return found, guess
+    return alignment, guess
 
 
-def mismatch(found: Alignment, guess: Guess | None) -> str:
+def mismatch(alignment: Alignment, guess: Guess | None) -> str:
     """The measurements, and a remedy."""
-    share = f"{found.in_view:.2g}" if 0 < found.in_view < 0.01 else f"{found.in_view:.0%}"
+    share = (
+        f"{alignment.in_view:.2g}" if 0 < alignment.in_view < 0.01 else f"{alignment.in_view:.0%}"
+    )
     facts = f"{share} of its Gaussians are in view"
-    if found.views:
+    if alignment.views:
         facts = (
-            f"renders have a PSNR of {found.psnr:.1f} dB against {found.views} photographs, their"
-            f" mean colours {found.mean_colour_psnr:.1f} dB; {facts}"
+            f"renders have a PSNR of {alignment.psnr:.1f} dB against {alignment.views} photographs,"
+            f" their mean colours {alignment.mean_colour_psnr:.1f} dB; {facts}"
         )
-    if found.on_white:
+    if alignment.on_white:
         return (
-            f"{facts}; over white the renders have {found.white_psnr:.1f} dB, but clod-adapt"
+            f"{facts}; over white the renders have {alignment.white_psnr:.1f} dB, but clod-adapt"
             " renders over black: give photographs with a transparent background (PNG; composited"
             " over black), or a checkpoint trained on black"
         )
@@ -123,8 +125,12 @@ def detect_filter(
     expected = gaussians.screen_filter.name or "off"
     name, psnr = compare_filters(gaussians, views, expected)
     if name != expected:
-        found = ", ".join(f"{psnr[each]:.2f} dB {WORDS[each]}" for each in (name, expected))
-        trained = f"{checkpoint.path}: by the photographs it was trained {WORDS[name]}: {found}"
+        comparison = ", ".join(
+            f"{psnr[filter_name]:.2f} dB {WORDS[filter_name]}" for filter_name in (name, expected)
+        )
+        trained = (
+            f"{checkpoint.path}: by the photographs it was trained {WORDS[name]}: {comparison}"
+        )
         override = f" ({option} {expected} overrides it)" if option else ""
         note(f"{trained}; rendered so{override}")
     return replace(checkpoint, gaussians=gaussians.replace(screen_filter=FILTERS[name]))

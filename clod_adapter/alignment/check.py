@@ -61,8 +61,8 @@ class Alignment:
         """
         if not self.views:
             return self.in_view >= FEWEST_IN_VIEW
-        shown = self.margin > 0 or self.explained >= 0.5 or self.correlation >= CORRELATED
-        return shown and not self.on_white
+        matches = self.margin > 0 or self.explained >= 0.5 or self.correlation >= CORRELATED
+        return matches and not self.on_white
 
     @property
     def margin(self) -> float:
@@ -89,10 +89,10 @@ def check_alignment(gaussians: Gaussians, views: Sequence[View]) -> Alignment:
     photographs.
     """
     views = spread(views, MOST_VIEWS)
-    seen = torch.zeros(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
+    in_frustums = torch.zeros(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
     for view in views:
-        seen |= in_frustum(gaussians.means, view.camera)
-    in_view = float(seen.float().mean()) if len(seen) else 0.0
+        in_frustums |= in_frustum(gaussians.means, view.camera)
+    in_view = float(in_frustums.float().mean()) if len(in_frustums) else 0.0
     table = compare_renders(gaussians, views)
     if not len(table):
         return Alignment(0, in_view, *[math.nan] * 5)
@@ -117,16 +117,18 @@ def compare_renders(gaussians: Gaussians, views: Sequence[View]) -> Tensor:
     rows = []
     for view in views:
         photograph = unit(view.image, gaussians.means)
-        about = photograph - photograph.mean((0, 1))
-        if float(about.square().mean().sqrt()) < FLAT:
+        deviation = photograph - photograph.mean((0, 1))
+        if float(deviation.square().mean().sqrt()) < FLAT:
             continue
         rendering = render(gaussians, view.camera)
         black = rendering.image.clamp(0, 1)
         white = (rendering.image + (1 - rendering.alpha)[..., None]).clamp(0, 1)
         centred = black - black.mean((0, 1))
-        errors = [(black - photograph).square(), (white - photograph).square(), about.square()]
+        errors = [(black - photograph).square(), (white - photograph).square(), deviation.square()]
         rows.append(
-            torch.stack([each.mean() for each in (*errors, centred.square(), centred * about)])
+            torch.stack(
+                [values.mean() for values in (*errors, centred.square(), centred * deviation)]
+            )
         )
     return torch.stack(rows) if rows else gaussians.means.new_empty(0, 5)
 
@@ -160,7 +162,10 @@ def compare_filters(
         )
 
     error = torch.stack(
-        [errors(gaussians.replace(screen_filter=each)) for each in FILTERS.values()]
+        [
+            errors(gaussians.replace(screen_filter=screen_filter))
+            for screen_filter in FILTERS.values()
+        ]
     )
     psnr, names = -10 * error.clamp(min=1e-10).log10(), list(FILTERS)
     gained, means = psnr - psnr[names.index(expected)], psnr.mean(1)

@@ -93,8 +93,10 @@ def known_frames(viewmats: Tensor, points: Tensor | None = None) -> list[Frame]:
     """The frames that follow from all cameras ``[V, 4, 4]`` and the scene's points, by which
     trainers normalize.
     """
-    here = torch.eye(3, dtype=torch.float64), 1.0, torch.zeros(3, dtype=torch.float64)
-    poses = [Frame(name, text, *here, inverted, opengl) for name, inverted, opengl, text in POSES]
+    identity = torch.eye(3, dtype=torch.float64), 1.0, torch.zeros(3, dtype=torch.float64)
+    poses = [
+        Frame(name, text, *identity, inverted, opengl) for name, inverted, opengl, text in POSES
+    ]
     return [*poses, *_axes(viewmats), *_nerfstudio(viewmats), *_gsplat(viewmats, points)]
 
 

@@ -49,34 +49,34 @@ class Guess:
 def guess_frame(
     gaussians: Gaussians,
     views: Sequence[View],
-    found: Alignment,
+    alignment: Alignment,
     points: Tensor | None = None,
     cameras: Sequence[Camera] = (),
 ) -> Guess | None:
     """A frame whose PSNR is BETTER_THAN_MEAN dB above the photographs' mean colours and CLEAR dB
-    above ``found``.
+    above ``alignment``.
 
     ``cameras`` are all of the scene's, if ``views`` are not, and ``points`` those of its model.
     """
-    if len(gaussians) == 0 or found.views == 0:
+    if len(gaussians) == 0 or alignment.views == 0:
         return None
     cameras = cameras or [view.camera for view in views]
-    every = torch.stack([camera.viewmat.double() for camera in cameras])
+    viewmats = torch.stack([camera.viewmat.double() for camera in cameras])
     score = _small(gaussians, views, *COARSE)
 
     def measured(frame: Frame) -> Guess | None:
         psnr = check_alignment(gaussians, views_in(views, frame)).psnr
-        enough = max(found.mean_colour_psnr + BETTER_THAN_MEAN, found.psnr + CLEAR)
+        enough = max(alignment.mean_colour_psnr + BETTER_THAN_MEAN, alignment.psnr + CLEAR)
         return (
-            Guess(frame, psnr, psnr >= found.mean_colour_psnr + DOUBTFUL)
+            Guess(frame, psnr, psnr >= alignment.mean_colour_psnr + DOUBTFUL)
             if psnr >= enough
             else None
         )
 
-    known = measured(max(known_frames(every, points), key=score))
-    if known:
-        return known
-    searched = _search(gaussians, views, score, every)
+    guess = measured(max(known_frames(viewmats, points), key=score))
+    if guess:
+        return guess
+    searched = _search(gaussians, views, score, viewmats)
     return measured(searched) if searched else None
 
 
@@ -168,8 +168,8 @@ def _climb(
             neighbours.append(_placed(frame.scale * by, focus - by * (focus - frame.offset)))
         for neighbour in neighbours:
             trials += 1
-            if (found := score(neighbour)) > best:
-                best, frame = found, neighbour
+            if (value := score(neighbour)) > best:
+                best, frame = value, neighbour
                 break
         else:
             step /= 2

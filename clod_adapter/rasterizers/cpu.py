@@ -183,8 +183,8 @@ class _Picture(torch.autograd.Function):
         written = need._replace(means=shaped, quats=shaped, scales=shaped)
         written = written._replace(opacities=True, sigma=True, growth=True)
         gradients = [
-            recycled(x.shape if wanted else (0, *x.shape[1:]))
-            for x, wanted in zip(inputs, written, strict=True)
+            recycled(x.shape if is_written else (0, *x.shape[1:]))
+            for x, is_written in zip(inputs, written, strict=True)
         ]
         threads.run(
             project_gradient,
@@ -201,8 +201,8 @@ class _Picture(torch.autograd.Function):
         behind = None
         if ctx.needs_input_grad[4]:
             behind = ((1 - alpha)[..., None] * slopes[0]).sum((0, 1))
-        asked = [g if needed else None for g, needed in zip(gradients, need, strict=True)]
-        return None, None, None, None, behind, *asked
+        requested = [g if needed else None for g, needed in zip(gradients, need, strict=True)]
+        return None, None, None, None, behind, *requested
 
 
 class _Compiled(Rasterizer):

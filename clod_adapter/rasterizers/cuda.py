@@ -50,8 +50,8 @@ def unusable() -> str | None:
             from gsplat.cuda import _backend
     # a failed compilation is a RuntimeError, a missing library an OSError or ImportError
     except Exception as error:
-        what = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
-        return f"gsplat cannot be imported ({what}): {INSTALL}"
+        reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+        return f"gsplat cannot be imported ({reason}): {INSTALL}"
     if _backend._C is None:
         return (
             f"gsplat {gsplat.__version__} has no CUDA kernels, and there is no CUDA toolkit to"
@@ -83,13 +83,13 @@ def rasterize(
     require_float32("CUDA", **on_gpu)
     rows = drawable(quats, opacities).nonzero()[:, 0]
     geometry = {name: _Rows.apply(rows, x) for name, x in geometry.items()}
-    drawn = _project(geometry, sh0, shN, rows, camera, screen_filter) if len(rows) else None
-    if drawn is None or len(drawn["means2d"]) == 0:
+    projected = _project(geometry, sh0, shN, rows, camera, screen_filter) if len(rows) else None
+    if projected is None or len(projected["means2d"]) == 0:
         # Nothing to draw; the gradients are 0.
         nothing = sum(_Rows.apply(rows[:0], x).sum() for x in tensors.values())
         empty = nothing + means.new_zeros(camera.height, camera.width)
         return background + empty[..., None], empty
-    image, alpha = _blend(drawn, camera)
+    image, alpha = _blend(projected, camera)
     return image + (1 - alpha)[..., None] * background, alpha
 
 
@@ -106,8 +106,8 @@ def _project(
 
     means, opacities = geometry["means"], geometry["opacities"]
     # In one transfer to the device.
-    parts = (camera.viewmat.flatten(), camera.K.flatten(), camera.position)
-    flat = torch.cat([part.detach().to(means.dtype) for part in parts]).to(
+    tensors = (camera.viewmat.flatten(), camera.K.flatten(), camera.position)
+    flat = torch.cat([tensor.detach().to(means.dtype) for tensor in tensors]).to(
         means.device, non_blocking=True
     )
     viewmat, K, eye = flat[:16].view(1, 4, 4), flat[16:25].view(1, 3, 3), flat[25:]
@@ -158,19 +158,19 @@ def _project(
     }
 
 
-def _blend(drawn: dict[str, Tensor], camera: Camera) -> tuple[Tensor, Tensor]:
+def _blend(projected: dict[str, Tensor], camera: Camera) -> tuple[Tensor, Tensor]:
     """Image ``[H, W, 3]`` without a background and alpha ``[H, W]``: tile lists sorted by depth,
     then pixels.
     """
     import gsplat
 
     across, down = -(-camera.width // TILE), -(-camera.height // TILE)
-    depths, means2d = drawn["depths"], drawn["means2d"]
+    depths, means2d = projected["depths"], projected["means2d"]
     ids = torch.zeros(len(depths), dtype=torch.int64, device=depths.device)  # all of one image
     _, keys, order = _call(
         gsplat.isect_tiles,
         means2d,
-        drawn["radii"],
+        projected["radii"],
         depths,
         TILE,
         across,
@@ -186,9 +186,9 @@ def _blend(drawn: dict[str, Tensor], camera: Camera) -> tuple[Tensor, Tensor]:
     offsets = gsplat.isect_offset_encode(keys, 1, across, down)
     image, alpha = gsplat.rasterize_to_pixels(
         means2d,
-        drawn["conics"],
-        drawn["colors"],
-        drawn["opacities"],
+        projected["conics"],
+        projected["colors"],
+        projected["opacities"],
         camera.width,
         camera.height,
         TILE,
@@ -205,8 +205,8 @@ def _call(function: Callable[..., Any], *args: Any, **options: Any) -> Any:
     """The result of gsplat's function, without the options that the installed version does not
     have.
     """
-    known = inspect.signature(function).parameters
-    return function(*args, **{name: value for name, value in options.items() if name in known})
+    parameters = inspect.signature(function).parameters
+    return function(*args, **{name: value for name, value in options.items() if name in parameters})
 
 
 class _Rows(Function):
