@@ -42,7 +42,7 @@ GRADIENTS = ("means2d", "gradient_2dgs")
 
 def render(
     function: Callable[..., Any],
-    given: dict[str, Any],
+    arguments: dict[str, Any],
     virtual_scale: float,
     config: AttenuationConfig,
     hide: bool,
@@ -51,99 +51,107 @@ def render(
 
     With ``hide``, culled centres move behind the camera, as this function draws rows of opacity 0.
     """
-    if given.get("distributed"):
+    if arguments.get("distributed"):
         raise ClodError(
             "distributed=True shares one opacity among all cameras, a dial needs one each; set it"
             " to False"
         )
     for name in PER_ROW:
-        if given[name] is not None and given[name].shape != given["opacities"].shape:
+        if arguments[name] is not None and arguments[name].shape != arguments["opacities"].shape:
             raise ClodError(
-                f"{name} is {tuple(given[name].shape)} and opacities"
-                f" {tuple(given['opacities'].shape)}; both must be [..., N]"
+                f"{name} is {tuple(arguments[name].shape)} and opacities"
+                f" {tuple(arguments['opacities'].shape)}; both must be [..., N]"
             )
-    shape = given["viewmats"].shape[:-2]
-    one = partial(_one_camera, function, virtual_scale=virtual_scale, config=config, hide=hide)
+    shape = arguments["viewmats"].shape[:-2]
+    render_one = partial(
+        _one_camera, function, virtual_scale=virtual_scale, config=config, hide=hide
+    )
     if math.prod(shape) == 1:
-        return one(given)
-    return _joined([one(arguments) for arguments in _cameras(given, shape)], shape)
+        return render_one(arguments)
+    return _joined(
+        [render_one(camera_arguments) for camera_arguments in _cameras(arguments, shape)], shape
+    )
 
 
 def _one_camera(
     function: Callable[..., Any],
-    given: dict[str, Any],
+    arguments: dict[str, Any],
     virtual_scale: float,
     config: AttenuationConfig,
     hide: bool,
 ) -> Any:
     """gsplat's result for a single camera with any batch dimensions."""
     camera = Camera(
-        given["viewmats"].reshape(4, 4),
-        given["Ks"].reshape(3, 3),
-        given["width"],
-        given["height"],
-        near=given["near_plane"],
+        arguments["viewmats"].reshape(4, 4),
+        arguments["Ks"].reshape(3, 3),
+        arguments["width"],
+        arguments["height"],
+        near=arguments["near_plane"],
     )
-    arguments = dict(given)
-    sigma_d, growth_d = (arguments.pop(name) for name in PER_ROW)
+    drawn_arguments = dict(arguments)
+    sigma_d, growth_d = (drawn_arguments.pop(name) for name in PER_ROW)
     hook = Hook(
         sigma_d.flatten(), config, virtual_scale, None if growth_d is None else growth_d.flatten()
     )
-    opacities, means = given["opacities"], given["means"]
+    opacities, means = arguments["opacities"], arguments["means"]
     attenuated = hook.attenuate(means.reshape(-1, 3), opacities.flatten(), camera)
-    arguments["opacities"] = attenuated.drawn.to(opacities).reshape(opacities.shape)
+    drawn_arguments["opacities"] = attenuated.drawn.to(opacities).reshape(opacities.shape)
     if growth_d is not None:
         name, growth = "scales", attenuated.growth
-        if given.get("covars") is not None:
+        if arguments.get("covars") is not None:
             name, growth = "covars", growth.square()
-        sizes = given[name]
+        sizes = arguments[name]
         further = (1,) * (sizes.dim() - opacities.dim())
-        arguments[name] = sizes * growth.to(sizes).reshape(opacities.shape + further)
-    if hide and not given.get("sparse_grad"):  # sparse gradients do not pass through where
+        drawn_arguments[name] = sizes * growth.to(sizes).reshape(opacities.shape + further)
+    if hide and not arguments.get("sparse_grad"):  # sparse gradients do not pass through where
         behind = (camera.position - camera.viewmat[2, :3]).detach().to(means)
         keep = attenuated.keep.reshape(opacities.shape)
-        arguments["means"] = torch.where(keep[..., None], means, behind)
-    return function(**arguments)
+        drawn_arguments["means"] = torch.where(keep[..., None], means, behind)
+    return function(**drawn_arguments)
 
 
-def _cameras(given: dict[str, Any], shape: torch.Size) -> Iterator[dict[str, Any]]:
+def _cameras(arguments: dict[str, Any], shape: torch.Size) -> Iterator[dict[str, Any]]:
     """Arguments for each camera, without batch dimensions, in gsplat's order of images."""
-    known = {*PER_GAUSSIAN, *PER_CAMERA, *PER_EITHER}
+    with_cameras = {*PER_GAUSSIAN, *PER_CAMERA, *PER_EITHER}
     if unknown := [
-        name for name, value in given.items() if isinstance(value, Tensor) and name not in known
+        name
+        for name, value in arguments.items()
+        if isinstance(value, Tensor) and name not in with_cameras
     ]:
         raise ClodError(
             f"{unknown[0]} may differ between cameras in a way unknown here; render one camera at a"
             " time"
         )
-    if isinstance(given.get("rays"), Tensor):  # the only one that gsplat broadcasts
-        given = {**given, "rays": given["rays"].expand(*shape, *[-1] * 3)}
+    if isinstance(arguments.get("rays"), Tensor):  # the only one that gsplat broadcasts
+        arguments = {**arguments, "rays": arguments["rays"].expand(*shape, *[-1] * 3)}
     for index in np.ndindex(*shape):
         batch, camera = index[:-1] or ..., (*index[:-1], slice(index[-1], index[-1] + 1))
         places = dict.fromkeys(PER_GAUSSIAN, batch) | dict.fromkeys(PER_CAMERA, camera)
         for name, degree in PER_EITHER.items():
-            if isinstance(value := given.get(name), Tensor):
+            if isinstance(value := arguments.get(name), Tensor):
                 # before N rows, or before N rows of K coefficients
-                leading = value.dim() - (2 if given[degree] is None else 3)
+                leading = value.dim() - (2 if arguments[degree] is None else 3)
                 places[name] = camera if leading == len(shape) else batch if leading else ...
         yield {
             name: value[places[name]] if isinstance(value, Tensor) else value
-            for name, value in given.items()
+            for name, value in arguments.items()
         }
 
 
-def _joined(parts: Sequence[Any], shape: torch.Size) -> Any:
+def _joined(results: Sequence[Any], shape: torch.Size) -> Any:
     """gsplat's result for all images from that of each; ``shape`` has batch dimensions and
     cameras.
     """
-    first = parts[0]
+    first = results[0]
     if isinstance(first, tuple):
-        return tuple(_joined(same, shape) for same in zip(*parts, strict=True))
+        return tuple(_joined(same, shape) for same in zip(*results, strict=True))
     if isinstance(first, dict):
-        return _joined_meta(parts, shape)
+        return _joined_meta(results, shape)
     if first is None:
         return None
-    images = torch.stack([part.reshape(part.shape[-3:]) for part in parts]).unflatten(0, shape)
+    images = torch.stack([result.reshape(result.shape[-3:]) for result in results]).unflatten(
+        0, shape
+    )
     return images.squeeze(0) if first.dim() == 3 else images  # as gsplat squeezes some
 
 
@@ -184,41 +192,42 @@ def _joined_meta(metas: Sequence[dict[str, Any]], shape: torch.Size) -> dict[str
     return joined
 
 
-def _pass_gradients_on(parts: list[Tensor], whole: Tensor) -> None:
-    """Gives ``whole`` the ``grad`` and ``absgrad`` of the parts, which gsplat rendered from.
+def _pass_gradients_on(inputs: list[Tensor], joint: Tensor) -> None:
+    """Gives ``joint`` the ``grad`` and ``absgrad`` of the ``inputs``, which gsplat rendered from.
 
     As with gsplat: ``grad`` if it is retained, as a leaf's always is, summed over backward passes;
     ``absgrad`` of the last one.
     """
-    if not whole.requires_grad:
+    if not joint.requires_grad:
         return
-    if all(part.is_leaf for part in parts):
-        whole.retain_grad()
-    whole.parts = parts  # type: ignore[attr-defined]
-    # the graph of whole holds the hooks; a strong reference would be a cycle
-    weak: Any = weakref.ref(whole)
-    values = whole.shape[-1]
-    rows = [0, *accumulate(part.numel() // values for part in parts)]
-    # gradients that came through whole and are in its grad already
-    seen: list[Any] = [0] * len(parts)
+    if all(piece.is_leaf for piece in inputs):
+        joint.retain_grad()
+    joint.inputs = inputs  # type: ignore[attr-defined]
+    # the graph of joint holds the hooks; a strong reference would be a cycle
+    weak: Any = weakref.ref(joint)
+    values = joint.shape[-1]
+    rows = [0, *accumulate(piece.numel() // values for piece in inputs)]
+    # gradients that came through joint and are in its grad already
+    joint_gradients: list[Any] = [0] * len(inputs)
 
-    def by_whole(gradient: Tensor) -> None:
-        seen[:] = gradient.reshape(-1, values).split(
+    def on_joint_gradient(gradient: Tensor) -> None:
+        joint_gradients[:] = gradient.reshape(-1, values).split(
             [stop - start for start, stop in pairwise(rows)]
         )
 
-    def by_part(gradient: Tensor, number: int) -> None:
-        drawn, seen[number] = gradient.reshape(-1, values) - seen[number], 0
-        if (whole := weak()) is None:
+    def on_input_gradient(gradient: Tensor, number: int) -> None:
+        own_gradient = gradient.reshape(-1, values) - joint_gradients[number]
+        joint_gradients[number] = 0
+        if (joint := weak()) is None:
             return
         place = slice(rows[number], rows[number + 1])
-        if whole.retains_grad:
-            whole.grad = torch.zeros_like(whole) if whole.grad is None else whole.grad.clone()
-            whole.grad.view(-1, values)[place] += drawn
-        if hasattr(whole.parts[number], "absgrad"):
-            whole.absgrad = getattr(whole, "absgrad", torch.zeros_like(whole))
-            whole.absgrad.view(-1, values)[place] = whole.parts[number].absgrad.view(-1, values)
+        if joint.retains_grad:
+            joint.grad = torch.zeros_like(joint) if joint.grad is None else joint.grad.clone()
+            joint.grad.view(-1, values)[place] += own_gradient
+        if hasattr(joint.inputs[number], "absgrad"):
+            joint.absgrad = getattr(joint, "absgrad", torch.zeros_like(joint))
+            joint.absgrad.view(-1, values)[place] = joint.inputs[number].absgrad.view(-1, values)
 
-    whole.register_hook(by_whole)
-    for number, part in enumerate(parts):
-        part.register_hook(partial(by_part, number=number))
+    joint.register_hook(on_joint_gradient)
+    for number, piece in enumerate(inputs):
+        piece.register_hook(partial(on_input_gradient, number=number))

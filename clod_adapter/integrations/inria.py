@@ -82,11 +82,13 @@ class GaussianRasterizer(installed.GaussianRasterizer):  # type: ignore[misc]
         width, height = settings.image_width, settings.image_height
         fx, fy = width / (2 * settings.tanfovx), height / (2 * settings.tanfovy)
         K = torch.tensor([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1]], dtype=torch.float32)
-        drawn, keep, growth = hook(means3D, opacities, viewmat, K, width, height)
+        opacities_drawn, keep, growth = hook(means3D, opacities, viewmat, K, width, height)
         # opposite to the viewing direction
         hidden = settings.campos - NEAR * settings.viewmatrix[:3, 2]
         means3D = torch.where(keep[:, None], means3D, hidden.to(means3D))
-        bound = inspect.signature(super().forward).bind(means3D, means2D, drawn, *args, **kwargs)
+        bound = inspect.signature(super().forward).bind(
+            means3D, means2D, opacities_drawn, *args, **kwargs
+        )
         for name, power in () if growth_d is None else (("scales", 1), ("cov3D_precomp", 2)):
             if (value := bound.arguments.get(name)) is not None:
                 bound.arguments[name] = value * growth.to(value)[:, None] ** power

@@ -44,26 +44,26 @@ def from_gsplat(
     Raises:
         ClodError: a parameter is missing or has the wrong shape.
     """
-    named = {name: float_tensor(value) for name, value in splats.items()}
+    tensors = {name: float_tensor(value) for name, value in splats.items()}
     degree_0 = (
-        "features_dc" in named and named.get("features_rest", torch.empty(0, 0)).shape[1] == 0
+        "features_dc" in tensors and tensors.get("features_rest", torch.empty(0, 0)).shape[1] == 0
     )
-    if "features_dc" in named:
-        colours = named["features_dc"]
-        named["sh0"] = ((colours.sigmoid() - 0.5) / SH_C0 if degree_0 else colours).unsqueeze(1)
-        named["shN"] = named.get("features_rest", colours.new_zeros(len(colours), 0, 3))
-    missing = [name for name in NAMES if name not in named and name != "shN"]
+    if "features_dc" in tensors:
+        colours = tensors["features_dc"]
+        tensors["sh0"] = ((colours.sigmoid() - 0.5) / SH_C0 if degree_0 else colours).unsqueeze(1)
+        tensors["shN"] = tensors.get("features_rest", colours.new_zeros(len(colours), 0, 3))
+    missing = [name for name in NAMES if name not in tensors and name != "shN"]
     if missing:
-        more = (
+        hint = (
             "; with appearance optimisation there are no spherical harmonics"
-            if "features" in named
+            if "features" in tensors
             else ""
         )
-        raise ClodError(f"splats needs {', '.join(missing)} too, it has {', '.join(splats)}{more}")
-    named.setdefault("shN", named["sh0"].new_zeros(len(named["sh0"]), 0, 3))
-    if named["opacities"].dim() == 2 and named["opacities"].shape[1] == 1:
-        named["opacities"] = named["opacities"].squeeze(1)
-    values: Any = {ours: named[theirs] for theirs, ours in NAMES.items()}
+        raise ClodError(f"splats needs {', '.join(missing)} too, it has {', '.join(splats)}{hint}")
+    tensors.setdefault("shN", tensors["sh0"].new_zeros(len(tensors["sh0"]), 0, 3))
+    if tensors["opacities"].dim() == 2 and tensors["opacities"].shape[1] == 1:
+        tensors["opacities"] = tensors["opacities"].squeeze(1)
+    values: Any = {ours: tensors[theirs] for theirs, ours in NAMES.items()}
     return Gaussians(**values, screen_filter=screen_filter)
 
 

@@ -97,8 +97,10 @@ class ClodSplatfactoModel(SplatfactoModel):  # type: ignore[misc]
 
     def attach(self, cameras: Sequence[Camera], saved: Mapping[str, Any]) -> None:
         """Gives the loaded Gaussians their dial, a saved or an initialized one (``new_dial``)."""
-        own = self.config
-        config = AdaptConfig(max_sv=own.max_sv, exponent=own.exponent, ssim_weight=own.ssim_lambda)
+        settings = self.config
+        config = AdaptConfig(
+            max_sv=settings.max_sv, exponent=settings.exponent, ssim_weight=settings.ssim_lambda
+        )
         self.dial = new_dial(self.gauss_params, cameras, config, saved).to(self.device)
         rates = trained_rates(self.dial)
         for name, parameter in self.gauss_params.items():
@@ -158,8 +160,8 @@ class ClodPipeline(VanillaPipeline):  # type: ignore[misc]
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
         others, saved = dict[str, Any](), dict[str, Any]()
         for name, value in loaded_state.items():
-            part = saved if name.startswith(OWN) else others
-            part[name.removeprefix(OWN)] = value
+            state = saved if name.startswith(OWN) else others
+            state[name.removeprefix(OWN)] = value
         super().load_pipeline(others, step)
         cameras = self.datamanager.train_dataset.cameras
         self.model.attach([camera_of(cameras[i : i + 1]) for i in range(len(cameras))], saved)
@@ -249,15 +251,15 @@ class ClodTrainer(Trainer):  # type: ignore[misc]
             )
         if folder is None:
             return Path(self.config.load_checkpoint)
-        found = sorted(
+        checkpoints = sorted(
             Path(folder).glob("step-*.ckpt" if step is None else f"step-{step:09d}.ckpt")
         )
-        if not found:
+        if not checkpoints:
             raise ClodError(
                 f"{folder}: has no checkpoint{'' if step is None else f' of step {step}'}"
                 " (step-*.ckpt)"
             )
-        return found[-1]
+        return checkpoints[-1]
 
 
 method = MethodSpecification(

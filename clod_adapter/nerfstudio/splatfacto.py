@@ -53,15 +53,15 @@ def shown(
     culls them before it sorts. Differentiable in the parameters and the dial; culled rows have
     gradient 0.
     """
-    found = dial(camera, virtual_scale)
+    attenuated = dial(camera, virtual_scale)
     means, opacities, scales = (parameters[name] for name in ("means", "opacities", "scales"))
-    keep = found.keep[:, None]
-    logits = torch.logit(found.drawn[:, None].where(keep, 0.5), eps=NEARLY)
+    keep = attenuated.keep[:, None]
+    logits = torch.logit(attenuated.drawn[:, None].where(keep, 0.5), eps=NEARLY)
     behind = (camera.position - camera.viewmat[2, :3]).to(means)
     return {
         "means": torch.where(keep, means, behind),
         "opacities": logits.where(keep, -torch.inf).to(opacities),
-        "scales": scales + found.growth.log().to(scales)[:, None],
+        "scales": scales + attenuated.growth.log().to(scales)[:, None],
     }
 
 
@@ -136,8 +136,8 @@ def write_ply(
     values = torch.cat([gaussians.means, gaussians.opacity_logits[:, None]], 1).detach().numpy()
     of_dial = enumerate(row.tobytes() for row in values)
     rows = []
-    for wanted in map(np.ndarray.tobytes, exported):
-        row = next((number for number, row in of_dial if row == wanted), None)
+    for exported_row in map(np.ndarray.tobytes, exported):
+        row = next((number for number, row in of_dial if row == exported_row), None)
         if row is None:
             raise ClodError(
                 f"{path}: nerfstudio exports other rows than those of the dial; nothing is written"
