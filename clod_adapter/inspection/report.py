@@ -62,9 +62,9 @@ class Inspection:
 
     def as_dict(self) -> dict[str, Any]:
         """Plain JSON."""
-        found = asdict(self)
-        found["oddities"] = found.pop("anomalies")
-        return found
+        document = asdict(self)
+        document["oddities"] = document.pop("anomalies")
+        return document
 
 
 def inspect(path: str | Path) -> Inspection:
@@ -72,8 +72,8 @@ def inspect(path: str | Path) -> Inspection:
     interrupted run.
     """
     path = Path(path)
-    if path.suffix.lower() == ".safetensors" and (found := _inspect_tensors(path)):
-        return found
+    if path.suffix.lower() == ".safetensors" and (inspection := _inspect_tensors(path)):
+        return inspection
     source = read_source(path)
     metadata, head, notes = source.metadata, source.head, [*source.notes, *source.metadata.notes]
     questions = in_question(source.arrays) if source.activation_unknown else {}
@@ -86,8 +86,8 @@ def inspect(path: str | Path) -> Inspection:
             # here: other files are inspected without torch
             from clod_adapter.io.checkpoint import plausibility
 
-            part = {name: rows.arrays[name][rows.keep] for name in ("means", "sigma_d")}
-            notes += plausibility(part, metadata.attenuation)
+            dial_arrays = {name: rows.arrays[name][rows.keep] for name in ("means", "sigma_d")}
+            notes += plausibility(dial_arrays, metadata.attenuation)
         notes += mismatch
     degree = math.isqrt(rows.arrays["shN"].shape[1])
     encoding = ""
@@ -128,11 +128,11 @@ def inspect(path: str | Path) -> Inspection:
         )
     kind = f"an adapted splat, with {splat.dial_columns}" if splat.dial else "a splat"
     packed = "compressed " * any("quantised" in note for note in source.notes)
-    what = f"{kind}, {packed}{'PLY' if head else path.suffix.lower()}"
+    description = f"{kind}, {packed}{'PLY' if head else path.suffix.lower()}"
     return Inspection(
         str(path),
         path.stat().st_size,
-        what,
+        description,
         writer,
         tuple(notes),
         splat,
@@ -145,8 +145,8 @@ def looks_like(head: Head) -> str | None:
     """The program that probably wrote a PLY with this header; None where it is not a known one."""
     for pattern, who in COMMENTS:
         for comment in head.comments:
-            if found := re.fullmatch(pattern, comment.strip()):
-                return who.format(*found.groups())
+            if match := re.fullmatch(pattern, comment.strip()):
+                return who.format(*match.groups())
     if is_packed(head.ply):
         return "gsplat's exporter, or a tool of PlayCanvas"
     names = [p.name for p in head.ply["vertex"].properties] if "vertex" in head.ply else []
@@ -157,8 +157,10 @@ def looks_like(head: Head) -> str | None:
     plain = [
         name for name in names if name not in dial_columns(names) and not name.startswith(COLUMN)
     ]
-    rest = sum(name.startswith("f_rest_") for name in names)
-    degree = next((degree for degree, count in SH_COUNTS.items() if 3 * (count - 1) == rest), 0)
+    rest_count = sum(name.startswith("f_rest_") for name in names)
+    degree = next(
+        (degree for degree, count in SH_COUNTS.items() if 3 * (count - 1) == rest_count), 0
+    )
     inria = list(inria_dtype(degree).names or ())
     if plain == inria:
         return "Inria's trainer, or one of the many that write its layout"
@@ -172,9 +174,9 @@ def looks_like(head: Head) -> str | None:
 
 def extra_columns(names: Sequence[str], sh_degree: int) -> tuple[str, ...]:
     """The properties of a PLY without a meaning here."""
-    known = {*NORMALS, *dial_columns(names), *MASK_COLUMNS, FILTER_3D}
-    known.update(*column_map(sh_degree).values(), RGB if is_coloured(names) else ())
-    return tuple(name for name in names if name not in known and not name.startswith(COLUMN))
+    with_meaning = {*NORMALS, *dial_columns(names), *MASK_COLUMNS, FILTER_3D}
+    with_meaning.update(*column_map(sh_degree).values(), RGB if is_coloured(names) else ())
+    return tuple(name for name in names if name not in with_meaning and not name.startswith(COLUMN))
 
 
 def anomalies_of(splat: Splat, questions: dict[str, tuple[float, float]]) -> tuple[Anomaly, ...]:
@@ -190,15 +192,17 @@ def anomalies_of(splat: Splat, questions: dict[str, tuple[float, float]]) -> tup
         ("far", splat.far, f"are at least {FAR:g} times as far from the centre as 90 % of all"),
         ("giant", splat.giant, "are larger than half the scene"),
     ]
-    found = [Anomaly(kind, count, f"{count:,} {says}") for kind, count, says in counted if count]
+    anomalies = [
+        Anomaly(kind, count, f"{count:,} {says}") for kind, count, says in counted if count
+    ]
     for name, (low, high) in questions.items():
         says = (
             f"{name} from {low:.4g} to {high:.4g}: looks activated, and is read as activated here;"
             " adapting needs"
         )
-        found.append(Anomaly("activated", 0, f"{says} --activated {choice_of(questions)}"))
+        anomalies.append(Anomaly("activated", 0, f"{says} --activated {choice_of(questions)}"))
     if any(splat.origin):
-        found.append(
+        anomalies.append(
             Anomaly(
                 "far_from_0",
                 0,
@@ -206,19 +210,19 @@ def anomalies_of(splat: Splat, questions: dict[str, tuple[float, float]]) -> tup
             )
         )
     if splat.screen_filter.compensate:
-        found.append(
+        anomalies.append(
             Anomaly(
                 "antialiased", 0, f"trained with antialiasing: {splat.screen_filter.description}"
             )
         )
-    return tuple(found)
+    return tuple(anomalies)
 
 
 def left_out_of(splat: Splat, notes: Sequence[str], changes: Sequence[str]) -> tuple[str, ...]:
     """Parts that adapting leaves out or does not change, a line each, from the reader's notes and
     changes.
     """
-    lines, used = [], splat.used_sh_degree
+    lines, used_degree = [], splat.used_sh_degree
     if gone := splat.total - splat.count:
         lines.append(f"{gone:,} of {splat.total:,} rows, which are not usable")
     lines += [
@@ -228,13 +232,14 @@ def left_out_of(splat: Splat, notes: Sequence[str], changes: Sequence[str]) -> t
     ]
     if any(name == FILTER_3D for name, _ in splat.columns):
         lines.append("filter_3D, which is merged into scale and opacity")
-    if splat.sh_degree > used:
+    if splat.sh_degree > used_degree:
         lines.append(
-            f"harmonics above degree {used}, which are 0: skipped in training, kept in the output"
+            f"harmonics above degree {used_degree}, which are 0: skipped in training, kept in the"
+            " output"
         )
     if splat.extra:
-        more = f" and {len(splat.extra) - 6} more" * (len(splat.extra) > 6)
-        lines.append(f"{', '.join(splat.extra[:6])}{more}: not used, copied to outputs")
+        further = f" and {len(splat.extra) - 6} more" * (len(splat.extra) > 6)
+        lines.append(f"{', '.join(splat.extra[:6])}{further}: not used, copied to outputs")
     return (*lines, *(change for change in changes if "taken as activated" in change))
 
 
@@ -251,7 +256,7 @@ def _inspect_tensors(path: Path) -> Inspection | None:
     writer, notes = None, tuple[str, ...]()
     about: dict[str, Any]
     if STATE_KEY in metadata:
-        what = "the state of an interrupted run, for --resume"
+        description = "the state of an interrupted run, for --resume"
         state, belongs = load_state(path)
         about = {
             "kind": "state",
@@ -264,7 +269,7 @@ def _inspect_tensors(path: Path) -> Inspection | None:
             "attenuation": state.attenuation,
         }
     elif f'"{ADAPTER}"' in metadata.get(KEY, ""):
-        what = "an adapter: what clod-adapt learned, without its checkpoint"
+        description = "an adapter: what clod-adapt learned, without its checkpoint"
         adapter = load_adapter(path)
         writer, notes = f"clod-adapter {adapter.version}", adapter.notes
         about = {
@@ -282,4 +287,4 @@ def _inspect_tensors(path: Path) -> Inspection | None:
         }
     else:
         return None
-    return Inspection(str(path), path.stat().st_size, what, writer, notes, about=about)
+    return Inspection(str(path), path.stat().st_size, description, writer, notes, about=about)

@@ -82,14 +82,14 @@ class Splat:
         return "sigma_d" if self.growth is None else "sigma_d and growth_d"
 
 
-def values_of(found: Prepared) -> dict[str, Any]:
+def values_of(prepared: Prepared) -> dict[str, Any]:
     """The fields of ``Splat`` up to ``growth``, of a file's rows, of which one is usable at
     least.
     """
-    keep = found.keep
+    keep = prepared.keep
     columns = {
         name: np.ascontiguousarray(array[keep].T)
-        for name, array in found.arrays.items()
+        for name, array in prepared.arrays.items()
         if name != "shN"
     }
     means, logits = columns["means"], columns["opacity_logits"].astype(np.float64)
@@ -102,16 +102,20 @@ def values_of(found: Prepared) -> dict[str, Any]:
     distance = np.linalg.norm(means.astype(np.float64) - middle, axis=0)
     diagonal = float(np.linalg.norm([spread.high - spread.low for spread in position]))
     same = means[:, np.lexsort(means)]
-    used = [
-        k + 1 for k in range(found.arrays["shN"].shape[1]) if found.arrays["shN"][:, k][keep].any()
+    nonzero_coefficients = [
+        k + 1
+        for k in range(prepared.arrays["shN"].shape[1])
+        if prepared.arrays["shN"][:, k][keep].any()
     ]
     return dict(
         total=len(keep),
         count=int(keep.sum()),
-        dropped=found.dropped,
-        position=tuple(map(Spread.moved, position, found.origin)),
+        dropped=prepared.dropped,
+        position=tuple(map(Spread.moved, position, prepared.origin)),
         used_sh_degree=next(
-            degree for degree, count in SH_COUNTS.items() if count > max(used, default=0)
+            degree
+            for degree, count in SH_COUNTS.items()
+            if count > max(nonzero_coefficients, default=0)
         ),
         scale=Spread.of(scales.ravel()),
         opacity=Spread.of(opacities),

@@ -87,11 +87,14 @@ def series_of(report: Mapping[str, Any]) -> list[Series]:
         others.setdefault((f"base pruned by {entry['by']}", False), []).append(entry["row"])
     for entry in report.get("against") or []:
         others.setdefault((entry["label"], True), []).append(entry["theirs"])
-    found = [model, Series(BASE, base)]
-    found += [Series(label, rows, one and len(rows) > 1) for (label, one), rows in others.items()]
-    found.append(Series("plain viewer, no dial", [report.get("detached_row") or {}]))
+    all_series = [model, Series(BASE, base)]
+    all_series += [
+        Series(label, rows, one_file and len(rows) > 1)
+        for (label, one_file), rows in others.items()
+    ]
+    all_series.append(Series("plain viewer, no dial", [report.get("detached_row") or {}]))
     complete = []
-    for series in found:
+    for series in all_series:
         rows = [row for row in series.rows if row and row["psnr"] is not None]
         if rows:
             complete.append(replace(series, rows=rows))
@@ -137,7 +140,7 @@ def inline_svg(draw: Draw, name: str, label: str) -> list[str]:
     """
     names = {INK: "ink", QUIET: "quiet", GRID: "line", PAPER: "paper"}
     names |= {colour: f"series-{k + 1}" for k, colour in enumerate(SERIES[:-1])}
-    found = []
+    charts = []
     for kind, size in (("wide", SIZE), ("narrow", NARROW)):
         with chart(draw, size) as figure:
             text = io.StringIO()
@@ -151,8 +154,8 @@ def inline_svg(draw: Draw, name: str, label: str) -> list[str]:
         svg = re.sub(r'^<svg [^>]*?viewBox="([^"]*)"[^>]*>', head, svg)
         svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.S).replace("xlink:href", "href")
         svg = re.sub(r'( id="|"#|url\(#)', rf"\g<1>{name}-{kind}-", svg)
-        found.append(svg.replace("'DejaVu Sans'", "ui-sans-serif, system-ui, sans-serif"))
-    return found
+        charts.append(svg.replace("'DejaVu Sans'", "ui-sans-serif, system-ui, sans-serif"))
+    return charts
 
 
 # by the name of the chart: the value of a row, the unit of the axis, its label
@@ -181,7 +184,10 @@ def draw_rows(axes: Any, series: Sequence[Series], quantity: str) -> None:
     point, placed = axes.figure.dpi / 72, list[Any]()
     for text, at in sorted(notes, key=lambda note: note not in (notes[0], notes[-1])):
         x, y = axes.transData.transform(at) / point
-        if all(abs(x - other[0]) > ROOM[0] or abs(y - other[1]) > ROOM[1] for other in placed):
+        if all(
+            abs(x - label_place[0]) > ROOM[0] or abs(y - label_place[1]) > ROOM[1]
+            for label_place in placed
+        ):
             placed.append((x, y))
             axes.annotate(
                 text, at, (-5, -11), textcoords="offset points", ha="right", fontsize=8, color=QUIET
@@ -232,8 +238,8 @@ def _finish(axes: Any, label: str) -> None:
     axes.set_ylabel("mean squared error, thousandths (log scale)")
     axes.set_yticks(_round_errors(*axes.get_ylim()))
     axes.yaxis.set_major_formatter(lambda psnr, _: f"{1e3 * error(psnr):.3g}")
-    left, far = axes.get_xlim()
-    label_log(axes.xaxis, "{:,g}", (1, 2, 5) if far / left > 20 else (1, 1.5, 2, 3, 4, 5, 7))
+    near, far = axes.get_xlim()
+    label_log(axes.xaxis, "{:,g}", (1, 2, 5) if far / near > 20 else (1, 1.5, 2, 3, 4, 5, 7))
     # above the axes it covers nothing
     axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=_columns(axes), borderaxespad=0)
     axes.annotate(
@@ -280,8 +286,8 @@ def save_figure(figure: Any, path: str | Path) -> None:
         if Path(path).suffix.lower() == ".png"
         else None
     )
-    with atomic_path(path) as part:
-        figure.savefig(part, facecolor=PAPER, metadata=about)
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, facecolor=PAPER, metadata=about)
 
 
 def label_log(axis: Any, text: str = "{:,.0f}", subs: Sequence[float] = (1, 2, 5)) -> None:

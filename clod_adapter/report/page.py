@@ -69,15 +69,15 @@ def write_page(
     """
     import jinja2
 
-    path, own, series = Path(path), own_teacher(report), charts.series_of(report)
+    path, against_base, series = Path(path), own_teacher(report), charts.series_of(report)
     # Against its own renders, the base has only rounding errors, far below the range of the charts.
-    drawn = [one for one in series if not (own and one.label == charts.BASE)]
+    drawn = [line for line in series if not (against_base and line.label == charts.BASE)]
     draws: dict[str, charts.Draw] = {
         name: partial(charts.draw_rows, series=drawn, quantity=name)
         for name in (charts.QUANTITIES if drawn else ())
     }
     if training:
-        base_psnr = None if own else training["base_psnr"]
+        base_psnr = None if against_base else training["base_psnr"]
         draws["adapting"] = partial(
             charts.draw_training, curves=training["curves"], base_psnr=base_psnr
         )
@@ -86,12 +86,12 @@ def write_page(
         if drawn and drawn[0].dial
         else []
     )
-    tiles = [(one.label, one.rows[0]) for one in drawn if one.label == charts.BASE]
+    tiles = [(line.label, line.rows[0]) for line in drawn if line.label == charts.BASE]
     ends_and_middle = dict.fromkeys((0, len(dial) // 2, len(dial) - 1)) if dial else ()
     tiles += [(f"s = {dial[k]['virtual_scale']:g}", dial[k]) for k in ends_and_middle]
     settings = {
         "model": report["model"],
-        "scene": "none (synthetic views)" if own else report["scene"],
+        "scene": "none (synthetic views)" if against_base else report["scene"],
     }
     settings |= {"version": report["version"], **report["machine"], "device": report["device"]}
     settings |= {f"{name}, seconds": f"{value:.1f}" for name, value in report["seconds"].items()}
@@ -104,10 +104,10 @@ def write_page(
         .from_string(template)
         .render(
             report=report,
-            own=own,
+            own=against_base,
             name=PurePath(report.get("outputs", {}).get("ply", report["model"])).name,
             model=PurePath(report["model"]).name,
-            scene="" if own else PurePath(abspath(report["scene"])).name,
+            scene="" if against_base else PurePath(abspath(report["scene"])).name,
             series=series,
             drawn=drawn,
             tiles=tiles,

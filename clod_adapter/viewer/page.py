@@ -108,9 +108,9 @@ class Payload:
         ]
         columns += [g.quats, *(tensors[name][:, None] for name in dial_columns(tensors))]
         yield self.header
-        for parts in zip(*(column.split(BLOCK_ROWS) for column in columns), strict=True):
-            rows = torch.cat([part.flatten(1) for part in parts], 1).detach().float().cpu().numpy()
-            yield rows.astype("<f4", copy=False).tobytes()
+        for columns_of_block in zip(*(column.split(BLOCK_ROWS) for column in columns), strict=True):
+            rows = torch.cat([values.flatten(1) for values in columns_of_block], 1).detach()
+            yield rows.float().cpu().numpy().astype("<f4", copy=False).tobytes()
 
     def packed(self, file: str) -> tuple[bytes, Gaussians, tuple[str, ...]]:
         """The splat as SPZ, of which rows that are near one another take a tenth less.
@@ -125,8 +125,8 @@ class Payload:
                 self.gaussians.select(rows),
                 Metadata(calibration=self.calibration, origin=self.origin),
             )
-            found = load(file, origin=self.origin).gaussians.to(self.gaussians.means.device)
-            return Path(file).read_bytes(), found, notes
+            gaussians = load(file, origin=self.origin).gaussians.to(self.gaussians.means.device)
+            return Path(file).read_bytes(), gaussians, notes
         finally:
             Path(file).unlink(missing_ok=True)
 
@@ -208,16 +208,20 @@ def write_viewer_page(
     config = page_config([{"name": payload.name, "element": ELEMENT}], None, entries, virtual_scale)
     with atomic_path(path) as temporary:
         if exact:
-            data, found, notes = b"".join(payload.blocks()), payload.gaussians, tuple[str, ...]()
+            data, gaussians, notes = (
+                b"".join(payload.blocks()),
+                payload.gaussians,
+                tuple[str, ...](),
+            )
         else:
-            data, found, notes = payload.packed(f"{temporary}.spz")
+            data, gaussians, notes = payload.packed(f"{temporary}.spz")
         opening = virtual_scale if virtual_scale is not None else 0.0 if placed else 1.0
-        first = cameras[:1] if not placed else [levelled(cameras[0], up_axis(found))]
-        poster = _poster(found, first[0], opening) if first else ""
+        first = cameras[:1] if not placed else [levelled(cameras[0], up_axis(gaussians))]
+        poster = _poster(gaussians, first[0], opening) if first else ""
         meta = f'<meta http-equiv="Content-Security-Policy" content="{policy()}">\n'
         with open(temporary, "wb") as file:
             file.writelines(document(config, _elements(data), meta, poster))
-    return found, notes
+    return gaussians, notes
 
 
 def _poster(gaussians: Gaussians, camera: Camera, virtual_scale: float) -> str:
@@ -251,12 +255,12 @@ def up_axis(gaussians: Gaussians) -> np.ndarray:
     g = gaussians.to("cpu")
     means, scales = g.means.double().numpy(), np.sort(g.log_scales.numpy(), axis=1)
     offsets = np.linalg.norm(means - np.median(means, axis=0), axis=1)
-    used = (scales[:, 0] + FLAT < scales[:, 1]) & (offsets <= np.quantile(offsets, 0.98))
-    if not used.any():
+    flat = (scales[:, 0] + FLAT < scales[:, 1]) & (offsets <= np.quantile(offsets, 0.98))
+    if not flat.any():
         return np.array(UPS[0])
-    axes = rotations(g.quats[torch.from_numpy(used)].double()).numpy()
-    thin = g.log_scales.numpy()[used].argmin(axis=1)
-    normals, weights = axes[np.arange(len(axes)), :, thin], g.opacities.double().numpy()[used]
+    axes = rotations(g.quats[torch.from_numpy(flat)].double()).numpy()
+    thin = g.log_scales.numpy()[flat].argmin(axis=1)
+    normals, weights = axes[np.arange(len(axes)), :, thin], g.opacities.double().numpy()[flat]
     for up in np.array(UPS):
         for _ in range(UP_STEPS):
             cosines = normals @ up
@@ -274,7 +278,7 @@ def policy(connect: str = "") -> str:
     from.
     """
     digests = [hashlib.sha256(_static_file(name).encode()).digest() for name in (SCRIPT, STYLE)]
-    script, style = (f"'sha256-{base64.b64encode(each).decode()}'" for each in digests)
+    script, style = (f"'sha256-{base64.b64encode(digest).decode()}'" for digest in digests)
     return (
         f"default-src 'none'; script-src {script}; style-src {style}; img-src data: blob:; "
         f"connect-src {connect} data: blob:; worker-src blob:; base-uri 'none'; form-action 'none'"
@@ -295,11 +299,11 @@ def document(
         ),
         "SCRIPT": f'<script type="module">{_static_file(SCRIPT)}</script>',
     }
-    for number, part in enumerate(re.split("<!--CLOD-([A-Z]+)-->", _static_file("page.html"))):
-        if part == "DATA":
+    for number, piece in enumerate(re.split("<!--CLOD-([A-Z]+)-->", _static_file("page.html"))):
+        if piece == "DATA":
             yield from data
         else:
-            yield (content[part] if number % 2 else part).encode()
+            yield (content[piece] if number % 2 else piece).encode()
 
 
 def _elements(data: bytes) -> Iterator[bytes]:
@@ -307,10 +311,10 @@ def _elements(data: bytes) -> Iterator[bytes]:
     id.
     """
     for start in range(0, len(data), PART):
-        part = base64.b64encode(data[start : start + PART])
+        encoded = base64.b64encode(data[start : start + PART])
         yield b'<script type="application/octet-stream" id="%s">%s</script>\n' % (
             ELEMENT.encode(),
-            part,
+            encoded,
         )
 
 
