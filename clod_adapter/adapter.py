@@ -127,17 +127,17 @@ class Adapter:
         Raises:
             ClodError: a different base was given.
         """
-        other = None
+        difference = None
         if fingerprint is not None and fingerprint != self.base_fingerprint:
-            other = (
+            difference = (
                 f"its SHA-256 is {fingerprint[:12]}..., the adapter was trained on"
                 f" {self.base_fingerprint[:12]}..."
             )
         elif len(base) != self.base_count:
-            other = f"it has {len(base)} Gaussians, the adapter {self.base_count}"
-        if other:
+            difference = f"it has {len(base)} Gaussians, the adapter {self.base_count}"
+        if difference:
             raise ClodError(
-                f"a different base was given: {other}; give the checkpoint it was trained on"
+                f"a different base was given: {difference}; give the checkpoint it was trained on"
             )
         changes: dict[str, Tensor] = {}
         for name, update in self.updates.items():

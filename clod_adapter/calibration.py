@@ -66,9 +66,11 @@ class Viewpoint:
         near = all(abs(value) < FARTHEST for value in values[:3])
         require(near, "the centre of a viewpoint", values[:3], f"below {FARTHEST:g}")
         lengths = math.hypot(*values[4:7]), math.hypot(*values[7:10])
-        known = NARROWEST < self.fov < math.pi and max(abs(length - 1) for length in lengths) < 1e-3
+        has_direction = (
+            NARROWEST < self.fov < math.pi and max(abs(length - 1) for length in lengths) < 1e-3
+        )
         require(
-            known or not any(values[4:]),
+            has_direction or not any(values[4:]),
             "the direction of a viewpoint",
             values[4:],
             "unit vectors and an angle",

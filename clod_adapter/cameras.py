@@ -130,7 +130,7 @@ def _check_matrices(name: str, viewmat: list[list[float]], K: list[list[float]])
         abs(sum(map(mul, axes[i], axes[j])) - (i == j)) for i, j in product(range(3), repeat=2)
     )
     moves = bent < BENT and viewmat[3] == [0, 0, 0, 1]
-    for ok, what in (
+    for ok, defect in (
         (all(map(math.isfinite, chain(*viewmat, *K))), "a value that is not finite"),
         (moves, "a viewmat that is no rotation and translation"),
         (fx > 0 and fy > 0, "a focal length that is not positive"),
@@ -140,7 +140,7 @@ def _check_matrices(name: str, viewmat: list[list[float]], K: list[list[float]])
         ),
     ):
         if not ok:
-            raise ClodError(f"camera {name!r} has {what}")
+            raise ClodError(f"camera {name!r} has {defect}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,9 +197,9 @@ class StoredView(View):
 
     @property
     def image(self) -> Tensor:  # type: ignore[override]
-        found: Tensor = self._read()  # type: ignore[attr-defined]
-        _check_image(self.camera, found)
-        return found
+        image: Tensor = self._read()  # type: ignore[attr-defined]
+        _check_image(self.camera, image)
+        return image
 
     def at(self, camera: Camera) -> View:
         return StoredView(camera, self._read)  # type: ignore[attr-defined]

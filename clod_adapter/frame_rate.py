@@ -46,7 +46,7 @@ def excess(frames: Sequence[Frame], milliseconds: float) -> float:
             break
         predicted.append(math.log(max(took / milliseconds, 1e-3)) + EXPONENT * distance)
     present, newest = median(predicted), median(predicted[:NEWEST])
-    noise = median(abs(each - present) for each in predicted)
+    noise = median(abs(prediction - present) for prediction in predicted)
     return newest if abs(newest - present) > max(DEAD_BAND, OUTLIER * noise) else present
 
 

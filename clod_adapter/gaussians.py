@@ -86,12 +86,12 @@ class Gaussians:
                 value.dtype,
                 "floating point: .float()",
             )
-            found = tuple(value.shape)
-            if name != "shN" and found != shapes[name]:
-                raise ClodError(f"Gaussians.{name} has shape {found}, expected {shapes[name]}")
-            if name == "shN" and found not in [(n, count - 1, 3) for count in SH_COUNTS.values()]:
+            shape = tuple(value.shape)
+            if name != "shN" and shape != shapes[name]:
+                raise ClodError(f"Gaussians.{name} has shape {shape}, expected {shapes[name]}")
+            if name == "shN" and shape not in [(n, count - 1, 3) for count in SH_COUNTS.values()]:
                 raise ClodError(
-                    f"Gaussians.shN has shape {found}, expected ({n}, K-1, 3) with K-1 in 0, 3, 8,"
+                    f"Gaussians.shN has shape {shape}, expected ({n}, K-1, 3) with K-1 in 0, 3, 8,"
                     " 15, 24"
                 )
         if (self.sigma_d is None) != (self.attenuation is None):
@@ -191,9 +191,9 @@ class Gaussians:
     def tensors(self) -> dict[str, Tensor]:
         """The tensor fields by name; without those that are None."""
         return {
-            f.name: each
+            f.name: value
             for f in dataclasses.fields(self)
-            if isinstance(each := getattr(self, f.name), Tensor)
+            if isinstance(value := getattr(self, f.name), Tensor)
         }
 
     def replace(self, **changes: Tensor | AttenuationConfig | ScreenFilter | None) -> Gaussians:
@@ -280,7 +280,7 @@ def largest_colour(gaussians: Gaussians) -> str:
     """The largest colour coefficient and its row, for the message about an image that overflows."""
     colours = {name: getattr(gaussians, name).abs().flatten(1) for name in ("sh0", "shN")}
     rows = {name: values.amax(1) for name, values in colours.items() if values.numel()}
-    name = max(rows, key=lambda each: float(rows[each].max()))
+    name = max(rows, key=lambda attribute: float(rows[attribute].max()))
     value, row = rows[name].max(0)
     return f"the largest {name} is {float(value):.3g}, in row {int(row)}: leave out such rows"
 

@@ -39,11 +39,11 @@ def with_sh_degree(gaussians: Gaussians, sh_degree: int, places: Sequence[Place]
     if gaussians.sh_degree <= sh_degree:
         return gaussians
     kept = SH_COUNTS[sh_degree]
-    parts = [
+    changes = [
         _fitted(gaussians.means[rows], gaussians.shN[rows], kept, places)
         for rows in torch.arange(len(gaussians), device=gaussians.means.device).split(ROWS)
     ]
-    change = torch.cat(parts).to(gaussians.sh0)
+    change = torch.cat(changes).to(gaussians.sh0)
     low = gaussians.shN[:, : kept - 1] + change[:, 1:]
     return gaussians.replace(sh0=gaussians.sh0 + change[:, :1], shN=low.contiguous())
 

@@ -91,9 +91,9 @@ class Hook:
         camera = Camera(
             _matrix(viewmat), _matrix(np.eye(3) if K is None else K), width, height, near=near
         )
-        given = tensor_of(opacities)
-        drawn, keep, growth = self.attenuate(tensor_of(means), given, camera)
-        result: Any = drawn.reshape(given.shape).to(given.dtype), keep, growth
+        opacity_tensor = tensor_of(opacities)
+        drawn, keep, growth = self.attenuate(tensor_of(means), opacity_tensor, camera)
+        result: Any = drawn.reshape(opacity_tensor.shape).to(opacity_tensor.dtype), keep, growth
         if isinstance(means, Tensor):
             return result  # type: ignore[no-any-return]
         return tuple(tensor.detach().numpy() for tensor in result)  # type: ignore[return-value]

@@ -86,9 +86,9 @@ def photometric_loss(image: Tensor, target: Tensor, ssim_weight: float = 0.2) ->
     """
     if image.device.type == "cpu" and image.dtype == torch.float32:
         return _FusedLoss.apply(image, target, ssim_weight)  # type: ignore[no-any-return, no-untyped-call]
-    wanted = unit(target, image)
-    return (1 - ssim_weight) * (image - wanted).abs().mean() + ssim_weight * (
-        1 - ssim_plain(image, wanted)
+    target_image = unit(target, image)
+    return (1 - ssim_weight) * (image - target_image).abs().mean() + ssim_weight * (
+        1 - ssim_plain(image, target_image)
     )
 
 

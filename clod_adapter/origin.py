@@ -33,11 +33,11 @@ def origin_of(means: np.ndarray) -> Origin:
     if not finite.any():
         return NOWHERE
     shares = (0.1, 0.5, 0.9)  # axis by axis, which takes a third of the memory
-    found = [
+    quantiles = [
         np.quantile(means[:, k][finite], shares, method="nearest", overwrite_input=True)
         for k in range(3)
     ]
-    low, middle, high = np.stack(found, 1).astype(np.float64)
+    low, middle, high = np.stack(quantiles, 1).astype(np.float64)
     with np.errstate(over="ignore"):  # of doubles
         spread = float((high - low).max())
     if not 0 < FAR * spread < float(np.abs(middle).max()):

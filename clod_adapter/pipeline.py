@@ -145,13 +145,13 @@ def extract_result(
 def calibrated(result: Result, note: Note) -> Result:
     """The result with the calibration of its rows in its adapter, or a note that there is none."""
     try:
-        found = calibrate(
+        calibration = calibrate(
             result.rows, result.gaussians, result.scene, result.against, result.base.origin
         )
     except ClodError as error:
         note(f"the files have no calibration, so --fps and --psnr-drop will not work: {error}")
         return result
-    return replace(result, adapter=replace(result.adapter, calibration=found))
+    return replace(result, adapter=replace(result.adapter, calibration=calibration))
 
 
 def _measured(result: Result, max_sv: float, progress: Listener | None, note: Note) -> Result:

@@ -24,12 +24,14 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=shared.cache_clear)  # a forked child has none of the threads
 
 
-def submit(pool: ThreadPoolExecutor, call: Callable[..., Result], *given: Any) -> Future[Result]:
+def submit(
+    pool: ThreadPoolExecutor, call: Callable[..., Result], *arguments: Any
+) -> Future[Result]:
     """``pool.submit``. Where a thread cannot be started, the pool's calls that have not begun are
     dropped.
     """
     try:
-        return pool.submit(call, *given)
+        return pool.submit(call, *arguments)
     except RuntimeError as error:
         shared.cache_clear()
         pool.shutdown(cancel_futures=True)

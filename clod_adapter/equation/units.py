@@ -31,9 +31,9 @@ def with_distance(gaussians: Gaussians, distance: float) -> Gaussians:
     config, sigma = gaussians.attenuation, gaussians.sigma_d
     if config is None or sigma is None or config.scene_distance == distance:
         return gaussians
-    known = known_distance(config)
+    reference = known_distance(config)
     if gaussians.growth_d is not None:
-        known = known or config.scene_distance
+        reference = reference or config.scene_distance
     if config.form == "ours":
         scaled = (
             (sigma.double() * (config.scene_distance / distance))
@@ -41,7 +41,7 @@ def with_distance(gaussians: Gaussians, distance: float) -> Gaussians:
             .to(sigma.dtype)
         )
         sigma = torch.where(sigma >= SIGMA_MAX, sigma, scaled)
-    changed = replace(config, scene_distance=distance, reference_distance=known)
+    changed = replace(config, scene_distance=distance, reference_distance=reference)
     return gaussians.replace(sigma_d=sigma, attenuation=changed)
 
 

@@ -119,11 +119,11 @@ def path_popping(
     progress: Listener | None = None,
 ) -> Popping:
     """Moves through the ``cameras`` in steps of equal length (``path``), at one dial value."""
-    gaussians, shown = gaussians.without_empty_bands(), path(cameras, steps)
+    gaussians, views = gaussians.without_empty_bands(), path(cameras, steps)
     rasterizer = for_device(gaussians.means.device)
 
     def picture(k: int, j: int) -> Tensor:
-        return rasterizer.draw(gaussians, shown[k], virtual_scale, seen_from=shown[j])[0]
+        return rasterizer.draw(gaussians, views[k], virtual_scale, seen_from=views[j])[0]
 
     return sweep(picture, [k / steps for k in range(steps + 1)], progress)
 
@@ -149,9 +149,10 @@ def path(cameras: Sequence[Camera], steps: int) -> list[Camera]:
     poses[:, :3, :3] = Slerp(places, Rotation.from_matrix(viewmats[:, :3, :3]))(at).as_matrix()
     moved = np.stack([np.interp(at, places, axis) for axis in centres.T], 1)
     poses[:, :3, 3] = -np.einsum("nij,nj->ni", poses[:, :3, :3], moved)
-    found = torch.from_numpy(poses).to(first.viewmat)
+    path_viewmats = torch.from_numpy(poses).to(first.viewmat)
     return [
-        Camera(viewmat, first.K, first.width, first.height, near=first.near) for viewmat in found
+        Camera(viewmat, first.K, first.width, first.height, near=first.near)
+        for viewmat in path_viewmats
     ]
 
 
@@ -160,5 +161,5 @@ def _change(delta: Tensor) -> tuple[float, float]:
     return 255 * float(delta.square().mean().sqrt()), 255 * float(delta.abs().max())
 
 
-def _ratio(part: float, whole: float) -> float:
-    return part / whole if whole > 0 else math.nan
+def _ratio(numerator: float, denominator: float) -> float:
+    return numerator / denominator if denominator > 0 else math.nan

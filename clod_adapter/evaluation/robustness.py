@@ -92,13 +92,13 @@ def distribution(gaussians: Gaussians) -> dict[str, Any]:
     columns = {"opacity": (gaussians.opacities, OPACITY_EDGES)}
     if gaussians.sigma_d is not None:
         columns["log10_sigma_d"] = gaussians.sigma_d.clamp(min=1e-30).log10(), LOG_SIGMA_EDGES
-    found = {}
+    histograms = {}
     for name, (values, edges) in columns.items():
         inner = torch.tensor(edges[1:-1], dtype=torch.float32)
         bins = torch.bucketize(values.detach().cpu().float(), inner, right=True)
         counts = bins.bincount(minlength=len(edges) - 1)
-        found[name] = {"edges": list(edges), "shares": (counts / max(len(values), 1)).tolist()}
-    return found
+        histograms[name] = {"edges": list(edges), "shares": (counts / max(len(values), 1)).tolist()}
+    return histograms
 
 
 def scene_fingerprint(scene: Scene) -> str:
